@@ -3,7 +3,7 @@
 """Normal equations of a PSF's terms, star by star, with the star's own place and gains eliminated."""
 
 from libc.math cimport isnan, sqrt
-from libc.stdlib cimport free, malloc
+from libc.stdlib cimport calloc, free, malloc
 from libc.string cimport memset
 
 import numpy as np
@@ -15,33 +15,38 @@ from starpos.core.psf cimport BLOCK, ORDERS, Local, blocks, evaluate, local_of, 
 
 cdef extern from *:
     """
-    /* Pixels whose products are summed in single precision; sixteen at once, which a compiler left to itself takes one by one. */
+    /* Pixels whose products are summed in single precision; eight at once, which a compiler left to itself takes one by one,
+       and four sums side by side, none of which waits for another. */
     #define STARPOS_ROOM 128
-    #define STARPOS_SIXTEENS 8
-    typedef float starpos_sixteen __attribute__((vector_size(64)));
-    typedef float starpos_sixteens __attribute__((vector_size(64), aligned(4)));
-    static inline double starpos_all(const starpos_sixteen *sums) {
+    #define STARPOS_EIGHTS 16
+    #define STARPOS_ABREAST 4
+    typedef float starpos_eight __attribute__((vector_size(32)));
+    typedef float starpos_eights __attribute__((vector_size(32), aligned(4)));
+    static inline double starpos_all(const starpos_eight *sums) {
         const float *v = (const float *)sums;
-        return ((double)((v[0] + v[8]) + (v[4] + v[12])) + (double)((v[1] + v[9]) + (v[5] + v[13])))
-            + ((double)((v[2] + v[10]) + (v[6] + v[14])) + (double)((v[3] + v[11]) + (v[7] + v[15])));
+        return (double)((v[0] + v[4]) + (v[2] + v[6])) + (double)((v[1] + v[5]) + (v[3] + v[7]));
     }
-    /* Add to the lower half of normal (k, k) and to right (k,) what so many steps of pixels say; design (k, room). */
+    /* Add to the lower half of normal (k, k) and to right (k,) what so many steps of pixels say. design (k, room), and beyond
+       it room for the steps abreast. */
     STARPOS_FUSED static void starpos_gram(const float *design, const float *weight, const float *value, int k, int steps,
                                           double *normal, double *right) {
-        const starpos_sixteens *row = (const starpos_sixteens *)design, *w = (const starpos_sixteens *)weight;
-        const starpos_sixteens *v = (const starpos_sixteens *)value;
+        const starpos_eights *row = (const starpos_eights *)design, *w = (const starpos_eights *)weight;
+        const starpos_eights *v = (const starpos_eights *)value;
         for (int a = 0; a < k; a++) {
-            starpos_sixteen weighted[STARPOS_SIXTEENS], sum = {0};
+            starpos_eight weighted[STARPOS_EIGHTS], sum = {0};
             for (int s = 0; s < steps; s++) {
-                weighted[s] = row[a * STARPOS_SIXTEENS + s] * w[s];
+                weighted[s] = row[a * STARPOS_EIGHTS + s] * w[s];
                 sum += weighted[s] * v[s];
             }
             right[a] += starpos_all(&sum);
-            for (int b = 0; b <= a; b++) {
-                starpos_sixteen product = {0};
+            for (int b = 0; b <= a; b += STARPOS_ABREAST) {
+                const starpos_eights *other = row + b * STARPOS_EIGHTS;
+                starpos_eight product[STARPOS_ABREAST] = {{0}};
                 for (int s = 0; s < steps; s++)
-                    product += weighted[s] * row[b * STARPOS_SIXTEENS + s];
-                normal[a * k + b] += starpos_all(&product);
+                    for (int c = 0; c < STARPOS_ABREAST; c++)
+                        product[c] += weighted[s] * other[c * STARPOS_EIGHTS + s];
+                for (int c = 0; c < STARPOS_ABREAST && b + c <= a; c++)
+                    normal[a * k + b + c] += starpos_all(&product[c]);
             }
         }
     }
@@ -52,7 +57,8 @@ cdef extern from *:
 
 cdef enum:
     ROOM = 128
-    STEP = 16
+    STEP = 8
+    ABREAST = 4
 
 
 cdef struct Pixels:
@@ -165,7 +171,7 @@ def marginal(
     cdef double[:, :, ::1] normals = out
     cdef double[:, ::1] rights = right_
     cdef double *normal = <double *>malloc(each * (each + 1) * sizeof(double))
-    pixels.design = <float *>malloc(each * ROOM * sizeof(float))
+    pixels.design = <float *>calloc((each + ABREAST) * ROOM, sizeof(float))
     if normal == NULL or pixels.design == NULL:
         free(normal)
         free(pixels.design)

@@ -15,58 +15,73 @@ from starpos.core.shapes cimport Shape, clipped_to, inverse, put_shape, shape_be
 cdef extern from *:
     """
     /* Columns that are summed side by side, and groups of these whose Gaussians are made at once: left to itself a compiler
-       takes them one by one. */
-    #define STARPOS_LANES 8
-    #define STARPOS_GROUPS 8
-    typedef double starpos_eight __attribute__((vector_size(64)));
-    typedef float starpos_pixels __attribute__((vector_size(32), aligned(4)));
+       takes them one by one, and of wider vectors than registers it keeps most in memory. */
+    #define STARPOS_LANES 4
+    #define STARPOS_GROUPS 16
+    typedef double starpos_four __attribute__((vector_size(32)));
+    typedef float starpos_pixels __attribute__((vector_size(16), aligned(4)));
+    #define STARPOS_LIGHT(pixels) __builtin_convertvector(*(const starpos_pixels *)(pixels), starpos_four)
     /* Sums over groups of columns of their light through a window, and of it times x, y, xx, xy and yy.
-       A column's neighbours in a Gaussian have a ratio, which changes by a constant factor from row to row. */
+       A column's neighbours in a Gaussian have a ratio, which changes by a constant factor from row to row: up and down from
+       the middle one, whose distances to both sides are the same. */
     STARPOS_FUSED static void starpos_columns(const float *light, int rows, int stride, int groups, int middle, double dx,
                                              double dy, double xx, double xy, double yy, double change, double *out) {
-        const starpos_eight lanes = {0, 1, 2, 3, 4, 5, 6, 7};
-        starpos_eight total[6] = {{0}}, power[2 * STARPOS_GROUPS];
+        const starpos_four lanes = {0, 1, 2, 3};
+        const int below = rows - 1 - middle, both = below < middle ? below : middle, longer = below + middle - both;
+        starpos_four total[6] = {{0}}, power[2 * STARPOS_GROUPS];
         for (int g = 0; g < groups; g++) {
-            const starpos_eight x = dx + g * STARPOS_LANES + lanes;
+            const starpos_four x = dx + g * STARPOS_LANES + lanes;
             const int at = g % STARPOS_GROUPS;
             if (at == 0) {
                 const int some = groups - g < STARPOS_GROUPS ? groups - g : STARPOS_GROUPS;
                 for (int k = 0; k < some; k++) {
-                    const starpos_eight off = x + k * STARPOS_LANES;
+                    const starpos_four off = x + k * STARPOS_LANES;
                     power[2 * k] = -0.5 * (xx * off * off + 2 * xy * dy * off + yy * dy * dy);
                     power[2 * k + 1] = -(xy * off + yy * (dy + 0.5));
                 }
                 starpos_exps((double *)power, 2 * some * STARPOS_LANES);
             }
-            const starpos_eight first = power[2 * at], down = power[2 * at + 1], up = change / down;
-            starpos_eight sum = {0}, sum_y = {0}, sum_yy = {0};
-            for (int side = 0; side < 2; side++) {
-                const int step = side ? -1 : 1, count = side ? middle : rows - middle;
-                const float *row = light + g * STARPOS_LANES + (side ? middle - 1 : middle) * stride;
-                starpos_eight through = side ? first * up : first, ratio = side ? up * change : down;
-                double y = side ? dy - 1 : dy;
-                for (int j = 0; j < count; j++) {
-                    const starpos_eight some = through * __builtin_convertvector(*(const starpos_pixels *)row, starpos_eight);
-                    const starpos_eight lever = some * y;
-                    sum += some;
-                    sum_y += lever;
-                    sum_yy += lever * y;
-                    through *= ratio;
-                    ratio *= change;
-                    y += step;
-                    row += step * stride;
-                }
+            const float *row = light + middle * stride + g * STARPOS_LANES, *down = row, *up = row;
+            starpos_four to_down = power[2 * at + 1], to_up = change / to_down, of_down = power[2 * at], of_up = of_down;
+            starpos_four sum = of_down * STARPOS_LIGHT(row), by_y = {0}, by_yy = {0}, y = {0};
+            for (int j = 0; j < both; j++) {
+                of_down *= to_down;
+                of_up *= to_up;
+                to_down *= change;
+                to_up *= change;
+                down += stride;
+                up -= stride;
+                y += 1;
+                const starpos_four a = of_down * STARPOS_LIGHT(down), b = of_up * STARPOS_LIGHT(up), pair = a + b;
+                sum += pair;
+                by_y += (a - b) * y;
+                by_yy += pair * y * y;
             }
+            const int step = below > middle ? stride : -stride;
+            starpos_four of_next = below > middle ? of_down : of_up, to_next = below > middle ? to_down : to_up;
+            const double side = below > middle ? 1 : -1;
+            row = below > middle ? down : up;
+            for (int j = both; j < longer; j++) {
+                of_next *= to_next;
+                to_next *= change;
+                row += step;
+                y += 1;
+                const starpos_four some = of_next * STARPOS_LIGHT(row), lever = some * y;
+                sum += some;
+                by_y += lever * side;
+                by_yy += lever * y;
+            }
+            by_yy += 2 * dy * by_y + dy * dy * sum;
+            by_y += dy * sum;
             total[0] += sum;
             total[1] += sum * x;
-            total[2] += sum_y;
+            total[2] += by_y;
             total[3] += sum * x * x;
-            total[4] += sum_y * x;
-            total[5] += sum_yy;
+            total[4] += by_y * x;
+            total[5] += by_yy;
         }
         for (int k = 0; k < 6; k++)
-            out[k] = ((total[k][0] + total[k][1]) + (total[k][2] + total[k][3]))
-                + ((total[k][4] + total[k][5]) + (total[k][6] + total[k][7]));
+            out[k] = (total[k][0] + total[k][1]) + (total[k][2] + total[k][3]);
     }
     """
     void sum_columns "starpos_columns"(
@@ -76,7 +91,7 @@ cdef extern from *:
 
 
 cdef enum:
-    LANES = 8
+    LANES = 4
 
 # A window's Gaussian is nothing (7e-10 of its peak) beyond so many of its widths.
 cdef double WIDTHS = 6.5

@@ -12,20 +12,20 @@ from starpos.core.limits cimport within
 
 cdef extern from *:
     """
-    /* Eight pixels at once, which a compiler left to itself takes one by one. */
-    typedef double starpos_eight __attribute__((vector_size(64)));
-    typedef double starpos_eights __attribute__((vector_size(64), aligned(8)));
-    typedef long long starpos_marks __attribute__((vector_size(64)));
-    /* Sums over n pixels (whole eights) of the light over its variance squared, and, of pixels whose square is not too large
+    /* Four pixels at once, which a compiler left to itself takes one by one. */
+    typedef double starpos_four __attribute__((vector_size(32)));
+    typedef double starpos_fours __attribute__((vector_size(32), aligned(8)));
+    typedef long long starpos_marks __attribute__((vector_size(32)));
+    /* Sums over n pixels (whole fours) of the light over its variance squared, and, of pixels whose square is not too large
        for it, of the products of light, light squared and the excess, each over the variance: pp, pq, qq, p, q. */
     STARPOS_FUSED static void starpos_light_sums(const double *noise2, const double *light, const double *square, int n,
                                                 double photon, double misfit2, double limit2, double *out) {
-        starpos_eight sums[6] = {{0}};
-        for (int k = 0; k < n; k += 8) {
-            const starpos_eight s = *(const starpos_eights *)(light + k), sky = *(const starpos_eights *)(noise2 + k);
-            const starpos_eight r2 = *(const starpos_eights *)(square + k), variance = sky + (photon + misfit2 * s) * s;
-            const starpos_eight all = s / variance, excess = (r2 - sky) / variance;
-            const starpos_eight a = (starpos_eight)((starpos_marks)all & (starpos_marks)(r2 < limit2 * variance)), b = a * s;
+        starpos_four sums[6] = {{0}};
+        for (int k = 0; k < n; k += 4) {
+            const starpos_four s = *(const starpos_fours *)(light + k), sky = *(const starpos_fours *)(noise2 + k);
+            const starpos_four r2 = *(const starpos_fours *)(square + k), variance = sky + (photon + misfit2 * s) * s;
+            const starpos_four all = s / variance, excess = (r2 - sky) / variance;
+            const starpos_four a = (starpos_four)((starpos_marks)all & (starpos_marks)(r2 < limit2 * variance)), b = a * s;
             sums[0] += all * all;
             sums[1] += a * a;
             sums[2] += a * b;
@@ -34,8 +34,7 @@ cdef extern from *:
             sums[5] += b * excess;
         }
         for (int k = 0; k < 6; k++)
-            out[k] = ((sums[k][0] + sums[k][1]) + (sums[k][2] + sums[k][3]))
-                + ((sums[k][4] + sums[k][5]) + (sums[k][6] + sums[k][7]));
+            out[k] = (sums[k][0] + sums[k][1]) + (sums[k][2] + sums[k][3]);
     }
     """
     void light_sums "starpos_light_sums"(
@@ -45,7 +44,7 @@ cdef extern from *:
 
 cdef enum:
     # Pixels that are summed at once.
-    LANES = 8
+    LANES = 4
     ROUNDS = 4
 
 # Smaller singular values, as a share of the largest, are 0; residuals are at most so much more certain than they look.

@@ -13,17 +13,19 @@ cdef extern from *:
     """
     #define STARPOS_BLOCK 64
     #define STARPOS_ORDERS 32
-    /* Pixels that are summed in registers, which a compiler left to itself takes one by one; steps of these in a block. */
-    #define STARPOS_LANES 8
-    #define STARPOS_STEPS 8
-    typedef double starpos_eight __attribute__((vector_size(64)));
-    typedef double starpos_eights __attribute__((vector_size(64), aligned(8)));
-    typedef float starpos_floats __attribute__((vector_size(32), aligned(4)));
+    /* Pixels that are summed in a register, which a compiler left to itself takes one by one; steps of these in a block, and
+       of these so many side by side. */
+    #define STARPOS_LANES 4
+    #define STARPOS_STEPS 16
+    #define STARPOS_ABREAST 2
+    typedef double starpos_four __attribute__((vector_size(32)));
+    typedef double starpos_fours __attribute__((vector_size(32), aligned(8)));
+    typedef float starpos_floats __attribute__((vector_size(16), aligned(4)));
     /* Of 0, 1, 2 ..., and 1 over them; set when the module is loaded. */
     static double starpos_root[STARPOS_ORDERS + 2], starpos_over_root[STARPOS_ORDERS + 2];
     /* Hermite polynomials over sqrt(k!), k = 0 .. order, of so many steps of numbers u. */
-    static inline void starpos_hermites(const starpos_eight *u, int steps, int order, starpos_eight (*out)[STARPOS_STEPS]) {
-        const starpos_eight one = {1, 1, 1, 1, 1, 1, 1, 1};
+    static inline void starpos_hermites(const starpos_four *u, int steps, int order, starpos_four (*out)[STARPOS_STEPS]) {
+        const starpos_four one = {1, 1, 1, 1};
         for (int s = 0; s < steps; s++) {
             out[0][s] = one;
             out[1][s] = u[s];
@@ -34,11 +36,11 @@ cdef extern from *:
                 out[k + 1][s] = (u[s] * out[k][s] - before * out[k - 1][s]) * over;
         }
     }
-    /* n offsets, at most a block, in widths, and the Gaussian there; the last step is filled up with the star's middle. How
-       many steps they are. */
+    /* n offsets, at most a block, in widths, and the Gaussian there; the last steps abreast are filled up with the star's
+       middle. How many steps they are. */
     static inline int starpos_places(const double *axes, double peak, const double *dx, const double *dy, int n, double *u,
                                      double *v, double *gauss) {
-        const int steps = (n + STARPOS_LANES - 1) / STARPOS_LANES, whole = steps * STARPOS_LANES;
+        const int abreast = STARPOS_ABREAST * STARPOS_LANES, whole = (n + abreast - 1) / abreast * abreast;
         for (int p = 0; p < n; p++) {
             u[p] = axes[0] * dx[p] + axes[1] * dy[p];
             v[p] = axes[2] * dx[p] + axes[3] * dy[p];
@@ -50,7 +52,7 @@ cdef extern from *:
         starpos_exps(gauss, whole);
         for (int p = 0; p < whole; p++)
             gauss[p] *= peak;
-        return steps;
+        return whole / STARPOS_LANES;
     }
     STARPOS_FUSED static void starpos_scaled(const double *axes, double peak, const double *dx, const double *dy, int n,
                                             double *u, double *v, double *gauss) {
@@ -61,63 +63,71 @@ cdef extern from *:
     STARPOS_FUSED static void starpos_evaluate(const double *axes, double peak, int rows, int columns, const int *first,
                                               const int *column, const double *term, const double *slope, const double *dx,
                                               const double *dy, int n, double *value, double *by_x, double *by_y) {
-        starpos_eight u[STARPOS_STEPS], v[STARPOS_STEPS], gauss[STARPOS_STEPS];
-        starpos_eight fu[STARPOS_ORDERS + 1][STARPOS_STEPS], fv[STARPOS_ORDERS + 1][STARPOS_STEPS];
+        starpos_four u[STARPOS_STEPS], v[STARPOS_STEPS], gauss[STARPOS_STEPS];
+        starpos_four fu[STARPOS_ORDERS + 1][STARPOS_STEPS], fv[STARPOS_ORDERS + 1][STARPOS_STEPS];
         const int steps = starpos_places(axes, peak, dx, dy, n, (double *)u, (double *)v, (double *)gauss);
         starpos_hermites(u, steps, rows, fu);
         starpos_hermites(v, steps, columns, fv);
-        for (int s = 0; s < steps; s++) {
-            starpos_eight sum = {0}, by_u = {0}, by_v = {0};
+        for (int s = 0; s < steps; s += STARPOS_ABREAST) {
+            starpos_four sum[STARPOS_ABREAST] = {{0}}, by_u[STARPOS_ABREAST] = {{0}}, by_v[STARPOS_ABREAST] = {{0}};
             for (int i = 0; i < rows; i++) {
-                starpos_eight across = {0}, steeper = {0};
+                starpos_four across[STARPOS_ABREAST] = {{0}}, steeper[STARPOS_ABREAST] = {{0}};
                 if (first[i] == first[i + 1])
                     continue;
-                for (int t = first[i]; t < first[i + 1]; t++) {
-                    across += term[t] * fv[column[t]][s];
-                    steeper += slope[t] * fv[column[t] + 1][s];
+                for (int t = first[i]; t < first[i + 1]; t++)
+                    for (int k = 0; k < STARPOS_ABREAST; k++) {
+                        across[k] += term[t] * fv[column[t]][s + k];
+                        steeper[k] += slope[t] * fv[column[t] + 1][s + k];
+                    }
+                for (int k = 0; k < STARPOS_ABREAST; k++) {
+                    sum[k] += fu[i][s + k] * across[k];
+                    by_u[k] += starpos_root[i + 1] * fu[i + 1][s + k] * across[k];
+                    by_v[k] += fu[i][s + k] * steeper[k];
                 }
-                sum += fu[i][s] * across;
-                by_u += starpos_root[i + 1] * fu[i + 1][s] * across;
-                by_v += fu[i][s] * steeper;
             }
-            ((starpos_eights *)value)[s] = sum * gauss[s];
-            ((starpos_eights *)by_x)[s] = (axes[0] * by_u + axes[2] * by_v) * gauss[s];
-            ((starpos_eights *)by_y)[s] = (axes[1] * by_u + axes[3] * by_v) * gauss[s];
+            for (int k = 0; k < STARPOS_ABREAST; k++) {
+                ((starpos_fours *)value)[s + k] = sum[k] * gauss[s + k];
+                ((starpos_fours *)by_x)[s + k] = (axes[0] * by_u[k] + axes[2] * by_v[k]) * gauss[s + k];
+                ((starpos_fours *)by_y)[s + k] = (axes[1] * by_u[k] + axes[3] * by_v[k]) * gauss[s + k];
+            }
         }
     }
     /* The sum alone. */
     STARPOS_FUSED static void starpos_values(const double *axes, double peak, int rows, int columns, const int *first,
                                             const int *column, const double *term, const double *dx, const double *dy, int n,
                                             double *value) {
-        starpos_eight u[STARPOS_STEPS], v[STARPOS_STEPS], gauss[STARPOS_STEPS];
-        starpos_eight fu[STARPOS_ORDERS + 1][STARPOS_STEPS], fv[STARPOS_ORDERS + 1][STARPOS_STEPS];
+        starpos_four u[STARPOS_STEPS], v[STARPOS_STEPS], gauss[STARPOS_STEPS];
+        starpos_four fu[STARPOS_ORDERS + 1][STARPOS_STEPS], fv[STARPOS_ORDERS + 1][STARPOS_STEPS];
         const int steps = starpos_places(axes, peak, dx, dy, n, (double *)u, (double *)v, (double *)gauss);
         starpos_hermites(u, steps, rows - 1, fu);
         starpos_hermites(v, steps, columns - 1, fv);
-        for (int s = 0; s < steps; s++) {
-            starpos_eight sum = {0};
+        for (int s = 0; s < steps; s += STARPOS_ABREAST) {
+            starpos_four sum[STARPOS_ABREAST] = {{0}};
             for (int i = 0; i < rows; i++) {
-                starpos_eight across = {0};
+                starpos_four across[STARPOS_ABREAST] = {{0}};
                 if (first[i] == first[i + 1])
                     continue;
                 for (int t = first[i]; t < first[i + 1]; t++)
-                    across += term[t] * fv[column[t]][s];
-                sum += fu[i][s] * across;
+                    for (int k = 0; k < STARPOS_ABREAST; k++)
+                        across[k] += term[t] * fv[column[t]][s + k];
+                for (int k = 0; k < STARPOS_ABREAST; k++)
+                    sum[k] += fu[i][s + k] * across[k];
             }
-            ((starpos_eights *)value)[s] = sum * gauss[s];
+            for (int k = 0; k < STARPOS_ABREAST; k++)
+                ((starpos_fours *)value)[s + k] = sum[k] * gauss[s + k];
         }
     }
     /* One term h_i(u) h_j(v) for each of so many orders (i, j), times the Gaussian, of a block; in rows of `out` so far apart. */
     STARPOS_FUSED static void starpos_terms(const int *orders, int count, int highest, const double *u, const double *v,
                                            const double *gauss, float *out, int apart) {
-        starpos_eight places[3][STARPOS_STEPS], fu[STARPOS_ORDERS + 1][STARPOS_STEPS], fv[STARPOS_ORDERS + 1][STARPOS_STEPS];
+        starpos_four places[3][STARPOS_STEPS], fu[STARPOS_ORDERS + 1][STARPOS_STEPS], fv[STARPOS_ORDERS + 1][STARPOS_STEPS];
         memcpy(places[0], u, sizeof places[0]);
         memcpy(places[1], v, sizeof places[1]);
         memcpy(places[2], gauss, sizeof places[2]);
         starpos_hermites(places[0], STARPOS_STEPS, highest, fu);
         starpos_hermites(places[1], STARPOS_STEPS, highest, fv);
         for (int t = 0; t < count; t++) {
-            const starpos_eight *a = fu[orders[2 * t]], *b = fv[orders[2 * t + 1]];
+            const starpos_four *a = fu[orders[2 * t]], *b = fv[orders[2 * t + 1]];
             starpos_floats *row = (starpos_floats *)(out + t * apart);
             for (int s = 0; s < STARPOS_STEPS; s++)
                 row[s] = __builtin_convertvector(a[s] * b[s] * places[2][s], starpos_floats);
