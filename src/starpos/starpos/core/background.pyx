@@ -55,17 +55,23 @@ cdef extern from *:
             away[i] = v[i] > middle ? v[i] - middle : middle - v[i];
     }
     STARPOS_WIDE static void starpos_sums(const unsigned short *v, int n, int middle, int limit, long long *out) {
-        long long sum = 0, square = 0;
-        int count = 0;
-        for (int i = 0; i < n; i++) {
-            const int off = v[i] - middle, kept = off <= limit && -off <= limit ? off : 0;
-            count += off <= limit && -off <= limit;
-            sum += kept;
-            square += (long long)kept * kept;
+        /* so many squares have a sum of 32 bits */
+        const int most = limit < 65536 ? 4294967295u / ((unsigned)limit * limit + 1) : 0, some = most > 1 ? most : 1;
+        out[0] = out[1] = out[2] = 0;
+        for (int first = 0; first < n; first += some) {
+            const int last = n - first < some ? n : first + some;
+            unsigned square = 0;
+            int count = 0, sum = 0;
+            for (int i = first; i < last; i++) {
+                const int off = v[i] - middle, kept = (unsigned)(off + limit) <= 2u * limit;
+                count += kept;
+                sum += kept ? off : 0;
+                square += kept ? (unsigned)off * (unsigned)off : 0;
+            }
+            out[0] += count;
+            out[1] += sum;
+            out[2] += square;
         }
-        out[0] = count;
-        out[1] = sum;
-        out[2] = square;
     }
     """
     int ranked "starpos_ranked"(const unsigned short *v, int n, int k) noexcept nogil

@@ -24,24 +24,37 @@ cdef extern from *:
         }
     STARPOS_WIDEN(8, unsigned char) STARPOS_WIDEN(16, unsigned short)
     /* Set `out` to a row times its weight and three pairs of others, each times its weight; or add three pairs. */
-    STARPOS_WIDE static void starpos_begin(float *restrict out, const float *w, Py_ssize_t n, const float *m, const float *const *p) {
+    STARPOS_FUSED static void starpos_begin(float *restrict out, const float *w, Py_ssize_t n, const float *m, const float *const *p) {
         const float s = w[0], t = w[1], u = w[2], v = w[3];
         const float *a = p[0], *b = p[1], *c = p[2], *d = p[3], *e = p[4], *f = p[5];
+        #pragma GCC unroll 2
         for (Py_ssize_t i = 0; i < n; i++)
             out[i] = s * m[i] + (t * (a[i] + b[i]) + u * (c[i] + d[i]) + v * (e[i] + f[i]));
     }
-    STARPOS_WIDE static void starpos_add(float *restrict out, const float *w, Py_ssize_t n, const float *const *p) {
+    STARPOS_FUSED static void starpos_add(float *restrict out, const float *w, Py_ssize_t n, const float *const *p) {
         const float t = w[0], u = w[1], v = w[2];
         const float *a = p[0], *b = p[1], *c = p[2], *d = p[3], *e = p[4], *f = p[5];
         for (Py_ssize_t i = 0; i < n; i++)
             out[i] += t * (a[i] + b[i]) + u * (c[i] + d[i]) + v * (e[i] + f[i]);
     }
-    /* Whether the sum of a pixel and the next one is above the limit. */
-    STARPOS_WIDE static int starpos_any_pair(const float *restrict row, float limit, Py_ssize_t n) {
-        int any = 0;
-        for (Py_ssize_t i = 0; i < n; i++)
-            any |= row[i] + row[i + 1] > limit;
-        return any;
+    /* Whether the sum of a pixel and the next one is above the limit: four times eight at once, which a compiler left to
+       itself takes one by one. The last of these may overlap with others. */
+    typedef float starpos_eights __attribute__((vector_size(32), aligned(4)));
+    typedef int starpos_marks __attribute__((vector_size(32)));
+    STARPOS_WIDE static int starpos_any_pair(const float *row, float limit, Py_ssize_t n) {
+        starpos_marks any[4] = {{0}};
+        int found = 0;
+        for (Py_ssize_t i = 0; i < n && n >= 32; i += 32) {
+            const float *at = row + (i < n - 32 ? i : n - 32);
+            for (int k = 0; k < 4; k++)
+                any[k] |= *(const starpos_eights *)(at + 8 * k) + *(const starpos_eights *)(at + 8 * k + 1) > limit;
+        }
+        any[0] |= any[1] | any[2] | any[3];
+        for (int k = 0; k < 8; k++)
+            found |= any[0][k];
+        for (Py_ssize_t i = 0; i < n && n < 32; i++)
+            found |= row[i] + row[i + 1] > limit;
+        return found != 0;
     }
     /* Whether a pixel of the row is above its limit. */
     STARPOS_WIDE static int starpos_any_above(const float *restrict row, const float *restrict limit, Py_ssize_t n) {
