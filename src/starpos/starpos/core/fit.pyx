@@ -4,14 +4,14 @@
 
 from libc.math cimport NAN, isfinite, sqrt
 from libc.stdlib cimport free, malloc
-from libc.string cimport memcpy, memset
+from libc.string cimport memcmp, memcpy, memset
 
 import numpy as np
 
 from starpos.core.equations cimport invert_scaled, scaled_factor, solve_scaled
 from starpos.core.psf cimport BLOCK, Local, blocks, evaluate, local_of, sound, values
 from starpos.core.rules cimport MOST, PHASES, Rules, first_of_phase, is_settled, rows_within, sound_stamps
-from starpos.core.sums cimport any_bright, chi_square, of_sky, products, squares, weigh
+from starpos.core.sums cimport any_bright, chi_square, of_sky, products, squares, take, weigh
 
 cdef enum:
     # Numbers kept of each pixel.
@@ -36,8 +36,12 @@ cdef struct Pixels:
     double *weight
     double *residual
     double *leverage
-    # Of each row of the stamp the first column within reach, and the one after the last.
+    # Of each row of the stamp the first column within reach, and the one after the last; and room for others.
     int *bound
+    int *wanted
+    # Of the star, when they were taken.
+    double x
+    double y
     # Of each pixel of the stamp, where it was marked last.
     unsigned char *outlier
 
@@ -73,12 +77,13 @@ cdef int _begin(Pixels *p, int area) except -1:
     # the last step of a block may begin anywhere
     cdef int room = (blocks(area) + 1) * BLOCK
     cdef double *columns = <double *>malloc(COLUMNS * room * sizeof(double))
-    p.place = <int *>malloc((room + 2 * area) * sizeof(int) + area)
+    p.place = <int *>malloc((room + 4 * area) * sizeof(int) + area)
     if columns == NULL or p.place == NULL:
         free(columns)
         free(p.place)
         raise MemoryError
-    p.bound, p.outlier = p.place + room, <unsigned char *>(p.place + room + 2 * area)
+    p.bound, p.wanted = p.place + room, p.place + room + 2 * area
+    p.outlier = <unsigned char *>(p.place + room + 4 * area)
     p.count = p.all = 0
     p.dx, p.dy, p.signal, p.noise2 = columns, columns + room, columns + 2 * room, columns + 3 * room
     p.value, p.by_x, p.by_y = columns + 4 * room, columns + 5 * room, columns + 6 * room
@@ -86,23 +91,38 @@ cdef int _begin(Pixels *p, int area) except -1:
     return 0
 
 
-cdef void _gather(const Stamp *s, const Star *star, const Local *psf, Rules rules, Pixels *p) noexcept nogil:
-    """Take the pixels of a stamp within reach of the star; the weight is 1 for those to be fitted, else 0."""
-    cdef int row, column, last, place, phase, n = 0, step = 2 if rules.own else 1
-    rows_within(psf.axes, s.left - star.x, s.top - star.y, s.size, rules.widths2, p.bound)
-    for phase in range(rules.phases):
-        p.first[phase] = n
-        for row in range(s.size):
-            column, last = p.bound[2 * row], p.bound[2 * row + 1]
-            if rules.own:
-                column = first_of_phase(s.phase + row * s.size, column, last, phase)
-            while column < last:
-                place = row * s.size + column
-                p.place[n], p.dx[n], p.dy[n] = place, s.left + column - star.x, s.top + row - star.y
-                p.signal[n], p.noise2[n] = s.signal[place], <double>s.noise[place] * s.noise[place]
-                p.weight[n] = s.good[place] & ~s.outlier[place]
-                n += 1
-                column += step
+cdef void _gather(const Stamp *s, const Star *star, const Local *psf, Rules rules, bint again, Pixels *p) noexcept nogil:
+    """Take the pixels of a stamp within reach of the star; the weight is 1 for those to be fitted, else 0.
+
+    again: whether the star has some, which are most often the same
+    """
+    cdef int row, first, last, place, phase, some, n = 0, step = 2 if rules.own else 1
+    rows_within(psf.axes, s.left - star.x, s.top - star.y, s.size, rules.widths2, p.wanted)
+    if again and not memcmp(p.wanted, p.bound, 2 * s.size * sizeof(int)):
+        for n in range(p.count):
+            p.dx[n], p.dy[n] = p.dx[n] + (p.x - star.x), p.dy[n] + (p.y - star.y)
+            p.weight[n] = s.good[p.place[n]] & ~s.outlier[p.place[n]]
+        n = p.count
+    else:
+        p.wanted, p.bound = p.bound, p.wanted
+        for phase in range(rules.phases):
+            p.first[phase] = n
+            # every other row has another two phases
+            row = 1 if rules.own and s.phase[0] // 2 != phase // 2 else 0
+            while row < s.size:
+                first, last = p.bound[2 * row], p.bound[2 * row + 1]
+                if rules.own:
+                    first = first_of_phase(s.phase + row * s.size, first, last, phase)
+                if first < last:
+                    place, some = row * s.size + first, (last - first + step - 1) // step
+                    take(
+                        s.signal + place, s.noise + place, s.good + place, s.outlier + place, place, some, step,
+                        s.left + first - star.x, s.top + row - star.y, p.place + n, p.dx + n, p.dy + n, p.signal + n,
+                        p.noise2 + n, p.weight + n,
+                    )
+                    n += some
+                row += step
+    p.x, p.y = star.x, star.y
     p.count = p.all = p.first[rules.phases] = n
     evaluate(psf, p.dx, p.dy, n, p.value, p.by_x, p.by_y)
     for phase in range(rules.own):
@@ -236,7 +256,7 @@ cdef void _fit(
         star.colour[k], star.gain[k] = 0.0, rules.gain[k]
     memset(s.outlier, 0, s.size * s.size)
     for round_ in range(rounds):
-        _gather(s, star, psf, rules, p)
+        _gather(s, star, psf, rules, round_ > 0, p)
         if round_ == 0:
             star.flux = _first_flux(p)
         weigh(p.signal, p.noise2, p.value, star.flux, rules.dn_per_photon, rules.misfit2, p.count, p.weight, p.residual)

@@ -12,25 +12,50 @@ from starpos.core.algebra cimport middle
 
 cdef extern from *:
     """
-    /* Take a row of n pixels that lies on the frame, whose columns alternate between two phases (or are of one): most are so,
-       and the loop takes wide registers. level, noise: of the first column and of the second; full: 1, not 255. */
-    #define STARPOS_TAKE_ROW(name, pixel) \
-    STARPOS_WIDE static void name(const pixel *restrict line, int n, int limit, const float *level, const float *noise, \
-                                  const unsigned char *phase, float *restrict signal, float *restrict sky, \
-                                  unsigned char *restrict good, unsigned char *restrict full, unsigned char *restrict part) { \
-        const float levels[2] = {level[0], level[1]}, noises[2] = {noise[0], noise[1]}; \
-        const unsigned char phases[2] = {phase[0], phase[1]}; \
-        for (int j = 0; j < n; j++) { \
-            const unsigned char white = line[j] >= limit; \
-            signal[j] = (float)line[j] - (j & 1 ? levels[1] : levels[0]); \
-            sky[j] = j & 1 ? noises[1] : noises[0]; \
-            part[j] = j & 1 ? phases[1] : phases[0]; \
-            full[j] = white; \
-            good[j] = white ^ 1; \
+    /* Eight pixels at once, which a compiler left to itself takes one by one where rows are short. */
+    typedef float starpos_eight __attribute__((vector_size(32)));
+    typedef float starpos_eights __attribute__((vector_size(32), aligned(4)));
+    typedef signed char starpos_bytes __attribute__((vector_size(8), aligned(1)));
+    /* Take a row of n pixels that lies on the frame, whose columns alternate between two phases (or are of one): most are so.
+       level, noise: of the first column and of the second; full: 1, not 255. The last eight may overlap with others. */
+    #define STARPOS_TAKE_ROW(name, pixel, whole) \
+    typedef pixel name##_pixels __attribute__((vector_size(8 * sizeof(pixel)), aligned(sizeof(pixel)))); \
+    STARPOS_WIDE static void name(const pixel *line, int n, int limit, const float *level, const float *noise, \
+                                  const unsigned char *phase, float *signal, float *sky, \
+                                  unsigned char *good, unsigned char *full, unsigned char *part) { \
+        const pixel last_dark = (pixel)(limit - 1 < whole ? limit - 1 : whole); \
+        for (int i = 0; i < n && n >= 8; i += 8) { \
+            const int at = i < n - 8 ? i : n - 8, odd = at & 1; \
+            const float a = level[odd], b = level[1 - odd], c = noise[odd], d = noise[1 - odd]; \
+            const signed char e = phase[odd], f = phase[1 - odd]; \
+            const name##_pixels value = *(const name##_pixels *)(line + at); \
+            const starpos_bytes white = __builtin_convertvector(value > last_dark, starpos_bytes) & 1; \
+            *(starpos_eights *)(signal + at) = __builtin_convertvector(value, starpos_eight) - (starpos_eight){a, b, a, b, a, b, a, b}; \
+            *(starpos_eights *)(sky + at) = (starpos_eight){c, d, c, d, c, d, c, d}; \
+            *(starpos_bytes *)(part + at) = (starpos_bytes){e, f, e, f, e, f, e, f}; \
+            *(starpos_bytes *)(full + at) = white; \
+            *(starpos_bytes *)(good + at) = white ^ 1; \
+        } \
+        for (int j = 0; j < n && n < 8; j++) { \
+            signal[j] = (float)line[j] - level[j & 1]; \
+            sky[j] = noise[j & 1]; \
+            part[j] = phase[j & 1]; \
+            full[j] = line[j] > last_dark; \
+            good[j] = full[j] ^ 1; \
         } \
     }
-    STARPOS_TAKE_ROW(starpos_take_8, unsigned char)
-    STARPOS_TAKE_ROW(starpos_take_16, unsigned short)
+    STARPOS_TAKE_ROW(starpos_take_8, unsigned char, 255)
+    STARPOS_TAKE_ROW(starpos_take_16, unsigned short, 65535)
+    /* A row of n pixels smoothed along both axes by 1/4, 1/2, 1/4. line: room for n + 2. */
+    STARPOS_WIDE static void starpos_grey(const float *restrict above, const float *restrict own, const float *restrict below,
+                                          Py_ssize_t n, float *restrict line, float *restrict out) {
+        for (Py_ssize_t j = 0; j < n; j++)
+            line[j + 1] = 0.5f * own[j] + 0.25f * (above[j] + below[j]);
+        line[0] = line[1];
+        line[n + 1] = line[n];
+        for (Py_ssize_t j = 0; j < n; j++)
+            out[j] = 0.5f * line[j + 1] + 0.25f * (line[j] + line[j + 2]);
+    }
     """
     void take_8 "starpos_take_8"(
         const unsigned char *line, int n, int limit, const float *level, const float *noise, const unsigned char *phase,
@@ -39,6 +64,9 @@ cdef extern from *:
     void take_16 "starpos_take_16"(
         const unsigned short *line, int n, int limit, const float *level, const float *noise, const unsigned char *phase,
         float *signal, float *sky, unsigned char *good, unsigned char *full, unsigned char *part,
+    ) noexcept nogil
+    void grey_row "starpos_grey"(
+        const float *above, const float *own, const float *below, Py_ssize_t n, float *line, float *out
     ) noexcept nogil
 
 
@@ -183,24 +211,20 @@ def scatter(const float[:, ::1] signal, const float[:, ::1] noise, double per_ma
 
 def greyed(const float[:, :, ::1] signal):
     """Images (N, S, S) smoothed along both axes by 1/4, 1/2, 1/4, which removes a mosaic's pattern; they end as in a level."""
-    cdef Py_ssize_t n = signal.shape[0], k, i, j, left, right
-    cdef Py_ssize_t rows = signal.shape[1], columns = signal.shape[2]
-    cdef const float *above
-    cdef const float *own
-    cdef const float *below
+    cdef Py_ssize_t n = signal.shape[0], rows = signal.shape[1], columns = signal.shape[2], k, i
     out = np.empty((n, rows, columns), np.float32)
+    if not columns:
+        return out
     cdef float[:, :, ::1] smooth = out
-    cdef float *line = <float *>malloc(max(columns, 1) * sizeof(float))
+    cdef float *line = <float *>malloc((columns + 2) * sizeof(float))
     if line == NULL:
         raise MemoryError
     with nogil:
         for k in range(n):
             for i in range(rows):
-                above, own, below = &signal[k, max(i - 1, 0), 0], &signal[k, i, 0], &signal[k, min(i + 1, rows - 1), 0]
-                for j in range(columns):
-                    line[j] = <float>0.5 * own[j] + <float>0.25 * (above[j] + below[j])
-                for j in range(columns):
-                    left, right = max(j - 1, 0), min(j + 1, columns - 1)
-                    smooth[k, i, j] = <float>0.5 * line[j] + <float>0.25 * (line[left] + line[right])
+                grey_row(
+                    &signal[k, max(i - 1, 0), 0], &signal[k, i, 0], &signal[k, min(i + 1, rows - 1), 0], columns, line,
+                    &smooth[k, i, 0],
+                )
     free(line)
     return out

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-# Sums over the pixels of a star that is fitted, four at once, for the fit.
+# The pixels of a star that is fitted, and sums over them, four at once.
 
 cimport starpos.core.wide
 
@@ -7,6 +7,41 @@ cdef extern from *:
     """
     typedef double starpos_four __attribute__((vector_size(32)));
     typedef double starpos_fours __attribute__((vector_size(32), aligned(8)));
+    /* Take n pixels of a row, each `step` (1 or 2) after the one before: light, squared noise, whether
+       it is good and no outlier, place in the stamp from `place` on, and offset. */
+    #define STARPOS_TAKE(step, k) {(k)[0], (k)[step], (k)[2 * step], (k)[3 * step]}
+    #define STARPOS_TAKE_PIXELS(step) \
+        for (; j + 4 <= n; j += 4) { \
+            const int k = j * step; \
+            const starpos_four light = STARPOS_TAKE(step, signal + k), sky = STARPOS_TAKE(step, noise + k); \
+            const starpos_four sound = STARPOS_TAKE(step, good + k), far = STARPOS_TAKE(step, outlier + k); \
+            *(starpos_fours *)(own_signal + j) = light; \
+            *(starpos_fours *)(noise2 + j) = sky * sky; \
+            *(starpos_fours *)(weight + j) = sound - sound * far; \
+            *(starpos_fours *)(dx + j) = x + k + (starpos_four){0, step, 2 * step, 3 * step}; \
+            *(starpos_fours *)(dy + j) = y + (starpos_four){0}; \
+        } \
+        for (int i = 0; i < n; i++) \
+            places[i] = place + i * step;
+    STARPOS_WIDE static void starpos_take(const float *signal, const float *noise, const unsigned char *good,
+                                          const unsigned char *outlier, int place, int n, int step, double x, double y,
+                                          int *places, double *dx, double *dy, double *own_signal, double *noise2,
+                                          double *weight) {
+        int j = 0;
+        if (step == 1) {
+            STARPOS_TAKE_PIXELS(1)
+        } else {
+            STARPOS_TAKE_PIXELS(2)
+        }
+        for (; j < n; j++) {
+            const int k = j * step;
+            own_signal[j] = signal[k];
+            noise2[j] = (double)noise[k] * noise[k];
+            weight[j] = good[k] & ~outlier[k];
+            dx[j] = x + k;
+            dy[j] = y;
+        }
+    }
     /* What a star of this flux leaves of n pixels, and their weights over the variance of sky and light. */
     STARPOS_FUSED static void starpos_weigh(const double *restrict signal, const double *restrict noise2,
                                            const double *restrict value, double flux, double dn_per_photon, double misfit2,
@@ -89,6 +124,10 @@ cdef extern from *:
         }
     }
     """
+    void take "starpos_take"(
+        const float *signal, const float *noise, const unsigned char *good, const unsigned char *outlier, int place, int n,
+        int step, double x, double y, int *places, double *dx, double *dy, double *own_signal, double *noise2, double *weight,
+    ) noexcept nogil
     void weigh "starpos_weigh"(
         const double *signal, const double *noise2, const double *value, double flux, double dn_per_photon, double misfit2,
         int n, double *weight, double *residual,
