@@ -2,10 +2,12 @@
 # cython: language_level=3, boundscheck=False, wraparound=False, cdivision=True, initializedcheck=False
 """A PSF at places of the field, over which its widths and its series may vary."""
 
-from libc.math cimport isnan
+from libc.math cimport fabs, isnan, sqrt
+from libc.stdlib cimport free, malloc
 
 import numpy as np
 
+from starpos.core.algebra cimport factored, middle, solved
 from starpos.core.shapes cimport Shape, clipped_to
 
 cdef enum:
@@ -101,3 +103,108 @@ def shapes_of(const double[:, :, ::1] axes):
             shape[k, 0, 0], shape[k, 1, 1] = (b * b + d * d) / volume2, (a * a + c * c) / volume2
             shape[k, 0, 1] = shape[k, 1, 0] = -(a * b + c * d) / volume2
     return out
+
+
+cdef bint _over_field(
+    const double[:, ::1] field, const double[:, ::1] own, const double *weight, double[:, ::1] out
+) noexcept nogil:
+    """Set coefficients of the monomials (6, V) to those of weighted least squares; False if there is no solution."""
+    cdef double[MONOMIALS * MONOMIALS] normal
+    cdef double[MONOMIALS] right
+    cdef double trace = 0.0
+    cdef Py_ssize_t k, v, n = field.shape[0]
+    cdef int i, j
+    for i in range(MONOMIALS):
+        for j in range(i + 1):
+            normal[i * MONOMIALS + j] = 0.0
+            for k in range(n):
+                normal[i * MONOMIALS + j] += weight[k] * field[k, i] * field[k, j]
+        trace += normal[i * MONOMIALS + i]
+    # what the places do not tell, as on a line, is 0
+    for i in range(MONOMIALS):
+        normal[i * MONOMIALS + i] += 1e-12 * trace
+    if isnan(factored(normal, MONOMIALS)):
+        return False
+    for v in range(own.shape[1]):
+        for i in range(MONOMIALS):
+            right[i] = 0.0
+            for k in range(n):
+                right[i] += weight[k] * field[k, i] * own[k, v]
+        solved(normal, right, MONOMIALS)
+        for i in range(MONOMIALS):
+            out[i, v] = right[i]
+    return True
+
+
+cdef int _sound_field(const double[:, ::1] field, const double[:, ::1] own) except -1:
+    if field.shape[1] != MONOMIALS or own.shape[0] != field.shape[0]:
+        raise ValueError(f"{own.shape[0]} rows at {field.shape[0]} places of {field.shape[1]} monomials: as many, of {MONOMIALS}")
+    return 0
+
+
+def over_field(const double[:, ::1] field, const double[:, ::1] own):
+    """Coefficients (6, V) of monomials, field (N, 6), that fit values (N, V) best, or None if nothing does."""
+    cdef Py_ssize_t k
+    _sound_field(field, own)
+    out = np.empty((MONOMIALS, own.shape[1]))
+    cdef double[::1] weight = np.ones(max(field.shape[0], 1))
+    return out if _over_field(field, own, &weight[0], out) else None
+
+
+def agreed(const double[:, ::1] field, const double[:, ::1] own, const double[::1] weight, double outlying, int least, int rounds):
+    """The same, with weights (N,), of the rows that agree: none is so many times farther off than the median.
+
+    Returns also chi-square of their weighted mean and of the fit, and how many they are; None if fewer than the least.
+    """
+    cdef Py_ssize_t n = field.shape[0], values = own.shape[1], k, v
+    cdef int round_, i, count = 0
+    cdef bint same
+    cdef double typical, one, total, mean, before = 0.0, after = 0.0
+    _sound_field(field, own)
+    if weight.shape[0] != n:
+        raise ValueError(f"{weight.shape[0]} weights for {n} rows: as many are needed")
+    if n < least:
+        return None
+    out = np.empty((MONOMIALS, values))
+    cdef double[:, ::1] fitted = out
+    # weights of the rows that are kept, how far each is off, and that to be sorted
+    cdef double *kept = <double *>malloc(3 * n * sizeof(double))
+    if kept == NULL:
+        raise MemoryError
+    cdef double *off = kept + n
+    with nogil:
+        for k in range(n):
+            kept[k] = weight[k]
+        for round_ in range(rounds):
+            if not _over_field(field, own, kept, fitted):
+                count = 0
+                break
+            for k in range(n):
+                off[k] = 0.0
+                for v in range(values):
+                    one = own[k, v]
+                    for i in range(MONOMIALS):
+                        one -= field[k, i] * fitted[i, v]
+                    off[k] = max(off[k], sqrt(weight[k]) * fabs(one))
+                off[n + k] = off[k]
+            typical, count, same = middle(off + n, <int>n), 0, True
+            for k in range(n):
+                one = weight[k] if off[k] < outlying * typical else 0.0
+                same, kept[k] = same and one == kept[k], one
+                count += one > 0
+            if count < least or same:
+                break
+        for v in range(values):
+            mean = total = 0.0
+            for k in range(n):
+                mean += kept[k] * own[k, v]
+                total += kept[k]
+            mean /= total
+            for k in range(n):
+                one = own[k, v]
+                for i in range(MONOMIALS):
+                    one -= field[k, i] * fitted[i, v]
+                before += kept[k] * (own[k, v] - mean) ** 2
+                after += kept[k] * one * one
+    free(kept)
+    return (out, before, after, count) if count >= least else None

@@ -22,8 +22,8 @@ from starpos.core.shapes import clipped, squared_widths
 MONOMIALS = 6
 # Limits of the squared widths at a place of the field over the mean ones.
 NARROW, BROAD = 0.25, 6.0
-# Where in the box the widest star is looked for.
-QUARTERS = np.arange(5) / 4
+# Where in the box (0 to 1 in x, in y) the widest star is looked for.
+QUARTERS = np.tile(np.arange(5) / 4, 5), np.repeat(np.arange(5) / 4, 5)
 # The series of a Gaussian.
 GAUSSIAN = np.ones((1, 1, 1))
 
@@ -110,9 +110,9 @@ class Psf(FieldPsf):
         """The largest squared width of a star within the box."""
         (left, top), (right, bottom) = self.box
         # where the widths are the same everywhere, one place tells them
-        quarters = QUARTERS if len(self.widths) > 1 else QUARTERS[:1]
-        x, y = left + (right - left) * quarters, top + (bottom - top) * quarters
-        return float(squared_widths(self.shapes_at(np.tile(x, len(y)), np.repeat(y, len(x)))).max())
+        across, down = QUARTERS if len(self.widths) > 1 else (QUARTERS[0][:1], QUARTERS[1][:1])
+        shapes = self.shapes_at(left + (right - left) * across, top + (bottom - top) * down)
+        return float(squared_widths(shapes)[:, 1].max())
 
     def monomials(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """Monomials (N, 6) of x, y scaled to -1..1 over the box; all but the first have zero mean over it."""
@@ -133,8 +133,12 @@ def gaussian(shape: np.ndarray, x: ArrayLike = (0.0,), y: ArrayLike = (0.0,)) ->
 
     The first axis is the long one.
     """
-    values, vectors = np.linalg.eigh(shape)
-    axes = np.ascontiguousarray((vectors / np.sqrt(values)).T[::-1])
+    (xx, xy), (_, yy) = shape.tolist()
+    mean, half = (xx + yy) / 2, math.hypot((xx - yy) / 2, xy)
+    angle = math.atan2(2 * xy, xx - yy) / 2
+    along, across = (mean + half) ** -0.5, (mean - half) ** -0.5
+    cos, sin = math.cos(angle), math.sin(angle)
+    axes = np.array([[cos * along, sin * along], [-sin * across, cos * across]])
     box = np.array([[np.min(x), np.min(y)], [np.max(x), np.max(y)]], float)
     return Psf(axes, np.eye(2)[None], np.ones((1, 1, 1)), box)
 
