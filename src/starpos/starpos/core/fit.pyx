@@ -310,17 +310,16 @@ cdef void _leverages(const Stamp *s, const Star *star, Rules rules, Pixels *p, f
 
 def fitted(
     const float[:, :, ::1] signal, const float[:, :, ::1] noise, const unsigned char[:, :, ::1] good,
-    const unsigned char[:, :, ::1] phase, const double[:, ::1] corner, const double[:, ::1] first,
-    const double[:, :, ::1] axes, const double[:, :, ::1] series, Rules rules, int rounds, bint weighed, bint whole,
+    const unsigned char[:, :, ::1] phase, const Py_ssize_t[::1] column, const Py_ssize_t[::1] row, const double[:] x,
+    const double[:] y, const double[:, :, ::1] axes, const double[:, :, ::1] series, Rules rules, int rounds, bint weighed, bint whole,
 ):
     """Fit N stars to their stamps (N, S, S), as `detection.fit.fit_stars` explains.
 
-    corner  (N, 2) px: x and y of each stamp's first pixel
-    first   (N, 2) px: first places of the stars
-    axes    (N, 2, 2) or (1, 2, 2), and
-    series  (N, I, J) or (1, I, J): as `detection.psf.LocalPsf` has them
-    weighed  whether the leverage of each pixel is wanted; else there is none
-    whole    whether the model is wanted beyond reach; else it is 0 there
+    column, row   (N,) of each stamp's middle
+    x, y          (N,) px: first places of the stars
+    axes, series  (N, ...) or (1, ...): as `detection.psf.LocalPsf` has them
+    weighed       whether the leverage of each pixel is wanted; else there is none
+    whole         whether the model is wanted beyond reach; else it is 0 there
 
     Returns the columns of `detection.fit.Fit`, in their order. A star whose equations are singular has NaN.
     """
@@ -332,12 +331,12 @@ def fitted(
     cdef Stamp s
     sound_stamps(signal, noise, good, phase, rules)
     sound(axes, series, n)
-    if not (corner.shape[0] == first.shape[0] == n and corner.shape[1] == first.shape[1] == 2 and rounds > 0):
-        raise ValueError(f"{corner.shape[0]} corners, {first.shape[0]} places, {rounds} rounds: {n} pairs, 1 round or more")
+    if not (column.shape[0] == row.shape[0] == x.shape[0] == y.shape[0] == n and rounds > 0):
+        raise ValueError(f"{column.shape[0]} stamps, {x.shape[0]} places, {rounds} rounds: {n} of each, 1 round or more")
     stars_, covariances, gains_ = np.empty((n, 6)), np.empty((n, 2, 2)), np.empty((n, rules.phases))
     images_, marks_ = np.empty((2, n, size, size), np.float32), np.zeros((2, n, size, size), np.uint8)
     leverage_ = np.zeros((n, seen, seen), np.float32)
-    cdef double[:, ::1] column = stars_
+    cdef double[:, ::1] found = stars_
     cdef double[:, :, ::1] covariance = covariances
     cdef double[:, ::1] gains = gains_
     cdef float[:, :, ::1] image = images_.reshape(2, n, area)
@@ -347,21 +346,21 @@ def fitted(
     s.size, s.outlier, most = size, p.outlier, rules.parameters
     with nogil:
         for k in range(n):
-            s.left, s.top = corner[k, 0], corner[k, 1]
+            s.left, s.top = column[k] - size // 2, row[k] - size // 2
             s.signal, s.noise, s.good = &signal[k, 0, 0], &noise[k, 0, 0], &good[k, 0, 0]
             s.phase = &phase[k, 0, 0]
-            star.x, star.y = first[k, 0], first[k, 1]
+            star.x, star.y = x[k], y[k]
             local_of(axes, series, k, &psf)
             _fit(&s, &psf, rules, rounds, whole, &p, &star)
-            column[k, 4] = _told(
-                &s, &star, &p, &image[0, k, 0], &image[1, k, 0], &mark[0, k, 0], &mark[1, k, 0], &column[k, 5]
+            found[k, 4] = _told(
+                &s, &star, &p, &image[0, k, 0], &image[1, k, 0], &mark[0, k, 0], &mark[1, k, 0], &found[k, 5]
             )
             if weighed:
                 _leverages(&s, &star, rules, &p, &leverage[k, 0, 0])
             if star.solved:
                 _step(&star, rules)
-            column[k, 0], column[k, 1], column[k, 2] = star.x, star.y, star.flux
-            column[k, 3] = 1 / sqrt(star.information)
+            found[k, 0], found[k, 1], found[k, 2] = star.x, star.y, star.flux
+            found[k, 3] = 1 / sqrt(star.information)
             for a in range(2):
                 for b in range(2):
                     covariance[k, a, b] = star.covariance[a * most + b]
@@ -369,10 +368,10 @@ def fitted(
                 gains[k, a] = star.gain[a]
     free(p.dx)
     free(p.place)
-    x, y, flux, sigma, chi2, pixels = np.ascontiguousarray(stars_.T)
+    at_x, at_y, flux, sigma, chi2, pixels = np.ascontiguousarray(stars_.T)
     residual, model = images_
     used, outlier = marks_.view(bool)
-    return x, y, flux, sigma, covariances, gains_, chi2, pixels, residual, model, used, outlier, leverage_
+    return at_x, at_y, flux, sigma, covariances, gains_, chi2, pixels, residual, model, used, outlier, leverage_
 
 
 cdef double _told(

@@ -336,13 +336,13 @@ cdef void _fit(
 
 def fitted_pairs(
     const float[:, :, ::1] signal, const float[:, :, ::1] noise, const unsigned char[:, :, ::1] good,
-    const unsigned char[:, :, ::1] phase, const double[:, ::1] corner, const double[:, :, ::1] first,
+    const unsigned char[:, :, ::1] phase, const Py_ssize_t[::1] x, const Py_ssize_t[::1] y, const double[:, :, ::1] first,
     const double[::1] least_flux, const double[:, :, ::1] axes, const double[:, :, ::1] series, Rules rules, int rounds,
     double least,
 ):
     """Fit a pair of stars to each of N stamps (N, S, S), as `detection.blend` explains.
 
-    corner      (N, 2) px: x and y of each stamp's first pixel
+    x, y        (N,) px: of each stamp's middle
     first       (2, N, 2) px: first places of the stars and of their companions
     least_flux  (N,) DN: of both at the beginning
     axes        (N, 2, 2) or (1, 2, 2), and
@@ -361,9 +361,9 @@ def fitted_pairs(
     cdef double[ALL] step
     sound_stamps(signal, noise, good, phase, rules)
     sound(axes, series, n)
-    if not (corner.shape[0] == first.shape[1] == least_flux.shape[0] == n and rounds > 0):
-        raise ValueError(f"{corner.shape[0]} corners, {first.shape[1]} places, {rounds} rounds: {n} pairs, 1 round or more")
-    if not (first.shape[0] == corner.shape[1] == first.shape[2] == 2):
+    if not (x.shape[0] == y.shape[0] == first.shape[1] == least_flux.shape[0] == n and rounds > 0):
+        raise ValueError(f"{x.shape[0]} stamps, {first.shape[1]} places, {rounds} rounds: {n} of each, 1 round or more")
+    if not (first.shape[0] == first.shape[2] == 2):
         raise ValueError("places of two stars, of two numbers each, are needed")
     stars_, gains_ = np.empty((4, 2, n)), np.empty((2, n, rules.phases))
     covariances_, chi2_ = np.empty((2, n, 2, 2)), np.zeros(n)
@@ -378,7 +378,7 @@ def fitted_pairs(
     _begin(&p, area)
     with nogil:
         for k in range(n):
-            s.left, s.top, s.signal, s.noise = corner[k, 0], corner[k, 1], &signal[k, 0, 0], &noise[k, 0, 0]
+            s.left, s.top, s.signal, s.noise = x[k] - size // 2, y[k] - size // 2, &signal[k, 0, 0], &noise[k, 0, 0]
             s.good, s.phase = &good[k, 0, 0], &phase[k, 0, 0]
             for j in range(2):
                 star[j].x, star[j].y, star[j].flux = first[j, k, 0], first[j, k, 1], least_flux[k]
@@ -401,5 +401,5 @@ def fitted_pairs(
             chi2[k] = chi_square(p.weight, p.residual, p.count)
     free(p.signal)
     free(p.place)
-    x, y, flux, sigmas = stars_
-    return x, y, flux, sigmas, gains_, covariances_, models_, used_.view(bool), chi2_
+    at_x, at_y, flux, sigmas = stars_
+    return at_x, at_y, flux, sigmas, gains_, covariances_, models_, used_.view(bool), chi2_

@@ -140,7 +140,7 @@ def _fit_pairs(stamps: Stamps, fit: Fit, psf: FieldPsf, response: Response) -> P
     local = psf.at(fit.x, fit.y)
     first = np.stack([np.stack([fit.x, fit.y], 1), np.stack(_brightest_left(stamps, fit, local), 1)])
     columns = fitted_pairs(
-        stamps.signal, stamps.noise, stamps.good, stamps.phase, stamps.origin, first, LEAST * fit.flux,
+        stamps.signal, stamps.noise, stamps.good, stamps.phase, stamps.x, stamps.y, first, LEAST * fit.flux,
         local.axes, local.series, response.rules, ROUNDS, LEAST,
     )  # fmt: skip
     return Pairs(**dict(zip((f.name for f in fields(Pairs)), columns, strict=True)))

@@ -110,8 +110,8 @@ def fit_stars(
     """
     local = psf.at(x, y)
     columns = fitted(
-        stamps.signal, stamps.noise, stamps.good, stamps.phase, stamps.origin, np.stack([x, y], 1), local.axes,
-        local.series, response.rules, rounds, leverage, whole,
+        stamps.signal, stamps.noise, stamps.good, stamps.phase, stamps.x, stamps.y, x, y, local.axes, local.series,
+        response.rules, rounds, leverage, whole,
     )  # fmt: skip
     return Fit(**dict(zip(COLUMNS, columns, strict=True)))
 

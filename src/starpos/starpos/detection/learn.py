@@ -10,7 +10,7 @@ from scipy import spatial
 from starpos.core.moments import own_shapes
 from starpos.core.neighbours import near_pairs
 from starpos.core.noise import light_noise, of_phases, strangeness, unit_light
-from starpos.core.order import quantile, row_medians
+from starpos.core.order import median, quantile, row_medians
 from starpos.core.shapes import squared_widths
 from starpos.core.stamps import greyed
 from starpos.detection.background import Background
@@ -213,8 +213,10 @@ def _most_alike(stamps: Stamps) -> np.ndarray:
         FARTHEST,
     )
     xx, xy, yy = (shape[:, i, j] for i, j in ((0, 0), (0, 1), (1, 1)))
-    look = np.stack([np.log(xx + yy) / 2, (xx - yy) / (xx + yy), 2 * xy / (xx + yy)], 1)
-    alike = np.linalg.norm(look - np.median(look, axis=0), axis=1) < LIKENESS
+    look = np.stack([np.log(xx + yy) / 2, (xx - yy) / (xx + yy), 2 * xy / (xx + yy)])
+    off = look - np.array([[median(kind)] for kind in look])
+    alike = (off**2).sum(0) < LIKENESS**2
+    look = look.T
     alike &= values[:, 0] > NARROWEST
     sound = (values[:, 0] > NARROWEST) & (values[:, 1] < widest)
     if np.count_nonzero(alike) > 0.5 * len(alike) or np.count_nonzero(sound) < ALIKE:

@@ -223,7 +223,7 @@ def _detect_at_full_size(picture: _Picture) -> Detection:
         covariance=columns["covariance"],
         flags=columns["flags"],
         fwhm_px=fwhm_px,
-        window=window_of(plane, level),
+        window=window_of(plane, int(peaks.highest.max()), level),
         **about,
     )
     return Detection(

@@ -55,11 +55,6 @@ class Stamps:
             return self
         return Stamps(**{name: getattr(self, name)[index] for name in COLUMNS})
 
-    @property
-    def origin(self) -> np.ndarray:
-        """Places (N, 2) px of the first column and row."""
-        return np.stack([self.x, self.y], 1) - float(self.reach)
-
     def corner(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Offsets (N,) px of the first column and row from the points x, y (N,) px."""
         return self.x - self.reach - x, self.y - self.reach - y

@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 from scipy import ndimage
 
+from starpos.core.neighbours import near_pairs
 from starpos.detection.background import Background
 
 # px. Peaks along a trail are never farther apart.
@@ -15,6 +16,8 @@ CELL = 8
 FEWEST = 12
 # and this length, px.
 SHORTEST = 100
+# Cells along a line without any peak, at most.
+GAP = 2
 # px. A wider band is not a trail.
 HALF_WIDTH = 12
 # px along a trail over which its light is taken as constant.
@@ -62,9 +65,11 @@ def find_streaks(
     if len(x) < FEWEST:
         return ()
     found: list[Streak] = []
+    if not _may_be_a_line(x, y):
+        return ()
     grid = np.zeros((background.height // CELL + 1, background.width // CELL + 1), np.uint8)
     grid[y // CELL, x // CELL] = 255
-    lines = cv2.HoughLinesP(grid, 1, np.pi / 360, FEWEST, minLineLength=SHORTEST / CELL, maxLineGap=2)
+    lines = cv2.HoughLinesP(grid, 1, np.pi / 360, FEWEST, minLineLength=SHORTEST / CELL, maxLineGap=GAP)
     points, free = np.stack([x, y], 1).astype(float), np.ones(len(x), bool)
     for ends in [] if lines is None else lines.reshape(-1, 2, 2)[:50] * CELL + CELL / 2:
         line = _through(points[free], ends)
@@ -75,6 +80,13 @@ def find_streaks(
             found.append(streak)
             free &= streak.at(y, x)[0] == 0
     return tuple(found)
+
+
+def _may_be_a_line(x: np.ndarray, y: np.ndarray) -> bool:
+    """Whether enough peaks x, y (N,) int px have one on each side of them, as along a line all but the two at its ends."""
+    pairs = near_pairs(x.astype(float), y.astype(float), np.sqrt(2) * (GAP + 2) * CELL)
+    between = np.count_nonzero(np.bincount(pairs.ravel(), minlength=1) > 1)
+    return between >= SHORTEST // CELL // (GAP + 1) - 1
 
 
 def _through(points: np.ndarray, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:

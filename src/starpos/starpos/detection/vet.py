@@ -86,6 +86,8 @@ def measure(
         if odd and (sum(len(star[1]) for star in odd) >= chunk or first + chunk >= len(x)):
             parts += with_companions(odd)
             odd = []
+    if len(parts) == 1:
+        return parts[0]
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 

@@ -7,19 +7,19 @@ from starpos.frames.stars import Window
 
 # A row or a column is white where this share of its pixels is.
 WHITE = 0.9
+# So many pixels of a side are looked at first.
+FEW = 32
 
 
-def window_of(plane: np.ndarray, sky_dn: float) -> Window | None:
+def window_of(plane: np.ndarray, highest: int, sky_dn: float) -> Window | None:
     """The Window of plane (h, w) between the white rows and columns along its sides; None if it has none, as is usual.
 
-    White is the frame's largest value. Rows and columns as dark as sky_dn may be a sky that is cut off at 0.
+    White is the frame's largest value, highest. Rows and columns as dark as sky_dn may be a sky that is cut off at 0.
     """
     sides = plane[0], plane[-1], plane[:, 0], plane[:, -1]
-    if not any(
-        np.count_nonzero(side == side.max()) >= WHITE * len(side) and side.max() > sky_dn for side in sides
-    ):
+    if highest <= sky_dn or not any(_is_white(side, highest) for side in sides):
         return None
-    white = plane == plane.max()
+    white = plane == highest
     columns = np.flatnonzero(white.mean(0) < WHITE)
     if len(columns) == 0:
         return None
@@ -29,3 +29,11 @@ def window_of(plane: np.ndarray, sky_dn: float) -> Window | None:
         return None
     window = left, int(rows[0]), right, int(rows[-1]) + 1
     return None if window == (0, 0, plane.shape[1], plane.shape[0]) else window
+
+
+def _is_white(side: np.ndarray, highest: int) -> bool:
+    """Whether most pixels (N,) along a side are white; a few of them tell of a dark one, most of whose are far apart."""
+    few = side[:: len(side) // FEW + 1]
+    return 2 * np.count_nonzero(few == highest) > len(few) and bool(
+        np.count_nonzero(side == highest) >= WHITE * len(side)
+    )

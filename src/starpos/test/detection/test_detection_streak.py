@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
+import cv2
 import numpy as np
 import pytest
 
 from starpos.detection import detect
+from starpos.detection.streak import CELL, FEWEST, GAP, SHORTEST, _may_be_a_line
 from starpos.frames.frame import Frame
 from starpos.frames.stars import ELONGATED
 from starpos_testing.skies.rendered import bound, field, grid, match, noisy
@@ -43,6 +45,26 @@ def test_a_trail_makes_no_star_and_costs_none_beside_it(start, end, electrons, r
     error = np.stack([found.x[index], found.y[index]], 1)[far] - stars[far, :2]
     assert np.sqrt(np.mean(error**2)) < 1.15 * np.sqrt(np.mean(bound(9000) ** 2))
     assert np.all((found.flags[index[far]] & ELONGATED) == 0)
+
+
+def test_no_line_is_passed_over_because_its_peaks_are_far_apart(rng):
+    """Peaks at random, and with a row of some among them whose gaps are as large as a line may have."""
+    seen = [0, 0]
+    for _ in range(400):
+        place = rng.uniform(0, 400, (rng.integers(0, 40), 2))
+        step = rng.uniform(4, (GAP + 1) * CELL + 2)
+        row = np.arange(rng.integers(3, 30))[:, None] * step + rng.normal(0, 1.5, (1, 1))
+        angle = rng.uniform(0, np.pi)
+        way = np.array([np.cos(angle), np.sin(angle)])
+        place = np.concatenate([place, 200 + (row - row.mean()) * way + rng.normal(0, 1.0, (len(row), 2))])
+        x, y = place[((place >= 0) & (place < 400)).all(1)].astype(int).T
+        cells = np.zeros((400 // CELL + 1,) * 2, np.uint8)
+        cells[y // CELL, x // CELL] = 255
+        lines = cv2.HoughLinesP(cells, 1, np.pi / 360, FEWEST, minLineLength=SHORTEST / CELL, maxLineGap=GAP)
+        if lines is not None:
+            assert _may_be_a_line(x, y)
+        seen[lines is not None] += 1
+    assert min(seen) > 50
 
 
 @pytest.mark.parametrize("electrons", [150, 500, 2000])

@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from starpos.core.field import local, monomials, shapes_of
+from starpos.core.field import agreed, local, monomials, over_field, shapes_of
 from starpos.core.marginal import chosen
 
 BOX = np.array([[10.0, 20.0], [410.0, 20.5]])
@@ -81,3 +81,33 @@ def test_terms_that_nothing_tells_are_not_taken():
     assert not chosen(normal + np.nan, np.ones(2), candidates, np.ones(2)).any()
     with pytest.raises(ValueError, match="2 are needed"):
         chosen(normal, np.ones(2), candidates, np.ones(3))
+
+
+def test_values_over_the_field_are_those_of_least_squares(rng):
+    x, y = rng.uniform(0, 420, 40), rng.uniform(19, 22, 40)
+    field, own = plain_monomials(x, y, np.array([[0.0, 19.0], [420.0, 22.0]])), rng.normal(0, 1, (40, 4))
+    plain = np.linalg.lstsq(field, own, rcond=None)[0]
+    np.testing.assert_allclose(over_field(field, own), plain, rtol=1e-8, atol=1e-9)
+    assert over_field(np.zeros((40, 6)), own) is None
+    # on a line much is not told, and what is told is
+    field = plain_monomials(x, 20 + 0 * y, np.array([[0.0, 19.0], [420.0, 22.0]]))
+    plain = np.linalg.lstsq(field, own, rcond=None)[0]
+    np.testing.assert_allclose(field @ over_field(field, own), field @ plain, atol=1e-6)
+
+
+def test_rows_that_disagree_are_left_out(rng):
+    x, y = rng.uniform(0, 420, 40), rng.uniform(0, 300, 40)
+    field = plain_monomials(x, y, np.array([[0.0, 0.0], [420.0, 300.0]]))
+    true, weight = rng.normal(0, 1, (6, 4)), rng.uniform(50, 100, 40)
+    own = field @ true + rng.normal(0, 1, (40, 4)) / np.sqrt(weight)[:, None]
+    own[3] += 40
+    fitted, before, after, count = agreed(field, own, weight, 6.0, 12, 4)
+    keep = np.arange(40) != 3
+    root = np.sqrt(weight[keep])[:, None]
+    plain = np.linalg.lstsq(field[keep] * root, own[keep] * root, rcond=None)[0]
+    np.testing.assert_allclose(fitted, plain, rtol=1e-8, atol=1e-9)
+    assert count == 39
+    assert after == pytest.approx(((own[keep] - field[keep] @ plain) ** 2 * root**2).sum(), rel=1e-9)
+    mean = np.average(own[keep], axis=0, weights=weight[keep])
+    assert before == pytest.approx(((own[keep] - mean) ** 2 * root**2).sum(), rel=1e-9)
+    assert agreed(field[:11], own[:11], weight[:11], 6.0, 12, 4) is None

@@ -42,14 +42,14 @@ def plain_psf(axes, series, left, top, size):
     return value, a[:, 0, 0] * by_u + a[:, 1, 0] * by_v, a[:, 0, 1] * by_u + a[:, 1, 1] * by_v
 
 
-def plain_fit(signal, noise, good, phase, corner, first, axes, series, gain, rounds):
+def plain_fit(signal, noise, good, phase, column, row, x, y, axes, series, gain, rounds):
     """The fit of all stars at once: what `fitted` does with one after the other."""
-    n, own_gains = len(first), len(gain) if len(gain) > 1 else 0
-    x, y, colour, outlier = *first.T.copy(), np.zeros((n, len(gain))), np.zeros(signal.shape, bool)
+    n, own_gains = len(x), len(gain) if len(gain) > 1 else 0
+    colour, outlier = np.zeros((n, len(gain))), np.zeros(signal.shape, bool)
     for round_ in range(rounds):
         gains = gain * (1 + colour)
         own = gains[np.arange(n)[:, None, None], phase]
-        left, top = corner[:, 0] - x, corner[:, 1] - y
+        left, top = column - SIZE // 2 - x, row - SIZE // 2 - y
         value, by_x, by_y = plain_psf(axes, series, left, top, SIZE)
         u, v = scaled(axes, left, top, SIZE)
         inside, unit = u * u + v * v < FIT_WIDTHS**2, value * own
@@ -99,21 +99,22 @@ def psfs(rng, n):
 def stamps(rng, n, gain):
     """Noisy stamps of n stars with a hot pixel beside the second and a bad one on the third."""
     axes, series = psfs(rng, n)
-    corner = rng.integers(0, 100, (n, 2)).astype(float)
-    place = corner + SIZE // 2 + rng.uniform(-1, 1, (n, 2))
+    column, row = rng.integers(SIZE, 100, (2, n))
+    x, y = np.stack([column, row]) + rng.uniform(-1, 1, (2, n))
     phase = np.zeros((n, SIZE, SIZE), np.uint8)
     if len(gain) > 1:
-        row, column = corner[:, 1, None, None].astype(int), corner[:, 0, None, None].astype(int)
-        grid = np.arange(SIZE)
-        phase = (2 * ((row + grid[:, None]) % 2) + (column + grid) % 2).astype(np.uint8)
-    light = plain_psf(axes, series, *(corner - place).T, SIZE)[0] * gain[phase]
+        grid = np.arange(SIZE) - SIZE // 2
+        down, across = (row[:, None] + grid)[:, :, None], (column[:, None] + grid)[:, None]
+        phase = (2 * (down % 2) + across % 2).astype(np.uint8)
+    light = plain_psf(axes, series, column - SIZE // 2 - x, row - SIZE // 2 - y, SIZE)[0] * gain[phase]
     light *= rng.uniform(3e3, 3e4, (n, 1, 1))
     noise = np.full(light.shape, 7, np.float32)
     signal = (light + rng.normal(0, 1, light.shape) * np.sqrt(49 + DN_PER_PHOTON * light)).astype(np.float32)
     signal[1, 4, 9] += 5000
     good = np.ones(light.shape, bool)
     good[2, SIZE // 2, SIZE // 2] = False
-    return signal, noise, good, phase, corner, place + rng.uniform(-0.3, 0.3, place.shape), axes, series
+    x, y = x + rng.uniform(-0.3, 0.3, n), y + rng.uniform(-0.3, 0.3, n)
+    return signal, noise, good, phase, column, row, x, y, axes, series
 
 
 def rules(gain, settled=0.0):
@@ -189,11 +190,11 @@ def test_a_star_without_light_has_no_place(rng):
 @pytest.mark.parametrize(
     ("which", "change"),
     [(1, lambda a: a[:2]), (2, lambda a: a[:, :-1].copy()), (3, lambda a: a + 1), (4, lambda a: a[:2]),
-     (6, lambda a: a[:2].copy()), (7, lambda a: np.ones((3, 33, 1)))],
-    ids=["noise", "good", "phase", "corner", "axes", "series"],
+     (7, lambda a: a[:2]), (8, lambda a: a[:2].copy()), (9, lambda a: np.ones((3, 33, 1)))],
+    ids=["noise", "good", "phase", "column", "y", "axes", "series"],
 )  # fmt: skip
 def test_what_does_not_fit_together_is_refused(which, change, rng):
     given = list(stamps(rng, 3, np.ones(1)))
     given[which] = change(given[which])
-    with pytest.raises(ValueError, match=r"px|shape|needed|phase|pairs|terms|axes"):
+    with pytest.raises(ValueError, match=r"px|shape|needed|phase|of each|terms|axes"):
         fitted(*given, rules(np.ones(1)), 5, True, True)

@@ -18,7 +18,7 @@ def inverses(normal):
     return np.linalg.inv(normal / scale) / scale
 
 
-def plain_pairs(signal, noise, good, phase, corner, first, least_flux, axes, series, gain, rounds):
+def plain_pairs(signal, noise, good, phase, column, row, first, least_flux, axes, series, gain, rounds):
     """The fit of all pairs at once: what `fitted_pairs` does with one after the other."""
     n, own = len(signal), len(gain) if len(gain) > 1 else 0
     x, y, colour = first[..., 0].copy(), first[..., 1].copy(), np.zeros((2, n, len(gain)))
@@ -26,7 +26,7 @@ def plain_pairs(signal, noise, good, phase, corner, first, least_flux, axes, ser
     for round_ in range(rounds + 1):
         gains, images, inside = gain * (1 + colour), [], np.zeros(signal.shape, bool)
         for k in (0, 1):
-            offset = corner[:, 0] - x[k], corner[:, 1] - y[k]
+            offset = column - SIZE // 2 - x[k], row - SIZE // 2 - y[k]
             at = gains[k][np.arange(n)[:, None, None], phase]
             images.append([image * at for image in plain_psf(axes, series, *offset, SIZE)])
             u, v = scaled(axes, *offset, SIZE)
@@ -56,9 +56,9 @@ def plain_pairs(signal, noise, good, phase, corner, first, least_flux, axes, ser
         right = (np.swapaxes(design, 1, 2) @ (weighted * residual))[..., 0]
         for k in (0, 1):
             for p in range(own):
-                row = each[k].start + 3 + p
-                normal[:, row, row] += SPREAD**-2
-                right[:, row] -= colour[k][:, p] * SPREAD**-2
+                at = each[k].start + 3 + p
+                normal[:, at, at] += SPREAD**-2
+                right[:, at] -= colour[k][:, p] * SPREAD**-2
         covariance = inverses(normal)
         if round_ == rounds:
             break
@@ -79,7 +79,7 @@ def plain_pairs(signal, noise, good, phase, corner, first, least_flux, axes, ser
 def pairs_of_stars(rng, n, gain):
     """Noisy stamps of n pairs, their first places, and least fluxes; a pixel of the second is bad."""
     axes, series = psfs(rng, n)
-    corner = rng.integers(0, 100, (n, 2)).astype(float)
+    corner = 2 * rng.integers(0, 50, (n, 2))
     place = corner + SIZE // 2 + np.array([[[-2.0, -1.0]], [[2.5, 1.0]]]) + rng.uniform(-1, 1, (2, n, 2))
     phase = np.zeros((n, SIZE, SIZE), np.uint8)
     if len(gain) > 1:
@@ -95,7 +95,8 @@ def pairs_of_stars(rng, n, gain):
     good = np.ones(light.shape, bool)
     good[1, 4, 5] = False
     first = place + rng.uniform(-0.3, 0.3, place.shape)
-    return signal, noise, good, phase, corner, first, np.full(n, 100.0), axes, series
+    column, row = np.ascontiguousarray(corner.T) + SIZE // 2
+    return signal, noise, good, phase, column, row, first, np.full(n, 100.0), axes, series
 
 
 @pytest.mark.parametrize("gain", [np.ones(1), np.array([0.7, 1.1, 1.2, 1.0])], ids=["grey", "mosaic"])
@@ -125,8 +126,8 @@ def test_settled_pairs_are_those_of_many_rounds(gain, rng):
 
 def test_two_stars_at_one_place_have_no_errors(rng):
     given = list(pairs_of_stars(rng, 3, np.ones(1)))
-    given[5] = given[5].copy()
-    given[5][1, 0] = given[5][0, 0]
+    given[6] = given[6].copy()
+    given[6][1, 0] = given[6][0, 0]
     _, _, _, sigma, _, covariance, models, _, chi2 = fitted_pairs(*given, rules(np.ones(1)), 10, LEAST)
     assert np.isnan(sigma[:, 0]).all() and np.isnan(covariance[:, 0]).all()
     assert np.isfinite(sigma[:, 1:]).all() and np.isfinite(models).all() and np.isfinite(chi2).all()
@@ -134,6 +135,6 @@ def test_two_stars_at_one_place_have_no_errors(rng):
 
 def test_places_of_as_many_pairs_are_needed(rng):
     given = list(pairs_of_stars(rng, 3, np.ones(1)))
-    given[5] = given[5][:, :2].copy()
-    with pytest.raises(ValueError, match="pairs"):
+    given[6] = given[6][:, :2].copy()
+    with pytest.raises(ValueError, match="of each"):
         fitted_pairs(*given, rules(np.ones(1)), 10, LEAST)
