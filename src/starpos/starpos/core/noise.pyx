@@ -8,6 +8,7 @@ from libc.stdlib cimport free, malloc
 import numpy as np
 
 cimport starpos.core.wide
+from starpos.core.algebra cimport middle
 from starpos.core.limits cimport within
 
 cdef extern from *:
@@ -251,3 +252,63 @@ def unit_light(
                     (&used[row, 0, 0])[j] * scale * scale / (sky * sky + (dn_per_photon + misfit2 * light) * light)
                 )
     return out[0], out[1]
+
+
+def typical_gains(
+    const double[:, ::1] own, const double[:, ::1] information, double darkest, double least, double outlying, int rounds
+):
+    """Gains (P,) of a mosaic's phases, mean 1, and the scatter (1 sigma) of single stars' gains about them, without noise.
+
+    own, information  (N, P), N > 0: the light of each star at each phase, and its inverse variance
+    darkest           a star's mean light is at least this
+    least             of a gain
+    outlying          sigmas from which a star's gain does not count
+    """
+    cdef int n = own.shape[0], phases = own.shape[1], k, p, round_
+    cdef double mean, total, sum_, of_spread, all_, off, spread2 = 0.0
+    if not n or not phases or information.shape[0] != n or information.shape[1] != phases:
+        raise ValueError(f"{n} x {phases} lights, {information.shape[0]} x {information.shape[1]} errors: as many are needed")
+    gain_ = np.empty(phases)
+    cdef double[::1] gain = gain_
+    # of each phase the gains of all stars, their variances, their weights; and some to be sorted
+    cdef double *room = <double *>malloc((3 * phases + 1) * n * sizeof(double))
+    if room == NULL:
+        raise MemoryError
+    cdef double *ratio = room
+    cdef double *error2 = room + phases * n
+    cdef double *weight = room + 2 * phases * n
+    cdef double *sorted_ = room + 3 * phases * n
+    with nogil:
+        for k in range(n):
+            mean = 0.0
+            for p in range(phases):
+                mean += own[k, p] / phases
+            mean = max(mean, darkest)
+            for p in range(phases):
+                ratio[p * n + k], error2[p * n + k] = own[k, p] / mean, 1 / max(information[k, p] * mean * mean, 1e-12)
+        for p in range(phases):
+            for k in range(n):
+                sorted_[k] = ratio[p * n + k]
+            gain[p] = middle(sorted_, n)
+        for round_ in range(rounds):
+            all_ = mean = of_spread = 0.0
+            for p in range(phases):
+                total = sum_ = 0.0
+                for k in range(p * n, (p + 1) * n):
+                    off = ratio[k] - gain[p]
+                    weight[k] = 1 / (error2[k] + spread2 + 1e-6)
+                    if not off * off * weight[k] < outlying * outlying:
+                        weight[k] = 0.0
+                    total += weight[k]
+                    sum_ += weight[k] * ratio[k]
+                gain[p] = max(sum_ / max(total, 1e-12), least)
+                mean += gain[p] / phases
+                all_ += total
+            for p in range(phases):
+                gain[p] /= mean
+                for k in range(p * n, (p + 1) * n):
+                    off = ratio[k] / gain[p] - 1
+                    of_spread += weight[k] * (off * off - error2[k])
+            spread2 = max(0.0, of_spread / max(all_, 1e-12))
+    free(room)
+    return gain_, sqrt(spread2)

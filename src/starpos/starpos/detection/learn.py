@@ -9,7 +9,7 @@ from scipy import spatial
 
 from starpos.core.moments import own_shapes
 from starpos.core.neighbours import near_pairs
-from starpos.core.noise import light_noise, of_phases, strangeness, unit_light
+from starpos.core.noise import light_noise, of_phases, strangeness, typical_gains, unit_light
 from starpos.core.order import median, quantile, row_medians
 from starpos.core.shapes import squared_widths
 from starpos.core.stamps import greyed
@@ -53,6 +53,9 @@ FINE_FWHM, FINE_STARS, FINE_ROUNDS = 2.3, 6, 4
 # Stars of at least this FWHM (px) may be rings with sharp edges if the PSF describes more than this share of the light
 # wrongly: then up to so many more rounds are made, with terms of this order.
 RING_FWHM, POOR, RING_ROUNDS, RING_ORDER = 5.0, 0.05, 6, 14
+# Rounds in which the gains of a mosaic's phases are averaged without stars so many sigma off; DN far below any star's; the
+# least gain, and the least and the largest scatter of single stars' gains.
+GAIN_ROUNDS, OUTLYING_GAIN, DARKEST_MEAN, LEAST_GAIN, SPREADS = 4, 4.0, 1e-3, 0.02, (0.01, 0.5)
 # Residuals of more sigma teach nothing of the noise.
 DEVIANT = 5.0
 # Largest distance from a star's centre to its stamp's edge, px.
@@ -270,19 +273,8 @@ def _gains(stamps: Stamps, value: np.ndarray, before: Response) -> tuple[np.ndar
         stamps.signal, stamps.noise, stamps.good, stamps.phase, value, before.dn_per_photon, before.misfit,
         len(before.gain),
     )  # fmt: skip
-    # 1e-3 DN is far below any star
-    mean = np.maximum(own.mean(1, keepdims=True), 1e-3)
-    own, error2 = own / mean, 1 / np.maximum(information * mean**2, 1e-12)
-    gain, spread2 = np.median(own, 0), 0.0
-    for _ in range(4):
-        weight = 1 / (error2 + spread2 + 1e-6)
-        weight = weight * ((own - gain) ** 2 * weight < 16)
-        gain = np.clip((weight * own).sum(0) / np.maximum(weight.sum(0), 1e-12), 0.02, None)
-        gain = gain / gain.mean()
-        spread2 = max(
-            0.0, float((weight * ((own / gain - 1) ** 2 - error2)).sum() / max(weight.sum(), 1e-12))
-        )
-    return gain, float(np.clip(np.sqrt(spread2), 0.01, 0.5))
+    gain, spread = typical_gains(own, information, DARKEST_MEAN, LEAST_GAIN, OUTLYING_GAIN, GAIN_ROUNDS)
+    return gain, float(np.clip(spread, *SPREADS))
 
 
 def _refined(stamps: Stamps, psf: Psf, fit: Fit, sound: np.ndarray, response: Response, terms: Terms) -> Psf:

@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from starpos.core.noise import light_noise, strangeness
+from starpos.core.noise import light_noise, strangeness, typical_gains
 
 N, SIZE = 20, 9
 
@@ -83,3 +83,31 @@ def test_strangeness_is_that_of_plain_sums(rng):
     )
     with pytest.raises(ValueError, match="one each"):
         strangeness(noise[1:], model, residual, used, leverage, 1e-9)
+
+
+def plain_gains(own, information):
+    """Gains of phases and the scatter of single stars' gains about them, all stars at once."""
+    mean = np.maximum(own.mean(1, keepdims=True), 1e-3)
+    own, error2 = own / mean, 1 / np.maximum(information * mean**2, 1e-12)
+    gain, spread2 = np.median(own, 0), 0.0
+    for _ in range(4):
+        weight = 1 / (error2 + spread2 + 1e-6)
+        weight = weight * ((own - gain) ** 2 * weight < 16)
+        gain = np.maximum((weight * own).sum(0) / np.maximum(weight.sum(0), 1e-12), 0.02)
+        gain = gain / gain.mean()
+        spread2 = max(0.0, (weight * ((own / gain - 1) ** 2 - error2)).sum() / max(weight.sum(), 1e-12))
+    return gain, np.sqrt(spread2)
+
+
+@pytest.mark.parametrize("n", [1, 2, 31])
+def test_gains_are_those_of_plain_sums(n, rng):
+    light, gain = rng.uniform(1e3, 1e5, (n, 1)), np.array([0.6, 1.1, 1.2, 1.1])
+    information = 1 / (50 + light * gain)
+    own = light * gain * rng.normal(1, 0.08, (n, 4)) + rng.normal(0, 1, (n, 4)) / np.sqrt(information)
+    own[n // 2, 2] *= 4
+    found, spread = typical_gains(own, information, 1e-3, 0.02, 4.0, 4)
+    expected = plain_gains(own, information)
+    np.testing.assert_allclose(found, expected[0], rtol=1e-11)
+    assert spread == pytest.approx(expected[1], rel=1e-9)
+    if n > 2:
+        np.testing.assert_allclose(found, gain, atol=0.1)
