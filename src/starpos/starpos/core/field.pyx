@@ -152,7 +152,7 @@ def over_field(const double[:, ::1] field, const double[:, ::1] own):
 
 
 def agreed(const double[:, ::1] field, const double[:, ::1] own, const double[::1] weight, double outlying, int least, int rounds):
-    """The same, with weights (N,), of the rows that agree: none is so many times farther off than the median.
+    """Coefficients as in `over_field`, with weights (N,), of the rows that agree: none is so many times farther off than the median.
 
     Returns also chi-square of their weighted mean and of the fit, and how many they are; None if fewer than the least.
     """

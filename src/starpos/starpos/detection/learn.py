@@ -53,8 +53,8 @@ FINE_FWHM, FINE_STARS, FINE_ROUNDS = 2.3, 6, 4
 # Stars of at least this FWHM (px) may be rings with sharp edges if the PSF describes more than this share of the light
 # wrongly: then up to so many more rounds are made, with terms of this order.
 RING_FWHM, POOR, RING_ROUNDS, RING_ORDER = 5.0, 0.05, 6, 14
-# Rounds in which the gains of a mosaic's phases are averaged without stars so many sigma off; DN far below any star's; the
-# least gain, and the least and the largest scatter of single stars' gains.
+# Rounds in which the gains of a mosaic's phases are averaged, without stars so many sigma off; DN far below any star's;
+# the least gain, and the least and the largest scatter of single stars' gains.
 GAIN_ROUNDS, OUTLYING_GAIN, DARKEST_MEAN, LEAST_GAIN, SPREADS = 4, 4.0, 1e-3, 0.02, (0.01, 0.5)
 # Residuals of more sigma teach nothing of the noise.
 DEVIANT = 5.0

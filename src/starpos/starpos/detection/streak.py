@@ -83,10 +83,10 @@ def find_streaks(
 
 
 def _may_be_a_line(x: np.ndarray, y: np.ndarray) -> bool:
-    """Whether enough peaks x, y (N,) int px have one on each side of them, as along a line all but the two at its ends."""
+    """Whether enough peaks x, y (N,) int px have one on both sides, as along a line all but the two at its ends."""
     pairs = near_pairs(x.astype(float), y.astype(float), np.sqrt(2) * (GAP + 2) * CELL)
     between = np.count_nonzero(np.bincount(pairs.ravel(), minlength=1) > 1)
-    return between >= SHORTEST // CELL // (GAP + 1) - 1
+    return bool(between >= SHORTEST // CELL // (GAP + 1) - 1)
 
 
 def _through(points: np.ndarray, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:

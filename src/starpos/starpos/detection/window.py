@@ -34,6 +34,6 @@ def window_of(plane: np.ndarray, highest: int, sky_dn: float) -> Window | None:
 def _is_white(side: np.ndarray, highest: int) -> bool:
     """Whether most pixels (N,) along a side are white; a few of them tell of a dark one, most of whose are far apart."""
     few = side[:: len(side) // FEW + 1]
-    return 2 * np.count_nonzero(few == highest) > len(few) and bool(
-        np.count_nonzero(side == highest) >= WHITE * len(side)
-    )
+    if 2 * np.count_nonzero(few == highest) <= len(few):
+        return False
+    return bool(np.count_nonzero(side == highest) >= WHITE * len(side))
