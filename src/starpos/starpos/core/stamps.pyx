@@ -8,7 +8,7 @@ from libc.stdlib cimport free, malloc
 import numpy as np
 
 cimport starpos.core.wide
-from starpos.core.algebra cimport middle
+from starpos.core.algebra cimport fetch, middle
 
 cdef extern from *:
     """
@@ -116,6 +116,9 @@ def around(
     with nogil:
         for k in range(n):
             whole = reach <= x[k] < width - reach
+            # peaks are in no order: the next one's rows are far away
+            for i in range(size if k + 1 < n else 0):
+                fetch(&plane[_inside(y[k + 1] - reach + i, height), _inside(x[k + 1] - reach, width)])
             for i in range(size):
                 row, place = y[k] - reach + i, i * size
                 line = &plane[_inside(row, height), 0]
@@ -166,6 +169,9 @@ def rims(
     cdef float[:, :, ::1] sky = out
     with nogil:
         for k in range(n):
+            for i in range(side if k + 1 < n else 0):
+                fetch(&plane[_inside(y[k + 1] - reach + i, height), _inside(x[k + 1] - reach, width)])
+                fetch(&plane[_inside(y[k + 1] - reach + i, height), _inside(x[k + 1] + reach, width)])
             for j in range(4 * side):
                 # from corner to corner: along the top, down the right side, and back
                 i = j % side - reach
