@@ -80,12 +80,3 @@ cdef inline bint invert(double *normal, int n, double *out) noexcept nogil:
     for a in range(n * n):
         out[a] = NAN
     return False
-
-
-cdef inline bint solve(double *normal, int n, double *right) noexcept nogil:
-    """Replace right (n,) by the solution of the equations of the lower half of normal (n, n); False if they are singular."""
-    cdef double[LARGEST] scale
-    if not scaled_factor(normal, n, scale):
-        return False
-    solve_scaled(normal, n, scale, right)
-    return True

@@ -17,7 +17,6 @@ cdef extern from *:
     """
     /* Pixels whose products are summed in single precision; eight at once, which a compiler left to itself takes one by one,
        and four sums side by side, none of which waits for another. */
-    #define STARPOS_ROOM 128
     #define STARPOS_EIGHTS 16
     #define STARPOS_ABREAST 4
     typedef float starpos_eight __attribute__((vector_size(32)));
