@@ -7,6 +7,8 @@ from libc.stdlib cimport free, malloc, realloc
 
 import numpy as np
 
+from starpos.core.limits cimport within
+
 
 def near_pairs(const double[::1] x, const double[::1] y, double reach):
     """All pairs (M, 2) of the points x, y (N,) that are not farther from each other than the reach, the lower number first.
@@ -46,6 +48,36 @@ def near_pairs(const double[::1] x, const double[::1] y, double reach):
         return out
     finally:
         free(pair)
+
+
+def groups(const Py_ssize_t[:, ::1] pairs, Py_ssize_t n):
+    """The number (N,) of each of n points' group: those that pairs (M, 2) of them join. Groups are numbered by their first point."""
+    cdef Py_ssize_t k, a, b, count = 0
+    if pairs.shape[1] != 2 or not within[Py_ssize_t](&pairs[0, 0], 2 * pairs.shape[0], 0, n - 1):
+        raise ValueError(f"a pair is not of two of the {n} points")
+    out = np.arange(n)
+    cdef Py_ssize_t[::1] root = out
+    with nogil:
+        # the root of a group is its first point
+        for k in range(pairs.shape[0]):
+            a, b = _root(root, pairs[k, 0]), _root(root, pairs[k, 1])
+            root[max(a, b)] = min(a, b)
+        # by now what a point leads to has its number
+        for k in range(n):
+            if root[k] == k:
+                root[k] = count
+                count += 1
+            else:
+                root[k] = root[root[k]]
+    return out
+
+
+cdef Py_ssize_t _root(Py_ssize_t[::1] root, Py_ssize_t k) noexcept nogil:
+    """The first point of a point's group; the way there is halved."""
+    while root[k] != k:
+        root[k] = root[root[k]]
+        k = root[k]
+    return k
 
 
 def any_near(const double[::1] x, const double[::1] y, const double[::1] to_x, const double[::1] to_y, double reach):

@@ -6,11 +6,11 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy import sparse, spatial
+from scipy import spatial
 
 from starpos.core.background import between
 from starpos.core.mesh import above
-from starpos.core.neighbours import near_pairs, nearest
+from starpos.core.neighbours import groups, near_pairs, nearest
 from starpos.core.order import median
 from starpos.core.peaks import peaks, smoothed
 from starpos.detection.background import Background
@@ -296,8 +296,7 @@ def _join_plateaus(
     pairs = near_pairs(x.astype(float), y.astype(float), flat + 0.5)
     if len(pairs) == 0:
         return x.astype(int), y.astype(int), height
-    graph = sparse.coo_matrix((np.ones(len(pairs)), pairs.T), (len(x), len(x)))
-    x, y, height = _merged(x, y, height, sparse.csgraph.connected_components(graph, directed=False)[1])
+    x, y, height = _merged(x, y, height, groups(pairs, len(x)))
     order = np.argsort(-height, kind="stable")
     return x[order], y[order], height[order]
 

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from scipy import ndimage
 
-from starpos.core.neighbours import near_pairs
+from starpos.core.neighbours import groups, near_pairs
 from starpos.detection.background import Background
 
 # px. Peaks along a trail are never farther apart.
@@ -83,10 +83,9 @@ def find_streaks(
 
 
 def _may_be_a_line(x: np.ndarray, y: np.ndarray) -> bool:
-    """Whether enough peaks x, y (N,) int px have one on both sides, as along a line all but the two at its ends."""
+    """Whether enough peaks x, y (N,) int px are joined by gaps that a line may have."""
     pairs = near_pairs(x.astype(float), y.astype(float), np.sqrt(2) * (GAP + 2) * CELL)
-    between = np.count_nonzero(np.bincount(pairs.ravel(), minlength=1) > 1)
-    return bool(between >= SHORTEST // CELL // (GAP + 1) - 1)
+    return len(pairs) > 0 and bool(np.bincount(groups(pairs, len(x))).max() >= FEWEST)
 
 
 def _through(points: np.ndarray, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:

@@ -5,10 +5,27 @@ import numpy as np
 import pytest
 from scipy import ndimage, spatial
 
-from starpos.core.neighbours import any_near, near_pairs, nearest
+from starpos.core.neighbours import any_near, groups, near_pairs, nearest
 from starpos.core.noise import of_phases, unit_light
 from starpos.core.stamps import greyed
 from starpos.core.vetting import brightest_left, counted
+
+
+@pytest.mark.parametrize("number", [1, 2, 30, 300])
+@pytest.mark.parametrize("share", [0.3, 0.6, 1.2])
+def test_groups_are_the_connected_components_of_a_graph(number, share, rng):
+    x, y = rng.uniform(0, 100, (2, number))
+    pairs = rng.permutation(near_pairs(x, y, share * 100 / number**0.5))
+    graph = sparse.coo_matrix((np.ones(len(pairs)), pairs.T), (number, number))
+    expected = sparse.csgraph.connected_components(graph, directed=False)[1]
+    np.testing.assert_array_equal(groups(pairs, number), expected)
+    np.testing.assert_array_equal(groups(np.ascontiguousarray(pairs[:, ::-1]), number), expected)
+
+
+def test_a_pair_of_what_is_no_point_is_refused():
+    for pair in ([0, 3], [-1, 0]):
+        with pytest.raises(ValueError, match="3 points"):
+            groups(np.array([pair]), 3)
 
 
 @pytest.mark.parametrize("number", [0, 1, 2, 300])

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from starpos.detection import detect
-from starpos.detection.streak import CELL, FEWEST, GAP, SHORTEST, _may_be_a_line
+from starpos.detection.streak import CELL, FEWEST, GAP, SHORTEST, _may_be_a_line, _through
 from starpos.frames.frame import Frame
 from starpos.frames.stars import ELONGATED
 from starpos_testing.skies.rendered import bound, field, grid, match, noisy
@@ -61,9 +61,12 @@ def test_no_line_is_passed_over_because_its_peaks_are_far_apart(rng):
         cells = np.zeros((400 // CELL + 1,) * 2, np.uint8)
         cells[y // CELL, x // CELL] = 255
         lines = cv2.HoughLinesP(cells, 1, np.pi / 360, FEWEST, minLineLength=SHORTEST / CELL, maxLineGap=GAP)
-        if lines is not None:
+        points = np.stack([x, y], 1).astype(float)
+        ends = [] if lines is None else lines.reshape(-1, 2, 2) * CELL + CELL / 2
+        is_line = any(_through(points, each) is not None for each in ends)
+        if is_line:
             assert _may_be_a_line(x, y)
-        seen[lines is not None] += 1
+        seen[is_line] += 1
     assert min(seen) > 50
 
 
