@@ -3,7 +3,7 @@
 
 import numpy as np
 import pytest
-from scipy import ndimage, spatial
+from scipy import ndimage, sparse, spatial
 
 from starpos.core.neighbours import any_near, groups, near_pairs, nearest
 from starpos.core.noise import of_phases, unit_light
