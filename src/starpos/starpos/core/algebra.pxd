@@ -188,6 +188,23 @@ cdef inline double middle(double *values, int n) noexcept nogil:
     return (lower + upper) / 2
 
 
+cdef inline (double, double) level_of(double *values, int n, double per_mad, double uneven) noexcept nogil:
+    """The median of values (n,), and their scatter where that is more than `uneven`, else 1; it disturbs them.
+
+    per_mad: sigma over the median of the absolute differences
+    """
+    cdef double level = middle(values, n), nearest = uneven / per_mad
+    cdef int k, near = 0
+    for k in range(n):
+        values[k] = fabs(values[k] - level)
+        near += values[k] <= nearest
+    # where most are that near, so is their median
+    if near > n // 2:
+        return level, 1.0
+    cdef double spread = per_mad * middle(values, n)
+    return level, spread if spread > uneven else 1.0
+
+
 cdef inline int strip_of(double x, const Strips *s) noexcept nogil:
     """The strip in which a point lies, or the nearest one."""
     cdef double strip = (x - s.least) * s.per_px

@@ -2,13 +2,13 @@
 # cython: language_level=3, boundscheck=False, wraparound=False, cdivision=True, initializedcheck=False
 """The pixels around stars, above the sky and in its noise."""
 
-from libc.math cimport ceil, fabs
+from libc.math cimport ceil
 from libc.stdlib cimport free, malloc
 
 import numpy as np
 
 cimport starpos.core.wide
-from starpos.core.algebra cimport fetch, middle
+from starpos.core.algebra cimport fetch
 
 cdef extern from *:
     """
@@ -147,72 +147,6 @@ def around(
                     place += 1
     good, white = marks[:2].view(bool)
     return skies[0], skies[1], good, white, marks[2]
-
-
-def rims(
-    const pixel_t[:, ::1] plane, const Py_ssize_t[::1] x, const Py_ssize_t[::1] y, int reach, const float[:, ::1] level,
-    const float[:, ::1] noise,
-):
-    """The edges of squares, reach px from the pixels x, y (N,) of a plane (h, w): signal and noise (N, 8 reach).
-
-    level, noise  (N, P) DN of the sky at each, P = 1, or 4 for the phases of a colour mosaic
-
-    A pixel beyond the frame is the nearest one on it.
-    """
-    cdef Py_ssize_t n = x.shape[0], height = plane.shape[0], width = plane.shape[1], k, row, column
-    cdef int side = 2 * reach, j, i, phase
-    if not (y.shape[0] == level.shape[0] == noise.shape[0] == n and noise.shape[1] == level.shape[1] in (1, 4)):
-        raise ValueError("a row, and a level and noise for each of 1 or 4 phases, are needed for each column of a star")
-    if reach < 1 or not (height and width):
-        raise ValueError(f"squares of {reach} px around stars of a frame of {width} x {height} px: there is nothing to see")
-    out = np.empty((2, n, 4 * side), np.float32)
-    cdef float[:, :, ::1] sky = out
-    with nogil:
-        for k in range(n):
-            for i in range(side if k + 1 < n else 0):
-                fetch(&plane[_inside(y[k + 1] - reach + i, height), _inside(x[k + 1] - reach, width)])
-                fetch(&plane[_inside(y[k + 1] - reach + i, height), _inside(x[k + 1] + reach, width)])
-            for j in range(4 * side):
-                # from corner to corner: along the top, down the right side, and back
-                i = j % side - reach
-                if j // side == 0:
-                    row, column = y[k] - reach, x[k] + i
-                elif j // side == 1:
-                    row, column = y[k] + i, x[k] + reach
-                elif j // side == 2:
-                    row, column = y[k] + reach, x[k] - i
-                else:
-                    row, column = y[k] - i, x[k] - reach
-                row, column = _inside(row, height), _inside(column, width)
-                phase = <int>(2 * (row & 1) + (column & 1)) if level.shape[1] > 1 else 0
-                sky[0, k, j], sky[1, k, j] = <float>plane[row, column] - level[k, phase], noise[k, phase]
-    return out[0], out[1]
-
-
-def scatter(const float[:, ::1] signal, const float[:, ::1] noise, double per_mad):
-    """Median (N,) and scatter (N,) of signal over noise, of K pixels each: (N, K).
-
-    per_mad: sigma over the median of the absolute differences.
-    """
-    cdef Py_ssize_t n = signal.shape[0], k
-    cdef int many = signal.shape[1], j
-    if noise.shape[0] != n or noise.shape[1] != many or many < 1:
-        raise ValueError(f"{n} x {many} pixels, {noise.shape[0]} x {noise.shape[1]} noises: as many are needed, at least one")
-    out = np.empty((2, n))
-    cdef double[:, ::1] found = out
-    cdef double *score = <double *>malloc(many * sizeof(double))
-    if score == NULL:
-        raise MemoryError
-    with nogil:
-        for k in range(n):
-            for j in range(many):
-                score[j] = <double>signal[k, j] / noise[k, j]
-            found[0, k] = middle(score, many)
-            for j in range(many):
-                score[j] = fabs(score[j] - found[0, k])
-            found[1, k] = per_mad * middle(score, many)
-    free(score)
-    return out[0], out[1]
 
 
 def greyed(const float[:, :, ::1] signal):

@@ -2,13 +2,13 @@
 # cython: language_level=3, boundscheck=False, wraparound=False, cdivision=True, initializedcheck=False
 """What the pixels of stamps say of their stars: the sky at their rims, spikes, other light, and whether one pixel is all."""
 
-from libc.math cimport fabs, log, sqrt
+from libc.math cimport log, sqrt
 from libc.stdlib cimport free, malloc
 
 import numpy as np
 
 cimport starpos.core.wide
-from starpos.core.algebra cimport middle
+from starpos.core.algebra cimport level_of, middle
 
 cdef extern from *:
     """
@@ -57,15 +57,6 @@ cdef void _take_rim(const float *signal, const float *noise, int size, Rim *rim)
     rim.count = n
 
 
-cdef (double, double) _sky_of(Rim *rim, double per_mad) noexcept nogil:
-    """Median and scatter of a rim's scores."""
-    cdef double level = middle(rim.score, rim.count)
-    cdef int k
-    for k in range(rim.count):
-        rim.score[k] = fabs(rim.score[k] - level)
-    return level, per_mad * middle(rim.score, rim.count)
-
-
 def level(float[:, :, ::1] signal, float[:, :, ::1] noise, double per_mad, double raised, double uneven, double own):
     """Correct level and noise of the sky in stamps (N, S, S), in place, by what the pixels at their rims show.
 
@@ -86,10 +77,10 @@ def level(float[:, :, ::1] signal, float[:, :, ::1] noise, double per_mad, doubl
     with nogil:
         for k in range(n):
             _take_rim(&signal[k, 0, 0], &noise[k, 0, 0], size, &rim)
-            sky, spread = _sky_of(&rim, per_mad)
+            sky, spread = level_of(rim.score, rim.count, per_mad, uneven)
             light = own * highest_of(&signal[k, 0, 0], area) / (rim.noise[0] if rim.even else middle(rim.noise, rim.count))
             up = <float>sky if sky > raised and sky > light else 0
-            wider = <float>spread if spread > uneven and spread > light else 1
+            wider = <float>spread if spread > light else 1
             if up != 0 or wider != 1:
                 for j in range(area):
                     (&signal[k, 0, 0])[j] -= up * (&noise[k, 0, 0])[j]

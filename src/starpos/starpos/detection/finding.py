@@ -19,8 +19,6 @@ from starpos.normal import SIGMA_PER_MAD
 
 # Rows of a strip, which has one limit.
 STRIP = 64
-# Peaks whose surroundings are looked at together.
-CHUNK = 1024
 # Parts of a strip in which the sky is compared; the whole frame is at most so many times less even than the typical one.
 PARTS, UNEVENEST = 4, 1.4
 # With fewer values in a part its quantiles are chance; a smaller factor may be chance too.
@@ -178,11 +176,9 @@ def _peaks_of(
     left_out = max(0, len(height) - 4 * limit)
     keep = np.argsort(-height, kind="stable")[: 4 * limit]
     x, y, height = x[keep].astype(int), y[keep].astype(int), height[keep]
-    alone = [are_alone(plane, background, x[c], y[c]) for c in _chunks(len(x))]
-    starlike = ~np.concatenate([*alone, np.zeros(0, bool)])
+    starlike = ~are_alone(plane, background, x, y)
     x, y, height = x[starlike], y[starlike], height[starlike]
-    near = [surroundings(plane, background, x[c], y[c], round(6.7 * kernel.sigma)) for c in _chunks(len(x))]
-    raised, uneven = np.concatenate(near, 1) if near else np.zeros((2, 0))
+    raised, uneven = surroundings(plane, background, x, y, round(6.7 * kernel.sigma))
     height = (height - raised / (kernel.norm * correlation)) / uneven
     keep = np.flatnonzero(height > _above_tail(height, threshold))
     keep = keep[np.argsort(-height[keep], kind="stable")]
@@ -196,11 +192,6 @@ def _peaks_of(
         highest=highest,
         left_out=left_out,
     )
-
-
-def _chunks(count: int) -> list[slice]:
-    """Peaks that are looked at together, of so many."""
-    return [slice(first, first + CHUNK) for first in range(0, count, CHUNK)]
 
 
 def _in_parts(plane: np.ndarray, kernel: Kernel, limit: np.ndarray, threads: int) -> tuple[np.ndarray, ...]:

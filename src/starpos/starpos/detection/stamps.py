@@ -5,7 +5,8 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from starpos.core.stamps import around, rims, scatter
+from starpos.core.beside import dots, lonely, rims
+from starpos.core.stamps import around
 from starpos.detection.background import Background
 from starpos.normal import SIGMA_PER_MAD
 
@@ -79,19 +80,17 @@ def cut(
 def are_dots(plane: np.ndarray, background: Background, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Whether the pixels x, y (N,) int are hot, one or two together: the others of nine have hardly any light.
 
-    Less than half the brightest's without it, or less than a quarter of it without the second too.
+    Less than half the brightest's without it, or less than a quarter of it without the second too. The light of streaks
+    counts.
     """
-    core = np.sort(cut(plane, background, x, y, 1, np.inf).signal.reshape(-1, 9), axis=1)
-    peak, second, rest = core[:, 8], core[:, 7], core[:, :7].sum(1)
-    return (rest + second < HALF * peak) | (rest < QUARTER * peak)
+    x, y = (np.ascontiguousarray(v, np.intp) for v in (x, y))
+    return dots(plane, x, y, background.near(x, y)[0], HALF, QUARTER)
 
 
 def are_alone(plane: np.ndarray, background: Background, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Whether the pixels x, y (N,) int are certainly hot: almost no light in the 24 pixels around them."""
-    around = cut(plane, background, x, y, 2, np.inf)
-    peak = around.signal.max((1, 2))
-    beside = around.signal.sum((1, 2)) - peak
-    return beside < np.minimum(ALONE * peak, NOTHING * np.sqrt((around.noise**2).sum((1, 2))))
+    x, y = (np.ascontiguousarray(v, np.intp) for v in (x, y))
+    return lonely(plane, x, y, *background.near(x, y), 2, ALONE, NOTHING)
 
 
 def surroundings(
@@ -103,5 +102,4 @@ def surroundings(
     even than the background's mesh says.
     """
     x, y = (np.ascontiguousarray(v, np.intp) for v in (x, y))
-    level, spread = scatter(*rims(plane, x, y, reach, *background.near(x, y)), SIGMA_PER_MAD)
-    return np.where(level > RAISED, level, 0), np.where(spread > UNEVEN, spread, 1)
+    return rims(plane, x, y, *background.near(x, y), reach, SIGMA_PER_MAD, RAISED, UNEVEN)

@@ -6,7 +6,7 @@ import pytest
 from scipy import ndimage
 
 from starpos.core.background import between, sampled
-from starpos.core.stamps import around, rims, scatter
+from starpos.core.stamps import around
 from starpos.detection.background import CLIP
 from starpos.normal import SIGMA_PER_MAD
 
@@ -65,37 +65,6 @@ def test_stamps_are_the_pixels_around_stars(phases, rng):
     )
     for found, plain in zip(around(plane, x, y, 3, level, noise, 900), expected, strict=True):
         np.testing.assert_array_equal(found, plain)
-
-
-@pytest.mark.parametrize("phases", [1, 4])
-def test_rims_are_the_edges_of_stamps(phases, rng):
-    """Some lie partly, or wholly, beyond the frame; the order is free."""
-    plane = rng.integers(0, 1000, (30, 20)).astype(np.uint16)
-    x, y = rng.integers(-9, 29, (2, 40))
-    level, noise = rng.uniform(0, 9, (2, 40, phases)).astype(np.float32)
-    rows, columns = np.mgrid[-3:4, -3:4]
-    edge = np.maximum(np.abs(rows), np.abs(columns)) == 3
-    rows, columns = y[:, None] + rows[edge], x[:, None] + columns[edge]
-    rows, columns = np.clip(rows, 0, 29), np.clip(columns, 0, 19)
-    phase = (2 * (rows % 2) + columns % 2) * (phases > 1)
-    each = np.arange(40)[:, None]
-    for found, plain in zip(
-        rims(plane, x, y, 3, level, noise),
-        (plane[rows, columns] - level[each, phase], noise[each, phase]),
-        strict=True,
-    ):
-        np.testing.assert_array_equal(np.sort(found), np.sort(plain))
-    with pytest.raises(ValueError, match="nothing to see"):
-        rims(plane, x, y, 0, level, noise)
-
-
-@pytest.mark.parametrize("pixels", [1, 2, 55, 56])
-def test_scatter_is_that_of_medians(pixels, rng):
-    signal, noise = rng.uniform(1, 9, (2, 20, pixels)).astype(np.float32)
-    score = signal.astype(float) / noise
-    level = np.median(score, axis=1)
-    spread = SIGMA_PER_MAD * np.median(np.abs(score - level[:, None]), axis=1)
-    np.testing.assert_allclose(scatter(signal, noise, SIGMA_PER_MAD), (level, spread), rtol=1e-12, atol=1e-12)
 
 
 def test_what_lies_beyond_the_frame_is_refused():
