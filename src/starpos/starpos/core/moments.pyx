@@ -93,8 +93,8 @@ cdef extern from *:
 cdef enum:
     LANES = 4
 
-# A window's Gaussian is nothing (7e-10 of its peak) beyond so many of its widths.
-cdef double WIDTHS = 6.5
+# A window's Gaussian is nothing (4e-6 of its peak) beyond so many of its widths.
+cdef double WIDTHS = 5.0
 
 
 cdef struct Image:

@@ -32,7 +32,8 @@ def test_moments_are_those_of_plain_sums(size, off_px, rng):
     for found, expected in zip(
         windowed(signal, left, top, window), plain(signal, left, top, window), strict=True
     ):
-        np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
+        # what lies beyond five widths of a window is left out
+        np.testing.assert_allclose(found, expected, rtol=2e-5, atol=2e-5)
 
 
 def test_without_light_there_is_no_place():
