@@ -46,6 +46,18 @@ cdef extern from *:
     }
     STARPOS_TAKE_ROW(starpos_take_8, unsigned char, 255)
     STARPOS_TAKE_ROW(starpos_take_16, unsigned short, 65535)
+    /* The light of n pixels above the sky at each; the highest of them. */
+    #define STARPOS_LIGHT_ROW(name, pixel) \
+    STARPOS_WIDE static int name(const pixel *restrict line, int n, const float *restrict level, float *restrict light) { \
+        int highest = 0; \
+        for (int j = 0; j < n; j++) { \
+            light[j] = (float)line[j] - level[j]; \
+            highest = line[j] > highest ? line[j] : highest; \
+        } \
+        return highest; \
+    }
+    STARPOS_LIGHT_ROW(starpos_light_8, unsigned char)
+    STARPOS_LIGHT_ROW(starpos_light_16, unsigned short)
     /* A row of n pixels smoothed along both axes by 1/4, 1/2, 1/4. line: room for n + 2. */
     STARPOS_WIDE static void starpos_grey(const float *restrict above, const float *restrict own, const float *restrict below,
                                           Py_ssize_t n, float *restrict line, float *restrict out) {
@@ -65,6 +77,8 @@ cdef extern from *:
         const unsigned short *line, int n, int limit, const float *level, const float *noise, const unsigned char *phase,
         float *signal, float *sky, unsigned char *good, unsigned char *full, unsigned char *part,
     ) noexcept nogil
+    int light_8 "starpos_light_8"(const unsigned char *line, int n, const float *level, float *light) noexcept nogil
+    int light_16 "starpos_light_16"(const unsigned short *line, int n, const float *level, float *light) noexcept nogil
     void grey_row "starpos_grey"(
         const float *above, const float *own, const float *below, Py_ssize_t n, float *line, float *out
     ) noexcept nogil
@@ -147,6 +161,57 @@ def around(
                     place += 1
     good, white = marks[:2].view(bool)
     return skies[0], skies[1], good, white, marks[2]
+
+
+def lights(
+    const pixel_t[:, ::1] plane, const Py_ssize_t[::1] x, const Py_ssize_t[::1] y, int reach, const float[:, ::1] level,
+    double saturation,
+):
+    """The signal alone (N, S, S) of stamps as in `around`, and whether one of their pixels is saturated, (N,) bool."""
+    cdef Py_ssize_t n = x.shape[0], height = plane.shape[0], width = plane.shape[1], k, i, j, row
+    cdef int size = 2 * reach + 1, phases = level.shape[1], highest
+    cdef const pixel_t *line
+    cdef float *own
+    if not (y.shape[0] == level.shape[0] == n and phases in (1, 4)):
+        raise ValueError("a row, and a level for each of 1 or 4 phases, are needed for each column of a star")
+    if reach < 0 or not (height and width):
+        raise ValueError(f"stamps of {size} px of a frame of {width} x {height} px: there is nothing to see")
+    light, white = np.empty((n, size, size), np.float32), np.empty(n, np.uint8)
+    cdef float[:, :, ::1] signal = light
+    cdef unsigned char[::1] full = white
+    # of the columns of an even row and of an odd one, and pixels where a row is not on the frame
+    cdef float *skies = <float *>malloc(2 * size * sizeof(float))
+    cdef pixel_t *pixels = <pixel_t *>malloc(size * sizeof(pixel_t))
+    if skies == NULL or pixels == NULL:
+        free(skies)
+        free(pixels)
+        raise MemoryError
+    with nogil:
+        for k in range(n):
+            for i in range(size if k + 1 < n else 0):
+                fetch(&plane[_inside(y[k + 1] - reach + i, height), _inside(x[k + 1] - reach, width)])
+            for i in range(2):
+                for j in range(size):
+                    skies[i * size + j] = level[k, 2 * i + (x[k] - reach + j & 1)] if phases > 1 else level[k, 0]
+            highest = 0
+            for i in range(size):
+                row = y[k] - reach + i
+                line = &plane[_inside(row, height), 0]
+                if reach <= x[k] < width - reach:
+                    line += x[k] - reach
+                else:
+                    for j in range(size):
+                        pixels[j] = line[_inside(x[k] - reach + j, width)]
+                    line = pixels
+                own = &signal[k, i, 0]
+                if pixel_t is unsigned_char:
+                    highest = max(highest, light_8(line, size, skies + (row & 1) * size, own))
+                else:
+                    highest = max(highest, light_16(line, size, skies + (row & 1) * size, own))
+            full[k] = highest >= saturation
+    free(skies)
+    free(pixels)
+    return light, white.view(bool)
 
 
 def greyed(const float[:, :, ::1] signal):

@@ -2,7 +2,7 @@
 """Learn a frame's PSF, colour gains and photon noise from its own bright stars."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy import spatial
@@ -28,12 +28,14 @@ from starpos.detection.shape import (
     relative_widths,
     window_for,
 )
-from starpos.detection.stamps import Stamps, are_dots, cut
+from starpos.detection.stamps import Stamps, are_dots, cut, lights
 
 # Widths of the PSF, px, for a frame with fewer than ALIKE stars to learn from: so many of its highest peaks decide.
 USUAL_SIGMAS, FEW = (1.1, 0.55, 2.2, 4.4), 10
 # A usual width replaces a learnt one if it finds so many times its light.
 CLEARLY = 1.1
+# px around a peak that are looked at while nobody knows how wide stars are.
+SIGHT = 12
 # Peaks of at least so many sigma of the smoothed noise can teach, at most so many of them,
 BRIGHT, TEACHERS = 20, 250
 # and of wide stars fewer: together they have so many pixels.
@@ -141,26 +143,29 @@ def _teachers(
     choices = (clear & alone & (height > BRIGHT), clear & alone, clear & high)
     bright = next((np.flatnonzero(c) for c in choices if c.any()), np.zeros(0, int))
     bright = bright[~are_dots(plane, background, x[bright], y[bright])][:TEACHERS]
-    stamps = cut(plane, background, x[bright], y[bright], 12, saturation)
-    stamps = stamps.take(np.logical_not(stamps.full.any((1, 2))))
+    light, full = lights(plane, background, x[bright], y[bright], SIGHT, saturation)
     # the shapes of fainter stars are noise
-    if np.count_nonzero(height[bright] > BRIGHT) > ALIKE and len(stamps.x):
-        stamps = stamps.take(_most_alike(grey(stamps, background)[0]))
-    shape = frame_shape(*grey(stamps, background)) if len(stamps.x) else None
+    clearly_many = np.count_nonzero(height[bright] > BRIGHT) > ALIKE
+    bright, light = bright[~full], _those(light, ~full)
+    light, blur = grey(light, background)
+    if clearly_many and len(bright):
+        alike = _most_alike(light)
+        bright, light = bright[alike], _those(light, alike)
+    shape = frame_shape(light, blur) if len(bright) else None
     # a shape as wide as the stamps is the sky's
-    if shape is not None and squared_widths(shape[None])[0, 0] > 0.9 * (stamps.reach / 2) ** 2:
+    if shape is not None and squared_widths(shape[None])[0, 0] > 0.9 * (SIGHT / 2) ** 2:
         shape = None
-    if shape is None or len(stamps.x) < ALIKE:
+    if shape is None or len(bright) < ALIKE:
         around = _highest(plane, background, x[clear], y[clear], saturation)
         shape, learnt = _likeliest(around, shape, Response(np.ones(len(background.level)), 0.3, 0.0, 0.0))
         if not learnt:
-            return gaussian(shape), stamps.take(slice(0)), np.zeros(0), np.zeros(0)
-    psf = gaussian(shape, stamps.x, stamps.y)
-    stamps = cut(plane, background, stamps.x, stamps.y, reach_of(psf), saturation)
-    smooth, blur = grey(stamps, background)
-    x, y = centroid(smooth, shape)
+            return gaussian(shape), around.take(slice(0)), np.zeros(0), np.zeros(0)
+    psf = gaussian(shape, x[bright], y[bright])
+    stamps = cut(plane, background, x[bright], y[bright], reach_of(psf), saturation)
+    smooth, blur = grey(stamps.signal, background)
+    x, y = centroid(smooth, stamps.x, stamps.y, shape)
     window = window_for(shape)
-    mass, _, seen = moments(smooth, x, y, window)
+    mass, _, seen = moments(smooth, *stamps.corner(x, y), window)
     ratio = np.nan_to_num(psf.axes @ (own_shape(seen, window) - blur * np.eye(2)) @ psf.axes.T)
     extremes = squared_widths(ratio)
     near = (extremes[:, 0] > NARROW) & (extremes[:, 1] < BROAD)
@@ -177,9 +182,9 @@ def _highest(
     plane: np.ndarray, background: Background, x: np.ndarray, y: np.ndarray, saturation: float
 ) -> Stamps:
     """Stamps of the first FEW of the peaks x, y (N,) int px, of those that are not saturated if there are any."""
-    full = cut(plane, background, x[:TEACHERS], y[:TEACHERS], 1, saturation).full.any((1, 2))
+    _, full = lights(plane, background, x[:TEACHERS], y[:TEACHERS], 1, saturation)
     few = np.argsort(full, kind="stable")[:FEW]
-    return cut(plane, background, x[few], y[few], 12, saturation)
+    return cut(plane, background, x[few], y[few], SIGHT, saturation)
 
 
 def _likeliest(stamps: Stamps, shape: np.ndarray | None, response: Response) -> tuple[np.ndarray, bool]:
@@ -199,15 +204,20 @@ def _likeliest(stamps: Stamps, shape: np.ndarray | None, response: Response) -> 
     return choices[0 if learnt else best], learnt
 
 
-def _most_alike(stamps: Stamps) -> np.ndarray:
-    """Select the stamps, (N,) bool, with similar shapes, as stars have and twigs have not.
+def _those(light: np.ndarray, which: np.ndarray) -> np.ndarray:
+    """The signals (N, S, S) that a mask (N,) selects; if it selects all, nothing is copied."""
+    return light if which.all() else light[which]
+
+
+def _most_alike(light: np.ndarray) -> np.ndarray:
+    """Select the signals (N, S, S), (N,) bool, with similar shapes, as stars have and twigs have not.
 
     All of them if most lie near the median shape, else those near the shape at which they are densest.
     """
-    widest = (stamps.reach / 2) ** 2
+    widest = (SIGHT / 2) ** 2
     shape, values = own_shapes(
-        stamps.signal,
-        (stamps.reach / 4) ** 2,
+        light,
+        (SIGHT / 4) ** 2,
         NARROWEST_WINDOW,
         NARROWEST,
         widest,
@@ -233,16 +243,16 @@ def reach_of(psf: FieldPsf) -> int:
     return min(max(math.ceil(3.5 * math.sqrt(psf.widest_px2())) + 1, 4), MAX_REACH)
 
 
-def grey(stamps: Stamps, background: Background) -> tuple[Stamps, float]:
-    """Stamps smoothed so that the mosaic's pattern vanishes, and the px2 which that added to the covariances."""
+def grey(signal: np.ndarray, background: Background) -> tuple[np.ndarray, float]:
+    """Signals (N, S, S) smoothed so that the mosaic's pattern vanishes, and the px2 which that added to covariances."""
     if not background.is_mosaic:
-        return stamps, 0.0
-    return replace(stamps, signal=greyed(stamps.signal)), SMOOTHING_WIDTH
+        return signal, 0.0
+    return greyed(signal), SMOOTHING_WIDTH
 
 
 def _isolated(x: np.ndarray, y: np.ndarray, height: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Which peaks (N,) have no neighbour within 12 px above a fiftieth of their height, and which have no higher one."""
-    pairs = near_pairs(x.astype(float), y.astype(float), 12)
+    """Which peaks (N,) have no neighbour within SIGHT px above a fiftieth of their height, and which have no higher one."""
+    pairs = near_pairs(x.astype(float), y.astype(float), SIGHT)
     alone, high = np.ones((2, len(x)), bool)
     for a, b in (pairs.T, pairs.T[::-1]):
         alone[a[height[b] > 0.02 * height[a]]] = False

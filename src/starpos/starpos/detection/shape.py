@@ -9,7 +9,6 @@ import numpy as np
 
 from starpos.core.moments import centred, settled, windowed
 from starpos.core.shapes import before, clipped, inverted, relative, through
-from starpos.detection.stamps import Stamps
 
 # px2. A single pixel has 1/12, and a star's light never falls on one pixel only.
 NARROWEST = 0.2
@@ -33,23 +32,30 @@ def _each(shape: np.ndarray) -> np.ndarray:
 
 
 def moments(
-    stamps: Stamps, x: np.ndarray, y: np.ndarray, window: np.ndarray
+    signal: np.ndarray, left: np.ndarray, top: np.ndarray, window: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Moments of the stamps through a window (2, 2) px2, or one window each (N, 2, 2), centred on x, y (N,) px.
+    """Moments of stamps' signals (N, S, S) through a window (2, 2) px2, or one window each (N, 2, 2), about points.
 
-    Returns the sum (N,), the mean offset (N, 2) px from x, y and the covariance (N, 2, 2) px2 of the windowed image;
-    NaN where there is no light. Pixels off the frame and saturated ones count as they are: without them the centroid
-    would be biased away from the edge.
+    left, top (N,) px: of each stamp's first column and row from its point.
+
+    Returns the sum (N,), the mean offset (N, 2) px from the points and the covariance (N, 2, 2) px2 of the windowed
+    image; NaN where there is no light. Pixels off the frame and saturated ones count as they are: without them the
+    centroid would be biased away from the edge.
     """
-    return windowed(stamps.signal, *stamps.corner(x, y), _each(window))
+    return windowed(signal, left, top, _each(window))
 
 
-def centroid(stamps: Stamps, shape: np.ndarray, rounds: int = 3) -> tuple[np.ndarray, np.ndarray]:
-    """Windowed centroids x, y (N,) px of stars of covariance shape px2, near the peak."""
+def centroid(
+    signal: np.ndarray, x: np.ndarray, y: np.ndarray, shape: np.ndarray, rounds: int = 3
+) -> tuple[np.ndarray, np.ndarray]:
+    """Windowed centroids x, y (N,) px of stars of covariance shape px2, near the peaks.
+
+    signal (N, S, S): of stamps around the pixels x, y (N,) int.
+    """
     window = window_for(shape)
     # through the window an offset looks smaller than it is
     gain = np.eye(2) + shape @ inverted(_each(window)).reshape(window.shape)
-    return centred(stamps.signal, stamps.x, stamps.y, _each(window), _each(gain), rounds, FARTHEST)
+    return centred(signal, x, y, _each(window), _each(gain), rounds, FARTHEST)
 
 
 def window_for(shape: np.ndarray) -> np.ndarray:
@@ -57,16 +63,17 @@ def window_for(shape: np.ndarray) -> np.ndarray:
     return at_least(shape, NARROWEST_WINDOW)
 
 
-def frame_shape(stamps: Stamps, blur: float = 0.0, rounds: int = 12) -> np.ndarray | None:
-    """The typical covariance C (2, 2) px2 of the stars in stamps, measured through a window of the same shape.
+def frame_shape(signal: np.ndarray, blur: float = 0.0, rounds: int = 12) -> np.ndarray | None:
+    """The typical covariance C (2, 2) px2 of stars, signals (N, S, S), measured through a window of the same shape.
 
     blur, px2, is what smoothing added to their covariance. None if no star can be measured.
     """
     # a wide window suits all stars, but in the noise of a wide window faint sharp ones are lost
-    for width in (max(1.5, stamps.reach / 4), 1.5):
+    reach = signal.shape[1] // 2
+    for width in (max(1.5, reach / 4), 1.5):
         # a stamp does not hold a wider star than half its reach
         shape = settled(
-            stamps.signal, width**2, NARROWEST_WINDOW, NARROWEST, (stamps.reach / 2) ** 2, rounds, NEAR, THINNEST, SETTLED
+            signal, width**2, NARROWEST_WINDOW, NARROWEST, (reach / 2) ** 2, rounds, NEAR, THINNEST, SETTLED
         )  # fmt: skip
         if shape is not None:
             return at_least(shape - blur * np.eye(2), NARROWEST)

@@ -76,7 +76,7 @@ def measure(
     for first in range(0, len(x), chunk):
         peak = x[first : first + chunk], y[first : first + chunk]
         stamps, spike = cut_at(*peak)
-        begin = centroid(grey(stamps, background)[0], psf.shapes_at(*peak))
+        begin = centroid(grey(stamps.signal, background)[0], stamps.x, stamps.y, psf.shapes_at(*peak))
         fit = fit_stars(stamps, psf, *begin, lesson.response)
         strange = surprising(stamps, fit)
         rows = np.flatnonzero(strange)
@@ -106,16 +106,17 @@ def _columns(
     """
     psf = lesson.psf
     local = psf.at(fit.x, fit.y)
+    corner = stamps.corner(fit.x, fit.y)
     matched, foreign, full, edge = looks(
         stamps.signal, stamps.noise, stamps.good, stamps.full, spike, fit.residual, fit.model, fit.used, fit.outlier,
-        *stamps.corner(fit.x, fit.y), local.axes, *CORE,
+        *corner, local.axes, *CORE,
     )  # fmt: skip
     dot = _is_dot(stamps, fit, lesson.response)
     own_light(stamps.signal, stamps.noise, spike, fit.model, fit.outlier, SPECK, LOUD)
-    smooth, blur = grey(stamps, background)
+    smooth, blur = grey(stamps.signal, background)
     shape = psf.shapes_at(stamps.x, stamps.y)
     window = window_for(shape)
-    _, _, seen = moments(smooth, fit.x, fit.y, window)
+    _, _, seen = moments(smooth, *corner, window)
     widths = relative_widths(seen, shape + blur * np.eye(2), window)
     misfit = _misfit(fit)
     with np.errstate(invalid="ignore", divide="ignore"):
