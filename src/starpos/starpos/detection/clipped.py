@@ -56,7 +56,7 @@ def with_clipped(
     lost[lost] = ~any_near(own_x[told], own_y[told], at_x[lost], at_y[lost], NEAR)
     lost |= any_near(own_x[untold], own_y[untold], at_x, at_y, NEAR)
     # what stands on a roof is the roof's
-    lost = np.flatnonzero(lost & (top - level > OWN * (top - sky)))[:MOST]
+    lost = (lost & (top - level > OWN * (top - sky))).nonzero()[0][:MOST]
     reach = max(LEAST_REACH, round(REACH * fwhm_px))
     images = [_image(plane, x[k], y[k], level[k], top[k], reach) for k in lost.tolist()]
     least = max(FEWEST, NARROWER * np.pi / 4 * fwhm_px**2)

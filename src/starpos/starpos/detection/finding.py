@@ -180,7 +180,7 @@ def _peaks_of(
     x, y, height = x[starlike], y[starlike], height[starlike]
     raised, uneven = surroundings(plane, background, x, y, round(6.7 * kernel.sigma))
     height = (height - raised / (kernel.norm * correlation)) / uneven
-    keep = np.flatnonzero(height > _above_tail(height, threshold))
+    keep = (height > _above_tail(height, threshold)).nonzero()[0]
     keep = keep[np.argsort(-height[keep], kind="stable")]
     x, y, height = _join_plateaus(x[keep], y[keep], height[keep], kernel.flat)
     left_out += max(0, len(x) - limit)

@@ -141,7 +141,7 @@ def _teachers(
     alone, high = _isolated(x, y, height)
     # where no bright star is isolated, fainter ones may be; where none is, stars are wider than their distances
     choices = (clear & alone & (height > BRIGHT), clear & alone, clear & high)
-    bright = next((np.flatnonzero(c) for c in choices if c.any()), np.zeros(0, int))
+    bright = next((c for c in choices if c.any()), clear & high).nonzero()[0]
     bright = bright[~are_dots(plane, background, x[bright], y[bright])][:TEACHERS]
     light, full = lights(plane, background, x[bright], y[bright], SIGHT, saturation)
     # the shapes of fainter stars are noise
@@ -166,14 +166,15 @@ def _teachers(
     x, y = centroid(smooth, stamps.x, stamps.y, shape)
     window = window_for(shape)
     mass, _, seen = moments(smooth, *stamps.corner(x, y), window)
-    ratio = np.nan_to_num(psf.axes @ (own_shape(seen, window) - blur * np.eye(2)) @ psf.axes.T)
+    ratio = psf.axes @ (own_shape(seen, window) - blur * np.eye(2)) @ psf.axes.T
+    ratio[np.isnan(ratio)] = 0
     extremes = squared_widths(ratio)
     near = (extremes[:, 0] > NARROW) & (extremes[:, 1] < BROAD)
     noise = row_medians(stamps.noise.reshape(len(x), -1))
     weight = np.clip(mass / noise, 1, LOUDEST) ** 2
     psf = widened(psf, x[near], y[near], ratio[near], weight[near])
     widths = relative_widths(seen, psf.shapes_at(x, y) + blur * np.eye(2), window)
-    alike = np.flatnonzero((widths[:, 0] > 0.6) & (widths[:, 1] < 1.4))
+    alike = ((widths[:, 0] > 0.6) & (widths[:, 1] < 1.4)).nonzero()[0]
     alike = alike[: max(TEACHING_PIXELS // stamps.signal[0].size, 40)]
     return psf, stamps.take(alike), x[alike], y[alike]
 
@@ -268,7 +269,7 @@ def respond(
     if len(gain) > 1:
         gain, spread = _gains(stamps, psf.at(x, y).evaluate(*stamps.corner(x, y), stamps.size), before)
     photon, misfit = light_noise(
-        stamps.noise, fit.model, fit.residual, fit.used, fit.leverage, np.flatnonzero(sound), before.dn_per_photon,
+        stamps.noise, fit.model, fit.residual, fit.used, fit.leverage, sound.nonzero()[0], before.dn_per_photon,
         before.misfit, DEVIANT,
     )  # fmt: skip
     return Response(gain, spread, photon, misfit)
@@ -292,7 +293,7 @@ def _refined(stamps: Stamps, psf: Psf, fit: Fit, sound: np.ndarray, response: Re
     x, y = fit.x[sound], fit.y[sound]
     # 2 % of the model as extra noise: the brightest star must not be the only teacher
     brightness, weight = unit_light(
-        stamps.signal, stamps.noise, stamps.phase, fit.model, fit.used, np.flatnonzero(sound), fit.flux, fit.gains,
+        stamps.signal, stamps.noise, stamps.phase, fit.model, fit.used, sound.nonzero()[0], fit.flux, fit.gains,
         response.dn_per_photon, response.misfit**2 + 0.02**2,
     )  # fmt: skip
     left, top = stamps.corner(x, y)

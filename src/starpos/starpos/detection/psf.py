@@ -12,7 +12,6 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from starpos.core.field import local, monomials, shapes_of
 from starpos.core.psf import evaluated
@@ -24,8 +23,10 @@ MONOMIALS = 6
 NARROW, BROAD = 0.25, 6.0
 # Where in the box (0 to 1 in x, in y) the widest star is looked for.
 QUARTERS = np.tile(np.arange(5) / 4, 5), np.repeat(np.arange(5) / 4, 5)
-# The series of a Gaussian.
-GAUSSIAN = np.ones((1, 1, 1))
+# Squared widths and series of a Gaussian that is the same everywhere.
+ALIKE, GAUSSIAN = np.eye(2)[None], np.ones((1, 1, 1))
+# Where nobody asks for more than one place.
+ONE_PLACE = np.zeros(1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,7 +129,7 @@ def _points(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.ascontiguousarray(x, float), np.ascontiguousarray(y, float)
 
 
-def gaussian(shape: np.ndarray, x: ArrayLike = (0.0,), y: ArrayLike = (0.0,)) -> Psf:
+def gaussian(shape: np.ndarray, x: np.ndarray = ONE_PLACE, y: np.ndarray = ONE_PLACE) -> Psf:
     """The Psf of an elliptical Gaussian of covariance shape (2, 2) px2; its box holds the points x, y (N,) px.
 
     The first axis is the long one.
@@ -139,8 +140,8 @@ def gaussian(shape: np.ndarray, x: ArrayLike = (0.0,), y: ArrayLike = (0.0,)) ->
     along, across = (mean + half) ** -0.5, (mean - half) ** -0.5
     cos, sin = math.cos(angle), math.sin(angle)
     axes = np.array([[cos * along, sin * along], [-sin * across, cos * across]])
-    box = np.array([[np.min(x), np.min(y)], [np.max(x), np.max(y)]], float)
-    return Psf(axes, np.eye(2)[None], np.ones((1, 1, 1)), box)
+    box = np.array([[x.min(), y.min()], [x.max(), y.max()]], float)
+    return Psf(axes, ALIKE, GAUSSIAN, box)
 
 
 def power(widths: np.ndarray, exponent: float) -> np.ndarray:

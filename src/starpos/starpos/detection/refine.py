@@ -148,14 +148,14 @@ def refine(
     candidates = terms.candidates.reshape(-1, len(right)).view(np.uint8)
     normal.flat[:: len(right) + 1] += LIKELY**-2
     found = chosen(normal, right, candidates, terms.price.ravel())
-    if not np.all(np.isfinite(found)):
+    if not np.isfinite(found).all():
         return psf
     found = found.reshape(count, places)
     if places > 1:
         psf, found = _absorbed(psf, field, terms, found)
-    used = np.any(found, axis=1)
+    used = found.any(1)
     i, j = np.concatenate([[(0, 0)], terms.orders[used]]).T
-    series = np.zeros((places if np.any(found[:, 1:]) else 1, i.max() + 1, j.max() + 1))
+    series = np.zeros((places if found[:, 1:].any() else 1, i.max() + 1, j.max() + 1))
     # unit flux: the other terms integrate to zero
     series[0, 0, 0] = 1
     series[:, i[1:], j[1:]] = found[used, : len(series)].T

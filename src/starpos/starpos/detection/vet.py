@@ -79,7 +79,7 @@ def measure(
         begin = centroid(grey(stamps.signal, background)[0], stamps.x, stamps.y, psf.shapes_at(*peak))
         fit = fit_stars(stamps, psf, *begin, lesson.response)
         strange = surprising(stamps, fit)
-        rows = np.flatnonzero(strange)
+        rows = strange.nonzero()[0]
         if len(rows):
             odd.append((stamps.take(rows), spike[rows], rows_of(fit, rows)))
         parts.append(measured((stamps, spike, fit), ~strange))

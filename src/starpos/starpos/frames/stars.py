@@ -67,21 +67,21 @@ class Stars(Exposure):
             self._set(name, np.float64, (n,), place)
         self._set("covariance", np.float64, (n, 2, 2), place)
         self._set("flags", np.int64, (n,), place)
-        if np.any((self.flags < 0) | (self.flags > 255)):
+        if ((self.flags < 0) | (self.flags > 255)).any():
             raise FrameError(
                 f"{place}: the stars' flags are not numbers from 0 to 255; give sums of the flags."
             )
         object.__setattr__(self, "flags", self.flags.astype(np.uint8))
         c = self.covariance
-        if np.any(c > MOST_VARIANCE_PX2):
+        if (c > MOST_VARIANCE_PX2).any():
             raise FrameError(f"{place}: a star's error is {np.sqrt(c.max()):.1g} px; leave such stars out.")
         variances = c[:, 0, 0] * c[:, 1, 1]
         definite = (c[:, 0, 0] > 0) & (c[:, 1, 1] > 0) & (variances > c[:, 0, 1] ** 2)
-        if not np.all(definite & ((c[:, 0, 1] - c[:, 1, 0]) ** 2 <= SYMMETRIC**2 * variances)):
+        if not (definite & ((c[:, 0, 1] - c[:, 1, 0]) ** 2 <= SYMMETRIC**2 * variances)).all():
             raise FrameError(
                 f"{place}: a star's covariance is not symmetric and positive definite; measure its centroid again."
             )
-        if np.any(np.diff(self.flux) > 0):
+        if (self.flux[1:] > self.flux[:-1]).any():
             raise FrameError(f"{place}: the stars are not sorted; give them brightest first.")
 
     def _set(self, name: str, dtype: type, shape: tuple[int, ...], place: str) -> None:
@@ -91,7 +91,7 @@ class Stars(Exposure):
             raise FrameError(f"{place}: the stars' {name} are not numbers; give an array of them.") from None
         if value.shape != shape:
             raise FrameError(f"{place}: the stars' {name} has the shape {value.shape}, it must be {shape}.")
-        if not np.all(np.isfinite(value)):
+        if not np.isfinite(value).all():
             raise FrameError(f"{place}: the stars' {name} holds NaN or infinity; leave such stars out.")
         object.__setattr__(self, name, value)
 
