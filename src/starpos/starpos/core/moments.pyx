@@ -263,7 +263,8 @@ def own_shapes(
     first                px2 along any axis, where it begins
     narrowest_window     px2, of a window
     narrowest, widest    px2: limits of the covariances; where nothing can be measured they are the widest
-    rounds               of windows; in each, so many rounds of centring, at most `farthest` px from the middle
+    rounds               of windows; in each but the first, which is wide, so many rounds of centring, at most `farthest` px
+                         from the middle
 
     Returns also their squared widths (N, 2) px2, the smaller first unless only that could not be measured.
     """
@@ -292,7 +293,7 @@ def own_shapes(
                 through = clipped_to(own, narrowest_window, INFINITY, 1.0)
                 _set_window(through, window)
                 _set_gain(own, inverse(through), gain)
-                _centre(&image, window, gain, begin, centring, farthest, place)
+                _centre(&image, window, gain, begin, centring if round_ else 0, farthest, place)
                 _moments(&image, window, -place[0], -place[1], found)
                 own = shape_before(Shape(found[3], found[4], found[5]), through)
                 if isnan(own.xx):

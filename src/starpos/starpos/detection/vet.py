@@ -51,7 +51,7 @@ def measure(
     """Measure the stars among the peaks x, y (N,) int px: columns x, y, flux, snr, covariance, flags, chi2, wide.
 
     The rows are in no order. saturation is the DN from which a pixel is saturated, min_snr the SNR a star must have, and
-    chunk how many are measured at once.
+    chunk about how many are measured at once.
     """
     psf = lesson.psf
 
@@ -73,8 +73,11 @@ def measure(
     parts: list[dict[str, np.ndarray]] = []
     # those of several chunks together, because most chunks have a few
     odd: list[Fitted] = []
-    for first in range(0, len(x), chunk):
-        peak = x[first : first + chunk], y[first : first + chunk]
+    # chunks of one size: a small one at the end would take nearly as long to begin
+    count = max(1, round(len(x) / chunk))
+    ends = [len(x) * k // count for k in range(count + 1)]
+    for first, end in zip(ends, ends[1:]):
+        peak = x[first:end], y[first:end]
         stamps, spike = cut_at(*peak)
         begin = centroid(grey(stamps.signal, background)[0], stamps.x, stamps.y, psf.shapes_at(*peak))
         fit = fit_stars(stamps, psf, *begin, lesson.response)
@@ -83,7 +86,7 @@ def measure(
         if len(rows):
             odd.append((stamps.take(rows), spike[rows], rows_of(fit, rows)))
         parts.append(measured((stamps, spike, fit), ~strange))
-        if odd and (sum(len(star[1]) for star in odd) >= chunk or first + chunk >= len(x)):
+        if odd and (sum(len(star[1]) for star in odd) >= chunk or end == len(x)):
             parts += with_companions(odd)
             odd = []
     if len(parts) == 1:

@@ -23,12 +23,12 @@ def stars(rng, n, size=13):
 
 
 def plain_own_shapes(signal, first, narrowest_window, narrowest, widest):
-    """Shapes (N, 2, 2) and squared widths (N, 2) by whole arrays, in 3 rounds of 2 centrings."""
+    """Shapes (N, 2, 2) and squared widths (N, 2) by whole arrays, in 3 rounds; in all but the first of 2 centrings."""
     n, half = len(signal), signal.shape[1] // 2
     middle, shape = np.full(n, half), np.eye(2)[None].repeat(n, 0) * first
-    for _ in range(3):
+    for centrings in (0, 2, 2):
         window = clipped(shape, narrowest_window, np.inf, 1.0)
-        x, y = centred(signal, middle, middle, window, np.eye(2) + shape @ inverted(window), 2, 2.0)
+        x, y = centred(signal, middle, middle, window, np.eye(2) + shape @ inverted(window), centrings, 2.0)
         own = np.nan_to_num(before(windowed(signal, -x, -y, window)[2], window))
         values, vectors = np.linalg.eigh(own)
         values = np.where(values > 0, np.clip(values, narrowest, widest), widest)
