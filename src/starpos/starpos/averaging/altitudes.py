@@ -79,7 +79,7 @@ def circle_of(
 ) -> Circle:
     """The circle of one frame; FixError where its direction or A3 tell no altitude."""
     level = mounting.level(tilt)
-    seen = level.camera @ camera.directions(*camera.centre_px)
+    seen = level.camera @ camera.centre_ray
     sine = np.hypot(seen[0], seen[1])
     if sine < LEAST_SINE or seen[2] < MIN_COS_ZENITH:
         raise FixError(

@@ -183,7 +183,7 @@ def solve_fix(
         clock_stddev_s,
         stamp_stddev_s,
     )
-    axis = g @ camera.directions(*camera.centre_px)
+    axis = g @ camera.centre_ray
     bent = math.dist(axis, refraction.unbend(axis))
     return Fix(
         utc_unix_s=earth.utc_unix_s,

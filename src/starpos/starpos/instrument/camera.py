@@ -95,6 +95,11 @@ class Camera:
         return (self.width - 1) / 2, (self.height - 1) / 2
 
     @cached_property
+    def centre_ray(self) -> np.ndarray:
+        """Unit vector (3,) in C of the frame's centre."""
+        return self.directions(*self.centre_px)
+
+    @cached_property
     def centre_from_axis(self) -> tuple[float, float, float]:
         """How far the frame's centre is from the axis, across and down, and the height of a row, in focal lengths."""
         x, y = self.centre_px
@@ -119,7 +124,8 @@ class Camera:
         """
         places = self._places(x, y)
         v = self.lens.rays(places)
-        if self.model == PLUMB_BOB and (np.isnan(v[..., 0]) & np.isfinite(places).all(-1)).any():
+        lost = np.isnan(v[..., 0])
+        if self.model == PLUMB_BOB and lost.any() and (lost & np.isfinite(places).all(-1)).any():
             raise InstrumentError(
                 f"distortion {self.distortion} cannot be inverted inside the frame: calibrate the camera again"
             )
