@@ -7,11 +7,14 @@ from libc.stdlib cimport free, malloc
 
 import numpy as np
 
+from starpos.core.algebra cimport fetch
 from starpos.core.triangles cimport CODES, bin_of, code_of, is_counter_clockwise
 
 
 cdef enum:
     MOST_TAKEN = 32
+    # Triangles whose places in memory are asked for before they are written.
+    AHEAD = 16
 
 
 cdef class Cells:
@@ -177,8 +180,10 @@ def binned(
                 corners[kept, i], shape[kept, i] = corner[i], <unsigned short>code[i]
             turns[kept] = is_counter_clockwise(&v[corner[0], 0], &v[corner[1], 0], &v[corner[2], 0])
             bin[kept] = bin_of(code[0], code[1], code[2])
-            start[bin[kept] + 1] += 1
             kept += 1
+        for k in range(kept):
+            fetch(&start[bin[min(k + 2 * AHEAD, kept - 1)] + 1])
+            start[bin[k] + 1] += 1
     np.cumsum(starts, out=starts)
     ordered = np.empty((kept, 3), np.uint16), np.empty((kept, 3), np.int32), np.empty(kept, np.uint8)
     next_ = starts[:bins].copy()
@@ -189,6 +194,12 @@ def binned(
     cdef Py_ssize_t to
     with nogil:
         for k in range(kept):
+            # the places are far from each other
+            fetch(&next[bin[min(k + 2 * AHEAD, kept - 1)]])
+            to = next[bin[min(k + AHEAD, kept - 1)]]
+            fetch(&shape_out[min(to, kept - 1), 0])
+            fetch(&corners_out[min(to, kept - 1), 0])
+            fetch(&turns_out[min(to, kept - 1)])
             to = next[bin[k]]
             next[bin[k]] += 1
             for i in range(3):
