@@ -19,6 +19,8 @@ cdef enum:
     LOG_MARKS = 18
     # Of fewer candidates each one's support is counted at once.
     MANY = 2000
+    # Candidates whose sides are asked for before they are counted.
+    SLOTS_AHEAD = 16
 
 # Tolerances of smallest and largest angles that are too wide to tell anything, rad.
 cdef double WORST_SMALLEST = 0.1, WORST_LARGEST = 0.2
@@ -355,36 +357,49 @@ cdef void _drop_lonely(Search *s, unsigned char *marks) noexcept nogil:
     s.count = kept
 
 
+cdef struct Slot:
+    # How many candidates have a side; 0 in place of its key if none has.
+    key_t side
+    long long count
+
+
 cdef int _support(Search *s) except -1:
     """Count for each candidate how many others share a side with it."""
-    cdef int slots = 64, k, i, slot, others
-    cdef key_t[3] side
+    cdef int slots = 64, k, i, others
+    cdef long long slot
+    cdef key_t *side
     while slots < 4 * s.count:
         slots *= 2
-    cdef key_t *keys = <key_t *>calloc(slots, sizeof(key_t))
-    cdef int *counts = <int *>calloc(slots, sizeof(int))
-    cdef int *places = <int *>malloc(3 * (s.count + 1) * sizeof(int))
+    cdef Slot *table = <Slot *>calloc(slots, sizeof(Slot))
+    # the sides of each candidate, and later the slots of these
+    cdef key_t *sides = <key_t *>malloc(3 * (s.count + 1) * sizeof(key_t))
     try:
-        if keys == NULL or counts == NULL or places == NULL:
+        if table == NULL or sides == NULL:
             raise MemoryError
-        for k in range(s.count):
-            _sides(&s.found[k], side)
+        for k in range(s.count + SLOTS_AHEAD):
+            if k < s.count:
+                _sides(&s.found[k], sides + 3 * k)
+                for i in range(3):
+                    fetch(&table[(sides[3 * k + i] >> 20) & (slots - 1)])
+            if k < SLOTS_AHEAD:
+                continue
+            side = sides + 3 * (k - SLOTS_AHEAD)
             for i in range(3):
                 slot = (side[i] >> 20) & (slots - 1)
-                while keys[slot] != 0 and keys[slot] != side[i]:
+                while table[slot].side != 0 and table[slot].side != side[i]:
                     slot = (slot + 1) & (slots - 1)
-                keys[slot] = side[i]
-                counts[slot] += 1
-                places[3 * k + i] = slot
+                table[slot].side = side[i]
+                table[slot].count += 1
+                side[i] = slot
         for k in range(s.count):
             others = -3
             for i in range(3):
-                others += counts[places[3 * k + i]]
+                fetch(&table[sides[3 * min(k + SLOTS_AHEAD, s.count - 1) + i]])
+                others += <int>table[sides[3 * k + i]].count
             s.found[k].support = others
     finally:
-        free(keys)
-        free(counts)
-        free(places)
+        free(table)
+        free(sides)
     return 0
 
 
