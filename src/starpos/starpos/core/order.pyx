@@ -37,25 +37,3 @@ def quantile(const double[::1] values, double share):
     low = <Py_ssize_t>place
     cdef double[::1] order = np.sort(values)
     return order[low] + (place - low) * (order[min(low + 1, values.shape[0] - 1)] - order[low])
-
-
-def row_medians(const float[:, ::1] values):
-    """The medians (N,) of rows (N, K), K > 0."""
-    cdef Py_ssize_t n = values.shape[0], k
-    cdef int many = values.shape[1], j, equal
-    if not many:
-        raise ValueError("rows of no values have no median")
-    out = np.empty(n)
-    cdef double[::1] found = out
-    cdef double *copy = <double *>malloc(many * sizeof(double))
-    if copy == NULL:
-        raise MemoryError
-    for k in range(n):
-        equal = 0
-        for j in range(many):
-            copy[j] = values[k, j]
-            equal += values[k, j] == values[k, 0]
-        # the noise of most stamps is the same everywhere
-        found[k] = copy[0] if equal == many else middle(copy, many)
-    free(copy)
-    return out

@@ -163,7 +163,7 @@ def around(
     return skies[0], skies[1], good, white, marks[2]
 
 
-def lights(
+def light_around(
     const pixel_t[:, ::1] plane, const Py_ssize_t[::1] x, const Py_ssize_t[::1] y, int reach, const float[:, ::1] level,
     double saturation,
 ):

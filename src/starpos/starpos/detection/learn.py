@@ -10,7 +10,7 @@ from scipy import spatial
 from starpos.core.moments import own_shapes
 from starpos.core.neighbours import near_pairs
 from starpos.core.noise import light_noise, of_phases, strangeness, typical_gains, unit_light
-from starpos.core.order import median, quantile, row_medians
+from starpos.core.order import median, quantile
 from starpos.core.shapes import squared_widths
 from starpos.core.stamps import greyed
 from starpos.detection.background import Background
@@ -170,8 +170,9 @@ def _teachers(
     ratio[np.isnan(ratio)] = 0
     extremes = squared_widths(ratio)
     near = (extremes[:, 0] > NARROW) & (extremes[:, 1] < BROAD)
-    noise = row_medians(stamps.noise.reshape(len(x), -1))
-    weight = np.clip(mass / noise, 1, LOUDEST) ** 2
+    # of the four phases of a mosaic
+    core = slice(stamps.reach, stamps.reach + 2)
+    weight = np.clip(mass / stamps.noise[:, core, core].mean((1, 2)), 1, LOUDEST) ** 2
     psf = widened(psf, x[near], y[near], ratio[near], weight[near])
     widths = relative_widths(seen, psf.shapes_at(x, y) + blur * np.eye(2), window)
     alike = ((widths[:, 0] > 0.6) & (widths[:, 1] < 1.4)).nonzero()[0]
@@ -252,7 +253,7 @@ def grey(signal: np.ndarray, background: Background) -> tuple[np.ndarray, float]
 
 
 def _isolated(x: np.ndarray, y: np.ndarray, height: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Which peaks (N,) have no neighbour within SIGHT px above a fiftieth of their height, and which have no higher one."""
+    """Which peaks (N,) have no neighbour in SIGHT above a fiftieth of their height, and which have no higher one."""
     pairs = near_pairs(x.astype(float), y.astype(float), SIGHT)
     alone, high = np.ones((2, len(x)), bool)
     for a, b in (pairs.T, pairs.T[::-1]):

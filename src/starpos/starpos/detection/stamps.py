@@ -5,8 +5,8 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from starpos.core import stamps as core
 from starpos.core.beside import dots, lonely, rims
+from starpos.core.stamps import around, light_around
 from starpos.detection.background import Background
 from starpos.normal import SIGMA_PER_MAD
 
@@ -69,7 +69,7 @@ def cut(
 ) -> Stamps:
     """The Stamps of (2 reach + 1) px around the pixels x, y (N,) int of plane (h, w)."""
     x, y = (np.ascontiguousarray(v, np.intp) for v in (x, y))
-    signal, noise, good, full, phase = core.around(plane, x, y, reach, *background.near(x, y), saturation)
+    signal, noise, good, full, phase = around(plane, x, y, reach, *background.near(x, y), saturation)
     grid = np.arange(-reach, reach + 1)
     for streak in background.streaks:
         more, least = streak.at((y[:, None] + grid)[:, :, None], (x[:, None] + grid)[:, None, :])
@@ -82,7 +82,7 @@ def lights(
 ) -> tuple[np.ndarray, np.ndarray]:
     """The signal alone of such Stamps, (N, S, S), and whether one of their pixels is saturated, (N,) bool."""
     x, y = (np.ascontiguousarray(v, np.intp) for v in (x, y))
-    signal, full = core.lights(plane, x, y, reach, background.near(x, y)[0], saturation)
+    signal, full = light_around(plane, x, y, reach, background.near(x, y)[0], saturation)
     grid = np.arange(-reach, reach + 1)
     for streak in background.streaks:
         more, _ = streak.at((y[:, None] + grid)[:, :, None], (x[:, None] + grid)[:, None, :])

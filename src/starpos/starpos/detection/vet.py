@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Turn peaks into measured stars: fit each, leave out what is not a star, flag the doubtful ones."""
 
+from itertools import pairwise
+
 import numpy as np
 
 from starpos.core.neighbours import near_pairs
@@ -63,12 +65,17 @@ def measure(
     def measured(stars: Fitted, wanted: np.ndarray) -> dict[str, np.ndarray]:
         return _columns(*stars, background, lesson, min_snr, wanted)
 
-    def with_companions(odd: list[Fitted]) -> list[dict[str, np.ndarray]]:
-        stamps, spikes, fits = zip(*odd, strict=True)
-        stars: Fitted = joined(stamps), np.concatenate(spikes), joined(fits)
+    def one_after_the_other(parts: list[Fitted]) -> Fitted:
+        stamps, spikes, fits = zip(*parts, strict=True)
+        return joined(stamps), np.concatenate(spikes), joined(fits)
+
+    def with_companions(odd: list[Fitted]) -> dict[str, np.ndarray]:
+        stars = one_after_the_other(odd)
         paired, pairs = pairs_among(stars, psf, lesson.response, cut_at)
-        alone = measured(stars, ~paired)
-        return [alone] if pairs is None else [alone, measured(pairs, np.ones(len(pairs[1]), bool))]
+        if pairs is not None:
+            alone = stars[0].take(~paired), stars[1][~paired], rows_of(stars[2], ~paired)
+            stars = one_after_the_other([alone, pairs])
+        return measured(stars, np.ones(len(stars[1]), bool))
 
     parts: list[dict[str, np.ndarray]] = []
     # those of several chunks together, because most chunks have a few
@@ -76,7 +83,7 @@ def measure(
     # chunks of one size: a small one at the end would take nearly as long to begin
     count = max(1, round(len(x) / chunk))
     ends = [len(x) * k // count for k in range(count + 1)]
-    for first, end in zip(ends, ends[1:]):
+    for first, end in pairwise(ends):
         peak = x[first:end], y[first:end]
         stamps, spike = cut_at(*peak)
         begin = centroid(grey(stamps.signal, background)[0], stamps.x, stamps.y, psf.shapes_at(*peak))
@@ -87,7 +94,7 @@ def measure(
             odd.append((stamps.take(rows), spike[rows], rows_of(fit, rows)))
         parts.append(measured((stamps, spike, fit), ~strange))
         if odd and (sum(len(star[1]) for star in odd) >= chunk or end == len(x)):
-            parts += with_companions(odd)
+            parts.append(with_companions(odd))
             odd = []
     if len(parts) == 1:
         return parts[0]

@@ -25,7 +25,10 @@ def peaks(request, rng):
 def squares(peaks, reach):
     """Signal and noise (N, pixels) around the peaks."""
     plane, x, y, level, noise = peaks
-    return [values.reshape(len(x), -1).astype(float) for values in around(plane, x, y, reach, level, noise, 1e9)[:2]]
+    return [
+        values.reshape(len(x), -1).astype(float)
+        for values in around(plane, x, y, reach, level, noise, 1e9)[:2]
+    ]
 
 
 def test_dots_have_their_light_in_one_or_two_pixels(peaks):

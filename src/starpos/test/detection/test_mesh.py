@@ -7,7 +7,7 @@ from scipy import ndimage
 
 from starpos.core.background import between, near
 from starpos.core.mesh import above, evened
-from starpos.core.order import median, quantile, row_medians
+from starpos.core.order import median, quantile
 from starpos.core.peaks import peaks, smoothed
 from starpos.core.sparse import any_flat, bright_squares, third_highest, thirds
 from starpos.detection.finding import SHARP, WIDE
@@ -95,15 +95,6 @@ def test_medians_and_quantiles_are_those_of_numpy(n, rng):
     for share in (0, 0.3, 0.97, 1):
         assert quantile(values, share) == pytest.approx(np.quantile(values, share), abs=1e-15)
     assert np.isnan(median(np.append(values, np.nan)))
-
-
-@pytest.mark.parametrize("n", [1, 2, 9, 100])
-def test_medians_of_rows_are_those_of_numpy(n, rng):
-    values = rng.normal(0, 1, (7, n)).astype(np.float32)
-    values[2:4] = values[2:4, :1]
-    np.testing.assert_allclose(row_medians(values), np.median(values.astype(float), axis=1), atol=1e-15)
-    with pytest.raises(ValueError, match="no median"):
-        row_medians(values[:, :0])
 
 
 def test_nothing_has_no_median_and_no_quantile():

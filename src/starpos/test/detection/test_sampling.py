@@ -6,7 +6,7 @@ import pytest
 from scipy import ndimage
 
 from starpos.core.background import between, sampled
-from starpos.core.stamps import around, lights
+from starpos.core.stamps import around, light_around
 from starpos.detection.background import CLIP
 from starpos.normal import SIGMA_PER_MAD
 
@@ -65,7 +65,7 @@ def test_stamps_are_the_pixels_around_stars(phases, rng):
     )
     for found, plain in zip(around(plane, x, y, 3, level, noise, 900), expected, strict=True):
         np.testing.assert_array_equal(found, plain)
-    signal, full = lights(plane, x, y, 3, level, 900)
+    signal, full = light_around(plane, x, y, 3, level, 900)
     np.testing.assert_array_equal(signal, expected[0])
     np.testing.assert_array_equal(full, (pixels >= 900).any((1, 2)))
 
@@ -81,6 +81,6 @@ def test_what_lies_beyond_the_frame_is_refused():
     with pytest.raises(ValueError, match="phases"):
         around(plane, np.zeros(2, int), np.zeros(1, int), 1, *np.zeros((2, 2, 1), np.float32), 1.0)
     with pytest.raises(ValueError, match="phases"):
-        lights(plane, np.zeros(2, int), np.zeros(1, int), 1, np.zeros((2, 1), np.float32), 1.0)
+        light_around(plane, np.zeros(2, int), np.zeros(1, int), 1, np.zeros((2, 1), np.float32), 1.0)
     with pytest.raises(ValueError, match="nothing to see"):
-        lights(plane, np.zeros(1, int), np.zeros(1, int), -1, np.zeros((1, 1), np.float32), 1.0)
+        light_around(plane, np.zeros(1, int), np.zeros(1, int), -1, np.zeros((1, 1), np.float32), 1.0)
