@@ -3,14 +3,17 @@
 
 cdef extern from *:
     """
-    /* Chosen when the module is loaded: WIDE with the same results, FUSED with products and sums rounded once, not twice. */
+    /* Chosen when the module is loaded: WIDE with the same results, FUSED with products and sums rounded once, not twice.
+       Of those that stand in a .pxd a module may use a few. */
     #if defined(__x86_64__) && defined(__GLIBC__) && defined(__GNUC__) && !defined(__clang__)
-    #define STARPOS_WIDE __attribute__((target_clones("avx2", "default")))
+    #define STARPOS_WIDE __attribute__((unused, target_clones("avx2", "default")))
+    #elif defined(__GNUC__)
+    #define STARPOS_WIDE __attribute__((unused))
     #else
     #define STARPOS_WIDE
     #endif
     #if defined(__x86_64__) && defined(__GLIBC__) && defined(__GNUC__) && !defined(__clang__) && __GNUC__ >= 12
-    #define STARPOS_FUSED __attribute__((target_clones("arch=x86-64-v4", "arch=x86-64-v3", "default")))
+    #define STARPOS_FUSED __attribute__((unused, target_clones("arch=x86-64-v4", "arch=x86-64-v3", "default")))
     #else
     #define STARPOS_FUSED STARPOS_WIDE
     #endif
