@@ -72,40 +72,27 @@ def pairs_among(
     crowd, spike, alone = stars
     light = _light(crowd, psf, alone.x, alone.y, alone.flux, alone.gains)
     alone = replace(alone, model=light, residual=crowd.signal - light)
-    before = crowd.good * alone.residual**2 / response.variance(crowd.noise, alone.model)
-    pairs = _fit_pairs(crowd, alone, psf, response)
-    x, y, flux, used = pairs.x, pairs.y, pairs.flux, pairs.used
-    pixels = used.sum((1, 2))
-    freedom = np.maximum(pixels - 6, 1)
-    apart = np.hypot(*(psf.at(x[0], y[0]).axes @ np.stack([x[1] - x[0], y[1] - y[0]], 1)[..., None]).T[0])
-    away = np.maximum(np.abs(x - crowd.x), np.abs(y - crowd.y))
-    with np.errstate(invalid="ignore"):
-        real = (flux > FAINTEST * pairs.flux_sigma).all(0) & np.isfinite(pairs.chi2) & (apart > CLOSEST)
-        real &= (away[0] < crowd.reach - 1) & (away[1] < crowd.reach + 2)
-        real &= (before * used).sum((1, 2)) - pairs.chi2 > GAIN * np.maximum(pairs.chi2 / freedom, 1)
-        real &= flux[1] > DIMMEST * flux[0]
+    real, pairs = _real_pairs(crowd, alone, psf, response)
     if not real.any():
         return real, None
-    used, whole = used[real], away[1, real] < crowd.reach - 1
-    x, y, flux, gains, sigma, covariance, models = (
-        values[:, real]
-        for values in (x, y, flux, pairs.gains, pairs.flux_sigma, pairs.covariance, pairs.models)
+    both, models, chi2 = crowd.take(real), pairs.models, pairs.chi2 / _freedom(pairs)
+    one, other = (
+        {name: getattr(pairs, name)[k] for name in ("x", "y", "flux", "flux_sigma", "covariance", "gains")}
+        for k in (0, 1)
     )
-    both = crowd.take(real)
     first = replace(
-        rows_of(alone, real), x=x[0], y=y[0], flux=flux[0], flux_sigma=sigma[0], covariance=covariance[0], gains=gains[0],
-        chi2=(pairs.chi2 / freedom)[real], pixels=pixels[real], residual=both.signal - models.sum(0), model=models[0],
-        used=used, outlier=np.zeros_like(used),
+        rows_of(alone, real), **one, chi2=chi2, pixels=_pixels(pairs), residual=both.signal - models.sum(0), model=models[0],
+        used=pairs.used, outlier=np.zeros_like(pairs.used),
     )  # fmt: skip
     first_stamps = replace(both, signal=both.signal - models[1])
-    second_stamps, second_spike = cut_at(np.rint(x[1]).astype(int), np.rint(y[1]).astype(int))
-    light = _light(second_stamps, psf, x[0], y[0], flux[0], gains[0])
+    second_stamps, second_spike = cut_at(np.rint(other["x"]).astype(int), np.rint(other["y"]).astype(int))
+    light = _light(second_stamps, psf, one["x"], one["y"], one["flux"], one["gains"])
     noise = np.sqrt(response.variance(second_stamps.noise, light))
     second_stamps = replace(second_stamps, signal=second_stamps.signal - light, noise=noise)
-    second = fit_stars(second_stamps, psf, x[1], y[1], response, rounds=3)
+    second = fit_stars(second_stamps, psf, other["x"], other["y"], response, rounds=3)
     # if the whole companion lies on the first star's stamp, the fit of both together is the better one
-    together = {"x": x[1], "y": y[1], "flux": flux[1], "flux_sigma": sigma[1], "covariance": covariance[1]}
-    together |= {"gains": gains[1], "chi2": first.chi2}
+    whole = _away(both, pairs)[1] < both.reach - 1
+    together = other | {"chi2": chi2}
     for name, value in together.items():
         own = getattr(second, name)
         together[name] = np.where(whole.reshape(-1, *[1] * (own.ndim - 1)), value, own)
@@ -114,6 +101,39 @@ def pairs_among(
         np.concatenate([spike[real], second_spike]),
         joined([first, replace(second, **together)]),
     )
+
+
+def _real_pairs(stamps: Stamps, alone: Fit, psf: FieldPsf, response: Response) -> tuple[np.ndarray, Pairs]:
+    """Which of N stars, fitted alone, have companions, (N,) bool, and the Pairs of those that have."""
+    pairs = _fit_pairs(stamps, alone, psf, response)
+    x, y, flux = pairs.x, pairs.y, pairs.flux
+    apart = np.hypot(*(psf.at(x[0], y[0]).axes @ np.stack([x[1] - x[0], y[1] - y[0]], 1)[..., None]).T[0])
+    away = _away(stamps, pairs)
+    before = stamps.good * pairs.used * alone.residual**2 / response.variance(stamps.noise, alone.model)
+    with np.errstate(invalid="ignore"):
+        real = (flux > FAINTEST * pairs.flux_sigma).all(0) & np.isfinite(pairs.chi2) & (apart > CLOSEST)
+        real &= (away[0] < stamps.reach - 1) & (away[1] < stamps.reach + 2)
+        real &= before.sum((1, 2)) - pairs.chi2 > GAIN * np.maximum(pairs.chi2 / _freedom(pairs), 1)
+        real &= flux[1] > DIMMEST * flux[0]
+    of_stars = ("used", "chi2")
+    return real, Pairs(
+        **{f.name: getattr(pairs, f.name)[real if f.name in of_stars else (slice(None), real)] for f in fields(Pairs)}
+    )
+
+
+def _pixels(pairs: Pairs) -> np.ndarray:
+    """How many pixels (N,) took part in the fits."""
+    return pairs.used.sum((1, 2))
+
+
+def _freedom(pairs: Pairs) -> np.ndarray:
+    """Degrees of freedom (N,) of the fits."""
+    return np.maximum(_pixels(pairs) - 6, 1)
+
+
+def _away(stamps: Stamps, pairs: Pairs) -> np.ndarray:
+    """How far both stars (2, N) are from the middles of their stamps, px along the farther axis."""
+    return np.maximum(np.abs(pairs.x - stamps.x), np.abs(pairs.y - stamps.y))
 
 
 def surprising(stamps: Stamps, fit: Fit) -> np.ndarray:

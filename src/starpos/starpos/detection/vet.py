@@ -69,8 +69,22 @@ def measure(
         stamps, spikes, fits = zip(*parts, strict=True)
         return joined(stamps), np.concatenate(spikes), joined(fits)
 
-    def with_companions(odd: list[Fitted]) -> dict[str, np.ndarray]:
+    # those of several chunks together, because most chunks have a few
+    odd: list[Fitted] = []
+
+    def one_chunk(x: np.ndarray, y: np.ndarray) -> dict[str, np.ndarray]:
+        stamps, spike = cut_at(x, y)
+        begin = centroid(grey(stamps.signal, background)[0], stamps.x, stamps.y, psf.shapes_at(x, y))
+        fit = fit_stars(stamps, psf, *begin, lesson.response)
+        strange = surprising(stamps, fit)
+        rows = strange.nonzero()[0]
+        if len(rows):
+            odd.append((stamps.take(rows), spike[rows], rows_of(fit, rows)))
+        return measured((stamps, spike, fit), ~strange)
+
+    def with_companions() -> dict[str, np.ndarray]:
         stars = one_after_the_other(odd)
+        odd.clear()
         paired, pairs = pairs_among(stars, psf, lesson.response, cut_at)
         if pairs is not None:
             alone = stars[0].take(~paired), stars[1][~paired], rows_of(stars[2], ~paired)
@@ -78,24 +92,13 @@ def measure(
         return measured(stars, np.ones(len(stars[1]), bool))
 
     parts: list[dict[str, np.ndarray]] = []
-    # those of several chunks together, because most chunks have a few
-    odd: list[Fitted] = []
     # chunks of one size: a small one at the end would take nearly as long to begin
     count = max(1, round(len(x) / chunk))
     ends = [len(x) * k // count for k in range(count + 1)]
     for first, end in pairwise(ends):
-        peak = x[first:end], y[first:end]
-        stamps, spike = cut_at(*peak)
-        begin = centroid(grey(stamps.signal, background)[0], stamps.x, stamps.y, psf.shapes_at(*peak))
-        fit = fit_stars(stamps, psf, *begin, lesson.response)
-        strange = surprising(stamps, fit)
-        rows = strange.nonzero()[0]
-        if len(rows):
-            odd.append((stamps.take(rows), spike[rows], rows_of(fit, rows)))
-        parts.append(measured((stamps, spike, fit), ~strange))
+        parts.append(one_chunk(x[first:end], y[first:end]))
         if odd and (sum(len(star[1]) for star in odd) >= chunk or end == len(x)):
-            parts.append(with_companions(odd))
-            odd = []
+            parts.append(with_companions())
     if len(parts) == 1:
         return parts[0]
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}

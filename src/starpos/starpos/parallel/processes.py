@@ -90,7 +90,10 @@ class Processes:
                     worker.task = None
 
     def _replace(self, k: int, board: "_Board", task: Task) -> None:
-        """Start a process in place of one that has died, and put its task back on the board."""
+        """Start a process in place of one that has died, and put its task back on the board.
+
+        A task that it had not begun did not end it: somebody else did, between two calls.
+        """
         dead = self._workers[k]
         why = dead.end(DYING_S)
         self._stillborn += not dead.ready
@@ -98,7 +101,10 @@ class Processes:
             del self._workers[k]
             raise ProcessError(f"the processes of --jobs do not start ({why}): use fewer, or --jobs 1")
         self._workers[k] = _Worker()
-        board.died(task, why)
+        if dead.begun:
+            board.died(task, why)
+        else:
+            board.came_back(task)
 
 
 class _Board:
@@ -108,6 +114,8 @@ class _Board:
         self._coming, self._ahead = enumerate(calls), ahead
         self._under_way: set[int] = set()
         self._again: deque[Task] = deque()
+        # Calls that were given to a process which was dead already.
+        self._untouched: deque[Task] = deque()
         # Calls that have ended a process.
         self._tried: set[int] = set()
         self._done: dict[int, bytes] = {}
@@ -120,6 +128,8 @@ class _Board:
         task: Task | None = None
         if self._again:
             task = self._again.popleft()
+        elif self._untouched:
+            task = self._untouched.popleft()
         elif self._given - self._told < self._ahead and (task := next(self._coming, None)) is not None:
             self._given += 1
         if task is not None:
@@ -129,6 +139,10 @@ class _Board:
     def came(self, task: Task, outcome: bytes) -> None:
         self._under_way.discard(task[0])
         self._done[task[0]] = outcome
+
+    def came_back(self, task: Task) -> None:
+        self._under_way.discard(task[0])
+        self._untouched.append(task)
 
     def died(self, task: Task, why: str) -> None:
         number, (_, files) = task
@@ -153,19 +167,24 @@ class _Board:
 
 
 class _Worker:
-    """A process. task: the one it was given and has not answered; ready: whether it has started to work."""
+    """A process.
+
+    task   the one it was given and has not answered
+    begun  whether it has begun that one
+    ready  whether it has started to work at all
+    """
 
     def __init__(self) -> None:
         self.pipe, theirs = get_context("spawn").Pipe()
         self.task: Task | None = None
-        self.ready = False
+        self.begun = self.ready = False
         self._process = get_context("spawn").Process(target=_serve, args=(theirs,), daemon=True)
         with theirs, _for_one_that_starts():
             self._process.start()
 
     def give(self, task: Task) -> bool:
         """Send a task; False if the process has died."""
-        self.task = task
+        self.task, self.begun = task, False
         try:
             self.pipe.send_bytes(pickle.dumps(task[1]))
         except OSError:
@@ -173,11 +192,11 @@ class _Worker:
         return True
 
     def hear(self) -> bytes | None:
-        """Receive an answer; None for the first message, which says that it runs. EOFError or OSError if it has died."""
+        """Receive an answer; None for word that it runs, the first, or has begun. EOFError or OSError if it has died."""
         said, outcome = pickle.loads(self.pipe.recv_bytes())
         for text in said:
             warnings.warn(text, stacklevel=2)
-        self.ready = True
+        self.begun, self.ready = self.ready, True
         return outcome
 
     def end(self, within_s: float = 0.0) -> str:
@@ -216,10 +235,14 @@ def _for_one_that_starts() -> Iterator[None]:
 
 def _serve(pipe: Connection) -> None:
     """Do the calls that come through the pipe until its other end is closed."""
+    word = pickle.dumps(((), None))
     with suppress(EOFError, OSError):
-        pipe.send_bytes(pickle.dumps(((), None)))
+        pipe.send_bytes(word)
         while True:
-            work, files = pickle.loads(pipe.recv_bytes())
+            call = pipe.recv_bytes()
+            # before anything is done with it, that may end this process
+            pipe.send_bytes(word)
+            work, files = pickle.loads(call)
             with warnings.catch_warnings(record=True) as said:
                 outcome = worked(work, files)
             pipe.send_bytes(pickle.dumps(([str(w.message) for w in said], outcome)))

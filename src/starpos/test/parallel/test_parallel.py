@@ -91,11 +91,31 @@ def test_a_killed_process_costs_no_answer(tmp_path):
         assert list(workers.map((killed_once, of) for of in given)) == given
 
 
-def test_a_process_killed_between_two_calls_costs_no_answer():
+def dead(pids):
+    """Kill processes of ours, and wait until they are dead."""
+    for pid in pids:
+        os.kill(pid, signal.SIGKILL)
+        os.waitid(os.P_PID, pid, os.WEXITED | os.WNOWAIT)
+
+
+def test_processes_killed_between_two_calls_cost_no_answer():
     with Processes(2) as workers:
-        for pid in set(workers.map((process_id, k) for k in range(8))):
-            os.kill(pid, signal.SIGKILL)
+        dead(set(workers.map((process_id, k) for k in range(8))))
         assert list(workers.map((twice, k) for k in range(8))) == list(range(0, 16, 2))
+
+
+def test_processes_killed_before_they_begin_what_they_were_given_cost_no_answer():
+    def calls(pids):
+        yield twice, 0
+        # the first call lies in the pipe of one that does not read it
+        dead(pids)
+        yield from ((twice, k) for k in range(1, 8))
+
+    with Processes(2) as workers:
+        pids = set(workers.map((process_id, k) for k in range(8)))
+        for pid in pids:
+            os.kill(pid, signal.SIGSTOP)
+        assert list(workers.map(calls(pids))) == list(range(0, 16, 2))
 
 
 def test_a_frame_that_ends_every_process_is_given_up_and_the_others_are_not():
