@@ -188,7 +188,7 @@ cdef inline double middle(double *values, int n) noexcept nogil:
     return (lower + upper) / 2
 
 
-cdef inline (double, double) level_of(double *values, int n, double per_mad, double uneven) noexcept nogil:
+cdef inline (double, double) level_and_scatter(double *values, int n, double per_mad, double uneven) noexcept nogil:
     """The median of values (n,), and their scatter where that is more than `uneven`, else 1; it disturbs them.
 
     per_mad: sigma over the median of the absolute differences

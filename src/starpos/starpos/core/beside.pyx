@@ -11,7 +11,7 @@ from libc.stdlib cimport free, malloc
 
 import numpy as np
 
-from starpos.core.algebra cimport fetch, level_of
+from starpos.core.algebra cimport fetch, level_and_scatter
 
 ctypedef unsigned char unsigned_char
 
@@ -152,7 +152,7 @@ def rims(
                 row, column = _inside(row, plane.shape[0]), _inside(column, plane.shape[1])
                 phase = _phase(row, column, phases)
                 score[j] = <double>(<float>plane[row, column] - level[k, phase]) / noise[k, phase]
-            sky, spread = level_of(score, 4 * side, per_mad, uneven)
+            sky, spread = level_and_scatter(score, 4 * side, per_mad, uneven)
             found[0, k], found[1, k] = sky if sky > raised else 0.0, spread
     free(score)
     return out[0], out[1]

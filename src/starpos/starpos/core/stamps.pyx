@@ -167,7 +167,10 @@ def light_around(
     const pixel_t[:, ::1] plane, const Py_ssize_t[::1] x, const Py_ssize_t[::1] y, int reach, const float[:, ::1] level,
     double saturation,
 ):
-    """The signal alone (N, S, S) of stamps as in `around`, and whether one of their pixels is saturated, (N,) bool."""
+    """The signal alone (N, S, S) of stamps as in `around`, and whether one of their pixels is saturated, (N,) bool.
+
+    Pixels beyond the frame count too: of a star on the frame they are as others on its stamp.
+    """
     cdef Py_ssize_t n = x.shape[0], height = plane.shape[0], width = plane.shape[1], k, i, j, row
     cdef int size = 2 * reach + 1, phases = level.shape[1], highest
     cdef const pixel_t *line

@@ -8,7 +8,7 @@ from libc.stdlib cimport free, malloc
 import numpy as np
 
 cimport starpos.core.wide
-from starpos.core.algebra cimport level_of, middle
+from starpos.core.algebra cimport level_and_scatter, middle
 
 cdef extern from *:
     """
@@ -77,7 +77,7 @@ def level(float[:, :, ::1] signal, float[:, :, ::1] noise, double per_mad, doubl
     with nogil:
         for k in range(n):
             _take_rim(&signal[k, 0, 0], &noise[k, 0, 0], size, &rim)
-            sky, spread = level_of(rim.score, rim.count, per_mad, uneven)
+            sky, spread = level_and_scatter(rim.score, rim.count, per_mad, uneven)
             light = own * highest_of(&signal[k, 0, 0], area) / (rim.noise[0] if rim.even else middle(rim.noise, rim.count))
             up = <float>sky if sky > raised and sky > light else 0
             wider = <float>spread if spread > light else 1

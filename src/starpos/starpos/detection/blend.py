@@ -81,8 +81,8 @@ def pairs_among(
         for k in (0, 1)
     )
     first = replace(
-        rows_of(alone, real), **one, chi2=chi2, pixels=_pixels(pairs), residual=both.signal - models.sum(0), model=models[0],
-        used=pairs.used, outlier=np.zeros_like(pairs.used),
+        rows_of(alone, real), **one, chi2=chi2, pixels=_pixels(pairs), residual=both.signal - models.sum(0),
+        model=models[0], used=pairs.used, outlier=np.zeros_like(pairs.used),
     )  # fmt: skip
     first_stamps = replace(both, signal=both.signal - models[1])
     second_stamps, second_spike = cut_at(np.rint(other["x"]).astype(int), np.rint(other["y"]).astype(int))
@@ -117,7 +117,10 @@ def _real_pairs(stamps: Stamps, alone: Fit, psf: FieldPsf, response: Response) -
         real &= flux[1] > DIMMEST * flux[0]
     of_stars = ("used", "chi2")
     return real, Pairs(
-        **{f.name: getattr(pairs, f.name)[real if f.name in of_stars else (slice(None), real)] for f in fields(Pairs)}
+        **{
+            f.name: getattr(pairs, f.name)[real if f.name in of_stars else (slice(None), real)]
+            for f in fields(Pairs)
+        }
     )
 
 

@@ -216,10 +216,11 @@ def _most_alike(light: np.ndarray) -> np.ndarray:
 
     All of them if most lie near the median shape, else those near the shape at which they are densest.
     """
-    widest = (SIGHT / 2) ** 2
+    reach = light.shape[1] // 2
+    widest = (reach / 2) ** 2
     shape, values = own_shapes(
         light,
-        (SIGHT / 4) ** 2,
+        (reach / 4) ** 2,
         NARROWEST_WINDOW,
         NARROWEST,
         widest,

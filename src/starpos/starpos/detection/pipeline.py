@@ -26,7 +26,7 @@ from starpos.frames.frame import Frame
 from starpos.frames.stars import BLENDED, EDGE, ELONGATED, Stars, no_stars
 from starpos.frames.trail import Trail
 
-# Pixels of stars that are fitted together, on a small and on a large frame: about 2 and 6 MB.
+# Pixels of stars that are fitted together, give or take half, on a small and on a large frame: about 2 and 6 MB.
 CHUNK_PIXELS = 30_000, 120_000
 # Peaks looked at, or twice the stars wanted if that is more: hot pixels are peaks too.
 PEAKS = 10_000

@@ -23,10 +23,8 @@ MONOMIALS = 6
 NARROW, BROAD = 0.25, 6.0
 # Where in the box (0 to 1 in x, in y) the widest star is looked for.
 QUARTERS = np.tile(np.arange(5) / 4, 5), np.repeat(np.arange(5) / 4, 5)
-# Squared widths and series of a Gaussian that is the same everywhere.
-ALIKE, GAUSSIAN = np.eye(2)[None], np.ones((1, 1, 1))
-# Where nobody asks for more than one place.
-ONE_PLACE = np.zeros(1)
+# Squared widths and series of a Gaussian that is the same everywhere; a place, where nobody asks for more than one.
+UNIFORM, GAUSSIAN, ONE_PLACE = np.eye(2)[None], np.ones((1, 1, 1)), np.zeros(1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,7 +139,7 @@ def gaussian(shape: np.ndarray, x: np.ndarray = ONE_PLACE, y: np.ndarray = ONE_P
     cos, sin = math.cos(angle), math.sin(angle)
     axes = np.array([[cos * along, sin * along], [-sin * across, cos * across]])
     box = np.array([[x.min(), y.min()], [x.max(), y.max()]], float)
-    return Psf(axes, ALIKE, GAUSSIAN, box)
+    return Psf(axes, UNIFORM, GAUSSIAN, box)
 
 
 def power(widths: np.ndarray, exponent: float) -> np.ndarray:

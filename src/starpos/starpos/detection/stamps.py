@@ -80,7 +80,7 @@ def cut(
 def lights(
     plane: np.ndarray, background: Background, x: np.ndarray, y: np.ndarray, reach: int, saturation: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The signal alone of such Stamps, (N, S, S), and whether one of their pixels is saturated, (N,) bool."""
+    """The signal (N, S, S) of the Stamps that `cut` makes, and whether one of their pixels is saturated, (N,) bool."""
     x, y = (np.ascontiguousarray(v, np.intp) for v in (x, y))
     signal, full = light_around(plane, x, y, reach, background.near(x, y)[0], saturation)
     grid = np.arange(-reach, reach + 1)
@@ -93,15 +93,18 @@ def lights(
 def are_dots(plane: np.ndarray, background: Background, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Whether the pixels x, y (N,) int are hot, one or two together: the others of nine have hardly any light.
 
-    Less than half the brightest's without it, or less than a quarter of it without the second too. The light of streaks
-    counts.
+    Less than half the brightest's without it, or less than a quarter of it without the second too.
     """
     x, y = (np.ascontiguousarray(v, np.intp) for v in (x, y))
-    return dots(plane, x, y, background.near(x, y)[0], HALF, QUARTER)
+    level, _ = background.near(x, y)
+    # a streak is wider than nine pixels
+    for streak in background.streaks:
+        level = level + streak.at(y, x)[0][:, None].astype(np.float32)
+    return dots(plane, x, y, level, HALF, QUARTER)
 
 
 def are_alone(plane: np.ndarray, background: Background, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Whether the pixels x, y (N,) int are certainly hot: almost no light in the 24 pixels around them."""
+    """Whether the pixels x, y (N,) int are certainly hot: almost no light in the 24 pixels around them, or of streaks."""
     x, y = (np.ascontiguousarray(v, np.intp) for v in (x, y))
     return lonely(plane, x, y, *background.near(x, y), 2, ALONE, NOTHING)
 

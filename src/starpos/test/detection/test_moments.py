@@ -23,7 +23,7 @@ def plain(signal, left, top, window):
 
 @pytest.mark.parametrize(("size", "off_px"), [(5, 0.4), (25, 0.4), (25, 30.0), (121, 0.4)])
 def test_moments_are_those_of_plain_sums(size, off_px, rng):
-    """A window far narrower than its stamp, or whose middle is off it, keeps its digits too."""
+    """A window may be far narrower than its stamp, and its middle off it."""
     n = 20
     signal = rng.uniform(1, 2, (n, size, size)).astype(np.float32)
     left, top = -(size // 2) + rng.uniform(-off_px, off_px, (2, n))

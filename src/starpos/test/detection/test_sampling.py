@@ -45,9 +45,12 @@ def test_between_cells_the_sky_is_linear_and_beyond_them_as_on_the_edge(rng):
 
 
 @pytest.mark.parametrize("phases", [1, 4])
-def test_stamps_are_the_pixels_around_stars(phases, rng):
+@pytest.mark.parametrize(("kind", "most"), [(np.uint8, 250), (np.uint16, 1000)])
+@pytest.mark.parametrize("saturation", [0.9, 0.9001, np.inf])
+def test_stamps_are_the_pixels_around_stars(phases, kind, most, saturation, rng):
     """Some lie partly, or wholly, beyond the frame."""
-    plane = rng.integers(0, 1000, (30, 20)).astype(np.uint16)
+    plane = rng.integers(0, most, (30, 20)).astype(kind)
+    saturation *= most
     x, y = rng.integers(-9, 29, (2, 40))
     level, noise = rng.uniform(0, 9, (2, 40, phases)).astype(np.float32)
     columns, rows = x[:, None, None] + np.arange(-3, 4), y[:, None, None] + np.arange(-3, 4)[:, None]
@@ -59,15 +62,15 @@ def test_stamps_are_the_pixels_around_stars(phases, rng):
     expected = (
         pixels - level[each, phase],
         noise[each, phase],
-        on & (pixels < 900),
-        on & (pixels >= 900),
+        on & (pixels < saturation),
+        on & (pixels >= saturation),
         phase,
     )
-    for found, plain in zip(around(plane, x, y, 3, level, noise, 900), expected, strict=True):
+    for found, plain in zip(around(plane, x, y, 3, level, noise, saturation), expected, strict=True):
         np.testing.assert_array_equal(found, plain)
-    signal, full = light_around(plane, x, y, 3, level, 900)
+    signal, full = light_around(plane, x, y, 3, level, saturation)
     np.testing.assert_array_equal(signal, expected[0])
-    np.testing.assert_array_equal(full, (pixels >= 900).any((1, 2)))
+    np.testing.assert_array_equal(full, (pixels >= saturation).any((1, 2)))
 
 
 def test_what_lies_beyond_the_frame_is_refused():

@@ -82,8 +82,8 @@ class Graph:
         self.image = self._camera.create_publisher(Image, "camera/image_raw", QoSProfile(depth=2))
         self.stars = self._publisher(StarArray, "stars")
         self.tilt = self._publisher(Tilt, "tilt", 1000)
-        # whether the present solver has acknowledged intrinsics
-        self._solver_knows_us = True
+        # whether there is a new solver that may not know us yet
+        self._solver_is_new = False
         self.solutions, self.fixes, self.imus = {}, {}, {}
         # by name: (seconds, status)
         self.diagnostics: dict[str, list] = {}
@@ -148,7 +148,7 @@ class Graph:
 
         if not self.comes(lambda: counts() == [1] * 6, WAIT_S):
             raise AssertionError(f"the solver is not there, or there are two: {counts()}")
-        self._solver_knows_us = False
+        self._solver_is_new = True
 
     def wait_for_detector(self, photograph):
         """Wait until an image comes back as a solution, which is the only proof that detector and solver have met."""
@@ -175,10 +175,11 @@ class Graph:
     def send(self, shot, image=None, capture=None):
         """Publish a shot's intrinsics, its tilts, then its stars or the image that they are in."""
         self.info.publish(shot.info)
-        if not self._solver_knows_us:
-            # our publisher knows a new solver before the solver knows it: the stars would overtake the intrinsics
-            self._solver_knows_us = self.info.wait_for_all_acked(Duration(seconds=WAIT_S))
-            assert self._solver_knows_us, "the solver has not acknowledged its intrinsics"
+        if self._solver_is_new:
+            # our publisher knows the solver before the solver knows it: the stars would overtake the intrinsics
+            heard = self.info.wait_for_all_acked(Duration(seconds=WAIT_S))
+            assert heard, "the solver has not acknowledged its intrinsics"
+            self._solver_is_new = False
         for tilt in shot.tilts:
             self.tilt.publish(tilt)
         if image is None:
