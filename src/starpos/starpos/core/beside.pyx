@@ -12,17 +12,13 @@ from libc.stdlib cimport free, malloc
 import numpy as np
 
 from starpos.core.algebra cimport fetch, level_and_scatter
+from starpos.core.limits cimport inside
 
 ctypedef unsigned char unsigned_char
 
 ctypedef fused pixel_t:
     unsigned_char
     unsigned short
-
-
-cdef inline Py_ssize_t _inside(Py_ssize_t k, Py_ssize_t n) noexcept nogil:
-    """The row or column of n that is nearest to k."""
-    return max(0, min(k, n - 1))
 
 
 cdef inline int _phase(Py_ssize_t row, Py_ssize_t column, int phases) noexcept nogil:
@@ -35,9 +31,9 @@ cdef void _fetched(const pixel_t[:, ::1] plane, Py_ssize_t x, Py_ssize_t y, int 
     cdef Py_ssize_t row
     cdef int i
     for i in range(-reach, reach + 1):
-        row = _inside(y + i, plane.shape[0])
-        fetch(&plane[row, _inside(x - reach, plane.shape[1])])
-        fetch(&plane[row, _inside(x + reach, plane.shape[1])])
+        row = inside(y + i, plane.shape[0])
+        fetch(&plane[row, inside(x - reach, plane.shape[1])])
+        fetch(&plane[row, inside(x + reach, plane.shape[1])])
 
 
 cdef int _sound(
@@ -72,9 +68,9 @@ def dots(
             first = second = -1e300
             sum_ = 0.0
             for i in range(-1, 2):
-                row = _inside(y[k] + i, plane.shape[0])
+                row = inside(y[k] + i, plane.shape[0])
                 for j in range(-1, 2):
-                    column = _inside(x[k] + j, plane.shape[1])
+                    column = inside(x[k] + j, plane.shape[1])
                     light = plane[row, column] - level[k, _phase(y[k] + i, x[k] + j, phases)]
                     sum_ += light
                     second = max(second, min(light, first))
@@ -103,9 +99,9 @@ def lonely(
                 _fetched(plane, x[k + 1], y[k + 1], reach)
             first, sum_, variance = -1e300, 0.0, 0.0
             for i in range(-reach, reach + 1):
-                row = _inside(y[k] + i, plane.shape[0])
+                row = inside(y[k] + i, plane.shape[0])
                 for j in range(-reach, reach + 1):
-                    column, phase = _inside(x[k] + j, plane.shape[1]), _phase(y[k] + i, x[k] + j, phases)
+                    column, phase = inside(x[k] + j, plane.shape[1]), _phase(y[k] + i, x[k] + j, phases)
                     light = plane[row, column] - level[k, phase]
                     sum_ += light
                     first = max(first, light)
@@ -149,7 +145,7 @@ def rims(
                     row, column = y[k] + reach, x[k] - i
                 else:
                     row, column = y[k] - i, x[k] - reach
-                row, column = _inside(row, plane.shape[0]), _inside(column, plane.shape[1])
+                row, column = inside(row, plane.shape[0]), inside(column, plane.shape[1])
                 phase = _phase(row, column, phases)
                 score[j] = <double>(<float>plane[row, column] - level[k, phase]) / noise[k, phase]
             sky, spread = level_and_scatter(score, 4 * side, per_mad, uneven)

@@ -51,7 +51,10 @@ def near_pairs(const double[::1] x, const double[::1] y, double reach):
 
 
 def groups(const Py_ssize_t[:, ::1] pairs, Py_ssize_t n):
-    """The number (N,) of each of n points' group: those that pairs (M, 2) of them join. Groups are numbered by their first point."""
+    """The number (N,) of each of n points' group: those that pairs (M, 2) of them join. Groups are numbered by their first point.
+
+    As scipy's `connected_components`, which takes longer to begin, in every frame, than this does to end.
+    """
     cdef Py_ssize_t k, a, b, count = 0
     if pairs.shape[1] != 2 or not within[Py_ssize_t](&pairs[0, 0], 2 * pairs.shape[0], 0, n - 1):
         raise ValueError(f"a pair is not of two of the {n} points")

@@ -9,6 +9,7 @@ import numpy as np
 
 cimport starpos.core.wide
 from starpos.core.algebra cimport fetch
+from starpos.core.limits cimport inside
 
 cdef extern from *:
     """
@@ -95,11 +96,6 @@ ctypedef fused pixel_t:
     unsigned short
 
 
-cdef inline Py_ssize_t _inside(Py_ssize_t k, Py_ssize_t n) noexcept nogil:
-    """The row or column of n that is nearest to k."""
-    return max(0, min(k, n - 1))
-
-
 def around(
     const pixel_t[:, ::1] plane, const Py_ssize_t[::1] x, const Py_ssize_t[::1] y, int reach, const float[:, ::1] level,
     const float[:, ::1] noise, double saturation,
@@ -132,10 +128,10 @@ def around(
             whole = reach <= x[k] < width - reach
             # peaks are in no order: the next one's rows are far away
             for i in range(size if k + 1 < n else 0):
-                fetch(&plane[_inside(y[k + 1] - reach + i, height), _inside(x[k + 1] - reach, width)])
+                fetch(&plane[inside(y[k + 1] - reach + i, height), inside(x[k + 1] - reach, width)])
             for i in range(size):
                 row, place = y[k] - reach + i, i * size
-                line = &plane[_inside(row, height), 0]
+                line = &plane[inside(row, height), 0]
                 if whole and 0 <= row < height:
                     for j in range(2):
                         parts[j] = <unsigned char>(2 * (row & 1) + (x[k] - reach + j & 1)) if phases > 1 else 0
@@ -154,7 +150,7 @@ def around(
                 for j in range(x[k] - reach, x[k] + reach + 1):
                     on = 0 <= row < height and 0 <= j < width
                     phase = <int>(2 * (row & 1) + (j & 1)) if phases > 1 else 0
-                    value = line[_inside(j, width)]
+                    value = line[inside(j, width)]
                     sky[0, k, place], sky[1, k, place] = <float>value - level[k, phase], noise[k, phase]
                     full = value >= limit
                     mark[0, k, place], mark[1, k, place], mark[2, k, place] = on and not full, on and full, phase
@@ -192,19 +188,19 @@ def light_around(
     with nogil:
         for k in range(n):
             for i in range(size if k + 1 < n else 0):
-                fetch(&plane[_inside(y[k + 1] - reach + i, height), _inside(x[k + 1] - reach, width)])
+                fetch(&plane[inside(y[k + 1] - reach + i, height), inside(x[k + 1] - reach, width)])
             for i in range(2):
                 for j in range(size):
                     skies[i * size + j] = level[k, 2 * i + (x[k] - reach + j & 1)] if phases > 1 else level[k, 0]
             highest = 0
             for i in range(size):
                 row = y[k] - reach + i
-                line = &plane[_inside(row, height), 0]
+                line = &plane[inside(row, height), 0]
                 if reach <= x[k] < width - reach:
                     line += x[k] - reach
                 else:
                     for j in range(size):
-                        pixels[j] = line[_inside(x[k] - reach + j, width)]
+                        pixels[j] = line[inside(x[k] - reach + j, width)]
                     line = pixels
                 own = &signal[k, i, 0]
                 if pixel_t is unsigned_char:

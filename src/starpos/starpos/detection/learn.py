@@ -141,7 +141,7 @@ def _teachers(
     alone, high = _isolated(x, y, height)
     # where no bright star is isolated, fainter ones may be; where none is, stars are wider than their distances
     choices = (clear & alone & (height > BRIGHT), clear & alone, clear & high)
-    bright = next((c for c in choices if c.any()), clear & high).nonzero()[0]
+    bright = next((c for c in choices if c.any()), choices[-1]).nonzero()[0]
     bright = bright[~are_dots(plane, background, x[bright], y[bright])][:TEACHERS]
     light, full = lights(plane, background, x[bright], y[bright], SIGHT, saturation)
     # the shapes of fainter stars are noise
