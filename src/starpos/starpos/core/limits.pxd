@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 # cython: boundscheck=False, wraparound=False
-# Whether numbers that come from Python lie where they must, which a library takes longer to begin than to look; and on a frame.
+# Whether numbers that come from Python lie where they must (a library takes longer to begin than to look), and what is on a frame.
 
 ctypedef unsigned char unsigned_char
 
