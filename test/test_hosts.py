@@ -43,6 +43,7 @@ def play(instrument, folder: Path, together: bool) -> dict:
         "refraction.humidity": truth["humidity"],
         "misalignment": truth["misalignment_deg"],
         "misalignment_stddev": 0.1,
+        "inclinometer.model": "sca100t_calibrated",
         "tilt_timeout": 5.0,
     }
     robot.start(folder / "solver", "starpos_solver", "solver", *(f"{k}:={v}" for k, v in known.items()))

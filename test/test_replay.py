@@ -110,6 +110,7 @@ def instrument(graph, truth, tmp_path_factory):
         "refraction.humidity": truth["humidity"],
         "misalignment": truth["misalignment_deg"],
         "misalignment_stddev": 0.1,
+        "inclinometer.model": "sca100t_calibrated",
     }
     words = [f"{name}:={value}" for name, value in parameters.items()]
     graph.start(folder / "solver.log", "starpos_solver", "solver", *words)

@@ -100,7 +100,7 @@ def _tilts(args: argparse.Namespace, instrument: Instrument) -> TiltLog | None:
     """The table of --tilt, None without one."""
     if args.tilt is None:
         return None
-    return checked_tilts("calibrate", args.tilt, instrument.inclinometer.noise_rad)
+    return checked_tilts("calibrate", args.tilt, instrument)
 
 
 def _from_pointings(args: argparse.Namespace) -> int:

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from starpos.averaging.average import Average
+from starpos.calibration.unknown import unnamed_inclinometer
 from starpos.cli import console
 from starpos.cli.frame_work import tilts
 from starpos.earth.ellipsoid import EARTH_RADIUS_M, zenith_of
@@ -21,6 +22,7 @@ from starpos.fix.budget import place_of
 from starpos.fix.fix import Fix
 from starpos.fix.readable import length_text
 from starpos.instrument.inclinometer import Tilt, level_of, up_of
+from starpos.instrument.instrument import Instrument
 from starpos.instrument.mounting import Mounting
 from starpos.instrument.tilt_doubt import like_radians
 from starpos.instrument.tilt_log import TiltLog
@@ -66,9 +68,14 @@ class Near:
         return apart_m((self.latitude, self.longitude), (latitude, longitude)) / 1000
 
 
-def checked_tilts(command: str, path: str, noise_rad: float) -> TiltLog:
-    """The table of tilts, with a complaint where it looks like radians; raises TiltError as `read_tilt_csv` does."""
-    log = tilts(path, noise_rad)
+def checked_tilts(command: str, path: str, instrument: Instrument) -> TiltLog:
+    """The table of tilts, with a complaint where it looks like radians, or where nobody names the inclinometer.
+
+    Raises TiltError as `read_tilt_csv` does.
+    """
+    log = tilts(path, instrument.inclinometer.noise_rad)
+    if unnamed := unnamed_inclinometer(instrument):
+        console.complain(command, unnamed)
     if doubt := like_radians(log):
         console.complain(command, f"{path}: {doubt}")
     return log

@@ -146,7 +146,7 @@ def add_instrument(parser: argparse.ArgumentParser) -> None:
         "--inclinometer",
         metavar="MODEL",
         help=f"take the inclinometer's errors from its data sheet: {', '.join(sensors.PRESETS)} "
-        "(else those of an SCA100T with a good converter, compensated and calibrated)",
+        "(else those of an SCA100T as sold: 7 km)",
     )
     parser.add_argument(
         "--readout",

@@ -121,8 +121,7 @@ def _plan(args: argparse.Namespace, night: NightFolder, about: About | None, rea
         return Plan(night, Listing(read))
     instrument, air = options.instrument_of(args, about), options.atmosphere_of(args)
     check_save(args, instrument)
-    noise = instrument.inclinometer.noise_rad
-    table = None if night.tilt is None else checked_tilts("solve", night.tilt, noise)
+    table = None if night.tilt is None else checked_tilts("solve", night.tilt, instrument)
     jobs.prepare("solve", instrument, about)
     solver = Solver(instrument, catalogue.load_catalogue(), air, progress=console.ProgressBar())
     return Plan(

@@ -41,8 +41,7 @@ def run(args: argparse.Namespace) -> int:
         raise InstrumentError("--jobs and --scheduler are for frames: --pointings are worked in a moment")
     solver, saving = _solver_of(args), 0
     check_save(args, solver.instrument)
-    noise = solver.instrument.inclinometer.noise_rad
-    log = None if own_level else checked_tilts("solve", args.tilt, noise)
+    log = None if own_level else checked_tilts("solve", args.tilt, solver.instrument)
     whole = [p for p in pointings if p.has_roll]
     output = Output(args, COLUMNS, HEAD if whole else ELEVATIONS_HEAD)
     if not whole:

@@ -115,7 +115,7 @@ class Tilt:
 
 @dataclass(frozen=True, kw_only=True)
 class InclinometerErrors:
-    """Errors of an inclinometer, 1 sigma; the default has the noise of an SCA100T-D01 with a good converter.
+    """Errors of an inclinometer, 1 sigma; the defaults are those of an SCA100T-D01, compensated and calibrated.
 
     noise_rad                white noise of one reading
     quantum_rad              step of its readings

@@ -161,8 +161,8 @@ def _from_mapping(content: dict, folder: Path) -> Instrument:
     if "link_to_camera" in content:
         link = _matrix(content["link_to_camera"], "link_to_camera")
         instrument = replace(instrument, link_to_camera=link)
-    sensor, errors = _sensor(content)
     given = {name: _error(content, key, unit) for key, (name, unit) in INCLINOMETER.items() if key in content}
+    sensor, errors = _sensor(content, bool(given))
     instrument = replace(instrument, inclinometer=replace(errors, **given), inclinometer_model=sensor)
     if "vertical" in content:
         if given or sensor:
@@ -286,8 +286,13 @@ def _calibration(content: dict) -> Calibration:
     return replace(calibration, utc_unix_s=utc, frames=frames, **more)
 
 
-def _sensor(content: dict) -> tuple[str, InclinometerErrors]:
-    """Model of the inclinometer ('' without one) and the errors that this gives."""
+def _sensor(content: dict, stated: bool) -> tuple[str, InclinometerErrors]:
+    """Model of the inclinometer ('' without one) and the errors that this gives; stated: whether the file states some.
+
+    A file that states some without a model speaks of a sensor that was measured: the others are those of a good one.
+    """
+    if "inclinometer" not in content and stated:
+        return "", InclinometerErrors()
     about = content.get("inclinometer", {"model": ""})
     if not isinstance(about, dict) or not isinstance(about.get("model"), str):
         raise InstrumentError(f"inclinometer is {_short(about)}: give {{model: NAME}}")

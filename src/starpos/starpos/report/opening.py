@@ -9,8 +9,7 @@ from starpos.earth.vertical import Deflection, Vertical
 from starpos.errors import FrameError, InstrumentError
 from starpos.frames.night_files import TILTS
 from starpos.frames.stars import Stars
-from starpos.instrument import instrument_file
-from starpos.instrument.inclinometer import SCA100T_NOISE_RAD
+from starpos.instrument import instrument_file, sensors
 from starpos.instrument.instrument import Calibration, Instrument
 from starpos.progress import Progress, quiet
 from starpos.report.folder import exposures, frames_in
@@ -24,6 +23,7 @@ class NightOnDisk:
     """A folder of frames with tilt.csv, and what is known of its instrument and the air; `solve` works on it.
 
     instrument: None if the frames' headers have the focal length.  calibration: A3 in place of the instrument's.
+    inclinometer: name of its model in place of the instrument's; '' for the instrument's.
     """
 
     folder: Path
@@ -31,6 +31,7 @@ class NightOnDisk:
     count: int
     instrument: Instrument | None
     calibration: Calibration | None
+    inclinometer: str
     atmosphere: Atmosphere
     vertical: Vertical
 
@@ -45,7 +46,7 @@ class NightOnDisk:
         self_calibrate: find A3 too, from frames of one place at several headings; turn_stddev_deg: how well the given A3
         has its turn about the plumb line.  Raises StarposError where the folder or the instrument cannot be used.
         """
-        noise = SCA100T_NOISE_RAD if self.instrument is None else self.instrument.inclinometer.noise_rad
+        noise = self._with_inclinometer(self.instrument or Instrument(1.0)).inclinometer.noise_rad
         shop = Workshop(
             instrument_for=self._instrument_for,
             catalogue=load_catalogue(),
@@ -64,7 +65,14 @@ class NightOnDisk:
                     f"{stars.place}: its header has no focal length: give instrument=Instrument(focal_px)"
                 )
             known = Instrument(stars.focal_px)
+        known = self._with_inclinometer(known)
         return known if self.calibration is None else replace(known, calibration=self.calibration)
+
+    def _with_inclinometer(self, instrument: Instrument) -> Instrument:
+        if not self.inclinometer:
+            return instrument
+        model, errors = sensors.find(self.inclinometer)
+        return replace(instrument, inclinometer=errors, inclinometer_model=model)
 
 
 def open_night(
@@ -72,6 +80,7 @@ def open_night(
     *,
     instrument: Instrument | str | Path | None = None,
     calibration: Calibration | None = None,
+    inclinometer: str = "",
     atmosphere: Atmosphere | None = None,
     vertical: Vertical | None = None,
 ) -> NightOnDisk:
@@ -79,7 +88,8 @@ def open_night(
 
     instrument: or the path of its file (YAML); None if the frames' headers have the focal length.
     calibration: A3 in place of the instrument's; while nobody knows A3 the place is over 1000 km wide, unless the night
-    is solved with self_calibrate=True.  atmosphere: None: not measured.  vertical: its deflection; None: not known.
+    is solved with self_calibrate=True.  inclinometer: name of its model, in place of the instrument's; where nobody names
+    it or states its errors they are those of an SCA100T as sold, 7 km.  atmosphere: None: not measured.  vertical: its deflection; None: not known.
     Raises StarposError if there is no frame, or the instrument's file cannot be used.
     """
     folder = Path(folder)
@@ -92,6 +102,7 @@ def open_night(
         count=len(frames_in(folder)),
         instrument=instrument,
         calibration=calibration,
+        inclinometer=inclinometer,
         atmosphere=Atmosphere.measured(None, None) if atmosphere is None else atmosphere,
         vertical=Deflection() if vertical is None else vertical,
     )

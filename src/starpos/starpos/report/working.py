@@ -9,7 +9,7 @@ import numpy as np
 
 from starpos.averaging.average import average
 from starpos.calibration.turning import turn
-from starpos.calibration.unknown import unknown_a3
+from starpos.calibration.unknown import unknown_a3, unnamed_inclinometer
 from starpos.earth.ellipsoid import EARTH_RADIUS_M
 from starpos.earth.refraction import Atmosphere
 from starpos.earth.vertical import Vertical
@@ -77,6 +77,8 @@ def worked(exposures: StarLists, shop: Workshop) -> Night:
     if instrument and shop.turn_stddev_deg is None:
         unknown = unknown_a3(instrument.calibration, (combined or fixes[-1]).covariance, fixes[-1].terms)
         remarks += [unknown] if unknown else []
+    if instrument and (unnamed := unnamed_inclinometer(instrument)):
+        remarks.append(unnamed)
     if extrapolated_days > 0:
         remarks.append(
             f"the Earth's rotation is extrapolated {extrapolated_days:.0f} days beyond the IERS table, which the budget "
