@@ -17,14 +17,11 @@ from starpos.frames.shutter import GLOBAL, Shutter
 from starpos.frames.stars import EDGE, Stars, no_stars
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import Tilt
-from starpos.recording import messages as reading
-from starpos.recording.messages import (
-    message_to_camera,
-    message_to_frame,
-    message_to_stars,
-    message_to_tilt,
-    stamp_to_unix,
-)
+from starpos.messages import camera as reading
+from starpos.messages.camera import message_to_camera, message_to_frame
+from starpos.messages.stamp import stamp_to_unix
+from starpos.messages.stars import message_to_stars
+from starpos.messages.tilt import message_to_tilt
 from starpos_common import messages
 from starpos_interfaces import msg
 

@@ -11,10 +11,11 @@ from starpos.errors import InstrumentError, TiltError
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import Tilt
 from starpos.instrument.tilt_log import TiltLog
+from starpos.messages.camera import message_to_camera
+from starpos.messages.tilt import UNUSABLE, message_to_tilt
 from starpos.progress import Progress
 from starpos.recording.bag import BagReader
 from starpos.recording.instruments import INPUTS, SOLUTION, STARS, TILT, instrument_in
-from starpos.recording.messages import UNUSABLE, message_to_camera, message_to_tilt
 from starpos.report.folder import truth_in
 from starpos.report.night import Shot, Truth
 from starpos.report.solutions import deflection_of, shot_of

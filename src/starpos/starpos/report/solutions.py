@@ -11,7 +11,8 @@ from starpos.errors import FrameError, StarposError
 from starpos.fix.budget import ALWAYS, ErrorTerm
 from starpos.fix.solution import Attitude, Status
 from starpos.instrument.camera import Camera
-from starpos.recording.messages import message_to_stars, stamp_to_unix
+from starpos.messages.stamp import stamp_to_unix
+from starpos.messages.stars import message_to_stars
 from starpos.report.folder import StarList
 from starpos.report.night import NO_TILT, ReportedPlace, Shot
 from starpos.rotation import full_turn

@@ -23,7 +23,9 @@ from starpos.frames.stars import Stars
 from starpos.identification.hint import Hint
 from starpos.identification.search import Priors
 from starpos.instrument.camera import Camera
-from starpos.recording.messages import message_to_camera, message_to_stars, stamp_to_unix
+from starpos.messages.camera import message_to_camera
+from starpos.messages.stamp import stamp_to_unix
+from starpos.messages.stars import message_to_stars
 from starpos.session import reports
 from starpos.session.attitude import asked, camera_attitude_of
 from starpos.session.calibrating import Calibrating

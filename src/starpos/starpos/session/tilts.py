@@ -9,14 +9,8 @@ import numpy as np
 from starpos.errors import TiltError, TiltRangeError
 from starpos.instrument.inclinometer import Tilt
 from starpos.instrument.tilt_log import BRACKET_S, NEIGHBOURS_S, OPEN_END, TOUCH_S, TiltLog, noise_excess
-from starpos.recording.messages import (
-    OUT_OF_RANGE,
-    SATURATED,
-    STUCK,
-    UNUSABLE,
-    message_to_tilt,
-    stamp_to_unix,
-)
+from starpos.messages.stamp import stamp_to_unix
+from starpos.messages.tilt import OUT_OF_RANGE, SATURATED, STUCK, UNUSABLE, message_to_tilt
 from starpos.session.tilt_publishers import TiltPublishers
 
 # Ten minutes at 10 Hz.
