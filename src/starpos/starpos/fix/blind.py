@@ -48,8 +48,8 @@ class BlindSolver:
         quads = quad_cache.cached(self.catalogue, self.progress)
         xy = np.stack([seen.x, seen.y], 1)
         size, near_px, window = (stars.width, stars.height), stars.rough_focal_px, stars.window
-        answer = identify_blind(xy, seen.sigma, *size, sky, quads, self.stages, near_px, window)
-        if answer is None:
+        match = identify_blind(xy, seen.sigma, *size, sky, quads, self.stages, near_px, window)
+        if match is None:
             message = (
                 f"{stars.place}: none of the sky fits its {len(seen)} stars at any scale (fields of {SMALLEST_DEG:g} to "
                 f"{LARGEST_DEG:g} deg from corner to corner were tried): give the focal length if it is known, check "
@@ -58,7 +58,7 @@ class BlindSolver:
             return replace(
                 Solution.failed(stars, Status.NOT_IDENTIFIED, message), identify_s=time.perf_counter() - begin
             )
-        camera, found = answer
+        camera, found = match
         field = frame_stars(camera.directions(seen.x, seen.y), seen.sigma, camera)
         answer = identified(seen, through(field, camera, window), sky, camera, found)
         return replace(answer.among(stars, inside), identify_s=time.perf_counter() - begin)

@@ -105,6 +105,11 @@ class Solution:
         """A solution that has nothing but the error with which the work on its frame ended."""
         return cls.failed(frame, status_of(frame, error), str(error))
 
+    @classmethod
+    def unreadable(cls, source: str, error: StarposError) -> "Solution":
+        """A solution of a file that holds no frame."""
+        return cls(Status.BAD_INPUT, str(error), source=source, utc_unix_s=None, stars_detected=0)
+
     def among(self, stars: Stars, rows: np.ndarray) -> "Solution":
         """The solution of `stars` that is found by those in `rows` (n,) alone."""
         star = None if self.star is None else rows[self.star]

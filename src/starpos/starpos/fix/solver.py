@@ -78,7 +78,7 @@ class Solver:
         try:
             camera, catalogue, triangles = self.view(stars.width, stars.height)
             if part != 1.0:
-                triangles = triangle_cache.cached(catalogue, part * wide.field_rad(camera), self.progress)
+                triangles = self.triangles_of(stars.width, stars.height, part)
             sky = Sky.at(catalogue, triangles, stars.mid_unix_s)
             field: FrameStars | wide.WideField | None = as_seen(camera, stars)
             if field is None:
@@ -137,7 +137,7 @@ class Solver:
         )
         done = time.perf_counter()
         answer = replace(answer, tilt=tilt, identify_s=done - begin)
-        if found is None:
+        if found is None or answer.magnitudes is None:
             return answer
         try:
             check_explained(answer)
@@ -272,6 +272,11 @@ class Solver:
             self._views.clear()
             self._views[width, height] = camera, catalogue, triangles
         return self._views[width, height]
+
+    def triangles_of(self, width: int, height: int, part: float) -> TriangleCatalogue:
+        """Triangles for a part of such frames, as `identify` has it, from the cache or built."""
+        camera, catalogue, _ = self.view(width, height)
+        return triangle_cache.cached(catalogue, part * wide.field_rad(camera), self.progress)
 
     def _inside(self, stars: Stars) -> np.ndarray | None:
         """Rows of the stars that lie on their frame and in its lens's picture; None if all do, as is usual."""

@@ -3,7 +3,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 from starpos.errors import TiltError
 from starpos.instrument.inclinometer import Tilt
@@ -34,7 +34,7 @@ NO_TILTS = NoTilts()
 class TiltsByTime:
     """The tilts of exposures, each known by their middle (Unix seconds)."""
 
-    tilts: Mapping[float, Tilt]
+    tilts: Mapping[Any, Tilt]
 
     def average(self, mid_unix_s: float, exposure_s: float, spread_s: float = 0.0) -> Tilt:
         """Give the tilt of the exposure with this middle."""

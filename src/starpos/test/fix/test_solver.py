@@ -326,7 +326,10 @@ def test_an_error_of_the_tilts_source_is_the_frames(night):
     def gone(mid, exposure, spread):
         raise TiltError("the port is gone: plug it in")
 
-    assert refused(solver.solve(stars, SimpleNamespace(average=gone)), Status.NO_TILT) == "the port is gone: plug it in"
+    assert (
+        refused(solver.solve(stars, SimpleNamespace(average=gone)), Status.NO_TILT)
+        == "the port is gone: plug it in"
+    )
 
 
 def test_a_star_outside_its_frame_costs_nothing_but_itself(catalogue, rng):
