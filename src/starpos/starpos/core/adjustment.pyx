@@ -6,8 +6,8 @@ from libc.math cimport fabs, isfinite, sqrt
 
 import numpy as np
 
+from starpos._numeric.algebra cimport best_rotation, factored, solved, turn_by, turned
 from starpos.core.air cimport Air
-from starpos.core.algebra cimport best_rotation, factored, solved, turn_by, turned
 from starpos.core.lens cimport Lens
 
 cdef enum:

@@ -6,7 +6,7 @@ from libc.math cimport cos, sin
 
 import numpy as np
 
-from starpos.core.algebra cimport length
+from starpos._numeric.algebra cimport length
 
 
 cdef class Air:

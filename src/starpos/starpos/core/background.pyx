@@ -7,9 +7,9 @@ from libc.stdlib cimport free, malloc
 
 import numpy as np
 
-from starpos.core.limits cimport within
+from starpos._numeric.limits cimport within
 
-cimport starpos.core.wide
+cimport starpos._numeric.wide
 
 cdef extern from *:
     """

@@ -11,8 +11,8 @@ from libc.stdlib cimport free, malloc
 
 import numpy as np
 
-from starpos.core.algebra cimport fetch, level_and_scatter
-from starpos.core.limits cimport inside
+from starpos._numeric.algebra cimport fetch, level_and_scatter
+from starpos._numeric.limits cimport inside
 
 ctypedef unsigned char unsigned_char
 

@@ -7,7 +7,7 @@ from libc.stdlib cimport free, malloc
 
 import numpy as np
 
-from starpos.core.algebra cimport fetch
+from starpos._numeric.algebra cimport fetch
 from starpos.core.triangles cimport CODES, bin_of, code_of, is_counter_clockwise
 
 

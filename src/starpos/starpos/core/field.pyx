@@ -7,7 +7,7 @@ from libc.stdlib cimport free, malloc
 
 import numpy as np
 
-from starpos.core.algebra cimport factored, middle, solved
+from starpos._numeric.algebra cimport factored, middle, solved
 from starpos.core.shapes cimport Shape, clipped_to
 
 cdef enum:

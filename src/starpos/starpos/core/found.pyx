@@ -6,7 +6,7 @@ from libc.math cimport M_PI, atan2, hypot, sqrt
 
 import numpy as np
 
-from starpos.core.memory cimport numbers_of
+from starpos._numeric.memory cimport numbers_of
 
 
 NAMES = (

@@ -6,7 +6,7 @@ from libc.math cimport atan, hypot, isfinite, rint, sqrt
 
 import numpy as np
 
-from starpos.core.memory cimport numbers_of
+from starpos._numeric.memory cimport numbers_of
 
 
 cdef class FrameStars:

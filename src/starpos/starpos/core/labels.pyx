@@ -6,8 +6,8 @@ from libc.string cimport memcpy
 
 import numpy as np
 
-from starpos.core.algebra cimport fetch
-from starpos.core.memory cimport numbers_of
+from starpos._numeric.algebra cimport fetch
+from starpos._numeric.memory cimport numbers_of
 
 cdef enum:
     # Letters of a name, at most.

@@ -8,9 +8,9 @@ from libc.string cimport memset
 
 import numpy as np
 
-cimport starpos.core.wide
-from starpos.core.algebra cimport factored, solved
-from starpos.core.limits cimport unsigned_char, within
+cimport starpos._numeric.wide
+from starpos._numeric.algebra cimport factored, solved
+from starpos._numeric.limits cimport unsigned_char, within
 from starpos.core.psf cimport BLOCK, ORDERS, Local, blocks, evaluate, local_of, scaled, sound, terms_at
 
 cdef extern from *:

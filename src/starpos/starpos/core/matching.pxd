@@ -4,7 +4,7 @@
 
 from libc.stdlib cimport malloc
 
-from starpos.core.algebra cimport Point, Strips, sort_by_x, strip_of
+from starpos._numeric.algebra cimport Point, Strips, sort_by_x, strip_of
 
 
 cdef struct Matching:

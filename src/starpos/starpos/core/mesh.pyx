@@ -7,7 +7,7 @@ from libc.stdlib cimport free, malloc
 
 import numpy as np
 
-from starpos.core.limits cimport within
+from starpos._numeric.limits cimport within
 
 cdef enum:
     # Cells that a mesh is continued by before it is evened out.

@@ -8,8 +8,8 @@ from libc.string cimport memcpy, memset
 
 import numpy as np
 
-cimport starpos.core.wide
-from starpos.core.algebra cimport middle
+cimport starpos._numeric.wide
+from starpos._numeric.algebra cimport middle
 from starpos.core.shapes cimport Shape, clipped_to, inverse, put_shape, shape_before, sides, with_sides
 
 cdef extern from *:

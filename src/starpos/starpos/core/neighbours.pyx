@@ -7,7 +7,7 @@ from libc.stdlib cimport free, malloc, realloc
 
 import numpy as np
 
-from starpos.core.limits cimport within
+from starpos._numeric.limits cimport within
 
 
 def near_pairs(const double[::1] x, const double[::1] y, double reach):

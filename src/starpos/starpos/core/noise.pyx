@@ -7,9 +7,9 @@ from libc.stdlib cimport free, malloc
 
 import numpy as np
 
-cimport starpos.core.wide
-from starpos.core.algebra cimport middle
-from starpos.core.limits cimport within
+cimport starpos._numeric.wide
+from starpos._numeric.algebra cimport middle
+from starpos._numeric.limits cimport within
 
 cdef extern from *:
     """

@@ -7,7 +7,7 @@ from libc.stdlib cimport free, malloc
 
 import numpy as np
 
-from starpos.core.algebra cimport middle
+from starpos._numeric.algebra cimport middle
 
 
 def median(const double[::1] values):

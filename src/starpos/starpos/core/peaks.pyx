@@ -8,7 +8,7 @@ from libc.string cimport memset
 
 import numpy as np
 
-cimport starpos.core.wide
+cimport starpos._numeric.wide
 
 cdef extern from *:
     """

@@ -7,7 +7,7 @@ from libc.stdlib cimport free, malloc
 
 import numpy as np
 
-from starpos.core.algebra cimport best_rotation, factored, length, median, solved, turn_by, turned
+from starpos._numeric.algebra cimport best_rotation, factored, length, median, solved, turn_by, turned
 from starpos.core.frame cimport FrameStars, direction_of, pixel_of, pixels_of
 from starpos.core.matching cimport Matching, match, order
 from starpos.core.sky cimport Visible

@@ -7,7 +7,7 @@ from libc.stdlib cimport free, malloc
 
 import numpy as np
 
-cimport starpos.core.wide
+cimport starpos._numeric.wide
 
 cdef extern from *:
     """

@@ -4,7 +4,7 @@
 
 import numpy as np
 
-from starpos.core.limits cimport unsigned_char, within
+from starpos._numeric.limits cimport unsigned_char, within
 
 
 cdef class Rules:

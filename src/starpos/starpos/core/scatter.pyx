@@ -7,8 +7,8 @@ from libc.stdlib cimport free, malloc
 
 import numpy as np
 
-cimport starpos.core.wide
-from starpos.core.algebra cimport middle
+cimport starpos._numeric.wide
+from starpos._numeric.algebra cimport middle
 
 cdef enum:
     # determinants whose product is a number, points of an integral, steps of a search

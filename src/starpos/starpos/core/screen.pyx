@@ -7,7 +7,7 @@ from libc.stdlib cimport free, malloc, qsort
 
 import numpy as np
 
-from starpos.core.algebra cimport best_rotation, fetch, length, turned
+from starpos._numeric.algebra cimport best_rotation, fetch, length, turned
 from starpos.core.frame cimport FrameStars, axis_of, direction_of, on_frame, pixel_of, pixels_of
 from starpos.core.matching cimport Matching, begin, match, order
 from starpos.core.sky cimport MOST_RUNS, Date, StarTable, runs_near

@@ -8,10 +8,10 @@ from libc.string cimport memcpy
 
 import numpy as np
 
+from starpos._numeric.memory cimport numbers_of
 from starpos.core.found cimport Identification, hold
 from starpos.core.frame cimport FrameStars, on_frame, pixels_of
 from starpos.core.matching cimport Matching, begin
-from starpos.core.memory cimport numbers_of
 from starpos.core.poses cimport Chances, Rules, Settled, count_alike, gates, settle, weighed
 from starpos.core.screen cimport BrightTable
 from starpos.core.sky cimport Date, StarTable, Visible, date_of

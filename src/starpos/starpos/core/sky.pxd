@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-from starpos.core.algebra cimport Point
+from starpos._numeric.algebra cimport Point
 from starpos.core.frame cimport FrameStars
 
 

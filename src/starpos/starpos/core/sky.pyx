@@ -7,7 +7,7 @@ from libc.stdlib cimport free, malloc
 
 import numpy as np
 
-from starpos.core.algebra cimport Point, Strips, fetch, sort_by_x, turned
+from starpos._numeric.algebra cimport Point, Strips, fetch, sort_by_x, turned
 from starpos.core.frame cimport FrameStars, axis_of, pixel_of, seen_on
 
 cdef enum:

@@ -4,7 +4,7 @@
 
 import numpy as np
 
-from starpos.core.limits cimport within
+from starpos._numeric.limits cimport within
 
 ctypedef unsigned char unsigned_char
 

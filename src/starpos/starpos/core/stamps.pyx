@@ -7,9 +7,9 @@ from libc.stdlib cimport free, malloc
 
 import numpy as np
 
-cimport starpos.core.wide
-from starpos.core.algebra cimport fetch
-from starpos.core.limits cimport inside
+cimport starpos._numeric.wide
+from starpos._numeric.algebra cimport fetch
+from starpos._numeric.limits cimport inside
 
 cdef extern from *:
     """

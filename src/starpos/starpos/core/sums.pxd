@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 # The pixels of a star that is fitted, and sums over them, four at once.
 
-cimport starpos.core.wide
+cimport starpos._numeric.wide
 
 cdef extern from *:
     """

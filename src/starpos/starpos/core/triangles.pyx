@@ -7,7 +7,7 @@ from libc.stdlib cimport abs, calloc, free, malloc, realloc
 
 import numpy as np
 
-from starpos.core.algebra cimport fetch, length
+from starpos._numeric.algebra cimport fetch, length
 from starpos.core.frame cimport FrameStars, direction_of
 
 cdef enum:

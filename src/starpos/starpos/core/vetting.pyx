@@ -7,8 +7,8 @@ from libc.stdlib cimport free, malloc
 
 import numpy as np
 
-cimport starpos.core.wide
-from starpos.core.algebra cimport level_and_scatter, middle
+cimport starpos._numeric.wide
+from starpos._numeric.algebra cimport level_and_scatter, middle
 
 cdef extern from *:
     """
