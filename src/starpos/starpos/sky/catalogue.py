@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from starpos.core.labels import Labels
+from starpos.sky._labels import Labels
 from starpos.errors import CatalogueError
 from starpos.files import open_regular
 from starpos.rotation import normalised
