@@ -8,7 +8,7 @@ import numpy as np
 
 from starpos._numeric.algebra cimport best_rotation, factored, solved, turn_by, turned
 from starpos.core.air cimport Air
-from starpos.core.lens cimport Lens
+from starpos.instrument._lens cimport Lens
 
 cdef enum:
     # Parameters: a small rotation about L's axes, and a relative change of the scale.
