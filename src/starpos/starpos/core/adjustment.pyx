@@ -7,7 +7,7 @@ from libc.math cimport fabs, isfinite, sqrt
 import numpy as np
 
 from starpos._numeric.algebra cimport best_rotation, factored, solved, turn_by, turned
-from starpos.core.air cimport Air
+from starpos.earth._air cimport Air
 from starpos.instrument._lens cimport Lens
 
 cdef enum:

@@ -10,7 +10,7 @@ from functools import cached_property
 import erfa
 import numpy as np
 
-from starpos.core.air import Air
+from starpos.earth._air import Air
 from starpos.errors import InstrumentError
 
 STANDARD_PRESSURE_PA = 101_325.0
