@@ -129,7 +129,7 @@ def _version(package: str) -> str:
 
 def core() -> Finding:
     """The compiled loops."""
-    if find_spec("starpos.core.frame") is None:
+    if find_spec("starpos.identification._frame") is None:
         return Finding(
             State.MISSING,
             "starpos.core is not compiled",

@@ -9,7 +9,7 @@ from functools import cached_property
 
 import numpy as np
 
-from starpos.core.frame import FrameStars, mean_sigma
+from starpos.identification._frame import FrameStars, mean_sigma
 from starpos.earth.orientation import EarthState, earth_state
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import FixError, InstrumentError, StarposError, TiltError, TimeError

@@ -8,8 +8,8 @@ from itertools import chain
 
 import numpy as np
 
-from starpos.core.frame import FrameStars, projected
-from starpos.core.search import Finder, Limits
+from starpos.identification._frame import FrameStars, projected
+from starpos.identification._search import Finder, Limits
 from starpos.errors import InstrumentError
 from starpos.frames.stars import Window
 from starpos.identification import wide

@@ -6,8 +6,8 @@ from functools import lru_cache
 
 import numpy as np
 
-from starpos.core.screen import BrightTable
-from starpos.core.sky import StarTable
+from starpos.identification._screen import BrightTable
+from starpos.identification._sky import StarTable
 from starpos.earth.orientation import earth_motion
 from starpos.frozen import at_once
 from starpos.identification.triangles import TriangleCatalogue

@@ -6,7 +6,7 @@ import pickle
 import numpy as np
 import pytest
 
-from starpos.core.frame import FrameStars
+from starpos.identification._frame import FrameStars
 from starpos.identification import Identification, search
 
 VALUES = {

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-from starpos.core.frame cimport FrameStars
-from starpos.core.sky cimport Date, StarTable
-from starpos.core.triangles cimport Candidate
+from starpos.identification._frame cimport FrameStars
+from starpos.identification._sky cimport Date, StarTable
+from starpos.identification._triangles cimport Candidate
 
 
 cdef struct Bright:

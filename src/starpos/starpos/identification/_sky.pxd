@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 from starpos._numeric.algebra cimport Point
-from starpos.core.frame cimport FrameStars
+from starpos.identification._frame cimport FrameStars
 
 
 cdef enum:

@@ -8,7 +8,7 @@ from libc.stdlib cimport free, malloc
 import numpy as np
 
 from starpos._numeric.algebra cimport fetch
-from starpos.core.triangles cimport CODES, bin_of, code_of, is_counter_clockwise
+from starpos.identification._triangles cimport CODES, bin_of, code_of, is_counter_clockwise
 
 
 cdef enum:

@@ -8,7 +8,7 @@ from libc.stdlib cimport abs, calloc, free, malloc, realloc
 import numpy as np
 
 from starpos._numeric.algebra cimport fetch, length
-from starpos.core.frame cimport FrameStars, direction_of
+from starpos.identification._frame cimport FrameStars, direction_of
 
 cdef enum:
     # Sides of triangles for each star of a crowd.

@@ -9,13 +9,13 @@ from libc.string cimport memcpy
 import numpy as np
 
 from starpos._numeric.memory cimport numbers_of
-from starpos.core.found cimport Identification, hold
-from starpos.core.frame cimport FrameStars, on_frame, pixels_of
-from starpos.core.matching cimport Matching, begin
-from starpos.core.poses cimport Chances, Rules, Settled, count_alike, gates, settle, weighed
-from starpos.core.screen cimport BrightTable
-from starpos.core.sky cimport Date, StarTable, Visible, date_of
-from starpos.core.triangles cimport Candidate, TriangleTable
+from starpos.identification._found cimport Identification, hold
+from starpos.identification._frame cimport FrameStars, on_frame, pixels_of
+from starpos.identification._matching cimport Matching, begin
+from starpos.identification._poses cimport Chances, Rules, Settled, count_alike, gates, settle, weighed
+from starpos.identification._screen cimport BrightTable
+from starpos.identification._sky cimport Date, StarTable, Visible, date_of
+from starpos.identification._triangles cimport Candidate, TriangleTable
 
 
 cdef enum:

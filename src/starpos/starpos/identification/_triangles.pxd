@@ -2,7 +2,7 @@
 # cython: boundscheck=False, wraparound=False, cdivision=True, initializedcheck=False
 # The numbers that shapes of triangles are kept as, and what a look-up finds, for the other modules here.
 
-from starpos.core.frame cimport FrameStars
+from starpos.identification._frame cimport FrameStars
 
 cdef enum:
     # Shapes are kept to 1/65536 of their ranges; the highest bits of the three are a triangle's bin.

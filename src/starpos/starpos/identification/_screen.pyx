@@ -8,10 +8,10 @@ from libc.stdlib cimport free, malloc, qsort
 import numpy as np
 
 from starpos._numeric.algebra cimport best_rotation, fetch, length, turned
-from starpos.core.frame cimport FrameStars, axis_of, direction_of, on_frame, pixel_of, pixels_of
-from starpos.core.matching cimport Matching, begin, match, order
-from starpos.core.sky cimport MOST_RUNS, Date, StarTable, runs_near
-from starpos.core.triangles cimport Candidate
+from starpos.identification._frame cimport FrameStars, axis_of, direction_of, on_frame, pixel_of, pixels_of
+from starpos.identification._matching cimport Matching, begin, match, order
+from starpos.identification._sky cimport MOST_RUNS, Date, StarTable, runs_near
+from starpos.identification._triangles cimport Candidate
 
 # Stars so far beyond a frame are on it.
 cdef double EDGE_PX = 2.0

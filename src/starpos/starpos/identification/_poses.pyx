@@ -8,9 +8,9 @@ from libc.stdlib cimport free, malloc
 import numpy as np
 
 from starpos._numeric.algebra cimport best_rotation, factored, length, median, solved, turn_by, turned
-from starpos.core.frame cimport FrameStars, direction_of, pixel_of, pixels_of
-from starpos.core.matching cimport Matching, match, order
-from starpos.core.sky cimport Visible
+from starpos.identification._frame cimport FrameStars, direction_of, pixel_of, pixels_of
+from starpos.identification._matching cimport Matching, match, order
+from starpos.identification._sky cimport Visible
 
 cdef enum:
     NONE = -1

@@ -8,7 +8,7 @@ from libc.stdlib cimport free, malloc
 import numpy as np
 
 from starpos._numeric.algebra cimport Point, Strips, fetch, sort_by_x, turned
-from starpos.core.frame cimport FrameStars, axis_of, pixel_of, seen_on
+from starpos.identification._frame cimport FrameStars, axis_of, pixel_of, seen_on
 
 cdef enum:
     # In mas.

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-from starpos.core.frame cimport FrameStars
-from starpos.core.matching cimport Matching
-from starpos.core.sky cimport Visible
+from starpos.identification._frame cimport FrameStars
+from starpos.identification._matching cimport Matching
+from starpos.identification._sky cimport Visible
 
 
 cdef enum:
