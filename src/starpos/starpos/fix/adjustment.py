@@ -9,7 +9,7 @@ from functools import cached_property
 
 import numpy as np
 
-from starpos.core.adjustment import Adjustment
+from starpos.fix._adjustment import Adjustment
 from starpos.earth.ellipsoid import ECCENTRICITY2
 from starpos.earth.orientation import EQUATOR_M_PER_S, SPEED_OF_LIGHT
 from starpos.earth.refraction import Refraction

@@ -6,9 +6,9 @@ import pytest
 from scipy.optimize import least_squares
 
 from starpos import rotation
-from starpos.core.adjustment import gain_of, spread
+from starpos.fix._adjustment import gain_of, spread
 from starpos._numeric.roots import symmetric_root
-from starpos.core.scatter import extra_variance
+from starpos.fix._scatter import extra_variance
 from starpos.earth.orientation import station_velocity
 from starpos.earth.refraction import MIN_COS_ZENITH, Atmosphere
 from starpos.fix.adjustment import adjustment_of, fitted
