@@ -115,7 +115,7 @@ class Refraction:
 
     @cached_property
     def compiled(self) -> Air:
-        """The model, for the compiled core."""
+        """The model, for compiled code."""
         return Air(self.a, self.b, MIN_COS_ZENITH)
 
     def bend(self, v: np.ndarray) -> np.ndarray:

@@ -86,7 +86,7 @@ class OnFrame:
 
 
 def judge(field: FrameStars, sky: Sky, prior: Prior, enough: float = ENOUGH) -> Judge:
-    """What judges poses of a frame by a prior, for the compiled core; enough: log-odds of an identification."""
+    """What judges poses of a frame by a prior, for compiled code; enough: log-odds of an identification."""
     return Judge(
         field,
         sky.stars,

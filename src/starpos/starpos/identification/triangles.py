@@ -90,7 +90,7 @@ class TriangleCatalogue:
 
     @cached_property
     def compiled(self) -> TriangleTable:
-        """The triangles, for the compiled core."""
+        """The triangles, for compiled code."""
         return TriangleTable(self, CROWDED, SCALE_TOLERANCE, TRIANGLE_SIGMA)
 
 

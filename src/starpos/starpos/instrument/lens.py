@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""ROS's lens models by name: `plumb_bob` of a pinhole, `equidistant` of a fisheye; the models are in `instrument._lens`."""
+"""ROS's lens models by name: `plumb_bob` of a pinhole, `equidistant` of a fisheye; the code is in `_lens`."""
 
 import math
 from functools import lru_cache

@@ -10,7 +10,7 @@ import numpy as np
 
 cimport starpos._numeric.wide
 from starpos._numeric.algebra cimport middle
-from starpos.core.shapes cimport Shape, clipped_to, inverse, put_shape, shape_before, sides, with_sides
+from starpos.detection._shapes cimport Shape, clipped_to, inverse, put_shape, shape_before, sides, with_sides
 
 cdef extern from *:
     """

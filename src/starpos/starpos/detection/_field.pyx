@@ -8,7 +8,7 @@ from libc.stdlib cimport free, malloc
 import numpy as np
 
 from starpos._numeric.algebra cimport factored, middle, solved
-from starpos.core.shapes cimport Shape, clipped_to
+from starpos.detection._shapes cimport Shape, clipped_to
 
 cdef enum:
     # How many monomials describe a variation over the field.

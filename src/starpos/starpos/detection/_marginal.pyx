@@ -11,7 +11,7 @@ import numpy as np
 cimport starpos._numeric.wide
 from starpos._numeric.algebra cimport factored, solved
 from starpos._numeric.limits cimport unsigned_char, within
-from starpos.core.psf cimport BLOCK, ORDERS, Local, blocks, evaluate, local_of, scaled, sound, terms_at
+from starpos.detection._psf cimport BLOCK, ORDERS, Local, blocks, evaluate, local_of, scaled, sound, terms_at
 
 cdef extern from *:
     """

@@ -8,10 +8,10 @@ from libc.string cimport memset
 
 import numpy as np
 
-from starpos.core.equations cimport invert, invert_scaled, scaled_factor, solve_scaled
-from starpos.core.psf cimport BLOCK, Local, blocks, evaluate, local_of, sound, values
-from starpos.core.rules cimport MOST, PHASES, Rules, first_of_phase, is_settled, rows_within, sound_stamps
-from starpos.core.sums cimport chi_square, products, weigh
+from starpos.detection._equations cimport invert, invert_scaled, scaled_factor, solve_scaled
+from starpos.detection._psf cimport BLOCK, Local, blocks, evaluate, local_of, sound, values
+from starpos.detection._rules cimport MOST, PHASES, Rules, first_of_phase, is_settled, rows_within, sound_stamps
+from starpos.detection._sums cimport chi_square, products, weigh
 
 cdef extern from *:
     """
