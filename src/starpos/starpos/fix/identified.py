@@ -3,10 +3,10 @@
 
 import math
 
-from starpos.core.frame import FrameStars
 from starpos.fix.solution import TWO_SKIES, UNEXPLAINED, Attitude, Solution
 from starpos.frames.stars import Stars
 from starpos.identification import Identification, Sky, wide
+from starpos.identification._frame import FrameStars
 from starpos.identification.explained import Explained, explained_by
 from starpos.identification.two_skies import two_skies
 from starpos.instrument.camera import Camera
