@@ -192,7 +192,7 @@ class Solver:
     def levelled(self, frame: Stars | Pointing, tilt: Tilt | Tilts | None) -> tuple[EarthState, Tilt]:
         """State of the Earth and the tilt at a frame; StarposError if its time or the tilt cannot be used."""
         if frame.mid_unix_s is None:
-            raise TimeError(f"{frame.place}: no time of exposure: {why_no_time(frame.source)}")
+            raise TimeError(f"{frame.place}: no time of exposure: {why_no_time(frame)}")
         state = earth_state(frame.mid_unix_s)
         if self.instrument.vertical is not None:
             tilt = own_level(frame.mid_unix_s)
