@@ -77,11 +77,12 @@ def reader_of(args: argparse.Namespace) -> Reader:
 
 @dataclass(frozen=True)
 class About:
-    """Frame size and focal length in px, as the first frame of a night states them."""
+    """Frame size, focal length and place on the sensor in px, as the first frame of a night states them."""
 
     width: int
     height: int
     focal_px: float | None
+    origin_px: tuple[float, float] | None = None
 
 
 # of pointings only the camera's axes count
@@ -99,7 +100,7 @@ class Look:
             with suppress(FrameError):
                 item = self.read(path)
                 self.read.keep(path, item)
-                return About(item.width, item.height, item.focal_px)
+                return About(item.width, item.height, item.focal_px, item.origin_px)
         return None
 
 

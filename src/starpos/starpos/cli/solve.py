@@ -25,6 +25,7 @@ from starpos.errors import InstrumentError, StarposError, TiltError
 from starpos.fix.solver import Solver
 from starpos.frames.stars import Stars
 from starpos.instrument import instrument_update
+from starpos.instrument.axis import with_frame_size
 from starpos.instrument.tilt_log import TiltLog
 from starpos.sky import catalogue
 
@@ -120,6 +121,9 @@ def _plan(args: argparse.Namespace, night: NightFolder, about: About | None, rea
     if about is None:
         return Plan(night, Listing(read))
     instrument, air = options.instrument_of(args, about), options.atmosphere_of(args)
+    instrument, doubt = with_frame_size(instrument, about)
+    if doubt:
+        console.complain("solve", doubt)
     check_save(args, instrument)
     noise = instrument.inclinometer.noise_rad
     table = None if night.tilt is None else checked_tilts("solve", night.tilt, noise)

@@ -78,7 +78,7 @@ class Solver:
         """
         begin = time.perf_counter()
         try:
-            camera, catalogue, triangles = self.view(stars.width, stars.height)
+            camera, catalogue, triangles = self.view(stars.width, stars.height, stars.origin_px)
             if part != 1.0:
                 triangles = triangle_cache.cached(catalogue, part * wide.field_rad(camera), self.progress)
             sky = Sky.at(catalogue, triangles, stars.mid_unix_s)
@@ -135,7 +135,7 @@ class Solver:
             return _for_all(stars, rows, self.solve(stars.take(rows), tilt, hint, predicted))
         try:
             state, tilt = self.levelled(stars, tilt)
-            camera, catalogue, triangles = self.view(stars.width, stars.height)
+            camera, catalogue, triangles = self.view(stars.width, stars.height, stars.origin_px)
             g = self.instrument.mounting.level(tilt).camera
             begin = time.perf_counter()
             directions = self.atmosphere.refraction().unbend(directions_of(camera, stars) @ g.T) @ g
@@ -285,14 +285,20 @@ class Solver:
         return self.instrument.shutter or stars.shutter or UNKNOWN
 
     @cached_property
-    def _views(self) -> dict[tuple[int, int], tuple[Camera, Catalogue, TriangleCatalogue]]:
-        """What `view` has given last, by size."""
+    def _views(self) -> dict[tuple, tuple[Camera, Catalogue, TriangleCatalogue]]:
+        """What `view` has given last, by size and origin."""
         return {}
 
-    def view(self, width: int, height: int) -> tuple[Camera, Catalogue, TriangleCatalogue]:
-        """Camera for frames of this size in px, catalogue for its field and its triangles; raises StarposError."""
-        if (width, height) not in self._views:
-            camera = self.instrument.camera_for(width, height)
+    def view(
+        self, width: int, height: int, origin_px: tuple[float, float] | None = None
+    ) -> tuple[Camera, Catalogue, TriangleCatalogue]:
+        """Camera for frames of this size in px, catalogue for its field and its triangles; raises StarposError.
+
+        origin_px: column and row of the camera's whole frame at which they begin, as their Exposure has it.
+        """
+        key = width, height, origin_px
+        if key not in self._views:
+            camera = self.instrument.camera_for(width, height, origin_px)
             field_deg = math.degrees(2 * camera.half_diagonal_rad)
             if field_deg < SMALLEST_FIELD_DEG or (field_deg > LARGEST_FIELD_DEG and not wide.is_wide(camera)):
                 raise InstrumentError(
@@ -304,13 +310,13 @@ class Solver:
             triangles = triangle_cache.cached(catalogue, wide.field_rad(camera), self.progress)
             # one size is usual
             self._views.clear()
-            self._views[width, height] = camera, catalogue, triangles
-        return self._views[width, height]
+            self._views[key] = camera, catalogue, triangles
+        return self._views[key]
 
     def _inside(self, stars: Stars) -> np.ndarray | None:
         """Rows of the stars that lie on their frame and in its lens's picture; None if all do, as is usual."""
         try:
-            return inside(stars, self.instrument.camera_for(stars.width, stars.height))
+            return inside(stars, self.instrument.camera_for(stars.width, stars.height, stars.origin_px))
         # who asks for the camera next reports the error
         except InstrumentError:
             return None

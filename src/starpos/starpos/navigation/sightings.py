@@ -115,7 +115,7 @@ def sighting_of(stars: Stars, eye: solver.Solver) -> IdentifiedFrame:
     mid_unix_s = stars.mid_unix_s
     if mid_unix_s is None:
         raise TimeError(f"{stars.place}: no time of exposure: {why_no_time(stars)}")
-    camera, catalogue, triangles = eye.view(stars.width, stars.height)
+    camera, catalogue, triangles = eye.view(stars.width, stars.height, stars.origin_px)
     if wide.is_wide(camera):
         raise InstrumentError(
             f"{stars.place}: frames of a fisheye tell no place under way: take a narrower lens"

@@ -20,6 +20,7 @@ from starpos.fix.solution import Solution, Status
 from starpos.fix.solver import Solver
 from starpos.frames.stars import Stars
 from starpos.identification.hint import Hint
+from starpos.instrument.axis import with_frame_size
 from starpos.instrument.inclinometer import level_of, up_of
 from starpos.instrument.instrument import Instrument
 from starpos.progress import Progress, quiet
@@ -55,6 +56,8 @@ class Workshop:
 
 def worked(exposures: StarLists, shop: Workshop) -> Night:
     """The night of these exposures; raises InstrumentError if there is no instrument for a frame."""
+    framing = _Framing(shop.instrument_for)
+    shop = replace(shop, instrument_for=framing)
     if shop.turn_stddev_deg is None:
         solved = _one_by_one(exposures, shop)
     else:
@@ -73,7 +76,7 @@ def worked(exposures: StarLists, shop: Workshop) -> Night:
         remarks += item.remarks
         shop.progress(exposures.name[:20], done / exposures.count)
     combined, why_not, said = _combined(fixes, shots)
-    remarks += said
+    remarks += [*said, *([framing.doubt] if framing.doubt else [])]
     if instrument and shop.turn_stddev_deg is None:
         unknown = unknown_a3(instrument.calibration, (combined or fixes[-1]).covariance, fixes[-1].terms)
         remarks += [unknown] if unknown else []
@@ -95,6 +98,20 @@ def worked(exposures: StarLists, shop: Workshop) -> Night:
     )
     steady = _steady(night, instrument) if combined and instrument else None
     return replace(night, steady=steady)
+
+
+class _Framing:
+    """The instrument for the stars of a frame, whose frame is that of the first one; and a doubt about its axis."""
+
+    def __init__(self, instrument_for: Callable[[Stars], Instrument]) -> None:
+        self._instrument_for, self.doubt = instrument_for, ""
+        self._first: Stars | None = None
+
+    def __call__(self, stars: Stars) -> Instrument:
+        self._first = stars if self._first is None else self._first
+        framed, doubt = with_frame_size(self._instrument_for(stars), self._first)
+        self.doubt = self.doubt or doubt
+        return framed
 
 
 @dataclass(frozen=True)

@@ -94,7 +94,7 @@ REFUSED = {
     "half a camera": ("starpos_instrument: 1\ncamera: {focal_mm: 600}\n", "pixel_um"),
     "unknown key": (SIMPLE + "misaligment_deg: [0, 0, 0]\n", "unknown key 'misaligment_deg'"),
     "unknown camera key": (SIMPLE.replace("}", ", distortions: [0, 0, 0, 0, 0]}"), "distortions"),
-    "two cameras": (FULL.replace("width", "focal_mm: 600, pixel_um: 6.4, width"), "unknown key 'width'"),
+    "two cameras": (FULL.replace("width", "focal_mm: 600, pixel_um: 6.4, width"), "unknown key 'fx'"),
     "no calibration": (
         "starpos_instrument: 1\ncamera: {calibration: none.yaml}\n",
         "none.yaml: not a readable calib",
