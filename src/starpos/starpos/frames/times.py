@@ -170,7 +170,8 @@ def _middles(
             span_s = end.since_s(start)
             if span_s < 0:
                 raise TimeError(f"its {last} is before its {key}: correct the header")
-            stddev_s = math.hypot(start.stddev_s, end.stddev_s) / 2
+            # an end is often when the frame had come: a start and a length count for more
+            stddev_s = math.hypot(start.stddev_s, end.stddev_s)
             found.append(_Middle(at_s + span_s / 2, stddev_s, f"{key} and {last}"))
     if not starts:
         # what reads the clock when the frame has come is late
