@@ -152,7 +152,9 @@ def _camera(
     """Fit the camera of --camera, write, draw and print it."""
     air = options.atmosphere_of(args)
     given = instrument.camera_for(frames[0].width, frames[0].height, frames[0].origin_px)
-    if {(f.width, f.height, f.origin_px) for f in frames} != {(given.width, given.height, frames[0].origin_px)}:
+    if {(f.width, f.height, f.origin_px) for f in frames} != {
+        (given.width, given.height, frames[0].origin_px)
+    }:
         raise InstrumentError(
             "the frames are not all of one size and one part of the sensor: give such ones for --camera"
         )

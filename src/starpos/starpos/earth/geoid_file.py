@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Grids of geoid undulations: GTX (NOAA's VDatum), NGS's .bin and GeoTIFF (PROJ's specification of geodetic TIFF grids)."""
+"""Grids of geoid undulations: NOAA's GTX, NGS's .bin and PROJ's GeoTIFF (its specification of geodetic TIFF grids)."""
 
 import os
 import struct
@@ -134,7 +134,9 @@ def read_grid(path: Path | str) -> Grid:
             if start in TIFF_MAGIC:
                 return Grid(*read_geotiff(bytes_of(file, MAX_BYTES), MAX_BYTES))
             if start in BIGTIFF_MAGIC:
-                raise GeoidError("it is a BigTIFF, which is not read: gdal_translate -co BIGTIFF=NO makes a TIFF of it")
+                raise GeoidError(
+                    "it is a BigTIFF, which is not read: gdal_translate -co BIGTIFF=NO makes a TIFF of it"
+                )
             return Grid(*_read_plain(file))
     except OSError as e:
         raise GeoidError(
@@ -172,7 +174,9 @@ def _read_plain(file: BinaryIO) -> tuple[np.ndarray, float, float, float, float]
         order, start = ">", GTX_HEADER.size
     south, west, step_latitude, step_longitude, rows, columns = struct.unpack_from(order + "4d2i", head)
     if rows <= 0 or columns <= 0 or 4 * rows * columns > MAX_BYTES:
-        raise GeoidError(f"its header claims {columns} x {rows} nodes: is it a GTX, NGS .bin or GeoTIFF file?")
+        raise GeoidError(
+            f"its header claims {columns} x {rows} nodes: is it a GTX, NGS .bin or GeoTIFF file?"
+        )
     missing = start + 4 * rows * columns - size
     if missing > 0:
         raise GeoidError(f"{missing} bytes are missing at its end: copy it again")

@@ -36,9 +36,9 @@ def read_frame(path: Path | str, clock: CameraClock | None = None) -> Frame | St
     TIMESYS), whose last digit is its error, EXPTIME or EXPOSURE its length in s, where 0 is unknown; a DATE-AVG is its
     middle, a DATE-END its end. Where these contradict each other, or a stack is told (STACKCNT), there is no time.
     XORGSUBF and YORGSUBF (or LTV1 and LTV2) say of which part of the sensor a frame is. BAYERPAT (XBAYROFF, YBAYROFF) is
-    the mosaic; FOCALLEN (mm) and XPIXSZ (um), or SCALE (arcsec), give focal_px. The first row of the file is row 0. Values that fit 16 bits
-    are only rounded. Others are shifted to begin at 0, and scaled to fill 16 bits if their range is wider than that
-    or, for floats, narrower than 4096. A few NaN or infinite pixels become the median. Values farther from it than any
+    the mosaic; FOCALLEN (mm) and XPIXSZ (um), or SCALE (arcsec), give focal_px. The first row of the file is row 0.
+    Values that fit 16 bits are only rounded. Others are shifted to begin at 0, and scaled to fill 16 bits if their range
+    is wider than that or, for floats, narrower than 4096. A few NaN or infinite pixels become the median. Values farther from it than any
     light (frame.LOUDEST) are clipped. Of several images (HDUs) the first is taken, with a warning; `a.fits[2]` or
     `a.fits[SCI]` is another one, by its number from 0 or its EXTNAME. What its header lacks is that of the primary one.
     Three planes (NAXIS3 = 3) are colours, and become their mean.
@@ -51,7 +51,8 @@ def read_frame(path: Path | str, clock: CameraClock | None = None) -> Frame | St
     required, then columns x, y, flux and optionally sigma (px); without it sigma is 0.1 px. The SNR is 1 px / sigma, that
     of a star image whose standard deviation is 1 px.
 
-    Without a time or an exposure mid_unix_s is None, and untimed says why. FrameError for everything that is not as described here.
+    Without a time or an exposure mid_unix_s is None, and untimed says why. FrameError for everything
+    that is not as described here.
     """
     path = Path(path)
     file_path, part = _part_of(path)

@@ -203,7 +203,9 @@ def _instant(header: Mapping, key: str, scale: str) -> _Instant | None:
         try:
             value = float(value)
         except (TypeError, ValueError, OverflowError):
-            raise TimeError(f"its {key} is {one_line(repr(value))}, which is no number: give an MJD") from None
+            raise TimeError(
+                f"its {key} is {one_line(repr(value))}, which is no number: give an MJD"
+            ) from None
     else:
         value = _as_today(value)
         # a number of another keyword (a Julian date, Unix time) would pass for an MJD
@@ -225,8 +227,8 @@ def _instant(header: Mapping, key: str, scale: str) -> _Instant | None:
             day, part = _tai(*_day_of(value, scale), scale)
     except (erfa.ErfaError, erfa.ErfaWarning, ValueError, TypeError, OverflowError):
         raise TimeError(
-            f"its {key} is {one_line(repr(value))}, which is no time of an exposure (hours to 23, minutes and seconds to 59): write it "
-            "like 2026-11-02T18:00:00.000"
+            f"its {key} is {one_line(repr(value))}, which is no time of an exposure (hours to 23, minutes and seconds to "
+            "59): write it like 2026-11-02T18:00:00.000"
         ) from None
     return _Instant(day, part, _rounding(value))
 

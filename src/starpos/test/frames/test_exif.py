@@ -181,7 +181,9 @@ def test_gps_time_gives_the_zone_and_is_held_against_the_one_that_is_stated(tmp_
     for clock in (CameraClock(), TEHRAN):
         assert read_frame(path, clock).mid_unix_s == pytest.approx(SHOWN_S - 3.5 * 3600 + 0.75)
     frame = read_frame(path, CameraClock(1.0))
-    assert frame.mid_unix_s is None and re.search(r"GPS.* 3\.51 h ahead of UTC, and not 1 h", why_no_time(frame))
+    assert frame.mid_unix_s is None and re.search(
+        r"GPS.* 3\.51 h ahead of UTC, and not 1 h", why_no_time(frame)
+    )
     told = write(tmp_path / "b.jpg", jpeg(offset="+01:00", gps=("2026:11:02", (14, 29, 20))))
     assert "GPS" in why_no_time(read_frame(told, CameraClock()))
     for broken in (("2026:13:02", (14, 29, 20)), ("2026:11:02", (25, 0, 0))):

@@ -24,7 +24,9 @@ WHOLE = (0.0, 0.0)
 
 def written(path, cards):
     """A FITS file with these cards, each a value or a value and its comment."""
-    header = fits.Header([(key, *(told if isinstance(told, tuple) else (told,))) for key, told in cards.items()])
+    header = fits.Header(
+        [(key, *(told if isinstance(told, tuple) else (told,))) for key, told in cards.items()]
+    )
     fits.PrimaryHDU(PIXELS, header).writeto(path)
     return path
 

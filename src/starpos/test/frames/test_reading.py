@@ -70,7 +70,10 @@ def test_an_exposure_across_a_leap_second_is_counted_in_real_seconds(tmp_path):
         ({"DATE-OBS": "2026-11-02", "UT": "18:00:00", "EXPTIME": 2}, unix(2026, 11, 2, 18, 0, 1)),
         ({"DATE-OBS": "2026-11-02", "MJD-OBS": 61346.75, "EXPTIME": 2}, unix(2026, 11, 2, 18, 0, 1)),
         ({"DATE-OBS": "2026-11-02T18:00:37", "TIMESYS": "TAI", "EXPTIME": 2}, unix(2026, 11, 2, 18, 0, 1)),
-        ({"DATE-OBS": "2026-11-02 18:00:00", "TIME-OBS": "18:00:00", "EXPTIME": 2}, unix(2026, 11, 2, 18, 0, 1)),
+        (
+            {"DATE-OBS": "2026-11-02 18:00:00", "TIME-OBS": "18:00:00", "EXPTIME": 2},
+            unix(2026, 11, 2, 18, 0, 1),
+        ),
         ({"DATE-OBS": "02/11/97", "TIME-OBS": "18:00:00", "EXPTIME": 2}, unix(1997, 11, 2, 18, 0, 1)),
         ({"DATE-AVG": "2026-11-02T18:00:01"}, unix(2026, 11, 2, 18, 0, 1)),
         ({"DATE-OBS": "2026-11-02T18:00:00", "EXPTIME": 0}, None),

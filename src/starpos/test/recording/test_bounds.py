@@ -146,6 +146,8 @@ def test_a_storage_that_is_not_named_or_not_known_is_said(tmp_path, storage):
     with Writer(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.MCAP) as bag:
         bag.add_connection("/told", "std_msgs/msg/String", typestore=store)
     metadata = tmp_path / "bag" / "metadata.yaml"
-    metadata.write_text(metadata.read_text().replace("storage_identifier: mcap", f"storage_identifier: {storage}"))
-    with pytest.raises(BagError, match="storage_identifier.*mcap or sqlite3"), BagReader(tmp_path / "bag"):
+    metadata.write_text(
+        metadata.read_text().replace("storage_identifier: mcap", f"storage_identifier: {storage}")
+    )
+    with pytest.raises(BagError, match=r"storage_identifier.*mcap or sqlite3"), BagReader(tmp_path / "bag"):
         pass

@@ -43,7 +43,9 @@ def exif_tags(
         0x9003: None if start is None else (ASCII, start),
         0x9291: None if subsec is None else (ASCII, subsec),
         0x9011: None if offset is None else (ASCII, offset),
-        GPS: None if gps is None else {0x1D: (ASCII, gps[0]), 0x07: (RATIONAL, [n for v in gps[1] for n in (v, 1)])},
+        GPS: None
+        if gps is None
+        else {0x1D: (ASCII, gps[0]), 0x07: (RATIONAL, [n for v in gps[1] for n in (v, 1)])},
     }
     return {tag: value for tag, value in tags.items() if value is not None}
 
@@ -58,7 +60,9 @@ def tiff(tags, exif, order="<", pixels=b""):
     at = {EXIF: at_exif, GPS: at_gps, STRIPS: at_gps + (_length(gps) if gps else 0)}
     tags = tags | {tag: (LONG, [at[tag]]) for tag in below}
     magic = (b"II*\0" if order == "<" else b"MM\0*") + struct.pack(order + "I", first)
-    directories = _ifd(tags, first, order) + _ifd(exif, at_exif, order) + (_ifd(gps, at_gps, order) if gps else b"")
+    directories = (
+        _ifd(tags, first, order) + _ifd(exif, at_exif, order) + (_ifd(gps, at_gps, order) if gps else b"")
+    )
     return magic + directories + pixels
 
 
