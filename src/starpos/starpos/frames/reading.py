@@ -37,10 +37,11 @@ def read_frame(path: Path | str, clock: CameraClock | None = None) -> Frame | St
     middle, a DATE-END its end. Where these contradict each other, or a stack is told (STACKCNT), there is no time.
     XORGSUBF and YORGSUBF (or LTV1 and LTV2) say of which part of the sensor a frame is. BAYERPAT (XBAYROFF, YBAYROFF) is
     the mosaic; FOCALLEN (mm) and XPIXSZ (um), or SCALE (arcsec), give focal_px. The first row of the file is row 0.
-    Values that fit 16 bits are only rounded. Others are shifted to begin at 0, and scaled to fill 16 bits if their range
-    is wider than that or, for floats, narrower than 4096. A few NaN or infinite pixels become the median. Values farther from it than any
-    light (frame.LOUDEST) are clipped. Of several images (HDUs) the first is taken, with a warning; `a.fits[2]` or
-    `a.fits[SCI]` is another one, by its number from 0 or its EXTNAME. What its header lacks is that of the primary one.
+    Values that fit 16 bits are only rounded. Others are shifted to begin at 0, and scaled to fill 16 bits if their
+    range is wider than that or, for floats, narrower than 4096. A few NaN or infinite pixels become the median.
+    Values farther from it than any light (frame.LOUDEST) are clipped. Of several images (HDUs) the first is taken,
+    with a warning; `a.fits[2]` or `a.fits[SCI]` is another one, by its number from 0 or its EXTNAME. What its header
+    lacks is that of the primary one.
     Three planes (NAXIS3 = 3) are colours, and become their mean.
     TIFF, PNG, JPEG, BMP: 8 or 16 bits, grey or colour; TIFF also of floats, by the rule above. Colours of more than 8
     bits become the mean of the three. HEIF: the same, through pillow-heif.

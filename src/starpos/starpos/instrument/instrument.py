@@ -291,8 +291,8 @@ class Instrument:
             where = "" if math.isnan(left + top) else f" at column {left:g}, row {top:g}"
             what = "focal length and A3 are" if self.camera is None else "the camera's intrinsics are"
             raise InstrumentError(
-                f"the frame is {width} x {height} px{where} but {what} of {whole.width} x {whole.height} px: use "
-                "those of this frame size, or frames whose header says which part of the whole one they are (XORGSUBF, YORGSUBF)"
+                f"the frame is {width} x {height} px{where} but {what} of {whole.width} x {whole.height} px: "
+                "use those of this frame size, or frames whose header says their part of the whole one (XORGSUBF, YORGSUBF)"
             )
         return whole.part(left, top, width, height) if (width, height) != self.size else whole
 
