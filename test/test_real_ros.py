@@ -16,6 +16,7 @@ from sensor_msgs.msg import NavSatFix
 
 from starpos_testing.graph.graph import Graph
 from starpos_testing.patience import WAIT_S
+from starpos_testing.skies.bags import knowing
 
 NIGHT = Path(__file__).parent / "data" / "night"
 PLACE = {"latitude": 48.1, "longitude": 11.6}
@@ -123,17 +124,9 @@ def test_a_night_that_ros2_bag_records_is_worked_by_starpos_replay(graph, fixes,
 @needs("ros2bag")
 def test_ros2_bag_play_of_a_night_gives_its_place(graph, run, tmp_path):
     truth = json.loads(NIGHT.with_suffix(".json").read_text())
-    values = {
-        "use_sim_time": "true",
-        "refraction.pressure": truth["pressure_pa"],
-        "refraction.temperature": truth["temperature_c"],
-        "refraction.humidity": truth["humidity"],
-        "misalignment": truth["misalignment_deg"],
-        "misalignment_stddev": 0.1,
-    }
     fixes = graph.hear(NavSatFix, "played/fix")
     moved = ("--ros-args", "-r", "__ns:=/played")
-    run("starpos_solver", "solver", *(f"{name}:={value}" for name, value in values.items()), arguments=moved)
+    run("starpos_solver", "solver", *knowing(truth), arguments=moved)
     renamed = [f"/{topic}:=/played/{topic}" for topic in ("stars", "tilt", "camera/camera_info")]
     with started(
         tmp_path / "log",

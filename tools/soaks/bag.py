@@ -23,7 +23,7 @@ from pathlib import Path
 
 from starpos_testing.domain import own_domain
 from starpos_testing.patience import WAIT_S
-from starpos_testing.skies.bags import part_of
+from starpos_testing.skies.bags import knowing, part_of
 
 NIGHT = Path(__file__).resolve().parents[2] / "test" / "data" / "night"
 SECONDS = 10
@@ -48,16 +48,7 @@ class Outcome:
 
 def parameters() -> list[str]:
     """The parameters of a solver that knows the night's instrument."""
-    truth = json.loads(NIGHT.with_suffix(".json").read_text())
-    values = {
-        "use_sim_time": "true",
-        "refraction.pressure": truth["pressure_pa"],
-        "refraction.temperature": truth["temperature_c"],
-        "refraction.humidity": truth["humidity"],
-        "misalignment": truth["misalignment_deg"],
-        "misalignment_stddev": 0.1,
-    }
-    return [f"{name}:={value}" for name, value in values.items()]
+    return knowing(json.loads(NIGHT.with_suffix(".json").read_text()))
 
 
 class Listener:
