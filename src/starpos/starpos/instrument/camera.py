@@ -11,8 +11,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
-from starpos.core.lens import Equidistant, Lens
 from starpos.errors import InstrumentError
+from starpos.instrument._lens import Equidistant, Lens
 from starpos.instrument.lens import COEFFICIENTS, PLUMB_BOB, lens_of
 
 
@@ -108,6 +108,10 @@ class Camera:
     def scaled(self, factor: float) -> "Camera":
         """The camera with its focal lengths multiplied by `factor`."""
         return replace(self, fx=self.fx * factor, fy=self.fy * factor)
+
+    def part(self, left: float, top: float, width: int, height: int) -> "Camera":
+        """The camera of a part of its frame, of a size in px and with its first pixel at that column and row."""
+        return replace(self, width=width, height=height, cx=self.cx - left, cy=self.cy - top)
 
     def sees(self, x: ArrayLike, y: ArrayLike) -> np.ndarray:
         """Whether pixels x, y (N,) lie within the lens's picture: around that of a fisheye the frame may be black."""
