@@ -29,10 +29,10 @@ from starpos.instrument.tilt_log import TiltLog
 from starpos.rotation import half_turn
 from starpos.simulation.montecarlo_nights import (
     CAMERA,
-    SCA100T_CALIBRATED,
     EXPOSURE_S,
     LEAN_DEG,
     READINGS,
+    SCA100T_CALIBRATED,
     TURN_S,
     NightWorld,
     Zero,

@@ -130,7 +130,7 @@ def place_of_circles(circles: Sequence[Circle], near: tuple[float, float] | None
 
 @dataclass(frozen=True)
 class Directions:
-    """D directions in which frames look: the circles of each, and the covariance (D, D) in rad2 of their mean zenith distances by source."""
+    """D directions: the circles of each, and by source the covariance (D, D) in rad2 of their mean zenith distances."""
 
     circles: list[list[Circle]]
     sources: dict[str, np.ndarray]

@@ -12,6 +12,7 @@ whose length nobody knows (Rasmussen and Williams, Gaussian Processes for Machin
 near each other are alike, and many of them know little more than one. docs/error_budget.md has the model in words.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -102,10 +103,10 @@ class Scatter:
 
 @dataclass(frozen=True)
 class _Kind:
-    """An error: its covariance (B, B) at unit size, and its mean variances over poses, over frames, and as noise."""
+    """An error of unit size: its covariance (B, B), and mean variances (3,) over poses, over frames, and as noise."""
 
     kernel: np.ndarray
-    means: tuple[float, float, float]
+    means: np.ndarray
 
 
 def scatter_of(frames: Frames) -> Scatter:
@@ -115,39 +116,32 @@ def scatter_of(frames: Frames) -> Scatter:
     own = np.diag(share**2 @ frames.sigma**2)
     shapes = _shapes(frames, share, poses)
     stated = own + frames.pose_sigma**2 * shapes[0].kernel
-    kinds: list[tuple[np.ndarray, _Kind]] = []
-    few = False
-    if _freedom(y, j, stated, frames.prior_sigma)[1]:
-        kinds = [(stated, kind) for kind in _wandering(frames, share, poses)]
-        of_poses = np.einsum("pk,kin->pin", poses, frames.design)
-        each = np.diag(poses**2 @ frames.sigma**2 + frames.pose_sigma**2)
-        free, tell = _freedom(poses @ frames.residual, of_poses, each, frames.prior_sigma)
-        few = tell and free < FEWEST_FREE
-        if tell:
-            # the whole error of the pose has one shape
-            kinds += [(own + frames.pose_sigma**2 * shape.kernel, shape) for shape in shapes]
-    least = LEAST_SHARE * float(np.sqrt(np.median(frames.sigma**2)))
-    sizes = np.geomspace(least, max(MOST_RAD, 10 * least), SIZES)
     # each hypothesis: its prior, its covariance, and its mean variances beyond what is stated
     many = 1 if frames.pose_sigma == 0 else len(shapes)
     tried = [
         (AS_STATED / many, own + frames.pose_sigma**2 * shape.kernel, np.zeros(3)) for shape in shapes[:many]
     ]
-    prior = (1 - AS_STATED) * _shrinking(sizes) / max(len(kinds), 1)
-    for beside, kind in kinds:
-        means = np.array(kind.means)
-        tried += [
-            (w, beside + size**2 * kind.kernel, size**2 * means)
-            for w, size in zip(prior, sizes, strict=True)
-        ]
-    noisy = [0.0, *_noises(frames)]
-    noise = _kind(share, poses, np.eye(len(frames.pose)), 1.0)
-    whole = [
-        (w / len(noisy), covariance + n**2 * noise.kernel, means + n**2 * np.array(noise.means))
-        for n in noisy
-        for w, covariance, means in tried
-    ]
-    weights, covariances, means = zip(*whole, strict=True)
+    few = False
+    if _freedom(y, j, stated, frames.prior_sigma)[1]:
+        of_poses = np.einsum("pk,kin->pin", poses, frames.design)
+        each = np.diag(poses**2 @ frames.sigma**2 + frames.pose_sigma**2)
+        free, tell = _freedom(poses @ frames.residual, of_poses, each, frames.prior_sigma)
+        few = tell and free < FEWEST_FREE
+        wandering, posed = _wandering(frames, share, poses), shapes if tell else []
+        least = LEAST_SHARE * float(np.sqrt(np.median(frames.sigma**2)))
+        sizes = np.geomspace(least, max(MOST_RAD, 10 * least), SIZES)
+        prior = (1 - AS_STATED) * _shrinking(sizes) / (len(wandering) + len(posed))
+        tried += _sized(stated, wandering, sizes, prior)
+        noises = _noises(frames)
+        for shape in posed:
+            # the whole error of the pose has one shape
+            beside = own + frames.pose_sigma**2 * shape.kernel
+            tried += _sized(beside, [shape], sizes, prior)
+            # and frames of a pose may have more noise too
+            for noise in noises:
+                more = _sized(beside + noise**2 * wandering[0].kernel, [shape], sizes, prior / len(noises))
+                tried += [(w, c, v + noise**2 * wandering[0].means) for w, c, v in more]
+    weights, covariances, means = zip(*tried, strict=True)
     normals, pulls, bares = _sums(y, j, np.array(covariances))
     # each hypothesis of the scatter with each of the response, one after another
     number = len(RESPONSES) if frames.response.any() else 1
@@ -159,8 +153,8 @@ def scatter_of(frames: Frames) -> Scatter:
     log_weight = evidence + np.log(np.outer(weights, wide_prior).ravel())
     weight = np.exp(log_weight - log_weight.max())
     weight /= weight.sum()
-    # nobody's word against a sensor is enough to doubt its response: the frames have to show it; few poses that contradict
-    # each other leave it open
+    # nobody's word against a sensor is enough to doubt its response: the frames have to show it; few poses that
+    # contradict each other leave it open
     wider = np.arange(len(weight)) % number > 0
     if not few and weight[wider].sum() < SHOWN:
         weight[wider] = 0.0
@@ -185,9 +179,7 @@ def _pose_means(frames: Frames) -> np.ndarray:
     return weight / weight.sum(1)[:, None]
 
 
-def _freedom(
-    y: np.ndarray, j: np.ndarray, stated: np.ndarray, prior_sigma: np.ndarray
-) -> tuple[float, bool]:
+def _freedom(y: np.ndarray, j: np.ndarray, stated: np.ndarray, prior_sigma: np.ndarray) -> tuple[float, bool]:
     """Degrees of freedom of data (B, 2), and whether these tell that they scatter more than (B, B) states."""
     normal, pull, _ = _sums(y, j, stated[None])
     free = 2 * len(y) - _told(normal[0], prior_sigma)
@@ -247,7 +239,20 @@ def _wandering(frames: Frames, share: np.ndarray, poses: np.ndarray) -> list[_Ki
 def _kind(share: np.ndarray, poses: np.ndarray, covariance: np.ndarray, noise: float = 0.0) -> _Kind:
     """An error from its covariance (K, K) of the frames; noise: the variance of it that is noise."""
     of_pose = float(np.mean(np.einsum("pk,kl,pl->p", poses, covariance, poses)))
-    return _Kind(share @ covariance @ share.T, (of_pose, float(np.mean(np.diag(covariance))), noise))
+    return _Kind(
+        share @ covariance @ share.T, np.array([of_pose, float(np.mean(np.diag(covariance))), noise])
+    )
+
+
+def _sized(
+    beside: np.ndarray, kinds: Sequence[_Kind], sizes: np.ndarray, prior: np.ndarray
+) -> list[tuple[float, np.ndarray, np.ndarray]]:
+    """Hypotheses of errors of each size (S,), with their priors (S,), beside what has the covariance (B, B)."""
+    return [
+        (float(w), beside + size**2 * kind.kernel, size**2 * kind.means)
+        for kind in kinds
+        for size, w in zip(sizes, prior, strict=True)
+    ]
 
 
 def _shrinking(sizes: np.ndarray) -> np.ndarray:

@@ -118,7 +118,9 @@ def find_axis(
         if one is not None:
             found.append(one)
     if not found:
-        raise FixError("the elevations determine no A3: check the tilts, the clock and that nothing was moved")
+        raise FixError(
+            "the elevations determine no A3: check the tilts, the clock and that nothing was moved"
+        )
     found.sort(key=lambda f: f[0])
     best = found[0][1]
     left = [f for chi2, f in found if chi2 - found[0][0] < EXCLUDED_SIGMA**2 * (1 + best.scatter2)]

@@ -221,8 +221,8 @@ class _Agreement:
         if not told:
             return ""
         return (
-            f"the tilts err by more than is stated of the inclinometer: {', '.join(told)}; the claim holds it, and so does "
-            f"the file that is written with A3; in another, state {', '.join(state)}"
+            f"the tilts err by more than is stated of the inclinometer: {', '.join(told)}; the claim holds it, and so "
+            f"does the file that is written with A3; in another, state {', '.join(state)}"
         )
 
     @property

@@ -175,8 +175,8 @@ def run_elevations(
         f"A3 of {calibration.frames} elevations in {found.directions} directions at {site.latitude_deg:+.6f} "
         f"{site.longitude_deg:+.6f} (by gravity): "
         "{:.5f} {:.5f} {:.5f} deg\n".format(*calibration.misalignment_deg)
-        + f"the frame's centre in the inclinometer is known to {found.stddev_arcsec:.2f} arcsec; elevations alone tell no "
-        "turn about it: for pointings without a roll it does not count\n"
+        + f"the frame's centre in the inclinometer is known to {found.stddev_arcsec:.2f} arcsec; elevations alone "
+        "tell no turn about it: for pointings without a roll it does not count\n"
     )
     whole = replace(instrument, calibration=calibration)
     save_instrument("calibrate", args.output, whole, about)

@@ -73,7 +73,8 @@ COMMANDS = {
     "report": Command(
         "nights on one page: stability, scatter, residuals, sky, error budget",
         (
-            "starpos report night --misalignment 0 0 0 --misalignment-stddev 5 --inclinometer sca100t_calibrated -o my-report",
+            "starpos report night --misalignment 0 0 0 --misalignment-stddev 5 --inclinometer sca100t_calibrated "
+            "-o my-report",
         ),
         "open the index.html whose path it prints",
     ),

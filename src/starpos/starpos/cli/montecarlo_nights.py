@@ -126,11 +126,7 @@ def _nees(solved: list[NightOutcome]) -> np.ndarray:
 
 
 def _errors(args: argparse.Namespace) -> montecarlo_nights.InclinometerErrors:
-    return (
-        SCA100T_CALIBRATED
-        if args.tiltmeter is None
-        else montecarlo_nights.tiltmeter(args.tiltmeter)
-    )
+    return SCA100T_CALIBRATED if args.tiltmeter is None else montecarlo_nights.tiltmeter(args.tiltmeter)
 
 
 def _either(

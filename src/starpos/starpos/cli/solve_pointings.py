@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from starpos.calibration.axis import FoundAxis
 from starpos.cli import console, options
 from starpos.cli.archive import NightFolder
 from starpos.cli.deflection import tell_unknown, vertical_of
@@ -22,7 +23,6 @@ from starpos.fix.solver import Solver
 from starpos.frames.pointings import Pointing, read_pointings
 from starpos.instrument.tilts import NO_TILTS, Tilts
 from starpos.night.doubts import Near
-from starpos.calibration.axis import FoundAxis
 from starpos.night.elevations import from_elevations
 from starpos.night.reading import NO_CAMERA
 from starpos.night.remarks import WORTH_SAVING_ARCSEC
@@ -89,7 +89,10 @@ def _from_elevations(
     whole, night = found.together, NightFolder((), args.tilt)
     saving = 0
     if found.axis is not None:
-        say(night, f"A3 from the elevations: the frame's centre in the inclinometer to {found.axis.stddev_arcsec:.0f} arcsec")
+        say(
+            night,
+            f"A3 from the elevations: the frame's centre in the inclinometer to {found.axis.stddev_arcsec:.0f} arcsec",
+        )
     if args.save is not None:
         saving = _save(args, solver, found.axis)
     say(night, *([whole.why_not] if whole.why_not else ()), *whole.remarks)

@@ -138,7 +138,16 @@ def test_the_command_line_takes_a_model_or_a_file(tmp_path, capsys):
     solve = ["solve", frame, "--tilt", table]
 
     def sigma_m(*options):
-        known = ("--misalignment", "0", "0", "0", "--misalignment-stddev", "5", "--inclinometer", "sca100t_calibrated")
+        known = (
+            "--misalignment",
+            "0",
+            "0",
+            "0",
+            "--misalignment-stddev",
+            "5",
+            "--inclinometer",
+            "sca100t_calibrated",
+        )
         assert main([*solve, *optics, *known, *options]) == 0
         return float(re.search(r"\+- (\d+) m", capsys.readouterr().out).group(1))
 
