@@ -166,7 +166,7 @@ def scatter_of(frames: Frames) -> Scatter:
         pose_sigma=float(np.sqrt(pose2 + frames.pose_sigma**2)),
         frame_sigma=float(np.sqrt(frame2 + frames.pose_sigma**2)),
         noise_sigma=float(np.sqrt(noise2)),
-        evident=bool(weight[: many * number].sum() < EVIDENT),
+        evident=bool(weight[: many * number : number].sum() < EVIDENT),
         moved=mean,
         covariance=np.tensordot(weight, spread, 1) + (weight * off.T) @ off,
         stated=spread[0],

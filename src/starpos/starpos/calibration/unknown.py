@@ -19,7 +19,9 @@ BY_PARAMETERS = (
     "starpos calibrate --site and set calibration_url, or set misalignment and misalignment_stddev"
 )
 # the same for the errors of the inclinometer
-MODEL_BY_OPTIONS = "name it with --inclinometer MODEL, or its model or errors (tilt_noise_deg and the others) in an instrument file"
+MODEL_BY_OPTIONS = (
+    "name it with --inclinometer MODEL, or its model or errors (tilt_...) in an instrument file"
+)
 MODEL_BY_PARAMETERS = "set inclinometer.model, or name it or its errors in the file of calibration_url"
 # of one lean nothing is known of the turn about the plumb line: then an angle has a sigma of some 100 deg
 UNKNOWN_DEG = 60.0

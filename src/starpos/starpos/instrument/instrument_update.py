@@ -91,7 +91,7 @@ def write(path: Path, instrument: Instrument, comment: str, *, camera_found: boo
         pose = says and stated.pose_rad < instrument.inclinometer.pose_rad
         noise = says and stated.noise_rad < instrument.inclinometer.noise_rad
         found = {*FOUND, *["camera"] * camera_found}
-        found |= {*["tilt_pose_arcsec"] * pose, *["tilt_noise_deg"] * noise}
+        found |= {*["tilt_pose_arcsec"] * bool(pose), *["tilt_noise_deg"] * bool(noise)}
         kept = yaml_file.load(path, "instrument file")
         changed = {k: v for k, v in kept.items() if k not in found} | {k: new[k] for k in found if k in new}
         if not camera_found and instrument.frame_size is not None:

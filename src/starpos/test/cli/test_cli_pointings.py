@@ -12,6 +12,7 @@ from starpos_testing.command_line import run
 from starpos_testing.skies.pointings import pointed_night
 
 AIR = ("--pressure-hpa", "880", "--temperature-c", "12", "--humidity", "0.3")
+SENSOR = ("--inclinometer", "sca100t_calibrated")
 A3 = (
     "--misalignment",
     "1.5",
@@ -104,12 +105,13 @@ def test_a3_by_turning_and_at_a_known_place(tables, capsys, tmp_path):
         "--self-calibrate",
         "--save",
         tmp_path / "a.yaml",
+        *SENSOR,
         "--json",
     )
     assert status == 0 and tables.sigmas_off(objects(out)[-1]) < 4
     place = ("--site", site.latitude_deg, site.longitude_deg)
     status, out, errors = run(
-        capsys, "calibrate", *table, *tables.tilt, *AIR, *place, "-o", tmp_path / "b.yaml"
+        capsys, "calibrate", *table, *tables.tilt, *AIR, *SENSOR, *place, "-o", tmp_path / "b.yaml"
     )
     assert (status, errors) == (0, []) and "A3 of 16 frames" in out
     for name in ("a.yaml", "b.yaml"):
@@ -167,7 +169,6 @@ REFUSED = {
     "both": (("x.fits", "WHOLE", "TILT"), "not both"),
     "no tilts": (("WHOLE",), "give --tilt CSV"),
     "no such table": (("--pointings", "none.csv", "TILT"), "none.csv: no readable table"),
-    "A3 from elevations": (("BARE", "TILT", "--self-calibrate"), "elevations alone do not tell A3"),
     "how near without where": (("WHOLE", "TILT", *A3, "--near-km", "20"), "--near-km is for --near"),
     "near nowhere": (("BARE", "TILT", "--near", "95", "2"), "give latitude and longitude in deg"),
     "processes": (("WHOLE", "TILT", "--jobs", "2"), "--jobs and --scheduler are for frames"),
@@ -191,9 +192,54 @@ def test_one_direction_is_no_place(tables, capsys):
     assert status == 1 and "in 1 direction tell no place" in errors[0]
 
 
-def test_an_unknown_a3_is_said_and_costs_the_elevations(tables, capsys):
-    status, _, errors = run(capsys, "solve", *tables.pointings("bare.csv"), *tables.tilt, *AIR)
-    assert status == 1 and "A3 has to be known" in errors[0]
+@pytest.mark.parametrize(
+    "a3",
+    [("--misalignment", "3.5", "-4", "130", "--misalignment-stddev", "9000"), (), ("--self-calibrate",)],
+    ids=["known to 2.5 deg", "not known", "found"],
+)
+def test_elevations_of_many_directions_determine_a3_too(a3, tables, capsys):
+    status, out, errors = run(
+        capsys, "solve", *tables.pointings("bare.csv"), *tables.tilt, *AIR, *SENSOR, *a3, "--json"
+    )
+    together = objects(out)[-1]
+    assert status == 0 and any("A3 from the elevations" in line for line in errors)
+    assert tables.sigmas_off(together) < 4 and together["sigma_north_m"] < 1000
+
+
+def test_two_directions_with_an_a3_known_badly_claim_little(tables, capsys):
+    near = ("--near", tables.night.site.latitude_deg, tables.night.site.longitude_deg)
+    a3 = ("--misalignment", "1.5", "-2", "130", "--misalignment-stddev", "3600")
+    status, out, _ = run(
+        capsys, "solve", *tables.pointings("two.csv"), *tables.tilt, *AIR, *SENSOR, *a3, *near, "--json"
+    )
+    assert status == 0 and objects(out)[-1]["sigma_north_m"] > 10_000
+
+
+def test_elevations_at_a_known_place_calibrate(tables, capsys, tmp_path):
+    """An instrument file without a camera: of pointings none is needed."""
+    site, found = tables.night.site, tmp_path / "found.yaml"
+    given = (
+        "starpos_instrument: 1\ninclinometer: {model: sca100t_calibrated}\nmisalignment_deg: [3.5, -4, 130]\n"
+    )
+    found.write_text(given + "calibration_stddev_arcsec: [9000, 9000, 9000]\n")
+    place = ("--site", site.latitude_deg, site.longitude_deg, "-o", found)
+    bare = (*tables.pointings("bare.csv"), *tables.tilt, *AIR, "--instrument", found)
+    status, out, errors = run(capsys, "calibrate", *bare, *place)
+    assert (status, errors) == (0, []) and "A3 of 16 elevations in 8 directions" in out
+    assert "camera" not in found.read_text()
+    status, out, errors = run(capsys, "solve", *bare, "--json")
+    assert status == 0 and tables.sigmas_off(objects(out)[-1]) < 4
+    assert objects(out)[-1]["sigma_north_m"] < 1000
+
+
+def test_frames_still_need_a_camera(capsys, tmp_path):
+    file = tmp_path / "mine.yaml"
+    file.write_text("starpos_instrument: 1\ninclinometer: {model: scl3300}\n")
+    (tmp_path / "tilt.csv").write_text("utc_unix_s,theta_x_deg,theta_y_deg\n1,0,0\n")
+    frame = tmp_path / "stars.csv"
+    frame.write_text('# {"NAXIS1": 100, "NAXIS2": 100}\nx,y,flux\n1,2,3\n')
+    status, _, errors = run(capsys, "solve", frame, "--tilt", tmp_path / "tilt.csv", "--instrument", file)
+    assert status == 2 and "camera is missing" in errors[0]
 
 
 def test_calibrate_refuses_a_camera_from_pointings(tables, capsys, tmp_path):
