@@ -7,7 +7,7 @@ whole field are too large for them.
 
 import json
 import re
-from dataclasses import replace
+from dataclasses import fields, replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -17,12 +17,16 @@ from starpos import open_night
 from starpos.cli import main
 from starpos.fix.solution import Status
 from starpos.frames.night_files import TILTS
+from starpos.frames.reading import read_frame
 from starpos.frames.star_list import write_star_list
 from starpos.instrument.instrument import Calibration
+from starpos.night.reading import stars_of as stars_in
 from starpos.session.job import JobsInTurn
 from starpos.session.now import Now, Sent
 from starpos.session.parameter_file import settings_of
 from starpos.session.session import SolverSession
+from starpos.simulation.night_on_disk import write_fits
+from starpos.simulation.scene import Exposed, expose, render
 from starpos.utc import utc_text
 from starpos_testing.skies.scenes import (
     EXPOSURE,
@@ -88,6 +92,25 @@ def test_the_library_solves_it(folder, partly):
     instrument = replace(scene.instrument, camera=None)
     night = open_night(folder, instrument=instrument, atmosphere=scene.site.atmosphere).solve()
     assert [shot.status for shot in night.shots] == [Status.OK] and is_right(night.combined, scene)
+
+
+def test_a_frame_with_its_pixels_too(partly, catalogue, folder, capsys):
+    scene, _, tilt = partly
+    rng = np.random.default_rng(1)
+    sky = expose(scene, catalogue, START, EXPOSURE, rng)
+    part = np.flatnonzero(sky.middle[:, 0] < SHARE * SIZE[0])
+    part = part[np.argsort(-sky.electrons[part])][BRIGHTEST : BRIGHTEST + LEFT]
+    few = Exposed(*(getattr(sky, f.name)[part] for f in fields(Exposed)))
+    frame = render(scene, few, START, EXPOSURE, rng)
+    write_fits(folder / "frame.fits", frame, utc_text(START), 6.4)
+    seen = read_frame(folder / "frame.fits")
+    assert solver_of(scene, catalogue).solve(stars_in(seen), tilt).status is Status.NOT_IDENTIFIED
+    known = ("--misalignment", "0", "0", "0", "--misalignment-stddev", "5", "--json")
+    assert main(["solve", str(folder), *known]) == 0
+    answer = json.loads(capsys.readouterr().out.splitlines()[0])
+    assert answer["status"] == "ok" and answer["stars_matched"] > BRIGHTEST
+    night = open_night(folder, calibration=KNOWN, atmosphere=scene.site.atmosphere).solve()
+    assert is_right(night.combined, scene)
 
 
 class Quiet:
