@@ -21,7 +21,7 @@ class Prepared:
         return self.thin
 
     def triangles_of(self, width, height, part):
-        """Nothing is looked up."""
+        """Give nothing."""
 
 
 def taken(solver):
