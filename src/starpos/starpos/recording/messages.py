@@ -12,7 +12,9 @@ import numpy as np
 from starpos import rotation
 from starpos.errors import FrameError, InstrumentError, TiltError
 from starpos.fix.camera_attitude import CameraAttitude
+from starpos.frames.encodings import pixels_of
 from starpos.frames.frame import Frame
+from starpos.frames.pictures import picture_pixels
 from starpos.frames.shutter import Shutter
 from starpos.frames.stars import Stars
 from starpos.instrument.camera import Camera
@@ -22,14 +24,6 @@ from starpos.instrument.lens import COEFFICIENTS, PLUMB_BOB
 # bits of Tilt.flags, as starpos_interfaces defines them
 OUT_OF_RANGE, STUCK, SATURATED, TIME_UNKNOWN = 1, 2, 4, 16
 UNUSABLE = OUT_OF_RANGE | STUCK | SATURATED | TIME_UNKNOWN
-# encoding -> (dtype, channels, pattern); the names of sensor_msgs/image_encodings.hpp
-ENCODINGS = {
-    "mono8": (np.uint8, 1, ""),
-    "mono16": (np.uint16, 1, ""),
-    "bgr8": (np.uint8, 3, ""),
-    **{f"bayer_{p}8": (np.uint8, 1, p) for p in ("rggb", "bggr", "grbg", "gbrg")},
-    **{f"bayer_{p}16": (np.uint16, 1, p) for p in ("rggb", "bggr", "grbg", "gbrg")},
-}
 # rad2; a larger variance says nothing, and might overflow
 MOST_TILT_VARIANCE = 1.0
 # of an attitude's quaternion, and the most that its covariance may say, rad2
@@ -219,32 +213,23 @@ def message_to_camera(message: Any, source: str = "camera_info") -> Camera:
 
 
 def message_to_frame(message: Any, source: str = "image_raw") -> Frame:
-    """Frame from an Image, on the message's own memory if byte order and alignment allow it, else on a copy.
+    """Frame from an Image, on the message's own memory where that holds pixels as a Frame does, else on a copy.
 
     Raises FrameError if encoding, size, step and data do not fit together.
     """
-    if message.encoding not in ENCODINGS:
-        raise FrameError(
-            f"{source}: the encoding {message.encoding!r} is unknown; send one of {', '.join(ENCODINGS)}."
-        )
-    kind, channels, pattern = ENCODINGS[message.encoding]
-    width, height, step = message.width, message.height, message.step
-    row = width * channels * np.dtype(kind).itemsize
-    if not width or not height:
-        raise FrameError(f"{source}: the frame is {width} x {height} px; it is empty, check the camera.")
-    if step < row:
-        raise FrameError(
-            f"{source}: step is {step} bytes but a row of {width} px needs {row}; check the camera driver."
-        )
-    if len(message.data) != step * height:
-        raise FrameError(
-            f"{source}: {len(message.data)} bytes of pixels for {height} rows of {step} bytes; "
-            "the frame is truncated or its sizes are wrong."
-        )
-    dtype = np.dtype(kind).newbyteorder(">" if message.is_bigendian else "<")
-    shape = (height, width) if channels == 1 else (height, width, channels)
-    strides = (step, dtype.itemsize) if channels == 1 else (step, channels, 1)
-    pixels = np.ndarray(shape, dtype, message.data, strides=strides)
-    if not pixels.dtype.isnative or not pixels.flags.aligned:
-        pixels = pixels.astype(kind)
+    pixels, pattern = pixels_of(
+        message.encoding,
+        message.data,
+        message.width,
+        message.height,
+        message.step,
+        bool(message.is_bigendian),
+        source,
+    )
     return Frame(pixels, pattern=pattern, mid_unix_s=stamp_to_unix(message.header.stamp), source=source)
+
+
+def message_to_picture(message: Any, source: str = "image_raw/compressed") -> Frame:
+    """Frame from a CompressedImage: JPEG, PNG or TIFF; raises FrameError if it is not a whole picture."""
+    pixels = picture_pixels(bytes(message.data), source)
+    return Frame(pixels, mid_unix_s=stamp_to_unix(message.header.stamp), source=source)
