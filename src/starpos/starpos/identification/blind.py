@@ -14,8 +14,8 @@ from itertools import combinations, product
 import numpy as np
 
 from starpos import rotation
-from starpos.core.frame import FrameStars
 from starpos.frames.stars import Window
+from starpos.identification._frame import FrameStars
 from starpos.identification.evidence import any_scale
 from starpos.identification.full import ENOUGH, FEWEST_STARS, Identification, identified
 from starpos.identification.pose import MATCH_SIGMA, Pose, Poses, directions, stars_at
