@@ -19,7 +19,7 @@ from starpos.frames.shutter import Shutter
 from starpos.frames.stars import Stars
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import MOST_CELSIUS, SCA100T_NOISE_RAD, SQUARE, Tilt
-from starpos.instrument.lens import COEFFICIENTS, PLUMB_BOB
+from starpos.instrument.lens import stated_lens
 
 # bits of Tilt.flags, as starpos_interfaces defines them
 OUT_OF_RANGE, STUCK, SATURATED, TIME_UNKNOWN = 1, 2, 4, 16
@@ -167,10 +167,14 @@ def message_to_attitude(message: Any, source: str = "attitude") -> CameraAttitud
     )
 
 
-def message_to_camera(message: Any, source: str = "camera_info") -> Camera:
-    """Camera from a CameraInfo; raises InstrumentError unless it is a calibrated camera of the whole frame.
+def message_to_camera(
+    message: Any, source: str = "camera_info", size: tuple[int, int] | None = None
+) -> Camera:
+    """Camera of the images that a CameraInfo goes with; raises InstrumentError unless it is calibrated.
 
-    Its model is plumb_bob, also where none is named, or equidistant.
+    Its model is plumb_bob, also where none is named, rational_polynomial or equidistant. K is that of the whole sensor;
+    the camera's is that of the region and the binning that the message states.
+    size: width and height of the images, px, for a message that leaves its own at 0.
     """
     k = np.array(message.k, float)
     d = np.array(message.d, float)
@@ -180,36 +184,44 @@ def message_to_camera(message: Any, source: str = "camera_info") -> Camera:
         raise InstrumentError(
             f"{source}: the camera is not calibrated (its focal length is 0); give it a calibration file."
         )
-    model = message.distortion_model or PLUMB_BOB
-    if model not in COEFFICIENTS or len(d) not in (0, len(COEFFICIENTS[model])):
-        known = " and ".join(f"{name!r} with {len(terms)}" for name, terms in COEFFICIENTS.items())
-        raise InstrumentError(
-            f"{source}: the distortion model is {message.distortion_model!r} with {len(d)} terms; {known} are "
-            "understood: calibrate with one of them."
-        )
+    model, distortion = stated_lens(message.distortion_model, d.tolist(), source)
     if np.any(k[[1, 3, 6, 7]]) or k[8] != 1:
         raise InstrumentError(
             f"{source}: K is not [fx 0 cx, 0 fy cy, 0 0 1]; calibrate the camera without skew."
         )
-    region = message.roi
-    cropped = (region.x_offset, region.y_offset) != (0, 0) or (
-        (region.width, region.height) not in ((0, 0), (message.width, message.height))
-    )
-    if cropped or message.binning_x > 1 or message.binning_y > 1:
-        raise InstrumentError(
-            f"{source}: the frame is binned or cropped; send whole frames, or calibrate it as it is sent."
-        )
+    region, by_x, by_y = message.roi, max(1, message.binning_x), max(1, message.binning_y)
+    width = _image_side(message.width, region.x_offset, region.width, by_x, source)
+    height = _image_side(message.height, region.y_offset, region.height, by_y, source)
+    if size is not None and leaves_size_open(message):
+        width, height = size
     fx, fy, cx, cy = k[[0, 4, 2, 5]].tolist()
     return Camera(
-        width=message.width,
-        height=message.height,
-        fx=fx,
-        fy=fy,
-        cx=cx,
-        cy=cy,
-        distortion=tuple(d.tolist()),
+        width=width,
+        height=height,
+        fx=fx / by_x,
+        fy=fy / by_y,
+        # the corner of the first pixel, half a pixel from its centre, is the same before and after binning
+        cx=(cx - region.x_offset + 0.5) / by_x - 0.5,
+        cy=(cy - region.y_offset + 0.5) / by_y - 0.5,
+        distortion=distortion,
         model=model,
     )
+
+
+def leaves_size_open(message: Any) -> bool:
+    """Whether a CameraInfo states no size, which is then that of the images."""
+    region = message.roi
+    return not (message.width or region.width) or not (message.height or region.height)
+
+
+def _image_side(whole: int, offset: int, cut: int, binned_by: int, source: str) -> int:
+    """Pixels along a side of the images: of a region of the sensor, if `cut` is not 0, binned; 0 where it is not stated."""
+    if whole and offset + cut > whole:
+        raise InstrumentError(
+            f"{source}: the region of interest ends at pixel {offset + cut} of {whole}; width and height are those of the "
+            "whole sensor: correct the camera's driver or its calibration file."
+        )
+    return (cut or max(0, whole - offset)) // binned_by
 
 
 def message_to_frame(message: Any, source: str = "image_raw") -> Frame:

@@ -23,7 +23,7 @@ from starpos.frames.stars import Stars
 from starpos.identification.hint import Hint
 from starpos.identification.search import Priors
 from starpos.instrument.camera import Camera
-from starpos.recording.messages import message_to_camera, message_to_stars, stamp_to_unix
+from starpos.recording.messages import message_to_stars, stamp_to_unix
 from starpos.session import reports
 from starpos.session.attitude import asked, camera_attitude_of
 from starpos.session.calibrating import Calibrating
@@ -138,7 +138,7 @@ class SolverSession:
         """
         made = self.at(now)
         try:
-            camera = message_to_camera(message)
+            self.instrument.take(message, at_once=not now.played)
         except StarposError as e:
             if self.instrument.camera is None:
                 self.instrument.trouble = str(e)
@@ -146,7 +146,6 @@ class SolverSession:
             return made
         self._heard.came("camera_info")
         self.names.camera = name_in(message)
-        self.instrument.take(camera, stamp_to_unix(message.header.stamp), at_once=not now.played)
         return made + self._work(now)
 
     def take_tilt(self, message: Any, sent: Sent, now: Now) -> list[Output]:
@@ -200,6 +199,7 @@ class SolverSession:
                 stars_detected=len(message.stars),
             )
             return [*made, self._answered(message.header.stamp, bad, now)]
+        self.instrument.frame_came(stars.width, stars.height, at_once=not now.played)
         self._waiting.append(Waiting(message, stars, now.waiting_s, now.ahead_s(stars.mid_unix_s)))
         while len(self._waiting) > (WAITING_PLAYED if now.played else WAITING):
             self._waiting.popleft()
