@@ -18,7 +18,8 @@ EIGHT = [0.513, -2.733, 4.5e-4, -2.1e-4, 1.618, 0.392, -2.558, 1.544]
 
 
 def info(model=PLUMB, d=(), **fields):
-    return CameraInfo(width=1280, height=960, distortion_model=model, d=[float(v) for v in d], k=K.ravel().tolist(), **fields)
+    about = {"width": 1280, "height": 960, "distortion_model": model, **fields}
+    return CameraInfo(d=[float(v) for v in d], k=K.ravel().tolist(), **about)
 
 
 @pytest.mark.parametrize(
@@ -41,7 +42,9 @@ def test_distortions_of_any_number_of_terms_are_opencvs(model, d, reduced):
     assert camera.model == reduced
     x, y = (np.random.default_rng(2).uniform(0, side - 1, 400) for side in (1280, 960))
     v = camera.directions(x, y)
-    theirs = cv2.projectPoints(v[:, None], np.zeros(3), np.zeros(3), K, np.array(d, float) if d else None)[0][:, 0]
+    theirs = cv2.projectPoints(v[:, None], np.zeros(3), np.zeros(3), K, np.array(d, float) if d else None)[0][
+        :, 0
+    ]
     np.testing.assert_allclose(theirs, np.stack([x, y], 1), atol=0.01)
     np.testing.assert_allclose(camera.project(v), theirs, atol=0.01)
     # what a node sends again is the same camera
@@ -50,7 +53,13 @@ def test_distortions_of_any_number_of_terms_are_opencvs(model, d, reduced):
 
 @pytest.mark.parametrize(
     ("model", "d"),
-    [(RATIONAL, [*EIGHT, 1e-3, 0, 0, 0]), (PLUMB, [0.1] * 6), (PLUMB, [0.1]), ("equidistant", [0.1] * 8), ("omni", FOUR)],
+    [
+        (RATIONAL, [*EIGHT, 1e-3, 0, 0, 0]),
+        (PLUMB, [0.1] * 6),
+        (PLUMB, [0.1]),
+        ("equidistant", [0.1] * 8),
+        ("omni", FOUR),
+    ],
 )
 def test_what_is_beyond_these_is_refused_with_what_is_understood(model, d):
     with pytest.raises(InstrumentError, match=f"{model!r} with {len(d)} terms.*4, 5 or 8"):
@@ -58,7 +67,9 @@ def test_what_is_beyond_these_is_refused_with_what_is_understood(model, d):
 
 
 @pytest.mark.parametrize("binning", [1, 2, 4])
-@pytest.mark.parametrize(("left", "top", "width", "height"), [(0, 0, 0, 0), (0, 0, 1280, 960), (160, 80, 640, 480)])
+@pytest.mark.parametrize(
+    ("left", "top", "width", "height"), [(0, 0, 0, 0), (0, 0, 1280, 960), (160, 80, 640, 480)]
+)
 def test_region_and_binning_move_the_pixels(binning, left, top, width, height):
     """A pixel of the image covers binning x binning ones of the sensor, from the region's corner on."""
     roi = RegionOfInterest(x_offset=left, y_offset=top, width=width, height=height)

@@ -75,7 +75,9 @@ def parameters(camera: Camera) -> tuple[str, ...]:
 
 def camera_values(camera: Camera) -> np.ndarray:
     """Values (P,) of a camera's parameters."""
-    return np.array([camera.fx, camera.fy, camera.cx, camera.cy, *camera.distortion])[: len(parameters(camera))]
+    return np.array([camera.fx, camera.fy, camera.cx, camera.cy, *camera.distortion])[
+        : len(parameters(camera))
+    ]
 
 
 def with_values(camera: Camera, values: np.ndarray) -> Camera:

@@ -42,7 +42,9 @@ class DriverStamp:
         if self.kind not in KINDS:
             raise FrameError(f"a stamp is of the {self.kind!r}: give {', '.join(KINDS[1:])}, or nothing")
         if self.exposure_s is not None and not 0 < self.exposure_s <= MOST_EXPOSURE_S:
-            raise FrameError(f"an exposure of {self.exposure_s} s cannot be: give up to {MOST_EXPOSURE_S:g} s")
+            raise FrameError(
+                f"an exposure of {self.exposure_s} s cannot be: give up to {MOST_EXPOSURE_S:g} s"
+            )
 
     @property
     def to_middle_s(self) -> float:
@@ -81,8 +83,9 @@ class DriverStamp:
             lacks = "the stamps are of the arrival, and nothing says how late that is: set the parameter stamp_stddev"
         else:
             return ""
-        metres = self.middle_stddev_s * METRES_PER_S
-        return f"{lacks}. Until then the time is off by {self.middle_stddev_s:.2g} s, {metres:.0f} m at the equator (1 sigma)."
+        stddev_s = self.middle_stddev_s
+        metres = stddev_s * METRES_PER_S
+        return f"{lacks}. Until then the time is taken as {stddev_s:.2g} s off, {metres:.0f} m at the equator (1 sigma)."
 
     def dated(self, frame: Frame) -> Frame:
         """The frame, whose mid_unix_s is the stamp, with the middle of its exposure and what is known of it."""

@@ -16,6 +16,7 @@ from starpos.frames.pictures import frame_pixels
 
 MOSAICS = tuple(filter(None, PATTERNS))
 
+
 @dataclass(frozen=True)
 class Encoding:
     """How pixels lie in a row.
@@ -68,9 +69,7 @@ def pixels_of(
     return (layout.convert(rows)[:, :width] if layout.convert else rows), layout.pattern
 
 
-def _rows(
-    layout: Encoding, data: bytes, sizes: tuple[int, int, int, int], big_endian: bool
-) -> np.ndarray:
+def _rows(layout: Encoding, data: bytes, sizes: tuple[int, int, int, int], big_endian: bool) -> np.ndarray:
     """The numbers in the rows: (h, w, numbers), (h, w) of one number, (h, bytes) where pixels are packed."""
     row, width, height, step = sizes
     dtype = np.dtype(layout.dtype).newbyteorder(">" if big_endian else "<")
@@ -134,7 +133,9 @@ def _bit_stream(bits: int) -> Callable[[np.ndarray], np.ndarray]:
         out = np.empty((*groups.shape[:2], count), np.uint16)
         for k in range(count):
             byte, shift = divmod(bits * k, 8)
-            out[:, :, k] = (groups[:, :, byte] >> shift | groups[:, :, byte + 1] << 8 - shift) & (1 << bits) - 1
+            out[:, :, k] = (groups[:, :, byte] >> shift | groups[:, :, byte + 1] << 8 - shift) & (
+                1 << bits
+            ) - 1
         return out.reshape(len(rows), -1)
 
     return convert
@@ -154,9 +155,15 @@ def _gige_vision(bits: int) -> Callable[[np.ndarray], np.ndarray]:
     return convert
 
 
-def _of_type(name: str, dtype: type[np.generic], one: Callable | None, three: Callable | None) -> dict[str, Encoding]:
+def _of_type(
+    name: str, dtype: type[np.generic], one: Callable | None, three: Callable | None
+) -> dict[str, Encoding]:
     """Numbers without a meaning, of one channel or three (taken as BGR), by cv_bridge's names."""
-    return {name: Encoding(dtype, 1, one), f"{name}C1": Encoding(dtype, 1, one), f"{name}C3": Encoding(dtype, 3, three)}
+    return {
+        name: Encoding(dtype, 1, one),
+        f"{name}C1": Encoding(dtype, 1, one),
+        f"{name}C3": Encoding(dtype, 3, three),
+    }
 
 
 def _packed(name: str, pattern: str) -> dict[str, Encoding]:

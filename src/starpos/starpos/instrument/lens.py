@@ -45,8 +45,8 @@ def stated_lens(model: str, d: Sequence[float], place: str) -> tuple[str, tuple[
             pinhole = RATIONAL if any(terms[5:8]) else PLUMB_BOB
             return pinhole, tuple(terms[: len(COEFFICIENTS[pinhole])])
     raise InstrumentError(
-        f"{place}: the distortion model is {model[:40]!r} with {len(d)} terms; {PLUMB_BOB!r} and {RATIONAL!r} with 4, 5 or "
-        f"8 and {EQUIDISTANT!r} with 4 are understood (further ones must be 0): calibrate with one of them."
+        f"{place}: the distortion model is {model[:40]!r} with {len(d)} terms; {PLUMB_BOB!r} and {RATIONAL!r} with 4, 5 "
+        f"or 8 and {EQUIDISTANT!r} with 4 are understood (further ones must be 0): calibrate with one of them."
     )
 
 

@@ -63,7 +63,13 @@ def test_colours_of_8_bits_are_bgr(name, code):
 
 @pytest.mark.parametrize(
     ("name", "order"),
-    [("rgb16", (2, 1, 0)), ("bgr16", (0, 1, 2)), ("16UC3", (0, 1, 2)), ("bgra16", (0, 1, 2, 0)), ("rgba16", (2, 1, 0, 0))],
+    [
+        ("rgb16", (2, 1, 0)),
+        ("bgr16", (0, 1, 2)),
+        ("16UC3", (0, 1, 2)),
+        ("bgra16", (0, 1, 2, 0)),
+        ("rgba16", (2, 1, 0, 0)),
+    ],
 )
 @pytest.mark.parametrize("big_endian", [False, True])
 def test_colours_of_16_bits_are_their_mean(name, order, big_endian):
@@ -111,7 +117,7 @@ def bit_stream(values, bits):
 
 
 def gige_vision(values, bits):
-    """GigE Vision's: high bits of the first, low bits of both, the second's in the upper half, high bits of the second."""
+    """GigE Vision's: high bits of the first, low bits of both (the second's above), high bits of the second."""
     out = []
     for row in values.tolist():
         packed = []
@@ -155,6 +161,13 @@ def test_every_channel_of_8_and_16_bits_that_cv_bridge_knows():
     ],
 )
 def test_what_does_not_fit_together_is_refused(change, word):
-    given = {"encoding": "mono16", "data": GREY.tobytes(), "width": W, "height": H, "step": 2 * W, "big_endian": False}
+    given = {
+        "encoding": "mono16",
+        "data": GREY.tobytes(),
+        "width": W,
+        "height": H,
+        "step": 2 * W,
+        "big_endian": False,
+    }
     with pytest.raises(FrameError, match=word):
         pixels_of(**{**given, **change}, place="image_raw")

@@ -16,12 +16,18 @@ CAMERA = Camera.from_focal(1000, 700, 80_000.0)
 def info(**changes):
     """A CameraInfo of that camera."""
     f, (cx, cy) = CAMERA.fx, CAMERA.centre_px
-    region = SimpleNamespace(x_offset=0, y_offset=0, width=0, height=0)
-    given = {"width": CAMERA.width, "height": CAMERA.height, "k": [f, 0, cx, 0, f, cy, 0, 0, 1.0], **changes}
-    stamp = SimpleNamespace(sec=1793642400, nanosec=0)
-    return SimpleNamespace(
-        header=SimpleNamespace(stamp=stamp), distortion_model="plumb_bob", d=[], binning_x=0, binning_y=0, roi=region, **given
-    )
+    about = {
+        "header": SimpleNamespace(stamp=SimpleNamespace(sec=1793642400, nanosec=0)),
+        "width": CAMERA.width,
+        "height": CAMERA.height,
+        "k": [f, 0, cx, 0, f, cy, 0, 0, 1.0],
+        "d": [],
+        "distortion_model": "plumb_bob",
+        "binning_x": 0,
+        "binning_y": 0,
+        "roi": SimpleNamespace(x_offset=0, y_offset=0, width=0, height=0),
+    }
+    return SimpleNamespace(**{**about, **changes})
 
 
 class Prepared:
