@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The detector with other people's drivers: compressed, best effort, no Capture. One graph, whose publishers come and go."""
+"""The detector with other people's drivers: compressed, best effort, no Capture; one graph for all tests."""
 
 import signal
 
@@ -10,7 +10,6 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CompressedImage, Image
 
 from starpos_camera.frame_topics import wants_compressed
-from starpos_common.messages import frame_to_message
 from starpos_interfaces.msg import StarArray
 from starpos_testing.nodes import Listener, Process
 
