@@ -10,7 +10,7 @@ from std_msgs.msg import Header
 
 from starpos.frames.driver_stamp import DriverStamp
 from starpos.frames.frame import Frame
-from starpos.recording.messages import message_to_shutter
+from starpos.messages.stars import message_to_shutter
 from starpos_interfaces.msg import Capture
 
 CAPTURES_KEPT = 16

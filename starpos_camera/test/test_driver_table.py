@@ -41,7 +41,7 @@ def test_what_a_driver_sends_becomes_a_frame(row):
 
 @pytest.mark.parametrize("row", ROWS, ids=lambda row: row[0].split()[0])
 def test_the_stamps_it_is_to_set_are_there(row):
-    assert {kind for kind in re.findall(r"`(\w+)`", row[4])} <= set(KINDS) and "`" in row[4]
+    assert set(re.findall(r"`(\w+)`", row[4])) <= set(KINDS) and "`" in row[4]
 
 
 def test_the_parameters_of_the_page_are_the_detectors():

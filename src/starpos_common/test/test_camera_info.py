@@ -8,7 +8,7 @@ from sensor_msgs.msg import CameraInfo, RegionOfInterest
 
 from starpos.errors import InstrumentError
 from starpos.instrument.camera import Camera
-from starpos.recording.messages import message_to_camera
+from starpos.messages.camera import message_to_camera
 from starpos_common.messages import camera_to_message
 
 K = np.array([[1010.0, 0, 633.2], [0, 1012.0, 470.9], [0, 0, 1]])

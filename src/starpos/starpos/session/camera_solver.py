@@ -8,7 +8,9 @@ from typing import Any
 from starpos.errors import InstrumentError
 from starpos.fix.solver import Solver
 from starpos.instrument.camera import Camera
-from starpos.recording.messages import leaves_size_open, message_to_camera, stamp_to_unix
+from starpos.messages.camera import leaves_size_open, message_to_camera
+from starpos.messages.stamp import stamp_to_unix
+from starpos.night.searching import prepare
 from starpos.session.job import Jobs, Outcome
 
 MOST_CHANGES = 1000
@@ -112,7 +114,7 @@ class CameraSolver:
 
         def work() -> tuple[Solver, str]:
             solver = self._make(camera)
-            return solver, solver.prepare(camera.width, camera.height)
+            return solver, prepare(solver, camera.width, camera.height)
 
         self._jobs.run(work).add_done_callback(lambda f: self._prepared(camera, f.result()))
 

@@ -177,11 +177,22 @@ PARAMETERS = (
     Parameter(
         "deflection.geoid",
         "",
-        "Geoid grid (GTX, GeoTIFF; in m) whose slopes are the deflection and whose roughness its error, instead of the "
-        "three above: a path, or a name among PROJ's grids such as egm96_15.gtx. '' for none. A coarse one misses 1 "
-        "arcsec in plains and 10 in mountains, and outside its area nothing is known again: 6 arcsec, 190 m.",
+        "Geoid grid (GTX, NGS .bin, GeoTIFF; in m) whose slopes are the deflection and whose roughness its error, "
+        "instead of the three above: a path, or a name among PROJ's grids such as egm96_15.gtx. '' for none. A coarse "
+        "one misses 1 arcsec in plains and 10 in mountains, and outside its area nothing is known again: 6 arcsec, "
+        "190 m.",
     ),
     Parameter("min_stars", 5, "Fewest identified stars that make a fix.", unit="", minimum=4, maximum=1000),
+    Parameter(
+        "search_time",
+        0.3,
+        "How long a frame that is not identified at once may be searched by other ways: smaller triangles, where stars "
+        "fill a part of it only; other focal lengths, to say which fits. At most half of the time between frames; "
+        "recorded frames are searched to the end. 0: not at all.",
+        unit="s",
+        minimum=0.0,
+        maximum=60.0,
+    ),
     Parameter(
         "gyro",
         False,
