@@ -24,7 +24,7 @@ from starpos.messages.camera import message_to_frame, message_to_picture
 from starpos.session.trails import Trails
 from starpos_camera.annotator import Annotator
 from starpos_camera.detector_parameters import PARAMETERS
-from starpos_camera.exposures import CAPTURES_KEPT, Exposures, key_of
+from starpos_camera.exposures import CAPTURES_KEPT, ExposureFacts, key_of
 from starpos_camera.frame_topics import FrameTopics
 from starpos_common.clock_report import time_is_simulated
 from starpos_common.diagnostics import Diagnosis, Diagnostics, Level
@@ -77,7 +77,7 @@ class DetectorNode(Node):
         super().__init__("detector", **options)
         self._values = declare(self, PARAMETERS, apply=self._apply)
         self._settings = self._detection_settings()
-        self._exposures = Exposures(self._values)
+        self._exposures = ExposureFacts(self._values)
         # images until their Captures come, oldest first, and how long they wait for them, s of the clock below
         self._held: deque[tuple[Image | CompressedImage, float]] = deque()
         self._frames = self._bad = self._dropped = 0

@@ -16,7 +16,7 @@ from starpos_interfaces.msg import Capture
 CAPTURES_KEPT = 16
 
 
-class Exposures:
+class ExposureFacts:
     """Keeps Captures by their stamps, and adds what they tell to their frames.
 
     values: the parameters of the detector.

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A subscription to a topic of somebody else's driver: it takes the reliability that is offered."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Collection, Sequence
+from typing import Any
 
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
@@ -23,7 +24,9 @@ class MatchedSubscription:
     """
 
     def __init__(self, node: Node, kind: type, topic: str, callback: Take, depth: int) -> None:
-        self._node, self._kind, self._callback = node, kind, callback
+        self._node, self._kind = node, kind
+        # rclpy's types know callbacks of one argument only
+        self._callback: Callable[..., Any] = callback
         self._subscription = subscription(
             node, kind, topic, callback, depth, events=SubscriptionEventCallbacks(use_default_callbacks=False)
         )
@@ -94,7 +97,7 @@ def _nodes(publishers: Sequence[TopicEndpointInfo]) -> str:
     return _named({f"{p.node_namespace.rstrip('/')}/{p.node_name}" for p in publishers})
 
 
-def _named(names: "set[str] | list[str]") -> str:
+def _named(names: Collection[str]) -> str:
     shown = sorted(names)
     more = f" and {len(shown) - MOST_NAMED} more" if len(shown) > MOST_NAMED else ""
     return ", ".join(shown[:MOST_NAMED]) + more

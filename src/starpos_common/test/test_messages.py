@@ -17,7 +17,6 @@ from starpos.frames.shutter import GLOBAL, Shutter
 from starpos.frames.stars import EDGE, Stars, no_stars
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import Tilt
-from starpos.messages import camera as reading
 from starpos.messages import tilt as tilts
 from starpos.messages.camera import message_to_camera, message_to_frame
 from starpos.messages.stamp import stamp_to_unix

@@ -107,7 +107,7 @@ def _signed_colours(rows: np.ndarray) -> np.ndarray:
 
 
 def _brightness(place: int) -> Callable[[np.ndarray], np.ndarray]:
-    """Of pairs of bytes, a brightness and a colour, the brightness."""
+    """Take the brightness from pairs of bytes, a brightness and a colour each."""
 
     def convert(rows: np.ndarray) -> np.ndarray:
         return np.ascontiguousarray(rows[:, :, place])
