@@ -31,8 +31,8 @@ LEAST_SIDE, SHORTEST = 0.6, 0.08
 # Shapes are kept to 1/65535; these are the bins of four of their sides, and of the logarithm of the longest.
 CODES, BINS, SIZE_BINS = 65535, 12, 56
 SIZES_RAD = np.log(0.004), np.log(1.2)
-# Most pairs of quads alike: more come of stars that are too close to each other for their errors, and tell nothing.
-MOST_ALIKE = 200_000
+# Most pairs of quads alike for one focal length: more come of stars too close to each other, and tell nothing.
+MOST_ALIKE = 2000
 # Which pairs of a quad's stars its sides are: AB is the longest.
 SIDES = np.array(list(combinations(range(4), 2)))
 

@@ -57,7 +57,7 @@ def is_wide(camera: Camera) -> bool:
 
 def field_rad(camera: Camera) -> float:
     """Half the diagonal, rad, of what is identified at once: of the frame, or of a part of it."""
-    return _pinhole(camera).half_diagonal_rad if is_wide(camera) else camera.half_diagonal_rad
+    return pinhole_of(camera).half_diagonal_rad if is_wide(camera) else camera.half_diagonal_rad
 
 
 @dataclass(frozen=True)
@@ -106,19 +106,21 @@ class Part:
 
 def parts(field: WideField) -> list[Part]:
     """The parts of a frame: first its middle."""
-    pinhole = _pinhole(field.camera)
-    made = []
-    for turn in _turns(field.camera, pinhole):
-        seen = field.directions @ turn.T
-        xy = pinhole.project(seen)
-        with np.errstate(invalid="ignore"):
-            row = np.flatnonzero(((xy >= 0) & (xy <= [pinhole.width - 1, pinhole.height - 1])).all(1))
-        # a pinhole's picture is stretched away from its middle
-        made.append(Part(pinhole, turn, row, seen[row], field.sigma_px[row] / seen[row, 2] ** 2))
-    return made
+    pinhole = pinhole_of(field.camera)
+    return [part_at(field, pinhole, turn) for turn in _turns(field.camera, pinhole)]
 
 
-def _pinhole(camera: Camera) -> Camera:
+def part_at(field: WideField, pinhole: Camera, turn: np.ndarray) -> Part:
+    """The part that an ideal camera sees into which a rotation (3, 3) takes C."""
+    seen = field.directions @ turn.T
+    xy = pinhole.project(seen)
+    with np.errstate(invalid="ignore"):
+        row = np.flatnonzero(((xy >= 0) & (xy <= [pinhole.width - 1, pinhole.height - 1])).all(1))
+    # a pinhole's picture is stretched away from its middle
+    return Part(pinhole, turn, row, seen[row], field.sigma_px[row] / seen[row, 2] ** 2)
+
+
+def pinhole_of(camera: Camera) -> Camera:
     """The ideal camera of a part: as wide as the frame, but at most HALF_RAD to each side."""
     across = np.minimum(
         [camera.cx, camera.cy], np.array([camera.width, camera.height]) - 1 - [camera.cx, camera.cy]

@@ -78,8 +78,8 @@ def test_frames_of_any_scale_are_found(field_deg, limit_mag, solver, catalogue, 
 @pytest.mark.parametrize("off", [0.85, 1.0, 1.15])
 def test_a_focal_length_that_is_roughly_known_comes_first(off, solver, catalogue, rng, monkeypatch):
     """EXIF's: rounded, or of a lens that breathes. Where a frame is found near it no other scale is searched."""
-    tried, all_of = [], blind._focal_lengths
-    monkeypatch.setattr(blind, "_focal_lengths", lambda *span: tried.append(span[1:]) or all_of(*span))
+    tried, all_of = [], blind.focal_lengths
+    monkeypatch.setattr(blind, "focal_lengths", lambda *span: tried.append(span[1:]) or all_of(*span))
     for field_deg, limit_mag in FIELDS[2::2]:
         xy, axis, focal_px = seen(catalogue, field_deg, limit_mag, rng)
         free = solver.identify(listed(xy))
