@@ -11,12 +11,12 @@ SHELL := /bin/bash
 .DELETE_ON_ERROR:
 export PYTHON
 
-# What a build copies or compiles. Python modules are links into the source tree: an edit needs no build, but of the core.
+# What a build copies or compiles. Python modules are links into the source tree: only an edit of Cython needs a build.
 PACKAGES := $(patsubst %/package.xml,%,$(wildcard */package.xml src/*/package.xml))
 INPUTS := colcon.meta tools/build $(foreach p,$(PACKAGES),$(wildcard $(p)/package.xml $(p)/setup.* $(p)/CMakeLists.txt \
   $(p)/msg $(p)/msg/* $(p)/srv $(p)/srv/* $(p)/launch $(p)/launch/* $(p)/config $(p)/config/* \
   $(p)/layouts $(p)/layouts/* $(p)/sros2 $(p)/sros2/* $(p)/urdf $(p)/urdf/* $(p)/resource/* \
-  $(p)/$(notdir $(p))/core/*.pyx $(p)/$(notdir $(p))/core/*.pxd))
+  $(p)/$(notdir $(p))/*/*.pyx $(p)/$(notdir $(p))/*/*.pxd))
 
 .PHONY: build demo bench docs emulated test lint clean distclean FORCE
 build: install/.built
@@ -48,7 +48,7 @@ lint: build
 	@. tools/env.sh && python tools/test.py --lint
 
 clean:
-	rm -rf src/starpos/starpos/core/*.c src/starpos/starpos/core/*.so
+	rm -rf src/starpos/starpos/*/*.c src/starpos/starpos/*/*.so
 	rm -rf build install log demo .pytest_cache .ruff_cache .mypy_cache
 
 distclean: clean

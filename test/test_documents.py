@@ -28,17 +28,19 @@ OF_NODES = {
 ROOMS = (ROOT / "docs", ROOT / "test", ROOT / "tools", *PACKAGES)
 FILES = sorted(f for f in (*ROOT.glob("*.*"), *(g for r in ROOMS for g in r.rglob("*"))) if f.is_file())
 CYTHON = (".pyx", ".pxd")
+MODULES = {p.name: p / p.name for p in PACKAGES}
 # but what Cython has written
 SOURCES = [
-    f for f in FILES if f.suffix in (".py", ".h", *CYTHON) or (f.suffix == ".c" and f.parent.name != "core")
+    f
+    for f in FILES
+    if f.suffix in (".py", ".h", *CYTHON) or (f.suffix == ".c" and MODULES["starpos"] not in f.parents)
 ]
-MODULES = {p.name: p / p.name for p in PACKAGES}
 FILE_ENDINGS = {"json", "md", "py", "rviz", "yaml"}
 # Names of the C library, of ERFA, of avr-libc.
 FOREIGN = {"sys/timex.h", "t_erfa_c.c", "util/crc16.h"}
 SHOUTED = r"\b(?:ARCHITECTURE|CONTRIBUTING|DESIGN|ERRATA|PROTOCOL|README|TUTORIAL)\b(?:\.md)?"
 NAMED = re.compile(rf"{SHOUTED}|(?<![\w./-])[\w./-]*\w\.(?:md|rst|py|pyx|pxd|c|h|svg)\b(?:#[\w-]+)?")
-DOTTED = re.compile(r"(?<![\w./-])(starpos(?:_[a-z]+)?)((?:\.[A-Za-z]\w*)+)")
+DOTTED = re.compile(r"(?<![\w./-])(starpos(?:_[a-z]+)?)((?:\.[A-Za-z_]\w*)+)")
 
 
 def headings(document: Path) -> set[str]:
@@ -168,7 +170,7 @@ def test_what_is_not_there_is_found(said):
     assert not_there(said, ROOT / "src" / "starpos" / "starpos" / "rotation.py")
 
 
-def test_what_the_compiled_core_names_is_read(tmp_path):
+def test_what_compiled_modules_name_is_read(tmp_path):
     source = tmp_path / "new.pyx"
     source.write_text('x = 1  # see nowhere.py\ndef f():\n    """As starpos.nowhere\n    # says."""\n')
     assert [not_there(text, source) for text in said_beside_the_code(source)] == [

@@ -56,29 +56,40 @@ BREACHES = [
     (
         "same_functions",
         {
-            "starpos.core.new": "def two(x):\n    return x",
+            "starpos.fix._new": "def two(x):\n    return x",
             "starpos.earth.b": "def two(): ...",
-            "starpos.fix.c": "from starpos.core.new import two",
+            "starpos.fix.c": "from starpos.fix._new import two",
             "starpos.fix.d": "from starpos.earth.b import two",
         },
-        "starpos.fix: two stands for 2 things, of starpos.core.new and starpos.earth.b",
+        "starpos.fix: two stands for 2 things, of starpos.earth.b and starpos.fix._new",
     ),
     ("keywords", {"starpos.fix.new": f"@dataclass(frozen=True)\nclass Six:\n{FIELDS}"}, "6 fields"),
     ("words", {"starpos.fix.new": '"""Of nothing."""'}, "a verb or a noun"),
     ("words", {"starpos.fix.new": "x = 1\n" * 500}, "500 lines"),
     ("words", {"starpos.fix.new": 'def f():\n    """By how much."""'}, "a verb or a noun"),
-    ("words", {"starpos.core.new": 'cdef f():\n    """And more.\n    """'}, "new.py:2"),
-    ("words", {"starpos.core.new": "x = 1\n" * 500}, "500 lines"),
+    ("words", {"starpos.fix._new": 'cdef f():\n    """And more.\n    """'}, "new.py:2"),
+    ("words", {"starpos.fix._new": "x = 1\n" * 500}, "500 lines"),
     ("comments", {"starpos.fix.new": "# Above.\nx = 1  # noqa: E741\ny = 2  # in m\n"}, "new.py:3"),
-    ("comments", {"starpos.core.new": "# Above.\nx = '#'\ny = 2  # in m\n"}, "new.py:3"),
+    ("comments", {"starpos.fix._new": "# Above.\nx = '#'\ny = 2  # in m\n"}, "new.py:3"),
     (
-        "core",
-        {"starpos.core.new": '"""Text.\n"""\nimport numpy as np, rclpy'},
-        "new.py:3: the core imports rclpy",
+        "cimports",
+        {"starpos.fix._new": '"""Text.\n"""\nimport numpy as np, rclpy'},
+        "new.py:3: a compiled module imports rclpy",
     ),
-    ("core", {"starpos.core.new": "def f():\n    from starpos.fix import fix"}, "imports starpos.fix"),
-    ("core", {"starpos.core.new": "cimport starpos.fix"}, "imports starpos.fix"),
-    ("core", {"starpos.core.new": "from . cimport algebra"}, "imports ."),
+    ("cimports", {"starpos.fix._new": "def f():\n    from starpos.fix import fix"}, "imports starpos.fix"),
+    ("cimports", {"starpos.fix._new": "cimport starpos.earth.gravity"}, "imports starpos.earth.gravity"),
+    ("cimports", {"starpos.fix._new": "from . cimport algebra"}, "imports ."),
+    (
+        "cimports",
+        {"starpos.earth._new": "from starpos.instrument._lens cimport Lens"},
+        "(floor 2) imports instrument",
+    ),
+    ("cimports", {"starpos._numeric.new": "cimport starpos.earth._air"}, "(floor 0) imports earth (floor 2)"),
+    (
+        "uncalled",
+        {"starpos.fix._new": "", "starpos.cli.new": "from starpos.fix._new import f"},
+        "nothing in fix calls it",
+    ),
     (
         "circles",
         {"starpos.fix.solver": "from starpos.fix import a", "starpos.fix.a": "from starpos import Solver"},
@@ -89,7 +100,7 @@ BREACHES = [
 
 def house_of(walls, sources):
     return [
-        (walls.Compiled if name.startswith("starpos.core.") else walls.Module)(name, ROOT / "new.py", text)
+        (walls.Compiled if "._" in name else walls.Module)(name, ROOT / "new.py", text)
         for name, text in sources.items()
     ]
 
@@ -113,12 +124,19 @@ def test_what_is_allowed_is_no_breach(walls):
     assert [*walls.layers(house), *walls.aliases(house)] == []
 
 
-def test_what_the_core_may_is_no_breach(walls):
+def test_what_a_compiled_module_may_is_no_breach(walls):
     text = (
         '# Above, "as it stands.\n"""Text: from rclpy import Node."""\n'
-        "from libc.math cimport sqrt\nfrom starpos.core.algebra cimport Point\ncimport starpos.core.wide\n"
+        "from libc.math cimport sqrt\nfrom starpos._numeric.algebra cimport Point\ncimport starpos._numeric.wide\n"
+        "from starpos.earth._air cimport Air\n"
         'cdef extern from *:\n    """\n    By C.\n    """\n    void f()\n'
         'def f():\n    """As many as `many`."""\n    return "# no comment"\n'
     )
-    house = house_of(walls, {"starpos.core.new": text})
-    assert [*walls.core(house), *walls.words(house), *walls.comments(house)] == []
+    house = house_of(walls, {"starpos.fix._new": text, "starpos.fix.a": "from starpos.fix._new import f"})
+    compiled = house[:1]
+    assert [
+        *walls.cimports(compiled),
+        *walls.uncalled(house),
+        *walls.words(house),
+        *walls.comments(house),
+    ] == []

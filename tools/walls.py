@@ -36,8 +36,8 @@ FOREIGN = {
     "scipy",
     "yaml",
 }
-# What the compiled core may import.
-CORE = {"cpython", "libc", "numpy", "starpos.core"}
+# What compiled modules may import besides compiled modules of their own room and of the floors below.
+OF_CYTHON = {"cpython", "libc", "numpy"}
 IMPORTED = re.compile(r"\bfrom\s+([\w.]+)\s+c?import\b|\bc?import\s+(.+)")
 # What asks the package itself, for its file and its version.
 AT_THE_DOOR = {"starpos.parallel.same"}
@@ -105,7 +105,7 @@ class Module:
 
 @dataclass(frozen=True)
 class Compiled(Module):
-    """A file of the core, in Cython, which Python cannot parse: strings, comments and the code between them."""
+    """A file in Cython, which Python cannot parse: strings, comments and the code between them."""
 
     def parts(self, kind: str) -> Iterator[tuple[int, str, str]]:
         """All of a kind of `CYTHON`: its line, the code before it on that line, and itself."""
@@ -128,6 +128,13 @@ class Compiled(Module):
     def comments(self) -> Iterator[tuple[int, str, str]]:
         """Each comment: its line, the code beside it, and itself."""
         yield from self.parts("comment")
+
+    def imported(self) -> Iterator[tuple[int, str]]:
+        """The line and the name of each module that it imports, in Python or in C."""
+        for number, line in enumerate(self.code().splitlines(), 1):
+            for home, names in IMPORTED.findall(line):
+                for name in [home] if home else [part.split()[0] for part in names.split(",")]:
+                    yield number, name
 
     def code(self) -> str:
         """The code without strings and comments, on its own lines."""
@@ -159,10 +166,10 @@ def beside() -> list[Module]:
 
 
 def compiled() -> list[Compiled]:
-    """All files of the compiled core."""
-    folder = packages()["starpos"] / "core"
-    paths = sorted((*folder.glob("*.pyx"), *folder.glob("*.pxd")))
-    return [Compiled(f"starpos.core.{path.stem}", path, path.read_text()) for path in paths]
+    """All files in Cython."""
+    folder = packages()["starpos"]
+    paths = sorted((*folder.glob("*/*.pyx"), *folder.glob("*/*.pxd")))
+    return [Compiled(f"starpos.{path.parent.name}.{path.stem}", path, path.read_text()) for path in paths]
 
 
 def rows(heading: str) -> list[list[str]]:
@@ -262,14 +269,36 @@ def circles(house: list[Module]) -> Iterator[str]:
         yield by_name[circle[0]].at(by_name[circle[0]].tree, f"imports in a circle: {', '.join(circle)}")
 
 
-def core(files: list[Compiled]) -> Iterator[str]:
-    """What the compiled core may not import."""
+def cimports(files: list[Compiled]) -> Iterator[str]:
+    """Imports of compiled modules: of others in Cython only, in their own room or on a floor below."""
+    floor, folder = floors(), packages()["starpos"]
     for file in files:
-        for number, line in enumerate(file.code().splitlines(), 1):
-            for home, names in IMPORTED.findall(line):
-                for name in [home] if home else [part.split()[0] for part in names.split(",")]:
-                    if not any(f"{name}.".startswith(f"{allowed}.") for allowed in CORE):
-                        yield file.at_line(number, f"the core imports {name}")
+        for line, name in file.imported():
+            package, room, module = (*name.split("."), "", "")[:3]
+            if package in OF_CYTHON:
+                continue
+            if package != "starpos" or not (folder / room / f"{module}.pxd").is_file():
+                yield file.at_line(line, f"a compiled module imports {name}")
+            elif room != file.room and floor[room] >= floor[file.room]:
+                sentence = f"{file.room} (floor {floor[file.room]}) imports {room} (floor {floor[room]})"
+                yield file.at_line(line, sentence)
+
+
+def uncalled(house: list[Module]) -> Iterator[str]:
+    """Compiled modules that nothing in their own room calls; those of `_numeric` are there to be shared."""
+    called = set()
+    for module in house:
+        if isinstance(module, Compiled):
+            called |= {(module.room, name) for _, name in module.imported()}
+        else:
+            called |= {(module.room, target.rpartition(".")[0]) for _, target in imports(module)}
+    for module in house:
+        if (
+            isinstance(module, Compiled)
+            and module.room != "_numeric"
+            and (module.room, module.name) not in called
+        ):
+            yield module.at_line(1, f"nothing in {module.room} calls it: put it where it is called")
 
 
 def aliases(house: list[Module]) -> Iterator[str]:
@@ -356,13 +385,14 @@ def comments(house: list[Module]) -> Iterator[str]:
 
 def breaches() -> list[str]:
     """All that is against the rules."""
-    house, core_files = modules(), compiled()
-    everything = [*house, *core_files, *beside()]
+    house, in_cython = modules(), compiled()
+    everything = [*house, *in_cython, *beside()]
     return [line for rule in (layers, circles, aliases, twins, keywords) for line in rule(house)] + [
         *words(everything),
         *comments(everything),
-        *same_functions([*house, *core_files]),
-        *core(core_files),
+        *same_functions([*house, *in_cython]),
+        *cimports(in_cython),
+        *uncalled([*house, *in_cython]),
     ]
 
 

@@ -9,23 +9,23 @@ from setuptools.command.build_ext import build_ext
 
 package = "starpos"
 # the code of views of arrays, which Cython from 3.1 on need not put into each module: that halves the time of a build
-VIEWS = f"{package}.core._views" if tuple(map(int, version("cython").split(".")[:2])) >= (3, 1) else None
-# the compiled core: a module is a .pyx; what several of them share is in .pxd
-SHARED = sorted(glob("starpos/core/*.pxd"))
-CORE = [
+VIEWS = f"{package}._numeric._views" if tuple(map(int, version("cython").split(".")[:2])) >= (3, 1) else None
+# a compiled module is a .pyx beside the Python that calls it; what several of them share is in .pxd
+SHARED = sorted(glob("starpos/*/*.pxd"))
+COMPILED = [
     Extension(
-        f"starpos.core.{Path(source).stem}",
+        ".".join(Path(source).with_suffix("").parts),
         [source],
         depends=[*SHARED, "setup.py"],
         # else the loader takes the oldest exp, which is slow
         libraries=["m"],
         extra_compile_args=["-O3", "-g0", "-fno-math-errno"],
     )
-    for source in [*sorted(glob("starpos/core/*.pyx")), *(["starpos/core/_views.c"] if VIEWS else [])]
+    for source in [*sorted(glob("starpos/*/*.pyx")), *(["starpos/_numeric/_views.c"] if VIEWS else [])]
 ]
 
 
-class BuildCore(build_ext):
+class BuildCompiled(build_ext):
     """Compiles several modules at once."""
 
     def build_extensions(self):
@@ -51,8 +51,8 @@ setup(
     python_requires=">=3.10",
     packages=find_packages(include=["starpos", "starpos.*"]),
     package_data={package: ["*/data/*", "*.pyi", "py.typed"]},
-    ext_modules=CORE,
-    cmdclass={"build_ext": BuildCore},
+    ext_modules=COMPILED,
+    cmdclass={"build_ext": BuildCompiled},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{package}"]),
         (f"share/{package}", ["package.xml"]),

@@ -13,8 +13,8 @@ from itertools import combinations
 import numpy as np
 
 from starpos import rotation
+from starpos._numeric.roots import symmetric_root
 from starpos.averaging.average import SCATTER, Average
-from starpos.core.roots import symmetric_root
 from starpos.earth.ellipsoid import curvature_radii_m
 from starpos.earth.orientation import EarthState, station_velocity
 from starpos.earth.refraction import MIN_COS_ZENITH, Atmosphere

@@ -11,9 +11,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from starpos._numeric.roots import symmetric_root
 from starpos.averaging.filter import Plane
 from starpos.averaging.scatter import MOST_ROWS, Frames, Scatter, scatter_of
-from starpos.core.roots import symmetric_root
 from starpos.earth.ellipsoid import EARTH_RADIUS_M
 from starpos.fix.budget import EACH_POSE, ErrorTerm
 from starpos.fix.fix import Fix

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from starpos.core.roots import symmetric_root
+from starpos._numeric.roots import symmetric_root
 from starpos.earth.ellipsoid import curvature_radii_m, enu_axes, meridian_turn, place_of_zenith, zenith_of
 from starpos.fix.budget import EACH_POSE, ErrorTerm, correlation
 from starpos.fix.fix import Fix

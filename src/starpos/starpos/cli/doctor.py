@@ -127,15 +127,15 @@ def _version(package: str) -> str:
     return "(version not told)"
 
 
-def core() -> Finding:
-    """The compiled loops."""
-    if find_spec("starpos.core.frame") is None:
+def compiled() -> Finding:
+    """The compiled modules."""
+    if find_spec("starpos._numeric.roots") is None:
         return Finding(
             State.MISSING,
-            "starpos.core is not compiled",
+            "the modules in Cython are not compiled",
             "pip install ./src/starpos, or make build in a clone (a C compiler is needed)",
         )
-    return Finding(State.OK, "starpos.core is compiled")
+    return Finding(State.OK, "the modules in Cython are compiled")
 
 
 def optional() -> Finding:
@@ -285,7 +285,7 @@ def ros() -> Finding:
 CHECKS: dict[str, Callable[[], Finding]] = {
     "starpos": versions,
     "packages": packages,
-    "compiled core": core,
+    "compiled modules": compiled,
     "optional": optional,
     "star catalogue": star_catalogue,
     "cache": cache,

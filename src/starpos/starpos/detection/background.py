@@ -7,10 +7,10 @@ from functools import cached_property, lru_cache
 import numpy as np
 from scipy import ndimage
 
-from starpos.core.background import near, sampled
-from starpos.core.mesh import evened
-from starpos.core.order import median
-from starpos.core.sparse import any_flat
+from starpos.detection._background import near, sampled
+from starpos.detection._mesh import evened
+from starpos.detection._order import median
+from starpos.detection._sparse import any_flat
 from starpos.normal import SIGMA_PER_MAD
 
 # Sigmas of a cell by which cells beside each other differ no more where the sky goes on.

@@ -7,8 +7,8 @@ from typing import TypeVar
 
 import numpy as np
 
-from starpos.core.pairs import fitted_pairs
-from starpos.core.vetting import brightest_left, counted
+from starpos.detection._pairs import fitted_pairs
+from starpos.detection._vetting import brightest_left, counted
 from starpos.detection.fit import FIT_WIDTHS, Fit, Response, fit_stars, gains_at
 from starpos.detection.psf import FieldPsf, LocalPsf
 from starpos.detection.stamps import Stamps

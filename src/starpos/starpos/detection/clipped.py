@@ -8,8 +8,8 @@ pixels above half its height.
 import cv2
 import numpy as np
 
-from starpos.core.neighbours import any_near
-from starpos.core.sparse import thirds
+from starpos.detection._neighbours import any_near
+from starpos.detection._sparse import thirds
 from starpos.detection.background import Background
 from starpos.detection.discs import FLAT, FULLEST, LONGEST, MOST, columns_of, with_discs
 from starpos.frames.stars import SATURATED

@@ -7,7 +7,7 @@ Their light is told by the area of the disc. Nothing else puts the brightest sta
 import cv2
 import numpy as np
 
-from starpos.core.sparse import bright_squares
+from starpos.detection._sparse import bright_squares
 from starpos.detection.background import Background
 from starpos.frames.stars import SATURATED
 

@@ -8,11 +8,11 @@ from functools import cached_property
 import numpy as np
 from scipy import spatial
 
-from starpos.core.background import between
-from starpos.core.mesh import above
-from starpos.core.neighbours import groups, near_pairs, nearest
-from starpos.core.order import median
-from starpos.core.peaks import peaks, smoothed
+from starpos.detection._background import between
+from starpos.detection._mesh import above
+from starpos.detection._neighbours import groups, near_pairs, nearest
+from starpos.detection._order import median
+from starpos.detection._peaks import peaks, smoothed
 from starpos.detection.background import Background
 from starpos.detection.stamps import are_alone, are_dots, surroundings
 from starpos.normal import SIGMA_PER_MAD

@@ -5,8 +5,8 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from starpos.core.fit import fitted
-from starpos.core.rules import Rules
+from starpos.detection._fit import fitted
+from starpos.detection._rules import Rules
 from starpos.detection.psf import FieldPsf
 from starpos.detection.stamps import Stamps
 
@@ -35,7 +35,7 @@ class Response:
 
     @property
     def rules(self) -> Rules:
-        """The rules by which the compiled core fits stars."""
+        """The rules by which compiled code fits stars."""
         return Rules(
             self.gain,
             self.colour_spread,

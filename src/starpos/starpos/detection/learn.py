@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import spatial
 
-from starpos.core.moments import own_shapes
-from starpos.core.neighbours import near_pairs
-from starpos.core.noise import light_noise, of_phases, strangeness, typical_gains, unit_light
-from starpos.core.order import median, quantile
-from starpos.core.shapes import squared_widths
-from starpos.core.stamps import greyed
+from starpos.detection._moments import own_shapes
+from starpos.detection._neighbours import near_pairs
+from starpos.detection._noise import light_noise, of_phases, strangeness, typical_gains, unit_light
+from starpos.detection._order import median, quantile
+from starpos.detection._shapes import squared_widths
+from starpos.detection._stamps import greyed
 from starpos.detection.background import Background
 from starpos.detection.fit import Fit, Response, fit_stars
 from starpos.detection.psf import BROAD, NARROW, FieldPsf, Psf, gaussian

@@ -10,7 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from starpos.core.sparse import third_highest
+from starpos.detection._sparse import third_highest
 from starpos.detection.background import measure_background
 from starpos.detection.clipped import with_clipped
 from starpos.detection.discs import find_discs, with_discs

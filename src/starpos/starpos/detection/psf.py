@@ -13,9 +13,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from starpos.core.field import local, monomials, shapes_of
-from starpos.core.psf import evaluated
-from starpos.core.shapes import clipped, squared_widths
+from starpos.detection._field import local, monomials, shapes_of
+from starpos.detection._psf import evaluated
+from starpos.detection._shapes import clipped, squared_widths
 
 # How many monomials describe a variation over the field: up to second order in x and y.
 MONOMIALS = 6

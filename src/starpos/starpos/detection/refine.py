@@ -7,8 +7,8 @@ from functools import cached_property, lru_cache
 
 import numpy as np
 
-from starpos.core.field import agreed, over_field
-from starpos.core.marginal import chosen, marginal
+from starpos.detection._field import agreed, over_field
+from starpos.detection._marginal import chosen, marginal
 from starpos.detection.psf import MONOMIALS, Psf, power
 
 # A variation over the field needs at least so many stars,

@@ -7,7 +7,7 @@ from functools import cached_property
 import numpy as np
 from scipy import ndimage, special
 
-from starpos.core.peaks import smoothed
+from starpos.detection._peaks import smoothed
 from starpos.detection.finding import SHARP, Kernel
 from starpos.detection.plane import plane_of
 from starpos.frames.frame import Frame

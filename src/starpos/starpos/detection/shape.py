@@ -7,8 +7,8 @@ a Gaussian of covariance V = (C^-1 + W^-1)^-1 (Bernstein & Jarvis 2002, AJ 123, 
 
 import numpy as np
 
-from starpos.core.moments import centred, settled, windowed
-from starpos.core.shapes import before, clipped, inverted, relative, through
+from starpos.detection._moments import centred, settled, windowed
+from starpos.detection._shapes import before, clipped, inverted, relative, through
 
 # px2. A single pixel has 1/12, and a star's light never falls on one pixel only.
 NARROWEST = 0.2

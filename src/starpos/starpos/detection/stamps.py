@@ -5,8 +5,8 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from starpos.core.beside import dots, lonely, rims
-from starpos.core.stamps import around, light_around
+from starpos.detection._beside import dots, lonely, rims
+from starpos.detection._stamps import around, light_around
 from starpos.detection.background import Background
 from starpos.normal import SIGMA_PER_MAD
 

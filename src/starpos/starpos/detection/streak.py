@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from scipy import ndimage
 
-from starpos.core.neighbours import groups, near_pairs
+from starpos.detection._neighbours import groups, near_pairs
 from starpos.detection.background import Background
 
 # px. Peaks along a trail are never farther apart.

@@ -5,9 +5,9 @@ from itertools import pairwise
 
 import numpy as np
 
-from starpos.core.neighbours import near_pairs
-from starpos.core.shapes import squared_widths
-from starpos.core.vetting import level, looks, one_pixel, own_light, without_spikes
+from starpos.detection._neighbours import near_pairs
+from starpos.detection._shapes import squared_widths
+from starpos.detection._vetting import level, looks, one_pixel, own_light, without_spikes
 from starpos.detection.background import Background
 from starpos.detection.blend import Fitted, joined, pairs_among, rows_of, surprising
 from starpos.detection.fit import OUTLIER, Fit, Response, fit_stars

@@ -10,7 +10,7 @@ from functools import cached_property
 import erfa
 import numpy as np
 
-from starpos.core.air import Air
+from starpos.earth._air import Air
 from starpos.errors import InstrumentError
 
 STANDARD_PRESSURE_PA = 101_325.0
@@ -115,7 +115,7 @@ class Refraction:
 
     @cached_property
     def compiled(self) -> Air:
-        """The model, for the compiled core."""
+        """The model, for compiled code."""
         return Air(self.a, self.b, MIN_COS_ZENITH)
 
     def bend(self, v: np.ndarray) -> np.ndarray:

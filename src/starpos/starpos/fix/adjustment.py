@@ -9,11 +9,11 @@ from functools import cached_property
 
 import numpy as np
 
-from starpos.core.adjustment import Adjustment
 from starpos.earth.ellipsoid import ECCENTRICITY2
 from starpos.earth.orientation import EQUATOR_M_PER_S, SPEED_OF_LIGHT
 from starpos.earth.refraction import Refraction
 from starpos.errors import FixError
+from starpos.fix._adjustment import Adjustment
 from starpos.fix.outliers import judged
 from starpos.frozen import at_once
 from starpos.instrument.camera import Camera

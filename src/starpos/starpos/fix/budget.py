@@ -9,10 +9,10 @@ from functools import cached_property
 import numpy as np
 
 from starpos import rotation
-from starpos.core.adjustment import gain_of, spread
-from starpos.core.roots import symmetric_root
+from starpos._numeric.roots import symmetric_root
 from starpos.earth.ellipsoid import curvature_radii_m, enu_axes, meridian_turn, place_of_zenith
 from starpos.earth.orientation import ROTATION_RAD_S, EarthState
+from starpos.fix._adjustment import gain_of, spread
 from starpos.frozen import at_once
 from starpos.instrument.inclinometer import Tilt
 from starpos.instrument.mounting import LocalLevel, Mounting

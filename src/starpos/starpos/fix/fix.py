@@ -11,10 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from starpos import rotation
-from starpos.core.adjustment import Adjustment
 from starpos.earth.orientation import ROTATION_RAD_S, EarthState, later, station_velocity
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import FixError
+from starpos.fix._adjustment import Adjustment
 from starpos.fix.adjustment import ISOTROPIC, Fitted, adjustment_of, fitted, share_free
 from starpos.fix.budget import (
     ALWAYS,

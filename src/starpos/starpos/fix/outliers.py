@@ -3,7 +3,7 @@
 
 import numpy as np
 
-from starpos.core.scatter import distances2, expected_variance, sifted
+from starpos.fix._scatter import distances2, expected_variance, sifted
 from starpos.normal import MEDIAN_OF_CHI2
 
 OUTLIER_SIGMA = 5.0

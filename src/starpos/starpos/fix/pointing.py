@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from starpos import rotation
-from starpos.core.roots import symmetric_root
+from starpos._numeric.roots import symmetric_root
 from starpos.earth.orientation import EarthState
 from starpos.earth.refraction import Atmosphere
 from starpos.fix.budget import ErrorTerm, Sensitivity, place_of

@@ -5,8 +5,8 @@ import math
 
 import numpy as np
 
-from starpos.core.frame import FrameStars, all_within, ideal_frame, unit_vectors
 from starpos.frames.stars import EDGE_PX, Stars
+from starpos.identification._frame import FrameStars, all_within, ideal_frame, unit_vectors
 from starpos.identification.pose import LEAST_SIGMA_PX, TEST_STARS
 from starpos.identification.search import through
 from starpos.instrument.camera import Camera

@@ -9,7 +9,6 @@ from functools import cached_property
 
 import numpy as np
 
-from starpos.core.frame import FrameStars, mean_sigma
 from starpos.earth.orientation import EarthState, earth_state
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import FixError, InstrumentError, StarposError, TiltError, TimeError
@@ -25,6 +24,7 @@ from starpos.frames.reading import why_no_time
 from starpos.frames.shutter import UNKNOWN, Shutter
 from starpos.frames.stars import Stars
 from starpos.identification import FEWEST_STARS, Identification, Sky, triangle_cache, wide
+from starpos.identification._frame import FrameStars, mean_sigma
 from starpos.identification.explained import Explained, explained_by
 from starpos.identification.hint import Hint
 from starpos.identification.search import Priors, field_of, identify_frame

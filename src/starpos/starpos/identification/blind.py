@@ -15,8 +15,8 @@ from itertools import product
 import numpy as np
 
 from starpos.budget import ENDLESS, Budget
-from starpos.core.frame import FrameStars
 from starpos.frames.stars import Window
+from starpos.identification._frame import FrameStars
 from starpos.identification.evidence import any_scale
 from starpos.identification.explained import explained_by
 from starpos.identification.full import ENOUGH, FEWEST_STARS, Identification, identified

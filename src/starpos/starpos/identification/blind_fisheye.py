@@ -14,7 +14,7 @@ import numpy as np
 
 from starpos import rotation
 from starpos.budget import ENDLESS, Budget
-from starpos.core.frame import FrameStars
+from starpos.identification._frame import FrameStars
 from starpos.identification import wide
 from starpos.identification.blind import ROUGHLY, is_sure
 from starpos.identification.evidence import any_scale

@@ -20,8 +20,8 @@ from functools import lru_cache
 
 import numpy as np
 
-from starpos.core.poses import Chances
-from starpos.core.search import Anywhere
+from starpos.identification._poses import Chances
+from starpos.identification._search import Anywhere
 from starpos.identification.pose import Pose
 from starpos.identification.triangles import SCALE_TOLERANCE
 

@@ -3,8 +3,8 @@
 
 from dataclasses import dataclass
 
-from starpos.core.frame import FrameStars
 from starpos.frozen import at_once
+from starpos.identification._frame import FrameStars
 from starpos.identification.full import Identification
 from starpos.identification.pose import TEST_STARS
 

@@ -5,10 +5,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from starpos.core.found import Identification
-from starpos.core.frame import FrameStars
-from starpos.core.poses import Rules
-from starpos.core.search import Judge
+from starpos.identification._found import Identification
+from starpos.identification._frame import FrameStars
+from starpos.identification._poses import Rules
+from starpos.identification._search import Judge
 from starpos.identification.evidence import CHANCES, Prior
 from starpos.identification.pose import SMALL_STEP, STEPS, Pose
 from starpos.identification.sky import Sky
@@ -86,7 +86,7 @@ class OnFrame:
 
 
 def judge(field: FrameStars, sky: Sky, prior: Prior, enough: float = ENOUGH) -> Judge:
-    """What judges poses of a frame by a prior, for the compiled core; enough: log-odds of an identification."""
+    """What judges poses of a frame by a prior, for compiled code; enough: log-odds of an identification."""
     return Judge(
         field,
         sky.stars,

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from starpos import rotation
-from starpos.core.frame import FrameStars
-from starpos.core.poses import fitted
+from starpos.identification._frame import FrameStars
+from starpos.identification._poses import fitted
 from starpos.instrument.camera import Camera
 
 # Most steps of a fit; a step below this (rad) is the last one.

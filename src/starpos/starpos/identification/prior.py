@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from starpos import rotation
-from starpos.core.frame import FrameStars
+from starpos.identification._frame import FrameStars
 from starpos.identification.evidence import SCALE_TOLERANCE, Prior
 from starpos.identification.full import OnFrame
 from starpos.identification.pose import MATCH_SIGMA, Pose, directions

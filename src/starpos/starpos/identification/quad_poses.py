@@ -9,7 +9,7 @@ from itertools import combinations
 import numpy as np
 
 from starpos import rotation
-from starpos.core.frame import FrameStars
+from starpos.identification._frame import FrameStars
 from starpos.identification.pose import MATCH_SIGMA, Pose, Poses, directions
 from starpos.identification.quads import SHORTEST, SIDES, QuadCatalogue, shapes
 from starpos.identification.sky import Sky

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from starpos.core.circles import well_apart
+from starpos.identification._circles import well_apart
 from starpos.identification._quads import near
 from starpos.identification.triangles import circle_count, spread_points
 from starpos.progress import Progress, quiet

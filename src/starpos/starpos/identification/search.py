@@ -8,11 +8,11 @@ from itertools import chain
 
 import numpy as np
 
-from starpos.core.frame import FrameStars, projected
-from starpos.core.search import Finder, Limits
 from starpos.errors import InstrumentError
 from starpos.frames.stars import Window
 from starpos.identification import wide
+from starpos.identification._frame import FrameStars, projected
+from starpos.identification._search import Finder, Limits
 from starpos.identification.evidence import CHANCES, anywhere
 from starpos.identification.full import ENOUGH, FEWEST_STARS, RULES, Identification, identified
 from starpos.identification.pose import CROWD_STARS, LEAST_SIGMA_PX, MATCH_SIGMA, TEST_STARS, stars_at

@@ -11,7 +11,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from starpos.core.frame import FrameStars
+from starpos.identification._frame import FrameStars
 from starpos.identification.full import Identification, OnFrame
 from starpos.identification.pose import TEST_STARS, Pose
 from starpos.identification.search import STAGES, Priors, near_or_lost

@@ -6,10 +6,10 @@ from functools import lru_cache
 
 import numpy as np
 
-from starpos.core.screen import BrightTable
-from starpos.core.sky import StarTable
 from starpos.earth.orientation import earth_motion
 from starpos.frozen import at_once
+from starpos.identification._screen import BrightTable
+from starpos.identification._sky import StarTable
 from starpos.identification.triangles import TriangleCatalogue
 from starpos.sky.catalogue import EPOCH, Catalogue
 
@@ -36,12 +36,12 @@ class Sky:
 
     @property
     def stars(self) -> StarTable:
-        """The catalogue, for the compiled core."""
+        """The catalogue, for compiled code."""
         return _stars(self.catalogue)
 
     @property
     def brightest(self) -> BrightTable:
-        """The triangle catalogue's stars, for the compiled core."""
+        """The triangle catalogue's stars, for compiled code."""
         return _brightest(self.catalogue, self.triangles)
 
     def load(self) -> None:

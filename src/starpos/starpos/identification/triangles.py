@@ -11,8 +11,8 @@ from math import comb
 
 import numpy as np
 
-from starpos.core.circles import binned, triples_of_circles, well_apart
-from starpos.core.triangles import TriangleTable
+from starpos.identification._circles import binned, triples_of_circles, well_apart
+from starpos.identification._triangles import TriangleTable
 from starpos.progress import Progress, quiet
 from starpos.sky.catalogue import Catalogue
 from starpos.sky.zones import CELLS, ZONES, cell_starts
@@ -90,7 +90,7 @@ class TriangleCatalogue:
 
     @cached_property
     def compiled(self) -> TriangleTable:
-        """The triangles, for the compiled core."""
+        """The triangles, for compiled code."""
         return TriangleTable(self, CROWDED, SCALE_TOLERANCE, TRIANGLE_SIGMA)
 
 

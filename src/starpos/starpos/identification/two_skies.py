@@ -14,7 +14,7 @@ import math
 
 import numpy as np
 
-from starpos.core.frame import FrameStars
+from starpos.identification._frame import FrameStars
 from starpos.identification.evidence import DOUBLE_PX
 from starpos.identification.explained import Explained
 from starpos.identification.full import ENOUGH, Identification

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from starpos import rotation
-from starpos.core.frame import FrameStars
+from starpos.identification._frame import FrameStars
 from starpos.identification.full import (
     BENT_PX,
     BLEND_PX,

@@ -11,8 +11,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
-from starpos.core.lens import Equidistant, Lens
 from starpos.errors import InstrumentError
+from starpos.instrument._lens import Equidistant, Lens
 from starpos.instrument.lens import COEFFICIENTS, PLUMB_BOB, lens_of
 
 

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""ROS's lens models by name: `plumb_bob` of a pinhole, `equidistant` of a fisheye; the models are in `core.lens`."""
+"""ROS's lens models by name: `plumb_bob` of a pinhole, `equidistant` of a fisheye; the code is in `_lens`."""
 
 import math
 from functools import lru_cache
 
 import numpy as np
 
-from starpos.core.lens import Equidistant, Lens, PlumbBob
+from starpos.instrument._lens import Equidistant, Lens, PlumbBob
 
 # ROS's names of the models that are understood, and the names of their coefficients.
 PLUMB_BOB, EQUIDISTANT = "plumb_bob", "equidistant"

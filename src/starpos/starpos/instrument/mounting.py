@@ -7,7 +7,7 @@ from functools import cached_property
 import numpy as np
 
 from starpos import rotation
-from starpos.core.roots import symmetric_root
+from starpos._numeric.roots import symmetric_root
 from starpos.errors import InstrumentError
 from starpos.frozen import at_once
 from starpos.instrument.inclinometer import EXACT, InclinometerErrors, Tilt, level_of, levelling_of, up_of

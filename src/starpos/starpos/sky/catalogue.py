@@ -15,10 +15,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from starpos.core.labels import Labels
 from starpos.errors import CatalogueError
 from starpos.files import open_regular
 from starpos.rotation import normalised
+from starpos.sky._labels import Labels
 from starpos.sky.zones import ZONES, cell_starts, rows_near
 from starpos.table_cache import cache_folder, load_or_build, mapped, rising
 from starpos.units import MAS, MAS_DEG

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What pixels beside peaks tell, by the compiled core, beside its plain form on stamps of them."""
+"""What pixels beside peaks tell, by compiled code, beside its plain form on stamps of them."""
 
 import numpy as np
 import pytest
 
-from starpos.core.beside import dots, lonely, rims
-from starpos.core.stamps import around
+from starpos.detection._beside import dots, lonely, rims
+from starpos.detection._stamps import around
 from starpos.normal import SIGMA_PER_MAD
 
 

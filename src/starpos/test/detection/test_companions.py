@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Near points, light that a fit leaves, and fluxes of phases, of the compiled core, beside their plain forms."""
+"""Near points, light that a fit leaves, and fluxes of phases, of compiled code, beside their plain forms."""
 
 import numpy as np
 import pytest
 from scipy import ndimage, sparse, spatial
 
-from starpos.core.neighbours import any_near, groups, near_pairs, nearest
-from starpos.core.noise import of_phases, unit_light
-from starpos.core.stamps import greyed
-from starpos.core.vetting import brightest_left, counted
+from starpos.detection._neighbours import any_near, groups, near_pairs, nearest
+from starpos.detection._noise import of_phases, unit_light
+from starpos.detection._stamps import greyed
+from starpos.detection._vetting import brightest_left, counted
 
 
 @pytest.mark.parametrize("number", [1, 2, 30, 300])

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A PSF at places of the field, and which of its terms are taken, of the compiled core, beside their plain forms."""
+"""A PSF at places of the field, and which of its terms are taken, of compiled code, beside their plain forms."""
 
 import numpy as np
 import pytest
 
-from starpos.core.field import agreed, local, monomials, over_field, shapes_of
-from starpos.core.marginal import chosen
+from starpos.detection._field import agreed, local, monomials, over_field, shapes_of
+from starpos.detection._marginal import chosen
 
 BOX = np.array([[10.0, 20.0], [410.0, 20.5]])
 

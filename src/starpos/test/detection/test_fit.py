@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""PSF and fit of the compiled core beside their plain forms."""
+"""PSF and fit of compiled code beside their plain forms."""
 
 import numpy as np
 import pytest
 from numpy.polynomial import hermite_e
 
-from starpos.core.fit import fitted
-from starpos.core.psf import evaluated
-from starpos.core.rules import Rules
+from starpos.detection._fit import fitted
+from starpos.detection._psf import evaluated
+from starpos.detection._rules import Rules
 from starpos.detection.fit import FAINT, FIT_WIDTHS, OUTLIER, SETTLED
 
 SIZE = 15

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Normal equations of a PSF's terms, of the compiled core, beside their plain form."""
+"""Normal equations of a PSF's terms, of compiled code, beside their plain form."""
 
 import numpy as np
 import pytest
 from test_fit import SIZE, hermite, plain_psf, psfs, scaled
 
-from starpos.core.marginal import marginal
+from starpos.detection._marginal import marginal
 
 ORDERS = np.array([(2, 0), (1, 1), (0, 2), (3, 0), (4, 2)], np.int32)
 

@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Meshes of the sky, sparse looks at a frame, and medians, of the compiled core, beside their plain forms."""
+"""Meshes of the sky, sparse looks at a frame, and medians, of compiled code, beside their plain forms."""
 
 import numpy as np
 import pytest
 from scipy import ndimage
 
-from starpos.core.background import between, near
-from starpos.core.mesh import above, evened
-from starpos.core.order import median, quantile
-from starpos.core.peaks import peaks, smoothed
-from starpos.core.sparse import any_flat, bright_squares, third_highest, thirds
+from starpos.detection._background import between, near
+from starpos.detection._mesh import above, evened
+from starpos.detection._order import median, quantile
+from starpos.detection._peaks import peaks, smoothed
+from starpos.detection._sparse import any_flat, bright_squares, third_highest, thirds
 from starpos.detection.finding import SHARP, WIDE
 
 

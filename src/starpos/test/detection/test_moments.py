@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Windowed moments of the compiled core beside their plain sums."""
+"""Windowed moments of compiled code beside their plain sums."""
 
 import numpy as np
 import pytest
 
-from starpos.core.moments import centred, windowed
+from starpos.detection._moments import centred, windowed
 
 
 def plain(signal, left, top, window):

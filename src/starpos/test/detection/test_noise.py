@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The noise that grows with light, of the compiled core, beside its plain form."""
+"""The noise that grows with light, of compiled code, beside its plain form."""
 
 import numpy as np
 import pytest
 
-from starpos.core.noise import light_noise, strangeness, typical_gains
+from starpos.detection._noise import light_noise, strangeness, typical_gains
 
 N, SIZE = 20, 9
 

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Shapes of stars through windows that follow them, of the compiled core, beside their plain forms."""
+"""Shapes of stars through windows that follow them, of compiled code, beside their plain forms."""
 
 import numpy as np
 import pytest
 
-from starpos.core.moments import centred, own_shapes, settled, windowed
-from starpos.core.shapes import before, clipped, inverted
+from starpos.detection._moments import centred, own_shapes, settled, windowed
+from starpos.detection._shapes import before, clipped, inverted
 
 
 def stars(rng, n, size=13):

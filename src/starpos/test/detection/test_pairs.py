@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The fit of two stars at once of the compiled core beside its plain form."""
+"""The fit of two stars at once of compiled code beside its plain form."""
 
 import numpy as np
 import pytest
 from test_fit import DN_PER_PHOTON, MISFIT, SIZE, SPREAD, plain_psf, psfs, rules, scaled
 
-from starpos.core.pairs import fitted_pairs
+from starpos.detection._pairs import fitted_pairs
 from starpos.detection.fit import FIT_WIDTHS, SETTLED
 
 LEAST = 0.05

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cells of the background and pixels around stars, of the compiled core, beside their plain forms."""
+"""Cells of the background and pixels around stars, of compiled code, beside their plain forms."""
 
 import numpy as np
 import pytest
 from scipy import ndimage
 
-from starpos.core.background import between, sampled
-from starpos.core.stamps import around, light_around
+from starpos.detection._background import between, sampled
+from starpos.detection._stamps import around, light_around
 from starpos.detection.background import CLIP
 from starpos.normal import SIGMA_PER_MAD
 

@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from starpos.core.shapes import before, clipped, inverted, relative, squared_widths, through
+from starpos.detection._shapes import before, clipped, inverted, relative, squared_widths, through
 
 N = 30
 

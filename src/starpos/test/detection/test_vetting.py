@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What pixels say of stars, of the compiled core, beside its plain form."""
+"""What pixels say of stars, of compiled code, beside its plain form."""
 
 import numpy as np
 import pytest
 from scipy import ndimage
 
-from starpos.core.vetting import level, looks, one_pixel, own_light, without_spikes
+from starpos.detection._vetting import level, looks, one_pixel, own_light, without_spikes
 from starpos.normal import SIGMA_PER_MAD
 
 N, SIZE = 12, 11

@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the compiled core computes for a fix, beside plain forms of it: derivatives, directions, scatter, roots."""
+"""What compiled code computes for a fix, beside plain forms of it: derivatives, directions, scatter, roots."""
 
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
 from starpos import rotation
-from starpos.core.adjustment import gain_of, spread
-from starpos.core.roots import symmetric_root
-from starpos.core.scatter import extra_variance
+from starpos._numeric.roots import symmetric_root
 from starpos.earth.orientation import station_velocity
 from starpos.earth.refraction import MIN_COS_ZENITH, Atmosphere
+from starpos.fix._adjustment import gain_of, spread
+from starpos.fix._scatter import extra_variance
 from starpos.fix.adjustment import adjustment_of, fitted
 from starpos.fix.outliers import GOOD_EXTRA, LEAST_EXTRA, distance2, expected_extra, judged
 from starpos.instrument.camera import Camera

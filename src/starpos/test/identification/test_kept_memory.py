@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the compiled core keeps as plain memory: it takes arrays that fit only, and gives what it was given."""
+"""What compiled code keeps as plain memory: it takes arrays that fit only, and gives what it was given."""
 
 import pickle
 
 import numpy as np
 import pytest
 
-from starpos.core.frame import FrameStars
 from starpos.identification import Identification, search
+from starpos.identification._frame import FrameStars
 
 VALUES = {
     "star": [0, 2, 5],

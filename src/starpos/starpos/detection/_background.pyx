@@ -1,0 +1,226 @@
+# SPDX-License-Identifier: Apache-2.0
+# cython: language_level=3, boundscheck=False, wraparound=False, cdivision=True, initializedcheck=False
+"""The sky in the cells of a mesh, by clipped means of a sample of the 8- or 16-bit pixels, and between the cells."""
+
+from libc.math cimport sqrt
+from libc.stdlib cimport free, malloc
+
+import numpy as np
+
+from starpos._numeric.limits cimport within
+
+cimport starpos._numeric.wide
+
+cdef extern from *:
+    """
+    /* How many of n numbers are at most `limit`. */
+    static inline int starpos_count(const unsigned short *v, int n, unsigned short limit) {
+        int count = 0;
+        for (int first = 0; first < n; first += 4096) {
+            const int last = n < first + 4096 ? n : first + 4096;
+            unsigned short some = 0;
+            for (int i = first; i < last; i++)
+                some += v[i] <= limit;
+            count += some;
+        }
+        return count;
+    }
+    /* The number that would stand at k of n if they were sorted: halving the range takes few looks at whole numbers. */
+    STARPOS_WIDE static int starpos_ranked(const unsigned short *v, int n, int k) {
+        unsigned short least = 65535, most = 0;
+        for (int i = 0; i < n; i++) {
+            least = v[i] < least ? v[i] : least;
+            most = v[i] > most ? v[i] : most;
+        }
+        int low = least, high = most;
+        while (low < high) {
+            const int middle = (low + high) / 2;
+            if (starpos_count(v, n, middle) > k)
+                high = middle;
+            else
+                low = middle + 1;
+        }
+        return low;
+    }
+    /* How many of n numbers are a given one. */
+    STARPOS_WIDE static int starpos_equal(const unsigned short *v, int n, int number) {
+        int count = 0;
+        for (int i = 0; i < n; i++)
+            count += v[i] == number;
+        return count;
+    }
+    /* How far n numbers are from the middle; of those within a limit their number, the sum of the differences and of squares. */
+    STARPOS_WIDE static void starpos_away(const unsigned short *v, int n, unsigned short middle, unsigned short *away) {
+        for (int i = 0; i < n; i++)
+            away[i] = v[i] > middle ? v[i] - middle : middle - v[i];
+    }
+    STARPOS_WIDE static void starpos_sums(const unsigned short *v, int n, int middle, int limit, long long *out) {
+        /* so many squares have a sum of 32 bits */
+        const int most = limit < 65536 ? 4294967295u / ((unsigned)limit * limit + 1) : 0, some = most > 1 ? most : 1;
+        out[0] = out[1] = out[2] = 0;
+        for (int first = 0; first < n; first += some) {
+            const int last = n - first < some ? n : first + some;
+            unsigned square = 0;
+            int count = 0, sum = 0;
+            for (int i = first; i < last; i++) {
+                const int off = v[i] - middle, kept = (unsigned)(off + limit) <= 2u * limit;
+                count += kept;
+                sum += kept ? off : 0;
+                square += kept ? (unsigned)off * (unsigned)off : 0;
+            }
+            out[0] += count;
+            out[1] += sum;
+            out[2] += square;
+        }
+    }
+    """
+    int ranked "starpos_ranked"(const unsigned short *v, int n, int k) noexcept nogil
+    int equal "starpos_equal"(const unsigned short *v, int n, int number) noexcept nogil
+    void away_from "starpos_away"(const unsigned short *v, int n, unsigned short middle, unsigned short *away) noexcept nogil
+    void sums_of "starpos_sums"(const unsigned short *v, int n, int middle, int limit, long long *out) noexcept nogil
+
+ctypedef fused pixel_t:
+    unsigned char
+    unsigned short
+
+
+cdef struct Clip:
+    # Sigma over the median of absolute differences, and over the distance of the 75 and 90 % quantiles; what lies within so
+    # many sigma is the sky, and has this share of a Gaussian's rms.
+    double per_mad
+    double per_tail
+    double sigmas
+    double share
+
+
+cdef double _quantile(const unsigned short *v, int n, double share) noexcept nogil:
+    """A quantile of values (n,), linear between them."""
+    cdef double place = share * (n - 1)
+    cdef int k = <int>place
+    cdef double low = ranked(v, n, k), high = ranked(v, n, min(k + 1, n - 1))
+    return low + (place - k) * (high - low)
+
+
+cdef void _clipped(
+    const unsigned short *v, int n, const Clip *clip, unsigned short *away, double *level, double *noise
+) noexcept nogil:
+    """Mean and rms of values (n,) without stars and defects; away (n,): to work in.
+
+    If more than half of them are equal (a sky cut off at 0), sigma comes from the quantiles above.
+    """
+    cdef int middle = ranked(v, n, n // 2)
+    cdef long long[3] sums
+    cdef double spread, mean
+    away_from(v, n, <unsigned short>middle, away)
+    spread = clip.per_mad * ranked(away, n, n // 2)
+    if spread == 0:
+        spread = clip.per_tail * (_quantile(v, n, 0.9) - _quantile(v, n, 0.75))
+    sums_of(v, n, middle, <int>max(clip.sigmas * spread, 1.0), sums)
+    mean = sums[1] / <double>sums[0]
+    level[0] = middle + mean
+    noise[0] = sqrt(max(sums[2] / <double>sums[0] - mean * mean, 0.0) * sums[0] / max(sums[0] - 1, 1)) / clip.share
+
+
+def sampled(
+    const pixel_t[:, ::1] plane, const int[:, ::1] rows, const int[:, ::1] columns, double per_mad, double per_tail,
+    double sigmas, double share,
+):
+    """The sky's level and noise in cells of a plane (h, w), for each phase of its 2 x 2 pattern, from a sample.
+
+    rows     (cells down, rows of each), and
+    columns  (cells across, columns of each): pairs of neighbours, the first even
+    per_mad  sigma of a Gaussian over the median of the absolute differences, and
+    per_tail  over the distance of its 75 and 90 % quantiles
+    sigmas   within which a pixel is of the sky
+    share    of a Gaussian's rms that these pixels have
+
+    Returns level and noise, and the sample's highest value and how many pixels have it, (4, cells down, cells across).
+    """
+    cdef int down = rows.shape[0], across = columns.shape[0], tall = rows.shape[1], wide = columns.shape[1]
+    cdef int n = tall // 2 * (wide // 2), i, j, phase, k, y, x, top
+    cdef const pixel_t *row
+    cdef Clip clip = Clip(per_mad, per_tail, sigmas, share)
+    if not n or tall % 2 or wide % 2:
+        raise ValueError("a cell's rows and columns must be pairs")
+    if not (
+        within[int](&rows[0, 0], down * tall, 0, <int>plane.shape[0] - 1)
+        and within[int](&columns[0, 0], across * wide, 0, <int>plane.shape[1] - 1)
+    ):
+        raise ValueError(f"a cell lies beyond the {plane.shape[1]} x {plane.shape[0]} px of the frame")
+    found, tops = np.empty((2, 4, down, across)), np.empty((2, 4, down, across), np.int32)
+    cdef double[:, :, :, ::1] sky = found
+    cdef int[:, :, :, ::1] highest = tops
+    cdef unsigned short *value = <unsigned short *>malloc(5 * n * sizeof(unsigned short))
+    if value == NULL:
+        raise MemoryError
+    cdef unsigned short *own
+    with nogil:
+        for i in range(down):
+            for j in range(across):
+                for y in range(tall):
+                    row, own = &plane[rows[i, y], 0], value + y % 2 * 2 * n + y // 2 * (wide // 2)
+                    for x in range(wide // 2):
+                        own[x], own[n + x] = row[columns[j, 2 * x]], row[columns[j, 2 * x + 1]]
+                for phase in range(4):
+                    own, top = value + phase * n, 0
+                    for k in range(n):
+                        top = max(top, <int>own[k])
+                    _clipped(own, n, &clip, value + 4 * n, &sky[0, phase, i, j], &sky[1, phase, i, j])
+                    highest[0, phase, i, j] = top
+                    highest[1, phase, i, j] = equal(own, n, top)
+    free(value)
+    return found[0], found[1], tops[0], tops[1]
+
+
+cdef inline double _between(const double[:, :, ::1] mesh, Py_ssize_t p, double row, double column) noexcept nogil:
+    """The value of mesh p at a place, bilinear; beyond the edges as on them."""
+    # what is not a number is 0
+    cdef double y = min(row if row > 0 else 0.0, mesh.shape[1] - 1.0), x = min(column if column > 0 else 0.0, mesh.shape[2] - 1.0)
+    cdef Py_ssize_t i = min(<Py_ssize_t>y, mesh.shape[1] - 2), j = min(<Py_ssize_t>x, mesh.shape[2] - 2)
+    y, x = y - i, x - j
+    return (
+        (1 - y) * ((1 - x) * mesh[p, i, j] + x * mesh[p, i, j + 1])
+        + y * ((1 - x) * mesh[p, i + 1, j] + x * mesh[p, i + 1, j + 1])
+    )
+
+
+def between(const double[:, :, ::1] mesh, const double[::1] row, const double[::1] column):
+    """Values (N, P) of P meshes (P, rows, columns) at the places row, column (N,), bilinear; beyond the edges as on them."""
+    cdef Py_ssize_t n = row.shape[0], k, p
+    if column.shape[0] != n or mesh.shape[1] < 2 or mesh.shape[2] < 2:
+        raise ValueError(
+            f"{n} rows and {column.shape[0]} columns in meshes of {mesh.shape[1]} x {mesh.shape[2]}: as many, in 2 x 2 or more"
+        )
+    out = np.empty((n, mesh.shape[0]))
+    cdef double[:, ::1] value = out
+    with nogil:
+        for k in range(n):
+            for p in range(mesh.shape[0]):
+                value[k, p] = _between(mesh, p, row[k], column[k])
+    return out
+
+
+def near(
+    const double[:, :, ::1] level, const double[:, :, ::1] noise, const Py_ssize_t[::1] x, const Py_ssize_t[::1] y,
+    int width, int height, float correlation,
+):
+    """Level and noise (N, P) float32 at the pixels x, y (N,) of a frame that meshes (P, rows + 2, columns + 2) cover.
+
+    correlation  factor of the noise
+    """
+    cdef Py_ssize_t n = x.shape[0], k, p
+    cdef double row, column
+    if y.shape[0] != n or level.shape[1] < 3 or level.shape[2] < 3 or width < 1 or height < 1:
+        raise ValueError(f"{n} columns, {y.shape[0]} rows, {width} x {height} px: as many are needed, on cells that cover them")
+    if not (level.shape[0] == noise.shape[0] and level.shape[1] == noise.shape[1] and level.shape[2] == noise.shape[2]):
+        raise ValueError("as many cells of noise as of level are needed")
+    out = np.empty((2, n, level.shape[0]), np.float32)
+    cdef float[:, :, ::1] sky = out
+    with nogil:
+        for k in range(n):
+            row = (y[k] + 0.5) * (level.shape[1] - 2) / height + 0.5
+            column = (x[k] + 0.5) * (level.shape[2] - 2) / width + 0.5
+            for p in range(level.shape[0]):
+                sky[0, k, p] = <float>_between(level, p, row, column)
+                sky[1, k, p] = <float>_between(noise, p, row, column) * correlation
+    return out[0], out[1]

@@ -1,0 +1,376 @@
+# SPDX-License-Identifier: Apache-2.0
+# cython: language_level=3, boundscheck=False, wraparound=False, cdivision=True, initializedcheck=False
+"""Moments of images through elliptical Gaussian windows, and the places of images by them."""
+
+from libc.math cimport INFINITY, NAN, exp, fabs, isnan, rint, sqrt
+from libc.stdlib cimport free, malloc
+from libc.string cimport memcpy, memset
+
+import numpy as np
+
+cimport starpos._numeric.wide
+from starpos._numeric.algebra cimport middle
+from starpos.detection._shapes cimport Shape, clipped_to, inverse, put_shape, shape_before, sides, with_sides
+
+cdef extern from *:
+    """
+    /* Columns that are summed side by side, and groups of these whose Gaussians are made at once: left to itself a compiler
+       takes them one by one, and of wider vectors than registers it keeps most in memory. */
+    #define STARPOS_LANES 4
+    #define STARPOS_GROUPS 16
+    typedef double starpos_four __attribute__((vector_size(32)));
+    typedef float starpos_pixels __attribute__((vector_size(16), aligned(4)));
+    #define STARPOS_LIGHT(pixels) __builtin_convertvector(*(const starpos_pixels *)(pixels), starpos_four)
+    /* Sums over groups of columns of their light through a window, and of it times x, y, xx, xy and yy.
+       A column's neighbours in a Gaussian have a ratio, which changes by a constant factor from row to row: up and down from
+       the middle one, whose distances to both sides are the same. */
+    STARPOS_FUSED static void starpos_columns(const float *light, int rows, int stride, int groups, int middle, double dx,
+                                             double dy, double xx, double xy, double yy, double change, double *out) {
+        const starpos_four lanes = {0, 1, 2, 3};
+        const int below = rows - 1 - middle, both = below < middle ? below : middle, longer = below + middle - both;
+        starpos_four total[6] = {{0}}, power[2 * STARPOS_GROUPS];
+        for (int g = 0; g < groups; g++) {
+            const starpos_four x = dx + g * STARPOS_LANES + lanes;
+            const int at = g % STARPOS_GROUPS;
+            if (at == 0) {
+                const int some = groups - g < STARPOS_GROUPS ? groups - g : STARPOS_GROUPS;
+                for (int k = 0; k < some; k++) {
+                    const starpos_four off = x + k * STARPOS_LANES;
+                    power[2 * k] = -0.5 * (xx * off * off + 2 * xy * dy * off + yy * dy * dy);
+                    power[2 * k + 1] = -(xy * off + yy * (dy + 0.5));
+                }
+                starpos_exps((double *)power, 2 * some * STARPOS_LANES);
+            }
+            const float *row = light + middle * stride + g * STARPOS_LANES, *down = row, *up = row;
+            starpos_four to_down = power[2 * at + 1], to_up = change / to_down, of_down = power[2 * at], of_up = of_down;
+            starpos_four sum = of_down * STARPOS_LIGHT(row), by_y = {0}, by_yy = {0}, y = {0};
+            for (int j = 0; j < both; j++) {
+                of_down *= to_down;
+                of_up *= to_up;
+                to_down *= change;
+                to_up *= change;
+                down += stride;
+                up -= stride;
+                y += 1;
+                const starpos_four a = of_down * STARPOS_LIGHT(down), b = of_up * STARPOS_LIGHT(up), pair = a + b;
+                sum += pair;
+                by_y += (a - b) * y;
+                by_yy += pair * y * y;
+            }
+            const int step = below > middle ? stride : -stride;
+            starpos_four of_next = below > middle ? of_down : of_up, to_next = below > middle ? to_down : to_up;
+            const double side = below > middle ? 1 : -1;
+            row = below > middle ? down : up;
+            for (int j = both; j < longer; j++) {
+                of_next *= to_next;
+                to_next *= change;
+                row += step;
+                y += 1;
+                const starpos_four some = of_next * STARPOS_LIGHT(row), lever = some * y;
+                sum += some;
+                by_y += lever * side;
+                by_yy += lever * y;
+            }
+            by_yy += 2 * dy * by_y + dy * dy * sum;
+            by_y += dy * sum;
+            total[0] += sum;
+            total[1] += sum * x;
+            total[2] += by_y;
+            total[3] += sum * x * x;
+            total[4] += by_y * x;
+            total[5] += by_yy;
+        }
+        for (int k = 0; k < 6; k++)
+            out[k] = (total[k][0] + total[k][1]) + (total[k][2] + total[k][3]);
+    }
+    """
+    void sum_columns "starpos_columns"(
+        const float *light, int rows, int stride, int groups, int middle, double dx, double dy, double xx, double xy,
+        double yy, double change, double *out,
+    ) noexcept nogil
+
+
+cdef enum:
+    LANES = 4
+
+# A window's Gaussian is nothing (4e-6 of its peak) beyond so many of its widths.
+cdef double WIDTHS = 5.0
+
+
+cdef struct Image:
+    # In rows of whole lanes, beyond its own columns dark.
+    float *light
+    int size
+    int stride
+
+
+cdef int _begin(Image *image, int size) except -1:
+    """Take memory for an image (size, size)."""
+    image.size, image.stride = size, (size + LANES - 1) // LANES * LANES
+    image.light = <float *>malloc(max(size * image.stride, 1) * sizeof(float))
+    if image.light == NULL:
+        raise MemoryError
+    return 0
+
+
+cdef void _take(Image *image, const float *signal) noexcept nogil:
+    """Take the pixels (S, S) of an image."""
+    cdef int j
+    for j in range(image.size):
+        memcpy(image.light + j * image.stride, signal + j * image.size, image.size * sizeof(float))
+        memset(image.light + j * image.stride + image.size, 0, (image.stride - image.size) * sizeof(float))
+
+
+cdef inline int _within(double place, int most) noexcept nogil:
+    """The whole number below a place, from 0 to so many; what is not a number is 0."""
+    return <int>max(0.0, min(place, <double>most))
+
+
+cdef void _moments(const Image *image, const double *window, double left, double top, double *out) noexcept nogil:
+    """Set `out` (6,) to sum, mean x, y and covariance xx, xy, yy through a window (2, 2) px2; NaN without light."""
+    cdef double volume = window[0] * window[3] - window[1] * window[2]
+    cdef double xx = window[3] / volume, xy = -window[1] / volume, yy = window[0] / volume, change = exp(-yy)
+    # from the row nearest to the window's middle to both sides
+    cdef int middle = <int>max(0.0, min(rint(-top), image.size - 1.0)), k
+    cdef int begin = _within(-top - WIDTHS * sqrt(window[3]), middle), end
+    cdef int first = _within(-left - WIDTHS * sqrt(window[0]), image.size), last
+    end = 1 + _within(-top + WIDTHS * sqrt(window[3]) + 1, image.size - 1)
+    last = 1 + _within(-left + WIDTHS * sqrt(window[0]) + 1, image.size - 1)
+    # in whole lanes
+    last = first + (max(last - first, 1) + LANES - 1) // LANES * LANES
+    first -= max(last - image.stride, 0)
+    sum_columns(
+        image.light + begin * image.stride + first, end - begin, image.stride, (min(last, image.stride) - first) // LANES,
+        middle - begin, left + first, top + middle, xx, xy, yy, change, out,
+    )
+    if not out[0] > 0:
+        for k in range(1, 6):
+            out[k] = NAN
+        return
+    for k in range(1, 6):
+        out[k] /= out[0]
+    out[3] -= out[1] * out[1]
+    out[4] -= out[1] * out[2]
+    out[5] -= out[2] * out[2]
+
+
+cdef int _sound(const float[:, :, ::1] signal, int places, int rows, const double[:, :, ::1] windows) except -1:
+    """Raise ValueError unless there are a place and a window for each square image."""
+    cdef Py_ssize_t n = signal.shape[0]
+    if places != n or rows != n or signal.shape[1] != signal.shape[2] or windows.shape[0] not in (1, n):
+        raise ValueError(f"{places} places and {windows.shape[0]} windows for {n} square images: a place each is needed")
+    if windows.shape[1] != 2 or windows.shape[2] != 2:
+        raise ValueError(f"windows of {windows.shape[1]} x {windows.shape[2]} numbers: 2 x 2 are needed")
+    return 0
+
+
+def windowed(
+    const float[:, :, ::1] signal, const double[::1] left, const double[::1] top, const double[:, :, ::1] window
+):
+    """Moments of N images (N, S, S) through windows about points.
+
+    left, top  (N,) px: of the first column and the first row from each point
+    window     (N, 2, 2) or (1, 2, 2): covariances of the windows, px2
+
+    Returns the sum (N,), the mean (N, 2) px from the points, and the covariance (N, 2, 2) px2; NaN without light.
+    """
+    cdef int n = signal.shape[0], k
+    cdef Image image
+    cdef double[6] found
+    _sound(signal, left.shape[0], top.shape[0], window)
+    masses, means, shapes = np.empty(n), np.empty((n, 2)), np.empty((n, 2, 2))
+    cdef double[::1] mass = masses
+    cdef double[:, ::1] mean = means
+    cdef double[:, :, ::1] shape = shapes
+    _begin(&image, signal.shape[1])
+    with nogil:
+        for k in range(n):
+            _take(&image, &signal[k, 0, 0])
+            _moments(&image, &window[k if window.shape[0] > 1 else 0, 0, 0], left[k], top[k], found)
+            mass[k], mean[k, 0], mean[k, 1] = found[0], found[1], found[2]
+            shape[k, 0, 0], shape[k, 1, 1] = found[3], found[5]
+            shape[k, 0, 1] = shape[k, 1, 0] = found[4]
+    free(image.light)
+    return masses, means, shapes
+
+
+def centred(
+    const float[:, :, ::1] signal, const Py_ssize_t[::1] column, const Py_ssize_t[::1] row,
+    const double[:, :, ::1] window, const double[:, :, ::1] gain, int rounds, double farthest,
+):
+    """Places x, y (N,) px of N images (N, S, S) by the means of their light through windows, which go with the places.
+
+    column, row  (N,) of each image's middle, where it begins
+    window       (N, 2, 2) or (1, 2, 2): covariances of the windows, px2
+    gain         as many: a step over the mean through the window; at most 1 px
+    farthest     px from the beginning
+    """
+    cdef int n = signal.shape[0], k, w
+    cdef Image image
+    cdef double[2] begin
+    _sound(signal, column.shape[0], row.shape[0], window)
+    _sound(signal, column.shape[0], row.shape[0], gain)
+    if gain.shape[0] != window.shape[0]:
+        raise ValueError(f"{window.shape[0]} windows and {gain.shape[0]} gains: as many are needed")
+    out = np.empty((n, 2))
+    cdef double[:, ::1] places = out
+    _begin(&image, signal.shape[1])
+    with nogil:
+        for k in range(n):
+            w = k if window.shape[0] > 1 else 0
+            _take(&image, &signal[k, 0, 0])
+            begin[0], begin[1] = column[k], row[k]
+            _centre(&image, &window[w, 0, 0], &gain[w, 0, 0], begin, rounds, farthest, &places[k, 0])
+    free(image.light)
+    return np.ascontiguousarray(out.T)
+
+
+cdef void _centre(
+    const Image *image, const double *window, const double *gain, const double *begin, int rounds, double farthest,
+    double *place,
+) noexcept nogil:
+    """Set place (2,) px by the mean of an image's light, as `centred` explains."""
+    cdef double[6] found
+    cdef double half = image.size // 2, step
+    cdef int round_, i
+    place[0], place[1] = begin[0], begin[1]
+    for round_ in range(rounds):
+        _moments(image, window, begin[0] - half - place[0], begin[1] - half - place[1], found)
+        # without light it stays where it is
+        if not found[0] > 0:
+            break
+        for i in range(2):
+            step = max(-1.0, min(gain[2 * i] * found[1] + gain[2 * i + 1] * found[2], 1.0))
+            place[i] = max(begin[i] - farthest, min(place[i] + step, begin[i] + farthest))
+
+
+cdef inline void _set_gain(Shape own, Shape of_window, double *gain) noexcept nogil:
+    """Set gain (2, 2): a star's step over the mean through a window, of whose covariance the inverse is given."""
+    gain[0], gain[1] = 1 + own.xx * of_window.xx + own.xy * of_window.xy, own.xx * of_window.xy + own.xy * of_window.yy
+    gain[2], gain[3] = own.xy * of_window.xx + own.yy * of_window.xy, 1 + own.xy * of_window.xy + own.yy * of_window.yy
+
+
+cdef inline void _set_window(Shape s, double *window) noexcept nogil:
+    window[0], window[1], window[2], window[3] = s.xx, s.xy, s.xy, s.yy
+
+
+def own_shapes(
+    const float[:, :, ::1] signal, double first, double narrowest_window, double narrowest, double widest, int rounds,
+    int centring, double farthest,
+):
+    """Covariances (N, 2, 2) px2 of N images (N, S, S), each through a window of its own shape.
+
+    first                px2 along any axis, where it begins
+    narrowest_window     px2, of a window
+    narrowest, widest    px2: limits of the covariances; where nothing can be measured they are the widest
+    rounds               of windows; in each but the first, which is wide, so many rounds of centring, at most `farthest` px
+                         from the middle
+
+    Returns also their squared widths (N, 2) px2, the smaller first unless only that could not be measured.
+    """
+    cdef int n = signal.shape[0], k, round_
+    cdef double half = signal.shape[1] // 2, low, high
+    cdef Image image
+    cdef Shape own, through
+    cdef double[4] window
+    cdef double[4] gain
+    cdef double[2] begin
+    cdef double[2] place
+    cdef double[6] found
+    if signal.shape[1] != signal.shape[2]:
+        raise ValueError(f"images of {signal.shape[2]} x {signal.shape[1]} px: they must be square")
+    out, widths = np.empty((n, 2, 2)), np.empty((n, 2))
+    cdef double[:, :, ::1] shape = out
+    cdef double[:, ::1] width = widths
+    low = high = first
+    begin[0] = begin[1] = half
+    _begin(&image, signal.shape[1])
+    with nogil:
+        for k in range(n):
+            _take(&image, &signal[k, 0, 0])
+            own = Shape(first, 0.0, first)
+            for round_ in range(rounds):
+                through = clipped_to(own, narrowest_window, INFINITY, 1.0)
+                _set_window(through, window)
+                _set_gain(own, inverse(through), gain)
+                _centre(&image, window, gain, begin, centring if round_ else 0, farthest, place)
+                _moments(&image, window, -place[0], -place[1], found)
+                own = shape_before(Shape(found[3], found[4], found[5]), through)
+                if isnan(own.xx):
+                    own = Shape(widest, 0.0, widest)
+                low, high = sides(own)
+                low = max(narrowest, min(low, widest)) if low > 0 else widest
+                high = max(narrowest, min(high, widest)) if high > 0 else widest
+                own = with_sides(own, low, high)
+            width[k, 0], width[k, 1] = low, high
+            put_shape(shape, k, own)
+    free(image.light)
+    return out, widths
+
+
+def settled(
+    const float[:, :, ::1] signal, double first, double narrowest_window, double narrowest, double widest, int rounds,
+    double farthest, double thinnest, double enough,
+):
+    """The typical covariance (2, 2) px2 of N images (N, S, S), through a window of that shape; None if all fail.
+
+    first                px2 along any axis, of the first window
+    narrowest_window     px2, of the others
+    narrowest, widest    px2: limits of the covariance
+    farthest, thinnest   an image counts whose mean is nearer (px) than that, and whose image is wider (px2)
+    enough               relative change at which it is settled, before so many rounds
+    """
+    cdef int n = signal.shape[0], k, j, round_, count
+    cdef double half = signal.shape[1] // 2, change = INFINITY
+    cdef Image image
+    cdef Shape own = Shape(NAN, NAN, NAN), through = Shape(first, 0.0, first), of_seen, of_window, before
+    cdef double[4] window
+    cdef double[4] gain
+    cdef double *found
+    if signal.shape[1] != signal.shape[2]:
+        raise ValueError(f"images of {signal.shape[2]} x {signal.shape[1]} px: they must be square")
+    _begin(&image, signal.shape[1])
+    # of each image its place and moments; of the images that count each of three moments
+    cdef double *room = <double *>malloc(max(11 * n, 1) * sizeof(double))
+    if room == NULL:
+        free(image.light)
+        raise MemoryError
+    cdef double *seen = room + 8 * n
+    with nogil:
+        for k in range(n):
+            room[8 * k] = room[8 * k + 1] = half
+        for round_ in range(rounds):
+            count = 0
+            _set_window(through, window)
+            for k in range(n):
+                found = room + 8 * k
+                _take(&image, &signal[k, 0, 0])
+                _moments(&image, window, -found[0], -found[1], found + 2)
+                if not (fabs(found[3]) < farthest and fabs(found[4]) < farthest):
+                    found[2] = 0.0
+                elif not sides(Shape(found[5], found[6], found[7]))[0] > thinnest:
+                    found[2] = 0.0
+                if found[2] > 0:
+                    for j in range(3):
+                        seen[j * n + count] = found[5 + j]
+                    count += 1
+            if not count:
+                break
+            of_seen = inverse(Shape(middle(seen, count), middle(seen + n, count), middle(seen + 2 * n, count)))
+            of_window, before = inverse(through), own
+            own = clipped_to(
+                Shape(of_seen.xx - of_window.xx, of_seen.xy - of_window.xy, of_seen.yy - of_window.yy), 1 / widest,
+                1 / narrowest, -1.0,
+            )
+            _set_gain(own, of_window, gain)
+            for k in range(n):
+                found = room + 8 * k
+                for j in range(2 if found[2] > 0 else 0):
+                    found[j] += max(-1.0, min(gain[2 * j] * found[3] + gain[2 * j + 1] * found[4], 1.0))
+            change = max(max(fabs(own.xx - before.xx), fabs(own.xy - before.xy)), fabs(own.yy - before.yy))
+            through = clipped_to(own, narrowest_window, INFINITY, 1.0)
+            if change < enough * max(own.xx, own.yy):
+                break
+    free(room)
+    free(image.light)
+    return None if isnan(own.xx) else np.array([[own.xx, own.xy], [own.xy, own.yy]])

@@ -1,0 +1,258 @@
+# SPDX-License-Identifier: Apache-2.0
+# cython: language_level=3, boundscheck=False, wraparound=False, cdivision=True, initializedcheck=False
+"""The PSF of stars at pixels: a Gauss-Hermite series (`detection.psf`), its derivatives, and its single terms."""
+
+from libc.math cimport M_PI, fabs, sqrt
+from libc.stdlib cimport free, malloc
+
+import numpy as np
+
+cimport starpos._numeric.wide
+
+cdef extern from *:
+    """
+    #define STARPOS_BLOCK 64
+    #define STARPOS_ORDERS 32
+    /* Pixels that are summed in a register, which a compiler left to itself takes one by one; steps of these in a block, and
+       of these so many side by side. */
+    #define STARPOS_LANES 4
+    #define STARPOS_STEPS 16
+    #define STARPOS_ABREAST 2
+    typedef double starpos_four __attribute__((vector_size(32)));
+    typedef double starpos_fours __attribute__((vector_size(32), aligned(8)));
+    typedef float starpos_floats __attribute__((vector_size(16), aligned(4)));
+    /* Of 0, 1, 2 ..., and 1 over them; set when the module is loaded. */
+    static double starpos_root[STARPOS_ORDERS + 2], starpos_over_root[STARPOS_ORDERS + 2];
+    /* Hermite polynomials over sqrt(k!), k = 0 .. order, of so many steps of numbers u. */
+    static inline void starpos_hermites(const starpos_four *u, int steps, int order, starpos_four (*out)[STARPOS_STEPS]) {
+        const starpos_four one = {1, 1, 1, 1};
+        for (int s = 0; s < steps; s++) {
+            out[0][s] = one;
+            out[1][s] = u[s];
+        }
+        for (int k = 1; k < order; k++) {
+            const double before = starpos_root[k], over = starpos_over_root[k + 1];
+            for (int s = 0; s < steps; s++)
+                out[k + 1][s] = (u[s] * out[k][s] - before * out[k - 1][s]) * over;
+        }
+    }
+    /* n offsets, at most a block, in widths, and the Gaussian there; the last steps abreast are filled up with the star's
+       middle. How many steps they are. */
+    static inline int starpos_places(const double *axes, double peak, const double *dx, const double *dy, int n, double *u,
+                                     double *v, double *gauss) {
+        const int abreast = STARPOS_ABREAST * STARPOS_LANES, whole = (n + abreast - 1) / abreast * abreast;
+        for (int p = 0; p < n; p++) {
+            u[p] = axes[0] * dx[p] + axes[1] * dy[p];
+            v[p] = axes[2] * dx[p] + axes[3] * dy[p];
+        }
+        for (int p = n; p < whole; p++)
+            u[p] = v[p] = 0;
+        for (int p = 0; p < whole; p++)
+            gauss[p] = -0.5 * (u[p] * u[p] + v[p] * v[p]);
+        starpos_exps(gauss, whole);
+        for (int p = 0; p < whole; p++)
+            gauss[p] *= peak;
+        return whole / STARPOS_LANES;
+    }
+    STARPOS_FUSED static void starpos_scaled(const double *axes, double peak, const double *dx, const double *dy, int n,
+                                            double *u, double *v, double *gauss) {
+        starpos_places(axes, peak, dx, dy, n, u, v, gauss);
+    }
+    /* The sum of term[t] h_i(u) h_j(v) times the Gaussian, and its derivatives by the star's x and y. Those of row i are the
+       terms from first[i] on, j is column[t], and slope[t] is term[t] sqrt(j + 1). */
+    STARPOS_FUSED static void starpos_evaluate(const double *axes, double peak, int rows, int columns, const int *first,
+                                              const int *column, const double *term, const double *slope, const double *dx,
+                                              const double *dy, int n, double *value, double *by_x, double *by_y) {
+        starpos_four u[STARPOS_STEPS], v[STARPOS_STEPS], gauss[STARPOS_STEPS];
+        starpos_four fu[STARPOS_ORDERS + 1][STARPOS_STEPS], fv[STARPOS_ORDERS + 1][STARPOS_STEPS];
+        const int steps = starpos_places(axes, peak, dx, dy, n, (double *)u, (double *)v, (double *)gauss);
+        starpos_hermites(u, steps, rows, fu);
+        starpos_hermites(v, steps, columns, fv);
+        for (int s = 0; s < steps; s += STARPOS_ABREAST) {
+            starpos_four sum[STARPOS_ABREAST] = {{0}}, by_u[STARPOS_ABREAST] = {{0}}, by_v[STARPOS_ABREAST] = {{0}};
+            for (int i = 0; i < rows; i++) {
+                starpos_four across[STARPOS_ABREAST] = {{0}}, steeper[STARPOS_ABREAST] = {{0}};
+                if (first[i] == first[i + 1])
+                    continue;
+                for (int t = first[i]; t < first[i + 1]; t++)
+                    for (int k = 0; k < STARPOS_ABREAST; k++) {
+                        across[k] += term[t] * fv[column[t]][s + k];
+                        steeper[k] += slope[t] * fv[column[t] + 1][s + k];
+                    }
+                for (int k = 0; k < STARPOS_ABREAST; k++) {
+                    sum[k] += fu[i][s + k] * across[k];
+                    by_u[k] += starpos_root[i + 1] * fu[i + 1][s + k] * across[k];
+                    by_v[k] += fu[i][s + k] * steeper[k];
+                }
+            }
+            for (int k = 0; k < STARPOS_ABREAST; k++) {
+                ((starpos_fours *)value)[s + k] = sum[k] * gauss[s + k];
+                ((starpos_fours *)by_x)[s + k] = (axes[0] * by_u[k] + axes[2] * by_v[k]) * gauss[s + k];
+                ((starpos_fours *)by_y)[s + k] = (axes[1] * by_u[k] + axes[3] * by_v[k]) * gauss[s + k];
+            }
+        }
+    }
+    /* The sum alone. */
+    STARPOS_FUSED static void starpos_values(const double *axes, double peak, int rows, int columns, const int *first,
+                                            const int *column, const double *term, const double *dx, const double *dy, int n,
+                                            double *value) {
+        starpos_four u[STARPOS_STEPS], v[STARPOS_STEPS], gauss[STARPOS_STEPS];
+        starpos_four fu[STARPOS_ORDERS + 1][STARPOS_STEPS], fv[STARPOS_ORDERS + 1][STARPOS_STEPS];
+        const int steps = starpos_places(axes, peak, dx, dy, n, (double *)u, (double *)v, (double *)gauss);
+        starpos_hermites(u, steps, rows - 1, fu);
+        starpos_hermites(v, steps, columns - 1, fv);
+        for (int s = 0; s < steps; s += STARPOS_ABREAST) {
+            starpos_four sum[STARPOS_ABREAST] = {{0}};
+            for (int i = 0; i < rows; i++) {
+                starpos_four across[STARPOS_ABREAST] = {{0}};
+                if (first[i] == first[i + 1])
+                    continue;
+                for (int t = first[i]; t < first[i + 1]; t++)
+                    for (int k = 0; k < STARPOS_ABREAST; k++)
+                        across[k] += term[t] * fv[column[t]][s + k];
+                for (int k = 0; k < STARPOS_ABREAST; k++)
+                    sum[k] += fu[i][s + k] * across[k];
+            }
+            for (int k = 0; k < STARPOS_ABREAST; k++)
+                ((starpos_fours *)value)[s + k] = sum[k] * gauss[s + k];
+        }
+    }
+    /* One term h_i(u) h_j(v) for each of so many orders (i, j), times the Gaussian, of a block; in rows of `out` so far apart. */
+    STARPOS_FUSED static void starpos_terms(const int *orders, int count, int highest, const double *u, const double *v,
+                                           const double *gauss, float *out, int apart) {
+        starpos_four places[3][STARPOS_STEPS], fu[STARPOS_ORDERS + 1][STARPOS_STEPS], fv[STARPOS_ORDERS + 1][STARPOS_STEPS];
+        memcpy(places[0], u, sizeof places[0]);
+        memcpy(places[1], v, sizeof places[1]);
+        memcpy(places[2], gauss, sizeof places[2]);
+        starpos_hermites(places[0], STARPOS_STEPS, highest, fu);
+        starpos_hermites(places[1], STARPOS_STEPS, highest, fv);
+        for (int t = 0; t < count; t++) {
+            const starpos_four *a = fu[orders[2 * t]], *b = fv[orders[2 * t + 1]];
+            starpos_floats *row = (starpos_floats *)(out + t * apart);
+            for (int s = 0; s < STARPOS_STEPS; s++)
+                row[s] = __builtin_convertvector(a[s] * b[s] * places[2][s], starpos_floats);
+        }
+    }
+    """
+    double[ORDERS + 2] root "starpos_root"
+    double[ORDERS + 2] over_root "starpos_over_root"
+    void scaled_at "starpos_scaled"(
+        const double *axes, double peak, const double *dx, const double *dy, int n, double *u, double *v, double *gauss
+    ) noexcept nogil
+    void evaluate_at "starpos_evaluate"(
+        const double *axes, double peak, int rows, int columns, const int *first, const int *column, const double *term,
+        const double *slope, const double *dx, const double *dy, int n, double *value, double *by_x, double *by_y,
+    ) noexcept nogil
+    void values_at "starpos_values"(
+        const double *axes, double peak, int rows, int columns, const int *first, const int *column, const double *term,
+        const double *dx, const double *dy, int n, double *value,
+    ) noexcept nogil
+    void each_at "starpos_terms"(
+        const int *orders, int count, int highest, const double *u, const double *v, const double *gauss, float *out,
+        int apart,
+    ) noexcept nogil
+
+for order in range(ORDERS + 2):
+    root[order] = sqrt(order)
+    over_root[order] = 1 / sqrt(max(order, 1))
+
+
+cdef int sound(const double[:, :, ::1] axes, const double[:, :, ::1] series, int n) except -1:
+    """Raise ValueError unless axes (n or 1, 2, 2) and series (n or 1, I, J) have the shapes that `evaluate` needs."""
+    if axes.shape[0] not in (1, n) or axes.shape[1] != 2 or axes.shape[2] != 2 or series.shape[0] not in (1, n):
+        raise ValueError(f"{axes.shape[0]} axes and {series.shape[0]} series for {n} stars: each must be one or as many")
+    if not (0 < series.shape[1] <= ORDERS and 0 < series.shape[2] <= ORDERS):
+        raise ValueError(f"{series.shape[1]} x {series.shape[2]} terms of a PSF: at most {ORDERS} along an axis")
+    return 0
+
+
+cdef void local_of(const double[:, :, ::1] axes, const double[:, :, ::1] series, int k, Local *out) noexcept nogil:
+    """Set `out` to the PSF of star k; a single PSF serves any star."""
+    cdef int a = k if axes.shape[0] > 1 else 0, s = k if series.shape[0] > 1 else 0, i, j, count = 0
+    out.axes[0], out.axes[1], out.axes[2], out.axes[3] = axes[a, 0, 0], axes[a, 0, 1], axes[a, 1, 0], axes[a, 1, 1]
+    out.peak = fabs(out.axes[0] * out.axes[3] - out.axes[1] * out.axes[2]) / (2 * M_PI)
+    out.rows, out.columns = <int>series.shape[1], <int>series.shape[2]
+    for i in range(out.rows):
+        out.first[i] = count
+        for j in range(out.columns):
+            # most are 0
+            if series[s, i, j] != 0:
+                out.column[count], out.term[count], out.slope[count] = j, series[s, i, j], series[s, i, j] * root[j + 1]
+                count += 1
+    out.first[out.rows] = count
+
+
+cdef void scaled(const Local *psf, const double *dx, const double *dy, int n, double *u, double *v, double *gauss) noexcept nogil:
+    """Offsets (n,) px in widths of the PSF, and the Gaussian there; the rest of a block is finite."""
+    cdef int p
+    scaled_at(psf.axes, psf.peak, dx, dy, n, u, v, gauss)
+    for p in range(n, BLOCK):
+        u[p] = v[p] = gauss[p] = 0.0
+
+
+cdef void evaluate(
+    const Local *psf, const double *dx, const double *dy, int n, double *value, double *by_x, double *by_y
+) noexcept nogil:
+    """The PSF at n offsets (px) from a star, and its derivatives by the star's x and y; room for whole blocks."""
+    cdef int block, first
+    for block in range(blocks(n)):
+        first = block * BLOCK
+        evaluate_at(
+            psf.axes, psf.peak, psf.rows, psf.columns, psf.first, psf.column, psf.term, psf.slope, dx + first, dy + first,
+            min(BLOCK, n - first), value + first, by_x + first, by_y + first,
+        )
+
+
+cdef void values(const Local *psf, const double *dx, const double *dy, int n, double *value) noexcept nogil:
+    """The PSF at n offsets (px) from a star; room for whole blocks."""
+    cdef int block, first
+    for block in range(blocks(n)):
+        first = block * BLOCK
+        values_at(
+            psf.axes, psf.peak, psf.rows, psf.columns, psf.first, psf.column, psf.term, dx + first, dy + first,
+            min(BLOCK, n - first), value + first,
+        )
+
+
+def evaluated(
+    const double[:, :, ::1] axes, const double[:, :, ::1] series, const double[::1] left, const double[::1] top, int size
+):
+    """The PSFs of N stars at the pixels of their stamps: (N, size, size) float32.
+
+    axes       (N, 2, 2) or (1, 2, 2), and
+    series     (N, I, J) or (1, I, J): as `detection.psf.LocalPsf` has them
+    left, top  (N,) px: of the first column and the first row from each star's centre
+    """
+    cdef int stars = left.shape[0], area = size * size, k, row, column, n
+    cdef Local psf
+    sound(axes, series, stars)
+    if top.shape[0] != stars or size < 1:
+        raise ValueError(f"{stars} stars, {top.shape[0]} rows, stamps of {size} px: as many rows as stars, and at least a pixel")
+    out = np.empty((stars, size, size), np.float32)
+    cdef float[:, ::1] image = out.reshape(stars, area)
+    cdef int room = blocks(area) * BLOCK
+    cdef double *dx = <double *>malloc(3 * room * sizeof(double))
+    if dx == NULL:
+        raise MemoryError
+    cdef double *dy = dx + room
+    cdef double *value = dx + 2 * room
+    with nogil:
+        for k in range(stars):
+            local_of(axes, series, k, &psf)
+            n = 0
+            for row in range(size):
+                for column in range(size):
+                    dx[n], dy[n] = left[k] + column, top[k] + row
+                    n += 1
+            values(&psf, dx, dy, area, value)
+            for n in range(area):
+                image[k, n] = <float>value[n]
+    free(dx)
+    return out
+
+
+cdef void terms_at(
+    const int *orders, int count, int highest, const double *u, const double *v, const double *gauss, float *out, int apart
+) noexcept nogil:
+    """Set rows of `out`, so far apart, to terms h_i(u) h_j(v) of a block's pixels times the Gaussian; (i, j) in orders (T, 2)."""
+    each_at(orders, count, highest, u, v, gauss, out, apart)

@@ -1,0 +1,360 @@
+# SPDX-License-Identifier: Apache-2.0
+# cython: language_level=3, boundscheck=False, wraparound=False, cdivision=True, initializedcheck=False
+"""What the pixels of stamps say of their stars: the sky at their rims, spikes, other light, and whether one pixel is all."""
+
+from libc.math cimport log, sqrt
+from libc.stdlib cimport free, malloc
+
+import numpy as np
+
+cimport starpos._numeric.wide
+from starpos._numeric.algebra cimport level_and_scatter, middle
+
+cdef extern from *:
+    """
+    /* The highest of n numbers, eight at once, which a compiler left to itself takes one by one. */
+    typedef float starpos_eights __attribute__((vector_size(32), aligned(4)));
+    typedef int starpos_marks __attribute__((vector_size(32)));
+    STARPOS_WIDE static float starpos_highest(const float *v, int n) {
+        starpos_eights most = {v[0], v[0], v[0], v[0], v[0], v[0], v[0], v[0]};
+        for (int i = 0; i + 8 <= n; i += 8) {
+            const starpos_eights some = *(const starpos_eights *)(v + i);
+            const starpos_marks above = some > most;
+            most = (starpos_eights)((above & (starpos_marks)some) | (~above & (starpos_marks)most));
+        }
+        float highest = v[0];
+        for (int k = 0; k < 8; k++)
+            highest = most[k] > highest ? most[k] : highest;
+        for (int i = n / 8 * 8; i < n; i++)
+            highest = v[i] > highest ? v[i] : highest;
+        return highest;
+    }
+    """
+    float highest_of "starpos_highest"(const float *v, int n) noexcept nogil
+
+
+cdef struct Rim:
+    # Of a stamp: the pixels at its edges, over their noise, and their noise; whether this is the same in all.
+    int count
+    bint even
+    double *score
+    double *noise
+
+
+cdef void _take_rim(const float *signal, const float *noise, int size, Rim *rim) noexcept nogil:
+    """Take the pixels at the edges of a stamp (S, S)."""
+    cdef int row, place, step, n = 0
+    rim.even = True
+    for row in range(size):
+        # of a row within, its ends
+        step = 1 if row == 0 or row == size - 1 else size - 1
+        place = row * size
+        while place < (row + 1) * size:
+            rim.score[n], rim.noise[n] = <double>signal[place] / noise[place], noise[place]
+            rim.even = rim.even and noise[place] == noise[0]
+            n += 1
+            place += step
+    rim.count = n
+
+
+def level(float[:, :, ::1] signal, float[:, :, ::1] noise, double per_mad, double raised, double uneven, double own):
+    """Correct level and noise of the sky in stamps (N, S, S), in place, by what the pixels at their rims show.
+
+    per_mad          sigma over the median of the absolute differences
+    raised, uneven   level and scatter in units of the noise, below which they may be chance
+    own              share of the brightest pixel that at the rim may be the star's own light
+    """
+    cdef Py_ssize_t n = signal.shape[0], k
+    cdef int size = signal.shape[1], area = size * size, j
+    cdef double sky, spread, light
+    cdef float up, wider
+    cdef Rim rim
+    _alike(signal.shape, noise.shape)
+    rim.score = <double *>malloc(2 * area * sizeof(double))
+    if rim.score == NULL:
+        raise MemoryError
+    rim.noise = rim.score + area
+    with nogil:
+        for k in range(n):
+            _take_rim(&signal[k, 0, 0], &noise[k, 0, 0], size, &rim)
+            sky, spread = level_and_scatter(rim.score, rim.count, per_mad, uneven)
+            light = own * highest_of(&signal[k, 0, 0], area) / (rim.noise[0] if rim.even else middle(rim.noise, rim.count))
+            up = <float>sky if sky > raised and sky > light else 0
+            wider = <float>spread if spread > light else 1
+            if up != 0 or wider != 1:
+                for j in range(area):
+                    (&signal[k, 0, 0])[j] -= up * (&noise[k, 0, 0])[j]
+                    (&noise[k, 0, 0])[j] *= wider
+    free(rim.score)
+
+
+def without_spikes(
+    float[:, :, ::1] signal, const float[:, :, ::1] noise, unsigned char[:, :, ::1] good,
+    const unsigned char[:, :, ::1] phase, const float[::1] gain, const float[::1] sharpest, float above,
+):
+    """Put the mean of their neighbours into pixels of stamps (N, S, S) that are much brighter than these, in place.
+
+    gain      (P,): of each phase, by which pixels are compared
+    sharpest  (N,): a spike is so many times brighter than its four neighbours and the noise, and
+    above     so many sigma above the sky
+
+    Returns which pixels they are, (N, S, S) bool; they are not good any more.
+    """
+    cdef Py_ssize_t n = signal.shape[0], k
+    cdef int size = signal.shape[1], row, column, place, count
+    cdef float grey, around
+    cdef float *own
+    cdef const float *sky
+    cdef const unsigned char *part
+    _alike(signal.shape, noise.shape)
+    _alike(signal.shape, good.shape)
+    _alike(signal.shape, phase.shape)
+    if sharpest.shape[0] != n or (n and np.max(phase) >= gain.shape[0]):
+        raise ValueError(f"{sharpest.shape[0]} sharpest and {gain.shape[0]} gains for {n} stars: one each, and of each phase")
+    out = np.zeros((n, size, size), np.uint8)
+    cdef unsigned char[:, :, ::1] spike = out
+    cdef float *mean = <float *>malloc(size * size * sizeof(float))
+    if mean == NULL:
+        raise MemoryError
+    with nogil:
+        for k in range(n):
+            own, sky, part, count = &signal[k, 0, 0], &noise[k, 0, 0], &phase[k, 0, 0], 0
+            for row in range(size):
+                for column in range(size):
+                    place = row * size + column
+                    if not own[place] > above * sky[place]:
+                        continue
+                    grey = own[place] / gain[part[place]]
+                    around = _beside(own, part, &gain[0], size, row, column)
+                    if grey > sharpest[k] * (around + sky[place]):
+                        spike[k, row, column], mean[place] = True, around * gain[part[place]]
+                        count += 1
+            # only now: a spike may have a spike beside it
+            for place in range(size * size if count else 0):
+                if (&spike[k, 0, 0])[place]:
+                    own[place], (&good[k, 0, 0])[place] = mean[place], False
+    free(mean)
+    return out.view(bool)
+
+
+cdef float _beside(const float *signal, const unsigned char *phase, const float *gain, int size, int row, int column) noexcept nogil:
+    """The mean of the four pixels beside one, over their gains; beyond the edges the image goes on as on them."""
+    cdef int up = max(row - 1, 0) * size + column, down = min(row + 1, size - 1) * size + column
+    cdef int left = row * size + max(column - 1, 0), right = row * size + min(column + 1, size - 1)
+    cdef float total = signal[up] / gain[phase[up]] + signal[down] / gain[phase[down]]
+    total += signal[left] / gain[phase[left]]
+    total += signal[right] / gain[phase[right]]
+    return total * <float>0.25
+
+
+cdef int _alike(const Py_ssize_t *stamps, const Py_ssize_t *other) except -1:
+    """Raise ValueError unless other pixels have the shape of stamps, which are squares."""
+    if stamps[1] != stamps[2] or not stamps[1] or not (other[0] == stamps[0] and other[1] == other[2] == stamps[1]):
+        raise ValueError(
+            f"pixels {(other[0], other[1], other[2])} of stamps {(stamps[0], stamps[1], stamps[2])}: as many are needed"
+        )
+    return 0
+
+
+def own_light(
+    float[:, :, ::1] signal, const float[:, :, ::1] noise, const unsigned char[:, :, ::1] spike,
+    const float[:, :, ::1] model, const unsigned char[:, :, ::1] outlier, int speck, float loud,
+):
+    """Put the model into pixels of stamps (N, S, S), in place, that say nothing about the star's own shape.
+
+    These are spikes; outliers, if there are not more than `speck`; and pixels with `loud` times the quietest one's noise.
+    """
+    cdef Py_ssize_t n = signal.shape[0], k
+    cdef int area = signal.shape[1] * signal.shape[1], j, outliers
+    cdef float least
+    cdef float *own
+    cdef const float *sky
+    _alike(signal.shape, noise.shape)
+    _alike(signal.shape, spike.shape)
+    _alike(signal.shape, model.shape)
+    _alike(signal.shape, outlier.shape)
+    with nogil:
+        for k in range(n):
+            own, sky, outliers, least = &signal[k, 0, 0], &noise[k, 0, 0], 0, noise[k, 0, 0]
+            for j in range(area):
+                outliers += (&outlier[k, 0, 0])[j]
+                least = min(least, sky[j])
+            for j in range(area):
+                if (&spike[k, 0, 0])[j] or sky[j] > loud * least or (outliers <= speck and (&outlier[k, 0, 0])[j]):
+                    own[j] = (&model[k, 0, 0])[j]
+
+
+def looks(
+    const float[:, :, ::1] signal, const float[:, :, ::1] noise, const unsigned char[:, :, ::1] good,
+    const unsigned char[:, :, ::1] full, const unsigned char[:, :, ::1] spike, const float[:, :, ::1] residual,
+    const float[:, :, ::1] model, const unsigned char[:, :, ::1] used, const unsigned char[:, :, ::1] outlier,
+    const double[::1] left, const double[::1] top, const double[:, :, ::1] axes, double core, double wider,
+):
+    """How fitted stars look in their stamps (N, S, S).
+
+    left, top    (N,) px: of each stamp's first column and row from its star
+    axes         (N, 2, 2) or (1, 2, 2): of the PSF
+    core, wider  widths of the PSF around the star
+
+    Returns columns (N,): the star's SNR in the sky's noise; the light of the outliers; and whether a pixel is saturated
+    within the core, and whether one is neither good nor saturated nor a spike within the wider one.
+    """
+    cdef Py_ssize_t n = signal.shape[0], k, a
+    cdef int size = signal.shape[1], row, column, place
+    cdef double dx, dy, u, v, distance2, score, matched, foreign, near2 = core * core, far2 = wider * wider
+    _alike(signal.shape, noise.shape)
+    _alike(signal.shape, good.shape)
+    _alike(signal.shape, full.shape)
+    _alike(signal.shape, spike.shape)
+    _alike(signal.shape, residual.shape)
+    _alike(signal.shape, model.shape)
+    _alike(signal.shape, used.shape)
+    _alike(signal.shape, outlier.shape)
+    if left.shape[0] != n or top.shape[0] != n or axes.shape[0] not in (1, n) or axes.shape[1] != 2 or axes.shape[2] != 2:
+        raise ValueError(f"{left.shape[0]} places and {axes.shape[0]} axes for {n} stars: one each is needed")
+    sums_, marks_ = np.empty((2, n)), np.zeros((2, n), np.uint8)
+    cdef double[:, ::1] sums = sums_
+    cdef unsigned char[:, ::1] marks = marks_
+    with nogil:
+        for k in range(n):
+            matched = foreign = 0.0
+            a = k if axes.shape[0] > 1 else 0
+            for row in range(size):
+                dy = top[k] + row
+                for column in range(size):
+                    if used[k, row, column]:
+                        score = model[k, row, column] / noise[k, row, column]
+                        matched += score * score
+                    if outlier[k, row, column] and residual[k, row, column] > 0:
+                        foreign += residual[k, row, column]
+                    if good[k, row, column]:
+                        continue
+                    dx = left[k] + column
+                    u, v = axes[a, 0, 0] * dx + axes[a, 0, 1] * dy, axes[a, 1, 0] * dx + axes[a, 1, 1] * dy
+                    distance2 = u * u + v * v
+                    if full[k, row, column]:
+                        marks[0, k] |= distance2 < near2
+                    elif not spike[k, row, column]:
+                        marks[1, k] |= distance2 < far2
+            sums[0, k], sums[1, k] = sqrt(matched), foreign
+    at_limit, cut_off = marks_.view(bool)
+    return sums_[0], sums_[1], at_limit, cut_off
+
+
+def one_pixel(
+    const float[:, :, ::1] signal, const float[:, :, ::1] noise, const unsigned char[:, :, ::1] good,
+    const unsigned char[:, :, ::1] full, const float[:, :, ::1] residual, const float[:, :, ::1] model,
+    double dn_per_photon, double misfit, int half,
+):
+    """How well a single pixel on the sky describes stars, and how well their fits do, `half` px around the middle.
+
+    Returns columns (N,): chi-square of the one pixel, chi-square of the star with the logarithm of its variance, and how
+    many pixels are good, and how many are saturated.
+    """
+    cdef Py_ssize_t n = signal.shape[0], k
+    cdef int size = signal.shape[1], middle_ = size // 2, row, column, count, white
+    cdef double score, most, one, star, light, sky2, variance
+    _alike(signal.shape, noise.shape)
+    _alike(signal.shape, good.shape)
+    _alike(signal.shape, full.shape)
+    _alike(signal.shape, residual.shape)
+    _alike(signal.shape, model.shape)
+    if not 0 <= half <= middle_:
+        raise ValueError(f"{half} px around the middle of stamps of {size} px: they have no such pixels")
+    sums_, counts_ = np.empty((2, n)), np.empty((2, n), np.int64)
+    cdef double[:, ::1] sums = sums_
+    cdef long long[:, ::1] counts = counts_
+    with nogil:
+        for k in range(n):
+            most = one = star = 0.0
+            count = white = 0
+            for row in range(middle_ - half, middle_ + half + 1):
+                for column in range(middle_ - half, middle_ + half + 1):
+                    white += full[k, row, column]
+                    if not good[k, row, column]:
+                        continue
+                    count += 1
+                    score = signal[k, row, column] / noise[k, row, column]
+                    one += score * score
+                    if signal[k, row, column] > 0:
+                        most = max(most, score * score)
+                    light, sky2 = max(model[k, row, column], 0.0), <double>noise[k, row, column] * noise[k, row, column]
+                    variance = sky2 + dn_per_photon * light + misfit * misfit * light * light
+                    star += residual[k, row, column] * residual[k, row, column] / variance + log(variance / sky2)
+            sums[0, k], sums[1, k], counts[0, k], counts[1, k] = one - most, star, count, white
+    return sums_[0], sums_[1], counts_[0], counts_[1]
+
+
+def counted(const unsigned char[:, :, ::1] mark):
+    """How many pixels of each stamp (N, S, S) are marked: (N,)."""
+    cdef Py_ssize_t n = mark.shape[0], area = mark.shape[1] * mark.shape[2], k, j
+    cdef int count
+    out = np.empty(n, np.intp)
+    cdef Py_ssize_t[::1] number = out
+    for k in range(n):
+        count = 0
+        for j in range(area):
+            count += (&mark[k, 0, 0])[j] != 0
+        number[k] = count
+    return out
+
+
+def brightest_left(
+    const float[:, :, ::1] residual, const unsigned char[:, :, ::1] good, const double[::1] left, const double[::1] top,
+    const double[:, :, ::1] axes, double nearest, double widths, const double[::1] weight,
+):
+    """Row and column (N,) of the pixel where a fit leaves the most light, of the good pixels smoothed.
+
+    left, top        (N,) px: of each stamp's (N, S, S) first column and row from its star
+    axes             (N, 2, 2) or (1, 2, 2): of the PSF
+    nearest, widths  the pixel is not nearer to the star (px), and within so many widths of the PSF
+    weight           (reach + 1,): of the smoothing, from the middle outwards, along both axes; images end as in a mirror
+    """
+    cdef Py_ssize_t n = residual.shape[0], k, a
+    cdef int size = residual.shape[1], reach = weight.shape[0] - 1, row, column, j
+    cdef double dx, dy, u, v, value, most
+    _alike(residual.shape, good.shape)
+    if left.shape[0] != n or top.shape[0] != n or axes.shape[0] not in (1, n) or axes.shape[1] != 2 or axes.shape[2] != 2:
+        raise ValueError(f"{left.shape[0]} places and {axes.shape[0]} axes for {n} stars: one each is needed")
+    if not 0 <= reach < size:
+        raise ValueError(f"a smoothing that reaches {reach} px in stamps of {size} px")
+    out = np.zeros((2, n), np.intp)
+    cdef Py_ssize_t[:, ::1] place = out
+    cdef double *plain = <double *>malloc(2 * size * size * sizeof(double))
+    if plain == NULL:
+        raise MemoryError
+    cdef double *across = plain + size * size
+    with nogil:
+        for k in range(n):
+            a, most = k if axes.shape[0] > 1 else 0, -1e300
+            for j in range(size * size):
+                plain[j] = (&residual[k, 0, 0])[j] if (&good[k, 0, 0])[j] else 0.0
+            for row in range(size):
+                for column in range(size):
+                    value = weight[0] * plain[row * size + column]
+                    for j in range(1, reach + 1):
+                        value += weight[j] * (
+                            plain[_mirrored(row - j, size) * size + column] + plain[_mirrored(row + j, size) * size + column]
+                        )
+                    across[row * size + column] = value
+            for row in range(size):
+                dy = top[k] + row
+                for column in range(size):
+                    dx = left[k] + column
+                    u, v = axes[a, 0, 0] * dx + axes[a, 0, 1] * dy, axes[a, 1, 0] * dx + axes[a, 1, 1] * dy
+                    if dx * dx + dy * dy < nearest * nearest or not u * u + v * v < widths * widths:
+                        continue
+                    value = weight[0] * across[row * size + column]
+                    for j in range(1, reach + 1):
+                        value += weight[j] * (
+                            across[row * size + _mirrored(column - j, size)] + across[row * size + _mirrored(column + j, size)]
+                        )
+                    if value > most:
+                        most, place[0, k], place[1, k] = value, row, column
+    free(plain)
+    return out[0], out[1]
+
+
+cdef inline int _mirrored(int k, int n) noexcept nogil:
+    """The pixel that stands for k beyond the edges of n: the first one again, and so on."""
+    return -k - 1 if k < 0 else 2 * n - 1 - k if k >= n else k
