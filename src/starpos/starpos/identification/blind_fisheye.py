@@ -14,14 +14,15 @@ import numpy as np
 
 from starpos import rotation
 from starpos.budget import ENDLESS, Budget
-from starpos.identification._frame import FrameStars
 from starpos.identification import wide
-from starpos.identification.blind import ROUGHLY, is_sure
+from starpos.identification._frame import FrameStars
+from starpos.identification.blind import ROUGHLY
 from starpos.identification.evidence import any_scale
 from starpos.identification.full import FEWEST_STARS, Identification, identified
+from starpos.identification.outwards import outwards
+from starpos.identification.pose import Poses
 from starpos.identification.quad_poses import Matches, QuadPoses, most_agreed
 from starpos.identification.quads import QuadCatalogue
-from starpos.identification.pose import Poses
 from starpos.identification.search import SECOND_TRY
 from starpos.identification.sky import Sky
 from starpos.instrument.camera import Camera
@@ -76,7 +77,9 @@ def disc_radius_px(xy: np.ndarray, width: int, height: int) -> float | None:
 
 def _share_beyond(radius_px: float, width: int, height: int) -> float:
     """The share of a frame's area that is farther from its middle."""
-    x, y = (np.arange(n + 0.5, size, n) - size / 2 for n, size in ((width / 64, width), (height / 64, height)))
+    x, y = (
+        np.arange(n + 0.5, size, n) - size / 2 for n, size in ((width / 64, width), (height / 64, height))
+    )
     return float(np.mean(x[:, None] ** 2 + y**2 > radius_px**2))
 
 
@@ -102,6 +105,7 @@ class _Picture:
 class _Guess:
     """A supposed lens, a part of the frame as it sees it, the stars of that part, and poses of it."""
 
+    focal_px: float
     lens: tuple[float, ...]
     part: wide.Part
     field: FrameStars
@@ -146,13 +150,14 @@ def identify_fisheye(
                 return best
             pose, radius = guess.found.poses[row], guess.found.radius_px(guess.field, row, ERROR_PX)
             found = identified(guess.field, sky, pose, radius, prior, need)
-            if found is None:
+            if found is None or (best is not None and found.log_odds <= best[1].log_odds):
                 continue
-            whole = _everywhere(picture, sky, guess, found)
-            if whole is not None and (best is None or len(whole[1].star) > len(best[1].star)):
-                best = whole
-                if is_sure(found, guess.field):
-                    return best
+            whole = outwards(picture.seen_by(guess.focal_px, guess.lens), sky, guess.part, found)
+            if whole is not None and whole.borne_out:
+                return whole.camera, whole.found
+            # off the middle, a wrong lens would turn the axis elsewhere
+            if whole is not None and k == 0:
+                best = whole.camera, whole.found
     return best
 
 
@@ -166,7 +171,7 @@ def _guesses(
     budget: Budget,
 ) -> Iterator[_Guess]:
     """Yield what each lens and focal length makes of a part of the picture."""
-    (shortest, longest), focal_px = focal_range, focal_range[0]
+    focal_px, longest = focal_range
     while focal_px < longest and not budget.spent:
         focal_px *= 1 + STEP
         for lens in LENSES:
@@ -177,7 +182,7 @@ def _guesses(
             matches = Matches.of(field, quads, min(stars, len(field)), ERROR_PX, part_px, STEP)
             found = QuadPoses.of(field, sky, matches, ERROR_PX, (part_px * (1 - STEP), part_px * (1 + STEP)))
             if len(found.poses):
-                yield _Guess(lens, part, field, found)
+                yield _Guess(focal_px, lens, part, field, found)
         focal_px *= 1 + STEP
 
 
@@ -186,8 +191,8 @@ def _part(
 ) -> tuple[wide.Part, FrameStars | None]:
     """A part of the picture and its stars, as if the picture had RADIUS_PX; None where too little of it shows sky."""
     seen, shrink = picture.seen_by(focal_px, lens), picture.radius_px / RADIUS_PX
-    side = 2 * round(focal_px / shrink * math.tan(wide.HALF_RAD))
-    pinhole = Camera.from_focal(side, side, focal_px / shrink)
+    width, height = (round(size / shrink) for size in (picture.width, picture.height))
+    pinhole = wide.pinhole_of(Camera.from_focal(width, height, focal_px / shrink, EQUIDISTANT))
     part = wide.part_at(replace(seen, sigma_px=seen.sigma_px / shrink), pinhole, turn)
     share = _share_seen(picture, seen.camera, pinhole, turn)
     if share < LEAST_SEEN:
@@ -197,7 +202,7 @@ def _part(
 
 def _share_seen(picture: _Picture, camera: Camera, pinhole: Camera, turn: np.ndarray) -> float:
     """The share of a part's frame that lies in the picture."""
-    x, y = np.meshgrid(*[np.linspace(0, pinhole.width - 1, GRID)] * 2)
+    x, y = np.meshgrid(*(np.linspace(0, size - 1, GRID) for size in (pinhole.width, pinhole.height)))
     xy = camera.project(pinhole.directions(x.ravel(), y.ravel()) @ turn)
     with np.errstate(invalid="ignore"):
         on = ((xy > -0.5) & (xy < [picture.width - 0.5, picture.height - 0.5])).all(1)
@@ -220,17 +225,3 @@ def _most_agreed(guesses: Sequence[_Guess]) -> Iterator[tuple[_Guess, int]]:
     for k in most_agreed(poses, half_diagonal_px, MOST_JUDGED):
         owner = int(np.searchsorted(first, k, side="right")) - 1
         yield guesses[owner], k - int(first[owner])
-
-
-def _everywhere(
-    picture: _Picture, sky: Sky, guess: _Guess, found: Identification
-) -> tuple[Camera, Identification] | None:
-    """The camera and the identification of the whole frame, by the lens that has most stars in their places."""
-    shrink = picture.radius_px / RADIUS_PX
-    best: tuple[Camera, Identification] | None = None
-    for lens in LENSES:
-        field = picture.seen_by(guess.field.focal_px * shrink, lens)
-        whole = wide.everywhere(field, sky, guess.part, found)
-        if whole is not None and (best is None or len(whole.star) > len(best[1].star)):
-            best = field.camera, whole
-    return best

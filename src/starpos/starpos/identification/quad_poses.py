@@ -10,7 +10,7 @@ import numpy as np
 
 from starpos import rotation
 from starpos.identification._frame import FrameStars
-from starpos.identification.pose import MATCH_SIGMA, Pose, Poses, directions
+from starpos.identification.pose import MATCH_SIGMA, Poses, directions
 from starpos.identification.quads import SHORTEST, SIDES, QuadCatalogue, shapes
 from starpos.identification.sky import Sky
 
@@ -38,7 +38,13 @@ class Matches:
 
     @classmethod
     def of(
-        cls, field: FrameStars, quads: QuadCatalogue, stars: int, error_px: float, focal_px: float, step: float
+        cls,
+        field: FrameStars,
+        quads: QuadCatalogue,
+        stars: int,
+        error_px: float,
+        focal_px: float,
+        step: float,
     ) -> "Matches":
         """Quads of the frame's brightest stars, and those of the sky that they look like at a focal length.
 

@@ -51,7 +51,10 @@ class AllSky:
         self.focal_px = self.radius_px / float(LENSES[self.lens](np.radians(self.field_deg / 2)))
         lean = rotation.from_vector(np.radians(rng.normal(0, self.lean_deg, 3)) * [1, 1, 0])
         self.zenith = lean @ np.array([0.0, 0.0, 1.0])
-        v = self.catalogue.directions(np.flatnonzero(self.catalogue.vmag() < self.limit_mag)) @ self.attitude.T
+        v = (
+            self.catalogue.directions(np.flatnonzero(self.catalogue.vmag() < self.limit_mag))
+            @ self.attitude.T
+        )
         mag = self.catalogue.vmag(np.flatnonzero(self.catalogue.vmag() < self.limit_mag))
         self.altitude = np.arcsin(v @ self.zenith)
         mag = mag + EXTINCTION_MAG / np.maximum(np.sin(self.altitude), 0.02) + rng.normal(0, 0.25, len(v))
@@ -59,7 +62,9 @@ class AllSky:
         self.xy = self.pixels(v) + rng.normal(0, 0.25, (len(v), 2))
         self.mag = mag
         angle = np.arccos(np.clip(v[:, 2], -1, 1))
-        self.keep((angle < np.radians(self.field_deg / 2)) & (self.altitude > 0.02) & (mag < self.limit_mag + 0.3))
+        self.keep(
+            (angle < np.radians(self.field_deg / 2)) & (self.altitude > 0.02) & (mag < self.limit_mag + 0.3)
+        )
 
     def pixels(self, v: np.ndarray) -> np.ndarray:
         """Pixels (N, 2) of directions v (N, 3) in C."""
@@ -97,7 +102,9 @@ class AllSky:
         phases, sizes = rng.uniform(0, 2 * np.pi, 4), rng.uniform(3, 10, 4)
 
         def top_deg(azimuth: np.ndarray) -> np.ndarray:
-            waves = [s * np.cos((k + 1) * azimuth + p) for k, (s, p) in enumerate(zip(sizes, phases, strict=True))]
+            waves = [
+                s * np.cos((k + 1) * azimuth + p) for k, (s, p) in enumerate(zip(sizes, phases, strict=True))
+            ]
             return np.clip(25 + sum(waves), 10, 55)
 
         self.keep(np.degrees(self.altitude) > top_deg(self.azimuth))
@@ -118,18 +125,26 @@ class AllSky:
     def aurora(self) -> "AllSky":
         """A band over a third of the sky: faint stars drown in it, and its rays are detections."""
         rng, middle = self.rng, self.rng.uniform(-np.pi, np.pi)
-        inside = (np.abs(np.angle(np.exp(1j * (self.azimuth - middle)))) < 1.0) & (self.altitude < np.radians(65))
+        inside = (np.abs(np.angle(np.exp(1j * (self.azimuth - middle)))) < 1.0) & (
+            self.altitude < np.radians(65)
+        )
         self.keep(~inside | (self.mag < 3.0))
         return self.add(rng.uniform(15, 65, 60), middle + rng.uniform(-1, 1, 60), rng.uniform(1.0, 3.5, 60))
 
     def moon(self) -> "AllSky":
         """The Moon, the faint stars that it outshines, and reflections of it in the lens."""
         alt, azimuth = self.rng.uniform(25, 70), self._around(1)[0]
-        there = np.array([np.cos(np.radians(alt)) * np.cos(azimuth), np.cos(np.radians(alt)) * np.sin(azimuth)])
+        there = np.array(
+            [np.cos(np.radians(alt)) * np.cos(azimuth), np.cos(np.radians(alt)) * np.sin(azimuth)]
+        )
         here = np.cos(self.altitude)[:, None] * np.stack([np.cos(self.azimuth), np.sin(self.azimuth)], 1)
         away = np.hypot(*(here - there).T)
         self.keep((away > 0.35) & (self.mag < 3.2 + 1.5 * away))
-        return self.add(np.array([alt, 90 - 0.4 * (90 - alt), 60.0]), azimuth + np.array([0, np.pi, np.pi]), np.array([-12.0, 0.0, 1.5]))
+        return self.add(
+            np.array([alt, 90 - 0.4 * (90 - alt), 60.0]),
+            azimuth + np.array([0, np.pi, np.pi]),
+            np.array([-12.0, 0.0, 1.5]),
+        )
 
     def planets(self) -> "AllSky":
         """Three of them."""
