@@ -21,7 +21,8 @@ from std_msgs.msg import Header
 from starpos.detection import Detection, DetectionSettings, detect
 from starpos.errors import StarposError, TimeError
 from starpos.frames.frame import Frame
-from starpos.recording.messages import message_to_frame, message_to_shutter
+from starpos.messages.camera import message_to_frame
+from starpos.messages.stars import message_to_shutter
 from starpos.session.trails import Trails
 from starpos_camera.annotator import Annotator
 from starpos_camera.detector_parameters import PARAMETERS

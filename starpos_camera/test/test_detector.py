@@ -12,7 +12,7 @@ from sensor_msgs.msg import Image
 
 from starpos.detection import detect
 from starpos.frames.frame import Frame
-from starpos.recording.messages import message_to_stars
+from starpos.messages.stars import message_to_stars
 from starpos_common.messages import frame_to_message
 from starpos_interfaces.msg import Capture, StarArray
 from starpos_testing.nodes import Listener, Process

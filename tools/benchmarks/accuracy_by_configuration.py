@@ -141,7 +141,7 @@ def turned(errors: InclinometerErrors, catalogue: Catalogue, rng: np.random.Gene
 
 def turned_fixes(solver: Solver, stars: list[Stars], tilts: TiltLog) -> list[Fix]:
     """The fixes of frames at several headings."""
-    return turn(solver, stars, tilts.average).fixes
+    return turn(solver, stars, tilts).fixes
 
 
 def given(errors: InclinometerErrors, catalogue: Catalogue, rng: np.random.Generator) -> list[Night]:
@@ -156,7 +156,7 @@ def given(errors: InclinometerErrors, catalogue: Catalogue, rng: np.random.Gener
     more, readings = photograph(lower, zero, response, begin + 3600, CALIBRATED, rng)
     solver, known = Solver(world.told, catalogue, world.air), log_of(rows + readings, errors)
     try:
-        found = calibrate_at(solver, stars + more, known.average, world.site)
+        found = calibrate_at(solver, stars + more, known, world.site)
     except StarposError as e:
         return [lost(e)] * len(GIVEN)
     ready = replace(solver, instrument=found.instrument)
@@ -175,7 +175,7 @@ def given(errors: InclinometerErrors, catalogue: Catalogue, rng: np.random.Gener
 
 def single_fixes(solver: Solver, frames: list[Stars], tilts: TiltLog) -> list[Fix]:
     """The fixes of frames, each by itself."""
-    return [s.fix for f in frames if (s := solver.solve(f, tilts.average)).fix]
+    return [s.fix for f in frames if (s := solver.solve(f, tilts)).fix]
 
 
 def lost(why: StarposError) -> Night:

@@ -24,7 +24,8 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import CameraInfo, NavSatFix
 
-from starpos.recording.messages import UNUSABLE, stamp_to_unix
+from starpos.messages.stamp import stamp_to_unix
+from starpos.messages.tilt import UNUSABLE
 from starpos_interfaces.msg import StarArray, Tilt
 from starpos_testing.graph.graph import Executable
 from starpos_testing.nodes import take_domain

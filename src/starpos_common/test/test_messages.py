@@ -17,14 +17,12 @@ from starpos.frames.shutter import GLOBAL, Shutter
 from starpos.frames.stars import EDGE, Stars, no_stars
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import Tilt
-from starpos.recording import messages as reading
-from starpos.recording.messages import (
-    message_to_camera,
-    message_to_frame,
-    message_to_stars,
-    message_to_tilt,
-    stamp_to_unix,
-)
+from starpos.messages import camera as reading
+from starpos.messages import tilt as tilts
+from starpos.messages.camera import message_to_camera, message_to_frame
+from starpos.messages.stamp import stamp_to_unix
+from starpos.messages.stars import message_to_stars
+from starpos.messages.tilt import message_to_tilt
 from starpos_common import messages
 from starpos_interfaces import msg
 
@@ -339,4 +337,4 @@ def test_images_that_do_not_fit_together_are_refused(change, word, heard):
 
 def test_the_flags_that_the_reader_knows_are_the_messages():
     for name in ("OUT_OF_RANGE", "STUCK", "SATURATED", "TIME_UNKNOWN"):
-        assert getattr(reading, name) == getattr(msg.Tilt, name)
+        assert getattr(tilts, name) == getattr(msg.Tilt, name)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from accelerated import World
 
-from starpos.recording.messages import stamp_to_unix
+from starpos.messages.stamp import stamp_to_unix
 from starpos_common.messages import unix_to_stamp
 
 NAN, INF = math.nan, math.inf

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """A3 from frames: at a known place, or at several headings of an unknown place (turning.py)."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 
 import numpy as np
 
@@ -15,13 +16,15 @@ from starpos.errors import FixError
 from starpos.fix.budget import ALWAYS, ErrorTerm, Sensitivity, place_of
 from starpos.fix.fix import Fix
 from starpos.fix.solution import Solution, Status
-from starpos.fix.solver import Solver, Tilts
+from starpos.fix.solver import Solver
 from starpos.frames.pointings import Pointing
 from starpos.frames.stars import Stars
+from starpos.identification import Identification
 from starpos.identification.hint import Hint
 from starpos.instrument.inclinometer import InclinometerErrors, up_of
 from starpos.instrument.instrument import MOST_C, UNKNOWN_ARCSEC, Calibration, Instrument
 from starpos.instrument.response import angles_at, stated_variances
+from starpos.instrument.tilts import Tilts
 from starpos.progress import Progress, quiet
 from starpos.sky.site import Site
 from starpos.units import ARCSEC
@@ -46,6 +49,9 @@ WORTH = 0.05
 
 # A3 and the zenith from readings, A3 as it is, and the fixes
 FindPlumbLine = Callable[[Readings, np.ndarray, list[Fix]], PlumbLine]
+# what is identified already, by the numbers of the frames
+Known = Mapping[int, Identification]
+NOTHING_KNOWN: Known = MappingProxyType({})
 
 
 @dataclass(frozen=True)
@@ -69,16 +75,17 @@ class Calibrated:
 def calibrate_at(
     solver: Solver,
     frames: Sequence[Stars | Pointing],
-    tilt: Tilts,
+    tilts: Tilts,
     site: Site,
     site_stddev_arcsec: float = 0.0,
     turn_stddev_deg: float = 180.0,
     progress: Progress = quiet,
+    known: Known = NOTHING_KNOWN,
 ) -> Calibrated:
     """A3 from one or more frames at a known astronomic place; the solver's A3 need not be near.
 
-    tilt: a function of (mid_unix_s, exposure_s, spread_s).
     site_stddev_arcsec: sigma of the place.
+    known: the stars of frames, by the frames' numbers, that only a longer search identifies than the solver's.
     turn_stddev_deg: sigma of the turn of the solver's A3 about the plumb line.  One lean of the instrument does not tell
     that turn, and only a fix at another lean needs it; the covariance shows it.
     Raises FixError if there is no fix or the frames do not agree.
@@ -91,7 +98,7 @@ def calibrate_at(
 
     if not frames:
         raise FixError("there is no frame to calibrate from: give at least one")
-    found = calibrate(solver, frames, tilt, find, fewest=1, progress=progress)
+    found = calibrate(solver, frames, tilts, find, fewest=1, progress=progress, known=known)
     if not found.fixes:
         raise FixError(f"no frame has a fix to calibrate from: {found.solutions[0].message}")
     if min(f.camera_to_itrs[:, 2] @ site.enu[2] for f in found.fixes) < 0:
@@ -105,10 +112,11 @@ def calibrate_at(
 def calibrate(
     solver: Solver,
     frames: Sequence[Stars | Pointing],
-    tilt: Tilts,
+    tilts: Tilts,
     find: FindPlumbLine,
     fewest: int,
     progress: Progress = quiet,
+    known: Known = NOTHING_KNOWN,
 ) -> Calibrated:
     """Solve the frames and `find` A3 from their fixes, again until it settles; with fewer fixes A3 stays as it was.
 
@@ -122,8 +130,11 @@ def calibrate(
     agreement: _Agreement | None = None
     for k in range(ROUNDS):
         solutions = []
-        for n, (stars, hint) in enumerate(zip(frames, hints, strict=True)):
-            solutions.append(solver.solve(stars, tilt, hint))
+        for n, (frame, hint) in enumerate(zip(frames, hints, strict=True)):
+            if isinstance(frame, Pointing):
+                solutions.append(solver.solve_pointing(frame, tilts))
+            else:
+                solutions.append(solver.solve(frame, tilts, hint, known=known.get(n)))
             progress("calibrating", (k + (n + 1) / len(frames)) / ROUNDS)
         hints = [s.hint for s in solutions]
         solved = [FixedFrame(s.fix, s.tilt) for s in solutions if s.fix and s.tilt]

@@ -14,8 +14,7 @@ from starpos.calibration.camera_adjustment import UNLEVELLED, UNTIMED, parameter
 from starpos.calibration.intrinsics import Intrinsics, rms
 from starpos.cli import calibrate_site, console, options, overwriting
 from starpos.cli.archive import frames_among
-from starpos.cli.doubts import checked_tilts
-from starpos.cli.frame_work import NO_CAMERA, Look, Reader, reader_of, stars_of
+from starpos.cli.inputs import checked_tilts, reader_of
 from starpos.cli.output import add_formats
 from starpos.cli.overwriting import CAMERA_NAME, Written
 from starpos.earth.refraction import Atmosphere
@@ -28,6 +27,7 @@ from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import level_of
 from starpos.instrument.instrument import Instrument
 from starpos.instrument.tilt_log import TiltLog
+from starpos.night.reading import NO_CAMERA, First, Reader, stars_of
 from starpos.sky import catalogue
 
 # Exit status.
@@ -73,7 +73,7 @@ def run(args: argparse.Namespace) -> int:
         return _from_pointings(args)
     read, args.frames = reader_of(args), frames_among(args.frames, args.tilt)
     # an instrument that cannot be used is refused before all frames are worked on
-    if (first := Look(read)(tuple(args.frames))) is not None:
+    if (first := First(read)(tuple(args.frames))) is not None:
         calibrate_site.check_output(args, options.instrument_of(args, first))
     frames, unreadable = _stars_of_all(args.frames, read)
     if not frames:
@@ -100,7 +100,7 @@ def _tilts(args: argparse.Namespace, instrument: Instrument) -> TiltLog | None:
     """The table of --tilt, None without one."""
     if args.tilt is None:
         return None
-    return checked_tilts("calibrate", args.tilt, instrument.inclinometer.noise_rad)
+    return checked_tilts("calibrate", args.tilt, instrument).log
 
 
 def _from_pointings(args: argparse.Namespace) -> int:

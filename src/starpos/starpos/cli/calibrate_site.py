@@ -136,7 +136,7 @@ def run(
         )
     else:
         found = calibrate_at(
-            solver, frames, tilts.average, site, stddev_arcsec, options.turn_of(args), console.ProgressBar()
+            solver, frames, tilts, site, stddev_arcsec, options.turn_of(args), console.ProgressBar()
         )
     for solution in found.solutions:
         if solution.fix is None:

@@ -7,13 +7,13 @@ import numpy as np
 
 from starpos.cli import console, jobs, options
 from starpos.cli.archive import frames_among
-from starpos.cli.frame_work import Identifying, IdentifyingBlind, Listing, Look, reader_of
+from starpos.cli.inputs import given_of, is_untold, reader_of
 from starpos.cli.output import Output, add_formats
-from starpos.cli.what_fits import say_what_would_fit
 from starpos.errors import FrameError
 from starpos.fix.blind import BlindSolver
 from starpos.fix.solution import Solution, Status
-from starpos.instrument.lens import PLUMB_BOB
+from starpos.night.reading import First, Given
+from starpos.night.work import Fitting, Identifying, OnFile
 from starpos.sky.catalogue import load_catalogue
 
 # of --csv
@@ -50,33 +50,30 @@ def run(args: argparse.Namespace) -> int:
     lost: str | None = None
     read, output = reader_of(args), Output(args, COLUMNS, HEAD)
     with jobs.workers_of(args, number) as workers:
-        (about,) = workers.map([(Look(read), tuple(args.frames))])
-        # without a frame that can be read, each one reports why it cannot
-        work: Listing | Identifying | IdentifyingBlind = Listing(read)
-        untold = (args.instrument, args.focal_mm, args.pixel_um) == (None,) * 3 and args.lens == PLUMB_BOB
-        if about is not None and untold and about.focal_px is None:
-            work = IdentifyingBlind(read)
+        (about,) = workers.map([(First(read), tuple(args.frames))])
+        given = Given(None, by_header=True)
+        if about is not None and is_untold(args) and about.focal_px is None:
             BlindSolver(load_catalogue(), console.ProgressBar()).prepare()
         elif about is not None:
-            instrument = options.instrument_of(args, about)
-            work = Identifying(read, instrument)
-            jobs.prepare("identify", instrument, about)
+            given = given_of(args, about)
+            jobs.prepare("identify", options.instrument_of(args, about), about)
+        # without a frame that can be read, each one reports why it cannot
+        work = OnFile(read, Identifying(given))
         answers = jobs.watched(workers.map((work, path) for path in args.frames), number)
         for path, answer in zip(args.frames, answers, strict=True):
             if isinstance(answer, FrameError):
-                unreadable = True
-                answer = (
-                    Solution(Status.BAD_INPUT, str(answer), source=path, utc_unix_s=None, stars_detected=0),
-                    0.0,
-                )
-            found, cpu_ms = answer
+                unreadable, found, cpu_ms = True, Solution.unreadable(path, answer), 0.0
+            else:
+                sight, cpu_ms = answer
+                found = sight.solution
             any_found |= found.ok
             lost = path if lost is None and found.status is Status.NOT_IDENTIFIED else lost
             if not found.ok:
                 console.complain("identify", found.message)
             output.put(as_json(path, found) | {"cpu_ms": cpu_ms}, _line(path, found))
-    if lost is not None and not any_found and isinstance(work, Identifying):
-        say_what_would_fit("identify", read, work.instrument, lost)
+    if lost is not None and not any_found:
+        for remark in Fitting(given)(read(lost)):
+            console.complain("identify", remark)
     return console.UNREADABLE if unreadable else 0 if any_found else 1
 
 

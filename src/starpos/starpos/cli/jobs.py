@@ -7,10 +7,10 @@ from collections.abc import Iterable, Iterator
 from contextlib import suppress
 
 from starpos.cli import console, options
-from starpos.cli.frame_work import About
 from starpos.errors import InstrumentError, StarposError
 from starpos.fix.solver import Solver
 from starpos.instrument.instrument import Instrument
+from starpos.night.reading import About
 from starpos.parallel.call import Here, Workers
 from starpos.parallel.cluster import Cluster
 from starpos.parallel.processes import Processes, processors

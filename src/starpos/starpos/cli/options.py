@@ -59,7 +59,7 @@ def has_own_level(args: argparse.Namespace) -> bool:
 
 
 def add_stamps(parser: argparse.ArgumentParser) -> None:
-    """Add the options of the frames' times, which `clock_of` and `frame_work.reader_of` read."""
+    """Add the options of the frames' times, which `clock_of` and `inputs.reader_of` read."""
     parser.add_argument(
         "--exif-utc-offset",
         type=_utc_offset,

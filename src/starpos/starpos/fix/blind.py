@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from starpos.errors import StarposError
-from starpos.fix.solution import Solution, Status, status_of
-from starpos.fix.solver import attitude_of, suspicions
+from starpos.fix.identified import identified
+from starpos.fix.solution import Solution, Status
 from starpos.frames.stars import Stars
 from starpos.identification import FEWEST_STARS, Sky, quad_cache
 from starpos.identification.blind import LARGEST_DEG, SMALLEST_DEG, STAGES, identify_blind
@@ -44,12 +44,12 @@ class BlindSolver:
         try:
             sky = Sky.at(self.catalogue, no_triangles(), stars.mid_unix_s)
         except StarposError as e:
-            return Solution.failed(stars, status_of(stars, e), str(e))
+            return Solution.refused(stars, e)
         quads = quad_cache.cached(self.catalogue, self.progress)
         xy = np.stack([seen.x, seen.y], 1)
         size, near_px, window = (stars.width, stars.height), stars.rough_focal_px, stars.window
-        answer = identify_blind(xy, seen.sigma, *size, sky, quads, self.stages, near_px, window)
-        if answer is None:
+        match = identify_blind(xy, seen.sigma, *size, sky, quads, self.stages, near_px, window)
+        if match is None:
             message = (
                 f"{stars.place}: none of the sky fits its {len(seen)} stars at any scale (fields of {SMALLEST_DEG:g} to "
                 f"{LARGEST_DEG:g} deg from corner to corner were tried): give the focal length if it is known, check "
@@ -58,17 +58,7 @@ class BlindSolver:
             return replace(
                 Solution.failed(stars, Status.NOT_IDENTIFIED, message), identify_s=time.perf_counter() - begin
             )
-        camera, found = answer
+        camera, found = match
         field = frame_stars(camera.directions(seen.x, seen.y), seen.sigma, camera)
-        warnings, explained = suspicions(seen, through(field, camera, window), sky, found)
-        names, magnitudes = self.catalogue.labels(found.catalogue)
-        return replace(
-            Solution.failed(stars, Status.OK, "identified"),
-            names=names,
-            star=inside[found.star],
-            magnitudes=magnitudes,
-            attitude=attitude_of(found, sky, camera),
-            identify_s=time.perf_counter() - begin,
-            warnings=warnings,
-            explained=explained,
-        )
+        answer = identified(seen, through(field, camera, window), sky, camera, found)
+        return replace(answer.among(stars, inside), identify_s=time.perf_counter() - begin)

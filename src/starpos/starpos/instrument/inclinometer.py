@@ -76,6 +76,10 @@ class Tilt:
                 f"tilts of {angles} deg cannot hold together: check the inclinometer and its units"
             )
 
+    def average(self, mid_unix_s: float, exposure_s: float, spread_s: float = 0.0) -> "Tilt":
+        """Return itself: one tilt is that of any exposure, as `starpos.instrument.tilts.Tilts` has it."""
+        return self
+
     @property
     def axes(self) -> int:
         """Number of axes that were measured, 2 or 3."""

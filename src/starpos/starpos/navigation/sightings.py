@@ -16,6 +16,7 @@ from starpos.errors import FixError, FrameError, InstrumentError, TimeError
 from starpos.fix import solver
 from starpos.fix.adjustment import share_free
 from starpos.fix.fix import sound_matches
+from starpos.fix.identified import suspicions
 from starpos.fix.outliers import expected_extra, judged
 from starpos.fix.unidentified import why_unidentified
 from starpos.frames.reading import why_no_time
@@ -128,7 +129,7 @@ def sighting_of(stars: Stars, eye: solver.Solver) -> IdentifiedFrame:
     found = identify_frame(field, sky)
     if found is None:
         raise FrameError(why_unidentified(stars, camera, catalogue))
-    suspicious, _ = solver.suspicions(stars, field, sky, found)
+    suspicious, _ = suspicions(stars, field, sky, found)
     if suspicious:
         raise FrameError(
             f"{stars.place}: its stars are not those of one sky ({', '.join(suspicious)}): left out"

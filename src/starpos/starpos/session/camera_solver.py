@@ -7,6 +7,7 @@ from collections.abc import Callable
 from starpos.errors import InstrumentError
 from starpos.fix.solver import Solver
 from starpos.instrument.camera import Camera
+from starpos.night.searching import prepare
 from starpos.session.job import Jobs, Outcome
 
 MOST_CHANGES = 1000
@@ -90,7 +91,7 @@ class CameraSolver:
 
         def work() -> tuple[Solver, str]:
             solver = self._make(camera)
-            return solver, solver.prepare(camera.width, camera.height)
+            return solver, prepare(solver, camera.width, camera.height)
 
         self._jobs.run(work).add_done_callback(lambda f: self._prepared(camera, f.result()))
 

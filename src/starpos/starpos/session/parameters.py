@@ -183,6 +183,16 @@ PARAMETERS = (
     ),
     Parameter("min_stars", 5, "Fewest identified stars that make a fix.", unit="", minimum=4, maximum=1000),
     Parameter(
+        "search_time",
+        0.3,
+        "How long a frame that is not identified at once may be searched by other ways: smaller triangles, where stars "
+        "fill a part of it only; other focal lengths, to say which fits. At most half of the time between frames; "
+        "recorded frames are searched to the end. 0: not at all.",
+        unit="s",
+        minimum=0.0,
+        maximum=60.0,
+    ),
+    Parameter(
         "gyro",
         False,
         "Take imu/data, whose turn rates say where a camera that turns looks: frames of four stars are identified too. "

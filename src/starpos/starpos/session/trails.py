@@ -9,7 +9,7 @@ import numpy as np
 from starpos.frames.frame import Frame
 from starpos.frames.trail import Trail
 from starpos.instrument.instrument import TOP_OF_FRAME
-from starpos.recording.messages import message_to_camera
+from starpos.messages.camera import message_to_camera
 from starpos.session.parameters import known_instrument
 
 # this share of an exposure may be without readings

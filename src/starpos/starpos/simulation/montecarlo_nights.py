@@ -253,7 +253,7 @@ def turned_night(
     solver = Solver(world.told, catalogue, world.air)
 
     def answer() -> Average:
-        return average(turn(solver, stars, tilts.average).fixes)
+        return average(turn(solver, stars, tilts).fixes)
 
     return _outcome("turned", answer, world.site, heading, rng)
 
@@ -290,9 +290,9 @@ def calibrated_night(
     shots, levels, heading = photograph(there, zero, later, [0.0], frames, rng)
 
     def answer() -> Average:
-        found = calibrate_at(solver, stars + more, tilts.average, world.site)
+        found = calibrate_at(solver, stars + more, tilts, world.site)
         ready = replace(solver, instrument=found.instrument)
-        solutions = [ready.solve(s, levels.average) for s in shots]
+        solutions = [ready.solve(s, levels) for s in shots]
         return average([s.fix for s in solutions if s.fix])
 
     return _outcome("calibrated", answer, there.site, heading, rng)

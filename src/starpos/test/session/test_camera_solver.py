@@ -20,6 +20,9 @@ class Prepared:
             raise InstrumentError("no such field")
         return self.thin
 
+    def triangles_of(self, width, height, part):
+        """Those of a part of the frame."""
+
 
 def taken(solver):
     """The CameraSolver that has taken a camera, and what it has said."""

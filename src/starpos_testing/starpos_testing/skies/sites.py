@@ -10,6 +10,7 @@ from starpos.fix.solver import Solver
 from starpos.frames.stars import Stars
 from starpos.instrument.inclinometer import Tilt
 from starpos.instrument.instrument import Calibration, Instrument
+from starpos.instrument.tilts import TiltsByTime
 from starpos.simulation.scene import Scene
 from starpos.units import ARCSEC
 from starpos_testing.skies.scenes import FOCAL_PX, START, stars_of, tilt_of, wide_scene
@@ -25,8 +26,10 @@ class Shots:
     frames: list[Stars]
     tilts: dict[float | None, Tilt]
 
-    def tilt(self, mid_unix_s: float, _exposure_s: float, _spread_s: float) -> Tilt:
-        return self.tilts[mid_unix_s]
+    @property
+    def tilt(self) -> TiltsByTime:
+        """The tilts as a solver takes them."""
+        return TiltsByTime(self.tilts)
 
     def spoil(self, k: int, x_deg: float) -> None:
         """Put an error on the tilt of frame k."""

@@ -1,29 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Doubts about an answer: tilts with their columns exchanged or in radians, a place that is far from --near.
+"""Doubts about an answer: tilts with their columns exchanged or in radians, a place that is far from where it should be.
 
 They are told, and change no answer.
 """
 
-import argparse
-import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from starpos.averaging.average import Average
-from starpos.cli import console
-from starpos.cli.frame_work import tilts
 from starpos.earth.ellipsoid import EARTH_RADIUS_M, zenith_of
 from starpos.earth.orientation import ROTATION_RAD_S
-from starpos.errors import InstrumentError
 from starpos.fix.budget import place_of
 from starpos.fix.fix import Fix
 from starpos.fix.readable import length_text
 from starpos.instrument.inclinometer import Tilt, level_of, up_of
 from starpos.instrument.mounting import Mounting
-from starpos.instrument.tilt_doubt import like_radians
-from starpos.instrument.tilt_log import TiltLog
+from starpos.night.remarks import Kind, Remark
 from starpos.rotation import half_turn
 from starpos.units import HOUR_S
 
@@ -66,45 +60,17 @@ class Near:
         return apart_m((self.latitude, self.longitude), (latitude, longitude)) / 1000
 
 
-def checked_tilts(command: str, path: str, noise_rad: float) -> TiltLog:
-    """The table of tilts, with a complaint where it looks like radians; raises TiltError as `read_tilt_csv` does."""
-    log = tilts(path, noise_rad)
-    if doubt := like_radians(log):
-        console.complain(command, f"{path}: {doubt}")
-    return log
+def doubts(
+    frames: Sequence[Levelled], whole: Fix | Average, mounting: Mounting | None, near: Near | None
+) -> Iterator[Remark]:
+    """Doubt places that tilts must have set apart, and one that lies far from `near`.
 
-
-def add_near(parser: argparse.ArgumentParser) -> None:
-    """Add the options that `near_of` reads."""
-    parser.add_argument(
-        "--near",
-        type=float,
-        nargs=2,
-        metavar=("LAT", "LON"),
-        help="roughly where the instrument is, deg: a fix that is far from there is told, with what may be wrong, and "
-        "never changed; of pointings without a roll it says which of two places it is, where their elevations leave two",
-    )
-    parser.add_argument(
-        "--near-km",
-        type=float,
-        metavar="KM",
-        help=f"how near that is ({NEAR_KM:g}; 4 sigma of the fix are added)",
-    )
-
-
-def near_of(args: argparse.Namespace) -> Near | None:
-    """The place of --near; None without it.  Raises InstrumentError."""
-    if args.near is None:
-        if args.near_km is not None:
-            raise InstrumentError("--near-km is for --near: give both")
-        return None
-    latitude, longitude = args.near
-    if not (abs(latitude) <= 90 and abs(longitude) <= 360):
-        raise InstrumentError(f"--near {latitude:g} {longitude:g}: give latitude and longitude in deg")
-    km = NEAR_KM if args.near_km is None else args.near_km
-    if not 0 < km <= 20_000:
-        raise InstrumentError(f"--near-km {km:g}: give a distance above 0 and at most 20000")
-    return Near(math.radians(latitude), math.radians(longitude), km)
+    mounting: of the frames, None where A3 was not given, and tells nothing.
+    """
+    if apart := _mistaken(mounting, frames):
+        yield Remark(Kind.MISTAKEN, apart)
+    if near is not None and (away := _far(near, whole, mounting, frames[-1:])):
+        yield Remark(Kind.FAR, away)
 
 
 def apart_m(a: tuple[float, float], b: tuple[float, float]) -> float:
@@ -113,11 +79,8 @@ def apart_m(a: tuple[float, float], b: tuple[float, float]) -> float:
     return EARTH_RADIUS_M * float(np.arctan2(np.linalg.norm(np.cross(up, other)), up @ other))
 
 
-def far(near: Near, fix: Fix | Average, mounting: Mounting | None, frames: Sequence[Levelled]) -> str:
-    """Say that a fix lies far from a place, and which mistake would explain it; '' if it does not.
-
-    mounting: of the frames, None where A3 was not given, and tells nothing.
-    """
+def _far(near: Near, fix: Fix | Average, mounting: Mounting | None, frames: Sequence[Levelled]) -> str:
+    """Say that a fix lies far from a place, and which mistake would explain it; '' if it does not."""
     km = near.km_from(fix.latitude, fix.longitude)
     sigma_m = float(np.sqrt(np.diag(fix.covariance)[:2].max()))
     if km <= near.km + FAR_SIGMA * sigma_m / 1000:
@@ -141,11 +104,13 @@ def _hours_ahead(near: Near, fix: Fix | Average) -> float:
     return hours if near.km_from(fix.latitude, turned) <= near.km else 0.0
 
 
-def mistaken(mounting: Mounting, frames: Sequence[Levelled]) -> str:
+def _mistaken(mounting: Mounting | None, frames: Sequence[Levelled]) -> str:
     """Say which mistake has set the places of frames far apart; '' if none explains it.
 
     One heading alone never tells: the same mistake then moves all places alike.
     """
+    if mounting is None:
+        return ""
     spread_m = _spread_m([_place(f, f.tilt.theta, mounting) for f in frames])
     if spread_m < APART_M:
         return ""

@@ -11,13 +11,15 @@ from starpos.errors import InstrumentError, TiltError
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import Tilt
 from starpos.instrument.tilt_log import TiltLog
+from starpos.messages.camera import message_to_camera
+from starpos.messages.tilt import UNUSABLE, message_to_tilt
+from starpos.night.folder import truth_in
+from starpos.night.night import Shot, Truth
+from starpos.night.remarks import Kind, Remark
+from starpos.night.solutions import deflection_of, shot_of
 from starpos.progress import Progress
 from starpos.recording.bag import BagReader
 from starpos.recording.instruments import INPUTS, SOLUTION, STARS, TILT, instrument_in
-from starpos.recording.messages import UNUSABLE, message_to_camera, message_to_tilt
-from starpos.report.folder import truth_in
-from starpos.report.night import Shot, Truth
-from starpos.report.solutions import deflection_of, shot_of
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection
@@ -42,7 +44,7 @@ class Recorded:
     solutions: tuple[Shot, ...]
     deflection: Deflection | None
     truth: Truth | None
-    remarks: tuple[str, ...]
+    remarks: tuple[Remark, ...]
 
     @property
     def name(self) -> str:
@@ -85,7 +87,7 @@ def read(path: Path, namespace: str | None, tilt_noise_rad: float, progress: Pro
         )
 
 
-def star_lists(r: Recorded) -> Iterator[Any]:
+def star_arrays(r: Recorded) -> Iterator[Any]:
     """The StarArray messages of an instrument, one at a time."""
     with BagReader(r.path, typed=True) as bag:
         _, connections = _instrument(bag, r.path, r.namespace)
@@ -137,11 +139,12 @@ class _Reading:
         in_time = sorted(self._tilts, key=lambda tilt: tilt.utc_unix_s)
         return TiltLog.of_readings(in_time) if in_time else None
 
-    def remarks(self, path: Path) -> tuple[str, ...]:
-        """Sentences on what was left out."""
+    def remarks(self, path: Path) -> tuple[Remark, ...]:
+        """What is to be said of what was left out."""
         said = []
         if self._unusable:
-            said.append(f"{self._unusable} tilts of the bag were left out: flagged, out of range or broken")
+            sentence = f"{self._unusable} tilts of the bag were left out: flagged, out of range or broken"
+            said.append(Remark(Kind.TILTS, sentence))
         if self._why_no_camera and not self.cameras:
-            said.append(f"{path.name}: {self._why_no_camera}")
+            said.append(Remark(Kind.RECORDED, f"{path.name}: {self._why_no_camera}"))
         return tuple(said)

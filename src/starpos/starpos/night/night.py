@@ -1,19 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The content of a report: the frames of a night, the answer of each, and their average."""
+"""A night: its frames, the answer of each, and their average."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from html import escape
 
 import numpy as np
 
 from starpos.averaging.average import Average
+from starpos.earth.ellipsoid import curvature_radii_m, enu_axes, zenith_of
 from starpos.earth.refraction import Atmosphere
 from starpos.earth.vertical import Geodetic, Vertical, geodetic
 from starpos.fix.budget import ErrorTerm
 from starpos.fix.fix import Fix
 from starpos.fix.readable import InDegrees
-from starpos.fix.solution import Attitude, Status
+from starpos.fix.solution import Attitude, Solution, Status
+from starpos.frames.stars import Stars
+from starpos.night.remarks import Remark
 
 NO_TILT = (float("nan"), float("nan"))
 NO_STARS = np.zeros((0, 2))
@@ -103,8 +106,45 @@ class Shot:
     camera_to_itrs: np.ndarray | None = None
     warnings: tuple[str, ...] = ()
 
+    @classmethod
+    def of(cls, name: str, s: Solution, stars: Stars | None) -> "Shot":
+        """The part of a solution that is shown; stars: those that gave it, None of a frame that cannot be read."""
+        shot = cls(
+            name=name,
+            status=s.status,
+            message=s.message,
+            utc_unix_s=float("nan") if s.utc_unix_s is None else s.utc_unix_s,
+            pointing=s.attitude,
+            size=None if stars is None else (stars.width, stars.height),
+            stars_detected=s.stars_detected,
+            stars_matched=len(s.names),
+            tilt=(s.tilt.theta_x, s.tilt.theta_y) if s.tilt else NO_TILT,
+            identify_s=s.identify_s,
+            fix_s=s.fix_s,
+            residual_arcsec=s.attitude.residual_arcsec if s.attitude else float("nan"),
+            warnings=s.warnings,
+        )
+        if stars is not None and s.star is not None and s.magnitudes is not None:
+            shot = replace(shot, xy=np.stack([stars.x, stars.y], -1)[s.star], magnitudes=s.magnitudes)
+        if s.fix is None:
+            return shot
+        return replace(
+            shot,
+            place=ReportedPlace.of(s.fix),
+            residual_px=-s.fix.residual_px,
+            residual_arcsec=s.fix.residual_arcsec,
+            camera_to_itrs=s.fix.camera_to_itrs,
+        )
+
     def __repr__(self) -> str:
         return f"<{self.name}: {self.place.in_degrees if self.place else self.message}>"
+
+
+def why_none(shots: Sequence[Shot]) -> str:
+    """A sentence that says why a night has no fix."""
+    if not shots:
+        return "there is no frame in it"
+    return f"none of its {len(shots)} frames gave a fix; the first: {shots[0].message}"
 
 
 @dataclass(frozen=True)
@@ -118,6 +158,13 @@ class Truth:
     longitude: float
     headings: tuple[tuple[float, float], ...] = ()
     simulated: bool = False
+
+
+def offset_m(place: ReportedPlace | Truth, latitude: float, longitude: float) -> tuple[float, float]:
+    """East, north in m of a place from another (rad)."""
+    across = enu_axes(latitude, longitude)[:2] @ zenith_of(place.latitude, place.longitude)
+    east, north = across * curvature_radii_m(latitude)
+    return float(east), float(north)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -140,7 +187,7 @@ class Night:
     atmosphere: Atmosphere
     truth: Truth | None = None
     steady: np.ndarray | None = None
-    remarks: tuple[str, ...] = ()
+    remarks: tuple[Remark, ...] = ()
 
     @property
     def simulated(self) -> bool:
@@ -182,5 +229,5 @@ class Night:
         head = ("frame", "status", "place (astronomic) and 1 sigma", "")
         table = "".join(f"<tr>{''.join(f'<td>{escape(cell)}</td>' for cell in row)}</tr>" for row in rows)
         titles = "".join(f"<th>{title}</th>" for title in head)
-        said = "".join(f"<p>{escape(remark)}</p>" for remark in self.remarks)
+        said = "".join(f"<p>{escape(remark.text)}</p>" for remark in self.remarks)
         return f"<p><b>{escape(repr(self)[1:-1])}</b></p><table><tr>{titles}</tr>{table}</table>{said}"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Converts recorded stars and solutions (messages) into the report's types."""
+"""Converts recorded stars and solutions (messages) into those of a night."""
 
 from typing import Any
 
@@ -10,10 +10,11 @@ from starpos.earth.vertical import Deflection, geodetic
 from starpos.errors import FrameError, StarposError
 from starpos.fix.budget import ALWAYS, ErrorTerm
 from starpos.fix.solution import Attitude, Status
+from starpos.frames.stars import Stars
 from starpos.instrument.camera import Camera
-from starpos.recording.messages import message_to_stars, stamp_to_unix
-from starpos.report.folder import StarList
-from starpos.report.night import NO_TILT, ReportedPlace, Shot
+from starpos.messages.stamp import stamp_to_unix
+from starpos.messages.stars import message_to_stars
+from starpos.night.night import NO_TILT, ReportedPlace, Shot
 from starpos.rotation import full_turn
 from starpos.units import ARCSEC
 from starpos.utc import utc_text
@@ -23,13 +24,13 @@ STATUS = (Status.OK, Status.TOO_FEW_STARS, Status.NOT_IDENTIFIED, Status.NO_TILT
           Status.TIME_OUTSIDE_TABLES, Status.BAD_INPUT, Status.POOR_FIT)  # fmt: skip
 
 
-def star_list_of(m: Any) -> StarList:
-    """The stars of a StarArray, or the error for which they cannot be used."""
+def named_stars(m: Any) -> tuple[str, Stars | FrameError]:
+    """A name for a StarArray, and its stars, or the error for which they cannot be used."""
     name = _name("stars", stamp_to_unix(m.header.stamp))
     try:
-        return StarList(name, message_to_stars(m, name))
+        return name, message_to_stars(m, name)
     except FrameError as error:
-        return StarList(name, error)
+        return name, error
 
 
 def _name(what: str, utc_unix_s: float | None) -> str:

@@ -6,17 +6,15 @@ from pathlib import Path
 
 from starpos.earth.refraction import Atmosphere
 from starpos.earth.vertical import Deflection, Vertical
-from starpos.errors import FrameError, InstrumentError
+from starpos.errors import FrameError
 from starpos.frames.night_files import TILTS
-from starpos.frames.stars import Stars
 from starpos.instrument import instrument_file
-from starpos.instrument.inclinometer import SCA100T_NOISE_RAD
 from starpos.instrument.instrument import Calibration, Instrument
+from starpos.night.folder import exposures, frames_in
+from starpos.night.night import Night
+from starpos.night.reading import First, Given, Reader
+from starpos.night.solving import solved_night
 from starpos.progress import Progress, quiet
-from starpos.report.folder import exposures, frames_in
-from starpos.report.night import Night
-from starpos.report.working import Workshop, worked
-from starpos.sky.catalogue import load_catalogue
 
 
 @dataclass(frozen=True)
@@ -45,26 +43,19 @@ class NightOnDisk:
         self_calibrate: find A3 too, from frames of one place at several headings; turn_stddev_deg: how well the given A3
         has its turn about the plumb line.  Raises StarposError where the folder or the instrument cannot be used.
         """
-        noise = SCA100T_NOISE_RAD if self.instrument is None else self.instrument.inclinometer.noise_rad
-        shop = Workshop(
-            instrument_for=self._instrument_for,
-            catalogue=load_catalogue(),
-            atmosphere=self.atmosphere,
-            vertical=self.vertical,
-            turn_stddev_deg=turn_stddev_deg if self_calibrate else None,
-            progress=progress,
+        given = self.instrument
+        if given is None:
+            first = First(Reader())(tuple(map(str, frames_in(self.folder))))
+            # each frame's own counts; without any, the frame says so
+            given = None if first is None or first.focal_px is None else Instrument(first.focal_px)
+        if given is not None and self.calibration is not None:
+            given = replace(given, calibration=self.calibration)
+        instruments = Given(given, by_header=self.instrument is None)
+        return solved_night(
+            exposures(self.folder, instruments, self.atmosphere, self.vertical),
+            turn_stddev_deg if self_calibrate else None,
+            progress,
         )
-        return worked(exposures(self.folder, noise), shop)
-
-    def _instrument_for(self, stars: Stars) -> Instrument:
-        known = self.instrument
-        if known is None:
-            if stars.focal_px is None:
-                raise InstrumentError(
-                    f"{stars.place}: its header has no focal length: give instrument=Instrument(focal_px)"
-                )
-            known = Instrument(stars.focal_px)
-        return known if self.calibration is None else replace(known, calibration=self.calibration)
 
 
 def open_night(

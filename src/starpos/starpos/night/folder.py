@@ -2,82 +2,65 @@
 """Reads a night from a folder as `starpos simulate` writes it: frames or lists of stars, tilt.csv, maybe truth.json."""
 
 import json
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 
-from starpos.detection import detect
+from starpos.earth.refraction import Atmosphere
+from starpos.earth.vertical import Vertical
 from starpos.errors import FrameError, TiltError
 from starpos.files import read_regular
+from starpos.frames.frame import Frame
 from starpos.frames.night_files import SIMULATED, TILTS, TRUTH
 from starpos.frames.reading import FITS, read_frame
 from starpos.frames.stars import Stars
-from starpos.instrument.inclinometer import Tilt
-from starpos.instrument.tilt_doubt import like_radians
+from starpos.instrument.inclinometer import SCA100T_NOISE_RAD
 from starpos.instrument.tilt_table import read_tilt_csv
-from starpos.report.night import Truth
+from starpos.instrument.tilts import NoTilts, Tilts
+from starpos.night.night import Truth
+from starpos.night.reading import Instruments
+from starpos.night.remarks import Remark, of_tilts
+from starpos.night.solving import Exposures
+from starpos.night.work import Solving
 
 TRUTH_LIMIT = 1 << 26
 
 
-@dataclass(frozen=True)
-class StarList:
-    """The stars of a frame, or the error for which there are none."""
+def exposures(
+    folder: Path, instruments: Instruments, atmosphere: Atmosphere, vertical: Vertical
+) -> Exposures:
+    """The frames of a folder in the order of their names, to be solved.  If tilt.csv is missing, each frame says so.
 
-    name: str
-    stars: Stars | FrameError
-
-
-@dataclass(frozen=True, kw_only=True)
-class StarLists:
-    """Exposures to solve: each call of `read` goes through all `count` of them, one at a time.
-
-    tilt: a function of (mid_unix_s, exposure_s, spread_s) that may raise TiltError.  remarks: what looks wrong.
-    """
-
-    name: str
-    origin: str
-    count: int
-    read: Callable[[], Iterator[StarList]]
-    tilt: Callable[[float, float, float], Tilt]
-    truth: Truth | None = None
-    remarks: tuple[str, ...] = ()
-
-
-def exposures(folder: Path, tilt_noise_rad: float) -> StarLists:
-    """The frames of a folder in the order of their names: its FITS files, or if there are none its CSV files.
-
-    Pictures are left out, because without a time they give no place.  If tilt.csv is missing, each frame says so.
     Raises FrameError if there are no frames, or truth.json cannot be used.
     """
     frames = frames_in(folder)
-    tilt: Callable[[float, float, float], Tilt]
-    doubt = ""
+    known = instruments.instrument
+    noise_rad = SCA100T_NOISE_RAD if known is None else known.inclinometer.noise_rad
+    tilts: Tilts
+    remarks: tuple[Remark, ...] = ()
     try:
-        log = read_tilt_csv(folder / TILTS, tilt_noise_rad)
-        tilt, doubt = log.average, like_radians(log)
+        tilts = log = read_tilt_csv(folder / TILTS, noise_rad)
+        remarks = of_tilts(log, TILTS)
     except TiltError as error:
-        tilt = _no_tilt(str(error))
+        tilts = NoTilts(str(error))
 
-    def read() -> Iterator[StarList]:
+    def each() -> Iterator[tuple[str, Frame | Stars | FrameError]]:
         for path in frames:
             try:
-                item = read_frame(path)
-                yield StarList(path.name, item if isinstance(item, Stars) else detect(item).stars)
+                yield path.name, read_frame(path)
             except FrameError as error:
-                yield StarList(path.name, error)
+                yield path.name, error
 
-    origin = f"solved from {len(frames)} {'lists of stars' if frames[0].suffix == '.csv' else 'frames'} and {TILTS}"
-    return StarLists(
+    return Exposures(
         name=folder.name or str(folder),
-        origin=origin,
+        origin=f"solved from {len(frames)} {'lists of stars' if frames[0].suffix == '.csv' else 'frames'} and {TILTS}",
         count=len(frames),
-        read=read,
-        tilt=tilt,
+        each=each,
+        work=Solving(instruments, atmosphere, tilts),
+        vertical=vertical,
         truth=truth_in(folder),
-        remarks=(f"{TILTS}: {doubt}",) if doubt else (),
+        remarks=remarks,
     )
 
 
@@ -120,10 +103,3 @@ def truth_in(folder: Path) -> Truth | None:
         ) from None
     latitude, longitude = np.radians(place).tolist()
     return Truth(latitude, longitude, headings, simulated)
-
-
-def _no_tilt(reason: str) -> Callable[[float, float, float], Tilt]:
-    def tilt(mid_unix_s: float, exposure_s: float, spread_s: float) -> Tilt:
-        raise TiltError(reason)
-
-    return tilt
