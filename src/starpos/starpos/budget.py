@@ -18,6 +18,11 @@ class Budget:
         return cls(time.process_time() + seconds)
 
     @property
+    def left_s(self) -> float:
+        """How many seconds are left."""
+        return max(self.end_s - time.process_time(), 0.0)
+
+    @property
     def spent(self) -> bool:
         """Whether the time is over."""
         return time.process_time() >= self.end_s

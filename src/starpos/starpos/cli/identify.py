@@ -10,10 +10,12 @@ from starpos.cli.archive import frames_among
 from starpos.cli.inputs import given_of, is_untold, reader_of
 from starpos.cli.output import Output, add_formats
 from starpos.errors import FrameError
-from starpos.fix.blind import BlindSolver
+from starpos.fix.blind import SEARCH_S, BlindSolver
 from starpos.fix.solution import Solution, Status
 from starpos.night.reading import First, Given
 from starpos.night.work import Fitting, Identifying, OnFile
+from starpos.parallel.call import Here
+from starpos.progress import quiet
 from starpos.sky.catalogue import load_catalogue
 
 # of --csv
@@ -40,6 +42,13 @@ def define(parser: argparse.ArgumentParser) -> None:
     )
     options.add_optics(parser)
     options.add_lens(parser)
+    parser.add_argument(
+        "--search-time",
+        type=options.number(0.1, 86400),
+        default=SEARCH_S,
+        metavar="S",
+        help=f"CPU time of the search for a frame of which neither scale nor lens is known ({SEARCH_S:g} s)",
+    )
     jobs.add_jobs(parser)
     parser.set_defaults(run=run)
 
@@ -58,7 +67,9 @@ def run(args: argparse.Namespace) -> int:
             given = given_of(args, about)
             jobs.prepare("identify", options.instrument_of(args, about), about)
         # without a frame that can be read, each one reports why it cannot
-        work = OnFile(read, Identifying(given))
+        # several at once would write over each other's progress
+        progress = console.ProgressBar() if isinstance(workers, Here) else quiet
+        work = OnFile(read, Identifying(given, args.search_time, progress))
         answers = jobs.watched(workers.map((work, path) for path in args.frames), number)
         for path, answer in zip(args.frames, answers, strict=True):
             if isinstance(answer, FrameError):

@@ -54,6 +54,8 @@ _TURNS = [
 ]
 # Stars lie in a disc if chance would leave the corners empty as seldom as this, and these have such a share of the frame.
 LOG_CHANCE, LEAST_OUTSIDE = math.log(1e-3), 0.1
+# The radius of a picture over the frame's shorter side is at least this.
+LEAST_RADIUS = 0.25
 # Stars outside the disc, over all: lettering, hot pixels.
 MOST_OUTSIDE = 0.03
 
@@ -72,7 +74,8 @@ def disc_radius_px(xy: np.ndarray, width: int, height: int) -> float | None:
     inside = len(away) - outside
     ways = math.lgamma(len(away) + 1) - math.lgamma(outside + 1) - math.lgamma(inside + 1)
     by_chance = beyond > LEAST_OUTSIDE and ways + inside * math.log1p(-beyond) > LOG_CHANCE
-    return radius_px if beyond > LEAST_OUTSIDE and not by_chance else None
+    round_enough = beyond > LEAST_OUTSIDE and radius_px > LEAST_RADIUS * min(width, height)
+    return radius_px if round_enough and not by_chance else None
 
 
 def _share_beyond(radius_px: float, width: int, height: int) -> float:
@@ -119,13 +122,15 @@ def identify_fisheye(
     height: int,
     sky: Sky,
     quads: QuadCatalogue,
+    stages: Sequence[int] = STAGES,
     near_px: float | None = None,
     budget: Budget = ENDLESS,
     progress: Progress = quiet,
 ) -> tuple[Camera, Identification] | None:
     """Identify stars at pixels xy (N, 2), brightest first, with errors (N,) px, of a fisheye with its axis in the middle.
 
-    near_px: a focal length that it may have.  budget: CPU time after which the search ends.
+    stages: numbers of the brightest stars of a part that make quads.  near_px: a focal length that it may have.
+    budget: CPU time after which the search ends.
 
     Returns a camera that is near the true one, and the identification; None if there is none beyond doubt.
     """
@@ -134,17 +139,18 @@ def identify_fisheye(
     disc_px = disc_radius_px(xy, width, height)
     radius_px = disc_px or math.hypot(width, height) / 2
     picture = _Picture(xy, sigma_px, width, height, radius_px)
-    longest, shortest = (radius_px / math.radians(deg / 2) for deg in (NARROWEST_DEG, WIDEST_DEG))
-    if near_px is not None and shortest < near_px < longest:
-        shortest, longest = max(shortest, near_px / ROUGHLY), min(longest, near_px * ROUGHLY)
-    prior = any_scale(*(focal * RADIUS_PX / radius_px for focal in (0.95 * shortest, 1.05 * longest)))
+    spans = [_focal_range(lens, radius_px, near_px) for lens in LENSES]
+    prior = any_scale(
+        0.95 * min(low for low, _ in spans) * RADIUS_PX / radius_px,
+        1.05 * max(high for _, high in spans) * RADIUS_PX / radius_px,
+    )
     # evidence as a frame needs, though so many parts and lenses are tried
     need = wide.enough(len(_TURNS) * len(LENSES)) + SECOND_TRY
-    work = [(stars, k) for stars in STAGES for k in range(len(_TURNS))]
+    work = [(stars, k) for stars in stages for k in range(len(_TURNS))]
     best: tuple[Camera, Identification] | None = None
     for done, (stars, k) in enumerate(work):
         progress("searching fisheyes", done / len(work))
-        guesses = list(_guesses(picture, (shortest, longest), _TURNS[k], stars, sky, quads, budget))
+        guesses = list(_guesses(picture, spans, _TURNS[k], stars, sky, quads, budget))
         for guess, row in _most_agreed(guesses):
             if budget.spent:
                 return best
@@ -161,9 +167,18 @@ def identify_fisheye(
     return best
 
 
+def _focal_range(lens: tuple[float, ...], radius_px: float, near_px: float | None) -> tuple[float, float]:
+    """The focal lengths (px) with which a lens makes a picture of that radius, or those near one that is told."""
+    angles = (math.radians(deg / 2) for deg in (WIDEST_DEG, NARROWEST_DEG))
+    low, high = (radius_px / (t * (1 + sum(k * t ** (2 * n) for n, k in enumerate(lens, 1)))) for t in angles)
+    if near_px is None or not low < near_px < high:
+        return low, high
+    return max(low, near_px / ROUGHLY), min(high, near_px * ROUGHLY)
+
+
 def _guesses(
     picture: _Picture,
-    focal_range: tuple[float, float],
+    spans: Sequence[tuple[float, float]],
     turn: np.ndarray,
     stars: int,
     sky: Sky,
@@ -171,19 +186,20 @@ def _guesses(
     budget: Budget,
 ) -> Iterator[_Guess]:
     """Yield what each lens and focal length makes of a part of the picture."""
-    focal_px, longest = focal_range
-    while focal_px < longest and not budget.spent:
-        focal_px *= 1 + STEP
-        for lens in LENSES:
-            part, field = _part(picture, focal_px, lens, turn)
+    for lens, (shortest, longest) in zip(LENSES, spans, strict=True):
+        for focal_px in np.geomspace(
+            shortest, longest, math.ceil(math.log(longest / shortest) / (2 * STEP)) + 1
+        ):
+            if budget.spent:
+                return
+            part, field = _part(picture, float(focal_px), lens, turn)
             if field is None or len(field) < FEWEST_STARS:
                 continue
-            part_px = field.focal_px
-            matches = Matches.of(field, quads, min(stars, len(field)), ERROR_PX, part_px, STEP)
-            found = QuadPoses.of(field, sky, matches, ERROR_PX, (part_px * (1 - STEP), part_px * (1 + STEP)))
+            matches = Matches.of(field, quads, min(stars, len(field)), ERROR_PX, field.focal_px, STEP)
+            scales = field.focal_px * (1 - STEP), field.focal_px * (1 + STEP)
+            found = QuadPoses.of(field, sky, matches, ERROR_PX, scales)
             if len(found.poses):
-                yield _Guess(focal_px, lens, part, field, found)
-        focal_px *= 1 + STEP
+                yield _Guess(float(focal_px), lens, part, field, found)
 
 
 def _part(

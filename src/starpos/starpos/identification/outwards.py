@@ -31,7 +31,7 @@ LOG_CHANCE = math.log(1e-6)
 
 @dataclass(frozen=True)
 class Outwards:
-    """A camera that was fitted to its stars, the identification of a frame, and whether stars beyond the part bear it out.
+    """A camera fitted to its stars, the identification of a frame, and whether stars beyond the part bear it out.
 
     Where they do not, the camera and the identification are those of the part.
     """

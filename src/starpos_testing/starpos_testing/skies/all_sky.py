@@ -157,7 +157,8 @@ class AllSky:
         n = len(order)
         return Stars(
             x=self.xy[order, 0], y=self.xy[order, 1], flux=10 ** (-0.4 * self.mag[order]), snr=np.full(n, 20.0),
-            covariance=np.broadcast_to(0.09 * np.eye(2), (n, 2, 2)), flags=np.zeros(n), width=self.width, height=self.height,
+            covariance=np.broadcast_to(0.09 * np.eye(2), (n, 2, 2)), flags=np.zeros(n),
+            width=self.width, height=self.height,
         )  # fmt: skip
 
     @property
