@@ -137,6 +137,74 @@ def test_random_points_are_refused_in_bounded_time(solver, rng):
     assert time.process_time() - begin < 60
 
 
+def crowd(rng):
+    """A swarm of detections that makes very many quads of the same sizes, as a cloud's edge or a tree does."""
+    swarm = rng.normal([800, 600], [30, 30], (60, 2))
+    return listed(np.concatenate([swarm, rng.uniform(0, [WIDTH - 1, HEIGHT - 1], (40, 2))]))
+
+
+def test_a_search_ends_with_its_time_and_says_how_to_go_on(catalogue, rng):
+    said = []
+    solver = BlindSolver(catalogue, lambda what, done: said.append(done), search_s=1.0)
+    begin = time.process_time()
+    s = solver.identify(crowd(rng))
+    assert s.status is Status.NOT_IDENTIFIED and "in 1 s of CPU" in s.message and "--search-time" in s.message
+    assert time.process_time() - begin < 4
+    assert said and all(0 <= done <= 1 for done in said)
+
+
+@pytest.mark.montecarlo
+def test_the_worst_swarms_end_in_the_time_of_a_frame(solver, rng):
+    begin = time.process_time()
+    solver.identify(crowd(rng))
+    assert time.process_time() - begin < 22
+
+
+def test_a_frame_that_is_found_costs_no_more_than_it_needs(catalogue, rng):
+    xy, axis, _ = seen(catalogue, 13.0, 7.5, rng)
+    s = BlindSolver(catalogue, search_s=2.0).identify(listed(xy))
+    assert s.ok and looks(s, axis) > 1 - 1e-6
+
+
+@pytest.mark.parametrize(("field_deg", "limit_mag"), [(3.0, 10.0), (13.0, 7.5), (45.0, 5.2), (80.0, 4.5)])
+def test_the_scales_that_are_tried_leave_no_hole(field_deg, limit_mag, solver, catalogue, rng):
+    """One sky at focal lengths over more than a step of the search: it is found at all, or, seldom, at none."""
+    camera = Camera.from_focal(WIDTH, HEIGHT, np.hypot(WIDTH, HEIGHT) / 2 / np.tan(np.radians(field_deg / 2)))
+    attitude = rotation.best_rotation(rng.normal(size=(1, 3, 3)), rng.normal(size=(1, 3, 3)))[0]
+    index = catalogue.cone(attitude[2], 0.75 * camera.half_diagonal_rad, limit_mag)
+    index = index[np.argsort(catalogue.vmag(index))]
+    found = []
+    for factor in np.geomspace(0.88, 1.14, 9):
+        xy = camera.scaled(factor).project(catalogue.directions(index) @ attitude.T)
+        xy += rng.normal(0, 0.1, xy.shape)
+        s = solver.identify(listed(xy[((xy > 0) & (xy < [WIDTH - 1, HEIGHT - 1])).all(1)]))
+        found.append(s.ok)
+        assert not s.ok or s.attitude.focal_px == pytest.approx(factor * camera.fx, rel=3e-3)
+    assert all(found)
+
+
+def test_the_focal_lengths_that_are_tried_cover_all():
+    half_px = 1000.0
+    for shortest, longest in ((800.0, 2e5), (466.0, 1000.0)):
+        reached = shortest
+        for focal_px, step in blind.focal_lengths(half_px, shortest, longest):
+            assert focal_px * (1 - step) <= reached * (1 + 1e-9)
+            reached = focal_px * (1 + step)
+        assert reached >= longest
+
+
+def test_a_poor_answer_near_the_focal_length_of_exif_does_not_bind(solver, catalogue, rng):
+    """Eight stars of one sky fit the focal length that is told; sixty of another fit a third of it."""
+    few, _, told_px = seen(catalogue, 6.0, 8.5, rng)
+    many, axis, focal_px = seen(catalogue, 20.0, 7.0, rng)
+    xy = np.concatenate([few[:8], many[:60]])
+    alone = solver.identify(replace(listed(few[:8]), rough_focal_px=told_px))
+    assert alone.ok and alone.attitude.focal_px == pytest.approx(told_px, rel=3e-3)
+    s = solver.identify(replace(listed(xy), rough_focal_px=told_px))
+    assert s.ok and looks(s, axis) > 1 - 1e-6 and s.attitude.focal_px == pytest.approx(focal_px, rel=3e-3)
+    assert s.attitude.log_odds > 2 * alone.attitude.log_odds
+
+
 def test_a_shape_is_that_of_the_quad_turned_scaled_and_mirrored(rng):
     flat = rng.normal(size=(50, 4, 2)) * 0.001
     v = rotation.normalised(np.concatenate([flat, np.ones((50, 4, 1))], 2))
