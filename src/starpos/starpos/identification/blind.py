@@ -18,7 +18,7 @@ from starpos.budget import ENDLESS, Budget
 from starpos.frames.stars import Window
 from starpos.identification._frame import FrameStars
 from starpos.identification.evidence import any_scale
-from starpos.identification.explained import explained_by
+from starpos.identification.explained import ENOUGH_EXPLAINED, explained_by
 from starpos.identification.full import ENOUGH, FEWEST_STARS, Identification, identified
 from starpos.identification.pose import Pose, stars_at
 from starpos.identification.quad_poses import Matches, QuadPoses, most_agreed
@@ -39,8 +39,8 @@ STAGES = (10, 0.4), (15, 0.4), (21, 0.4), (12, 2.0)
 LARGEST_STEP, BENT = 0.1, 0.003
 # So many poses, those with most votes, are judged in each stage.
 MOST_JUDGED = 40
-# Log-odds of an answer that ends the search, if it explains the frame: a right one may have less, where stars are few.
-SURE = 3 * ENOUGH
+# Log-odds of an answer that ends the search though most bright detections are not its stars.
+SURE = 6 * ENOUGH
 
 
 @dataclass(frozen=True)
@@ -121,7 +121,10 @@ def stages_of(stages: Sequence[tuple[int, float]], stars: int) -> list[tuple[int
 
 def is_sure(found: Identification, field: FrameStars) -> bool:
     """Whether no better answer needs to be looked for."""
-    return found.log_odds >= SURE and explained_by(found, field).enough
+    explained = explained_by(found, field)
+    return explained.explained >= ENOUGH_EXPLAINED * explained.bright or (
+        explained.enough and found.log_odds >= SURE
+    )
 
 
 def _poses(

@@ -15,7 +15,10 @@ from starpos.fix.solution import Status
 from starpos.fix.solver import Solver
 from starpos.frames.reading import read_frame
 from starpos.frames.stars import Stars
-from starpos.identification import blind, quad_cache, quads
+from starpos.identification import Sky, blind, quad_cache, quads
+from starpos.identification.pose import stars_at
+from starpos.identification.quad_poses import Matches
+from starpos.identification.triangles import no_triangles
 from starpos.instrument.camera import Camera
 from starpos.instrument.instrument import Instrument
 
@@ -160,27 +163,33 @@ def test_the_worst_swarms_end_in_the_time_of_a_frame(solver, rng):
     assert time.process_time() - begin < 22
 
 
-def test_a_frame_that_is_found_costs_no_more_than_it_needs(catalogue, rng):
-    xy, axis, _ = seen(catalogue, 13.0, 7.5, rng)
-    s = BlindSolver(catalogue, search_s=2.0).identify(listed(xy))
-    assert s.ok and looks(s, axis) > 1 - 1e-6
-
-
-@pytest.mark.parametrize(("field_deg", "limit_mag"), [(3.0, 10.0), (13.0, 7.5), (45.0, 5.2), (80.0, 4.5)])
-def test_the_scales_that_are_tried_leave_no_hole(field_deg, limit_mag, solver, catalogue, rng):
-    """One sky at focal lengths over more than a step of the search: it is found at all, or, seldom, at none."""
-    camera = Camera.from_focal(WIDTH, HEIGHT, np.hypot(WIDTH, HEIGHT) / 2 / np.tan(np.radians(field_deg / 2)))
-    attitude = rotation.best_rotation(rng.normal(size=(1, 3, 3)), rng.normal(size=(1, 3, 3)))[0]
-    index = catalogue.cone(attitude[2], 0.75 * camera.half_diagonal_rad, limit_mag)
-    index = index[np.argsort(catalogue.vmag(index))]
-    found = []
-    for factor in np.geomspace(0.88, 1.14, 9):
-        xy = camera.scaled(factor).project(catalogue.directions(index) @ attitude.T)
-        xy += rng.normal(0, 0.1, xy.shape)
-        s = solver.identify(listed(xy[((xy > 0) & (xy < [WIDTH - 1, HEIGHT - 1])).all(1)]))
-        found.append(s.ok)
-        assert not s.ok or s.attitude.focal_px == pytest.approx(factor * camera.fx, rel=3e-3)
-    assert all(found)
+def test_at_any_scale_the_quads_of_a_frame_are_those_of_the_sky(catalogue, rng):
+    """Every quad of the sky that a frame can hold is found again, whatever the focal length of that frame."""
+    sky, table, half_px = (
+        Sky(catalogue, no_triangles()),
+        quad_cache.cached(catalogue),
+        np.hypot(WIDTH, HEIGHT) / 2,
+    )
+    span = [half_px / np.tan(np.radians(d / 2)) for d in (blind.LARGEST_DEG, blind.SMALLEST_DEG)]
+    tried = 0
+    while tried < 40:
+        focal_px, quad = np.exp(rng.uniform(*np.log(span))), rng.integers(len(table.corners))
+        camera = Camera.from_focal(WIDTH, HEIGHT, focal_px)
+        w = sky.directions(table.corners[quad])
+        axis = rotation.normalised(w.mean(0)[None])[0]
+        turn = rotation.best_rotation(axis[None, None], np.array([[[0.0, 0, 1]]]))[0]
+        xy = camera.project(w @ turn.T)
+        # a quad of a few pixels has no shape, and one that is not on the frame is not seen
+        if not (np.abs(xy - camera.centre_px) < [WIDTH / 2, HEIGHT / 2]).all() or np.ptp(xy) < 300:
+            continue
+        tried += 1
+        field = stars_at(camera, xy, np.full(4, 0.1))
+        found = [
+            Matches.of(field, table, 4, 0.4, focal, step)
+            for focal, step in blind.focal_lengths(half_px, *span)
+            if abs(np.log(focal / focal_px)) < 0.3
+        ]
+        assert any((m.corner == table.corners[quad]).all(1).any() for m in found), focal_px
 
 
 def test_the_focal_lengths_that_are_tried_cover_all():

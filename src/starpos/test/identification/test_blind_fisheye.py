@@ -6,6 +6,7 @@ import time
 import numpy as np
 import pytest
 
+from starpos.detection import detect
 from starpos.fix.blind import BlindSolver
 from starpos.fix.solution import Status
 from starpos.identification.blind_fisheye import disc_radius_px
@@ -69,6 +70,16 @@ def test_most_stars_of_the_frame_are_named_though_the_lens_was_not_known(solver,
     s = solver.identify(sky.stars)
     assert s.ok, s.message
     assert len(s.names) > 0.8 * len(sky.stars) and s.warnings == ()
+
+
+@pytest.mark.parametrize("kinds", [(), ("horizon", "trees"), ("horizon", "aurora"), ("horizon", "moon")])
+def test_a_picture_of_the_sky_is_found(kinds, solver, catalogue, rng):
+    sky = AllSky(catalogue, rng, "between", width=1000, height=800, radius_px=380.0, limit_mag=5.0)
+    for kind in kinds:
+        getattr(sky, kind)()
+    s = solver.identify(detect(sky.picture()).stars)
+    assert s.ok, s.message
+    check(s, sky)
 
 
 def test_random_points_in_a_disc_are_no_sky_and_the_fisheye_is_named(solver, rng):

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from starpos import rotation
+from starpos.frames.frame import Frame
 from starpos.frames.stars import Stars
 from starpos.sky.catalogue import Catalogue
 
@@ -160,6 +161,26 @@ class AllSky:
             covariance=np.broadcast_to(0.09 * np.eye(2), (n, 2, 2)), flags=np.zeros(n),
             width=self.width, height=self.height,
         )  # fmt: skip
+
+    def picture(self, glow: float = 12.0, noise: float = 2.0) -> Frame:
+        """An 8-bit picture of the stars on a glowing sky, black around the disc, with what stands in the way as dark."""
+        rng, shape = self.rng, (self.height, self.width)
+        rows, columns = np.mgrid[: self.height, : self.width]
+        away = np.hypot(columns - self.centre[0], rows - self.centre[1]) / self.radius_px
+        pixels = np.where(away < 1, glow * (1 + 1.5 * away**4), 0.0)
+        for (x, y), mag in zip(self.xy.tolist(), self.mag.tolist(), strict=True):
+            i, j, reach = round(y), round(x), 5
+            if not (reach <= i < shape[0] - reach and reach <= j < shape[1] - reach):
+                continue
+            near = np.s_[i - reach : i + reach + 1, j - reach : j + reach + 1]
+            apart2 = (rows[near] - y) ** 2 + (columns[near] - x) ** 2
+            pixels[near] += 400 * 10 ** (-0.4 * (mag - 1)) * np.exp(-0.5 * apart2 / 1.1**2)
+        if (bright := self.mag < -8).any():
+            moon = self.xy[bright][0]
+            apart = np.hypot(columns - moon[0], rows - moon[1]) / self.radius_px
+            pixels += np.where(away < 1, 60 / (0.05 + 4 * apart), 0.0)
+        pixels = np.where(away < 1, pixels, 0.0) + 3 + rng.normal(0, noise, shape)
+        return Frame(pixels=pixels.clip(0, 255).astype(np.uint8))
 
     @property
     def axis(self) -> np.ndarray:
