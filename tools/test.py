@@ -3,10 +3,10 @@
 
 `test.py [PYTEST ARGUMENTS]`, `test.py --lint`. The last line counts what passed, failed and was skipped (a
 linter counts as one test); the exit status is 0 only where nothing failed. `test.py --ubuntu` runs packages' tests with
-the versions that Ubuntu 24.04 has (tools/setup/ubuntu), in an environment as bare as a newcomer's: without the counterparts
-that tools/setup/counterparts brings. `test.py --both` runs all, the core's tests with other interpreters that are at hand
-(tools/setup/core), builds the documents' site, looks through the licences and checks the package, which `test.py --docs`
-does alone: a warning is a failure.
+the versions that Ubuntu 24.04 has (tools/setup/ubuntu), in an environment as bare as a newcomer's: without the
+counterparts that tools/setup/counterparts brings. `test.py --both` runs all, the core's tests with other interpreters
+that are at hand (tools/setup/core), builds the documents' site, looks through the licences and checks the package, which
+`test.py --docs` does alone: a warning is a failure.
 """
 
 import os
