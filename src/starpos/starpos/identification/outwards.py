@@ -68,7 +68,7 @@ def outwards(field: WideField, sky: Sky, part: Part, found: Identification) -> O
         star, w = pair[0], near.directions[pair[1]]
         if inner is None:
             inner = _answer(field, pose, xy, near, pair, found, False)
-    if _borne_out(np.count_nonzero(beyond[star]), xy[beyond], len(near.index), gate[beyond]):
+    if _borne_out(int(beyond[star].sum()), xy[beyond], len(near.index), gate[beyond]):
         return _answer(field, pose, xy, near, pair, found, True)
     return inner
 

@@ -42,7 +42,13 @@ def check(s, sky, off_deg=0.5):
 @pytest.mark.parametrize("lens", LENSES)
 @pytest.mark.parametrize("kinds", SKIES.values(), ids=SKIES)
 def test_an_all_sky_frame_is_found_with_no_option_at_all(kinds, lens, solver, catalogue, rng):
-    sky = AllSky(catalogue, rng, lens, field_deg=rng.uniform(150, 195), limit_mag=rng.uniform(4.0, 5.5))
+    sky = AllSky(
+        catalogue=catalogue,
+        rng=rng,
+        lens=lens,
+        field_deg=rng.uniform(150, 195),
+        limit_mag=rng.uniform(4.0, 5.5),
+    )
     for kind in kinds:
         getattr(sky, kind)()
     s = solver.identify(sky.stars)
@@ -58,7 +64,15 @@ def test_an_all_sky_frame_is_found_with_no_option_at_all(kinds, lens, solver, ca
 )  # fmt: skip
 def test_other_fields_and_sizes_are_found(width, height, radius_px, field_deg, solver, catalogue, rng):
     sky = AllSky(
-        catalogue, rng, "equisolid", width, height, radius_px, field_deg, limit_mag=5.5, off_px=0.01 * width
+        catalogue=catalogue,
+        rng=rng,
+        lens="equisolid",
+        width=width,
+        height=height,
+        radius_px=radius_px,
+        field_deg=field_deg,
+        limit_mag=5.5,
+        off_px=0.01 * width,
     ).horizon()
     s = solver.identify(sky.stars)
     assert s.ok, s.message
@@ -66,7 +80,7 @@ def test_other_fields_and_sizes_are_found(width, height, radius_px, field_deg, s
 
 
 def test_most_stars_of_the_frame_are_named_though_the_lens_was_not_known(solver, catalogue, rng):
-    sky = AllSky(catalogue, rng, "stereographic", limit_mag=5.0)
+    sky = AllSky(catalogue=catalogue, rng=rng, lens="stereographic", limit_mag=5.0)
     s = solver.identify(sky.stars)
     assert s.ok, s.message
     assert len(s.names) > 0.8 * len(sky.stars) and s.warnings == ()
@@ -74,7 +88,9 @@ def test_most_stars_of_the_frame_are_named_though_the_lens_was_not_known(solver,
 
 @pytest.mark.parametrize("kinds", [(), ("horizon", "trees"), ("horizon", "aurora"), ("horizon", "moon")])
 def test_a_picture_of_the_sky_is_found(kinds, solver, catalogue, rng):
-    sky = AllSky(catalogue, rng, "between", width=1000, height=800, radius_px=380.0, limit_mag=5.0)
+    sky = AllSky(
+        catalogue=catalogue, rng=rng, lens="between", width=1000, height=800, radius_px=380.0, limit_mag=5.0
+    )
     for kind in kinds:
         getattr(sky, kind)()
     s = solver.identify(detect(sky.picture()).stars)

@@ -22,7 +22,7 @@ LENSES: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 EXTINCTION_MAG = 0.2
 
 
-@dataclass
+@dataclass(kw_only=True)
 class AllSky:
     """What an all-sky camera sees, brightest first: pixels, magnitudes, directions in C, which are stars.
 
