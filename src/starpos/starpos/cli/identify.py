@@ -12,6 +12,7 @@ from starpos.cli.output import Output, add_formats
 from starpos.errors import FrameError
 from starpos.fix.blind import SEARCH_S, BlindSolver
 from starpos.fix.solution import Solution, Status
+from starpos.instrument.lens import EQUIDISTANT
 from starpos.night.reading import First, Given
 from starpos.night.work import Fitting, Identifying, OnFile
 from starpos.parallel.call import Here
@@ -20,10 +21,10 @@ from starpos.sky.catalogue import load_catalogue
 
 # of --csv
 COLUMNS = ("file", "status", "ra", "dec", "roll", "focal_px", "stars_detected", "stars_matched", "residual_arcsec",
-           "log_odds", "mirrored", "negative", "warnings", "cpu_ms")  # fmt: skip
+           "log_odds", "lens", "mirrored", "negative", "warnings", "cpu_ms")  # fmt: skip
 JSON_HELP = (
     "one JSON object a frame: ra, dec of the middle of the frame and roll, the position angle of its top, in deg (ICRS), "
-    "focal_px, residual_arcsec, log_odds of the answer against chance; status is ok, or why these are null"
+    "focal_px, lens, residual_arcsec, log_odds of the answer against chance; status is ok, or why these are null"
 )
 HEAD = (
     "file: right ascension and declination of the middle of the frame (deg, ICRS), direction of its top (deg, from north "
@@ -101,6 +102,7 @@ def as_json(path: str, s: Solution) -> dict:
         "stars_matched": len(s.names),
         "residual_arcsec": a.residual_arcsec if a else None,
         "log_odds": a.log_odds if a else None,
+        "lens": a.model if a else None,
         "mirrored": a.mirrored if a else None,
         "negative": s.negative,
         "status": s.status.value,
@@ -118,6 +120,7 @@ def _line(path: str, s: Solution) -> str:
         f"{path}: RA {np.degrees(a.ra):.5f} Dec {np.degrees(a.dec):+.5f} top at {np.degrees(a.roll):.3f} deg, "
         f"{len(s.names)} of {s.stars_detected} stars, residual {a.residual_arcsec:.2f} arcsec, "
         f"focal length {a.focal_px:.1f} px, log-odds {a.log_odds:.0f}"
+        + (", a fisheye" if a.model == EQUIDISTANT else "")
         + (", mirrored" if a.mirrored else "")
         + (", a negative" if s.negative else "")
         + "".join(f", {name}" for name in s.warnings)
