@@ -2,6 +2,7 @@
 """All-sky frames of which nothing is known: found behind horizons, trees, domes, aurora, Moon; never found wrong."""
 
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -77,6 +78,17 @@ def test_other_fields_and_sizes_are_found(width, height, radius_px, field_deg, s
     s = solver.identify(sky.stars)
     assert s.ok, s.message
     check(s, sky)
+
+
+def test_a_mirrored_frame_looks_where_the_other_does(solver, catalogue, rng):
+    sky = AllSky(catalogue=catalogue, rng=rng, limit_mag=5.0, off_px=15.0).horizon()
+    stars = sky.stars
+    s, flipped = solver.identify(stars), solver.identify(replace(stars, y=sky.height - 1 - stars.y))
+    check(s, sky)
+    assert flipped.ok and flipped.attitude.mirrored
+    assert np.degrees(np.arccos(min(1.0, axis_of(flipped) @ axis_of(s)))) < 0.05
+    turned = np.degrees(flipped.attitude.roll - s.attitude.roll - np.pi) % 360
+    assert min(turned, 360 - turned) < 0.2
 
 
 def test_most_stars_of_the_frame_are_named_though_the_lens_was_not_known(solver, catalogue, rng):
