@@ -104,6 +104,7 @@ NEWEST_ONLY = [
             "cli/test_cli_jobs",
             "detection/test_detection_sky",
             "identification/test_blind",
+            "identification/test_blind_fisheye",
             "identification/test_real_frames",
             "navigation/test_bad_records",
             "navigation/test_borne_out",
