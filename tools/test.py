@@ -29,7 +29,9 @@ LINTERS = [
     *(f"ruff {check} --output-format concise" for check in ("check", "format --check")),
     "codespell",
     "mypy",
+    "lint-imports --config tools/imports.ini --no-cache",
     f"{sys.executable} tools/walls.py",
+    "actionlint -no-color",
 ]
 # the site of the documents, whether each file has its licence, and the package's metadata, with what the first brings
 DOCS = [

@@ -109,6 +109,10 @@ class Camera:
         """The camera with its focal lengths multiplied by `factor`."""
         return replace(self, fx=self.fx * factor, fy=self.fy * factor)
 
+    def part(self, left: float, top: float, width: int, height: int) -> "Camera":
+        """The camera of a part of its frame, of a size in px and with its first pixel at that column and row."""
+        return replace(self, width=width, height=height, cx=self.cx - left, cy=self.cy - top)
+
     def sees(self, x: ArrayLike, y: ArrayLike) -> np.ndarray:
         """Whether pixels x, y (N,) lie within the lens's picture: around that of a fisheye the frame may be black."""
         places = self._places(x, y)

@@ -57,6 +57,7 @@ KEYS = (
     "shutter",
     "vertical",
 )
+SIDES = ("width", "height")
 SHUTTER = ("readout_s", "readout_stddev_s")
 VERTICAL = ("camera_to_itrs", "covariance_arcsec2", "sag_arcsec_per_sqrt_hour")
 
@@ -67,7 +68,8 @@ def read(path: Path | str) -> Instrument:
     starpos_instrument: 1
     camera: {focal_mm, pixel_um}, {focal_px} or {width, height, fx, fy, cx, cy, distortion: [k1, k2, p1, p2, k3]}
             or {calibration: camera.yaml}, a CameraInfo calibration file beside this one or at a full path; each of the
-            first three may have `model: equidistant`, of a fisheye, whose distortion is [k1, k2, k3, k4]
+            first three may have `model: equidistant`, of a fisheye, whose distortion is [k1, k2, k3, k4], and the first
+            two width and height: of the whole frame, in whose middle the optical axis is, and to which A3 belongs
     misalignment_deg: [rx, ry, rz]                       without one of the next two it is not known: 10 deg
     calibration_stddev_arcsec: [x, y, z]                 about the inclinometer's axes, or as
     calibration_covariance_arcsec2: [[..], [..], [..]]
@@ -121,6 +123,8 @@ def content_of(instrument: Instrument) -> dict[str, Any]:
         content["camera"] = {"width": camera.width, "height": camera.height}
         content["camera"] |= {k: float(getattr(camera, k)) for k in ("fx", "fy", "cx", "cy")}
         content["camera"]["distortion"] = [float(d) for d in camera.distortion]
+    elif instrument.frame_size is not None:
+        content["camera"] |= dict(zip(SIDES, instrument.frame_size, strict=True))
     if model != PLUMB_BOB:
         content["camera"]["model"] = model
     content["misalignment_deg"] = [float(a) for a in c.misalignment_deg]
@@ -158,6 +162,8 @@ def _from_mapping(content: dict, folder: Path) -> Instrument:
     _refuse_others(content, KEYS)
     camera, focal_px, model = _camera(content.get("camera"), folder)
     instrument = Instrument(focal_px, camera=camera, model=model, calibration=_calibration(content))
+    if camera is None and any(side in content["camera"] for side in SIDES):
+        instrument = replace(instrument, frame_size=_size(content["camera"]))
     if "link_to_camera" in content:
         link = _matrix(content["link_to_camera"], "link_to_camera")
         instrument = replace(instrument, link_to_camera=link)
@@ -211,10 +217,10 @@ def _camera(camera: object, folder: Path) -> tuple[Camera | None, float, str]:
     if model not in tuple(COEFFICIENTS):
         raise InstrumentError(f"the camera's model is {_short(model)}: give {' or '.join(COEFFICIENTS)}")
     if "focal_mm" in camera:
-        _refuse_others(camera, ("focal_mm", "pixel_um", "model"))
+        _refuse_others(camera, ("focal_mm", "pixel_um", *SIDES, "model"))
         return None, focal_px_of(_number(camera, "focal_mm"), _number(camera, "pixel_um")), model
     if "focal_px" in camera:
-        _refuse_others(camera, ("focal_px", "model"))
+        _refuse_others(camera, ("focal_px", *SIDES, "model"))
         return None, _number(camera, "focal_px"), model
     if "calibration" in camera:
         _refuse_others(camera, ("calibration",))
@@ -225,14 +231,10 @@ def _camera(camera: object, folder: Path) -> tuple[Camera | None, float, str]:
         full = camera_file.read(folder / camera["calibration"])
         return full, full.fx, PLUMB_BOB
     _refuse_others(camera, ("width", "height", "fx", "fy", "cx", "cy", "distortion", "model"))
-    for side in ("width", "height"):
-        if type(camera.get(side)) is not int or not 1 <= camera[side] <= LARGEST_SIDE:
-            raise InstrumentError(
-                f"the camera's {side} is {_short(camera.get(side))}: give a whole number of pixels"
-            )
+    width, height = _size(camera)
     full = Camera(
-        width=camera["width"],
-        height=camera["height"],
+        width=width,
+        height=height,
         fx=_number(camera, "fx"),
         fy=_number(camera, "fy"),
         cx=_number(camera, "cx"),
@@ -241,6 +243,16 @@ def _camera(camera: object, folder: Path) -> tuple[Camera | None, float, str]:
         model=model,
     )
     return full, full.fx, PLUMB_BOB
+
+
+def _size(camera: dict) -> tuple[int, int]:
+    """Width and height of a camera's frame."""
+    for side in SIDES:
+        if type(camera.get(side)) is not int or not 1 <= camera[side] <= LARGEST_SIDE:
+            raise InstrumentError(
+                f"the camera's {side} is {_short(camera.get(side))}: give a whole number of pixels"
+            )
+    return camera[SIDES[0]], camera[SIDES[1]]
 
 
 def _calibration(content: dict) -> Calibration:

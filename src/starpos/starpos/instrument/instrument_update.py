@@ -53,6 +53,8 @@ def check_fits(
         )
     if not camera_found and _lens(kept) != _lens(instrument):
         what = "camera"
+    elif not camera_found and None not in (kept.size, instrument.size) and kept.size != instrument.size:
+        what = "frame size"
     elif not fixed and _says_sensor(instrument) and _sensor(kept) != _sensor(instrument):
         what = "inclinometer"
     else:
@@ -88,6 +90,10 @@ def write(path: Path, instrument: Instrument, comment: str, *, camera_found: boo
         found = {*FOUND, *["camera"] * camera_found, *["tilt_pose_arcsec"] * pose}
         kept = yaml_file.load(path, "instrument file")
         changed = {k: v for k, v in kept.items() if k not in found} | {k: new[k] for k in found if k in new}
+        if not camera_found and instrument.frame_size is not None:
+            # to which the new A3 belongs
+            sides = dict(zip(instrument_file.SIDES, instrument.frame_size, strict=True))
+            changed["camera"] = kept["camera"] | sides
         order = ["starpos_instrument", *instrument_file.KEYS]
         new = {k: changed[k] for k in sorted(changed, key=order.index)}
     yaml_file.save(path, new, comment)

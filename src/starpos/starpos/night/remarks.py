@@ -25,6 +25,7 @@ class Kind(str, Enum):
 
     TILTS = "tilts"
     FOCAL_LENGTH = "focal length"
+    AXIS = "optical axis"
     EARTH_ROTATION = "earth rotation"
     LEFT_OUT = "left out"
     MOVED = "moved"
@@ -51,6 +52,11 @@ def of_tilts(log: TiltLog, path: str) -> tuple[Remark, ...]:
     """Say that a table of tilts looks like radians."""
     doubt = like_radians(log)
     return (Remark(Kind.TILTS, f"{path}: {doubt}"),) if doubt else ()
+
+
+def of_axis(doubt: str) -> tuple[Remark, ...]:
+    """Say that the optical axis of a night's frames is not known; doubt: the sentence, '' if it is."""
+    return (Remark(Kind.AXIS, doubt),) if doubt else ()
 
 
 def of_focal_length(place: str, focal_px: float) -> Remark:

@@ -72,7 +72,7 @@ class Identifying:
             solver = Solver(instrument, stars_known)
             # the frame reports the error
             with suppress(StarposError):
-                solver.prepare(item.width, item.height)
+                solver.prepare(item.width, item.height, item.origin_px)
             begin = time.process_time()
             sight = searching.identified(solver, item, stars_of(item))
         return sight, 1000 * (time.process_time() - begin)

@@ -177,9 +177,10 @@ PARAMETERS = (
     Parameter(
         "deflection.geoid",
         "",
-        "Geoid grid (GTX, GeoTIFF; in m) whose slopes are the deflection and whose roughness its error, instead of the "
-        "three above: a path, or a name among PROJ's grids such as egm96_15.gtx. '' for none. A coarse one misses 1 "
-        "arcsec in plains and 10 in mountains, and outside its area nothing is known again: 6 arcsec, 190 m.",
+        "Geoid grid (GTX, NGS .bin, GeoTIFF; in m) whose slopes are the deflection and whose roughness its error, "
+        "instead of the three above: a path, or a name among PROJ's grids such as egm96_15.gtx. '' for none. A coarse "
+        "one misses 1 arcsec in plains and 10 in mountains, and outside its area nothing is known again: 6 arcsec, "
+        "190 m.",
     ),
     Parameter("min_stars", 5, "Fewest identified stars that make a fix.", unit="", minimum=4, maximum=1000),
     Parameter(

@@ -1,0 +1,185 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The real `ros2 launch`, tf2, rosbag2 and robot_localization; each test skips where its program is absent.
+
+PyPI's ROS has none of them: these tests run in a ros:jazzy container (.github/workflows/ci.yml).
+"""
+
+import json
+import signal
+import subprocess
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+from ament_index_python.packages import PackageNotFoundError, get_package_share_directory
+from sensor_msgs.msg import NavSatFix
+
+from starpos_testing.graph.graph import Graph
+from starpos_testing.patience import WAIT_S
+from starpos_testing.skies.bags import knowing
+
+NIGHT = Path(__file__).parent / "data" / "night"
+PLACE = {"latitude": 48.1, "longitude": 11.6}
+CAMERA, INCLINOMETER, LINK = "starpos_camera_optical_frame", "starpos_inclinometer_frame", "starpos_link"
+
+
+def has(package: str) -> bool:
+    try:
+        return bool(get_package_share_directory(package))
+    except PackageNotFoundError:
+        return False
+
+
+def needs(*packages: str) -> pytest.MarkDecorator:
+    absent = [package for package in packages if not has(package)]
+    return pytest.mark.skipif(bool(absent), reason=f"ROS from apt alone has {', '.join(packages)}")
+
+
+@contextmanager
+def started(log: Path, *words: str):
+    """A command that runs meanwhile and is ended as Ctrl-C ends it; yields how to read what it has said."""
+    with log.open("w") as out, subprocess.Popen(words, stdout=out, stderr=subprocess.STDOUT) as process:
+        try:
+            yield log.read_text
+        finally:
+            process.send_signal(signal.SIGINT)
+            try:
+                process.wait(WAIT_S)
+            except subprocess.TimeoutExpired:
+                process.kill()
+
+
+@pytest.fixture(scope="module")
+def graph(domain):
+    """A node that only listens: a second publisher of tilts would look like a second instrument."""
+    graph = Graph()
+    for publisher in (graph.info, graph.capture, graph.stars, graph.tilt):
+        graph.node.destroy_publisher(publisher)
+    yield graph
+    graph.close()
+
+
+@pytest.fixture(scope="module")
+def fixes(graph):
+    return graph.hear(NavSatFix, "fix")
+
+
+@pytest.fixture(scope="module")
+def demo(graph, fixes, tmp_path_factory):
+    """The launch file of the simulated instrument, which has given a fix; its processes end cleanly."""
+    log = tmp_path_factory.mktemp("demo") / "launch.log"
+    place = [f"{name}:={value}" for name, value in PLACE.items()]
+    with started(
+        log, "ros2", "launch", "starpos_bringup", "demo.launch.py", "dashboard:=false", *place
+    ) as said:
+        graph.wait(lambda: any(fix.status.status >= 0 for fix in fixes), "for a fix of the demo")
+        yield said
+    assert said().count("process has finished cleanly") == said().count("process started with pid") == 4, (
+        said()
+    )
+
+
+@needs("ros2launch")
+def test_the_instrument_that_ros2_launch_starts_gives_its_place(demo, fixes):
+    [fix] = [fix for fix in fixes if fix.status.status >= 0][-1:]
+    sigma_deg = max(fix.position_covariance[0], fix.position_covariance[4]) ** 0.5 / 111e3
+    assert abs(fix.latitude - PLACE["latitude"]) < 5 * sigma_deg < 0.1
+
+
+@needs("ros2launch")
+@pytest.mark.parametrize("name", ["starpos", "instruments", "replay", "demo"])
+def test_ros2_launch_reads_every_launch_file(name):
+    words = ["ros2", "launch", "starpos_bringup", f"{name}.launch.py", "--show-args"]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=WAIT_S, check=False)
+    assert done.returncode == 0 and "'log_level'" in done.stdout, done.stderr
+
+
+@needs("ros2launch", "tf2_ros")
+@pytest.mark.usefixtures("demo")
+def test_tf2_knows_how_camera_and_inclinometer_sit_on_the_robot(graph):
+    from rclpy.time import Time
+    from tf2_ros import Buffer, TransformListener
+
+    tree = Buffer()
+    TransformListener(tree, graph.node)
+    for frame in (CAMERA, INCLINOMETER):
+        graph.wait(lambda frame=frame: tree.can_transform(LINK, frame, Time()), f"for {LINK} -> {frame}")
+
+
+@needs("ros2launch", "ros2bag")
+@pytest.mark.usefixtures("demo")
+def test_a_night_that_ros2_bag_records_is_worked_by_starpos_replay(graph, fixes, tmp_path):
+    topics = ["/stars", "/tilt", "/camera/camera_info"]
+    bag = tmp_path / "night"
+    before = len(fixes)
+    with started(tmp_path / "log", "ros2", "bag", "record", "-o", str(bag), *topics):
+        # the frame that is under way when the recorder begins may lack its tilts
+        graph.wait(lambda: len(fixes) >= before + 4, "for fixes while a bag is recorded")
+    words = ["starpos", "replay", str(bag), "--json", "-p", "misalignment:=[0.4, -0.3, 12.0]"]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=WAIT_S, check=False)
+    answers = [json.loads(line) for line in done.stdout.splitlines()]
+    assert done.returncode == 0 and any(answer["status"] == "ok" for answer in answers), done.stderr
+
+
+@needs("ros2bag")
+def test_ros2_bag_play_of_a_night_gives_its_place(graph, run, tmp_path):
+    truth = json.loads(NIGHT.with_suffix(".json").read_text())
+    fixes = graph.hear(NavSatFix, "played/fix")
+    moved = ("--ros-args", "-r", "__ns:=/played")
+    run("starpos_solver", "solver", *knowing(truth), arguments=moved)
+    renamed = [f"/{topic}:=/played/{topic}" for topic in ("stars", "tilt", "camera/camera_info")]
+    with started(
+        tmp_path / "log",
+        *("ros2", "bag", "play", str(NIGHT), "--clock", "--delay", "5", "--remap", *renamed),
+    ):
+        graph.wait(lambda: any(fix.status.status >= 0 for fix in fixes), "for a fix of the played night")
+    assert abs(fixes[-1].latitude - truth["latitude_deg"]) < 0.1
+
+
+@needs("ros2launch", "robot_localization", "tf2_ros")
+@pytest.mark.usefixtures("demo")
+def test_robot_localization_takes_the_recipe_and_gives_a_map(graph, tmp_path):
+    from geometry_msgs.msg import TransformStamped
+    from nav_msgs.msg import Odometry
+    from rclpy.time import Time
+    from tf2_ros import Buffer, StaticTransformBroadcaster, TransformListener
+
+    recipe = Path(get_package_share_directory("starpos_bringup")) / "config" / "robot_localization.yaml"
+    assert graph.set("solver", altitude=500.0, altitude_stddev=20.0)[0]
+    tree, standing = Buffer(), graph.node.create_publisher(Odometry, "wheel/odometry", 10)
+    TransformListener(tree, graph.node)
+    still = StaticTransformBroadcaster(graph.node)
+    links = [TransformStamped(child_frame_id=child) for child in ("base_link", LINK)]
+    for link, parent in zip(links, ("odom", "base_link"), strict=True):
+        link.header.frame_id, link.transform.rotation.w = parent, 1.0
+    still.sendTransform(links)
+    places = graph.hear(Odometry, "odometry/global")
+
+    def stand():
+        message = Odometry(child_frame_id="base_link")
+        message.header.frame_id = "odom"
+        message.header.stamp = graph.node.get_clock().now().to_msg()
+        message.pose.pose.orientation.w = 1.0
+        message.twist.covariance = [1e-4 if k % 7 == 0 else 0.0 for k in range(36)]
+        standing.publish(message)
+        return tree.can_transform("map", "odom", Time()) and places and places[-1].pose.covariance[0] < 1e6
+
+    parameters = ("--params-file", str(recipe), "-r", "odometry/filtered:=odometry/global")
+    ekf = ("ros2", "run", "robot_localization", "ekf_node", "--ros-args", "-r", "__node:=ekf_map")
+    navsat = (
+        "ros2",
+        "run",
+        "robot_localization",
+        "navsat_transform_node",
+        "--ros-args",
+        "-r",
+        "gps/fix:=fix",
+    )
+    with (
+        started(tmp_path / "ekf", *ekf, *parameters) as filtered,
+        started(tmp_path / "navsat", *navsat, *parameters) as placed,
+    ):
+        graph.wait(stand, "for a map that the fixes hold")
+        assert "[ERROR]" not in filtered() + placed()
+    # the first fix is the map's origin, and the robot stands
+    assert abs(places[-1].pose.pose.position.x) < 5 * places[-1].pose.covariance[0] ** 0.5
