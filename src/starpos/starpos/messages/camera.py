@@ -92,7 +92,7 @@ def message_to_frame(message: Any, source: str = "image_raw") -> Frame:
     dtype = np.dtype(kind).newbyteorder(">" if message.is_bigendian else "<")
     shape = (height, width) if channels == 1 else (height, width, channels)
     strides = (step, dtype.itemsize) if channels == 1 else (step, channels, 1)
-    pixels = np.ndarray(shape, dtype, message.data, strides=strides)
+    pixels: np.ndarray = np.ndarray(shape, dtype, message.data, strides=strides)
     if not pixels.dtype.isnative or not pixels.flags.aligned:
         pixels = pixels.astype(kind)
     return Frame(pixels, pattern=pattern, mid_unix_s=stamp_to_unix(message.header.stamp), source=source)
