@@ -68,7 +68,10 @@ def test_versions_that_are_not_ubuntus_are_named(tmp_path):
 
 
 def test_variables_name_the_ros_of_the_interpreter_that_has_its_own(tmp_path, tests):
-    theirs = {"AMENT_PREFIX_PATH": f"/ws/install:{tests.UNDERLAY / 'venv'}", "_ROS_WHEELS_BOOTSTRAP_COMPLETE": "1"}
+    theirs = {
+        "AMENT_PREFIX_PATH": f"/ws/install:{tests.UNDERLAY / 'venv'}",
+        "_ROS_WHEELS_BOOTSTRAP_COMPLETE": "1",
+    }
     assert tests.of_its_own_ros(theirs, tmp_path) == theirs
     (tmp_path / "messages").mkdir()
     assert tests.of_its_own_ros(theirs, tmp_path) == {"AMENT_PREFIX_PATH": f"/ws/install:{tmp_path}"}

@@ -39,7 +39,8 @@ DOCS = [
     ".underlay/docs/bin/python -m sphinx -W --keep-going -n -q -c docs . build/docs",
     ".underlay/docs/bin/python -m reuse lint --lines",
     # the wheel is made from the source package: what that lacks is missed here; nothing runs in it, so it is compiled quickly
-    f"env CC={ROOT}/tools/setup/cc_quickly .underlay/docs/bin/python -m build --no-isolation src/starpos --outdir build/dist",
+    f"env CC={ROOT}/tools/setup/cc_quickly"
+    " .underlay/docs/bin/python -m build --no-isolation src/starpos --outdir build/dist",
     ".underlay/docs/bin/python -m twine check --strict build/dist/*",
 ]
 # pytest's exit status where a -k left none.
