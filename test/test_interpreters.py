@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which interpreter a name means, what is said of the versions that tests run with, and what becomes of one that is absent."""
+"""Which interpreter a name means, what is said of the versions that tests run with, and of one that is absent."""
 
 import importlib.util
 import subprocess

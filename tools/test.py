@@ -3,10 +3,10 @@
 
 `test.py [PYTEST ARGUMENTS]`, `test.py --lint`. The last line counts what passed, failed and was skipped (a
 linter counts as one test); the exit status is 0 only where nothing failed. `test.py --ubuntu` runs packages' tests with
-the versions that Ubuntu 24.04 has (tools/setup/ubuntu), in an environment as bare as a newcomer's: without the counterparts
-that tools/setup/counterparts brings. `test.py --both` runs all, the core's tests with other interpreters that are at hand
-(tools/setup/core), builds the documents' site, looks through the licences and checks the package, which `test.py --docs`
-does alone: a warning is a failure.
+the versions that Ubuntu 24.04 has (tools/setup/ubuntu), in an environment as bare as a newcomer's: without the
+counterparts that tools/setup/counterparts brings. `test.py --both` runs all, and the core's tests with other interpreters
+that are at hand (tools/setup/core); it builds the documents' site, looks through the licences and checks the package,
+which `test.py --docs` does alone: a warning is a failure.
 """
 
 import os
@@ -38,7 +38,7 @@ DOCS = [
     "tools/setup/docs",
     ".underlay/docs/bin/python -m sphinx -W --keep-going -n -q -c docs . build/docs",
     ".underlay/docs/bin/python -m reuse lint --lines",
-    # the wheel is made from the source package: what that lacks is missed here; nothing runs in it, so it is compiled quickly
+    # the wheel is made from the source package: what that lacks is missed here; nothing runs in it: compiled quickly
     f"env CC={ROOT}/tools/setup/cc_quickly"
     " .underlay/docs/bin/python -m build --no-isolation src/starpos --outdir build/dist",
     ".underlay/docs/bin/python -m twine check --strict build/dist/*",
