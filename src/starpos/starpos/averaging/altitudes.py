@@ -242,7 +242,7 @@ def _sound(whole: _Directions) -> np.ndarray:
         return np.abs(whole.residual(zenith)[0]) / sigma
 
     zenith = min(_starts(whole), key=lambda start: float(np.median(size(start))), default=None)
-    rows = every
+    rows: np.ndarray = every
     for _ in range(JUDGED):
         if zenith is None:
             return every

@@ -101,7 +101,7 @@ def scatter_of(frames: Frames) -> Scatter:
     stated = own + frames.pose_sigma**2 * same_pose.kernel
     normal, pull, bare = _sums(y, j, stated)
     kinds: list[_Kind] = []
-    sizes = np.zeros(0)
+    sizes: np.ndarray = np.zeros(0)
     if 2 * len(y) - _told(normal, frames.prior_sigma) >= FEWEST_FREE:
         kinds = _wandering(frames, share, poses)
         of_poses = np.einsum("pk,kin->pin", poses, frames.design)

@@ -262,7 +262,8 @@ def _unhidden(find: FindPlumbLine, whole: Readings, solved: list[FixedFrame], a3
     Each is judged against a fit of the frames that lie closest to it, as many as must agree (least trimmed squares).
     Few poses fit almost anything; then these are all.
     """
-    rows = everyone = np.arange(len(solved))
+    everyone: np.ndarray = np.arange(len(solved))
+    rows = everyone
     most = int(np.ceil((1 - MOST_OUTLIERS) * len(solved)))
     if len(np.unique(whole.pose)) < MANY_POSES:
         return everyone
