@@ -27,7 +27,8 @@ from starpos_testing.skies.bags import part_of
 NIGHT = Path(__file__).parent / "data" / "night"
 SOAK = Path(__file__).parent.parent / "tools" / "soaks" / "soak.py"
 KNOWN = ("refraction.pressure:=66000.0", "refraction.temperature:=-4.0", "refraction.humidity:=0.4",
-         "misalignment:=[0.31, -0.22, 0.53]", "misalignment_stddev:=0.1")  # fmt: skip
+         "misalignment:=[0.31, -0.22, 0.53]", "misalignment_stddev:=0.1",
+         "inclinometer.model:=sca100t_calibrated")  # fmt: skip
 # Between ticks, as `ros2 bag play --clock` does.
 CLOCK_S = 0.025
 

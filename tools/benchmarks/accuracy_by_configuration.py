@@ -29,7 +29,7 @@ from starpos.instrument.tilt_log import TiltLog
 from starpos.rotation import half_turn
 from starpos.simulation.montecarlo_nights import (
     CAMERA,
-    COMPENSATED,
+    SCA100T_CALIBRATED,
     EXPOSURE_S,
     LEAN_DEG,
     READINGS,
@@ -49,7 +49,7 @@ SENSORS = {
     "IMU at rest (Bosch BMI088, data sheet)": sensors.BMI088,
     "SCA100T-D01 as sold (data sheet)": sensors.SCA100T,
     "SCL3300, digital, as sold (data sheet)": sensors.SCL3300,
-    "SCA100T, compensated and calibrated": COMPENSATED,
+    "SCA100T, compensated and calibrated": SCA100T_CALIBRATED,
     "tiltmeter of 0.1 arcsec": tiltmeter(0.1),
 }
 # headings, frames at each, s from frame to frame

@@ -169,7 +169,7 @@ def night(folder: Path) -> tuple[str, ...]:
     optics = ("--focal-mm", "600", "--pixel-um", "6.4")
     starpos(["simulate", str(folder / "night"), "-n", "1", "--stars-only", *optics])
     [stars] = (folder / "night").glob("stars_*.csv")
-    mounting = ("--misalignment", "0", "0", "0", "--misalignment-stddev", "5")
+    mounting = ("--misalignment", "0", "0", "0", "--misalignment-stddev", "5", "--inclinometer", "sca100t_calibrated")
     tilt = ("--tilt", str(folder / "night" / "tilt.csv"))
     return ("solve", str(stars), *tilt, *optics, *mounting, "--json")
 

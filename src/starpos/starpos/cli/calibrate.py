@@ -19,7 +19,7 @@ from starpos.cli.output import add_formats
 from starpos.cli.overwriting import CAMERA_NAME, Written
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import CalibrationError, FixError, FrameError, InstrumentError, StarposError
-from starpos.frames.pointings import read_pointings
+from starpos.frames.pointings import Pointing, read_pointings
 from starpos.frames.reading import why_no_time
 from starpos.frames.stars import Stars
 from starpos.instrument import camera_file, instrument_update
@@ -109,6 +109,8 @@ def _from_pointings(args: argparse.Namespace) -> int:
     """Calibrate from the pointings of a plate solver; returns the exit status."""
     pointings = read_pointings(args.pointings)
     whole = [p for p in pointings if p.has_roll]
+    if not whole and args.tilt is not None:
+        return _from_elevations(args, pointings)
     if len(whole) < len(pointings):
         console.complain("calibrate", f"{len(pointings) - len(whole)} pointings without a roll are left out")
     instrument = options.instrument_of(args, NO_CAMERA)
@@ -116,6 +118,19 @@ def _from_pointings(args: argparse.Namespace) -> int:
     tilts = _tilts(args, instrument)
     try:
         calibrate_site.run(args, whole, instrument, tilts)
+    except FixError as e:
+        console.complain("calibrate", e)
+        return NOTHING
+    return 0
+
+
+def _from_elevations(args: argparse.Namespace, pointings: Sequence[Pointing]) -> int:
+    """Calibrate from pointings without a roll, whose elevations determine A3's axis; returns the exit status."""
+    instrument = options.instrument_of(args, NO_CAMERA)
+    calibrate_site.check_output(args, instrument)
+    tilts = _tilts(args, instrument)
+    try:
+        calibrate_site.run_elevations(args, pointings, instrument, tilts)
     except FixError as e:
         console.complain("calibrate", e)
         return NOTHING

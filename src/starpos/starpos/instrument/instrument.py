@@ -17,6 +17,7 @@ from starpos.instrument.inclinometer import InclinometerErrors
 from starpos.instrument.lens import PLUMB_BOB
 from starpos.instrument.mounting import Mounting
 from starpos.instrument.response import COEFFICIENTS
+from starpos.instrument.sensors import UNNAMED
 from starpos.units import ARCSEC, DAY_S
 from starpos.utc import utc_text
 
@@ -219,7 +220,7 @@ class Instrument:
     model               of the lens of that ideal camera: PLUMB_BOB, or EQUIDISTANT for a fisheye
     calibration         A3 and its errors
     link_to_camera      (3, 3): base link into C
-    inclinometer        its errors
+    inclinometer        its errors; unless stated, those of an SCA100T as sold
     inclinometer_model  name in sensors.PRESETS that these errors began with; '': none
     clock_stddev_s      standard deviation of the clock against UTC, s
     shutter             times of the camera's rows; None: as the source of the frames states them
@@ -233,7 +234,7 @@ class Instrument:
     model: str = PLUMB_BOB
     calibration: Calibration = field(default_factory=Calibration)
     link_to_camera: tuple = TOP_OF_FRAME
-    inclinometer: InclinometerErrors = field(default_factory=InclinometerErrors)
+    inclinometer: InclinometerErrors = UNNAMED
     inclinometer_model: str = ""
     clock_stddev_s: float = UNKNOWN_CLOCK_S
     shutter: Shutter | None = None

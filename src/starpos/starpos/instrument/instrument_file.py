@@ -23,6 +23,8 @@ from starpos.utc import unix_of, utc_text
 
 FORMAT = 1
 MOST_FRAMES = 1 << 31
+# focal length of a camera that a file for pointings does not name: it counts for nothing
+POINTED_FOCAL_PX = 10_000.0
 # By key of the file: field of InclinometerErrors, and unit (rad or 1).
 INCLINOMETER = {
     "tilt_noise_deg": ("noise_rad", math.radians(1)),
@@ -62,7 +64,7 @@ SHUTTER = ("readout_s", "readout_stddev_s")
 VERTICAL = ("camera_to_itrs", "covariance_arcsec2", "sag_arcsec_per_sqrt_hour")
 
 
-def read(path: Path | str) -> Instrument:
+def read(path: Path | str, needs_camera: bool = True) -> Instrument:
     """Read an Instrument from its YAML file; InstrumentError says why a file cannot be used. The format:
 
     starpos_instrument: 1
@@ -90,6 +92,8 @@ def read(path: Path | str) -> Instrument:
     shutter: {readout_s: 0.03, readout_stddev_s: 0}      from the row read first to the last; negative: bottom row first
     vertical: {camera_to_itrs, covariance_arcsec2, sag_arcsec_per_sqrt_hour}
                                                          of a camera fixed to the ground, in place of tilt_...
+
+    needs_camera: whether a file without a camera is refused; pointings need none.
     """
     path = Path(path)
     content = yaml_file.load(path, "instrument file")
@@ -98,7 +102,7 @@ def read(path: Path | str) -> Instrument:
             f"{path}: no instrument file of format {FORMAT}: its first key is `starpos_instrument: {FORMAT}`"
         )
     try:
-        return _from_mapping(content, path.parent)
+        return _from_mapping(content, path.parent, needs_camera)
     except InstrumentError as e:
         raise InstrumentError(f"{path}: {e}") from None
 
@@ -158,17 +162,20 @@ def content_of(instrument: Instrument) -> dict[str, Any]:
     return content
 
 
-def _from_mapping(content: dict, folder: Path) -> Instrument:
+def _from_mapping(content: dict, folder: Path, needs_camera: bool) -> Instrument:
     _refuse_others(content, KEYS)
-    camera, focal_px, model = _camera(content.get("camera"), folder)
+    if "camera" in content or needs_camera:
+        camera, focal_px, model = _camera(content.get("camera"), folder)
+    else:
+        camera, focal_px, model = None, POINTED_FOCAL_PX, PLUMB_BOB
     instrument = Instrument(focal_px, camera=camera, model=model, calibration=_calibration(content))
-    if camera is None and any(side in content["camera"] for side in SIDES):
+    if camera is None and any(side in content.get("camera", ()) for side in SIDES):
         instrument = replace(instrument, frame_size=_size(content["camera"]))
     if "link_to_camera" in content:
         link = _matrix(content["link_to_camera"], "link_to_camera")
         instrument = replace(instrument, link_to_camera=link)
-    sensor, errors = _sensor(content)
     given = {name: _error(content, key, unit) for key, (name, unit) in INCLINOMETER.items() if key in content}
+    sensor, errors = _sensor(content, bool(given))
     instrument = replace(instrument, inclinometer=replace(errors, **given), inclinometer_model=sensor)
     if "vertical" in content:
         if given or sensor:
@@ -298,8 +305,13 @@ def _calibration(content: dict) -> Calibration:
     return replace(calibration, utc_unix_s=utc, frames=frames, **more)
 
 
-def _sensor(content: dict) -> tuple[str, InclinometerErrors]:
-    """Model of the inclinometer ('' without one) and the errors that this gives."""
+def _sensor(content: dict, stated: bool) -> tuple[str, InclinometerErrors]:
+    """Model of the inclinometer ('' without one) and the errors that this gives; stated: whether the file states some.
+
+    A file that states some without a model speaks of a sensor that was measured: the others are those of a good one.
+    """
+    if "inclinometer" not in content and stated:
+        return "", InclinometerErrors()
     about = content.get("inclinometer", {"model": ""})
     if not isinstance(about, dict) or not isinstance(about.get("model"), str):
         raise InstrumentError(f"inclinometer is {_short(about)}: give {{model: NAME}}")

@@ -44,6 +44,7 @@ def knowing(truth: dict) -> list[str]:
         "refraction.humidity": truth["humidity"],
         "misalignment": truth["misalignment_deg"],
         "misalignment_stddev": 0.1,
+        "inclinometer.model": "sca100t_calibrated",
     }
     return [f"{name}:={value}" for name, value in values.items()]
 
