@@ -80,8 +80,8 @@ def run(args: argparse.Namespace) -> int:
                 found = sight.solution
             any_found |= found.ok
             lost = path if lost is None and found.status is Status.NOT_IDENTIFIED else lost
-            if not found.ok:
-                console.complain("identify", found.message)
+            if not found.ok or found.remark:
+                console.complain("identify", found.remark or found.message)
             output.put(as_json(path, found) | {"cpu_ms": cpu_ms}, _line(path, found))
     if lost is not None and not any_found:
         for remark in Fitting(given)(read(lost)):

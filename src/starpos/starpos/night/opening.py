@@ -62,6 +62,7 @@ class NightOnDisk:
             progress,
         )
 
+
 def open_night(
     folder: str | Path,
     *,

@@ -24,6 +24,7 @@ from starpos.identification.blind import STAGES
 from starpos.identification.hint import Hint
 from starpos.identification.search import Priors
 from starpos.identification.second_look import ENOUGH
+from starpos.instrument.instrument import Instrument
 from starpos.instrument.tilts import Tilts
 
 if TYPE_CHECKING:
@@ -43,10 +44,14 @@ NEVER_S = math.inf
 
 @dataclass(frozen=True, eq=False)
 class Sight:
-    """A frame as it was seen: stars of it, and the solution that they gave."""
+    """A frame as it was seen: stars of it, and the solution that they gave.
+
+    instrument: with the focal length that fits, where that of the frame's header does not; else None.
+    """
 
     stars: Stars
     solution: Solution
+    instrument: Instrument | None = None
 
     @property
     def found(self) -> Identification | None:

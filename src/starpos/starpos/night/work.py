@@ -17,6 +17,7 @@ from starpos.frames.stars import Stars
 from starpos.identification.hint import Hint
 from starpos.instrument.tilts import NO_TILTS, Tilts
 from starpos.night import searching
+from starpos.night.hints import without_hint
 from starpos.night.reading import Instruments, Reader, TiltFile, stars_of
 from starpos.night.remarks import Remark, of_focal_length
 from starpos.night.searching import Sight
@@ -79,8 +80,21 @@ class Identifying:
             with suppress(StarposError):
                 solver.prepare(item.width, item.height, item.origin_px)
             begin = time.process_time()
-            sight = searching.identified(solver, item, stars_of(item))
+            sight = self._by_focal_length(solver, item)
         return sight, 1000 * (time.process_time() - begin)
+
+    def _by_focal_length(self, solver: Solver, item: Frame | Stars) -> Sight:
+        stars = stars_of(item)
+
+        def work(solver: Solver) -> Sight:
+            return searching.identified(solver, item, stars)
+
+        sight = work(solver)
+        return (
+            without_hint(solver, item, stars, sight, work, self.progress)
+            if self.instruments.hinted
+            else sight
+        )
 
 
 @dataclass(frozen=True)
@@ -91,7 +105,8 @@ class Fitting:
 
     def __call__(self, item: Frame | Stars) -> tuple[Remark, ...]:
         instrument = self.instruments.of(item)
-        if instrument is None:
+        # without its header's focal length a frame was searched already
+        if instrument is None or self.instruments.hinted:
             return ()
         solver = Solver(instrument, catalogue.load_catalogue())
         focal_px = searching.focal_px_that_fits(solver, stars_of(item))
@@ -103,11 +118,13 @@ class Solving:
     """Solves a frame, identified by every way there is: its Solution.
 
     tilts: not asked of a camera that is fixed to the ground.
+    progress: of the search for a focal length.
     """
 
     instruments: Instruments
     atmosphere: Atmosphere
     tilts: Tilts = NO_TILTS
+    progress: Progress = quiet
 
     def __call__(self, item: Frame | Stars) -> Solution:
         return self.sight(item).solution
@@ -123,4 +140,14 @@ class Solving:
 
     def sight(self, item: Frame | Stars, hint: Hint | None = None) -> Sight:
         """The solution of a frame, and the stars that gave it; hint: of the frame before."""
-        return searching.solved(self.solver(item), item, stars_of(item), self.tilts, hint)
+        solver, stars = self.solver(item), stars_of(item)
+
+        def work(solver: Solver) -> Sight:
+            return searching.solved(solver, item, stars, self.tilts, hint)
+
+        sight = work(solver)
+        return (
+            without_hint(solver, item, stars, sight, work, self.progress)
+            if self.instruments.hinted
+            else sight
+        )
