@@ -7,7 +7,7 @@ A night that `starpos simulate night` has written:
 
     >>> import starpos
     >>> known = starpos.Calibration.of((0, 0, 0), (5, 5, 5))  # A3 in deg, its errors in arcsec
-    >>> night = starpos.open_night("night", calibration=known)
+    >>> night = starpos.open_night("night", calibration=known, inclinometer="sca100t_calibrated")
     >>> night
     <night: 5 frames and tilt.csv, to be solved>
     >>> answer = night.solve()

@@ -40,8 +40,12 @@ TURN_SIGMA = 3.0
 OUTLIER_SIGMA, MOST_OUTLIERS, JUDGED = 6.0, 1 / 3, 5
 # of so many poses two thirds leave the fit, with its five parameters, free enough to judge the others
 MANY_POSES = 10
-# poses that scatter more than any inclinometer were moved, or are of several places
-MOST_POSE_RAD = np.radians(0.15)
+# frames that scatter more than any inclinometer or mount were moved, or are of several places
+MOST_POSE_RAD = np.radians(0.5)
+# a noise so many times a frame's own error is worth stating
+NOISIER = 1.0
+# a coefficient of the response is shown by so many of its sigma
+SHOWN_SIGMA = 3.0
 # chi-square per degree of freedom of frames too few to tell their scatter
 MOST_SCATTER = 16.0
 # share by which a coefficient of the response must be known better, or worse, than stated to be worth keeping
@@ -59,12 +63,14 @@ class Calibrated:
     """An instrument with its new A3, and each frame solved with it.
 
     plumb_stddev_arcsec: sigma of the plumb line in the camera, on the worse of two axes.
+    beyond: a sentence on how much the frames scatter beyond the stated errors, and what to state; '' if they do not.
     The budgets of the fixes take A3 as unknown, because the calibration was made from the same frames.
     """
 
     instrument: Instrument
     plumb_stddev_arcsec: float
     solutions: tuple[Solution, ...]
+    beyond: str = ""
 
     @property
     def fixes(self) -> list[Fix]:
@@ -161,7 +167,7 @@ def calibrate(
     instrument = replace(
         solver.instrument, calibration=_dated(agreement, errors), inclinometer=agreement.errors(errors)
     )
-    return Calibrated(instrument, error, tuple(solutions))
+    return Calibrated(instrument, error, tuple(solutions), agreement.beyond(errors))
 
 
 @dataclass(frozen=True)
@@ -179,8 +185,50 @@ class _Agreement:
     left_out: dict[float, float]
 
     def errors(self, stated: InclinometerErrors) -> InclinometerErrors:
-        """The inclinometer's errors, with those of its poses as these show them."""
-        return replace(stated, pose_rad=self.scatter.pose_sigma)
+        """The inclinometer's errors, with its noise and those of its poses as these frames show them."""
+        noise = stated.noise_rad
+        if self._noisy:
+            samples = np.mean([s.tilt.samples for s in self.sound])
+            noise = float(np.hypot(noise, self.scatter.noise_sigma * np.sqrt(samples)))
+        return replace(stated, pose_rad=self.scatter.pose_sigma, noise_rad=noise)
+
+    @property
+    def _noisy(self) -> bool:
+        own = float(np.sqrt(np.median(self.readings.sigma**2)))
+        return self.scatter.evident and self.scatter.noise_sigma > NOISIER * own
+
+    def beyond(self, stated: InclinometerErrors) -> str:
+        """Say by how much the frames scatter beyond the stated errors, and what to state; '' if they do not."""
+        found = self.errors(stated)
+        scale = self.plumb.response[self._scales]
+        shown = np.abs(scale) > SHOWN_SIGMA * np.hypot(
+            np.sqrt(np.diag(self.plumb.response_covariance))[self._scales], stated.scale
+        )
+        told, state = [], []
+        if found.noise_rad > stated.noise_rad:
+            noise = np.degrees(found.noise_rad)
+            told.append(f"noise of {noise:.2g} deg a reading ({np.degrees(stated.noise_rad):.2g} stated)")
+            state.append(f"tilt_noise_deg: {noise:.2g}")
+        if self.scatter.evident and found.pose_rad > stated.pose_rad:
+            told.append(
+                f"{np.degrees(found.pose_rad):.2g} deg from pose to pose ({np.degrees(stated.pose_rad):.2g} stated)"
+            )
+            state.append(f"tilt_pose_arcsec: {found.pose_rad / ARCSEC:.2g}")
+        if shown.any():
+            worst = float(scale[np.argmax(np.abs(scale))])
+            told.append(f"a scale that is {100 * worst:+.2g} % off ({100 * stated.scale:.2g} stated)")
+            state.append(f"tilt_scale: {abs(worst):.2g}")
+        if not told:
+            return ""
+        return (
+            f"the tilts err by more than is stated of the inclinometer: {', '.join(told)}; the claim holds it, and so does "
+            f"the file that is written with A3; in another, state {', '.join(state)}"
+        )
+
+    @property
+    def _scales(self) -> slice:
+        axes = self.sound[0].tilt.axes
+        return slice(axes, 2 * axes)
 
     def check(self) -> None:
         """Raise FixError if the frames are not of one zenith."""
@@ -190,7 +238,7 @@ class _Agreement:
             raise FixError(
                 f"{len(self.left_out)} of {of} frames disagree with the others on the zenith: {why}"
             )
-        scatter = max(self.scatter.pose_sigma, self.scatter_left)
+        scatter = self.scatter_left
         # too few to tell how much they scatter, they must agree as they state
         if scatter > MOST_POSE_RAD or (self.plumb.scatter > MOST_SCATTER and not self.scatter.evident):
             raise FixError(
@@ -226,11 +274,9 @@ def _agreed(
     readings = whole.take(rows)
     _, scatter = settled(plumb, readings)
     # once more about the answer, with what the poses tell of their errors
-    again = find(replace(readings, pose_sigma=scatter.pose_sigma), a3, fixes)
+    noisy = np.hypot(readings.sigma, scatter.noise_sigma)
+    again = find(replace(readings, pose_sigma=scatter.pose_sigma, sigma=noisy), a3, fixes)
     plumb, scatter = settled(again, readings)
-    # errors that poses share in part leave the zenith less certain than as many errors of their own do
-    alike = max(plumb.zenith_sigma / again.zenith_sigma, 1.0)
-    scatter = replace(scatter, pose_sigma=scatter.pose_sigma * alike)
     left_out = {}
     if len(rows) < len(solved):
         # how far the others are off shows against the answer of these
@@ -262,7 +308,8 @@ def _unhidden(find: FindPlumbLine, whole: Readings, solved: list[FixedFrame], a3
     Each is judged against a fit of the frames that lie closest to it, as many as must agree (least trimmed squares).
     Few poses fit almost anything; then these are all.
     """
-    rows = everyone = np.arange(len(solved))
+    everyone: np.ndarray = np.arange(len(solved))
+    rows = everyone
     most = int(np.ceil((1 - MOST_OUTLIERS) * len(solved)))
     if len(np.unique(whole.pose)) < MANY_POSES:
         return everyone

@@ -10,7 +10,7 @@ from starpos.instrument.instrument import Instrument
 from starpos.instrument.lens import PLUMB_BOB
 from starpos.night.doubts import NEAR_KM, Near
 from starpos.night.reading import About, Given, Reader, TiltFile
-from starpos.night.remarks import of_tilts
+from starpos.night.remarks import of_inclinometer, of_tilts
 
 
 def reader_of(args: argparse.Namespace) -> Reader:
@@ -34,9 +34,12 @@ def is_untold(args: argparse.Namespace) -> bool:
 
 
 def checked_tilts(command: str, path: str, instrument: Instrument) -> TiltFile:
-    """The table of tilts, with a complaint where it looks like radians; raises TiltError as `read_tilt_csv` does."""
+    """The table of tilts, with a complaint where it looks like radians, or where nobody names the inclinometer.
+
+    Raises TiltError as `read_tilt_csv` does.
+    """
     file = TiltFile(path, instrument.inclinometer.noise_rad)
-    for remark in of_tilts(file.log, path):
+    for remark in (*of_inclinometer(instrument), *of_tilts(file.log, path)):
         console.complain(command, remark)
     return file
 

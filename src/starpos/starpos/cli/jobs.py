@@ -70,5 +70,5 @@ def prepare(command: str, instrument: Instrument, about: About) -> None:
     solver = Solver(instrument, catalogue.load_catalogue(), progress=console.ProgressBar())
     # the frames report the error
     with suppress(StarposError):
-        if thin := solver.prepare(about.width, about.height):
+        if thin := solver.prepare(about.width, about.height, about.origin_px):
             console.complain(command, thin)

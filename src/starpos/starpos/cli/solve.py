@@ -3,7 +3,7 @@
 
 import argparse
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from starpos.cli import console, jobs, options, overwriting, solve_pointings
 from starpos.cli.archive import NightFolder, frames_among, nights_of
@@ -16,6 +16,7 @@ from starpos.cli.solved_night import check_save, say, tell, tell_turned
 from starpos.errors import FrameError, InstrumentError, StarposError, TiltError
 from starpos.fix.solver import Solver
 from starpos.instrument import instrument_update
+from starpos.instrument.axis import with_frame_size
 from starpos.instrument.tilts import NO_TILTS, Tilts
 from starpos.night.reading import About, First, Given, Reader, stars_of
 from starpos.night.together import turned
@@ -118,8 +119,10 @@ def _plan(args: argparse.Namespace, night: NightFolder, about: About | None, rea
     # without a frame that can be read, each one reports why it cannot
     if about is None:
         return Plan(night, OnFile(read, stars_of), Given(None))
-    instrument, air = options.instrument_of(args, about), options.atmosphere_of(args)
-    given = given_of(args, about)
+    instrument, doubt = with_frame_size(options.instrument_of(args, about), about)
+    if doubt:
+        console.complain("solve", doubt)
+    given, air = replace(given_of(args, about), instrument=instrument), options.atmosphere_of(args)
     check_save(args, instrument)
     tilts = NO_TILTS if night.tilt is None else checked_tilts("solve", night.tilt, instrument)
     jobs.prepare("solve", instrument, about)

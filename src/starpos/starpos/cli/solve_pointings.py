@@ -3,6 +3,7 @@
 
 import argparse
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -12,6 +13,7 @@ from starpos.cli.deflection import tell_unknown, vertical_of
 from starpos.cli.fix_output import COLUMNS, HEAD, json_of, put_combined
 from starpos.cli.inputs import checked_tilts, near_of
 from starpos.cli.output import Output
+from starpos.cli.overwriting import save_instrument
 from starpos.cli.solved_night import NO_FIX, check_save, say, tell, tell_turned
 from starpos.earth.vertical import Vertical
 from starpos.errors import InstrumentError, StarposError
@@ -20,8 +22,10 @@ from starpos.fix.solver import Solver
 from starpos.frames.pointings import Pointing, read_pointings
 from starpos.instrument.tilts import NO_TILTS, Tilts
 from starpos.night.doubts import Near
+from starpos.calibration.axis import FoundAxis
 from starpos.night.elevations import from_elevations
 from starpos.night.reading import NO_CAMERA
+from starpos.night.remarks import WORTH_SAVING_ARCSEC
 from starpos.night.together import turned
 from starpos.sky import catalogue
 from starpos.utc import utc_text
@@ -46,10 +50,6 @@ def run(args: argparse.Namespace) -> int:
     whole = [p for p in pointings if p.has_roll]
     output = Output(args, COLUMNS, HEAD if whole else ELEVATIONS_HEAD)
     if not whole:
-        if args.self_calibrate:
-            raise InstrumentError(
-                "--self-calibrate needs pointings with their roll: elevations alone do not tell A3"
-            )
         return _from_elevations(args, output, solver, tilts, pointings, vertical, near)
     night = NightFolder(tuple(p.source for p in pointings), args.tilt)
     if args.self_calibrate:
@@ -79,7 +79,7 @@ def _from_elevations(
     near: Near | None,
 ) -> int:
     """Print the zenith distance of each row and the place that they tell together; returns the exit status."""
-    found = from_elevations(solver, pointings, tilts, near)
+    found = from_elevations(solver, pointings, tilts, near, args.self_calibrate)
     for p, circle in zip(pointings, found.circles, strict=True):
         if isinstance(circle, StarposError):
             console.complain("solve", circle)
@@ -87,6 +87,11 @@ def _from_elevations(
         else:
             _put_row(output, p, circle.zenith_distance, ELEVATION, vertical)
     whole, night = found.together, NightFolder((), args.tilt)
+    saving = 0
+    if found.axis is not None:
+        say(night, f"A3 from the elevations: the frame's centre in the inclinometer to {found.axis.stddev_arcsec:.0f} arcsec")
+    if args.save is not None:
+        saving = _save(args, solver, found.axis)
     say(night, *([whole.why_not] if whole.why_not else ()), *whole.remarks)
     place, about = whole.average, {}
     if place is not None:
@@ -94,7 +99,18 @@ def _from_elevations(
         about = {} if near is None else {"km_from_near": near.km_from(place.latitude, place.longitude)}
     if place is not None or whole.why_not:
         put_combined(output, night, place, [], set(), vertical, about)
-    return 0 if place else NO_FIX
+    return max(saving, 0 if place else NO_FIX)
+
+
+def _save(args: argparse.Namespace, solver: Solver, axis: FoundAxis | None) -> int:
+    """Write the A3 that the elevations determined, as --save asks; NO_FIX if they did not."""
+    if axis is None or axis.stddev_arcsec > WORTH_SAVING_ARCSEC:
+        console.complain("solve", f"{args.save} is not written: the elevations hardly determine A3")
+        return NO_FIX
+    calibration = axis.calibration(solver.instrument.calibration, options.turn_of(args))
+    about = f"A3 of elevations alone: the frame's centre to {axis.stddev_arcsec:.2f} arcsec"
+    save_instrument("solve", args.save, replace(solver.instrument, calibration=calibration), about)
+    return 0
 
 
 def _put_row(

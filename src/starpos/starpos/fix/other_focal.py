@@ -23,7 +23,7 @@ def focal_that_fits(solver: Solver, stars: Stars, until_s: float = math.inf) -> 
     if len(on) < FEWEST_STARS:
         return None
     try:
-        given, catalogue, triangles = solver.view(on.width, on.height)
+        given, catalogue, triangles = solver.view(on.width, on.height, on.origin_px)
         sky = Sky.at(catalogue, triangles, on.mid_unix_s)
         for k in sorted(range(-TRIES, TRIES + 1), key=abs):
             if time.monotonic() >= until_s:

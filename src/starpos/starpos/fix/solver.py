@@ -57,12 +57,12 @@ class Solver:
     min_stars: int = 5
     progress: Progress = quiet
 
-    def prepare(self, width: int, height: int) -> str:
+    def prepare(self, width: int, height: int, origin_px: tuple[float, float] | None = None) -> str:
         """Load the tables for frames of this size in px, or build them; raises StarposError.
 
         Returns what such a field lacks in the catalogue, as `too_thin` says it, '' if nothing.
         """
-        camera, catalogue, triangles = self.view(width, height)
+        camera, catalogue, triangles = self.view(width, height, origin_px)
         Sky(catalogue, triangles).load()
         return deeper.too_thin(catalogue, camera)
 
@@ -76,9 +76,9 @@ class Solver:
         """
         begin = time.perf_counter()
         try:
-            camera, catalogue, triangles = self.view(stars.width, stars.height)
+            camera, catalogue, triangles = self.view(stars.width, stars.height, stars.origin_px)
             if part != 1.0:
-                triangles = self.triangles_of(stars.width, stars.height, part)
+                triangles = self.triangles_of(stars.width, stars.height, part, stars.origin_px)
             sky = Sky.at(catalogue, triangles, stars.mid_unix_s)
             field: FrameStars | wide.WideField | None = as_seen(camera, stars)
             if field is None:
@@ -118,7 +118,7 @@ class Solver:
             return self.solve(stars.take(rows), tilts, hint, predicted, known).among(stars, rows)
         try:
             state, tilt = self.levelled(stars, tilts)
-            camera, catalogue, triangles = self.view(stars.width, stars.height)
+            camera, catalogue, triangles = self.view(stars.width, stars.height, stars.origin_px)
             g = self.instrument.mounting.level(tilt).camera
             begin = time.perf_counter()
             directions = self.atmosphere.refraction().unbend(directions_of(camera, stars) @ g.T) @ g
@@ -185,7 +185,7 @@ class Solver:
     def levelled(self, frame: Stars | Pointing, tilts: Tilts) -> tuple[EarthState, Tilt]:
         """State of the Earth and the tilt at a frame; StarposError if its time or the tilt cannot be used."""
         if frame.mid_unix_s is None:
-            raise TimeError(f"{frame.place}: no time of exposure: {why_no_time(frame.source)}")
+            raise TimeError(f"{frame.place}: no time of exposure: {why_no_time(frame)}")
         state = earth_state(frame.mid_unix_s)
         if self.instrument.vertical is not None:
             tilts = OWN_LEVEL
@@ -251,14 +251,20 @@ class Solver:
         return self.instrument.shutter or stars.shutter or UNKNOWN
 
     @cached_property
-    def _views(self) -> dict[tuple[int, int], tuple[Camera, Catalogue, TriangleCatalogue]]:
-        """What `view` has given last, by size."""
+    def _views(self) -> dict[tuple, tuple[Camera, Catalogue, TriangleCatalogue]]:
+        """What `view` has given last, by size and origin."""
         return {}
 
-    def view(self, width: int, height: int) -> tuple[Camera, Catalogue, TriangleCatalogue]:
-        """Camera for frames of this size in px, catalogue for its field and its triangles; raises StarposError."""
-        if (width, height) not in self._views:
-            camera = self.instrument.camera_for(width, height)
+    def view(
+        self, width: int, height: int, origin_px: tuple[float, float] | None = None
+    ) -> tuple[Camera, Catalogue, TriangleCatalogue]:
+        """Camera for frames of this size in px, catalogue for its field and its triangles; raises StarposError.
+
+        origin_px: column and row of the camera's whole frame at which they begin, as their Exposure has it.
+        """
+        key = width, height, origin_px
+        if key not in self._views:
+            camera = self.instrument.camera_for(width, height, origin_px)
             field_deg = math.degrees(2 * camera.half_diagonal_rad)
             if field_deg < SMALLEST_FIELD_DEG or (field_deg > LARGEST_FIELD_DEG and not wide.is_wide(camera)):
                 raise InstrumentError(
@@ -270,18 +276,20 @@ class Solver:
             triangles = triangle_cache.cached(catalogue, wide.field_rad(camera), self.progress)
             # one size is usual
             self._views.clear()
-            self._views[width, height] = camera, catalogue, triangles
-        return self._views[width, height]
+            self._views[key] = camera, catalogue, triangles
+        return self._views[key]
 
-    def triangles_of(self, width: int, height: int, part: float) -> TriangleCatalogue:
+    def triangles_of(
+        self, width: int, height: int, part: float, origin_px: tuple[float, float] | None = None
+    ) -> TriangleCatalogue:
         """Triangles for a part of such frames, as `identify` has it, from the cache or built."""
-        camera, catalogue, _ = self.view(width, height)
+        camera, catalogue, _ = self.view(width, height, origin_px)
         return triangle_cache.cached(catalogue, part * wide.field_rad(camera), self.progress)
 
     def _inside(self, stars: Stars) -> np.ndarray | None:
         """Rows of the stars that lie on their frame and in its lens's picture; None if all do, as is usual."""
         try:
-            return inside(stars, self.instrument.camera_for(stars.width, stars.height))
+            return inside(stars, self.instrument.camera_for(stars.width, stars.height, stars.origin_px))
         # who asks for the camera next reports the error
         except InstrumentError:
             return None

@@ -115,8 +115,8 @@ def sighting_of(stars: Stars, eye: solver.Solver) -> IdentifiedFrame:
     """Identify the stars of a frame wherever it looks; a StarposError says why it cannot be used."""
     mid_unix_s = stars.mid_unix_s
     if mid_unix_s is None:
-        raise TimeError(f"{stars.place}: no time of exposure: {why_no_time(stars.source)}")
-    camera, catalogue, triangles = eye.view(stars.width, stars.height)
+        raise TimeError(f"{stars.place}: no time of exposure: {why_no_time(stars)}")
+    camera, catalogue, triangles = eye.view(stars.width, stars.height, stars.origin_px)
     if wide.is_wide(camera):
         raise InstrumentError(
             f"{stars.place}: frames of a fisheye tell no place under way: take a narrower lens"

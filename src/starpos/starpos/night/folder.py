@@ -19,29 +19,30 @@ from starpos.instrument.inclinometer import SCA100T_NOISE_RAD
 from starpos.instrument.tilt_table import read_tilt_csv
 from starpos.instrument.tilts import NoTilts, Tilts
 from starpos.night.night import Truth
-from starpos.night.reading import Instruments
-from starpos.night.remarks import Remark, of_tilts
+from starpos.night.reading import First, Given, Reader
+from starpos.night.remarks import of_inclinometer, of_tilts
 from starpos.night.solving import Exposures
 from starpos.night.work import Solving
 
 TRUTH_LIMIT = 1 << 26
 
 
-def exposures(
-    folder: Path, instruments: Instruments, atmosphere: Atmosphere, vertical: Vertical
-) -> Exposures:
+def exposures(folder: Path, given: Given, atmosphere: Atmosphere, vertical: Vertical) -> Exposures:
     """The frames of a folder in the order of their names, to be solved.  If tilt.csv is missing, each frame says so.
 
     Raises FrameError if there are no frames, or truth.json cannot be used.
     """
     frames = frames_in(folder)
+    first = First(Reader())(tuple(map(str, frames)))
+    instruments, remarks = (given, ()) if first is None else given.framed(first)
     known = instruments.instrument
     noise_rad = SCA100T_NOISE_RAD if known is None else known.inclinometer.noise_rad
     tilts: Tilts
-    remarks: tuple[Remark, ...] = ()
     try:
         tilts = log = read_tilt_csv(folder / TILTS, noise_rad)
-        remarks = of_tilts(log, TILTS)
+        remarks = (*of_tilts(log, TILTS), *remarks)
+        if instruments.instrument is not None:
+            remarks = (*of_inclinometer(instruments.instrument), *remarks)
     except TiltError as error:
         tilts = NoTilts(str(error))
 

@@ -8,7 +8,7 @@ from starpos.earth.refraction import Atmosphere
 from starpos.earth.vertical import Deflection, Vertical
 from starpos.errors import FrameError
 from starpos.frames.night_files import TILTS
-from starpos.instrument import instrument_file
+from starpos.instrument import instrument_file, sensors
 from starpos.instrument.instrument import Calibration, Instrument
 from starpos.night.folder import exposures, frames_in
 from starpos.night.night import Night
@@ -22,6 +22,7 @@ class NightOnDisk:
     """A folder of frames with tilt.csv, and what is known of its instrument and the air; `solve` works on it.
 
     instrument: None if the frames' headers have the focal length.  calibration: A3 in place of the instrument's.
+    inclinometer: name of its model in place of the instrument's; '' for the instrument's.
     """
 
     folder: Path
@@ -29,6 +30,7 @@ class NightOnDisk:
     count: int
     instrument: Instrument | None
     calibration: Calibration | None
+    inclinometer: str
     atmosphere: Atmosphere
     vertical: Vertical
 
@@ -50,6 +52,9 @@ class NightOnDisk:
             given = None if first is None or first.focal_px is None else Instrument(first.focal_px)
         if given is not None and self.calibration is not None:
             given = replace(given, calibration=self.calibration)
+        if given is not None and self.inclinometer:
+            model, errors = sensors.find(self.inclinometer)
+            given = replace(given, inclinometer=errors, inclinometer_model=model)
         instruments = Given(given, by_header=self.instrument is None)
         return solved_night(
             exposures(self.folder, instruments, self.atmosphere, self.vertical),
@@ -57,12 +62,12 @@ class NightOnDisk:
             progress,
         )
 
-
 def open_night(
     folder: str | Path,
     *,
     instrument: Instrument | str | Path | None = None,
     calibration: Calibration | None = None,
+    inclinometer: str = "",
     atmosphere: Atmosphere | None = None,
     vertical: Vertical | None = None,
 ) -> NightOnDisk:
@@ -70,7 +75,9 @@ def open_night(
 
     instrument: or the path of its file (YAML); None if the frames' headers have the focal length.
     calibration: A3 in place of the instrument's; while nobody knows A3 the place is over 1000 km wide, unless the night
-    is solved with self_calibrate=True.  atmosphere: None: not measured.  vertical: its deflection; None: not known.
+    is solved with self_calibrate=True.  inclinometer: name of its model, in place of the instrument's; where nobody names
+    it or states its errors they are those of an SCA100T as sold, 7 km.  atmosphere: None: not measured.  vertical: its
+    deflection; None: not known.
     Raises StarposError if there is no frame, or the instrument's file cannot be used.
     """
     folder = Path(folder)
@@ -83,6 +90,7 @@ def open_night(
         count=len(frames_in(folder)),
         instrument=instrument,
         calibration=calibration,
+        inclinometer=inclinometer,
         atmosphere=Atmosphere.measured(None, None) if atmosphere is None else atmosphere,
         vertical=Deflection() if vertical is None else vertical,
     )

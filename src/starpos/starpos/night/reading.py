@@ -15,10 +15,12 @@ from starpos.frames.exif import CameraClock
 from starpos.frames.frame import Frame
 from starpos.frames.reading import read_frame
 from starpos.frames.stars import Stars
+from starpos.instrument.axis import with_frame_size
 from starpos.instrument.inclinometer import Tilt
 from starpos.instrument.instrument import Instrument
 from starpos.instrument.tilt_log import TiltLog
 from starpos.instrument.tilt_table import read_tilt_csv
+from starpos.night.remarks import Remark, of_axis
 
 
 @dataclass(frozen=True)
@@ -62,11 +64,12 @@ def stars_of(item: Frame | Stars) -> Stars:
 
 @dataclass(frozen=True)
 class About:
-    """Frame size and focal length in px, as the first frame of a night states them."""
+    """Frame size, focal length and place on the sensor in px, as the first frame of a night states them."""
 
     width: int
     height: int
     focal_px: float | None
+    origin_px: tuple[float, float] | None = None
 
 
 # of pointings only the camera's axes count
@@ -84,7 +87,7 @@ class First:
             with suppress(FrameError):
                 item = self.read(path)
                 self.read.keep(path, item)
-                return About(item.width, item.height, item.focal_px)
+                return About(item.width, item.height, item.focal_px, item.origin_px)
         return None
 
 
@@ -106,6 +109,13 @@ class Given:
 
     instrument: Instrument | None
     by_header: bool = False
+
+    def framed(self, first: About) -> tuple["Given", tuple[Remark, ...]]:
+        """Instruments of a night with this first frame, and a remark if the optical axis of its frames is not known."""
+        if self.instrument is None:
+            return self, ()
+        instrument, doubt = with_frame_size(self.instrument, first)
+        return replace(self, instrument=instrument), of_axis(doubt)
 
     def of(self, frame: Frame | Stars) -> Instrument | None:
         """The instrument of a frame."""

@@ -9,9 +9,16 @@ import numpy as np
 
 from starpos.averaging.average import Average
 from starpos.calibration.misalignment import Calibrated
-from starpos.calibration.unknown import BY_OPTIONS, TELL_IT, at_another_lean, may_turn, unknown_a3
+from starpos.calibration.unknown import (
+    BY_OPTIONS,
+    TELL_IT,
+    at_another_lean,
+    may_turn,
+    unknown_a3,
+    unnamed_inclinometer,
+)
 from starpos.fix.fix import Fix
-from starpos.instrument.instrument import Calibration
+from starpos.instrument.instrument import Calibration, Instrument
 from starpos.instrument.tilt_doubt import like_radians
 from starpos.instrument.tilt_log import TiltLog
 from starpos.utc import utc_text
@@ -24,7 +31,9 @@ class Kind(str, Enum):
     """What a remark is about."""
 
     TILTS = "tilts"
+    INCLINOMETER = "inclinometer"
     FOCAL_LENGTH = "focal length"
+    AXIS = "optical axis"
     EARTH_ROTATION = "earth rotation"
     LEFT_OUT = "left out"
     MOVED = "moved"
@@ -51,6 +60,17 @@ def of_tilts(log: TiltLog, path: str) -> tuple[Remark, ...]:
     """Say that a table of tilts looks like radians."""
     doubt = like_radians(log)
     return (Remark(Kind.TILTS, f"{path}: {doubt}"),) if doubt else ()
+
+
+def of_inclinometer(instrument: Instrument) -> tuple[Remark, ...]:
+    """Say that nobody has said which inclinometer it is."""
+    sentence = unnamed_inclinometer(instrument)
+    return (Remark(Kind.INCLINOMETER, sentence),) if sentence else ()
+
+
+def of_axis(doubt: str) -> tuple[Remark, ...]:
+    """Say that the optical axis of a night's frames is not known; doubt: the sentence, '' if it is."""
+    return (Remark(Kind.AXIS, doubt),) if doubt else ()
 
 
 def of_focal_length(place: str, focal_px: float) -> Remark:
@@ -103,3 +123,5 @@ def of_turn(turned: Calibrated) -> Iterator[Remark]:
     yield Remark(Kind.CALIBRATED, f"calibrated: {error}; {at_another_lean(found)}")
     if may_turn(found):
         yield Remark(Kind.CALIBRATED, f"to use A3 at another lean, {TELL_IT}")
+    if turned.beyond:
+        yield Remark(Kind.INCLINOMETER, turned.beyond)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import InstrumentError, StarposError
-from starpos.fix.blind import BlindSolver
+from starpos.fix.blind import SEARCH_S, BlindSolver
 from starpos.fix.solution import Solution
 from starpos.fix.solver import Solver
 from starpos.frames.frame import Frame
@@ -20,6 +20,7 @@ from starpos.night import searching
 from starpos.night.reading import Instruments, Reader, TiltFile, stars_of
 from starpos.night.remarks import Remark, of_focal_length
 from starpos.night.searching import Sight
+from starpos.progress import Progress, quiet
 from starpos.sky import catalogue
 
 if TYPE_CHECKING:
@@ -57,14 +58,18 @@ class Identifying:
     """Identifies a frame by every way there is, of any scale where nobody knows its focal length.
 
     Gives its Sight, and the CPU time in ms.
+    search_s: CPU time after which the search at every scale ends.
+    progress: of that search.
     """
 
     instruments: Instruments
+    search_s: float = SEARCH_S
+    progress: Progress = quiet
 
     def __call__(self, item: Frame | Stars) -> tuple[Sight, float]:
         instrument, stars_known = self.instruments.of(item), catalogue.load_catalogue()
         if instrument is None:
-            blind = BlindSolver(stars_known)
+            blind = BlindSolver(stars_known, self.progress, search_s=self.search_s)
             blind.prepare()
             begin = time.process_time()
             sight = searching.identified_blind(blind, item, stars_of(item))
@@ -72,7 +77,7 @@ class Identifying:
             solver = Solver(instrument, stars_known)
             # the frame reports the error
             with suppress(StarposError):
-                solver.prepare(item.width, item.height)
+                solver.prepare(item.width, item.height, item.origin_px)
             begin = time.process_time()
             sight = searching.identified(solver, item, stars_of(item))
         return sight, 1000 * (time.process_time() - begin)

@@ -36,7 +36,7 @@ def camera_attitude_of(
     if found is None or answer.warnings or found.mirrored or stars.mid_unix_s is None:
         return None
     try:
-        camera, catalogue, _ = solver.view(stars.width, stars.height)
+        camera, catalogue, _ = solver.view(stars.width, stars.height, stars.origin_px)
         if wide.is_wide(camera):
             return None
         state = earth_state(stars.mid_unix_s)

@@ -25,6 +25,7 @@ from starpos.frames.stars import Stars
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import InclinometerErrors
 from starpos.instrument.instrument import Calibration, Instrument
+from starpos.instrument.sensors import SCA100T_CALIBRATED
 from starpos.instrument.tilt_log import TiltLog
 from starpos.rotation import half_turn
 from starpos.simulation.scene import Scene, TiltErrors, detected, expose, read_tilt
@@ -39,8 +40,6 @@ EXPOSURE_S, READINGS, CADENCE_S, TURN_S = 0.5, 5, 5.0, 60.0
 FIRST_UNIX_S, LAST_UNIX_S = 1451606400.0, 1798761600.0
 # 1 sigma of the lean that a turn by hand causes
 LEAN_DEG = 0.05
-# an SCA100T-D01 that is compensated and calibrated; as sold it is `sensors.SCA100T`
-COMPENSATED = InclinometerErrors()
 
 
 def tiltmeter(noise_arcsec: float) -> InclinometerErrors:
@@ -240,7 +239,7 @@ def photograph(
 def turned_night(
     rng: np.random.Generator,
     catalogue: Catalogue,
-    errors: InclinometerErrors = COMPENSATED,
+    errors: InclinometerErrors = SCA100T_CALIBRATED,
     headings: int = 4,
     frames: int = 25,
     clock_stddev_s: float = 0.01,
@@ -261,7 +260,7 @@ def turned_night(
 def calibrated_night(
     rng: np.random.Generator,
     catalogue: Catalogue,
-    errors: InclinometerErrors = COMPENSATED,
+    errors: InclinometerErrors = SCA100T_CALIBRATED,
     frames: int = 6,
     clock_stddev_s: float = 0.01,
     camera: Camera = CAMERA,

@@ -11,6 +11,7 @@ from starpos.earth.orientation import EarthState, earth_state, station_velocity
 from starpos.frames.pointings import Pointing
 from starpos.instrument.inclinometer import InclinometerErrors, Tilt
 from starpos.instrument.instrument import Calibration, Instrument
+from starpos.instrument.sensors import SCA100T_CALIBRATED
 from starpos.instrument.tilts import TiltsByTime
 from starpos.sky.site import Site, camera_to_enu
 from starpos.units import ARCSEC
@@ -20,8 +21,8 @@ TRUE_A3 = Calibration(misalignment_deg=(1.5, -2.0, 130.0)).a3
 READINGS = 5
 # directions around the axis whose rotation is the roll
 RING_RAD = ((1e-3, 0.0), (0.0, 1e-3), (-1e-3, 0.0), (0.0, -1e-3))
-# of a tilt sensor such as the paper's
-SENSOR = InclinometerErrors()
+# a tilt sensor such as the paper's
+SENSOR = SCA100T_CALIBRATED
 
 
 def icrs_of(site: Site, seen: np.ndarray, state: EarthState) -> np.ndarray:

@@ -10,6 +10,7 @@ from starpos.fix.solver import Solver
 from starpos.frames.stars import Stars
 from starpos.instrument.inclinometer import Tilt
 from starpos.instrument.instrument import Calibration, Instrument
+from starpos.instrument.sensors import SCA100T_CALIBRATED
 from starpos.instrument.tilts import TiltsByTime
 from starpos.simulation.scene import Scene
 from starpos.units import ARCSEC
@@ -42,7 +43,9 @@ class Shots:
 
     def solver(self, catalogue, given=(0.0, 0.0, 0.0)) -> Solver:
         """The solver of an instrument whose A3 is said to be as given; how well, nobody says, so it is not known."""
-        instrument = Instrument(FOCAL_PX, calibration=Calibration(misalignment_deg=given))
+        instrument = Instrument(
+            FOCAL_PX, calibration=Calibration(misalignment_deg=given), inclinometer=SCA100T_CALIBRATED
+        )
         return Solver(instrument, catalogue, self.scene.site.atmosphere)
 
 

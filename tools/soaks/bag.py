@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A bag again and again through fresh nodes, beside busy processes: are all outputs the same to the last byte?
 
-    python tools/soaks/soak_replay.py [--runs 50] [--busy 8] [--rates 0 1 10] [--processes 1 4] [--lanes 2]
-
 Plays the first 10 s of the tests' night (--inputs images: 10 s of its images, by the detector), records what comes of
 them by a listener that listens to the inputs too, and compares `fix`, `attitude`, `solver/solution` and
 `fix_averaged`.  In 4 processes: solver, detector, player, listener; in 1: all but the listener.  Exit status 0 only if
@@ -25,7 +23,7 @@ from pathlib import Path
 
 from starpos_testing.domain import own_domain
 from starpos_testing.patience import WAIT_S
-from starpos_testing.skies.bags import part_of
+from starpos_testing.skies.bags import knowing, part_of
 
 NIGHT = Path(__file__).resolve().parents[2] / "test" / "data" / "night"
 SECONDS = 10
@@ -50,16 +48,7 @@ class Outcome:
 
 def parameters() -> list[str]:
     """The parameters of a solver that knows the night's instrument."""
-    truth = json.loads(NIGHT.with_suffix(".json").read_text())
-    values = {
-        "use_sim_time": "true",
-        "refraction.pressure": truth["pressure_pa"],
-        "refraction.temperature": truth["temperature_c"],
-        "refraction.humidity": truth["humidity"],
-        "misalignment": truth["misalignment_deg"],
-        "misalignment_stddev": 0.1,
-    }
-    return [f"{name}:={value}" for name, value in values.items()]
+    return knowing(json.loads(NIGHT.with_suffix(".json").read_text()))
 
 
 class Listener:
@@ -88,19 +77,19 @@ class Listener:
         return Outcome(tuple(map(len, self.kept.values())), digest)
 
 
-def run(bag: Path, inputs: str, rate: float, processes: int) -> Outcome:
+def play(bag: Path, inputs: str, rate: float, processes: int) -> Outcome:
     """Play a bag once through fresh nodes in a domain of their own."""
     with own_domain(), tempfile.TemporaryDirectory() as folder:
         from starpos_testing.graph.graph import Graph
 
         graph = Graph()
         try:
-            return _run(graph, Path(folder), bag, inputs, rate, processes)
+            return _play(graph, Path(folder), bag, inputs, rate, processes)
         finally:
             graph.close()
 
 
-def _run(graph, folder: Path, bag: Path, inputs: str, rate: float, processes: int) -> Outcome:
+def _play(graph, folder: Path, bag: Path, inputs: str, rate: float, processes: int) -> Outcome:
     listener = Listener(graph)
     # this end must not seem to be an instrument
     for publisher in (graph.info, graph.stars, graph.tilt, graph.capture):
@@ -138,17 +127,16 @@ def busy():
         pass
 
 
-def main() -> int:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+def options(parser) -> None:
     parser.add_argument("--runs", type=int, default=50, help="of each kind (50)")
     parser.add_argument("--busy", type=int, default=8, help="processes that compute beside (8)")
     parser.add_argument("--rates", type=float, nargs="+", default=[0.0, 1.0, 10.0])
     parser.add_argument("--processes", type=int, nargs="+", choices=(1, 4), default=[1, 4])
     parser.add_argument("--inputs", choices=tuple(BEGIN_S), default="stars")
     parser.add_argument("--lanes", type=int, default=2, help="runs at a time (2)")
-    options = parser.parse_args()
+
+
+def run(options) -> int:
     context = multiprocessing.get_context("spawn")
     others = [context.Process(target=busy, daemon=True) for _ in range(options.busy)]
     for other in others:
@@ -168,7 +156,7 @@ def compare(bag: Path, options: argparse.Namespace, context) -> int:
     with ProcessPoolExecutor(options.lanes, mp_context=context, max_tasks_per_child=1) as lanes:
         for processes, rate in itertools.product(options.processes, options.rates):
             begin = time.monotonic()
-            futures = [lanes.submit(run, bag, options.inputs, rate, processes) for _ in range(options.runs)]
+            futures = [lanes.submit(play, bag, options.inputs, rate, processes) for _ in range(options.runs)]
             outcomes = Counter(future.result() for future in futures)
             seen += outcomes
             said = "; ".join(
@@ -180,7 +168,3 @@ def compare(bag: Path, options: argparse.Namespace, context) -> int:
     same = len(seen) == 1 and all(o.messages and min(o.messages) for o in seen)
     print(f"{seen.total()} runs, {len(seen)} different outcomes")
     return int(not same)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,44 +1,43 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Half an hour of one source of the camera, as fast as it gives frames: its memory, and whether it grows.
+"""Half an hour of one source of the camera, as fast as it gives frames: whether its memory grows.
 
-    python tools/soaks/soak_camera.py SOURCE [NAME:=VALUE ...] [FRAMES]       360: 30 minutes of a frame every 5 s
-    python tools/soaks/soak_camera.py files files.path:=/nights/1 files.loop:=true
-    python tools/soaks/soak_camera.py simulated simulated.width:=1404 simulated.height:=936 focal_mm:=150.0
+    soak.py camera files files.path:=/nights/1 files.loop:=true
+    soak.py camera simulated simulated.width:=1404 simulated.height:=936 focal_mm:=150.0
 
-The parameters are those of the node `camera`; a camera, or the server of one, has to be there. Prints the resident
-memory at each tenth. Exit status 0; 1 if the last half's memory has grown by more than 2 MB against the half
-before, or a frame did not come.
+The parameters are those of the node `camera`; a camera, or the server of one, has to be there.  Exit status 1 if the
+last half's memory has grown by more than 2 MB against the half before, or a frame did not come.
 """
 
 import gc
-import sys
 import time
 
 import yaml
+from runner import Memory, Progress
 
 from starpos.errors import StarposError
 from starpos_camera.camera_parameters import PARAMETERS
 from starpos_camera.sources.registry import SOURCES
 from starpos_camera.sources.source import CaptureSettings
 from starpos_common.parameters import ParameterError
-from starpos_testing.processes import memory_mb
 
-HALF_HOUR, ALLOWED_MB = 360, 2.0
+ALLOWED_MB = 2.0
 
 
-def main() -> int:
-    name, *words = sys.argv[1:] or ["--help"]
-    if name not in SOURCES:
-        print(__doc__)
-        return 2
-    frames = int(words.pop()) if words and words[-1].isdecimal() else HALF_HOUR
+def options(parser) -> None:
+    parser.add_argument("source", choices=tuple(SOURCES))
+    parser.add_argument("parameters", nargs="*", metavar="NAME:=VALUE")
+    parser.add_argument("--frames", type=int, default=360, help="360: 30 minutes of one every 5 s")
+
+
+def run(options) -> int:
+    name, frames = options.source, options.frames
     try:
-        values = values_of(words) | {"source": name}
+        values = values_of(options.parameters) | {"source": name}
     except ParameterError as error:
         print(error)
         return 2
-    if not frames:
-        print("0 frames are no soak: give 1 or more.")
+    if frames < 1:
+        print(f"{frames} frames are no soak: give 1 or more.")
         return 2
     settings = CaptureSettings(
         set_or_none(values["exposure"]), set_or_none(values["gain"]), values["cadence"]
@@ -47,32 +46,30 @@ def main() -> int:
         print(refusal)
         return 2
     source = SOURCES[name](values, time.time)
-    sizes, failed, begin = [], 0, time.monotonic()
+    failed, begin, progress = 0, time.monotonic(), Progress(frames, "frames")
     try:
         for k in range(1, frames + 1):
             try:
                 frame = source.capture(settings).frame
-                size = f"{frame.width} x {frame.height} px {frame.pixels.dtype}"
+                said = f"{frame.width} x {frame.height} px {frame.pixels.dtype}"
                 del frame
             except StarposError as error:
                 failed += 1
-                size = str(error)
+                said = str(error)
+            gc.collect()
             # By then everything that is made only once has been made.
-            if k > frames // 10:
-                sizes.append(memory_mb())
-            if k % max(1, frames // 10) == 0:
-                gc.collect()
-                print(f"{k:6d} frames  {memory_mb():7.1f} MB  {size}", flush=True)
+            if k <= max(1, frames // 10):
+                memory = Memory()
+            memory.look()
+            progress.at(k, memory, said)
     finally:
         source.close()
-    half = len(sizes) // 2
-    grown = max(sizes[half:]) - max(sizes[:half] or sizes)
     each_s = (time.monotonic() - begin) / frames
     print(
-        f"{frames} frames of {name}, {failed} did not come: {each_s:.3f} s each; the last half's memory {grown:+.2f} MB "
-        "against the half's before"
+        f"{frames} frames of {name}, {failed} did not come: {each_s:.3f} s each; the last half's memory "
+        f"{memory.grown:+.2f} MB"
     )
-    return int(grown > ALLOWED_MB or failed > 0)
+    return int(memory.grown > ALLOWED_MB or failed > 0)
 
 
 def values_of(words: list[str]) -> dict:
@@ -95,7 +92,3 @@ def values_of(words: list[str]) -> dict:
 
 def set_or_none(value: float) -> float | None:
     return None if value != value else value
-
-
-if __name__ == "__main__":
-    sys.exit(main())

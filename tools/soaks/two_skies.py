@@ -1,8 +1,5 @@
-#!/usr/bin/env python3
 # SPDX-License-Identifier: Apache-2.0
 """Frames made of two different skies: no answer may be wrong unless it is flagged.
-
-    soak_two_skies.py [--frames 10000] [--seed 1] [--first 0]
 
 Each frame has 10 to 90 % of one sky and the rest of another: of the exposure, so that all stars of both are there but
 fainter, or of the stars themselves. The other sky is any, or that of a camera that was turned by less than a field. The
@@ -10,12 +7,11 @@ errors of the centroids, the faintest star and the field of view vary. An answer
 skies nor has a warning. Exit status: 1 where there was one. Needs no ROS.
 """
 
-import argparse
 import json
-import sys
 from collections import Counter
 
 import numpy as np
+from runner import Progress
 
 from starpos import rotation
 from starpos.fix.solver import Solver
@@ -73,15 +69,14 @@ def two_skies(catalogue: Catalogue, seed: int, number: int) -> tuple[Stars, Came
     return Field(xy, mag, None, name).stars(c), camera, [first[2], second[2]], kind
 
 
-def main() -> int:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+def options(parser) -> None:
     parser.add_argument("--frames", type=int, default=10000)
     parser.add_argument("--first", type=int, default=0, help="number of the first frame")
     parser.add_argument("--seed", type=int, default=1)
-    args = parser.parse_args()
-    catalogue, tally = load_catalogue(), {}
+
+
+def run(args) -> int:
+    catalogue, tally, progress = load_catalogue(), {}, Progress(args.frames, "frames")
     for number in range(args.first, args.first + args.frames):
         stars, camera, centres, kind = two_skies(catalogue, args.seed, number)
         s = Solver(Instrument(camera.fx), catalogue).identify(stars)
@@ -98,14 +93,9 @@ def main() -> int:
                 about = f"{len(s.names)} of {len(stars)} stars, {away:.1f} px off"
                 print(f"BAD {stars.source}: {about}, log-odds {s.attitude.log_odds:.0f}", flush=True)
         tally.setdefault(kind, Counter())[verdict] += 1
-        if (number - args.first) % 500 == 499:
-            print(number - args.first + 1, json.dumps(dict(sum(tally.values(), Counter()))), flush=True)
+        progress.at(number - args.first + 1, json.dumps(sum(tally.values(), Counter())))
     for kind, counts in sorted(tally.items()):
         print(f"{kind:24s}", json.dumps(dict(counts)))
     whole = sum(tally.values(), Counter())
     print(json.dumps({"frames": args.frames} | dict(whole)))
     return int(whole["wrong"] > 0)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A recorded voyage in real time through the running nodes: is the navigator's place the command line's?
 
-    python tools/soaks/soak_voyage.py FOLDER [--rate 1] [--vehicle rover] [--focal-mm 25] [--pixel-um 5.86]
-
 FOLDER holds what `starpos navigate` takes: stars_*.csv, imu.csv, imu.yaml and, where there is one, velocity.csv.  They
 become a bag, `replay` plays it, `solver` makes attitudes of its stars and `navigator` its place.  Prints the place at the
 last frame by both ways, how far they are apart in their claim, what share of a core the nodes took and what they refused.
@@ -59,17 +57,16 @@ class Place:
         return EARTH_M * np.array([east, np.radians(self.latitude - other.latitude)])
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+def options(parser) -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--rate", type=float, default=1.0)
     parser.add_argument("--vehicle", default="rover")
     parser.add_argument("--focal-mm", type=float, default=25.0)
     parser.add_argument("--pixel-um", type=float, default=5.86)
     parser.add_argument("--pressure-hpa", type=float, default=1010.0)
-    args = parser.parse_args()
+
+
+def run(args) -> int:
     recorded = by_command(args)
     with tempfile.TemporaryDirectory() as folder:
         bag = Path(folder) / "bag"
@@ -82,7 +79,7 @@ def main() -> None:
         f"{np.linalg.norm(off):.1f} m apart, {sigma_m:.1f} m claimed an axis, {ratio:.3f} of the command's; "
         f"{100 * share:.0f} % of a core; {refused} refused"
     )
-    sys.exit(int(not (np.linalg.norm(off) < sigma_m and abs(ratio - 1) < 0.1 and refused == 0)))
+    return int(not (np.linalg.norm(off) < sigma_m and abs(ratio - 1) < 0.1 and refused == 0))
 
 
 def by_command(args: argparse.Namespace) -> Place:
@@ -174,7 +171,3 @@ def by_nodes(args: argparse.Namespace, bag: Path, folder: Path) -> tuple[Place, 
         return Place(last.latitude, last.longitude, covariance), share, int(inputs["refused"])
     finally:
         graph.close()
-
-
-if __name__ == "__main__":
-    main()

@@ -1,25 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Half an hour of the inclinometer's driver on a pseudo-terminal, accelerated, with faults: its memory at each tenth.
+"""Half an hour of the inclinometer's driver on a pseudo-terminal, accelerated, with faults: whether its memory grows.
 
-    python tools/soaks/soak_inclinometer.py [SAMPLES] [SPEED]          90000 at 50 Hz, 60 times as fast
-
-One line in twenty is damaged, the microcontroller is reset every 5 minutes, the cable pulled every 7. Exit status 0; 1 if
+One line in twenty is damaged, the microcontroller is reset every 5 minutes, the cable pulled every 7.  Exit status 1 if
 the resident memory of the last half has grown by more than 1 MB against the half before, or too few samples came.
 """
 
 import random
-import sys
 import tempfile
 import threading
 import time
 from pathlib import Path
+
+from runner import Memory, Progress
 
 from starpos_inclinometer.emulator import Faults, Mcu, Pty
 from starpos_inclinometer.host_clock import HostClock
 from starpos_inclinometer.parameters import PARAMETERS
 from starpos_inclinometer.sources.mcu import McuSource
 from starpos_inclinometer.sources.source import Surroundings
-from starpos_testing.processes import memory_mb
 
 RATE_HZ, ALLOWED_MB, ENOUGH = 50, 1.0, 0.6
 RESET_S, PULL_S, PULLED_S = 300.0, 420.0, 20.0
@@ -57,16 +55,19 @@ class Device(threading.Thread):
             port.close()
 
 
-def main() -> int:
-    samples = int(sys.argv[1]) if len(sys.argv) > 1 else 90_000
-    speed = float(sys.argv[2]) if len(sys.argv) > 2 else 60.0
-    begin_ns = time.monotonic_ns()
+def options(parser) -> None:
+    parser.add_argument("--samples", type=int, default=90_000, help=f"90000, at {RATE_HZ} Hz")
+    parser.add_argument("--speed", type=float, default=60.0, help="times as fast as real time (60)")
+
+
+def run(options) -> int:
+    samples, speed, begin_ns = options.samples, options.speed, time.monotonic_ns()
 
     def fast_ns() -> int:
         return round((time.monotonic_ns() - begin_ns) * speed)
 
     values = {p.name: p.default for p in PARAMETERS} | {"rate": RATE_HZ}
-    stop, woken, sizes, got = threading.Event(), threading.Event(), [], 0
+    stop, woken, progress, got = threading.Event(), threading.Event(), Progress(samples, "samples due"), 0
     with tempfile.TemporaryDirectory() as folder:
         values["port"] = str(Path(folder) / "port")
         device = Device(values["port"], lambda: fast_ns() * 1e-9, stop)
@@ -74,25 +75,20 @@ def main() -> int:
         source = McuSource(Surroundings(None, clock, woken.set), values)
         device.start()
         source.start()
-        tenths = [samples / RATE_HZ * k / 10 for k in range(1, 11)]
-        while tenths:
+        due, memory = 0, Memory()
+        while due < samples:
             woken.wait(0.1)
             woken.clear()
             got += len(source.take())
-            sizes.append(memory_mb())
-            if fast_ns() * 1e-9 >= tenths[0]:
-                print(f"{tenths.pop(0):7.0f} s  {got:6d} samples  {sizes[-1]:7.2f} MB", flush=True)
+            due = round(fast_ns() * 1e-9 * RATE_HZ)
+            if due < samples / 10:
+                memory = Memory()
+            memory.look()
+            progress.at(due, got, "came,", memory)
         health = source.health()
         stop.set()
         device.join()
         source.stop()
-    warm = sizes[len(sizes) // 10 :]
-    half = len(warm) // 2
-    grown = max(warm[half:]) - max(warm[:half])
     print(health.counts, {k: health.values[k] for k in ("openings", "unfetched samples")})
-    print(f"{got} of {samples} samples; the last half's memory {grown:+.2f} MB against the first's")
-    return int(grown > ALLOWED_MB or got < ENOUGH * samples)
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+    print(f"{got} of {samples} samples; the last half's memory {memory.grown:+.2f} MB")
+    return int(memory.grown > ALLOWED_MB or got < ENOUGH * samples)
