@@ -61,7 +61,7 @@ cdef wide_void _ranked(const unsigned short *v, int n, int k, int *out) noexcept
 
 
 cdef wide_void _sums(const unsigned short *v, int n, int middle, int limit, long long *out) noexcept nogil:
-    """Of n numbers within a limit of the middle how many there are, the sum of their differences from it, and of the squares."""
+    """Sum up the n numbers within a limit of the middle: how many, their differences from it, and the squares of these."""
     # the sum of so many squares has 32 bits
     cdef int some = max(<int>(UINT_MAX // (<unsigned int>limit * <unsigned int>limit + 1)), 1) if limit < 65536 else 1
     cdef int first = 0, k, off, kept, count, total
