@@ -5,7 +5,8 @@ import numpy as np
 from sensor_msgs.msg import Image
 
 from starpos.frames.annotate import IDENTIFIED
-from starpos.recording.messages import message_to_frame, message_to_stars
+from starpos.messages.camera import message_to_frame
+from starpos.messages.stars import message_to_stars
 from starpos.sky.catalogue import load_catalogue
 from starpos_interfaces.msg import Solution, StarArray
 from starpos_testing.graph.shots import SMALL, photograph, shoot

@@ -8,7 +8,7 @@ import pytest
 from sensor_msgs.msg import NavSatFix
 from std_srvs.srv import Trigger
 
-from starpos.recording.messages import stamp_to_unix
+from starpos.messages.stamp import stamp_to_unix
 from starpos_common.messages import unix_to_stamp
 from starpos_interfaces.msg import Solution
 from starpos_interfaces.srv import Solve

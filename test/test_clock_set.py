@@ -8,7 +8,7 @@ import pytest
 from rclpy.qos import QoSProfile
 from rosgraph_msgs.msg import Clock
 
-from starpos.recording.messages import stamp_to_unix
+from starpos.messages.stamp import stamp_to_unix
 from starpos_common.messages import unix_to_stamp
 from starpos_interfaces.msg import Solution
 from starpos_testing.graph.shots import EXPOSURE_S, SOLVER, START_S, scene_at, shot_of

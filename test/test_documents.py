@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the documents name is there: links, headings, files, tools, parameters; changelogs are as bloom reads them."""
+"""What the documents name is there: links, headings, files, tools, parameters."""
 
 import ast
 import io
 import re
 import tokenize
 from pathlib import Path
-from xml.etree import ElementTree
 
 import pytest
 import yaml
@@ -117,17 +116,6 @@ def flat(parameters: dict, before: str = ""):
             yield from flat(value, f"{before}{name}.")
         else:
             yield before + name
-
-
-@pytest.mark.parametrize("package", PACKAGES, ids=lambda p: p.name)
-def test_a_package_has_a_changelog_as_catkin_prepare_release_wants_it(package):
-    name = ElementTree.parse(package / "package.xml").findtext("name")
-    bar, title, again, _, section, line, *entries = (package / "CHANGELOG.rst").read_text().splitlines()
-    assert title == f"Changelog for package {name}" and bar == again == "^" * len(title)
-    assert re.fullmatch(r"Forthcoming|\d+\.\d+\.\d+ \(\d{4}-\d\d-\d\d\)", section) and line == "-" * len(
-        section
-    )
-    assert entries and all(re.match(r"\* |  \S|-+$|$|\d+\.", entry) for entry in entries)
 
 
 @pytest.mark.parametrize("package", [None, *PACKAGES], ids=lambda p: p.name if p else "test and tools")

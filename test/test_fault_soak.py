@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Hundreds of random faults from all inputs and no wrong fix, no crash: tools/faults/fault_soak.py, shortened."""
+"""Hundreds of random faults from all inputs and no wrong fix, no crash: tools/soaks/soak.py faults, shortened."""
 
 import signal
 import subprocess
@@ -10,13 +10,23 @@ import pytest
 
 from starpos_testing.patience import WAIT_S
 
-TOOL = Path(__file__).parent.parent / "tools" / "faults" / "fault_soak.py"
+TOOL = Path(__file__).parent.parent / "tools" / "soaks" / "soak.py"
 FAULTS, SEED = 40, 20778
 
 
 @pytest.mark.timeout(5 * WAIT_S)
 def test_random_faults_make_no_wrong_fix_and_no_crash():
-    command = [sys.executable, str(TOOL), "--faults", str(FAULTS), "--lanes", "1", "--seed", str(SEED)]
+    command = [
+        sys.executable,
+        str(TOOL),
+        "faults",
+        "--faults",
+        str(FAULTS),
+        "--lanes",
+        "1",
+        "--seed",
+        str(SEED),
+    ]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as tool:
         try:
             out, _ = tool.communicate(timeout=4 * WAIT_S)

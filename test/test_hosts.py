@@ -14,6 +14,7 @@ from starpos_testing.graph import hosts
 from starpos_testing.graph.link import FULL_FRAME_BYTES, TILT_RATE_HZ, start, traffic, two_hosts
 from starpos_testing.graph.shots import SMALL
 from starpos_testing.patience import WAIT_S
+from starpos_testing.skies.bags import knowing
 
 NIGHT = Path(__file__).parent / "data" / "night"
 LOSSY = Path(__file__).parents[1] / "src" / "starpos_bringup" / "config" / "lossy_link.xml"
@@ -36,16 +37,8 @@ def play(instrument, folder: Path, together: bool) -> dict:
     robot, ear = instrument.robot, instrument.ear
     mount = robot if together else instrument.mount
     truth = json.loads(NIGHT.with_suffix(".json").read_text())
-    known = {
-        "use_sim_time": "true",
-        "refraction.pressure": truth["pressure_pa"],
-        "refraction.temperature": truth["temperature_c"],
-        "refraction.humidity": truth["humidity"],
-        "misalignment": truth["misalignment_deg"],
-        "misalignment_stddev": 0.1,
-        "tilt_timeout": 5.0,
-    }
-    robot.start(folder / "solver", "starpos_solver", "solver", *(f"{k}:={v}" for k, v in known.items()))
+    known = (*knowing(truth), "tilt_timeout:=5.0")
+    robot.start(folder / "solver", "starpos_solver", "solver", *known)
     mount.start(folder / "detector", "starpos_camera", "detector", "use_sim_time:=true")
     arguments = (str(NIGHT), "--rate", "0", "--wait", "30")
     replay = mount.start(folder / "replay", "starpos_bringup", "replay", arguments=arguments)

@@ -8,7 +8,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from catkin_pkg.changelog import get_changelog_from_path
 from catkin_pkg.package import parse_package
+from catkin_pkg.package_version import get_forthcoming_label, rename_section
 
 ROOT = Path(__file__).parents[1]
 FOLDERS = sorted(p.parent for folder in (ROOT, ROOT / "src") for p in folder.glob("*/package.xml"))
@@ -58,6 +60,21 @@ def test_a_manifest_is_sound(folder):
 
 def test_all_have_one_version():
     assert len({parse_package(folder).version for folder in FOLDERS}) == 1
+
+
+@pytest.mark.filterwarnings("ignore:nodes.Node.traverse:DeprecationWarning")
+@pytest.mark.parametrize("folder", FOLDERS, ids=lambda folder: folder.name)
+def test_a_changelog_can_be_released_by_catkin_prepare_release(folder):
+    """`catkin_prepare_release` renames `Forthcoming`; bloom reads the changes of each version; a change is one line."""
+    package = parse_package(folder)
+    log = get_changelog_from_path(str(folder), package.name)
+    released = list(log.foreach_version())
+    assert released[0][0] == package.version and all(changes for *_, changes in released)
+    title, label = f"Changelog for package {package.name}", get_forthcoming_label(log.rst)
+    next_release = rename_section(log.rst, label, "9.9.9 (2100-01-01)") if label else log.rst
+    bar, name, again, *lines = next_release.splitlines()
+    assert name == title and bar == again == "^" * len(title)
+    assert all(re.match(r"\* |\d+\.\d+\.\d+ \(\d{4}-\d\d-\d\d\)$|-+$|$", line) for line in lines)
 
 
 @pytest.mark.parametrize("folder", PYTHON, ids=lambda folder: folder.name)

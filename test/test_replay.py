@@ -28,6 +28,7 @@ from starpos_interfaces.msg import Played, Solution, StarArray, Taken
 from starpos_testing.graph.graph import stamp_of
 from starpos_testing.graph.shots import photograph
 from starpos_testing.patience import WAIT_S
+from starpos_testing.skies.bags import knowing
 
 NIGHT = Path(__file__).parent / "data" / "night"
 LATCHED = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -103,16 +104,7 @@ def test_a_replay_that_only_strangers_hear_says_so(graph, run):
 def instrument(graph, truth, tmp_path_factory):
     """Detector and solver that know what the bag's instrument is."""
     folder = tmp_path_factory.mktemp("instrument")
-    parameters = {
-        "use_sim_time": "true",
-        "refraction.pressure": truth["pressure_pa"],
-        "refraction.temperature": truth["temperature_c"],
-        "refraction.humidity": truth["humidity"],
-        "misalignment": truth["misalignment_deg"],
-        "misalignment_stddev": 0.1,
-    }
-    words = [f"{name}:={value}" for name, value in parameters.items()]
-    graph.start(folder / "solver.log", "starpos_solver", "solver", *words)
+    graph.start(folder / "solver.log", "starpos_solver", "solver", *knowing(truth))
     graph.wait_for_solver()
     graph.start(folder / "detector.log", "starpos_camera", "detector", "use_sim_time:=true")
     graph.wait_for_detector(photograph)

@@ -25,9 +25,10 @@ from starpos_testing.patience import WAIT_S
 from starpos_testing.skies.bags import part_of
 
 NIGHT = Path(__file__).parent / "data" / "night"
-SOAK = Path(__file__).parent.parent / "tools" / "soaks" / "soak_replay.py"
+SOAK = Path(__file__).parent.parent / "tools" / "soaks" / "soak.py"
 KNOWN = ("refraction.pressure:=66000.0", "refraction.temperature:=-4.0", "refraction.humidity:=0.4",
-         "misalignment:=[0.31, -0.22, 0.53]", "misalignment_stddev:=0.1")  # fmt: skip
+         "misalignment:=[0.31, -0.22, 0.53]", "misalignment_stddev:=0.1",
+         "inclinometer.model:=sca100t_calibrated")  # fmt: skip
 # Between ticks, as `ros2 bag play --clock` does.
 CLOCK_S = 0.025
 
@@ -191,7 +192,7 @@ def test_what_such_a_player_loses_is_named(graph, run):
 @pytest.mark.timeout(5 * WAIT_S)
 @pytest.mark.parametrize(("inputs", "rates"), [("stars", ("10",)), ("images", ("0",))])
 def test_three_busy_runs_are_the_same_to_the_last_byte(inputs, rates):
-    command = [sys.executable, str(SOAK), "--runs", "3", "--busy", "3", "--rates", *rates, "--processes", "4",
+    command = [sys.executable, str(SOAK), "bag", "--runs", "3", "--busy", "3", "--rates", *rates, "--processes", "4",
                "--lanes", "3", "--inputs", inputs]  # fmt: skip
     done = subprocess.run(command, capture_output=True, text=True, timeout=5 * WAIT_S, check=False)
     told = f"{3 * len(rates)} runs, 1 different outcomes"

@@ -50,13 +50,13 @@ def read_tilts(path) -> list[msg.Tilt]:
 def test_the_graph_and_the_command_line_agree(graph, run, night):
     frames = sorted(night.glob("*.fits"))
     lines = starpos("solve", *frames, "--tilt", night / "tilt.csv", "--focal-mm", FOCAL_MM, "--pixel-um", PIXEL_UM,
-                    "--misalignment", *MISALIGNMENT, "--misalignment-stddev", 5, "--clock-stddev", CLOCK_S, *AIR,
+                    "--misalignment", *MISALIGNMENT, "--misalignment-stddev", 5, "--inclinometer", "sca100t_calibrated", "--clock-stddev", CLOCK_S, *AIR,
                     "--json").splitlines()  # fmt: skip
     expected = [json.loads(line) for line in lines][:FRAMES]
 
     misalignment = ",".join(MISALIGNMENT)
     air = ("refraction.pressure:=88000.0", "refraction.temperature:=12.0", "refraction.humidity:=0.3")
-    run("starpos_solver", "solver", f"misalignment:=[{misalignment}]", "misalignment_stddev:=5.0",
+    run("starpos_solver", "solver", f"misalignment:=[{misalignment}]", "misalignment_stddev:=5.0", "inclinometer.model:=sca100t_calibrated",
         f"clock_stddev:={CLOCK_S}", "tilt_timeout:=20.0", *air)  # fmt: skip
     run("starpos_camera", "detector")
     graph.wait(lambda: graph.tilt.get_subscription_count() and graph.node.count_publishers("stars") == 2)

@@ -12,8 +12,8 @@ from starpos.errors import StarposError
 from starpos.frames.reading import read_frame
 from starpos.instrument import camera_file, instrument_file
 from starpos.instrument.tilt_table import read_tilt_csv
+from starpos.messages.stars import MAX_STARS, message_to_stars
 from starpos.navigation.table import read_record
-from starpos.recording.messages import MAX_STARS, message_to_stars
 from starpos_interfaces.msg import Star, StarArray
 
 ROOT = Path(__file__).parents[1]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The inclinometer's process stands still while the instrument turns: tools/faults/stall_soak.py, shortened."""
+"""The inclinometer's process stands still while the instrument turns: tools/soaks/soak.py stalls, shortened."""
 
 import signal
 import subprocess
@@ -10,12 +10,12 @@ import pytest
 
 from starpos_testing.patience import WAIT_S
 
-TOOL = Path(__file__).parent.parent / "tools" / "faults" / "stall_soak.py"
+TOOL = Path(__file__).parent.parent / "tools" / "soaks" / "soak.py"
 
 
 @pytest.mark.timeout(4 * WAIT_S)
 def test_a_stalled_inclinometer_makes_no_wrong_tilt_and_no_wrong_fix():
-    command = [sys.executable, str(TOOL), "--stalls", "4", "--instruments", "2", "--seed", "3"]
+    command = [sys.executable, str(TOOL), "stalls", "--stalls", "4", "--instruments", "2", "--seed", "3"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as tool:
         try:
             out, _ = tool.communicate(timeout=3 * WAIT_S)

@@ -55,15 +55,18 @@ def test_a_run_of_no_frames_is_refused(tmp_path, tool, frames):
     ("words", "sentence"),
     [
         (["foo:=1"], "foo:=1 is no NAME:=VALUE of a parameter of the node camera: see its README."),
-        (["foo", "5"], "foo is no NAME:=VALUE of a parameter of the node camera: see its README."),
+        (
+            ["foo", "--frames", "5"],
+            "foo is no NAME:=VALUE of a parameter of the node camera: see its README.",
+        ),
         (["exposure"], "exposure is no NAME:=VALUE of a parameter of the node camera: see its README."),
         (["indi.binning:=0"], "parameter indi.binning must be a whole number from 1 to 16 px; 0 was given."),
         (["exposure:=[1"], "exposure:=[1: the value is no YAML."),
-        (["0"], "0 frames are no soak: give 1 or more."),
+        (["--frames", "0"], "0 frames are no soak: give 1 or more."),
     ],
 )
 def test_a_soak_with_words_that_are_none_ends_in_a_sentence(words, sentence):
-    assert run("soaks/soak_camera.py", "indi", *words) == (2, sentence + "\n")
+    assert run("soaks/soak.py", "camera", "indi", *words) == (2, sentence + "\n")
 
 
 @pytest.mark.parametrize(("outcome", "bad"), OUTCOMES.items(), ids=["passed", "skipped", "failed", "broken"])

@@ -3,9 +3,10 @@
 
 `test.py [PYTEST ARGUMENTS]`, `test.py --lint`. The last line counts what passed, failed and was skipped (a
 linter counts as one test); the exit status is 0 only where nothing failed. `test.py --ubuntu` runs packages' tests with
-the versions that Ubuntu 24.04 has (tools/setup/ubuntu-24.04.txt), in an environment as bare as a newcomer's: without
-the counterparts that tools/setup/counterparts brings. `test.py --both` runs all, builds the documents' site, looks
-through the licences and checks the package, which `test.py --docs` does alone: a warning is a failure.
+the versions that Ubuntu 24.04 has (tools/setup/ubuntu), in an environment as bare as a newcomer's: without the
+counterparts that tools/setup/counterparts brings. `test.py --both` runs all, and the core's tests with other interpreters
+that are at hand (tools/setup/core); it builds the documents' site, looks through the licences and checks the package,
+which `test.py --docs` does alone: a warning is a failure.
 """
 
 import os
@@ -19,7 +20,7 @@ from collections import Counter
 from collections.abc import Callable, Collection
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -28,15 +29,18 @@ LINTERS = [
     *(f"ruff {check} --output-format concise" for check in ("check", "format --check")),
     "codespell",
     "mypy",
+    "lint-imports --config tools/imports.ini --no-cache",
     f"{sys.executable} tools/walls.py",
+    "actionlint -no-color",
 ]
 # the site of the documents, whether each file has its licence, and the package's metadata, with what the first brings
 DOCS = [
     "tools/setup/docs",
     ".underlay/docs/bin/python -m sphinx -W --keep-going -n -q -c docs . build/docs",
     ".underlay/docs/bin/python -m reuse lint --lines",
-    # the wheel is made from the source package: what that lacks is missed here
-    ".underlay/docs/bin/python -m build --no-isolation src/starpos --outdir build/dist",
+    # the wheel is made from the source package: what that lacks is missed here; nothing runs in it: compiled quickly
+    f"env CC={ROOT}/tools/setup/cc_quickly"
+    " .underlay/docs/bin/python -m build --no-isolation src/starpos --outdir build/dist",
     ".underlay/docs/bin/python -m twine check --strict build/dist/*",
 ]
 # pytest's exit status where a -k left none.
@@ -46,21 +50,40 @@ SHOWN = 20
 # At once: on two cores, because tests of nodes mostly wait.
 LANES = 4
 # a folder's files in so many parts, which run as lanes are free
-PARTS = {"graph": 5, "starpos": 9, "starpos_camera": 3, "starpos_inclinometer": 2}
+PARTS = {"graph": 5, "starpos": 5, "starpos_camera": 3, "starpos_inclinometer": 2}
 # with Ubuntu's versions less is run
-UBUNTU_PARTS = {"starpos": 4}
+UBUNTU_PARTS = {"starpos": 3}
 # for so many at once: a thread that has no processor of its own makes the others wait for it
 ONE_THREAD = {"OPENCV_FOR_THREADS_NUM": "1"}
 # what is no test of pytest's
-CHECKS = ("linters", "documents")
+CHECKS = ("linters", "documents", "versions")
 # parts that mostly wait run beside those that mostly compute
 FIRST = ("graph", "starpos", "starpos_camera", "starpos_inclinometer")
 UBUNTU = "Ubuntu's "
-VERSIONS = "tools/setup/ubuntu-24.04.txt"
-# the Earth's rotation as Ubuntu 24.04 knows it, and the rooms of starpos whose answers depend on it
-OLD_TABLE = "astropy-iers-data==0.2024.2.26.0.28.55"
+# the rooms of starpos whose answers depend on the table of the Earth's rotation, which is older there
 ROTATING = [f"src/starpos/test/{room}" for room in ("earth", "fix", "session", "sky")]
 UNDERLAY = ROOT / ".underlay"
+# interpreters with which the core's tests run too, where they are at hand; Ubuntu's versions run with Python 3.12
+OTHERS = ("python3.10", "python3.13")
+# what enters and leaves compiled modules in most ways, in few seconds
+CORE = [
+    f"src/starpos/test/{name}.py"
+    for name in (
+        "detection/test_detection",
+        "detection/test_fit",
+        "detection/test_mesh",
+        "detection/test_pairs",
+        "detection/test_vetting",
+        "earth/test_refraction",
+        "fix/test_derivatives",
+        "fix/test_fix",
+        "fix/test_solver",
+        "identification/test_identification",
+        "identification/test_triangles",
+        "identification/test_two_skies",
+        "instrument/test_camera",
+    )
+]
 # with the newest versions only: what waits for nodes or other processes, what takes long and is
 # in other tests too, and what draws many nights (montecarlo)
 NEWEST_ONLY = [
@@ -82,6 +105,7 @@ NEWEST_ONLY = [
             "cli/test_cli_jobs",
             "detection/test_detection_sky",
             "identification/test_blind",
+            "identification/test_blind_fisheye",
             "identification/test_real_frames",
             "navigation/test_bad_records",
             "navigation/test_borne_out",
@@ -229,31 +253,21 @@ def newest(pytest_args: list[str]) -> Tests:
     }
 
 
-def made(folder: Path, out) -> bool:
-    """Whether there is an environment with the versions that Ubuntu 24.04 has; made once.
+@cache
+def set_up(*command: str) -> tuple[bool, str]:
+    """Run a command of set-up, once: whether it went well, and what it said."""
+    done = subprocess.run(
+        command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False
+    )
+    return done.returncode == 0, done.stdout
 
-    ROS, and what the list leaves out, are the workspace's.
-    """
-    wanted, stamp = (ROOT / VERSIONS).read_text() + OLD_TABLE, folder / "stamp"
+
+def versions(out) -> Outcome:
+    """Set up what Ubuntu's versions run with, and say what it is, before its tests' turn: PyPI makes it wait."""
     with MAKING:
-        if stamp.is_file() and stamp.read_text() == wanted:
-            return True
-        base = (UNDERLAY / "python").read_text().strip()
-        pip = [str(folder / "bin" / "python"), "-m", "pip", "--disable-pip-version-check", "install", "-q"]
-        alone = os.environ | {"PYTHONPATH": ""}
-        for command in (
-            [base, "-m", "venv", "--clear", str(folder)],
-            [*pip, "--no-input", "-r", VERSIONS],
-            [*pip, "--no-input", "--no-deps", "--target", str(folder / "old_table"), OLD_TABLE],
-        ):
-            if run(command, out, alone):
-                return False
-        [packages] = folder.glob("lib/python*/site-packages")
-        behind = UNDERLAY / "venv" / packages.relative_to(folder)
-        # its packages, and not those its own .pth files name: the counterparts
-        (packages / "workspace.pth").write_text(f"{behind}\n")
-        stamp.write_text(wanted)
-        return True
+        made, said = set_up("tools/setup/ubuntu")
+    print(said, end="", file=out)
+    return Outcome() if made else broken("Ubuntu's versions: no environment")
 
 
 def bare_environment(python: Path, programs: Path) -> dict[str, str]:
@@ -274,18 +288,47 @@ def older(
     before: folders of its environment whose packages come before all others.
     """
     ubuntu = UNDERLAY / "ubuntu"
-    if not made(ubuntu, out):
-        print("Ubuntu 24.04's versions could not be installed", file=out)
+    with MAKING:
+        made, _ = set_up("tools/setup/ubuntu")
+    if not made:
         return broken(f"{report}: no environment")
     python = ubuntu / "bin" / "python"
     with tempfile.TemporaryDirectory() as programs:
         # Some tests become another user.
         os.chmod(programs, 0o755)
-        environment = bare_environment(python, Path(programs))
-        first = [str(ubuntu / folder) for folder in before]
+        environment = of_its_own_ros(bare_environment(python, Path(programs)), ubuntu)
+        first = [str(ubuntu / folder) for folder in (*before, "messages")]
         environment["PYTHONPATH"] = os.pathsep.join([*first, environment.get("PYTHONPATH", "")])
         chosen = ["-m", "not montecarlo", *pytest_args]
         return pytest(files, report, chosen, out, python=str(python), environment=environment)
+
+
+def of_its_own_ros(variables: dict[str, str], environment: Path) -> dict[str, str]:
+    """Variables of the workspace, with the ROS of an environment that has its own, as another interpreter's does."""
+    if not (environment / "messages").is_dir():
+        return variables
+    # the wheels of ROS set the search path of libraries where this is not set
+    rest = {name: value for name, value in variables.items() if name != "_ROS_WHEELS_BOOTSTRAP_COMPLETE"}
+    return {name: value.replace(f"{UNDERLAY / 'venv'}", f"{environment}") for name, value in rest.items()}
+
+
+def core(name: str, pytest_args: list[str], out) -> Outcome:
+    """The tests of starpos's core with another interpreter, by its name; one skipped where this machine has none."""
+    if not set_up("tools/setup/interpreter", name)[0]:
+        return Outcome(Counter(skipped=1), skipped=Counter({f"{name} is not on this machine": 1}))
+    made, said = set_up("tools/setup/core", name)
+    print(said, end="", file=out, flush=True)
+    if not made:
+        return broken(f"core with {name}: no environment")
+    python = UNDERLAY / f"core-{name.removeprefix('python')}" / "bin" / "python"
+    chosen = ["-m", "not montecarlo", *pytest_args]
+    return pytest(CORE, f"core-{name}", chosen, out, python=str(python))
+
+
+def others(pytest_args: list[str]) -> Tests:
+    """Tests of the core with the interpreters that neither the workspace nor Ubuntu's versions run with."""
+    own = f"python{sys.version_info[0]}.{sys.version_info[1]}"
+    return {f"core with {name}": partial(core, name, pytest_args) for name in OTHERS if name != own}
 
 
 def ubuntus(pytest_args: list[str]) -> Tests:
@@ -298,7 +341,7 @@ def ubuntus(pytest_args: list[str]) -> Tests:
         for name, files in parts(folders(), UBUNTU_PARTS, {*NEWEST_ONLY, *rotating}).items()
     }
     table = partial(older, rotating, "table-ubuntu", pytest_args, before=["old_table"])
-    return tests | {f"{UBUNTU}table": table}
+    return tests | {f"{UBUNTU}table": table, "versions": versions}
 
 
 def shown(name: str, tests: Callable) -> Outcome:
@@ -313,10 +356,12 @@ def shown(name: str, tests: Callable) -> Outcome:
 
 
 def turn(name: str) -> tuple[bool, int, int]:
-    """When a part runs: linters, the first of each package, then the second of each; Ubuntu's versions last."""
+    """When a part runs: linters, the first of each package, then the second of each; other versions last."""
     package, *number = name.removeprefix(UBUNTU).split()
     if package in CHECKS:
         return False, 0, 0
+    if package == "core":
+        return True, 0, 0
     first = FIRST.index(package) if package in FIRST else len(FIRST)
     return name.startswith(UBUNTU), int(*number) if number else max(PARTS.values()) // 2, first
 
@@ -337,6 +382,8 @@ def main(args: list[str]) -> int:
         tests["documents"] = partial(lint, DOCS)
     if which & {"--ubuntu", "--both"}:
         tests |= ubuntus(pytest_args)
+    if "--both" in which:
+        tests |= others(pytest_args)
     total = all_of(tests)
     for reason, count in sorted(total.skipped.items()):
         print(f"{count:4d} skipped: {reason}")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Hold the house's walls: who may import whom, as the tables of docs/architecture.md say, and a few rules of names.
+"""Hold those walls of the house that import-linter does not see (tools/imports.ini): ROS, Cython, a few rules of names.
 
 `walls.py` prints a line for each breach and exits 1 where there is one. `make lint` runs it.
 """
@@ -11,13 +11,14 @@ import sys
 import tokenize
 from collections import defaultdict
 from collections.abc import Iterator
+from configparser import ConfigParser
 from dataclasses import dataclass
 from functools import cache, cached_property
-from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-PLAN = ROOT / "docs" / "architecture.md"
+# who may import whom, for import-linter; compiled modules keep to the same floors
+CONTRACTS = ROOT / "tools" / "imports.ini"
 # What starpos may import beside Python's own: a closed list, because ROS has more names than one could list.
 FOREIGN = {
     "argcomplete",
@@ -172,101 +173,41 @@ def compiled() -> list[Compiled]:
     return [Compiled(f"starpos.{path.parent.name}.{path.stem}", path, path.read_text()) for path in paths]
 
 
-def rows(heading: str) -> list[list[str]]:
-    """The cells of the table under a heading of the plan."""
-    section = PLAN.read_text().split(f"## {heading}\n", 1)[1].split("\n## ", 1)[0]
-    lines = [line for line in section.splitlines() if line.startswith("|")]
-    return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines[2:]]
-
-
+@cache
 def floors() -> dict[str, int]:
-    """The floor of each folder of `starpos`, 0 for the ground's modules."""
+    """The floor of each folder of `starpos`, from the ground's modules, 0, upwards."""
+    contracts = ConfigParser()
+    contracts.read(CONTRACTS)
+    lines = contracts["importlinter:contract:floors"]["layers"].split("\n")
     return {
-        name: 0 if floor == "ground" else int(floor)
-        for floor, cell, _ in rows("Folders of starpos")
-        for name in re.findall(r"`(\w+)`", cell)
+        name: k
+        for k, line in enumerate(reversed([line for line in lines if line]))
+        for name in re.findall(r"\w+", line)
     }
 
 
-def allowed() -> dict[str, set[str]]:
-    """Which packages of ours each may import, beside itself and the messages."""
-    ours, nodes = (
-        set(packages()),
-        {"starpos_camera", "starpos_inclinometer", "starpos_solver", "starpos_dashboard"},
-    )
-    may = {}
-    for where, _, cell in rows("Packages"):
-        [name] = re.findall(r"`(?:src/)?(\w+)`", where)
-        words = {
-            word if word.startswith("starpos") else f"starpos_{word}" for word in re.findall(r"\w+", cell)
-        }
-        may[name] = nodes | {"starpos", "starpos_common"} if "all nodes" in cell else words & ours
-    return may
-
-
-@cache
-def homes() -> dict[str, str]:
-    """Where the public names are that the door of `starpos` offers, by their full names."""
-    for node in ast.parse((packages()["starpos"] / "__init__.py").read_text()).body:
-        if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "_HOMES":
-            table = ast.literal_eval(node.value)
-            return {f"starpos.{name}": f"starpos.{home}.{name}" for name, home in table.items()}
-    raise SystemExit("walls.py: starpos/__init__.py has no table _HOMES: say here where the public names are")
-
-
 def imports(module: Module) -> Iterator[tuple[ast.AST, str]]:
-    """What it imports, by the name of its home, and where; a relative import begins with its dots."""
+    """What it imports, and where."""
     for node in ast.walk(module.tree):
         if isinstance(node, ast.Import):
             yield from ((node, alias.name) for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
-            where = "." * node.level + (f"{node.module}." if node.module else "")
-            for alias in node.names:
-                yield node, homes().get(where + alias.name, where + alias.name)
+            yield from ((node, f"{node.module}.{alias.name}") for alias in node.names)
 
 
-def layers(house: list[Module]) -> Iterator[str]:
-    """Imports that a wall forbids."""
-    floor, may = floors(), allowed()
+def outside(house: list[Module]) -> Iterator[str]:
+    """Imports of `starpos` that no contract sees: of ROS, and of its own public names, which opens every floor."""
     for module in house:
-        own = floor.get(module.room)
-        if module.package == "starpos" and module.room and module.room != "__main__" and own is None:
-            yield module.at(module.tree, f"{module.room} has no floor in {PLAN.name}: say where it belongs")
-        for node, target in imports(module):
+        for node, target in imports(module) if module.package == "starpos" else ():
             package, _, rest = target.partition(".")
-            room = rest.partition(".")[0]
-            ours = {module.package, "starpos_interfaces"} | may.get(module.package, set())
-            if not package:
-                yield module.at(node, f"{module.name} imports {target}: write the full name")
-            elif package in may and package not in ours:
-                yield module.at(node, f"{module.package} imports {package}, which {PLAN.name} does not allow")
-            elif module.package != "starpos":
-                continue
-            elif package not in {"starpos", *FOREIGN, *sys.stdlib_module_names}:
+            if package not in {"starpos", *FOREIGN, *sys.stdlib_module_names}:
                 yield module.at(
                     node, f"starpos imports {package}, which is ROS, or not yet in FOREIGN of walls.py"
                 )
-            elif package == "starpos" and isinstance(node, ast.Import) and module.name not in AT_THE_DOOR:
-                yield module.at(node, f"import {target} opens every floor: import a name from its folder")
-            elif package == "starpos" and own is not None and room != module.room:
-                above = floor.get(room)
-                if above is not None and above >= own and not (above == own == 0):
-                    yield module.at(node, f"{module.room} (floor {own}) imports {room} (floor {above})")
-
-
-def circles(house: list[Module]) -> Iterator[str]:
-    """Modules that import each other in a circle, also where a function does when it is called."""
-    by_name = {module.name: module for module in house}
-    needs: dict[str, set[str]] = {}
-    for module in house:
-        # of starpos.cli.solve.run the module is starpos.cli.solve; a package's own name is a door, not a room
-        found = {t if t in by_name else t.rpartition(".")[0] for _, t in imports(module)}
-        needs[module.name] = {t for t in found & set(by_name) if by_name[t].path.name != "__init__.py"}
-    try:
-        TopologicalSorter(needs).prepare()
-    except CycleError as error:
-        circle = error.args[1]
-        yield by_name[circle[0]].at(by_name[circle[0]].tree, f"imports in a circle: {', '.join(circle)}")
+            elif package != "starpos" or rest == "__version__" or module.name in AT_THE_DOOR:
+                continue
+            elif rest.partition(".")[0] not in floors():
+                yield module.at(node, f"import of {target} opens every floor: import a name from its folder")
 
 
 def cimports(files: list[Compiled]) -> Iterator[str]:
@@ -387,7 +328,7 @@ def breaches() -> list[str]:
     """All that is against the rules."""
     house, in_cython = modules(), compiled()
     everything = [*house, *in_cython, *beside()]
-    return [line for rule in (layers, circles, aliases, twins, keywords) for line in rule(house)] + [
+    return [line for rule in (outside, aliases, twins, keywords) for line in rule(house)] + [
         *words(everything),
         *comments(everything),
         *same_functions([*house, *in_cython]),

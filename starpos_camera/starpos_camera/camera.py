@@ -25,7 +25,7 @@ from starpos.frames.shutter import Shutter
 from starpos.instrument import camera_file
 from starpos.instrument.camera import Camera
 from starpos.instrument.instrument import focal_px_of
-from starpos.recording.messages import message_to_camera
+from starpos.messages.camera import message_to_camera
 from starpos.session import system_clock
 from starpos_camera.camera_parameters import PARAMETERS
 from starpos_camera.sources.registry import SOURCES

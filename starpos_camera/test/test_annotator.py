@@ -14,7 +14,7 @@ from std_msgs.msg import Header
 from test_detector import Feed
 
 from starpos.frames.annotate import DETECTED, IDENTIFIED
-from starpos.recording.messages import message_to_frame
+from starpos.messages.camera import message_to_frame
 from starpos_camera.detector import DetectorNode
 from starpos_interfaces.msg import Solution, StarArray
 from starpos_testing.nodes import Listener, Process

@@ -17,7 +17,8 @@ from starpos.frames.reading import read_frame
 from starpos.frames.shutter import UNKNOWN_LATENCY_S
 from starpos.instrument import camera_file
 from starpos.instrument.camera import Camera
-from starpos.recording.messages import message_to_camera, message_to_frame, stamp_to_unix
+from starpos.messages.camera import message_to_camera, message_to_frame
+from starpos.messages.stamp import stamp_to_unix
 from starpos.simulation.scene import expose
 from starpos.sky.catalogue import load_catalogue
 from starpos_common.messages import camera_to_message

@@ -9,7 +9,7 @@ import pytest
 from sensor_msgs.msg import Image
 
 from starpos.frames.frame import Frame
-from starpos.recording.messages import stamp_to_unix
+from starpos.messages.stamp import stamp_to_unix
 from starpos.session.system_clock import StepWatch
 from starpos_camera.sources.source import CapturedFrame, CaptureError
 from starpos_camera.stamping import in_one_time

@@ -8,7 +8,8 @@ from sensor_msgs.msg import CameraInfo, Image
 
 from starpos.detection import detect
 from starpos.frames.reading import read_frame
-from starpos.recording.messages import message_to_stars, stamp_to_unix
+from starpos.messages.stamp import stamp_to_unix
+from starpos.messages.stars import message_to_stars
 from starpos_interfaces.msg import Capture, StarArray
 
 OK = 0

@@ -1,15 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """What each inclinometer buys in metres: the table of accuracy by configuration, as Markdown.
 
-    . tools/env.sh && nice python tools/benchmarks/accuracy_by_configuration.py
-
 Whole nights are simulated and worked as a user would.  Place, date, pointing, mounting (A3), air, clock, Earth rotation
 and catalogue are drawn anew for each, and so are the errors of the sensor: noise, zero, drift, temperature, scale, cross
 axis, and what is new at each pose.  The instrument is told only how large these are.  Printed are the rms error of one
 axis against the astronomic truth, the error that the budget claims, and their ratio squared (1 where claims are true).
 """
 
-import argparse
 import sys
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -32,7 +29,7 @@ from starpos.instrument.tilt_log import TiltLog
 from starpos.rotation import half_turn
 from starpos.simulation.montecarlo_nights import (
     CAMERA,
-    COMPENSATED,
+    SCA100T_CALIBRATED,
     EXPOSURE_S,
     LEAN_DEG,
     READINGS,
@@ -52,7 +49,7 @@ SENSORS = {
     "IMU at rest (Bosch BMI088, data sheet)": sensors.BMI088,
     "SCA100T-D01 as sold (data sheet)": sensors.SCA100T,
     "SCL3300, digital, as sold (data sheet)": sensors.SCL3300,
-    "SCA100T, compensated and calibrated": COMPENSATED,
+    "SCA100T, compensated and calibrated": SCA100T_CALIBRATED,
     "tiltmeter of 0.1 arcsec": tiltmeter(0.1),
 }
 # headings, frames at each, s from frame to frame
@@ -141,7 +138,7 @@ def turned(errors: InclinometerErrors, catalogue: Catalogue, rng: np.random.Gene
 
 def turned_fixes(solver: Solver, stars: list[Stars], tilts: TiltLog) -> list[Fix]:
     """The fixes of frames at several headings."""
-    return turn(solver, stars, tilts.average).fixes
+    return turn(solver, stars, tilts).fixes
 
 
 def given(errors: InclinometerErrors, catalogue: Catalogue, rng: np.random.Generator) -> list[Night]:
@@ -156,7 +153,7 @@ def given(errors: InclinometerErrors, catalogue: Catalogue, rng: np.random.Gener
     more, readings = photograph(lower, zero, response, begin + 3600, CALIBRATED, rng)
     solver, known = Solver(world.told, catalogue, world.air), log_of(rows + readings, errors)
     try:
-        found = calibrate_at(solver, stars + more, known.average, world.site)
+        found = calibrate_at(solver, stars + more, known, world.site)
     except StarposError as e:
         return [lost(e)] * len(GIVEN)
     ready = replace(solver, instrument=found.instrument)
@@ -175,7 +172,7 @@ def given(errors: InclinometerErrors, catalogue: Catalogue, rng: np.random.Gener
 
 def single_fixes(solver: Solver, frames: list[Stars], tilts: TiltLog) -> list[Fix]:
     """The fixes of frames, each by itself."""
-    return [s.fix for f in frames if (s := solver.solve(f, tilts.average)).fix]
+    return [s.fix for f in frames if (s := solver.solve(f, tilts)).fix]
 
 
 def lost(why: StarposError) -> Night:
@@ -217,14 +214,13 @@ def worked(task: tuple) -> list[Night]:
     return night(errors, load_catalogue(), np.random.default_rng(seed))
 
 
-def main() -> int:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+def options(parser) -> None:
     parser.add_argument("--nights", type=int, default=12, metavar="N", help="of each cell (12)")
     parser.add_argument("--seed", type=int, default=1, metavar="S", help="(1)")
     parser.add_argument("--jobs", type=int, default=1, metavar="N", help="processes (1)")
-    args = parser.parse_args()
+
+
+def run(args) -> int:
     columns = [f"A3 given, {time}" for time in GIVEN] + [f"A3 turned, {time}" for time in TURNED]
     cells: dict[str, list] = {}
     with ProcessPoolExecutor(args.jobs) as pool:
@@ -247,7 +243,3 @@ def main() -> int:
     for name, row in cells.items():
         print(f"| {name} | " + " | ".join(f"{metres(c[1])}, {c[2]:.2f}" for c in row) + " |")
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -3,6 +3,7 @@
 
 `make bench`, or `. tools/env.sh && python tools/benchmarks/bench.py [GROUP ...] [--quick] [--peers FOLDER]`.  Works are
 done by turns, so that what else the machine does falls on all of them: trust the ratio, not the time.
+`bench.py full KIND [OPTIONS]` is a longer measurement: more cases, memory, accuracy, targets (`bench.py full --help`).
 """
 
 import argparse
@@ -18,7 +19,10 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("RAYON_NUM_THREADS", "1")
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
 import peers
+import runner
 from table import HEAD, Row, circumstances, show
 
 # By its name: the benchmark whose `rows` it is.
@@ -31,6 +35,17 @@ GROUPS = {
     "jobs": "benchmark_jobs",
     "navigation": "benchmark_navigation",
     "navigator": "benchmark_navigator",
+    "nodes": "latency",
+}
+# What `full` measures: the benchmark whose `run` it is.
+FULL = {
+    "accuracy": "accuracy_by_configuration",
+    "detection": "benchmark_detection",
+    "identification": "benchmark_identification",
+    "instructions": "instructions",
+    "jobs": "benchmark_jobs",
+    "link": "link_bandwidth",
+    "navigation": "benchmark_navigation",
     "nodes": "latency",
 }
 
@@ -48,6 +63,9 @@ def rows(groups: list[str], options: argparse.Namespace) -> Iterator[Row]:
 
 
 def main() -> int:
+    if sys.argv[1:2] == ["full"]:
+        kinds = {name: Path(__file__).with_name(f"{module}.py") for name, module in FULL.items()}
+        return runner.main("A longer measurement of one part.", kinds, sys.argv[2:], "full")
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )

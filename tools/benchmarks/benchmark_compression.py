@@ -53,20 +53,3 @@ def rows(options) -> Iterator[Row]:
     name, ours = next(iter(costs.items()))
     for peer in ("Rice", "PNG"):
         yield Row(f"a full frame packed, {name}", ours, peer, costs[peer])
-
-
-def main() -> None:
-    pixels = full_frame()
-    noise = 1.4826 / np.sqrt(2) * np.median(np.abs(np.diff(pixels.astype(int), axis=1)))
-    bits = 8 * pixels.itemsize
-    least = np.log2(noise * np.sqrt(2 * np.pi * np.e)) / bits
-    print(
-        f"{pixels.shape[1]} x {pixels.shape[0]} px of {bits} bits; noise of {noise:.1f} DN leaves {least:.2f}\n"
-    )
-    print("| | of the size | CPU s |\n| --- | --- | --- |")
-    for name, share, seconds in coded(pixels):
-        print(f"| {name} | {share:.2f} | {seconds:.2f} |")
-
-
-if __name__ == "__main__":
-    main()

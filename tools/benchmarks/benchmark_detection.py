@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """CPU time and memory of detection against the frame's size and kind, the number of stars and the share of hot pixels.
 
-`benchmark_detection.py [--repeat N] [--peers FOLDER]`: medians of N.  sep with windowed positions works on the same
+Medians of --repeat runs.  sep with windowed positions works on the same
 frames, by turns, if it can be imported (peers.py); those of a colour mosaic are made grey for it by OpenCV, in its time.
 Memory is the growth of the process at its peak, over the frame's own bytes (Linux only).
 """
 
-import argparse
 import multiprocessing
 import os
 import tempfile
@@ -208,13 +207,12 @@ def rows(options) -> Iterator[Row]:
                 yield Row(what, ours)
 
 
-def main():
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+def options(parser) -> None:
     parser.add_argument("--repeat", type=int, default=3)
     parser.add_argument("--peers", type=Path, default=peers.folder(), metavar="FOLDER", help="of peers")
-    options = parser.parse_args()
+
+
+def run(options) -> int:
     peers.look_in(options.peers)
     programs = {"starpos": with_starpos}
     if peers.is_here("sep"):
@@ -225,7 +223,3 @@ def main():
         for m in found.values():
             line += f" | {m.found:14d} {m.ms:7.1f} {m.ms / case.mpx:6.1f} {m.memory:6.2f}"
         print(line, flush=True)
-
-
-if __name__ == "__main__":
-    main()

@@ -1,14 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Table of starpos and its peers on the same random fields, in one run.
 
-`benchmark_identification.py [--fields N] [--seed S] [--false K ...] [--index FOLDER] [--peers FOLDER]`.  Peers run
+Peers run
 where they can be imported (peers.py): cedar-solve and tetra3rs with databases made here from this program's catalogue
 for this field of view (five minutes and one), kept in the cache; astrometry.net's engine with FOLDER's index files
 (its figures are those of these files: `build-astrometry-index -P 7 .. 10 -n 30` of a V < 9.5 list finds 97 to 98 %).
 Every program gets the focal length to 3 %, and the stars in order of brightness; all programs get each field.
 """
 
-import argparse
 import logging
 import math
 import sys
@@ -282,10 +281,7 @@ def compared(what: str, tallies: dict[str, Tally]) -> Iterator[Row]:
         yield Row(what, ours)
 
 
-def main() -> int:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+def options(parser) -> None:
     parser.add_argument("--fields", type=int, default=1000, metavar="N", help="of each kind (1000)")
     parser.add_argument("--seed", type=int, default=1, metavar="S", help="of the random numbers (1)")
     parser.add_argument(
@@ -293,7 +289,9 @@ def main() -> int:
     )
     parser.add_argument("--index", type=Path, metavar="FOLDER", help="astrometry.net's index files")
     parser.add_argument("--peers", type=Path, default=peers.folder(), metavar="FOLDER", help="of peers")
-    args = parser.parse_args()
+
+
+def run(args) -> int:
     peers.look_in(args.peers)
     stars = catalogue.load_catalogue()
     answers = answers_of(stars, args)
@@ -310,7 +308,3 @@ def main() -> int:
                     flush=True,
                 )
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Comparison of `starpos solve --jobs N` with --jobs 1, on simulated frames of the paper's size and on star lists.
 
-`benchmark_jobs.py [--frames N] [--lists N] [--jobs N] [--rounds R]`.  Whole commands are timed, with start and end of
+Whole commands are timed, with start and end of
 the processes, 1 and N by turns; the best round counts, because other work on the machine only slows.  The CPU time of all
 processes shows what is possible on a machine that always has other work.  The answers are compared byte by byte.
 """
 
-import argparse
 import resource
 import subprocess
 import sys
@@ -100,15 +99,14 @@ def rows(options) -> Iterator[Row]:
     yield Row(f"{number} star lists replayed from bags, all their CPU", Cost(1000 * cpu_s), "solved", alone)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+def options(parser) -> None:
     parser.add_argument("--frames", type=int, default=40)
     parser.add_argument("--lists", type=int, default=400)
     parser.add_argument("--jobs", type=int, default=processors())
     parser.add_argument("--rounds", type=int, default=3)
-    args = parser.parse_args()
+
+
+def run(args) -> int:
     start, call = overhead_ms(args.jobs)
     print(f"{args.jobs} processes start within {start:.0f} ms; a call costs {call:.2f} ms besides its work")
     n = args.jobs
@@ -120,7 +118,3 @@ def main() -> None:
         ):
             folder = simulated(Path(scratch) / what.replace(" ", ""), number, *more)
             compare(what, folder, number, args.jobs, args.rounds)
-
-
-if __name__ == "__main__":
-    main()

@@ -1,13 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Table of docs/navigation.md: how well place and heading are known under way, and whether their claims hold.
 
-`benchmark_navigation.py [--voyages N] [--first SEED] [--seconds S] [--vehicles rover ...]`.  Voyages of
+Voyages of
 starpos_testing.voyages with odometry or a log (none for drones, and for rovers of starpos_testing.halting), a frame
 every 2 s.  Means of the last quarter: error of the place, 1 sigma an axis as claimed, NEES of the place (2 where claims
 hold), error of the heading; CPU time of a voyage without identification.
 """
 
-import argparse
 import math
 import time
 from collections.abc import Iterator
@@ -116,16 +115,15 @@ def rows(options) -> Iterator[Row]:
         yield Row(what, Cost(1000 * spent_s), "real time", Cost(1000 * VOYAGE_S))
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+def options(parser) -> None:
     parser.add_argument("--voyages", type=int, default=8, help="of each kind")
     parser.add_argument("--first", type=int, default=0, metavar="SEED", help="of the first voyage (0)")
     parser.add_argument("--seconds", type=float, default=1200.0)
     usual = tuple(dict.fromkeys([*VEHICLES, *WINDS, *KNOWN]))
     parser.add_argument("--vehicles", nargs="+", choices=(*usual, *DRIVES), default=usual)
-    args = parser.parse_args()
+
+
+def run(args) -> int:
     print(
         "| vehicle | IMU | error m | claimed m | NEES | heading arcsec | CPU s |",
         "| --- | --- | --- | --- | --- | --- | --- |",
@@ -142,7 +140,3 @@ def main() -> None:
                 f"| {spent_s:.1f} |",
                 flush=True,
             )
-
-
-if __name__ == "__main__":
-    main()

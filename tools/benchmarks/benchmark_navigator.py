@@ -1,17 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """CPU time of the node `navigator` by an IMU of so many Hz, in real time, with a frame and ten velocities a second.
 
-    benchmark_navigator.py [--rate 400] [--seconds 120] [--outputs 10]
-
-Prints the share of a core that the node takes, second half alone, how many readings it refused, and what it says at the
-end.  The voyage is a rover's of starpos_testing.voyages, that began before now.
+The second half alone counts.  The voyage is a rover's of starpos_testing.voyages, that began before now.
 """
 
-import argparse
 import tempfile
 import time
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -35,38 +31,16 @@ from starpos_testing.voyages import INDUSTRIAL, MadeVoyage, made
 Event = tuple[float, str, object]
 
 
-@dataclass(frozen=True)
-class Load:
-    """The share of a core that the node took, how many messages it refused, and what it says at the end."""
-
-    share: float
-    refused: str
-    said: str
-
-
 def rows(options) -> Iterator[Row]:
     """The rows of bench.py; with --quick none."""
     if not options.quick:
-        load = measured(400.0, 30.0, 10.0)
-        yield Row("navigator, a second at 400 Hz", Cost(1000 * load.share), "real time", Cost(1000.0))
+        share, refused = measured(400.0, 30.0, 10.0)
+        here = Cost(1000 * share, f"{refused} messages refused")
+        yield Row("navigator, a second at 400 Hz", here, "real time", Cost(1000.0))
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--rate", type=float, default=400.0, help="of the IMU, Hz")
-    parser.add_argument("--seconds", type=float, default=120.0)
-    parser.add_argument("--outputs", type=float, default=10.0, help="a second")
-    args = parser.parse_args()
-    load = measured(args.rate, args.seconds, args.outputs)
-    print(
-        f"{args.rate:g} Hz: {100 * load.share:.1f} % of a core; {load.refused} messages refused; {load.said}"
-    )
-
-
-def measured(rate_hz: float, seconds: float, outputs_hz: float) -> Load:
-    """Start the node and play a rover's voyage of so many seconds."""
+def measured(rate_hz: float, seconds: float, outputs_hz: float) -> tuple[float, str]:
+    """Start the node and play a rover's voyage of so many seconds; the share of a core and what it refused."""
     events = messages(made("rover", seconds, 1, rate_hz=rate_hz))
     take_domain()
     with tempfile.TemporaryDirectory() as folder:
@@ -81,7 +55,7 @@ def measured(rate_hz: float, seconds: float, outputs_hz: float) -> Load:
 
 def played(
     graph: Graph, folder: Path, seconds: float, outputs_hz: float, events: list[Event], model: Path
-) -> Load:
+) -> tuple[float, str]:
     """Play the messages in real time."""
     node = graph.start(
         folder / "log",
@@ -107,9 +81,8 @@ def played(
             halfway = cpu_s(node.process.pid)
         publishers[topic].publish(message)
     share = (cpu_s(node.process.pid) - halfway) / (time.monotonic() - begin - half_s)
-    said = graph.state("navigator: Navigation", "").message
     inputs = {v.key: v.value for v in graph.state("navigator: Inputs", "").values}
-    return Load(share, inputs["refused"], said)
+    return share, inputs["refused"]
 
 
 def messages(record: MadeVoyage) -> list[Event]:
@@ -150,7 +123,3 @@ def attitude(frame: IdentifiedFrame) -> Attitude:
         log_odds=50.0,
     )
     return attitude_to_message(found)
-
-
-if __name__ == "__main__":
-    main()

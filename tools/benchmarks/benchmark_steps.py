@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """CPU time of the steps around detection and identification: a message, a fix, an average, a new field, a start.
 
-`benchmark_steps.py [--rounds N]`.  Where no program of others does the same step, it stands beside a known piece of work
+Where no program of others does the same step, it stands beside a known piece of work
 that it cannot do without, or that is as much: a copy of the frame, astropy's places of the same stars, Python's start.
 """
 
-import argparse
 import importlib.util
 import os
 import subprocess
@@ -20,7 +19,7 @@ from pathlib import Path
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
-from table import HEAD, Cost, Row, by_turns, spent_ms
+from table import Cost, Row, by_turns, spent_ms
 
 from starpos.averaging.average import average
 from starpos.cli import main as starpos
@@ -170,7 +169,7 @@ def night(folder: Path) -> tuple[str, ...]:
     optics = ("--focal-mm", "600", "--pixel-um", "6.4")
     starpos(["simulate", str(folder / "night"), "-n", "1", "--stars-only", *optics])
     [stars] = (folder / "night").glob("stars_*.csv")
-    mounting = ("--misalignment", "0", "0", "0", "--misalignment-stddev", "5")
+    mounting = ("--misalignment", "0", "0", "0", "--misalignment-stddev", "5", "--inclinometer", "sca100t_calibrated")
     tilt = ("--tilt", str(folder / "night" / "tilt.csv"))
     return ("solve", str(stars), *tilt, *optics, *mounting, "--json")
 
@@ -197,19 +196,3 @@ def rows(options) -> Iterator[Row]:
         yield from step(options)
     if not options.quick:
         yield from new_field(options)
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--rounds", type=int, default=5)
-    options = parser.parse_args()
-    options.quick = False
-    print(HEAD)
-    for row in rows(options):
-        print(row, flush=True)
-
-
-if __name__ == "__main__":
-    main()

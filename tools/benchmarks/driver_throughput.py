@@ -1,12 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""CPU time per sample of the inclinometer's driver, from bytes to readings, and how much faster than real time it is.
+"""CPU time per sample of the inclinometer's driver, from bytes to readings, a line at a time as they come."""
 
-    python tools/benchmarks/driver_throughput.py [SAMPLES]          20000, at 50 Hz, a line at a time as they come
-
-Exit status 0; 1 if it is less than 100 times real time.
-"""
-
-import sys
 import time
 from collections.abc import Iterator
 
@@ -19,7 +13,7 @@ from starpos_inclinometer.sources import mcu_protocol
 from starpos_inclinometer.sources.ascii_line import LineDecoder
 from starpos_inclinometer.sources.mcu import McuDecoder, McuTilts
 
-RATE_HZ, WANTED = 50, 100
+RATE_HZ = 50
 COMPENSATED = {
     "cross_axis": (1.0, 0.01, -0.01, 1.0),
     "temperature.offset_x": (1e-4, 1e-6, 1e-8),
@@ -44,19 +38,6 @@ def rows(options) -> Iterator[Row]:
             f"real time at {RATE_HZ} Hz",
             Cost(1000 / RATE_HZ),
         )
-
-
-def main() -> int:
-    samples = int(sys.argv[1]) if len(sys.argv) > 1 else 20_000
-    slowest_us = max(report(what, us) for what, us in each(samples))
-    return int(1e6 / RATE_HZ / slowest_us < WANTED)
-
-
-def report(what: str, each_us: float) -> float:
-    print(
-        f"{what:22} {each_us:6.1f} us a sample, {1e6 / RATE_HZ / each_us:5.0f} times real time at {RATE_HZ} Hz"
-    )
-    return each_us
 
 
 def serial(samples: int, values) -> float:
@@ -84,7 +65,3 @@ def ascii_lines(samples: int, pattern: str) -> float:
     took_s = time.process_time() - began_s
     assert believed == samples
     return 1e6 * took_s / samples
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,13 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Instructions that the steps of a frame take, which a busy machine does not change, and what they come to on a board.
 
-    . tools/env.sh && python tools/benchmarks/instructions.py
-
 Needs valgrind.  Numerical libraries are held to vectors of 128 bits, as an ARM core has them.  The time on a board is
 instructions / (instructions a cycle x clock), with the figures of BOARDS: an estimate, nothing here runs on a board.
 """
 
-import argparse
 import ctypes
 import json
 import os
@@ -186,7 +183,7 @@ def measured(folder: Path) -> Iterator[tuple[str, float, float | None]]:
     rng = np.random.default_rng(1)
     for name, (size, stars) in FRAMES.items():
         np.save(folder / f"{name}.npy", exposure(size, stars, rng)[0])
-    again = [sys.executable, str(Path(__file__)), "--within", str(folder)]
+    again = [sys.executable, str(Path(__file__)), str(folder)]
     ms = dict(said([*again, "--timed"]))
     gate = (f"--toggle-collect={GATE}", f"--dump-after={GATE}")
     counts = {}
@@ -197,17 +194,11 @@ def measured(folder: Path) -> Iterator[tuple[str, float, float | None]]:
     yield "start to the first answer, `starpos solve` of a star list", *start(folder)
 
 
-def main() -> int:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+def options(parser) -> None:
     parser.add_argument("--into", type=Path, metavar="DOCUMENT", help="whose table is replaced")
-    parser.add_argument("--within", type=Path, help=argparse.SUPPRESS)
-    parser.add_argument("--timed", action="store_true", help=argparse.SUPPRESS)
-    options = parser.parse_args()
-    if options.within:
-        (timed if options.timed else counted)(options.within)
-        return 0
+
+
+def run(options) -> int:
     if shutil.which("valgrind") is None:
         print("valgrind is not here, and it is what counts: apt install valgrind", file=sys.stderr)
         return 1
@@ -218,4 +209,5 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    # the works themselves, within valgrind, for `run`
+    (timed if "--timed" in sys.argv else counted)(Path(sys.argv[1]))

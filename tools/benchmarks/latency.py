@@ -1,16 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Times and costs of the installed nodes: start to first fix, frame to fix, stars to fix, CPU, memory.
 
-    python tools/benchmarks/latency.py [--frames 100] [--starts 5] [--only start,stars,frames] [--profile FILE]
-
 Prints a table in Markdown with the targets.  Exit status 1 if one is missed.  A frame waits for the tilts of its
 exposure, so they are sent before it.  The first run on a machine builds the sky's triangles before anything is timed.
 """
 
-import argparse
 import os
 import signal
-import sys
 import tempfile
 import time
 from collections.abc import Iterator
@@ -265,17 +261,16 @@ def choose(profile: str) -> None:
         os.environ.pop(PROFILES, None)
 
 
-def main() -> int:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+def options(parser) -> None:
     parser.add_argument("--frames", type=int, default=100)
     parser.add_argument("--starts", type=int, default=5)
     parser.add_argument("--only", default="start,stars,frames")
     parser.add_argument(
         "--profile", default=str(QUICK_START), help="Fast DDS profiles of all nodes; '' for its own"
     )
-    options = parser.parse_args()
+
+
+def run(options) -> int:
     only, rows = options.only.split(","), []
     choose(options.profile)
     signal.signal(signal.SIGTERM, signal.default_int_handler)
@@ -296,7 +291,3 @@ def main() -> int:
     load = os.getloadavg()[0]
     print(f"\n{os.cpu_count()} cores, load {load:.1f} at the end")
     return int(any(row.missed for row in rows))
-
-
-if __name__ == "__main__":
-    sys.exit(main())

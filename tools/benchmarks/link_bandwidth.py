@@ -1,13 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Network load between the mount's computer and the robot's: two hosts of Linux namespaces, full frames.
 
-    python tools/benchmarks/link_bandwidth.py [FRAMES]          10; as root, with iproute2 and /dev/net/tun
-
-Counts the bytes of Ethernet in both directions, with those of DDS. Detection runs on the mount, so only stars and tilts
-cross.
+As root, with iproute2 and /dev/net/tun.  Counts the bytes of Ethernet in both directions, with those of DDS.  Detection
+runs on the mount, so only stars and tilts cross.
 """
 
-import sys
 import tempfile
 from pathlib import Path
 
@@ -16,12 +13,15 @@ from starpos_testing.domain import own_domain
 CADENCE_S = 2.0
 
 
-def main() -> int:
+def options(parser) -> None:
+    parser.add_argument("--frames", type=int, default=10)
+
+
+def run(options) -> int:
     from starpos_testing.graph.link import FULL_FRAME_BYTES, TILT_RATE_HZ, traffic
 
-    frames = int(sys.argv[1]) if len(sys.argv) > 1 else 10
     with own_domain(), tempfile.TemporaryDirectory() as folder:
-        seen = traffic(Path(folder), frames, CADENCE_S)
+        seen = traffic(Path(folder), options.frames, CADENCE_S)
     each, second = seen.bytes_per_frame, seen.bytes_per_second
     print(f"{seen.frames} frames, {seen.stars:.0f} stars each")
     print(f"a frame's stars      {each / 1e3:8.1f} kB")
@@ -33,7 +33,3 @@ def main() -> int:
         f"raw frames would be  {FULL_FRAME_BYTES * 8e-6:8.0f} Mbit/s (calculated: {FULL_FRAME_BYTES} bytes each)"
     )
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

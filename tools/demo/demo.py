@@ -87,7 +87,8 @@ def picture(watcher: PictureWatcher, errors: np.ndarray, covariance: np.ndarray,
     from picture import draw
 
     from starpos.frames.annotate import Identified, annotate
-    from starpos.recording.messages import message_to_frame, message_to_stars
+    from starpos.messages.camera import message_to_frame
+    from starpos.messages.stars import message_to_stars
 
     frame, place = watcher.pictured, watcher.place
     if frame is None or stamp_of(frame) not in watcher.stars:

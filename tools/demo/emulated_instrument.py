@@ -107,7 +107,7 @@ def wait_for(port: int):
 def start_nodes(nodes: Processes, place: Place, found: dict):
     nodes.node("starpos_inclinometer", "inclinometer", found["inclinometer"])
     # A3 is exact here, and the clock is also that of the sky, so their usual errors would only widen the covariance.
-    exact = {"misalignment_stddev": EXACT_ARCSEC, "clock_stddev": EXACT_S}
+    exact = {"misalignment_stddev": EXACT_ARCSEC, "inclinometer.model": "sca100t_calibrated", "clock_stddev": EXACT_S}
     nodes.node("starpos_solver", "solver", known_of(place) | exact)
     nodes.node("starpos_camera", "detector", {})
     nodes.node("starpos_camera", "camera", found["camera"] | {"cadence": CADENCE_S, "exposure": EXPOSURE_S})

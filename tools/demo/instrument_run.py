@@ -131,6 +131,7 @@ def known_of(place: Place) -> dict:
     """Parameters of the solver that a user knows who sets up the instrument there, without the place."""
     known = {f"refraction.{k}": getattr(place, k) for k in ("pressure", "temperature", "humidity")}
     known["misalignment_stddev"] = 5.0
+    known["inclinometer.model"] = "sca100t_calibrated"
     known["misalignment"] = "[" + ", ".join(f"{v:.9f}" for v in place.misalignment) + "]"
     return known
 

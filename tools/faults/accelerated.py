@@ -78,6 +78,7 @@ def parameters_of(folder: Path) -> dict:
         "self_calibration": False,
         "frame_id": "starpos_link",
         "misalignment_stddev": 5.0,
+        "inclinometer.model": "sca100t_calibrated",
     }
 
 

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Thousands of random faults from all inputs into the installed nodes, and the outcome of each kind.
 
-    python tools/faults/fault_soak.py [--faults 10000] [--lanes 3] [--seed S]
-
 A simulated instrument in accelerated time (/clock) sends star lists to the solver and small images to the detector;
 between the faults it turns and drives.  Nodes wait more than they compute, so several such instruments run at a time,
 each in a ROS domain of its own.  Every fix of every topic is held against where it truly was: one further off
@@ -10,7 +8,6 @@ than 5 of its own sigmas is wrong.  Prints a table in Markdown.  Exit status 0 o
 defect in a log, recovery after every fault, and memory that stays.
 """
 
-import argparse
 import math
 import multiprocessing
 import signal
@@ -22,6 +19,8 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from statistics import median
+
+from runner import Memory, Progress, seed_of_the_day
 
 from starpos_testing.domain import own_domain
 
@@ -218,13 +217,12 @@ def _yaml(value) -> str:
     return {True: "true", False: "false"}[value] if isinstance(value, bool) else str(value)
 
 
-def run(faults: int, seed: int) -> Outcome:
+def soaked(faults: int, seed: int) -> Outcome:
     """Inject so many faults into one instrument, in a ROS domain of its own."""
-    from starpos_testing.processes import memory_mb
-
     restarts = max(4, faults // FAULTS_A_RESTART)
     with own_domain(), tempfile.TemporaryDirectory() as folder:
-        soak, sizes, begin = Soak(Path(folder), seed), {}, time.monotonic()
+        soak, memory = Soak(Path(folder), seed), {}
+        progress = Progress(faults, f"faults of seed {seed}")
         world = soak.world
         try:
             assert soak.settle()[0] and soak.settle(image=True)[0], "no fix before any fault"
@@ -233,14 +231,8 @@ def run(faults: int, seed: int) -> Outcome:
                 soak.any_fault()
                 if k >= WARM * faults:
                     for name, node in soak.nodes.items():
-                        sizes.setdefault(name, []).append(memory_mb(node.process.pid))
-                if k % 500 == 0:
-                    passed = time.monotonic() - begin
-                    print(
-                        f"seed {seed}: {k} faults, {passed:.0f} s, {len(world.wrong)} wrong",
-                        file=sys.stderr,
-                        flush=True,
-                    )
+                        memory.setdefault(name, Memory(node.process.pid)).look()
+                progress.at(k, len(world.wrong), "wrong")
             for _ in range(restarts):
                 soak.restart()
         finally:
@@ -252,22 +244,17 @@ def run(faults: int, seed: int) -> Outcome:
         wrong=world.wrong,
         crashes=soak.crashes,
         stuck=soak.stuck,
-        memory=[(f"{name} {seed}", *_halves(mb)) for name, mb in sizes.items()],
+        memory=[(f"{name} {seed}", *seen.halves) for name, seen in memory.items()],
     )
 
 
 def run_lanes(faults: int, seed: int, lanes: int) -> list[Outcome]:
     """Share the faults among so many instruments at a time."""
     if lanes == 1:
-        return [run(faults, seed)]
+        return [soaked(faults, seed)]
     shares = [len(range(k, faults, lanes)) for k in range(lanes)]
     with ProcessPoolExecutor(lanes, multiprocessing.get_context("spawn")) as pool:
-        return list(pool.map(run, shares, range(seed, seed + lanes)))
-
-
-def _halves(mb: list[float]) -> tuple[float, float]:
-    """Largest values of the first and of the last half."""
-    return max(mb[: len(mb) // 2]), max(mb[len(mb) // 2 :])
+        return list(pool.map(soaked, shares, range(seed, seed + lanes)))
 
 
 def _spread(sigmas: dict[str, list[float]]) -> str:
@@ -293,15 +280,13 @@ def table(rows: dict[str, Row]) -> str:
     return "\n".join(lines)
 
 
-def main(arguments=None) -> int:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+def options(parser) -> None:
     parser.add_argument("--faults", type=int, default=10000)
-    today = int(time.time() // 86400)
-    parser.add_argument("--seed", type=int, default=today, help="default: of the day")
+    parser.add_argument("--seed", type=int, default=seed_of_the_day(), help="default: of the day")
     parser.add_argument("--lanes", type=int, default=3, help="instruments at a time")
-    options = parser.parse_args(arguments)
+
+
+def run(options) -> int:
     begin, outcome = time.monotonic(), Outcome()
     each = run_lanes(options.faults, options.seed, options.lanes)
     for one in each:
@@ -318,7 +303,7 @@ def report(outcome: Outcome, options: str, seconds: float):
     """Print what happened."""
     from kinds import UNTOLD
 
-    print(f"`tools/faults/fault_soak.py {options}`:\n")
+    print(f"`tools/soaks/soak.py faults {options}`:\n")
     print(table(outcome.rows))
     right = ", ".join(f"{n} of {topic}" for topic, n in outcome.right.items())
     print(f"\n{outcome.injected} faults in {seconds / 60:.0f} min; right: {right}; wrong: {len(outcome.wrong)}; "
@@ -329,7 +314,3 @@ def report(outcome: Outcome, options: str, seconds: float):
     print(f"\n{UNTOLD}")
     for line in (*outcome.wrong, *outcome.crashes, *outcome.stuck):
         print(line, file=sys.stderr)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

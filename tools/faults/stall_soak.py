@@ -1,15 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """The inclinometer's process stands still (SIGSTOP) for 0.5 to 10 s while the instrument turns: its tilts, and the fixes.
 
-    python tools/faults/stall_soak.py [--stalls 200] [--instruments 4] [--seed S]
-
 Each instrument is an inclinometer on a pseudo-terminal (the microcontroller with its clock, or lines of text without
 one), the nodes `inclinometer` and `solver`, and star lists of what it points at, in real time. A tilt is wrong if the
 instrument did not lean so at its stamp, unless its flags say that its time is not known. A fix is wrong beyond 5 of its
 own sigmas. Prints one line. Exit status 0 only with nothing wrong, and a fix after every stall.
 """
 
-import argparse
 import multiprocessing
 import signal
 import sys
@@ -22,9 +19,11 @@ import numpy as np
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import QoSProfile
+from runner import seed_of_the_day
 from sensor_msgs.msg import CameraInfo, NavSatFix
 
-from starpos.recording.messages import UNUSABLE, stamp_to_unix
+from starpos.messages.stamp import stamp_to_unix
+from starpos.messages.tilt import UNUSABLE
 from starpos_interfaces.msg import StarArray, Tilt
 from starpos_testing.graph.graph import Executable
 from starpos_testing.nodes import take_domain
@@ -177,7 +176,7 @@ class Instrument:
         self.device.join()
 
 
-def run(stalls: int, instruments: int, seed: int, folder: Path) -> list[Instrument]:
+def soaked(stalls: int, instruments: int, seed: int, folder: Path) -> list[Instrument]:
     """Run until each of the instruments has recovered from the last of the stalls; return them."""
     rclpy.init()
     node, executor = rclpy.create_node("stall_soak"), SingleThreadedExecutor()
@@ -204,22 +203,17 @@ def run(stalls: int, instruments: int, seed: int, folder: Path) -> list[Instrume
     return made
 
 
-def main(arguments=None) -> int:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+def options(parser) -> None:
     parser.add_argument("--stalls", type=int, default=200)
     parser.add_argument("--instruments", type=int, default=4, help="at a time")
-    parser.add_argument("--seed", type=int, default=int(time.time() // 86400), help="default: of the day")
-    options = parser.parse_args(arguments)
+    parser.add_argument("--seed", type=int, default=seed_of_the_day(), help="default: of the day")
+
+
+def run(options) -> int:
     take_domain()
     with tempfile.TemporaryDirectory() as folder:
-        made = run(options.stalls, options.instruments, options.seed, Path(folder))
+        made = soaked(options.stalls, options.instruments, options.seed, Path(folder))
     counts = sum((i.counts for i in made), Counter())
     names = ("fixes", "wrong fixes", "no fixes", "tilts", "wrong tilts", "flagged", "stuck")
     print(f"{options.stalls} stalls: " + ", ".join(f"{counts[name]} {name}" for name in names))
     return int(any(i.wrong for i in made) or counts["stuck"] > 0)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

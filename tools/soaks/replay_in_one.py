@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Solver, detector and player in one process: `replay_in_one.py ARGUMENTS OF REPLAY --ros-args ...` (soak_replay.py)."""
+"""Solver, detector and player in one process: `replay_in_one.py ARGUMENTS OF REPLAY --ros-args ...` (bag.py)."""
 
 import os
 import sys

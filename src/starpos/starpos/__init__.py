@@ -7,7 +7,7 @@ A night that `starpos simulate night` has written:
 
     >>> import starpos
     >>> known = starpos.Calibration.of((0, 0, 0), (5, 5, 5))  # A3 in deg, its errors in arcsec
-    >>> night = starpos.open_night("night", calibration=known)
+    >>> night = starpos.open_night("night", calibration=known, inclinometer="sca100t_calibrated")
     >>> night
     <night: 5 frames and tilt.csv, to be solved>
     >>> answer = night.solve()
@@ -41,10 +41,10 @@ _HOMES = {
     "Frame": "frames.frame",
     "InDegrees": "fix.readable",
     "Instrument": "instrument.instrument",
-    "Night": "report.night",
-    "NightOnDisk": "report.opening",
-    "ReportedPlace": "report.night",
-    "Shot": "report.night",
+    "Night": "night.night",
+    "NightOnDisk": "night.opening",
+    "ReportedPlace": "night.night",
+    "Shot": "night.night",
     "Site": "sky.site",
     "Solution": "fix.solution",
     "Solver": "fix.solver",
@@ -58,7 +58,7 @@ _HOMES = {
     "detect": "detection",
     "geodetic": "earth.vertical",
     "load_catalogue": "sky.catalogue",
-    "open_night": "report.opening",
+    "open_night": "night.opening",
     "read_frame": "frames.reading",
     "read_tilt_csv": "instrument.tilt_table",
     "turn": "calibration.turning",

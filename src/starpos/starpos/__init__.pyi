@@ -23,11 +23,11 @@ from starpos.instrument.instrument import Calibration as Calibration
 from starpos.instrument.instrument import Instrument as Instrument
 from starpos.instrument.tilt_log import TiltLog as TiltLog
 from starpos.instrument.tilt_table import read_tilt_csv as read_tilt_csv
-from starpos.report.night import Night as Night
-from starpos.report.night import ReportedPlace as ReportedPlace
-from starpos.report.night import Shot as Shot
-from starpos.report.opening import NightOnDisk as NightOnDisk
-from starpos.report.opening import open_night as open_night
+from starpos.night.night import Night as Night
+from starpos.night.night import ReportedPlace as ReportedPlace
+from starpos.night.night import Shot as Shot
+from starpos.night.opening import NightOnDisk as NightOnDisk
+from starpos.night.opening import open_night as open_night
 from starpos.sky.catalogue import Catalogue as Catalogue
 from starpos.sky.catalogue import load_catalogue as load_catalogue
 from starpos.sky.site import Site as Site

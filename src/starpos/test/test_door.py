@@ -103,7 +103,7 @@ def test_what_a_user_prints_is_a_line(tmp_path):
     solver = starpos.Solver(starpos.Instrument(4635.9375), starpos.load_catalogue())
     tilts = starpos.read_tilt_csv(tmp_path / "tilt.csv")
     stars = [starpos.read_frame(path) for path in sorted(tmp_path.glob("stars_*.csv"))]
-    solutions = [solver.solve(one, tilts.average) for one in stars]
+    solutions = [solver.solve(one, tilts) for one in stars]
     for value in (solutions[0], solutions[0].fix, starpos.average([s.fix for s in solutions])):
         assert "+35.70" in repr(value) and "heading 235." in repr(value) and len(repr(value)) < 150
     night = starpos.open_night(tmp_path, instrument=solver.instrument).solve()

@@ -72,6 +72,7 @@ def nodes(context):
     solver = {f"refraction.{name}": value for name, value in AIR.items()} | {
         "misalignment": list(MISALIGNMENT_DEG),
         "misalignment_stddev": 5.0,
+        "inclinometer.model": "sca100t_calibrated",
     }
     emulator = ExecutableInPackage("emulator", "starpos_inclinometer")
     device = [emulator, "--link", link, "--tilt-x", f"{theta_x:.9f}", "--tilt-y", f"{theta_y:.9f}"]

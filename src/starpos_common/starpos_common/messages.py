@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Conversion of starpos' types to messages; `starpos.recording.messages` converts back."""
+"""Conversion of starpos' types to messages; `starpos.messages` converts back."""
 
 import array
 import sys

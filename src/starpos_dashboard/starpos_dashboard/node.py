@@ -11,7 +11,7 @@ from rclpy.subscription import Subscription
 from sensor_msgs.msg import Image, Imu, NavSatFix
 
 from starpos.errors import FrameError
-from starpos.recording.messages import stamp_to_unix
+from starpos.messages.stamp import stamp_to_unix
 from starpos_common.diagnostics import Diagnosis, Diagnostics, Level
 from starpos_common.parameters import declare
 from starpos_common.topics import subscription

@@ -6,7 +6,7 @@ import numpy as np
 from sensor_msgs.msg import Image
 
 from starpos.errors import FrameError
-from starpos.recording.messages import message_to_frame
+from starpos.messages.camera import message_to_frame
 
 ENCODINGS = ("bgr8", "mono8")
 LARGEST_PX = 1 << 26

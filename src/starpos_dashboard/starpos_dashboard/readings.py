@@ -12,7 +12,7 @@ import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
 from sensor_msgs.msg import Imu, NavSatFix, NavSatStatus
 
-from starpos.recording.messages import stamp_to_unix
+from starpos.messages.stamp import stamp_to_unix
 from starpos_interfaces.msg import Solution, Tilt
 
 # Most letters of a text from outside.

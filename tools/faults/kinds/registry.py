@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The faults that tools/faults/fault_soak.py injects: each a function that sends something bad into the graph.
+"""The faults that tools/soaks/soak.py faults injects: each a function that sends something bad into the graph.
 
 The table prints its docstring.  A fault may only do what the data can show to be wrong. A single wrong stamp, tilt or
 pointing that no earlier frame contradicts makes a wrong fix in any instrument; see UNTOLD.
@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from accelerated import World
 
-from starpos.recording.messages import stamp_to_unix
+from starpos.messages.stamp import stamp_to_unix
 from starpos_common.messages import unix_to_stamp
 
 NAN, INF = math.nan, math.inf

@@ -30,8 +30,8 @@ from starpos.units import ARCSEC
 
 # so near the zenith a direction has hardly an elevation to speak of
 LEAST_SINE = 0.01
-# with a worse A3 the circles are no longer what a linear error makes of them
-MOST_A3_RAD = 360 * ARCSEC
+# with a worse A3 the circles are no longer what a linear error makes of them: its axis is fitted first
+LINEAR_A3_RAD = 360 * ARCSEC
 # frames closer than this, or than so many sigma, look in one direction
 SAME_RAD, SAME_SIGMA = 60 * ARCSEC, 6.0
 MOST_DIRECTIONS = 1000
@@ -56,10 +56,13 @@ class Circle:
     itrs (3,): geocentric apparent direction of the frame's centre.  zenith_distance (rad): as it is without refraction.
     sigma (rad): of the pointing, across the circle.  terms: errors of the zenith distance, with factors (1, m) in rad.
     clock_stddev_s, stamp_stddev_s: as those of a fix.
+    up (3,): in S, as the inclinometer shows it; axes: their number, 2 or 3.
     """
 
     utc_unix_s: float
     itrs: np.ndarray
+    up: np.ndarray
+    axes: int
     zenith_distance: float
     sigma: float
     terms: tuple[ErrorTerm, ...]
@@ -77,7 +80,7 @@ def circle_of(
     earth: EarthState,
     clock_stddev_s: float,
 ) -> Circle:
-    """The circle of one frame; FixError where its direction or A3 tell no altitude."""
+    """The circle of one frame; FixError where its direction tells no altitude."""
     level = mounting.level(tilt)
     seen = level.camera @ camera.centre_ray
     sine = np.hypot(seen[0], seen[1])
@@ -89,17 +92,14 @@ def circle_of(
     # up that errs by a small rotation of L lies nearer to the axis, or further
     rows = np.array([[-seen[1], seen[0], 0.0]]) / sine
     terms = tilt_terms(rows, level, tilt, mounting, earth.utc_unix_s)
-    if np.sqrt(terms[0].covariance[0, 0]) > MOST_A3_RAD:
-        raise FixError(
-            f"{pointing.place}: without a roll A3 has to be known to {MOST_A3_RAD / ARCSEC:.0f} arcsec: calibrate it at "
-            "a known place, say how well it is known, or give pointings with their roll"
-        )
     true = atmosphere.refraction().unbend(seen)
     z = float(np.arctan2(np.hypot(true[0], true[1]), true[2]))
     bent = (z - np.arctan2(sine, seen[2])) * atmosphere.relative_sigma
     return Circle(
         utc_unix_s=earth.utc_unix_s,
         itrs=earth.to_itrs(rotation.unit_vector([pointing.ra], [pointing.dec]))[0],
+        up=level.up,
+        axes=tilt.axes,
         zenith_distance=z,
         sigma=pointing.sigma,
         terms=(*terms, ErrorTerm("refraction", np.array([[bent]]), shared=ALWAYS)),
@@ -116,7 +116,7 @@ def place_of_circles(circles: Sequence[Circle], near: tuple[float, float] | None
     `poses` is the number of directions, `left_out` the frames of those that disagree.
     Raises FixError if there are fewer than three directions, or two without `near`, or if they leave two places.
     """
-    whole = _Directions.of(sorted(circles, key=lambda c: c.utc_unix_s))
+    whole = Directions.of(sorted(circles, key=lambda c: c.utc_unix_s))
     number = len(whole.covariance)
     if number < 2 or (number == 2 and near is None):
         raise FixError(
@@ -129,14 +129,14 @@ def place_of_circles(circles: Sequence[Circle], near: tuple[float, float] | None
 
 
 @dataclass(frozen=True)
-class _Directions:
-    """D directions: the circles of each, and the covariance (D, D) in rad2 of their mean zenith distances by source."""
+class Directions:
+    """D directions in which frames look: the circles of each, and the covariance (D, D) in rad2 of their mean zenith distances by source."""
 
     circles: list[list[Circle]]
     sources: dict[str, np.ndarray]
 
     @classmethod
-    def of(cls, circles: Sequence[Circle]) -> "_Directions":
+    def of(cls, circles: Sequence[Circle]) -> "Directions":
         """Directions of circles in order of time; FixError if they are too many."""
         groups: list[list[Circle]] = []
         for c in circles:
@@ -155,9 +155,19 @@ class _Directions:
     def covariance(self) -> np.ndarray:
         return np.sum(list(self.sources.values()), axis=0)
 
-    def take(self, rows: np.ndarray) -> "_Directions":
+    @staticmethod
+    def east_north(zenith: np.ndarray) -> np.ndarray:
+        """East and north (2, 3) in ITRS at a zenith (3,), along which the derivatives of `residual` are."""
+        return _enu(zenith)[:2]
+
+    @property
+    def wide(self) -> bool:
+        """Whether A3 is known too badly for a linear error."""
+        return any(g[0].terms[0].covariance[0, 0] > LINEAR_A3_RAD**2 for g in self.circles)
+
+    def take(self, rows: np.ndarray) -> "Directions":
         """Some of the directions."""
-        return _Directions(
+        return Directions(
             [self.circles[k] for k in rows], {n: c[np.ix_(rows, rows)] for n, c in self.sources.items()}
         )
 
@@ -226,7 +236,7 @@ class _Answer:
     chi2: float
 
 
-def _sound(whole: _Directions) -> np.ndarray:
+def _sound(whole: Directions) -> np.ndarray:
     """The directions that agree, as rows; all if they are too few to judge, or too many disagree.
 
     They are judged from the place with the least median of residuals, in units of what is usual (Rousseeuw and Leroy,
@@ -241,8 +251,8 @@ def _sound(whole: _Directions) -> np.ndarray:
     def size(zenith: np.ndarray) -> np.ndarray:
         return np.abs(whole.residual(zenith)[0]) / sigma
 
-    zenith = min(_starts(whole), key=lambda start: float(np.median(size(start))), default=None)
-    rows = every
+    zenith = min(starts(whole), key=lambda start: float(np.median(size(start))), default=None)
+    rows: np.ndarray = every
     for _ in range(JUDGED):
         if zenith is None:
             return every
@@ -259,11 +269,11 @@ def _sound(whole: _Directions) -> np.ndarray:
     return rows
 
 
-def _answer(part: _Directions, near: tuple[float, float] | None) -> _Answer:
+def _answer(part: Directions, near: tuple[float, float] | None) -> _Answer:
     """The one place that fits; FixError if there is none, or another fits as well."""
     weight = np.linalg.inv(part.covariance)
     found: list[_Answer] = []
-    for start in _starts(part):
+    for start in starts(part):
         one = _refined(part, weight, start)
         if one is not None and all(np.linalg.norm(one.zenith - f.zenith) > ALIKE for f in found):
             found.append(one)
@@ -288,11 +298,11 @@ def _answer(part: _Directions, near: tuple[float, float] | None) -> _Answer:
     return left[0]
 
 
-def _starts(part: _Directions) -> list[np.ndarray]:
+def starts(part: Directions) -> list[np.ndarray]:
     """Zeniths (3,) in which two circles meet, or where they are nearest to each other."""
     some = np.unique(np.linspace(0, len(part.circles) - 1, STARTS).astype(int))
     firsts = [part.circles[k][0] for k in some]
-    starts = []
+    zeniths = []
     for a, b in combinations(firsts, 2):
         normal = np.cross(a.itrs, b.itrs)
         across2 = normal @ normal
@@ -301,11 +311,11 @@ def _starts(part: _Directions) -> list[np.ndarray]:
         ca, cb, c = np.cos(a.zenith_distance), np.cos(b.zenith_distance), a.itrs @ b.itrs
         flat = ((ca - c * cb) * a.itrs + (cb - c * ca) * b.itrs) / across2
         height = np.sqrt(max(1 - flat @ flat, 1e-6) / across2) * normal
-        starts += [rotation.normalised(flat + height), rotation.normalised(flat - height)]
-    return starts
+        zeniths += [rotation.normalised(flat + height), rotation.normalised(flat - height)]
+    return zeniths
 
 
-def _refined(part: _Directions, weight: np.ndarray, zenith: np.ndarray) -> _Answer | None:
+def _refined(part: Directions, weight: np.ndarray, zenith: np.ndarray) -> _Answer | None:
     """The answer near a zenith, by Gauss-Newton; None if there is none."""
     for _ in range(ROUNDS):
         left, slope = part.residual(zenith)
@@ -321,7 +331,7 @@ def _refined(part: _Directions, weight: np.ndarray, zenith: np.ndarray) -> _Answ
     return None
 
 
-def _average(part: _Directions, answer: _Answer, frames: int) -> Average:
+def _average(part: Directions, answer: _Answer, frames: int) -> Average:
     latitude, longitude = np.radians(_degrees(answer.zenith))
     prime, meridian = curvature_radii_m(latitude)
     metres = answer.gain * np.array([[prime], [meridian]])
@@ -343,8 +353,8 @@ def _average(part: _Directions, answer: _Answer, frames: int) -> Average:
             f"the elevations of three directions contradict each other by {np.sqrt(answer.chi2):.0f} sigma: one is "
             "wrong, or all err by more than is stated: add directions, or state larger errors"
         )
-    excess = _excess(answer.chi2, free)
-    terms.append(term(SCATTER, excess * metres @ part.covariance @ metres.T))
+    beyond = excess(answer.chi2, free)
+    terms.append(term(SCATTER, beyond * metres @ part.covariance @ metres.T))
     times = [c.utc_unix_s for c in every]
     return Average(
         utc_unix_s=float(np.mean(times)),
@@ -365,7 +375,7 @@ def f_quantile(free: int, share: float) -> float:
     return free / 2 * float((1 - share) ** (-2 / free) - 1)
 
 
-def _excess(chi2: float, free: int) -> float:
+def excess(chi2: float, free: int) -> float:
     """Variance beyond the stated one, as a share of it, for residuals that scatter more than stated.
 
     Few of them tell badly by how much; Student's t makes up for it. One alone is taken for two.

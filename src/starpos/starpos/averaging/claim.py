@@ -14,7 +14,7 @@ import numpy as np
 from starpos._numeric.roots import symmetric_root
 from starpos.averaging.filter import Plane
 from starpos.averaging.scatter import MOST_ROWS, Frames, Scatter, scatter_of
-from starpos.earth.ellipsoid import EARTH_RADIUS_M
+from starpos.earth.ellipsoid import EARTH_RADIUS_M, zenith_of
 from starpos.fix.budget import EACH_POSE, ErrorTerm
 from starpos.fix.fix import Fix
 
@@ -30,14 +30,17 @@ NEWS = 0.3
 class Remembered:
     """A fix, or the mean of some that follow each other in a pose.
 
+    attitude (3, 3): ITRS into C.  up (3,): in C.
     place (2,): east, north in m in the plane.  to_rad (2, 2): m to the inclinometer's axes in rad.
     shared (2, n): m for 1 sigma of each error that all fixes share.
-    sigma (rad): of its own errors.  pose_sigma (rad): stated, of an error that is new at each pose.
+    sigma (rad): of its own errors.  pose_sigma (rad): stated, of an error of the pose.
     """
 
     utc_unix_s: float
     pose: int
     fixes: int
+    attitude: np.ndarray
+    up: np.ndarray
     place: np.ndarray
     to_rad: np.ndarray
     shared: np.ndarray
@@ -59,6 +62,8 @@ class Remembered:
             utc_unix_s=f.utc_unix_s,
             pose=pose,
             fixes=1,
+            attitude=f.camera_to_itrs.T,
+            up=f.camera_to_itrs.T @ zenith_of(f.latitude, f.longitude),
             place=plane.seen(f)[:2],
             to_rad=np.linalg.inv(turn @ f.levelling[:3]),
             shared=np.hstack(factors),
@@ -142,12 +147,15 @@ class Claim:
             Frames(
                 utc_unix_s=np.array([s.utc_unix_s for s in self.seen]),
                 pose=np.unique([s.pose for s in self.seen], return_inverse=True)[1],
+                attitude=np.array([s.attitude for s in self.seen]),
+                up=np.array([s.up for s in self.seen]),
                 residual=np.einsum("kij,kj->ki", to_rad, off),
                 design=np.einsum("kij,kjn->kin", to_rad, columns),
                 sigma=np.array([s.sigma for s in self.seen]),
                 pose_sigma=float(np.median([s.pose_sigma for s in self.seen])),
                 prior_sigma=np.append([ANYWHERE_RAD] * 2, np.ones(n - 2)),
                 response=np.zeros(n, bool),
+                zero_free=False,
             )
         )
 

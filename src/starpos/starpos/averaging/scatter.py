@@ -1,10 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """How much frames scatter beyond what they state, and what that makes of the answer of all.
 
-An inclinometer may have an error that is new at each pose (hysteresis, flexure, a soft footing), or one that wanders
-(wind, soft ground, warming up), or more noise than stated, and its axes may err with the lean. Nobody need have stated
-any of it; the frames tell. Every kind and size is tried, weighted by its evidence, and the answer is the mean over all,
-so that few frames make a wide claim and many a narrow one.
+An inclinometer may have an error of each pose, or one that wanders (wind, soft ground, warming up), or more noise than
+stated, and its axes may err with the lean. Nobody need have stated any of it; the frames tell. Every kind and size is
+tried, weighted by its evidence, and the answer is the mean over all (Bayesian model averaging), so that few frames make
+a wide claim and many a narrow one.
+
+The error of a pose may be new at each pose (hysteresis, a soft footing), or a smooth function of how the camera leans (a
+mount that bends, a sensor that is not linear) or of its whole attitude (cables that pull, a bearing): a Gaussian process
+whose length nobody knows (Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, section 4.2). Then poses
+near each other are alike, and many of them know little more than one. docs/error_budget.md has the model in words.
 """
 
 from dataclasses import dataclass
@@ -18,6 +23,12 @@ LEAST_SHARE, MOST_RAD, SIZES = 0.5, 3600 * ARCSEC, 12
 # times in which an error forgets itself, and the most that frames may be alike on average: what hardly changes in the
 # whole time cannot be told from a constant
 FORGETS_S, MOST_ALIKE = (15.0, 60.0, 240.0, 1000.0, 4000.0), 0.75
+# lengths in rad over which an error of the pose changes with the lean, and with the attitude
+LEAN_RAD, ATTITUDE_RAD = (0.05, 0.15, 0.5), (0.2, 0.6, 1.5)
+# share of its variance that is new at each pose all the same
+ROUGH = (0.03, 0.3)
+# readings with more noise than stated beside another error: sizes of that noise, over what the frames of a pose show
+NOISES, NOISY_SIGMA = (0.7, 1.0, 1.4), 4.0
 # the response errs more than stated where that is so probable
 SHOWN = 0.75
 # the scatter is evident where it is so improbable that all is as stated
@@ -26,8 +37,8 @@ EVIDENT = 0.25
 RESPONSES = (0.0, 3e-4, 1e-3, 3e-3, 1e-2, 3e-2)
 # prior probability that all is as stated; a larger error is the less likely, in proportion
 AS_STATED = 0.7
-# with fewer degrees of freedom the frames, or the poses, do not tell
-FEWEST_FREE = 2.5
+# with fewer degrees of freedom the frames, or the poses, do not tell, unless they contradict what is stated by so much
+FEWEST_FREE, LEAST_FREE, CONTRADICT_SIGMA = 2.5, 0.5, 4.0
 # so many frames or means of frames are looked at; more are averaged before
 MOST_ROWS = 64
 
@@ -37,19 +48,24 @@ class Frames:
     """What K frames say of n parameters that they share, all per axis of two.
 
     utc_unix_s (K,).  pose (K,): number of each one's pose, from 0.
+    attitude (K, 3, 3): takes axes of the ground (ITRS) into those of the camera.  up (K, 3): in axes of the instrument.
     residual (K, 2) in rad, where the parameters are 0, and its derivatives design (K, 2, n) by them.
-    sigma (K,) in rad: own error of each frame.  pose_sigma (rad): stated error that is new at each pose.
+    sigma (K,) in rad: own error of each frame.  pose_sigma (rad): stated error of a pose.
     prior_sigma (n,): of the parameters about 0.  response (n,): mask of those that are coefficients of a response.
+    zero_free: whether the parameters hold an error that is the same at all poses, as an A3 that is being found does.
     """
 
     utc_unix_s: np.ndarray
     pose: np.ndarray
+    attitude: np.ndarray
+    up: np.ndarray
     residual: np.ndarray
     design: np.ndarray
     sigma: np.ndarray
     pose_sigma: float
     prior_sigma: np.ndarray
     response: np.ndarray
+    zero_free: bool
 
     def blocks(self) -> np.ndarray:
         """Weights (B, K) that average frames next to each other in a pose, so that at most about MOST_ROWS are left."""
@@ -69,13 +85,15 @@ class Scatter:
     """What the frames tell, as means over all hypotheses.
 
     pose_sigma (rad): root of the mean variance of what does not average away within a pose; frame_sigma (rad): the same
-    of all that a frame has beside its own stated error.
+    of all that a frame has beside its own stated error; noise_sigma (rad): of what is new in each frame alone.
     evident: whether it is improbable that all is as stated.
-    moved (n,), covariance (n, n): of the parameters.  stated (n, n): their covariance if all is as stated.
+    moved (n,), covariance (n, n): of the parameters.  stated (n, n): their covariance if all is as stated, and the
+    stated error of a pose new at each.
     """
 
     pose_sigma: float
     frame_sigma: float
+    noise_sigma: float
     evident: bool
     moved: np.ndarray
     covariance: np.ndarray
@@ -84,59 +102,77 @@ class Scatter:
 
 @dataclass(frozen=True)
 class _Kind:
-    """A hypothesis: the covariance (B, B) of an error of unit size, and its means over poses and over frames."""
+    """An error: its covariance (B, B) at unit size, and its mean variances over poses, over frames, and as noise."""
 
     kernel: np.ndarray
-    of_pose: float
-    of_frame: float
+    means: tuple[float, float, float]
 
 
 def scatter_of(frames: Frames) -> Scatter:
     """What frames tell of their scatter and of the parameters that they share."""
-    share = frames.blocks()
-    poses = _pose_means(frames)
+    share, poses = frames.blocks(), _pose_means(frames)
     y, j = share @ frames.residual, np.einsum("bk,kin->bin", share, frames.design)
     own = np.diag(share**2 @ frames.sigma**2)
-    same_pose = _Kind(share @ (frames.pose[:, None] == frames.pose) @ share.T, 1.0, 1.0)
-    stated = own + frames.pose_sigma**2 * same_pose.kernel
-    normal, pull, bare = _sums(y, j, stated)
-    kinds: list[_Kind] = []
-    sizes = np.zeros(0)
-    if 2 * len(y) - _told(normal, frames.prior_sigma) >= FEWEST_FREE:
-        kinds = _wandering(frames, share, poses)
+    shapes = _shapes(frames, share, poses)
+    stated = own + frames.pose_sigma**2 * shapes[0].kernel
+    kinds: list[tuple[np.ndarray, _Kind]] = []
+    few = False
+    if _freedom(y, j, stated, frames.prior_sigma)[1]:
+        kinds = [(stated, kind) for kind in _wandering(frames, share, poses)]
         of_poses = np.einsum("pk,kin->pin", poses, frames.design)
-        told, _, _ = _sums(poses @ frames.residual, of_poses, np.diag(poses**2 @ frames.sigma**2))
-        if 2 * len(poses) - _told(told, frames.prior_sigma) >= FEWEST_FREE:
-            kinds = [same_pose, *kinds]
-        least = LEAST_SHARE * float(np.sqrt(np.median(frames.sigma**2)))
-        sizes = np.geomspace(least, max(MOST_RAD, 10 * least), SIZES)
-    prior = np.append(
-        AS_STATED, np.tile((1 - AS_STATED) * _shrinking(sizes), len(kinds)) / max(len(kinds), 1)
-    )
+        each = np.diag(poses**2 @ frames.sigma**2 + frames.pose_sigma**2)
+        free, tell = _freedom(poses @ frames.residual, of_poses, each, frames.prior_sigma)
+        few = tell and free < FEWEST_FREE
+        if tell:
+            # the whole error of the pose has one shape
+            kinds += [(own + frames.pose_sigma**2 * shape.kernel, shape) for shape in shapes]
+    least = LEAST_SHARE * float(np.sqrt(np.median(frames.sigma**2)))
+    sizes = np.geomspace(least, max(MOST_RAD, 10 * least), SIZES)
+    # each hypothesis: its prior, its covariance, and its mean variances beyond what is stated
+    many = 1 if frames.pose_sigma == 0 else len(shapes)
+    tried = [
+        (AS_STATED / many, own + frames.pose_sigma**2 * shape.kernel, np.zeros(3)) for shape in shapes[:many]
+    ]
+    prior = (1 - AS_STATED) * _shrinking(sizes) / max(len(kinds), 1)
+    for beside, kind in kinds:
+        means = np.array(kind.means)
+        tried += [
+            (w, beside + size**2 * kind.kernel, size**2 * means)
+            for w, size in zip(prior, sizes, strict=True)
+        ]
+    noisy = [0.0, *_noises(frames)]
+    noise = _kind(share, poses, np.eye(len(frames.pose)), 1.0)
+    whole = [
+        (w / len(noisy), covariance + n**2 * noise.kernel, means + n**2 * np.array(noise.means))
+        for n in noisy
+        for w, covariance, means in tried
+    ]
+    weights, covariances, means = zip(*whole, strict=True)
+    normals, pulls, bares = _sums(y, j, np.array(covariances))
+    # each hypothesis of the scatter with each of the response, one after another
     number = len(RESPONSES) if frames.response.any() else 1
     wide_prior = np.append(AS_STATED, (1 - AS_STATED) * _shrinking(np.array(RESPONSES[1:])))[:number]
-    variances = np.array([(0.0, 0.0)] + [(k.of_pose * s**2, k.of_frame * s**2) for k in kinds for s in sizes])
-    sums = [(normal, pull, bare)] + [_sums(y, j, stated + s**2 * k.kernel) for k in kinds for s in sizes]
-    # each hypothesis of the scatter with each of the response, one after another
-    wide = np.tile(RESPONSES[:number], len(sums))[:, None]
+    wide = np.tile(RESPONSES[:number], len(weights))[:, None]
     prior_sigma = np.where(frames.response, np.hypot(frames.prior_sigma, wide), frames.prior_sigma)
-    normals, pulls, bares = (np.repeat(np.array(each), number, axis=0) for each in zip(*sums, strict=True))
+    normals, pulls, bares = (np.repeat(each, number, axis=0) for each in (normals, pulls, bares))
     moved, spread, evidence = _answers(normals, pulls, bares, prior_sigma)
-    log_weight = evidence + np.log(np.outer(prior, wide_prior).ravel())
+    log_weight = evidence + np.log(np.outer(weights, wide_prior).ravel())
     weight = np.exp(log_weight - log_weight.max())
     weight /= weight.sum()
-    # nobody's word against a sensor is enough to doubt its response: the frames have to show it
+    # nobody's word against a sensor is enough to doubt its response: the frames have to show it; few poses that contradict
+    # each other leave it open
     wider = np.arange(len(weight)) % number > 0
-    if weight[wider].sum() < SHOWN:
+    if not few and weight[wider].sum() < SHOWN:
         weight[wider] = 0.0
         weight /= weight.sum()
     mean = weight @ moved
     off = moved - mean
-    pose2, frame2 = weight @ np.repeat(variances, number, axis=0)
+    pose2, frame2, noise2 = weight @ np.repeat(np.array(means), number, axis=0)
     return Scatter(
         pose_sigma=float(np.sqrt(pose2 + frames.pose_sigma**2)),
         frame_sigma=float(np.sqrt(frame2 + frames.pose_sigma**2)),
-        evident=bool(weight[0] < EVIDENT),
+        noise_sigma=float(np.sqrt(noise2)),
+        evident=bool(weight[: many * number].sum() < EVIDENT),
         moved=mean,
         covariance=np.tensordot(weight, spread, 1) + (weight * off.T) @ off,
         stated=spread[0],
@@ -149,11 +185,58 @@ def _pose_means(frames: Frames) -> np.ndarray:
     return weight / weight.sum(1)[:, None]
 
 
+def _freedom(
+    y: np.ndarray, j: np.ndarray, stated: np.ndarray, prior_sigma: np.ndarray
+) -> tuple[float, bool]:
+    """Degrees of freedom of data (B, 2), and whether these tell that they scatter more than (B, B) states."""
+    normal, pull, _ = _sums(y, j, stated[None])
+    free = 2 * len(y) - _told(normal[0], prior_sigma)
+    if free >= FEWEST_FREE:
+        return free, True
+    scaled, pulled = normal[0] * np.outer(prior_sigma, prior_sigma), pull[0] * prior_sigma
+    fitted = pulled @ np.linalg.solve(scaled + np.eye(len(scaled)), pulled)
+    chi2 = np.sum(y * np.linalg.solve(stated, y)) - fitted
+    return free, bool(free >= LEAST_FREE and chi2 > free + CONTRADICT_SIGMA * np.sqrt(2 * free))
+
+
+def _shapes(frames: Frames, share: np.ndarray, poses: np.ndarray) -> list[_Kind]:
+    """Errors of a pose: new at each, and smooth functions of the lean and of the attitude, over each length.
+
+    The first is that which is new at each.  Smooth ones that are about the same at all poses are none: they are a zero.
+    """
+    leans2 = np.sum((frames.up[:, None] - frames.up) ** 2, axis=2)
+    # half the squared norm is the squared angle where that is small; it keeps the kernel positive
+    turns2 = np.sum((frames.attitude[:, None] - frames.attitude) ** 2, axis=(2, 3)) / 2
+    alike = [np.exp(-leans2 / (2 * length**2)) for length in LEAN_RAD]
+    alike += [np.exp(-turns2 / (2 * length**2)) for length in ATTITUDE_RAD]
+    new = (frames.pose[:, None] == frames.pose).astype(float)
+    smooth = [a for a in alike if a.mean() < MOST_ALIKE]
+    if frames.zero_free:
+        # what is left of a smooth function once its mean over the poses is part of the zero
+        mean = poses.mean(0)
+        smooth = [a - a @ mean - (a @ mean)[:, None] + mean @ a @ mean for a in smooth]
+    return [_kind(share, poses, a) for a in (new, *(r * new + (1 - r) * a for a in smooth for r in ROUGH))]
+
+
+def _noises(frames: Frames) -> list[float]:
+    """Sizes (rad) of noise beyond that stated, if frames of one pose differ by clearly more than that."""
+    poses = frames.pose.max() + 1
+    free = 2 * (len(frames.pose) - poses)
+    if not free:
+        return []
+    off = frames.residual - (_pose_means(frames) @ frames.residual)[frames.pose]
+    excess = np.sum(off**2 / frames.sigma[:, None] ** 2) / free
+    if excess < 1 + NOISY_SIGMA * np.sqrt(2 / free):
+        return []
+    size = float(np.sqrt((excess - 1) * np.mean(frames.sigma**2)))
+    return [n * size for n in NOISES]
+
+
 def _wandering(frames: Frames, share: np.ndarray, poses: np.ndarray) -> list[_Kind]:
     """Errors that are noise, walk away from 0, grow, or wander and forget themselves in a time (Ornstein, Uhlenbeck)."""
     t = frames.utc_unix_s - frames.utc_unix_s.min()
     apart, longest = np.abs(t[:, None] - t), float(t.max())
-    kinds = [_kind(share, poses, np.eye(len(t)))]
+    kinds = [_kind(share, poses, np.eye(len(t)), 1.0)]
     if longest:
         kinds.append(_kind(share, poses, np.minimum(t[:, None], t) / longest))
         kinds.append(_kind(share, poses, np.outer(t, t) / longest**2))
@@ -161,10 +244,10 @@ def _wandering(frames: Frames, share: np.ndarray, poses: np.ndarray) -> list[_Ki
     return kinds + [_kind(share, poses, a) for a in alike if a.mean() < MOST_ALIKE]
 
 
-def _kind(share: np.ndarray, poses: np.ndarray, covariance: np.ndarray) -> _Kind:
-    """A hypothesis from its covariance (K, K) of the frames."""
+def _kind(share: np.ndarray, poses: np.ndarray, covariance: np.ndarray, noise: float = 0.0) -> _Kind:
+    """An error from its covariance (K, K) of the frames; noise: the variance of it that is noise."""
     of_pose = float(np.mean(np.einsum("pk,kl,pl->p", poses, covariance, poses)))
-    return _Kind(share @ covariance @ share.T, of_pose, float(np.mean(np.diag(covariance))))
+    return _Kind(share @ covariance @ share.T, (of_pose, float(np.mean(np.diag(covariance))), noise))
 
 
 def _shrinking(sizes: np.ndarray) -> np.ndarray:
@@ -172,13 +255,19 @@ def _shrinking(sizes: np.ndarray) -> np.ndarray:
     return sizes**-0.5 / np.sum(sizes**-0.5)
 
 
-def _sums(y: np.ndarray, j: np.ndarray, covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-    """Normal matrix, right-hand side, and -2 log likelihood of data (B, 2) with a covariance (B, B) for either axis."""
+def _sums(y: np.ndarray, j: np.ndarray, covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Normal matrices, right-hand sides, and -2 log likelihoods of data (B, 2) with covariances (H, B, B) an axis."""
     lower = np.linalg.cholesky(covariance)
     n = j.shape[2]
     white = np.linalg.solve(lower, np.concatenate([y, j.reshape(len(y), -1)], 1))
-    y, j = white[:, :2].ravel(), white[:, 2:].reshape(-1, n)
-    return j.T @ j, -j.T @ y, float(y @ y + 4 * np.log(np.diag(lower)).sum())
+    seen, slope = white[..., :2].reshape(len(lower), -1), white[..., 2:].reshape(len(lower), -1, n)
+    turned = slope.swapaxes(1, 2)
+    log_determinant = np.log(np.diagonal(lower, axis1=1, axis2=2)).sum(1)
+    return (
+        turned @ slope,
+        -(turned @ seen[..., None])[..., 0],
+        np.sum(seen**2, axis=1) + 4 * log_determinant,
+    )
 
 
 def _told(normal: np.ndarray, prior_sigma: np.ndarray) -> float:

@@ -14,10 +14,10 @@ from starpos.fix.solver import Solver
 from starpos.frames.pointings import Pointing
 from starpos.frames.stars import Stars
 from starpos.instrument.camera_vertical import (
+    OWN_LEVEL,
     SAG_ARCSEC_PER_SQRT_HOUR,
     CameraVertical,
     level_errors,
-    own_level,
 )
 from starpos.progress import Progress, quiet
 from starpos.sky.site import Site
@@ -44,9 +44,7 @@ def calibrate_fixed(
         solver,
         instrument=replace(solver.instrument, inclinometer=level, inclinometer_model="", vertical=None),
     )
-    found = calibrate_at(
-        bare, frames, lambda mid, *_: own_level(mid), site, site_stddev_arcsec, TURN_DEG, progress
-    )
+    found = calibrate_at(bare, frames, OWN_LEVEL, site, site_stddev_arcsec, TURN_DEG, progress)
     fixes = found.fixes
     if poses_of(fixes).any():
         raise FixError(

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """A3 from frames: at a known place, or at several headings of an unknown place (turning.py)."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 
 import numpy as np
 
@@ -15,13 +16,15 @@ from starpos.errors import FixError
 from starpos.fix.budget import ALWAYS, ErrorTerm, Sensitivity, place_of
 from starpos.fix.fix import Fix
 from starpos.fix.solution import Solution, Status
-from starpos.fix.solver import Solver, Tilts
+from starpos.fix.solver import Solver
 from starpos.frames.pointings import Pointing
 from starpos.frames.stars import Stars
+from starpos.identification import Identification
 from starpos.identification.hint import Hint
 from starpos.instrument.inclinometer import InclinometerErrors, up_of
 from starpos.instrument.instrument import MOST_C, UNKNOWN_ARCSEC, Calibration, Instrument
 from starpos.instrument.response import angles_at, stated_variances
+from starpos.instrument.tilts import Tilts
 from starpos.progress import Progress, quiet
 from starpos.sky.site import Site
 from starpos.units import ARCSEC
@@ -37,8 +40,12 @@ TURN_SIGMA = 3.0
 OUTLIER_SIGMA, MOST_OUTLIERS, JUDGED = 6.0, 1 / 3, 5
 # of so many poses two thirds leave the fit, with its five parameters, free enough to judge the others
 MANY_POSES = 10
-# poses that scatter more than any inclinometer were moved, or are of several places
-MOST_POSE_RAD = np.radians(0.15)
+# frames that scatter more than any inclinometer or mount were moved, or are of several places
+MOST_POSE_RAD = np.radians(0.5)
+# a noise so many times a frame's own error is worth stating
+NOISIER = 1.0
+# a coefficient of the response is shown by so many of its sigma
+SHOWN_SIGMA = 3.0
 # chi-square per degree of freedom of frames too few to tell their scatter
 MOST_SCATTER = 16.0
 # share by which a coefficient of the response must be known better, or worse, than stated to be worth keeping
@@ -46,6 +53,9 @@ WORTH = 0.05
 
 # A3 and the zenith from readings, A3 as it is, and the fixes
 FindPlumbLine = Callable[[Readings, np.ndarray, list[Fix]], PlumbLine]
+# what is identified already, by the numbers of the frames
+Known = Mapping[int, Identification]
+NOTHING_KNOWN: Known = MappingProxyType({})
 
 
 @dataclass(frozen=True)
@@ -53,12 +63,14 @@ class Calibrated:
     """An instrument with its new A3, and each frame solved with it.
 
     plumb_stddev_arcsec: sigma of the plumb line in the camera, on the worse of two axes.
+    beyond: a sentence on how much the frames scatter beyond the stated errors, and what to state; '' if they do not.
     The budgets of the fixes take A3 as unknown, because the calibration was made from the same frames.
     """
 
     instrument: Instrument
     plumb_stddev_arcsec: float
     solutions: tuple[Solution, ...]
+    beyond: str = ""
 
     @property
     def fixes(self) -> list[Fix]:
@@ -69,16 +81,17 @@ class Calibrated:
 def calibrate_at(
     solver: Solver,
     frames: Sequence[Stars | Pointing],
-    tilt: Tilts,
+    tilts: Tilts,
     site: Site,
     site_stddev_arcsec: float = 0.0,
     turn_stddev_deg: float = 180.0,
     progress: Progress = quiet,
+    known: Known = NOTHING_KNOWN,
 ) -> Calibrated:
     """A3 from one or more frames at a known astronomic place; the solver's A3 need not be near.
 
-    tilt: a function of (mid_unix_s, exposure_s, spread_s).
     site_stddev_arcsec: sigma of the place.
+    known: the stars of frames, by the frames' numbers, that only a longer search identifies than the solver's.
     turn_stddev_deg: sigma of the turn of the solver's A3 about the plumb line.  One lean of the instrument does not tell
     that turn, and only a fix at another lean needs it; the covariance shows it.
     Raises FixError if there is no fix or the frames do not agree.
@@ -91,7 +104,7 @@ def calibrate_at(
 
     if not frames:
         raise FixError("there is no frame to calibrate from: give at least one")
-    found = calibrate(solver, frames, tilt, find, fewest=1, progress=progress)
+    found = calibrate(solver, frames, tilts, find, fewest=1, progress=progress, known=known)
     if not found.fixes:
         raise FixError(f"no frame has a fix to calibrate from: {found.solutions[0].message}")
     if min(f.camera_to_itrs[:, 2] @ site.enu[2] for f in found.fixes) < 0:
@@ -105,10 +118,11 @@ def calibrate_at(
 def calibrate(
     solver: Solver,
     frames: Sequence[Stars | Pointing],
-    tilt: Tilts,
+    tilts: Tilts,
     find: FindPlumbLine,
     fewest: int,
     progress: Progress = quiet,
+    known: Known = NOTHING_KNOWN,
 ) -> Calibrated:
     """Solve the frames and `find` A3 from their fixes, again until it settles; with fewer fixes A3 stays as it was.
 
@@ -122,8 +136,11 @@ def calibrate(
     agreement: _Agreement | None = None
     for k in range(ROUNDS):
         solutions = []
-        for n, (stars, hint) in enumerate(zip(frames, hints, strict=True)):
-            solutions.append(solver.solve(stars, tilt, hint))
+        for n, (frame, hint) in enumerate(zip(frames, hints, strict=True)):
+            if isinstance(frame, Pointing):
+                solutions.append(solver.solve_pointing(frame, tilts))
+            else:
+                solutions.append(solver.solve(frame, tilts, hint, known=known.get(n)))
             progress("calibrating", (k + (n + 1) / len(frames)) / ROUNDS)
         hints = [s.hint for s in solutions]
         solved = [FixedFrame(s.fix, s.tilt) for s in solutions if s.fix and s.tilt]
@@ -150,7 +167,7 @@ def calibrate(
     instrument = replace(
         solver.instrument, calibration=_dated(agreement, errors), inclinometer=agreement.errors(errors)
     )
-    return Calibrated(instrument, error, tuple(solutions))
+    return Calibrated(instrument, error, tuple(solutions), agreement.beyond(errors))
 
 
 @dataclass(frozen=True)
@@ -168,8 +185,50 @@ class _Agreement:
     left_out: dict[float, float]
 
     def errors(self, stated: InclinometerErrors) -> InclinometerErrors:
-        """The inclinometer's errors, with those of its poses as these show them."""
-        return replace(stated, pose_rad=self.scatter.pose_sigma)
+        """The inclinometer's errors, with its noise and those of its poses as these frames show them."""
+        noise = stated.noise_rad
+        if self._noisy:
+            samples = np.mean([s.tilt.samples for s in self.sound])
+            noise = float(np.hypot(noise, self.scatter.noise_sigma * np.sqrt(samples)))
+        return replace(stated, pose_rad=self.scatter.pose_sigma, noise_rad=noise)
+
+    @property
+    def _noisy(self) -> bool:
+        own = float(np.sqrt(np.median(self.readings.sigma**2)))
+        return self.scatter.evident and self.scatter.noise_sigma > NOISIER * own
+
+    def beyond(self, stated: InclinometerErrors) -> str:
+        """Say by how much the frames scatter beyond the stated errors, and what to state; '' if they do not."""
+        found = self.errors(stated)
+        scale = self.plumb.response[self._scales]
+        shown = np.abs(scale) > SHOWN_SIGMA * np.hypot(
+            np.sqrt(np.diag(self.plumb.response_covariance))[self._scales], stated.scale
+        )
+        told, state = [], []
+        if found.noise_rad > stated.noise_rad:
+            noise = np.degrees(found.noise_rad)
+            told.append(f"noise of {noise:.2g} deg a reading ({np.degrees(stated.noise_rad):.2g} stated)")
+            state.append(f"tilt_noise_deg: {noise:.2g}")
+        if self.scatter.evident and found.pose_rad > stated.pose_rad:
+            told.append(
+                f"{np.degrees(found.pose_rad):.2g} deg from pose to pose ({np.degrees(stated.pose_rad):.2g} stated)"
+            )
+            state.append(f"tilt_pose_arcsec: {found.pose_rad / ARCSEC:.2g}")
+        if shown.any():
+            worst = float(scale[np.argmax(np.abs(scale))])
+            told.append(f"a scale that is {100 * worst:+.2g} % off ({100 * stated.scale:.2g} stated)")
+            state.append(f"tilt_scale: {abs(worst):.2g}")
+        if not told:
+            return ""
+        return (
+            f"the tilts err by more than is stated of the inclinometer: {', '.join(told)}; the claim holds it, and so does "
+            f"the file that is written with A3; in another, state {', '.join(state)}"
+        )
+
+    @property
+    def _scales(self) -> slice:
+        axes = self.sound[0].tilt.axes
+        return slice(axes, 2 * axes)
 
     def check(self) -> None:
         """Raise FixError if the frames are not of one zenith."""
@@ -179,7 +238,7 @@ class _Agreement:
             raise FixError(
                 f"{len(self.left_out)} of {of} frames disagree with the others on the zenith: {why}"
             )
-        scatter = max(self.scatter.pose_sigma, self.scatter_left)
+        scatter = self.scatter_left
         # too few to tell how much they scatter, they must agree as they state
         if scatter > MOST_POSE_RAD or (self.plumb.scatter > MOST_SCATTER and not self.scatter.evident):
             raise FixError(
@@ -215,11 +274,9 @@ def _agreed(
     readings = whole.take(rows)
     _, scatter = settled(plumb, readings)
     # once more about the answer, with what the poses tell of their errors
-    again = find(replace(readings, pose_sigma=scatter.pose_sigma), a3, fixes)
+    noisy = np.hypot(readings.sigma, scatter.noise_sigma)
+    again = find(replace(readings, pose_sigma=scatter.pose_sigma, sigma=noisy), a3, fixes)
     plumb, scatter = settled(again, readings)
-    # errors that poses share in part leave the zenith less certain than as many errors of their own do
-    alike = max(plumb.zenith_sigma / again.zenith_sigma, 1.0)
-    scatter = replace(scatter, pose_sigma=scatter.pose_sigma * alike)
     left_out = {}
     if len(rows) < len(solved):
         # how far the others are off shows against the answer of these
@@ -251,7 +308,8 @@ def _unhidden(find: FindPlumbLine, whole: Readings, solved: list[FixedFrame], a3
     Each is judged against a fit of the frames that lie closest to it, as many as must agree (least trimmed squares).
     Few poses fit almost anything; then these are all.
     """
-    rows = everyone = np.arange(len(solved))
+    everyone: np.ndarray = np.arange(len(solved))
+    rows = everyone
     most = int(np.ceil((1 - MOST_OUTLIERS) * len(solved)))
     if len(np.unique(whole.pose)) < MANY_POSES:
         return everyone

@@ -19,8 +19,8 @@ from starpos.normal import MEDIAN_OF_CHI2
 
 ROBUST_ROUNDS = 10
 TURNS_TRIED = 8
-# fewer poses tell no response of the inclinometer
-FEWEST_POSES = 3
+# one pose tells no response of the inclinometer
+FEWEST_POSES = 2
 # chi-square per degree of freedom above which the search ended in a wrong minimum
 FOUND_SCATTER = 16.0
 # chi-square per degree of freedom above which the poses scatter
@@ -32,6 +32,8 @@ AMBIGUOUS_SIGMA = 4.0
 # root mean square, per axis, of the way a random turn moves a point on a circle, in radii
 ANY_TURN = np.sqrt(1.5)
 TOLD_TURN = np.radians(10)
+# a zenith whose prior is wider than this is not known
+TOLD_ZENITH = 1.0
 # if the turn is known better than this, no other turns need be tried
 NARROW_TURN = np.radians(20)
 # half the chi-square by which a solution may be worse than the best and still be true
@@ -134,6 +136,9 @@ def settled(plumb: PlumbLine, readings: Readings) -> tuple[PlumbLine, Scatter]:
         Frames(
             utc_unix_s=readings.utc_unix_s,
             pose=readings.pose,
+            attitude=readings.to_camera,
+            # by the stars: the readings' own errors would seem to follow from the lean that they show
+            up=readings.to_camera @ plumb.zenith,
             residual=linear.residual,
             design=linear.design,
             sigma=readings.sigma,
@@ -141,6 +146,8 @@ def settled(plumb: PlumbLine, readings: Readings) -> tuple[PlumbLine, Scatter]:
             prior_sigma=prior_sigma,
             response=(np.arange(len(prior_sigma)) >= 5 + readings.response.start)
             & (readings.pose.max() + 1 >= FEWEST_POSES),
+            # with an unknown zenith an error of all poses moves that too
+            zero_free=bool(prior_sigma[3] < TOLD_ZENITH),
         )
     )
     moved, covariance, at = scatter.moved, scatter.covariance, 5 + readings.response.start
@@ -193,7 +200,7 @@ def _chi2_without(readings: Readings, columns: np.ndarray) -> float:
     design = np.vstack(
         [design * np.repeat(weight, 3)[:, None], np.eye(more, design.shape[1], design.shape[1] - more)]
     )
-    pull = np.ones(len(off))
+    pull: np.ndarray = np.ones(len(off))
     for _ in range(ROBUST_ROUNDS):
         rest = off - design @ np.linalg.lstsq(design * pull[:, None], off * pull, rcond=1e-9)[0]
         size = np.linalg.norm(rest[: len(rest) - more].reshape(-1, 3), axis=1)

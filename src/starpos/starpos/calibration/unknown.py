@@ -6,7 +6,8 @@ from collections.abc import Iterable
 import numpy as np
 
 from starpos.fix.budget import CALIBRATION, ErrorTerm
-from starpos.instrument.instrument import Calibration
+from starpos.instrument.instrument import Calibration, Instrument
+from starpos.instrument.sensors import UNNAMED
 
 # what to do, in the options of `starpos solve` and in the parameters of the node
 BY_OPTIONS = (
@@ -17,6 +18,11 @@ BY_PARAMETERS = (
     "turn the instrument on the spot and set self_calibration:=true, find it at a known place with solver/calibrate or "
     "starpos calibrate --site and set calibration_url, or set misalignment and misalignment_stddev"
 )
+# the same for the errors of the inclinometer
+MODEL_BY_OPTIONS = (
+    "name it with --inclinometer MODEL, or its model or errors (tilt_noise_deg and the others) in an instrument file"
+)
+MODEL_BY_PARAMETERS = "set inclinometer.model, or name it or its errors in the file of calibration_url"
 # of one lean nothing is known of the turn about the plumb line: then an angle has a sigma of some 100 deg
 UNKNOWN_DEG = 60.0
 # a turn that is known better than so is said to be known; a place that is wider is worth a word
@@ -47,6 +53,16 @@ def unknown_a3(
     return (
         "the instrument leans otherwise than when A3 was found, and A3's turn about the plumb line, "
         f"{_known(calibration)}, makes the place {metres / 1000:.0f} km wide (1 sigma): lean it as then, or {TELL_IT}"
+    )
+
+
+def unnamed_inclinometer(instrument: Instrument, ways: str = MODEL_BY_OPTIONS) -> str:
+    """Say that nobody has said which inclinometer it is, and what is taken instead; '' if somebody has."""
+    if instrument.vertical is not None or instrument.inclinometer_model or instrument.inclinometer != UNNAMED:
+        return ""
+    return (
+        "nobody has said which inclinometer this is: its errors are taken for those of an SCA100T as sold, "
+        f"{np.degrees(UNNAMED.pose_rad):.2f} deg and more, 7 km (1 sigma): {ways}"
     )
 
 

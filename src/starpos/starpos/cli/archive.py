@@ -55,7 +55,7 @@ def nights_of(given: list[str], tilt: str | None, own_level: bool = False) -> li
 
 
 def _night(folder: str) -> NightFolder | FrameError:
-    from starpos.report.folder import frames_in
+    from starpos.night.folder import frames_in
 
     try:
         frames = tuple(map(str, frames_in(Path(folder))))

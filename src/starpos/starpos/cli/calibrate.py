@@ -14,20 +14,21 @@ from starpos.calibration.camera_adjustment import UNLEVELLED, UNTIMED, parameter
 from starpos.calibration.intrinsics import Intrinsics, rms
 from starpos.cli import calibrate_site, console, options, overwriting
 from starpos.cli.archive import frames_among
-from starpos.cli.doubts import checked_tilts
-from starpos.cli.frame_work import NO_CAMERA, Look, Reader, reader_of, stars_of
+from starpos.cli.inputs import checked_tilts, reader_of
 from starpos.cli.output import add_formats
 from starpos.cli.overwriting import CAMERA_NAME, Written
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import CalibrationError, FixError, FrameError, InstrumentError, StarposError
-from starpos.frames.pointings import read_pointings
+from starpos.frames.pointings import Pointing, read_pointings
 from starpos.frames.reading import why_no_time
 from starpos.frames.stars import Stars
 from starpos.instrument import camera_file, instrument_update
+from starpos.instrument.axis import with_frame_size
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import level_of
 from starpos.instrument.instrument import Instrument
 from starpos.instrument.tilt_log import TiltLog
+from starpos.night.reading import NO_CAMERA, First, Reader, stars_of
 from starpos.sky import catalogue
 
 # Exit status.
@@ -73,12 +74,13 @@ def run(args: argparse.Namespace) -> int:
         return _from_pointings(args)
     read, args.frames = reader_of(args), frames_among(args.frames, args.tilt)
     # an instrument that cannot be used is refused before all frames are worked on
-    if (first := Look(read)(tuple(args.frames))) is not None:
-        calibrate_site.check_output(args, options.instrument_of(args, first))
+    if (first := First(read)(tuple(args.frames))) is not None:
+        calibrate_site.check_output(args, with_frame_size(options.instrument_of(args, first), first)[0])
     frames, unreadable = _stars_of_all(args.frames, read)
     if not frames:
         return console.UNREADABLE
-    instrument = options.instrument_of(args, frames[0])
+    # an error of the axis that all frames share becomes part of the A3 that is found
+    instrument, _ = with_frame_size(options.instrument_of(args, frames[0]), frames[0])
     tilts = _tilts(args, instrument)
     try:
         if args.camera is not None:
@@ -100,13 +102,15 @@ def _tilts(args: argparse.Namespace, instrument: Instrument) -> TiltLog | None:
     """The table of --tilt, None without one."""
     if args.tilt is None:
         return None
-    return checked_tilts("calibrate", args.tilt, instrument.inclinometer.noise_rad)
+    return checked_tilts("calibrate", args.tilt, instrument).log
 
 
 def _from_pointings(args: argparse.Namespace) -> int:
     """Calibrate from the pointings of a plate solver; returns the exit status."""
     pointings = read_pointings(args.pointings)
     whole = [p for p in pointings if p.has_roll]
+    if not whole and args.tilt is not None:
+        return _from_elevations(args, pointings)
     if len(whole) < len(pointings):
         console.complain("calibrate", f"{len(pointings) - len(whole)} pointings without a roll are left out")
     instrument = options.instrument_of(args, NO_CAMERA)
@@ -114,6 +118,19 @@ def _from_pointings(args: argparse.Namespace) -> int:
     tilts = _tilts(args, instrument)
     try:
         calibrate_site.run(args, whole, instrument, tilts)
+    except FixError as e:
+        console.complain("calibrate", e)
+        return NOTHING
+    return 0
+
+
+def _from_elevations(args: argparse.Namespace, pointings: Sequence[Pointing]) -> int:
+    """Calibrate from pointings without a roll, whose elevations determine A3's axis; returns the exit status."""
+    instrument = options.instrument_of(args, NO_CAMERA)
+    calibrate_site.check_output(args, instrument)
+    tilts = _tilts(args, instrument)
+    try:
+        calibrate_site.run_elevations(args, pointings, instrument, tilts)
     except FixError as e:
         console.complain("calibrate", e)
         return NOTHING
@@ -149,7 +166,13 @@ def _camera(
 ) -> Camera:
     """Fit the camera of --camera, write, draw and print it."""
     air = options.atmosphere_of(args)
-    given = instrument.camera_for(frames[0].width, frames[0].height)
+    given = instrument.camera_for(frames[0].width, frames[0].height, frames[0].origin_px)
+    if {(f.width, f.height, f.origin_px) for f in frames} != {
+        (given.width, given.height, frames[0].origin_px)
+    }:
+        raise InstrumentError(
+            "the frames are not all of one size and one part of the sensor: give such ones for --camera"
+        )
     levels: Sequence[np.ndarray | None] = [None] * len(frames)
     if tilts is not None:
         frames, levels = _levelled(frames, instrument, tilts)
@@ -159,14 +182,15 @@ def _camera(
     if tilts is None:
         _tell_what_tilts_would(found.fit, air, frames)
     about = _about(found)
-    camera_file.write(Path(args.camera), found.fit.camera, CAMERA_NAME, about + _covariance_text(found.fit))
+    whole = instrument.whole_of(found.fit.camera, frames[0].origin_px)
+    camera_file.write(Path(args.camera), whole, CAMERA_NAME, about + _covariance_text(found.fit))
     if args.map is not None:
         _draw(args.map, found)
     if args.json:
         console.print_json(_json_of(found, args.camera))
     else:
         print(about, end="")
-    return found.fit.camera
+    return whole
 
 
 def _levelled(
@@ -178,7 +202,7 @@ def _levelled(
     for stars in frames:
         try:
             if stars.mid_unix_s is None:
-                raise FrameError(f"no time of exposure: {why_no_time(stars.source)}")
+                raise FrameError(f"no time of exposure: {why_no_time(stars)}")
             tilt = tilts.average(stars.mid_unix_s, stars.exposure_s or 0.0)
             levels.append(level_of(tilt.up) @ instrument.mounting.a3)
             kept.append(stars)

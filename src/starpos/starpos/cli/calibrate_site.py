@@ -15,7 +15,7 @@ from starpos.cli import console, options
 from starpos.cli.deflection import add_vertical, vertical_of
 from starpos.cli.overwriting import save_instrument
 from starpos.earth.vertical import astronomic
-from starpos.errors import InstrumentError
+from starpos.errors import InstrumentError, StarposError
 from starpos.fix.solver import Solver
 from starpos.frames.pointings import Pointing
 from starpos.frames.stars import Stars
@@ -24,6 +24,7 @@ from starpos.instrument.camera_vertical import MOST_SAG_ARCSEC, SAG_ARCSEC_PER_S
 from starpos.instrument.inclinometer import up_of
 from starpos.instrument.instrument import Calibration, Instrument
 from starpos.instrument.tilt_log import TiltLog
+from starpos.night.elevations import axis_of, circles_of
 from starpos.sky import catalogue
 from starpos.sky.site import Site
 from starpos.units import ARCSEC
@@ -136,11 +137,13 @@ def run(
         )
     else:
         found = calibrate_at(
-            solver, frames, tilts.average, site, stddev_arcsec, options.turn_of(args), console.ProgressBar()
+            solver, frames, tilts, site, stddev_arcsec, options.turn_of(args), console.ProgressBar()
         )
     for solution in found.solutions:
         if solution.fix is None:
             console.complain("calibrate", f"left out: {solution.message}")
+    if found.beyond:
+        console.complain("calibrate", found.beyond)
     calibration = found.instrument.calibration
     if args.valid_days is not None:
         calibration = replace(calibration, valid_days=args.valid_days)
@@ -151,6 +154,34 @@ def run(
     save_instrument("calibrate", args.output, found.instrument, about, camera_found=args.camera is not None)
     if args.json:
         console.print_json(_json_of(found, args.output))
+    else:
+        print(about, end="")
+
+
+def run_elevations(
+    args: argparse.Namespace, pointings: Sequence[Pointing], instrument: Instrument, tilts: TiltLog
+) -> None:
+    """Find A3's axis from pointings without a roll, write and print it; raises FixError if they do not determine it."""
+    solver = Solver(instrument, catalogue.load_catalogue(), options.atmosphere_of(args))
+    for row in circles_of(solver, pointings, tilts):
+        if isinstance(row, StarposError):
+            console.complain("calibrate", f"left out: {row}")
+    site, stddev_arcsec = _site(args)
+    found = axis_of(solver, pointings, tilts, site=site, site_stddev_arcsec=stddev_arcsec)
+    calibration = found.calibration(instrument.calibration, options.turn_of(args))
+    if args.valid_days is not None:
+        calibration = replace(calibration, valid_days=args.valid_days)
+    about = (
+        f"A3 of {calibration.frames} elevations in {found.directions} directions at {site.latitude_deg:+.6f} "
+        f"{site.longitude_deg:+.6f} (by gravity): "
+        "{:.5f} {:.5f} {:.5f} deg\n".format(*calibration.misalignment_deg)
+        + f"the frame's centre in the inclinometer is known to {found.stddev_arcsec:.2f} arcsec; elevations alone tell no "
+        "turn about it: for pointings without a roll it does not count\n"
+    )
+    whole = replace(instrument, calibration=calibration)
+    save_instrument("calibrate", args.output, whole, about)
+    if args.json:
+        console.print_json(_json_of(Calibrated(whole, found.stddev_arcsec, ()), args.output))
     else:
         print(about, end="")
 

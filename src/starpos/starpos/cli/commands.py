@@ -23,7 +23,8 @@ COMMANDS = {
     "solve": Command(
         "position and heading of frames with their tilts",
         (
-            "starpos simulate night && starpos solve night --misalignment 0 0 0 --misalignment-stddev 5",
+            "starpos simulate night && starpos solve night --misalignment 0 0 0 --misalignment-stddev 5 "
+            "--inclinometer sca100t_calibrated",
             "starpos solve *.fits --tilt tilt.csv --focal-mm 600 --pixel-um 6.4 --self-calibrate --save mine.yaml",
             "starpos solve *.fits --tilt tilt.csv --instrument mine.yaml --near 35.7 51.4 --csv > places.csv",
         ),
@@ -71,7 +72,9 @@ COMMANDS = {
     ),
     "report": Command(
         "nights on one page: stability, scatter, residuals, sky, error budget",
-        ("starpos report night --misalignment 0 0 0 --misalignment-stddev 5 -o my-report",),
+        (
+            "starpos report night --misalignment 0 0 0 --misalignment-stddev 5 --inclinometer sca100t_calibrated -o my-report",
+        ),
         "open the index.html whose path it prints",
     ),
     "simulate": Command(
@@ -86,7 +89,7 @@ COMMANDS = {
         "build the star catalogue, or say what it and its triangles hold",
         (
             "starpos catalogue info",
-            "starpos catalogue deepen tycho2_2.orig.tar.xz",
+            "starpos catalogue deepen --fetch",
         ),
         "starpos identify and starpos solve take the catalogue by themselves",
     ),

@@ -5,13 +5,9 @@ import json
 import math
 import sys
 import time
-from collections.abc import Sequence
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
-
-from starpos.errors import StarposError
-from starpos.fix.fix import Fix
 
 # Exit status.
 UNREADABLE = 2
@@ -39,36 +35,12 @@ def plain(value: Any) -> Any:
     return value
 
 
-def complain(command: str, error: StarposError | str) -> None:
-    """Print a line on standard error, as the command's."""
+def complain(command: str, error: object) -> None:
+    """Print a line on standard error, as the command's: an error, a remark or a sentence."""
     # clears a progress bar
     if sys.stderr.isatty():
         print("\r\x1b[K", end="", file=sys.stderr)
     print(f"starpos {command}: {error}", file=sys.stderr)
-
-
-class HasFix(Protocol):
-    """The fix of a frame, and how many days beyond the IERS table its date lies."""
-
-    @property
-    def fix(self) -> Fix | None:
-        """The fix; None without one."""
-
-    @property
-    def extrapolated_days(self) -> float:
-        """Days beyond the table; 0 within it."""
-
-
-def tell_extrapolation(command: str, solved: Sequence[HasFix]) -> None:
-    """Complain once about all fixes beyond the IERS table: the days and the error of the worst."""
-    worst = max(solved, key=lambda s: s.extrapolated_days, default=None)
-    if worst is not None and worst.fix is not None and worst.extrapolated_days > 0:
-        (ut1,) = (t for t in worst.fix.terms if t.name == "ut1")
-        complain(
-            command,
-            f"the Earth's rotation is extrapolated {worst.extrapolated_days:.0f} days beyond the IERS table, "
-            f"{np.sqrt(ut1.covariance[0, 0]):.0f} m east (1 sigma, in the budget): upgrade astropy-iers-data",
-        )
 
 
 class ProgressBar:

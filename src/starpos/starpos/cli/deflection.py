@@ -22,7 +22,7 @@ def add_vertical(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--geoid",
         metavar="FILE",
-        help="take the deflection and its error from a geoid grid, GTX or GeoTIFF, such as egm96_15.gtx of proj-data",
+        help="deflection and its error from a geoid grid (GTX, NGS .bin, GeoTIFF), such as egm96_15.gtx of proj-data",
     )
     parser.add_argument(
         "--altitude-m",

@@ -6,10 +6,11 @@ from typing import TYPE_CHECKING
 
 from starpos.cli import console, jobs, options
 from starpos.cli.archive import frames_among
-from starpos.cli.frame_work import Detecting, Reader
 from starpos.cli.output import Output, add_formats
 from starpos.errors import FrameError
 from starpos.frames.stars import Stars
+from starpos.night.reading import Reader
+from starpos.night.work import OnFile, detected
 
 if TYPE_CHECKING:
     from starpos.detection import Detection
@@ -31,7 +32,7 @@ def define(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     output = Output(args, COLUMNS, "")
     args.frames = frames_among(args.frames)
-    status, work, number = 0, Detecting(Reader()), len(args.frames)
+    status, work, number = 0, OnFile(Reader(), detected), len(args.frames)
     with jobs.workers_of(args, number) as workers:
         answers = jobs.watched(workers.map((work, path) for path in args.frames), number)
         for path, answer in zip(args.frames, answers, strict=True):

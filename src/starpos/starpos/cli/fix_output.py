@@ -2,7 +2,6 @@
 """The lines, the keys of JSON and the columns of a CSV that tell of fixes: of a frame, and of a night together."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -14,7 +13,7 @@ from starpos.earth.vertical import Vertical, geodetic
 from starpos.fix.fix import Fix
 from starpos.fix.readable import InDegrees, length_text
 from starpos.fix.solution import Solution, Status
-from starpos.instrument.inclinometer import Tilt
+from starpos.night.together import Solved
 from starpos.utc import utc_text
 
 # numbers of an average that are printed
@@ -34,32 +33,6 @@ JSON_HELP = (
     "source; status is ok, or why there is no fix, which is null then"
 )
 CSV_HELP = "a row of a CSV a frame, and one with combined=True for all; columns as the keys of --json"
-
-
-@dataclass(frozen=True, kw_only=True)
-class Solved:
-    """The part of a Solution that is needed until the end of a night."""
-
-    fix: Fix
-    extrapolated_days: float
-    stars_detected: int
-    stars_matched: int
-    log_odds: float
-    tilt: Tilt | None = None
-
-    @classmethod
-    def of(cls, s: Solution, fix: Fix) -> "Solved":
-        """The part of a solution with a fix."""
-        light = replace(fix, used=np.zeros(0, int), residual_px=np.zeros((0, 2)))
-        log_odds = s.attitude.log_odds if s.attitude else float("nan")
-        return cls(
-            fix=light,
-            extrapolated_days=s.extrapolated_days,
-            stars_detected=s.stars_detected,
-            stars_matched=len(s.names),
-            log_odds=log_odds,
-            tilt=s.tilt,
-        )
 
 
 def json_of(fix: Fix | Average | None, vertical: Vertical) -> dict:

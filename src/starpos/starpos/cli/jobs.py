@@ -7,10 +7,10 @@ from collections.abc import Iterable, Iterator
 from contextlib import suppress
 
 from starpos.cli import console, options
-from starpos.cli.frame_work import About
 from starpos.errors import InstrumentError, StarposError
 from starpos.fix.solver import Solver
 from starpos.instrument.instrument import Instrument
+from starpos.night.reading import About
 from starpos.parallel.call import Here, Workers
 from starpos.parallel.cluster import Cluster
 from starpos.parallel.processes import Processes, processors
@@ -70,5 +70,5 @@ def prepare(command: str, instrument: Instrument, about: About) -> None:
     solver = Solver(instrument, catalogue.load_catalogue(), progress=console.ProgressBar())
     # the frames report the error
     with suppress(StarposError):
-        if thin := solver.prepare(about.width, about.height):
+        if thin := solver.prepare(about.width, about.height, about.origin_px):
             console.complain(command, thin)

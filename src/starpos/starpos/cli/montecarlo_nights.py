@@ -10,6 +10,7 @@ from functools import lru_cache, partial
 import numpy as np
 
 from starpos.cli import console, options
+from starpos.instrument.sensors import SCA100T_CALIBRATED
 from starpos.simulation import montecarlo_nights
 from starpos.simulation.montecarlo_nights import NightOutcome
 from starpos.sky import catalogue
@@ -126,7 +127,7 @@ def _nees(solved: list[NightOutcome]) -> np.ndarray:
 
 def _errors(args: argparse.Namespace) -> montecarlo_nights.InclinometerErrors:
     return (
-        montecarlo_nights.COMPENSATED
+        SCA100T_CALIBRATED
         if args.tiltmeter is None
         else montecarlo_nights.tiltmeter(args.tiltmeter)
     )

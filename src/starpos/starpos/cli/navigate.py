@@ -12,7 +12,7 @@ from starpos.cli import console, jobs, options
 from starpos.cli.archive import frames_among
 from starpos.cli.deflection import add_vertical, tell_unknown, vertical_of
 from starpos.cli.fix_output import HEAD, in_degrees
-from starpos.cli.frame_work import Look, Reader, reader_of, stars_of
+from starpos.cli.inputs import reader_of
 from starpos.cli.output import Output, add_formats
 from starpos.earth.orientation import earth_orientation
 from starpos.earth.vertical import Vertical, geodetic
@@ -27,6 +27,7 @@ from starpos.navigation.velocity import read_velocity
 from starpos.navigation.vessel import Vessel
 from starpos.navigation.voyage import Voyage, navigate
 from starpos.navigation.voyage_fix import VoyageFix
+from starpos.night.reading import First, Reader, stars_of
 from starpos.sky import catalogue
 
 NO_ANSWER = 1
@@ -147,7 +148,7 @@ def run(args: argparse.Namespace) -> int:
     model = ImuModel() if args.imu_model is None else read_imu_model(Path(args.imu_model))
     velocity = None if args.velocity is None else read_velocity(args.velocity)
     with jobs.workers_of(args, number) as workers:
-        (about,) = workers.map([(Look(read), tuple(args.frames))])
+        (about,) = workers.map([(First(read), tuple(args.frames))])
         if about is None:
             raise VoyageError(f"none of the {number} frames can be read: give star lists or frames")
         instrument = options.instrument_of(args, about)

@@ -13,7 +13,7 @@ from starpos.frames.shutter import MOST_READOUT_S, UNKNOWN, Shutter
 from starpos.instrument import instrument, instrument_file, sensors
 from starpos.instrument.camera import Camera
 from starpos.instrument.instrument import UNKNOWN_CLOCK_S
-from starpos.instrument.lens import COEFFICIENTS, PLUMB_BOB
+from starpos.instrument.lens import EQUIDISTANT, PLUMB_BOB
 
 
 def add_frames(parser: argparse.ArgumentParser, pointings: bool = False) -> None:
@@ -48,7 +48,10 @@ def check_frames(args: argparse.Namespace) -> None:
 
 def has_own_level(args: argparse.Namespace) -> bool:
     """Whether --instrument is the file of a camera fixed to the ground; InstrumentError if there is a --tilt too."""
-    if args.instrument is None or instrument_file.read(args.instrument).vertical is None:
+    if args.instrument is None:
+        return False
+    pointed = getattr(args, "pointings", None) is not None
+    if instrument_file.read(args.instrument, needs_camera=not pointed).vertical is None:
         return False
     if args.tilt is not None or getattr(args, "self_calibrate", False):
         raise InstrumentError(
@@ -59,7 +62,7 @@ def has_own_level(args: argparse.Namespace) -> bool:
 
 
 def add_stamps(parser: argparse.ArgumentParser) -> None:
-    """Add the options of the frames' times, which `clock_of` and `frame_work.reader_of` read."""
+    """Add the options of the frames' times, which `clock_of` and `inputs.reader_of` read."""
     parser.add_argument(
         "--exif-utc-offset",
         type=_utc_offset,
@@ -116,7 +119,7 @@ def add_lens(parser: argparse.ArgumentParser) -> None:
     """Add --lens, the model of a lens that is not calibrated yet."""
     parser.add_argument(
         "--lens",
-        choices=tuple(COEFFICIENTS),
+        choices=(PLUMB_BOB, EQUIDISTANT),
         default=PLUMB_BOB,
         help="model of a lens whose calibration is not known (plumb_bob: a pinhole; equidistant: a fisheye)",
     )
@@ -146,7 +149,7 @@ def add_instrument(parser: argparse.ArgumentParser) -> None:
         "--inclinometer",
         metavar="MODEL",
         help=f"take the inclinometer's errors from its data sheet: {', '.join(sensors.PRESETS)} "
-        "(else those of an SCA100T with a good converter, compensated and calibrated)",
+        "(else those of an SCA100T as sold: 7 km)",
     )
     parser.add_argument(
         "--readout",
@@ -274,7 +277,8 @@ def instrument_of(args: argparse.Namespace, first: "HasFocalLength | None") -> i
             raise InstrumentError(
                 "--instrument holds focal length, lens, misalignment and the inclinometer: give either it or the options"
             )
-        return _with_times(instrument_file.read(path), args)
+        pointed = getattr(args, "pointings", None) is not None
+        return _with_times(instrument_file.read(path, needs_camera=not pointed), args)
     if (args.focal_mm is None) != (args.pixel_um is None):
         raise InstrumentError("--focal-mm and --pixel-um belong together: give both")
     if args.focal_mm is not None:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from starpos.averaging.average import Average
-from starpos.calibration.unknown import BY_PARAMETERS, unknown_a3
+from starpos.calibration.unknown import BY_PARAMETERS
 from starpos.cli import console, jobs
 from starpos.cli.archive import NightFolder
 from starpos.cli.fix_output import (
@@ -15,7 +15,6 @@ from starpos.cli.fix_output import (
     CSV_HELP,
     HEAD,
     JSON_HELP,
-    Solved,
     json_about,
     json_of,
     line_of,
@@ -27,6 +26,8 @@ from starpos.earth.vertical import Vertical
 from starpos.errors import StarposError
 from starpos.fix.solution import Solution
 from starpos.instrument.instrument import Calibration
+from starpos.night.remarks import of_a3
+from starpos.night.together import Solved, extrapolated
 from starpos.session.frames import Answered, Averaged
 from starpos.session.parameter_file import settings_of
 from starpos.session.replay import Replay
@@ -165,14 +166,13 @@ def tell(
             {"file": bag} | json_of(solution.fix, vertical) | json_about(solution),
             line_of(f"{bag} {time}", solution, turning=False),
         )
-    console.tell_extrapolation("replay", solved)
+    whole = night.average
+    for remark in (*extrapolated(solved), *(of_a3(calibration, whole, BY_PARAMETERS) if whole else ())):
+        console.complain("replay", f"{bag}: {remark}")
     if solved:
-        whole = night.average
-        if whole and (unknown := unknown_a3(calibration, whole.covariance, whole.terms, BY_PARAMETERS)):
-            console.complain("replay", f"{bag}: {unknown}")
         warnings = {warning for s in night.solutions for warning in s.warnings}
         folder = NightFolder((), None, bag if len(args.bags) > 1 else None)
-        put_combined(output, folder, night.average, solved, warnings, vertical)
+        put_combined(output, folder, whole, solved, warnings, vertical)
     # a trouble names its bag
     console.complain("replay", night.trouble or f"{bag}: {night.summary}")
     return console.UNREADABLE if night.trouble else 0 if solved else NO_FIX

@@ -3,23 +3,20 @@
 
 import argparse
 import time
-from collections.abc import Callable
-from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from starpos.cli import console, options
 from starpos.cli.deflection import add_vertical, vertical_of
+from starpos.cli.inputs import given_of
 from starpos.errors import FrameError, InstrumentError
-from starpos.frames.stars import Stars, no_stars
-from starpos.instrument.instrument import Instrument
-from starpos.report.night import Night
+from starpos.frames.stars import no_stars
+from starpos.night.folder import exposures, frames_in
+from starpos.night.night import Night
+from starpos.night.reading import First, Given, Reader
+from starpos.night.solving import solved_night
 from starpos.sky import catalogue
 from starpos.utc import utc_text
-
-if TYPE_CHECKING:
-    from starpos.report.bag import Recorded
 
 NO_FIX = 1
 # so many nights get all their figures; more get the table and the errors only
@@ -78,17 +75,10 @@ def run(args: argparse.Namespace) -> int:
 
 def _night(path: Path, args: argparse.Namespace) -> Night:
     """The Night of a folder or a bag; raises StarposError if there is nothing to work on."""
-    from starpos.report import bag, folder, recorded
-    from starpos.report.working import Workshop, worked
+    from starpos.night import bag, recorded
 
-    shop = Workshop(
-        instrument_for=_once_a_size(lambda stars: options.instrument_of(args, stars)),
-        catalogue=catalogue.load_catalogue(),
-        atmosphere=options.atmosphere_of(args),
-        vertical=vertical_of(args),
-        turn_stddev_deg=options.turn_of(args) if args.self_calibrate else None,
-        progress=console.ProgressBar(),
-    )
+    air, vertical, progress = options.atmosphere_of(args), vertical_of(args), console.ProgressBar()
+    turn_stddev_deg = options.turn_of(args) if args.self_calibrate else None
     if not path.exists():
         raise FrameError(f"{path}: there is no such night: give a folder, or a rosbag2")
     if not bag.is_bag(path):
@@ -96,43 +86,14 @@ def _night(path: Path, args: argparse.Namespace) -> Night:
             raise FrameError(
                 f"{path}: neither a folder of frames nor a rosbag2 (.mcap, .db3): give one of these"
             )
-        return worked(folder.exposures(path, _tilt_noise(args)), shop)
+        about = First(Reader())(tuple(map(str, frames_in(path))))
+        given = Given(None) if about is None else given_of(args, about)
+        return solved_night(exposures(path, given, air, vertical), turn_stddev_deg, progress)
     if find_spec("rosbags") is None:
         raise FrameError(f"{path}: bags are read with rosbags, which is not here: {PIP}")
-    found = bag.read(path, args.namespace, _tilt_noise(args), shop.progress)
-    return recorded.night(found, replace(shop, instrument_for=_once_a_size(_with_camera(args, found))))
-
-
-def _tilt_noise(args: argparse.Namespace) -> float:
-    """Noise in rad of a tilt that does not state its own."""
-    return _instrument(args).inclinometer.noise_rad
-
-
-def _instrument(args: argparse.Namespace) -> Instrument:
-    """The instrument of the options, with any camera."""
-    return options.instrument_of(args, no_stars(100, 100, focal_px=1000.0))
-
-
-def _once_a_size(instrument_for: Callable[[Stars], Instrument]) -> Callable[[Stars], Instrument]:
-    """A function like `instrument_for` that asks it only for the first frame of each size."""
-    known: dict[tuple[int, int], Instrument] = {}
-
-    def remembered(stars: Stars) -> Instrument:
-        size = stars.width, stars.height
-        if size not in known:
-            known[size] = instrument_for(stars)
-        return known[size]
-
-    return remembered
-
-
-def _with_camera(args: argparse.Namespace, found: "Recorded") -> Callable[[Stars], Instrument]:
-    """A function that gives the instrument for a frame, with the bag's camera unless the options have a focal length."""
-
-    def instrument_for(stars: Stars) -> Instrument:
-        camera = found.cameras.get((stars.width, stars.height))
-        if args.focal_mm is not None or camera is None:
-            return options.instrument_of(args, stars)
-        return replace(_instrument(args), camera=camera, focal_px=camera.fx)
-
-    return instrument_for
+    any_camera = options.instrument_of(args, no_stars(100, 100, focal_px=1000.0))
+    found = bag.read(path, args.namespace, any_camera.inclinometer.noise_rad, progress)
+    told = (args.instrument, args.focal_mm) != (None, None)
+    cameras = found.cameras if args.focal_mm is None else {}
+    instruments = recorded.OfBag(any_camera, cameras, any_size=told)
+    return recorded.night(found, instruments, air, vertical, turn_stddev_deg, progress)

@@ -3,29 +3,24 @@
 
 import argparse
 from collections.abc import Iterable
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, replace
 
 from starpos.cli import console, jobs, options, overwriting, solve_pointings
 from starpos.cli.archive import NightFolder, frames_among, nights_of
 from starpos.cli.deflection import add_vertical, vertical_of
-from starpos.cli.doubts import add_near, checked_tilts, near_of
-from starpos.cli.fix_output import (
-    COLUMNS,
-    CSV_HELP,
-    HEAD,
-    JSON_HELP,
-)
-from starpos.cli.frame_work import About, Listing, Look, Reader, Solving, reader_of
+from starpos.cli.fix_output import COLUMNS, CSV_HELP, HEAD, JSON_HELP
+from starpos.cli.inputs import add_near, checked_tilts, given_of, near_of, reader_of
 from starpos.cli.output import Output, add_formats
 from starpos.cli.overwriting import Written
-from starpos.cli.solved_night import check_save, solved_by_turning, tell
-from starpos.cli.what_fits import say_what_would_fit
-from starpos.errors import InstrumentError, StarposError, TiltError
+from starpos.cli.solved_night import check_save, say, tell, tell_turned
+from starpos.errors import FrameError, InstrumentError, StarposError, TiltError
 from starpos.fix.solver import Solver
-from starpos.frames.stars import Stars
 from starpos.instrument import instrument_update
-from starpos.instrument.tilt_log import TiltLog
+from starpos.instrument.axis import with_frame_size
+from starpos.instrument.tilts import NO_TILTS, Tilts
+from starpos.night.reading import About, First, Given, Reader, stars_of
+from starpos.night.together import turned
+from starpos.night.work import Fitting, Identifying, OnFile, Solving
 from starpos.sky import catalogue
 
 
@@ -56,12 +51,16 @@ def define(parser: argparse.ArgumentParser) -> None:
 
 @dataclass(frozen=True)
 class Plan:
-    """How to work on a night: the work on each frame, and solver and tilts, None if no frame can be read."""
+    """How to work on a night: what is done on each frame, the instruments, and the solver of its first frame.
+
+    solver: None if no frame can be read; each one reports why then.
+    """
 
     night: NightFolder
-    work: Solving | Listing
+    work: OnFile
+    given: Given
     solver: Solver | None = None
-    tilts: TiltLog | None = None
+    tilts: Tilts = NO_TILTS
 
 
 def run(args: argparse.Namespace) -> int:
@@ -83,7 +82,7 @@ def run(args: argparse.Namespace) -> int:
     number = sum(len(night.frames) for night in nights)
     with jobs.workers_of(args, number) as workers:
         plans = []
-        abouts = workers.map((Look(read), night.frames) for night in nights)
+        abouts = workers.map((First(read), night.frames) for night in nights)
         for night, about in zip(nights, abouts, strict=True):
             try:
                 plans.append(_plan(args, night, about, read))
@@ -100,10 +99,11 @@ def run(args: argparse.Namespace) -> int:
             if args.self_calibrate:
                 rows, saving = _turned(args, plan, list(rows))
                 statuses.append(saving)
-            instrument = None if plan.solver is None else plan.solver.instrument
-            fits = None if instrument is None else partial(say_what_would_fit, "solve", read, instrument)
-            known = None if args.self_calibrate else instrument
-            statuses.append(tell(args, output, plan.night, rows, vertical, known, fits))
+            known = None if args.self_calibrate else plan.given.instrument
+            status, lost = tell(args, output, plan.night, rows, vertical, known)
+            statuses.append(status)
+            if lost:
+                say(plan.night, *Fitting(plan.given)(read(lost)))
     return max(statuses)
 
 
@@ -118,29 +118,28 @@ def _refused(why: StarposError, given: list) -> int:
 def _plan(args: argparse.Namespace, night: NightFolder, about: About | None, read: Reader) -> Plan:
     # without a frame that can be read, each one reports why it cannot
     if about is None:
-        return Plan(night, Listing(read))
-    instrument, air = options.instrument_of(args, about), options.atmosphere_of(args)
+        return Plan(night, OnFile(read, stars_of), Given(None))
+    instrument, doubt = with_frame_size(options.instrument_of(args, about), about)
+    if doubt:
+        console.complain("solve", doubt)
+    given, air = replace(given_of(args, about), instrument=instrument), options.atmosphere_of(args)
     check_save(args, instrument)
-    noise = instrument.inclinometer.noise_rad
-    table = None if night.tilt is None else checked_tilts("solve", night.tilt, noise)
+    tilts = NO_TILTS if night.tilt is None else checked_tilts("solve", night.tilt, instrument)
     jobs.prepare("solve", instrument, about)
     solver = Solver(instrument, catalogue.load_catalogue(), air, progress=console.ProgressBar())
-    return Plan(
-        night,
-        Listing(read) if args.self_calibrate else Solving(read, instrument, air, night.tilt),
-        solver,
-        table,
-    )
+    work = Identifying(given) if args.self_calibrate else Solving(given, air, tilts)
+    return Plan(night, OnFile(read, work), given, solver, tilts)
 
 
 def _turned(args: argparse.Namespace, plan: Plan, rows: list) -> tuple[list, int]:
-    """(path, Solution or FrameError) of frames (path, Stars or FrameError), solved with the A3 that all of them tell.
+    """(path, Solution or FrameError) of frames (path, Identifying's answer or FrameError), with the A3 that they tell.
 
     Returns the exit status of saving that A3 too.
     """
-    frames = [stars for _, stars in rows if isinstance(stars, Stars)]
-    if not frames or plan.solver is None or plan.tilts is None:
+    sights = [answer[0] for _, answer in rows if not isinstance(answer, FrameError)]
+    if not sights or plan.solver is None:
         return rows, 0
-    solved, saving = solved_by_turning(args, plan.night, plan.solver, plan.tilts, frames)
-    answers = iter(solved)
-    return [(path, next(answers) if isinstance(item, Stars) else item) for path, item in rows], saving
+    found = turned(plan.solver, [(s.stars, s.found) for s in sights], plan.tilts, options.turn_of(args))
+    solutions = iter(found.solutions)
+    answers = [(path, answer if isinstance(answer, FrameError) else next(solutions)) for path, answer in rows]
+    return answers, tell_turned(args, plan.night, found)

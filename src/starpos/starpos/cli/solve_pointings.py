@@ -3,25 +3,30 @@
 
 import argparse
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
-from starpos.averaging.altitudes import Circle, circle_of, place_of_circles
 from starpos.cli import console, options
 from starpos.cli.archive import NightFolder
 from starpos.cli.deflection import tell_unknown, vertical_of
-from starpos.cli.doubts import Near, checked_tilts, far, near_of
 from starpos.cli.fix_output import COLUMNS, HEAD, json_of, put_combined
-from starpos.cli.frame_work import NO_CAMERA
+from starpos.cli.inputs import checked_tilts, near_of
 from starpos.cli.output import Output
-from starpos.cli.solved_night import NO_FIX, check_save, solved_by_turning, tell
+from starpos.cli.overwriting import save_instrument
+from starpos.cli.solved_night import NO_FIX, check_save, say, tell, tell_turned
 from starpos.earth.vertical import Vertical
-from starpos.errors import FixError, InstrumentError, StarposError
-from starpos.fix.pointing import IDEAL
+from starpos.errors import InstrumentError, StarposError
 from starpos.fix.solution import status_of
 from starpos.fix.solver import Solver
 from starpos.frames.pointings import Pointing, read_pointings
-from starpos.instrument.tilt_log import TiltLog
+from starpos.instrument.tilts import NO_TILTS, Tilts
+from starpos.night.doubts import Near
+from starpos.calibration.axis import FoundAxis
+from starpos.night.elevations import from_elevations
+from starpos.night.reading import NO_CAMERA
+from starpos.night.remarks import WORTH_SAVING_ARCSEC
+from starpos.night.together import turned
 from starpos.sky import catalogue
 from starpos.utc import utc_text
 
@@ -41,25 +46,21 @@ def run(args: argparse.Namespace) -> int:
         raise InstrumentError("--jobs and --scheduler are for frames: --pointings are worked in a moment")
     solver, saving = _solver_of(args), 0
     check_save(args, solver.instrument)
-    noise = solver.instrument.inclinometer.noise_rad
-    log = None if own_level else checked_tilts("solve", args.tilt, noise)
+    tilts = NO_TILTS if own_level else checked_tilts("solve", args.tilt, solver.instrument)
     whole = [p for p in pointings if p.has_roll]
     output = Output(args, COLUMNS, HEAD if whole else ELEVATIONS_HEAD)
     if not whole:
-        if args.self_calibrate:
-            raise InstrumentError(
-                "--self-calibrate needs pointings with their roll: elevations alone do not tell A3"
-            )
-        return _from_elevations(args, output, solver, log, pointings, vertical, near)
+        return _from_elevations(args, output, solver, tilts, pointings, vertical, near)
     night = NightFolder(tuple(p.source for p in pointings), args.tilt)
-    if args.self_calibrate and log is not None:
-        turned, saving = solved_by_turning(args, night, solver, log, whole)
-        solved = iter(turned)
-        answers = [next(solved) if p.has_roll else solver.solve(p) for p in pointings]
+    if args.self_calibrate:
+        found = turned(solver, [(p, None) for p in whole], tilts, options.turn_of(args))
+        saving, solved = tell_turned(args, night, found), iter(found.solutions)
+        answers = [next(solved) if p.has_roll else solver.solve_pointing(p) for p in pointings]
     else:
-        answers = [solver.solve(p, None if log is None else log.average) for p in pointings]
+        answers = [solver.solve_pointing(p, tilts) for p in pointings]
     given = None if args.self_calibrate else solver.instrument
-    return max(saving, tell(args, output, night, zip(night.frames, answers, strict=True), vertical, given))
+    status, _ = tell(args, output, night, zip(night.frames, answers, strict=True), vertical, given)
+    return max(saving, status)
 
 
 def _solver_of(args: argparse.Namespace) -> Solver:
@@ -72,49 +73,44 @@ def _from_elevations(
     args: argparse.Namespace,
     output: Output,
     solver: Solver,
-    log: TiltLog | None,
+    tilts: Tilts,
     pointings: Sequence[Pointing],
     vertical: Vertical,
     near: Near | None,
 ) -> int:
     """Print the zenith distance of each row and the place that they tell together; returns the exit status."""
-    circles: list[Circle] = []
-    for p in pointings:
-        try:
-            circles.append(_circle(solver, log, p))
-            zenith_distance, status = circles[-1].zenith_distance, ELEVATION
-        except StarposError as e:
-            console.complain("solve", e)
-            zenith_distance, status = None, status_of(p, e).value
-        _put_row(output, p, zenith_distance, status, vertical)
-    together = None
-    if circles:
-        try:
-            together = place_of_circles(circles, None if near is None else (near.latitude, near.longitude))
-            tell_unknown("solve", args, vertical.at(together.latitude, together.longitude))
-        except FixError as e:
-            console.complain("solve", e)
-        about = {}
-        if near is not None and together is not None:
-            about = {"km_from_near": near.km_from(together.latitude, together.longitude)}
-            if away := far(near, together, None, ()):
-                console.complain("solve", away)
-        put_combined(output, NightFolder((), args.tilt), together, [], set(), vertical, about)
-    return 0 if together else NO_FIX
+    found = from_elevations(solver, pointings, tilts, near, args.self_calibrate)
+    for p, circle in zip(pointings, found.circles, strict=True):
+        if isinstance(circle, StarposError):
+            console.complain("solve", circle)
+            _put_row(output, p, None, status_of(p, circle).value, vertical)
+        else:
+            _put_row(output, p, circle.zenith_distance, ELEVATION, vertical)
+    whole, night = found.together, NightFolder((), args.tilt)
+    saving = 0
+    if found.axis is not None:
+        say(night, f"A3 from the elevations: the frame's centre in the inclinometer to {found.axis.stddev_arcsec:.0f} arcsec")
+    if args.save is not None:
+        saving = _save(args, solver, found.axis)
+    say(night, *([whole.why_not] if whole.why_not else ()), *whole.remarks)
+    place, about = whole.average, {}
+    if place is not None:
+        tell_unknown("solve", args, vertical.at(place.latitude, place.longitude))
+        about = {} if near is None else {"km_from_near": near.km_from(place.latitude, place.longitude)}
+    if place is not None or whole.why_not:
+        put_combined(output, night, place, [], set(), vertical, about)
+    return max(saving, 0 if place else NO_FIX)
 
 
-def _circle(solver: Solver, log: TiltLog | None, pointing: Pointing) -> Circle:
-    state, tilt = solver.levelled(pointing, None if log is None else log.average)
-    instrument = solver.instrument
-    return circle_of(
-        pointing,
-        instrument.camera or IDEAL,
-        tilt,
-        instrument.mounting,
-        solver.atmosphere,
-        state,
-        solver.clock_stddev_s(pointing),
-    )
+def _save(args: argparse.Namespace, solver: Solver, axis: FoundAxis | None) -> int:
+    """Write the A3 that the elevations determined, as --save asks; NO_FIX if they did not."""
+    if axis is None or axis.stddev_arcsec > WORTH_SAVING_ARCSEC:
+        console.complain("solve", f"{args.save} is not written: the elevations hardly determine A3")
+        return NO_FIX
+    calibration = axis.calibration(solver.instrument.calibration, options.turn_of(args))
+    about = f"A3 of elevations alone: the frame's centre to {axis.stddev_arcsec:.2f} arcsec"
+    save_instrument("solve", args.save, replace(solver.instrument, calibration=calibration), about)
+    return 0
 
 
 def _put_row(

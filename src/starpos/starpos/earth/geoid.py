@@ -111,7 +111,9 @@ class Geoid:
 
 
 def read(path: Path | str) -> Geoid:
-    """Read a Geoid from a GTX or GeoTIFF file; a file name without a folder is also looked for among PROJ's grids.
+    """Read a Geoid from a GTX, .bin (NGS) or GeoTIFF file.
+
+    A file name without a folder is also looked for among PROJ's grids.
 
     GeoidError says why a file cannot be used.
     """

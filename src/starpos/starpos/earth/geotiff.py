@@ -18,6 +18,8 @@ PIXEL_SCALE, TIEPOINT, GEO_KEYS = 33550, 33922, 34735
 GDAL_METADATA, GDAL_NODATA = 42112, 42113
 # Two keys, and the value of each that is read.
 MODEL_TYPE, RASTER_TYPE, GEOGRAPHIC, PIXEL_IS_POINT = 1024, 1025, 2, 2
+# What a band of geoid undulations is called in GDAL's metadata.
+UNDULATION = "geoid_undulation"
 # The types of these tags: BYTE, ASCII, SHORT, LONG, DOUBLE.
 KINDS = {1: "B", 2: "s", 3: "H", 4: "I", 12: "d"}
 MAX_TAG_BYTES = 1 << 20
@@ -120,6 +122,9 @@ def _metadata(tags: dict) -> tuple[float, float]:
     kind = items.get("TYPE", "VERTICAL_OFFSET_GEOGRAPHIC_TO_VERTICAL")
     if kind != "VERTICAL_OFFSET_GEOGRAPHIC_TO_VERTICAL":
         raise GeoidError(f"it is a grid of {kind[:60]}: geoid undulations are wanted")
+    # of the same type are heights of a tidal surface (hydroid_height), which is not level
+    if (band := items.get("DESCRIPTION", UNDULATION).strip()) != UNDULATION:
+        raise GeoidError(f"its band is {band[:60]!r}: one of {UNDULATION} is wanted")
     try:
         scale, offset = float(items.get("SCALE", 1)), float(items.get("OFFSET", 0))
     except ValueError:

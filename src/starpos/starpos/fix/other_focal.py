@@ -1,6 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The focal length at which a frame is identified that was not with the given one."""
 
+import math
+import time
+
 from starpos.errors import StarposError
 from starpos.fix.solver import Solver
 from starpos.frames.stars import Stars
@@ -10,18 +13,21 @@ from starpos.identification import FEWEST_STARS, Sky, identify_directions
 STEP, TRIES = 1.055, 6
 
 
-def focal_that_fits(solver: Solver, stars: Stars) -> float | None:
+def focal_that_fits(solver: Solver, stars: Stars, until_s: float = math.inf) -> float | None:
     """The focal length in px at which a frame is identified, from 0.7 to 1.4 times the solver's; None if there is none.
 
+    No try is begun after until_s (time.monotonic).
     Triangles are found by their angles, which hardly depend on the focal length, so those of the given field serve.
     """
     on = stars.take(stars.on_frame.nonzero()[0])
     if len(on) < FEWEST_STARS:
         return None
     try:
-        given, catalogue, triangles = solver.view(on.width, on.height)
+        given, catalogue, triangles = solver.view(on.width, on.height, on.origin_px)
         sky = Sky.at(catalogue, triangles, on.mid_unix_s)
         for k in sorted(range(-TRIES, TRIES + 1), key=abs):
+            if time.monotonic() >= until_s:
+                break
             camera = given.scaled(STEP**k)
             seen = on.take(camera.sees(on.x, on.y).nonzero()[0])
             found = identify_directions(camera.directions(seen.x, seen.y), seen.sigma, camera, sky)

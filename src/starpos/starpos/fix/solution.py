@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The solution of a frame: its status, and as much of the answer as there is."""
 
-from dataclasses import KW_ONLY, dataclass
+from dataclasses import KW_ONLY, dataclass, replace
 from enum import Enum
+from typing import Any
 
 import numpy as np
 
@@ -90,26 +91,54 @@ class Solution:
     negative: bool = False
 
     @classmethod
-    def failed(cls, stars: Stars | Pointing, status: Status, message: str) -> "Solution":
+    def of(cls, frame: Stars | Pointing, message: str = "identified", **found: Any) -> "Solution":
+        """The success of a frame; found: what there is of the answer, by the names of the fields."""
+        return cls(Status.OK, message, **found, **_about(frame))
+
+    @classmethod
+    def failed(cls, frame: Stars | Pointing, status: Status, message: str) -> "Solution":
         """A solution that has nothing but its status and message."""
-        number, negative = (len(stars), stars.negative) if isinstance(stars, Stars) else (0, False)
-        return cls(
-            status,
-            message,
-            source=stars.source,
-            utc_unix_s=stars.mid_unix_s,
-            stars_detected=number,
-            negative=negative,
-        )
+        return cls(status, message, **_about(frame))
+
+    @classmethod
+    def refused(cls, frame: Stars | Pointing, error: StarposError) -> "Solution":
+        """A solution that has nothing but the error with which the work on its frame ended."""
+        return cls.failed(frame, status_of(frame, error), str(error))
+
+    @classmethod
+    def unreadable(cls, source: str, error: StarposError) -> "Solution":
+        """A solution of a file that holds no frame."""
+        return cls(Status.BAD_INPUT, str(error), source=source, utc_unix_s=None, stars_detected=0)
+
+    def among(self, stars: Stars, rows: np.ndarray) -> "Solution":
+        """The solution of `stars` that is found by those in `rows` (n,) alone."""
+        star = None if self.star is None else rows[self.star]
+        found = self.found and self.found.but(star=rows[self.found.star])
+        return replace(self, star=star, found=found, stars_detected=len(stars))
 
     def __repr__(self) -> str:
         found = self.fix.in_degrees if self.fix else self.message
         return f"<Solution {self.status.value}: {found}; {len(self.names)} of {self.stars_detected} stars>"
 
     @property
+    def lost(self) -> bool:
+        """Whether the stars tell nothing, so that another search might find them."""
+        return self.status in (Status.NOT_IDENTIFIED, Status.TOO_FEW_STARS)
+
+    @property
     def ok(self) -> bool:
         """Whether all that was asked for is there."""
         return self.status is Status.OK
+
+
+def _about(frame: Stars | Pointing) -> dict[str, Any]:
+    number, negative = (len(frame), frame.negative) if isinstance(frame, Stars) else (0, False)
+    return {
+        "source": frame.source,
+        "utc_unix_s": frame.mid_unix_s,
+        "stars_detected": number,
+        "negative": negative,
+    }
 
 
 def status_of(stars: Stars | Pointing, error: StarposError) -> Status:

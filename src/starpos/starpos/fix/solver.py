@@ -3,7 +3,6 @@
 
 import math
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -11,44 +10,43 @@ import numpy as np
 
 from starpos.earth.orientation import EarthState, earth_state
 from starpos.earth.refraction import Atmosphere
-from starpos.errors import FixError, InstrumentError, StarposError, TiltError, TimeError
+from starpos.errors import FixError, InstrumentError, StarposError, TimeError
 from starpos.fix.fix import Fix, MatchedStars, solve_fix, sound_matches
 from starpos.fix.horizon import check_above_horizon
+from starpos.fix.identified import identified
 from starpos.fix.pointing import IDEAL, pointing_fix
 from starpos.fix.seen import as_seen, directions_of, high_enough, inside
-from starpos.fix.solution import TWO_SKIES, UNEXPLAINED, Attitude, Solution, Status, status_of
+from starpos.fix.solution import TWO_SKIES, UNEXPLAINED, Solution, Status, status_of
 from starpos.fix.unidentified import why_unidentified
 from starpos.fix.unmoved import check_unmoved
 from starpos.frames.pointings import Pointing
 from starpos.frames.reading import why_no_time
 from starpos.frames.shutter import UNKNOWN, Shutter
 from starpos.frames.stars import Stars
-from starpos.identification import FEWEST_STARS, Identification, Sky, triangle_cache, wide
+from starpos.identification import FEWEST_STARS, Identification, PointingPrior, Sky, triangle_cache, wide
 from starpos.identification._frame import FrameStars, mean_sigma
-from starpos.identification.explained import Explained, explained_by
 from starpos.identification.hint import Hint
 from starpos.identification.search import Priors, field_of, identify_frame
 from starpos.identification.second_look import Look, second_look
 from starpos.identification.triangles import TriangleCatalogue
-from starpos.identification.two_skies import two_skies
 from starpos.instrument.camera import Camera
-from starpos.instrument.camera_vertical import own_level
+from starpos.instrument.camera_vertical import OWN_LEVEL
 from starpos.instrument.inclinometer import Tilt
 from starpos.instrument.instrument import Instrument
+from starpos.instrument.tilts import NO_TILTS, Tilts
 from starpos.progress import Progress, quiet
 from starpos.sky import deeper
 from starpos.sky.catalogue import Catalogue
-from starpos.units import ARCSEC
 
 ENOUGH_SOUND = 8
 SMALLEST_FIELD_DEG, LARGEST_FIELD_DEG = 0.3, 100.0
-# the tilt at (mid_unix_s, exposure_s, spread_s)
-Tilts = Callable[[float, float, float], Tilt]
 
 
 @dataclass(frozen=True)
 class Solver:
-    """Solver for one instrument in its surroundings: `solve` makes a fix, `identify` a pointing alone.
+    """Solver for one instrument in its surroundings: `solve` makes a fix, `identify` a pointing alone, by one search.
+
+    What else there is to try with a frame that this search does not find: `starpos.night.searching`.
 
     catalogue: or the deeper one in its stead, for a field that needs it.
     """
@@ -59,12 +57,12 @@ class Solver:
     min_stars: int = 5
     progress: Progress = quiet
 
-    def prepare(self, width: int, height: int) -> str:
+    def prepare(self, width: int, height: int, origin_px: tuple[float, float] | None = None) -> str:
         """Load the tables for frames of this size in px, or build them; raises StarposError.
 
         Returns what such a field lacks in the catalogue, as `too_thin` says it, '' if nothing.
         """
-        camera, catalogue, triangles = self.view(width, height)
+        camera, catalogue, triangles = self.view(width, height, origin_px)
         Sky(catalogue, triangles).load()
         return deeper.too_thin(catalogue, camera)
 
@@ -78,14 +76,14 @@ class Solver:
         """
         begin = time.perf_counter()
         try:
-            camera, catalogue, triangles = self.view(stars.width, stars.height)
+            camera, catalogue, triangles = self.view(stars.width, stars.height, stars.origin_px)
             if part != 1.0:
-                triangles = triangle_cache.cached(catalogue, part * wide.field_rad(camera), self.progress)
+                triangles = self.triangles_of(stars.width, stars.height, part, stars.origin_px)
             sky = Sky.at(catalogue, triangles, stars.mid_unix_s)
             field: FrameStars | wide.WideField | None = as_seen(camera, stars)
             if field is None:
                 if (rows := inside(stars, camera)) is not None:
-                    return _for_all(stars, rows, self.identify(stars.take(rows), predicted, look, part))
+                    return self.identify(stars.take(rows), predicted, look, part).among(stars, rows)
                 field = field_of(
                     directions_of(camera, stars), mean_sigma(stars.covariance), camera, stars.window
                 )
@@ -93,128 +91,80 @@ class Solver:
             if found is None and look is not None and isinstance(field, FrameStars):
                 found = second_look(field, sky, predicted, camera, look)
         except StarposError as e:
-            return _failure(stars, e)
-        if found is None:
-            return replace(_unidentified(stars, camera, sky), identify_s=time.perf_counter() - begin)
-        warnings, explained = suspicions(stars, field, sky, found)
-        names, magnitudes = catalogue.labels(found.catalogue)
-        return Solution(
-            Status.OK,
-            "identified",
-            source=stars.source,
-            utc_unix_s=stars.mid_unix_s,
-            stars_detected=len(stars),
-            negative=stars.negative,
-            names=names,
-            star=found.star,
-            magnitudes=magnitudes,
-            attitude=attitude_of(found, sky, camera),
-            identify_s=time.perf_counter() - begin,
-            warnings=warnings,
-            explained=explained,
-            found=found,
+            return Solution.refused(stars, e)
+        answer = (
+            _unidentified(stars, camera, sky)
+            if found is None
+            else identified(stars, field, sky, camera, found)
         )
+        return replace(answer, identify_s=time.perf_counter() - begin)
 
     def solve(
         self,
-        stars: Stars | Pointing,
-        tilt: Tilt | Tilts | None = None,
+        stars: Stars,
+        tilts: Tilts = NO_TILTS,
         hint: Hint | None = None,
         predicted: Priors = (),
+        known: Identification | None = None,
     ) -> Solution:
         """The fix of one frame; a fault of the frame, the tilt or the time is a status and never an exception.
 
-        stars: or the pointing of the frame, if it has a roll.
-        tilt: the average over the exposure, or a function of (mid_unix_s, exposure_s, spread_s) that gives it; a
-        camera that is its own level needs none.
+        tilts: not asked of a camera that is its own level.
         predicted, hint: where to look, the latter of an earlier solution; a wrong one costs 0.5 ms and does no harm.
+        known: what `identify` found of these stars, where the search here may be too short for them.
         """
-        if isinstance(stars, Pointing):
-            return self._solve_pointing(stars, tilt)
         if (rows := self._inside(stars)) is not None:
-            return _for_all(stars, rows, self.solve(stars.take(rows), tilt, hint, predicted))
+            known = known and known.but(star=np.searchsorted(rows, known.star))
+            return self.solve(stars.take(rows), tilts, hint, predicted, known).among(stars, rows)
         try:
-            state, tilt = self.levelled(stars, tilt)
-            camera, catalogue, triangles = self.view(stars.width, stars.height)
+            state, tilt = self.levelled(stars, tilts)
+            camera, catalogue, triangles = self.view(stars.width, stars.height, stars.origin_px)
             g = self.instrument.mounting.level(tilt).camera
             begin = time.perf_counter()
             directions = self.atmosphere.refraction().unbend(directions_of(camera, stars) @ g.T) @ g
             sky = Sky(catalogue, triangles, state.year, tuple(state.velocity))
             field = field_of(directions, mean_sigma(stars.covariance), camera, stars.window)
-            found = identify_frame(field, sky, (*predicted, *(hint.priors(state, g[2]) if hint else ())))
+            priors = (*predicted, *(hint.priors(state, g[2]) if hint else ()))
+            if known is not None and not known.mirrored:
+                priors = PointingPrior(known.attitude, camera.fx * known.focal_scale), *priors
+            found = identify_frame(field, sky, priors) or known
         except StarposError as e:
-            return _failure(stars, e)
-        if found is None:
-            return replace(
-                _unidentified(stars, camera, sky), tilt=tilt, identify_s=time.perf_counter() - begin
-            )
-        warnings, explained = suspicions(stars, field, sky, found)
-        identified = time.perf_counter()
-        names, magnitudes = catalogue.labels(found.catalogue)
-        solution = replace(
-            Solution.failed(stars, Status.OK, "fix"),
-            attitude=attitude_of(found, sky, camera),
-            tilt=tilt,
-            identify_s=identified - begin,
-            names=names,
-            star=found.star,
-            magnitudes=magnitudes,
-            warnings=warnings,
-            explained=explained,
-            found=found,
+            return Solution.refused(stars, e)
+        answer = (
+            _unidentified(stars, camera, sky)
+            if found is None
+            else identified(stars, field, sky, camera, found)
         )
+        done = time.perf_counter()
+        answer = replace(answer, tilt=tilt, identify_s=done - begin)
+        if found is None or answer.magnitudes is None:
+            return answer
         try:
-            if TWO_SKIES in warnings:
-                raise FixError(
-                    f"{stars.source or 'the frame'}: two skies in one frame, its bright stars are those of two "
-                    "pointings: keep the camera still while it exposes, and expose once"
-                )
-            if UNEXPLAINED in warnings:
-                raise FixError(
-                    f"{stars.source or 'the frame'}: only {explained.explained} of its {explained.bright} brightest "
-                    f"detections are stars of the sky found, and only {explained.seen} of the {explained.due} brightest "
-                    "stars there are detected: look at the frame"
-                )
-            fix = self._fix(stars, found, camera, tilt, state, sky.catalogue)
+            check_explained(answer)
+            fix = self._fix(stars, found, camera, tilt, state, catalogue)
         except StarposError as e:
-            return replace(solution, status=status_of(stars, e), message=str(e))
+            return replace(answer, status=status_of(stars, e), message=str(e))
         return replace(
-            solution,
+            answer,
+            message="fix",
             fix=fix,
-            fix_s=time.perf_counter() - identified,
+            fix_s=time.perf_counter() - done,
             extrapolated_days=state.orientation.extrapolated_days,
             hint=Hint.at(found, state, camera.fx * found.focal_scale, fix.latitude, fix.longitude),
-            names=tuple(names[k] for k in fix.used),
+            names=tuple(answer.names[k] for k in fix.used),
             star=found.star[fix.used],
-            magnitudes=magnitudes[fix.used],
+            magnitudes=answer.magnitudes[fix.used],
         )
 
-    def levelled(self, frame: Stars | Pointing, tilt: Tilt | Tilts | None) -> tuple[EarthState, Tilt]:
-        """State of the Earth and the tilt at a frame; StarposError if its time or the tilt cannot be used."""
-        if frame.mid_unix_s is None:
-            raise TimeError(f"{frame.place}: no time of exposure: {why_no_time(frame.source)}")
-        state = earth_state(frame.mid_unix_s)
-        if self.instrument.vertical is not None:
-            tilt = own_level(frame.mid_unix_s)
-        elif callable(tilt):
-            # the width of an even distribution of that standard deviation, as rounding makes it
-            spread_s = math.sqrt(12) * frame.stamp_stddev_s
-            tilt = tilt(frame.mid_unix_s, frame.exposure_s or 0.0, spread_s)
-        if tilt is None:
-            raise TiltError(f"{frame.place}: no tilt: give the inclinometer's")
-        self.instrument.calibration.check_age(frame.mid_unix_s)
-        self.instrument.inclinometer.check_range(tilt)
-        self.instrument.inclinometer.check_axes(tilt)
-        return state, tilt
-
-    def _solve_pointing(self, pointing: Pointing, tilt: Tilt | Tilts | None) -> Solution:
+    def solve_pointing(self, pointing: Pointing, tilts: Tilts = NO_TILTS) -> Solution:
+        """The fix of a frame whose pointing a plate solver found, if it has a roll; a fault is a status."""
         begin = time.perf_counter()
         try:
             if not pointing.has_roll:
                 raise FixError(
                     f"{pointing.place}: no roll: an elevation alone makes no fix, those of several do"
                 )
-            state, tilt = self.levelled(pointing, tilt)
+            state, tilt = self.levelled(pointing, tilts)
             camera, clock_s = self.instrument.camera or IDEAL, self.clock_stddev_s(pointing)
             fix = pointing_fix(
                 pointing, camera, tilt, self.instrument.mounting, self.atmosphere, state, clock_s
@@ -222,14 +172,30 @@ class Solver:
             check_above_horizon(math.cos(fix.zenith_distance), self.instrument.calibration)
             check_unmoved(fix, self.instrument, clock_s)
         except StarposError as e:
-            return _failure(pointing, e)
-        return replace(
-            Solution.failed(pointing, Status.OK, "fix"),
+            return Solution.refused(pointing, e)
+        return Solution.of(
+            pointing,
+            "fix",
             fix=fix,
             tilt=tilt,
             fix_s=time.perf_counter() - begin,
             extrapolated_days=state.orientation.extrapolated_days,
         )
+
+    def levelled(self, frame: Stars | Pointing, tilts: Tilts) -> tuple[EarthState, Tilt]:
+        """State of the Earth and the tilt at a frame; StarposError if its time or the tilt cannot be used."""
+        if frame.mid_unix_s is None:
+            raise TimeError(f"{frame.place}: no time of exposure: {why_no_time(frame)}")
+        state = earth_state(frame.mid_unix_s)
+        if self.instrument.vertical is not None:
+            tilts = OWN_LEVEL
+        # the width of an even distribution of that standard deviation, as rounding makes it
+        spread_s = math.sqrt(12) * frame.stamp_stddev_s
+        tilt = tilts.average(frame.mid_unix_s, frame.exposure_s or 0.0, spread_s)
+        self.instrument.calibration.check_age(frame.mid_unix_s)
+        self.instrument.inclinometer.check_range(tilt)
+        self.instrument.inclinometer.check_axes(tilt)
+        return state, tilt
 
     def _fix(
         self,
@@ -285,14 +251,20 @@ class Solver:
         return self.instrument.shutter or stars.shutter or UNKNOWN
 
     @cached_property
-    def _views(self) -> dict[tuple[int, int], tuple[Camera, Catalogue, TriangleCatalogue]]:
-        """What `view` has given last, by size."""
+    def _views(self) -> dict[tuple, tuple[Camera, Catalogue, TriangleCatalogue]]:
+        """What `view` has given last, by size and origin."""
         return {}
 
-    def view(self, width: int, height: int) -> tuple[Camera, Catalogue, TriangleCatalogue]:
-        """Camera for frames of this size in px, catalogue for its field and its triangles; raises StarposError."""
-        if (width, height) not in self._views:
-            camera = self.instrument.camera_for(width, height)
+    def view(
+        self, width: int, height: int, origin_px: tuple[float, float] | None = None
+    ) -> tuple[Camera, Catalogue, TriangleCatalogue]:
+        """Camera for frames of this size in px, catalogue for its field and its triangles; raises StarposError.
+
+        origin_px: column and row of the camera's whole frame at which they begin, as their Exposure has it.
+        """
+        key = width, height, origin_px
+        if key not in self._views:
+            camera = self.instrument.camera_for(width, height, origin_px)
             field_deg = math.degrees(2 * camera.half_diagonal_rad)
             if field_deg < SMALLEST_FIELD_DEG or (field_deg > LARGEST_FIELD_DEG and not wide.is_wide(camera)):
                 raise InstrumentError(
@@ -304,13 +276,20 @@ class Solver:
             triangles = triangle_cache.cached(catalogue, wide.field_rad(camera), self.progress)
             # one size is usual
             self._views.clear()
-            self._views[width, height] = camera, catalogue, triangles
-        return self._views[width, height]
+            self._views[key] = camera, catalogue, triangles
+        return self._views[key]
+
+    def triangles_of(
+        self, width: int, height: int, part: float, origin_px: tuple[float, float] | None = None
+    ) -> TriangleCatalogue:
+        """Triangles for a part of such frames, as `identify` has it, from the cache or built."""
+        camera, catalogue, _ = self.view(width, height, origin_px)
+        return triangle_cache.cached(catalogue, part * wide.field_rad(camera), self.progress)
 
     def _inside(self, stars: Stars) -> np.ndarray | None:
         """Rows of the stars that lie on their frame and in its lens's picture; None if all do, as is usual."""
         try:
-            return inside(stars, self.instrument.camera_for(stars.width, stars.height))
+            return inside(stars, self.instrument.camera_for(stars.width, stars.height, stars.origin_px))
         # who asks for the camera next reports the error
         except InstrumentError:
             return None
@@ -321,52 +300,16 @@ def _unidentified(stars: Stars, camera: Camera, sky: Sky) -> Solution:
     return Solution.failed(stars, status, why_unidentified(stars, camera, sky.catalogue))
 
 
-def _for_all(stars: Stars, inside: np.ndarray, s: Solution) -> Solution:
-    """Solution for all stars from that for the rows `inside` of them."""
-    star = None if s.star is None else inside[s.star]
-    found = s.found and s.found.but(star=inside[s.found.star])
-    return replace(s, star=star, found=found, stars_detected=len(stars))
-
-
-def _failure(stars: Stars | Pointing, error: StarposError) -> Solution:
-    return Solution.failed(stars, status_of(stars, error), str(error))
-
-
-def suspicions(
-    stars: Stars, field: FrameStars | wide.WideField, sky: Sky, found: Identification
-) -> tuple[tuple[str, ...], Explained]:
-    """Names, sorted, of what is suspicious about the stars' identification, and what it explains.
-
-    Of a fisheye the part with most identified stars is judged.
-    """
-    flux = stars.flux
-    if isinstance(field, wide.WideField):
-        part, found = wide.part_of(field, sky, found)
-        field, flux = part.field, flux[part.row]
-    explained = explained_by(found, field)
-    names = (TWO_SKIES,) * two_skies(field, flux, sky, found, explained) + (UNEXPLAINED,) * (
-        not explained.enough
-    )
-    return names, explained
-
-
-def attitude_of(found: Identification, sky: Sky, camera: Camera) -> Attitude:
-    """Pointing of the frame's centre; of a mirrored frame, after it was turned the right way up."""
-    scale = found.focal_scale
-    if camera.is_ideal:
-        across, down, row = camera.centre_from_axis
-        centre, above = (across, down, scale), (across, down - row, scale)
-    else:
-        x, y = camera.centre_px
-        centre, above = camera.scaled(scale).directions([x, x], [y, y - 1.0])
-    ra, dec, roll = found.pointing(centre, above, sky.velocity)
-    return Attitude(
-        ra=ra,
-        dec=dec,
-        roll=roll,
-        focal_px=camera.fx * scale,
-        residual_arcsec=found.residual_px / (scale * math.sqrt(camera.fx * camera.fy)) / ARCSEC,
-        log_odds=found.log_odds,
-        mirrored=found.mirrored,
-        model=camera.model,
-    )
+def check_explained(answer: Solution) -> None:
+    """Raise FixError if what was identified is suspicious."""
+    place, seen = answer.source or "the frame", answer.explained
+    if TWO_SKIES in answer.warnings:
+        raise FixError(
+            f"{place}: two skies in one frame, its bright stars are those of two pointings: keep the camera still "
+            "while it exposes, and expose once"
+        )
+    if UNEXPLAINED in answer.warnings and seen is not None:
+        raise FixError(
+            f"{place}: only {seen.explained} of its {seen.bright} brightest detections are stars of the sky found, and "
+            f"only {seen.seen} of the {seen.due} brightest stars there are detected: look at the frame"
+        )

@@ -15,7 +15,7 @@ from datetime import datetime, timezone
 from typing import Any
 
 from starpos.errors import FrameError, TimeError
-from starpos.frames.header import MAX_EXPOSURE_S
+from starpos.frames.exposure import MOST_EXPOSURE_S
 from starpos.frames.shutter import UNKNOWN_LATENCY_S
 
 # Canon and Nikon allow their clocks an error of a minute a month.
@@ -28,6 +28,10 @@ FIRST_YEAR = 1996
 FILM_MM = 43.267
 # Units of FocalPlaneResolutionUnit in mm: inch, cm, mm, um.
 UNITS_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
+# A zone is a multiple of this. GPS tells the time of its last fix, and a camera's clock is off by less than half of it.
+ZONE_STEP_S, GPS_APART_S = 900.0, 450.0
+# Sides of a picture over those that the camera made: both alike, or it was cropped, but for rounding.
+SAME_SHAPE = 0.02
 # A focal length over the frame's diagonal that no lens has lies beyond these.
 SHORTEST, LONGEST = 0.1, 1000.0
 
@@ -56,10 +60,10 @@ def told(data: bytes, place: str, clock: CameraClock | None, shape: tuple[int, .
     """Read from the EXIF of a TIFF, JPEG, PNG or TIFF-like raw file (DNG, CR2, NEF ...) what a Frame has fields for.
 
     shape is that of the pixels, rows first. exposure_s comes from ExposureTime, rough_focal_px from
-    FocalLengthIn35mmFilm, else from FocalLength and FocalPlaneXResolution. With a clock also mid_unix_s, stamp_stddev_s
-    and clock_stddev_s: DateTimeOriginal and SubSecTimeOriginal are the start of the exposure, rounded down; when the
-    shutter opened is known less well.
-    FrameError if these exist but are not a time.
+    FocalLengthIn35mmFilm, else from FocalLength and FocalPlaneXResolution; origin_px is NaN if the picture has another
+    shape than the camera gave it (ExifImageWidth, ExifImageLength). With a clock also mid_unix_s, stamp_stddev_s and
+    clock_stddev_s, or untimed: DateTimeOriginal and SubSecTimeOriginal are the start of the exposure, rounded down; when
+    the shutter opened is known less well. FrameError if exifread is missing where a clock asks for it.
     """
     try:
         import exifread
@@ -77,9 +81,17 @@ def told(data: bytes, place: str, clock: CameraClock | None, shape: tuple[int, .
     exposure_s = _exposure_s(tags)
     known: dict[str, Any] = {} if exposure_s is None else {"exposure_s": exposure_s}
     known["rough_focal_px"] = _focal_px(tags, shape[1], shape[0])
-    if clock is None or exposure_s is None or "EXIF DateTimeOriginal" not in tags:
+    if _cropped(tags, shape[1], shape[0]):
+        known["origin_px"] = (math.nan, math.nan)
+    if clock is None:
         return known
-    start_unix_s, step_s = _start(tags, place, clock)
+    if exposure_s is None or "EXIF DateTimeOriginal" not in tags:
+        lacks = "ExposureTime" if exposure_s is None else "DateTimeOriginal"
+        return known | {"untimed": f"its EXIF has no {lacks}: give the file as the camera wrote it"}
+    try:
+        start_unix_s, step_s = _start(tags, clock)
+    except TimeError as e:
+        return known | {"untimed": str(e)}
     return known | {
         "mid_unix_s": start_unix_s + exposure_s / 2,
         "stamp_stddev_s": math.hypot(step_s / math.sqrt(12), UNKNOWN_LATENCY_S),
@@ -90,7 +102,13 @@ def told(data: bytes, place: str, clock: CameraClock | None, shape: tuple[int, .
 def _exposure_s(tags: Mapping) -> float | None:
     """ExposureTime in s; None if it is missing or impossible."""
     seconds = _number(tags, "ExposureTime")
-    return seconds if seconds is not None and seconds <= MAX_EXPOSURE_S else None
+    return seconds if seconds is not None and seconds <= MOST_EXPOSURE_S else None
+
+
+def _cropped(tags: Mapping, width: int, height: int) -> bool:
+    """Whether a picture of this size has another shape than the one that the camera made, in either orientation."""
+    made = sorted(_number(tags, name) or 0.0 for name in ("ExifImageWidth", "ExifImageLength"))
+    return made[0] > 0 and abs(made[0] / made[1] * max(width, height) / min(width, height) - 1) > SAME_SHAPE
 
 
 def _focal_px(tags: Mapping, width: int, height: int) -> float | None:
@@ -121,34 +139,60 @@ def _number(tags: Mapping, name: str) -> float | None:
     return number if 0 < number < math.inf else None
 
 
-def _start(tags: Mapping, place: str, clock: CameraClock) -> tuple[float, float]:
-    """Unix time of the exposure's start (middle of the clock's last step before it), and the length of a step (s)."""
+def _start(tags: Mapping, clock: CameraClock) -> tuple[float, float]:
+    """Unix time of the exposure's start (middle of the clock's last step before it), and the length of a step (s).
+
+    The zone is the clock's, else OffsetTimeOriginal's, else what GPS's time says; TimeError if there is no time, no zone,
+    or if GPS contradicts it.
+    """
     text = _text(tags, "DateTimeOriginal")
     try:
         shown = datetime.strptime(text, "%Y:%m:%d %H:%M:%S")
     except ValueError:
         shown = datetime.min
     if shown.year < FIRST_YEAR:
-        raise FrameError(
-            f"{place}: its EXIF was taken at {text!r}, which is no time: set the camera's clock."
+        raise TimeError(f"its EXIF was taken at {text!r}, which is no time: set the camera's clock")
+    shown_s = shown.replace(tzinfo=timezone.utc).timestamp()
+    ahead_s = None if (gps_s := _gps_unix_s(tags)) is None else shown_s - gps_s
+    offset_s = _stated_offset_s(tags, clock)
+    if offset_s is None and ahead_s is not None and abs(ahead_s) <= 3600 * ZONES_H + GPS_APART_S:
+        offset_s = round(ahead_s / ZONE_STEP_S) * ZONE_STEP_S
+    if offset_s is None:
+        raise TimeError(
+            f"its EXIF has no zone (OffsetTimeOriginal is {_text(tags, 'OffsetTimeOriginal')!r}) and no time by GPS: say "
+            "by how many hours the camera's clock is before UTC"
         )
-    offset_h = clock.utc_offset_h
-    if offset_h is None:
-        zone = _text(tags, "OffsetTimeOriginal")
-        parts = re.fullmatch(r"([+-])(\d\d):(\d\d)", zone)
-        if not parts:
-            raise FrameError(
-                f"{place}: its EXIF has no zone (OffsetTimeOriginal is {zone!r}): say by how many hours the camera's "
-                "clock is before UTC."
-            )
-        offset_h = float(parts[1] + "1") * (int(parts[2]) + int(parts[3]) / 60)
+    if ahead_s is not None and abs(ahead_s - offset_s) > GPS_APART_S:
+        raise TimeError(
+            f"by the GPS time in its EXIF the camera's clock was {ahead_s / 3600:.2f} h ahead of UTC, and not "
+            f"{offset_s / 3600:g} h: state the zone that it showed, or set it"
+        )
     digits = _text(tags, "SubSecTimeOriginal")
     # many cameras that count no fractions write zeros
     if not re.fullmatch(r"\d{1,9}", digits) or not int(digits):
         digits = ""
     step_s = 10.0 ** -len(digits)
-    whole = shown.replace(tzinfo=timezone.utc).timestamp() - 3600 * offset_h
-    return whole + (int(digits or 0) + 0.5) * step_s, step_s
+    return shown_s - offset_s + (int(digits or 0) + 0.5) * step_s, step_s
+
+
+def _stated_offset_s(tags: Mapping, clock: CameraClock) -> float | None:
+    """Time in s by which the camera's clock was ahead of UTC, by the user or by the file; None if neither says it."""
+    if clock.utc_offset_h is not None:
+        return 3600 * clock.utc_offset_h
+    parts = re.fullmatch(r"([+-])(\d\d):(\d\d)", _text(tags, "OffsetTimeOriginal"))
+    return float(parts[1] + "1") * (3600 * int(parts[2]) + 60 * int(parts[3])) if parts else None
+
+
+def _gps_unix_s(tags: Mapping) -> float | None:
+    """GPSDateStamp and GPSTimeStamp, UTC of the last fix, as a Unix time; None without them, or if they are no time."""
+    try:
+        day = datetime.strptime(str(tags["GPS GPSDate"].values).strip("\0 "), "%Y:%m:%d")
+        hours, minutes, seconds = (value.num / value.den for value in tags["GPS GPSTimeStamp"].values)
+    except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError):
+        return None
+    if not (0 <= hours < 24 and 0 <= minutes < 60 and 0 <= seconds <= 60):
+        return None
+    return day.replace(tzinfo=timezone.utc).timestamp() + 3600 * hours + 60 * minutes + seconds
 
 
 def _text(tags: Mapping, name: str) -> str:

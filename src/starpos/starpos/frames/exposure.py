@@ -25,9 +25,12 @@ class Exposure:
     source          where it came from, for messages: a path or a topic
     focal_px        focal length by the file's header (FOCALLEN / XPIXSZ), px; only a hint; None: unknown
     rough_focal_px  focal length by the camera's EXIF, px: where a search for it begins; None: unknown
+    origin_px       column and row of the sensor's whole frame at which this one begins; NaN: it is a part, and nobody
+                    knows which; None: nobody has said that it is one
     stamp_stddev_s  standard deviation of mid_unix_s against the clock it was read from; 0: unknown
     clock_stddev_s  standard deviation of that clock against UTC, an error that all frames share; 0: unknown
     shutter         times of the rows; None: nobody has said
+    untimed         why mid_unix_s is None, for messages; '': its file has no time
 
     FrameError if a time, a standard deviation or the focal length is an impossible number.
     """
@@ -40,6 +43,8 @@ class Exposure:
     clock_stddev_s: float = 0.0
     shutter: Shutter | None = None
     rough_focal_px: float | None = None
+    origin_px: tuple[float, float] | None = None
+    untimed: str = ""
 
     def __post_init__(self) -> None:
         place = self.place

@@ -17,7 +17,7 @@ import numpy as np
 from starpos.errors import FrameError, one_line
 from starpos.frames.files import MAX_BYTES, check_pixels
 from starpos.frames.frame import PATTERNS, Frame, to_unsigned
-from starpos.frames.header import KEYS, focal_px, shutter, times
+from starpos.frames.header import KEYS, about
 
 FITS_START, GZIP_START = b"SIMPLE", b"\x1f\x8b"
 # Planes of a stack or of a camera of colours.
@@ -29,6 +29,8 @@ TILES = ("COMPRESSED_DATA", "GZIP_COMPRESSED_DATA")
 # What astropy unpacks safely: a damaged HCOMPRESS_1 ends the whole program, with astropy 6.0 to 8.0 at least.
 PACKINGS = ("RICE_1", "RICE_ONE", "GZIP_1", "GZIP_2", "NOCOMPRESS")
 STEP = 1 << 20
+# Comments of a DATE-OBS that is the end of the exposure (early SharpCap), and of one that comes later still (Seestar).
+GRABBED, CREATED = "frame grabbed", "image created"
 # zlib's name for data in the form of gzip
 GZIP_BITS = 31
 
@@ -72,17 +74,7 @@ def _read(file: BinaryIO, place: str, part: str) -> tuple[Frame, dict[str, Any]]
             f"like '{place}[{image.others[0]}]'",
             stacklevel=3,
         )
-    mid, exposure, rounding = times(header, place)
-    frame = Frame(
-        to_unsigned(values, place),
-        pattern=_pattern(header, place),
-        mid_unix_s=mid,
-        exposure_s=exposure,
-        source=place,
-        focal_px=focal_px(header),
-        stamp_stddev_s=rounding,
-        shutter=shutter(header, place),
-    )
+    frame = Frame(to_unsigned(values, place), pattern=_pattern(header, place), **about(header, place))
     return frame, header
 
 
@@ -188,6 +180,11 @@ def _content(file: BinaryIO, image: _Image, place: str) -> tuple[dict[str, Any],
         _check_tiles(file, image.number, place)
     headers = (hdu.header,) if hdu.header.get("INHERIT") is False else (image.primary, hdu.header)
     known = {key: header[key] for header in headers for key in KEYS if key in header}
+    remark = next((h.comments["DATE-OBS"].lower() for h in reversed(headers) if "DATE-OBS" in h), "")
+    if GRABBED in remark:
+        known.setdefault("DATE-END", known.pop("DATE-OBS"))
+    elif CREATED in remark:
+        known["DATE-OBS"] = f"{known['DATE-OBS']}, {CREATED} time"
     values = np.asarray(hdu.data)
     if planes == 1:
         return known, values.reshape(shape[-2:])

@@ -53,7 +53,8 @@ def raw_frame(data: bytes, place: str, clock: exif.CameraClock | None = None) ->
             f"{place}: its colour mosaic is {pattern!r}, not a 2 x 2 Bayer one; convert it to TIFF."
         )
     about = exif.told(data, place, clock, pixels.shape)
-    return Frame(to_unsigned(pixels, place), pattern=pattern, source=place, **about)
+    # the sensor's own pixels are all here, whatever shape the camera gave to its pictures
+    return Frame(to_unsigned(pixels, place), pattern=pattern, source=place, **about | {"origin_px": None})
 
 
 def _words(error: Exception) -> str:

@@ -9,6 +9,7 @@ from typing import BinaryIO
 from starpos.errors import FrameError, one_line
 from starpos.files import bytes_of
 from starpos.frames.exif import CameraClock
+from starpos.frames.exposure import Exposure
 from starpos.frames.files import MAX_BYTES, opened
 from starpos.frames.fits import read_fits
 from starpos.frames.frame import Frame
@@ -32,12 +33,15 @@ def read_frame(path: Path | str, clock: CameraClock | None = None) -> Frame | St
     clock is that of the camera which wrote the file, if it may be trusted.
 
     FITS (also .fz and .gz): DATE-OBS (or DATE-BEG, MJD-OBS, MJD-BEG) is the start of the exposure in UTC (or in
-    TIMESYS), whose last digit is its error, EXPTIME or EXPOSURE its length in s; BAYERPAT (XBAYROFF, YBAYROFF) is the
-    mosaic; FOCALLEN (mm) and XPIXSZ (um) give focal_px. The first row of the file is row 0. Values that fit 16 bits
-    are only rounded. Others are shifted to begin at 0, and scaled to fill 16 bits if their range is wider than that
-    or, for floats, narrower than 4096. A few NaN or infinite pixels become the median. Values farther from it than any
-    light (frame.LOUDEST) are clipped. Of several images (HDUs) the first is taken, with a warning; `a.fits[2]` or
-    `a.fits[SCI]` is another one, by its number from 0 or its EXTNAME. What its header lacks is that of the primary one.
+    TIMESYS), whose last digit is its error, EXPTIME or EXPOSURE its length in s, where 0 is unknown; a DATE-AVG is its
+    middle, a DATE-END its end. Where these contradict each other, or a stack is told (STACKCNT), there is no time.
+    XORGSUBF and YORGSUBF (or LTV1 and LTV2) say of which part of the sensor a frame is. BAYERPAT (XBAYROFF, YBAYROFF) is
+    the mosaic; FOCALLEN (mm) and XPIXSZ (um), or SCALE (arcsec), give focal_px. The first row of the file is row 0.
+    Values that fit 16 bits are only rounded. Others are shifted to begin at 0, and scaled to fill 16 bits if their
+    range is wider than that or, for floats, narrower than 4096. A few NaN or infinite pixels become the median.
+    Values farther from it than any light (frame.LOUDEST) are clipped. Of several images (HDUs) the first is taken,
+    with a warning; `a.fits[2]` or `a.fits[SCI]` is another one, by its number from 0 or its EXTNAME. What its header
+    lacks is that of the primary one.
     Three planes (NAXIS3 = 3) are colours, and become their mean.
     TIFF, PNG, JPEG, BMP: 8 or 16 bits, grey or colour; TIFF also of floats, by the rule above. Colours of more than 8
     bits become the mean of the three. HEIF: the same, through pillow-heif.
@@ -48,7 +52,8 @@ def read_frame(path: Path | str, clock: CameraClock | None = None) -> Frame | St
     required, then columns x, y, flux and optionally sigma (px); without it sigma is 0.1 px. The SNR is 1 px / sigma, that
     of a star image whose standard deviation is 1 px.
 
-    Without a time or an exposure mid_unix_s is None. FrameError for everything that is not as described here.
+    Without a time or an exposure mid_unix_s is None, and untimed says why. FrameError for everything
+    that is not as described here.
     """
     path = Path(path)
     file_path, part = _part_of(path)
@@ -93,9 +98,11 @@ def decode_frame(data: bytes, source: str) -> Frame:
     return raw_frame(data, source)
 
 
-def why_no_time(source: str) -> str:
-    """Explain why a frame has no time (mid_unix_s is None) and what to do, by the suffix of its source."""
-    suffix = _part_of(Path(source))[0].suffix.lower()
+def why_no_time(exposure: Exposure) -> str:
+    """Explain why a frame has no time (mid_unix_s is None) and what to do: as its file says, else by its suffix."""
+    if exposure.untimed:
+        return exposure.untimed
+    suffix = _part_of(Path(exposure.source))[0].suffix.lower()
     if suffix in PICTURE + JPEG + HEIF + RAW:
         vouch = "vouch for its camera's clock (--exif-utc-offset)"
         return f"a {suffix} file carries none in UTC: give FITS, a CSV of centroids, or {vouch}"

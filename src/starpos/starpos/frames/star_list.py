@@ -11,7 +11,7 @@ import numpy as np
 
 from starpos.errors import FrameError, one_line
 from starpos.files import bytes_of
-from starpos.frames.header import focal_mm, focal_px, shutter, times
+from starpos.frames.header import about, focal_mm
 from starpos.frames.stars import Stars
 
 MAX_CSV_BYTES = 20_000_000
@@ -61,7 +61,6 @@ def read_star_list(file: BinaryIO, place: str) -> Stars:
             f"{place}: a star's sigma is not between 0 and 1000 px; correct or remove the column."
         )
     order = np.argsort(-column["flux"], kind="stable")
-    mid, exposure, rounding = times(header, place)
     return Stars(
         x=column["x"][order],
         y=column["y"][order],
@@ -71,12 +70,7 @@ def read_star_list(file: BinaryIO, place: str) -> Stars:
         flags=np.zeros(len(table)),
         width=width,
         height=height,
-        mid_unix_s=mid,
-        exposure_s=exposure,
-        source=place,
-        focal_px=focal_px(header),
-        stamp_stddev_s=rounding,
-        shutter=shutter(header, place),
+        **about(header, place),
     )
 
 
@@ -85,19 +79,19 @@ def write_star_list(path: Path | str, stars: Stars, start_utc: str, pixel_um: fl
 
     pixel_um: with the focal length in px it makes FOCALLEN, mm; a list of stars without a focal length states neither.
     """
-    about = {
+    header = {
         "DATE-OBS": start_utc,
         "EXPTIME": stars.exposure_s,
         "NAXIS1": stars.width,
         "NAXIS2": stars.height,
     }
     if stars.focal_px is not None:
-        about |= {"FOCALLEN": focal_mm(stars.focal_px, pixel_um), "XPIXSZ": pixel_um}
+        header |= {"FOCALLEN": focal_mm(stars.focal_px, pixel_um), "XPIXSZ": pixel_um}
     if stars.shutter is not None:
-        about["ROLLSHUT"] = stars.shutter.readout_s
+        header["ROLLSHUT"] = stars.shutter.readout_s
     sigma = np.sqrt(np.trace(stars.covariance, axis1=1, axis2=2) / 2)
     rows = "".join(
         f"{x:.5f},{y:.5f},{f:.2f},{s:.5f}\n"
         for x, y, f, s in zip(stars.x, stars.y, stars.flux, sigma, strict=True)
     )
-    Path(path).write_text(f"# {json.dumps(about)}\nx,y,flux,sigma\n{rows}")
+    Path(path).write_text(f"# {json.dumps(header)}\nx,y,flux,sigma\n{rows}")

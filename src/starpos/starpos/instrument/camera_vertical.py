@@ -58,6 +58,12 @@ def level_errors(sag_arcsec_per_sqrt_hour: float) -> InclinometerErrors:
     return replace(EXACT, noise_rad=NO_NOISE, drift_rad_per_sqrt_hour=sag_arcsec_per_sqrt_hour * ARCSEC)
 
 
-def own_level(utc_unix_s: float) -> Tilt:
-    """The reading of that level at a time, always zero."""
-    return Tilt(0.0, 0.0, np.eye(2) * NO_NOISE**2, utc_unix_s=utc_unix_s)
+class OwnLevel:
+    """The tilts of that level, as `starpos.instrument.tilts.Tilts`: always zero."""
+
+    def average(self, mid_unix_s: float, exposure_s: float, spread_s: float = 0.0) -> Tilt:
+        """Zero, read at the middle of the exposure."""
+        return Tilt(0.0, 0.0, np.eye(2) * NO_NOISE**2, utc_unix_s=mid_unix_s)
+
+
+OWN_LEVEL = OwnLevel()

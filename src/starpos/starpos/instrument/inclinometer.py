@@ -23,8 +23,8 @@ SCA100T_NOISE_RAD = np.radians(0.0035)
 
 
 # sines of three axes that are square have a sum of squares of 1; scale and cross-axis errors of any sensor change it by
-# less than SQUARE, errors that nobody states (zeros, 0.3 deg of a pose) by less than LEAST_SQUARE
-SQUARE, LEAST_SQUARE = 0.1, 0.01
+# less than SQUARE, errors that nobody states (zeros, 0.3 deg of a pose, 3 % of scale) by less than LEAST_SQUARE
+SQUARE, LEAST_SQUARE = 0.1, 0.06
 SQUARE_SIGMA = 5.0
 # what the stated errors explain of it
 EXPLAINED_SIGMA = 3.0
@@ -76,6 +76,10 @@ class Tilt:
                 f"tilts of {angles} deg cannot hold together: check the inclinometer and its units"
             )
 
+    def average(self, mid_unix_s: float, exposure_s: float, spread_s: float = 0.0) -> "Tilt":
+        """Return itself: one tilt is that of any exposure, as `starpos.instrument.tilts.Tilts` has it."""
+        return self
+
     @property
     def axes(self) -> int:
         """Number of axes that were measured, 2 or 3."""
@@ -115,7 +119,7 @@ class Tilt:
 
 @dataclass(frozen=True, kw_only=True)
 class InclinometerErrors:
-    """Errors of an inclinometer, 1 sigma; the default has the noise of an SCA100T-D01 with a good converter.
+    """Errors of an inclinometer, 1 sigma; the defaults are those of an SCA100T-D01, compensated and calibrated.
 
     noise_rad                white noise of one reading
     quantum_rad              step of its readings

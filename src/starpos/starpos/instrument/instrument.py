@@ -17,6 +17,7 @@ from starpos.instrument.inclinometer import InclinometerErrors
 from starpos.instrument.lens import PLUMB_BOB
 from starpos.instrument.mounting import Mounting
 from starpos.instrument.response import COEFFICIENTS
+from starpos.instrument.sensors import UNNAMED
 from starpos.units import ARCSEC, DAY_S
 from starpos.utc import utc_text
 
@@ -213,11 +214,13 @@ class Instrument:
     """The instrument of the paper, or another one; InstrumentError for impossible values.
 
     focal_px            focal length, px
-    camera              full intrinsics; None: an ideal camera of any size
+    camera              full intrinsics; None: an ideal camera
+    frame_size          (width, height) px of the whole frame of that ideal camera, in whose middle its axis lies, and to
+                        which A3 belongs; None: nobody has said, the axis is in the middle of any frame
     model               of the lens of that ideal camera: PLUMB_BOB, or EQUIDISTANT for a fisheye
     calibration         A3 and its errors
     link_to_camera      (3, 3): base link into C
-    inclinometer        its errors
+    inclinometer        its errors; unless stated, those of an SCA100T as sold
     inclinometer_model  name in sensors.PRESETS that these errors began with; '': none
     clock_stddev_s      standard deviation of the clock against UTC, s
     shutter             times of the camera's rows; None: as the source of the frames states them
@@ -227,10 +230,11 @@ class Instrument:
     focal_px: float
     _: KW_ONLY
     camera: Camera | None = None
+    frame_size: tuple[int, int] | None = None
     model: str = PLUMB_BOB
     calibration: Calibration = field(default_factory=Calibration)
     link_to_camera: tuple = TOP_OF_FRAME
-    inclinometer: InclinometerErrors = field(default_factory=InclinometerErrors)
+    inclinometer: InclinometerErrors = UNNAMED
     inclinometer_model: str = ""
     clock_stddev_s: float = UNKNOWN_CLOCK_S
     shutter: Shutter | None = None
@@ -268,16 +272,36 @@ class Instrument:
         ):
             raise InstrumentError("link_to_camera must be a 3 x 3 rotation matrix")
 
-    def camera_for(self, width: int, height: int) -> Camera:
-        """The camera for a frame of this size; InstrumentError if the intrinsics are for another size."""
-        if self.camera is None:
+    @property
+    def size(self) -> tuple[int, int] | None:
+        """Width and height (px) of the whole frame, to which camera and A3 belong; None: nobody has said."""
+        return self.frame_size if self.camera is None else (self.camera.width, self.camera.height)
+
+    def camera_for(self, width: int, height: int, origin_px: tuple[float, float] | None = None) -> Camera:
+        """The camera for a frame of this size, that begins at a column and row of the whole one.
+
+        InstrumentError if the frame is of another size than the whole one, or not within it.
+        """
+        if self.size is None:
             return _ideal(width, height, self.focal_px, self.model)
-        if (self.camera.width, self.camera.height) != (width, height):
+        whole = self.camera or _ideal(*self.size, self.focal_px, self.model)
+        if origin_px is None and self.size == (width, height):
+            return whole
+        left, top = origin_px or (math.nan, math.nan)
+        if not (0 <= left <= whole.width - width and 0 <= top <= whole.height - height):
+            where = "" if math.isnan(left + top) else f" at column {left:g}, row {top:g}"
+            what = "focal length and A3 are" if self.camera is None else "the camera's intrinsics are"
             raise InstrumentError(
-                f"the frame is {width} x {height} px but the camera's intrinsics are of {self.camera.width} x "
-                f"{self.camera.height} px: use those of this frame size"
+                f"the frame is {width} x {height} px{where} but {what} of {whole.width} x {whole.height} px: "
+                "use those of this frame size, or frames whose header says which part they are (XORGSUBF, YORGSUBF)"
             )
-        return self.camera
+        return whole.part(left, top, width, height) if (width, height) != self.size else whole
+
+    def whole_of(self, camera: Camera, origin_px: tuple[float, float] | None) -> Camera:
+        """The camera of the whole frame from that of a part which begins at a column and row, if both are known."""
+        if self.size is None or origin_px is None:
+            return camera
+        return camera.part(-origin_px[0], -origin_px[1], *self.size)
 
     @property
     def mounting(self) -> Mounting:

@@ -23,6 +23,8 @@ from starpos.utc import unix_of, utc_text
 
 FORMAT = 1
 MOST_FRAMES = 1 << 31
+# focal length of a camera that a file for pointings does not name: it counts for nothing
+POINTED_FOCAL_PX = 10_000.0
 # By key of the file: field of InclinometerErrors, and unit (rad or 1).
 INCLINOMETER = {
     "tilt_noise_deg": ("noise_rad", math.radians(1)),
@@ -57,17 +59,19 @@ KEYS = (
     "shutter",
     "vertical",
 )
+SIDES = ("width", "height")
 SHUTTER = ("readout_s", "readout_stddev_s")
 VERTICAL = ("camera_to_itrs", "covariance_arcsec2", "sag_arcsec_per_sqrt_hour")
 
 
-def read(path: Path | str) -> Instrument:
+def read(path: Path | str, needs_camera: bool = True) -> Instrument:
     """Read an Instrument from its YAML file; InstrumentError says why a file cannot be used. The format:
 
     starpos_instrument: 1
     camera: {focal_mm, pixel_um}, {focal_px} or {width, height, fx, fy, cx, cy, distortion: [k1, k2, p1, p2, k3]}
             or {calibration: camera.yaml}, a CameraInfo calibration file beside this one or at a full path; each of the
-            first three may have `model: equidistant`, of a fisheye, whose distortion is [k1, k2, k3, k4]
+            first three may have `model: equidistant`, of a fisheye, whose distortion is [k1, k2, k3, k4], and the first
+            two width and height: of the whole frame, in whose middle the optical axis is, and to which A3 belongs
     misalignment_deg: [rx, ry, rz]                       without one of the next two it is not known: 10 deg
     calibration_stddev_arcsec: [x, y, z]                 about the inclinometer's axes, or as
     calibration_covariance_arcsec2: [[..], [..], [..]]
@@ -88,6 +92,8 @@ def read(path: Path | str) -> Instrument:
     shutter: {readout_s: 0.03, readout_stddev_s: 0}      from the row read first to the last; negative: bottom row first
     vertical: {camera_to_itrs, covariance_arcsec2, sag_arcsec_per_sqrt_hour}
                                                          of a camera fixed to the ground, in place of tilt_...
+
+    needs_camera: whether a file without a camera is refused; pointings need none.
     """
     path = Path(path)
     content = yaml_file.load(path, "instrument file")
@@ -96,7 +102,7 @@ def read(path: Path | str) -> Instrument:
             f"{path}: no instrument file of format {FORMAT}: its first key is `starpos_instrument: {FORMAT}`"
         )
     try:
-        return _from_mapping(content, path.parent)
+        return _from_mapping(content, path.parent, needs_camera)
     except InstrumentError as e:
         raise InstrumentError(f"{path}: {e}") from None
 
@@ -121,6 +127,8 @@ def content_of(instrument: Instrument) -> dict[str, Any]:
         content["camera"] = {"width": camera.width, "height": camera.height}
         content["camera"] |= {k: float(getattr(camera, k)) for k in ("fx", "fy", "cx", "cy")}
         content["camera"]["distortion"] = [float(d) for d in camera.distortion]
+    elif instrument.frame_size is not None:
+        content["camera"] |= dict(zip(SIDES, instrument.frame_size, strict=True))
     if model != PLUMB_BOB:
         content["camera"]["model"] = model
     content["misalignment_deg"] = [float(a) for a in c.misalignment_deg]
@@ -154,15 +162,20 @@ def content_of(instrument: Instrument) -> dict[str, Any]:
     return content
 
 
-def _from_mapping(content: dict, folder: Path) -> Instrument:
+def _from_mapping(content: dict, folder: Path, needs_camera: bool) -> Instrument:
     _refuse_others(content, KEYS)
-    camera, focal_px, model = _camera(content.get("camera"), folder)
+    if "camera" in content or needs_camera:
+        camera, focal_px, model = _camera(content.get("camera"), folder)
+    else:
+        camera, focal_px, model = None, POINTED_FOCAL_PX, PLUMB_BOB
     instrument = Instrument(focal_px, camera=camera, model=model, calibration=_calibration(content))
+    if camera is None and any(side in content.get("camera", ()) for side in SIDES):
+        instrument = replace(instrument, frame_size=_size(content["camera"]))
     if "link_to_camera" in content:
         link = _matrix(content["link_to_camera"], "link_to_camera")
         instrument = replace(instrument, link_to_camera=link)
-    sensor, errors = _sensor(content)
     given = {name: _error(content, key, unit) for key, (name, unit) in INCLINOMETER.items() if key in content}
+    sensor, errors = _sensor(content, bool(given))
     instrument = replace(instrument, inclinometer=replace(errors, **given), inclinometer_model=sensor)
     if "vertical" in content:
         if given or sensor:
@@ -211,10 +224,10 @@ def _camera(camera: object, folder: Path) -> tuple[Camera | None, float, str]:
     if model not in tuple(COEFFICIENTS):
         raise InstrumentError(f"the camera's model is {_short(model)}: give {' or '.join(COEFFICIENTS)}")
     if "focal_mm" in camera:
-        _refuse_others(camera, ("focal_mm", "pixel_um", "model"))
+        _refuse_others(camera, ("focal_mm", "pixel_um", *SIDES, "model"))
         return None, focal_px_of(_number(camera, "focal_mm"), _number(camera, "pixel_um")), model
     if "focal_px" in camera:
-        _refuse_others(camera, ("focal_px", "model"))
+        _refuse_others(camera, ("focal_px", *SIDES, "model"))
         return None, _number(camera, "focal_px"), model
     if "calibration" in camera:
         _refuse_others(camera, ("calibration",))
@@ -225,14 +238,10 @@ def _camera(camera: object, folder: Path) -> tuple[Camera | None, float, str]:
         full = camera_file.read(folder / camera["calibration"])
         return full, full.fx, PLUMB_BOB
     _refuse_others(camera, ("width", "height", "fx", "fy", "cx", "cy", "distortion", "model"))
-    for side in ("width", "height"):
-        if type(camera.get(side)) is not int or not 1 <= camera[side] <= LARGEST_SIDE:
-            raise InstrumentError(
-                f"the camera's {side} is {_short(camera.get(side))}: give a whole number of pixels"
-            )
+    width, height = _size(camera)
     full = Camera(
-        width=camera["width"],
-        height=camera["height"],
+        width=width,
+        height=height,
         fx=_number(camera, "fx"),
         fy=_number(camera, "fy"),
         cx=_number(camera, "cx"),
@@ -241,6 +250,16 @@ def _camera(camera: object, folder: Path) -> tuple[Camera | None, float, str]:
         model=model,
     )
     return full, full.fx, PLUMB_BOB
+
+
+def _size(camera: dict) -> tuple[int, int]:
+    """Width and height of a camera's frame."""
+    for side in SIDES:
+        if type(camera.get(side)) is not int or not 1 <= camera[side] <= LARGEST_SIDE:
+            raise InstrumentError(
+                f"the camera's {side} is {_short(camera.get(side))}: give a whole number of pixels"
+            )
+    return camera[SIDES[0]], camera[SIDES[1]]
 
 
 def _calibration(content: dict) -> Calibration:
@@ -286,8 +305,13 @@ def _calibration(content: dict) -> Calibration:
     return replace(calibration, utc_unix_s=utc, frames=frames, **more)
 
 
-def _sensor(content: dict) -> tuple[str, InclinometerErrors]:
-    """Model of the inclinometer ('' without one) and the errors that this gives."""
+def _sensor(content: dict, stated: bool) -> tuple[str, InclinometerErrors]:
+    """Model of the inclinometer ('' without one) and the errors that this gives; stated: whether the file states some.
+
+    A file that states some without a model speaks of a sensor that was measured: the others are those of a good one.
+    """
+    if "inclinometer" not in content and stated:
+        return "", InclinometerErrors()
     about = content.get("inclinometer", {"model": ""})
     if not isinstance(about, dict) or not isinstance(about.get("model"), str):
         raise InstrumentError(f"inclinometer is {_short(about)}: give {{model: NAME}}")

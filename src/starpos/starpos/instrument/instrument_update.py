@@ -25,7 +25,7 @@ def check_replaceable(path: Path) -> None:
     The sentence does not say what to do.
     """
     try:
-        instrument_file.read(path)
+        instrument_file.read(path, needs_camera=False)
     except InstrumentError:
         raise InstrumentError(
             f"{path}: it is there already, and no instrument file that can be read"
@@ -45,7 +45,7 @@ def check_fits(
     """
     if not path.exists():
         return
-    kept = instrument_file.read(path)
+    kept = instrument_file.read(path, needs_camera=False)
     if (kept.vertical is not None) != fixed:
         other = "an instrument with an inclinometer" if fixed else "a camera that is fixed to the ground"
         raise InstrumentError(
@@ -53,6 +53,8 @@ def check_fits(
         )
     if not camera_found and _lens(kept) != _lens(instrument):
         what = "camera"
+    elif not camera_found and None not in (kept.size, instrument.size) and kept.size != instrument.size:
+        what = "frame size"
     elif not fixed and _says_sensor(instrument) and _sensor(kept) != _sensor(instrument):
         what = "inclinometer"
     else:
@@ -68,8 +70,8 @@ def _lens(instrument: Instrument) -> tuple:
 
 
 def _sensor(instrument: Instrument) -> InclinometerErrors:
-    # a calibration finds how new the error is at each pose
-    return replace(instrument.inclinometer, pose_rad=0.0)
+    # a calibration finds the errors of its poses and its noise
+    return replace(instrument.inclinometer, pose_rad=0.0, noise_rad=0.0)
 
 
 def _says_sensor(instrument: Instrument) -> bool:
@@ -84,10 +86,18 @@ def write(path: Path, instrument: Instrument, comment: str, *, camera_found: boo
     """
     new = instrument_file.content_of(instrument)
     if path.exists():
-        pose = instrument_file.read(path).inclinometer.pose_rad < instrument.inclinometer.pose_rad
-        found = {*FOUND, *["camera"] * camera_found, *["tilt_pose_arcsec"] * pose}
+        stated = instrument_file.read(path, needs_camera=False).inclinometer
+        says = _says_sensor(instrument)
+        pose = says and stated.pose_rad < instrument.inclinometer.pose_rad
+        noise = says and stated.noise_rad < instrument.inclinometer.noise_rad
+        found = {*FOUND, *["camera"] * camera_found}
+        found |= {*["tilt_pose_arcsec"] * pose, *["tilt_noise_deg"] * noise}
         kept = yaml_file.load(path, "instrument file")
         changed = {k: v for k, v in kept.items() if k not in found} | {k: new[k] for k in found if k in new}
+        if not camera_found and instrument.frame_size is not None:
+            # to which the new A3 belongs
+            sides = dict(zip(instrument_file.SIDES, instrument.frame_size, strict=True))
+            changed["camera"] = kept["camera"] | sides
         order = ["starpos_instrument", *instrument_file.KEYS]
         new = {k: changed[k] for k in sorted(changed, key=order.index)}
     yaml_file.save(path, new, comment)

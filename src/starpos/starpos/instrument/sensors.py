@@ -6,7 +6,8 @@ Murata's minimum and maximum are 3 sigma, as its sheets say. Another limit (a ma
 straight line) is a uniform distribution: `limit`. A noise density is that of a filter of first order: `rms`.
 """
 
-from math import radians, sin, sqrt
+from dataclasses import replace
+from math import pi, radians, sin, sqrt
 
 from starpos.errors import InstrumentError
 from starpos.instrument.inclinometer import InclinometerErrors
@@ -125,8 +126,16 @@ BMI088 = InclinometerErrors(
     range_rad=radians(90),
 )
 
+# the same sensor with a good converter, compensated for temperature and calibrated by its owner; each figure is an
+# estimate of what that leaves
+SCA100T_CALIBRATED = InclinometerErrors()
+
+# what holds where nobody names the inclinometer or states its errors: those of a sensor as sold, at any lean
+UNNAMED = replace(SCA100T, range_rad=pi / 2)
+
 PRESETS = {
     "sca100t": SCA100T,
+    "sca100t_calibrated": SCA100T_CALIBRATED,
     "scl3300": SCL3300,
     "adis16209": ADIS16209,
     "nivel210": NIVEL210,
@@ -135,13 +144,13 @@ PRESETS = {
 
 
 def find(model: str) -> tuple[str, InclinometerErrors]:
-    """Name among PRESETS and errors of a model in any case; '' gives '' and the default errors.
+    """Name among PRESETS and errors of a model in any case; '' gives '' and UNNAMED.
 
     Raises InstrumentError with the names for an unknown one.
     """
     name = model.strip().lower()
     if not name:
-        return "", InclinometerErrors()
+        return "", UNNAMED
     if name not in PRESETS:
         raise InstrumentError(
             f"the inclinometer's model {model[:40]!r} is not known: the models are {', '.join(PRESETS)}; "

@@ -19,6 +19,8 @@ MOST_OFF, SIGMAS = 0.5, 6.0
 LOWEST_DEG = 80.0
 # turns that are seen so far above their noise show the gyro's axes; and what part of them may be off
 CLEARLY, MOST_SHARE = 20.0, 0.3
+# a gyro whose turns scatter by so many times the noise of its model where the stars see none has another unit
+MOST_SCATTER = 8.0
 # a frame strays whose turn is so much off, rad, and so many in a row at most
 STRAY, MOST_STRAYS = np.radians(3.0), 5
 # rad/s in other units
@@ -87,12 +89,18 @@ def _check_turns(stars: StarAttitudes, pieces: Pieces, model: ImuModel, camera_t
             raise VoyageError(
                 f"the gyro's turns differ from those of the stars by {100 * share:.0f} %: {_cause(turns, others)}"
             )
+    scatter = float(np.median(np.linalg.norm(off - bias, axis=1) / noise))
+    if not clear.any() and scatter > MOST_SCATTER:
+        raise VoyageError(
+            f"the gyro scatters by {scatter:.0f} times the noise of its model, where the stars see no turn, as if it was "
+            "in deg/s: give rad/s, or the model of the IMU"
+        )
     allowed = SIGMAS * (model.gyroscope_bias_stddev + float(np.median(noise)))
     allowed += MOST_SHARE * float(np.linalg.norm(np.median(seen, axis=0)))
     if np.abs(bias).max() > allowed:
         raise VoyageError(
             f"the gyro turns by {np.degrees(np.abs(bias).max()):.3g} deg/s more than the stars, its model allows "
-            f"{np.degrees(allowed):.2g}: check its unit (rad/s) and the model of the IMU"
+            f"{np.degrees(allowed):.2g}, as if it was in deg/s: give rad/s, and the model of the IMU"
         )
 
 

@@ -16,6 +16,7 @@ from starpos.errors import FixError, FrameError, InstrumentError, TimeError
 from starpos.fix import solver
 from starpos.fix.adjustment import share_free
 from starpos.fix.fix import sound_matches
+from starpos.fix.identified import suspicions
 from starpos.fix.outliers import expected_extra, judged
 from starpos.fix.unidentified import why_unidentified
 from starpos.frames.reading import why_no_time
@@ -114,8 +115,8 @@ def sighting_of(stars: Stars, eye: solver.Solver) -> IdentifiedFrame:
     """Identify the stars of a frame wherever it looks; a StarposError says why it cannot be used."""
     mid_unix_s = stars.mid_unix_s
     if mid_unix_s is None:
-        raise TimeError(f"{stars.place}: no time of exposure: {why_no_time(stars.source)}")
-    camera, catalogue, triangles = eye.view(stars.width, stars.height)
+        raise TimeError(f"{stars.place}: no time of exposure: {why_no_time(stars)}")
+    camera, catalogue, triangles = eye.view(stars.width, stars.height, stars.origin_px)
     if wide.is_wide(camera):
         raise InstrumentError(
             f"{stars.place}: frames of a fisheye tell no place under way: take a narrower lens"
@@ -128,7 +129,7 @@ def sighting_of(stars: Stars, eye: solver.Solver) -> IdentifiedFrame:
     found = identify_frame(field, sky)
     if found is None:
         raise FrameError(why_unidentified(stars, camera, catalogue))
-    suspicious, _ = solver.suspicions(stars, field, sky, found)
+    suspicious, _ = suspicions(stars, field, sky, found)
     if suspicious:
         raise FrameError(
             f"{stars.place}: its stars are not those of one sky ({', '.join(suspicious)}): left out"

@@ -5,6 +5,7 @@ rosbags (0.11) unpacks whatever a chunk, a message or a file holds, without a li
 that unpack by bounded ones.  The errors here do not name the bag: its reader does that (bag.py).
 """
 
+import re
 import shutil
 import tempfile
 from pathlib import Path
@@ -22,6 +23,8 @@ MOST_UNPACKED = 1 << 29
 MOST_AT_ONCE = 1 << 30
 # the first and the last bytes of a file
 MCAP = b"\x89MCAP0\r\n"
+# what rosbag2 calls the files that are read, .mcap and .db3
+STORAGES = ("mcap", "sqlite3")
 # bytes that stay free in the folder for temporary files, when a packed file is unpacked there
 LEFT_ON_DISK = 1 << 30
 
@@ -29,8 +32,8 @@ LEFT_ON_DISK = 1 << 30
 def check_folder(path: Path) -> None:
     """Check the files of a bag before it is opened.
 
-    Raises BagError if one is a pipe or a device, if metadata.yaml is too large, or if an MCAP file begins as one and has
-    no end.
+    Raises BagError if one is a pipe or a device, if metadata.yaml is too large or names a storage that is not read, or if
+    an MCAP file begins as one and has no end.
     """
     for file in sorted(path.iterdir()) if path.is_dir() else [path]:
         if file.exists() and not (file.is_file() or file.is_dir()):
@@ -44,8 +47,17 @@ def check_folder(path: Path) -> None:
                 f"{file.name} -o whole.mcap` (https://mcap.dev) gets back what is in it, to the last second or minute"
             )
     metadata = path / "metadata.yaml"
-    if metadata.is_file() and metadata.stat().st_size > MOST_METADATA:
+    if not metadata.is_file():
+        return
+    if metadata.stat().st_size > MOST_METADATA:
         raise BagError(f"its metadata.yaml has over {MOST_METADATA >> 20} MB, not the description of a bag")
+    named = re.search(rb"^\s*storage_identifier:[ \t]*(.*?)\s*$", metadata.read_bytes(), re.MULTILINE)
+    storage = named[1].decode("ascii", "replace").strip("'\"") if named else STORAGES[0]
+    if storage not in STORAGES:
+        raise BagError(
+            f"the storage_identifier in its metadata.yaml is {storage[:40]!r}: write there {' or '.join(STORAGES)}, as "
+            "its files are, or name the file itself"
+        )
 
 
 def _is_cut_off(file: Path) -> bool:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from starpos.report.night import Night, Shot
+from starpos.night.night import Night, Shot
 from starpos.report.style import BLUE, GREEN, ORANGE, PURPLE, RED, plain
 from starpos.utc import utc_text
 

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from starpos.earth.ellipsoid import curvature_radii_m, enu_axes, place_of_zenith, zenith_of
+from starpos.earth.ellipsoid import curvature_radii_m, place_of_zenith, zenith_of
+from starpos.night.night import Night, ReportedPlace, Truth, offset_m
 from starpos.normal import SIGMA_PER_MAD
-from starpos.report.night import Night, ReportedPlace, Truth
 from starpos.rotation import half_turns
 from starpos.units import ARCSEC
 
@@ -84,13 +84,6 @@ def steadiness(night: Night, steady: np.ndarray) -> Stability:
 def around(night: Night, latitude: float, longitude: float) -> np.ndarray:
     """East, north (N, 2) in m of the fixes from a place (rad)."""
     return np.array([offset_m(p, latitude, longitude) for p in night.places])
-
-
-def offset_m(place: ReportedPlace | Truth, latitude: float, longitude: float) -> tuple[float, float]:
-    """East, north in m of a place from another (rad)."""
-    across = enu_axes(latitude, longitude)[:2] @ zenith_of(place.latitude, place.longitude)
-    east, north = across * curvature_radii_m(latitude)
-    return float(east), float(north)
 
 
 def middle(night: Night) -> tuple[float, float]:

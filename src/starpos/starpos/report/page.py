@@ -13,8 +13,8 @@ import numpy as np
 
 from starpos import __version__
 from starpos.fix.readable import length_text
+from starpos.night.night import Night, ReportedPlace, Truth
 from starpos.report import measures
-from starpos.report.night import Night, ReportedPlace, Truth
 from starpos.report.pictures import Picture
 from starpos.report.style import figures_of
 from starpos.utc import utc_text
@@ -156,7 +156,7 @@ def _summary(night: Night) -> str:
     if used:
         rows += _rows_on_fixes(night)
     rows.append(("Source", escape(night.origin)))
-    rows += [("Note", escape(remark)) for remark in night.remarks]
+    rows += [("Note", escape(remark.text)) for remark in night.remarks]
     cells = "".join(f"<tr><th>{name}</th><td>{text}</td></tr>\n" for name, text in rows)
     return f"<table>\n{cells}</table>\n{_names(night)}"
 

@@ -10,8 +10,8 @@ import numpy as np
 
 from starpos.calibration import residual_map
 from starpos.errors import TimeError
+from starpos.night.night import Night
 from starpos.report import coast, frame_figures, measures, place_figures, sky_figure
-from starpos.report.night import Night
 from starpos.report.style import figures_of, mark_simulated, new_figure, png_of
 from starpos.sky.catalogue import Catalogue
 

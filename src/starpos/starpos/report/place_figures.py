@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from starpos.night.night import Night, ReportedPlace
 from starpos.report import measures
 from starpos.report.measures import Stability
-from starpos.report.night import Night, ReportedPlace
 from starpos.report.style import BLUE, GREEN, GREY, ORANGE, RED, SKY, figures_of, number_axis, plain
 
 if TYPE_CHECKING:

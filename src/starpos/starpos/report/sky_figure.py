@@ -11,7 +11,7 @@ import numpy as np
 from starpos.earth.orientation import EarthState, earth_state
 from starpos.fix.solution import Attitude
 from starpos.instrument.camera import Camera
-from starpos.report.night import Night, Shot
+from starpos.night.night import Night, Shot
 from starpos.report.style import BLUE, GREY, ORANGE
 from starpos.sky.catalogue import Catalogue
 from starpos.sky.site import Site

@@ -10,15 +10,18 @@ from starpos.frames.stars import Stars
 from starpos.identification import wide
 from starpos.identification.search import Priors
 from starpos.navigation.sightings import sighted
+from starpos.night.searching import NEVER_S, identified
 
 # what the stars are not asked before
 UNASKED = (Status.NO_TILT, Status.TILT_OUT_OF_RANGE)
 
 
-def asked(solver: Solver, stars: Stars, answer: Solution, predicted: Priors = ()) -> Solution:
+def asked(
+    solver: Solver, stars: Stars, answer: Solution, predicted: Priors = (), until_s: float = NEVER_S
+) -> Solution:
     """The answer that a solver has given to a frame, or where it did not ask the stars what they say."""
     if answer.found is None and answer.status in UNASKED:
-        return solver.identify(stars, predicted)
+        return identified(solver, stars, stars, predicted, until_s).solution
     return answer
 
 
@@ -33,7 +36,7 @@ def camera_attitude_of(
     if found is None or answer.warnings or found.mirrored or stars.mid_unix_s is None:
         return None
     try:
-        camera, catalogue, _ = solver.view(stars.width, stars.height)
+        camera, catalogue, _ = solver.view(stars.width, stars.height, stars.origin_px)
         if wide.is_wide(camera):
             return None
         state = earth_state(stars.mid_unix_s)

@@ -19,7 +19,7 @@ from starpos.session.averaging import Averaging, News
 from starpos.session.diagnosis import Diagnosis, Level
 from starpos.session.job import Coming, Jobs, Outcome
 from starpos.session.log import Log
-from starpos.session.memory import PoseMemory, RecentFrames, Seen, tilts_of
+from starpos.session.memory import PoseMemory, RecentFrames, Seen, known_of, tilts_of
 from starpos.session.settings import Settings
 from starpos.session.turned import Turned, turn_on_the_spot
 from starpos.sky.site import Site
@@ -217,8 +217,8 @@ class Calibrating:
         solver = self._solver()
         site = Site(latitude, longitude, solver.atmosphere)
         turn_deg = self._values["calibration_turn_stddev"]
-        stars, tilts = [f.stars for f in frames], tilts_of(frames)
-        return lambda: calibrate_at(solver, stars, tilts, site, turn_stddev_deg=turn_deg)
+        stars, tilts, known = [f.stars for f in frames], tilts_of(frames), known_of(frames)
+        return lambda: calibrate_at(solver, stars, tilts, site, turn_stddev_deg=turn_deg, known=known)
 
     # turning on the spot ---------------------------------------------------------------------------------------------
 

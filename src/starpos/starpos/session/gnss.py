@@ -8,7 +8,7 @@ import numpy as np
 
 from starpos.earth.ellipsoid import curvature_radii_m
 from starpos.earth.vertical import Geodetic
-from starpos.recording.messages import stamp_to_unix
+from starpos.messages.stamp import stamp_to_unix
 from starpos.rotation import half_turn
 
 # of a fix that states no error, m an axis

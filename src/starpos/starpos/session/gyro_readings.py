@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 
 from starpos.errors import VoyageError
+from starpos.messages.stamp import stamp_to_unix
 from starpos.navigation.imu import clipped
 from starpos.navigation.preintegration import turn_between
 from starpos.navigation.recent import BACK_S, RecentReadings
-from starpos.recording.messages import stamp_to_unix
 
 # readings are kept so long, in blocks of so much
 KEPT_S, BLOCK_S = 60.0, 1.0

@@ -2,15 +2,17 @@
 """Frames kept for a calibration: the newest ones, and one for each pose; their number is bounded."""
 
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 from starpos.averaging.slip import slip_s
 from starpos.errors import TiltError
 from starpos.fix.fix import Fix
 from starpos.frames.stars import Stars
+from starpos.identification import Identification
 from starpos.instrument.inclinometer import Tilt
 from starpos.instrument.tilt_log import TiltLog
+from starpos.instrument.tilts import TiltsByTime
 
 MOST_POSES = 36
 # The newest tilts of a pose.
@@ -19,10 +21,11 @@ MOST_TILTS = 64
 
 @dataclass(frozen=True)
 class Seen:
-    """The stars of a frame that has a time, with its tilt."""
+    """The stars of a frame that has a time, with its tilt; found: which stars they are, None if that is not known."""
 
     stars: Stars
     tilt: Tilt
+    found: Identification | None = None
 
     @property
     def mid_unix_s(self) -> float:
@@ -114,7 +117,11 @@ def mean_tilt(tilts: Sequence[Tilt]) -> Tilt:
     return replace(mean, samples=sum(t.samples for t in tilts))
 
 
-def tilts_of(seen: Sequence[Seen]) -> Callable[[float, float, float], Tilt]:
-    """Make the function that `starpos.calibration.misalignment` calls for the tilt of an exposure."""
-    by_time = {s.mid_unix_s: s.tilt for s in seen}
-    return lambda mid_unix_s, *_: by_time[mid_unix_s]
+def tilts_of(seen: Sequence[Seen]) -> TiltsByTime:
+    """The tilts of frames, as a solver takes them."""
+    return TiltsByTime({s.mid_unix_s: s.tilt for s in seen})
+
+
+def known_of(seen: Sequence[Seen]) -> dict[int, Identification]:
+    """Which stars those of the frames are, by the frames' numbers."""
+    return {k: s.found for k, s in enumerate(seen) if s.found is not None}

@@ -17,6 +17,8 @@ from starpos.earth.ellipsoid import enu_axes
 from starpos.earth.gravity import geodetic_place
 from starpos.earth.vertical import Geodetic, geodetic
 from starpos.errors import StarposError, VoyageError
+from starpos.messages.attitude import message_to_attitude
+from starpos.messages.stamp import stamp_to_unix
 from starpos.navigation.adjustment import FEWEST_FRAMES
 from starpos.navigation.estimate import Estimate
 from starpos.navigation.motion import PLACE
@@ -26,7 +28,6 @@ from starpos.navigation.recent import BACK_S, LONGEST_GAP_S, Recent
 from starpos.navigation.vessel import PARKED
 from starpos.navigation.voyage import Voyage
 from starpos.navigation.voyage_fix import VoyageFix
-from starpos.recording.messages import message_to_attitude, stamp_to_unix
 from starpos.session.diagnosis import Diagnosis, Level
 from starpos.session.gnss import OLDEST_S, GnssPlace, contradiction, message_to_gnss
 from starpos.session.job import Jobs, Outcome

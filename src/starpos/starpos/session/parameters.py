@@ -61,7 +61,7 @@ PARAMETERS = (
         "inclinometer.model",
         "",
         f"Take the inclinometer's errors from its data sheet: {', '.join(sensors.PRESETS)}; used without "
-        "calibration_url, whose file names its own. '' for an SCA100T with a good converter, compensated and calibrated.",
+        "calibration_url, whose file names its own. '' for an SCA100T as sold (7 km).",
     ),
     Parameter(
         "calibration_frames",
@@ -177,11 +177,22 @@ PARAMETERS = (
     Parameter(
         "deflection.geoid",
         "",
-        "Geoid grid (GTX, GeoTIFF; in m) whose slopes are the deflection and whose roughness its error, instead of the "
-        "three above: a path, or a name among PROJ's grids such as egm96_15.gtx. '' for none. A coarse one misses 1 "
-        "arcsec in plains and 10 in mountains, and outside its area nothing is known again: 6 arcsec, 190 m.",
+        "Geoid grid (GTX, NGS .bin, GeoTIFF; in m) whose slopes are the deflection and whose roughness its error, "
+        "instead of the three above: a path, or a name among PROJ's grids such as egm96_15.gtx. '' for none. A coarse "
+        "one misses 1 arcsec in plains and 10 in mountains, and outside its area nothing is known again: 6 arcsec, "
+        "190 m.",
     ),
     Parameter("min_stars", 5, "Fewest identified stars that make a fix.", unit="", minimum=4, maximum=1000),
+    Parameter(
+        "search_time",
+        0.3,
+        "How long a frame that is not identified at once may be searched by other ways: smaller triangles, where stars "
+        "fill a part of it only; other focal lengths, to say which fits. At most half of the time between frames; "
+        "recorded frames are searched to the end. 0: not at all.",
+        unit="s",
+        minimum=0.0,
+        maximum=60.0,
+    ),
     Parameter(
         "gyro",
         False,
@@ -262,9 +273,17 @@ def known_instrument(url: str) -> Instrument | None:
 
 
 def check_camera(known: Instrument | None, url: str, camera: Camera) -> None:
-    """Raise InstrumentError if the instrument file (`known`, from `url`) belongs to another camera."""
-    if known is None or abs(known.focal_px / camera.fx - 1) <= SAME_FOCAL:
+    """Raise InstrumentError if the instrument file (`known`, from `url`) belongs to another camera or frame size."""
+    if known is None:
         return
+    if abs(known.focal_px / camera.fx - 1) <= SAME_FOCAL:
+        if known.size in (None, (camera.width, camera.height)):
+            return
+        width, height = known.size
+        raise InstrumentError(
+            f"{url}: its A3 is of frames of {width} x {height} px, camera_info's are {camera.width} x {camera.height}: "
+            "calibrate with these"
+        )
     raise InstrumentError(
         f"{url}: it is of another camera: its focal length is {known.focal_px:.0f} px, camera_info's {camera.fx:.0f}"
     )

@@ -20,10 +20,12 @@ from starpos.fix.fix import Fix
 from starpos.fix.solution import Solution, Status
 from starpos.fix.solver import Solver
 from starpos.frames.stars import Stars
+from starpos.identification import Identification
 from starpos.identification.hint import Hint
 from starpos.identification.search import Priors
 from starpos.instrument.camera import Camera
-from starpos.recording.messages import message_to_camera, message_to_stars, stamp_to_unix
+from starpos.messages.stamp import stamp_to_unix
+from starpos.messages.stars import message_to_stars
 from starpos.session import reports
 from starpos.session.attitude import asked, camera_attitude_of
 from starpos.session.calibrating import Calibrating
@@ -35,6 +37,7 @@ from starpos.session.job import Jobs
 from starpos.session.log import Heard, Log
 from starpos.session.memory import Seen
 from starpos.session.now import Now, Sent
+from starpos.session.search import AT_ONCE_S, Search
 from starpos.session.settings import Settings
 from starpos.session.tilts import TiltBuffer
 from starpos.session.transforms import FrameNames, name_in
@@ -77,6 +80,7 @@ class SolverSession:
         self.names = FrameNames()
         self.doubt = ClockDoubt()
         self.gyro = Gyro(heard)
+        self._search = Search(settings.values)
         self._settings, self._values = settings, settings.values
         self._catalogue = catalogue.load_catalogue()
         # This reads the tables of the Earth's rotation, so that the first frame is not slow.
@@ -106,6 +110,7 @@ class SolverSession:
 
     def _other_camera(self) -> None:
         self._hint = None
+        self._search.other_camera()
         self.gyro.forget()
         self.calibrating.camera_changed()
 
@@ -138,7 +143,7 @@ class SolverSession:
         """
         made = self.at(now)
         try:
-            camera = message_to_camera(message)
+            self.instrument.take(message, at_once=not now.played)
         except StarposError as e:
             if self.instrument.camera is None:
                 self.instrument.trouble = str(e)
@@ -146,7 +151,6 @@ class SolverSession:
             return made
         self._heard.came("camera_info")
         self.names.camera = name_in(message)
-        self.instrument.take(camera, stamp_to_unix(message.header.stamp), at_once=not now.played)
         return made + self._work(now)
 
     def take_tilt(self, message: Any, sent: Sent, now: Now) -> list[Output]:
@@ -186,6 +190,7 @@ class SolverSession:
         """Take a StarArray."""
         made = self.at(now)
         self._heard.came("stars")
+        self._search.frame_came(now)
         try:
             stars = message_to_stars(message)
             # If the user sets clock_stddev, it replaces the error that the camera's host states.
@@ -200,6 +205,7 @@ class SolverSession:
                 stars_detected=len(message.stars),
             )
             return [*made, self._answered(message.header.stamp, bad, now)]
+        self.instrument.frame_came(stars.width, stars.height, at_once=not now.played)
         self._waiting.append(Waiting(message, stars, now.waiting_s, now.ahead_s(stars.mid_unix_s)))
         while len(self._waiting) > (WAITING_PLAYED if now.played else WAITING):
             self._waiting.popleft()
@@ -278,26 +284,27 @@ class SolverSession:
 
     def _solve(self, frame: Waiting, now: Now) -> list[Output]:
         predicted = self.gyro.predicted(frame.stars, self.instrument.solver)
-        answer = self._answer_to(frame, self._hint, predicted)
+        until_s = self._search.until_s(now, bool(self._waiting))
+        answer = self._answer_to(frame, self._hint, until_s, predicted)
         if answer.ok and answer.fix is not None:
             frame, answer = self._with_doubt(frame, answer, answer.fix)
         self.latest = frame
         header = frame.message.header
         answered = self._answered(header.stamp, answer, now)
-        attitude = self._attitude(frame.stars, answer, header.frame_id, predicted)
+        attitude = self._attitude(frame.stars, answer, header.frame_id, predicted, until_s)
         made: list[Output] = [replace(answered, attitude=attitude)]
         if self.instrument.solver is not None:
             made += self._learn(frame, answer)
         return made
 
     def _attitude(
-        self, stars: Stars, answer: Solution, frame_id: str, predicted: Priors
+        self, stars: Stars, answer: Solution, frame_id: str, predicted: Priors, until_s: float
     ) -> CameraAttitude | None:
         solver = self.instrument.solver
         if solver is None:
             return None
         try:
-            answer = asked(solver, stars, answer, predicted)
+            answer = asked(solver, stars, answer, predicted, until_s)
             attitude = camera_attitude_of(solver, stars, answer, frame_id)
             if attitude is not None and answer.found is not None:
                 self.gyro.saw(stars, answer.found, solver)
@@ -318,9 +325,16 @@ class SolverSession:
         frame = replace(frame, stars=replace(frame.stars, clock_stddev_s=self.doubt.seconds), doubted=True)
         if self.doubt.leans_otherwise:
             return frame, Solution.failed(frame.stars, Status.NO_TILT, reports.OTHER_TILTS)
-        return frame, self._answer_to(frame, answer.hint)
+        return frame, self._answer_to(frame, answer.hint, AT_ONCE_S, known=answer.found)
 
-    def _answer_to(self, frame: Waiting, hint: Hint | None, predicted: Priors = ()) -> Solution:
+    def _answer_to(
+        self,
+        frame: Waiting,
+        hint: Hint | None,
+        until_s: float,
+        predicted: Priors = (),
+        known: Identification | None = None,
+    ) -> Solution:
         stars = frame.stars
         try:
             solver = self.instrument.solver_now
@@ -328,9 +342,8 @@ class SolverSession:
                 raise TimeError(
                     f"the frame is stamped {frame.ahead_s:.3g} s before its time: {reports.ONE_CLOCK}"
                 )
-            return solver.solve(
-                stars, lambda mid, *_: self.tilts.average(mid, self._span(stars)), hint, predicted
-            )
+            tilts = self.tilts.over(self._span(stars))
+            return self._search.solved(solver, stars, tilts, hint, predicted, until_s, known)
         except (InstrumentError, TimeError) as e:
             return Solution.failed(stars, Status.BAD_INPUT, str(e))
         except Exception as e:
@@ -355,7 +368,7 @@ class SolverSession:
         except StarposError:
             return []
         try:
-            used = self.calibrating.learn(Seen(stars, tilt), answer.fix)
+            used = self.calibrating.learn(Seen(stars, tilt, answer.found), answer.fix)
             place = self.calibrating.average.place if used else None
             if place is None:
                 return []
@@ -398,7 +411,8 @@ class SolverSession:
         """Solve the newest frame with what is known now, identified anew whatever was found before; None without one."""
         if self.latest is None:
             return None
-        return self._output(self.latest.message.header.stamp, self._answer_to(self.latest, None))
+        answer = self._answer_to(self.latest, None, self._search.until_s(None, False))
+        return self._output(self.latest.message.header.stamp, answer)
 
     def reset(self) -> None:
         """Forget tilts, frames and the place, but no calibration that was found."""

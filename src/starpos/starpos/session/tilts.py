@@ -2,6 +2,7 @@
 """The tilts that have arrived, and their average over an exposure."""
 
 from collections import deque
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -9,14 +10,9 @@ import numpy as np
 from starpos.errors import TiltError, TiltRangeError
 from starpos.instrument.inclinometer import Tilt
 from starpos.instrument.tilt_log import BRACKET_S, NEIGHBOURS_S, OPEN_END, TOUCH_S, TiltLog, noise_excess
-from starpos.recording.messages import (
-    OUT_OF_RANGE,
-    SATURATED,
-    STUCK,
-    UNUSABLE,
-    message_to_tilt,
-    stamp_to_unix,
-)
+from starpos.instrument.tilts import Tilts
+from starpos.messages.stamp import stamp_to_unix
+from starpos.messages.tilt import OUT_OF_RANGE, SATURATED, STUCK, UNUSABLE, message_to_tilt
 from starpos.session.tilt_publishers import TiltPublishers
 
 # Ten minutes at 10 Hz.
@@ -132,6 +128,10 @@ class TiltBuffer:
         excess = self._excess(mid_unix_s + span_s / 2)
         return TiltLog.of_readings(near, excess).average(mid_unix_s, span_s)
 
+    def over(self, span_s: float) -> "Tilts":
+        """These tilts for a frame, over a span in place of an exposure that may not be known."""
+        return _Over(self, span_s)
+
     def _note_step(self, before: Tilt, sample: Tilt) -> None:
         apart = sample.utc_unix_s - before.utc_unix_s
         # a sample that comes again tells nothing new, and would make chance look like noise
@@ -170,3 +170,15 @@ class TiltBuffer:
         nearest = min((abs(s.utc_unix_s - mid_unix_s) for _, s in self._good), default=None)
         known = "none has arrived at all" if nearest is None else f"the nearest is {nearest:.1f} s off"
         raise TiltError(f"tilt: no sample near the exposure ({known}): check the inclinometer and the clocks")
+
+
+@dataclass(frozen=True)
+class _Over:
+    """The tilts of a TiltBuffer over a span."""
+
+    buffer: TiltBuffer
+    span_s: float
+
+    def average(self, mid_unix_s: float, exposure_s: float, spread_s: float = 0.0) -> Tilt:
+        """Average over the span about a time."""
+        return self.buffer.average(mid_unix_s, self.span_s)

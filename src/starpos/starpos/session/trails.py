@@ -9,7 +9,7 @@ import numpy as np
 from starpos.frames.frame import Frame
 from starpos.frames.trail import Trail
 from starpos.instrument.instrument import TOP_OF_FRAME
-from starpos.recording.messages import message_to_camera
+from starpos.messages.camera import message_to_camera
 from starpos.session.parameters import known_instrument
 
 # this share of an exposure may be without readings
@@ -40,7 +40,8 @@ class Trails:
 
     def take_camera(self, message: Any) -> None:
         """Take a CameraInfo; InstrumentError in a sentence if it cannot be used."""
-        self._focal_px = message_to_camera(message).fx
+        # a size that it may leave open is of no consequence here
+        self._focal_px = message_to_camera(message, size=(1, 1)).fx
 
     def told(self, frame: Frame) -> Frame:
         """The frame with its trail; as it is where time, exposure, focal length or readings lack, or it turned far."""

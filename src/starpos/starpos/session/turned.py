@@ -9,7 +9,7 @@ from starpos.calibration.turning import turn
 from starpos.errors import FixError
 from starpos.fix.fix import Fix
 from starpos.fix.solver import Solver
-from starpos.session.memory import Seen, tilts_of
+from starpos.session.memory import Seen, known_of, tilts_of
 
 
 @dataclass(frozen=True)
@@ -22,7 +22,9 @@ class Turned:
 
 def turn_on_the_spot(solver: Solver, poses: list[Seen], turn_stddev_deg: float) -> Turned:
     """Calibrate from poses on the spot; FixError if they give no place, or more than one."""
-    calibrated = turn(solver, [p.stars for p in poses], tilts_of(poses), turn_stddev_deg)
+    calibrated = turn(
+        solver, [p.stars for p in poses], tilts_of(poses), turn_stddev_deg, known=known_of(poses)
+    )
     if not calibrated.fixes:
         raise FixError(f"no heading has a fix: {calibrated.solutions[0].message}")
     place = average(calibrated.fixes)

@@ -25,6 +25,7 @@ from starpos.frames.stars import Stars
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import InclinometerErrors
 from starpos.instrument.instrument import Calibration, Instrument
+from starpos.instrument.sensors import SCA100T_CALIBRATED
 from starpos.instrument.tilt_log import TiltLog
 from starpos.rotation import half_turn
 from starpos.simulation.scene import Scene, TiltErrors, detected, expose, read_tilt
@@ -39,8 +40,6 @@ EXPOSURE_S, READINGS, CADENCE_S, TURN_S = 0.5, 5, 5.0, 60.0
 FIRST_UNIX_S, LAST_UNIX_S = 1451606400.0, 1798761600.0
 # 1 sigma of the lean that a turn by hand causes
 LEAN_DEG = 0.05
-# an SCA100T-D01 that is compensated and calibrated; as sold it is `sensors.SCA100T`
-COMPENSATED = InclinometerErrors()
 
 
 def tiltmeter(noise_arcsec: float) -> InclinometerErrors:
@@ -240,7 +239,7 @@ def photograph(
 def turned_night(
     rng: np.random.Generator,
     catalogue: Catalogue,
-    errors: InclinometerErrors = COMPENSATED,
+    errors: InclinometerErrors = SCA100T_CALIBRATED,
     headings: int = 4,
     frames: int = 25,
     clock_stddev_s: float = 0.01,
@@ -253,7 +252,7 @@ def turned_night(
     solver = Solver(world.told, catalogue, world.air)
 
     def answer() -> Average:
-        return average(turn(solver, stars, tilts.average).fixes)
+        return average(turn(solver, stars, tilts).fixes)
 
     return _outcome("turned", answer, world.site, heading, rng)
 
@@ -261,7 +260,7 @@ def turned_night(
 def calibrated_night(
     rng: np.random.Generator,
     catalogue: Catalogue,
-    errors: InclinometerErrors = COMPENSATED,
+    errors: InclinometerErrors = SCA100T_CALIBRATED,
     frames: int = 6,
     clock_stddev_s: float = 0.01,
     camera: Camera = CAMERA,
@@ -290,9 +289,9 @@ def calibrated_night(
     shots, levels, heading = photograph(there, zero, later, [0.0], frames, rng)
 
     def answer() -> Average:
-        found = calibrate_at(solver, stars + more, tilts.average, world.site)
+        found = calibrate_at(solver, stars + more, tilts, world.site)
         ready = replace(solver, instrument=found.instrument)
-        solutions = [ready.solve(s, levels.average) for s in shots]
+        solutions = [ready.solve(s, levels) for s in shots]
         return average([s.fix for s in solutions if s.fix])
 
     return _outcome("calibrated", answer, there.site, heading, rng)

@@ -18,6 +18,7 @@ from starpos.frames.stars import Stars
 from starpos.instrument.camera import Camera
 from starpos.instrument.instrument import Calibration, Instrument
 from starpos.instrument.lens import PLUMB_BOB
+from starpos.instrument.sensors import SCA100T_CALIBRATED
 from starpos.rotation import full_turn
 from starpos.sky.catalogue import Catalogue
 from starpos.sky.site import Site, camera_to_enu
@@ -221,7 +222,11 @@ def scene_of(
     return Scene(
         camera=Camera.from_focal(size[0], size[1], focal_px, lens),
         instrument=Instrument(
-            focal_px, model=lens, calibration=Calibration.of(misalignment_deg, STATED_ARCSEC)
+            focal_px,
+            model=lens,
+            calibration=Calibration.of(misalignment_deg, STATED_ARCSEC),
+            inclinometer=SCA100T_CALIBRATED,
+            inclinometer_model="sca100t_calibrated",
         ),
         site=Site(latitude_deg, longitude_deg, atmosphere),
         azimuth_deg=azimuth_deg,

@@ -55,7 +55,7 @@ def sagged(rng, hours, attitude):
 def test_place_and_heading_need_no_tilt(solver, site, rng):
     ready = calibrated(solver, site, rng)
     (frame,) = frames_of(site, pose(), BEGIN + 24 * HOUR_S, rng, 1)
-    fix = ready.solve(frame).fix
+    fix = ready.solve_pointing(frame).fix
     assert abs(np.degrees(fix.latitude) - site.latitude_deg) < 40 / 3600
     forward = -pose()[:, 1]
     truth = np.arctan2(forward[0], forward[1])
@@ -74,7 +74,7 @@ def test_claims_are_true_of_cameras_that_sag_as_stated(solver):
         ready, hours = calibrated(solver, site, rng, first), rng.uniform(1, 200)
         now = sagged(rng, hours, first)
         (frame,) = frames_of(site, now, BEGIN + hours * HOUR_S, rng, 1)
-        answer = ready.solve(frame)
+        answer = ready.solve_pointing(frame)
         assert answer.fix, answer.message
         fix, forward = answer.fix, -now[:, 1]
         off = np.radians([half_turn_deg(np.degrees(fix.longitude) - site.longitude_deg), 0])
@@ -105,7 +105,7 @@ def test_a_camera_that_was_moved_says_so(moved, solver, site, rng):
     ready = calibrated(solver, site, rng)
     there, attitude = moved(site)
     (frame,) = frames_of(there, attitude, BEGIN + 4 * HOUR_S, rng, 1)
-    answer = ready.solve(frame)
+    answer = ready.solve_pointing(frame)
     assert (answer.fix, answer.status) == (None, Status.POOR_FIT)
     assert "the camera has moved, by " in answer.message
 
@@ -113,7 +113,7 @@ def test_a_camera_that_was_moved_says_so(moved, solver, site, rng):
 def test_a_clock_that_is_off_is_no_other_place(solver, site, rng):
     ready = calibrated(solver, site, rng)
     (frame,) = frames_of(site, pose(), BEGIN + HOUR_S, rng, 1)
-    answer = ready.solve(replace(frame, mid_unix_s=frame.mid_unix_s + 60))
+    answer = ready.solve_pointing(replace(frame, mid_unix_s=frame.mid_unix_s + 60))
     assert answer.fix is None and "or the clock is off" in answer.message
 
 

@@ -15,6 +15,8 @@ from starpos.fix.solver import Solver
 from starpos.frames.stars import no_stars
 from starpos.instrument.inclinometer import Tilt, up_of
 from starpos.instrument.instrument import Calibration, Instrument
+from starpos.instrument.sensors import SCA100T_CALIBRATED
+from starpos.instrument.tilts import TiltsByTime
 from starpos.sky.site import camera_to_enu
 from starpos_testing.skies.scenes import FOCAL_PX, START, stars_of, tilt_of, wide_scene
 
@@ -36,8 +38,8 @@ def turned(catalogue, rng, headings, misalignment=(1.5, -2.0, 130.0), zero_deg=(
         tilts[stars.mid_unix_s] = Tilt(
             tilt.theta_x + zero[0], tilt.theta_y + zero[1], tilt.covariance, utc_unix_s=stars.mid_unix_s
         )
-    solver = Solver(Instrument(FOCAL_PX), catalogue, scene.site.atmosphere)
-    return turn(solver, frames, lambda mid, *_: tilts[mid]), scene
+    solver = Solver(Instrument(FOCAL_PX, inclinometer=SCA100T_CALIBRATED), catalogue, scene.site.atmosphere)
+    return turn(solver, frames, TiltsByTime(tilts)), scene
 
 
 def about_an_axis(catalogue, rng, headings, lean_deg, turn_stddev_deg):
@@ -64,8 +66,9 @@ def about_an_axis(catalogue, rng, headings, lean_deg, turn_stddev_deg):
     if turn_stddev_deg < 180:
         off = np.radians(rng.normal(0, turn_stddev_deg))
         given = given.turned_to(rotation.about_axis(2, off) @ misalignment.a3)
-    solver = Solver(Instrument(FOCAL_PX, calibration=given), catalogue, scene.site.atmosphere)
-    return turn(solver, frames, lambda mid, *_: tilts[mid], turn_stddev_deg), scene
+    known = Instrument(FOCAL_PX, calibration=given, inclinometer=SCA100T_CALIBRATED)
+    solver = Solver(known, catalogue, scene.site.atmosphere)
+    return turn(solver, frames, TiltsByTime(tilts), turn_stddev_deg), scene
 
 
 @pytest.mark.montecarlo
@@ -146,9 +149,9 @@ def test_a_small_turn_tells_little_and_says_so(catalogue, rng):
 
 
 def test_frames_without_stars_stay_without_a_fix(catalogue):
-    solver = Solver(Instrument(FOCAL_PX), catalogue)
+    solver = Solver(Instrument(FOCAL_PX, inclinometer=SCA100T_CALIBRATED), catalogue)
     empty = no_stars(1000, 700, mid_unix_s=START, exposure_s=0.5)
-    answer = turn(solver, [empty, empty], lambda *_: Tilt(0.0, 0.0, np.eye(2) * 1e-10, utc_unix_s=START))
+    answer = turn(solver, [empty, empty], Tilt(0.0, 0.0, np.eye(2) * 1e-10, utc_unix_s=START))
     assert [s.status for s in answer.solutions] == [Status.TOO_FEW_STARS] * 2
     assert answer.instrument.calibration.misalignment_deg == (0.0, 0.0, 0.0)
 

@@ -72,6 +72,8 @@ def test_an_a3_that_nobody_vouches_for_is_over_1000_km_and_said_in_a_sentence(gi
         " km wide",
         "--self-calibrate",
         "--site",
+        "--inclinometer",
+        "sca100t_calibrated",
         "--misalignment-stddev",
     ):
         assert words in said

@@ -12,7 +12,7 @@ from starpos.instrument import camera_file
 # 500 px.
 OPTICS = ("--focal-mm", "2.25", "--pixel-um", "4.5")
 LENS = (*OPTICS, "--lens", "equidistant")
-A3 = ("--misalignment", "0", "0", "0", "--misalignment-stddev", "5")
+A3 = ("--misalignment", "0", "0", "0", "--misalignment-stddev", "5", "--inclinometer", "sca100t_calibrated")
 
 
 @pytest.fixture(scope="module")

@@ -91,6 +91,8 @@ def test_from_a_known_place_to_a_fix_elsewhere(known, elsewhere, run, tmp_path):
     angles = [float(a) for a in first.split("(by gravity): ")[1].split()[:3]]
     assert angles == pytest.approx(TRUE_A3_DEG, abs=0.05)
     assert second.startswith("the plumb line in the camera is known to ")
+    shot = known.shot.frames[0]
+    assert instrument_file.read(out).size == (shot.width, shot.height)
     calibration = instrument_file.read(out).calibration
     assert a3_error(known.shot, calibration)[1] < 25
     assert calibration.misalignment_deg == pytest.approx(angles, abs=1e-5)

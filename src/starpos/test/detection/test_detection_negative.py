@@ -6,10 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from starpos.cli.frame_work import look_at, stars_of
 from starpos.detection import detect
 from starpos.detection.negative import detect_dark_too, negative_of
 from starpos.frames.frame import Frame
+from starpos.night.reading import stars_of
+from starpos.night.searching import look_at
 from starpos_testing.skies.rendered import field, grid, noisy
 
 SIZE = (400, 600)
@@ -43,7 +44,7 @@ def test_a_frame_with_stars_or_without_any_is_no_negative(frame, rng):
     assert not detect_dark_too(Frame(dusty)).stars.negative
 
 
-def test_the_command_line_looks_at_the_negative_again(frame):
+def test_a_night_looks_at_the_negative_again(frame):
     dark = negative_of(frame)
     stars = stars_of(dark)
     assert stars.negative

@@ -260,6 +260,18 @@ def test_no_data_of_a_geotiff(tmp_path):
     assert geoid.read(path).at(*np.radians([46.1, 12.0])) != Deflection()
 
 
+@pytest.mark.parametrize("order", "<>")
+def test_a_grid_of_ngs_says_what_the_gtx_says_in_either_byte_order(tmp_path, order):
+    """Its header has one word more than a GTX's: taken for one, each node would be a column off."""
+    heights, south, west, _ = hill(30.0, 0.3, 0.1)
+    plain = gtx(tmp_path / "a.gtx", heights, south, west, 0.1)
+    header = struct.pack(order + "4d3i", south, west, 0.1, 0.1, *heights.shape, 1)
+    (tmp_path / "a.bin").write_bytes(header + heights.astype(order + "f4").tobytes())
+    told, expected = read_grid(tmp_path / "a.bin"), read_grid(plain)
+    assert np.array_equal(told.values, expected.values)
+    assert (told.south, told.west, told.step_longitude) == (south, west, 0.1)
+
+
 BROKEN_GTX = {
     "empty": (b"", "shorter"),
     "a text": (b"latitude longitude undulation, all of them in one line\n", "nodes"),
@@ -314,6 +326,10 @@ BROKEN_TIFF = {
         {"extra": [(42112, "s", b'<Item name="TYPE">VERTICAL_OFFSET_VERTICAL_TO_VERTICAL</Item>\0')]},
         "VERTICAL_TO_VERTICAL",
     ),
+    "heights of the tide": (
+        {"extra": [(42112, "s", b'<Item name="DESCRIPTION" sample="0">hydroid_height</Item>\0')]},
+        "hydroid_height",
+    ),
     "a scale of nothing": ({"extra": [(42112, "s", b'<Item name="SCALE">0</Item>\0')]}, "scale"),
     "a scale of letters": ({"extra": [(42112, "s", b'<Item name="SCALE">one</Item>\0')]}, "number"),
     "no data of letters": ({"extra": [(42113, "s", b"nothing\0")]}, "no data"),
@@ -329,6 +345,13 @@ def test_a_geotiff_that_is_none(tmp_path, name):
     changes, words = BROKEN_TIFF[name]
     about = {"heights": HEIGHTS[::-1], "tie": (10.0, 48.9), "scale": (0.2, 0.1)} | changes
     refused(tiff(tmp_path / "broken.tif", **about), words)
+
+
+@pytest.mark.parametrize("order", "<>")
+def test_a_bigtiff_is_named(tmp_path, order):
+    head = b"II+\0" if order == "<" else b"MM\0+"
+    (tmp_path / "big.tif").write_bytes(head + struct.pack(order + "HHQ", 8, 0, 16) + bytes(200))
+    refused(tmp_path / "big.tif", "BigTIFF.*gdal_translate")
 
 
 def test_a_picture_is_no_grid(tmp_path):

@@ -13,6 +13,7 @@ from starpos.fix.solution import Status
 from starpos.fix.solver import Solver
 from starpos.frames.pointings import Pointing
 from starpos.instrument.camera import Camera
+from starpos.instrument.tilts import NO_TILTS
 from starpos.rotation import half_turn
 from starpos.units import ARCSEC
 from starpos_testing.skies.pointings import TRUE_A3, pointed_night, without_roll
@@ -24,7 +25,7 @@ EXACT = {"sigma_arcsec": TINY, "sigma_roll_arcsec": TINY, "a3_sigma_arcsec": TIN
 
 def solved(night, catalogue, **instrument):
     solver = Solver(replace(night.instrument, **instrument), catalogue, AIR)
-    return solver, [solver.solve(p, night.tilt) for p in night.pointings]
+    return solver, [solver.solve_pointing(p, night.tilt) for p in night.pointings]
 
 
 def test_an_exact_pointing_gives_the_exact_place_and_heading(catalogue, rng):
@@ -50,7 +51,7 @@ def test_stars_and_the_pointing_of_the_same_frame_agree(catalogue, rng):
         sigma=0.5 * ARCSEC,
         sigma_roll=5 * ARCSEC,
     )
-    by_stars, by_pointing = solver.solve(stars, tilt).fix, solver.solve(p, tilt).fix
+    by_stars, by_pointing = solver.solve(stars, tilt).fix, solver.solve_pointing(p, tilt).fix
     assert half_turn(by_stars.heading - by_pointing.heading) == pytest.approx(0, abs=3 * ARCSEC)
     assert by_pointing.latitude == pytest.approx(by_stars.latitude, abs=1 * ARCSEC)
     assert by_pointing.longitude == pytest.approx(by_stars.longitude, abs=1 * ARCSEC)
@@ -61,14 +62,14 @@ def test_the_errors_are_exactly_those_stated(catalogue, rng):
     night = pointed_night(rng, **EXACT)
     stated = replace(night.pointings[0], sigma=10 * ARCSEC, sigma_roll=10 * ARCSEC)
     solver = Solver(night.instrument, catalogue, AIR)
-    term = next(t for t in solver.solve(stated, night.tilts[0]).fix.terms if t.name == "pointing")
+    term = next(t for t in solver.solve_pointing(stated, night.tilts[0]).fix.terms if t.name == "pointing")
     # one sigma for all three rotations is one sigma for any
     np.testing.assert_allclose(np.sqrt(np.diag(term.covariance)[:2]) / 6.37e6 / ARCSEC, 10, rtol=0.01)
     np.testing.assert_allclose(
         np.linalg.eigvalsh(term.covariance[:2, :2]) ** 0.5 / 6.37e6 / ARCSEC, 10, rtol=0.01
     )
     sharp = replace(stated, sigma=1e-3 * ARCSEC)
-    only_roll = solver.solve(sharp, night.tilts[0]).fix
+    only_roll = solver.solve_pointing(sharp, night.tilts[0]).fix
     term = next(t for t in only_roll.terms if t.name == "pointing")
     sine = np.sin(only_roll.zenith_distance)
     least, most = np.linalg.eigvalsh(term.covariance[:2, :2]) ** 0.5 / 6.37e6 / ARCSEC
@@ -125,8 +126,8 @@ def test_faults_are_a_status_and_a_sentence(catalogue, rng):
     p, tilt = night.pointings[0], night.tilts[0]
     for frame, level, status, words in (
         (without_roll(p), tilt, Status.POOR_FIT, "no roll"),
-        (p, None, Status.NO_TILT, "no tilt"),
+        (p, NO_TILTS, Status.NO_TILT, "no tilt"),
         (replace(p, mid_unix_s=1e11), tilt, Status.TIME_OUTSIDE_TABLES, "IERS"),
     ):
-        answer = solver.solve(frame, level)
+        answer = solver.solve_pointing(frame, level)
         assert (answer.fix, answer.status) == (None, status) and words in answer.message

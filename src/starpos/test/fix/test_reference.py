@@ -39,7 +39,7 @@ def test_a_night_made_by_others(night, catalogue):
     assert np.degrees(mine.tilt) == pytest.approx(truth["frames"][0]["theta_ideal_deg"], abs=1e-9)
     site, tilts = truth["site"], read_tilt_csv(night / "tilt.csv")
     solver = Solver(Instrument(focal_px_of(600.0, 6.4)), catalogue, Atmosphere.measured(88000.0, 12.0, 0.3))
-    solved = [solver.solve(read_frame(path), tilts.average) for path in sorted(night.glob("centroids_*.csv"))]
+    solved = [solver.solve(read_frame(path), tilts) for path in sorted(night.glob("centroids_*.csv"))]
     assert [s.message for s in solved] == ["fix"] * 3
     if solved[0].extrapolated_days > 0:
         pytest.skip("the IERS table that is installed ends before this night")

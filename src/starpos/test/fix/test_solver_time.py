@@ -8,9 +8,9 @@ import pytest
 from solved_night import refused
 
 from starpos.averaging.average import average
-from starpos.cli.console import tell_extrapolation
 from starpos.earth.orientation import earth_state
 from starpos.fix.solution import Status
+from starpos.night.together import Solved, extrapolated
 from starpos.units import ARCSEC
 from starpos.utc import utc_text
 from starpos_testing.skies.scenes import EXPOSURE, START, solver_of, stars_of, tilt_of, wide_scene
@@ -76,7 +76,7 @@ def test_a_pointing_of_an_impossible_date(utc, night):
     assert "between 1900 and 2100" in refused(s, Status.TIME_OUTSIDE_TABLES)
 
 
-def test_a_fix_beyond_the_tables_says_by_how_much(night, catalogue, rng, capsys):
+def test_a_fix_beyond_the_tables_says_by_how_much(night, catalogue, rng):
     scene, stars, tilt, solver = night
     # Whatever table is installed.
     within = replace(solver.solve(stars, tilt), extrapolated_days=0.0)
@@ -85,15 +85,12 @@ def test_a_fix_beyond_the_tables_says_by_how_much(night, catalogue, rng, capsys)
     s = solver.solve(stars_of(scene, catalogue, rng, later), tilt_of(scene, rng, later))
     assert s.ok, s.message
     assert s.extrapolated_days == earth_state(later + EXPOSURE / 2).orientation.extrapolated_days > 0
-    tell_extrapolation("solve", [within])
-    tell_extrapolation("solve", [])
-    assert capsys.readouterr().err == ""
-    tell_extrapolation("solve", [s, within, s])
-    (line,) = capsys.readouterr().err.splitlines()
+    beyond, within = Solved.of(s, s.fix), Solved.of(within, within.fix)
+    assert extrapolated([within]) == extrapolated([]) == ()
+    (remark,) = extrapolated([beyond, within, beyond])
+    line = remark.text
     east = 465.1 * np.cos(s.fix.latitude) * earth_state(later).orientation.ut1_sigma_s
-    assert line.startswith(
-        f"starpos solve: the Earth's rotation is extrapolated {s.extrapolated_days:.0f} days"
-    )
+    assert line.startswith(f"the Earth's rotation is extrapolated {s.extrapolated_days:.0f} days")
     assert f"{east:.0f} m east" in line
 
 

@@ -3,6 +3,7 @@
 
 import contextlib
 import gc
+import re
 import sys
 from datetime import datetime, timezone
 
@@ -13,7 +14,7 @@ import pytest
 from starpos.errors import FrameError, TimeError
 from starpos.frames.exif import CameraClock
 from starpos.frames.frame import Frame
-from starpos.frames.reading import decode_frame, read_frame
+from starpos.frames.reading import decode_frame, read_frame, why_no_time
 from starpos.frames.shutter import UNKNOWN_LATENCY_S
 from starpos_testing.lacking import needs
 from starpos_testing.skies import raws
@@ -148,8 +149,7 @@ def test_the_zone_is_the_files_own_or_the_users(tmp_path):
         assert read_frame(path, clock).mid_unix_s == pytest.approx(SHOWN_S - 3600 * offset_h + 0.75)
     for offset in (None, "", "Z", "+3", "   :  "):
         path = write(tmp_path / "b.jpg", jpeg(offset=offset))
-        with pytest.raises(FrameError, match="no zone"):
-            read_frame(path, CameraClock())
+        assert "no zone" in why_no_time(read_frame(path, CameraClock()))
         assert read_frame(path, CameraClock(0.0)).mid_unix_s == pytest.approx(SHOWN_S + 0.75)
 
 
@@ -159,17 +159,45 @@ def test_the_zone_is_the_files_own_or_the_users(tmp_path):
 )
 def test_a_clock_that_was_never_set_is_said(tmp_path, start):
     path = write(tmp_path / "a.jpg", jpeg(start=start))
-    with pytest.raises(FrameError, match="set the camera's clock"):
-        read_frame(path, TEHRAN)
-    assert read_frame(path).mid_unix_s is None
+    frame = read_frame(path, TEHRAN)
+    assert frame.mid_unix_s is None and "set the camera's clock" in why_no_time(frame)
+    assert "--exif-utc-offset" in why_no_time(read_frame(path))
 
 
 @needs_exifread
 @pytest.mark.parametrize(
     "exif", [{"start": None}, {"exposure": None}, {"exposure": (1, 0)}, {"exposure": (0, 1)}]
 )
-def test_without_a_start_or_an_exposure_there_is_no_time(tmp_path, exif):
-    assert read_frame(write(tmp_path / "a.jpg", jpeg(**exif)), TEHRAN).mid_unix_s is None
+def test_without_a_start_or_an_exposure_there_is_no_time_and_it_is_said_which_lacks(tmp_path, exif):
+    frame = read_frame(write(tmp_path / "a.jpg", jpeg(**exif)), TEHRAN)
+    assert frame.mid_unix_s is None
+    assert ("ExposureTime" if "exposure" in exif else "DateTimeOriginal") in why_no_time(frame)
+
+
+@needs_exifread
+def test_gps_time_gives_the_zone_and_is_held_against_the_one_that_is_stated(tmp_path):
+    """18:00:00 in a zone of 3.5 h is 14:30 UTC; GPS told the time of its last fix, 40 s before."""
+    path = write(tmp_path / "a.jpg", jpeg(gps=("2026:11:02", (14, 29, 20))))
+    for clock in (CameraClock(), TEHRAN):
+        assert read_frame(path, clock).mid_unix_s == pytest.approx(SHOWN_S - 3.5 * 3600 + 0.75)
+    frame = read_frame(path, CameraClock(1.0))
+    assert frame.mid_unix_s is None and re.search(
+        r"GPS.* 3\.51 h ahead of UTC, and not 1 h", why_no_time(frame)
+    )
+    told = write(tmp_path / "b.jpg", jpeg(offset="+01:00", gps=("2026:11:02", (14, 29, 20))))
+    assert "GPS" in why_no_time(read_frame(told, CameraClock()))
+    for broken in (("2026:13:02", (14, 29, 20)), ("2026:11:02", (25, 0, 0))):
+        path = write(tmp_path / "c.jpg", jpeg(gps=broken))
+        assert "no zone" in why_no_time(read_frame(path, CameraClock()))
+
+
+@needs_exifread
+@pytest.mark.parametrize(
+    ("size", "cropped"), [(None, False), ((1280, 960), False), ((960, 1280), False), ((1280, 720), True)]
+)
+def test_a_picture_of_another_shape_than_the_cameras_is_a_crop_of_unknown_place(tmp_path, size, cropped):
+    origin = read_frame(write(tmp_path / "a.jpg", jpeg(size=size))).origin_px
+    assert np.isnan(origin).all() if cropped else origin is None
 
 
 @pytest.mark.parametrize("given", [(15.0, 1.0), (float("nan"), 1.0), (0.0, -1.0), (0.0, float("inf"))])

@@ -46,7 +46,7 @@ def test_another_image_is_named_by_its_number_or_its_name(several, part, more, e
     assert np.array_equal(frame.pixels, SKY + more)
     # what an image does not say itself the first part says, unless it forbids that
     assert frame.exposure_s == exposure_s
-    assert frame.source == f"{several}[{part}]" and "DATE-OBS" in why_no_time(frame.source)
+    assert frame.source == f"{several}[{part}]" and "DATE-OBS" in why_no_time(frame)
 
 
 @pytest.mark.parametrize(

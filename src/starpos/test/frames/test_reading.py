@@ -17,8 +17,8 @@ from astropy.utils import iers
 from starpos.errors import LETTERS, FrameError, one_line
 from starpos.frames.fits import decode_fits
 from starpos.frames.frame import Frame
-from starpos.frames.header import times
-from starpos.frames.reading import read_frame
+from starpos.frames.reading import read_frame, why_no_time
+from starpos.frames.times import times
 
 PIXELS = np.arange(12, dtype=np.uint16).reshape(3, 4) * 5000
 NIGHT = {"DATE-OBS": "2026-11-02T18:00:00.125", "EXPTIME": 0.5}
@@ -66,10 +66,17 @@ def test_an_exposure_across_a_leap_second_is_counted_in_real_seconds(tmp_path):
     [
         ({"DATE-BEG": "2026-11-02T18:00:00Z", "EXPOSURE": 2}, unix(2026, 11, 2, 18, 0, 1)),
         ({"MJD-OBS": 61346.75, "EXPTIME": 0.5}, unix(2026, 11, 2, 18) + 0.25),
-        ({"DATE-OBS": "2026-11-02", "TIME-OBS": "18:00:00", "EXPTIME": 0}, unix(2026, 11, 2, 18)),
-        ({"DATE-OBS": "2026-11-02T18:00:37", "TIMESYS": "TAI", "EXPTIME": 0}, unix(2026, 11, 2, 18)),
-        ({"DATE-OBS": "2026-11-02 18:00:00", "TIME-OBS": "18:00:00", "EXPTIME": 0}, unix(2026, 11, 2, 18)),
-        ({"DATE-OBS": "02/11/97", "TIME-OBS": "18:00:00", "EXPTIME": 0}, unix(1997, 11, 2, 18)),
+        ({"DATE-OBS": "2026-11-02", "TIME-OBS": "18:00:00", "EXPTIME": 2}, unix(2026, 11, 2, 18, 0, 1)),
+        ({"DATE-OBS": "2026-11-02", "UT": "18:00:00", "EXPTIME": 2}, unix(2026, 11, 2, 18, 0, 1)),
+        ({"DATE-OBS": "2026-11-02", "MJD-OBS": 61346.75, "EXPTIME": 2}, unix(2026, 11, 2, 18, 0, 1)),
+        ({"DATE-OBS": "2026-11-02T18:00:37", "TIMESYS": "TAI", "EXPTIME": 2}, unix(2026, 11, 2, 18, 0, 1)),
+        (
+            {"DATE-OBS": "2026-11-02 18:00:00", "TIME-OBS": "18:00:00", "EXPTIME": 2},
+            unix(2026, 11, 2, 18, 0, 1),
+        ),
+        ({"DATE-OBS": "02/11/97", "TIME-OBS": "18:00:00", "EXPTIME": 2}, unix(1997, 11, 2, 18, 0, 1)),
+        ({"DATE-AVG": "2026-11-02T18:00:01"}, unix(2026, 11, 2, 18, 0, 1)),
+        ({"DATE-OBS": "2026-11-02T18:00:00", "EXPTIME": 0}, None),
         ({"DATE-OBS": "2026-11-02", "EXPTIME": 1}, None),
         ({"DATE-OBS": "02/11/97", "EXPTIME": 1}, None),
         ({"DATE-OBS": "2026-11-02T18:00:00"}, None),
@@ -93,9 +100,9 @@ def test_an_mjd_of_few_decimals_has_the_error_of_its_last(tmp_path, mjd, sigma_s
 
 HARD_TIMES = [
     "2016-12-31T23:59:60.5", "2016-12-31T23:59:59.9", "2015-06-30T23:59:60", "2026-11-02T18:00", "2026-11-02T24:00:00",
-    "2026-02-30T18:00:00", "1955-01-01T00:00:00", "1969-06-01T00:00:00.25", "2026-11-02T18:00:60", "2026-11-02T18:60:00",
+    "2026-02-30T18:00:00", "1955-01-01T00:00:00", "1969-06-01T00:00:00.25", "2026-11-02T18:60:00",
     "2026-11-02t18:00:00", "2026-11-02T18:00:00+01:00", "2026-11-02T18:00:00.", "2026-11-02T18:00:0", "2026-306T18:00:00",
-    "-026-11-02T18:00:00", "2026-11-02T18:00:61", "2050-07-01T12:00:00.123456", 60000.25, 57753.99999, -1e4,
+    "-026-11-02T18:00:00", "2050-07-01T12:00:00.123456", 60000.25, 57753.99999, -1e4,
 ]  # fmt: skip
 
 
@@ -105,24 +112,26 @@ def test_times_are_those_of_astropy(scale):
     iers.conf.auto_download = False
     for start in HARD_TIMES:
         key, form = ("DATE-OBS", "isot") if isinstance(start, str) else ("MJD-OBS", "mjd")
-        for exposure_s in (0.0, 1.5, 3600.0):
+        for exposure_s in (0.25, 1.5, 3600.0):
             header = {key: start, "EXPTIME": exposure_s, "TIMESYS": scale}
             try:
+                # astropy takes any seconds up to 60, and other scales have no leap seconds
+                if scale != "UTC" and ":60" in str(start):
+                    raise ValueError
                 with warnings.catch_warnings():
                     warnings.simplefilter("ignore")
                     begin = Time(start, format=form, scale=scale.lower())
                     middle = float((begin.utc + TimeDelta(exposure_s / 2, format="sec")).unix)
             except ValueError:
-                with pytest.raises(FrameError, match="no time"):
-                    times(header, "it")
+                assert "no time" in times(header)["untimed"]
                 continue
-            assert times(header, "it")[0] == pytest.approx(middle, abs=1e-6), (start, exposure_s)
+            assert times(header)["mid_unix_s"] == pytest.approx(middle, abs=1e-6), (start, exposure_s)
 
 
 @pytest.mark.parametrize("key", ["DATE-OBS", "DATE-BEG"])
-def test_a_date_that_is_a_number_is_refused(tmp_path, key):
-    with pytest.raises(FrameError, match=rf"{key} is 61346.75.*no text"):
-        read_frame(write_fits(tmp_path / "a.fits", **{key: 61346.75, "EXPTIME": 1}))
+def test_a_date_that_is_a_number_is_no_time(tmp_path, key):
+    frame = read_frame(write_fits(tmp_path / "a.fits", **{key: 61346.75, "EXPTIME": 1}))
+    assert frame.mid_unix_s is None and f"{key} is 61346.75, which is no text" in why_no_time(frame)
 
 
 @pytest.mark.parametrize(
@@ -232,11 +241,9 @@ def huge_fits():
         ("a.csv", b'# {"NAXIS1": 9, "NAXIS2": 9}\nx,y,flux\n1,2\n'),
         ("a.csv", b'# {"NAXIS1": 9, "NAXIS2": 9}\nx,y,flux\n1,2,nan\n'),
         ("a.csv", b'# {"NAXIS1": 9, "NAXIS2": 9}\nx,y,flux,sigma\n1,2,3,0\n'),
-        ("a.csv", b'# {"NAXIS1": 9, "NAXIS2": 9, "DATE-OBS": "now", "EXPTIME": 1}\nx,y,flux\n'),
         ("a.csv", b"# [1, 2]\nx,y,flux\n"),
         # Over csv's field limit.
         ("a.csv", b'# {"NAXIS1": 9, "NAXIS2": 9}\nx,y,flux\n' + b"1" * 200_000),
-        ("a.csv", b'# {"NAXIS1": 9, "NAXIS2": 9, "EXPTIME": 1' + b"0" * 400 + b"}\nx,y,flux\n"),
         # Longer than a file system's names.
         (f"{'a' * 300}.fits", None),
         ("a\0.fits", None),
@@ -258,13 +265,6 @@ def test_a_file_that_is_no_frame_is_refused_in_one_sentence(tmp_path, name, cont
         (np.zeros((4, 4, 5), np.uint16), {}),
         (np.full((4, 4), np.nan, np.float32), {}),
         (np.array([[0.0, np.inf]]), {}),
-        (PIXELS, {"DATE-OBS": "yesterday T", "EXPTIME": 1}),
-        (PIXELS, {"DATE-OBS": "2026-13-45T99:00:00", "EXPTIME": 1}),
-        (PIXELS, {**NIGHT, "EXPTIME": -1}),
-        (PIXELS, {**NIGHT, "EXPTIME": "long"}),
-        (PIXELS, {**NIGHT, "EXPTIME": 1e300}),
-        (PIXELS, {"MJD-OBS": 1e300, "EXPTIME": 1}),
-        (PIXELS, {**NIGHT, "TIMESYS": "MOON"}),
         (PIXELS, {"BAYERPAT": "CMYG"}),
         (None, {}),
     ],

@@ -85,14 +85,14 @@ def three_axes(angles_deg):
 
 
 @pytest.mark.parametrize(
-    ("errors", "most"), [(InclinometerErrors(), 0.011), (sensors.SCL3300, 0.05), (sensors.SCA100T, 0.1)]
+    ("errors", "most"), [(InclinometerErrors(), 0.061), (sensors.SCL3300, 0.09), (sensors.SCA100T, 0.1)]
 )
 def test_three_axes_that_contradict_each_other_are_refused(errors, most, rng):
     """The sines of (30, 40, 35.69) deg have squares that add up to 1; a step of the third axis makes them contradict."""
-    for third in np.linspace(35.69, 38.5, 30):
+    for third in np.linspace(35.69, 42.0, 60):
         tilt = three_axes((30.0, 40.0, third))
         off = float(np.sum(np.sin(tilt.theta) ** 2)) - 1
-        if off < 0.009:
+        if off < 0.059:
             errors.check_axes(tilt)
         elif off > most:
             with pytest.raises(

@@ -94,7 +94,11 @@ REFUSED = {
     "half a camera": ("starpos_instrument: 1\ncamera: {focal_mm: 600}\n", "pixel_um"),
     "unknown key": (SIMPLE + "misaligment_deg: [0, 0, 0]\n", "unknown key 'misaligment_deg'"),
     "unknown camera key": (SIMPLE.replace("}", ", distortions: [0, 0, 0, 0, 0]}"), "distortions"),
-    "two cameras": (FULL.replace("width", "focal_mm: 600, pixel_um: 6.4, width"), "unknown key 'width'"),
+    "two cameras": (FULL.replace("width", "focal_mm: 600, pixel_um: 6.4, width"), "unknown key 'fx'"),
+    "half a size": (
+        "starpos_instrument: 1\ncamera: {focal_px: 900, width: 600}\n",
+        "the camera's height is missing",
+    ),
     "no calibration": (
         "starpos_instrument: 1\ncamera: {calibration: none.yaml}\n",
         "none.yaml: not a readable calib",
@@ -338,6 +342,14 @@ def test_what_is_written_is_read(full, rng, tmp_path):
         # From then on it is the same to the last bit.
         write(tmp_path / "again.yaml", again)
         assert (tmp_path / "again.yaml").read_text() == text
+
+
+@pytest.mark.parametrize("camera", ["focal_mm: 600, pixel_um: 6.4", "focal_px: 93750"])
+def test_the_size_of_the_frame_that_a3_belongs_to_is_kept(camera, reads, tmp_path):
+    i = reads(f"starpos_instrument: 1\ncamera: {{{camera}, width: 600, height: 400}}\n")
+    assert (i.size, i.camera) == ((600, 400), None)
+    write(tmp_path / "again.yaml", i)
+    assert read(tmp_path / "again.yaml") == i
 
 
 def test_numbers_are_written_as_people_gave_them(tmp_path):

@@ -1,8 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Instrument files that are there already: comments of people are seen, keys of people stay."""
 
+from dataclasses import replace
+
 import pytest
 
+from starpos.errors import InstrumentError
 from starpos.instrument import instrument_file, instrument_update
 from starpos.instrument.instrument import Calibration, Instrument
 from starpos.instrument.yaml_file import line_of_comment, own_comment, text_of
@@ -54,3 +57,14 @@ def test_a3_is_replaced_and_all_else_stays(tmp_path):
     assert after.calibration.remounted_arcsec == 300
     assert (after.inclinometer, after.shutter) == (before.inclinometer, before.shutter)
     assert "focal_mm: 600" in path.read_text() and "# about it" in path.read_text()
+
+
+def test_the_size_of_the_frames_goes_with_a3_and_one_of_other_frames_is_refused(tmp_path):
+    path = tmp_path / "mine.yaml"
+    path.write_text("starpos_instrument: 1\ncamera: {focal_mm: 600, pixel_um: 6.4}\n")
+    new = Instrument(93750.0, calibration=Calibration.of((1.0, 2.0, 3.0)), frame_size=(2808, 1872))
+    instrument_update.check_fits(path, new)
+    instrument_update.write(path, new, "about it")
+    assert instrument_file.read(path).size == (2808, 1872) and "focal_mm: 600" in path.read_text()
+    with pytest.raises(InstrumentError, match="another frame size"):
+        instrument_update.check_fits(path, replace(new, frame_size=(1600, 1200)))

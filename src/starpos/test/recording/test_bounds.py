@@ -138,3 +138,16 @@ def test_a_pipe_in_a_bag_is_not_waited_for(tmp_path, name):
     for path in (tmp_path, tmp_path / name):
         with pytest.raises(BagError, match="no regular file"), BagReader(path):
             pass
+
+
+@pytest.mark.parametrize("storage", ['""', "''", "", "parquet"])
+def test_a_storage_that_is_not_named_or_not_known_is_said(tmp_path, storage):
+    store = get_typestore(Stores.ROS2_JAZZY)
+    with Writer(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.MCAP) as bag:
+        bag.add_connection("/told", "std_msgs/msg/String", typestore=store)
+    metadata = tmp_path / "bag" / "metadata.yaml"
+    metadata.write_text(
+        metadata.read_text().replace("storage_identifier: mcap", f"storage_identifier: {storage}")
+    )
+    with pytest.raises(BagError, match=r"storage_identifier.*mcap or sqlite3"), BagReader(tmp_path / "bag"):
+        pass

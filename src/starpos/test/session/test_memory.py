@@ -91,4 +91,6 @@ def test_poses_of_before_a_move_are_forgotten():
 def test_each_frame_gets_its_own_tilt():
     frames = [seen_at(0.0, x_deg=1.0), seen_at(10.0, x_deg=2.0)]
     tilts = tilts_of(frames)
-    assert [np.degrees(tilts(f.stars.mid_unix_s, 0.5).theta_x) for f in frames] == pytest.approx([1.0, 2.0])
+    assert [np.degrees(tilts.average(f.stars.mid_unix_s, 0.5).theta_x) for f in frames] == pytest.approx(
+        [1.0, 2.0]
+    )

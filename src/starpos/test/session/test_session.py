@@ -10,9 +10,9 @@ import pytest
 pytest.importorskip("rosbags")
 
 from starpos.fix.solution import Status
+from starpos.messages.stamp import stamp_to_unix
 from starpos.recording.bag import BagReader
 from starpos.recording.instruments import CAMERA_INFO, INPUTS, STARS, TILT, instrument_in
-from starpos.recording.messages import stamp_to_unix
 from starpos.session.frames import Answered
 from starpos.session.job import JobsInTurn
 from starpos.session.now import Now, Sent

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from starpos.errors import TiltError, TiltRangeError
-from starpos.recording.messages import OUT_OF_RANGE, SATURATED, STUCK
+from starpos.messages.tilt import OUT_OF_RANGE, SATURATED, STUCK
 from starpos.session.tilts import CAPACITY, TiltBuffer
 
 NOISE = math.radians(0.0035)

@@ -10,6 +10,7 @@ import pytest
 from starpos.cli import main
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import InclinometerErrors
+from starpos.instrument.sensors import SCA100T_CALIBRATED
 from starpos.simulation import montecarlo_nights
 from starpos_testing.skies.scenes import FOCAL_PX, SIZE
 
@@ -75,7 +76,7 @@ def test_a_quiet_inclinometer_makes_a_better_night(catalogue):
 def test_nothing_told_is_what_was_drawn(catalogue):
     """Else the nights would flatter: A3, zero, scale, air and stars are all other than the instrument is told."""
     rng = np.random.default_rng(1)
-    world, begin = montecarlo_nights.draw(rng, catalogue, montecarlo_nights.COMPENSATED, 0.01, CAMERA)
+    world, begin = montecarlo_nights.draw(rng, catalogue, SCA100T_CALIBRATED, 0.01, CAMERA)
     assert montecarlo_nights.FIRST_UNIX_S < begin < montecarlo_nights.LAST_UNIX_S
     assert world.told.calibration.misalignment_deg == (0.0, 0.0, 0.0)
     assert np.abs(world.scene.instrument.calibration.misalignment_deg).max() > 0.1

@@ -35,6 +35,20 @@ def part_of(bag: Path, folder: Path, begin_s: float, seconds: float) -> Path:
     return folder
 
 
+def knowing(truth: dict) -> list[str]:
+    """Parameters of a solver that knows the instrument of the night test/data/night, from the JSON beside it."""
+    values = {
+        "use_sim_time": "true",
+        "refraction.pressure": truth["pressure_pa"],
+        "refraction.temperature": truth["temperature_c"],
+        "refraction.humidity": truth["humidity"],
+        "misalignment": truth["misalignment_deg"],
+        "misalignment_stddev": 0.1,
+        "inclinometer.model": "sca100t_calibrated",
+    }
+    return [f"{name}:={value}" for name, value in values.items()]
+
+
 class NightBag:
     """Writes a bag, by default MCAP, with its topics in `namespace`."""
 

@@ -11,6 +11,8 @@ from starpos.earth.orientation import EarthState, earth_state, station_velocity
 from starpos.frames.pointings import Pointing
 from starpos.instrument.inclinometer import InclinometerErrors, Tilt
 from starpos.instrument.instrument import Calibration, Instrument
+from starpos.instrument.sensors import SCA100T_CALIBRATED
+from starpos.instrument.tilts import TiltsByTime
 from starpos.sky.site import Site, camera_to_enu
 from starpos.units import ARCSEC
 from starpos_testing.skies.scenes import AIR
@@ -19,8 +21,8 @@ TRUE_A3 = Calibration(misalignment_deg=(1.5, -2.0, 130.0)).a3
 READINGS = 5
 # directions around the axis whose rotation is the roll
 RING_RAD = ((1e-3, 0.0), (0.0, 1e-3), (-1e-3, 0.0), (0.0, -1e-3))
-# of a tilt sensor such as the paper's
-SENSOR = InclinometerErrors()
+# a tilt sensor such as the paper's
+SENSOR = SCA100T_CALIBRATED
 
 
 def icrs_of(site: Site, seen: np.ndarray, state: EarthState) -> np.ndarray:
@@ -74,8 +76,10 @@ class PointedNight:
     pointings: list[Pointing]
     tilts: list[Tilt]
 
-    def tilt(self, mid_unix_s: float, _exposure_s: float, _spread_s: float) -> Tilt:
-        return next(t for t in self.tilts if t.utc_unix_s == mid_unix_s)
+    @property
+    def tilt(self) -> TiltsByTime:
+        """The tilts as a solver takes them."""
+        return TiltsByTime({t.utc_unix_s: t for t in self.tilts})
 
     def place_nees(self, answer) -> float:
         """Squared error of a fix or an average in units of its covariance, of the place alone."""

@@ -11,6 +11,7 @@ import numpy as np
 BYTE, ASCII, SHORT, LONG, RATIONAL, SRATIONAL = 1, 2, 3, 4, 5, 10
 SIZES = {BYTE: 1, ASCII: 1, SHORT: 2, LONG: 4, RATIONAL: 8, SRATIONAL: 8}
 COLOURS = {"r": 0, "g": 1, "b": 2}
+EXIF, GPS, STRIPS = 0x8769, 0x8825, 0x111
 START = "2026:11:02 18:00:00"
 
 
@@ -24,9 +25,11 @@ def exif_tags(
     plane=None,
     unit=None,
     size=None,
+    gps=None,
 ):
-    """The tags of an Exif IFD; None leaves one out.
+    """The tags of an Exif IFD, with those of the GPS IFD under 0x8825; None leaves one out.
 
+    gps: UTC by GPS, a day like '2026:11:02' and whole hours, minutes and seconds.
     film_mm, focal (ratio of mm), plane (ratio of px per unit), unit, size (px) are those of the focal length.
     """
     tags = {
@@ -40,18 +43,27 @@ def exif_tags(
         0x9003: None if start is None else (ASCII, start),
         0x9291: None if subsec is None else (ASCII, subsec),
         0x9011: None if offset is None else (ASCII, offset),
+        GPS: None
+        if gps is None
+        else {0x1D: (ASCII, gps[0]), 0x07: (RATIONAL, [n for v in gps[1] for n in (v, 1)])},
     }
     return {tag: value for tag, value in tags.items() if value is not None}
 
 
 def tiff(tags, exif, order="<", pixels=b""):
-    """The bytes of a TIFF: one IFD of `tags` (with StripOffsets for `pixels`), one Exif IFD, the pixels last."""
-    first = 8
-    at_exif = first + _length(tags | {0x8769: (LONG, [0])} | ({0x111: (LONG, [0])} if pixels else {}))
-    at_pixels = at_exif + _length(exif)
-    tags = tags | {0x8769: (LONG, [at_exif])} | ({0x111: (LONG, [at_pixels])} if pixels else {})
+    """The bytes of a TIFF: an IFD of `tags` (with StripOffsets for `pixels`), an Exif and a GPS IFD, the pixels last."""
+    exif, first = dict(exif), 8
+    gps = exif.pop(GPS, None)
+    below = [EXIF, *([GPS] if gps else []), *([STRIPS] if pixels else [])]
+    at_exif = first + _length(tags | {tag: (LONG, [0]) for tag in below})
+    at_gps = at_exif + _length(exif)
+    at = {EXIF: at_exif, GPS: at_gps, STRIPS: at_gps + (_length(gps) if gps else 0)}
+    tags = tags | {tag: (LONG, [at[tag]]) for tag in below}
     magic = (b"II*\0" if order == "<" else b"MM\0*") + struct.pack(order + "I", first)
-    return magic + _ifd(tags, first, order) + _ifd(exif, at_exif, order) + pixels
+    directories = (
+        _ifd(tags, first, order) + _ifd(exif, at_exif, order) + (_ifd(gps, at_gps, order) if gps else b"")
+    )
+    return magic + directories + pixels
 
 
 def dng(mosaic, pattern="rggb", order="<", **exif):

@@ -10,6 +10,8 @@ from starpos.fix.solver import Solver
 from starpos.frames.stars import Stars
 from starpos.instrument.inclinometer import Tilt
 from starpos.instrument.instrument import Calibration, Instrument
+from starpos.instrument.sensors import SCA100T_CALIBRATED
+from starpos.instrument.tilts import TiltsByTime
 from starpos.simulation.scene import Scene
 from starpos.units import ARCSEC
 from starpos_testing.skies.scenes import FOCAL_PX, START, stars_of, tilt_of, wide_scene
@@ -25,8 +27,10 @@ class Shots:
     frames: list[Stars]
     tilts: dict[float | None, Tilt]
 
-    def tilt(self, mid_unix_s: float, _exposure_s: float, _spread_s: float) -> Tilt:
-        return self.tilts[mid_unix_s]
+    @property
+    def tilt(self) -> TiltsByTime:
+        """The tilts as a solver takes them."""
+        return TiltsByTime(self.tilts)
 
     def spoil(self, k: int, x_deg: float) -> None:
         """Put an error on the tilt of frame k."""
@@ -39,7 +43,9 @@ class Shots:
 
     def solver(self, catalogue, given=(0.0, 0.0, 0.0)) -> Solver:
         """The solver of an instrument whose A3 is said to be as given; how well, nobody says, so it is not known."""
-        instrument = Instrument(FOCAL_PX, calibration=Calibration(misalignment_deg=given))
+        instrument = Instrument(
+            FOCAL_PX, calibration=Calibration(misalignment_deg=given), inclinometer=SCA100T_CALIBRATED
+        )
         return Solver(instrument, catalogue, self.scene.site.atmosphere)
 
 

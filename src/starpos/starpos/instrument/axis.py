@@ -1,0 +1,75 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where the optical axis pierces the frames of a night, as far as anybody has said of which sensor they are a part."""
+
+import math
+from dataclasses import replace
+from typing import Protocol
+
+import numpy as np
+
+from starpos.instrument.instrument import Instrument
+from starpos.units import ARCSEC
+
+# Longer over shorter side of sensors, and of what cameras keep of their middle; real ones differ by this share.
+SHAPES = (1.0, 5 / 4, 4 / 3, 3 / 2, 8 / 5, 16 / 9)
+SHAPE_OFF = 0.05
+# 1 sigma of the axis from a frame's centre where nobody knows of which part of the sensor it is: its longer side, and at
+# least this, as most sensors have up to 7000 px
+LEAST_UNKNOWN_PX = 2000.0
+
+
+class Framed(Protocol):
+    """A frame, or what is known of it, in px."""
+
+    @property
+    def width(self) -> int:
+        """Its width."""
+
+    @property
+    def height(self) -> int:
+        """Its height."""
+
+    @property
+    def origin_px(self) -> tuple[float, float] | None:
+        """Column and row of the sensor's whole frame at which it begins, as an Exposure has it."""
+
+
+def with_frame_size(instrument: Instrument, first: Framed) -> tuple[Instrument, str]:
+    """The instrument for the frames of a night by the first of them; and a remark if its axis is not known, else ''.
+
+    An instrument that knows its frame's size stays as it is.  Else a frame counts as a whole one, and its size holds for
+    the others, unless its header says that it begins somewhere on a sensor, or no sensor has its shape: then the error
+    of the axis is part of A3's.
+    """
+    if instrument.size is not None:
+        return instrument, ""
+    width, height, origin_px = first.width, first.height, first.origin_px
+    longer, shorter = max(width, height), min(width, height)
+    if origin_px is None:
+        if any(abs(longer / shorter / shape - 1) < SHAPE_OFF for shape in SHAPES):
+            return replace(instrument, frame_size=(width, height)), ""
+        instrument = replace(instrument, frame_size=(width, height))
+        why = f"no sensor has the shape of frames of {width} x {height} px"
+    elif np.isfinite(origin_px).all():
+        left, top = origin_px
+        # a crop is taken from the middle, for want of better; frames that begin elsewhere then agree with it
+        whole = round(width + 2 * max(left, 0.0)), round(height + 2 * max(top, 0.0))
+        instrument = replace(instrument, frame_size=whole)
+        why = (
+            f"these frames of {width} x {height} px begin at column {left:g}, row {top:g} of a sensor whose size nobody "
+            "says"
+        )
+    else:
+        why = f"these frames of {width} x {height} px are cut out of larger ones, nobody says where"
+    calibration = instrument.calibration
+    if calibration.unknown:
+        return instrument, ""
+    error_px = max(longer, LEAST_UNKNOWN_PX)
+    error_rad = math.atan(error_px / instrument.focal_px)
+    widened = np.asarray(calibration.covariance_arcsec2, float) + np.eye(3) * (error_rad / ARCSEC) ** 2
+    wide = replace(calibration, covariance_arcsec2=tuple(map(tuple, widened.tolist())))
+    return replace(instrument, calibration=wide), (
+        f"{why}: the optical axis may be {error_px:.0f} px from their centre, {math.degrees(error_rad):.2g} "
+        "deg that count as an error of A3: give the whole frame's size, camera: {focal_mm, pixel_um, width, height} in "
+        "the instrument file"
+    )

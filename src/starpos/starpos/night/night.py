@@ -1,0 +1,233 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A night: its frames, the answer of each, and their average."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from html import escape
+
+import numpy as np
+
+from starpos.averaging.average import Average
+from starpos.earth.ellipsoid import curvature_radii_m, enu_axes, zenith_of
+from starpos.earth.refraction import Atmosphere
+from starpos.earth.vertical import Geodetic, Vertical, geodetic
+from starpos.fix.budget import ErrorTerm
+from starpos.fix.fix import Fix
+from starpos.fix.readable import InDegrees
+from starpos.fix.solution import Attitude, Solution, Status
+from starpos.frames.stars import Stars
+from starpos.night.remarks import Remark
+
+NO_TILT = (float("nan"), float("nan"))
+NO_STARS = np.zeros((0, 2))
+# so many frames are shown in a notebook
+SHOWN = 20
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ReportedPlace:
+    """Astronomic latitude, longitude and heading (rad), with their errors.
+
+    heading: that of the last pose; NaN if there is no one heading.  poses: number of poses that the place comes from.
+    covariance (3, 3): of east m, north m, heading rad, the sum of the `terms`.
+    """
+
+    utc_unix_s: float
+    latitude: float
+    longitude: float
+    heading: float
+    covariance: np.ndarray
+    terms: tuple[ErrorTerm, ...]
+    poses: int = 1
+
+    @classmethod
+    def of(cls, fix: Fix | Average) -> "ReportedPlace":
+        """The place of a fix or an average."""
+        poses = fix.poses if isinstance(fix, Average) else 1
+        return cls(
+            utc_unix_s=fix.utc_unix_s,
+            latitude=fix.latitude,
+            longitude=fix.longitude,
+            heading=fix.heading,
+            covariance=fix.covariance,
+            terms=fix.terms,
+            poses=poses,
+        )
+
+    def __repr__(self) -> str:
+        return f"<{self.in_degrees} (astronomic)>"
+
+    @property
+    def own(self) -> np.ndarray:
+        """Covariance (3, 3) of the errors that are new in each frame, by which the frames differ from each other."""
+        return sum((t.covariance[:3, :3] for t in self.terms if not t.common), np.zeros((3, 3)))
+
+    @property
+    def sigma(self) -> np.ndarray:
+        """Standard deviations (3,) of east m, north m, heading rad."""
+        return np.sqrt(np.diag(self.covariance))
+
+    @property
+    def in_degrees(self) -> InDegrees:
+        """Place and heading in degrees."""
+        return InDegrees.of(self.latitude, self.longitude, self.heading, self.covariance)
+
+    def on_ground(self, vertical: Vertical) -> Geodetic:
+        """The geodetic place, with the deflection of the vertical removed."""
+        return geodetic(self.latitude, self.longitude, self.heading, self.covariance, vertical)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Shot:
+    """One frame: its status, and as much of its answer as there is.
+
+    utc_unix_s: NaN if unknown.  size: of the frame in px.  tilt: in rad.
+    xy, residual_px (M, 2): seen places of the stars of its fix, and these minus the fitted ones.
+    camera_to_itrs (3, 3): attitude against the Earth by the stars alone.
+    warnings: what is suspicious about its identification, as `Solution.warnings`.
+    """
+
+    name: str
+    status: Status
+    message: str
+    utc_unix_s: float = float("nan")
+    place: ReportedPlace | None = None
+    pointing: Attitude | None = None
+    size: tuple[int, int] | None = None
+    xy: np.ndarray = field(default_factory=lambda: NO_STARS)
+    residual_px: np.ndarray = field(default_factory=lambda: NO_STARS)
+    magnitudes: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    stars_detected: int = 0
+    stars_matched: int = 0
+    residual_arcsec: float = float("nan")
+    tilt: tuple[float, float] = NO_TILT
+    identify_s: float = float("nan")
+    fix_s: float = float("nan")
+    camera_to_itrs: np.ndarray | None = None
+    warnings: tuple[str, ...] = ()
+
+    @classmethod
+    def of(cls, name: str, s: Solution, stars: Stars | None) -> "Shot":
+        """The part of a solution that is shown; stars: those that gave it, None of a frame that cannot be read."""
+        shot = cls(
+            name=name,
+            status=s.status,
+            message=s.message,
+            utc_unix_s=float("nan") if s.utc_unix_s is None else s.utc_unix_s,
+            pointing=s.attitude,
+            size=None if stars is None else (stars.width, stars.height),
+            stars_detected=s.stars_detected,
+            stars_matched=len(s.names),
+            tilt=(s.tilt.theta_x, s.tilt.theta_y) if s.tilt else NO_TILT,
+            identify_s=s.identify_s,
+            fix_s=s.fix_s,
+            residual_arcsec=s.attitude.residual_arcsec if s.attitude else float("nan"),
+            warnings=s.warnings,
+        )
+        if stars is not None and s.star is not None and s.magnitudes is not None:
+            shot = replace(shot, xy=np.stack([stars.x, stars.y], -1)[s.star], magnitudes=s.magnitudes)
+        if s.fix is None:
+            return shot
+        return replace(
+            shot,
+            place=ReportedPlace.of(s.fix),
+            residual_px=-s.fix.residual_px,
+            residual_arcsec=s.fix.residual_arcsec,
+            camera_to_itrs=s.fix.camera_to_itrs,
+        )
+
+    def __repr__(self) -> str:
+        return f"<{self.name}: {self.place.in_degrees if self.place else self.message}>"
+
+
+def why_none(shots: Sequence[Shot]) -> str:
+    """A sentence that says why a night has no fix."""
+    if not shots:
+        return "there is no frame in it"
+    return f"none of its {len(shots)} frames gave a fix; the first: {shots[0].message}"
+
+
+@dataclass(frozen=True)
+class Truth:
+    """The true place of the instrument (astronomic, rad); headings: (mid_unix_s, rad) of frames.
+
+    simulated: whether no camera took these frames.
+    """
+
+    latitude: float
+    longitude: float
+    headings: tuple[tuple[float, float], ...] = ()
+    simulated: bool = False
+
+
+def offset_m(place: ReportedPlace | Truth, latitude: float, longitude: float) -> tuple[float, float]:
+    """East, north in m of a place from another (rad)."""
+    across = enu_axes(latitude, longitude)[:2] @ zenith_of(place.latitude, place.longitude)
+    east, north = across * curvature_radii_m(latitude)
+    return float(east), float(north)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Night:
+    """All frames of one place; printed, and in a notebook shown, in a few lines.
+
+    origin: a sentence that says where the fixes come from.
+    shots: one for each frame.
+    combined: the average, astronomic and in rad; None if there is none, and why_not says why.
+    wgs84: the same for a map, in deg.
+    steady (N, 3): latitude, longitude, heading (rad) of the fixes with one tilt for all; None if the camera moved.
+    """
+
+    name: str
+    origin: str
+    shots: Sequence[Shot]
+    combined: ReportedPlace | None
+    why_not: str
+    vertical: Vertical
+    atmosphere: Atmosphere
+    truth: Truth | None = None
+    steady: np.ndarray | None = None
+    remarks: tuple[Remark, ...] = ()
+
+    @property
+    def simulated(self) -> bool:
+        """Whether its truth.json says that no camera took its frames."""
+        return self.truth is not None and self.truth.simulated
+
+    @property
+    def wgs84(self) -> InDegrees | None:
+        """Where the night was, on WGS 84, in degrees; None if there is no average."""
+        if self.combined is None:
+            return None
+        ground = self.combined.on_ground(self.vertical)
+        return InDegrees.of(ground.latitude, ground.longitude, ground.heading, ground.covariance)
+
+    @property
+    def fixed(self) -> list[tuple[int, Shot]]:
+        """The frames with a fix, each with its number from 1."""
+        return [(k, s) for k, s in enumerate(self.shots, 1) if s.place]
+
+    @property
+    def places(self) -> list[ReportedPlace]:
+        """The places of the frames with a fix."""
+        return [s.place for s in self.shots if s.place]
+
+    def __repr__(self) -> str:
+        found = self.why_not if self.wgs84 is None else f"{self.wgs84} (WGS 84)"
+        return f"<{self.name}: {len(self.fixed)} of {len(self.shots)} frames fixed; {found}>"
+
+    def _repr_html_(self) -> str:
+        """The night as a table, for notebooks."""
+        rows = [
+            (s.name, s.status.value, s.place.in_degrees.where, s.place.in_degrees.facing)
+            if s.place
+            else (s.name, s.status.value, s.message, "")
+            for s in self.shots[:SHOWN]
+        ]
+        if len(self.shots) > SHOWN:
+            rows.append((f"{len(self.shots) - SHOWN} frames more", "", "", ""))
+        head = ("frame", "status", "place (astronomic) and 1 sigma", "")
+        table = "".join(f"<tr>{''.join(f'<td>{escape(cell)}</td>' for cell in row)}</tr>" for row in rows)
+        titles = "".join(f"<th>{title}</th>" for title in head)
+        said = "".join(f"<p>{escape(remark.text)}</p>" for remark in self.remarks)
+        return f"<p><b>{escape(repr(self)[1:-1])}</b></p><table><tr>{titles}</tr>{table}</table>{said}"

@@ -1,0 +1,152 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Reads what a night consists of: frames and their stars, the table of tilts, the instrument of each frame."""
+
+import math
+import os
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Protocol
+
+from starpos.errors import FrameError
+from starpos.fix.pointing import IDEAL
+from starpos.frames.exif import CameraClock
+from starpos.frames.frame import Frame
+from starpos.frames.reading import read_frame
+from starpos.frames.stars import Stars
+from starpos.instrument.axis import with_frame_size
+from starpos.instrument.inclinometer import Tilt
+from starpos.instrument.instrument import Instrument
+from starpos.instrument.tilt_log import TiltLog
+from starpos.instrument.tilt_table import read_tilt_csv
+from starpos.night.remarks import Remark, of_axis
+
+
+@dataclass(frozen=True)
+class Reader:
+    """Reads frames, and keeps one that will be asked for again, in its own process only.
+
+    delay_s: how much later than its header says a frame was exposed, and the standard deviation of that.
+    """
+
+    clock: CameraClock | None = None
+    delay_s: tuple[float, float] = (0.0, 0.0)
+    _kept: dict = field(default_factory=dict, compare=False)
+
+    def __call__(self, path: str) -> Frame | Stars:
+        if path in self._kept:
+            return self._kept.pop(path)
+        item = read_frame(path, self.clock)
+        if item.mid_unix_s is None:
+            return item
+        late_s, stddev_s = self.delay_s
+        stamp_s = math.hypot(item.stamp_stddev_s, stddev_s)
+        return replace(item, mid_unix_s=item.mid_unix_s + late_s, stamp_stddev_s=stamp_s)
+
+    def keep(self, path: str, item: Frame | Stars) -> None:
+        """Keep a frame for the next call with its path."""
+        self._kept.clear()
+        self._kept[path] = item
+
+    def __reduce__(self) -> tuple[type["Reader"], tuple[CameraClock | None, tuple[float, float]]]:
+        return Reader, (self.clock, self.delay_s)
+
+
+def stars_of(item: Frame | Stars) -> Stars:
+    """The stars of a list, or those detected on a frame."""
+    if isinstance(item, Stars):
+        return item
+    from starpos.detection.negative import detect_dark_too
+
+    return detect_dark_too(item).stars
+
+
+@dataclass(frozen=True)
+class About:
+    """Frame size, focal length and place on the sensor in px, as the first frame of a night states them."""
+
+    width: int
+    height: int
+    focal_px: float | None
+    origin_px: tuple[float, float] | None = None
+
+
+# of pointings only the camera's axes count
+NO_CAMERA = About(IDEAL.width, IDEAL.height, IDEAL.fx)
+
+
+@dataclass(frozen=True)
+class First:
+    """Finds the About of the first of several frames that can be read; None if none can."""
+
+    read: Reader
+
+    def __call__(self, paths: tuple[str, ...]) -> About | None:
+        for path in paths:
+            with suppress(FrameError):
+                item = self.read(path)
+                self.read.keep(path, item)
+                return About(item.width, item.height, item.focal_px, item.origin_px)
+        return None
+
+
+class Instruments(Protocol):
+    """The instrument of each frame of a night, with its camera; None where nobody knows its focal length.
+
+    instrument: whose A3 and inclinometer all frames have; None where nobody knows anything.
+    """
+
+    @property
+    def instrument(self) -> Instrument | None: ...
+
+    def of(self, frame: Frame | Stars) -> Instrument | None: ...
+
+
+@dataclass(frozen=True)
+class Given:
+    """One instrument for all frames; by_header: but for the focal length that a frame's own header states."""
+
+    instrument: Instrument | None
+    by_header: bool = False
+
+    def framed(self, first: About) -> tuple["Given", tuple[Remark, ...]]:
+        """Instruments of a night with this first frame, and a remark if the optical axis of its frames is not known."""
+        if self.instrument is None:
+            return self, ()
+        instrument, doubt = with_frame_size(self.instrument, first)
+        return replace(self, instrument=instrument), of_axis(doubt)
+
+    def of(self, frame: Frame | Stars) -> Instrument | None:
+        """The instrument of a frame."""
+        if not self.by_header or frame.focal_px is None:
+            return self.instrument
+        if self.instrument is None:
+            return Instrument(frame.focal_px)
+        return replace(self.instrument, focal_px=frame.focal_px)
+
+
+@dataclass(frozen=True)
+class TiltFile:
+    """The table of tilts in a file, as `Tilts`, which any process or machine reads for itself; path: absolute."""
+
+    path: str
+    noise_rad: float
+
+    @property
+    def log(self) -> TiltLog:
+        """The readings, read again only if the file has changed; raises TiltError as `read_tilt_csv` does."""
+        try:
+            status = os.stat(self.path)
+        except (OSError, ValueError):
+            return read_tilt_csv(self.path, self.noise_rad)
+        return _log(Path(self.path), self.noise_rad, (status.st_mtime_ns, status.st_size))
+
+    def average(self, mid_unix_s: float, exposure_s: float, spread_s: float = 0.0) -> Tilt:
+        """Average over an exposure, as `TiltLog.average` does."""
+        return self.log.average(mid_unix_s, exposure_s, spread_s)
+
+
+@lru_cache(maxsize=4)
+def _log(path: Path, noise_rad: float, _time_and_size: tuple[int, int]) -> TiltLog:
+    return read_tilt_csv(path, noise_rad)

@@ -1,0 +1,174 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Identify a frame by every way there is, one after another, until one succeeds or its time is over.
+
+Its stars as they are, with a second look at the frame; smaller triangles, where stars fill a part of the frame only; then
+the same with stars that are detected otherwise. A list of stars has no other way to be seen.
+"""
+
+import itertools
+import math
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+from starpos.budget import Budget
+from starpos.fix.blind import BlindSolver
+from starpos.fix.other_focal import focal_that_fits
+from starpos.fix.solution import Solution
+from starpos.fix.solver import Solver
+from starpos.frames.frame import Frame
+from starpos.frames.stars import Stars
+from starpos.identification import Identification, blind_fisheye, quad_cache
+from starpos.identification.blind import STAGES
+from starpos.identification.hint import Hint
+from starpos.identification.search import Priors
+from starpos.identification.second_look import ENOUGH
+from starpos.instrument.tilts import Tilts
+
+if TYPE_CHECKING:
+    from starpos.detection.second_look import SecondLook
+
+# Each of at most so many other ways to see a frame is another try, with a second look of its own: together they add 0.01
+# wrong answers in 1e9 frames.
+MOST_WAYS = 3
+ENOUGH_OTHERWISE = ENOUGH + math.log(10 * MOST_WAYS)
+# Where stars fill a part of a frame only (a roof, clouds, a white half), triangles of a field this share as large are.
+PART = 0.6
+# of the search at every scale, for stars that are detected otherwise
+QUICK, QUICK_FISHEYE = STAGES[:2], blind_fisheye.STAGES[:1]
+# a deadline, by time.monotonic, that is never reached
+NEVER_S = math.inf
+
+
+@dataclass(frozen=True, eq=False)
+class Sight:
+    """A frame as it was seen: stars of it, and the solution that they gave."""
+
+    stars: Stars
+    solution: Solution
+
+    @property
+    def found(self) -> Identification | None:
+        """Which stars they are; None where nothing was identified."""
+        return self.solution.found
+
+
+def prepare(solver: Solver, width: int, height: int) -> str:
+    """Load or build the tables of every way for frames of this size in px, as `Solver.prepare`."""
+    thin = solver.prepare(width, height)
+    solver.triangles_of(width, height, PART)
+    return thin
+
+
+def identified(
+    solver: Solver, item: Frame | Stars, stars: Stars, predicted: Priors = (), until_s: float = NEVER_S
+) -> Sight:
+    """Identify a frame or a list, whose stars these are; no way is begun after until_s (time.monotonic).
+
+    Returns the stars that identified it, or those given with the first answer where nothing did.
+    """
+
+    def ways(seen: Stars) -> Iterator[Solution]:
+        look = look_at(item, seen)
+        yield solver.identify(seen, predicted, look)
+        yield solver.identify(seen, predicted, look, part=PART)
+
+    return _first(item, stars, ways, lambda: time.monotonic() >= until_s)
+
+
+def identified_blind(solver: BlindSolver, item: Frame | Stars, stars: Stars) -> Sight:
+    """Identify a frame or a list of any scale, as `identified` does one whose scale is known.
+
+    All ways together have the CPU time that the solver has for a search.
+    """
+    budget = Budget.of(solver.search_s)
+
+    def ways(seen: Stars) -> Iterator[Solution]:
+        way = solver
+        if seen is not stars:
+            way = replace(solver, stages=QUICK, fisheye_stages=QUICK_FISHEYE, search_s=budget.left_s)
+        yield way.identify(seen)
+
+    return _first(item, stars, ways, lambda: budget.spent)
+
+
+def solved(
+    solver: Solver,
+    item: Frame | Stars,
+    stars: Stars,
+    tilts: Tilts,
+    hint: Hint | None = None,
+    predicted: Priors = (),
+    until_s: float = NEVER_S,
+    known: Identification | None = None,
+) -> Sight:
+    """The fix of a frame or a list, whose stars these are, identified by every way there is until until_s.
+
+    known: what is identified of these stars already.
+    """
+    answer = solver.solve(stars, tilts, hint, predicted, known)
+    if answer.lost and time.monotonic() < until_s:
+        sight = identified(solver, item, stars, predicted, until_s)
+        if sight.found is not None:
+            again = solver.solve(sight.stars, tilts, hint, predicted, known=sight.found)
+            return Sight(sight.stars, replace(again, identify_s=answer.identify_s + again.identify_s))
+    return Sight(stars, answer)
+
+
+def focal_px_that_fits(solver: Solver, stars: Stars) -> float | None:
+    """A focal length in px at which stars are identified that are not with the given one; None if none is found.
+
+    Near the given one, or wherever the first stage of the search at every scale finds it, if its quads are built.
+    """
+    found = focal_that_fits(solver, stars)
+    if found is None and quad_cache.is_built(solver.catalogue):
+        answer = BlindSolver(solver.catalogue, stages=STAGES[:1], fisheye_stages=()).identify(stars)
+        found = None if answer.attitude is None else answer.attitude.focal_px
+    return found
+
+
+def look_at(item: Frame | Stars, stars: Stars) -> "SecondLook | None":
+    """A second look at the frame of the stars; None for a list."""
+    if isinstance(item, Stars):
+        return None
+    from starpos.detection.negative import negative_of
+    from starpos.detection.second_look import SecondLook
+
+    return SecondLook.of(negative_of(item) if stars.negative else item, stars)
+
+
+def _first(
+    item: Frame | Stars,
+    stars: Stars,
+    ways: Callable[[Stars], Iterator[Solution]],
+    is_over: Callable[[], bool],
+) -> Sight:
+    """The first sight of a frame that is identified beyond doubt, by some way and some stars; else the first of all.
+
+    No way is begun once the time is over.
+    """
+    first: Sight | None = None
+    for seen, enough in _seen(item, stars):
+        for answer in ways(seen):
+            if answer.attitude is not None and answer.attitude.log_odds >= enough:
+                return Sight(seen, answer)
+            first = first or Sight(seen, answer)
+            if not first.solution.lost or is_over():
+                return first
+    assert first is not None
+    return first
+
+
+def _seen(item: Frame | Stars, stars: Stars) -> Iterator[tuple[Stars, float]]:
+    """Yield the stars of a frame, then those detected otherwise, each with the least log-odds that accept an answer."""
+    yield stars, -math.inf
+    if isinstance(item, Stars):
+        return
+    # slow to import, and seldom needed
+    from starpos.detection.negative import negative_of
+    from starpos.detection.otherwise import otherwise
+
+    seen = otherwise(negative_of(item) if stars.negative else item, stars.window)
+    for others in itertools.islice(seen, MOST_WAYS):
+        yield replace(others, negative=stars.negative), ENOUGH_OTHERWISE

@@ -1,0 +1,101 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Cards of a header that agree on when a frame was exposed, that contradict each other, or that are no times."""
+
+import re
+from datetime import datetime, timezone
+
+import numpy as np
+import pytest
+
+from starpos.frames.shutter import UNKNOWN_LATENCY_S
+from starpos.frames.times import times
+
+START_S = datetime(2026, 11, 2, 18, tzinfo=timezone.utc).timestamp()
+START = {"DATE-OBS": "2026-11-02T18:00:00.000"}
+STEP_S = 0.001 / np.sqrt(3)
+
+
+@pytest.mark.parametrize(
+    ("cards", "middle_s", "exposure_s"),
+    [
+        ({**START, "EXPTIME": 4, "EXPOSURE": 4}, 2, 4),
+        ({**START, "EXPTIME": 0, "EXPOSURE": 4}, 2, 4),
+        ({**START, "EXPTIME": "4.0"}, 2, 4),
+        ({**START, "EXP": 15.0}, 7.5, 15),
+        ({**START, "DATE-END": "2026-11-02T18:00:04.000"}, 2, 4),
+        ({**START, "EXPTIME": 4, "DATE-AVG": "2026-11-02T18:00:02.000", "STACKCNT": 1, "TOTALEXP": 4}, 2, 4),
+        ({"DATE-AVG": "2026-11-02T18:00:02.000", "EXPTIME": 4}, 2, 4),
+        ({"DATE-AVG": "2026-11-02T18:00:02.000", "DATE-OBS": "2026-11-02"}, 2, None),
+        ({"MJD-OBS": "61346.75000000", "EXPTIME": 4}, 2, 4),
+        ({"DATE-OBS": "2026-11-02", "UTSTART": " 18:00:00.000 ", "EXPTIME": 4}, 2, 4),
+    ],
+)
+def test_what_agrees_is_the_middle_of_the_exposure(cards, middle_s, exposure_s):
+    told = times(cards)
+    assert told["mid_unix_s"] - START_S == pytest.approx(middle_s, abs=1e-5)
+    assert told["exposure_s"] == (exposure_s if exposure_s is None else pytest.approx(exposure_s))
+
+
+@pytest.mark.parametrize(
+    ("cards", "words"),
+    [
+        ({**START, "EXPTIME": 0}, "EXPTIME is 0"),
+        ({**START, "EXPTIME": ""}, "needs EXPTIME"),
+        (START, "needs EXPTIME"),
+        ({**START, "EXPTIME": 4, "EXPOSURE": 0.5}, "EXPTIME .*EXPOSURE .*contradict"),
+        ({**START, "EXPTIME": 0.5, "DATE-END": "2026-11-02T18:00:04"}, "DATE-END .*contradict"),
+        ({**START, "EXPTIME": 0.5, "DATE-AVG": "2026-11-02T18:00:02"}, "contradict"),
+        ({**START, "EXPTIME": 0.5, "LIVETIME": 4.0}, "LIVETIME .*contradict"),
+        ({**START, "MJD-OBS": 61346.7612, "EXPTIME": 0.5}, "contradict"),
+        ({**START, "DATE-END": "2026-11-02T17:59:00", "EXPTIME": 1}, "DATE-END is before its DATE-OBS"),
+        ({**START, "EXPTIME": 10, "STACKCNT": 187, "TOTALEXP": 1870}, "stack of 187 exposures"),
+        ({**START, "EXPTIME": 10, "NCOMBINE": 8}, "stack of 8"),
+        ({**START, "EXPTIME": 10, "SNAPSHOT": 3}, "stack of 3"),
+        ({**START, "EXPTIME": -1}, "EXPTIME is -1"),
+        ({**START, "EXPTIME": "long"}, "EXPTIME is 'long'"),
+        ({**START, "EXPTIME": 1e300}, "EXPTIME"),
+        ({**START, "EXPTIME": 10**400}, "EXPTIME"),
+        ({**START, "EXPTIME": 7200}, "EXPTIME is 7200: give 0 to 3600 s"),
+        ({**START, "EXPTIME": 1, "TIMESYS": "MOON"}, "TIMESYS is 'moon'"),
+        ({"DATE-OBS": "26/07/102", "EXPTIME": 1}, "26/07/102.*no time"),
+        ({"DATE-OBS": "now", "EXPTIME": 1}, "'now'.*no time"),
+        ({"DATE-OBS": "2026-13-45T99:00:00", "EXPTIME": 1}, "no time"),
+        ({"DATE-OBS": "2026-11-02T18:00:75", "EXPTIME": 1}, "seconds to 59"),
+        ({"DATE-OBS": "2026-11-02T18:00:60", "EXPTIME": 1}, "seconds to 59"),
+        ({"DATE-OBS": "2026-11-02", "UT": "25:00:00", "EXPTIME": 1}, "no time"),
+        ({"MJD-OBS": 1e300, "EXPTIME": 1}, "no time"),
+        ({"MJD-OBS": "soon", "EXPTIME": 1}, "no number"),
+    ],
+)
+def test_what_contradicts_itself_or_is_none_tells_no_time_and_says_why(cards, words):
+    told = times(cards)
+    assert "mid_unix_s" not in told
+    assert re.search(words, told["untimed"]), told["untimed"]
+    assert "\n" not in told["untimed"]
+
+
+def test_cards_that_are_a_little_apart_are_in_the_claim():
+    """A DATE-END 0.6 s late by the time the frame took to come: the middle may be 0.3 s later."""
+    late = times({**START, "EXPTIME": 4, "DATE-END": "2026-11-02T18:00:04.600"})
+    assert late["mid_unix_s"] - START_S == pytest.approx(2.0, abs=1e-5)
+    assert late["stamp_stddev_s"] == pytest.approx(0.3, abs=0.01)
+    # whole seconds are only cut off
+    cut = times({**START, "EXPTIME": 4, "DATE-END": "2026-11-02T18:00:04"})
+    assert cut["stamp_stddev_s"] == pytest.approx(STEP_S)
+    assert times({**START, "EXPTIME": 4, "DATE-END": "2026-11-02T18:00:06.000"}).keys() == {"untimed"}
+
+
+def test_the_finest_of_several_times_is_the_one_that_counts():
+    told = times({"DATE-OBS": "2026-11-02T18:00:00", "DATE-AVG": "2026-11-02T18:00:02.7500", "EXPTIME": 4})
+    assert told["mid_unix_s"] - START_S == pytest.approx(2.75, abs=1e-5)
+    assert told["stamp_stddev_s"] == pytest.approx(1e-4 / np.sqrt(3))
+
+
+def test_an_end_alone_tells_the_middle_but_for_the_delay_of_who_reads_the_clock():
+    told = times({"DATE-END": "2026-11-02T18:00:04.000", "EXPTIME": 4})
+    assert told["mid_unix_s"] - START_S == pytest.approx(2.0, abs=1e-5)
+    assert told["stamp_stddev_s"] == pytest.approx(np.hypot(STEP_S, UNKNOWN_LATENCY_S))
+
+
+def test_without_any_card_nothing_is_said():
+    assert times({"EXPTIME": 2}) == {"exposure_s": 2.0} and times({}) == {"exposure_s": None}
