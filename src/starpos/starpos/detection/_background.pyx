@@ -2,6 +2,7 @@
 # cython: language_level=3, boundscheck=False, wraparound=False, cdivision=True, initializedcheck=False
 """The sky in the cells of a mesh, by clipped means of a sample of the 8- or 16-bit pixels, and between the cells."""
 
+from libc.limits cimport UINT_MAX
 from libc.math cimport sqrt
 from libc.stdlib cimport free, malloc
 
@@ -44,9 +45,12 @@ cdef inline int _at_most(const unsigned short *v, int n, unsigned short limit) n
 
 cdef wide_void _ranked(const unsigned short *v, int n, int k, int *out) noexcept nogil:
     """Set `out` to the number at place k of n if they were sorted: halving the range takes few looks at whole numbers."""
-    cdef int low = 65535, high = 0, i, middle
+    cdef unsigned short least = 65535, most = 0
+    cdef int low, high, i, middle
     for i in range(n):
-        low, high = min(low, <int>v[i]), max(high, <int>v[i])
+        least = v[i] if v[i] < least else least
+        most = v[i] if v[i] > most else most
+    low, high = least, most
     while low < high:
         middle = (low + high) // 2
         if _at_most(v, n, <unsigned short>middle) > k:
@@ -57,17 +61,36 @@ cdef wide_void _ranked(const unsigned short *v, int n, int k, int *out) noexcept
 
 
 cdef wide_void _sums(const unsigned short *v, int n, int middle, int limit, long long *out) noexcept nogil:
-    """Of n numbers within a limit of the middle how many there are, the sum of their differences from it, and of the squares."""
-    cdef int k, off, kept, count = 0
-    cdef long long total = 0, squares = 0
+    """Sum up the n numbers within a limit of the middle: how many, their differences from it, and the squares of these."""
+    # the sum of so many squares has 32 bits
+    cdef int some = max(<int>(UINT_MAX // (<unsigned int>limit * <unsigned int>limit + 1)), 1) if limit < 65536 else 1
+    cdef int first = 0, k, off, kept, count, total
+    cdef unsigned int squares
+    out[0] = out[1] = out[2] = 0
+    while first < n:
+        count, total, squares = 0, 0, 0
+        for k in range(first, min(first + min(some, n), n)):
+            off = v[k] - middle
+            kept = <unsigned int>(off + limit) <= 2 * <unsigned int>limit
+            off *= kept
+            count += kept
+            total += off
+            squares += <unsigned int>off * <unsigned int>off
+        out[0] += count
+        out[1] += total
+        out[2] += squares
+        first += min(some, n)
+
+
+cdef wide_void _highest(const unsigned short *v, int n, int *highest) noexcept nogil:
+    """Set `highest` to the highest of n numbers, and how many are as high."""
+    cdef unsigned short most = 0
+    cdef int k, count = 0
     for k in range(n):
-        off = v[k] - middle
-        kept = -limit <= off <= limit
-        off *= kept
-        count += kept
-        total += off
-        squares += <long long>off * off
-    out[0], out[1], out[2] = count, total, squares
+        most = v[k] if v[k] > most else most
+    for k in range(n):
+        count += v[k] == most
+    highest[0], highest[1] = most, count
 
 
 cdef double _quantile(const unsigned short *v, int n, double share) noexcept nogil:
@@ -80,7 +103,7 @@ cdef double _quantile(const unsigned short *v, int n, double share) noexcept nog
     return low + (place - k) * (high - low)
 
 
-cdef void _clipped(
+cdef wide_void _clipped(
     const unsigned short *v, int n, const Clip *clip, unsigned short *away, double *level, double *noise
 ) noexcept nogil:
     """Mean and rms of values (n,) without stars and defects; away (n,): to work in.
@@ -119,7 +142,8 @@ def sampled(
     Returns level and noise, and the sample's highest value and how many pixels have it, (4, cells down, cells across).
     """
     cdef int down = rows.shape[0], across = columns.shape[0], tall = rows.shape[1], wide = columns.shape[1]
-    cdef int n = tall // 2 * (wide // 2), i, j, phase, k, y, x, top, equal
+    cdef int n = tall // 2 * (wide // 2), i, j, phase, y, x
+    cdef int[2] top
     cdef const pixel_t *row
     cdef Clip clip = Clip(per_mad, per_tail, sigmas, share)
     if not n or tall % 2 or wide % 2:
@@ -144,14 +168,10 @@ def sampled(
                     for x in range(wide // 2):
                         own[x], own[n + x] = row[columns[j, 2 * x]], row[columns[j, 2 * x + 1]]
                 for phase in range(4):
-                    own, top, equal = value + phase * n, 0, 0
-                    for k in range(n):
-                        top = max(top, <int>own[k])
-                    for k in range(n):
-                        equal += own[k] == top
+                    own = value + phase * n
                     _clipped(own, n, &clip, value + 4 * n, &sky[0, phase, i, j], &sky[1, phase, i, j])
-                    highest[0, phase, i, j] = top
-                    highest[1, phase, i, j] = equal
+                    _highest(own, n, top)
+                    highest[0, phase, i, j], highest[1, phase, i, j] = top[0], top[1]
     free(value)
     return found[0], found[1], tops[0], tops[1]
 

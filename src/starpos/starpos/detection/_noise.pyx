@@ -4,15 +4,18 @@
 
 from libc.math cimport INFINITY, hypot, sqrt
 from libc.stdlib cimport free, malloc
+from libc.string cimport memset
 
 import numpy as np
 
 from starpos._numeric.algebra cimport middle
 from starpos._numeric.limits cimport within
+from starpos._numeric.wide cimport fused_void, lanes, sum_of
 
 cdef enum:
     # Pixels that are summed at once.
     LANES = 4
+    BLOCK = 64
     ROUNDS = 4
 
 # Smaller singular values, as a share of the largest, are 0; residuals are at most so much more certain than they look.
@@ -47,27 +50,41 @@ cdef (double, double) _two_terms(double pp, double pq, double qq, double p, doub
     return 0.0, b
 
 
-cdef void _light_sums(const Pixels *p, double photon, double misfit2, double limit2, double *out) noexcept nogil:
+cdef fused_void _light_sums(const Pixels *p, double photon, double misfit2, double limit2, double *out) noexcept nogil:
     """Sums over pixels of their light over its variance, squared; and pp, pq, qq, p, q.
 
     These are the products of light, light squared and the excess, each over the variance, of pixels whose square is not too large
     for it.
     """
-    cdef double light, variance, whole, excess, kept
-    cdef int k
+    cdef double[BLOCK] whole
+    cdef double[BLOCK] kept
+    cdef double[BLOCK] excess
+    cdef double[BLOCK] light
+    cdef lanes[6] sums
+    cdef lanes all_, a, b, e
+    cdef double variance
+    cdef int first = 0, n, k
+    memset(sums, 0, sizeof(sums))
+    while first < p.count:
+        # whole lanes, as the pixels are
+        n = min(BLOCK, p.count - first)
+        for k in range(n):
+            light[k] = p.light[first + k]
+            variance = p.noise2[first + k] + (photon + misfit2 * light[k]) * light[k]
+            whole[k], excess[k] = light[k] / variance, (p.square[first + k] - p.noise2[first + k]) / variance
+            kept[k] = whole[k] if p.square[first + k] < limit2 * variance else 0.0
+        for k in range(0, n, 4):
+            all_, a, e = (<const lanes *>(whole + k))[0], (<const lanes *>(kept + k))[0], (<const lanes *>(excess + k))[0]
+            b = a * (<const lanes *>(light + k))[0]
+            sums[0] += all_ * all_
+            sums[1] += a * a
+            sums[2] += a * b
+            sums[3] += b * b
+            sums[4] += a * e
+            sums[5] += b * e
+        first += BLOCK
     for k in range(6):
-        out[k] = 0.0
-    for k in range(p.count):
-        light = p.light[k]
-        variance = p.noise2[k] + (photon + misfit2 * light) * light
-        whole, excess = light / variance, (p.square[k] - p.noise2[k]) / variance
-        kept = whole if p.square[k] < limit2 * variance else 0.0
-        out[0] += whole * whole
-        out[1] += kept * kept
-        out[2] += kept * kept * light
-        out[3] += kept * kept * light * light
-        out[4] += kept * excess
-        out[5] += kept * light * excess
+        out[k] = sum_of(&sums[k])
 
 
 cdef (double, double) _fitted(const Pixels *p, double photon, double misfit2, double outlier2) noexcept nogil:

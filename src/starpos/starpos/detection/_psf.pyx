@@ -11,7 +11,8 @@ from starpos._numeric.wide cimport fused_void
 
 cdef extern from *:
     """
-    #define STARPOS_BLOCK 64
+    /* In C because Cython has no constants of several numbers: pixels one by one take 2.5 times the instructions here, a sixth more
+       in all for a frame of 5 megapixels with 315 stars, and a third more for one with 1500. */
     #define STARPOS_ORDERS 32
     /* Pixels that are summed in a register, which a compiler left to itself takes one by one; steps of these in a block, and
        of these so many side by side. */
@@ -203,13 +204,14 @@ def evaluated(
 cdef inline void _hermites(const double *u, int order, double *out) noexcept nogil:
     """Hermite polynomials over sqrt(k!), k = 0 .. order, of a block of numbers u: (order + 1, BLOCK)."""
     cdef int k, p
+    cdef double before, over
     cdef double *own
     for p in range(BLOCK):
         out[p], out[BLOCK + p] = 1.0, u[p]
     for k in range(1, order):
-        own = out + k * BLOCK
+        own, before, over = out + k * BLOCK, root[k], over_root[k + 1]
         for p in range(BLOCK):
-            own[BLOCK + p] = (u[p] * own[p] - root[k] * own[p - BLOCK]) * over_root[k + 1]
+            own[BLOCK + p] = (u[p] * own[p] - before * own[p - BLOCK]) * over
 
 
 cdef fused_void _terms(

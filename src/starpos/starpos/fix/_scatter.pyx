@@ -8,6 +8,7 @@ from libc.stdlib cimport free, malloc
 import numpy as np
 
 from starpos._numeric.algebra cimport middle
+from starpos._numeric.wide cimport wide_void
 
 cdef enum:
     # determinants whose product is a number, points of an integral, steps of a search
@@ -52,20 +53,13 @@ def expected_variance(
     cdef double[POINTS] product
     cdef double[POINTS] units
     cdef double step = log(most / least) / (POINTS - 1), best, density, whole = 0.0, mean = 0.0
-    cdef double x2, y2, twice, xx, xy, yy, determinant
     fit(residual, covariance)
     for g in range(POINTS):
         extra[g], total[g], product[g] = least * exp(g * step), 0.0, 1.0
         # of determinants: they are alike then, and their products neither too large nor too small for a number
         units[g] = 1 / (stated + extra[g]) / (stated + extra[g])
     for k in range(n):
-        x2, y2, xy = residual[k, 0] * residual[k, 0], residual[k, 1] * residual[k, 1], covariance[k, 0, 1]
-        twice = 2 * xy * residual[k, 0] * residual[k, 1]
-        for g in range(POINTS):
-            xx, yy = covariance[k, 0, 0] + extra[g], covariance[k, 1, 1] + extra[g]
-            determinant = xx * yy - xy * xy
-            total[g] -= 0.5 * (yy * x2 - twice + xx * y2) / determinant
-            product[g] *= determinant * units[g]
+        _add(&residual[k, 0], &covariance[k, 0, 0], extra, units, total, product)
         # a logarithm for several determinants
         if k % TOGETHER == TOGETHER - 1 or k == n - 1:
             for g in range(POINTS):
@@ -81,6 +75,20 @@ def expected_variance(
         whole += density
         mean += density * extra[g]
     return mean / whole
+
+
+cdef wide_void _add(
+    const double *residual, const double *covariance, const double *extra, const double *units, double *total, double *product
+) noexcept nogil:
+    """Take half of a residual's squared distance from totals, and multiply products by its determinant, for each extra variance."""
+    cdef double x2 = residual[0] * residual[0], y2 = residual[1] * residual[1], xy = covariance[1]
+    cdef double twice = 2 * xy * residual[0] * residual[1], xx, yy, determinant
+    cdef int g
+    for g in range(POINTS):
+        xx, yy = covariance[0] + extra[g], covariance[3] + extra[g]
+        determinant = xx * yy - xy * xy
+        total[g] -= 0.5 * (yy * x2 - twice + xx * y2) / determinant
+        product[g] *= determinant * units[g]
 
 
 def sifted(
@@ -201,13 +209,23 @@ cdef double searched(Columns *c, double share, double median_of_chi2, double lea
     return exp(there)
 
 
+cdef wide_void _distances(
+    const double *x2, const double *y2, const double *twice, const double *xx, const double *xy, const double *yy, double extra,
+    int n, double *d2
+) noexcept nogil:
+    """Squared distances (n,) of residuals under a variance that is added to theirs."""
+    cdef int k
+    cdef double x, y
+    for k in range(n):
+        x, y = xx[k] + extra, yy[k] + extra
+        d2[k] = (y * x2[k] - twice[k] * xy[k] + x * y2[k]) / (x * y - xy[k] * xy[k])
+
+
 cdef double size(Columns *c, double extra, double median_of_chi2) noexcept nogil:
     """The mean squared distance along an axis under an extra variance; from the median if median_of_chi2 > 0."""
-    cdef double total = 0.0, xx, yy
+    cdef double total = 0.0
     cdef int k
-    for k in range(c.n):
-        xx, yy = c.xx[k] + extra, c.yy[k] + extra
-        c.d2[k] = (yy * c.x2[k] - c.twice[k] * c.xy[k] + xx * c.y2[k]) / (xx * yy - c.xy[k] * c.xy[k])
+    _distances(c.x2, c.y2, c.twice, c.xx, c.xy, c.yy, extra, c.n, c.d2)
     if median_of_chi2 > 0:
         return middle(c.d2, c.n) / median_of_chi2
     for k in range(c.n):
