@@ -147,7 +147,7 @@ def scatter_of(frames: Frames) -> Scatter:
         for n in noisy
         for w, covariance, means in tried
     ]
-    weights, covariances, means = zip(*whole, strict=True)
+    weights, covariances, shares = zip(*whole, strict=True)
     normals, pulls, bares = _sums(y, j, np.array(covariances))
     # each hypothesis of the scatter with each of the response, one after another
     number = len(RESPONSES) if frames.response.any() else 1
@@ -167,7 +167,7 @@ def scatter_of(frames: Frames) -> Scatter:
         weight /= weight.sum()
     mean = weight @ moved
     off = moved - mean
-    pose2, frame2, noise2 = weight @ np.repeat(np.array(means), number, axis=0)
+    pose2, frame2, noise2 = weight @ np.repeat(np.array(shares), number, axis=0)
     return Scatter(
         pose_sigma=float(np.sqrt(pose2 + frames.pose_sigma**2)),
         frame_sigma=float(np.sqrt(frame2 + frames.pose_sigma**2)),

@@ -78,7 +78,7 @@ def _rows(layout: Encoding, data: bytes, sizes: tuple[int, int, int, int], big_e
         return np.ndarray((height, row), np.uint8, data, strides=(step, 1))
     shape = (height, width) if numbers == 1 else (height, width, numbers)
     strides = (step, dtype.itemsize) if numbers == 1 else (step, numbers * dtype.itemsize, dtype.itemsize)
-    rows = np.ndarray(shape, dtype, data, strides=strides)
+    rows: np.ndarray = np.ndarray(shape, dtype, data, strides=strides)
     return rows if rows.dtype.isnative and rows.flags.aligned else rows.astype(layout.dtype)
 
 
