@@ -86,7 +86,8 @@ class Scatter:
 
     pose_sigma (rad): root of the mean variance of what does not average away within a pose; frame_sigma (rad): the same
     of all that a frame has beside its own stated error; noise_sigma (rad): of what is new in each frame alone.
-    evident: whether it is improbable that all is as stated.
+    evident: whether it is improbable that the frames scatter as stated.  response_evident: whether it is that the response
+    errs as stated.
     moved (n,), covariance (n, n): of the parameters.  stated (n, n): their covariance if all is as stated, and the
     stated error of a pose new at each.
     """
@@ -95,6 +96,7 @@ class Scatter:
     frame_sigma: float
     noise_sigma: float
     evident: bool
+    response_evident: bool
     moved: np.ndarray
     covariance: np.ndarray
     stated: np.ndarray
@@ -173,6 +175,7 @@ def scatter_of(frames: Frames) -> Scatter:
         frame_sigma=float(np.sqrt(frame2 + frames.pose_sigma**2)),
         noise_sigma=float(np.sqrt(noise2)),
         evident=bool(weight[: many * number].sum() < EVIDENT),
+        response_evident=bool(weight[wider].sum() > 1 - EVIDENT),
         moved=mean,
         covariance=np.tensordot(weight, spread, 1) + (weight * off.T) @ off,
         stated=spread[0],

@@ -239,8 +239,9 @@ class _Agreement:
                 f"{len(self.left_out)} of {of} frames disagree with the others on the zenith: {why}"
             )
         scatter = self.scatter_left
-        # too few to tell how much they scatter, they must agree as they state
-        if scatter > MOST_POSE_RAD or (self.plumb.scatter > MOST_SCATTER and not self.scatter.evident):
+        # frames too few to show an error of the tilts must agree as they state
+        shown = self.scatter.evident or self.scatter.response_evident
+        if scatter > MOST_POSE_RAD or (self.plumb.scatter > MOST_SCATTER and not shown):
             raise FixError(
                 f"{of} frames do not agree on one zenith (they scatter by "
                 f"{np.degrees(scatter):.2f} deg): {why}"
