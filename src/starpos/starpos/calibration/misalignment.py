@@ -290,8 +290,27 @@ def _agreed(
 def _agreeing(
     find: FindPlumbLine, whole: Readings, solved: list[FixedFrame], a3: np.ndarray, errors: InclinometerErrors
 ) -> tuple[np.ndarray, PlumbLine]:
-    """Indices of the frames that agree with most of the others, and the plumb line of these."""
-    rows = _unhidden(find, whole, solved, a3)
+    """Indices of the frames that agree with most of the others, and the plumb line of these.
+
+    Of few poses the robust fit may end between sound and bad tilts. A second one begins with the frames that agree with
+    their own poses, and the fit from which half of the frames are less far counts.
+    """
+    starts, calm = [_unhidden(find, whole, solved, a3)], _calm(whole)
+    if (1 - MOST_OUTLIERS) * len(solved) <= len(calm) < len(starts[0]):
+        starts.append(calm)
+    found = [_kept(find, whole, solved, a3, errors, rows) for rows in starts]
+    return min(found, key=lambda f: typical(_left(whole, f[1]), 5))
+
+
+def _kept(
+    find: FindPlumbLine,
+    whole: Readings,
+    solved: list[FixedFrame],
+    a3: np.ndarray,
+    errors: InclinometerErrors,
+    rows: np.ndarray,
+) -> tuple[np.ndarray, PlumbLine]:
+    """The frames in `rows` without those that their plumb line shows to disagree, and the plumb line of the rest."""
     for _ in range(JUDGED):
         plumb = find(whole.take(rows), a3, [solved[k].fix for k in rows])
         size = np.linalg.norm(plumb.left, axis=1)
@@ -301,6 +320,16 @@ def _agreeing(
             break
         rows = rows[agree]
     return rows, plumb
+
+
+def _calm(whole: Readings) -> np.ndarray:
+    """Indices of the frames whose readings agree with the median of their pose, by how much most frames do."""
+    off = np.empty_like(whole.plumb)
+    for pose in range(whole.pose.max() + 1):
+        rows = whole.pose == pose
+        off[rows] = whole.plumb[rows] - np.median(whole.plumb[rows], axis=0)
+    size = np.linalg.norm(off, axis=1)
+    return np.flatnonzero(size < OUTLIER_SIGMA * np.maximum(whole.sigma, typical(off, 0)))
 
 
 def _unhidden(find: FindPlumbLine, whole: Readings, solved: list[FixedFrame], a3: np.ndarray) -> np.ndarray:
