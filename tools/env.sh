@@ -30,4 +30,8 @@ fi
 . "$_starpos_root/install/local_setup.$_starpos_shell"
 case $_starpos_flags in *u*) set -u ;; esac
 case $_starpos_flags in *e*) set -e ;; esac
+# a camera's driver that is started from here may send large frames best effort
+if [ -z "${FASTRTPS_DEFAULT_PROFILES_FILE:-}${FASTDDS_DEFAULT_PROFILES_FILE:-}" ]; then
+  export FASTRTPS_DEFAULT_PROFILES_FILE="$_starpos_root/install/starpos_bringup/share/starpos_bringup/config/large_frames.xml"
+fi
 unset _starpos_env _starpos_shell _starpos_root _starpos_flags

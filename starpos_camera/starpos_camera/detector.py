@@ -14,18 +14,18 @@ from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.node import Node
 from rclpy.qos import ReliabilityPolicy
-from rclpy.subscription import Subscription
-from sensor_msgs.msg import CameraInfo, Image, Imu
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Imu
 from std_msgs.msg import Header
 
 from starpos.detection import Detection, DetectionSettings, detect
 from starpos.errors import StarposError, TimeError
 from starpos.frames.frame import Frame
-from starpos.messages.camera import message_to_frame
-from starpos.messages.stars import message_to_shutter
+from starpos.messages.camera import message_to_frame, message_to_picture
 from starpos.session.trails import Trails
 from starpos_camera.annotator import Annotator
 from starpos_camera.detector_parameters import PARAMETERS
+from starpos_camera.exposures import CAPTURES_KEPT, ExposureFacts, key_of
+from starpos_camera.frame_topics import FrameTopics
 from starpos_common.clock_report import time_is_simulated
 from starpos_common.diagnostics import Diagnosis, Diagnostics, Level
 from starpos_common.messages import encoding_of, stars_to_message
@@ -36,9 +36,6 @@ from starpos_common.troubles import Troubles
 from starpos_common.worker import Worker
 from starpos_interfaces.msg import Capture, StarArray
 
-# Only the newest frame is kept; each more would take another 42 MB.
-IMAGE_DEPTH = 1
-CAPTURES_KEPT = 16
 # seconds of an IMU at 400 Hz
 IMU_QUEUE = 4000
 # An image waits so long for its Capture, which comes on another topic: where a busy machine lost it, the middleware
@@ -55,9 +52,9 @@ MIN_SILENCE_S = 5.0
 
 @dataclass(frozen=True, eq=False)
 class Job:
-    """A frame with its message's header."""
+    """What makes a frame, which may take long, and the header of its stars."""
 
-    frame: Frame
+    frame: Callable[[], Frame]
     header: Header
 
 
@@ -80,15 +77,12 @@ class DetectorNode(Node):
         super().__init__("detector", **options)
         self._values = declare(self, PARAMETERS, apply=self._apply)
         self._settings = self._detection_settings()
-        # By stamp, the oldest first.
-        self._captures: dict[tuple[int, int], Capture] = {}
-        # what holds for a frame whose Capture is lost
-        self._usual = Capture()
-        # frames until their Captures come, oldest first, and how long they wait for them, s of the clock below
-        self._held: deque[tuple[Job, float]] = deque()
+        self._exposures = ExposureFacts(self._values)
+        # images until their Captures come, oldest first, and how long they wait for them, s of the clock below
+        self._held: deque[tuple[Image | CompressedImage, float]] = deque()
         self._frames = self._bad = self._dropped = 0
-        # Sequence number of the last image; None: the middleware gives none.
-        self._sequence: int | None = None
+        # Type and sequence number of the last image; None: the middleware gives none.
+        self._sequence: tuple[type, int | None] = (Image, None)
         self._replayed: Replayed | None = None
         self._troubles = Troubles(self)
         # What was wrong with a frame since the last report.
@@ -100,8 +94,8 @@ class DetectorNode(Node):
         self._last_frame_s: float | None = None
         self._interval_s: float | None = None
         self._publisher = publisher(self, StarArray, "stars", 10)
-        # Where frames come from, for messages.
-        self._where = ""
+        self._topics = FrameTopics(self, self._on_image)
+        self._captures_come: Callable[[], int] = lambda: 0
         self._annotator = Annotator(self)
         self._trails: Trails | None = None
         if self._values["gyro"]:
@@ -117,22 +111,23 @@ class DetectorNode(Node):
 
     def listen(self) -> None:
         """Take the frames of `camera/image_raw`. A camera in the same process calls `submit` instead."""
-        takes: dict[str, Take] = {"camera/capture": self._on_capture, "camera/image_raw": self._on_image}
+        takes: dict[str, Take] = {"camera/capture": self._on_capture, **self._topics.takes}
         self._patience_clock = Clock(clock_type=ClockType.STEADY_TIME)
         if time_is_simulated(self):
             self._patience_clock = self.get_clock()
             self._replayed = Replayed(self, takes, [self._publisher], busy=lambda: not self._worker.idle)
         self._look = self.create_timer(LOOK_S, self._go_on, clock=self._patience_clock, autostart=False)
-        self._captures_come = self._subscribe(Capture, "camera/capture", takes, CAPTURES_KEPT)
-        images = self._subscribe(Image, "camera/image_raw", takes, IMAGE_DEPTH)
-        self._where = f" on {images.topic_name}"
 
-    def _subscribe(self, kind: type, name: str, takes: Mapping[str, Take], depth: int) -> Subscription:
-        def on_message(message: Any, info: Mapping[str, Any]) -> None:
-            if self._replayed is None or not self._replayed.holds(name, message, info):
-                takes[name](message, info)
+        def taker(name: str) -> Take:
+            def on_message(message: Any, info: Mapping[str, Any]) -> None:
+                if self._replayed is None or not self._replayed.holds(name, message, info):
+                    takes[name](message, info)
 
-        return subscription(self, kind, name, on_message, depth)
+            return on_message
+
+        captures = subscription(self, Capture, "camera/capture", taker("camera/capture"), CAPTURES_KEPT)
+        self._captures_come = captures.get_publisher_count
+        self._topics.listen(taker, both=self._replayed is not None)
 
     def destroy_node(self) -> None:
         self._worker.stop()
@@ -147,16 +142,18 @@ class DetectorNode(Node):
     def submit(self, frame: Frame, header: Header) -> None:
         """Detect and publish the stars of a frame under `header`; it replaces a frame that still waits.
 
-        The subscription calls this, and a camera node in the same process, which hands its pixels over without a copy.
+        A camera node in the same process calls this, and hands its pixels over without a copy.
         """
         self._arrived()
-        size = f"{frame.width} x {frame.height} px, {encoding_of(frame)}"
-        if size != self._size:
-            self._size = size
-            self.get_logger().info(f"frames of {size}.")
+        self._offer(lambda: frame, header)
+
+    def _offer(self, make: Callable[[], Frame], header: Header) -> None:
+        job = Job(make, header)
         if self._trails is not None:
-            frame = self._trails.told(frame)
-        if self._worker.offer(Job(frame, header)):
+            # the readings are taken in this thread
+            frame = self._trails.told(make())
+            job = Job(lambda: frame, header)
+        if self._worker.offer(job):
             self._dropped += 1
 
     def _on_imu(self, message: Imu) -> None:
@@ -196,28 +193,26 @@ class DetectorNode(Node):
         self._settings = self._detection_settings()
 
     def _on_capture(self, message: Capture, info: Mapping[str, Any]) -> None:
-        if len(self._captures) >= CAPTURES_KEPT:
-            del self._captures[next(iter(self._captures))]
-        self._captures[_key(message.header)] = message
+        self._exposures.take(message)
         self._go_on()
 
-    def _on_image(self, message: Image, info: Mapping[str, Any]) -> None:
-        self._count_overwritten(info["publication_sequence_number"])
+    def _on_image(self, message: Image | CompressedImage, info: Mapping[str, Any]) -> None:
+        self._count_overwritten(type(message), info["publication_sequence_number"])
+        first = self._last_frame_s is None
+        self._arrived()
         try:
             _check_stamp(message.header)
-            frame = message_to_frame(message)
         except StarposError as error:
-            self._arrived()
             self._complain(str(error))
             return
-        patience_s = CAPTURE_PATIENCE_S if self._captures_come.get_publisher_count() else 0.0
+        patience_s = CAPTURE_PATIENCE_S if self._captures_come() else 0.0
         # At the first image the sender's Captures may not have been discovered yet.
-        if self._last_frame_s is None:
+        if first:
             patience_s = max(patience_s, DISCOVERY_S)
         if self._replayed is not None and self._replayed.playing:
             # It was played before its image, or is not in the bag.
             patience_s = 0.0
-        self._held.append((Job(frame, message.header), self._now_s() + patience_s))
+        self._held.append((message, self._now_s() + patience_s))
         self._go_on()
 
     def _now_s(self) -> float:
@@ -229,7 +224,7 @@ class DetectorNode(Node):
             return
         while self._ready(0):
             if self._worker.idle:
-                self._submit_with_capture(self._held.popleft()[0])
+                self._offer_image(self._held.popleft()[0])
             elif self._ready(1):
                 self._held.popleft()
                 self._dropped += 1
@@ -245,59 +240,37 @@ class DetectorNode(Node):
         if k >= len(self._held):
             return False
         # of one sender they come in order: if that of a later frame is here, its own is lost
-        come = any(_key(job.header) in self._captures for job, _ in itertools.islice(self._held, k, None))
+        come = any(self._exposures.has(image.header) for image, _ in itertools.islice(self._held, k, None))
         return come or len(self._held) > MOST_HELD or self._now_s() >= self._held[k][1]
 
-    def _submit_with_capture(self, job: Job) -> None:
-        """Submit a frame, with its Capture if that has come."""
+    def _offer_image(self, message: Image | CompressedImage) -> None:
+        """Have an image worked on, with what is known of its exposure."""
+        read = message_to_frame if isinstance(message, Image) else message_to_picture
         try:
-            frame = self._with_capture(job)
+            header, add = self._exposures.of(message.header)
+            self._offer(lambda: add(read(message)), header)
         except StarposError as error:
             # The Capture has values that no exposure and no clock can have.
-            self._arrived()
             self._complain(str(error))
-            return
-        self.submit(frame, job.header)
 
-    def _count_overwritten(self, sequence: int | None) -> None:
+    def _count_overwritten(self, kind: type, sequence: int | None) -> None:
         """Count the frames that newer ones replaced in the middleware; a lower number comes from another publisher."""
-        if sequence is not None and self._sequence is not None and sequence > self._sequence:
-            self._dropped += sequence - self._sequence - 1
-        self._sequence = sequence
-
-    def _with_capture(self, job: Job) -> Frame:
-        """Add exposure, errors and shutter of the Capture to its frame; of a lost one those of the last, no exposure."""
-        capture = self._captures.pop(_key(job.header), None) or self._usual
-        told = (capture.exposure, capture.stamp_stddev, capture.clock_stddev)
-        exposure, stamp, clock = (v if math.isfinite(v) and v > 0 else 0.0 for v in told)
-        exposure = exposure or self._values["exposure"] or None
-        frame = replace(
-            job.frame,
-            exposure_s=exposure,
-            stamp_stddev_s=stamp,
-            clock_stddev_s=clock,
-            shutter=message_to_shutter(capture),
-        )
-        # the errors of a camera's times and its shutter are those of its other frames; its exposure may not be
-        self._usual = Capture(
-            stamp_stddev=capture.stamp_stddev,
-            clock_stddev=capture.clock_stddev,
-            shutter_known=capture.shutter_known,
-            readout=capture.readout,
-            readout_stddev=capture.readout_stddev,
-        )
-        return frame
+        before, last = self._sequence
+        if sequence is not None and last is not None and kind is before and sequence > last:
+            self._dropped += sequence - last - 1
+        self._sequence = kind, sequence
 
     def _detect(self, job: Job) -> DetectedFrame:
         """Find the stars of a frame, in the worker's thread."""
         # The CPU time of this thread alone: others may draw or render meanwhile.
         begin, cpu = time.monotonic(), time.thread_time()
-        detection = detect(job.frame, self._settings)
+        frame = job.frame()
+        detection = detect(frame, self._settings)
         message = stars_to_message(detection.stars, job.header.frame_id)
         # The stamp must be the frame's to the nanosecond, because others match messages by it.
         message.header = job.header
         cpu_ms = (time.thread_time() - cpu) * 1e3
-        return DetectedFrame(job.frame, message, detection, cpu_ms, time.monotonic() - begin)
+        return DetectedFrame(frame, message, detection, cpu_ms, time.monotonic() - begin)
 
     def _on_wake(self) -> None:
         for result in self._worker.fetch():
@@ -308,6 +281,7 @@ class DetectorNode(Node):
                     self._replayed.made += 1
                 self._troubles.right("frames")
                 if result.frame is not None:
+                    self._say_size(result.frame)
                     self._annotator.take(result.frame, result.detection.stars, result.message.header)
                 self._last = replace(result, frame=None)
             elif isinstance(result, StarposError):
@@ -320,10 +294,23 @@ class DetectorNode(Node):
         if self._replayed is not None:
             self._replayed.go_on()
 
+    def _say_size(self, frame: Frame) -> None:
+        size = f"{frame.width} x {frame.height} px, {encoding_of(frame)}"
+        if size != self._size:
+            self._size = size
+            self.get_logger().info(f"frames of {size}.")
+
     def _complain(self, sentence: str) -> None:
         self._bad += 1
         self._complaint = sentence
         self._troubles.wrong("frames", sentence)
+
+    def _unsaid(self) -> str:
+        """Sentence on what the user has to state of the camera; '' if there is nothing."""
+        unsaid = self._exposures.unsaid if self._topics.where and not self._captures_come() else ""
+        if unsaid:
+            self._troubles.wrong("stamps", unsaid)
+        return unsaid
 
     def _report(self) -> Diagnosis:
         level, sentence = Level.OK, "no stars in the last frame."
@@ -336,12 +323,20 @@ class DetectorNode(Node):
             sentence += f" {last.detection.left_out} fainter peaks are left out: too many for stars, check the exposure."
         silence_s = time.monotonic() - self._last_frame_s if self._last_frame_s is not None else math.inf
         if self._last_frame_s is None:
-            level, sentence = Level.WARN, f"no frame has come yet{self._where}."
+            level, sentence = (
+                Level.WARN,
+                f"no frame has come yet{self._topics.where}{self._topics.missing()}.",
+            )
         elif complaint:
             level, sentence = Level.WARN, complaint
         elif silence_s > max(MIN_SILENCE_S, 3 * (self._interval_s or 0.0)):
             level = Level.WARN
-            sentence = f"no frame for {silence_s:.0f} s{self._where}: is the camera running?"
+            sentence = f"no frame for {silence_s:.0f} s{self._topics.where}: is the camera running?"
+        elif unsaid := self._unsaid():
+            level, sentence = Level.WARN, f"{sentence} {unsaid}"
+        if unheard := self._topics.unheard():
+            self._troubles.wrong("unheard", unheard)
+            level, sentence = Level.WARN, f"{unheard} {sentence}"
         values: dict[str, object] = {
             "frames": self._frames,
             "bad frames": self._bad,
@@ -361,13 +356,9 @@ class DetectorNode(Node):
         return Diagnosis(level, sentence, values)
 
 
-def _key(header: Header) -> tuple[int, int]:
-    return header.stamp.sec, header.stamp.nanosec
-
-
 def _check_stamp(header: Header) -> None:
     """Raise TimeError if the stamp is not set, or is no time."""
-    sec, nanosec = _key(header)
+    sec, nanosec = key_of(header)
     if not sec and not nanosec:
         raise TimeError(
             "image_raw: the frame has no time stamp; set header.stamp to the middle of the exposure."

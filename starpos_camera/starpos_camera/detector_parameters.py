@@ -3,6 +3,9 @@
 
 import math
 
+from starpos.frames.driver_stamp import KINDS, UNKNOWN
+from starpos.frames.exposure import MOST_EXPOSURE_S
+from starpos.frames.shutter import MOST_READOUT_S
 from starpos_common.parameters import Parameter
 
 PARAMETERS = (
@@ -51,10 +54,38 @@ PARAMETERS = (
     Parameter(
         "exposure",
         0.0,
-        "Exposure time of frames that come without a Capture message, 0 unknown; the tilt is averaged over it.",
+        "Exposure time of frames that come without a Capture message, 0 unknown: the tilt is averaged over it, and it "
+        "tells where the middle of an exposure is whose start or end is stamped.",
         unit="s",
         minimum=0.0,
-        maximum=3600.0,
+        maximum=MOST_EXPOSURE_S,
+    ),
+    Parameter(
+        "stamp",
+        UNKNOWN,
+        "Which moment is stamped of frames without a Capture message: middle, start or end of the exposure of the row "
+        "that is read first, or arrival of the image, after its last row was read; '' unknown: 0.3 s off (1 sigma). "
+        "A wrong one shifts longitudes by 15 arcsec for each second.",
+        choices=KINDS,
+    ),
+    Parameter(
+        "stamp_stddev",
+        math.nan,
+        "How far these stamps may be off; 0.1 s is 46 m at the equator. Unset: 0.02 s for middle, start and end, 0.3 s "
+        "for arrival and unknown. Too small makes fixes claim too much.",
+        unit="s",
+        minimum=0.0,
+        maximum=60.0,
+    ),
+    Parameter(
+        "readout",
+        math.nan,
+        "From the row of these frames that is read first to the last: positive where the top row is first, negative "
+        "where the bottom one is; 0 for a global shutter. Unset: unknown, and fixes hold 0.03 s. The wrong sign makes a "
+        "fix wrong by twice what it would be without.",
+        unit="s",
+        minimum=-MOST_READOUT_S,
+        maximum=MOST_READOUT_S,
     ),
     Parameter(
         "gyro",

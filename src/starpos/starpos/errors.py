@@ -33,6 +33,10 @@ class InstrumentError(StarposError):
     """The instrument's description (camera, misalignment, mount) is missing or inconsistent."""
 
 
+class FieldError(InstrumentError):
+    """The focal length makes a field of another size than this program works with."""
+
+
 class GeoidError(StarposError):
     """A grid of geoid undulations is missing or broken."""
 

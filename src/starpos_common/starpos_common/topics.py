@@ -43,31 +43,33 @@ def subscription(
     depth: int,
     reliability: ReliabilityPolicy = ReliabilityPolicy.RELIABLE,
     raw: bool = False,
+    events: SubscriptionEventCallbacks | None = None,
 ) -> Subscription:
     """Make a volatile subscription that keeps the newest `depth` messages; ParameterError if an override is not allowed.
 
-    raw: the callback takes bytes.
+    raw: the callback takes bytes.  events: in place of rclpy's, which log publishers that do not match.
     """
     # rclpy writes the overrides into the profile: a shared profile would carry them to the next topic.
     qos = QoSProfile(depth=depth, reliability=reliability)
 
     def make() -> Subscription:
         return node.create_subscription(
-            kind, topic, callback, qos, raw=raw, qos_overriding_options=_options()
+            kind, topic, callback, qos, raw=raw, event_callbacks=events, qos_overriding_options=_options()
         )
 
     return _made(node, topic, make)
 
 
 def subscription_from_any(node: Node, kind: type, topic: str, callback: Take, depth: int) -> None:
-    """Subscribe to a topic whether it is published transient_local or volatile; each message is taken once.
+    """Subscribe to a topic of small messages however it is published; each message is taken once.
 
-    DDS has no subscription for both: one that wants what was sent before it came hears no volatile publisher.
+    DDS has no subscription for all: one that wants what was sent before it came hears no volatile publisher, and one
+    that wants each message hears none of best effort.
     """
-    taken: deque[tuple[object, object]] = deque(maxlen=2 * depth)
+    taken: deque[tuple[object, object]] = deque(maxlen=3 * depth)
 
     def once(message: Any, info: Mapping[str, Any]) -> None:
-        # the middleware's own, and so the same in both
+        # the middleware's own, and so the same in all
         which = info.get("source_timestamp"), info.get("publication_sequence_number")
         if any(which) and which in taken:
             return
@@ -76,11 +78,13 @@ def subscription_from_any(node: Node, kind: type, topic: str, callback: Take, de
 
     # rclpy's types know callbacks of one argument only
     heard: Callable[..., None] = once
-    subscription(node, kind, topic, heard, depth)
-    # a volatile publisher is no reason for its warning
+    # a publisher that one of them does not match is no reason for its warning
     silent = SubscriptionEventCallbacks(use_default_callbacks=False)
-    qos = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-    node.create_subscription(kind, topic, heard, qos, event_callbacks=silent)
+    subscription(node, kind, topic, heard, depth, events=silent)
+    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    best_effort = QoSProfile(depth=depth, reliability=ReliabilityPolicy.BEST_EFFORT)
+    for qos in (latched, best_effort):
+        node.create_subscription(kind, topic, heard, qos, event_callbacks=silent)
 
 
 def _options() -> QoSOverridingOptions:

@@ -17,7 +17,6 @@ from starpos.frames.shutter import GLOBAL, Shutter
 from starpos.frames.stars import EDGE, Stars, no_stars
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import Tilt
-from starpos.messages import camera as reading
 from starpos.messages import tilt as tilts
 from starpos.messages.camera import message_to_camera, message_to_frame
 from starpos.messages.stamp import stamp_to_unix
@@ -251,9 +250,8 @@ def test_a_fisheye_round_trip(heard):
         ({"k": [-9.0, 0, 5, 0, 9.0, 5, 0, 0, 1]}, "positive"),
         ({"k": [9.0, 0.1, 5, 0, 9.0, 5, 0, 0, 1]}, "skew"),
         ({"distortion_model": "equidistant"}, "equidistant"),
-        ({"distortion_model": "rational_polynomial", "d": [0.0] * 8}, "8 terms"),
-        ({"d": [0.0] * 4}, "4 terms"),
-        ({"binning_x": 2}, "binned"),
+        ({"distortion_model": "rational_polynomial", "d": [0.0] * 8 + [1e-3] * 4}, "12 terms"),
+        ({"d": [0.0] * 6}, "6 terms"),
         ({"width": 0}, "size"),
     ],
 )
@@ -267,23 +265,23 @@ def test_cameras_that_are_not_understood_are_refused(change, word, heard):
         message_to_camera(heard(CameraInfo()))
 
 
-def test_region_of_interest(heard):
-    message = messages.camera_to_message(Camera.from_focal(100, 80, 1000.0), "c")
-    message.roi.width, message.roi.height = 100, 80
-    message_to_camera(heard(message))
-    message.roi.x_offset = 1
-    with pytest.raises(InstrumentError, match="cropped"):
-        message_to_camera(heard(message))
-
-
 def pixels(kind, channels=1):
     shape = (6, 4) if channels == 1 else (6, 4, channels)
     return RNG.integers(0, np.iinfo(kind).max, shape, kind, endpoint=True)
 
 
-@pytest.mark.parametrize("encoding", reading.ENCODINGS)
+SENT = {
+    "mono8": (np.uint8, 1, ""),
+    "mono16": (np.uint16, 1, ""),
+    "bgr8": (np.uint8, 3, ""),
+    **{f"bayer_{p}8": (np.uint8, 1, p) for p in ("rggb", "bggr", "grbg", "gbrg")},
+    **{f"bayer_{p}16": (np.uint16, 1, p) for p in ("rggb", "bggr", "grbg", "gbrg")},
+}
+
+
+@pytest.mark.parametrize("encoding", SENT)
 def test_frames_round_trip_without_a_copy_on_arrival(encoding, heard):
-    kind, channels, pattern = reading.ENCODINGS[encoding]
+    kind, channels, pattern = SENT[encoding]
     frame = Frame(pixels(kind, channels), pattern=pattern, mid_unix_s=MID, exposure_s=0.5)
     sent = messages.frame_to_message(frame, "c")
     assert sent.encoding == encoding and isinstance(sent.data, array.array)
@@ -314,7 +312,7 @@ def test_padded_rows_and_the_other_byte_order(padding, heard):
 @pytest.mark.parametrize(
     ("change", "word"),
     [
-        ({"encoding": "rgba8"}, "rgba8"),
+        ({"encoding": "32FC1"}, "32FC1"),
         ({"encoding": ""}, "encoding"),
         ({"width": 0}, "empty"),
         ({"height": 0}, "empty"),

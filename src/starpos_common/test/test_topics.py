@@ -1,14 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""QoS overrides reach the topic they name, and no other."""
+"""QoS overrides reach the topic they name, and no other; small messages are heard however they are published."""
+
+import time
 
 import pytest
 import rclpy
-from rclpy.qos import ReliabilityPolicy
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import String
 
 from starpos_common.parameters import ParameterError
-from starpos_common.topics import publisher, subscription
+from starpos_common.topics import publisher, subscription, subscription_from_any
 from starpos_testing.nodes import take_domain
+from starpos_testing.patience import WAIT_S
 
 
 @pytest.fixture
@@ -60,3 +64,36 @@ def test_an_override_that_makes_no_sense_is_refused_in_a_sentence(make, override
     with pytest.raises(ParameterError) as error:
         publisher(make(override), String, "fix", 10)
     assert all(word in str(error.value) for word in words.split())
+
+
+@pytest.mark.parametrize(
+    ("reliability", "durability"),
+    [
+        (ReliabilityPolicy.BEST_EFFORT, DurabilityPolicy.VOLATILE),
+        (ReliabilityPolicy.RELIABLE, DurabilityPolicy.VOLATILE),
+        (ReliabilityPolicy.RELIABLE, DurabilityPolicy.TRANSIENT_LOCAL),
+    ],
+)
+def test_small_messages_are_heard_however_they_are_published_and_once(make, reliability, durability):
+    node, heard = make(), []
+    subscription_from_any(node, String, "info", lambda message, info: heard.append(message.data), 10)
+    qos = QoSProfile(depth=10, reliability=reliability, durability=durability)
+    sender = node.create_publisher(String, "info", qos)
+    executor = SingleThreadedExecutor(context=node.context)
+    executor.add_node(node)
+    end_s = time.monotonic() + WAIT_S
+    while "last" not in heard:
+        assert time.monotonic() < end_s
+        # best effort may lose one
+        sender.publish(String(data="last" if heard else "first"))
+        executor.spin_once(timeout_sec=0.1)
+    first = heard.count("first")
+    for number in range(20):
+        sender.publish(String(data=str(number)))
+        executor.spin_once(timeout_sec=0.1)
+    while "19" not in heard:
+        assert time.monotonic() < end_s
+        sender.publish(String(data="19"))
+        executor.spin_once(timeout_sec=0.1)
+    executor.shutdown()
+    assert first and max(heard.count(str(number)) for number in range(19)) == 1

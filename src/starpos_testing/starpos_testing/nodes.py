@@ -30,7 +30,7 @@ def take_domain() -> None:
     # the profile of the launch files; where their package is not built, nodes find each other some seconds later
     with suppress(PackageNotFoundError):
         profile = Path(get_package_share_directory("starpos_bringup"), "config", "quick_start.xml")
-        os.environ.setdefault("FASTRTPS_DEFAULT_PROFILES_FILE", str(profile))
+        os.environ["FASTRTPS_DEFAULT_PROFILES_FILE"] = str(profile)
 
 
 class Listener:

@@ -180,10 +180,10 @@ class Files(FrameSource):
             return CapturedFrame(frame, Capture.DRIVER)
         by_camera = path.suffix.lower() in PICTURE + JPEG + RAW
         if frame.mid_unix_s is None:
-            lack = (
+            lack = frame.untimed or (
                 "vouch for its camera's clock (files.exif)" if by_camera else "add DATE-OBS and EXPTIME to it"
             )
-            raise FrameError(f"{path}: it does not say when it was taken; {lack}, or set files.restamp.")
+            raise FrameError(f"{path}: it does not say when it was taken: {lack}, or set files.restamp.")
         return CapturedFrame(frame, Capture.EXIF if by_camera else Capture.FILE)
 
     def _next_arrived(self, watched: WatchedFolder) -> CapturedFrame:

@@ -54,7 +54,7 @@ class WatchedFolder:
         self._folder, self._wanted, self._rest_s, self._clock = folder, wanted, rest_s, clock
         self._arrivals: dict[str, NewFile] = {}
         # Hashes of the names of the last listing.
-        self._known = np.zeros(0, np.int64)
+        self._known: np.ndarray = np.zeros(0, np.int64)
         # The folder's device and inode.
         self._is: tuple[int, int] | None = None
         # The folder's time, and when it was seen to change.

@@ -17,6 +17,9 @@ cdef extern from *:
     #else
     #define STARPOS_FUSED STARPOS_WIDE
     #endif
+    /* Numbers that are added and multiplied at once. */
+    typedef double starpos_lanes __attribute__((vector_size(32), aligned(8)));
+    typedef float starpos_eights __attribute__((vector_size(32), aligned(4)));
     /* Put e to the power of each of n numbers in its place, to 3e-16 of it; beyond +-700 as there.
        Unlike libm's it takes wide registers. */
     static inline void starpos_exps(double *x, int n) {
@@ -53,3 +56,15 @@ cdef extern from *:
         }
     }
     """
+    # What functions return whose loops take wide registers: nothing.
+    ctypedef void wide_void "STARPOS_WIDE void"
+    ctypedef void fused_void "STARPOS_FUSED void"
+    # Sums of several pixels side by side, which a compiler left to itself takes one by one. To Cython a number, to C four or eight.
+    ctypedef double lanes "starpos_lanes"
+    ctypedef float eights "starpos_eights"
+
+
+cdef inline double sum_of(const lanes *v) noexcept nogil:
+    """The sum of four lanes."""
+    cdef const double *x = <const double *>v
+    return (x[0] + x[1]) + (x[2] + x[3])

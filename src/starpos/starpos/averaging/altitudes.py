@@ -252,7 +252,7 @@ def _sound(whole: Directions) -> np.ndarray:
         return np.abs(whole.residual(zenith)[0]) / sigma
 
     zenith = min(starts(whole), key=lambda start: float(np.median(size(start))), default=None)
-    rows = every
+    rows: np.ndarray = every
     for _ in range(JUDGED):
         if zenith is None:
             return every

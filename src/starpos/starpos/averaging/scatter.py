@@ -87,7 +87,8 @@ class Scatter:
 
     pose_sigma (rad): root of the mean variance of what does not average away within a pose; frame_sigma (rad): the same
     of all that a frame has beside its own stated error; noise_sigma (rad): of what is new in each frame alone.
-    evident: whether it is improbable that all is as stated.
+    evident: whether it is improbable that the frames scatter as stated.  response_evident: whether it is that the response
+    errs as stated.
     moved (n,), covariance (n, n): of the parameters.  stated (n, n): their covariance if all is as stated, and the
     stated error of a pose new at each.
     """
@@ -96,6 +97,7 @@ class Scatter:
     frame_sigma: float
     noise_sigma: float
     evident: bool
+    response_evident: bool
     moved: np.ndarray
     covariance: np.ndarray
     stated: np.ndarray
@@ -141,7 +143,7 @@ def scatter_of(frames: Frames) -> Scatter:
             for noise in noises:
                 more = _sized(beside + noise**2 * wandering[0].kernel, [shape], sizes, prior / len(noises))
                 tried += [(w, c, v + noise**2 * wandering[0].means) for w, c, v in more]
-    weights, covariances, means = zip(*tried, strict=True)
+    weights, covariances, shares = zip(*tried, strict=True)
     normals, pulls, bares = _sums(y, j, np.array(covariances))
     # each hypothesis of the scatter with each of the response, one after another
     number = len(RESPONSES) if frames.response.any() else 1
@@ -161,12 +163,13 @@ def scatter_of(frames: Frames) -> Scatter:
         weight /= weight.sum()
     mean = weight @ moved
     off = moved - mean
-    pose2, frame2, noise2 = weight @ np.repeat(np.array(means), number, axis=0)
+    pose2, frame2, noise2 = weight @ np.repeat(np.array(shares), number, axis=0)
     return Scatter(
         pose_sigma=float(np.sqrt(pose2 + frames.pose_sigma**2)),
         frame_sigma=float(np.sqrt(frame2 + frames.pose_sigma**2)),
         noise_sigma=float(np.sqrt(noise2)),
-        evident=bool(weight[: many * number : number].sum() < EVIDENT),
+        evident=bool(weight[: many * number].sum() < EVIDENT),
+        response_evident=bool(weight[wider].sum() > 1 - EVIDENT),
         moved=mean,
         covariance=np.tensordot(weight, spread, 1) + (weight * off.T) @ off,
         stated=spread[0],

@@ -16,7 +16,7 @@ from starpos.earth.refraction import Atmosphere
 from starpos.errors import CalibrationError
 from starpos.fix.outliers import distance2, judged
 from starpos.instrument.camera import Camera
-from starpos.instrument.lens import COEFFICIENTS, EQUIDISTANT
+from starpos.instrument.lens import COEFFICIENTS, EQUIDISTANT, PLUMB_BOB, RATIONAL
 
 # 1 sigma of the priors about the given camera: relative focal length, fx over fy, principal point (share of the longer
 # side), and the shift of a corner by k1, k2, p1, p2, k3 (share of half the diagonal)
@@ -69,19 +69,22 @@ def _shrinking(atmosphere: Atmosphere) -> float:
 
 
 def parameters(camera: Camera) -> tuple[str, ...]:
-    """Names (P,) of the parameters of a camera, which depend on the model of its lens."""
-    return ("fx", "fy", "cx", "cy", *COEFFICIENTS[camera.model])
+    """Names (P,) of the parameters of a camera that can be found: of a rational lens all but its denominator's."""
+    return ("fx", "fy", "cx", "cy", *COEFFICIENTS[PLUMB_BOB if camera.model == RATIONAL else camera.model])
 
 
 def camera_values(camera: Camera) -> np.ndarray:
     """Values (P,) of a camera's parameters."""
-    return np.array([camera.fx, camera.fy, camera.cx, camera.cy, *camera.distortion])
+    return np.array([camera.fx, camera.fy, camera.cx, camera.cy, *camera.distortion])[
+        : len(parameters(camera))
+    ]
 
 
 def with_values(camera: Camera, values: np.ndarray) -> Camera:
     """A camera of the same size and model with other values (P,) of its parameters."""
     fx, fy, cx, cy, *distortion = values.tolist()
-    return replace(camera, fx=fx, fy=fy, cx=cx, cy=cy, distortion=tuple(distortion))
+    held = camera.distortion[len(distortion) :]
+    return replace(camera, fx=fx, fy=fy, cx=cx, cy=cy, distortion=(*distortion, *held))
 
 
 # The unknowns q, in sigma of their priors: scale, squareness, the camera's other parameters, and these: the strength of

@@ -239,8 +239,9 @@ class _Agreement:
                 f"{len(self.left_out)} of {of} frames disagree with the others on the zenith: {why}"
             )
         scatter = self.scatter_left
-        # too few to tell how much they scatter, they must agree as they state
-        if scatter > MOST_POSE_RAD or (self.plumb.scatter > MOST_SCATTER and not self.scatter.evident):
+        # frames too few to show an error of the tilts must agree as they state
+        shown = self.scatter.evident or self.scatter.response_evident
+        if scatter > MOST_POSE_RAD or (self.plumb.scatter > MOST_SCATTER and not shown):
             raise FixError(
                 f"{of} frames do not agree on one zenith (they scatter by "
                 f"{np.degrees(scatter):.2f} deg): {why}"
@@ -289,8 +290,27 @@ def _agreed(
 def _agreeing(
     find: FindPlumbLine, whole: Readings, solved: list[FixedFrame], a3: np.ndarray, errors: InclinometerErrors
 ) -> tuple[np.ndarray, PlumbLine]:
-    """Indices of the frames that agree with most of the others, and the plumb line of these."""
-    rows = _unhidden(find, whole, solved, a3)
+    """Indices of the frames that agree with most of the others, and the plumb line of these.
+
+    Of few poses the robust fit may end between sound and bad tilts. A second one begins with the frames that agree with
+    their own poses, and the fit from which half of the frames are less far counts.
+    """
+    starts, calm = [_unhidden(find, whole, solved, a3)], _calm(whole)
+    if (1 - MOST_OUTLIERS) * len(solved) <= len(calm) < len(starts[0]):
+        starts.append(calm)
+    found = [_kept(find, whole, solved, a3, errors, rows) for rows in starts]
+    return min(found, key=lambda f: typical(_left(whole, f[1]), 5))
+
+
+def _kept(
+    find: FindPlumbLine,
+    whole: Readings,
+    solved: list[FixedFrame],
+    a3: np.ndarray,
+    errors: InclinometerErrors,
+    rows: np.ndarray,
+) -> tuple[np.ndarray, PlumbLine]:
+    """The frames in `rows` without those that their plumb line shows to disagree, and the plumb line of the rest."""
     for _ in range(JUDGED):
         plumb = find(whole.take(rows), a3, [solved[k].fix for k in rows])
         size = np.linalg.norm(plumb.left, axis=1)
@@ -302,13 +322,24 @@ def _agreeing(
     return rows, plumb
 
 
+def _calm(whole: Readings) -> np.ndarray:
+    """Indices of the frames whose readings agree with the median of their pose, by how much most frames do."""
+    off = np.empty_like(whole.plumb)
+    for pose in range(whole.pose.max() + 1):
+        rows = whole.pose == pose
+        off[rows] = whole.plumb[rows] - np.median(whole.plumb[rows], axis=0)
+    size = np.linalg.norm(off, axis=1)
+    return np.flatnonzero(size < OUTLIER_SIGMA * np.maximum(whole.sigma, typical(off, 0)))
+
+
 def _unhidden(find: FindPlumbLine, whole: Readings, solved: list[FixedFrame], a3: np.ndarray) -> np.ndarray:
     """Indices of the frames without outliers that pull the fit of all towards them, and so seem to agree with it.
 
     Each is judged against a fit of the frames that lie closest to it, as many as must agree (least trimmed squares).
     Few poses fit almost anything; then these are all.
     """
-    rows = everyone = np.arange(len(solved))
+    everyone: np.ndarray = np.arange(len(solved))
+    rows = everyone
     most = int(np.ceil((1 - MOST_OUTLIERS) * len(solved)))
     if len(np.unique(whole.pose)) < MANY_POSES:
         return everyone

@@ -200,7 +200,7 @@ def _chi2_without(readings: Readings, columns: np.ndarray) -> float:
     design = np.vstack(
         [design * np.repeat(weight, 3)[:, None], np.eye(more, design.shape[1], design.shape[1] - more)]
     )
-    pull = np.ones(len(off))
+    pull: np.ndarray = np.ones(len(off))
     for _ in range(ROBUST_ROUNDS):
         rest = off - design @ np.linalg.lstsq(design * pull[:, None], off * pull, rcond=1e-9)[0]
         size = np.linalg.norm(rest[: len(rest) - more].reshape(-1, 3), axis=1)

@@ -128,7 +128,7 @@ def _from_elevations(args: argparse.Namespace, pointings: Sequence[Pointing]) ->
     """Calibrate from pointings without a roll, whose elevations determine A3's axis; returns the exit status."""
     instrument = options.instrument_of(args, NO_CAMERA)
     calibrate_site.check_output(args, instrument)
-    tilts = _tilts(args, instrument)
+    tilts = checked_tilts("calibrate", args.tilt, instrument).log
     try:
         calibrate_site.run_elevations(args, pointings, instrument, tilts)
     except FixError as e:

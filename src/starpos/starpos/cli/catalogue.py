@@ -19,7 +19,8 @@ ORIGINALS = """The original Tycho-2 files are in Debian's and Ubuntu's source pa
 which brings tycho2_2.orig.tar.xz; give that archive, or a folder with tyc2.dat.00 .. 19 and suppl_1.dat."""
 
 DEEPER = """The catalogue that comes with starpos goes to V = 11. Fields that hold too few of its stars take
-the deeper one (70 MB in the cache) by themselves. Where STARPOS_TYCHO2 names the original files, it
+the deeper one (70 MB in the cache) by themselves. `starpos catalogue deepen --fetch` is all it needs; without
+a network, give it the original files. Where STARPOS_TYCHO2 names the original files, it
 is built as soon as a field needs it."""
 
 
@@ -46,10 +47,21 @@ def define(parser: argparse.ArgumentParser) -> None:
     deepen = kinds.add_parser(
         "deepen",
         help="keep all stars of Tycho-2's original files in the cache, for small fields",
-        epilog=f"{ORIGINALS}\n\n{DEEPER}",
+        epilog=f"{DEEPER}\n\n{ORIGINALS}",
     )
     deepen.formatter_class = argparse.RawDescriptionHelpFormatter
-    deepen.add_argument("originals", metavar="ORIGINALS", help="folder or archive of the original files")
+    source = deepen.add_mutually_exclusive_group(required=True)
+    source.add_argument(
+        "--fetch",
+        nargs="?",
+        const="",
+        metavar="URL",
+        help="fetch the original files (121 MB): from Debian, from a mirror of it, or from the address of the file; "
+        "what has come before is resumed, and the checksum is verified",
+    )
+    source.add_argument(
+        "originals", nargs="?", metavar="ORIGINALS", help="folder or archive of the original files"
+    )
     deepen.set_defaults(run=keep_deeper)
     triangle = kinds.add_parser("triangles", help="the catalogue of triangles of a field; the paper's")
     triangle.add_argument("--paper", action="store_true", help="count the paper's triangles again instead")
@@ -75,7 +87,7 @@ def show(args: argparse.Namespace) -> int:
     if args.path is None:
         more = deeper.kept()
         print(
-            "no deeper catalogue in the cache: small fields want one (`starpos catalogue deepen --help`)"
+            "no deeper catalogue in the cache: small fields want one (`starpos catalogue deepen --fetch`)"
             if more is None
             else f"{len(more)} stars of the deeper catalogue are in the cache, for small fields"
         )
@@ -99,8 +111,12 @@ def build_file(args: argparse.Namespace) -> int:
 
 
 def keep_deeper(args: argparse.Namespace) -> int:
-    """Build the deeper catalogue from the original files into the cache; raises CatalogueError."""
-    made = deeper.build(args.originals, console.ProgressBar(), anew=True)
+    """Build the deeper catalogue from the original files, here or fetched, into the cache; raises CatalogueError."""
+    bar = console.ProgressBar()
+    if args.originals is None:
+        made = deeper.fetched(args.fetch or None, bar)
+    else:
+        made = deeper.build(args.originals, bar, anew=True)
     print(
         f"{len(made)} stars are kept in {cache_folder()}: small fields take them from now on", file=sys.stderr
     )

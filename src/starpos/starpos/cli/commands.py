@@ -90,7 +90,7 @@ COMMANDS = {
         "build the star catalogue, or say what it and its triangles hold",
         (
             "starpos catalogue info",
-            "starpos catalogue deepen tycho2_2.orig.tar.xz",
+            "starpos catalogue deepen --fetch",
         ),
         "starpos identify and starpos solve take the catalogue by themselves",
     ),

@@ -155,7 +155,7 @@ def star_catalogue() -> Finding:
     where = os.environ.get("STARPOS_CATALOGUE") or "the one that comes with starpos"
     found = f"{len(stars)} stars to V = {stars.vmag().max():.1f}, {where}"
     if deeper.kept() is None:
-        found += "; none deeper, which fields under about 1 deg want (starpos catalogue deepen --help)"
+        found += "; none deeper, which fields under about 1 deg want (starpos catalogue deepen --fetch)"
     return Finding(State.OK, found)
 
 

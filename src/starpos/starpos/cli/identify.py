@@ -10,18 +10,21 @@ from starpos.cli.archive import frames_among
 from starpos.cli.inputs import given_of, is_untold, reader_of
 from starpos.cli.output import Output, add_formats
 from starpos.errors import FrameError
-from starpos.fix.blind import BlindSolver
+from starpos.fix.blind import SEARCH_S, BlindSolver
 from starpos.fix.solution import Solution, Status
+from starpos.instrument.lens import EQUIDISTANT
 from starpos.night.reading import First, Given
 from starpos.night.work import Fitting, Identifying, OnFile
+from starpos.parallel.call import Here
+from starpos.progress import quiet
 from starpos.sky.catalogue import load_catalogue
 
 # of --csv
 COLUMNS = ("file", "status", "ra", "dec", "roll", "focal_px", "stars_detected", "stars_matched", "residual_arcsec",
-           "log_odds", "mirrored", "negative", "warnings", "cpu_ms")  # fmt: skip
+           "log_odds", "lens", "mirrored", "negative", "warnings", "cpu_ms")  # fmt: skip
 JSON_HELP = (
     "one JSON object a frame: ra, dec of the middle of the frame and roll, the position angle of its top, in deg (ICRS), "
-    "focal_px, residual_arcsec, log_odds of the answer against chance; status is ok, or why these are null"
+    "focal_px, lens, residual_arcsec, log_odds of the answer against chance; status is ok, or why these are null"
 )
 HEAD = (
     "file: right ascension and declination of the middle of the frame (deg, ICRS), direction of its top (deg, from north "
@@ -40,6 +43,13 @@ def define(parser: argparse.ArgumentParser) -> None:
     )
     options.add_optics(parser)
     options.add_lens(parser)
+    parser.add_argument(
+        "--search-time",
+        type=options.number(0.1, 86400),
+        default=SEARCH_S,
+        metavar="S",
+        help=f"CPU time of the search for a frame of which neither scale nor lens is known ({SEARCH_S:g} s)",
+    )
     jobs.add_jobs(parser)
     parser.set_defaults(run=run)
 
@@ -58,7 +68,9 @@ def run(args: argparse.Namespace) -> int:
             given = given_of(args, about)
             jobs.prepare("identify", options.instrument_of(args, about), about)
         # without a frame that can be read, each one reports why it cannot
-        work = OnFile(read, Identifying(given))
+        # several at once would write over each other's progress
+        progress = console.ProgressBar() if isinstance(workers, Here) else quiet
+        work = OnFile(read, Identifying(given, args.search_time, progress))
         answers = jobs.watched(workers.map((work, path) for path in args.frames), number)
         for path, answer in zip(args.frames, answers, strict=True):
             if isinstance(answer, FrameError):
@@ -68,8 +80,8 @@ def run(args: argparse.Namespace) -> int:
                 found = sight.solution
             any_found |= found.ok
             lost = path if lost is None and found.status is Status.NOT_IDENTIFIED else lost
-            if not found.ok:
-                console.complain("identify", found.message)
+            if not found.ok or found.remark:
+                console.complain("identify", found.remark or found.message)
             output.put(as_json(path, found) | {"cpu_ms": cpu_ms}, _line(path, found))
     if lost is not None and not any_found:
         for remark in Fitting(given)(read(lost)):
@@ -90,6 +102,7 @@ def as_json(path: str, s: Solution) -> dict:
         "stars_matched": len(s.names),
         "residual_arcsec": a.residual_arcsec if a else None,
         "log_odds": a.log_odds if a else None,
+        "lens": a.model if a else None,
         "mirrored": a.mirrored if a else None,
         "negative": s.negative,
         "status": s.status.value,
@@ -107,6 +120,7 @@ def _line(path: str, s: Solution) -> str:
         f"{path}: RA {np.degrees(a.ra):.5f} Dec {np.degrees(a.dec):+.5f} top at {np.degrees(a.roll):.3f} deg, "
         f"{len(s.names)} of {s.stars_detected} stars, residual {a.residual_arcsec:.2f} arcsec, "
         f"focal length {a.focal_px:.1f} px, log-odds {a.log_odds:.0f}"
+        + (", a fisheye" if a.model == EQUIDISTANT else "")
         + (", mirrored" if a.mirrored else "")
         + (", a negative" if s.negative else "")
         + "".join(f", {name}" for name in s.warnings)

@@ -13,7 +13,7 @@ from starpos.frames.shutter import MOST_READOUT_S, UNKNOWN, Shutter
 from starpos.instrument import instrument, instrument_file, sensors
 from starpos.instrument.camera import Camera
 from starpos.instrument.instrument import UNKNOWN_CLOCK_S
-from starpos.instrument.lens import COEFFICIENTS, PLUMB_BOB
+from starpos.instrument.lens import EQUIDISTANT, PLUMB_BOB
 
 
 def add_frames(parser: argparse.ArgumentParser, pointings: bool = False) -> None:
@@ -119,7 +119,7 @@ def add_lens(parser: argparse.ArgumentParser) -> None:
     """Add --lens, the model of a lens that is not calibrated yet."""
     parser.add_argument(
         "--lens",
-        choices=tuple(COEFFICIENTS),
+        choices=(PLUMB_BOB, EQUIDISTANT),
         default=PLUMB_BOB,
         help="model of a lens whose calibration is not known (plumb_bob: a pinhole; equidistant: a fisheye)",
     )

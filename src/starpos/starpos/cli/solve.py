@@ -18,6 +18,7 @@ from starpos.fix.solver import Solver
 from starpos.instrument import instrument_update
 from starpos.instrument.axis import with_frame_size
 from starpos.instrument.tilts import NO_TILTS, Tilts
+from starpos.night.hints import of_one_camera
 from starpos.night.reading import About, First, Given, Reader, stars_of
 from starpos.night.together import turned
 from starpos.night.work import Fitting, Identifying, OnFile, Solving
@@ -139,7 +140,8 @@ def _turned(args: argparse.Namespace, plan: Plan, rows: list) -> tuple[list, int
     sights = [answer[0] for _, answer in rows if not isinstance(answer, FrameError)]
     if not sights or plan.solver is None:
         return rows, 0
-    found = turned(plan.solver, [(s.stars, s.found) for s in sights], plan.tilts, options.turn_of(args))
+    solver, seen = of_one_camera(plan.solver, sights)
+    found = turned(solver, seen, plan.tilts, options.turn_of(args))
     solutions = iter(found.solutions)
     answers = [(path, answer if isinstance(answer, FrameError) else next(solutions)) for path, answer in rows]
     return answers, tell_turned(args, plan.night, found)

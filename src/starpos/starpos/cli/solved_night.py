@@ -49,6 +49,8 @@ def tell(
             solved.append(Solved.of(answer, answer.fix))
         else:
             console.complain("solve", answer.message)
+        if answer.remark:
+            console.complain("solve", answer.remark)
         output.put(
             {"file": path} | json_of(answer.fix, vertical) | json_about(answer),
             line_of(path, answer, args.self_calibrate),

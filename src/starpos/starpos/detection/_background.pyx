@@ -2,86 +2,22 @@
 # cython: language_level=3, boundscheck=False, wraparound=False, cdivision=True, initializedcheck=False
 """The sky in the cells of a mesh, by clipped means of a sample of the 8- or 16-bit pixels, and between the cells."""
 
+from libc.limits cimport UINT_MAX
 from libc.math cimport sqrt
 from libc.stdlib cimport free, malloc
 
 import numpy as np
 
 from starpos._numeric.limits cimport within
-
-cimport starpos._numeric.wide
-
-cdef extern from *:
-    """
-    /* How many of n numbers are at most `limit`. */
-    static inline int starpos_count(const unsigned short *v, int n, unsigned short limit) {
-        int count = 0;
-        for (int first = 0; first < n; first += 4096) {
-            const int last = n < first + 4096 ? n : first + 4096;
-            unsigned short some = 0;
-            for (int i = first; i < last; i++)
-                some += v[i] <= limit;
-            count += some;
-        }
-        return count;
-    }
-    /* The number that would stand at k of n if they were sorted: halving the range takes few looks at whole numbers. */
-    STARPOS_WIDE static int starpos_ranked(const unsigned short *v, int n, int k) {
-        unsigned short least = 65535, most = 0;
-        for (int i = 0; i < n; i++) {
-            least = v[i] < least ? v[i] : least;
-            most = v[i] > most ? v[i] : most;
-        }
-        int low = least, high = most;
-        while (low < high) {
-            const int middle = (low + high) / 2;
-            if (starpos_count(v, n, middle) > k)
-                high = middle;
-            else
-                low = middle + 1;
-        }
-        return low;
-    }
-    /* How many of n numbers are a given one. */
-    STARPOS_WIDE static int starpos_equal(const unsigned short *v, int n, int number) {
-        int count = 0;
-        for (int i = 0; i < n; i++)
-            count += v[i] == number;
-        return count;
-    }
-    /* How far n numbers are from the middle; of those within a limit their number, the sum of the differences and of squares. */
-    STARPOS_WIDE static void starpos_away(const unsigned short *v, int n, unsigned short middle, unsigned short *away) {
-        for (int i = 0; i < n; i++)
-            away[i] = v[i] > middle ? v[i] - middle : middle - v[i];
-    }
-    STARPOS_WIDE static void starpos_sums(const unsigned short *v, int n, int middle, int limit, long long *out) {
-        /* so many squares have a sum of 32 bits */
-        const int most = limit < 65536 ? 4294967295u / ((unsigned)limit * limit + 1) : 0, some = most > 1 ? most : 1;
-        out[0] = out[1] = out[2] = 0;
-        for (int first = 0; first < n; first += some) {
-            const int last = n - first < some ? n : first + some;
-            unsigned square = 0;
-            int count = 0, sum = 0;
-            for (int i = first; i < last; i++) {
-                const int off = v[i] - middle, kept = (unsigned)(off + limit) <= 2u * limit;
-                count += kept;
-                sum += kept ? off : 0;
-                square += kept ? (unsigned)off * (unsigned)off : 0;
-            }
-            out[0] += count;
-            out[1] += sum;
-            out[2] += square;
-        }
-    }
-    """
-    int ranked "starpos_ranked"(const unsigned short *v, int n, int k) noexcept nogil
-    int equal "starpos_equal"(const unsigned short *v, int n, int number) noexcept nogil
-    void away_from "starpos_away"(const unsigned short *v, int n, unsigned short middle, unsigned short *away) noexcept nogil
-    void sums_of "starpos_sums"(const unsigned short *v, int n, int middle, int limit, long long *out) noexcept nogil
+from starpos._numeric.wide cimport wide_void
 
 ctypedef fused pixel_t:
     unsigned char
     unsigned short
+
+cdef enum:
+    # Numbers of which a count fits into 16 bits.
+    BLOCK = 32768
 
 
 cdef struct Clip:
@@ -93,29 +29,98 @@ cdef struct Clip:
     double share
 
 
+cdef inline int _at_most(const unsigned short *v, int n, unsigned short limit) noexcept nogil:
+    """How many of n numbers are at most `limit`."""
+    cdef int count = 0, first = 0, k
+    # of 16 bits too, so that wide registers hold as many as of the numbers
+    cdef unsigned short some
+    while first < n:
+        some = 0
+        for k in range(first, min(first + BLOCK, n)):
+            some += v[k] <= limit
+        count += some
+        first += BLOCK
+    return count
+
+
+cdef wide_void _ranked(const unsigned short *v, int n, int k, int *out) noexcept nogil:
+    """Set `out` to the number at place k of n if they were sorted: halving the range takes few looks at whole numbers."""
+    cdef unsigned short least = 65535, most = 0
+    cdef int low, high, i, middle
+    for i in range(n):
+        least = v[i] if v[i] < least else least
+        most = v[i] if v[i] > most else most
+    low, high = least, most
+    while low < high:
+        middle = (low + high) // 2
+        if _at_most(v, n, <unsigned short>middle) > k:
+            high = middle
+        else:
+            low = middle + 1
+    out[0] = low
+
+
+cdef wide_void _sums(const unsigned short *v, int n, int middle, int limit, long long *out) noexcept nogil:
+    """Sum up the n numbers within a limit of the middle: how many, their differences from it, and the squares of these."""
+    # the sum of so many squares has 32 bits
+    cdef int some = max(<int>(UINT_MAX // (<unsigned int>limit * <unsigned int>limit + 1)), 1) if limit < 65536 else 1
+    cdef int first = 0, k, off, kept, count, total
+    cdef unsigned int squares
+    out[0] = out[1] = out[2] = 0
+    while first < n:
+        count, total, squares = 0, 0, 0
+        for k in range(first, min(first + min(some, n), n)):
+            off = v[k] - middle
+            kept = <unsigned int>(off + limit) <= 2 * <unsigned int>limit
+            off *= kept
+            count += kept
+            total += off
+            squares += <unsigned int>off * <unsigned int>off
+        out[0] += count
+        out[1] += total
+        out[2] += squares
+        first += min(some, n)
+
+
+cdef wide_void _highest(const unsigned short *v, int n, int *highest) noexcept nogil:
+    """Set `highest` to the highest of n numbers, and how many are as high."""
+    cdef unsigned short most = 0
+    cdef int k, count = 0
+    for k in range(n):
+        most = v[k] if v[k] > most else most
+    for k in range(n):
+        count += v[k] == most
+    highest[0], highest[1] = most, count
+
+
 cdef double _quantile(const unsigned short *v, int n, double share) noexcept nogil:
     """A quantile of values (n,), linear between them."""
     cdef double place = share * (n - 1)
     cdef int k = <int>place
-    cdef double low = ranked(v, n, k), high = ranked(v, n, min(k + 1, n - 1))
+    cdef int low, high
+    _ranked(v, n, k, &low)
+    _ranked(v, n, min(k + 1, n - 1), &high)
     return low + (place - k) * (high - low)
 
 
-cdef void _clipped(
+cdef wide_void _clipped(
     const unsigned short *v, int n, const Clip *clip, unsigned short *away, double *level, double *noise
 ) noexcept nogil:
     """Mean and rms of values (n,) without stars and defects; away (n,): to work in.
 
     If more than half of them are equal (a sky cut off at 0), sigma comes from the quantiles above.
     """
-    cdef int middle = ranked(v, n, n // 2)
+    cdef int middle, scatter, k
     cdef long long[3] sums
     cdef double spread, mean
-    away_from(v, n, <unsigned short>middle, away)
-    spread = clip.per_mad * ranked(away, n, n // 2)
+    _ranked(v, n, n // 2, &middle)
+    for k in range(n):
+        away[k] = <unsigned short>(v[k] - middle if v[k] > middle else middle - v[k])
+    _ranked(away, n, n // 2, &scatter)
+    spread = clip.per_mad * scatter
     if spread == 0:
         spread = clip.per_tail * (_quantile(v, n, 0.9) - _quantile(v, n, 0.75))
-    sums_of(v, n, middle, <int>max(clip.sigmas * spread, 1.0), sums)
+    _sums(v, n, middle, <int>max(clip.sigmas * spread, 1.0), sums)
     mean = sums[1] / <double>sums[0]
     level[0] = middle + mean
     noise[0] = sqrt(max(sums[2] / <double>sums[0] - mean * mean, 0.0) * sums[0] / max(sums[0] - 1, 1)) / clip.share
@@ -137,7 +142,8 @@ def sampled(
     Returns level and noise, and the sample's highest value and how many pixels have it, (4, cells down, cells across).
     """
     cdef int down = rows.shape[0], across = columns.shape[0], tall = rows.shape[1], wide = columns.shape[1]
-    cdef int n = tall // 2 * (wide // 2), i, j, phase, k, y, x, top
+    cdef int n = tall // 2 * (wide // 2), i, j, phase, y, x
+    cdef int[2] top
     cdef const pixel_t *row
     cdef Clip clip = Clip(per_mad, per_tail, sigmas, share)
     if not n or tall % 2 or wide % 2:
@@ -162,12 +168,10 @@ def sampled(
                     for x in range(wide // 2):
                         own[x], own[n + x] = row[columns[j, 2 * x]], row[columns[j, 2 * x + 1]]
                 for phase in range(4):
-                    own, top = value + phase * n, 0
-                    for k in range(n):
-                        top = max(top, <int>own[k])
+                    own = value + phase * n
                     _clipped(own, n, &clip, value + 4 * n, &sky[0, phase, i, j], &sky[1, phase, i, j])
-                    highest[0, phase, i, j] = top
-                    highest[1, phase, i, j] = equal(own, n, top)
+                    _highest(own, n, top)
+                    highest[0, phase, i, j], highest[1, phase, i, j] = top[0], top[1]
     free(value)
     return found[0], found[1], tops[0], tops[1]
 

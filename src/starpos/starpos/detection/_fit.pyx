@@ -161,10 +161,11 @@ cdef bint _mark(const Stamp *s, const Star *star, Rules rules, const Pixels *p) 
     """Mark the good pixels that are much too bright for the star; whether they are those that were left out."""
     cdef double faintest = 0.0, light, variance
     cdef int k, place
-    cdef bint same = True, bright
+    cdef bint same = True, bright, found
     memset(s.outlier, 0, s.size * s.size)
     # most stars have none, and had none
-    if not any_bright(p.weight, p.residual, rules.outlier2, p.count):
+    any_bright(p.weight, p.residual, rules.outlier2, p.count, &found)
+    if not found:
         return True
     for k in range(p.count):
         faintest = max(faintest, p.value[k])

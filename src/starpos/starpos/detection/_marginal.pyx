@@ -8,54 +8,14 @@ from libc.string cimport memset
 
 import numpy as np
 
-cimport starpos._numeric.wide
 from starpos._numeric.algebra cimport factored, solved
 from starpos._numeric.limits cimport unsigned_char, within
+from starpos._numeric.wide cimport eights, fused_void
 from starpos.detection._psf cimport BLOCK, ORDERS, Local, blocks, evaluate, local_of, scaled, sound, terms_at
-
-cdef extern from *:
-    """
-    /* Pixels whose products are summed in single precision; eight at once, which a compiler left to itself takes one by one,
-       and four sums side by side, none of which waits for another. */
-    #define STARPOS_EIGHTS 16
-    #define STARPOS_ABREAST 4
-    typedef float starpos_eight __attribute__((vector_size(32)));
-    typedef float starpos_eights __attribute__((vector_size(32), aligned(4)));
-    static inline double starpos_all(const starpos_eight *sums) {
-        const float *v = (const float *)sums;
-        return (double)((v[0] + v[4]) + (v[2] + v[6])) + (double)((v[1] + v[5]) + (v[3] + v[7]));
-    }
-    /* Add to the lower half of normal (k, k) and to right (k,) what so many steps of pixels say. design (k, room), and beyond
-       it room for the steps abreast. */
-    STARPOS_FUSED static void starpos_gram(const float *design, const float *weight, const float *value, int k, int steps,
-                                          double *normal, double *right) {
-        const starpos_eights *row = (const starpos_eights *)design, *w = (const starpos_eights *)weight;
-        const starpos_eights *v = (const starpos_eights *)value;
-        for (int a = 0; a < k; a++) {
-            starpos_eight weighted[STARPOS_EIGHTS], sum = {0};
-            for (int s = 0; s < steps; s++) {
-                weighted[s] = row[a * STARPOS_EIGHTS + s] * w[s];
-                sum += weighted[s] * v[s];
-            }
-            right[a] += starpos_all(&sum);
-            for (int b = 0; b <= a; b += STARPOS_ABREAST) {
-                const starpos_eights *other = row + b * STARPOS_EIGHTS;
-                starpos_eight product[STARPOS_ABREAST] = {{0}};
-                for (int s = 0; s < steps; s++)
-                    for (int c = 0; c < STARPOS_ABREAST; c++)
-                        product[c] += weighted[s] * other[c * STARPOS_EIGHTS + s];
-                for (int c = 0; c < STARPOS_ABREAST && b + c <= a; c++)
-                    normal[a * k + b + c] += starpos_all(&product[c]);
-            }
-        }
-    }
-    """
-    void gram "starpos_gram"(
-        const float *design, const float *weight, const float *value, int k, int steps, double *normal, double *right
-    ) noexcept nogil
 
 cdef enum:
     ROOM = 128
+    EIGHTS = 16
     STEP = 8
     ABREAST = 4
 
@@ -69,6 +29,43 @@ cdef struct Pixels:
     float[ROOM] value
     unsigned char[ROOM] phase
     float *design
+
+
+cdef inline double _all(const eights *sums) noexcept nogil:
+    cdef const float *v = <const float *>sums
+    return <double>((v[0] + v[4]) + (v[2] + v[6])) + <double>((v[1] + v[5]) + (v[3] + v[7]))
+
+
+cdef fused_void _gram(
+    const float *design, const float *weight, const float *value, int n, int steps, double *normal, double *right
+) noexcept nogil:
+    """Add to the lower half of normal (n, n) and to right (n,) what so many steps of pixels say.
+
+    design: (n, ROOM), and beyond it room for the rows abreast.
+    """
+    cdef const eights *row
+    cdef const eights *other
+    cdef const eights *w = <const eights *>weight
+    cdef const eights *v = <const eights *>value
+    cdef eights[EIGHTS] weighted
+    # four sums side by side, none of which waits for another
+    cdef eights[ABREAST] sums
+    cdef int a, b, c, s
+    for a in range(n):
+        row = <const eights *>design + a * EIGHTS
+        memset(sums, 0, sizeof(sums))
+        for s in range(steps):
+            weighted[s] = row[s] * w[s]
+            sums[0] += weighted[s] * v[s]
+        right[a] += _all(sums)
+        for b in range(0, a + 1, 4):
+            other = <const eights *>design + b * EIGHTS
+            memset(sums, 0, sizeof(sums))
+            for s in range(steps):
+                for c in range(ABREAST):
+                    sums[c] += weighted[s] * other[c * EIGHTS + s]
+            for c in range(min(ABREAST, a + 1 - b)):
+                normal[a * n + b + c] += _all(&sums[c])
 
 
 cdef void _add(
@@ -97,7 +94,7 @@ cdef void _add(
     # the last step is filled up
     for k in range(pixels.count, (pixels.count + STEP - 1) // STEP * STEP):
         pixels.weight[k] = pixels.value[k] = 0.0
-    gram(pixels.design, pixels.weight, pixels.value, terms + free_, (pixels.count + STEP - 1) // STEP, normal, right)
+    _gram(pixels.design, pixels.weight, pixels.value, terms + free_, (pixels.count + STEP - 1) // STEP, normal, right)
     pixels.count = 0
 
 
@@ -160,7 +157,7 @@ def marginal(
             raise ValueError(f"pixels {(images, rows, columns)}: {(n, size, size)} are needed")
     if top.shape[0] != n or orders.shape[1] != 2 or phases not in (1, 4):
         raise ValueError(f"{top.shape[0]} rows, {phases} phases, orders of {orders.shape[1]} numbers: {n} rows, 1 or 4, 2")
-    if not within[unsigned_char](&phase[0, 0, 0], n * size * size, 0, phases - 1):
+    if not within[unsigned_char](&phase[0, 0, 0], phase.shape[0] * phase.shape[1] * phase.shape[2], 0, phases - 1):
         raise ValueError(f"a pixel of phase {np.max(phase)}: there are {phases}")
     if not within[int](&orders[0, 0], 2 * count, 0, ORDERS):
         raise ValueError(f"terms of orders to {np.max(orders)}: they must be 0 to {ORDERS}")

@@ -14,7 +14,9 @@ from starpos.detection._shapes cimport Shape, clipped_to, inverse, put_shape, sh
 
 cdef extern from *:
     """
-    /* Columns that are summed side by side, and groups of these whose Gaussians are made at once: left to itself a compiler
+    /* In C because Cython has no constants of several numbers: columns one by one take 2.6 times the instructions here, a tenth
+       more in all for a frame of 5 megapixels with 315 stars.
+       Columns that are summed side by side, and groups of these whose Gaussians are made at once: left to itself a compiler
        takes them one by one, and of wider vectors than registers it keeps most in memory. */
     #define STARPOS_LANES 4
     #define STARPOS_GROUPS 16

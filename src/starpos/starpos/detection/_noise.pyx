@@ -4,48 +4,18 @@
 
 from libc.math cimport INFINITY, hypot, sqrt
 from libc.stdlib cimport free, malloc
+from libc.string cimport memset
 
 import numpy as np
 
-cimport starpos._numeric.wide
 from starpos._numeric.algebra cimport middle
 from starpos._numeric.limits cimport within
-
-cdef extern from *:
-    """
-    /* Four pixels at once, which a compiler left to itself takes one by one. */
-    typedef double starpos_four __attribute__((vector_size(32)));
-    typedef double starpos_fours __attribute__((vector_size(32), aligned(8)));
-    typedef long long starpos_marks __attribute__((vector_size(32)));
-    /* Sums over n pixels (whole fours) of the light over its variance squared, and, of pixels whose square is not too large
-       for it, of the products of light, light squared and the excess, each over the variance: pp, pq, qq, p, q. */
-    STARPOS_FUSED static void starpos_light_sums(const double *noise2, const double *light, const double *square, int n,
-                                                double photon, double misfit2, double limit2, double *out) {
-        starpos_four sums[6] = {{0}};
-        for (int k = 0; k < n; k += 4) {
-            const starpos_four s = *(const starpos_fours *)(light + k), sky = *(const starpos_fours *)(noise2 + k);
-            const starpos_four r2 = *(const starpos_fours *)(square + k), variance = sky + (photon + misfit2 * s) * s;
-            const starpos_four all = s / variance, excess = (r2 - sky) / variance;
-            const starpos_four a = (starpos_four)((starpos_marks)all & (starpos_marks)(r2 < limit2 * variance)), b = a * s;
-            sums[0] += all * all;
-            sums[1] += a * a;
-            sums[2] += a * b;
-            sums[3] += b * b;
-            sums[4] += a * excess;
-            sums[5] += b * excess;
-        }
-        for (int k = 0; k < 6; k++)
-            out[k] = (sums[k][0] + sums[k][1]) + (sums[k][2] + sums[k][3]);
-    }
-    """
-    void light_sums "starpos_light_sums"(
-        const double *noise2, const double *light, const double *square, int n, double photon, double misfit2, double limit2,
-        double *out,
-    ) noexcept nogil
+from starpos._numeric.wide cimport fused_void, lanes, sum_of
 
 cdef enum:
     # Pixels that are summed at once.
     LANES = 4
+    BLOCK = 64
     ROUNDS = 4
 
 # Smaller singular values, as a share of the largest, are 0; residuals are at most so much more certain than they look.
@@ -80,15 +50,50 @@ cdef (double, double) _two_terms(double pp, double pq, double qq, double p, doub
     return 0.0, b
 
 
+cdef fused_void _light_sums(const Pixels *p, double photon, double misfit2, double limit2, double *out) noexcept nogil:
+    """Sums over pixels of their light over its variance, squared; and pp, pq, qq, p, q.
+
+    These are the products of light, light squared and the excess, each over the variance, of pixels whose square is not too large
+    for it.
+    """
+    cdef double[BLOCK] whole
+    cdef double[BLOCK] kept
+    cdef double[BLOCK] excess
+    cdef double[BLOCK] light
+    cdef lanes[6] sums
+    cdef lanes all_, a, b, e
+    cdef double variance
+    cdef int first = 0, n, k
+    memset(sums, 0, sizeof(sums))
+    while first < p.count:
+        # whole lanes, as the pixels are
+        n = min(BLOCK, p.count - first)
+        for k in range(n):
+            light[k] = p.light[first + k]
+            variance = p.noise2[first + k] + (photon + misfit2 * light[k]) * light[k]
+            whole[k], excess[k] = light[k] / variance, (p.square[first + k] - p.noise2[first + k]) / variance
+            kept[k] = whole[k] if p.square[first + k] < limit2 * variance else 0.0
+        for k in range(0, n, 4):
+            all_, a, e = (<const lanes *>(whole + k))[0], (<const lanes *>(kept + k))[0], (<const lanes *>(excess + k))[0]
+            b = a * (<const lanes *>(light + k))[0]
+            sums[0] += all_ * all_
+            sums[1] += a * a
+            sums[2] += a * b
+            sums[3] += b * b
+            sums[4] += a * e
+            sums[5] += b * e
+        first += BLOCK
+    for k in range(6):
+        out[k] = sum_of(&sums[k])
+
+
 cdef (double, double) _fitted(const Pixels *p, double photon, double misfit2, double outlier2) noexcept nogil:
     """DN of a photon, with 1 sigma of its error, and misfit squared, from those before."""
     cdef double[6] sums
     cdef int round_
     for round_ in range(ROUNDS):
         # at first nothing is known that could be exceeded
-        light_sums(
-            p.noise2, p.light, p.square, p.count, photon, misfit2, outlier2 if photon + misfit2 > 0 else INFINITY, sums
-        )
+        _light_sums(p, photon, misfit2, outlier2 if photon + misfit2 > 0 else INFINITY, sums)
         photon, misfit2 = _two_terms(sums[1], sums[2], sums[3], sums[4], sums[5])
     # because errors given too small do more harm than too large ones
     return photon + sqrt(2 / max(sums[0], 1e-12)), misfit2

@@ -8,37 +8,11 @@ from libc.string cimport memset
 
 import numpy as np
 
+from starpos._numeric.wide cimport fused_void, lanes, sum_of
 from starpos.detection._equations cimport invert, invert_scaled, scaled_factor, solve_scaled
 from starpos.detection._psf cimport BLOCK, Local, blocks, evaluate, local_of, sound, values
 from starpos.detection._rules cimport MOST, PHASES, Rules, first_of_phase, is_settled, rows_within, sound_stamps
 from starpos.detection._sums cimport chi_square, products, weigh
-
-cdef extern from *:
-    """
-    /* Products of three columns with three others and the weights, summed over n pixels: ad, ae, af, bd, be, bf, cd, ce, cf. */
-    STARPOS_FUSED static void starpos_crossed(const double *weight, const double *const *one, const double *const *other, int n,
-                                             double *out) {
-        starpos_four sums[3][3] = {{{0}}};
-        for (int p = 0; p + 4 <= n; p += 4) {
-            const starpos_four w = *(const starpos_fours *)(weight + p);
-            for (int a = 0; a < 3; a++) {
-                const starpos_four wa = w * *(const starpos_fours *)(one[a] + p);
-                for (int b = 0; b < 3; b++)
-                    sums[a][b] += wa * *(const starpos_fours *)(other[b] + p);
-            }
-        }
-        for (int a = 0; a < 3; a++)
-            for (int b = 0; b < 3; b++) {
-                double sum = (sums[a][b][0] + sums[a][b][1]) + (sums[a][b][2] + sums[a][b][3]);
-                for (int p = n / 4 * 4; p < n; p++)
-                    sum += weight[p] * one[a][p] * other[b][p];
-                out[3 * a + b] = sum;
-            }
-    }
-    """
-    void crossed "starpos_crossed"(
-        const double *weight, const double *const *one, const double *const *other, int n, double *out
-    ) noexcept nogil
 
 cdef enum:
     # Parameters of both stars.
@@ -216,6 +190,24 @@ cdef void _weigh(const Star *star, Rules rules, Pixels *p) noexcept nogil:
     weigh(p.signal, p.noise2, p.light, 1.0, rules.dn_per_photon, rules.misfit2, p.count, p.weight, p.residual)
 
 
+cdef fused_void _crossed(const double *weight, const double **one, const double **other, int n, double *out) noexcept nogil:
+    """Products of three columns with three others and the weights, summed over n pixels: ad, ae, af, bd, be, bf, cd, ce, cf."""
+    cdef lanes[9] sums
+    cdef lanes wa
+    cdef int a, b, p
+    memset(sums, 0, sizeof(sums))
+    for p in range(0, n - 3, 4):
+        for a in range(3):
+            wa = (<const lanes *>(weight + p))[0] * (<const lanes *>(one[a] + p))[0]
+            for b in range(3):
+                sums[3 * a + b] += wa * (<const lanes *>(other[b] + p))[0]
+    for a in range(3):
+        for b in range(3):
+            out[3 * a + b] = sum_of(&sums[3 * a + b])
+            for p in range(n // 4 * 4, n):
+                out[3 * a + b] += weight[p] * one[a][p] * other[b][p]
+
+
 cdef void _products(const Pixels *p, int first, int n, double *square, double *right) noexcept nogil:
     """Sums over n pixels of the products (6, 6), lower half, of both stars' derivatives and values, and with the residuals (6,)."""
     cdef const double *column[6]
@@ -229,7 +221,7 @@ cdef void _products(const Pixels *p, int first, int n, double *square, double *r
         square[a], square[a + 6], square[a + 7] = sums[0], sums[1], sums[2]
         square[a + 12], square[a + 13], square[a + 14] = sums[3], sums[4], sums[5]
         right[3 * k], right[3 * k + 1], right[3 * k + 2] = sums[6], sums[7], sums[8]
-    crossed(p.weight + first, column + 3, column, n, sums)
+    _crossed(p.weight + first, column + 3, column, n, sums)
     for a in range(3):
         for b in range(3):
             square[6 * (3 + a) + b] = sums[3 * a + b]

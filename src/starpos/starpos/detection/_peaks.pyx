@@ -8,68 +8,7 @@ from libc.string cimport memset
 
 import numpy as np
 
-cimport starpos._numeric.wide
-
-cdef extern from *:
-    """
-    /* Take a row of n pixels; the highest. */
-    #define STARPOS_WIDEN(kind, pixel) \
-        STARPOS_WIDE static int starpos_widen_##kind(float *restrict out, const pixel *restrict row, Py_ssize_t n) { \
-            pixel highest = 0; \
-            for (Py_ssize_t i = 0; i < n; i++) \
-                highest = row[i] > highest ? row[i] : highest; \
-            for (Py_ssize_t i = 0; i < n; i++) \
-                out[i] = row[i]; \
-            return highest; \
-        }
-    STARPOS_WIDEN(8, unsigned char) STARPOS_WIDEN(16, unsigned short)
-    /* Set `out` to a row times its weight and three pairs of others, each times its weight; or add three pairs. */
-    STARPOS_FUSED static void starpos_begin(float *restrict out, const float *w, Py_ssize_t n, const float *m, const float *const *p) {
-        const float s = w[0], t = w[1], u = w[2], v = w[3];
-        const float *a = p[0], *b = p[1], *c = p[2], *d = p[3], *e = p[4], *f = p[5];
-        #pragma GCC unroll 2
-        for (Py_ssize_t i = 0; i < n; i++)
-            out[i] = s * m[i] + (t * (a[i] + b[i]) + u * (c[i] + d[i]) + v * (e[i] + f[i]));
-    }
-    STARPOS_FUSED static void starpos_add(float *restrict out, const float *w, Py_ssize_t n, const float *const *p) {
-        const float t = w[0], u = w[1], v = w[2];
-        const float *a = p[0], *b = p[1], *c = p[2], *d = p[3], *e = p[4], *f = p[5];
-        for (Py_ssize_t i = 0; i < n; i++)
-            out[i] += t * (a[i] + b[i]) + u * (c[i] + d[i]) + v * (e[i] + f[i]);
-    }
-    /* Whether the sum of a pixel and the next one is above the limit: four times eight at once, which a compiler left to
-       itself takes one by one. The last of these may overlap with others. */
-    typedef float starpos_eights __attribute__((vector_size(32), aligned(4)));
-    typedef int starpos_marks __attribute__((vector_size(32)));
-    STARPOS_WIDE static int starpos_any_pair(const float *row, float limit, Py_ssize_t n) {
-        starpos_marks any[4] = {{0}};
-        int found = 0;
-        for (Py_ssize_t i = 0; i < n && n >= 32; i += 32) {
-            const float *at = row + (i < n - 32 ? i : n - 32);
-            for (int k = 0; k < 4; k++)
-                any[k] |= *(const starpos_eights *)(at + 8 * k) + *(const starpos_eights *)(at + 8 * k + 1) > limit;
-        }
-        any[0] |= any[1] | any[2] | any[3];
-        for (int k = 0; k < 8; k++)
-            found |= any[0][k];
-        for (Py_ssize_t i = 0; i < n && n < 32; i++)
-            found |= row[i] + row[i + 1] > limit;
-        return found != 0;
-    }
-    /* Whether a pixel of the row is above its limit. */
-    STARPOS_WIDE static int starpos_any_above(const float *restrict row, const float *restrict limit, Py_ssize_t n) {
-        int any = 0;
-        for (Py_ssize_t i = 0; i < n; i++)
-            any |= row[i] > limit[i];
-        return any;
-    }
-    """
-    int widen_8 "starpos_widen_8"(float *out, const unsigned char *row, Py_ssize_t n) noexcept nogil
-    int widen_16 "starpos_widen_16"(float *out, const unsigned short *row, Py_ssize_t n) noexcept nogil
-    void begin "starpos_begin"(float *out, const float *w, Py_ssize_t n, const float *middle, const float **p) noexcept nogil
-    void add "starpos_add"(float *out, const float *w, Py_ssize_t n, const float **p) noexcept nogil
-    bint any_pair "starpos_any_pair"(const float *row, float limit, Py_ssize_t n) noexcept nogil
-    bint any_above "starpos_any_above"(const float *row, const float *limit, Py_ssize_t n) noexcept nogil
+from starpos._numeric.wide cimport fused_void, wide_void
 
 ctypedef unsigned char unsigned_char
 
@@ -266,6 +205,55 @@ cdef inline Py_ssize_t _mirrored(Py_ssize_t k, Py_ssize_t n) noexcept nogil:
     return k if n > 1 else 0
 
 
+cdef wide_void _widen(const pixel_t *row, Py_ssize_t n, float *out, int *highest) noexcept nogil:
+    """Take a row of n pixels, and its highest."""
+    cdef pixel_t most = 0
+    cdef Py_ssize_t k
+    for k in range(n):
+        most = row[k] if row[k] > most else most
+    for k in range(n):
+        out[k] = row[k]
+    highest[0] = most
+
+
+cdef fused_void _weighted(
+    float *out, int first, const float *weight, Py_ssize_t n, const float *middle, const float **p
+) noexcept nogil:
+    """Add three pairs of rows, each times its weight from the first on, to `out`; with the first pairs also the middle row."""
+    cdef float s = weight[0], t = weight[first], u = weight[first + 1], v = weight[first + 2]
+    cdef const float *a = p[0]
+    cdef const float *b = p[1]
+    cdef const float *c = p[2]
+    cdef const float *d = p[3]
+    cdef const float *e = p[4]
+    cdef const float *f = p[5]
+    cdef Py_ssize_t k
+    if first == 1:
+        for k in range(n):
+            out[k] = s * middle[k] + (t * (a[k] + b[k]) + u * (c[k] + d[k]) + v * (e[k] + f[k]))
+    else:
+        for k in range(n):
+            out[k] += t * (a[k] + b[k]) + u * (c[k] + d[k]) + v * (e[k] + f[k])
+
+
+cdef wide_void _any_pair(const float *row, float limit, Py_ssize_t n, bint *found) noexcept nogil:
+    """Whether the sum of one of n pixels and the next is above the limit."""
+    cdef int any_ = 0
+    cdef Py_ssize_t k
+    for k in range(n):
+        any_ |= row[k] + row[k + 1] > limit
+    found[0] = any_
+
+
+cdef wide_void _any_above(const float *row, const float *limit, Py_ssize_t n, bint *found) noexcept nogil:
+    """Whether one of n pixels is above its limit."""
+    cdef int any_ = 0
+    cdef Py_ssize_t k
+    for k in range(n):
+        any_ |= row[k] > limit[k]
+    found[0] = any_
+
+
 cdef void _smooth_across(const pixel_t[:, ::1] plane, Smoother *s, Py_ssize_t row, float *out) noexcept nogil:
     """Set `out` (stride,) to a row smoothed with those above and below it, and its margins."""
     cdef const float *pair[2 * TOGETHER]
@@ -277,10 +265,7 @@ cdef void _smooth_across(const pixel_t[:, ::1] plane, Smoother *s, Py_ssize_t ro
         s.end = max(row - s.reach, 0)
     s.last = row
     while s.end < min(row + s.reach + 1, height):
-        if pixel_t is unsigned_char:
-            highest = widen_8(s.plain + (s.end % s.slots) * width, &plane[s.end, 0], width)
-        else:
-            highest = widen_16(s.plain + (s.end % s.slots) * width, &plane[s.end, 0], width)
+        _widen(&plane[s.end, 0], width, s.plain + (s.end % s.slots) * width, &highest)
         if s.highest != NULL:
             s.highest[s.end] = highest
         s.end += 1
@@ -290,10 +275,7 @@ cdef void _smooth_across(const pixel_t[:, ::1] plane, Smoother *s, Py_ssize_t ro
             near = k + j if k + j <= s.reach else 0
             pair[2 * j] = s.plain + (_mirrored(row - near, height) % s.slots) * width
             pair[2 * j + 1] = s.plain + (_mirrored(row + near, height) % s.slots) * width
-        if k == 1:
-            begin(smooth, s.weight, width, s.plain + (row % s.slots) * width, pair)
-        else:
-            add(smooth, &s.weight[k], width, pair)
+        _weighted(smooth, k, s.weight, width, s.plain + (row % s.slots) * width, pair)
     for k in range(1, s.padded + 1):
         smooth[-k], smooth[width - 1 + k] = smooth[_mirrored(-k, width)], smooth[_mirrored(width - 1 + k, width)]
 
@@ -305,10 +287,7 @@ cdef void _smooth_along(const Smoother *s, const float *row, Py_ssize_t n, float
     for k in range(1, s.padded + 1, 3):
         for j in range(TOGETHER):
             pair[2 * j], pair[2 * j + 1] = row - (k + j), row + (k + j)
-        if k == 1:
-            begin(out, s.weight, n, row, pair)
-        else:
-            add(out, &s.weight[k], n, pair)
+        _weighted(out, k, s.weight, n, row, pair)
 
 
 cdef void _finish(const Smoother *s, Window *w, Py_ssize_t row, Py_ssize_t block) noexcept nogil:
@@ -327,16 +306,19 @@ cdef int _take_peaks(const Smoother *s, Window *w, Py_ssize_t height, Py_ssize_t
     # the first pixel that the row's first one is made of
     cdef const float *across = w.across + (row % w.kept) * s.stride + s.padded - s.reach
     cdef Py_ssize_t top = max(row - flat, 0), bottom = min(row + flat + 1, height), block, first, count, x, y, k
+    cdef bint found
     g.here, g.above = g.above, g.here
     if g.last >= row - 2:
         memset(g.here, 0xFF, (w.width + 2) * sizeof(int))
     for block in range(w.blocks):
         first = block * BLOCK
         count = min(BLOCK, w.width - first)
-        if not any_pair(across + first, w.least[block], count + 2 * s.reach - 1):
+        _any_pair(across + first, w.least[block], count + 2 * s.reach - 1, &found)
+        if not found:
             continue
         _finish(s, w, row, block)
-        if not any_above(own + first, w.limit + first, count):
+        _any_above(own + first, w.limit + first, count, &found)
+        if not found:
             continue
         for y in range(top, bottom):
             for k in range(max(first - flat, 0) // BLOCK, (min(first + count + flat, w.width) - 1) // BLOCK + 1):

@@ -7,31 +7,7 @@ from libc.stdlib cimport free, malloc
 
 import numpy as np
 
-cimport starpos._numeric.wide
 from starpos._numeric.algebra cimport level_and_scatter, middle
-
-cdef extern from *:
-    """
-    /* The highest of n numbers, eight at once, which a compiler left to itself takes one by one. */
-    typedef float starpos_eights __attribute__((vector_size(32), aligned(4)));
-    typedef int starpos_marks __attribute__((vector_size(32)));
-    STARPOS_WIDE static float starpos_highest(const float *v, int n) {
-        starpos_eights most = {v[0], v[0], v[0], v[0], v[0], v[0], v[0], v[0]};
-        for (int i = 0; i + 8 <= n; i += 8) {
-            const starpos_eights some = *(const starpos_eights *)(v + i);
-            const starpos_marks above = some > most;
-            most = (starpos_eights)((above & (starpos_marks)some) | (~above & (starpos_marks)most));
-        }
-        float highest = v[0];
-        for (int k = 0; k < 8; k++)
-            highest = most[k] > highest ? most[k] : highest;
-        for (int i = n / 8 * 8; i < n; i++)
-            highest = v[i] > highest ? v[i] : highest;
-        return highest;
-    }
-    """
-    float highest_of "starpos_highest"(const float *v, int n) noexcept nogil
-
 
 cdef struct Rim:
     # Of a stamp: the pixels at its edges, over their noise, and their noise; whether this is the same in all.
@@ -39,6 +15,15 @@ cdef struct Rim:
     bint even
     double *score
     double *noise
+
+
+cdef float _highest(const float *v, int n) noexcept nogil:
+    """The highest of n numbers."""
+    cdef float highest = v[0]
+    cdef int k
+    for k in range(n):
+        highest = v[k] if v[k] > highest else highest
+    return highest
 
 
 cdef void _take_rim(const float *signal, const float *noise, int size, Rim *rim) noexcept nogil:
@@ -78,7 +63,7 @@ def level(float[:, :, ::1] signal, float[:, :, ::1] noise, double per_mad, doubl
         for k in range(n):
             _take_rim(&signal[k, 0, 0], &noise[k, 0, 0], size, &rim)
             sky, spread = level_and_scatter(rim.score, rim.count, per_mad, uneven)
-            light = own * highest_of(&signal[k, 0, 0], area) / (rim.noise[0] if rim.even else middle(rim.noise, rim.count))
+            light = own * _highest(&signal[k, 0, 0], area) / (rim.noise[0] if rim.even else middle(rim.noise, rim.count))
             up = <float>sky if sky > raised and sky > light else 0
             wider = <float>spread if spread > light else 1
             if up != 0 or wider != 1:

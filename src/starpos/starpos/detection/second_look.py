@@ -55,9 +55,9 @@ class SecondLook:
         first number exceeds that of a normal distribution nowhere. Ties count against a star. NaN at the frame's edge.
         """
         steps = np.arange(-FARTHEST, FARTHEST + 1, STEP)
-        dx, dy = (d.ravel() for d in np.meshgrid(steps, steps))
-        around = (np.hypot(dx, dy) >= NEAREST) & (np.hypot(dx, dy) <= FARTHEST)
-        dx, dy = np.append(0, dx[around]), np.append(0, dy[around])
+        across, down = (d.ravel() for d in np.meshgrid(steps, steps))
+        around = (np.hypot(across, down) >= NEAREST) & (np.hypot(across, down) <= FARTHEST)
+        dx, dy = np.append(0, across[around]), np.append(0, down[around])
         height, width = self._smooth.shape
         left, top, right, bottom = self.window or (0, 0, width, height)
         edge = self._kernel.reach + 1

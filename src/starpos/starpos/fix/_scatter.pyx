@@ -7,49 +7,14 @@ from libc.stdlib cimport free, malloc
 
 import numpy as np
 
-cimport starpos._numeric.wide
 from starpos._numeric.algebra cimport middle
+from starpos._numeric.wide cimport wide_void
 
 cdef enum:
     # determinants whose product is a number, points of an integral, steps of a search
     TOGETHER = 8
     POINTS = 128
     MOST_TURNS = 100
-
-
-cdef extern from *:
-    """
-    /* Take half of a residual's squared distance from n totals, and multiply n products by its determinant in n units; one
-       for each variance that is added to its own. */
-    STARPOS_WIDE static void starpos_widen(const double *restrict residual, const double *restrict covariance,
-            const double *restrict extra, const double *restrict units, int n, double *restrict total,
-            double *restrict product) {
-        const double x2 = residual[0] * residual[0], y2 = residual[1] * residual[1];
-        const double xy = covariance[1], twice = 2 * xy * residual[0] * residual[1];
-        for (int g = 0; g < n; g++) {
-            const double xx = covariance[0] + extra[g], yy = covariance[3] + extra[g], determinant = xx * yy - xy * xy;
-            total[g] -= 0.5 * (yy * x2 - twice + xx * y2) / determinant;
-            product[g] *= determinant * units[g];
-        }
-    }
-    /* Squared distances of n residuals under a variance that is added to theirs. */
-    STARPOS_WIDE static void starpos_distances(const double *restrict x2, const double *restrict y2,
-            const double *restrict twice, const double *restrict xx, const double *restrict xy, const double *restrict yy,
-            double extra, int n, double *restrict d2) {
-        for (int k = 0; k < n; k++) {
-            const double x = xx[k] + extra, y = yy[k] + extra;
-            d2[k] = (y * x2[k] - twice[k] * xy[k] + x * y2[k]) / (x * y - xy[k] * xy[k]);
-        }
-    }
-    """
-    void starpos_distances(
-        const double *x2, const double *y2, const double *twice, const double *xx, const double *xy, const double *yy,
-        double extra, int n, double *d2
-    ) noexcept nogil
-    void starpos_widen(
-        const double *residual, const double *covariance, const double *extra, const double *units, int n, double *total,
-        double *product
-    ) noexcept nogil
 
 
 cdef inline double distance2_of(
@@ -94,7 +59,7 @@ def expected_variance(
         # of determinants: they are alike then, and their products neither too large nor too small for a number
         units[g] = 1 / (stated + extra[g]) / (stated + extra[g])
     for k in range(n):
-        starpos_widen(&residual[k, 0], &covariance[k, 0, 0], extra, units, POINTS, total, product)
+        _add(&residual[k, 0], &covariance[k, 0, 0], extra, units, total, product)
         # a logarithm for several determinants
         if k % TOGETHER == TOGETHER - 1 or k == n - 1:
             for g in range(POINTS):
@@ -110,6 +75,20 @@ def expected_variance(
         whole += density
         mean += density * extra[g]
     return mean / whole
+
+
+cdef wide_void _add(
+    const double *residual, const double *covariance, const double *extra, const double *units, double *total, double *product
+) noexcept nogil:
+    """Take half of a residual's squared distance from totals, and multiply products by its determinant, for each extra variance."""
+    cdef double x2 = residual[0] * residual[0], y2 = residual[1] * residual[1], xy = covariance[1]
+    cdef double twice = 2 * xy * residual[0] * residual[1], xx, yy, determinant
+    cdef int g
+    for g in range(POINTS):
+        xx, yy = covariance[0] + extra[g], covariance[3] + extra[g]
+        determinant = xx * yy - xy * xy
+        total[g] -= 0.5 * (yy * x2 - twice + xx * y2) / determinant
+        product[g] *= determinant * units[g]
 
 
 def sifted(
@@ -230,11 +209,23 @@ cdef double searched(Columns *c, double share, double median_of_chi2, double lea
     return exp(there)
 
 
+cdef wide_void _distances(
+    const double *x2, const double *y2, const double *twice, const double *xx, const double *xy, const double *yy, double extra,
+    int n, double *d2
+) noexcept nogil:
+    """Squared distances (n,) of residuals under a variance that is added to theirs."""
+    cdef int k
+    cdef double x, y
+    for k in range(n):
+        x, y = xx[k] + extra, yy[k] + extra
+        d2[k] = (y * x2[k] - twice[k] * xy[k] + x * y2[k]) / (x * y - xy[k] * xy[k])
+
+
 cdef double size(Columns *c, double extra, double median_of_chi2) noexcept nogil:
     """The mean squared distance along an axis under an extra variance; from the median if median_of_chi2 > 0."""
     cdef double total = 0.0
     cdef int k
-    starpos_distances(c.x2, c.y2, c.twice, c.xx, c.xy, c.yy, extra, c.n, c.d2)
+    _distances(c.x2, c.y2, c.twice, c.xx, c.xy, c.yy, extra, c.n, c.d2)
     if median_of_chi2 > 0:
         return middle(c.d2, c.n) / median_of_chi2
     for k in range(c.n):

@@ -1,38 +1,51 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The pointing of a frame whose scale nobody has said."""
+"""The pointing of a frame whose scale, and lens, nobody has said."""
 
 import time
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from starpos.budget import Budget
 from starpos.errors import StarposError
 from starpos.fix.identified import identified
+from starpos.fix.noise_alone import why_noise
 from starpos.fix.solution import Solution, Status
 from starpos.frames.stars import Stars
-from starpos.identification import FEWEST_STARS, Sky, quad_cache
+from starpos.identification import FEWEST_STARS, Identification, Sky, blind_fisheye, quad_cache
 from starpos.identification.blind import LARGEST_DEG, SMALLEST_DEG, STAGES, identify_blind
-from starpos.identification.search import frame_stars, through
+from starpos.identification.blind_fisheye import NARROWEST_DEG, WIDEST_DEG, disc_radius_px, identify_fisheye
+from starpos.identification.search import field_of
 from starpos.identification.triangles import no_triangles
+from starpos.instrument.camera import Camera
 from starpos.progress import Progress, quiet
 from starpos.sky.catalogue import Catalogue
+
+# CPU time, s, of the search for one frame.
+SEARCH_S = 20.0
 
 
 @dataclass(frozen=True)
 class BlindSolver:
-    """Identifies frames of any scale, first near that of their EXIF; `stages` of the search are fewer to be quick."""
+    """Identifies frames of any scale, those of fisheyes too; where EXIF tells a scale, first near that.
+
+    stages, fisheye_stages: of the search; fewer are quicker.
+    search_s: CPU time after which the search of a frame ends.
+    """
 
     catalogue: Catalogue
     progress: Progress = quiet
     stages: tuple[tuple[int, float], ...] = STAGES
+    fisheye_stages: tuple[int, ...] = blind_fisheye.STAGES
+    search_s: float = SEARCH_S
 
     def prepare(self) -> None:
         """Load the quads, or build them."""
         quad_cache.cached(self.catalogue, self.progress)
 
     def identify(self, stars: Stars) -> Solution:
-        """Names of the stars, pointing and focal length of a pinhole camera with its axis in the middle of the frame."""
-        begin = time.perf_counter()
+        """Names of the stars, pointing, focal length and lens of a camera with its axis near the middle of the frame."""
+        begin, budget = time.perf_counter(), Budget.of(self.search_s)
         inside = np.flatnonzero(stars.on_frame)
         seen = stars.take(inside)
         if len(seen) < FEWEST_STARS:
@@ -41,24 +54,58 @@ class BlindSolver:
                 "and exposure"
             )
             return Solution.failed(stars, Status.TOO_FEW_STARS, message)
+        if noise := why_noise(stars):
+            return Solution.failed(stars, Status.NOT_IDENTIFIED, noise)
         try:
             sky = Sky.at(self.catalogue, no_triangles(), stars.mid_unix_s)
         except StarposError as e:
             return Solution.refused(stars, e)
-        quads = quad_cache.cached(self.catalogue, self.progress)
-        xy = np.stack([seen.x, seen.y], 1)
-        size, near_px, window = (stars.width, stars.height), stars.rough_focal_px, stars.window
-        match = identify_blind(xy, seen.sigma, *size, sky, quads, self.stages, near_px, window)
+        match = self._match(seen, sky, budget)
         if match is None:
-            message = (
-                f"{stars.place}: none of the sky fits its {len(seen)} stars at any scale (fields of {SMALLEST_DEG:g} to "
-                f"{LARGEST_DEG:g} deg from corner to corner were tried): give the focal length if it is known, check "
-                "clouds and exposure"
-            )
             return replace(
-                Solution.failed(stars, Status.NOT_IDENTIFIED, message), identify_s=time.perf_counter() - begin
+                Solution.failed(stars, Status.NOT_IDENTIFIED, _why(seen, self.search_s, budget)),
+                identify_s=time.perf_counter() - begin,
             )
         camera, found = match
-        field = frame_stars(camera.directions(seen.x, seen.y), seen.sigma, camera)
-        answer = identified(seen, through(field, camera, window), sky, camera, found)
+        field = field_of(camera.directions(seen.x, seen.y), seen.sigma, camera, seen.window)
+        answer = identified(seen, field, sky, camera, found)
         return replace(answer.among(stars, inside), identify_s=time.perf_counter() - begin)
+
+    def _match(self, seen: Stars, sky: Sky, budget: Budget) -> tuple[Camera, Identification] | None:
+        """A camera and its identification of stars: of a pinhole, else of a fisheye, which comes first in a disc."""
+        quads = quad_cache.cached(self.catalogue, self.progress)
+        xy = np.stack([seen.x, seen.y], 1)
+        about = xy, seen.sigma, seen.width, seen.height, sky, quads
+        near_px = seen.rough_focal_px
+
+        def by_fisheye() -> tuple[Camera, Identification] | None:
+            return identify_fisheye(*about, self.fisheye_stages, near_px, budget, self.progress)
+
+        def by_pinhole() -> tuple[Camera, Identification] | None:
+            return identify_blind(*about, self.stages, near_px, seen.window, budget, self.progress)
+
+        ways = (by_pinhole, by_fisheye)
+        if disc_radius_px(xy, seen.width, seen.height) is not None:
+            ways = (by_fisheye, by_pinhole)
+        return ways[0]() or ways[1]()
+
+
+def _why(seen: Stars, search_s: float, budget: Budget) -> str:
+    """A sentence that says why stars were not identified, and what to do."""
+    tried = (
+        f"fields of {SMALLEST_DEG:g} to {LARGEST_DEG:g} deg from corner to corner, fisheyes of {NARROWEST_DEG:g} to "
+        f"{WIDEST_DEG:g} deg"
+    )
+    if budget.spent:
+        what = (
+            f"in {search_s:g} s of CPU none of the sky was found to fit its {len(seen)} stars at any scale ({tried}): "
+            "give more time (--search-time) or the focal length"
+        )
+    else:
+        what = (
+            f"none of the sky fits its {len(seen)} stars at any scale ({tried}, were tried): give the focal length if it "
+            "is known, check clouds and exposure"
+        )
+    if disc_radius_px(np.stack([seen.x, seen.y], 1), seen.width, seen.height) is not None:
+        what += "; the stars lie in a disc, as those of a fisheye do: give its focal length with --lens equidistant"
+    return f"{seen.place}: {what}"

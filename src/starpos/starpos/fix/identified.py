@@ -56,8 +56,12 @@ def attitude_of(found: Identification, sky: Sky, camera: Camera) -> Attitude:
         across, down, row = camera.centre_from_axis
         centre, above = (across, down, scale), (across, down - row, scale)
     else:
+        # a mirrored fisheye's attitude is that of its picture turned over about the axis, which need not be the middle
+        turned = found.mirrored and wide.is_wide(camera)
         x, y = camera.centre_px
-        centre, above = camera.scaled(scale).directions([x, x], [y, y - 1.0])
+        centre, above = camera.scaled(scale).directions([x, x], [y, y + 1.0 if turned else y - 1.0])
+        if turned:
+            centre, above = wide.FLIP @ centre, wide.FLIP @ above
     ra, dec, roll = found.pointing(centre, above, sky.velocity)
     return Attitude(
         ra=ra,

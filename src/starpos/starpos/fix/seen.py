@@ -10,7 +10,7 @@ from starpos.identification._frame import FrameStars, all_within, ideal_frame, u
 from starpos.identification.pose import LEAST_SIGMA_PX, TEST_STARS
 from starpos.identification.search import through
 from starpos.instrument.camera import Camera
-from starpos.instrument.lens import PLUMB_BOB
+from starpos.instrument.lens import EQUIDISTANT
 
 # Lower stars of a fisheye make no fix: what refraction does near the horizon no model tells.
 LEAST_ALTITUDE_RAD = math.radians(10)
@@ -18,7 +18,7 @@ LEAST_ALTITUDE_RAD = math.radians(10)
 
 def inside(stars: Stars, camera: Camera) -> np.ndarray | None:
     """Rows of the stars that lie on their frame and in its lens's picture; None if all do, as is usual."""
-    if camera.model == PLUMB_BOB and all_within(stars.x, stars.y, stars.width, stars.height, EDGE_PX):
+    if camera.model != EQUIDISTANT and all_within(stars.x, stars.y, stars.width, stars.height, EDGE_PX):
         return None
     on = stars.on_frame & camera.sees(stars.x, stars.y)
     return None if on.all() else np.flatnonzero(on)

@@ -67,6 +67,7 @@ class Solution:
     found: the identification itself, whose rows are those of the input's stars.
     negative: whether the stars are dark on a bright sky.
     hint: helps to identify the next frame.
+    remark: what is to be said of a frame although it was identified; '' if nothing is.
     """
 
     status: Status
@@ -89,6 +90,7 @@ class Solution:
     explained: Explained | None = None
     found: Identification | None = None
     negative: bool = False
+    remark: str = ""
 
     @classmethod
     def of(cls, frame: Stars | Pointing, message: str = "identified", **found: Any) -> "Solution":

@@ -10,7 +10,7 @@ import numpy as np
 
 from starpos.earth.orientation import EarthState, earth_state
 from starpos.earth.refraction import Atmosphere
-from starpos.errors import FixError, InstrumentError, StarposError, TimeError
+from starpos.errors import FieldError, FixError, InstrumentError, StarposError, TimeError
 from starpos.fix.fix import Fix, MatchedStars, solve_fix, sound_matches
 from starpos.fix.horizon import check_above_horizon
 from starpos.fix.identified import identified
@@ -267,7 +267,7 @@ class Solver:
             camera = self.instrument.camera_for(width, height, origin_px)
             field_deg = math.degrees(2 * camera.half_diagonal_rad)
             if field_deg < SMALLEST_FIELD_DEG or (field_deg > LARGEST_FIELD_DEG and not wide.is_wide(camera)):
-                raise InstrumentError(
+                raise FieldError(
                     f"focal length {camera.fx:.0f} px makes a field of {field_deg:.2f} deg across, this program works "
                     f"from {SMALLEST_FIELD_DEG:g} to {LARGEST_FIELD_DEG:g} deg: check focal length and pixel size, and "
                     "whether the lens is a fisheye (equidistant)"

@@ -24,6 +24,7 @@ class Exposure:
     exposure_s      None: unknown
     source          where it came from, for messages: a path or a topic
     focal_px        focal length by the file's header (FOCALLEN / XPIXSZ), px; only a hint; None: unknown
+    pixel_um        pixel size by the file's header (XPIXSZ), um; None: unknown
     rough_focal_px  focal length by the camera's EXIF, px: where a search for it begins; None: unknown
     origin_px       column and row of the sensor's whole frame at which this one begins; NaN: it is a part, and nobody
                     knows which; None: nobody has said that it is one
@@ -43,6 +44,7 @@ class Exposure:
     clock_stddev_s: float = 0.0
     shutter: Shutter | None = None
     rough_focal_px: float | None = None
+    pixel_um: float | None = None
     origin_px: tuple[float, float] | None = None
     untimed: str = ""
 

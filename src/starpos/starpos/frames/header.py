@@ -42,6 +42,7 @@ def about(header: Mapping, place: str) -> dict[str, Any]:
     return times.times(header) | {
         "source": place,
         "focal_px": focal_px(header),
+        "pixel_um": _positive(header, "XPIXSZ"),
         "shutter": shutter(header, place),
         "origin_px": origin_px(header),
     }
@@ -77,18 +78,19 @@ def shutter(header: Mapping, place: str) -> Shutter | None:
 
 def focal_px(header: Mapping) -> float | None:
     """Focal length in px by FOCALLEN (mm) / XPIXSZ (um), else by a plate scale; None if nothing says it. Only a hint."""
+    focal, pixel_um = _positive(header, "FOCALLEN"), _positive(header, "XPIXSZ")
+    if focal is not None and pixel_um is not None:
+        return focal * 1000.0 / pixel_um
+    scales = (_positive(header, key) for key in SCALES)
+    return next((1.0 / (scale * ARCSEC) for scale in scales if scale is not None), None)
 
-    def number(key: str) -> float:
-        with suppress(KeyError, TypeError, ValueError, OverflowError):
-            if LEAST < (value := float(header[key])) < math.inf:
-                return value
-        return math.nan
 
-    told = (
-        number("FOCALLEN") * 1000.0 / number("XPIXSZ"),
-        *(1.0 / (number(key) * ARCSEC) for key in SCALES),
-    )
-    return next((focal for focal in told if math.isfinite(focal)), None)
+def _positive(header: Mapping, key: str) -> float | None:
+    """A number above LEAST; None for anything else."""
+    with suppress(KeyError, TypeError, ValueError, OverflowError):
+        if LEAST < (value := float(header[key])) < math.inf:
+            return value
+    return None
 
 
 def focal_mm(focal_px: float, pixel_um: float) -> float:

@@ -28,6 +28,12 @@ def picture_frame(data: bytes, place: str, clock: exif.CameraClock | None = None
 
     place says where the bytes came from, for messages; clock is that of the camera, if it may be trusted.
     """
+    pixels = picture_pixels(data, place)
+    return Frame(pixels, source=place, **exif.told(data, place, clock, pixels.shape))
+
+
+def picture_pixels(data: bytes, place: str) -> np.ndarray:
+    """The pixels of a Frame from the bytes of a PNG, TIFF, JPEG or BMP; FrameError for anything else."""
     size = _size(data)
     if size is None:
         raise FrameError(f"{place}: this is not a whole PNG, TIFF, JPEG or BMP image; give one, or FITS.")
@@ -35,8 +41,7 @@ def picture_frame(data: bytes, place: str, clock: exif.CameraClock | None = None
     pixels = decode_picture(_png_image(data) if data.startswith(PNG_START) else data)
     if pixels is None:
         raise FrameError(f"{place}: this is not a whole PNG, TIFF, JPEG or BMP image; take or copy it again.")
-    pixels = frame_pixels(pixels, place)
-    return Frame(pixels, source=place, **exif.told(data, place, clock, pixels.shape))
+    return frame_pixels(pixels, place)
 
 
 def frame_pixels(pixels: np.ndarray, place: str) -> np.ndarray:

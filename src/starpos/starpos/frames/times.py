@@ -87,8 +87,8 @@ def times(header: Mapping) -> dict[str, Any]:
     other = max(middles, key=lambda m: _apart_s(m, best))
     if (apart_s := _apart_s(other, best)) > MOST_APART_S:
         return {
-            "untimed": f"by {best.by} the middle of the exposure is {abs(other.after_s - best.after_s):.3g} s from where "
-            f"{other.by} have it: these cards contradict each other, correct the header"
+            "untimed": f"the middle of its exposure by {best.by} and by {other.by} differ by "
+            f"{abs(other.after_s - best.after_s):.3g} s: these cards contradict each other, correct the header"
         }
     if exposure_s is None:
         exposure_s = _span_s(told)
@@ -164,7 +164,7 @@ def _middles(
     for key, start in starts.items():
         at_s = start.since_s(zero)
         found += [
-            _Middle(at_s + s / 2, start.stddev_s, f"{key} and {length}") for length, s in lengths.items()
+            _Middle(at_s + s / 2, start.stddev_s, f"{key} with {length}") for length, s in lengths.items()
         ]
         for last, end in ends.items():
             span_s = end.since_s(start)
@@ -172,14 +172,14 @@ def _middles(
                 raise TimeError(f"its {last} is before its {key}: correct the header")
             # an end is often when the frame had come: a start and a length count for more
             stddev_s = math.hypot(start.stddev_s, end.stddev_s)
-            found.append(_Middle(at_s + span_s / 2, stddev_s, f"{key} and {last}"))
+            found.append(_Middle(at_s + span_s / 2, stddev_s, f"{key} with {last}"))
     if not starts:
         # what reads the clock when the frame has come is late
         found += [
             _Middle(
                 end.since_s(zero) - s / 2,
                 math.hypot(end.stddev_s, UNKNOWN_LATENCY_S),
-                f"{last} and {length}",
+                f"{last} with {length}",
             )
             for last, end in ends.items()
             for length, s in lengths.items()

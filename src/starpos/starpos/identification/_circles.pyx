@@ -2,12 +2,13 @@
 # cython: language_level=3, boundscheck=False, wraparound=False, cdivision=True, initializedcheck=False
 """Build a catalogue of triangles: those of the brightest stars of circles over the sky, measured and put in bins."""
 
-from libc.math cimport M_PI, asin, atan2, cos, fabs, floor, hypot, sin, sqrt
-from libc.stdlib cimport free, malloc
+from libc.limits cimport INT_MAX
+from libc.math cimport M_PI, asin, atan2, cos, fabs, floor, sin, sqrt
 
 import numpy as np
 
 from starpos._numeric.algebra cimport fetch
+from starpos._numeric.limits cimport within
 from starpos.identification._triangles cimport CODES, bin_of, code_of, is_counter_clockwise
 
 
@@ -18,7 +19,7 @@ cdef enum:
 
 
 cdef class Cells:
-    """Stars in cells of a width (rad): zones of declination, each parted in right ascension; and a radius about points."""
+    """Stars in cells: zones of declination, each parted in right ascension; and a radius (rad) about points."""
 
     cdef const double[:, ::1] v
     cdef double radius, chord2
@@ -28,8 +29,10 @@ cdef class Cells:
     cdef int[::1] start
     cdef int[::1] row
 
-    def __init__(self, const double[:, ::1] v, double radius, double width):
+    def __init__(self, const double[:, ::1] v, double radius):
         cdef int k, n = v.shape[0]
+        # no more cells than a few for each star
+        cdef double width = max(radius, 2.0 / sqrt(max(n, 4)))
         self.v, self.radius, self.chord2 = v, radius, (2 * sin(radius / 2)) ** 2
         self.zones = max(1, <int>(M_PI / width))
         middles = (np.arange(self.zones) + 0.5) * np.pi / self.zones - np.pi / 2
@@ -91,8 +94,7 @@ def well_apart(const double[:, ::1] v, double nearest):
 
     Close groups make no triangles among themselves, but would use up the stars of a circle.
     """
-    # a few stars in a cell
-    cdef Cells cells = Cells(v, nearest, max(nearest, 2.0 / sqrt(max(len(v), 4))))
+    cdef Cells cells = Cells(v, nearest)
     cdef int k, first = 0
     rows = np.empty(len(v), np.intp)
     cdef Py_ssize_t[::1] row = rows
@@ -106,38 +108,93 @@ def well_apart(const double[:, ::1] v, double nearest):
 
 
 def triples_of_circles(const double[:, ::1] v, const double[:, ::1] centres, double radius, int most):
-    """Keys of all triples among the `most` first of the stars v (n, 3) in each circle: (a n + b) n + c, a < b < c."""
-    cdef Cells cells = Cells(v, radius, radius)
-    cdef long long n = v.shape[0]
+    """The triples a < b < c among the `most` first of the stars v (n, 3) in each circle: a (T,), and b, c as one number (T,)."""
+    cdef Cells cells = Cells(v, radius)
     cdef int[MOST_TAKEN] taken
-    cdef int circle, count, a, b, c
-    cdef Py_ssize_t place = 0
+    cdef int count, i, j, k
+    cdef Py_ssize_t circle, place = 0
     if not 3 <= most <= MOST_TAKEN:
         raise ValueError(f"{most} stars of each circle: it must be 3 to {MOST_TAKEN}")
-    found = np.empty(len(centres) * (most * (most - 1) * (most - 2) // 6), np.int64)
-    cdef long long[::1] key = found
+    room = len(centres) * (most * (most - 1) * (most - 2) // 6)
+    brightest, others = np.empty(room, np.int32), np.empty(room, np.int64)
+    cdef int[::1] a = brightest
+    cdef long long[::1] pair = others
     for circle in range(centres.shape[0]):
         count = cells.brightest(&centres[circle, 0], most, taken)
-        for a in range(count):
-            for b in range(a + 1, count):
-                for c in range(b + 1, count):
-                    key[place] = (taken[a] * n + taken[b]) * n + taken[c]
+        for i in range(count):
+            for j in range(i + 1, count):
+                for k in range(j + 1, count):
+                    a[place], pair[place] = taken[i], <long long>taken[j] << 32 | taken[k]
                     place += 1
-    return found[:place]
+    return brightest[:place], others[:place]
+
+
+def distinct(const int[::1] brightest, const long long[::1] others, Py_ssize_t n):
+    """The distinct ones of triples of n stars, as `triples_of_circles` returns them, sorted.
+
+    Returns start (n + 1,) and others: those whose brightest star is a are others[start[a]:start[a + 1]]. One key of 64 bits for
+    all three stars would overflow beyond two million stars.
+    """
+    cdef Py_ssize_t k, begin = 0, end, kept = 0, count = brightest.shape[0]
+    cdef int a
+    if others.shape[0] != count or not within[int](&brightest[0], count, 0, <int>min(n, INT_MAX) - 1):
+        raise ValueError(f"a triple is not of the {n} stars")
+    starts, ordered = np.zeros(n + 1, np.intp), np.empty(count, np.int64)
+    cdef Py_ssize_t[::1] start = starts
+    cdef long long[::1] pair = ordered
+    for k in range(count):
+        start[brightest[k] + 1] += 1
+    np.cumsum(starts, out=starts)
+    with nogil:
+        for k in range(count):
+            # the places are far from each other
+            fetch(&start[brightest[min(k + 2 * AHEAD, count - 1)]])
+            fetch(&pair[min(start[brightest[min(k + AHEAD, count - 1)]], count - 1)])
+            a = brightest[k]
+            pair[start[a]] = others[k]
+            start[a] += 1
+        # by now start[a] is the end of star a's
+        for a in range(n):
+            end, start[a] = start[a], kept
+            _sort(&pair[begin], end - begin)
+            for k in range(begin, end):
+                if k == begin or pair[k] != pair[kept - 1]:
+                    pair[kept] = pair[k]
+                    kept += 1
+            begin = end
+    start[n] = kept
+    return starts, ordered[:kept]
+
+
+cdef void _sort(long long *v, Py_ssize_t n) noexcept nogil:
+    """Sort up to a few hundred numbers, by Shell's method: a library's sort is called too slowly for so few."""
+    cdef Py_ssize_t gap = 1, i, j
+    cdef long long x
+    while gap < n // 3:
+        gap = 3 * gap + 1
+    while gap > 0:
+        for i in range(gap, n):
+            x, j = v[i], i
+            while j >= gap and v[j - gap] > x:
+                v[j] = v[j - gap]
+                j -= gap
+            v[j] = x
+        gap //= 3
 
 
 def binned(
-    const double[:, ::1] v, const int[::1] rows, const long long[::1] keys, double shortest, double longest,
-    int bins,
+    const double[:, ::1] v, const int[::1] rows, const Py_ssize_t[::1] first, const long long[::1] others, double shortest,
+    double longest, int bins,
 ):
-    """The triangles of keys whose sides are longer than `shortest` and shorter than `longest`, rad, in bins of their shape.
+    """The triangles of triples whose sides are longer than `shortest` and shorter than `longest`, rad, in bins of their shape.
 
-    v, rows  directions (S, 3) of all stars, and the rows (n,) of those that the keys number; keys ascend
+    v, rows        directions (S, 3) of all stars, and the rows (n,) of those that the triples number
+    first, others  the triples, as `distinct` returns them
 
     Returns corners (T, 3), counter_clockwise (T,), shape (T, 3) and bin_start, as `TriangleCatalogue` has them.
     """
-    cdef long long n = rows.shape[0], rest, a = 0, b
-    cdef Py_ssize_t k, kept = 0
+    cdef Py_ssize_t k, kept = 0, n = rows.shape[0], count = others.shape[0]
+    cdef long long a, b, c
     cdef int i, j
     cdef int[3] corner
     cdef double[3] sine
@@ -146,8 +203,14 @@ def binned(
     cdef int[3] code
     cdef double least = sin(shortest / 2), most = sin(longest / 2)
     per_unit[0], per_unit[1], per_unit[2] = CODES / (2 * M_PI / 3), CODES / (M_PI / 3), CODES / longest
-    of = np.empty(len(keys), np.int32)
-    made = np.empty((len(keys), 3), np.uint16), np.empty((len(keys), 3), np.int32), np.empty(len(keys), np.uint8)
+    if len(first) != n + 1 or first[0] != 0 or first[n] != count or np.diff(first).min(initial=0) < 0:
+        raise ValueError("the triples of each star do not follow each other")
+    if not within[int](&rows[0], n, 0, <int>min(len(v), INT_MAX) - 1):
+        raise ValueError(f"a triple is of a star beyond {len(v)}")
+    if count > INT_MAX:
+        raise ValueError(f"{count} triangles: a catalogue holds at most {INT_MAX}")
+    of = np.empty(count, np.int32)
+    made = np.empty((count, 3), np.uint16), np.empty((count, 3), np.int32), np.empty(count, np.uint8)
     starts = np.zeros(bins + 1, np.int32)
     cdef int[::1] bin = of
     cdef unsigned short[:, ::1] shape = made[0]
@@ -155,32 +218,32 @@ def binned(
     cdef unsigned char[::1] turns = made[2]
     cdef int[::1] start = starts
     with nogil:
-        for k in range(keys.shape[0]):
-            # keys rise
-            while keys[k] >= (a + 1) * n * n:
-                a += 1
-            rest = keys[k] - a * n * n
-            b = rest // n
-            corner[0], corner[1], corner[2] = rows[a], rows[b], rows[rest - b * n]
-            for i in range(3):
-                sine[i] = _half_chord(&v[corner[(i + 1) % 3], 0], &v[corner[(i + 2) % 3], 0])
-            # the largest angle lies opposite the longest side
-            for i in range(2):
-                for j in range(2 - i):
-                    if sine[j] < sine[j + 1]:
-                        sine[j], sine[j + 1] = sine[j + 1], sine[j]
-                        corner[j], corner[j + 1] = corner[j + 1], corner[j]
-            if not (sine[0] < most and sine[2] > least):
-                continue
-            _largest_and_smallest(sine, angle)
-            code[0] = code_of(angle[0], M_PI / 3, per_unit[0])
-            code[1] = code_of(angle[1], 0.0, per_unit[1])
-            code[2] = code_of(2 * asin(sine[0]), 0.0, per_unit[2])
-            for i in range(3):
-                corners[kept, i], shape[kept, i] = corner[i], <unsigned short>code[i]
-            turns[kept] = is_counter_clockwise(&v[corner[0], 0], &v[corner[1], 0], &v[corner[2], 0])
-            bin[kept] = bin_of(code[0], code[1], code[2])
-            kept += 1
+        for a in range(n):
+            for k in range(first[a], first[a + 1]):
+                b, c = others[k] >> 32, <unsigned int>others[k]
+                if not a < b < c < n:
+                    with gil:
+                        raise ValueError(f"stars {a}, {b} and {c} of {n} make no triple")
+                corner[0], corner[1], corner[2] = rows[a], rows[b], rows[c]
+                for i in range(3):
+                    sine[i] = _half_chord(&v[corner[(i + 1) % 3], 0], &v[corner[(i + 2) % 3], 0])
+                # the largest angle lies opposite the longest side
+                for i in range(2):
+                    for j in range(2 - i):
+                        if sine[j] < sine[j + 1]:
+                            sine[j], sine[j + 1] = sine[j + 1], sine[j]
+                            corner[j], corner[j + 1] = corner[j + 1], corner[j]
+                if not (sine[0] < most and sine[2] > least):
+                    continue
+                _largest_and_smallest(sine, angle)
+                code[0] = code_of(angle[0], M_PI / 3, per_unit[0])
+                code[1] = code_of(angle[1], 0.0, per_unit[1])
+                code[2] = code_of(2 * asin(sine[0]), 0.0, per_unit[2])
+                for i in range(3):
+                    corners[kept, i], shape[kept, i] = corner[i], <unsigned short>code[i]
+                turns[kept] = is_counter_clockwise(&v[corner[0], 0], &v[corner[1], 0], &v[corner[2], 0])
+                bin[kept] = bin_of(code[0], code[1], code[2])
+                kept += 1
         for k in range(kept):
             fetch(&start[bin[min(k + 2 * AHEAD, kept - 1)] + 1])
             start[bin[k] + 1] += 1

@@ -142,7 +142,7 @@ cdef class StarTable:
             n += runs[2 * i + 1] - runs[2 * i]
             self.ask(runs[2 * i], runs[2 * i + 1], date)
         most = min(most, n)
-        out.memory = malloc((most + 1) * (sizeof(Py_ssize_t) + 4 * sizeof(double) + 2 * sizeof(Point)) + 3 * (n + 1) * sizeof(int))
+        out.memory = malloc((most + 1) * (sizeof(Py_ssize_t) + 4 * sizeof(double) + 2 * sizeof(Point)) + 3 * sizeof(int) * (n + 1))
         if out.memory == NULL:
             with gil:
                 raise MemoryError

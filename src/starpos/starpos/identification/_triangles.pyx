@@ -2,6 +2,7 @@
 # cython: language_level=3, boundscheck=False, wraparound=False, cdivision=True, initializedcheck=False
 """Look up a frame's triangles of bright stars among those of the sky, by their shape."""
 
+from libc.limits cimport INT_MAX
 from libc.math cimport M_PI, asin, atan2, fabs, sqrt
 from libc.stdlib cimport abs, calloc, free, malloc, realloc
 
@@ -310,8 +311,10 @@ cdef int _begin(Search *s, FrameStars frame, int stars, double error_px) except 
 
 cdef int _grow(Search *s) except -1 nogil:
     """Make room for more candidates."""
-    s.room = max(256, 2 * s.room)
-    cdef Candidate *more = <Candidate *>realloc(s.found, s.room * sizeof(Candidate))
+    cdef Candidate *more = NULL
+    if s.room <= INT_MAX // 2:
+        s.room = max(256, 2 * s.room)
+        more = <Candidate *>realloc(s.found, s.room * sizeof(Candidate))
     if more == NULL:
         with gil:
             raise MemoryError
@@ -365,14 +368,14 @@ cdef struct Slot:
 
 cdef int _support(Search *s) except -1:
     """Count for each candidate how many others share a side with it."""
-    cdef int slots = 64, k, i, others
-    cdef long long slot
+    cdef int k, i, others
+    cdef Py_ssize_t slots = 64, slot, count = s.count
     cdef key_t *side
-    while slots < 4 * s.count:
+    while slots < 4 * count:
         slots *= 2
     cdef Slot *table = <Slot *>calloc(slots, sizeof(Slot))
     # the sides of each candidate, and later the slots of these
-    cdef key_t *sides = <key_t *>malloc(3 * (s.count + 1) * sizeof(key_t))
+    cdef key_t *sides = <key_t *>malloc(3 * (count + 1) * sizeof(key_t))
     try:
         if table == NULL or sides == NULL:
             raise MemoryError

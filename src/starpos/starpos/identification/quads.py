@@ -6,16 +6,16 @@ hardly any other four have it too. Here the shape is the lengths of five sides o
 """
 
 from dataclasses import dataclass
-from itertools import combinations, product
+from itertools import combinations
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from starpos.identification._circles import well_apart
+from starpos.identification._quads import near
 from starpos.identification.triangles import circle_count, spread_points
 from starpos.progress import Progress, quiet
 from starpos.sky.catalogue import Catalogue
-from starpos.sky.zones import ranges
 
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
@@ -31,6 +31,8 @@ LEAST_SIDE, SHORTEST = 0.6, 0.08
 # Shapes are kept to 1/65535; these are the bins of four of their sides, and of the logarithm of the longest.
 CODES, BINS, SIZE_BINS = 65535, 12, 56
 SIZES_RAD = np.log(0.004), np.log(1.2)
+# Most pairs of quads alike for one focal length: more come of stars too close to each other, and tell nothing.
+MOST_ALIKE = 2000
 # Which pairs of a quad's stars its sides are: AB is the longest.
 SIDES = np.array(list(combinations(range(4), 2)))
 
@@ -55,24 +57,23 @@ class QuadCatalogue:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Quads within tolerance (N,) of shapes (N, 5) and within log_tolerance of their sizes (N,), as logarithms.
 
-        Returns arrays of query (M,) and quad (M,). A tolerance is less than half a bin.
+        Returns arrays of query (M,) and quad (M,), M at most MOST_ALIKE.
         """
-        low, high = (_bin(shape[:, :4] + sign * tolerance[:, None]) for sign in (-1, 1))
-        first, last = (_size_bin(log_size + sign * log_tolerance) for sign in (-1, 1))
-        queries, quads = [], []
-        for corner in product((False, True), repeat=4):
-            # where both ends lie in one bin it is looked up once
-            use = np.flatnonzero(((high > low) | ~np.array(corner)).all(1))
-            run = _key(np.where(corner, high[use], low[use]))
-            begin, end = self.bin_start[run + first[use]], self.bin_start[run + last[use] + 1]
-            of, quad = ranges(begin, end - begin)
-            query = use[of]
-            off = np.abs(self.shape[quad] * np.float32(1 / CODES) - shape[query])
-            close = (off <= tolerance[query, None]).all(1)
-            close &= np.abs(self.log_size[quad] - log_size[query]) <= log_tolerance
-            queries.append(query[close])
-            quads.append(quad[close])
-        return np.concatenate(queries), np.concatenate(quads)
+        query, quad = near(
+            self.bin_start,
+            self.shape,
+            self.log_size,
+            np.ascontiguousarray(shape, float),
+            np.ascontiguousarray(tolerance, float),
+            np.ascontiguousarray(log_size, float),
+            log_tolerance,
+            CODES,
+            BINS,
+            SIZE_BINS,
+            *SIZES_RAD,
+            MOST_ALIKE,
+        )
+        return query, quad
 
 
 def shapes(v: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

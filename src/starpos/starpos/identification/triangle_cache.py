@@ -12,11 +12,10 @@ from starpos.identification import triangles
 from starpos.identification.triangles import TriangleCatalogue
 from starpos.progress import Progress, quiet
 from starpos.sky.catalogue import Catalogue
-from starpos.sky.zones import CELLS, ZONES
-from starpos.table_cache import cache_folder, load_or_build, mapped, rising
+from starpos.table_cache import cache_folder, load_or_build, mapped
 
-# Names of folders in the cache; the number is that of the format.
-PREFIX = "triangles-10-"
+# Cache folders; the number is the format version. Up to 10, tables of over 2 million stars may be wrong.
+PREFIX = "triangles-11-"
 MOST_IN_USE = 4
 
 
@@ -64,22 +63,8 @@ def _map(folder: Path, catalogue_stars: int) -> TriangleCatalogue | None:
     t = mapped(TriangleCatalogue, folder, "iiiifibufi")
     if t is None:
         return None
-    stars, count = len(t.star), len(t.corners)
-    fit = (
-        t.bin_start.shape == (np.prod(triangles.BINS) + 1,)
-        and t.cell_start.shape == (ZONES * CELLS + 1,)
-        and t.corners.shape == t.shape.shape == (count, 3)
-        and t.counter_clockwise.shape == (count,)
-        and t.rank.shape == t.star.shape == (stars,)
-        and t.beacons.shape == (len(t.beacon), 3)
-        and t.longest_allowed.shape == (1,)
-        and t.longest_allowed[0] > 0
-        and rising(t.bin_start, count)
-        and rising(t.cell_start, stars)
-        # So that the first and the last are the limits.
-        and bool(np.all(np.diff(t.star) > 0))
-        and (stars == 0 or 0 <= t.star[0] <= t.star[-1] < catalogue_stars)
-        and (count == 0 or 0 <= t.corners.min() <= t.corners.max() < stars)
-        and bool(np.all(t.corners[:, 0] != t.corners[:, 1]))
-    )
-    return t if fit else None
+    try:
+        t.check(catalogue_stars)
+    except ValueError:
+        return None
+    return t

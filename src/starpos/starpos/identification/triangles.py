@@ -11,11 +11,12 @@ from math import comb
 
 import numpy as np
 
-from starpos.identification._circles import binned, triples_of_circles, well_apart
+from starpos.identification._circles import binned, distinct, triples_of_circles, well_apart
 from starpos.identification._triangles import TriangleTable
 from starpos.progress import Progress, quiet
 from starpos.sky.catalogue import Catalogue
 from starpos.sky.zones import CELLS, ZONES, cell_starts
+from starpos.table_cache import rising
 
 # Shortest side over the longest allowed one: the errors of centroids blur the angles of smaller triangles.
 SHORTEST_SIDE = 0.03
@@ -88,6 +89,32 @@ class TriangleCatalogue:
     longest_allowed: np.ndarray
     bin_start: np.ndarray
 
+    def check(self, catalogue_stars: int) -> None:
+        """Raise ValueError for columns that do not fit together, or to so many stars: compiled loops trust them."""
+        stars, count = len(self.star), len(self.corners)
+        if not (
+            self.bin_start.shape == (np.prod(BINS) + 1,)
+            and self.cell_start.shape == (ZONES * CELLS + 1,)
+            and self.corners.shape == self.shape.shape == (count, 3)
+            and self.counter_clockwise.shape == (count,)
+            and self.rank.shape == self.star.shape == (stars,)
+            and self.beacons.shape == (len(self.beacon), 3)
+            and self.longest_allowed.shape == (1,)
+        ):
+            raise ValueError("the columns of the triangles are not of equal length")
+        if not (
+            self.longest_allowed[0] > 0
+            and rising(self.bin_start, count)
+            and rising(self.cell_start, stars)
+            # so that the first and the last are the limits
+            and bool(np.all(np.diff(self.star) > 0))
+            and (stars == 0 or 0 <= self.star[0] <= self.star[-1] < catalogue_stars)
+            and (count == 0 or 0 <= self.corners.min() <= self.corners.max() < stars)
+            and bool(np.all(self.corners[:, 0] != self.corners[:, 1]))
+            and (len(self.beacon) == 0 or 0 <= self.beacon.min() <= self.beacon.max() < stars)
+        ):
+            raise ValueError("the triangles are not sorted, or not of the catalogue's stars")
+
     @cached_property
     def compiled(self) -> TriangleTable:
         """The triangles, for compiled code."""
@@ -125,18 +152,20 @@ def build(catalogue: Catalogue, half_diagonal: float, progress: Progress = quiet
     brightest_first = np.argsort(rank)
     beacon = np.sort(brightest_first[: int(BEACONS * len(pool))])
     apart = brightest_first[well_apart(v[brightest_first], SHORTEST_SIDE * 2 * half_diagonal)]
-    keys = []
+    triples = []
     taken = affordable(half_diagonal)
     for k, (radius, spacing, most) in enumerate(taken):
         centres = spread_points(circle_count(radius * half_diagonal, spacing))
-        keys.append(triples_of_circles(v[apart], centres, radius * half_diagonal, most))
+        triples.append(triples_of_circles(v[apart], centres, radius * half_diagonal, most))
         progress("star triangles", (k + 1) / (len(taken) + 1))
     longest = 2 * half_diagonal
+    brightest, others = (np.concatenate(column) for column in zip(*triples, strict=True))
+    first, others = distinct(brightest, others, len(apart))
     corners, counter_clockwise, shape, bin_start = binned(
-        v, apart.astype(np.int32), _distinct(keys), SHORTEST_SIDE * longest, longest, int(np.prod(BINS))
+        v, apart.astype(np.int32), first, others, SHORTEST_SIDE * longest, longest, int(np.prod(BINS))
     )
     progress("star triangles", 1.0)
-    return TriangleCatalogue(
+    built = TriangleCatalogue(
         star=pool.astype(np.int32),
         cell_start=cell_starts(np.searchsorted(pool, catalogue.zone_start), catalogue.ra_mas[pool] / 3.6e6),
         rank=rank.astype(np.int32),
@@ -148,6 +177,8 @@ def build(catalogue: Catalogue, half_diagonal: float, progress: Progress = quiet
         longest_allowed=np.array([longest]),
         bin_start=bin_start,
     )
+    built.check(len(catalogue))
+    return built
 
 
 def affordable(half_diagonal: float) -> list[tuple[float, float, int]]:
@@ -167,15 +198,6 @@ def affordable(half_diagonal: float) -> list[tuple[float, float, int]]:
 def _made(taken: list[tuple[float, float, int]], half_diagonal: float) -> int:
     """How many triangles circles make over the whole sky, before duplicates are removed."""
     return sum(circle_count(radius * half_diagonal, spacing) * comb(n, 3) for radius, spacing, n in taken)
-
-
-def _distinct(keys: list[np.ndarray]) -> np.ndarray:
-    """The distinct ones of keys, ascending: `numpy.unique` takes fifty times as long for millions of integers."""
-    ordered = np.concatenate(keys)
-    ordered.sort()
-    new = np.ones(len(ordered), bool)
-    np.not_equal(ordered[1:], ordered[:-1], out=new[1:])
-    return ordered[new]
 
 
 def circle_count(radius: float, spacing: float) -> int:

@@ -94,7 +94,8 @@ def _between_two(field: FrameStars, sky: Sky, found: Identification) -> bool:
     u, v = ((xy - field.middle) / field.half.max()).T
     powers = np.stack([u**0, u, v, u * u, u * v, v * v, u**3, u * u * v, u * v * v, v**3], 1)
     terms = powers[:, : max([1, *(k for n, k in BENDS if stars >= n)])]
-    residual, kept = residual - terms @ np.linalg.lstsq(terms, residual, rcond=None)[0], np.arange(stars)
+    residual = residual - terms @ np.linalg.lstsq(terms, residual, rcond=None)[0]
+    kept: np.ndarray = np.arange(stars)
     if stars >= FEW_WRONG:
         # where a lens bends much, some stars are matched wrongly
         kept = np.sort(np.argsort(np.square(residual).sum(1))[: int(ROBUST * stars)])

@@ -57,7 +57,7 @@ def is_wide(camera: Camera) -> bool:
 
 def field_rad(camera: Camera) -> float:
     """Half the diagonal, rad, of what is identified at once: of the frame, or of a part of it."""
-    return _pinhole(camera).half_diagonal_rad if is_wide(camera) else camera.half_diagonal_rad
+    return pinhole_of(camera).half_diagonal_rad if is_wide(camera) else camera.half_diagonal_rad
 
 
 @dataclass(frozen=True)
@@ -106,19 +106,21 @@ class Part:
 
 def parts(field: WideField) -> list[Part]:
     """The parts of a frame: first its middle."""
-    pinhole = _pinhole(field.camera)
-    made = []
-    for turn in _turns(field.camera, pinhole):
-        seen = field.directions @ turn.T
-        xy = pinhole.project(seen)
-        with np.errstate(invalid="ignore"):
-            row = np.flatnonzero(((xy >= 0) & (xy <= [pinhole.width - 1, pinhole.height - 1])).all(1))
-        # a pinhole's picture is stretched away from its middle
-        made.append(Part(pinhole, turn, row, seen[row], field.sigma_px[row] / seen[row, 2] ** 2))
-    return made
+    pinhole = pinhole_of(field.camera)
+    return [part_at(field, pinhole, turn) for turn in _turns(field.camera, pinhole)]
 
 
-def _pinhole(camera: Camera) -> Camera:
+def part_at(field: WideField, pinhole: Camera, turn: np.ndarray) -> Part:
+    """The part that an ideal camera sees into which a rotation (3, 3) takes C."""
+    seen = field.directions @ turn.T
+    xy = pinhole.project(seen)
+    with np.errstate(invalid="ignore"):
+        row = np.flatnonzero(((xy >= 0) & (xy <= [pinhole.width - 1, pinhole.height - 1])).all(1))
+    # a pinhole's picture is stretched away from its middle
+    return Part(pinhole, turn, row, seen[row], field.sigma_px[row] / seen[row, 2] ** 2)
+
+
+def pinhole_of(camera: Camera) -> Camera:
     """The ideal camera of a part: as wide as the frame, but at most HALF_RAD to each side."""
     across = np.minimum(
         [camera.cx, camera.cy], np.array([camera.width, camera.height]) - 1 - [camera.cx, camera.cy]
@@ -167,7 +169,7 @@ def part_of(field: WideField, sky: Sky, found: Identification) -> tuple[Part, Id
 
 
 @dataclass(frozen=True)
-class _Lens:
+class LensPose:
     """A pose of the fisheye among the stars: attitude (3, 3), `Sky`'s directions into C."""
 
     camera: Camera
@@ -179,13 +181,13 @@ class _Lens:
         u = w @ self.attitude.T
         return self.camera.project(u @ FLIP if self.mirrored else u)
 
-    def moved(self, turn: np.ndarray, scale: float) -> "_Lens":
+    def moved(self, turn: np.ndarray, scale: float) -> "LensPose":
         """The pose turned by turn (3,) rad about C's axes, its focal length longer by the share `scale`."""
         return replace(
             self, camera=self.camera.scaled(1 + scale), attitude=rotation.from_vector(turn) @ self.attitude
         )
 
-    def fitted(self, xy: np.ndarray, w: np.ndarray, error_px: np.ndarray) -> "_Lens":
+    def fitted(self, xy: np.ndarray, w: np.ndarray, error_px: np.ndarray) -> "LensPose":
         """Fit attitude and focal length to pixels xy (n, 2), with errors (n,) px, of directions w (n, 3)."""
         pose = self
         for _ in range(STEPS):
@@ -202,6 +204,25 @@ class _Lens:
                 break
         return pose
 
+    def identified(
+        self, field: WideField, xy: np.ndarray, there: OnFrame, pair: np.ndarray, found: Identification
+    ) -> Identification:
+        """The identification of a field, its stars at xy (N, 2), that pairs (2, M) of stars and those there make."""
+        star, sigma = pair[0], field.sigma_px[pair[0]]
+        residual = xy[star] - self.project(there.directions[pair[1]])
+        return Identification(
+            star=star,
+            catalogue=there.index[pair[1]],
+            blend_px=there.blend_px[pair[1]],
+            attitude=self.attitude,
+            focal_scale=self.camera.fx / field.camera.fx,
+            residual_px=_rms_px(residual, np.hypot(sigma, FLOOR_PX)),
+            mean_square_px2=_mean_square(residual),
+            log_odds=found.log_odds,
+            expected=there.index[_within(self.project(there.directions), field.camera, -INSIDE_PX)],
+            mirrored=found.mirrored,
+        )
+
 
 def everywhere(field: WideField, sky: Sky, part: Part, found: Identification) -> Identification | None:
     """The identification of all stars of a frame from that of a part.
@@ -210,7 +231,7 @@ def everywhere(field: WideField, sky: Sky, part: Part, found: Identification) ->
     """
     flip = FLIP if found.mirrored else np.eye(3)
     attitude = flip @ part.turn.T @ flip @ found.attitude
-    pose = _Lens(field.camera.scaled(found.focal_scale), attitude, found.mirrored)
+    pose = LensPose(field.camera.scaled(found.focal_scale), attitude, found.mirrored)
     # what lies beyond the picture once refraction is undone is beside all stars
     xy = np.nan_to_num(field.camera.project(field.directions[:FAINTEST_FIT]), nan=FAR_PX)
     sigma = field.sigma_px[:FAINTEST_FIT]
@@ -218,12 +239,12 @@ def everywhere(field: WideField, sky: Sky, part: Part, found: Identification) ->
     star, index = star[star < len(xy)], index[star < len(xy)]
     w, beyond = sky.directions(index), ~np.isin(np.arange(len(xy)), part.row)
     for _ in range(ROUNDS):
-        pose = pose.fitted(xy[star], w, np.hypot(sigma[star], _error_px(xy[star] - pose.project(w))))
+        pose = pose.fitted(xy[star], w, np.hypot(sigma[star], error_px(xy[star] - pose.project(w))))
         residual = xy[star] - pose.project(w)
-        there = _on_frame(pose, sky, len(xy))
+        there = stars_on(pose, sky, len(xy))
         gate = _gate_px(residual, sigma)
         # a lens that is not known well has other stars than its own in their places farther out
-        if _spread_px(residual) > BENT_PX:
+        if spread_px(residual) > BENT_PX:
             gate[beyond] = 0.0
         predicted = pose.project(there.directions)
         pair = mutual_nearest(xy, predicted, gate)
@@ -233,33 +254,21 @@ def everywhere(field: WideField, sky: Sky, part: Part, found: Identification) ->
         star, index, w = pair[0], there.index[pair[1]], there.directions[pair[1]]
         if same:
             break
-    residual = xy[star] - pose.project(w)
-    return Identification(
-        star=star,
-        catalogue=index,
-        blend_px=there.blend_px[pair[1]],
-        attitude=pose.attitude,
-        focal_scale=pose.camera.fx / field.camera.fx,
-        residual_px=_rms_px(residual, np.hypot(sigma[star], FLOOR_PX)),
-        mean_square_px2=_mean_square(residual),
-        log_odds=found.log_odds,
-        expected=there.index[_within(predicted, field.camera, -INSIDE_PX)],
-        mirrored=found.mirrored,
-    )
+    return pose.identified(field, xy, there, np.stack(pair), found)
 
 
-def _error_px(residual: np.ndarray) -> float:
+def error_px(residual: np.ndarray) -> float:
     """Error beside the centroids' own: where the lens is not known well all stars count alike."""
-    spread = _spread_px(residual[np.isfinite(residual).all(1)])
+    spread = spread_px(residual[np.isfinite(residual).all(1)])
     return spread if spread > BENT_PX else FLOOR_PX
 
 
 def _gate_px(residual: np.ndarray, sigma: np.ndarray) -> np.ndarray:
     """Largest distance (N,) px of each star from its place, from the residuals (M, 2) of the stars matched so far."""
-    return GATE_SIGMA * np.hypot(max(_spread_px(residual), LEAST_SPREAD_PX), sigma) + GATE_PX
+    return GATE_SIGMA * np.hypot(max(spread_px(residual), LEAST_SPREAD_PX), sigma) + GATE_PX
 
 
-def _spread_px(residual: np.ndarray) -> float:
+def spread_px(residual: np.ndarray) -> float:
     """Standard deviation (px) that the median of residuals (M, 2) shows."""
     return SIGMA_PER_MAD * float(np.sort(np.abs(residual), axis=None)[residual.size // 2])
 
@@ -282,7 +291,7 @@ def _within(pixel: np.ndarray, camera: Camera, margin_px: float) -> np.ndarray:
         return np.asarray(((pixel > least) & (pixel < most)).all(1))
 
 
-def _on_frame(pose: _Lens, sky: Sky, stars: int) -> OnFrame:
+def stars_on(pose: LensPose, sky: Sky, stars: int) -> OnFrame:
     """The catalogue stars that so many detections may be."""
     camera, catalogue = pose.camera, sky.catalogue
     axis = (FLIP[2] if pose.mirrored else np.array([0.0, 0.0, 1.0])) @ pose.attitude

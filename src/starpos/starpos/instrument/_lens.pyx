@@ -21,7 +21,7 @@ cdef class Lens:
 
     def __init__(self, d):
         cdef int k
-        for k in range(5):
+        for k in range(8):
             self.d[k] = d[k] if k < len(d) else 0.0
 
     cdef void seen(self, const double *v, double *place) noexcept nogil:
@@ -54,9 +54,19 @@ cdef class Lens:
         return out.reshape(np.shape(places)[: np.ndim(places) - 1] + (3,))
 
 
+cdef inline double polynomial(double r2, double a, double b, double c) noexcept nogil:
+    return 1 + r2 * (a + r2 * (b + r2 * c))
+
+
+cdef inline double increase(double r2, double a, double b, double c) noexcept nogil:
+    """Derivative of `polynomial` by r2."""
+    return a + r2 * (2 * b + r2 * 3 * c)
+
+
 cdef class PlumbBob(Lens):
     """`plumb_bob`, Brown and Conrady's distortion of a pinhole's picture, as OpenCV has it: d is k1, k2, p1, p2, k3.
 
+    With k4, k5, k6 it is `rational_polynomial`: the radial factor is divided by 1 + k4 r^2 + k5 r^4 + k6 r^6.
     The plane is the tangent plane of the unit sphere on the optical axis. Behind the camera nothing is seen, and no ray
     leads where the distortion cannot be inverted.
     """
@@ -100,17 +110,20 @@ cdef class PlumbBob(Lens):
 
     cdef void distorted(self, const double *plane, double *out) noexcept nogil:
         """Set `out` (2,) to the distorted place of plane (2,)."""
-        cdef double k1 = self.d[0], k2 = self.d[1], p1 = self.d[2], p2 = self.d[3], k3 = self.d[4]
-        cdef double x = plane[0], y = plane[1], r2 = x * x + y * y, radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        cdef double p1 = self.d[2], p2 = self.d[3], x = plane[0], y = plane[1], r2 = x * x + y * y
+        cdef double radial = polynomial(r2, self.d[0], self.d[1], self.d[4]) / polynomial(r2, self.d[5], self.d[6], self.d[7])
         out[0] = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
         out[1] = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
 
     cdef void distorted_slopes(self, const double *plane, double *slope) noexcept nogil:
         """Set slope (2, 2) to the derivatives of `distorted` by plane (2,)."""
-        cdef double k1 = self.d[0], k2 = self.d[1], p1 = self.d[2], p2 = self.d[3], k3 = self.d[4]
-        cdef double x = plane[0], y = plane[1], r2 = x * x + y * y, radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        cdef double p1 = self.d[2], p2 = self.d[3], x = plane[0], y = plane[1], r2 = x * x + y * y
+        cdef double under = polynomial(r2, self.d[5], self.d[6], self.d[7])
+        cdef double radial = polynomial(r2, self.d[0], self.d[1], self.d[4]) / under
         # the radial factor grows by this times x along x
-        cdef double grows = 2 * (k1 + r2 * (2 * k2 + r2 * 3 * k3))
+        cdef double grows = 2 / under * (
+            increase(r2, self.d[0], self.d[1], self.d[4]) - radial * increase(r2, self.d[5], self.d[6], self.d[7])
+        )
         slope[0] = radial + x * x * grows + 2 * p1 * y + 6 * p2 * x
         slope[1] = slope[2] = x * y * grows + 2 * p1 * x + 2 * p2 * y
         slope[3] = radial + y * y * grows + 6 * p1 * y + 2 * p2 * x

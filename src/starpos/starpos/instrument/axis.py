@@ -11,7 +11,7 @@ from starpos.instrument.instrument import Instrument
 from starpos.units import ARCSEC
 
 # Longer over shorter side of sensors, and of what cameras keep of their middle; real ones differ by this share.
-SHAPES = (1.0, 5 / 4, 4 / 3, 3 / 2, 8 / 5, 16 / 9, 17 / 9)
+SHAPES = (1.0, 5 / 4, 4 / 3, 3 / 2, 8 / 5, 16 / 9)
 SHAPE_OFF = 0.05
 # 1 sigma of the axis from a frame's centre where nobody knows of which part of the sensor it is: its longer side, and at
 # least this, as most sensors have up to 7000 px

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from starpos.errors import InstrumentError
 from starpos.instrument._lens import Equidistant, Lens
-from starpos.instrument.lens import COEFFICIENTS, PLUMB_BOB, lens_of
+from starpos.instrument.lens import COEFFICIENTS, EQUIDISTANT, PLUMB_BOB, lens_of
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -23,8 +23,8 @@ class Camera:
     width, height  px of the frame
     fx, fy         focal lengths, px
     cx, cy         principal point, px
-    distortion     coefficients of the model: k1, k2, p1, p2, k3 or k1, k2, k3, k4; (): all 0
-    model          of the lens: PLUMB_BOB, or EQUIDISTANT for a fisheye
+    distortion     coefficients of the model, by the names in COEFFICIENTS; (): all 0
+    model          of the lens: PLUMB_BOB or RATIONAL, or EQUIDISTANT for a fisheye
     """
 
     width: int
@@ -39,7 +39,7 @@ class Camera:
     def __post_init__(self) -> None:
         if self.model not in COEFFICIENTS:
             raise InstrumentError(
-                f"the distortion model is {self.model[:40]!r}; {' and '.join(COEFFICIENTS)} are understood: calibrate "
+                f"the distortion model is {self.model[:40]!r}; {', '.join(COEFFICIENTS)} are understood: calibrate "
                 "with one of them"
             )
         if not self.distortion:
@@ -73,7 +73,7 @@ class Camera:
     @cached_property
     def is_ideal(self) -> bool:
         """Whether the camera is a pinhole without distortion."""
-        return self.model == PLUMB_BOB and not any(self.distortion)
+        return self.model != EQUIDISTANT and not any(self.distortion)
 
     @property
     def scale_arcsec(self) -> float:
@@ -129,7 +129,7 @@ class Camera:
         places = self._places(x, y)
         v = self.lens.rays(places)
         lost = np.isnan(v[..., 0])
-        if self.model == PLUMB_BOB and lost.any() and (lost & np.isfinite(places).all(-1)).any():
+        if self.model != EQUIDISTANT and lost.any() and (lost & np.isfinite(places).all(-1)).any():
             raise InstrumentError(
                 f"distortion {self.distortion} cannot be inverted inside the frame: calibrate the camera again"
             )

@@ -8,7 +8,7 @@ from pathlib import Path
 from starpos.errors import InstrumentError
 from starpos.instrument import yaml_file
 from starpos.instrument.camera import Camera
-from starpos.instrument.lens import COEFFICIENTS
+from starpos.instrument.lens import stated_lens
 
 # Most pixels along a frame's side.
 LARGEST_SIDE = 1_000_000
@@ -21,22 +21,14 @@ def read(path: Path) -> Camera:
         model = content.get("distortion_model", "plumb_bob")
         width, height = content["image_width"], content["image_height"]
         k = _numbers(content["camera_matrix"], 9)
-        count = len(COEFFICIENTS.get(model, ())) if isinstance(model, str) else 0
-        d = (
-            _numbers(content["distortion_coefficients"], count)
-            if count and "distortion_coefficients" in content
-            else ()
-        )
+        terms = content.get("distortion_coefficients")
+        d = () if terms is None else tuple(float(value) for value in terms["data"])
     except (AttributeError, KeyError, TypeError, ValueError, OverflowError) as error:
         raise InstrumentError(
             f"{path}: a key of this calibration file is missing or of the wrong kind ({repr(error)[:120]}); "
             "it needs image_width, image_height, camera_matrix, distortion_coefficients."
         ) from None
-    if not count:
-        known = " and ".join(COEFFICIENTS)
-        raise InstrumentError(
-            f"{path}: the distortion model is {reprlib.repr(model)}; {known} are understood: calibrate with one of them."
-        )
+    model, d = stated_lens(model if isinstance(model, str) else reprlib.repr(model), d, str(path))
     if any(type(side) is not int or side > LARGEST_SIDE for side in (width, height)):
         raise InstrumentError(f"{path}: image_width and image_height must be whole numbers of px.")
     if any(k[i] for i in (1, 3, 6, 7)) or k[8] != 1:

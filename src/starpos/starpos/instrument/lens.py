@@ -1,21 +1,53 @@
 # SPDX-License-Identifier: Apache-2.0
-"""ROS's lens models by name: `plumb_bob` of a pinhole, `equidistant` of a fisheye; the code is in `_lens`."""
+"""ROS's lens models by name: of a pinhole `plumb_bob` and `rational_polynomial`, of a fisheye `equidistant`.
+
+The code is in `_lens`.
+"""
 
 import math
+from collections.abc import Sequence
 from functools import lru_cache
 
 import numpy as np
 
+from starpos.errors import InstrumentError
 from starpos.instrument._lens import Equidistant, Lens, PlumbBob
 
 # ROS's names of the models that are understood, and the names of their coefficients.
-PLUMB_BOB, EQUIDISTANT = "plumb_bob", "equidistant"
-COEFFICIENTS = {PLUMB_BOB: ("k1", "k2", "p1", "p2", "k3"), EQUIDISTANT: ("k1", "k2", "k3", "k4")}
+PLUMB_BOB, EQUIDISTANT, RATIONAL = "plumb_bob", "equidistant", "rational_polynomial"
+COEFFICIENTS = {
+    PLUMB_BOB: ("k1", "k2", "p1", "p2", "k3"),
+    EQUIDISTANT: ("k1", "k2", "k3", "k4"),
+    RATIONAL: ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
+}
+# numbers of coefficients that OpenCV knows of a pinhole: its 12 and 14 have a thin prism and a tilted sensor
+OPENCV_NUMBERS = (0, 4, 5, 8, 12, 14)
 
 
 def lens_of(model: str, d: tuple[float, ...]) -> Lens:
     """The lens of a model with its coefficients."""
-    return PlumbBob(d) if model == PLUMB_BOB else Equidistant(d, _reach(d))
+    return Equidistant(d, _reach(d)) if model == EQUIDISTANT else PlumbBob(d)
+
+
+def stated_lens(model: str, d: Sequence[float], place: str) -> tuple[str, tuple[float, ...]]:
+    """Model and coefficients for a Camera, from those of a message or file as OpenCV and ROS mean them.
+
+    A pinhole's coefficients are OpenCV's by their number, whichever of the two names stands with them. Without a name
+    they are a pinhole's. Zeros at the end say nothing.
+    InstrumentError where the model is another one or has another number of coefficients.
+    """
+    model = model or PLUMB_BOB
+    if model == EQUIDISTANT and len(d) in (0, 4):
+        return model, tuple(d)
+    if model in (PLUMB_BOB, RATIONAL) and len(d) in OPENCV_NUMBERS:
+        terms = [*d, *[0.0] * 14]
+        if not any(terms[8:]):
+            pinhole = RATIONAL if any(terms[5:8]) else PLUMB_BOB
+            return pinhole, tuple(terms[: len(COEFFICIENTS[pinhole])])
+    raise InstrumentError(
+        f"{place}: the distortion model is {model[:40]!r} with {len(d)} terms; {PLUMB_BOB!r} and {RATIONAL!r} with 4, 5 "
+        f"or 8 and {EQUIDISTANT!r} with 4 are understood (further ones must be 0): calibrate with one of them."
+    )
 
 
 @lru_cache(maxsize=64)

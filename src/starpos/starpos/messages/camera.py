@@ -1,30 +1,27 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A camera from a CameraInfo, and its frames from an Image."""
+"""A camera from a CameraInfo, and its frames from an Image or a CompressedImage."""
 
 from typing import Any
 
 import numpy as np
 
-from starpos.errors import FrameError, InstrumentError
+from starpos.errors import InstrumentError
+from starpos.frames.encodings import pixels_of
 from starpos.frames.frame import Frame
+from starpos.frames.pictures import picture_pixels
 from starpos.instrument.camera import Camera
-from starpos.instrument.lens import COEFFICIENTS, PLUMB_BOB
+from starpos.instrument.lens import stated_lens
 from starpos.messages.stamp import stamp_to_unix
 
-# encoding -> (dtype, channels, pattern); the names of sensor_msgs/image_encodings.hpp
-ENCODINGS = {
-    "mono8": (np.uint8, 1, ""),
-    "mono16": (np.uint16, 1, ""),
-    "bgr8": (np.uint8, 3, ""),
-    **{f"bayer_{p}8": (np.uint8, 1, p) for p in ("rggb", "bggr", "grbg", "gbrg")},
-    **{f"bayer_{p}16": (np.uint16, 1, p) for p in ("rggb", "bggr", "grbg", "gbrg")},
-}
 
+def message_to_camera(
+    message: Any, source: str = "camera_info", size: tuple[int, int] | None = None
+) -> Camera:
+    """Camera of the images that a CameraInfo goes with; raises InstrumentError unless it is calibrated.
 
-def message_to_camera(message: Any, source: str = "camera_info") -> Camera:
-    """Camera from a CameraInfo; raises InstrumentError unless it is a calibrated camera of the whole frame.
-
-    Its model is plumb_bob, also where none is named, or equidistant.
+    Its model is plumb_bob, also where none is named, rational_polynomial or equidistant. K is that of the whole sensor;
+    the camera's is that of the region and the binning that the message states.
+    size: width and height of the images, px, for a message that leaves its own at 0.
     """
     k = np.array(message.k, float)
     d = np.array(message.d, float)
@@ -34,65 +31,64 @@ def message_to_camera(message: Any, source: str = "camera_info") -> Camera:
         raise InstrumentError(
             f"{source}: the camera is not calibrated (its focal length is 0); give it a calibration file."
         )
-    model = message.distortion_model or PLUMB_BOB
-    if model not in COEFFICIENTS or len(d) not in (0, len(COEFFICIENTS[model])):
-        known = " and ".join(f"{name!r} with {len(terms)}" for name, terms in COEFFICIENTS.items())
-        raise InstrumentError(
-            f"{source}: the distortion model is {message.distortion_model!r} with {len(d)} terms; {known} are "
-            "understood: calibrate with one of them."
-        )
+    model, distortion = stated_lens(message.distortion_model, d.tolist(), source)
     if np.any(k[[1, 3, 6, 7]]) or k[8] != 1:
         raise InstrumentError(
             f"{source}: K is not [fx 0 cx, 0 fy cy, 0 0 1]; calibrate the camera without skew."
         )
-    region = message.roi
-    cropped = (region.x_offset, region.y_offset) != (0, 0) or (
-        (region.width, region.height) not in ((0, 0), (message.width, message.height))
-    )
-    if cropped or message.binning_x > 1 or message.binning_y > 1:
-        raise InstrumentError(
-            f"{source}: the frame is binned or cropped; send whole frames, or calibrate it as it is sent."
-        )
+    region, by_x, by_y = message.roi, max(1, message.binning_x), max(1, message.binning_y)
+    width = _image_side(message.width, region.x_offset, region.width, by_x, source)
+    height = _image_side(message.height, region.y_offset, region.height, by_y, source)
+    if size is not None and leaves_size_open(message):
+        width, height = size
     fx, fy, cx, cy = k[[0, 4, 2, 5]].tolist()
     return Camera(
-        width=message.width,
-        height=message.height,
-        fx=fx,
-        fy=fy,
-        cx=cx,
-        cy=cy,
-        distortion=tuple(d.tolist()),
+        width=width,
+        height=height,
+        fx=fx / by_x,
+        fy=fy / by_y,
+        # the corner of the first pixel, half a pixel from its centre, is the same before and after binning
+        cx=(cx - region.x_offset + 0.5) / by_x - 0.5,
+        cy=(cy - region.y_offset + 0.5) / by_y - 0.5,
+        distortion=distortion,
         model=model,
     )
 
 
+def leaves_size_open(message: Any) -> bool:
+    """Whether a CameraInfo states no size, which is then that of the images."""
+    region = message.roi
+    return not (message.width or region.width) or not (message.height or region.height)
+
+
+def _image_side(whole: int, offset: int, cut: int, binned_by: int, source: str) -> int:
+    """Pixels along a side of the images: the binned ones of the sensor, or of a part `cut` of it; 0 if not stated."""
+    if whole and offset + cut > whole:
+        raise InstrumentError(
+            f"{source}: the region of interest ends at pixel {offset + cut} of {whole}; width and height are those of "
+            "the whole sensor: correct the camera's driver or its calibration file."
+        )
+    return (cut or max(0, whole - offset)) // binned_by
+
+
 def message_to_frame(message: Any, source: str = "image_raw") -> Frame:
-    """Frame from an Image, on the message's own memory if byte order and alignment allow it, else on a copy.
+    """Frame from an Image, on the message's own memory where that holds pixels as a Frame does, else on a copy.
 
     Raises FrameError if encoding, size, step and data do not fit together.
     """
-    if message.encoding not in ENCODINGS:
-        raise FrameError(
-            f"{source}: the encoding {message.encoding!r} is unknown; send one of {', '.join(ENCODINGS)}."
-        )
-    kind, channels, pattern = ENCODINGS[message.encoding]
-    width, height, step = message.width, message.height, message.step
-    row = width * channels * np.dtype(kind).itemsize
-    if not width or not height:
-        raise FrameError(f"{source}: the frame is {width} x {height} px; it is empty, check the camera.")
-    if step < row:
-        raise FrameError(
-            f"{source}: step is {step} bytes but a row of {width} px needs {row}; check the camera driver."
-        )
-    if len(message.data) != step * height:
-        raise FrameError(
-            f"{source}: {len(message.data)} bytes of pixels for {height} rows of {step} bytes; "
-            "the frame is truncated or its sizes are wrong."
-        )
-    dtype = np.dtype(kind).newbyteorder(">" if message.is_bigendian else "<")
-    shape = (height, width) if channels == 1 else (height, width, channels)
-    strides = (step, dtype.itemsize) if channels == 1 else (step, channels, 1)
-    pixels = np.ndarray(shape, dtype, message.data, strides=strides)
-    if not pixels.dtype.isnative or not pixels.flags.aligned:
-        pixels = pixels.astype(kind)
+    pixels, pattern = pixels_of(
+        message.encoding,
+        message.data,
+        message.width,
+        message.height,
+        message.step,
+        bool(message.is_bigendian),
+        source,
+    )
     return Frame(pixels, pattern=pattern, mid_unix_s=stamp_to_unix(message.header.stamp), source=source)
+
+
+def message_to_picture(message: Any, source: str = "image_raw/compressed") -> Frame:
+    """Frame from a CompressedImage: JPEG, PNG or TIFF; raises FrameError if it is not a whole picture."""
+    pixels = picture_pixels(bytes(message.data), source)
+    return Frame(pixels, mid_unix_s=stamp_to_unix(message.header.stamp), source=source)

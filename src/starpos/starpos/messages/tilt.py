@@ -24,7 +24,7 @@ def message_to_tilt(message: Any, unknown_stddev_rad: float = SCA100T_NOISE_RAD)
     An impossible temperature becomes NaN, unknown.  The flags are left to the caller.  Raises TiltError for NaN, no
     stamp, angles that cannot hold together, or an impossible covariance.
     """
-    covariance = np.array(message.covariance, float).reshape(2, 2)
+    covariance: np.ndarray = np.array(message.covariance, float).reshape(2, 2)
     unix_s = stamp_to_unix(message.header.stamp)
     if unix_s is None:
         raise TiltError("a tilt message has no time stamp: set header.stamp to the time of the sample.")

@@ -128,9 +128,10 @@ class _Reading:
             self.solutions.append(shot_of(message, self.cameras))
             if self.deflection is None and message.status == 0:
                 self.deflection = deflection_of(message)
-        elif (message.width, message.height) not in self.cameras:
+        else:
             try:
-                self.cameras[message.width, message.height] = message_to_camera(message, "its camera_info")
+                camera = message_to_camera(message, "its camera_info")
+                self.cameras.setdefault((camera.width, camera.height), camera)
             except InstrumentError as error:
                 self._why_no_camera = str(error)
 

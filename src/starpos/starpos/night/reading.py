@@ -102,6 +102,10 @@ class Instruments(Protocol):
 
     def of(self, frame: Frame | Stars) -> Instrument | None: ...
 
+    @property
+    def hinted(self) -> bool:
+        """Whether only headers give the focal length."""
+
 
 @dataclass(frozen=True)
 class Given:
@@ -116,6 +120,11 @@ class Given:
             return self, ()
         instrument, doubt = with_frame_size(self.instrument, first)
         return replace(self, instrument=instrument), of_axis(doubt)
+
+    @property
+    def hinted(self) -> bool:
+        """Whether only headers give the focal length."""
+        return self.by_header
 
     def of(self, frame: Frame | Stars) -> Instrument | None:
         """The instrument of a frame."""

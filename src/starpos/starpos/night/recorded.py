@@ -37,6 +37,11 @@ class OfBag:
     cameras: Mapping[tuple[int, int], Camera]
     any_size: bool
 
+    @property
+    def hinted(self) -> bool:
+        """Whether only headers give the focal length: a bag has none."""
+        return False
+
     def of(self, frame: Frame | Stars) -> Instrument | None:
         """The instrument of a frame."""
         camera = self.cameras.get((frame.width, frame.height))

@@ -12,17 +12,19 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
+from starpos.budget import Budget
 from starpos.fix.blind import BlindSolver
 from starpos.fix.other_focal import focal_that_fits
 from starpos.fix.solution import Solution
 from starpos.fix.solver import Solver
 from starpos.frames.frame import Frame
 from starpos.frames.stars import Stars
-from starpos.identification import Identification, quad_cache
+from starpos.identification import Identification, blind_fisheye, quad_cache
 from starpos.identification.blind import STAGES
 from starpos.identification.hint import Hint
 from starpos.identification.search import Priors
 from starpos.identification.second_look import ENOUGH
+from starpos.instrument.instrument import Instrument
 from starpos.instrument.tilts import Tilts
 
 if TYPE_CHECKING:
@@ -35,17 +37,21 @@ ENOUGH_OTHERWISE = ENOUGH + math.log(10 * MOST_WAYS)
 # Where stars fill a part of a frame only (a roof, clouds, a white half), triangles of a field this share as large are.
 PART = 0.6
 # of the search at every scale, for stars that are detected otherwise
-QUICK = STAGES[:2]
+QUICK, QUICK_FISHEYE = STAGES[:2], blind_fisheye.STAGES[:1]
 # a deadline, by time.monotonic, that is never reached
 NEVER_S = math.inf
 
 
 @dataclass(frozen=True, eq=False)
 class Sight:
-    """A frame as it was seen: stars of it, and the solution that they gave."""
+    """A frame as it was seen: stars of it, and the solution that they gave.
+
+    instrument: with the focal length that fits, where that of the frame's header does not; else None.
+    """
 
     stars: Stars
     solution: Solution
+    instrument: Instrument | None = None
 
     @property
     def found(self) -> Identification | None:
@@ -73,17 +79,23 @@ def identified(
         yield solver.identify(seen, predicted, look)
         yield solver.identify(seen, predicted, look, part=PART)
 
-    return _first(item, stars, ways, until_s)
+    return _first(item, stars, ways, lambda: time.monotonic() >= until_s)
 
 
 def identified_blind(solver: BlindSolver, item: Frame | Stars, stars: Stars) -> Sight:
-    """Identify a frame or a list of any scale, as `identified` does one whose scale is known."""
-    quick = replace(solver, stages=QUICK)
+    """Identify a frame or a list of any scale, as `identified` does one whose scale is known.
+
+    All ways together have the CPU time that the solver has for a search.
+    """
+    budget = Budget.of(solver.search_s)
 
     def ways(seen: Stars) -> Iterator[Solution]:
-        yield (solver if seen is stars else quick).identify(seen)
+        way = solver
+        if seen is not stars:
+            way = replace(solver, stages=QUICK, fisheye_stages=QUICK_FISHEYE, search_s=budget.left_s)
+        yield way.identify(seen)
 
-    return _first(item, stars, ways, NEVER_S)
+    return _first(item, stars, ways, lambda: budget.spent)
 
 
 def solved(
@@ -116,7 +128,7 @@ def focal_px_that_fits(solver: Solver, stars: Stars) -> float | None:
     """
     found = focal_that_fits(solver, stars)
     if found is None and quad_cache.is_built(solver.catalogue):
-        answer = BlindSolver(solver.catalogue, stages=STAGES[:1]).identify(stars)
+        answer = BlindSolver(solver.catalogue, stages=STAGES[:1], fisheye_stages=()).identify(stars)
         found = None if answer.attitude is None else answer.attitude.focal_px
     return found
 
@@ -132,16 +144,22 @@ def look_at(item: Frame | Stars, stars: Stars) -> "SecondLook | None":
 
 
 def _first(
-    item: Frame | Stars, stars: Stars, ways: Callable[[Stars], Iterator[Solution]], until_s: float
+    item: Frame | Stars,
+    stars: Stars,
+    ways: Callable[[Stars], Iterator[Solution]],
+    is_over: Callable[[], bool],
 ) -> Sight:
-    """The first sight of a frame that is identified beyond doubt, by some way and some stars; else the first of all."""
+    """The first sight of a frame that is identified beyond doubt, by some way and some stars; else the first of all.
+
+    No way is begun once the time is over.
+    """
     first: Sight | None = None
     for seen, enough in _seen(item, stars):
         for answer in ways(seen):
             if answer.attitude is not None and answer.attitude.log_odds >= enough:
                 return Sight(seen, answer)
             first = first or Sight(seen, answer)
-            if not first.solution.lost or time.monotonic() >= until_s:
+            if not first.solution.lost or is_over():
                 return first
     assert first is not None
     return first

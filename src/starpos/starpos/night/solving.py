@@ -17,13 +17,12 @@ from starpos.frames.stars import Stars
 from starpos.identification.hint import Hint
 from starpos.instrument.inclinometer import level_of, up_of
 from starpos.instrument.instrument import Instrument
-from starpos.night import searching
+from starpos.night.hints import of_one_camera
 from starpos.night.night import Night, ReportedPlace, Shot, Truth, why_none
-from starpos.night.reading import stars_of
-from starpos.night.remarks import Remark
+from starpos.night.remarks import Kind, Remark
 from starpos.night.searching import Sight
 from starpos.night.together import Solved, TurnedNight, together, turned
-from starpos.night.work import Fitting, Solving
+from starpos.night.work import Fitting, Identifying, Solving
 from starpos.progress import Progress, quiet
 from starpos.rotation import half_turns
 
@@ -65,10 +64,12 @@ def solved_night(
         answers, instrument = _one_by_one(exposures, progress), exposures.work.instruments.instrument
     else:
         answers, said, instrument = _by_turning(exposures, turn_stddev_deg, progress)
-    shots, solved = [], []
+    shots, solved, of_frames = [], [], []
     lost: Stars | None = None
     for done, (name, stars, solution) in enumerate(answers, 1):
         shots.append(Shot.of(name, solution, stars))
+        if solution.remark:
+            of_frames.append(Remark(Kind.FOCAL_LENGTH, solution.remark))
         if solution.fix:
             solved.append(Solved.of(solution, solution.fix))
         elif solution.status is Status.NOT_IDENTIFIED:
@@ -85,7 +86,7 @@ def solved_night(
         vertical=exposures.vertical,
         atmosphere=exposures.work.atmosphere,
         truth=exposures.truth,
-        remarks=(*exposures.remarks, *said, *fits, *whole.remarks),
+        remarks=(*exposures.remarks, *said, *of_frames, *fits, *whole.remarks),
     )
     return replace(night, steady=_steady(night, instrument)) if night.combined and instrument else night
 
@@ -121,10 +122,10 @@ def _by_turning(
             rows.append((name, item))
             continue
         solver = solver or replace(work.solver(item), progress=progress)
-        rows.append((name, searching.identified(work.solver(item), item, stars_of(item))))
+        rows.append((name, Identifying(work.instruments, progress=progress)(item)[0]))
     found, instrument = TurnedNight(()), None
     if solver is not None:
-        sights = [(s.stars, s.found) for _, s in rows if isinstance(s, Sight)]
+        solver, sights = of_one_camera(solver, [s for _, s in rows if isinstance(s, Sight)])
         found = turned(solver, sights, work.tilts, turn_stddev_deg)
         instrument = solver.instrument if found.calibrated is None else found.calibrated.instrument
     solutions = iter(found.solutions)

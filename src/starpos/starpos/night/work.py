@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import InstrumentError, StarposError
-from starpos.fix.blind import BlindSolver
+from starpos.fix.blind import SEARCH_S, BlindSolver
 from starpos.fix.solution import Solution
 from starpos.fix.solver import Solver
 from starpos.frames.frame import Frame
@@ -17,9 +17,11 @@ from starpos.frames.stars import Stars
 from starpos.identification.hint import Hint
 from starpos.instrument.tilts import NO_TILTS, Tilts
 from starpos.night import searching
+from starpos.night.hints import without_hint
 from starpos.night.reading import Instruments, Reader, TiltFile, stars_of
 from starpos.night.remarks import Remark, of_focal_length
 from starpos.night.searching import Sight
+from starpos.progress import Progress, quiet
 from starpos.sky import catalogue
 
 if TYPE_CHECKING:
@@ -57,14 +59,18 @@ class Identifying:
     """Identifies a frame by every way there is, of any scale where nobody knows its focal length.
 
     Gives its Sight, and the CPU time in ms.
+    search_s: CPU time after which the search at every scale ends.
+    progress: of that search.
     """
 
     instruments: Instruments
+    search_s: float = SEARCH_S
+    progress: Progress = quiet
 
     def __call__(self, item: Frame | Stars) -> tuple[Sight, float]:
         instrument, stars_known = self.instruments.of(item), catalogue.load_catalogue()
         if instrument is None:
-            blind = BlindSolver(stars_known)
+            blind = BlindSolver(stars_known, self.progress, search_s=self.search_s)
             blind.prepare()
             begin = time.process_time()
             sight = searching.identified_blind(blind, item, stars_of(item))
@@ -74,8 +80,21 @@ class Identifying:
             with suppress(StarposError):
                 solver.prepare(item.width, item.height, item.origin_px)
             begin = time.process_time()
-            sight = searching.identified(solver, item, stars_of(item))
+            sight = self._by_focal_length(solver, item)
         return sight, 1000 * (time.process_time() - begin)
+
+    def _by_focal_length(self, solver: Solver, item: Frame | Stars) -> Sight:
+        stars = stars_of(item)
+
+        def work(solver: Solver) -> Sight:
+            return searching.identified(solver, item, stars)
+
+        sight = work(solver)
+        return (
+            without_hint(solver, item, stars, sight, work, self.progress)
+            if self.instruments.hinted
+            else sight
+        )
 
 
 @dataclass(frozen=True)
@@ -86,7 +105,8 @@ class Fitting:
 
     def __call__(self, item: Frame | Stars) -> tuple[Remark, ...]:
         instrument = self.instruments.of(item)
-        if instrument is None:
+        # without its header's focal length a frame was searched already
+        if instrument is None or self.instruments.hinted:
             return ()
         solver = Solver(instrument, catalogue.load_catalogue())
         focal_px = searching.focal_px_that_fits(solver, stars_of(item))
@@ -98,11 +118,13 @@ class Solving:
     """Solves a frame, identified by every way there is: its Solution.
 
     tilts: not asked of a camera that is fixed to the ground.
+    progress: of the search for a focal length.
     """
 
     instruments: Instruments
     atmosphere: Atmosphere
     tilts: Tilts = NO_TILTS
+    progress: Progress = quiet
 
     def __call__(self, item: Frame | Stars) -> Solution:
         return self.sight(item).solution
@@ -118,4 +140,14 @@ class Solving:
 
     def sight(self, item: Frame | Stars, hint: Hint | None = None) -> Sight:
         """The solution of a frame, and the stars that gave it; hint: of the frame before."""
-        return searching.solved(self.solver(item), item, stars_of(item), self.tilts, hint)
+        solver, stars = self.solver(item), stars_of(item)
+
+        def work(solver: Solver) -> Sight:
+            return searching.solved(solver, item, stars, self.tilts, hint)
+
+        sight = work(solver)
+        return (
+            without_hint(solver, item, stars, sight, work, self.progress)
+            if self.instruments.hinted
+            else sight
+        )

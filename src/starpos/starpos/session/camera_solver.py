@@ -3,10 +3,13 @@
 
 from collections import deque
 from collections.abc import Callable
+from typing import Any
 
 from starpos.errors import InstrumentError
 from starpos.fix.solver import Solver
 from starpos.instrument.camera import Camera
+from starpos.messages.camera import leaves_size_open, message_to_camera
+from starpos.messages.stamp import stamp_to_unix
 from starpos.night.searching import prepare
 from starpos.session.job import Jobs, Outcome
 
@@ -35,6 +38,9 @@ class CameraSolver:
         # why there is no solver
         self.trouble = ""
         self._make, self._changed, self._jobs, self._say, self._topic = make, changed, jobs, say, topic
+        self._frame_px: tuple[int, int] | None = None
+        # the last CameraInfo, if it states no size
+        self._of_open_size: Any = None
         # cameras that hold from a stamp on which no frame has reached yet
         self._changes: deque[tuple[float | None, Camera]] = deque(maxlen=MOST_CHANGES)
 
@@ -53,8 +59,25 @@ class CameraSolver:
             waiting = "the triangles of this field are being built"
         raise InstrumentError(self.trouble or waiting)
 
-    def take(self, camera: Camera, since_s: float | None, at_once: bool) -> None:
-        """Take a camera for the frames from a time on, or at once; the first one counts at once anyway."""
+    def take(self, message: Any, at_once: bool) -> None:
+        """Take a CameraInfo for the frames from its stamp on, or at once; the first one counts at once anyway.
+
+        One that leaves the size open waits for a frame. InstrumentError if it cannot be used.
+        """
+        size = self._frame_px or (1, 1)
+        camera, open_size = message_to_camera(message, size=size), leaves_size_open(message)
+        self._of_open_size = message if open_size else None
+        if self._frame_px is not None or not open_size:
+            self._take(camera, stamp_to_unix(message.header.stamp), at_once)
+
+    def frame_came(self, width: int, height: int, at_once: bool) -> None:
+        """Note the size of a frame, px: it is that of a camera whose CameraInfo leaves it open."""
+        if (width, height) != self._frame_px:
+            self._frame_px = width, height
+            if self._of_open_size is not None:
+                self.take(self._of_open_size, at_once)
+
+    def _take(self, camera: Camera, since_s: float | None, at_once: bool) -> None:
         if camera == (self._changes[-1][1] if self._changes else self.camera):
             return
         if at_once or self.camera is None:

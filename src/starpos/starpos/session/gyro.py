@@ -51,7 +51,8 @@ class Gyro:
         self._forget_bias()
 
     def _forget_bias(self) -> None:
-        self._bias, self._bias_stddev = np.zeros(3), WORST.gyroscope_bias_stddev
+        self._bias: np.ndarray = np.zeros(3)
+        self._bias_stddev = WORST.gyroscope_bias_stddev
 
     def take(self, message: Any, now: Now) -> None:
         """Take a sensor_msgs/Imu; none of recorded data, whose answers may not hang on what was read before a frame."""

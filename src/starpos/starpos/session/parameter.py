@@ -76,7 +76,7 @@ class Parameter:
         text = kinds[type(self.items[0])]
         unit = f" {self.unit}" if self.unit else ""
         if self.choices:
-            text = "one of " + ", ".join(map(str, self.choices))
+            text = "one of " + ", ".join(str(choice) or "''" for choice in self.choices)
         elif self.form:
             text = self.form.constraint
         elif self.minimum is not None and self.maximum is not None:

@@ -273,9 +273,17 @@ def known_instrument(url: str) -> Instrument | None:
 
 
 def check_camera(known: Instrument | None, url: str, camera: Camera) -> None:
-    """Raise InstrumentError if the instrument file (`known`, from `url`) belongs to another camera."""
-    if known is None or abs(known.focal_px / camera.fx - 1) <= SAME_FOCAL:
+    """Raise InstrumentError if the instrument file (`known`, from `url`) belongs to another camera or frame size."""
+    if known is None:
         return
+    if abs(known.focal_px / camera.fx - 1) <= SAME_FOCAL:
+        if known.size in (None, (camera.width, camera.height)):
+            return
+        width, height = known.size
+        raise InstrumentError(
+            f"{url}: its A3 is of frames of {width} x {height} px, camera_info's are {camera.width} x {camera.height}: "
+            "calibrate with these"
+        )
     raise InstrumentError(
         f"{url}: it is of another camera: its focal length is {known.focal_px:.0f} px, camera_info's {camera.fx:.0f}"
     )

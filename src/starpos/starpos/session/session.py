@@ -24,7 +24,6 @@ from starpos.identification import Identification
 from starpos.identification.hint import Hint
 from starpos.identification.search import Priors
 from starpos.instrument.camera import Camera
-from starpos.messages.camera import message_to_camera
 from starpos.messages.stamp import stamp_to_unix
 from starpos.messages.stars import message_to_stars
 from starpos.session import reports
@@ -144,7 +143,7 @@ class SolverSession:
         """
         made = self.at(now)
         try:
-            camera = message_to_camera(message)
+            self.instrument.take(message, at_once=not now.played)
         except StarposError as e:
             if self.instrument.camera is None:
                 self.instrument.trouble = str(e)
@@ -152,7 +151,6 @@ class SolverSession:
             return made
         self._heard.came("camera_info")
         self.names.camera = name_in(message)
-        self.instrument.take(camera, stamp_to_unix(message.header.stamp), at_once=not now.played)
         return made + self._work(now)
 
     def take_tilt(self, message: Any, sent: Sent, now: Now) -> list[Output]:
@@ -207,6 +205,7 @@ class SolverSession:
                 stars_detected=len(message.stars),
             )
             return [*made, self._answered(message.header.stamp, bad, now)]
+        self.instrument.frame_came(stars.width, stars.height, at_once=not now.played)
         self._waiting.append(Waiting(message, stars, now.waiting_s, now.ahead_s(stars.mid_unix_s)))
         while len(self._waiting) > (WAITING_PLAYED if now.played else WAITING):
             self._waiting.popleft()

@@ -40,7 +40,8 @@ class Trails:
 
     def take_camera(self, message: Any) -> None:
         """Take a CameraInfo; InstrumentError in a sentence if it cannot be used."""
-        self._focal_px = message_to_camera(message).fx
+        # a size that it may leave open is of no consequence here
+        self._focal_px = message_to_camera(message, size=(1, 1)).fx
 
     def told(self, frame: Frame) -> Frame:
         """The frame with its trail; as it is where time, exposure, focal length or readings lack, or it turned far."""

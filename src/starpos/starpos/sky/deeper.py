@@ -18,10 +18,7 @@ ORIGINALS = "STARPOS_TYCHO2"
 # Fainter than all stars of Tycho-2, and how many it has.
 ALL_MAG, TYCHO2_STARS = 20.0, 2_550_000
 # How to get the deeper catalogue.
-GET_IT = (
-    "type `apt-get source --download-only tycho2` (Debian or Ubuntu, with a deb-src line) and `starpos catalogue deepen "
-    "tycho2_2.orig.tar.xz`"
-)
+GET_IT = "type `starpos catalogue deepen --fetch` (121 MB, once)"
 
 _lock = threading.Lock()
 _in_use: dict[Path, Catalogue] = {}
@@ -86,6 +83,19 @@ def build(originals: Path | str, progress: Progress = quiet, *, anew: bool = Fal
             "stars of the deeper catalogue",
         )
         return _in_use[folder]
+
+
+def fetched(mirror: str | None = None, progress: Progress = quiet) -> Catalogue:
+    """Build the deeper catalogue from the original files that a mirror of Debian has (`fetching.fetch`), and keep it.
+
+    Raises CatalogueError if they cannot be fetched; what has come stays for the next call.
+    """
+    from starpos.sky.fetching import fetch
+
+    archive = fetch(mirror, progress)
+    made = build(archive, progress, anew=True)
+    archive.unlink(missing_ok=True)
+    return made
 
 
 def _folder() -> Path:

@@ -15,7 +15,10 @@ from starpos.fix.solution import Status
 from starpos.fix.solver import Solver
 from starpos.frames.reading import read_frame
 from starpos.frames.stars import Stars
-from starpos.identification import blind, quad_cache, quads
+from starpos.identification import Sky, blind, quad_cache, quads
+from starpos.identification.pose import stars_at
+from starpos.identification.quad_poses import Matches
+from starpos.identification.triangles import no_triangles
 from starpos.instrument.camera import Camera
 from starpos.instrument.instrument import Instrument
 
@@ -78,8 +81,8 @@ def test_frames_of_any_scale_are_found(field_deg, limit_mag, solver, catalogue, 
 @pytest.mark.parametrize("off", [0.85, 1.0, 1.15])
 def test_a_focal_length_that_is_roughly_known_comes_first(off, solver, catalogue, rng, monkeypatch):
     """EXIF's: rounded, or of a lens that breathes. Where a frame is found near it no other scale is searched."""
-    tried, all_of = [], blind._focal_lengths
-    monkeypatch.setattr(blind, "_focal_lengths", lambda *span: tried.append(span[1:]) or all_of(*span))
+    tried, all_of = [], blind.focal_lengths
+    monkeypatch.setattr(blind, "focal_lengths", lambda *span: tried.append(span[1:]) or all_of(*span))
     for field_deg, limit_mag in FIELDS[2::2]:
         xy, axis, focal_px = seen(catalogue, field_deg, limit_mag, rng)
         free = solver.identify(listed(xy))
@@ -135,6 +138,80 @@ def test_random_points_are_refused_in_bounded_time(solver, rng):
         assert s.status is (Status.TOO_FEW_STARS if n < 4 else Status.NOT_IDENTIFIED)
     assert "at any scale" in s.message
     assert time.process_time() - begin < 60
+
+
+def crowd(rng):
+    """A swarm of detections that makes very many quads of the same sizes, as a cloud's edge or a tree does."""
+    swarm = rng.normal([800, 600], [30, 30], (60, 2))
+    return listed(np.concatenate([swarm, rng.uniform(0, [WIDTH - 1, HEIGHT - 1], (40, 2))]))
+
+
+def test_a_search_ends_with_its_time_and_says_how_to_go_on(catalogue, rng):
+    said = []
+    solver = BlindSolver(catalogue, lambda what, done: said.append(done), search_s=1.0)
+    begin = time.process_time()
+    s = solver.identify(crowd(rng))
+    assert s.status is Status.NOT_IDENTIFIED and "in 1 s of CPU" in s.message and "--search-time" in s.message
+    assert time.process_time() - begin < 4
+    assert said and all(0 <= done <= 1 for done in said)
+
+
+@pytest.mark.montecarlo
+def test_the_worst_swarms_end_in_the_time_of_a_frame(solver, rng):
+    begin = time.process_time()
+    solver.identify(crowd(rng))
+    assert time.process_time() - begin < 22
+
+
+def test_at_any_scale_the_quads_of_a_frame_are_those_of_the_sky(catalogue, rng):
+    """Every quad of the sky that a frame can hold is found again, whatever the focal length of that frame."""
+    sky, table, half_px = (
+        Sky(catalogue, no_triangles()),
+        quad_cache.cached(catalogue),
+        np.hypot(WIDTH, HEIGHT) / 2,
+    )
+    span = [half_px / np.tan(np.radians(d / 2)) for d in (blind.LARGEST_DEG, blind.SMALLEST_DEG)]
+    tried = 0
+    while tried < 40:
+        focal_px, quad = np.exp(rng.uniform(*np.log(span))), rng.integers(len(table.corners))
+        camera = Camera.from_focal(WIDTH, HEIGHT, focal_px)
+        w = sky.directions(table.corners[quad])
+        axis = rotation.normalised(w.mean(0)[None])[0]
+        turn = rotation.best_rotation(axis[None, None], np.array([[[0.0, 0, 1]]]))[0]
+        xy = camera.project(w @ turn.T)
+        # a quad of a few pixels has no shape, and one that is not on the frame is not seen
+        if not (np.abs(xy - camera.centre_px) < [WIDTH / 2, HEIGHT / 2]).all() or np.ptp(xy) < 300:
+            continue
+        tried += 1
+        field = stars_at(camera, xy, np.full(4, 0.1))
+        found = [
+            Matches.of(field, table, 4, 0.4, focal, step)
+            for focal, step in blind.focal_lengths(half_px, *span)
+            if abs(np.log(focal / focal_px)) < 0.3
+        ]
+        assert any((m.corner == table.corners[quad]).all(1).any() for m in found), focal_px
+
+
+def test_the_focal_lengths_that_are_tried_cover_all():
+    half_px = 1000.0
+    for shortest, longest in ((800.0, 2e5), (466.0, 1000.0)):
+        reached = shortest
+        for focal_px, step in blind.focal_lengths(half_px, shortest, longest):
+            assert focal_px * (1 - step) <= reached * (1 + 1e-9)
+            reached = focal_px * (1 + step)
+        assert reached >= longest
+
+
+def test_a_poor_answer_near_the_focal_length_of_exif_does_not_bind(solver, catalogue, rng):
+    """Eight stars of one sky fit the focal length that is told; sixty of another fit a third of it."""
+    few, _, told_px = seen(catalogue, 6.0, 8.5, rng)
+    many, axis, focal_px = seen(catalogue, 20.0, 7.0, rng)
+    xy = np.concatenate([few[:8], many[:60]])
+    alone = solver.identify(replace(listed(few[:8]), rough_focal_px=told_px))
+    assert alone.ok and alone.attitude.focal_px == pytest.approx(told_px, rel=3e-3)
+    s = solver.identify(replace(listed(xy), rough_focal_px=told_px))
+    assert s.ok and looks(s, axis) > 1 - 1e-6 and s.attitude.focal_px == pytest.approx(focal_px, rel=3e-3)
+    assert s.attitude.log_odds > 2 * alone.attitude.log_odds
 
 
 def test_a_shape_is_that_of_the_quad_turned_scaled_and_mirrored(rng):

@@ -17,12 +17,22 @@ BENT = Camera(
     width=SIZE[0], height=SIZE[1], fx=93750.0, fy=93800.0, cx=2800, cy=1870, distortion=(0.3, 5.0, 1e-3, 2e-3, 0)
 )  # fmt: skip
 
+# of an Azure Kinect, and of an OAK-D, whose polynomials all but cancel
+KINECT = Camera(
+    width=1280, height=960, fx=610.0, fy=609.8, cx=638.4, cy=481.2, model="rational_polynomial",
+    distortion=(0.513, -2.733, 4.5e-4, -2.1e-4, 1.618, 0.392, -2.558, 1.544),
+)  # fmt: skip
+OAK = Camera(
+    width=1280, height=800, fx=796.0, fy=796.5, cx=641.0, cy=398.0, model="rational_polynomial",
+    distortion=(-5.33, 16.2, 5e-4, -9e-4, -8.05, -5.37, 16.37, -8.41),
+)  # fmt: skip
+
 
 def pixels(camera, rng, n=500):
     return rng.uniform(0, camera.width - 1, n), rng.uniform(0, camera.height - 1, n)
 
 
-@pytest.mark.parametrize("camera", [WIDE, PAPER, BENT])
+@pytest.mark.parametrize("camera", [WIDE, PAPER, BENT, KINECT, OAK])
 def test_projection_is_opencvs(camera, rng):
     """cv2.projectPoints has the same pinhole, the same plumb_bob and the same pixel (0, 0)."""
     v = camera.directions(*pixels(camera, rng))
@@ -32,7 +42,7 @@ def test_projection_is_opencvs(camera, rng):
     np.testing.assert_allclose(camera.project(v), theirs, atol=1e-9)
 
 
-@pytest.mark.parametrize("camera", [WIDE, PAPER])
+@pytest.mark.parametrize("camera", [WIDE, PAPER, KINECT, OAK])
 def test_round_trip(camera, rng):
     x, y = pixels(camera, rng)
     v = camera.directions(x, y)
@@ -91,12 +101,13 @@ def test_impossible_intrinsics_are_refused(change, words):
 
 def test_a_camera_whose_lens_is_made_goes_to_other_processes(rng):
     v = WIDE.directions(*pixels(WIDE, rng, 5))
-    again = pickle.loads(pickle.dumps(WIDE))
-    assert again == WIDE
-    np.testing.assert_array_equal(again.project(v), WIDE.project(v))
+    for camera in (WIDE, KINECT):
+        again = pickle.loads(pickle.dumps(camera))
+        assert again == camera
+        np.testing.assert_array_equal(again.project(v), camera.project(v))
 
 
-@pytest.mark.parametrize("camera", [WIDE, PAPER])
+@pytest.mark.parametrize("camera", [WIDE, PAPER, KINECT])
 def test_a_pixel_that_is_no_number_has_no_direction(camera):
     v = camera.directions([np.nan, 100.0], [50.0, 60.0])
     assert np.isnan(v[0]).any() and np.isfinite(v[1]).all()

@@ -63,6 +63,16 @@ def test_reads_and_writes_a_fisheye(tmp_path):
     assert camera_file.read(path) == fisheye and "cols: 4" in path.read_text()
 
 
+def test_reads_and_writes_a_rational_lens(tmp_path):
+    path, eight = tmp_path / "camera.yaml", (0.5, -2.7, 4e-4, -2e-4, 1.6, 0.4, -2.5, 1.5)
+    written = WRITTEN_BY_ROS.replace("plumb_bob", "rational_polynomial").replace("cols: 5", "cols: 8")
+    path.write_text(written.replace("[0.1, -0.2, 0.0001, -0.0002, 0.05]", str(list(eight))))
+    rational = replace(CAMERA, model="rational_polynomial", distortion=eight)
+    assert camera_file.read(path) == rational
+    camera_file.write(path, rational, "camera")
+    assert camera_file.read(path) == rational and "cols: 8" in path.read_text()
+
+
 def test_reads_what_it_writes_even_into_a_new_folder(tmp_path):
     path = tmp_path / "new" / "camera.yaml"
     camera_file.write(path, CAMERA, "camera")
@@ -73,14 +83,14 @@ def test_reads_what_it_writes_even_into_a_new_folder(tmp_path):
 @pytest.mark.parametrize(
     ("old", "new", "sentence"),
     [
-        ("plumb_bob", "omni", "plumb_bob and equidistant"),
-        ("plumb_bob", "equidistant", "5 values for 4"),
+        ("plumb_bob", "omni", "'omni' with 5 terms"),
+        ("plumb_bob", "equidistant", "'equidistant' with 5 terms"),
         ("image_width: 640", "image_width: 640.5", "whole numbers"),
         ("image_width: 640", "image_width: 0", "at least 1"),
         ("camera_matrix", "matrix", "camera_matrix"),
         ("image_width: 640", "image_width: " + "9" * 400, "whole numbers"),
         ("plumb_bob", "[[[[[[[[a]]]]]]]]", "distortion model"),
-        ("-0.0002, 0.05]", "-0.0002]", "4 values for 5"),
+        ("-0.0002, 0.05]", "-0.0002, 0.05, 0.1]", "6 terms"),
         ("[7800.5, 0., 320.1", "[7800.5, 3., 320.1", "skew"),
         ("[7800.5, 0., 320.1", "[.nan, 0., 320.1", "not finite"),
         ("[7800.5, 0., 320.1", "[-1.0, 0., 320.1", "positive"),

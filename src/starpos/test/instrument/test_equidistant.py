@@ -107,7 +107,7 @@ def test_the_field_is_to_the_corner_or_to_the_end_of_the_picture():
     [
         ({"distortion": (0.1,) * 5}, "equidistant has 4, k1 k2 k3 k4"),
         ({"distortion": (np.nan, 0, 0, 0)}, "not finite"),
-        ({"model": "omni"}, "'omni'; plumb_bob and equidistant are understood"),
+        ({"model": "omni"}, "'omni'; plumb_bob, equidistant, rational_polynomial are understood"),
     ],
 )
 def test_impossible_fisheyes_are_refused(change, words):

@@ -15,6 +15,7 @@ from starpos import open_night
 from starpos.cli import main
 from starpos.earth.refraction import Atmosphere
 from starpos.instrument.instrument import Calibration, Instrument
+from starpos.instrument.sensors import SCA100T_CALIBRATED
 from starpos.night import folder
 from starpos.report import measures
 from starpos.report.pictures import nights_picture
@@ -72,7 +73,7 @@ def report(capsys, night, out, *more):
 
 
 def worked(folder, calibration=KNOWN_A3):
-    instrument = Instrument(29.67e3 / 6.4, calibration=calibration)
+    instrument = Instrument(29.67e3 / 6.4, calibration=calibration, inclinometer=SCA100T_CALIBRATED)
     air = Atmosphere(pressure_pa=100000.0, temperature_c=5.0, humidity=0.3)
     return open_night(folder, instrument=instrument, atmosphere=air).solve()
 

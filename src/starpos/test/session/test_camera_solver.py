@@ -1,12 +1,33 @@
 # SPDX-License-Identifier: Apache-2.0
 """The Solver of the camera in use: what its catalogue lacks is said once it is prepared."""
 
+from types import SimpleNamespace
+
+import pytest
+
 from starpos.errors import InstrumentError
 from starpos.instrument.camera import Camera
 from starpos.session.camera_solver import CameraSolver
 from starpos.session.job import JobsInTurn
 
 CAMERA = Camera.from_focal(1000, 700, 80_000.0)
+
+
+def info(**changes):
+    """A CameraInfo of that camera."""
+    f, (cx, cy) = CAMERA.fx, CAMERA.centre_px
+    about = {
+        "header": SimpleNamespace(stamp=SimpleNamespace(sec=1793642400, nanosec=0)),
+        "width": CAMERA.width,
+        "height": CAMERA.height,
+        "k": [f, 0, cx, 0, f, cy, 0, 0, 1.0],
+        "d": [],
+        "distortion_model": "plumb_bob",
+        "binning_x": 0,
+        "binning_y": 0,
+        "roi": SimpleNamespace(x_offset=0, y_offset=0, width=0, height=0),
+    }
+    return SimpleNamespace(**{**about, **changes})
 
 
 class Prepared:
@@ -21,14 +42,14 @@ class Prepared:
         return self.thin
 
     def triangles_of(self, width, height, part):
-        """Nothing is looked up."""
+        """Give nothing."""
 
 
 def taken(solver):
     """The CameraSolver that has taken a camera, and what it has said."""
     said, jobs = [], JobsInTurn(print)
     camera_solver = CameraSolver(lambda camera: solver, lambda: None, jobs, said.append, "camera/camera_info")
-    camera_solver.take(CAMERA, None, at_once=True)
+    camera_solver.take(info(), at_once=True)
     jobs.work()
     return camera_solver, said
 
@@ -48,3 +69,20 @@ def test_nothing_is_said_of_a_field_with_enough_stars():
 def test_a_field_that_cannot_be_leaves_no_solver():
     camera_solver, said = taken(Prepared(thin=None))
     assert camera_solver.solver is None and said == ["no such field"] == [camera_solver.trouble]
+
+
+def test_a_camera_of_no_size_has_that_of_the_frames():
+    jobs = JobsInTurn(print)
+    camera_solver = CameraSolver(lambda camera: Prepared(), lambda: None, jobs, print, "camera/camera_info")
+    camera_solver.take(info(width=0, height=0), at_once=True)
+    assert camera_solver.camera is None
+    with pytest.raises(InstrumentError, match="not calibrated"):
+        camera_solver.take(info(width=0, height=0, k=[0.0] * 9), at_once=True)
+    for size in ((1000, 700), (500, 300)):
+        camera_solver.frame_came(*size, at_once=True)
+        jobs.work()
+        assert (camera_solver.camera.width, camera_solver.camera.height) == size
+        assert camera_solver.camera.fx == CAMERA.fx and camera_solver.solver is not None
+    # it counts for the frames that follow, too
+    camera_solver.take(info(width=0, height=0), at_once=True)
+    assert camera_solver.camera.width == 500

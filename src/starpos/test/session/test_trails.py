@@ -22,7 +22,7 @@ FRAME = Frame(np.zeros((400, 500), np.uint8), mid_unix_s=MID_S, exposure_s=EXPOS
 def told(monkeypatch):
     """Trails of a camera; CameraInfo is its test's own."""
     camera = type("Camera", (), {"fx": FOCAL_PX})
-    monkeypatch.setattr(trails, "message_to_camera", lambda message: camera)
+    monkeypatch.setattr(trails, "message_to_camera", lambda message, **_: camera)
     told = Trails("")
     told.take_camera(None)
     return told

@@ -144,7 +144,9 @@ class Graph:
 
         def counts():
             ears = [e.get_publisher_count() for e in self._ears]
-            return [p.get_subscription_count() for p in (self.info, self.stars, self.tilt)] + ears
+            # a node subscribes to camera_info several times, to hear it however it is published
+            heard = self.info.get_subscription_count() > 0
+            return [int(heard), *(p.get_subscription_count() for p in (self.stars, self.tilt)), *ears]
 
         if not self.comes(lambda: counts() == [1] * 6, WAIT_S):
             raise AssertionError(f"the solver is not there, or there are two: {counts()}")

@@ -1,0 +1,194 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A frame that one search does not identify: the command, the library and the node find the same, by every way there is.
+
+Its stars fill less than half of it, and the brightest are missing, as behind a roof and clouds: triangles of the
+whole field are too large for them.
+"""
+
+import json
+import re
+from dataclasses import fields, replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from starpos import open_night
+from starpos.cli import main
+from starpos.fix.solution import Status
+from starpos.frames.night_files import TILTS
+from starpos.frames.reading import read_frame
+from starpos.frames.star_list import write_star_list
+from starpos.instrument.instrument import Calibration
+from starpos.night.reading import stars_of as stars_in
+from starpos.session.job import JobsInTurn
+from starpos.session.now import Now, Sent
+from starpos.session.parameter_file import settings_of
+from starpos.session.session import SolverSession
+from starpos.simulation.night_on_disk import write_fits
+from starpos.simulation.scene import Exposed, expose, render
+from starpos.utc import utc_text
+from starpos_testing.skies.scenes import (
+    EXPOSURE,
+    FOCAL_PX,
+    SIZE,
+    START,
+    solver_of,
+    stars_of,
+    tilt_of,
+    wide_scene,
+)
+
+KNOWN = Calibration.of((0.0, 0.0, 0.0), (5.0, 5.0, 5.0))
+BRIGHTEST, LEFT, SHARE = 4, 14, 0.45
+
+
+def part_of(stars):
+    """A few of the stars in a part of the frame."""
+    return stars.take(np.flatnonzero(stars.x < SHARE * SIZE[0])[BRIGHTEST : BRIGHTEST + LEFT])
+
+
+@pytest.fixture(scope="module")
+def partly(catalogue):
+    rng = np.random.default_rng(1)
+    scene = wide_scene(pointing_deg=(184.0, 80.0, 30.0), misalignment_deg=(0.0, 0.0, 0.0))
+    scene = replace(scene, instrument=replace(scene.instrument, calibration=KNOWN))
+    stars, tilt = part_of(stars_of(scene, catalogue, rng)), tilt_of(scene, rng)
+    solver = solver_of(scene, catalogue)
+    assert solver.solve(stars, tilt).status is Status.NOT_IDENTIFIED
+    return scene, stars, tilt
+
+
+@pytest.fixture
+def folder(partly, tmp_path):
+    """The frame as a star list, with its tilt."""
+    _, stars, tilt = partly
+    write_star_list(tmp_path / "stars_0000.csv", stars, utc_text(START), 6.4)
+    row = tilt.utc_unix_s, *np.degrees([tilt.theta_x, tilt.theta_y]).tolist()
+    (tmp_path / TILTS).write_text("utc_unix_s,theta_x_deg,theta_y_deg\n" + ",".join(map(repr, row)) + "\n")
+    return tmp_path
+
+
+def is_right(fix, scene):
+    """Whether a fix lies where the instrument stood, within what it claims."""
+    off = np.degrees([fix.latitude, fix.longitude]) - [scene.site.latitude_deg, scene.site.longitude_deg]
+    sigma_m = np.sqrt(np.diag(fix.covariance)[:2].max())
+    return np.hypot(off[0], off[1] * np.cos(fix.latitude)) * 111_000 < 4 * sigma_m and sigma_m < 2000
+
+
+def test_the_command_solves_it(folder, partly, capsys):
+    optics = ("--focal-mm", str(FOCAL_PX * 6.4e-3), "--pixel-um", "6.4")
+    known = ("--misalignment", "0", "0", "0", "--misalignment-stddev", "5")
+    frame = str(folder / "stars_0000.csv")
+    assert main(["identify", frame, *optics, "--json"]) == 0
+    named = json.loads(capsys.readouterr().out)
+    assert main(["solve", str(folder), *optics, *known, "--json"]) == 0
+    answer = json.loads(capsys.readouterr().out.splitlines()[0])
+    assert answer["status"] == "ok" and answer["stars_matched"] == named["stars_matched"] == len(partly[1])
+
+
+def test_the_library_solves_it(folder, partly):
+    scene, _, _ = partly
+    instrument = replace(scene.instrument, camera=None)
+    night = open_night(folder, instrument=instrument, atmosphere=scene.site.atmosphere).solve()
+    assert [shot.status for shot in night.shots] == [Status.OK] and is_right(night.combined, scene)
+
+
+def test_a_frame_with_its_pixels_too(partly, catalogue, folder, capsys):
+    scene, _, tilt = partly
+    rng = np.random.default_rng(1)
+    sky = expose(scene, catalogue, START, EXPOSURE, rng)
+    part = np.flatnonzero(sky.middle[:, 0] < SHARE * SIZE[0])
+    part = part[np.argsort(-sky.electrons[part])][BRIGHTEST : BRIGHTEST + LEFT]
+    few = Exposed(*(getattr(sky, f.name)[part] for f in fields(Exposed)))
+    frame = render(scene, few, START, EXPOSURE, rng)
+    write_fits(folder / "frame.fits", frame, utc_text(START), 6.4)
+    seen = read_frame(folder / "frame.fits")
+    assert solver_of(scene, catalogue).solve(stars_in(seen), tilt).status is Status.NOT_IDENTIFIED
+    known = ("--misalignment", "0", "0", "0", "--misalignment-stddev", "5", "--json")
+    assert main(["solve", str(folder), *known]) == 0
+    answer = json.loads(capsys.readouterr().out.splitlines()[0])
+    assert answer["status"] == "ok" and answer["stars_matched"] > BRIGHTEST
+    known = replace(scene.instrument, camera=None)
+    night = open_night(folder, instrument=known, atmosphere=scene.site.atmosphere).solve()
+    assert is_right(night.combined, scene)
+
+
+class Quiet:
+    """Takes what a session says."""
+
+    def came(self, name):
+        """Nothing is said of it."""
+
+    refuse = info = warning = error = lambda self, *_: None
+
+
+def header(unix_s):
+    return SimpleNamespace(
+        stamp=SimpleNamespace(sec=int(unix_s), nanosec=round((unix_s % 1) * 1e9)), frame_id="f"
+    )
+
+
+def told(scene, stars, tilt, **parameters):
+    """What the node publishes of a frame: the messages' session, live."""
+    given = {
+        "misalignment": [0.0, 0.0, 0.0],
+        "misalignment_stddev": 5.0,
+        "inclinometer.model": "sca100t_calibrated",
+        "search_time": 20.0,
+        "refraction.pressure": scene.site.atmosphere.pressure_pa,
+    } | parameters
+    quiet, jobs = Quiet(), []
+
+    def new():
+        jobs.append(JobsInTurn(lambda text: None))
+        return jobs[-1]
+
+    session = SolverSession(settings_of(None, [f"{k}:={v}" for k, v in given.items()]), new, quiet, quiet)
+    now = Now(START + EXPOSURE, 0.0)
+    camera = scene.instrument.camera_for(*SIZE)
+    info = SimpleNamespace(
+        header=header(START), width=SIZE[0], height=SIZE[1], distortion_model="plumb_bob", d=[0.0] * 5,
+        k=[camera.fx, 0.0, camera.cx, 0.0, camera.fy, camera.cy, 0.0, 0.0, 1.0], binning_x=0, binning_y=0,
+        roi=SimpleNamespace(x_offset=0, y_offset=0, width=0, height=0),
+    )  # fmt: skip
+    session.take_camera(info, now)
+    for each in jobs:
+        each.work()
+    message = SimpleNamespace(
+        header=header(tilt.utc_unix_s), x=tilt.theta_x, y=tilt.theta_y, z=np.nan, z_variance=np.nan,
+        covariance=tilt.covariance.ravel(), temperature=15.0, flags=0,
+    )  # fmt: skip
+    session.take_tilt(message, Sent(1), now)
+    seen = [
+        SimpleNamespace(x=x, y=y, flux=flux, snr=snr, covariance=c.ravel(), flags=flag)
+        for x, y, flux, snr, c, flag in zip(
+            stars.x, stars.y, stars.flux, stars.snr, stars.covariance, stars.flags, strict=True
+        )
+    ]
+    array = SimpleNamespace(
+        header=header(START + EXPOSURE / 2), width=SIZE[0], height=SIZE[1], exposure=EXPOSURE, stamp_stddev=0.0,
+        clock_stddev=0.0, shutter_known=True, readout=0.0, readout_stddev=0.0, stars=seen,
+    )  # fmt: skip
+    answers = session.take_stars(array, now) + session.end(Now(START + 2.0, 1.5))
+    return answers[0].solution
+
+
+def test_the_node_solves_it(partly):
+    scene, stars, tilt = partly
+    answer = told(scene, stars, tilt)
+    assert answer.ok and len(answer.names) == len(stars) and is_right(answer.fix, scene)
+
+
+def test_the_node_does_not_search_where_it_has_no_time(partly):
+    assert told(*partly, search_time=0.0).status is Status.NOT_IDENTIFIED
+
+
+def test_a_focal_length_that_is_wrong_is_named_and_makes_no_fix(partly, catalogue):
+    scene, _, tilt = partly
+    stars = stars_of(scene, catalogue, np.random.default_rng(1))
+    wrong = replace(scene, instrument=replace(scene.instrument, camera=None, focal_px=FOCAL_PX * 1.2))
+    answer = told(wrong, stars, tilt)
+    assert answer.fix is None and answer.status is Status.NOT_IDENTIFIED
+    (focal_px,) = map(float, re.findall(r"a focal length of (\d+) px fits", answer.message))
+    assert focal_px == pytest.approx(FOCAL_PX, rel=1e-3)
