@@ -111,7 +111,7 @@ def save_instrument(
 ) -> None:
     """Write A3 into an instrument file, new or there already; raises InstrumentError."""
     instrument_update.write(Path(name), found, about, camera_found=camera_found)
-    if arcsec := instrument_file.read(name).calibration.remounted_arcsec:
+    if arcsec := instrument_file.read(name, needs_camera=False).calibration.remounted_arcsec:
         console.complain(
             command,
             f"{name} keeps remounted_arcsec: {arcsec:g}: A3 is new, so take it out unless you remount again",
