@@ -84,6 +84,16 @@ def test_the_camera_is_calibrated_by_the_command_that_says_how(tmp_path, monkeyp
     assert (tmp_path / "camera.png").read_bytes().startswith(b"\x89PNG")
 
 
+def test_the_hobbyists_commands_print_the_places_of_the_page(tmp_path, monkeypatch, capsys):
+    said = typed("docs/tutorials/hobby.md", tmp_path, monkeypatch, capsys)
+    page = (ROOT / "docs" / "tutorials" / "hobby.md").read_text()
+    printed = [line for out in said.values() for line in out.splitlines() if " frames together: " in line]
+    expected = re.findall(r"^    (\d+ frames together: .*)$", page, re.MULTILINE)
+    assert len(printed) == len(expected) == 2
+    for told, line in zip(expected, printed, strict=True):
+        assert numbers(line) == pytest.approx(numbers(told), rel=0.05)
+
+
 def test_another_solvers_pointings_make_a_place_by_the_command_that_says_how(tmp_path, monkeypatch, capsys):
     assert run(capsys, "simulate", tmp_path / "night", "-n", "3", *LISTS[:1])[0] == 0
     frames = json.loads((tmp_path / "night" / "truth.json").read_text())["frames"]
@@ -97,7 +107,8 @@ def test_another_solvers_pointings_make_a_place_by_the_command_that_says_how(tmp
     ]
     (tmp_path / "table.csv").write_text("\n".join([head, *rows]) + "\n")
     known = "camera: {focal_mm: 600, pixel_um: 6.4}\nmisalignment_deg: [0, 0, 0]"
-    known = f"starpos_instrument: 1\n{known}\ncalibration_stddev_arcsec: [5, 5, 20]\n"
+    known += "\ncalibration_stddev_arcsec: [5, 5, 20]\ninclinometer: {model: sca100t_calibrated}"
+    known = f"starpos_instrument: 1\n{known}\n"
     (tmp_path / "mine.yaml").write_text(known)
     [solved] = typed("docs/how-to/pointings.md", tmp_path, monkeypatch, capsys).values()
     [night] = [line for line in solved.splitlines() if "3 frames together" in line]

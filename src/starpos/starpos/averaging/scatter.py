@@ -87,7 +87,7 @@ class Scatter:
 
     pose_sigma (rad): root of the mean variance of what does not average away within a pose; frame_sigma (rad): the same
     of all that a frame has beside its own stated error; noise_sigma (rad): of what is new in each frame alone.
-    evident: whether it is improbable that the frames scatter as stated.  response_evident: whether it is that the response
+    evident: whether it is improbable that the frames scatter as stated; response_evident: that the response
     errs as stated.
     moved (n,), covariance (n, n): of the parameters.  stated (n, n): their covariance if all is as stated, and the
     stated error of a pose new at each.
