@@ -8,7 +8,17 @@ import struct
 
 import numpy as np
 import pytest
-from cli_calls import IDENTIFY_KEYS, KNOWN, PLACE, SOLVE_KEYS, WIDE, objects, solve, without_focal_length
+from cli_calls import (
+    IDENTIFY_KEYS,
+    KNOWN,
+    PLACE,
+    SENSOR,
+    SOLVE_KEYS,
+    WIDE,
+    objects,
+    solve,
+    without_focal_length,
+)
 
 from starpos.cli import main
 from starpos_testing.command_line import run
@@ -63,7 +73,7 @@ def test_solve_without_json(night, capsys):
     "given", [(), ("--misalignment", "0", "0", "0")], ids=["not given", "without its error"]
 )
 def test_an_a3_that_nobody_vouches_for_is_over_1000_km_and_said_in_a_sentence(given, lists, capsys):
-    status, out, errors = solve(capsys, lists, *WIDE, *given, "--json", frames="stars_0000.csv")
+    status, out, errors = solve(capsys, lists, *WIDE, *SENSOR, *given, "--json", frames="stars_0000.csv")
     assert status == 0
     (said,) = errors
     for words in (
@@ -72,8 +82,6 @@ def test_an_a3_that_nobody_vouches_for_is_over_1000_km_and_said_in_a_sentence(gi
         " km wide",
         "--self-calibrate",
         "--site",
-        "--inclinometer",
-        "sca100t_calibrated",
         "--misalignment-stddev",
     ):
         assert words in said
@@ -180,12 +188,14 @@ def test_no_fix_is_exit_1(lists, tmp_path, capsys):
     rows = (lists / "stars_0000.csv").read_text().splitlines()
     few = tmp_path / "few.csv"
     few.write_text("\n".join(rows[:4]) + "\n")
-    status, out, errors = run(capsys, "solve", few, "--tilt", lists / "tilt.csv", *WIDE, "--json")
+    status, out, errors = run(capsys, "solve", few, "--tilt", lists / "tilt.csv", *WIDE, *SENSOR, "--json")
     assert (status, len(errors)) == (1, 1)
     assert objects(out)[0]["status"] == "too few stars"
     late = tmp_path / "tilt.csv"
     late.write_text("utc_unix_s,theta_x_deg,theta_y_deg\n1000,0,0\n")
-    status, out, errors = run(capsys, "solve", lists / "stars_0000.csv", "--tilt", late, *WIDE, "--json")
+    status, out, errors = run(
+        capsys, "solve", lists / "stars_0000.csv", "--tilt", late, *WIDE, *SENSOR, "--json"
+    )
     assert (status, len(errors)) == (1, 1)
     assert [o["status"] for o in objects(out)] == ["no tilt"]
 

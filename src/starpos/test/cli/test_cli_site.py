@@ -16,7 +16,7 @@ from starpos_testing.skies.sites import TRUE_A3_DEG, a3_error, shots
 
 LAT, LON = 35.7046, 51.4106
 PLACE = ("--site", str(LAT), str(LON))
-OPTICS = ("--focal-mm", "29.67", "--pixel-um", "6.4")
+OPTICS = ("--focal-mm", "29.67", "--pixel-um", "6.4", "--inclinometer", "sca100t_calibrated")
 AIR = ("--pressure-hpa", "880", "--temperature-c", "12")
 ARCSEC_DEG = 1 / 3600
 
