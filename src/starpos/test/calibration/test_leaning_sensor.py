@@ -22,6 +22,7 @@ from starpos.fix.solver import Solver
 from starpos.frames.stars import Stars
 from starpos.instrument.inclinometer import InclinometerErrors, Tilt
 from starpos.instrument.instrument import Calibration, Instrument
+from starpos.instrument.tilts import TiltsByTime
 from starpos.simulation.scene import Scene
 from starpos.sky.site import camera_to_enu
 from starpos.units import DAY_S
@@ -42,11 +43,8 @@ class Night:
 
     scene: Scene
     frames: list[Stars]
-    tilts: dict[float | None, Tilt]
+    tilts: TiltsByTime
     bad: frozenset[int]
-
-    def tilt(self, mid_unix_s: float, *_) -> Tilt:
-        return self.tilts[mid_unix_s]
 
     def solver(self, catalogue, instrument: Instrument) -> Solver:
         return Solver(instrument, catalogue, self.scene.site.atmosphere)
@@ -82,7 +80,7 @@ def night(catalogue, rng, a3, pose_deg, bad=0, place=FIRST, start=START) -> Nigh
         up = a3 @ scene.attitude[2]
         off = rng.normal(0, pose_deg * DEG, 3) + (k in wrong) * 0.5 * DEG * across(up, rng)
         tilts[mid] = read(rotation.normalised(up + off), rng, mid)
-    return Night(scene, frames, tilts, wrong)
+    return Night(scene, frames, TiltsByTime(tilts), wrong)
 
 
 def across(up: np.ndarray, rng) -> np.ndarray:
@@ -135,10 +133,10 @@ def refused(find):
 def test_calibrated_at_a_known_place_it_is_right_at_another(catalogue, nights):
     chi2, left_out = [], []
     for one, two in nights:
-        found = calibrate_at(one.solver(catalogue, unknown()), one.frames, one.tilt, one.scene.site)
+        found = calibrate_at(one.solver(catalogue, unknown()), one.frames, one.tilts, one.scene.site)
         assert len(found.fixes) >= DIRECTIONS - 1
         solver = two.solver(catalogue, found.instrument)
-        fixes = [solver.solve(stars, two.tilt).fix for stars in two.frames]
+        fixes = [solver.solve(stars, two.tilts).fix for stars in two.frames]
         place = refused(lambda fixes=fixes: average([f for f in fixes if f]))
         if place is not None:
             chi2.append(two.chi2(place))
@@ -153,7 +151,7 @@ def test_each_night_alone_is_right_without_a_calibration(catalogue, nights, whic
     chi2, named, wronged = [], 0, 0
     for pair in nights:
         alone = pair[which]
-        found = refused(lambda n=alone: turn(n.solver(catalogue, unknown()), n.frames, n.tilt))
+        found = refused(lambda n=alone: turn(n.solver(catalogue, unknown()), n.frames, n.tilts))
         if found is None:
             continue
         chi2.append(alone.chi2(average(found.fixes)))
