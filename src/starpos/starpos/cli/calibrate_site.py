@@ -13,6 +13,7 @@ from starpos.calibration.misalignment import Calibrated, calibrate_at
 from starpos.calibration.unknown import TELL_IT, at_another_lean, may_turn
 from starpos.cli import console, options
 from starpos.cli.deflection import add_vertical, vertical_of
+from starpos.cli.inputs import tell_unnamed
 from starpos.cli.overwriting import save_instrument
 from starpos.earth.vertical import astronomic
 from starpos.errors import InstrumentError, StarposError
@@ -136,6 +137,7 @@ def run(
             f"{args.instrument} is of a camera that is fixed to the ground: give --fixed, or another instrument file"
         )
     else:
+        tell_unnamed("calibrate", instrument)
         found = calibrate_at(
             solver, frames, tilts, site, stddev_arcsec, options.turn_of(args), console.ProgressBar()
         )
@@ -166,6 +168,7 @@ def run_elevations(
     for row in circles_of(solver, pointings, tilts):
         if isinstance(row, StarposError):
             console.complain("calibrate", f"left out: {row}")
+    tell_unnamed("calibrate", instrument)
     site, stddev_arcsec = _site(args)
     found = axis_of(solver, pointings, tilts, site=site, site_stddev_arcsec=stddev_arcsec)
     calibration = found.calibration(instrument.calibration, options.turn_of(args))

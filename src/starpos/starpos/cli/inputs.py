@@ -34,14 +34,17 @@ def is_untold(args: argparse.Namespace) -> bool:
 
 
 def checked_tilts(command: str, path: str, instrument: Instrument) -> TiltFile:
-    """The table of tilts, with a complaint where it looks like radians, or where nobody names the inclinometer.
-
-    Raises TiltError as `read_tilt_csv` does.
-    """
+    """The table of tilts, with a complaint where it looks like radians; raises TiltError as `read_tilt_csv` does."""
     file = TiltFile(path, instrument.inclinometer.noise_rad)
-    for remark in (*of_inclinometer(instrument), *of_tilts(file.log, path)):
+    for remark in of_tilts(file.log, path):
         console.complain(command, remark)
     return file
+
+
+def tell_unnamed(command: str, instrument: Instrument) -> None:
+    """Complain where nobody has said which inclinometer it is."""
+    for remark in of_inclinometer(instrument):
+        console.complain(command, remark)
 
 
 def add_near(parser: argparse.ArgumentParser) -> None:

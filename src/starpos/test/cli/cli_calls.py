@@ -13,10 +13,9 @@ from starpos_testing.command_line import run
 SCHEMA = Path(__file__).resolve().parents[4] / "docs" / "reference" / "starpos.schema.json"
 # 4636 px: 15 deg across 1000 x 700 px.
 WIDE = ("--focal-mm", "29.67", "--pixel-um", "6.4")
-# the inclinometer of simulated nights
-NAMED = ("--inclinometer", "sca100t_calibrated")
-# the same optics, with an A3 that is known
-KNOWN = (*WIDE, "--misalignment", "0", "0", "0", "--misalignment-stddev", "5", *NAMED)
+SENSOR = ("--inclinometer", "sca100t_calibrated")
+# the same, with an A3 that is known
+KNOWN = (*WIDE, *SENSOR, "--misalignment", "0", "0", "0", "--misalignment-stddev", "5")
 PLACE = {"latitude": 47.3, "longitude": -122.8}
 AIR = ("--pressure-hpa", "1000", "--temperature-c", "5")
 SOLVE_KEYS = {"utc", "latitude", "longitude", "heading", "latitude_geodetic", "longitude_geodetic",

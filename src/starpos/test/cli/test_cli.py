@@ -11,8 +11,8 @@ import pytest
 from cli_calls import (
     IDENTIFY_KEYS,
     KNOWN,
-    NAMED,
     PLACE,
+    SENSOR,
     SOLVE_KEYS,
     WIDE,
     objects,
@@ -73,7 +73,7 @@ def test_solve_without_json(night, capsys):
     "given", [(), ("--misalignment", "0", "0", "0")], ids=["not given", "without its error"]
 )
 def test_an_a3_that_nobody_vouches_for_is_over_1000_km_and_said_in_a_sentence(given, lists, capsys):
-    status, out, errors = solve(capsys, lists, *WIDE, *NAMED, *given, "--json", frames="stars_0000.csv")
+    status, out, errors = solve(capsys, lists, *WIDE, *SENSOR, *given, "--json", frames="stars_0000.csv")
     assert status == 0
     (said,) = errors
     for words in (
@@ -188,13 +188,13 @@ def test_no_fix_is_exit_1(lists, tmp_path, capsys):
     rows = (lists / "stars_0000.csv").read_text().splitlines()
     few = tmp_path / "few.csv"
     few.write_text("\n".join(rows[:4]) + "\n")
-    status, out, errors = run(capsys, "solve", few, "--tilt", lists / "tilt.csv", *WIDE, *NAMED, "--json")
+    status, out, errors = run(capsys, "solve", few, "--tilt", lists / "tilt.csv", *WIDE, *SENSOR, "--json")
     assert (status, len(errors)) == (1, 1)
     assert objects(out)[0]["status"] == "too few stars"
     late = tmp_path / "tilt.csv"
     late.write_text("utc_unix_s,theta_x_deg,theta_y_deg\n1000,0,0\n")
     status, out, errors = run(
-        capsys, "solve", lists / "stars_0000.csv", "--tilt", late, *WIDE, *NAMED, "--json"
+        capsys, "solve", lists / "stars_0000.csv", "--tilt", late, *WIDE, *SENSOR, "--json"
     )
     assert (status, len(errors)) == (1, 1)
     assert [o["status"] for o in objects(out)] == ["no tilt"]

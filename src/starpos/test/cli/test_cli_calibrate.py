@@ -17,11 +17,10 @@ from starpos_testing.skies.lenses import FIELDS, night, random_camera, values
 
 AIR = ("--pressure-hpa", "880", "--temperature-c", "12")
 INSTRUMENT = (
-    "starpos_instrument: 1\nmisalignment_deg: [-45, 0, 0]\ncalibration_stddev_arcsec: [5, 5, 5]\n"
-    "inclinometer: {{model: sca100t_calibrated}}\ncamera: {}\n"
+    "starpos_instrument: 1\nmisalignment_deg: [-45, 0, 0]\ncalibration_stddev_arcsec: [5, 5, 5]\ncamera: {}\n"
 )
 # 2750 px: 25 deg.
-OPTICS = ("--focal-mm", "27.5", "--pixel-um", "10", "--inclinometer", "sca100t_calibrated")
+OPTICS = ("--focal-mm", "27.5", "--pixel-um", "10")
 
 NAMES = ["fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3"]
 A3_TOO = "starpos calibrate: an A3 belongs to the camera it was found with: find it again with this one"

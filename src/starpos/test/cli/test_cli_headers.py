@@ -9,10 +9,8 @@ from cli_calls import AIR, KNOWN, PLACE, WIDE
 
 LEFT, TOP, WIDTH, HEIGHT = 300, 180, 640, 480
 WHOLE = "camera: {focal_mm: 29.67, pixel_um: 6.4, width: 1000, height: 700}"
-A3 = (
-    "misalignment_deg: [0, 0, 0]\ncalibration_stddev_arcsec: [5, 5, 5]\nclock_stddev_s: 0.001\n"
-    "inclinometer: {model: sca100t_calibrated}\n"
-)
+A3 = "misalignment_deg: [0, 0, 0]\ncalibration_stddev_arcsec: [5, 5, 5]\nclock_stddev_s: 0.001\n"
+A3 += "inclinometer: {model: sca100t_calibrated}\n"
 
 
 def changed(lists, folder, cut=None, **cards):

@@ -7,7 +7,7 @@ import subprocess
 import sys
 
 import pytest
-from cli_calls import NAMED, WIDE
+from cli_calls import WIDE
 
 from starpos import cli
 from starpos.cli import console, jobs, parser_for
@@ -117,7 +117,7 @@ def test_a_cache_that_cannot_be_written_is_one_line_for_all_frames(lists, tmp_pa
 
 @pytest.mark.parametrize("command", ["solve", "identify"])
 def test_a_missing_catalogue_is_one_line(command, lists, tmp_path):
-    tilt = ("--tilt", lists / "tilt.csv", *NAMED) if command == "solve" else ()
+    tilt = ("--tilt", lists / "tilt.csv") if command == "solve" else ()
     none = str(tmp_path / "none.npz")
     status, errors = starpos(command, lists / "stars_0000.csv", *tilt, *WIDE, STARPOS_CATALOGUE=none)
     assert (status, len(errors)) == (2, 1), errors

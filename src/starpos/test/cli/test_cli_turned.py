@@ -4,7 +4,7 @@
 import json
 
 import pytest
-from cli_calls import AIR, NAMED, PLACE, WIDE, objects
+from cli_calls import AIR, PLACE, SENSOR, WIDE, objects
 
 from starpos.cli import main
 from starpos.instrument.instrument_file import read
@@ -35,7 +35,7 @@ def arcsec_off(combined):
 
 def test_the_place_is_found_and_a3_saved_for_another_night(turned, tmp_path, capsys):
     saved = tmp_path / "mine.yaml"
-    status, out, errors = solve(capsys, turned, *WIDE, *NAMED, "--self-calibrate", "--save", saved, "--json")
+    status, out, errors = solve(capsys, turned, *WIDE, *SENSOR, "--self-calibrate", "--save", saved, "--json")
     *each, combined = objects(out)
     assert status == 0 and len(each) == 8
     assert max(arcsec_off(combined)) < 4 * max(combined["sigma_north_m"], combined["sigma_east_m"]) / 20
@@ -59,7 +59,7 @@ def test_a_night_at_another_lean_than_the_turn_says_what_makes_it_wide(turned, t
     turn = ("--misalignment", "0", "0", "20", "--turn-stddev")
     for name, known in (("loose", ()), ("held", (*turn, "2"))):
         saved = tmp_path / f"{name}.yaml"
-        assert solve(capsys, turned, *WIDE, *NAMED, *known, "--self-calibrate", "--save", saved)[0] == 0
+        assert solve(capsys, turned, *WIDE, *SENSOR, *known, "--self-calibrate", "--save", saved)[0] == 0
         status, out, errors = solve(capsys, lean, "--instrument", saved, "--json")
         wide = objects(out)[-1]["sigma_east_m"] > 1e5
         assert status == 0 and wide == (name == "loose")
@@ -69,7 +69,7 @@ def test_a_night_at_another_lean_than_the_turn_says_what_makes_it_wide(turned, t
 def test_without_a_turn_nothing_is_saved_and_the_error_is_wide(tmp_path, capsys):
     still = simulated(tmp_path / "still", "-n", "2")
     status, out, errors = solve(
-        capsys, still, *WIDE, *NAMED, "--self-calibrate", "--save", tmp_path / "no.yaml", "--json"
+        capsys, still, *WIDE, *SENSOR, "--self-calibrate", "--save", tmp_path / "no.yaml", "--json"
     )
     # the place is there, and what was asked to be written is not
     assert status == 1 and json.loads(out.splitlines()[-1])["sigma_north_m"] > 1e5
@@ -77,14 +77,14 @@ def test_without_a_turn_nothing_is_saved_and_the_error_is_wide(tmp_path, capsys)
 
 
 def test_a_frames_own_place_waits_for_the_turn_and_no_loose_angles_are_printed(turned, capsys):
-    status, out, errors = solve(capsys, turned, *WIDE, *NAMED, "--self-calibrate")
+    status, out, errors = solve(capsys, turned, *WIDE, *SENSOR, "--self-calibrate")
     said, _, kept = errors
     assert status == 0 and out.count("its place waits for the whole turn") == 8
     assert "--misalignment" not in said and "the plumb line" in said and "--save OUT keeps A3" in kept
 
 
 def test_save_needs_self_calibrate(turned, tmp_path, capsys):
-    status, _, errors = solve(capsys, turned, *WIDE, *NAMED, "--save", tmp_path / "no.yaml")
+    status, _, errors = solve(capsys, turned, *WIDE, *SENSOR, "--save", tmp_path / "no.yaml")
     assert status == 2 and "give both" in errors[0]
 
 
@@ -104,6 +104,6 @@ def test_a_place_under_the_ground_is_refused(turned, tmp_path, capsys):
     site = ("--site", -PLACE["latitude"], PLACE["longitude"] + 180)
     out = tmp_path / "no.yaml"
     status, _, errors = run(
-        capsys, "calibrate", *frames, "--tilt", turned / "tilt.csv", *WIDE, *NAMED, *AIR, *site, "-o", out
+        capsys, "calibrate", *frames, "--tilt", turned / "tilt.csv", *WIDE, *AIR, *site, "-o", out
     )
     assert status == 1 and "into the ground" in errors[-1] and not out.exists()

@@ -50,7 +50,9 @@ def test_a_named_inclinometer_has_its_sheets_errors_unless_a_file_states_them():
     known = Instrument(1000.0, inclinometer=InclinometerErrors(scale=0.01))
     of_file = instrument_of(values(inclinometer__model="scl3300"), CAMERA, known)
     assert (of_file.inclinometer, of_file.inclinometer_model) == (known.inclinometer, "")
-    with pytest.raises(InstrumentError, match="'x' is not known: the models are sca100t, sca100t_calibrated"):
+    with pytest.raises(
+        InstrumentError, match="'x' is not known: the models are sca100t, sca100t_calibrated, scl3300"
+    ):
         instrument_of(values(inclinometer__model="x"), CAMERA, None)
 
 
