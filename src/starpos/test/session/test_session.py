@@ -23,7 +23,8 @@ from starpos.session.session import SolverSession
 NIGHT = Path(__file__).resolve().parents[4] / "test" / "data" / "night"
 if not NIGHT.is_dir():
     pytest.skip("the recorded night is not beside this package", allow_module_level=True)
-KNOWN = ("misalignment:=[0.31,-0.22,0.53]", "misalignment_stddev:=0.1", "refraction.pressure:=66000.0",
+KNOWN = ("inclinometer.model:=sca100t_calibrated",
+         "misalignment:=[0.31,-0.22,0.53]", "misalignment_stddev:=0.1", "refraction.pressure:=66000.0",
          "refraction.temperature:=-4.0", "refraction.humidity:=0.4")  # fmt: skip
 
 
