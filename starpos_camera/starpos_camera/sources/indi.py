@@ -135,6 +135,8 @@ class Indi(FrameSource):
 
     def _exposure(self, blob: Blob, wanted_s: float, commanded_s: float, ready_s: float) -> CapturedFrame:
         frame, header = decode_fits(_unpacked(blob), "its frame")
+        if frame.untimed:
+            raise CaptureError(f"the header of its frame cannot be used: {frame.untimed}.")
         exposure_s = frame.exposure_s or wanted_s
         if exposure_s > ready_s - commanded_s + CLOCK_TOLERANCE_S:
             raise CaptureError(

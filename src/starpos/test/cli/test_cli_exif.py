@@ -71,9 +71,10 @@ def test_an_untended_clock_may_be_a_minute_off(night, capsys):
     assert answers[0]["budget"]["clock"][0] == pytest.approx(60 * M_PER_S, rel=0.01)
 
 
-def test_files_that_do_not_say_their_zone_are_refused_where_they_should(night, capsys):
-    status, _, said = solve(capsys, night, "--exif-utc-offset", "file")
-    assert status == 2 and "OffsetTimeOriginal" in said
+def test_files_that_do_not_say_their_zone_have_no_time_where_they_should_say_it(night, capsys):
+    status, answers, said = solve(capsys, night, "--exif-utc-offset", "file")
+    assert status == 1 and {a["status"] for a in answers} == {"bad input"}
+    assert "OffsetTimeOriginal" in said
 
 
 @pytest.mark.parametrize(
