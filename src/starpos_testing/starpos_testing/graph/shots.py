@@ -30,6 +30,7 @@ SOLVER = (
     f"refraction.temperature:={TEMPERATURE_C}",
     f"refraction.humidity:={HUMIDITY}",
     "misalignment_stddev:=0.5",
+    "inclinometer.model:=sca100t_calibrated",
     "deflection.stddev:=0.0",
 )
 
