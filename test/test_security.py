@@ -63,6 +63,7 @@ READS_WHOLE = {
     "starpos/identification/paper.py": "of the package",
     "starpos/report/coast.py": "of the package",
     "starpos/recording/bag.py": "installed messages",
+    "starpos/recording/bounds.py": "MOST_METADATA",
     "starpos/instrument/tilt_table.py": "MAX_CSV_BYTES",
     "starpos/navigation/table.py": "MOST_BYTES",
     "starpos_bringup/recording/bag.py": "installed messages",
