@@ -223,7 +223,7 @@ def flood(byte):
     ("change", "words"),
     [
         (truncate, "truncated"),
-        (lambda image: setattr(image, "encoding", "yuv422"), "yuv422"),
+        (lambda image: setattr(image, "encoding", "32FC1"), "32FC1"),
         (unstamp, "no time stamp"),
         (empty, "empty"),
         (lambda image: setattr(image, "step", 10), "step"),

@@ -62,7 +62,7 @@ def unnamed_inclinometer(instrument: Instrument, ways: str = MODEL_BY_OPTIONS) -
         return ""
     return (
         "nobody has said which inclinometer this is: its errors are taken for those of an SCA100T as sold, "
-        f"{np.degrees(UNNAMED.pose_rad):.2f} deg and more, 7 km (1 sigma): {ways}"
+        f"{np.degrees(UNNAMED.pose_rad):.2f} deg, 7 km or more (1 sigma): {ways}"
     )
 
 

@@ -184,6 +184,21 @@ def test_an_unreadable_frame_among_good_ones(night, tmp_path, capsys):
     assert combined["frames"] == 2
 
 
+def test_an_inclinometer_that_nobody_names_is_said_once_and_errs_as_one_as_sold(lists, capsys):
+    a3 = ("--misalignment", "0", "0", "0", "--misalignment-stddev", "5")
+
+    def solved(*options):
+        status, out, errors = solve(capsys, lists, *WIDE, *a3, *options, "--json", frames="stars_0000.csv")
+        assert status == 0
+        return objects(out)[0]["sigma_north_m"], [line for line in errors if "which inclinometer" in line]
+
+    unnamed, said = solved()
+    as_sold, silent = solved("--inclinometer", "sca100t")
+    assert len(said) == 1 and "as sold" in said[0] and "--inclinometer MODEL" in said[0]
+    assert silent == [] and unnamed == pytest.approx(as_sold)
+    assert unnamed > 3 * solved(*SENSOR)[0]
+
+
 def test_no_fix_is_exit_1(lists, tmp_path, capsys):
     rows = (lists / "stars_0000.csv").read_text().splitlines()
     few = tmp_path / "few.csv"
