@@ -267,7 +267,8 @@ def _sums(y: np.ndarray, j: np.ndarray, covariance: np.ndarray) -> tuple[np.ndar
     """Normal matrices, right-hand sides, and -2 log likelihoods of data (B, 2) with covariances (H, B, B) an axis."""
     lower = np.linalg.cholesky(covariance)
     n = j.shape[2]
-    white = np.linalg.solve(lower, np.concatenate([y, j.reshape(len(y), -1)], 1))
+    # one more axis: numpy before 2 takes a matrix beside a stack of matrices for a stack of vectors
+    white = np.linalg.solve(lower, np.concatenate([y, j.reshape(len(y), -1)], 1)[None])
     seen, slope = white[..., :2].reshape(len(lower), -1), white[..., 2:].reshape(len(lower), -1, n)
     turned = slope.swapaxes(1, 2)
     log_determinant = np.log(np.diagonal(lower, axis1=1, axis2=2)).sum(1)
