@@ -149,7 +149,7 @@ def add_instrument(parser: argparse.ArgumentParser) -> None:
         "--inclinometer",
         metavar="MODEL",
         help=f"take the inclinometer's errors from its data sheet: {', '.join(sensors.PRESETS)} "
-        "(else those of an SCA100T as sold: 7 km)",
+        "(else those of an SCA100T as sold: 7 km or more)",
     )
     parser.add_argument(
         "--readout",

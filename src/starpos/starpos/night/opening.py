@@ -77,8 +77,8 @@ def open_night(
     instrument: or the path of its file (YAML); None if the frames' headers have the focal length.
     calibration: A3 in place of the instrument's; while nobody knows A3 the place is over 1000 km wide, unless the night
     is solved with self_calibrate=True.  inclinometer: name of its model, in place of the instrument's; where nobody names
-    it or states its errors they are those of an SCA100T as sold, 7 km.  atmosphere: None: not measured.  vertical: its
-    deflection; None: not known.
+    it or states its errors they are those of an SCA100T as sold, 7 km or more.  atmosphere: None: not measured.
+    vertical: its deflection; None: not known.
     Raises StarposError if there is no frame, or the instrument's file cannot be used.
     """
     folder = Path(folder)

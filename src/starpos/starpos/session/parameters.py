@@ -61,7 +61,7 @@ PARAMETERS = (
         "inclinometer.model",
         "",
         f"Take the inclinometer's errors from its data sheet: {', '.join(sensors.PRESETS)}; used without "
-        "calibration_url, whose file names its own. '' for an SCA100T as sold (7 km).",
+        "calibration_url, whose file names its own. '' for an SCA100T as sold (7 km or more).",
     ),
     Parameter(
         "calibration_frames",
