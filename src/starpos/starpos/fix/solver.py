@@ -264,20 +264,33 @@ class Solver:
         """
         key = width, height, origin_px
         if key not in self._views:
-            camera = self.instrument.camera_for(width, height, origin_px)
-            field_deg = math.degrees(2 * camera.half_diagonal_rad)
-            if field_deg < SMALLEST_FIELD_DEG or (field_deg > LARGEST_FIELD_DEG and not wide.is_wide(camera)):
-                raise FieldError(
-                    f"focal length {camera.fx:.0f} px makes a field of {field_deg:.2f} deg across, this program works "
-                    f"from {SMALLEST_FIELD_DEG:g} to {LARGEST_FIELD_DEG:g} deg: check focal length and pixel size, and "
-                    "whether the lens is a fisheye (equidistant)"
-                )
-            catalogue = deeper.for_field(self.catalogue, camera, self.progress)
+            camera, catalogue = self._field(width, height, origin_px)
             triangles = triangle_cache.cached(catalogue, wide.field_rad(camera), self.progress)
             # one size is usual
             self._views.clear()
             self._views[key] = camera, catalogue, triangles
         return self._views[key]
+
+    def _field(
+        self, width: int, height: int, origin_px: tuple[float, float] | None
+    ) -> tuple[Camera, Catalogue]:
+        camera = self.instrument.camera_for(width, height, origin_px)
+        field_deg = math.degrees(2 * camera.half_diagonal_rad)
+        if field_deg < SMALLEST_FIELD_DEG or (field_deg > LARGEST_FIELD_DEG and not wide.is_wide(camera)):
+            raise FieldError(
+                f"focal length {camera.fx:.0f} px makes a field of {field_deg:.2f} deg across, this program works "
+                f"from {SMALLEST_FIELD_DEG:g} to {LARGEST_FIELD_DEG:g} deg: check focal length and pixel size, and "
+                "whether the lens is a fisheye (equidistant)"
+            )
+        return camera, deeper.for_field(self.catalogue, camera, self.progress)
+
+    def prepare_part(self, width: int, height: int, part: float) -> None:
+        """Build the triangles for a part of such frames, as `identify` has it, unless the disk has them.
+
+        They are not kept in memory: a frame that needs them maps them.  Raises StarposError.
+        """
+        camera, catalogue = self._field(width, height, None)
+        triangle_cache.build_ahead(catalogue, part * wide.field_rad(camera), self.progress)
 
     def triangles_of(
         self, width: int, height: int, part: float, origin_px: tuple[float, float] | None = None

@@ -24,7 +24,7 @@ def cached(catalogue: Catalogue, half_diagonal_rad: float, progress: Progress = 
 
     The field is rounded up to steps of 5 %, so that a refined focal length does not need a new one.
     """
-    half_diagonal = 1.05 ** math.ceil(math.log(half_diagonal_rad) / math.log(1.05))
+    half_diagonal = _rounded(half_diagonal_rad)
     with _lock:
         key = (catalogue.fingerprint, half_diagonal)
         if key not in _in_use:
@@ -32,6 +32,16 @@ def cached(catalogue: Catalogue, half_diagonal_rad: float, progress: Progress = 
                 _in_use.pop(next(iter(_in_use)))
             _in_use[key] = _load_or_build(catalogue, half_diagonal, progress)
         return _in_use[key]
+
+
+def build_ahead(catalogue: Catalogue, half_diagonal_rad: float, progress: Progress = quiet) -> None:
+    """Build the table that `cached` maps unless the disk has it; memory holds it no longer than that takes."""
+    with _lock:
+        _load_or_build(catalogue, _rounded(half_diagonal_rad), progress)
+
+
+def _rounded(half_diagonal_rad: float) -> float:
+    return 1.05 ** math.ceil(math.log(half_diagonal_rad) / math.log(1.05))
 
 
 _lock = threading.Lock()

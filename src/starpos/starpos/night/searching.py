@@ -61,9 +61,9 @@ class Sight:
 
 def prepare(solver: Solver, width: int, height: int) -> str:
     """Load or build the tables of every way for frames of this size in px, as `Solver.prepare`."""
-    thin = solver.prepare(width, height)
-    solver.triangles_of(width, height, PART)
-    return thin
+    # first, so that memory never holds both tables
+    solver.prepare_part(width, height, PART)
+    return solver.prepare(width, height)
 
 
 def identified(

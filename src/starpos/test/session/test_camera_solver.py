@@ -41,7 +41,7 @@ class Prepared:
             raise InstrumentError("no such field")
         return self.thin
 
-    def triangles_of(self, width, height, part):
+    def prepare_part(self, width, height, part):
         """Give nothing."""
 
 
