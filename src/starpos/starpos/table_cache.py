@@ -55,7 +55,9 @@ def load_or_build(
                     stacklevel=3,
                 )
             return built
-    return load() or built
+        # the one that is mapped takes its place in memory
+        del built
+    return load() or build()
 
 
 def mapped(kind: type, folder: Path, number_kinds: str) -> Any | None:
