@@ -284,14 +284,6 @@ class Solver:
             )
         return camera, deeper.for_field(self.catalogue, camera, self.progress)
 
-    def prepare_part(self, width: int, height: int, part: float) -> None:
-        """Build the triangles for a part of such frames, as `identify` has it, unless the disk has them.
-
-        They are not kept in memory: a frame that needs them maps them.  Raises StarposError.
-        """
-        camera, catalogue = self._field(width, height, None)
-        triangle_cache.build_ahead(catalogue, part * wide.field_rad(camera), self.progress)
-
     def triangles_of(
         self, width: int, height: int, part: float, origin_px: tuple[float, float] | None = None
     ) -> TriangleCatalogue:

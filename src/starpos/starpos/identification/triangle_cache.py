@@ -34,12 +34,6 @@ def cached(catalogue: Catalogue, half_diagonal_rad: float, progress: Progress = 
         return _in_use[key]
 
 
-def build_ahead(catalogue: Catalogue, half_diagonal_rad: float, progress: Progress = quiet) -> None:
-    """Build the table that `cached` maps unless the disk has it; memory holds it no longer than that takes."""
-    with _lock:
-        _load_or_build(catalogue, _rounded(half_diagonal_rad), progress)
-
-
 def _rounded(half_diagonal_rad: float) -> float:
     return 1.05 ** math.ceil(math.log(half_diagonal_rad) / math.log(1.05))
 

@@ -59,13 +59,6 @@ class Sight:
         return self.solution.found
 
 
-def prepare(solver: Solver, width: int, height: int) -> str:
-    """Load or build the tables of every way for frames of this size in px, as `Solver.prepare`."""
-    # first, so that memory never holds both tables
-    solver.prepare_part(width, height, PART)
-    return solver.prepare(width, height)
-
-
 def identified(
     solver: Solver, item: Frame | Stars, stars: Stars, predicted: Priors = (), until_s: float = NEVER_S
 ) -> Sight:

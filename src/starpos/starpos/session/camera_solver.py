@@ -10,7 +10,6 @@ from starpos.fix.solver import Solver
 from starpos.instrument.camera import Camera
 from starpos.messages.camera import leaves_size_open, message_to_camera
 from starpos.messages.stamp import stamp_to_unix
-from starpos.night.searching import prepare
 from starpos.session.job import Jobs, Outcome
 
 MOST_CHANGES = 1000
@@ -114,7 +113,7 @@ class CameraSolver:
 
         def work() -> tuple[Solver, str]:
             solver = self._make(camera)
-            return solver, prepare(solver, camera.width, camera.height)
+            return solver, solver.prepare(camera.width, camera.height)
 
         self._jobs.run(work).add_done_callback(lambda f: self._prepared(camera, f.result()))
 

@@ -41,9 +41,6 @@ class Prepared:
             raise InstrumentError("no such field")
         return self.thin
 
-    def prepare_part(self, width, height, part):
-        """Give nothing."""
-
 
 def taken(solver):
     """The CameraSolver that has taken a camera, and what it has said."""
