@@ -197,7 +197,7 @@ def _freedom(y: np.ndarray, j: np.ndarray, stated: np.ndarray, prior_sigma: np.n
 def _shapes(frames: Frames, share: np.ndarray, poses: np.ndarray) -> list[_Kind]:
     """Errors of a pose: new at each, and smooth functions of the lean and of the attitude, over each length.
 
-    The first is that which is new at each.  Smooth ones that are about the same at all poses are none: they are a zero.
+    The first is new at each pose.  Smooth errors that are about equal at all poses are left out: they act as a zero.
     """
     leans2 = np.sum((frames.up[:, None] - frames.up) ** 2, axis=2)
     # half the squared norm is the squared angle where that is small; it keeps the kernel positive
