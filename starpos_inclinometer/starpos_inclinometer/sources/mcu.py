@@ -25,16 +25,18 @@ NEAR_CODES = 11_000
 DEFAULT_DELAY_MS = 54
 # Below this determinant of the cross-axis matrix the two axes are not independent.
 SMALLEST_DETERMINANT = 0.5
+RATE_PARAMETER = Parameter(
+    "rate",
+    10,
+    "Samples a second from the microcontroller, or of source iio without a trigger; above the sensor's bandwidth, 18 Hz "
+    "of the SCA100T, they add little.",
+    unit="Hz",
+    minimum=mcu_protocol.MIN_RATE_HZ,
+    maximum=mcu_protocol.MAX_RATE_HZ,
+)
 PARAMETERS = (
     *SERIAL_PARAMETERS,
-    Parameter(
-        "rate",
-        10,
-        "Samples a second from the microcontroller; above 18 Hz, the sensor's bandwidth, they add little.",
-        unit="Hz",
-        minimum=mcu_protocol.MIN_RATE_HZ,
-        maximum=mcu_protocol.MAX_RATE_HZ,
-    ),
+    RATE_PARAMETER,
     Parameter(
         "offset_volts",
         (2.5, 2.5),
