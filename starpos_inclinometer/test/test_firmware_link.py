@@ -63,7 +63,7 @@ def test_the_node_publishes_the_tilt_of_the_device(board):
         assert (stamps[-1] - stamps[0]) / 49 == pytest.approx(0.02, abs=0.0005)
         listener.wait(lambda: reports and report().level == b"\x00")
         values = {v.key: v.value for v in report().values}
-        assert (values["unit"], values["firmware"], values["checksum errors"]) == ("0000002A", "1.0", "0")
+        assert (values["unit"], values["firmware"], values["checksum errors"]) == ("0000002A", "2.0", "0")
         board.tell("reference 0")
         listener.wait(lambda: tilts[-1].flags & Tilt.STUCK and report().level == b"\x02")
         board.tell("reference 1")
