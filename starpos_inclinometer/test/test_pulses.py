@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from board import Board
 
+from starpos.session.shutter_pulses import Edge, ShutterPulse, ShutterPulses
 from starpos_inclinometer.host_clock import Moment
 from starpos_inclinometer.parameters import PARAMETERS
 from starpos_inclinometer.sources.mcu import McuDecoder, McuTilts
@@ -175,6 +176,44 @@ def test_the_numbers_of_edges_go_on_over_their_wrap_and_tell_of_lost_ones():
         pulse = Pulse(input=0, rising=False, number=number, bounces=0, milliseconds=0, microseconds=0)
         times.add(pulse, Moment(10, 10**10), 9.9)
     assert [t.sequence for t in times.take()] == [0, 1, 2, 4]
+
+
+def test_a_night_of_frames_has_the_times_of_their_light_though_nobody_stated_the_cameras_lag(board):
+    """From the contact through board, line, driver and pairing: 0.1 ms are 5 cm of longitude, the lag's 0.3 s 139 m."""
+    rng, exposure_s, off_s = np.random.default_rng(1), 0.3, 0.015
+    decoder, tilts, pairing = McuDecoder(10), McuTilts(VALUES), ShutterPulses()
+    board.run(BOOT_MS)
+    # the first pulse of the receiver is the second 1.7e9
+    zero_ms = board.tell("pps 100 1000")["ms"] + 100
+    utc_s = lambda ms: 1.7e9 + (ms - zero_ms) * 1e-3  # noqa: E731
+    errors = []
+    for k in range(24):
+        now_ms = board.tell("state")["ms"]
+        commanded_s = utc_s(now_ms) + off_s
+        lag_s = 0.3 + rng.normal(0, 0.004)
+        board.tell(f"shutter {lag_s * 1e3} {exposure_s * 1e3} 0")
+        for _ in range(16):
+            data = board.run(50, decoder.command() if k < 2 else b"")
+            read_ms = board.tell("state")["ms"]
+            host_ns = round((utc_s(read_ms) + off_s) * 1e9)
+            tilts.read(decoder.feed(data, Moment(read_ms * 1e-3, host_ns)))
+            for t in tilts.pulses.take():
+                if t.input == Input.SHUTTER:
+                    edge = Edge(
+                        time_s=t.stamp_ns * 1e-9,
+                        stddev_s=t.stddev_s,
+                        rising=t.rising,
+                        sequence=t.sequence,
+                        disciplined=t.disciplined,
+                    )
+                    pairing.add(edge)
+        got = pairing.pair(commanded_s, exposure_s, commanded_s, host_ns * 1e-9)
+        if isinstance(got, ShutterPulse):
+            assert got.disciplined
+            errors.append(got.begin_s - utc_s(now_ms) - lag_s)
+    assert len(errors) >= 12 and np.abs(errors).max() < 1e-4
+    # against the host's clock, which is off by what the lag then holds too
+    assert pairing.lag.median_s == pytest.approx(0.3 - off_s, abs=0.004)
 
 
 def test_edges_go_through_the_driver_with_the_relation_that_the_samples_showed(board):
