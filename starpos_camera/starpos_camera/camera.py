@@ -30,7 +30,7 @@ from starpos.session import system_clock
 from starpos_camera.camera_parameters import PARAMETERS
 from starpos_camera.shutter_times import ShutterTimes
 from starpos_camera.sources.registry import SOURCES
-from starpos_camera.sources.source import CaptureSettings, FrameSource, NothingYet, SourceEnded
+from starpos_camera.sources.source import CapturedFrame, CaptureSettings, FrameSource, NothingYet, SourceEnded
 from starpos_camera.stamping import OF_SYSTEM_CLOCK, in_one_time
 from starpos_common.clock_report import ClockReport, time_is_simulated
 from starpos_common.diagnostics import Diagnosis, Diagnostics, Level
@@ -182,10 +182,7 @@ class CameraNode(Node):
         if time_is_simulated(self):
             exposure, clock = self._source.capture(settings), None
         else:
-            since_s = self._now_s()
-            exposure = in_one_time(lambda: self._source.capture(settings), self._clock_report.watch)
-            if self._shutter is not None:
-                exposure = self._shutter.timed(exposure, since_s, self._now_s())
+            exposure = self._captured(settings)
             # If the source states an error, the clock is that of another machine.
             ours = exposure.stamp_source in OF_SYSTEM_CLOCK and not exposure.frame.clock_stddev_s
             clock = system_clock.read() if ours else None
@@ -212,6 +209,13 @@ class CameraNode(Node):
             remark=exposure.remark,
             seconds=time.monotonic() - begin,
         )
+
+    def _captured(self, settings: CaptureSettings) -> CapturedFrame:
+        if self._shutter is None:
+            return in_one_time(lambda: self._source.capture(settings), self._clock_report.watch)
+        since_s = self._now_s()
+        exposure = in_one_time(lambda: self._source.capture(settings), self._clock_report.watch)
+        return self._shutter.timed(exposure, since_s, self._now_s())
 
     def _on_wake(self) -> None:
         for result in self._worker.fetch():

@@ -68,10 +68,11 @@ class ShutterTimes:
 
     def hear(self, message: Pulse) -> None:
         """Take a message of the topic `pulses`."""
-        if message.input != Pulse.SHUTTER:
+        time_s = stamp_to_unix(message.header.stamp)
+        if message.input != Pulse.SHUTTER or time_s is None:
             return
         edge = Edge(
-            time_s=stamp_to_unix(message.header.stamp),
+            time_s=time_s,
             stddev_s=message.stamp_stddev,
             rising=message.rising,
             sequence=message.sequence,
