@@ -39,7 +39,7 @@ def with_frame_size(instrument: Instrument, first: Framed) -> tuple[Instrument, 
 
     An instrument that knows its frame's size stays as it is.  Else a frame counts as a whole one, and its size holds for
     the others, unless its header says that it begins somewhere on a sensor, or no sensor has its shape: then the error
-    of the axis is part of A3's.
+    of the axis is part of A3's, and stands in axis_stddev_rad.
     """
     if instrument.size is not None:
         return instrument, ""
@@ -61,11 +61,12 @@ def with_frame_size(instrument: Instrument, first: Framed) -> tuple[Instrument, 
         )
     else:
         why = f"these frames of {width} x {height} px are cut out of larger ones, nobody says where"
+    error_px = max(longer, LEAST_UNKNOWN_PX)
+    error_rad = math.atan(error_px / instrument.focal_px)
+    instrument = replace(instrument, axis_stddev_rad=error_rad)
     calibration = instrument.calibration
     if calibration.unknown:
         return instrument, ""
-    error_px = max(longer, LEAST_UNKNOWN_PX)
-    error_rad = math.atan(error_px / instrument.focal_px)
     widened = np.asarray(calibration.covariance_arcsec2, float) + np.eye(3) * (error_rad / ARCSEC) ** 2
     wide = replace(calibration, covariance_arcsec2=tuple(map(tuple, widened.tolist())))
     return replace(instrument, calibration=wide), (
