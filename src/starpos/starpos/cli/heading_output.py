@@ -30,6 +30,8 @@ KEYS = ("heading", "sigma_heading_deg", "pitch", "sigma_pitch_deg", "roll", "sig
         "heading_geodetic", "sigma_heading_geodetic_deg", "pitch_geodetic", "roll_geodetic",
         "covariance_attitude_geodetic")  # fmt: skip
 
+COVARIANCES = ("covariance", "covariance_geodetic")
+
 
 def with_heading(
     values: dict, found: AttitudeAtPlace | MeanAttitude | None, place: KnownPlace | None = None
@@ -39,7 +41,8 @@ def with_heading(
     The place in the covariances stays a fix's, without the correlation with a heading that does not come from it.
     """
     if found is None or place is None:
-        return values | dict.fromkeys(KEYS)
+        none = {k: _with_variance(values[k], np.nan) for k in COVARIANCES if values[k] is not None}
+        return values | dict.fromkeys(KEYS) | none
     plumb, ellipsoid = found.plumb, found.ellipsoid
     covariance, covariance_geodetic = (np.degrees(np.degrees(a.covariance)) for a in (plumb, ellipsoid))
     sigma = np.sqrt(np.diag(covariance))

@@ -107,9 +107,14 @@ class AttitudeAtPlace:
     camera_to_itrs: np.ndarray
     camera_covariance: np.ndarray
 
+    @property
+    def text(self) -> str:
+        """The heading by the plumb line, in deg, with its error."""
+        sigma = math.degrees(math.sqrt(self.plumb.covariance[0, 0]))
+        return f"heading {math.degrees(self.plumb.heading):.5f} +- {sigma:.5f} deg at the known place"
+
     def __repr__(self) -> str:
-        deg, sigma = math.degrees(self.plumb.heading), math.degrees(math.sqrt(self.plumb.covariance[0, 0]))
-        return f"<AttitudeAtPlace: heading {deg:.5f} +- {sigma:.5f} deg>"
+        return f"<AttitudeAtPlace: {self.text}>"
 
 
 def attitude_at_place(

@@ -32,7 +32,9 @@ def placed(solver: Solver, stars: Stars, answer: Solution, places: Places) -> So
         place = places.at(stars.mid_unix_s)
         if answer.fix is not None:
             check_agrees(answer.fix, place)
-        return replace(answer, at_place=solver.attitude_at(stars, answer.found, place))
+        attitude = solver.attitude_at(stars, answer.found, place)
+        alone = answer.ok and answer.fix is None
+        return replace(answer, at_place=attitude, message=attitude.text if alone else answer.message)
     except StarposError as e:
         if answer.fix is not None:
             return replace(answer, remark=f"{stars.place}: no heading at the known place: {e}")
@@ -49,6 +51,6 @@ def check_agrees(fix: Fix, place: KnownPlace) -> None:
     sigmas = math.sqrt(off @ np.linalg.solve(claim, off))
     if sigmas > SIGMAS:
         raise PlaceError(
-            f"stars and tilt have a place {length_text(float(np.linalg.norm(off)))} from the given one, {sigmas:.2g} "
+            f"stars and tilt have a place {length_text(float(np.linalg.norm(off)))} from the given one, {sigmas:.0f} "
             "times what both claim: check latitude and longitude, their order and signs, the tilts, A3 and the clock"
         )

@@ -34,6 +34,7 @@ from starpos.session.clock_doubt import ClockDoubt
 from starpos.session.frames import Answered, Averaged, Output, Waiting, ground_of
 from starpos.session.gyro import Gyro
 from starpos.session.job import Jobs
+from starpos.session.known_place import SessionPlaces
 from starpos.session.log import Heard, Log
 from starpos.session.memory import Seen
 from starpos.session.now import Now, Sent
@@ -80,6 +81,7 @@ class SolverSession:
         self.names = FrameNames()
         self.doubt = ClockDoubt()
         self.gyro = Gyro(heard)
+        self.places = SessionPlaces(settings)
         self._search = Search(settings.values)
         self._settings, self._values = settings, settings.values
         self._catalogue = catalogue.load_catalogue()
@@ -186,6 +188,11 @@ class SolverSession:
         except StarposError as e:
             self._heard.refuse("tilt", str(e))
 
+    def take_gnss(self, message: Any) -> None:
+        """Take a NavSatFix of satellites, for the heading at its place."""
+        self.places.take(message)
+        self._heard.came("gnss/fix")
+
     def take_stars(self, message: Any, now: Now) -> list[Output]:
         """Take a StarArray."""
         made = self.at(now)
@@ -277,6 +284,9 @@ class SolverSession:
             return True
         if self.instrument.solver is None:
             return bool(self.instrument.trouble)
+        # an instrument at a known place may have no inclinometer
+        if self.places.known and not len(self.tilts):
+            return True
         return self.tilts.complete(mid, self._span(frame.stars))
 
     def _span(self, stars: Stars) -> float:
@@ -343,7 +353,8 @@ class SolverSession:
                     f"the frame is stamped {frame.ahead_s:.3g} s before its time: {reports.ONE_CLOCK}"
                 )
             tilts = self.tilts.over(self._span(stars))
-            return self._search.solved(solver, stars, tilts, hint, predicted, until_s, known)
+            places = self.places if self.places.known else None
+            return self._search.solved(solver, stars, tilts, places, hint, predicted, until_s, known)
         except (InstrumentError, TimeError) as e:
             return Solution.failed(stars, Status.BAD_INPUT, str(e))
         except Exception as e:
@@ -421,5 +432,6 @@ class SolverSession:
         self._early.clear()
         self.latest = self.answer = self._hint = None
         self.gyro.forget()
+        self.places.forget()
         self.doubt.clear()
         self.calibrating.forget()
