@@ -6,8 +6,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from starpos.averaging.attitude import MeanAttitude, mean_attitude
+from starpos.cli import fix_output
 from starpos.cli.archive import NightFolder
-from starpos.cli.fix_output import COLUMNS as FIX_COLUMNS
 from starpos.cli.fix_output import COUNTS, counted, json_of
 from starpos.cli.output import Output
 from starpos.earth.known_place import KnownPlace
@@ -24,7 +24,7 @@ HEAD = (
     "up) by the plumb line, each +- 1 sigma"
 )
 # besides those of a fix
-COLUMNS = (*FIX_COLUMNS, "pitch", "roll", "sigma_pitch_deg", "sigma_roll_deg", "heading_geodetic",
+COLUMNS = (*fix_output.COLUMNS, "pitch", "roll", "sigma_pitch_deg", "sigma_roll_deg", "heading_geodetic",
            "sigma_heading_geodetic_deg", "pitch_geodetic", "roll_geodetic")  # fmt: skip
 KEYS = ("heading", "sigma_heading_deg", "pitch", "sigma_pitch_deg", "roll", "sigma_roll_deg", "covariance_attitude",
         "heading_geodetic", "sigma_heading_geodetic_deg", "pitch_geodetic", "roll_geodetic",

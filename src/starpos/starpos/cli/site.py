@@ -60,4 +60,5 @@ def place_of(args: argparse.Namespace, vertical: Vertical) -> KnownPlace | None:
         vertical = replace(vertical, height_m=args.site[2])
     covariance = np.eye(2) * (args.site_stddev or 0.0) ** 2
     make = KnownPlace.on_ellipsoid if args.geodetic else KnownPlace.by_gravity
-    return make(*args.site[:2], vertical, covariance)
+    latitude_deg, longitude_deg, *_ = args.site
+    return make(latitude_deg, longitude_deg, vertical, covariance)

@@ -140,7 +140,7 @@ def attitude_at_place(
     a4 = place.plumb_axes
     rays = camera.directions(*stars.xy.T)
     g = a4 @ rotation.best_rotation(rays, itrs)
-    check_visible(float((rays @ g[2]).mean()))
+    check_visible(float((rays @ g[2]).min()))
     for _ in range(MOST_ROUNDS):
         seen = fit_stars(stars, camera, g, refraction, itrs)
         # by as much as the fitted A4 is off that of the place, the level was
@@ -196,7 +196,9 @@ def _check_refraction(seen: StarFit, atmosphere: Atmosphere) -> None:
     if atmosphere.pressure_pa == 0:
         return
     share, sigma = seen.refraction_seen(atmosphere)
-    if share < LEAST_SHARE and 1 - share > SIGMAS * sigma:
+    # of few stars the scatter is hardly known, as Student's t has it
+    sigmas = SIGMAS * (1 + 5 / len(seen.residual))
+    if share < LEAST_SHARE and 1 - share > sigmas * sigma:
         raise PlaceError(
             f"from the given place the air would bend this field more than the stars show ({share:.2f} +- {sigma:.2f} of "
             "it): check latitude and longitude, their order and signs, the clock, and the camera's fx and fy"

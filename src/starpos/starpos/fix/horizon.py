@@ -19,16 +19,16 @@ def check_above_horizon(sine: float, calibration: Calibration) -> None:
     """
     if not calibration.unknown and sine < MIN_COS_ZENITH:
         raise FixError(
-            f"by the tilts and A3 the stars are {_where(sine)}, and stars tell a place from {LEAST_DEG:.0f} deg above "
-            "it: check the signs and the order of the inclinometer's axes, and A3"
+            f"by the tilts and A3 the stars are {_where(sine)}, and stars tell a place from {LEAST_DEG:.0f} deg "
+            "above it: check the signs and the order of the inclinometer's axes, and A3"
         )
 
 
 def check_visible(sine: float) -> None:
-    """Raise PlaceError if a camera's stars cannot be seen from a known place; sine: of the altitude of their middle."""
+    """Raise PlaceError if a camera's stars cannot be seen from a known place; sine: of the altitude of the lowest."""
     if sine < MIN_COS_ZENITH:
         raise PlaceError(
-            f"from the given place the stars are {_where(sine)}, and stars tell a heading from {LEAST_DEG:.0f} deg above "
+            f"from the given place the stars, or some, are {_where(sine)}, and stars tell a heading from {LEAST_DEG:.0f} deg above "
             "it: check latitude and longitude, their order and signs, and the clock"
         )
 

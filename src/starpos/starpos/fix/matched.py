@@ -85,10 +85,15 @@ class StarFit:
         An attitude and a plate scale take up most of it; what is left squeezes the field along the vertical.
         """
         slope = np.dstack([self.fit.slope[self.fit.kept], self._by_refraction(atmosphere)])
-        weighted = np.linalg.solve(self.errors.centroids + self.errors.catalogue, slope)
+        whole = self.errors.centroids + self.errors.catalogue
+        weighted = np.linalg.solve(whole, slope)
         covariance = np.linalg.pinv(np.einsum("nki,nkj->ij", slope, weighted))
-        beyond = covariance[4] @ np.einsum("nki,nk->i", weighted, -self.residual)
-        return 1 + float(beyond), float(np.sqrt(covariance[4, 4]))
+        found = covariance @ np.einsum("nki,nk->i", weighted, -self.residual)
+        # the scatter of the stars may be that of a refraction which is not theirs
+        left = -self.residual - slope @ found
+        free = max(left.size - len(found), 1)
+        scatter2 = np.vdot(left, np.linalg.solve(whole, left[..., None])[..., 0]) / free
+        return 1 + float(found[4]), float(np.sqrt(covariance[4, 4] * scatter2))
 
     def _by_refraction(self, atmosphere: Atmosphere) -> np.ndarray:
         """Move (M, 2) of the stars, px, by as much refraction again."""

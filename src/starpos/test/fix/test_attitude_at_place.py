@@ -77,7 +77,7 @@ def test_attitude_is_that_of_the_chain_of_erfa(pointing):
 
 
 def test_azimuth_of_the_test_vector_that_sofa_publishes():
-    """t_atco13 of SOFA's t_sofa_c.c (release 2016-05-03): a star's observed azimuth at 9.3 deg of altitude."""
+    """t_atco13 of SOFA's own test program in C (release 2016-05-03): a star's observed azimuth at 9.3 deg of altitude."""
     utc1, utc2, dut1, longitude, latitude = 2456384.5, 0.969254051, 0.1550675, -0.527800806, -1.2345856
     unix_s = (utc1 - UNIX_EPOCH_JD + utc2) * 86400
     orientation = EarthOrientation(
