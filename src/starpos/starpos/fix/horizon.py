@@ -28,8 +28,8 @@ def check_visible(sine: float) -> None:
     """Raise PlaceError if a camera's stars cannot be seen from a known place; sine: of the altitude of the lowest."""
     if sine < MIN_COS_ZENITH:
         raise PlaceError(
-            f"from the given place the stars, or some, are {_where(sine)}, and stars tell a heading from {LEAST_DEG:.0f} deg above "
-            "it: check latitude and longitude, their order and signs, and the clock"
+            f"from the given place the stars, or some, are {_where(sine)}, and stars tell a heading from "
+            f"{LEAST_DEG:.0f} deg above it: check latitude and longitude, their order and signs, and the clock"
         )
 
 
