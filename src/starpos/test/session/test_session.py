@@ -243,7 +243,8 @@ def test_a_replay_twice_is_the_same():
             repr(replace(m, stamp=None)) for m in Replay(settings_of(None, KNOWN), said, said).play(NIGHT)
         ]
 
-    assert played() == played() and len(played()) == 20
+    first = played()
+    assert first == played() and len(first) == 20
 
 
 def test_tilts_stamped_before_their_time_are_refused_though_they_are_read_when_it_has_come(messages):
