@@ -13,9 +13,13 @@ from starpos.units import ARCSEC
 # Longer over shorter side of sensors, and of what cameras keep of their middle; real ones differ by this share.
 SHAPES = (1.0, 5 / 4, 4 / 3, 3 / 2, 8 / 5, 16 / 9)
 SHAPE_OFF = 0.05
+# Sizes of whole frames of some cameras, to which programs also cut the frames of larger sensors.
+STANDARD_SIZES = {(320, 240), (640, 480), (800, 600), (1024, 768), (1280, 720), (1280, 960), (1280, 1024), (1600, 1200),
+                  (1920, 1080)}  # fmt: skip
 # 1 sigma of the axis from a frame's centre where nobody knows of which part of the sensor it is: its longer side, and at
 # least this, as most sensors have up to 7000 px
 LEAST_UNKNOWN_PX = 2000.0
+SIZE_IN_FILE = "camera: {focal_mm, pixel_um, width, height} in the instrument file"
 
 
 class Framed(Protocol):
@@ -35,11 +39,11 @@ class Framed(Protocol):
 
 
 def with_frame_size(instrument: Instrument, first: Framed) -> tuple[Instrument, str]:
-    """The instrument for the frames of a night by the first of them; and a remark if its axis is not known, else ''.
+    """The instrument for the frames of a night by the first of them; and a remark if its axis is doubtful, else ''.
 
     An instrument that knows its frame's size stays as it is.  Else a frame counts as a whole one, and its size holds for
     the others, unless its header says that it begins somewhere on a sensor, or no sensor has its shape: then the error
-    of the axis is part of A3's.
+    of the axis is part of A3's.  A standard size may be either: that is remarked, and the error is not widened.
     """
     if instrument.size is not None:
         return instrument, ""
@@ -47,7 +51,9 @@ def with_frame_size(instrument: Instrument, first: Framed) -> tuple[Instrument, 
     longer, shorter = max(width, height), min(width, height)
     if origin_px is None:
         if any(abs(longer / shorter / shape - 1) < SHAPE_OFF for shape in SHAPES):
-            return replace(instrument, frame_size=(width, height)), ""
+            whole = replace(instrument, frame_size=(width, height))
+            doubtful = (longer, shorter) in STANDARD_SIZES and not instrument.calibration.unknown
+            return whole, _standard_size(width, height) if doubtful else ""
         instrument = replace(instrument, frame_size=(width, height))
         why = f"no sensor has the shape of frames of {width} x {height} px"
     elif np.isfinite(origin_px).all():
@@ -70,6 +76,12 @@ def with_frame_size(instrument: Instrument, first: Framed) -> tuple[Instrument, 
     wide = replace(calibration, covariance_arcsec2=tuple(map(tuple, widened.tolist())))
     return replace(instrument, calibration=wide), (
         f"{why}: the optical axis may be {error_px:.0f} px from their centre, {math.degrees(error_rad):.2g} "
-        "deg that count as an error of A3: give the whole frame's size, camera: {focal_mm, pixel_um, width, height} in "
-        "the instrument file"
+        f"deg that count as an error of A3: give the whole frame's size, {SIZE_IN_FILE}"
+    )
+
+
+def _standard_size(width: int, height: int) -> str:
+    return (
+        f"frames of {width} x {height} px count as whole ones: if they are cut out of larger ones, the optical axis may "
+        f"be off their middle and the place wrong: give the whole frame's size, {SIZE_IN_FILE}"
     )
