@@ -51,9 +51,9 @@ def with_frame_size(instrument: Instrument, first: Framed) -> tuple[Instrument, 
     longer, shorter = max(width, height), min(width, height)
     if origin_px is None:
         if any(abs(longer / shorter / shape - 1) < SHAPE_OFF for shape in SHAPES):
-            whole = replace(instrument, frame_size=(width, height))
+            counted = replace(instrument, frame_size=(width, height))
             doubtful = (longer, shorter) in STANDARD_SIZES and not instrument.calibration.unknown
-            return whole, _standard_size(width, height) if doubtful else ""
+            return counted, _standard_size(width, height) if doubtful else ""
         instrument = replace(instrument, frame_size=(width, height))
         why = f"no sensor has the shape of frames of {width} x {height} px"
     elif np.isfinite(origin_px).all():
