@@ -5,7 +5,9 @@ import json
 
 import numpy as np
 import pytest
-from cli_calls import AIR, KNOWN, PLACE, SENSOR, WIDE, objects
+from cli_calls import AIR, KNOWN, PLACE, WIDE, objects
+
+from starpos_testing.command_line import SENSOR
 
 LEFT, TOP, WIDTH, HEIGHT = 300, 180, 640, 480
 WHOLE = "camera: {focal_mm: 29.67, pixel_um: 6.4, width: 1000, height: 700}"

@@ -5,10 +5,10 @@ import dataclasses
 
 import numpy as np
 import pytest
-from cli_calls import SENSOR, SOLVE_KEYS, objects
+from cli_calls import SOLVE_KEYS, objects
 
 from starpos.instrument.instrument_file import read
-from starpos_testing.command_line import run
+from starpos_testing.command_line import SENSOR, run
 from starpos_testing.skies.pointings import pointed_night
 
 AIR = ("--pressure-hpa", "880", "--temperature-c", "12", "--humidity", "0.3")
