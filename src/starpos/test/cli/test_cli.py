@@ -12,7 +12,6 @@ from cli_calls import (
     IDENTIFY_KEYS,
     KNOWN,
     PLACE,
-    SENSOR,
     SOLVE_KEYS,
     WIDE,
     objects,
@@ -21,7 +20,7 @@ from cli_calls import (
 )
 
 from starpos.cli import main
-from starpos_testing.command_line import run
+from starpos_testing.command_line import SENSOR, run
 
 
 def test_solve_a_night_of_frames(night, capsys):
