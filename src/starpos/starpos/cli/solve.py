@@ -10,7 +10,7 @@ from starpos.cli import console, heading_output, jobs, options, overwriting, sol
 from starpos.cli.archive import NightFolder, frames_among, nights_of
 from starpos.cli.deflection import add_vertical, vertical_of
 from starpos.cli.fix_output import COLUMNS, CSV_HELP, HEAD, JSON_HELP
-from starpos.cli.inputs import add_near, checked_tilts, given_of, near_of, reader_of, tell_unnamed
+from starpos.cli.inputs import add_near, checked_tilts, given_of, near_of, reader_of
 from starpos.cli.output import Output, add_formats
 from starpos.cli.overwriting import Written
 from starpos.cli.site import add_site, place_of
@@ -146,8 +146,6 @@ def _plan(
     tilts = NO_TILTS if night.tilt is None else checked_tilts("solve", night.tilt, instrument)
     jobs.prepare("solve", instrument, about)
     solver = Solver(instrument, catalogue.load_catalogue(), air, progress=console.ProgressBar())
-    if night.tilt is not None:
-        tell_unnamed("solve", instrument)
     levelled = own_level or night.tilt is not None
     solving = Solving(given, air, tilts if levelled else None, place)
     work = Identifying(given) if args.self_calibrate else solving
