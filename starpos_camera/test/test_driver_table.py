@@ -9,7 +9,7 @@ import pytest
 
 from starpos.frames.driver_stamp import KINDS
 from starpos.frames.encodings import ENCODINGS, pixels_of
-from starpos_camera.detector_parameters import PARAMETERS
+from starpos.session.detector_parameters import PARAMETERS
 
 PAGE = Path(__file__).parents[2] / "docs" / "how-to" / "existing_robot.md"
 if not PAGE.is_file():

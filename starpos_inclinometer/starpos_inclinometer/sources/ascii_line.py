@@ -15,7 +15,7 @@ from starpos.units import ARCSEC
 from starpos_common.parameters import Parameter
 from starpos_inclinometer.clock import ArrivalFilter, PaceWatch
 from starpos_inclinometer.host_clock import Moment
-from starpos_inclinometer.noise import NoiseTracker, noise_text
+from starpos.instrument.noise_tracker import NoiseTracker, noise_text
 from starpos_inclinometer.sources.mcu_continuity import HOST_TOLERANCE_S, HOST_TOLERANCE_SHARE, Gate
 from starpos_inclinometer.sources.reading import (
     GAP,

@@ -14,6 +14,7 @@ from starpos.instrument import instrument, instrument_file, sensors
 from starpos.instrument.camera import Camera
 from starpos.instrument.instrument import UNKNOWN_CLOCK_S
 from starpos.instrument.lens import EQUIDISTANT, PLUMB_BOB
+from starpos.recording import drivers
 
 
 def add_frames(parser: argparse.ArgumentParser, pointings: bool = False) -> None:
@@ -34,6 +35,23 @@ def add_frames(parser: argparse.ArgumentParser, pointings: bool = False) -> None
             "its top from north over east, 1 sigma of the centre along each of two axes and of the turn about it; "
             "without a roll elevations alone tell the place, from three directions or more, and no heading",
         )
+
+
+def add_remaps(parser: argparse.ArgumentParser) -> None:
+    """Add --remap, which `remaps_of` reads."""
+    parser.add_argument(
+        "--remap",
+        action="append",
+        default=[],
+        metavar="NAME:=TOPIC",
+        help=f"the topic of a bag that serves as one of {', '.join(drivers.INPUTS)}, such as "
+        "camera/image_raw:=/cam0/image_raw; without it the one with this name, or the only one of its type",
+    )
+
+
+def remaps_of(args: argparse.Namespace) -> drivers.Remaps:
+    """The topics of --remap; raises FrameError."""
+    return drivers.Remaps.of(args.remap)
 
 
 def check_frames(args: argparse.Namespace) -> None:
