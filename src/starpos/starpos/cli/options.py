@@ -4,6 +4,7 @@
 import argparse
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, Protocol
 
 from starpos.earth.refraction import Atmosphere
@@ -35,6 +36,21 @@ def add_frames(parser: argparse.ArgumentParser, pointings: bool = False) -> None
             "its top from north over east, 1 sigma of the centre along each of two axes and of the turn about it; "
             "without a roll elevations alone tell the place, from three directions or more, and no heading",
         )
+
+
+def add_parameters(parser: argparse.ArgumentParser, whose: str, such_as: str) -> None:
+    """Add --params-file and --param; whose: of which nodes.  such_as: an example."""
+    parser.add_argument(
+        "--params-file", type=Path, metavar="YAML", help=f"parameters, as ROS's files have them, {whose}"
+    )
+    parser.add_argument(
+        "-p",
+        "--param",
+        action="append",
+        default=[],
+        metavar="[NODE:]NAME:=VALUE",
+        help=f"a parameter, such as {such_as}, by default of the solver; it counts more than the file's",
+    )
 
 
 def add_remaps(parser: argparse.ArgumentParser) -> None:

@@ -46,21 +46,10 @@ def define(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--namespace", metavar="NAME", help="of the instrument, in a bag, or a YAML, of several"
     )
-    parser.add_argument(
-        "--params-file",
-        type=Path,
-        metavar="YAML",
-        help="parameters of the node solver, as ROS's files have them; for images and an IMU those of detector and "
-        "inclinometer, too",
-    )
-    parser.add_argument(
-        "-p",
-        "--param",
-        action="append",
-        default=[],
-        metavar="[NODE:]NAME:=VALUE",
-        help="a parameter of the node solver, such as misalignment_stddev:=5.0, or of another, such as "
-        "detector:stamp:=start; it counts more than the file's",
+    options.add_parameters(
+        parser,
+        "of the node solver; for a robot's images and IMU of detector and inclinometer, too",
+        "misalignment_stddev:=5.0 or detector:stamp:=start",
     )
     options.add_remaps(parser)
     add_formats(parser, JSON_HELP, CSV_HELP)

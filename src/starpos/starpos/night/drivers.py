@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from starpos.errors import StarposError
+from starpos.errors import FrameError, StarposError
 from starpos.frames.stars import Stars
 from starpos.messages.camera import message_to_frame, message_to_picture
 from starpos.messages.exposures import ExposureFacts, check_stamp
@@ -15,6 +15,7 @@ from starpos.messages.imu_tilts import ImuTilts
 from starpos.messages.stamp import Header, Stamp, stamp_to_unix
 from starpos.messages.tilt import TiltMessage
 from starpos.recording.drivers import CAPTURE, IMAGE, IMU, NO_REMAPS, PICTURE, Remaps
+from starpos.utc import utc_text
 
 if TYPE_CHECKING:
     from starpos.detection import DetectionSettings
@@ -99,3 +100,12 @@ def _as_sent(stars: Stars, header: Header) -> Stars:
         negative=False,
     )
 
+
+def named_image(kind: str, message: Any, messages: DriverMessages) -> tuple[str, Stars | FrameError]:
+    """A name for an image, and its stars, or the error for which there are none."""
+    stamp_s = stamp_to_unix(message.header.stamp)
+    name = "image " + ("of unknown time" if stamp_s is None else utc_text(stamp_s))
+    try:
+        return name, replace(messages.stars_of(kind, message)[0], source=name)
+    except StarposError as error:
+        return name, FrameError(f"{name}: {error}")
