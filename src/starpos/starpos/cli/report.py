@@ -15,7 +15,7 @@ from starpos.night.folder import exposures, frames_in
 from starpos.night.night import Night
 from starpos.night.reading import First, Given, Reader
 from starpos.night.solving import solved_night
-from starpos.session.parameter_file import drivers_of
+from starpos.session.parameter_file import drivers_of, of_solver
 from starpos.sky import catalogue
 from starpos.utc import utc_text
 
@@ -53,6 +53,11 @@ def define(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     options.check_self_calibration(args)
+    if wrong := of_solver(args.param):
+        raise InstrumentError(
+            f"-p {wrong[0]}: a report has the solver's values from its other options, such as --misalignment; -p takes "
+            "NODE:NAME:=VALUE of detector and inclinometer"
+        )
     if find_spec("matplotlib") is None:
         raise InstrumentError(f"a report is drawn with matplotlib, which is not here: {PIP}")
     from starpos.report.page import page

@@ -50,6 +50,11 @@ def drivers_of(
     )
 
 
+def of_solver(given: Sequence[str]) -> list[str]:
+    """Those of the texts [NODE:]NAME:=VALUE that are the solver's; raises InstrumentError for one that is none."""
+    return [text for text in given if _assigned(text)[0] == SOLVER]
+
+
 def _values(
     node: str, table: Sequence[Parameter], file: Path | None, given: Sequence[str], namespace: str | None
 ) -> dict[str, Any]:

@@ -78,6 +78,8 @@ class Player:
         self._listeners: list[int] = []
         self._unchanged_since_s = -math.inf
         self._now_ns: int | None = None
+        # what /clock said last
+        self._ticked_ns = 0
         self._show = sys.stderr.isatty()
         self._shown_s = 0.0
         # a thread of its own: the bag's next message may be long in coming from a slow disk
@@ -182,7 +184,7 @@ class Player:
 
     def start_round(self) -> None:
         """Begin a replay with those who take part."""
-        self._now_ns = None
+        self._now_ns, self._ticked_ns = None, 0
         self._first_ns: int | None = None
         self._participants.begin()
         end_s = time.monotonic() + BEGIN_S
@@ -211,7 +213,7 @@ class Player:
             if self.broken == 1:
                 self._say(f"a message of {topic.name} is broken and left out, as are others like it")
             return
-        self._pace(log_ns)
+        self._pace(log_ns, often=topic.type_name == IMU)
         if self._stopped:
             return
         publisher = self._publishers[topic.name]
@@ -260,7 +262,8 @@ class Player:
         while not self._spin(1.0, self._participants.have_taken_all) and not self._stopped:
             pass
 
-    def _pace(self, log_ns: int) -> None:
+    def _pace(self, log_ns: int, often: bool) -> None:
+        """Wait for the time of a message; often: one of so many that the clock need not tick for each."""
         if self._first_ns is None:
             self._first_ns = log_ns
         while self._rate and not self._stopped:
@@ -272,12 +275,16 @@ class Player:
             self._spin(min(left_s, CLOCK_PERIOD_S))
             passed_ns = int((time.monotonic() - self._begin_s) * self._rate * 1e9)
             self._tick(min(self._first_ns + passed_ns, log_ns))
-        self._tick(log_ns)
+        self._tick(log_ns, CLOCK_PERIOD_S if often else 0.0)
 
-    def _tick(self, now_ns: int) -> None:
+    def _tick(self, now_ns: int, least_s: float = 0.0) -> None:
+        """Go on to a time; it is published unless the clock was within so many seconds before."""
         if self._now_ns is not None and now_ns <= self._now_ns:
             return
         self._now_ns = now_ns
+        if now_ns - self._ticked_ns < least_s * 1e9:
+            return
+        self._ticked_ns = now_ns
         message = Clock()
         message.clock.sec, message.clock.nanosec = divmod(now_ns, 10**9)
         self._clock.publish(message)
