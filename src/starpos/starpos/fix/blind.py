@@ -68,8 +68,7 @@ class BlindSolver:
             )
         camera, found = match
         field = field_of(camera.directions(seen.x, seen.y), seen.sigma, camera, seen.window)
-        answer = identified(seen, field, sky, camera, found)
-        return replace(answer.among(stars, inside), identify_s=time.perf_counter() - begin)
+        return identified(seen, field, sky, camera, found, begin).among(stars, inside)
 
     def _match(self, seen: Stars, sky: Sky, budget: Budget) -> tuple[Camera, Identification] | None:
         """A camera and its identification of stars: of a pinhole, else of a fisheye, which comes first in a disc."""
