@@ -7,12 +7,14 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from starpos.errors import TimeError
-from starpos.frames.driver_stamp import DriverStamp
+from starpos.frames.driver_stamp import UNKNOWN, DriverStamp
 from starpos.frames.frame import Frame
 from starpos.frames.shutter import Shutter
 from starpos.messages.stars import message_to_shutter
 
 CAPTURES_KEPT = 16
+# Capture.stamp_source of one that does not know
+UNKNOWN_SOURCE = 0
 NANO = 10**9
 
 
@@ -34,6 +36,8 @@ class ExposureFacts:
 
     def __init__(self, values: Mapping[str, Any]) -> None:
         self._values = values
+        # whether Captures have come that tell nothing but exposures
+        self._exposures_come = False
         # the oldest first
         self._captures: dict[tuple[int, int], Any] = {}
         # what holds for a frame whose Capture is lost; None: no Capture has ever come
@@ -52,24 +56,29 @@ class ExposureFacts:
     @property
     def unsaid(self) -> str:
         """Sentence on what the user has to state of the camera; '' where Captures come, or all is stated."""
-        return "" if self._usual else self._driver_stamp.unsaid
+        return "" if self._usual else self._driver_stamp(1.0 if self._exposures_come else 0.0).unsaid
 
     def of(self, header: Any) -> tuple[int, Callable[[Frame], Frame]]:
         """The middle of a frame's exposure, ns since 1970, and what adds the exposure to the frame.
 
         From its Capture; where that is lost, with the errors and the shutter of the last one; where none has ever come,
-        from the parameters. The frame has the stamp of its message. Raises StarposError for what no exposure can have.
+        from the parameters. A Capture that does not know where the stamp comes from tells the exposure, which changes with
+        automatic ones, and the parameters tell the rest, if `stamp` is set. The frame has the stamp of its message.
+        Raises StarposError for what no exposure can have.
         """
         stamp_ns = header.stamp.sec * NANO + header.stamp.nanosec
         capture = self._captures.pop(key_of(header), None)
-        facts = self._usual if capture is None else _facts_of(capture)
+        told = None if capture is None else _facts_of(capture)
+        of_driver = capture is not None and self._is_of_driver(capture)
+        self._exposures_come |= of_driver
+        facts = None if of_driver else told or self._usual
         if facts is None:
-            driver = self._driver_stamp
+            driver = self._driver_stamp(told.exposure_s if told else 0.0)
             mid_ns = stamp_ns + round(driver.to_middle_s * 1e9)
             if mid_ns <= 0:
                 raise TimeError("image_raw: the middle of the exposure is before 1970; check the camera's clock.")
             return mid_ns, driver.dated
-        told: dict[str, Any] = {
+        known: dict[str, Any] = {
             "exposure_s": facts.exposure_s or self._values["exposure"] or None,
             "stamp_stddev_s": facts.stamp_stddev_s,
             "clock_stddev_s": facts.clock_stddev_s,
@@ -77,12 +86,17 @@ class ExposureFacts:
         }
         # the errors of a camera's times and its shutter are those of its other frames; its exposure may not be
         self._usual = replace(facts, exposure_s=0.0)
-        return stamp_ns, lambda frame: replace(frame, **told)
+        return stamp_ns, lambda frame: replace(frame, **known)
 
-    @property
-    def _driver_stamp(self) -> DriverStamp:
+    def _is_of_driver(self, capture: Any) -> bool:
+        """Whether a Capture leaves it to the parameters what the stamp is."""
+        return capture.stamp_source == UNKNOWN_SOURCE and self._values["stamp"] != UNKNOWN
+
+    def _driver_stamp(self, exposure_s: float) -> DriverStamp:
+        """The meaning of a driver's stamp by the parameters; exposure_s: that a Capture tells, 0 where none does."""
         v = self._values
-        return DriverStamp(v["stamp"], v["stamp_stddev"], v["exposure"] or None, v["readout"])
+        exposure_s = exposure_s or v["exposure"]
+        return DriverStamp(v["stamp"], v["stamp_stddev"], exposure_s or None, v["readout"])
 
 
 def _facts_of(capture: Any) -> _Facts:
