@@ -75,7 +75,9 @@ def busy():
 
 
 def play(graph, run, bag, rate, *more):
-    replay = run("starpos_bringup", "replay", arguments=(str(bag), "--inputs", "images", "--rate", rate, *more))
+    replay = run(
+        "starpos_bringup", "replay", arguments=(str(bag), "--inputs", "images", "--rate", rate, *more)
+    )
     assert replay.wait() == 0, replay.output
     assert f"{robots.FRAMES} frames, {robots.FRAMES} answers, {robots.FRAMES} fixes" in replay.output
     return replay.output

@@ -35,9 +35,7 @@ class InclinometerNode(Node):
         self._wake = self.create_guard_condition(self._on_wake)
         self._replayed: Replayed | None = None
         self.host_clock = HostClock(self._now_ns, lambda: time_is_simulated(self))
-        host = Surroundings(
-            self, self.host_clock, self._wake.trigger, self._in_turn, time_is_simulated(self)
-        )
+        host = Surroundings(self, self.host_clock, self._wake.trigger, self._in_turn, time_is_simulated(self))
         self._source = SOURCES[self._values["source"]](host, self._values)
         if host.replays and self._source.takes:
             takes = {name: self._at_once(take) for name, take in self._source.takes.items()}

@@ -19,8 +19,16 @@ ARGUMENTS = (
     ("image", None, "the camera's topic, sensor_msgs/Image, or the one whose /compressed is sent"),
     ("camera_info", None, "the topic of its intrinsics"),
     ("imu", None, "the IMU's topic, sensor_msgs/Imu with accelerations"),
-    ("params_file", None, "parameters of the nodes: a copy of config/existing_robot.yaml, with your own values"),
-    ("namespace", "starpos", "of what the nodes publish: /NAMESPACE/fix, so that it is not mixed with a GNSS receiver's"),
+    (
+        "params_file",
+        None,
+        "parameters of the nodes: a copy of config/existing_robot.yaml, with your own values",
+    ),
+    (
+        "namespace",
+        "starpos",
+        "of what the nodes publish: /NAMESPACE/fix, so that it is not mixed with a GNSS receiver's",
+    ),
     *(argument for argument in COMMON_ARGUMENTS if argument[0] not in ("params_file", "namespace")),
     ("use_sim_time", "", "true: time from /clock, for a bag"),
     ("dashboard", "false", "true: also the web page, at http://127.0.0.1:8042"),

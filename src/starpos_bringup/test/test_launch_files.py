@@ -245,7 +245,9 @@ def test_a_robots_topics_are_remapped_and_its_own_fix_has_another_name():
     )
     assert remaps == {"detector": [image, info, imu], "inclinometer": [imu], "solver": [info, imu]}
     assert robot["inclinometer"].more["/**/inclinometer"] == {"source": "imu"}
-    assert {p.namespace for p in robot.values()} == {"/starpos"} and {p.user_file for p in robot.values()} == {mine}
+    assert {p.namespace for p in robot.values()} == {"/starpos"} and {
+        p.user_file for p in robot.values()
+    } == {mine}
     with pytest.raises(RuntimeError, match='"image" was not provided'):
         started("robot")
 

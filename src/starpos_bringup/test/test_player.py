@@ -3,8 +3,8 @@
 
 import pytest
 import rclpy
-from rclpy.serialization import serialize_message
 from builtin_interfaces.msg import Time
+from rclpy.serialization import serialize_message
 from sensor_msgs.msg import Image, Imu
 from std_msgs.msg import String
 
@@ -138,6 +138,11 @@ def test_a_tilt_has_its_turn_right_after_the_acceleration_that_completes_it(play
         message = Imu()
         message.header.stamp.sec = k
         player.play(topic("/imu/data", Imu, IMU), k * 10**9, bytes(serialize_message(message)))
-    assert told == [("/imu/data", 1, True), ("/imu/data", 2, True), ("/tilt", 7, False), ("/imu/data", 3, True)]
+    assert told == [
+        ("/imu/data", 1, True),
+        ("/imu/data", 2, True),
+        ("/tilt", 7, False),
+        ("/imu/data", 3, True),
+    ]
     # and the solver, which takes no accelerations, was not waited for
     assert not player.lost

@@ -164,7 +164,9 @@ class Replayed:
     def _done(self, turn: Played) -> None:
         self._taking, self._index = None, turn.index
         if turn.kind == Played.END:
-            self._leave(STRANGERS.format("{}", ", ".join(sorted(n for n, held in self._held.items() if held))))
+            self._leave(
+                STRANGERS.format("{}", ", ".join(sorted(n for n, held in self._held.items() if held)))
+            )
         # who does not take a topic is not waited for
         if turn.answer and (not turn.topic or turn.topic in self._takes):
             self._say()

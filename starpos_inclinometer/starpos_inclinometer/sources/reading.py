@@ -23,6 +23,7 @@ __all__ = [
     "Reading",
 ]
 
+
 class Phase(Enum):
     """State of a source."""
 

@@ -60,7 +60,7 @@ def add_remaps(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="NAME:=TOPIC",
-        help=f"the topic of a bag that serves as one of {', '.join(drivers.INPUTS)}, such as "
+        help=f"the topic of a bag that serves as one of {', '.join(drivers.DRIVER_INPUTS)}, such as "
         "camera/image_raw:=/cam0/image_raw; without it the one with this name, or the only one of its type",
     )
 

@@ -76,7 +76,9 @@ class ExposureFacts:
             driver = self._driver_stamp(told.exposure_s if told else 0.0)
             mid_ns = stamp_ns + round(driver.to_middle_s * 1e9)
             if mid_ns <= 0:
-                raise TimeError("image_raw: the middle of the exposure is before 1970; check the camera's clock.")
+                raise TimeError(
+                    "image_raw: the middle of the exposure is before 1970; check the camera's clock."
+                )
             return mid_ns, driver.dated
         known: dict[str, Any] = {
             "exposure_s": facts.exposure_s or self._values["exposure"] or None,

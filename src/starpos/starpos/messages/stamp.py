@@ -6,23 +6,23 @@ from typing import Any
 
 
 @dataclass(frozen=True)
-class Stamp:
-    """As builtin_interfaces/Time."""
+class PlainStamp:
+    """Time as builtin_interfaces/Time has it."""
 
     sec: int
     nanosec: int
 
     @classmethod
-    def of_ns(cls, unix_ns: int) -> "Stamp":
+    def of_ns(cls, unix_ns: int) -> "PlainStamp":
         """The stamp of a time in ns since 1970."""
         return cls(*divmod(unix_ns, 10**9))
 
 
 @dataclass(frozen=True)
-class Header:
-    """As std_msgs/Header."""
+class PlainHeader:
+    """Stamp and frame as std_msgs/Header has them."""
 
-    stamp: Stamp
+    stamp: PlainStamp
     frame_id: str
 
 

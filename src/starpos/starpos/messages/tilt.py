@@ -9,7 +9,7 @@ import numpy as np
 
 from starpos.errors import TiltError
 from starpos.instrument.inclinometer import MOST_CELSIUS, SCA100T_NOISE_RAD, SQUARE, Tilt
-from starpos.messages.stamp import Header, Stamp, stamp_to_unix
+from starpos.messages.stamp import PlainHeader, PlainStamp, stamp_to_unix
 
 # bits of Tilt.flags, as starpos_interfaces defines them
 OUT_OF_RANGE, STUCK, SATURATED, GAP, TIME_UNKNOWN = 1, 2, 4, 8, 16
@@ -18,11 +18,11 @@ UNUSABLE = OUT_OF_RANGE | STUCK | SATURATED | TIME_UNKNOWN
 MOST_TILT_VARIANCE = 1.0
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class TiltMessage:
-    """As starpos_interfaces/Tilt."""
+    """Fields of starpos_interfaces/Tilt."""
 
-    header: Header
+    header: PlainHeader
     x: float
     y: float
     covariance: tuple[float, ...]
@@ -53,17 +53,17 @@ class Reading:
     z_variance: float = math.nan
 
     def message(self, frame_id: str) -> TiltMessage:
-        """As a message; frame_id: the inclinometer's frame."""
+        """Make a message; frame_id: the inclinometer's frame."""
         return TiltMessage(
-            Header(Stamp.of_ns(self.stamp_ns), frame_id),
-            self.x,
-            self.y,
-            self.covariance,
-            self.temperature_c,
-            self.sequence,
-            self.flags,
-            self.z,
-            self.z_variance,
+            header=PlainHeader(PlainStamp.of_ns(self.stamp_ns), frame_id),
+            x=self.x,
+            y=self.y,
+            covariance=self.covariance,
+            temperature=self.temperature_c,
+            sequence=self.sequence,
+            flags=self.flags,
+            z=self.z,
+            z_variance=self.z_variance,
         )
 
 

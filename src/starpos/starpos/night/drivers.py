@@ -12,9 +12,9 @@ from starpos.frames.stars import Stars
 from starpos.messages.camera import message_to_frame, message_to_picture
 from starpos.messages.exposures import ExposureFacts, check_stamp
 from starpos.messages.imu_tilts import ImuTilts
-from starpos.messages.stamp import Header, Stamp, stamp_to_unix
+from starpos.messages.stamp import PlainHeader, PlainStamp, stamp_to_unix
 from starpos.messages.tilt import TiltMessage
-from starpos.recording.drivers import CAPTURE, IMAGE, IMU, NO_REMAPS, PICTURE, Remaps
+from starpos.recording.drivers import IMAGE, NO_REMAPS, PICTURE, Remaps
 from starpos.utc import utc_text
 
 if TYPE_CHECKING:
@@ -53,7 +53,7 @@ class DriverMessages:
         """Take a Capture."""
         self._exposures.take(message)
 
-    def stars_of(self, kind: str, message: Any) -> tuple[Stars, Header]:
+    def stars_of(self, kind: str, message: Any) -> tuple[Stars, PlainHeader]:
         """The stars of an image of this type and the header of their message; raises StarposError if there are none."""
         from starpos.detection import detect
 
@@ -61,7 +61,7 @@ class DriverMessages:
         check_stamp(message.header)
         mid_ns, add = self._exposures.of(message.header)
         frame = add(message_to_frame(message) if kind == IMAGE else message_to_picture(message))
-        header = Header(Stamp.of_ns(mid_ns), message.header.frame_id)
+        header = PlainHeader(PlainStamp.of_ns(mid_ns), message.header.frame_id)
         return _as_sent(detect(frame, self._drivers.settings).stars, header), header
 
     def tilt_of(self, message: Any, now_s: float) -> TiltMessage | None:
@@ -87,7 +87,7 @@ class DriverMessages:
         return [sentence for sentence in said if sentence]
 
 
-def _as_sent(stars: Stars, header: Header) -> Stars:
+def _as_sent(stars: Stars, header: PlainHeader) -> Stars:
     """Stars with the numbers that a StarArray holds of them."""
     return replace(
         stars,

@@ -14,7 +14,7 @@ CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 TILT, CAPTURE = f"{PACKAGE}/msg/Tilt", f"{PACKAGE}/msg/Capture"
 RAW, IMU_DATA = "camera/image_raw", "imu/data"
 # what each input may be, the preferred type first
-INPUTS = {
+DRIVER_INPUTS = {
     RAW: (IMAGE, PICTURE),
     "camera/camera_info": (CAMERA_INFO,),
     "camera/capture": (CAPTURE,),
@@ -48,8 +48,8 @@ class Remaps:
 
     def __post_init__(self) -> None:
         for name in self.topics:
-            if name not in INPUTS:
-                raise FrameError(f"--remap {name}:=...: the inputs are {', '.join(INPUTS)}")
+            if name not in DRIVER_INPUTS:
+                raise FrameError(f"--remap {name}:=...: the inputs are {', '.join(DRIVER_INPUTS)}")
 
     @classmethod
     def of(cls, texts: Sequence[str]) -> "Remaps":
@@ -67,9 +67,12 @@ NO_REMAPS = Remaps({})
 
 
 def driver_topics(
-    connections: Sequence[C], remaps: Remaps = NO_REMAPS, namespace: str | None = None, place: Path | str = "the bag"
+    connections: Sequence[C],
+    remaps: Remaps = NO_REMAPS,
+    namespace: str | None = None,
+    place: Path | str = "the bag",
 ) -> dict[str, str]:
-    """Topics by the names of the INPUTS that they serve as; {} without images.
+    """Topics by the names of the DRIVER_INPUTS that they serve as; {} without images.
 
     A topic counts that the user names, else that has the input's own name, else that is beside the images (as
     image_transport has camera_info), else the only one of its type.  Accelerations count where no tilts are, or where
@@ -117,7 +120,7 @@ class _Topics:
         """The topic of an input, preferred beside others; None if there is none."""
         if name in self.remaps.topics:
             return self._named(name, self.remaps.topics[name])
-        for kind in INPUTS[name]:
+        for kind in DRIVER_INPUTS[name]:
             topics = self._of_type(kind)
             own = [t for t in topics if t.removesuffix("/compressed").endswith(f"/{name}")]
             near = [t for t in topics if beside and t.rpartition("/")[0] == beside]
@@ -144,6 +147,8 @@ class _Topics:
         kinds = {c.topic: c.msgtype for c in self.connections}
         if topic not in kinds:
             raise FrameError(f"{self.place}: no topic {topic} in it; it has {', '.join(sorted(kinds))}")
-        if kinds[topic] not in INPUTS[name]:
-            raise FrameError(f"{self.place}: {topic} has {kinds[topic]}; {name} takes {', '.join(INPUTS[name])}")
+        if kinds[topic] not in DRIVER_INPUTS[name]:
+            raise FrameError(
+                f"{self.place}: {topic} has {kinds[topic]}; {name} takes {', '.join(DRIVER_INPUTS[name])}"
+            )
         return topic

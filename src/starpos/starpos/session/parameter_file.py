@@ -51,7 +51,7 @@ def drivers_of(
 
 
 def of_solver(given: Sequence[str]) -> list[str]:
-    """Those of the texts [NODE:]NAME:=VALUE that are the solver's; raises InstrumentError for one that is none."""
+    """Select those of the texts [NODE:]NAME:=VALUE that are the solver's; raises InstrumentError for one that is none."""
     return [text for text in given if _assigned(text)[0] == SOLVER]
 
 
@@ -123,9 +123,7 @@ def _names(path: str) -> list[str]:
     return [name for name in path.split("/") if name]
 
 
-def _sections(
-    path: Path, node: str, names: list[str], below: Any
-) -> Iterator[tuple[list[str], Any]]:
+def _sections(path: Path, node: str, names: list[str], below: Any) -> Iterator[tuple[list[str], Any]]:
     """Go down the names of namespaces and nodes, which may be nested, to each `ros__parameters` of a node."""
     if not isinstance(below, Mapping):
         raise InstrumentError(f"{path}: {'/'.join(names)} has no ros__parameters")

@@ -9,7 +9,7 @@ import pytest
 from starpos.errors import TimeError
 from starpos.frames.frame import Frame
 from starpos.messages.exposures import ExposureFacts
-from starpos.messages.stamp import Header, Stamp
+from starpos.messages.stamp import PlainHeader, PlainStamp
 
 S = 10**9
 UNKNOWN, SIMULATED = 0, 5
@@ -17,7 +17,7 @@ START = {"stamp": "start", "stamp_stddev": 0.002, "exposure": 0.0, "readout": 0.
 
 
 def header(at_s):
-    return Header(Stamp(at_s, 0), "camera")
+    return PlainHeader(PlainStamp(at_s, 0), "camera")
 
 
 def capture(at_s, exposure, source):
@@ -28,7 +28,7 @@ def capture(at_s, exposure, source):
 
 
 def seen(facts, at_s):
-    """Stamp in ns, and frame, of an image."""
+    """PlainStamp in ns, and frame, of an image."""
     mid_ns, add = facts.of(header(at_s))
     return mid_ns, add(Frame(np.zeros((4, 4), np.uint8), mid_unix_s=float(at_s)))
 

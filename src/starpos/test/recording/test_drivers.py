@@ -8,7 +8,9 @@ import pytest
 from starpos.errors import FrameError
 from starpos.recording.drivers import Remaps, driver_topics
 
-IMAGE, PICTURE, INFO, IMU = (f"sensor_msgs/msg/{n}" for n in ("Image", "CompressedImage", "CameraInfo", "Imu"))
+IMAGE, PICTURE, INFO, IMU = (
+    f"sensor_msgs/msg/{n}" for n in ("Image", "CompressedImage", "CameraInfo", "Imu")
+)
 TILT = "starpos_interfaces/msg/Tilt"
 RAW = "camera/image_raw"
 

@@ -224,7 +224,9 @@ class Player:
             made = self._agree(publisher.topic_name, message.header.stamp, topic.type_name in FRAMES)
         elif self._rate == 0 and self.count % BURST == 0:
             self._spin(BURST_REST_S)
-        if topic.type_name == STARS or (topic.type_name in IMAGES and (taken or not self._frames_are_taken())):
+        if topic.type_name == STARS or (
+            topic.type_name in IMAGES and (taken or not self._frames_are_taken())
+        ):
             self.frames += not made
         self._progress()
 

@@ -12,8 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from starpos.errors import BagError, FrameError, StarposError
-from starpos.recording.drivers import INPUTS as DRIVER_INPUTS
-from starpos.recording.drivers import RAW, Remaps
+from starpos.recording.drivers import DRIVER_INPUTS, RAW, Remaps
 from starpos_bringup.recording.bag import Bag, Topic
 from starpos_common.stop_signals import stop_signals
 
@@ -44,7 +43,7 @@ def main(arguments: list[str], stopped: list[int]) -> int:
         with Bag(options.bag) as bag:
             remaps = Remaps.of(options.remap)
             if remaps.topics and options.inputs != "images":
-                raise FrameError("--remap says which of a bag's topics are images and accelerations: give --inputs images")
+                raise FrameError("--remap names a bag's images and accelerations: give --inputs images")
             wanted = bag.inputs(*INPUTS[options.inputs], remaps) if options.inputs else options.topics
             if options.inputs:
                 _say(f"playing {', '.join(wanted)}")
@@ -91,8 +90,8 @@ def _parser() -> argparse.ArgumentParser:
         action="append",
         default=[],
         metavar="NAME:=TOPIC",
-        help=f"with --inputs images: the bag's topic that serves as one of {', '.join(DRIVER_INPUTS)}; without it the one "
-        "with this name, or the only one of its type. It is played under its own name: remap the nodes, as on the robot, "
+        help=f"with --inputs images: the bag's topic that serves as one of {', '.join(DRIVER_INPUTS)}; without it the "
+        "one with this name, or the only one of its type. It is played under its own name: remap the nodes, as on the robot, "
         "or the player (--ros-args -r)",
     )
     parser.add_argument("--loop", action="store_true", help="again and again; the time begins anew as well")

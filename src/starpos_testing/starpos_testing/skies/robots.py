@@ -40,7 +40,7 @@ def write(folder, compressed: bool = False, prefix: str = "") -> Scene:
     messages = [*_frames(robot, compressed, rng), *_readings(robot, rng)]
     with NightBag(folder, prefix) as bag:
         for log_s, topic, kind, stamp_s, fields in sorted(messages, key=lambda m: m[0]):
-            make = getattr(bag, "message")
+            make = bag.message
             made = make(f"{MSG}/{kind}", stamp_s, **fields(make) if callable(fields) else fields)
             made.header.frame_id = "imu_link" if kind == "Imu" else "cam0"
             bag.write(topic, made, log_s)
@@ -60,7 +60,13 @@ def _frames(robot, compressed, rng):
         yield log_s, INFO, "CameraInfo", start_s, info
         if compressed:
             data = cv2.imencode(".png", pixels)[1].ravel()
-            yield log_s, PICTURE, "CompressedImage", start_s, {"format": "mono16; png compressed", "data": data}
+            yield (
+                log_s,
+                PICTURE,
+                "CompressedImage",
+                start_s,
+                {"format": "mono16; png compressed", "data": data},
+            )
         else:
             about = {"width": SIZE[0], "height": SIZE[1], "encoding": "mono16", "step": 2 * SIZE[0]}
             yield log_s, IMAGE, "Image", start_s, about | {"data": pixels.view(np.uint8).ravel()}
@@ -70,9 +76,9 @@ def _readings(robot, rng):
     up = robot.instrument.mounting.a3 @ robot.attitude[2]
     for n in range(round((FRAMES * CADENCE_S + 2.0) * IMU_HZ)):
         at_s = START_S + n / IMU_HZ
-        x, y, z = 9.81 * up + rng.normal(0, IMU_NOISE, 3)
+        x, y, z = (9.81 * up + rng.normal(0, IMU_NOISE, 3)).tolist()
 
-        def fields(make, force=(x, y, z)):
-            return {"linear_acceleration": make("geometry_msgs/msg/Vector3", **dict(zip("xyz", map(float, force))))}
+        def fields(make, x=x, y=y, z=z):
+            return {"linear_acceleration": make("geometry_msgs/msg/Vector3", x=x, y=y, z=z)}
 
         yield at_s + 0.004, IMU, "Imu", at_s, fields
