@@ -57,6 +57,7 @@ class TiltSource(Protocol):
 
     def restart(self) -> None:
         """Forget what came of topics: a replay begins."""
+        return None
 
     def configure(self, values: Mapping[str, Any]) -> None:
         """Apply the parameters that may change at run time."""

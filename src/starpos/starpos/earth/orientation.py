@@ -131,7 +131,7 @@ def earth_orientation(utc_unix_s: float) -> EarthOrientation:
         raise TimeError("the time of the frame is not a finite number: check the clock that stamps it")
     if 0 <= utc_unix_s < COUNTED_S:
         raise TimeError(
-            f"a time of {utc_unix_s:.3f} s after 1970 is no date: it is counted from a start, as simulated time (Gazebo's "
+            f"a time of {utc_unix_s:.3f} s after 1970 is no date: it counts from a start, as simulated time (Gazebo's "
             "/clock) or time since boot, and stars need UTC: start the simulation at a date (gz sim --initial-sim-time), "
             "or have the frames stamped in UTC"
         )

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tilts from the accelerations of an IMU at rest, sensor_msgs/Imu. An accelerometer at rest measures g upward (REP 145)."""
+"""Tilts from the accelerations of a sensor_msgs/Imu at rest: an accelerometer then measures g upward (REP 145)."""
 
 import math
 from collections.abc import Mapping

@@ -157,7 +157,7 @@ class Player:
         return all(p.get_subscription_count() for p in every)
 
     def _chain(self) -> bool:
-        """Whether somebody takes the frames, somebody the star lists that are made of them, and somebody accelerations."""
+        """Whether somebody takes the frames, the star lists that are made of them, and accelerations if there are any."""
         makers = self._made_of_frames()
         solvers = [*self._star_topics, *makers]
         takers = self._participants.taking
@@ -234,7 +234,7 @@ class Player:
         return any(map(self._participants.taking, self._frame_topics))
 
     def _agree(self, topic: str, stamp: Any, is_frame: bool) -> bool:
-        """Wait until the nodes have taken a message, and then what they made of it; return whether that were star lists."""
+        """Wait until the nodes have taken a message, and then what they made of it; return whether star lists came."""
         # what others take of what is made of it has its turn before the next message
         links = any(map(self._participants.taking, self._participants.topics_made_of(topic)))
         answer = is_frame or links or self.count % BURST == 0
