@@ -62,8 +62,8 @@ class ExposureFacts:
         """The middle of a frame's exposure, ns since 1970, and what adds the exposure to the frame.
 
         From its Capture; where that is lost, with the errors and the shutter of the last one; where none has ever come,
-        from the parameters. Where `stamp` is set, a Capture without a stamp source tells the exposure alone, which changes
-        with automatic ones, and the parameters tell the rest. The frame has the stamp of its message.
+        from the parameters. Where `stamp` is set, a Capture without a stamp source tells the exposure alone, which
+        changes with automatic ones, and the parameters tell the rest. The frame has the stamp of its message.
         Raises StarposError for what no exposure can have.
         """
         stamp_ns = header.stamp.sec * NANO + header.stamp.nanosec

@@ -91,8 +91,8 @@ def _parser() -> argparse.ArgumentParser:
         default=[],
         metavar="NAME:=TOPIC",
         help=f"with --inputs images: the bag's topic that serves as one of {', '.join(DRIVER_INPUTS)}; without it the "
-        "one with this name, or the only one of its type. It is played under its own name: remap the nodes as on the robot, or "
-        "the player (--ros-args -r)",
+        "one with this name, or the only one of its type. It is played under its own name: remap the nodes, or the "
+        "player (--ros-args -r)",
     )
     parser.add_argument("--loop", action="store_true", help="again and again; the time begins anew as well")
     parser.add_argument(
