@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from sensor_msgs.msg import Imu
 
-from starpos_inclinometer.sources.force import ForceAverager, MeanForce
-from starpos_inclinometer.sources.imu import BadMessage, felt
+from starpos.messages.imu_tilts import BadMessage, ForceAverager, MeanForce, felt
 from starpos_interfaces.msg import Tilt
 from starpos_testing.nodes import Listener, Process, take_domain
 

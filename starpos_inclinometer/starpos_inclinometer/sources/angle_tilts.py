@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from starpos.instrument.inclinometer import SCA100T_NOISE_RAD
+from starpos.instrument.noise_tracker import NoiseTracker
 from starpos_inclinometer.host_clock import Moment
-from starpos_inclinometer.noise import NoiseTracker
 from starpos_inclinometer.sources.reading import GAP, OUT_OF_RANGE, STUCK, TIME_UNKNOWN, Reading
 
 

@@ -10,11 +10,12 @@ from pathlib import Path
 from typing import Any
 
 from starpos.instrument import sensors
+from starpos.instrument.noise_tracker import noise_text
+from starpos.messages.imu_tilts import Felt, ImuTilts
+from starpos.session import inclinometer_parameters
 from starpos_common.parameters import Parameter
 from starpos_inclinometer.host_clock import Moment
-from starpos_inclinometer.noise import noise_text
 from starpos_inclinometer.sources.angle_tilts import Angles, AngleTilts
-from starpos_inclinometer.sources.force import FORCE_PARAMETERS, Felt, ForceTilts
 from starpos_inclinometer.sources.iio_buffer import Buffer
 from starpos_inclinometer.sources.iio_device import (
     FAILED_READS,
@@ -40,7 +41,7 @@ RATE_WINDOW_S = 5.0
 
 PARAMETERS = (
     RATE_PARAMETER,
-    *FORCE_PARAMETERS,
+    *inclinometer_parameters.IMU,
     Parameter(
         "iio.root",
         "/sys/bus/iio/devices",
@@ -229,7 +230,7 @@ class IioTilts:
     """Converts raw values of a device to readings."""
 
     def __init__(self, values: Mapping[str, Any]) -> None:
-        self.angles, self.forces = AngleTilts(), ForceTilts(values)
+        self.angles, self.forces = AngleTilts(), ImuTilts(values)
         self.unusable = 0
         self.device: IioDevice | None = None
         self.configure(values)
@@ -303,7 +304,7 @@ class IioSource(TiltSource):
         if phase is Phase.RECEIVING and tilts.forces.unrest:
             phase = Phase.MOVING
             sentence = f"the accelerometer is not at rest: {tilts.forces.unrest}; tilts come when it is."
-        noise = tilts.angles.noise.sigma or tilts.forces.noise.sigma
+        noise = tilts.angles.noise.sigma or tilts.forces.noise
         values = {
             "openings": self._link.connections,
             "driver": device.model if device else "unknown",

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from starpos.instrument.inclinometer import elevations
-from starpos_inclinometer.sources.force import STANDARD_GRAVITY
+from starpos.messages.imu_tilts import STANDARD_GRAVITY
 
 # What is looked for, the better first: a sensor that measures angles has calibrated and filtered them itself.
 INCLINATION, ACCELERATION = "incli", "accel"

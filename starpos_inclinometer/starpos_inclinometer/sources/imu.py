@@ -1,86 +1,63 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The source `imu`: tilts from sensor_msgs/Imu at rest. An accelerometer at rest measures g upward (REP 145)."""
+"""The source `imu`: tilts from sensor_msgs/Imu at rest; what they are is starpos.messages.imu_tilts's."""
 
 import math
 from collections import deque
 from collections.abc import Mapping
 from typing import Any
 
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
 from rclpy.qos import ReliabilityPolicy
 from sensor_msgs.msg import Imu
 
-from starpos_common.parameters import Parameter
-from starpos_common.topics import subscription
-from starpos_inclinometer.noise import noise_text
-from starpos_inclinometer.sources.force import FORCE_PARAMETERS, LEAST, Felt, ForceTilts
-from starpos_inclinometer.sources.reading import Counts, Health, Phase, Reading
+from starpos.instrument.noise_tracker import noise_text
+from starpos.messages.imu_tilts import LEAST, ImuTilts
+from starpos.messages.tilt import Reading
+from starpos.session import inclinometer_parameters
+from starpos_common.matched import MatchedSubscription
+from starpos_common.topics import Take, subscription
+from starpos_inclinometer.sources.reading import Counts, Health, Phase
 from starpos_inclinometer.sources.source import Surroundings, TiltSource
 
 TOPIC = "imu/data"
-# A stamp further ahead is wrong: the clocks of two hosts differ by less.
-FUTURE_S = 0.1
-QUEUE = 512
+QUEUE, DEPTH = 512, 1000
+# how often a simulator's publishers are looked at
+LOOK_S = 0.5
 RATE_WINDOW_S = 5.0
 # Silence is reported within 2 s, with a report every second.
 PATIENCE_S = 0.8
-
-PARAMETERS = (
-    *FORCE_PARAMETERS,
-    Parameter(
-        "imu.max_rotation",
-        2.0,
-        "Rate of rotation beyond which the IMU is not at rest, its gyroscope's own offset included.",
-        unit="deg/s",
-        minimum=0.001,
-        maximum=360.0,
-    ),
-)
-
-
-class BadMessage(ValueError):
-    """A message cannot be used; the text says what is wrong with it."""
-
-
-def felt(message: Imu) -> Felt:
-    """Read a message; BadMessage if it has no stamp or holds NaN, infinity or a negative variance."""
-    stamp_ns = message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec
-    if stamp_ns <= 0:
-        raise BadMessage("has no stamp")
-    a, w = message.linear_acceleration, message.angular_velocity
-    force = (a.x, a.y, a.z)
-    # A covariance that begins with -1 says that the quantity is not measured. The force is checked against g anyway.
-    rotation: tuple[float, ...] = (0.0,) if message.angular_velocity_covariance[0] == -1 else (w.x, w.y, w.z)
-    stated = message.linear_acceleration_covariance
-    variance = (float(stated[0]), float(stated[4]), float(stated[8]))
-    if stated[0] == -1:
-        variance = (0.0, 0.0, 0.0)
-    if not all(map(math.isfinite, (*force, *rotation, *variance))) or min(variance) < 0:
-        raise BadMessage("holds NaN, infinity or a negative variance")
-    return Felt(stamp_ns, force, math.hypot(*rotation), variance)
 
 
 class ImuSource(TiltSource):
     """Averages the messages on TOPIC to readings."""
 
-    parameters, name = PARAMETERS, TOPIC
+    parameters, name = inclinometer_parameters.IMU, TOPIC
 
     def __init__(self, host: Surroundings, values: Mapping[str, Any]) -> None:
-        node = host.node
         self._clock, self._wake = host.clock, host.wake
-        self._now_ns = lambda: node.get_clock().now().nanoseconds
-        self._tilts = ForceTilts(values)
+        self._values = values
+        self._tilts = ImuTilts(values)
         self._readings: deque[Reading] = deque(maxlen=QUEUE)
         self._recent: deque[float] = deque(maxlen=QUEUE)
         self._heard_s = self._told_s = -math.inf
-        self._good = self._malformed = self._future = 0
-        self._frame = ""
-        self.configure(values)
-        self._subscription = subscription(node, Imu, TOPIC, self._hear, 1000, ReliabilityPolicy.BEST_EFFORT)
-        self._topic = self._subscription.topic_name
+        hear = host.in_turn(TOPIC, self._hear)
+        if host.replays:
+            # of a replay none may be lost; a simulator may offer best effort only
+            matched = MatchedSubscription(host.node, Imu, TOPIC, hear, DEPTH)
+            host.node.create_timer(LOOK_S, matched.look, clock=Clock(clock_type=ClockType.STEADY_TIME))
+            self._topic = matched.topic
+        else:
+            best_effort = ReliabilityPolicy.BEST_EFFORT
+            self._topic = subscription(host.node, Imu, TOPIC, hear, DEPTH, best_effort).topic_name
 
     @staticmethod
     def refusal(values: Mapping[str, Any]) -> str | None:
         return None
+
+    @property
+    def takes(self) -> Mapping[str, Take]:
+        return {TOPIC: self._hear}
 
     def start(self) -> None:
         pass
@@ -88,48 +65,39 @@ class ImuSource(TiltSource):
     def stop(self) -> None:
         pass
 
+    def restart(self) -> None:
+        self._tilts = ImuTilts(self._values)
+        self._readings.clear()
+
     def configure(self, values: Mapping[str, Any]) -> None:
         self._tilts.configure(values)
-        self._tilts.max_rotation = math.radians(values["imu.max_rotation"])
 
     def take(self) -> list[Reading]:
         taken = list(self._readings)
         self._readings.clear()
         return taken
 
-    def _hear(self, message: Imu) -> None:
+    def _hear(self, message: Imu, info: Mapping[str, Any]) -> None:
         self._heard_s = self._clock.read().monotonic_s
-        self._frame = message.header.frame_id
-        try:
-            said = felt(message)
-        except BadMessage:
-            self._malformed += 1
-            return
-        if said.stamp_ns > self._now_ns() + FUTURE_S * 1e9:
-            self._future += 1
-            return
-        self._good += 1
-        unrest = self._tilts.unrest
-        reading = self._tilts.add(said)
+        before = self._tilts.unrest
+        reading = self._tilts.take(message, self._clock.now_ns())
         if reading is not None:
             self._readings.append(reading)
             self._told_s = self._heard_s
             self._recent.append(self._heard_s)
-            self._wake()
-        elif self._tilts.unrest and not unrest:
+        if reading is not None or (self._tilts.unrest and not before):
             self._wake()
 
     def health(self) -> Health:
-        now_s = self._clock.read().monotonic_s
+        now_s, tilts = self._clock.read().monotonic_s, self._tilts
         recent = [t for t in self._recent if now_s - t < RATE_WINDOW_S]
         rate_hz = (len(recent) - 1) / (recent[-1] - recent[0]) if len(recent) > 1 else 0.0
-        averager = self._tilts.averager
-        counts = Counts(good=self._good, malformed=self._malformed, duplicates=averager.duplicates)
+        counts = Counts(good=tilts.good, malformed=tilts.malformed, duplicates=tilts.averager.duplicates)
         values = {
-            "messages from the future": self._future,
-            "messages out of order": averager.disordered,
-            "IMU's frame": self._frame or "unknown",
-            "noise by axis (arcsec)": noise_text(self._tilts.noise.sigma),
+            "messages from the future": tilts.future,
+            "messages out of order": tilts.averager.disordered,
+            "IMU's frame": tilts.frame or "unknown",
+            "noise by axis (arcsec)": noise_text(tilts.noise),
         }
         phase, sentence = self._phase(now_s)
         return Health(
@@ -143,14 +111,15 @@ class ImuSource(TiltSource):
         )
 
     def _phase(self, now_s: float) -> tuple[Phase, str]:
-        if now_s - self._heard_s > max(PATIENCE_S, self._tilts.averager.seconds):
+        average_s = self._tilts.averager.seconds
+        if now_s - self._heard_s > max(PATIENCE_S, average_s):
             return Phase.ABSENT, f"nothing comes on {self._topic}: start the IMU's driver, or remap {TOPIC}."
         if self._tilts.unrest:
             return Phase.MOVING, f"the IMU is not at rest: {self._tilts.unrest}; tilts come when it is."
-        if now_s - self._told_s > PATIENCE_S + 2 * self._tilts.averager.seconds:
+        if now_s - self._told_s > PATIENCE_S + 2 * average_s:
             return (
                 Phase.GARBLED,
                 f"{self._topic} brings no usable messages: check its stamps against this host's clock, and that "
-                f"at least {LEAST} come in {self._tilts.averager.seconds:g} s.",
+                f"at least {LEAST} come in {average_s:g} s.",
             )
         return Phase.RECEIVING, f"receiving from {self._topic}"

@@ -8,7 +8,7 @@ import math
 from dataclasses import dataclass
 
 from starpos.instrument import sensors
-from starpos_inclinometer.noise import NoiseTracker
+from starpos.instrument.noise_tracker import NoiseTracker
 from starpos_inclinometer.sources.mcu_protocol import Sample, SampleStatus
 from starpos_inclinometer.sources.reading import GAP, OUT_OF_RANGE, STUCK
 from starpos_inclinometer.sources.sca100t import CODE_ZERO, Measured

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tilts from accelerations: averages of an accelerometer at rest, their covariance, and what is no tilt."""
+"""Tilts from the accelerations of a sensor_msgs/Imu at rest: an accelerometer then measures g upward (REP 145)."""
 
 import math
 from collections.abc import Mapping
@@ -8,48 +8,28 @@ from typing import Any
 
 import numpy as np
 
-from starpos_common.parameters import Parameter
-from starpos_inclinometer.noise import NoiseTracker
-from starpos_inclinometer.sources.reading import GAP, STUCK, Reading
+from starpos.instrument.noise_tracker import NoiseTracker
+from starpos.messages.tilt import GAP, STUCK, Reading
 
 # m/s2; true within 0.3 % everywhere on the ground
 STANDARD_GRAVITY = 9.80665
-# An average needs so many readings: fewer show no scatter.
+# An average needs so many messages: fewer show no scatter.
 LEAST = 3
-# Share of the time of an average that its readings must cover.
+# Share of the time of an average that its messages must cover.
 COVERED = 0.5
+# A stamp further ahead is wrong: the clocks of two hosts differ by less.
+FUTURE_S = 0.1
 # If stamps go back further than this, the clock was set.
 NEW_TIME_S = 1.0
 # A floor, for a simulated accelerometer may have no noise.
 LEAST_STDDEV_RAD = 1e-6
-# Most readings in an average.
+# Most messages in an average.
 MAX_MESSAGES = 10_000
-
-FORCE_PARAMETERS = (
-    Parameter(
-        "imu.average",
-        0.5,
-        "Time over which accelerations are averaged to one tilt, of sources imu and iio; short ones are noisy, long "
-        "ones late.",
-        unit="s",
-        minimum=0.02,
-        maximum=60.0,
-    ),
-    Parameter(
-        "imu.max_force_error",
-        0.05,
-        "Share by which the acceleration may differ from 9.81 m/s2; beyond it is not at rest and tells no tilt. "
-        "Too small refuses an uncalibrated accelerometer, too large takes driving for leaning.",
-        unit="",
-        minimum=0.0001,
-        maximum=0.5,
-    ),
-)
 
 
 @dataclass(frozen=True, slots=True)
 class Felt:
-    """An accelerometer's reading, at rest or not."""
+    """Content of one message, at rest or not."""
 
     stamp_ns: int
     # Specific force, m/s2.
@@ -60,9 +40,31 @@ class Felt:
     variance: tuple[float, float, float]
 
 
+class BadMessage(ValueError):
+    """A message cannot be used; the text says what is wrong with it."""
+
+
+def felt(message: Any) -> Felt:
+    """Read a message; BadMessage if it has no stamp or holds NaN, infinity or a negative variance."""
+    stamp_ns = message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec
+    if stamp_ns <= 0:
+        raise BadMessage("has no stamp")
+    a, w = message.linear_acceleration, message.angular_velocity
+    force = (a.x, a.y, a.z)
+    # A covariance that begins with -1 says that the quantity is not measured. The force is checked against g anyway.
+    rotation: tuple[float, ...] = (0.0,) if message.angular_velocity_covariance[0] == -1 else (w.x, w.y, w.z)
+    stated = message.linear_acceleration_covariance
+    variance = (float(stated[0]), float(stated[4]), float(stated[8]))
+    if stated[0] == -1:
+        variance = (0.0, 0.0, 0.0)
+    if not all(map(math.isfinite, (*force, *rotation, *variance))) or min(variance) < 0:
+        raise BadMessage("holds NaN, infinity or a negative variance")
+    return Felt(stamp_ns, force, math.hypot(*rotation), variance)
+
+
 @dataclass(frozen=True)
 class MeanForce:
-    """The readings of one span of time; forces is (N, 3), see `Felt`."""
+    """The messages of one span of time; forces is (N, 3), see `Felt`."""
 
     forces: np.ndarray
     mid_ns: int
@@ -148,62 +150,86 @@ class ForceAverager:
         return MeanForce.of(messages)
 
 
-class ForceTilts:
-    """Tilts of one accelerometer: averages that are at rest, with flags, numbers, and a covariance."""
+class ImuTilts:
+    """Averages the messages of an IMU, or the readings of any accelerometer, to tilts; counts what it leaves out.
+
+    values: the parameters noise_stddev, latency and imu.* of the inclinometer.
+    unrest: why the last average gave no tilt; '' where it gave one.  frame: of the last message.
+    """
 
     def __init__(self, values: Mapping[str, Any]) -> None:
+        self.good = self.malformed = self.future = 0
+        self.unrest = self.frame = ""
         self.averager = ForceAverager(values["imu.average"])
-        self.noise = NoiseTracker()
-        # Why the last average gave no tilt; empty if it gave one.
-        self.unrest = ""
-        # rad/s; of a sensor without a gyroscope it does not matter.
-        self.max_rotation = math.inf
+        self._noise = NoiseTracker()
         self._sequence = 0
         self._gap = self._has_noise = False
         self.configure(values)
 
     def configure(self, values: Mapping[str, Any]) -> None:
+        """Apply the parameters."""
         self.averager.seconds = values["imu.average"]
         self._max_force_error = values["imu.max_force_error"]
+        self._max_rotation = math.radians(values["imu.max_rotation"])
         self._floor = 0.0 if math.isnan(values["noise_stddev"]) else math.radians(values["noise_stddev"])
         self._latency_ns = 0 if math.isnan(values["latency"]) else round(values["latency"] * 1e9)
 
-    def add(self, felt: Felt, temperature_c: float = math.nan, step_rad: float = 0.0) -> Reading | None:
-        """Take a reading of the accelerometer; return the tilt of the average that it ends, if there is one.
+    @property
+    def noise(self) -> tuple[float, ...] | None:
+        """White noise of a tilt by axis, rad, as the tilts show it; None: too few yet."""
+        return self._noise.sigma
+
+    def take(self, message: Any, now_ns: int) -> Reading | None:
+        """Take a message; return the tilt that it completes.  now_ns: a stamp that is ahead of it is wrong."""
+        self.frame = message.header.frame_id
+        try:
+            said = felt(message)
+        except BadMessage:
+            self.malformed += 1
+            return None
+        if said.stamp_ns > now_ns + FUTURE_S * 1e9:
+            self.future += 1
+            return None
+        self.good += 1
+        return self.add(said)
+
+    def add(self, said: Felt, temperature_c: float = math.nan, step_rad: float = 0.0) -> Reading | None:
+        """Take a reading of an accelerometer; return the tilt that it completes.
 
         step_rad: the step of a reading, as a share of g; where it exceeds the noise no average takes the rounding away.
         """
         breaks = self.averager.breaks
-        average = self.averager.add(felt)
-        reading = None
-        if average is not None:
-            self.unrest = average.unrest(self._max_force_error, self.max_rotation)
-            if self.unrest:
-                self._gap = True
-            else:
-                reading = self._reading(average, temperature_c, step_rad)
-            self._sequence += 1
+        average = self.averager.add(said)
+        reading = None if average is None else self._told(average, temperature_c, step_rad)
         self._gap |= self.averager.breaks != breaks
         return reading
+
+    def _told(self, average: MeanForce, temperature_c: float, step_rad: float) -> Reading | None:
+        self.unrest = average.unrest(self._max_force_error, self._max_rotation)
+        if self.unrest:
+            self._sequence += 1
+            self._gap = True
+            return None
+        return self._reading(average, temperature_c, step_rad)
 
     def _reading(self, average: MeanForce, temperature_c: float, step_rad: float) -> Reading:
         x, y, z = average.tilt()
         flags = self._flags(average)
         if flags & GAP:
-            self.noise.interrupt()
+            self._noise.interrupt()
         if not flags & STUCK:
-            self.noise.add(average.mid_ns * 1e-9, x, y, z)
+            self._noise.add(average.mid_ns * 1e-9, x, y, z)
+        self._sequence += 1
         covariance = self._covariance(average) + step_rad**2 / 12 * np.eye(3)
-        xx, xy, yx, yy = covariance[:2, :2].ravel().tolist()
         return Reading(
             stamp_ns=max(average.mid_ns - self._latency_ns, 0),
             x=x,
             y=y,
-            covariance=(xx, xy, yx, yy),
+            covariance=tuple(covariance[:2, :2].ravel().tolist()),
             z=z,
             z_variance=float(covariance[2, 2]),
             temperature_c=temperature_c,
-            sequence=self._sequence & 0xFFFFFFFF,
+            sequence=(self._sequence - 1) & 0xFFFFFFFF,
             flags=flags,
         )
 
@@ -217,9 +243,9 @@ class ForceTilts:
         return flags
 
     def _covariance(self, average: MeanForce) -> np.ndarray:
-        """Covariance from the readings, or from the scatter of the averages if that is more (IMU noise is not white)."""
+        """Covariance from the messages, or from the scatter of the averages if that is more (IMU noise is not white)."""
         covariance = average.covariance()
         found = np.sqrt(np.diag(covariance))
-        least = np.maximum(self.noise.sigma or (0.0,) * 3, self._floor)
+        least = np.maximum(self._noise.sigma or (0.0,) * 3, self._floor)
         grown = np.maximum(least / found, 1.0)
         return covariance * np.outer(grown, grown)
