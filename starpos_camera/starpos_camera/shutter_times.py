@@ -62,7 +62,7 @@ class ShutterTimes:
         self._changed = threading.Condition()
         self._last: Edge | None = None
         self._lag: Lag | None = None
-        self.paired = 0
+        self.paired = self.heard = 0
         # Why the last frame has no pulse; '' if it has one.
         self.unpaired = "no frame yet"
 
@@ -81,6 +81,7 @@ class ShutterTimes:
         with self._changed:
             self._pulses.add(edge)
             self._last = edge
+            self.heard += 1
             self._changed.notify_all()
 
     def timed(self, exposure: CapturedFrame, since_s: float, until_s: float) -> CapturedFrame:
@@ -127,6 +128,7 @@ class ShutterTimes:
             f"{lag.median_s:.4f} +- {lag.stddev_s:.4f} s, of {lag.frames} frames" if lag else "not known yet"
         )
         return {
+            "edges of the shutter": self.heard,
             "frames with a pulse": self.paired,
             "last frame without a pulse": self.unpaired or "no",
             "measured lag": told,
