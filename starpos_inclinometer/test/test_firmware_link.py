@@ -67,11 +67,11 @@ def test_the_node_publishes_the_tilt_of_the_device(board):
         assert (values["unit"], values["firmware"], values["checksum errors"]) == ("0000002A", "2.0", "0")
         board.tell("shutter 5 40 1")
         listener.wait(lambda: len(pulses) == 2)
-        assert [(p.input, p.rising, p.bounces, p.disciplined) for p in pulses] == [
-            (Pulse.SHUTTER, False, 0, False),
-            (Pulse.SHUTTER, True, 2, False),
+        assert [(p.input, p.rising, p.disciplined) for p in pulses] == [
+            (Pulse.SHUTTER, False, False),
+            (Pulse.SHUTTER, True, False),
         ]
-        assert pulses[1].device_time - pulses[0].device_time == pytest.approx(0.0404, abs=1e-5)
+        assert pulses[1].device_time - pulses[0].device_time == pytest.approx(0.0404, abs=1e-3)
         stamps = [p.header.stamp.sec + p.header.stamp.nanosec * 1e-9 for p in pulses]
         assert stamps[1] - stamps[0] == pytest.approx(0.0404, abs=0.002)
         board.tell("reference 0")
