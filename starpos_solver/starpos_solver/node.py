@@ -10,6 +10,7 @@ from rclpy.clock_type import ClockType
 from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.qos import ReliabilityPolicy
+from rclpy.subscription import Subscription
 from sensor_msgs.msg import CameraInfo, Imu
 from std_srvs.srv import Trigger
 
@@ -35,7 +36,7 @@ from starpos_solver.settings import SolverSettings
 from starpos_solver.transforms import StaticTransforms
 
 POLL_S = 0.02
-TILT_QUEUE = 1000
+TILT_QUEUE, STARS_QUEUE = 1000, 100
 PLAY_SLOWER = (
     "play it slower, or by `ros2 run starpos_bringup replay`; frames without them have other fixes, or none"
 )
@@ -59,7 +60,8 @@ class SolverNode(Node):
             lambda: JobRunner(self, self._go_on),
             self._inputs,
             NodeLog(self.get_logger()),
-            arrived=self._arrived_tilts,
+            arrived=lambda: self._arrived(self._tilts, "tilt", TILT_QUEUE),
+            arrived_stars=lambda: self._arrived(self._stars, "stars", STARS_QUEUE),
             topic=self.resolve_topic_name(CAMERA_TOPIC),
         )
         self._connect()
@@ -76,7 +78,7 @@ class SolverNode(Node):
         takes: dict[str, Take] = {
             CAMERA_TOPIC: lambda m, _: self._publish(session.take_camera(m, self._now())),
             "tilt": lambda m, info: self._publish(session.take_tilt(m, _sent(info), self._now())),
-            "stars": lambda m, _: self._publish(session.take_stars(m, self._now())),
+            "stars": lambda m, info: self._publish(session.take_stars(m, self._now(), _sent(info))),
         }
         if time_is_simulated(self):
             self._replayed = Replayed(
@@ -89,7 +91,8 @@ class SolverNode(Node):
             )
         subscription_from_any(self, CameraInfo, CAMERA_TOPIC, self._taker(CAMERA_TOPIC, takes), 10)
         self._tilts = subscription(self, msg.Tilt, "tilt", self._taker("tilt", takes), TILT_QUEUE)
-        subscription(self, msg.StarArray, "stars", self._taker("stars", takes), 10)
+        self._stars = subscription(self, msg.StarArray, "stars", self._taker("stars", takes), STARS_QUEUE)
+        self._again = self.create_guard_condition(self._go_on)
         if self._values["gyro"]:
             best_effort = ReliabilityPolicy.BEST_EFFORT
             subscription(self, Imu, IMU_TOPIC, self._on_imu, IMU_QUEUE, best_effort)
@@ -143,17 +146,19 @@ class SolverNode(Node):
         if time_is_simulated(self):
             self._dropped.came(name, info)
 
-    def _arrived_tilts(self) -> Iterator[tuple[msg.Tilt, Sent]]:
-        """Read the tilts that have arrived but wait for the executor; in a replay they wait for their turn."""
+    def _arrived(self, ear: Subscription, name: str, most: int) -> Iterator[tuple[Any, Sent]]:
+        """Read what has arrived but waits for the executor; in a replay it waits for its turn.
+
+        name: relative one of the topic.  most: messages that may wait.
+        """
         if self._replayed is not None and self._replayed.playing:
             return
-        handle = self._tilts.handle
-        with handle:
-            for _ in range(TILT_QUEUE):
-                taken = handle.take_message(msg.Tilt, False)
+        with ear.handle:
+            for _ in range(most):
+                taken = ear.handle.take_message(ear.msg_type, False)
                 if taken is None:
                     return
-                self._note_dropped("tilt", taken[1])
+                self._note_dropped(name, taken[1])
                 yield taken[0], _sent(taken[1])
 
     def _go_on(self) -> None:
@@ -180,6 +185,8 @@ class SolverNode(Node):
                 self._replayed.fixes += output.solution.ok
         if outputs:
             self._update_transforms()
+        if self._session.more:
+            self._again.trigger()
         # poll only while a frame waits; where the clock is played, its ticks do
         waits = self._session.waits and not time_is_simulated(self)
         if waits and self._poll.is_canceled():
@@ -214,7 +221,7 @@ class SolverNode(Node):
                 "building the triangles of this field" if session.instrument.preparing else "no frame yet"
             )
             return Diagnosis(Level.WARN, session.instrument.trouble or waiting, session.counts)
-        return reports.of_solution(session.answer, session.counts)
+        return reports.of_solution(session.answer, session.counts, session.pace.complaint)
 
     def _report_clock(self) -> Diagnosis:
         latest, solver = self._session.latest, self._session.instrument.solver

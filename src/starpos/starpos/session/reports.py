@@ -23,8 +23,8 @@ OTHER_TILTS = (
 )
 
 
-def of_solution(answer: Solution, counts: Mapping[str, int]) -> Diagnosis:
-    """Report the solution of the newest frame."""
+def of_solution(answer: Solution, counts: Mapping[str, int], dropped: str = "") -> Diagnosis:
+    """Report the solution of the newest frame; dropped: a sentence, where most frames were dropped."""
     values: dict[str, object] = {**counts, "status": answer.status.value}
     values |= {
         "stars detected": answer.stars_detected,
@@ -44,6 +44,8 @@ def of_solution(answer: Solution, counts: Mapping[str, int]) -> Diagnosis:
     if answer.extrapolated_days > 0:
         old = f"UT1 is extrapolated by {answer.extrapolated_days:.0f} days: upgrade astropy-iers-data"
         return Diagnosis(Level.WARN, old if answer.ok else answer.message, values)
+    if dropped:
+        return Diagnosis(Level.WARN, dropped if answer.ok else f"{answer.message}; {dropped}", values)
     return Diagnosis(Level.OK if answer.ok else Level.WARN, answer.message, values)
 
 

@@ -28,6 +28,7 @@ from starpos.messages.stamp import stamp_to_unix
 from starpos.messages.stars import message_to_stars
 from starpos.session import reports
 from starpos.session.attitude import asked, camera_attitude_of
+from starpos.session.backlog import MOST, Backlog
 from starpos.session.calibrating import Calibrating
 from starpos.session.camera_solver import CameraSolver
 from starpos.session.clock_doubt import ClockDoubt
@@ -37,15 +38,17 @@ from starpos.session.job import Jobs
 from starpos.session.log import Heard, Log
 from starpos.session.memory import Seen
 from starpos.session.now import Now, Sent
+from starpos.session.pace import Pace
 from starpos.session.search import AT_ONCE_S, Search
 from starpos.session.settings import Settings
 from starpos.session.tilts import TiltBuffer
 from starpos.session.transforms import FrameNames, name_in
 from starpos.sky import catalogue
 
-# Most frames that wait for their tilts or for the triangles; older ones are dropped. Of recorded ones none should be.
-WAITING, WAITING_PLAYED = 4, 1000
 MOST_EARLY = 1000
+# A frame waits for its tilts so long, or so many times as long as they usually take to come.
+PATIENCE_S, DELAYS = 0.5, 1.5
+NOTHING_TOLD = Sent()
 J2000_UNIX_S = 946_728_000.0
 # A stamp in the future is wrong beyond AHEAD_S and so many stated errors.
 CLOCK_SIGMAS = 6.0
@@ -58,7 +61,7 @@ class SolverSession:
     """An instrument's messages to its solutions.
 
     jobs: makes who runs what takes long; when an Outcome has come, call `at`.
-    arrived: gives the tilts that have come but are not taken yet.
+    arrived, arrived_stars: give the tilts, and the star lists, that have come but are not taken yet.
     topic: full name of the topic of the camera's intrinsics, for sentences.
     """
 
@@ -70,11 +73,16 @@ class SolverSession:
         log: Log,
         *,
         arrived: Callable[[], Iterable[tuple[Any, Sent]]] = tuple,
+        arrived_stars: Callable[[], Iterable[tuple[Any, Sent]]] = tuple,
         topic: str = CAMERA_TOPIC,
     ) -> None:
         self.latest: Waiting | None = None
         self.answer: Solution | None = None
-        self.counts = {"frames": 0, "fixes": 0, "dropped frames": 0}
+        self.pace = Pace()
+        self._answered_frames = self._fixes = 0
+        # whether another frame can be answered at once, live: whoever drives the session calls `at` again, so that
+        # what has come meanwhile has its turn
+        self.more = False
         self.tilts = TiltBuffer()
         # of the frames that the messages taken are in
         self.names = FrameNames()
@@ -85,8 +93,11 @@ class SolverSession:
         self._catalogue = catalogue.load_catalogue()
         # This reads the tables of the Earth's rotation, so that the first frame is not slow.
         earth_state(J2000_UNIX_S)
-        self._heard, self._log, self._arrived = heard, log, arrived
-        self._waiting: deque[Waiting] = deque()
+        self._heard, self._log = heard, log
+        self._arrived, self._arrived_stars = arrived, arrived_stars
+        self._backlog = Backlog()
+        # number of the last star list among those of its publisher
+        self._stars_number: int | None = None
         # tilts ahead of a clock that may have been heard only after them
         self._early: deque[Any] = deque(maxlen=MOST_EARLY)
         self._was_s: float | None = None
@@ -117,7 +128,17 @@ class SolverSession:
     @property
     def waits(self) -> bool:
         """Whether a frame or a tilt waits for its time."""
-        return bool(self._waiting or self._early)
+        return bool(self._backlog or self._early)
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """How many frames were answered, by a fix, or left out, for the diagnostics."""
+        return {
+            "frames": self._answered_frames,
+            "fixes": self._fixes,
+            "dropped frames": self.pace.dropped,
+            "left out by max_rate": self.pace.left_out,
+        }
 
     @property
     def busy(self) -> bool:
@@ -141,7 +162,7 @@ class SolverSession:
         Another camera's counts from now on; in recorded data from its stamp on, since it may be read before frames that
         were taken before it.
         """
-        made = self.at(now)
+        made = self._begun(now)
         try:
             self.instrument.take(message, at_once=not now.played)
         except StarposError as e:
@@ -155,7 +176,7 @@ class SolverSession:
 
     def take_tilt(self, message: Any, sent: Sent, now: Now) -> list[Output]:
         """Take a Tilt."""
-        made = self.at(now)
+        made = self._begun(now)
         self._take_tilt(message, sent, now)
         return made + self._work(now)
 
@@ -181,16 +202,31 @@ class SolverSession:
             if (ahead_s := now.ahead_s(stamp_to_unix(message.header.stamp))) > reports.AHEAD_S:
                 raise TiltError(f"a tilt is stamped {ahead_s:.3g} s before its time: {reports.ONE_CLOCK}")
             self.tilts.add(message, self._settings.tilt_stddev_rad)
+            self.tilts.came_late(-ahead_s)
             self._heard.came("tilt")
             self.names.inclinometer = name_in(message)
         except StarposError as e:
             self._heard.refuse("tilt", str(e))
 
-    def take_stars(self, message: Any, now: Now) -> list[Output]:
-        """Take a StarArray."""
-        made = self.at(now)
+    def take_stars(self, message: Any, now: Now, sent: Sent = NOTHING_TOLD) -> list[Output]:
+        """Take a StarArray, and those that have come after it."""
+        made = self._begun(now)
+        made += self._add_stars(message, now, sent)
+        for later, later_sent in self._arrived_stars():
+            made += self._add_stars(later, now, later_sent)
+        return made + self._work(now)
+
+    def _add_stars(self, message: Any, now: Now, sent: Sent) -> list[Output]:
+        """Have a frame wait for its tilts, if it is wanted and can be answered in time; returns the answer to a bad one."""
         self._heard.came("stars")
+        self._note_lost(sent, now)
+        if not self.pace.wants(stamp_to_unix(message.header.stamp), self._values["max_rate"]):
+            return []
         self._search.frame_came(now)
+        if not now.played and not self._backlog.has_room(self._delay_s(now)):
+            self.pace.drop(now.waiting_s)
+            return []
+        self.pace.took(now.waiting_s)
         try:
             stars = message_to_stars(message)
             # If the user sets clock_stddev, it replaces the error that the camera's host states.
@@ -204,24 +240,44 @@ class SolverSession:
                 utc_unix_s=None,
                 stars_detected=len(message.stars),
             )
-            return [*made, self._answered(message.header.stamp, bad, now)]
+            return [self._answered(message.header.stamp, bad, now)]
         self.instrument.frame_came(stars.width, stars.height, at_once=not now.played)
-        self._waiting.append(Waiting(message, stars, now.waiting_s, now.ahead_s(stars.mid_unix_s)))
-        while len(self._waiting) > (WAITING_PLAYED if now.played else WAITING):
-            self._waiting.popleft()
-            self.counts["dropped frames"] += 1
-            if now.played:
-                self._heard.refuse(
-                    "stars", f"a frame was dropped: over {WAITING_PLAYED} wait for their tilts"
-                )
-        return made + self._work(now)
+        if len(self._backlog) >= MOST:
+            self.pace.drop(now.waiting_s)
+            self._heard.refuse("stars", f"a frame was dropped: {MOST} wait for their tilts")
+            return []
+        self._backlog.add(Waiting(message.header, stars, now.waiting_s, now.ahead_s(stars.mid_unix_s)))
+        if self.instrument.preparing and not now.played:
+            self.pace.dropped += self._backlog.keep_newest()
+        return []
+
+    def _note_lost(self, sent: Sent, now: Now) -> None:
+        """Count the star lists that newer ones replaced in the middleware; a lower number is another publisher's."""
+        last, self._stars_number = self._stars_number, sent.number
+        if not now.played and last is not None and sent.number is not None and sent.number > last + 1:
+            self.pace.drop(now.waiting_s, sent.number - last - 1)
+
+    def _delay_s(self, now: Now) -> float:
+        """For how long frames wait for their tilts, by the tilts that have come, and by the first frame."""
+        if not self._backlog or self._ready(self._backlog.first, now):
+            return self.tilts.delay_s
+        return max(self.tilts.delay_s, now.waiting_s - self._backlog.first.since_s)
 
     # time ------------------------------------------------------------------------------------------------------------
 
     def at(self, now: Now) -> list[Output]:
         """Go on to a time."""
         self._ended = False
-        return self._on(now)
+        self._advance(now)
+        return self._work(now)
+
+    def _begun(self, now: Now) -> list[Output]:
+        """Go on to the time of a message before it is taken; live, what is ready is answered with it."""
+        if now.played:
+            return self.at(now)
+        self._ended = False
+        self._advance(now)
+        return []
 
     def begin(self) -> None:
         """Note that recorded messages begin: who published on `tilt` before was another player, no rival."""
@@ -230,9 +286,10 @@ class SolverSession:
     def end(self, now: Now) -> list[Output]:
         """Answer the frames that wait, because nothing comes any more; again after a job."""
         self._ended = True
-        return self._on(now)
+        self._advance(now)
+        return self._work(now)
 
-    def _on(self, now: Now) -> list[Output]:
+    def _advance(self, now: Now) -> None:
         was_s, self._was_s = self._was_s, now.unix_s
         if was_s is not None and now.unix_s is not None:
             if now.unix_s < was_s - STEP_S:
@@ -242,23 +299,30 @@ class SolverSession:
                 early, self._early = self._early, deque(maxlen=MOST_EARLY)
                 for message in early:
                     self._add_tilt(message, now)
-        return self._work(now)
 
     # work ------------------------------------------------------------------------------------------------------------
 
     def _work(self, now: Now) -> list[Output]:
-        """Solve the frames that have everything they need."""
+        """Answer the first frames that have everything they need: of recorded ones all, live one at a time."""
         made: list[Output] = []
+        self.more = False
         # In recorded data a job is done when it was begun, however long it takes.
-        while self._waiting and not (now.played and self.busy):
-            self.instrument.go_on_to(self._waiting[0].stars.mid_unix_s)
-            if not self._ready(self._waiting[0], now):
-                break
+        while not (now.played and self.busy) and self._first_ready(now):
+            if made and not now.played:
+                self.more = True
+                return made
             # After a stall the frame's own tilts may be among them.
             for message, sent in self._arrived():
                 self._take_tilt(message, sent, now)
-            made += self._solve(self._dated(self._waiting.popleft(), now), now)
+            made += self._solve(self._dated(self._backlog.pop(now.waiting_s), now), now)
+        self._backlog.pause()
         return made
+
+    def _first_ready(self, now: Now) -> bool:
+        if not self._backlog:
+            return False
+        self.instrument.go_on_to(self._backlog.first.stars.mid_unix_s)
+        return self._ready(self._backlog.first, now)
 
     def _dated(self, frame: Waiting, now: Now) -> Waiting:
         """Correct how far a frame is ahead of a played clock, whose tick may have been heard only after the frame."""
@@ -270,28 +334,33 @@ class SolverSession:
         if self.instrument.preparing:
             return False
         if math.isnan(frame.since_s):
-            frame = self._waiting[0] = replace(frame, since_s=now.waiting_s)
+            frame = self._backlog.first = replace(frame, since_s=now.waiting_s)
         mid, waited_s = frame.stars.mid_unix_s, now.waiting_s - frame.since_s
         # a negative wait: the clock has begun anew
-        if mid is None or self._ended or waited_s > self._values["tilt_timeout"] or waited_s < 0:
+        if mid is None or self._ended or waited_s > self._patience_s or waited_s < 0:
             return True
         if self.instrument.solver is None:
             return bool(self.instrument.trouble)
         return self.tilts.complete(mid, self._span(frame.stars))
+
+    @property
+    def _patience_s(self) -> float:
+        """How long a frame waits for its tilts."""
+        stated_s = self._values["tilt_timeout"]
+        return max(PATIENCE_S, DELAYS * self.tilts.delay_s) if math.isnan(stated_s) else stated_s
 
     def _span(self, stars: Stars) -> float:
         return stars.exposure_s or self._values["tilt_window"]
 
     def _solve(self, frame: Waiting, now: Now) -> list[Output]:
         predicted = self.gyro.predicted(frame.stars, self.instrument.solver)
-        until_s = self._search.until_s(now, bool(self._waiting))
+        until_s = self._search.until_s(now, bool(self._backlog))
         answer = self._answer_to(frame, self._hint, until_s, predicted)
         if answer.ok and answer.fix is not None:
             frame, answer = self._with_doubt(frame, answer, answer.fix)
         self.latest = frame
-        header = frame.message.header
-        answered = self._answered(header.stamp, answer, now)
-        attitude = self._attitude(frame.stars, answer, header.frame_id, predicted, until_s)
+        answered = self._answered(frame.header.stamp, answer, now)
+        attitude = self._attitude(frame.stars, answer, frame.header.frame_id, predicted, until_s)
         made: list[Output] = [replace(answered, attitude=attitude)]
         if self.instrument.solver is not None:
             made += self._learn(frame, answer)
@@ -372,7 +441,7 @@ class SolverSession:
             place = self.calibrating.average.place if used else None
             if place is None:
                 return []
-            return [Averaged(frame.message.header.stamp, place, ground_of(place, self._settings.vertical))]
+            return [Averaged(frame.header.stamp, place, ground_of(place, self._settings.vertical))]
         except Exception:
             # Fix and heading go on without the average; data that cause a defect must not stay.
             self._log.error(traceback.format_exc())
@@ -386,8 +455,8 @@ class SolverSession:
             # by the clock of recorded data no time passes
             answer = replace(answer, identify_s=0.0, fix_s=0.0)
         self.answer = answer
-        self.counts["frames"] += 1
-        self.counts["fixes"] += answer.ok
+        self._answered_frames += 1
+        self._fixes += answer.ok
         self._hint = answer.hint or self._hint
         self._log_change("fixes are coming" if answer.ok else answer.message, answer.ok, answer.status)
         return self._output(stamp, answer)
@@ -412,12 +481,12 @@ class SolverSession:
         if self.latest is None:
             return None
         answer = self._answer_to(self.latest, None, self._search.until_s(None, False))
-        return self._output(self.latest.message.header.stamp, answer)
+        return self._output(self.latest.header.stamp, answer)
 
     def reset(self) -> None:
         """Forget tilts, frames and the place, but no calibration that was found."""
         self.tilts.clear()
-        self._waiting.clear()
+        self._backlog.clear()
         self._early.clear()
         self.latest = self.answer = self._hint = None
         self.gyro.forget()
