@@ -8,8 +8,8 @@ from collections import deque
 LATELY_S, FEWEST = 10.0, 10
 MOST_KEPT = 2000
 MOST_DROPPED = 0.5
-# A frame counts as due from half of its interval on, so that jitter of the stamps costs none.
-DUE = 0.5
+# Share of the interval by which a frame may come early, so that jitter of the stamps costs none.
+JITTER = 0.25
 MOST_RATE = 1000.0
 
 
@@ -21,7 +21,8 @@ class Pace:
 
     def __init__(self) -> None:
         self.left_out = self.dropped = 0
-        self._credit, self._before_s = 1.0, math.nan
+        # the rate, the stamp of the last frame, and when the next one is due that is wanted
+        self._most_hz = self._before_s = self._due_s = math.nan
         # when each frame came, and whether it was taken
         self._lately: deque[tuple[float, bool]] = deque(maxlen=MOST_KEPT)
 
@@ -29,16 +30,15 @@ class Pace:
         """Whether a frame of this stamp is wanted, at most so many a second; NaN: all are, as those without a stamp."""
         if math.isnan(most_hz) or unix_s is None:
             return True
-        passed_s, self._before_s = unix_s - self._before_s, unix_s
-        # also where stamps begin anew
-        if not passed_s >= 0:
-            self._credit = 1.0
-        else:
-            self._credit = min(self._credit + passed_s * most_hz, 1.0)
-        if self._credit < DUE:
+        period_s = 1 / most_hz
+        # the first one, and where stamps begin anew
+        if most_hz != self._most_hz or not unix_s >= self._before_s:
+            self._due_s = unix_s
+        self._most_hz, self._before_s = most_hz, unix_s
+        if unix_s < self._due_s - JITTER * period_s:
             self.left_out += 1
             return False
-        self._credit -= 1.0
+        self._due_s = max(self._due_s, unix_s - period_s) + period_s
         return True
 
     def took(self, now_s: float) -> None:
