@@ -2,6 +2,7 @@
 """The solution of a frame whose stars are identified: names, pointing, and what is suspicious about them."""
 
 import math
+import time
 
 from starpos.fix.solution import TWO_SKIES, UNEXPLAINED, Attitude, Solution
 from starpos.frames.stars import Stars
@@ -14,9 +15,18 @@ from starpos.units import ARCSEC
 
 
 def identified(
-    stars: Stars, field: FrameStars | wide.WideField, sky: Sky, camera: Camera, found: Identification
+    stars: Stars,
+    field: FrameStars | wide.WideField,
+    sky: Sky,
+    camera: Camera,
+    found: Identification,
+    begin_s: float,
 ) -> Solution:
-    """The solution of stars that are identified: a success without a fix.  field: the stars as they were searched."""
+    """The solution of stars that are identified: a success without a fix.
+
+    field: the stars as they were searched.
+    begin_s: when their search began, by time.perf_counter.
+    """
     warnings, explained = suspicions(stars, field, sky, found)
     names, magnitudes = sky.catalogue.labels(found.catalogue)
     return Solution.of(
@@ -28,6 +38,7 @@ def identified(
         warnings=warnings,
         explained=explained,
         found=found,
+        identify_s=time.perf_counter() - begin_s,
     )
 
 

@@ -93,14 +93,25 @@ class Solution:
     remark: str = ""
 
     @classmethod
-    def of(cls, frame: Stars | Pointing, message: str = "identified", **found: Any) -> "Solution":
-        """The success of a frame; found: what there is of the answer, by the names of the fields."""
-        return cls(Status.OK, message, **found, **_about(frame))
+    def of(
+        cls, frame: Stars | Pointing, message: str = "identified", status: Status = Status.OK, **found: Any
+    ) -> "Solution":
+        """The solution of a frame; found: what there is of the answer, by the names of the fields."""
+        number, negative = (len(frame.x), frame.negative) if isinstance(frame, Stars) else (0, False)
+        return cls(
+            status,
+            message,
+            source=frame.source,
+            utc_unix_s=frame.mid_unix_s,
+            stars_detected=number,
+            negative=negative,
+            **found,
+        )
 
     @classmethod
     def failed(cls, frame: Stars | Pointing, status: Status, message: str) -> "Solution":
         """A solution that has nothing but its status and message."""
-        return cls(status, message, **_about(frame))
+        return cls.of(frame, message, status)
 
     @classmethod
     def refused(cls, frame: Stars | Pointing, error: StarposError) -> "Solution":
@@ -131,16 +142,6 @@ class Solution:
     def ok(self) -> bool:
         """Whether all that was asked for is there."""
         return self.status is Status.OK
-
-
-def _about(frame: Stars | Pointing) -> dict[str, Any]:
-    number, negative = (len(frame), frame.negative) if isinstance(frame, Stars) else (0, False)
-    return {
-        "source": frame.source,
-        "utc_unix_s": frame.mid_unix_s,
-        "stars_detected": number,
-        "negative": negative,
-    }
 
 
 def status_of(stars: Stars | Pointing, error: StarposError) -> Status:

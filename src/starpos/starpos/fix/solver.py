@@ -92,12 +92,9 @@ class Solver:
                 found = second_look(field, sky, predicted, camera, look)
         except StarposError as e:
             return Solution.refused(stars, e)
-        answer = (
-            _unidentified(stars, camera, sky)
-            if found is None
-            else identified(stars, field, sky, camera, found)
-        )
-        return replace(answer, identify_s=time.perf_counter() - begin)
+        if found is None:
+            return _unidentified(stars, camera, sky, begin)
+        return identified(stars, field, sky, camera, found, begin)
 
     def solve(
         self,
@@ -130,22 +127,18 @@ class Solver:
             found = identify_frame(field, sky, priors) or known
         except StarposError as e:
             return Solution.refused(stars, e)
-        answer = (
-            _unidentified(stars, camera, sky)
-            if found is None
-            else identified(stars, field, sky, camera, found)
-        )
-        done = time.perf_counter()
-        answer = replace(answer, tilt=tilt, identify_s=done - begin)
-        if found is None or answer.magnitudes is None:
-            return answer
+        if found is None:
+            return replace(_unidentified(stars, camera, sky, begin), tilt=tilt)
+        answer, done = identified(stars, field, sky, camera, found, begin), time.perf_counter()
+        assert answer.magnitudes is not None
         try:
             check_explained(answer)
             fix = self._fix(stars, found, camera, tilt, state, catalogue)
         except StarposError as e:
-            return replace(answer, status=status_of(stars, e), message=str(e))
+            return replace(answer, tilt=tilt, status=status_of(stars, e), message=str(e))
         return replace(
             answer,
+            tilt=tilt,
             message="fix",
             fix=fix,
             fix_s=time.perf_counter() - done,
@@ -300,9 +293,10 @@ class Solver:
             return None
 
 
-def _unidentified(stars: Stars, camera: Camera, sky: Sky) -> Solution:
+def _unidentified(stars: Stars, camera: Camera, sky: Sky, begin_s: float) -> Solution:
     status = Status.TOO_FEW_STARS if len(stars) < FEWEST_STARS else Status.NOT_IDENTIFIED
-    return Solution.failed(stars, status, why_unidentified(stars, camera, sky.catalogue))
+    failed = Solution.failed(stars, status, why_unidentified(stars, camera, sky.catalogue))
+    return replace(failed, identify_s=time.perf_counter() - begin_s)
 
 
 def check_explained(answer: Solution) -> None:

@@ -67,12 +67,17 @@ def identified(
     Returns the stars that identified it, or those given with the first answer where nothing did.
     """
 
+    first = Sight(stars, solver.identify(stars, predicted, look_at(item, stars)))
+    if not first.solution.lost:
+        return first
+
     def ways(seen: Stars) -> Iterator[Solution]:
         look = look_at(item, seen)
-        yield solver.identify(seen, predicted, look)
+        if seen is not stars:
+            yield solver.identify(seen, predicted, look)
         yield solver.identify(seen, predicted, look, part=PART)
 
-    return _first(item, stars, ways, lambda: time.monotonic() >= until_s)
+    return _another(item, first, ways, lambda: time.monotonic() >= until_s)
 
 
 def identified_blind(solver: BlindSolver, item: Frame | Stars, stars: Stars) -> Sight:
@@ -83,12 +88,11 @@ def identified_blind(solver: BlindSolver, item: Frame | Stars, stars: Stars) -> 
     budget = Budget.of(solver.search_s)
 
     def ways(seen: Stars) -> Iterator[Solution]:
-        way = solver
         if seen is not stars:
-            way = replace(solver, stages=QUICK, fisheye_stages=QUICK_FISHEYE, search_s=budget.left_s)
-        yield way.identify(seen)
+            quick = replace(solver, stages=QUICK, fisheye_stages=QUICK_FISHEYE, search_s=budget.left_s)
+            yield quick.identify(seen)
 
-    return _first(item, stars, ways, lambda: budget.spent)
+    return _another(item, Sight(stars, solver.identify(stars)), ways, lambda: budget.spent)
 
 
 def solved(
@@ -136,25 +140,24 @@ def look_at(item: Frame | Stars, stars: Stars) -> "SecondLook | None":
     return SecondLook.of(negative_of(item) if stars.negative else item, stars)
 
 
-def _first(
+def _another(
     item: Frame | Stars,
-    stars: Stars,
+    first: Sight,
     ways: Callable[[Stars], Iterator[Solution]],
     is_over: Callable[[], bool],
 ) -> Sight:
-    """The first sight of a frame that is identified beyond doubt, by some way and some stars; else the first of all.
+    """The next sight of a frame that is identified beyond doubt, by some way and some stars; else the first.
 
-    No way is begun once the time is over.
+    That is the answer where it is not lost.  No way is begun once the time is over.
     """
-    first: Sight | None = None
-    for seen, enough in _seen(item, stars):
+    if not first.solution.lost or is_over():
+        return first
+    for seen, enough in _seen(item, first.stars):
         for answer in ways(seen):
             if answer.attitude is not None and answer.attitude.log_odds >= enough:
                 return Sight(seen, answer)
-            first = first or Sight(seen, answer)
-            if not first.solution.lost or is_over():
+            if is_over():
                 return first
-    assert first is not None
     return first
 
 

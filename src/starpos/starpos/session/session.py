@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import Any
 
+from starpos.calibration.unknown import MODEL_BY_PARAMETERS, unnamed_inclinometer
 from starpos.earth.orientation import earth_state
 from starpos.errors import InstrumentError, StarposError, TiltError, TimeError
 from starpos.fix.camera_attitude import CameraAttitude
@@ -115,6 +116,8 @@ class SolverSession:
         self.calibrating = Calibrating(
             settings, jobs(), lambda: self.instrument.solver_now, self.instrument.remake, log
         )
+        if unnamed := unnamed_inclinometer(settings.instrument(None), MODEL_BY_PARAMETERS):
+            log.warning(unnamed)
 
     def _make_solver(self, camera: Camera) -> Solver:
         return self._settings.solver(camera, self.calibrating.found, self._catalogue)
