@@ -11,11 +11,11 @@ from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.qos import ReliabilityPolicy
 from rclpy.subscription import Subscription
-from sensor_msgs.msg import CameraInfo, Imu
+from sensor_msgs.msg import CameraInfo, Imu, NavSatFix
 from std_srvs.srv import Trigger
 
 from starpos.instrument.camera import Camera
-from starpos.session import reports
+from starpos.session import gnss_check, reports
 from starpos.session.frames import Answered, Output
 from starpos.session.gyro import IMU_TOPIC
 from starpos.session.now import Now, Sent
@@ -24,6 +24,7 @@ from starpos_common.clock_report import time_is_simulated
 from starpos_common.diagnostics import Diagnosis, Diagnostics, Level
 from starpos_common.dropped import Dropped
 from starpos_common.job import JobRunner
+from starpos_common.others import other_publishers
 from starpos_common.replayed import Replayed
 from starpos_common.topics import Take, subscription, subscription_from_any
 from starpos_interfaces import msg
@@ -96,6 +97,9 @@ class SolverNode(Node):
         if self._values["gyro"]:
             best_effort = ReliabilityPolicy.BEST_EFFORT
             subscription(self, Imu, IMU_TOPIC, self._on_imu, IMU_QUEUE, best_effort)
+        self._gnss = gnss_check.GnssCheck()
+        best_effort = ReliabilityPolicy.BEST_EFFORT
+        subscription(self, NavSatFix, gnss_check.TOPIC, self._gnss.take, 10, best_effort)
         self.create_service(Solve, "~/solve", self._on_solve)
         self.create_service(Trigger, "~/reset", self._on_reset)
         self._calibration_services = CalibrationServices(self, self._session, self._settings)
@@ -107,6 +111,7 @@ class SolverNode(Node):
         tasks = {
             "Solution": self._report_solution,
             "Inputs": lambda: self._inputs.report({"tilts kept": len(session.tilts)}, self._dropped.counts),
+            "Outputs": self._report_outputs,
             "Clock": self._report_clock,
             "Conditions": self._report_conditions,
             "Calibration": session.calibrating.report,
@@ -221,7 +226,13 @@ class SolverNode(Node):
                 "building the triangles of this field" if session.instrument.preparing else "no frame yet"
             )
             return Diagnosis(Level.WARN, session.instrument.trouble or waiting, session.counts)
-        return reports.of_solution(session.answer, session.counts, session.pace.complaint)
+        remarks = session.pace.complaint, self._gnss.remark(session.answer, self._settings.vertical)
+        return reports.of_solution(session.answer, session.counts, "; ".join(filter(None, remarks)))
+
+    def _report_outputs(self) -> Diagnosis:
+        if others := other_publishers(self, self._outputs.shared):
+            return Diagnosis(Level.WARN, others)
+        return Diagnosis(Level.OK, "no other node publishes on fix or heading/imu")
 
     def _report_clock(self) -> Diagnosis:
         latest, solver = self._session.latest, self._session.instrument.solver

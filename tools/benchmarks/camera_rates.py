@@ -48,7 +48,11 @@ class Run:
     def __str__(self) -> str:
         came, soon = len(self.delays_s), sum(d <= LATE_S for d in self.delays_s)
         delays = sorted(self.delays_s)
-        said = [f"{1e3 * d:.0f}" for d in (median(delays), delays[int(0.99 * came)], delays[-1])] if came else ["-"] * 3
+        said = (
+            [f"{1e3 * d:.0f}" for d in (median(delays), delays[int(0.99 * came)], delays[-1])]
+            if came
+            else ["-"] * 3
+        )
         cpu = ", ".join(f"{name} {1e3 * s:.1f}" for name, s in self.cpu_s.items())
         memory = ", ".join(f"{name} {a:.0f} to {b:.0f}" for name, (a, b) in self.memory_mb.items())
         words = (

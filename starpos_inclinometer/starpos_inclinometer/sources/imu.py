@@ -4,7 +4,7 @@
 import math
 from collections import deque
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -34,6 +34,13 @@ LEAST_STDDEV_RAD = 1e-6
 MAX_MESSAGES = 10_000
 QUEUE = 512
 RATE_WINDOW_S = 5.0
+# Stamps that are older when they come are of another clock.
+OLD_S = 5.0
+# So many averages with noise make one without it that of a stuck sensor.
+NOISY = 20
+# A stated standard deviation over the scatter of the messages, from which on it is named as a placeholder.
+PLACEHOLDER = 5.0
+STATED, SCATTER = "stated", "scatter"
 # Silence is reported within 2 s, with a report every second.
 PATIENCE_S = 0.8
 
@@ -46,6 +53,13 @@ PARAMETERS = (
         unit="s",
         minimum=0.02,
         maximum=60.0,
+    ),
+    Parameter(
+        "imu.variance",
+        STATED,
+        "What tells the noise of an IMU's accelerations: stated, the variance in its messages, or their scatter if that "
+        "is more; scatter alone, where the driver states a placeholder. A placeholder that is too large widens fixes.",
+        choices=(STATED, SCATTER),
     ),
     Parameter(
         "imu.max_force_error",
@@ -125,6 +139,12 @@ class MeanForce:
     @property
     def force(self) -> np.ndarray:
         return self.forces.mean(0)
+
+    @property
+    def excess(self) -> float:
+        """How many times larger the stated standard deviation is than the scatter, by the axis where it is least so."""
+        scatter = self.forces.var(0, ddof=1)
+        return float(np.sqrt(np.min(self.variance / scatter))) if scatter.all() else 0.0
 
     def unrest(self, max_force_error: float, max_rotation: float) -> str:
         """Say why it gives no tilt (limits: a share of g, rad/s); empty if it gives one."""
@@ -206,7 +226,11 @@ class ImuSource(TiltSource):
         self._heard_s = self._told_s = -math.inf
         self._good = self._malformed = self._future = self._sequence = 0
         self._unrest = self._frame = ""
-        self._gap = self._has_noise = False
+        self._gap = False
+        # averages with noise since the last one without
+        self._noisy = 0
+        # of the last average
+        self._age_s = self._excess = 0.0
         self.configure(values)
         self._subscription = subscription(node, Imu, TOPIC, self._hear, 1000, ReliabilityPolicy.BEST_EFFORT)
         self._topic = self._subscription.topic_name
@@ -225,6 +249,7 @@ class ImuSource(TiltSource):
         self._averager.seconds = values["imu.average"]
         self._max_force_error = values["imu.max_force_error"]
         self._max_rotation = math.radians(values["imu.max_rotation"])
+        self._variance = values["imu.variance"]
         self._floor = 0.0 if math.isnan(values["noise_stddev"]) else math.radians(values["noise_stddev"])
         self._latency_ns = 0 if math.isnan(values["latency"]) else round(values["latency"] * 1e9)
 
@@ -245,6 +270,9 @@ class ImuSource(TiltSource):
             self._future += 1
             return
         self._good += 1
+        self._age_s = (self._now_ns() - said.stamp_ns) * 1e-9
+        if self._variance == SCATTER:
+            said = replace(said, variance=(0.0, 0.0, 0.0))
         breaks = self._averager.breaks
         average = self._averager.add(said)
         if average is not None:
@@ -266,6 +294,7 @@ class ImuSource(TiltSource):
 
     def _reading(self, average: MeanForce) -> Reading:
         x, y, z = average.tilt()
+        self._excess = average.excess
         flags = self._flags(average)
         if flags & GAP:
             self._noise.interrupt()
@@ -289,9 +318,13 @@ class ImuSource(TiltSource):
         flags = GAP if self._gap else 0
         self._gap = False
         still = not np.ptp(average.forces, axis=0).any()
-        if still and (self._has_noise or average.variance.any()):
+        # a simulated IMU may have no noise at all, but while it turns
+        if still and self._noisy >= NOISY:
             flags |= STUCK
-        self._has_noise |= not still
+        elif still:
+            self._noisy = 0
+        else:
+            self._noisy += 1
         return flags
 
     def _covariance(self, average: MeanForce) -> np.ndarray:
@@ -311,6 +344,7 @@ class ImuSource(TiltSource):
         values = {
             "messages from the future": self._future,
             "messages out of order": averager.disordered,
+            "age of the stamps (s)": self._age_s,
             "IMU's frame": self._frame or "unknown",
             "noise by axis (arcsec)": noise_text(self._noise.sigma),
         }
@@ -320,10 +354,23 @@ class ImuSource(TiltSource):
             sentence=sentence,
             rate_hz=rate_hz,
             counts=counts,
-            complaint="",
+            complaint=self._complaint(),
             step=self._clock.step,
             values=values,
         )
+
+    def _complaint(self) -> str:
+        if self._age_s > OLD_S:
+            return (
+                f"stamps on {self._topic} are {self._age_s:.3g} s behind this host's clock: they belong to another clock, "
+                "and frames find no tilts; stamp with the time of day, or synchronise the IMU's host."
+            )
+        if self._excess > PLACEHOLDER:
+            return (
+                f"the variance on {self._topic} is a placeholder: {self._excess:.2g} times the scatter of its messages "
+                f"(1 sigma), and it widens fixes; set imu.variance to {SCATTER}."
+            )
+        return ""
 
     def _phase(self, now_s: float) -> tuple[Phase, str]:
         if now_s - self._heard_s > max(PATIENCE_S, self._averager.seconds):

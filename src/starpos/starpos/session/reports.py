@@ -15,6 +15,8 @@ from starpos.instrument.instrument import Instrument
 from starpos.session.diagnosis import Diagnosis, Level
 
 WIDE_CLOCK_S = 0.1
+# Frames that are older when they are answered are of another clock.
+OLD_S = 10.0
 AHEAD_S = 1.0
 ONE_CLOCK = "set the clocks of camera, inclinometer and solver by one source"
 
@@ -24,8 +26,8 @@ OTHER_TILTS = (
 )
 
 
-def of_solution(answer: Solution, counts: Mapping[str, int], dropped: str = "") -> Diagnosis:
-    """Report the solution of the newest frame; dropped: a sentence, where most frames were dropped."""
+def of_solution(answer: Solution, counts: Mapping[str, int], remarks: str = "") -> Diagnosis:
+    """Report the solution of the newest frame; remarks: sentences on what is wrong around it."""
     values: dict[str, object] = {**counts, "status": answer.status.value}
     values |= {
         "stars detected": answer.stars_detected,
@@ -45,8 +47,8 @@ def of_solution(answer: Solution, counts: Mapping[str, int], dropped: str = "") 
     if answer.extrapolated_days > 0:
         old = f"UT1 is extrapolated by {answer.extrapolated_days:.0f} days: upgrade astropy-iers-data"
         return Diagnosis(Level.WARN, old if answer.ok else answer.message, values)
-    if dropped:
-        return Diagnosis(Level.WARN, dropped if answer.ok else f"{answer.message}; {dropped}", values)
+    if remarks:
+        return Diagnosis(Level.WARN, remarks if answer.ok else f"{answer.message}; {remarks}", values)
     return Diagnosis(Level.OK if answer.ok else Level.WARN, answer.message, values)
 
 
@@ -67,6 +69,13 @@ def of_clock(clock_stddev_s: float, stamp_stddev_s: float, ahead_s: float, doubt
             Level.WARN,
             f"by their stamps the camera at rest has turned with the Earth for {doubt_s:.3g} s: a clock was set, or a "
             "frame stamped wrongly. Fixes are as wide as that until it is back, or solver/reset is called",
+            values,
+        )
+    if -ahead_s > OLD_S:
+        return Diagnosis(
+            Level.WARN,
+            f"frames are stamped {-ahead_s:.3g} s behind this node's clock: if they are taken now, they belong to another "
+            f"clock, and so does their longitude: {ONE_CLOCK}",
             values,
         )
     wide = float(np.hypot(clock_stddev_s, stamp_stddev_s))

@@ -16,7 +16,9 @@ def wanted(stamps, most_hz) -> np.ndarray:
     return np.array([pace.wants(t, most_hz) for t in stamps])
 
 
-@pytest.mark.parametrize(("rate", "most", "share"), [(30, 10, 1 / 3), (30, 20, 2 / 3), (25, 1, 1 / 25), (10, 30, 1.0)])
+@pytest.mark.parametrize(
+    ("rate", "most", "share"), [(30, 10, 1 / 3), (30, 20, 2 / 3), (25, 1, 1 / 25), (10, 30, 1.0)]
+)
 def test_a_rate_is_kept_and_the_frames_are_spread_evenly(rate, most, share):
     stamps = T0 + np.arange(600) / rate
     chosen = np.flatnonzero(wanted(stamps, most))

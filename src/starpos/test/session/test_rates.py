@@ -109,7 +109,13 @@ def test_every_frame_is_answered_where_the_processor_can(messages, frames_hz, ti
 
 @pytest.mark.parametrize(
     ("frames_hz", "tilts_hz", "late_s", "cost_s"),
-    [(30, 2, 0.3, 0.05), (30, 10, 0.3, 0.05), (60, 100, 0.005, 0.04), (10, 2, 0.3, 0.15), (100, 2, 0.3, 0.02)],
+    [
+        (30, 2, 0.3, 0.05),
+        (30, 10, 0.3, 0.05),
+        (60, 100, 0.005, 0.04),
+        (10, 2, 0.3, 0.15),
+        (100, 2, 0.3, 0.02),
+    ],
 )
 def test_of_too_many_frames_an_even_share_is_answered_as_many_as_the_processor_can_and_soon(
     messages,  # noqa: F811
