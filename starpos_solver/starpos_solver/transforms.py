@@ -107,7 +107,7 @@ class MovingTransform:
 
 
 def _can_be_told(node: Node, topic: str) -> bool:
-    """Whether there are messages of tf, which is looked for once, as it takes longer than a fix; says in the log if not."""
+    """Whether there are messages of tf; says in the log if not. Looking takes longer than a fix: ask once."""
     if find_spec("tf2_msgs") is not None:
         return True
     node.get_logger().info(

@@ -102,6 +102,7 @@ def measure(name: str, seconds: float, folder: Path) -> Run:
     """Publish the frames of a case at their times."""
     import numpy as np
     from runner import Memory
+
     from starpos_common.messages import camera_to_message
     from starpos_interfaces.msg import Attitude
     from starpos_testing.graph.graph import Graph

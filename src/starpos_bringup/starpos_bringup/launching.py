@@ -127,7 +127,6 @@ def process(
         executable=executable,
         parameters=[file for file in files if file],
         arguments=[*arguments, *ros_arguments(executable, common)],
-        remappings=[(name, f"{common.outputs}/{name}") for name in OUTPUTS if common.outputs],
         output="screen",
         respawn=common.respawn,
         respawn_delay=RESPAWN_DELAY_S,
@@ -144,7 +143,10 @@ def profile() -> dict[str, PathJoinSubstitution]:
 def ros_arguments(executable: str, common: Common) -> list[str]:
     """Make the arguments for ROS; the enclave is only a name while security is not enabled (ROS_SECURITY_ENABLE)."""
     enclave = f"{common.enclaves}/{executable}"
-    return ["--ros-args", "--log-level", common.log_level, "--enclave", enclave]
+    remaps = [
+        word for name in OUTPUTS if common.outputs for word in ("-r", f"{name}:={common.outputs}/{name}")
+    ]
+    return ["--ros-args", "--log-level", common.log_level, "--enclave", enclave, *remaps]
 
 
 def _written(parameters: Mapping[str, Mapping]) -> str:

@@ -362,8 +362,8 @@ class ImuSource(TiltSource):
     def _complaint(self) -> str:
         if self._age_s > OLD_S:
             return (
-                f"stamps on {self._topic} are {self._age_s:.3g} s behind this host's clock: they belong to another clock, "
-                "and frames find no tilts; stamp with the time of day, or synchronise the IMU's host."
+                f"stamps on {self._topic} are {self._age_s:.3g} s behind this host's clock: they belong to another "
+                "clock, and frames find no tilts; stamp with the time of day, or synchronise the IMU's host."
             )
         if self._excess > PLACEHOLDER:
             return (

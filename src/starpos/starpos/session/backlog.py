@@ -19,8 +19,8 @@ class Backlog:
     """Frames in the order in which they came.
 
     A new frame is taken if those before it can be answered by the time its own tilts come or within FRESH_S, or if at
-    most one is before it. So no frame pushes out another one that waits, frames are answered all the time while too many come, and answers
-    come at an even rate and hardly later than their tilts allow.
+    most one is before it. So no frame pushes out another one that waits, the processor always has work while too many
+    frames come, and answers come at an even rate and hardly later than their tilts allow.
     """
 
     def __init__(self) -> None:

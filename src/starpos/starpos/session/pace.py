@@ -64,6 +64,6 @@ class Pace:
         if frames < FEWEST or dropped <= MOST_DROPPED * frames:
             return ""
         return (
-            f"{100 * dropped / frames:.0f} % of the frames of the last {LATELY_S:.0f} s were dropped: more come than this "
-            "machine can work on; set max_rate to the rate you need, or slow the camera"
+            f"{100 * dropped / frames:.0f} % of the frames of the last {LATELY_S:.0f} s were dropped: more come than "
+            "this machine can work on; set max_rate to the rate you need, or slow the camera"
         )

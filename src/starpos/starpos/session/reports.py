@@ -13,10 +13,12 @@ from starpos.frames.shutter import UNKNOWN, Shutter
 from starpos.instrument.inclinometer import Tilt
 from starpos.instrument.instrument import Instrument
 from starpos.session.diagnosis import Diagnosis, Level
+from starpos.session.now import ANOTHER_TIME_S
 
 WIDE_CLOCK_S = 0.1
-# Frames that are older when they are answered are of another clock.
-OLD_S = 10.0
+# Frames that are older when they come are of another clock, unless they are of another evening, as recorded ones; those
+# that are older still are stamped since the boot of their host.
+OLD_S, SINCE_BOOT_S = 40.0, 1e9
 AHEAD_S = 1.0
 ONE_CLOCK = "set the clocks of camera, inclinometer and solver by one source"
 
@@ -71,11 +73,11 @@ def of_clock(clock_stddev_s: float, stamp_stddev_s: float, ahead_s: float, doubt
             "frame stamped wrongly. Fixes are as wide as that until it is back, or solver/reset is called",
             values,
         )
-    if -ahead_s > OLD_S:
+    if OLD_S < -ahead_s < ANOTHER_TIME_S or -ahead_s > SINCE_BOOT_S:
         return Diagnosis(
             Level.WARN,
-            f"frames are stamped {-ahead_s:.3g} s behind this node's clock: if they are taken now, they belong to another "
-            f"clock, and so does their longitude: {ONE_CLOCK}",
+            f"frames are stamped {-ahead_s:.3g} s behind this node's clock: if they are taken now, they belong to "
+            f"another clock, and so does their longitude: {ONE_CLOCK}",
             values,
         )
     wide = float(np.hypot(clock_stddev_s, stamp_stddev_s))

@@ -220,7 +220,7 @@ class SolverSession:
         return made + self._work(now)
 
     def _add_stars(self, message: Any, now: Now, sent: Sent) -> list[Output]:
-        """Have a frame wait for its tilts, if it is wanted and can be answered in time; returns the answer to a bad one."""
+        """Have a frame wait for its tilts, if it is wanted and can be answered in time; return a bad one's answer."""
         self._heard.came("stars")
         self._note_lost(sent, now)
         if not self.pace.wants(stamp_to_unix(message.header.stamp), self._values["max_rate"]):

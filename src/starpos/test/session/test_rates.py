@@ -63,7 +63,7 @@ class Core:
             yield message, Sent(number)
 
     def run(self, frames_hz, tilts_hz, late_s):
-        """Send frames and tilts; returns the share of frames that are answered with their tilt, by when (s) after them."""
+        """Send frames and tilts; returns the share that is answered with its tilts, and how long (s) each took."""
         begin_s = self.begin_s + 10.0
         for kind, rate, late, message, before in (
             (STARS, frames_hz, 0.05, self.stars, 0.0),
