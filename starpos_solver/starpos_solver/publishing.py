@@ -34,7 +34,7 @@ class SolutionPublishers:
 
     @property
     def shared(self) -> tuple[Publisher, ...]:
-        """Those of topics whose names other drivers have, too."""
+        """The publishers of topics whose names other drivers have, too."""
         return self._fix, self._imu
 
     def publish(self, output: Output) -> None:

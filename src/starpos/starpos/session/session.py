@@ -8,14 +8,13 @@ the same messages at the same times give the same answers.
 
 import math
 import traceback
-from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import Any
 
 from starpos.calibration.unknown import MODEL_BY_PARAMETERS, unnamed_inclinometer
 from starpos.earth.orientation import earth_state
-from starpos.errors import InstrumentError, StarposError, TiltError, TimeError
+from starpos.errors import InstrumentError, StarposError, TimeError
 from starpos.fix.camera_attitude import CameraAttitude
 from starpos.fix.fix import Fix
 from starpos.fix.solution import Solution, Status
@@ -42,11 +41,11 @@ from starpos.session.now import Now, Sent
 from starpos.session.pace import Pace
 from starpos.session.search import AT_ONCE_S, Search
 from starpos.session.settings import Settings
+from starpos.session.tilt_intake import TiltIntake
 from starpos.session.tilts import TiltBuffer
 from starpos.session.transforms import FrameNames, name_in
 from starpos.sky import catalogue
 
-MOST_EARLY = 1000
 # A frame waits for its tilts so long, or so many times as long as they usually take to come.
 PATIENCE_S, DELAYS = 0.5, 1.5
 NOTHING_TOLD = Sent()
@@ -99,8 +98,7 @@ class SolverSession:
         self._backlog = Backlog()
         # number of the last star list among those of its publisher
         self._stars_number: int | None = None
-        # tilts ahead of a clock that may have been heard only after them
-        self._early: deque[Any] = deque(maxlen=MOST_EARLY)
+        self._intake = TiltIntake(self.tilts, self.names, settings, heard)
         self._was_s: float | None = None
         self._ended = False
         # from the last fix
@@ -131,7 +129,7 @@ class SolverSession:
     @property
     def waits(self) -> bool:
         """Whether a frame or a tilt waits for its time."""
-        return bool(self._backlog or self._early)
+        return bool(self._backlog) or self._intake.waits
 
     @property
     def counts(self) -> dict[str, int]:
@@ -180,36 +178,8 @@ class SolverSession:
     def take_tilt(self, message: Any, sent: Sent, now: Now) -> list[Output]:
         """Take a Tilt."""
         made = self._begun(now)
-        self._take_tilt(message, sent, now)
+        self._intake.take(message, sent, now)
         return made + self._work(now)
-
-    def _take_tilt(self, message: Any, sent: Sent, now: Now) -> None:
-        stamp_s = stamp_to_unix(message.header.stamp)
-        if sent.unix_s is not None and not now.played:
-            # A process that stood still may read it only when its time has come.
-            now = replace(now, unix_s=min(sent.unix_s, sent.unix_s if now.unix_s is None else now.unix_s))
-        try:
-            self.tilts.heard(message, sent.number, now.waiting_s)
-            ahead_s = now.ahead_s(stamp_s)
-        except StarposError as e:
-            self._heard.refuse("tilt", str(e))
-            return
-        if now.played and ahead_s > reports.AHEAD_S:
-            self._early.append(message)
-        else:
-            self._add_tilt(message, now)
-
-    def _add_tilt(self, message: Any, now: Now) -> None:
-        """Keep a tilt, unless it is broken, or of the future: the instrument may lean otherwise when its time comes."""
-        try:
-            if (ahead_s := now.ahead_s(stamp_to_unix(message.header.stamp))) > reports.AHEAD_S:
-                raise TiltError(f"a tilt is stamped {ahead_s:.3g} s before its time: {reports.ONE_CLOCK}")
-            self.tilts.add(message, self._settings.tilt_stddev_rad)
-            self.tilts.came_late(-ahead_s)
-            self._heard.came("tilt")
-            self.names.inclinometer = name_in(message)
-        except StarposError as e:
-            self._heard.refuse("tilt", str(e))
 
     def take_stars(self, message: Any, now: Now, sent: Sent = NOTHING_TOLD) -> list[Output]:
         """Take a StarArray, and those that have come after it."""
@@ -299,9 +269,7 @@ class SolverSession:
                 # The clock was set back: no tilt may be from the future.
                 self.tilts.forget_after(now.unix_s)
             if now.unix_s > was_s:
-                early, self._early = self._early, deque(maxlen=MOST_EARLY)
-                for message in early:
-                    self._add_tilt(message, now)
+                self._intake.go_on(now)
 
     # work ------------------------------------------------------------------------------------------------------------
 
@@ -316,7 +284,7 @@ class SolverSession:
                 return made
             # After a stall the frame's own tilts may be among them.
             for message, sent in self._arrived():
-                self._take_tilt(message, sent, now)
+                self._intake.take(message, sent, now)
             made += self._solve(self._dated(self._backlog.pop(now.waiting_s), now), now)
         self._backlog.pause()
         return made
@@ -490,7 +458,7 @@ class SolverSession:
         """Forget tilts, frames and the place, but no calibration that was found."""
         self.tilts.clear()
         self._backlog.clear()
-        self._early.clear()
+        self._intake.clear()
         self.latest = self.answer = self._hint = None
         self.gyro.forget()
         self.doubt.clear()
