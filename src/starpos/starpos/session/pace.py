@@ -23,6 +23,7 @@ class Pace:
         self.left_out = self.dropped = 0
         # the rate, the stamp of the last frame, and when the next one is due that is wanted
         self._most_hz = self._before_s = self._due_s = math.nan
+        self._number: int | None = None
         # when each frame came, and whether it was taken
         self._lately: deque[tuple[float, bool]] = deque(maxlen=MOST_KEPT)
 
@@ -40,6 +41,15 @@ class Pace:
             return False
         self._due_s = max(self._due_s, unix_s - period_s) + period_s
         return True
+
+    def numbered(self, number: int | None, now_s: float) -> None:
+        """Drop the frames that the middleware lost before this one, by its number among those of its publisher.
+
+        None: the middleware tells none.  A lower number is another publisher's.
+        """
+        last, self._number = self._number, number
+        if last is not None and number is not None and number > last + 1:
+            self.drop(now_s, number - last - 1)
 
     def took(self, now_s: float) -> None:
         """Note a frame that is worked on."""

@@ -96,8 +96,6 @@ class SolverSession:
         self._heard, self._log = heard, log
         self._arrived, self._arrived_stars = arrived, arrived_stars
         self._backlog = Backlog()
-        # number of the last star list among those of its publisher
-        self._stars_number: int | None = None
         self._intake = TiltIntake(self.tilts, self.names, settings, heard)
         self._was_s: float | None = None
         self._ended = False
@@ -192,7 +190,8 @@ class SolverSession:
     def _add_stars(self, message: Any, now: Now, sent: Sent) -> list[Output]:
         """Have a frame wait for its tilts, if it is wanted and can be answered in time; return a bad one's answer."""
         self._heard.came("stars")
-        self._note_lost(sent, now)
+        if not now.played:
+            self.pace.numbered(sent.number, now.waiting_s)
         if not self.pace.wants(stamp_to_unix(message.header.stamp), self._values["max_rate"]):
             return []
         self._search.frame_came(now)
@@ -206,13 +205,8 @@ class SolverSession:
             if not math.isnan(self._values["clock_stddev"]):
                 stars = replace(stars, clock_stddev_s=0.0)
         except StarposError as e:
-            bad = Solution(
-                Status.BAD_INPUT,
-                str(e),
-                source="stars",
-                utc_unix_s=None,
-                stars_detected=len(message.stars),
-            )
+            number = len(message.stars)
+            bad = Solution(Status.BAD_INPUT, str(e), source="stars", utc_unix_s=None, stars_detected=number)
             return [self._answered(message.header.stamp, bad, now)]
         self.instrument.frame_came(stars.width, stars.height, at_once=not now.played)
         if len(self._backlog) >= MOST:
@@ -224,12 +218,6 @@ class SolverSession:
             self.pace.dropped += self._backlog.keep_newest()
         return []
 
-    def _note_lost(self, sent: Sent, now: Now) -> None:
-        """Count the star lists that newer ones replaced in the middleware; a lower number is another publisher's."""
-        last, self._stars_number = self._stars_number, sent.number
-        if not now.played and last is not None and sent.number is not None and sent.number > last + 1:
-            self.pace.drop(now.waiting_s, sent.number - last - 1)
-
     def _delay_s(self, now: Now) -> float:
         """For how long frames wait for their tilts, by the tilts that have come, and by the first frame."""
         if not self._backlog or self._ready(self._backlog.first, now):
@@ -240,17 +228,13 @@ class SolverSession:
 
     def at(self, now: Now) -> list[Output]:
         """Go on to a time."""
-        self._ended = False
         self._advance(now)
         return self._work(now)
 
     def _begun(self, now: Now) -> list[Output]:
         """Go on to the time of a message before it is taken; live, what is ready is answered with it."""
-        if now.played:
-            return self.at(now)
-        self._ended = False
         self._advance(now)
-        return []
+        return self._work(now) if now.played else []
 
     def begin(self) -> None:
         """Note that recorded messages begin: who published on `tilt` before was another player, no rival."""
@@ -258,18 +242,20 @@ class SolverSession:
 
     def end(self, now: Now) -> list[Output]:
         """Answer the frames that wait, because nothing comes any more; again after a job."""
-        self._ended = True
         self._advance(now)
+        self._ended = True
         return self._work(now)
 
     def _advance(self, now: Now) -> None:
+        self._ended = False
         was_s, self._was_s = self._was_s, now.unix_s
-        if was_s is not None and now.unix_s is not None:
-            if now.unix_s < was_s - STEP_S:
-                # The clock was set back: no tilt may be from the future.
-                self.tilts.forget_after(now.unix_s)
-            if now.unix_s > was_s:
-                self._intake.go_on(now)
+        if was_s is None or now.unix_s is None:
+            return
+        if now.unix_s < was_s - STEP_S:
+            # The clock was set back: no tilt may be from the future.
+            self.tilts.forget_after(now.unix_s)
+        if now.unix_s > was_s:
+            self._intake.go_on(now)
 
     # work ------------------------------------------------------------------------------------------------------------
 
@@ -290,10 +276,9 @@ class SolverSession:
         return made
 
     def _first_ready(self, now: Now) -> bool:
-        if not self._backlog:
-            return False
-        self.instrument.go_on_to(self._backlog.first.stars.mid_unix_s)
-        return self._ready(self._backlog.first, now)
+        if self._backlog:
+            self.instrument.go_on_to(self._backlog.first.stars.mid_unix_s)
+        return bool(self._backlog) and self._ready(self._backlog.first, now)
 
     def _dated(self, frame: Waiting, now: Now) -> Waiting:
         """Correct how far a frame is ahead of a played clock, whose tick may have been heard only after the frame."""
