@@ -53,7 +53,10 @@ class SolverNode(Node):
         self._values = self._settings.values
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         gyro = (IMU_TOPIC,) * self._values["gyro"]
-        self._inputs = Inputs(self, ("camera_info", "stars", "tilt", *gyro))
+        gnss = (gnss_check.TOPIC,) * self._values["gnss.use"]
+        # at a known place a heading needs no tilt
+        tilt = ("tilt",) * (self._settings.site is None and not gnss)
+        self._inputs = Inputs(self, ("camera_info", "stars", *tilt, *gyro, *gnss))
         self._dropped = Dropped(self, PLAY_SLOWER)
         self._replayed: Replayed | None = None
         self._session = SolverSession(
@@ -99,7 +102,7 @@ class SolverNode(Node):
             subscription(self, Imu, IMU_TOPIC, self._on_imu, IMU_QUEUE, best_effort)
         self._gnss = gnss_check.GnssCheck()
         best_effort = ReliabilityPolicy.BEST_EFFORT
-        subscription(self, NavSatFix, gnss_check.TOPIC, self._gnss.take, 10, best_effort)
+        subscription(self, NavSatFix, gnss_check.TOPIC, self._on_gnss, 10, best_effort)
         self.create_service(Solve, "~/solve", self._on_solve)
         self.create_service(Trigger, "~/reset", self._on_reset)
         self._calibration_services = CalibrationServices(self, self._session, self._settings)
@@ -147,6 +150,11 @@ class SolverNode(Node):
     def _on_imu(self, message: Imu) -> None:
         self._session.gyro.take(message, self._now())
 
+    def _on_gnss(self, message: NavSatFix) -> None:
+        self._gnss.take(message)
+        if self._values["gnss.use"]:
+            self._session.take_gnss(message)
+
     def _note_dropped(self, name: str, info: Mapping[str, Any]) -> None:
         if time_is_simulated(self):
             self._dropped.came(name, info)
@@ -186,8 +194,7 @@ class SolverNode(Node):
         for output in outputs:
             self._outputs.publish(output)
             if self._replayed is not None and isinstance(output, Answered):
-                self._replayed.made += 1
-                self._replayed.fixes += output.solution.ok
+                self._replayed.note(output.stamp, output.solution.ok)
         if outputs:
             self._update_transforms()
         if self._session.more:
@@ -225,9 +232,9 @@ class SolverNode(Node):
             waiting = (
                 "building the triangles of this field" if session.instrument.preparing else "no frame yet"
             )
-            return Diagnosis(Level.WARN, session.instrument.trouble or waiting, session.counts)
+            return Diagnosis(Level.WARN, session.instrument.trouble or waiting, session.pace.counts)
         remarks = session.pace.complaint, self._gnss.remark(session.answer, self._settings.vertical)
-        return reports.of_solution(session.answer, session.counts, "; ".join(filter(None, remarks)))
+        return reports.of_solution(session.answer, session.pace.counts, "; ".join(filter(None, remarks)))
 
     def _report_outputs(self) -> Diagnosis:
         if others := other_publishers(self, self._outputs.shared):

@@ -21,6 +21,7 @@ class Pace:
 
     def __init__(self) -> None:
         self.left_out = self.dropped = 0
+        self._answers = self._fixes = 0
         # the rate, the stamp of the last frame, and when the next one is due that is wanted
         self._most_hz = self._before_s = self._due_s = math.nan
         self._number: int | None = None
@@ -50,6 +51,21 @@ class Pace:
         last, self._number = self._number, number
         if last is not None and number is not None and number > last + 1:
             self.drop(now_s, number - last - 1)
+
+    def answered(self, fix: bool) -> None:
+        """Count an answer, and whether it is a fix."""
+        self._answers += 1
+        self._fixes += fix
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """How many frames were answered, by a fix, or left out."""
+        return {
+            "frames": self._answers,
+            "fixes": self._fixes,
+            "dropped frames": self.dropped,
+            "left out by max_rate": self.left_out,
+        }
 
     def took(self, now_s: float) -> None:
         """Note a frame that is worked on."""

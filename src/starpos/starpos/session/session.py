@@ -35,7 +35,8 @@ from starpos.session.clock_doubt import ClockDoubt
 from starpos.session.frames import Answered, Averaged, Output, Waiting, ground_of
 from starpos.session.gyro import Gyro
 from starpos.session.job import Jobs
-from starpos.session.log import Heard, Log
+from starpos.session.known_place import SessionPlaces
+from starpos.session.log import Changes, Heard, Log
 from starpos.session.memory import Seen
 from starpos.session.now import Now, Sent
 from starpos.session.pace import Pace
@@ -46,8 +47,6 @@ from starpos.session.tilts import TiltBuffer
 from starpos.session.transforms import FrameNames, name_in
 from starpos.sky import catalogue
 
-# A frame waits for its tilts so long, or so many times as long as they usually take to come.
-PATIENCE_S, DELAYS = 0.5, 1.5
 NOTHING_TOLD = Sent()
 J2000_UNIX_S = 946_728_000.0
 # A stamp in the future is wrong beyond AHEAD_S and so many stated errors.
@@ -79,7 +78,6 @@ class SolverSession:
         self.latest: Waiting | None = None
         self.answer: Solution | None = None
         self.pace = Pace()
-        self._answered_frames = self._fixes = 0
         # whether another frame can be answered at once, live: whoever drives the session calls `at` again, so that
         # what has come meanwhile has its turn
         self.more = False
@@ -88,6 +86,7 @@ class SolverSession:
         self.names = FrameNames()
         self.doubt = ClockDoubt()
         self.gyro = Gyro(heard)
+        self.places = SessionPlaces(settings)
         self._search = Search(settings.values)
         self._settings, self._values = settings, settings.values
         self._catalogue = catalogue.load_catalogue()
@@ -101,12 +100,12 @@ class SolverSession:
         self._ended = False
         # from the last fix
         self._hint: Hint | None = None
-        self._logged: object = None
+        self._changes = Changes(log)
         self.instrument = CameraSolver(
             self._make_solver,
             self._other_camera,
             jobs(),
-            lambda why: self._log_change(why, good=False),
+            lambda why: self._changes.say(why, good=False),
             topic,
         )
         self.calibrating = Calibrating(
@@ -128,16 +127,6 @@ class SolverSession:
     def waits(self) -> bool:
         """Whether a frame or a tilt waits for its time."""
         return bool(self._backlog) or self._intake.waits
-
-    @property
-    def counts(self) -> dict[str, int]:
-        """How many frames were answered, by a fix, or left out, for the diagnostics."""
-        return {
-            "frames": self._answered_frames,
-            "fixes": self._fixes,
-            "dropped frames": self.pace.dropped,
-            "left out by max_rate": self.pace.left_out,
-        }
 
     @property
     def busy(self) -> bool:
@@ -188,35 +177,57 @@ class SolverSession:
         return made + self._work(now)
 
     def _add_stars(self, message: Any, now: Now, sent: Sent) -> list[Output]:
-        """Have a frame wait for its tilts, if it is wanted and can be answered in time; return a bad one's answer."""
-        self._heard.came("stars")
-        if not now.played:
-            self.pace.numbered(sent.number, now.waiting_s)
-        if not self.pace.wants(stamp_to_unix(message.header.stamp), self._values["max_rate"]):
+        """Have a frame wait for its tilts, if there is room; return a bad one's answer."""
+        if not self._takes(message.header, now, sent):
             return []
-        self._search.frame_came(now)
-        if not now.played and not self._backlog.has_room(self._delay_s(now)):
-            self.pace.drop(now.waiting_s)
-            return []
-        self.pace.took(now.waiting_s)
         try:
             stars = message_to_stars(message)
-            # If the user sets clock_stddev, it replaces the error that the camera's host states.
-            if not math.isnan(self._values["clock_stddev"]):
-                stars = replace(stars, clock_stddev_s=0.0)
         except StarposError as e:
             number = len(message.stars)
             bad = Solution(Status.BAD_INPUT, str(e), source="stars", utc_unix_s=None, stars_detected=number)
             return [self._answered(message.header.stamp, bad, now)]
+        self._wait_for(stars, message.header, now)
+        return []
+
+    def take_detected(self, stars: Stars, header: Any, now: Now) -> list[Output]:
+        """Take stars as a StarArray with this header holds them."""
+        made = self._begun(now)
+        if self._takes(header, now, NOTHING_TOLD):
+            self._wait_for(stars, header, now)
+        return made + self._work(now)
+
+    def take_gnss(self, message: Any) -> None:
+        """Take a NavSatFix of satellites, for the heading at its place."""
+        self.places.take(message)
+        self._heard.came("gnss/fix")
+
+    def _takes(self, header: Any, now: Now, sent: Sent) -> bool:
+        """Whether a frame is wanted and can be answered in time."""
+        self._heard.came("stars")
+        if not now.played:
+            self.pace.numbered(sent.number, now.waiting_s)
+        if not self.pace.wants(stamp_to_unix(header.stamp), self._values["max_rate"]):
+            return False
+        self._search.frame_came(now)
+        if not now.played and not self._backlog.has_room(self._delay_s(now)):
+            self.pace.drop(now.waiting_s)
+            return False
+        self.pace.took(now.waiting_s)
+        return True
+
+    def _wait_for(self, stars: Stars, header: Any, now: Now) -> None:
+        """Have a frame wait for its tilts."""
+        # If the user sets clock_stddev, it replaces the error that the camera's host states.
+        if not math.isnan(self._values["clock_stddev"]):
+            stars = replace(stars, clock_stddev_s=0.0)
         self.instrument.frame_came(stars.width, stars.height, at_once=not now.played)
         if len(self._backlog) >= MOST:
             self.pace.drop(now.waiting_s)
             self._heard.refuse("stars", f"a frame was dropped: {MOST} wait for their tilts")
-            return []
-        self._backlog.add(Waiting(message.header, stars, now.waiting_s, now.ahead_s(stars.mid_unix_s)))
+            return
+        self._backlog.add(Waiting(header, stars, now.waiting_s, now.ahead_s(stars.mid_unix_s)))
         if self.instrument.preparing and not now.played:
             self.pace.dropped += self._backlog.keep_newest()
-        return []
 
     def _delay_s(self, now: Now) -> float:
         """For how long frames wait for their tilts, by the tilts that have come, and by the first frame."""
@@ -271,7 +282,7 @@ class SolverSession:
             # After a stall the frame's own tilts may be among them.
             for message, sent in self._arrived():
                 self._intake.take(message, sent, now)
-            made += self._solve(self._dated(self._backlog.pop(now.waiting_s), now), now)
+            made += self._solve(self._backlog.pop(now.waiting_s).dated(now), now)
         self._backlog.pause()
         return made
 
@@ -280,12 +291,6 @@ class SolverSession:
             self.instrument.go_on_to(self._backlog.first.stars.mid_unix_s)
         return bool(self._backlog) and self._ready(self._backlog.first, now)
 
-    def _dated(self, frame: Waiting, now: Now) -> Waiting:
-        """Correct how far a frame is ahead of a played clock, whose tick may have been heard only after the frame."""
-        if not now.played:
-            return frame
-        return replace(frame, ahead_s=min(now.ahead_s(frame.stars.mid_unix_s), frame.ahead_s))
-
     def _ready(self, frame: Waiting, now: Now) -> bool:
         if self.instrument.preparing:
             return False
@@ -293,17 +298,19 @@ class SolverSession:
             frame = self._backlog.first = replace(frame, since_s=now.waiting_s)
         mid, waited_s = frame.stars.mid_unix_s, now.waiting_s - frame.since_s
         # a negative wait: the clock has begun anew
-        if mid is None or self._ended or waited_s > self._patience_s or waited_s < 0:
+        if (
+            mid is None
+            or self._ended
+            or waited_s > self.tilts.patience_s(self._values["tilt_timeout"])
+            or waited_s < 0
+        ):
             return True
         if self.instrument.solver is None:
             return bool(self.instrument.trouble)
+        # an instrument at a known place may have no inclinometer
+        if self.places.known and not len(self.tilts):
+            return True
         return self.tilts.complete(mid, self._span(frame.stars))
-
-    @property
-    def _patience_s(self) -> float:
-        """How long a frame waits for its tilts."""
-        stated_s = self._values["tilt_timeout"]
-        return max(PATIENCE_S, DELAYS * self.tilts.delay_s) if math.isnan(stated_s) else stated_s
 
     def _span(self, stars: Stars) -> float:
         return stars.exposure_s or self._values["tilt_window"]
@@ -368,7 +375,8 @@ class SolverSession:
                     f"the frame is stamped {frame.ahead_s:.3g} s before its time: {reports.ONE_CLOCK}"
                 )
             tilts = self.tilts.over(self._span(stars))
-            return self._search.solved(solver, stars, tilts, hint, predicted, until_s, known)
+            places = self.places if self.places.known else None
+            return self._search.solved(solver, stars, tilts, places, hint, predicted, until_s, known)
         except (InstrumentError, TimeError) as e:
             return Solution.failed(stars, Status.BAD_INPUT, str(e))
         except Exception as e:
@@ -411,26 +419,15 @@ class SolverSession:
             # by the clock of recorded data no time passes
             answer = replace(answer, identify_s=0.0, fix_s=0.0)
         self.answer = answer
-        self._answered_frames += 1
-        self._fixes += answer.ok
+        self.pace.answered(answer.ok)
         self._hint = answer.hint or self._hint
-        self._log_change("fixes are coming" if answer.ok else answer.message, answer.ok, answer.status)
+        self._changes.say("fixes are coming" if answer.ok else answer.message, answer.ok, answer.status)
         return self._output(stamp, answer)
 
     def _output(self, stamp: Any, answer: Solution) -> Answered:
         no_camera = self.instrument.solver is None and self.instrument.camera is None
         ground = None if answer.fix is None else ground_of(answer.fix, self._settings.vertical)
         return Answered(stamp, answer, ground, no_camera)
-
-    def _log_change(self, sentence: str, good: bool, state: object = None) -> None:
-        state = state or sentence
-        if state == self._logged:
-            return
-        self._logged = state
-        if good:
-            self._log.info(sentence)
-        else:
-            self._log.warning(sentence)
 
     def solve_again(self) -> Answered | None:
         """Solve the newest frame with what is known now, identified anew whatever was found before; None without one."""
@@ -446,5 +443,6 @@ class SolverSession:
         self._intake.clear()
         self.latest = self.answer = self._hint = None
         self.gyro.forget()
+        self.places.forget()
         self.doubt.clear()
         self.calibrating.forget()

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The tilts that have arrived, and their average over an exposure."""
 
+import math
 from collections import deque
 from dataclasses import dataclass
 from typing import Any
@@ -20,6 +21,8 @@ from starpos.session.tilt_steps import TiltSteps
 CAPACITY = 6000
 # How late samples come, and how often, is told by so many. Those that come later than this are of another clock.
 USUAL, LATEST_S = 10, 2.0
+# A frame waits for its tilts so long, or so many times as long as they usually take to come.
+PATIENCE_S, DELAYS = 0.5, 1.5
 # Between two samples of one exposure at most so many others arrive.
 TOGETHER = 20
 # Samples so near to an exposure may bracket it; a flagged one explains why it has no good one.
@@ -106,6 +109,10 @@ class TiltBuffer:
             return 0.0
         late_s, apart_s = max(self._late_s), float(np.median(self._apart_s))
         return late_s + apart_s if late_s < LATEST_S and apart_s < BRACKET_S else 0.0
+
+    def patience_s(self, stated_s: float) -> float:
+        """How long a frame waits for its tilts, s; NaN for what is stated: by how long they take to come."""
+        return max(PATIENCE_S, DELAYS * self.delay_s) if math.isnan(stated_s) else stated_s
 
     def complete(self, mid_unix_s: float, span_s: float) -> bool:
         """Whether all samples that an exposure needs have arrived: none that may still come lies in it or bounds it."""

@@ -147,7 +147,7 @@ def test_a_rate_is_kept_and_no_complaint_is_made(messages):  # noqa: F811
     core = Core(messages, 0.02, "max_rate:=5.0")
     share, _ = core.run(30, 10, 0.02)
     assert share == pytest.approx(5 / 30, rel=0.05)
-    assert core.session.pace.complaint == "" and core.session.counts["left out by max_rate"] > 100
+    assert core.session.pace.complaint == "" and core.session.pace.counts["left out by max_rate"] > 100
 
 
 def test_a_wait_that_is_stated_is_kept(messages):  # noqa: F811
