@@ -24,7 +24,7 @@ LEARNING, AGREES, DOUBTFUL, DISAGREES = "learning", "agrees", "doubtful", "disag
 # chi-square of two degrees of freedom that a good GNSS exceeds once in 1000 and, of each test, once in 3e6 frames
 DOUBT, ALARM = 13.8, 30.0
 # GNSS is believed again once it has agreed for so long, over so many frames, within that chi-square
-BACK_S, BACK_FRAMES, BACK = 240.0, 4, 9.2
+BACK_S, BACK_FRAMES, BACK = 600.0, 10, 7.4
 # a place that is wider than this (1 sigma, m) is none: the filter is not linear over it
 WIDEST_M = 50_000.0
 # the place of a lean at which A3 was not learned may be bent by this share of its sigma
