@@ -24,7 +24,9 @@ from starpos.units import ARCSEC
 
 # name of the term of all that was learned
 LEARNED = "learned"
-NOTHING_LEARNED = "too little is known of A3: let GNSS teach it, newly turned and leaning by some degrees, or give A3"
+NOTHING_LEARNED = (
+    "too little is known of A3: let GNSS teach it, newly turned and leaning by some degrees, or give A3"
+)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

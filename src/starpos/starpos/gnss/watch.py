@@ -11,7 +11,6 @@ from starpos.averaging.slip import slip_s
 from starpos.earth.ellipsoid import EARTH_RADIUS_M
 from starpos.earth.vertical import Vertical
 from starpos.fix.fix import Fix
-from starpos.fix.readable import length_text
 from starpos.gnss.filter import GnssFrame, begun, chi2, is_linear, stddev_rad, updated
 from starpos.gnss.guard import Witnesses
 from starpos.gnss.place import GnssPlace
@@ -55,9 +54,13 @@ class GnssCheck:
         if math.isnan(self.distance_m):
             return "A3 is learned from GNSS: the stars tell no place of their own yet"
         where = COMPASS[round(self.bearing_deg / 45) % 8]
-        off, sigma = length_text(self.distance_m), length_text(self.sigma_m)
+        off, sigma = _length_text(self.distance_m), _length_text(self.sigma_m)
         sentence = f"GNSS is {off} {where} of where the stars put us ({sigma})"
         return sentence + (": it is not believed" if self.status == DISAGREES else "")
+
+
+def _length_text(metres: float) -> str:
+    return f"{metres:.0f} m" if metres < 1000 else f"{metres / 1000:.2g} km"
 
 
 class GnssWatch:

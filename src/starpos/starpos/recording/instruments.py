@@ -14,7 +14,10 @@ if TYPE_CHECKING:
 STARS, TILT, SOLUTION = (f"{PACKAGE}/msg/{name}" for name in ("StarArray", "Tilt", "Solution"))
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 # types by the relative names of what a solver takes
+NAV_SAT_FIX = "sensor_msgs/msg/NavSatFix"
 INPUTS = {"stars": STARS, "tilt": TILT, "camera/camera_info": CAMERA_INFO}
+# what it takes besides, with gnss.use
+GNSS = {"gnss/fix": NAV_SAT_FIX}
 
 
 def instrument_in(

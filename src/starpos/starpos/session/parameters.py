@@ -202,6 +202,21 @@ PARAMETERS = (
         read_only=True,
     ),
     Parameter(
+        "gnss.use",
+        False,
+        "Take gnss/fix, which teaches the misalignment, the inclinometer's errors and the deflection while the stars "
+        "agree with it, and is guarded by them; fix stays the stars' own. A GNSS that is led astray from the first frame "
+        "on teaches what is wrong.",
+        read_only=True,
+    ),
+    Parameter(
+        "gnss.learned",
+        "",
+        "File that keeps what GNSS taught, read at the start if it is there; '' for none. Delete it after camera or "
+        "inclinometer was remounted: the old one makes fixes wrong until GNSS disagrees.",
+        read_only=True,
+    ),
+    Parameter(
         "tilt_window",
         0.5,
         "Span of tilts averaged where the exposure is unknown.",
@@ -265,6 +280,18 @@ def instrument_of(
         clock_stddev_s=known.clock_stddev_s if math.isnan(clock) else clock,
         inclinometer=errors if math.isnan(tilt) else replace(errors, noise_rad=math.radians(tilt)),
     )
+
+
+def check_gnss(values: Mapping, instrument: Instrument) -> None:
+    """Raise InstrumentError if gnss.use does not go with the others."""
+    if not values["gnss.use"]:
+        return
+    if values["self_calibration"]:
+        raise InstrumentError("gnss.use and self_calibration both find A3: set one of the two")
+    if instrument.vertical is not None:
+        raise InstrumentError(
+            "gnss.use teaches an inclinometer, and the camera of calibration_url is its own level: set it to false"
+        )
 
 
 def known_instrument(url: str) -> Instrument | None:

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from starpos.recording.bag import BagReader
-from starpos.recording.instruments import INPUTS, STARS, TILT, instrument_in
+from starpos.recording.instruments import GNSS, INPUTS, NAV_SAT_FIX, STARS, TILT, instrument_in
 from starpos.session.frames import Output
 from starpos.session.job import JobsInTurn
 from starpos.session.log import Heard, Log
@@ -34,7 +34,8 @@ class Replay:
         """
         session, tilts, now_ns = self.session, 0, 0
         with BagReader(path, typed=True) as bag:
-            _, connections = instrument_in(bag, path, namespace, INPUTS, (STARS,))
+            topics = INPUTS if session.gnss is None else INPUTS | GNSS
+            _, connections = instrument_in(bag, path, namespace, topics, (STARS,))
             for connection, log_ns, message in bag.decoded(connections):
                 # Time never goes back, even if the times of a bag's messages do.
                 now_ns = max(now_ns, log_ns)
@@ -45,6 +46,8 @@ class Replay:
                 elif connection.msgtype == STARS:
                     self.frames += 1
                     yield from session.take_stars(message, now)
+                elif connection.msgtype == NAV_SAT_FIX:
+                    yield from session.take_gnss(message, now)
                 else:
                     yield from session.take_camera(message, now)
                 yield from self._settled(now)

@@ -20,6 +20,7 @@ from starpos.fix.fix import Fix
 from starpos.fix.solution import Solution, Status
 from starpos.fix.solver import Solver
 from starpos.frames.stars import Stars
+from starpos.gnss.solving import Watched
 from starpos.identification import Identification
 from starpos.identification.hint import Hint
 from starpos.identification.search import Priors
@@ -32,6 +33,7 @@ from starpos.session.calibrating import Calibrating
 from starpos.session.camera_solver import CameraSolver
 from starpos.session.clock_doubt import ClockDoubt
 from starpos.session.frames import Answered, Averaged, Output, Waiting, ground_of
+from starpos.session.gnss_teacher import GnssTeacher
 from starpos.session.gyro import Gyro
 from starpos.session.job import Jobs
 from starpos.session.log import Heard, Log
@@ -80,6 +82,8 @@ class SolverSession:
         self.names = FrameNames()
         self.doubt = ClockDoubt()
         self.gyro = Gyro(heard)
+        # None without gnss.use
+        self.gnss = GnssTeacher(settings, jobs(), heard, log) if settings.values["gnss.use"] else None
         self._search = Search(settings.values)
         self._settings, self._values = settings, settings.values
         self._catalogue = catalogue.load_catalogue()
@@ -112,6 +116,8 @@ class SolverSession:
         self._hint = None
         self._search.other_camera()
         self.gyro.forget()
+        if self.gnss is not None:
+            self.gnss.other_camera()
         self.calibrating.camera_changed()
 
     @property
@@ -216,6 +222,13 @@ class SolverSession:
                 )
         return made + self._work(now)
 
+    def take_gnss(self, message: Any, now: Now) -> list[Output]:
+        """Take a sensor_msgs/NavSatFix of GNSS; without gnss.use there is nothing to do with it."""
+        made = self.at(now)
+        if self.gnss is not None:
+            self.gnss.take(message, now)
+        return made
+
     # time ------------------------------------------------------------------------------------------------------------
 
     def at(self, now: Now) -> list[Output]:
@@ -290,12 +303,20 @@ class SolverSession:
             frame, answer = self._with_doubt(frame, answer, answer.fix)
         self.latest = frame
         header = frame.message.header
-        answered = self._answered(header.stamp, answer, now)
+        # of a frame whose time is in doubt GNSS's place is in doubt too
+        beside = self._beside(frame, answer, compared=not frame.doubted)
+        answer = answer if beside is None else beside.solution
+        answered = self._answered(header.stamp, answer, now, beside)
         attitude = self._attitude(frame.stars, answer, header.frame_id, predicted, until_s)
         made: list[Output] = [replace(answered, attitude=attitude)]
         if self.instrument.solver is not None:
             made += self._learn(frame, answer)
         return made
+
+    def _beside(self, frame: Waiting, rough: Solution, compared: bool) -> Watched | None:
+        """Solve a frame with what GNSS taught; None without gnss.use.  compared: with GNSS's place too."""
+        gnss, solver = self.gnss, self.instrument.solver
+        return gnss.solved(solver, frame.stars, rough, compared) if gnss and solver else None
 
     def _attitude(
         self, stars: Stars, answer: Solution, frame_id: str, predicted: Priors, until_s: float
@@ -381,7 +402,7 @@ class SolverSession:
 
     # outputs ---------------------------------------------------------------------------------------------------------
 
-    def _answered(self, stamp: Any, answer: Solution, now: Now) -> Answered:
+    def _answered(self, stamp: Any, answer: Solution, now: Now, beside: Watched | None = None) -> Answered:
         if now.played:
             # by the clock of recorded data no time passes
             answer = replace(answer, identify_s=0.0, fix_s=0.0)
@@ -390,12 +411,16 @@ class SolverSession:
         self.counts["fixes"] += answer.ok
         self._hint = answer.hint or self._hint
         self._log_change("fixes are coming" if answer.ok else answer.message, answer.ok, answer.status)
-        return self._output(stamp, answer)
+        if self.gnss is not None:
+            self.gnss.save_if_due(now)
+        return self._output(stamp, answer, beside)
 
-    def _output(self, stamp: Any, answer: Solution) -> Answered:
+    def _output(self, stamp: Any, answer: Solution, beside: Watched | None) -> Answered:
         no_camera = self.instrument.solver is None and self.instrument.camera is None
         ground = None if answer.fix is None else ground_of(answer.fix, self._settings.vertical)
-        return Answered(stamp, answer, ground, no_camera)
+        if beside is not None:
+            ground = beside.ground
+        return Answered(stamp=stamp, solution=answer, ground=ground, no_camera=no_camera, beside=beside)
 
     def _log_change(self, sentence: str, good: bool, state: object = None) -> None:
         state = state or sentence
@@ -412,7 +437,9 @@ class SolverSession:
         if self.latest is None:
             return None
         answer = self._answer_to(self.latest, None, self._search.until_s(None, False))
-        return self._output(self.latest.message.header.stamp, answer)
+        beside = self._beside(self.latest, answer, compared=False)
+        answer = answer if beside is None else beside.solution
+        return self._output(self.latest.message.header.stamp, answer, beside)
 
     def reset(self) -> None:
         """Forget tilts, frames and the place, but no calibration that was found."""
