@@ -226,11 +226,11 @@ class SolverNode(Node):
         return reports.of_clock(clock_s, stars.stamp_stddev_s, latest.ahead_s, doubt_s)
 
     def _report_conditions(self) -> Diagnosis:
-        calibration = self._settings.calibration(self._session.calibrating.found)
+        instrument = self._settings.instrument(self._session.calibrating.found)
         tilt = self._session.answer.tilt if self._session.answer else None
         latest, solver = self._session.latest, self._session.instrument.solver
         shutter = solver.shutter(latest.stars) if latest and solver else None
-        return reports.of_conditions(self._values, calibration, tilt, shutter)
+        return reports.of_conditions(self._values, instrument, tilt, shutter)
 
 
 def _sent(info: Mapping[str, Any]) -> Sent:

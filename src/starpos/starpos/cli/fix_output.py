@@ -97,6 +97,7 @@ def json_about(s: Solution) -> dict:
         "log_odds": a.log_odds if a else None,
         "status": s.status.value,
         "warnings": list(s.warnings),
+        "remark": s.remark or None,
     }
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from starpos.averaging.average import Average
-from starpos.calibration.unknown import BY_PARAMETERS
+from starpos.calibration.unknown import BY_PARAMETERS, MODEL_BY_PARAMETERS
 from starpos.cli import console, jobs
 from starpos.cli.archive import NightFolder
 from starpos.cli.fix_output import (
@@ -25,8 +25,8 @@ from starpos.cli.solved_night import NO_FIX
 from starpos.earth.vertical import Vertical
 from starpos.errors import StarposError
 from starpos.fix.solution import Solution
-from starpos.instrument.instrument import Calibration
-from starpos.night.remarks import of_a3
+from starpos.instrument.instrument import Instrument
+from starpos.night.remarks import of_a3, of_inclinometer
 from starpos.night.together import Solved, extrapolated
 from starpos.session.frames import Answered, Averaged
 from starpos.session.parameter_file import settings_of
@@ -139,7 +139,7 @@ def run(args: argparse.Namespace) -> int:
     with jobs.workers_of(args, len(args.bags)) as workers:
         answers = jobs.watched(workers.map((work, bag) for bag in args.bags), len(args.bags), "bag")
         return max(
-            tell(args, output, bag, night, settings.vertical, settings.calibration(None))
+            tell(args, output, bag, night, settings.vertical, settings.instrument(None))
             for bag, night in zip(args.bags, answers, strict=True)
         )
 
@@ -150,7 +150,7 @@ def tell(
     bag: str,
     night: PlayedNight,
     vertical: Vertical,
-    calibration: Calibration,
+    instrument: Instrument,
 ) -> int:
     """Write the solutions of a bag and the average of its place; returns the exit status."""
     for sentence in night.said:
@@ -167,7 +167,12 @@ def tell(
             line_of(f"{bag} {time}", solution, turning=False),
         )
     whole = night.average
-    for remark in (*extrapolated(solved), *(of_a3(calibration, whole, BY_PARAMETERS) if whole else ())):
+    remarks = list(extrapolated(solved))
+    if solved:
+        remarks += of_inclinometer(instrument, MODEL_BY_PARAMETERS)
+    if whole:
+        remarks += of_a3(instrument.calibration, whole, BY_PARAMETERS)
+    for remark in remarks:
         console.complain("replay", f"{bag}: {remark}")
     if solved:
         warnings = {warning for s in night.solutions for warning in s.warnings}

@@ -9,7 +9,7 @@ from starpos.cli import console, jobs, options, overwriting, solve_gnss, solve_p
 from starpos.cli.archive import NightFolder, frames_among, nights_of
 from starpos.cli.deflection import add_vertical, vertical_of
 from starpos.cli.fix_output import COLUMNS, CSV_HELP, HEAD, JSON_HELP
-from starpos.cli.inputs import add_near, checked_tilts, given_of, near_of, reader_of, tell_unnamed
+from starpos.cli.inputs import add_near, checked_tilts, given_of, near_of, reader_of
 from starpos.cli.output import Output, add_formats
 from starpos.cli.overwriting import Written
 from starpos.cli.plan import Plan
@@ -123,8 +123,6 @@ def _plan(args: argparse.Namespace, night: NightFolder, about: About | None, rea
     tilts = NO_TILTS if night.tilt is None else checked_tilts("solve", night.tilt, instrument)
     jobs.prepare("solve", instrument, about)
     solver = Solver(instrument, catalogue.load_catalogue(), air, progress=console.ProgressBar())
-    if night.tilt is not None:
-        tell_unnamed("solve", instrument)
     together = args.self_calibrate or args.gnss is not None
     work = Identifying(given) if together else Solving(given, air, tilts)
     return Plan(night, OnFile(read, work), given, solver, tilts)

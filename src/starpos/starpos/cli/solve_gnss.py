@@ -22,6 +22,7 @@ from starpos.gnss.table import read_gnss_csv
 from starpos.gnss.track import GnssTrack
 from starpos.gnss.watch import GnssCheck
 from starpos.night.hints import of_one_camera
+from starpos.night.remarks import of_inclinometer
 from starpos.night.together import Solved, together
 from starpos.night.watching import watched_night
 
@@ -114,7 +115,8 @@ def run(
             console.complain("solve", told.solution.message)
         output.put({"file": path} | json_of_watched(told) | json_about(told.solution), _line(path, told))
     whole = together(solved, None, near_of(args))
-    for text in (*([whole.why_not] if whole.why_not else ()), *whole.remarks):
+    unnamed = of_inclinometer(plan.solver.instrument) if solved and plan.solver is not None else ()
+    for text in (*([whole.why_not] if whole.why_not else ()), *unnamed, *whole.remarks):
         console.complain("solve", text)
     if solved:
         put_combined(output, plan.night, whole.average, solved, warnings, vertical)

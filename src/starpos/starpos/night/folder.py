@@ -20,7 +20,7 @@ from starpos.instrument.tilt_table import read_tilt_csv
 from starpos.instrument.tilts import NoTilts, Tilts
 from starpos.night.night import Truth
 from starpos.night.reading import First, Given, Reader
-from starpos.night.remarks import of_inclinometer, of_tilts
+from starpos.night.remarks import of_tilts
 from starpos.night.solving import Exposures
 from starpos.night.work import Solving
 
@@ -41,8 +41,6 @@ def exposures(folder: Path, given: Given, atmosphere: Atmosphere, vertical: Vert
     try:
         tilts = log = read_tilt_csv(folder / TILTS, noise_rad)
         remarks = (*of_tilts(log, TILTS), *remarks)
-        if instruments.instrument is not None:
-            remarks = (*of_inclinometer(instruments.instrument), *remarks)
     except TiltError as error:
         tilts = NoTilts(str(error))
 

@@ -20,3 +20,22 @@ class Heard(Protocol):
     def came(self, name: str) -> object: ...
 
     def refuse(self, name: str, sentence: str) -> object: ...
+
+
+class LogOfChanges:
+    """Says a state in a log when it becomes another one."""
+
+    def __init__(self, log: Log) -> None:
+        self._log = log
+        self._said: object = None
+
+    def say(self, sentence: str, good: bool, state: object = None) -> None:
+        """Say a sentence, as information or a warning, unless the state (by default the sentence) was said last."""
+        state = state or sentence
+        if state == self._said:
+            return
+        self._said = state
+        if good:
+            self._log.info(sentence)
+        else:
+            self._log.warning(sentence)

@@ -6,11 +6,12 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from starpos.calibration.unknown import MODEL_BY_PARAMETERS, unnamed_inclinometer
 from starpos.earth.orientation import EQUATOR_M_PER_S, table_age_days
 from starpos.fix.solution import Solution
 from starpos.frames.shutter import UNKNOWN, Shutter
 from starpos.instrument.inclinometer import Tilt
-from starpos.instrument.instrument import Calibration
+from starpos.instrument.instrument import Instrument
 from starpos.session.diagnosis import Diagnosis, Level
 
 WIDE_CLOCK_S = 0.1
@@ -78,15 +79,17 @@ def of_clock(clock_stddev_s: float, stamp_stddev_s: float, ahead_s: float, doubt
 
 
 def of_conditions(
-    values: Mapping, calibration: Calibration, tilt: Tilt | None, shutter: Shutter | None
+    values: Mapping, instrument: Instrument, tilt: Tilt | None, shutter: Shutter | None
 ) -> Diagnosis:
-    """Report what nobody knows of the air, of the inclinometer's temperatures and of the shutter.
+    """Report what nobody knows of the air, of the inclinometer, its temperatures, and of the shutter.
 
     values: the parameters.  tilt, shutter: those of the newest frame, None without one.
     """
+    calibration = instrument.calibration
     now_c = math.nan if tilt is None else tilt.temperature_c
     pressure_pa, air_c = values["refraction.pressure"], values["refraction.temperature"]
-    unknown = []
+    unnamed = unnamed_inclinometer(instrument, MODEL_BY_PARAMETERS)
+    unknown = [unnamed] if unnamed else []
     if math.isnan(pressure_pa):
         unknown.append("the air's pressure is not known, which widens the fix: set refraction.pressure")
     if math.isnan(air_c):
@@ -112,4 +115,4 @@ def of_conditions(
     }
     if unknown:
         return Diagnosis(Level.WARN, "; ".join(unknown), shown)
-    return Diagnosis(Level.OK, "air, temperatures and shutter are known", shown)
+    return Diagnosis(Level.OK, "air, inclinometer, temperatures and shutter are known", shown)

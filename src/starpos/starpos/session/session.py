@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import Any
 
+from starpos.calibration.unknown import MODEL_BY_PARAMETERS, unnamed_inclinometer
 from starpos.earth.orientation import earth_state
 from starpos.errors import InstrumentError, StarposError, TiltError, TimeError
 from starpos.fix.camera_attitude import CameraAttitude
@@ -36,7 +37,7 @@ from starpos.session.frames import Answered, Averaged, Output, Waiting, ground_o
 from starpos.session.gnss_teacher import GnssTeacher
 from starpos.session.gyro import Gyro
 from starpos.session.job import Jobs
-from starpos.session.log import Heard, Log
+from starpos.session.log import Heard, Log, LogOfChanges
 from starpos.session.memory import Seen
 from starpos.session.now import Now, Sent
 from starpos.session.search import AT_ONCE_S, Search
@@ -90,6 +91,7 @@ class SolverSession:
         # This reads the tables of the Earth's rotation, so that the first frame is not slow.
         earth_state(J2000_UNIX_S)
         self._heard, self._log, self._arrived = heard, log, arrived
+        self._changes = LogOfChanges(log)
         self._waiting: deque[Waiting] = deque()
         # tilts ahead of a clock that may have been heard only after them
         self._early: deque[Any] = deque(maxlen=MOST_EARLY)
@@ -97,17 +99,18 @@ class SolverSession:
         self._ended = False
         # from the last fix
         self._hint: Hint | None = None
-        self._logged: object = None
         self.instrument = CameraSolver(
             self._make_solver,
             self._other_camera,
             jobs(),
-            lambda why: self._log_change(why, good=False),
+            lambda why: self._changes.say(why, good=False),
             topic,
         )
         self.calibrating = Calibrating(
             settings, jobs(), lambda: self.instrument.solver_now, self.instrument.remake, log
         )
+        if unnamed := unnamed_inclinometer(settings.instrument(None), MODEL_BY_PARAMETERS):
+            log.warning(unnamed)
 
     def _make_solver(self, camera: Camera) -> Solver:
         return self._settings.solver(camera, self.calibrating.found, self._catalogue)
@@ -410,7 +413,7 @@ class SolverSession:
         self.counts["frames"] += 1
         self.counts["fixes"] += answer.ok
         self._hint = answer.hint or self._hint
-        self._log_change("fixes are coming" if answer.ok else answer.message, answer.ok, answer.status)
+        self._changes.say("fixes are coming" if answer.ok else answer.message, answer.ok, answer.status)
         if self.gnss is not None:
             self.gnss.save_if_due(now)
         return self._output(stamp, answer, beside)
@@ -421,16 +424,6 @@ class SolverSession:
         if beside is not None:
             ground = beside.ground
         return Answered(stamp=stamp, solution=answer, ground=ground, no_camera=no_camera, beside=beside)
-
-    def _log_change(self, sentence: str, good: bool, state: object = None) -> None:
-        state = state or sentence
-        if state == self._logged:
-            return
-        self._logged = state
-        if good:
-            self._log.info(sentence)
-        else:
-            self._log.warning(sentence)
 
     def solve_again(self) -> Answered | None:
         """Solve the newest frame with what is known now, identified anew whatever was found before; None without one."""

@@ -84,9 +84,9 @@ class Settings:
         )
         return errors.noise_rad
 
-    def calibration(self, found: Calibration | None) -> Calibration:
-        """The calibration in use; `found` is the one from frames, or None."""
-        return parameters.instrument_of(self.values, ANY_CAMERA, self._known, found).calibration
+    def instrument(self, found: Calibration | None) -> Instrument:
+        """The instrument in use, but for its camera; `found` is the calibration from frames, or None."""
+        return parameters.instrument_of(self.values, ANY_CAMERA, self._known, found)
 
     def solver(self, camera: Camera, found: Calibration | None, catalogue: Catalogue) -> Solver:
         """Make a Solver for a camera, with the calibration from frames (`found`, or None).

@@ -118,6 +118,16 @@ def test_random_points_in_a_disc_are_no_sky_and_the_fisheye_is_named(solver, rng
     assert time.process_time() - begin < 20
 
 
+def test_a_frame_whose_lens_is_called_a_fisheye_is_searched_as_one_first(catalogue, rng):
+    said = []
+    solver = BlindSolver(catalogue, lambda what, done: said.append(what), search_s=0.1)
+    stars = scattered(*rng.uniform(0, [[1280], [960]], (2, 60)))
+    assert "EXIF" not in solver.identify(stars).message and "fisheyes" not in said[0]
+    said.clear()
+    s = solver.identify(replace(stars, fisheye=True))
+    assert said[0] == "searching fisheyes" and "its EXIF calls the lens a fisheye" in s.message
+
+
 def scattered(x, y):
     from starpos.frames.stars import Stars
 

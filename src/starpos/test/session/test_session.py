@@ -32,7 +32,7 @@ class Said:
     """Keeps what a session says."""
 
     def __init__(self):
-        self.refused, self.errors = [], []
+        self.refused, self.errors, self.warnings = [], [], []
 
     def came(self, name):
         pass
@@ -43,7 +43,8 @@ class Said:
     def info(self, message):
         pass
 
-    warning = info
+    def warning(self, message):
+        self.warnings.append(message)
 
     def error(self, message):
         self.errors.append(message)
@@ -108,6 +109,15 @@ def told(messages, begin_s):
 
 def tilts_of(messages, end_s):
     return [(message, at_s) for kind, message, at_s in messages if kind == TILT and at_s < end_s]
+
+
+@pytest.mark.parametrize(("model", "times"), [("", 1), ("scl3300", 0)])
+def test_that_nobody_has_named_the_inclinometer_is_said_once(model, times, messages, begin_s):
+    told = Told(f"inclinometer.model:={model!r}")
+    told.tell(CAMERA_INFO, first(messages, CAMERA_INFO)[0], begin_s)
+    told.work(begin_s)
+    said = [warning for warning in told.said.warnings if "which inclinometer" in warning]
+    assert len(said) == times and all("set inclinometer.model" in warning for warning in said)
 
 
 def test_frames_have_the_names_of_messages_that_are_taken(told, messages, begin_s):
@@ -243,7 +253,8 @@ def test_a_replay_twice_is_the_same():
             repr(replace(m, stamp=None)) for m in Replay(settings_of(None, KNOWN), said, said).play(NIGHT)
         ]
 
-    assert played() == played() and len(played()) == 20
+    first = played()
+    assert first == played() and len(first) == 20
 
 
 def test_tilts_stamped_before_their_time_are_refused_though_they_are_read_when_it_has_come(messages):
