@@ -10,11 +10,11 @@ from rclpy.clock_type import ClockType
 from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.qos import ReliabilityPolicy
-from sensor_msgs.msg import CameraInfo, Imu
+from sensor_msgs.msg import CameraInfo, Imu, NavSatFix
 from std_srvs.srv import Trigger
 
 from starpos.instrument.camera import Camera
-from starpos.session import reports
+from starpos.session import gnss_teacher, reports
 from starpos.session.frames import Answered, Output
 from starpos.session.gyro import IMU_TOPIC
 from starpos.session.now import Now, Sent
@@ -51,7 +51,8 @@ class SolverNode(Node):
         self._values = self._settings.values
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         gyro = (IMU_TOPIC,) * self._values["gyro"]
-        self._inputs = Inputs(self, ("camera_info", "stars", "tilt", *gyro))
+        gnss = (gnss_teacher.TOPIC,) * self._values["gnss.use"]
+        self._inputs = Inputs(self, ("camera_info", "stars", "tilt", *gyro, *gnss))
         self._dropped = Dropped(self, PLAY_SLOWER)
         self._replayed: Replayed | None = None
         self._session = SolverSession(
@@ -78,6 +79,8 @@ class SolverNode(Node):
             "tilt": lambda m, info: self._publish(session.take_tilt(m, _sent(info), self._now())),
             "stars": lambda m, _: self._publish(session.take_stars(m, self._now())),
         }
+        if session.gnss is not None:
+            takes[gnss_teacher.TOPIC] = lambda m, _: self._publish(session.take_gnss(m, self._now()))
         if time_is_simulated(self):
             self._replayed = Replayed(
                 self,
@@ -93,6 +96,11 @@ class SolverNode(Node):
         if self._values["gyro"]:
             best_effort = ReliabilityPolicy.BEST_EFFORT
             subscription(self, Imu, IMU_TOPIC, self._on_imu, IMU_QUEUE, best_effort)
+        if session.gnss is not None:
+            # receivers' drivers publish in either way
+            best_effort = ReliabilityPolicy.BEST_EFFORT
+            take = self._taker(gnss_teacher.TOPIC, takes)
+            subscription(self, NavSatFix, gnss_teacher.TOPIC, take, 10, best_effort)
         self.create_service(Solve, "~/solve", self._on_solve)
         self.create_service(Trigger, "~/reset", self._on_reset)
         self._calibration_services = CalibrationServices(self, self._session, self._settings)
@@ -109,8 +117,16 @@ class SolverNode(Node):
             "Calibration": session.calibrating.report,
             "Average": session.calibrating.average.report,
         }
+        if session.gnss is not None:
+            tasks["GNSS"] = session.gnss.report
         self._diagnostics = Diagnostics(self, tasks, self._values["frame_id"])
         self._update_transforms()
+
+    def destroy_node(self) -> None:
+        """End the node; what GNSS taught is kept."""
+        if self._session.gnss is not None:
+            self._session.gnss.close()
+        super().destroy_node()
 
     def _apply(self, names: frozenset[str]) -> None:
         self._diagnostics.hardware_id = self._values["frame_id"]

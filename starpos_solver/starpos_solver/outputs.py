@@ -12,6 +12,8 @@ from std_msgs.msg import Header
 from starpos import rotation
 from starpos.earth.vertical import Geodetic
 from starpos.fix.solution import Solution, Status
+from starpos.gnss.solving import Compared
+from starpos.gnss.watch import AGREES, DISAGREES, DOUBTFUL, LEARNING
 from starpos_common.messages import tilt_to_message
 from starpos_interfaces import msg
 
@@ -24,6 +26,12 @@ STATUS = {
     Status.TIME_OUTSIDE_TABLES: msg.Solution.TIME_OUTSIDE_TABLES,
     Status.BAD_INPUT: msg.Solution.BAD_INPUT,
     Status.POOR_FIT: msg.Solution.POOR_FIT,
+}
+GNSS_STATUS = {
+    LEARNING: msg.GnssCheck.LEARNING,
+    AGREES: msg.GnssCheck.AGREES,
+    DOUBTFUL: msg.GnssCheck.DOUBTFUL,
+    DISAGREES: msg.GnssCheck.DISAGREES,
 }
 # An entry of the error budget that concerns the geodetic position only.
 DEFLECTION = "deflection"
@@ -133,3 +141,20 @@ def solution(header: Header, answer: Solution, ground: Geodetic | None) -> msg.S
     message.diurnal_aberration = fix.diurnal_aberration_arcsec
     message.ut1_minus_utc = fix.ut1_minus_utc_s
     return message
+
+
+def gnss_check(header: Header, compared: Compared) -> msg.GnssCheck:
+    """Make the message of what the stars say of a GNSS place."""
+    check, place = compared.check, compared.place
+    return msg.GnssCheck(
+        header=header,
+        status=GNSS_STATUS[check.status],
+        status_text=check.sentence,
+        distance=check.distance_m,
+        bearing=check.bearing_deg,
+        distance_stddev=check.sigma_m,
+        latitude=math.degrees(place.latitude),
+        longitude=math.degrees(place.longitude),
+        frames=compared.frames,
+        poses=compared.poses,
+    )

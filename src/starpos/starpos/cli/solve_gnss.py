@@ -2,10 +2,9 @@
 """`starpos solve --gnss`: frames with a GNSS receiver beside them, which teaches the instrument and is guarded."""
 
 import argparse
+import math
 from dataclasses import dataclass
 from pathlib import Path
-
-import numpy as np
 
 from starpos.cli import console
 from starpos.cli.fix_output import FIX_KEYS, json_about, json_on_ground, line_of, put_combined
@@ -14,6 +13,7 @@ from starpos.cli.output import Output
 from starpos.cli.plan import Plan
 from starpos.earth.vertical import Vertical
 from starpos.errors import FrameError, InstrumentError
+from starpos.fix.fix import Fix
 from starpos.fix.solution import Solution
 from starpos.gnss import learned_file
 from starpos.gnss.solving import Watched
@@ -137,10 +137,9 @@ def json_of_watched(told: Watched) -> dict:
         keys = json_on_ground(fix, ground)
     else:
         keys = dict.fromkeys(FIX_KEYS)
-        if told.heading is not None:
-            keys["heading"] = np.degrees(told.heading.heading)
-            keys["sigma_heading_deg"] = np.degrees(np.sqrt(told.heading.covariance[2, 2]))
-    return keys | {"gnss": None if told.check is None else json_of_check(told.check)}
+        if told.at_gnss is not None:
+            keys["heading"], keys["sigma_heading_deg"] = _heading_deg(told.at_gnss[0])
+    return keys | {"gnss": None if told.compared is None else json_of_check(told.compared.check)}
 
 
 def json_of_check(check: GnssCheck) -> dict:
@@ -153,9 +152,17 @@ def json_of_check(check: GnssCheck) -> dict:
     }
 
 
+def _heading_deg(fix: Fix) -> tuple[float, float]:
+    """The heading of a fix and its sigma, deg."""
+    return math.degrees(fix.heading), math.degrees(math.sqrt(fix.covariance[2, 2]))
+
+
 def _line(path: str, told: Watched) -> str:
     line = line_of(path, told.solution, False)
-    if told.solution.fix is None and told.heading is not None:
-        sigma_deg = np.degrees(np.sqrt(told.heading.covariance[2, 2]))
-        line += f", heading {np.degrees(told.heading.heading):.4f} +- {sigma_deg:.4f} deg at GNSS's place"
-    return line if told.check is None else f"{line}; GNSS {told.check.status}: {told.check.sentence}"
+    if told.at_gnss is not None:
+        heading_deg, sigma_deg = _heading_deg(told.at_gnss[0])
+        line += f", heading {heading_deg:.4f} +- {sigma_deg:.4f} deg at GNSS's place"
+    if told.compared is None:
+        return line
+    check = told.compared.check
+    return f"{line}; GNSS {check.status}: {check.sentence}"

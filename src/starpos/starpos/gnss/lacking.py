@@ -27,7 +27,10 @@ def what_would_tell_more(learned: Learned) -> str:
 
 
 def _correlation(covariance: np.ndarray, a: slice, b: slice) -> float:
-    """Largest correlation of any combination of some states with any of others (canonical correlation)."""
-    root_a, root_b = (np.linalg.cholesky(covariance[s, s]) for s in (a, b))
+    """Largest correlation of any combination of some states with any of others; 0 where one of them is known."""
+    of_a, of_b = covariance[a, a], covariance[b, b]
+    if min(np.linalg.eigvalsh(of_a)[0], np.linalg.eigvalsh(of_b)[0]) <= 0:
+        return 0.0
+    root_a, root_b = np.linalg.cholesky(of_a), np.linalg.cholesky(of_b)
     whitened = np.linalg.solve(root_a, np.linalg.solve(root_b, covariance[b, a]).T)
     return float(np.linalg.svd(whitened, compute_uv=False)[0])

@@ -30,13 +30,18 @@ LEARNED_TERMS = (
 class LevelSight:
     """Attitude of the camera by the stars, camera_to_itrs (3, 3), and the tilt of a frame.
 
+    camera_covariance (3, 3): as that of a Fix.
     zenith_covariance (3, 3): of a zenith in ITRS by the errors of the stars, the air and the time, rad2.
+    latitude, longitude (rad): of the fix, whose A3 may be wrong.
     """
 
     utc_unix_s: float
     camera_to_itrs: np.ndarray
+    camera_covariance: np.ndarray
     tilt: Tilt
     zenith_covariance: np.ndarray
+    latitude: float
+    longitude: float
 
     @classmethod
     def of(cls, fix: Fix, tilt: Tilt) -> "LevelSight":
@@ -48,8 +53,11 @@ class LevelSight:
         return cls(
             utc_unix_s=fix.utc_unix_s,
             camera_to_itrs=fix.camera_to_itrs,
+            camera_covariance=fix.camera_covariance,
             tilt=tilt,
             zenith_covariance=axes.T @ covariance @ axes,
+            latitude=fix.latitude,
+            longitude=fix.longitude,
         )
 
 

@@ -29,18 +29,28 @@ NOTHING_LEARNED = (
 )
 
 
+@dataclass(frozen=True, eq=False)
+class Compared:
+    """A GNSS place at a frame, and what the stars say of it; frames, poses: from which was learned what counts."""
+
+    place: GnssPlace
+    check: GnssCheck
+    frames: int
+    poses: int
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Watched:
     """A frame's answer.
 
-    ground: the geodetic place, None without a fix.  check: None without a GNSS place.
-    heading: a fix whose level is that of the GNSS place, of which heading and attitude count; None with a fix of its own.
+    ground: the geodetic place, None without a fix.  compared: None without a GNSS place.
+    at_gnss: with no fix of its own, one whose level is that of the GNSS place: its heading and attitude count.
     """
 
     solution: Solution
     ground: Geodetic | None = None
-    check: GnssCheck | None = None
-    heading: Fix | None = None
+    compared: Compared | None = None
+    at_gnss: tuple[Fix, Geodetic] | None = None
 
 
 def watched(
@@ -53,7 +63,7 @@ def watched(
     if rough.fix is None or rough.tilt is None:
         return Watched(solution=rough)
     tilt = rough.tilt
-    watch.go_on(rough.fix, tilt)
+    watch.go_on(LevelSight.of(rough.fix, tilt))
     up = _up(watch, rough.fix, tilt, gnss)
     levelled, check = _levelled(solver, stars, rough, up), None
     if gnss is not None and levelled.fix is not None:
@@ -64,28 +74,32 @@ def watched(
             levelled = _levelled(solver, stars, levelled, again)
     fix = levelled.fix
     if fix is None:
-        return Watched(solution=levelled, check=check)
+        return Watched(solution=levelled)
     sighting = LevelSight.of(fix, tilt)
     if watch.learned is not None and watch.tells_place(sighting):
         fix = _budgeted(fix, sighting, watch.learned)
         ground = _ground(fix, sighting, watch.learned, watch.vertical)
-        answer = Watched(solution=replace(levelled, fix=fix), ground=ground, check=check)
+        answer = Watched(solution=replace(levelled, fix=fix), ground=ground)
     else:
-        none = replace(
-            levelled, status=Status.POOR_FIT, message=f"{stars.place}: {NOTHING_LEARNED}", fix=None
-        )
-        heading = None if gnss is None else _at_place(fix, watch.vertical)
-        answer = Watched(solution=none, check=check, heading=heading)
-    if gnss is not None and check is not None:
-        watch.learn(sighting, gnss, check)
-    return answer
+        why = f"{stars.place}: {NOTHING_LEARNED}"
+        none = replace(levelled, status=Status.POOR_FIT, message=why, fix=None)
+        answer = Watched(solution=none, at_gnss=None if gnss is None else _at_place(fix, watch.vertical))
+    if gnss is None or check is None:
+        return answer
+    watch.learn(sighting, gnss, check)
+    frames, poses = (0, 0) if watch.learned is None else (watch.learned.frames, watch.learned.poses)
+    return replace(answer, compared=Compared(gnss, check, frames, poses))
 
 
 def _up(watch: GnssWatch, fix: Fix, tilt: Tilt, gnss: GnssPlace | None) -> np.ndarray | None:
     """Up (3,) in C: as it was learned where that tells a place, else by GNSS; None if neither tells it."""
     if watch.tells_place(LevelSight.of(fix, tilt)):
         return watch.up_in_camera(tilt)
-    return None if gnss is None else fix.camera_to_itrs.T @ gnss.zenith
+    if gnss is None:
+        return None
+    stated, axes = watch.vertical.at(gnss.latitude, gnss.longitude), gnss.axes
+    lean = ARCSEC * (stated.eta_arcsec * axes[0] + stated.xi_arcsec * axes[1])
+    return fix.camera_to_itrs.T @ rotation.normalised(axes[2] + lean)
 
 
 def _levelled(solver: Solver, stars: Stars, answer: Solution, up_in_camera: np.ndarray | None) -> Solution:
@@ -146,9 +160,12 @@ def _ground(fix: Fix, sighting: LevelSight, learned: Learned, vertical: Vertical
     return replace(ground, covariance=others + rows @ covariance @ rows.T)
 
 
-def _at_place(fix: Fix, vertical: Vertical) -> Fix:
+def _at_place(fix: Fix, vertical: Vertical) -> tuple[Fix, Geodetic]:
     """A fix whose level is that of a known place: its errors are those of stars, air and time, and the deflection's."""
     terms = (t for t in _kept_terms(fix) if t.name != "tilt")
-    stddev = vertical.at(fix.latitude, fix.longitude).stddev_arcsec * ARCSEC
-    term = ErrorTerm("deflection", _zenith_moved(fix) * stddev, shared=ALWAYS)
-    return replace(fix, terms=(*terms, term))
+    stated = vertical.at(fix.latitude, fix.longitude)
+    term = ErrorTerm("deflection", _zenith_moved(fix) * stated.stddev_arcsec * ARCSEC, shared=ALWAYS)
+    fix = replace(fix, terms=(*terms, term))
+    # the deflection's error is in the fix already
+    exact = replace(stated, stddev_arcsec=0.0)
+    return fix, geodetic(fix.latitude, fix.longitude, fix.heading, fix.covariance, exact)

@@ -10,7 +10,6 @@ import numpy as np
 from starpos.averaging.slip import slip_s
 from starpos.earth.ellipsoid import EARTH_RADIUS_M
 from starpos.earth.vertical import Vertical
-from starpos.fix.fix import Fix
 from starpos.gnss.filter import GnssFrame, begun, chi2, is_linear, stddev_rad, updated
 from starpos.gnss.guard import Witnesses
 from starpos.gnss.place import GnssPlace
@@ -79,7 +78,7 @@ class GnssWatch:
         self._begins = learned is None
         self._held: deque[GnssFrame] = deque(maxlen=MOST_HELD)
         self._of_pose = 0
-        self._pose: Fix | None = None
+        self._pose: LevelSight | None = None
         self._new_pose = True
         self._readings: frozenset[float] = frozenset()
         self._witnesses = Witnesses.none(0)
@@ -89,23 +88,24 @@ class GnssWatch:
         """Whether A3 is not known yet as well as a filter needs."""
         return self._begins
 
-    def go_on(self, fix: Fix, tilt: Tilt) -> None:
-        """Go on to the time of a frame; fix: by any A3, of which only the attitude of the camera counts."""
-        self._new_pose = self._pose is None or slip_s(fix, self._pose) is None
+    def go_on(self, sighting: LevelSight) -> None:
+        """Go on to the time of a frame, seen with any A3: only the attitude of its camera counts."""
+        tilt = sighting.tilt
+        self._new_pose = self._pose is None or slip_s(sighting, self._pose) is None
         if self._new_pose:
-            self._pose, self._of_pose = fix, 0
+            self._pose, self._of_pose = sighting, 0
         if self.learned is not None and self.learned.axes != tilt.axes:
             # another inclinometer
             self._forget()
         if self.learned is None:
             if self._instrument.calibration.unknown:
                 return
-            stddev = stddev_rad(self.vertical, fix.latitude, fix.longitude)
-            self.learned = prior(self._instrument, tilt, stddev, fix.utc_unix_s)
+            stddev = stddev_rad(self.vertical, sighting.latitude, sighting.longitude)
+            self.learned = prior(self._instrument, tilt, stddev, sighting.utc_unix_s)
             self._begins = not is_linear(self.learned, tilt)
         # before A3 is known its frames are gone through again, each at its time
         if not self._begins:
-            self._age(LevelSight.of(fix, tilt))
+            self._age(sighting)
 
     def _forget(self) -> None:
         self.learned, self._begins, self.disagrees = None, True, False

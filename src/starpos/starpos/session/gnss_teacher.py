@@ -24,7 +24,7 @@ from starpos.instrument.instrument import Instrument
 from starpos.session.diagnosis import Diagnosis, Level
 from starpos.session.job import Jobs
 from starpos.session.log import Heard, Log
-from starpos.session.now import Now
+from starpos.session.now import ANOTHER_TIME_S, Now
 from starpos.session.reports import AHEAD_S, ONE_CLOCK
 from starpos.session.settings import Settings
 from starpos.units import ARCSEC
@@ -66,7 +66,7 @@ class GnssTeacher:
         try:
             place = message_to_gnss(message)
             ahead_s = now.ahead_s(place.utc_unix_s)
-            if ahead_s > AHEAD_S or (now.unix_s is not None and ahead_s < -OLDEST_S):
+            if ahead_s > AHEAD_S or -ANOTHER_TIME_S < ahead_s < -OLDEST_S:
                 side = "ahead of" if ahead_s > 0 else "behind"
                 raise GnssError(f"GNSS's stamps are {abs(ahead_s):.3g} s {side} this clock: {ONE_CLOCK}")
             if self._places and place.utc_unix_s < self._places[-1].utc_unix_s:
@@ -160,17 +160,18 @@ class GnssTeacher:
 
     def report(self) -> Diagnosis:
         """Make the diagnostic `GNSS`."""
-        check = None if self.newest is None else self.newest.check
+        compared = None if self.newest is None else self.newest.compared
         values = self._values_of(self.learned)
         if self._trouble:
             return Diagnosis(Level.WARN, self._trouble, values)
-        if check is None:
+        if compared is None:
             since = (
                 "no frame with a GNSS place yet"
                 if self.newest is None
                 else "no GNSS place at the newest frame"
             )
             return Diagnosis(Level.WARN, f"{since}: the stars' place goes on with what was learned", values)
+        check = compared.check
         values |= {
             "status": check.status,
             "distance (m)": check.distance_m,
