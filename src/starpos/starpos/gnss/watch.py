@@ -27,6 +27,7 @@ BACK_S, BACK_FRAMES, BACK = 600.0, 10, 7.4
 WIDEST_M = 50_000.0
 # the place of a lean at which A3 was not learned may be bent by this share of its sigma
 MOST_BENT = 0.3
+NOISE_SIGMA = 2.0
 # before A3 is known, so many frames of a pose teach, and so many of all are kept
 FEW_OF_POSE, MOST_HELD = 12, 200
 # a place further off than so many sigma is another one, with a deflection of its own
@@ -103,9 +104,7 @@ class GnssWatch:
             stddev = stddev_rad(self.vertical, sighting.latitude, sighting.longitude)
             self.learned = prior(self._instrument, tilt, stddev, sighting.utc_unix_s)
             self._begins = not is_linear(self.learned, tilt)
-        # before A3 is known its frames are gone through again, each at its time
-        if not self._begins:
-            self._age(sighting)
+        self._age(sighting)
 
     def _forget(self) -> None:
         self.learned, self._begins, self.disagrees = None, True, False
@@ -153,7 +152,9 @@ class GnssWatch:
         """What a turn of A3 about the plumb line that is hardly known may do to the place beyond a linear error."""
         assert self.learned is not None
         at, up = self.learned.layout, tilt.up
-        leaned = min(float(np.linalg.norm(up - frame.sighting.tilt.up)) for frame in self._held)
+        off = min(float(np.linalg.norm(up - frame.sighting.tilt.up)) for frame in self._held)
+        # the noise of two tilts is no lean
+        leaned = max(off - NOISE_SIGMA * math.sqrt(2 * np.trace(tilt.noise)), 0.0)
         turn2 = min(float(up @ self.learned.covariance[at.a3, at.a3] @ up), 2.0)
         return turn2 / 2 * leaned * EARTH_RADIUS_M
 
