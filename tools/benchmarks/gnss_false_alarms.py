@@ -3,8 +3,8 @@
 
     python tools/benchmarks/gnss_false_alarms.py [--frames 300000] [--seed 1]
 
-Prints, for each inclinometer, the frames, those that doubt, the alarms, and the frames that these last, then the rate of all
-alarms with its upper limit (95 %).  Exit status 1 where that limit is above one in 1e5 frames.
+Prints, for each inclinometer, the frames, those that doubt, the alarms, and the frames that these last, then the rate of
+all alarms with its upper limit (95 %).  Exit status 1 where that limit is above one in 1e5 frames.
 """
 
 import argparse
