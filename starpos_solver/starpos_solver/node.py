@@ -52,7 +52,9 @@ class SolverNode(Node):
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         gyro = (IMU_TOPIC,) * self._values["gyro"]
         gnss = (gnss_teacher.TOPIC,) * self._values["gnss.use"]
-        self._inputs = Inputs(self, ("camera_info", "stars", "tilt", *gyro, *gnss))
+        # at a known place a heading needs no tilt
+        tilt = ("tilt",) * (self._settings.site is None and not gnss)
+        self._inputs = Inputs(self, ("camera_info", "stars", *tilt, *gyro, *gnss))
         self._dropped = Dropped(self, PLAY_SLOWER)
         self._replayed: Replayed | None = None
         self._session = SolverSession(

@@ -44,11 +44,11 @@ class SolutionPublishers:
             self._fix_averaged.publish(self._nav_sat_fix(header, output.ground))
             return
         self._fix.publish(self._nav_sat_fix(header, output.ground))
-        fix, ground, beside = output.solution.fix, output.ground, output.beside
-        if fix is None and beside is not None and beside.at_gnss is not None:
-            fix, ground = beside.at_gnss
-        if fix is not None and ground is not None:
-            self._imu.publish(outputs.imu(header, fix, ground))
+        fix, at_place, beside = output.solution.fix, output.solution.at_place, output.beside
+        if at_place is not None:
+            self._imu.publish(outputs.imu_at_place(header, at_place.true_north))
+        elif fix is not None and output.ground is not None:
+            self._imu.publish(outputs.imu(header, fix, output.ground))
         if self._check is not None and beside is not None and beside.compared is not None:
             self._check.publish(outputs.gnss_check(header, beside.compared))
         if output.attitude is not None:

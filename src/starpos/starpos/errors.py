@@ -45,6 +45,10 @@ class GnssError(StarposError):
     """What a GNSS receiver states cannot be used, or a table of it is missing or broken."""
 
 
+class PlaceError(StarposError):
+    """A place that is said to be known cannot be, or the stars contradict it."""
+
+
 class BagError(StarposError):
     """A recording (rosbag2) cannot be read, or unpacks to more than it may."""
 

@@ -25,7 +25,7 @@ STATED_M = float(np.hypot(WHITE_M, SLOW_M))
 
 
 @dataclass(frozen=True, eq=False)
-class Moment:
+class DriveFrame:
     """A frame of a drive: the sighting, GNSS's place, and the true one (latitude, longitude in rad)."""
 
     sighting: LevelSight
@@ -33,7 +33,7 @@ class Moment:
     place: tuple[float, float]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class GnssDrive:
     """A robot that stands every `every_s`, newly turned and leaning, for `frames` frames, and drives on.
 
@@ -57,7 +57,7 @@ class GnssDrive:
         """The instrument as its file states it: of A3 nothing."""
         return Instrument(93750.0, inclinometer=self.errors, calibration=Calibration(), clock_stddev_s=0.001)
 
-    def moments(self, rng: np.random.Generator, astray=lambda t: np.zeros(2)) -> Iterator[Moment]:
+    def moments(self, rng: np.random.Generator, astray=lambda t: np.zeros(2)) -> Iterator[DriveFrame]:
         """The frames of a drive; astray: error of GNSS, east and north in m, by the time in s."""
         errors = self.errors
         latitude, longitude = np.radians([rng.uniform(-65, 65), rng.uniform(-180, 180)])
@@ -105,7 +105,7 @@ class GnssDrive:
                     samples=READINGS,
                     temperature_c=celsius,
                 )
-                yield Moment(
+                yield DriveFrame(
                     LevelSight(
                         utc_unix_s=1.7e9 + t,
                         camera_to_itrs=seen,

@@ -2,18 +2,17 @@
 """`starpos solve --gnss`: frames with a GNSS receiver beside them, which teaches the instrument and is guarded."""
 
 import argparse
-import math
 from dataclasses import dataclass
 from pathlib import Path
 
-from starpos.cli import console
+from starpos.cli import console, heading_output
 from starpos.cli.fix_output import FIX_KEYS, json_about, json_on_ground, line_of, put_combined
+from starpos.cli.heading_output import with_heading
 from starpos.cli.inputs import near_of
 from starpos.cli.output import Output
 from starpos.cli.plan import Plan
 from starpos.earth.vertical import Vertical
 from starpos.errors import FrameError, InstrumentError
-from starpos.fix.fix import Fix
 from starpos.fix.solution import Solution
 from starpos.gnss import learned_file
 from starpos.gnss.solving import Watched
@@ -54,8 +53,8 @@ def check(args: argparse.Namespace) -> None:
     if args.self_calibrate or args.pointings is not None:
         other = "--pointings" if args.pointings is not None else "--self-calibrate"
         raise InstrumentError(f"--gnss and {other} do not go together: give one of the two")
-    if args.tilt is None:
-        raise InstrumentError("--gnss needs the tilts of its frames: give --tilt")
+    if args.site is not None:
+        raise InstrumentError("--gnss and --site both say where the instrument is: give one of the two")
 
 
 @dataclass(frozen=True)
@@ -94,7 +93,8 @@ def run(
             raise InstrumentError(
                 "--gnss teaches an inclinometer, and this camera is its own level: leave --gnss out"
             )
-        night = watched_night(solver, seen, plan.tilts, satellites.track, vertical, satellites.learned)
+        tilts = None if plan.night.tilt is None else plan.tilts
+        night = watched_night(solver, seen, tilts, satellites.track, vertical, satellites.learned)
         answers = list(night.answers)
         for remark in night.remarks:
             console.complain("solve", remark)
@@ -111,7 +111,7 @@ def run(
         warnings |= set(told.solution.warnings)
         if told.solution.fix:
             solved.append(Solved.of(told.solution, told.solution.fix))
-        else:
+        elif told.solution.at_place is None or not told.solution.ok:
             console.complain("solve", told.solution.message)
         output.put({"file": path} | json_of_watched(told) | json_about(told.solution), _line(path, told))
     whole = together(solved, None, near_of(args))
@@ -120,7 +120,9 @@ def run(
         console.complain("solve", text)
     if solved:
         put_combined(output, plan.night, whole.average, solved, warnings, vertical)
-    return console.UNREADABLE if unreadable else 0 if whole.average else NO_FIX
+    # without tilts headings are all that was asked for
+    found = whole.average or (args.tilt is None and any(told.solution.at_place for told in answers))
+    return console.UNREADABLE if unreadable else 0 if found else NO_FIX
 
 
 def _save(path: Path, learned: Learned | None) -> None:
@@ -133,12 +135,9 @@ def _save(path: Path, learned: Learned | None) -> None:
 def json_of_watched(told: Watched) -> dict:
     """The keys of --json of a frame that come from its fix, or its heading at GNSS's place, and `gnss`."""
     fix, ground = told.solution.fix, told.ground
-    if fix is not None and ground is not None:
-        keys = json_on_ground(fix, ground)
-    else:
-        keys = dict.fromkeys(FIX_KEYS)
-        if told.at_gnss is not None:
-            keys["heading"], keys["sigma_heading_deg"] = _heading_deg(told.at_gnss[0])
+    keys = dict.fromkeys(FIX_KEYS) if fix is None or ground is None else json_on_ground(fix, ground)
+    if (at_place := told.solution.at_place) is not None:
+        keys = with_heading(keys, at_place, at_place.place)
     return keys | {"gnss": None if told.compared is None else json_of_check(told.compared.check)}
 
 
@@ -152,16 +151,11 @@ def json_of_check(check: GnssCheck) -> dict:
     }
 
 
-def _heading_deg(fix: Fix) -> tuple[float, float]:
-    """The heading of a fix and its sigma, deg."""
-    return math.degrees(fix.heading), math.degrees(math.sqrt(fix.covariance[2, 2]))
-
-
 def _line(path: str, told: Watched) -> str:
-    line = line_of(path, told.solution, False)
-    if told.at_gnss is not None:
-        heading_deg, sigma_deg = _heading_deg(told.at_gnss[0])
-        line += f", heading {heading_deg:.4f} +- {sigma_deg:.4f} deg at GNSS's place"
+    if told.solution.at_place is None:
+        line = line_of(path, told.solution, False)
+    else:
+        line = heading_output.line_of(path, told.solution)
     if told.compared is None:
         return line
     check = told.compared.check

@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 
 from starpos.earth.ellipsoid import curvature_radii_m, enu_axes, zenith_of
+from starpos.earth.known_place import KnownPlace
+from starpos.earth.vertical import Vertical
 from starpos.errors import GnssError
 from starpos.messages.stamp import stamp_to_unix
 from starpos.rotation import half_turn
@@ -111,3 +113,9 @@ def message_to_gnss(message: Any, unstated_m: float = math.nan) -> GnssPlace:
     if message.position_covariance_type == 0 or not stated:
         covariance = np.eye(2) * unstated_m**2
     return checked(unix_s, message.latitude, message.longitude, covariance, message.status.status)
+
+
+def known_place(gnss: GnssPlace, vertical: Vertical) -> KnownPlace:
+    """A GNSS place as one that is known, with the deflection there."""
+    latitude, longitude = np.degrees([gnss.latitude, gnss.longitude]).tolist()
+    return KnownPlace.on_ellipsoid(latitude, longitude, vertical, gnss.covariance)

@@ -17,13 +17,13 @@ from starpos.frames.stars import Stars
 from starpos.gnss.place import GnssPlace
 from starpos.gnss.sighting import LEARNED_TERMS, LevelSight, zenith_rows
 from starpos.gnss.states import Learned
-from starpos.gnss.watch import GnssCheck, GnssWatch
+from starpos.gnss.watch import LEARNING, GnssCheck, GnssWatch
 from starpos.instrument.inclinometer import Tilt
 from starpos.instrument.instrument import Calibration
 from starpos.units import ARCSEC
 
 # name of the term of all that was learned
-LEARNED = "learned"
+LEARNED_TERM = "learned"
 NOTHING_LEARNED = (
     "too little is known of A3: let GNSS teach it, newly turned and leaning by some degrees, or give A3"
 )
@@ -43,14 +43,13 @@ class Compared:
 class Watched:
     """A frame's answer.
 
+    solution: with a place, or with a heading at GNSS's place where too little is known for one.
     ground: the geodetic place, None without a fix.  compared: None without a GNSS place.
-    at_gnss: with no fix of its own, one whose level is that of the GNSS place: its heading and attitude count.
     """
 
     solution: Solution
     ground: Geodetic | None = None
     compared: Compared | None = None
-    at_gnss: tuple[Fix, Geodetic] | None = None
 
 
 def watched(
@@ -58,10 +57,12 @@ def watched(
 ) -> Watched:
     """Solve a frame that is later than all before, and let the watch judge and learn.
 
-    rough: its solution by the solver, whose A3 may be wrong.  gnss: the place by GNSS then, None without one.
+    rough: its solution by the solver, whose A3 may be wrong, and its heading at GNSS's place.
+    gnss: that place, None without one.
     """
     if rough.fix is None or rough.tilt is None:
-        return Watched(solution=rough)
+        compared = None if gnss is None else Compared(gnss, GnssCheck(LEARNING), 0, 0)
+        return Watched(solution=rough, compared=compared)
     tilt = rough.tilt
     watch.go_on(LevelSight.of(rough.fix, tilt))
     up = _up(watch, rough.fix, tilt, gnss)
@@ -82,8 +83,8 @@ def watched(
         answer = Watched(solution=replace(levelled, fix=fix), ground=ground)
     else:
         why = f"{stars.place}: {NOTHING_LEARNED}"
-        none = replace(levelled, status=Status.POOR_FIT, message=why, fix=None)
-        answer = Watched(solution=none, at_gnss=None if gnss is None else _at_place(fix, watch.vertical))
+        none = replace(levelled, status=Status.POOR_FIT, message=why, fix=None, at_place=rough.at_place)
+        answer = Watched(solution=none)
     if gnss is None or check is None:
         return answer
     watch.learn(sighting, gnss, check)
@@ -135,7 +136,7 @@ def _budgeted(fix: Fix, sighting: LevelSight, learned: Learned) -> Fix:
     """The fix with the error of what was learned in the place of those of A3 and the inclinometer."""
     rows = _zenith_rows(fix, sighting, learned)
     root = symmetric_root(rows @ learned.covariance @ rows.T)
-    term = ErrorTerm(LEARNED, _zenith_moved(fix) @ root, shared=ALWAYS)
+    term = ErrorTerm(LEARNED_TERM, _zenith_moved(fix) @ root, shared=ALWAYS)
     return replace(fix, terms=(*_kept_terms(fix), term))
 
 
@@ -156,16 +157,5 @@ def _ground(fix: Fix, sighting: LevelSight, learned: Learned, vertical: Vertical
     rows = _zenith_moved(fix)[:3] @ _zenith_rows(fix, sighting, learned)
     rows[:, at.constant] += moved
     rows[:, at.field] += moved
-    others = total_covariance([t for t in fix.terms if t.name != LEARNED])[:3, :3]
+    others = total_covariance([t for t in fix.terms if t.name != LEARNED_TERM])[:3, :3]
     return replace(ground, covariance=others + rows @ covariance @ rows.T)
-
-
-def _at_place(fix: Fix, vertical: Vertical) -> tuple[Fix, Geodetic]:
-    """A fix whose level is that of a known place: its errors are those of stars, air and time, and the deflection's."""
-    terms = (t for t in _kept_terms(fix) if t.name != "tilt")
-    stated = vertical.at(fix.latitude, fix.longitude)
-    term = ErrorTerm("deflection", _zenith_moved(fix) * stated.stddev_arcsec * ARCSEC, shared=ALWAYS)
-    fix = replace(fix, terms=(*terms, term))
-    # the deflection's error is in the fix already
-    exact = replace(stated, stddev_arcsec=0.0)
-    return fix, geodetic(fix.latitude, fix.longitude, fix.heading, fix.covariance, exact)

@@ -9,7 +9,7 @@ from starpos.earth.vertical import Vertical
 from starpos.errors import GnssError
 from starpos.fix.solver import Solver
 from starpos.frames.stars import Stars
-from starpos.gnss.place import GnssPlace
+from starpos.gnss.place import GnssPlace, known_place
 from starpos.gnss.solving import Watched, watched
 from starpos.gnss.states import Learned
 from starpos.gnss.track import GnssTrack
@@ -17,6 +17,7 @@ from starpos.gnss.watch import GnssWatch
 from starpos.identification import Identification
 from starpos.instrument.tilts import Tilts
 from starpos.night.remarks import Kind, Remark
+from starpos.night.searching import answered
 
 
 @dataclass(frozen=True)
@@ -31,14 +32,14 @@ class WatchedNight:
 def watched_night(
     solver: Solver,
     frames: Sequence[tuple[Stars, Identification | None]],
-    tilts: Tilts,
+    tilts: Tilts | None,
     track: GnssTrack,
     vertical: Vertical,
     learned: Learned | None = None,
 ) -> WatchedNight:
     """Solve a night's frames in the order of their times, each with what is identified of it already.
 
-    learned: what is known of the instrument from earlier nights.
+    tilts: None where headings alone are wanted.  learned: what is known of the instrument from earlier nights.
     """
     watch = GnssWatch(solver.instrument, vertical, learned)
     said: Counter[str] = Counter()
@@ -55,7 +56,9 @@ def watched_night(
     answers: dict[int, Watched] = {}
     for k in sorted(range(len(frames)), key=lambda k: frames[k][0].mid_unix_s or 0.0):
         stars, found = frames[k]
-        rough = solver.solve(stars, tilts, known=found)
-        answers[k] = watched(solver, stars, rough, place_at(stars), watch)
+        gnss = place_at(stars)
+        place = None if gnss is None else known_place(gnss, vertical)
+        rough = answered(solver, stars, stars, tilts, place, known=found).solution
+        answers[k] = watched(solver, stars, rough, gnss, watch)
     remarks = tuple(Remark(Kind.GNSS, f"{number} frames: {why}") for why, number in said.items())
     return WatchedNight(tuple(answers[k] for k in range(len(frames))), watch.learned, remarks)

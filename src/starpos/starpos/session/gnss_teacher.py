@@ -4,6 +4,7 @@
 import math
 import traceback
 from collections import deque
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -80,7 +81,7 @@ class GnssTeacher:
     def solved(self, solver: Solver, stars: Stars, rough: Solution, compared: bool = True) -> Watched:
         """Solve a frame with what GNSS taught before it; compared: with GNSS's place of its time too."""
         watch = self._watch_of(solver.instrument)
-        gnss = self._place_at(stars) if compared else None
+        gnss = self._compared_with(stars) if compared else None
         try:
             answer = watched(solver, stars, rough, gnss, watch)
         except Exception as e:
@@ -88,6 +89,9 @@ class GnssTeacher:
             self._log.error(traceback.format_exc())
             why = f"what GNSS taught could not be used on this frame ({type(e).__name__}: {e})"
             answer = Watched(solution=Solution.failed(stars, Status.BAD_INPUT, why))
+        if self._settings.site is not None:
+            # the heading there is better than that of any fix
+            answer = replace(answer, solution=replace(answer.solution, at_place=rough.at_place))
         if compared:
             self.newest = answer
         return answer
@@ -113,11 +117,19 @@ class GnssTeacher:
             self._log.warning("another camera_info: what GNSS taught of the other camera is forgotten")
             self._watch = GnssWatch(self._instrument, self._settings.vertical)
 
-    def _place_at(self, stars: Stars) -> GnssPlace | None:
+    def place_at(self, utc_unix_s: float) -> GnssPlace | None:
+        """GNSS's place at a time, None without one; GnssError if its places contradict each other."""
+        return GnssTrack(list(self._places)).at(utc_unix_s)
+
+    def forget_places(self) -> None:
+        """Forget where GNSS had the instrument, not what it taught."""
+        self._places.clear()
+
+    def _compared_with(self, stars: Stars) -> GnssPlace | None:
         if stars.mid_unix_s is None:
             return None
         try:
-            return GnssTrack(list(self._places)).at(stars.mid_unix_s)
+            return self.place_at(stars.mid_unix_s)
         except GnssError as error:
             self._heard.refuse(TOPIC, str(error))
             return None
@@ -200,3 +212,10 @@ class GnssTeacher:
             "deflection (arcsec, 1 sigma)": float(deflection),
             "more would tell": what_would_tell_more(learned),
         }
+
+
+def solved_beside(
+    gnss: GnssTeacher | None, solver: Solver | None, stars: Stars, rough: Solution, compared: bool
+) -> Watched | None:
+    """Solve a frame as a teacher does; None without one, or without a solver."""
+    return gnss.solved(solver, stars, rough, compared) if gnss is not None and solver is not None else None

@@ -34,9 +34,10 @@ from starpos.session.calibrating import Calibrating
 from starpos.session.camera_solver import CameraSolver
 from starpos.session.clock_doubt import ClockDoubt
 from starpos.session.frames import Answered, Averaged, Output, Waiting, ground_of
-from starpos.session.gnss_teacher import GnssTeacher
+from starpos.session.gnss_teacher import GnssTeacher, solved_beside
 from starpos.session.gyro import Gyro
 from starpos.session.job import Jobs
+from starpos.session.known_place import SessionPlaces
 from starpos.session.log import Heard, Log, LogOfChanges
 from starpos.session.memory import Seen
 from starpos.session.now import Now, Sent
@@ -85,6 +86,7 @@ class SolverSession:
         self.gyro = Gyro(heard)
         # None without gnss.use
         self.gnss = GnssTeacher(settings, jobs(), heard, log) if settings.values["gnss.use"] else None
+        self.places = SessionPlaces(settings, self.gnss)
         self._search = Search(settings.values)
         self._settings, self._values = settings, settings.values
         self._catalogue = catalogue.load_catalogue()
@@ -293,6 +295,9 @@ class SolverSession:
             return True
         if self.instrument.solver is None:
             return bool(self.instrument.trouble)
+        # an instrument at a known place may have no inclinometer
+        if self.places.known and not len(self.tilts):
+            return True
         return self.tilts.complete(mid, self._span(frame.stars))
 
     def _span(self, stars: Stars) -> float:
@@ -307,7 +312,9 @@ class SolverSession:
         self.latest = frame
         header = frame.message.header
         # of a frame whose time is in doubt GNSS's place is in doubt too
-        beside = self._beside(frame, answer, compared=not frame.doubted)
+        beside = solved_beside(
+            self.gnss, self.instrument.solver, frame.stars, answer, compared=not frame.doubted
+        )
         answer = answer if beside is None else beside.solution
         answered = self._answered(header.stamp, answer, now, beside)
         attitude = self._attitude(frame.stars, answer, header.frame_id, predicted, until_s)
@@ -315,11 +322,6 @@ class SolverSession:
         if self.instrument.solver is not None:
             made += self._learn(frame, answer)
         return made
-
-    def _beside(self, frame: Waiting, rough: Solution, compared: bool) -> Watched | None:
-        """Solve a frame with what GNSS taught; None without gnss.use.  compared: with GNSS's place too."""
-        gnss, solver = self.gnss, self.instrument.solver
-        return gnss.solved(solver, frame.stars, rough, compared) if gnss and solver else None
 
     def _attitude(
         self, stars: Stars, answer: Solution, frame_id: str, predicted: Priors, until_s: float
@@ -367,7 +369,8 @@ class SolverSession:
                     f"the frame is stamped {frame.ahead_s:.3g} s before its time: {reports.ONE_CLOCK}"
                 )
             tilts = self.tilts.over(self._span(stars))
-            return self._search.solved(solver, stars, tilts, hint, predicted, until_s, known)
+            places = self.places if self.places.known else None
+            return self._search.solved(solver, stars, tilts, places, hint, predicted, until_s, known)
         except (InstrumentError, TimeError) as e:
             return Solution.failed(stars, Status.BAD_INPUT, str(e))
         except Exception as e:
@@ -430,7 +433,7 @@ class SolverSession:
         if self.latest is None:
             return None
         answer = self._answer_to(self.latest, None, self._search.until_s(None, False))
-        beside = self._beside(self.latest, answer, compared=False)
+        beside = solved_beside(self.gnss, self.instrument.solver, self.latest.stars, answer, compared=False)
         answer = answer if beside is None else beside.solution
         return self._output(self.latest.message.header.stamp, answer, beside)
 
@@ -441,5 +444,7 @@ class SolverSession:
         self._early.clear()
         self.latest = self.answer = self._hint = None
         self.gyro.forget()
+        if self.gnss is not None:
+            self.gnss.forget_places()
         self.doubt.clear()
         self.calibrating.forget()

@@ -39,7 +39,7 @@ def stars_of_cygnus(
     last = np.array([(camera.width if width is None else width) - 1, camera.height - 1])
     xy = xy[((xy > 0) & (xy < last)).all(1)]
     n = len(xy)
-    given = {
+    given: dict[str, Any] = {
         "flux": np.arange(n, 0, -1.0),
         "snr": np.full(n, 20.0),
         "covariance": np.broadcast_to(0.01 * np.eye(2), (n, 2, 2)),
