@@ -194,8 +194,7 @@ class SolverNode(Node):
         for output in outputs:
             self._outputs.publish(output)
             if self._replayed is not None and isinstance(output, Answered):
-                self._replayed.made += 1
-                self._replayed.fixes += output.solution.ok
+                self._replayed.note(output.stamp, output.solution.ok)
         if outputs:
             self._update_transforms()
         # poll only while a frame waits; where the clock is played, its ticks do

@@ -77,14 +77,14 @@ class StarFit:
 
     def bending(self, atmosphere: Atmosphere) -> np.ndarray:
         """Rotation (3,) of A4 in rad for 1 sigma of the refraction."""
-        return self.errors.rotated(self._by_refraction(atmosphere) * atmosphere.relative_sigma)
+        return self.errors.rotated(self._bent(atmosphere) * (atmosphere.relative_sigma / STEP_REFRACTION))
 
     def refraction_seen(self, atmosphere: Atmosphere) -> tuple[float, float]:
         """Refraction by how it bends the field, over that of the air at the fitted zenith, and the 1 sigma of this share.
 
         An attitude and a plate scale take up most of it; what is left squeezes the field along the vertical.
         """
-        slope = np.dstack([self.fit.slope[self.fit.kept], self._by_refraction(atmosphere)])
+        slope = np.dstack([self.fit.slope[self.fit.kept], self._bent(atmosphere) / STEP_REFRACTION])
         whole = self.errors.centroids + self.errors.catalogue
         weighted = np.linalg.solve(whole, slope)
         covariance = np.linalg.pinv(np.einsum("nki,nkj->ij", slope, weighted))
@@ -95,11 +95,11 @@ class StarFit:
         scatter2 = np.vdot(left, np.linalg.solve(whole, left[..., None])[..., 0]) / free
         return 1 + float(found[4]), float(np.sqrt(covariance[4, 4] * scatter2))
 
-    def _by_refraction(self, atmosphere: Atmosphere) -> np.ndarray:
-        """Move (M, 2) of the stars, px, by as much refraction again."""
+    def _bent(self, atmosphere: Atmosphere) -> np.ndarray:
+        """Move (M, 2) of the stars, px, by STEP_REFRACTION of their refraction more."""
         fit, stronger = self.fit, atmosphere.refraction(1 + STEP_REFRACTION).compiled
         moved = self.problem.predict(fit.a4, fit.scale, stronger) - self.problem.xy - fit.residual
-        return moved[fit.kept] / STEP_REFRACTION
+        return moved[fit.kept]
 
     def rolling(self, shutter: Shutter, height: int) -> np.ndarray:
         """Rotation (3, 2) of A4 in rad for 1 sigma of the two errors of the rows' times."""

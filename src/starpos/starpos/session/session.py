@@ -16,7 +16,6 @@ from typing import Any
 from starpos.calibration.unknown import MODEL_BY_PARAMETERS, unnamed_inclinometer
 from starpos.earth.orientation import earth_state
 from starpos.errors import InstrumentError, StarposError, TiltError, TimeError
-from starpos.fix.camera_attitude import CameraAttitude
 from starpos.fix.fix import Fix
 from starpos.fix.solution import Solution, Status
 from starpos.fix.solver import Solver
@@ -29,7 +28,7 @@ from starpos.instrument.camera import Camera
 from starpos.messages.stamp import stamp_to_unix
 from starpos.messages.stars import message_to_stars
 from starpos.session import reports
-from starpos.session.attitude import asked, camera_attitude_of
+from starpos.session.attitude import attitude_seen
 from starpos.session.calibrating import Calibrating
 from starpos.session.camera_solver import CameraSolver
 from starpos.session.clock_doubt import ClockDoubt
@@ -199,14 +198,9 @@ class SolverSession:
 
     def take_stars(self, message: Any, now: Now) -> list[Output]:
         """Take a StarArray."""
-        made = self.at(now)
-        self._heard.came("stars")
-        self._search.frame_came(now)
+        made = self._stars_came(now)
         try:
             stars = message_to_stars(message)
-            # If the user sets clock_stddev, it replaces the error that the camera's host states.
-            if not math.isnan(self._values["clock_stddev"]):
-                stars = replace(stars, clock_stddev_s=0.0)
         except StarposError as e:
             bad = Solution(
                 Status.BAD_INPUT,
@@ -216,8 +210,25 @@ class SolverSession:
                 stars_detected=len(message.stars),
             )
             return [*made, self._answered(message.header.stamp, bad, now)]
+        return made + self._wait_for(stars, message.header, now)
+
+    def take_detected(self, stars: Stars, header: Any, now: Now) -> list[Output]:
+        """Take stars as a StarArray with this header holds them."""
+        return self._stars_came(now) + self._wait_for(stars, header, now)
+
+    def _stars_came(self, now: Now) -> list[Output]:
+        made = self.at(now)
+        self._heard.came("stars")
+        self._search.frame_came(now)
+        return made
+
+    def _wait_for(self, stars: Stars, header: Any, now: Now) -> list[Output]:
+        """Have a frame wait for what it needs."""
+        # If the user sets clock_stddev, it replaces the error that the camera's host states.
+        if not math.isnan(self._values["clock_stddev"]):
+            stars = replace(stars, clock_stddev_s=0.0)
         self.instrument.frame_came(stars.width, stars.height, at_once=not now.played)
-        self._waiting.append(Waiting(message, stars, now.waiting_s, now.ahead_s(stars.mid_unix_s)))
+        self._waiting.append(Waiting(header, stars, now.waiting_s, now.ahead_s(stars.mid_unix_s)))
         while len(self._waiting) > (WAITING_PLAYED if now.played else WAITING):
             self._waiting.popleft()
             self.counts["dropped frames"] += 1
@@ -225,7 +236,7 @@ class SolverSession:
                 self._heard.refuse(
                     "stars", f"a frame was dropped: over {WAITING_PLAYED} wait for their tilts"
                 )
-        return made + self._work(now)
+        return self._work(now)
 
     def take_gnss(self, message: Any, now: Now) -> list[Output]:
         """Take a sensor_msgs/NavSatFix of GNSS; without gnss.use there is nothing to do with it."""
@@ -310,35 +321,26 @@ class SolverSession:
         if answer.ok and answer.fix is not None:
             frame, answer = self._with_doubt(frame, answer, answer.fix)
         self.latest = frame
-        header = frame.message.header
         # of a frame whose time is in doubt GNSS's place is in doubt too
         beside = solved_beside(
             self.gnss, self.instrument.solver, frame.stars, answer, compared=not frame.doubted
         )
         answer = answer if beside is None else beside.solution
-        answered = self._answered(header.stamp, answer, now, beside)
-        attitude = self._attitude(frame.stars, answer, header.frame_id, predicted, until_s)
+        answered = self._answered(frame.header.stamp, answer, now, beside)
+        attitude = attitude_seen(
+            self.instrument.solver,
+            frame.stars,
+            answer,
+            frame.header.frame_id,
+            predicted,
+            until_s,
+            self.gyro,
+            self._log,
+        )
         made: list[Output] = [replace(answered, attitude=attitude)]
         if self.instrument.solver is not None:
             made += self._learn(frame, answer)
         return made
-
-    def _attitude(
-        self, stars: Stars, answer: Solution, frame_id: str, predicted: Priors, until_s: float
-    ) -> CameraAttitude | None:
-        solver = self.instrument.solver
-        if solver is None:
-            return None
-        try:
-            answer = asked(solver, stars, answer, predicted, until_s)
-            attitude = camera_attitude_of(solver, stars, answer, frame_id)
-            if attitude is not None and answer.found is not None:
-                self.gyro.saw(stars, answer.found, solver)
-            return attitude
-        except Exception:
-            # A defect costs this attitude only.
-            self._log.error(traceback.format_exc())
-            return None
 
     def _with_doubt(self, frame: Waiting, answer: Solution, fix: Fix) -> tuple[Waiting, Solution]:
         """Add the error of its time that the stars of earlier frames show to a frame and its answer."""
@@ -399,7 +401,7 @@ class SolverSession:
             place = self.calibrating.average.place if used else None
             if place is None:
                 return []
-            return [Averaged(frame.message.header.stamp, place, ground_of(place, self._settings.vertical))]
+            return [Averaged(frame.header.stamp, place, ground_of(place, self._settings.vertical))]
         except Exception:
             # Fix and heading go on without the average; data that cause a defect must not stay.
             self._log.error(traceback.format_exc())
@@ -435,7 +437,7 @@ class SolverSession:
         answer = self._answer_to(self.latest, None, self._search.until_s(None, False))
         beside = solved_beside(self.gnss, self.instrument.solver, self.latest.stars, answer, compared=False)
         answer = answer if beside is None else beside.solution
-        return self._output(self.latest.message.header.stamp, answer, beside)
+        return self._output(self.latest.header.stamp, answer, beside)
 
     def reset(self) -> None:
         """Forget tilts, frames and the place, but no calibration that was found."""

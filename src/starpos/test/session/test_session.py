@@ -89,8 +89,9 @@ class Told:
 def messages():
     """(type, message, time it was recorded at) of the night."""
     with BagReader(NIGHT, typed=True) as bag:
-        _, connections = instrument_in(bag, NIGHT, None, INPUTS, (STARS,))
-        return [(c.msgtype, message, log_ns * 1e-9) for c, log_ns, message in bag.decoded(connections)]
+        chosen = instrument_in(bag, NIGHT, None, INPUTS, (STARS,))
+        decoded = bag.decoded(chosen.connections)
+        return [(c.msgtype, message, log_ns * 1e-9) for c, log_ns, message in decoded]
 
 
 @pytest.fixture(scope="module")
