@@ -15,7 +15,7 @@ from sensor_msgs.msg import CameraInfo, Imu, NavSatFix
 from std_srvs.srv import Trigger
 
 from starpos.instrument.camera import Camera
-from starpos.session import gnss_check, reports
+from starpos.session import gnss_check, gnss_teacher, reports
 from starpos.session.frames import Answered, Output
 from starpos.session.gyro import IMU_TOPIC
 from starpos.session.now import Now, Sent
@@ -53,7 +53,7 @@ class SolverNode(Node):
         self._values = self._settings.values
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         gyro = (IMU_TOPIC,) * self._values["gyro"]
-        gnss = (gnss_check.TOPIC,) * self._values["gnss.use"]
+        gnss = (gnss_teacher.TOPIC,) * self._values["gnss.use"]
         # at a known place a heading needs no tilt
         tilt = ("tilt",) * (self._settings.site is None and not gnss)
         self._inputs = Inputs(self, ("camera_info", "stars", *tilt, *gyro, *gnss))
@@ -84,6 +84,8 @@ class SolverNode(Node):
             "tilt": lambda m, info: self._publish(session.take_tilt(m, _sent(info), self._now())),
             "stars": lambda m, info: self._publish(session.take_stars(m, self._now(), _sent(info))),
         }
+        if session.gnss is not None:
+            takes[gnss_teacher.TOPIC] = lambda m, _: self._publish(session.take_gnss(m, self._now()))
         if time_is_simulated(self):
             self._replayed = Replayed(
                 self,
@@ -101,8 +103,9 @@ class SolverNode(Node):
             best_effort = ReliabilityPolicy.BEST_EFFORT
             subscription(self, Imu, IMU_TOPIC, self._on_imu, IMU_QUEUE, best_effort)
         self._gnss = gnss_check.GnssCheck()
-        best_effort = ReliabilityPolicy.BEST_EFFORT
-        subscription(self, NavSatFix, gnss_check.TOPIC, self._on_gnss, 10, best_effort)
+        take = self._gnss.take if session.gnss is None else self._taker(gnss_teacher.TOPIC, takes)
+        # receivers' drivers publish in either way
+        subscription(self, NavSatFix, gnss_teacher.TOPIC, take, 10, ReliabilityPolicy.BEST_EFFORT)
         self.create_service(Solve, "~/solve", self._on_solve)
         self.create_service(Trigger, "~/reset", self._on_reset)
         self._calibration_services = CalibrationServices(self, self._session, self._settings)
@@ -120,8 +123,16 @@ class SolverNode(Node):
             "Calibration": session.calibrating.report,
             "Average": session.calibrating.average.report,
         }
+        if session.gnss is not None:
+            tasks["GNSS"] = session.gnss.report
         self._diagnostics = Diagnostics(self, tasks, self._values["frame_id"])
         self._update_transforms()
+
+    def destroy_node(self) -> None:
+        """End the node; what GNSS taught is kept."""
+        if self._session.gnss is not None:
+            self._session.gnss.close()
+        super().destroy_node()
 
     def _apply(self, names: frozenset[str]) -> None:
         self._diagnostics.hardware_id = self._values["frame_id"]
@@ -149,11 +160,6 @@ class SolverNode(Node):
 
     def _on_imu(self, message: Imu) -> None:
         self._session.gyro.take(message, self._now())
-
-    def _on_gnss(self, message: NavSatFix) -> None:
-        self._gnss.take(message)
-        if self._values["gnss.use"]:
-            self._session.take_gnss(message)
 
     def _note_dropped(self, name: str, info: Mapping[str, Any]) -> None:
         if time_is_simulated(self):

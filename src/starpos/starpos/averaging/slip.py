@@ -6,6 +6,7 @@ turned about exactly that axis, which no hand does, one of the stamps is wrong.
 """
 
 from collections.abc import Sequence
+from typing import Protocol
 
 import numpy as np
 
@@ -24,7 +25,20 @@ HIGHEST_LATITUDE = np.radians(89.0)
 LARGE_TRACE = 2.9
 
 
-def slip_s(fix: Fix, first: Fix, stated_s: float = 0.0) -> float | None:
+class Sighted(Protocol):
+    """Attitude of a camera against the Earth, as a Fix has it: a rotation (3, 3), its covariance (3, 3), a latitude."""
+
+    @property
+    def camera_to_itrs(self) -> np.ndarray: ...
+
+    @property
+    def camera_covariance(self) -> np.ndarray: ...
+
+    @property
+    def latitude(self) -> float: ...
+
+
+def slip_s(fix: Sighted, first: Sighted, stated_s: float = 0.0) -> float | None:
     """Seconds by which the time stamps of two fixes contradict each other; None if the camera was touched in between.
 
     The result is 0 if the errors of both attitudes, the mount's creep and stated_s explain the difference.

@@ -10,15 +10,17 @@ from starpos.fix.camera_attitude import CameraAttitude
 from starpos.fix.fix import Fix
 from starpos.fix.solution import Solution
 from starpos.frames.stars import Stars
+from starpos.gnss.solving import Watched
 from starpos.session.now import Now
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Answered:
     """What became of a frame: its message's stamp, its solution, the place on the ellipsoid, None without one.
 
     no_camera: no camera calibration has arrived.
     attitude: the camera's, by its stars; None where they tell none.
+    beside: with GNSS, what it taught and what the guard says of it; None without.
     """
 
     stamp: Any
@@ -26,6 +28,7 @@ class Answered:
     ground: Geodetic | None
     no_camera: bool
     attitude: CameraAttitude | None = None
+    beside: Watched | None = None
 
 
 @dataclass(frozen=True)

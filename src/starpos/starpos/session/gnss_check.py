@@ -4,11 +4,11 @@
 from typing import Any
 
 from starpos.earth.vertical import Vertical
+from starpos.errors import GnssError
 from starpos.fix.solution import Solution
+from starpos.gnss.place import GnssPlace, message_to_gnss
 from starpos.session.frames import ground_of
-from starpos.session.gnss import OLDEST_S, GnssPlace, contradiction, message_to_gnss
-
-TOPIC = "gnss/fix"
+from starpos.session.gnss import OLDEST_S, UNSTATED_M, contradiction
 
 
 class GnssCheck:
@@ -18,8 +18,11 @@ class GnssCheck:
         self._place: GnssPlace | None = None
 
     def take(self, message: Any) -> None:
-        """Take a sensor_msgs/NavSatFix."""
-        self._place = message_to_gnss(message)
+        """Take a sensor_msgs/NavSatFix; one without a place that can be used is forgotten."""
+        try:
+            self._place = message_to_gnss(message, UNSTATED_M)
+        except GnssError:
+            self._place = None
 
     def remark(self, answer: Solution | None, vertical: Vertical) -> str:
         """Sentence with the distance, where both places cannot be right; '' otherwise."""

@@ -217,12 +217,6 @@ PARAMETERS = (
         minimum=0.0,
         maximum=100000.0,
     ),
-    Parameter(
-        "gnss.use",
-        False,
-        "Take gnss/fix for the place of heading/imu, where no site is set.",
-        read_only=True,
-    ),
     Parameter("min_stars", 5, "Fewest identified stars that make a fix.", unit="", minimum=4, maximum=1000),
     Parameter(
         "search_time",
@@ -249,6 +243,21 @@ PARAMETERS = (
         "Take imu/data, whose turn rates say where a camera that turns looks: frames of four stars are identified too. "
         "Its axes are frame_id's, as calibration_url's link_to_camera has them; wrong ones help nothing, harm nothing. "
         "Of no effect with use_sim_time: a replay gives the same answers at any rate.",
+        read_only=True,
+    ),
+    Parameter(
+        "gnss.use",
+        False,
+        "Take gnss/fix, which teaches the misalignment, the inclinometer's errors and the deflection while the stars "
+        "agree with it, and is guarded by them; fix stays the stars' own. A GNSS that is led astray from the first frame "
+        "on teaches what is wrong.",
+        read_only=True,
+    ),
+    Parameter(
+        "gnss.learned",
+        "",
+        "File that keeps what GNSS taught, read at the start if it is there; '' for none. Delete it after camera or "
+        "inclinometer was remounted: the old one makes fixes wrong until GNSS disagrees.",
         read_only=True,
     ),
     Parameter(
@@ -316,6 +325,18 @@ def instrument_of(
         clock_stddev_s=known.clock_stddev_s if math.isnan(clock) else clock,
         inclinometer=errors if math.isnan(tilt) else replace(errors, noise_rad=math.radians(tilt)),
     )
+
+
+def check_gnss(values: Mapping, instrument: Instrument) -> None:
+    """Raise InstrumentError if gnss.use does not go with the others."""
+    if not values["gnss.use"]:
+        return
+    if values["self_calibration"]:
+        raise InstrumentError("gnss.use and self_calibration both find A3: set one of the two")
+    if instrument.vertical is not None:
+        raise InstrumentError(
+            "gnss.use teaches an inclinometer, and the camera of calibration_url is its own level: set it to false"
+        )
 
 
 def known_instrument(url: str) -> Instrument | None:

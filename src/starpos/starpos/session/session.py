@@ -15,11 +15,11 @@ from typing import Any
 from starpos.calibration.unknown import MODEL_BY_PARAMETERS, unnamed_inclinometer
 from starpos.earth.orientation import earth_state
 from starpos.errors import InstrumentError, StarposError, TimeError
-from starpos.fix.camera_attitude import CameraAttitude
 from starpos.fix.fix import Fix
 from starpos.fix.solution import Solution, Status
 from starpos.fix.solver import Solver
 from starpos.frames.stars import Stars
+from starpos.gnss.solving import Watched
 from starpos.identification import Identification
 from starpos.identification.hint import Hint
 from starpos.identification.search import Priors
@@ -27,12 +27,13 @@ from starpos.instrument.camera import Camera
 from starpos.messages.stamp import stamp_to_unix
 from starpos.messages.stars import message_to_stars
 from starpos.session import reports
-from starpos.session.attitude import asked, camera_attitude_of
+from starpos.session.attitude import attitude_seen
 from starpos.session.backlog import MOST, Backlog
 from starpos.session.calibrating import Calibrating
 from starpos.session.camera_solver import CameraSolver
 from starpos.session.clock_doubt import ClockDoubt
 from starpos.session.frames import Answered, Averaged, Output, Waiting, ground_of
+from starpos.session.gnss_teacher import GnssTeacher, solved_beside
 from starpos.session.gyro import Gyro
 from starpos.session.job import Jobs
 from starpos.session.known_place import SessionPlaces
@@ -86,7 +87,9 @@ class SolverSession:
         self.names = FrameNames()
         self.doubt = ClockDoubt()
         self.gyro = Gyro(heard)
-        self.places = SessionPlaces(settings)
+        # None without gnss.use
+        self.gnss = GnssTeacher(settings, jobs(), heard, log) if settings.values["gnss.use"] else None
+        self.places = SessionPlaces(settings, self.gnss)
         self._search = Search(settings.values)
         self._settings, self._values = settings, settings.values
         self._catalogue = catalogue.load_catalogue()
@@ -121,6 +124,8 @@ class SolverSession:
         self._hint = None
         self._search.other_camera()
         self.gyro.forget()
+        if self.gnss is not None:
+            self.gnss.other_camera()
         self.calibrating.camera_changed()
 
     @property
@@ -196,11 +201,6 @@ class SolverSession:
             self._wait_for(stars, header, now)
         return made + self._work(now)
 
-    def take_gnss(self, message: Any) -> None:
-        """Take a NavSatFix of satellites, for the heading at its place."""
-        self.places.take(message)
-        self._heard.came("gnss/fix")
-
     def _takes(self, header: Any, now: Now, sent: Sent) -> bool:
         """Whether a frame is wanted and can be answered in time."""
         self._heard.came("stars")
@@ -234,6 +234,13 @@ class SolverSession:
         if not self._backlog or self._ready(self._backlog.first, now):
             return self.tilts.delay_s
         return max(self.tilts.delay_s, now.waiting_s - self._backlog.first.since_s)
+
+    def take_gnss(self, message: Any, now: Now) -> list[Output]:
+        """Take a sensor_msgs/NavSatFix of GNSS; without gnss.use there is nothing to do with it."""
+        made = self.at(now)
+        if self.gnss is not None:
+            self.gnss.take(message, now)
+        return made
 
     # time ------------------------------------------------------------------------------------------------------------
 
@@ -322,29 +329,26 @@ class SolverSession:
         if answer.ok and answer.fix is not None:
             frame, answer = self._with_doubt(frame, answer, answer.fix)
         self.latest = frame
-        answered = self._answered(frame.header.stamp, answer, now)
-        attitude = self._attitude(frame.stars, answer, frame.header.frame_id, predicted, until_s)
+        # of a frame whose time is in doubt GNSS's place is in doubt too
+        beside = solved_beside(
+            self.gnss, self.instrument.solver, frame.stars, answer, compared=not frame.doubted
+        )
+        answer = answer if beside is None else beside.solution
+        answered = self._answered(frame.header.stamp, answer, now, beside)
+        attitude = attitude_seen(
+            self.instrument.solver,
+            frame.stars,
+            answer,
+            frame.header.frame_id,
+            predicted,
+            until_s,
+            self.gyro,
+            self._log,
+        )
         made: list[Output] = [replace(answered, attitude=attitude)]
         if self.instrument.solver is not None:
             made += self._learn(frame, answer)
         return made
-
-    def _attitude(
-        self, stars: Stars, answer: Solution, frame_id: str, predicted: Priors, until_s: float
-    ) -> CameraAttitude | None:
-        solver = self.instrument.solver
-        if solver is None:
-            return None
-        try:
-            answer = asked(solver, stars, answer, predicted, until_s)
-            attitude = camera_attitude_of(solver, stars, answer, frame_id)
-            if attitude is not None and answer.found is not None:
-                self.gyro.saw(stars, answer.found, solver)
-            return attitude
-        except Exception:
-            # A defect costs this attitude only.
-            self._log.error(traceback.format_exc())
-            return None
 
     def _with_doubt(self, frame: Waiting, answer: Solution, fix: Fix) -> tuple[Waiting, Solution]:
         """Add the error of its time that the stars of earlier frames show to a frame and its answer."""
@@ -414,7 +418,7 @@ class SolverSession:
 
     # outputs ---------------------------------------------------------------------------------------------------------
 
-    def _answered(self, stamp: Any, answer: Solution, now: Now) -> Answered:
+    def _answered(self, stamp: Any, answer: Solution, now: Now, beside: Watched | None = None) -> Answered:
         if now.played:
             # by the clock of recorded data no time passes
             answer = replace(answer, identify_s=0.0, fix_s=0.0)
@@ -422,19 +426,25 @@ class SolverSession:
         self.pace.answered(answer.ok)
         self._hint = answer.hint or self._hint
         self._changes.say("fixes are coming" if answer.ok else answer.message, answer.ok, answer.status)
-        return self._output(stamp, answer)
+        if self.gnss is not None:
+            self.gnss.save_if_due(now)
+        return self._output(stamp, answer, beside)
 
-    def _output(self, stamp: Any, answer: Solution) -> Answered:
+    def _output(self, stamp: Any, answer: Solution, beside: Watched | None) -> Answered:
         no_camera = self.instrument.solver is None and self.instrument.camera is None
         ground = None if answer.fix is None else ground_of(answer.fix, self._settings.vertical)
-        return Answered(stamp, answer, ground, no_camera)
+        if beside is not None:
+            ground = beside.ground
+        return Answered(stamp=stamp, solution=answer, ground=ground, no_camera=no_camera, beside=beside)
 
     def solve_again(self) -> Answered | None:
         """Solve the newest frame with what is known now, identified anew whatever was found before; None without one."""
         if self.latest is None:
             return None
         answer = self._answer_to(self.latest, None, self._search.until_s(None, False))
-        return self._output(self.latest.header.stamp, answer)
+        beside = solved_beside(self.gnss, self.instrument.solver, self.latest.stars, answer, compared=False)
+        answer = answer if beside is None else beside.solution
+        return self._output(self.latest.header.stamp, answer, beside)
 
     def reset(self) -> None:
         """Forget tilts, frames and the place, but no calibration that was found."""
@@ -443,6 +453,7 @@ class SolverSession:
         self._intake.clear()
         self.latest = self.answer = self._hint = None
         self.gyro.forget()
-        self.places.forget()
+        if self.gnss is not None:
+            self.gnss.forget_places()
         self.doubt.clear()
         self.calibrating.forget()

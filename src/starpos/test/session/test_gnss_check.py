@@ -16,7 +16,7 @@ from starpos.session.gnss_check import GnssCheck
 def gnss(latitude_deg, longitude_deg, seconds=0.0):
     whole, part = divmod(round((T0 + seconds) * 1e6), 1_000_000)
     return SimpleNamespace(
-        header=SimpleNamespace(stamp=SimpleNamespace(sec=whole, nanosec=part * 1000)),
+        header=SimpleNamespace(frame_id="gps", stamp=SimpleNamespace(sec=whole, nanosec=part * 1000)),
         latitude=latitude_deg,
         longitude=longitude_deg,
         position_covariance=(np.eye(3) * 9.0).ravel(),
