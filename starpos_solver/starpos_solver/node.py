@@ -102,7 +102,7 @@ class SolverNode(Node):
         if self._values["gyro"]:
             best_effort = ReliabilityPolicy.BEST_EFFORT
             subscription(self, Imu, IMU_TOPIC, self._on_imu, IMU_QUEUE, best_effort)
-        self._gnss = gnss_check.GnssCheck()
+        self._gnss = gnss_check.GnssComparison()
         take = self._gnss.take if session.gnss is None else self._taker(gnss_teacher.TOPIC, takes)
         # receivers' drivers publish in either way
         subscription(self, NavSatFix, gnss_teacher.TOPIC, take, 10, ReliabilityPolicy.BEST_EFFORT)

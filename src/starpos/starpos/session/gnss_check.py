@@ -11,7 +11,7 @@ from starpos.session.frames import ground_of
 from starpos.session.gnss import OLDEST_S, UNSTATED_M, contradiction
 
 
-class GnssCheck:
+class GnssComparison:
     """Keeps the last place of GNSS; it never changes a fix."""
 
     def __init__(self) -> None:

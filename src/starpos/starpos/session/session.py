@@ -345,10 +345,7 @@ class SolverSession:
             self.gyro,
             self._log,
         )
-        made: list[Output] = [replace(answered, attitude=attitude)]
-        if self.instrument.solver is not None:
-            made += self._learn(frame, answer)
-        return made
+        return [replace(answered, attitude=attitude), *self._learn(frame, answer)]
 
     def _with_doubt(self, frame: Waiting, answer: Solution, fix: Fix) -> tuple[Waiting, Solution]:
         """Add the error of its time that the stars of earlier frames show to a frame and its answer."""
@@ -396,7 +393,7 @@ class SolverSession:
         A frame whose time is in doubt is left out.  Returns the average if it includes the frame.
         """
         stars = frame.stars
-        if stars.mid_unix_s is None or frame.doubted:
+        if self.instrument.solver is None or stars.mid_unix_s is None or frame.doubted:
             return []
         if answer.status is Status.BAD_INPUT and frame.ahead_s > reports.AHEAD_S:
             return []
@@ -404,17 +401,10 @@ class SolverSession:
             tilt = answer.tilt or self.tilts.average(stars.mid_unix_s, self._span(stars))
         except StarposError:
             return []
-        try:
-            used = self.calibrating.learn(Seen(stars, tilt, answer.found), answer.fix)
-            place = self.calibrating.average.place if used else None
-            if place is None:
-                return []
-            return [Averaged(frame.header.stamp, place, ground_of(place, self._settings.vertical))]
-        except Exception:
-            # Fix and heading go on without the average; data that cause a defect must not stay.
-            self._log.error(traceback.format_exc())
-            self.calibrating.forget()
+        place = self.calibrating.learn(Seen(stars, tilt, answer.found), answer.fix)
+        if place is None:
             return []
+        return [Averaged(frame.header.stamp, place, ground_of(place, self._settings.vertical))]
 
     # outputs ---------------------------------------------------------------------------------------------------------
 

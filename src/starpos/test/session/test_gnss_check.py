@@ -10,7 +10,7 @@ from fixes import T0, fix_at
 
 from starpos.earth.vertical import Deflection
 from starpos.fix.solution import Status
-from starpos.session.gnss_check import GnssCheck
+from starpos.session.gnss_check import GnssComparison
 
 
 def gnss(latitude_deg, longitude_deg, seconds=0.0):
@@ -31,7 +31,7 @@ def gnss(latitude_deg, longitude_deg, seconds=0.0):
 def test_a_place_that_cannot_be_is_said_with_its_distance(latitude_deg, seconds, said):
     fix = fix_at(0.0)
     answer = SimpleNamespace(fix=fix, status=Status.OK)
-    check = GnssCheck()
+    check = GnssComparison()
     assert check.remark(answer, Deflection()) == ""
     check.take(gnss(latitude_deg, math.degrees(fix.longitude), seconds))
     remark = check.remark(answer, Deflection())
