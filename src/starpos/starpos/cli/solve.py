@@ -7,12 +7,12 @@ from dataclasses import dataclass, replace
 
 from starpos.cli import console, jobs, options, overwriting, solve_pointings
 from starpos.cli.archive import NightFolder, frames_among, nights_of
-from starpos.cli.deflection import add_vertical, vertical_of
 from starpos.cli.fix_output import COLUMNS, CSV_HELP, HEAD, JSON_HELP
 from starpos.cli.inputs import add_near, checked_tilts, given_of, near_of, reader_of, tell_unnamed
 from starpos.cli.output import Output, add_formats
 from starpos.cli.overwriting import Written
 from starpos.cli.solved_night import check_save, say, tell, tell_turned
+from starpos.cli.vertical import add_vertical, vertical_of
 from starpos.errors import FrameError, InstrumentError, StarposError, TiltError
 from starpos.fix.solver import Solver
 from starpos.instrument import instrument_update
