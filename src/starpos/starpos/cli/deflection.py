@@ -29,7 +29,7 @@ COLUMNS = ("file", "combined", "status", "utc", "face", "heading", "xi_arcsec", 
 HEAD = "file: face, heading of the frame's top (deg), xi and eta (arcsec) of the frame alone, with the session's A3"
 JSON_HELP = (
     "one JSON object a frame, and one with combined: true: xi_arcsec, eta_arcsec at the mark as the plumb line stood, "
-    "covariance_arcsec2 (2 x 2), errors (1 sigma of xi, eta for each source), reduced (without the tide, and at the geoid)"
+    "covariance_arcsec2 (2 x 2), errors (1 sigma of xi, eta for each source), reduced (without the tide; at the geoid)"
 )
 
 
@@ -178,7 +178,8 @@ def _combined_text(session: DeflectionSession, value: dict) -> str:
     return (
         f"xi {found.xi_arcsec:+.3f} +- {value['sigma_xi_arcsec']:.3f}, eta {found.eta_arcsec:+.3f} +- "
         f"{value['sigma_eta_arcsec']:.3f} arcsec at the mark, of {value['frames']} frames in {value['faces']} faces\n"
-        f"without the tide {mark[0]:+.3f} {mark[1]:+.3f}, at the geoid {geoid[0]:+.3f} {geoid[1]:+.3f} (normal plumb line)\n"
+        f"without the tide {mark[0]:+.3f} {mark[1]:+.3f}, at the geoid {geoid[0]:+.3f} {geoid[1]:+.3f} (normal plumb "
+        "line)\n"
         f"image motion {value['image_motion_arcsec']:.2f} a frame, anomalous refraction "
         f"{value['anomalous_refraction_arcsec']:.3f}; largest errors (xi, eta): {sizes}"
     )

@@ -16,7 +16,6 @@ K2, L2 = 0.29525, 0.0847
 # The plumb line among the stars over a mark whose coordinates are without the tide: the Earth's bulge pulls too, and the
 # mark moves (Melchior, The Tides of the Planet Earth (1983), chapter 1: Lambda = 1 + k - l).
 YIELDING = 1 + K2 - L2
-_METRES = erfa.DAU
 
 
 def plumb_tide(utc_unix_s: float, place: np.ndarray, enu: np.ndarray) -> np.ndarray:
@@ -36,10 +35,8 @@ def tidal_pull(utc_unix_s: float, place: np.ndarray) -> np.ndarray:
     moon = np.asarray(erfa.moon98(*tt)["p"])
     # TT serves as TDB: they differ by 2 ms
     sun = -np.asarray(erfa.epv00(*tt)[0]["p"])
-    return sum(
-        _differential(strength, to_itrs @ body * _METRES, place)
-        for strength, body in ((GM_MOON, moon), (GM_SUN, sun))
-    )
+    of_moon = _differential(GM_MOON, to_itrs @ moon * erfa.DAU, place)
+    return of_moon + _differential(GM_SUN, to_itrs @ sun * erfa.DAU, place)
 
 
 def _differential(strength: float, body: np.ndarray, place: np.ndarray) -> np.ndarray:

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The deflection of the vertical of one session, by generalised least squares of all its frames.
 
-Unknown are xi, eta and A3 (its two tilts, which hold the tiltmeter's zero, and its turn).  All else is in the covariance of
-the readings.  The session's residuals determine the size of image motion and anomalous refraction, by restricted maximum
-likelihood (Patterson and Thompson 1971, Biometrika 58, 545).  A session hardly shows an error that changes as slowly as
-the second, so that is never taken to be smaller than the share AIR_SHARE of the first.
+Unknown are xi, eta and A3 (its two tilts, which hold the tiltmeter's zero, and its turn).  All else is in the covariance
+of the readings.  The session's residuals determine the size of image motion and anomalous refraction, by restricted
+maximum likelihood (Patterson and Thompson 1971, Biometrika 58, 545).  A session hardly shows an error that changes as
+slowly as the second, so that is never taken to be smaller than the share AIR_SHARE of the first.
 """
 
 from collections.abc import Sequence
@@ -88,9 +88,9 @@ class Adjusted:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _Fit:
-    """A weighted fit: step (5,), covariance (5, 5), gain (5, 2 N) by the readings, root (2 N, 2 N): of the readings' covariance.
+    """A weighted fit: step (5,), covariance (5, 5), gain (5, 2 N) by the readings.
 
-    cost: -2 log of the likelihood.
+    root (2 N, 2 N): of the covariance of the readings.  cost: -2 log of the likelihood.
     """
 
     step: np.ndarray
@@ -115,16 +115,17 @@ def adjusted(
     given = instrument.calibration
     start = start_of(sightings)
     estimate = start if given.unknown else LeanEstimate(lean=np.zeros(2), a3=given.a3)
-    air, offset = None, np.zeros(5)
+    offset, sized = np.zeros(5), False
+    air = Air(motion=MOTION_RAD, anomalous=MOTION_RAD * AIR_SHARE)
     for _ in range(STEPS):
         lines = Lines.at(estimate, sightings, bending)
         errors = errors_of(
             lines, sightings, faces, instrument.inclinometer, mark, since_unix_s=given.utc_unix_s
         )
-        stated = sum(s.covariance for s in errors.sources)
+        stated = np.sum([s.covariance for s in errors.sources], axis=0)
         # A3's prior stays where it was
-        if air is None:
-            air = _air_of(lines, stated, errors, prior, offset)
+        if not sized:
+            air, sized = _air_of(lines, stated, errors, prior, offset), True
         fit = _fitted(lines, _whole(stated, errors, air), prior, offset)
         estimate, offset = estimate.moved(fit.step), offset + fit.step
         if np.abs(fit.step).max() < SETTLED * np.sqrt(np.diag(fit.covariance)).min():

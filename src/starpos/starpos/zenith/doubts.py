@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What speaks against a session: faces that do not come round, a clock or a zero that jumped, a face unlike the others."""
+"""What speaks against a session: faces that do not come round, a jump of the clock or of a zero, a face unlike others."""
 
 from collections.abc import Sequence
 
@@ -55,8 +55,8 @@ def remarks(found: Adjusted, sightings: Sequence[ZenithSighting], frames: int) -
     size = float(np.hypot(found.xi_arcsec, found.eta_arcsec))
     if size > LARGE_ARCSEC:
         said.append(
-            f"the deflection is {size:.1f} arcsec, which only high mountains have: elsewhere the site is {_off(found)}, or "
-            f"the clock is {found.eta_arcsec / 15:+.2f} s off at the equator"
+            f"the deflection is {size:.1f} arcsec, which only high mountains have: elsewhere the site is {_off(found)}, "
+            "or the clock is wrong (1 s is 15 arcsec of eta at the equator)"
         )
     number = np.bincount(found.faces)
     for face in np.flatnonzero(number < THIN * np.median(number)):

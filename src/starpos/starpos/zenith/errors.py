@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from starpos.earth.orientation import ROTATION_RAD_S
-from starpos.fix.budget import correlation
 from starpos.instrument.inclinometer import InclinometerErrors
 from starpos.zenith.lines import Lines
 from starpos.zenith.sighting import Mark, ZenithSighting
@@ -87,8 +86,7 @@ def _of_tilts(
     noise = np.array([np.linalg.cholesky(tilt.noise[:2, :2]) for tilt in tilts])
     begin = t.min() if np.isnan(since_unix_s) else min(since_unix_s, t.min())
     hours = np.minimum.outer(t - begin, t - begin) / HOUR_S
-    same = np.array([[correlation(a.times, b.times) for b in tilts] for a in tilts])
-    same[np.diag_indices(n)] = 1.0
+    same = _shared_readings(sightings)
     rounding = np.array([inclinometer.undithered_rad(tilt) for tilt in tilts])
     sources = [
         Source.varying("tilt readings", same, noise),
@@ -108,6 +106,16 @@ def _of_tilts(
         walk = hours * UNKNOWN_WALK_C_PER_SQRT_HOUR**2
         sources.append(Source.varying("tilt temperature", walk, axes * per_c))
     return sources
+
+
+def _shared_readings(sightings: Sequence[ZenithSighting]) -> np.ndarray:
+    """Correlation (N, N) of the mean tilts of frames, of which neighbours may share readings."""
+    times = [s.tilt.times or (s.utc_unix_s,) for s in sightings]
+    number = np.array([len(t) for t in times])
+    reading = np.unique(np.concatenate(times), return_inverse=True)[1]
+    member = np.zeros((len(times), reading.max() + 1))
+    member[np.repeat(np.arange(len(times)), number), reading] = 1 / np.sqrt(np.repeat(number, number))
+    return member @ member.T
 
 
 def _of_stars(lines: Lines, sightings: Sequence[ZenithSighting]) -> list[Source]:

@@ -33,8 +33,8 @@ class Lines:
     """The equations of N frames, linear about an LeanEstimate.
 
     off (N, 2): readings minus those that the estimate predicts, rad.
-    Derivatives of the prediction: by_parameters (N, 2, 5) as in `LeanEstimate.moved`; by_camera (N, 2, 3), by a small rotation
-    of the camera about C's axes; by_sky (N, 2, 3), by one of the sky about east, north, up.
+    Derivatives of the prediction: by_parameters (N, 2, 5) as in `LeanEstimate.moved`; by_camera (N, 2, 3), by a small
+    rotation of the camera about C's axes; by_sky (N, 2, 3), by one of the sky about east, north, up.
     """
 
     off: np.ndarray

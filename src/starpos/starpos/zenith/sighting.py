@@ -49,7 +49,7 @@ class ZenithSighting:
     enu_to_camera (3, 3): geodetic east, north, up into C, by the stars.  All rotations below are small ones of the camera
     about C's axes, rad.
     centroids (3, 3): covariance of it by the stars' places on the frame.
-    stars (N,): rows of the catalogue.  by_star (3, N, 3): rotation for 1 sigma of each star's place along the axes of ICRS.
+    stars (N,): rows of the catalogue.  by_star (3, N, 3): rotation for 1 sigma of each star's place along ICRS's axes.
     by_refraction (3,): rotation for 1 sigma of the refraction.  by_rows (3, 2): for the two errors of the rows' times.
     residual_arcsec (N, 2): the stars' places by the fit minus those seen, along the frame's columns and rows.
     """
