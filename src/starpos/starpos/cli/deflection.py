@@ -86,7 +86,7 @@ def run(args: argparse.Namespace) -> int:
     except FixError as error:
         console.complain("deflection", error)
         return NO_DEFLECTION
-    for said in remarks(session.adjusted, session.sightings, len(frames)):
+    for said in remarks(session.adjusted, session.sightings, len(frames), instrument.inclinometer.scale):
         console.complain("deflection", said)
     at = {id(s): k for k, s in enumerate(session.sightings)}
     for path, answer in rows.items():

@@ -21,8 +21,9 @@ LARGE_ARCSEC, MOST_ARCSEC = 25.0, 120.0
 DOUBTED_CHI2 = 36.0
 # a face with a smaller share of the usual number of frames is thin
 THIN = 0.5
-# share of the deflection's variance by the tiltmeter's response from which levelling pays
-BY_RESPONSE = 0.25
+# Differences of lean that the scale turns into more than so many sigma of the deflection rest on the scale being the same
+# everywhere, which nobody states.
+UNLEVEL_SIGMA = 3.0
 
 
 def check_session(found: Adjusted, sightings: Sequence[ZenithSighting]) -> None:
@@ -49,8 +50,11 @@ def check_session(found: Adjusted, sightings: Sequence[ZenithSighting]) -> None:
         )
 
 
-def remarks(found: Adjusted, sightings: Sequence[ZenithSighting], frames: int) -> list[str]:
-    """Sentences on what may be wrong with a deflection that was found, of so many frames."""
+def remarks(found: Adjusted, sightings: Sequence[ZenithSighting], frames: int, scale: float) -> list[str]:
+    """Sentences on what may be wrong with a deflection that was found.
+
+    frames: number that was given.  scale: stated error of the tiltmeter's scale.
+    """
     said = []
     size = float(np.hypot(found.xi_arcsec, found.eta_arcsec))
     if size > LARGE_ARCSEC:
@@ -66,15 +70,12 @@ def remarks(found: Adjusted, sightings: Sequence[ZenithSighting], frames: int) -
         )
     if frames > len(sightings):
         said.append(f"{frames - len(sightings)} of {frames} frames are left out")
-    response = [variance for name, *variance in found.terms if name in ("tilt scale", "tilt cross")]
-    share = (
-        np.sum(np.square(response), axis=0) / np.diag(found.covariance_arcsec2) if response else np.zeros(2)
-    )
-    if share.max() > BY_RESPONSE:
-        lean = max(np.ptp([s.tilt.theta[k] for s in sightings]) for k in (0, 1)) / ARCSEC
+    lean = max(np.ptp([s.tilt.theta[k] for s in sightings]) for k in (0, 1)) / ARCSEC
+    if scale * lean > UNLEVEL_SIGMA * found.sigma_arcsec.max():
         said.append(
-            f"the tiltmeter's scale makes {100 * share.max():.0f} % of the variance, because its angles differ by up to "
-            f"{lean:.0f} arcsec from face to face: level every face better"
+            f"the tiltmeter's angles differ by up to {lean:.0f} arcsec from face to face, of which its scale, known to "
+            f"{scale:.2g}, makes {scale * lean:.2g} arcsec: level every face to "
+            f"{found.sigma_arcsec.max() / scale:.0f} arcsec"
         )
     return said
 

@@ -46,7 +46,7 @@ def drawn(rng, *, azimuths=(0, 90, 180, 270) * 2, frames=6, motion=0.4, air=0.05
     a3 = rotation.about_axis(2, np.radians(turn_deg)) @ rotation.from_vector([*rng.normal(0, 0.002, 2), 0.0])
     zero, scale = rng.normal(0, 60, 2) * ARCSEC, rng.normal(0, SCALE, 2)
     quiet = motion == 0 and air == 0
-    walk, slow, late = np.zeros(2), rng.normal(0, 1, 2) * air, 0.0
+    walk, slow = np.zeros(2), rng.normal(0, 1, 2) * air
     sightings, t = [], 0.0
     for azimuth in azimuths:
         level = rotation.from_vector([*rng.normal(0, lean, 2) * ARCSEC, 0.0])

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from sessions import INSTRUMENT, MARK, VACUUM, Drawn, drawn, shifted
+from sessions import INSTRUMENT, MARK, SCALE, VACUUM, Drawn, drawn, shifted
 
 from starpos.errors import FixError
 from starpos.night.sightings import DeflectionSession
@@ -19,7 +19,7 @@ def session(sightings):
 
 def said(sightings, frames=None):
     found = session(sightings)
-    return " ".join(remarks(found.adjusted, found.sightings, frames or len(sightings)))
+    return " ".join(remarks(found.adjusted, found.sightings, frames or len(sightings), SCALE))
 
 
 def test_a_sound_session_has_no_remarks(rng):
@@ -70,9 +70,7 @@ def test_clouds_in_one_face(rng):
 
 
 def test_a_tiltmeter_that_is_not_level_enough(rng):
-    # two faces tell no scale
-    calm = drawn(rng, azimuths=(0, 180), motion=0.02, air=0.002, lean=60.0)
-    assert "level every face better" in said(calm.sightings)
+    assert "level every face to" in said(drawn(rng, lean=300.0).sightings)
 
 
 def test_no_sighting_is_no_deflection():
