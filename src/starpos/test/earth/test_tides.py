@@ -12,8 +12,8 @@ MONTH_H = np.arange(0, 29.53 * 24, 2.0)
 
 
 def test_the_moons_semidiurnal_pull_at_the_equator_is_a_thirteen_millionth_of_gravity():
-    # Popular Science Monthly 74 (1909), 529: "at the equator the mean value of the semi-diurnal force at 9 or 3 o'clock is
-    # equal to one thirteen-millionth part of the force of gravity"
+    # Popular Science Monthly 74 (1909), 529: "at the equator the mean value of the semi-diurnal force at 9 or 3 o'clock
+    # is equal to one thirteen-millionth part of the force of gravity"
     place = itrs_place(0.0, 0.0, 0.0)
     east = enu_axes(0.0, 0.0)[0]
     pull = np.array([tides.tidal_pull(1.75e9 + 3600 * h, place) @ east for h in MONTH_H])
