@@ -159,6 +159,7 @@ def _combined_json(session: DeflectionSession, without: Reduced) -> dict:
         "errors": {name: [xi, eta] for name, xi, eta in found.terms},
         "image_motion_arcsec": found.air.motion / ARCSEC,
         "anomalous_refraction_arcsec": found.air.anomalous / ARCSEC,
+        "catalogue_factor": found.catalogue_factor,
         "chi2_per_degree": found.chi2_per_degree,
         "misalignment_deg": found.misalignment_deg,
         "reduced": {

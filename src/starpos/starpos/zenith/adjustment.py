@@ -20,6 +20,7 @@ from starpos.units import ARCSEC
 from starpos.zenith.errors import Errors, errors_of
 from starpos.zenith.faces import faces_of
 from starpos.zenith.lines import LeanEstimate, Lines, start_of
+from starpos.zenith.places import Places
 from starpos.zenith.sighting import Mark, ZenithSighting
 
 STEPS = 8
@@ -53,6 +54,7 @@ class Adjusted:
     a3 (3, 3): C into S, with the tiltmeter's zero.  turn_stddev_rad: of its turn about the plumb line.
     faces (N,): number of each frame's face.  frame_arcsec (N, 2): xi, eta of each frame minus those of the session.
     frame_stddev_arcsec (N, 2): what these should scatter by.
+    catalogue_factor: size of the catalogue's errors over what it states, by the session's own stars.
     chi2_per_degree: of the residuals; 1 where the stated errors and those of the air explain them.
     by_lean (N, 2, 2), by_second (N, 2): derivatives of the readings by eta and xi, and by a second of the clock, rad.
     projector (2 N, 2 N), weighted (2 N,): weights of the readings that the unknowns leave, and of their residuals, for
@@ -69,6 +71,7 @@ class Adjusted:
     frame_arcsec: np.ndarray
     frame_stddev_arcsec: np.ndarray
     air: Air
+    catalogue_factor: float
     chi2_per_degree: float
     by_lean: np.ndarray
     by_second: np.ndarray
@@ -110,6 +113,8 @@ def adjusted(
     """
     if len(sightings) < 3:
         raise FixError(f"{len(sightings)} frames make no session: at least 3, in several faces, are needed")
+    places = Places.of(sightings)
+    sightings = places.applied(sightings)
     faces, prior = faces_of(sightings), _prior_of(instrument)
     bending = atmosphere.refraction().a
     given = instrument.calibration
@@ -120,7 +125,7 @@ def adjusted(
     for _ in range(STEPS):
         lines = Lines.at(estimate, sightings, bending)
         errors = errors_of(
-            lines, sightings, faces, instrument.inclinometer, mark, since_unix_s=given.utc_unix_s
+            lines, sightings, places, faces, instrument.inclinometer, mark, since_unix_s=given.utc_unix_s
         )
         stated = np.sum([s.covariance for s in errors.sources], axis=0)
         # A3's prior stays where it was
@@ -130,7 +135,7 @@ def adjusted(
         estimate, offset = estimate.moved(fit.step), offset + fit.step
         if np.abs(fit.step).max() < SETTLED * np.sqrt(np.diag(fit.covariance)).min():
             break
-    return _adjusted(estimate, sightings, lines, errors, fit, air, faces, mark)
+    return _adjusted(estimate, sightings, lines, errors, fit, air, faces, mark, places.factor)
 
 
 def _prior_of(instrument: Instrument) -> np.ndarray:
@@ -193,6 +198,7 @@ def _adjusted(
     air: Air,
     faces: np.ndarray,
     mark: Mark,
+    catalogue_factor: float,
 ) -> Adjusted:
     # slow to import
     from scipy.linalg import cho_solve
@@ -236,6 +242,7 @@ def _adjusted(
         frame_arcsec=np.einsum("nab,nb->na", back, left)[:, ::-1] / ARCSEC,
         frame_stddev_arcsec=np.sqrt(np.diagonal(per_frame, axis1=1, axis2=2))[:, ::-1] / ARCSEC,
         air=air,
+        catalogue_factor=catalogue_factor,
         chi2_per_degree=fit.chi2 / max(left.size - 5, 1),
         by_lean=lines.by_lean,
         by_second=lines.by_sky @ (mark.enu[:, 2] * ROTATION_RAD_S),

@@ -9,6 +9,7 @@ import numpy as np
 from starpos.earth.orientation import ROTATION_RAD_S
 from starpos.instrument.inclinometer import InclinometerErrors
 from starpos.zenith.lines import Lines
+from starpos.zenith.places import Places
 from starpos.zenith.sighting import Mark, ZenithSighting
 
 HOUR_S = 3600.0
@@ -54,6 +55,7 @@ class Errors:
 def errors_of(
     lines: Lines,
     sightings: Sequence[ZenithSighting],
+    places: Places,
     faces: np.ndarray,
     inclinometer: InclinometerErrors,
     mark: Mark,
@@ -66,7 +68,7 @@ def errors_of(
     return Errors(
         sources=(
             *_of_tilts(sightings, faces, inclinometer, since_unix_s),
-            *_of_stars(lines, sightings),
+            *_of_stars(lines, sightings, places),
             *_of_time(lines, sightings, mark),
         ),
         motion=Source.varying("image motion", own, lines.by_lean),
@@ -118,19 +120,14 @@ def _shared_readings(sightings: Sequence[ZenithSighting]) -> np.ndarray:
     return member @ member.T
 
 
-def _of_stars(lines: Lines, sightings: Sequence[ZenithSighting]) -> list[Source]:
+def _of_stars(lines: Lines, sightings: Sequence[ZenithSighting], places: Places) -> list[Source]:
     n = len(sightings)
     roots = np.linalg.cholesky([s.centroids for s in sightings])
-    names, row = np.unique(np.concatenate([s.stars for s in sightings]), return_inverse=True)
-    ends = np.cumsum([0] + [len(s.stars) for s in sightings])
-    catalogue = np.zeros((n, 2, len(names), 3))
-    for k, s in enumerate(sightings):
-        catalogue[k][:, row[ends[k] : ends[k + 1]]] = np.einsum("ai,inj->anj", lines.by_camera[k], s.by_star)
     bent = np.array([s.by_refraction for s in sightings])
     rows = np.array([s.by_rows for s in sightings])
     return [
         Source.varying("centroids", np.eye(n), lines.by_camera @ roots),
-        Source.shared("catalogue", catalogue.reshape(n, 2, -1)),
+        Source.shared("catalogue", places.columns(lines.by_camera, sightings)),
         Source.shared("refraction", lines.by_camera @ bent[..., None]),
         Source.shared("shutter", lines.by_camera @ rows),
     ]

@@ -50,6 +50,8 @@ class ZenithSighting:
     about C's axes, rad.
     centroids (3, 3): covariance of it by the stars' places on the frame.
     stars (N,): rows of the catalogue.  by_star (3, N, 3): rotation for 1 sigma of each star's place along ICRS's axes.
+    star_weight (N, 3, 3), star_common (4, N, 3), star_pull (N, 3): normal equations of these displacements by this
+    frame's stars alone: each star's own weight, less what attitude and scale take up, and the right side.
     by_refraction (3,): rotation for 1 sigma of the refraction.  by_rows (3, 2): for the two errors of the rows' times.
     residual_arcsec (N, 2): the stars' places by the fit minus those seen, along the frame's columns and rows.
     """
@@ -60,6 +62,9 @@ class ZenithSighting:
     centroids: np.ndarray
     stars: np.ndarray
     by_star: np.ndarray
+    star_weight: np.ndarray
+    star_common: np.ndarray
+    star_pull: np.ndarray
     by_refraction: np.ndarray
     by_rows: np.ndarray
     residual_arcsec: np.ndarray
@@ -120,13 +125,13 @@ def sighting(solver: Solver, stars: Stars, found: Identification, mark: Mark, ti
         0.0,
         ECCENTRICITY2,
     )
-    catalogue_px2 = ISOTROPIC * ((matched.place_sigma * camera.fx) ** 2)[:, None, None]
-    stated = matched.covariance_px2 + catalogue_px2
-    fit = fitted(problem, camera.directions(*matched.xy.T), stated)
+    # the catalogue's errors do not weigh here: `places` adjusts them with those of all frames
+    fit = fitted(problem, camera.directions(*matched.xy.T), matched.covariance_px2)
     kept, residual = fit.kept, fit.residual[fit.kept]
-    extra2 = expected_extra(residual, stated[kept], share_free(fit.keep))
-    centroids = matched.covariance_px2[kept] + ISOTROPIC * extra2
-    errors = StarErrors.of(fit.slope[kept], centroids, catalogue_px2[kept], ())
+    catalogue_px2 = float(np.mean((matched.place_sigma[kept] * camera.fx) ** 2))
+    extra2 = expected_extra(residual, matched.covariance_px2[kept], share_free(fit.keep))
+    centroids = matched.covariance_px2[kept] + ISOTROPIC * max(extra2 - catalogue_px2, 0.0)
+    errors = StarErrors.of(fit.slope[kept], centroids, np.zeros_like(centroids), ())
     if not np.isfinite(errors.gain).all():
         raise FixError(
             f"{stars.place}: its {len(residual)} stars do not determine the attitude: more are needed"
@@ -137,7 +142,9 @@ def sighting(solver: Solver, stars: Stars, found: Identification, mark: Mark, ti
     across = np.array([rotation.cross_matrix(ray) for ray in rays])
     icrs_to_camera = fit.a4 @ mark.enu @ state.gcrs_to_itrs
     displaced_px = turns @ across @ icrs_to_camera * matched.place_sigma[kept, None, None]
-    gain = -errors.gain
+    gain, white = errors.gain, np.linalg.inv(np.linalg.cholesky(centroids))
+    shown = white @ displaced_px
+    common = np.linalg.qr((white @ fit.slope[kept]).reshape(-1, 4))[0].reshape(-1, 2, 4)
     stronger = solver.atmosphere.refraction(1 + STRONGER).bend(enu)[kept] - refraction.bend(enu)[kept]
     bent_px = np.einsum("nij,njk,nk->ni", turns, across, stronger @ fit.a4.T)
     pole = fit.a4 @ mark.enu[:, 2]
@@ -150,6 +157,9 @@ def sighting(solver: Solver, stars: Stars, found: Identification, mark: Mark, ti
         centroids=errors.rotation_covariance(centroids),
         stars=index[kept],
         by_star=np.einsum("ing,ngj->inj", gain, displaced_px),
+        star_weight=np.einsum("ngi,ngj->nij", shown, shown),
+        star_common=np.einsum("ngp,ngi->pni", common, shown),
+        star_pull=-np.einsum("ngi,ngh,nh->ni", shown, white, residual),
         by_refraction=np.einsum("ing,ng->i", gain, bent_px) * solver.atmosphere.relative_sigma / STRONGER,
         by_rows=np.einsum("ing,ng,nk->ik", gain, drift_px, late_s),
         residual_arcsec=residual * camera.scale_arcsec,

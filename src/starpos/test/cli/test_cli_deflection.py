@@ -99,7 +99,7 @@ def test_its_lines_for_people_and_its_table(run, session):
 
 
 def test_one_face_and_a_site_far_away_have_no_deflection(run, session):
-    status, out, err = run(*arguments(session, frames="stars_[01].csv"), "--json")
+    status, _, err = run(*arguments(session, frames="stars_[01].csv"), "--json")
     assert status == 1 and any("at least 3" in line for line in err)
     status, _, err = run(*arguments(session, latitude=LATITUDE + 0.1))
     assert status == 1 and any("no place of the Earth" in line and "km off" in line for line in err)
