@@ -1,6 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """A ROS domain of this session's own, the graph's other end, and a solver that a file's tests share."""
 
+import json
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -11,6 +14,23 @@ from starpos_testing.graph.tf2_messages import built
 from starpos_testing.nodes import take_domain
 
 ROOT = Path(__file__).parents[1]
+# a process of its own, as the test's has no tf2_msgs: a line for each transform
+LISTEN = """
+import json, sys, rclpy
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from tf2_msgs.msg import TFMessage
+rclpy.init()
+node = rclpy.create_node("listener")
+def on_message(message):
+    for t in message.transforms:
+        at, p, q = t.header.stamp, t.transform.translation, t.transform.rotation
+        names, numbers = [t.header.frame_id, t.child_frame_id], [p.x, p.y, p.z, q.x, q.y, q.z, q.w]
+        print(json.dumps([[at.sec, at.nanosec], names, numbers]), flush=True)
+topic, latched = sys.argv[1:]
+kept = DurabilityPolicy.TRANSIENT_LOCAL if latched == "latched" else DurabilityPolicy.VOLATILE
+node.create_subscription(TFMessage, topic, on_message, QoSProfile(depth=1000, durability=kept))
+rclpy.spin(node)
+"""
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -60,3 +80,23 @@ def tf2(variables_of_tf2, monkeypatch):
     """Nodes that are started have the package tf2_msgs, as on a robot."""
     for name, value in variables_of_tf2.items():
         monkeypatch.setenv(name, value)
+
+
+@pytest.fixture
+def listen(tf2, tmp_path):
+    """Listen to transforms from now on: listen(topic, "latched" or "") returns a function that gives those heard.
+
+    Each is its stamp, the names of parent and child, translation and quaternion.
+    """
+    listeners = []
+
+    def listen(topic, kind=""):
+        heard = tmp_path / f"transforms-{len(listeners)}"
+        with heard.open("w") as out:
+            listeners.append(subprocess.Popen([sys.executable, "-c", LISTEN, topic, kind], stdout=out))
+        return lambda: [json.loads(s) for s in heard.read_text().splitlines(keepends=True) if s[-1] == "\n"]
+
+    yield listen
+    for process in listeners:
+        process.kill()
+        process.wait()

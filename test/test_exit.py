@@ -14,7 +14,7 @@ CAMERA = (
 )
 
 
-@pytest.mark.parametrize("signals", [(signal.SIGINT, signal.SIGINT), (signal.SIGTERM,), (signal.SIGINT,)])
+@pytest.mark.parametrize("signals", [(signal.SIGINT, signal.SIGINT), (signal.SIGTERM,)])
 def test_all_at_work_end_with_status_0(graph, run, tmp_path, signals):
     port = tmp_path / "port"
     emulator = run("starpos_inclinometer", "emulator", arguments=("--link", str(port), "--tilt-x", "3"))
@@ -38,13 +38,13 @@ def test_all_at_work_end_with_status_0(graph, run, tmp_path, signals):
 
 
 def test_a_bad_start_is_one_line_and_status_1(graph, run):
-    for package, name, parameter in (
-        ("starpos_solver", "solver", "min_stars:=1"),
-        ("starpos_camera", "camera", "source:=nothing"),
-        ("starpos_camera", "detector", "threshold:=-1.0"),
-        ("starpos_inclinometer", "inclinometer", "rate:=0"),
-    ):
-        process = run(package, name, parameter)
+    started = [
+        run("starpos_solver", "solver", "min_stars:=1"),
+        run("starpos_camera", "camera", "source:=nothing"),
+        run("starpos_camera", "detector", "threshold:=-1.0"),
+        run("starpos_inclinometer", "inclinometer", "rate:=0"),
+    ]
+    for process in started:
         assert process.wait() == 1
         (line,) = process.output.splitlines()
-        assert line.startswith(name) and "must be" in line, line
+        assert line.startswith(process.name) and "must be" in line, line

@@ -11,7 +11,7 @@ import pytest
 from starpos_testing.patience import WAIT_S
 
 TOOL = Path(__file__).parent.parent / "tools" / "soaks" / "soak.py"
-FAULTS, SEED = 40, 20778
+FAULTS, SEED = 25, 20778
 
 
 @pytest.mark.timeout(5 * WAIT_S)

@@ -1,9 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The node `navigator`: a rover's messages become the command line's answer, and what cannot be is said."""
 
-import json
-import subprocess
-import sys
 from dataclasses import asdict
 from types import SimpleNamespace
 
@@ -27,19 +24,6 @@ from starpos_interfaces.msg import Attitude
 from starpos_testing.graph.graph import stamp_of
 from starpos_testing.voyages import CAMERA_TO_BODY, INDUSTRIAL, made
 
-LISTEN = """
-import json, rclpy
-from tf2_msgs.msg import TFMessage
-rclpy.init()
-node = rclpy.create_node("listener")
-def tell(message):
-    for t in message.transforms:
-        at, p, q = t.header.stamp, t.transform.translation, t.transform.rotation
-        names, numbers = [t.header.frame_id, t.child_frame_id], [p.x, p.y, p.z, q.x, q.y, q.z, q.w]
-        print(json.dumps([[at.sec, at.nanosec], names, numbers]), flush=True)
-node.create_subscription(TFMessage, "/tf", tell, 1000)
-rclpy.spin(node)
-"""
 SECONDS = 60
 # of readings between two reports while the adjustment catches up
 STEP_S = 0.1
@@ -53,15 +37,11 @@ def record():
 
 
 @pytest.fixture
-def transforms(graph, tf2, tmp_path):
+def transforms(graph, listen):
     """What is told on /tf: stamp, names of the frames, translation and quaternion, one after another."""
-    said = tmp_path / "tf"
-    with said.open("w") as out, subprocess.Popen([sys.executable, "-c", LISTEN], stdout=out) as listener:
-        graph.wait(lambda: graph.node.count_subscribers("/tf") == 1)
-        yield lambda: [
-            json.loads(line) for line in said.read_text().splitlines(keepends=True) if line[-1] == "\n"
-        ]
-        listener.kill()
+    heard = listen("/tf")
+    graph.wait(lambda: graph.node.count_subscribers("/tf") == 1)
+    return heard
 
 
 @pytest.fixture

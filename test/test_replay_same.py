@@ -190,10 +190,8 @@ def test_what_such_a_player_loses_is_named(graph, run):
 
 
 @pytest.mark.timeout(5 * WAIT_S)
-@pytest.mark.parametrize(("inputs", "rates"), [("stars", ("10",)), ("images", ("0",))])
-def test_three_busy_runs_are_the_same_to_the_last_byte(inputs, rates):
-    command = [sys.executable, str(SOAK), "bag", "--runs", "3", "--busy", "3", "--rates", *rates, "--processes", "4",
-               "--lanes", "3", "--inputs", inputs]  # fmt: skip
+def test_two_busy_runs_are_the_same_to_the_last_byte():
+    command = [sys.executable, str(SOAK), "bag", "--runs", "2", "--busy", "3", "--rates", "0", "--processes", "4",
+               "--lanes", "2", "--inputs", "images"]  # fmt: skip
     done = subprocess.run(command, capture_output=True, text=True, timeout=5 * WAIT_S, check=False)
-    told = f"{3 * len(rates)} runs, 1 different outcomes"
-    assert done.returncode == 0 and told in done.stdout, done.stdout + done.stderr
+    assert done.returncode == 0 and "2 runs, 1 different outcomes" in done.stdout, done.stdout + done.stderr

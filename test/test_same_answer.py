@@ -11,6 +11,7 @@ import pytest
 from starpos.instrument.inclinometer import Tilt
 from starpos_common.messages import tilt_to_message
 from starpos_interfaces import msg
+from starpos_testing.command_line import SENSOR
 from starpos_testing.graph.shots import focal_of
 
 SIZE = (1000, 700)
@@ -51,7 +52,7 @@ def test_the_graph_and_the_command_line_agree(graph, run, night):
     frames = sorted(night.glob("*.fits"))
     lines = starpos("solve", *frames, "--tilt", night / "tilt.csv", "--focal-mm", FOCAL_MM, "--pixel-um", PIXEL_UM,
                     "--misalignment", *MISALIGNMENT, "--misalignment-stddev", 5,
-                    "--inclinometer", "sca100t_calibrated", "--clock-stddev", CLOCK_S, *AIR,
+                    *SENSOR, "--clock-stddev", CLOCK_S, *AIR,
                     "--json").splitlines()  # fmt: skip
     expected = [json.loads(line) for line in lines][:FRAMES]
 

@@ -1,9 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The transforms of the instrument on /tf_static, as who listens later hears them."""
 
-import json
-import subprocess
-import sys
 from importlib.util import find_spec
 
 import numpy as np
@@ -13,43 +10,23 @@ from scipy.spatial.transform import Rotation
 from starpos.instrument import instrument_file
 from starpos.instrument.instrument import Calibration, Instrument
 from starpos_testing.graph.shots import FULL_FOCAL_PX, SOLVER, shoot
-from starpos_testing.patience import WAIT_S
 
 TF = "/tf_static"
-LISTEN = """
-import json, rclpy
-from rclpy.qos import DurabilityPolicy, QoSProfile
-from tf2_msgs.msg import TFMessage
-rclpy.init()
-node, heard = rclpy.create_node("listener"), []
-qos = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-node.create_subscription(TFMessage, "/tf_static", heard.append, qos)
-while not heard:
-    rclpy.spin_once(node)
-for t in heard[-1].transforms:
-    q = t.transform.rotation
-    print(json.dumps([t.header.frame_id, t.child_frame_id, [q.x, q.y, q.z, q.w]]))
-"""
 # x of the link is the camera's z, y its x: a camera that looks ahead
 AHEAD = ((0.0, 1.0, 0.0), (0.0, 0.0, 1.0), (1.0, 0.0, 0.0))
 MISALIGNMENT_DEG = (0.4, -0.3, 35.0)
 
 
-def heard() -> dict[tuple[str, str], np.ndarray]:
-    """The quaternions that a listener hears who comes now, by parent and child."""
-    done = subprocess.run(
-        [sys.executable, "-c", LISTEN], capture_output=True, text=True, timeout=WAIT_S, check=True
-    )
-    lines = map(json.loads, done.stdout.splitlines())
-    return {(parent, child): np.array(quaternion) for parent, child, quaternion in lines}
+def latest(heard) -> dict[tuple[str, str], np.ndarray]:
+    """The newest quaternions that were heard, by parent and child."""
+    return {tuple(names): np.array(pose[3:]) for _, names, pose in heard()}
 
 
 def turned(quaternion: np.ndarray, vector) -> np.ndarray:
     return Rotation.from_quat(quaternion).apply(vector)
 
 
-@pytest.mark.usefixtures("tf2")
-def test_who_listens_later_hears_how_camera_and_inclinometer_are_turned(graph, run, tmp_path):
+def test_who_listens_later_hears_how_camera_and_inclinometer_are_turned(graph, run, listen, tmp_path):
     calibration = Calibration.of(MISALIGNMENT_DEG, (5.0,) * 3)
     instrument = Instrument(FULL_FOCAL_PX, calibration=calibration, link_to_camera=AHEAD)
     instrument_file.write(tmp_path / "i.yaml", instrument)
@@ -64,7 +41,9 @@ def test_who_listens_later_hears_how_camera_and_inclinometer_are_turned(graph, r
     shot = shoot()
     graph.answer(shot)
     camera, inclinometer = shot.info.header.frame_id, shot.tilts[0].header.frame_id
-    transforms = heard()
+    heard = listen(TF, "latched")
+    graph.wait(lambda: len(heard()) >= 2)
+    transforms = latest(heard)
     assert set(transforms) == {("rover/mount", camera), (camera, inclinometer)}
     # The optical axis, as the link sees it.
     axis = turned(transforms["rover/mount", camera], (0, 0, 1))
@@ -74,17 +53,18 @@ def test_who_listens_later_hears_how_camera_and_inclinometer_are_turned(graph, r
     np.testing.assert_allclose(back, (0.1, 0.2, 0.9), atol=1e-12)
 
     assert graph.set("solver", misalignment_stddev=5.0, calibration_url="", frame_id="starpos_link")[0]
-    graph.wait(lambda: ("starpos_link", camera) in heard())
+    graph.wait(lambda: ("starpos_link", camera) in latest(heard))
     assert graph.set("solver", publish_tf=False) == (True, "")
     graph.wait(lambda: graph.node.count_publishers(TF) == 0)
 
 
-@pytest.mark.usefixtures("tf2")
-def test_an_inclinometer_that_nobody_has_measured_is_in_no_tree(graph, run):
+def test_an_inclinometer_that_nobody_has_measured_is_in_no_tree(graph, run, listen):
     run("starpos_solver", "solver")
     graph.wait_for_solver()
     graph.answer(shoot())
-    assert [child for _, child in heard()] == ["starpos_camera_optical_frame"]
+    heard = listen(TF, "latched")
+    graph.wait(heard)
+    assert [child for _, child in latest(heard)] == ["starpos_camera_optical_frame"]
 
 
 @pytest.mark.skipif(find_spec("tf2_msgs") is not None, reason="tf2_msgs is installed here")

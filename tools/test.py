@@ -48,7 +48,7 @@ NO_TESTS = 5
 # How many of the slowest tests are printed.
 SHOWN = 20
 # At once: on two cores, because tests of nodes mostly wait.
-LANES = 4
+LANES = 6
 # a folder's files in so many parts, which run as lanes are free
 PARTS = {"graph": 5, "starpos": 5, "starpos_camera": 3, "starpos_inclinometer": 2}
 # with Ubuntu's versions less is run

@@ -82,6 +82,6 @@ def test_a_file_of_another_camera_is_refused_when_it_is_set(make, tmp_path):
 
 def test_a_misalignment_without_its_error_is_not_known(make):
     _, nobody, _ = make(misalignment=[1.0, 2.0, 3.0])
-    assert nobody.calibration(None).unknown
+    assert nobody.instrument(None).calibration.unknown
     _, known, _ = make(misalignment=[1.0, 2.0, 3.0], misalignment_stddev=5.0)
-    assert not known.calibration(None).unknown
+    assert not known.instrument(None).calibration.unknown

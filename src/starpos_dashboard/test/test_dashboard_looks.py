@@ -8,6 +8,7 @@ import said
 from browser import ELLIPSES, LAMPS, OK, metres_per_px
 
 from starpos.cli import main
+from starpos_testing.command_line import A3, OPTICS
 
 CONTRAST = """
 const parse = (c) => c.match(/[\\d.]+/g).map(Number);
@@ -103,20 +104,9 @@ def test_no_card_is_empty_by_a_third_and_no_letter_too_small(page, width, height
 
 
 def test_a_nights_report_fits_a_phone(driver, tmp_path):
-    wide = ("--focal-mm", "29.67", "--pixel-um", "6.4")
-    known = (
-        "--misalignment",
-        "0",
-        "0",
-        "0",
-        "--misalignment-stddev",
-        "5",
-        "--inclinometer",
-        "sca100t_calibrated",
-    )
     night, report = tmp_path / "night", tmp_path / "report"
-    assert main(["simulate", str(night), "-n", "2", "--stars-only", "--size", "1000", "700", *wide]) == 0
-    assert main(["report", str(night), *wide, *known, "-o", str(report)]) == 0
+    assert main(["simulate", str(night), "-n", "2", "--stars-only", "--size", "1000", "700", *OPTICS]) == 0
+    assert main(["report", str(night), *OPTICS, *A3, "-o", str(report)]) == 0
     metrics = {"width": 360, "height": 740, "deviceScaleFactor": 3, "mobile": True}
     driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", metrics)
     try:

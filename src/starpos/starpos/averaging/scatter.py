@@ -142,7 +142,8 @@ def scatter_of(frames: Frames) -> Scatter:
             # and frames of a pose may have more noise too
             for noise in noises:
                 more = _sized(beside + noise**2 * wandering[0].kernel, [shape], sizes, prior / len(noises))
-                tried += [(w, c, v + noise**2 * wandering[0].means) for w, c, v in more]
+                means: np.ndarray = noise**2 * wandering[0].means
+                tried += [(w, c, v + means) for w, c, v in more]
     weights, covariances, shares = zip(*tried, strict=True)
     normals, pulls, bares = _sums(y, j, np.array(covariances))
     # each hypothesis of the scatter with each of the response, one after another

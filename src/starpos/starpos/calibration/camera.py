@@ -18,9 +18,10 @@ from starpos.calibration.intrinsics import (
     fewest_stars,
     fit_camera,
 )
+from starpos.calibration.misalignment import NOTHING_KNOWN, Known
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import CalibrationError, InstrumentError
-from starpos.fix.fix import sound_matches
+from starpos.fix.matched import sound_matches
 from starpos.fix.seen import high_enough
 from starpos.fix.solver import ENOUGH_SOUND
 from starpos.frames.stars import Stars
@@ -63,12 +64,14 @@ def calibrate_camera(
     catalogue: Catalogue,
     atmosphere: Atmosphere,
     progress: Progress = quiet,
+    known: Known = NOTHING_KNOWN,
 ) -> FromSky:
     """One camera from frames of any attitudes.
 
     levels: for each frame the rotation (3, 3) of C into the local level L, None if unknown.
     given: a camera that is right to 3 % of the focal length and a few px of distortion; a fisheye to 5 px within 30 deg
     of its axis.
+    known: the stars of frames, by the frames' numbers, that only a longer search identifies.
     Frames that are not identified are left out.  Raises CalibrationError if no camera can be found, InstrumentError for
     a mirrored frame, TimeError for an impossible time.
     """
@@ -87,7 +90,7 @@ def calibrate_camera(
     every = parameters(given)
     skies = [_Frame.of(stars, level, catalogue, table) for stars, level in zip(frames, levels, strict=True)]
     camera, before = given, 0
-    attitudes: dict[int, np.ndarray] = {}
+    attitudes = {n: found.attitude for n, found in known.items() if not found.mirrored}
     for k, free in enumerate((*FIRST_FREE, *[every] * ROUNDS)):
         sightings = {}
         for n, frame in enumerate(skies):

@@ -8,7 +8,7 @@ import numpy as np
 
 from starpos import rotation
 from starpos.averaging.slip import poses_of
-from starpos.calibration.misalignment import Calibrated, calibrate_at
+from starpos.calibration.misalignment import NOTHING_KNOWN, Calibrated, Known, calibrate_at
 from starpos.errors import FixError
 from starpos.fix.solver import Solver
 from starpos.frames.pointings import Pointing
@@ -34,9 +34,11 @@ def calibrate_fixed(
     site_stddev_arcsec: float = 0.0,
     sag_arcsec_per_sqrt_hour: float = SAG_ARCSEC_PER_SQRT_HOUR,
     progress: Progress = quiet,
+    known: Known = NOTHING_KNOWN,
 ) -> Calibrated:
     """The instrument with the camera's own vertical, from frames of a camera at rest at a known astronomic place.
 
+    known: the stars of frames, as `calibrate_at` has them.
     Raises FixError if there is no fix, the frames do not agree, or the camera was touched between them.
     """
     level = level_errors(sag_arcsec_per_sqrt_hour)
@@ -44,7 +46,7 @@ def calibrate_fixed(
         solver,
         instrument=replace(solver.instrument, inclinometer=level, inclinometer_model="", vertical=None),
     )
-    found = calibrate_at(bare, frames, OWN_LEVEL, site, site_stddev_arcsec, TURN_DEG, progress)
+    found = calibrate_at(bare, frames, OWN_LEVEL, site, site_stddev_arcsec, TURN_DEG, progress, known)
     fixes = found.fixes
     if poses_of(fixes).any():
         raise FixError(

@@ -8,6 +8,7 @@ from types import MappingProxyType
 import numpy as np
 
 from starpos.averaging.scatter import Scatter
+from starpos.averaging.slip import poses_of
 from starpos.calibration.plumb_fit import PlumbLine
 from starpos.calibration.plumb_line import FEWEST_POSES, hang, settled, typical
 from starpos.calibration.readings import FixedFrame, Readings
@@ -272,7 +273,8 @@ def _agreed(
     rows, plumb = _agreeing(find, whole, solved, a3, errors)
     sound = [solved[k] for k in rows]
     fixes = [s.fix for s in sound]
-    readings = whole.take(rows)
+    # a fix with a bad tilt, hence a bad refraction, may have split the pose of the sound ones
+    readings = replace(whole.take(rows), pose=poses_of(fixes))
     _, scatter = settled(plumb, readings)
     # once more about the answer, with what the poses tell of their errors
     noisy = np.hypot(readings.sigma, scatter.noise_sigma)

@@ -14,25 +14,32 @@ from starpos.calibration.camera_adjustment import UNLEVELLED, UNTIMED, parameter
 from starpos.calibration.intrinsics import Intrinsics, rms
 from starpos.cli import calibrate_site, console, options, overwriting
 from starpos.cli.archive import frames_among
-from starpos.cli.inputs import checked_tilts, reader_of
+from starpos.cli.inputs import checked_tilts, given_of, reader_of
 from starpos.cli.output import add_formats
 from starpos.cli.overwriting import CAMERA_NAME, Written
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import CalibrationError, FixError, FrameError, InstrumentError, StarposError
+from starpos.fix.solver import Solver
 from starpos.frames.pointings import Pointing, read_pointings
 from starpos.frames.reading import why_no_time
 from starpos.frames.stars import Stars
+from starpos.identification import Identification
 from starpos.instrument import camera_file, instrument_update
 from starpos.instrument.axis import with_frame_size
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import level_of
 from starpos.instrument.instrument import Instrument
 from starpos.instrument.tilt_log import TiltLog
-from starpos.night.reading import NO_CAMERA, First, Reader, stars_of
+from starpos.night.hints import of_one_camera
+from starpos.night.reading import NO_CAMERA, First, Given, Reader
+from starpos.night.searching import Sight
+from starpos.night.work import Identifying
 from starpos.sky import catalogue
 
 # Exit status.
 NOTHING = 1
+# the stars of a frame, and what is identified of them
+_Seen = tuple[Stars, Identification | None]
 
 
 def define(parser: argparse.ArgumentParser) -> None:
@@ -73,14 +80,18 @@ def run(args: argparse.Namespace) -> int:
     if args.pointings is not None:
         return _from_pointings(args)
     read, args.frames = reader_of(args), frames_among(args.frames, args.tilt)
-    # an instrument that cannot be used is refused before all frames are worked on
-    if (first := First(read)(tuple(args.frames))) is not None:
-        calibrate_site.check_output(args, with_frame_size(options.instrument_of(args, first), first)[0])
-    frames, unreadable = _stars_of_all(args.frames, read)
-    if not frames:
+    first = First(read)(tuple(args.frames))
+    if first is None:
+        # each frame says why it cannot be read
+        _sights(args.frames, read, Given(None))
         return console.UNREADABLE
     # an error of the axis that all frames share becomes part of the A3 that is found
-    instrument, _ = with_frame_size(options.instrument_of(args, frames[0]), frames[0])
+    instrument, _ = with_frame_size(options.instrument_of(args, first), first)
+    # an instrument that cannot be used is refused before all frames are worked on
+    calibrate_site.check_output(args, instrument)
+    sights, unreadable = _sights(args.frames, read, replace(given_of(args, first), instrument=instrument))
+    solver, frames = of_one_camera(Solver(instrument, catalogue.load_catalogue()), sights)
+    instrument = solver.instrument
     tilts = _tilts(args, instrument)
     try:
         if args.camera is not None:
@@ -89,9 +100,13 @@ def run(args: argparse.Namespace) -> int:
                 console.complain(
                     "calibrate", "an A3 belongs to the camera it was found with: find it again with this one"
                 )
+            frames = [
+                (s, k and k.but(focal_scale=k.focal_scale * instrument.focal_px / camera.fx))
+                for s, k in frames
+            ]
             instrument = replace(instrument, camera=camera, focal_px=camera.fx)
         if args.site is not None:
-            calibrate_site.run(args, frames, instrument, tilts)
+            calibrate_site.run(args, [s for s, _ in frames], instrument, tilts, _known(frames))
     except (CalibrationError, FixError) as e:
         console.complain("calibrate", e)
         return console.UNREADABLE if unreadable else NOTHING
@@ -147,36 +162,43 @@ def _written(args: argparse.Namespace) -> Iterator[Written]:
         yield Written("--output", args.output, instrument_update.check_replaceable)
 
 
-def _stars_of_all(paths: Sequence[str], read: Reader) -> tuple[list[Stars], bool]:
-    """The stars of the frames that can be read, and whether some cannot."""
-    progress, unreadable = console.ProgressBar(), False
-    frames: list[Stars] = []
+def _sights(paths: Sequence[str], read: Reader, given: Given) -> tuple[list[Sight], bool]:
+    """The frames that can be read, identified by every way there is, and whether some cannot be read."""
+    progress, unreadable, work = console.ProgressBar(), False, Identifying(given)
+    sights: list[Sight] = []
     for k, path in enumerate(paths):
         try:
-            frames.append(stars_of(read(path)))
+            sight, _ = work(read(path))
+            sights.append(sight)
+            if sight.solution.remark:
+                console.complain("calibrate", sight.solution.remark)
         except FrameError as e:
             console.complain("calibrate", e)
             unreadable = True
         progress("frames", (k + 1) / len(paths))
-    return frames, unreadable
+    return sights, unreadable
+
+
+def _known(frames: Sequence[_Seen]) -> dict[int, Identification]:
+    """What is identified of frames, by their numbers."""
+    return {n: found for n, (_, found) in enumerate(frames) if found is not None}
 
 
 def _camera(
-    args: argparse.Namespace, frames: list[Stars], instrument: Instrument, tilts: TiltLog | None
+    args: argparse.Namespace, seen: list[_Seen], instrument: Instrument, tilts: TiltLog | None
 ) -> Camera:
     """Fit the camera of --camera, write, draw and print it."""
-    air = options.atmosphere_of(args)
-    given = instrument.camera_for(frames[0].width, frames[0].height, frames[0].origin_px)
-    if {(f.width, f.height, f.origin_px) for f in frames} != {
-        (given.width, given.height, frames[0].origin_px)
-    }:
+    air, (first, _) = options.atmosphere_of(args), seen[0]
+    given = instrument.camera_for(first.width, first.height, first.origin_px)
+    if {(f.width, f.height, f.origin_px) for f, _ in seen} != {(given.width, given.height, first.origin_px)}:
         raise InstrumentError(
             "the frames are not all of one size and one part of the sensor: give such ones for --camera"
         )
-    levels: Sequence[np.ndarray | None] = [None] * len(frames)
+    levels: Sequence[np.ndarray | None] = [None] * len(seen)
     if tilts is not None:
-        frames, levels = _levelled(frames, instrument, tilts)
-    found = calibrate_camera(frames, levels, given, catalogue.load_catalogue(), air, console.ProgressBar())
+        seen, levels = _levelled(seen, instrument, tilts)
+    frames, bar = [stars for stars, _ in seen], console.ProgressBar()
+    found = calibrate_camera(frames, levels, given, catalogue.load_catalogue(), air, bar, _known(seen))
     for k in sorted(set(range(len(frames))) - set(found.used)):
         console.complain("calibrate", f"{frames[k].source}: none of the sky fits it, it is left out")
     if tilts is None:
@@ -194,18 +216,18 @@ def _camera(
 
 
 def _levelled(
-    frames: Sequence[Stars], instrument: Instrument, tilts: TiltLog
-) -> tuple[list[Stars], list[np.ndarray]]:
+    frames: Sequence[_Seen], instrument: Instrument, tilts: TiltLog
+) -> tuple[list[_Seen], list[np.ndarray]]:
     """The frames that have a tilt, with the rotation (3, 3) of C into L for each; complains about the others."""
-    kept: list[Stars] = []
+    kept: list[_Seen] = []
     levels: list[np.ndarray] = []
-    for stars in frames:
+    for stars, found in frames:
         try:
             if stars.mid_unix_s is None:
                 raise FrameError(f"no time of exposure: {why_no_time(stars)}")
             tilt = tilts.average(stars.mid_unix_s, stars.exposure_s or 0.0)
             levels.append(level_of(tilt.up) @ instrument.mounting.a3)
-            kept.append(stars)
+            kept.append((stars, found))
         except StarposError as e:
             console.complain("calibrate", f"{stars.source} is left out: {e}")
     if not kept:

@@ -9,10 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from starpos.calibration.fixed_camera import calibrate_fixed
-from starpos.calibration.misalignment import Calibrated, calibrate_at
+from starpos.calibration.misalignment import NOTHING_KNOWN, Calibrated, Known, calibrate_at
 from starpos.calibration.unknown import TELL_IT, at_another_lean, may_turn
 from starpos.cli import console, options
-from starpos.cli.inputs import tell_unnamed
 from starpos.cli.overwriting import save_instrument
 from starpos.cli.vertical import add_vertical, vertical_of
 from starpos.earth.vertical import astronomic
@@ -26,6 +25,7 @@ from starpos.instrument.inclinometer import up_of
 from starpos.instrument.instrument import Calibration, Instrument
 from starpos.instrument.tilt_log import TiltLog
 from starpos.night.elevations import axis_of, circles_of
+from starpos.night.remarks import of_inclinometer
 from starpos.sky import catalogue
 from starpos.sky.site import Site
 from starpos.units import ARCSEC
@@ -125,22 +125,25 @@ def run(
     frames: Sequence[Stars | Pointing],
     instrument: Instrument,
     tilts: TiltLog | None,
+    known: Known = NOTHING_KNOWN,
 ) -> None:
-    """Find A3, or the vertical of a fixed camera, write and print it; raises FixError if the frames do not tell it."""
+    """Find A3, or the vertical of a fixed camera, write and print it; raises FixError if the frames do not tell it.
+
+    known: what is identified of the frames already.
+    """
     solver = Solver(instrument, catalogue.load_catalogue(), options.atmosphere_of(args))
-    site, stddev_arcsec = _site(args)
+    (site, stddev_arcsec), bar = _site(args), console.ProgressBar()
     if tilts is None:
         sag = SAG_ARCSEC_PER_SQRT_HOUR if args.sag is None else args.sag
-        found = calibrate_fixed(solver, frames, site, stddev_arcsec, sag, console.ProgressBar())
+        found = calibrate_fixed(solver, frames, site, stddev_arcsec, sag, bar, known)
     elif instrument.vertical is not None:
         raise InstrumentError(
             f"{args.instrument} is of a camera that is fixed to the ground: give --fixed, or another instrument file"
         )
     else:
-        tell_unnamed("calibrate", instrument)
-        found = calibrate_at(
-            solver, frames, tilts, site, stddev_arcsec, options.turn_of(args), console.ProgressBar()
-        )
+        found = calibrate_at(solver, frames, tilts, site, stddev_arcsec, options.turn_of(args), bar, known)
+        for remark in of_inclinometer(instrument):
+            console.complain("calibrate", remark)
     for solution in found.solutions:
         if solution.fix is None:
             console.complain("calibrate", f"left out: {solution.message}")
@@ -168,9 +171,10 @@ def run_elevations(
     for row in circles_of(solver, pointings, tilts):
         if isinstance(row, StarposError):
             console.complain("calibrate", f"left out: {row}")
-    tell_unnamed("calibrate", instrument)
     site, stddev_arcsec = _site(args)
     found = axis_of(solver, pointings, tilts, site=site, site_stddev_arcsec=stddev_arcsec)
+    for remark in of_inclinometer(instrument):
+        console.complain("calibrate", remark)
     calibration = found.calibration(instrument.calibration, options.turn_of(args))
     if args.valid_days is not None:
         calibration = replace(calibration, valid_days=args.valid_days)

@@ -9,12 +9,13 @@ import numpy as np
 
 from starpos.cli import console, jobs, options
 from starpos.cli.archive import frames_among
-from starpos.cli.inputs import checked_tilts, given_of, reader_of, tell_unnamed
+from starpos.cli.inputs import checked_tilts, given_of, reader_of
 from starpos.cli.output import Output, add_formats
 from starpos.errors import FixError, FrameError, InstrumentError
 from starpos.fix.solution import Solution
 from starpos.instrument.axis import with_frame_size
 from starpos.night.reading import First
+from starpos.night.remarks import of_inclinometer
 from starpos.night.sightings import DeflectionSession, Sighted
 from starpos.night.work import OnFile
 from starpos.units import ARCSEC
@@ -71,7 +72,8 @@ def run(args: argparse.Namespace) -> int:
             console.complain("deflection", doubt)
         given = replace(given_of(args, about), instrument=instrument)
         tilts = checked_tilts("deflection", os.path.abspath(args.tilt), instrument)
-        tell_unnamed("deflection", instrument)
+        for remark in of_inclinometer(instrument):
+            console.complain("deflection", remark)
         jobs.prepare("deflection", instrument, about)
         air = options.atmosphere_of(args)
         work = OnFile(read, Sighted(given, air, tilts, mark))

@@ -109,6 +109,7 @@ def as_json(path: str, s: Solution) -> dict:
         "warnings": list(s.warnings),
         "bright_explained": [s.explained.explained, s.explained.bright] if s.explained else None,
         "bright_seen": [s.explained.seen, s.explained.due] if s.explained else None,
+        "remark": s.remark or None,
     }
 
 

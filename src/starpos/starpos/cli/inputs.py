@@ -10,7 +10,7 @@ from starpos.instrument.instrument import Instrument
 from starpos.instrument.lens import PLUMB_BOB
 from starpos.night.doubts import NEAR_KM, Near
 from starpos.night.reading import About, Given, Reader, TiltFile
-from starpos.night.remarks import of_inclinometer, of_tilts
+from starpos.night.remarks import of_tilts
 
 
 def reader_of(args: argparse.Namespace) -> Reader:
@@ -39,12 +39,6 @@ def checked_tilts(command: str, path: str, instrument: Instrument) -> TiltFile:
     for remark in of_tilts(file.log, path):
         console.complain(command, remark)
     return file
-
-
-def tell_unnamed(command: str, instrument: Instrument) -> None:
-    """Complain where nobody has said which inclinometer it is."""
-    for remark in of_inclinometer(instrument):
-        console.complain(command, remark)
 
 
 def add_near(parser: argparse.ArgumentParser) -> None:

@@ -11,15 +11,15 @@ import numpy as np
 from starpos.cli import console, jobs, options
 from starpos.cli.archive import frames_among
 from starpos.cli.fix_output import HEAD, in_degrees
-from starpos.cli.inputs import reader_of
+from starpos.cli.inputs import given_of, reader_of
 from starpos.cli.output import Output, add_formats
 from starpos.cli.vertical import add_vertical, tell_unknown, vertical_of
 from starpos.earth.orientation import earth_orientation
 from starpos.earth.vertical import Vertical, geodetic
-from starpos.errors import FixError, FrameError, VoyageError
+from starpos.errors import FixError, FrameError, InstrumentError, TimeError, VoyageError
 from starpos.fix.readable import InDegrees
 from starpos.fix.solver import Solver
-from starpos.instrument.instrument import Instrument
+from starpos.instrument.axis import AxisDoubt, framed
 from starpos.navigation.imu import ImuModel, read_imu, read_imu_model
 from starpos.navigation.laws import LAWS
 from starpos.navigation.sightings import IdentifiedFrame, sighting_of
@@ -27,11 +27,12 @@ from starpos.navigation.velocity import read_velocity
 from starpos.navigation.vessel import Vessel
 from starpos.navigation.voyage import Voyage, navigate
 from starpos.navigation.voyage_fix import VoyageFix
-from starpos.night.reading import First, Reader, stars_of
+from starpos.night.reading import First, Given, Reader
+from starpos.night.work import Identifying
 from starpos.sky import catalogue
 
 NO_ANSWER = 1
-MOUNT_STDDEV_DEG = 1.0
+MOUNT_STDDEV_DEG, MOST_MOUNT_DEG = 1.0, 20.0
 # of --altitude-m: the geoid, and hills on the way
 GIVEN_HEIGHT_STDDEV_M = 100.0
 OK, CARRIED, NO_READINGS, BAD_INPUT = "ok", "carried", "no inertial readings", "bad input"
@@ -75,7 +76,7 @@ def define(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--mount-stddev",
-        type=options.number(1e-4, 20),
+        type=options.number(1e-4, MOST_MOUNT_DEG),
         default=MOUNT_STDDEV_DEG,
         metavar="DEG",
         help="how well the camera sits as the instrument says, an axis: z up, the top of the frame forward "
@@ -112,7 +113,7 @@ def define(parser: argparse.ArgumentParser) -> None:
 
 @dataclass(frozen=True)
 class FrameSeen:
-    """A frame's time, its stars as far as they are identified, and else why not."""
+    """A frame's time, its stars as far as they are identified, and else why not, or what else is to be said of it."""
 
     utc_unix_s: float | None
     sighting: IdentifiedFrame | None
@@ -124,16 +125,18 @@ class Seeing:
     """Work of `navigate`: a FrameSeen."""
 
     read: Reader
-    instrument: Instrument
+    given: Given
 
     def __call__(self, path: str) -> FrameSeen:
-        stars = stars_of(self.read(path))
+        item = self.read(path)
+        sight, _ = Identifying(self.given)(item)
+        instrument = sight.instrument or self.given.of(item)
+        assert instrument is not None
+        eye, time_s = Solver(instrument, catalogue.load_catalogue()), item.mid_unix_s
         try:
-            return FrameSeen(
-                stars.mid_unix_s, sighting_of(stars, Solver(self.instrument, catalogue.load_catalogue()))
-            )
-        except FrameError as error:
-            return FrameSeen(stars.mid_unix_s, None, str(error))
+            return FrameSeen(time_s, sighting_of(sight.stars, eye, sight.solution), sight.solution.remark)
+        except (FrameError, TimeError) as error:
+            return FrameSeen(time_s, None, str(error))
 
 
 def run(args: argparse.Namespace) -> int:
@@ -151,9 +154,11 @@ def run(args: argparse.Namespace) -> int:
         (about,) = workers.map([(First(read), tuple(args.frames))])
         if about is None:
             raise VoyageError(f"none of the {number} frames can be read: give star lists or frames")
-        instrument = options.instrument_of(args, about)
+        instrument, doubt = framed(options.instrument_of(args, about), about)
+        mount_stddev = _mount_stddev(args, doubt)
         jobs.prepare("navigate", instrument, about)
-        answers = jobs.watched(workers.map((Seeing(read, instrument), path) for path in args.frames), number)
+        work = Seeing(read, replace(given_of(args, about), instrument=instrument))
+        answers = jobs.watched(workers.map((work, path) for path in args.frames), number)
         seen = [FrameSeen(None, None, str(a)) if isinstance(a, FrameError) else a for a in answers]
     for frame in seen:
         if frame.message:
@@ -162,7 +167,7 @@ def run(args: argparse.Namespace) -> int:
         vehicle=args.vehicle,
         model=model,
         camera_to_body=np.asarray(instrument.link_to_camera, float).T,
-        mount_stddev=np.radians(args.mount_stddev),
+        mount_stddev=mount_stddev,
         atmosphere=options.atmosphere_of(args),
         clock_stddev_s=instrument.clock_stddev_s,
         drift_stddev=args.drift_stddev,
@@ -178,6 +183,18 @@ def run(args: argparse.Namespace) -> int:
         console.complain("navigate", error)
         return NO_ANSWER
     return tell(args, seen, voyage, vertical)
+
+
+def _mount_stddev(args: argparse.Namespace, doubt: AxisDoubt | None) -> float:
+    """1 sigma in rad of the mount, of which an axis that nobody knows is a part; InstrumentError if that is too wide."""
+    stddev = math.radians(args.mount_stddev)
+    if doubt is None:
+        return stddev
+    said, stddev = doubt.counted_as("the mount"), math.hypot(stddev, doubt.error_rad)
+    if math.degrees(stddev) > MOST_MOUNT_DEG:
+        raise InstrumentError(f"{said}; a mount that is known no better tells no place under way")
+    console.complain("navigate", said)
+    return stddev
 
 
 def tell(args: argparse.Namespace, seen: list[FrameSeen], voyage: Voyage, vertical: Vertical) -> int:

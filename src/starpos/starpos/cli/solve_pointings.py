@@ -11,7 +11,7 @@ from starpos.calibration.axis import FoundAxis
 from starpos.cli import console, options
 from starpos.cli.archive import NightFolder
 from starpos.cli.fix_output import COLUMNS, HEAD, json_of, put_combined
-from starpos.cli.inputs import checked_tilts, near_of, tell_unnamed
+from starpos.cli.inputs import checked_tilts, near_of
 from starpos.cli.output import Output
 from starpos.cli.overwriting import save_instrument
 from starpos.cli.solved_night import NO_FIX, check_save, say, tell, tell_turned
@@ -47,7 +47,6 @@ def run(args: argparse.Namespace) -> int:
     solver, saving = _solver_of(args), 0
     check_save(args, solver.instrument)
     tilts = NO_TILTS if own_level else checked_tilts("solve", args.tilt, solver.instrument)
-    tell_unnamed("solve", solver.instrument)
     whole = [p for p in pointings if p.has_roll]
     output = Output(args, COLUMNS, HEAD if whole else ELEVATIONS_HEAD)
     if not whole:

@@ -27,7 +27,7 @@ SEARCH_S = 20.0
 
 @dataclass(frozen=True)
 class BlindSolver:
-    """Identifies frames of any scale, those of fisheyes too; where EXIF tells a scale, first near that.
+    """Identifies frames of any scale, those of fisheyes too; where EXIF tells a scale or a fisheye, first by that.
 
     stages, fisheye_stages: of the search; fewer are quicker.
     search_s: CPU time after which the search of a frame ends.
@@ -71,7 +71,7 @@ class BlindSolver:
         return identified(seen, field, sky, camera, found, begin).among(stars, inside)
 
     def _match(self, seen: Stars, sky: Sky, budget: Budget) -> tuple[Camera, Identification] | None:
-        """A camera and its identification of stars: of a pinhole, else of a fisheye, which comes first in a disc."""
+        """A camera and its identification of stars: of a pinhole, else of a fisheye, first where it looks like one."""
         quads = quad_cache.cached(self.catalogue, self.progress)
         xy = np.stack([seen.x, seen.y], 1)
         about = xy, seen.sigma, seen.width, seen.height, sky, quads
@@ -84,7 +84,7 @@ class BlindSolver:
             return identify_blind(*about, self.stages, near_px, seen.window, budget, self.progress)
 
         ways = (by_pinhole, by_fisheye)
-        if disc_radius_px(xy, seen.width, seen.height) is not None:
+        if seen.fisheye or disc_radius_px(xy, seen.width, seen.height) is not None:
             ways = (by_fisheye, by_pinhole)
         return ways[0]() or ways[1]()
 
@@ -107,4 +107,6 @@ def _why(seen: Stars, search_s: float, budget: Budget) -> str:
         )
     if disc_radius_px(np.stack([seen.x, seen.y], 1), seen.width, seen.height) is not None:
         what += "; the stars lie in a disc, as those of a fisheye do: give its focal length with --lens equidistant"
+    elif seen.fisheye:
+        what += "; its EXIF calls the lens a fisheye: give its focal length with --lens equidistant"
     return f"{seen.place}: {what}"

@@ -32,6 +32,9 @@ UNITS_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 ZONE_STEP_S, GPS_APART_S = 900.0, 450.0
 # Sides of a picture over those that the camera made: both alike, or it was cropped, but for rounding.
 SAME_SHAPE = 0.02
+# A lens, or a camera with its lens, that is called a fisheye: "EF8-15mm f/4L FISHEYE USM", "AF Fish-Eye-Nikkor 16mm".
+FISHEYE = re.compile(r"fish[ _-]?eye", re.IGNORECASE)
+NAMES = ("EXIF LensModel", "EXIF LensMake", "Image Model", "Image Make")
 # A focal length over the frame's diagonal that no lens has lies beyond these.
 SHORTEST, LONGEST = 0.1, 1000.0
 
@@ -60,10 +63,11 @@ def told(data: bytes, place: str, clock: CameraClock | None, shape: tuple[int, .
     """Read from the EXIF of a TIFF, JPEG, PNG or TIFF-like raw file (DNG, CR2, NEF ...) what a Frame has fields for.
 
     shape is that of the pixels, rows first. exposure_s comes from ExposureTime, rough_focal_px from
-    FocalLengthIn35mmFilm, else from FocalLength and FocalPlaneXResolution; origin_px is NaN if the picture has another
-    shape than the camera gave it (ExifImageWidth, ExifImageLength). With a clock also mid_unix_s, stamp_stddev_s and
-    clock_stddev_s, or untimed: DateTimeOriginal and SubSecTimeOriginal are the start of the exposure, rounded down; when
-    the shutter opened is known less well. FrameError if exifread is missing where a clock asks for it.
+    FocalLengthIn35mmFilm, else from FocalLength and FocalPlaneXResolution; fisheye from the names of lens and camera;
+    origin_px is NaN if the picture has another shape than the camera gave it (ExifImageWidth, ExifImageLength). With a
+    clock also mid_unix_s, stamp_stddev_s and clock_stddev_s, or untimed: DateTimeOriginal and SubSecTimeOriginal are the
+    start of the exposure, rounded down; when the shutter opened is known less well. FrameError if exifread is missing
+    where a clock asks for it.
     """
     try:
         import exifread
@@ -81,6 +85,7 @@ def told(data: bytes, place: str, clock: CameraClock | None, shape: tuple[int, .
     exposure_s = _exposure_s(tags)
     known: dict[str, Any] = {} if exposure_s is None else {"exposure_s": exposure_s}
     known["rough_focal_px"] = _focal_px(tags, shape[1], shape[0])
+    known["fisheye"] = any(FISHEYE.search(_text(tags, name)) for name in NAMES)
     if _cropped(tags, shape[1], shape[0]):
         known["origin_px"] = (math.nan, math.nan)
     if clock is None:
@@ -145,7 +150,7 @@ def _start(tags: Mapping, clock: CameraClock) -> tuple[float, float]:
     The zone is the clock's, else OffsetTimeOriginal's, else what GPS's time says; TimeError if there is no time, no zone,
     or if GPS contradicts it.
     """
-    text = _text(tags, "DateTimeOriginal")
+    text = _text(tags, "EXIF DateTimeOriginal")
     try:
         shown = datetime.strptime(text, "%Y:%m:%d %H:%M:%S")
     except ValueError:
@@ -154,12 +159,12 @@ def _start(tags: Mapping, clock: CameraClock) -> tuple[float, float]:
         raise TimeError(f"its EXIF was taken at {text!r}, which is no time: set the camera's clock")
     shown_s = shown.replace(tzinfo=timezone.utc).timestamp()
     ahead_s = None if (gps_s := _gps_unix_s(tags)) is None else shown_s - gps_s
-    offset_s = _stated_offset_s(tags, clock)
+    offset_s, zone = _stated_offset_s(tags, clock), _text(tags, "EXIF OffsetTimeOriginal")
     if offset_s is None and ahead_s is not None and abs(ahead_s) <= 3600 * ZONES_H + GPS_APART_S:
         offset_s = round(ahead_s / ZONE_STEP_S) * ZONE_STEP_S
     if offset_s is None:
         raise TimeError(
-            f"its EXIF has no zone (OffsetTimeOriginal is {_text(tags, 'OffsetTimeOriginal')!r}) and no time by GPS: say "
+            f"its EXIF has no zone (OffsetTimeOriginal is {zone!r}) and no time by GPS: say "
             "by how many hours the camera's clock is before UTC"
         )
     if ahead_s is not None and abs(ahead_s - offset_s) > GPS_APART_S:
@@ -167,7 +172,7 @@ def _start(tags: Mapping, clock: CameraClock) -> tuple[float, float]:
             f"by the GPS time in its EXIF the camera's clock was {ahead_s / 3600:.2f} h ahead of UTC, and not "
             f"{offset_s / 3600:g} h: state the zone that it showed, or set it"
         )
-    digits = _text(tags, "SubSecTimeOriginal")
+    digits = _text(tags, "EXIF SubSecTimeOriginal")
     # many cameras that count no fractions write zeros
     if not re.fullmatch(r"\d{1,9}", digits) or not int(digits):
         digits = ""
@@ -179,7 +184,7 @@ def _stated_offset_s(tags: Mapping, clock: CameraClock) -> float | None:
     """Time in s by which the camera's clock was ahead of UTC, by the user or by the file; None if neither says it."""
     if clock.utc_offset_h is not None:
         return 3600 * clock.utc_offset_h
-    parts = re.fullmatch(r"([+-])(\d\d):(\d\d)", _text(tags, "OffsetTimeOriginal"))
+    parts = re.fullmatch(r"([+-])(\d\d):(\d\d)", _text(tags, "EXIF OffsetTimeOriginal"))
     return float(parts[1] + "1") * (3600 * int(parts[2]) + 60 * int(parts[3])) if parts else None
 
 
@@ -196,6 +201,6 @@ def _gps_unix_s(tags: Mapping) -> float | None:
 
 
 def _text(tags: Mapping, name: str) -> str:
-    """The text of a tag without padding; empty if the tag is missing."""
-    value = getattr(tags.get(f"EXIF {name}"), "values", "")
+    """The text of a tag without padding, by its name in exifread; empty if the tag is missing."""
+    value = getattr(tags.get(name), "values", "")
     return value.replace("\0", " ").strip() if isinstance(value, str) else ""

@@ -26,6 +26,7 @@ class Exposure:
     focal_px        focal length by the file's header (FOCALLEN / XPIXSZ), px; only a hint; None: unknown
     pixel_um        pixel size by the file's header (XPIXSZ), um; None: unknown
     rough_focal_px  focal length by the camera's EXIF, px: where a search for it begins; None: unknown
+    fisheye         whether the camera's EXIF calls its lens a fisheye
     origin_px       column and row of the sensor's whole frame at which this one begins; NaN: it is a part, and nobody
                     knows which; None: nobody has said that it is one
     stamp_stddev_s  standard deviation of mid_unix_s against the clock it was read from; 0: unknown
@@ -44,6 +45,7 @@ class Exposure:
     clock_stddev_s: float = 0.0
     shutter: Shutter | None = None
     rough_focal_px: float | None = None
+    fisheye: bool = False
     pixel_um: float | None = None
     origin_px: tuple[float, float] | None = None
     untimed: str = ""

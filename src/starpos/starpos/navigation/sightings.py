@@ -15,15 +15,13 @@ from starpos.earth.refraction import Atmosphere, Refraction
 from starpos.errors import FixError, FrameError, InstrumentError, TimeError
 from starpos.fix import solver
 from starpos.fix.adjustment import share_free
-from starpos.fix.fix import sound_matches
-from starpos.fix.identified import suspicions
+from starpos.fix.matched import sound_matches
 from starpos.fix.outliers import expected_extra, judged
-from starpos.fix.unidentified import why_unidentified
+from starpos.fix.solution import Solution
 from starpos.frames.reading import why_no_time
 from starpos.frames.stars import Stars
-from starpos.identification import Identification, Sky, wide
+from starpos.identification import Identification, wide
 from starpos.identification.pose import Pose
-from starpos.identification.search import frame_stars, identify_frame
 from starpos.instrument.camera import Camera
 from starpos.sky.catalogue import Catalogue
 from starpos.units import ARCSEC
@@ -111,32 +109,28 @@ def roughly(camera_to_itrs: np.ndarray) -> StarAttitude:
     )
 
 
-def sighting_of(stars: Stars, eye: solver.Solver) -> IdentifiedFrame:
-    """Identify the stars of a frame wherever it looks; a StarposError says why it cannot be used."""
+def sighting_of(stars: Stars, eye: solver.Solver, answer: Solution) -> IdentifiedFrame:
+    """The frame under way of stars that are identified; a StarposError says why it cannot be used.
+
+    answer: of these stars, by the solver's camera.
+    """
     mid_unix_s = stars.mid_unix_s
     if mid_unix_s is None:
         raise TimeError(f"{stars.place}: no time of exposure: {why_no_time(stars)}")
-    camera, catalogue, triangles = eye.view(stars.width, stars.height, stars.origin_px)
+    camera, catalogue, _ = eye.view(stars.width, stars.height, stars.origin_px)
     if wide.is_wide(camera):
         raise InstrumentError(
             f"{stars.place}: frames of a fisheye tell no place under way: take a narrower lens"
         )
-    stars = stars.take(np.flatnonzero(stars.on_frame & camera.sees(stars.x, stars.y)))
-    state = earth_state(mid_unix_s)
-    sky = Sky(catalogue, triangles, state.year, tuple(state.velocity))
-    directions = camera.directions(stars.x, stars.y)
-    field = frame_stars(directions, stars.sigma, camera)
-    found = identify_frame(field, sky)
-    if found is None:
-        raise FrameError(why_unidentified(stars, camera, catalogue))
-    suspicious, _ = suspicions(stars, field, sky, found)
-    if suspicious:
+    if answer.found is None:
+        raise FrameError(answer.message)
+    if answer.warnings:
         raise FrameError(
-            f"{stars.place}: its stars are not those of one sky ({', '.join(suspicious)}): left out"
+            f"{stars.place}: its stars are not those of one sky ({', '.join(answer.warnings)}): left out"
         )
-    if found.mirrored:
+    if answer.found.mirrored:
         raise InstrumentError(f"{stars.place}: the frame is mirrored (its rows run bottom-up): flip it")
-    return sighted(stars, found, (camera, catalogue), state)
+    return sighted(stars, answer.found, (camera, catalogue), earth_state(mid_unix_s))
 
 
 def sighted(

@@ -19,6 +19,7 @@ from starpos.instrument.instrument import Calibration
 from starpos.instrument.mounting import Mounting
 from starpos.instrument.tilts import Tilts
 from starpos.night.doubts import Near, doubts
+from starpos.night.remarks import of_inclinometer
 from starpos.night.together import Together
 from starpos.sky.site import Site
 from starpos.units import ARCSEC
@@ -62,7 +63,7 @@ def from_elevations(
             # A3 counts as known as before: from where it was given, or from what was found where nothing was
             sound = axis.about(axis.a3 if self_calibrate else solver.instrument.calibration.a3)
         place = place_of_circles(sound, there)
-        together = Together(place, "", tuple(doubts((), place, None, near)))
+        together = Together(place, "", (*of_inclinometer(solver.instrument), *doubts((), place, None, near)))
     except FixError as error:
         together = Together(None, str(error))
     return Elevations(tuple(circles), together, axis)

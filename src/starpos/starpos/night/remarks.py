@@ -11,6 +11,7 @@ from starpos.averaging.average import Average
 from starpos.calibration.misalignment import Calibrated
 from starpos.calibration.unknown import (
     BY_OPTIONS,
+    MODEL_BY_OPTIONS,
     TELL_IT,
     at_another_lean,
     may_turn,
@@ -62,9 +63,9 @@ def of_tilts(log: TiltLog, path: str) -> tuple[Remark, ...]:
     return (Remark(Kind.TILTS, f"{path}: {doubt}"),) if doubt else ()
 
 
-def of_inclinometer(instrument: Instrument) -> tuple[Remark, ...]:
-    """Say that nobody has said which inclinometer it is."""
-    sentence = unnamed_inclinometer(instrument)
+def of_inclinometer(instrument: Instrument, ways: str = MODEL_BY_OPTIONS) -> tuple[Remark, ...]:
+    """Say that nobody has said which inclinometer it is; ways: what to do then."""
+    sentence = unnamed_inclinometer(instrument, ways)
     return (Remark(Kind.INCLINOMETER, sentence),) if sentence else ()
 
 

@@ -77,6 +77,7 @@ def together(solved: Sequence[Solved], given: Instrument | None, near: Near | No
     said += [] if whole is None else remarks.of_average(whole)
     mounting = None
     if given is not None:
+        said += remarks.of_inclinometer(given)
         said += remarks.of_a3(given.calibration, place)
         if given.vertical is None and not given.calibration.unknown:
             mounting = given.mounting
@@ -123,4 +124,7 @@ def turned(
         found = turn(solver, items, tilts, turn_stddev_deg, solver.progress, known)
     except FixError as error:
         return TurnedNight(tuple(Solution.failed(item, Status.POOR_FIT, str(error)) for item in items))
-    return TurnedNight(found.solutions, found, tuple(remarks.of_turn(found)))
+    said = tuple(remarks.of_turn(found))
+    if any(s.fix is not None for s in found.solutions):
+        said += remarks.of_inclinometer(solver.instrument)
+    return TurnedNight(found.solutions, found, said)

@@ -100,7 +100,7 @@ class Calibrating:
     @property
     def unknown(self) -> bool:
         """Whether A3 is not known, so that fixes carry its error."""
-        return not self._is_told and self._settings.calibration(self.found).unknown
+        return not self._is_told and self._settings.instrument(self.found).calibration.unknown
 
     @property
     def _is_told(self) -> bool:

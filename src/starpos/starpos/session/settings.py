@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from starpos.earth.geoid import Geoid
+from starpos.earth.known_place import KnownPlace
 from starpos.earth.vertical import Vertical
 from starpos.errors import StarposError
 from starpos.fix.solver import Solver
@@ -47,7 +48,7 @@ class Settings:
                 grid = parameters.geoid_file(values["deflection.geoid"])
             parameters.instrument_of(values, ANY_CAMERA, known)
             parameters.atmosphere_of(values)
-            parameters.vertical_of(values, grid)
+            parameters.site_of(values, parameters.vertical_of(values, grid))
         except StarposError as e:
             return str(e)
         self._read = known, grid
@@ -67,6 +68,11 @@ class Settings:
         return parameters.vertical_of(self.values, self._geoid)
 
     @property
+    def site(self) -> KnownPlace | None:
+        """The place that is known; None where none is set."""
+        return parameters.site_of(self.values, self.vertical)
+
+    @property
     def tilt_stddev_rad(self) -> float:
         """Standard deviation of a tilt sample that states none."""
         stated = math.radians(self.values["tilt_stddev"])
@@ -77,9 +83,9 @@ class Settings:
         )
         return errors.noise_rad
 
-    def calibration(self, found: Calibration | None) -> Calibration:
-        """The calibration in use; `found` is the one from frames, or None."""
-        return parameters.instrument_of(self.values, ANY_CAMERA, self._known, found).calibration
+    def instrument(self, found: Calibration | None) -> Instrument:
+        """The instrument in use, but for its camera; `found` is the calibration from frames, or None."""
+        return parameters.instrument_of(self.values, ANY_CAMERA, self._known, found)
 
     def solver(self, camera: Camera, found: Calibration | None, catalogue: Catalogue) -> Solver:
         """Make a Solver for a camera, with the calibration from frames (`found`, or None).

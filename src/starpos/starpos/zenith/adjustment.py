@@ -20,7 +20,7 @@ from starpos.units import ARCSEC
 from starpos.zenith.errors import Errors, errors_of
 from starpos.zenith.faces import faces_of
 from starpos.zenith.lines import LeanEstimate, Lines, start_of
-from starpos.zenith.places import Places
+from starpos.zenith.places import StarPlaces
 from starpos.zenith.sighting import Mark, ZenithSighting
 
 STEPS = 8
@@ -113,7 +113,7 @@ def adjusted(
     """
     if len(sightings) < 3:
         raise FixError(f"{len(sightings)} frames make no session: at least 3, in several faces, are needed")
-    places = Places.of(sightings)
+    places = StarPlaces.of(sightings)
     sightings = places.applied(sightings)
     faces, prior = faces_of(sightings), _prior_of(instrument)
     bending = atmosphere.refraction().a

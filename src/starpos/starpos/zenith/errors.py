@@ -9,7 +9,7 @@ import numpy as np
 from starpos.earth.orientation import ROTATION_RAD_S
 from starpos.instrument.inclinometer import InclinometerErrors
 from starpos.zenith.lines import Lines
-from starpos.zenith.places import Places
+from starpos.zenith.places import StarPlaces
 from starpos.zenith.sighting import Mark, ZenithSighting
 
 HOUR_S = 3600.0
@@ -55,7 +55,7 @@ class Errors:
 def errors_of(
     lines: Lines,
     sightings: Sequence[ZenithSighting],
-    places: Places,
+    places: StarPlaces,
     faces: np.ndarray,
     inclinometer: InclinometerErrors,
     mark: Mark,
@@ -120,7 +120,7 @@ def _shared_readings(sightings: Sequence[ZenithSighting]) -> np.ndarray:
     return member @ member.T
 
 
-def _of_stars(lines: Lines, sightings: Sequence[ZenithSighting], places: Places) -> list[Source]:
+def _of_stars(lines: Lines, sightings: Sequence[ZenithSighting], places: StarPlaces) -> list[Source]:
     n = len(sightings)
     roots = np.linalg.cholesky([s.centroids for s in sightings])
     bent = np.array([s.by_refraction for s in sightings])

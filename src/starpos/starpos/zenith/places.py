@@ -20,7 +20,7 @@ MOST_FACTOR = 5.0
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Places:
+class StarPlaces:
     """Corrections of S stars' places along the axes of ICRS, in units of their sigmas in the catalogue.
 
     rows: for each frame, which of the S stars are its (N,).  correction (S, 3).
@@ -34,7 +34,7 @@ class Places:
     factor: float
 
     @classmethod
-    def of(cls, sightings: Sequence[ZenithSighting]) -> "Places":
+    def of(cls, sightings: Sequence[ZenithSighting]) -> "StarPlaces":
         """The corrections that all frames agree on best."""
         # slow to import
         from scipy.linalg import cho_solve, cholesky

@@ -13,7 +13,7 @@ from starpos.errors import FixError, InstrumentError
 from starpos.fix._adjustment import Adjustment
 from starpos.fix.adjustment import ISOTROPIC, fitted, share_free
 from starpos.fix.budget import StarErrors
-from starpos.fix.fix import MatchedStars, sound_matches
+from starpos.fix.matched import MatchedStars, sound_matches
 from starpos.fix.outliers import expected_extra
 from starpos.fix.solver import ENOUGH_SOUND, Solver
 from starpos.frames.shutter import Shutter

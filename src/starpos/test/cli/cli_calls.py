@@ -8,14 +8,12 @@ from pathlib import Path
 
 import pytest
 
-from starpos_testing.command_line import run
+from starpos_testing.command_line import A3, run
+from starpos_testing.command_line import OPTICS as WIDE
 
 SCHEMA = Path(__file__).resolve().parents[4] / "docs" / "reference" / "starpos.schema.json"
-# 4636 px: 15 deg across 1000 x 700 px.
-WIDE = ("--focal-mm", "29.67", "--pixel-um", "6.4")
-SENSOR = ("--inclinometer", "sca100t_calibrated")
 # the same, with an A3 that is known
-KNOWN = (*WIDE, *SENSOR, "--misalignment", "0", "0", "0", "--misalignment-stddev", "5")
+KNOWN = (*WIDE, *A3)
 PLACE = {"latitude": 47.3, "longitude": -122.8}
 AIR = ("--pressure-hpa", "1000", "--temperature-c", "5")
 SOLVE_KEYS = {"utc", "latitude", "longitude", "heading", "latitude_geodetic", "longitude_geodetic",

@@ -12,7 +12,6 @@ from cli_calls import (
     IDENTIFY_KEYS,
     KNOWN,
     PLACE,
-    SENSOR,
     SOLVE_KEYS,
     WIDE,
     objects,
@@ -21,7 +20,7 @@ from cli_calls import (
 )
 
 from starpos.cli import main
-from starpos_testing.command_line import run
+from starpos_testing.command_line import SENSOR, run
 
 
 def test_solve_a_night_of_frames(night, capsys):
@@ -197,6 +196,15 @@ def test_an_inclinometer_that_nobody_names_is_said_once_and_errs_as_one_as_sold(
     assert len(said) == 1 and "as sold" in said[0] and "--inclinometer MODEL" in said[0]
     assert silent == [] and unnamed == pytest.approx(as_sold)
     assert unnamed > 3 * solved(*SENSOR)[0]
+
+
+@pytest.mark.parametrize("how", [(), ("--self-calibrate",)])
+def test_an_inclinometer_of_which_nothing_was_solved_is_not_spoken_of(how, lists, tmp_path, capsys):
+    of_another_day = tmp_path / "tilt.csv"
+    of_another_day.write_text("utc_unix_s,theta_x_deg,theta_y_deg\n1.0e9,0.1,0.1\n")
+    paths = sorted(lists.glob("stars_*.csv"))
+    status, _, errors = run(capsys, "solve", *paths, *WIDE, "--tilt", of_another_day, *how)
+    assert status == 1 and errors and not any("which inclinometer" in line for line in errors)
 
 
 def test_no_fix_is_exit_1(lists, tmp_path, capsys):

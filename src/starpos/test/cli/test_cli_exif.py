@@ -9,12 +9,10 @@ import pytest
 
 from starpos.cli import main
 from starpos.frames.reading import read_frame
+from starpos_testing.command_line import A3, OPTICS
 from starpos_testing.lacking import needs
 from starpos_testing.skies import raws
 
-# 4636 px: 15 deg across 1000 x 700 px.
-OPTICS = ("--focal-mm", "29.67", "--pixel-um", "6.4")
-A3 = ("--misalignment", "0", "0", "0", "--misalignment-stddev", "5", "--inclinometer", "sca100t_calibrated")
 AIR = ("--pressure-hpa", "1000", "--temperature-c", "5")
 LONGITUDE_DEG, OFFSET_H = -122.8, -8.0
 M_PER_S = 464.0 * np.cos(np.radians(47.3))

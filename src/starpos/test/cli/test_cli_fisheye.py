@@ -8,11 +8,11 @@ from cli_calls import AIR, PLACE, objects, without_focal_length
 
 from starpos.cli import main
 from starpos.instrument import camera_file
+from starpos_testing.command_line import A3
 
 # 500 px.
 OPTICS = ("--focal-mm", "2.25", "--pixel-um", "4.5")
 LENS = (*OPTICS, "--lens", "equidistant")
-A3 = ("--misalignment", "0", "0", "0", "--misalignment-stddev", "5", "--inclinometer", "sca100t_calibrated")
 
 
 @pytest.fixture(scope="module")

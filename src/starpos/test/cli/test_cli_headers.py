@@ -5,7 +5,9 @@ import json
 
 import numpy as np
 import pytest
-from cli_calls import AIR, KNOWN, PLACE, WIDE
+from cli_calls import AIR, KNOWN, PLACE, WIDE, objects
+
+from starpos_testing.command_line import SENSOR
 
 LEFT, TOP, WIDTH, HEIGHT = 300, 180, 640, 480
 WHOLE = "camera: {focal_mm: 29.67, pixel_um: 6.4, width: 1000, height: 700}"
@@ -99,3 +101,25 @@ def test_a_frame_without_a_sound_time_has_no_fix_and_is_identified_all_the_same(
     assert (status, answer) == (1, None)
     assert all(f"no time of exposure: {words}" in line or words in line for line in errors) and errors
     assert run("identify", paths[0], *WIDE, "--json")[0] == 0
+
+
+def test_the_sentence_about_a_wrong_header_is_in_the_json(lists, run, tmp_path):
+    wrong, right = changed(lists, tmp_path, XPIXSZ=6.8)[0], sorted(lists.glob("stars_*.csv"))[1]
+    for command in (("identify",), ("solve", "--tilt", lists / "tilt.csv", *AIR, *KNOWN[len(WIDE) :])):
+        _, out, errors = run(*command, wrong, right, "--json")
+        told = next(line for line in errors if "its header is wrong" in line)
+        of_wrong, of_right, *_ = objects(out)
+        assert (of_wrong["status"], of_right["remark"]) == ("ok", None)
+        assert told == f"starpos {command[0]}: {of_wrong['remark']}"
+
+
+def test_a_wrong_header_keeps_no_frame_from_a_calibration(lists, run, tmp_path):
+    paths, mine = changed(lists, tmp_path, XPIXSZ=6.8), tmp_path / "mine.yaml"
+    site = ("--tilt", lists / "tilt.csv", "--site", *PLACE.values(), *SENSOR, *AIR)
+    status, out, errors = run(
+        "calibrate", *paths, *site, "-o", mine, "--camera", tmp_path / "c.yaml", "--json"
+    )
+    camera, a3 = objects(out)
+    assert status == 0 and camera["fx"] == pytest.approx(29670 / 6.4, rel=1e-3)
+    assert a3["frames"] == 3 and np.allclose(a3["misalignment_deg"], 0, atol=0.01)
+    assert sum("its header is wrong" in line for line in errors) == 3

@@ -2,16 +2,19 @@
 """`starpos navigate` on a drive of 80 s: star lists under the catalogue's sky, an IMU's table, odometry."""
 
 import json
+from argparse import Namespace
 from dataclasses import asdict
 
 import numpy as np
 import pytest
 from cli_calls import AIR, WIDE, objects
 
+from starpos.cli.navigate import _mount_stddev
 from starpos.earth.orientation import earth_state
 from starpos.earth.refraction import Atmosphere
 from starpos.frames.star_list import write_star_list
 from starpos.frames.stars import Stars
+from starpos.instrument.axis import AxisDoubt
 from starpos.instrument.camera import Camera
 from starpos.sky.site import Site
 from starpos.utc import utc_text
@@ -154,3 +157,46 @@ def test_a_model_that_is_none(voyage, capsys, tmp_path):
 def test_a_velocity_over_ground_has_no_drift_that_changes(voyage, capsys):
     status, out, errors = navigate(capsys, voyage[0], "--drift-change", "0.1")
     assert status == 2 and out == "" and "--drift-stddev" in errors[-1]
+
+
+def cards(folder, to, **more):
+    """Copies of the star lists with more cards in their headers."""
+    for path in folder.glob("stars_*.csv"):
+        first, rows = path.read_text().split("\n", 1)
+        (to / path.name).write_text(f"# {json.dumps(json.loads(first.lstrip('# ')) | more)}\n{rows}")
+    for name in ("imu.csv", "imu.yaml", "velocity.csv"):
+        (to / name).write_bytes((folder / name).read_bytes())
+
+
+def test_crops_of_a_sensor_of_which_nobody_says_the_size_are_refused_as_of_a_mount_that_nobody_knows(
+    voyage, tmp_path, capsys
+):
+    cards(voyage[0], tmp_path, XORGSUBF=0, YORGSUBF=0)
+    status, out, errors = navigate(capsys, tmp_path)
+    # 2000 px are 23 deg here
+    assert (status, out, len(errors)) == (2, "", 1)
+    assert "size nobody says" in errors[0] and "an error of the mount" in errors[0]
+
+
+def test_an_axis_that_nobody_knows_widens_the_mount(capsys):
+    doubt = AxisDoubt("cut out", 300.0, np.radians(4))
+    assert _mount_stddev(Namespace(mount_stddev=3.0), doubt) == pytest.approx(np.radians(5))
+    assert "4 deg that count as an error of the mount" in capsys.readouterr().err
+
+
+def test_a_wrong_header_keeps_no_frame_from_a_voyage(voyage, tmp_path, capsys):
+    cards(voyage[0], tmp_path, FOCALLEN=29.67, XPIXSZ=6.8)
+    given = (
+        "--imu",
+        tmp_path / "imu.csv",
+        "--imu-model",
+        tmp_path / "imu.yaml",
+        "--velocity",
+        tmp_path / "velocity.csv",
+    )
+    lists = sorted(tmp_path.glob("stars_*.csv"))[:5]
+    status, out, errors = run(
+        capsys, "navigate", *lists, *given, "--vehicle", "rover", *AIR, "--clock-stddev", "0.001", "--json"
+    )
+    assert status == 0 and [row["status"] for row in objects(out)] == ["ok"] * 5
+    assert sum("its header is wrong" in line for line in errors) == 5

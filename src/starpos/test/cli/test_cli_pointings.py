@@ -5,23 +5,14 @@ import dataclasses
 
 import numpy as np
 import pytest
-from cli_calls import SENSOR, SOLVE_KEYS, objects
+from cli_calls import SOLVE_KEYS, objects
 
 from starpos.instrument.instrument_file import read
-from starpos_testing.command_line import run
+from starpos_testing.command_line import SENSOR, run
 from starpos_testing.skies.pointings import pointed_night
 
 AIR = ("--pressure-hpa", "880", "--temperature-c", "12", "--humidity", "0.3")
-A3 = (
-    "--misalignment",
-    "1.5",
-    "-2",
-    "130",
-    "--misalignment-stddev",
-    "0.1",
-    "--inclinometer",
-    "sca100t_calibrated",
-)
+A3 = ("--misalignment", "1.5", "-2", "130", "--misalignment-stddev", "0.1", *SENSOR)
 NAMES = "utc_unix_s,ra_deg,dec_deg,roll_deg,sigma_arcsec,sigma_roll_arcsec"
 
 

@@ -11,8 +11,8 @@ from starpos.frames.reading import read_frame
 from starpos.frames.shutter import Shutter
 from starpos.instrument import instrument_file
 from starpos.instrument.instrument import Instrument
+from starpos_testing.command_line import A3
 
-A3 = ("--misalignment", "0", "0", "0", "--misalignment-stddev", "5", "--inclinometer", "sca100t_calibrated")
 PLACE, START = ("--latitude", "35", "--longitude", "51"), "2026-11-02T18:00:00"
 M_PER_S = 465.1 * np.cos(np.radians(35))
 READOUT_S = 0.04

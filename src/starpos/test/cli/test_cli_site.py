@@ -7,16 +7,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from cli_calls import without_focal_length
+from cli_calls import WIDE, without_focal_length
 
 from starpos.frames.star_list import write_star_list
 from starpos.instrument import camera_file, instrument_file
 from starpos.utc import utc_text
+from starpos_testing.command_line import SENSOR
 from starpos_testing.skies.sites import TRUE_A3_DEG, a3_error, shots
 
 LAT, LON = 35.7046, 51.4106
 PLACE = ("--site", str(LAT), str(LON))
-OPTICS = ("--focal-mm", "29.67", "--pixel-um", "6.4", "--inclinometer", "sca100t_calibrated")
+OPTICS = (*WIDE, *SENSOR)
 AIR = ("--pressure-hpa", "880", "--temperature-c", "12")
 ARCSEC_DEG = 1 / 3600
 

@@ -4,11 +4,11 @@
 import json
 
 import pytest
-from cli_calls import AIR, PLACE, SENSOR, WIDE, objects
+from cli_calls import AIR, PLACE, WIDE, objects
 
 from starpos.cli import main
 from starpos.instrument.instrument_file import read
-from starpos_testing.command_line import run
+from starpos_testing.command_line import SENSOR, run
 
 
 def simulated(folder, *more):

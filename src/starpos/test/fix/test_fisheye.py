@@ -188,7 +188,7 @@ def test_a_hint_of_the_frame_before_serves(night):
 def test_under_way_a_fisheye_is_refused(night):
     _, stars, _, solver = night
     with pytest.raises(InstrumentError, match="fisheye"):
-        sighting_of(stars, solver)
+        sighting_of(stars, solver, solver.identify(stars))
 
 
 def test_the_focal_length_that_fits_is_found(night, catalogue):

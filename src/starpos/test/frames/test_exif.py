@@ -193,6 +193,16 @@ def test_gps_time_gives_the_zone_and_is_held_against_the_one_that_is_stated(tmp_
 
 @needs_exifread
 @pytest.mark.parametrize(
+    ("lens", "fisheye"),
+    [("EF8-15mm f/4L FISHEYE USM", True), ("AF Fish-Eye-Nikkor 16mm f/2.8D", True), ("EF24-105mm f/4L IS USM", False),
+     (None, False)],
+)  # fmt: skip
+def test_a_lens_that_is_called_a_fisheye_is_one(tmp_path, lens, fisheye):
+    assert read_frame(write(tmp_path / "a.jpg", jpeg(lens=lens))).fisheye is fisheye
+
+
+@needs_exifread
+@pytest.mark.parametrize(
     ("size", "cropped"), [(None, False), ((1280, 960), False), ((960, 1280), False), ((1280, 720), True)]
 )
 def test_a_picture_of_another_shape_than_the_cameras_is_a_crop_of_unknown_place(tmp_path, size, cropped):

@@ -156,13 +156,6 @@ def test_a_search_ends_with_its_time_and_says_how_to_go_on(catalogue, rng):
     assert said and all(0 <= done <= 1 for done in said)
 
 
-@pytest.mark.montecarlo
-def test_the_worst_swarms_end_in_the_time_of_a_frame(solver, rng):
-    begin = time.process_time()
-    solver.identify(crowd(rng))
-    assert time.process_time() - begin < 22
-
-
 def test_at_any_scale_the_quads_of_a_frame_are_those_of_the_sky(catalogue, rng):
     """Every quad of the sky that a frame can hold is found again, whatever the focal length of that frame."""
     sky, table, half_px = (

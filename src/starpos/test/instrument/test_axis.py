@@ -48,7 +48,7 @@ def test_a_part_of_unknown_place_or_beyond_the_whole_is_refused(size, origin):
 
 
 @pytest.mark.parametrize(
-    "size", [(600, 400), (400, 600), (640, 480), (1936, 1216), (3008, 3008), (4144, 2822)]
+    "size", [(600, 400), (400, 600), (1640, 1232), (1936, 1216), (3008, 3008), (4144, 2822)]
 )
 def test_the_first_frame_of_a_night_counts_as_a_whole_one_where_a_sensor_has_its_shape(size):
     instrument, said = with_frame_size(Instrument(900.0, calibration=KNOWN), frame(*size))
@@ -79,6 +79,15 @@ def test_an_axis_of_which_nobody_says_where_it_is_is_an_error_of_a3_and_told(fir
     if size is not None and first.origin_px is not None:
         one, other = (instrument.camera_for(300, 200, (x, 40.0)) for x in (50.0, 90.0))
         assert one.cx - other.cx == 40
+
+
+@pytest.mark.parametrize("size", [(1600, 1200), (480, 640)])
+def test_a_size_that_is_of_whole_frames_and_of_parts_is_told_and_widens_nothing(size):
+    instrument, said = with_frame_size(Instrument(900.0, calibration=KNOWN), frame(*size))
+    assert (instrument.size, instrument.calibration) == (size, KNOWN)
+    assert f"frames of {size[0]} x {size[1]} px count as whole ones" in said and "width, height" in said
+    stated = Instrument(900.0, calibration=KNOWN, frame_size=size)
+    assert [with_frame_size(i, frame(*size))[1] for i in (stated, Instrument(900.0))] == ["", ""]
 
 
 def test_nothing_is_said_where_the_size_is_known_or_a3_is_not():

@@ -13,6 +13,7 @@ from starpos.errors import InstrumentError
 from starpos.instrument import instrument_file, sensors
 from starpos.instrument.inclinometer import InclinometerErrors
 from starpos.instrument.instrument import Instrument
+from starpos_testing.command_line import A3
 
 SIMPLE = "starpos_instrument: 1\ncamera: {focal_mm: 600, pixel_um: 6.4}\n"
 ARCSEC = np.pi / 648000
@@ -138,17 +139,7 @@ def test_the_command_line_takes_a_model_or_a_file(tmp_path, capsys):
     solve = ["solve", frame, "--tilt", table]
 
     def sigma_m(*options):
-        known = (
-            "--misalignment",
-            "0",
-            "0",
-            "0",
-            "--misalignment-stddev",
-            "5",
-            "--inclinometer",
-            "sca100t_calibrated",
-        )
-        assert main([*solve, *optics, *known, *options]) == 0
+        assert main([*solve, *optics, *A3, *options]) == 0
         return float(re.search(r"\+- (\d+) m", capsys.readouterr().out).group(1))
 
     assert sigma_m("--inclinometer", "SCL3300") > 3 * sigma_m()

@@ -2,21 +2,25 @@
 """Frames whose header gives a wrong focal length: each is found by the one that fits, and its header is named."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from starpos.fix.solution import Status
+from starpos.fix.solution import Attitude, Solution, Status
 from starpos.fix.solver import Solver
 from starpos.frames.header import about
-from starpos.frames.stars import Stars
 from starpos.instrument.camera import Camera
 from starpos.instrument.instrument import Instrument
+from starpos.instrument.lens import EQUIDISTANT
+from starpos.night import hints
 from starpos.night.hints import of_one_camera, without_hint
 from starpos.night.reading import Given
+from starpos.night.searching import Sight
 from starpos.night.work import Identifying
-from starpos.rotation import unit_vector
+from starpos.progress import quiet
 from starpos.sky.catalogue import load_catalogue
+from starpos_testing.skies.cygnus import DEC_DEG, stars_of_cygnus
 
 SIZE, FOCAL_MM, PIXEL_UM = (2808, 1872), 600.0, 6.4
 FOCAL_PX = 1000 * FOCAL_MM / PIXEL_UM
@@ -27,27 +31,9 @@ RIGHT = {"FOCALLEN": FOCAL_MM, "XPIXSZ": PIXEL_UM}
 def seen(catalogue, rng):
     """A function that gives the stars of a field of 2 deg, with a header."""
     camera = Camera.from_focal(*SIZE, FOCAL_PX)
-    ra, dec = np.radians([295.77, 49.79])
-    axis, north = unit_vector(ra, dec), unit_vector(ra, dec + np.pi / 2)
-    attitude = np.stack([np.cross(-north, axis), -north, axis])
-    index = catalogue.cone(axis, camera.half_diagonal_rad, 9.0)
-    index = index[np.argsort(catalogue.vmag(index))]
-    xy = camera.project(catalogue.directions(index) @ attitude.T) + rng.normal(0, 0.05, (len(index), 2))
-    xy = xy[((xy > 0) & (xy < np.array(SIZE) - 1)).all(1)]
-    n = len(xy)
 
     def stars(header):
-        return Stars(
-            x=xy[:, 0],
-            y=xy[:, 1],
-            flux=np.arange(n, 0, -1.0),
-            snr=np.full(n, 50.0),
-            covariance=np.broadcast_to(0.0025 * np.eye(2), (n, 2, 2)),
-            flags=np.zeros(n),
-            width=SIZE[0],
-            height=SIZE[1],
-            **about(header, "frame.fits"),
-        )
+        return stars_of_cygnus(catalogue, rng, camera, 9.0, 0.05, **about(header, "frame.fits"))
 
     return stars
 
@@ -71,7 +57,7 @@ def test_a_wrong_header_binds_nothing(seen, header, told):
     stars = seen(header)
     work = Identifying(Given(None, by_header=True))
     sight, _ = work(stars)
-    assert sight.solution.ok and np.degrees(sight.solution.attitude.dec) == pytest.approx(49.79, abs=1e-3)
+    assert sight.solution.ok and np.degrees(sight.solution.attitude.dec) == pytest.approx(DEC_DEG, abs=1e-3)
     assert sight.instrument.focal_px == pytest.approx(FOCAL_PX, rel=0.03)
     assert re.fullmatch(
         f"frame.fits: its header is wrong: it makes a focal length of {told}", sight.solution.remark
@@ -107,19 +93,67 @@ def test_turning_takes_the_focal_length_that_fits(seen):
     assert solver.instrument.focal_px == FOCAL_PX and frames[0][1] is right.found
 
 
-def test_a_frame_that_nothing_fits_keeps_its_sentence(seen, rng):
-    """Points of chance are searched within the time that a frame has, and told by the first sentence."""
-    stars = seen(RIGHT | {"XPIXSZ": 3.2}).take(slice(0, 6))
+@pytest.fixture
+def lost(seen):
+    """Stars whose header is wrong, the solver by that header, and the sight that it gives."""
+    stars = seen(RIGHT | {"XPIXSZ": 3.2})
     solver = _solver(187500.0)
-    lost = Identifying(Given(solver.instrument))(stars)[0]
+    return stars, solver, Identifying(Given(solver.instrument))(stars)[0]
 
-    def never(solver):
-        raise AssertionError("no focal length fits")
 
-    points = Stars(**stars.about | {name: getattr(stars, name) for name in ("flux", "snr", "covariance", "flags")}
-                   | {"x": rng.uniform(0, SIZE[0], 6), "y": rng.uniform(0, SIZE[1], 6)},
-                   width=SIZE[0], height=SIZE[1])  # fmt: skip
-    assert without_hint(solver, points, points, lost, never, lambda *_: None) is lost
+def never(*_):
+    raise AssertionError("nothing is searched, or solved again")
+
+
+def test_a_frame_that_nothing_fits_keeps_its_sentence(lost, rng):
+    """Points of chance are searched within the time that a frame has, and told by the first sentence."""
+    stars, solver, sight = lost
+    points = replace(stars.take(np.arange(6)), x=rng.uniform(0, SIZE[0], 6), y=rng.uniform(0, SIZE[1], 6))
+    assert without_hint(solver, points, points, sight, never, quiet) is sight
+
+
+def test_a_focal_length_near_the_headers_needs_no_search_at_every_scale(catalogue, rng, monkeypatch):
+    monkeypatch.setattr(hints, "identified_blind", never)
+    wide, header = Camera.from_focal(1000, 700, 5000.0), about({"FOCALLEN": 34, "XPIXSZ": 6.4}, "frame.fits")
+    sight, _ = Identifying(Given(None, by_header=True))(
+        stars_of_cygnus(catalogue, rng, wide, 6.5, 0.05, **header)
+    )
+    assert sight.solution.ok and "(34 mm" in sight.solution.remark and "32 mm" in sight.solution.remark
+
+
+def test_a_scale_and_a_lens_that_then_identify_nothing_are_not_told(lost, monkeypatch):
+    stars, solver, sight = lost
+    searched, tried = [], []
+
+    def blind(solver, *_):
+        searched.append(solver.search_s)
+        a_fisheye = Attitude(ra=0.0, dec=0.0, roll=0.0, focal_px=900.0, residual_arcsec=1.0, log_odds=99.0,
+                             mirrored=False, model=EQUIDISTANT)  # fmt: skip
+        return Sight(stars, Solution.of(stars, attitude=a_fisheye))
+
+    def again(solver):
+        tried.append((solver.instrument.focal_px, solver.instrument.model))
+        return sight
+
+    monkeypatch.setattr(hints, "identified_blind", blind)
+    assert without_hint(solver, stars, stars, sight, again, quiet) is sight
+    assert (searched, tried) == ([hints.SEARCH_S], [(900.0, EQUIDISTANT)])
+
+
+@pytest.mark.parametrize(
+    ("instrument", "status"),
+    [
+        (Instrument(187500.0), Status.TOO_FEW_STARS),
+        (Instrument(187500.0, frame_size=(100, 80)), Status.BAD_INPUT),
+    ],
+)
+def test_what_no_focal_length_can_help_is_not_searched(instrument, status, seen, monkeypatch):
+    monkeypatch.setattr(hints, "focal_that_fits", never)
+    stars = seen(RIGHT).take(np.arange(3))
+    solver = replace(_solver(187500.0), instrument=instrument)
+    sight = Identifying(Given(instrument))(stars)[0]
+    assert sight.solution.status is status
+    assert without_hint(solver, stars, stars, sight, never, quiet) is sight
 
 
 def _solver(focal_px):

@@ -10,46 +10,30 @@ from starpos.detection import otherwise as ways
 from starpos.fix.solution import Solution, Status
 from starpos.fix.solver import Solver
 from starpos.frames.frame import Frame
-from starpos.frames.stars import Stars, no_stars
+from starpos.frames.stars import no_stars
 from starpos.instrument.camera import Camera
 from starpos.instrument.instrument import Instrument
 from starpos.night import searching
 from starpos.night.searching import PART, identified
-from starpos.rotation import unit_vector
+from starpos_testing.skies.cygnus import DEC_DEG, stars_of_cygnus
 
 SIZE, FOCAL_PX = (1280, 960), 2657.0
 
 
-def stars_of_cygnus(catalogue, rng):
+@pytest.fixture
+def left_half(catalogue, rng):
     """Stars of the left half of a field whose brighter ones lie on its right."""
     camera = Camera.from_focal(*SIZE, FOCAL_PX)
-    ra, dec, roll = np.radians([295.77, 49.79, 124.67])
-    axis, north = unit_vector(ra, dec), unit_vector(ra, dec + np.pi / 2)
-    down = -np.cos(roll) * north - np.sin(roll) * np.cross(north, axis)
-    attitude = np.stack([np.cross(down, axis), down, axis])
-    index = catalogue.cone(attitude[2], camera.half_diagonal_rad, 6.5)
-    index = index[np.argsort(catalogue.vmag(index))]
-    xy = camera.project(catalogue.directions(index) @ attitude.T) + rng.normal(0, 0.3, (len(index), 2))
-    xy = xy[((xy > 0) & (xy < [640, 959])).all(1)]
-    n = len(xy)
-    return Stars(
-        x=xy[:, 0],
-        y=xy[:, 1],
-        flux=np.arange(n, 0, -1.0),
-        snr=np.full(n, 20.0),
-        covariance=np.broadcast_to(0.01 * np.eye(2), (n, 2, 2)),
-        flags=np.zeros(n),
-        width=SIZE[0],
-        height=SIZE[1],
-        window=(0, 0, 640, 960),
+    return stars_of_cygnus(
+        catalogue, rng, camera, 6.5, 0.3, roll_deg=124.67, width=641, window=(0, 0, 640, 960)
     )
 
 
-def test_a_part_of_a_frame_without_the_brightest_stars_around_it(catalogue, rng):
-    stars, solver = stars_of_cygnus(catalogue, rng), Solver(Instrument(FOCAL_PX), catalogue)
+def test_a_part_of_a_frame_without_the_brightest_stars_around_it(catalogue, left_half):
+    stars, solver = left_half, Solver(Instrument(FOCAL_PX), catalogue)
     assert solver.identify(stars).status is Status.NOT_IDENTIFIED
     found = solver.identify(stars, part=PART)
-    assert found.ok and found.attitude.dec == pytest.approx(np.radians(49.79), abs=1e-4)
+    assert found.ok and found.attitude.dec == pytest.approx(np.radians(DEC_DEG), abs=1e-4)
     assert identified(solver, stars, stars).solution.star.tolist() == found.star.tolist()
 
 
@@ -68,8 +52,8 @@ class Answering:
         return next(self.answers)
 
 
-def test_an_answer_by_stars_detected_otherwise_needs_more_evidence(frame, catalogue, rng, monkeypatch):
-    stars = stars_of_cygnus(catalogue, rng)
+def test_an_answer_by_stars_detected_otherwise_needs_more_evidence(frame, catalogue, left_half, monkeypatch):
+    stars = left_half
     good = Solver(Instrument(FOCAL_PX), catalogue).identify(stars, part=PART)
     lost = Solution.failed(stars, Status.NOT_IDENTIFIED, "lost")
     others = [replace(stars, source=str(k)) for k in range(4)]

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from starpos.cli import main
+from starpos_testing.command_line import SENSOR
 from starpos_testing.skies.reports import A3, AIR, KNOWN, Page, assert_drawn, run, simulate
 
 pytest.importorskip("matplotlib")
@@ -121,8 +122,7 @@ def test_the_recorded_night_of_the_repository(tmp_path, capsys):
         *truth["misalignment_deg"],
         "--misalignment-stddev",
         5,
-        "--inclinometer",
-        "sca100t_calibrated",
+        *SENSOR,
     )
     status, _, errors = run(capsys, "report", RECORDED, "-o", tmp_path / "out", *about)
     page = Page(tmp_path / "out" / "index.html")

@@ -10,14 +10,16 @@ from starpos.earth.orientation import measured_until
 from starpos.fix.solution import Solution, Status
 from starpos.frames.shutter import GLOBAL, UNKNOWN, Shutter
 from starpos.frames.stars import no_stars
-from starpos.instrument.instrument import Calibration
+from starpos.instrument.instrument import Calibration, Instrument
+from starpos.instrument.sensors import SCL3300
 from starpos.session import reports
 from starpos.session.diagnosis import Level
 from starpos_testing.skies.fields import SkyField
 
 TOLD = {"refraction.pressure": 95000.0, "refraction.temperature": 8.0}
-NOBODYS = Calibration.of((0.0, 0.0, 0.0), (5.0,) * 3)
-DATED = Calibration(utc_unix_s=1.79e9)
+NAMED = Instrument(4000.0, inclinometer=SCL3300, inclinometer_model="scl3300")
+NOBODYS = replace(NAMED, calibration=Calibration.of((0.0, 0.0, 0.0), (5.0,) * 3))
+DATED = replace(NAMED, calibration=Calibration(utc_unix_s=1.79e9))
 
 
 def tilt(temperature_c):
@@ -32,17 +34,18 @@ def test_conditions_that_are_known_are_right():
 
 
 @pytest.mark.parametrize(
-    ("values", "calibration", "temperature_c", "shutter", "words"),
+    ("values", "instrument", "temperature_c", "shutter", "words"),
     [
         ({"refraction.pressure": math.nan}, NOBODYS, 12.0, GLOBAL, "the air's pressure is not known"),
         ({"refraction.temperature": math.nan}, NOBODYS, 12.0, GLOBAL, "the air's temperature is not known"),
         ({}, NOBODYS, math.nan, GLOBAL, "the inclinometer's temperature is not known"),
         ({}, DATED, 12.0, Shutter(0.02, 0.001), "at its calibration is not known"),
         ({}, NOBODYS, 12.0, UNKNOWN, "the shutter's first row to its last is not known"),
+        ({}, Instrument(4000.0), 12.0, GLOBAL, "which inclinometer this is"),
     ],
 )
-def test_what_nobody_told_is_a_warning(values, calibration, temperature_c, shutter, words):
-    said = reports.of_conditions(TOLD | values, calibration, tilt(temperature_c), shutter)
+def test_what_nobody_told_is_a_warning(values, instrument, temperature_c, shutter, words):
+    said = reports.of_conditions(TOLD | values, instrument, tilt(temperature_c), shutter)
     assert said.level == Level.WARN and words in said.message and ";" not in said.message
 
 

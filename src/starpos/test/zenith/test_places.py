@@ -8,7 +8,7 @@ import pytest
 from sessions import drawn
 
 from starpos import rotation
-from starpos.zenith.places import Places
+from starpos.zenith.places import StarPlaces
 
 # a frame's stars, of all that pass; error of a seen place in units of the catalogue's sigma; that sigma in rad
 WIDE, STARS, SEEN, SIGMA = 20, 60, 0.5, 2e-7
@@ -44,14 +44,14 @@ def passing(rng, frames, displaced):
 @pytest.mark.parametrize("factor", [0.4, 1.0, 2.5])
 def test_the_size_of_the_catalogues_errors_comes_from_the_stars(rng, factor):
     frames = drawn(rng, frames=10).sightings
-    found = Places.of(passing(rng, frames, factor * rng.normal(0, 1, (STARS, 3))))
+    found = StarPlaces.of(passing(rng, frames, factor * rng.normal(0, 1, (STARS, 3))))
     assert found.factor == pytest.approx(factor, rel=0.35)
 
 
 def test_corrected_places_move_the_attitudes_towards_the_truth(rng):
     frames = drawn(rng, frames=10).sightings
     sightings = passing(rng, frames, rng.normal(0, 1, (STARS, 3)))
-    corrected = Places.of(sightings).applied(sightings)
+    corrected = StarPlaces.of(sightings).applied(sightings)
 
     def off(seen):
         turns = [

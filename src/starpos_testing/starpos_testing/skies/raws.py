@@ -26,13 +26,15 @@ def exif_tags(
     unit=None,
     size=None,
     gps=None,
+    lens=None,
 ):
     """The tags of an Exif IFD, with those of the GPS IFD under 0x8825; None leaves one out.
 
     gps: UTC by GPS, a day like '2026:11:02' and whole hours, minutes and seconds.
-    film_mm, focal (ratio of mm), plane (ratio of px per unit), unit, size (px) are those of the focal length.
+    film_mm, focal (ratio of mm), plane (ratio of px per unit), unit, size (px) are of the focal length; lens: its name.
     """
     tags = {
+        0xA434: None if lens is None else (ASCII, lens),
         0x920A: None if focal is None else (RATIONAL, focal),
         0xA002: None if size is None else (LONG, [size[0]]),
         0xA003: None if size is None else (LONG, [size[1]]),

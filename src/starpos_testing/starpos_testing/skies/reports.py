@@ -8,12 +8,8 @@ from html.parser import HTMLParser
 import numpy as np
 
 from starpos.cli import main
-from starpos_testing.command_line import run
+from starpos_testing.command_line import A3, OPTICS, run
 
-# 4636 px: 15 deg across 1000 x 700 px.
-OPTICS = ("--focal-mm", "29.67", "--pixel-um", "6.4")
-# that A3 is known
-A3 = ("--misalignment", 0, 0, 0, "--misalignment-stddev", 5, "--inclinometer", "sca100t_calibrated")
 KNOWN = (*OPTICS, *A3)
 AIR = ("--pressure-hpa", "1000", "--temperature-c", "5")
 PLACE = {"latitude": 47.3, "longitude": -122.8}
