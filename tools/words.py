@@ -1,0 +1,112 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Find riddles, long sentences and American spelling in the documents.
+
+`words.py [FILE ...]` prints a line for each and exits 1 if it found any. Without arguments it reads every document
+except the changelogs. `words.py --count` prints how often each pattern occurs. `make lint` runs it.
+"""
+
+import re
+import sys
+from collections import Counter
+from collections.abc import Iterator
+from itertools import groupby
+from pathlib import Path
+from typing import NamedTuple
+
+ROOT = Path(__file__).resolve().parents[1]
+DOCUMENTS = ("*.md", "docs/**/*.md", "test/*.md", "starpos_*/*.md", "src/*/*.md")
+MAX_WORDS = 40
+# Name of a pattern: its expression, and what to write instead.
+RIDDLES = {
+    "that of": (r"\bth(?:at|ose) of\b", "repeat the noun"),
+    "is none": (r"\b(?:is|are|was|were) none\b", "say what is missing"),
+    "tells": (r"\b(?:tells?|told)\b", "determines, gives, says or shows"),
+    "beside": (r"\bbeside\b", "next to, besides or compared with"),
+    "so many": (r"\bso many\b", "give the number or name the quantity"),
+    "of each ... its": (r"\bof each\b[^.:;]{0,40}\bits\b", "each X has its Y"),
+    "what ... that": (r"\bwhat\b[^.,:;|]{0,40}\bthat\b", "name the thing"),
+    "want of": (r"\bwant of\b", "lack of"),
+    "nobody": (r"\bnobody\b", "unknown, unset or not stated"),
+}
+AMERICAN = {
+    r"colors?|colored": "colour",
+    r"gray": "grey",
+    r"(?:centi|milli|kilo)?meters?": "metre",
+    r"centers?|centered": "centre",
+    r"neighbors?|neighboring": "neighbour",
+    r"behavior": "behaviour",
+    r"favor\w*": "favour",
+    r"catalogs?": "catalogue",
+    r"licenses": "licences",
+    r"modeled|modeling": "modelled",
+    r"labeled|canceled|leveled": "two letters l",
+    r"analyz\w+": "analyse",
+    # not size, prize, seize, Ritz
+    r"\w{3,}(?:al|an|et|ct|ch|mm|n|gn|im|ar|il|t|er|in)iz(?:e|es|ed|ing|ation)": "-ise",
+}
+PATTERNS = [
+    *((name, re.compile(wrong, re.IGNORECASE), advice) for name, (wrong, advice) in RIDDLES.items()),
+    *(("spelling", re.compile(rf"\b(?:{wrong})\b", re.IGNORECASE), advice) for wrong, advice in AMERICAN.items()),
+]
+FENCE = re.compile(r"^ *(?:```|<!--)")
+# What a program reads or prints, and addresses, are quoted as they are.
+QUOTED = re.compile(r"``.+?``|`[^`]*`|(?<=\])\([^)\s]*\)|<[^>\s]*>|\"[^\"]*\"")
+SENTENCE_END = re.compile(r"(?<=[.?!])[\"')*]*\s+(?=[\W\d]*[A-Z`])")
+NEW_BLOCK = re.compile(r"^\s*(?:[-*+] |\d+\. |#|\||>|: |\[\^)")
+
+
+class Breach(NamedTuple):
+    line: int
+    name: str
+    words: str
+    advice: str
+
+
+def blocks(markdown: str) -> Iterator[tuple[int, str]]:
+    """Paragraphs, items, headings and table cells of a document with the line on which each begins; no code."""
+    fenced, begun, gathered = False, 0, []
+    for number, line in enumerate([*markdown.splitlines(), ""], 1):
+        if FENCE.match(line) and "-->" not in line:
+            fenced = not fenced
+        elif line.strip().endswith("-->"):
+            fenced = False if not line.lstrip().startswith("<!--") else fenced
+        indented = line.startswith("    ") and not gathered
+        text = "" if fenced or indented or FENCE.match(line) else line
+        if gathered and (not text.strip() or NEW_BLOCK.match(text)):
+            yield begun, " ".join(gathered)
+            gathered = []
+        if text.lstrip().startswith("|"):
+            yield from ((number, cell.strip()) for cell in text.strip().strip("|").split("|"))
+        elif text.strip():
+            begun = begun if gathered else number
+            gathered.append(text.strip())
+
+
+def breaches(markdown: str) -> Iterator[Breach]:
+    """All breaches in a document, in reading order."""
+    for line, block in blocks(markdown):
+        plain = QUOTED.sub(lambda quoted: "" if quoted.group().startswith("(") else "X", block)
+        for name, wrong, advice in PATTERNS:
+            yield from (Breach(line, name, found.group(), advice) for found in wrong.finditer(plain))
+        for sentence in SENTENCE_END.split(plain):
+            words = [word for word in sentence.split() if re.search(r"\w", word)]
+            if len(words) > MAX_WORDS:
+                yield Breach(line, "long", f"{len(words)} words: {' '.join(words[:6])} ...", "one idea a sentence")
+
+
+def main(arguments: list[str]) -> int:
+    counting = "--count" in arguments
+    named = [Path(argument) for argument in arguments if argument != "--count"]
+    files = named or sorted({path for pattern in DOCUMENTS for path in ROOT.glob(pattern)})
+    found = [(file, breach) for file in files for breach in breaches(file.read_text(encoding="utf-8"))]
+    if counting:
+        for name, count in Counter(breach.name for _, breach in found).most_common():
+            print(f"{count:5} {name}")
+    else:
+        for file, breach in found:
+            print(f"{file.resolve().relative_to(ROOT)}:{breach.line}: {breach.name}: {breach.words} ({breach.advice})")
+    return 1 if found else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
