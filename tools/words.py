@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Find riddles, long sentences and American spelling in the documents.
+"""Find riddles, long sentences and American spelling in the documents and the definitions of messages.
 
 `words.py [FILE ...]` prints a line for each and exits 1 if it found any. Without arguments it reads every document
 except the changelogs. `words.py --count` prints how often each pattern occurs. `make lint` runs it.
@@ -9,12 +9,11 @@ import re
 import sys
 from collections import Counter
 from collections.abc import Iterator
-from itertools import groupby
 from pathlib import Path
 from typing import NamedTuple
 
 ROOT = Path(__file__).resolve().parents[1]
-DOCUMENTS = ("*.md", "docs/**/*.md", "test/*.md", "starpos_*/*.md", "src/*/*.md")
+DOCUMENTS = ("*.md", "docs/**/*.md", "test/*.md", "starpos_*/*.md", "src/*/*.md", "starpos_interfaces/*/*.[ms][sr][gv]")
 MAX_WORDS = 40
 # Name of a pattern: its expression, and what to write instead.
 RIDDLES = {
@@ -48,11 +47,15 @@ PATTERNS = [
     *((name, re.compile(wrong, re.IGNORECASE), advice) for name, (wrong, advice) in RIDDLES.items()),
     *(("spelling", re.compile(rf"\b(?:{wrong})\b", re.IGNORECASE), advice) for wrong, advice in AMERICAN.items()),
 ]
-FENCE = re.compile(r"^ *(?:```|<!--)")
+# Generated tables, comments and code of Markdown, which are left out; a glossary stands between fences, too.
+LEFT_OUT = re.compile(
+    r"<!-- table -->.*?<!-- end of table -->|<!--.*?-->|^ *```(?!\{glossary\}).*?^ *```$|^(?: {4}|\t)[^\n]*(?=\n)",
+    re.DOTALL | re.MULTILINE,
+)
 # What a program reads or prints, and addresses, are quoted as they are.
-QUOTED = re.compile(r"``.+?``|`[^`]*`|(?<=\])\([^)\s]*\)|<[^>\s]*>|\"[^\"]*\"")
-SENTENCE_END = re.compile(r"(?<=[.?!])[\"')*]*\s+(?=[\W\d]*[A-Z`])")
-NEW_BLOCK = re.compile(r"^\s*(?:[-*+] |\d+\. |#|\||>|: |\[\^)")
+QUOTED = re.compile(r"`[^`]*`|(?<=\])\([^)\s]*\)|<[^>\s]*>|\"[^\"]*\"|\w*_\w*")
+SENTENCE_END = re.compile(r"(?<=[.?!])[\"')*]*\s+(?=[^\w`]*[A-Z0-9`])")
+BLOCK = re.compile(r"\s*(?:[-*+] |\d+\. |#|\||>|: |```|$)")
 
 
 class Breach(NamedTuple):
@@ -63,28 +66,37 @@ class Breach(NamedTuple):
 
 
 def blocks(markdown: str) -> Iterator[tuple[int, str]]:
-    """Paragraphs, items, headings and table cells of a document with the line on which each begins; no code."""
-    fenced, begun, gathered = False, 0, []
-    for number, line in enumerate([*markdown.splitlines(), ""], 1):
-        if FENCE.match(line) and "-->" not in line:
-            fenced = not fenced
-        elif line.strip().endswith("-->"):
-            fenced = False if not line.lstrip().startswith("<!--") else fenced
-        indented = line.startswith("    ") and not gathered
-        text = "" if fenced or indented or FENCE.match(line) else line
-        if gathered and (not text.strip() or NEW_BLOCK.match(text)):
-            yield begun, " ".join(gathered)
-            gathered = []
-        if text.lstrip().startswith("|"):
-            yield from ((number, cell.strip()) for cell in text.strip().strip("|").split("|"))
-        elif text.strip():
-            begun = begun if gathered else number
-            gathered.append(text.strip())
+    """Paragraphs, items, headings and table cells with the line on which each begins."""
+    blank = LEFT_OUT.sub(lambda found: "\n" * found.group().count("\n"), markdown)
+    begun, gathered = 0, ""
+    for number, line in enumerate([*blank.splitlines(), ""], 1):
+        if BLOCK.match(line):
+            if gathered:
+                yield begun, gathered
+            begun, gathered = number, ""
+        if line.lstrip().startswith("|"):
+            yield from ((number, cell) for cell in line.split("|"))
+        else:
+            gathered = f"{gathered} {line.strip()}".strip()
 
 
-def breaches(markdown: str) -> Iterator[Breach]:
-    """All breaches in a document, in reading order."""
-    for line, block in blocks(markdown):
+def comments(definition: str) -> Iterator[tuple[int, str]]:
+    """Comments of a message's or service's definition; those on successive lines of their own are one."""
+    begun, gathered = 0, ""
+    for number, line in enumerate([*definition.splitlines(), ""], 1):
+        code, _, comment = line.partition("#")
+        if gathered and (code.strip() or not comment.strip()):
+            yield begun, gathered
+            gathered = ""
+        if code.strip():
+            yield number, comment.strip()
+        elif comment.strip():
+            begun, gathered = begun if gathered else number, f"{gathered} {comment.strip()}".strip()
+
+
+def breaches(text: str, suffix: str = ".md") -> Iterator[Breach]:
+    """All breaches in a document or definition, in reading order."""
+    for line, block in blocks(text) if suffix == ".md" else comments(text):
         plain = QUOTED.sub(lambda quoted: "" if quoted.group().startswith("(") else "X", block)
         for name, wrong, advice in PATTERNS:
             yield from (Breach(line, name, found.group(), advice) for found in wrong.finditer(plain))
@@ -98,7 +110,7 @@ def main(arguments: list[str]) -> int:
     counting = "--count" in arguments
     named = [Path(argument) for argument in arguments if argument != "--count"]
     files = named or sorted({path for pattern in DOCUMENTS for path in ROOT.glob(pattern)})
-    found = [(file, breach) for file in files for breach in breaches(file.read_text(encoding="utf-8"))]
+    found = [(file, breach) for file in files for breach in breaches(file.read_text(encoding="utf-8"), file.suffix)]
     if counting:
         for name, count in Counter(breach.name for _, breach in found).most_common():
             print(f"{count:5} {name}")
