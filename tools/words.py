@@ -5,15 +5,25 @@
 except the changelogs. `words.py --count` prints how often each pattern occurs. `make lint` runs it.
 """
 
+import ast
+import io
 import re
 import sys
+import tokenize
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
 ROOT = Path(__file__).resolve().parents[1]
-DOCUMENTS = ("*.md", "docs/**/*.md", "test/*.md", "starpos_*/*.md", "src/*/*.md", "starpos_interfaces/*/*.[ms][sr][gv]")
+DOCUMENTS = (
+    "*.md",
+    "docs/**/*.md",
+    "test/*.md",
+    "starpos_*/*.md",
+    "src/*/*.md",
+    "starpos_interfaces/*/*.[ms][sr][gv]",
+)
 MAX_WORDS = 40
 # Name of a pattern: its expression, and what to write instead.
 RIDDLES = {
@@ -45,7 +55,10 @@ AMERICAN = {
 }
 PATTERNS = [
     *((name, re.compile(wrong, re.IGNORECASE), advice) for name, (wrong, advice) in RIDDLES.items()),
-    *(("spelling", re.compile(rf"\b(?:{wrong})\b", re.IGNORECASE), advice) for wrong, advice in AMERICAN.items()),
+    *(
+        ("spelling", re.compile(rf"\b(?:{wrong})\b", re.IGNORECASE), advice)
+        for wrong, advice in AMERICAN.items()
+    ),
 ]
 # Generated tables, comments and code of Markdown, which are left out; a glossary stands between fences, too.
 LEFT_OUT = re.compile(
@@ -73,11 +86,11 @@ def blocks(markdown: str) -> Iterator[tuple[int, str]]:
         if BLOCK.match(line):
             if gathered:
                 yield begun, gathered
-            begun, gathered = number, ""
+            gathered = ""
         if line.lstrip().startswith("|"):
             yield from ((number, cell) for cell in line.split("|"))
         else:
-            gathered = f"{gathered} {line.strip()}".strip()
+            begun, gathered = begun if gathered else number, f"{gathered} {line.strip()}".strip()
 
 
 def comments(definition: str) -> Iterator[tuple[int, str]]:
@@ -94,29 +107,53 @@ def comments(definition: str) -> Iterator[tuple[int, str]]:
             begun, gathered = begun if gathered else number, f"{gathered} {comment.strip()}".strip()
 
 
-def breaches(text: str, suffix: str = ".md") -> Iterator[Breach]:
-    """All breaches in a document or definition, in reading order."""
-    for line, block in blocks(text) if suffix == ".md" else comments(text):
+def said(source: str) -> Iterator[tuple[int, str]]:
+    """Paragraphs of docstrings, and comments; those on successive lines are one."""
+    for node in ast.walk(ast.parse(source)):
+        match node:
+            case ast.Expr(ast.Constant(str(text))):
+                for paragraph in re.split(r"\n\s*\n", text):
+                    yield node.lineno, " ".join(paragraph.split())
+    begun, last, gathered = 0, 0, ""
+    for token in tokenize.generate_tokens(io.StringIO(source).readline):
+        if token.type == tokenize.COMMENT:
+            number = token.start[0]
+            if gathered and number != last + 1:
+                yield begun, gathered
+                gathered = ""
+            begun, last = begun if gathered else number, number
+            gathered = f"{gathered} {token.string.lstrip('# ')}".strip()
+    yield begun, gathered
+
+
+READERS = {".md": blocks, ".msg": comments, ".srv": comments, ".py": said}
+
+
+def breaches(text: str, suffix: str) -> Iterator[Breach]:
+    """All breaches in the text of a file, in reading order."""
+    for line, block in READERS[suffix](text):
         plain = QUOTED.sub(lambda quoted: "" if quoted.group().startswith("(") else "X", block)
         for name, wrong, advice in PATTERNS:
             yield from (Breach(line, name, found.group(), advice) for found in wrong.finditer(plain))
         for sentence in SENTENCE_END.split(plain):
             words = [word for word in sentence.split() if re.search(r"\w", word)]
             if len(words) > MAX_WORDS:
-                yield Breach(line, "long", f"{len(words)} words: {' '.join(words[:6])} ...", "one idea a sentence")
+                start = " ".join(words[:6])
+                yield Breach(line, "long", f"{len(words)} words: {start} ...", "one idea a sentence")
 
 
 def main(arguments: list[str]) -> int:
     counting = "--count" in arguments
     named = [Path(argument) for argument in arguments if argument != "--count"]
-    files = named or sorted({path for pattern in DOCUMENTS for path in ROOT.glob(pattern)})
-    found = [(file, breach) for file in files for breach in breaches(file.read_text(encoding="utf-8"), file.suffix)]
+    files = named or sorted({path.relative_to(ROOT) for pattern in DOCUMENTS for path in ROOT.glob(pattern)})
+    texts = {file: (ROOT / file).read_text(encoding="utf-8") for file in files}
+    found = [(file, breach) for file, text in texts.items() for breach in breaches(text, file.suffix)]
     if counting:
         for name, count in Counter(breach.name for _, breach in found).most_common():
             print(f"{count:5} {name}")
     else:
         for file, breach in found:
-            print(f"{file.resolve().relative_to(ROOT)}:{breach.line}: {breach.name}: {breach.words} ({breach.advice})")
+            print(f"{file}:{breach.line}: {breach.name}: {breach.words} ({breach.advice})")
     return 1 if found else 0
 
 
