@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Find riddles, long sentences and American spelling in the documents and the definitions of messages.
+"""Find riddles, long sentences and American spelling in documents, definitions of messages, docstrings and comments.
 
-`words.py [FILE ...]` prints a line for each and exits 1 if it found any. Without arguments it reads every document
-except the changelogs. `words.py --count` prints how often each pattern occurs. `make lint` runs it.
+`words.py [FILE ...]` prints a line for each and exits 1 if it found any. Without arguments it reads all that READ
+names. `words.py --count` prints how often each pattern occurs. `make lint` runs it.
 """
 
 import ast
@@ -16,13 +16,15 @@ from pathlib import Path
 from typing import NamedTuple
 
 ROOT = Path(__file__).resolve().parents[1]
-DOCUMENTS = (
+# What is read; rooms of code as they are clean.
+READ = (
     "*.md",
     "docs/**/*.md",
     "test/*.md",
     "starpos_*/*.md",
     "src/*/*.md",
     "starpos_interfaces/*/*.[ms][sr][gv]",
+    "src/starpos/starpos/identification/*.py",
 )
 MAX_WORDS = 40
 # Name of a pattern: its expression, and what to write instead.
@@ -68,6 +70,8 @@ LEFT_OUT = re.compile(
 # What a program reads or prints, and addresses, are quoted as they are.
 QUOTED = re.compile(r"`[^`]*`|(?<=\])\([^)\s]*\)|<[^>\s]*>|\"[^\"]*\"|\w*_\w*")
 SENTENCE_END = re.compile(r"(?<=[.?!])[\"')*]*\s+(?=[^\w`]*[A-Z0-9`])")
+# Between paragraphs of a docstring, and before the description of an argument or a field.
+PARAGRAPH = re.compile(r"\n\s*\n|\n(?=[ \w,*]+(?:  |: ))|(?<=\S)  +(?=\S)")
 BLOCK = re.compile(r"\s*(?:[-*+] |\d+\. |#|\||>|: |```|$)")
 
 
@@ -112,7 +116,7 @@ def said(source: str) -> Iterator[tuple[int, str]]:
     for node in ast.walk(ast.parse(source)):
         match node:
             case ast.Expr(ast.Constant(str(text))):
-                for paragraph in re.split(r"\n\s*\n", text):
+                for paragraph in PARAGRAPH.split(text):
                     yield node.lineno, " ".join(paragraph.split())
     begun, last, gathered = 0, 0, ""
     for token in tokenize.generate_tokens(io.StringIO(source).readline):
@@ -145,7 +149,7 @@ def breaches(text: str, suffix: str) -> Iterator[Breach]:
 def main(arguments: list[str]) -> int:
     counting = "--count" in arguments
     named = [Path(argument) for argument in arguments if argument != "--count"]
-    files = named or sorted({path.relative_to(ROOT) for pattern in DOCUMENTS for path in ROOT.glob(pattern)})
+    files = named or sorted({path.relative_to(ROOT) for pattern in READ for path in ROOT.glob(pattern)})
     texts = {file: (ROOT / file).read_text(encoding="utf-8") for file in files}
     found = [(file, breach) for file, text in texts.items() for breach in breaches(text, file.suffix)]
     if counting:
