@@ -24,6 +24,8 @@ READ = (
     "starpos_*/*.md",
     "src/*/*.md",
     "starpos_interfaces/*/*.[ms][sr][gv]",
+    "src/starpos/starpos/averaging/*.py",
+    "src/starpos/starpos/detection/*.py",
     "src/starpos/starpos/identification/*.py",
 )
 MAX_WORDS = 40
