@@ -25,8 +25,10 @@ READ = (
     "src/*/*.md",
     "starpos_interfaces/*/*.[ms][sr][gv]",
     "src/starpos/starpos/averaging/*.py",
+    "src/starpos/starpos/calibration/*.py",
     "src/starpos/starpos/detection/*.py",
     "src/starpos/starpos/identification/*.py",
+    "src/starpos/starpos/navigation/*.py",
 )
 MAX_WORDS = 40
 # Name of a pattern: its expression, and what to write instead.

@@ -8,8 +8,9 @@ a wide claim and many a narrow one.
 
 The error of a pose may be new at each pose (hysteresis, a soft footing). Or it is a smooth function of the camera's lean
 (a mount that bends, a sensor that is not linear), or of its whole attitude (cables that pull, a bearing). This is a
-Gaussian process of unknown length (Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, section 4.2). Then poses
-near each other are alike, and many of them add little to one. docs/error_budget.md has the model in words.
+Gaussian process of unknown length (Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, section
+4.2). Then poses near each other are alike, and many of them add little to one. docs/error_budget.md has the model in
+words.
 """
 
 from collections.abc import Sequence
