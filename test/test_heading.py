@@ -2,13 +2,14 @@
 """What a robot's localisation reads: place, ENU yaw, covariances, stamps."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from sensor_msgs.msg import NavSatFix, NavSatStatus
 
 from starpos_interfaces.msg import Solution
-from starpos_testing.graph.shots import azimuth_for_heading, shoot
+from starpos_testing.graph.shots import LATITUDE_DEG, LONGITUDE_DEG, azimuth_for_heading, shoot
 from starpos_testing.headings import yaw_deg
 
 CARDINAL = [(0.01, 90), (359.99, 90), (90.01, 0), (89.99, 0), (180.01, -90), (179.99, -90), (270.0, 180)]
@@ -73,3 +74,22 @@ def test_covariances_and_stamps(graph, solver):
     assert error @ claimed @ error < 4**2
     # 2 arcsec.
     assert np.abs(error).max() < 60
+
+
+def test_at_a_known_place_heading_needs_no_tilt_and_there_is_no_fix(graph, solver):
+    assert graph.set("solver", site__latitude=LATITUDE_DEG, site__longitude=LONGITUDE_DEG) == (True, "")
+    try:
+        shot = replace(shoot(210.0), tilts=[])
+        solution, fix, _ = graph.answer(shot)
+        graph.wait(lambda: shot.stamp in graph.imus, "for a heading without a tilt")
+        imu = graph.imus[shot.stamp][-1]
+        assert solution.status == Solution.NO_TILT and fix.status.status == NavSatStatus.STATUS_NO_FIX
+        assert math.isnan(fix.latitude) and math.isnan(solution.latitude)
+        # the site is by gravity: the deflection that nobody states is in the heading on WGS 84
+        assert abs(shot.heading_error_deg(solution.heading)) < 4 * solution.heading_stddev < 60 / 3600
+        assert abs(shot.heading_error_deg(90 - yaw_deg(imu))) < 10 / 3600
+        graph.state("solver: Solution", "heading at the known place")
+        refused, why = graph.set("solver", site__longitude=math.nan)
+        assert not refused and "belong together" in why
+    finally:
+        assert graph.set("solver", site__latitude=math.nan, site__longitude=math.nan) == (True, "")

@@ -4,6 +4,7 @@
 Some seconds of CPU: two nights of ten frames, which are the first that a newcomer sees, and smaller ones.
 """
 
+import doctest
 import json
 import re
 
@@ -124,6 +125,18 @@ def test_an_archives_nights_have_a_place_each_by_the_command_that_says_how(tmp_p
     [solved] = [out for line, out in said.items() if line.startswith("starpos solve archive/*")]
     places = [numbers(told)[0] for told in re.findall("2 frames together: (.*)", solved)]
     assert places == pytest.approx([35.0, -20.0], abs=0.1)
+
+
+def test_the_surveyors_commands_print_the_heading_that_the_page_says(tmp_path, monkeypatch, capsys):
+    said = typed("docs/tutorials/azimuth.md", tmp_path, monkeypatch, capsys)
+    page = (ROOT / "docs" / "tutorials" / "azimuth.md").read_text()
+    [shown_line] = re.findall(r"^    3 frames together: (.*)$", page, re.MULTILINE)
+    *_, told = [line for out in said.values() for line in out.splitlines() if "frames together: " in line]
+    assert (
+        doctest.testfile(str(ROOT / "docs" / "tutorials" / "azimuth.md"), module_relative=False).failed == 0
+    )
+    # of lists instead of frames the last digits are others
+    assert numbers(told)[1:] == pytest.approx(numbers(shown_line), abs=0.002)
 
 
 def lines(said: dict[str, str]) -> list[str]:

@@ -14,17 +14,18 @@ from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.node import Node
 from rclpy.qos import ReliabilityPolicy
+from rclpy.time import Time
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Imu
 from std_msgs.msg import Header
 
-from starpos.detection import Detection, DetectionSettings, detect
-from starpos.errors import StarposError, TimeError
+from starpos.detection import Detection, detect
+from starpos.errors import StarposError
 from starpos.frames.frame import Frame
 from starpos.messages.camera import message_to_frame, message_to_picture
+from starpos.messages.exposures import CAPTURES_KEPT, ExposureFacts, check_stamp
+from starpos.session.detector_parameters import PARAMETERS, detection_settings
 from starpos.session.trails import Trails
 from starpos_camera.annotator import Annotator
-from starpos_camera.detector_parameters import PARAMETERS
-from starpos_camera.exposures import CAPTURES_KEPT, ExposureFacts, key_of
 from starpos_camera.frame_topics import FrameTopics
 from starpos_common.clock_report import time_is_simulated
 from starpos_common.diagnostics import Diagnosis, Diagnostics, Level
@@ -76,7 +77,7 @@ class DetectorNode(Node):
         """Make the node; options: those of rclpy's Node (context, namespace, parameter_overrides ...)."""
         super().__init__("detector", **options)
         self._values = declare(self, PARAMETERS, apply=self._apply)
-        self._settings = self._detection_settings()
+        self._settings = detection_settings(self._values)
         self._exposures = ExposureFacts(self._values)
         # images until their Captures come, oldest first, and how long they wait for them, s of the clock below
         self._held: deque[tuple[Image | CompressedImage, float]] = deque()
@@ -115,7 +116,9 @@ class DetectorNode(Node):
         self._patience_clock = Clock(clock_type=ClockType.STEADY_TIME)
         if time_is_simulated(self):
             self._patience_clock = self.get_clock()
-            self._replayed = Replayed(self, takes, [self._publisher], busy=lambda: not self._worker.idle)
+            self._replayed = Replayed(
+                self, takes, [self._publisher], busy=lambda: not self._worker.idle, begin=self._forget
+            )
         self._look = self.create_timer(LOOK_S, self._go_on, clock=self._patience_clock, autostart=False)
 
         def taker(name: str) -> Take:
@@ -128,6 +131,10 @@ class DetectorNode(Node):
         captures = subscription(self, Capture, "camera/capture", taker("camera/capture"), CAPTURES_KEPT)
         self._captures_come = captures.get_publisher_count
         self._topics.listen(taker, both=self._replayed is not None)
+
+    def _forget(self) -> None:
+        """Forget what Captures have told: a replay begins."""
+        self._exposures = ExposureFacts(self._values)
 
     def destroy_node(self) -> None:
         self._worker.stop()
@@ -178,19 +185,8 @@ class DetectorNode(Node):
             self._interval_s = now - self._last_frame_s
         self._last_frame_s = now
 
-    def _detection_settings(self) -> DetectionSettings:
-        v = self._values
-        saturation = None if math.isnan(v["saturation"]) else v["saturation"]
-        return DetectionSettings(
-            threshold=v["threshold"],
-            min_snr=v["min_snr"],
-            max_stars=v["max_stars"],
-            threads=v["threads"],
-            saturation_dn=saturation,
-        )
-
     def _apply(self, names: frozenset[str]) -> None:
-        self._settings = self._detection_settings()
+        self._settings = detection_settings(self._values)
 
     def _on_capture(self, message: Capture, info: Mapping[str, Any]) -> None:
         self._exposures.take(message)
@@ -201,7 +197,7 @@ class DetectorNode(Node):
         first = self._last_frame_s is None
         self._arrived()
         try:
-            _check_stamp(message.header)
+            check_stamp(message.header)
         except StarposError as error:
             self._complain(str(error))
             return
@@ -247,7 +243,8 @@ class DetectorNode(Node):
         """Have an image worked on, with what is known of its exposure."""
         read = message_to_frame if isinstance(message, Image) else message_to_picture
         try:
-            header, add = self._exposures.of(message.header)
+            mid_ns, add = self._exposures.of(message.header)
+            header = Header(frame_id=message.header.frame_id, stamp=Time(nanoseconds=mid_ns).to_msg())
             self._offer(lambda: add(read(message)), header)
         except StarposError as error:
             # The Capture has values that no exposure and no clock can have.
@@ -278,7 +275,7 @@ class DetectorNode(Node):
                 self._publisher.publish(result.message)
                 self._frames += 1
                 if self._replayed is not None:
-                    self._replayed.made += 1
+                    self._replayed.note(result.message.header.stamp)
                 self._troubles.right("frames")
                 if result.frame is not None:
                     self._say_size(result.frame)
@@ -354,19 +351,6 @@ class DetectorNode(Node):
                 "seconds": last.seconds,
             }
         return Diagnosis(level, sentence, values)
-
-
-def _check_stamp(header: Header) -> None:
-    """Raise TimeError if the stamp is not set, or is no time."""
-    sec, nanosec = key_of(header)
-    if not sec and not nanosec:
-        raise TimeError(
-            "image_raw: the frame has no time stamp; set header.stamp to the middle of the exposure."
-        )
-    if sec < 0 or nanosec >= 1_000_000_000:
-        raise TimeError(
-            f"image_raw: the stamp {sec} s {nanosec} ns is no time after 1970; check the camera's clock."
-        )
 
 
 def _warm_up() -> None:

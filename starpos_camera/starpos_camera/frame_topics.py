@@ -10,7 +10,7 @@ from rclpy.clock_type import ClockType
 from rclpy.node import Node
 from sensor_msgs.msg import CompressedImage, Image
 
-from starpos_camera.exposures import key_of
+from starpos.messages.exposures import key_of
 from starpos_common.matched import MatchedSubscription
 from starpos_common.topics import Take
 

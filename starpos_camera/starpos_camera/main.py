@@ -56,7 +56,8 @@ def camera_detector() -> int:
 
 
 def _help(executable: str, about: str, *nodes: str) -> str:
-    from starpos_camera import camera_parameters, detector_parameters
+    from starpos.session import detector_parameters
+    from starpos_camera import camera_parameters
     from starpos_common.node_help import node_help
 
     tables = {"camera": camera_parameters.PARAMETERS, "detector": detector_parameters.PARAMETERS}

@@ -6,10 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
 from starpos.frames.driver_stamp import KINDS
 from starpos.frames.encodings import ENCODINGS, pixels_of
-from starpos_camera.detector_parameters import PARAMETERS
+from starpos.session.detector_parameters import PARAMETERS
 
 PAGE = Path(__file__).parents[2] / "docs" / "how-to" / "existing_robot.md"
 if not PAGE.is_file():
@@ -17,7 +18,7 @@ if not PAGE.is_file():
 TEXT = PAGE.read_text()
 ROWS = [
     [cell.strip() for cell in line.strip("|").split("|")]
-    for line in TEXT.splitlines()
+    for line in TEXT.split("## What drivers send")[1].splitlines()
     if line.startswith("| ")
 ][2:]
 DRIVERS = ("camera_ros", "usb_cam", "v4l2_camera", "realsense2", "spinnaker", "pylon", "camera_aravis2")
@@ -44,8 +45,8 @@ def test_the_stamps_it_is_to_set_are_there(row):
     assert set(re.findall(r"`(\w+)`", row[4])) <= set(KINDS) and "`" in row[4]
 
 
-def test_the_parameters_of_the_page_are_the_detectors():
-    block = TEXT.split("```yaml")[1].split("```")[0]
-    stated = re.findall(r"^    (\w+):", block, re.MULTILINE)
-    assert stated == ["stamp", "stamp_stddev", "exposure", "readout"]
+def test_the_file_of_the_page_says_what_no_driver_does():
+    config = PAGE.parents[2] / "src" / "starpos_bringup" / "config" / "existing_robot.yaml"
+    stated = yaml.safe_load(config.read_text())["/**/detector"]["ros__parameters"]
+    assert list(stated) == ["stamp", "stamp_stddev", "exposure", "readout"]
     assert set(stated) <= {p.name for p in PARAMETERS}

@@ -2,6 +2,8 @@
 """The node `inclinometer`: publishes the readings of one source on `tilt`."""
 
 import time
+from collections.abc import Mapping
+from typing import Any
 
 from rclpy.node import Node
 from rclpy.time import Time
@@ -9,7 +11,8 @@ from rclpy.time import Time
 from starpos_common.clock_report import time_is_simulated
 from starpos_common.diagnostics import Diagnosis, Diagnostics
 from starpos_common.parameters import declare
-from starpos_common.topics import publisher
+from starpos_common.replayed import Replayed
+from starpos_common.topics import Take, publisher
 from starpos_inclinometer.host_clock import HostClock, Step
 from starpos_inclinometer.parameters import PARAMETERS, refusal
 from starpos_inclinometer.report import Reporter, step_sentence
@@ -30,13 +33,39 @@ class InclinometerNode(Node):
         self._logged_step: Step | None = None
         self._reporter = Reporter()
         self._wake = self.create_guard_condition(self._on_wake)
-        self.host_clock = HostClock(
-            lambda: self.get_clock().now().nanoseconds, lambda: time_is_simulated(self)
-        )
-        host = Surroundings(self, self.host_clock, self._wake.trigger)
+        self._replayed: Replayed | None = None
+        self.host_clock = HostClock(self._now_ns, lambda: time_is_simulated(self))
+        host = Surroundings(self, self.host_clock, self._wake.trigger, self._in_turn, time_is_simulated(self))
         self._source = SOURCES[self._values["source"]](host, self._values)
+        if host.replays and self._source.takes:
+            takes = {name: self._at_once(take) for name, take in self._source.takes.items()}
+            self._replayed = Replayed(
+                self, takes, [self._publisher], busy=lambda: False, begin=self._source.restart
+            )
         self._diagnostics = Diagnostics(self, {"Link": self._report}, self._source.name)
         self._source.start()
+
+    def _now_ns(self) -> int:
+        replayed = self._replayed
+        if replayed is not None and replayed.playing:
+            return round((replayed.unix_s or 0.0) * 1e9)
+        return self.get_clock().now().nanoseconds
+
+    def _in_turn(self, name: str, take: Take) -> Take:
+        def on_message(message: Any, info: Mapping[str, Any]) -> None:
+            if self._replayed is None or not self._replayed.holds(name, message, info):
+                take(message, info)
+
+        return on_message
+
+    def _at_once(self, take: Take) -> Take:
+        """Take a message of a replay, and publish what is made of it before the next one has its turn."""
+
+        def on_turn(message: Any, info: Mapping[str, Any]) -> None:
+            take(message, info)
+            self._publish_readings()
+
+        return on_turn
 
     def destroy_node(self) -> None:
         self._source.stop()
@@ -45,11 +74,19 @@ class InclinometerNode(Node):
     def _apply(self, names: frozenset[str]) -> None:
         self._source.configure(self._values)
 
-    def _on_wake(self) -> None:
+    def _publish_readings(self) -> bool:
+        """Publish what the source has; return whether one has a flag that was not reported yet."""
         urgent = False
         for reading in self._source.take():
-            self._publisher.publish(self._message(reading))
+            message = self._message(reading)
+            self._publisher.publish(message)
             urgent |= self._reporter.count(reading.flags)
+            if self._replayed is not None:
+                self._replayed.note(message.header.stamp)
+        return urgent
+
+    def _on_wake(self) -> None:
+        urgent = self._publish_readings()
         health = self._source.health()
         urgent |= self._log(health)
         if urgent:

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Parameters of the node `inclinometer`; those of a source are in the module of the source."""
 
-import math
 from collections.abc import Mapping
 from typing import Any
 
-from starpos_common.parameters import FRAME_NAME, Parameter
+from starpos.session.inclinometer_parameters import SHARED
+from starpos_common.parameters import Parameter
 from starpos_inclinometer.sources.registry import SOURCES
 
 COMMON = (
@@ -17,31 +17,7 @@ COMMON = (
         choices=tuple(SOURCES),
         read_only=True,
     ),
-    Parameter(
-        "frame_id",
-        "starpos_inclinometer_frame",
-        "Frame of the tilts: S, the sensor's X', Y', Z'; of source imu, the IMU's own axes.",
-        read_only=True,
-        form=FRAME_NAME,
-    ),
-    Parameter(
-        "noise_stddev",
-        math.nan,
-        "White noise of one sample and axis, at least; unset takes what the samples show, 0.0035 deg until there are "
-        "enough. Too large widens fixes for nothing.",
-        unit="deg",
-        minimum=1e-6,
-        maximum=10.0,
-    ),
-    Parameter(
-        "latency",
-        math.nan,
-        "From the middle of a sample to the first byte of its line, of source imu to its stamp; unset takes what the "
-        "microcontroller reports, 0 of other sources. Matters only while the tilt moves.",
-        unit="s",
-        minimum=0.0,
-        maximum=10.0,
-    ),
+    *SHARED,
 )
 # Two sources may share a parameter, as the two on a serial port do.
 PARAMETERS = tuple(

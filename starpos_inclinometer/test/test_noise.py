@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from board import Board
 
+from starpos.instrument.noise_tracker import LONG, SHORT, NoiseTracker
 from starpos_inclinometer.emulator import Mcu
-from starpos_inclinometer.noise import LONG, SHORT, NoiseTracker
 from starpos_inclinometer.sources import mcu_protocol
 from starpos_inclinometer.sources.sca100t import Sensor
 

@@ -10,7 +10,7 @@ from rclpy.clock_type import ClockType
 from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.qos import ReliabilityPolicy
-from sensor_msgs.msg import CameraInfo, Imu
+from sensor_msgs.msg import CameraInfo, Imu, NavSatFix
 from std_srvs.srv import Trigger
 
 from starpos.instrument.camera import Camera
@@ -35,6 +35,7 @@ from starpos_solver.settings import SolverSettings
 from starpos_solver.transforms import StaticTransforms
 
 POLL_S = 0.02
+GNSS_TOPIC = "gnss/fix"
 TILT_QUEUE = 1000
 PLAY_SLOWER = (
     "play it slower, or by `ros2 run starpos_bringup replay`; frames without them have other fixes, or none"
@@ -51,7 +52,10 @@ class SolverNode(Node):
         self._values = self._settings.values
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         gyro = (IMU_TOPIC,) * self._values["gyro"]
-        self._inputs = Inputs(self, ("camera_info", "stars", "tilt", *gyro))
+        gnss = (GNSS_TOPIC,) * self._values["gnss.use"]
+        # at a known place a heading needs no tilt
+        tilt = ("tilt",) * (self._settings.site is None and not gnss)
+        self._inputs = Inputs(self, ("camera_info", "stars", *tilt, *gyro, *gnss))
         self._dropped = Dropped(self, PLAY_SLOWER)
         self._replayed: Replayed | None = None
         self._session = SolverSession(
@@ -93,6 +97,8 @@ class SolverNode(Node):
         if self._values["gyro"]:
             best_effort = ReliabilityPolicy.BEST_EFFORT
             subscription(self, Imu, IMU_TOPIC, self._on_imu, IMU_QUEUE, best_effort)
+        if self._values["gnss.use"]:
+            subscription(self, NavSatFix, GNSS_TOPIC, session.take_gnss, 10, ReliabilityPolicy.BEST_EFFORT)
         self.create_service(Solve, "~/solve", self._on_solve)
         self.create_service(Trigger, "~/reset", self._on_reset)
         self._calibration_services = CalibrationServices(self, self._session, self._settings)
@@ -176,8 +182,7 @@ class SolverNode(Node):
         for output in outputs:
             self._outputs.publish(output)
             if self._replayed is not None and isinstance(output, Answered):
-                self._replayed.made += 1
-                self._replayed.fixes += output.solution.ok
+                self._replayed.note(output.stamp, output.solution.ok)
         if outputs:
             self._update_transforms()
         # poll only while a frame waits; where the clock is played, its ticks do

@@ -11,6 +11,8 @@ from std_msgs.msg import Header
 
 from starpos import rotation
 from starpos.earth.vertical import Geodetic
+from starpos.fix.attitude_at_place import AttitudeAtPlace
+from starpos.fix.fix import Fix
 from starpos.fix.solution import Solution, Status
 from starpos_common.messages import tilt_to_message
 from starpos_interfaces import msg
@@ -69,16 +71,28 @@ def attitude(fix: Oriented, ground: Geodetic) -> tuple[Quaternion, np.ndarray]:
     """The attitude of the base link in true-north ENU, and its covariance (3, 3)."""
     # Azimuths grow clockwise.
     to_geodetic_north = rotation.about_axis(2, -ground.azimuth_turn)
-    x, y, z, w = rotation.to_quaternion(to_geodetic_north @ fix.link_to_enu).tolist()
     covariance = to_geodetic_north @ fix.attitude_covariance @ to_geodetic_north.T
     covariance[2, 2] += ground.deflection_covariance[2, 2]
-    return Quaternion(x=x, y=y, z=z, w=w), covariance
+    return _quaternion(to_geodetic_north @ fix.link_to_enu), covariance
+
+
+def _quaternion(turn: np.ndarray) -> Quaternion:
+    x, y, z, w = rotation.to_quaternion(turn).tolist()
+    return Quaternion(x=x, y=y, z=z, w=w)
 
 
 def imu(header: Header, fix: Oriented, ground: Geodetic) -> Imu:
     """Make the attitude of the base link in true-north ENU; rates and accelerations are not measured."""
-    message = Imu(header=header)
-    message.orientation, covariance = attitude(fix, ground)
+    return _imu(header, *attitude(fix, ground))
+
+
+def imu_at_place(header: Header, link: Oriented) -> Imu:
+    """Make the same of an attitude that is in true-north ENU already."""
+    return _imu(header, _quaternion(link.link_to_enu), link.attitude_covariance)
+
+
+def _imu(header: Header, orientation: Quaternion, covariance: np.ndarray) -> Imu:
+    message = Imu(header=header, orientation=orientation)
     message.orientation_covariance = covariance.ravel()
     message.angular_velocity_covariance[0] = -1.0
     message.linear_acceleration_covariance[0] = -1.0
@@ -110,6 +124,8 @@ def solution(header: Header, answer: Solution, ground: Geodetic | None) -> msg.S
                      "refraction", "diurnal_aberration", "ut1_minus_utc", "xi", "eta"):  # fmt: skip
             setattr(message, name, NAN)
         message.covariance = message.covariance_geodetic = [NAN] * 9
+        if answer.at_place is not None:
+            _add_heading(message, answer.at_place)
         return message
     degrees = np.array([1.0, 1.0, np.degrees(1.0)])
     message.latitude, message.longitude = math.degrees(fix.latitude), math.degrees(fix.longitude)
@@ -129,7 +145,32 @@ def solution(header: Header, answer: Solution, ground: Geodetic | None) -> msg.S
         message.budget.append(
             msg.ErrorTerm(name=name, east=east, north=north, heading=heading, common=common)
         )
-    message.refraction = fix.refraction_arcsec
-    message.diurnal_aberration = fix.diurnal_aberration_arcsec
-    message.ut1_minus_utc = fix.ut1_minus_utc_s
+    _add_corrections(message, fix)
+    if answer.at_place is not None:
+        _set_heading(message, answer.at_place)
     return message
+
+
+def _add_heading(message: msg.Solution, at_place: AttitudeAtPlace) -> None:
+    """Put what a known place tells into the message of a frame without a place of its own."""
+    _set_heading(message, at_place)
+    _add_corrections(message, at_place)
+    deflection = at_place.place.deflection
+    message.xi, message.eta = deflection.xi_arcsec, deflection.eta_arcsec
+    for term in at_place.true_north.terms:
+        heading = math.degrees(math.sqrt(term.covariance[2, 2]))
+        message.budget.append(
+            msg.ErrorTerm(name=term.name, east=NAN, north=NAN, heading=heading, common=term.common)
+        )
+
+
+def _set_heading(message: msg.Solution, at_place: AttitudeAtPlace) -> None:
+    link = at_place.true_north
+    message.heading = math.degrees(link.heading)
+    message.heading_stddev = math.degrees(math.sqrt(link.covariance[0, 0]))
+
+
+def _add_corrections(message: msg.Solution, applied: Fix | AttitudeAtPlace) -> None:
+    message.refraction = applied.refraction_arcsec
+    message.diurnal_aberration = applied.diurnal_aberration_arcsec
+    message.ut1_minus_utc = applied.ut1_minus_utc_s

@@ -39,8 +39,10 @@ class SolutionPublishers:
             self._fix_averaged.publish(self._nav_sat_fix(header, output.ground))
             return
         self._fix.publish(self._nav_sat_fix(header, output.ground))
-        fix = output.solution.fix
-        if fix is not None and output.ground is not None:
+        fix, at_place = output.solution.fix, output.solution.at_place
+        if at_place is not None:
+            self._imu.publish(outputs.imu_at_place(header, at_place.true_north))
+        elif fix is not None and output.ground is not None:
             self._imu.publish(outputs.imu(header, fix, output.ground))
         if output.attitude is not None:
             self._attitude.publish(attitude_to_message(output.attitude))

@@ -2,15 +2,17 @@
 """What consumers of fix and heading rely on: frames, signs, covariances, and NaN where nothing is known."""
 
 import math
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
 from sensor_msgs.msg import NavSatFix, NavSatStatus
 from std_msgs.msg import Header
 
+from starpos.earth.known_place import KnownPlace
 from starpos.earth.vertical import Deflection
-from starpos.fix.budget import ErrorTerm, heading_of
+from starpos.fix.attitude_at_place import AttitudeAtPlace, LinkAttitude
+from starpos.fix.budget import ErrorTerm, heading_of, heading_row
 from starpos.fix.fix import Fix
 from starpos.fix.solution import Solution, Status
 from starpos.session.frames import ground_of
@@ -185,3 +187,33 @@ def test_the_budget_adds_up_and_the_deflection_to_the_geodetic_covariance():
     variance += np.square([deflection.east, deflection.north, deflection.heading])
     np.testing.assert_allclose(variance, np.diag(np.reshape(message.covariance_geodetic, (3, 3))), rtol=1e-9)
     assert deflection.north == pytest.approx(3 * 30.84, rel=0.01)
+
+
+def at_place_facing(azimuth_deg: float, **places) -> AttitudeAtPlace:
+    """An attitude at a known place, the same by both norths, with an error of 1e-4 rad about each axis."""
+    fix = fix_facing(azimuth_deg)
+    heading = heading_row(fix.link_to_enu)
+    term = ErrorTerm("centroids", np.vstack([np.zeros((2, 3)), heading, np.eye(3)]) * 1e-4)
+    link = LinkAttitude(link_to_enu=fix.link_to_enu, terms=(term,))
+    shared = {f.name: getattr(fix, f.name) for f in fields(AttitudeAtPlace) if hasattr(fix, f.name)}
+    where = KnownPlace.on_ellipsoid(40.0, 57.0, EXACT)
+    return AttitudeAtPlace(**shared, place=where, plumb=link, ellipsoid=link, true_north=link)
+
+
+def test_a_heading_without_a_fix_is_an_attitude_and_a_solution_without_a_place():
+    answer = replace(answer_facing(60.0), status=Status.NO_TILT, fix=None, at_place=at_place_facing(60.0))
+    message = outputs.solution(Header(), answer, None)
+    assert message.status == msg.Solution.NO_TILT and math.isnan(message.latitude)
+    assert message.heading == pytest.approx(60.0)
+    assert message.heading_stddev == pytest.approx(math.degrees(1e-4))
+    assert [term.name for term in message.budget] == ["centroids"]
+    assert math.isnan(message.budget[0].east) and message.refraction == 12.0
+    attitude = outputs.imu_at_place(Header(), answer.at_place.true_north)
+    assert yaw_deg(attitude) == pytest.approx(30.0)
+    assert np.diag(np.reshape(attitude.orientation_covariance, (3, 3))) == pytest.approx([1e-8] * 3)
+
+
+def test_beside_a_fix_the_heading_is_that_of_the_known_place():
+    answer = replace(answer_facing(60.0), at_place=at_place_facing(61.0))
+    message = outputs.solution(Header(), answer, ground_of(answer.fix, EXACT))
+    assert message.heading == pytest.approx(61.0) and message.latitude == pytest.approx(40.0)

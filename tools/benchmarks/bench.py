@@ -41,6 +41,7 @@ GROUPS = {
 FULL = {
     "accuracy": "accuracy_by_configuration",
     "detection": "benchmark_detection",
+    "heading": "benchmark_heading",
     "identification": "benchmark_identification",
     "instructions": "instructions",
     "jobs": "benchmark_jobs",

@@ -25,7 +25,8 @@ from starpos.averaging.average import average
 from starpos.cli import main as starpos
 from starpos.earth.orientation import earth_state
 from starpos.earth.refraction import Atmosphere
-from starpos.fix.fix import Fix, MatchedStars, solve_fix
+from starpos.fix.fix import Fix, solve_fix
+from starpos.fix.matched import MatchedStars
 from starpos.fix.solver import Solver
 from starpos.frames.frame import Frame
 from starpos.frames.stars import Stars

@@ -41,6 +41,7 @@ _HOMES = {
     "Frame": "frames.frame",
     "InDegrees": "fix.readable",
     "Instrument": "instrument.instrument",
+    "KnownPlace": "earth.known_place",
     "Night": "night.night",
     "NightOnDisk": "night.opening",
     "ReportedPlace": "night.night",

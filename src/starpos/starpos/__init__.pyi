@@ -5,6 +5,7 @@ from starpos.calibration.misalignment import calibrate_at as calibrate_at
 from starpos.calibration.turning import turn as turn
 from starpos.detection import Detection as Detection
 from starpos.detection import detect as detect
+from starpos.earth.known_place import KnownPlace as KnownPlace
 from starpos.earth.refraction import Atmosphere as Atmosphere
 from starpos.earth.vertical import Deflection as Deflection
 from starpos.earth.vertical import geodetic as geodetic

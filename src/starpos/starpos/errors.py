@@ -41,6 +41,10 @@ class GeoidError(StarposError):
     """A grid of geoid undulations is missing or broken."""
 
 
+class PlaceError(StarposError):
+    """A place that is said to be known cannot be, or the stars contradict it."""
+
+
 class BagError(StarposError):
     """A recording (rosbag2) cannot be read, or unpacks to more than it may."""
 

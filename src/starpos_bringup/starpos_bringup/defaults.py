@@ -5,16 +5,15 @@ python -m starpos_bringup.defaults > config/starpos.yaml
 """
 
 import starpos_camera.camera_parameters
-import starpos_camera.detector_parameters
 import starpos_dashboard.parameters
 import starpos_inclinometer.parameters
 import starpos_solver.settings
-from starpos.session import navigator_parameters
+from starpos.session import detector_parameters, navigator_parameters
 from starpos_common.parameters import to_yaml
 
 NODES = {
     "camera": starpos_camera.camera_parameters.PARAMETERS,
-    "detector": starpos_camera.detector_parameters.PARAMETERS,
+    "detector": detector_parameters.PARAMETERS,
     "inclinometer": starpos_inclinometer.parameters.PARAMETERS,
     "solver": starpos_solver.settings.PARAMETERS,
     "navigator": navigator_parameters.PARAMETERS,

@@ -105,19 +105,21 @@ def process(
     parameters: Mapping[str, Mapping] = {},
     arguments: Sequence[str] = (),
     defaults: Mapping[str, Mapping] = {},
+    remaps: Mapping[str, str] = {},
     **options: Any,
 ) -> Node:
     """Make a process.
 
     parameters, defaults: of its nodes, by name ('**' is all); the parameter file counts less than parameters, more
-    than defaults.
+    than defaults.  remaps: topics by the names that the nodes know them by.
     """
+    renamed = [word for name, topic in remaps.items() for word in ("-r", f"{name}:={topic}")]
     files = [_written(defaults), common.params_file, _written(parameters)]
     return Node(
         package=package,
         executable=executable,
         parameters=[file for file in files if file],
-        arguments=[*arguments, *ros_arguments(executable, common)],
+        arguments=[*arguments, *ros_arguments(executable, common), *renamed],
         output="screen",
         respawn=common.respawn,
         respawn_delay=RESPAWN_DELAY_S,

@@ -229,6 +229,29 @@ def test_two_instruments_have_namespaces_frames_and_enclaves_of_their_own_and_on
         ]
 
 
+def test_a_robots_topics_are_remapped_and_its_own_fix_has_another_name():
+    mine = str(FOLDER.parent / "config" / "existing_robot.yaml")
+    topics = {"image": "/cam0/image_raw", "camera_info": "/cam0/camera_info", "imu": "/imu/data"}
+    robot = started("robot", params_file=mine, use_sim_time="true", **topics)
+    assert list(robot) == ["detector", "inclinometer", "solver"]
+    remaps = {name: [w for w in p.words if ":=" in w] for name, p in robot.items()}
+    image, info, imu = (
+        f"{name}:={topics[key]}"
+        for name, key in (
+            ("camera/image_raw", "image"),
+            ("camera/camera_info", "camera_info"),
+            ("imu/data", "imu"),
+        )
+    )
+    assert remaps == {"detector": [image, info, imu], "inclinometer": [imu], "solver": [info, imu]}
+    assert robot["inclinometer"].more["/**/inclinometer"] == {"source": "imu"}
+    assert {p.namespace for p in robot.values()} == {"/starpos"} and {
+        p.user_file for p in robot.values()
+    } == {mine}
+    with pytest.raises(RuntimeError, match='"image" was not provided'):
+        started("robot")
+
+
 def test_a_replay_takes_the_stars_or_finds_them_again(bag):
     stars = started("replay", bag=bag, rate="0", namespace="rover")
     assert list(stars) == ["solver", "replay"]

@@ -3,16 +3,18 @@
 
 import pytest
 import rclpy
+from builtin_interfaces.msg import Time
 from rclpy.serialization import serialize_message
-from sensor_msgs.msg import Image
+from sensor_msgs.msg import Image, Imu
 from std_msgs.msg import String
 
 from starpos_bringup.recording.bag import Topic
-from starpos_bringup.recording.player import IMAGE, STARS, Player
+from starpos_bringup.recording.player import FRAMES, IMU, Player
 from starpos_interfaces.msg import StarArray, Taken
 from starpos_testing.nodes import take_domain
 
 IMAGES = "/camera/image_raw"
+STARS, IMAGE = FRAMES[:2]
 
 
 def topic(name, kind, type_name):
@@ -107,3 +109,40 @@ def test_images_that_nobody_takes_are_no_frames_where_somebody_takes_stars(playe
     for played in TOPICS.values():
         player.play(played, 1, bytes(serialize_message(played.kind())))
     assert (player.count, player.frames) == (2, frames)
+
+
+def test_a_tilt_has_its_turn_right_after_the_acceleration_that_completes_it(player_of):
+    inclinometer = Taken(node="/inclinometer", takes=["/imu/data"], makes=["/tilt"])
+    solver = Taken(node="/solver", takes=["/stars", "/tilt"], makes=["/solver/solution"])
+    player, _ = player_of([topic("/imu/data", Imu, IMU)], inclinometer, solver)
+    participants = player._participants
+    participants.begin()
+    player._first_ns = None
+    told, tell = [], participants.tell
+
+    def note(kind, now_ns, name, stamp, *, answer):
+        told.append((name, stamp.sec, answer))
+        tell(kind, now_ns, name, stamp, answer=answer)
+
+    participants.tell = note
+
+    def taken():
+        """What the inclinometer says when the message has its turn: the second one completes a tilt."""
+        made = [Time(sec=7)] if told[-1][1] == 2 else []
+        now = {"replay": participants._replay, "index": participants._index}
+        heard = Taken(node="/inclinometer", takes=["/imu/data"], makes=["/tilt"], stamps=made, **now)
+        participants._on_taken(heard)
+
+    player._taken = taken
+    for k in (1, 2, 3):
+        message = Imu()
+        message.header.stamp.sec = k
+        player.play(topic("/imu/data", Imu, IMU), k * 10**9, bytes(serialize_message(message)))
+    assert told == [
+        ("/imu/data", 1, True),
+        ("/imu/data", 2, True),
+        ("/tilt", 7, False),
+        ("/imu/data", 3, True),
+    ]
+    # and the solver, which takes no accelerations, was not waited for
+    assert not player.lost

@@ -11,6 +11,7 @@ from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+from builtin_interfaces.msg import Time
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
 from rclpy.node import Node
@@ -31,6 +32,10 @@ WORD_S = 1.0
 # One that says nothing for so long has ended if the graph does not show it: a busy machine may lose sight of one that
 # has not.  The graph shows a killed one for many seconds: so long without a word is enough.
 ENDED_S, SILENT_S = 5.0, 15.0
+STRANGERS = (
+    "{} messages on {} are left out, which were neither played nor made of what was: stop the node that sends them, or "
+    "start it with use_sim_time, so that it takes part in the replay"
+)
 BROKEN_OFF = "the player ended in the middle, and {} messages are left out: play it again"
 
 
@@ -38,7 +43,7 @@ class Replayed:
     """Holds back the messages of a replay until it is their turn.
 
     takes: what takes the messages of a topic, by its relative name.
-    makes: the node's publishers, first that of what it makes of a frame; the node counts this in `made` and `fixes`.
+    makes: the node's publishers, first that of what it makes of a frame, or of an IMU's messages; the node tells `note`.
     busy: whether the node still works on what it has taken; it calls `go_on` when that is done.
     begin, end: called before the first message of a replay, and when no more come.
     """
@@ -66,6 +71,8 @@ class Replayed:
         self._silent_s, self._beat_s = 0.0, time.monotonic()
         self._turns: deque[Played] = deque()
         self._taking: Played | None = None
+        # stamps of what was made of the last message that was taken
+        self._stamps: list[Time] = []
         self._held: dict[str, deque[tuple[Any, Mapping[str, Any]]]] = {}
         node.create_subscription(Played, PLAYED, self._on_played, DEPTH)
         self._publisher = node.create_publisher(Taken, TAKEN, LATCHED)
@@ -87,6 +94,13 @@ class Replayed:
         self._held.setdefault(self._names[name], deque(maxlen=DEPTH)).append((message, info))
         self.go_on()
         return True
+
+    def note(self, stamp: Time, fix: bool = False) -> None:
+        """Note that something was made and published; fix: whether it is a fix."""
+        self.made += 1
+        self.fixes += fix
+        if self._playing:
+            self._stamps.append(stamp)
 
     def go_on(self) -> None:
         """Take all messages whose turn it is."""
@@ -121,6 +135,7 @@ class Replayed:
             return False
         if turn.kind != Played.BEGIN:
             self.unix_s = (turn.time.sec * 10**9 + turn.time.nanosec) * 1e-9
+        self._stamps = []
         if take and held is not None:
             self._turns.popleft()
             self._taking = turn
@@ -149,8 +164,11 @@ class Replayed:
     def _done(self, turn: Played) -> None:
         self._taking, self._index = None, turn.index
         if turn.kind == Played.END:
-            self._leave("another node publishes what is played, too: {} messages of it are left out")
-        if turn.answer:
+            self._leave(
+                STRANGERS.format("{}", ", ".join(sorted(n for n, held in self._held.items() if held)))
+            )
+        # who does not take a topic is not waited for
+        if turn.answer and (not turn.topic or turn.topic in self._takes):
             self._say()
 
     def _leave(self, why: str) -> None:
@@ -193,5 +211,6 @@ class Replayed:
                 listeners=self._listeners,
                 made=self.made,
                 fixes=self.fixes,
+                stamps=self._stamps,
             )
         )

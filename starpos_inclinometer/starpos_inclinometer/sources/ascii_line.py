@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 
 from starpos.instrument.inclinometer import SCA100T_NOISE_RAD, elevations
+from starpos.instrument.noise_tracker import NoiseTracker, noise_text
 from starpos.units import ARCSEC
 from starpos_common.parameters import Parameter
 from starpos_inclinometer.clock import ArrivalFilter, PaceWatch
 from starpos_inclinometer.host_clock import Moment
-from starpos_inclinometer.noise import NoiseTracker, noise_text
 from starpos_inclinometer.sources.mcu_continuity import HOST_TOLERANCE_S, HOST_TOLERANCE_SHARE, Gate
 from starpos_inclinometer.sources.reading import (
     GAP,

@@ -5,10 +5,10 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
+from starpos.instrument.noise_tracker import noise_text
 from starpos_common.parameters import Parameter
 from starpos_inclinometer.clock import ArrivalFilter
 from starpos_inclinometer.host_clock import Moment
-from starpos_inclinometer.noise import noise_text
 from starpos_inclinometer.sources import mcu_protocol, sca100t
 from starpos_inclinometer.sources.mcu_continuity import Continuity, Gate, mcu_follows
 from starpos_inclinometer.sources.mcu_protocol import Identity, Reason, Refusal

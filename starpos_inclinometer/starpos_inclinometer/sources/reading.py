@@ -1,20 +1,27 @@
 # SPDX-License-Identifier: Apache-2.0
 """The results of a source: readings, and the state of the source."""
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import Enum
 from typing import Any
 
+from starpos.messages.tilt import GAP, OUT_OF_RANGE, SATURATED, STUCK, TIME_UNKNOWN, Reading
 from starpos_inclinometer.host_clock import Moment, Step
 
-# starpos_interfaces/Tilt flags
-OUT_OF_RANGE = 1
-STUCK = 2
-SATURATED = 4
-GAP = 8
-TIME_UNKNOWN = 16
+# for the sources
+__all__ = [
+    "GAP",
+    "OUT_OF_RANGE",
+    "SATURATED",
+    "STUCK",
+    "TIME_UNKNOWN",
+    "Arrival",
+    "Counts",
+    "Health",
+    "Phase",
+    "Reading",
+]
 
 
 class Phase(Enum):
@@ -61,26 +68,6 @@ class Arrival:
     moment: Moment
     # What the device had told about itself when it sent this.
     identity: Any = None
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Reading:
-    """A tilt as it is published.
-
-    stamp_ns: the host's time.  x, y: rad, always finite.  covariance: rad2 (xx, xy, yx, yy).
-    temperature_c: deg C, or NaN if it is not known.
-    z, z_variance: rad, rad2; NaN of a two-axis sensor.
-    """
-
-    stamp_ns: int
-    x: float
-    y: float
-    covariance: tuple[float, float, float, float]
-    temperature_c: float
-    sequence: int
-    flags: int
-    z: float = math.nan
-    z_variance: float = math.nan
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -13,7 +13,7 @@ from starpos.instrument.inclinometer import (
     SCA100T_RANGE_RAD,
     SCA100T_SENSITIVITY_V_PER_G,
 )
-from starpos_inclinometer.noise import NoiseTracker
+from starpos.instrument.noise_tracker import NoiseTracker
 from starpos_inclinometer.sources.mcu_protocol import Sample, SampleStatus
 from starpos_inclinometer.sources.reading import GAP, OUT_OF_RANGE, SATURATED, STUCK
 from starpos_inclinometer.temperature import Temperature

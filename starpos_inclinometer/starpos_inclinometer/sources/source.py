@@ -8,17 +8,24 @@ from typing import Any, Protocol
 from rclpy.node import Node
 
 from starpos_common.parameters import Parameter
+from starpos_common.topics import Take
 from starpos_inclinometer.host_clock import HostClock
 from starpos_inclinometer.sources.reading import Health, Reading
 
 
 @dataclass(frozen=True)
 class Surroundings:
-    """What a node gives its source: itself, for topics; the host's clock; `wake`, which any thread may call."""
+    """What a node gives its source: itself, for topics; the host's clock; `wake`, which any thread may call.
+
+    in_turn: the callback of a topic by its relative name and what takes its messages: in a replay each has its turn.
+    replays: whether the node's time is simulated.
+    """
 
     node: Node
     clock: HostClock
     wake: Callable[[], object]
+    in_turn: Callable[[str, Take], Take] = lambda name, take: take
+    replays: bool = False
 
 
 class TiltSource(Protocol):
@@ -37,11 +44,20 @@ class TiltSource(Protocol):
     def refusal(values: Mapping[str, Any]) -> str | None:
         """Say in a sentence why a source cannot be made of these parameters; None if it can."""
 
+    @property
+    def takes(self) -> Mapping[str, Take]:
+        """What takes the messages of each topic, by its relative name."""
+        return {}
+
     def start(self) -> None:
         """Begin to listen."""
 
     def stop(self) -> None:
         """End everything that `start` began; takes at most a second."""
+
+    def restart(self) -> None:
+        """Forget what came of topics: a replay begins."""
+        return None
 
     def configure(self, values: Mapping[str, Any]) -> None:
         """Apply the parameters that may change at run time."""

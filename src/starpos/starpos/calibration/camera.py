@@ -21,7 +21,7 @@ from starpos.calibration.intrinsics import (
 from starpos.calibration.misalignment import NOTHING_KNOWN, Known
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import CalibrationError, InstrumentError
-from starpos.fix.fix import sound_matches
+from starpos.fix.matched import sound_matches
 from starpos.fix.seen import high_enough
 from starpos.fix.solver import ENOUGH_SOUND
 from starpos.frames.stars import Stars

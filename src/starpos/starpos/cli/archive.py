@@ -13,7 +13,7 @@ from starpos.frames.night_files import TILTS, TRUTH
 class NightFolder:
     """Frames with one table of tilts that make one fix together.
 
-    tilt: absolute path; None for a camera that is fixed to the ground.  folder: None if the frames were named one by one.
+    tilt: absolute path; None where none is needed.  folder: None if the frames were named one by one.
     """
 
     frames: tuple[str, ...]
@@ -33,8 +33,10 @@ def frames_among(given: list[str], *tables: str | None) -> list[str]:
     return frames or given
 
 
-def nights_of(given: list[str], tilt: str | None, own_level: bool = False) -> list[NightFolder | FrameError]:
-    """One night from frames and a table, or without one for a camera that is fixed to the ground.
+def nights_of(
+    given: list[str], tilt: str | None, needs_no_tilt: bool = False
+) -> list[NightFolder | FrameError]:
+    """One night from frames and a table, or without one for a camera fixed to the ground or at a known place.
 
     Else a night for each folder, or the error why it is none.
 
@@ -43,7 +45,7 @@ def nights_of(given: list[str], tilt: str | None, own_level: bool = False) -> li
     """
     if tilt is not None:
         return [NightFolder(tuple(given), os.path.abspath(tilt))]
-    if own_level:
+    if needs_no_tilt:
         return [NightFolder(tuple(given), None)]
     if missing := next((path for path in given if not os.path.exists(path)), None):
         raise FrameError(f"{missing}: there is no such file or folder")

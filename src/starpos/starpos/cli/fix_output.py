@@ -63,6 +63,11 @@ def json_of(fix: Fix | Average | None, vertical: Vertical) -> dict:
     return dict(zip(keys, values, strict=True))
 
 
+def counted(frames: int) -> str:
+    """A number of frames in words."""
+    return "1 frame" if frames == 1 else f"{frames} frames"
+
+
 def in_degrees(covariance: np.ndarray) -> np.ndarray:
     """A covariance (3, 3) of east m, north m, heading rad with the heading in deg instead."""
     unit = np.array([1.0, 1.0, np.degrees(1.0)])
@@ -83,11 +88,11 @@ def budget_of(fix: Fix | Average, vertical: Vertical) -> dict:
 
 def json_about(s: Solution) -> dict:
     """The keys of --json about the stars of a frame."""
-    a = s.attitude
+    a, fitted = s.attitude, s.fix or s.at_place
     return {
         "stars_detected": s.stars_detected,
         "stars_matched": len(s.names),
-        "residual_arcsec": s.fix.residual_arcsec if s.fix else None,
+        "residual_arcsec": fitted.residual_arcsec if fitted else None,
         "log_odds": a.log_odds if a else None,
         "status": s.status.value,
         "warnings": list(s.warnings),
@@ -144,7 +149,7 @@ def _lines_of(night: NightFolder, together: Average, vertical: Vertical) -> str:
     turned = f" (the last of {together.poses} poses)" if together.poses > 1 else ""
     folder = "" if night.folder is None else f"{night.folder}: "
     on_ground = InDegrees.of(ground.latitude, ground.longitude, 0.0, ground.covariance)
-    frames = "1 frame" if together.frames == 1 else f"{together.frames} frames together"
+    frames = counted(together.frames) + ("" if together.frames == 1 else " together")
     lines = [
         f"{folder}{frames}: {together.in_degrees}{turned} (astronomic)",
         f"geodetic, WGS 84: {on_ground.where} (the deflection of the vertical included)",

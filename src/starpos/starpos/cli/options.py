@@ -4,6 +4,7 @@
 import argparse
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, Protocol
 
 from starpos.earth.refraction import Atmosphere
@@ -14,6 +15,7 @@ from starpos.instrument import instrument, instrument_file, sensors
 from starpos.instrument.camera import Camera
 from starpos.instrument.instrument import UNKNOWN_CLOCK_S
 from starpos.instrument.lens import EQUIDISTANT, PLUMB_BOB
+from starpos.recording import drivers
 
 
 def add_frames(parser: argparse.ArgumentParser, pointings: bool = False) -> None:
@@ -34,6 +36,38 @@ def add_frames(parser: argparse.ArgumentParser, pointings: bool = False) -> None
             "its top from north over east, 1 sigma of the centre along each of two axes and of the turn about it; "
             "without a roll elevations alone tell the place, from three directions or more, and no heading",
         )
+
+
+def add_parameters(parser: argparse.ArgumentParser, whose: str, such_as: str) -> None:
+    """Add --params-file and --param; whose: of which nodes.  such_as: an example."""
+    parser.add_argument(
+        "--params-file", type=Path, metavar="YAML", help=f"parameters, as ROS's files have them, {whose}"
+    )
+    parser.add_argument(
+        "-p",
+        "--param",
+        action="append",
+        default=[],
+        metavar="[NODE:]NAME:=VALUE",
+        help=f"a parameter, such as {such_as}, by default of the solver; it counts more than the file's",
+    )
+
+
+def add_remaps(parser: argparse.ArgumentParser) -> None:
+    """Add --remap, which `remaps_of` reads."""
+    parser.add_argument(
+        "--remap",
+        action="append",
+        default=[],
+        metavar="NAME:=TOPIC",
+        help=f"the topic of a bag that serves as one of {', '.join(drivers.DRIVER_INPUTS)}, such as "
+        "camera/image_raw:=/cam0/image_raw; without it the one with this name, or the only one of its type",
+    )
+
+
+def remaps_of(args: argparse.Namespace) -> drivers.Remaps:
+    """The topics of --remap; raises FrameError."""
+    return drivers.Remaps.of(args.remap)
 
 
 def check_frames(args: argparse.Namespace) -> None:

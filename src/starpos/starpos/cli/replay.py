@@ -8,7 +8,7 @@ from pathlib import Path
 
 from starpos.averaging.average import Average
 from starpos.calibration.unknown import BY_PARAMETERS, MODEL_BY_PARAMETERS
-from starpos.cli import console, jobs
+from starpos.cli import console, jobs, options
 from starpos.cli.archive import NightFolder
 from starpos.cli.fix_output import (
     COLUMNS,
@@ -28,8 +28,9 @@ from starpos.fix.solution import Solution
 from starpos.instrument.instrument import Instrument
 from starpos.night.remarks import of_a3, of_inclinometer
 from starpos.night.together import Solved, extrapolated
+from starpos.recording.drivers import NO_REMAPS, Remaps
 from starpos.session.frames import Answered, Averaged
-from starpos.session.parameter_file import settings_of
+from starpos.session.parameter_file import drivers_of, settings_of
 from starpos.session.replay import Replay
 from starpos.utc import utc_text
 
@@ -39,25 +40,18 @@ def define(parser: argparse.ArgumentParser) -> None:
         "bags",
         nargs="+",
         metavar="BAG",
-        help="a rosbag2 with stars, tilts and camera_info: a folder or a file",
+        help="a rosbag2 with stars, tilts and camera_info, or with a robot's images, camera_info and IMU: a folder or a "
+        "file",
     )
     parser.add_argument(
         "--namespace", metavar="NAME", help="of the instrument, in a bag, or a YAML, of several"
     )
-    parser.add_argument(
-        "--params-file",
-        type=Path,
-        metavar="YAML",
-        help="parameters of the node solver, as ROS's files have them",
+    options.add_parameters(
+        parser,
+        "of the node solver; for a robot's images and IMU of detector and inclinometer, too",
+        "misalignment_stddev:=5.0 or detector:stamp:=start",
     )
-    parser.add_argument(
-        "-p",
-        "--param",
-        action="append",
-        default=[],
-        metavar="NAME:=VALUE",
-        help="a parameter of the node solver, such as misalignment_stddev:=5.0; it counts more than the file's",
-    )
+    options.add_remaps(parser)
     add_formats(parser, JSON_HELP, CSV_HELP)
     jobs.add_jobs(parser, "bags")
     parser.set_defaults(run=run)
@@ -110,11 +104,17 @@ class Playing:
     params_file: Path | None
     given: Sequence[str]
     namespace: str | None
+    remaps: Remaps = NO_REMAPS
 
     def __call__(self, bag: str) -> PlayedNight:
         night = PlayedNight()
         said = _Said(night)
-        replay = Replay(settings_of(self.params_file, self.given, self.namespace), said, said)
+        replay = Replay(
+            settings_of(self.params_file, self.given, self.namespace),
+            said,
+            said,
+            drivers_of(self.params_file, self.given, self.namespace, self.remaps),
+        )
         try:
             for output in replay.play(Path(bag), self.namespace):
                 if isinstance(output, Answered):
@@ -124,6 +124,7 @@ class Playing:
         except StarposError as error:
             night.trouble = str(error)
         night.frames = replay.frames
+        night.said[:0] = replay.remarks
         return night
 
 
@@ -135,7 +136,9 @@ def _light(solution: Solution) -> Solution:
 def run(args: argparse.Namespace) -> int:
     settings = settings_of(args.params_file, args.param, args.namespace)
     output = Output(args, COLUMNS, HEAD)
-    work = Playing(args.params_file, tuple(args.param), args.namespace)
+    # a wrong parameter is told once, not of each bag
+    drivers_of(args.params_file, args.param, args.namespace)
+    work = Playing(args.params_file, tuple(args.param), args.namespace, options.remaps_of(args))
     with jobs.workers_of(args, len(args.bags)) as workers:
         answers = jobs.watched(workers.map((work, bag) for bag in args.bags), len(args.bags), "bag")
         return max(

@@ -15,6 +15,7 @@ from starpos.night.folder import exposures, frames_in
 from starpos.night.night import Night
 from starpos.night.reading import First, Given, Reader
 from starpos.night.solving import solved_night
+from starpos.session.parameter_file import drivers_of, of_solver
 from starpos.sky import catalogue
 from starpos.utc import utc_text
 
@@ -29,12 +30,20 @@ def define(parser: argparse.ArgumentParser) -> None:
         "nights",
         nargs="+",
         metavar="NIGHT",
-        help="a folder of frames (FITS, or CSV of stars) with tilt.csv and perhaps truth.json, or a rosbag2",
+        help="a folder of frames (FITS, or CSV of stars) with tilt.csv and perhaps truth.json, or a rosbag2, of the "
+        "instrument or of a robot's own camera and IMU",
     )
     parser.add_argument(
         "-o", "--out", default="starpos-report", metavar="FOLDER", help="index.html and PNGs (starpos-report)"
     )
     parser.add_argument("--namespace", metavar="NAME", help="of the instrument, in a bag that holds several")
+    options.add_parameters(
+        parser,
+        "of detector and inclinometer, where stars and tilts are made of a robot's images and IMU; what the solver's are "
+        "is given by the other options",
+        "detector:stamp:=start",
+    )
+    options.add_remaps(parser)
     options.add_instrument(parser)
     options.add_air(parser)
     add_vertical(parser)
@@ -44,6 +53,11 @@ def define(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     options.check_self_calibration(args)
+    if wrong := of_solver(args.param):
+        raise InstrumentError(
+            f"-p {wrong[0]}: a report has the solver's values from its other options, such as --misalignment; -p takes "
+            "NODE:NAME:=VALUE of detector and inclinometer"
+        )
     if find_spec("matplotlib") is None:
         raise InstrumentError(f"a report is drawn with matplotlib, which is not here: {PIP}")
     from starpos.report.page import page
@@ -92,7 +106,8 @@ def _night(path: Path, args: argparse.Namespace) -> Night:
     if find_spec("rosbags") is None:
         raise FrameError(f"{path}: bags are read with rosbags, which is not here: {PIP}")
     any_camera = options.instrument_of(args, no_stars(100, 100, focal_px=1000.0))
-    found = bag.read(path, args.namespace, any_camera.inclinometer.noise_rad, progress)
+    drivers = drivers_of(args.params_file, args.param, args.namespace, options.remaps_of(args))
+    found = bag.read(path, args.namespace, any_camera.inclinometer.noise_rad, drivers, progress)
     told = (args.instrument, args.focal_mm) != (None, None)
     cameras = found.cameras if args.focal_mm is None else {}
     instruments = recorded.OfBag(any_camera, cameras, any_size=told)

@@ -2,17 +2,20 @@
 """`starpos solve`: position and heading from frames with their tilts, for each frame and for all together."""
 
 import argparse
+import os
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
-from starpos.cli import console, jobs, options, overwriting, solve_pointings
+from starpos.cli import console, heading_output, jobs, options, overwriting, solve_pointings
 from starpos.cli.archive import NightFolder, frames_among, nights_of
 from starpos.cli.deflection import add_vertical, vertical_of
 from starpos.cli.fix_output import COLUMNS, CSV_HELP, HEAD, JSON_HELP
 from starpos.cli.inputs import add_near, checked_tilts, given_of, near_of, reader_of
 from starpos.cli.output import Output, add_formats
 from starpos.cli.overwriting import Written
+from starpos.cli.site import add_site, place_of
 from starpos.cli.solved_night import check_save, say, tell, tell_turned
+from starpos.earth.known_place import KnownPlace
 from starpos.errors import FrameError, InstrumentError, StarposError, TiltError
 from starpos.fix.solver import Solver
 from starpos.instrument import instrument_update
@@ -32,12 +35,13 @@ def define(parser: argparse.ArgumentParser) -> None:
         "--tilt",
         metavar="CSV",
         help="utc_unix_s, theta_x_deg, theta_y_deg[, theta_z_deg, temperature_c, sigma_deg]; not with nights: folders of "
-        "frames with tilt.csv, nor with the instrument file of a camera fixed to the ground",
+        "frames with tilt.csv, nor with the instrument file of a camera fixed to the ground; --site needs none",
     )
     options.add_stamps(parser)
     options.add_instrument(parser)
     options.add_air(parser)
     add_vertical(parser)
+    add_site(parser)
     add_near(parser)
     options.add_self_calibration(parser)
     parser.add_argument(
@@ -73,9 +77,16 @@ def run(args: argparse.Namespace) -> int:
         overwriting.check(args, Written("--save", args.save, instrument_update.check_replaceable))
     if args.pointings is not None:
         return solve_pointings.run(args)
-    vertical, read, output = vertical_of(args), reader_of(args), Output(args, COLUMNS, HEAD)
+    vertical, read = vertical_of(args), reader_of(args)
+    place = place_of(args, vertical)
+    output = Output(
+        args, *((COLUMNS, HEAD) if place is None else (heading_output.COLUMNS, heading_output.HEAD))
+    )
     near_of(args)
-    given = nights_of(frames_among(args.frames, args.tilt), args.tilt, options.has_own_level(args))
+    own_level = options.has_own_level(args)
+    # the folder of a night has its tilts
+    needs_no_tilt = own_level or (place is not None and not any(map(os.path.isdir, args.frames)))
+    given = nights_of(frames_among(args.frames, args.tilt), args.tilt, needs_no_tilt)
     if args.save is not None and len(given) > 1:
         raise InstrumentError("--save writes the A3 of one night: give one")
     nights = [night for night in given if isinstance(night, NightFolder)]
@@ -86,7 +97,7 @@ def run(args: argparse.Namespace) -> int:
         abouts = workers.map((First(read), night.frames) for night in nights)
         for night, about in zip(nights, abouts, strict=True):
             try:
-                plans.append(_plan(args, night, about, read))
+                plans.append(_plan(args, night, about, read, own_level, place))
             except TiltError as error:
                 statuses.append(_refused(error, given))
         calls = ((plan.work, path) for plan in plans for path in plan.night.frames)
@@ -101,7 +112,7 @@ def run(args: argparse.Namespace) -> int:
                 rows, saving = _turned(args, plan, list(rows))
                 statuses.append(saving)
             known = None if args.self_calibrate else plan.given.instrument
-            status, lost = tell(args, output, plan.night, rows, vertical, known)
+            status, lost = tell(args, output, plan.night, rows, vertical, known, place)
             statuses.append(status)
             if lost:
                 say(plan.night, *Fitting(plan.given)(read(lost)))
@@ -116,7 +127,14 @@ def _refused(why: StarposError, given: list) -> int:
     return console.UNREADABLE
 
 
-def _plan(args: argparse.Namespace, night: NightFolder, about: About | None, read: Reader) -> Plan:
+def _plan(
+    args: argparse.Namespace,
+    night: NightFolder,
+    about: About | None,
+    read: Reader,
+    own_level: bool,
+    place: KnownPlace | None,
+) -> Plan:
     # without a frame that can be read, each one reports why it cannot
     if about is None:
         return Plan(night, OnFile(read, stars_of), Given(None))
@@ -128,7 +146,9 @@ def _plan(args: argparse.Namespace, night: NightFolder, about: About | None, rea
     tilts = NO_TILTS if night.tilt is None else checked_tilts("solve", night.tilt, instrument)
     jobs.prepare("solve", instrument, about)
     solver = Solver(instrument, catalogue.load_catalogue(), air, progress=console.ProgressBar())
-    work = Identifying(given) if args.self_calibrate else Solving(given, air, tilts)
+    levelled = own_level or night.tilt is not None
+    solving = Solving(given, air, tilts if levelled else None, place)
+    work = Identifying(given) if args.self_calibrate else solving
     return Plan(night, OnFile(read, work), given, solver, tilts)
 
 

@@ -5,13 +5,14 @@ import argparse
 from collections.abc import Iterable
 from pathlib import Path
 
-from starpos.cli import console
+from starpos.cli import console, heading_output
 from starpos.cli.archive import NightFolder
 from starpos.cli.deflection import tell_unknown
 from starpos.cli.fix_output import json_about, json_of, line_of, put_combined
 from starpos.cli.inputs import near_of
 from starpos.cli.output import Output
 from starpos.cli.overwriting import save_instrument
+from starpos.earth.known_place import KnownPlace
 from starpos.earth.vertical import Vertical
 from starpos.errors import FrameError
 from starpos.fix.solution import Solution, Status
@@ -29,13 +30,16 @@ def tell(
     rows: Iterable,
     vertical: Vertical,
     given: Instrument | None = None,
+    place: KnownPlace | None = None,
 ) -> tuple[int, str]:
     """Write (path, Solution or FrameError) of each frame, and what they come to together.
 
     given: the instrument whose A3 was taken as it is; None where it was found by turning.
+    place: that is known, None where there is none; its headings are told then.
     Returns the exit status, and a frame that was not identified if no frame has a fix, else ''.
     """
     solved: list[Solved] = []
+    headings: list[Solution] = []
     warnings: set[str] = set()
     unreadable, lost = False, ""
     for path, answer in rows:
@@ -47,25 +51,34 @@ def tell(
             lost = lost or path
         if answer.fix:
             solved.append(Solved.of(answer, answer.fix))
-        else:
+        elif answer.at_place is None or not answer.ok:
             console.complain("solve", answer.message)
         if answer.remark:
             console.complain("solve", answer.remark)
-        output.put(
-            {"file": path} | json_of(answer.fix, vertical) | json_about(answer),
-            line_of(path, answer, args.self_calibrate),
-        )
+        values = {"file": path} | json_of(answer.fix, vertical) | json_about(answer)
+        if place is None:
+            output.put(values, line_of(path, answer, args.self_calibrate))
+            continue
+        headings += [answer] if answer.at_place else []
+        told = heading_output.with_heading(values, answer.at_place, place)
+        output.put(told, heading_output.line_of(path, answer))
     near = near_of(args)
     whole = together(solved, given, near)
-    say(night, *([whole.why_not] if whole.why_not else ()), *whole.remarks)
+    mean, why = heading_output.mean_of(headings)
+    say(night, *([whole.why_not] if whole.why_not else ()), *whole.remarks, *why)
     if solved:
         last = solved[-1].fix
         tell_unknown("solve", args, vertical.at(last.latitude, last.longitude))
-        place = last if whole.average is None else whole.average
-        about = {} if near is None else {"km_from_near": near.km_from(place.latitude, place.longitude)}
+        where = last if whole.average is None else whole.average
+        about = {} if near is None else {"km_from_near": near.km_from(where.latitude, where.longitude)}
+        if place is not None:
+            about |= heading_output.with_heading(json_of(whole.average, vertical), mean, place)
         put_combined(output, night, whole.average, solved, warnings, vertical, about)
-    status = console.UNREADABLE if unreadable else 0 if whole.average else NO_FIX
-    return status, "" if solved else lost
+    elif headings and place is not None:
+        heading_output.put_mean(output, night, headings, mean, place, vertical)
+    found = headings if place is not None and not args.tilt else whole.average
+    status = console.UNREADABLE if unreadable else 0 if found else NO_FIX
+    return status, "" if solved or headings else lost
 
 
 def check_save(args: argparse.Namespace, instrument: Instrument) -> None:

@@ -27,6 +27,8 @@ SPEED_OF_LIGHT = erfa.CMPS
 # IERS Conventions (2010), table 1.1.
 ROTATION_RAD_S = 7.292115e-5
 EQUATOR_M_PER_S = ROTATION_RAD_S * EQUATOR_RADIUS_M
+# a time of the first year since 1970 is one that counts from a start
+COUNTED_S = 366 * DAY_S
 # 1973-01-02: the first day of the IERS table.
 FIRST_MJD = 41684.0
 # Root mean square error of carrying UT1-UTC on along its last year's slope, over all days of 1973 to 2026, and of
@@ -127,6 +129,12 @@ def earth_orientation(utc_unix_s: float) -> EarthOrientation:
     """
     if not np.isfinite(utc_unix_s):
         raise TimeError("the time of the frame is not a finite number: check the clock that stamps it")
+    if 0 <= utc_unix_s < COUNTED_S:
+        raise TimeError(
+            f"a time of {utc_unix_s:.3f} s after 1970 is no date: it counts from a start, as simulated time (Gazebo's "
+            "/clock) or time since boot, and stars need UTC: start the simulation at a date (gz sim --initial-sim-time), "
+            "or have the frames stamped in UTC"
+        )
     table = _table()
     mjd = utc_unix_s / DAY_S + UNIX_EPOCH_JD - 2400000.5
     beyond = mjd - table.mjd[-1]

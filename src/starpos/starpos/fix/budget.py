@@ -138,6 +138,14 @@ def heading_row(link_to_enu: np.ndarray) -> np.ndarray:
     return np.array([east * up / level, north * up / level, -1.0])
 
 
+def mount_term(name: str, link_to_enu: np.ndarray, stddev: float) -> tuple[ErrorTerm, ...]:
+    """The error of the base link against the sky that the camera sees, stddev rad about each axis; none if that is 0."""
+    if not stddev:
+        return ()
+    factor = np.vstack([np.zeros((2, 3)), heading_row(link_to_enu), np.eye(3)]) * stddev
+    return (ErrorTerm(name, factor, shared=ALWAYS),)
+
+
 @at_once
 @dataclass(frozen=True)
 class StarErrors:

@@ -1,11 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tells tilts or an A3 that cannot be right: they have the camera look through the ground."""
+"""Tells tilts, an A3 or a place that cannot be right: they have the camera look through the ground."""
 
 import numpy as np
 
 from starpos.earth.refraction import MIN_COS_ZENITH
-from starpos.errors import FixError
+from starpos.errors import FixError, PlaceError
 from starpos.instrument.instrument import Calibration
+
+# Below it no refraction is known.
+LEAST_DEG = np.degrees(np.arcsin(MIN_COS_ZENITH))
 
 
 def check_above_horizon(sine: float, calibration: Calibration) -> None:
@@ -14,12 +17,22 @@ def check_above_horizon(sine: float, calibration: Calibration) -> None:
     sine: of the altitude of their middle by the tilts and A3. While A3 is not known, as before it is found by turning,
     this tells nothing.
     """
-    if calibration.unknown or sine >= MIN_COS_ZENITH:
-        return
+    if not calibration.unknown and sine < MIN_COS_ZENITH:
+        raise FixError(
+            f"by the tilts and A3 the stars are {_where(sine)}, and stars tell a place from {LEAST_DEG:.0f} deg "
+            "above it: check the signs and the order of the inclinometer's axes, and A3"
+        )
+
+
+def check_visible(sine: float) -> None:
+    """Raise PlaceError if a camera's stars cannot be seen from a known place; sine: of the altitude of the lowest."""
+    if sine < MIN_COS_ZENITH:
+        raise PlaceError(
+            f"from the given place the stars, or some, are {_where(sine)}, and stars tell a heading from "
+            f"{LEAST_DEG:.0f} deg above it: check latitude and longitude, their order and signs, and the clock"
+        )
+
+
+def _where(sine: float) -> str:
     altitude_deg = np.degrees(np.arcsin(max(sine, -1.0)))
-    side = "above" if altitude_deg > 0 else "below"
-    least_deg = np.degrees(np.arcsin(MIN_COS_ZENITH))
-    raise FixError(
-        f"by the tilts and A3 the stars are {abs(altitude_deg):.1f} deg {side} the horizon, and stars tell a place "
-        f"from {least_deg:.0f} deg above it: check the signs and the order of the inclinometer's axes, and A3"
-    )
+    return f"{abs(altitude_deg):.1f} deg {'above' if altitude_deg > 0 else 'below'} the horizon"

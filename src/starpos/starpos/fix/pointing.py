@@ -14,7 +14,8 @@ from starpos._numeric.roots import symmetric_root
 from starpos.earth.orientation import EarthState
 from starpos.earth.refraction import Atmosphere
 from starpos.fix.budget import ErrorTerm, Sensitivity, place_of
-from starpos.fix.fix import Fix, MatchedStars, solve_fix
+from starpos.fix.fix import Fix, solve_fix
+from starpos.fix.matched import MatchedStars
 from starpos.frames.pointings import Pointing
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import Tilt

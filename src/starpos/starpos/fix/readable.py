@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Places and errors as people read them: degrees, metres or kilometres."""
+"""Places, angles and errors as people read them: degrees or arcseconds, metres or kilometres."""
 
 import math
 from dataclasses import dataclass
 
 import numpy as np
+
+from starpos.units import ARCSEC
 
 # lengths from here on are told in km
 LONG_M = 10_000.0
@@ -13,6 +15,12 @@ LONG_M = 10_000.0
 def length_text(metres: float, digits: int = 0) -> str:
     """A length in m, or where metres mean nothing in km."""
     return f"{metres:.{digits}f} m" if abs(metres) < LONG_M else f"{metres / 1000:.0f} km"
+
+
+def angle_text(rad: float) -> str:
+    """An angle in arcsec, or from 1 deg in deg."""
+    arcsec = rad / ARCSEC
+    return f"{arcsec:.0f} arcsec" if arcsec < 3600 else f"{arcsec / 3600:.2f} deg"
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from starpos.errors import FixError, StarposError, TiltError, TiltRangeError, TimeError
+from starpos.errors import FixError, PlaceError, StarposError, TiltError, TiltRangeError, TimeError
+from starpos.fix.attitude_at_place import AttitudeAtPlace
 from starpos.fix.fix import Fix
 from starpos.frames.pointings import Pointing
 from starpos.frames.stars import Stars
@@ -64,6 +65,7 @@ class Solution:
     extrapolated_days: how far behind the end of the IERS table the frame's date lies; 0 within it.
     warnings: names, sorted, of what is suspicious about an identification: TWO_SKIES, UNEXPLAINED. There is no fix then.
     explained: how much of the frame the identification explains.
+    at_place: heading, pitch and roll at a known place; None where none was asked for, or there are none.
     found: the identification itself, whose rows are those of the input's stars.
     negative: whether the stars are dark on a bright sky.
     hint: helps to identify the next frame.
@@ -88,6 +90,7 @@ class Solution:
     hint: Hint | None = None
     warnings: tuple[str, ...] = ()
     explained: Explained | None = None
+    at_place: AttitudeAtPlace | None = None
     found: Identification | None = None
     negative: bool = False
     remark: str = ""
@@ -150,6 +153,6 @@ def status_of(stars: Stars | Pointing, error: StarposError) -> Status:
         (TiltRangeError, Status.TILT_OUT_OF_RANGE),
         (TiltError, Status.NO_TILT),
         (TimeError, Status.BAD_INPUT if stars.mid_unix_s is None else Status.TIME_OUTSIDE_TABLES),
-        (FixError, Status.POOR_FIT),
+        ((FixError, PlaceError), Status.POOR_FIT),
     )
     return next((s for kind, s in kinds if isinstance(error, kind)), Status.BAD_INPUT)

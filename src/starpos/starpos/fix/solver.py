@@ -8,12 +8,15 @@ from functools import cached_property
 
 import numpy as np
 
+from starpos.earth.known_place import KnownPlace
 from starpos.earth.orientation import EarthState, earth_state
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import FieldError, FixError, InstrumentError, StarposError, TimeError
-from starpos.fix.fix import Fix, MatchedStars, solve_fix, sound_matches
+from starpos.fix.attitude_at_place import AttitudeAtPlace, attitude_at_place
+from starpos.fix.fix import Fix, solve_fix
 from starpos.fix.horizon import check_above_horizon
 from starpos.fix.identified import identified
+from starpos.fix.matched import MatchedStars, sound_matches
 from starpos.fix.pointing import IDEAL, pointing_fix
 from starpos.fix.seen import as_seen, directions_of, high_enough, inside
 from starpos.fix.solution import TWO_SKIES, UNEXPLAINED, Solution, Status, status_of
@@ -199,26 +202,11 @@ class Solver:
         state: EarthState,
         catalogue: Catalogue,
     ) -> Fix:
-        if len(found.star) < self.min_stars:
-            raise FixError(f"only {len(found.star)} stars identified, min_stars is {self.min_stars}: no fix")
-        if found.mirrored:
-            raise InstrumentError(
-                "the frame is mirrored (its rows run bottom-up): flip it, a position needs to know which side is up"
-            )
-        use = sound_matches(stars, found, max(self.min_stars, ENOUGH_SOUND))
+        up = self.instrument.mounting.level(tilt).camera[2]
+        use, matched = self._matched(stars, found, camera, up, state, catalogue)
         if wide.is_wide(camera):
-            g = self.instrument.mounting.level(tilt).camera
-            sines = directions_of(camera, stars)[found.star] @ g[2]
+            sines = directions_of(camera, stars)[found.star] @ up
             check_above_horizon(float(sines.mean()), self.instrument.calibration)
-            use &= high_enough(sines)
-        star, index = found.star[use], found.catalogue[use]
-        matched = MatchedStars(
-            np.stack([stars.x, stars.y], -1)[star],
-            stars.covariance[star],
-            catalogue.directions(index, state.year),
-            np.hypot(catalogue.sigma(index, state.year), found.blend_px[use] / camera.fx),
-            index,
-        )
         fix = solve_fix(
             matched,
             camera.scaled(found.focal_scale),
@@ -234,6 +222,59 @@ class Solver:
             check_above_horizon(math.cos(fix.zenith_distance), self.instrument.calibration)
         check_unmoved(fix, self.instrument, self.clock_stddev_s(stars))
         return replace(fix, used=np.flatnonzero(use)[fix.used])
+
+    def _matched(
+        self,
+        stars: Stars,
+        found: Identification,
+        camera: Camera,
+        up: np.ndarray,
+        state: EarthState,
+        catalogue: Catalogue,
+    ) -> tuple[np.ndarray, MatchedStars]:
+        """Which of the identified stars to use (M,), and these; up (3,): the zenith in C, roughly."""
+        if len(found.star) < self.min_stars:
+            raise FixError(f"only {len(found.star)} stars identified, min_stars is {self.min_stars}: no fix")
+        if found.mirrored:
+            raise InstrumentError(
+                "the frame is mirrored (its rows run bottom-up): flip it, a position needs to know which side is up"
+            )
+        use = sound_matches(stars, found, max(self.min_stars, ENOUGH_SOUND))
+        if wide.is_wide(camera):
+            use &= high_enough(directions_of(camera, stars)[found.star] @ up)
+        star, index = found.star[use], found.catalogue[use]
+        return use, MatchedStars(
+            np.stack([stars.x, stars.y], -1)[star],
+            stars.covariance[star],
+            catalogue.directions(index, state.year),
+            np.hypot(catalogue.sigma(index, state.year), found.blend_px[use] / camera.fx),
+            index,
+        )
+
+    def attitude_at(self, stars: Stars, found: Identification, place: KnownPlace) -> AttitudeAtPlace:
+        """Heading, pitch and roll at a known place, from what is identified of a frame's stars; needs no tilt.
+
+        Raises StarposError where the stars, the place or the time do not tell them.
+        """
+        if stars.mid_unix_s is None:
+            raise TimeError(f"{stars.place}: no time of exposure: {why_no_time(stars)}")
+        state = earth_state(stars.mid_unix_s)
+        camera, catalogue, _ = self.view(stars.width, stars.height, stars.origin_px)
+        up = found.attitude @ state.gcrs_to_itrs.T @ place.plumb_axes[2]
+        use, matched = self._matched(stars, found, camera, up, state, catalogue)
+        attitude = attitude_at_place(
+            matched,
+            camera.scaled(found.focal_scale),
+            place,
+            self.instrument.mounting,
+            self.atmosphere,
+            state,
+            self.clock_stddev_s(stars),
+            stars.stamp_stddev_s,
+            self.shutter(stars),
+            self.instrument.axis_stddev_rad,
+        )
+        return replace(attitude, used=np.flatnonzero(use)[attitude.used])
 
     def clock_stddev_s(self, stars: Stars | Pointing) -> float:
         """Standard deviation of the clock that stamped the stars: its host's own, but at least the instrument's."""

@@ -8,6 +8,7 @@ from starpos.earth.ellipsoid import EARTH_RADIUS_M
 from starpos.earth.orientation import ROTATION_RAD_S
 from starpos.errors import FixError
 from starpos.fix.fix import Fix
+from starpos.fix.readable import angle_text
 from starpos.instrument.instrument import Instrument
 from starpos.units import ARCSEC, HOUR_S
 from starpos.utc import utc_text
@@ -40,12 +41,7 @@ def check_unmoved(fix: Fix, instrument: Instrument, clock_stddev_s: float) -> No
     if angle < 0.5 and small @ np.linalg.solve(covariance, small) <= SIGMAS**2:
         return
     raise FixError(
-        f"the camera has moved, by {_angle(angle)} against the Earth since its calibration of "
-        f"{utc_text(instrument.calibration.utc_unix_s)}, where {_angle(SIGMAS * np.sqrt(sag2))} of sag are allowed for "
-        "(or the clock is off): calibrate it again at a known place, or use an inclinometer"
+        f"the camera has moved, by {angle_text(angle)} against the Earth since its calibration of "
+        f"{utc_text(instrument.calibration.utc_unix_s)}, where {angle_text(SIGMAS * np.sqrt(sag2))} of sag are allowed "
+        "for (or the clock is off): calibrate it again at a known place, or use an inclinometer"
     )
-
-
-def _angle(rad: float) -> str:
-    arcsec = rad / ARCSEC
-    return f"{arcsec:.0f} arcsec" if arcsec < 3600 else f"{arcsec / 3600:.2f} deg"

@@ -94,8 +94,13 @@ def framed(instrument: Instrument, first: Framed) -> tuple[Instrument, AxisDoubt
 
 
 def with_frame_size(instrument: Instrument, first: Framed) -> tuple[Instrument, str]:
-    """The instrument as `framed` has it, with the error of the axis in A3's, and its doubt; '' where A3 is not known."""
+    """The instrument as `framed` has it, with the error of the axis in A3's, and its doubt; '' where A3 is not known.
+
+    The error stands in axis_stddev_rad too, for headings at a known place, which need no A3.
+    """
     instrument, doubt = framed(instrument, first)
+    if doubt is not None:
+        instrument = replace(instrument, axis_stddev_rad=doubt.error_rad)
     calibration = instrument.calibration
     if doubt is None or calibration.unknown:
         return instrument, ""

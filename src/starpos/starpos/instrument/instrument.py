@@ -220,6 +220,8 @@ class Instrument:
     model               of the lens of that ideal camera: PLUMB_BOB, or EQUIDISTANT for a fisheye
     calibration         A3 and its errors
     link_to_camera      (3, 3): base link into C
+    mount_stddev_arcsec 1 sigma of link_to_camera about each axis; 0 of a link that is the camera's own axes
+    axis_stddev_rad     1 sigma of the optical axis in frames that are a part of a sensor, nobody knows which
     inclinometer        its errors; unless stated, those of an SCA100T as sold
     inclinometer_model  name in sensors.PRESETS that these errors began with; '': none
     clock_stddev_s      standard deviation of the clock against UTC, s
@@ -234,6 +236,8 @@ class Instrument:
     model: str = PLUMB_BOB
     calibration: Calibration = field(default_factory=Calibration)
     link_to_camera: tuple = TOP_OF_FRAME
+    mount_stddev_arcsec: float = 0.0
+    axis_stddev_rad: float = 0.0
     inclinometer: InclinometerErrors = UNNAMED
     inclinometer_model: str = ""
     clock_stddev_s: float = UNKNOWN_CLOCK_S
@@ -255,6 +259,10 @@ class Instrument:
         if not 0 <= self.clock_stddev_s <= MOST_CLOCK_S:
             raise InstrumentError(
                 f"clock_stddev_s of the instrument is {self.clock_stddev_s:g}: it must be 0 or more, at most a day"
+            )
+        if not 0 <= self.mount_stddev_arcsec <= MOST_ARCSEC:
+            raise InstrumentError(
+                f"link_to_camera_stddev_arcsec is {self.mount_stddev_arcsec:g}: give 0 to {MOST_ARCSEC:g}"
             )
         # with noise 0 every instrument would count as moving
         if self.inclinometer.noise_rad <= 0:
@@ -310,6 +318,7 @@ class Instrument:
         return Mounting(
             a3=c.a3,
             link_to_camera=np.asarray(self.link_to_camera, float),
+            link_stddev_rad=self.mount_stddev_arcsec * ARCSEC,
             calibration_covariance=np.asarray(c.covariance_arcsec2, float) * ARCSEC**2,
             remounted_rad=c.remounted_arcsec * ARCSEC,
             inclinometer=self.inclinometer,

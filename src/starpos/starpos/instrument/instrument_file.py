@@ -53,6 +53,7 @@ KEYS = (
     "calibrated",
     "remounted_arcsec",
     "link_to_camera",
+    "link_to_camera_stddev_arcsec",
     "inclinometer",
     *INCLINOMETER,
     "clock_stddev_s",
@@ -79,6 +80,7 @@ def read(path: Path | str, needs_camera: bool = True) -> Instrument:
                                                          which `starpos calibrate` writes
     remounted_arcsec: 0                                  1 sigma of A3's turn since the two were put together again
     link_to_camera: [[..], [..], [..]]
+    link_to_camera_stddev_arcsec: 0                      1 sigma of it about each axis
     inclinometer: {model: scl3300}                       fills the tilt_* keys that the file leaves out (sensors.py)
     tilt_noise_deg: 0.0035                               for one reading; the others are errors of zero and scale
     tilt_quantum_deg: 0.0005
@@ -146,6 +148,8 @@ def content_of(instrument: Instrument) -> dict[str, Any]:
             content["calibrated"]["response"] = [float(r) for r in c.response]
             content["calibrated"]["response_covariance"] = np.asarray(c.response_covariance, float).tolist()
     content["link_to_camera"] = np.asarray(instrument.link_to_camera, float).tolist()
+    if instrument.mount_stddev_arcsec:
+        content["link_to_camera_stddev_arcsec"] = float(instrument.mount_stddev_arcsec)
     if instrument.inclinometer_model:
         content["inclinometer"] = {"model": instrument.inclinometer_model}
     if instrument.vertical is None:
@@ -174,6 +178,9 @@ def _from_mapping(content: dict, folder: Path, needs_camera: bool) -> Instrument
     if "link_to_camera" in content:
         link = _matrix(content["link_to_camera"], "link_to_camera")
         instrument = replace(instrument, link_to_camera=link)
+    if "link_to_camera_stddev_arcsec" in content:
+        mount = _number(content, "link_to_camera_stddev_arcsec")
+        instrument = replace(instrument, mount_stddev_arcsec=mount)
     given = {name: _error(content, key, unit) for key, (name, unit) in INCLINOMETER.items() if key in content}
     sensor, errors = _sensor(content, bool(given))
     instrument = replace(instrument, inclinometer=replace(errors, **given), inclinometer_model=sensor)

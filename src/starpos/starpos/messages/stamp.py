@@ -1,7 +1,29 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The time stamp of a message."""
+"""The time stamp of a message, and a header of one that no middleware has sent."""
 
+from dataclasses import dataclass
 from typing import Any
+
+
+@dataclass(frozen=True)
+class PlainStamp:
+    """Time as builtin_interfaces/Time has it."""
+
+    sec: int
+    nanosec: int
+
+    @classmethod
+    def of_ns(cls, unix_ns: int) -> "PlainStamp":
+        """The stamp of a time in ns since 1970."""
+        return cls(*divmod(unix_ns, 10**9))
+
+
+@dataclass(frozen=True)
+class PlainHeader:
+    """Stamp and frame as std_msgs/Header has them."""
+
+    stamp: PlainStamp
+    frame_id: str
 
 
 def stamp_to_unix(stamp: Any) -> float | None:

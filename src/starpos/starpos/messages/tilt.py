@@ -1,20 +1,70 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A tilt from its message."""
+"""A tilt from its message, and a message from what an inclinometer reads."""
 
 import math
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from starpos.errors import TiltError
 from starpos.instrument.inclinometer import MOST_CELSIUS, SCA100T_NOISE_RAD, SQUARE, Tilt
-from starpos.messages.stamp import stamp_to_unix
+from starpos.messages.stamp import PlainHeader, PlainStamp, stamp_to_unix
 
 # bits of Tilt.flags, as starpos_interfaces defines them
-OUT_OF_RANGE, STUCK, SATURATED, TIME_UNKNOWN = 1, 2, 4, 16
+OUT_OF_RANGE, STUCK, SATURATED, GAP, TIME_UNKNOWN = 1, 2, 4, 8, 16
 UNUSABLE = OUT_OF_RANGE | STUCK | SATURATED | TIME_UNKNOWN
 # rad2; a larger variance says nothing, and might overflow
 MOST_TILT_VARIANCE = 1.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class TiltMessage:
+    """Fields of starpos_interfaces/Tilt."""
+
+    header: PlainHeader
+    x: float
+    y: float
+    covariance: tuple[float, ...]
+    temperature: float
+    sequence: int
+    flags: int
+    z: float
+    z_variance: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Reading:
+    """A tilt as it is published.
+
+    stamp_ns: the host's time.  x, y: rad, always finite.  covariance: rad2 (xx, xy, yx, yy).
+    temperature_c: deg C, or NaN if it is not known.
+    z, z_variance: rad, rad2; NaN of a two-axis sensor.
+    """
+
+    stamp_ns: int
+    x: float
+    y: float
+    covariance: tuple[float, ...]
+    temperature_c: float
+    sequence: int
+    flags: int
+    z: float = math.nan
+    z_variance: float = math.nan
+
+    def message(self, frame_id: str) -> TiltMessage:
+        """Make a message; frame_id: the inclinometer's frame."""
+        return TiltMessage(
+            header=PlainHeader(PlainStamp.of_ns(self.stamp_ns), frame_id),
+            x=self.x,
+            y=self.y,
+            covariance=self.covariance,
+            temperature=self.temperature_c,
+            sequence=self.sequence,
+            flags=self.flags,
+            z=self.z,
+            z_variance=self.z_variance,
+        )
 
 
 def message_to_tilt(message: Any, unknown_stddev_rad: float = SCA100T_NOISE_RAD) -> Tilt:

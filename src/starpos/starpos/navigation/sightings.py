@@ -15,7 +15,7 @@ from starpos.earth.refraction import Atmosphere, Refraction
 from starpos.errors import FixError, FrameError, InstrumentError, TimeError
 from starpos.fix import solver
 from starpos.fix.adjustment import share_free
-from starpos.fix.fix import sound_matches
+from starpos.fix.matched import sound_matches
 from starpos.fix.outliers import expected_extra, judged
 from starpos.fix.solution import Solution
 from starpos.frames.reading import why_no_time

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from starpos.earth.known_place import KnownPlace
 from starpos.earth.refraction import Atmosphere
 from starpos.earth.vertical import Vertical
 from starpos.errors import FrameError, TiltError
@@ -27,8 +28,17 @@ from starpos.night.work import Solving
 TRUTH_LIMIT = 1 << 26
 
 
-def exposures(folder: Path, given: Given, atmosphere: Atmosphere, vertical: Vertical) -> Exposures:
-    """The frames of a folder in the order of their names, to be solved.  If tilt.csv is missing, each frame says so.
+def exposures(
+    folder: Path,
+    given: Given,
+    atmosphere: Atmosphere,
+    vertical: Vertical,
+    place: KnownPlace | None = None,
+) -> Exposures:
+    """The frames of a folder in the order of their names, to be solved.
+
+    place: that is known, where each frame has a heading.  If tilt.csv is missing, headings alone are wanted there;
+    without a known place each frame says that it is missing.
 
     Raises FrameError if there are no frames, or truth.json cannot be used.
     """
@@ -37,12 +47,12 @@ def exposures(folder: Path, given: Given, atmosphere: Atmosphere, vertical: Vert
     instruments, remarks = (given, ()) if first is None else given.framed(first)
     known = instruments.instrument
     noise_rad = SCA100T_NOISE_RAD if known is None else known.inclinometer.noise_rad
-    tilts: Tilts
+    tilts: Tilts | None
     try:
         tilts = log = read_tilt_csv(folder / TILTS, noise_rad)
         remarks = (*of_tilts(log, TILTS), *remarks)
     except TiltError as error:
-        tilts = NoTilts(str(error))
+        tilts = None if place is not None and not (folder / TILTS).exists() else NoTilts(str(error))
 
     def each() -> Iterator[tuple[str, Frame | Stars | FrameError]]:
         for path in frames:
@@ -56,7 +66,7 @@ def exposures(folder: Path, given: Given, atmosphere: Atmosphere, vertical: Vert
         origin=f"solved from {len(frames)} {'lists of stars' if frames[0].suffix == '.csv' else 'frames'} and {TILTS}",
         count=len(frames),
         each=each,
-        work=Solving(instruments, atmosphere, tilts),
+        work=Solving(instruments, atmosphere, tilts, place),
         vertical=vertical,
         truth=truth_in(folder),
         remarks=remarks,

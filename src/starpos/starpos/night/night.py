@@ -11,6 +11,7 @@ from starpos.averaging.average import Average
 from starpos.earth.ellipsoid import curvature_radii_m, enu_axes, zenith_of
 from starpos.earth.refraction import Atmosphere
 from starpos.earth.vertical import Geodetic, Vertical, geodetic
+from starpos.fix.attitude_at_place import AttitudeAtPlace
 from starpos.fix.budget import ErrorTerm
 from starpos.fix.fix import Fix
 from starpos.fix.readable import InDegrees
@@ -84,6 +85,7 @@ class Shot:
     utc_unix_s: NaN if unknown.  size: of the frame in px.  tilt: in rad.
     xy, residual_px (M, 2): seen places of the stars of its fix, and these minus the fitted ones.
     camera_to_itrs (3, 3): attitude against the Earth by the stars alone.
+    at_place: heading, pitch and roll at a known place; None where none is known.
     warnings: what is suspicious about its identification, as `Solution.warnings`.
     """
 
@@ -104,6 +106,7 @@ class Shot:
     identify_s: float = float("nan")
     fix_s: float = float("nan")
     camera_to_itrs: np.ndarray | None = None
+    at_place: AttitudeAtPlace | None = None
     warnings: tuple[str, ...] = ()
 
     @classmethod
@@ -122,6 +125,7 @@ class Shot:
             identify_s=s.identify_s,
             fix_s=s.fix_s,
             residual_arcsec=s.attitude.residual_arcsec if s.attitude else float("nan"),
+            at_place=s.at_place,
             warnings=s.warnings,
         )
         if stars is not None and s.star is not None and s.magnitudes is not None:

@@ -4,6 +4,7 @@
 from dataclasses import KW_ONLY, dataclass, replace
 from pathlib import Path
 
+from starpos.earth.known_place import KnownPlace
 from starpos.earth.refraction import Atmosphere
 from starpos.earth.vertical import Deflection, Vertical
 from starpos.errors import FrameError
@@ -33,6 +34,7 @@ class NightOnDisk:
     inclinometer: str
     atmosphere: Atmosphere
     vertical: Vertical
+    place: KnownPlace | None = None
 
     def __repr__(self) -> str:
         return f"<{self.folder}: {self.count} frames and {TILTS}, to be solved>"
@@ -57,7 +59,7 @@ class NightOnDisk:
             given = replace(given, inclinometer=errors, inclinometer_model=model)
         instruments = Given(given, by_header=self.instrument is None)
         return solved_night(
-            exposures(self.folder, instruments, self.atmosphere, self.vertical),
+            exposures(self.folder, instruments, self.atmosphere, self.vertical, self.place),
             turn_stddev_deg if self_calibrate else None,
             progress,
         )
@@ -71,6 +73,7 @@ def open_night(
     inclinometer: str = "",
     atmosphere: Atmosphere | None = None,
     vertical: Vertical | None = None,
+    place: KnownPlace | None = None,
 ) -> NightOnDisk:
     """A night: a folder of FITS frames, or else of CSV lists of stars, with tilt.csv; not read yet.
 
@@ -79,6 +82,7 @@ def open_night(
     is solved with self_calibrate=True.  inclinometer: name of its model, in place of the instrument's; where nobody names
     it or states its errors they are those of an SCA100T as sold, 7 km or more.  atmosphere: None: not measured.
     vertical: its deflection; None: not known.
+    place: where the instrument is known to be: each frame's `Shot.at_place` is its heading there, and tilt.csv may lack.
     Raises StarposError if there is no frame, or the instrument's file cannot be used.
     """
     folder = Path(folder)
@@ -94,4 +98,5 @@ def open_night(
         inclinometer=inclinometer,
         atmosphere=Atmosphere.measured(None, None) if atmosphere is None else atmosphere,
         vertical=Deflection() if vertical is None else vertical,
+        place=place,
     )

@@ -15,11 +15,10 @@ from starpos.frames.stars import Stars
 from starpos.instrument.camera import Camera
 from starpos.instrument.instrument import Instrument
 from starpos.instrument.tilts import NoTilts, Tilts
-from starpos.night.bag import Recorded, star_arrays
+from starpos.night.bag import Recorded, each_frame
 from starpos.night.night import Night, ReportedPlace, offset_m, why_none
 from starpos.night.reading import Instruments
 from starpos.night.remarks import Kind, Remark
-from starpos.night.solutions import named_stars
 from starpos.night.solving import Exposures, solved_night
 from starpos.night.work import Solving
 from starpos.progress import Progress, quiet
@@ -66,7 +65,7 @@ def night(
             name=r.name,
             origin=f"solved from stars and tilt of the bag {r.path.name}, namespace {r.namespace}",
             count=r.star_count,
-            each=lambda: map(named_stars, star_arrays(r)),
+            each=lambda: each_frame(r),
             work=Solving(instruments, atmosphere, tilts),
             vertical=vertical,
             truth=r.truth,

@@ -13,9 +13,11 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from starpos.budget import Budget
+from starpos.earth.known_place import Places
 from starpos.fix.blind import BlindSolver
 from starpos.fix.other_focal import focal_that_fits
-from starpos.fix.solution import Solution
+from starpos.fix.placed import placed
+from starpos.fix.solution import Solution, Status
 from starpos.fix.solver import Solver
 from starpos.frames.frame import Frame
 from starpos.frames.stars import Stars
@@ -38,6 +40,8 @@ ENOUGH_OTHERWISE = ENOUGH + math.log(10 * MOST_WAYS)
 PART = 0.6
 # of the search at every scale, for stars that are detected otherwise
 QUICK, QUICK_FISHEYE = STAGES[:2], blind_fisheye.STAGES[:1]
+# what the stars are not asked before
+UNASKED = (Status.NO_TILT, Status.TILT_OUT_OF_RANGE)
 # a deadline, by time.monotonic, that is never reached
 NEVER_S = math.inf
 
@@ -116,6 +120,36 @@ def solved(
             again = solver.solve(sight.stars, tilts, hint, predicted, known=sight.found)
             return Sight(sight.stars, replace(again, identify_s=answer.identify_s + again.identify_s))
     return Sight(stars, answer)
+
+
+def answered(
+    solver: Solver,
+    item: Frame | Stars,
+    stars: Stars,
+    tilts: Tilts | None,
+    places: Places | None,
+    hint: Hint | None = None,
+    predicted: Priors = (),
+    until_s: float = NEVER_S,
+    known: Identification | None = None,
+) -> Sight:
+    """The fix of a frame or a list by its tilt, as `solved` has it, and its heading where the place is known.
+
+    tilts: None where headings alone are wanted.
+    """
+    if tilts is None:
+        sight = identified(solver, item, stars, predicted, until_s)
+    else:
+        sight = solved(solver, item, stars, tilts, hint, predicted, until_s, known)
+    if places is None:
+        return sight
+    answer = sight.solution
+    if answer.found is None and answer.status in UNASKED:
+        sight = identified(solver, item, stars, predicted, until_s)
+        if sight.found is None:
+            return sight
+        answer = replace(sight.solution, status=answer.status, message=answer.message)
+    return replace(sight, solution=placed(solver, sight.stars, answer, places))
 
 
 def focal_px_that_fits(solver: Solver, stars: Stars) -> float | None:

@@ -17,6 +17,7 @@ from starpos.frames.stars import Stars
 from starpos.identification.hint import Hint
 from starpos.instrument.inclinometer import level_of, up_of
 from starpos.instrument.instrument import Instrument
+from starpos.instrument.tilts import NO_TILTS
 from starpos.night.hints import of_one_camera
 from starpos.night.night import Night, ReportedPlace, Shot, Truth, why_none
 from starpos.night.remarks import Kind, Remark
@@ -126,7 +127,7 @@ def _by_turning(
     found, instrument = TurnedNight(()), None
     if solver is not None:
         solver, sights = of_one_camera(solver, [s for _, s in rows if isinstance(s, Sight)])
-        found = turned(solver, sights, work.tilts, turn_stddev_deg)
+        found = turned(solver, sights, work.tilts or NO_TILTS, turn_stddev_deg)
         instrument = solver.instrument if found.calibrated is None else found.calibrated.instrument
     solutions = iter(found.solutions)
     answers: list[_Answer] = [

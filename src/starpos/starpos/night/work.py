@@ -7,6 +7,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from starpos.earth.known_place import Places
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import InstrumentError, StarposError
 from starpos.fix.blind import SEARCH_S, BlindSolver
@@ -117,13 +118,15 @@ class Fitting:
 class Solving:
     """Solves a frame, identified by every way there is: its Solution.
 
-    tilts: not asked of a camera that is fixed to the ground.
+    tilts: not asked of a camera that is fixed to the ground; None where headings alone are wanted.
+    places: where the instrument is known to be, for its heading there; None where nobody says.
     progress: of the search for a focal length.
     """
 
     instruments: Instruments
     atmosphere: Atmosphere
-    tilts: Tilts = NO_TILTS
+    tilts: Tilts | None = NO_TILTS
+    places: Places | None = None
     progress: Progress = quiet
 
     def __call__(self, item: Frame | Stars) -> Solution:
@@ -143,7 +146,7 @@ class Solving:
         solver, stars = self.solver(item), stars_of(item)
 
         def work(solver: Solver) -> Sight:
-            return searching.solved(solver, item, stars, self.tilts, hint)
+            return searching.answered(solver, item, stars, self.tilts, self.places, hint)
 
         sight = work(solver)
         return (

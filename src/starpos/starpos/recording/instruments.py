@@ -2,27 +2,54 @@
 """The topics of one instrument among those of a bag."""
 
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from starpos.errors import FrameError
 from starpos.recording.bag import PACKAGE, BagReader
+from starpos.recording.drivers import (
+    CAMERA_INFO,
+    IMU_DATA,
+    NO_REMAPS,
+    RAW,
+    TILT,
+    Remaps,
+    driver_topics,
+    named_topics,
+    told,
+)
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection
 
-STARS, TILT, SOLUTION = (f"{PACKAGE}/msg/{name}" for name in ("StarArray", "Tilt", "Solution"))
-CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
+STARS, SOLUTION = (f"{PACKAGE}/msg/{name}" for name in ("StarArray", "Solution"))
 # types by the relative names of what a solver takes
 INPUTS = {"stars": STARS, "tilt": TILT, "camera/camera_info": CAMERA_INFO}
 
 
+@dataclass(frozen=True)
+class Chosen:
+    """An instrument's namespace and connections; made: what is made of a robot's own messages, '' where nothing is."""
+
+    namespace: str
+    connections: "Sequence[Connection]"
+    made: str = ""
+
+
 def instrument_in(
-    bag: BagReader, path: Path, namespace: str | None, topics: Mapping[str, str], needed: Collection[str]
-) -> "tuple[str, Sequence[Connection]]":
-    """Find namespace and connections of an instrument; FrameError if there is none, or several and none is named.
+    bag: BagReader,
+    path: Path,
+    namespace: str | None,
+    topics: Mapping[str, str],
+    needed: Collection[str],
+    remaps: Remaps = NO_REMAPS,
+) -> Chosen:
+    """Find namespace and connections of an instrument, or of a robot's own drivers where no instrument is.
 
     topics: types by relative names.  needed: types of which one has to be there, with a message.
+    remaps: images that the user names count more than star lists; accelerations that he names more than tilts.
+    FrameError if there is none, or several and none is named.
     """
     found: dict[str, list[Connection]] = {}
     for c in bag.connections:
@@ -30,10 +57,14 @@ def instrument_in(
             if c.msgtype == kind and c.topic.endswith(f"/{suffix}"):
                 found.setdefault(c.topic.removesuffix(suffix).rstrip("/") or "/", []).append(c)
     able = sorted(n for n, cs in found.items() if any(c.msgtype in needed and c.msgcount for c in cs))
-    if not able:
+    if not able or RAW in remaps.topics:
+        drivers = driver_topics(bag.connections, remaps, namespace, path)
+        if drivers:
+            return _of_drivers(bag, drivers, namespace)
         names = " nor ".join(name for name, kind in topics.items() if kind in needed)
         raise FrameError(
-            f"{path}: {'neither ' if len(needed) > 1 else 'no '}{names} in it: record stars, tilt and camera/camera_info"
+            f"{path}: {'neither ' if len(needed) > 1 else 'no '}{names} in it, and no images: record stars, tilt and "
+            "camera/camera_info, or the images and the IMU of a robot"
         )
     wanted = "/" + namespace.strip("/") if namespace is not None else able[0]
     if able == ["/"] and wanted != "/":
@@ -42,4 +73,14 @@ def instrument_in(
         )
     if wanted not in able or (namespace is None and len(able) > 1):
         raise FrameError(f"{path}: the instruments in it are {', '.join(able)}: choose one with --namespace")
-    return wanted, found[wanted]
+    named = named_topics(bag.connections, remaps, path)
+    replaced = {INPUTS.get("tilt" if name == IMU_DATA else name) for name in named}
+    own = [c for c in found[wanted] if c.msgtype not in replaced]
+    others = [c for c in bag.connections if c.topic in named.values()]
+    return Chosen(wanted, [*own, *others], told(named, others))
+
+
+def _of_drivers(bag: BagReader, drivers: Mapping[str, str], namespace: str | None) -> Chosen:
+    used = set(drivers.values())
+    connections = [c for c in bag.connections if c.topic in used]
+    return Chosen("/" + (namespace or "").strip("/"), connections, told(drivers, connections))

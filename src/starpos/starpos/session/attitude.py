@@ -4,16 +4,13 @@
 from starpos.earth.orientation import earth_state
 from starpos.errors import StarposError
 from starpos.fix.camera_attitude import CameraAttitude
-from starpos.fix.solution import Solution, Status
+from starpos.fix.solution import Solution
 from starpos.fix.solver import Solver
 from starpos.frames.stars import Stars
 from starpos.identification import wide
 from starpos.identification.search import Priors
 from starpos.navigation.sightings import sighted
-from starpos.night.searching import NEVER_S, identified
-
-# what the stars are not asked before
-UNASKED = (Status.NO_TILT, Status.TILT_OUT_OF_RANGE)
+from starpos.night.searching import NEVER_S, UNASKED, identified
 
 
 def asked(

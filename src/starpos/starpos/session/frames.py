@@ -41,14 +41,14 @@ Output = Answered | Averaged
 
 @dataclass(frozen=True)
 class Waiting:
-    """A frame that waits: its message, and its stars with the error of their time.
+    """A frame that waits: the header of its message, and its stars with the error of their time.
 
     since_s: when it came, by the clock in which waiting is counted.
     ahead_s: how far the middle of its exposure was ahead of the session's clock then.
     doubted: whether its stars contradict its time.
     """
 
-    message: Any
+    header: Any
     stars: Stars
     since_s: float
     ahead_s: float

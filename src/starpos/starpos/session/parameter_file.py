@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The solver's parameters from ROS's parameter files and NAME:=VALUE, without ROS."""
+"""The nodes' parameters from ROS's parameter files and NAME:=VALUE, without ROS."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from difflib import get_close_matches
@@ -8,10 +8,17 @@ from typing import Any
 
 from starpos.errors import InstrumentError
 from starpos.instrument import yaml_file
+from starpos.night.drivers import Drivers
+from starpos.recording.drivers import NO_REMAPS, Remaps
+from starpos.session import detector_parameters, inclinometer_parameters
+from starpos.session.parameter import Parameter
 from starpos.session.parameters import PARAMETERS
 from starpos.session.settings import Settings
 
-NODE = "solver"
+SOLVER, DETECTOR, INCLINOMETER = "solver", "detector", "inclinometer"
+NODES = (SOLVER, DETECTOR, INCLINOMETER)
+# a name in a file is a misspelt one if it is as much like a parameter as this
+MISSPELT = 0.85
 WILDCARDS = ("*", "**")
 
 
@@ -21,18 +28,7 @@ def settings_of(file: Path | None, given: Sequence[str], namespace: str | None =
     namespace: that of the solver; None: whatever it is, if the file is of one instrument.
     Raises ParameterError if a value is not allowed, InstrumentError if something cannot be read, or is no parameter.
     """
-    table = {p.name: p for p in PARAMETERS}
-    values: dict[str, Any] = {p.name: p.default for p in PARAMETERS}
-    told = ({} if file is None else dict(_in_file(file, namespace))) | dict(map(_assigned, given))
-    for name, value in told.items():
-        # qos_overrides, use_sim_time: they are of the node
-        if name.startswith("qos_overrides.") or name == "use_sim_time":
-            continue
-        if name not in table:
-            near = get_close_matches(name, table, 1)
-            meant = f"did you mean {near[0]}?" if near else f"they are {', '.join(table)}"
-            raise InstrumentError(f"there is no parameter {name}: {meant}")
-        values[name] = table[name].convert(value)
+    values = _values(SOLVER, PARAMETERS, file, given, namespace)
     settings = Settings(values)
     if trouble := settings.check(values, frozenset(values), None):
         raise InstrumentError(trouble)
@@ -40,22 +36,79 @@ def settings_of(file: Path | None, given: Sequence[str], namespace: str | None =
     return settings
 
 
-def _assigned(text: str) -> tuple[str, Any]:
-    name, sign, value = text.partition(":=")
+def drivers_of(
+    file: Path | None, given: Sequence[str], namespace: str | None = None, remaps: Remaps = NO_REMAPS
+) -> Drivers:
+    """The parameters of detector and inclinometer, read as those of the solver; texts NODE:NAME:=VALUE are theirs."""
+    detector = _values(DETECTOR, detector_parameters.PARAMETERS, file, given, namespace)
+    of_imu = (*inclinometer_parameters.SHARED, *inclinometer_parameters.IMU)
+    return Drivers(
+        detector,
+        detector_parameters.detection_settings(detector),
+        _values(INCLINOMETER, of_imu, file, given, namespace),
+        remaps,
+    )
+
+
+def of_solver(given: Sequence[str]) -> list[str]:
+    """Select those of the texts [NODE:]NAME:=VALUE that are the solver's; raises InstrumentError for one that is none."""
+    return [text for text in given if _assigned(text)[0] == SOLVER]
+
+
+def _values(
+    node: str, table: Sequence[Parameter], file: Path | None, given: Sequence[str], namespace: str | None
+) -> dict[str, Any]:
+    """The values of a node's parameters by name."""
+    known = {p.name: p for p in table}
+    values: dict[str, Any] = {p.name: p.default for p in table}
+    for name, value in () if file is None else _in_file(file, node, namespace):
+        if name in known:
+            values[name] = known[name].convert(value)
+        # qos_overrides, use_sim_time: they are of the node
+        elif not name.startswith("qos_overrides.") and name != "use_sim_time":
+            _check_unknown(name, known, node == SOLVER)
+    for text in given:
+        whose, name, value = _assigned(text)
+        if whose == node and name != "use_sim_time":
+            if name not in known:
+                _check_unknown(name, known, refused=True)
+            values[name] = known[name].convert(value)
+    return values
+
+
+def _check_unknown(name: str, known: Mapping[str, Parameter], refused: bool) -> None:
+    """Raise InstrumentError for a name that is refused, or that is a misspelt one.
+
+    The node `inclinometer` has parameters that no bag needs.
+    """
+    near = get_close_matches(name, known, 1, 0.6 if refused else MISSPELT)
+    if refused or near:
+        meant = f"did you mean {near[0]}?" if near else f"they are {', '.join(known)}"
+        raise InstrumentError(f"there is no parameter {name}: {meant}")
+
+
+def _assigned(text: str) -> tuple[str, str, Any]:
+    """Node, name and value of a text [NODE:]NAME:=VALUE, as ROS's command line has them."""
+    full, sign, value = text.partition(":=")
+    node, colon, name = full.rpartition(":")
     if not sign:
         raise InstrumentError(f"{text}: write NAME:=VALUE, such as refraction.pressure:=95000.0")
-    return name, yaml_file.parse(value, f"{text}: not a readable value")
+    if colon and node not in NODES:
+        raise InstrumentError(f"{text}: there is no node {node} here: {', '.join(NODES)}")
+    return node or SOLVER, name, yaml_file.parse(value, f"{text}: not a readable value")
 
 
-def _in_file(path: Path, namespace: str | None) -> Iterator[tuple[str, Any]]:
-    """(name, value) of each parameter of the solver, in the order of the file."""
+def _in_file(path: Path, node: str, namespace: str | None) -> Iterator[tuple[str, Any]]:
+    """(name, value) of each parameter of a node, in the order of the file."""
     content = yaml_file.load(path, "parameter file")
     if not isinstance(content, Mapping):
         raise InstrumentError(f"{path}: no parameter file: it has no names of nodes")
-    sections = [s for pattern, below in content.items() for s in _sections(path, _names(str(pattern)), below)]
+    sections = [
+        s for pattern, below in content.items() for s in _sections(path, node, _names(str(pattern)), below)
+    ]
     if namespace is not None:
-        node = [*_names(namespace), NODE]
-        sections = [s for s in sections if _fits(s[0], node)]
+        full = [*_names(namespace), node]
+        sections = [s for s in sections if _fits(s[0], full)]
     else:
         several = sorted({"/" + "/".join(names[:-1]) for names, _ in sections if _is_of_one(names)})
         if len(several) > 1:
@@ -70,14 +123,14 @@ def _names(path: str) -> list[str]:
     return [name for name in path.split("/") if name]
 
 
-def _sections(path: Path, names: list[str], below: Any) -> Iterator[tuple[list[str], Any]]:
-    """Go down the names of namespaces and nodes, which may be nested, to each `ros__parameters` of a solver."""
+def _sections(path: Path, node: str, names: list[str], below: Any) -> Iterator[tuple[list[str], Any]]:
+    """Go down the names of namespaces and nodes, which may be nested, to each `ros__parameters` of a node."""
     if not isinstance(below, Mapping):
         raise InstrumentError(f"{path}: {'/'.join(names)} has no ros__parameters")
     for key, value in below.items():
         if key != "ros__parameters":
-            yield from _sections(path, [*names, *_names(str(key))], value)
-        elif names and names[-1] in (NODE, *WILDCARDS):
+            yield from _sections(path, node, [*names, *_names(str(key))], value)
+        elif names and names[-1] in (node, *WILDCARDS):
             yield names, value
 
 

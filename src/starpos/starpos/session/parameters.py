@@ -5,11 +5,14 @@ import math
 from collections.abc import Mapping
 from dataclasses import replace
 
+import numpy as np
+
 from starpos.earth import geoid
 from starpos.earth.geoid import Geoid
+from starpos.earth.known_place import KnownPlace
 from starpos.earth.refraction import Atmosphere
 from starpos.earth.vertical import UNKNOWN_STDDEV_ARCSEC, AtHeight, Deflection, Vertical
-from starpos.errors import GeoidError, InstrumentError
+from starpos.errors import GeoidError, InstrumentError, PlaceError
 from starpos.files import path_of
 from starpos.instrument import instrument_file, sensors
 from starpos.instrument.camera import Camera
@@ -182,6 +185,43 @@ PARAMETERS = (
         "one misses 1 arcsec in plains and 10 in mountains, and outside its area nothing is known again: 6 arcsec, "
         "190 m.",
     ),
+    Parameter(
+        "site.latitude",
+        NAN,
+        "Latitude of a place that is known, as of a pillar: heading/imu is published there without any tilt. Unset: the "
+        "place is not known. One that the stars contradict gives no heading.",
+        unit="deg",
+        minimum=-90.0,
+        maximum=90.0,
+    ),
+    Parameter(
+        "site.longitude",
+        NAN,
+        "Its longitude, east positive.",
+        unit="deg",
+        minimum=-360.0,
+        maximum=360.0,
+    ),
+    Parameter(
+        "site.geodetic",
+        False,
+        "Whether the site is on WGS 84, as a map or a receiver has it; false: by gravity, as a fix's astronomic place. "
+        "Where the deflection is not known, this decides which heading has its error: by gravity or on WGS 84.",
+    ),
+    Parameter(
+        "site.stddev",
+        0.0,
+        "Error of the site to the east and to the north; 31 m are 1 arcsec of pitch and roll.",
+        unit="m",
+        minimum=0.0,
+        maximum=100000.0,
+    ),
+    Parameter(
+        "gnss.use",
+        False,
+        "Take gnss/fix for the place of heading/imu, where no site is set.",
+        read_only=True,
+    ),
     Parameter("min_stars", 5, "Fewest identified stars that make a fix.", unit="", minimum=4, maximum=1000),
     Parameter(
         "search_time",
@@ -294,6 +334,17 @@ def atmosphere_of(values: Mapping) -> Atmosphere:
     names = ("pressure", "temperature", "humidity", "wavelength")
     set_to = [values[f"refraction.{name}"] for name in names]
     return Atmosphere.measured(*(None if math.isnan(value) else value for value in set_to))
+
+
+def site_of(values: Mapping, vertical: Vertical) -> KnownPlace | None:
+    """Make the place of site.latitude and site.longitude, None where they are unset; PlaceError if only one is."""
+    latitude, longitude = values["site.latitude"], values["site.longitude"]
+    if math.isnan(latitude) and math.isnan(longitude):
+        return None
+    if math.isnan(latitude) or math.isnan(longitude):
+        raise PlaceError("site.latitude and site.longitude belong together: set both, or neither")
+    make = KnownPlace.on_ellipsoid if values["site.geodetic"] else KnownPlace.by_gravity
+    return make(latitude, longitude, vertical, np.eye(2) * values["site.stddev"] ** 2)
 
 
 def geoid_file(name: str) -> Geoid | None:

@@ -1,26 +1,39 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A recorded night through a session, as the node `solver` works it when `replay` plays the bag to it."""
+"""A recorded night through a session, as the nodes work it when `replay` plays the bag to them."""
 
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
+from starpos.errors import StarposError
+from starpos.night.drivers import IMAGES, DriverMessages, Drivers
 from starpos.recording.bag import BagReader
+from starpos.recording.drivers import CAPTURE, IMU
 from starpos.recording.instruments import INPUTS, STARS, TILT, instrument_in
 from starpos.session.frames import Output
 from starpos.session.job import JobsInTurn
 from starpos.session.log import Heard, Log
 from starpos.session.now import Now, Sent
+from starpos.session.parameter_file import drivers_of
 from starpos.session.session import SolverSession
 from starpos.session.settings import Settings
 
 
 class Replay:
-    """A session whose messages come from a bag, each at the time it was recorded at; frames: star lists read so far."""
+    """A session whose messages come from a bag, each at the time it was recorded at.
 
-    def __init__(self, settings: Settings, heard: Heard, log: Log) -> None:
+    drivers: how the messages of a robot's own camera and IMU are used; None: by default parameters.
+    frames: star lists and images read so far.
+    remarks: sentences on what is made of a robot's own messages.
+    """
+
+    def __init__(self, settings: Settings, heard: Heard, log: Log, drivers: Drivers | None = None) -> None:
         self.frames = 0
+        self.remarks: list[str] = []
+        self._tilts = 0
         self._jobs: list[JobsInTurn] = []
-        self._log = log
+        self._heard, self._log = heard, log
+        self._drivers = drivers_of(None, ()) if drivers is None else drivers
         self.session = SolverSession(settings, self._new_jobs, heard, log)
 
     def _new_jobs(self) -> JobsInTurn:
@@ -30,29 +43,53 @@ class Replay:
     def play(self, path: Path, namespace: str | None = None) -> Iterator[Output]:
         """Yield what the solver publishes of a bag; namespace: the instrument's, None where there is only one.
 
-        Raises BagError if the bag cannot be read, FrameError if the instrument is not in it.
+        Raises BagError if the bag cannot be read, FrameError if neither an instrument nor a robot's images are in it.
         """
-        session, tilts, now_ns = self.session, 0, 0
+        now_ns, messages = 0, self._drivers.begin()
         with BagReader(path, typed=True) as bag:
-            _, connections = instrument_in(bag, path, namespace, INPUTS, (STARS,))
-            for connection, log_ns, message in bag.decoded(connections):
+            chosen = instrument_in(bag, path, namespace, INPUTS, (STARS,), self._drivers.remaps)
+            if chosen.made:
+                self.remarks.append(chosen.made)
+            for connection, log_ns, message in bag.decoded(chosen.connections):
                 # Time never goes back, even if the times of a bag's messages do.
                 now_ns = max(now_ns, log_ns)
                 now = Now.in_data(now_ns * 1e-9)
-                if connection.msgtype == TILT:
-                    tilts += 1
-                    yield from session.take_tilt(message, Sent(tilts), now)
-                elif connection.msgtype == STARS:
-                    self.frames += 1
-                    yield from session.take_stars(message, now)
-                else:
-                    yield from session.take_camera(message, now)
+                yield from self._taken(connection.msgtype, message, messages, now)
                 yield from self._settled(now)
         now = Now.in_data(now_ns * 1e-9)
-        yield from session.end(now)
-        while session.busy:
+        yield from self.session.end(now)
+        while self.session.busy:
             yield from self._settled(now)
-            yield from session.end(now)
+            yield from self.session.end(now)
+        self.remarks += messages.remarks()
+
+    def _taken(self, kind: str, message: Any, messages: DriverMessages, now: Now) -> list[Output]:
+        """Have the session take a message, or what is made of it."""
+        session = self.session
+        if kind == TILT:
+            return self._take_tilt(message, now)
+        if kind == STARS:
+            self.frames += 1
+            return session.take_stars(message, now)
+        if kind in IMAGES:
+            self.frames += 1
+            try:
+                stars, header = messages.stars_of(kind, message)
+            except StarposError as error:
+                self._heard.refuse("image_raw", str(error))
+                return []
+            return session.take_detected(stars, header, now)
+        if kind == IMU:
+            tilt = messages.tilt_of(message, now.unix_s or 0.0)
+            return [] if tilt is None else self._take_tilt(tilt, now)
+        if kind == CAPTURE:
+            messages.take_capture(message)
+            return []
+        return session.take_camera(message, now)
+
+    def _take_tilt(self, message: Any, now: Now) -> list[Output]:
+        self._tilts += 1
+        return self.session.take_tilt(message, Sent(self._tilts), now)
 
     def _settled(self, now: Now) -> Iterator[Output]:
         while self.session.busy:

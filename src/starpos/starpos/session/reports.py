@@ -8,11 +8,13 @@ import numpy as np
 
 from starpos.calibration.unknown import MODEL_BY_PARAMETERS, unnamed_inclinometer
 from starpos.earth.orientation import EQUATOR_M_PER_S, table_age_days
+from starpos.fix.attitude_at_place import AttitudeAtPlace
 from starpos.fix.solution import Solution
 from starpos.frames.shutter import UNKNOWN, Shutter
 from starpos.instrument.inclinometer import Tilt
 from starpos.instrument.instrument import Instrument
 from starpos.session.diagnosis import Diagnosis, Level
+from starpos.units import ARCSEC
 
 WIDE_CLOCK_S = 0.1
 AHEAD_S = 1.0
@@ -40,12 +42,25 @@ def of_solution(answer: Solution, counts: Mapping[str, int]) -> Diagnosis:
             "sigma north (m)": float(north),
             "residual (arcsec)": answer.fix.residual_arcsec,
         }
+    if (attitude := answer.at_place) is not None:
+        values["sigma heading at the known place (arcsec)"] = _heading_stddev_arcsec(attitude)
     if answer.utc_unix_s is not None:
         values["IERS table age (days)"] = table_age_days(answer.utc_unix_s)
     if answer.extrapolated_days > 0:
         old = f"UT1 is extrapolated by {answer.extrapolated_days:.0f} days: upgrade astropy-iers-data"
         return Diagnosis(Level.WARN, old if answer.ok else answer.message, values)
+    if answer.remark:
+        return Diagnosis(Level.WARN, answer.remark, values)
+    if answer.fix is None and attitude is not None:
+        sigma_arcsec = _heading_stddev_arcsec(attitude)
+        told = f"heading at the known place, +- {sigma_arcsec:.2g} arcsec; no position: {answer.message}"
+        return Diagnosis(Level.OK, told, values)
     return Diagnosis(Level.OK if answer.ok else Level.WARN, answer.message, values)
+
+
+def _heading_stddev_arcsec(attitude: AttitudeAtPlace) -> float:
+    """1 sigma of the heading that is published."""
+    return float(np.sqrt(attitude.true_north.covariance[0, 0]) / ARCSEC)
 
 
 def of_clock(clock_stddev_s: float, stamp_stddev_s: float, ahead_s: float, doubt_s: float) -> Diagnosis:

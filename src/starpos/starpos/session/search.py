@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
+from starpos.earth.known_place import Places
 from starpos.fix.other_focal import focal_that_fits
 from starpos.fix.solution import Solution, Status
 from starpos.fix.solver import Solver
@@ -61,13 +62,15 @@ class Search:
         solver: Solver,
         stars: Stars,
         tilts: Tilts,
+        places: Places | None,
         hint: Hint | None,
         predicted: Priors,
         until_s: float,
         known: Identification | None,
     ) -> Solution:
-        """Solve a frame, as `searching.solved` does a list; while none is identified, say which focal length fits."""
-        answer = searching.solved(solver, stars, stars, tilts, hint, predicted, until_s, known).solution
+        """Solve a frame, as `searching.answered` does a list; while none is identified, say which focal length fits."""
+        seen = searching.answered(solver, stars, stars, tilts, places, hint, predicted, until_s, known)
+        answer = seen.solution
         self._identified |= answer.found is not None
         if self._identified or answer.status is not Status.NOT_IDENTIFIED:
             return answer

@@ -35,6 +35,7 @@ from starpos.session.clock_doubt import ClockDoubt
 from starpos.session.frames import Answered, Averaged, Output, Waiting, ground_of
 from starpos.session.gyro import Gyro
 from starpos.session.job import Jobs
+from starpos.session.known_place import SessionPlaces
 from starpos.session.log import Heard, Log
 from starpos.session.memory import Seen
 from starpos.session.now import Now, Sent
@@ -81,6 +82,7 @@ class SolverSession:
         self.names = FrameNames()
         self.doubt = ClockDoubt()
         self.gyro = Gyro(heard)
+        self.places = SessionPlaces(settings)
         self._search = Search(settings.values)
         self._settings, self._values = settings, settings.values
         self._catalogue = catalogue.load_catalogue()
@@ -189,16 +191,16 @@ class SolverSession:
         except StarposError as e:
             self._heard.refuse("tilt", str(e))
 
+    def take_gnss(self, message: Any) -> None:
+        """Take a NavSatFix of satellites, for the heading at its place."""
+        self.places.take(message)
+        self._heard.came("gnss/fix")
+
     def take_stars(self, message: Any, now: Now) -> list[Output]:
         """Take a StarArray."""
-        made = self.at(now)
-        self._heard.came("stars")
-        self._search.frame_came(now)
+        made = self._stars_came(now)
         try:
             stars = message_to_stars(message)
-            # If the user sets clock_stddev, it replaces the error that the camera's host states.
-            if not math.isnan(self._values["clock_stddev"]):
-                stars = replace(stars, clock_stddev_s=0.0)
         except StarposError as e:
             bad = Solution(
                 Status.BAD_INPUT,
@@ -208,8 +210,25 @@ class SolverSession:
                 stars_detected=len(message.stars),
             )
             return [*made, self._answered(message.header.stamp, bad, now)]
+        return made + self._wait_for(stars, message.header, now)
+
+    def take_detected(self, stars: Stars, header: Any, now: Now) -> list[Output]:
+        """Take stars as a StarArray with this header holds them."""
+        return self._stars_came(now) + self._wait_for(stars, header, now)
+
+    def _stars_came(self, now: Now) -> list[Output]:
+        made = self.at(now)
+        self._heard.came("stars")
+        self._search.frame_came(now)
+        return made
+
+    def _wait_for(self, stars: Stars, header: Any, now: Now) -> list[Output]:
+        """Have a frame wait for what it needs."""
+        # If the user sets clock_stddev, it replaces the error that the camera's host states.
+        if not math.isnan(self._values["clock_stddev"]):
+            stars = replace(stars, clock_stddev_s=0.0)
         self.instrument.frame_came(stars.width, stars.height, at_once=not now.played)
-        self._waiting.append(Waiting(message, stars, now.waiting_s, now.ahead_s(stars.mid_unix_s)))
+        self._waiting.append(Waiting(header, stars, now.waiting_s, now.ahead_s(stars.mid_unix_s)))
         while len(self._waiting) > (WAITING_PLAYED if now.played else WAITING):
             self._waiting.popleft()
             self.counts["dropped frames"] += 1
@@ -217,7 +236,7 @@ class SolverSession:
                 self._heard.refuse(
                     "stars", f"a frame was dropped: over {WAITING_PLAYED} wait for their tilts"
                 )
-        return made + self._work(now)
+        return self._work(now)
 
     # time ------------------------------------------------------------------------------------------------------------
 
@@ -280,6 +299,9 @@ class SolverSession:
             return True
         if self.instrument.solver is None:
             return bool(self.instrument.trouble)
+        # an instrument at a known place may have no inclinometer
+        if self.places.known and not len(self.tilts):
+            return True
         return self.tilts.complete(mid, self._span(frame.stars))
 
     def _span(self, stars: Stars) -> float:
@@ -292,9 +314,8 @@ class SolverSession:
         if answer.ok and answer.fix is not None:
             frame, answer = self._with_doubt(frame, answer, answer.fix)
         self.latest = frame
-        header = frame.message.header
-        answered = self._answered(header.stamp, answer, now)
-        attitude = self._attitude(frame.stars, answer, header.frame_id, predicted, until_s)
+        answered = self._answered(frame.header.stamp, answer, now)
+        attitude = self._attitude(frame.stars, answer, frame.header.frame_id, predicted, until_s)
         made: list[Output] = [replace(answered, attitude=attitude)]
         if self.instrument.solver is not None:
             made += self._learn(frame, answer)
@@ -346,7 +367,8 @@ class SolverSession:
                     f"the frame is stamped {frame.ahead_s:.3g} s before its time: {reports.ONE_CLOCK}"
                 )
             tilts = self.tilts.over(self._span(stars))
-            return self._search.solved(solver, stars, tilts, hint, predicted, until_s, known)
+            places = self.places if self.places.known else None
+            return self._search.solved(solver, stars, tilts, places, hint, predicted, until_s, known)
         except (InstrumentError, TimeError) as e:
             return Solution.failed(stars, Status.BAD_INPUT, str(e))
         except Exception as e:
@@ -375,7 +397,7 @@ class SolverSession:
             place = self.calibrating.average.place if used else None
             if place is None:
                 return []
-            return [Averaged(frame.message.header.stamp, place, ground_of(place, self._settings.vertical))]
+            return [Averaged(frame.header.stamp, place, ground_of(place, self._settings.vertical))]
         except Exception:
             # Fix and heading go on without the average; data that cause a defect must not stay.
             self._log.error(traceback.format_exc())
@@ -415,7 +437,7 @@ class SolverSession:
         if self.latest is None:
             return None
         answer = self._answer_to(self.latest, None, self._search.until_s(None, False))
-        return self._output(self.latest.message.header.stamp, answer)
+        return self._output(self.latest.header.stamp, answer)
 
     def reset(self) -> None:
         """Forget tilts, frames and the place, but no calibration that was found."""
@@ -424,5 +446,6 @@ class SolverSession:
         self._early.clear()
         self.latest = self.answer = self._hint = None
         self.gyro.forget()
+        self.places.forget()
         self.doubt.clear()
         self.calibrating.forget()

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from starpos.earth.geoid import Geoid
+from starpos.earth.known_place import KnownPlace
 from starpos.earth.vertical import Vertical
 from starpos.errors import StarposError
 from starpos.fix.solver import Solver
@@ -47,7 +48,7 @@ class Settings:
                 grid = parameters.geoid_file(values["deflection.geoid"])
             parameters.instrument_of(values, ANY_CAMERA, known)
             parameters.atmosphere_of(values)
-            parameters.vertical_of(values, grid)
+            parameters.site_of(values, parameters.vertical_of(values, grid))
         except StarposError as e:
             return str(e)
         self._read = known, grid
@@ -65,6 +66,11 @@ class Settings:
     def vertical(self) -> Vertical:
         """The deflection of the vertical, or the geoid that tells it."""
         return parameters.vertical_of(self.values, self._geoid)
+
+    @property
+    def site(self) -> KnownPlace | None:
+        """The place that is known; None where none is set."""
+        return parameters.site_of(self.values, self.vertical)
 
     @property
     def tilt_stddev_rad(self) -> float:

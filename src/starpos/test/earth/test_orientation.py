@@ -272,7 +272,16 @@ def last_day():
 
 
 @pytest.mark.parametrize(
-    "utc", [unix_of(1972, 12, 31), -1e18, 0.0, unix_of(2200, 1, 1), 1e18, float("nan"), float("inf")]
+    "utc",
+    [
+        unix_of(1972, 12, 31),
+        -1e18,
+        unix_of(1971, 1, 2),
+        unix_of(2200, 1, 1),
+        1e18,
+        float("nan"),
+        float("inf"),
+    ],
 )
 def test_a_time_outside_the_tables_is_refused_with_one_sentence(utc):
     with pytest.raises(TimeError) as e:

@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """A session told the messages of a recorded night: what waits for what, and that only the data count."""
 
+import math
 from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -13,6 +15,8 @@ from starpos.fix.solution import Status
 from starpos.messages.stamp import stamp_to_unix
 from starpos.recording.bag import BagReader
 from starpos.recording.instruments import CAMERA_INFO, INPUTS, STARS, TILT, instrument_in
+from starpos.session import reports
+from starpos.session.diagnosis import Level
 from starpos.session.frames import Answered
 from starpos.session.job import JobsInTurn
 from starpos.session.now import Now, Sent
@@ -85,8 +89,9 @@ class Told:
 def messages():
     """(type, message, time it was recorded at) of the night."""
     with BagReader(NIGHT, typed=True) as bag:
-        _, connections = instrument_in(bag, NIGHT, None, INPUTS, (STARS,))
-        return [(c.msgtype, message, log_ns * 1e-9) for c, log_ns, message in bag.decoded(connections)]
+        chosen = instrument_in(bag, NIGHT, None, INPUTS, (STARS,))
+        decoded = bag.decoded(chosen.connections)
+        return [(c.msgtype, message, log_ns * 1e-9) for c, log_ns, message in decoded]
 
 
 @pytest.fixture(scope="module")
@@ -268,3 +273,84 @@ def test_tilts_stamped_before_their_time_are_refused_though_they_are_read_when_i
             )
             count += 1
     assert len(told.session.tilts) == (count + 1) // 2 > 0
+
+
+SITE = ("site.latitude:=46.5475", "site.longitude:=7.9852")
+
+
+def seen_at(messages, begin_s, *parameters):
+    told = Told(*parameters)
+    told.tell(CAMERA_INFO, first(messages, CAMERA_INFO)[0], begin_s)
+    told.work(begin_s)
+    return told
+
+
+def gnss_fix(stars, **changed):
+    about = {
+        "latitude": 46.5475,
+        "longitude": 7.9852,
+        "position_covariance": [4.0, 0, 0, 0, 4.0, 0, 0, 0, 9.0],
+    }
+    return SimpleNamespace(
+        header=stars.header, status=SimpleNamespace(status=0), position_covariance_type=2, **(about | changed)
+    )
+
+
+def test_at_a_site_a_frame_has_its_heading_at_once_and_no_fix(messages, begin_s):
+    told = seen_at(messages, begin_s, *SITE)
+    stars, came_s = first(messages, STARS)
+    [answer] = told.tell(STARS, stars, came_s)
+    solution = answer.solution
+    assert solution.fix is None and solution.status is Status.NO_TILT and answer.ground is None
+    assert math.degrees(solution.at_place.plumb.heading) == pytest.approx(195.31952, abs=2e-3)
+    assert answer.attitude is not None
+    report = reports.of_solution(solution, told.session.counts)
+    assert report.level is Level.OK and "heading at the known place" in report.message
+
+
+def test_at_a_site_tilts_make_a_fix_too(messages, begin_s):
+    told = seen_at(messages, begin_s, *SITE)
+    stars, came_s = first(messages, STARS)
+    for tilt, _ in tilts_of(messages, came_s + 5.0):
+        told.tell(TILT, tilt, came_s)
+    [answer, *_] = told.tell(STARS, stars, came_s)
+    assert answer.solution.ok and answer.solution.fix is not None and answer.solution.at_place is not None
+
+
+def test_a_site_that_the_stars_contradict_gives_a_sentence_and_no_heading(messages, begin_s):
+    told = seen_at(messages, begin_s, "site.latitude:=-46.5475", "site.longitude:=7.9852")
+    stars, came_s = first(messages, STARS)
+    [answer] = told.tell(STARS, stars, came_s)
+    assert answer.solution.at_place is None and "check latitude and longitude" in answer.solution.message
+
+
+def test_half_a_site_is_refused():
+    settings = settings_of(None, KNOWN)
+    said = settings.check(settings.values | {"site.latitude": 46.0}, frozenset({"site.latitude"}), None)
+    assert "belong together" in said
+
+
+def test_the_place_of_a_heading_may_be_that_of_gnss(messages, begin_s):
+    told = seen_at(messages, begin_s, "gnss.use:=true")
+    stars, came_s = first(messages, STARS)
+    told.session.take_gnss(gnss_fix(stars))
+    [answer] = told.tell(STARS, stars, came_s)
+    at_place = answer.solution.at_place
+    assert math.degrees(at_place.ellipsoid.heading) == pytest.approx(195.31952, abs=2e-3)
+    # the deflection is not known, and GNSS has the place on the ellipsoid
+    assert at_place.ellipsoid.covariance[0, 0] < 0.3 * at_place.plumb.covariance[0, 0]
+    later = deepcopy(stars)
+    later.header.stamp.sec += 30
+    [answer] = told.tell(STARS, later, came_s + 30.0)
+    assert answer.solution.at_place is None and "no GNSS place within 5 s" in answer.solution.message
+
+
+def test_gnss_without_a_fix_is_no_place(messages, begin_s):
+    told = seen_at(messages, begin_s, "gnss.use:=true")
+    stars, came_s = first(messages, STARS)
+    told.session.take_gnss(gnss_fix(stars, latitude=float("nan")))
+    lost = gnss_fix(stars)
+    lost.status = SimpleNamespace(status=-1)
+    told.session.take_gnss(lost)
+    [answer] = told.tell(STARS, stars, came_s)
+    assert answer.solution.at_place is None

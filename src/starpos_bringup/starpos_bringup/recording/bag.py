@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from starpos.errors import BagError
 from starpos.recording.bag import BagReader
+from starpos.recording.drivers import IMU_DATA, NO_REMAPS, RAW, Remaps, driver_topics
 from starpos_bringup.recording.older_types import OlderTypes
 
 if TYPE_CHECKING:
@@ -46,14 +47,22 @@ class Bag:
     def __exit__(self, *exception: object) -> None:
         self._reader.__exit__(*exception)
 
-    def inputs(self, needed: str, others: tuple[str, ...]) -> list[str]:
-        """Find the topics of these relative names in any namespace; raises BagError if the needed one is missing."""
-        names = sorted({c.topic for c in self._reader.connections})
-        if not any(name.endswith("/" + needed) for name in names):
+    def inputs(self, needed: str, others: tuple[str, ...], remaps: Remaps = NO_REMAPS) -> list[str]:
+        """Find the topics of these relative names in any namespace, or those of a robot's own camera and IMU.
+
+        Accelerations count where no tilts are.  Raises BagError if the needed one is missing, FrameError where several
+        topics may be a robot's, or one of the remaps cannot be.
+        """
+        connections = self._reader.connections
+        names = sorted({c.topic for c in connections})
+        if not remaps.topics and any(name.endswith("/" + needed) for name in names):
+            of_tilt = () if any(name.endswith("/tilt") for name in names) else (IMU_DATA,)
+            ends = tuple("/" + relative for relative in (needed, *others, *of_tilt))
+            return [name for name in names if name.endswith(ends)]
+        found = driver_topics(connections, remaps, place=self.path) if needed == RAW else {}
+        if not found:
             raise BagError(f"{self.path}: no topic {needed} in it; it has {', '.join(map(repr, names))}")
-        return [
-            name for name in names if name.endswith(tuple("/" + relative for relative in (needed, *others)))
-        ]
+        return sorted(found.values())
 
     def topics(self, wanted: list[str] | None, left_out: Callable[[str], None]) -> dict[int, Topic]:
         """Find the topics that can be played, by connection; `left_out` gets a sentence for each other topic.

@@ -60,8 +60,8 @@ class Participants:
         # those of this replay; None before it begins. Who comes later takes part in the next.
         self._members: list[_Participant] | None = None
         self._replay, self._index = 0, -1
-        # when it was asked what is taken
-        self._asked_s = 0.0
+        # when it was asked what is taken, and of which topic; '': of all
+        self._asked_s, self._asked_topic = 0.0, ""
         # whether one was lost on the way
         self.lost = False
         self._publisher = node.create_publisher(Played, PLAYED, DEPTH)
@@ -92,9 +92,15 @@ class Participants:
         """The participants that take a topic."""
         return [p for p in self._present if topic in p.words.takes]
 
-    def made_of(self, topic: str) -> list[tuple[str, int]]:
-        """The topics made from this one (stars from images), each with how many messages have been published so far."""
-        return [(p.words.makes[0], p.words.made) for p in self.taking(topic)]
+    def topics_made_of(self, topic: str) -> set[str]:
+        """The topics that are made of this one: star lists of images, tilts of accelerations."""
+        return {p.words.makes[0] for p in self.taking(topic) if p.words.makes}
+
+    def newly_made(self, topic: str) -> list[tuple[str, Time]]:
+        """Topics and stamps of what was made of the newest message that was told, one of this topic."""
+        newest = self._replay, self._index
+        makers = [p for p in self.taking(topic) if (p.words.replay, p.words.index) == newest]
+        return [(p.words.makes[0], stamp) for p in makers for stamp in p.words.stamps]
 
     def making(self, topic: str) -> list[list[str]]:
         """What each of those that publish a topic takes."""
@@ -131,7 +137,7 @@ class Participants:
     ) -> None:
         """Say what is played; answer: and ask whether it is taken."""
         if answer:
-            self._asked_s = time.monotonic()
+            self._asked_s, self._asked_topic = time.monotonic(), topic
         with self._speaking:
             self._index += 1
             self._publish(kind, now_ns, topic, stamp, answer=answer)
@@ -153,8 +159,9 @@ class Participants:
         )
 
     def have_taken_all(self) -> bool:
-        """Whether all that was told is taken by all who are still there."""
-        for p in self._present:
+        """Whether what was asked for is taken, with all before it, by those of its takers who are still there."""
+        asked = self.taking(self._asked_topic) if self._asked_topic else self._present
+        for p in asked:
             if (p.words.replay, p.words.index) == (self._replay, self._index):
                 continue
             why = self._why_given_up(p)

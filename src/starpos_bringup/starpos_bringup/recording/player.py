@@ -23,7 +23,10 @@ from starpos_bringup.recording.participants import Participants
 from starpos_common.replayed import WORD_S
 from starpos_interfaces.msg import Played
 
-STARS, IMAGE = "starpos_interfaces/msg/StarArray", "sensor_msgs/msg/Image"
+STARS = "starpos_interfaces/msg/StarArray"
+IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+FRAMES = (STARS, *IMAGES)
+IMU = "sensor_msgs/msg/Imu"
 CLOCK_PERIOD_S = 0.025
 ACKNOWLEDGED_S = 3.0
 # So many messages are on their way at most: queues hold some hundred.
@@ -61,15 +64,22 @@ class Player:
         self._executor = SingleThreadedExecutor(context=contexts[0])
         self._executor.add_node(self._node)
         self._clock = self._node.create_publisher(Clock, "/clock", 10)
-        topics = list(topics)
-        self._publishers = {t.name: self._publisher(t) for t in topics}
-        self._frame_topics = [t.name for t in topics if t.type_name in (STARS, IMAGE)]
+        by_name = {t.name: t for t in topics}
+        # by the bag's name of a topic
+        self._publishers = {name: self._publisher(t) for name, t in by_name.items()}
+        # by the name that the graph knows it by, which the user may have remapped
+        self._played = {p.topic_name: p for p in self._publishers.values()}
+        kinds = {self._publishers[name].topic_name: t.type_name for name, t in by_name.items()}
+        self._frame_topics = [name for name, kind in kinds.items() if kind in FRAMES]
+        self._imu_topics = [name for name, kind in kinds.items() if kind == IMU]
         # those of star lists, which a solver answers
-        self._star_topics = {t.name for t in topics if t.type_name == STARS}
+        self._star_topics = {name for name, kind in kinds.items() if kind == STARS}
         self._participants = Participants(self._node, say)
         self._listeners: list[int] = []
         self._unchanged_since_s = -math.inf
         self._now_ns: int | None = None
+        # what /clock said last
+        self._ticked_ns = 0
         self._show = sys.stderr.isatty()
         self._shown_s = 0.0
         # a thread of its own: the bag's next message may be long in coming from a slow disk
@@ -110,7 +120,7 @@ class Player:
         self._spin(at_most_s, lambda: self._all_listen() and (not for_solver or self._chain()))
         # who takes part may not be heard yet, and who listens not be found
         self._spin(min(at_most_s, FOUND_S), self._settled)
-        heard = [n for n in self._frame_topics if self._publishers[n].get_subscription_count()]
+        heard = [n for n in self._frame_topics if self._played[n].get_subscription_count()]
         if self._frame_topics and not heard and not self._stopped:
             self._say(
                 f"nobody subscribes to {', '.join(self._frame_topics)}: start detector or solver in its namespace, with "
@@ -125,7 +135,7 @@ class Player:
 
     def _say_doubled(self) -> None:
         """Say which topics come twice: from another node too, or made again of what is played."""
-        makers = {n: self._participants.making(n) for n in self._publishers}
+        makers = {n: self._participants.making(n) for n in self._played}
         others = [n for n, known in makers.items() if self._node.count_publishers(n) > 1 + len(known)]
         if others:
             self._say(
@@ -140,27 +150,28 @@ class Player:
             )
 
     def _made_of_frames(self) -> set[str]:
-        return {makes for n in self._frame_topics for makes, _ in self._participants.made_of(n)}
+        return {makes for n in self._frame_topics for makes in self._participants.topics_made_of(n)}
 
     def _all_listen(self) -> bool:
         every = [*self._publishers.values(), self._clock]
         return all(p.get_subscription_count() for p in every)
 
     def _chain(self) -> bool:
-        """Whether somebody takes the frames, and somebody the star lists that are made of them."""
+        """Whether somebody takes the frames, the star lists that are made of them, and accelerations if there are any."""
         makers = self._made_of_frames()
         solvers = [*self._star_topics, *makers]
-        return bool(makers) and any(map(self._participants.taking, solvers))
+        takers = self._participants.taking
+        return bool(makers) and any(map(takers, solvers)) and all(map(takers, self._imu_topics))
 
     def _all_found(self) -> bool:
         """Whether each subscription that the graph shows, and whose QoS fits, is matched."""
         return self._participants.all_here() and all(
-            p.get_subscription_count() >= self._could_hear(name, p) for name, p in self._publishers.items()
+            p.get_subscription_count() >= self._could_hear(name, p) for name, p in self._played.items()
         )
 
     def _settled(self) -> bool:
         """Whether all who listen are found, and nobody new has come for SETTLED_S: strangers do not say they will."""
-        listeners = [self._node.count_subscribers(name) for name in self._publishers]
+        listeners = [self._node.count_subscribers(name) for name in self._played]
         if listeners != self._listeners:
             self._listeners, self._unchanged_since_s = listeners, time.monotonic()
         return self._all_found() and time.monotonic() - self._unchanged_since_s >= SETTLED_S
@@ -173,7 +184,7 @@ class Player:
 
     def start_round(self) -> None:
         """Begin a replay with those who take part."""
-        self._now_ns = None
+        self._now_ns, self._ticked_ns = None, 0
         self._first_ns: int | None = None
         self._participants.begin()
         end_s = time.monotonic() + BEGIN_S
@@ -202,40 +213,45 @@ class Player:
             if self.broken == 1:
                 self._say(f"a message of {topic.name} is broken and left out, as are others like it")
             return
-        self._pace(log_ns)
+        self._pace(log_ns, often=topic.type_name == IMU)
         if self._stopped:
             return
-        before = self._participants.made_of(topic.name) if topic.type_name == IMAGE else []
-        self._publishers[topic.name].publish(data)
+        publisher = self._publishers[topic.name]
+        publisher.publish(data)
         self.count += 1
-        made, taken = False, bool(self._participants.taking(topic.name))
+        made, taken = False, bool(self._participants.taking(publisher.topic_name))
         if taken:
-            made = self._agree(topic, message.header.stamp, before)
+            made = self._agree(publisher.topic_name, message.header.stamp, topic.type_name in FRAMES)
         elif self._rate == 0 and self.count % BURST == 0:
             self._spin(BURST_REST_S)
-        if topic.type_name == STARS or (topic.type_name == IMAGE and (taken or not self._frames_are_taken())):
+        if topic.type_name == STARS or (
+            topic.type_name in IMAGES and (taken or not self._frames_are_taken())
+        ):
             self.frames += not made
         self._progress()
 
     def _frames_are_taken(self) -> bool:
         return any(map(self._participants.taking, self._frame_topics))
 
-    def _agree(self, topic: Topic, stamp: Any, before: list[tuple[str, int]]) -> bool:
-        """Wait until the nodes have taken a message, and then what they made of it; return whether they made anything."""
-        frame = topic.type_name in (STARS, IMAGE)
-        answer = frame or self.count % BURST == 0
-        self._tell(topic.name, stamp, answer)
+    def _agree(self, topic: str, stamp: Any, is_frame: bool) -> bool:
+        """Wait until the nodes have taken a message, and then what they made of it; return whether star lists came."""
+        # what others take of what is made of it has its turn before the next message
+        links = any(map(self._participants.taking, self._participants.topics_made_of(topic)))
+        answer = is_frame or links or self.count % BURST == 0
+        self._tell(topic, stamp, answer)
         if not answer:
             return False
         self._taken()
+        if topic in self._star_topics or not (is_frame or links):
+            return False
         made_any = False
-        after = dict(self._participants.made_of(topic.name))
-        for makes, made in before:
-            for _ in range(after.get(makes, made) - made):
+        for makes, made_stamp in self._participants.newly_made(topic):
+            if is_frame:
                 made_any = True
                 self._star_topics.add(makes)
                 self.frames += 1
-                self._tell(makes, stamp, answer=True)
+            self._tell(makes, made_stamp, answer=is_frame)
+            if is_frame:
                 self._taken()
         return made_any
 
@@ -248,7 +264,8 @@ class Player:
         while not self._spin(1.0, self._participants.have_taken_all) and not self._stopped:
             pass
 
-    def _pace(self, log_ns: int) -> None:
+    def _pace(self, log_ns: int, often: bool) -> None:
+        """Wait for the time of a message; often: one of so many that the clock need not tick for each."""
         if self._first_ns is None:
             self._first_ns = log_ns
         while self._rate and not self._stopped:
@@ -260,12 +277,16 @@ class Player:
             self._spin(min(left_s, CLOCK_PERIOD_S))
             passed_ns = int((time.monotonic() - self._begin_s) * self._rate * 1e9)
             self._tick(min(self._first_ns + passed_ns, log_ns))
-        self._tick(log_ns)
+        self._tick(log_ns, CLOCK_PERIOD_S if often else 0.0)
 
-    def _tick(self, now_ns: int) -> None:
+    def _tick(self, now_ns: int, least_s: float = 0.0) -> None:
+        """Go on to a time; it is published unless the clock was within so many seconds before."""
         if self._now_ns is not None and now_ns <= self._now_ns:
             return
         self._now_ns = now_ns
+        if now_ns - self._ticked_ns < least_s * 1e9:
+            return
+        self._ticked_ns = now_ns
         message = Clock()
         message.clock.sec, message.clock.nanosec = divmod(now_ns, 10**9)
         self._clock.publish(message)

@@ -11,7 +11,8 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from starpos.errors import BagError, StarposError
+from starpos.errors import BagError, FrameError, StarposError
+from starpos.recording.drivers import DRIVER_INPUTS, RAW, Remaps
 from starpos_bringup.recording.bag import Bag, Topic
 from starpos_common.stop_signals import stop_signals
 
@@ -23,7 +24,7 @@ PLAYED, CUT_SHORT, REFUSED = 0, 1, 2
 # The topic that must be there, and others.
 INPUTS = {
     "stars": ("stars", ("camera/camera_info", "tilt")),
-    "images": ("camera/image_raw", ("camera/camera_info", "camera/capture", "tilt")),
+    "images": (RAW, ("camera/camera_info", "camera/capture", "tilt")),
 }
 WAIT_S, WAIT_FOR_INPUTS_S = 3.0, 30.0
 
@@ -40,7 +41,12 @@ def main(arguments: list[str], stopped: list[int]) -> int:
     options = _parser().parse_args(ours)
     try:
         with Bag(options.bag) as bag:
-            wanted = bag.inputs(*INPUTS[options.inputs]) if options.inputs else options.topics
+            remaps = Remaps.of(options.remap)
+            if remaps.topics and options.inputs != "images":
+                raise FrameError("--remap names a bag's images and accelerations: give --inputs images")
+            wanted = bag.inputs(*INPUTS[options.inputs], remaps) if options.inputs else options.topics
+            if options.inputs:
+                _say(f"playing {', '.join(wanted)}")
             topics = bag.topics(wanted, left_out=_say)
             return 0 if stopped else _play(bag, topics, options, ros, stopped)
     except StarposError as error:
@@ -76,8 +82,17 @@ def _parser() -> argparse.ArgumentParser:
     some.add_argument(
         "--inputs",
         choices=tuple(INPUTS),
-        help="only what a solver takes (stars), or detector and solver (images), in whatever namespace; not what they "
-        "gave then",
+        help="only what a solver takes (stars), or detector, solver and, where no tilts are, inclinometer (images), in "
+        "whatever namespace, or of a robot's own drivers; not what they gave then",
+    )
+    parser.add_argument(
+        "--remap",
+        action="append",
+        default=[],
+        metavar="NAME:=TOPIC",
+        help=f"with --inputs images: the bag's topic that serves as one of {', '.join(DRIVER_INPUTS)}; without it the "
+        "one with this name, or the only one of its type. It is played under its own name: remap the nodes, or the "
+        "player (--ros-args -r)",
     )
     parser.add_argument("--loop", action="store_true", help="again and again; the time begins anew as well")
     parser.add_argument(

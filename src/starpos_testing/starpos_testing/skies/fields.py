@@ -9,7 +9,8 @@ import numpy as np
 from starpos import rotation
 from starpos.earth.orientation import EarthState, earth_state, station_velocity
 from starpos.earth.refraction import Atmosphere
-from starpos.fix.fix import Fix, MatchedStars, Mounting, solve_fix
+from starpos.fix.fix import Fix, Mounting, solve_fix
+from starpos.fix.matched import MatchedStars
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import Tilt
 from starpos.instrument.instrument import TOP_OF_FRAME

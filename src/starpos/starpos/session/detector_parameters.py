@@ -2,11 +2,16 @@
 """Parameters of the node `detector`."""
 
 import math
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
 
 from starpos.frames.driver_stamp import KINDS, UNKNOWN
 from starpos.frames.exposure import MOST_EXPOSURE_S
 from starpos.frames.shutter import MOST_READOUT_S
-from starpos_common.parameters import Parameter
+from starpos.session.parameter import Parameter
+
+if TYPE_CHECKING:
+    from starpos.detection import DetectionSettings
 
 PARAMETERS = (
     Parameter(
@@ -103,3 +108,16 @@ PARAMETERS = (
         read_only=True,
     ),
 )
+
+
+def detection_settings(values: Mapping[str, Any]) -> "DetectionSettings":
+    """The settings of the detection by the values of these parameters."""
+    from starpos.detection import DetectionSettings
+
+    return DetectionSettings(
+        threshold=values["threshold"],
+        min_snr=values["min_snr"],
+        max_stars=values["max_stars"],
+        threads=values["threads"],
+        saturation_dn=None if math.isnan(values["saturation"]) else values["saturation"],
+    )

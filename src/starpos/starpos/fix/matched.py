@@ -1,0 +1,147 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Identified stars of a frame, and their fit in a level whose axes are given to the camera."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from starpos.earth.orientation import ROTATION_RAD_S, EarthState, later
+from starpos.earth.refraction import Atmosphere, Refraction
+from starpos.errors import FixError
+from starpos.fix._adjustment import Adjustment
+from starpos.fix.adjustment import ISOTROPIC, Fitted, adjustment_of, fitted, share_free
+from starpos.fix.budget import ALWAYS, StarErrors
+from starpos.fix.outliers import expected_extra
+from starpos.frames.shutter import Shutter
+from starpos.frames.stars import Stars
+from starpos.frozen import at_once
+from starpos.identification import Identification
+from starpos.instrument.camera import Camera
+
+# share of the frame's diagonal; stars that scatter more were not identified rightly
+MAX_SCATTER = 0.003
+STEP_REFRACTION = 0.01
+# so many stars tell whether two frames show the same ones
+MARKS = 20
+
+
+@at_once
+@dataclass(frozen=True)
+class MatchedStars:
+    """N identified stars; ValueError if the arrays do not fit to each other, FixError if a place's error is not finite.
+
+    xy (N, 2) in px and covariance_px2 (N, 2, 2): where they are on the frame.
+    places (N, 3): ICRS directions at the date; place_sigma (N,): their standard deviation per axis in rad.
+    index (N,): their rows in the catalogue; None if unknown.
+    """
+
+    xy: np.ndarray
+    covariance_px2: np.ndarray
+    places: np.ndarray
+    place_sigma: np.ndarray
+    index: np.ndarray | None = None
+
+    def __post_init__(self) -> None:
+        n = len(self.xy)
+        shapes = (self.xy.shape, self.covariance_px2.shape, self.places.shape, self.place_sigma.shape)
+        if shapes != ((n, 2), (n, 2, 2), (n, 3), (n,)) or (self.index is not None and len(self.index) != n):
+            raise ValueError(f"arrays of identified stars do not fit to each other: {shapes}")
+        if not np.isfinite(self.covariance_px2).all():
+            raise FixError("the error of a star's place is not a finite number: leave that star out")
+
+
+def sound_matches(stars: Stars, found: Identification, enough: int) -> np.ndarray:
+    """Mask (M,) of the matches to use: those of stars without a flag, or all if fewer than `enough` have none."""
+    sound = stars.sound[found.star]
+    return sound if sound.sum() >= enough else np.ones(len(sound), bool)
+
+
+@at_once
+@dataclass(frozen=True, kw_only=True)
+class StarFit:
+    """A fit of N stars: the problem, its solution, the errors of the M stars that are kept.
+
+    residual (M, 2): fitted places minus those seen, px.
+    """
+
+    problem: Adjustment
+    fit: Fitted
+    errors: StarErrors
+    residual: np.ndarray
+
+    @property
+    def residual_px(self) -> float:
+        """Root mean square residual of a coordinate."""
+        return math.sqrt(np.vdot(self.residual, self.residual) / self.residual.size)
+
+    def bending(self, atmosphere: Atmosphere) -> np.ndarray:
+        """Rotation (3,) of A4 in rad for 1 sigma of the refraction."""
+        return self.errors.rotated(self._bent(atmosphere) * (atmosphere.relative_sigma / STEP_REFRACTION))
+
+    def refraction_seen(self, atmosphere: Atmosphere) -> tuple[float, float]:
+        """Refraction by how it bends the field, over that of the air at the fitted zenith, and the 1 sigma of this share.
+
+        An attitude and a plate scale take up most of it; what is left squeezes the field along the vertical.
+        """
+        slope = np.dstack([self.fit.slope[self.fit.kept], self._bent(atmosphere) / STEP_REFRACTION])
+        whole = self.errors.centroids + self.errors.catalogue
+        weighted = np.linalg.solve(whole, slope)
+        covariance = np.linalg.pinv(np.einsum("nki,nkj->ij", slope, weighted))
+        found = covariance @ np.einsum("nki,nk->i", weighted, -self.residual)
+        # the scatter of the stars may be that of a refraction which is not theirs
+        left = -self.residual - slope @ found
+        free = max(left.size - len(found), 1)
+        scatter2 = np.vdot(left, np.linalg.solve(whole, left[..., None])[..., 0]) / free
+        return 1 + float(found[4]), float(np.sqrt(covariance[4, 4] * scatter2))
+
+    def _bent(self, atmosphere: Atmosphere) -> np.ndarray:
+        """Move (M, 2) of the stars, px, by STEP_REFRACTION of their refraction more."""
+        fit, stronger = self.fit, atmosphere.refraction(1 + STEP_REFRACTION).compiled
+        moved = self.problem.predict(fit.a4, fit.scale, stronger) - self.problem.xy - fit.residual
+        return moved[fit.kept]
+
+    def rolling(self, shutter: Shutter, height: int) -> np.ndarray:
+        """Rotation (3, 2) of A4 in rad for 1 sigma of the two errors of the rows' times."""
+        fit = self.fit
+        if not shutter.readout_stddev_s:
+            return np.zeros((3, 2))
+        # in a second the sky turns about the pole, which is a column of A4
+        drift = fit.slope[fit.kept, :, :3] @ (-ROTATION_RAD_S * fit.a4[:, 2])
+        late = shutter.errors_s(self.problem.xy[fit.kept, 1], height)
+        return self.errors.rotated(drift[..., None] * late[:, None])
+
+
+def fit_stars(
+    stars: MatchedStars, camera: Camera, g: np.ndarray, refraction: Refraction, itrs: np.ndarray
+) -> StarFit:
+    """Fit A4 and the plate scale to stars; g (3, 3): C into L.  itrs (N, 3): their geocentric apparent directions.
+
+    Raises FixError if the stars are too few or do not agree.
+    """
+    problem = adjustment_of(stars.xy, camera, g, itrs, refraction)
+    catalogue_px2 = ISOTROPIC * ((stars.place_sigma * camera.fx) ** 2)[:, None, None]
+    stated = stars.covariance_px2 + catalogue_px2
+    fit = fitted(problem, refraction.unbend(camera.directions(*stars.xy.T) @ g.T), stated)
+    if fit.jitter2 > (MAX_SCATTER * math.hypot(camera.width, camera.height)) ** 2:
+        raise FixError(
+            f"the identified stars lie {math.sqrt(fit.jitter2):.1f} px off the best attitude: check the camera's "
+            "distortion"
+        )
+    kept, residual = fit.kept, fit.residual[fit.kept]
+    claimed2 = expected_extra(residual, stated[kept], share_free(fit.keep))
+    centroids = stars.covariance_px2[kept] + ISOTROPIC * claimed2
+    same_stars = ALWAYS if stars.index is None else tuple(stars.index[kept][:MARKS].tolist())
+    errors = StarErrors.of(fit.slope[kept], centroids, catalogue_px2[kept], same_stars)
+    if not np.isfinite(errors.gain).all() or not math.isfinite(claimed2):
+        raise FixError(
+            f"the {len(residual)} stars do not tell the attitude and how well it is known: more stars are needed, "
+            "further apart, with sound errors"
+        )
+    return StarFit(problem=problem, fit=fit, errors=errors, residual=residual)
+
+
+def apparent(stars: MatchedStars, earth: EarthState, shutter: Shutter, height: int) -> np.ndarray:
+    """Geocentric apparent directions (N, 3) of the stars in ITRS, each when its row was exposed."""
+    itrs = earth.to_itrs(stars.places)
+    return later(itrs, shutter.later_s(stars.xy[:, 1], height)) if shutter.readout_s else itrs

@@ -1,0 +1,111 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A robot's own messages as its instrument's: stars detected in its images, tilts made of its accelerations."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from starpos.errors import FrameError, StarposError
+from starpos.frames.stars import Stars
+from starpos.messages.camera import message_to_frame, message_to_picture
+from starpos.messages.exposures import ExposureFacts, check_stamp
+from starpos.messages.imu_tilts import ImuTilts
+from starpos.messages.stamp import PlainHeader, PlainStamp, stamp_to_unix
+from starpos.messages.tilt import TiltMessage
+from starpos.recording.drivers import IMAGE, NO_REMAPS, PICTURE, Remaps
+from starpos.utc import utc_text
+
+if TYPE_CHECKING:
+    from starpos.detection import DetectionSettings
+
+IMAGES = (IMAGE, PICTURE)
+
+
+@dataclass(frozen=True)
+class Drivers:
+    """How a robot's messages are used: parameters of detector and inclinometer by name, and which topics.
+
+    settings: the detector's parameters as the detection takes them.
+    """
+
+    detector: Mapping[str, Any]
+    settings: "DetectionSettings"
+    inclinometer: Mapping[str, Any]
+    remaps: Remaps = NO_REMAPS
+
+    def begin(self) -> "DriverMessages":
+        """What takes the messages of one bag."""
+        return DriverMessages(self)
+
+
+class DriverMessages:
+    """Takes the messages of a robot's drivers one after another, as the nodes detector and inclinometer do."""
+
+    def __init__(self, drivers: Drivers) -> None:
+        self._drivers = drivers
+        self._exposures = ExposureFacts(drivers.detector)
+        self._imu = ImuTilts(drivers.inclinometer)
+        self._frames = self._tilts = 0
+
+    def take_capture(self, message: Any) -> None:
+        """Take a Capture."""
+        self._exposures.take(message)
+
+    def stars_of(self, kind: str, message: Any) -> tuple[Stars, PlainHeader]:
+        """The stars of an image of this type and the header of their message; raises StarposError if there are none."""
+        from starpos.detection import detect
+
+        self._frames += 1
+        check_stamp(message.header)
+        mid_ns, add = self._exposures.of(message.header)
+        frame = add(message_to_frame(message) if kind == IMAGE else message_to_picture(message))
+        header = PlainHeader(PlainStamp.of_ns(mid_ns), message.header.frame_id)
+        return _as_sent(detect(frame, self._drivers.settings).stars, header), header
+
+    def tilt_of(self, message: Any, now_s: float) -> TiltMessage | None:
+        """The tilt that an IMU's message completes; now_s: when it was recorded."""
+        reading = self._imu.take(message, round(now_s * 1e9))
+        if reading is None:
+            return None
+        self._tilts += 1
+        return reading.message(self._drivers.inclinometer["frame_id"])
+
+    def remarks(self) -> list[str]:
+        """Sentences on what the user has to state, and on accelerations that gave no tilt."""
+        said = [self._exposures.unsaid] if self._frames else []
+        imu = self._imu
+        heard = imu.good + imu.malformed + imu.future
+        if heard and not self._tilts:
+            why = imu.unrest or (
+                f"{imu.malformed} are broken and {imu.future} stamped after they were recorded"
+                if imu.malformed + imu.future
+                else "too few come in imu.average"
+            )
+            said.append(f"no tilt was made of {heard} messages of the IMU: {why}")
+        return [sentence for sentence in said if sentence]
+
+
+def _as_sent(stars: Stars, header: PlainHeader) -> Stars:
+    """Stars with the numbers that a StarArray holds of them."""
+    return replace(
+        stars,
+        flux=stars.flux.astype(np.float32),
+        snr=stars.snr.astype(np.float32),
+        mid_unix_s=stamp_to_unix(header.stamp),
+        source="stars",
+        fwhm_px=None,
+        window=None,
+        negative=False,
+    )
+
+
+def named_image(kind: str, message: Any, messages: DriverMessages) -> tuple[str, Stars | FrameError]:
+    """A name for an image, and its stars, or the error for which there are none."""
+    stamp_s = stamp_to_unix(message.header.stamp)
+    name = "image " + ("of unknown time" if stamp_s is None else utc_text(stamp_s))
+    try:
+        return name, replace(messages.stars_of(kind, message)[0], source=name)
+    except StarposError as error:
+        return name, FrameError(f"{name}: {error}")
