@@ -32,6 +32,11 @@ class SolutionPublishers:
         """The publishers of all topics, the solution's first."""
         return self._solution, self._fix, self._fix_averaged, self._imu, self._attitude
 
+    @property
+    def shared(self) -> tuple[Publisher, ...]:
+        """The publishers of topics whose names other drivers have, too."""
+        return self._fix, self._imu
+
     def publish(self, output: Output) -> None:
         """Publish what a session made."""
         header = self._header(output.stamp)
