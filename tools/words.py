@@ -27,6 +27,7 @@ READ = (
     "src/starpos/starpos/averaging/*.py",
     "src/starpos/starpos/calibration/*.py",
     "src/starpos/starpos/detection/*.py",
+    "src/starpos/starpos/earth/*.py",
     "src/starpos/starpos/identification/*.py",
     "src/starpos/starpos/navigation/*.py",
 )
