@@ -16,7 +16,7 @@ from starpos.fix.solution import Solution
 from starpos.instrument.axis import with_frame_size
 from starpos.night.reading import First
 from starpos.night.remarks import of_inclinometer
-from starpos.night.sightings import DeflectionSession, Sighted
+from starpos.night.sightings import DeflectionSession, ZenithSighted
 from starpos.night.work import OnFile
 from starpos.units import ARCSEC
 from starpos.utc import utc_text
@@ -76,7 +76,7 @@ def run(args: argparse.Namespace) -> int:
             console.complain("deflection", remark)
         jobs.prepare("deflection", instrument, about)
         air = options.atmosphere_of(args)
-        work = OnFile(read, Sighted(given, air, tilts, mark))
+        work = OnFile(read, ZenithSighted(given, air, tilts, mark))
         answers = list(jobs.watched(workers.map((work, path) for path in frames), len(frames), silent=False))
     rows = dict(zip(frames, answers, strict=True))
     for path, answer in rows.items():

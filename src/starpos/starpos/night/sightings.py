@@ -21,7 +21,7 @@ from starpos.zenith.sighting import Mark, ZenithSighting, sighting
 
 
 @dataclass(frozen=True)
-class Sighted:
+class ZenithSighted:
     """Makes the ZenithSighting of a frame at a mark; a frame's fault is a Solution that says why there is none."""
 
     instruments: Instruments
