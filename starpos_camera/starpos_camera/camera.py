@@ -28,16 +28,17 @@ from starpos.instrument.instrument import focal_px_of
 from starpos.messages.camera import message_to_camera
 from starpos.session import system_clock
 from starpos_camera.camera_parameters import PARAMETERS
+from starpos_camera.shutter_times import ShutterTimes
 from starpos_camera.sources.registry import SOURCES
-from starpos_camera.sources.source import CaptureSettings, FrameSource, NothingYet, SourceEnded
+from starpos_camera.sources.source import CapturedFrame, CaptureSettings, FrameSource, NothingYet, SourceEnded
 from starpos_camera.stamping import OF_SYSTEM_CLOCK, in_one_time
 from starpos_common.clock_report import ClockReport, time_is_simulated
 from starpos_common.diagnostics import Diagnosis, Diagnostics, Level
 from starpos_common.messages import camera_to_message, frame_to_message, shutter_fields, unix_to_stamp
 from starpos_common.parameters import declare
-from starpos_common.topics import publisher
+from starpos_common.topics import publisher, subscription
 from starpos_common.worker import Worker
-from starpos_interfaces.msg import Capture
+from starpos_interfaces.msg import Capture, Pulse
 from starpos_interfaces.srv import SetCapture
 
 # A trouble is shown so long; diagnostics come once a second.
@@ -94,6 +95,10 @@ class CameraNode(Node):
                     f"{self._calibration_path}: there is no calibration yet; the camera is ideal, of focal_mm "
                     "and pixel_um, until ~/set_camera_info is called."
                 )
+        self._shutter: ShutterTimes | None = None
+        if self._values["pulses"]:
+            self._shutter = ShutterTimes(self._values)
+            subscription(self, Pulse, "pulses", self._shutter.hear, 100)
         self._source: FrameSource = SOURCES[self._values["source"]](self._values, self._now_s)
 
         self._frames = self._failed = self._skipped = 0
@@ -177,7 +182,7 @@ class CameraNode(Node):
         if time_is_simulated(self):
             exposure, clock = self._source.capture(settings), None
         else:
-            exposure = in_one_time(lambda: self._source.capture(settings), self._clock_report.watch)
+            exposure = self._captured(settings)
             # If the source states an error, the clock is that of another machine.
             ours = exposure.stamp_source in OF_SYSTEM_CLOCK and not exposure.frame.clock_stddev_s
             clock = system_clock.read() if ours else None
@@ -204,6 +209,13 @@ class CameraNode(Node):
             remark=exposure.remark,
             seconds=time.monotonic() - begin,
         )
+
+    def _captured(self, settings: CaptureSettings) -> CapturedFrame:
+        if self._shutter is None:
+            return in_one_time(lambda: self._source.capture(settings), self._clock_report.watch)
+        since_s = self._now_s()
+        exposure = in_one_time(lambda: self._source.capture(settings), self._clock_report.watch)
+        return self._shutter.timed(exposure, since_s, self._now_s())
 
     def _on_wake(self) -> None:
         for result in self._worker.fetch():
@@ -343,6 +355,7 @@ class CameraNode(Node):
             "skipped": self._skipped,
             "cadence (s)": cadence,
             "calibrated": self._calibration is not None,
+            **(self._shutter.values() if self._shutter is not None else {}),
         }
         if last is not None and self._size is not None:
             width, height = self._size

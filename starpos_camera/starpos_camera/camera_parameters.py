@@ -4,6 +4,7 @@
 import math
 
 from starpos.frames.shutter import MOST_READOUT_S
+from starpos_camera import shutter_times
 from starpos_camera.sources.registry import SOURCES
 from starpos_common.parameters import FRAME_NAME, Parameter
 
@@ -123,4 +124,8 @@ COMMON = (
         maximum=1000.0,
     ),
 )
-PARAMETERS = (*COMMON, *(p for source in SOURCES.values() for p in source.parameters))
+PARAMETERS = (
+    *COMMON,
+    *shutter_times.PARAMETERS,
+    *(p for source in SOURCES.values() for p in source.parameters),
+)

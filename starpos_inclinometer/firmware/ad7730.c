@@ -5,6 +5,9 @@
 
 #include "spi.h"
 
+// POL high: mode 3; 1 MHz, at most 5 MHz (pulses of 100 ns each).
+#define CONTROL (SPI_MODE_3 | SPI_BY_8)
+
 static volatile bool ready;
 
 ISR(INT0_vect)
@@ -14,7 +17,7 @@ ISR(INT0_vect)
 
 static void write(uint8_t address, uint32_t value, uint8_t bytes)
 {
-    spi_select_ad7730();
+    spi_select(CONTROL, PIN_AD7730_CS);
     spi_transfer(AD7730_WRITE | address);
     while (bytes--)
         spi_transfer(value >> (8 * bytes));
@@ -24,7 +27,7 @@ static void write(uint8_t address, uint32_t value, uint8_t bytes)
 static uint32_t read(uint8_t address, uint8_t bytes)
 {
     uint32_t value = 0;
-    spi_select_ad7730();
+    spi_select(CONTROL, PIN_AD7730_CS);
     spi_transfer(AD7730_READ | address);
     while (bytes--)
         value = value << 8 | spi_transfer(0); // zeros: ones at DIN would count towards a reset
@@ -40,7 +43,7 @@ void ad7730_init(void)
 
 void ad7730_reset(void)
 {
-    spi_select_ad7730();
+    spi_select(CONTROL, PIN_AD7730_CS);
     for (uint8_t i = 0; i < 5; i++) // at least 32 clocks with DIN high, wherever the interface stood
         spi_transfer(0xFF);
     spi_release();

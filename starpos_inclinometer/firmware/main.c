@@ -1,20 +1,22 @@
 // SPDX-License-Identifier: Apache-2.0
-// The starpos inclinometer: an ATmega8 between an SCA100T-D01, an AD7730 and a serial line (PROTOCOL.md).
+// The starpos inclinometer: an MCU between a sensor and a serial line (PROTOCOL.md); board.h has the two boards.
 #include <avr/eeprom.h>
 #include <avr/interrupt.h>
 #include <avr/io.h>
 #include <avr/sleep.h>
 #include <avr/wdt.h>
 
-#include "ad7730.h"
+#include "board.h"
 #include "clock.h"
 #include "frame.h"
+#include "front.h"
+#include "pulses.h"
 #include "sampler.h"
 #include "spi.h"
 #include "uart.h"
 
-#define PROTOCOL_VERSION 1
-#define FIRMWARE_VERSION 0x0100 // 1.0
+#define PROTOCOL_VERSION 2
+#define FIRMWARE_VERSION 0x0200 // 2.0
 #define UNIT_ADDRESS ((const uint32_t *)0) // in the EEPROM; erased: no serial number
 
 enum reason { WRONG_CRC = 1, UNKNOWN = 2, OUT_OF_RANGE = 3 };
@@ -28,6 +30,7 @@ static bool send_identity(void)
     frame_field(unit == UINT32_MAX ? 0 : unit, 4);
     frame_field(sampler_rate_hz(), 1);
     frame_field(sampler_delay_ms(), 2);
+    frame_field(SENSOR_KIND, 1);
     return frame_send();
 }
 
@@ -76,7 +79,7 @@ static void sleep_until_interrupt(uint32_t since_ms)
 {
     const char *line;
     cli();
-    if (clock_ms() == since_ms && !ad7730_ready() && !uart_command(&line)) {
+    if (clock_ms() == since_ms && !front_pending() && !uart_command(&line)) {
         sleep_enable();
         sei();
         sleep_cpu(); // the instruction after sei() is executed before any interrupt
@@ -93,7 +96,8 @@ int main(void)
     clock_init();
     uart_init();
     spi_init();
-    ad7730_init();
+    front_init();
+    pulses_init();
     set_sleep_mode(SLEEP_MODE_IDLE);
     sampler_init(after_watchdog);
     sei();
@@ -103,6 +107,7 @@ int main(void)
         wdt_reset();
         poll_commands();
         sampler_poll();
+        pulses_poll(now);
         sleep_until_interrupt(now);
     }
 }

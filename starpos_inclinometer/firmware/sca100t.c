@@ -10,7 +10,7 @@
 // Between two commands CSB must be high for 150 us; they are a sample, at least 20 ms, apart.
 bool sca100t_temperature(uint8_t *counts)
 {
-    spi_select_sca100t();
+    spi_select(SPI_MODE_0 | SPI_BY_32, PIN_SCA100T_CS); // 250 kHz, at most 500 kHz
     spi_transfer(RWTR);
     *counts = spi_transfer(0);
     spi_release();

@@ -21,8 +21,8 @@ static volatile bool input_complete;
 void uart_init(void)
 {
     UBRRH = 0;
-    UBRRL = F_CPU / 16 / UART_BAUD - 1; // 12: 38462 baud
-    UCSRC = _BV(URSEL) | _BV(UCSZ1) | _BV(UCSZ0);
+    UBRRL = F_CPU / 16 / UART_BAUD - 1; // 12 at 8 MHz, 25 at 16 MHz: 38462 baud
+    UCSRC = UART_FRAME;
     UCSRB = _BV(RXCIE) | _BV(RXEN) | _BV(TXEN);
 }
 
@@ -36,7 +36,7 @@ bool uart_send(const char *line, uint8_t length)
         at = (at + 1) & MASK;
     }
     head = at;
-    UCSRB |= _BV(UDRIE); // one instruction (sbi): the interrupt that clears it cannot come in between
+    UCSRB |= _BV(UDRIE); // the interrupt that may come in between changes no other bit of it
     return true;
 }
 

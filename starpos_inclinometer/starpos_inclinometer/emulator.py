@@ -22,7 +22,7 @@ from typing import Any
 from starpos.instrument.inclinometer import sca100t_volts
 from starpos_inclinometer.sources import mcu_protocol, sca100t
 
-FIRMWARE = 0x0100
+FIRMWARE = 0x0200
 UNIT = 0x53494D00
 DEFAULT_RATE_HZ = 10
 # 260 nV rms (AD7730 data sheet, +-80 mV, 200 Hz, chopped) over 9.54 nV per code.
@@ -161,7 +161,11 @@ class Mcu:
     def _identify(self) -> bytes:
         return mcu_protocol.identity_line(
             mcu_protocol.Identity(
-                mcu_protocol.VERSION, FIRMWARE, UNIT, self._rate_hz, delay_ms(self._rate_hz)
+                version=mcu_protocol.VERSION,
+                firmware=FIRMWARE,
+                unit=UNIT,
+                rate_hz=self._rate_hz,
+                delay_ms=delay_ms(self._rate_hz),
             )
         )
 

@@ -16,10 +16,10 @@ from starpos_common.topics import Take, publisher
 from starpos_inclinometer.host_clock import HostClock, Step
 from starpos_inclinometer.parameters import PARAMETERS, refusal
 from starpos_inclinometer.report import Reporter, step_sentence
-from starpos_inclinometer.sources.reading import Health, Phase, Reading
+from starpos_inclinometer.sources.reading import Health, Phase, Reading, TimedPulse
 from starpos_inclinometer.sources.registry import SOURCES
 from starpos_inclinometer.sources.source import Surroundings
-from starpos_interfaces.msg import Tilt
+from starpos_interfaces.msg import Pulse, Tilt
 
 
 class InclinometerNode(Node):
@@ -29,6 +29,7 @@ class InclinometerNode(Node):
         super().__init__("inclinometer")
         self._values = declare(self, PARAMETERS, apply=self._apply, check=lambda values, _: refusal(values))
         self._publisher = publisher(self, Tilt, "tilt", 100)
+        self._pulses = publisher(self, Pulse, "pulses", 100)
         self._logged: tuple[Phase, str] | None = None
         self._logged_step: Step | None = None
         self._reporter = Reporter()
@@ -83,6 +84,8 @@ class InclinometerNode(Node):
             urgent |= self._reporter.count(reading.flags)
             if self._replayed is not None:
                 self._replayed.note(message.header.stamp)
+        for pulse in self._source.take_pulses():
+            self._pulses.publish(_pulse_message(pulse))
         return urgent
 
     def _on_wake(self) -> None:
@@ -124,3 +127,13 @@ class InclinometerNode(Node):
         health = self._source.health()
         self._log(health)
         return self._reporter.report(health, time.monotonic())
+
+
+def _pulse_message(pulse: TimedPulse) -> Pulse:
+    message = Pulse()
+    message.header.stamp = Time(nanoseconds=max(pulse.stamp_ns, 0)).to_msg()
+    message.input, message.rising = pulse.input, pulse.rising
+    message.sequence, message.bounces = pulse.sequence, pulse.bounces
+    message.device_time = pulse.device_time_s
+    message.stamp_stddev, message.disciplined = pulse.stddev_s, pulse.disciplined
+    return message

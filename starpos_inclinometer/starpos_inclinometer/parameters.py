@@ -13,7 +13,7 @@ COMMON = (
         "source",
         "serial",
         "Where tilts come from: serial is the starpos microcontroller, imu a sensor_msgs/Imu on imu/data, ascii lines "
-        "of text from a digital tiltmeter.",
+        "of text from a digital tiltmeter, iio a sensor that Linux's own driver reads (Industrial I/O).",
         choices=tuple(SOURCES),
         read_only=True,
     ),

@@ -15,7 +15,7 @@ from starpos_testing.lacking import lacks
 from starpos_testing.patience import WAIT_S
 
 FIRMWARE = Path(__file__).parent.parent / "firmware"
-ELF, SIM = "inclinometer.elf", "inclinometer-sim"
+ELF, SIM = "{}.elf", "inclinometer-sim"
 NEEDED = {
     "gcc-avr": lambda: shutil.which("avr-gcc"),
     "avr-libc": lambda: preprocesses("avr-gcc", "-mmcu=atmega8", "avr/io.h"),
@@ -43,8 +43,16 @@ def build(folder) -> Path:
 class Board:
     """A board that runs; at speed 0 its time passes by `run` only."""
 
-    def __init__(self, folder, *options, speed=0):
-        command = [folder / SIM, folder / ELF, "--speed", str(speed), *options]
+    def __init__(self, folder, *options, speed=0, board="paper"):
+        command = [
+            folder / SIM,
+            folder / ELF.format(board),
+            "--board",
+            board,
+            "--speed",
+            str(speed),
+            *options,
+        ]
         self.process = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
         )

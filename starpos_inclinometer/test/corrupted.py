@@ -8,7 +8,9 @@ from starpos_inclinometer.sources import mcu_protocol
 
 RATE_HZ = 50
 HEX = np.frombuffer(b"0123456789ABCDEF", np.uint8)
-IDENTITY = mcu_protocol.identity_line(mcu_protocol.Identity(1, 0x0100, 7, RATE_HZ, 14))
+IDENTITY = mcu_protocol.identity_line(
+    mcu_protocol.Identity(version=1, firmware=0x0100, unit=7, rate_hz=RATE_HZ, delay_ms=14)
+)
 
 
 def lines(n, rng, first=0):

@@ -7,7 +7,7 @@ import pytest
 from starpos_inclinometer.host_clock import Moment
 from starpos_inclinometer.sources import mcu_protocol
 from starpos_inclinometer.sources.mcu import NEAR_CODES, McuDecoder
-from starpos_inclinometer.sources.mcu_protocol import SampleStatus
+from starpos_inclinometer.sources.mcu_protocol import SampleStatus, SensorKind
 
 CODE = 0x812345
 
@@ -17,7 +17,9 @@ def line(sequence, ms=None, x=CODE, y=CODE, status=0):
 
 
 def identity(rate_hz=10):
-    return mcu_protocol.identity_line(mcu_protocol.Identity(1, 0x0100, 7, rate_hz, 14))
+    return mcu_protocol.identity_line(
+        mcu_protocol.Identity(version=1, firmware=0x0100, unit=7, rate_hz=rate_hz, delay_ms=14)
+    )
 
 
 class Line:
@@ -57,7 +59,7 @@ def test_the_first_sample_waits_for_a_second_one(cable):
 
 def test_a_fault_is_told_at_once_its_end_when_it_is_said_twice(cable):
     cable.send(line(0), line(1))
-    got = cable.send(line(2, status=SampleStatus.ADC_TIMEOUT), line(3, status=SampleStatus.ADC_TIMEOUT))
+    got = cable.send(line(2, status=SampleStatus.NO_ANSWER), line(3, status=SampleStatus.NO_ANSWER))
     assert numbers(got) == [2, 3]
     assert cable.send(line(4)) == [] and numbers(cable.send(line(5))) == [4, 5]
 
@@ -72,7 +74,7 @@ def test_without_temperature_its_number_means_nothing(cable):
     "wrong",
     [
         mcu_protocol.sample_line(3, 300, CODE, CODE, 0xAF ^ 0x40, 0),
-        line(3, x=CODE + 4 * NEAR_CODES),
+        line(3, x=CODE + 4 * NEAR_CODES[SensorKind.SCA100T]),
         line(3, y=0xFFFFFF),
         line(3, ms=350),
         line(3, ms=3000),

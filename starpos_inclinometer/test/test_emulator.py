@@ -50,7 +50,7 @@ def test_beyond_its_range_it_says_so():
 def test_clock_and_sequence():
     mcu = Mcu(seed=1, rate_hz=20, drift_ppm=1000)
     (identity,) = LineParser().feed(mcu.reset(5.0))
-    assert identity == Identity(1, 0x0100, 0x53494D00, 20, 24)
+    assert identity == Identity(version=2, firmware=0x0200, unit=0x53494D00, rate_hz=20, delay_ms=24)
     samples = LineParser().feed(b"".join(mcu.sample() for _ in range(101)))
     assert samples[0].status == SampleStatus.FIRST and samples[1].status == 0
     # Its samples are due by its own clock, which is fast.

@@ -19,7 +19,7 @@ def test_samples_identity_and_rate(bench, read):
     reader = read(rate_hz=50)
     state = reader.wait(lambda state, samples: len(samples) >= 30)
     assert state.phase is Phase.RECEIVING
-    assert reader.identity.rate_hz == 50 and reader.identity.version == 1
+    assert reader.identity.rate_hz == 50 and reader.identity.version == 2
     reader.wait(lambda state, samples: state.rate_hz > 40)
     codes = [a.sample.x for a in reader.samples]
     assert len(set(codes)) > 1

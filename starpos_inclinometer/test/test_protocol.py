@@ -50,7 +50,7 @@ def test_the_documents_example_is_a_line_of_this_protocol():
 
 
 def test_messages_round_trip():
-    identity = Identity(1, 0x0102, 0xDEADBEEF, 10, 20)
+    identity = Identity(version=1, firmware=0x0102, unit=0xDEADBEEF, rate_hz=10, delay_ms=20)
     stream = mcu_protocol.identity_line(identity) + lines(1)[0] + mcu_protocol.refusal_line(Reason.UNKNOWN)
     messages = LineParser().feed(stream)
     assert messages == [

@@ -149,7 +149,7 @@ def test_a_polynomial_far_outside_of_its_range_does_not_turn_an_axis_round():
 
 @pytest.mark.parametrize(
     "odd",
-    [{"lost": 1}, {"status": SampleStatus.ADC_TIMEOUT}, {"x": 0}, {"x": Sca100tCalibration().code(4.9)}],
+    [{"lost": 1}, {"status": SampleStatus.NO_ANSWER}, {"x": 0}, {"x": Sca100tCalibration().code(4.9)}],
 )
 def test_what_is_flagged_tells_no_noise(odd):
     s = Sensor()
@@ -183,8 +183,8 @@ def test_a_temperature_never_known_widens_the_error_by_all_it_may_be():
         (sample(lost=3), sca100t.GAP),
         (sample(restarted=True), sca100t.GAP),
         (sample(resumed=True), sca100t.GAP),
-        (sample(status=SampleStatus.ADC_TIMEOUT), sca100t.STUCK),
-        (sample(status=SampleStatus.NO_REFERENCE), sca100t.STUCK),
+        (sample(status=SampleStatus.NO_ANSWER), sca100t.STUCK),
+        (sample(status=SampleStatus.MEANINGLESS), sca100t.STUCK),
         (sample(status=SampleStatus.OVERRUN | 0xC0), 0),
     ],
 )

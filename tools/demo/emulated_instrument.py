@@ -64,7 +64,7 @@ def start_devices(devices: Processes, place: Place, seed: int) -> dict[str, dict
     folder = devices.folder
     make = ["make", "-C", str(ROOT / "starpos_inclinometer" / "firmware"), f"BUILD={folder}", "all", "sim"]
     subprocess.run(make, check=True, stdout=subprocess.DEVNULL)
-    board, link = [str(folder / "inclinometer-sim"), str(folder / "inclinometer.elf")], str(folder / "port")
+    board, link = [str(folder / "inclinometer-sim"), str(folder / "paper.elf")], str(folder / "port")
     theta_x, theta_y = np.degrees(place.scene().tilt)
     tilt = ["--tilt", f"{theta_x:.9f}", f"{theta_y:.9f}"]
     # It ends when its input ends.

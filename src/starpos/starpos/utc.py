@@ -17,6 +17,12 @@ def utc_text(utc_unix_s: float) -> str:
     return moment.strftime("%Y-%m-%dT%H:%M:%S.") + f"{moment.microsecond // 1000:03d}Z"
 
 
+def date_obs(utc_unix_s: float) -> str:
+    """Unix seconds in the form of FITS' DATE-OBS, UTC to the microsecond."""
+    moment = datetime.datetime.fromtimestamp(round(utc_unix_s, 6), datetime.timezone.utc)
+    return moment.strftime("%Y-%m-%dT%H:%M:%S.%f")
+
+
 def unix_of(utc: str) -> float:
     """Unix seconds of an ISO 8601 time, UTC unless it names another zone; TimeError if it is not a time."""
     try:

@@ -18,7 +18,7 @@
 #include "mcu.h"
 
 static const char USAGE[] =
-    "usage: inclinometer-sim ELF [--speed FACTOR] [--link PATH] [--unit HEX] [--tilt X Y]\n"
+    "usage: inclinometer-sim ELF [--speed FACTOR] [--link PATH] [--board paper|nano] [--unit HEX] [--tilt X Y]\n"
     "Runs until its standard input ends. FACTOR is 1 for real time; at 0 time passes by `run` only. Its lines:\n"
     "  run MS [BYTES] once BYTES bytes altogether have come from the host\n"
     "  tilt X Y [RATE_X RATE_Y]   deg, and deg/s from now on\n"
@@ -27,6 +27,14 @@ static const char USAGE[] =
     "  freeze 0|1     1: the converter does not finish what it does\n"
     "  reference 0|1  0: the converter's reference is open\n"
     "  sensor 0|1     0: the sensor does not answer on the SPI bus\n"
+    "  shutter AFTER_MS MS [BOUNCES]  its contact closes, and opens again\n"
+    "  pps AFTER_MS EVERY_MS          a receiver's pulses; 0 ends them\n"
+    "  face 0|1       1: the board lies on its face\n"
+    "  miso 0|1       0: the SCL3300's answers do not arrive\n"
+    "  noisy 0|1      1: each third answer of the SCL3300 has a wrong bit\n"
+    "  fail BITS      the SCL3300's own supervision sets bits of its status\n"
+    "  selftest N     the SCL3300's self-test output\n"
+    "  supply         the SCL3300 alone loses its supply for a moment\n"
     "  adc            the converter alone is reset, as by a spike\n"
     "  slip BYTES     after so many bytes its interface gets out of step, as by a spike\n"
     "  reset, power   the MCU by its pin; the whole board\n"
@@ -111,10 +119,10 @@ static void print_state(void)
     double now = mcu_now();
     fprintf(answers,
            "{\"ms\": %.3f, \"line_ms\": %.3f, \"awake_ms\": %.3f, \"mode\": %u, \"filter\": %u, \"dac\": %u, "
-           "\"calibrated\": %d, \"adc_resets\": %u, \"conversions\": %u, \"sent\": %lu, \"complaints\": \"%s\"}\n",
+           "\"calibrated\": %d, \"adc_resets\": %u, \"conversions\": %u, \"frames\": %u, \"sensor_resets\": %u, \"sent\": %lu, \"complaints\": \"%s\"}\n",
            (now - mcu.reset_at) * 1e3, (mcu.line_at - mcu.reset_at) * 1e3, (now - mcu.asleep) * 1e3, a->mode, a->filter,
            a->dac, a->full_scale[0] && a->full_scale[1] && a->zero_scale[0] && a->zero_scale[1], a->resets,
-           a->conversions, bytes_sent, complaints());
+           a->conversions, mcu.scl3300.frames, mcu.scl3300.resets, bytes_sent, complaints());
 }
 
 // Whether the command is one, with as many numbers as it takes.
@@ -140,6 +148,22 @@ static bool obey(const char *command)
         mcu.adc.reference_missing = !v[0];
     else if (!strcmp(name, "sensor") && n == 1)
         mcu.sensor.absent = !v[0];
+    else if (!strcmp(name, "shutter") && (n == 2 || n == 3))
+        mcu_shutter(v[0] * 1e-3, v[1] * 1e-3, v[2]);
+    else if (!strcmp(name, "pps") && n == 2)
+        mcu_pps(v[0] * 1e-3, v[1] * 1e-3);
+    else if (!strcmp(name, "face") && n == 1)
+        mcu.scl3300.upside_down = v[0];
+    else if (!strcmp(name, "miso") && n == 1)
+        mcu.scl3300.broken = !v[0];
+    else if (!strcmp(name, "noisy") && n == 1)
+        mcu.scl3300.noisy = v[0];
+    else if (!strcmp(name, "fail") && n == 1)
+        scl3300_fail(&mcu.scl3300, v[0]);
+    else if (!strcmp(name, "selftest") && n == 1)
+        mcu.scl3300.self_test = v[0];
+    else if (!strcmp(name, "supply") && n == 0)
+        scl3300_power_on(&mcu.scl3300, -1); // long ago: the firmware cannot know of it
     else if (!strcmp(name, "adc") && n == 0)
         adc_power_on(&mcu.adc);
     else if (!strcmp(name, "slip") && n == 1)
@@ -216,12 +240,15 @@ int main(int argc, char **argv)
     const char *elf = NULL, *link = NULL;
     double speed = 1, x = 0, y = 0;
     uint32_t unit = UINT32_MAX;
+    enum board board = PAPER;
     for (int i = 1; i < argc; i++) {
         int left = argc - 1 - i;
         if (!strcmp(argv[i], "--speed") && left >= 1)
             speed = atof(argv[++i]);
         else if (!strcmp(argv[i], "--link") && left >= 1)
             link = argv[++i];
+        else if (!strcmp(argv[i], "--board") && left >= 1)
+            board = strcmp(argv[++i], "nano") ? PAPER : NANO;
         else if (!strcmp(argv[i], "--unit") && left >= 1)
             unit = strtoul(argv[++i], NULL, 16);
         else if (!strcmp(argv[i], "--tilt") && left >= 2)
@@ -248,7 +275,7 @@ int main(int argc, char **argv)
         return 1;
     mcu.sent = sent;
     int status = 1;
-    if (mcu_init(elf, unit)) {
+    if (mcu_init(elf, board, unit)) {
         sensor_tilt(&mcu.sensor, 0, x * M_PI / 180, y * M_PI / 180, 0, 0);
         fprintf(answers, "%s\n", link ? link : path);
         fflush(answers);
@@ -256,7 +283,7 @@ int main(int argc, char **argv)
         if (status)
             fprintf(stderr, "inclinometer-sim: the MCU crashed\n");
     } else {
-        fprintf(stderr, "inclinometer-sim: %s: not a firmware for the ATmega8\n", elf);
+        fprintf(stderr, "inclinometer-sim: %s: not a firmware for this board\n", elf);
     }
     if (link)
         unlink(link);

@@ -46,9 +46,14 @@ static double wander(struct sensor *s, int axis, double now)
     return s->wander[axis] * s->noise_rad;
 }
 
+double sensor_angle(struct sensor *s, int axis, double now)
+{
+    return angle(s, axis, now) + wander(s, axis, now);
+}
+
 double sensor_volts(struct sensor *s, int axis, double now)
 {
-    double volts = SUPPLY_V / 2 + VOLTS_PER_G * sin(angle(s, axis, now) + wander(s, axis, now));
+    double volts = SUPPLY_V / 2 + VOLTS_PER_G * sin(sensor_angle(s, axis, now));
     return fmin(fmax(volts, 0), SUPPLY_V);
 }
 

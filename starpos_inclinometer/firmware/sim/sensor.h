@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-// The SCA100T-D01: angles in, analog outputs and SPI temperature out.
+// What a board feels: angles and a temperature; and the SCA100T-D01's analog outputs and SPI temperature.
 #pragma once
 
 #include <stdbool.h>
@@ -21,6 +21,7 @@ struct sensor {
 double gaussian(void); // standard normal noise, for the converter too
 void sensor_init(struct sensor *s);
 void sensor_tilt(struct sensor *s, double now, double x, double y, double rate_x, double rate_y); // rad, rad/s
+double sensor_angle(struct sensor *s, int axis, double now); // rad, with noise; `now` must not go back
 double sensor_volts(struct sensor *s, int axis, double now); // `now` must not go back
 void sensor_select(struct sensor *s, bool selected, double now);
 uint8_t sensor_transfer(struct sensor *s, uint8_t in);

@@ -10,23 +10,15 @@ from typing import Any
 
 import numpy as np
 
-from starpos.instrument.inclinometer import SCA100T_NOISE_RAD, elevations
-from starpos.instrument.noise_tracker import NoiseTracker, noise_text
+from starpos.instrument.inclinometer import elevations
+from starpos.instrument.noise_tracker import noise_text
 from starpos.units import ARCSEC
 from starpos_common.parameters import Parameter
 from starpos_inclinometer.clock import ArrivalFilter, PaceWatch
 from starpos_inclinometer.host_clock import Moment
+from starpos_inclinometer.sources.angle_tilts import Angles, AngleTilts
 from starpos_inclinometer.sources.mcu_continuity import HOST_TOLERANCE_S, HOST_TOLERANCE_SHARE, Gate
-from starpos_inclinometer.sources.reading import (
-    GAP,
-    OUT_OF_RANGE,
-    STUCK,
-    TIME_UNKNOWN,
-    Arrival,
-    Counts,
-    Health,
-    Reading,
-)
+from starpos_inclinometer.sources.reading import Arrival, Counts, Health, Reading
 from starpos_inclinometer.sources.serial_link import SERIAL_PARAMETERS, SerialLink, port_refusal
 from starpos_inclinometer.sources.source import Surroundings, TiltSource
 
@@ -331,10 +323,7 @@ class AsciiSource(TiltSource):
         )
         self._link = SerialLink(values["port"], self._baud, self._decoder, host.clock, host.wake)
         self._arrivals, self._pace = ArrivalFilter(), PaceWatch()
-        self._noise = NoiseTracker()
-        self._equal = 0
-        self._last: tuple[float | None, ...] = (math.nan, math.nan)
-        self._sequence = -1
+        self._tilts = AngleTilts()
         self.configure(values)
 
     @staticmethod
@@ -351,11 +340,11 @@ class AsciiSource(TiltSource):
         self._link.stop()
 
     def configure(self, values: Mapping[str, Any]) -> None:
-        self._floor = 0.0 if math.isnan(values["noise_stddev"]) else math.radians(values["noise_stddev"])
-        self._latency = 0.0 if math.isnan(values["latency"]) else values["latency"]
-        self._stuck_samples = values["ascii.stuck_samples"]
-        self._range = (
-            math.pi / 2 if math.isnan(values["ascii.range"]) else math.radians(values["ascii.range"])
+        range_deg = values["ascii.range"]
+        self._tilts.configure(
+            values,
+            stuck_samples=values["ascii.stuck_samples"],
+            range_rad=math.pi / 2 if math.isnan(range_deg) else math.radians(range_deg),
         )
 
     def take(self) -> list[Reading]:
@@ -370,40 +359,9 @@ class AsciiSource(TiltSource):
             if line.broken:
                 self._arrivals.restart()
             known_s = self._arrivals.delay(line.milliseconds, moment.monotonic_s)
-        late = known_s or 0.0
-        flags = self._flags(line) | (TIME_UNKNOWN if known_s is None else 0)
-        if flags & GAP:
-            self._noise.interrupt()
         angles = (line.x, line.y) if line.z is None else (line.x, line.y, line.z)
-        if not flags & (OUT_OF_RANGE | STUCK):
-            self._noise.add(moment.monotonic_s - late, *angles)
-        sigmas = self._noise.sigma or (max(SCA100T_NOISE_RAD, line.step),) * len(angles)
-        variances = [max(s, self._floor) ** 2 + line.step**2 / 12 for s in sigmas]
-        self._sequence = (self._sequence + 1 + line.lost) & 0xFFFFFFFF
-        stamp_ns = moment.host_ns - round((late + self._latency) * 1e9)
-        covariance = (variances[0], 0.0, 0.0, variances[1])
-        return Reading(
-            stamp_ns=max(stamp_ns, 0),
-            x=line.x,
-            y=line.y,
-            covariance=covariance,
-            temperature_c=line.temperature_c,
-            sequence=self._sequence,
-            flags=flags,
-            z=math.nan if line.z is None else line.z,
-            z_variance=math.nan if line.z is None else variances[2],
-        )
-
-    def _flags(self, line: Line) -> int:
-        self._equal = self._equal + 1 if (line.x, line.y, line.z) == self._last else 1
-        self._last = line.x, line.y, line.z
-        flags = GAP if line.lost or line.broken else 0
-        if 0 < self._stuck_samples <= self._equal:
-            flags |= STUCK
-        # For a sensor without z, beyond 90 deg is upside down.
-        if max(abs(line.x), abs(line.y)) > self._range:
-            flags |= OUT_OF_RANGE
-        return flags
+        measured = Angles(angles, line.step, line.temperature_c, line.lost, line.broken)
+        return self._tilts.reading(measured, moment, known_s)
 
     def health(self) -> Health:
         state = self._link.state()
@@ -411,7 +369,7 @@ class AsciiSource(TiltSource):
             "openings": state.connections,
             "unfetched samples": state.dropped,
             "clock rate error (ppm)": self._arrivals.rate_ppm,
-            "noise by axis (arcsec)": noise_text(self._noise.sigma),
+            "noise by axis (arcsec)": noise_text(self._tilts.noise.sigma),
         }
         return Health(
             phase=state.phase,

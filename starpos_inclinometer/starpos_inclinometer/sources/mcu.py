@@ -3,6 +3,7 @@
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 from starpos.instrument.noise_tracker import noise_text
@@ -11,30 +12,32 @@ from starpos_inclinometer.clock import ArrivalFilter
 from starpos_inclinometer.host_clock import Moment
 from starpos_inclinometer.sources import mcu_protocol, sca100t
 from starpos_inclinometer.sources.mcu_continuity import Continuity, Gate, mcu_follows
-from starpos_inclinometer.sources.mcu_protocol import Identity, Reason, Refusal
-from starpos_inclinometer.sources.reading import TIME_UNKNOWN, Arrival, Counts, Health, Reading
+from starpos_inclinometer.sources.mcu_protocol import Identity, Pulse, Reason, Refusal, SensorKind
+from starpos_inclinometer.sources.pulse_times import PulseTimes
+from starpos_inclinometer.sources.reading import TIME_UNKNOWN, Arrival, Counts, Health, Reading, TimedPulse
 from starpos_inclinometer.sources.sca100t import Sca100tCalibration, Sensor
+from starpos_inclinometer.sources.scl3300 import Scl3300, Scl3300Calibration
 from starpos_inclinometer.sources.serial_link import SERIAL_PARAMETERS, SerialLink, port_refusal
 from starpos_inclinometer.sources.source import Surroundings, TiltSource
 
 # 8N1: a start bit, eight of data, a stop bit.
 BITS_PER_BYTE = 10
-# 0.05 deg, ten times the noise.
-NEAR_CODES = 11_000
-# The firmware's delay at its default rate, used until the firmware tells its own.
-DEFAULT_DELAY_MS = 54
+# 0.05 deg: of the SCA100T ten times the noise, of the SCL3300 six times.
+NEAR_CODES = {SensorKind.SCA100T: 11_000, SensorKind.SCL3300: 2_330}
 # Below this determinant of the cross-axis matrix the two axes are not independent.
 SMALLEST_DETERMINANT = 0.5
+RATE_PARAMETER = Parameter(
+    "rate",
+    10,
+    "Samples a second from the microcontroller, or of source iio without a trigger; above the sensor's bandwidth, 18 Hz "
+    "of the SCA100T, they add little.",
+    unit="Hz",
+    minimum=mcu_protocol.MIN_RATE_HZ,
+    maximum=mcu_protocol.MAX_RATE_HZ,
+)
 PARAMETERS = (
     *SERIAL_PARAMETERS,
-    Parameter(
-        "rate",
-        10,
-        "Samples a second from the microcontroller; above 18 Hz, the sensor's bandwidth, they add little.",
-        unit="Hz",
-        minimum=mcu_protocol.MIN_RATE_HZ,
-        maximum=mcu_protocol.MAX_RATE_HZ,
-    ),
+    RATE_PARAMETER,
     Parameter(
         "offset_volts",
         (2.5, 2.5),
@@ -143,7 +146,7 @@ class McuDecoder:
         self._ask = True
         self._refused_rate: int | None = None
         self._parser = mcu_protocol.LineParser()
-        self._gate = Gate(self._follows, NEAR_CODES)
+        self._gate = Gate(self._follows, NEAR_CODES[SensorKind.SCA100T])
         self._continuity = Continuity()
 
     @property
@@ -184,9 +187,13 @@ class McuDecoder:
             if isinstance(message, mcu_protocol.Sample):
                 believed += self._admit(Arrival(message, moment, self.identity))
                 continue
+            if isinstance(message, Pulse):
+                believed.append(Arrival(message, moment, self.identity))
+                continue
             self.answered = True
             if isinstance(message, Identity):
                 self.identity = message
+                self._gate.tolerance = NEAR_CODES[SensorKind(message.kind)]
                 self._ask = False
             elif isinstance(message, Refusal) and message.reason == Reason.OUT_OF_RANGE:
                 self._refused_rate = self.wanted_rate_hz
@@ -219,23 +226,56 @@ class McuTilts:
     """Converts believed samples to readings."""
 
     def __init__(self, values: Mapping[str, Any]) -> None:
-        self.sensor = Sensor()
+        # The sensor of the unit that was last heard.
+        self.sensor: Sensor | Scl3300 = Sensor()
+        self._sca100t, self._scl3300 = self.sensor, Scl3300()
         self.arrivals = ArrivalFilter()
         self._line_s = mcu_protocol.SAMPLE_LINE * BITS_PER_BYTE / values["baud"]
-        self._delay_ms = DEFAULT_DELAY_MS
+        self._delay_ms = 0
+        # The samples that came before the identity were the first after a gap.
+        self._gap = False
+        self.pulses = PulseTimes()
         self._rate_hz = 0
         self.configure(values)
 
     def configure(self, values: Mapping[str, Any]) -> None:
-        self.sensor.calibration = calibration(values)
+        self._sca100t.calibration = calibration(values)
+        self._scl3300.calibration = Scl3300Calibration(
+            values["cross_axis"], self._sca100t.calibration.noise_floor_rad
+        )
         self._latency_s = values["latency"]
 
     def read(self, arrivals: list[Arrival]) -> list[Reading]:
-        """Convert the arrivals that an `McuDecoder` believed, in order."""
-        return [self._reading(arrival) for arrival in arrivals]
+        """Convert the arrivals that an `McuDecoder` believed, in order.
+
+        Until the unit has told which sensor it has, nobody can say what its codes mean, and they are left out.
+        The times of pulses among them go to `pulses`.
+        """
+        readings = []
+        for arrival in arrivals:
+            if isinstance(arrival.sample, Pulse):
+                self._take_pulse(arrival)
+            elif arrival.identity is None:
+                sample = arrival.sample
+                self._gap |= bool(sample.lost) or sample.restarted or sample.resumed
+            else:
+                readings.append(self._reading(arrival))
+        return readings
+
+    def _take_pulse(self, arrival: Arrival) -> None:
+        """Date an edge through the clocks' relation that the samples have shown."""
+        sent_s = self.arrivals.arrival_s(arrival.sample.milliseconds, arrival.moment.monotonic_s)
+        if sent_s is not None:
+            sent_s -= self._sample_to_arrival_s()
+        self.pulses.add(arrival.sample, arrival.moment, sent_s)
+
+    def _sample_to_arrival_s(self) -> float:
+        """From the time that a line tells to its arrival, the shortest there is."""
+        return (self._delay_ms * 1e-3 if math.isnan(self._latency_s) else self._latency_s) + self._line_s
 
     def _follow(self, identity: Identity) -> None:
-        """Take over the rate and delay that the MCU had told when it sent the next sample."""
+        """Take over the sensor, rate and delay that the MCU had told when it sent the next sample."""
+        self.sensor = self._scl3300 if identity.kind == SensorKind.SCL3300 else self._sca100t
         # At a lower rate a sample is the mean of more conversions, so its noise is another.
         if identity.rate_hz != self._rate_hz:
             self._rate_hz = identity.rate_hz
@@ -247,16 +287,16 @@ class McuTilts:
 
     def _reading(self, arrival: Arrival) -> Reading:
         sample, moment = arrival.sample, arrival.moment
-        if arrival.identity:
-            self._follow(arrival.identity)
+        self._follow(arrival.identity)
+        sample, self._gap = replace(sample, resumed=sample.resumed or self._gap), False
         if sample.restarted or sample.resumed:
             self.arrivals.restart()
+            self.pulses.restart()
         known_s = self.arrivals.delay(sample.milliseconds, moment.monotonic_s)
         late_s = known_s or 0.0
-        delay_s = self._delay_ms * 1e-3 if math.isnan(self._latency_s) else self._latency_s
         measured = self.sensor.measure(sample, moment.monotonic_s - late_s)
         return Reading(
-            stamp_ns=max(moment.host_ns - round((late_s + delay_s + self._line_s) * 1e9), 0),
+            stamp_ns=max(moment.host_ns - round((late_s + self._sample_to_arrival_s()) * 1e9), 0),
             x=measured.x,
             y=measured.y,
             covariance=measured.covariance,
@@ -300,6 +340,9 @@ class McuSource(TiltSource):
     def take(self) -> list[Reading]:
         return self._tilts.read(self._link.take())
 
+    def take_pulses(self) -> list[TimedPulse]:
+        return self._tilts.pulses.take()
+
     def health(self) -> Health:
         state = self._link.state()
         identity = self._decoder.identity
@@ -314,7 +357,10 @@ class McuSource(TiltSource):
             "clock rate error (ppm)": self._tilts.arrivals.rate_ppm,
             "noise x, y (arcsec)": noise_text(sensor.noise.sigma),
             "sensor temperature (deg C)": sensor.temperature.celsius(math.nan),
+            "pulses, and without a time": f"{self._tilts.pulses.dated}, {self._tilts.pulses.undated}",
+            "receiver's second": self._tilts.pulses.second,
             "firmware": f"{identity.firmware >> 8}.{identity.firmware & 255}" if identity else "unknown",
+            "sensor": SensorKind(identity.kind).name if identity else "unknown",
             "unit": f"{identity.unit:08X}" if identity else "unknown",
         }
         return Health(

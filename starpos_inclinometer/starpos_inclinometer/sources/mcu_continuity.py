@@ -24,7 +24,7 @@ PERIOD_TOLERANCE_MS = 2
 SHORTEST_MS, LONGEST_MS = 20, 1000
 # Counts; 2.8 deg C from one sample to the next.
 TEMPERATURE_TOLERANCE = 3
-FAULTS = SampleStatus.ADC_TIMEOUT | SampleStatus.NO_REFERENCE
+FAULTS = SampleStatus.NO_ANSWER | SampleStatus.MEANINGLESS
 # The host may stall for a time; the MCU's RC oscillator may be wrong by a share.
 HOST_TOLERANCE_S, HOST_TOLERANCE_SHARE = 3.0, 0.05
 
@@ -40,7 +40,7 @@ class Gate:
     def __init__(self, follows: Callable[[Arrival, Arrival], bool], tolerance: float) -> None:
         self.rejected = self.duplicates = 0
         self._follows = follows
-        self._tolerance = tolerance
+        self.tolerance = tolerance
         self._change = 0.0
         self._last: Arrival | None = None
         self._waiting: list[Arrival] = []
@@ -69,13 +69,13 @@ class Gate:
         return []
 
     def _near(self, a: Arrival, b: Arrival) -> bool:
-        return _change(a, b) <= max(self._tolerance, TOLERANCE_OF_CHANGE * self._change)
+        return _change(a, b) <= max(self.tolerance, TOLERANCE_OF_CHANGE * self._change)
 
     def _believe(self, arrivals: list[Arrival]) -> list[Arrival]:
         for arrival in arrivals:
             if self._last is not None:
                 # A single leap must not make leaps usual, so its size is limited.
-                limit = 4 * max(self._tolerance, TOLERANCE_OF_CHANGE * self._change)
+                limit = 4 * max(self.tolerance, TOLERANCE_OF_CHANGE * self._change)
                 self._change += CHANGE_SHARE * (min(_change(self._last, arrival), limit) - self._change)
             self._last = arrival
         self._waiting = []

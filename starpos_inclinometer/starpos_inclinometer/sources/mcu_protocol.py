@@ -6,13 +6,15 @@ from binascii import crc_hqx
 from dataclasses import dataclass
 from enum import IntEnum, IntFlag
 
-VERSION = 1
+VERSION = 2
 BAUD = 38400
 MIN_RATE_HZ, MAX_RATE_HZ = 1, 50
 # Bytes with '$' and CR LF, in both directions.
 MAX_LINE = 48
 # Bytes of a `$T` line.
 SAMPLE_LINE = 43
+# Bit of the K field of a `$P` line.
+RISING = 0x80
 # A line is sent within the period of its sample and this time.
 MAX_SENDING_MS = 50
 
@@ -20,7 +22,11 @@ _LINE = re.compile(rb"\$([^$*\r\n]{1,40})\*([0-9A-F]{4})\r\n")
 _SAMPLE = re.compile(
     rb"T,([0-9A-F]{4}),([0-9A-F]{8}),([0-9A-F]{6}),([0-9A-F]{6}),([0-9A-F]{2}),([0-9A-F]{2})"
 )
-_IDENTITY = re.compile(rb"I,([0-9A-F]{2}),([0-9A-F]{4}),([0-9A-F]{8}),([0-9A-F]{2}),([0-9A-F]{4})")
+# Version 1 had no kind: its firmware was that of the SCA100T alone.
+_IDENTITY = re.compile(
+    rb"I,([0-9A-F]{2}),([0-9A-F]{4}),([0-9A-F]{8}),([0-9A-F]{2}),([0-9A-F]{4})(?:,([0-9A-F]{2}))?"
+)
+_PULSE = re.compile(rb"P,([0-9A-F]{2}),([0-9A-F]{2}),([0-9A-F]{2}),([0-9A-F]{8}),([0-9A-F]{4})")
 _REFUSAL = re.compile(rb"N,([0-9A-F]{2})")
 _RATE = re.compile(rb"R,([0-9A-F]{2})")
 
@@ -28,10 +34,10 @@ _RATE = re.compile(rb"R,([0-9A-F]{2})")
 class SampleStatus(IntFlag):
     """Status bits of a sample; unknown bits belong to later versions and are ignored."""
 
-    # A channel did not convert in time: its code is that of the sample before.
-    ADC_TIMEOUT = 0x01
-    # The AD7730's NOREF bit: the codes mean nothing.
-    NO_REFERENCE = 0x02
+    # The sensor, or its converter, did not answer in time, or with a wrong checksum: the codes are those before.
+    NO_ANSWER = 0x01
+    # The AD7730's NOREF bit, or an error that the SCL3300 reports: the codes mean nothing.
+    MEANINGLESS = 0x02
     NO_TEMPERATURE = 0x04
     # The first sample since the reset.
     FIRST = 0x08
@@ -39,6 +45,26 @@ class SampleStatus(IntFlag):
     WATCHDOG = 0x10
     # At least one sample before this one was not sent.
     OVERRUN = 0x20
+    # The SCL3300's Z axis points below the horizon.
+    UPSIDE_DOWN = 0x40
+    # The SCL3300's self-test failed.
+    SELF_TEST = 0x80
+
+
+class SensorKind(IntEnum):
+    """The sensor of a unit."""
+
+    # SCA100T-D01 behind an AD7730.
+    SCA100T = 0
+    # SCL3300-D01.
+    SCL3300 = 1
+
+
+class Input(IntEnum):
+    """What a pulse came from."""
+
+    SHUTTER = 0
+    PPS = 1
 
 
 class Reason(IntEnum):
@@ -57,10 +83,10 @@ class Sample:
     sequence: int
     # The MCU's clock at the middle of the conversions, 32 bits.
     milliseconds: int
-    # AD7730 codes, 24-bit offset binary: 0x800000 is no input.
+    # Codes, 24-bit offset binary: 0x800000 is no input of the AD7730, or an angle of 0 of the SCL3300.
     x: int
     y: int
-    # The SCA100T's temperature counts, 8 bits.
+    # Temperature counts of the sensor, 8 bits.
     temperature: int
     # Bits of SampleStatus.
     status: int
@@ -72,7 +98,7 @@ class Sample:
     resumed: bool = False
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Identity:
     """The MCU's answer to both commands."""
 
@@ -85,12 +111,32 @@ class Identity:
     rate_hz: int
     # The time from a sample to the first byte of its line.
     delay_ms: int
+    kind: int = SensorKind.SCA100T
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Pulse:
+    """One `$P` line: an edge of an input."""
+
+    # One of Input.
+    input: int
+    rising: bool
+    # 8 bits; a jump tells how many were lost.
+    number: int
+    # Edges of this input since the one before, within 2 ms of one another: they have no line.
+    bounces: int
+    # The MCU's clock at the edge, 32 bits and 0 to 999.
+    milliseconds: int
+    microseconds: int
 
 
 @dataclass(frozen=True, slots=True)
 class Refusal:
     # One of Reason.
     reason: int
+
+
+Message = Sample | Identity | Refusal | Pulse
 
 
 def checksum(body: bytes) -> int:
@@ -120,7 +166,14 @@ def sample_line(sequence: int, milliseconds: int, x: int, y: int, temperature: i
 
 def identity_line(identity: Identity) -> bytes:
     i = identity
-    return frame(b"I,%02X,%04X,%08X,%02X,%04X" % (i.version, i.firmware, i.unit, i.rate_hz, i.delay_ms))
+    numbers = (i.version, i.firmware, i.unit, i.rate_hz, i.delay_ms, i.kind)
+    return frame(b"I,%02X,%04X,%08X,%02X,%04X,%02X" % numbers)
+
+
+def pulse_line(pulse: Pulse) -> bytes:
+    p = pulse
+    kind = p.input | (RISING if p.rising else 0)
+    return frame(b"P,%02X,%02X,%02X,%08X,%04X" % (kind, p.number, p.bounces, p.milliseconds, p.microseconds))
 
 
 def refusal_line(reason: Reason) -> bytes:
@@ -168,9 +221,9 @@ class LineParser:
     def garbage_bytes(self) -> int:
         return self._splitter.garbage_bytes
 
-    def feed(self, data: bytes) -> list[Sample | Identity | Refusal]:
+    def feed(self, data: bytes) -> list[Message]:
         """Return the messages that `data` completes, in order; none with a wrong checksum or an impossible field."""
-        messages: list[Sample | Identity | Refusal] = []
+        messages: list[Message] = []
         for body, right in self._splitter.feed(data):
             if not right:
                 self.crc_errors += 1
@@ -186,7 +239,7 @@ class LineParser:
         self._splitter.forget()
 
 
-def _parse(body: bytes) -> Sample | Identity | Refusal | None:
+def _parse(body: bytes) -> Message | None:
     if match := _SAMPLE.fullmatch(body):
         sequence, milliseconds, x, y, temperature, status = (int(group, 16) for group in match.groups())
         sample = Sample(
@@ -194,8 +247,22 @@ def _parse(body: bytes) -> Sample | Identity | Refusal | None:
         )
         return None if sample.status & SampleStatus.FIRST and sample.sequence else sample
     if match := _IDENTITY.fullmatch(body):
-        identity = Identity(*(int(group, 16) for group in match.groups()))
+        version, firmware, unit, rate_hz, delay_ms, kind = (int(group or "0", 16) for group in match.groups())
+        identity = Identity(
+            version=version, firmware=firmware, unit=unit, rate_hz=rate_hz, delay_ms=delay_ms, kind=kind
+        )
         return identity if _possible(identity) else None
+    if match := _PULSE.fullmatch(body):
+        kind, number, bounces, milliseconds, microseconds = (int(group, 16) for group in match.groups())
+        pulse = Pulse(
+            input=kind & ~RISING,
+            rising=bool(kind & RISING),
+            number=number,
+            bounces=bounces,
+            milliseconds=milliseconds,
+            microseconds=microseconds,
+        )
+        return pulse if pulse.input in list(Input) and microseconds < 1000 else None
     if match := _REFUSAL.fullmatch(body):
         return Refusal(int(match[1], 16))
     return None
@@ -203,7 +270,11 @@ def _parse(body: bytes) -> Sample | Identity | Refusal | None:
 
 def _possible(identity: Identity) -> bool:
     rate = identity.rate_hz
-    return MIN_RATE_HZ <= rate <= MAX_RATE_HZ and identity.delay_ms <= 1000 / rate + MAX_SENDING_MS
+    return (
+        identity.kind in list(SensorKind)
+        and MIN_RATE_HZ <= rate <= MAX_RATE_HZ
+        and identity.delay_ms <= 1000 / rate + MAX_SENDING_MS
+    )
 
 
 def parse_command(body: bytes) -> tuple[str, int] | Reason:

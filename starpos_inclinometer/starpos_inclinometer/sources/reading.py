@@ -70,6 +70,24 @@ class Arrival:
     identity: Any = None
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TimedPulse:
+    """An edge with its time, as it is published.
+
+    input: of starpos_interfaces/Pulse.  sequence: counted on over resets.  bounces: edges since the one before that have
+    no line.  stamp_ns: the host's time, or UTC by the receiver's second if `disciplined`.
+    """
+
+    input: int
+    rising: bool
+    sequence: int
+    bounces: int
+    device_time_s: float
+    stamp_ns: int
+    stddev_s: float
+    disciplined: bool
+
+
 @dataclass(frozen=True, kw_only=True)
 class Health:
     """State of a source, for a person to read."""

@@ -2,6 +2,7 @@
 """The sources by their name in the parameter `source`. A new sensor needs a module here and a line below."""
 
 from starpos_inclinometer.sources.ascii_line import AsciiSource
+from starpos_inclinometer.sources.iio import IioSource
 from starpos_inclinometer.sources.imu import ImuSource
 from starpos_inclinometer.sources.mcu import McuSource
 from starpos_inclinometer.sources.source import TiltSource
@@ -10,4 +11,5 @@ SOURCES: dict[str, type[TiltSource]] = {
     "serial": McuSource,
     "imu": ImuSource,
     "ascii": AsciiSource,
+    "iio": IioSource,
 }

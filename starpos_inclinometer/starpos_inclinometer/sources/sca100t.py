@@ -152,7 +152,7 @@ class Sensor:
             self._run[axis] = self._run[axis] + 1 if codes[axis] == self._last[axis] else 1
         self._last = codes
         stuck = max(self._run) >= STUCK_SAMPLES or min(self._run) >= STUCK_PAIRS
-        if stuck or sample.status & (SampleStatus.ADC_TIMEOUT | SampleStatus.NO_REFERENCE):
+        if stuck or sample.status & (SampleStatus.NO_ANSWER | SampleStatus.MEANINGLESS):
             flags |= STUCK
         if any(code in (0, CODE_MAX) for code in codes):
             flags |= SATURATED

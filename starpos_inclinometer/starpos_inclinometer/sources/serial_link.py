@@ -246,7 +246,8 @@ class SerialLink:
             for arrival in arrivals:
                 self._dropped += len(self._queue) == QUEUE_SAMPLES
                 self._queue.append(arrival)
-                self._recent.append(moment.monotonic_s)
+                if not isinstance(arrival.sample, mcu_protocol.Pulse):
+                    self._recent.append(moment.monotonic_s)
             if self._decoder.answered:
                 self._next_command = 0.0
             lines = self._decoder.counts.good > before

@@ -10,7 +10,7 @@ from rclpy.node import Node
 from starpos_common.parameters import Parameter
 from starpos_common.topics import Take
 from starpos_inclinometer.host_clock import HostClock
-from starpos_inclinometer.sources.reading import Health, Reading
+from starpos_inclinometer.sources.reading import Health, Reading, TimedPulse
 
 
 @dataclass(frozen=True)
@@ -64,6 +64,10 @@ class TiltSource(Protocol):
 
     def take(self) -> list[Reading]:
         """Return the readings since the last call, in order."""
+
+    def take_pulses(self) -> list[TimedPulse]:
+        """Return the edges that the device has timed since the last call, in order; most devices time none."""
+        return []
 
     def health(self) -> Health:
         """State of the source, for a person to read."""

@@ -288,7 +288,9 @@ def number(low: float, high: float, kind: type[int] | type[float] = float) -> Ca
 
 
 def atmosphere_of(args: argparse.Namespace) -> Atmosphere:
-    """The air from the options, as far as they give it."""
+    """The air from the options, as far as they give it; `args.air` is that of a field report."""
+    if (stated := getattr(args, "air", None)) is not None:
+        return stated
     pressure_pa = None if args.pressure_hpa is None else args.pressure_hpa * 100
     return Atmosphere.measured(pressure_pa, args.temperature_c, args.humidity, args.wavelength_um)
 

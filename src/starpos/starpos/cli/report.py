@@ -5,6 +5,7 @@ import argparse
 import time
 from importlib.util import find_spec
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from starpos.cli import console, options
 from starpos.cli.inputs import given_of
@@ -14,10 +15,14 @@ from starpos.frames.stars import no_stars
 from starpos.night.folder import exposures, frames_in
 from starpos.night.night import Night
 from starpos.night.reading import First, Given, Reader
-from starpos.night.solving import solved_night
+from starpos.night.solving import Exposures, solved_night
 from starpos.session.parameter_file import drivers_of, of_solver
 from starpos.sky import catalogue
 from starpos.utc import utc_text
+
+if TYPE_CHECKING:
+    from starpos.night.bag import Recorded
+    from starpos.night.recorded import OfBag
 
 NO_FIX = 1
 # so many nights get all their figures; more get the table and the errors only
@@ -35,6 +40,12 @@ def define(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "-o", "--out", default="starpos-report", metavar="FOLDER", help="index.html and PNGs (starpos-report)"
+    )
+    parser.add_argument(
+        "--field",
+        metavar="ZIP",
+        help="instead of a page, write one night's lists of stars, tilts, instrument, air, versions and truth.json into "
+        "one file that can be sent and `starpos solve` reads: no pictures, paths, names or serial numbers",
     )
     parser.add_argument("--namespace", metavar="NAME", help="of the instrument, in a bag that holds several")
     options.add_parameters(
@@ -58,6 +69,8 @@ def run(args: argparse.Namespace) -> int:
             f"-p {wrong[0]}: a report has the solver's values from its other options, such as --misalignment; -p takes "
             "NODE:NAME:=VALUE of detector and inclinometer"
         )
+    if args.field is not None:
+        return _pack(args)
     if find_spec("matplotlib") is None:
         raise InstrumentError(f"a report is drawn with matplotlib, which is not here: {PIP}")
     from starpos.report.page import page
@@ -87,12 +100,41 @@ def run(args: argparse.Namespace) -> int:
     return 0 if any(n.combined for n in nights) else NO_FIX
 
 
+def _pack(args: argparse.Namespace) -> int:
+    """Write a field report of one night."""
+    from starpos.night import recorded
+    from starpos.report import field
+
+    if len(args.nights) > 1:
+        raise FrameError("--field packs one night: give one")
+    if not args.field.lower().endswith(field.SUFFIX):
+        raise FrameError(f"--field {args.field}: give it a name that ends in {field.SUFFIX}")
+    found = _exposures(Path(args.nights[0]), args)
+    if not isinstance(found, Exposures):
+        found = recorded.exposures(*found, options.atmosphere_of(args), vertical_of(args))
+    count = field.write(Path(args.field), found, console.ProgressBar())
+    print(f"{args.field}: {count} frames")
+    return 0
+
+
 def _night(path: Path, args: argparse.Namespace) -> Night:
     """The Night of a folder or a bag; raises StarposError if there is nothing to work on."""
+    from starpos.night import recorded
+
+    turn_stddev_deg = options.turn_of(args) if args.self_calibrate else None
+    found = _exposures(path, args)
+    if isinstance(found, Exposures):
+        return solved_night(found, turn_stddev_deg, console.ProgressBar())
+    return recorded.night(
+        *found, options.atmosphere_of(args), vertical_of(args), turn_stddev_deg, console.ProgressBar()
+    )
+
+
+def _exposures(path: Path, args: argparse.Namespace) -> "Exposures | tuple[Recorded, OfBag]":
+    """The exposures of a folder, or what a bag holds; raises StarposError if there is nothing to work on."""
     from starpos.night import bag, recorded
 
     air, vertical, progress = options.atmosphere_of(args), vertical_of(args), console.ProgressBar()
-    turn_stddev_deg = options.turn_of(args) if args.self_calibrate else None
     if not path.exists():
         raise FrameError(f"{path}: there is no such night: give a folder, or a rosbag2")
     if not bag.is_bag(path):
@@ -102,7 +144,7 @@ def _night(path: Path, args: argparse.Namespace) -> Night:
             )
         about = First(Reader())(tuple(map(str, frames_in(path))))
         given = Given(None) if about is None else given_of(args, about)
-        return solved_night(exposures(path, given, air, vertical), turn_stddev_deg, progress)
+        return exposures(path, given, air, vertical)
     if find_spec("rosbags") is None:
         raise FrameError(f"{path}: bags are read with rosbags, which is not here: {PIP}")
     any_camera = options.instrument_of(args, no_stars(100, 100, focal_px=1000.0))
@@ -110,5 +152,4 @@ def _night(path: Path, args: argparse.Namespace) -> Night:
     found = bag.read(path, args.namespace, any_camera.inclinometer.noise_rad, drivers, progress)
     told = (args.instrument, args.focal_mm) != (None, None)
     cameras = found.cameras if args.focal_mm is None else {}
-    instruments = recorded.OfBag(any_camera, cameras, any_size=told)
-    return recorded.night(found, instruments, air, vertical, turn_stddev_deg, progress)
+    return found, recorded.OfBag(any_camera, cameras, any_size=told)

@@ -17,7 +17,7 @@ from starpos.cli import (
 )
 from starpos.cli.archive import NightFolder, frames_among, nights_of
 from starpos.cli.fix_output import COLUMNS, CSV_HELP, HEAD, JSON_HELP
-from starpos.cli.inputs import add_near, checked_tilts, given_of, near_of, reader_of
+from starpos.cli.inputs import add_near, checked_tilts, given_of, is_untold, near_of, reader_of
 from starpos.cli.output import Output, add_formats
 from starpos.cli.overwriting import Written
 from starpos.cli.plan import Plan
@@ -34,6 +34,7 @@ from starpos.night.hints import of_one_camera
 from starpos.night.reading import About, First, Given, Reader, stars_of
 from starpos.night.together import turned
 from starpos.night.work import Fitting, Identifying, OnFile, Solving
+from starpos.report import field
 from starpos.sky import catalogue
 
 
@@ -65,6 +66,25 @@ def define(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
+    if len(args.frames) == 1 and field.is_field(args.frames[0]):
+        return _of_field(args)
+    return _run(args)
+
+
+def _of_field(args: argparse.Namespace) -> int:
+    """Solve a field report, with its instrument and its air where the options name none."""
+    if args.tilt is not None:
+        raise TiltError(f"{args.frames[0]} has its own tilts: leave --tilt out")
+    with field.opened(args.frames[0]) as (folder, air):
+        args.frames = [str(folder)]
+        if is_untold(args):
+            args.instrument = str(folder / field.INSTRUMENT)
+        if (args.pressure_hpa, args.temperature_c, args.humidity, args.wavelength_um) == (None,) * 4:
+            args.air = air
+        return _run(args)
+
+
+def _run(args: argparse.Namespace) -> int:
     options.check_self_calibration(args)
     if args.save is not None and not args.self_calibrate:
         raise InstrumentError("--save writes what --self-calibrate finds: give both")

@@ -126,7 +126,46 @@ BMI088 = InclinometerErrors(
     range_rad=radians(90),
 )
 
-# the same sensor with a good converter, compensated for temperature and calibrated by its owner; each figure is an
+# Murata SCA3300-D01, Doc. 3165 Rev. 3, table 2, in mode 1 (3 g, 70 Hz), which the kernel's driver leaves it in.
+SCA3300 = InclinometerErrors(
+    # 37 ug/sqrt(Hz)
+    noise_rad=rms(0.037 * MG, 70),
+    # 2700 LSB/g
+    quantum_rad=1 / 2700,
+    # estimate: not stated
+    drift_rad_per_sqrt_hour=5 * ARCSEC,
+    # X, Y: 10 mg between 23 and 125 C, as the SCL3300's 0.57 deg
+    temperature_rad_per_c=10 * MG / 3 / 102,
+    # 0.7 %
+    scale=0.007 / 3,
+    # 1 %
+    cross=0.01 / 3,
+    # linearity within 1 g: 1 mg
+    pose_rad=1 * MG / 3,
+    range_rad=radians(90),
+)
+
+# Analog Devices ADXL355, data sheet ADXL354/ADXL355 Rev. B, table 2, within 2 g, 125 Hz (31.25 Hz). Its sheet was not at
+# hand: all but the noise density is from memory of it.
+ADXL355 = InclinometerErrors(
+    # 22.5 ug/sqrt(Hz)
+    noise_rad=rms(0.0225 * MG, 31.25),
+    # 256000 LSB/g
+    quantum_rad=1 / 256000,
+    # estimate: not stated
+    drift_rad_per_sqrt_hour=5 * ARCSEC,
+    # below 0.15 mg/C
+    temperature_rad_per_c=limit(0.15 * MG),
+    # 235520 to 276480 LSB/g
+    scale=limit(0.08),
+    # 1 %
+    cross=0.01,
+    # nonlinearity 0.1 % of 2 g; a curve of second order leaves a quarter of it within 1 g
+    pose_rad=limit(2 * MG / 4),
+    range_rad=radians(90),
+)
+
+# the SCA100T with a good converter, compensated for temperature and calibrated by its owner; each figure is an
 # estimate of what that leaves
 SCA100T_CALIBRATED = InclinometerErrors()
 
@@ -140,6 +179,8 @@ PRESETS = {
     "adis16209": ADIS16209,
     "nivel210": NIVEL210,
     "bmi088": BMI088,
+    "sca3300": SCA3300,
+    "adxl355": ADXL355,
 }
 
 

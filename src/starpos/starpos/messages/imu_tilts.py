@@ -159,7 +159,7 @@ class ForceAverager:
 
 
 class ImuTilts:
-    """Averages the messages of an IMU to tilts; counts what it leaves out.
+    """Averages the messages of an IMU, or the readings of any accelerometer, to tilts; counts what it leaves out.
 
     values: the parameters noise_stddev, latency and imu.* of the inclinometer.
     unrest: why the last average gave no tilt; '' where it gave one.  frame: of the last message.
@@ -208,21 +208,28 @@ class ImuTilts:
         self.age_s = (now_ns - said.stamp_ns) * 1e-9
         if self._scatter_alone:
             said = replace(said, variance=(0.0, 0.0, 0.0))
+        return self.add(said)
+
+    def add(self, said: Felt, temperature_c: float = math.nan, step_rad: float = 0.0) -> Reading | None:
+        """Take a reading of an accelerometer; return the tilt that it completes.
+
+        step_rad: the step of a reading, as a share of g; where it exceeds the noise no average takes the rounding away.
+        """
         breaks = self.averager.breaks
         average = self.averager.add(said)
-        reading = None if average is None else self._told(average)
+        reading = None if average is None else self._told(average, temperature_c, step_rad)
         self._gap |= self.averager.breaks != breaks
         return reading
 
-    def _told(self, average: MeanForce) -> Reading | None:
+    def _told(self, average: MeanForce, temperature_c: float, step_rad: float) -> Reading | None:
         self.unrest = average.unrest(self._max_force_error, self._max_rotation)
         if self.unrest:
             self._sequence += 1
             self._gap = True
             return None
-        return self._reading(average)
+        return self._reading(average, temperature_c, step_rad)
 
-    def _reading(self, average: MeanForce) -> Reading:
+    def _reading(self, average: MeanForce, temperature_c: float, step_rad: float) -> Reading:
         x, y, z = average.tilt()
         self.excess = average.excess
         flags = self._flags(average)
@@ -231,7 +238,7 @@ class ImuTilts:
         if not flags & STUCK:
             self._noise.add(average.mid_ns * 1e-9, x, y, z)
         self._sequence += 1
-        covariance = self._covariance(average)
+        covariance = self._covariance(average) + step_rad**2 / 12 * np.eye(3)
         return Reading(
             stamp_ns=max(average.mid_ns - self._latency_ns, 0),
             x=x,
@@ -239,7 +246,7 @@ class ImuTilts:
             covariance=tuple(covariance[:2, :2].ravel().tolist()),
             z=z,
             z_variance=float(covariance[2, 2]),
-            temperature_c=math.nan,
+            temperature_c=temperature_c,
             sequence=(self._sequence - 1) & 0xFFFFFFFF,
             flags=flags,
         )

@@ -60,24 +60,28 @@ def night(
     """The night of a bag, by options as `solved_night` has them; raises StarposError if nothing in it can be used."""
     r = recorded
     if r.star_count and (r.tilts or not r.solutions):
-        tilts: Tilts = r.tilts or NoTilts(f"{r.path}: no usable tilt in it: record the topic tilt too")
-        exposures = Exposures(
-            name=r.name,
-            origin=f"solved from stars and tilt of the bag {r.path.name}, namespace {r.namespace}",
-            count=r.star_count,
-            each=lambda: each_frame(r),
-            work=Solving(instruments, atmosphere, tilts),
-            vertical=vertical,
-            truth=r.truth,
-            remarks=r.remarks,
-        )
         try:
-            solved = solved_night(exposures, turn_stddev_deg, progress)
+            solved = solved_night(exposures(r, instruments, atmosphere, vertical), turn_stddev_deg, progress)
             return replace(solved, remarks=(*solved.remarks, *_against_recorded(solved, r)))
         except InstrumentError:
             if not r.solutions:
                 raise
     return _as_recorded(r, atmosphere, vertical)
+
+
+def exposures(r: Recorded, instruments: Instruments, atmosphere: Atmosphere, vertical: Vertical) -> Exposures:
+    """The stars of a bag, to be solved."""
+    tilts: Tilts = r.tilts or NoTilts(f"{r.path}: no usable tilt in it: record the topic tilt too")
+    return Exposures(
+        name=r.name,
+        origin=f"solved from stars and tilt of the bag {r.path.name}, namespace {r.namespace}",
+        count=r.star_count,
+        each=lambda: each_frame(r),
+        work=Solving(instruments, atmosphere, tilts),
+        vertical=vertical,
+        truth=r.truth,
+        remarks=r.remarks,
+    )
 
 
 def _against_recorded(solved: Night, r: Recorded) -> tuple[Remark, ...]:

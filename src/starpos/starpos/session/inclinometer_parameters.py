@@ -39,7 +39,8 @@ IMU = (
     Parameter(
         "imu.average",
         0.5,
-        "Time over which an IMU's accelerations are averaged to one tilt; short ones are noisy, long ones late.",
+        "Time over which accelerations are averaged to one tilt, of sources imu and iio; short ones are noisy, long "
+        "ones late.",
         unit="s",
         minimum=0.02,
         maximum=60.0,
@@ -54,7 +55,7 @@ IMU = (
     Parameter(
         "imu.max_force_error",
         0.05,
-        "Share by which the IMU's acceleration may differ from 9.81 m/s2; beyond it is not at rest and tells no tilt. "
+        "Share by which the acceleration may differ from 9.81 m/s2; beyond it is not at rest and tells no tilt. "
         "Too small refuses an uncalibrated accelerometer, too large takes driving for leaning.",
         unit="",
         minimum=0.0001,

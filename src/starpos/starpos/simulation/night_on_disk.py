@@ -18,7 +18,7 @@ from starpos.frames.star_list import write_star_list
 from starpos.progress import Progress, quiet
 from starpos.simulation.scene import Scene, detected, expose, read_tilt, render
 from starpos.sky.catalogue import Catalogue
-from starpos.utc import unix_of
+from starpos.utc import date_obs, unix_of
 
 TILT_RATE_HZ = 10.0
 MOST_BYTES = 1 << 31
@@ -57,15 +57,15 @@ def write_night(
             names.append(f"stars_{k:04d}.csv" if stars_only else f"frame_{k:04d}.fits")
             if stars_only:
                 listed = detected(now, stars, start + exposure_s / 2, exposure_s, rng)
-                write_star_list(folder / names[-1], listed, _text(start), pixel_um)
+                write_star_list(folder / names[-1], listed, date_obs(start), pixel_um)
             else:
                 frame = render(now, stars, start, exposure_s, rng)
-                write_fits(folder / names[-1], frame, _text(start), pixel_um)
+                write_fits(folder / names[-1], frame, date_obs(start), pixel_um)
             samples = max(1, round(exposure_s * TILT_RATE_HZ))
             for j in range(samples):
                 moment = start + (j + 0.5) * exposure_s / samples
                 tilts.append((moment, *np.degrees(read_tilt(now, (moment - begin) / 3600, rng)), 15.0))
-            truth.append({"start_utc": _text(start), "mid_unix_s": start + exposure_s / 2,
+            truth.append({"start_utc": date_obs(start), "mid_unix_s": start + exposure_s / 2,
                           "heading_deg": float(np.degrees(now.heading)), "stars": len(stars.electrons)})  # fmt: skip
             progress("frames", (k + 1) / frames)
         rows = "".join("{:.6f},{:.7f},{:.7f},{:.2f}\n".format(*row) for row in tilts)
@@ -107,14 +107,6 @@ def _take_away_simulated(folder: Path) -> None:
 
 def _digest(path: Path) -> str:
     return hashlib.sha256(read_regular(path, MOST_BYTES)).hexdigest()
-
-
-def _text(unix_s: float) -> str:
-    """UTC in the form of FITS' DATE-OBS, to the microsecond."""
-    import datetime
-
-    moment = datetime.datetime.fromtimestamp(round(unix_s, 6), datetime.timezone.utc)
-    return moment.strftime("%Y-%m-%dT%H:%M:%S.%f")
 
 
 def write_fits(path: Path | str, frame: Frame, start_utc: str, pixel_um: float = 1.0) -> None:

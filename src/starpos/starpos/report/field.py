@@ -1,0 +1,169 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A field report: a night in one small file, to be sent by those who have hardware.
+
+It holds lists of stars, tilts, the instrument, the air, versions, and the truth where the night has one. It holds no
+picture, no path, no name of a file, camera, computer or person, and no serial number: only what is named here is written.
+"""
+
+import io
+import json
+import platform
+import tempfile
+import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from importlib.metadata import PackageNotFoundError, version
+from math import degrees, hypot
+from pathlib import Path
+
+import numpy as np
+
+from starpos.earth.refraction import Atmosphere
+from starpos.errors import FrameError
+from starpos.files import read_regular, write_whole
+from starpos.frames.night_files import SIMULATED, TILTS, TRUTH
+from starpos.frames.star_list import write_star_list
+from starpos.frames.stars import Stars
+from starpos.instrument import instrument_file
+from starpos.instrument.instrument import Instrument
+from starpos.instrument.tilt_log import TiltLog
+from starpos.night.night import Truth
+from starpos.night.reading import stars_of
+from starpos.night.solving import Exposures
+from starpos.progress import Progress, quiet
+from starpos.report.writing import WriteError
+from starpos.utc import date_obs
+
+ABOUT, INSTRUMENT = "field.json", "instrument.yaml"
+FORMAT = 1
+SUFFIX = ".zip"
+# A night of 10,000 lists of 1000 stars; a file that unpacks to more is none of ours.
+MOST_BYTES, MOST_FILES = 400_000_000, 20_000
+PACKAGES = ("starpos", "numpy", "scipy", "astropy", "astropy-iers-data", "pyerfa", "opencv-python-headless")
+
+
+def write(path: Path, exposures: Exposures, progress: Progress = quiet) -> int:
+    """Write the night of these exposures; returns how many frames it holds.
+
+    Raises FrameError for a night without a usable frame or tilt, WriteError if the file cannot be written.
+    """
+    if not isinstance(exposures.work.tilts, TiltLog):
+        raise FrameError(f"{exposures.name}: no tilts: a field report needs those of the night")
+    lists: dict[str, bytes] = {}
+    instrument, unreadable = None, 0
+    with tempfile.TemporaryDirectory() as folder:
+        for k, (_, item) in enumerate(exposures.each()):
+            progress(exposures.name[:20], (k + 1) / exposures.count)
+            stars = None if isinstance(item, FrameError) else stars_of(item)
+            if stars is None or stars.mid_unix_s is None or not stars.exposure_s:
+                unreadable += 1
+                continue
+            instrument = _with_clock(instrument or exposures.work.instruments.of(stars), stars)
+            one = Path(folder) / f"stars_{k:04d}.csv"
+            write_star_list(one, stars, date_obs(stars.mid_unix_s - stars.exposure_s / 2))
+            lists[one.name] = one.read_bytes()
+        if instrument is None:
+            raise FrameError(f"{exposures.name}: no frame of it has stars, a time and a known focal length")
+        instrument_file.write(Path(folder) / INSTRUMENT, instrument)
+        lists[INSTRUMENT] = (Path(folder) / INSTRUMENT).read_bytes()
+    lists[TILTS] = _tilt_table(exposures.work.tilts).encode()
+    lists[ABOUT] = json.dumps(_about(exposures, unreadable), indent=1).encode()
+    if exposures.truth is not None:
+        lists[TRUTH] = json.dumps(_truth(exposures.truth)).encode()
+    packed = io.BytesIO()
+    with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as file:
+        for name in sorted(lists):
+            # a date of its own would tell of the computer's clock and zone
+            file.writestr(zipfile.ZipInfo(name), lists[name], zipfile.ZIP_DEFLATED)
+    try:
+        write_whole(path, packed.getvalue())
+    except OSError as error:
+        raise WriteError(f"{path}: the field report cannot be written there ({error.strerror})") from None
+    return sum(name.startswith("stars_") for name in lists)
+
+
+def is_field(path: Path | str) -> bool:
+    """Whether a path looks like a field report."""
+    return str(path).lower().endswith(SUFFIX) and Path(path).is_file()
+
+
+@contextmanager
+def opened(path: Path | str) -> Iterator[tuple[Path, Atmosphere]]:
+    """Unpack a field report as a night's folder, which lasts as long as the context, and give the air it states.
+
+    Raises FrameError for a file that is none.
+    """
+    with tempfile.TemporaryDirectory() as base:
+        folder = Path(base) / Path(path).stem
+        folder.mkdir()
+        try:
+            with zipfile.ZipFile(io.BytesIO(read_regular(path, MOST_BYTES))) as file:
+                entries = file.infolist()
+                if len(entries) > MOST_FILES or sum(e.file_size for e in entries) > MOST_BYTES:
+                    raise ValueError("it unpacks to more than a night")
+                for entry in entries:
+                    if not _ours(entry.filename):
+                        raise ValueError(f"it holds {entry.filename[:40]!r}")
+                    (folder / entry.filename).write_bytes(file.read(entry))
+            about = json.loads((folder / ABOUT).read_text())
+            if about["starpos_field"] != FORMAT:
+                raise ValueError(f"its format is {about['starpos_field']!r}, and this starpos reads {FORMAT}")
+            air = Atmosphere(**about["air"])
+        except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile, RecursionError) as error:
+            why = getattr(error, "strerror", None) or error
+            raise FrameError(f"{path}: not a field report of starpos ({why})") from None
+        yield folder, air
+
+
+def _ours(name: str) -> bool:
+    stars = name.startswith("stars_") and name.endswith(".csv") and name[6:-4].isdecimal()
+    return stars or name in (ABOUT, INSTRUMENT, TILTS, TRUTH)
+
+
+def _with_clock(instrument: Instrument | None, stars: Stars) -> Instrument | None:
+    """The instrument with a clock at least as bad as this frame's time: a list of stars states no error of its own."""
+    if instrument is None:
+        return None
+    stddev_s = hypot(stars.stamp_stddev_s, stars.clock_stddev_s)
+    return replace(instrument, clock_stddev_s=max(instrument.clock_stddev_s, stddev_s))
+
+
+def _tilt_table(log: TiltLog) -> str:
+    sigma_deg = np.degrees(np.sqrt(np.trace(log.covariance, axis1=1, axis2=2) / 2))
+    columns = {
+        "utc_unix_s": log.utc_unix_s,
+        "theta_x_deg": np.degrees(log.theta_x),
+        "theta_y_deg": np.degrees(log.theta_y),
+    }
+    if log.theta_z is not None and np.isfinite(log.theta_z).all():
+        columns["theta_z_deg"] = np.degrees(log.theta_z)
+    if np.isfinite(log.temperature_c).all():
+        columns["temperature_c"] = log.temperature_c
+    columns["sigma_deg"] = sigma_deg
+    rows = zip(*columns.values(), strict=True)
+    return ",".join(columns) + "\n" + "".join(",".join(f"{v:.9f}" for v in row) + "\n" for row in rows)
+
+
+def _about(exposures: Exposures, unreadable: int) -> dict:
+    return {
+        "starpos_field": FORMAT,
+        "versions": {"python": platform.python_version(), "machine": platform.machine()} | dict(_versions()),
+        "air": vars(exposures.work.atmosphere),
+        "frames_left_out": unreadable,
+        "remarks": [remark.kind.value for remark in exposures.remarks],
+    }
+
+
+def _versions() -> Iterator[tuple[str, str]]:
+    for package in PACKAGES:
+        try:
+            yield package, version(package)
+        except PackageNotFoundError:
+            continue
+
+
+def _truth(truth: Truth) -> dict:
+    frames = [{"mid_unix_s": at, "heading_deg": degrees(heading)} for at, heading in truth.headings]
+    place = {"latitude_deg": degrees(truth.latitude), "longitude_deg": degrees(truth.longitude)}
+    return place | {"frames": frames, SIMULATED: truth.simulated}

@@ -1,0 +1,165 @@
+// SPDX-License-Identifier: Apache-2.0
+// SCL3300-D01. A burst is one reading of all registers at the window's begin; the sensor filters to 40 Hz by itself.
+#include "front.h"
+
+#include "scl3300.h"
+
+#define SETUP_MS (SCL3300_POWER_MS + SCL3300_RESET_MS + SCL3300_SETTLING_MS + WINDOW_MS)
+#define CODE_PER_ANGLE 256 // 90 deg are 2^22 codes
+#define TEMPERATURE_SHIFT 4
+#define TEMPERATURE_ZERO 256 // T = TEMP / 16 - 256, for -40 to 125 deg C: 19 to 214
+
+const uint8_t front_half_burst_ms = 1; // 0.5 ms of transfers, begun 0.2 ms after the tick
+const uint16_t front_setup_ms = SETUP_MS;
+
+static enum { POWERING, RESETTING, SETTLING, RUNNING } phase;
+static uint32_t phase_began;
+static bool begun; // a burst; measured by the next poll
+
+static uint8_t burst_status;
+static int32_t sums[2];
+static uint32_t codes[2] = {CODE_ZERO, CODE_ZERO};
+static uint16_t temperature;
+
+static void enter(uint8_t next, uint32_t now)
+{
+    phase = next;
+    phase_began = now;
+}
+
+void front_init(void)
+{
+}
+
+void front_begin_setup(uint32_t now)
+{
+    enter(POWERING, now);
+}
+
+// The last step of starting up: the status clears by being read, and then must be good.
+static bool is_well(void)
+{
+    uint16_t answer;
+    scl3300_frame(SCL3300_READ(SCL3300_STATUS), &answer);
+    scl3300_frame(SCL3300_READ(SCL3300_STATUS), &answer);
+    scl3300_frame(SCL3300_READ(SCL3300_STATUS), &answer);
+    scl3300_frame(SCL3300_READ(SCL3300_WHOAMI), &answer);
+    return scl3300_frame(SCL3300_READ(SCL3300_STATUS), &answer) == SCL3300_GOOD && answer == SCL3300_IDENTITY;
+}
+
+void front_begin_sample(void)
+{
+    sums[0] = sums[1] = 0;
+}
+
+// The elevation of an axis: an angle beyond 90 deg has that of its supplement.
+static int16_t elevation(uint16_t raw)
+{
+    int16_t angle = raw;
+    if (angle > SCL3300_QUARTER_TURN)
+        return (int32_t)2 * SCL3300_QUARTER_TURN - angle;
+    if (angle < -SCL3300_QUARTER_TURN)
+        return (int32_t)-2 * SCL3300_QUARTER_TURN - angle;
+    return angle;
+}
+
+// Reads all registers; each answer comes with the frame after.
+static uint8_t measure(void)
+{
+    static const uint8_t REGISTERS[] = {SCL3300_ANGLE_X,     SCL3300_ANGLE_Y, SCL3300_ANGLE_Z, SCL3300_SELF_TEST_OUTPUT,
+                                        SCL3300_TEMPERATURE, SCL3300_STATUS,  SCL3300_STATUS};
+    enum { X, Y, Z, SELF_TEST_OUTPUT, TEMPERATURE, STATUS, COUNT };
+    uint16_t answers[COUNT], old;
+    uint8_t status = 0;
+    scl3300_frame(SCL3300_READ(REGISTERS[0]), &old);
+    for (uint8_t i = 0; i < COUNT; i++) {
+        enum scl3300_answer answer = scl3300_frame(SCL3300_READ(REGISTERS[i + 1]), &answers[i]);
+        if (answer == SCL3300_WRONG)
+            return NO_ANSWER;
+        if (answer == SCL3300_FAILING)
+            status = MEANINGLESS;
+    }
+    if (answers[STATUS])
+        status = MEANINGLESS;
+    int16_t self_test = answers[SELF_TEST_OUTPUT];
+    if (self_test > SCL3300_SELF_TEST_LIMIT || self_test < -SCL3300_SELF_TEST_LIMIT)
+        status |= SELF_TEST;
+    if (elevation(answers[Z]) < 0)
+        status |= UPSIDE_DOWN;
+    for (uint8_t i = 0; i < 2; i++)
+        sums[i] += elevation(answers[i]);
+    temperature = answers[TEMPERATURE];
+    return status;
+}
+
+void front_begin_burst(void)
+{
+    burst_status = NO_ANSWER;
+    begun = phase == RUNNING;
+}
+
+void front_poll(uint32_t now)
+{
+    uint16_t answer;
+    uint16_t elapsed = now - phase_began;
+    if (phase == RUNNING && begun) {
+        begun = false;
+        burst_status = measure();
+        // A sensor that lost its supply has lost its mode and its angles too: it is set up again, whatever it was.
+        if (burst_status & (NO_ANSWER | MEANINGLESS))
+            front_begin_setup(now);
+    } else if (phase == POWERING && elapsed >= SCL3300_POWER_MS) {
+        scl3300_frame(SCL3300_WRITE(SCL3300_MODE, SCL3300_SOFTWARE_RESET), &answer);
+        enter(RESETTING, now);
+    } else if (phase == RESETTING && elapsed >= SCL3300_RESET_MS) {
+        scl3300_frame(SCL3300_WRITE(SCL3300_MODE, SCL3300_MODE_1), &answer);
+        scl3300_frame(SCL3300_WRITE(SCL3300_ANGLE_CONTROL, SCL3300_ANGLES_ON), &answer);
+        enter(SETTLING, now);
+    } else if (phase == SETTLING && elapsed >= SCL3300_SETTLING_MS) {
+        enter(is_well() ? RUNNING : POWERING, now);
+    }
+}
+
+bool front_pending(void)
+{
+    return begun;
+}
+
+uint8_t front_end_burst(uint32_t now)
+{
+    (void)now;
+    return burst_status;
+}
+
+void front_abandon(void)
+{
+    begun = false;
+}
+
+bool front_idle(void)
+{
+    return phase == RUNNING;
+}
+
+uint8_t front_end_sample(uint32_t now, uint8_t bursts, uint8_t status)
+{
+    (void)now;
+    if (!(status & NO_ANSWER)) {
+        for (uint8_t i = 0; i < 2; i++)
+            codes[i] = CODE_ZERO + sums[i] * CODE_PER_ANGLE / bursts;
+    }
+    return 0;
+}
+
+uint32_t front_code(uint8_t axis)
+{
+    return codes[axis];
+}
+
+bool front_temperature(uint8_t *counts)
+{
+    uint16_t scaled = temperature >> TEMPERATURE_SHIFT;
+    bool sound = scaled >= TEMPERATURE_ZERO && scaled < TEMPERATURE_ZERO + 256;
+    *counts = sound ? scaled - TEMPERATURE_ZERO : 0;
+    return sound;
+}
