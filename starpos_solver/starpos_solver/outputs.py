@@ -14,6 +14,8 @@ from starpos.earth.vertical import Geodetic
 from starpos.fix.attitude_at_place import AttitudeAtPlace
 from starpos.fix.fix import Fix
 from starpos.fix.solution import Solution, Status
+from starpos.gnss.solving import Compared
+from starpos.gnss.watch import AGREES, DISAGREES, DOUBTFUL, LEARNING
 from starpos_common.messages import tilt_to_message
 from starpos_interfaces import msg
 
@@ -26,6 +28,12 @@ STATUS = {
     Status.TIME_OUTSIDE_TABLES: msg.Solution.TIME_OUTSIDE_TABLES,
     Status.BAD_INPUT: msg.Solution.BAD_INPUT,
     Status.POOR_FIT: msg.Solution.POOR_FIT,
+}
+GNSS_STATUS = {
+    LEARNING: msg.GnssCheck.LEARNING,
+    AGREES: msg.GnssCheck.AGREES,
+    DOUBTFUL: msg.GnssCheck.DOUBTFUL,
+    DISAGREES: msg.GnssCheck.DISAGREES,
 }
 # An entry of the error budget that concerns the geodetic position only.
 DEFLECTION = "deflection"
@@ -149,6 +157,23 @@ def solution(header: Header, answer: Solution, ground: Geodetic | None) -> msg.S
     if answer.at_place is not None:
         _set_heading(message, answer.at_place)
     return message
+
+
+def gnss_check(header: Header, compared: Compared) -> msg.GnssCheck:
+    """Make the message of what the stars say of a GNSS place."""
+    check, place = compared.check, compared.place
+    return msg.GnssCheck(
+        header=header,
+        status=GNSS_STATUS[check.status],
+        status_text=check.sentence,
+        distance=check.distance_m,
+        bearing=check.bearing_deg,
+        distance_stddev=check.sigma_m,
+        latitude=math.degrees(place.latitude),
+        longitude=math.degrees(place.longitude),
+        frames=compared.frames,
+        poses=compared.poses,
+    )
 
 
 def _add_heading(message: msg.Solution, at_place: AttitudeAtPlace) -> None:

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The solver's topics: `fix`, `heading/imu`, `attitude`, `solver/solution` of frames, `fix_averaged` of the average."""
+"""The solver's topics: `fix`, `heading/imu`, `attitude`, `solver/solution` of frames, `fix_averaged` of the average.
+
+With gnss.use `gnss/check` too.
+"""
 
 from builtin_interfaces.msg import Time
 from rclpy.node import Node
@@ -26,11 +29,18 @@ class SolutionPublishers:
         self._imu = publisher(node, Imu, "heading/imu", 10)
         self._attitude = publisher(node, msg.Attitude, "attitude", 10)
         self._solution = publisher(node, msg.Solution, "solver/solution", 10)
+        self._check = publisher(node, msg.GnssCheck, "gnss/check", 10) if self._values["gnss.use"] else None
 
     @property
     def publishers(self) -> tuple[Publisher, ...]:
         """The publishers of all topics, the solution's first."""
-        return self._solution, self._fix, self._fix_averaged, self._imu, self._attitude
+        check = () if self._check is None else (self._check,)
+        return self._solution, self._fix, self._fix_averaged, self._imu, self._attitude, *check
+
+    @property
+    def shared(self) -> tuple[Publisher, ...]:
+        """The publishers of topics whose names other drivers have, too."""
+        return self._fix, self._imu
 
     def publish(self, output: Output) -> None:
         """Publish what a session made."""
@@ -39,11 +49,13 @@ class SolutionPublishers:
             self._fix_averaged.publish(self._nav_sat_fix(header, output.ground))
             return
         self._fix.publish(self._nav_sat_fix(header, output.ground))
-        fix, at_place = output.solution.fix, output.solution.at_place
+        fix, at_place, beside = output.solution.fix, output.solution.at_place, output.beside
         if at_place is not None:
             self._imu.publish(outputs.imu_at_place(header, at_place.true_north))
         elif fix is not None and output.ground is not None:
             self._imu.publish(outputs.imu(header, fix, output.ground))
+        if self._check is not None and beside is not None and beside.compared is not None:
+            self._check.publish(outputs.gnss_check(header, beside.compared))
         if output.attitude is not None:
             self._attitude.publish(attitude_to_message(output.attitude))
         self._solution.publish(self.solution(output))

@@ -41,6 +41,10 @@ class GeoidError(StarposError):
     """A grid of geoid undulations is missing or broken."""
 
 
+class GnssError(StarposError):
+    """What a GNSS receiver states cannot be used, or a table of it is missing or broken."""
+
+
 class PlaceError(StarposError):
     """A place that is said to be known cannot be, or the stars contradict it."""
 

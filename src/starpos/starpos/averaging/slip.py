@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tells a camera that was touched from one whose time stamps contradict each other.
+"""Distinguish a camera that was touched from one whose time stamps contradict each other.
 
 For a camera at rest the sky turns about the Earth's axis as its time stamps say.  If by the stamps the camera itself has
 turned about exactly that axis, which no hand does, one of the stamps is wrong.
 """
 
 from collections.abc import Sequence
+from typing import Protocol
 
 import numpy as np
 
@@ -16,7 +17,7 @@ from starpos.units import ARCSEC
 
 # errors may be as large as this
 SIGMAS = 6.0
-# a mount that nobody touches may settle by this
+# maximum creep of an untouched mount
 CREEP_RAD = 10 * ARCSEC
 # beyond it any turn about the plumb line is one about the Earth's axis
 HIGHEST_LATITUDE = np.radians(89.0)
@@ -24,7 +25,20 @@ HIGHEST_LATITUDE = np.radians(89.0)
 LARGE_TRACE = 2.9
 
 
-def slip_s(fix: Fix, first: Fix, stated_s: float = 0.0) -> float | None:
+class Sighted(Protocol):
+    """Attitude of a camera against the Earth, as a Fix has it: a rotation (3, 3), its covariance (3, 3), a latitude."""
+
+    @property
+    def camera_to_itrs(self) -> np.ndarray: ...
+
+    @property
+    def camera_covariance(self) -> np.ndarray: ...
+
+    @property
+    def latitude(self) -> float: ...
+
+
+def slip_s(fix: Sighted, first: Sighted, stated_s: float = 0.0) -> float | None:
     """Seconds by which the time stamps of two fixes contradict each other; None if the camera was touched in between.
 
     The result is 0 if the errors of both attitudes, the mount's creep and stated_s explain the difference.

@@ -9,7 +9,7 @@ from starpos.averaging.average import Average
 from starpos.cli.archive import NightFolder
 from starpos.cli.output import Output
 from starpos.earth.orientation import measured_until, table_age_days
-from starpos.earth.vertical import Vertical, geodetic
+from starpos.earth.vertical import Geodetic, Vertical, geodetic
 from starpos.fix.fix import Fix
 from starpos.fix.readable import InDegrees, length_text
 from starpos.fix.solution import Solution, Status
@@ -35,14 +35,21 @@ JSON_HELP = (
 CSV_HELP = "a row of a CSV a frame, and one with combined=True for all; columns as the keys of --json"
 
 
-def json_of(fix: Fix | Average | None, vertical: Vertical) -> dict:
-    """The keys of --json that come from a fix; None for each if there is none."""
-    keys = ("utc", "latitude", "longitude", "heading", "latitude_geodetic", "longitude_geodetic", "sigma_east_m",
+FIX_KEYS = ("utc", "latitude", "longitude", "heading", "latitude_geodetic", "longitude_geodetic", "sigma_east_m",
             "sigma_north_m", "sigma_heading_deg", "covariance", "covariance_geodetic", "xi_arcsec", "eta_arcsec",
             "deflection_stddev_arcsec", "budget")  # fmt: skip
+
+
+def json_of(fix: Fix | Average | None, vertical: Vertical) -> dict:
+    """The keys of --json that come from a fix; None for each if there is none."""
     if fix is None:
-        return dict.fromkeys(keys)
+        return dict.fromkeys(FIX_KEYS)
     ground = geodetic(fix.latitude, fix.longitude, fix.heading, fix.covariance, vertical)
+    return json_on_ground(fix, ground)
+
+
+def json_on_ground(fix: Fix | Average, ground: Geodetic) -> dict:
+    """The keys of --json that come from a fix with its geodetic place."""
     covariance = in_degrees(fix.covariance)
     sigma = np.sqrt(np.diag(covariance))
     values = (
@@ -58,9 +65,9 @@ def json_of(fix: Fix | Average | None, vertical: Vertical) -> dict:
         ground.deflection.xi_arcsec,
         ground.deflection.eta_arcsec,
         ground.deflection.stddev_arcsec,
-        budget_of(fix, vertical),
+        budget_of(fix, ground),
     )
-    return dict(zip(keys, values, strict=True))
+    return dict(zip(FIX_KEYS, values, strict=True))
 
 
 def counted(frames: int) -> str:
@@ -74,10 +81,9 @@ def in_degrees(covariance: np.ndarray) -> np.ndarray:
     return covariance * np.outer(unit, unit)
 
 
-def budget_of(fix: Fix | Average, vertical: Vertical) -> dict:
+def budget_of(fix: Fix | Average, ground: Geodetic) -> dict:
     """1 sigma (3,) of each source: east m, north m, heading deg; the deflection acts on the geodetic place only."""
     terms = {t.name: np.sqrt(np.diag(t.covariance)[:3]) * [1, 1, np.degrees(1)] for t in fix.terms}
-    ground = geodetic(fix.latitude, fix.longitude, 0.0, fix.covariance, vertical)
     terms["deflection (geodetic only)"] = np.sqrt(np.diag(ground.deflection_covariance)) * [
         1,
         1,
@@ -155,7 +161,7 @@ def _lines_of(night: NightFolder, together: Average, vertical: Vertical) -> str:
         f"geodetic, WGS 84: {on_ground.where} (the deflection of the vertical included)",
         "where the error comes from, 1 sigma of each source in the place and the heading:",
     ]
-    for name, (east, north, heading) in budget_of(together, vertical).items():
+    for name, (east, north, heading) in budget_of(together, ground).items():
         turn = "" if np.isnan(together.heading) else f" {heading * 3600:8.2f} arcsec"
         lines.append(f"  {name:<28} {length_text(east, 2):>10} E {length_text(north, 2):>10} N{turn}")
     age_days = table_age_days(together.utc_unix_s)

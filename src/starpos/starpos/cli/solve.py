@@ -4,23 +4,32 @@
 import argparse
 import os
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
-from starpos.cli import console, heading_output, jobs, options, overwriting, solve_pointings
+from starpos.cli import (
+    console,
+    heading_output,
+    jobs,
+    options,
+    overwriting,
+    solve_gnss,
+    solve_pointings,
+)
 from starpos.cli.archive import NightFolder, frames_among, nights_of
-from starpos.cli.deflection import add_vertical, vertical_of
 from starpos.cli.fix_output import COLUMNS, CSV_HELP, HEAD, JSON_HELP
 from starpos.cli.inputs import add_near, checked_tilts, given_of, is_untold, near_of, reader_of
 from starpos.cli.output import Output, add_formats
 from starpos.cli.overwriting import Written
+from starpos.cli.plan import Plan
 from starpos.cli.site import add_site, place_of
 from starpos.cli.solved_night import check_save, say, tell, tell_turned
+from starpos.cli.vertical import add_vertical, vertical_of
 from starpos.earth.known_place import KnownPlace
 from starpos.errors import FrameError, InstrumentError, StarposError, TiltError
 from starpos.fix.solver import Solver
 from starpos.instrument import instrument_update
 from starpos.instrument.axis import with_frame_size
-from starpos.instrument.tilts import NO_TILTS, Tilts
+from starpos.instrument.tilts import NO_TILTS
 from starpos.night.hints import of_one_camera
 from starpos.night.reading import About, First, Given, Reader, stars_of
 from starpos.night.together import turned
@@ -38,6 +47,7 @@ def define(parser: argparse.ArgumentParser) -> None:
         help="utc_unix_s, theta_x_deg, theta_y_deg[, theta_z_deg, temperature_c, sigma_deg]; not with nights: folders of "
         "frames with tilt.csv, nor with the instrument file of a camera fixed to the ground; --site needs none",
     )
+    solve_gnss.add_gnss(parser)
     options.add_stamps(parser)
     options.add_instrument(parser)
     options.add_air(parser)
@@ -53,20 +63,6 @@ def define(parser: argparse.ArgumentParser) -> None:
     )
     jobs.add_jobs(parser)
     parser.set_defaults(run=run)
-
-
-@dataclass(frozen=True)
-class Plan:
-    """How to work on a night: what is done on each frame, the instruments, and the solver of its first frame.
-
-    solver: None if no frame can be read; each one reports why then.
-    """
-
-    night: NightFolder
-    work: OnFile
-    given: Given
-    solver: Solver | None = None
-    tilts: Tilts = NO_TILTS
 
 
 def run(args: argparse.Namespace) -> int:
@@ -93,6 +89,7 @@ def _run(args: argparse.Namespace) -> int:
     if args.save is not None and not args.self_calibrate:
         raise InstrumentError("--save writes what --self-calibrate finds: give both")
     options.check_frames(args)
+    solve_gnss.check(args)
     if args.save is not None:
         overwriting.check(args, Written("--save", args.save, instrument_update.check_replaceable))
     if args.pointings is not None:
@@ -104,9 +101,12 @@ def _run(args: argparse.Namespace) -> int:
     )
     near_of(args)
     own_level = options.has_own_level(args)
+    satellites = solve_gnss.read(args)
     # the folder of a night has its tilts
-    needs_no_tilt = own_level or (place is not None and not any(map(os.path.isdir, args.frames)))
-    given = nights_of(frames_among(args.frames, args.tilt), args.tilt, needs_no_tilt)
+    needs_no_tilt = own_level or (
+        (place is not None or satellites is not None) and not any(map(os.path.isdir, args.frames))
+    )
+    given = nights_of(frames_among(args.frames, args.tilt, args.gnss), args.tilt, needs_no_tilt)
     if args.save is not None and len(given) > 1:
         raise InstrumentError("--save writes the A3 of one night: give one")
     nights = [night for night in given if isinstance(night, NightFolder)]
@@ -123,11 +123,16 @@ def _run(args: argparse.Namespace) -> int:
         calls = ((plan.work, path) for plan in plans for path in plan.night.frames)
         # the lines of a turn wait for its end, and show no progress
         answers = jobs.watched(
-            workers.map(calls), sum(len(p.night.frames) for p in plans), silent=not args.self_calibrate
+            workers.map(calls),
+            sum(len(p.night.frames) for p in plans),
+            silent=not (args.self_calibrate or args.gnss),
         )
         for plan in plans:
             # takes the answers of this night, and leaves the others
             rows: Iterable = zip(plan.night.frames, answers, strict=False)
+            if satellites is not None:
+                statuses.append(solve_gnss.run(args, output, plan, list(rows), satellites, vertical))
+                continue
             if args.self_calibrate:
                 rows, saving = _turned(args, plan, list(rows))
                 statuses.append(saving)
@@ -168,7 +173,8 @@ def _plan(
     solver = Solver(instrument, catalogue.load_catalogue(), air, progress=console.ProgressBar())
     levelled = own_level or night.tilt is not None
     solving = Solving(given, air, tilts if levelled else None, place)
-    work = Identifying(given) if args.self_calibrate else solving
+    together = args.self_calibrate or args.gnss is not None
+    work = Identifying(given) if together else solving
     return Plan(night, OnFile(read, work), given, solver, tilts)
 
 

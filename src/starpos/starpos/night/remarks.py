@@ -44,6 +44,7 @@ class Kind(str, Enum):
     MISTAKEN = "mistaken"
     FAR = "far"
     RECORDED = "recorded"
+    GNSS = "gnss"
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,10 @@ if TYPE_CHECKING:
 
 STARS, SOLUTION = (f"{PACKAGE}/msg/{name}" for name in ("StarArray", "Solution"))
 # types by the relative names of what a solver takes
+NAV_SAT_FIX = "sensor_msgs/msg/NavSatFix"
 INPUTS = {"stars": STARS, "tilt": TILT, "camera/camera_info": CAMERA_INFO}
+# what it takes besides, with gnss.use
+GNSS = {"gnss/fix": NAV_SAT_FIX}
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The camera's attitude among the stars, of each frame that is identified, whether there is a tilt or not."""
 
+import traceback
+
 from starpos.earth.orientation import earth_state
 from starpos.errors import StarposError
 from starpos.fix.camera_attitude import CameraAttitude
@@ -11,6 +13,8 @@ from starpos.identification import wide
 from starpos.identification.search import Priors
 from starpos.navigation.sightings import sighted
 from starpos.night.searching import NEVER_S, UNASKED, identified
+from starpos.session.gyro import Gyro
+from starpos.session.log import Log
 
 
 def asked(
@@ -50,3 +54,28 @@ def camera_attitude_of(
         stars=len(found.star),
         log_odds=found.log_odds,
     )
+
+
+def attitude_seen(
+    solver: Solver | None,
+    stars: Stars,
+    answer: Solution,
+    frame_id: str,
+    predicted: Priors,
+    until_s: float,
+    gyro: Gyro,
+    log: Log,
+) -> CameraAttitude | None:
+    """The attitude of an answered frame, also given to the gyro; None without a solver or identified stars."""
+    if solver is None:
+        return None
+    try:
+        answer = asked(solver, stars, answer, predicted, until_s)
+        attitude = camera_attitude_of(solver, stars, answer, frame_id)
+        if attitude is not None and answer.found is not None:
+            gyro.saw(stars, answer.found, solver)
+        return attitude
+    except Exception:
+        # A defect costs this attitude only.
+        log.error(traceback.format_exc())
+        return None

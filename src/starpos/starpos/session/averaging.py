@@ -118,7 +118,9 @@ class Averaging:
 
 def _is_wide(fix: Fix) -> bool:
     """Whether A3 may be so wrong that a linear filter cannot separate its error from the place."""
-    calibration = sum(t.covariance[:2, :2] for t in fix.terms if t.name in (CALIBRATION, "remounting"))
+    of_a3 = [t.covariance[:2, :2] for t in fix.terms if t.name in (CALIBRATION, "remounting")]
+    # what GNSS taught of A3 is a term of its own, and linear
+    calibration = sum(of_a3, np.zeros((2, 2)))
     return bool(np.linalg.eigvalsh(calibration)[-1] > (WIDE_RAD * EARTH_RADIUS_M) ** 2)
 
 

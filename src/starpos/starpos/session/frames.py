@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A frame in a session: while it waits, and what becomes of it."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from starpos.averaging.average import Average
@@ -10,14 +10,17 @@ from starpos.fix.camera_attitude import CameraAttitude
 from starpos.fix.fix import Fix
 from starpos.fix.solution import Solution
 from starpos.frames.stars import Stars
+from starpos.gnss.solving import Watched
+from starpos.session.now import Now
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Answered:
     """What became of a frame: its message's stamp, its solution, the place on the ellipsoid, None without one.
 
     no_camera: no camera calibration has arrived.
     attitude: the camera's, by its stars; None where they tell none.
+    beside: with GNSS, what it taught and what the guard says of it; None without.
     """
 
     stamp: Any
@@ -25,6 +28,7 @@ class Answered:
     ground: Geodetic | None
     no_camera: bool
     attitude: CameraAttitude | None = None
+    beside: Watched | None = None
 
 
 @dataclass(frozen=True)
@@ -53,6 +57,12 @@ class Waiting:
     since_s: float
     ahead_s: float
     doubted: bool = False
+
+    def dated(self, now: Now) -> "Waiting":
+        """Correct how far it is ahead of a played clock, whose tick may have been heard only after the frame."""
+        if not now.played:
+            return self
+        return replace(self, ahead_s=min(now.ahead_s(self.stars.mid_unix_s), self.ahead_s))
 
 
 def ground_of(place: Fix | Average, vertical: Vertical) -> Geodetic:

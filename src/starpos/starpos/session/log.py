@@ -14,6 +14,25 @@ class Log(Protocol):
     def error(self, message: str) -> object: ...
 
 
+class Changes:
+    """Logs what is so, once until it changes."""
+
+    def __init__(self, log: Log) -> None:
+        self._log = log
+        self._logged: object = None
+
+    def say(self, sentence: str, good: bool, state: object = None) -> None:
+        """Log a sentence, unless its state (or it itself) was logged last."""
+        state = state or sentence
+        if state == self._logged:
+            return
+        self._logged = state
+        if good:
+            self._log.info(sentence)
+        else:
+            self._log.warning(sentence)
+
+
 class Heard(Protocol):
     """Keeps account of the messages, by the relative name of their topic."""
 

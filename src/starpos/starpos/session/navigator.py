@@ -16,7 +16,8 @@ import numpy as np
 from starpos.earth.ellipsoid import enu_axes
 from starpos.earth.gravity import geodetic_place
 from starpos.earth.vertical import Geodetic, geodetic
-from starpos.errors import StarposError, VoyageError
+from starpos.errors import GnssError, StarposError, VoyageError
+from starpos.gnss.place import GnssPlace, message_to_gnss
 from starpos.messages.attitude import message_to_attitude
 from starpos.messages.stamp import stamp_to_unix
 from starpos.navigation.adjustment import FEWEST_FRAMES
@@ -29,7 +30,7 @@ from starpos.navigation.vessel import PARKED
 from starpos.navigation.voyage import Voyage
 from starpos.navigation.voyage_fix import VoyageFix
 from starpos.session.diagnosis import Diagnosis, Level
-from starpos.session.gnss import OLDEST_S, GnssPlace, contradiction, message_to_gnss
+from starpos.session.gnss import OLDEST_S, UNSTATED_M, contradiction
 from starpos.session.job import Jobs, Outcome
 from starpos.session.log import Heard, Log
 from starpos.session.navigator_parameters import NavigatorSettings
@@ -163,7 +164,10 @@ class NavigatorSession:
 
     def take_gnss(self, message: Any, now: Now) -> list[Navigated]:
         """Take a sensor_msgs/NavSatFix of satellites: it is compared, not fused."""
-        self._gnss = message_to_gnss(message)
+        try:
+            self._gnss = message_to_gnss(message, UNSTATED_M)
+        except GnssError:
+            self._gnss = None
         self._heard.came("gnss/fix")
         return []
 

@@ -17,6 +17,7 @@ from starpos.files import path_of
 from starpos.instrument import instrument_file, sensors
 from starpos.instrument.camera import Camera
 from starpos.instrument.instrument import Calibration, Instrument
+from starpos.session.pace import MOST_RATE
 from starpos.session.parameter import FRAME_NAME, Parameter
 
 NAN = math.nan
@@ -216,12 +217,6 @@ PARAMETERS = (
         minimum=0.0,
         maximum=100000.0,
     ),
-    Parameter(
-        "gnss.use",
-        False,
-        "Take gnss/fix for the place of heading/imu, where no site is set.",
-        read_only=True,
-    ),
     Parameter("min_stars", 5, "Fewest identified stars that make a fix.", unit="", minimum=4, maximum=1000),
     Parameter(
         "search_time",
@@ -234,11 +229,35 @@ PARAMETERS = (
         maximum=60.0,
     ),
     Parameter(
+        "max_rate",
+        NAN,
+        "Most frames that are answered in a second, chosen evenly by their stamps; unset, as many as the processor can: "
+        "then all of them, or an even share, which costs other programs their time.",
+        unit="Hz",
+        minimum=0.01,
+        maximum=MOST_RATE,
+    ),
+    Parameter(
         "gyro",
         False,
         "Take imu/data, whose turn rates say where a camera that turns looks: frames of four stars are identified too. "
         "Its axes are frame_id's, as calibration_url's link_to_camera has them; wrong ones help nothing, harm nothing. "
         "Of no effect with use_sim_time: a replay gives the same answers at any rate.",
+        read_only=True,
+    ),
+    Parameter(
+        "gnss.use",
+        False,
+        "Take gnss/fix, which teaches the misalignment, the inclinometer's errors and the deflection while the stars "
+        "agree with it, and is guarded by them; fix stays the stars' own. A GNSS that is led astray from the first frame "
+        "on teaches what is wrong.",
+        read_only=True,
+    ),
+    Parameter(
+        "gnss.learned",
+        "",
+        "File that keeps what GNSS taught, read at the start if it is there; '' for none. Delete it after camera or "
+        "inclinometer was remounted: the old one makes fixes wrong until GNSS disagrees.",
         read_only=True,
     ),
     Parameter(
@@ -251,8 +270,9 @@ PARAMETERS = (
     ),
     Parameter(
         "tilt_timeout",
-        0.5,
-        "How long a frame waits for the tilts of its exposure; later ones come too late.",
+        NAN,
+        "How long a frame waits for the tilts of its exposure; later ones come too late. Unset: 0.5 s, or 1.5 times as "
+        "long as tilts take to come, by their interval and their delay.",
         unit="s",
         minimum=0.0,
         maximum=60.0,
@@ -305,6 +325,18 @@ def instrument_of(
         clock_stddev_s=known.clock_stddev_s if math.isnan(clock) else clock,
         inclinometer=errors if math.isnan(tilt) else replace(errors, noise_rad=math.radians(tilt)),
     )
+
+
+def check_gnss(values: Mapping, instrument: Instrument) -> None:
+    """Raise InstrumentError if gnss.use does not go with the others."""
+    if not values["gnss.use"]:
+        return
+    if values["self_calibration"]:
+        raise InstrumentError("gnss.use and self_calibration both find A3: set one of the two")
+    if instrument.vertical is not None:
+        raise InstrumentError(
+            "gnss.use teaches an inclinometer, and the camera of calibration_url is its own level: set it to false"
+        )
 
 
 def known_instrument(url: str) -> Instrument | None:

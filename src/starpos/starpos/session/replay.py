@@ -9,7 +9,7 @@ from starpos.errors import StarposError
 from starpos.night.drivers import IMAGES, DriverMessages, Drivers
 from starpos.recording.bag import BagReader
 from starpos.recording.drivers import CAPTURE, IMU
-from starpos.recording.instruments import INPUTS, STARS, TILT, instrument_in
+from starpos.recording.instruments import GNSS, INPUTS, NAV_SAT_FIX, STARS, TILT, instrument_in
 from starpos.session.frames import Output
 from starpos.session.job import JobsInTurn
 from starpos.session.log import Heard, Log
@@ -47,7 +47,8 @@ class Replay:
         """
         now_ns, messages = 0, self._drivers.begin()
         with BagReader(path, typed=True) as bag:
-            chosen = instrument_in(bag, path, namespace, INPUTS, (STARS,), self._drivers.remaps)
+            topics = INPUTS if self.session.gnss is None else INPUTS | GNSS
+            chosen = instrument_in(bag, path, namespace, topics, (STARS,), self._drivers.remaps)
             if chosen.made:
                 self.remarks.append(chosen.made)
             for connection, log_ns, message in bag.decoded(chosen.connections):
@@ -82,6 +83,8 @@ class Replay:
         if kind == IMU:
             tilt = messages.tilt_of(message, now.unix_s or 0.0)
             return [] if tilt is None else self._take_tilt(tilt, now)
+        if kind == NAV_SAT_FIX:
+            return session.take_gnss(message, now)
         if kind == CAPTURE:
             messages.take_capture(message)
             return []

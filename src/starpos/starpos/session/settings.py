@@ -9,7 +9,10 @@ from starpos.earth.geoid import Geoid
 from starpos.earth.known_place import KnownPlace
 from starpos.earth.vertical import Vertical
 from starpos.errors import StarposError
+from starpos.files import path_of
 from starpos.fix.solver import Solver
+from starpos.gnss import learned_file
+from starpos.gnss.states import Learned
 from starpos.instrument import sensors
 from starpos.instrument.camera import Camera
 from starpos.instrument.instrument import Calibration, Instrument
@@ -32,6 +35,8 @@ class Settings:
         self._geoid: Geoid | None = None
         # by the last check
         self._read: tuple[Instrument | None, Geoid | None] = None, None
+        # what earlier sessions learned by GNSS; None without a file
+        self.learned: Learned | None = None
 
     def check(self, values: Mapping, names: frozenset[str], camera: Camera | None) -> str | None:
         """Say in a sentence why values make no instrument together, such as with a broken file; None if they do.
@@ -46,7 +51,9 @@ class Settings:
                     parameters.check_camera(known, values["calibration_url"], camera)
             if "deflection.geoid" in names:
                 grid = parameters.geoid_file(values["deflection.geoid"])
-            parameters.instrument_of(values, ANY_CAMERA, known)
+            if "gnss.learned" in names and values["gnss.learned"]:
+                self.learned = learned_file.read_if_there(path_of(values["gnss.learned"]))
+            parameters.check_gnss(values, parameters.instrument_of(values, ANY_CAMERA, known))
             parameters.atmosphere_of(values)
             parameters.site_of(values, parameters.vertical_of(values, grid))
         except StarposError as e:

@@ -304,7 +304,7 @@ def test_at_a_site_a_frame_has_its_heading_at_once_and_no_fix(messages, begin_s)
     assert solution.fix is None and solution.status is Status.NO_TILT and answer.ground is None
     assert math.degrees(solution.at_place.plumb.heading) == pytest.approx(195.31952, abs=2e-3)
     assert answer.attitude is not None
-    report = reports.of_solution(solution, told.session.counts)
+    report = reports.of_solution(solution, told.session.pace.counts)
     assert report.level is Level.OK and "heading at the known place" in report.message
 
 
@@ -333,7 +333,7 @@ def test_half_a_site_is_refused():
 def test_the_place_of_a_heading_may_be_that_of_gnss(messages, begin_s):
     told = seen_at(messages, begin_s, "gnss.use:=true")
     stars, came_s = first(messages, STARS)
-    told.session.take_gnss(gnss_fix(stars))
+    told.session.take_gnss(gnss_fix(stars), Now.in_data(came_s))
     [answer] = told.tell(STARS, stars, came_s)
     at_place = answer.solution.at_place
     assert math.degrees(at_place.ellipsoid.heading) == pytest.approx(195.31952, abs=2e-3)
@@ -342,15 +342,15 @@ def test_the_place_of_a_heading_may_be_that_of_gnss(messages, begin_s):
     later = deepcopy(stars)
     later.header.stamp.sec += 30
     [answer] = told.tell(STARS, later, came_s + 30.0)
-    assert answer.solution.at_place is None and "no GNSS place within 5 s" in answer.solution.message
+    assert answer.solution.at_place is None and "no GNSS place within 3 s" in answer.solution.message
 
 
 def test_gnss_without_a_fix_is_no_place(messages, begin_s):
     told = seen_at(messages, begin_s, "gnss.use:=true")
     stars, came_s = first(messages, STARS)
-    told.session.take_gnss(gnss_fix(stars, latitude=float("nan")))
+    told.session.take_gnss(gnss_fix(stars, latitude=float("nan")), Now.in_data(came_s))
     lost = gnss_fix(stars)
     lost.status = SimpleNamespace(status=-1)
-    told.session.take_gnss(lost)
+    told.session.take_gnss(lost, Now.in_data(came_s))
     [answer] = told.tell(STARS, stars, came_s)
     assert answer.solution.at_place is None

@@ -1,0 +1,24 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How `starpos solve` works on a night."""
+
+from dataclasses import dataclass
+
+from starpos.cli.archive import NightFolder
+from starpos.fix.solver import Solver
+from starpos.instrument.tilts import NO_TILTS, Tilts
+from starpos.night.reading import Given
+from starpos.night.work import OnFile
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How to work on a night: what is done on each frame, the instruments, and the solver of its first frame.
+
+    solver: None if no frame can be read; each one reports why then.
+    """
+
+    night: NightFolder
+    work: OnFile
+    given: Given
+    solver: Solver | None = None
+    tilts: Tilts = NO_TILTS

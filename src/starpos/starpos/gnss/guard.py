@@ -1,0 +1,117 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Tells a GNSS place that is led astray, at once or slowly, from one that is good.
+
+At several moments of the last half hour a witness was set aside: a filter that began with what was known then, and that
+goes on with one more unknown, an error of GNSS that began at that moment, as a step or growing evenly.  If GNSS is good
+that error is 0 within its covariance, which holds all that the stars' place may err by; a likelihood ratio tells
+(Willsky and Jones, IEEE Trans. Automatic Control 21(1), 1976, 108, from memory).  So a drag shows although each frame of
+it agrees with the frame before, and although the filter that learns has followed it.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from starpos.gnss.sighting import Innovation
+from starpos.gnss.states import Ageing, Learned
+
+# A witness is set aside every so many s, and heard for so long.
+EVERY_S, LONGEST_S = 110.0, 3000.0
+# The growing error is counted from this time on, in units of that many s.
+GROWS_AFTER_S, UNIT_S = 240.0, 600.0
+# 1 sigma of an error of which nothing is known, as an angle at the Earth's centre: 600 km.
+NOTHING_RAD = 0.1
+OFFSETS = 4
+
+
+@dataclass(frozen=True, eq=False)
+class Witnesses:
+    """W filters, each with n states and then the error of GNSS: east, north of a step, and of a growth in UNIT_S.
+
+    before: what was known when each was set aside.  since (W,): that time.  frames (W,): heard by each.
+    """
+
+    before: tuple[Learned, ...]
+    since: np.ndarray
+    frames: np.ndarray
+    state: np.ndarray
+    covariance: np.ndarray
+
+    @classmethod
+    def none(cls, size: int) -> "Witnesses":
+        """No witness, for filters of so many states."""
+        n = size + OFFSETS
+        return cls((), np.zeros(0), np.zeros(0, int), np.zeros((0, n)), np.zeros((0, n, n)))
+
+    def set_aside(self, learned: Learned) -> "Witnesses":
+        """Add one, who knows what is known now."""
+        n = len(learned.state)
+        state, covariance = np.zeros((1, n + OFFSETS)), np.zeros((1, n + OFFSETS, n + OFFSETS))
+        state[0, :n], covariance[0, :n, :n] = learned.state, learned.covariance
+        covariance[0, n:, n:] = np.eye(OFFSETS) * NOTHING_RAD**2
+        return Witnesses(
+            (*self.before, learned),
+            np.append(self.since, learned.utc_unix_s),
+            np.append(self.frames, 0),
+            np.concatenate([self.state, state]),
+            np.concatenate([self.covariance, covariance]),
+        )
+
+    def due(self, utc_unix_s: float) -> bool:
+        """Whether another witness should be set aside."""
+        return not len(self.since) or utc_unix_s - self.since[-1] >= EVERY_S
+
+    def recent(self, utc_unix_s: float) -> "Witnesses":
+        """Drop those that were heard for long enough."""
+        return self._take(utc_unix_s - self.since <= LONGEST_S)
+
+    def _take(self, which: np.ndarray) -> "Witnesses":
+        before = tuple(b for b, kept in zip(self.before, which, strict=True) if kept)
+        return Witnesses(
+            before, self.since[which], self.frames[which], self.state[which], self.covariance[which]
+        )
+
+    def aged(self, by: Ageing) -> "Witnesses":
+        """Age them all alike."""
+        state, covariance = by.of(self.state, self.covariance)
+        return replace(self, state=state, covariance=covariance)
+
+    def heard(self, seen: Innovation, about: np.ndarray, utc_unix_s: float) -> "Witnesses":
+        """Let all hear a frame with a GNSS place, whose innovation is about the states (n,)."""
+        n, grown = len(about), (utc_unix_s - self.since) / UNIT_S
+        rows = np.empty((len(self.since), 2, n + OFFSETS))
+        rows[:, :, :n] = seen.rows
+        rows[:, :, n : n + 2] = seen.offset
+        rows[:, :, n + 2 :] = seen.offset * grown[:, None, None]
+        left = np.concatenate([about - self.state[:, :n], -self.state[:, n:]], 1)
+        value = seen.value + np.einsum("wij,wj->wi", rows, left)
+        across = self.covariance @ rows.swapaxes(1, 2)
+        spread = rows @ across + seen.noise
+        gain = np.linalg.solve(spread, across.swapaxes(1, 2)).swapaxes(1, 2)
+        kept = np.eye(n + OFFSETS) - gain @ rows
+        covariance = kept @ self.covariance @ kept.swapaxes(1, 2) + gain @ seen.noise @ gain.swapaxes(1, 2)
+        return replace(
+            self,
+            state=self.state + np.einsum("wij,wj->wi", gain, value),
+            covariance=(covariance + covariance.swapaxes(1, 2)) / 2,
+            frames=self.frames + 1,
+        )
+
+    def against(self, utc_unix_s: float) -> np.ndarray:
+        """How much each speaks against GNSS (W,): the larger chi-square, of two degrees of freedom, of its two errors."""
+        n = self.state.shape[1] - OFFSETS
+        weight = np.linalg.inv(self.covariance[:, n:, n:])
+        pull = np.einsum("wij,wj->wi", weight, self.state[:, n:])
+        # less what was taken for known at the beginning
+        weight = weight - np.eye(OFFSETS) / NOTHING_RAD**2
+        step = _chi2(weight[:, :2, :2], pull[:, :2])
+        growth = _chi2(weight[:, 2:, 2:], pull[:, 2:])
+        old = utc_unix_s - self.since >= GROWS_AFTER_S
+        return np.where(self.frames > 0, np.where(old, np.maximum(step, growth), step), 0.0)
+
+
+def _chi2(weight: np.ndarray, pull: np.ndarray) -> np.ndarray:
+    """pull^T weight^-1 pull for each (2, 2) weight, 0 where it says nothing."""
+    told = np.linalg.eigvalsh(weight)[:, 0] > 1.0
+    safe = np.where(told[:, None, None], weight, np.eye(2))
+    return np.where(told, np.einsum("wi,wi->w", pull, np.linalg.solve(safe, pull[..., None])[..., 0]), 0.0)

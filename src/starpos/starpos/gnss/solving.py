@@ -1,0 +1,161 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The solution of a frame with what GNSS has taught before it, and what the guard says of the GNSS place at it."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from starpos import rotation
+from starpos._numeric.roots import symmetric_root
+from starpos.earth.ellipsoid import curvature_radii_m, enu_axes, meridian_turn
+from starpos.earth.vertical import Deflection, Geodetic, Vertical, geodetic
+from starpos.fix.budget import ALWAYS, ErrorTerm, Sensitivity, place_of, total_covariance
+from starpos.fix.fix import Fix
+from starpos.fix.solution import Solution, Status
+from starpos.fix.solver import Solver
+from starpos.frames.stars import Stars
+from starpos.gnss.place import GnssPlace
+from starpos.gnss.sighting import LEARNED_TERMS, LevelSight, zenith_rows
+from starpos.gnss.states import Learned
+from starpos.gnss.watch import LEARNING, GnssCheck, GnssWatch
+from starpos.instrument.inclinometer import Tilt
+from starpos.instrument.instrument import Calibration
+from starpos.units import ARCSEC
+
+# name of the term of all that was learned
+LEARNED_TERM = "learned"
+NOTHING_LEARNED = (
+    "too little is known of A3: let GNSS teach it, newly turned and leaning by some degrees, or give A3"
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Compared:
+    """A GNSS place at a frame, and what the stars say of it; frames, poses: from which was learned what counts."""
+
+    place: GnssPlace
+    check: GnssCheck
+    frames: int
+    poses: int
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Watched:
+    """A frame's answer.
+
+    solution: with a place, or with a heading at GNSS's place where too little is known for one.
+    ground: the geodetic place, None without a fix.  compared: None without a GNSS place.
+    """
+
+    solution: Solution
+    ground: Geodetic | None = None
+    compared: Compared | None = None
+
+
+def watched(
+    solver: Solver, stars: Stars, rough: Solution, gnss: GnssPlace | None, watch: GnssWatch
+) -> Watched:
+    """Solve a frame that is later than all before, and let the watch judge and learn.
+
+    rough: its solution by the solver, whose A3 may be wrong, and its heading at GNSS's place.
+    gnss: that place, None without one.
+    """
+    if rough.fix is None or rough.tilt is None:
+        compared = None if gnss is None else Compared(gnss, GnssCheck(LEARNING), 0, 0)
+        return Watched(solution=rough, compared=compared)
+    tilt = rough.tilt
+    watch.go_on(LevelSight.of(rough.fix, tilt))
+    up = _up(watch, rough.fix, tilt, gnss)
+    levelled, check = _levelled(solver, stars, rough, up), None
+    if gnss is not None and levelled.fix is not None:
+        check = watch.judge(LevelSight.of(levelled.fix, tilt), gnss)
+        # what was taken back changes the level, and so does an attitude with another refraction where GNSS gives it
+        again = _up(watch, levelled.fix, tilt, gnss)
+        if again is not None and (up is None or not np.array_equal(again, up)):
+            levelled = _levelled(solver, stars, levelled, again)
+    fix = levelled.fix
+    if fix is None:
+        return Watched(solution=levelled)
+    sighting = LevelSight.of(fix, tilt)
+    if watch.learned is not None and watch.tells_place(sighting):
+        fix = _budgeted(fix, sighting, watch.learned)
+        ground = _ground(fix, sighting, watch.learned, watch.vertical)
+        answer = Watched(solution=replace(levelled, fix=fix), ground=ground)
+    else:
+        why = f"{stars.place}: {NOTHING_LEARNED}"
+        none = replace(levelled, status=Status.POOR_FIT, message=why, fix=None, at_place=rough.at_place)
+        answer = Watched(solution=none)
+    if gnss is None or check is None:
+        return answer
+    watch.learn(sighting, gnss, check)
+    frames, poses = (0, 0) if watch.learned is None else (watch.learned.frames, watch.learned.poses)
+    return replace(answer, compared=Compared(gnss, check, frames, poses))
+
+
+def _up(watch: GnssWatch, fix: Fix, tilt: Tilt, gnss: GnssPlace | None) -> np.ndarray | None:
+    """Up (3,) in C: as it was learned where that tells a place, else by GNSS; None if neither tells it."""
+    if watch.tells_place(LevelSight.of(fix, tilt)):
+        return watch.up_in_camera(tilt)
+    if gnss is None:
+        return None
+    stated, axes = watch.vertical.at(gnss.latitude, gnss.longitude), gnss.axes
+    lean = ARCSEC * (stated.eta_arcsec * axes[0] + stated.xi_arcsec * axes[1])
+    return fix.camera_to_itrs.T @ rotation.normalised(axes[2] + lean)
+
+
+def _levelled(solver: Solver, stars: Stars, answer: Solution, up_in_camera: np.ndarray | None) -> Solution:
+    """The solution of a frame whose level is given, so that its refraction is right."""
+    assert answer.fix is not None and answer.tilt is not None
+    if up_in_camera is None:
+        return answer
+    used = solver.instrument.calibration.a3
+    a3 = rotation.shortest_turn(used @ up_in_camera, answer.tilt.up) @ used
+    instrument = replace(solver.instrument, calibration=Calibration().turned_to(a3))
+    return replace(solver, instrument=instrument).solve(stars, answer.tilt, known=answer.found)
+
+
+def _zenith_moved(fix: Fix) -> np.ndarray:
+    """Change (6, 2) of the rows of an ErrorTerm for a zenith of the level that lies 1 rad further east, or north."""
+    # with east, north, up for L
+    level = Sensitivity.of(place_of(enu_axes(fix.latitude, fix.longitude)), fix.link_to_enu).level
+    return np.stack([-level[:, 1], level[:, 0]], 1)
+
+
+def _zenith_rows(fix: Fix, sighting: LevelSight, learned: Learned) -> np.ndarray:
+    """Derivatives (2, n) of the zenith, to the east and the north of a fix, by the states."""
+    return enu_axes(fix.latitude, fix.longitude)[:2] @ zenith_rows(
+        sighting, learned, learned.up(sighting.tilt)
+    )
+
+
+def _kept_terms(fix: Fix) -> tuple[ErrorTerm, ...]:
+    return tuple(t for t in fix.terms if t.name not in LEARNED_TERMS)
+
+
+def _budgeted(fix: Fix, sighting: LevelSight, learned: Learned) -> Fix:
+    """The fix with the error of what was learned in the place of those of A3 and the inclinometer."""
+    rows = _zenith_rows(fix, sighting, learned)
+    root = symmetric_root(rows @ learned.covariance @ rows.T)
+    term = ErrorTerm(LEARNED_TERM, _zenith_moved(fix) @ root, shared=ALWAYS)
+    return replace(fix, terms=(*_kept_terms(fix), term))
+
+
+def _ground(fix: Fix, sighting: LevelSight, learned: Learned, vertical: Vertical) -> Geodetic:
+    """The geodetic place, whose error knows that A3 and the deflection were learned together."""
+    at, covariance = learned.layout, learned.covariance
+    deflection = learned.deflection_rad(vertical, fix.latitude, fix.longitude) / ARCSEC
+    both = covariance[at.constant, at.constant] + covariance[at.field, at.field]
+    both = both + covariance[at.constant, at.field] + covariance[at.field, at.constant]
+    applied = Deflection(
+        xi_arcsec=float(deflection[1]),
+        eta_arcsec=float(deflection[0]),
+        stddev_arcsec=float(np.sqrt(np.trace(both) / 2)) / ARCSEC,
+    )
+    ground = geodetic(fix.latitude, fix.longitude, fix.heading, fix.covariance, applied)
+    prime, meridian = curvature_radii_m(ground.latitude)
+    moved = -np.array([[prime, 0.0], [0.0, meridian], [meridian_turn(ground.latitude), 0.0]])
+    rows = _zenith_moved(fix)[:3] @ _zenith_rows(fix, sighting, learned)
+    rows[:, at.constant] += moved
+    rows[:, at.field] += moved
+    others = total_covariance([t for t in fix.terms if t.name != LEARNED_TERM])[:3, :3]
+    return replace(ground, covariance=others + rows @ covariance @ rows.T)

@@ -1,0 +1,256 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What GNSS teaches of an instrument: A3, the errors of its inclinometer, the deflection of the vertical; all together.
+
+All are angles in rad, or shares. Their covariance is kept whole, because at once most of them cannot be told apart: at
+one pose a turn of A3 looks like a zero, and at one heading like a deflection.
+"""
+
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
+
+import numpy as np
+
+from starpos import rotation
+from starpos.earth.vertical import Vertical
+from starpos.instrument.inclinometer import InclinometerErrors, Tilt
+from starpos.instrument.instrument import Instrument
+from starpos.instrument.response import COEFFICIENTS, Zeroed, response_columns, stated_variances
+from starpos.units import ARCSEC, HOUR_S
+
+# Share of the deflection's variance that is the same everywhere the instrument goes; the rest is a field.
+CONSTANT_SHARE = 0.5
+# Distance (m) over which the field is forgotten, by exp(-d / L).  That and the exponential law are those with which
+# inertial navigation models deflections (Nash and Jordan, Statistical Geodesy, Proc. IEEE 66(5), 1978: 20 nautical
+# miles); from memory, the paper was not at hand.
+FIELD_LENGTH_M = 37_000.0
+# An error of GNSS that it does not state: multipath, which changes within minutes.
+GNSS_SLOW_RAD, GNSS_SLOW_S = 10.0 / 6.371e6, 300.0
+# 1 sigma about each axis of an A3 of which nobody knows anything.
+NO_A3_RAD = 1.0
+# A night cools by so much in that time: the wandering of a temperature that nobody measures.
+UNMEASURED_C_PER_SQRT_HOUR = 14.0 / np.sqrt(6.0)
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where each state stands, for a sensor of two or three axes."""
+
+    axes: int
+
+    @cached_property
+    def _ends(self) -> list[int]:
+        widths = (3, self.axes, COEFFICIENTS[self.axes], self.axes, self.axes, 2, 2, 2)
+        return np.cumsum((0, *widths)).tolist()
+
+    def _slice(self, k: int) -> slice:
+        return slice(self._ends[k], self._ends[k + 1])
+
+    @property
+    def a3(self) -> slice:
+        """A small rotation of A3 about S's axes."""
+        return self._slice(0)
+
+    @property
+    def zero(self) -> slice:
+        """Each axis' zero, which wanders."""
+        return self._slice(1)
+
+    @property
+    def response(self) -> slice:
+        """The coefficients of `instrument.response`."""
+        return self._slice(2)
+
+    @property
+    def temperature(self) -> slice:
+        """Change of each zero per C."""
+        return self._slice(3)
+
+    @property
+    def pose(self) -> slice:
+        """Error of each axis that is new at each pose."""
+        return self._slice(4)
+
+    @property
+    def constant(self) -> slice:
+        """Deflection, east and north, that is the same everywhere, beyond that of the `Vertical`."""
+        return self._slice(5)
+
+    @property
+    def field(self) -> slice:
+        """Deflection, east and north, of this place, beyond the constant."""
+        return self._slice(6)
+
+    @property
+    def gnss(self) -> slice:
+        """Slow error of GNSS, east and north, as angles at the Earth's centre."""
+        return self._slice(7)
+
+    @property
+    def size(self) -> int:
+        return self._ends[-1]
+
+
+layout_of = lru_cache(maxsize=2)(Layout)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Learned:
+    """What is known of an instrument at a time and a place.
+
+    a3 (3, 3): C into S, about which the states are linear.  calibrated_up (3,): where the response counts nothing.
+    temperature_c: from which temperatures count; NaN until one was measured.
+    state (n,), covariance (n, n): as `layout_of(axes)` has them.
+    place: latitude and longitude (rad) to which the deflection's field belongs; None before there was one.
+    frames, poses: from how many it was learned.  since_unix_s: time of the first of them, NaN without one.
+    """
+
+    axes: int
+    a3: np.ndarray
+    calibrated_up: np.ndarray
+    temperature_c: float
+    state: np.ndarray
+    covariance: np.ndarray
+    utc_unix_s: float
+    place: tuple[float, float] | None = None
+    frames: int = 0
+    poses: int = 0
+    since_unix_s: float = float("nan")
+
+    @property
+    def layout(self) -> Layout:
+        """Where the states stand."""
+        return layout_of(self.axes)
+
+    @property
+    def rotation(self) -> np.ndarray:
+        """A3 (3, 3) with what was learned of it."""
+        return rotation.from_vector(self.state[self.layout.a3]) @ self.a3
+
+    def columns(self, tilt: Tilt) -> tuple[np.ndarray, np.ndarray]:
+        """Change of up in S for the response's coefficients (3, m), and for errors of the angles (3, axes)."""
+        zeroed = _zeroed(tuple(self.calibrated_up.tolist()), self.axes)
+        return response_columns(tilt.theta, tilt.up, zeroed), tilt.slope
+
+    def warmer_c(self, tilt: Tilt) -> float:
+        """How much warmer a tilt's sensor is than `temperature_c`; 0 where nobody measured."""
+        warmer = tilt.temperature_c - self.temperature_c
+        return float(warmer) if np.isfinite(warmer) else 0.0
+
+    def up(self, tilt: Tilt) -> np.ndarray:
+        """Up (3,) in S at a tilt, without the errors that are known."""
+        at, (response, slope) = self.layout, self.columns(tilt)
+        x = self.state
+        angles = x[at.zero] + x[at.pose] + x[at.temperature] * self.warmer_c(tilt)
+        return rotation.normalised(tilt.up - response @ x[at.response] - slope @ angles)
+
+    def tilted(self, tilt: Tilt) -> np.ndarray:
+        """Derivatives (3, n) of `up` by the states; A3, the deflection and GNSS have none."""
+        at, (response, slope) = self.layout, self.columns(tilt)
+        rows = np.zeros((3, at.size))
+        rows[:, at.response] = -response
+        rows[:, at.zero] = rows[:, at.pose] = -slope
+        rows[:, at.temperature] = -slope * self.warmer_c(tilt)
+        return rows
+
+    def deflection_rad(self, vertical: Vertical, latitude: float, longitude: float) -> np.ndarray:
+        """Deflection (2,) east, north at a place: that of a Vertical, and what was learned beyond it."""
+        stated, at = vertical.at(latitude, longitude), self.layout
+        known = np.array([stated.eta_arcsec, stated.xi_arcsec]) * ARCSEC
+        return known + self.state[at.constant] + self.state[at.field]
+
+
+@lru_cache(maxsize=4)
+def _zeroed(up: tuple[float, ...], axes: int) -> Zeroed:
+    return Zeroed.at(np.array(up), axes)
+
+
+def prior(instrument: Instrument, tilt: Tilt, deflection_stddev_rad: float, utc_unix_s: float) -> Learned:
+    """What is known of an instrument before GNSS has taught anything, at the time of a tilt."""
+    mounting, errors = instrument.mounting, instrument.inclinometer
+    at, calibration = layout_of(tilt.axes), instrument.calibration
+    variance = np.zeros((at.size, at.size))
+    variance[at.a3, at.a3] = (
+        np.eye(3) * NO_A3_RAD**2 if calibration.unknown else mounting.calibration_covariance
+    ) + np.eye(3) * mounting.remounted_rad**2
+    since_s = abs(utc_unix_s - calibration.utc_unix_s)
+    drift2 = errors.drift_rad_per_sqrt_hour**2 * (since_s if np.isfinite(since_s) else 0.0) / HOUR_S
+    state = np.zeros(at.size)
+    if calibration.response and len(calibration.response) == COEFFICIENTS[tilt.axes]:
+        state[at.response] = calibration.response
+        variance[at.response, at.response] = calibration.response_covariance
+    else:
+        variance[at.response, at.response] = np.diag(stated_variances(errors, tilt.axes))
+    deflection2 = deflection_stddev_rad**2
+    for rows, value in (
+        (at.zero, drift2),
+        (at.temperature, errors.temperature_rad_per_c**2),
+        (at.pose, pose_variance(errors, tilt)),
+        (at.constant, CONSTANT_SHARE * deflection2),
+        (at.field, (1 - CONSTANT_SHARE) * deflection2),
+        (at.gnss, GNSS_SLOW_RAD**2),
+    ):
+        variance[rows, rows] = np.eye(rows.stop - rows.start) * value
+    known = calibration.temperature_c
+    return Learned(
+        axes=tilt.axes,
+        a3=mounting.a3,
+        calibrated_up=mounting.calibrated_up,
+        temperature_c=known if np.isfinite(known) else tilt.temperature_c,
+        state=state,
+        covariance=variance,
+        utc_unix_s=utc_unix_s,
+    )
+
+
+def pose_variance(errors: InclinometerErrors, tilt: Tilt) -> float:
+    """Variance (rad2) of what is new at each pose: hysteresis, flexure, and the rounding that noise does not remove."""
+    return errors.pose_rad**2 + errors.undithered_rad(tilt) ** 2
+
+
+@dataclass(frozen=True, eq=False)
+class Ageing:
+    """What passes between two frames: each state keeps a share (n,) of itself and gains a variance (n,)."""
+
+    share: np.ndarray
+    variance: np.ndarray
+
+    def of(self, state: np.ndarray, covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """States (..., n) and covariances (..., n, n) after it; states beyond those n stay."""
+        share, variance = self.share, self.variance
+        if (more := state.shape[-1] - len(share)) > 0:
+            share, variance = np.append(share, np.ones(more)), np.append(variance, np.zeros(more))
+        covariance = covariance * (share[:, None] * share) + np.diag(variance)
+        return state * share, covariance
+
+
+def ageing(
+    learned: Learned,
+    errors: InclinometerErrors,
+    tilt: Tilt,
+    utc_unix_s: float,
+    moved_m: float,
+    deflection_stddev_rad: float,
+    new_pose: bool,
+) -> Ageing:
+    """What passes until a tilt at a time, for an instrument that was moved by moved_m in between."""
+    at = learned.layout
+    share, variance = np.ones(at.size), np.zeros(at.size)
+    seconds = abs(utc_unix_s - learned.utc_unix_s)
+    walk = errors.drift_rad_per_sqrt_hour**2
+    if not np.isfinite(tilt.temperature_c):
+        walk += (errors.temperature_rad_per_c * UNMEASURED_C_PER_SQRT_HOUR) ** 2
+    variance[at.zero] = walk * seconds / HOUR_S
+    kept = np.exp(-moved_m / FIELD_LENGTH_M)
+    share[at.field] = kept
+    variance[at.field] = (1 - CONSTANT_SHARE) * deflection_stddev_rad**2 * (1 - kept**2)
+    kept = np.exp(-seconds / GNSS_SLOW_S)
+    share[at.gnss], variance[at.gnss] = kept, GNSS_SLOW_RAD**2 * (1 - kept**2)
+    if new_pose:
+        share[at.pose], variance[at.pose] = 0.0, pose_variance(errors, tilt)
+    return Ageing(share, variance)
+
+
+def aged(learned: Learned, by: Ageing, utc_unix_s: float) -> Learned:
+    """What is left of what was learned after an ageing."""
+    state, covariance = by.of(learned.state, learned.covariance)
+    return replace(learned, state=state, covariance=covariance, utc_unix_s=utc_unix_s)

@@ -1,0 +1,244 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a session knows of its instrument by GNSS, and whether it believes GNSS: frame by frame, in order of time."""
+
+import math
+from collections import deque
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from starpos.averaging.slip import slip_s
+from starpos.earth.ellipsoid import EARTH_RADIUS_M
+from starpos.earth.vertical import Vertical
+from starpos.gnss.filter import GnssFrame, begun, chi2, is_linear, stddev_rad, updated
+from starpos.gnss.guard import Witnesses
+from starpos.gnss.place import GnssPlace
+from starpos.gnss.sighting import LevelSight, innovation, place_of_stars
+from starpos.gnss.states import Learned, aged, ageing, prior
+from starpos.instrument.inclinometer import Tilt
+from starpos.instrument.instrument import Instrument
+
+LEARNING, AGREES, DOUBTFUL, DISAGREES = "learning", "agrees", "doubtful", "disagrees"
+# chi-square of two degrees of freedom that a good GNSS exceeds once in 1000 and, of each test, once in 3e6 frames
+DOUBT, ALARM = 13.8, 30.0
+# GNSS is believed again once it has agreed for so long, over so many frames, within that chi-square
+BACK_S, BACK_FRAMES, BACK = 600.0, 10, 7.4
+# a place that is wider than this (1 sigma, m) is none: the filter is not linear over it
+WIDEST_M = 50_000.0
+# the place of a lean at which A3 was not learned may be bent by this share of its sigma
+MOST_BENT = 0.3
+NOISE_SIGMA = 2.0
+# before A3 is known, so many frames of a pose teach, and so many of all are kept
+FEW_OF_POSE, MOST_HELD = 12, 200
+# a place further off than so many sigma is another one, with a deflection of its own
+ELSEWHERE_SIGMA = 3.0
+COMPASS = ("north", "north-east", "east", "south-east", "south", "south-west", "west", "north-west")
+
+
+@dataclass(frozen=True)
+class GnssCheck:
+    """What the guard says of a GNSS fix: a status, and how far it is from the stars' place.
+
+    distance_m, bearing_deg: of the GNSS place from that of the stars.  sigma_m: 1 sigma of the distance.
+    All three are NaN where the stars tell no place yet.
+    """
+
+    status: str
+    distance_m: float = math.nan
+    bearing_deg: float = math.nan
+    sigma_m: float = math.nan
+
+    @property
+    def sentence(self) -> str:
+        """Sentence that says the same."""
+        if math.isnan(self.distance_m):
+            return "A3 is learned from GNSS: the stars tell no place of their own yet"
+        where = COMPASS[round(self.bearing_deg / 45) % 8]
+        off, sigma = _length_text(self.distance_m), _length_text(self.sigma_m)
+        sentence = f"GNSS is {off} {where} of where the stars put us ({sigma})"
+        return sentence + (": it is not believed" if self.status == DISAGREES else "")
+
+
+def _length_text(metres: float) -> str:
+    return f"{metres:.0f} m" if metres < 1000 else f"{metres / 1000:.2g} km"
+
+
+class GnssWatch:
+    """Keeps what is known of an instrument, learned from GNSS while the stars agree with it.
+
+    For each frame `go_on`, then `judge` where there is a GNSS place, then `learn`.
+    learned: None before the first frame.
+    """
+
+    def __init__(self, instrument: Instrument, vertical: Vertical, learned: Learned | None = None) -> None:
+        self.learned = learned
+        self.disagrees = False
+        self.vertical = vertical
+        self._instrument = instrument
+        # whether A3 may still be anything, and frames are held to begin again with
+        self._begins = learned is None
+        self._held: deque[GnssFrame] = deque(maxlen=MOST_HELD)
+        self._of_pose = 0
+        self._pose: LevelSight | None = None
+        self._new_pose = True
+        self._readings: frozenset[float] = frozenset()
+        self._witnesses = Witnesses.none(0)
+
+    @property
+    def is_learning(self) -> bool:
+        """Whether A3 is not known yet as well as a filter needs."""
+        return self._begins
+
+    def go_on(self, sighting: LevelSight) -> None:
+        """Go on to the time of a frame, seen with any A3: only the attitude of its camera counts."""
+        tilt = sighting.tilt
+        self._new_pose = self._pose is None or slip_s(sighting, self._pose) is None
+        if self._new_pose:
+            self._pose, self._of_pose = sighting, 0
+        if self.learned is not None and self.learned.axes != tilt.axes:
+            # another inclinometer
+            self._forget()
+        if self.learned is None:
+            if self._instrument.calibration.unknown:
+                return
+            stddev = stddev_rad(self.vertical, sighting.latitude, sighting.longitude)
+            self.learned = prior(self._instrument, tilt, stddev, sighting.utc_unix_s)
+            self._begins = not is_linear(self.learned, tilt)
+        self._age(sighting)
+
+    def _forget(self) -> None:
+        self.learned, self._begins, self.disagrees = None, True, False
+        self._held.clear()
+        self._witnesses = Witnesses.none(0)
+
+    def _age(self, sighting: LevelSight) -> None:
+        learned, tilt = self.learned, sighting.tilt
+        assert learned is not None
+        latitude, longitude, covariance = place_of_stars(sighting, learned, self.vertical)
+        here, moved_m = learned.place, 0.0
+        if here is None:
+            here = latitude, longitude
+        elif self._new_pose:
+            way_m = float(np.linalg.norm(_apart_m(here, (latitude, longitude))))
+            if way_m > ELSEWHERE_SIGMA * math.sqrt(np.linalg.eigvalsh(covariance)[-1]):
+                moved_m, here = way_m, (latitude, longitude)
+        passed = ageing(
+            learned,
+            self._instrument.inclinometer,
+            tilt,
+            sighting.utc_unix_s,
+            moved_m,
+            stddev_rad(self.vertical, latitude, longitude),
+            self._new_pose,
+        )
+        self.learned = replace(aged(learned, passed, sighting.utc_unix_s), place=here)
+        if len(self._witnesses.since):
+            self._witnesses = self._witnesses.aged(passed).recent(sighting.utc_unix_s)
+
+    def up_in_camera(self, tilt: Tilt) -> np.ndarray | None:
+        """Up (3,) in C at a tilt by what was learned; None if nothing is known."""
+        return None if self.learned is None else self.learned.rotation.T @ self.learned.up(tilt)
+
+    def tells_place(self, sighting: LevelSight) -> bool:
+        """Whether the stars tell a place with what was learned before this frame."""
+        if self.learned is None:
+            return False
+        covariance = place_of_stars(sighting, self.learned, self.vertical)[2]
+        if np.linalg.eigvalsh(covariance)[-1] >= WIDEST_M**2:
+            return False
+        return not self._held or self._bent_m(sighting.tilt) < MOST_BENT * math.sqrt(np.trace(covariance) / 2)
+
+    def _bent_m(self, tilt: Tilt) -> float:
+        """What a turn of A3 about the plumb line that is hardly known may do to the place beyond a linear error."""
+        assert self.learned is not None
+        at, up = self.learned.layout, tilt.up
+        off = min(float(np.linalg.norm(up - frame.sighting.tilt.up)) for frame in self._held)
+        # the noise of two tilts is no lean
+        leaned = max(off - NOISE_SIGMA * math.sqrt(2 * np.trace(tilt.noise)), 0.0)
+        turn2 = min(float(up @ self.learned.covariance[at.a3, at.a3] @ up), 2.0)
+        return turn2 / 2 * leaned * EARTH_RADIUS_M
+
+    def judge(self, sighting: LevelSight, gnss: GnssPlace) -> GnssCheck:
+        """Compare a GNSS place with that of the stars; where they disagree, take back what GNSS taught meanwhile."""
+        if self.learned is None or not self.tells_place(sighting):
+            return GnssCheck(LEARNING)
+        seen = innovation(sighting, gnss, self.learned, self.vertical)
+        single = chi2(self.learned, seen)
+        if self._begins:
+            status = DISAGREES if single > ALARM else DOUBTFUL if single > DOUBT else LEARNING
+            return self._check(status, sighting, gnss)
+        witnesses = self._witnesses if len(self._witnesses.since) else Witnesses.none(len(self.learned.state))
+        if not self.disagrees and witnesses.due(sighting.utc_unix_s):
+            witnesses = witnesses.set_aside(self.learned)
+        self._witnesses = witnesses.heard(seen, self.learned.state, sighting.utc_unix_s)
+        against = self._witnesses.against(sighting.utc_unix_s)
+        worst = max(single, float(against.max()))
+        if self.disagrees:
+            self._hope(worst, sighting.utc_unix_s)
+        elif worst > ALARM:
+            self._take_back(int(np.argmax(against)), sighting)
+        if self.disagrees:
+            return self._check(DISAGREES, sighting, gnss)
+        return self._check(DOUBTFUL if worst > DOUBT else AGREES, sighting, gnss)
+
+    def _take_back(self, witness: int, sighting: LevelSight) -> None:
+        """Know again what was known one witness before the one who speaks most against GNSS."""
+        self.disagrees = True
+        self.learned = self._witnesses.before[max(witness - 1, 0)]
+        self._witnesses = Witnesses.none(0)
+        self._new_pose = True
+        self._age(sighting)
+        assert self.learned is not None
+        self._witnesses = Witnesses.none(len(self.learned.state)).set_aside(self.learned)
+
+    def _hope(self, worst: float, utc_unix_s: float) -> None:
+        """Believe GNSS again after it has agreed for long enough, by a witness that begins anew at each contradiction."""
+        assert self.learned is not None
+        if worst > BACK:
+            self._witnesses = Witnesses.none(len(self.learned.state)).set_aside(self.learned)
+        elif utc_unix_s - self._witnesses.since[0] >= BACK_S and self._witnesses.frames[0] >= BACK_FRAMES:
+            self.disagrees = False
+
+    def _check(self, status: str, sighting: LevelSight, gnss: GnssPlace) -> GnssCheck:
+        assert self.learned is not None
+        latitude, longitude, covariance = place_of_stars(sighting, self.learned, self.vertical)
+        apart = gnss.from_place_m(latitude, longitude)
+        distance = float(np.linalg.norm(apart))
+        way = apart / max(distance, 1e-9)
+        return GnssCheck(
+            status=status,
+            distance_m=distance,
+            bearing_deg=float(np.degrees(np.arctan2(*apart)) % 360),
+            sigma_m=math.sqrt(way @ (covariance + gnss.covariance) @ way),
+        )
+
+    def learn(self, sighting: LevelSight, gnss: GnssPlace, check: GnssCheck) -> None:
+        """Learn from a frame if GNSS is believed, and its readings are new."""
+        readings = frozenset(sighting.tilt.times)
+        if check.status not in (LEARNING, AGREES) or readings & self._readings:
+            return
+        self._readings = readings
+        if not self._begins:
+            assert self.learned is not None
+            seen = innovation(sighting, gnss, self.learned, self.vertical)
+            first = not math.isfinite(self.learned.since_unix_s)
+            self.learned = replace(
+                updated(self.learned, seen),
+                poses=self.learned.poses + (self._of_pose == 0),
+                since_unix_s=sighting.utc_unix_s if first else self.learned.since_unix_s,
+            )
+            self._of_pose += 1
+            return
+        if self._of_pose >= FEW_OF_POSE:
+            return
+        self._held.append(GnssFrame(sighting, gnss, self._of_pose == 0))
+        self._of_pose += 1
+        self.learned = begun(self._instrument, self._held, self.vertical)
+        self._begins = not is_linear(self.learned, sighting.tilt)
+        if not self._begins:
+            self._held.clear()
+
+
+def _apart_m(a: tuple[float, float], b: tuple[float, float]) -> np.ndarray:
+    """East, north (2,) in m from a to b, places in rad."""
+    return GnssPlace(utc_unix_s=0.0, latitude=b[0], longitude=b[1], covariance=np.eye(2)).from_place_m(*a)

@@ -1,0 +1,221 @@
+# SPDX-License-Identifier: Apache-2.0
+"""GNSS beside a session: its fixes as they come, what they teach, and the file that keeps it."""
+
+import math
+import traceback
+from collections import deque
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from starpos.errors import GnssError, StarposError
+from starpos.files import path_of
+from starpos.fix.solution import Solution, Status
+from starpos.fix.solver import Solver
+from starpos.frames.stars import Stars
+from starpos.gnss import learned_file
+from starpos.gnss.lacking import what_would_tell_more
+from starpos.gnss.place import GnssPlace, message_to_gnss
+from starpos.gnss.solving import Watched, watched
+from starpos.gnss.states import Learned
+from starpos.gnss.track import GnssTrack
+from starpos.gnss.watch import DISAGREES, DOUBTFUL, GnssWatch
+from starpos.instrument.instrument import Instrument
+from starpos.session.diagnosis import Diagnosis, Level
+from starpos.session.job import Jobs
+from starpos.session.log import Heard, Log
+from starpos.session.now import ANOTHER_TIME_S, Now
+from starpos.session.reports import AHEAD_S, ONE_CLOCK
+from starpos.session.settings import Settings
+from starpos.units import ARCSEC
+from starpos.utc import utc_text
+
+TOPIC = "gnss/fix"
+# fixes that are kept: frames wait for their tilts meanwhile
+KEPT = 100
+# a fix that comes later than this after its stamp is of another clock, s
+OLDEST_S = 30.0
+# what was learned is written at most so often, s
+SAVE_EVERY_S = 60.0
+
+
+class GnssTeacher:
+    """Keeps the newest fixes of GNSS, and what they have taught of the instrument in use.
+
+    jobs: writes the file.
+    """
+
+    def __init__(self, settings: Settings, jobs: Jobs, heard: Heard, log: Log) -> None:
+        self.newest: Watched | None = None
+        self._settings, self._values, self._jobs = settings, settings.values, jobs
+        self._heard, self._log = heard, log
+        self._places: deque[GnssPlace] = deque(maxlen=KEPT)
+        self._watch: GnssWatch | None = None
+        self._instrument: Instrument | None = None
+        self._stored: Learned | None = settings.learned
+        self._saved_s = -math.inf
+        self._trouble = ""
+
+    @property
+    def learned(self) -> Learned | None:
+        """What is known of the instrument now."""
+        return self._stored if self._watch is None else self._watch.learned
+
+    def take(self, message: Any, now: Now) -> None:
+        """Take a sensor_msgs/NavSatFix; one that cannot be used is refused with the reason."""
+        try:
+            place = message_to_gnss(message)
+            ahead_s = now.ahead_s(place.utc_unix_s)
+            if ahead_s > AHEAD_S or -ANOTHER_TIME_S < ahead_s < -OLDEST_S:
+                side = "ahead of" if ahead_s > 0 else "behind"
+                raise GnssError(f"GNSS's stamps are {abs(ahead_s):.3g} s {side} this clock: {ONE_CLOCK}")
+            if self._places and place.utc_unix_s < self._places[-1].utc_unix_s:
+                raise GnssError("GNSS's stamps go back: check that one receiver publishes, not two")
+        except GnssError as error:
+            self._heard.refuse(TOPIC, str(error))
+            return
+        self._heard.came(TOPIC)
+        self._places.append(place)
+
+    def solved(self, solver: Solver, stars: Stars, rough: Solution, compared: bool = True) -> Watched:
+        """Solve a frame with what GNSS taught before it; compared: with GNSS's place of its time too."""
+        watch = self._watch_of(solver.instrument)
+        gnss = self._compared_with(stars) if compared else None
+        try:
+            answer = watched(solver, stars, rough, gnss, watch)
+        except Exception as e:
+            # A defect costs this frame only.
+            self._log.error(traceback.format_exc())
+            why = f"what GNSS taught could not be used on this frame ({type(e).__name__}: {e})"
+            answer = Watched(solution=Solution.failed(stars, Status.BAD_INPUT, why))
+        if self._settings.site is not None:
+            # the heading there is better than that of any fix
+            answer = replace(answer, solution=replace(answer.solution, at_place=rough.at_place))
+        if compared:
+            self.newest = answer
+        return answer
+
+    def _watch_of(self, instrument: Instrument) -> GnssWatch:
+        """The watch of an instrument; a new one where A3 or the inclinometer is stated otherwise."""
+        before = self._instrument
+        if self._watch is None:
+            self._watch = GnssWatch(instrument, self._settings.vertical, self._stored)
+        elif before is not None and (
+            before.calibration != instrument.calibration or before.inclinometer != instrument.inclinometer
+        ):
+            self._log.warning(
+                "another A3 or inclinometer is stated: what GNSS taught of the other is forgotten"
+            )
+            self._watch = GnssWatch(instrument, self._settings.vertical)
+        self._instrument = instrument
+        return self._watch
+
+    def other_camera(self) -> None:
+        """Forget what was learned, which is of the other camera."""
+        if self._watch is not None and self._instrument is not None:
+            self._log.warning("another camera_info: what GNSS taught of the other camera is forgotten")
+            self._watch = GnssWatch(self._instrument, self._settings.vertical)
+
+    def place_at(self, utc_unix_s: float) -> GnssPlace | None:
+        """GNSS's place at a time, None without one; GnssError if its places contradict each other."""
+        return GnssTrack(list(self._places)).at(utc_unix_s)
+
+    def forget_places(self) -> None:
+        """Forget where GNSS had the instrument, not what it taught."""
+        self._places.clear()
+
+    def _compared_with(self, stars: Stars) -> GnssPlace | None:
+        if stars.mid_unix_s is None:
+            return None
+        try:
+            return self.place_at(stars.mid_unix_s)
+        except GnssError as error:
+            self._heard.refuse(TOPIC, str(error))
+            return None
+
+    # the file --------------------------------------------------------------------------------------------------------
+
+    def save_if_due(self, now: Now) -> None:
+        """Write what was learned, as a job, if the last time is long enough ago."""
+        due = not self._jobs.busy and abs(now.waiting_s - self._saved_s) >= SAVE_EVERY_S
+        if due and self._worth_saving:
+            self._saved_s = now.waiting_s
+            path, learned = path_of(self._values["gnss.learned"]), self.learned
+            assert learned is not None
+            coming = self._jobs.run(lambda: learned_file.save(path, learned))
+            coming.add_done_callback(lambda f: self._note(f.result().trouble))
+
+    def close(self) -> None:
+        """Write what was learned, at the end."""
+        if self._worth_saving:
+            assert self.learned is not None
+            try:
+                learned_file.save(path_of(self._values["gnss.learned"]), self.learned)
+            except StarposError as error:
+                self._note(str(error))
+
+    @property
+    def _worth_saving(self) -> bool:
+        """Whether there is a file to write, and what was learned is whole and newer than it."""
+        watch = self._watch
+        if not self._values["gnss.learned"] or watch is None or watch.learned is None or watch.is_learning:
+            return False
+        return watch.learned.frames > 0
+
+    def _note(self, trouble: str) -> None:
+        if trouble and trouble != self._trouble:
+            self._log.warning(trouble)
+        self._trouble = trouble
+
+    # diagnostics -----------------------------------------------------------------------------------------------------
+
+    def report(self) -> Diagnosis:
+        """Make the diagnostic `GNSS`."""
+        compared = None if self.newest is None else self.newest.compared
+        values = self._values_of(self.learned)
+        if self._trouble:
+            return Diagnosis(Level.WARN, self._trouble, values)
+        if compared is None:
+            since = (
+                "no frame with a GNSS place yet"
+                if self.newest is None
+                else "no GNSS place at the newest frame"
+            )
+            return Diagnosis(Level.WARN, f"{since}: the stars' place goes on with what was learned", values)
+        check = compared.check
+        values |= {
+            "status": check.status,
+            "distance (m)": check.distance_m,
+            "bearing (deg)": check.bearing_deg,
+            "sigma (m)": check.sigma_m,
+        }
+        if check.status == DISAGREES:
+            return Diagnosis(Level.ERROR, check.sentence, values)
+        if check.status == DOUBTFUL:
+            return Diagnosis(Level.WARN, f"{check.sentence}: it teaches nothing now", values)
+        return Diagnosis(Level.OK, check.sentence, values)
+
+    def _values_of(self, learned: Learned | None) -> dict[str, object]:
+        if learned is None or not learned.frames:
+            return {"frames learned from": 0}
+        at, up = learned.layout, learned.calibrated_up
+        a3 = learned.covariance[at.a3, at.a3]
+        turn2 = float(up @ a3 @ up)
+        deflection = np.sqrt(np.trace(learned.covariance[at.constant, at.constant]) / 2) / ARCSEC
+        return {
+            "frames learned from": learned.frames,
+            "poses learned from": learned.poses,
+            "learned since": utc_text(learned.since_unix_s),
+            "A3 across the plumb line (arcsec, 1 sigma)": math.sqrt((np.trace(a3) - turn2) / 2) / ARCSEC,
+            "A3 about the plumb line (arcsec, 1 sigma)": math.sqrt(turn2) / ARCSEC,
+            "deflection (arcsec, 1 sigma)": float(deflection),
+            "more would tell": what_would_tell_more(learned),
+        }
+
+
+def solved_beside(
+    gnss: GnssTeacher | None, solver: Solver | None, stars: Stars, rough: Solution, compared: bool
+) -> Watched | None:
+    """Solve a frame as a teacher does; None without one, or without a solver."""
+    return gnss.solved(solver, stars, rough, compared) if gnss is not None and solver is not None else None

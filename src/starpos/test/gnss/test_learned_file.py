@@ -1,0 +1,67 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What was learned is there again, whole, and a file that is none says so."""
+
+import json
+
+import numpy as np
+import pytest
+
+from starpos.earth.vertical import Deflection
+from starpos.errors import GnssError
+from starpos.gnss import learned_file
+from starpos.gnss.watch import GnssWatch
+from starpos_testing.gnss_drives import GnssDrive
+
+DRIVE = GnssDrive(stops=6)
+
+
+@pytest.fixture(scope="module")
+def learned():
+    watch = GnssWatch(DRIVE.instrument, Deflection())
+    for moment in DRIVE.moments(np.random.default_rng(3)):
+        watch.go_on(moment.sighting)
+        watch.learn(moment.sighting, moment.gnss, watch.judge(moment.sighting, moment.gnss))
+    return watch.learned
+
+
+@pytest.fixture
+def saved(learned, tmp_path):
+    learned_file.save(tmp_path / "learned.json", learned)
+    return tmp_path / "learned.json"
+
+
+def test_it_is_the_same_after_a_restart(learned, saved):
+    again = learned_file.read_if_there(saved)
+    for name in ("a3", "state", "covariance", "calibrated_up"):
+        assert np.array_equal(getattr(again, name), getattr(learned, name))
+    for name in ("axes", "utc_unix_s", "place", "frames", "poses", "since_unix_s", "temperature_c"):
+        assert getattr(again, name) == getattr(learned, name)
+
+
+def test_without_a_file_nothing_is_known(tmp_path):
+    assert learned_file.read_if_there(tmp_path / "none.json") is None
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "said"),
+    [
+        ("starpos_learned", 99, "starpos_learned is not 1"),
+        ("axes", 4, "axes"),
+        ("state", [1.0], "state is not"),
+        ("a3", np.eye(3).tolist()[::-1], "no rotation"),
+        ("covariance", (-np.eye(20)).tolist(), "symmetric and positive"),
+        ("frames", None, "not a file of what GNSS taught"),
+    ],
+)
+def test_a_file_that_is_broken_says_what_is_wrong_and_what_to_do(saved, key, value, said):
+    content = json.loads(saved.read_text()) | {key: value}
+    saved.write_text(json.dumps(content))
+    with pytest.raises(GnssError, match=said) as error:
+        learned_file.read_if_there(saved)
+    assert "delete it" in str(error.value)
+
+
+def test_a_place_that_cannot_be_written_is_an_error_of_one_sentence(learned, tmp_path):
+    (tmp_path / "folder").mkdir()
+    with pytest.raises(GnssError, match="cannot be written"):
+        learned_file.save(tmp_path / "folder", learned)

@@ -1,0 +1,71 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a receiver may state, and the sentence for each thing that tells no place."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from starpos.errors import GnssError
+from starpos.gnss.place import message_to_gnss
+
+SOUND = {
+    "status": 0,
+    "latitude": 47.0,
+    "longitude": 8.0,
+    "covariance": np.diag([4.0, 9.0, 25.0]),
+    "kind": 2,
+    "frame_id": "gps",
+    "stamp": 1_700_000_000,
+}
+
+
+def message(**changes):
+    values = SOUND | changes
+    return SimpleNamespace(
+        header=SimpleNamespace(
+            stamp=SimpleNamespace(sec=values["stamp"], nanosec=0), frame_id=values["frame_id"]
+        ),
+        status=SimpleNamespace(status=values["status"]),
+        latitude=values["latitude"],
+        longitude=values["longitude"],
+        position_covariance=values["covariance"].ravel(),
+        position_covariance_type=values["kind"],
+    )
+
+
+def test_a_sound_fix_is_a_place_without_an_altitude_too():
+    place = message_to_gnss(message())
+    assert np.degrees([place.latitude, place.longitude]) == pytest.approx([47.0, 8.0], abs=1e-12)
+    assert place.covariance.tolist() == [[4.0, 0.0], [0.0, 9.0]]
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"status": -1}, "no fix"),
+        ({"latitude": np.nan}, "not a number"),
+        ({"longitude": np.inf}, "not a number"),
+        ({"latitude": 0.0, "longitude": 0.0}, "0 N 0 E"),
+        ({"latitude": 91.0}, "latitude first"),
+        ({"kind": 0}, "states no error"),
+        ({"covariance": np.full((3, 3), np.nan)}, "states no error"),
+        ({"covariance": np.diag([4.0, -4.0, 4.0])}, "states no error"),
+        ({"covariance": np.diag([1e9, 1e9, 1e9])}, "over 10 km"),
+        ({"frame_id": "map_NAD-27"}, "another datum"),
+        ({"stamp": 0}, "no time stamp"),
+    ],
+)
+def test_what_tells_no_place_says_why_in_a_sentence(changes, said):
+    with pytest.raises(GnssError, match=said):
+        message_to_gnss(message(**changes))
+
+
+def test_an_error_may_be_taken_for_one_that_is_not_stated():
+    assert message_to_gnss(message(kind=0), 30.0).covariance[0, 0] == 900.0
+
+
+def test_metres_to_a_place_across_the_date_line():
+    east = message_to_gnss(message(longitude=-179.999, latitude=0.5))
+    here = message_to_gnss(message(longitude=179.999, latitude=0.5))
+    assert east.from_place_m(here.latitude, here.longitude) == pytest.approx([222.6, 0.0], abs=0.1)

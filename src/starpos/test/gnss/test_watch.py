@@ -1,0 +1,157 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What GNSS teaches on drives whose errors are drawn from stated laws, and what is made of a GNSS that is led astray."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from starpos.earth.vertical import Deflection
+from starpos.gnss.lacking import what_would_tell_more
+from starpos.gnss.place import GnssPlace
+from starpos.gnss.sighting import place_of_stars
+from starpos.gnss.watch import AGREES, DISAGREES, LEARNING, GnssWatch
+from starpos.instrument import sensors
+from starpos_testing.gnss_drives import GnssDrive
+
+UNKNOWN = Deflection(stddev_arcsec=6.0)
+DRIVE = GnssDrive()
+# after so many s of good GNSS something happens
+THEN_S = 1200.0
+ROVER = GnssDrive(stops=25)
+
+
+@dataclass
+class Told:
+    """What a watch tells of a frame: the check, None without GNSS; its place's error east, north in m, and covariance."""
+
+    at_s: float
+    check: object
+    error_m: np.ndarray | None
+    covariance: np.ndarray | None
+
+    @property
+    def nees(self):
+        return self.error_m @ np.linalg.solve(self.covariance, self.error_m)
+
+
+def driven(drive, seed, gnss_until_s=np.inf, astray=lambda t: np.zeros(2), watch=None):
+    watch, told = watch or GnssWatch(drive.instrument, UNKNOWN), []
+    for moment in drive.moments(np.random.default_rng(seed), astray):
+        t, sighting = moment.sighting.utc_unix_s - 1.7e9, moment.sighting
+        watch.go_on(sighting)
+        check = watch.judge(sighting, moment.gnss) if t < gnss_until_s else None
+        error = covariance = None
+        if watch.tells_place(sighting):
+            latitude, longitude, covariance = place_of_stars(sighting, watch.learned, UNKNOWN)
+            here = GnssPlace(utc_unix_s=0.0, latitude=latitude, longitude=longitude, covariance=covariance)
+            error = here.from_place_m(*moment.place)
+        told.append(Told(t, check, error, covariance))
+        if check is not None:
+            watch.learn(sighting, moment.gnss, check)
+    return told, watch
+
+
+def after(told, at_s):
+    return [frame for frame in told if frame.at_s > at_s]
+
+
+@pytest.fixture(scope="module")
+def carried():
+    """Drives whose GNSS goes after 20 min, for the rest of 80."""
+    return [driven(DRIVE, seed, gnss_until_s=THEN_S)[0] for seed in range(6)]
+
+
+def test_there_is_no_place_before_anything_was_learned(carried):
+    for told in carried:
+        assert told[0].error_m is None and told[0].check.status == LEARNING
+
+
+def test_the_place_goes_on_without_gnss_and_its_claim_is_true_and_grows(carried):
+    nees = np.array([[frame.nees for frame in after(told, THEN_S)] for told in carried])
+    assert 1.0 < nees.mean() < 3.0 and nees.max() < 30
+    claims = np.array([[np.trace(frame.covariance) for frame in after(told, THEN_S)] for told in carried])
+    early, late = np.sqrt(claims[:, :15].mean() / 2), np.sqrt(claims[:, -15:].mean() / 2)
+    # a frame's own readings are 174 m
+    assert 180 < early < late < 400
+
+
+def test_a_good_gnss_agrees_and_teaches_more_and_more():
+    told, watch = driven(DRIVE, 11)
+    assert all(frame.check.status != DISAGREES for frame in told)
+    assert np.mean([frame.check.status == AGREES for frame in after(told, THEN_S)]) > 0.95
+    assert np.sqrt(np.trace(told[-1].covariance) / 2) < 215
+    assert watch.learned.poses == DRIVE.stops and what_would_tell_more(watch.learned) == ""
+
+
+def test_multipath_of_30_m_is_no_spoofing():
+    for seed in (21, 22):
+        told, _ = driven(ROVER, seed, astray=lambda t: np.array([0.0, 30.0]) * (1200 < t < 1500))
+        assert all(frame.check.status != DISAGREES for frame in told)
+
+
+ATTACKS = {
+    "drag": lambda t: np.array([0.6, 0.8]) * max(t - THEN_S, 0.0),
+    "jump": lambda t: np.array([0.0, 2000.0]) * (t > THEN_S),
+}
+
+
+@pytest.mark.parametrize(("kind", "by_s"), [("drag", 1500.0), ("jump", 130.0)])
+def test_a_gnss_that_is_led_astray_is_not_believed_and_what_it_taught_is_taken_back(kind, by_s):
+    drive = GnssDrive(stops=30)
+    for seed in (31, 32):
+        told, watch = driven(drive, seed, astray=ATTACKS[kind])
+        first = next(frame.at_s for frame in told if frame.check.status == DISAGREES)
+        assert THEN_S < first < THEN_S + by_s
+        since = after(told, first)
+        assert all(frame.check.status == DISAGREES for frame in since)
+        # the covariance is whole: the same drive without that GNSS knows as much
+        assert np.mean([frame.nees for frame in since]) < 4 and max(frame.nees for frame in since) < 30
+        assert watch.disagrees and "not believed" in told[-1].check.sentence
+
+
+def test_a_gnss_that_comes_back_is_believed_after_ten_minutes_and_not_at_once():
+    back_s = THEN_S + 600
+    told, _ = driven(
+        GnssDrive(stops=36), 41, astray=lambda t: np.array([2000.0, 0.0]) * (THEN_S < t < back_s)
+    )
+    assert all(
+        frame.check.status == DISAGREES for frame in after(told, THEN_S + 60) if frame.at_s < back_s + 480
+    )
+    assert told[-1].check.status == AGREES
+
+
+def test_a_sentence_says_where_gnss_is():
+    told, _ = driven(ROVER, 51, astray=lambda t: np.array([1600.0, 1600.0]) * (t > THEN_S))
+    assert (
+        "GNSS is 2" in told[-1].check.sentence
+        and "km north-east of where the stars put us" in told[-1].check.sentence
+    )
+    assert told[-1].check.bearing_deg == pytest.approx(45, abs=15)
+
+
+def test_one_lean_tells_no_turn_and_the_diagnostic_says_what_would():
+    told, watch = driven(GnssDrive(stops=3, lean_deg=0.0), 61)
+    assert "lean it otherwise" in what_would_tell_more(watch.learned)
+    # at that lean the place is known all the same
+    assert told[-1].nees < 20
+
+
+def test_readings_that_two_frames_share_teach_once():
+    moment = next(iter(DRIVE.moments(np.random.default_rng(1))))
+    watch = GnssWatch(DRIVE.instrument, UNKNOWN)
+    watch.go_on(moment.sighting)
+    check = watch.judge(moment.sighting, moment.gnss)
+    object.__setattr__(moment.sighting.tilt, "times", (1.0, 2.0))
+    watch.learn(moment.sighting, moment.gnss, check)
+    learned = watch.learned
+    watch.learn(moment.sighting, moment.gnss, check)
+    assert watch.learned is learned
+
+
+@pytest.mark.parametrize("model", ["nivel210", "scl3300"])
+def test_an_error_of_each_pose_is_claimed_before_a3_is_known_too(model):
+    drive = GnssDrive(errors=sensors.PRESETS[model], lean_deg=0.03 if model == "nivel210" else 4.0, stops=12)
+    told = [frame for seed in (1, 2) for frame in driven(drive, seed)[0] if frame.error_m is not None]
+    assert np.mean([frame.nees for frame in told]) < 4
+    assert all(frame.check.status != DISAGREES for frame in told)

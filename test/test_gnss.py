@@ -1,0 +1,169 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A drive with GNSS through the running solver: it learns A3 from nothing, and what it says when GNSS is led astray."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from sensor_msgs.msg import NavSatFix
+
+from starpos_interfaces.msg import GnssCheck, Solution
+from starpos_testing.graph import shots
+
+# between frames, s; the robot is turned at each
+STEP_S = 60.0
+STATED_M = 2.5
+ASTRAY_M = 2000.0
+# A fix that overtakes its frame's GNSS is not compared: then the next frame is
+AGAIN_S = 2.0
+
+
+class Drive:
+    """A robot that is newly turned, and leans otherwise, at each frame; and what the solver tells of it."""
+
+    def __init__(self, graph):
+        self.graph, self.rng, self.at_s = graph, np.random.default_rng(7), shots.START_S
+        self.gnss = graph.node.create_publisher(NavSatFix, "gnss/fix", 10)
+        self.checks = {}
+        graph.node.create_subscription(GnssCheck, "gnss/check", self._keep, 100)
+
+    def _keep(self, check):
+        self.checks[check.header.stamp.sec, check.header.stamp.nanosec] = check
+
+    def shot(self):
+        self.at_s += STEP_S
+        scene = shots.scene_at(self.rng.uniform(0, 360))
+        scene = replace(
+            scene, altitude_deg=90 - abs(self.rng.normal(0, 5)), roll_deg=self.rng.uniform(0, 360)
+        )
+        return shots.shot_of(scene, self.at_s, self.rng)
+
+    def fix(self, shot, north_m=0.0, status=0):
+        """GNSS's fix at a shot, as far north of the robot."""
+        message = NavSatFix()
+        message.header.stamp = shot.stars.header.stamp
+        message.status.status = status
+        metres = self.rng.normal([0.0, north_m], STATED_M)
+        degrees = np.degrees(metres / 6.371e6)
+        message.longitude = shots.LONGITUDE_DEG + degrees[0] / math.cos(math.radians(shots.LATITUDE_DEG))
+        message.latitude = shots.LATITUDE_DEG + degrees[1]
+        message.position_covariance = np.diag([STATED_M**2, STATED_M**2, 25.0]).ravel()
+        message.position_covariance_type = NavSatFix.COVARIANCE_TYPE_DIAGONAL_KNOWN
+        return message
+
+    def compared(self, **gnss):
+        """The check and the solution of a frame that was compared with GNSS."""
+        found = []
+
+        def come():
+            shot = self.shot()
+            self.gnss.publish(self.fix(shot, **gnss))
+            solution, _, _ = self.graph.answer(shot)
+            if self.graph.comes(lambda: shot.stamp in self.checks, AGAIN_S):
+                found.append((self.checks[shot.stamp], solution, shot))
+            return bool(found)
+
+        self.graph.wait(come, "for a frame that is compared with GNSS")
+        return found[0]
+
+
+@pytest.fixture(scope="module")
+def drive(graph, tmp_path_factory):
+    # of A3 nothing is stated
+    known = [p for p in shots.SOLVER if not p.startswith("misalignment")]
+    folder = tmp_path_factory.mktemp("gnss")
+    started = graph.start(
+        folder / "log", "starpos_solver", "solver", *known, "gnss.use:=true",
+        f"gnss.learned:={folder / 'learned.json'}", "clock_stddev:=0.001",
+    )  # fmt: skip
+    graph.wait_for_solver()
+    made = Drive(graph)
+    made.process, made.learned = started, folder / "learned.json"
+    graph.wait(lambda: made.gnss.get_subscription_count() == 1, "for the solver's ear for GNSS")
+    return made
+
+
+def is_right(solution, shot):
+    error = shot.error_m(solution)
+    claimed = np.reshape(solution.covariance, (3, 3))[:2, :2]
+    return error @ np.linalg.solve(claimed, error) < 4**2
+
+
+def test_what_a_robot_is_told_while_gnss_teaches_is_jammed_led_astray_and_comes_back(drive, graph):
+    # the first frame has a heading and no place
+    check, solution, shot = drive.compared()
+    assert check.status == GnssCheck.LEARNING and math.isnan(check.distance)
+    assert solution.status == Solution.POOR_FIT and math.isnan(solution.latitude)
+    graph.wait(lambda: shot.stamp in graph.imus, "for a heading at GNSS's place")
+    assert math.isnan(graph.fixes[shot.stamp][-1].latitude)
+    # ten minutes of GNSS
+    for _ in range(9):
+        check, solution, shot = drive.compared()
+    assert check.status == GnssCheck.AGREES and check.poses >= 8
+    assert solution.status == Solution.OK and is_right(solution, shot)
+    sigma_m = math.sqrt(solution.covariance_geodetic[0])
+    assert sigma_m < 100
+    # jammed: the place goes on, and is the stars' own
+    for _ in range(3):
+        shot = drive.shot()
+        drive.gnss.publish(drive.fix(shot, status=-1))
+        solution, _, _ = graph.answer(shot)
+        assert solution.status == Solution.OK and is_right(solution, shot)
+        assert shot.stamp not in drive.checks
+    assert "no GNSS place" in graph.state("solver: GNSS", "no GNSS place").message
+    # led astray by 2 km
+    for _ in range(3):
+        check, solution, shot = drive.compared(north_m=ASTRAY_M)
+        assert check.status == GnssCheck.DISAGREES
+        assert check.distance == pytest.approx(ASTRAY_M, abs=6 * check.distance_stddev)
+        assert abs((check.bearing + 180) % 360 - 180) < 15
+        assert is_right(solution, shot)
+    said = graph.state("solver: GNSS", "km north of where the stars put us")
+    assert said.level == b"\x02" and "GNSS is 2" in said.message and "not believed" in said.message
+    # back: believed again only after ten minutes
+    statuses = []
+    for _ in range(14):
+        check, solution, shot = drive.compared()
+        statuses.append(check.status)
+        assert is_right(solution, shot)
+    assert statuses[:9] == [GnssCheck.DISAGREES] * 9 and statuses[-1] == GnssCheck.AGREES
+
+
+BAD = [
+    ({"latitude": math.nan}, "not a number"),
+    ({"latitude": 0.0, "longitude": 0.0}, "0 N 0 E"),
+    ({"latitude": 95.0}, "latitude first"),
+    ({"position_covariance_type": 0}, "states no error"),
+]
+
+
+@pytest.mark.parametrize(("changes", "said"), BAD)
+def test_a_bad_fix_is_one_sentence_and_teaches_nothing(drive, graph, changes, said):
+    shot = drive.shot()
+    message = drive.fix(shot)
+    for name, value in changes.items():
+        setattr(message, name, value)
+    drive.gnss.publish(message)
+    assert said in graph.state("solver: Inputs", said).message
+    assert shot.stamp not in drive.checks
+
+
+def test_what_was_taught_is_there_after_a_restart(drive, graph, run):
+    drive.process.end()
+    graph.processes.remove(drive.process)
+    assert drive.learned.is_file()
+    known = [p for p in shots.SOLVER if not p.startswith("misalignment")]
+    run(
+        "starpos_solver",
+        "solver",
+        *known,
+        "gnss.use:=true",
+        f"gnss.learned:={drive.learned}",
+        "clock_stddev:=0.001",
+    )
+    graph.wait_for_solver()
+    shot = drive.shot()
+    solution, _, _ = graph.answer(shot)
+    assert solution.status == Solution.OK and is_right(solution, shot)
+    assert "learned" in [term.name for term in solution.budget]
