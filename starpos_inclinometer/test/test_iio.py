@@ -13,7 +13,7 @@ from iio_tree import adxl355, node, plug, scan, scl3300
 from starpos_inclinometer.host_clock import HostClock, Moment
 from starpos_inclinometer.parameters import PARAMETERS
 from starpos_inclinometer.sources.iio import IioLink, IioTilts
-from starpos_inclinometer.sources.iio_buffer import Buffer, Layout, element
+from starpos_inclinometer.sources.iio_buffer import Buffer, ScanLayout, element
 from starpos_inclinometer.sources.iio_device import DeviceError, find, set_sampling_frequency
 from starpos_inclinometer.sources.reading import GAP, OUT_OF_RANGE, STUCK, TIME_UNKNOWN, Arrival, Phase
 from starpos_inclinometer.sources.source import Surroundings
@@ -154,9 +154,9 @@ def test_the_layout_is_the_one_of_the_kernels_document():
     kinds = ["be:u16/16>>0", "be:u32/32>>0", "be:u32/32>>0", "be:u64/64>>0"]
     elements = [element(str(i), i, kind) for i, kind in enumerate(kinds)]
     scan = b"".join([b"\0\1\xff\xff", b"\0\0\0\2", b"\0\0\0\3", b"\xff" * 4, b"\0" * 7 + b"\4"])
-    whole = Layout(elements[::-1])
+    whole = ScanLayout(elements[::-1])
     assert (whole.size, whole.numbers(scan)) == (24, {"0": 1, "1": 2, "2": 3, "3": 4})
-    two = Layout([elements[0], elements[3]])
+    two = ScanLayout([elements[0], elements[3]])
     assert (two.size, two.numbers(scan[:4] + b"\xff" * 4 + scan[16:])) == (16, {"0": 1, "3": 4})
     with pytest.raises(DeviceError, match="nobody can read"):
         element("in", 0, "le:f32/32X2>>0")

@@ -59,7 +59,7 @@ def element(name: str, index: int, text: str) -> Element:
     )
 
 
-class Layout:
+class ScanLayout:
     """Where each element of a scan lies: in the order of their indices, each aligned to its own size."""
 
     def __init__(self, elements: list[Element]) -> None:
@@ -107,7 +107,7 @@ class Buffer:
             self._write("current_timestamp_clock", CLOCK)
             for path in elements.glob("*_en"):
                 path.write_text("1" if path.name.removesuffix("_en") in names else "0")
-            self._layout = Layout([self._element(elements, name) for name in names])
+            self._layout = ScanLayout([self._element(elements, name) for name in names])
             self._write("buffer/length", str(LENGTH))
             self._write("buffer/enable", "1")
             self._file = os.open(nodes / self._folder.name, os.O_RDONLY | os.O_NONBLOCK)
