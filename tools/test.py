@@ -31,6 +31,7 @@ LINTERS = [
     "mypy",
     "lint-imports --config tools/imports.ini --no-cache",
     f"{sys.executable} tools/walls.py",
+    f"{sys.executable} tools/words.py",
     "actionlint -no-color",
 ]
 # the site of the documents, whether each file has its licence, and the package's metadata, with what the first brings

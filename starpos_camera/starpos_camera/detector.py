@@ -23,7 +23,10 @@ from starpos.errors import StarposError
 from starpos.frames.frame import Frame
 from starpos.messages.camera import message_to_frame, message_to_picture
 from starpos.messages.exposures import CAPTURES_KEPT, ExposureFacts, check_stamp
+from starpos.messages.stamp import stamp_to_unix
+from starpos.session.backlog import FRESH_S
 from starpos.session.detector_parameters import PARAMETERS, detection_settings
+from starpos.session.pace import Pace
 from starpos.session.trails import Trails
 from starpos_camera.annotator import Annotator
 from starpos_camera.frame_topics import FrameTopics
@@ -81,7 +84,8 @@ class DetectorNode(Node):
         self._exposures = ExposureFacts(self._values)
         # images until their Captures come, oldest first, and how long they wait for them, s of the clock below
         self._held: deque[tuple[Image | CompressedImage, float]] = deque()
-        self._frames = self._bad = self._dropped = 0
+        self._frames = self._bad = 0
+        self._pace = Pace()
         # Type and sequence number of the last image; None: the middleware gives none.
         self._sequence: tuple[type, int | None] = (Image, None)
         self._replayed: Replayed | None = None
@@ -160,8 +164,13 @@ class DetectorNode(Node):
             # the readings are taken in this thread
             frame = self._trails.told(make())
             job = Job(lambda: frame, header)
+        self._pace.took(time.monotonic())
         if self._worker.offer(job):
-            self._dropped += 1
+            self._drop()
+
+    def _drop(self, frames: int = 1) -> None:
+        """Note frames that are lost because others were there."""
+        self._pace.drop(time.monotonic(), frames)
 
     def _on_imu(self, message: Imu) -> None:
         # in a replay the stars would depend on which readings came before a frame
@@ -201,6 +210,8 @@ class DetectorNode(Node):
         except StarposError as error:
             self._complain(str(error))
             return
+        if not self._pace.wants(stamp_to_unix(message.header.stamp), self._values["max_rate"]):
+            return
         patience_s = CAPTURE_PATIENCE_S if self._captures_come() else 0.0
         # At the first image the sender's Captures may not have been discovered yet.
         if first:
@@ -215,21 +226,27 @@ class DetectorNode(Node):
         return self._patience_clock.now().nanoseconds * 1e-9
 
     def _go_on(self) -> None:
-        """Submit the oldest frame if its Capture has come, or will not come; a newer one that is ready replaces it."""
+        """Submit the oldest frame if its Capture has come, or will not come; of too many the oldest is dropped."""
         if not self._held:
             return
         while self._ready(0):
             if self._worker.idle:
                 self._offer_image(self._held.popleft()[0])
-            elif self._ready(1):
+            elif self._ready(1) and self._too_many:
                 self._held.popleft()
-                self._dropped += 1
+                self._drop()
             else:
                 break
         if not self._held:
             self._look.cancel()
         elif self._look.is_canceled():
             self._look.reset()
+
+    @property
+    def _too_many(self) -> bool:
+        """Whether the frames that are held would be worked on too late."""
+        each_s = self._last.seconds if self._last else math.inf
+        return len(self._held) > MOST_HELD or len(self._held) * each_s > FRESH_S
 
     def _ready(self, k: int) -> bool:
         """Whether the k-th frame that is held need not wait for its Capture any more."""
@@ -254,7 +271,7 @@ class DetectorNode(Node):
         """Count the frames that newer ones replaced in the middleware; a lower number comes from another publisher."""
         before, last = self._sequence
         if sequence is not None and last is not None and kind is before and sequence > last:
-            self._dropped += sequence - last - 1
+            self._drop(sequence - last - 1)
         self._sequence = kind, sequence
 
     def _detect(self, job: Job) -> DetectedFrame:
@@ -329,6 +346,8 @@ class DetectorNode(Node):
         elif silence_s > max(MIN_SILENCE_S, 3 * (self._interval_s or 0.0)):
             level = Level.WARN
             sentence = f"no frame for {silence_s:.0f} s{self._topics.where}: is the camera running?"
+        elif dropped := self._pace.complaint:
+            level, sentence = Level.WARN, f"{sentence} {dropped}."
         elif unsaid := self._unsaid():
             level, sentence = Level.WARN, f"{sentence} {unsaid}"
         if unheard := self._topics.unheard():
@@ -337,7 +356,8 @@ class DetectorNode(Node):
         values: dict[str, object] = {
             "frames": self._frames,
             "bad frames": self._bad,
-            "dropped": self._dropped,
+            "dropped": self._pace.dropped,
+            "left out by max_rate": self._pace.left_out,
         }
         if last:
             values |= {

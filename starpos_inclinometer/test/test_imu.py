@@ -50,6 +50,13 @@ def test_tilt_is_the_direction_of_the_specific_force(tilt):
     assert got.unrest(0.05, 0.1) == ""
 
 
+def test_a_placeholder_variance_shows_as_many_times_the_scatter():
+    forces = G * up(0, 0) + np.random.default_rng(1).normal(0, 0.007, (50, 3))
+    assert average(forces, variance=0.017).excess == pytest.approx(math.sqrt(0.017) / 0.007, rel=0.4)
+    assert average(forces, variance=0.007**2).excess < 2
+    assert average(np.tile(G * up(1, 2), (10, 1)), variance=0.017).excess == 0
+
+
 @pytest.mark.parametrize("tilt", [(20, -20), (45, -40)])
 def test_covariance_is_that_of_the_averages(tilt):
     rng = np.random.default_rng(1)

@@ -10,11 +10,12 @@ from rclpy.clock_type import ClockType
 from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.qos import ReliabilityPolicy
+from rclpy.subscription import Subscription
 from sensor_msgs.msg import CameraInfo, Imu, NavSatFix
 from std_srvs.srv import Trigger
 
 from starpos.instrument.camera import Camera
-from starpos.session import gnss_teacher, reports
+from starpos.session import gnss_check, gnss_teacher, reports
 from starpos.session.frames import Answered, Output
 from starpos.session.gyro import IMU_TOPIC
 from starpos.session.now import Now, Sent
@@ -23,6 +24,7 @@ from starpos_common.clock_report import time_is_simulated
 from starpos_common.diagnostics import Diagnosis, Diagnostics, Level
 from starpos_common.dropped import Dropped
 from starpos_common.job import JobRunner
+from starpos_common.others import other_publishers
 from starpos_common.replayed import Replayed
 from starpos_common.topics import Take, subscription, subscription_from_any
 from starpos_interfaces import msg
@@ -35,7 +37,7 @@ from starpos_solver.settings import SolverSettings
 from starpos_solver.transforms import StaticTransforms
 
 POLL_S = 0.02
-TILT_QUEUE = 1000
+TILT_QUEUE, STARS_QUEUE = 1000, 100
 PLAY_SLOWER = (
     "play it slower, or by `ros2 run starpos_bringup replay`; frames without them have other fixes, or none"
 )
@@ -62,7 +64,8 @@ class SolverNode(Node):
             lambda: JobRunner(self, self._go_on),
             self._inputs,
             NodeLog(self.get_logger()),
-            arrived=self._arrived_tilts,
+            arrived=lambda: self._arrived(self._tilts, "tilt", TILT_QUEUE),
+            arrived_stars=lambda: self._arrived(self._stars, "stars", STARS_QUEUE),
             topic=self.resolve_topic_name(CAMERA_TOPIC),
         )
         self._connect()
@@ -79,7 +82,7 @@ class SolverNode(Node):
         takes: dict[str, Take] = {
             CAMERA_TOPIC: lambda m, _: self._publish(session.take_camera(m, self._now())),
             "tilt": lambda m, info: self._publish(session.take_tilt(m, _sent(info), self._now())),
-            "stars": lambda m, _: self._publish(session.take_stars(m, self._now())),
+            "stars": lambda m, info: self._publish(session.take_stars(m, self._now(), _sent(info))),
         }
         if session.gnss is not None:
             takes[gnss_teacher.TOPIC] = lambda m, _: self._publish(session.take_gnss(m, self._now()))
@@ -94,15 +97,15 @@ class SolverNode(Node):
             )
         subscription_from_any(self, CameraInfo, CAMERA_TOPIC, self._taker(CAMERA_TOPIC, takes), 10)
         self._tilts = subscription(self, msg.Tilt, "tilt", self._taker("tilt", takes), TILT_QUEUE)
-        subscription(self, msg.StarArray, "stars", self._taker("stars", takes), 10)
+        self._stars = subscription(self, msg.StarArray, "stars", self._taker("stars", takes), STARS_QUEUE)
+        self._again = self.create_guard_condition(self._go_on)
         if self._values["gyro"]:
             best_effort = ReliabilityPolicy.BEST_EFFORT
             subscription(self, Imu, IMU_TOPIC, self._on_imu, IMU_QUEUE, best_effort)
-        if session.gnss is not None:
-            # receivers' drivers publish in either way
-            best_effort = ReliabilityPolicy.BEST_EFFORT
-            take = self._taker(gnss_teacher.TOPIC, takes)
-            subscription(self, NavSatFix, gnss_teacher.TOPIC, take, 10, best_effort)
+        self._gnss = gnss_check.GnssComparison()
+        take = self._gnss.take if session.gnss is None else self._taker(gnss_teacher.TOPIC, takes)
+        # receivers' drivers publish in either way
+        subscription(self, NavSatFix, gnss_teacher.TOPIC, take, 10, ReliabilityPolicy.BEST_EFFORT)
         self.create_service(Solve, "~/solve", self._on_solve)
         self.create_service(Trigger, "~/reset", self._on_reset)
         self._calibration_services = CalibrationServices(self, self._session, self._settings)
@@ -114,6 +117,7 @@ class SolverNode(Node):
         tasks = {
             "Solution": self._report_solution,
             "Inputs": lambda: self._inputs.report({"tilts kept": len(session.tilts)}, self._dropped.counts),
+            "Outputs": self._report_outputs,
             "Clock": self._report_clock,
             "Conditions": self._report_conditions,
             "Calibration": session.calibrating.report,
@@ -161,17 +165,19 @@ class SolverNode(Node):
         if time_is_simulated(self):
             self._dropped.came(name, info)
 
-    def _arrived_tilts(self) -> Iterator[tuple[msg.Tilt, Sent]]:
-        """Read the tilts that have arrived but wait for the executor; in a replay they wait for their turn."""
+    def _arrived(self, ear: Subscription, name: str, most: int) -> Iterator[tuple[Any, Sent]]:
+        """Read what has arrived but waits for the executor; in a replay it waits for its turn.
+
+        name: relative one of the topic.  most: messages that may wait.
+        """
         if self._replayed is not None and self._replayed.playing:
             return
-        handle = self._tilts.handle
-        with handle:
-            for _ in range(TILT_QUEUE):
-                taken = handle.take_message(msg.Tilt, False)
+        with ear.handle:
+            for _ in range(most):
+                taken = ear.handle.take_message(ear.msg_type, False)
                 if taken is None:
                     return
-                self._note_dropped("tilt", taken[1])
+                self._note_dropped(name, taken[1])
                 yield taken[0], _sent(taken[1])
 
     def _go_on(self) -> None:
@@ -197,6 +203,8 @@ class SolverNode(Node):
                 self._replayed.note(output.stamp, output.solution.ok)
         if outputs:
             self._update_transforms()
+        if self._session.more:
+            self._again.trigger()
         # poll only while a frame waits; where the clock is played, its ticks do
         waits = self._session.waits and not time_is_simulated(self)
         if waits and self._poll.is_canceled():
@@ -230,8 +238,14 @@ class SolverNode(Node):
             waiting = (
                 "building the triangles of this field" if session.instrument.preparing else "no frame yet"
             )
-            return Diagnosis(Level.WARN, session.instrument.trouble or waiting, session.counts)
-        return reports.of_solution(session.answer, session.counts)
+            return Diagnosis(Level.WARN, session.instrument.trouble or waiting, session.pace.counts)
+        remarks = session.pace.complaint, self._gnss.remark(session.answer, self._settings.vertical)
+        return reports.of_solution(session.answer, session.pace.counts, "; ".join(filter(None, remarks)))
+
+    def _report_outputs(self) -> Diagnosis:
+        if others := other_publishers(self, self._outputs.shared):
+            return Diagnosis(Level.WARN, others)
+        return Diagnosis(Level.OK, "no other node publishes on fix or heading/imu")
 
     def _report_clock(self) -> Diagnosis:
         latest, solver = self._session.latest, self._session.instrument.solver

@@ -37,6 +37,11 @@ class SolutionPublishers:
         check = () if self._check is None else (self._check,)
         return self._solution, self._fix, self._fix_averaged, self._imu, self._attitude, *check
 
+    @property
+    def shared(self) -> tuple[Publisher, ...]:
+        """The publishers of topics whose names other drivers have, too."""
+        return self._fix, self._imu
+
     def publish(self, output: Output) -> None:
         """Publish what a session made."""
         header = self._header(output.stamp)

@@ -5,6 +5,7 @@
 where the base link is under way.
 """
 
+from functools import cached_property
 from importlib.util import find_spec
 
 from geometry_msgs.msg import Quaternion, TransformStamped, Vector3
@@ -37,10 +38,14 @@ class StaticTransforms:
         """
         if not wanted:
             self._close()
-        elif _can_be_told(self._node, STATIC):
+        elif self._possible:
             self._publish(
                 transforms_of(instrument, link, names.camera, names.inclinometer) if instrument else ()
             )
+
+    @cached_property
+    def _possible(self) -> bool:
+        return _can_be_told(self._node, STATIC)
 
     def _publish(self, transforms: tuple[Transform, ...]) -> None:
         from tf2_msgs.msg import TFMessage
@@ -79,10 +84,14 @@ class MovingTransform:
             if self._publisher is not None:
                 self._node.destroy_publisher(self._publisher)
                 self._publisher = None
-        elif self._publisher is None and _can_be_told(self._node, MOVING):
+        elif self._publisher is None and self._possible:
             from tf2_msgs.msg import TFMessage
 
             self._publisher = self._node.create_publisher(TFMessage, MOVING, MOVING_QOS)
+
+    @cached_property
+    def _possible(self) -> bool:
+        return _can_be_told(self._node, MOVING)
 
     def publish(self, odometry: Odometry) -> None:
         """Publish a pose if the topic is open."""
@@ -98,12 +107,11 @@ class MovingTransform:
 
 
 def _can_be_told(node: Node, topic: str) -> bool:
-    """Whether there are messages of tf; says in the log if not."""
+    """Whether there are messages of tf; says in the log if not. Looking takes longer than a fix: ask once."""
     if find_spec("tf2_msgs") is not None:
         return True
     node.get_logger().info(
         f"tf2_msgs is not installed, so there is no {topic}: sudo apt install ros-jazzy-tf2-msgs, or set publish_tf to "
-        "false",
-        once=True,
+        "false"
     )
     return False

@@ -48,6 +48,7 @@ FULL = {
     "link": "link_bandwidth",
     "navigation": "benchmark_navigation",
     "nodes": "latency",
+    "rates": "camera_rates",
 }
 
 

@@ -29,7 +29,7 @@ def cells(page: str) -> list[dict]:
 def notebook(page: str) -> str:
     """The notebook of a page, as JSON."""
     kernel = {"kernelspec": {"display_name": "Python 3", "language": "python", "name": "python3"}}
-    page = page.replace("The same as a [notebook](method.ipynb).\n", "")
+    page = re.sub(r"\s*The same text is a\s+\[notebook\]\(method.ipynb\)\.", "", page)
     whole = {"cells": cells(page), "metadata": kernel, "nbformat": 4, "nbformat_minor": 5}
     return json.dumps(whole, indent=1, ensure_ascii=False) + "\n"
 

@@ -93,7 +93,10 @@ def has_mark(path: Path | str) -> bool:
 
 
 def path_of(url: str) -> Path:
-    """The file that file:///a/b.yaml, or a path that may begin with ~, names; InstrumentError for anything else."""
+    """The file that file:///a/b.yaml, package://a/b.yaml, or a path that may begin with ~, names.
+
+    InstrumentError for anything else, and for a package that is not installed.
+    """
     if len(url) > LONGEST_PATH:
         raise InstrumentError(
             f"a text of {len(url)} characters names no file: give file:///path/to/file.yaml, or a path"
@@ -104,10 +107,22 @@ def path_of(url: str) -> Path:
             return Path(url).expanduser()
         if parts.scheme == "file" and parts.netloc in ("", "localhost") and parts.path:
             return Path(unquote(parts.path))
+        if parts.scheme == "package" and parts.netloc and parts.path:
+            return _share_of(parts.netloc) / unquote(parts.path).lstrip("/")
     except (ValueError, RuntimeError):
         # It is no URL, or ~ names a user who does not exist.
         pass
     raise InstrumentError(f"{url!r} names no file: give file:///path/to/file.yaml, or a path")
+
+
+def _share_of(package: str) -> Path:
+    """The share folder of a package of ROS, as ament finds it; InstrumentError where it is not installed."""
+    for prefix in filter(None, os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)):
+        if (Path(prefix) / "share/ament_index/resource_index/packages" / package).is_file():
+            return Path(prefix) / "share" / package
+    raise InstrumentError(
+        f"package://{package}: no such package is installed: enter the workspace that has it"
+    )
 
 
 def _open_at_once(path: str, flags: int) -> int:

@@ -19,7 +19,6 @@ def test_a_file_url_and_a_path_name_a_file():
     "url",
     [
         "http://a/b.yaml",
-        "package://a/b.yaml",
         "file://host/b.yaml",
         "file:",
         "//[",
@@ -31,3 +30,13 @@ def test_what_names_none_is_refused_with_what_does(url):
     with pytest.raises(InstrumentError, match="give file:///path") as raised:
         path_of(url)
     assert len(str(raised.value)) < 200
+
+
+def test_a_package_of_ros_has_its_files_where_ament_finds_them(tmp_path, monkeypatch):
+    index = tmp_path / "share/ament_index/resource_index/packages"
+    index.mkdir(parents=True)
+    (index / "robot").touch()
+    monkeypatch.setenv("AMENT_PREFIX_PATH", f"/nowhere:{tmp_path}")
+    assert path_of("package://robot/config/a%20b.yaml") == tmp_path / "share/robot/config/a b.yaml"
+    with pytest.raises(InstrumentError, match="no such package is installed"):
+        path_of("package://rob/config/a.yaml")

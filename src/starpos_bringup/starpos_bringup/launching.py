@@ -15,7 +15,7 @@ from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
 from launch_ros.substitutions import FindPackageShare
 
-from starpos_bringup.launch_arguments import LaunchError, is_true, one_of
+from starpos_bringup.launch_arguments import LaunchError, is_true, names, one_of
 
 if TYPE_CHECKING:
     from launch.launch_context import LaunchContext
@@ -32,12 +32,19 @@ COMMON_ARGUMENTS = (
     ),
     ("log_level", "info", ", ".join(LOG_LEVELS)),
     (
+        "outputs",
+        "",
+        "puts fix, fix_averaged and heading/imu under this name: stars is stars/fix, where another driver has fix",
+    ),
+    (
         "enclaves",
         "/starpos",
         "where the SROS2 enclaves are: each process has enclaves/EXECUTABLE, if security is enabled",
     ),
 )
 RESPAWN_DELAY_S = 2.0
+# Topics of the solver whose names drivers of GNSS and IMUs have, too.
+OUTPUTS = ("fix", "fix_averaged", "heading/imu")
 # The variable until Jazzy, and the one after it.
 PROFILES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
 QUICK_START = PathJoinSubstitution([FindPackageShare("starpos_bringup"), "config", "quick_start.xml"])
@@ -51,6 +58,7 @@ class Common:
     log_level: str
     enclaves: str
     respawn: bool = False
+    outputs: str = ""
 
     @classmethod
     def of(cls, told: Mapping[str, str]) -> "Common":
@@ -61,7 +69,8 @@ class Common:
             raise LaunchError(f"params_file:={told['params_file']}: there is no such file")
         respawn = is_true(told, "respawn") if "respawn" in told else False
         level = one_of(told, "log_level", LOG_LEVELS)
-        return cls(str(path), level, told["enclaves"].rstrip("/"), respawn)
+        outputs = names(told, "outputs")[0] if told["outputs"] else ""
+        return cls(str(path), level, told["enclaves"].rstrip("/"), respawn, outputs)
 
 
 def declared(arguments: Arguments) -> list[DeclareLaunchArgument]:
@@ -136,7 +145,10 @@ def profile() -> dict[str, PathJoinSubstitution]:
 def ros_arguments(executable: str, common: Common) -> list[str]:
     """Make the arguments for ROS; the enclave is only a name while security is not enabled (ROS_SECURITY_ENABLE)."""
     enclave = f"{common.enclaves}/{executable}"
-    return ["--ros-args", "--log-level", common.log_level, "--enclave", enclave]
+    remaps = [
+        word for name in OUTPUTS if common.outputs for word in ("-r", f"{name}:={common.outputs}/{name}")
+    ]
+    return ["--ros-args", "--log-level", common.log_level, "--enclave", enclave, *remaps]
 
 
 def _written(parameters: Mapping[str, Mapping]) -> str:

@@ -47,3 +47,14 @@ def test_nodes_find_each_other_at_once_and_the_rest_of_the_robot_is_as_it_was(en
 @pytest.mark.parametrize("name", ["FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE"])
 def test_profiles_of_the_users_stay(environment, name):
     assert environment(**{name: "/home/robot/lossy_link.xml"}) == {}
+
+
+def test_outputs_are_put_under_a_name_of_their_own(launching):
+    common = launching.Common("", "info", "/starpos", outputs="stars")
+    words = launching.ros_arguments("solver", common)
+    assert [w for w in words if ":=" in w] == [
+        "fix:=stars/fix",
+        "fix_averaged:=stars/fix_averaged",
+        "heading/imu:=stars/heading/imu",
+    ]
+    assert "-r" not in launching.ros_arguments("solver", launching.Common("", "info", "/starpos"))

@@ -99,7 +99,8 @@ class GnssDrive:
                 error_m = slow + rng.normal(0, WHITE_M, 2) + astray(t)
                 off = error_m / radii / [np.cos(latitude), 1.0]
                 tilt = Tilt(
-                    *theta,
+                    theta[0],
+                    theta[1],
                     np.eye(2) * noise**2,
                     utc_unix_s=1.7e9 + t,
                     samples=READINGS,

@@ -25,6 +25,10 @@ QUEUE, DEPTH = 512, 1000
 # how often a simulator's publishers are looked at
 LOOK_S = 0.5
 RATE_WINDOW_S = 5.0
+# Stamps that are older when they come are of another clock.
+OLD_S = 5.0
+# A stated standard deviation over the scatter of the messages, from which on it is named as a placeholder.
+PLACEHOLDER = 5.0
 # Silence is reported within 2 s, with a report every second.
 PATIENCE_S = 0.8
 
@@ -96,6 +100,7 @@ class ImuSource(TiltSource):
         values = {
             "messages from the future": tilts.future,
             "messages out of order": tilts.averager.disordered,
+            "age of the stamps (s)": tilts.age_s,
             "IMU's frame": tilts.frame or "unknown",
             "noise by axis (arcsec)": noise_text(tilts.noise),
         }
@@ -105,10 +110,23 @@ class ImuSource(TiltSource):
             sentence=sentence,
             rate_hz=rate_hz,
             counts=counts,
-            complaint="",
+            complaint=self._complaint(),
             step=self._clock.step,
             values=values,
         )
+
+    def _complaint(self) -> str:
+        if self._tilts.age_s > OLD_S:
+            return (
+                f"stamps on {self._topic} are {self._tilts.age_s:.3g} s behind this host's clock: they belong to another "
+                "clock, and frames find no tilts; stamp with the time of day, or synchronise the IMU's host."
+            )
+        if self._tilts.excess > PLACEHOLDER:
+            return (
+                f"the variance on {self._topic} is a placeholder: {self._tilts.excess:.2g} times the scatter of its "
+                f"messages (1 sigma), and it widens fixes; set imu.variance to {inclinometer_parameters.SCATTER}."
+            )
+        return ""
 
     def _phase(self, now_s: float) -> tuple[Phase, str]:
         average_s = self._tilts.averager.seconds

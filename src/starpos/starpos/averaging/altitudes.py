@@ -32,20 +32,20 @@ from starpos.units import ARCSEC
 LEAST_SINE = 0.01
 # with a worse A3 the circles are no longer what a linear error makes of them: its axis is fitted first
 LINEAR_A3_RAD = 360 * ARCSEC
-# frames closer than this, or than so many sigma, look in one direction
+# maximum distance of frames that look in one direction, in rad and in sigma
 SAME_RAD, SAME_SIGMA = 60 * ARCSEC, 6.0
 MOST_DIRECTIONS = 1000
-# so many directions give the first places to try
+# number of directions that give the first places to try
 STARTS = 8
 ROUNDS, SETTLED = 30, 1e-12
-# answers closer to each other than this, in rad, are one
+# maximum distance (rad) of equal answers
 ALIKE = 1e-7
-# an answer that fits worse by so many sigma is excluded
+# an answer is excluded if its fit is worse by this
 EXCLUDED_SIGMA = 6.0
-# directions further off are left out, of so many or more, up to this share; and so often are they judged
+# outliers: their distance, minimum number of directions, maximum share left out, maximum number of rounds
 OUTLIER_SIGMA, FEWEST_JUDGED, MOST_OUTLIERS, JUDGED = 6.0, 6, 1 / 3, 6
 WITHIN = 0.95
-# three directions that contradict each other by more sigma err by nobody knows how much
+# three directions that contradict each other by more have errors of unknown size
 CONTRADICT_SIGMA = 5.0
 
 
@@ -55,7 +55,7 @@ class Circle:
 
     itrs (3,): geocentric apparent direction of the frame's centre.  zenith_distance (rad): as it is without refraction.
     sigma (rad): of the pointing, across the circle.  terms: errors of the zenith distance, with factors (1, m) in rad.
-    clock_stddev_s, stamp_stddev_s: as those of a fix.
+    clock_stddev_s, stamp_stddev_s: as in a fix.
     up (3,): in S, as the inclinometer shows it; axes: their number, 2 or 3.
     """
 
@@ -80,7 +80,7 @@ def circle_of(
     earth: EarthState,
     clock_stddev_s: float,
 ) -> Circle:
-    """The circle of one frame; FixError where its direction tells no altitude."""
+    """The circle of one frame; FixError if its direction does not determine an altitude."""
     level = mounting.level(tilt)
     seen = level.camera @ camera.centre_ray
     sine = np.hypot(seen[0], seen[1])
@@ -112,7 +112,7 @@ def circle_of(
 def place_of_circles(circles: Sequence[Circle], near: tuple[float, float] | None = None) -> Average:
     """The place where circles of several directions meet; its heading is NaN.
 
-    near: latitude, longitude (rad) that tells two places apart, where the circles meet in two.
+    near: latitude, longitude (rad) that selects one of two places, where the circles meet in two.
     `poses` is the number of directions, `left_out` the frames of those that disagree.
     Raises FixError if there are fewer than three directions, or two without `near`, or if they leave two places.
     """
@@ -270,7 +270,7 @@ def _sound(whole: Directions) -> np.ndarray:
 
 
 def _answer(part: Directions, near: tuple[float, float] | None) -> _Answer:
-    """The one place that fits; FixError if there is none, or another fits as well."""
+    """The one place that fits; FixError if no place fits, or two do."""
     weight = np.linalg.inv(part.covariance)
     found: list[_Answer] = []
     for start in starts(part):
@@ -316,7 +316,7 @@ def starts(part: Directions) -> list[np.ndarray]:
 
 
 def _refined(part: Directions, weight: np.ndarray, zenith: np.ndarray) -> _Answer | None:
-    """The answer near a zenith, by Gauss-Newton; None if there is none."""
+    """The answer near a zenith, by Gauss-Newton; None if it does not converge."""
     for _ in range(ROUNDS):
         left, slope = part.residual(zenith)
         normal = slope.T @ weight @ slope
@@ -378,11 +378,11 @@ def f_quantile(free: int, share: float) -> float:
 def excess(chi2: float, free: int) -> float:
     """Variance beyond the stated one, as a share of it, for residuals that scatter more than stated.
 
-    Few of them tell badly by how much; Student's t makes up for it. One alone is taken for two.
+    A few of them determine it poorly; Student's t allows for this. A single one counts as two.
     """
     if free < 1 or chi2 <= free:
         return 0.0
-    # the ellipse that holds a share WITHIN, over that of a known scatter
+    # the ellipse that holds a share WITHIN, over the ellipse of a known scatter
     wide = f_quantile(max(free, 2), WITHIN) / -np.log(1 - WITHIN)
     return float((chi2 / free - 1) * wide)
 

@@ -2,7 +2,7 @@
 """The average of many fixes of one place, one after the other or all at once: both use the same recursion.
 
 A fix that lies far from the others (a wrong tilt or time stamp) is left out.  A robot that moved gets a new average.
-The stars tell the two apart: a camera that has not turned against the Earth has not moved.
+The stars separate the two cases: a camera that has not turned against the Earth has not moved.
 """
 
 from collections.abc import Sequence
@@ -23,11 +23,12 @@ from starpos.fix.readable import InDegrees
 SCATTER = "scatter"
 # a fix further off than this is wrong, or of another place
 GATE_SIGMA = 6.0
-# so many fixes of a turned camera, so far off, are of another place
+# minimum number and distance of fixes of a turned camera that belong to another place
 MOVED_FIXES, MOVED_SIGMA = 3, 4.5
-# so many steps from pose to pose tell of their scatter, by the smaller share of them; no inclinometer errs by more
+# minimum number of steps from pose to pose that show their scatter, share of the smaller ones that are used, and
+# maximum error of an inclinometer
 FEWEST_STEPS, SMALLER, MOST_POSE_RAD = 6, 1 / 3, np.radians(0.25)
-# an average of a smaller share of the fixes is none of one place that scatters
+# if fewer than this share of the fixes agree, they do not describe one place
 MOST_OF_ALL = 2 / 3
 # a rival with fewer fixes is kept when the camera is touched again
 RIVAL_FIXES = 10
@@ -74,7 +75,7 @@ class Average:
 def average(fixes: Sequence[Fix]) -> Average:
     """The average of fixes in any order, of the last place in time if there are several; a frame counts once.
 
-    Raises FixError if there is no fix, or if as many were left out as were used: then nobody can say which are right.
+    Raises FixError if there is no fix, or if as many were left out as were used: it is then unknown which are right.
     """
     different = {(f.utc_unix_s, f.latitude, f.longitude): f for f in fixes}.values()
     in_order = sorted(different, key=lambda f: f.utc_unix_s)
@@ -137,7 +138,7 @@ class _Track:
     """An average that grows with each fix.
 
     pose: the first fix since the camera was last touched; in_pose: number of accepted fixes since then.
-    claim: what the fixes tell of their scatter.
+    claim: the scatter that the fixes show.
     """
 
     place_filter: PlaceFilter
@@ -151,7 +152,7 @@ class _Track:
 
     @classmethod
     def before(cls, f: Fix, frame_sigma: float) -> "_Track":
-        """A track without a fix, ready for fixes like `f` that scatter by so many rad beyond their budgets."""
+        """A track without a fix, ready for fixes like `f`; frame_sigma (rad): their scatter beyond their budgets."""
         place_filter = PlaceFilter.before(_with_scatter(f, frame_sigma))
         return cls(
             place_filter=place_filter, pose=f, claim=Claim(frame_sigma=frame_sigma), began_unix_s=f.utc_unix_s
@@ -287,7 +288,7 @@ class Averager:
             self._rival_turned &= self._rival is not None
             rival, self._disbelieved = track.rival(f).begin(f), 1
         self._rival = rival
-        # while nobody touches the camera, only a majority of its fixes may overrule the average
+        # while the camera is not touched, only a majority of its fixes may overrule the average
         if self._disbelieved >= MOVED_FIXES if self._rival_turned else rival.frames > track.in_pose:
             self._switch(track, rival, f)
 

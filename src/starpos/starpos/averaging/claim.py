@@ -20,9 +20,9 @@ from starpos.fix.fix import Fix
 
 # sigma of a place in rad before anything is known of it
 ANYWHERE_RAD = np.pi
-# so many remembered fixes are averaged two by two
+# number of remembered fixes at which they are averaged two by two
 MOST_REMEMBERED = 2 * MOST_ROWS
-# a fix more changes little where many are seen: the scatter is looked at again after so large a share more
+# one more fix changes little among many: the scatter is computed again after an increase by this share
 NEWS = 0.3
 
 
@@ -49,7 +49,7 @@ class Remembered:
 
     @classmethod
     def of(cls, f: Fix, first: Fix, pose: int, plane: Plane) -> "Remembered":
-        """What is remembered of a fix of a pose that began with `first`."""
+        """The part of a fix to remember; its pose began with `first`."""
         own = [t for t in f.terms if not t.common and t.shared != EACH_POSE]
         new = [t for t in f.terms if t.shared == EACH_POSE]
         turn, first_turn = plane.turn(f)[:2], plane.turn(first)[:2]
@@ -90,9 +90,9 @@ def _sigma(terms: Sequence[ErrorTerm]) -> float:
 
 @dataclass(frozen=True)
 class Claim:
-    """What is remembered of the fixes of a place, and what they told when they were last looked at.
+    """The remembered parts of the fixes of a place, and the result when they were last looked at.
 
-    looked: number of fixes then.  frame_sigma (rad): of what a fix evidently has beside its stated errors.
+    looked: number of fixes then.  frame_sigma (rad): evident error of a fix in addition to its stated errors.
     beyond (2, 2): covariance in m2 of east, north beyond what the filter states.
     """
 

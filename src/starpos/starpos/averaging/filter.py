@@ -2,7 +2,7 @@
 """A Kalman filter over the place and heading of an instrument at rest, and over the errors that its fixes share.
 
 A calibration error that turns with the instrument is separated from the place; one that does not turn stays in the
-answer.  A zero that wanders also wanders in the filter.  The filter's size is constant, and its answer is that of
+answer.  A zero that wanders also wanders in the filter.  The filter's size is constant, and its answer equals
 generalised least squares over all fixes at once (test_average.py).  It keeps a covariance per source of error, so that
 the average has a budget.
 """
@@ -88,9 +88,9 @@ class PlaceFilter:
     """State of the filter after the fixes so far.
 
     state (n,): east, north, heading in UNIT, then the errors that fixes share, in units of their own.
-    known (3,): mask of those of east, north, heading that are known.
+    known (3,): mask of the known ones among east, north, heading.
     sources (T, n, n): covariance of the state that comes from each of the T terms of a fix.
-    names, columns, keys: name of each term, place of its shared error in the state, and `shared` of its last fix.
+    names, columns, keys: names of the terms, positions of their shared errors in the state, and `shared` of the last fix.
     utc_unix_s: time of the last fix.
     """
 
@@ -170,7 +170,7 @@ class PlaceFilter:
             kept -= gain @ design
             brought[:, known] = gain
             state = state + gain @ innovation
-        # an unknown element becomes that of the fix, less the shared errors
+        # an unknown element is set to the fix, less the shared errors
         for row in np.flatnonzero(~known):
             state[row] = seen[row] - shared[row] @ state
             kept[row] = -shared[row] @ kept
@@ -183,7 +183,7 @@ class PlaceFilter:
         """Whether the step from an earlier place to this one is short enough for the plane.
 
         An error of the clock moves the place along its parallel, which leaves the plane with the square of the step: by
-        20 m in 16 km.  That has to be small beside this place's sigma.
+        20 m in 16 km.  That has to be small compared with this place's sigma.
         """
         if not before.known[:2].all():
             return True
@@ -232,7 +232,7 @@ class PlaceFilter:
         return self.state[:2] * UNIT[:2]
 
     def terms(self, like: Sequence[ErrorTerm]) -> tuple[ErrorTerm, ...]:
-        """The budget of `place`, with factors (3, 3); names and keys are those of the terms `like`."""
+        """The budget of `place`, with factors (3, 3); names and keys as in the terms `like`."""
         latitude, _ = self.plane.place(self.state[:2] * UNIT[:2])
         return tuple(
             ErrorTerm(t.name, self.plane.local(latitude, symmetric_root(source[:3, :3])), shared=t.shared)
@@ -240,7 +240,7 @@ class PlaceFilter:
         )
 
     def sigmas_apart(self, part: "PlaceFilter") -> float:
-        """Distance in sigma between this place and that of `part`, a filter of some of the same fixes."""
+        """Distance in sigma between this place and the place of `part`, a filter of some of the same fixes."""
         apart = self.plane.across(*part.place[:2]) - self.state[:2]
         # the difference of a part and the whole is independent of the whole, so their covariances subtract
         beyond = (part.sources.sum(0) - self.sources.sum(0))[:2, :2]

@@ -1,15 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How much frames scatter beyond what they state, and what that makes of the answer of all.
+"""Estimate how much frames scatter beyond their stated errors, and the effect on their common answer.
 
 An inclinometer may have an error of each pose, or one that wanders (wind, soft ground, warming up), or more noise than
-stated, and its axes may err with the lean. Nobody need have stated any of it; the frames tell. Every kind and size is
+stated, and its axes may err with the lean. None of this need be stated; the frames show it. Every kind and size is
 tried, weighted by its evidence, and the answer is the mean over all (Bayesian model averaging), so that few frames make
 a wide claim and many a narrow one.
 
-The error of a pose may be new at each pose (hysteresis, a soft footing), or a smooth function of how the camera leans (a
-mount that bends, a sensor that is not linear) or of its whole attitude (cables that pull, a bearing): a Gaussian process
-whose length nobody knows (Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, section 4.2). Then poses
-near each other are alike, and many of them know little more than one. docs/error_budget.md has the model in words.
+The error of a pose may be new at each pose (hysteresis, a soft footing). Or it is a smooth function of the camera's lean
+(a mount that bends, a sensor that is not linear), or of its whole attitude (cables that pull, a bearing). This is a
+Gaussian process of unknown length (Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, section
+4.2). Then poses near each other are alike, and many of them add little to one. docs/error_budget.md has the model in
+words.
 """
 
 from collections.abc import Sequence
@@ -21,38 +22,38 @@ from starpos.units import ARCSEC
 
 # sizes: from a share of a frame's own error to the most that any sensor has
 LEAST_SHARE, MOST_RAD, SIZES = 0.5, 3600 * ARCSEC, 12
-# times in which an error forgets itself, and the most that frames may be alike on average: what hardly changes in the
-# whole time cannot be told from a constant
+# correlation times of an error, and maximum mean correlation of the frames: an error that hardly changes in the whole
+# time looks like a constant
 FORGETS_S, MOST_ALIKE = (15.0, 60.0, 240.0, 1000.0, 4000.0), 0.75
 # lengths in rad over which an error of the pose changes with the lean, and with the attitude
 LEAN_RAD, ATTITUDE_RAD = (0.05, 0.15, 0.5), (0.2, 0.6, 1.5)
 # share of its variance that is new at each pose all the same
 ROUGH = (0.03, 0.3)
-# readings with more noise than stated beside another error: sizes of that noise, over what the frames of a pose show
+# excess noise of readings in addition to another error: sizes of that noise over the scatter of the frames of a pose
 NOISES, NOISY_SIGMA = (0.7, 1.0, 1.4), 4.0
-# the response errs more than stated where that is so probable
+# probability above which we report that the sensor's response error is understated
 SHOWN = 0.75
-# the scatter is evident where it is so improbable that all is as stated
+# probability that all is as stated, below which the scatter is evident
 EVIDENT = 0.25
-# sizes of the coefficients of the response, beside what is stated
+# sizes of the coefficients of the response, in addition to the stated ones
 RESPONSES = (0.0, 3e-4, 1e-3, 3e-3, 1e-2, 3e-2)
 # prior probability that all is as stated; a larger error is the less likely, in proportion
 AS_STATED = 0.7
-# with fewer degrees of freedom the frames, or the poses, do not tell, unless they contradict what is stated by so much
+# minimum degrees of freedom of frames or poses; LEAST_FREE if they contradict stated errors by CONTRADICT_SIGMA
 FEWEST_FREE, LEAST_FREE, CONTRADICT_SIGMA = 2.5, 0.5, 4.0
-# so many frames or means of frames are looked at; more are averaged before
+# maximum number of frames or means of frames; more are averaged first
 MOST_ROWS = 64
 
 
 @dataclass(frozen=True, kw_only=True)
 class Frames:
-    """What K frames say of n parameters that they share, all per axis of two.
+    """The data of K frames on n parameters that they share, all per axis of two.
 
     utc_unix_s (K,).  pose (K,): number of each one's pose, from 0.
-    attitude (K, 3, 3): takes axes of the ground (ITRS) into those of the camera.  up (K, 3): in axes of the instrument.
+    attitude (K, 3, 3): takes axes of the ground (ITRS) into the camera's axes.  up (K, 3): in axes of the instrument.
     residual (K, 2) in rad, where the parameters are 0, and its derivatives design (K, 2, n) by them.
     sigma (K,) in rad: own error of each frame.  pose_sigma (rad): stated error of a pose.
-    prior_sigma (n,): of the parameters about 0.  response (n,): mask of those that are coefficients of a response.
+    prior_sigma (n,): of the parameters about 0.  response (n,): mask of the coefficients of a response.
     zero_free: whether the parameters hold an error that is the same at all poses, as an A3 that is being found does.
     """
 
@@ -83,10 +84,10 @@ class Frames:
 
 @dataclass(frozen=True, kw_only=True)
 class Scatter:
-    """What the frames tell, as means over all hypotheses.
+    """The result of the frames, as means over all hypotheses.
 
-    pose_sigma (rad): root of the mean variance of what does not average away within a pose; frame_sigma (rad): the same
-    of all that a frame has beside its own stated error; noise_sigma (rad): of what is new in each frame alone.
+    pose_sigma (rad): root of the mean variance of errors that do not average out within a pose; frame_sigma (rad): the
+    same of all errors of a frame in addition to its own stated error; noise_sigma (rad): of errors new in each frame.
     evident: whether it is improbable that the frames scatter as stated; response_evident: that the response
     errs as stated.
     moved (n,), covariance (n, n): of the parameters.  stated (n, n): their covariance if all is as stated, and the
@@ -112,7 +113,7 @@ class _Kind:
 
 
 def scatter_of(frames: Frames) -> Scatter:
-    """What frames tell of their scatter and of the parameters that they share."""
+    """Estimate the frames' scatter and the parameters that they share."""
     share, poses = frames.blocks(), _pose_means(frames)
     y, j = share @ frames.residual, np.einsum("bk,kin->bin", share, frames.design)
     own = np.diag(share**2 @ frames.sigma**2)
@@ -156,8 +157,7 @@ def scatter_of(frames: Frames) -> Scatter:
     log_weight = evidence + np.log(np.outer(weights, wide_prior).ravel())
     weight = np.exp(log_weight - log_weight.max())
     weight /= weight.sum()
-    # nobody's word against a sensor is enough to doubt its response: the frames have to show it; few poses that
-    # contradict each other leave it open
+    # the response is doubted only if the frames show an error; few poses that contradict each other leave it open
     wider = np.arange(len(weight)) % number > 0
     if not few and weight[wider].sum() < SHOWN:
         weight[wider] = 0.0
@@ -184,7 +184,7 @@ def _pose_means(frames: Frames) -> np.ndarray:
 
 
 def _freedom(y: np.ndarray, j: np.ndarray, stated: np.ndarray, prior_sigma: np.ndarray) -> tuple[float, bool]:
-    """Degrees of freedom of data (B, 2), and whether these tell that they scatter more than (B, B) states."""
+    """Degrees of freedom of data (B, 2), and whether these show that they scatter more than (B, B) states."""
     normal, pull, _ = _sums(y, j, stated[None])
     free = 2 * len(y) - _told(normal[0], prior_sigma)
     if free >= FEWEST_FREE:
@@ -251,7 +251,7 @@ def _kind(share: np.ndarray, poses: np.ndarray, covariance: np.ndarray, noise: f
 def _sized(
     beside: np.ndarray, kinds: Sequence[_Kind], sizes: np.ndarray, prior: np.ndarray
 ) -> list[tuple[float, np.ndarray, np.ndarray]]:
-    """Hypotheses of errors of each size (S,), with their priors (S,), beside what has the covariance (B, B)."""
+    """Hypotheses of errors of each size (S,), with their priors (S,), added to errors of covariance `beside` (B, B)."""
     return [
         (float(w), beside + size**2 * kind.kernel, size**2 * kind.means)
         for kind in kinds
@@ -268,7 +268,7 @@ def _sums(y: np.ndarray, j: np.ndarray, covariance: np.ndarray) -> tuple[np.ndar
     """Normal matrices, right-hand sides, and -2 log likelihoods of data (B, 2) with covariances (H, B, B) an axis."""
     lower = np.linalg.cholesky(covariance)
     n = j.shape[2]
-    # one more axis: numpy before 2 takes a matrix beside a stack of matrices for a stack of vectors
+    # one more axis: numpy before 2 takes a matrix combined with a stack of matrices for a stack of vectors
     white = np.linalg.solve(lower, np.concatenate([y, j.reshape(len(y), -1)], 1)[None])
     seen, slope = white[..., :2].reshape(len(lower), -1), white[..., 2:].reshape(len(lower), -1, n)
     turned = slope.swapaxes(1, 2)
@@ -281,7 +281,7 @@ def _sums(y: np.ndarray, j: np.ndarray, covariance: np.ndarray) -> tuple[np.ndar
 
 
 def _told(normal: np.ndarray, prior_sigma: np.ndarray) -> float:
-    """Number of parameters that the data tell rather than the prior."""
+    """Number of parameters that the data determine rather than the prior."""
     told = np.maximum(np.linalg.eigvalsh(normal * np.outer(prior_sigma, prior_sigma)), 0.0)
     return float(np.sum(told / (1 + told)))
 

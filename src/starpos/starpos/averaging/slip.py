@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tells a camera that was touched from one whose time stamps contradict each other.
+"""Distinguish a camera that was touched from one whose time stamps contradict each other.
 
 For a camera at rest the sky turns about the Earth's axis as its time stamps say.  If by the stamps the camera itself has
 turned about exactly that axis, which no hand does, one of the stamps is wrong.
@@ -17,7 +17,7 @@ from starpos.units import ARCSEC
 
 # errors may be as large as this
 SIGMAS = 6.0
-# a mount that nobody touches may settle by this
+# maximum creep of an untouched mount
 CREEP_RAD = 10 * ARCSEC
 # beyond it any turn about the plumb line is one about the Earth's axis
 HIGHEST_LATITUDE = np.radians(89.0)

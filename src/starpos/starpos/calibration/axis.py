@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The camera's axis in the inclinometer from elevations: A3 of pointings without a roll.
 
-Such a frame tells the angle between the plumb line and its centre alone. So of A3 only the direction of that centre in S
+Such a frame gives only the angle between the plumb line and its centre. So of A3 only the direction of that centre in S
 counts, two angles: they are fitted with the zenith, which is known or not, to frames of several directions. A turn of A3
 about the axis changes no elevation, and stays as it was given.
 """
@@ -22,11 +22,11 @@ from starpos.units import ARCSEC
 ROUNDS, SETTLED_CHI2, FIRST_DAMPING, LAST_DAMPING = 80, 1e-6, 1e-3, 1e9
 # an axis that is known better than this (rad) is known
 LEAST_RAD = 1e-9
-# so many zeniths are tried, those that fit best at first
+# number of zeniths that are tried, the ones that fit best at first
 TRIED = 4
-# an answer that fits worse by so many sigma is excluded
+# an answer is excluded if its fit is worse by this
 EXCLUDED_SIGMA = 6.0
-# fewer directions tell no axis, with the zenith known and unknown
+# minimum number of directions that determine an axis, with the zenith known and unknown
 FEWEST, FEWEST_WITHOUT_SITE = 2, 4
 # how long A3 may be used
 VALID_DAYS = 365.0
@@ -39,10 +39,10 @@ CirclesOf = Callable[[np.ndarray], Sequence[Circle]]
 
 @dataclass(frozen=True, kw_only=True)
 class FoundAxis:
-    """A3 whose axis the elevations told.
+    """A3 whose axis the elevations determined.
 
     a3 (3, 3).  ray (3,): the frame's centre in C.  zenith (3,) in ITRS.
-    covariance (2, 2) in rad2: of the axis along `across` (2, 3) in S, with what the directions scatter.
+    covariance (2, 2) in rad2: of the axis along `across` (2, 3) in S, with the scatter of the directions.
     scatter2: variance beyond the stated, as a share of it.  directions, frames: numbers.
     """
 
@@ -97,7 +97,7 @@ def find_axis(
 ) -> FoundAxis:
     """Fit A3's axis, and the zenith unless a site is given; `given` counts as well as it is known.
 
-    ray (3,): the frame's centre in C.  near: latitude, longitude (rad) that tells two answers apart.
+    ray (3,): the frame's centre in C.  near: latitude, longitude (rad) that selects one of two answers.
     Raises FixError if the directions are too few, or leave two answers.
     """
     first = Directions.of(sorted(circles_of(given.a3), key=lambda c: c.utc_unix_s))
@@ -176,7 +176,7 @@ def _fitted(
     zenith: np.ndarray,
     zenith_sigma: float | None,
 ) -> tuple[float, FoundAxis] | None:
-    """The answer near a zenith, by Levenberg and Marquardt's method, with its chi-square; None if there is none.
+    """The answer near a zenith, by Levenberg and Marquardt's method, with its chi-square; None if it does not converge.
 
     Axis and zenith together lie in a narrow, bent valley where the sensor leans about alike in all directions.
     """

@@ -41,7 +41,7 @@ from starpos.sky.catalogue import Catalogue
 
 # the first rounds have coarse matches and fit few terms: with more, wrong matches in the corners would confirm themselves
 FIRST_FREE = (("fx", "fy", "k1"), ("fx", "fy", "cx", "cy", "k1"), ("fx", "fy", "cx", "cy", "k1", "k2"))
-# of fewer stars than so many times the fewest nearly all must fit, because a wrong lens leaves some over
+# below FEW times the minimum number of stars nearly all must fit, because a wrong lens leaves some over
 FEW, NEARLY_ALL = 2, 0.9
 # most rounds in which all terms are fitted
 ROUNDS = 5

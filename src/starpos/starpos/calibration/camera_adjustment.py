@@ -44,7 +44,7 @@ class Sighting:
     directions (N, 3): apparent directions, aberration included; direction_sigma (N,): sigma per axis in rad.
     attitude (3, 3): takes `directions` into C, approximately.
     level (3, 3): takes C into the local level L; None if unknown.
-    timed: whether the aberration is that of the frame's date.
+    timed: whether the aberration is computed for the frame's date.
     """
 
     xy: np.ndarray
@@ -87,8 +87,8 @@ def with_values(camera: Camera, values: np.ndarray) -> Camera:
     return replace(camera, fx=fx, fy=fy, cx=cx, cy=cy, distortion=(*distortion, *held))
 
 
-# The unknowns q, in sigma of their priors: scale, squareness, the camera's other parameters, and these: the strength of
-# the refraction relative to the model, and the shrinking of the field along x and y where the level is not known
+# The unknowns q are in sigma of their priors: scale, squareness, the camera's other parameters, and these. They are the
+# strength of the refraction relative to the model, and the shrinking of the field along x and y if the level is unknown
 OF_THE_AIR = ("refraction", "shrink_x", "shrink_y")
 
 

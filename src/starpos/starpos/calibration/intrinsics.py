@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fits a camera, and an attitude per frame, to identified stars (camera_adjustment.py), and judges the fit.
+"""Fit a camera, and an attitude per frame, to identified stars (camera_adjustment.py), and judge the fit.
 
-A narrow field cannot tell everything: a shift of the principal point looks nearly like a turn of the camera, and k2 and
-k3 look nearly like k1.  The covariance is that of sky and priors together.
+A narrow field does not determine everything: a shift of the principal point looks nearly like a turn of the camera, and
+k2 and k3 look nearly like k1.  The covariance combines sky and priors.
 """
 
 from collections.abc import Sequence
@@ -25,14 +25,14 @@ from starpos.errors import CalibrationError, InstrumentError
 from starpos.instrument.camera import Camera
 from starpos.instrument.lens import EQUIDISTANT
 
-# the sky has told a parameter if its sigma is below this share of the prior's
+# the sky determines a parameter if its sigma is below this share of the prior's
 TOLD = 0.5
 # sigma; a parameter further off than this is not of the given camera
 BEYOND_PRIOR = 5.0
 # stars for each free parameter; with fewer, one wrong match in a corner can look like a lens
 STARS_EACH = 3
 MAX_SCATTER_PX = 1.5
-# a camera is checked, and its error computed, at so many points per side of the frame
+# number of points per side of the frame at which a camera is checked and its error computed
 BORDER = 25
 
 
@@ -117,7 +117,7 @@ def fit_camera(
 ) -> Intrinsics:
     """Fit a camera near the `given` one to all sightings; parameters that are not in `free` keep their values.
 
-    Without `free` all are fitted. Raises CalibrationError if the stars are too few or do not agree.  `check_sound` tells
+    Without `free` all are fitted. Raises CalibrationError if the stars are too few or do not agree.  `check_sound` says
     whether the fit is good.
     """
     free = free or parameters(given)

@@ -35,19 +35,19 @@ SETTLED_RAD = 0.02 * ARCSEC
 # terms that move the zenith, of all frames about alike
 OF_PLACE = ("refraction", "shutter", "clock", "time stamp", "ut1", "pole")
 VALID_DAYS = 365.0
-# the fixes use so many times the sigma of A3's turn that the leans gave, because both come from the same tilts
+# factor on the sigma of A3's turn from the leans that the fixes use, because both come from the same tilts
 TURN_SIGMA = 3.0
 # frames further off are left out, up to this share of all, and so often are those left judged again
 OUTLIER_SIGMA, MOST_OUTLIERS, JUDGED = 6.0, 1 / 3, 5
-# of so many poses two thirds leave the fit, with its five parameters, free enough to judge the others
+# number of poses of which two thirds leave the fit, with its five parameters, free enough to judge the others
 MANY_POSES = 10
 # frames that scatter more than any inclinometer or mount were moved, or are of several places
 MOST_POSE_RAD = np.radians(0.5)
-# a noise so many times a frame's own error is worth stating
+# minimum noise over a frame's own error that is worth stating
 NOISIER = 1.0
-# a coefficient of the response is shown by so many of its sigma
+# minimum significance of a coefficient of the response, in sigma
 SHOWN_SIGMA = 3.0
-# chi-square per degree of freedom of frames too few to tell their scatter
+# maximum chi-square per degree of freedom of frames too few to estimate their scatter
 MOST_SCATTER = 16.0
 # share by which a coefficient of the response must be known better, or worse, than stated to be worth keeping
 WORTH = 0.05
@@ -93,8 +93,8 @@ def calibrate_at(
 
     site_stddev_arcsec: sigma of the place.
     known: the stars of frames, by the frames' numbers, that only a longer search identifies than the solver's.
-    turn_stddev_deg: sigma of the turn of the solver's A3 about the plumb line.  One lean of the instrument does not tell
-    that turn, and only a fix at another lean needs it; the covariance shows it.
+    turn_stddev_deg: sigma of the turn of the solver's A3 about the plumb line.  One lean of the instrument does not
+    determine that turn, and only a fix at another lean needs it; the covariance shows it.
     Raises FixError if there is no fix or the frames do not agree.
     """
 
@@ -186,7 +186,7 @@ class _Agreement:
     left_out: dict[float, float]
 
     def errors(self, stated: InclinometerErrors) -> InclinometerErrors:
-        """The inclinometer's errors, with its noise and those of its poses as these frames show them."""
+        """The inclinometer's errors, with its noise and its poses' errors as these frames show them."""
         noise = stated.noise_rad
         if self._noisy:
             samples = np.mean([s.tilt.samples for s in self.sound])
@@ -276,7 +276,7 @@ def _agreed(
     # a fix with a bad tilt, hence a bad refraction, may have split the pose of the sound ones
     readings = replace(whole.take(rows), pose=poses_of(fixes))
     _, scatter = settled(plumb, readings)
-    # once more about the answer, with what the poses tell of their errors
+    # once more about the answer, with the errors that the poses show
     noisy = np.hypot(readings.sigma, scatter.noise_sigma)
     again = find(replace(readings, pose_sigma=scatter.pose_sigma, sigma=noisy), a3, fixes)
     plumb, scatter = settled(again, readings)
@@ -365,7 +365,7 @@ def _left(whole: Readings, plumb: PlumbLine) -> np.ndarray:
 
 
 def _unknown(agreement: _Agreement, errors: InclinometerErrors) -> Calibration:
-    """A3 as the budgets of the fixes take it: unknown, except for its turn about the plumb line if the leans told that.
+    """A3 as the budgets of the fixes take it: unknown, except for its turn about the plumb line if the leans show it.
 
     With an unknown turn every lean would become an error.
     """
@@ -373,8 +373,8 @@ def _unknown(agreement: _Agreement, errors: InclinometerErrors) -> Calibration:
     up = up_of(np.radians(found.tilt_deg))
     turn_arcsec = np.sqrt(up @ plumb.covariance @ up) / ARCSEC
     across, about = UNKNOWN_ARCSEC[0], min(UNKNOWN_ARCSEC[2], TURN_SIGMA * turn_arcsec)
-    # the errors of single tilts would seem to tell the turn, unless the instrument really leans from pose to pose; if
-    # it does and nothing tells the turn, `_with_zenith_error` accounts for it
+    # the errors of single tilts would seem to determine the turn, unless the instrument really leans from pose to pose;
+    # if it does and the turn stays unknown, `_with_zenith_error` accounts for it
     if plumb.astray or not agreement.readings.lean(agreement.scatter.pose_sigma):
         about = 0.0
     covariance = np.eye(3) * across**2 + np.outer(up, up) * (about**2 - across**2)
@@ -408,7 +408,7 @@ def _dated(agreement: _Agreement, errors: InclinometerErrors) -> Calibration:
 
 
 def _found(agreement: _Agreement, errors: InclinometerErrors) -> Calibration:
-    """The A3 that was found, at the mean temperature and tilt of the frames, with the response if the poses tell it."""
+    """The A3 that was found, at the mean temperature and tilt of the frames, with the response if the poses show it."""
     plumb, axes = agreement.plumb, agreement.sound[0].tilt.axes
     found = Calibration(
         temperature_c=_mean_temperature_c(agreement.sound),
@@ -416,7 +416,7 @@ def _found(agreement: _Agreement, errors: InclinometerErrors) -> Calibration:
     ).turned_to(plumb.a3)
     stated = np.diag(stated_variances(errors, axes))
     known, most = np.sqrt(np.diag(plumb.response_covariance)), np.sqrt(np.diag(stated))
-    # few poses tell no response, nor do those that scatter so much that they will be refused
+    # few poses show no response, nor do poses that scatter so much that they will be refused
     enough = agreement.readings.pose.max() + 1 >= FEWEST_POSES
     told = enough and (np.abs(known - most) > WORTH * np.maximum(known, most)).any()
     if not told or agreement.scatter.pose_sigma > MOST_POSE_RAD:

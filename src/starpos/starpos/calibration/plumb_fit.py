@@ -41,7 +41,7 @@ class PlumbLine:
     left (K, 2): what the fit leaves of each frame's reading, in rad across the plumb line.
     response (m,), response_covariance (m, m): of the inclinometer's response.
     linear: the fit about its answer.
-    astray (rad): sigma by which the zenith may be off together with A3's turn about a leaning axis; no heading tells it.
+    astray (rad): sigma by which the zenith may be off together with A3's turn about a leaning axis; no heading shows it.
     """
 
     a3: np.ndarray
@@ -165,8 +165,8 @@ def fits(
 ) -> list[PlumbLine]:
     """Fit A3, the zenith and the errors of the inclinometer by robust Gauss-Newton, from each of T starts.
 
-    starts (T, 3, 3): the given A3, turned by `turned` (T,) rad about the plumb line.  The residuals are those of the
-    readings against the plumb line of the stars, whose error is small beside theirs.  The prior of A3's tilts is
+    starts (T, 3, 3): the given A3, turned by `turned` (T,) rad about the plumb line.  The residuals compare
+    the readings with the plumb line of the stars, whose error is small compared with theirs.  The prior of A3's tilts is
     UNKNOWN_ARCSEC.
     """
     model = _Model.of(readings, starts, known)

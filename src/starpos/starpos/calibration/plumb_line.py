@@ -19,7 +19,7 @@ from starpos.normal import MEDIAN_OF_CHI2
 
 ROBUST_ROUNDS = 10
 TURNS_TRIED = 8
-# one pose tells no response of the inclinometer
+# one pose does not show the inclinometer's response
 FEWEST_POSES = 2
 # chi-square per degree of freedom above which the search ended in a wrong minimum
 FOUND_SCATTER = 16.0
@@ -38,14 +38,14 @@ TOLD_ZENITH = 1.0
 NARROW_TURN = np.radians(20)
 # half the chi-square by which a solution may be worse than the best and still be true
 AS_GOOD = 8.0
-# share of the axis' weight below which the headings do not tell the axis
+# share of the axis' weight below which the headings do not determine the axis
 SAME_AXIS = 1e-9
 
 
 def level(readings: Readings, given: np.ndarray, turn_sigma: float = np.pi) -> PlumbLine:
-    """The A3 for which all frames have one zenith, wherever that is; it stays near `given` (3, 3) where nothing tells it.
+    """The A3 for which all frames have one zenith, wherever that is; it stays near `given` (3, 3) where undetermined.
 
-    turn_sigma: sigma in rad of the turn of `given` about the plumb line.  The readings tell that turn only if the lean
+    turn_sigma: sigma in rad of the turn of `given` about the plumb line.  The readings show that turn only if the lean
     changes in another way than by a turn about one leaning axis: A3 and the zenith, both turned about such an axis, give
     the same readings.  The zenith is then as uncertain as the lean times the turn.
     Raises FixError if two answers are equally good and further apart than that.
@@ -82,7 +82,7 @@ def level(readings: Readings, given: np.ndarray, turn_sigma: float = np.pi) -> P
         )
     if nearest.cost < best.cost + AS_GOOD:
         best = nearest
-    # leans in other directions may have told the turn
+    # leans in other directions may have shown the turn
     told = turn < min(turn_sigma / 2, TOLD_TURN)
     return best if told or astray < best.zenith_sigma / 2 else replace(best, astray=astray)
 
@@ -90,7 +90,7 @@ def level(readings: Readings, given: np.ndarray, turn_sigma: float = np.pi) -> P
 def hang(
     readings: Readings, given: np.ndarray, zenith: np.ndarray, zenith_sigma: float, turn_sigma: float
 ) -> PlumbLine:
-    """A3 for a known zenith (3,) in ITRS with zenith_sigma in rad; it stays near `given` where nothing tells it.
+    """A3 for a known zenith (3,) in ITRS with zenith_sigma in rad; it stays near `given` where undetermined.
 
     turn_sigma: sigma in rad of the turn of `given` about the plumb line.
     """
@@ -107,7 +107,7 @@ def hang(
 
 
 def typical(left: np.ndarray, parameters: int) -> float:
-    """Sigma per axis in rad of what a fit of so many parameters leaves (K, 2), by the median: outliers do not count."""
+    """Sigma per axis in rad of the residuals (K, 2) of a fit, by the median: outliers do not count."""
     free = len(left) / max(len(left) - parameters / 2, 0.5)
     return float(np.sqrt(np.median(np.sum(left**2, 1)) / MEDIAN_OF_CHI2 * free))
 
@@ -126,7 +126,7 @@ def settled(plumb: PlumbLine, readings: Readings) -> tuple[PlumbLine, Scatter]:
     readings: of the frames of the fit.
     """
     linear, prior_sigma = plumb.linear, plumb.linear.prior_sigma.copy()
-    # the errors of the tilts would seem to tell A3's turn, unless the instrument really leans from pose to pose
+    # the errors of the tilts would seem to show A3's turn, unless the instrument really leans from pose to pose
     leans = readings.lean(_pose_scatter(plumb, readings))
     if not leans:
         prior_sigma[2] = KNOWN

@@ -18,7 +18,7 @@ from starpos.instrument.response import COEFFICIENTS, Zeroed, response_columns, 
 
 # sigma of a coefficient that is as good as known
 KNOWN = 1e-9
-# a lean by more than so many sigma is no error of the tilts
+# minimum significance of a lean, which errors of the tilts do not reach
 LEAN_SIGMA = 5.0
 
 
@@ -89,7 +89,7 @@ class Readings:
 
     @property
     def spread(self) -> np.ndarray:
-        """Sigma (K,) in rad of each frame with the error of its pose, so that all of a pose know no better than one."""
+        """Sigma (K,) in rad of frames with the errors of poses, so that all frames of a pose are no better than one."""
         return np.sqrt(self.sigma**2 + np.bincount(self.pose)[self.pose] * self.pose_sigma**2)
 
     def lean(self, pose_sigma: float) -> bool:

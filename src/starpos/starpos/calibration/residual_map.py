@@ -40,7 +40,7 @@ def draw(path: Path | str, fit: Intrinsics, title: str) -> None:
     figure.colorbar(image, ax=cells, label="rms an axis, px", shrink=0.85)
     cells.set_title("what is left, by place")
     figure.suptitle(title)
-    # of other formats it cannot be told that starpos has made them
+    # other formats do not show that starpos has made them
     made_by = {"Software": "starpos"} if Path(path).suffix.lower() == ".png" else None
     figure.savefig(path, dpi=90, metadata=made_by)
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What to say of fixes that were made with an A3 of which nobody knows all, or nothing."""
+"""Sentences about fixes with a partly or wholly unknown A3."""
 
 from collections.abc import Iterable
 
@@ -57,7 +57,7 @@ def unknown_a3(
 
 
 def unnamed_inclinometer(instrument: Instrument, ways: str = MODEL_BY_OPTIONS) -> str:
-    """Say that nobody has said which inclinometer it is, and what is taken instead; '' if somebody has."""
+    """Say that no inclinometer is stated, and which one is assumed; '' if one is stated."""
     if instrument.vertical is not None or instrument.inclinometer_model or instrument.inclinometer != UNNAMED:
         return ""
     return (

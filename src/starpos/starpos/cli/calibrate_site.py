@@ -12,8 +12,8 @@ from starpos.calibration.fixed_camera import calibrate_fixed
 from starpos.calibration.misalignment import NOTHING_KNOWN, Calibrated, Known, calibrate_at
 from starpos.calibration.unknown import TELL_IT, at_another_lean, may_turn
 from starpos.cli import console, options
-from starpos.cli.deflection import add_vertical, vertical_of
 from starpos.cli.overwriting import save_instrument
+from starpos.cli.vertical import add_vertical, vertical_of
 from starpos.earth.vertical import astronomic
 from starpos.errors import InstrumentError, StarposError
 from starpos.fix.solver import Solver

@@ -70,6 +70,14 @@ COMMANDS = {
         ),
         "starpos solve --instrument with the file that was written",
     ),
+    "deflection": Command(
+        "deflection of the vertical at a known site, from a zenith camera's frames and tilts",
+        (
+            "starpos deflection *.fits --tilt tilt.csv --site 47.3 8.5 560 --instrument zenith.yaml --pressure-hpa 950 "
+            "--temperature-c 12",
+        ),
+        "docs/how-to/deflection.md leads from a mount and a tiltmeter to a value",
+    ),
     "report": Command(
         "nights on one page: stability, scatter, residuals, sky, error budget",
         (

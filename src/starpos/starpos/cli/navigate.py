@@ -10,10 +10,10 @@ import numpy as np
 
 from starpos.cli import console, jobs, options
 from starpos.cli.archive import frames_among
-from starpos.cli.deflection import add_vertical, tell_unknown, vertical_of
 from starpos.cli.fix_output import HEAD, in_degrees
 from starpos.cli.inputs import given_of, reader_of
 from starpos.cli.output import Output, add_formats
+from starpos.cli.vertical import add_vertical, tell_unknown, vertical_of
 from starpos.earth.orientation import earth_orientation
 from starpos.earth.vertical import Vertical, geodetic
 from starpos.errors import FixError, FrameError, InstrumentError, TimeError, VoyageError

@@ -7,8 +7,8 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from starpos.cli import console, options
-from starpos.cli.deflection import add_vertical, vertical_of
 from starpos.cli.inputs import given_of
+from starpos.cli.vertical import add_vertical, vertical_of
 from starpos.errors import FrameError, InstrumentError
 from starpos.frames.stars import no_stars
 from starpos.night.folder import exposures, frames_in

@@ -16,7 +16,6 @@ from starpos.cli import (
     solve_pointings,
 )
 from starpos.cli.archive import NightFolder, frames_among, nights_of
-from starpos.cli.deflection import add_vertical, vertical_of
 from starpos.cli.fix_output import COLUMNS, CSV_HELP, HEAD, JSON_HELP
 from starpos.cli.inputs import add_near, checked_tilts, given_of, near_of, reader_of
 from starpos.cli.output import Output, add_formats
@@ -24,6 +23,7 @@ from starpos.cli.overwriting import Written
 from starpos.cli.plan import Plan
 from starpos.cli.site import add_site, place_of
 from starpos.cli.solved_night import check_save, say, tell, tell_turned
+from starpos.cli.vertical import add_vertical, vertical_of
 from starpos.earth.known_place import KnownPlace
 from starpos.errors import FrameError, InstrumentError, StarposError, TiltError
 from starpos.fix.solver import Solver

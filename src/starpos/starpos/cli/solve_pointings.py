@@ -10,12 +10,12 @@ import numpy as np
 from starpos.calibration.axis import FoundAxis
 from starpos.cli import console, options
 from starpos.cli.archive import NightFolder
-from starpos.cli.deflection import tell_unknown, vertical_of
 from starpos.cli.fix_output import COLUMNS, HEAD, json_of, put_combined
 from starpos.cli.inputs import checked_tilts, near_of
 from starpos.cli.output import Output
 from starpos.cli.overwriting import save_instrument
 from starpos.cli.solved_night import NO_FIX, check_save, say, tell, tell_turned
+from starpos.cli.vertical import tell_unknown, vertical_of
 from starpos.earth.vertical import Vertical
 from starpos.errors import InstrumentError, StarposError
 from starpos.fix.solution import status_of

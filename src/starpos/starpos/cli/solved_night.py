@@ -7,11 +7,11 @@ from pathlib import Path
 
 from starpos.cli import console, heading_output
 from starpos.cli.archive import NightFolder
-from starpos.cli.deflection import tell_unknown
 from starpos.cli.fix_output import json_about, json_of, line_of, put_combined
 from starpos.cli.inputs import near_of
 from starpos.cli.output import Output
 from starpos.cli.overwriting import save_instrument
+from starpos.cli.vertical import tell_unknown
 from starpos.earth.known_place import KnownPlace
 from starpos.earth.vertical import Vertical
 from starpos.errors import FrameError

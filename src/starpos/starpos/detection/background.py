@@ -13,12 +13,12 @@ from starpos.detection._order import median
 from starpos.detection._sparse import any_flat
 from starpos.normal import SIGMA_PER_MAD
 
-# Sigmas of a cell by which cells beside each other differ no more where the sky goes on.
+# Maximum difference of neighbouring cells of continuous sky, in sigmas of a cell.
 STEEP = 5
 # DN rms. Rounding to whole numbers adds this noise, so no pixel has less.
 QUANTISATION = 12**-0.5
-# The sky is what lies within 3.5 sigma of a cell's median, which leaves 0.9969 of a Gaussian's rms; sigma comes from the
-# median of the differences, or where most pixels are equal (a sky cut off at 0) from the 75 and 90 % quantiles.
+# The sky is all pixels within 3.5 sigma of a cell's median, which keeps 0.9969 of a Gaussian's rms. Sigma comes from the
+# median of the differences, or, if most pixels are equal (a sky cut off at 0), from the 75 and 90 % quantiles.
 CLIP = (SIGMA_PER_MAD, 1 / 0.607, 3.5, 0.9969)
 # A cell is partly white where this share of its pixels has the frame's largest value.
 WHITE = 0.03
@@ -115,9 +115,9 @@ def measure_background(plane: np.ndarray, cell_px: int = 64, mosaic: bool | None
 
 
 def _beside_lamps(white: np.ndarray, level: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Level and noise (P, rows, columns) with those of the nearest dark cell in cells that are partly white.
+    """Level and noise (P, rows, columns); cells that are partly white get the values of the nearest dark cell.
 
-    white (rows, columns): the share of pixels with the frame's largest value. Else the sky beside a white wall would be
+    white (rows, columns): the share of pixels with the frame's largest value. Else the sky next to a white wall would be
     too bright, and its stars lost.
     """
     if white.mean() < WHITE or not (white < WHITE).any():

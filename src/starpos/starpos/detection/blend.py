@@ -13,13 +13,13 @@ from starpos.detection.fit import FIT_WIDTHS, Fit, Response, fit_stars, gains_at
 from starpos.detection.psf import FieldPsf, LocalPsf
 from starpos.detection.stamps import Stamps
 
-# A companion is tried where chi-square is so many sigma above that of a single star.
+# Minimum excess of chi-square over a single star's, in sigma, at which a companion is tried.
 SURPRISING = 4.0
 # Widths of the PSF: closer pairs cannot be separated.
 CLOSEST = 1.5
 # SNR a companion must have.
 FAINTEST = 5.0
-# A companion must lower the sum of squares by so many times chi-square per pixel (it brings three parameters).
+# Minimum decrease of the sum of squares by a companion, over chi-square per pixel (it adds three parameters).
 GAIN = 30.0
 # Companions fainter than this share of the star may be faults of the PSF.
 DIMMEST = 0.03

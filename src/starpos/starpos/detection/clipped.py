@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Stars clipped to a few pixels of one height without wings: of a stretched picture, or bright ones on sharp lenses.
 
-No PSF fits them, and they are too small to be looked for as discs, but each is a peak. Place and light are told by the
+No PSF fits them, and they are too small to be looked for as discs, but each is a peak. Place and light are given by the
 pixels above half its height.
 """
 
@@ -14,15 +14,15 @@ from starpos.detection.background import Background
 from starpos.detection.discs import FLAT, FULLEST, LONGEST, MOST, columns_of, with_discs
 from starpos.frames.stars import SATURATED
 
-# A fit tells a clipped star's light if it does so to this share of it; and that of any other if chi2 is below this.
+# Maximum relative error at which a fit gives a clipped star's light, and maximum chi2 at which it gives another's.
 TOLD, STRANGE = 0.1, 3.0
 # px. A star measured so near a peak is the peak's.
 NEAR = 2.0
-# At least this share of its light above the sky is its own, not that of what is around it.
+# Minimum share of the light above sky that belongs to the source itself.
 OWN = 0.5
-# A clipped image has at least so many pixels, and this share of those of a star that is just not clipped.
+# Minimum number of pixels of a clipped image, and its share of the pixels of a star that is just not clipped.
 FEWEST, NARROWER = 4, 0.8
-# It is looked at in a window that reaches so many widths of a star from the peak, and at least so many px.
+# Reach of the window around the peak, in widths of a star, and its minimum in px.
 REACH, LEAST_REACH = 6.0, 12
 
 
@@ -34,9 +34,9 @@ def with_clipped(
     y: np.ndarray,
     fwhm_px: float,
 ) -> dict[str, np.ndarray]:
-    """The columns of measured stars with those of clipped ones among the peaks x, y (N,) int px, brightest first.
+    """The columns of measured stars and of clipped ones among the peaks x, y (N,) int px, brightest first.
 
-    A saturated star is measured anew if its wings tell little of its light, and so is what seems to be several stars in
+    A saturated star is measured anew if its wings constrain its light weakly, and so is what seems to be several stars in
     one flat image.
     """
     saturated = (stars["flags"] & SATURATED) != 0
@@ -60,7 +60,7 @@ def with_clipped(
     reach = max(LEAST_REACH, round(REACH * fwhm_px))
     images = [_image(plane, x[k], y[k], level[k], top[k], reach) for k in lost.tolist()]
     least = max(FEWEST, NARROWER * np.pi / 4 * fwhm_px**2)
-    # several peaks may be those of one image
+    # several peaks may belong to one image
     clipped = [
         image for image in dict.fromkeys(images) if image is not None and np.pi * image[2] ** 2 >= least
     ]

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Stars so bright that the sensor or the plate shows a flat disc, wider than the PSF: they have no peak and no fit.
 
-Their light is told by the area of the disc. Nothing else puts the brightest stars of a frame first.
+The area of the disc gives their light. Nothing else puts the brightest stars of a frame first.
 """
 
 import cv2
@@ -13,15 +13,15 @@ from starpos.frames.stars import SATURATED
 
 # Pixels above this share of the frame's brightest discs belong to a disc: a plate or a JPEG has no sharp limit.
 FLAT = 0.8
-# A disc's radius over the FWHM of the stars: smaller ones are fitted by their wings. At least so many px.
+# Minimum radius of a disc over the FWHM of the stars (smaller ones are fitted by their wings), and in px.
 WIDER, LEAST_PX = 1.3, 4.0
 # A disc's radius is at most this share of the frame's shorter side: larger ones are lamps, roofs or the Moon.
 WIDEST = 0.05
-# The disc's top is at least so many sigma of a pixel's noise above the sky.
+# Minimum height of the disc's top above the sky, in sigma of a pixel's noise.
 CLEAR = 20.0
 # The squared axes of an ellipse of the disc's moments differ at most by this factor; it has that share of its area.
 LONGEST, FULLEST = 3.0, 0.8
-# At most so many discs, the largest.
+# Maximum number of discs; the largest are kept.
 MOST = 500
 # The centre of a disc is known to this share of its radius.
 OFF_CENTRE = 0.04
@@ -57,7 +57,7 @@ def find_discs(
 def _groups(row: np.ndarray, column: np.ndarray) -> np.ndarray:
     """Boxes (left, top, width, height) of the groups of places row, column (N,) side by side, the largest group first.
 
-    Of rows and columns without any place only those beside others are looked at: most frames have a few places.
+    Only neighbours of rows and columns with a place are looked at: most frames have a few places.
     """
     kept = [np.unique(np.stack([place, place + 1])) for place in (row, column)]
     mask = np.zeros([len(places) for places in kept], np.uint8)
@@ -125,7 +125,7 @@ def columns_of(
 def with_discs(
     stars: dict[str, np.ndarray], discs: dict[str, np.ndarray], fwhm_px: float
 ) -> dict[str, np.ndarray]:
-    """The columns of measured stars with those of the discs, brightest first.
+    """The columns of measured stars and of the discs, brightest first.
 
     A star measured by its wings, near a disc's middle, keeps its place. All else on the disc and its rim is its light.
     """

@@ -19,15 +19,15 @@ from starpos.normal import SIGMA_PER_MAD
 
 # Rows of a strip, which has one limit.
 STRIP = 64
-# Parts of a strip in which the sky is compared; the whole frame is at most so many times less even than the typical one.
+# Parts of a strip in which the sky is compared, and maximum unevenness of the whole frame over the typical strip's.
 PARTS, UNEVENEST = 4, 1.4
 # With fewer values in a part its quantiles are chance; a smaller factor may be chance too.
 SAMPLES, CORRELATED = 32, 1.1
 # Diameter of the widest defocused star, px.
 CROWD = 14
-# So many of the brightest peaks decide whether the frame's stars are rings,
+# Number of the brightest peaks that decide whether the frame's stars are rings,
 LEADERS = 100
-# and so many sharp peaks near a wide one decide what that one is.
+# and number of sharp peaks near a wide one that decide what it is.
 NEAREST = 24
 # Two neighbours lie on opposite sides of a peak, as on a line, if the cosine between their directions is below this.
 OPPOSITE = -0.95
@@ -83,8 +83,8 @@ def find_peaks(
 
     A star through a defocused telescope with a central obstruction is a ring, with several peaks close together. If
     most bright peaks have such neighbours, a wider kernel is tried, and its peaks are taken if most of them are rings.
-    The peaks along a streak or a twig are close together too, but continue to both sides; those of a pair of stars
-    are higher than the wide peak.
+    The peaks along a streak or a twig are close together too, but continue to both sides; the peaks of a pair of
+    stars are higher than the wide peak.
     """
     sharp = _peaks_of(plane, background, SHARP, threshold, limit, threads)
     bright = _no_dots(plane, background, sharp)
@@ -97,7 +97,7 @@ def find_peaks(
 
 
 def _no_dots(plane: np.ndarray, background: Background, peaks: Peaks) -> Peaks:
-    """The Peaks without those of hot pixels."""
+    """The Peaks without hot pixels."""
     keep = ~are_dots(plane, background, peaks.x, peaks.y)
     return replace(peaks, x=peaks.x[keep], y=peaks.y[keep], height=peaks.height[keep])
 
@@ -195,10 +195,7 @@ def _peaks_of(
 
 
 def _in_parts(plane: np.ndarray, kernel: Kernel, limit: np.ndarray, threads: int) -> tuple[np.ndarray, ...]:
-    """Peaks x, y, value (N,) of the smoothed plane above the limit (strips, cells), and each row's highest pixel (h,).
-
-    So many threads look for them.
-    """
+    """Peaks x, y, value (N,) of the smoothed plane above the limit (strips, cells), and each row's highest pixel (h,)."""
     height, parts = plane.shape[0], min(threads, len(limit))
     ends = [len(limit) * k // parts * STRIP for k in range(parts)] + [height]
 
@@ -244,7 +241,7 @@ def _noise_of_smooth(plane: np.ndarray, background: Background, kernel: Kernel) 
 
 
 def _parts(score: np.ndarray, down: int) -> list[np.ndarray]:
-    """Scores (rows, columns) in parts, so many below each other and up to PARTS side by side: (parts, N) of each size."""
+    """Scores (rows, columns) in parts, below each other and up to PARTS side by side: (parts, N) of each size."""
     across = min(PARTS, score.shape[1])
     width, wider = divmod(score.shape[1], across)
     sizes = (slice(wider * (width + 1)), wider), (slice(wider * (width + 1), None), across - wider)

@@ -12,7 +12,7 @@ from starpos.detection.stamps import Stamps
 
 # Sigmas above the model, and that share of the star's brightest pixel, from which a pixel is not the star's alone.
 OUTLIER, FAINT = 6.0, 0.15
-# Pixels within so many widths of the star are fitted; farther out there are only noise and neighbours.
+# Radius of the fit in widths of the star; farther out there are only noise and neighbours.
 FIT_WIDTHS = 4.0
 # Sigmas that a fit may be from the place that more rounds would find: of 26 000 simulated stars none was 0.01 off.
 SETTLED = 5e-4
@@ -67,7 +67,7 @@ class Fit:
     model             (N, S, S) DN; 0 beyond FIT_WIDTHS, unless the whole is asked for
     used              (N, S, S) bool: pixels that took part in the fit
     outlier           (N, S, S) bool: pixels left out because they are much too bright for this star
-    leverage          (N, S, S), 0..1: a residual's variance is (1 - leverage) times that of the noise; empty if not
+    leverage          (N, S, S), 0..1: a residual's variance is (1 - leverage) times the noise's; empty if not
                       asked for
     """
 
@@ -101,7 +101,7 @@ def fit_stars(
 ) -> Fit:
     """Fit stars by Gauss-Newton, starting at the points x, y (N,) px.
 
-    The leverage of pixels is told if it is asked for, and so is the model of the whole stamp.
+    The leverage of pixels and the model of the whole stamp are returned if asked for.
 
     On a mosaic nothing is interpolated: each pixel is compared with the PSF at its own place, times the gain of its
     colour. Each star's four gains are fitted too, held near the frame's by colour_spread, so that neither the mosaic's

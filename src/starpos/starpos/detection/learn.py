@@ -30,32 +30,32 @@ from starpos.detection.shape import (
 )
 from starpos.detection.stamps import Stamps, are_dots, cut, lights
 
-# Widths of the PSF, px, for a frame with fewer than ALIKE stars to learn from: so many of its highest peaks decide.
+# Widths of the PSF, px, tried in a frame with fewer than ALIKE stars, and number of the highest peaks that decide.
 USUAL_SIGMAS, FEW = (1.1, 0.55, 2.2, 4.4), 10
-# A usual width replaces a learnt one if it finds so many times its light.
+# Minimum factor of light by which a usual width replaces a learnt one.
 CLEARLY = 1.1
-# px around a peak that are looked at while nobody knows how wide stars are.
+# Radius (px) around a peak that is used while the width of stars is unknown.
 SIGHT = 12
-# Peaks of at least so many sigma of the smoothed noise can teach, at most so many of them,
+# Minimum height (sigma of the smoothed noise) and maximum number of the peaks that the PSF is learnt from,
 BRIGHT, TEACHERS = 20, 250
-# and of wide stars fewer: together they have so many pixels.
+# and their maximum number of pixels in total, which limits wide stars.
 TEACHING_PIXELS = 12000
-# A star does not teach if the residual's share of its squared light exceeds this, plus noise, plus three times that of
-# other stars; DN2 of light, so that darkness has a share too.
+# Maximum share of the residual in a star's squared light, plus noise, plus three times other stars' share, for a star to
+# learn from; minimum of the squared light (DN2), so that darkness has a share too.
 UNLIKE, DARKEST = 0.005, 1e-9
 # Rounds in which each star's own shape is measured, and in each of them rounds of centring.
 OWN_ROUNDS, CENTRINGS = 3, 2
-# So many stars agree by more than chance if they differ by less than this (log of width, ellipticity); twigs do not.
+# Number of stars that agree by more than chance, and their maximum difference (log of width, ellipticity); twigs differ.
 ALIKE, LIKENESS = 5, 0.6
 # Rounds of fitting and refining the PSF, and the order of its terms.
 ROUNDS, ORDER = 2, 6
-# On a mosaic, colour and shape of stars narrower than this FWHM (px) are hard to separate: with at least so many stars,
-# so many more rounds are made.
+# On a mosaic, colour and shape of stars narrower than FINE_FWHM (px) are hard to separate: FINE_ROUNDS more rounds are
+# made, if there are FINE_STARS or more.
 FINE_FWHM, FINE_STARS, FINE_ROUNDS = 2.3, 6, 4
 # Stars of at least this FWHM (px) may be rings with sharp edges if the PSF describes more than this share of the light
-# wrongly: then up to so many more rounds are made, with terms of this order.
+# wrongly: then up to RING_ROUNDS more rounds are made, with terms of this order.
 RING_FWHM, POOR, RING_ROUNDS, RING_ORDER = 5.0, 0.05, 6, 14
-# Rounds in which the gains of a mosaic's phases are averaged, without stars so many sigma off; DN far below any star's;
+# Rounds in which the gains of a mosaic's phases are averaged, limit of outliers in sigma; DN far below any star's;
 # the least gain, and the least and the largest scatter of single stars' gains.
 GAIN_ROUNDS, OUTLYING_GAIN, DARKEST_MEAN, LEAST_GAIN, SPREADS = 4, 4.0, 1e-3, 0.02, (0.01, 0.5)
 # Residuals of more sigma teach nothing of the noise.

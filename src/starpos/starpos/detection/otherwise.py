@@ -19,11 +19,11 @@ from starpos.frames.stars import Stars
 
 # (how often the frame is reduced by two, whether what is wider than a star is taken away), in the order of their use
 WAYS = (0, True), (1, True), (2, False)
-# Wider light than so many px is no star's.
+# Maximum width (px) of a star's light.
 WIDEST_PX = 9
 # Cells of the background (px): what is left of clouds ends sooner than a sky.
 MESH_PX = 16
-# A reduced frame has at least so many px along its shorter side.
+# Minimum length (px) of a reduced frame's shorter side.
 SHORTEST_PX = 64
 # A flattened plane is stretched to at most this, by whole numbers: DN of 8 bits are coarse.
 HIGHEST, MOST_STRETCH = 40_000, 32
@@ -56,7 +56,7 @@ def _flattened(plane: np.ndarray) -> np.ndarray:
 
 
 def _enlarged(stars: Stars, times: int, frame: Frame, window: tuple[int, int, int, int] | None) -> Stars:
-    """The stars of a frame that was reduced so many times, on the frame as it was."""
+    """The stars of a reduced frame, on the original frame."""
     return replace(
         stars,
         x=times * stars.x + (times - 1) / 2,

@@ -30,13 +30,13 @@ from starpos.frames.trail import Trail
 CHUNK_PIXELS = 30_000, 120_000
 # Peaks looked at, or twice the stars wanted if that is more: hot pixels are peaks too.
 PEAKS = 10_000
-# Pixels that are fitted, for each of so many peaks: 2 million take some 10 s. With as many stars, or with wide ones, the
-# faintest are left out. Ordinary frames have a tenth. Each reduction by two has half as many as the one before.
+# Maximum number of fitted pixels over the maximum number of peaks: 2 million take some 10 s. Beyond it the faintest stars
+# are left out. Ordinary frames have a tenth. Each reduction by two has half as many as the one before.
 PIXELS_PER_PEAK = 100
 # Stars of at least this FWHM (px), or none at all, are looked for in the frame reduced by two as well, and there again.
-# They are taken if more of them are like stars. A reduced frame has at least so many pixels along its shorter side.
+# They are taken if more of them are like stars. SHORTEST_PX is the minimum of a reduced frame's shorter side.
 WIDE_FWHM, SHORTEST_PX = 8.0, 150
-# What is still wider after so many reductions is a cloud.
+# Maximum number of reductions: light that is still wider is a cloud.
 MOST_HALVINGS = 3
 
 
@@ -48,7 +48,7 @@ class DetectionSettings:
     min_snr         flux of a star over its sigma in the sky's noise
     max_stars       how many stars are kept, brightest first
     mesh_px         size of the background's cells, 16 or more
-    threads         of the processor, so many at most
+    threads         maximum number of threads
     saturation_dn   DN from which a pixel is saturated; None: the type's largest value, or the frame's largest if several
                     pixels of a star share it
     """
@@ -107,10 +107,10 @@ class Detection:
 class _Picture:
     """What stars are looked for in.
 
-    plane     (h, w) of a frame, or of one reduced by two, which may be reduced so many times (halvings) more
+    plane     (h, w) of a frame, or of a reduced one; halvings: how often it may be reduced by two
     mosaic    whether its pixels are of several colours
     about     what a frame's Stars know of it
-    trail     how stars move during the exposure; None if nobody said
+    trail     how stars move during the exposure; None if not stated
     """
 
     plane: np.ndarray

@@ -6,14 +6,14 @@ import numpy as np
 
 from starpos.frames.frame import Frame
 
-# Measured pixels must be so many times noisier than interpolated ones.
+# Minimum noise of measured pixels over the noise of interpolated ones.
 NATIVE = 1.1
 
 
 def plane_of(frame: Frame) -> tuple[np.ndarray, bool | None]:
     """The pixels (h, w) of a Frame as they were measured, and whether they are a mosaic.
 
-    The second value is True, False, or None if the file does not say: then only the pixels can tell. In colours made
+    The second value is True, False, or None if the file does not say: then only the pixels can show it. In colours made
     from a mosaic two thirds of the numbers are interpolated. That correlates the noise of neighbours and spreads a hot
     pixel to a star's width, so only the measured third is taken. Other colours are added, as uint16.
     """

@@ -23,7 +23,7 @@ MONOMIALS = 6
 NARROW, BROAD = 0.25, 6.0
 # Where in the box (0 to 1 in x, in y) the widest star is looked for.
 QUARTERS = np.tile(np.arange(5) / 4, 5), np.repeat(np.arange(5) / 4, 5)
-# Squared widths and series of a Gaussian that is the same everywhere; a place, where nobody asks for more than one.
+# Squared widths and series of a Gaussian that is the same everywhere; a place, if only one is asked for.
 UNIFORM, GAUSSIAN, ONE_PLACE = np.eye(2)[None], np.ones((1, 1, 1)), np.zeros(1)
 
 
@@ -46,13 +46,13 @@ class LocalPsf:
     def evaluate(self, left: np.ndarray, top: np.ndarray, size: int) -> np.ndarray:
         """The PSF at the pixels of N stamps (N, size, size).
 
-        left, top (N,) px: of each stamp's first column and row from its star's centre.
+        left, top (N,) px: first column and row of a stamp, from the centre of the star.
         """
         return evaluated(self.axes, self.series, left, top, size)
 
 
 class FieldPsf(ABC):
-    """The PSF of a frame; `at` gives it at the places of stars. axes (2, 2): those of the mean star, as in LocalPsf."""
+    """The PSF of a frame; `at` gives it at the places of stars. axes (2, 2): the mean star's, as in LocalPsf."""
 
     axes: np.ndarray
 
@@ -89,7 +89,7 @@ class Psf(FieldPsf):
     widths  (K, 2, 2): squared widths along these axes, as coefficients of K monomials of the field's coordinates; K is
             6, or 1 if they are the same everywhere
     series  (K, I, J): coefficients of the series, in the same way
-    box     (2, 2): lowest and highest x, y, px, of the stars it was learnt from; beyond, the PSF is that of its edge
+    box     (2, 2): lowest and highest x, y, px, of the stars it was learnt from; beyond, the PSF is as at its edge
     """
 
     axes: np.ndarray
@@ -108,7 +108,7 @@ class Psf(FieldPsf):
     def widest_px2(self) -> float:
         """The largest squared width of a star within the box."""
         (left, top), (right, bottom) = self.box
-        # where the widths are the same everywhere, one place tells them
+        # one place is enough if the widths are the same everywhere
         across, down = QUARTERS if len(self.widths) > 1 else (QUARTERS[0][:1], QUARTERS[1][:1])
         shapes = self.shapes_at(left + (right - left) * across, top + (bottom - top) * down)
         return float(squared_widths(shapes)[:, 1].max())
@@ -118,7 +118,7 @@ class Psf(FieldPsf):
         return monomials(*_points(x, y), self.box)
 
     def with_widths(self, widths: np.ndarray) -> "Psf":
-        """The Psf with the squared widths (6, 2, 2) along these axes; its axes become those of the new mean star."""
+        """The Psf with the squared widths (6, 2, 2) along these axes; its axes become the new mean star's."""
         root = power(widths[:1], -0.5)[0]
         return replace(self, axes=root @ self.axes, widths=root @ widths @ root)
 

@@ -11,11 +11,11 @@ from starpos.detection._field import agreed, over_field
 from starpos.detection._marginal import chosen, marginal
 from starpos.detection.psf import MONOMIALS, Psf, power
 
-# A variation over the field needs at least so many stars,
+# Minimum number of stars for a variation over the field,
 PLACES = 12
 # and widths that vary over the field must be better than constant ones by this F.
 SIGNIFICANT = 4.0
-# and none of these stars may be so many times farther from that than the median.
+# and maximum distance of any of these stars from it, over the median distance.
 OUTLYING = 6.0
 # Prior of each coefficient, 1 sigma.
 LIKELY = 0.3
@@ -32,14 +32,14 @@ STEPS = 32
 
 
 def widened(psf: Psf, x: np.ndarray, y: np.ndarray, ratio: np.ndarray, weight: np.ndarray) -> Psf:
-    """The Psf with squared widths that vary over the field as those of N stars do; psf itself if they do not.
+    """The Psf with squared widths that vary over the field as N stars' widths do; psf itself if they do not.
 
     psf     the same everywhere
     x, y    (N,) px
     ratio   (N, 2, 2): the stars' covariances along the axes of psf
     weight  (N,) inverse variances of ratio, in any unit
     """
-    # pairs are wide but tell nothing of the optics
+    # pairs are wide but say nothing about the optics
     found = agreed(psf.monomials(x, y), ratio.reshape(-1, 4), weight, OUTLYING, PLACES, 4)
     if found is None:
         return psf
@@ -86,7 +86,7 @@ def _lengthened(psf: Psf) -> float:
 
 
 def _rank(orders: np.ndarray, longer: float) -> np.ndarray:
-    """The order that terms (T, 2) count as: along the trail of a star so many times longer than wide they count less."""
+    """The order that terms (T, 2) count as: along a trail they count less, by the ratio of its length to its width."""
     return orders[:, 0] / longer + orders[:, 1]
 
 
@@ -130,10 +130,10 @@ def refine(
     """The Psf whose series fits N stars best, by weighted linear least squares with free positions and gains.
 
     x, y        (N,) px: the stars' places
-    left, top   (N,) px: of each stamp's first column and row from its star's centre
+    left, top   (N,) px: first column and row of a stamp, from the centre of the star
     brightness  (N, S, S): the pixels over their stars' fluxes and gains
     weight      (N, S, S): inverse variances of brightness; 0 for a pixel that is not used
-    phase       (N, S, S): the pixels' numbers in the mosaic, of so many phases
+    phase       (N, S, S): the pixels' phases in the mosaic, counted from 0; phases: their number
     terms       the terms that are tried; they are taken if they are worth their price
     """
     local = psf.at(x, y)

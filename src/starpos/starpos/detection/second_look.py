@@ -15,9 +15,9 @@ from starpos.frames.stars import Stars, Window
 from starpos.normal import SIGMA_PER_MAD
 
 FWHM_PER_SIGMA = 2.3548
-# A kernel is cut off at so many sigma; wider stars than that of the widest are not looked for.
+# Radius of a kernel in sigma, and maximum sigma of stars that are looked for.
 CUT, WIDEST_SIGMA = 2.5, 4.0
-# The places around one, beyond its own light, at steps of some px; with fewer of them on the frame they tell nothing.
+# The places around one, beyond its own light, at steps of some px; minimum number of them on the frame.
 NEAREST, FARTHEST, STEP, FEWEST = 8, 60, 2, 200
 
 
@@ -51,8 +51,8 @@ class SecondLook:
     def __call__(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """How bright the places x, y (N,) px are: in sigma of a normal distribution, by rank; and the SNR.
 
-        A place without a star is any of those around it: its rank among them is even, whatever the noise, and the
-        first number exceeds that of a normal distribution nowhere. Ties count against a star. NaN at the frame's edge.
+        A place without a star has an even rank among the places around it, for any noise, so the first number never
+        exceeds a normal distribution's. Ties count against a star. NaN at the frame's edge.
         """
         steps = np.arange(-FARTHEST, FARTHEST + 1, STEP)
         across, down = (d.ravel() for d in np.meshgrid(steps, steps))

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Gaussian-windowed moments: place and width of a star with any symmetric image, without a model of it.
 
-If a star is a Gaussian of covariance C, its moments through an elliptical Gaussian window of covariance W are those of
-a Gaussian of covariance V = (C^-1 + W^-1)^-1 (Bernstein & Jarvis 2002, AJ 123, 583).
+If a star is a Gaussian of covariance C, its moments through an elliptical Gaussian window of covariance W equal the
+moments of a Gaussian of covariance V = (C^-1 + W^-1)^-1 (Bernstein & Jarvis 2002, AJ 123, 583).
 """
 
 import numpy as np
@@ -36,7 +36,7 @@ def moments(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Moments of stamps' signals (N, S, S) through a window (2, 2) px2, or one window each (N, 2, 2), about points.
 
-    left, top (N,) px: of each stamp's first column and row from its point.
+    left, top (N,) px: first column and row of a stamp, from the point.
 
     Returns the sum (N,), the mean offset (N, 2) px from the points and the covariance (N, 2, 2) px2 of the windowed
     image; NaN where there is no light. Pixels off the frame and saturated ones count as they are: without them the
@@ -81,12 +81,12 @@ def frame_shape(signal: np.ndarray, blur: float = 0.0, rounds: int = 12) -> np.n
 
 
 def own_shape(seen: np.ndarray, window: np.ndarray) -> np.ndarray:
-    """Covariances (N, 2, 2) px2 of stars from those of their windowed images, seen (N, 2, 2); NaN where impossible."""
+    """Covariances (N, 2, 2) px2 of stars from the windowed images' covariances seen (N, 2, 2); NaN where impossible."""
     return before(seen, _each(window))
 
 
 def relative_widths(seen: np.ndarray, shape: np.ndarray, window: np.ndarray) -> np.ndarray:
-    """The smaller and the larger squared width (N, 2) of windowed images, over those of stars of `shape` (..., 2, 2).
+    """The smaller and the larger squared width (N, 2) of windowed images, over the widths of `shape` (..., 2, 2).
 
     Both are 1 for a star of that shape and near 0 for a hot pixel. Along a streak the larger reaches 2 if the window is
     the shape. NaN counts as 0.

@@ -13,7 +13,7 @@ from starpos.normal import SIGMA_PER_MAD
 # Around a star the sky counts as brighter or less even than the mesh says where about 50 pixels lie so far above it, or
 # scatter so much, in units of a pixel's noise: both are four times their errors.
 RAISED, UNEVEN = 0.6, 1.6
-# The 24 pixels around a hot pixel hold together less than this share of its light and than so many sigma of their noise.
+# Maximum light of the 24 pixels around a hot pixel, as a share of its light and in sigma of their noise.
 ALONE, NOTHING = 0.25, 3.0
 # Hot pixels may be neighbours: of nine pixels all but the brightest, or all but the two brightest, then hold less than
 # these shares of the brightest's light. In a star of 1 px FWHM they hold 0.7 even where two share the light.
@@ -114,7 +114,7 @@ def surroundings(
 ) -> tuple[np.ndarray, np.ndarray]:
     """The sky's level and scatter on the edges of squares, reach px from the pixels x, y (N,) int, over the noise.
 
-    0 and 1 where a difference may be chance. Beside a roof, among twigs or under a cloud the sky is brighter and less
+    0 and 1 where a difference may be chance. Near a roof, among twigs or under a cloud the sky is brighter and less
     even than the background's mesh says.
     """
     x, y = (np.ascontiguousarray(v, np.intp) for v in (x, y))

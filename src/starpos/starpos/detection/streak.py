@@ -12,9 +12,9 @@ from starpos.detection.background import Background
 
 # px. Peaks along a trail are never farther apart.
 CELL = 8
-# A line needs so many peaks
+# Minimum number of peaks of a line,
 FEWEST = 12
-# and this length, px.
+# and its minimum length, px.
 SHORTEST = 100
 # Cells along a line without any peak, at most.
 GAP = 2
@@ -131,7 +131,7 @@ def _measured(
     level, noise = background.of_pixels(*centre, row, column)
     signal, sigma = plane[row, column] - level, np.median(noise, axis=-1)
     middle = np.median(signal, axis=-1)
-    # residuals of neighbouring pixels along the streak are correlated, so the noise is that of sums of three
+    # residuals of neighbouring pixels along the streak are correlated, so the noise is measured on sums of three
     rest = signal - middle[..., None]
     rest = (rest[..., :-2] + rest[..., 1:-1] + rest[..., 2:]) / 3**0.5
     scatter, most = np.quantile(np.abs(rest), (0.9, 0.97), axis=-1)

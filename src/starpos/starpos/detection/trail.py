@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The PSF of stars whose trail is known, for a frame whose stars do not tell it well enough themselves."""
+"""The PSF of stars whose trail is known, for a frame whose own stars do not determine it well enough."""
 
 from dataclasses import replace
 
@@ -18,11 +18,11 @@ from starpos.frames.trail import Trail
 SHORTEST_PX = 1.0
 # A long star has its peaks off its middle: a fit from there takes longer.
 ROUNDS = 10
-# Where trails differ over the frame the highest peaks are of the shortest: so many times as many are looked at.
+# Where trails differ over the frame the highest peaks belong to the shortest: factor by which more peaks are looked at.
 MORE = 4
 # Factors by which the width is sought further, after the usual ones.
 FINER = 2**0.5, 2**0.25
-# Unknowns of a learnt Gaussian; and by how much chi-square must be lower than that of a width that no star has taught.
+# Unknowns of a learnt Gaussian; minimum decrease of chi-square against a width that is not learnt from stars.
 OF_SHAPE, CLEAR = 3, 10.0
 
 

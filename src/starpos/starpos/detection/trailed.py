@@ -27,8 +27,8 @@ class TrailedPsf(FieldPsf):
     def at(self, x: np.ndarray, y: np.ndarray) -> LocalPsf:
         """The PSF at the points x, y (N,) px.
 
-        The coefficient of h_i is its mean over the light: that of He_i / sqrt(i!) over +-sqrt(3), where an even spread
-        has a variance of 1, times the power i / 2 of the trail's share of the variance along it.
+        The coefficient of h_i is its mean over the light: the mean of He_i / sqrt(i!) over +-sqrt(3), where an even
+        spread has a variance of 1, times the power i / 2 of the trail's share of the variance along it.
         """
         way = self.trail.at(x, y, self.width, self.height)
         length = np.hypot(way[:, 0], way[:, 1])

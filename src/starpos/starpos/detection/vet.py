@@ -18,9 +18,9 @@ from starpos.detection.stamps import RAISED, UNEVEN, Stamps, cut
 from starpos.frames.stars import BLENDED, EDGE, ELONGATED, SATURATED
 from starpos.normal import SIGMA_PER_MAD
 
-# Outliers of up to so many pixels are a hot pixel or a cosmic ray on the star, not another source.
+# Maximum size in pixels of an outlier that is a hot pixel or a cosmic ray on the star, not another source.
 SPECK = 3
-# A spike is so many times sharper than a star.
+# Minimum sharpness of a spike over a star's.
 SPIKE = 3
 # Widths of the PSF (3 are 1.3 FWHM): of closer pairs each star's position depends on the other's.
 RESOLVED = 3.0
@@ -28,7 +28,7 @@ RESOLVED = 3.0
 FAR = 6.0
 # A single star's chi-square stays below this; twigs, nebulae and covered stars exceed it.
 STRANGE = 3.0
-# An image with more than so many times a star's squared width is not a single star.
+# Maximum squared width of a single star's image over a star's.
 WIDE = 1.7
 # If it is narrower than this across, and has this SNR, it may be several stars in a row: it is kept, with a flag.
 NARROW, CERTAIN = 1.2, 60
@@ -36,7 +36,7 @@ NARROW, CERTAIN = 1.2, 60
 CORE = 2.0, 3.0
 # The rim of a very bright star is its own light: this share of its brightest pixel.
 OWN = 0.01
-# Pixels with so many times the noise of the quietest pixel of their stamp lie on a streak.
+# Minimum noise of pixels on a streak, over the quietest pixel of their stamp.
 LOUD = 3
 
 
@@ -69,7 +69,7 @@ def measure(
         stamps, spikes, fits = zip(*parts, strict=True)
         return joined(stamps), np.concatenate(spikes), joined(fits)
 
-    # those of several chunks together, because most chunks have a few
+    # odd stars of several chunks together, because most chunks have a few
     odd: list[Fitted] = []
 
     def one_chunk(x: np.ndarray, y: np.ndarray) -> dict[str, np.ndarray]:

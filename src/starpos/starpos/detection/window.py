@@ -7,7 +7,7 @@ from starpos.frames.stars import Window
 
 # A row or a column is white where this share of its pixels is.
 WHITE = 0.9
-# So many pixels of a side are looked at first.
+# Number of pixels of a side that are looked at first.
 FEW = 32
 
 
@@ -32,7 +32,7 @@ def window_of(plane: np.ndarray, highest: int, sky_dn: float) -> Window | None:
 
 
 def _is_white(side: np.ndarray, highest: int) -> bool:
-    """Whether most pixels (N,) along a side are white; a few of them tell of a dark one, most of whose are far apart."""
+    """Whether most pixels (N,) along a side are white; a few of them, far apart, are enough to recognise a dark side."""
     few = side[:: len(side) // FEW + 1]
     if 2 * np.count_nonzero(few == highest) <= len(few):
         return False

@@ -27,7 +27,7 @@ def place_of_zenith(zenith: np.ndarray) -> tuple[float, float]:
 
 
 def enu_axes(latitude: float, longitude: float) -> np.ndarray:
-    """Rotation (3, 3) of ITRS into east, north, up at a place (rad); at a pole north is that of its longitude."""
+    """Rotation (3, 3) of ITRS into east, north, up at a place (rad); at a pole its longitude defines north."""
     cl, sl, cp, sp = np.cos(longitude), np.sin(longitude), np.cos(latitude), np.sin(latitude)
     return np.array([[-sl, cl, 0.0], [-sp * cl, -sp * sl, cp], [cp * cl, cp * sl, sp]])
 

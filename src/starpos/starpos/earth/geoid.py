@@ -17,12 +17,12 @@ REACHES = (8, 4, 2)
 # The error comes from the grid's roughness, the change of slope from node to node, within this distance and number of
 # nodes in each direction,
 ROUGH_DEG, ROUGH_NODES = 0.5, (8, 60)
-# times this factor. With it the slopes of EGM96 differ from those of the national geoids of Australia, Austria, Iceland,
+# times this factor. With it the slopes of EGM96 differ from the national geoids of Australia, Austria, Iceland,
 # the Netherlands, Poland, South Africa, Spain, Switzerland and the USA by 0.3 (islands of the USA) to 1.2 (Iceland)
 # sigma, root mean square (tools/data/geoid_sigma.py).
 UNRESOLVED = 1.5
 FLOOR_ARCSEC = 0.5
-# Closer to a pole than this, meridians converge so fast that the roughness is not that of the geoid.
+# Closer to a pole than this, converging meridians distort the estimate of the geoid's roughness.
 ROUGH_NORTH_DEG = 87.0
 # 111 m from a pole; closer, east and west have no meaning.
 NEAREST_POLE_DEG = 1e-3

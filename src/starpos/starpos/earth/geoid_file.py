@@ -89,7 +89,7 @@ class Grid:
         return (latitude - self.south) / self.step_latitude, east / self.step_longitude
 
     def undulations(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
-        """Undulations (R, C) in m at rows (R,) and columns (C,), NaN where there are none.
+        """Undulations (R, C) in m at rows (R,) and columns (C,), NaN where unknown.
 
         A grid around the globe continues across its seam, and across a pole if its rows reach it.
         """

@@ -87,7 +87,7 @@ class KnownPlace:
         )
 
     def at(self, utc_unix_s: float) -> "KnownPlace":
-        """Return itself: one place is that of any time, as `Places` has it."""
+        """Return itself: one place holds for any time; `Places` has the same method."""
         return self
 
     @property

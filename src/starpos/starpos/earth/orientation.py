@@ -169,7 +169,7 @@ def earth_orientation(utc_unix_s: float) -> EarthOrientation:
 
 
 def measured_until() -> float:
-    """Time (UTC, Unix s) of the last UT1 in the IERS table that is measured; those of later days are predicted."""
+    """Time (UTC, Unix s) of the last measured UT1 in the IERS table; later values are predicted."""
     return (_table().measured_until_mjd - UNIX_EPOCH_JD + 2400000.5) * DAY_S
 
 
@@ -243,7 +243,7 @@ def _tai_minus_utc(utc_unix_s: float) -> float:
 
 
 def later(itrs: np.ndarray, seconds: np.ndarray) -> np.ndarray:
-    """Directions (N, 3) in ITRS as they are so many seconds (N,) later, by the Earth's rotation alone."""
+    """Directions (N, 3) in ITRS after a number of seconds (N,), by the Earth's rotation alone."""
     angle = ROTATION_RAD_S * seconds
     c, s, x, y = np.cos(angle), np.sin(angle), itrs[..., 0], itrs[..., 1]
     turned = itrs.copy()

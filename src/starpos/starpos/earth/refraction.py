@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Refraction in the local level L, where the tilt tells the zenith distance.
+"""Refraction in the local level L, where the tilt gives the zenith distance.
 
-The paper puts aberration beside it; docs/the_paper.md#matrix-a2 says where that is instead.
+The paper puts aberration in the same place; docs/the_paper.md#matrix-a2 says where it is here.
 """
 
 from dataclasses import dataclass, replace

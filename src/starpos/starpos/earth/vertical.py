@@ -23,7 +23,7 @@ from starpos.units import ARCSEC
 
 # Standard deviation of each component if nothing is known: the root mean square over the continents.
 UNKNOWN_STDDEV_ARCSEC = 6.0
-# Root mean square height of land, for a height that nobody stated: the mean is 0.8 km (ETOPO1), and heights are spread
+# Root mean square height of land, for a height that is not stated: the mean is 0.8 km (ETOPO1), and heights are spread
 # about as an exponential distribution.
 UNKNOWN_HEIGHT_M = 1200.0
 # Somigliana's constant of normal gravity, WGS 84 (NIMA TR8350.2, table 3.4).
@@ -41,7 +41,7 @@ class Vertical(Protocol):
 class Deflection:
     """Components xi (north) and eta (east) in arcsec, with the 1 sigma of each; InstrumentError if not finite.
 
-    North and east are those of the place that the Deflection is asked for; close to a pole they change with every step.
+    North and east are at the place that the Deflection is asked for; close to a pole they change with every step.
     """
 
     xi_arcsec: float = 0.0

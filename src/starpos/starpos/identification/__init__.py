@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Identify a frame's stars with those of the catalogue: from a prior, or lost in space from the brightest stars.
+"""Identify a frame's stars with catalogue stars: from a prior, or lost in space from the brightest stars.
 
 Triangles of the brightest stars are looked up by their shape. Candidates that share a side support each other (the
 paper's search). The pose of each is fitted to the brightest stars that agree, and its evidence is computed: a match is

@@ -37,7 +37,7 @@ ROUGHLY, LARGEST_TOLD_DEG = 1.2, 130.0
 STAGES = (10, 0.4), (15, 0.4), (21, 0.4), (12, 2.0)
 # A step of the focal length is at most this; and so small that it changes the shape of no quad by more than that.
 LARGEST_STEP, BENT = 0.1, 0.003
-# So many poses, those with most votes, are judged in each stage.
+# Poses judged in each stage: the ones with most votes.
 MOST_JUDGED = 40
 # Log-odds of an answer that ends the search though most bright detections are not its stars.
 SURE = 6 * ENOUGH
@@ -67,12 +67,12 @@ def identify_blind(
 ) -> tuple[Camera, Identification] | None:
     """Identify stars at pixels xy (N, 2), brightest first, of a pinhole camera of unknown focal length.
 
-    near_px: a focal length that it may have, with which the search begins; half of the probability is for it.
+    near_px: a likely focal length, with which the search begins; it has half of the probability.
     window: the part of the frame that shows something, as `Stars` has it; None: all of it.
     budget: CPU time after which the search ends; what it has found until then counts.
 
-    Returns the camera, whose focal length `Identification.focal_scale` refines, and the identification; None if there is
-    none beyond doubt.
+    Returns the camera, whose focal length `Identification.focal_scale` refines, and the identification; None without
+    an identification beyond doubt.
     """
     if len(xy) < FEWEST_STARS:
         return None
@@ -87,7 +87,7 @@ def identify_blind(
     frame = stars_at(camera, xy, sigma_px)
     tries = [_Try(np.arange(len(xy)), 1.0, ENOUGH)]
     if (even := second_try(through(frame, camera, window))) is not None:
-        # each star found keeps those of its cell away: that leaves less area for the others
+        # only one star is taken from a cell, which leaves less area for the others
         tries.append(_Try(even, 0.5, ENOUGH + SECOND_TRY))
     # the quick stages of all tries come before the slow ones of any
     work = [
@@ -115,7 +115,7 @@ def identify_blind(
 
 
 def stages_of(stages: Sequence[tuple[int, float]], stars: int) -> list[tuple[int, float]]:
-    """The stages of a frame of so many stars, without those that would be the same."""
+    """The stages for a frame with this number of stars, without duplicates."""
     return list(dict.fromkeys((min(number, stars), error_px) for number, error_px in stages))
 
 

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Identify a fisheye's frame of which nothing is known: lens model and scale, from parts of the frame outwards.
+"""Identify a fisheye's frame with unknown lens model and scale, from parts of the frame outwards.
 
-With a lens and a focal length that are supposed, the stars of a part of the frame have directions, and a pinhole that
-looks there would see them like those of any frame. Quads of the brightest of them give poses of the part, which are
-judged by the same evidence as any other. Then the lens extends the answer to the whole frame.
+An assumed lens and focal length give directions to the stars in a part of the frame, and a pinhole that looks there
+would see them like any other frame. Quads of the brightest of them give poses of the part, which are judged by the
+same evidence as any other. Then the lens extends the answer to the whole frame.
 """
 
 import math
@@ -39,11 +39,12 @@ LENSES = (
 NARROWEST_DEG, WIDEST_DEG = 60.0, 200.0
 # A step of the focal length either way: what it changes the shape of a part by is within the errors.
 STEP = 0.02
-# Frames are searched as if their pictures had this radius (px), and stars this error: that of lenses that are supposed.
+# Frames are scaled to this radius of the picture (px); the error of stars (px) allows for the assumed lens.
 RADIUS_PX, ERROR_PX = 500.0, 0.6
 # The brightest stars of a part that make quads, in turn; and how many poses of each part are judged.
 STAGES, MOST_JUDGED = (12, 18), 60
-# Parts look at the middle, and so far off it in so many directions. So much of a part shows sky, of points of a grid.
+# Parts look at the middle, and in AROUND directions at OFF_RAD from it. LEAST_SEEN is the minimum share of a part
+# that shows sky, counted on a grid of GRID x GRID points.
 OFF_RAD, AROUND, LEAST_SEEN, GRID = math.radians(40), 6, 0.6, 9
 _TURNS = [
     np.eye(3),
@@ -61,9 +62,9 @@ MOST_OUTSIDE = 0.03
 
 
 def disc_radius_px(xy: np.ndarray, width: int, height: int) -> float | None:
-    """The radius of a disc about a frame's middle in which its stars xy (N, 2) lie while the corners have none; or None.
+    """The radius of a disc about a frame's middle that contains its stars xy (N, 2), if the corners are empty; or None.
 
-    It is that of the stars: the picture of a fisheye may reach farther.
+    It is the radius of the stars: the picture of a fisheye may reach farther.
     """
     if len(xy) < FEWEST_STARS:
         return None
@@ -132,7 +133,7 @@ def identify_fisheye(
     stages: numbers of the brightest stars of a part that make quads.  near_px: a focal length that it may have.
     budget: CPU time after which the search ends.
 
-    Returns a camera that is near the true one, and the identification; None if there is none beyond doubt.
+    Returns a camera that is near the true one, and the identification; None without one beyond doubt.
     """
     if len(xy) < FEWEST_STARS:
         return None
@@ -144,7 +145,7 @@ def identify_fisheye(
         0.95 * min(low for low, _ in spans) * RADIUS_PX / radius_px,
         1.05 * max(high for _, high in spans) * RADIUS_PX / radius_px,
     )
-    # evidence as a frame needs, though so many parts and lenses are tried
+    # the evidence that a frame needs, raised for the number of parts and lenses tried
     need = wide.enough(len(_TURNS) * len(LENSES)) + SECOND_TRY
     work = [(stars, k) for stars in stages for k in range(len(_TURNS))]
     best: tuple[Camera, Identification] | None = None
@@ -168,7 +169,7 @@ def identify_fisheye(
 
 
 def _focal_range(lens: tuple[float, ...], radius_px: float, near_px: float | None) -> tuple[float, float]:
-    """The focal lengths (px) with which a lens makes a picture of that radius, or those near one that is told."""
+    """The focal lengths (px) with which a lens makes a picture of that radius; only ones near near_px, if given."""
     angles = (math.radians(deg / 2) for deg in (WIDEST_DEG, NARROWEST_DEG))
     low, high = (radius_px / (t * (1 + sum(k * t ** (2 * n) for n, k in enumerate(lens, 1)))) for t in angles)
     if near_px is None or not low < near_px < high:

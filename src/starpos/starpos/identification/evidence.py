@@ -25,7 +25,7 @@ from starpos.identification._search import Anywhere
 from starpos.identification.pose import Pose
 from starpos.identification.triangles import SCALE_TOLERANCE
 
-# Errors of the centroids beside their own (px) and their probabilities: none, errors of the catalogue, unknown lenses.
+# Extra centroid errors (px) and their prior probabilities: none, errors of the catalogue, unknown lenses.
 ERRORS_PX, LOG_SHARES = np.array([0.0, 0.3, 1.0, 3.0]), np.log([0.6, 0.2, 0.1, 0.1])
 # Limits on the error of its logarithm, and their probabilities.
 SCALES = (0.003, 0.5), (SCALE_TOLERANCE + 0.005, 0.5)
@@ -44,7 +44,7 @@ class Prior:
 
     log_density  of a pose, per rad3 of rotation and unit of the focal length's logarithm; -inf if the pose is impossible
     width        (4,): size of the region of possible poses, rad about C's axes and in that logarithm. It limits the
-                 volume of poses where the stars of a frame tell little.
+                 volume of poses where the stars of a frame constrain the pose weakly.
     """
 
     log_density: Callable[[Pose], float]

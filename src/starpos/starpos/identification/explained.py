@@ -8,7 +8,7 @@ from starpos.identification._frame import FrameStars
 from starpos.identification.full import Identification
 from starpos.identification.pose import TEST_STARS
 
-# At least so many catalogue stars are asked for, where the frame has as many.
+# Minimum number of catalogue stars looked for, if the frame has as many.
 LEAST_DUE = 8
 # An identification explains a frame if it explains this share of its bright detections, or if this share of the bright
 # stars that should be there are: then the other detections are false stars.
@@ -20,8 +20,8 @@ ENOUGH_EXPLAINED, ENOUGH_SEEN = 0.5, 0.6
 class Explained:
     """Counts of what an identification explains.
 
-    explained, bright  of so many brightest detections, those that are catalogue stars
-    seen, due          of so many brightest catalogue stars on the frame, those that are detected
+        explained, bright  catalogue stars among the brightest detections, and the number of these detections
+    seen, due          detections among the brightest catalogue stars on the frame, and the number of these stars
     """
 
     explained: int

@@ -14,24 +14,24 @@ from starpos.identification.pose import SMALL_STEP, STEPS, Pose
 from starpos.identification.sky import Sky
 from starpos.normal import SIGMA_PER_MAD
 
-# An identification has at least so many stars.
+# Minimum number of stars of an identification.
 FEWEST_STARS = 4
 # Log-odds: one try identifies at most one of 1e9 frames without stars.
 ENOUGH = np.log(1e9)
 ROUNDS = 3
 # A star may be GATE_SIGMA of the spread from its place, plus GATE_PX; the spread is at least LEAST_SPREAD_PX.
 LEAST_SPREAD_PX, GATE_SIGMA, GATE_PX = 0.02, 4.0, 0.2
-# So many of the brightest detections take part.
+# Number of the brightest detections that take part.
 FAINTEST_FIT = 2000
 # Errors of catalogue and lens, which a centroid's own error does not include.
 FLOOR_PX = 0.05
-# Where the residuals spread more, the lens bends: then all stars count alike, or the brightest few would decide.
+# With a larger spread of residuals the lens is distorted: all stars get the same weight, or the brightest few decide.
 BENT_PX = 0.3
 # Closer stars make one image.
 BLEND_PX = 2.5
-# So many catalogue stars may be those of a frame: for each detection, and so many more.
+# Number of catalogue stars that are compared with a frame: per detection, and in addition.
 PER_DETECTION, MORE_STARS = 3, 50
-# Stars so far beyond the frame (px) are on it, and a star so near its edge may be cut off.
+# Distance beyond the frame at which a star still counts as on it, and from its edge within which it may be cut (px).
 EDGE_PX, INSIDE_PX = 2.0, 5.0
 
 

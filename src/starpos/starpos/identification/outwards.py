@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Extend the identification of a part of a fisheye's frame to the whole of it, and find out its lens on the way.
 
-Stars near those that are known already are matched first. Each ring of them tells more of the lens (its focal length,
-axis and distortion), which then predicts the next ring.
+Stars near identified ones are matched first. Each ring of them improves the lens (focal length, axis and distortion),
+which then predicts the next ring.
 """
 
 import math
@@ -17,13 +17,13 @@ from starpos.identification.sky import Sky
 from starpos.identification.wide import FAR_PX, FLIP, LensPose, Part, WideField, error_px, spread_px, stars_on
 from starpos.instrument.camera import Camera
 
-# What lenses may be that nobody has told, 1 sigma: the axis's place in focal lengths, k1 and k2.
+# Prior of an unknown lens, 1 sigma: the position of the axis in focal lengths (x, y), k1 and k2.
 PRIOR = np.array([0.08, 0.08, 0.06, 0.02])
-# Terms of a fit: turns, logarithm of the focal length, and those of PRIOR. Its step, and how many are made.
+# Terms of a fit: rotations, logarithm of the focal length, and the terms of PRIOR. Size and number of its steps.
 TERMS, STEP, STEPS = 8, 1e-6, 3
-# Stars are matched so far from the part's middle at first, and farther in each round; then in so many more rounds.
+# Radius about the part's middle in which stars are matched first, its growth in each round, number of final rounds.
 FIRST_RAD, NEXT_RAD, LAST_ROUNDS = math.radians(32), math.radians(15), 2
-# A star may lie so far from its place (focal lengths) besides what the residuals show.
+# Maximum distance of a star from its predicted place (focal lengths), in addition to the residuals' spread.
 GATE_RAD, LEAST_SPREAD_PX = 0.004, 0.2
 # Stars beyond the part bear it out if chance makes as many pairs as seldom as this (logarithm).
 LOG_CHANCE = math.log(1e-6)
@@ -33,7 +33,7 @@ LOG_CHANCE = math.log(1e-6)
 class Outwards:
     """A camera fitted to its stars, the identification of a frame, and whether stars beyond the part bear it out.
 
-    Where they do not, the camera and the identification are those of the part.
+    If they do not, the camera and the identification stay as the part gave them.
     """
 
     camera: Camera
@@ -91,7 +91,7 @@ def _within(there: OnFrame, which: np.ndarray) -> OnFrame:
 
 
 def _borne_out(pairs: int, xy: np.ndarray, places: int, gate: np.ndarray) -> bool:
-    """Whether so many pairs of stars xy (n, 2) with so many places, within gate (n,) px, are more than chance makes."""
+    """Whether this number of pairs of stars xy (n, 2) and places, within gate (n,) px, is more than chance makes."""
     if pairs == 0:
         return False
     area = float(np.prod(np.ptp(xy, axis=0))) * math.pi / 4
@@ -100,7 +100,7 @@ def _borne_out(pairs: int, xy: np.ndarray, places: int, gate: np.ndarray) -> boo
 
 
 def _log_tail(count: int, expected: float) -> float:
-    """Chernoff's bound of the logarithm of the probability of so many events or more."""
+    """Chernoff's bound of the logarithm of the probability of `count` or more events."""
     return count - expected - count * math.log(count / expected) if expected > 0 else -math.inf
 
 

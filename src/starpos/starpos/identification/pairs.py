@@ -3,7 +3,7 @@
 
 import numpy as np
 
-# Up to so many distances a table of all is faster than two trees.
+# Number of distances up to which a table of all is faster than two trees.
 SMALL_TABLE = 100_000
 
 

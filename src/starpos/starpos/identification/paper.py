@@ -28,7 +28,7 @@ EXCEPTIONS = Path(__file__).with_name("data") / "paper_stars.csv"
 # observed place and epoch are Tycho-2's; the proper motion (mas/yr, in right ascension times cos(dec)) is the pair's.
 _A_RA_DEG, _A_DEC_DEG, _A_EPOCH = 300.87250833, 36.02515667, 1991.6
 _A_PM_RA, _A_PM_DEC = -10.7, -4.3
-# Errors of the place and of the motion, which is not that of A alone.
+# Errors of the place and of the motion, which belongs to the pair and not to A alone.
 _A_SIGMA_MAS = np.hypot(4.0, 2.6 * (EPOCH - _A_EPOCH))
 
 
@@ -38,7 +38,7 @@ def plain_cut(catalogue: Catalogue) -> np.ndarray:
 
 
 def stars(catalogue: Catalogue) -> np.ndarray:
-    """Rows of the paper's stars, those of Tycho-2's main table; a merged pair comes twice if the paper has both stars.
+    """Rows of the paper's stars, from Tycho-2's main table; a merged pair comes twice if the paper has both stars.
 
     EXCEPTIONS holds the stars that the compact catalogue cannot distinguish; `tools/data/paper_stars.py` makes it from
     the original files. CatalogueError if the catalogue lacks some of them.

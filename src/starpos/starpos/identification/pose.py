@@ -12,11 +12,11 @@ from starpos.instrument.camera import Camera
 
 # Most steps of a fit; a step below this (rad) is the last one.
 STEPS, SMALL_STEP = 2, 3e-5
-# So many of a frame's brightest stars decide, and so many where most of the brightest may be false.
+# Number of a frame's brightest stars that decide, normally and if most of the brightest may be false.
 TEST_STARS, CROWD_STARS = 50, 200
 # No centroid is better than this.
 LEAST_SIGMA_PX = 1e-3
-# A star lies within so many sigma of its place.
+# Maximum distance of a star from its predicted place, in sigma.
 MATCH_SIGMA = 3.5
 
 

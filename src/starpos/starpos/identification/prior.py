@@ -18,15 +18,15 @@ from starpos.identification.sky import Sky
 ERROR_PX = 5.0
 # If the camera has not moved, no star of the frame has moved by more.
 STILL_PX = 6.0
-# So many of the frame's stars vote for a shift.
+# Number of the frame's brightest stars that vote for a shift.
 BRIGHTEST = 15
 # The stars may have moved by this share of the frame's width.
 REACH = 0.05
-# Votes that differ by less are for the same shift.
+# Maximum difference of votes for the same shift.
 AGREE_PX = 3.0
 # Most proposals of one kind.
 MOST = 4
-# So many of the frame's stars vote for an azimuth.
+# Number of the frame's stars that vote for an azimuth.
 RING_STARS = 8
 # A zenith that is known less well does not help.
 WIDEST_RAD = 0.1
@@ -56,7 +56,7 @@ class PointingPrior:
             raise ValueError("a Pointing's focal length must be positive and finite")
 
     def attempts(self, field: FrameStars, sky: Sky, log_share: float) -> Iterator[Attempt]:
-        """Yield the pose if nothing has moved, then poses shifted as most stars agree; log_share is that of the Prior."""
+        """Yield the unshifted pose, then shifted ones in order of the stars they match; log_share as in the Prior."""
         pose = Pose(self.attitude, self.focal_px, False)
         radius_px = np.hypot(MATCH_SIGMA * field.sigma, ERROR_PX)
         yield pose, radius_px, self._known(field, STILL_PX, log_share + STANDS)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Keep the quads of a star catalogue: in memory, and beside the triangles on the disk, memory-mapped."""
+"""Keep the quads of a star catalogue: in memory, and next to the triangles on the disk, memory-mapped."""
 
 import hashlib
 import threading
@@ -11,7 +11,7 @@ from starpos.progress import Progress, quiet
 from starpos.sky.catalogue import Catalogue
 from starpos.table_cache import cache_folder, load_or_build, mapped, rising
 
-# Name of the folder in the cache; the number is that of the format.
+# Cache folder; the number is the format version.
 PREFIX = "quads-1-"
 
 _lock = threading.Lock()

@@ -46,7 +46,7 @@ class Matches:
         focal_px: float,
         step: float,
     ) -> "Matches":
-        """Quads of the frame's brightest stars, and those of the sky that they look like at a focal length.
+        """Quads of the frame's brightest stars, and similar quads of the sky at a focal length.
 
         error_px: of the stars, besides their own.  step: the share by which the true focal length may differ.
         """
@@ -55,9 +55,9 @@ class Matches:
         order, shape, size = shapes(v[four])
         star = np.take_along_axis(four, order, 1)
         error = QUAD_SIGMA * np.hypot(error_px, field.sigma[four].max(1)) / (focal_px * size)
-        # a lower rim than that of the catalogue's
+        # a lower limit than the catalogue's
         use = np.flatnonzero((shape.min(1) > 0.8 * SHORTEST) & (error < 0.03))
-        # the best known first: no more than so many are looked up
+        # the best known first: the number of look-ups is limited
         use = use[np.argsort(error[use], kind="stable")]
         query, quad = quads.near(shape[use], error[use] + LENS, np.log(size[use]), step + 0.01)
         return cls(star[use[query]], quads.corners[quad], np.full(len(query), focal_px))
@@ -100,7 +100,7 @@ class QuadPoses:
 
 
 def most_agreed(poses: Poses, half_diagonal_px: float, most: int) -> list[int]:
-    """Rows of the poses with most votes, at most so many, one of each group that agrees."""
+    """Rows of the poses with most votes, one of each group that agrees, up to a maximum number."""
     from scipy.spatial import cKDTree
 
     if not len(poses):

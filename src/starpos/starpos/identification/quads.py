@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Quads of bright stars of every size, by their shape: they tell the scale of a frame of which nothing is known.
+"""Quads of bright stars of every size, by their shape: they determine the scale of an unknown frame.
 
 As in astrometry.net (Lang et al. 2010, AJ 139, 1782) four stars have a shape that does not depend on the scale, and
-hardly any other four have it too. Here the shape is the lengths of five sides over that of the longest.
+hardly any other four have it too. Here the shape is the lengths of five sides over the length of the longest.
 """
 
 from dataclasses import dataclass
@@ -31,7 +31,7 @@ LEAST_SIDE, SHORTEST = 0.6, 0.08
 # Shapes are kept to 1/65535; these are the bins of four of their sides, and of the logarithm of the longest.
 CODES, BINS, SIZE_BINS = 65535, 12, 56
 SIZES_RAD = np.log(0.004), np.log(1.2)
-# Most pairs of quads alike for one focal length: more come of stars too close to each other, and tell nothing.
+# Maximum number of similar pairs of quads for one focal length: more come from close stars and add no information.
 MOST_ALIKE = 2000
 # Which pairs of a quad's stars its sides are: AB is the longest.
 SIDES = np.array(list(combinations(range(4), 2)))

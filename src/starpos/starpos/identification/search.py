@@ -136,7 +136,7 @@ def frame_stars(directions: np.ndarray, sigma_px: np.ndarray, camera: Camera) ->
 def identify_frame(
     field: FrameStars | wide.WideField, sky: Sky, priors: Priors = ()
 ) -> Identification | None:
-    """Identify stars as `identify` does, from FrameStars, or from those of a fisheye."""
+    """Identify stars as `identify` does, from the stars of a pinhole camera or of a fisheye."""
     if isinstance(field, wide.WideField):
         return _by_parts(field, sky, priors)
     return next(identifications(field, sky, priors), None)
@@ -156,13 +156,13 @@ def identifications(
 def _crowded_or_uneven(
     field: FrameStars, sky: Sky, priors: Priors, enough: float
 ) -> Iterator[Identification]:
-    """Yield what is identified of a frame whose brightest stars may nearly all be false, in any order.
+    """Yield identifications of a frame whose brightest stars may nearly all be false, in any order.
 
-    Then that of stars that are spread evenly, if the brightest are not.
+    Then the same for evenly spread stars, if the brightest are not spread evenly.
     """
     yield from _crowded(field, sky, priors, enough, CROWD_STARS)
     rows = second_try(field)
-    # each star found keeps those of its cell away: that leaves less area for the others
+    # only one star is taken from a cell, which leaves less area for the others
     left_px2 = field.area_px2 - 4 * float(field.half.prod()) / 2
     if rows is not None and left_px2 > 0:
         even, enough = field.take(rows).but(area_px2=left_px2), enough + SECOND_TRY
@@ -207,9 +207,9 @@ def near_or_lost(
     enough: float = ENOUGH,
     crowded: bool = False,
 ) -> Iterator[Identification]:
-    """What is identified with log-odds of `enough`: by the priors, then lost in space by `stages`.
+    """Yield identifications with log-odds of `enough`: by the priors, then lost in space by `stages`.
 
-    Half of the probability is that of the priors, if there are any.
+    The priors have half of the probability, if there are any.
     crowded: only triangles that others support are looked at, but all of those.
     """
     if priors:

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where the stars detected are too few to decide, the frame itself tells: is there light where fainter stars should be?
+"""If too few stars are detected to decide, look in the frame itself for light where fainter stars should be.
 
 A pose that its stars make likely, but not likely enough, says where the catalogue's other stars are. Each of these places
 is compared with those around it, where a star is as likely to be if the pose is wrong. The evidence is the ratio of the
-probabilities of that comparison, so its mean is at most 1 if the pose is wrong, whatever noise the frame has; and as it
-looks only where nothing was detected, it multiplies with the evidence of the detections.
+probabilities of that comparison. So its mean is at most 1 if the pose is wrong, for any noise of the frame. It looks only
+where nothing was detected, so it multiplies with the evidence of the detections.
 """
 
 from collections.abc import Callable
@@ -25,10 +25,10 @@ Look = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 # once in 1e10 frames. So all tries together fail at most 1.2 times in 1e9.
 WORTH, ENOUGH = 5.0, 26.2
 MOST_LOOKS = 20
-# Nearer to a detection a place tells what is known already; nearer to a brighter star of the catalogue, of that one.
+# Places nearer to a detection add no information; places nearer to a brighter catalogue star show that star's light.
 DETECTED_PX, NEAR_PX = 8.0, 6.0
-# A star may be so much fainter than the stars identified say (all alike), or missing (each); it is expected at most so
-# high, in sigma: a light that is higher tells no more. Fainter stars than the last are not looked for.
+# Brightness of stars over the prediction from identified ones (common to all), probability that a star is missing, and
+# maximum and minimum expected signal in sigma. Brighter detections add no evidence; fainter stars are not looked for.
 BRIGHTNESS, MISSING, HIGHEST, LOWEST = np.array([0.25, 0.5, 0.8, 1.2]), 0.25, 2.5, 0.5
 
 
@@ -37,7 +37,7 @@ def second_look(
 ) -> Identification | None:
     """Identify a frame whose stars are too few, by the light at the places of others.
 
-    field, priors  as `identify_frame` takes them; the field is that of the camera's pixels, without refraction
+    field, priors  as `identify_frame` takes them; the field is in the camera's pixels, without refraction
     """
     seen: set[tuple[bytes, bytes]] = set()
     for found in near_or_lost(field, sky, priors, STAGES, WORTH):

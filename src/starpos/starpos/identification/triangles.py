@@ -23,7 +23,7 @@ SHORTEST_SIDE = 0.03
 # Shapes (largest angle 60..180 deg, smallest 0..60 deg, longest side 0..the longest allowed) are kept to 1/65536 of
 # these ranges; the highest bits of the three are a triangle's bin.
 CODES = 1 << 16
-# The focal length may be off by this share, and a triangle by so many sigma of its stars.
+# Maximum error of the focal length (share), and of a triangle (sigma of its stars).
 SCALE_TOLERANCE, TRIANGLE_SIGMA = 0.03, 3.0
 # Density of shapes where they are looked up, over the mean density.
 CROWDED = 5.0
@@ -36,9 +36,9 @@ BEACONS = 0.25
 # Circles over the whole sky: (radius over the field's half diagonal, spacing over radius, brightest stars taken). The
 # first fits into a field of 3:2 or 4:3, the last contains the whole field.
 CIRCLES = ((0.6, 0.7, 7), (0.8, 0.7, 8), (1.0, 0.7, 9))
-# Limits, counted before duplicates of overlapping circles are removed. Beyond the first one there are no larger circles,
-# beyond the second one down to FEWEST_TAKEN stars are taken of the smallest, and one less beyond twice as many triangles:
-# the table of a field of 0.3 deg has 600 MB.
+# Limits, counted before duplicates of overlapping circles are removed. Beyond MAX_TRIANGLES there are no larger circles.
+# Beyond MOST_TRIANGLES fewer stars are taken of the smallest circles, down to FEWEST_TAKEN, and one less beyond twice as
+# many triangles: the table of a field of 0.3 deg has 600 MB.
 MAX_TRIANGLES, MOST_TRIANGLES, FEWEST_TAKEN = 9_000_000, 16_000_000, 5
 
 
@@ -90,7 +90,7 @@ class TriangleCatalogue:
     bin_start: np.ndarray
 
     def check(self, catalogue_stars: int) -> None:
-        """Raise ValueError for columns that do not fit together, or to so many stars: compiled loops trust them."""
+        """Raise ValueError for columns that do not match each other or the stars: compiled loops trust them."""
         stars, count = len(self.star), len(self.corners)
         if not (
             self.bin_start.shape == (np.prod(BINS) + 1,)
@@ -139,7 +139,7 @@ def no_triangles() -> TriangleCatalogue:
 
 
 def build(catalogue: Catalogue, half_diagonal: float, progress: Progress = quiet) -> TriangleCatalogue:
-    """Triangles for a field of this half diagonal (rad): those of the brightest stars of every circle over the sky.
+    """Triangles for a field of this half diagonal (rad), of the brightest stars of every circle over the sky.
 
     A circle takes its own brightest stars, however bright its neighbours are, so that every part of the sky has enough.
     """

@@ -7,7 +7,7 @@ The second is another pose of the same camera: what is left over is identified a
 evidence. In both the second sky must be about as bright as the first: ghosts and glare are much fainter.
 
 Two skies a few pixels apart may be identified as one between them. Then the residuals of neighbouring stars differ by
-much more than their errors, and as much as those of distant stars, which no lens does.
+much more than their errors, and as much as the residuals of distant stars, which no lens does.
 """
 
 import math
@@ -24,44 +24,44 @@ from starpos.identification.prior import PointingPrior
 from starpos.identification.search import STAGES, near_or_lost
 from starpos.identification.sky import Sky
 
-# A second sky leaves at least so many of the TEST_STARS brightest over, and this share of them.
+# Minimum number and share of the TEST_STARS brightest that a second sky leaves unidentified.
 LEAST_LEFT, LEAST_SHARE_LEFT = 4, 0.12
-# So many of the brightest are looked at for twins, and so many of those left over for another pose.
+# Number of the brightest stars searched for twins, and of the leftover ones searched for another pose.
 MOST_STARS = 2 * TEST_STARS
-# The shares of the two skies in the exposure differ by at most this (2.5 mag: 1 to 10).
+# Maximum ratio of the two skies' exposures, in magnitudes (2.5 mag: 1 to 10).
 MOST_FAINTER_MAG = 2.5
-# The brightness of a star in one sky, less that in the other, differs from that of the others by at most this.
+# Maximum deviation of a star's magnitude offset between the two skies.
 SAME_MAG = 1.0
 # Offsets of twins agree to one of these: the widest is for a camera that was turned too, or a lens that bends.
 OFFSETS_PX = 0.5, 2.0, 8.0
-# An offset is at least so long, and so many times that, or the twins are one image with a tail; at most it is this share
+# Minimum length of an offset, in px and in tolerances, or the twins are one image with a tail; maximum length as a share
 # of the frame.
 NEAREST_PX, NEAREST, FARTHEST = 4.0, 2.0, 0.25
-# Chance is counted around the offset, out to so many times that: the companions of stars lie in a ring.
+# Chance pairs are counted around the offset, out to this many tolerances: the companions of stars lie in a ring.
 AROUND = 4
-# Twins make up this share of the bright stars, lie apart by this share of the frame in every direction, and at most
-# this share of them is a twin on both sides, as in a row or a lattice of lights.
+# Minimum share of twins among the bright stars, minimum spread of twins as a share of the frame in every direction, and
+# maximum share of twins on both sides, which a row or a lattice of lights has.
 LEAST_SHARE, LEAST_SPREAD, MOST_IN_ROWS = 0.25, 0.05, 0.25
-# At least so many twins have one star that is identified and one that is not.
+# Minimum number of twins with one identified and one unidentified star.
 LEAST_LINKED = 3
 # Stages of the search for another pose; the poor ones are for lenses that the first identification has dealt with.
 QUICK_STAGES = STAGES[:2]
-# The other pose has the same focal length to this share, and residuals of so many times those of the first plus so much.
+# Maximum difference of the other pose's focal length (share); maximum residuals over the first pose's (factor, px).
 SAME_FOCAL, WORSE, WORSE_PX = 0.01, 2.0, 0.5
-# This share of those left over that are as bright belongs to the second sky.
+# Minimum share of equally bright leftovers that the second sky must explain.
 LEAST_SHARE_SECOND = 0.5
 # From a star of the first sky to its neighbour, what a lens bends changes by at most this share of their distance.
 STEEPEST_BEND = 0.2
-# Between two skies the residuals of neighbours differ by so many px, by their errors times the first number plus the
-# second over the square root of the number of stars, and by this share of what those of distant stars do.
+# Minimum difference of neighbours' residuals between two skies: in px; in their errors, times the first number plus the
+# second over the square root of the number of stars; and as a share of the difference of distant stars.
 MIXED_PX, MIXED, MIXED_BY_CHANCE, MIXED_EVERYWHERE = 1.2, 1.4, 2.0, 0.3
 # With a smaller mean square of all residuals no two skies are mixed.
 LEAST_MIXED_PX2 = MIXED_PX**2 * MIXED_EVERYWHERE
-# Errors of centroids (px) that nobody states.
+# Minimum error of centroids (px), for errors that are not stated.
 LEAST_ERROR_PX = 0.1
-# Of so many stars or more only this share, those that fit best, are compared.
+# From this number of stars on, only this share of them, the best-fitting ones, is compared.
 FEW_WRONG, ROBUST = 32, 0.9
-# A lens bends by a polynomial of so many terms, the more the more stars there are.
+# Minimum number of stars, and number of terms of the polynomial of the lens's distortion.
 BENDS = (12, 3), (20, 6), (32, 10)
 
 
@@ -87,7 +87,7 @@ def two_skies(
 
 
 def _between_two(field: FrameStars, sky: Sky, found: Identification) -> bool:
-    """Whether the residuals of neighbouring stars differ as only those of two skies do."""
+    """Whether the residuals of neighbouring stars differ by more than one sky can explain."""
     stars = len(found.star)
     xy, error2 = field.xy[int(found.mirrored)][found.star], field.sigma[found.star] ** 2 + LEAST_ERROR_PX**2
     residual = xy - _pose(field, found).project(sky.directions(found.catalogue))
@@ -165,7 +165,7 @@ def _most_alike(
     nearest2 = np.minimum(away2, np.square(offset + centre).sum(1))
     around = np.sum(nearest2 < (AROUND * within_px) ** 2) - len(twin)
     expected, others = (around + 1) / (AROUND**2 - 1), len(twin) - 1
-    # so many others around any one of the offsets, by Poisson's distribution
+    # this number of others around any one of the offsets, by Poisson's distribution
     return twin, math.log(len(offset)) + others * math.log(expected) - math.lgamma(others + 1)
 
 
@@ -194,7 +194,7 @@ def _another_pose(
             return False
         new = _new(field, mag, row[second.star], sky, found, second)
         if new.all():
-            # what lies beside many stars, as companions do, is near any pose that is a little off
+            # a pose that is slightly wrong still puts companions near catalogue stars
             bright = int(np.median(second.star)) + 1
             return bool(np.sum(second.star < bright) >= LEAST_SHARE_SECOND * bright)
         # the evidence must do without the others
@@ -251,5 +251,5 @@ def _pose(field: FrameStars, found: Identification) -> Pose:
 
 
 def _zero(mag: np.ndarray, sky: Sky, found: Identification) -> float:
-    """Median of the brightness (M,) of identified stars, less that of the catalogue."""
+    """Median of the magnitudes (M,) of identified stars, less the catalogue's magnitudes."""
     return float(np.median(mag - sky.catalogue.vmag(found.catalogue)))

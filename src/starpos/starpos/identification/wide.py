@@ -95,7 +95,7 @@ class Part:
         return stars_at(self.camera, self.camera.project(self.directions), self.sigma_px)
 
     def turned(self, priors: Sequence[PointingPrior | PlumbPrior]) -> tuple[PointingPrior | PlumbPrior, ...]:
-        """Priors of the frame as those of this part."""
+        """Priors of the frame, turned into this part."""
         return tuple(
             replace(p, attitude=self.turn @ p.attitude)
             if isinstance(p, PointingPrior)
@@ -144,12 +144,12 @@ def _turns(camera: Camera, pinhole: Camera) -> list[np.ndarray]:
 
 
 def enough(part_count: int) -> float:
-    """Log-odds that one of so many parts needs, so that all together are as safe as a frame."""
+    """Log-odds that one of `part_count` parts needs, so that all together are as safe as a frame."""
     return float(ENOUGH) + math.log(part_count)
 
 
 def part_of(field: WideField, sky: Sky, found: Identification) -> tuple[Part, Identification]:
-    """The part with most identified stars of a frame, and the identification as that of the part."""
+    """The part with most identified stars of a frame, and the identification in terms of the part."""
     best = max(parts(field), key=lambda p: np.isin(found.star, p.row).sum())
     inside = np.isin(found.star, best.row)
     star, catalogue = np.searchsorted(best.row, found.star[inside]), found.catalogue[inside]
@@ -225,14 +225,14 @@ class LensPose:
 
 
 def everywhere(field: WideField, sky: Sky, part: Part, found: Identification) -> Identification | None:
-    """The identification of all stars of a frame from that of a part.
+    """Extend the identification of a part to the whole frame.
 
-    None if the lens does not have in their places the stars that were identified.
+    None if the lens puts the identified stars in other places.
     """
     flip = FLIP if found.mirrored else np.eye(3)
     attitude = flip @ part.turn.T @ flip @ found.attitude
     pose = LensPose(field.camera.scaled(found.focal_scale), attitude, found.mirrored)
-    # what lies beyond the picture once refraction is undone is beside all stars
+    # ignore stars that fall outside the picture once refraction is removed
     xy = np.nan_to_num(field.camera.project(field.directions[:FAINTEST_FIT]), nan=FAR_PX)
     sigma = field.sigma_px[:FAINTEST_FIT]
     star, index = part.row[found.star], found.catalogue
@@ -258,13 +258,13 @@ def everywhere(field: WideField, sky: Sky, part: Part, found: Identification) ->
 
 
 def error_px(residual: np.ndarray) -> float:
-    """Error beside the centroids' own: where the lens is not known well all stars count alike."""
+    """Extra error: where the lens is poorly known, it dominates, so all stars get the same weight."""
     spread = spread_px(residual[np.isfinite(residual).all(1)])
     return spread if spread > BENT_PX else FLOOR_PX
 
 
 def _gate_px(residual: np.ndarray, sigma: np.ndarray) -> np.ndarray:
-    """Largest distance (N,) px of each star from its place, from the residuals (M, 2) of the stars matched so far."""
+    """Maximum distance (N,) px of a star from its place, from the residuals (M, 2) of the stars matched so far."""
     return GATE_SIGMA * np.hypot(max(spread_px(residual), LEAST_SPREAD_PX), sigma) + GATE_PX
 
 
@@ -292,7 +292,7 @@ def _within(pixel: np.ndarray, camera: Camera, margin_px: float) -> np.ndarray:
 
 
 def stars_on(pose: LensPose, sky: Sky, stars: int) -> OnFrame:
-    """The catalogue stars that so many detections may be."""
+    """The catalogue stars that this number of detections may be."""
     camera, catalogue = pose.camera, sky.catalogue
     axis = (FLIP[2] if pose.mirrored else np.array([0.0, 0.0, 1.0])) @ pose.attitude
     index = rows_near(catalogue.cell_start, axis, min(1.05 * camera.half_diagonal_rad + 0.02, math.pi))

@@ -3,7 +3,7 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -23,6 +23,8 @@ FUTURE_S = 0.1
 NEW_TIME_S = 1.0
 # A floor, for a simulated accelerometer may have no noise.
 LEAST_STDDEV_RAD = 1e-6
+# So many averages with noise make one without it that of a stuck sensor.
+NOISY = 20
 # Most messages in an average.
 MAX_MESSAGES = 10_000
 
@@ -85,6 +87,12 @@ class MeanForce:
     @property
     def force(self) -> np.ndarray:
         return self.forces.mean(0)
+
+    @property
+    def excess(self) -> float:
+        """How many times larger the stated standard deviation is than the scatter, by the axis where it is least so."""
+        scatter = self.forces.var(0, ddof=1)
+        return float(np.sqrt(np.min(self.variance / scatter))) if scatter.all() else 0.0
 
     def unrest(self, max_force_error: float, max_rotation: float) -> str:
         """Say why it gives no tilt (limits: a share of g, rad/s); empty if it gives one."""
@@ -155,6 +163,7 @@ class ImuTilts:
 
     values: the parameters noise_stddev, latency and imu.* of the inclinometer.
     unrest: why the last average gave no tilt; '' where it gave one.  frame: of the last message.
+    age_s: of the last message's stamp.  excess: how many times the last average's scatter its stated noise is.
     """
 
     def __init__(self, values: Mapping[str, Any]) -> None:
@@ -163,7 +172,11 @@ class ImuTilts:
         self.averager = ForceAverager(values["imu.average"])
         self._noise = NoiseTracker()
         self._sequence = 0
-        self._gap = self._has_noise = False
+        # of the last message (s), and of the last average
+        self.age_s = self.excess = 0.0
+        self._gap = False
+        # averages with noise since the last one without
+        self._noisy = 0
         self.configure(values)
 
     def configure(self, values: Mapping[str, Any]) -> None:
@@ -171,6 +184,7 @@ class ImuTilts:
         self.averager.seconds = values["imu.average"]
         self._max_force_error = values["imu.max_force_error"]
         self._max_rotation = math.radians(values["imu.max_rotation"])
+        self._scatter_alone = values["imu.variance"] == "scatter"
         self._floor = 0.0 if math.isnan(values["noise_stddev"]) else math.radians(values["noise_stddev"])
         self._latency_ns = 0 if math.isnan(values["latency"]) else round(values["latency"] * 1e9)
 
@@ -191,6 +205,9 @@ class ImuTilts:
             self.future += 1
             return None
         self.good += 1
+        self.age_s = (now_ns - said.stamp_ns) * 1e-9
+        if self._scatter_alone:
+            said = replace(said, variance=(0.0, 0.0, 0.0))
         breaks = self.averager.breaks
         average = self.averager.add(said)
         reading = None if average is None else self._told(average)
@@ -207,6 +224,7 @@ class ImuTilts:
 
     def _reading(self, average: MeanForce) -> Reading:
         x, y, z = average.tilt()
+        self.excess = average.excess
         flags = self._flags(average)
         if flags & GAP:
             self._noise.interrupt()
@@ -230,9 +248,13 @@ class ImuTilts:
         flags = GAP if self._gap else 0
         self._gap = False
         still = not np.ptp(average.forces, axis=0).any()
-        if still and (self._has_noise or average.variance.any()):
+        # a simulated IMU may have no noise at all, but while it turns
+        if still and self._noisy >= NOISY:
             flags |= STUCK
-        self._has_noise |= not still
+        elif still:
+            self._noisy = 0
+        else:
+            self._noisy += 1
         return flags
 
     def _covariance(self, average: MeanForce) -> np.ndarray:

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Place and heading of an instrument under way: stars tell the attitude, an IMU the vertical, both from nothing known."""
+"""Place and heading of an instrument under way: stars give the attitude, an IMU the vertical, with no prior knowledge."""

@@ -47,7 +47,7 @@ FEWEST_FRAMES = 3
 SETTLED_M, SETTLED_SHARE = 1.0, 0.02
 # equations of a place farther off are wrong by more than the stars' errors: the square of the angle
 NEAR_M = 2000.0
-# variances so many times those stated are told
+# minimum ratio of found to stated variances that is reported
 NOTABLE = 4.0
 # no step on the Earth is longer
 FARTHEST_M, MOST_ROUNDS = 2e7, 25
@@ -151,7 +151,7 @@ class Adjustment:
         solution: Smoothed | None = None
         zenith, step, sigma = np.zeros(3), np.inf, 1.0
         for k in range(MOST_ROUNDS):
-            # equations of another place tell neither how the stars are seen nor which measurements are wrong
+            # equations for another place show neither how the stars are seen nor which measurements are wrong
             near = step < min(NEAR_M, sigma)
             up = zenith_at(motion.place[len(motion) // 2])
             seen_anew = near and bool(np.linalg.norm(up - zenith) > ZENITH_MOVED)
@@ -213,9 +213,9 @@ class Adjustment:
         return len(seeming) != before
 
     def _weighed(self, motion: Motion, chain: Chain, links: Links) -> bool:
-        """Whether the record changes how much is believed of its own noise, or of the law that stands in for velocities.
+        """Whether the record changes the weight of its own noise, or of the law that stands in for velocities.
 
-        The noise only where velocities or standstills tell it: a law's errors hide it.
+        The noise only if velocities or standstills show it: a law's errors hide it.
         """
         if (self.odometry is not None or self.standing) and not self.noise_weighed:
             self._weigh(chain, links)
@@ -315,7 +315,7 @@ class Adjustment:
         return chain, links
 
     def _by_law(self, motion: Motion, stands: Lacks) -> np.ndarray:
-        """Whitened equations (K, 3, n + m + 1) of the law of motion, and in their place those of standstills."""
+        """Whitened equations (K, 3, n + m + 1) of the law of motion, replaced by the equations of standstills."""
         assert self.law is not None
         rows = law_lacks(motion, self.law).whitened(len(motion))
         rows[stands.index] = stands.whitened(len(motion))[stands.index]

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A law of motion as a record bears it out: how much wind and gusts change from one minute to the next.
+"""Check a law of motion against a record: how much wind and gusts change from one minute to the next.
 
-Only what goes across the nose tells it, since the speed along the nose is unknown.  A trend, steady from end to end of
-the record, is what an error of the place looks like: it tells nothing.  Minutes tell of it, as far as a wind walks at
-random, and a slow swing, half a wave or two over the record, hides a trend of its own size.  Calm air may drift without
-either, so the record may widen how fast the drift changes, and never narrows it.
+Only the motion across the nose shows it, since the speed along the nose is unknown.  A trend, steady from end to end of
+the record, looks like an error of the place, so it cannot be used.  Minutes reveal it as far as a wind is a random walk.
+A slow swing, half a wave or two over the record, hides a trend of its own size.  Calm air may drift without either, so
+the record may widen how fast the drift changes, and never narrows it.
 """
 
 from dataclasses import dataclass, replace
@@ -16,14 +16,14 @@ from starpos.earth.gravity import geodetic_place, zenith_at
 from starpos.navigation.laws import MotionLaw
 from starpos.navigation.motion import Motion
 
-# means over so long are compared, of a long record over longer; fewer tell nothing
+# duration of the means, longer in a long record; minimum and maximum number of means
 MEAN_S, FEWEST, MOST = 60.0, 5, 40
 # factors of the law that are tried; the law is believed within a factor of e, 1 sigma
 WALKS, RESTS = 2.0 ** np.arange(0, 5.1, 0.5), 2.0 ** np.arange(-6, 4.1, 0.5)
 # of the trend that a walk as the law has it leaves: sizes of swings of SWINGS half waves, and how probable each is
 TRENDS, SWINGS = np.append(0.0, 2.0 ** np.arange(0, 6.1, 0.5)), 4
 PROBABLE = np.append(0.9, np.full(len(TRENDS) - 1, 0.1 / (len(TRENDS) - 1)))
-# directions in which means are less sure than the surest by such a factor are none
+# minimum certainty of a direction of means over the surest; less certain ones are dropped
 RANK = 1e-6
 
 
@@ -75,7 +75,7 @@ class Means:
     swings: np.ndarray
 
     def log_likelihood(self, variance: np.ndarray, swing: float) -> np.ndarray:
-        """Logarithms (...) of how likely the values are, by variances (..., D) and swings of so many m/s2, 1 sigma."""
+        """Logarithms (...) of how likely the values are, by variances (..., D) and swings in m/s2, 1 sigma."""
         seen = self.swings * swing
         normal = np.eye(seen.shape[1]) + np.einsum("di,...d,dj->...ij", seen, 1 / variance, seen)
         right = (self.values / variance) @ seen
@@ -85,7 +85,7 @@ class Means:
 
 
 def independent_means(t: np.ndarray, side: np.ndarray, across: np.ndarray, number: int) -> Means:
-    """The Means of so many parts of a record, free of a steady drift and of its steady change.
+    """The Means of the parts of a record, free of a steady drift and of its steady change.
 
     t (K,) from 0, side (K, 2) level, across (K,) m/s.
     """

@@ -13,7 +13,7 @@ from starpos.navigation.table import read_record
 COLUMNS = ("gx", "gy", "gz", "ax", "ay", "az")
 # a reading that comes later than this share of the usual time has one missing before it
 GAP = 1.5
-# so many readings in a row at a channel's greatest value are clipped ones
+# number of readings in a row at a channel's greatest value that count as clipped
 CLIPPED = 3
 FEWEST = 100
 
@@ -100,7 +100,7 @@ def read_imu(path: Path | str) -> ImuLog:
 class ImuModel:
     """Errors of an IMU, 1 sigma an axis: densities of noise as kalibr names them, and what is constant over a voyage.
 
-    The defaults are those of a cheap one of which nothing is said.
+    The defaults describe a cheap IMU, for one that is not stated.
 
     gyroscope_noise_density, accelerometer_noise_density: rad/s/sqrt(Hz), m/s2/sqrt(Hz)
     gyroscope_random_walk, accelerometer_random_walk: of the biases, rad/s2/sqrt(Hz), m/s3/sqrt(Hz)

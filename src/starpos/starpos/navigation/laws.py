@@ -94,7 +94,7 @@ def carried(drift_stddev: float) -> MotionLaw:
     )
 
 
-# nobody has said what it is: anything that goes on the ground, at sea or in the air
+# default: any vehicle on land, at sea or in the air
 ANYTHING = MotionLaw(
     speed_stddev=100.0,
     speed_walk=1.0,

@@ -32,7 +32,7 @@ from starpos.navigation.motion import (
 )
 from starpos.navigation.preintegration import Pieces, Sums
 
-# the rate at a frame is the mean of so many readings
+# number of readings whose mean is the rate at a frame
 RATE_READINGS = 5
 # nothing is known of it before: place m, velocity m/s, attitude rad
 NO_PLACE, NO_VELOCITY, NO_TURN = 2e7, 1e3, 10.0
@@ -77,7 +77,7 @@ class Lacks:
     covariance: np.ndarray
 
     def whitened(self, count: int) -> np.ndarray:
-        """Equations (count, 3, n + m + 1) of all nodes, with zeros where there are none."""
+        """Equations (count, 3, n + m + 1) of all nodes, with zeros at nodes without one."""
         all_rows = np.zeros((count, *self.rows.shape[1:]))
         if len(self.index):
             all_rows[self.index] = np.linalg.solve(np.linalg.cholesky(self.covariance), self.rows)
@@ -154,7 +154,7 @@ def standing_lacks(motion: Motion, index: np.ndarray, sigma: float, n: int) -> L
 
 
 def law_lacks(motion: Motion, law: MotionLaw) -> Lacks:
-    """Equations of all nodes whose velocity only a law of motion tells: a speed along the nose, a drift, a rest."""
+    """Equations of the nodes whose velocity is known only from the motion law: speed along the nose, drift, rest."""
     up, count = zenith_at(motion.place), len(motion)
     level = np.eye(3) - up[:, :, None] * up[:, None, :]
     nose = np.einsum("kij,kj->ki", level, motion.attitude[:, :, 0])

@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-# columns of a node: place m and velocity m/s in ITRS, attitude as a small rotation about ITRS's axes in rad, biases of
-# gyro and accelerometer; where a law of motion stands in for a velocity also speed along the nose and drift in ITRS
+# Columns of a node: place m and velocity m/s in ITRS, attitude as a small rotation about ITRS's axes in rad, biases of
+# gyro and accelerometer. If a law of motion stands in for a velocity: also speed along the nose and drift in ITRS
 PLACE, VELOCITY, TURN = slice(0, 3), slice(3, 6), slice(6, 9)
 GYRO_BIAS, ACCEL_BIAS = slice(9, 12), slice(12, 15)
 SPEED, DRIFT = slice(15, 16), slice(16, 19)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a claim under way rests on: the unknown by which most of the place's error comes, and what would tell it."""
+"""The unknown that contributes most to the place's error under way, and the action that would determine it."""
 
 from dataclasses import dataclass
 
@@ -33,7 +33,7 @@ class Observability:
 def observability(estimate: Estimate, measured: bool) -> Observability:
     """Which unknown an estimate's place depends on: by how much its error would shrink if that were known.
 
-    measured: whether a velocity is, so that nothing else would tell it.
+    measured: whether a velocity is measured, so that nothing else would determine it.
     """
     covariance = estimate.covariance
     latitude, longitude, _ = (float(x) for x in geodetic_place(estimate.motion.place[0]))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Measured velocities against those of a voyage: what each lacks, at the node that is nearest to it."""
+"""Measured velocities against a voyage's velocities: the residuals, at the nearest nodes."""
 
 from dataclasses import dataclass
 
@@ -13,7 +13,7 @@ from starpos.navigation.preintegration import Pieces, Sums
 from starpos.navigation.velocity import VelocityLog
 from starpos.normal import SIGMA_PER_MAD
 
-# velocities farther off are those of a slipping wheel or another mishap
+# velocities farther off come from a slipping wheel or another mishap
 OUTLIER_SIGMA = 5.0
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Frames of which only the camera's attitude among the stars is told, not the stars themselves."""
+"""Frames that give only the camera's attitude among the stars, not the stars themselves."""
 
 from dataclasses import dataclass
 
@@ -11,8 +11,8 @@ from starpos.earth.refraction import Atmosphere
 from starpos.fix.camera_attitude import CameraAttitude
 from starpos.navigation.sightings import StarAttitude, roughly
 
-# refraction squeezes a frame more along the vertical than across: a middle of the stars that lies so far from the axis,
-# rad, makes of that a turn across the axis, and stars spread farther one way than the other, as a share, one about it
+# Refraction squeezes a frame more along the vertical than across. This turns the attitude across the axis if the middle
+# of the stars is off the axis (rad), and about it if stars spread farther one way than the other (share): 1 sigma.
 OFF_AXIS, SPREAD = 0.03, 0.25
 # sine of the lowest altitude that this is for
 LOWEST = 0.1
@@ -46,9 +46,9 @@ class PlacelessFrame:
     def under(self, zenith: np.ndarray, atmosphere: Atmosphere) -> StarAttitude:
         """The attitude under a zenith (3,) in ITRS, from where stars around the camera's axis would be seen there.
 
-        How far the frame's own stars lie from it their attitude's covariance tells; the plate scale that was fitted with
-        it has taken up what refraction does to all directions alike.  What it does to the ones that they happen to lie
-        in is in the covariance.
+        The attitude's covariance gives the distance of the frame's own stars from it.  The fitted plate scale has
+        absorbed the effect of refraction that is the same in all directions.  The covariance contains the rest, which
+        depends on the directions in which the stars lie.
         """
         across, about = np.diag(self.covariance)[:2].mean(), self.covariance[2, 2]
         ring = np.column_stack([np.sqrt(across / about) * CIRCLE, np.ones(len(CIRCLE))])

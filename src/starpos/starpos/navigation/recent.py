@@ -105,7 +105,7 @@ class RecentRecord:
     velocity: np.ndarray | None
 
     def adjusted(self, vessel: Vessel) -> Voyage:
-        """The voyage; VoyageError or FixError says why there is none."""
+        """The voyage; VoyageError or FixError if it cannot be found."""
         rows = np.concatenate(self.blocks)
         imu = thinned(ImuLog.of(rows[:, 0], rows[:, 1:4], rows[:, 4:]), READING_S)
         log = None

@@ -13,15 +13,15 @@ from starpos.navigation.measures import StarAttitudes
 from starpos.navigation.preintegration import Pieces, Sums
 
 GRAVITY = 9.8
-# the mean force may differ from gravity by this, and by so many sigmas of what the model allows
+# maximum difference of the mean force from gravity, and the same in sigmas of the model
 MOST_OFF, SIGMAS = 0.5, 6.0
 # so low, in the mean, no camera on a vehicle looks for stars: so far from the plumb line, deg
 LOWEST_DEG = 80.0
 # turns that are seen so far above their noise show the gyro's axes; and what part of them may be off
 CLEARLY, MOST_SHARE = 20.0, 0.3
-# a gyro whose turns scatter by so many times the noise of its model where the stars see none has another unit
+# maximum scatter of a gyro's turns over its model's noise while the stars show no turn; more means another unit
 MOST_SCATTER = 8.0
-# a frame strays whose turn is so much off, rad, and so many in a row at most
+# minimum error (rad) of the turn of a stray frame, and maximum number of stray frames in a row
 STRAY, MOST_STRAYS = np.radians(3.0), 5
 # rad/s in other units
 UNITS = {"deg/s": np.degrees(1.0), "rev/min": 30 / np.pi}
@@ -30,9 +30,9 @@ UNITS = {"deg/s": np.degrees(1.0), "rev/min": 30 / np.pi}
 def check(
     stars: StarAttitudes, pieces: Pieces, sums: Sums, model: ImuModel, camera_to_body: np.ndarray
 ) -> None:
-    """Raise VoyageError where gravity is missing, or turns and forces are not those of the camera.
+    """Raise VoyageError where gravity is missing, or turns and forces do not match the camera's.
 
-    sums are those of the readings as they are.
+    sums are of the unchanged readings.
     """
     _check_gravity(pieces, sums, model, camera_to_body)
     _check_turns(stars, pieces, model, camera_to_body)
@@ -128,7 +128,7 @@ def strays(
 
 
 def _cause(seen: np.ndarray, felt: np.ndarray) -> str:
-    """What would make the gyro's turns (N, 3) those of the stars (N, 3)."""
+    """The change that would make the gyro's turns (N, 3) equal the stars' (N, 3)."""
     ratio = float(np.median(np.linalg.norm(felt, axis=1) / np.linalg.norm(seen, axis=1)))
     for unit, size in UNITS.items():
         if abs(ratio / size - 1) < MOST_SHARE:

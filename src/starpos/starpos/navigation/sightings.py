@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The stars of a frame under way, and the attitude of the camera against the Earth that they tell.
+"""The stars of a frame under way, and the attitude of the camera against the Earth that they give.
 
 No level is needed: only refraction and the diurnal aberration depend on the zenith, and hardly.
 """

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Standstills of a vehicle on the ground, by the record itself: attitudes, readings, and whether the rest bears them out.
+"""Find standstills of a vehicle on the ground in the record: by attitudes, readings and agreement with the rest.
 
-No single sign tells a vehicle that stands from one that rolls evenly and straight.  So it is believed where three agree.
-Its attitude stays, to the errors of the stars, as no rolling vehicle's does on real ground.  Its readings are quieter
-than while it surely moves: a vehicle whose motion is not felt is never seen to stand.  And the rest of the record,
-without that standstill, tells its velocity well enough, and it is 0.  Where one of them cannot be 0 none is believed:
-which of those that contradict each other are true nobody knows.
+No single sign distinguishes a standing vehicle from one that rolls evenly and straight.  So three signs must agree.
+Its attitude is constant within the errors of the stars, which no vehicle that rolls on real ground achieves.  Its
+readings are quieter than while it surely moves: a vehicle whose motion is not felt never counts as standing.  And the
+rest of the record, without that standstill, determines its velocity well enough, and it is 0.  If one of them cannot be
+0, all are rejected: it is unknown which of the contradicting ones are true.
 """
 
 from dataclasses import dataclass
@@ -18,20 +18,20 @@ from starpos.navigation.measures import Lacks, StarAttitudes
 from starpos.navigation.preintegration import Pieces
 from starpos.units import ARCSEC
 
-# it surely moves where it turns by more, rad/s, which is told by frames that are so far apart, s
+# turn rate (rad/s) above which it surely moves, and minimum time (s) between the frames that show it
 TURNING, TOLD_S = 5e-4, 1.0
-# so long it has to move before its motion is known, and so many of a hundred of these seconds may be quiet, s
+# minimum time (s) of motion before its motion is known, and maximum percentage of quiet seconds in it
 LEARNT_S, QUIET_PERCENT = 60.0, 5.0
-# of these readings' scatter a standstill has less; it is taken over so long before and after, s
+# maximum scatter of a standstill over the scatter of these quiet seconds; time (s) before and after that it covers
 QUIETER, AROUND_S = 0.5, 1.0
-# a standstill has so many frames, and so long from the first to the last of them, s
+# minimum number of frames of a standstill, and minimum time (s) from the first to the last
 FEWEST_FRAMES, SHORTEST_S = 4, 8.0
-# frames that tell two axes to this, rad; variances of their attitudes are at most so many times those stated
+# maximum error (rad) of a fine frame's two axes; maximum ratio of the variances of their attitudes to the stated ones
 FINE, STEADY = 10 * ARCSEC, 2.0
 # forces add up to no more, in m/s, than their mean
 LEAP = 0.02
-# a standstill is checked where the rest leads to its velocity with less of an error, m/s an axis; what one in a thousand
-# exceeds of a chi-squared of three degrees of freedom; and so many that agree are no chance
+# maximum error (m/s an axis) of the velocity from the rest of the record, for a check; value of a chi-squared of three
+# degrees of freedom that one in a thousand exceeds; minimum number of standstills that agree beyond chance
 CHECKED, ONE_IN_1000, FEWEST_STANDSTILLS = 0.1, 16.3, 3
 # of a residual's variance such a share is left at least: less is rounding
 LEAST_LEFT = 1e-5
@@ -58,7 +58,7 @@ class Standstills:
         return np.concatenate([np.zeros(0, int), *map(np.arange, self.first, self.last + 1)])
 
     def links(self, count: int) -> np.ndarray:
-        """Mask (count - 1,) of the intervals between so many nodes that lie within them."""
+        """Mask (count - 1,) of the intervals between `count` nodes that lie within standstills."""
         edges = np.zeros(count, int)
         edges[self.first] += 1
         edges[self.last] -= 1
@@ -132,7 +132,7 @@ def by_the_rest(trial: Lacks, sigma: float, solution: Smoothed) -> ByTheRest:
     unknowns = np.concatenate([solution.nodes[trial.index], constants], 1)
     left = short - np.einsum("jki,ji->jk", slope, unknowns)
     told = slope @ solution.covariance[trial.index] @ slope.transpose(0, 2, 1)
-    # the errors of the residuals: where they are nearly none, nothing but the equation itself tells the velocity
+    # the errors of the residuals: where they nearly vanish, only the equation itself determines the velocity
     size, axes = np.linalg.eigh(np.eye(3) - told / sigma**2)
     inverse = (axes / np.maximum(size, LEAST_LEFT)[:, None]) @ axes.transpose(0, 2, 1)
     return ByTheRest(
@@ -145,7 +145,7 @@ def by_the_rest(trial: Lacks, sigma: float, solution: Smoothed) -> ByTheRest:
 def noise_density2(pieces: Pieces, standing: Standstills) -> float:
     """Density of the force's noise within standstills, (m/s2)2/Hz an axis, by how intervals' means scatter.
 
-    Not from reading to reading: a fan shakes those, and of that nothing adds up.  0 where there is nothing to tell it.
+    Not from reading to reading: a fan shakes those, and its shaking does not add up.  0 without standstills to use.
     """
     square, free = 0.0, 0
     for begin, end in zip(standing.first, standing.last, strict=True):

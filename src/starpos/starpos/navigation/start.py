@@ -14,7 +14,7 @@ from starpos.rotation import normalised
 
 
 def nodes_of(frames: np.ndarray, most_apart_s: float) -> np.ndarray:
-    """Times (K,) of nodes: those of frames (F,), in order, and others between, so that none are farther apart."""
+    """Times (K,) of nodes: the frames' times (F,), in order, and others between, so that no gap is longer."""
     parts = np.maximum(np.ceil(np.diff(frames) / most_apart_s).astype(int), 1)
     begin, step = np.repeat(frames[:-1], parts), np.repeat(np.diff(frames) / parts, parts)
     return np.append(
@@ -64,7 +64,7 @@ def first_motion(
 def _attitudes(
     count: int, stars: StarAttitudes, back: np.ndarray, turn: np.ndarray, camera_to_body: np.ndarray
 ) -> np.ndarray:
-    """Attitudes (count, 3, 3) of the body: by stars where there are some, else by the gyro from the node beside."""
+    """Attitudes (count, 3, 3) of the body: by stars where there are some, else by the gyro from the neighbouring node."""
     attitude = np.empty((count, 3, 3))
     known = np.zeros(count, bool)
     known[stars.index] = True

@@ -32,8 +32,8 @@ class Record:
 def read_record(path: Path | str, columns: Sequence[str], what: str) -> Record:
     """Read the columns of a CSV whose first line names them, utc_unix_s first; VoyageError if it cannot be used.
 
-    Rows that are not all finite numbers are left out, and rows whose time does not come after all before them: which of
-    two readings with one stamp is right nobody knows.
+    Rows that are not all finite numbers are left out, and so are rows whose time does not come after all before them:
+    of two readings with one stamp it is unknown which is right.
     """
     cure = f"give a CSV with a line of names, {','.join((TIME, *columns))}, and a row a reading"
     try:

@@ -49,9 +49,9 @@ def navigate(
     times: np.ndarray | None = None,
     progress: Progress = quiet,
 ) -> Voyage:
-    """Fixes at times (T,), Unix s, or those of the frames; VoyageError or FixError says why there are none.
+    """Fixes at times (T,), Unix s, or at the frames' times; VoyageError or FixError if there is no fix.
 
-    Nothing need be known of the start.  The place is where gravity points, astronomic.
+    No prior knowledge of the start is needed.  The place is where gravity points, astronomic.
     """
     times = np.array([f.utc_unix_s for f in frames]) if times is None else np.asarray(times, float)
     begin, end = imu.utc_unix_s[0] - imu.length_s[0], imu.utc_unix_s[-1]

@@ -66,7 +66,7 @@ def attitude_seen(
     gyro: Gyro,
     log: Log,
 ) -> CameraAttitude | None:
-    """The attitude of an answered frame, which the gyro is told; None without a solver, or where stars tell none."""
+    """The attitude of an answered frame, also given to the gyro; None without a solver or identified stars."""
     if solver is None:
         return None
     try:

@@ -5,10 +5,12 @@ Both are here because they must forget at the same events: an average holds for 
 """
 
 import math
+import traceback
 from collections.abc import Callable
 
 import numpy as np
 
+from starpos.averaging.average import Average
 from starpos.calibration.misalignment import Calibrated, calibrate_at
 from starpos.calibration.unknown import at_another_lean
 from starpos.errors import FixError, InstrumentError, StarposError
@@ -109,8 +111,18 @@ class Calibrating:
 
     # events of the session ----------------------------------------------------------------------------------------------
 
-    def learn(self, seen: Seen, fix: Fix | None) -> bool:
-        """Take a frame and its fix; return whether the average includes this frame."""
+    def learn(self, seen: Seen, fix: Fix | None) -> Average | None:
+        """Take a frame and its fix; return the average if it includes this frame."""
+        try:
+            return self.average.place if self._take(seen, fix) else None
+        except Exception:
+            # Fix and heading go on without the average; data that cause a defect must not stay.
+            self._log.error(traceback.format_exc())
+            self.forget()
+            return None
+
+    def _take(self, seen: Seen, fix: Fix | None) -> bool:
+        """Take a frame; return whether the average includes it."""
         mid = seen.mid_unix_s
         if mid == self._newest_unix_s or self._came_late(mid):
             return False

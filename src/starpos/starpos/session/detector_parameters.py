@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 from starpos.frames.driver_stamp import KINDS, UNKNOWN
 from starpos.frames.exposure import MOST_EXPOSURE_S
 from starpos.frames.shutter import MOST_READOUT_S
+from starpos.session.pace import MOST_RATE
 from starpos.session.parameter import Parameter
 
 if TYPE_CHECKING:
@@ -46,6 +47,15 @@ PARAMETERS = (
         unit="",
         minimum=1,
         maximum=64,
+    ),
+    Parameter(
+        "max_rate",
+        math.nan,
+        "Most frames that are worked on in a second, chosen evenly by their stamps; unset, as many as the processor can: "
+        "then all of them, or an even share, which costs other programs their time.",
+        unit="Hz",
+        minimum=0.01,
+        maximum=MOST_RATE,
     ),
     Parameter(
         "saturation",

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A frame in a session: while it waits, and what becomes of it."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from starpos.averaging.average import Average
@@ -11,6 +11,7 @@ from starpos.fix.fix import Fix
 from starpos.fix.solution import Solution
 from starpos.frames.stars import Stars
 from starpos.gnss.solving import Watched
+from starpos.session.now import Now
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,6 +57,12 @@ class Waiting:
     since_s: float
     ahead_s: float
     doubted: bool = False
+
+    def dated(self, now: Now) -> "Waiting":
+        """Correct how far it is ahead of a played clock, whose tick may have been heard only after the frame."""
+        if not now.played:
+            return self
+        return replace(self, ahead_s=min(now.ahead_s(self.stars.mid_unix_s), self.ahead_s))
 
 
 def ground_of(place: Fix | Average, vertical: Vertical) -> Geodetic:

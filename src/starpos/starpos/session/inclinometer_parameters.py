@@ -5,6 +5,8 @@ import math
 
 from starpos.session.parameter import FRAME_NAME, Parameter
 
+# the values of imu.variance
+STATED, SCATTER = "stated", "scatter"
 # of all sources
 SHARED = (
     Parameter(
@@ -41,6 +43,13 @@ IMU = (
         unit="s",
         minimum=0.02,
         maximum=60.0,
+    ),
+    Parameter(
+        "imu.variance",
+        STATED,
+        "What tells the noise of an IMU's accelerations: stated, the variance in its messages, or their scatter if that "
+        "is more; scatter alone, where the driver states a placeholder. A placeholder that is too large widens fixes.",
+        choices=(STATED, SCATTER),
     ),
     Parameter(
         "imu.max_force_error",

@@ -14,28 +14,28 @@ class Log(Protocol):
     def error(self, message: str) -> object: ...
 
 
+class Changes:
+    """Logs what is so, once until it changes."""
+
+    def __init__(self, log: Log) -> None:
+        self._log = log
+        self._logged: object = None
+
+    def say(self, sentence: str, good: bool, state: object = None) -> None:
+        """Log a sentence, unless its state (or it itself) was logged last."""
+        state = state or sentence
+        if state == self._logged:
+            return
+        self._logged = state
+        if good:
+            self._log.info(sentence)
+        else:
+            self._log.warning(sentence)
+
+
 class Heard(Protocol):
     """Keeps account of the messages, by the relative name of their topic."""
 
     def came(self, name: str) -> object: ...
 
     def refuse(self, name: str, sentence: str) -> object: ...
-
-
-class LogOfChanges:
-    """Says a state in a log when it becomes another one."""
-
-    def __init__(self, log: Log) -> None:
-        self._log = log
-        self._said: object = None
-
-    def say(self, sentence: str, good: bool, state: object = None) -> None:
-        """Say a sentence, as information or a warning, unless the state (by default the sentence) was said last."""
-        state = state or sentence
-        if state == self._said:
-            return
-        self._said = state
-        if good:
-            self._log.info(sentence)
-        else:
-            self._log.warning(sentence)

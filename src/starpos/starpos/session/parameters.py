@@ -17,6 +17,7 @@ from starpos.files import path_of
 from starpos.instrument import instrument_file, sensors
 from starpos.instrument.camera import Camera
 from starpos.instrument.instrument import Calibration, Instrument
+from starpos.session.pace import MOST_RATE
 from starpos.session.parameter import FRAME_NAME, Parameter
 
 NAN = math.nan
@@ -228,6 +229,15 @@ PARAMETERS = (
         maximum=60.0,
     ),
     Parameter(
+        "max_rate",
+        NAN,
+        "Most frames that are answered in a second, chosen evenly by their stamps; unset, as many as the processor can: "
+        "then all of them, or an even share, which costs other programs their time.",
+        unit="Hz",
+        minimum=0.01,
+        maximum=MOST_RATE,
+    ),
+    Parameter(
         "gyro",
         False,
         "Take imu/data, whose turn rates say where a camera that turns looks: frames of four stars are identified too. "
@@ -260,8 +270,9 @@ PARAMETERS = (
     ),
     Parameter(
         "tilt_timeout",
-        0.5,
-        "How long a frame waits for the tilts of its exposure; later ones come too late.",
+        NAN,
+        "How long a frame waits for the tilts of its exposure; later ones come too late. Unset: 0.5 s, or 1.5 times as "
+        "long as tilts take to come, by their interval and their delay.",
         unit="s",
         minimum=0.0,
         maximum=60.0,

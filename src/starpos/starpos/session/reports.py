@@ -14,9 +14,13 @@ from starpos.frames.shutter import UNKNOWN, Shutter
 from starpos.instrument.inclinometer import Tilt
 from starpos.instrument.instrument import Instrument
 from starpos.session.diagnosis import Diagnosis, Level
+from starpos.session.now import ANOTHER_TIME_S
 from starpos.units import ARCSEC
 
 WIDE_CLOCK_S = 0.1
+# Frames that are older when they come are of another clock, unless they are of another evening, as recorded ones; those
+# that are older still are stamped since the boot of their host.
+OLD_S, SINCE_BOOT_S = 40.0, 1e9
 AHEAD_S = 1.0
 ONE_CLOCK = "set the clocks of camera, inclinometer and solver by one source"
 
@@ -26,8 +30,8 @@ OTHER_TILTS = (
 )
 
 
-def of_solution(answer: Solution, counts: Mapping[str, int]) -> Diagnosis:
-    """Report the solution of the newest frame."""
+def of_solution(answer: Solution, counts: Mapping[str, int], remarks: str = "") -> Diagnosis:
+    """Report the solution of the newest frame; remarks: sentences on what is wrong around it."""
     values: dict[str, object] = {**counts, "status": answer.status.value}
     values |= {
         "stars detected": answer.stars_detected,
@@ -49,8 +53,11 @@ def of_solution(answer: Solution, counts: Mapping[str, int]) -> Diagnosis:
     if answer.extrapolated_days > 0:
         old = f"UT1 is extrapolated by {answer.extrapolated_days:.0f} days: upgrade astropy-iers-data"
         return Diagnosis(Level.WARN, old if answer.ok else answer.message, values)
-    if answer.remark:
-        return Diagnosis(Level.WARN, answer.remark, values)
+    said = "; ".join(filter(None, (answer.remark, remarks)))
+    if said:
+        return Diagnosis(
+            Level.WARN, said if answer.ok or answer.remark else f"{answer.message}; {said}", values
+        )
     if answer.fix is None and attitude is not None:
         sigma_arcsec = _heading_stddev_arcsec(attitude)
         told = f"heading at the known place, +- {sigma_arcsec:.2g} arcsec; no position: {answer.message}"
@@ -80,6 +87,13 @@ def of_clock(clock_stddev_s: float, stamp_stddev_s: float, ahead_s: float, doubt
             Level.WARN,
             f"by their stamps the camera at rest has turned with the Earth for {doubt_s:.3g} s: a clock was set, or a "
             "frame stamped wrongly. Fixes are as wide as that until it is back, or solver/reset is called",
+            values,
+        )
+    if OLD_S < -ahead_s < ANOTHER_TIME_S or -ahead_s > SINCE_BOOT_S:
+        return Diagnosis(
+            Level.WARN,
+            f"frames are stamped {-ahead_s:.3g} s behind this node's clock: if they are taken now, they belong to "
+            f"another clock, and so does their longitude: {ONE_CLOCK}",
             values,
         )
     wide = float(np.hypot(clock_stddev_s, stamp_stddev_s))

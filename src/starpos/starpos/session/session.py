@@ -8,14 +8,13 @@ the same messages at the same times give the same answers.
 
 import math
 import traceback
-from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import Any
 
 from starpos.calibration.unknown import MODEL_BY_PARAMETERS, unnamed_inclinometer
 from starpos.earth.orientation import earth_state
-from starpos.errors import InstrumentError, StarposError, TiltError, TimeError
+from starpos.errors import InstrumentError, StarposError, TimeError
 from starpos.fix.fix import Fix
 from starpos.fix.solution import Solution, Status
 from starpos.fix.solver import Solver
@@ -29,6 +28,7 @@ from starpos.messages.stamp import stamp_to_unix
 from starpos.messages.stars import message_to_stars
 from starpos.session import reports
 from starpos.session.attitude import attitude_seen
+from starpos.session.backlog import MOST, Backlog
 from starpos.session.calibrating import Calibrating
 from starpos.session.camera_solver import CameraSolver
 from starpos.session.clock_doubt import ClockDoubt
@@ -37,18 +37,18 @@ from starpos.session.gnss_teacher import GnssTeacher, solved_beside
 from starpos.session.gyro import Gyro
 from starpos.session.job import Jobs
 from starpos.session.known_place import SessionPlaces
-from starpos.session.log import Heard, Log, LogOfChanges
+from starpos.session.log import Changes, Heard, Log
 from starpos.session.memory import Seen
 from starpos.session.now import Now, Sent
+from starpos.session.pace import Pace
 from starpos.session.search import AT_ONCE_S, Search
 from starpos.session.settings import Settings
+from starpos.session.tilt_intake import TiltIntake
 from starpos.session.tilts import TiltBuffer
 from starpos.session.transforms import FrameNames, name_in
 from starpos.sky import catalogue
 
-# Most frames that wait for their tilts or for the triangles; older ones are dropped. Of recorded ones none should be.
-WAITING, WAITING_PLAYED = 4, 1000
-MOST_EARLY = 1000
+NOTHING_TOLD = Sent()
 J2000_UNIX_S = 946_728_000.0
 # A stamp in the future is wrong beyond AHEAD_S and so many stated errors.
 CLOCK_SIGMAS = 6.0
@@ -61,7 +61,7 @@ class SolverSession:
     """An instrument's messages to its solutions.
 
     jobs: makes who runs what takes long; when an Outcome has come, call `at`.
-    arrived: gives the tilts that have come but are not taken yet.
+    arrived, arrived_stars: give the tilts, and the star lists, that have come but are not taken yet.
     topic: full name of the topic of the camera's intrinsics, for sentences.
     """
 
@@ -73,11 +73,15 @@ class SolverSession:
         log: Log,
         *,
         arrived: Callable[[], Iterable[tuple[Any, Sent]]] = tuple,
+        arrived_stars: Callable[[], Iterable[tuple[Any, Sent]]] = tuple,
         topic: str = CAMERA_TOPIC,
     ) -> None:
         self.latest: Waiting | None = None
         self.answer: Solution | None = None
-        self.counts = {"frames": 0, "fixes": 0, "dropped frames": 0}
+        self.pace = Pace()
+        # whether another frame can be answered at once, live: whoever drives the session calls `at` again, so that
+        # what has come meanwhile has its turn
+        self.more = False
         self.tilts = TiltBuffer()
         # of the frames that the messages taken are in
         self.names = FrameNames()
@@ -90,15 +94,15 @@ class SolverSession:
         self._catalogue = catalogue.load_catalogue()
         # This reads the tables of the Earth's rotation, so that the first frame is not slow.
         earth_state(J2000_UNIX_S)
-        self._heard, self._log, self._arrived = heard, log, arrived
-        self._changes = LogOfChanges(log)
-        self._waiting: deque[Waiting] = deque()
-        # tilts ahead of a clock that may have been heard only after them
-        self._early: deque[Any] = deque(maxlen=MOST_EARLY)
+        self._heard, self._log = heard, log
+        self._arrived, self._arrived_stars = arrived, arrived_stars
+        self._backlog = Backlog()
+        self._intake = TiltIntake(self.tilts, self.names, settings, heard)
         self._was_s: float | None = None
         self._ended = False
         # from the last fix
         self._hint: Hint | None = None
+        self._changes = Changes(log)
         self.instrument = CameraSolver(
             self._make_solver,
             self._other_camera,
@@ -126,7 +130,7 @@ class SolverSession:
     @property
     def waits(self) -> bool:
         """Whether a frame or a tilt waits for its time."""
-        return bool(self._waiting or self._early)
+        return bool(self._backlog) or self._intake.waits
 
     @property
     def busy(self) -> bool:
@@ -150,7 +154,7 @@ class SolverSession:
         Another camera's counts from now on; in recorded data from its stamp on, since it may be read before frames that
         were taken before it.
         """
-        made = self.at(now)
+        made = self._begun(now)
         try:
             self.instrument.take(message, at_once=not now.played)
         except StarposError as e:
@@ -164,78 +168,71 @@ class SolverSession:
 
     def take_tilt(self, message: Any, sent: Sent, now: Now) -> list[Output]:
         """Take a Tilt."""
-        made = self.at(now)
-        self._take_tilt(message, sent, now)
+        made = self._begun(now)
+        self._intake.take(message, sent, now)
         return made + self._work(now)
 
-    def _take_tilt(self, message: Any, sent: Sent, now: Now) -> None:
-        stamp_s = stamp_to_unix(message.header.stamp)
-        if sent.unix_s is not None and not now.played:
-            # A process that stood still may read it only when its time has come.
-            now = replace(now, unix_s=min(sent.unix_s, sent.unix_s if now.unix_s is None else now.unix_s))
-        try:
-            self.tilts.heard(message, sent.number, now.waiting_s)
-            ahead_s = now.ahead_s(stamp_s)
-        except StarposError as e:
-            self._heard.refuse("tilt", str(e))
-            return
-        if now.played and ahead_s > reports.AHEAD_S:
-            self._early.append(message)
-        else:
-            self._add_tilt(message, now)
+    def take_stars(self, message: Any, now: Now, sent: Sent = NOTHING_TOLD) -> list[Output]:
+        """Take a StarArray, and those that have come after it."""
+        made = self._begun(now)
+        made += self._add_stars(message, now, sent)
+        for later, later_sent in self._arrived_stars():
+            made += self._add_stars(later, now, later_sent)
+        return made + self._work(now)
 
-    def _add_tilt(self, message: Any, now: Now) -> None:
-        """Keep a tilt, unless it is broken, or of the future: the instrument may lean otherwise when its time comes."""
-        try:
-            if (ahead_s := now.ahead_s(stamp_to_unix(message.header.stamp))) > reports.AHEAD_S:
-                raise TiltError(f"a tilt is stamped {ahead_s:.3g} s before its time: {reports.ONE_CLOCK}")
-            self.tilts.add(message, self._settings.tilt_stddev_rad)
-            self._heard.came("tilt")
-            self.names.inclinometer = name_in(message)
-        except StarposError as e:
-            self._heard.refuse("tilt", str(e))
-
-    def take_stars(self, message: Any, now: Now) -> list[Output]:
-        """Take a StarArray."""
-        made = self._stars_came(now)
+    def _add_stars(self, message: Any, now: Now, sent: Sent) -> list[Output]:
+        """Have a frame wait for its tilts, if there is room; return a bad one's answer."""
+        if not self._takes(message.header, now, sent):
+            return []
         try:
             stars = message_to_stars(message)
         except StarposError as e:
-            bad = Solution(
-                Status.BAD_INPUT,
-                str(e),
-                source="stars",
-                utc_unix_s=None,
-                stars_detected=len(message.stars),
-            )
-            return [*made, self._answered(message.header.stamp, bad, now)]
-        return made + self._wait_for(stars, message.header, now)
+            number = len(message.stars)
+            bad = Solution(Status.BAD_INPUT, str(e), source="stars", utc_unix_s=None, stars_detected=number)
+            return [self._answered(message.header.stamp, bad, now)]
+        self._wait_for(stars, message.header, now)
+        return []
 
     def take_detected(self, stars: Stars, header: Any, now: Now) -> list[Output]:
         """Take stars as a StarArray with this header holds them."""
-        return self._stars_came(now) + self._wait_for(stars, header, now)
+        made = self._begun(now)
+        if self._takes(header, now, NOTHING_TOLD):
+            self._wait_for(stars, header, now)
+        return made + self._work(now)
 
-    def _stars_came(self, now: Now) -> list[Output]:
-        made = self.at(now)
+    def _takes(self, header: Any, now: Now, sent: Sent) -> bool:
+        """Whether a frame is wanted and can be answered in time."""
         self._heard.came("stars")
+        if not now.played:
+            self.pace.numbered(sent.number, now.waiting_s)
+        if not self.pace.wants(stamp_to_unix(header.stamp), self._values["max_rate"]):
+            return False
         self._search.frame_came(now)
-        return made
+        if not now.played and not self._backlog.has_room(self._delay_s(now)):
+            self.pace.drop(now.waiting_s)
+            return False
+        self.pace.took(now.waiting_s)
+        return True
 
-    def _wait_for(self, stars: Stars, header: Any, now: Now) -> list[Output]:
-        """Have a frame wait for what it needs."""
+    def _wait_for(self, stars: Stars, header: Any, now: Now) -> None:
+        """Have a frame wait for its tilts."""
         # If the user sets clock_stddev, it replaces the error that the camera's host states.
         if not math.isnan(self._values["clock_stddev"]):
             stars = replace(stars, clock_stddev_s=0.0)
         self.instrument.frame_came(stars.width, stars.height, at_once=not now.played)
-        self._waiting.append(Waiting(header, stars, now.waiting_s, now.ahead_s(stars.mid_unix_s)))
-        while len(self._waiting) > (WAITING_PLAYED if now.played else WAITING):
-            self._waiting.popleft()
-            self.counts["dropped frames"] += 1
-            if now.played:
-                self._heard.refuse(
-                    "stars", f"a frame was dropped: over {WAITING_PLAYED} wait for their tilts"
-                )
-        return self._work(now)
+        if len(self._backlog) >= MOST:
+            self.pace.drop(now.waiting_s)
+            self._heard.refuse("stars", f"a frame was dropped: {MOST} wait for their tilts")
+            return
+        self._backlog.add(Waiting(header, stars, now.waiting_s, now.ahead_s(stars.mid_unix_s)))
+        if self.instrument.preparing and not now.played:
+            self.pace.dropped += self._backlog.keep_newest()
+
+    def _delay_s(self, now: Now) -> float:
+        """For how long frames wait for their tilts, by the tilts that have come, and by the first frame."""
+        if not self._backlog or self._ready(self._backlog.first, now):
+            return self.tilts.delay_s
+        return max(self.tilts.delay_s, now.waiting_s - self._backlog.first.since_s)
 
     def take_gnss(self, message: Any, now: Now) -> list[Output]:
         """Take a sensor_msgs/NavSatFix of GNSS; nothing is done with it without gnss.use."""
@@ -247,8 +244,13 @@ class SolverSession:
 
     def at(self, now: Now) -> list[Output]:
         """Go on to a time."""
-        self._ended = False
-        return self._on(now)
+        self._advance(now)
+        return self._work(now)
+
+    def _begun(self, now: Now) -> list[Output]:
+        """Go on to the time of a message before it is taken; live, what is ready is answered with it."""
+        self._advance(now)
+        return self._work(now) if now.played else []
 
     def begin(self) -> None:
         """Note that recorded messages begin: who published on `tilt` before was another player, no rival."""
@@ -256,51 +258,57 @@ class SolverSession:
 
     def end(self, now: Now) -> list[Output]:
         """Answer the frames that wait, because nothing comes any more; again after a job."""
+        self._advance(now)
         self._ended = True
-        return self._on(now)
-
-    def _on(self, now: Now) -> list[Output]:
-        was_s, self._was_s = self._was_s, now.unix_s
-        if was_s is not None and now.unix_s is not None:
-            if now.unix_s < was_s - STEP_S:
-                # The clock was set back: no tilt may be from the future.
-                self.tilts.forget_after(now.unix_s)
-            if now.unix_s > was_s:
-                early, self._early = self._early, deque(maxlen=MOST_EARLY)
-                for message in early:
-                    self._add_tilt(message, now)
         return self._work(now)
+
+    def _advance(self, now: Now) -> None:
+        self._ended = False
+        was_s, self._was_s = self._was_s, now.unix_s
+        if was_s is None or now.unix_s is None:
+            return
+        if now.unix_s < was_s - STEP_S:
+            # The clock was set back: no tilt may be from the future.
+            self.tilts.forget_after(now.unix_s)
+        if now.unix_s > was_s:
+            self._intake.go_on(now)
 
     # work ------------------------------------------------------------------------------------------------------------
 
     def _work(self, now: Now) -> list[Output]:
-        """Solve the frames that have everything they need."""
+        """Answer the first frames that have everything they need: of recorded ones all, live one at a time."""
         made: list[Output] = []
+        self.more = False
         # In recorded data a job is done when it was begun, however long it takes.
-        while self._waiting and not (now.played and self.busy):
-            self.instrument.go_on_to(self._waiting[0].stars.mid_unix_s)
-            if not self._ready(self._waiting[0], now):
-                break
+        while not (now.played and self.busy) and self._first_ready(now):
+            if made and not now.played:
+                self.more = True
+                return made
             # After a stall the frame's own tilts may be among them.
             for message, sent in self._arrived():
-                self._take_tilt(message, sent, now)
-            made += self._solve(self._dated(self._waiting.popleft(), now), now)
+                self._intake.take(message, sent, now)
+            made += self._solve(self._backlog.pop(now.waiting_s).dated(now), now)
+        self._backlog.pause()
         return made
 
-    def _dated(self, frame: Waiting, now: Now) -> Waiting:
-        """Correct how far a frame is ahead of a played clock, whose tick may have been heard only after the frame."""
-        if not now.played:
-            return frame
-        return replace(frame, ahead_s=min(now.ahead_s(frame.stars.mid_unix_s), frame.ahead_s))
+    def _first_ready(self, now: Now) -> bool:
+        if self._backlog:
+            self.instrument.go_on_to(self._backlog.first.stars.mid_unix_s)
+        return bool(self._backlog) and self._ready(self._backlog.first, now)
 
     def _ready(self, frame: Waiting, now: Now) -> bool:
         if self.instrument.preparing:
             return False
         if math.isnan(frame.since_s):
-            frame = self._waiting[0] = replace(frame, since_s=now.waiting_s)
+            frame = self._backlog.first = replace(frame, since_s=now.waiting_s)
         mid, waited_s = frame.stars.mid_unix_s, now.waiting_s - frame.since_s
         # a negative wait: the clock has begun anew
-        if mid is None or self._ended or waited_s > self._values["tilt_timeout"] or waited_s < 0:
+        if (
+            mid is None
+            or self._ended
+            or waited_s > self.tilts.patience_s(self._values["tilt_timeout"])
+            or waited_s < 0
+        ):
             return True
         if self.instrument.solver is None:
             return bool(self.instrument.trouble)
@@ -314,7 +322,7 @@ class SolverSession:
 
     def _solve(self, frame: Waiting, now: Now) -> list[Output]:
         predicted = self.gyro.predicted(frame.stars, self.instrument.solver)
-        until_s = self._search.until_s(now, bool(self._waiting))
+        until_s = self._search.until_s(now, bool(self._backlog))
         answer = self._answer_to(frame, self._hint, until_s, predicted)
         if answer.ok and answer.fix is not None:
             frame, answer = self._with_doubt(frame, answer, answer.fix)
@@ -335,10 +343,7 @@ class SolverSession:
             self.gyro,
             self._log,
         )
-        made: list[Output] = [replace(answered, attitude=attitude)]
-        if self.instrument.solver is not None:
-            made += self._learn(frame, answer)
-        return made
+        return [replace(answered, attitude=attitude), *self._learn(frame, answer)]
 
     def _with_doubt(self, frame: Waiting, answer: Solution, fix: Fix) -> tuple[Waiting, Solution]:
         """Add the error of its time that the stars of earlier frames show to a frame and its answer."""
@@ -386,7 +391,7 @@ class SolverSession:
         A frame whose time is in doubt is left out.  Returns the average if it includes the frame.
         """
         stars = frame.stars
-        if stars.mid_unix_s is None or frame.doubted:
+        if self.instrument.solver is None or stars.mid_unix_s is None or frame.doubted:
             return []
         if answer.status is Status.BAD_INPUT and frame.ahead_s > reports.AHEAD_S:
             return []
@@ -394,17 +399,10 @@ class SolverSession:
             tilt = answer.tilt or self.tilts.average(stars.mid_unix_s, self._span(stars))
         except StarposError:
             return []
-        try:
-            used = self.calibrating.learn(Seen(stars, tilt, answer.found), answer.fix)
-            place = self.calibrating.average.place if used else None
-            if place is None:
-                return []
-            return [Averaged(frame.header.stamp, place, ground_of(place, self._settings.vertical))]
-        except Exception:
-            # Fix and heading go on without the average; data that cause a defect must not stay.
-            self._log.error(traceback.format_exc())
-            self.calibrating.forget()
+        place = self.calibrating.learn(Seen(stars, tilt, answer.found), answer.fix)
+        if place is None:
             return []
+        return [Averaged(frame.header.stamp, place, ground_of(place, self._settings.vertical))]
 
     # outputs ---------------------------------------------------------------------------------------------------------
 
@@ -413,8 +411,7 @@ class SolverSession:
             # by the clock of recorded data no time passes
             answer = replace(answer, identify_s=0.0, fix_s=0.0)
         self.answer = answer
-        self.counts["frames"] += 1
-        self.counts["fixes"] += answer.ok
+        self.pace.answered(answer.ok)
         self._hint = answer.hint or self._hint
         self._changes.say("fixes are coming" if answer.ok else answer.message, answer.ok, answer.status)
         if self.gnss is not None:
@@ -440,8 +437,8 @@ class SolverSession:
     def reset(self) -> None:
         """Forget tilts, frames and the place, but no calibration that was found."""
         self.tilts.clear()
-        self._waiting.clear()
-        self._early.clear()
+        self._backlog.clear()
+        self._intake.clear()
         self.latest = self.answer = self._hint = None
         self.gyro.forget()
         if self.gnss is not None:

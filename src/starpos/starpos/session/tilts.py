@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The tilts that have arrived, and their average over an exposure."""
 
+import math
 from collections import deque
 from dataclasses import dataclass
 from typing import Any
@@ -9,16 +10,19 @@ import numpy as np
 
 from starpos.errors import TiltError, TiltRangeError
 from starpos.instrument.inclinometer import Tilt
-from starpos.instrument.tilt_log import BRACKET_S, NEIGHBOURS_S, OPEN_END, TOUCH_S, TiltLog, noise_excess
+from starpos.instrument.tilt_log import BRACKET_S, OPEN_END, TOUCH_S, TiltLog
 from starpos.instrument.tilts import Tilts
 from starpos.messages.stamp import stamp_to_unix
 from starpos.messages.tilt import OUT_OF_RANGE, SATURATED, STUCK, UNUSABLE, message_to_tilt
 from starpos.session.tilt_publishers import TiltPublishers
+from starpos.session.tilt_steps import TiltSteps
 
 # Ten minutes at 10 Hz.
 CAPACITY = 6000
-# The noise is measured from so many samples.
-NOISE_CAPACITY = 2000
+# How late samples come, and how often, is told by so many. Those that come later than this are of another clock.
+USUAL, LATEST_S = 10, 2.0
+# A frame waits for its tilts so long, or so many times as long as they usually take to come.
+PATIENCE_S, DELAYS = 0.5, 1.5
 # Between two samples of one exposure at most so many others arrive.
 TOGETHER = 20
 # Samples so near to an exposure may bracket it; a flagged one explains why it has no good one.
@@ -38,8 +42,10 @@ class TiltBuffer:
         self._good: deque[tuple[int, Tilt]] = deque(maxlen=CAPACITY)
         self._came, self._latest_unix_s = 0, -np.inf
         self._flagged: deque[tuple[float, int]] = deque(maxlen=CAPACITY)
-        # of each sample and the one before it: time of the later, how far they differ, and the stated variance
-        self._steps: deque[tuple[float, np.ndarray, float]] = deque(maxlen=NOISE_CAPACITY)
+        self._steps = TiltSteps()
+        # how late each of the newest came, and the time between it and the one before
+        self._late_s: deque[float] = deque(maxlen=USUAL)
+        self._apart_s: deque[float] = deque(maxlen=USUAL)
         self._publishers = TiltPublishers()
 
     def __len__(self) -> int:
@@ -49,6 +55,8 @@ class TiltBuffer:
         self._good.clear()
         self._flagged.clear()
         self._steps.clear()
+        self._late_s.clear()
+        self._apart_s.clear()
         self._latest_unix_s = -np.inf
         self.forget_publishers()
 
@@ -74,7 +82,9 @@ class TiltBuffer:
             return
         sample = message_to_tilt(message, unknown_stddev_rad)
         if self._good:
-            self._note_step(self._good[-1][1], sample)
+            before = self._good[-1][1]
+            self._steps.note(before, sample)
+            self._apart_s.append(abs(sample.utc_unix_s - before.utc_unix_s))
         self.forget_after(sample.utc_unix_s + ORDER_S)
         self._came += 1
         self._good.append((self._came, sample))
@@ -86,7 +96,23 @@ class TiltBuffer:
             self._latest_unix_s = unix_s
             self._good = deque((s for s in self._good if s[1].utc_unix_s <= unix_s), maxlen=CAPACITY)
             # A night that is played again comes from here on: its steps count once, as when it was played first.
-            self._steps = deque((s for s in self._steps if s[0] <= unix_s - ORDER_S), maxlen=NOISE_CAPACITY)
+            self._steps.forget_after(unix_s - ORDER_S)
+
+    def came_late(self, late_s: float) -> None:
+        """Note how long after its time the last sample came."""
+        self._late_s.append(max(late_s, 0.0))
+
+    @property
+    def delay_s(self) -> float:
+        """Longest time until the sample that follows a moment usually is here; 0 while that is not known."""
+        if not self._late_s or not self._apart_s:
+            return 0.0
+        late_s, apart_s = max(self._late_s), float(np.median(self._apart_s))
+        return late_s + apart_s if late_s < LATEST_S and apart_s < BRACKET_S else 0.0
+
+    def patience_s(self, stated_s: float) -> float:
+        """How long a frame waits for its tilts, s; NaN for what is stated: by how long they take to come."""
+        return max(PATIENCE_S, DELAYS * self.delay_s) if math.isnan(stated_s) else stated_s
 
     def complete(self, mid_unix_s: float, span_s: float) -> bool:
         """Whether all samples that an exposure needs have arrived: none that may still come lies in it or bounds it."""
@@ -106,11 +132,15 @@ class TiltBuffer:
         """
         near: dict[float, Tilt] = {}
         reach, last = span_s / 2 + NEAR_S, 0
-        for came, sample in self._good:
+        for came, sample in reversed(self._good):
+            # those before it are hardly later
+            if sample.utc_unix_s < mid_unix_s - reach - ORDER_S:
+                break
             if abs(sample.utc_unix_s - mid_unix_s) <= reach:
-                if came > last + TOGETHER:
-                    near.clear()
-                near[sample.utc_unix_s], last = sample, came
+                if near and came < last - TOGETHER:
+                    break
+                near.setdefault(sample.utc_unix_s, sample)
+                last = came
         return [near[t] for t in sorted(near)]
 
     def average(self, mid_unix_s: float, span_s: float) -> Tilt:
@@ -125,29 +155,13 @@ class TiltBuffer:
             # Later samples must not count, because it is chance how many have arrived by now; one may be waited for.
             open_end = mid_unix_s + span_s / 2 - near[inside[-1]].utc_unix_s > OPEN_END * span_s
             near = near[max(inside[0] - 1, 0) : inside[-1] + 1 + open_end]
-        excess = self._excess(mid_unix_s + span_s / 2)
+        # by samples up to the exposure's end: it is chance how many came since
+        excess = self._steps.excess(mid_unix_s + span_s / 2)
         return TiltLog.of_readings(near, excess).average(mid_unix_s, span_s)
 
     def over(self, span_s: float) -> "Tilts":
         """These tilts for a frame, over a span in place of an exposure that may not be known."""
         return _Over(self, span_s)
-
-    def _note_step(self, before: Tilt, sample: Tilt) -> None:
-        apart = sample.utc_unix_s - before.utc_unix_s
-        # a sample that comes again tells nothing new, and would make chance look like noise
-        if self._steps and sample.utc_unix_s <= self._steps[-1][0]:
-            return
-        if 0 < apart < NEIGHBOURS_S and sample.axes == before.axes:
-            variance = float(np.diag(sample.covariance).mean())
-            self._steps.append((sample.utc_unix_s, sample.theta - before.theta, variance))
-
-    def _excess(self, end_unix_s: float) -> float:
-        """Measured noise over the stated one, by samples up to the exposure's end: it is chance how many came since."""
-        steps = [(step, variance) for t, step, variance in self._steps if t <= end_unix_s]
-        if not steps or len({len(step) for step, _ in steps}) > 1:
-            return 1.0
-        stated = np.sqrt(np.mean([variance for _, variance in steps]))
-        return noise_excess(np.array([step for step, _ in steps]), float(stated))
 
     def _explain(self, mid_unix_s: float, span_s: float, others_near: bool) -> None:
         """Raise the reason why no sample lies in an exposure; return if others that are near it may bracket it."""

@@ -64,3 +64,13 @@ def test_each_lack_has_a_sentence():
     nothing = dict.fromkeys(TOLD, math.nan)
     said = reports.of_conditions(nothing, DATED, tilt(math.nan), UNKNOWN)
     assert said.level == Level.WARN and said.message.count("is not known") == 4
+
+
+@pytest.mark.parametrize(
+    ("age_s", "said"),
+    [(0.5, False), (60.0, True), (1.7e9, True), (6e7, False)],
+    ids=["fresh", "behind", "boot", "night"],
+)
+def test_frames_of_another_clock_are_said_with_their_age_but_not_those_of_a_recorded_night(age_s, said):
+    report = reports.of_clock(0.01, 0.001, -age_s, 0.0)
+    assert (report.level is Level.WARN and f"{age_s:.3g} s behind" in report.message) == said

@@ -304,7 +304,7 @@ def test_at_a_site_a_frame_has_its_heading_at_once_and_no_fix(messages, begin_s)
     assert solution.fix is None and solution.status is Status.NO_TILT and answer.ground is None
     assert math.degrees(solution.at_place.plumb.heading) == pytest.approx(195.31952, abs=2e-3)
     assert answer.attitude is not None
-    report = reports.of_solution(solution, told.session.counts)
+    report = reports.of_solution(solution, told.session.pace.counts)
     assert report.level is Level.OK and "heading at the known place" in report.message
 
 

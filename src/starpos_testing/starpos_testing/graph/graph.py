@@ -134,6 +134,10 @@ class Graph:
             self._executor.spin_once(timeout_sec=0.2)
         return True
 
+    def spin_once(self, seconds: float) -> None:
+        """Take a message, if one comes within so many seconds."""
+        self._executor.spin_once(timeout_sec=seconds)
+
     def wait(self, condition, why="") -> None:
         if not self.comes(condition, WAIT_S):
             tails = "\n".join(f"{p.name}: {p.output[-2000:]}" for p in self.processes)

@@ -1,0 +1,251 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The deflection of the vertical of one session, by generalised least squares of all its frames.
+
+Unknown are xi, eta and A3 (its two tilts, which hold the tiltmeter's zero, and its turn).  All else is in the covariance
+of the readings.  The session's residuals determine the size of image motion and anomalous refraction, by restricted
+maximum likelihood (Patterson and Thompson 1971, Biometrika 58, 545).  A session hardly shows an error that changes as
+slowly as the second, so that is never taken to be smaller than the share AIR_SHARE of the first.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from starpos.earth.orientation import ROTATION_RAD_S
+from starpos.earth.refraction import Atmosphere
+from starpos.errors import FixError
+from starpos.instrument.instrument import Calibration, Instrument
+from starpos.units import ARCSEC
+from starpos.zenith.errors import Errors, errors_of
+from starpos.zenith.faces import faces_of
+from starpos.zenith.lines import LeanEstimate, Lines, start_of
+from starpos.zenith.places import StarPlaces
+from starpos.zenith.sighting import Mark, ZenithSighting
+
+STEPS = 8
+# of its sigma: a smaller step is the last
+SETTLED = 1e-3
+# Anomalous refraction over image motion: a twenty-minute mean of zenith cameras scatters by 0.05 arcsec (Hirt 2006, A&A
+# 459, 283: 0.05 to 0.2 over hours) where a frame's image motion is 0.4; in air that moves no image nothing bends slowly.
+AIR_SHARE = 1 / 8
+# and a night's share above that is within this factor of it (1 sigma)
+AIR_FACTOR = 1.5
+# size of the image motion at which its search begins, rad
+MOTION_RAD = 0.3 * ARCSEC
+# and below which it makes no difference
+LEAST_RAD = 1e-3 * ARCSEC
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Air:
+    """1 sigma of image motion and of anomalous refraction, rad."""
+
+    motion: float
+    anomalous: float
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Adjusted:
+    """The deflection of a session at the mark, arcsec, with its errors.
+
+    covariance_arcsec2 (2, 2): of xi, eta, the sum of the `terms`.
+    terms: 1 sigma of xi and eta for each source of error.
+    a3 (3, 3): C into S, with the tiltmeter's zero.  turn_stddev_rad: of its turn about the plumb line.
+    faces (N,): number of each frame's face.  frame_arcsec (N, 2): xi, eta of each frame minus those of the session.
+    frame_stddev_arcsec (N, 2): what these should scatter by.
+    catalogue_factor: size of the catalogue's errors over what it states, by the session's own stars.
+    chi2_per_degree: of the residuals; 1 where the stated errors and those of the air explain them.
+    by_lean (N, 2, 2), by_second (N, 2): derivatives of the readings by eta and xi, and by a second of the clock, rad.
+    projector (2 N, 2 N), weighted (2 N,): weights of the readings that the unknowns leave, and of their residuals, for
+    tests of what else there may be.
+    """
+
+    xi_arcsec: float
+    eta_arcsec: float
+    covariance_arcsec2: np.ndarray
+    terms: tuple[tuple[str, float, float], ...]
+    a3: np.ndarray
+    turn_stddev_rad: float
+    faces: np.ndarray
+    frame_arcsec: np.ndarray
+    frame_stddev_arcsec: np.ndarray
+    air: Air
+    catalogue_factor: float
+    chi2_per_degree: float
+    by_lean: np.ndarray
+    by_second: np.ndarray
+    projector: np.ndarray
+    weighted: np.ndarray
+
+    @property
+    def sigma_arcsec(self) -> np.ndarray:
+        """Standard deviations (2,) of xi, eta."""
+        return np.sqrt(np.diag(self.covariance_arcsec2))
+
+    @property
+    def misalignment_deg(self) -> tuple[float, ...]:
+        """A3 as three angles, as instrument files have them."""
+        return Calibration().turned_to(self.a3).misalignment_deg
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Fit:
+    """A weighted fit: step (5,), covariance (5, 5), gain (5, 2 N) by the readings.
+
+    root (2 N, 2 N): of the covariance of the readings.  cost: -2 log of the likelihood.
+    """
+
+    step: np.ndarray
+    covariance: np.ndarray
+    gain: np.ndarray
+    root: np.ndarray
+    cost: float
+    chi2: float
+
+
+def adjusted(
+    sightings: Sequence[ZenithSighting], instrument: Instrument, atmosphere: Atmosphere, mark: Mark
+) -> Adjusted:
+    """The deflection of a session; sightings: in order of time, at least three.
+
+    Raises FixError where there are fewer, or the equations have no solution.
+    """
+    if len(sightings) < 3:
+        raise FixError(f"{len(sightings)} frames make no session: at least 3, in several faces, are needed")
+    places = StarPlaces.of(sightings)
+    sightings = places.applied(sightings)
+    faces, prior = faces_of(sightings), _prior_of(instrument)
+    bending = atmosphere.refraction().a
+    given = instrument.calibration
+    start = start_of(sightings)
+    estimate = start if given.unknown else LeanEstimate(lean=np.zeros(2), a3=given.a3)
+    offset, sized = np.zeros(5), False
+    air = Air(motion=MOTION_RAD, anomalous=MOTION_RAD * AIR_SHARE)
+    for _ in range(STEPS):
+        lines = Lines.at(estimate, sightings, bending)
+        errors = errors_of(
+            lines, sightings, places, faces, instrument.inclinometer, mark, since_unix_s=given.utc_unix_s
+        )
+        stated = np.sum([s.covariance for s in errors.sources], axis=0)
+        # A3's prior stays where it was
+        if not sized:
+            air, sized = _air_of(lines, stated, errors, prior, offset), True
+        fit = _fitted(lines, _whole(stated, errors, air), prior, offset)
+        estimate, offset = estimate.moved(fit.step), offset + fit.step
+        if np.abs(fit.step).max() < SETTLED * np.sqrt(np.diag(fit.covariance)).min():
+            break
+    return _adjusted(estimate, sightings, lines, errors, fit, air, faces, mark, places.factor)
+
+
+def _prior_of(instrument: Instrument) -> np.ndarray:
+    """Weights (5, 5) of what is known before: A3, as far as the instrument's calibration has it."""
+    c = instrument.calibration
+    weights = np.zeros((5, 5))
+    covariance = np.asarray(c.covariance_arcsec2, float) + np.eye(3) * c.remounted_arcsec**2
+    weights[2:, 2:] = np.linalg.inv(covariance * ARCSEC**2 + np.eye(3) * LEAST_RAD**2)
+    return weights
+
+
+def _whole(stated: np.ndarray, errors: Errors, air: Air) -> np.ndarray:
+    """Covariance (2 N, 2 N) of the readings."""
+    return stated + air.motion**2 * errors.motion.covariance + air.anomalous**2 * errors.air.covariance
+
+
+def _air_of(lines: Lines, stated: np.ndarray, errors: Errors, prior: np.ndarray, offset: np.ndarray) -> Air:
+    """Sizes of image motion and anomalous refraction, as the residuals make them likeliest."""
+    # slow to import
+    from scipy.optimize import minimize
+
+    def of(p: np.ndarray) -> Air:
+        motion = float(np.hypot(LEAST_RAD, MOTION_RAD * np.exp(p[0])))
+        return Air(motion=motion, anomalous=motion * AIR_SHARE * AIR_FACTOR ** max(float(p[1]), 0.0))
+
+    def cost(p: np.ndarray) -> float:
+        return _fitted(lines, _whole(stated, errors, of(p)), prior, offset).cost + float(p[1] ** 2)
+
+    found = minimize(
+        cost, np.zeros(2), method="Nelder-Mead", options={"xatol": 0.02, "fatol": 0.02, "maxfev": 120}
+    )
+    return of(found.x)
+
+
+def _fitted(lines: Lines, covariance: np.ndarray, prior: np.ndarray, offset: np.ndarray) -> _Fit:
+    """Weighted fit of the equations; offset (5,): how far the estimate has moved from that of the prior."""
+    # slow to import
+    from scipy.linalg import cholesky, solve_triangular
+
+    design = lines.by_parameters.reshape(-1, 5)
+    root = cholesky(covariance, lower=True)
+    both = solve_triangular(root, np.column_stack([design, lines.off.reshape(-1)]), lower=True)
+    white, off = both[:, :5], both[:, 5]
+    normal = white.T @ white + prior
+    inverse = np.linalg.inv(normal)
+    step = inverse @ (white.T @ off - prior @ offset)
+    left, moved = off - white @ step, offset + step
+    chi2 = float(left @ left + moved @ prior @ moved)
+    cost = chi2 + 2 * float(np.log(np.diag(root)).sum()) + float(np.linalg.slogdet(normal)[1])
+    gain = inverse @ solve_triangular(root, white, lower=True, trans=1).T
+    return _Fit(step=step, covariance=inverse, gain=gain, root=root, cost=cost, chi2=chi2)
+
+
+def _adjusted(
+    estimate: LeanEstimate,
+    sightings: Sequence[ZenithSighting],
+    lines: Lines,
+    errors: Errors,
+    fit: _Fit,
+    air: Air,
+    faces: np.ndarray,
+    mark: Mark,
+    catalogue_factor: float,
+) -> Adjusted:
+    # slow to import
+    from scipy.linalg import cho_solve
+
+    scaled = (
+        (errors.motion.name, air.motion**2 * errors.motion.covariance),
+        (errors.air.name, air.anomalous**2 * errors.air.covariance),
+    )
+    sources = [(s.name, s.covariance) for s in errors.sources] + list(scaled)
+    gain = fit.gain[[1, 0]] / ARCSEC
+    terms, total = [], np.zeros((2, 2))
+    for name, covariance in sources:
+        term = gain @ covariance @ gain.T
+        total += term
+        if term.any():
+            xi, eta = np.sqrt(np.diag(term)).tolist()
+            terms.append((name, xi, eta))
+    whole = fit.covariance[:2, :2][::-1, ::-1] / ARCSEC**2
+    given = np.sqrt(np.maximum(np.diag(whole - total), 0.0))
+    terms.append(("A3 as given", *given.tolist()))
+    left = (lines.off.reshape(-1) - lines.by_parameters.reshape(-1, 5) @ fit.step).reshape(-1, 2)
+    back = np.linalg.inv(lines.by_lean)
+    own = np.array([c for name, c in sources if name in ("tilt readings", "centroids", "image motion")]).sum(
+        0
+    )
+    n = len(sightings)
+    own = own.reshape(n, 2, n, 2)[np.arange(n), :, np.arange(n)]
+    per_frame = np.einsum("nab,nbc,ndc->nad", back, own, back)
+    up = estimate.a3 @ np.append(estimate.lean, 1.0)
+    xi_eta = estimate.lean[::-1] / ARCSEC
+    inverse = cho_solve((fit.root, True), np.eye(2 * n))
+    design = inverse @ lines.by_parameters.reshape(-1, 5)
+    return Adjusted(
+        xi_arcsec=float(xi_eta[0]),
+        eta_arcsec=float(xi_eta[1]),
+        covariance_arcsec2=whole,
+        terms=tuple(terms),
+        a3=estimate.a3,
+        turn_stddev_rad=float(np.sqrt(up @ fit.covariance[2:, 2:] @ up)),
+        faces=faces,
+        frame_arcsec=np.einsum("nab,nb->na", back, left)[:, ::-1] / ARCSEC,
+        frame_stddev_arcsec=np.sqrt(np.diagonal(per_frame, axis1=1, axis2=2))[:, ::-1] / ARCSEC,
+        air=air,
+        catalogue_factor=catalogue_factor,
+        chi2_per_degree=fit.chi2 / max(left.size - 5, 1),
+        by_lean=lines.by_lean,
+        by_second=lines.by_sky @ (mark.enu[:, 2] * ROTATION_RAD_S),
+        projector=inverse - design @ fit.covariance @ design.T,
+        weighted=inverse @ left.reshape(-1),
+    )

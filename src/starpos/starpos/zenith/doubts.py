@@ -1,0 +1,143 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What speaks against a session: faces that do not come round, a jump of the clock or of a zero, a face unlike others."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from starpos.earth.ellipsoid import EARTH_RADIUS_M
+from starpos.errors import FixError
+from starpos.units import ARCSEC
+from starpos.utc import utc_text
+from starpos.zenith.adjustment import Adjusted
+from starpos.zenith.faces import mean_headings
+from starpos.zenith.sighting import ZenithSighting
+
+# A deflection whose sigma is larger is none: maps of the geoid know it better.
+MOST_SIGMA_ARCSEC = 3.0
+# On land 6 arcsec are usual, over 25 are found in high mountains only, over 120 nowhere.
+LARGE_ARCSEC, MOST_ARCSEC = 25.0, 120.0
+# chi-square of a step or of a face, which chance exceeds in one session of 10^5 with hundreds of frames
+DOUBTED_CHI2 = 36.0
+# a face with a smaller share of the usual number of frames is thin
+THIN = 0.5
+# Differences of lean that the scale turns into more than so many sigma of the deflection rest on the scale being the same
+# everywhere, which nobody states.
+UNLEVEL_SIGMA = 3.0
+
+
+def check_session(found: Adjusted, sightings: Sequence[ZenithSighting]) -> None:
+    """Raise FixError, with a sentence, where the readings do not bear a deflection."""
+    sigma = float(np.sqrt(np.linalg.eigvalsh(found.covariance_arcsec2)[-1]))
+    headings = np.degrees(mean_headings(sightings, found.faces))
+    if sigma > MOST_SIGMA_ARCSEC:
+        shown = ", ".join(f"{h:.0f}" for h in headings[:8])
+        raise FixError(
+            f"the faces do not come round: the top of the frame was at {shown} deg, which leaves {sigma:.3g} arcsec of "
+            "the deflection undetermined: turn the instrument by half a turn, better to four faces, or calibrate A3"
+        )
+    chi2, sentence = max(
+        (_clock(found, sightings), _zero(found, sightings), _face(found, headings)),
+        key=lambda doubt: doubt[0],
+    )
+    if chi2 > DOUBTED_CHI2:
+        raise FixError(sentence)
+    size = float(np.hypot(found.xi_arcsec, found.eta_arcsec))
+    if size > MOST_ARCSEC:
+        raise FixError(
+            f"the deflection would be {size:.0f} arcsec, as on no place of the Earth: the site is "
+            f"{_off(found)}, or the clock is wrong"
+        )
+
+
+def remarks(found: Adjusted, sightings: Sequence[ZenithSighting], frames: int, scale: float) -> list[str]:
+    """Sentences on what may be wrong with a deflection that was found.
+
+    frames: number that was given.  scale: stated error of the tiltmeter's scale.
+    """
+    said = []
+    size = float(np.hypot(found.xi_arcsec, found.eta_arcsec))
+    if size > LARGE_ARCSEC:
+        said.append(
+            f"the deflection is {size:.1f} arcsec, which only high mountains have: elsewhere the site is {_off(found)}, "
+            "or the clock is wrong (1 s is 15 arcsec of eta at the equator)"
+        )
+    number = np.bincount(found.faces)
+    for face in np.flatnonzero(number < THIN * np.median(number)):
+        said.append(
+            f"face {face + 1} has {number[face]} frames of the usual {np.median(number):.0f}: clouds, or its tilts were "
+            "refused"
+        )
+    if frames > len(sightings):
+        said.append(f"{frames - len(sightings)} of {frames} frames are left out")
+    lean = max(np.ptp([s.tilt.theta[k] for s in sightings]) for k in (0, 1)) / ARCSEC
+    if scale * lean > UNLEVEL_SIGMA * found.sigma_arcsec.max():
+        said.append(
+            f"the tiltmeter's angles differ by up to {lean:.0f} arcsec from face to face, of which its scale, known to "
+            f"{scale:.2g}, makes {scale * lean:.2g} arcsec: level every face to "
+            f"{found.sigma_arcsec.max() / scale:.0f} arcsec"
+        )
+    return said
+
+
+def _off(found: Adjusted) -> str:
+    """How far the site would be off."""
+    north, east = np.array([found.xi_arcsec, found.eta_arcsec]) * ARCSEC * EARTH_RADIUS_M
+    return (
+        f"{np.hypot(north, east) / 1000:.1f} km off (the stars have it {abs(north):.0f} m "
+        f"{'north' if north > 0 else 'south'} and {abs(east):.0f} m {'east' if east > 0 else 'west'} of there)"
+    )
+
+
+def _clock(found: Adjusted, sightings: Sequence[ZenithSighting]) -> tuple[float, str]:
+    """Chi-square of the likeliest jump of the clock, and the sentence about it."""
+    step, chi2, at = _steps(found, found.by_second[..., None])
+    when = utc_text(sightings[at].utc_unix_s)
+    return chi2, (
+        f"the clock that stamps the frames seems to have jumped by {step[0]:+.3f} s before {when}: use the frames "
+        "before or after, or repeat the session with a disciplined clock"
+    )
+
+
+def _zero(found: Adjusted, sightings: Sequence[ZenithSighting]) -> tuple[float, str]:
+    """Chi-square of the likeliest jump of the tiltmeter's zero, and the sentence about it."""
+    step, chi2, at = _steps(found, np.broadcast_to(np.eye(2), (len(sightings), 2, 2)))
+    x, y = step / ARCSEC
+    # two parameters where the clock has one
+    return chi2 - 2, (
+        f"the tiltmeter's zero seems to have jumped by {x:+.2f}, {y:+.2f} arcsec before "
+        f"{utc_text(sightings[at].utc_unix_s)}: use the frames before or after, or repeat the session"
+    )
+
+
+def _face(found: Adjusted, headings: np.ndarray) -> tuple[float, str]:
+    """Chi-square of the face that goes least with the others, and the sentence about it."""
+    best, sentence = 0.0, ""
+    # of two faces nobody knows which is wrong
+    for face in range(len(headings) if len(headings) > 2 else 0):
+        rows = (found.faces == face)[:, None, None]
+        step, chi2 = _test(found, found.by_lean * rows)
+        if chi2 - 2 > best:
+            best = chi2 - 2
+            sentence = (
+                f"face {face + 1} (top of the frame at {headings[face]:.0f} deg, {rows.sum()} frames) is "
+                f"{np.hypot(*step) / ARCSEC:.2f} arcsec off what the others have: leave its frames out, or repeat it"
+            )
+    return best, sentence
+
+
+def _steps(found: Adjusted, columns: np.ndarray) -> tuple[np.ndarray, float, int]:
+    """The likeliest jump (m,) along columns (N, 2, m), its chi-square, and the frame from which on it holds."""
+    late = np.arange(len(columns))
+    every = [_test(found, columns * (late >= k)[:, None, None]) for k in late[1:]]
+    at = int(np.argmax([chi2 for _, chi2 in every]))
+    return *every[at], at + 1
+
+
+def _test(found: Adjusted, columns: np.ndarray) -> tuple[np.ndarray, float]:
+    """The best multiple (m,) of further columns (N, 2, m) of the equations, and by how much chi-square falls."""
+    flat = columns.reshape(-1, columns.shape[2])
+    normal = flat.T @ found.projector @ flat
+    right = flat.T @ found.weighted
+    step = np.linalg.lstsq(normal, right, rcond=1e-9)[0]
+    return step, float(step @ right)

@@ -1,0 +1,54 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The adjustment of a zenith camera's session: its value, and the truth of its covariance."""
+
+import numpy as np
+import pytest
+from sessions import INSTRUMENT, MARK, VACUUM, drawn
+
+from starpos.errors import FixError
+from starpos.zenith.adjustment import adjusted
+from starpos.zenith.faces import faces_of
+
+
+@pytest.mark.parametrize("turn_deg", [0.0, 94.0, 180.0, 271.0])
+def test_without_noise_the_deflection_comes_back_however_the_tiltmeter_faces(rng, turn_deg):
+    session = drawn(rng, motion=0.0, air=0.0, turn_deg=turn_deg, frames=2)
+    found = session.adjusted()
+    assert [found.xi_arcsec, found.eta_arcsec] == pytest.approx([session.xi, session.eta], abs=2e-4)
+
+
+def test_claimed_errors_are_true(rng):
+    nees = []
+    for _ in range(20):
+        session = drawn(rng, frames=4)
+        found = session.adjusted()
+        error = np.array([found.xi_arcsec - session.xi, found.eta_arcsec - session.eta])
+        nees.append(error @ np.linalg.solve(found.covariance_arcsec2, error))
+    assert 1.2 < np.mean(nees) < 2.8
+
+
+def test_the_covariance_is_the_sum_of_its_sources(rng):
+    found = drawn(rng, frames=3).adjusted()
+    variances = np.sum([np.square(term[1:]) for term in found.terms], axis=0)
+    assert variances == pytest.approx(np.diag(found.covariance_arcsec2), rel=1e-6)
+
+
+def test_the_size_of_the_image_motion_comes_from_the_frames_own_scatter(rng):
+    calm, restless = (drawn(rng, motion=m, air=m / 8).adjusted() for m in (0.05, 0.8))
+    assert [np.degrees(a.air.motion) * 3600 for a in (calm, restless)] == pytest.approx([0.05, 0.8], rel=0.35)
+    assert calm.sigma_arcsec.max() < restless.sigma_arcsec.min() / 4
+
+
+def test_more_faces_do_not_average_what_their_air_shares(rng):
+    short, long = (drawn(rng, azimuths=(0, 90, 180, 270) * n).adjusted() for n in (1, 2))
+    assert long.sigma_arcsec.max() > 0.75 * short.sigma_arcsec.min()
+
+
+def test_faces_are_runs_of_one_heading(rng):
+    sightings = drawn(rng, azimuths=(350, 5, 350), frames=2).sightings
+    assert faces_of(sightings).tolist() == [0, 0, 1, 1, 2, 2]
+
+
+def test_two_frames_are_no_session(rng):
+    with pytest.raises(FixError, match="at least 3"):
+        adjusted(drawn(rng).sightings[:2], INSTRUMENT, VACUUM, MARK)
