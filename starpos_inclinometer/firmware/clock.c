@@ -35,5 +35,6 @@ struct instant clock_instant(uint16_t timer)
 {
     // The timer may have wrapped while interrupts were off: then the millisecond is not counted yet.
     bool uncounted = (TIFR & _BV(OCF1A)) && timer < CYCLES_PER_MS / 2;
-    return (struct instant){milliseconds + uncounted, timer / (F_CPU / 1000000)};
+    uint16_t us = timer / (F_CPU / 1000000);
+    return (struct instant){milliseconds + uncounted, us < 1000 ? us : 999};
 }

@@ -55,7 +55,6 @@ static void follow_level(void)
         TCCR1B &= ~_BV(ICES1);
     else
         TCCR1B |= _BV(ICES1);
-    TIFR = _BV(ICF1); // a change of the edge may set it
 }
 
 ISR(TIMER1_CAPT_vect)
@@ -80,6 +79,7 @@ void pulses_init(void)
     PORTB |= _BV(PIN_SHUTTER); // pulled up: the contact closes to ground
     TCCR1B |= _BV(ICNC1);      // an edge must last four cycles
     follow_level();
+    TIFR = _BV(ICF1); // the change may have set it; later a flag that it sets counts as a bounce
     TIMSK |= _BV(TICIE1);
     PPS_ENABLE();
 }

@@ -53,6 +53,26 @@ def test_a_contact_that_bounces_gives_its_first_edge_to_the_microsecond_and_its_
     assert 0 <= -errors.mean() < 0.3 and np.ptp(errors) < 0.003
 
 
+def test_an_edge_beside_the_end_of_a_millisecond_costs_none(board):
+    """The timer wraps while the edge's handler runs: the millisecond is counted, once, and the clock goes on."""
+    board.run(BOOT_MS)
+    board.tell("shutter 5 20")
+    first = pulses(board.messages(120))[0]
+    # of the MCU's clock against its reset
+    off_ms = time_ms(first) - (board.tell("state")["ms"] - 120 + 5)
+    errors = []
+    for k in range(-12, 20):
+        now_ms = board.tell("state")["ms"]
+        after_ms = 8 - (now_ms + off_ms) % 1 + k * 0.0005
+        board.tell(f"shutter {after_ms:.6f} 20")
+        closed, opened = pulses(board.messages(80))
+        errors += [
+            time_ms(closed) - off_ms - now_ms - after_ms,
+            time_ms(opened) - off_ms - now_ms - after_ms - 20,
+        ]
+    assert np.abs(errors).max() < 0.003 and board.parser.malformed == 0
+
+
 def test_a_receivers_second_is_timed_beside_samples_and_shutter(board):
     board.run(BOOT_MS)
     begin_ms = board.tell("state")["ms"]
