@@ -87,7 +87,6 @@ class SolverSession:
         self.names = FrameNames()
         self.doubt = ClockDoubt()
         self.gyro = Gyro(heard)
-        # None without gnss.use
         self.gnss = GnssTeacher(settings, jobs(), heard, log) if settings.values["gnss.use"] else None
         self.places = SessionPlaces(settings, self.gnss)
         self._search = Search(settings.values)
@@ -236,11 +235,10 @@ class SolverSession:
         return max(self.tilts.delay_s, now.waiting_s - self._backlog.first.since_s)
 
     def take_gnss(self, message: Any, now: Now) -> list[Output]:
-        """Take a sensor_msgs/NavSatFix of GNSS; without gnss.use there is nothing to do with it."""
-        made = self.at(now)
+        """Take a sensor_msgs/NavSatFix of GNSS; nothing is done with it without gnss.use."""
         if self.gnss is not None:
             self.gnss.take(message, now)
-        return made
+        return self.at(now)
 
     # time ------------------------------------------------------------------------------------------------------------
 
