@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Detector, inclinometer and solver on the camera and the IMU that a robot has.
 
-    ros2 launch starpos_bringup robot.launch.py image:=/cam0/image_raw camera_info:=/cam0/camera_info imu:=/imu/data \\
-      params_file:=mine.yaml
+    ros2 launch starpos_bringup robot.launch.py image:=/cam0/image_raw imu:=/imu/data params_file:=mine.yaml
 
-The file says what the drivers do not: begin with a copy of config/existing_robot.yaml.
+`camera_info:=` names the intrinsics. The file says what the drivers do not: begin with a copy of config/existing_robot.yaml.
 """
 
 from launch import LaunchDescription
