@@ -34,7 +34,7 @@ KEYS = {
 OPTIONAL = {
     "alpaca", "alpaca_simulators", "argcomplete", "dask", "distributed", "exifread", "fastjsonschema",
     "gphoto2", "indipyclient", "lz4", "pillow_heif", "rawpy", "requests", "rosbags", "selenium",
-    "starpos_camera.sources.alpaca_http", "starpos_testing.skies.bags", "urllib3",
+    "starpos_camera.sources.alpaca_http", "starpos_testing.skies.bags", "starpos_testing.skies.robots", "urllib3",
 }  # fmt: skip
 # Modules beside the tests.
 HELPERS = {path.stem for folder in PYTHON for path in folder.glob("test/**/*.py")}
