@@ -3,7 +3,8 @@
 
     ros2 launch starpos_bringup robot.launch.py image:=/cam0/image_raw imu:=/imu/data params_file:=mine.yaml
 
-`camera_info:=` names the intrinsics. The file says what the drivers do not: begin with a copy of config/existing_robot.yaml.
+`camera_info:=` names the intrinsics. The file states what the drivers do not: begin with a copy of
+config/existing_robot.yaml.
 """
 
 from launch import LaunchDescription

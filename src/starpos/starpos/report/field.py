@@ -111,7 +111,15 @@ def opened(path: Path | str) -> Iterator[tuple[Path, Atmosphere]]:
             if about["starpos_field"] != FORMAT:
                 raise ValueError(f"its format is {about['starpos_field']!r}, and this starpos reads {FORMAT}")
             air = Atmosphere(**about["air"])
-        except (OSError, ValueError, KeyError, TypeError, RuntimeError, zipfile.BadZipFile, zlib.error) as error:
+        except (
+            OSError,
+            ValueError,
+            KeyError,
+            TypeError,
+            RuntimeError,
+            zipfile.BadZipFile,
+            zlib.error,
+        ) as error:
             why = getattr(error, "strerror", None) or error
             raise FrameError(f"{path}: not a field report of starpos ({why})") from None
         yield folder, air
