@@ -41,7 +41,7 @@ FIX_KEYS = ("utc", "latitude", "longitude", "heading", "latitude_geodetic", "lon
 
 
 def json_of(fix: Fix | Average | None, vertical: Vertical) -> dict:
-    """The keys of --json that come from a fix; None for each if there is none."""
+    """The keys of --json that come from a fix; all None without a fix."""
     if fix is None:
         return dict.fromkeys(FIX_KEYS)
     ground = geodetic(fix.latitude, fix.longitude, fix.heading, fix.covariance, vertical)

@@ -36,7 +36,7 @@ COVARIANCES = ("covariance", "covariance_geodetic")
 def with_heading(
     values: dict, found: AttitudeAtPlace | MeanAttitude | None, place: KnownPlace | None = None
 ) -> dict:
-    """The keys of a fix, or of none, with those of the heading at a known place, None for each if there is none.
+    """The keys of a fix and of the heading at a known place; keys without a value are None.
 
     The place in the covariances stays a fix's, without the correlation with a heading that does not come from it.
     """
@@ -92,7 +92,7 @@ def text_of(found: AttitudeAtPlace | MeanAttitude) -> str:
 
 
 def mean_of(answers: Sequence[Solution]) -> tuple[MeanAttitude | None, tuple[str, ...]]:
-    """The mean attitude of frames that have one; None where there is none, and why, if it is not that no frame has."""
+    """The mean attitude of the frames, or None with the reason; the reason is empty if no frame has an attitude."""
     attitudes = [s.at_place for s in answers if s.at_place]
     try:
         return (mean_attitude(attitudes) if attitudes else None), ()

@@ -227,7 +227,7 @@ def _status(frame: FrameSeen, fix: VoyageFix | None) -> str:
 
 
 def json_of(fix: VoyageFix | None, vertical: Vertical) -> dict:
-    """The keys of --json that come from a fix; None for each if there is none."""
+    """The keys of --json that come from a fix; all None without a fix."""
     if fix is None:
         return dict.fromkeys(KEYS)
     ground = geodetic(fix.latitude, fix.longitude, fix.heading, fix.covariance, vertical)

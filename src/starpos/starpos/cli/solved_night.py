@@ -35,7 +35,7 @@ def tell(
     """Write (path, Solution or FrameError) of each frame, and what they come to together.
 
     given: the instrument whose A3 was taken as it is; None where it was found by turning.
-    place: that is known, None where there is none; its headings are told then.
+    place: the known place, whose headings are then reported; None without one.
     Returns the exit status, and a frame that was not identified if no frame has a fix, else ''.
     """
     solved: list[Solved] = []

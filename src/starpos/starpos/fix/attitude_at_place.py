@@ -143,7 +143,7 @@ def attitude_at_place(
     check_visible(float((rays @ g[2]).min()))
     for _ in range(MOST_ROUNDS):
         seen = fit_stars(stars, camera, g, refraction, itrs)
-        # by as much as the fitted A4 is off that of the place, the level was
+        # the fitted A4 differs from the A4 of the place by as much as the level was
         off = a4 @ seen.fit.a4.T
         g = off @ g
         if np.linalg.norm(rotation.to_small_vector(off)) < SETTLED:

@@ -80,7 +80,7 @@ class StarFit:
         return self.errors.rotated(self._bent(atmosphere) * (atmosphere.relative_sigma / STEP_REFRACTION))
 
     def refraction_seen(self, atmosphere: Atmosphere) -> tuple[float, float]:
-        """Refraction by how it bends the field, over that of the air at the fitted zenith, and the 1 sigma of this share.
+        """Share of the refraction that the field shows, relative to the air at the fitted zenith, and its 1 sigma.
 
         An attitude and a plate scale take up most of it; what is left squeezes the field along the vertical.
         """

@@ -65,7 +65,7 @@ class Solution:
     extrapolated_days: how far behind the end of the IERS table the frame's date lies; 0 within it.
     warnings: names, sorted, of what is suspicious about an identification: TWO_SKIES, UNEXPLAINED. There is no fix then.
     explained: how much of the frame the identification explains.
-    at_place: heading, pitch and roll at a known place; None where none was asked for, or there are none.
+    at_place: heading, pitch and roll at a known place; None if not asked for or not found.
     found: the identification itself, whose rows are those of the input's stars.
     negative: whether the stars are dark on a bright sky.
     hint: helps to identify the next frame.

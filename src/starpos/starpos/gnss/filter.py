@@ -37,7 +37,7 @@ def updated(learned: Learned, seen: Innovation) -> Learned:
 
 
 def chi2(learned: Learned, seen: Innovation) -> float:
-    """Squared distance in sigma between a GNSS place and that of the stars: chi-square of two degrees of freedom."""
+    """Squared distance in sigma between the GNSS place and the star fix: chi-square, two degrees of freedom."""
     spread = seen.rows @ learned.covariance @ seen.rows.T + seen.noise
     return float(seen.value @ np.linalg.solve(spread, seen.value))
 
