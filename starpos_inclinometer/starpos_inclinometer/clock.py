@@ -114,6 +114,9 @@ class ArrivalFilter:
         self._backlog = catching_up and (self._backlog or late > BACKLOG_S)
         if self._backlog:
             return max(late, 0.0)
+        if time - self._points[-1][0] > REFIT_S:
+            # The first samples after a gap may be late: an edge of the hull to one of them would show a wrong rate.
+            self._next_fit = time + REFIT_S
         self._keep(time, offset)
         if time >= self._next_fit:
             self._next_fit = time + REFIT_S
