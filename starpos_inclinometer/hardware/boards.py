@@ -122,7 +122,7 @@ def _shutter() -> Group:
         _r("R2", "4.7k", "+5V", "SHUTTER"),
         _c("C1", "100n", "+5V", "GND"),
     )
-    return Group("Shutter: closed contact or low strobe line lights the LED; SHUTTER is low", parts)
+    return Group("Shutter: a closed contact or a low line lights the LED", parts)
 
 
 def _second(buffer: Part) -> Group:
@@ -135,7 +135,7 @@ def _second(buffer: Part) -> Group:
         buffer,
         _c("C2", "100n", "+5V", "GND"),
     )
-    return Group("Receiver's second, 3.3 or 5 V; 74AHCT125 has TTL inputs and 5 V outputs", parts)
+    return Group("Receiver's second; TTL inputs: 3.3 or 5 V", parts)
 
 
 def _ahct(nets: Mapping[str, str]) -> Part:
@@ -152,7 +152,7 @@ NANO = Board(
     (
         (
             Group(
-                "Microcontroller; flashed at its own ICSP header, powered by USB",
+                "Microcontroller, powered by USB",
                 (
                     Part(
                         "A1",
@@ -317,7 +317,7 @@ PAPER = Board(
         ),
         (
             Group(
-                "Converter, 4.9152 MHz; +5VA feeds converter, sensor and reference alike",
+                "Converter; +5VA is supply and reference",
                 (
                     Part(
                         "U2",

@@ -27,7 +27,7 @@ def svg(sheet: Sheet) -> str:
     for placed in sheet.placed:
         lines += _part(placed)
     lines.append(_text(15.24, 12.0, f"{board.title}. Nobody has built this board.", "title"))
-    right = min(WIDTH_MM, max(placed.x + placed.part.symbol.width_mm / 2 for placed in sheet.placed) + 26)
+    right = min(WIDTH_MM, max(placed.x + placed.part.symbol.width_mm / 2 for placed in sheet.placed) + 32)
     low = min(HEIGHT_MM, max(placed.y + placed.part.symbol.height_mm / 2 for placed in sheet.placed) + MARGIN_MM)
     view = f"{MARGIN_MM:g} 6 {right - MARGIN_MM:.2f} {low - 6:.2f}"
     return "\n".join(
@@ -69,7 +69,7 @@ def _part(placed: Placed) -> list[str]:
         lines.append(_path([(u, v), (inside, v)]))
         if box:
             inward = "start" if pin.inward > 0 else "end"
-            low = "low" if pin.name.startswith("~") else ""
+            low = "low" if "~" in pin.name else ""
             lines.append(_text(inside + 0.7 * pin.inward, v + 0.7, pin.name.replace("~", ""), low, inward))
             lines.append(_text(inside - 0.3 * pin.inward, v - 0.3, pin.number, "number", outward))
         if net := part.nets.get(pin.number):

@@ -59,7 +59,7 @@ def chip(name: str, prefix: str, left: str, right: str, width: int = 10) -> Symb
         for i, row in enumerate(side):
             if row != ["-"]:
                 number, label, kind = row
-                pins.append(Pin(number, label, KINDS[kind], x, (i - (height - 1) // 2) * GRID, inward))
+                pins.append(Pin(number, label, KINDS[kind], x, (i - (height - 2) / 2) * GRID, inward))
     return Symbol(name, prefix, tuple(pins), width * GRID, height * GRID)
 
 
