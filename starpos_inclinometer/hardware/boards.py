@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The two boards: every part, its manufacturer's number and its nets. All drawings and lists are made of this.
 
-Pins that a part does not name are left open. Groups stand in columns on the sheet, each under a sentence that says what it does.
+Pins that a part does not name are left open. Groups stand in columns on the sheet, each under a sentence on its job.
 """
 
 from collections.abc import Mapping
@@ -76,6 +76,11 @@ CAPACITORS = {
 }
 
 
+def _nets(text: str) -> dict[str, str]:
+    """Read nets as `PIN NET, PIN NET`."""
+    return dict(pair.split() for pair in text.split(", "))
+
+
 def _r(reference: str, value: str, one: str, two: str) -> Part:
     number = f"MFR-25FBF52-{RESISTORS[value]}"
     return Part(reference, RESISTOR, value, "Yageo", number, {"1": one, "2": two})
@@ -102,9 +107,9 @@ def _j(reference: str, value: str, manufacturer: str, number: str, *nets: str) -
 def _shutter() -> Group:
     """Make the shutter's input.
 
-    1N4007 blocks a flash's voltage. 1N4148 keeps its leakage from reversing the LED. The contact carries about 1 mA: enough for a
-    6N139, and little beside what would keep a camera's thyristor conducting after the exposure. A strobe line of 3.3 or 5 V may
-    drive it as well: low is lit.
+    The 1N4007 blocks a flash's voltage; the 1N4148 keeps its leakage from reversing the LED. The contact carries about
+    1 mA. That lights a 6N139, and seldom keeps a camera's thyristor conducting after the exposure. A strobe line
+    of 3.3 or 5 V works, too: low lights the LED.
     """
     parts = (
         _j("J2", "shutter: 1 contact 2 ground", "JST", "B2B-XH-A(LF)(SN)", "SHOE", "GND"),
@@ -114,7 +119,7 @@ def _shutter() -> Group:
             "6N139",
             "Vishay",
             "6N139",
-            {"2": "LED_A", "3": "LED_K", "8": "+5V", "6": "SHUTTER", "5": "GND"},
+            _nets("2 LED_A, 3 LED_K, 8 +5V, 6 SHUTTER, 5 GND"),
         ),
         _r("R1", "2.2k", "+5V", "LED_A"),
         _d("D1", "1N4007", "1N4007-E3/54", "SHOE", "LED_K"),
@@ -129,7 +134,7 @@ def _second(buffer: Part) -> Group:
     """Make the receiver's input: TTL levels, so 3.3 V are high; open it is low."""
     parts = (
         _j("J3", "PPS: 1 pulse 2 ground", "JST", "B2B-XH-A(LF)(SN)", "PPS_IN", "GND"),
-        Part("D3", CLAMP, "BAT54S", "Nexperia", "BAT54S,215", {"1": "GND", "3": "PPS_TTL", "2": "+5V"}),
+        Part("D3", CLAMP, "BAT54S", "Nexperia", "BAT54S,215", _nets("1 GND, 3 PPS_TTL, 2 +5V")),
         _r("R3", "1k", "PPS_IN", "PPS_TTL"),
         _r("R4", "100k", "PPS_TTL", "GND"),
         buffer,
@@ -138,14 +143,12 @@ def _second(buffer: Part) -> Group:
     return Group("Receiver's second; TTL inputs: 3.3 or 5 V", parts)
 
 
-def _ahct(nets: Mapping[str, str]) -> Part:
-    return Part(
-        "U4", BUFFER_125, "74AHCT125", "Texas Instruments", "SN74AHCT125N", {"14": "+5V", "7": "GND", **nets}
-    )
+def _ahct(gates: str) -> Part:
+    # Gates 3 and 4 are not used: inputs at ground, outputs off.
+    nets = _nets(f"14 +5V, 7 GND, 9 GND, 10 +5V, 12 GND, 13 +5V, {gates}")
+    return Part("U4", BUFFER_125, "74AHCT125", "Texas Instruments", "SN74AHCT125N", nets)
 
 
-# Gates that are not used: inputs at ground, outputs off.
-_SPARE_3_4 = {"9": "GND", "10": "+5V", "12": "GND", "13": "+5V"}
 NANO = Board(
     "nano",
     "starpos inclinometer, Arduino Nano and SCL3300-D01",
@@ -160,18 +163,10 @@ NANO = Board(
                         "Arduino Nano",
                         "Arduino",
                         "A000005",
-                        {
-                            "4": "GND",
-                            "29": "GND",
-                            "27": "+5V",
-                            "17": "+3V3",
-                            "11": "SHUTTER",
-                            "6": "PPS",
-                            "13": "CS",
-                            "14": "MOSI",
-                            "15": "MISO",
-                            "16": "SCK",
-                        },
+                        _nets(
+                            "4 GND, 29 GND, 27 +5V, 17 +3V3, 11 SHUTTER, 6 PPS, 13 CS, 14 MOSI, 15 MISO, "
+                            "16 SCK"
+                        ),
                     ),
                     _c("C3", "10u", "+5V", "GND"),
                     _r("R5", "10k", "+5V", "CS"),
@@ -186,20 +181,10 @@ NANO = Board(
                         "SCL3300-D01",
                         "Murata",
                         "SCL3300-D01-1",
-                        {
-                            "5": "CS_3V3",
-                            "8": "SCK_3V3",
-                            "7": "MOSI_3V3",
-                            "6": "MISO_3V3",
-                            "2": "A_EXTC",
-                            "10": "D_EXTC",
-                            "4": "+3V3",
-                            "9": "+3V3",
-                            "1": "GND",
-                            "11": "GND",
-                            "12": "GND",
-                            "3": "GND",
-                        },
+                        _nets(
+                            "5 CS_3V3, 8 SCK_3V3, 7 MOSI_3V3, 6 MISO_3V3, 2 A_EXTC, 10 D_EXTC, 4 +3V3, "
+                            "9 +3V3, 1 GND, 11 GND, 12 GND, 3 GND"
+                        ),
                     ),
                     _c("C4", "100n", "+3V3", "GND"),
                     _c("C5", "100n", "+3V3", "GND"),
@@ -219,30 +204,17 @@ NANO = Board(
                         "74LVC125",
                         "Texas Instruments",
                         "SN74LVC125AD",
-                        {
-                            "14": "+3V3",
-                            "7": "GND",
-                            "1": "GND",
-                            "2": "CS",
-                            "3": "CS_3V3",
-                            "4": "GND",
-                            "5": "SCK",
-                            "6": "SCK_3V3",
-                            "10": "GND",
-                            "9": "MOSI",
-                            "8": "MOSI_3V3",
-                            "13": "+3V3",
-                            "12": "GND",
-                        },
+                        _nets(
+                            "14 +3V3, 7 GND, 1 GND, 2 CS, 3 CS_3V3, 4 GND, 5 SCK, 6 SCK_3V3, 10 GND, 9 MOSI, "
+                            "8 MOSI_3V3, 13 +3V3, 12 GND"
+                        ),
                     ),
                     _c("C8", "100n", "+3V3", "GND"),
                 ),
             ),
             _second(
                 # 2: MISO, off while the sensor is not selected, so that a programmer finds the line free.
-                _ahct(
-                    {"1": "GND", "2": "PPS_TTL", "3": "PPS", "4": "CS", "5": "MISO_3V3", "6": "MISO"} | _SPARE_3_4
-                )
+                _ahct("1 GND, 2 PPS_TTL, 3 PPS, 4 CS, 5 MISO_3V3, 6 MISO")
             ),
         ),
         (_shutter(),),
@@ -263,28 +235,13 @@ PAPER = Board(
                         "ATmega8",
                         "Microchip",
                         "ATMEGA8-16PU",
-                        {
-                            "1": "RESET",
-                            "9": "XTAL1",
-                            "10": "XTAL2",
-                            "14": "SHUTTER",
-                            "15": "CS_SCA100T",
-                            "16": "CS_AD7730",
-                            "17": "MOSI",
-                            "18": "MISO",
-                            "19": "SCK",
-                            "7": "+5V",
-                            "20": "+5V",
-                            "21": "AREF",
-                            "8": "GND",
-                            "22": "GND",
-                            "2": "RXD",
-                            "3": "TXD",
-                            "4": "RDY",
-                            "5": "PPS",
-                        },
+                        _nets(
+                            "1 RESET, 9 XTAL1, 10 XTAL2, 14 SHUTTER, 15 CS_SCA100T, 16 CS_AD7730, 17 MOSI, "
+                            "18 MISO, 19 SCK, 7 +5V, 20 +5V, 21 AREF, 8 GND, 22 GND, 2 RXD, 3 TXD, 4 RDY, "
+                            "5 PPS"
+                        ),
                     ),
-                    Part("Y1", CRYSTAL, "8 MHz", "Abracon", "ABLS-8.000MHZ-B4-T", {"1": "XTAL1", "2": "XTAL2"}),
+                    Part("Y1", CRYSTAL, "8 MHz", "Abracon", "ABLS-8.000MHZ-B4-T", _nets("1 XTAL1, 2 XTAL2")),
                     _r("R5", "10k", "+5V", "RESET"),
                     _c("C3", "22p", "XTAL1", "GND"),
                     _c("C4", "22p", "XTAL2", "GND"),
@@ -325,29 +282,11 @@ PAPER = Board(
                         "AD7730",
                         "Analog Devices",
                         "AD7730BNZ",
-                        {
-                            "9": "+5VA",
-                            "14": "+5VA",
-                            "15": "GND",
-                            "10": "AIN1P",
-                            "11": "AIN1N",
-                            "12": "AIN2P",
-                            "13": "AIN2N",
-                            "8": "GND",
-                            "23": "+5V",
-                            "1": "SCK",
-                            "22": "MOSI",
-                            "21": "MISO",
-                            "19": "CS_AD7730",
-                            "20": "RDY",
-                            "4": "+5V",
-                            "5": "+5V",
-                            "6": "+5V",
-                            "18": "+5V",
-                            "2": "MCLK1",
-                            "3": "MCLK2",
-                            "24": "GND",
-                        },
+                        _nets(
+                            "9 +5VA, 14 +5VA, 15 GND, 10 AIN1P, 11 AIN1N, 12 AIN2P, 13 AIN2N, 8 GND, 23 +5V, "
+                            "1 SCK, 22 MOSI, 21 MISO, 19 CS_AD7730, 20 RDY, 4 +5V, 5 +5V, 6 +5V, 18 +5V, "
+                            "2 MCLK1, 3 MCLK2, 24 GND"
+                        ),
                     ),
                     Part(
                         "Y2",
@@ -355,7 +294,7 @@ PAPER = Board(
                         "4.9152 MHz",
                         "Abracon",
                         "ABLS-4.9152MHZ-B4-T",
-                        {"1": "MCLK1", "2": "MCLK2"},
+                        _nets("1 MCLK1, 2 MCLK2"),
                     ),
                     Part(
                         "FB1",
@@ -363,7 +302,7 @@ PAPER = Board(
                         "220R at 100 MHz",
                         "Murata",
                         "BLM21PG221SN1D",
-                        {"1": "+5V", "2": "+5VA"},
+                        _nets("1 +5V, 2 +5VA"),
                     ),
                     _c("C9", "22p", "MCLK1", "GND"),
                     _c("C10", "22p", "MCLK2", "GND"),
@@ -381,18 +320,10 @@ PAPER = Board(
                         "SCA100T-D01",
                         "Murata",
                         "SCA100T-D01-1",
-                        {
-                            "12": "+5VA",
-                            "11": "OUT_1",
-                            "5": "OUT_2",
-                            "10": "GND",
-                            "9": "GND",
-                            "6": "GND",
-                            "1": "SCK",
-                            "4": "MOSI",
-                            "3": "MISO",
-                            "7": "CS_SCA100T",
-                        },
+                        _nets(
+                            "12 +5VA, 11 OUT_1, 5 OUT_2, 10 GND, 9 GND, 6 GND, 1 SCK, 4 MOSI, 3 MISO, "
+                            "7 CS_SCA100T"
+                        ),
                     ),
                     _c("C14", "100n", "+5VA", "GND"),
                 ),
@@ -421,7 +352,7 @@ PAPER = Board(
                         "MCP601",
                         "Microchip",
                         "MCP601-I/P",
-                        {"3": "HALF", "2": "MID", "6": "MID", "7": "+5VA", "4": "GND"},
+                        _nets("3 HALF, 2 MID, 6 MID, 7 +5VA, 4 GND"),
                     ),
                     _r("R14", "10k", "+5VA", "HALF"),
                     _r("R15", "10k", "HALF", "GND"),
@@ -431,11 +362,7 @@ PAPER = Board(
             ),
             _shutter(),
         ),
-        (
-            _second(
-                _ahct({"1": "GND", "2": "PPS_TTL", "3": "PPS", "5": "GND", "4": "+5V"} | _SPARE_3_4)
-            ),
-        ),
+        (_second(_ahct("1 GND, 2 PPS_TTL, 3 PPS, 5 GND, 4 +5V")),),
     ),
     ("GND", "+5V", "+5VA"),
 )

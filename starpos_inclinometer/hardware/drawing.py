@@ -28,7 +28,9 @@ def svg(sheet: Sheet) -> str:
         lines += _part(placed)
     lines.append(_text(15.24, 12.0, f"{board.title}. Nobody has built this board.", "title"))
     right = min(WIDTH_MM, max(placed.x + placed.part.symbol.width_mm / 2 for placed in sheet.placed) + 32)
-    low = min(HEIGHT_MM, max(placed.y + placed.part.symbol.height_mm / 2 for placed in sheet.placed) + MARGIN_MM)
+    low = min(
+        HEIGHT_MM, max(placed.y + placed.part.symbol.height_mm / 2 for placed in sheet.placed) + MARGIN_MM
+    )
     view = f"{MARGIN_MM:g} 6 {right - MARGIN_MM:.2f} {low - 6:.2f}"
     return "\n".join(
         (

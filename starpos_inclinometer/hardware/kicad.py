@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Schematics in the format of KiCad 6 (version 20211123), with their symbols inside: a label at each pin makes the nets.
 
-The format is described at https://dev-docs.kicad.org/en/file-formats/sexpr-schematic/. Identifiers are derived from the names, so
-that the same board always makes the same file.
+The format is described at https://dev-docs.kicad.org/en/file-formats/sexpr-schematic/. Identifiers are derived
+from the names, so that the same board always makes the same file.
 """
 
 import json
@@ -106,7 +106,9 @@ def strokes(symbol: Symbol) -> list[list[tuple[float, float]]]:
     if symbol.shape == "capacitor":
         return [*wires, *plates]
     if symbol.shape == "crystal":
-        return [[(-w, 0.0), (-1.3, 0.0)], [(1.3, 0.0), (w, 0.0)]] + [
+        return [
+            [(-w, 0.0), (-1.3, 0.0)],
+            [(1.3, 0.0), (w, 0.0)],
             [(-1.3, -1.2), (-1.3, 1.2)],
             [(1.3, -1.2), (1.3, 1.2)],
             [(-0.7, -1.5), (0.7, -1.5), (0.7, 1.5), (-0.7, 1.5), (-0.7, -1.5)],

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where each part of a board stands on its sheet: groups in columns, large parts in rows of their own, small ones two a row."""
+"""Place of each part of a board on its sheet: groups in columns, large parts in rows of their own, small ones paired."""
 
 from dataclasses import dataclass
 

@@ -64,7 +64,10 @@ def chip(name: str, prefix: str, left: str, right: str, width: int = 10) -> Symb
 
 
 def _two_terminals(name: str, prefix: str, shape: str, names: tuple[str, str] = ("1", "2")) -> Symbol:
-    ends = (Pin("1", names[0], "passive", -2 * GRID, 0.0, 1), Pin("2", names[1], "passive", 2 * GRID, 0.0, -1))
+    ends = (
+        Pin("1", names[0], "passive", -2 * GRID, 0.0, 1),
+        Pin("2", names[1], "passive", 2 * GRID, 0.0, -1),
+    )
     return Symbol(name, prefix, ends, 2 * GRID, 0.8 * GRID, shape)
 
 

@@ -3,7 +3,7 @@
 
 import csv
 import re
-import sys
+import runpy
 from collections import defaultdict
 from pathlib import Path
 
@@ -106,13 +106,10 @@ def _firmware_pins(board):
     return dict(re.findall(r"#define (PIN_\w+) (P[B-D]\d)", common + (nano if board == "nano" else paper)))
 
 
-def test_drawings_are_those_of_the_description():
-    sys.path.insert(0, str(HARDWARE))
-    try:
-        from draw import files
-    finally:
-        sys.path.remove(str(HARDWARE))
-    stale = [path.name for path, text in files().items() if path.read_text(encoding="utf-8") != text]
+def test_drawings_are_those_of_the_description(monkeypatch):
+    monkeypatch.syspath_prepend(HARDWARE)
+    files = runpy.run_path(str(HARDWARE / "draw.py"))["files"]()
+    stale = [path.name for path, text in files.items() if path.read_text(encoding="utf-8") != text]
     assert not stale, "run: python starpos_inclinometer/hardware/draw.py"
 
 
@@ -182,8 +179,12 @@ def test_every_net_joins_two_pins_and_has_one_driver(drawn):
 def test_supplies_have_a_capacitor_a_chip(drawn):
     _, nets = drawn
     for net in ("+5V", "+3V3", "+5VA"):
-        fed = {part for part, number in nets.pins[net] if part[0] == "U" and nets.fields[part]["MPN"] != "6N139"}
-        fed = {part for part in fed if any(nets.by_name.get((part, n)) == net for n in ("VCC", "VDD", "AVDD"))}
+        fed = {
+            part for part, number in nets.pins[net] if part[0] == "U" and nets.fields[part]["MPN"] != "6N139"
+        }
+        fed = {
+            part for part in fed if any(nets.by_name.get((part, n)) == net for n in ("VCC", "VDD", "AVDD"))
+        }
         decoupled = {part for part, _ in nets.pins[net] if part[0] == "C"}
         assert len(decoupled) >= len(fed), f"{net}: {fed}"
 
