@@ -2,10 +2,10 @@
 """Estimate how much the mounting plate bends between camera and level when the instrument leans by one degree more.
 
 The plate counts as a cantilever from the mount's screw to the camera's. At its end the whole weight of camera and lens
-pulls, at the height of their centre of mass. The end turns by P L^2 / 2EI under the force P and by M L / EI under the
-moment M (Young, Budynas and Sadegh, Roark's Formulas for Stress and Strain, 8th ed., table 8.1, cases 1a and 3a). A lean by
-one degree changes a component of the weight by at most sin(1 deg) of it. The camera stiffens the plate, so this is an upper
-bound of the plate's share. It does not contain joints, the lens and the sensor's own board.
+pulls, at the height of their centre of mass. The end turns by P L^2 / 2EI under the force P, by M L / EI under the moment
+M (Young, Budynas and Sadegh, Roark's Formulas for Stress and Strain, 8th ed., table 8.1, cases 1a and 3a). A lean by
+one degree changes a component of the weight by at most sin(1 deg) of it. The camera stiffens the plate, so this is an
+upper bound of the plate's share. It does not contain joints, the lens and the sensor's own board.
 """
 
 import argparse
