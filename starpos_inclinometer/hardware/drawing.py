@@ -27,7 +27,7 @@ def svg(sheet: Sheet) -> str:
     for placed in sheet.placed:
         lines += _part(placed)
     lines.append(_text(15.24, 12.0, f"{board.title}. Nobody has built this board.", "title"))
-    right = min(WIDTH_MM, max(placed.x + placed.part.symbol.width_mm / 2 for placed in sheet.placed) + 32)
+    right = min(WIDTH_MM, max(placed.x + placed.part.symbol.width_mm / 2 for placed in sheet.placed) + 22)
     low = min(
         HEIGHT_MM, max(placed.y + placed.part.symbol.height_mm / 2 for placed in sheet.placed) + MARGIN_MM
     )

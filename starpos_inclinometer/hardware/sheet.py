@@ -9,7 +9,7 @@ from symbols import GRID
 # An A3 sheet (mm).
 WIDTH_MM, HEIGHT_MM = 420.0, 297.0
 # Left and upper edge of the first column, and the columns' distance, in grid steps.
-LEFT, TOP, COLUMN = 6, 8, 39
+LEFT, TOP, COLUMN = 6, 8, 31
 # Distances in grid steps: from a group's sentence to its first part, between parts, between groups.
 AFTER_TITLE, BETWEEN, BETWEEN_GROUPS = 3, 3, 3
 # A part lower than this many grid steps shares its row.
@@ -65,11 +65,11 @@ def _place(group: Group, left: int, row: int, placed: list[Placed]) -> int:
         if height < LOW:
             waiting.append((part, height))
         else:
-            placed.append(Placed(part, (left + COLUMN // 2 - 2) * GRID, (row + height // 2) * GRID))
+            placed.append(Placed(part, (left + COLUMN // 2 - 1) * GRID, (row + height // 2) * GRID))
             row += height + BETWEEN
     for pair in (waiting[i : i + 2] for i in range(0, len(waiting), 2)):
         tallest = max(height for _, height in pair)
-        for (part, _), x in zip(pair, (8, 26), strict=False):
+        for (part, _), x in zip(pair, (6, 22), strict=False):
             placed.append(Placed(part, (left + x) * GRID, (row + tallest // 2) * GRID))
         row += tallest + BETWEEN
     return row
