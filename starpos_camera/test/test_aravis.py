@@ -233,7 +233,7 @@ def test_the_stamps_error_holds_what_is_not_known():
     # At 0.25 s from one or the other.
     assert either.stddev_s == pytest.approx(0.25, rel=1e-3)
     utc = stamp_of_camera(taken(relation=None, camera_s=1000.01), "unknown", values())
-    assert utc.stddev_s == pytest.approx(np.hypot(0.1 / np.sqrt(12), 1e-3))
+    assert utc.stddev_s == pytest.approx(np.hypot(0.1 / np.sqrt(3), 1e-3))
     assert "contradict" in stamp_of_camera(taken(), "end", values()).remark
 
 

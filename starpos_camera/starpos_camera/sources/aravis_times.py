@@ -81,8 +81,8 @@ def _by_host(times: FrameTimes, values: Mapping) -> Stamp:
 def _on_host_clock(times: FrameTimes) -> tuple[float, float]:
     """The camera's time of a frame on the host's clock, and its standard deviation (s); NaN: the clocks are not related.
 
-    A camera whose clock cannot be read may keep UTC (PTP). Then its time lies between trigger and arrival, and is no
-    better known than that, because nobody says how well it keeps it.
+    A camera whose clock cannot be read may keep UTC (PTP), but nobody states how well. Exposure and stamp then lie
+    anywhere between trigger and arrival: the error is the one of a stamp at either edge.
     """
     assert times.camera_s is not None
     if times.relation is not None:
@@ -91,4 +91,4 @@ def _on_host_clock(times: FrameTimes) -> tuple[float, float]:
     if times.commanded_s is None or not times.commanded_s <= times.camera_s <= times.received_s + TOLERANCE_S:
         return math.nan, math.nan
     slack_s = max(0.0, times.received_s - times.commanded_s - times.exposure_s)
-    return times.camera_s, math.hypot(slack_s / math.sqrt(12), TIMESTAMP_STDDEV_S)
+    return times.camera_s, math.hypot(slack_s / math.sqrt(3), TIMESTAMP_STDDEV_S)
