@@ -80,7 +80,7 @@ def test_a_replay_that_nobody_hears_says_so(graph, run):
     replay = run("starpos_bringup", "replay", arguments=(str(NIGHT), "--rate", "0", "--wait", "0.2"))
     assert replay.wait() == 1
     assert "13 frames, 0 answers, 0 fixes" in replay.output, replay.output
-    assert "nobody subscribes to" in replay.output and "/stars" in replay.output, replay.output
+    assert "no node subscribes to" in replay.output and "/stars" in replay.output, replay.output
 
 
 def test_a_replay_that_only_strangers_hear_says_so(graph, run):
@@ -95,7 +95,7 @@ def test_a_replay_that_only_strangers_hear_says_so(graph, run):
     )
     assert replay.wait() == 1, replay.output
     assert "10 frames, 0 answers, 0 fixes" in replay.output
-    assert "do not say what they take: start detector and solver with use_sim_time" in replay.output
+    assert "do not report what they take: start detector and solver with use_sim_time" in replay.output
     for subscription in heard:
         graph.node.destroy_subscription(subscription)
 

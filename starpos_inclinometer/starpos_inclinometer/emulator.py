@@ -47,7 +47,7 @@ class Faults:
     drop: float = _fault("the line is lost")
     truncate: float = _fault("the line ends early")
     double: float = _fault("the line comes twice")
-    flip: float = _fault("the bit is the other way round")
+    flip: float = _fault("the bit is flipped")
 
     def apply(self, line: bytes, rng: random.Random) -> bytes:
         """Return the bytes that arrive when a line is sent."""

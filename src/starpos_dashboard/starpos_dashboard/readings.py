@@ -28,7 +28,7 @@ TILT_FLAGS = (
     (Tilt.STUCK, "the sensor repeats one value"),
     (Tilt.SATURATED, "the converter is at its limit"),
     (Tilt.GAP, "readings were lost"),
-    (Tilt.TIME_UNKNOWN, "nobody knows when it was read"),
+    (Tilt.TIME_UNKNOWN, "its time is unknown"),
 )
 
 
@@ -56,7 +56,7 @@ def position(message: NavSatFix) -> dict:
     covariance = _covariance(message)
     return told | {
         "good": True,
-        "trouble": "" if covariance else "how far it may be off is not known",
+        "trouble": "" if covariance else "its error is not known",
         "latitude": latitude,
         "longitude": math.remainder(longitude, 360.0),
         "altitude": number(message.altitude),

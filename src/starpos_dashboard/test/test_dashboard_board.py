@@ -104,7 +104,7 @@ def test_nan_everywhere_is_null_everywhere():
 
 def test_the_flags_of_a_tilt_are_said_in_words():
     flags = readings.tilt(said.tilt(31.0, 0.0, flags=Tilt.OUT_OF_RANGE | Tilt.TIME_UNKNOWN))["flags"]
-    assert flags == ["beyond the sensor's range", "nobody knows when it was read"]
+    assert flags == ["beyond the sensor's range", "its time is unknown"]
     flags = {v for v in (getattr(Tilt, name) for name in dir(Tilt) if name.isupper()) if isinstance(v, int)}
     assert {flag for flag, _ in readings.TILT_FLAGS} == flags
 

@@ -167,7 +167,7 @@ def test_a_frame_that_cannot_be_shown_says_why(page):
 
 def test_no_fix_looks_like_no_fix_and_nan_is_no_number(page):
     nan = math.nan
-    sentence = "none of the sky fits these 41 stars: look at the frame"
+    sentence = "no part of the sky matches these 41 stars: look at the frame"
     page.instrument.works(
         fix=said.fix(nan),
         fix_averaged=None,

@@ -75,7 +75,8 @@ PARAMETERS = (
     Parameter(
         "iio.stuck_samples",
         100,
-        "So many equal inclinations in a row are a stuck device; 0: never, for one whose steps are coarser than its "
+        "Number of equal inclinations in a row after which the device counts as stuck; 0: never, for one "
+        "whose steps are coarser than its "
         "noise, as those of an ADIS16209 are.",
         unit="",
         minimum=0,
@@ -167,7 +168,7 @@ class IioLink:
             try:
                 raw = device.read_raw()
             except ValueError:
-                self._fail(good_s, before, f"{device.folder} tells no numbers")
+                self._fail(good_s, before, f"{device.folder} shows no numbers")
                 continue
             except OSError as error:
                 if error.errno == errno.EBUSY:

@@ -45,7 +45,7 @@ def element(name: str, index: int, text: str) -> Element:
     match = _TYPE.fullmatch(text.strip())
     if match is None or int(match[4]) % 8:
         raise DeviceError(
-            f"{name} is stored as {text.strip()!r}, which nobody can read: unset `iio.trigger`."
+            f"{name} is stored as {text.strip()!r}, a format that is not known: unset `iio.trigger`."
         )
     order, sign, bits, storage, shift = match.groups()
     return Element(

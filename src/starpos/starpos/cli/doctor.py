@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`starpos doctor`: what this machine has of what starpos needs, what is missing, and what to type.
+"""`starpos doctor`: which parts that starpos needs this machine has, which are missing, and what to type.
 
 Nothing that may be missing is imported but inside the check of it.
 """
@@ -65,8 +65,8 @@ def define(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--live",
         action="store_true",
-        help="for an instrument that runs here: a clock that nothing keeps to UTC, no serial port and no camera are "
-        "missing too, and not only noted",
+        help="for an instrument that runs on this machine: also count an unsynchronised clock, no serial "
+        "port and no camera as missing",
     )
     parser.add_argument("--json", action="store_true", help="one JSON object a check instead of lines")
     parser.set_defaults(run=run)
@@ -95,7 +95,7 @@ def _safely(check: Callable[[], Finding]) -> Finding:
         return check()
     except ImportError as error:
         return Finding(
-            State.MISSING, f"cannot be told: {one_line(error)}", "see the packages that are missing"
+            State.MISSING, f"cannot be determined: {one_line(error)}", "see the packages that are missing"
         )
     except (StarposError, OSError) as error:
         return Finding(State.MISSING, one_line(error))
@@ -155,7 +155,7 @@ def star_catalogue() -> Finding:
     where = os.environ.get("STARPOS_CATALOGUE") or "the one that comes with starpos"
     found = f"{len(stars)} stars to V = {stars.vmag().max():.1f}, {where}"
     if deeper.kept() is None:
-        found += "; none deeper, which fields under about 1 deg want (starpos catalogue deepen --fetch)"
+        found += "; no deeper one, which fields under about 1 deg need (starpos catalogue deepen --fetch)"
     return Finding(State.OK, found)
 
 
@@ -208,12 +208,13 @@ def clock() -> Finding:
 
     state = system_clock.read()
     if state is None:
-        return Finding(State.NOTE, "the system does not tell whether it is kept to UTC")
+        return Finding(State.NOTE, "the system does not report whether it is kept to UTC")
     if state.synchronised:
         return Finding(State.OK, f"kept to UTC within {state.max_error_s:.2g} s; 1 s is 464 m at the equator")
     return Finding(
         State.NOTE,
-        "nothing keeps it to UTC: frames that are stamped here tell no longitude; recorded ones are not concerned",
+        "nothing keeps it to UTC: frames stamped on this machine give no longitude; recorded ones are not "
+        "affected",
         "sudo apt-get install chrony   # or: sudo timedatectl set-ntp true",
     )
 

@@ -20,7 +20,7 @@ from starpos.utc import utc_text
 COUNTS = ("frames", "poses", "left_out", "moved")
 # the first line for people
 HEAD = (
-    "file: latitude and longitude (deg, astronomic: as the plumb line has them) +- 1 sigma, heading (deg, from true "
+    "file: latitude and longitude (deg, astronomic: by the plumb line) +- 1 sigma, heading (deg, from true "
     "north over east) +- 1 sigma"
 )
 # of --csv: keys of --json that are one value

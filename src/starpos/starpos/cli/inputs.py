@@ -48,14 +48,15 @@ def add_near(parser: argparse.ArgumentParser) -> None:
         type=float,
         nargs=2,
         metavar=("LAT", "LON"),
-        help="roughly where the instrument is, deg: a fix that is far from there is told, with what may be wrong, and "
-        "never changed; of pointings without a roll it says which of two places it is, where their elevations leave two",
+        help="approximate position of the instrument, deg: a fix far from it is reported with likely causes "
+        "and never changed; for pointings without a roll it selects between two possible places",
     )
     parser.add_argument(
         "--near-km",
         type=float,
         metavar="KM",
-        help=f"how near that is ({NEAR_KM:g}; 4 sigma of the fix are added)",
+        help=f"distance from --near within which the fix is expected ({NEAR_KM:g}; 4 sigma of the fix are "
+        f"added)",
     )
 
 

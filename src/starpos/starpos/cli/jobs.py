@@ -27,7 +27,7 @@ def add_jobs(parser: argparse.ArgumentParser, what: str = "frames") -> None:
         "--jobs",
         type=_jobs,
         metavar="N|auto",
-        help=f"work {what} on so many processes of this machine (1; auto or 0: one a processor)",
+        help=f"work {what} on this number of processes (1; auto or 0: one per processor)",
     )
     parser.add_argument(
         "--scheduler",
@@ -47,7 +47,9 @@ def workers_of(args: argparse.Namespace, frames: int) -> Workers:
     """The workers that the options ask for, with no more processes than frames; raises InstrumentError."""
     if args.scheduler is not None:
         if args.jobs is not None:
-            raise InstrumentError("--scheduler names machines, --jobs processes of this one: give either")
+            raise InstrumentError(
+                "--scheduler names machines, --jobs processes of this one: give one of the two"
+            )
         return Cluster(args.scheduler)
     number = min(processors() if args.jobs == 0 else args.jobs or 1, frames)
     return Here() if number <= 1 else Processes(number)

@@ -55,7 +55,7 @@ def define(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--stars", type=options.number(1, 100, int), nargs="*", default=[5, 6, 7], metavar="K",
-        help="fields of only so many stars (5 6 7)",
+        help="star counts of the fields reduced to their brightest stars (5 6 7)",
     )  # fmt: skip
     parser.add_argument(
         "--points",
@@ -69,7 +69,7 @@ def define(parser: argparse.ArgumentParser) -> None:
         "--limit-mag",
         type=options.number(0, 20),
         metavar="V",
-        help="faintest star (9; what gives as many in other fields)",
+        help="faintest star (9; in fields of another size the limit that gives as many stars)",
     )
     parser.add_argument(
         "--noise-px", type=options.number(0.001, 10), default=0.05, metavar="PX", help="centroids' (0.05)"

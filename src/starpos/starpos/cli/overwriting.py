@@ -75,13 +75,13 @@ def _inputs(args: argparse.Namespace) -> Iterator[str]:
 def camera(path: Path) -> None:
     """The check of a camera's calibration file."""
     if not camera_file.as_written(path, CAMERA_NAME):
-        raise _there(path, "starpos calibrate has not made it as it is")
+        raise _there(path, "starpos calibrate did not write it in this form")
 
 
 def picture(path: Path) -> None:
     """The check of a picture: a PNG can say who has made it."""
     if not (path.is_file() and path.suffix.lower() == ".png" and files.has_mark(path)):
-        raise _there(path, "no picture of starpos")
+        raise _there(path, "not a picture made by starpos")
 
 
 def stars(path: Path) -> None:
@@ -89,7 +89,7 @@ def stars(path: Path) -> None:
     try:
         catalogue.load_catalogue(str(path))
     except CatalogueError:
-        raise _there(path, "no catalogue of starpos") from None
+        raise _there(path, "not a catalogue made by starpos") from None
 
 
 def failed_fields(folder: Path) -> None:
@@ -103,7 +103,7 @@ def failed_fields(folder: Path) -> None:
         except (ValueError, TypeError, RecursionError):
             is_ours = False
         if not is_ours:
-            raise _there(path, "starpos montecarlo has not made it")
+            raise _there(path, "starpos montecarlo did not write it")
 
 
 def save_instrument(

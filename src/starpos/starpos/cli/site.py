@@ -19,8 +19,9 @@ def add_site(parser: argparse.ArgumentParser) -> None:
         type=float,
         nargs="+",
         metavar=("LAT", "LON HEIGHT"),
-        help="the place is known, deg, by gravity unless --geodetic says otherwise, and maybe its height above the "
-        "ellipsoid, m: heading, pitch and roll of each frame there; needs no --tilt, without which the place is null",
+        help="known position, deg (by gravity unless --geodetic), and optionally its height above the "
+        "ellipsoid, m: gives heading, pitch and roll of each frame; needs no --tilt; without tilts the "
+        "position of a frame is null",
     )
     parser.add_argument(
         "--geodetic",
@@ -46,7 +47,8 @@ def place_of(args: argparse.Namespace, vertical: Vertical) -> KnownPlace | None:
         return None
     if len(args.site) not in (2, 3):
         raise InstrumentError(
-            f"--site has {len(args.site)} numbers: give latitude, longitude and maybe the height in m, after the frames"
+            f"--site has {len(args.site)} numbers: give latitude, longitude and optionally the height in m, "
+            f"after the frames"
         )
     if args.self_calibrate:
         raise InstrumentError(

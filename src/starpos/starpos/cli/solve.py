@@ -59,7 +59,7 @@ def define(parser: argparse.ArgumentParser) -> None:
         "--save",
         metavar="OUT",
         help="write the A3 of --self-calibrate into an instrument file (YAML); one that is there keeps its other keys; "
-        "exit status 1 if the headings hardly tell A3, and nothing is written",
+        "exits with status 1 and writes nothing if the headings do not determine A3",
     )
     jobs.add_jobs(parser)
     parser.set_defaults(run=run)

@@ -32,7 +32,7 @@ from starpos.utc import utc_text
 
 # the status of a row that tells an elevation
 ELEVATION = "elevation alone"
-ELEVATIONS_HEAD = "row: how far from the zenith its direction is; together these tell the place"
+ELEVATIONS_HEAD = "row: the zenith distance of its direction; together these give the position"
 
 
 def run(args: argparse.Namespace) -> int:
@@ -43,7 +43,7 @@ def run(args: argparse.Namespace) -> int:
     if args.tilt is None and not own_level:
         raise InstrumentError("--pointings needs the tilts: give --tilt CSV")
     if args.jobs is not None or args.scheduler is not None:
-        raise InstrumentError("--jobs and --scheduler are for frames: --pointings are worked in a moment")
+        raise InstrumentError("--jobs and --scheduler are for frames: --pointings take only a moment")
     solver, saving = _solver_of(args), 0
     check_save(args, solver.instrument)
     tilts = NO_TILTS if own_level else checked_tilts("solve", args.tilt, solver.instrument)

@@ -42,7 +42,8 @@ def vertical_of(args: argparse.Namespace) -> Vertical:
     if args.geoid is not None:
         if by_hand != (None, None, None):
             raise InstrumentError(
-                "--geoid tells the deflection and its error: give either it or --xi, --eta and theirs"
+                "--geoid gives the deflection and its error: give either --geoid or --xi, --eta and "
+                "--deflection-stddev"
             )
         return _at_height(geoid.read(args.geoid), args)
     if by_hand == (None, None, None):

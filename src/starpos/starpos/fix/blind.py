@@ -97,12 +97,14 @@ def _why(seen: Stars, search_s: float, budget: Budget) -> str:
     )
     if budget.spent:
         what = (
-            f"in {search_s:g} s of CPU none of the sky was found to fit its {len(seen)} stars at any scale ({tried}): "
+            f"in {search_s:g} s of CPU no part of the sky was found to match its {len(seen)} stars at any "
+            f"scale ({tried}): "
             "give more time (--search-time) or the focal length"
         )
     else:
         what = (
-            f"none of the sky fits its {len(seen)} stars at any scale ({tried}, were tried): give the focal length if it "
+            f"no part of the sky matches its {len(seen)} stars at any scale ({tried}, were tried): give the "
+            f"focal length if it "
             "is known, check clouds and exposure"
         )
     if disc_radius_px(np.stack([seen.x, seen.y], 1), seen.width, seen.height) is not None:

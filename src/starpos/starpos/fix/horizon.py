@@ -19,8 +19,8 @@ def check_above_horizon(sine: float, calibration: Calibration) -> None:
     """
     if not calibration.unknown and sine < MIN_COS_ZENITH:
         raise FixError(
-            f"by the tilts and A3 the stars are {_where(sine)}, and stars tell a place from {LEAST_DEG:.0f} deg "
-            "above it: check the signs and the order of the inclinometer's axes, and A3"
+            f"by the tilts and A3 the stars are {_where(sine)}, and a position needs stars {LEAST_DEG:.0f} "
+            f"deg or more above it: check the signs and the order of the inclinometer's axes, and A3"
         )
 
 
@@ -28,8 +28,9 @@ def check_visible(sine: float) -> None:
     """Raise PlaceError if a camera's stars cannot be seen from a known place; sine: of the altitude of the lowest."""
     if sine < MIN_COS_ZENITH:
         raise PlaceError(
-            f"from the given place the stars, or some, are {_where(sine)}, and stars tell a heading from "
-            f"{LEAST_DEG:.0f} deg above it: check latitude and longitude, their order and signs, and the clock"
+            f"from the given place the stars, or some, are {_where(sine)}, and a heading needs stars "
+            f"{LEAST_DEG:.0f} deg or more above it: check latitude and longitude, their order and signs, "
+            f"and the clock"
         )
 
 

@@ -46,7 +46,7 @@ class MatchedStars:
         n = len(self.xy)
         shapes = (self.xy.shape, self.covariance_px2.shape, self.places.shape, self.place_sigma.shape)
         if shapes != ((n, 2), (n, 2, 2), (n, 3), (n,)) or (self.index is not None and len(self.index) != n):
-            raise ValueError(f"arrays of identified stars do not fit to each other: {shapes}")
+            raise ValueError(f"arrays of identified stars differ in length or shape: {shapes}")
         if not np.isfinite(self.covariance_px2).all():
             raise FixError("the error of a star's place is not a finite number: leave that star out")
 
@@ -135,8 +135,8 @@ def fit_stars(
     errors = StarErrors.of(fit.slope[kept], centroids, catalogue_px2[kept], same_stars)
     if not np.isfinite(errors.gain).all() or not math.isfinite(claimed2):
         raise FixError(
-            f"the {len(residual)} stars do not tell the attitude and how well it is known: more stars are needed, "
-            "further apart, with sound errors"
+            f"the {len(residual)} stars do not determine the attitude and its error: more stars are needed, "
+            f"further apart, with realistic errors"
         )
     return StarFit(problem=problem, fit=fit, errors=errors, residual=residual)
 

@@ -51,6 +51,7 @@ def check_agrees(fix: Fix, place: KnownPlace) -> None:
     sigmas = math.sqrt(off @ np.linalg.solve(claim, off))
     if sigmas > SIGMAS:
         raise PlaceError(
-            f"stars and tilt have a place {length_text(float(np.linalg.norm(off)))} from the given one, {sigmas:.0f} "
-            "times what both claim: check latitude and longitude, their order and signs, the tilts, A3 and the clock"
+            f"stars and tilt give a position {length_text(float(np.linalg.norm(off)))} from the given one, "
+            f"{sigmas:.0f} times their stated errors: check latitude and longitude, their order and signs, "
+            f"the tilts, A3 and the clock"
         )

@@ -157,9 +157,7 @@ class Solver:
         begin = time.perf_counter()
         try:
             if not pointing.has_roll:
-                raise FixError(
-                    f"{pointing.place}: no roll: an elevation alone makes no fix, those of several do"
-                )
+                raise FixError(f"{pointing.place}: no roll: one elevation gives no fix, several together do")
             state, tilt = self.levelled(pointing, tilts)
             camera, clock_s = self.instrument.camera or IDEAL, self.clock_stddev_s(pointing)
             fix = pointing_fix(
@@ -345,7 +343,8 @@ def check_explained(answer: Solution) -> None:
     place, seen = answer.source or "the frame", answer.explained
     if TWO_SKIES in answer.warnings:
         raise FixError(
-            f"{place}: two skies in one frame, its bright stars are those of two pointings: keep the camera still "
+            f"{place}: two skies in one frame, its bright stars belong to two pointings: keep the camera "
+            f"still "
             "while it exposes, and expose once"
         )
     if UNEXPLAINED in answer.warnings and seen is not None:

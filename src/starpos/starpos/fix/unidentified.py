@@ -40,4 +40,4 @@ def why_unidentified(stars: Stars, camera: Camera, catalogue: Catalogue) -> str:
             "of brightness says little: expose for a shorter time"
         )
     causes.append(f"check the focal length ({camera.fx:.0f} px given, 3 % is allowed), clouds and exposure")
-    return f"{stars.place}: none of the sky fits its {n} stars: {'; '.join(causes)}"
+    return f"{stars.place}: no part of the sky matches its {n} stars: {'; '.join(causes)}"

@@ -84,11 +84,11 @@ def framed(instrument: Instrument, first: Framed) -> tuple[Instrument, AxisDoubt
         whole_size = round(width + 2 * max(left, 0.0)), round(height + 2 * max(top, 0.0))
         instrument = replace(instrument, frame_size=whole_size)
         why = (
-            f"these frames of {width} x {height} px begin at column {left:g}, row {top:g} of a sensor whose size nobody "
-            "says"
+            f"these frames of {width} x {height} px begin at column {left:g}, row {top:g} of a sensor whose "
+            f"size is not stated"
         )
     else:
-        why = f"these frames of {width} x {height} px are cut out of larger ones, nobody says where"
+        why = f"these frames of {width} x {height} px are cut out of larger ones at an unstated position"
     error_px = max(longer, LEAST_UNKNOWN_PX)
     return instrument, AxisDoubt(why, error_px, math.atan(error_px / instrument.focal_px))
 

@@ -96,7 +96,7 @@ class Calibration:
         if covariance.shape != (3, 3) or not np.allclose(covariance, covariance.T, rtol=1e-6):
             raise InstrumentError("the calibration's covariance must be a symmetric 3 x 3 matrix, arcsec2")
         if np.linalg.eigvalsh(covariance)[0] < -1e-9 * max(np.trace(covariance), 1e-300):
-            raise InstrumentError("the calibration's covariance is none: a variance in it is negative")
+            raise InstrumentError("the calibration's covariance has a negative variance: correct it")
         self._check_response()
         if not 0 <= self.remounted_arcsec <= MOST_ARCSEC:
             raise InstrumentError(
@@ -134,8 +134,8 @@ class Calibration:
         ] > -1e-9 * np.trace(covariance)
         if max(abs(c) for c in self.response) > MOST_RESPONSE or not sound:
             raise InstrumentError(
-                f"the calibration's response is none: its coefficients are at most {MOST_RESPONSE:g}, their covariance "
-                "is symmetric and without negative variances"
+                f"the calibration's response is not valid: its coefficients must be at most "
+                f"{MOST_RESPONSE:g}, their covariance symmetric and without negative variances"
             )
 
     @classmethod

@@ -30,6 +30,7 @@ def like_radians(log: TiltLog) -> str:
     if not stated_rad / ALIKE_NOISE < noise < stated_rad * ALIKE_NOISE:
         return ""
     return (
-        f"the tilts look like radians: none is above pi/2, and their noise of {noise:.2g} would be that of the "
-        f"inclinometer ({stated_rad:.2g} rad): write them in deg, or state the inclinometer's noise if it is so quiet"
+        f"the tilts look like radians: none is above pi/2, and their noise of {noise:.2g} would be the "
+        f"inclinometer's ({stated_rad:.2g} rad): write them in deg, or state the inclinometer's noise if it "
+        f"is so quiet"
     )

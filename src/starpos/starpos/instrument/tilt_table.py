@@ -70,7 +70,8 @@ def read_tilt_csv(path: Path | str, noise_rad: float = SCA100T_NOISE_RAD) -> Til
     for name in set(names) - {*NEEDED, *OPTIONAL}:
         for meant in difflib.get_close_matches(name.lower(), OPTIONAL, 1, ALIKE_NAME):
             raise TiltError(
-                f"{path}: its column {name} is not read: call it {meant} if it is that, else otherwise"
+                f"{path}: its column {name} is not read: call it {meant} if it holds that, else give it "
+                f"another name"
             )
     column = dict(zip(names, rows.T, strict=True))
     if not np.isfinite([column[name] for name in NEEDED]).all(0).any():

@@ -120,7 +120,7 @@ def sighting_of(stars: Stars, eye: solver.Solver, answer: Solution) -> Identifie
     camera, catalogue, _ = eye.view(stars.width, stars.height, stars.origin_px)
     if wide.is_wide(camera):
         raise InstrumentError(
-            f"{stars.place}: frames of a fisheye tell no place under way: take a narrower lens"
+            f"{stars.place}: frames of a fisheye give no position under way: use a narrower lens"
         )
     if answer.found is None:
         raise FrameError(answer.message)

@@ -85,7 +85,7 @@ def _far(near: Near, fix: Fix | Average, mounting: Mounting | None, frames: Sequ
     sigma_m = float(np.sqrt(np.diag(fix.covariance)[:2].max()))
     if km <= near.km + FAR_SIGMA * sigma_m / 1000:
         return ""
-    told = f"the place is {km:.0f} km from that of --near, and should be within {near.km:g} km"
+    told = f"the place is {km:.0f} km from --near, and should be within {near.km:g} km"
     for name, places in _places(mounting, frames):
         off = [near.km_from(*place) for place in places]
         if max(off) <= near.km:

@@ -118,7 +118,7 @@ def of_turn(turned: Calibrated) -> Iterator[Remark]:
     error = f"the plumb line in the camera is known to {turned.plumb_stddev_arcsec:.2f} arcsec"
     if turned.plumb_stddev_arcsec > WORTH_SAVING_ARCSEC:
         yield Remark(
-            Kind.NOT_CALIBRATED, f"not calibrated: the headings hardly tell A3, {error}: turn it further"
+            Kind.NOT_CALIBRATED, f"not calibrated: the headings hardly determine A3, {error}: turn it further"
         )
         return
     found = turned.instrument.calibration

@@ -137,7 +137,10 @@ class Cluster:
             return self._begun(call, here).result()
         except KilledWorker as error:
             return pickle.dumps(
-                given_up(call[1], f"the workers that worked it died, at last alone ({one_line(error)})")
+                given_up(
+                    call[1],
+                    f"the workers that took it died, the last one with no other work ({one_line(error)})",
+                )
             )
 
     def _begun(self, call: Call, here: Same) -> Any:

@@ -208,7 +208,7 @@ class _Worker:
         code = self._process.exitcode
         self._process.close()
         if code == -signal.SIGKILL:
-            return "killed, perhaps for want of memory: try fewer --jobs"
+            return "killed, perhaps for lack of memory: try fewer --jobs"
         if code is not None and code < 0:
             return signal.strsignal(-code) or f"signal {-code}"
         return f"exit status {code}"

@@ -83,7 +83,7 @@ def bound_rosbags() -> None:
         reader.zstd = _Zstd(zstd)  # type: ignore[assignment]  # takes the place of a module
     except AttributeError:
         raise BagError(
-            "this version of rosbags unpacks as none we know, without bounds: pip install rosbags==0.11.9"
+            "this version of rosbags unpacks in an unknown way, without bounds: pip install rosbags==0.11.9"
         ) from None
 
 

@@ -30,7 +30,8 @@ from starpos.sky.site import Site
 FEWEST_HEADINGS, FEWEST_BY_ITSELF = 3, 4
 TURN_IT = "turn it on the spot"
 CALIBRATE_IT = (
-    "fixes are over 1000 km wide. Set calibration_url or misalignment_stddev, call solver/calibrate at a known place, or "
+    "fixes have errors of over 1000 km. Set calibration_url or misalignment_stddev, call solver/calibrate "
+    "at a known place, or "
     "set self_calibration and turn it on the spot"
 )
 # So many old frames in a row, in order, are not late: a bag is played again.
@@ -275,7 +276,7 @@ class Calibrating:
         if era == self._era:
             said = outcome.trouble or self._why_not(outcome.value, FEWEST_BY_ITSELF)
             if not said and not self._is_better(outcome.value.calibrated):
-                said = "the headings here tell the calibration in use no better"
+                said = "the headings here do not improve the calibration in use"
             self._said = said
             if not said:
                 self._adopt_turned(outcome.value)
@@ -295,7 +296,8 @@ class Calibrating:
             )
         if not found <= limit:
             return (
-                f"the headings tell the plumb line in the camera to {found:.0f} arcsec only, self_calibration_limit is "
+                f"the headings determine the plumb line in the camera to {found:.0f} arcsec only, "
+                f"self_calibration_limit is "
                 f"{limit:g}: turn the instrument further, or to more headings"
             )
         return ""

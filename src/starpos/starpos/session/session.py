@@ -371,7 +371,7 @@ class SolverSession:
             solver = self.instrument.solver_now
             if frame.ahead_s > reports.AHEAD_S + CLOCK_SIGMAS * solver.clock_stddev_s(stars):
                 raise TimeError(
-                    f"the frame is stamped {frame.ahead_s:.3g} s before its time: {reports.ONE_CLOCK}"
+                    f"the frame is stamped {frame.ahead_s:.3g} s in the future: {reports.ONE_CLOCK}"
                 )
             tilts = self.tilts.over(self._span(stars))
             places = self.places if self.places.known else None

@@ -69,7 +69,8 @@ class SystemClock:
         if self.synchronised:
             return f"the system's clock is kept to UTC within {self.max_error_s:.2g} s."
         return (
-            "the system's clock is not synchronised, and fixes tell no longitude: start chrony, systemd-timesyncd or "
+            "the system's clock is not synchronised, so fixes have no valid longitude: start chrony, "
+            "systemd-timesyncd or "
             "linuxptp, or set the solver's clock_stddev where you know how good the clock is."
         )
 

@@ -60,7 +60,7 @@ class TiltIntake:
         """Keep a tilt, unless it is broken, or of the future: the instrument may lean otherwise when its time comes."""
         try:
             if (ahead_s := now.ahead_s(stamp_to_unix(message.header.stamp))) > reports.AHEAD_S:
-                raise TiltError(f"a tilt is stamped {ahead_s:.3g} s before its time: {reports.ONE_CLOCK}")
+                raise TiltError(f"a tilt is stamped {ahead_s:.3g} s in the future: {reports.ONE_CLOCK}")
             self._tilts.add(message, self._settings.tilt_stddev_rad)
             self._tilts.came_late(-ahead_s)
             self._heard.came("tilt")

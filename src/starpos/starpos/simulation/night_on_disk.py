@@ -98,7 +98,8 @@ def _take_away_simulated(folder: Path) -> None:
         strange.append(TRUTH)
     if strange:
         raise FrameError(
-            f"{folder / min(strange)}: it is there already, and starpos simulate has not made it as it is: "
+            f"{folder / min(strange)}: it is there already, and starpos simulate did not write it in this "
+            f"form: "
             "give another folder, or move it away"
         )
     for name in there:

@@ -142,7 +142,7 @@ def test_a_better_frame_counts_more(rng):
 
 def test_two_frames_of_two_places_have_no_average(rng):
     here, there = SkyField(), replace(SkyField(), latitude=SkyField().latitude + 0.5)
-    with pytest.raises(FixError, match="not of one place"):
+    with pytest.raises(FixError, match="the frames are of several places"):
         average(in_order(fixes(here, rng, [40.0]) + fixes(there, rng, [40.0])))
 
 

@@ -247,7 +247,7 @@ def test_stars_that_agree_on_too_little(rng):
 def test_a_camera_of_another_focal_length(rng):
     true = ideal(11).scaled(1.2)
     fit = fit_camera(sightings(true, 5, 60, rng), ideal(11), VACUUM)
-    with pytest.raises(CalibrationError, match="too unlike the given one"):
+    with pytest.raises(CalibrationError, match="too different from the given one"):
         check_sound(fit, ideal(11))
 
 

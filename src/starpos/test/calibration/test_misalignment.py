@@ -152,7 +152,7 @@ def test_frames_that_noise_explains_are_not_refused_but_claim_little(catalogue, 
     shot.spoil(0, 0.2)
     found = found_at(shot, catalogue)
     assert 0.05 < found.plumb_stddev_arcsec / 3600 < 0.5
-    assert "more than is stated of the inclinometer" in found.beyond and "state tilt_" in found.beyond
+    assert "more than the inclinometer's stated errors" in found.beyond and "state tilt_" in found.beyond
     assert found_at(shots(catalogue, rng, [0.0] * 4), catalogue).beyond == ""
 
 

@@ -78,7 +78,7 @@ def test_an_a3_that_nobody_vouches_for_is_over_1000_km_and_said_in_a_sentence(gi
     for words in (
         "misalignment",
         "not known",
-        " km wide",
+        " km (1 sigma)",
         "--self-calibrate",
         "--site",
         "--misalignment-stddev",

@@ -216,7 +216,7 @@ def test_tilts_ahead_of_a_played_clock_wait_for_its_next_tick(told, messages, be
     tilt.header.stamp.sec += 50
     told.tell(TILT, tilt, begin_s + 6.0)
     told.at(begin_s + 7.0)
-    assert "before its time" in told.said.refused[0][1]
+    assert "in the future" in told.said.refused[0][1]
 
 
 def answers_of(messages, delay):

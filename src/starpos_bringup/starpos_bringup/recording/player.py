@@ -123,12 +123,14 @@ class Player:
         heard = [n for n in self._frame_topics if self._played[n].get_subscription_count()]
         if self._frame_topics and not heard and not self._stopped:
             self._say(
-                f"nobody subscribes to {', '.join(self._frame_topics)}: start detector or solver in its namespace, with "
+                f"no node subscribes to {', '.join(self._frame_topics)}: start detector or solver in its "
+                f"namespace, with "
                 "use_sim_time, or remap (--ros-args -r)"
             )
         elif self._frame_topics and not any(map(self._participants.taking, heard)):
             self._say(
-                f"those who subscribe to {', '.join(heard)} do not say what they take: start detector and solver with "
+                f"the subscribers of {', '.join(heard)} do not report what they take: start detector and "
+                f"solver with "
                 "use_sim_time"
             )
         self._say_doubled()
