@@ -29,6 +29,7 @@ READ = (
     "src/starpos/starpos/detection/*.py",
     "src/starpos/starpos/earth/*.py",
     "src/starpos/starpos/identification/*.py",
+    "src/starpos/starpos/instrument/*.py",
     "src/starpos/starpos/navigation/*.py",
 )
 MAX_WORDS = 40

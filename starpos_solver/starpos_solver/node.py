@@ -265,6 +265,6 @@ class SolverNode(Node):
 
 
 def _sent(info: Mapping[str, Any]) -> Sent:
-    """What the middleware tells of a message."""
+    """What the middleware reports of a message."""
     written_ns = info.get("source_timestamp")
     return Sent(info.get("publication_sequence_number"), written_ns * 1e-9 if written_ns else None)

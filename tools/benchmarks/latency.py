@@ -33,7 +33,7 @@ SETTLED = 3
 
 @dataclass(frozen=True)
 class Row:
-    """A measurement; target: for the median, None if there is none."""
+    """A measurement; target: for the median, None without one."""
 
     what: str
     values: list[float]

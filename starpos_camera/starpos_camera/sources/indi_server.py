@@ -186,7 +186,7 @@ class IndiDevice:
         return found.state if found is not None else None
 
     def value(self, vector: str, member: str) -> str | None:
-        """Text of a member; None if there is none."""
+        """Text of a member; None without one."""
         found = self._vector(vector)
         return found.get(member) if found is not None else None
 

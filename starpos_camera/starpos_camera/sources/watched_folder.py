@@ -67,7 +67,7 @@ class WatchedFolder:
         self._newest_ns: int | None = None
 
     def next(self) -> tuple[Path, bool] | None:
-        """Return the oldest complete file, and whether this is its last chance; None if there is none.
+        """Return the oldest complete file, and whether this is its last chance; None without one.
 
         Call `try_again` or `done` afterwards. Raises OSError if there is no such folder.
         """

@@ -14,7 +14,7 @@ STEP, TRIES = 1.055, 6
 
 
 def focal_that_fits(solver: Solver, stars: Stars, until_s: float = math.inf) -> float | None:
-    """The focal length in px at which a frame is identified, from 0.7 to 1.4 times the solver's; None if there is none.
+    """The focal length in px at which a frame is identified, from 0.7 to 1.4 times the solver's; None without one.
 
     No try is begun after until_s (time.monotonic).
     Triangles are found by their angles, which hardly depend on the focal length, so those of the given field serve.

@@ -5,15 +5,15 @@ import numpy as np
 
 from starpos.instrument.tilt_log import BRACKET_S, TiltLog, white_noise
 
-# The noise of readings in radians that are taken for degrees is 57.3 times too small. So many differences tell it, to
-# this factor.
+# The noise of readings in radians that are taken for degrees is 57.3 times too small. Number of differences that
+# determine it, and to which factor.
 ENOUGH_STEPS, ALIKE_NOISE = 8, 3.0
 
 
 def like_radians(log: TiltLog) -> str:
     """Say that a table of tilts looks like radians; '' if it does not.
 
-    Its noise tells: taken for degrees, that of radians is 57 times less than the sensor's.
+    The noise shows it: radians taken for degrees have 57 times less than the sensor's.
     """
     order = np.argsort(log.utc_unix_s, kind="stable")
     apart = np.diff(log.utc_unix_s[order])

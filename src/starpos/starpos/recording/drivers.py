@@ -117,7 +117,7 @@ class _Topics:
     place: str
 
     def of(self, name: str, beside: str) -> str | None:
-        """The topic of an input, preferred beside others; None if there is none."""
+        """The topic of an input, preferred beside others; None without one."""
         if name in self.remaps.topics:
             return self._named(name, self.remaps.topics[name])
         for kind in DRIVER_INPUTS[name]:

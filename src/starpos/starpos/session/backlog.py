@@ -7,11 +7,11 @@ from collections import deque
 
 from starpos.session.frames import Waiting
 
-# Most frames that wait. While the triangles are built, only the newest few, since the others would be answered late.
+# Maximum number of waiting frames. While the triangles are built, only the newest few: others would be answered late.
 MOST, MOST_NEWEST = 1000, 4
-# The usual time an answer takes is the median of so many.
+# Number of answers whose median is the usual time of an answer.
 COSTS = 9
-# Answers may come so late where others were before them: a processor that others use now and then loses no frame by it.
+# Tolerated delay of an answer behind others: short load by other programs then loses no frame.
 FRESH_S = 0.1
 
 

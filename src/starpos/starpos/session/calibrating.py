@@ -34,7 +34,7 @@ CALIBRATE_IT = (
     "at a known place, or "
     "set self_calibration and turn it on the spot"
 )
-# So many old frames in a row, in order, are not late: a bag is played again.
+# Number of old frames in a row, in order, that show that a bag is played again.
 LATE_FRAMES = 3
 # A calibration replaces one that the solver has found itself only if its error is smaller by this factor.
 BETTER = 0.8
@@ -51,9 +51,9 @@ OF_AVERAGE = OF_CALIBRATION | {
 
 
 class Calibrating:
-    """Keeps the calibration from frames: `found`, None while that of the parameters holds.
+    """Keeps the calibration from frames: `found`, None while the parameters' calibration holds.
 
-    solver: returns the solver in use, or raises an InstrumentError that says why there is none.
+    solver: returns the solver in use, or raises an InstrumentError that says why there is no solver.
     changed: called when `found` changes.
     """
 
@@ -204,7 +204,7 @@ class Calibrating:
     # at a known place ------------------------------------------------------------------------------------------------
 
     async def at_known_place(self, latitude: float, longitude: float, frames: int) -> Outcome:
-        """Find A3 from so many of the newest frames (0: all) at a place by gravity (deg), and use it: a Calibrated."""
+        """Find A3 from a number of the newest frames (0: all) at a place by gravity (deg), and use it: a Calibrated."""
         outcome = await self._asked_for(lambda: self._at_known_place(latitude, longitude, frames))
         if not outcome.trouble:
             self._adopt(outcome.value)
@@ -258,7 +258,7 @@ class Calibrating:
         return lambda: turn_on_the_spot(solver, poses, turn_deg)
 
     def _turn_by_itself(self) -> None:
-        """Calibrate from the present poses; if a job runs, do it afterwards, from the poses of that time."""
+        """Calibrate from the present poses; if a job runs, do it afterwards, from the poses kept then."""
         self._again = self._worker.busy or self._asked
         if self._again:
             return
@@ -303,7 +303,7 @@ class Calibrating:
         return ""
 
     def _is_better(self, calibrated: Calibrated) -> bool:
-        """Whether it is so much better than the calibration in use that the average should start again for it.
+        """Whether it improves on the calibration in use by enough to start the average again.
 
         The zero of the inclinometer drifts, so the calibration in use gets worse with time.
         """

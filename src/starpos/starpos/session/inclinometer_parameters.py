@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Parameters of the node `inclinometer` that tilts of an IMU depend on; those of its other sources are with these."""
+"""Parameters of the node `inclinometer` for tilts from an IMU; the parameters of other sources are with the sources."""
 
 import math
 

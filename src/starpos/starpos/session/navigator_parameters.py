@@ -176,7 +176,7 @@ class NavigatorSettings:
 
     @property
     def vertical(self) -> Vertical:
-        """The deflection of the vertical, or the geoid that tells it."""
+        """The deflection of the vertical, or the geoid that gives it."""
         return parameters.vertical_of(self.values, self._files[2])
 
     def vessel(self, clock_stddev_s: float) -> Vessel:

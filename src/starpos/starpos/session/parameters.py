@@ -307,7 +307,7 @@ def instrument_of(
     """Make the Instrument from an instrument file (`known`, or None) or from the parameters, with camera_info's camera.
 
     clock_stddev and tilt_stddev, if they are set, replace the values of the file. A calibration from frames (`found`)
-    replaces that of file and parameters; with self_calibration, and before there is a `found`, it counts as unknown.
+    replaces the one from file and parameters; with self_calibration, and before there is a `found`, it counts as unknown.
     """
     if known is None:
         model, errors = sensors.find(values["inclinometer.model"])

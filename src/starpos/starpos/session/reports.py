@@ -18,8 +18,8 @@ from starpos.session.now import ANOTHER_TIME_S
 from starpos.units import ARCSEC
 
 WIDE_CLOCK_S = 0.1
-# Frames that are older when they come are of another clock, unless they are of another evening, as recorded ones; those
-# that are older still are stamped since the boot of their host.
+# Age on arrival above which frames are stamped by another clock or recorded on another evening, and age above which
+# stamps count from the boot of their host.
 OLD_S, SINCE_BOOT_S = 40.0, 1e9
 AHEAD_S = 1.0
 ONE_CLOCK = "set the clocks of camera, inclinometer and solver by one source"
@@ -111,9 +111,9 @@ def of_clock(clock_stddev_s: float, stamp_stddev_s: float, ahead_s: float, doubt
 def of_conditions(
     values: Mapping, instrument: Instrument, tilt: Tilt | None, shutter: Shutter | None
 ) -> Diagnosis:
-    """Report what nobody knows of the air, of the inclinometer, its temperatures, and of the shutter.
+    """Report what is unknown of the air, the inclinometer, its temperatures, and the shutter.
 
-    values: the parameters.  tilt, shutter: those of the newest frame, None without one.
+    values: the parameters.  tilt, shutter: of the newest frame, None without one.
     """
     calibration = instrument.calibration
     now_c = math.nan if tilt is None else tilt.temperature_c

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tilts on their way into the buffer of a session: which of them are kept, and when."""
+"""Tilts on their way into a session's buffer: which are kept, and when."""
 
 from collections import deque
 from dataclasses import replace
@@ -18,7 +18,7 @@ MOST_EARLY = 1000
 
 
 class TiltIntake:
-    """Gives tilts to a buffer; names: of the frames that the messages taken are in."""
+    """Gives tilts to a buffer; names: of the frames of the messages taken."""
 
     def __init__(self, tilts: TiltBuffer, names: FrameNames, settings: Settings, heard: Heard) -> None:
         self._tilts, self._names, self._settings, self._heard = tilts, names, settings, heard

@@ -100,7 +100,7 @@ def test_directions_around_the_horizon_cancel_an_error_of_a3():
 
 def test_one_direction_is_no_place_however_the_sky_turns(rng):
     night = pointed_night(rng, (10.0,), frames=6)
-    with pytest.raises(FixError, match="6 elevations in 1 direction tell no place"):
+    with pytest.raises(FixError, match="6 elevations in 1 direction do not determine a place"):
         place_of_circles(circles(night))
 
 

@@ -97,7 +97,7 @@ def test_a_frame_that_ends_every_worker_is_given_up(cluster, tmp_path):
     with Cluster(cluster) as workers:
         error, good = workers.map([(killed, str(bad)), (read, str(bad))])
     assert isinstance(error, FrameError)
-    assert "bad.fits: given up: the workers that worked it died, at last alone" in str(error)
+    assert "bad.fits: given up: the workers that took it died, the last one with no other work" in str(error)
     assert good == "bad"
 
 

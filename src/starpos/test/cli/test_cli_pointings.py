@@ -179,7 +179,7 @@ def test_a_bad_call_is_refused_in_a_line(kind, tables, capsys):
 
 def test_one_direction_is_no_place(tables, capsys):
     status, _, errors = run(capsys, "solve", *tables.pointings("one.csv"), *tables.tilt, *AIR, *A3)
-    assert status == 1 and "in 1 direction tell no place" in errors[0]
+    assert status == 1 and "in 1 direction do not determine a place" in errors[0]
 
 
 @pytest.mark.parametrize(
