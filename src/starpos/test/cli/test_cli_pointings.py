@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`xpointings` in place of frames: what a plate solver found, with and without a roll."""
+"""`--pointings` in place of frames: what a plate solver found, with and without a roll."""
 
 import dataclasses
 
@@ -11,8 +11,8 @@ from starpos.instrument.instrument_file import read
 from starpos_testing.command_line import SENSOR, run
 from starpos_testing.skies.pointings import pointed_night
 
-AIR = ("xpressure-hpa", "880", "xtemperature-c", "12", "xhumidity", "0.3")
-A3 = ("xmisalignment", "1.5", "-2", "130", "xmisalignment-stddev", "0.1", *SENSOR)
+AIR = ("--pressure-hpa", "880", "--temperature-c", "12", "--humidity", "0.3")
+A3 = ("--misalignment", "1.5", "-2", "130", "--misalignment-stddev", "0.1", *SENSOR)
 NAMES = "utc_unix_s,ra_deg,dec_deg,roll_deg,sigma_arcsec,sigma_roll_arcsec"
 
 
@@ -23,10 +23,10 @@ class Tables:
 
     @property
     def tilt(self):
-        return "xtilt", self.folder / "tilt.csv"
+        return "--tilt", self.folder / "tilt.csv"
 
     def pointings(self, name):
-        return "xpointings", self.folder / name
+        return "--pointings", self.folder / name
 
     def sigmas_off(self, answer):
         """Error of the place in units of the claimed sigma, the worse of the two axes."""
@@ -63,7 +63,7 @@ def tables(tmp_path_factory):
 
 def test_with_a_roll_each_row_is_a_fix(tables, capsys):
     status, out, errors = run(
-        capsys, "solve", *tables.pointings("whole.csv"), *tables.tilt, *AIR, *A3, "xjson"
+        capsys, "solve", *tables.pointings("whole.csv"), *tables.tilt, *AIR, *A3, "--json"
     )
     *each, together = objects(out)
     assert (status, errors, len(each)) == (0, [], 16)
@@ -92,14 +92,14 @@ def test_a3_by_turning_and_at_a_known_place(tables, capsys, tmp_path):
         *table,
         *tables.tilt,
         *AIR,
-        "xself-calibrate",
-        "xsave",
+        "--self-calibrate",
+        "--save",
         tmp_path / "a.yaml",
         *SENSOR,
-        "xjson",
+        "--json",
     )
     assert status == 0 and tables.sigmas_off(objects(out)[-1]) < 4
-    place = ("xsite", site.latitude_deg, site.longitude_deg)
+    place = ("--site", site.latitude_deg, site.longitude_deg)
     status, out, errors = run(
         capsys, "calibrate", *table, *tables.tilt, *AIR, *SENSOR, *place, "-o", tmp_path / "b.yaml"
     )
@@ -107,14 +107,14 @@ def test_a3_by_turning_and_at_a_known_place(tables, capsys, tmp_path):
     for name in ("a.yaml", "b.yaml"):
         assert read(tmp_path / name).calibration.frames == 16
         status, out, errors = run(
-            capsys, "solve", *table, *tables.tilt, *AIR, "xinstrument", tmp_path / name, "xjson"
+            capsys, "solve", *table, *tables.tilt, *AIR, "--instrument", tmp_path / name, "--json"
         )
         assert (status, errors) == (0, []) and tables.sigmas_off(objects(out)[-1]) < 4
 
 
 def test_elevations_alone_tell_the_place_and_no_heading(tables, capsys):
     status, out, errors = run(
-        capsys, "solve", *tables.pointings("bare.csv"), *tables.tilt, *AIR, *A3, "xjson"
+        capsys, "solve", *tables.pointings("bare.csv"), *tables.tilt, *AIR, *A3, "--json"
     )
     *each, together = objects(out)
     assert (status, errors) == (0, [])
@@ -126,18 +126,18 @@ def test_elevations_alone_tell_the_place_and_no_heading(tables, capsys):
 
 
 def test_two_directions_need_to_be_told_which_of_two_places(tables, capsys):
-    args = ("solve", *tables.pointings("two.csv"), *tables.tilt, *AIR, *A3, "xjson")
+    args = ("solve", *tables.pointings("two.csv"), *tables.tilt, *AIR, *A3, "--json")
     status, out, errors = run(capsys, *args)
     assert status == 1 and "two circles meet in two places" in errors[0]
     assert objects(out)[-1]["combined"] and objects(out)[-1]["latitude"] is None
     site = tables.night.site
-    status, out, _ = run(capsys, *args, "xnear", site.latitude_deg - 1, site.longitude_deg)
+    status, out, _ = run(capsys, *args, "--near", site.latitude_deg - 1, site.longitude_deg)
     assert status == 0 and tables.sigmas_off(objects(out)[-1]) < 4
 
 
 def test_rows_without_a_roll_among_others_are_named(tables, capsys):
     status, out, errors = run(
-        capsys, "solve", *tables.pointings("mixed.csv"), *tables.tilt, *AIR, *A3, "xjson"
+        capsys, "solve", *tables.pointings("mixed.csv"), *tables.tilt, *AIR, *A3, "--json"
     )
     assert status == 0 and objects(out)[-1]["frames"] == 8
     assert len(errors) == 8 and all("no roll" in line for line in errors)
@@ -148,20 +148,20 @@ def test_rows_without_a_tilt_are_named(tables, capsys, tmp_path):
     (tmp_path / "tilt.csv").write_text("\n".join(text[:-4]) + "\n")
     for table in ("whole.csv", "bare.csv"):
         status, out, errors = run(
-            capsys, "solve", *tables.pointings(table), "xtilt", tmp_path / "tilt.csv", *AIR, *A3, "xjson"
+            capsys, "solve", *tables.pointings(table), "--tilt", tmp_path / "tilt.csv", *AIR, *A3, "--json"
         )
         assert status == 0 and objects(out)[-1]["frames"] == 14
         assert [row["status"] for row in objects(out)].count("no tilt") == 2 and len(errors) == 2
 
 
 REFUSED = {
-    "nothing to work on": (("TILT",), "give either frames or xpointings CSV"),
+    "nothing to work on": (("TILT",), "give either frames or --pointings CSV"),
     "both": (("x.fits", "WHOLE", "TILT"), "not both"),
-    "no tilts": (("WHOLE",), "give xtilt CSV"),
-    "no such table": (("xpointings", "none.csv", "TILT"), "none.csv: no readable table"),
-    "how near without where": (("WHOLE", "TILT", *A3, "xnear-km", "20"), "xnear-km is for xnear"),
-    "near nowhere": (("BARE", "TILT", "xnear", "95", "2"), "give latitude and longitude in deg"),
-    "processes": (("WHOLE", "TILT", "xjobs", "2"), "xjobs and xscheduler are for frames"),
+    "no tilts": (("WHOLE",), "give --tilt CSV"),
+    "no such table": (("--pointings", "none.csv", "TILT"), "none.csv: no readable table"),
+    "how near without where": (("WHOLE", "TILT", *A3, "--near-km", "20"), "--near-km is for --near"),
+    "near nowhere": (("BARE", "TILT", "--near", "95", "2"), "give latitude and longitude in deg"),
+    "processes": (("WHOLE", "TILT", "--jobs", "2"), "--jobs and --scheduler are for frames"),
 }  # fmt: skip
 
 
@@ -184,12 +184,12 @@ def test_one_direction_is_no_place(tables, capsys):
 
 @pytest.mark.parametrize(
     "a3",
-    [("xmisalignment", "3.5", "-4", "130", "xmisalignment-stddev", "9000"), (), ("xself-calibrate",)],
+    [("--misalignment", "3.5", "-4", "130", "--misalignment-stddev", "9000"), (), ("--self-calibrate",)],
     ids=["known to 2.5 deg", "not known", "found"],
 )
 def test_elevations_of_many_directions_determine_a3_too(a3, tables, capsys):
     status, out, errors = run(
-        capsys, "solve", *tables.pointings("bare.csv"), *tables.tilt, *AIR, *SENSOR, *a3, "xjson"
+        capsys, "solve", *tables.pointings("bare.csv"), *tables.tilt, *AIR, *SENSOR, *a3, "--json"
     )
     together = objects(out)[-1]
     assert status == 0 and any("A3 from the elevations" in line for line in errors)
@@ -197,10 +197,10 @@ def test_elevations_of_many_directions_determine_a3_too(a3, tables, capsys):
 
 
 def test_two_directions_with_an_a3_known_badly_claim_little(tables, capsys):
-    near = ("xnear", tables.night.site.latitude_deg, tables.night.site.longitude_deg)
-    a3 = ("xmisalignment", "1.5", "-2", "130", "xmisalignment-stddev", "3600")
+    near = ("--near", tables.night.site.latitude_deg, tables.night.site.longitude_deg)
+    a3 = ("--misalignment", "1.5", "-2", "130", "--misalignment-stddev", "3600")
     status, out, _ = run(
-        capsys, "solve", *tables.pointings("two.csv"), *tables.tilt, *AIR, *SENSOR, *a3, *near, "xjson"
+        capsys, "solve", *tables.pointings("two.csv"), *tables.tilt, *AIR, *SENSOR, *a3, *near, "--json"
     )
     assert status == 0 and objects(out)[-1]["sigma_north_m"] > 10_000
 
@@ -212,12 +212,12 @@ def test_elevations_at_a_known_place_calibrate(tables, capsys, tmp_path):
         "starpos_instrument: 1\ninclinometer: {model: sca100t_calibrated}\nmisalignment_deg: [3.5, -4, 130]\n"
     )
     found.write_text(given + "calibration_stddev_arcsec: [9000, 9000, 9000]\n")
-    place = ("xsite", site.latitude_deg, site.longitude_deg, "-o", found)
-    bare = (*tables.pointings("bare.csv"), *tables.tilt, *AIR, "xinstrument", found)
+    place = ("--site", site.latitude_deg, site.longitude_deg, "-o", found)
+    bare = (*tables.pointings("bare.csv"), *tables.tilt, *AIR, "--instrument", found)
     status, out, errors = run(capsys, "calibrate", *bare, *place)
     assert (status, errors) == (0, []) and "A3 of 16 elevations in 8 directions" in out
     assert "camera" not in found.read_text()
-    status, out, errors = run(capsys, "solve", *bare, "xjson")
+    status, out, errors = run(capsys, "solve", *bare, "--json")
     assert status == 0 and tables.sigmas_off(objects(out)[-1]) < 4
     assert objects(out)[-1]["sigma_north_m"] < 1000
 
@@ -228,11 +228,11 @@ def test_frames_still_need_a_camera(capsys, tmp_path):
     (tmp_path / "tilt.csv").write_text("utc_unix_s,theta_x_deg,theta_y_deg\n1,0,0\n")
     frame = tmp_path / "stars.csv"
     frame.write_text('# {"NAXIS1": 100, "NAXIS2": 100}\nx,y,flux\n1,2,3\n')
-    status, _, errors = run(capsys, "solve", frame, "xtilt", tmp_path / "tilt.csv", "xinstrument", file)
+    status, _, errors = run(capsys, "solve", frame, "--tilt", tmp_path / "tilt.csv", "--instrument", file)
     assert status == 2 and "camera is missing" in errors[0]
 
 
 def test_calibrate_refuses_a_camera_from_pointings(tables, capsys, tmp_path):
     out = tmp_path / "camera.yaml"
-    status, _, errors = run(capsys, "calibrate", *tables.pointings("whole.csv"), "xcamera", out)
-    assert status == 2 and "xpointings say nothing of the camera" in errors[0] and not out.exists()
+    status, _, errors = run(capsys, "calibrate", *tables.pointings("whole.csv"), "--camera", out)
+    assert status == 2 and "--pointings hold no stars" in errors[0] and not out.exists()

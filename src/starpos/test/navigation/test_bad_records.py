@@ -89,9 +89,7 @@ def test_a_wheel_that_slips_is_left_out(record):
 
     slipped = navigated(with_velocity(record, slip))
     assert nees(slipped, record) < 16
-    assert (
-        50 < slipped.left_out["velocities"] < 70 and "velocities do not go with the rest" in slipped.faults[0]
-    )
+    assert 50 < slipped.left_out["velocities"] < 70 and "velocities contradict the rest" in slipped.faults[0]
 
 
 def test_velocities_worse_than_stated_widen_the_claim(record, rng):

@@ -121,7 +121,7 @@ def test_that_nobody_has_named_the_inclinometer_is_said_once(model, times, messa
     told = Told(f"inclinometer.model:={model!r}")
     told.tell(CAMERA_INFO, first(messages, CAMERA_INFO)[0], begin_s)
     told.work(begin_s)
-    said = [warning for warning in told.said.warnings if "which inclinometer" in warning]
+    said = [warning for warning in told.said.warnings if "model is not stated" in warning]
     assert len(said) == times and all("set inclinometer.model" in warning for warning in said)
 
 
