@@ -38,7 +38,7 @@ from starpos.sky import catalogue
 
 # Exit status.
 NOTHING = 1
-# the stars of a frame, and what is identified of them
+# the stars of a frame, and their identification
 _Seen = tuple[Stars, Identification | None]
 
 
@@ -87,7 +87,7 @@ def run(args: argparse.Namespace) -> int:
         return console.UNREADABLE
     # an error of the axis that all frames share becomes part of the A3 that is found
     instrument, _ = with_frame_size(options.instrument_of(args, first), first)
-    # an instrument that cannot be used is refused before all frames are worked on
+    # an unusable instrument is refused before the work on all frames
     calibrate_site.check_output(args, instrument)
     sights, unreadable = _sights(args.frames, read, replace(given_of(args, first), instrument=instrument))
     solver, frames = of_one_camera(Solver(instrument, catalogue.load_catalogue()), sights)
@@ -180,7 +180,7 @@ def _sights(paths: Sequence[str], read: Reader, given: Given) -> tuple[list[Sigh
 
 
 def _known(frames: Sequence[_Seen]) -> dict[int, Identification]:
-    """What is identified of frames, by their numbers."""
+    """Identifications of frames, by their numbers."""
     return {n: found for n, (_, found) in enumerate(frames) if found is not None}
 
 

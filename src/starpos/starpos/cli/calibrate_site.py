@@ -115,7 +115,7 @@ def check(args: argparse.Namespace) -> None:
 
 
 def check_output(args: argparse.Namespace, instrument: Instrument) -> None:
-    """Raise InstrumentError if the file of -o is there and is of another instrument."""
+    """Raise InstrumentError if the file of -o exists and describes another instrument."""
     if args.site is not None:
         instrument_update.check_fits(
             Path(args.output), instrument, fixed=args.fixed, camera_found=args.camera is not None
@@ -129,9 +129,9 @@ def run(
     tilts: TiltLog | None,
     known: Known = NOTHING_KNOWN,
 ) -> None:
-    """Find A3, or the vertical of a fixed camera, write and print it; raises FixError if the frames do not tell it.
+    """Find A3, or the vertical of a fixed camera, write and print it; raises FixError if the frames do not determine it.
 
-    known: what is identified of the frames already.
+    known: identifications of the frames so far.
     """
     solver = Solver(instrument, catalogue.load_catalogue(), options.atmosphere_of(args))
     (site, stddev_arcsec), bar = _site(args), console.ProgressBar()

@@ -129,7 +129,7 @@ def show_triangles(args: argparse.Namespace) -> int:
 
 
 def show_paper() -> int:
-    """Count the paper's triangles again and print them beside its own numbers."""
+    """Count the paper's triangles again and print them next to its own numbers."""
     from starpos.identification import paper
 
     c = catalogue.load_catalogue()

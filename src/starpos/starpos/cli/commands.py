@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The commands of `starpos`: what each does, examples of it, and what may come next."""
+"""The commands of `starpos`: a summary, examples and next steps for each."""
 
 from dataclasses import dataclass
 

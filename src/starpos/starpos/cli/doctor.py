@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """`starpos doctor`: which parts that starpos needs this machine has, which are missing, and what to type.
 
-Nothing that may be missing is imported but inside the check of it.
+A package that may be missing is imported only inside its check.
 """
 
 import argparse
@@ -40,7 +40,7 @@ CV2 = ("opencv-python-headless", "opencv-python", "opencv-contrib-python")
 SERIAL = ("dev/serial/by-id/*", "dev/ttyUSB*", "dev/ttyACM*")
 # interface class of a photo camera, in USB's list
 STILL_IMAGE = "06"
-# What the system tells of a device is far shorter.
+# Maximum size of the system's description of a device.
 MOST_BYTES = 4096
 
 
@@ -90,7 +90,7 @@ def _lines(name: str, finding: Finding) -> str:
 
 
 def _safely(check: Callable[[], Finding]) -> Finding:
-    """The finding of a check; one that cannot be made for want of a package, or of a right, says so."""
+    """The finding of a check; a check that lacks a package or a permission says so."""
     try:
         return check()
     except ImportError as error:
@@ -203,7 +203,7 @@ def earth_rotation() -> Finding:
 
 
 def clock() -> Finding:
-    """What the kernel says of this machine's clock."""
+    """The kernel's state of this machine's clock."""
     from starpos.session import system_clock
 
     state = system_clock.read()
@@ -296,5 +296,5 @@ CHECKS: dict[str, Callable[[], Finding]] = {
     "cameras": cameras,
     "ROS 2": ros,
 }
-# what only an instrument that runs here needs
+# checks that only an instrument on this machine needs
 LIVE = ("clock", "serial ports", "cameras")

@@ -90,7 +90,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def as_json(path: str, s: Solution) -> dict:
-    """The solution of a frame as JSON has it; angles in deg, None for what was not found."""
+    """The solution of a frame as JSON has it; angles in deg, None for missing values."""
     a = s.attitude
     return {
         "file": path,

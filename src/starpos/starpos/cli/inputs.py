@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the options say of a night's frames: how they are read, their instrument, tilts, and where it should be."""
+"""What the options state of a night's frames: how they are read, their instrument, tilts, and expected place."""
 
 import argparse
 import math
@@ -19,7 +19,7 @@ def reader_of(args: argparse.Namespace) -> Reader:
 
 
 def given_of(args: argparse.Namespace, first: About | None) -> Given:
-    """The instrument of each frame, whose focal length is that of its header unless the options give one.
+    """The instrument of each frame; the focal length is from its header unless the options give one.
 
     Raises InstrumentError if the options do not fit together, or the first frame has no focal length either.
     """

@@ -21,7 +21,7 @@ AUTO = "auto"
 
 
 def add_jobs(parser: argparse.ArgumentParser, what: str = "frames") -> None:
-    """Add the options that `workers_of` reads; what: that which is worked."""
+    """Add the options that `workers_of` reads; what: the object of the work."""
     parser.add_argument(
         "-j",
         "--jobs",
@@ -56,9 +56,9 @@ def workers_of(args: argparse.Namespace, frames: int) -> Workers:
 
 
 def watched(answers: Iterable, number: int, what: str = "frame", silent: bool = True) -> Iterator:
-    """The answers as they are, with a progress bar unless standard output shows them on the same terminal.
+    """The answers unchanged, with a progress bar unless standard output shows them on the same terminal.
 
-    silent: whether, where no terminal is, the answers are lines that show how far the work is.
+    silent: whether, without a terminal, the answers are lines that show the progress.
     """
     bar = console.ProgressBar(terminal_only=silent)
     for k, answer in enumerate(answers, 1):
@@ -68,7 +68,7 @@ def watched(answers: Iterable, number: int, what: str = "frame", silent: bool = 
 
 
 def prepare(command: str, instrument: Instrument, about: About) -> None:
-    """Put the tables of a field into the cache, where all processes of a machine find them; says what it lacks."""
+    """Put the tables of a field into the cache, for all processes of a machine; reports what the catalogue lacks."""
     solver = Solver(instrument, catalogue.load_catalogue(), progress=console.ProgressBar())
     # the frames report the error
     with suppress(StarposError):

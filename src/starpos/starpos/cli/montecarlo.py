@@ -21,11 +21,11 @@ from starpos.simulation import montecarlo_fields
 from starpos.sky import catalogue, deeper
 from starpos.sky.catalogue import Catalogue
 
-# % identified of 1000 fields with so many false stars, and of fields of so many stars
+# % identified of 1000 fields by number of false stars, and by number of stars
 PAPER_FALSE = {0: "99.2", 1: "98.1", 2: "96.7"}
 PAPER_FEW = {5: "> 95", 6: "> 99", 7: "> 99.9"}
 PAPER_CAMERA = Camera.from_focal(5616, 3744, 93750.0)
-# a field of the paper holds so many stars on average
+# limiting magnitude of the paper's fields, and their mean number of stars
 PAPER_LIMIT_MAG, PAPER_STARS = 9.0, 24.9
 
 EPILOG = """Realistic fields: brightness off by 0.3 mag, 5 % of the stars not detected, stars closer than 4 px one.

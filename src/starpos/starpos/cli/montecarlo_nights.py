@@ -132,7 +132,7 @@ def _errors(args: argparse.Namespace) -> montecarlo_nights.InclinometerErrors:
 def _either(
     rng: np.random.Generator, stars: Catalogue, errors: montecarlo_nights.InclinometerErrors
 ) -> NightOutcome:
-    """A night of either kind, with fewer frames than the paper's so that more nights can be worked."""
+    """A night of either kind, with fewer frames than the paper's so that more nights can be solved."""
     if rng.random() < 0.5:
         headings = int(rng.integers(3, 9))
         return montecarlo_nights.turned_night(rng, stars, errors, headings, int(rng.integers(1, 7)))
@@ -140,7 +140,7 @@ def _either(
 
 
 def _all(args: argparse.Namespace, night: Callable) -> list[NightOutcome]:
-    """Every night's outcome, the same ones however many processes there are."""
+    """Every night's outcome, independent of the number of processes."""
     seeds, outcomes, bar = np.random.SeedSequence(args.seed).spawn(args.nights), {}, console.ProgressBar()
     for k, outcome in _each(night, seeds, min(args.jobs, args.nights)):
         outcomes[k] = outcome

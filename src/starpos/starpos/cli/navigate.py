@@ -114,7 +114,7 @@ def define(parser: argparse.ArgumentParser) -> None:
 
 @dataclass(frozen=True)
 class FrameSeen:
-    """A frame's time, its stars as far as they are identified, and else why not, or what else is to be said of it."""
+    """A frame's time, its identified stars, or why it has none, or a remark."""
 
     utc_unix_s: float | None
     sighting: IdentifiedFrame | None
@@ -187,7 +187,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _mount_stddev(args: argparse.Namespace, doubt: AxisDoubt | None) -> float:
-    """1 sigma in rad of the mount, of which an axis that nobody knows is a part; InstrumentError if that is too wide."""
+    """1 sigma in rad of the mount, including an unknown optical axis; InstrumentError if it is too large."""
     stddev = math.radians(args.mount_stddev)
     if doubt is None:
         return stddev

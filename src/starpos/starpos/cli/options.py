@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Options that several commands have: frames, instrument and air, and what is made of them."""
+"""Options shared by several commands: frames, instrument and air, and the objects made from them."""
 
 import argparse
 from collections.abc import Callable
@@ -296,7 +296,7 @@ def number(low: float, high: float, kind: type[int] | type[float] = float) -> Ca
 
 
 def atmosphere_of(args: argparse.Namespace) -> Atmosphere:
-    """The air from the options, as far as they give it; `args.air` is that of a field report."""
+    """The air from the options, as far as they give it; `args.air`: from a field report."""
     if (stated := getattr(args, "air", None)) is not None:
         return stated
     pressure_pa = None if args.pressure_hpa is None else args.pressure_hpa * 100
@@ -354,8 +354,8 @@ def _with_times(known: instrument.Instrument, args: argparse.Namespace) -> instr
 
 
 class HasFocalLength(Protocol):
-    """A frame, or what is known of it."""
+    """A frame, or its header's facts."""
 
     @property
     def focal_px(self) -> float | None:
-        """Focal length in px that the frame's header states; None if it states none."""
+        """Focal length in px from the frame's header; None without one."""

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from starpos.night.recorded import OfBag
 
 NO_FIX = 1
-# so many nights get all their figures; more get the table and the errors only
+# maximum number of nights with all figures; more nights get the table and the errors only
 ALL_FIGURES = 6
 PIP = "pip install matplotlib rosbags"
 
@@ -131,7 +131,7 @@ def _night(path: Path, args: argparse.Namespace) -> Night:
 
 
 def _exposures(path: Path, args: argparse.Namespace) -> "Exposures | tuple[Recorded, OfBag]":
-    """The exposures of a folder, or what a bag holds; raises StarposError if there is nothing to work on."""
+    """The exposures of a folder or a bag; raises StarposError if there is nothing to work on."""
     from starpos.night import bag, recorded
 
     air, vertical, progress = options.atmosphere_of(args), vertical_of(args), console.ProgressBar()

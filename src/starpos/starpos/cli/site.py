@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The options for a place that is known, at which the stars alone tell heading, pitch and roll."""
+"""The options for a known place, at which the stars alone determine heading, pitch and roll."""
 
 import argparse
 from dataclasses import replace
@@ -37,7 +37,7 @@ def add_site(parser: argparse.ArgumentParser) -> None:
 
 
 def place_of(args: argparse.Namespace, vertical: Vertical) -> KnownPlace | None:
-    """The place of --site, None without it; InstrumentError for options that do not fit, PlaceError for no place.
+    """The place of --site, None without it; InstrumentError for bad options, PlaceError for an impossible place.
 
     vertical: the deflection by the other options.
     """

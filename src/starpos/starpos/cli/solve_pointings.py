@@ -30,13 +30,13 @@ from starpos.night.together import turned
 from starpos.sky import catalogue
 from starpos.utc import utc_text
 
-# the status of a row that tells an elevation
+# the status of a row that gives an elevation
 ELEVATION = "elevation alone"
 ELEVATIONS_HEAD = "row: the zenith distance of its direction; together these give the position"
 
 
 def run(args: argparse.Namespace) -> int:
-    """Work on the table of --pointings; returns the exit status."""
+    """Solve the table of --pointings; returns the exit status."""
     near = near_of(args)
     pointings, vertical = read_pointings(args.pointings), vertical_of(args)
     own_level = options.has_own_level(args)
@@ -78,7 +78,7 @@ def _from_elevations(
     vertical: Vertical,
     near: Near | None,
 ) -> int:
-    """Print the zenith distance of each row and the place that they tell together; returns the exit status."""
+    """Print each row's zenith distance and the place that they give together; returns the exit status."""
     found = from_elevations(solver, pointings, tilts, near, args.self_calibrate)
     for p, circle in zip(pointings, found.circles, strict=True):
         if isinstance(circle, StarposError):

@@ -36,7 +36,7 @@ def add_vertical(parser: argparse.ArgumentParser) -> None:
 def vertical_of(args: argparse.Namespace) -> Vertical:
     """The deflection that is given by hand or by a geoid; without either an unknown one.  Raises StarposError.
 
-    One given by hand is that at the instrument; the others are those at the geoid, and plumb lines curve above it.
+    A deflection given by hand holds at the instrument; others hold at the geoid, and plumb lines curve above it.
     """
     by_hand = args.xi, args.eta, args.deflection_stddev
     if args.geoid is not None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The pointing of a frame whose scale, and lens, nobody has said."""
+"""The pointing of a frame of unknown scale and lens."""
 
 import time
 from dataclasses import dataclass, replace
@@ -27,7 +27,7 @@ SEARCH_S = 20.0
 
 @dataclass(frozen=True)
 class BlindSolver:
-    """Identifies frames of any scale, those of fisheyes too; where EXIF tells a scale or a fisheye, first by that.
+    """Identifies frames of any scale, including fisheyes; if EXIF states a scale or a fisheye, it tries that first.
 
     stages, fisheye_stages: of the search; fewer are quicker.
     search_s: CPU time after which the search of a frame ends.

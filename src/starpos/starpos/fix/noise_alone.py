@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Frames whose detections are noise: nearly all are equally bright, as no stars are.
+"""Frames whose detections are noise: nearly all are equally bright, which stars never are.
 
 Stars become more numerous by a factor of about 2.8 with each magnitude. So of 150 the brightest hundredth are tens of
 times as bright as the median, and 5 times even where a picture is stretched by a gamma of 2.2. Peaks of noise end soon
@@ -10,9 +10,9 @@ import numpy as np
 
 from starpos.frames.stars import Stars
 
-# So many detections tell how their brightness is distributed.
+# Number of detections that show the distribution of their brightness.
 ENOUGH = 150
-# The brightest hundredth of them is noise too if it is less than this many times as bright as the median.
+# If the brightest hundredth is less than this many times as bright as the median, all are noise.
 LEAST_RANGE, BRIGHTEST = 3.5, 0.01
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from starpos.units import ARCSEC
 
-# lengths from here on are told in km
+# lengths from here on are given in km
 LONG_M = 10_000.0
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Why a frame was not identified, in a sentence: what can be told from its stars, its field and the catalogue."""
+"""Why a frame was not identified, in a sentence: likely causes from its stars, its field and the catalogue."""
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from starpos.sky.catalogue import Catalogue
 
 # Images wider than this (FWHM, px) are out of focus, or the frame has more pixels than its lens resolves.
 WIDE_PX = 8.0
-# If so many of the brightest detections are saturated, their order of brightness may be wrong.
+# If this share of the brightest detections is saturated, their order of brightness may be wrong.
 BRIGHTEST, MANY = 20, 0.5
 
 

@@ -216,7 +216,7 @@ class Instrument:
     focal_px            focal length, px
     camera              full intrinsics; None: an ideal camera
     frame_size          (width, height) px of the whole frame of that ideal camera, in whose middle its axis lies, and to
-    which A3 belongs; None: not stated, the axis is in the middle of any frame
+                        which A3 belongs; None: not stated, the axis is in the middle of any frame
     model               of the lens of that ideal camera: PLUMB_BOB, or EQUIDISTANT for a fisheye
     calibration         A3 and its errors
     link_to_camera      (3, 3): base link into C

@@ -19,8 +19,8 @@ def message_to_camera(
 ) -> Camera:
     """Camera of the images that a CameraInfo goes with; raises InstrumentError unless it is calibrated.
 
-    Its model is plumb_bob, also where none is named, rational_polynomial or equidistant. K is that of the whole sensor;
-    the camera's is that of the region and the binning that the message states.
+    Its model is plumb_bob, also where none is named, rational_polynomial or equidistant. K is for the whole sensor; the
+    camera's is for the message's region and binning.
     size: width and height of the images, px, for a message that leaves its own at 0.
     """
     k = np.array(message.k, float)
@@ -56,7 +56,7 @@ def message_to_camera(
 
 
 def leaves_size_open(message: Any) -> bool:
-    """Whether a CameraInfo states no size, which is then that of the images."""
+    """Whether a CameraInfo states no size; then the images' size holds."""
     region = message.roi
     return not (message.width or region.width) or not (message.height or region.height)
 

@@ -29,7 +29,7 @@ from starpos.rotation import full_turn, half_turns
 class OfBag:
     """The instrument of a bag's frames, with the bag's camera for their size.
 
-    any_size: whether frames of other sizes have the instrument as it is.
+    any_size: whether frames of other sizes use the instrument unchanged.
     """
 
     instrument: Instrument

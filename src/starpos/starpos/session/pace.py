@@ -29,8 +29,7 @@ class Pace:
         self._lately: deque[tuple[float, bool]] = deque(maxlen=MOST_KEPT)
 
     def wants(self, unix_s: float | None, most_hz: float) -> bool:
-        """Whether a frame of this stamp is wanted at a rate of at most most_hz; NaN: all are, as are frames without a
-        stamp."""
+        """Whether a frame of this stamp is wanted at a rate of at most most_hz; NaN: all, as without a stamp."""
         if math.isnan(most_hz) or unix_s is None:
             return True
         period_s = 1 / most_hz
