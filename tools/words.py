@@ -38,8 +38,17 @@ READ = (
     "src/starpos/starpos/night/*.py",
     "src/starpos/starpos/parallel/*.py",
     "src/starpos/starpos/recording/*.py",
+    "src/starpos/starpos/report/*.py",
     "src/starpos/starpos/simulation/*.py",
+    "src/starpos/starpos/session/*.py",
     "src/starpos/starpos/sky/*.py",
+    "src/starpos_bringup/starpos_bringup/**/*.py",
+    "src/starpos_common/starpos_common/*.py",
+    "src/starpos_dashboard/starpos_dashboard/*.py",
+    "src/starpos_testing/starpos_testing/**/*.py",
+    "starpos_camera/starpos_camera/**/*.py",
+    "starpos_inclinometer/starpos_inclinometer/**/*.py",
+    "starpos_solver/starpos_solver/*.py",
 )
 MAX_WORDS = 40
 # Name of a pattern: its expression, and what to write instead.

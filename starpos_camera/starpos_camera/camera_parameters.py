@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Parameters of the node `camera`; those of a source are in the module of the source."""
+"""Parameters of the node `camera`; a source's own are in its module."""
 
 import math
 

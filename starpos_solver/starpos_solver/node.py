@@ -45,7 +45,7 @@ TICK = JumpThreshold(min_forward=Duration(nanoseconds=1), min_backward=Duration(
 
 
 class SolverNode(Node):
-    """Publishes the place and the attitude of the instrument; see README.md.  What it decides is starpos.session's."""
+    """Publishes the place and the attitude of the instrument; see README.md.  Decisions are in starpos.session."""
 
     def __init__(self) -> None:
         super().__init__("solver")

@@ -17,7 +17,7 @@ ARCSEC_PER_S = 15.041
 
 
 def time_is_simulated(node: Node) -> bool:
-    """Tell whether the node takes its time from /clock (use_sim_time)."""
+    """Whether the node takes its time from /clock (use_sim_time)."""
     clock = node.get_clock()
     return isinstance(clock, ROSClock) and clock.ros_time_is_active
 

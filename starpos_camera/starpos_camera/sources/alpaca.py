@@ -81,7 +81,7 @@ class Alpaca(FrameSource):
         self._gain: float | None = None
 
     def lacking(self) -> None:
-        """Return None, because only a call to the server would tell."""
+        """Return None, because only a call to the server would show it."""
 
     def capture(self, settings: CaptureSettings) -> CapturedFrame:
         try:

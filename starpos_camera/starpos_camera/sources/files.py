@@ -249,7 +249,7 @@ def split(path: str) -> tuple[Path, str]:
 
 
 def fits(name: str, pattern: str) -> bool:
-    """Whether a name is that of a frame; hidden files are not finished, and names of other encodings cannot be shown."""
+    """Whether a name belongs to a frame; hidden files are not finished, and names of other encodings cannot be shown."""
     if not name.isprintable() or name.startswith("."):
         return False
     return fnmatch.fnmatchcase(name, pattern) if pattern else name.lower().endswith(SUFFIXES)

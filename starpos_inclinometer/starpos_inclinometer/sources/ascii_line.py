@@ -112,7 +112,7 @@ class Line:
     y: float
     z: float | None
     step: float
-    # NaN if the line does not tell it; not compared, because NaN is not equal to itself.
+    # NaN if the line does not hold it; not compared, because NaN is not equal to itself.
     temperature_c: float = field(compare=False)
     sequence: int | None
     # Time of the device's clock, 32 bits.

@@ -93,7 +93,7 @@ class IioLink:
         self._trigger, self._sampling_hz = values["iio.trigger"].strip(), values["iio.sampling_frequency"]
         self.rate_hz = values["rate"]
         self._clock, self._wake = host.clock, host.wake
-        # Arrivals of raw values; `identity` is the device, None where nobody knows when they were taken.
+        # Arrivals of raw values; `identity` is the device, None if the time of the values is unknown.
         self._queue: deque[tuple[IioDevice, Arrival]] = deque(maxlen=QUEUE)
         self._recent: deque[float] = deque(maxlen=QUEUE)
         self._good = self._failed = 0
@@ -249,7 +249,7 @@ class IioTilts:
         self.forces.configure(values)
 
     def read(self, device: IioDevice, arrival: Arrival) -> Reading | None:
-        """Convert one reading; None while accelerations are being averaged, or it tells no tilt."""
+        """Convert one reading; None while accelerations are being averaged, or if it gives no tilt."""
         broken = self.device is not None and device is not self.device
         if device is not self.device:
             self.device = device

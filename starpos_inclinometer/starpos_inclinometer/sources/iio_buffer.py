@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Buffered reading of an Industrial I/O device: whole scans from /dev, with the kernel's own time stamps.
 
-The layout of a scan, and the order of what is set, are those of the kernel's document "Industrial IIO device buffers".
+The layout of a scan, and the order of the settings, follow the kernel's document "Industrial IIO device "
+    "buffers".
 """
 
 import contextlib

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The navigator's decisions: when the newest part of a voyage is adjusted, how it is carried on, what is told.
+"""The navigator's decisions: when the newest part of a voyage is adjusted, how it is carried on, what is published.
 
-A state machine without a clock or a thread of its own, as session.py is for frames: it is told each message with the
-time it came at, and returns what to publish.  The adjustment is a job; until its outcome comes the IMU carries the last
-one on.
+A state machine without a clock or a thread of its own, as session.py is for frames: its driver passes each message with
+its time of arrival; it returns what to publish.  The adjustment is a job; until its outcome comes the IMU carries the
+last one on.
 """
 
 import math
@@ -37,9 +37,9 @@ from starpos.session.navigator_parameters import NavigatorSettings
 from starpos.session.now import Now
 from starpos.session.reports import AHEAD_S
 
-# the window holds so much at least before it is adjusted, s, and so many frames a second of the period
+# minimum length of the window before it is adjusted, s, and minimum frames per second of the period
 SHORTEST_S, FRAMES_PER_S = 10.0, 30.0
-# a claim is wide beyond, m an axis
+# 1 sigma beyond which a position counts as unknown, m an axis
 WIDE_M = 1000.0
 STARTING = "no frame with stars yet"
 APART = "all frames with stars are stamped later than the IMU's readings: set their clocks by one source"
@@ -69,7 +69,7 @@ class Navigated:
 class NavigatorSession:
     """Messages of an IMU, a camera's attitudes and velocities to places under way.
 
-    jobs: makes who runs the adjustment.
+    jobs: makes the runner of the adjustment.
     """
 
     def __init__(self, settings: NavigatorSettings, jobs: Callable[[], Jobs], heard: Heard, log: Log) -> None:
@@ -93,7 +93,7 @@ class NavigatorSession:
         self._seen_s = -math.inf
         self._clock_stddev_s = 0.0
         self._gnss: GnssPlace | None = None
-        # an outcome of a job that began before counts no more
+        # marks outcomes of jobs that began before as out of date
         self._voyage = object()
 
     @property
@@ -153,7 +153,7 @@ class NavigatorSession:
                 raise VoyageError(
                     "a velocity's variance is NaN or below 0: state it, or zeros for velocity_stddev"
                 )
-            # an axis that states none moves as little as the others, or is not measured
+            # an axis without a stated variance moves as little as the others, or is not measured
             sigma = math.sqrt(variance.max()) or self._values["velocity_stddev"]
             self._recent.add_velocity(time_s, (v.x, v.y, v.z), sigma)
         except StarposError as e:

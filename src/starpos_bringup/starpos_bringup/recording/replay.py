@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """`ros2 run starpos_bringup replay BAG`: play a rosbag2 into the running graph, byte for byte, with its time on /clock.
 
-For machines without `ros2 bag play`, and to play as fast as the solver answers, with the same result, which that cannot.
+For machines without `ros2 bag play`, and to play as fast as the solver answers with the same result, which `ros2 bag
+play` cannot.
 """
 
 import argparse
