@@ -246,7 +246,7 @@ def test_pictures_as_json_are_refused(liar):
 @pytest.mark.parametrize(
     ("member", "value", "sentence"),
     [
-        ("cameraxsize", -5, "sensor of -5 x 48 px is none"),
+        ("cameraxsize", -5, "sensor of -5 x 48 px is not valid"),
         ("cameraxsize", 10**9, "is none"),
         ("cameraxsize", "many", "(ValueError)"),
         ("cameraysize", None, "(TypeError)"),

@@ -298,7 +298,7 @@ def test_frames_are_taken_as_they_come_and_a_broken_one_is_said_once(folder):
 def test_patterns_hidden_files_and_folders_that_are_not_there(folder):
     source = make(folder / "in" / "b*.fits", files__rest=0.01)
     assert "no such folder" in source.lacking()
-    with pytest.raises(CaptureError, match="cannot be looked into"):
+    with pytest.raises(CaptureError, match="cannot be listed"):
         source.capture(SETTINGS)
     (folder / "in").mkdir()
     assert source.lacking() is None

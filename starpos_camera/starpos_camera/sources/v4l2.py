@@ -181,7 +181,7 @@ class V4l2Device:
         unstamped = 0
         while time.monotonic() < end_s and not self.closing:
             if not capture.grab():
-                raise CaptureError("it gives no frame; look after its plug.")
+                raise CaptureError("it gives no frame; check its plug.")
             steady_s, now_s = self._clocks()
             stamp_s = capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
             # Drivers stamp with one clock or the other.

@@ -228,7 +228,7 @@ def _against(given: Calibration, found: Calibration) -> str:
     """A line on how far apart two A3 have the plumb line in the camera, at the lean of the calibration."""
     up = up_of(np.radians(found.tilt_deg))
     apart = np.degrees(np.arccos(np.clip(up @ found.a3 @ given.a3.T @ up, -1, 1)))
-    return f"the --misalignment given has the plumb line {apart:.2g} deg from there: if that cannot be, check the site\n"
+    return f"the --misalignment given has the plumb line {apart:.2g} deg from there: check the site if it cannot be\n"
 
 
 def _json_of(found: Calibrated, path: str) -> dict:

@@ -78,7 +78,7 @@ def check_frames(args: argparse.Namespace) -> None:
         raise InstrumentError("give either frames or --pointings CSV" + (", not both" if args.frames else ""))
     if args.pointings is not None and (args.shutter_delay, args.readout) != (None, None):
         raise InstrumentError(
-            "--shutter-delay and --readout are for frames: the times in --pointings are those when the sky was seen"
+            "--shutter-delay and --readout are for frames: the times in --pointings are when the sky was seen"
         )
 
 

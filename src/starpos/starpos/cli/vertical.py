@@ -28,8 +28,8 @@ def add_vertical(parser: argparse.ArgumentParser) -> None:
         "--altitude-m",
         type=options.number(-1000, 100_000),
         metavar="M",
-        help="height above the ellipsoid: plumb lines curve by 0.17 arcsec (5 m) a km at 45 deg; not with --xi and "
-        "--eta, which are those at the instrument",
+        help="height above the ellipsoid: plumb lines curve by 0.17 arcsec (5 m) a km at 45 deg; not with "
+        "--xi and --eta, which hold at the instrument",
     )
 
 
@@ -50,7 +50,8 @@ def vertical_of(args: argparse.Namespace) -> Vertical:
         return _at_height(Deflection(), args)
     if args.altitude_m is not None:
         raise InstrumentError(
-            "--altitude-m is for a deflection at the geoid: leave it out, --xi and --eta are those at the instrument"
+            "--altitude-m is for a deflection at the geoid: leave it out, --xi and --eta hold at the "
+            "instrument"
         )
     stddev = args.deflection_stddev
     if stddev is None:

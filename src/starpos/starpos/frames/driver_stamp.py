@@ -43,7 +43,7 @@ class DriverStamp:
             raise FrameError(f"a stamp is of the {self.kind!r}: give {', '.join(KINDS[1:])}, or nothing")
         if self.exposure_s is not None and not 0 < self.exposure_s <= MOST_EXPOSURE_S:
             raise FrameError(
-                f"an exposure of {self.exposure_s} s cannot be: give up to {MOST_EXPOSURE_S:g} s"
+                f"an exposure of {self.exposure_s} s is impossible: give up to {MOST_EXPOSURE_S:g} s"
             )
 
     @property

@@ -36,7 +36,8 @@ class Shutter:
     def __post_init__(self) -> None:
         if not (abs(self.readout_s) <= MOST_READOUT_S and 0 <= self.readout_stddev_s <= MOST_READOUT_S):
             raise FrameError(
-                f"a shutter's readout of {self.readout_s:g} s +- {self.readout_stddev_s:g} s cannot be: give at most "
+                f"a shutter's readout of {self.readout_s:g} s +- {self.readout_stddev_s:g} s is impossible: "
+                f"give at most "
                 f"{MOST_READOUT_S:g} s from the first row to the last, negative where the bottom row is first, and its "
                 "standard deviation"
             )

@@ -84,7 +84,8 @@ class Calibration:
             or np.sum(np.sin(np.radians(self.tilt_deg[:2])) ** 2) > 1
         ):
             raise InstrumentError(
-                "tilt_deg of the calibration cannot be: give the elevations of the inclinometer's axes, in deg"
+                "tilt_deg of the calibration is impossible: give the elevations of the inclinometer's axes, "
+                "in deg"
             )
         if not (np.isnan(self.temperature_c) or abs(self.temperature_c) < MOST_C):
             raise InstrumentError(f"temperature_c of the calibration is {self.temperature_c:g}: give deg C")

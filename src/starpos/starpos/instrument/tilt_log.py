@@ -166,7 +166,7 @@ class TiltLog:
     def mean(self) -> Tilt:
         """The mean of all readings, of an instrument that is at rest between them too; TiltError if it moved."""
         if not self._finite.all():
-            raise TiltError("some tilts have two axes and some three: give those of one inclinometer")
+            raise TiltError("some tilts have two axes and some three: give the tilts of one inclinometer")
         return self._mean(np.argsort(self.utc_unix_s, kind="stable"))
 
     @property

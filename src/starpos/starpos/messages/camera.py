@@ -65,8 +65,8 @@ def _image_side(whole: int, offset: int, cut: int, binned_by: int, source: str) 
     """Pixels along a side of the images: the binned ones of the sensor, or of a part `cut` of it; 0 if not stated."""
     if whole and offset + cut > whole:
         raise InstrumentError(
-            f"{source}: the region of interest ends at pixel {offset + cut} of {whole}; width and height are those of "
-            "the whole sensor: correct the camera's driver or its calibration file."
+            f"{source}: the region of interest ends at pixel {offset + cut} of {whole}; width and height "
+            f"must be the whole sensor's: correct the camera's driver or its calibration file."
         )
     return (cut or max(0, whole - offset)) // binned_by
 

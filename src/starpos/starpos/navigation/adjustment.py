@@ -83,9 +83,7 @@ class Adjustment:
         self.vibration = vibration
         self.odometry = None if velocity is None else Odometry.of(velocity, nodes, pieces)
         if self.odometry is not None and not len(self.odometry.node):
-            raise VoyageError(
-                "no velocity lies on the voyage: check that its clock and that of the camera agree"
-            )
+            raise VoyageError("no velocity lies on the voyage: check that its clock and the camera's agree")
         self.law = self._law(vessel)
         self.unknowns = MEASURED if self.law is None else BY_LAW
         self.known = Beforehand(

@@ -126,7 +126,7 @@ def sighting_of(stars: Stars, eye: solver.Solver, answer: Solution) -> Identifie
         raise FrameError(answer.message)
     if answer.warnings:
         raise FrameError(
-            f"{stars.place}: its stars are not those of one sky ({', '.join(answer.warnings)}): left out"
+            f"{stars.place}: its stars do not belong to one sky ({', '.join(answer.warnings)}): left out"
         )
     if answer.found.mirrored:
         raise InstrumentError(f"{stars.place}: the frame is mirrored (its rows run bottom-up): flip it")

@@ -50,7 +50,7 @@ def write(path: Path, exposures: Exposures, progress: Progress = quiet) -> int:
     Raises FrameError for a night without a usable frame or tilt, WriteError if the file cannot be written.
     """
     if not isinstance(exposures.work.tilts, TiltLog):
-        raise FrameError(f"{exposures.name}: no tilts: a field report needs those of the night")
+        raise FrameError(f"{exposures.name}: no tilts: a field report needs the night's tilts")
     lists: dict[str, bytes] = {}
     instrument, unreadable = None, 0
     with tempfile.TemporaryDirectory() as folder:

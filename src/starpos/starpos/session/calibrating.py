@@ -215,7 +215,7 @@ class Calibrating:
         most = self._values["calibration_frames"]
         if not (abs(latitude) <= 90 and abs(longitude) <= 360):
             raise InstrumentError(
-                f"latitude {latitude:g}, longitude {longitude:g}: give those of the place, by gravity, in deg"
+                f"latitude {latitude:g}, longitude {longitude:g}: give the place's, by gravity, in deg"
             )
         if wanted > most:
             raise FixError(
@@ -354,8 +354,10 @@ class Calibrating:
             values |= {"plumb line (arcsec)": self._plumb_arcsec, "found of frames": self.found.frames}
         if self.unknown:
             remedy = (self._said or TURN_IT) if self._values["self_calibration"] else CALIBRATE_IT
-            return Diagnosis(Level.WARN, f"camera against inclinometer is not known: {remedy}", values)
-        return Diagnosis(Level.OK, self._about or "that of the parameters", values)
+            return Diagnosis(
+                Level.WARN, f"the misalignment of camera and inclinometer is not known: {remedy}", values
+            )
+        return Diagnosis(Level.OK, self._about or "from the parameters", values)
 
 
 def _about(found: Calibrated) -> str:

@@ -26,5 +26,6 @@ def contradiction(gnss: GnssPlace, ground: Geodetic, utc_unix_s: float, speed: f
     if sigmas < SIGMAS:
         return apart, ""
     return apart, (
-        f"GNSS has a place {apart:.3g} m from here, {sigmas:.2g} times what both claim: one of them is wrong"
+        f"GNSS has a place {apart:.3g} m from here, {sigmas:.2g} times their stated errors: one of them is "
+        f"wrong"
     )

@@ -31,7 +31,7 @@ class GyroReadings:
         w, time_s = message.angular_velocity, stamp_to_unix(message.header.stamp)
         if message.angular_velocity_covariance[0] == -1:
             raise VoyageError(
-                "the IMU says by a covariance of -1 that it measures no rates: take one that does"
+                "the IMU says by a covariance of -1 that it measures no rates: use one that does"
             )
         if time_s is None:
             raise VoyageError(

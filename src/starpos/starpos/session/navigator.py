@@ -117,7 +117,8 @@ class NavigatorSession:
                 or message.linear_acceleration_covariance[0] == -1
             ):
                 raise VoyageError(
-                    "the IMU says by a covariance of -1 that it measures no rates or no accelerations: take one that does"
+                    "the IMU says by a covariance of -1 that it measures no rates or no accelerations: use "
+                    "one that does"
                 )
             self._check_time(row[0], now, "an inertial reading")
             self._begin_anew(row[0])

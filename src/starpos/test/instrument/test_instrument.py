@@ -70,7 +70,7 @@ def test_the_covariance_of_the_angles_is_that_of_turned_a3s(angles, rng):
             "beyond any turn",
         ),
         ({"tilt_deg": (0.0,)}, "two or three"),
-        ({"tilt_deg": (80.0, 80.0)}, "cannot be: give the elevations"),
+        ({"tilt_deg": (80.0, 80.0)}, "is impossible: give the elevations"),
         ({"tilt_deg": (np.inf, 0.0)}, "finite"),
         ({"temperature_c": np.inf}, "temperature_c"),
         ({"temperature_c": -1e300}, "temperature_c"),
