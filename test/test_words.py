@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A breach of each rule for sentences is found, on its line; whether the documents keep them, `make lint` sees."""
+"""Breaches of all rules for sentences are found, with their lines; whether the documents keep them, `make lint` sees."""
 
 import subprocess
 import sys

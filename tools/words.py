@@ -21,6 +21,8 @@ READ = (
     "*.md",
     "docs/**/*.md",
     "test/*.md",
+    "test/*.py",
+    "tools/**/*.py",
     "starpos_*/*.md",
     "src/*/*.md",
     "starpos_interfaces/*/*.[ms][sr][gv]",

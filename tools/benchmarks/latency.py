@@ -254,7 +254,7 @@ def rows(options) -> Iterator[table.Row]:
 
 
 def choose(profile: str) -> None:
-    """Set the Fast DDS profiles of all nodes; '' is none, even if the shell has some."""
+    """Set the Fast DDS profiles of all nodes; '' means without, even if the shell has some."""
     if profile:
         os.environ[PROFILES] = profile
     else:
