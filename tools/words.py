@@ -22,6 +22,8 @@ READ = (
     "docs/**/*.md",
     "test/*.md",
     "test/*.py",
+    "starpos_*/test/*.py",
+    "src/*/test/**/*.py",
     "tools/**/*.py",
     "starpos_*/*.md",
     "src/*/*.md",

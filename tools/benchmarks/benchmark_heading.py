@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How well a frame determines the heading at a known place, and whether its claim holds: table of
-docs/tutorials/azimuth.md.
+"""How well a frame determines the heading at a known place: table of docs/tutorials/azimuth.md.
 
 Each frame is of a night of its own.  Drawn are the place, its deflection of the vertical (6 arcsec a component, not
 stated), and the error of the place (GNSS, 2 m). So are date, pointing (70 deg high), air, clock (1 ms), the Earth's

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the page is told: never a number that is none, never more than it can hold."""
+"""The state sent to the page: never an invalid number, never more than it can hold."""
 
 import json
 import math

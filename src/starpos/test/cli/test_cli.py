@@ -49,7 +49,7 @@ def test_solve_star_lists_that_turn(lists, capsys):
     assert status == 0
     *each, combined = objects(out)
     assert combined["poses"] == 3
-    # The heading is that of the last pose.
+    # The heading is the last pose's.
     assert combined["heading"] == pytest.approx(each[-1]["heading"], abs=0.01)
     assert [e["status"] for e in each] == ["ok"] * 3
     assert abs(combined["latitude"] - PLACE["latitude"]) * 3600 < 1

@@ -68,7 +68,7 @@ def test_a_cluster_gives_the_same_answers(more, cluster, archive, capfd, monkeyp
     monkeypatch.chdir(archive / "turned")
     command = [Path(a).name if a.endswith(".csv") else a for a in solve(archive / "turned", "--json", *more)]
     status, out, err = run(capfd, command)
-    # It tells of the broken frame.
+    # It reports the broken frame.
     assert status == 2
     there = run(capfd, [*command, "--scheduler", cluster])
     assert there[:2] == (status, out)

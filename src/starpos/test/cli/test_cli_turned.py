@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`starpos solve --self-calibrate` on a night whose A3 nobody tells it, and the instrument file it leaves."""
+"""`starpos solve --self-calibrate` on a night with an unknown A3, and the instrument file it leaves."""
 
 import json
 

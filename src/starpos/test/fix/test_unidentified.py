@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The sentence for a frame that is not identified tells its causes apart."""
+"""The sentence for a frame that is not identified distinguishes the causes."""
 
 import numpy as np
 

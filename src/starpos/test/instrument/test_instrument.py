@@ -122,7 +122,7 @@ def test_age():
         with pytest.raises(InstrumentError, match=r"2001-09-09T01:46:40\.000Z is 10 days .* holds for 10"):
             c.check_age(1e9 + off * 86400)
     replace(c, valid_days=float("inf")).check_age(1e12)
-    # Nobody knows how old it is.
+    # Its age is unknown.
     Calibration(valid_days=1.0).check_age(1e9)
 
 

@@ -423,7 +423,7 @@ def test_a_disk_that_is_full_leaves_the_old_file(tmp_path):
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     assert path.read_bytes() == before
-    # Nothing half written beside it.
+    # Nothing half written next to it.
     assert list(tmp_path.iterdir()) == [path]
 
 

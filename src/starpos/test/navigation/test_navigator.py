@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The session behind the node `navigator`: what it makes of voyages that it is told message by message."""
+"""The session behind the node `navigator`: voyages given to it message by message."""
 
 from dataclasses import asdict, replace
 from types import SimpleNamespace

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`starpos report` on a rosbag2: the answer of the same night in files, what the solver said, and bags that are none."""
+"""`starpos report` on a rosbag2: the answer of the same night in files, the solver's sentences, and invalid bags."""
 
 import io
 import json

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the diagnostics say of conditions that nobody told."""
+"""The diagnostics of unstated conditions."""
 
 import math
 from dataclasses import replace
@@ -29,7 +29,7 @@ def tilt(temperature_c):
 def test_conditions_that_are_known_are_right():
     said = reports.of_conditions(TOLD, NOBODYS, tilt(12.0), GLOBAL)
     assert said.level == Level.OK and said.values["inclinometer (deg C)"] == 12.0
-    # before the first frame nobody can know what the tilts carry
+    # before the first frame the contents of the tilts are unknown
     assert reports.of_conditions(TOLD, NOBODYS, None, None).level == Level.OK
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A session told the messages of a recorded night: what waits for what, and that only the data count."""
+"""A session with the messages of a recorded night: what waits for what, and that only the data count."""
 
 import math
 from copy import deepcopy
@@ -58,7 +58,7 @@ NOTHING_TOLD = Sent()
 
 
 class Told:
-    """A session that is told messages, and its jobs, which are done when a test says so."""
+    """A session that receives messages, and its jobs, which are done when a test says so."""
 
     def __init__(self, *parameters):
         self.said, self.jobs = Said(), []
@@ -220,7 +220,7 @@ def test_tilts_ahead_of_a_played_clock_wait_for_its_next_tick(told, messages, be
 
 
 def answers_of(messages, delay):
-    """The solutions of a night that turns, with jobs that are done so many messages after they were begun."""
+    """The solutions of a night that turns, with jobs that are done a number of messages after they were begun."""
     told, made, left = Told("self_calibration:=true"), [], 0
     for kind, message, at_s in messages:
         made += told.tell(kind, message, at_s)
