@@ -24,7 +24,7 @@ from starpos.frames.frame import Frame
 from starpos.messages.camera import message_to_frame, message_to_picture
 from starpos.messages.exposures import CAPTURES_KEPT, ExposureFacts, check_stamp
 from starpos.messages.stamp import stamp_to_unix
-from starpos.session.backlog import FRESH_S
+from starpos.session.backlog import MAX_LATE_S
 from starpos.session.detector_parameters import PARAMETERS, detection_settings
 from starpos.session.pace import Pace
 from starpos.session.trails import Trails
@@ -48,7 +48,7 @@ CAPTURE_PATIENCE_S = 3.5
 # The same time while no publisher of Captures is known yet: there may not be one.
 DISCOVERY_S = 0.5
 # Maximum number of waiting frames, of 42 MB each.
-MOST_HELD = 3
+MAX_HELD = 3
 LOOK_S = 0.1
 # Silence is reported after this time, and after three times the interval between the last two frames.
 MIN_SILENCE_S = 5.0
@@ -246,7 +246,7 @@ class DetectorNode(Node):
     def _too_many(self) -> bool:
         """Whether the held frames would be searched too late."""
         each_s = self._last.seconds if self._last else math.inf
-        return len(self._held) > MOST_HELD or len(self._held) * each_s > FRESH_S
+        return len(self._held) > MAX_HELD or len(self._held) * each_s > MAX_LATE_S
 
     def _ready(self, k: int) -> bool:
         """Whether the k-th held frame need not wait for its Capture any more."""
@@ -254,7 +254,7 @@ class DetectorNode(Node):
             return False
         # a sender's Captures come in order: if a later frame's is here, its own is lost
         come = any(self._exposures.has(image.header) for image, _ in itertools.islice(self._held, k, None))
-        return come or len(self._held) > MOST_HELD or self._now_s() >= self._held[k][1]
+        return come or len(self._held) > MAX_HELD or self._now_s() >= self._held[k][1]
 
     def _offer_image(self, message: Image | CompressedImage) -> None:
         """Submit an image, with the known facts of its exposure."""

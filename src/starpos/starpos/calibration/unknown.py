@@ -27,7 +27,7 @@ MODEL_BY_PARAMETERS = "set inclinometer.model, or name it or its errors in the f
 UNKNOWN_DEG = 60.0
 # a turn that is known better than so is said to be known; a place that is wider is worth a word
 KNOWN_DEG, WIDE_M = 5.0, 10_000.0
-TELL_IT = (
+FIND_TURN = (
     "calibrate with leans of some degrees between the frames, or state it with --misalignment and "
     "--turn-stddev"
 )
@@ -53,7 +53,7 @@ def unknown_a3(
     return (
         "the instrument leans otherwise than when A3 was found, and A3's turn about the plumb line, "
         f"{_known(calibration)}, makes the position error {metres / 1000:.0f} km (1 sigma): lean it as then, "
-        f"or {TELL_IT}"
+        f"or {FIND_TURN}"
     )
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from starpos.calibration.fixed_camera import calibrate_fixed
 from starpos.calibration.misalignment import NOTHING_KNOWN, Calibrated, Known, calibrate_at
-from starpos.calibration.unknown import TELL_IT, at_another_lean, may_turn
+from starpos.calibration.unknown import FIND_TURN, at_another_lean, may_turn
 from starpos.cli import console, options
 from starpos.cli.overwriting import save_instrument
 from starpos.cli.vertical import add_vertical, vertical_of
@@ -220,7 +220,7 @@ def _about(found: Calibrated, site: Site) -> str:
         + at_another_lean(c),
     ]
     if may_turn(c):
-        lines.append(f"to find that turn as well, {TELL_IT}")
+        lines.append(f"to find that turn as well, {FIND_TURN}")
     return "\n".join(lines) + "\n"
 
 

@@ -11,18 +11,18 @@ import numpy as np
 from starpos.frames.stars import Stars
 
 # Number of detections that show the distribution of their brightness.
-ENOUGH = 150
+MIN_DETECTIONS = 150
 # If the brightest hundredth is less than this many times as bright as the median, all are noise.
-LEAST_RANGE, BRIGHTEST = 3.5, 0.01
+MIN_RANGE, BRIGHTEST = 3.5, 0.01
 
 
 def why_noise(stars: Stars) -> str:
     """A sentence that says why the detections on a frame are noise; '' if they may be stars, and for a list of stars."""
     # only a detector says how wide images are; the flux of a list may be anything that sorts it
-    if stars.fwhm_px is None or len(stars) < ENOUGH:
+    if stars.fwhm_px is None or len(stars) < MIN_DETECTIONS:
         return ""
     brightest = float(stars.flux[int(BRIGHTEST * len(stars))] / np.median(stars.flux))
-    if brightest >= LEAST_RANGE:
+    if brightest >= MIN_RANGE:
         return ""
     return (
         f"{stars.place}: its {len(stars)} detections are noise, because nearly all are equally bright (the brightest "

@@ -6,7 +6,7 @@ from collections import deque
 
 import numpy as np
 
-from starpos.instrument.tilt_log import ENOUGH_NEIGHBOURS, SIGNIFICANT, white_noise
+from starpos.instrument.tilt_log import MIN_NEIGHBOURS, SIGNIFICANT, white_noise
 
 # A sensor of 18 Hz has a memory of 9 ms, so means over this time are independent.
 BLOCK_S = 0.1
@@ -60,7 +60,7 @@ class NoiseTracker:
             return
         scale = math.sqrt(2 / (1 / n + 1 / before[1]))
         self._differences.append([scale * (a - b) for a, b in zip(mean[2:], before[2:], strict=True)])
-        if len(self._differences) >= ENOUGH_NEIGHBOURS:
+        if len(self._differences) >= MIN_NEIGHBOURS:
             self.sigma = self._estimate()
 
     def _estimate(self) -> tuple[float, ...]:

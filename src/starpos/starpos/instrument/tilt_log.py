@@ -11,11 +11,11 @@ from starpos.errors import TiltError
 from starpos.instrument.inclinometer import SCA100T_NOISE_RAD, Tilt
 from starpos.normal import SIGMA_PER_MAD
 
-# The noise is measured from readings at most NEIGHBOURS_S apart, if there are ENOUGH_NEIGHBOURS of them.
-NEIGHBOURS_S, ENOUGH_NEIGHBOURS = 1.0, 20
+# The noise is measured from readings at most NEIGHBOURS_S apart, if there are MIN_NEIGHBOURS of them.
+NEIGHBOURS_S, MIN_NEIGHBOURS = 1.0, 20
 # Readings further away, in sigma, are left out; an instrument whose readings scatter by a larger multiple of their noise
 # is not at rest.
-OUTLIER_SIGMA, REST = 6.0, 6.0
+OUTLIER_SIGMA, MAX_SCATTER_SIGMA = 6.0, 6.0
 # The noise comes from the smallest 80 % of a Gaussian's deviations, which have this variance.
 KEPT, KEPT_VARIANCE = 0.8, 0.4377
 # Over sqrt(steps) it is three times the relative error of `white_noise`.
@@ -30,7 +30,7 @@ USUAL_GAPS = 2.5
 # an end of the exposure longer than this share of it is open if the reading beyond disagrees
 OPEN_END = 0.25
 # Half of an exposure with a margin for rounded times; number of readings that determine their usual interval.
-HALF, ENOUGH_TIMES = 0.6, 5
+HALF, MIN_TIMES = 0.6, 5
 # Number of equal readings in a row that show a stuck sensor, as in the node, if equal neighbours are rare elsewhere: at
 # 0.1, chance makes one such row in 10^9 readings.
 STUCK_READINGS, RARE = 10, 0.1
@@ -51,11 +51,11 @@ def white_noise(steps: np.ndarray) -> np.ndarray:
 def noise_excess(steps: np.ndarray, stated_rad: float) -> float:
     """Noise of readings over the stated one, from their differences (N, axes) from one to the next; 1 or more.
 
-    The readings of a pair are not more than NEIGHBOURS_S apart. Fewer than ENOUGH_NEIGHBOURS pairs give 1.
+    The readings of a pair are not more than NEIGHBOURS_S apart. Fewer than MIN_NEIGHBOURS pairs give 1.
     """
     # of an instrument at rest: while it moves, readings differ by more than any noise that is let pass
-    steps = steps[(np.abs(steps) < np.sqrt(2) * OUTLIER_SIGMA * REST * stated_rad).all(1)]
-    if len(steps) < ENOUGH_NEIGHBOURS:
+    steps = steps[(np.abs(steps) < np.sqrt(2) * OUTLIER_SIGMA * MAX_SCATTER_SIGMA * stated_rad).all(1)]
+    if len(steps) < MIN_NEIGHBOURS:
         return 1.0
     found = float(white_noise(steps).max() / stated_rad)
     return found if found > 1 + SIGNIFICANT / np.sqrt(len(steps)) else 1.0
@@ -201,7 +201,7 @@ class TiltLog:
         free &= (np.abs(steps) < np.sqrt(2) * OUTLIER_SIGMA * noise).all(1)
         for first, last in zip(begin, end, strict=True):
             free[first:last] = False
-        if free.sum() < max(ENOUGH_NEIGHBOURS, (end - begin).sum() / MOSTLY_STUCK):
+        if free.sum() < max(MIN_NEIGHBOURS, (end - begin).sum() / MOSTLY_STUCK):
             return stuck
         moved = np.abs(steps[free])
         coarse = np.where(moved > 0, moved, np.inf).min() > noise
@@ -221,7 +221,7 @@ class TiltLog:
         # wild readings differ from each other; neighbours that agree are of another lean
         turned = any(self._agree(use[k], use[k + 1]) for k in wild[:-1] if not sane[k + 1])
         turned = turned or any(self._agree(a, b) for a, b in self._edges(use) if not sane[use == a].all())
-        if turned or spread.max() > REST * noise:
+        if turned or spread.max() > MAX_SCATTER_SIGMA * noise:
             # impossible angles, as in another unit, scatter as well
             _check_possible(theta[from_middle.max(1).argmin()])
             raise TiltError(
@@ -311,7 +311,7 @@ class TiltLog:
         t = self.utc_unix_s[index]
         begin, over = mid_unix_s - exposure_s / 2, mid_unix_s + exposure_s / 2
         usual_s = USUAL_GAPS * self.period_s
-        rare = len(t) >= ENOUGH_TIMES and self.period_s > BRACKET_S
+        rare = len(t) >= MIN_TIMES and self.period_s > BRACKET_S
         gaps = [(float(gap), max(exposure_s / 2, usual_s)) for gap in np.diff(t[first:end])]
         for gap, one in ((t[first] - begin, first - 1), (over - t[end - 1], end - 1)):
             if not (0 <= one < len(t) - 1 and t[one + 1] - t[one] <= BRACKET_S):

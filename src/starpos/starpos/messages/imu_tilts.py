@@ -14,9 +14,9 @@ from starpos.messages.tilt import GAP, STUCK, Reading
 # m/s2; true within 0.3 % everywhere on the ground
 STANDARD_GRAVITY = 9.80665
 # Minimum number of messages in an average: fewer show no scatter.
-LEAST = 3
+MIN_MESSAGES = 3
 # Share of the time of an average that its messages must cover.
-COVERED = 0.5
+MIN_COVERED = 0.5
 # A stamp further ahead is wrong: the clocks of two hosts differ by less.
 FUTURE_S = 0.1
 # If stamps go back further than this, the clock was set.
@@ -24,7 +24,7 @@ NEW_TIME_S = 1.0
 # A lower bound, because a simulated accelerometer may have no noise.
 LEAST_STDDEV_RAD = 1e-6
 # Number of averages with noise after which one without noise means a stuck sensor.
-NOISY = 20
+MIN_NOISY = 20
 # Most messages in an average.
 MAX_MESSAGES = 10_000
 
@@ -152,7 +152,10 @@ class ForceAverager:
             messages.append(message)
             return None
         self._messages = [message]
-        if len(messages) < LEAST or messages[-1].stamp_ns - messages[0].stamp_ns < COVERED * length_ns:
+        if (
+            len(messages) < MIN_MESSAGES
+            or messages[-1].stamp_ns - messages[0].stamp_ns < MIN_COVERED * length_ns
+        ):
             self.breaks += bool(messages)
             return None
         return MeanForce.of(messages)
@@ -256,7 +259,7 @@ class ImuTilts:
         self._gap = False
         still = not np.ptp(average.forces, axis=0).any()
         # a simulated IMU may have no noise at all, except while it turns
-        if still and self._noisy >= NOISY:
+        if still and self._noisy >= MIN_NOISY:
             flags |= STUCK
         elif still:
             self._noisy = 0

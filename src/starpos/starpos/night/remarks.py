@@ -11,8 +11,8 @@ from starpos.averaging.average import Average
 from starpos.calibration.misalignment import Calibrated
 from starpos.calibration.unknown import (
     BY_OPTIONS,
+    FIND_TURN,
     MODEL_BY_OPTIONS,
-    TELL_IT,
     at_another_lean,
     may_turn,
     unknown_a3,
@@ -124,6 +124,6 @@ def of_turn(turned: Calibrated) -> Iterator[Remark]:
     found = turned.instrument.calibration
     yield Remark(Kind.CALIBRATED, f"calibrated: {error}; {at_another_lean(found)}")
     if may_turn(found):
-        yield Remark(Kind.CALIBRATED, f"to use A3 at another lean, {TELL_IT}")
+        yield Remark(Kind.CALIBRATED, f"to use A3 at another lean, {FIND_TURN}")
     if turned.beyond:
         yield Remark(Kind.INCLINOMETER, turned.beyond)

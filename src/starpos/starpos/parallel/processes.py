@@ -22,7 +22,7 @@ from starpos.parallel.call import Call, answer_of, given_up, worked
 # Calls for each process whose answers may wait for an earlier one.
 AHEAD = 4
 # Maximum number of processes in a row that end before they are ready.
-STILLBORN = 3
+MAX_STILLBORN = 3
 # Time for a process that no longer answers to end.
 DYING_S = 1.0
 # There is a process for each processor, so the libraries need no threads of their own.
@@ -97,7 +97,7 @@ class Processes:
         dead = self._workers[k]
         why = dead.end(DYING_S)
         self._stillborn += not dead.ready
-        if self._stillborn > STILLBORN:
+        if self._stillborn > MAX_STILLBORN:
             del self._workers[k]
             raise ProcessError(f"the processes of --jobs do not start ({why}): use fewer, or --jobs 1")
         self._workers[k] = _Worker()

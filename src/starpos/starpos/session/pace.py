@@ -5,7 +5,7 @@ import math
 from collections import deque
 
 # Interval over which the share of dropped frames is taken, and minimum number of frames.
-LATELY_S, FEWEST = 10.0, 10
+LATELY_S, MIN_FRAMES = 10.0, 10
 MOST_KEPT = 2000
 MOST_DROPPED = 0.5
 # Share of the interval by which a frame may come early, so that jitter of the stamps costs none.
@@ -87,7 +87,7 @@ class Pace:
         """Sentence, where most of the latest frames were dropped; '' where they were not."""
         frames = len(self._lately)
         dropped = sum(not taken for _, taken in self._lately)
-        if frames < FEWEST or dropped <= MOST_DROPPED * frames:
+        if frames < MIN_FRAMES or dropped <= MOST_DROPPED * frames:
             return ""
         return (
             f"{100 * dropped / frames:.0f} % of the frames of the last {LATELY_S:.0f} s were dropped: more come than "

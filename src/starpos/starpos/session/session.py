@@ -28,7 +28,7 @@ from starpos.messages.stamp import stamp_to_unix
 from starpos.messages.stars import message_to_stars
 from starpos.session import reports
 from starpos.session.attitude import attitude_seen
-from starpos.session.backlog import MOST, Backlog
+from starpos.session.backlog import MAX_WAITING, Backlog
 from starpos.session.calibrating import Calibrating
 from starpos.session.camera_solver import CameraSolver
 from starpos.session.clock_doubt import ClockDoubt
@@ -220,9 +220,9 @@ class SolverSession:
         if not math.isnan(self._values["clock_stddev"]):
             stars = replace(stars, clock_stddev_s=0.0)
         self.instrument.frame_came(stars.width, stars.height, at_once=not now.played)
-        if len(self._backlog) >= MOST:
+        if len(self._backlog) >= MAX_WAITING:
             self.pace.drop(now.waiting_s)
-            self._heard.refuse("stars", f"a frame was dropped: {MOST} wait for their tilts")
+            self._heard.refuse("stars", f"a frame was dropped: {MAX_WAITING} wait for their tilts")
             return
         self._backlog.add(Waiting(header, stars, now.waiting_s, now.ahead_s(stars.mid_unix_s)))
         if self.instrument.preparing and not now.played:
