@@ -6,6 +6,7 @@ names. `words.py --count` prints how often each pattern occurs. `make lint` runs
 """
 
 import ast
+import inspect
 import io
 import re
 import sys
@@ -99,7 +100,10 @@ LEFT_OUT = re.compile(
 QUOTED = re.compile(r"`[^`]*`|(?<=\])\([^)\s]*\)|<[^>\s]*>|\"[^\"]*\"|\w*_\w*")
 SENTENCE_END = re.compile(r"(?<=[.?!])[\"')*]*\s+(?=[^\w`]*[A-Z0-9`])")
 # Between paragraphs of a docstring, and before the description of an argument or a field.
-PARAGRAPH = re.compile(r"\n\s*\n|\n(?=[ \w,*]+(?:  |: ))|(?<=\S)  +(?=\S)")
+PARAGRAPH = re.compile(
+    r"\n\s*\n|\n(?=[ \w,*]+(?:  |: ))|(?<=\S)  +(?=\S)"
+    r"|(?<=\.)\s(?=[\w, ]+(?: \([^)]*\))?(?: in [\w.]+)?: )"
+)
 BLOCK = re.compile(r"\s*(?:[-*+] |\d+\. |#|\||>|: |```|$)")
 
 
@@ -144,7 +148,7 @@ def said(source: str) -> Iterator[tuple[int, str]]:
     for node in ast.walk(ast.parse(source)):
         match node:
             case ast.Expr(ast.Constant(str(text))):
-                for paragraph in PARAGRAPH.split(text):
+                for paragraph in PARAGRAPH.split(inspect.cleandoc(text)):
                     yield node.lineno, " ".join(paragraph.split())
     begun, last, gathered = 0, 0, ""
     for token in tokenize.generate_tokens(io.StringIO(source).readline):

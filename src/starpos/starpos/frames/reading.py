@@ -33,8 +33,9 @@ def read_frame(path: Path | str, clock: CameraClock | None = None) -> Frame | St
     clock: of the camera that wrote the file, if it may be trusted.
 
     FITS (also .fz and .gz): DATE-OBS (or DATE-BEG, MJD-OBS, MJD-BEG) is the start of the exposure in UTC (or in
-    TIMESYS), whose last digit is its error, EXPTIME or EXPOSURE its length in s, where 0 is unknown; a DATE-AVG is its
-    middle, a DATE-END its end. Where these contradict each other, or the frame is a stack (STACKCNT), there is no time.
+    TIMESYS), whose last digit is its error. EXPTIME or EXPOSURE is its length in s, where 0 is unknown; a DATE-AVG is
+    its middle, a DATE-END its end. Where these contradict each other, or the frame is a stack (STACKCNT), there is no
+    time.
     XORGSUBF and YORGSUBF (or LTV1 and LTV2) say of which part of the sensor a frame is. BAYERPAT (XBAYROFF, YBAYROFF) is
     the mosaic; FOCALLEN (mm) and XPIXSZ (um), or SCALE (arcsec), give focal_px. The first row of the file is row 0.
     Values that fit 16 bits are only rounded. Others are shifted to begin at 0, and scaled to fill 16 bits if their
