@@ -23,11 +23,12 @@ NODES = (
     "src/starpos_dashboard",
 )
 # Calls whose texts people read: diagnostics, warnings of nodes, remarks of commands.
-SHOWN = {"Diagnosis", "Remark", "warning", "warn", "complain", "_say", "failed"}
+SHOWN = {"Diagnosis", "Remark", "Finding", "warning", "warn", "complain", "refuse", "_say", "failed"}
 # A sentence has at least this number of words, and for each value this number: others are parts, or lines of results.
 MIN_WORDS, MIN_WORDS_A_VALUE = 4, 1.5
 GAP = "…"
 WORD = re.compile(r"[A-Za-z]{2,}")
+MARKUP = re.compile(r"<|&\w+;")
 # What happened, in three words or more, and behind a colon or semicolon what to do.
 PARTS = re.compile(r"^(?P<happened>(?:\S+ ){2,}?\S+?)(?:: |; )(?P<advice>.+)$", re.DOTALL)
 
@@ -105,8 +106,8 @@ def shown(tree: ast.AST, errors: set[str], known: Mapping[str, str]) -> Iterator
             case ast.Call(ast.Name(name) | ast.Attribute(_, name), arguments) if name in SHOWN:
                 for argument in arguments:
                     yield from texts(argument, known)
-            # a function that words a message returns what happened and what to do
-            case ast.Return(value) if value is not None:
+            # a function that words a message returns, or collects, what happened and what to do
+            case ast.Return(ast.expr() as value) | ast.Call(ast.Attribute(_, "append"), [value]):
                 yield from (text for text in texts(value, known) if PARTS.match(text) and ". " not in text)
 
 
@@ -118,10 +119,10 @@ def messages(folder: str, errors: set[str], shared: Mapping[str, str]) -> list[M
             # the place, such as a file, comes first
             plain = re.sub(rf"^{GAP}: ", "", " ".join(text.split())).rstrip(".")
             words = len(WORD.findall(plain))
-            if words >= max(MIN_WORDS, MIN_WORDS_A_VALUE * plain.count(GAP)) and "<" not in plain:
+            if words >= max(MIN_WORDS, MIN_WORDS_A_VALUE * plain.count(GAP)) and not MARKUP.search(plain):
                 parts = PARTS.match(plain)
                 found.add(Message(parts["happened"], parts["advice"]) if parts else Message(plain, ""))
-    return sorted(found, key=lambda message: message.happened.lstrip(f"{GAP} ").lower())
+    return sorted(found, key=lambda message: (message.happened.lstrip(f"{GAP} ").lower(), message))
 
 
 def about(package: Path) -> str:
