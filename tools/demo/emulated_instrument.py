@@ -3,7 +3,7 @@
 
 The inclinometer's firmware, as it is flashed, runs on an emulated ATmega8 with its converter and sensor
 (starpos_inclinometer/firmware/sim). The camera is the CCD simulator of a real indiserver; indi_sky.py gives it the sky of
-each exposure. The four nodes are the installed ones. The place is drawn at random, and the nodes do not know it.  Exit
+each exposure. The four nodes are the installed ones. The place is drawn at random, and the nodes are not told it.  Exit
 status 0 if the truth lies within 4 sigma and all ended cleanly; 2 where something is not installed.
 """
 
@@ -106,7 +106,7 @@ def wait_for(port: int):
 
 def start_nodes(nodes: Processes, place: Place, found: dict):
     nodes.node("starpos_inclinometer", "inclinometer", found["inclinometer"])
-    # A3 is exact here, and the sky has the same clock, so their usual errors would only widen the covariance.
+    # A3 is exact here, and the clock is also that of the sky, so their usual errors would only widen the covariance.
     exact = {
         "misalignment_stddev": EXACT_ARCSEC,
         "inclinometer.model": "sca100t_calibrated",

@@ -4,8 +4,8 @@
     indi_sky.py PORT FOLDER EXPOSURE_S SEED PLACE       PLACE: instrument_run.Place as JSON
 
 The simulator reads its frames from a folder when an exposure begins.  The folder has one file, and this process holds a
-lease on it (fcntl(2), F_SETLEASE). When the simulator opens the file, the kernel notifies this process, and the
-simulator waits until the sky of that moment is drawn and the lease given back.  Only this process knows the place.
+lease on it (fcntl(2), F_SETLEASE). When the simulator opens the file, the kernel tells this process, and the simulator
+waits until the sky of that moment is drawn and the lease given back.  Only this process knows the place.
 Prints `ready`, then the Unix time of each exposure's begin.
 """
 
@@ -47,7 +47,7 @@ class Picture:
         np.bitwise_xor(pixels, 0x8000, out=self._pixels, casting="unsafe")
 
     def lease(self):
-        """Wait until the file has no reader; from then on a reader has to wait, and SIGIO announces it."""
+        """Wait until nobody reads the file; from then on a reader has to wait, and SIGIO tells of it."""
         end = time.monotonic() + PATIENCE_S
         while True:
             try:

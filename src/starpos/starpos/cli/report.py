@@ -131,7 +131,7 @@ def _night(path: Path, args: argparse.Namespace) -> Night:
 
 
 def _exposures(path: Path, args: argparse.Namespace) -> "Exposures | tuple[Recorded, OfBag]":
-    """The exposures of a folder or a bag; raises StarposError if there is nothing to work on."""
+    """The exposures of a folder, or what a bag holds; raises StarposError if there is nothing to work on."""
     from starpos.night import bag, recorded
 
     air, vertical, progress = options.atmosphere_of(args), vertical_of(args), console.ProgressBar()

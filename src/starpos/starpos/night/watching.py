@@ -39,7 +39,7 @@ def watched_night(
 ) -> WatchedNight:
     """Solve a night's frames in the order of their times, each with its identification so far.
 
-    tilts: None if only headings are wanted.  learned: what earlier nights taught of the instrument.
+    tilts: None where headings alone are wanted.  learned: what is known of the instrument from earlier nights.
     """
     watch = GnssWatch(solver.instrument, vertical, learned)
     said: Counter[str] = Counter()

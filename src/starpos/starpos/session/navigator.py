@@ -39,7 +39,7 @@ from starpos.session.reports import AHEAD_S
 
 # minimum length of the window before it is adjusted, s, and minimum frames per second of the period
 SHORTEST_S, FRAMES_PER_S = 10.0, 30.0
-# 1 sigma beyond which a position counts as unknown, m an axis
+# a claim is wide beyond, m an axis
 WIDE_M = 1000.0
 STARTING = "no frame with stars yet"
 APART = "all frames with stars are stamped later than the IMU's readings: set their clocks by one source"
@@ -93,7 +93,7 @@ class NavigatorSession:
         self._seen_s = -math.inf
         self._clock_stddev_s = 0.0
         self._gnss: GnssPlace | None = None
-        # marks outcomes of jobs that began before as out of date
+        # an outcome of a job that began before counts no more
         self._voyage = object()
 
     @property

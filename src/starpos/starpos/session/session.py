@@ -134,7 +134,7 @@ class SolverSession:
 
     @property
     def busy(self) -> bool:
-        """Whether a job runs; frames that come meanwhile may be answered with its outcome, or without."""
+        """Whether a job runs: what comes meanwhile may be answered with its outcome, or without."""
         return self.instrument.preparing or self.calibrating.busy
 
     # parameters ------------------------------------------------------------------------------------------------------
