@@ -2,7 +2,7 @@
 """`starpos solve --gnss`: frames with a GNSS receiver beside them, which teaches the instrument and is guarded."""
 
 import argparse
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from starpos.cli import console, heading_output
@@ -108,6 +108,10 @@ def run(
             told = Watched(solution=Solution.unreadable(path, answer))
         else:
             told = next(following)
+            # the frame was identified before this solver had its focal length: the remark is of that moment
+            if remark := answer[0].solution.remark:
+                console.complain("solve", remark)
+                told = replace(told, solution=replace(told.solution, remark=remark))
         warnings |= set(told.solution.warnings)
         if told.solution.fix:
             solved.append(Solved.of(told.solution, told.solution.fix))
