@@ -84,3 +84,30 @@ def test_learned_needs_gnss(drive, tmp_path, capsys):
         capsys, "solve", *frames, "--tilt", drive / "tilt.csv", "--learned", tmp_path / "a.json"
     )
     assert status == 2 and "give both" in errors[0]
+
+
+def test_without_gnss_its_code_is_not_asked_and_no_key_is_new(drive, capsys, monkeypatch):
+    frames = sorted(drive.glob("stars_*.csv"))
+    command = (
+        "solve",
+        *frames,
+        "--tilt",
+        drive / "tilt.csv",
+        *AIR,
+        *WIDE,
+        *SENSOR,
+        "--misalignment",
+        "1.5",
+        "-2",
+    )
+    command = (*command, "130", "--json")
+    before = run(capsys, *command)
+
+    def never(*_):
+        raise AssertionError("GNSS was asked")
+
+    for name in ("watch.GnssWatch.__init__", "track.GnssTrack.__init__", "table.read_gnss_csv"):
+        monkeypatch.setattr(f"starpos.gnss.{name}", never)
+    assert run(capsys, *command) == before
+    for line in objects(before[1]):
+        assert line["status"] == "ok" and "gnss" not in line
