@@ -21,8 +21,8 @@ from starpos.units import ARCSEC, HOUR_S
 CONSTANT_SHARE = 0.5
 # Distance (m) over which the field is forgotten, by exp(-d / L): 20 nautical miles.  Our choice, after the Markov models
 # with which inertial navigation describes deflections (reviewed by Nash and Jordan, Statistical geodesy - an engineering
-# perspective, Proc. IEEE 66(5), 1978, 532-550, of which only the abstract was at hand).  Laws that agree with those of
-# anomaly and geoid are smooth at d = 0 (Jordan, JGR 77(20), 1972): next to them an exponential forgets more on a short way.
+# perspective, Proc. IEEE 66(5), 1978, 532-550, of which only the abstract was at hand).  Laws that agree with anomaly and
+# geoid are smooth at d = 0 (Jordan, JGR 77(20), 1972): an exponential forgets more on a short way.
 FIELD_LENGTH_M = 37_000.0
 # An error of GNSS that it does not state: multipath, which changes within minutes.
 GNSS_SLOW_RAD, GNSS_SLOW_S = 10.0 / 6.371e6, 300.0
