@@ -127,6 +127,21 @@ class Learned:
         """A3 (3, 3) with what was learned of it."""
         return rotation.from_vector(self.state[self.layout.a3]) @ self.a3
 
+    @property
+    def a3_stddev_rad(self) -> tuple[float, float]:
+        """1 sigma of A3 across the plumb line, an axis, and about it."""
+        a3, up = self.covariance[self.layout.a3, self.layout.a3], self.calibrated_up
+        about2 = float(up @ a3 @ up)
+        return float(np.sqrt(max(np.trace(a3) - about2, 0.0) / 2)), float(np.sqrt(about2))
+
+    @property
+    def deflection_stddev_rad(self) -> float:
+        """1 sigma of a component of the deflection at `place`."""
+        at, covariance = self.layout, self.covariance
+        both = covariance[at.constant, at.constant] + covariance[at.field, at.field]
+        both = both + covariance[at.constant, at.field] + covariance[at.field, at.constant]
+        return float(np.sqrt(np.trace(both) / 2))
+
     def columns(self, tilt: Tilt) -> tuple[np.ndarray, np.ndarray]:
         """Change of up in S for the response's coefficients (3, m), and for errors of the angles (3, axes)."""
         zeroed = _zeroed(tuple(self.calibrated_up.tolist()), self.axes)
