@@ -11,7 +11,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from sensor_msgs.msg import Imu, NavSatFix
 
 from starpos_dashboard import readings
-from starpos_interfaces.msg import Solution, Tilt
+from starpos_interfaces.msg import GnssCheck, Solution, Tilt
 
 # Age at which messages of 1 Hz or faster are old.
 FAST_S = 5.0
@@ -72,6 +72,9 @@ class Board:
 
     def hear_solution(self, message: Solution) -> None:
         self._keep("solution", readings.solution(message))
+
+    def hear_gnss(self, message: GnssCheck) -> None:
+        self._keep("gnss", readings.gnss(message))
 
     def hear_diagnostics(self, message: DiagnosticArray) -> None:
         """Keep the diagnostics of the nodes that have lights."""

@@ -13,7 +13,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from sensor_msgs.msg import Imu, NavSatFix, NavSatStatus
 
 from starpos.messages.stamp import stamp_to_unix
-from starpos_interfaces.msg import Solution, Tilt
+from starpos_interfaces.msg import GnssCheck, Solution, Tilt
 
 # Maximum length of a text from outside.
 NAME_LETTERS, SENTENCE_LETTERS = 80, 300
@@ -30,6 +30,13 @@ TILT_FLAGS = (
     (Tilt.GAP, "readings were lost"),
     (Tilt.TIME_UNKNOWN, "its time is unknown"),
 )
+
+GNSS_WORDS = {
+    GnssCheck.LEARNING: "learning",
+    GnssCheck.AGREES: "agrees",
+    GnssCheck.DOUBTFUL: "doubtful",
+    GnssCheck.DISAGREES: "disagrees",
+}
 
 
 def number(value: float) -> float | None:
@@ -100,6 +107,21 @@ def tilt(message: Tilt) -> dict:
         "sigma_y": sigma_y,
         "temperature": number(message.temperature),
         "flags": [said for flag, said in TILT_FLAGS if message.flags & flag],
+    }
+
+
+def gnss(message: GnssCheck) -> dict | None:
+    """Place [deg] of GNSS, and what the stars say of it; None for a status that is none of the message's constants."""
+    if message.status not in GNSS_WORDS:
+        return None
+    latitude, longitude = number(message.latitude), number(message.longitude)
+    on_earth = latitude is not None and longitude is not None and max(abs(latitude), abs(longitude) / 4) <= 90
+    return {
+        "status": GNSS_WORDS[message.status],
+        "sentence": text(message.status_text),
+        "latitude": latitude if on_earth else None,
+        "longitude": longitude if on_earth else None,
+        "stamp": stamp_to_unix(message.header.stamp),
     }
 
 

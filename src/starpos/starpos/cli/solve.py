@@ -101,10 +101,10 @@ def _run(args: argparse.Namespace) -> int:
     )
     near_of(args)
     own_level = options.has_own_level(args)
-    satellites = solve_gnss.read(args)
+    receiver = solve_gnss.read_receiver(args.gnss, args.learned, "solve")
     # the folder of a night has its tilts
     needs_no_tilt = own_level or (
-        (place is not None or satellites is not None) and not any(map(os.path.isdir, args.frames))
+        (place is not None or receiver is not None) and not any(map(os.path.isdir, args.frames))
     )
     given = nights_of(frames_among(args.frames, args.tilt, args.gnss), args.tilt, needs_no_tilt)
     if args.save is not None and len(given) > 1:
@@ -130,8 +130,8 @@ def _run(args: argparse.Namespace) -> int:
         for plan in plans:
             # takes the answers of this night, and leaves the rest
             rows: Iterable = zip(plan.night.frames, answers, strict=False)
-            if satellites is not None:
-                statuses.append(solve_gnss.run(args, output, plan, list(rows), satellites, vertical))
+            if receiver is not None:
+                statuses.append(solve_gnss.run(args, output, plan, list(rows), receiver, vertical))
                 continue
             if args.self_calibrate:
                 rows, saving = _turned(args, plan, list(rows))

@@ -15,8 +15,7 @@ FEW_POSES = 6
 def what_would_tell_more(learned: Learned) -> str:
     """Say in a sentence what would teach most; '' if nothing stands out."""
     at, covariance = learned.layout, learned.covariance
-    up = learned.calibrated_up
-    turn = float(np.sqrt(up @ covariance[at.a3, at.a3] @ up))
+    _, turn = learned.a3_stddev_rad
     if turn > LINEAR_TURN_RAD:
         return f"lean it otherwise at each pose: A3's turn about the plumb line is known to {np.degrees(turn):.2g} deg"
     if _correlation(covariance, at.a3, at.constant) > ALIKE:

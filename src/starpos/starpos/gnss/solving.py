@@ -45,11 +45,13 @@ class Watched:
 
     solution: with a place, or with a heading at GNSS's place where too little is known for one.
     ground: the geodetic place, None without a fix.  compared: None without a GNSS place.
+    learned: what is known after the frame; None where nothing is.
     """
 
     solution: Solution
     ground: Geodetic | None = None
     compared: Compared | None = None
+    learned: Learned | None = None
 
 
 def watched(
@@ -86,10 +88,10 @@ def watched(
         none = replace(levelled, status=Status.POOR_FIT, message=why, fix=None, at_place=rough.at_place)
         answer = Watched(solution=none)
     if gnss is None or check is None:
-        return answer
+        return replace(answer, learned=watch.learned)
     watch.learn(sighting, gnss, check)
     frames, poses = (0, 0) if watch.learned is None else (watch.learned.frames, watch.learned.poses)
-    return replace(answer, compared=Compared(gnss, check, frames, poses))
+    return replace(answer, compared=Compared(gnss, check, frames, poses), learned=watch.learned)
 
 
 def _up(watch: GnssWatch, fix: Fix, tilt: Tilt, gnss: GnssPlace | None) -> np.ndarray | None:
@@ -144,12 +146,10 @@ def _ground(fix: Fix, sighting: LevelSight, learned: Learned, vertical: Vertical
     """The geodetic place, whose error knows that A3 and the deflection were learned together."""
     at, covariance = learned.layout, learned.covariance
     deflection = learned.deflection_rad(vertical, fix.latitude, fix.longitude) / ARCSEC
-    both = covariance[at.constant, at.constant] + covariance[at.field, at.field]
-    both = both + covariance[at.constant, at.field] + covariance[at.field, at.constant]
     applied = Deflection(
         xi_arcsec=float(deflection[1]),
         eta_arcsec=float(deflection[0]),
-        stddev_arcsec=float(np.sqrt(np.trace(both) / 2)) / ARCSEC,
+        stddev_arcsec=learned.deflection_stddev_rad / ARCSEC,
     )
     ground = geodetic(fix.latitude, fix.longitude, fix.heading, fix.covariance, applied)
     prime, meridian = curvature_radii_m(ground.latitude)

@@ -19,9 +19,10 @@ from starpos.units import ARCSEC, HOUR_S
 
 # Share of the deflection's variance that is the same everywhere the instrument goes; the rest is a field.
 CONSTANT_SHARE = 0.5
-# Distance (m) over which the field is forgotten, by exp(-d / L).  That and the exponential law are those with which
-# inertial navigation models deflections (Nash and Jordan, Statistical Geodesy, Proc. IEEE 66(5), 1978: 20 nautical
-# miles); from memory, the paper was not at hand.
+# Distance (m) over which the field is forgotten, by exp(-d / L): 20 nautical miles.  Our choice, after the Markov models
+# with which inertial navigation describes deflections (reviewed by Nash and Jordan, Statistical geodesy - an engineering
+# perspective, Proc. IEEE 66(5), 1978, 532-550, of which only the abstract was at hand).  Laws that agree with anomaly and
+# geoid are smooth at d = 0 (Jordan, JGR 77(20), 1972): an exponential forgets more on a short way.
 FIELD_LENGTH_M = 37_000.0
 # An error of GNSS that it does not state: multipath, which changes within minutes.
 GNSS_SLOW_RAD, GNSS_SLOW_S = 10.0 / 6.371e6, 300.0
@@ -125,6 +126,21 @@ class Learned:
     def rotation(self) -> np.ndarray:
         """A3 (3, 3) with what was learned of it."""
         return rotation.from_vector(self.state[self.layout.a3]) @ self.a3
+
+    @property
+    def a3_stddev_rad(self) -> tuple[float, float]:
+        """1 sigma of A3 across the plumb line, an axis, and about it."""
+        a3, up = self.covariance[self.layout.a3, self.layout.a3], self.calibrated_up
+        about2 = float(up @ a3 @ up)
+        return float(np.sqrt(max(np.trace(a3) - about2, 0.0) / 2)), float(np.sqrt(about2))
+
+    @property
+    def deflection_stddev_rad(self) -> float:
+        """1 sigma of a component of the deflection at `place`."""
+        at, covariance = self.layout, self.covariance
+        both = covariance[at.constant, at.constant] + covariance[at.field, at.field]
+        both = both + covariance[at.constant, at.field] + covariance[at.field, at.constant]
+        return float(np.sqrt(np.trace(both) / 2))
 
     def columns(self, tilt: Tilt) -> tuple[np.ndarray, np.ndarray]:
         """Change of up in S for the response's coefficients (3, m), and for errors of the angles (3, axes)."""

@@ -13,7 +13,7 @@ from starpos.earth.vertical import Vertical
 from starpos.errors import FrameError, TiltError
 from starpos.files import read_regular
 from starpos.frames.frame import Frame
-from starpos.frames.night_files import SIMULATED, TILTS, TRUTH
+from starpos.frames.night_files import GNSS, SIMULATED, TILTS, TRUTH
 from starpos.frames.reading import FITS, read_frame
 from starpos.frames.stars import Stars
 from starpos.instrument.inclinometer import SCA100T_NOISE_RAD
@@ -80,7 +80,7 @@ def frames_in(folder: Path) -> list[Path]:
     except OSError as e:
         raise FrameError(f"{folder}: the folder cannot be read ({e.strerror})") from None
     frames = [p for p in files if p.suffix.lower() in FITS]
-    frames = frames or [p for p in files if p.suffix.lower() == ".csv" and p.name != TILTS]
+    frames = frames or [p for p in files if p.suffix.lower() == ".csv" and p.name not in (TILTS, GNSS)]
     if not frames:
         raise FrameError(
             f"{folder}: no frames in it: a night is a folder of FITS frames, or of CSV lists of stars, and {TILTS}"

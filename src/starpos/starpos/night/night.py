@@ -18,6 +18,7 @@ from starpos.fix.readable import InDegrees
 from starpos.fix.solution import Attitude, Solution, Status
 from starpos.frames.stars import Stars
 from starpos.night.remarks import Remark
+from starpos.night.watching import WatchedNight
 
 NO_TILT = (float("nan"), float("nan"))
 NO_STARS = np.zeros((0, 2))
@@ -180,6 +181,7 @@ class Night:
     combined: the average, astronomic and in rad; None without one, and why_not says why.
     wgs84: the same for a map, in deg.
     steady (N, 3): latitude, longitude, heading (rad) of the fixes with one tilt for all; None if the camera moved.
+    watched: what GNSS taught and what its guard said, of each frame that can be read; None without GNSS.
     """
 
     name: str
@@ -191,6 +193,7 @@ class Night:
     atmosphere: Atmosphere
     truth: Truth | None = None
     steady: np.ndarray | None = None
+    watched: WatchedNight | None = None
     remarks: tuple[Remark, ...] = ()
 
     @property

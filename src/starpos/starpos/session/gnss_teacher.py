@@ -7,8 +7,6 @@ from collections import deque
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
-
 from starpos.errors import GnssError, StarposError
 from starpos.files import path_of
 from starpos.fix.solution import Solution, Status
@@ -199,17 +197,14 @@ class GnssTeacher:
     def _values_of(self, learned: Learned | None) -> dict[str, object]:
         if learned is None or not learned.frames:
             return {"frames learned from": 0}
-        at, up = learned.layout, learned.calibrated_up
-        a3 = learned.covariance[at.a3, at.a3]
-        turn2 = float(up @ a3 @ up)
-        deflection = np.sqrt(np.trace(learned.covariance[at.constant, at.constant]) / 2) / ARCSEC
+        across, about = learned.a3_stddev_rad
         return {
             "frames learned from": learned.frames,
             "poses learned from": learned.poses,
             "learned since": utc_text(learned.since_unix_s),
-            "A3 across the plumb line (arcsec, 1 sigma)": math.sqrt((np.trace(a3) - turn2) / 2) / ARCSEC,
-            "A3 about the plumb line (arcsec, 1 sigma)": math.sqrt(turn2) / ARCSEC,
-            "deflection (arcsec, 1 sigma)": float(deflection),
+            "A3 across the plumb line (arcsec, 1 sigma)": across / ARCSEC,
+            "A3 about the plumb line (arcsec, 1 sigma)": about / ARCSEC,
+            "deflection (arcsec, 1 sigma)": learned.deflection_stddev_rad / ARCSEC,
             "more would tell": what_would_tell_more(learned),
         }
 

@@ -7,6 +7,7 @@ last one on.
 """
 
 import math
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -15,12 +16,15 @@ import numpy as np
 
 from starpos.earth.ellipsoid import enu_axes
 from starpos.earth.gravity import geodetic_place
+from starpos.earth.known_place import KnownPlace
 from starpos.earth.vertical import Geodetic, geodetic
 from starpos.errors import GnssError, StarposError, VoyageError
-from starpos.gnss.place import GnssPlace, message_to_gnss
+from starpos.gnss.place import GnssPlace, known_place, message_to_gnss
+from starpos.gnss.track import GnssTrack
 from starpos.messages.attitude import message_to_attitude
 from starpos.messages.stamp import stamp_to_unix
 from starpos.navigation.adjustment import FEWEST_FRAMES
+from starpos.navigation.at_place import BodyAttitude, attitude_at_place
 from starpos.navigation.estimate import Estimate
 from starpos.navigation.motion import PLACE
 from starpos.navigation.observability import Observability, observability
@@ -39,6 +43,8 @@ from starpos.session.reports import AHEAD_S
 
 # minimum length of the window before it is adjusted, s, and minimum frames per second of the period
 SHORTEST_S, FRAMES_PER_S = 10.0, 30.0
+# fixes of GNSS that are kept: attitudes come later than they
+GNSS_KEPT = 100
 # a claim is wide beyond, m an axis
 WIDE_M = 1000.0
 STARTING = "no frame with stars yet"
@@ -58,12 +64,16 @@ class Position:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Navigated:
-    """An output at one time: a fix, the place on the ellipsoid, where it lies from the origin; None without support."""
+    """An output at one time: a fix, the place on the ellipsoid, where it lies from the origin; None without support.
+
+    at_place: heading, pitch and roll at a known place, while there is no fix; None where no place is known.
+    """
 
     utc_unix_s: float
     fix: VoyageFix | None = None
     ground: Geodetic | None = None
     position: Position | None = None
+    at_place: BodyAttitude | None = None
 
 
 class NavigatorSession:
@@ -92,7 +102,7 @@ class NavigatorSession:
         # of the newest frame that the estimate is made of
         self._seen_s = -math.inf
         self._clock_stddev_s = 0.0
-        self._gnss: GnssPlace | None = None
+        self._gnss: deque[GnssPlace] = deque(maxlen=GNSS_KEPT)
         # an outcome of a job that began before counts no more
         self._voyage = object()
 
@@ -134,13 +144,34 @@ class NavigatorSession:
         try:
             attitude = message_to_attitude(message)
             self._check_time(attitude.utc_unix_s, now, "an attitude")
-            self._recent.add_frame(PlacelessFrame.of(attitude))
+            frame = PlacelessFrame.of(attitude)
+            self._recent.add_frame(frame)
         except StarposError as e:
             self._heard.refuse("attitude", str(e))
             return []
         self._clock_stddev_s = attitude.clock_stddev_s
         self._heard.came("attitude")
-        return []
+        return self._at_place(frame)
+
+    def _at_place(self, frame: PlacelessFrame) -> list[Navigated]:
+        """The heading at a known place, while there is no fix."""
+        if self._estimate is not None and not self._stars_missing:
+            return []
+        try:
+            place = self._settings.site or self._by_gnss(frame.utc_unix_s)
+        except GnssError as e:
+            self._heard.refuse("gnss/fix", str(e))
+            return []
+        if place is None:
+            return []
+        found = attitude_at_place(frame, place, self._settings.vessel(self._clock_stddev_s))
+        return [Navigated(utc_unix_s=frame.utc_unix_s, at_place=found)]
+
+    def _by_gnss(self, utc_unix_s: float) -> KnownPlace | None:
+        if not self._values["gnss.use"]:
+            return None
+        gnss = GnssTrack(list(self._gnss)).at(utc_unix_s)
+        return None if gnss is None else known_place(gnss, self._settings.vertical)
 
     def take_velocity(self, message: Any, now: Now, name: str) -> list[Navigated]:
         """Take a nav_msgs/Odometry or a geometry_msgs/TwistWithCovarianceStamped, from the topic of that name."""
@@ -166,9 +197,9 @@ class NavigatorSession:
     def take_gnss(self, message: Any, now: Now) -> list[Navigated]:
         """Take a sensor_msgs/NavSatFix of satellites: it is compared, not fused."""
         try:
-            self._gnss = message_to_gnss(message, UNSTATED_M)
+            self._gnss.append(message_to_gnss(message, UNSTATED_M))
         except GnssError:
-            self._gnss = None
+            self._gnss.clear()
         self._heard.came("gnss/fix")
         return []
 
@@ -324,10 +355,10 @@ class NavigatorSession:
         if self._stars_missing:
             return Diagnosis(Level.WARN, self._why_old(since_s), values)
         faults = list(self._faults)
-        if self._gnss is not None and abs(estimate.utc_unix_s - self._gnss.utc_unix_s) < OLDEST_S:
+        if self._gnss and abs(estimate.utc_unix_s - self._gnss[-1].utc_unix_s) < OLDEST_S:
             fix = estimate.fix
             moving = float(np.linalg.norm(fix.velocity))
-            apart_m, wrong = contradiction(self._gnss, self._ground(fix), fix.utc_unix_s, moving)
+            apart_m, wrong = contradiction(self._gnss[-1], self._ground(fix), fix.utc_unix_s, moving)
             values["GNSS from here (m)"] = apart_m
             faults += [wrong] if wrong else []
         said = [f"place to {known.sigma_m:.3g} m", *([known.missing] if known.missing else [])]

@@ -105,7 +105,10 @@ def test_a_frame_without_a_sound_time_has_no_fix_and_is_identified_all_the_same(
 
 def test_the_sentence_about_a_wrong_header_is_in_the_json(lists, run, tmp_path):
     wrong, right = changed(lists, tmp_path, XPIXSZ=6.8)[0], sorted(lists.glob("stars_*.csv"))[1]
-    for command in (("identify",), ("solve", "--tilt", lists / "tilt.csv", *AIR, *KNOWN[len(WIDE) :])):
+    gnss = tmp_path / "gnss.csv"
+    gnss.write_text("utc_unix_s,latitude,longitude,sigma_east_m,sigma_north_m\n")
+    solve = ("solve", "--tilt", lists / "tilt.csv", *AIR, *KNOWN[len(WIDE) :])
+    for command in (("identify",), solve, (*solve, "--gnss", gnss)):
         _, out, errors = run(*command, wrong, right, "--json")
         told = next(line for line in errors if "its header is wrong" in line)
         of_wrong, of_right, *_ = objects(out)

@@ -354,3 +354,19 @@ def test_gnss_without_a_fix_is_no_place(messages, begin_s):
     told.session.take_gnss(lost, Now.in_data(came_s))
     [answer] = told.tell(STARS, stars, came_s)
     assert answer.solution.at_place is None
+
+
+def test_without_gnss_use_messages_of_gnss_change_no_answer(messages, begin_s):
+    stars, came_s = first(messages, STARS)
+    answers = []
+    for given in (False, True):
+        told = seen_at(messages, begin_s)
+        for tilt, _ in tilts_of(messages, came_s + 5.0):
+            told.tell(TILT, tilt, came_s)
+        if given:
+            told.session.take_gnss(gnss_fix(stars, latitude=10.0), Now.in_data(came_s))
+        [answer, *_] = told.tell(STARS, stars, came_s)
+        assert answer.solution.ok and answer.beside is None
+        fix = answer.solution.fix
+        answers.append((fix.latitude, fix.longitude, fix.covariance.tobytes(), answer.ground.latitude))
+    assert answers[0] == answers[1] and told.session.gnss is None
