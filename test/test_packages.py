@@ -36,7 +36,7 @@ OPTIONAL = {
     "gi", "gphoto2", "indipyclient", "lz4", "pillow_heif", "rawpy", "requests", "rosbags", "selenium",
     "starpos_camera.sources.alpaca_http", "starpos_testing.skies.bags", "starpos_testing.skies.robots", "urllib3",
 }  # fmt: skip
-# Modules beside the tests.
+# Modules next to the tests.
 HELPERS = {path.stem for folder in PYTHON for path in folder.glob("test/**/*.py")}
 # A test writes it.
 HELPERS |= {"late_starpos"}
