@@ -21,6 +21,7 @@ from starpos.zenith.errors import Errors, errors_of
 from starpos.zenith.faces import faces_of
 from starpos.zenith.lines import LeanEstimate, Lines, start_of
 from starpos.zenith.places import StarPlaces
+from starpos.zenith.quality import FaceQuality, Leftover, StarQuality, face_qualities
 from starpos.zenith.sighting import Mark, ZenithSighting
 
 STEPS = 8
@@ -56,9 +57,7 @@ class Adjusted:
     frame_stddev_arcsec (N, 2): what these should scatter by.
     catalogue_factor: size of the catalogue's errors over what it states, by the session's own stars.
     chi2_per_degree: of the residuals; 1 where the stated errors and those of the air explain them.
-    by_lean (N, 2, 2), by_second (N, 2): derivatives of the readings by eta and xi, and by a second of the clock, rad.
-    projector (2 N, 2 N), weighted (2 N,): weights of the readings that the unknowns leave, and of their residuals, for
-    tests of what else there may be.
+    face_quality: each face against the others.  stars: the residuals and the leverage of each star.
     """
 
     xi_arcsec: float
@@ -73,10 +72,9 @@ class Adjusted:
     air: Air
     catalogue_factor: float
     chi2_per_degree: float
-    by_lean: np.ndarray
-    by_second: np.ndarray
-    projector: np.ndarray
-    weighted: np.ndarray
+    face_quality: tuple[FaceQuality, ...]
+    stars: StarQuality
+    leftover: Leftover
 
     @property
     def sigma_arcsec(self) -> np.ndarray:
@@ -135,7 +133,7 @@ def adjusted(
         estimate, offset = estimate.moved(fit.step), offset + fit.step
         if np.abs(fit.step).max() < SETTLED * np.sqrt(np.diag(fit.covariance)).min():
             break
-    return _adjusted(estimate, sightings, lines, errors, fit, air, faces, mark, places.factor)
+    return _adjusted(estimate, sightings, lines, errors, fit, air, faces, mark, places)
 
 
 def _prior_of(instrument: Instrument) -> np.ndarray:
@@ -198,7 +196,7 @@ def _adjusted(
     air: Air,
     faces: np.ndarray,
     mark: Mark,
-    catalogue_factor: float,
+    places: StarPlaces,
 ) -> Adjusted:
     # slow to import
     from scipy.linalg import cho_solve
@@ -214,7 +212,7 @@ def _adjusted(
         term = gain @ covariance @ gain.T
         total += term
         if term.any():
-            xi, eta = np.sqrt(np.diag(term)).tolist()
+            xi, eta = np.sqrt(np.maximum(np.diag(term), 0.0)).tolist()
             terms.append((name, xi, eta))
     whole = fit.covariance[:2, :2][::-1, ::-1] / ARCSEC**2
     given = np.sqrt(np.maximum(np.diag(whole - total), 0.0))
@@ -231,6 +229,12 @@ def _adjusted(
     xi_eta = estimate.lean[::-1] / ARCSEC
     inverse = cho_solve((fit.root, True), np.eye(2 * n))
     design = inverse @ lines.by_parameters.reshape(-1, 5)
+    leftover = Leftover(
+        by_lean=lines.by_lean,
+        by_second=lines.by_sky @ (mark.enu[:, 2] * ROTATION_RAD_S),
+        projector=inverse - design @ fit.covariance @ design.T,
+        weighted=inverse @ left.reshape(-1),
+    )
     return Adjusted(
         xi_arcsec=float(xi_eta[0]),
         eta_arcsec=float(xi_eta[1]),
@@ -242,10 +246,9 @@ def _adjusted(
         frame_arcsec=np.einsum("nab,nb->na", back, left)[:, ::-1] / ARCSEC,
         frame_stddev_arcsec=np.sqrt(np.diagonal(per_frame, axis1=1, axis2=2))[:, ::-1] / ARCSEC,
         air=air,
-        catalogue_factor=catalogue_factor,
+        catalogue_factor=places.factor,
         chi2_per_degree=fit.chi2 / max(left.size - 5, 1),
-        by_lean=lines.by_lean,
-        by_second=lines.by_sky @ (mark.enu[:, 2] * ROTATION_RAD_S),
-        projector=inverse - design @ fit.covariance @ design.T,
-        weighted=inverse @ left.reshape(-1),
+        face_quality=face_qualities(leftover, sightings, faces),
+        stars=StarQuality.of(sightings, places, lines, gain),
+        leftover=leftover,
     )

@@ -23,11 +23,12 @@ MOST_FACTOR = 5.0
 class StarPlaces:
     """Corrections of S stars' places along the axes of ICRS, in units of their sigmas in the catalogue.
 
-    rows: for each frame, which of the S stars are its (N,).  correction (S, 3).
+    stars (S,): rows of the catalogue.  rows: for each frame, which of the S stars are its (N,).  correction (S, 3).
     root (3 S, 3 S): lower triangular, of the weights that the corrections have.
     factor: size of the catalogue's errors over what it states.
     """
 
+    stars: np.ndarray
     rows: tuple[np.ndarray, ...]
     correction: np.ndarray
     root: np.ndarray
@@ -53,7 +54,7 @@ class StarPlaces:
         factor = _factor(flat, pull)
         root = cholesky(flat + np.eye(len(flat)) / factor**2, lower=True)
         correction = cho_solve((root, True), pull).reshape(-1, 3)
-        return cls(rows=rows, correction=correction, root=root, factor=factor)
+        return cls(stars=names, rows=rows, correction=correction, root=root, factor=factor)
 
     def applied(self, sightings: Sequence[ZenithSighting]) -> list[ZenithSighting]:
         """The sightings with the attitudes that the corrected places give."""
