@@ -5,9 +5,12 @@ import numpy as np
 import pytest
 from sessions import INSTRUMENT, MARK, VACUUM, drawn
 
+from starpos.earth.ellipsoid import enu_axes
 from starpos.errors import FixError
+from starpos.units import ARCSEC
 from starpos.zenith.adjustment import adjusted
 from starpos.zenith.faces import faces_of
+from starpos.zenith.lines import LeanEstimate
 
 
 @pytest.mark.parametrize("turn_deg", [0.0, 94.0, 180.0, 271.0])
@@ -47,6 +50,15 @@ def test_more_faces_do_not_average_what_their_air_shares(rng):
 def test_faces_are_runs_of_one_heading(rng):
     sightings = drawn(rng, azimuths=(350, 5, 350), frames=2).sightings
     assert faces_of(sightings).tolist() == [0, 0, 1, 1, 2, 2]
+
+
+def test_eta_is_the_difference_of_longitudes_where_meridians_converge():
+    latitude, (xi, eta) = np.radians(80.0), np.array([20.0, 25.0]) * ARCSEC
+    up, place = enu_axes(latitude + xi, eta / np.cos(latitude))[2], enu_axes(latitude, 0.0)
+    east, north, height = place @ up
+    lean = LeanEstimate(lean=np.array([east, north]) / height, a3=np.eye(3))
+    assert lean.deflection(latitude) / ARCSEC == pytest.approx([20.0, 25.0], abs=1e-6)
+    assert abs(lean.lean[0] - eta) / ARCSEC > 0.01
 
 
 def test_two_frames_are_no_session(rng):
