@@ -7,16 +7,15 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from starpos.cli import console, options
+from starpos.cli import bags, console, options
 from starpos.cli.inputs import given_of
 from starpos.cli.vertical import add_vertical, vertical_of
 from starpos.errors import FrameError, InstrumentError
-from starpos.frames.stars import no_stars
 from starpos.night.folder import exposures, frames_in
 from starpos.night.night import Night
 from starpos.night.reading import First, Given, Reader
 from starpos.night.solving import Exposures, solved_night
-from starpos.session.parameter_file import drivers_of, of_solver
+from starpos.session.parameter_file import of_solver
 from starpos.sky import catalogue
 from starpos.utc import utc_text
 
@@ -27,7 +26,6 @@ if TYPE_CHECKING:
 NO_FIX = 1
 # so many nights get all their figures; more get the table and the errors only
 ALL_FIGURES = 6
-PIP = "pip install matplotlib rosbags"
 
 
 def define(parser: argparse.ArgumentParser) -> None:
@@ -47,14 +45,7 @@ def define(parser: argparse.ArgumentParser) -> None:
         help="instead of a page, write one night's lists of stars, tilts, instrument, air, versions and truth.json into "
         "one file that can be sent and `starpos solve` reads: no pictures, paths, names or serial numbers",
     )
-    parser.add_argument("--namespace", metavar="NAME", help="of the instrument, in a bag that holds several")
-    options.add_parameters(
-        parser,
-        "of detector and inclinometer, where stars and tilts are made of a robot's images and IMU; what the solver's are "
-        "is given by the other options",
-        "detector:stamp:=start",
-    )
-    options.add_remaps(parser)
+    bags.add_bag(parser)
     options.add_instrument(parser)
     options.add_air(parser)
     add_vertical(parser)
@@ -72,7 +63,7 @@ def run(args: argparse.Namespace) -> int:
     if args.field is not None:
         return _pack(args)
     if find_spec("matplotlib") is None:
-        raise InstrumentError(f"a report is drawn with matplotlib, which is not here: {PIP}")
+        raise InstrumentError(f"a report is drawn with matplotlib, which is not here: {bags.PIP}")
     from starpos.report.page import page
     from starpos.report.pictures import nights_picture, pictures_of
     from starpos.report.writing import PAGE, check, write
@@ -132,9 +123,9 @@ def _night(path: Path, args: argparse.Namespace) -> Night:
 
 def _exposures(path: Path, args: argparse.Namespace) -> "Exposures | tuple[Recorded, OfBag]":
     """The exposures of a folder, or what a bag holds; raises StarposError if there is nothing to work on."""
-    from starpos.night import bag, recorded
+    from starpos.night import bag
 
-    air, vertical, progress = options.atmosphere_of(args), vertical_of(args), console.ProgressBar()
+    air, vertical = options.atmosphere_of(args), vertical_of(args)
     if not path.exists():
         raise FrameError(f"{path}: there is no such night: give a folder, or a rosbag2")
     if not bag.is_bag(path):
@@ -145,11 +136,4 @@ def _exposures(path: Path, args: argparse.Namespace) -> "Exposures | tuple[Recor
         about = First(Reader())(tuple(map(str, frames_in(path))))
         given = Given(None) if about is None else given_of(args, about)
         return exposures(path, given, air, vertical)
-    if find_spec("rosbags") is None:
-        raise FrameError(f"{path}: bags are read with rosbags, which is not here: {PIP}")
-    any_camera = options.instrument_of(args, no_stars(100, 100, focal_px=1000.0))
-    drivers = drivers_of(args.params_file, args.param, args.namespace, options.remaps_of(args))
-    found = bag.read(path, args.namespace, any_camera.inclinometer.noise_rad, drivers, progress)
-    told = (args.instrument, args.focal_mm) != (None, None)
-    cameras = found.cameras if args.focal_mm is None else {}
-    return found, recorded.OfBag(any_camera, cameras, any_size=told)
+    return bags.read_bag(path, args)

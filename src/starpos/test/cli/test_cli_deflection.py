@@ -10,7 +10,9 @@ from cli_calls import objects
 from starpos import rotation
 from starpos.earth.orientation import earth_state
 from starpos.earth.refraction import Atmosphere
+from starpos.frames.reading import read_frame
 from starpos.instrument.camera import Camera
+from starpos.instrument.tilt_table import read_tilt_csv
 from starpos.sky.site import Site
 from starpos.units import ARCSEC
 from starpos.utc import utc_text
@@ -88,6 +90,54 @@ def test_the_deflection_of_four_faces(run, session):
     fallen = whole["reduced"]["mark_arcsec"][0] - whole["reduced"]["geoid_arcsec"][0]
     assert fallen == pytest.approx(0.171 * np.sin(2 * np.radians(LATITUDE)) * 0.9, rel=0.01)
     assert sum(v[0] ** 2 for v in whole["errors"].values()) == pytest.approx(sigma**2, rel=1e-6)
+
+
+def test_each_face_and_star_has_its_residuals(run, session):
+    _, out, _ = run(*arguments(session), "--json", "--station", "Pillar 1")
+    *frames, whole = objects(out)
+    assert whole["station"] == "Pillar 1" and whole["site"]["height_m"] == HEIGHT_M
+    assert [face["frames"] for face in whole["by_face"]] == [2] * 4
+    assert all(face["chi2"] < 20 for face in whole["by_face"])
+    lever = [np.hypot(*star["leverage_arcsec"]) for star in whole["by_star"]]
+    assert lever == sorted(lever, reverse=True) and 0 < lever[0] < whole["sigma_xi_arcsec"]
+    assert whole["stars"] >= len(lever) and all(1 <= star["frames"] <= 8 for star in whole["by_star"])
+    assert whole["by_star"][0]["star"].startswith(("HIP ", "TYC "))
+
+
+def test_a_bag_gives_what_its_files_give(run, session, tmp_path):
+    pytest.importorskip("rosbags")
+    from starpos_testing.skies.bags import NightBag
+
+    with NightBag(tmp_path / "bag") as bag:
+        bag.camera(CAMERA.fx, CAMERA.width, CAMERA.height)
+        for path in sorted(session.glob("stars_*.csv")):
+            bag.stars(read_frame(path))
+        bag.tilts(read_tilt_csv(session / "tilt.csv"))
+    _, out, _ = run(*arguments(session), "--json")
+    options = arguments(session)[11:]
+    status, of_bag, err = run("deflection", tmp_path / "bag", *options, "--json")
+    files, bag = objects(out)[-1], objects(of_bag)[-1]
+    assert status == 0 and bag["frames"] == 8
+    # messages have the times of tilts in microseconds
+    for key in ("xi_arcsec", "eta_arcsec", "sigma_xi_arcsec", "sigma_eta_arcsec"):
+        assert bag[key] == pytest.approx(files[key], abs=2e-3)
+    status, _, err = run("deflection", tmp_path / "bag", *options, "--tilt", session / "tilt.csv")
+    assert status == 2 and "has its own tilts" in err[-1]
+
+
+def test_a_plan_needs_no_frames(run, session):
+    site = ("--site", LATITUDE, LONGITUDE, HEIGHT_M, "--instrument", session / "instrument.yaml")
+    status, out, _ = run(
+        "deflection", "--plan", 0.5, *site, "--size", 1000, 700, "--limit-mag", 7.5, "--json"
+    )
+    (plan,) = objects(out)
+    assert (
+        status == 0 and plan["faces"] == 4 and max(plan["sigma_xi_arcsec"], plan["sigma_eta_arcsec"]) <= 0.5
+    )
+    status, out, _ = run("deflection", "--plan", 0.5, *site, "--size", 1000, 700, "--limit-mag", 7.5)
+    assert status == 0 and "4 faces" in out and "largest errors" in out
+    status, _, err = run("deflection", *site)
+    assert status == 2 and "--plan SIGMA" in err[0]
 
 
 def test_its_lines_for_people_and_its_table(run, session):
