@@ -128,9 +128,11 @@ def sighting(solver: Solver, stars: Stars, found: Identification, mark: Mark, ti
     # the catalogue's errors do not weigh here: `places` adjusts them with those of all frames
     fit = fitted(problem, camera.directions(*matched.xy.T), matched.covariance_px2)
     kept, residual = fit.kept, fit.residual[fit.kept]
-    catalogue_px2 = float(np.mean((matched.place_sigma[kept] * camera.fx) ** 2))
-    extra2 = expected_extra(residual, matched.covariance_px2[kept], share_free(fit.keep))
-    centroids = matched.covariance_px2[kept] + ISOTROPIC * max(extra2 - catalogue_px2, 0.0)
+    # each star's own place error is no scatter of the centroids: one star of unknown motion would hide theirs
+    placed = (matched.place_sigma[kept] * camera.fx) ** 2
+    own = matched.covariance_px2[kept]
+    extra2 = expected_extra(residual, own + ISOTROPIC * placed[:, None, None], share_free(fit.keep))
+    centroids = own + ISOTROPIC * extra2
     errors = StarErrors.of(fit.slope[kept], centroids, np.zeros_like(centroids), ())
     if not np.isfinite(errors.gain).all():
         raise FixError(
