@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 NO_FIX = 1
 # so many nights get all their figures; more get the table and the errors only
 ALL_FIGURES = 6
+# ending of a session's result
+SESSION = ".json"
 
 
 def define(parser: argparse.ArgumentParser) -> None:
@@ -34,7 +36,7 @@ def define(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         metavar="NIGHT",
         help="a folder of frames (FITS, or CSV of stars) with tilt.csv and perhaps truth.json, or a rosbag2, of the "
-        "instrument or of a robot's own camera and IMU",
+        "instrument or of a robot's own camera and IMU; or sessions of starpos deflection --json (.json)",
     )
     parser.add_argument(
         "-o", "--out", default="starpos-report", metavar="FOLDER", help="index.html and PNGs (starpos-report)"
@@ -69,6 +71,8 @@ def run(args: argparse.Namespace) -> int:
     from starpos.report.writing import PAGE, check, write
 
     check(Path(args.out))
+    if _are_sessions(args.nights):
+        return _stations(args)
     nights = [_night(Path(path), args) for path in args.nights]
     for night in nights:
         for sentence in (*night.remarks, *([night.why_not] if night.why_not else [])):
@@ -81,7 +85,7 @@ def run(args: argparse.Namespace) -> int:
         bar("figures", (k + 1) / len(nights))
     known = [(k, n) for k, n in enumerate(nights, 1) if n.truth and n.combined]
     overall = [nights_picture(known)] if len(nights) > 1 and known else []
-    html = page(nights, each, overall, utc_text(time.time())[:16].replace("T", " ") + " UTC")
+    html = page(nights, each, overall, _now_text())
     files = {f"{p.name}.png": p.png for p in overall}
     for k, pictures in enumerate(each, 1):
         prefix = f"night{k}-" if len(nights) > 1 else ""
@@ -89,6 +93,41 @@ def run(args: argparse.Namespace) -> int:
     write(Path(args.out), files | {PAGE: html.encode(errors="replace")})
     print(Path(args.out) / PAGE)
     return 0 if any(n.combined for n in nights) else NO_FIX
+
+
+def _are_sessions(paths: list[str]) -> bool:
+    """Whether the results of deflection sessions are given; raises FrameError for these and nights together."""
+    results = [path for path in paths if path.lower().endswith(SESSION)]
+    if results and len(results) < len(paths):
+        raise FrameError(f"{results[0]}: give either nights or sessions of starpos deflection, not both")
+    return bool(results)
+
+
+def _stations(args: argparse.Namespace) -> int:
+    """Write the page of a zenith camera's stations."""
+    from starpos.earth import geoid
+    from starpos.report.station_page import station_page
+    from starpos.report.writing import PAGE, write
+    from starpos.zenith import session_file
+    from starpos.zenith.stations import against_grid, stations_of
+
+    stations = stations_of([session_file.read(path) for path in args.nights])
+    for station in stations:
+        if station.doubt:
+            console.complain("report", station.doubt)
+    grid = None if args.geoid is None else geoid.read(args.geoid)
+    compared = [None if grid is None else against_grid(station, grid) for station in stations]
+    html, pictures = station_page(
+        stations, compared, "" if args.geoid is None else Path(args.geoid).name, _now_text()
+    )
+    files = {f"{name}.png": picture.png for name, picture in pictures.items()}
+    write(Path(args.out), files | {PAGE: html.encode(errors="replace")})
+    print(Path(args.out) / PAGE)
+    return 0
+
+
+def _now_text() -> str:
+    return utc_text(time.time())[:16].replace("T", " ") + " UTC"
 
 
 def _pack(args: argparse.Namespace) -> int:
