@@ -30,8 +30,9 @@ SETTLED = 1e-3
 # Anomalous refraction over image motion: a twenty-minute mean of zenith cameras scatters by 0.05 arcsec (Hirt 2006, A&A
 # 459, 283: 0.05 to 0.2 over hours) where a frame's image motion is 0.4; in air that moves no image nothing bends slowly.
 AIR_SHARE = 1 / 8
-# and a night's share above that is within this factor of it (1 sigma)
-AIR_FACTOR = 1.5
+# and a night's share above that is within this factor of it (1 sigma), and within three sigma: a face that is off by more
+# is no air
+AIR_FACTOR, MOST_SIGMA = 1.5, 3.0
 # size of the image motion at which its search begins, rad
 MOTION_RAD = 0.3 * ARCSEC
 # and below which it makes no difference
@@ -163,14 +164,17 @@ def _air_of(lines: Lines, stated: np.ndarray, errors: Errors, prior: np.ndarray,
 
     def of(p: np.ndarray) -> Air:
         motion = float(np.hypot(LEAST_RAD, MOTION_RAD * np.exp(p[0])))
-        return Air(motion=motion, anomalous=motion * AIR_SHARE * AIR_FACTOR ** max(float(p[1]), 0.0))
+        return Air(
+            motion=motion, anomalous=motion * AIR_SHARE * AIR_FACTOR ** min(max(float(p[1]), 0.0), MOST_SIGMA)
+        )
 
     def cost(p: np.ndarray) -> float:
         return _fitted(lines, _whole(stated, errors, of(p)), prior, offset).cost + float(p[1] ** 2)
 
-    found = minimize(
-        cost, np.zeros(2), method="Nelder-Mead", options={"xatol": 0.02, "fatol": 0.02, "maxfev": 120}
-    )
+    # wide: in still air the cost hardly changes over a factor of ten
+    simplex = np.array([[0.0, 0.0], [-3.0, 0.0], [0.0, 1.0]])
+    options = {"initial_simplex": simplex, "xatol": 0.05, "fatol": 0.002, "maxfev": 120}
+    found = minimize(cost, simplex[0], method="Nelder-Mead", options=options)
     return of(found.x)
 
 
