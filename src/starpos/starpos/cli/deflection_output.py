@@ -155,5 +155,5 @@ def _star_text(star: dict, stars: int) -> str:
     xi, eta = star["leverage_arcsec"]
     return (
         f"of {stars} stars {star['star']} (V {star['vmag']:.1f}, {star['frames']} frames) counts most: 1 sigma of its "
-        f"catalogue place moves xi by {xi:.4f}, eta by {eta:.4f}"
+        f"catalogue place would move xi by {xi:.4f}, eta by {eta:.4f}, if the session did not correct it"
     )
