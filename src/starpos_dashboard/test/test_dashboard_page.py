@@ -116,7 +116,7 @@ def test_the_card_of_the_deflection_is_there_while_one_is_measured(page):
     seen = "return document.getElementById('deflection-card').checkVisibility()"
     assert not page.run(seen)
     sentence = "enough; xi +3.120 +- 0.070, eta -1.020 +- 0.080 arcsec, 8 faces, 192 frames"
-    page.instrument.works(diagnostics=said.diagnostics(("solver: Deflection", 0, sentence)))
+    page.instrument.works(__diagnostics=said.diagnostics(("solver: Deflection", 0, sentence)))
     page.until(lambda: page.run(seen) and sentence in page.text("deflection"))
 
 
