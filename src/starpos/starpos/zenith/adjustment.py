@@ -25,6 +25,8 @@ from starpos.zenith.quality import FaceQuality, Leftover, StarQuality, face_qual
 from starpos.zenith.sighting import Mark, ZenithSighting
 
 STEPS = 8
+# closer to a pole, a deflection is no longer small beside the distance from it
+LEAST_COSINE = 1e-3
 # of its sigma: a smaller step is the last
 SETTLED = 1e-3
 # Anomalous refraction over image motion: a twenty-minute mean of zenith cameras scatters by 0.05 arcsec (Hirt 2006, A&A
@@ -114,10 +116,12 @@ def adjusted(
 
     air: its size where it is known, as for a session that is only planned; else the residuals determine it.
 
-    Raises FixError where there are fewer, or the equations have no solution.
+    Raises FixError where there are fewer, at the poles, or where the equations have no solution.
     """
     if len(sightings) < 3:
         raise FixError(f"{len(sightings)} frames make no session: at least 3, in several faces, are needed")
+    if np.cos(mark.latitude) < LEAST_COSINE:
+        raise FixError("the mark is within 6 km of a pole, where eta has no direction")
     places = StarPlaces.of(sightings)
     sightings = places.applied(sightings)
     faces, prior = faces_of(sightings), _prior_of(instrument)
@@ -236,7 +240,7 @@ def _adjusted(
     own = own.reshape(n, 2, n, 2)[np.arange(n), :, np.arange(n)]
     per_frame = np.einsum("nab,nbc,ndc->nad", back, own, back)
     up = estimate.a3 @ np.append(estimate.lean, 1.0)
-    xi_eta = estimate.lean[::-1] / ARCSEC
+    xi_eta = estimate.deflection(mark.latitude) / ARCSEC
     inverse = cho_solve((fit.root, True), np.eye(2 * n))
     design = inverse @ lines.by_parameters.reshape(-1, 5)
     leftover = Leftover(

@@ -128,11 +128,8 @@ def sighting(solver: Solver, stars: Stars, found: Identification, mark: Mark, ti
     # the catalogue's errors do not weigh here: `places` adjusts them with those of all frames
     fit = fitted(problem, camera.directions(*matched.xy.T), matched.covariance_px2)
     kept, residual = fit.kept, fit.residual[fit.kept]
-    # each star's own place error is no scatter of the centroids: one star of unknown motion would hide theirs
-    placed = (matched.place_sigma[kept] * camera.fx) ** 2
-    own = matched.covariance_px2[kept]
-    extra2 = expected_extra(residual, own + ISOTROPIC * placed[:, None, None], share_free(fit.keep))
-    centroids = own + ISOTROPIC * extra2
+    placed_px = matched.place_sigma[kept] * camera.fx
+    centroids = centroids_of(residual, matched.covariance_px2[kept], placed_px, share_free(fit.keep))
     errors = StarErrors.of(fit.slope[kept], centroids, np.zeros_like(centroids), ())
     if not np.isfinite(errors.gain).all():
         raise FixError(
@@ -170,6 +167,16 @@ def sighting(solver: Solver, stars: Stars, found: Identification, mark: Mark, ti
         clock_stddev_s=solver.clock_stddev_s(stars),
         stamp_stddev_s=stars.stamp_stddev_s,
     )
+
+
+def centroids_of(residual: np.ndarray, stated: np.ndarray, placed_px: np.ndarray, share: float) -> np.ndarray:
+    """Covariances (N, 2, 2) px2 of centroids, as stated (N, 2, 2) or larger where the residuals (N, 2) show it.
+
+    placed_px (N,): 1 sigma of the stars' own places, each with its star: one of unknown motion would otherwise hide the
+    scatter of all centroids.  share: part of the coordinates that the fit leaves free.
+    """
+    whole = stated + ISOTROPIC * placed_px[:, None, None] ** 2
+    return stated + ISOTROPIC * expected_extra(residual, whole, share)
 
 
 def _seen(stars: MatchedStars, state: EarthState, shutter: Shutter, height: int, mark: Mark) -> np.ndarray:

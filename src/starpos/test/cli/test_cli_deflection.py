@@ -138,7 +138,7 @@ def test_a_bag_gives_what_its_files_give(run, session, recorded):
 
 
 def played(recorded, session, wanted):
-    """What the solver's session says of the deflection after these frames, as the node's service and light say it."""
+    """Play the frames to the solver's session, which has the node's service and light say what it says."""
     values = {
         "deflection.wanted": wanted,
         "site.latitude": LATITUDE,
