@@ -3,7 +3,6 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,21 +11,12 @@ from starpos.calibration import residual_map
 from starpos.errors import TimeError
 from starpos.night.night import Night
 from starpos.report import coast, frame_figures, measures, place_figures, sky_figure
+from starpos.report.html import Picture
 from starpos.report.style import figures_of, mark_simulated, new_figure, png_of
 from starpos.sky.catalogue import Catalogue
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-
-@dataclass(frozen=True, eq=False)
-class Picture:
-    """A figure as PNG; name: of its file, without suffix; title, caption: plain text."""
-
-    name: str
-    title: str
-    caption: str
-    png: bytes
 
 
 def pictures_of(night: Night, catalogue: Catalogue) -> Iterator[Picture]:

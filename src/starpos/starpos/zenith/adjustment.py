@@ -106,9 +106,15 @@ class _Fit:
 
 
 def adjusted(
-    sightings: Sequence[ZenithSighting], instrument: Instrument, atmosphere: Atmosphere, mark: Mark
+    sightings: Sequence[ZenithSighting],
+    instrument: Instrument,
+    atmosphere: Atmosphere,
+    mark: Mark,
+    air: Air | None = None,
 ) -> Adjusted:
     """The deflection of a session; sightings: in order of time, at least three.
+
+    air: its size where it is known, as for a session that is only planned; else the residuals determine it.
 
     Raises FixError where there are fewer, at the poles, or where the equations have no solution.
     """
@@ -123,8 +129,7 @@ def adjusted(
     given = instrument.calibration
     start = start_of(sightings)
     estimate = start if given.unknown else LeanEstimate(lean=np.zeros(2), a3=given.a3)
-    offset, sized = np.zeros(5), False
-    air = Air(motion=MOTION_RAD, anomalous=MOTION_RAD * AIR_SHARE)
+    offset, size = np.zeros(5), air
     for _ in range(STEPS):
         lines = Lines.at(estimate, sightings, bending)
         errors = errors_of(
@@ -132,13 +137,14 @@ def adjusted(
         )
         stated = np.sum([s.covariance for s in errors.sources], axis=0)
         # A3's prior stays where it was
-        if not sized:
-            air, sized = _air_of(lines, stated, errors, prior, offset), True
-        fit = _fitted(lines, _whole(stated, errors, air), prior, offset)
+        if size is None:
+            size = _air_of(lines, stated, errors, prior, offset)
+        fit = _fitted(lines, _whole(stated, errors, size), prior, offset)
         estimate, offset = estimate.moved(fit.step), offset + fit.step
         if np.abs(fit.step).max() < SETTLED * np.sqrt(np.diag(fit.covariance)).min():
             break
-    return _adjusted(estimate, sightings, lines, errors, fit, air, faces, mark, places)
+    assert size is not None
+    return _adjusted(estimate, sightings, lines, errors, fit, size, faces, mark, places)
 
 
 def _prior_of(instrument: Instrument) -> np.ndarray:
