@@ -2,7 +2,7 @@
 """CPU time and error of `starpos deflection` for stations of 24 minutes: whole commands, from star lists.
 
 A station: 192 star lists in four faces, two rounds, under a lens of 600 mm; five readings of the tiltmeter a frame.
-Image motion is 0.4 arcsec a frame, centroids scatter by 0.09 px, the catalogue is exact.
+Centroids scatter by 0.09 px.  `--motion 0 --places 30`: still air, and stars 30 mas from their places in the catalogue.
 """
 
 import json
@@ -20,11 +20,11 @@ from starpos.earth.refraction import Atmosphere
 from starpos.instrument.camera import Camera
 from starpos.sky import catalogue
 from starpos.sky.site import Site
-from starpos.units import ARCSEC
+from starpos.units import ARCSEC, MAS
 from starpos.utc import utc_text
 
 FACES, FRAMES, CADENCE_S, TURNING_S, LIMIT_MAG = 8, 24, 5.0, 60.0, 9.8
-NOISE, MOTION, LEAN, SCATTER_PX = 0.1 * ARCSEC, 0.4 * ARCSEC, 10 * ARCSEC, 0.09
+NOISE, LEAN, SCATTER_PX = 0.1 * ARCSEC, 10 * ARCSEC, 0.09
 CAMERA, AIR = Camera.from_focal(5616, 3744, 93750.0), ("--pressure-hpa", "900", "--temperature-c", "10")
 INSTRUMENT = f"""starpos_instrument: 1
 camera: {{focal_mm: 600, pixel_um: 6.4}}
@@ -38,9 +38,13 @@ shutter: {{readout_s: 0, readout_stddev_s: 0}}
 """
 
 
-def station(folder: Path, seed: int) -> tuple[np.ndarray, list[str]]:
-    """Write a station's star lists, tilts and instrument; its xi and eta in arcsec, and the options of the command."""
+def station(folder: Path, seed: int, motion: float, places: float) -> tuple[np.ndarray, list[str]]:
+    """Write a station's star lists, tilts and instrument; its xi and eta in arcsec, and the options of the command.
+
+    motion: 1 sigma of a frame's image motion, rad.  places: of a star's place along each axis of ICRS, rad.
+    """
     rng, stars = np.random.default_rng(seed), catalogue.load_catalogue()
+    displaced = rng.normal(0, places, (len(stars), 3))
     latitude, longitude = np.degrees(np.arcsin(rng.uniform(-0.9, 0.9))), rng.uniform(-180, 180)
     xi, eta = rng.normal(0, 6, 2)
     cosine, begin = np.cos(np.radians(latitude)), rng.uniform(1.70e9, 1.76e9)
@@ -57,8 +61,10 @@ def station(folder: Path, seed: int) -> tuple[np.ndarray, list[str]]:
             at += CADENCE_S
             theta = np.degrees(np.arcsin(sensor[:2, 2]) + rng.normal(0, NOISE, (5, 2)))
             rows += [f"{at - 0.2 + 0.1 * j:.3f},{x:.9f},{y:.9f}" for j, (x, y) in enumerate(theta)]
-            moved = rotation.from_vector([*rng.normal(0, MOTION, 2), 0.0])
-            write_list(folder / f"stars_{face}_{k:02d}.csv", stars, site, at, a3.T @ sensor @ moved, rng)
+            moved = rotation.from_vector([*rng.normal(0, motion, 2), 0.0])
+            write_list(
+                folder / f"stars_{face}_{k:02d}.csv", stars, displaced, site, at, a3.T @ sensor @ moved, rng
+            )
         at += TURNING_S
     (folder / "tilt.csv").write_text("\n".join(rows) + "\n")
     (folder / "instrument.yaml").write_text(INSTRUMENT)
@@ -75,13 +81,12 @@ def station(folder: Path, seed: int) -> tuple[np.ndarray, list[str]]:
     return np.array([xi, eta]), [*given, *AIR]
 
 
-def write_list(path, stars, site, at: float, axes: np.ndarray, rng) -> None:
+def write_list(path, stars, displaced: np.ndarray, site, at: float, axes: np.ndarray, rng) -> None:
     """Write the stars that a camera with these axes (3, 3), rows in east, north, up, sees."""
     state = earth_state(at)
     index = site.overhead(stars, state, axes[2], CAMERA.half_diagonal_rad, LIMIT_MAG)
-    xy = CAMERA.project(site.observed(stars, index, state) @ axes.T) + rng.normal(
-        0, SCATTER_PX, (len(index), 2)
-    )
+    seen = site.refracted(rotation.normalised(stars.directions(index, state.year) + displaced[index]), state)
+    xy = CAMERA.project(seen @ axes.T) + rng.normal(0, SCATTER_PX, (len(index), 2))
     on = ((xy > 2) & (xy < [CAMERA.width - 3, CAMERA.height - 3])).all(1)
     flux = 10 ** (-0.4 * (stars.vmag(index) - 14))
     head = {
@@ -97,6 +102,8 @@ def write_list(path, stars, site, at: float, axes: np.ndarray, rng) -> None:
 def options(parser) -> None:
     parser.add_argument("-n", "--stations", type=int, default=5)
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--motion", type=float, default=0.4, metavar="ARCSEC")
+    parser.add_argument("--places", type=float, default=0.0, metavar="MAS")
 
 
 def run(args) -> int:
@@ -104,7 +111,7 @@ def run(args) -> int:
     for seed in range(args.seed, args.seed + args.stations):
         with tempfile.TemporaryDirectory() as scratch:
             folder = Path(scratch)
-            true, given = station(folder, seed)
+            true, given = station(folder, seed, args.motion * ARCSEC, args.places * MAS)
             frames = sorted(p.name for p in folder.glob("stars_*.csv"))
             command = [
                 sys.executable,
