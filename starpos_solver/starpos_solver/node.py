@@ -235,7 +235,9 @@ class SolverNode(Node):
 
     def _on_deflection(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         if not self._session.deflection.measures:
-            response.message = "no deflection is measured: start the solver with deflection.wanted, a site and altitude"
+            response.message = (
+                "no deflection is measured: start the solver with deflection.wanted, a site and altitude"
+            )
             return response
         told = self._session.deflection.report()
         response.success, response.message = told.level == Level.OK, told.message

@@ -67,7 +67,8 @@ def station_page(
         f"<footer><p>Made by starpos {escape(__version__)} on {escape(made_utc)}. {XI} is the deflection to the north, "
         f"{ETA} to the east: astronomic minus geodetic latitude, and the same of longitude times the cosine of latitude, "
         "on WGS 84. Values are tide free: the pull of Moon and Sun is taken off, its permanent part too. Errors are 1 "
-        "sigma. At the geoid: by the curvature of the normal plumb line (Heiskanen &amp; Moritz 1967, section 5-6).</p></footer>"
+        "sigma. At the geoid: by the curvature of the normal plumb line (Heiskanen &amp; Moritz 1967, section 5-6).</p>"
+        "</footer>"
     )
     return document(f"starpos: {title}", parts), pictures
 

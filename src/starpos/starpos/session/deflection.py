@@ -66,9 +66,7 @@ class LiveDeflection:
         if names & OF_SESSION:
             self.forget()
 
-    def take(
-        self, solver: Solver | None, stars: Stars, tilts: Tilts, found: Identification | None
-    ) -> None:
+    def take(self, solver: Solver | None, stars: Stars, tilts: Tilts, found: Identification | None) -> None:
         """Take an identified frame; one that gives no sighting is counted by its reason only."""
         if solver is None or found is None or not self.measures or len(self._sightings) >= MOST:
             return
@@ -114,7 +112,9 @@ class LiveDeflection:
             f"xi {found.xi_arcsec:+.3f} +- {xi:.3f}, eta {found.eta_arcsec:+.3f} +- {eta:.3f} arcsec, {faces} faces, "
             f"{len(self._found.sightings)} frames"
         )
-        more = self._trouble or ("enough" if enough else f"not enough: {_lacking(self._found, faces, wanted)}")
+        more = self._trouble or (
+            "enough" if enough else f"not enough: {_lacking(self._found, faces, wanted)}"
+        )
         if len(self._sightings) >= MOST and not enough:
             more = f"{MOST} frames are the most: finish, and call solver/reset"
         values = {

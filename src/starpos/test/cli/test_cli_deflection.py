@@ -177,8 +177,10 @@ def test_live_the_session_says_when_enough_is_enough(run, session, recorded):
 def test_live_a_session_that_lacks_something_says_what(session, recorded):
     told = played(recorded, session, 0.005).report()
     assert told.level == Level.WARN and not told.values["enough"]
-    assert re.match(r"not enough: (about \d+ min more|more frames do not help, [a-z0-9 ]+ alone leaves)", told.message)
-    with pytest.raises(InstrumentError, match="set site.latitude"):
+    assert re.match(
+        r"not enough: (about \d+ min more|more frames do not help, [a-z0-9 ]+ alone leaves)", told.message
+    )
+    with pytest.raises(InstrumentError, match=r"set site\.latitude"):
         settings_of(None, ["deflection.wanted:=0.1"])
 
 
