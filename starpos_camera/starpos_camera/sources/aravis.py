@@ -80,7 +80,7 @@ class Aravis(FrameSource):
         self._camera: AravisCamera | None = None
 
     def lacking(self) -> None:
-        """Return None, because only a look at the network and the bus would tell."""
+        """Return None, because only a look at the network and the bus would show it."""
 
     def capture(self, settings: CaptureSettings) -> CapturedFrame:
         with self._in_use:

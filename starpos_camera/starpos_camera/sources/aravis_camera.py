@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """One GenICam camera through Aravis: its settings, its clock, and its buffers as pixels.
 
-Names of features are those of GenICam's Standard Features Naming Convention and of GigE Vision. Aravis's functions:
+Features have the names of GenICam's Standard Features Naming Convention and of GigE Vision. Aravis's functions:
 https://aravisproject.github.io/docs/aravis-0.8/.
 """
 
@@ -47,7 +47,7 @@ class ArrivedFrame:
 
     pixels      (height, width) uint8 or uint16
     pattern     of its mosaic; '' for none
-    camera_s    its time on the camera's clock; None: it tells none
+    camera_s    its time on the camera's clock; None where it gives no time
     received_s  its arrival, Unix time by the system's clock
     """
 
