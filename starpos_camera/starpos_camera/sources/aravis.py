@@ -149,5 +149,6 @@ class Aravis(FrameSource):
                 return buffer
         source = self._values["aravis.trigger"]
         raise CaptureError(
-            f"no frame has come {READOUT_S:g} s after its exposure; look after the trigger ({source}) and the cable."
+            f"no frame has come {READOUT_S:g} s after its exposure; check the trigger ({source}) and the "
+            f"cable."
         )

@@ -131,7 +131,7 @@ class LiveDeflection:
 
 
 def _lacking(session: DeflectionSession, faces: int, wanted_arcsec: float) -> str:
-    """What a session lacks for the wanted error."""
+    """Advice on reaching the wanted error in a session."""
     if faces < QUARTER:
         return f"turn by a quarter, to face {faces + 1}"
     found = session.adjusted
