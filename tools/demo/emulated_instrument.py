@@ -57,29 +57,34 @@ ROOT = Path(__file__).resolve().parents[2]
 NEEDED = {"gcc-avr", "avr-libc", "libsimavr-dev", "libelf-dev", "indi-bin"}
 
 
-def lacking() -> str | None:
+def lacking(needed: set[str] = NEEDED, modules: tuple[str, ...] = ("indipyclient",)) -> str | None:
     """Say in commands how to install all that the devices need and this machine lacks; None if it has all."""
     missing = subprocess.run(
         [ROOT / "tools" / "setup" / "missing", "tests"], capture_output=True, text=True, check=True
     )
     commands = []
-    if packages := sorted(NEEDED & set(missing.stdout.split())):
+    if packages := sorted(needed & set(missing.stdout.split())):
         commands.append(f"sudo apt-get install {' '.join(packages)}")
-    if not find_spec("indipyclient"):
-        commands.append("pip install indipyclient")
+    if absent := [name for name in modules if not find_spec(name)]:
+        commands.append(f"pip install {' '.join(absent)}")
     return " && ".join(commands) or None
+
+
+def start_board(devices: Processes, tilt_deg: np.ndarray) -> tuple[subprocess.Popen, str]:
+    """Start the paper's board at a tilt; returns its process, which takes commands, and its serial port."""
+    folder = devices.folder
+    make = ["make", "-C", str(ROOT / "starpos_inclinometer" / "firmware"), f"BUILD={folder}", "all", "sim"]
+    subprocess.run(make, check=True, stdout=subprocess.DEVNULL)
+    board, link = [str(folder / "inclinometer-sim"), str(folder / "paper.elf")], str(folder / "port")
+    tilt = ["--tilt", *(f"{angle:.9f}" for angle in tilt_deg)]
+    # It ends when its input ends.
+    return devices.start("board", [*board, "--link", link, *tilt], stdin=subprocess.PIPE), link
 
 
 def start_devices(devices: Processes, place: Place, seed: int) -> dict[str, dict]:
     """Start inclinometer, camera and sky; return for each node the parameters by which it finds its device."""
     folder = devices.folder
-    make = ["make", "-C", str(ROOT / "starpos_inclinometer" / "firmware"), f"BUILD={folder}", "all", "sim"]
-    subprocess.run(make, check=True, stdout=subprocess.DEVNULL)
-    board, link = [str(folder / "inclinometer-sim"), str(folder / "paper.elf")], str(folder / "port")
-    theta_x, theta_y = np.degrees(place.scene().tilt)
-    tilt = ["--tilt", f"{theta_x:.9f}", f"{theta_y:.9f}"]
-    # It ends when its input ends.
-    board = devices.start("board", [*board, "--link", link, *tilt], stdin=subprocess.PIPE)
+    board, link = start_board(devices, np.degrees(place.scene().tilt))
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = str(probe.getsockname()[1])
