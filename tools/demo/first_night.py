@@ -7,7 +7,6 @@ the transcript.  Exit status 0 if A3 is saved, within 4 sigma of the truth; 2 wh
 """
 
 import argparse
-import os
 import subprocess
 import sys
 import tempfile
@@ -122,15 +121,16 @@ def run(out: Path, scratch: Path) -> int:
         command = [
             "starpos",
             "first-night",
-            str(night),
+            night.name,
             "--inclinometer",
             "sca100t_calibrated",
             "--save",
-            str(saved),
+            saved.name,
+            "--patience",
+            "60",
         ]
-        command += ["--patience", "60"]
         begin = time.monotonic()
-        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=os.environ) as told:
+        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=out) as told:
             found = ""
             for line in told.stdout:
                 print(line, end="", flush=True)

@@ -6,9 +6,8 @@ import sys
 import time
 from pathlib import Path
 
-from starpos.cli import console, doctor, options
+from starpos.cli import console, doctor, options, overwriting
 from starpos.cli.inputs import given_of
-from starpos.cli.overwriting import Written, check, save_instrument
 from starpos.earth.vertical import Deflection
 from starpos.errors import FrameError, TiltError
 from starpos.fix.solver import Solver
@@ -18,9 +17,9 @@ from starpos.frames.stars import Stars
 from starpos.instrument import instrument_update
 from starpos.instrument.tilt_log import BRACKET_S, TiltLog
 from starpos.instrument.tilt_table import read_tilt_csv
-from starpos.night.first_night import AROUND_S, FirstNight, Look, Step
+from starpos.night.first_night import AROUND_S, FirstNight, Look, Stage
 from starpos.night.folder import exposures, frames_in
-from starpos.night.reading import Given, stars_of
+from starpos.night.reading import About, Given, stars_of
 from starpos.night.work import Identifying
 from starpos.report import field
 from starpos.sky import catalogue
@@ -61,7 +60,7 @@ def define(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    check(args, Written("--save", args.save, instrument_update.check_replaceable))
+    overwriting.check(args, overwriting.Written("--save", args.save, instrument_update.check_replaceable))
     folder = Path(args.folder)
     if not folder.is_dir():
         raise FrameError(
@@ -80,7 +79,9 @@ def run(args: argparse.Namespace) -> int:
             "first-night", f"no frame has come for {args.patience:g} s, and A3 is not known yet: {AGAIN}"
         )
         return NOT_YET
-    save_instrument("first-night", args.save, found.calibrated.instrument, "A3 by the first night")
+    overwriting.save_instrument(
+        "first-night", args.save, found.calibrated.instrument, "A3 by the first night"
+    )
     print(f"done: {args.save} is written -> starpos solve FRAMES --tilt {TILTS} --instrument {args.save}")
     if args.field is not None:
         packed = exposures(folder, given, options.atmosphere_of(args), Deflection())
@@ -109,7 +110,7 @@ def _watched(args: argparse.Namespace, folder: Path) -> tuple[FirstNight | None,
             seen.add(path)
             waited = time.monotonic()
             if night is None:
-                given = given_of(args, item)
+                given = given_of(args, About(item.width, item.height, item.focal_px, item.origin_px))
                 air = options.atmosphere_of(args)
                 night = FirstNight(Solver(options.instrument_of(args, item), catalogue.load_catalogue(), air))
             sight = Identifying(given)(item)[0]
@@ -152,7 +153,7 @@ def _tell(look: Look, stars: Stars) -> None:
     print(f"{at} {mark} {look.step.value:<9}{look.found}\n{'':12}-> {look.todo}", flush=True)
     if look.done and sys.stdout.isatty():
         print("\a", end="", flush=True)
-    if look.done and look.step is Step.LEVEL:
+    if look.done and look.step is Stage.LEVEL:
         finding = doctor.clock()
         mark = "ok" if finding.state is doctor.State.OK else "!!"
         cure = f"\n{'':12}-> {finding.cure}" if finding.cure else ""

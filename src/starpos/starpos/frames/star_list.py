@@ -46,7 +46,7 @@ def read_star_list(file: BinaryIO, place: str) -> Stars:
     names = [name.strip().lower() for name in rows[0]] if rows else []
     if not {"x", "y", "flux"} <= set(names):
         raise FrameError(
-            f"{place}: its second line names the columns {reprlib.repr(names)}; it must name x, y, flux and may sigma, flags."
+            f"{place}: its second line names the columns {reprlib.repr(names)}; it must name x, y, flux."
         )
     try:
         table = np.array([[float(cell) for cell in row] for row in rows[1:]]).reshape(-1, len(names))

@@ -44,7 +44,7 @@ HEADINGS, FRAMES_EACH, APART_DEG = 4, 3, 45.0
 BAR = 20
 
 
-class Step(Enum):
+class Stage(Enum):
     """The steps, in their order."""
 
     FOCUS = "focus"
@@ -58,14 +58,14 @@ class Step(Enum):
 class Look:
     """What a step found at a frame; todo: what to do next."""
 
-    step: Step
+    step: Stage
     done: bool
     found: str
     todo: str
 
 
 @dataclass(frozen=True)
-class Pose:
+class Standing:
     """An identified frame of a still instrument: its sight, up (3,) in S, and ITRS into C (3, 3)."""
 
     sight: Sight
@@ -82,13 +82,13 @@ class FirstNight:
     def __init__(self, solver: Solver) -> None:
         self.turned: TurnedNight | None = None
         self._solver = solver
-        self._steps = list(Step)
+        self._steps = list(Stage)
         self._widths: list[float] = []
-        self._base: Pose | None = None
+        self._base: Standing | None = None
         # Direction in which each lean moved up in S (rad), and its pose.
-        self._leans: list[tuple[float, Pose]] = []
-        self._poses: list[Pose] = []
-        self._headings: list[list[Pose]] = []
+        self._leans: list[tuple[float, Standing]] = []
+        self._poses: list[Standing] = []
+        self._headings: list[list[Standing]] = []
 
     @property
     def instrument(self) -> Instrument:
@@ -96,19 +96,19 @@ class FirstNight:
         return self._solver.instrument
 
     @property
-    def step(self) -> Step | None:
+    def step(self) -> Stage | None:
         """The step that the next frame is for; None after the last."""
         return self._steps[0] if self._steps else None
 
     def add(self, sight: Sight, log: TiltLog | str) -> Look:
         """Take the next frame, identified, and the tilts so far, or why there are none."""
         step = self._steps[0]
-        looks: dict[Step, Callable[[], Look]] = {
-            Step.FOCUS: lambda: self._focus(sight.stars),
-            Step.EXPOSURE: lambda: self._exposure(sight),
-            Step.LEVEL: lambda: self._level(sight.stars, log),
-            Step.HORIZON: lambda: self._with_pose(sight, log, self._horizon),
-            Step.TURN: lambda: self._with_pose(sight, log, self._turn),
+        looks: dict[Stage, Callable[[], Look]] = {
+            Stage.FOCUS: lambda: self._focus(sight.stars),
+            Stage.EXPOSURE: lambda: self._exposure(sight),
+            Stage.LEVEL: lambda: self._level(sight.stars, log),
+            Stage.HORIZON: lambda: self._with_pose(sight, log, self._horizon),
+            Stage.TURN: lambda: self._with_pose(sight, log, self._turn),
         }
         look = looks[step]()
         if look.done:
@@ -118,21 +118,21 @@ class FirstNight:
     def _focus(self, stars: Stars) -> Look:
         width = stars.fwhm_px
         if width is None or not width > 0:
-            return Look(Step.FOCUS, False, "no width of stars", "check cap, clouds and exposure")
+            return Look(Stage.FOCUS, False, "no width of stars", "check cap, clouds and exposure")
         self._widths.append(width)
         best = min(self._widths)
         bar = "#" * round(BAR * best / width)
         found = f"FWHM {width:4.1f} px [{bar:<{BAR}}] best {best:.1f}"
         last = self._widths[-SHARP_FRAMES:]
         if len(last) == SHARP_FRAMES and max(last) <= min(AS_SHARP * best, WIDEST_PX):
-            return Look(Step.FOCUS, True, found, "leave the focus as it is and fix it with tape")
+            return Look(Stage.FOCUS, True, found, "leave the focus as it is and fix it with tape")
         if width > AS_SHARP * best:
-            return Look(Step.FOCUS, False, found, "turn the ring back: it was sharper")
+            return Look(Stage.FOCUS, False, found, "turn the ring back: it was sharper")
         if width > WIDEST_PX:
             return Look(
-                Step.FOCUS, False, found, f"turn the focus ring a little, until it is under {WIDEST_PX:g} px"
+                Stage.FOCUS, False, found, f"turn the focus ring a little, until it is under {WIDEST_PX:g} px"
             )
-        return Look(Step.FOCUS, False, found, "hands off for some frames")
+        return Look(Stage.FOCUS, False, found, "hands off for some frames")
 
     def _exposure(self, sight: Sight) -> Look:
         stars = sight.stars
@@ -146,13 +146,13 @@ class FirstNight:
         if stars.fwhm_px is not None and stars.fwhm_px < NARROWEST_PX:
             found += f", FWHM {stars.fwhm_px:.1f} px: too sharp for its pixels"
         if saturated > MOST_SATURATED:
-            return Look(Step.EXPOSURE, False, found, "halve the exposure, or the gain")
+            return Look(Stage.EXPOSURE, False, found, "halve the exposure, or the gain")
         if len(stars) < FEWEST_STARS:
-            return Look(Step.EXPOSURE, False, found, "double the exposure, or the gain")
+            return Look(Stage.EXPOSURE, False, found, "double the exposure, or the gain")
         if sight.found is None:
-            return Look(Step.EXPOSURE, False, found, sight.solution.message)
+            return Look(Stage.EXPOSURE, False, found, sight.solution.message)
         return Look(
-            Step.EXPOSURE,
+            Stage.EXPOSURE,
             True,
             f"{found}, {len(sight.found.star)} identified",
             "keep exposure and gain",
@@ -160,12 +160,14 @@ class FirstNight:
 
     def _level(self, stars: Stars, log: TiltLog | str) -> Look:
         if isinstance(log, str):
-            return Look(Step.LEVEL, False, log, "connect the inclinometer")
+            return Look(Stage.LEVEL, False, log, "connect the inclinometer")
         end = log.utc_unix_s[-1]
         late_s = (stars.mid_unix_s or 0.0) - end
         near = log.utc_unix_s > end - LEVEL_S
         if late_s > LEVEL_S or np.ptp(log.utc_unix_s[near]) < 0.8 * LEVEL_S:
-            return Look(Step.LEVEL, False, f"no tilts over {LEVEL_S:.0f} s yet", "leave the instrument alone")
+            return Look(
+                Stage.LEVEL, False, f"no tilts over {LEVEL_S:.0f} s yet", "leave the instrument alone"
+            )
         angles = np.degrees([log.theta_x[near], log.theta_y[near]]) * 3600
         minutes = (log.utc_unix_s[near] - end) / 60
         drift = np.polyfit(minutes, angles.T, 1)[0]
@@ -174,11 +176,11 @@ class FirstNight:
         found = f"noise {noise:.1f} arcsec (stated {stated:.1f}), drift {drift[0]:+.0f}, {drift[1]:+.0f} arcsec/min"
         if not _still(log, end - LEVEL_S, end):
             return Look(
-                Step.LEVEL, False, found, "wait until nothing moves: a firm ground, no wind, no hands"
+                Stage.LEVEL, False, found, "wait until nothing moves: a firm ground, no wind, no hands"
             )
-        return Look(Step.LEVEL, True, found, "the level is still")
+        return Look(Stage.LEVEL, True, found, "the level is still")
 
-    def _with_pose(self, sight: Sight, log: TiltLog | str, look: Callable[[Pose], Look]) -> Look:
+    def _with_pose(self, sight: Sight, log: TiltLog | str, look: Callable[[Standing], Look]) -> Look:
         step = self._steps[0]
         if isinstance(log, str):
             return Look(step, False, log, "connect the inclinometer")
@@ -192,9 +194,9 @@ class FirstNight:
         if not _still(log, mid - AROUND_S, mid + AROUND_S):
             return Look(step, False, "it moves", "hands off until it is still")
         camera = sight.found.attitude @ earth_state(mid).gcrs_to_itrs.T
-        return look(Pose(sight, up_of(tilt.theta), camera))
+        return look(Standing(sight, up_of(tilt.theta), camera))
 
-    def _horizon(self, pose: Pose) -> Look:
+    def _horizon(self, pose: Standing) -> Look:
         """Compare leans by the level with the same leans by the stars, through A3."""
         if self._base is None:
             self._base = pose
@@ -219,10 +221,10 @@ class FirstNight:
         found += f", the stars differ by {misfit:.0%}"
         if len(leans) > 1 and self._turn_of(base, leans, mirrored=True)[1] <= OFF_SHARE:
             todo = "one of X' and Y' has the wrong sign, or they are swapped: correct it, and begin anew"
-            return Look(Step.HORIZON, False, f"{found}: the level is mirrored", todo)
-        return Look(Step.HORIZON, False, found, "camera and level do not move together: look what is loose")
+            return Look(Stage.HORIZON, False, f"{found}: the level is mirrored", todo)
+        return Look(Stage.HORIZON, False, found, "camera and level do not move together: look what is loose")
 
-    def _turn_of(self, base: Pose, leans: Sequence[Pose], mirrored: bool) -> tuple[float, float]:
+    def _turn_of(self, base: Standing, leans: Sequence[Standing], mirrored: bool) -> tuple[float, float]:
         """Turn of A3 about Z' (rad) with which the stars lean as the level does, and the misfit as a share of the lean.
 
         mirrored: as if Y' had the wrong sign.
@@ -253,7 +255,7 @@ class FirstNight:
         else:
             found += f"A3's signs are right, its rz is {now_deg:.0f} deg"
         return Look(
-            Step.HORIZON,
+            Stage.HORIZON,
             True,
             found,
             "set the foot back; then turn the whole instrument on the spot by 90 deg",
@@ -261,23 +263,21 @@ class FirstNight:
 
     def _lean(self, found: str) -> Look:
         foot = "only another foot, a quarter around," if self._leans else "one foot"
-        return Look(Step.HORIZON, False, found, f"raise {foot} by 1 to 5 deg, and wait")
+        return Look(Stage.HORIZON, False, found, f"raise {foot} by 1 to 5 deg, and wait")
 
-    def _turn(self, pose: Pose) -> Look:
-        for number, heading in enumerate(self._headings, 1):
-            if _angle_deg(heading[0], pose) < APART_DEG:
-                heading.append(pose)
-                break
-        else:
-            self._headings.append([pose])
-            number = len(self._headings)
+    def _turn(self, pose: Standing) -> Look:
+        near = [k for k, heading in enumerate(self._headings) if _angle_deg(heading[0], pose) < APART_DEG]
+        if not near:
+            self._headings.append([])
+        number = near[0] if near else len(self._headings) - 1
+        self._headings[number].append(pose)
         self._poses.append(pose)
-        many = len(self._headings[number - 1])
+        number, many = number + 1, len(self._headings[number])
         found = f"heading {number} of {HEADINGS}: frame {many}"
         if many < FRAMES_EACH:
-            return Look(Step.TURN, False, found, "hands off")
+            return Look(Stage.TURN, False, found, "hands off")
         if sum(len(h) >= FRAMES_EACH for h in self._headings) < HEADINGS:
-            return Look(Step.TURN, False, found, "turn by 90 deg on the spot, always the same way")
+            return Look(Stage.TURN, False, found, "turn by 90 deg on the spot, always the same way")
         return self._calibrated(found)
 
     def _calibrated(self, found: str) -> Look:
@@ -293,17 +293,17 @@ class FirstNight:
         self.turned = turned(solver, frames, log, TURN_STDDEV_DEG)
         said = f"{found}; {'; '.join(map(str, self.turned.remarks))}"
         if not self.turned.worth_saving:
-            return Look(Step.TURN, False, said, "turn on, to other headings")
-        return Look(Step.TURN, True, said, "A3 is known")
+            return Look(Stage.TURN, False, said, "turn on, to other headings")
+        return Look(Stage.TURN, True, said, "A3 is known")
 
 
-def _angle_deg(one: Pose, other: Pose) -> float:
+def _angle_deg(one: Standing, other: Standing) -> float:
     return float(np.degrees(np.linalg.norm(rotation.to_vector(one.camera @ other.camera.T))))
 
 
 def _still(log: TiltLog, begin_s: float, end_s: float) -> bool:
     """Whether the level's readings between two times differ by no more than their stated noise explains."""
-    near: Sequence[bool] = (log.utc_unix_s >= begin_s) & (log.utc_unix_s <= end_s)
+    near = (log.utc_unix_s >= begin_s) & (log.utc_unix_s <= end_s)
     angles = np.stack([log.theta_x, log.theta_y])[:, near]
     if angles.shape[1] < 2:
         return True

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """`starpos first-night`: from nothing to a saved A3, what it says on the way, and what it refuses."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
@@ -44,11 +46,8 @@ def test_from_nothing_to_a_saved_a3_in_ten_minutes(first_night, whole, tmp_path)
     done = [line.split()[2] for line in said.splitlines() if " ok " in line and line.split()[2] != "clock"]
     assert done == ["focus", "exposure", "level", "horizon", "turn"]
     # each frame's line is followed by what to do
-    lines = said.splitlines()
     assert all(
-        after.strip().startswith("->")
-        for line, after in zip(lines, lines[1:], strict=False)
-        if " .. " in line
+        after.strip().startswith("->") for line, after in pairwise(said.splitlines()) if " .. " in line
     )
 
 

@@ -23,7 +23,7 @@ def folder() -> int:
     k = sys.argv.index("--ros-args") if "--ros-args" in sys.argv else len(sys.argv)
     parser = argparse.ArgumentParser(
         prog="folder",
-        description="Write the instrument's stars and tilts into a folder until Ctrl-C; one that is there is gone on with.",
+        description="Write the instrument's stars and tilts into a folder, new or there already, until Ctrl-C.",
     )
     parser.add_argument("folder", type=Path, metavar="NIGHT")
     path = parser.parse_args(sys.argv[1:k]).folder

@@ -65,11 +65,12 @@ class FolderWriter(Node):
             stars = message_to_stars(message)
             if stars.mid_unix_s is None or not stars.exposure_s:
                 raise StarposError("stars without a time of their exposure: set the detector's `stamp`")
+            begin_s = stars.mid_unix_s - stars.exposure_s / 2
             stars = replace(stars, focal_px=self._focal_px, fwhm_px=self._fwhm_px)
             # A reader must never see half of a list.
             whole = self._folder / f"stars_{self._frames:04d}.csv"
             part = whole.with_suffix(".part")
-            write_star_list(part, stars, date_obs(stars.mid_unix_s - stars.exposure_s / 2))
+            write_star_list(part, stars, date_obs(begin_s))
             part.rename(whole)
             self._frames += 1
             self._trouble = ""

@@ -22,7 +22,7 @@ A3_DEG = (0.4, -0.7, 130.0)
 
 @dataclass(frozen=True)
 class Stand:
-    """The instrument for some frames: leans (deg) about north and east, turned about the vertical (deg), and its optics."""
+    """The instrument for some frames: leans (deg) about north and east, turn about the vertical (deg), optics."""
 
     frames: int
     lean_deg: tuple[float, float] = (0.0, 0.0)
