@@ -59,7 +59,7 @@ def define(parser: argparse.ArgumentParser) -> None:
     parser.set_defaults(run=run)
 
 
-@dataclass
+@dataclass(kw_only=True)
 class PlayedNight:
     """What came of a bag: frames read, solutions, the average of its place, what was said; trouble: why it broke off."""
 
@@ -119,7 +119,7 @@ class Playing:
 
     def _played(self, play: Callable[[Replay], Iterator[frames.Output]], given: Sequence[str]) -> PlayedNight:
         settings = settings_of(self.params_file, given, self.namespace)
-        night = PlayedNight(settings.instrument(None))
+        night = PlayedNight(instrument=settings.instrument(None))
         said = _Said(night)
         replay = Replay(
             settings,
