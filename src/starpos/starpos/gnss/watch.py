@@ -25,7 +25,7 @@ DOUBT, ALARM = 13.8, 30.0
 BACK_S, BACK_FRAMES, BACK = 600.0, 10, 7.4
 # a place that is wider than this (1 sigma, m) is none: the filter is not linear over it
 WIDEST_M = 50_000.0
-# the place of a lean at which A3 was not learned may be bent by this share of its sigma
+# the place of a lean at which A3 was not learned may be bent by this share of its least sigma
 MOST_BENT = 0.3
 NOISE_SIGMA = 2.0
 # before A3 is known, so many frames of a pose teach, and so many of all are kept
@@ -143,10 +143,11 @@ class GnssWatch:
         """Whether the stars tell a place with what was learned before this frame."""
         if self.learned is None:
             return False
-        covariance = place_of_stars(sighting, self.learned, self.vertical)[2]
-        if np.linalg.eigvalsh(covariance)[-1] >= WIDEST_M**2:
+        narrow, wide = np.linalg.eigvalsh(place_of_stars(sighting, self.learned, self.vertical)[2])
+        if wide >= WIDEST_M**2:
             return False
-        return not self._held or self._bent_m(sighting.tilt) < MOST_BENT * math.sqrt(np.trace(covariance) / 2)
+        # a turn makes the place wide along an arc, and the bend leaves it across
+        return not self._held or self._bent_m(sighting.tilt) < MOST_BENT * math.sqrt(narrow)
 
     def _bent_m(self, tilt: Tilt) -> float:
         """What a turn of A3 about the plumb line that is hardly known may do to the place beyond a linear error."""
@@ -231,7 +232,9 @@ class GnssWatch:
             return
         if self._of_pose >= FEW_OF_POSE:
             return
-        self._held.append(GnssFrame(sighting, gnss, self._of_pose == 0))
+        first = self._of_pose == 0
+        up = sighting.camera_to_itrs.T @ gnss.zenith if first else self._held[-1].up_in_camera
+        self._held.append(GnssFrame(sighting, gnss, first, up))
         self._of_pose += 1
         self.learned = begun(self._instrument, self._held, self.vertical)
         self._begins = not is_linear(self.learned, sighting.tilt)
