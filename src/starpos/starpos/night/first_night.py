@@ -24,10 +24,10 @@ from starpos.night.together import TurnedNight, turned
 
 # Widths of star images that the detector measures well, px.
 NARROWEST_PX, WIDEST_PX = 1.2, 4.0
-# So many frames in a row are as sharp as the sharpest so far, within this share.
+# Number of frames in a row that are as sharp as the sharpest so far, within this share.
 SHARP_FRAMES, AS_SHARP = 3, 1.1
 FEWEST_STARS = 20
-# Of so many of the brightest stars at most this share may be saturated.
+# Number of the brightest stars, and the share of them that may be saturated.
 BRIGHTEST, MOST_SATURATED = 20, 0.2
 # The level is watched so long; a lean that moves less than its noise, times this, is still.
 LEVEL_S, STILL = 10.0, 3.0
@@ -101,7 +101,7 @@ class FirstNight:
         return self._steps[0] if self._steps else None
 
     def add(self, sight: Sight, log: TiltLog | str) -> Look:
-        """Take the next frame, identified, and the tilts so far, or why there are none."""
+        """Take the next frame, identified, and the tilts so far, or a sentence on why they are missing."""
         step = self._steps[0]
         looks: dict[Stage, Callable[[], Look]] = {
             Stage.FOCUS: lambda: self._focus(sight.stars),

@@ -74,7 +74,7 @@ def arriving(
             for k in range(stand.frames):
                 waits_s = MOVED_S if moved and k == 0 else CADENCE_S
                 for t in np.arange(now_s, now_s + waits_s, TILT_S):
-                    # while it is moved nobody reads the level
+                    # no readings while it is moved
                     if waits_s == CADENCE_S or t > now_s + MOVED_S - CADENCE_S:
                         x, y = np.degrees(read_tilt(at, (t - begin_s) / 3600, rng))
                         tilts.write(f"{t:.3f},{x:.6f},{-y if mirrored else y:.6f}\n")
