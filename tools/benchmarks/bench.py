@@ -40,6 +40,7 @@ GROUPS = {
 # What `full` measures: the benchmark whose `run` it is.
 FULL = {
     "accuracy": "accuracy_by_configuration",
+    "deflection": "benchmark_deflection",
     "detection": "benchmark_detection",
     "heading": "benchmark_heading",
     "identification": "benchmark_identification",

@@ -61,6 +61,10 @@ class FixError(StarposError):
     """The stars do not support a fix."""
 
 
+class StationError(StarposError):
+    """The result of a zenith camera's session is missing or broken, or contradicts that of another."""
+
+
 class VoyageError(StarposError):
     """The record of a voyage (inertial readings, velocities) is missing or broken, or contradicts its stars."""
 

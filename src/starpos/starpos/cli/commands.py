@@ -75,8 +75,19 @@ COMMANDS = {
         (
             "starpos deflection *.fits --tilt tilt.csv --site 47.3 8.5 560 --instrument zenith.yaml --pressure-hpa 950 "
             "--temperature-c 12",
+            "starpos deflection --plan 0.1 --site 47.3 8.5 560 --instrument zenith.yaml",
         ),
-        "docs/how-to/deflection.md leads from a mount and a tiltmeter to a value",
+        "starpos stations and starpos report read what --json prints; docs/how-to/deflection.md has the whole way",
+    ),
+    "stations": Command(
+        "many sessions of starpos deflection: repeats, differences from a geoid grid, levelling, GeoJSON",
+        (
+            "starpos deflection *.fits --tilt tilt.csv --site 47.3 8.5 560 --station P1 --instrument z.yaml --json > "
+            "p1.json",
+            "starpos stations p1.json p2.json --geoid egm96_15.gtx --level P1 P2",
+            "starpos stations *.json --geojson > stations.geojson",
+        ),
+        "starpos report p1.json makes the station's page",
     ),
     "report": Command(
         "nights on one page: stability, scatter, residuals, sky, error budget",

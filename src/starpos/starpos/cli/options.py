@@ -246,6 +246,12 @@ def check_self_calibration(args: argparse.Namespace) -> None:
 
 def add_size(parser: argparse.ArgumentParser) -> None:
     """Add the frame size, and make the paper's optics the default."""
+    add_frame_size(parser)
+    parser.set_defaults(focal_mm=600.0, pixel_um=6.4)
+
+
+def add_frame_size(parser: "argparse._ActionsContainer") -> None:
+    """Add --size, the paper's by default."""
     parser.add_argument(
         "--size",
         type=number(16, 100_000, int),
@@ -254,7 +260,6 @@ def add_size(parser: argparse.ArgumentParser) -> None:
         metavar=("W", "H"),
         help="frame size in px (5616 3744)",
     )
-    parser.set_defaults(focal_mm=600.0, pixel_um=6.4)
 
 
 def camera_of(args: argparse.Namespace) -> Camera:

@@ -82,6 +82,8 @@ class GnssWatch:
         self._pose: LevelSight | None = None
         self._new_pose = True
         self._readings: frozenset[float] = frozenset()
+        # the readings of a frame that would have been an alarm, before A3 was known
+        self._suspicious: frozenset[float] | None = None
         self._witnesses = Witnesses.none(0)
 
     @property
@@ -109,6 +111,7 @@ class GnssWatch:
     def _forget(self) -> None:
         self.learned, self._begins, self.disagrees = None, True, False
         self._held.clear()
+        self._suspicious = None
         self._witnesses = Witnesses.none(0)
 
     def _age(self, sighting: LevelSight) -> None:
@@ -166,8 +169,7 @@ class GnssWatch:
         seen = innovation(sighting, gnss, self.learned, self.vertical)
         single = chi2(self.learned, seen)
         if self._begins:
-            status = DISAGREES if single > ALARM else DOUBTFUL if single > DOUBT else LEARNING
-            return self._check(status, sighting, gnss)
+            return self._check(self._while_it_begins(single, sighting.tilt), sighting, gnss)
         witnesses = self._witnesses if len(self._witnesses.since) else Witnesses.none(len(self.learned.state))
         if not self.disagrees and witnesses.due(sighting.utc_unix_s):
             witnesses = witnesses.set_aside(self.learned)
@@ -181,6 +183,17 @@ class GnssWatch:
         if self.disagrees:
             return self._check(DISAGREES, sighting, gnss)
         return self._check(DOUBTFUL if worst > DOUBT else AGREES, sighting, gnss)
+
+    def _while_it_begins(self, single: float, tilt: Tilt) -> str:
+        """The status while A3 is hardly known: an alarm needs two frames, for readings that err by chance say it once."""
+        readings = frozenset(tilt.times)
+        again = self._suspicious is not None and not (readings & self._suspicious)
+        if single <= ALARM:
+            self._suspicious = None
+            return DOUBTFUL if single > DOUBT else LEARNING
+        if self._suspicious is None:
+            self._suspicious = readings
+        return DISAGREES if again else DOUBTFUL
 
     def _take_back(self, witness: int, sighting: LevelSight) -> None:
         """Know again what was known one witness before the one who speaks most against GNSS."""

@@ -193,6 +193,16 @@ PARAMETERS = (
         "190 m.",
     ),
     Parameter(
+        "deflection.wanted",
+        NAN,
+        "Measure the deflection of the vertical at the site (site.geodetic, altitude) until it errs by at most this; "
+        "~/deflection and the dashboard say how far it is. Unset: it is not measured.",
+        unit="arcsec",
+        minimum=0.001,
+        maximum=3.0,
+        read_only=True,
+    ),
+    Parameter(
         "site.latitude",
         NAN,
         "Latitude of a place that is known, as of a pillar: heading/imu is published there without any tilt. Unset: the "
@@ -384,6 +394,18 @@ def site_of(values: Mapping, vertical: Vertical) -> KnownPlace | None:
         raise PlaceError("site.latitude and site.longitude belong together: set both, or neither")
     make = KnownPlace.on_ellipsoid if values["site.geodetic"] else KnownPlace.by_gravity
     return make(latitude, longitude, vertical, np.eye(2) * values["site.stddev"] ** 2)
+
+
+def check_deflection(values: Mapping) -> None:
+    """Raise PlaceError if deflection.wanted lacks the mark."""
+    if math.isnan(values["deflection.wanted"]):
+        return
+    mark = (values["site.latitude"], values["site.longitude"], values["altitude"])
+    if not values["site.geodetic"] or any(math.isnan(value) for value in mark):
+        raise PlaceError(
+            "deflection.wanted is measured at a mark on WGS 84: set site.latitude, site.longitude, site.geodetic true "
+            "and altitude too"
+        )
 
 
 def geoid_file(name: str) -> Geoid | None:

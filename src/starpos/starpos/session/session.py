@@ -32,6 +32,7 @@ from starpos.session.backlog import MAX_WAITING, Backlog
 from starpos.session.calibrating import Calibrating
 from starpos.session.camera_solver import CameraSolver
 from starpos.session.clock_doubt import ClockDoubt
+from starpos.session.deflection import LiveDeflection
 from starpos.session.frames import Answered, Averaged, Output, Waiting, ground_of
 from starpos.session.gnss_teacher import GnssTeacher, solved_beside
 from starpos.session.gyro import Gyro
@@ -89,6 +90,7 @@ class SolverSession:
         self.gyro = Gyro(heard)
         self.gnss = GnssTeacher(settings, jobs(), heard, log) if settings.values["gnss.use"] else None
         self.places = SessionPlaces(settings, self.gnss)
+        self.deflection = LiveDeflection(settings, jobs())
         self._search = Search(settings.values)
         self._settings, self._values = settings, settings.values
         self._catalogue = catalogue.load_catalogue()
@@ -126,6 +128,7 @@ class SolverSession:
         if self.gnss is not None:
             self.gnss.other_camera()
         self.calibrating.camera_changed()
+        self.deflection.forget()
 
     @property
     def waits(self) -> bool:
@@ -135,7 +138,7 @@ class SolverSession:
     @property
     def busy(self) -> bool:
         """Whether a job runs: what comes meanwhile may be answered with its outcome, or without."""
-        return self.instrument.preparing or self.calibrating.busy
+        return self.instrument.preparing or self.calibrating.busy or self.deflection.busy
 
     # parameters ------------------------------------------------------------------------------------------------------
 
@@ -144,6 +147,7 @@ class SolverSession:
         if "clock_stddev" in names:
             self.doubt.clear()
         self.calibrating.parameters_set(names)
+        self.deflection.parameters_set(names)
         self.instrument.remake()
 
     # inputs ----------------------------------------------------------------------------------------------------------
@@ -240,8 +244,6 @@ class SolverSession:
             self.gnss.take(message, now)
         return self.at(now)
 
-    # time ------------------------------------------------------------------------------------------------------------
-
     def at(self, now: Now) -> list[Output]:
         """Go on to a time."""
         self._advance(now)
@@ -272,8 +274,6 @@ class SolverSession:
             self.tilts.forget_after(now.unix_s)
         if now.unix_s > was_s:
             self._intake.go_on(now)
-
-    # work ------------------------------------------------------------------------------------------------------------
 
     def _work(self, now: Now) -> list[Output]:
         """Answer the first frames that have everything they need: of recorded ones all, live one at a time."""
@@ -399,12 +399,11 @@ class SolverSession:
             tilt = answer.tilt or self.tilts.average(stars.mid_unix_s, self._span(stars))
         except StarposError:
             return []
+        self.deflection.take(self.instrument.solver, stars, tilt, answer.found)
         place = self.calibrating.learn(Seen(stars, tilt, answer.found), answer.fix)
         if place is None:
             return []
         return [Averaged(frame.header.stamp, place, ground_of(place, self._settings.vertical))]
-
-    # outputs ---------------------------------------------------------------------------------------------------------
 
     def _answered(self, stamp: Any, answer: Solution, now: Now, beside: Watched | None = None) -> Answered:
         if now.played:
@@ -445,3 +444,4 @@ class SolverSession:
             self.gnss.forget_places()
         self.doubt.clear()
         self.calibrating.forget()
+        self.deflection.forget()

@@ -10,7 +10,7 @@ from starpos.earth.vertical import Deflection
 from starpos.gnss.lacking import what_would_tell_more
 from starpos.gnss.place import GnssPlace
 from starpos.gnss.sighting import place_of_stars
-from starpos.gnss.watch import AGREES, DISAGREES, LEARNING, GnssWatch
+from starpos.gnss.watch import AGREES, DISAGREES, DOUBTFUL, LEARNING, GnssWatch
 from starpos.instrument import sensors
 from starpos_testing.gnss_drives import GnssDrive
 
@@ -164,3 +164,10 @@ def test_one_pose_tells_no_turn_of_a3_however_good_the_inclinometer():
     learned = watch.learned
     up, a3 = learned.calibrated_up, learned.covariance[learned.layout.a3, learned.layout.a3]
     assert np.sqrt(up @ a3 @ up) > 0.99
+
+
+def test_before_a3_is_known_an_alarm_needs_two_frames():
+    # good for two frames of a pose, then 30 km off
+    drive = GnssDrive(stops=1, frames=4)
+    told, _ = driven(drive, 71, astray=lambda t: np.array([0.0, 30_000.0]) * (t > 9))
+    assert [frame.check.status for frame in told] == [LEARNING, LEARNING, DOUBTFUL, DISAGREES]
