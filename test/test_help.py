@@ -20,7 +20,7 @@ NODES_OF = {name: (name,) for name in NODES} | {"camera_detector": ("camera", "d
 
 
 def test_all_are_asked():
-    assert {name for _, name in EXECUTABLES} == {*NODES_OF, "emulator", "record", "replay"}
+    assert {name for _, name in EXECUTABLES} == {*NODES_OF, "emulator", "folder", "record", "replay"}
 
 
 @pytest.mark.parametrize(("package", "name"), EXECUTABLES, ids=[name for _, name in EXECUTABLES])

@@ -124,11 +124,12 @@ def test_the_policy_holds_for_the_nodes_apart(graph, secured, tmp_path):
     secured("starpos_camera", "detector", sim, "gyro:=true")
     secured("starpos_inclinometer", "inclinometer", sim, "source:=imu")
     secured("starpos_bringup", "record", arguments=(str(tmp_path / "bag"), "--images"))
+    secured("starpos_bringup", "folder", arguments=(str(tmp_path / "night"),))
     dashboard = secured("starpos_dashboard", "dashboard", sim, "port:=0")
     graph.wait(lambda: "http://" in dashboard.output)
     address = "http://" + dashboard.output.split("http://")[1].split()[0]
     with urllib.request.urlopen(f"{address}/events?frame", timeout=WAIT_S):
-        names = ("solver", "navigator", "camera", "detector", "inclinometer", "record", "dashboard")
+        names = ("solver", "navigator", "camera", "detector", "inclinometer", "record", "folder", "dashboard")
         hold(graph, *(f"/starpos/{name}" for name in names))
 
 

@@ -28,6 +28,7 @@ setup(
         "console_scripts": [
             "record = starpos_bringup.recording.record:record",
             "replay = starpos_bringup.recording.replay:replay",
+            "folder = starpos_bringup.recording.folder:folder",
         ]
     },
 )

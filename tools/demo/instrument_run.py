@@ -22,7 +22,10 @@ ACCEPTED_SIGMA = 4.0
 
 @dataclass(frozen=True, kw_only=True)
 class Place:
-    """The place of the instrument, its pointing, and the mounting of its parts; deg, Pa, deg C."""
+    """The place of the instrument, its pointing, and the mounting of its parts; deg, Pa, deg C.
+
+    binning: pixels of the camera that become one, each way.
+    """
 
     latitude: float
     longitude: float
@@ -33,6 +36,7 @@ class Place:
     pressure: float = 95000.0
     temperature: float = 8.0
     humidity: float = 0.4
+    binning: int = 1
 
     @classmethod
     def drawn(cls, rng: np.random.Generator) -> "Place":
@@ -52,6 +56,8 @@ class Place:
         air = Atmosphere(pressure_pa=self.pressure, temperature_c=self.temperature, humidity=self.humidity)
         pointing = (self.azimuth, self.altitude, self.roll)
         return scene_of(
+            size=(5616 // self.binning, 3744 // self.binning),
+            focal_px=93750.0 / self.binning,
             latitude_deg=self.latitude,
             longitude_deg=self.longitude,
             atmosphere=air,
@@ -190,7 +196,7 @@ def stamp_of(message) -> tuple[int, int]:
     return message.header.stamp.sec, message.header.stamp.nanosec
 
 
-def _error_m(latitude: float, longitude: float, place: Place) -> tuple[float, float]:
+def error_m(latitude: float, longitude: float, place: Place) -> tuple[float, float]:
     """Errors of a solution to the east and north of the truth, m."""
     from starpos.earth.ellipsoid import curvature_radii_m
 
@@ -207,7 +213,7 @@ def _row(number: int, s, place: Place, seconds: float) -> str:
     if s.status != s.OK:
         return f"{number:5d}  {s.stars_detected:5d}  {s.status_text}"
     sigma = math.sqrt((s.covariance[0] + s.covariance[4]) / 2)
-    error = math.hypot(*_error_m(s.latitude, s.longitude, place))
+    error = math.hypot(*error_m(s.latitude, s.longitude, place))
     return (
         f"{number:5d}  {s.stars_detected:5d}  {s.stars_matched:7d}  {s.latitude:+10.5f}  {s.longitude:+11.5f}  "
         f"{s.heading:10.4f}  {sigma:8.0f}  {error:8.0f}  {seconds:7.2f}"
@@ -216,7 +222,7 @@ def _row(number: int, s, place: Place, seconds: float) -> str:
 
 def summarise(solutions: list, place: Place) -> tuple[dict, np.ndarray, np.ndarray]:
     """Compare the mean fix with the truth; return a summary, the errors (N, 2) m, and the covariance of one fix."""
-    errors = np.array([_error_m(s.latitude, s.longitude, place) for s in solutions])
+    errors = np.array([error_m(s.latitude, s.longitude, place) for s in solutions])
     one = np.array(solutions[-1].covariance).reshape(3, 3)
     variance = np.zeros(2)
     # Errors that are new in every frame average out, the others stay.

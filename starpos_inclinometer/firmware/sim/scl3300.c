@@ -1,5 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
-// Written from the data sheet (Doc. 4921 Rev. 2), apart from the firmware's header, so that the two check each other.
+// Written from the data sheet (Doc. 4921 Rev. 2), apart from the firmware's header, so that the two check each other. The
+// sheet's words for reading and setting, with their checksums, are as published drivers have them (0x240000C7 reads ANG_X,
+// 0xB400001F sets mode 1, 0x40000091 reads WHOAMI); the waiting times are from memory.
 #include "scl3300.h"
 
 #include <math.h>

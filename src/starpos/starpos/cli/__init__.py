@@ -59,7 +59,7 @@ def parser_for(given: Sequence[str]) -> CommandParser:
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )
         if given and given[0] == name:
-            import_module(f"starpos.cli.{name}").define(sub)
+            import_module(f"starpos.cli.{name.replace('-', '_')}").define(sub)
             sub.epilog = f"{sub.epilog}\n\n{command.epilog}" if sub.epilog else command.epilog
     return parser
 

@@ -118,6 +118,14 @@ COMMANDS = {
         ("starpos montecarlo --fields 100", "starpos montecarlo nights --help"),
         "docs/the_paper.md compares the tables with the paper's",
     ),
+    "first-night": Command(
+        "focus, exposure, level, clock, the level's signs, then A3 by turning: step by step, live, until it is saved",
+        (
+            "starpos first-night NIGHT --focal-mm 600 --pixel-um 6.4 --save mine.yaml",
+            "starpos first-night NIGHT --save mine.yaml --field night.zip",
+        ),
+        "starpos solve --instrument with the file that was written",
+    ),
     "doctor": Command(
         "which parts that starpos needs this machine has, which are missing, and what to type",
         (

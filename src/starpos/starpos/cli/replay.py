@@ -2,13 +2,13 @@
 """`starpos replay`: solve recorded nights with the code of the node `solver`, without ROS."""
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from starpos.averaging.average import Average
 from starpos.calibration.unknown import BY_PARAMETERS, MODEL_BY_PARAMETERS
-from starpos.cli import console, jobs, options
+from starpos.cli import console, field_replay, jobs, options
 from starpos.cli.archive import NightFolder
 from starpos.cli.fix_output import (
     COLUMNS,
@@ -29,6 +29,8 @@ from starpos.instrument.instrument import Instrument
 from starpos.night.remarks import of_a3, of_inclinometer
 from starpos.night.together import Solved, extrapolated
 from starpos.recording.drivers import NO_REMAPS, Remaps
+from starpos.report.field import is_field, opened
+from starpos.session import frames
 from starpos.session.frames import Answered, Averaged
 from starpos.session.parameter_file import drivers_of, settings_of
 from starpos.session.replay import Replay
@@ -41,7 +43,7 @@ def define(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         metavar="BAG",
         help="a rosbag2 with stars, tilts and camera_info, or with a robot's images, camera_info and IMU: a folder or a "
-        "file",
+        "file; or a field report (ZIP)",
     )
     parser.add_argument(
         "--namespace", metavar="NAME", help="of the instrument, in a bag, or a YAML, of several"
@@ -57,10 +59,11 @@ def define(parser: argparse.ArgumentParser) -> None:
     parser.set_defaults(run=run)
 
 
-@dataclass
+@dataclass(kw_only=True)
 class PlayedNight:
     """The result of a bag: frames read, solutions, the average of its place, sentences; trouble: why it broke off."""
 
+    instrument: Instrument
     frames: int = 0
     solutions: list[Solution] = field(default_factory=list)
     average: Average | None = None
@@ -107,16 +110,25 @@ class Playing:
     remaps: Remaps = NO_REMAPS
 
     def __call__(self, bag: str) -> PlayedNight:
-        night = PlayedNight()
+        if is_field(bag):
+            with opened(bag) as (folder, air):
+                told = self.given or self.params_file is not None
+                given = self.given if told else field_replay.parameters_in(folder, air)
+                return self._played(lambda replay: field_replay.played(replay, folder), given)
+        return self._played(lambda replay: replay.play(Path(bag), self.namespace), self.given)
+
+    def _played(self, play: Callable[[Replay], Iterator[frames.Output]], given: Sequence[str]) -> PlayedNight:
+        settings = settings_of(self.params_file, given, self.namespace)
+        night = PlayedNight(instrument=settings.instrument(None))
         said = _Said(night)
         replay = Replay(
-            settings_of(self.params_file, self.given, self.namespace),
+            settings,
             said,
             said,
             drivers_of(self.params_file, self.given, self.namespace, self.remaps),
         )
         try:
-            for output in replay.play(Path(bag), self.namespace):
+            for output in play(replay):
                 if isinstance(output, Answered):
                     night.solutions.append(_light(output.solution))
                 elif isinstance(output, Averaged):
@@ -142,7 +154,7 @@ def run(args: argparse.Namespace) -> int:
     with jobs.workers_of(args, len(args.bags)) as workers:
         answers = jobs.watched(workers.map((work, bag) for bag in args.bags), len(args.bags), "bag")
         return max(
-            tell(args, output, bag, night, settings.vertical, settings.instrument(None))
+            tell(args, output, bag, night, settings.vertical)
             for bag, night in zip(args.bags, answers, strict=True)
         )
 
@@ -153,7 +165,6 @@ def tell(
     bag: str,
     night: PlayedNight,
     vertical: Vertical,
-    instrument: Instrument,
 ) -> int:
     """Write the solutions of a bag and the average of its place; returns the exit status."""
     for sentence in night.said:
@@ -172,9 +183,9 @@ def tell(
     whole = night.average
     remarks = list(extrapolated(solved))
     if solved:
-        remarks += of_inclinometer(instrument, MODEL_BY_PARAMETERS)
+        remarks += of_inclinometer(night.instrument, MODEL_BY_PARAMETERS)
     if whole:
-        remarks += of_a3(instrument.calibration, whole, BY_PARAMETERS)
+        remarks += of_a3(night.instrument.calibration, whole, BY_PARAMETERS)
     for remark in remarks:
         console.complain("replay", f"{bag}: {remark}")
     if solved:

@@ -76,6 +76,11 @@ def shutter(header: Mapping, place: str) -> Shutter | None:
         ) from None
 
 
+def fwhm_px(header: Mapping) -> float | None:
+    """Width of the star images (px) by the FWHM of a list of stars; None if it has none."""
+    return _positive(header, "FWHM")
+
+
 def focal_px(header: Mapping) -> float | None:
     """Focal length in px by FOCALLEN (mm) / XPIXSZ (um), else by a plate scale; None if nothing says it. Only a hint."""
     focal, pixel_um = _positive(header, "FOCALLEN"), _positive(header, "XPIXSZ")

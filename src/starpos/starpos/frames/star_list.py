@@ -11,7 +11,7 @@ import numpy as np
 
 from starpos.errors import FrameError, one_line
 from starpos.files import bytes_of
-from starpos.frames.header import about, focal_mm
+from starpos.frames.header import about, focal_mm, fwhm_px
 from starpos.frames.stars import Stars
 
 MAX_CSV_BYTES = 20_000_000
@@ -46,7 +46,7 @@ def read_star_list(file: BinaryIO, place: str) -> Stars:
     names = [name.strip().lower() for name in rows[0]] if rows else []
     if not {"x", "y", "flux"} <= set(names):
         raise FrameError(
-            f"{place}: its second line names the columns {reprlib.repr(names)}; it must name x, y, flux and may sigma."
+            f"{place}: its second line names the columns {reprlib.repr(names)}; it must name x, y, flux."
         )
     try:
         table = np.array([[float(cell) for cell in row] for row in rows[1:]]).reshape(-1, len(names))
@@ -67,9 +67,10 @@ def read_star_list(file: BinaryIO, place: str) -> Stars:
         flux=column["flux"][order],
         snr=1.0 / sigma[order],
         covariance=(sigma[order] ** 2)[:, None, None] * np.eye(2),
-        flags=np.zeros(len(table)),
+        flags=column.get("flags", np.zeros(len(table)))[order],
         width=width,
         height=height,
+        fwhm_px=fwhm_px(header),
         **about(header, place),
     )
 
@@ -89,9 +90,11 @@ def write_star_list(path: Path | str, stars: Stars, start_utc: str, pixel_um: fl
         header |= {"FOCALLEN": focal_mm(stars.focal_px, pixel_um), "XPIXSZ": pixel_um}
     if stars.shutter is not None:
         header["ROLLSHUT"] = stars.shutter.readout_s
+    if stars.fwhm_px is not None:
+        header["FWHM"] = round(stars.fwhm_px, 3)
     sigma = np.sqrt(np.trace(stars.covariance, axis1=1, axis2=2) / 2)
     rows = "".join(
-        f"{x:.5f},{y:.5f},{f:.2f},{s:.5f}\n"
-        for x, y, f, s in zip(stars.x, stars.y, stars.flux, sigma, strict=True)
+        f"{x:.5f},{y:.5f},{f:.2f},{s:.5f},{flags}\n"
+        for x, y, f, s, flags in zip(stars.x, stars.y, stars.flux, sigma, stars.flags, strict=True)
     )
-    Path(path).write_text(f"# {json.dumps(header)}\nx,y,flux,sigma\n{rows}")
+    Path(path).write_text(f"# {json.dumps(header)}\nx,y,flux,sigma,flags\n{rows}")

@@ -2,7 +2,7 @@
 """A log of tilt readings: the tilt of an exposure from it."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import KW_ONLY, dataclass
+from dataclasses import KW_ONLY, dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -144,6 +144,20 @@ class TiltLog:
         near = (apart > 0) & (apart < NEIGHBOURS_S)
         steps = np.diff(self.theta[order], axis=0)[near]
         return max(noise_excess(steps, float(np.sqrt(self.variance.mean()))), self.earlier_excess)
+
+    def until(self, unix_s: float) -> "TiltLog":
+        """The readings up to a time."""
+        rows = self.utc_unix_s <= unix_s
+        return replace(
+            self,
+            utc_unix_s=self.utc_unix_s[rows],
+            theta_x=self.theta_x[rows],
+            theta_y=self.theta_y[rows],
+            temperature_c=self.temperature_c[rows],
+            covariance=self.covariance[rows],
+            theta_z=None if self.theta_z is None else self.theta_z[rows],
+            variance_z=None if self.variance_z is None else self.variance_z[rows],
+        )
 
     def average(self, mid_unix_s: float, exposure_s: float, spread_s: float = 0.0) -> Tilt:
         """The mean tilt over an exposure, from the readings in it or, for a short one, from two that bracket it closely.

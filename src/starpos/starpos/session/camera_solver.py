@@ -69,6 +69,10 @@ class CameraSolver:
         if self._frame_px is not None or not open_size:
             self._take(camera, stamp_to_unix(message.header.stamp), at_once)
 
+    def know(self, camera: Camera) -> None:
+        """Take a camera that is known without a CameraInfo."""
+        self._take(camera, None, at_once=True)
+
     def frame_came(self, width: int, height: int, at_once: bool) -> None:
         """Note the size of a frame, px: a CameraInfo that leaves its size open takes it."""
         if (width, height) != self._frame_px:

@@ -1,11 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """A recorded night through a session, as the nodes solve it when `replay` plays the bag to them."""
 
-from collections.abc import Iterator
+import math
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 from starpos.errors import StarposError
+from starpos.frames.stars import Stars
+from starpos.instrument.camera import Camera
+from starpos.instrument.tilt_log import TiltLog
+from starpos.messages.stamp import PlainHeader, PlainStamp
+from starpos.messages.tilt import Reading, TiltMessage
 from starpos.night.drivers import IMAGES, DriverMessages, Drivers
 from starpos.recording.bag import BagReader
 from starpos.recording.drivers import CAPTURE, IMU
@@ -57,12 +63,27 @@ class Replay:
                 now = Now.in_data(now_ns * 1e-9)
                 yield from self._taken(connection.msgtype, message, messages, now)
                 yield from self._settled(now)
-        now = Now.in_data(now_ns * 1e-9)
-        yield from self.session.end(now)
-        while self.session.busy:
-            yield from self._settled(now)
-            yield from self.session.end(now)
+        yield from self._ended(Now.in_data(now_ns * 1e-9))
         self.remarks += messages.remarks()
+
+    def play_lists(self, camera: Camera, stars: Sequence[Stars], tilts: TiltLog) -> Iterator[Output]:
+        """Yield what the solver publishes of lists of stars with times, and of tilts, each at its own time."""
+        self.session.instrument.know(camera)
+        messages: list[tuple[float, Any]] = [
+            (unix_s, _tilt_message(tilts, k)) for k, unix_s in enumerate(tilts.utc_unix_s.tolist())
+        ]
+        messages += [((s.mid_unix_s or 0.0) + (s.exposure_s or 0.0) / 2, s) for s in stars]
+        now = Now.in_data(0.0)
+        for unix_s, message in sorted(messages, key=lambda m: m[0]):
+            now = Now.in_data(unix_s)
+            if isinstance(message, Stars):
+                self.frames += 1
+                stamp = PlainStamp.of_ns(round((message.mid_unix_s or 0.0) * 1e9))
+                yield from self.session.take_detected(message, PlainHeader(stamp, "camera"), now)
+            else:
+                yield from self._take_tilt(message, now)
+            yield from self._settled(now)
+        yield from self._ended(now)
 
     def _taken(self, kind: str, message: Any, messages: DriverMessages, now: Now) -> list[Output]:
         """Have the session take a message, or the stars or tilt made from it."""
@@ -94,8 +115,30 @@ class Replay:
         self._tilts += 1
         return self.session.take_tilt(message, Sent(self._tilts), now)
 
+    def _ended(self, now: Now) -> Iterator[Output]:
+        yield from self.session.end(now)
+        while self.session.busy:
+            yield from self._settled(now)
+            yield from self.session.end(now)
+
     def _settled(self, now: Now) -> Iterator[Output]:
         while self.session.busy:
             for jobs in self._jobs:
                 jobs.work()
             yield from self.session.at(now)
+
+
+def _tilt_message(log: TiltLog, k: int) -> TiltMessage:
+    """The message of a reading."""
+    z, variance_z = (math.nan if c is None else float(c[k]) for c in (log.theta_z, log.variance_z))
+    return Reading(
+        stamp_ns=round(float(log.utc_unix_s[k]) * 1e9),
+        x=float(log.theta_x[k]),
+        y=float(log.theta_y[k]),
+        covariance=tuple(log.covariance[k].ravel().tolist()),
+        temperature_c=float(log.temperature_c[k]),
+        sequence=k,
+        flags=0,
+        z=z,
+        z_variance=variance_z,
+    ).message("inclinometer")

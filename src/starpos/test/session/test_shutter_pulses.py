@@ -33,6 +33,11 @@ class Camera:
         pulses = [] if "missed" in faults else [(true_s, self.length_s + rng.normal(0, 2e-5))]
         if "double" in faults:
             pulses.append((true_s + self.length_s + rng.uniform(0.005, 0.02), rng.uniform(0.001, 0.01)))
+        if "bouncing" in faults:
+            # longer than the 2 ms that the board bridges: the contact opens and closes once more
+            at, length = pulses.pop(0) if pulses else (true_s, self.length_s)
+            shut, apart = rng.uniform(0.0001, 0.004), rng.uniform(0.002, 0.006)
+            pulses += [(at, shut), (at + shut + apart, length - shut - apart)]
         if "spark" in faults:
             pulses.append((rng.uniform(commanded_s, arrived_s), 10 ** rng.uniform(-5, -1)))
         if "flash" in faults:
@@ -56,8 +61,8 @@ def test_of_ten_thousand_frames_with_faulty_pulses_none_is_paired_wrongly():
     for seed in range(4):
         camera = Camera(seed, lag_s=(0.05, 0.2, 0.0, 0.15)[seed], jitter_s=(0.001, 0.004, 0.0, 0.008)[seed])
         for k in range(2500):
-            kinds = ("missed", "double", "spark", "flash", "lost")
-            faults = [f for f in kinds if camera.rng.random() < 0.055]
+            kinds = ("missed", "double", "bouncing", "spark", "flash", "lost")
+            faults = [f for f in kinds if camera.rng.random() < 0.045]
             got, true_s = camera.frame(BEGIN_S + 0.5 * k, faults)
             good += not faults
             if isinstance(got, ShutterPulse):

@@ -1,0 +1,160 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`starpos first-night`: from nothing to a saved A3, live, with what to do next after each frame."""
+
+import argparse
+import sys
+import time
+from pathlib import Path
+
+from starpos.cli import console, doctor, options, overwriting
+from starpos.cli.inputs import given_of
+from starpos.earth.vertical import Deflection
+from starpos.errors import FrameError, TiltError
+from starpos.fix.solver import Solver
+from starpos.frames.night_files import TILTS
+from starpos.frames.reading import read_frame
+from starpos.frames.stars import Stars
+from starpos.instrument import instrument_update
+from starpos.instrument.tilt_log import BRACKET_S, TiltLog
+from starpos.instrument.tilt_table import read_tilt_csv
+from starpos.night.first_night import AROUND_S, FirstNight, Look, Stage
+from starpos.night.folder import exposures, frames_in
+from starpos.night.reading import About, Given, stars_of
+from starpos.night.work import Identifying
+from starpos.report import field
+from starpos.sky import catalogue
+from starpos.utc import utc_text
+
+NOT_YET = 1
+POLL_S = 0.5
+# A file that cannot be read may still be written for so long.
+WRITTEN_S = 10.0
+# Tilts may come so long after their frame.
+TILTS_S = 4.0
+AGAIN = "the same command goes on where it was"
+
+
+def define(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "folder",
+        metavar="FOLDER",
+        help=f"where frames (FITS, or CSV of stars) and {TILTS} arrive: of your own programs, or of `ros2 run "
+        "starpos_bringup folder FOLDER`",
+    )
+    parser.add_argument(
+        "--save", required=True, metavar="OUT", help="the instrument file (YAML) that is written at the end"
+    )
+    parser.add_argument(
+        "--field", metavar="ZIP", help="write the night's field report too, as `starpos report --field` does"
+    )
+    parser.add_argument(
+        "--patience",
+        type=options.number(0, 86_400),
+        default=600.0,
+        metavar="S",
+        help="end when no frame has come for so long (600)",
+    )
+    options.add_instrument(parser)
+    options.add_air(parser)
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    overwriting.check(args, overwriting.Written("--save", args.save, instrument_update.check_replaceable))
+    folder = Path(args.folder)
+    if not folder.is_dir():
+        raise FrameError(
+            f"{folder}: there is no such folder: make it, and have frames and {TILTS} arrive there"
+        )
+    if args.field is not None and not args.field.lower().endswith(field.SUFFIX):
+        raise FrameError(f"--field {args.field}: give it a name that ends in {field.SUFFIX}")
+    try:
+        night, given = _watched(args, folder)
+    except KeyboardInterrupt:
+        console.complain("first-night", f"stopped: {AGAIN}")
+        return NOT_YET
+    found = None if night is None else night.turned
+    if found is None or found.calibrated is None:
+        console.complain(
+            "first-night", f"no frame has come for {args.patience:g} s, and A3 is not known yet: {AGAIN}"
+        )
+        return NOT_YET
+    overwriting.save_instrument(
+        "first-night", args.save, found.calibrated.instrument, "A3 by the first night"
+    )
+    print(f"done: {args.save} is written -> starpos solve FRAMES --tilt {TILTS} --instrument {args.save}")
+    if args.field is not None:
+        packed = exposures(folder, given, options.atmosphere_of(args), Deflection())
+        count = field.write(Path(args.field), packed)
+        print(f"done: {args.field} holds {count} frames -> attach it to an issue `It ran on hardware`")
+    return 0
+
+
+def _watched(args: argparse.Namespace, folder: Path) -> tuple[FirstNight | None, Given]:
+    """Take frames as they come, until the last step is done or none has come for long."""
+    night: FirstNight | None = None
+    given = Given(None)
+    seen: set[Path] = set()
+    waited = time.monotonic()
+    while True:
+        new = [path for path in _frames(folder) if path not in seen]
+        for path in new:
+            try:
+                item = read_frame(path)
+            except FrameError as error:
+                if time.time() < path.stat().st_mtime + WRITTEN_S:
+                    break
+                console.complain("first-night", error)
+                seen.add(path)
+                continue
+            seen.add(path)
+            waited = time.monotonic()
+            if night is None:
+                given = given_of(args, About(item.width, item.height, item.focal_px, item.origin_px))
+                air = options.atmosphere_of(args)
+                night = FirstNight(Solver(options.instrument_of(args, item), catalogue.load_catalogue(), air))
+            sight = Identifying(given)(item)[0]
+            look = night.add(sight, _tilts(folder, night, stars_of(item)))
+            _tell(look, sight.stars)
+            if night.step is None:
+                return night, given
+        if time.monotonic() - waited > args.patience:
+            return night, given
+        time.sleep(POLL_S)
+
+
+def _frames(folder: Path) -> list[Path]:
+    try:
+        return frames_in(folder)
+    except FrameError:
+        return []
+
+
+def _tilts(folder: Path, night: FirstNight, stars: Stars) -> TiltLog | str:
+    """The tilts up to some time after the frame, which are waited for; or why there are none."""
+    end_s = (stars.mid_unix_s or 0.0) + max((stars.exposure_s or 0.0) / 2, AROUND_S)
+    begin = time.monotonic()
+    while True:
+        try:
+            log = read_tilt_csv(folder / TILTS, night.instrument.inclinometer.noise_rad)
+        except TiltError as error:
+            if time.monotonic() > begin + TILTS_S:
+                return str(error)
+        else:
+            if log.utc_unix_s[-1] > end_s or time.monotonic() > begin + TILTS_S:
+                return log.until(end_s + BRACKET_S)
+        time.sleep(POLL_S)
+
+
+def _tell(look: Look, stars: Stars) -> None:
+    """Print what a step found, and after the level the clock."""
+    at = utc_text(stars.mid_unix_s)[11:19] if stars.mid_unix_s else "--:--:--"
+    mark = "ok" if look.done else ".."
+    print(f"{at} {mark} {look.step.value:<9}{look.found}\n{'':12}-> {look.todo}", flush=True)
+    if look.done and sys.stdout.isatty():
+        print("\a", end="", flush=True)
+    if look.done and look.step is Stage.LEVEL:
+        finding = doctor.clock()
+        mark = "ok" if finding.state is doctor.State.OK else "!!"
+        cure = f"\n{'':12}-> {finding.cure}" if finding.cure else ""
+        print(f"{at} {mark} {'clock':<9}{finding.found}{cure}", flush=True)
