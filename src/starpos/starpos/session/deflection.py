@@ -101,7 +101,8 @@ class LiveDeflection:
         """What the session has so far, and whether it is enough."""
         if self._found is None:
             waiting = f"{len(self._sightings)} frames so far"
-            said = self._trouble or self._left_out or "point the camera at the zenith"
+            nothing = "the adjustment runs" if self._sightings else "point the camera at the zenith"
+            said = self._trouble or self._left_out or nothing
             return Diagnosis(Level.WARN, f"{waiting}: {said}", {"frames": len(self._sightings)})
         found, wanted = self._found.adjusted, self.wanted_arcsec
         sigma = float(found.sigma_arcsec.max())

@@ -111,7 +111,7 @@ def test_each_face_and_star_has_its_residuals(run, session):
 
 @pytest.fixture(scope="module")
 def recorded(session, tmp_path_factory):
-    """The same session in a bag."""
+    """Record the same session in a bag."""
     pytest.importorskip("rosbags")
     from starpos_testing.skies.bags import NightBag
 
