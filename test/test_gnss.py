@@ -1,7 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A drive with GNSS through the running solver: it learns A3 from nothing, and what it says when GNSS is led astray."""
+"""A drive with GNSS through the running solver: it learns A3 from nothing, and what it says when GNSS is led astray.
+
+The drive is recorded, and its recording says the same.
+"""
 
 import math
+import signal
 from dataclasses import replace
 
 import numpy as np
@@ -13,6 +17,12 @@ from starpos_testing.graph import shots
 
 # between frames, s; the robot is turned at each
 STEP_S = 60.0
+# of A3 nothing is stated
+SOLVER = (
+    *(p for p in shots.SOLVER if not p.startswith("misalignment")),
+    "gnss.use:=true",
+    "clock_stddev:=0.001",
+)
 STATED_M = 2.5
 ASTRAY_M = 2000.0
 # A fix that overtakes its frame's GNSS is not compared: then the next frame is
@@ -20,7 +30,7 @@ AGAIN_S = 2.0
 
 
 class Drive:
-    """A robot that is newly turned, and leans otherwise, at each frame; and what the solver tells of it."""
+    """A robot that is newly turned, and leans otherwise, at each frame; and the solver's answers."""
 
     def __init__(self, graph):
         self.graph, self.rng, self.at_s = graph, np.random.default_rng(7), shots.START_S
@@ -70,17 +80,17 @@ class Drive:
 
 @pytest.fixture(scope="module")
 def drive(graph, tmp_path_factory):
-    # of A3 nothing is stated
-    known = [p for p in shots.SOLVER if not p.startswith("misalignment")]
     folder = tmp_path_factory.mktemp("gnss")
-    started = graph.start(
-        folder / "log", "starpos_solver", "solver", *known, "gnss.use:=true",
-        f"gnss.learned:={folder / 'learned.json'}", "clock_stddev:=0.001",
-    )  # fmt: skip
-    graph.wait_for_solver()
     made = Drive(graph)
-    made.process, made.learned = started, folder / "learned.json"
-    graph.wait(lambda: made.gnss.get_subscription_count() == 1, "for the solver's ear for GNSS")
+    made.bag, made.learned = folder / "bag", folder / "learned.json"
+    kept = f"gnss.learned:={made.learned}"
+    made.process = graph.start(folder / "log", "starpos_solver", "solver", *SOLVER, kept)
+    graph.wait_for_solver()
+    made.recorder = graph.start(folder / "record", "starpos_bringup", "record", arguments=(str(made.bag),))
+    graph.wait(
+        lambda: all(p.get_subscription_count() == 2 for p in (made.gnss, graph.stars, graph.tilt)),
+        "for the solver's and the recorder's ears",
+    )
     return made
 
 
@@ -149,19 +159,31 @@ def test_a_bad_fix_is_one_sentence_and_teaches_nothing(drive, graph, changes, sa
     assert shot.stamp not in drive.checks
 
 
-def test_what_was_taught_is_there_after_a_restart(drive, graph, run):
+def test_the_recorded_drive_tells_the_same(drive, graph, run):
+    drive.recorder.signal(signal.SIGINT)
+    assert drive.recorder.wait() == 0, drive.recorder.output
     drive.process.end()
-    graph.processes.remove(drive.process)
-    assert drive.learned.is_file()
-    known = [p for p in shots.SOLVER if not p.startswith("misalignment")]
-    run(
-        "starpos_solver",
-        "solver",
-        *known,
-        "gnss.use:=true",
-        f"gnss.learned:={drive.learned}",
-        "clock_stddev:=0.001",
+    for process in (drive.recorder, drive.process):
+        graph.processes.remove(process)
+    live, statuses = dict(drive.checks), {GnssCheck.LEARNING, GnssCheck.AGREES, GnssCheck.DISAGREES}
+    assert statuses <= {check.status for check in live.values()}
+    drive.checks.clear()
+    run("starpos_solver", "solver", "use_sim_time:=true", *SOLVER)
+    graph.wait_for_solver()
+    replay = run("starpos_bringup", "replay", arguments=(str(drive.bag), "--rate", "0", "--inputs", "stars"))
+    assert replay.wait() == 0, replay.output
+    # the recorder may have missed the first message, and heard a fix before or after the frame of its moment
+    graph.wait(
+        lambda: len(drive.checks.keys() & live.keys()) > 0.8 * len(live), "for the checks of the replay"
     )
+    both = sorted(drive.checks.keys() & live.keys())
+    same = [drive.checks[stamp].status == live[stamp].status for stamp in both]
+    assert sum(same) >= len(same) - 2 and statuses <= {drive.checks[stamp].status for stamp in both}
+
+
+def test_what_was_taught_is_there_after_a_restart(drive, graph, run):
+    assert drive.learned.is_file()
+    run("starpos_solver", "solver", *SOLVER, f"gnss.learned:={drive.learned}")
     graph.wait_for_solver()
     shot = drive.shot()
     solution, _, _ = graph.answer(shot)

@@ -25,7 +25,7 @@ from starpos_solver.node_log import NodeLog
 
 
 class NavigatorNode(Node):
-    """Publishes the place of a vehicle under way; see README.md.  What it decides is starpos.session's."""
+    """Publishes the place of a vehicle under way; see README.md.  Decisions are in starpos.session."""
 
     def __init__(self) -> None:
         super().__init__("navigator")
@@ -41,7 +41,7 @@ class NavigatorNode(Node):
         self._outputs = NavigatorPublishers(self, self._settings)
         session, best_effort = self._session, ReliabilityPolicy.BEST_EFFORT
         subscription(self, Imu, "imu/data", self._on_imu, IMU_QUEUE, best_effort)
-        subscription(self, Attitude, "attitude", lambda m: session.take_attitude(m, self._now()), 100)
+        subscription(self, Attitude, "attitude", self._on_attitude, 100)
         for kind, name in ((Odometry, "odom"), (TwistWithCovarianceStamped, "twist")):
             subscription(
                 self,
@@ -74,6 +74,10 @@ class NavigatorNode(Node):
 
     def _on_imu(self, message: Imu) -> None:
         for output in self._session.take_imu(message, self._now()):
+            self._outputs.publish(output)
+
+    def _on_attitude(self, message: Attitude) -> None:
+        for output in self._session.take_attitude(message, self._now()):
             self._outputs.publish(output)
 
     def _on_reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:

@@ -30,13 +30,16 @@ class NavigatorPublishers:
         self.parameters_set()
 
     def parameters_set(self) -> None:
-        """Have the topics that the parameters want."""
+        """Create the topics that the parameters ask for."""
         self._transform.open(self._values["publish_tf"])
 
     def publish(self, output: Navigated) -> None:
-        """Publish one output; without support it is a NO_FIX alone."""
+        """Publish one output; without support it is a NO_FIX alone, and at a known place a heading."""
         frame = self._values["frame_id"]
         header = Header(stamp=unix_to_stamp(output.utc_unix_s), frame_id=frame)
+        if output.at_place is not None:
+            self._heading.publish(outputs.imu_at_place(header, output.at_place))
+            return
         altitude = self._values["altitude"], self._values["altitude_stddev"]
         self._fix.publish(outputs.nav_sat_fix(header, output.ground, *altitude))
         if output.fix is None or output.ground is None:

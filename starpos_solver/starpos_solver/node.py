@@ -45,7 +45,7 @@ TICK = JumpThreshold(min_forward=Duration(nanoseconds=1), min_backward=Duration(
 
 
 class SolverNode(Node):
-    """Publishes the place and the attitude of the instrument; see README.md.  What it decides is starpos.session's."""
+    """Publishes the place and the attitude of the instrument; see README.md.  Decisions are in starpos.session."""
 
     def __init__(self) -> None:
         super().__init__("solver")
@@ -278,6 +278,6 @@ class SolverNode(Node):
 
 
 def _sent(info: Mapping[str, Any]) -> Sent:
-    """What the middleware tells of a message."""
+    """What the middleware reports of a message."""
     written_ns = info.get("source_timestamp")
     return Sent(info.get("publication_sequence_number"), written_ns * 1e-9 if written_ns else None)

@@ -19,9 +19,9 @@ from starpos_dashboard import access, picture
 from starpos_dashboard.board import Board
 from starpos_dashboard.parameters import PARAMETERS, names
 from starpos_dashboard.server import DashboardServer, listen
-from starpos_interfaces.msg import Solution, Tilt
+from starpos_interfaces.msg import GnssCheck, Solution, Tilt
 
-# An open page gets a state at least so often, because ages grow even if no message comes.
+# Maximum interval between states sent to an open page, because ages grow even if no message comes.
 HEARTBEAT_S = 1.0
 
 
@@ -61,6 +61,7 @@ class DashboardNode(Node):
             (Imu, "heading/imu", board.hear_heading),
             (Tilt, "tilt", board.hear_tilt),
             (Solution, "solver/solution", board.hear_solution),
+            (GnssCheck, "gnss/check", board.hear_gnss),
         ):
             subscription(self, kind, topic, hear, 10)
         self.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 50)

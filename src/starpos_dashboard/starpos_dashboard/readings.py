@@ -13,27 +13,34 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from sensor_msgs.msg import Imu, NavSatFix, NavSatStatus
 
 from starpos.messages.stamp import stamp_to_unix
-from starpos_interfaces.msg import Solution, Tilt
+from starpos_interfaces.msg import GnssCheck, Solution, Tilt
 
-# Most letters of a text from outside.
+# Maximum length of a text from outside.
 NAME_LETTERS, SENTENCE_LETTERS = 80, 300
-# Most terms of an error budget, and warnings of an identification.
+# Maximum number of terms of an error budget, and of warnings of an identification.
 TERMS, WARNINGS = 16, 4
 # Levels of DiagnosticStatus.
 STALE, ERROR = 3, 2
-# By so much the length of a quaternion may differ from 1.
+# Tolerance on the length of a quaternion.
 UNIT = 1e-3
 TILT_FLAGS = (
     (Tilt.OUT_OF_RANGE, "beyond the sensor's range"),
     (Tilt.STUCK, "the sensor repeats one value"),
     (Tilt.SATURATED, "the converter is at its limit"),
     (Tilt.GAP, "readings were lost"),
-    (Tilt.TIME_UNKNOWN, "nobody knows when it was read"),
+    (Tilt.TIME_UNKNOWN, "its time is unknown"),
 )
+
+GNSS_WORDS = {
+    GnssCheck.LEARNING: "learning",
+    GnssCheck.AGREES: "agrees",
+    GnssCheck.DOUBTFUL: "doubtful",
+    GnssCheck.DISAGREES: "disagrees",
+}
 
 
 def number(value: float) -> float | None:
-    """Return a number, None if it is not finite: JSON cannot hold it, and nobody should read it as a number."""
+    """Return a number, None if it is not finite: JSON cannot hold it, and it must not be read as a number."""
     value = float(value)
     return value if math.isfinite(value) else None
 
@@ -56,7 +63,7 @@ def position(message: NavSatFix) -> dict:
     covariance = _covariance(message)
     return told | {
         "good": True,
-        "trouble": "" if covariance else "how far it may be off is not known",
+        "trouble": "" if covariance else "its error is not known",
         "latitude": latitude,
         "longitude": math.remainder(longitude, 360.0),
         "altitude": number(message.altitude),
@@ -103,6 +110,21 @@ def tilt(message: Tilt) -> dict:
     }
 
 
+def gnss(message: GnssCheck) -> dict | None:
+    """Place [deg] of GNSS, and what the stars say of it; None for a status that is none of the message's constants."""
+    if message.status not in GNSS_WORDS:
+        return None
+    latitude, longitude = number(message.latitude), number(message.longitude)
+    on_earth = latitude is not None and longitude is not None and max(abs(latitude), abs(longitude) / 4) <= 90
+    return {
+        "status": GNSS_WORDS[message.status],
+        "sentence": text(message.status_text),
+        "latitude": latitude if on_earth else None,
+        "longitude": longitude if on_earth else None,
+        "stamp": stamp_to_unix(message.header.stamp),
+    }
+
+
 def solution(message: Solution) -> dict:
     """Result of the newest frame in words and counts, and the error budget (1 sigma: position [m], heading [deg])."""
     terms = [
@@ -133,7 +155,7 @@ def seen_from(namespace: str, name: str) -> str:
 
 
 def light(status: DiagnosticStatus, name: str) -> dict:
-    """Convert a diagnostic to a light; a level that is none of the four is an error."""
+    """Convert a diagnostic to a light; a level other than the four is an error."""
     level = status.level[0] if isinstance(status.level, bytes) else int(status.level)
     return {
         "name": text(name, NAME_LETTERS),

@@ -5,7 +5,7 @@ import said
 from diagnostic_msgs.msg import DiagnosticArray
 from sensor_msgs.msg import Image, Imu, NavSatFix
 
-from starpos_interfaces.msg import Solution, Tilt
+from starpos_interfaces.msg import GnssCheck, Solution, Tilt
 
 OK, WARN, ERROR = 0, 1, 2
 STALE_AFTER_S = 2.0
@@ -27,6 +27,7 @@ TOPICS = {
     "heading/imu": Imu,
     "tilt": Tilt,
     "solver/solution": Solution,
+    "gnss/check": GnssCheck,
     "/diagnostics": DiagnosticArray,
     "detector/image_annotated": Image,
 }

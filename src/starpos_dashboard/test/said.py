@@ -8,7 +8,7 @@ import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from sensor_msgs.msg import Image, Imu, NavSatFix, NavSatStatus
 
-from starpos_interfaces.msg import ErrorTerm, Solution, Tilt
+from starpos_interfaces.msg import ErrorTerm, GnssCheck, Solution, Tilt
 
 NAN = math.nan
 
@@ -66,6 +66,12 @@ def solution(status=Solution.OK, sentence="21 stars fit", warnings=()) -> Soluti
             ErrorTerm(name="deflection", east=120.0, north=160.0, heading=0.002, common=True),
         ]
     return message
+
+
+def gnss(status=GnssCheck.DISAGREES, latitude=48.1553, longitude=11.5755) -> GnssCheck:
+    """What the solver says of a GNSS that lies 2 km north of `fix`."""
+    sentence = "GNSS is 2 km north of where the stars put us (120 m): it is not believed"
+    return GnssCheck(status=status, status_text=sentence, latitude=latitude, longitude=longitude)
 
 
 def diagnostics(*statuses) -> DiagnosticArray:

@@ -7,7 +7,7 @@ import pytest
 import said
 from browser import HOSTILE, LAMPS
 
-from starpos_interfaces.msg import ErrorTerm, Solution, Tilt
+from starpos_interfaces.msg import ErrorTerm, GnssCheck, Solution, Tilt
 
 
 def test_the_numbers_are_those_of_the_messages(page):
@@ -36,6 +36,28 @@ def test_the_numbers_are_those_of_the_messages(page):
 def test_south_and_west_and_a_better_fix_have_their_letters_and_digits(page):
     page.instrument.works(fix=said.fix(-0.5, -179.99999, (0.5**2, 0.0, 0.5**2)))
     page.shows(latitude="0°30′00.000″ S", longitude="179°59′59.964″ W", sigma_east="± 50.0 cm")
+
+
+def test_both_places_are_shown_and_what_the_guard_says_of_gnss(page):
+    hidden = "return document.getElementById('gnss').hidden"
+    assert page.run(hidden)
+    page.instrument.works(gnss__check=said.gnss())
+    page.shows(
+        gnss_word="disagrees",
+        gnss_place="48.15530° 11.57550°",
+        gnss_sentence="GNSS is 2 km north of where the stars put us (120 m): it is not believed",
+    )
+    places = """
+      const rect = (q) => document.querySelector(q).getBoundingClientRect();
+      const mid = (r) => [r.x + r.width / 2, r.y + r.height / 2];
+      const status = document.querySelector("#map-gnss").dataset.status;
+      return [...mid(rect("#map-gnss")), ...mid(rect("#ellipse-newest .mark")), rect("#map").y, status];
+    """
+    x, y, fix_x, fix_y, top, status = page.run(places)
+    # north of the fix, on the map
+    assert abs(x - fix_x) < 1.5 and top < y < fix_y - 50 and status == "disagrees"
+    page.instrument.works(gnss__check=said.gnss(GnssCheck.AGREES, 48.1374))
+    page.shows(gnss_word="agrees")
 
 
 def test_the_place_is_copied_and_opens_in_a_map(page):
@@ -175,7 +197,7 @@ def test_a_frame_that_cannot_be_shown_says_why(page):
 
 def test_no_fix_looks_like_no_fix_and_nan_is_no_number(page):
     nan = math.nan
-    sentence = "none of the sky fits these 41 stars: look at the frame"
+    sentence = "no part of the sky matches these 41 stars: look at the frame"
     page.instrument.works(
         fix=said.fix(nan),
         fix_averaged=None,

@@ -112,7 +112,7 @@ def show(args: argparse.Namespace) -> int:
     if args.path is None:
         more = deeper.kept()
         print(
-            "no deeper catalogue in the cache: small fields want one (`starpos catalogue deepen --fetch`)"
+            "no deeper catalogue in the cache: small fields need one (`starpos catalogue deepen --fetch`)"
             if more is None
             else f"{len(more)} stars of the deeper catalogue are in the cache, for small fields"
         )
@@ -172,7 +172,7 @@ def show_triangles(args: argparse.Namespace) -> int:
 
 
 def show_paper() -> int:
-    """Count the paper's triangles again and print them beside its own numbers."""
+    """Count the paper's triangles again and print them next to its own numbers."""
     from starpos.identification import paper
 
     c = catalogue.load_catalogue()

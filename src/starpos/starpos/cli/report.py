@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from starpos.cli import bags, console, options
 from starpos.cli.inputs import given_of
+from starpos.cli.solve_gnss import read_receiver
 from starpos.cli.vertical import add_vertical, vertical_of
 from starpos.errors import FrameError, InstrumentError
 from starpos.night.folder import exposures, frames_in
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
     from starpos.night.recorded import OfBag
 
 NO_FIX = 1
-# so many nights get all their figures; more get the table and the errors only
+# maximum number of nights with all figures; more nights get the table and the errors only
 ALL_FIGURES = 6
 # ending of a session's result
 SESSION = ".json"
@@ -52,6 +53,11 @@ def define(parser: argparse.ArgumentParser) -> None:
     options.add_air(parser)
     add_vertical(parser)
     options.add_self_calibration(parser)
+    parser.add_argument(
+        "--gnss",
+        metavar="CSV",
+        help="draw a drive beside GNSS, whose fixes teach the instrument: a table as `starpos solve --gnss` takes it",
+    )
     parser.set_defaults(run=run)
 
 
@@ -62,6 +68,7 @@ def run(args: argparse.Namespace) -> int:
             f"-p {wrong[0]}: a report has the solver's values from its other options, such as --misalignment; -p takes "
             "NODE:NAME:=VALUE of detector and inclinometer"
         )
+    _check_gnss(args)
     if args.field is not None:
         return _pack(args)
     if find_spec("matplotlib") is None:
@@ -93,6 +100,13 @@ def run(args: argparse.Namespace) -> int:
     write(Path(args.out), files | {PAGE: html.encode(errors="replace")})
     print(Path(args.out) / PAGE)
     return 0 if any(n.combined for n in nights) else NO_FIX
+
+
+def _check_gnss(args: argparse.Namespace) -> None:
+    if args.gnss is not None and (args.self_calibrate or args.field is not None or len(args.nights) > 1):
+        raise InstrumentError(
+            "--gnss is of one night, and goes with neither --self-calibrate nor --field: leave one out"
+        )
 
 
 def _are_sessions(paths: list[str]) -> bool:
@@ -153,8 +167,11 @@ def _night(path: Path, args: argparse.Namespace) -> Night:
 
     turn_stddev_deg = options.turn_of(args) if args.self_calibrate else None
     found = _exposures(path, args)
+    receiver = read_receiver(args.gnss, None, "report")
     if isinstance(found, Exposures):
-        return solved_night(found, turn_stddev_deg, console.ProgressBar())
+        return solved_night(found, turn_stddev_deg, console.ProgressBar(), receiver)
+    if receiver is not None:
+        raise FrameError(f"{path}: --gnss goes with a folder of frames, and this is a bag: leave it out")
     return recorded.night(
         *found, options.atmosphere_of(args), vertical_of(args), turn_stddev_deg, console.ProgressBar()
     )

@@ -59,7 +59,7 @@ def define(parser: argparse.ArgumentParser) -> None:
         "--save",
         metavar="OUT",
         help="write the A3 of --self-calibrate into an instrument file (YAML); one that is there keeps its other keys; "
-        "exit status 1 if the headings hardly tell A3, and nothing is written",
+        "exits with status 1 and writes nothing if the headings do not determine A3",
     )
     jobs.add_jobs(parser)
     parser.set_defaults(run=run)
@@ -101,10 +101,10 @@ def _run(args: argparse.Namespace) -> int:
     )
     near_of(args)
     own_level = options.has_own_level(args)
-    satellites = solve_gnss.read(args)
+    receiver = solve_gnss.read_receiver(args.gnss, args.learned, "solve")
     # the folder of a night has its tilts
     needs_no_tilt = own_level or (
-        (place is not None or satellites is not None) and not any(map(os.path.isdir, args.frames))
+        (place is not None or receiver is not None) and not any(map(os.path.isdir, args.frames))
     )
     given = nights_of(frames_among(args.frames, args.tilt, args.gnss), args.tilt, needs_no_tilt)
     if args.save is not None and len(given) > 1:
@@ -121,17 +121,17 @@ def _run(args: argparse.Namespace) -> int:
             except TiltError as error:
                 statuses.append(_refused(error, given))
         calls = ((plan.work, path) for plan in plans for path in plan.night.frames)
-        # the lines of a turn wait for its end, and show no progress
+        # the lines of a turn come at its end, and show no progress
         answers = jobs.watched(
             workers.map(calls),
             sum(len(p.night.frames) for p in plans),
             silent=not (args.self_calibrate or args.gnss),
         )
         for plan in plans:
-            # takes the answers of this night, and leaves the others
+            # takes the answers of this night, and leaves the rest
             rows: Iterable = zip(plan.night.frames, answers, strict=False)
-            if satellites is not None:
-                statuses.append(solve_gnss.run(args, output, plan, list(rows), satellites, vertical))
+            if receiver is not None:
+                statuses.append(solve_gnss.run(args, output, plan, list(rows), receiver, vertical))
                 continue
             if args.self_calibrate:
                 rows, saving = _turned(args, plan, list(rows))
@@ -179,7 +179,7 @@ def _plan(
 
 
 def _turned(args: argparse.Namespace, plan: Plan, rows: list) -> tuple[list, int]:
-    """(path, Solution or FrameError) of frames (path, Identifying's answer or FrameError), with the A3 that they tell.
+    """(path, Solution or FrameError) of frames (path, Identifying's answer or FrameError), with their A3.
 
     Returns the exit status of saving that A3 too.
     """

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`starpos solve --gnss`: frames with a GNSS receiver beside them, which teaches the instrument and is guarded."""
+"""`starpos solve --gnss`: frames with a GNSS receiver, which teaches the instrument and is guarded."""
 
 import argparse
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 
 from starpos.cli import console, heading_output
@@ -18,18 +18,17 @@ from starpos.gnss import learned_file
 from starpos.gnss.solving import Watched
 from starpos.gnss.states import Learned
 from starpos.gnss.table import read_gnss_csv
-from starpos.gnss.track import GnssTrack
 from starpos.gnss.watch import GnssCheck
 from starpos.night.hints import of_one_camera
 from starpos.night.remarks import of_inclinometer
 from starpos.night.together import Solved, together
-from starpos.night.watching import watched_night
+from starpos.night.watching import Receiver, watched_night
 
 NO_FIX = 1
 
 
 def add_gnss(parser: argparse.ArgumentParser) -> None:
-    """Add the options that `check`, `read` and `run` take."""
+    """Add the options that `check`, `read_receiver` and `run` take."""
     parser.add_argument(
         "--gnss",
         metavar="CSV",
@@ -57,23 +56,15 @@ def check(args: argparse.Namespace) -> None:
         raise InstrumentError("--gnss and --site both say where the instrument is: give one of the two")
 
 
-@dataclass(frozen=True)
-class Satellites:
-    """The GNSS places of a night, and what earlier nights taught."""
-
-    track: GnssTrack
-    learned: Learned | None
-
-
-def read(args: argparse.Namespace) -> Satellites | None:
-    """Read the tables of the options; None without them.  Raises StarposError."""
-    if args.gnss is None:
+def read_receiver(gnss: str | None, learned: str | None, command: str) -> Receiver | None:
+    """Read the tables of --gnss and --learned; None without the first.  Raises StarposError."""
+    if gnss is None:
         return None
-    track, faults = read_gnss_csv(args.gnss)
+    track, faults = read_gnss_csv(gnss)
     for fault in faults:
-        console.complain("solve", fault)
-    before = None if args.learned is None else learned_file.read_if_there(Path(args.learned))
-    return Satellites(track, before)
+        console.complain(command, fault)
+    before = None if learned is None else learned_file.read_if_there(Path(learned))
+    return Receiver(track, before)
 
 
 def run(
@@ -81,7 +72,7 @@ def run(
     output: Output,
     plan: Plan,
     rows: list,
-    satellites: Satellites,
+    receiver: Receiver,
     vertical: Vertical,
 ) -> int:
     """Write the answers to (path, Identifying's answer or FrameError) of a night's frames; returns the exit status."""
@@ -94,7 +85,7 @@ def run(
                 "--gnss teaches an inclinometer, and this camera is its own level: leave --gnss out"
             )
         tilts = None if plan.night.tilt is None else plan.tilts
-        night = watched_night(solver, seen, tilts, satellites.track, vertical, satellites.learned)
+        night = watched_night(solver, seen, tilts, receiver, vertical)
         answers = list(night.answers)
         for remark in night.remarks:
             console.complain("solve", remark)
@@ -108,6 +99,10 @@ def run(
             told = Watched(solution=Solution.unreadable(path, answer))
         else:
             told = next(following)
+            # the frame was identified before this solver had its focal length: the remark is of that moment
+            if remark := answer[0].solution.remark:
+                console.complain("solve", remark)
+                told = replace(told, solution=replace(told.solution, remark=remark))
         warnings |= set(told.solution.warnings)
         if told.solution.fix:
             solved.append(Solved.of(told.solution, told.solution.fix))

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A4 from one frame: the place and the attitude of the instrument, with their covariance.
 
-The equation is that of the paper's section 4, A2 A3 W = A4 A1 V, with refraction in L and the diurnal aberration of the
+The equation is the paper's, section 4: A2 A3 W = A4 A1 V, with refraction in L and the diurnal aberration of the
 site.
 """
 
@@ -38,7 +38,7 @@ class Fix:
     """Astronomic latitude, longitude and heading (rad) at one instant, with the error budget.
 
     link_to_enu (3, 3): attitude of the base link.
-    used (M,): rows of the given stars that were kept; residual_px (M, 2): their fitted places minus their seen ones.
+    used (M,): rows of the given stars that were kept; residual_px (M, 2): their fitted places minus their seen places.
     jitter_px: scatter of the stars beyond the centroids' own errors (seeing, optics).
     focal_scale: factor on the given focal length.
     levelling (6, 2): change of the rows of an ErrorTerm for errors, in rad, of up about two axes fixed to the

@@ -51,11 +51,15 @@ def is_linear(learned: Learned, tilt: Tilt) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class GnssFrame:
-    """A frame with a GNSS place; new_pose: whether the camera was touched before it."""
+    """A frame with a GNSS place; new_pose: whether the camera was touched before it.
+
+    up_in_camera (3,): up in C by GNSS at the first frame of the pose.
+    """
 
     sighting: LevelSight
     gnss: GnssPlace
     new_pose: bool
+    up_in_camera: np.ndarray
 
 
 def begun(instrument: Instrument, frames: Sequence[GnssFrame], vertical: Vertical) -> Learned:
@@ -102,7 +106,9 @@ def taught(learned: Learned, frame: GnssFrame, instrument: Instrument, vertical:
         learned = replace(learned, place=(gnss.latitude, gnss.longitude), poses=learned.poses + 1)
     # about A3 as it was taken: what a few frames seem to tell of its turn would mislead
     about = np.zeros(learned.layout.size)
-    seen = innovation(sighting, gnss, replace(learned, state=about), vertical)
+    # one up for all frames of a pose: GNSS's noise, as large as a good inclinometer's, would seem to lean the camera
+    # and so to determine A3's turn about the plumb line
+    seen = innovation(sighting, gnss, replace(learned, state=about), vertical, frame.up_in_camera)
     return updated(learned, replace(seen, value=seen.value - seen.rows @ learned.state))
 
 

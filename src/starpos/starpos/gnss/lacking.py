@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What an instrument should do so that GNSS teaches more."""
+"""Advice on how an instrument lets GNSS teach more."""
 
 import numpy as np
 
 from starpos.gnss.filter import LINEAR_TURN_RAD
 from starpos.gnss.states import Learned
 
-# A3 and the deflection that are correlated by more have not been told apart.
+# Correlation of A3 and the deflection above which they are not separated.
 ALIKE = 0.8
 # Fewer poses average the inclinometer's errors badly.
 FEW_POSES = 6
@@ -15,8 +15,7 @@ FEW_POSES = 6
 def what_would_tell_more(learned: Learned) -> str:
     """Say in a sentence what would teach most; '' if nothing stands out."""
     at, covariance = learned.layout, learned.covariance
-    up = learned.calibrated_up
-    turn = float(np.sqrt(up @ covariance[at.a3, at.a3] @ up))
+    _, turn = learned.a3_stddev_rad
     if turn > LINEAR_TURN_RAD:
         return f"lean it otherwise at each pose: A3's turn about the plumb line is known to {np.degrees(turn):.2g} deg"
     if _correlation(covariance, at.a3, at.constant) > ALIKE:

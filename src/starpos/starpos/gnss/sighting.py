@@ -87,8 +87,17 @@ class Innovation:
     offset: np.ndarray
 
 
-def innovation(sighting: LevelSight, gnss: GnssPlace, learned: Learned, vertical: Vertical) -> Innovation:
-    """Compare the plumb line that GNSS and the deflection expect with that of the stars and the tilt."""
+def innovation(
+    sighting: LevelSight,
+    gnss: GnssPlace,
+    learned: Learned,
+    vertical: Vertical,
+    up_in_camera: np.ndarray | None = None,
+) -> Innovation:
+    """Compare the plumb line that GNSS and the deflection expect with that of the stars and the tilt.
+
+    up_in_camera (3,): about which the comparison is linear; None: as GNSS has it at this frame.
+    """
     at, axes = learned.layout, gnss.axes
     east_north = learned.state[at.gnss]
     deflection = learned.deflection_rad(vertical, gnss.latitude, gnss.longitude)
@@ -96,7 +105,7 @@ def innovation(sighting: LevelSight, gnss: GnssPlace, learned: Learned, vertical
     # along two directions at the place
     seen = axes[:2] @ (zenith_of_stars(sighting, learned) - expected)
     # that of the stars has no noise of the tilts, by which a turn of A3 that is not known would seem to be told
-    up = learned.rotation @ sighting.camera_to_itrs.T @ expected
+    up = learned.rotation @ (sighting.camera_to_itrs.T @ expected if up_in_camera is None else up_in_camera)
     rows = -axes[:2] @ zenith_rows(sighting, learned, up)
     rows[:, at.constant] += np.eye(2)
     rows[:, at.field] += np.eye(2)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The solution of a frame with what GNSS has taught before it, and what the guard says of the GNSS place at it."""
+"""The solution of a frame with what GNSS has taught before it, and the guard's verdict on the GNSS place at it."""
 
 from dataclasses import dataclass, replace
 
@@ -45,11 +45,13 @@ class Watched:
 
     solution: with a place, or with a heading at GNSS's place where too little is known for one.
     ground: the geodetic place, None without a fix.  compared: None without a GNSS place.
+    learned: what is known after the frame; None where nothing is.
     """
 
     solution: Solution
     ground: Geodetic | None = None
     compared: Compared | None = None
+    learned: Learned | None = None
 
 
 def watched(
@@ -86,14 +88,14 @@ def watched(
         none = replace(levelled, status=Status.POOR_FIT, message=why, fix=None, at_place=rough.at_place)
         answer = Watched(solution=none)
     if gnss is None or check is None:
-        return answer
+        return replace(answer, learned=watch.learned)
     watch.learn(sighting, gnss, check)
     frames, poses = (0, 0) if watch.learned is None else (watch.learned.frames, watch.learned.poses)
-    return replace(answer, compared=Compared(gnss, check, frames, poses))
+    return replace(answer, compared=Compared(gnss, check, frames, poses), learned=watch.learned)
 
 
 def _up(watch: GnssWatch, fix: Fix, tilt: Tilt, gnss: GnssPlace | None) -> np.ndarray | None:
-    """Up (3,) in C: as it was learned where that tells a place, else by GNSS; None if neither tells it."""
+    """Up (3,) in C: as learned if that gives a place, else by GNSS; None without either."""
     if watch.tells_place(LevelSight.of(fix, tilt)):
         return watch.up_in_camera(tilt)
     if gnss is None:
@@ -133,7 +135,7 @@ def _kept_terms(fix: Fix) -> tuple[ErrorTerm, ...]:
 
 
 def _budgeted(fix: Fix, sighting: LevelSight, learned: Learned) -> Fix:
-    """The fix with the error of what was learned in the place of those of A3 and the inclinometer."""
+    """The fix with the error of the learned states in place of the errors of A3 and the inclinometer."""
     rows = _zenith_rows(fix, sighting, learned)
     root = symmetric_root(rows @ learned.covariance @ rows.T)
     term = ErrorTerm(LEARNED_TERM, _zenith_moved(fix) @ root, shared=ALWAYS)
@@ -144,12 +146,10 @@ def _ground(fix: Fix, sighting: LevelSight, learned: Learned, vertical: Vertical
     """The geodetic place, whose error knows that A3 and the deflection were learned together."""
     at, covariance = learned.layout, learned.covariance
     deflection = learned.deflection_rad(vertical, fix.latitude, fix.longitude) / ARCSEC
-    both = covariance[at.constant, at.constant] + covariance[at.field, at.field]
-    both = both + covariance[at.constant, at.field] + covariance[at.field, at.constant]
     applied = Deflection(
         xi_arcsec=float(deflection[1]),
         eta_arcsec=float(deflection[0]),
-        stddev_arcsec=float(np.sqrt(np.trace(both) / 2)) / ARCSEC,
+        stddev_arcsec=learned.deflection_stddev_rad / ARCSEC,
     )
     ground = geodetic(fix.latitude, fix.longitude, fix.heading, fix.covariance, applied)
     prime, meridian = curvature_radii_m(ground.latitude)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What GNSS teaches of an instrument: A3, the errors of its inclinometer, the deflection of the vertical; all together.
 
-All are angles in rad, or shares. Their covariance is kept whole, because at once most of them cannot be told apart: at
+All are angles in rad, or shares. Their covariance is kept whole, because at first most of them cannot be separated: at
 one pose a turn of A3 looks like a zero, and at one heading like a deflection.
 """
 
@@ -19,15 +19,16 @@ from starpos.units import ARCSEC, HOUR_S
 
 # Share of the deflection's variance that is the same everywhere the instrument goes; the rest is a field.
 CONSTANT_SHARE = 0.5
-# Distance (m) over which the field is forgotten, by exp(-d / L).  That and the exponential law are those with which
-# inertial navigation models deflections (Nash and Jordan, Statistical Geodesy, Proc. IEEE 66(5), 1978: 20 nautical
-# miles); from memory, the paper was not at hand.
+# Distance (m) over which the field is forgotten, by exp(-d / L): 20 nautical miles.  Our choice, after the Markov models
+# with which inertial navigation describes deflections (reviewed by Nash and Jordan, Statistical geodesy - an engineering
+# perspective, Proc. IEEE 66(5), 1978, 532-550, of which only the abstract was at hand).  Laws that agree with anomaly and
+# geoid are smooth at d = 0 (Jordan, JGR 77(20), 1972): an exponential forgets more on a short way.
 FIELD_LENGTH_M = 37_000.0
 # An error of GNSS that it does not state: multipath, which changes within minutes.
 GNSS_SLOW_RAD, GNSS_SLOW_S = 10.0 / 6.371e6, 300.0
-# 1 sigma about each axis of an A3 of which nobody knows anything.
+# 1 sigma about each axis of an unknown A3.
 NO_A3_RAD = 1.0
-# A night cools by so much in that time: the wandering of a temperature that nobody measures.
+# A night's cooling: the random walk of an unmeasured temperature.
 UNMEASURED_C_PER_SQRT_HOUR = 14.0 / np.sqrt(6.0)
 
 
@@ -72,7 +73,7 @@ class Layout:
 
     @property
     def constant(self) -> slice:
-        """Deflection, east and north, that is the same everywhere, beyond that of the `Vertical`."""
+        """Deflection, east and north, that is the same everywhere, beyond the `Vertical`'s."""
         return self._slice(5)
 
     @property
@@ -126,13 +127,28 @@ class Learned:
         """A3 (3, 3) with what was learned of it."""
         return rotation.from_vector(self.state[self.layout.a3]) @ self.a3
 
+    @property
+    def a3_stddev_rad(self) -> tuple[float, float]:
+        """1 sigma of A3 across the plumb line, an axis, and about it."""
+        a3, up = self.covariance[self.layout.a3, self.layout.a3], self.calibrated_up
+        about2 = float(up @ a3 @ up)
+        return float(np.sqrt(max(np.trace(a3) - about2, 0.0) / 2)), float(np.sqrt(about2))
+
+    @property
+    def deflection_stddev_rad(self) -> float:
+        """1 sigma of a component of the deflection at `place`."""
+        at, covariance = self.layout, self.covariance
+        both = covariance[at.constant, at.constant] + covariance[at.field, at.field]
+        both = both + covariance[at.constant, at.field] + covariance[at.field, at.constant]
+        return float(np.sqrt(np.trace(both) / 2))
+
     def columns(self, tilt: Tilt) -> tuple[np.ndarray, np.ndarray]:
         """Change of up in S for the response's coefficients (3, m), and for errors of the angles (3, axes)."""
         zeroed = _zeroed(tuple(self.calibrated_up.tolist()), self.axes)
         return response_columns(tilt.theta, tilt.up, zeroed), tilt.slope
 
     def warmer_c(self, tilt: Tilt) -> float:
-        """How much warmer a tilt's sensor is than `temperature_c`; 0 where nobody measured."""
+        """How much warmer a tilt's sensor is than `temperature_c`; 0 if not measured."""
         warmer = tilt.temperature_c - self.temperature_c
         return float(warmer) if np.isfinite(warmer) else 0.0
 
@@ -153,7 +169,7 @@ class Learned:
         return rows
 
     def deflection_rad(self, vertical: Vertical, latitude: float, longitude: float) -> np.ndarray:
-        """Deflection (2,) east, north at a place: that of a Vertical, and what was learned beyond it."""
+        """Deflection (2,) east, north at a place: a Vertical's, and what was learned beyond it."""
         stated, at = vertical.at(latitude, longitude), self.layout
         known = np.array([stated.eta_arcsec, stated.xi_arcsec]) * ARCSEC
         return known + self.state[at.constant] + self.state[at.field]

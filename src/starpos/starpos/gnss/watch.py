@@ -25,7 +25,7 @@ DOUBT, ALARM = 13.8, 30.0
 BACK_S, BACK_FRAMES, BACK = 600.0, 10, 7.4
 # a place that is wider than this (1 sigma, m) is none: the filter is not linear over it
 WIDEST_M = 50_000.0
-# the place of a lean at which A3 was not learned may be bent by this share of its sigma
+# the place of a lean at which A3 was not learned may be bent by this share of its least sigma
 MOST_BENT = 0.3
 NOISE_SIGMA = 2.0
 # before A3 is known, so many frames of a pose teach, and so many of all are kept
@@ -82,6 +82,8 @@ class GnssWatch:
         self._pose: LevelSight | None = None
         self._new_pose = True
         self._readings: frozenset[float] = frozenset()
+        # the readings of a frame that would have been an alarm, before A3 was known
+        self._suspicious: frozenset[float] | None = None
         self._witnesses = Witnesses.none(0)
 
     @property
@@ -109,6 +111,7 @@ class GnssWatch:
     def _forget(self) -> None:
         self.learned, self._begins, self.disagrees = None, True, False
         self._held.clear()
+        self._suspicious = None
         self._witnesses = Witnesses.none(0)
 
     def _age(self, sighting: LevelSight) -> None:
@@ -143,10 +146,11 @@ class GnssWatch:
         """Whether the stars tell a place with what was learned before this frame."""
         if self.learned is None:
             return False
-        covariance = place_of_stars(sighting, self.learned, self.vertical)[2]
-        if np.linalg.eigvalsh(covariance)[-1] >= WIDEST_M**2:
+        narrow, wide = np.linalg.eigvalsh(place_of_stars(sighting, self.learned, self.vertical)[2])
+        if wide >= WIDEST_M**2:
             return False
-        return not self._held or self._bent_m(sighting.tilt) < MOST_BENT * math.sqrt(np.trace(covariance) / 2)
+        # a turn makes the place wide along an arc, and the bend leaves it across
+        return not self._held or self._bent_m(sighting.tilt) < MOST_BENT * math.sqrt(narrow)
 
     def _bent_m(self, tilt: Tilt) -> float:
         """What a turn of A3 about the plumb line that is hardly known may do to the place beyond a linear error."""
@@ -165,8 +169,7 @@ class GnssWatch:
         seen = innovation(sighting, gnss, self.learned, self.vertical)
         single = chi2(self.learned, seen)
         if self._begins:
-            status = DISAGREES if single > ALARM else DOUBTFUL if single > DOUBT else LEARNING
-            return self._check(status, sighting, gnss)
+            return self._check(self._while_it_begins(single, sighting.tilt), sighting, gnss)
         witnesses = self._witnesses if len(self._witnesses.since) else Witnesses.none(len(self.learned.state))
         if not self.disagrees and witnesses.due(sighting.utc_unix_s):
             witnesses = witnesses.set_aside(self.learned)
@@ -180,6 +183,17 @@ class GnssWatch:
         if self.disagrees:
             return self._check(DISAGREES, sighting, gnss)
         return self._check(DOUBTFUL if worst > DOUBT else AGREES, sighting, gnss)
+
+    def _while_it_begins(self, single: float, tilt: Tilt) -> str:
+        """The status while A3 is hardly known: an alarm needs two frames, for readings that err by chance say it once."""
+        readings = frozenset(tilt.times)
+        again = self._suspicious is not None and not (readings & self._suspicious)
+        if single <= ALARM:
+            self._suspicious = None
+            return DOUBTFUL if single > DOUBT else LEARNING
+        if self._suspicious is None:
+            self._suspicious = readings
+        return DISAGREES if again else DOUBTFUL
 
     def _take_back(self, witness: int, sighting: LevelSight) -> None:
         """Know again what was known one witness before the one who speaks most against GNSS."""
@@ -231,7 +245,9 @@ class GnssWatch:
             return
         if self._of_pose >= FEW_OF_POSE:
             return
-        self._held.append(GnssFrame(sighting, gnss, self._of_pose == 0))
+        first = self._of_pose == 0
+        up = sighting.camera_to_itrs.T @ gnss.zenith if first else self._held[-1].up_in_camera
+        self._held.append(GnssFrame(sighting, gnss, first, up))
         self._of_pose += 1
         self.learned = begun(self._instrument, self._held, self.vertical)
         self._begins = not is_linear(self.learned, sighting.tilt)

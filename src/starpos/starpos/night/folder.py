@@ -13,7 +13,7 @@ from starpos.earth.vertical import Vertical
 from starpos.errors import FrameError, TiltError
 from starpos.files import read_regular
 from starpos.frames.frame import Frame
-from starpos.frames.night_files import SIMULATED, TILTS, TRUTH
+from starpos.frames.night_files import GNSS, SIMULATED, TILTS, TRUTH
 from starpos.frames.reading import FITS, read_frame
 from starpos.frames.stars import Stars
 from starpos.instrument.inclinometer import SCA100T_NOISE_RAD
@@ -37,8 +37,8 @@ def exposures(
 ) -> Exposures:
     """The frames of a folder in the order of their names, to be solved.
 
-    place: that is known, where each frame has a heading.  If tilt.csv is missing, headings alone are wanted there;
-    without a known place each frame says that it is missing.
+    place: a known place, where each frame has a heading. If tilt.csv is missing, only headings are computed there;
+    without a known place each frame reports that it is missing.
 
     Raises FrameError if there are no frames, or truth.json cannot be used.
     """
@@ -74,13 +74,13 @@ def exposures(
 
 
 def frames_in(folder: Path) -> list[Path]:
-    """Paths of the frames in a folder by name, at least one; raises FrameError if there is none."""
+    """Paths of the frames in a folder by name, at least one; raises FrameError without any."""
     try:
         files = sorted(p for p in folder.iterdir() if p.is_file())
     except OSError as e:
         raise FrameError(f"{folder}: the folder cannot be read ({e.strerror})") from None
     frames = [p for p in files if p.suffix.lower() in FITS]
-    frames = frames or [p for p in files if p.suffix.lower() == ".csv" and p.name != TILTS]
+    frames = frames or [p for p in files if p.suffix.lower() == ".csv" and p.name not in (TILTS, GNSS)]
     if not frames:
         raise FrameError(
             f"{folder}: no frames in it: a night is a folder of FITS frames, or of CSV lists of stars, and {TILTS}"

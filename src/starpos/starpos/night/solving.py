@@ -12,6 +12,7 @@ from starpos.earth.vertical import Vertical
 from starpos.errors import FrameError, StarposError
 from starpos.fix.budget import heading_of, place_of
 from starpos.fix.solution import Solution, Status
+from starpos.fix.solver import Solver
 from starpos.frames.frame import Frame
 from starpos.frames.stars import Stars
 from starpos.identification.hint import Hint
@@ -23,6 +24,7 @@ from starpos.night.night import Night, ReportedPlace, Shot, Truth, why_none
 from starpos.night.remarks import Kind, Remark
 from starpos.night.searching import Sight
 from starpos.night.together import Solved, TurnedNight, together, turned
+from starpos.night.watching import Receiver, WatchedNight, watched_night
 from starpos.night.work import Fitting, Identifying, Solving
 from starpos.progress import Progress, quiet
 from starpos.rotation import half_turns
@@ -53,15 +55,23 @@ _Answer = tuple[str, Stars | None, Solution]
 
 
 def solved_night(
-    exposures: Exposures, turn_stddev_deg: float | None = None, progress: Progress = quiet
+    exposures: Exposures,
+    turn_stddev_deg: float | None = None,
+    progress: Progress = quiet,
+    receiver: Receiver | None = None,
 ) -> Night:
     """The night of these exposures; raises InstrumentError if there is no instrument for a frame.
 
     turn_stddev_deg: to calibrate by turning, the sigma of A3's turn; None to use A3 as given.
+    receiver: GNSS, which teaches the instrument; None without one.
     """
     answers: Iterable[_Answer]
     said: tuple[Remark, ...] = ()
-    if turn_stddev_deg is None:
+    watched: WatchedNight | None = None
+    if receiver is not None:
+        answers, watched, instrument = _beside(exposures, receiver, progress)
+        said = watched.remarks
+    elif turn_stddev_deg is None:
         answers, instrument = _one_by_one(exposures, progress), exposures.work.instruments.instrument
     else:
         answers, said, instrument = _by_turning(exposures, turn_stddev_deg, progress)
@@ -76,7 +86,8 @@ def solved_night(
         elif solution.status is Status.NOT_IDENTIFIED:
             lost = stars if lost is None else lost
         progress(exposures.name[:20], done / exposures.count)
-    whole = together(solved, exposures.work.instruments.instrument if turn_stddev_deg is None else None)
+    as_given = turn_stddev_deg is None and receiver is None
+    whole = together(solved, exposures.work.instruments.instrument if as_given else None)
     fits = Fitting(exposures.work.instruments)(lost) if lost is not None and not solved else ()
     night = Night(
         name=exposures.name,
@@ -87,6 +98,7 @@ def solved_night(
         vertical=exposures.vertical,
         atmosphere=exposures.work.atmosphere,
         truth=exposures.truth,
+        watched=watched,
         remarks=(*exposures.remarks, *said, *of_frames, *fits, *whole.remarks),
     )
     return replace(night, steady=_steady(night, instrument)) if night.combined and instrument else night
@@ -116,27 +128,56 @@ def _by_turning(
     exposures: Exposures, turn_stddev_deg: float, progress: Progress
 ) -> tuple[list[_Answer], tuple[Remark, ...], Instrument | None]:
     """Solve all frames together, with the A3 that they determine; returns that instrument too, None without a frame."""
+    rows, solver = _identified(exposures, progress)
+    found, instrument = TurnedNight(()), None
+    if solver is not None:
+        solver, sights = of_one_camera(solver, [s for _, s in rows if isinstance(s, Sight)])
+        found = turned(solver, sights, exposures.work.tilts or NO_TILTS, turn_stddev_deg)
+        instrument = solver.instrument if found.calibrated is None else found.calibrated.instrument
+    return _answers(rows, found.solutions), found.remarks, instrument
+
+
+def _beside(
+    exposures: Exposures, receiver: Receiver, progress: Progress
+) -> tuple[list[_Answer], WatchedNight, Instrument | None]:
+    """Solve the frames in the order of their times, each with what GNSS taught before it."""
+    rows, solver = _identified(exposures, progress)
+    night = WatchedNight((), receiver.learned, ())
+    if solver is not None:
+        solver, sights = of_one_camera(solver, [s for _, s in rows if isinstance(s, Sight)])
+        night = watched_night(solver, sights, exposures.work.tilts, receiver, exposures.vertical)
+    return (
+        _answers(rows, [told.solution for told in night.answers]),
+        night,
+        None if solver is None else solver.instrument,
+    )
+
+
+_Rows = list[tuple[str, Sight | FrameError]]
+
+
+def _identified(exposures: Exposures, progress: Progress) -> tuple[_Rows, Solver | None]:
+    """The sight of each frame, and the solver of the first that can be read, None without one."""
     work, solver = exposures.work, None
-    rows: list[tuple[str, Sight | FrameError]] = []
+    rows: _Rows = []
     for name, item in exposures.each():
         if isinstance(item, FrameError):
             rows.append((name, item))
             continue
         solver = solver or replace(work.solver(item), progress=progress)
         rows.append((name, Identifying(work.instruments, progress=progress)(item)[0]))
-    found, instrument = TurnedNight(()), None
-    if solver is not None:
-        solver, sights = of_one_camera(solver, [s for _, s in rows if isinstance(s, Sight)])
-        found = turned(solver, sights, work.tilts or NO_TILTS, turn_stddev_deg)
-        instrument = solver.instrument if found.calibrated is None else found.calibrated.instrument
-    solutions = iter(found.solutions)
-    answers: list[_Answer] = [
+    return rows, solver
+
+
+def _answers(rows: _Rows, solutions: Iterable[Solution]) -> list[_Answer]:
+    """The answer to each frame; solutions: of those that can be read, in order."""
+    following = iter(solutions)
+    return [
         (name, None, Solution.unreadable(name, s))
         if isinstance(s, FrameError)
-        else (name, s.stars, next(solutions))
+        else (name, s.stars, next(following))
         for name, s in rows
     ]
-    return answers, found.remarks, instrument
 
 
 def _steady(night: Night, instrument: Instrument) -> np.ndarray | None:

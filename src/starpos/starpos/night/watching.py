@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A night with GNSS beside it: its frames one after another, each with what GNSS has taught before it."""
+"""A night with GNSS: its frames one after another, each with what GNSS has taught before it."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -21,8 +21,16 @@ from starpos.night.searching import answered
 
 
 @dataclass(frozen=True)
+class Receiver:
+    """The GNSS places of a night, and what earlier nights learned of the instrument; None where nothing."""
+
+    track: GnssTrack
+    learned: Learned | None = None
+
+
+@dataclass(frozen=True)
 class WatchedNight:
-    """The answer to each frame, in the order in which they were given; what is known at their end; remarks."""
+    """The answer to each frame in the given order; what GNSS taught by the end; remarks."""
 
     answers: tuple[Watched, ...]
     learned: Learned | None
@@ -33,22 +41,21 @@ def watched_night(
     solver: Solver,
     frames: Sequence[tuple[Stars, Identification | None]],
     tilts: Tilts | None,
-    track: GnssTrack,
+    receiver: Receiver,
     vertical: Vertical,
-    learned: Learned | None = None,
 ) -> WatchedNight:
-    """Solve a night's frames in the order of their times, each with what is identified of it already.
+    """Solve a night's frames in the order of their times, each with its identification so far.
 
-    tilts: None where headings alone are wanted.  learned: what is known of the instrument from earlier nights.
+    tilts: None where headings alone are wanted.
     """
-    watch = GnssWatch(solver.instrument, vertical, learned)
+    watch = GnssWatch(solver.instrument, vertical, receiver.learned)
     said: Counter[str] = Counter()
 
     def place_at(stars: Stars) -> GnssPlace | None:
         if stars.mid_unix_s is None:
             return None
         try:
-            return track.at(stars.mid_unix_s)
+            return receiver.track.at(stars.mid_unix_s)
         except GnssError as error:
             said[str(error)] += 1
             return None

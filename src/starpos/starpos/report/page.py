@@ -18,7 +18,7 @@ from starpos.report.html import Picture, document, figures, sexagesimal, table, 
 from starpos.report.style import figures_of
 from starpos.utc import utc_text
 
-# so many names of frames are listed
+# maximum number of frames listed by name
 LISTED = 200
 
 
@@ -56,7 +56,7 @@ def _simulated(night: Night) -> str:
 
 
 def _place(night: Night) -> str:
-    """The answer of a night, or the reason why there is none."""
+    """The answer of a night, or the reason why it is missing."""
     if night.combined is None:
         return f'<p class="place bad">No position: {escape(night.why_not)}</p>'
     c = night.combined

@@ -9,11 +9,14 @@ import numpy as np
 
 from starpos.calibration import residual_map
 from starpos.errors import TimeError
+from starpos.gnss.solving import Watched
+from starpos.gnss.watch import DISAGREES
 from starpos.night.night import Night
-from starpos.report import coast, frame_figures, measures, place_figures, sky_figure
+from starpos.report import coast, drive_figure, frame_figures, measures, place_figures, sky_figure
 from starpos.report.html import Picture
 from starpos.report.style import figures_of, mark_simulated, new_figure, png_of
 from starpos.sky.catalogue import Catalogue
+from starpos.utc import utc_text
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -31,6 +34,10 @@ def pictures_of(night: Night, catalogue: Catalogue) -> Iterator[Picture]:
                 yield _drawn(night.simulated, "sky", "Where the camera looked", _sky_caption(), 6.4,
                          lambda f: sky_figure.draw_sky(f, night, catalogue))  # fmt: skip
     if night.shots:
+        if night.watched is not None and drive_figure.compared_of(night.watched.answers):
+            answers = night.watched.answers
+            yield _drawn(night.simulated, "drive", "The drive beside GNSS", _drive_caption(answers), 8.6,
+                         lambda f: drive_figure.draw_drive(f, answers))  # fmt: skip
         yield _drawn(
             night.simulated,
             "health",
@@ -120,10 +127,25 @@ HEALTH = (
     "go (clouds, dew), a residual that rises (focus, wind), a tilt that drifts or jumps (the mount), slow "
     "identification."
 )
+DRIVE = (
+    "Above, the stars' own places, each with what was learned before it, and the GNSS places in the colour of what the "
+    "guard said. In the middle, how far they are apart; below, how well A3 and the deflection were known. Suspicious: a "
+    "distance that grows evenly (a drag)."
+)
 NIGHTS = (
     "Combined fix of each night less its truth, astronomic, with the 1 sigma that is claimed. Suspicious: errors beyond "
     "twice their bars in more than one night of twenty, or all on one side: the calibration has changed."
 )
+
+
+def _drive_caption(answers: Sequence[Watched]) -> str:
+    compared = drive_figure.compared_of(answers)
+    alarm = next((a for a in compared if a.compared and a.compared.check.status == DISAGREES), None)
+    if alarm is None or alarm.compared is None:
+        told = "No alarm: GNSS never disagreed."
+    else:
+        told = f"Alarm at {utc_text(alarm.solution.utc_unix_s or 0.0)}: {alarm.compared.check.sentence}."
+    return f"{DRIVE} {told}"
 
 
 def _stability_caption(s: measures.Stability, text: str) -> str:

@@ -1,13 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""GNSS beside a session: its fixes as they come, what they teach, and the file that keeps it."""
+"""GNSS in a session: its fixes as they come, what they teach, and the file that keeps it."""
 
 import math
 import traceback
 from collections import deque
 from dataclasses import replace
 from typing import Any
-
-import numpy as np
 
 from starpos.errors import GnssError, StarposError
 from starpos.files import path_of
@@ -36,7 +34,7 @@ TOPIC = "gnss/fix"
 KEPT = 100
 # a fix that comes later than this after its stamp is of another clock, s
 OLDEST_S = 30.0
-# what was learned is written at most so often, s
+# minimum interval between writings of what was learned, s
 SAVE_EVERY_S = 60.0
 
 
@@ -85,12 +83,12 @@ class GnssTeacher:
         try:
             answer = watched(solver, stars, rough, gnss, watch)
         except Exception as e:
-            # A defect costs this frame only.
+            # A defect loses only this frame.
             self._log.error(traceback.format_exc())
             why = f"what GNSS taught could not be used on this frame ({type(e).__name__}: {e})"
             answer = Watched(solution=Solution.failed(stars, Status.BAD_INPUT, why))
         if self._settings.site is not None:
-            # the heading there is better than that of any fix
+            # the heading there is better than any fix's
             answer = replace(answer, solution=replace(answer.solution, at_place=rough.at_place))
         if compared:
             self.newest = answer
@@ -112,7 +110,7 @@ class GnssTeacher:
         return self._watch
 
     def other_camera(self) -> None:
-        """Forget what was learned, which is of the other camera."""
+        """Forget what was learned of the other camera."""
         if self._watch is not None and self._instrument is not None:
             self._log.warning("another camera_info: what GNSS taught of the other camera is forgotten")
             self._watch = GnssWatch(self._instrument, self._settings.vertical)
@@ -199,17 +197,14 @@ class GnssTeacher:
     def _values_of(self, learned: Learned | None) -> dict[str, object]:
         if learned is None or not learned.frames:
             return {"frames learned from": 0}
-        at, up = learned.layout, learned.calibrated_up
-        a3 = learned.covariance[at.a3, at.a3]
-        turn2 = float(up @ a3 @ up)
-        deflection = np.sqrt(np.trace(learned.covariance[at.constant, at.constant]) / 2) / ARCSEC
+        across, about = learned.a3_stddev_rad
         return {
             "frames learned from": learned.frames,
             "poses learned from": learned.poses,
             "learned since": utc_text(learned.since_unix_s),
-            "A3 across the plumb line (arcsec, 1 sigma)": math.sqrt((np.trace(a3) - turn2) / 2) / ARCSEC,
-            "A3 about the plumb line (arcsec, 1 sigma)": math.sqrt(turn2) / ARCSEC,
-            "deflection (arcsec, 1 sigma)": float(deflection),
+            "A3 across the plumb line (arcsec, 1 sigma)": across / ARCSEC,
+            "A3 about the plumb line (arcsec, 1 sigma)": about / ARCSEC,
+            "deflection (arcsec, 1 sigma)": learned.deflection_stddev_rad / ARCSEC,
             "more would tell": what_would_tell_more(learned),
         }
 

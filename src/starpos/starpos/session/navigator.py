@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The navigator's decisions: when the newest part of a voyage is adjusted, how it is carried on, what is told.
+"""The navigator's decisions: when the newest part of a voyage is adjusted, how it is carried on, what is published.
 
-A state machine without a clock or a thread of its own, as session.py is for frames: it is told each message with the
-time it came at, and returns what to publish.  The adjustment is a job; until its outcome comes the IMU carries the last
-one on.
+A state machine without a clock or a thread of its own, as session.py is for frames: its driver passes each message with
+its time of arrival; it returns what to publish.  The adjustment is a job; until its outcome comes the IMU carries the
+last one on.
 """
 
 import math
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -15,12 +16,15 @@ import numpy as np
 
 from starpos.earth.ellipsoid import enu_axes
 from starpos.earth.gravity import geodetic_place
+from starpos.earth.known_place import KnownPlace
 from starpos.earth.vertical import Geodetic, geodetic
 from starpos.errors import GnssError, StarposError, VoyageError
-from starpos.gnss.place import GnssPlace, message_to_gnss
+from starpos.gnss.place import GnssPlace, known_place, message_to_gnss
+from starpos.gnss.track import GnssTrack
 from starpos.messages.attitude import message_to_attitude
 from starpos.messages.stamp import stamp_to_unix
 from starpos.navigation.adjustment import FEWEST_FRAMES
+from starpos.navigation.at_place import BodyAttitude, attitude_at_place
 from starpos.navigation.estimate import Estimate
 from starpos.navigation.motion import PLACE
 from starpos.navigation.observability import Observability, observability
@@ -37,8 +41,10 @@ from starpos.session.navigator_parameters import NavigatorSettings
 from starpos.session.now import Now
 from starpos.session.reports import AHEAD_S
 
-# the window holds so much at least before it is adjusted, s, and so many frames a second of the period
+# minimum length of the window before it is adjusted, s, and minimum frames per second of the period
 SHORTEST_S, FRAMES_PER_S = 10.0, 30.0
+# fixes of GNSS that are kept: attitudes come later than they
+GNSS_KEPT = 100
 # a claim is wide beyond, m an axis
 WIDE_M = 1000.0
 STARTING = "no frame with stars yet"
@@ -58,18 +64,22 @@ class Position:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Navigated:
-    """An output at one time: a fix, the place on the ellipsoid, where it lies from the origin; None without support."""
+    """An output at one time: a fix, the place on the ellipsoid, where it lies from the origin; None without support.
+
+    at_place: heading, pitch and roll at a known place, while there is no fix; None where no place is known.
+    """
 
     utc_unix_s: float
     fix: VoyageFix | None = None
     ground: Geodetic | None = None
     position: Position | None = None
+    at_place: BodyAttitude | None = None
 
 
 class NavigatorSession:
     """Messages of an IMU, a camera's attitudes and velocities to places under way.
 
-    jobs: makes who runs the adjustment.
+    jobs: makes the runner of the adjustment.
     """
 
     def __init__(self, settings: NavigatorSettings, jobs: Callable[[], Jobs], heard: Heard, log: Log) -> None:
@@ -92,7 +102,7 @@ class NavigatorSession:
         # of the newest frame that the estimate is made of
         self._seen_s = -math.inf
         self._clock_stddev_s = 0.0
-        self._gnss: GnssPlace | None = None
+        self._gnss: deque[GnssPlace] = deque(maxlen=GNSS_KEPT)
         # an outcome of a job that began before counts no more
         self._voyage = object()
 
@@ -117,7 +127,8 @@ class NavigatorSession:
                 or message.linear_acceleration_covariance[0] == -1
             ):
                 raise VoyageError(
-                    "the IMU says by a covariance of -1 that it measures no rates or no accelerations: take one that does"
+                    "the IMU says by a covariance of -1 that it measures no rates or no accelerations: use "
+                    "one that does"
                 )
             self._check_time(row[0], now, "an inertial reading")
             self._begin_anew(row[0])
@@ -133,13 +144,34 @@ class NavigatorSession:
         try:
             attitude = message_to_attitude(message)
             self._check_time(attitude.utc_unix_s, now, "an attitude")
-            self._recent.add_frame(PlacelessFrame.of(attitude))
+            frame = PlacelessFrame.of(attitude)
+            self._recent.add_frame(frame)
         except StarposError as e:
             self._heard.refuse("attitude", str(e))
             return []
         self._clock_stddev_s = attitude.clock_stddev_s
         self._heard.came("attitude")
-        return []
+        return self._at_place(frame)
+
+    def _at_place(self, frame: PlacelessFrame) -> list[Navigated]:
+        """The heading at a known place, while there is no fix."""
+        if self._estimate is not None and not self._stars_missing:
+            return []
+        try:
+            place = self._settings.site or self._by_gnss(frame.utc_unix_s)
+        except GnssError as e:
+            self._heard.refuse("gnss/fix", str(e))
+            return []
+        if place is None:
+            return []
+        found = attitude_at_place(frame, place, self._settings.vessel(self._clock_stddev_s))
+        return [Navigated(utc_unix_s=frame.utc_unix_s, at_place=found)]
+
+    def _by_gnss(self, utc_unix_s: float) -> KnownPlace | None:
+        if not self._values["gnss.use"]:
+            return None
+        gnss = GnssTrack(list(self._gnss)).at(utc_unix_s)
+        return None if gnss is None else known_place(gnss, self._settings.vertical)
 
     def take_velocity(self, message: Any, now: Now, name: str) -> list[Navigated]:
         """Take a nav_msgs/Odometry or a geometry_msgs/TwistWithCovarianceStamped, from the topic of that name."""
@@ -153,7 +185,7 @@ class NavigatorSession:
                 raise VoyageError(
                     "a velocity's variance is NaN or below 0: state it, or zeros for velocity_stddev"
                 )
-            # an axis that states none moves as little as the others, or is not measured
+            # an axis without a stated variance moves as little as the others, or is not measured
             sigma = math.sqrt(variance.max()) or self._values["velocity_stddev"]
             self._recent.add_velocity(time_s, (v.x, v.y, v.z), sigma)
         except StarposError as e:
@@ -165,9 +197,9 @@ class NavigatorSession:
     def take_gnss(self, message: Any, now: Now) -> list[Navigated]:
         """Take a sensor_msgs/NavSatFix of satellites: it is compared, not fused."""
         try:
-            self._gnss = message_to_gnss(message, UNSTATED_M)
+            self._gnss.append(message_to_gnss(message, UNSTATED_M))
         except GnssError:
-            self._gnss = None
+            self._gnss.clear()
         self._heard.came("gnss/fix")
         return []
 
@@ -176,7 +208,8 @@ class NavigatorSession:
             raise VoyageError(f"{what} has no time stamp: set header.stamp to when it was measured")
         if now.ahead_s(unix_s) > AHEAD_S:
             raise VoyageError(
-                f"{what} is stamped {now.ahead_s(unix_s):.3g} s before its time: set the clocks of camera, IMU and "
+                f"{what} is stamped {now.ahead_s(unix_s):.3g} s in the future: set the clocks of camera, "
+                f"IMU and "
                 "navigator by one source"
             )
 
@@ -322,10 +355,10 @@ class NavigatorSession:
         if self._stars_missing:
             return Diagnosis(Level.WARN, self._why_old(since_s), values)
         faults = list(self._faults)
-        if self._gnss is not None and abs(estimate.utc_unix_s - self._gnss.utc_unix_s) < OLDEST_S:
+        if self._gnss and abs(estimate.utc_unix_s - self._gnss[-1].utc_unix_s) < OLDEST_S:
             fix = estimate.fix
             moving = float(np.linalg.norm(fix.velocity))
-            apart_m, wrong = contradiction(self._gnss, self._ground(fix), fix.utc_unix_s, moving)
+            apart_m, wrong = contradiction(self._gnss[-1], self._ground(fix), fix.utc_unix_s, moving)
             values["GNSS from here (m)"] = apart_m
             faults += [wrong] if wrong else []
         said = [f"place to {known.sigma_m:.3g} m", *([known.missing] if known.missing else [])]

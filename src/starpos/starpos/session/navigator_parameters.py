@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Parameters of the navigator, and what they and their files say of the vehicle."""
+"""Parameters of the navigator, and the vehicle that they and their files describe."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from starpos.earth.geoid import Geoid
+from starpos.earth.known_place import KnownPlace
 from starpos.earth.vertical import Vertical
 from starpos.errors import StarposError
 from starpos.files import path_of
@@ -29,6 +30,10 @@ SHARED = (
     "deflection.eta",
     "deflection.stddev",
     "deflection.geoid",
+    "site.latitude",
+    "site.longitude",
+    "site.geodetic",
+    "site.stddev",
 )
 PARAMETERS = (
     Parameter(
@@ -129,6 +134,12 @@ PARAMETERS = (
         minimum=1.0,
         maximum=3600.0,
     ),
+    Parameter(
+        "gnss.use",
+        False,
+        "Take the place of gnss/fix for navigator/heading, before there is a fix; navigator/fix stays the stars' own. A "
+        "GNSS that is 10 km astray turns the heading by up to 0.1 deg, more near a pole.",
+    ),
     *(p for p in parameters.PARAMETERS if p.name in SHARED),
 )
 # of a stated altitude: the vehicle goes up and down by more than its file says
@@ -144,7 +155,7 @@ class NavigatorSettings:
 
     def __init__(self, values: Mapping[str, Any]) -> None:
         self.values = values
-        # those in use, and those of the last check
+        # the files in use, and the files of the last check
         self._files: tuple[Instrument, ImuModel, Geoid | None] = ANY_INSTRUMENT, ImuModel(), None
         self._read: tuple[Instrument, ImuModel, Geoid | None] = self._files
 
@@ -163,7 +174,7 @@ class NavigatorSettings:
             if "deflection.geoid" in names:
                 grid = parameters.geoid_file(values["deflection.geoid"])
             parameters.atmosphere_of(values)
-            parameters.vertical_of(values, grid)
+            parameters.site_of(values, parameters.vertical_of(values, grid))
             check_drift(values["vehicle"], values["drift_stddev"], values["drift_change"])
         except StarposError as e:
             return str(e)
@@ -176,8 +187,13 @@ class NavigatorSettings:
 
     @property
     def vertical(self) -> Vertical:
-        """The deflection of the vertical, or the geoid that tells it."""
+        """The deflection of the vertical, or the geoid that gives it."""
         return parameters.vertical_of(self.values, self._files[2])
+
+    @property
+    def site(self) -> KnownPlace | None:
+        """The place that is known; None where none is set."""
+        return parameters.site_of(self.values, self.vertical)
 
     def vessel(self, clock_stddev_s: float) -> Vessel:
         """Instrument and vehicle, of which the frames' clock states its error."""

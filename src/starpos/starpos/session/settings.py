@@ -72,7 +72,7 @@ class Settings:
 
     @property
     def vertical(self) -> Vertical:
-        """The deflection of the vertical, or the geoid that tells it."""
+        """The deflection of the vertical, or the geoid that gives it."""
         return parameters.vertical_of(self.values, self._geoid)
 
     @property

@@ -6,7 +6,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from starpos.earth.ellipsoid import EARTH_RADIUS_M
+from starpos.earth.orientation import earth_motion
 from starpos.errors import FixError
+from starpos.sky.catalogue import load_catalogue
 from starpos.units import ARCSEC
 from starpos.utc import utc_text
 from starpos.zenith.adjustment import Adjusted
@@ -24,6 +26,9 @@ DOUBTED_CHI2 = 36.0
 UNLIKE_CHI2 = 18.0
 # a face with a smaller share of the usual number of frames is thin
 THIN = 0.5
+# Tycho-2 over 6 deg and more: less than 1 mas in places, of 1991.25, and about 0.5 mas a year in proper motions (Hog et
+# al. 2000, A&A 355, L27, section 3).  A catalogue whose stars err by less than LIKE_GAIA_ARCSEC has no such zones.
+ZONES_ARCSEC, ZONES_ARCSEC_PER_YEAR, ZONES_EPOCH, LIKE_GAIA_ARCSEC = 0.001, 0.0005, 1991.25, 0.005
 # Differences of lean that the scale turns into more than so many sigma of the deflection rest on the scale being the same
 # everywhere, which nobody states.
 UNLEVEL_SIGMA = 3.0
@@ -75,6 +80,12 @@ def remarks(found: Adjusted, sightings: Sequence[ZenithSighting], frames: int, s
         if quality.chi2 > UNLIKE_CHI2:
             xi, eta = quality.stddev_arcsec
             said.append(f"{_face_off(quality)} (1 sigma {xi:.2f}, {eta:.2f}): look at its frames")
+    zones = _zones_arcsec(found, sightings)
+    if found.sigma_arcsec.min() < zones:
+        said.append(
+            f"zonal errors of Tycho-2, up to {zones:.3f} arcsec here, are not in the covariance: all sessions under "
+            "these stars share them: use Gaia's places (starpos catalogue build --gaia)"
+        )
     if frames > len(sightings):
         said.append(f"{frames - len(sightings)} of {frames} frames are left out")
     lean = max(np.ptp([s.tilt.theta[k] for s in sightings]) for k in (0, 1)) / ARCSEC
@@ -85,6 +96,15 @@ def remarks(found: Adjusted, sightings: Sequence[ZenithSighting], frames: int, s
             f"{found.sigma_arcsec.max() / scale:.0f} arcsec"
         )
     return said
+
+
+def _zones_arcsec(found: Adjusted, sightings: Sequence[ZenithSighting]) -> float:
+    """Zonal errors of the catalogue at the session's date, at most; 0 for a catalogue like Gaia's."""
+    year, _ = earth_motion(sightings[0].utc_unix_s)
+    sigma = float(np.median(load_catalogue().sigma(found.stars.stars, year))) / ARCSEC
+    if sigma < LIKE_GAIA_ARCSEC:
+        return 0.0
+    return ZONES_ARCSEC + ZONES_ARCSEC_PER_YEAR * abs(year - ZONES_EPOCH)
 
 
 def _off(found: Adjusted) -> str:

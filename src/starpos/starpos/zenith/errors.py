@@ -14,7 +14,7 @@ from starpos.zenith.places import StarPlaces
 from starpos.zenith.sighting import Mark, ZenithSighting
 
 HOUR_S = 3600.0
-# Temperature of a tiltmeter that nobody measured: it follows a clear night's air, some degrees in a few hours.
+# Unmeasured temperature of a tiltmeter: it follows a clear night's air, some degrees in a few hours.
 UNKNOWN_WALK_C_PER_SQRT_HOUR = 2.0
 # Daily and half-daily terms of UT1 and of the pole, which tables of a value a day have not: root mean square of the ocean
 # tides' terms (IERS Conventions (2010), tables 8.2 and 8.3: M2 alone is 0.33 mas of the pole, O1 0.02 ms of UT1), and of
@@ -47,7 +47,7 @@ class Source:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Errors:
-    """All errors of the readings but those of the air: sources; and those of the air for 1 rad of each.
+    """All errors of the readings: sources without the air, and the air's errors for 1 rad of each.
 
     motion: image motion, new in each frame.  air: anomalous refraction, that changes within AIR_TAU_S.
     """

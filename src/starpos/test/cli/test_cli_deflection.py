@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`starpos deflection`, on lists of the stars above a place whose plumb line is not that of the ellipsoid."""
+"""`starpos deflection`, on lists of the stars above a place whose plumb line differs from the ellipsoid's normal."""
 
 import json
 import re

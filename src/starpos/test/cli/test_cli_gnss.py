@@ -14,7 +14,7 @@ HEAD = "utc_unix_s,latitude,longitude,altitude_m,sigma_east_m,sigma_north_m,stat
 
 @pytest.fixture(scope="module")
 def drive(tmp_path_factory):
-    """Two frames of one pose, and a receiver that stands still beside them."""
+    """Two frames of one pose, and a receiver that stands still next to them."""
     folder = tmp_path_factory.mktemp("drive")
     place = [f"--{k}={v}" for k, v in PLACE.items()]
     command = [
@@ -84,3 +84,50 @@ def test_learned_needs_gnss(drive, tmp_path, capsys):
         capsys, "solve", *frames, "--tilt", drive / "tilt.csv", "--learned", tmp_path / "a.json"
     )
     assert status == 2 and "give both" in errors[0]
+
+
+def test_without_gnss_its_code_is_not_asked_and_no_key_is_new(drive, capsys, monkeypatch):
+    frames = sorted(drive.glob("stars_*.csv"))
+    command = (
+        "solve",
+        *frames,
+        "--tilt",
+        drive / "tilt.csv",
+        *AIR,
+        *WIDE,
+        *SENSOR,
+        "--misalignment",
+        "1.5",
+        "-2",
+    )
+    command = (*command, "130", "--json")
+    before = run(capsys, *command)
+
+    def never(*_):
+        raise AssertionError("GNSS was asked")
+
+    for name in ("watch.GnssWatch.__init__", "track.GnssTrack.__init__", "table.read_gnss_csv"):
+        monkeypatch.setattr(f"starpos.gnss.{name}", never)
+    assert run(capsys, *command) == before
+    for line in objects(before[1]):
+        assert line["status"] == "ok" and "gnss" not in line
+
+
+@pytest.mark.parametrize(
+    ("north_deg", "said"),
+    [(0.0, "No alarm: GNSS never disagreed."), (0.5, "km north of where the stars put us")],
+)
+def test_the_report_draws_the_drive_and_tells_the_alarm(drive, tmp_path, capsys, north_deg, said):
+    pytest.importorskip("matplotlib")
+    rows = (drive / "gnss.csv").read_text().splitlines()[1:]
+    cells = [row.split(",") for row in rows]
+    moved = [",".join([t, str(float(latitude) + north_deg), *rest]) for t, latitude, *rest in cells]
+    gnss, out = tmp_path / "moved.csv", tmp_path / "report"
+    gnss.write_text("\n".join([HEAD, *moved]) + "\n")
+    a3 = ("--misalignment", "1.5", "-2", "130", "--misalignment-stddev", "0.01")
+    status, _, errors = run(capsys, "report", drive, "--gnss", gnss, *AIR, *WIDE, *SENSOR, *a3, "-o", out)
+    assert status == 0, errors
+    page = (out / "index.html").read_text()
+    assert "The drive beside GNSS" in page and said in page
+    # the receiver's own table is no frame
+    assert (out / "drive.png").stat().st_size > 10_000 and "bad input" not in page

@@ -71,7 +71,7 @@ def test_where_nobody_says_the_size_of_the_sensor_a3_counts_as_not_known(lists, 
     status, answer, errors = solve(paths, *KNOWN)
     # 2000 px are 23 deg here
     assert (status, answer["latitude"]) == (1, None)
-    assert any("of a sensor whose size nobody says" in line for line in errors)
+    assert any("of a sensor whose size is not stated" in line for line in errors)
 
 
 def test_frames_of_another_size_than_the_first_or_the_files_have_no_fix(lists, solve, tmp_path):
@@ -105,7 +105,10 @@ def test_a_frame_without_a_sound_time_has_no_fix_and_is_identified_all_the_same(
 
 def test_the_sentence_about_a_wrong_header_is_in_the_json(lists, run, tmp_path):
     wrong, right = changed(lists, tmp_path, XPIXSZ=6.8)[0], sorted(lists.glob("stars_*.csv"))[1]
-    for command in (("identify",), ("solve", "--tilt", lists / "tilt.csv", *AIR, *KNOWN[len(WIDE) :])):
+    gnss = tmp_path / "gnss.csv"
+    gnss.write_text("utc_unix_s,latitude,longitude,sigma_east_m,sigma_north_m\n")
+    solve = ("solve", "--tilt", lists / "tilt.csv", *AIR, *KNOWN[len(WIDE) :])
+    for command in (("identify",), solve, (*solve, "--gnss", gnss)):
         _, out, errors = run(*command, wrong, right, "--json")
         told = next(line for line in errors if "its header is wrong" in line)
         of_wrong, of_right, *_ = objects(out)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The session behind the node `navigator`: what it makes of voyages that it is told message by message."""
+"""The session behind the node `navigator`: voyages given to it message by message."""
 
 from dataclasses import asdict, replace
 from types import SimpleNamespace
@@ -19,6 +19,14 @@ from navigator_calls import (
 )
 from voyage_calls import navigated
 
+from starpos import rotation
+from starpos.earth.ellipsoid import enu_axes
+from starpos.earth.known_place import KnownPlace
+from starpos.earth.refraction import Atmosphere
+from starpos.earth.vertical import Deflection
+from starpos.navigation.at_place import attitude_at_place
+from starpos.navigation.placeless import PlacelessFrame
+from starpos.navigation.vessel import Vessel
 from starpos.session.diagnosis import Level
 from starpos.session.now import Now
 from starpos_testing.voyages import INDUSTRIAL, made
@@ -174,7 +182,7 @@ NO_G = [0.0, 0.0, 9.8]
         (imu_message(1.7e9, [0, 0, np.nan], NO_G), "NaN"),
         (imu_message(1.7e9, [0, 0, 0], [0, 0, 1e200]), "beyond"),
         (imu_message(0.0, [0, 0, 0], NO_G), "no time stamp"),
-        (imu_message(1.7e9 + 60, [0, 0, 0], NO_G), "before its time"),
+        (imu_message(1.7e9 + 60, [0, 0, 0], NO_G), "in the future"),
     ],
 )
 def test_a_reading_that_cannot_be_is_refused_with_a_sentence(message, said):
@@ -230,3 +238,60 @@ def test_a_velocity_that_cannot_be_is_refused_with_a_sentence(velocity, sigma, s
     navigator = Navigator()
     navigator.session.take_velocity(velocity_message(1.7e9, velocity, sigma), NOW, "odom")
     assert said in navigator.told.refused[0][1]
+
+
+def gnss_message(unix_s, latitude, longitude):
+    return SimpleNamespace(
+        header=header_of(unix_s), status=SimpleNamespace(status=0), position_covariance=np.diag([4.0, 4.0, 9.0]).ravel(),
+        position_covariance_type=2, latitude=np.degrees(latitude), longitude=np.degrees(longitude),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("known_by", ["gnss", "site", "nobody"])
+def test_at_a_known_place_there_is_a_heading_before_a_fix(record, known_by):
+    """Without an IMU there never is a fix."""
+    latitude, longitude = record.latitude[0], record.longitude[0]
+    site = {"site.latitude": np.degrees(latitude), "site.longitude": np.degrees(longitude)}
+    values = {"gnss": {"gnss.use": True}, "site": site, "nobody": {}}[known_by]
+    navigator = Navigator(**values)
+    frames = [(f.utc_unix_s + 0.5, "attitude", attitude_message(f)) for f in record.frames]
+    gnss = [
+        (t, "gnss", gnss_message(t, *place))
+        for t, *place in zip(record.frames_s, record.latitude, record.longitude, strict=True)
+    ]
+    navigator.play([*frames, *gnss])
+    if known_by == "nobody":
+        assert navigator.outputs == []
+        return
+    assert len(navigator.outputs) == len(record.frames) and navigator.outputs[0].fix is None
+    nees = []
+    for output, true in zip(navigator.outputs, record.heading, strict=True):
+        seen = output.at_place
+        heading = np.arctan2(*seen.link_to_enu[:2, 0])
+        off_rad = np.remainder(heading - true + np.pi, 2 * np.pi) - np.pi
+        nees.append(off_rad**2 / seen.attitude_covariance[2, 2])
+    # the mount's error is the same in all, 1 deg; all others are far below
+    assert np.mean(nees) < 9 and np.sqrt(seen.attitude_covariance[2, 2]) < np.radians(1.01)
+    assert np.std([np.sqrt(x) for x in nees]) < 0.2
+
+
+def test_a_heading_at_a_known_place_claims_what_it_errs_by_when_the_mount_is_known(record):
+    air = Atmosphere(pressure_pa=0.0)
+    there = Vessel(vehicle=None, model=INDUSTRIAL, camera_to_body=record.mount, mount_stddev=1e-9, atmosphere=air,
+                   clock_stddev_s=1e-4)  # fmt: skip
+    nees = []
+    truth = zip(record.latitude, record.longitude, record.body_to_itrs, strict=True)
+    for frame, (latitude, longitude, body_to_itrs) in zip(record.frames, truth, strict=True):
+        place = KnownPlace.by_gravity(*np.degrees([latitude, longitude]), Deflection(0.0, 0.0, 0.0))
+        seen = frame.placeless()
+        placeless = PlacelessFrame(
+            utc_unix_s=frame.utc_unix_s,
+            stamp_stddev_s=0.0,
+            camera_to_itrs=seen.camera_to_itrs,
+            covariance=seen.covariance,
+        )
+        found = attitude_at_place(placeless, place, there)
+        off = rotation.to_small_vector(found.link_to_enu @ (enu_axes(latitude, longitude) @ body_to_itrs).T)
+        nees.append(off @ np.linalg.solve(found.attitude_covariance, off))
+    # three degrees of freedom; 60 frames
+    assert 2.0 < np.mean(nees) < 4.2

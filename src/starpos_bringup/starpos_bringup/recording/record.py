@@ -24,6 +24,8 @@ TOPICS = {
     "attitude": "starpos_interfaces/msg/Attitude",
     "fix": "sensor_msgs/msg/NavSatFix",
     "fix_averaged": "sensor_msgs/msg/NavSatFix",
+    "gnss/fix": "sensor_msgs/msg/NavSatFix",
+    "gnss/check": "starpos_interfaces/msg/GnssCheck",
     "heading/imu": "sensor_msgs/msg/Imu",
     "solver/solution": "starpos_interfaces/msg/Solution",
     "/diagnostics": "diagnostic_msgs/msg/DiagnosticArray",

@@ -126,7 +126,20 @@ function showPosition(fix, old) {
   say("average", average ? both.join("  ") : text.UNKNOWN);
   say("average-sigma", average ? `± ${text.metres(a.east)} east, ± ${text.metres(a.north)} north` : "");
   const heading = state.heading && !isOld(state.heading) && link.alive ? state.heading.azimuth : null;
-  map?.show({ newest: last, average, old: old || !good, azimuth: heading, track });
+  const gnss = showGnss();
+  map?.show({ newest: last, average, gnss, old: old || !good, azimuth: heading, track });
+}
+
+// The GNSS place of the newest frame, null without one, and what the guard says of it.
+function showGnss() {
+  const gnss = state.gnss && !isOld(state.gnss) && link.alive ? state.gnss : null;
+  element("gnss").hidden = !gnss;
+  if (!gnss) return null;
+  element("gnss").dataset.status = gnss.status;
+  say("gnss-word", gnss.status);
+  say("gnss-place", `${text.decimal(gnss.latitude)} ${text.decimal(gnss.longitude)}`);
+  say("gnss-sentence", gnss.sentence);
+  return gnss.latitude === null || gnss.longitude === null ? null : gnss;
 }
 
 const plain = (fix, s) => `${text.decimal(fix.latitude, s.latitude)} ${text.decimal(fix.longitude, s.longitude)}`;

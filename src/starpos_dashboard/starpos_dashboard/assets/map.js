@@ -45,13 +45,15 @@ export class EarthMap {
         mark: add(group, "path", { class: "mark", d: "M-7 0H7M0-7V7" }),
       };
     }
+    this.gnss = layer("path", { class: "gnss", id: "map-gnss", d: "M0-8L8 0L0 8L-8 0Z" });
     this.ray = add(this.ellipses.newest.group, "path", { class: "ray", d: "M0-9V-44" });
     this._inset();
     this._listen();
     new ResizeObserver(() => this.draw()).observe(this.box);
   }
 
-  // {newest, average: {latitude, longitude, covariance} or null, old, azimuth or null, track: [[number, lat, lon]]}
+  // {newest, average: {latitude, longitude, covariance} or null, gnss: {latitude, longitude, status} or null, old,
+  // azimuth or null, track: [[number, lat, lon]]}
   show(data) {
     this.data = data;
     this.draw();
@@ -80,6 +82,7 @@ export class EarthMap {
     this._drawTrack();
     this._drawEllipse("newest", this.data.newest);
     this._drawEllipse("average", this.data.average);
+    this._drawGnss();
     this._drawScale();
     this._drawInset();
     this._describe();
@@ -94,7 +97,7 @@ export class EarthMap {
     const fix = this.data.newest;
     if (this.follow && fix) Object.assign(this.view, { lon: fix.longitude, lat: fix.latitude });
     const near = this.follow === "fix" && fix;
-    if (near) this.view.k = EARTH_M / this._scaleOf(fix);
+    if (near) this.view.k = EARTH_M / Math.max(this._scaleOf(fix), this._scaleWithGnss(fix));
     else if (this.follow === "earth" || (this.follow && !fix)) this.view.k = this._whole;
     this.view.k = Math.min(Math.max(this.view.k, this._whole * 0.8), EARTH_M / NEAREST);
   }
@@ -104,6 +107,14 @@ export class EarthMap {
     const axis = fix.covariance ? axes(fix.covariance).major : 100;
     const exact = (RING_95 * axis) / (FILL * (Math.min(this.width, this.height) / 2));
     return 2 ** (Math.ceil(Math.log2(exact) * 2) / 2);
+  }
+
+  // m a pixel at which GNSS's place is on the map too, in the same steps; 0 without one.
+  _scaleWithGnss(fix) {
+    const { gnss } = this.data;
+    if (!gnss) return 0;
+    const apart = EARTH_M * geoDistance([fix.longitude, fix.latitude], [gnss.longitude, gnss.latitude]);
+    return apart ? 2 ** (Math.ceil(Math.log2(apart / (FILL * (Math.min(this.width, this.height) / 2))) * 2) / 2) : 0;
   }
 
   _project([lon, lat]) {
@@ -193,6 +204,18 @@ export class EarthMap {
     const drawn = fix.covariance && RING_95 * axes(fix.covariance).major < BIGGEST_M;
     inner.setAttribute("d", drawn ? this._line(ellipse(fix, 1)) : "");
     outer.setAttribute("d", drawn ? this._line(ellipse(fix, RING_95)) : "");
+  }
+
+  _drawGnss() {
+    const { gnss } = this.data;
+    const shown = gnss && this._isHere([gnss.longitude, gnss.latitude]);
+    this.gnss.classList.toggle("hidden", !shown);
+    element("legend-gnss").classList.toggle("hidden", !gnss);
+    element("legend-gnss").dataset.status = gnss?.status ?? "";
+    if (!shown) return;
+    const [x, y] = this._project([gnss.longitude, gnss.latitude]);
+    this.gnss.setAttribute("transform", `translate(${x.toFixed(2)} ${y.toFixed(2)})`);
+    this.gnss.dataset.status = gnss.status;
   }
 
   _drawScale() {

@@ -1,0 +1,94 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a running session makes of a receiver's messages: each that cannot be used is a sentence and teaches nothing."""
+
+import math
+from types import SimpleNamespace
+
+import pytest
+
+from starpos.frames.stars import no_stars
+from starpos.session.gnss_teacher import TOPIC, GnssTeacher
+from starpos.session.job import JobsInTurn
+from starpos.session.now import Now
+from starpos.session.parameter_file import settings_of
+
+START_S = 1_790_000_000
+NORTH_3_KM = 0.027
+
+
+class Account:
+    """Keeps which messages came and which were refused."""
+
+    def __init__(self):
+        self.taken, self.refused = 0, []
+
+    def came(self, _):
+        self.taken += 1
+
+    def refuse(self, name, sentence):
+        assert name == TOPIC
+        self.refused.append(sentence)
+
+
+@pytest.fixture
+def teacher():
+    account = Account()
+    log = SimpleNamespace(info=print, warning=print, error=print)
+    made = GnssTeacher(settings_of(None, ("gnss.use:=true",)), JobsInTurn(print), account, log)
+    made.account = account
+    return made
+
+
+def fix(seconds=0.0, status=0, frame_id="gps", kind=2, variance=4.0, **place):
+    nanosec = round((seconds % 1) * 1e9)
+    stamp = SimpleNamespace(sec=START_S + math.floor(seconds), nanosec=nanosec)
+    about = {"latitude": 47.0, "longitude": 8.0, "altitude": math.nan} | place
+    return SimpleNamespace(
+        header=SimpleNamespace(stamp=stamp, frame_id=frame_id), status=SimpleNamespace(status=status),
+        position_covariance=[variance, 0, 0, 0, variance, 0, 0, 0, 9.0], position_covariance_type=kind, **about,
+    )  # fmt: skip
+
+
+def now(seconds=0.0):
+    return Now(START_S + seconds, seconds)
+
+
+def test_a_fix_without_an_altitude_is_a_place(teacher):
+    teacher.take(fix(), now())
+    assert teacher.account.taken == 1 and teacher.place_at(START_S) is not None
+
+
+@pytest.mark.parametrize(
+    ("message", "said"),
+    [
+        (fix(kind=0), "states no error"),
+        (fix(variance=math.nan), "states no error"),
+        (fix(latitude=math.nan), "not a number"),
+        (fix(latitude=0.0, longitude=0.0), "0 N 0 E"),
+        (fix(frame_id="OSGB36"), "another datum"),
+        (fix(status=-1), "no fix"),
+        (fix(seconds=100.0), "100 s ahead of this clock"),
+        (fix(seconds=-100.0), "100 s behind this clock"),
+    ],
+)
+def test_what_tells_no_place_is_a_sentence_and_is_not_kept(teacher, message, said):
+    teacher.take(message, now())
+    assert len(teacher.account.refused) == 1 and said in teacher.account.refused[0]
+    assert not teacher.account.taken and teacher.place_at(START_S) is None and teacher.learned is None
+
+
+def test_stamps_that_go_back_are_refused(teacher):
+    for seconds in (0.0, 1.0, 0.5):
+        teacher.take(fix(seconds), now(1.0))
+    assert teacher.account.taken == 2 and "stamps go back" in teacher.account.refused[0]
+
+
+def test_two_receivers_on_one_topic_are_compared_with_nothing(teacher):
+    for k in range(6):
+        teacher.take(fix(float(k), latitude=47.0 + NORTH_3_KM * (k % 2)), now(float(k)))
+    stars = no_stars(100, 100, mid_unix_s=START_S + 2.5)
+    rough = SimpleNamespace(fix=None, tilt=None, at_place=None, message="")
+    solver = SimpleNamespace(instrument=settings_of(None, ()).instrument(None))
+    answer = teacher.solved(solver, stars, rough)
+    assert answer.compared is None and "one receiver publishes, not two" in teacher.account.refused[-1]
+    assert teacher.learned is None
