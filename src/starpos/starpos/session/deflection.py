@@ -132,7 +132,7 @@ class LiveDeflection:
 
 
 def _lacking(session: DeflectionSession, faces: int, wanted_arcsec: float) -> str:
-    """What a session lacks for the error that is wanted."""
+    """What a session lacks to reach the wanted error."""
     if faces < QUARTER:
         return f"turn by a quarter, to face {faces + 1}"
     found = session.adjusted
@@ -149,5 +149,5 @@ def _lacking(session: DeflectionSession, faces: int, wanted_arcsec: float) -> st
 
 def _variance(found: Adjusted, terms: Sequence[tuple[str, float, float]]) -> float:
     """Sum of the squares of terms, arcsec2, of the component that errs most."""
-    worst = 1 + int(np.argmax(found.sigma_arcsec))
-    return float(sum(term[worst] ** 2 for term in terms))
+    worst = int(np.argmax(found.sigma_arcsec))
+    return sum((xi, eta)[worst] ** 2 for _, xi, eta in terms)
