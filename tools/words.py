@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 ROOT = Path(__file__).resolve().parents[1]
-# What is read; rooms of code as they are clean.
+# What is read.
 READ = (
     "*.md",
     "docs/**/*.md",
@@ -30,24 +30,7 @@ READ = (
     "starpos_*/*.md",
     "src/*/*.md",
     "starpos_interfaces/*/*.[ms][sr][gv]",
-    "src/starpos/starpos/*.py",
-    "src/starpos/starpos/averaging/*.py",
-    "src/starpos/starpos/calibration/*.py",
-    "src/starpos/starpos/detection/*.py",
-    "src/starpos/starpos/earth/*.py",
-    "src/starpos/starpos/fix/*.py",
-    "src/starpos/starpos/frames/*.py",
-    "src/starpos/starpos/identification/*.py",
-    "src/starpos/starpos/instrument/*.py",
-    "src/starpos/starpos/messages/*.py",
-    "src/starpos/starpos/navigation/*.py",
-    "src/starpos/starpos/night/*.py",
-    "src/starpos/starpos/parallel/*.py",
-    "src/starpos/starpos/recording/*.py",
-    "src/starpos/starpos/report/*.py",
-    "src/starpos/starpos/simulation/*.py",
-    "src/starpos/starpos/session/*.py",
-    "src/starpos/starpos/sky/*.py",
+    "src/starpos/starpos/**/*.py",
     "src/starpos_bringup/starpos_bringup/**/*.py",
     "src/starpos_common/starpos_common/*.py",
     "src/starpos_dashboard/starpos_dashboard/*.py",

@@ -43,7 +43,7 @@ def values(**changes):
 
 @pytest.fixture(scope="module")
 def fake(tmp_path_factory):
-    """Aravis with its fake camera, Fake_1: 2048 x 2048 px, of which it sends 512 x 512 unless told otherwise."""
+    """Aravis with its fake camera, Fake_1: 2048 x 2048 px, of which it sends 512 x 512 by default."""
     if not find_spec("gi"):
         if not DEBIAN.is_dir():
             lacks("python3-gi gir1.2-aravis-0.8")
@@ -94,7 +94,7 @@ def test_a_frame_is_the_whole_sensor_with_its_exposure_and_a_time_between_comman
 
 
 def test_the_moment_of_the_cameras_time_is_found_where_only_one_is_possible(make):
-    # The fake camera's time is that of the arrival, so that the exposure can only have ended then.
+    # The fake camera's time is the arrival's, so that the exposure can only have ended then.
     for _ in range(3):
         begin = time.time()
         exposure = make().capture(CaptureSettings(0.3, None, 1.0))
@@ -107,7 +107,7 @@ def test_the_moment_of_the_cameras_time_is_found_where_only_one_is_possible(make
 
 def test_frames_are_new_ones_and_exposure_and_gain_are_set(make, fake, monkeypatch):
     source = make(device="Fake_1")
-    # Frames that nobody has asked for wait meanwhile.
+    # Unrequested frames wait meanwhile.
     source.capture(SHORT)
     time.sleep(0.3)
     begin = time.time()
@@ -152,7 +152,7 @@ def test_a_trigger_that_never_comes_is_said_and_the_node_ends_at_once(make, monk
     assert "the node ends" in capture.result(10)[0]
     closer.join()
     monkeypatch.setattr(source_module, "READOUT_S", 0.1)
-    assert "look after the trigger (Line0)" in attempt(make(trigger="Line0"), SHORT)
+    assert "check the trigger (Line0)" in attempt(make(trigger="Line0"), SHORT)
 
 
 def test_an_incomplete_frame_is_refused(make, monkeypatch):
@@ -206,7 +206,7 @@ def taken(**changes):
         # Both fit, if a frame comes late.
         ({"camera_s": 20.55, "received_s": 1001.1}, "unknown", 1000.55, Capture.HARDWARE),
         ({"camera_s": 20.55, "received_s": 1001.1}, "start", 1000.80, Capture.HARDWARE),
-        # What was stated cannot be, and what nobody could have exposed then.
+        # Impossible stated values, and impossible exposures.
         ({}, "end", 1000.25, Capture.COMMAND),
         ({"camera_s": 19.0}, "unknown", 1000.25, Capture.COMMAND),
         ({"camera_s": 21.0}, "unknown", 1000.25, Capture.COMMAND),

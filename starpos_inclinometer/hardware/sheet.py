@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Place of each part of a board on its sheet: groups in columns, large parts in rows of their own, small ones paired."""
+"""Places of a board's parts on its sheet: groups in columns, large parts in rows of their own, small ones paired."""
 
 from dataclasses import dataclass
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The drawings: they are those of the description, and their nets are the firmware's pins."""
+"""The drawings: they match the description, and their nets are the firmware's pins."""
 
 import csv
 import re

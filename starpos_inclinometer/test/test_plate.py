@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The mounting plate: its mesh is closed and has the source's sizes, and its flexure is that of a beam."""
+"""The mounting plate: its mesh is closed and has the source's sizes, and its flexure is a beam's."""
 
 import math
 import re

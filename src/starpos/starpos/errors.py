@@ -62,7 +62,7 @@ class FixError(StarposError):
 
 
 class StationError(StarposError):
-    """The result of a zenith camera's session is missing or broken, or contradicts that of another."""
+    """The result of a zenith camera's session is missing or broken, or contradicts another one."""
 
 
 class VoyageError(StarposError):

@@ -111,7 +111,7 @@ def tilt(message: Tilt) -> dict:
 
 
 def gnss(message: GnssCheck) -> dict | None:
-    """Place [deg] of GNSS, and what the stars say of it; None for a status that is none of the message's constants."""
+    """Place [deg] of GNSS, and its comparison with the stars; None for an unknown status."""
     if message.status not in GNSS_WORDS:
         return None
     latitude, longitude = number(message.latitude), number(message.longitude)

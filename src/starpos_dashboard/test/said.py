@@ -69,7 +69,7 @@ def solution(status=Solution.OK, sentence="21 stars fit", warnings=()) -> Soluti
 
 
 def gnss(status=GnssCheck.DISAGREES, latitude=48.1553, longitude=11.5755) -> GnssCheck:
-    """What the solver says of a GNSS that lies 2 km north of `fix`."""
+    """The solver's message about GNSS 2 km north of `fix`."""
     sentence = "GNSS is 2 km north of where the stars put us (120 m): it is not believed"
     return GnssCheck(status=status, status_text=sentence, latitude=latitude, longitude=longitude)
 

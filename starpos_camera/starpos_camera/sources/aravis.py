@@ -80,7 +80,7 @@ class Aravis(FrameSource):
         self._camera: AravisCamera | None = None
 
     def lacking(self) -> None:
-        """Return None, because only a look at the network and the bus would tell."""
+        """Return None, because only a look at the network and the bus would show it."""
 
     def capture(self, settings: CaptureSettings) -> CapturedFrame:
         with self._in_use:
@@ -149,5 +149,6 @@ class Aravis(FrameSource):
                 return buffer
         source = self._values["aravis.trigger"]
         raise CaptureError(
-            f"no frame has come {READOUT_S:g} s after its exposure; look after the trigger ({source}) and the cable."
+            f"no frame has come {READOUT_S:g} s after its exposure; check the trigger ({source}) and the "
+            f"cable."
         )

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """One GenICam camera through Aravis: its settings, its clock, and its buffers as pixels.
 
-Names of features are those of GenICam's Standard Features Naming Convention and of GigE Vision. Aravis's functions:
+Names of features follow GenICam's Standard Features Naming Convention and GigE Vision. Aravis's functions:
 https://aravisproject.github.io/docs/aravis-0.8/.
 """
 
@@ -47,7 +47,7 @@ class ArrivedFrame:
 
     pixels      (height, width) uint8 or uint16
     pattern     of its mosaic; '' for none
-    camera_s    its time on the camera's clock; None: it tells none
+    camera_s    its time on the camera's clock; None: not reported
     received_s  its arrival, Unix time by the system's clock
     """
 
@@ -72,7 +72,7 @@ def fault(error: Exception) -> str:
     if isinstance(error, StarposError):
         return str(error)
     words = one_line(getattr(error, "message", error)).rstrip(".")
-    return f"{words or type(error).__name__}; look after its cable, its power, and programs that hold it."
+    return f"{words or type(error).__name__}; check its cable, its power, and programs that hold it."
 
 
 class AravisCamera:
@@ -214,7 +214,7 @@ def _found(aravis: ModuleType, wanted: str) -> str:
     if wanted in names or (not wanted and len(names) == 1):
         return wanted or names[0]
     if not names:
-        raise CaptureError("no GenICam camera is found; look after its cable, power and network address.")
+        raise CaptureError("no GenICam camera is found; check its cable, power and network address.")
     raise CaptureError(f"aravis.device must be one of: {', '.join(names)}.")
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Middle of an exposure from the time that a GenICam camera tells of it, on its own clock."""
+"""Middle of an exposure from a GenICam camera's time of it, on its own clock."""
 
 import math
 from collections.abc import Mapping
@@ -28,7 +28,7 @@ class FrameTimes:
 
     commanded_s  time just before the software trigger; None: a line has triggered
     received_s   arrival of the frame's first or last data
-    camera_s     the frame's time on the camera's clock; None: it tells none
+    camera_s     the frame's time on the camera's clock; None: not reported
     relation     None: the camera does not let its clock be read
     """
 
@@ -60,7 +60,7 @@ def stamp_of_camera(times: FrameTimes, moment: str, values: Mapping) -> Stamp:
     ]
     wanted = [name for name in possible if moment in (name, "unknown")]
     if not wanted:
-        told = "its times of frames contradict those of trigger and arrival, and are not used"
+        told = "its times of frames contradict trigger and arrival, and are not used"
         return replace(otherwise, remark=told)
     middle_s = sum(middles_s[name] for name in wanted) / len(wanted)
     if len(wanted) > 1:
@@ -81,7 +81,7 @@ def _by_host(times: FrameTimes, values: Mapping) -> Stamp:
 def _on_host_clock(times: FrameTimes) -> tuple[float, float]:
     """The camera's time of a frame on the host's clock, and its standard deviation (s); NaN: the clocks are not related.
 
-    A camera whose clock cannot be read may keep UTC (PTP), but nobody states how well. Exposure and stamp then lie
+    A camera whose clock cannot be read may keep UTC (PTP), but its error is not stated. Exposure and stamp then lie
     anywhere between trigger and arrival: the error is the one of a stamp at either edge.
     """
     assert times.camera_s is not None

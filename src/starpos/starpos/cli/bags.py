@@ -23,8 +23,8 @@ def add_bag(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--namespace", metavar="NAME", help="of the instrument, in a bag that holds several")
     options.add_parameters(
         parser,
-        "of detector and inclinometer, where stars and tilts are made of a robot's images and IMU; what the solver's are "
-        "is given by the other options",
+        "of detector and inclinometer, where stars and tilts are made of a robot's images and IMU; the "
+        "solver's parameters come from the other options",
         "detector:stamp:=start",
     )
     options.add_remaps(parser)

@@ -87,7 +87,7 @@ def run(args: argparse.Namespace) -> int:
 
 @dataclass(frozen=True, eq=False)
 class _Taken:
-    """A session's frames: their names, and of each its sighting or why it has none.
+    """A session's frames: their names, and their sightings or the errors.
 
     catalogue: of which the sightings' stars are rows.
     """

@@ -19,7 +19,7 @@ JSON_HELP = (
     "covariance_arcsec2 (2 x 2), errors (1 sigma of xi, eta for each source), reduced (without the tide; at the geoid), "
     "by_face and by_star (residuals, leverage); starpos stations and starpos report read it"
 )
-# so many stars are listed, those with the largest leverage first
+# number of stars listed, largest leverage first
 STARS_LISTED = 50
 
 

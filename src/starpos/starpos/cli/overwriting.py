@@ -16,7 +16,7 @@ from starpos.instrument import camera_file, instrument_file, instrument_update
 from starpos.instrument.instrument import Instrument
 from starpos.sky import catalogue
 
-# options of which a command reads a file, or several
+# options that name files to be read
 INPUTS = ("frames", "tilt", "pointings", "imu", "geoid", "originals", "gaia")
 # the name in the camera's file, which the camera node uses
 CAMERA_NAME = "camera"

@@ -24,8 +24,8 @@ def define(parser: argparse.ArgumentParser) -> None:
         "sessions",
         nargs="+",
         metavar="SESSION",
-        help="what starpos deflection --json printed, a file a session; those of one --station, or of one mark, are a "
-        "station",
+        help="output of starpos deflection --json, a file per session; sessions of one --station, or of one "
+        "mark, form a station",
     )
     parser.add_argument(
         "--geoid",

@@ -87,7 +87,7 @@ class AttitudeAtPlace:
     plumb: in east, north, up by the plumb line (astronomic).  ellipsoid: by WGS 84's normal (geodetic).
     true_north: level by the plumb line, north by the ellipsoid, as the fix's attitude in a graph of nodes.
     used, residual_px, residual_arcsec, jitter_px, focal_scale, zenith_distance, refraction_arcsec,
-    diurnal_aberration_arcsec, ut1_minus_utc_s, camera_to_itrs, camera_covariance: as in a Fix.
+    diurnal_aberration_arcsec, ut1_minus_utc_s, camera_to_itrs, camera_covariance: as those of a Fix.
     """
 
     utc_unix_s: float

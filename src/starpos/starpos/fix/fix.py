@@ -38,7 +38,7 @@ class Fix:
     """Astronomic latitude, longitude and heading (rad) at one instant, with the error budget.
 
     link_to_enu (3, 3): attitude of the base link.
-    used (M,): rows of the given stars that were kept; residual_px (M, 2): their fitted places minus their seen places.
+    used (M,): rows of the given stars that were kept; residual_px (M, 2): their fitted places minus their seen ones.
     jitter_px: scatter of the stars beyond the centroids' own errors (seeing, optics).
     focal_scale: factor on the given focal length.
     levelling (6, 2): change of the rows of an ErrorTerm for errors, in rad, of up about two axes fixed to the

@@ -17,7 +17,7 @@ from starpos.units import ARCSEC
 
 # An A3 known so well, across the plumb line and about it, is linear: the squares of what is left are below 0.5 arcsec.
 LINEAR_ACROSS_RAD, LINEAR_TURN_RAD = 120 * ARCSEC, 900 * ARCSEC
-# So many times the start is made again about its own answer.
+# Maximum number of times that the start is repeated about its own answer, and its convergence.
 ROUNDS, SETTLED_RAD = 6, 1e-6
 
 
@@ -93,7 +93,7 @@ def begun(instrument: Instrument, frames: Sequence[GnssFrame], vertical: Vertica
 
 
 def taught(learned: Learned, frame: GnssFrame, instrument: Instrument, vertical: Vertical) -> Learned:
-    """What is known after a frame that comes later than all before."""
+    """The state after a frame that comes later than all before."""
     gnss, sighting = frame.gnss, frame.sighting
     assert learned.place is not None
     moved_m = float(np.linalg.norm(gnss.from_place_m(*learned.place))) if frame.new_pose else 0.0
@@ -104,7 +104,7 @@ def taught(learned: Learned, frame: GnssFrame, instrument: Instrument, vertical:
     learned = aged(learned, passed, sighting.utc_unix_s)
     if frame.new_pose:
         learned = replace(learned, place=(gnss.latitude, gnss.longitude), poses=learned.poses + 1)
-    # about A3 as it was taken: what a few frames seem to tell of its turn would mislead
+    # about A3 as it was taken: its turn by a few frames would mislead
     about = np.zeros(learned.layout.size)
     # one up for all frames of a pose: GNSS's noise, as large as a good inclinometer's, would seem to lean the camera
     # and so to determine A3's turn about the plumb line

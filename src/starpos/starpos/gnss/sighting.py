@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A frame as the filter takes it: the place that it tells with what was learned, and what it tells with a GNSS place."""
+"""A frame as the filter takes it: its place by the learned states, and its equations with a GNSS place."""
 
 from dataclasses import dataclass
 
@@ -30,7 +30,7 @@ LEARNED_TERMS = (
 class LevelSight:
     """Attitude of the camera by the stars, camera_to_itrs (3, 3), and the tilt of a frame.
 
-    camera_covariance (3, 3): as that of a Fix.
+    camera_covariance (3, 3): as in a Fix.
     zenith_covariance (3, 3): of a zenith in ITRS by the errors of the stars, the air and the time, rad2.
     latitude, longitude (rad): of the fix, whose A3 may be wrong.
     """
@@ -94,7 +94,7 @@ def innovation(
     vertical: Vertical,
     up_in_camera: np.ndarray | None = None,
 ) -> Innovation:
-    """Compare the plumb line that GNSS and the deflection expect with that of the stars and the tilt.
+    """Compare the plumb line that GNSS and the deflection expect with the one by the stars and the tilt.
 
     up_in_camera (3,): about which the comparison is linear; None: as GNSS has it at this frame.
     """
@@ -104,7 +104,7 @@ def innovation(
     expected = rotation.normalised(axes[2] + (deflection - east_north) @ axes[:2])
     # along two directions at the place
     seen = axes[:2] @ (zenith_of_stars(sighting, learned) - expected)
-    # that of the stars has no noise of the tilts, by which a turn of A3 that is not known would seem to be told
+    # the stars' plumb line has no noise of the tilts, by which an unknown turn of A3 would seem to be determined
     up = learned.rotation @ (sighting.camera_to_itrs.T @ expected if up_in_camera is None else up_in_camera)
     rows = -axes[:2] @ zenith_rows(sighting, learned, up)
     rows[:, at.constant] += np.eye(2)

@@ -21,16 +21,16 @@ from starpos.instrument.instrument import Instrument
 LEARNING, AGREES, DOUBTFUL, DISAGREES = "learning", "agrees", "doubtful", "disagrees"
 # chi-square of two degrees of freedom that a good GNSS exceeds once in 1000 and, of each test, once in 3e6 frames
 DOUBT, ALARM = 13.8, 30.0
-# GNSS is believed again once it has agreed for so long, over so many frames, within that chi-square
+# GNSS is used again once it has agreed for this time, over this number of frames, within this chi-square
 BACK_S, BACK_FRAMES, BACK = 600.0, 10, 7.4
-# a place that is wider than this (1 sigma, m) is none: the filter is not linear over it
+# a place wider than this (1 sigma, m) is not used: the filter is not linear over it
 WIDEST_M = 50_000.0
 # the place of a lean at which A3 was not learned may be bent by this share of its least sigma
 MOST_BENT = 0.3
 NOISE_SIGMA = 2.0
-# before A3 is known, so many frames of a pose teach, and so many of all are kept
+# before A3 is known: maximum number of frames of a pose that teach, and of all that are kept
 FEW_OF_POSE, MOST_HELD = 12, 200
-# a place further off than so many sigma is another one, with a deflection of its own
+# a place further off, in sigma, is another one, with a deflection of its own
 ELSEWHERE_SIGMA = 3.0
 COMPASS = ("north", "north-east", "east", "south-east", "south", "south-west", "west", "north-west")
 
@@ -39,8 +39,8 @@ COMPASS = ("north", "north-east", "east", "south-east", "south", "south-west", "
 class GnssCheck:
     """What the guard says of a GNSS fix: a status, and how far it is from the stars' place.
 
-    distance_m, bearing_deg: of the GNSS place from that of the stars.  sigma_m: 1 sigma of the distance.
-    All three are NaN where the stars tell no place yet.
+    distance_m, bearing_deg: of the GNSS place from the stars' place.  sigma_m: 1 sigma of the distance.
+    All three are NaN where the stars give no place yet.
     """
 
     status: str
@@ -143,7 +143,7 @@ class GnssWatch:
         return None if self.learned is None else self.learned.rotation.T @ self.learned.up(tilt)
 
     def tells_place(self, sighting: LevelSight) -> bool:
-        """Whether the stars tell a place with what was learned before this frame."""
+        """Whether the stars give a place with what was learned before this frame."""
         if self.learned is None:
             return False
         narrow, wide = np.linalg.eigvalsh(place_of_stars(sighting, self.learned, self.vertical)[2])
@@ -153,7 +153,7 @@ class GnssWatch:
         return not self._held or self._bent_m(sighting.tilt) < MOST_BENT * math.sqrt(narrow)
 
     def _bent_m(self, tilt: Tilt) -> float:
-        """What a turn of A3 about the plumb line that is hardly known may do to the place beyond a linear error."""
+        """Effect on the place, beyond a linear error, of a hardly known turn of A3 about the plumb line."""
         assert self.learned is not None
         at, up = self.learned.layout, tilt.up
         off = min(float(np.linalg.norm(up - frame.sighting.tilt.up)) for frame in self._held)
@@ -163,7 +163,7 @@ class GnssWatch:
         return turn2 / 2 * leaned * EARTH_RADIUS_M
 
     def judge(self, sighting: LevelSight, gnss: GnssPlace) -> GnssCheck:
-        """Compare a GNSS place with that of the stars; where they disagree, take back what GNSS taught meanwhile."""
+        """Compare a GNSS place with the stars'; where they disagree, take back what GNSS taught meanwhile."""
         if self.learned is None or not self.tells_place(sighting):
             return GnssCheck(LEARNING)
         seen = innovation(sighting, gnss, self.learned, self.vertical)

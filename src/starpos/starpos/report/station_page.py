@@ -45,7 +45,7 @@ def station_page(
 ) -> tuple[str, dict[str, Picture]]:
     """The HTML of stations, and its pictures by the names of files.
 
-    compared: each station against a grid, None without a grid there; grid_name: the grid's name, '' without one.
+    compared: each station against a grid, None without one; grid_name: the grid's, '' without one.
     """
     title = f"Station {stations[0].name}" if len(stations) == 1 else f"{len(stations)} stations"
     parts, pictures = [f"<h1>Deflection of the vertical: {escape(title)}</h1>"], {}
@@ -82,7 +82,7 @@ def _drawn(
 
 
 def _pictures(station: Station) -> list[Picture]:
-    """The figures of a station: its repeats, then frames, faces and errors of its sessions."""
+    """The figures of a station: of its sessions, and of their repeats."""
     made = []
     if len(station.sessions) > 1:
         made.append(

@@ -101,8 +101,7 @@ class LiveDeflection:
         """What the session has so far, and whether it is enough."""
         if self._found is None:
             waiting = f"{len(self._sightings)} frames so far"
-            nothing = "the adjustment runs" if self._sightings else "point the camera at the zenith"
-            said = self._trouble or self._left_out or nothing
+            said = self._trouble or self._left_out or "point the camera at the zenith"
             return Diagnosis(Level.WARN, f"{waiting}: {said}", {"frames": len(self._sightings)})
         found, wanted = self._found.adjusted, self.wanted_arcsec
         sigma = float(found.sigma_arcsec.max())
@@ -132,7 +131,7 @@ class LiveDeflection:
 
 
 def _lacking(session: DeflectionSession, faces: int, wanted_arcsec: float) -> str:
-    """What a session lacks to reach the wanted error."""
+    """Advice on reaching the wanted error in a session."""
     if faces < QUARTER:
         return f"turn by a quarter, to face {faces + 1}"
     found = session.adjusted
@@ -150,4 +149,4 @@ def _lacking(session: DeflectionSession, faces: int, wanted_arcsec: float) -> st
 def _variance(found: Adjusted, terms: Sequence[tuple[str, float, float]]) -> float:
     """Sum of the squares of terms, arcsec2, of the component that errs most."""
     worst = int(np.argmax(found.sigma_arcsec))
-    return sum((xi, eta)[worst] ** 2 for _, xi, eta in terms)
+    return float(sum(sizes[worst] ** 2 for _, *sizes in terms))

@@ -45,7 +45,7 @@ from starpos.session.reports import AHEAD_S
 SHORTEST_S, FRAMES_PER_S = 10.0, 30.0
 # fixes of GNSS that are kept: attitudes come later than they
 GNSS_KEPT = 100
-# a claim is wide beyond, m an axis
+# 1 sigma beyond which a position counts as unknown, m an axis
 WIDE_M = 1000.0
 STARTING = "no frame with stars yet"
 APART = "all frames with stars are stamped later than the IMU's readings: set their clocks by one source"
@@ -103,7 +103,7 @@ class NavigatorSession:
         self._seen_s = -math.inf
         self._clock_stddev_s = 0.0
         self._gnss: deque[GnssPlace] = deque(maxlen=GNSS_KEPT)
-        # an outcome of a job that began before counts no more
+        # marks outcomes of jobs that began before as out of date
         self._voyage = object()
 
     @property

@@ -45,7 +45,7 @@ UNITS = {
 # read where it is there: a star's errors are larger by it (Lindegren et al. 2021, A&A 649, A2)
 RUWE = "ruwe"
 MOST_BYTES = 4_000_000_000
-# A star of Tycho-2 is one of Gaia's within this number of sigma of its place, plus this distance,
+# A star of Tycho-2 is one of Gaia's within this number of sigma of its place, and this distance besides,
 MATCH_SIGMA, MATCH_MAS = 5.0, 200.0
 # whose G is V within this: V - G is 0 to 0.5 for most stars and up to 3 for the reddest (Riello et al. 2021, A&A 649, A3)
 MATCH_MAG = (-1.0, 3.0)
@@ -137,7 +137,7 @@ def _table(path: Path) -> "Table":
 
 
 def _column(path: Path, column: "Table.Column", name: str, unit: str) -> np.ndarray:
-    """The numbers (N,) of a column in a unit, NaN where a value is missing."""
+    """The numbers (N,) of a column in a unit, NaN for empty cells."""
     # slow to import
     from astropy.units import Unit, UnitsError
 
@@ -189,7 +189,7 @@ def _rows(extract: Extract, rows: np.ndarray) -> Extract:
 
 
 def _matched(base: Catalogue, extract: Extract) -> tuple[np.ndarray, np.ndarray]:
-    """Rows of the catalogue, and the rows of the extract that are surely the same stars."""
+    """Rows of the catalogue, and rows of the extract that are these stars without doubt."""
     # slow to import
     from scipy.spatial import cKDTree
 

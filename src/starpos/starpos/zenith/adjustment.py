@@ -25,12 +25,12 @@ from starpos.zenith.quality import FaceQuality, Leftover, StarQuality, face_qual
 from starpos.zenith.sighting import Mark, ZenithSighting
 
 STEPS = 8
-# closer to a pole, a deflection is no longer small beside the distance from it
+# closer to a pole, a deflection is no longer small compared with the distance from it
 LEAST_COSINE = 1e-3
 # of its sigma: a smaller step is the last
 SETTLED = 1e-3
 # Anomalous refraction over image motion: a twenty-minute mean of zenith cameras scatters by 0.05 arcsec (Hirt 2006, A&A
-# 459, 283: 0.05 to 0.2 over hours) where a frame's image motion is 0.4; in air that moves no image nothing bends slowly.
+# 459, 283: 0.05 to 0.2 over hours) where a frame's image motion is 0.4. In air that moves no image nothing bends slowly.
 AIR_SHARE = 1 / 8
 # and a night's share above that is within this factor of it (1 sigma), and within three sigma: a face that is off by more
 # is no air
@@ -56,10 +56,10 @@ class Adjusted:
     covariance_arcsec2 (2, 2): of xi, eta, the sum of the `terms`.
     terms: 1 sigma of xi and eta for each source of error.
     a3 (3, 3): C into S, with the tiltmeter's zero.  turn_stddev_rad: of its turn about the plumb line.
-    faces (N,): number of each frame's face.  frame_arcsec (N, 2): xi, eta of each frame minus those of the session.
+    faces (N,): number of each frame's face.  frame_arcsec (N, 2): xi, eta of each frame minus the session's.
     frame_stddev_arcsec (N, 2): what these should scatter by.
     catalogue_factor: size of the catalogue's errors over what it states, by the session's own stars.
-    chi2_per_degree: of the residuals; 1 where the stated errors and those of the air explain them.
+    chi2_per_degree: of the residuals; 1 where the stated errors and the air's explain them.
     face_quality: each face against the others.  stars: the residuals and the leverage of each star.
     """
 
@@ -183,7 +183,7 @@ def _air_of(lines: Lines, stated: np.ndarray, errors: Errors, prior: np.ndarray,
 
 
 def _fitted(lines: Lines, covariance: np.ndarray, prior: np.ndarray, offset: np.ndarray) -> _Fit:
-    """Weighted fit of the equations; offset (5,): how far the estimate has moved from that of the prior."""
+    """Weighted fit of the equations; offset (5,): how far the estimate has moved from the prior's."""
     # slow to import
     from scipy.linalg import cholesky, solve_triangular
 

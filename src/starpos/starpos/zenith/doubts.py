@@ -16,7 +16,7 @@ from starpos.zenith.faces import mean_headings
 from starpos.zenith.quality import FaceQuality
 from starpos.zenith.sighting import ZenithSighting
 
-# A deflection whose sigma is larger is none: maps of the geoid know it better.
+# A deflection with a larger sigma is useless: maps of the geoid know it better.
 MOST_SIGMA_ARCSEC = 3.0
 # On land 6 arcsec are usual, over 25 are found in high mountains only, over 120 nowhere.
 LARGE_ARCSEC, MOST_ARCSEC = 25.0, 120.0
@@ -29,8 +29,8 @@ THIN = 0.5
 # Tycho-2 over 6 deg and more: less than 1 mas in places, of 1991.25, and about 0.5 mas a year in proper motions (Hog et
 # al. 2000, A&A 355, L27, section 3).  A catalogue whose stars err by less than LIKE_GAIA_ARCSEC has no such zones.
 ZONES_ARCSEC, ZONES_ARCSEC_PER_YEAR, ZONES_EPOCH, LIKE_GAIA_ARCSEC = 0.001, 0.0005, 1991.25, 0.005
-# Differences of lean that the scale turns into more than so many sigma of the deflection rest on the scale being the same
-# everywhere, which nobody states.
+# Limit on the scale's effect of differences of lean, in sigma of the deflection: beyond it the result assumes the same
+# scale everywhere, which is not stated.
 UNLEVEL_SIGMA = 3.0
 
 
@@ -59,7 +59,7 @@ def check_session(found: Adjusted, sightings: Sequence[ZenithSighting]) -> None:
 
 
 def remarks(found: Adjusted, sightings: Sequence[ZenithSighting], frames: int, scale: float) -> list[str]:
-    """Sentences on what may be wrong with a deflection that was found.
+    """Sentences on possible faults of a deflection.
 
     frames: number that was given.  scale: stated error of the tiltmeter's scale.
     """

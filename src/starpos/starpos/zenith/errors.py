@@ -16,9 +16,9 @@ from starpos.zenith.sighting import Mark, ZenithSighting
 HOUR_S = 3600.0
 # Unmeasured temperature of a tiltmeter: it follows a clear night's air, some degrees in a few hours.
 UNKNOWN_WALK_C_PER_SQRT_HOUR = 2.0
-# Daily and half-daily terms of UT1 and of the pole, which tables of a value a day have not: root mean square of the ocean
-# tides' terms (IERS Conventions (2010), tables 8.2 and 8.3: M2 alone is 0.33 mas of the pole, O1 0.02 ms of UT1), and of
-# interpolating UT1 linearly across a day of its fortnightly tide (0.8 ms, table 8.1).
+# Daily and half-daily terms of UT1 and of the pole, which daily tables do not have. The values are the root mean square
+# of the ocean tides' terms (IERS Conventions (2010), tables 8.2 and 8.3: M2 alone is 0.33 mas of the pole, O1 0.02 ms of
+# UT1). They include the error of interpolating UT1 linearly across a day of its fortnightly tide (0.8 ms, table 8.1).
 DAILY_UT1_S, DAILY_POLE_RAD = 3e-5, 3e-4 * ARCSEC
 # Correlation time of anomalous refraction, within the minutes to hours of Hirt (2006), A&A 459, 283.
 AIR_TAU_S = 1200.0

@@ -19,8 +19,8 @@ from starpos.errors import StationError
 from starpos.units import ARCSEC
 from starpos.zenith.stations import Station, offset_m
 
-# Correlation length of deflections over land, m, where no grid shows their field.  Those of UNKNOWN_STDDEV_ARCSEC then
-# change by 0.75 arcsec a kilometre, as under a horizontal gradient of gravity of 36 Eotvos, which hills have; high
+# Correlation length of deflections over land, m, where no grid shows their field.  Deflections of UNKNOWN_STDDEV_ARCSEC
+# then change by 0.75 arcsec a kilometre, as under a horizontal gradient of gravity of 36 Eotvos, which hills have; high
 # mountains have more.
 FIELD_LENGTH_M = 8_000.0
 # points of the path at which the field is evaluated

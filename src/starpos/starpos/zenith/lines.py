@@ -30,7 +30,8 @@ class LeanEstimate:
     def deflection(self, latitude: float) -> np.ndarray:
         """Deflection (2,) xi, eta in rad at a geodetic latitude, by the astronomic latitude and longitude of up.
 
-        xi is the difference of the latitudes, eta that of the longitudes times cos(latitude) (Heiskanen and Moritz 1967,
+        xi is the difference of the latitudes, eta the difference of the longitudes times cos(latitude) (Heiskanen and
+        Moritz 1967,
         section 5-4).  It differs from up's lean by xi eta tan(latitude), 3 mas at 80 deg for 10 arcsec of each.
         """
         east, north = self.lean

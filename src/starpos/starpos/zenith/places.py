@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a session itself says of its stars' catalogue places.
 
-Stars stand in many frames, and those of a frame show how far each is from where the others have it.  So their places are
+Stars stand in many frames, so a frame's stars show how far each is from its place in the others.  So their places are
 adjusted, as overlapping plates are (Eichhorn 1960, Astron. Nachr. 285, 233), with the catalogue's errors as what is known
 before; and their scatter shows how large the catalogue's errors are here, by maximum likelihood.  What is common to all
 stars of the session remains as uncertain as such errors leave it.
@@ -15,7 +15,7 @@ import numpy as np
 from starpos import rotation
 from starpos.zenith.sighting import ZenithSighting
 
-# the catalogue's errors may be so many times smaller or larger than stated
+# factor by which the catalogue's errors may be smaller or larger than stated
 MOST_FACTOR = 5.0
 
 

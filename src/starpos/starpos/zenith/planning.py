@@ -26,10 +26,10 @@ from starpos.zenith.sighting import Mark, ZenithSighting
 FACES = 4
 ROUNDS = (1, 2, 3, 4, 6)
 LEAST_FRAMES, MOST_FRAMES = 3, 240
-# a frame's stars are planned as so many, of a smaller error where the frame has more
+# number of stars planned in a frame; they get a smaller error if the frame has more
 GROUPS = 12
-# How faces happen to lean decides how well the tiltmeter's turn is known, and so up to a third of the error: a plan is
-# the mean of so many sessions.
+# How faces happen to lean decides how well the tiltmeter's turn is known, and so up to a third of the error: number of
+# sessions whose mean is a plan.
 LEVELLINGS = 3
 
 

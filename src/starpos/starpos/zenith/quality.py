@@ -59,7 +59,7 @@ class FaceQuality:
 
     number: from 0.  heading_deg: azimuth of the top of the frame.  frames: number of its frames.
     off_arcsec, stddev_arcsec (2,): xi and eta that it alone has more than the others have, with 1 sigma; NaN where they
-    cannot be told apart from A3.  chi2: of these two.
+    cannot be separated from A3.  chi2: of these two.
     """
 
     number: int
@@ -97,7 +97,7 @@ def face_qualities(
 ) -> tuple[FaceQuality, ...]:
     """Each face of a session against the others; faces (N,): number of each frame's face.
 
-    Empty for fewer than three faces: of two nobody knows which is wrong.
+    Empty for fewer than three faces: of two it is unknown which is wrong.
     """
     headings = np.degrees(mean_headings(sightings, faces)).tolist()
     return tuple(_quality(leftover, k, h, faces == k) for k, h in enumerate(headings) if len(headings) > 2)

@@ -97,7 +97,7 @@ class SessionResult:
 
 
 def read(path: Path | str) -> SessionResult:
-    """Read a session's result; StationError says why a file is none."""
+    """Read a session's result; StationError says why a file is not one."""
     path = Path(path)
     try:
         lines = [

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One frame at a known site: the camera's attitude by its stars, what that errs by, and the tilt."""
+"""One frame at a known site: the camera's attitude by its stars, its errors, and the tilt."""
 
 from dataclasses import dataclass
 
@@ -125,7 +125,7 @@ def sighting(solver: Solver, stars: Stars, found: Identification, mark: Mark, ti
         0.0,
         ECCENTRICITY2,
     )
-    # the catalogue's errors do not weigh here: `places` adjusts them with those of all frames
+    # the catalogue's errors do not weigh here: `places` adjusts them with all frames' stars
     fit = fitted(problem, camera.directions(*matched.xy.T), matched.covariance_px2)
     kept, residual = fit.kept, fit.residual[fit.kept]
     placed_px = matched.place_sigma[kept] * camera.fx

@@ -139,7 +139,7 @@ def _station(sessions: list[SessionResult], number: str) -> Station:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class AgainstGrid:
-    """A station's deflection at the geoid minus that of a grid, arcsec: off, stddev (2,); grid: the grid's own."""
+    """A station's deflection at the geoid minus a grid's, arcsec: off, stddev (2,); grid: the grid's own."""
 
     grid: Deflection
     off: np.ndarray
