@@ -33,7 +33,7 @@ img { display: block; width: 100%; height: auto; background: #fff; }
 figcaption { margin-top: .6rem; } details { margin: .6rem 0 1.2rem; } summary { cursor: pointer; }
 @media (max-width: 40rem) { body { padding: .7rem; } th { width: 8rem; }
   th, td { padding: .4rem .5rem; font-size: .92rem; } }
-@media print { img { filter: none; } }
+@media print { img { filter: none; } .wide table { white-space: normal; font-size: .8rem; } }
 """
 
 
