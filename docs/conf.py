@@ -6,6 +6,7 @@ Sphinx reads from the root of the repository, so that the packages' READMEs are 
 
 import os
 import re
+import sys
 from pathlib import Path
 
 import starpos
@@ -88,6 +89,14 @@ def about_commands() -> str:
     return "\n".join(made)
 
 
+def about_troubles() -> str:
+    """The messages of commands and nodes, from the code."""
+    sys.path.insert(0, str(ROOT / "tools"))
+    import messages
+
+    return messages.page()
+
+
 def about_messages() -> str:
     """The definitions of messages and services, which say of each field what it is."""
     files = [*sorted(INTERFACES.glob("msg/*.msg")), *sorted(INTERFACES.glob("srv/*.srv"))]
@@ -100,6 +109,7 @@ MADE = {
     "<!-- messages -->": about_messages,
     "<!-- parameters -->": about_parameters,
     "<!-- public names -->": about_names,
+    "<!-- troubles -->": about_troubles,
 }
 
 

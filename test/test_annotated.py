@@ -18,7 +18,7 @@ def test_an_image_with_the_solvers_stars_under_the_stamp_of_the_frame(graph, sol
     run("starpos_camera", "detector")
     graph.wait_for_detector(photograph)
     stars = graph.hear(StarArray, "stars")
-    # This test: the detector has nobody to draw for.
+    # This test: the detector has no subscriber to draw for.
     assert graph.node.count_subscribers("solver/solution") == 1
     images = graph.hear(Image, "detector/image_annotated", 1)
     graph.wait(

@@ -193,7 +193,7 @@ def test_another_instrument_or_other_air_begins_it_anew(graph, solver, averaged,
     shots = [noisy(rng) for _ in range(3)]
     average_after(graph, averaged, *shots)
     assert graph.set("solver", **parameters)[0]
-    # The same frame tells nothing new, and does no harm.
+    # The same frame adds nothing new, and does no harm.
     graph.send(shots[-1])
     average_after(graph, averaged, noisy(rng))
     assert average_state(graph, "of all")["frames"] == "1"

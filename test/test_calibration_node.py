@@ -29,7 +29,7 @@ from starpos_testing.graph.shots import (
 )
 
 HERE = {"latitude": LATITUDE_DEG, "longitude": LONGITUDE_DEG}
-# Where the solver is told zeros.
+# The place of the parameters' A3 of zeros.
 WRONG = misaligned()
 SITE = scene_at().site
 
@@ -141,7 +141,7 @@ def test_headings_on_the_spot_tell_place_and_a3(graph, solver):
     assert 0 < answer.plumb_stddev < 3 / 3600
     shot = check_fix(graph, 60, within_m=100)
     average = answer_in(graph, averaged, shot)
-    # the fix shares A3 with the place the turn has told: that stays
+    # the fix shares A3 with the place found by the turn: that stays
     place = (answer.latitude, answer.longitude)
     assert (average.latitude, average.longitude) == pytest.approx(place, abs=1e-11)
     claimed = np.reshape(average.position_covariance, (3, 3))[:2, :2].ravel()

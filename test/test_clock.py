@@ -143,9 +143,9 @@ def test_frames_and_tilts_from_the_future_are_refused(graph, solver):
     late(shot, time.time() + 2.0 - stamp_to_unix(shot.stars.header.stamp))
     graph.send(shot)
     solution, _, _ = graph.result(stamp_of(shot.stars))
-    assert solution.status == Solution.BAD_INPUT and "before its time" in solution.status_text
+    assert solution.status == Solution.BAD_INPUT and "in the future" in solution.status_text
     answer = graph.call(Solve, "solver/solve", Solve.Request())
-    assert not answer.success and "before its time" in answer.message
+    assert not answer.success and "in the future" in answer.message
     # What the clock's stated error allows is used.
     shot = shoot()
     late(shot, time.time() + 100 - stamp_to_unix(shot.stars.header.stamp))
@@ -164,7 +164,7 @@ def test_frames_and_tilts_from_the_future_are_refused(graph, solver):
     shot = shoot()
     late(shot, time.time() + 100 - stamp_to_unix(shot.stars.header.stamp))
     graph.send(shot)
-    state = graph.state("solver: Clock", "before their time")
+    state = graph.state("solver: Clock", "in the future")
     assert (
         state.level == WARN and 90 < -float({v.key: v.value for v in state.values}["frame age (s)"]) < 100.5
     )

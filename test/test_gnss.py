@@ -30,7 +30,7 @@ AGAIN_S = 2.0
 
 
 class Drive:
-    """A robot that is newly turned, and leans otherwise, at each frame; and what the solver tells of it."""
+    """A robot that is newly turned, and leans otherwise, at each frame; and the solver's answers."""
 
     def __init__(self, graph):
         self.graph, self.rng, self.at_s = graph, np.random.default_rng(7), shots.START_S

@@ -85,7 +85,7 @@ def test_at_a_known_place_heading_needs_no_tilt_and_there_is_no_fix(graph, solve
         imu = graph.imus[shot.stamp][-1]
         assert solution.status == Solution.NO_TILT and fix.status.status == NavSatStatus.STATUS_NO_FIX
         assert math.isnan(fix.latitude) and math.isnan(solution.latitude)
-        # the site is by gravity: the deflection that nobody states is in the heading on WGS 84
+        # the site is by gravity: the unstated deflection is in the heading on WGS 84
         assert abs(shot.heading_error_deg(solution.heading)) < 4 * solution.heading_stddev < 60 / 3600
         assert abs(shot.heading_error_deg(90 - yaw_deg(imu))) < 10 / 3600
         graph.state("solver: Solution", "heading at the known place")

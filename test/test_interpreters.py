@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which interpreter a name means, what is said of the versions that tests run with, and of one that is absent."""
+"""Which interpreter a name means, and the messages on the versions of a test run and on an absent one."""
 
 import importlib.util
 import subprocess

@@ -20,8 +20,8 @@ from starpos_testing.patience import WAIT_S
 KILLS, KILLED_NODES = 40, 2
 # That a service keeps.
 CALLS = 8
-# Forks a child that saves two contents in turn, kills it at a random moment after so many, looks at the file; says how
-# often which.
+# Forks a child that saves two contents in turn, kills it at a random moment after some, looks at the file; returns the
+# counts of each.
 KILLER = """
 import os, random, signal, sys, time
 from pathlib import Path

@@ -38,7 +38,7 @@ def record():
 
 @pytest.fixture
 def transforms(graph, listen):
-    """What is told on /tf: stamp, names of the frames, translation and quaternion, one after another."""
+    """Messages on /tf: stamp, names of the frames, translation and quaternion, one after another."""
     heard = listen("/tf")
     graph.wait(lambda: graph.node.count_subscribers("/tf") == 1)
     return heard
@@ -123,7 +123,7 @@ def send_stars_and_wheels(ears, record):
 
 
 def send_readings(ears, record, begin_s, end_s):
-    """Send those of some seconds since the record began."""
+    """Send the readings of some seconds since the record began."""
     imu = record.imu
     since = imu.utc_unix_s - record.frames_s[0] + 0.5
     for k in np.flatnonzero((since > begin_s + 1e-6) & (since < end_s + 1e-6)):

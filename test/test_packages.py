@@ -29,14 +29,14 @@ KEYS = {
     "tornado": "python3-tornado",
     "yaml": "python3-yaml",
 }
-# Only PyPI has them, or brings them with these, and the code says so where one is absent; a module of ours that
-# cannot do without is one of them
+# Only PyPI has them, or brings them with these, or apt for one Python (gi), and the code says so where one is absent; a
+# module of ours that cannot do without is one of them
 OPTIONAL = {
     "alpaca", "alpaca_simulators", "argcomplete", "dask", "distributed", "exifread", "fastjsonschema",
-    "gphoto2", "indipyclient", "lz4", "pillow_heif", "rawpy", "requests", "rosbags", "selenium",
+    "gi", "gphoto2", "indipyclient", "lz4", "pillow_heif", "rawpy", "requests", "rosbags", "selenium",
     "starpos_camera.sources.alpaca_http", "starpos_testing.skies.bags", "starpos_testing.skies.robots", "urllib3",
 }  # fmt: skip
-# Modules beside the tests.
+# Modules next to the tests.
 HELPERS = {path.stem for folder in PYTHON for path in folder.glob("test/**/*.py")}
 # A test writes it.
 HELPERS |= {"late_starpos"}

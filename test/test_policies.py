@@ -62,7 +62,7 @@ def allowed() -> dict[str, set]:
 
 
 def done(graph) -> dict[str, set]:
-    """What the nodes that are there use, those without an enclave left out; none of them calls a service."""
+    """Topics and services of the running nodes that have an enclave; none of them calls a service."""
     found, ask = {}, graph.node
     for node, namespace, enclave in ask.get_node_names_and_namespaces_with_enclaves():
         if enclave == "/":

@@ -18,7 +18,7 @@ from starpos_testing.graph.graph import Graph
 from starpos_testing.patience import WAIT_S
 
 PLACE = {"latitude": 48.1, "longitude": 11.6}
-# what demo.launch.py tells its solver
+# the parameters that demo.launch.py gives its solver
 AIR = ("refraction.pressure:=95000.0", "refraction.temperature:=8.0", "refraction.humidity:=0.4")
 KNOWN = (*AIR, "misalignment:=[0.4, -0.3, 12.0]", "misalignment_stddev:=5.0")
 CAMERA, INCLINOMETER, LINK = "starpos_camera_optical_frame", "starpos_inclinometer_frame", "starpos_link"

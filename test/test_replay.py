@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Bags through the running graph, and what the replay says to those that are none."""
+"""Bags through the running graph, and the replay's messages on invalid ones."""
 
 import json
 import os
@@ -62,7 +62,7 @@ def test_nodes_that_speak_at_once_are_all_heard_and_only_a_replays_answers_count
     until(player.all_here)
     player.begin()
     until(lambda: played[0])
-    # an answer to a frame that came before, told with the replay's begin, is none of the replay's
+    # an answer to an earlier frame, reported with the replay's begin, does not belong to the replay
     theirs = {"takes": ["/stars"], "replay": played[0][0].replay, "index": played[0][0].index}
     speak(made=1, fixes=1, **theirs)
     until(player.have_taken_all)
@@ -80,7 +80,7 @@ def test_a_replay_that_nobody_hears_says_so(graph, run):
     replay = run("starpos_bringup", "replay", arguments=(str(NIGHT), "--rate", "0", "--wait", "0.2"))
     assert replay.wait() == 1
     assert "13 frames, 0 answers, 0 fixes" in replay.output, replay.output
-    assert "nobody subscribes to" in replay.output and "/stars" in replay.output, replay.output
+    assert "no node subscribes to" in replay.output and "/stars" in replay.output, replay.output
 
 
 def test_a_replay_that_only_strangers_hear_says_so(graph, run):
@@ -95,7 +95,7 @@ def test_a_replay_that_only_strangers_hear_says_so(graph, run):
     )
     assert replay.wait() == 1, replay.output
     assert "10 frames, 0 answers, 0 fixes" in replay.output
-    assert "do not say what they take: start detector and solver with use_sim_time" in replay.output
+    assert "do not report what they take: start detector and solver with use_sim_time" in replay.output
     for subscription in heard:
         graph.node.destroy_subscription(subscription)
 
@@ -169,7 +169,7 @@ def test_the_kept_script_makes_this_bag(tmp_path, truth):
 
 
 def write_bag(folder, messages, plugin=StoragePlugin.MCAP):
-    """A bag of (log ns, topic, type, bytes); every topic latched. Types that nobody knows get a definition."""
+    """A bag of (log ns, topic, type, bytes); every topic latched. Unknown types get a definition."""
     store = get_typestore(Stores.ROS2_JAZZY)
     latched = offered_qos(latched=True)
     with Writer(folder, version=9, storage_plugin=plugin) as writer:
@@ -235,7 +235,7 @@ def test_a_single_file_and_chosen_topics(graph, run, tmp_path):
 
 
 def test_what_a_bag_may_not_bring(graph, run, tmp_path):
-    """Types that are not installed, names that are none, bytes that are no message: left out, the rest is played."""
+    """Types that are not installed, invalid names, bytes that are no message: left out, the rest is played."""
     messages = [
         (1 * S, "/a", "os/msg/Path", b"\0\1\0\0\0"),
         (2 * S, "/b", "os.path/msg/../X", b"\0\1\0\0\0"),

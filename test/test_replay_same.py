@@ -39,7 +39,7 @@ def bag(tmp_path_factory):
 
 
 class Quiet:
-    """Whom a session may tell anything."""
+    """A log and driver that take anything from a session."""
 
     def __getattr__(self, name):
         return lambda *_: None
@@ -135,7 +135,7 @@ def test_a_bag_gives_all_its_fixes_after_a_player_that_was_killed(
 
 
 def play_as_others_do(graph, bag, rate):
-    """Publish a bag and /clock and ask nobody, as `ros2 bag play --clock`."""
+    """Publish a bag and /clock without asking, as `ros2 bag play --clock`."""
     clock = graph.node.create_publisher(Clock, "/clock", QoSProfile(depth=1))
     with Bag(bag) as opened:
         topics = opened.topics(None, print)

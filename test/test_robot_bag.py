@@ -20,7 +20,7 @@ TOPICS = ("-r", "camera/image_raw:=/cam0/image_raw", "-r", "camera/camera_info:=
 
 
 class Quiet:
-    """Whom a session may tell anything."""
+    """A log and driver that take anything from a session."""
 
     def __getattr__(self, name):
         return lambda *_: None

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What tools/ make of arguments that are none, and of tests that did not run."""
+"""How tools/ treat invalid arguments, and tests that did not run."""
 
 import importlib.util
 import os

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A breach of each rule for sentences is found, on its line; whether the documents keep them, `make lint` sees."""
+"""Breaches of all rules for sentences are found, with their lines; whether the documents keep them, `make lint` sees."""
 
 import subprocess
 import sys
@@ -72,3 +72,10 @@ def test_docstrings_and_comments_of_code_are_read_and_its_strings_are_not(tmp_pa
             "6: so many: so many (give the number or name the quantity)",
         ],
     )
+
+
+def test_a_long_sentence_in_an_indented_docstring_is_found(tmp_path):
+    lines = "\n".join(f"    {'word ' * 14}" for _ in range(3))
+    text = f'def f():\n    """Clean.\n\n{lines}.\n    """\n'
+    status, [line] = found(tmp_path / "new.py", text)
+    assert status == 1 and line.startswith("2: long: 42 words")

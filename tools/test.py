@@ -39,7 +39,7 @@ DOCS = [
     "tools/setup/docs",
     ".underlay/docs/bin/python -m sphinx -W --keep-going -n -q -c docs . build/docs",
     ".underlay/docs/bin/python -m reuse lint --lines",
-    # the wheel is made from the source package: what that lacks is missed here; nothing runs in it: compiled quickly
+    # the wheel is made from the source package, so a missing file shows here; nothing runs in it: compiled quickly
     f"env CC={ROOT}/tools/setup/cc_quickly"
     " .underlay/docs/bin/python -m build --no-isolation src/starpos --outdir build/dist",
     ".underlay/docs/bin/python -m twine check --strict build/dist/*",
@@ -50,15 +50,15 @@ NO_TESTS = 5
 SHOWN = 20
 # At once: on two cores, because tests of nodes mostly wait.
 LANES = 6
-# a folder's files in so many parts, which run as lanes are free
+# a folder's files in several parts, which run as lanes are free
 PARTS = {"graph": 5, "starpos": 5, "starpos_camera": 3, "starpos_inclinometer": 2}
 # with Ubuntu's versions less is run
 UBUNTU_PARTS = {"starpos": 3}
-# for so many at once: a thread that has no processor of its own makes the others wait for it
+# for several at once: a thread without a processor of its own makes the others wait for it
 ONE_THREAD = {"OPENCV_FOR_THREADS_NUM": "1"}
 # what is no test of pytest's
 CHECKS = ("linters", "documents", "versions")
-# parts that mostly wait run beside those that mostly compute
+# parts that mostly wait run next to parts that mostly compute
 FIRST = ("graph", "starpos", "starpos_camera", "starpos_inclinometer")
 UBUNTU = "Ubuntu's "
 # the rooms of starpos whose answers depend on the table of the Earth's rotation, which is older there
@@ -219,7 +219,7 @@ def pytest(
 
 
 def one_cache() -> dict[str, str]:
-    """Where all parts keep tables of stars: in the user's cache where there is one, else beside the build."""
+    """Where all parts keep tables of stars: in the user's cache where there is one, else next to the build."""
     if (Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "starpos").is_dir():
         return {}
     (ROOT / "build" / "cache" / "starpos").mkdir(parents=True, exist_ok=True)
@@ -236,7 +236,7 @@ def folders() -> dict[str, str]:
 def parts(
     folders: dict[str, str], shares: dict[str, int], without: Collection[str] = ()
 ) -> dict[str, list[str]]:
-    """Files of tests, by the name of their part; shares: in how many parts a folder's files run, 1 where none is told."""
+    """Files of tests, by the name of their part; shares: in how many parts a folder's files run, 1 by default."""
     made = {}
     for name, folder in folders.items():
         files = [str(path.relative_to(ROOT)) for path in sorted((ROOT / folder).glob("**/test_*.py"))]

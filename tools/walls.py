@@ -19,7 +19,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 # who may import whom, for import-linter; compiled modules keep to the same floors
 CONTRACTS = ROOT / "tools" / "imports.ini"
-# What starpos may import beside Python's own: a closed list, because ROS has more names than one could list.
+# Modules that starpos may import besides Python's own: a closed list, because ROS has more names than one could list.
 FOREIGN = {
     "argcomplete",
     "astropy",
@@ -50,13 +50,13 @@ MOST_LINES = 450
 NO_BEGINNING = re.compile(
     r"(Of|The same|By|At which|As(?! many\b)|And|But|Also|In|With|Within|That|Those|Until|Under)\b"
 )
-# What a tool reads stands beside the code that it is about.
+# Directives of tools stand next to the code that they are about.
 FOR_TOOLS = re.compile(r"# *(noqa|type:|fmt:|pragma)")
 # What is no code in Cython. One expression: a comment may hold a quotation mark, and a string a hash.
 CYTHON = re.compile(
     r"""(?P<long>\"{3}.*?\"{3})|(?P<comment>\#[^\n]*)|(?P<short>"[^"\n]*"|'[^'\n]*')""", re.DOTALL
 )
-# A dataclass of so many is made by keyword, after three fields at most.
+# A dataclass of this number of fields is made by keyword, after three fields at most.
 KEYWORD_FIELDS = 6
 
 
@@ -98,7 +98,7 @@ class Module:
         yield from (node.name for node in self.tree.body if isinstance(node, ast.FunctionDef))
 
     def comments(self) -> Iterator[tuple[int, str, str]]:
-        """Each comment: its line, the code beside it, and itself."""
+        """Comments, each with its line and the code next to it."""
         for token in tokenize.generate_tokens(io.StringIO(self.text).readline):
             if token.type == tokenize.COMMENT:
                 yield token.start[0], token.line[: token.start[1]].strip(), token.string
@@ -123,11 +123,11 @@ class Compiled(Module):
                 yield line, said.strip('"').strip()
 
     def functions(self) -> Iterator[str]:
-        """The names of those of its functions that Python sees."""
+        """The names of its functions that Python sees."""
         yield from re.findall(r"(?m)^def (\w+)\(", self.code())
 
     def comments(self) -> Iterator[tuple[int, str, str]]:
-        """Each comment: its line, the code beside it, and itself."""
+        """Comments, each with its line and the code next to it."""
         yield from self.parts("comment")
 
     def imported(self) -> Iterator[tuple[int, str]]:
@@ -226,7 +226,7 @@ def cimports(files: list[Compiled]) -> Iterator[str]:
 
 
 def uncalled(house: list[Module]) -> Iterator[str]:
-    """Compiled modules that nothing in their own room calls; those of `_numeric` are there to be shared."""
+    """Compiled modules that nothing in their own room calls; the modules of `_numeric` are shared on purpose."""
     called = set()
     for module in house:
         if isinstance(module, Compiled):

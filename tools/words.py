@@ -6,6 +6,7 @@ names. `words.py --count` prints how often each pattern occurs. `make lint` runs
 """
 
 import ast
+import inspect
 import io
 import re
 import sys
@@ -21,21 +22,45 @@ READ = (
     "*.md",
     "docs/**/*.md",
     "test/*.md",
+    "test/*.py",
+    "starpos_*/test/*.py",
+    "src/*/test/**/*.py",
+    "tools/*.py",
+    "tools/[bfs]*/**/*.py",
     "starpos_*/*.md",
     "src/*/*.md",
     "starpos_interfaces/*/*.[ms][sr][gv]",
+    "src/starpos/starpos/*.py",
     "src/starpos/starpos/averaging/*.py",
     "src/starpos/starpos/calibration/*.py",
     "src/starpos/starpos/detection/*.py",
     "src/starpos/starpos/earth/*.py",
+    "src/starpos/starpos/fix/*.py",
+    "src/starpos/starpos/frames/*.py",
     "src/starpos/starpos/identification/*.py",
+    "src/starpos/starpos/instrument/*.py",
+    "src/starpos/starpos/messages/*.py",
     "src/starpos/starpos/navigation/*.py",
+    "src/starpos/starpos/night/*.py",
+    "src/starpos/starpos/parallel/*.py",
+    "src/starpos/starpos/recording/*.py",
+    "src/starpos/starpos/report/*.py",
+    "src/starpos/starpos/simulation/*.py",
+    "src/starpos/starpos/session/*.py",
+    "src/starpos/starpos/sky/*.py",
+    "src/starpos_bringup/starpos_bringup/**/*.py",
+    "src/starpos_common/starpos_common/*.py",
+    "src/starpos_dashboard/starpos_dashboard/*.py",
+    "src/starpos_testing/starpos_testing/**/*.py",
+    "starpos_camera/starpos_camera/**/*.py",
+    "starpos_inclinometer/starpos_inclinometer/**/*.py",
+    "starpos_solver/starpos_solver/*.py",
 )
 MAX_WORDS = 40
 # Name of a pattern: its expression, and what to write instead.
 RIDDLES = {
     "that of": (r"\bth(?:at|ose) of\b", "repeat the noun"),
-    "is none": (r"\b(?:is|are|was|were) none\b", "say what is missing"),
+    "is none": (r"\b(?:is|are|was|were) (?-i:none)\b", "say what is missing"),
     "tells": (r"\b(?:tells?|told)\b", "determines, gives, says or shows"),
     "beside": (r"\bbeside\b", "next to, besides or compared with"),
     "so many": (r"\bso many\b", "give the number or name the quantity"),
@@ -76,7 +101,10 @@ LEFT_OUT = re.compile(
 QUOTED = re.compile(r"`[^`]*`|(?<=\])\([^)\s]*\)|<[^>\s]*>|\"[^\"]*\"|\w*_\w*")
 SENTENCE_END = re.compile(r"(?<=[.?!])[\"')*]*\s+(?=[^\w`]*[A-Z0-9`])")
 # Between paragraphs of a docstring, and before the description of an argument or a field.
-PARAGRAPH = re.compile(r"\n\s*\n|\n(?=[ \w,*]+(?:  |: ))|(?<=\S)  +(?=\S)")
+PARAGRAPH = re.compile(
+    r"\n\s*\n|\n(?=[ \w,*]+(?:  |: ))|(?<=\S)  +(?=\S)"
+    r"|(?<=\.)\s(?=[\w, ]+(?: \([^)]*\))?(?: in [\w.]+)?: )"
+)
 BLOCK = re.compile(r"\s*(?:[-*+] |\d+\. |#|\||>|: |```|$)")
 
 
@@ -121,7 +149,7 @@ def said(source: str) -> Iterator[tuple[int, str]]:
     for node in ast.walk(ast.parse(source)):
         match node:
             case ast.Expr(ast.Constant(str(text))):
-                for paragraph in PARAGRAPH.split(text):
+                for paragraph in PARAGRAPH.split(inspect.cleandoc(text)):
                     yield node.lineno, " ".join(paragraph.split())
     begun, last, gathered = 0, 0, ""
     for token in tokenize.generate_tokens(io.StringIO(source).readline):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Annotated image of the detector, made only while somebody subscribes, one frame at a time."""
+"""Annotated image of the detector, made only for subscribers, one frame at a time."""
 
 import math
 from dataclasses import dataclass
@@ -21,9 +21,9 @@ from starpos_common.troubles import Troubles
 from starpos_common.worker import Worker
 from starpos_interfaces.msg import Solution
 
-# A frame waits so long for its solution; then it is shown without one.
+# Time that a frame waits for its solution; then it is shown without one.
 PATIENCE_S = 2.0
-# Most letters of a text from outside.
+# Maximum length of a text from outside.
 NAME_LETTERS, SENTENCE_LETTERS = 24, 300
 
 
@@ -40,7 +40,7 @@ class Annotator:
     """Publishes sensor_msgs/Image on `~/image_annotated` for a node that detects stars.
 
     If there is a solver, the frame waits for its solver/solution. Frames that come meanwhile are left out, so that at
-    most one is kept, and none while nobody subscribes. The node calls `take` and `stop` in its executor.
+    most one is kept, and none without subscribers. The node calls `take` and `stop` in its executor.
     """
 
     def __init__(self, node: Node) -> None:
@@ -135,7 +135,7 @@ def _identified(message: Solution, count: int) -> Identified:
 
 
 def _remarks(message: Solution) -> list[str]:
-    """Write fix and heading, or why there are none."""
+    """Write fix and heading, or the reason why they are missing."""
     if message.status != Solution.OK:
         return [message.status_text[:SENTENCE_LETTERS]]
     north, east = message.latitude_geodetic, message.longitude_geodetic

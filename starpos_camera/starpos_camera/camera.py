@@ -41,7 +41,7 @@ from starpos_common.worker import Worker
 from starpos_interfaces.msg import Capture, Pulse
 from starpos_interfaces.srv import SetCapture
 
-# A trouble is shown so long; diagnostics come once a second.
+# Time for which a trouble is shown; diagnostics come once a second.
 SHOWN_S = 5.0
 # Frames (of 42 MB) that the middleware keeps for slow readers.
 IMAGE_DEPTH = 2
@@ -52,7 +52,7 @@ STAMP_SOURCES = ("unknown", "file", "driver", "command", "hardware", "simulated"
 class Taken:
     """A frame with its Capture, the intrinsics and the remark of its source, and how long it took.
 
-    image: its message, None while nobody subscribes.
+    image: its message, None without subscribers.
     """
 
     frame: Frame
@@ -68,7 +68,7 @@ class Taker(Protocol):
 
     @property
     def wanted(self) -> bool:
-        """Whether somebody listens to its results."""
+        """Whether its results have subscribers."""
 
     def submit(self, frame: Frame, header: Header) -> None:
         """Take a frame; returns at once."""
@@ -78,7 +78,7 @@ class CameraNode(Node):
     """Publishes sensor_msgs/Image, CameraInfo and starpos_interfaces/Capture; see README.md."""
 
     def __init__(self, **options: Any) -> None:
-        """Make the node; options: those of rclpy's Node (context, namespace, parameter_overrides ...)."""
+        """Make the node; options: as for rclpy's Node (context, namespace, parameter_overrides ...)."""
         super().__init__("camera", **options)
         self._values = declare(
             self, PARAMETERS, apply=self._apply, check=lambda values, _: _complaint(values)
@@ -166,7 +166,7 @@ class CameraNode(Node):
         if not self._worker.idle:
             self._skipped += 1
         elif self._source.waits_for_listener and not self._frames and not self._heard():
-            # What is lacking is said first, because a subscriber would not help.
+            # Missing parts are reported first, because a subscriber would not help.
             lack = self._source.lacking()
             waiting = f"waiting for a subscriber of {self._images.topic_name}{' or of the stars' * bool(self._takers)}."
             self._say(Level.WARN if lack else Level.OK, lack or waiting)
@@ -183,7 +183,7 @@ class CameraNode(Node):
             exposure, clock = self._source.capture(settings), None
         else:
             exposure = self._captured(settings)
-            # If the source states an error, the clock is that of another machine.
+            # If the source states an error, the clock is another machine's.
             ours = exposure.stamp_source in OF_SYSTEM_CLOCK and not exposure.frame.clock_stddev_s
             clock = system_clock.read() if ours else None
         frame = replace(exposure.frame, clock_stddev_s=clock.stddev_s) if clock else exposure.frame
@@ -230,7 +230,7 @@ class CameraNode(Node):
                 self._failed += 1
                 self._say(Level.ERROR, str(result))
             elif isinstance(result, Exception):
-                # A defect costs this frame only; the node goes on.
+                # A defect loses only this frame; the node goes on.
                 self._failed += 1
                 kind = type(result).__name__
                 self._say(Level.ERROR, f"a frame was given up ({kind}: {result}); keep it and report this.")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Parameters of the node `camera`; those of a source are in the module of the source."""
+"""Parameters of the node `camera`; a source's own are in its module."""
 
 import math
 
@@ -51,8 +51,8 @@ COMMON = (
     Parameter(
         "command_lag",
         0.0,
-        "From the command to the start of the exposure, of cameras that do not tell when it began. Longitudes come out "
-        "15 arcsec too far east for each second it is set too small: so it is found at a known place.",
+        "From the command to the start of the exposure, for cameras that do not report when it began. Each "
+        "second it is set too small moves longitudes 15 arcsec east, which a known place shows.",
         unit="s",
         minimum=-10.0,
         maximum=60.0,
@@ -60,7 +60,8 @@ COMMON = (
     Parameter(
         "command_lag_stddev",
         0.3,
-        "How far that lag may be off; 0.1 s is 46 m at the equator. The default is that of a camera nobody has measured.",
+        "How far that lag may be off; 0.1 s is 46 m at the equator. The default is for a camera that was "
+        "not measured.",
         unit="s",
         minimum=0.0,
         maximum=60.0,
@@ -68,8 +69,9 @@ COMMON = (
     Parameter(
         "driver_lag",
         0.0,
-        "From the start of an exposure that a driver tells (INDI, Alpaca) to that of the light: a driver tells when it "
-        "told the camera. A single-lens reflex takes tenths of a second more. Of the same effect as command_lag.",
+        "From the start of an exposure that a driver reports (INDI, Alpaca) to the opening of the shutter: "
+        "a driver reports when it sent the command. A single-lens reflex takes tenths of a second more. "
+        "Same effect as command_lag.",
         unit="s",
         minimum=-10.0,
         maximum=60.0,
@@ -77,7 +79,8 @@ COMMON = (
     Parameter(
         "driver_lag_stddev",
         0.05,
-        "How far that lag may be off; 0.05 s is 23 m at the equator. Too small makes fixes claim too much.",
+        "How far that lag may be off; 0.05 s is 23 m at the equator. If too small, fixes claim errors that "
+        "are too small.",
         unit="s",
         minimum=0.0,
         maximum=60.0,

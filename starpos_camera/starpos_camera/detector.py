@@ -24,7 +24,7 @@ from starpos.frames.frame import Frame
 from starpos.messages.camera import message_to_frame, message_to_picture
 from starpos.messages.exposures import CAPTURES_KEPT, ExposureFacts, check_stamp
 from starpos.messages.stamp import stamp_to_unix
-from starpos.session.backlog import FRESH_S
+from starpos.session.backlog import MAX_LATE_S
 from starpos.session.detector_parameters import PARAMETERS, detection_settings
 from starpos.session.pace import Pace
 from starpos.session.trails import Trails
@@ -42,21 +42,21 @@ from starpos_interfaces.msg import Capture, StarArray
 
 # seconds of an IMU at 400 Hz
 IMU_QUEUE = 4000
-# An image waits so long for its Capture, which comes on another topic: where a busy machine lost it, the middleware
+# Time that an image waits for its Capture, which comes on another topic: if a busy machine lost it, the middleware
 # repeats it when the next one is sent, or after 3 s.
 CAPTURE_PATIENCE_S = 3.5
-# So long where no publisher of Captures is known yet: there may be none.
+# The same time while no publisher of Captures is known yet: there may not be one.
 DISCOVERY_S = 0.5
-# Frames that wait at most, of 42 MB each.
-MOST_HELD = 3
+# Maximum number of waiting frames, of 42 MB each.
+MAX_HELD = 3
 LOOK_S = 0.1
-# Silence is reported after so long, and after three times the interval between the last two frames.
+# Silence is reported after this time, and after three times the interval between the last two frames.
 MIN_SILENCE_S = 5.0
 
 
 @dataclass(frozen=True, eq=False)
 class Job:
-    """What makes a frame, which may take long, and the header of its stars."""
+    """A function that makes a frame, which may take long, and the header of its stars."""
 
     frame: Callable[[], Frame]
     header: Header
@@ -77,7 +77,7 @@ class DetectorNode(Node):
     """Publishes starpos_interfaces/StarArray on `stars`, and frames with marks on `~/image_annotated`; see README.md."""
 
     def __init__(self, **options: Any) -> None:
-        """Make the node; options: those of rclpy's Node (context, namespace, parameter_overrides ...)."""
+        """Make the node; options: as for rclpy's Node (context, namespace, parameter_overrides ...)."""
         super().__init__("detector", **options)
         self._values = declare(self, PARAMETERS, apply=self._apply)
         self._settings = detection_settings(self._values)
@@ -137,7 +137,7 @@ class DetectorNode(Node):
         self._topics.listen(taker, both=self._replayed is not None)
 
     def _forget(self) -> None:
-        """Forget what Captures have told: a replay begins."""
+        """Forget all Captures: a replay begins."""
         self._exposures = ExposureFacts(self._values)
 
     def destroy_node(self) -> None:
@@ -147,7 +147,7 @@ class DetectorNode(Node):
 
     @property
     def wanted(self) -> bool:
-        """Whether somebody subscribes to the stars."""
+        """Whether the stars have subscribers."""
         return self._publisher.get_subscription_count() > 0
 
     def submit(self, frame: Frame, header: Header) -> None:
@@ -169,7 +169,7 @@ class DetectorNode(Node):
             self._drop()
 
     def _drop(self, frames: int = 1) -> None:
-        """Note frames that are lost because others were there."""
+        """Note frames that were replaced by others."""
         self._pace.drop(time.monotonic(), frames)
 
     def _on_imu(self, message: Imu) -> None:
@@ -244,20 +244,20 @@ class DetectorNode(Node):
 
     @property
     def _too_many(self) -> bool:
-        """Whether the frames that are held would be worked on too late."""
+        """Whether the held frames would be searched too late."""
         each_s = self._last.seconds if self._last else math.inf
-        return len(self._held) > MOST_HELD or len(self._held) * each_s > FRESH_S
+        return len(self._held) > MAX_HELD or len(self._held) * each_s > MAX_LATE_S
 
     def _ready(self, k: int) -> bool:
-        """Whether the k-th frame that is held need not wait for its Capture any more."""
+        """Whether the k-th held frame need not wait for its Capture any more."""
         if k >= len(self._held):
             return False
-        # of one sender they come in order: if that of a later frame is here, its own is lost
+        # a sender's Captures come in order: if a later frame's is here, its own is lost
         come = any(self._exposures.has(image.header) for image, _ in itertools.islice(self._held, k, None))
-        return come or len(self._held) > MOST_HELD or self._now_s() >= self._held[k][1]
+        return come or len(self._held) > MAX_HELD or self._now_s() >= self._held[k][1]
 
     def _offer_image(self, message: Image | CompressedImage) -> None:
-        """Have an image worked on, with what is known of its exposure."""
+        """Submit an image, with the known facts of its exposure."""
         read = message_to_frame if isinstance(message, Image) else message_to_picture
         try:
             mid_ns, add = self._exposures.of(message.header)
@@ -301,7 +301,7 @@ class DetectorNode(Node):
             elif isinstance(result, StarposError):
                 self._complain(str(result))
             else:
-                # A defect costs this frame only; the node goes on.
+                # A defect loses only this frame; the node goes on.
                 kind = type(result).__name__
                 self._complain(f"a frame was given up ({kind}: {result}); keep it and report this.")
         self._go_on()
@@ -320,7 +320,7 @@ class DetectorNode(Node):
         self._troubles.wrong("frames", sentence)
 
     def _unsaid(self) -> str:
-        """Sentence on what the user has to state of the camera; '' if there is nothing."""
+        """Sentence on the parameters to state of the camera; '' if there is nothing."""
         unsaid = self._exposures.unsaid if self._topics.where and not self._captures_come() else ""
         if unsaid:
             self._troubles.wrong("stamps", unsaid)

@@ -49,7 +49,7 @@ class FrameTopics:
         return {RAW: self._take_raw, self.compressed_topic: self._take_compressed}
 
     def listen(self, taker: Callable[[str], Take], both: bool) -> None:
-        """Subscribe; taker gives the callback of a topic, which calls that of `takes` when a message has its turn.
+        """Subscribe; taker gives the callback of a topic, which calls the one in `takes` when a message has its turn.
 
         both: hear both topics from the start, as in a replay, where which of them sends shows only message by message.
         """
@@ -66,7 +66,7 @@ class FrameTopics:
         return f" on {self._raw.topic}" if self._raw else ""
 
     def unheard(self) -> str:
-        """Sentence on publishers that cannot be heard, and why; '' if there are none."""
+        """Sentence on publishers that cannot be heard, and why; '' without any."""
         heard = [s for s in (self._raw, self._compressed) if s is not None]
         return next(filter(None, (s.unheard() for s in heard)), "")
 

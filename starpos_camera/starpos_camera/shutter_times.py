@@ -15,7 +15,7 @@ from starpos_interfaces.msg import Capture, Pulse
 
 # How long after a frame its pulse may still be on the serial line.
 PATIENCE_S = 0.2
-# A frame whose own pulse is missing has the lag of the others, when that is known from so many.
+# A frame whose own pulse is missing has the lag of the others, if at least this number of frames has shown it.
 ENOUGH_FOR_LAG = 10
 # A receiver's second is UTC within this.
 RECEIVER_STDDEV_S = 1e-5
@@ -51,7 +51,7 @@ PARAMETERS = (
 
 
 class ShutterTimes:
-    """Replaces the times of a source's frames by those of their pulses.
+    """Replaces the times of a source's frames by the times of their pulses.
 
     `hear` is called by the executor's thread, `timed` by the one that captures.
     """
@@ -87,7 +87,7 @@ class ShutterTimes:
     def timed(self, exposure: CapturedFrame, since_s: float, until_s: float) -> CapturedFrame:
         """Date a frame that was captured between two times (Unix s) by its pulse, or by the lag of other frames' ones.
 
-        A frame with neither, or of a source that tells better times itself, is returned as it is.
+        A frame with neither, or of a source that gives better times itself, is returned unchanged.
         """
         frame, lag = exposure.frame, LAGS.get(exposure.stamp_source)
         if lag is None or not frame.exposure_s or frame.mid_unix_s is None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Alpaca servers for tests: the simulators of PyPI's alpaca-simulators, and one that says whatever it is told to."""
+"""Alpaca servers for tests: the simulators of PyPI's alpaca-simulators, and one that says whatever a test asks for."""
 
 import json
 import socket

@@ -80,7 +80,7 @@ class IndiServer:
 
 
 class OtherClient:
-    """Another client of the server: tells a device, and waits for what the device says."""
+    """Another client of the server: commands a device, and waits for its reply."""
 
     def __init__(self, server):
         self._socket = socket.create_connection(("127.0.0.1", server.port), WAIT_S)

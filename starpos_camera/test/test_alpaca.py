@@ -216,9 +216,9 @@ GOOD = image_bytes(ROWS.astype(np.uint16), 8)
         (GOOD[:-1], "ended after 6143 of 6144 bytes"),
         (GOOD[:44], "ended after 0 of 6144 bytes"),
         (GOOD + b"x", "more than its 6144 bytes"),
-        (image_bytes(ROWS, 8, version=2), "none of version 1"),
-        (image_bytes(ROWS, 8, begin=-1), "none of version 1"),
-        (image_bytes(ROWS, 8, begin=2**31 - 1), "none of version 1"),
+        (image_bytes(ROWS, 8, version=2), "not of version 1"),
+        (image_bytes(ROWS, 8, begin=-1), "not of version 1"),
+        (image_bytes(ROWS, 8, begin=2**31 - 1), "not of version 1"),
         (image_bytes(ROWS, 8, columns=2**31 - 1, rows=2**31 - 1), "no other program may"),
         (image_bytes(ROWS, 8, rank=3, planes=3), "in 3 dimensions"),
         (image_bytes(ROWS, 3), "type 3"),
@@ -246,8 +246,8 @@ def test_pictures_as_json_are_refused(liar):
 @pytest.mark.parametrize(
     ("member", "value", "sentence"),
     [
-        ("cameraxsize", -5, "sensor of -5 x 48 px is none"),
-        ("cameraxsize", 10**9, "is none"),
+        ("cameraxsize", -5, "sensor of -5 x 48 px is not valid"),
+        ("cameraxsize", 10**9, "is not valid"),
         ("cameraxsize", "many", "(ValueError)"),
         ("cameraysize", None, "(TypeError)"),
         ("camerastate", 77, "77"),

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The detector's annotated image: for whom, of what, and what it costs where nobody looks."""
+"""The detector's annotated image: for whom, of what, and its cost without subscribers."""
 
 import gc
 import weakref
@@ -189,7 +189,7 @@ def test_the_solution_of_the_frame_names_its_stars(viewer):
     assert has(plain[:480], stars[row], DETECTED)
     rows, columns = np.nonzero((named[:480] != plain[:480]).any(2))
     away = np.hypot(columns - stars[row].x, rows - stars[row].y)
-    # A text beside it, and nothing elsewhere.
+    # A text next to it, and nothing elsewhere.
     assert 30 < away.max() < 150
 
 

@@ -49,7 +49,7 @@ def test_what_a_cameras_own_clock_is_off_goes_with_its_frames(start, listener, t
     listener.wait(lambda: captures)
     told = captures[0]
     assert (told.stamp_source, told.clock_stddev, told.exposure) == (Capture.EXIF, 60.0, 0.5)
-    # whole seconds, and what nobody knows of the shutter
+    # whole seconds, and the unknown shutter
     assert told.stamp_stddev == pytest.approx(math.hypot(1 / math.sqrt(12), UNKNOWN_LATENCY_S), abs=1e-4)
     assert stamp_to_unix(told.header.stamp) == pytest.approx(1793642400.0 - 3600 + 0.75)
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The node `detector` with `gyro`: a star is found by the trail that the readings tell, and not without."""
+"""The node `detector` with `gyro`: a star is found by the trail from the readings, and not without."""
 
 from dataclasses import replace
 

@@ -25,7 +25,7 @@ def qos(reliability):
 
 
 class Graph:
-    """A detector that nobody has told anything, and the stars it sends."""
+    """A detector with default parameters, and the stars it sends."""
 
     def __init__(self):
         self.listener = Listener()
@@ -117,7 +117,7 @@ def test_best_effort_is_heard_and_the_raw_frames_are_preferred(best_effort, grap
     colours = cv2.cvtColor(pixels, cv2.COLOR_GRAY2RGBA)
     got = graph.shown(best_effort, raw(colours, "rgba8"))
     assert len(got.stars) >= len(of_compressed.stars)
-    # and nobody asks the driver to compress any more
+    # and the driver is not asked to compress any more
     node = graph.listener.node
     graph.listener.wait(lambda: not node.count_subscribers(f"/{COMPRESSED}"))
 

@@ -21,7 +21,7 @@ PIXELS = np.zeros((16, 16), np.uint8)
 
 
 class Reflex:
-    """A camera with a lag of 0.3 s that nobody has stated; the parameters say 0.1 s."""
+    """A camera with an unstated lag of 0.3 s; the parameters say 0.1 s."""
 
     def __init__(self, patience_s=0.0, **values):
         self.times = ShutterTimes(VALUES | values, patience_s)
@@ -61,7 +61,7 @@ def test_a_frame_has_the_time_of_its_pulse_and_the_cameras_lag_is_measured(sourc
     for got, mid_s in results[5:]:
         assert got.stamp_source == Capture.HARDWARE and not got.remark
         assert got.frame.mid_unix_s == pytest.approx(mid_s, abs=1e-5)
-        # the receiver's second, and the travel of a curtain that nobody has measured
+        # the receiver's second, and the unmeasured travel of a curtain
         assert got.frame.clock_stddev_s == 1e-5 and got.frame.stamp_stddev_s == pytest.approx(0.003, abs=1e-5)
     shown = reflex.times.values()
     assert shown["frames with a pulse"] == 15 and shown["measured lag"].startswith(("0.29", "0.30"))

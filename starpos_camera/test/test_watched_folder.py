@@ -27,7 +27,7 @@ OK, ERROR = 0, 2
 
 
 class Clock:
-    """Seconds that pass when they are told to."""
+    """Seconds that pass on command."""
 
     def __init__(self):
         self.now = 1000.0
@@ -44,7 +44,7 @@ class Watch:
         self.folder = WatchedFolder(path, lambda name: name.endswith(".fits"), REST_S, self.clock)
 
     def look(self, after_s=0.0):
-        """The name of the file that is there after so many seconds, or None; it is not done with."""
+        """The name of the file that is there after some seconds, or None; it stays in use."""
         self.clock.now += after_s
         found = self.folder.next()
         return found and found[0].name
@@ -69,7 +69,7 @@ def watch(tmp_path):
 
 
 def put(path, age_s=0.0, content=b"x"):
-    """A file as of so many seconds ago."""
+    """A file as of some seconds ago."""
     path.write_bytes(content)
     moment = time.time() - age_s
     os.utime(path, (moment, moment))
@@ -263,7 +263,7 @@ def make(path, **changes):
 
 
 def until_something(source):
-    """The next exposure, or the error that is none of waiting."""
+    """The next exposure, or the error other than waiting."""
     end = time.monotonic() + WAIT_S
     while time.monotonic() < end:
         try:
@@ -298,7 +298,7 @@ def test_frames_are_taken_as_they_come_and_a_broken_one_is_said_once(folder):
 def test_patterns_hidden_files_and_folders_that_are_not_there(folder):
     source = make(folder / "in" / "b*.fits", files__rest=0.01)
     assert "no such folder" in source.lacking()
-    with pytest.raises(CaptureError, match="cannot be looked into"):
+    with pytest.raises(CaptureError, match="cannot be listed"):
         source.capture(SETTINGS)
     (folder / "in").mkdir()
     assert source.lacking() is None
@@ -326,7 +326,7 @@ def small_disk(tmp_path):
 
 
 def copy(source: Path, target: Path, most: int | None) -> int:
-    """Copy in a process of its own, with files of at most so many bytes; its exit status."""
+    """Copy in a process of its own, with files of limited size; its exit status."""
 
     def limit():
         if most is not None:

@@ -16,24 +16,24 @@ MIN_SPAN_S = 10.0
 REFIT_S = 1.0
 # More than the error of an RC oscillator, let alone of a crystal.
 MAX_RATE_ERROR = 0.05
-# With a sample so far ahead of the envelope the MCU's clock has jumped.
+# If a sample is further ahead of the envelope, the MCU's clock has jumped.
 EARLY_S = 0.2
-# A sample so far behind comes from a backlog, or the MCU's clock stood still.
+# A sample further behind comes from a backlog, or the MCU's clock stood still.
 LATE_S = 2.0
-# Samples that are read so late, and fast, come from a backlog.
+# Samples that are read later than this, and fast, come from a backlog.
 BACKLOG_S = 0.25
 # Samples that come closer than this share of their spacing are read from a backlog.
 FASTEST_PACE = 0.5
-# A new relation of the clocks is believed when it has held for so long, to BACKLOG_S: that of a backlog changes faster.
+# Time that a new relation of the clocks must hold, to BACKLOG_S, before it is used: in a backlog it changes faster.
 HELD_S = 1.0
-# On a busy machine a line may be late by so much and still count as coming at its pace.
+# Delay of a line on a busy machine that still counts as coming at its pace.
 JITTER_S = 0.05
-# Lines come as they are sent again when so many in a row take this share of their usual time; a backlog comes faster.
+# Lines come at their pace again after this number in a row at this share of their usual interval; a backlog comes faster.
 PACED, SLOWEST_BACKLOG = 4, 0.75
 # The time at which a line is due runs a little slow, so that it follows the earliest lines.
 DUE_CREEP = 1.05
 MAX_POINTS = 4096
-# The usual time between lines is the mean of so many.
+# Number of lines whose mean interval is the usual one.
 USUAL_OF = 21
 
 
@@ -69,7 +69,7 @@ class ArrivalFilter:
     def arrival_s(self, milliseconds: int, now_s: float) -> float | None:
         """When a line with this device time would come at the earliest, on the monotonic clock.
 
-        None while the clocks' relation is not known, and for a time that cannot be that of a line which came at now_s.
+        None while the clocks' relation is not known, and for a time impossible for a line that came at now_s.
         """
         ahead_s = ((milliseconds - self._last_ms + (1 << 31)) % (1 << 32) - (1 << 31)) * 1e-3
         if not self._live or not self._points or abs(ahead_s) > LATE_S:
@@ -79,7 +79,7 @@ class ArrivalFilter:
         return arrival_s if -LATE_S < arrival_s - now_s < LATE_S else None
 
     def restart(self) -> None:
-        """Forget the device's clock: it was reset, or may have been reset while nobody listened."""
+        """Forget the device's clock: it was reset, or may have been reset unnoticed."""
         self._points.clear()
 
     def delay(self, milliseconds: int, arrival_s: float) -> float | None:
@@ -114,6 +114,9 @@ class ArrivalFilter:
         self._backlog = catching_up and (self._backlog or late > BACKLOG_S)
         if self._backlog:
             return max(late, 0.0)
+        if time - self._points[-1][0] > REFIT_S:
+            # The first samples after a gap may be late: an edge of the hull to one of them would show a wrong rate.
+            self._next_fit = time + REFIT_S
         self._keep(time, offset)
         if time >= self._next_fit:
             self._next_fit = time + REFIT_S

@@ -47,7 +47,7 @@ class Faults:
     drop: float = _fault("the line is lost")
     truncate: float = _fault("the line ends early")
     double: float = _fault("the line comes twice")
-    flip: float = _fault("the bit is the other way round")
+    flip: float = _fault("the bit is flipped")
 
     def apply(self, line: bytes, rng: random.Random) -> bytes:
         """Return the bytes that arrive when a line is sent."""
@@ -137,7 +137,7 @@ class Mcu:
         return line
 
     def skip_to(self, now: float) -> None:
-        """Drop the lines that were due long before `now`: the host was asleep, or nobody ran this."""
+        """Drop the lines that were due long before `now`: the host was asleep, or this did not run."""
         if self.due < now - 1.0:
             missed = int((now - self.due) / self._period)
             self._sequence += missed
@@ -187,7 +187,7 @@ class Pty:
         self.fd, host = os.openpty()
         tty.setraw(host)
         self.path = os.ttyname(host)
-        # With the host's end closed here, poll tells whether anyone listens: a cable stores no bytes.
+        # With the host's end closed here, poll shows whether anyone listens: a cable stores no bytes.
         os.close(host)
         os.set_blocking(self.fd, False)
         if link:
@@ -208,13 +208,13 @@ class Pty:
         return not any(event & select.POLLHUP for _, event in poll.poll(0))
 
     def write(self, data: bytes) -> None:
-        """Send bytes; they are lost if nobody reads them."""
+        """Send bytes; without a reader they are lost."""
         if data and self.connected:
             with contextlib.suppress(BlockingIOError):
                 os.write(self.fd, data)
 
     def read(self) -> bytes:
-        """Return the bytes that the host has sent; empty if there are none, or no host."""
+        """Return the bytes that the host has sent; empty without any, or without a host."""
         try:
             return os.read(self.fd, 4096)
         except OSError:

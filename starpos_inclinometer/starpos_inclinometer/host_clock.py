@@ -32,7 +32,7 @@ class HostClock:
     """Reads both clocks at one moment and notices steps; one thread has to read it several times a second.
 
     now_ns: the host's clock.
-    simulated: whether the host's clock is that of a simulation; no steps are looked for then.
+    simulated: whether the host's clock is simulated; no steps are looked for then.
     monotonic_ns: the clock that is never set.
     """
 

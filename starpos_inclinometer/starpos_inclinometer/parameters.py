@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Parameters of the node `inclinometer`; those of a source are in the module of the source."""
+"""Parameters of the node `inclinometer`; a source's own are in its module."""
 
 from collections.abc import Mapping
 from typing import Any

@@ -7,7 +7,7 @@ import math
 SMOOTHING_S = 60.0
 # Step from one reading to the next possible one.
 STEP_C = 0.92
-# How fast the temperature may drift while nobody reads it.
+# How fast the temperature may drift while it is not read.
 AGEING_C_PER_S = 2.0 / 60
 # Without any reading the temperature may be anywhere from -40 to 125 deg C.
 UNKNOWN_STDDEV_C = 40.0
@@ -33,7 +33,7 @@ class Temperature:
         self._read_s = time_s
 
     def celsius(self, otherwise: float) -> float:
-        """The newest known temperature, or `otherwise` if there is none."""
+        """The newest known temperature, or `otherwise` without one."""
         return otherwise if math.isnan(self._value) else self._value
 
     @property

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The firmware on an emulated board (firmware/sim): built, started, told what to feel, and read."""
+"""The firmware on an emulated board (firmware/sim): built, started, given a tilt, and read."""
 
 import json
 import os
@@ -63,7 +63,7 @@ class Board:
         self._read = self._written = 0
 
     def tell(self, command) -> dict:
-        """What the board says of itself after the command; what it sends meanwhile is lost if nobody reads."""
+        """The board's identity after the command; what it sends meanwhile is lost without a reader."""
         print(command, file=self.process.stdin, flush=True)
         answer = self.process.stdout.readline()
         assert answer.startswith("{"), answer
@@ -102,7 +102,7 @@ class Board:
         return [self.continuity.follow(m) if isinstance(m, Sample) else m for m in messages]
 
     def close(self) -> str:
-        """End it; what the firmware did that the parts' data sheets forbid."""
+        """End it; return violations of the parts' data sheets by the firmware."""
         complaints = self.tell("state")["complaints"]
         self.process.terminate()
         _, error = self.process.communicate(timeout=WAIT_S)

@@ -121,7 +121,7 @@ def test_a_third_axis_and_angles_that_are_counted_to_360_deg():
     got = Feeder(THREE).send(*["330,45.5,229.95"] * 2)[-1]
     assert np.degrees([got.x, got.y, got.z]) == pytest.approx([-30, 45.5, -49.95])
     assert math.degrees(got.step) == pytest.approx(1.0)
-    # upside down, as the third axis tells
+    # upside down, as the third axis shows
     over = Feeder(THREE).send(*["170,0,-80"] * 2)[-1]
     assert np.degrees([over.x, over.y, over.z]) == pytest.approx([10, 0, -80])
     two = Feeder().send(*["359.5,0.5"] * 2)[-1]
@@ -264,7 +264,7 @@ def meter(tmp_path):
 
 
 def readings(path, enough, **parameters):
-    """At least so many of a source, and its health."""
+    """At least a number of readings of a source, and its health."""
     come = threading.Event()
     source = AsciiSource(Surroundings(None, HostClock(), come.set), values(port=path, **parameters))
     source.start()

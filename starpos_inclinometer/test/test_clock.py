@@ -37,6 +37,23 @@ def test_jitter_is_filtered_whatever_the_drift(drift_ppm):
     assert clock.rate_ppm == pytest.approx(-drift_ppm, abs=max(60, 0.011 * abs(drift_ppm)))
 
 
+@pytest.mark.parametrize("seed", range(0, 40, 4))
+def test_a_stall_on_a_busy_machine_does_not_spoil_the_rate(seed):
+    """The first samples after a stall come late: no rate is fitted to them."""
+    errors_s = []
+    for stall in range(seed, seed + 4):
+        rng = np.random.default_rng(stall)
+        before_s, stall_s = rng.uniform(4, 30), rng.uniform(0.5, 10)
+        true = 1000.0 + np.arange(0, before_s + stall_s + 5, 0.1)
+        # The busy reader reads at random times, and not at all while it stands still.
+        reads = 1000.0 + np.cumsum(rng.exponential(0.1, 2000))
+        reads = reads[(reads < 1000.0 + before_s) | (reads > 1000.0 + before_s + stall_s)]
+        arrivals = reads[np.searchsorted(reads, true)] + LATENCY_S
+        ms = np.round((true - 1000.0) * 1e3 * (1 - 3e-3)).astype(int)
+        errors_s.append(np.abs(stamps(ms, arrivals)[0] - true))
+    assert np.nanmax(np.concatenate(errors_s)) < 0.1
+
+
 def test_the_wrap_of_the_milliseconds_is_not_seen():
     true, ms, arrivals = jittery(np.random.default_rng(4), 1200, boot_ms=2**32 - 60_000)
     assert ms.max() > 2**32 - 200 and ms.min() < 200

@@ -23,7 +23,7 @@ def identity(rate_hz=10):
 
 
 class Line:
-    """A decoder fed line by line, 0.1 s apart unless told otherwise."""
+    """A decoder fed line by line, 0.1 s apart by default."""
 
     def __init__(self):
         self.decoder = McuDecoder(10)
@@ -166,7 +166,7 @@ def test_millisecond_wrap_is_no_reset_but_going_back_is(cable):
 
 
 def test_the_first_sample_of_a_new_connection_claims_no_continuity(cable):
-    """The MCU may have been reset while nobody listened, and by chance go on where it was."""
+    """The MCU may have been reset unnoticed, and by chance go on where it was."""
     got = cable.send(line(0), line(1), line(2)[:9])
     cable.decoder.resume()
     assert cable.send(line(2)) == []

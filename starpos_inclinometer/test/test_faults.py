@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What can go wrong between the sensor and the host, on the firmware in its emulated MCU: each with what came of it.
 
-Every test tells its `fault` and `result`, which the package's README has as a table.
+Every test records its `fault` and `result`, which the package's README has as a table.
 """
 
 import math

@@ -161,7 +161,7 @@ def test_slower_samples_are_averages(board):
 
 @pytest.mark.parametrize("rate_hz", [50, 10])
 def test_the_milliseconds_are_the_middle_of_both_axes(board, rate_hz):
-    """The tilt goes through the range at 10 deg/s: each angle tells the time it was taken at."""
+    """The tilt goes through the range at 10 deg/s: each angle shows the time it was taken at."""
     board.tell("noise 0")
     at_rate(board, rate_hz)
     begin = board.tell("tilt -10 10 10 -10")["ms"]

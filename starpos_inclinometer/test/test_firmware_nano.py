@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The firmware of the Arduino Nano as it is flashed, on an emulated ATmega328P with an SCL3300.
 
-The sensor's model is written after its data sheet and complains of what that forbids; each test ends by asking it.
+The sensor's model is written after its data sheet and reports violations of it; each test ends by asking it.
 """
 
 import math
@@ -99,7 +99,7 @@ def test_an_average_has_more_digits_than_the_sensor(board):
 
 @pytest.mark.parametrize("rate_hz", [1, 7, 50])
 def test_the_milliseconds_are_those_of_the_reading(board, rate_hz):
-    """The tilt goes through the range at 10 deg/s: each angle tells the time it was taken at."""
+    """The tilt goes through the range at 10 deg/s: each angle shows the time it was taken at."""
     board.tell("noise 0")
     identity = at_rate(board, rate_hz)
     begin = board.tell("tilt -30 30 10 -10")["ms"]

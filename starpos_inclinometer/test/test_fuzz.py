@@ -119,7 +119,7 @@ def test_a_million_random_bytes_alone_are_nothing():
 
 
 def grown(feed, rounds):
-    """Bytes by which Python's memory grows from one half of so many rounds to the other."""
+    """Bytes by which Python's memory grows from one half of a number of rounds to the other."""
     sizes = []
     feed(0)
     tracemalloc.start()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Accelerations to tilts: averages, their covariance, and everything an IMU may send that tells no tilt."""
+"""Accelerations to tilts: averages, their covariance, and everything an IMU may send that gives no tilt."""
 
 import math
 import signal

@@ -46,7 +46,7 @@ def test_a_contact_that_bounces_gives_its_first_edge_to_the_microsecond_and_its_
     assert [p.rising for p in got] == [False, True] * 40
     assert [p.number for p in got] == list(range(80))
     assert {p.input for p in got} == {Input.SHUTTER}
-    # all edges of the bounces, told with the edge that ends the pulse
+    # all edges of the bounces, reported with the edge that ends the pulse
     assert [p.bounces for p in got[1::2]] == [2 * (k % 4) for k in range(40)]
     errors = np.array([time_ms(p) for p in got]) - expected
     # the MCU's clock begins a little after its reset

@@ -112,7 +112,7 @@ def test_another_rate_is_another_noise():
 
 
 def played(rates_hz, at_once):
-    """(stamp less the truth of each sample, s), of a decoder and an emulated MCU that is told one rate after another.
+    """(stamp less the truth of each sample, s), of a decoder and an emulated MCU that is set to one rate after another.
 
     at_once: the samples are taken when all are there, not each as it comes.
     """
@@ -148,7 +148,7 @@ def test_a_change_of_rate_moves_no_stamp(at_once):
 
 
 def test_samples_before_the_microcontroller_has_said_its_rate_move_none_after():
-    """It had another rate from before, and nobody knows which sensor: they are left out, and what was lost is told."""
+    """It had another rate from before, and the sensor is unknown: they are left out, and the losses are counted."""
     tilts = McuTilts(VALUES)
     assert tilts.read([arrival(k, 0.02 * k + 0.014, lost=k == 0) for k in range(5)]) == []
     later = tilts.read([arrival(k, 0.02 * k + 0.014, identity(50)) for k in range(5, 20)])

@@ -25,7 +25,7 @@ from starpos_solver.node_log import NodeLog
 
 
 class NavigatorNode(Node):
-    """Publishes the place of a vehicle under way; see README.md.  What it decides is starpos.session's."""
+    """Publishes the place of a vehicle under way; see README.md.  Decisions are in starpos.session."""
 
     def __init__(self) -> None:
         super().__init__("navigator")

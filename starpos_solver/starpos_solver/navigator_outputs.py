@@ -30,7 +30,7 @@ class NavigatorPublishers:
         self.parameters_set()
 
     def parameters_set(self) -> None:
-        """Have the topics that the parameters want."""
+        """Create the topics that the parameters ask for."""
         self._transform.open(self._values["publish_tf"])
 
     def publish(self, output: Navigated) -> None:

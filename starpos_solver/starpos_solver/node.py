@@ -45,7 +45,7 @@ TICK = JumpThreshold(min_forward=Duration(nanoseconds=1), min_backward=Duration(
 
 
 class SolverNode(Node):
-    """Publishes the place and the attitude of the instrument; see README.md.  What it decides is starpos.session's."""
+    """Publishes the place and the attitude of the instrument; see README.md.  Decisions are in starpos.session."""
 
     def __init__(self) -> None:
         super().__init__("solver")
@@ -108,6 +108,7 @@ class SolverNode(Node):
         subscription(self, NavSatFix, gnss_teacher.TOPIC, take, 10, ReliabilityPolicy.BEST_EFFORT)
         self.create_service(Solve, "~/solve", self._on_solve)
         self.create_service(Trigger, "~/reset", self._on_reset)
+        self.create_service(Trigger, "~/deflection", self._on_deflection)
         self._calibration_services = CalibrationServices(self, self._session, self._settings)
         group = MutuallyExclusiveCallbackGroup()
         self._poll = self.create_timer(
@@ -125,6 +126,8 @@ class SolverNode(Node):
         }
         if session.gnss is not None:
             tasks["GNSS"] = session.gnss.report
+        if session.deflection.measures:
+            tasks["Deflection"] = session.deflection.report
         self._diagnostics = Diagnostics(self, tasks, self._values["frame_id"])
         self._update_transforms()
 
@@ -230,6 +233,16 @@ class SolverNode(Node):
         response.message = "tilts, frames and the place are forgotten; a calibration that was found is not"
         return response
 
+    def _on_deflection(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        if not self._session.deflection.measures:
+            response.message = (
+                "no deflection is measured: start the solver with deflection.wanted, a site and altitude"
+            )
+            return response
+        told = self._session.deflection.report()
+        response.success, response.message = told.level == Level.OK, told.message
+        return response
+
     # diagnostics -----------------------------------------------------------------------------------------------------
 
     def _report_solution(self) -> Diagnosis:
@@ -265,6 +278,6 @@ class SolverNode(Node):
 
 
 def _sent(info: Mapping[str, Any]) -> Sent:
-    """What the middleware tells of a message."""
+    """What the middleware reports of a message."""
     written_ns = info.get("source_timestamp")
     return Sent(info.get("publication_sequence_number"), written_ns * 1e-9 if written_ns else None)

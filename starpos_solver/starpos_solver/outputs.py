@@ -160,7 +160,7 @@ def solution(header: Header, answer: Solution, ground: Geodetic | None) -> msg.S
 
 
 def gnss_check(header: Header, compared: Compared) -> msg.GnssCheck:
-    """Make the message of what the stars say of a GNSS place."""
+    """Make the message of the comparison of a GNSS place with the stars."""
     check, place = compared.check, compared.place
     return msg.GnssCheck(
         header=header,
@@ -177,7 +177,7 @@ def gnss_check(header: Header, compared: Compared) -> msg.GnssCheck:
 
 
 def _add_heading(message: msg.Solution, at_place: AttitudeAtPlace) -> None:
-    """Put what a known place tells into the message of a frame without a place of its own."""
+    """Put the heading at a known place into the message of a frame without a place of its own."""
     _set_heading(message, at_place)
     _add_corrections(message, at_place)
     deflection = at_place.place.deflection

@@ -43,7 +43,7 @@ class SolutionPublishers:
         return self._fix, self._imu
 
     def publish(self, output: Output) -> None:
-        """Publish what a session made."""
+        """Publish a session's results."""
         header = self._header(output.stamp)
         if isinstance(output, Averaged):
             self._fix_averaged.publish(self._nav_sat_fix(header, output.ground))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The session's parameters as those of a node."""
+"""The session's parameters as a node's."""
 
 from collections.abc import Callable, Mapping
 

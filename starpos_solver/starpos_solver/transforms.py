@@ -32,7 +32,7 @@ class StaticTransforms:
         self._published: tuple[Transform, ...] = ()
 
     def update(self, wanted: bool, link: str, names: FrameNames, instrument: Instrument | None) -> None:
-        """Publish what is known, if it differs from before; take it back if it is not wanted.
+        """Publish the known transforms, if they differ from before; withdraw them if they are not wanted.
 
         link: name of the base link.  names: of the others.  instrument: that in use, None before there is one.
         """
@@ -79,7 +79,7 @@ class MovingTransform:
         self._publisher: Publisher | None = None
 
     def open(self, wanted: bool) -> None:
-        """Have the topic if it is wanted and can be told, before there is a pose; take it back if it is not."""
+        """Have the topic if it is wanted and possible, before there is a pose; remove it if not."""
         if not wanted:
             if self._publisher is not None:
                 self._node.destroy_publisher(self._publisher)

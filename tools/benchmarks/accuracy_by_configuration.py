@@ -3,7 +3,7 @@
 
 Whole nights are simulated and worked as a user would.  Place, date, pointing, mounting (A3), air, clock, Earth rotation
 and catalogue are drawn anew for each, and so are the errors of the sensor: noise, zero, drift, temperature, scale, cross
-axis, and what is new at each pose.  The instrument is told only how large these are.  Printed are the rms error of one
+axis, and what is new at each pose.  The instrument knows only their sizes.  Printed are the rms error of one
 axis against the astronomic truth, the error that the budget claims, and their ratio squared (1 where claims are true).
 """
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One table of what everything takes: CPU time here, beside other programs that do the same, and the ratio, in one run.
+"""One table of the cost of everything: CPU time here and of other programs that do the same, and the ratio, in one run.
 
 `make bench`, or `. tools/env.sh && python tools/benchmarks/bench.py [GROUP ...] [--quick] [--peers FOLDER]`.  Works are
 done by turns, so that what else the machine does falls on all of them: trust the ratio, not the time.
@@ -40,6 +40,7 @@ GROUPS = {
 # What `full` measures: the benchmark whose `run` it is.
 FULL = {
     "accuracy": "accuracy_by_configuration",
+    "deflection": "benchmark_deflection",
     "detection": "benchmark_detection",
     "heading": "benchmark_heading",
     "identification": "benchmark_identification",

@@ -2,7 +2,7 @@
 """CPU time and memory of detection against the frame's size and kind, the number of stars and the share of hot pixels.
 
 Medians of --repeat runs.  sep with windowed positions works on the same
-frames, by turns, if it can be imported (peers.py); those of a colour mosaic are made grey for it by OpenCV, in its time.
+frames, by turns, if it can be imported (peers.py); frames of a colour mosaic are made grey for it by OpenCV, in its time.
 Memory is the growth of the process at its peak, over the frame's own bytes (Linux only).
 """
 
@@ -193,7 +193,7 @@ def cases(programs: dict[str, Callable], which, repeat: int) -> Iterator[tuple[C
 
 
 def rows(options) -> Iterator[Row]:
-    """The rows of bench.py: on the frames of QUICK beside all peers, on the others beside sep."""
+    """The rows of bench.py: on the frames of QUICK next to all peers, on the others next to sep."""
     here = {name: work for name, work in peers.DETECTORS.items() if peers.is_here(name)}
     sep = {name: work for name, work in here.items() if name == "sep"}
     rest = [] if options.quick else [case for case in CASES if case not in QUICK]

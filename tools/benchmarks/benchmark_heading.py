@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How well a frame tells the heading at a known place, and whether its claim holds: table of docs/tutorials/azimuth.md.
+"""How well a frame determines the heading at a known place: table of docs/tutorials/azimuth.md.
 
 Each frame is of a night of its own.  Drawn are the place, its deflection of the vertical (6 arcsec a component, not
-told), the error of the place (GNSS, 2 m), date, pointing (70 deg high), air, clock (1 ms), the Earth's rotation, the
-errors of catalogue and stars.  The place is told on WGS 84.  Printed are the rms error of the heading, the rms claim, and
-the mean of the errors squared over the claims (1 where claims are true), from the north of WGS 84 and from that of the
-plumb line, arcsec.  Exits with status 1 where a limit does not hold.
+stated), and the error of the place (GNSS, 2 m). So are date, pointing (70 deg high), air, clock (1 ms), the Earth's
+rotation, the errors of catalogue and stars.  The place is stated on WGS 84.  Printed are the rms error of the heading,
+the rms claim, and the mean of the errors squared over the claims (1 where claims are true), from the north of WGS 84 and
+from the plumb line's, arcsec.  Exits with status 1 where a limit does not hold.
 """
 
 import sys
@@ -54,7 +54,7 @@ CASES = (
         0.02,
         20.0,
     ),
-    # frames as those of cedar-solve's examples: 30.9 arcsec a pixel, 20 to 45 stars that scatter by 0.15 px
+    # frames as in cedar-solve's examples: 30.9 arcsec a pixel, 20 to 45 stars that scatter by 0.15 px
     Case(
         "16 mm, 50 ms: a Raspberry Pi's HQ camera",
         Camera.from_focal(1280, 960, 6675.0),

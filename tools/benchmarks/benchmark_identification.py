@@ -3,8 +3,8 @@
 
 Peers run
 where they can be imported (peers.py): cedar-solve and tetra3rs with databases made here from this program's catalogue
-for this field of view (five minutes and one), kept in the cache; astrometry.net's engine with FOLDER's index files
-(its figures are those of these files: `build-astrometry-index -P 7 .. 10 -n 30` of a V < 9.5 list finds 97 to 98 %).
+for this field of view (five minutes and one), kept in the cache. So does astrometry.net's engine with FOLDER's index
+files (its figures depend on these files: `build-astrometry-index -P 7 .. 10 -n 30` of a V < 9.5 list finds 97 to 98 %).
 Every program gets the focal length to 3 %, and the stars in order of brightness; all programs get each field.
 """
 
@@ -228,7 +228,7 @@ def cost(tally: Tally) -> Cost:
 
 
 def rows(options) -> Iterator[Row]:
-    """The rows of bench.py: fields as the paper has them and realistic ones beside peers, harder ones alone."""
+    """The rows of bench.py: fields as the paper has them and realistic ones next to peers, harder ones alone."""
     stars, number, seed = catalogue.load_catalogue(), options.fields, 1
     answers = answers_of(stars, options)
     alone = {"starpos": answers["starpos"]}
@@ -263,7 +263,7 @@ def rows(options) -> Iterator[Row]:
 
 
 def joined(tallies: list[Tally]) -> Tally:
-    """All their answers as those of one."""
+    """All their answers combined into one."""
     whole = Tally()
     for tally in tallies:
         whole.correct, whole.wrong = whole.correct + tally.correct, whole.wrong + tally.wrong

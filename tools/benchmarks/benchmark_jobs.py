@@ -2,8 +2,8 @@
 """Comparison of `starpos solve --jobs N` with --jobs 1, on simulated frames of the paper's size and on star lists.
 
 Whole commands are timed, with start and end of
-the processes, 1 and N by turns; the best round counts, because other work on the machine only slows.  The CPU time of all
-processes shows what is possible on a machine that always has other work.  The answers are compared byte by byte.
+the processes, 1 and N by turns; the best round counts, because other work on the machine only slows.  The CPU time of
+all processes shows the possible speed on a machine that always has other work.  The answers are compared byte by byte.
 """
 
 import resource
@@ -37,7 +37,7 @@ def timed(command: list[str]) -> tuple[np.ndarray, bytes]:
 
 
 def best_of(folder: Path, number: int, jobs: int, rounds: int) -> tuple[dict[int, np.ndarray], bool]:
-    """The least wall and CPU time (s) of a night on 1 and on so many processes, and whether the answers are the same."""
+    """The least wall and CPU time (s) of a night on 1 and on several processes, and whether the answers are the same."""
     some = sorted(str(p) for p in folder.iterdir() if p.stem.startswith(("frame", "stars")))
     given = [some[k % len(some)] for k in range(number)]
     command = ["solve", *given, "--tilt", str(folder / "tilt.csv"), *OPTICS, "--json", "--jobs"]
@@ -82,7 +82,7 @@ def overhead_ms(jobs: int, calls: int = 2000) -> tuple[float, float]:
 
 
 def simulated(folder: Path, number: int, *more: str) -> Path:
-    """Make a night of so many frames, AT_ONCE at most."""
+    """Make a night of a number of frames, AT_ONCE at most."""
     starpos(["simulate", str(folder), "-n", str(min(number, AT_ONCE)), *OPTICS, *more])
     return folder
 

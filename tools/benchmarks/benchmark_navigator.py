@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""CPU time of the node `navigator` by an IMU of so many Hz, in real time, with a frame and ten velocities a second.
+"""CPU time of the node `navigator` by the rate of the IMU, in real time, with a frame and ten velocities a second.
 
 The second half alone counts.  The voyage is a rover's of starpos_testing.voyages, that began before now.
 """
@@ -40,7 +40,7 @@ def rows(options) -> Iterator[Row]:
 
 
 def measured(rate_hz: float, seconds: float, outputs_hz: float) -> tuple[float, str]:
-    """Start the node and play a rover's voyage of so many seconds; the share of a core and what it refused."""
+    """Start the node and play a rover's voyage of a length in s; the share of a core and what it refused."""
     events = messages(made("rover", seconds, 1, rate_hz=rate_hz))
     take_domain()
     with tempfile.TemporaryDirectory() as folder:

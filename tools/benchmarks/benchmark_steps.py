@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """CPU time of the steps around detection and identification: a message, a fix, an average, a new field, a start.
 
-Where no program of others does the same step, it stands beside a known piece of work
+Where no program of others does the same step, it stands next to a known piece of work
 that it cannot do without, or that is as much: a copy of the frame, astropy's places of the same stars, Python's start.
 """
 
@@ -134,7 +134,7 @@ def averages(options) -> Iterator[Row]:
 
 
 def messages(options) -> Iterator[Row]:
-    """A frame of 42 MB into a message; without ROS there is none."""
+    """A frame of 42 MB into a message; left out without ROS."""
     if importlib.util.find_spec("sensor_msgs") is None:
         print(
             "a frame into a message: skipped, ROS is not here (make build, . tools/env.sh)", file=sys.stderr
@@ -150,7 +150,7 @@ def messages(options) -> Iterator[Row]:
 
 
 def new_field(options) -> Iterator[Row]:
-    """The triangles of a field that was never used, beside a sort of as many numbers."""
+    """The triangles of a field that was never used, next to a sort of as many numbers."""
     catalogue, half = load_catalogue(), Shot().scene.camera.half_diagonal_rad
     made: list = []
     ms = spent_ms(lambda: made.append(triangles.build(catalogue, half)))

@@ -80,7 +80,7 @@ def scene_of(size):
 
 
 def draw(scene, begin_s: float, frames: int, rate_hz: float) -> Iterator[tuple[float, bytearray]]:
-    """The middle of each exposure, and its image as DDS carries it."""
+    """Middles of exposures with their images as DDS carries them."""
     import numpy as np
     from rclpy.serialization import serialize_message
 

@@ -32,7 +32,7 @@ MOST = 1e-5
 
 
 def counted(drive: GnssDrive, frames: int, rng: np.random.Generator) -> Counter:
-    """Frames by status, and alarms, of so many frames."""
+    """Frames by status, and alarms."""
     number: Counter = Counter()
     while number["frames"] < frames:
         watch, before = GnssWatch(drive.instrument, Deflection(stddev_arcsec=drive.deflection_arcsec)), ""

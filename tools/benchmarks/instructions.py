@@ -30,8 +30,9 @@ FRAMES = {
     "5 Mpx (21 binned 2 x 2)": ((2808, 1872), 315),
     "2 Mpx": (SIZES[2], 30),
 }
-# What a node does with a frame beside detection, or without it, in million instructions a megapixel. It is not counted,
-# but CPU time of the nodes in docs/evidence/speed.md, less that of detection, at 7.4 instructions a ns as detection has.
+# A node's work on a frame besides detection, or without it, in million instructions a megapixel. It is not counted, but
+# derived from the CPU time of the nodes in docs/evidence/speed.md, less detection's, at 7.4 instructions a ns as
+# detection has.
 NODES = {
     "node `camera_detector`": (True, 30),
     "node `detector` beside `camera`": (True, 35),

@@ -33,7 +33,7 @@ SETTLED = 3
 
 @dataclass(frozen=True)
 class Row:
-    """A measurement; target: for the median, None if there is none."""
+    """A measurement; target: for the median, None without one."""
 
     what: str
     values: list[float]
@@ -254,7 +254,7 @@ def rows(options) -> Iterator[table.Row]:
 
 
 def choose(profile: str) -> None:
-    """Set the Fast DDS profiles of all nodes; '' is none, even if the shell has some."""
+    """Set the Fast DDS profiles of all nodes; '' means without, even if the shell has some."""
     if profile:
         os.environ[PROFILES] = profile
     else:

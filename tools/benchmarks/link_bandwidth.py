@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Network load between the mount's computer and the robot's: two hosts of Linux namespaces, full frames.
 
-As root, with iproute2 and /dev/net/tun.  Counts the bytes of Ethernet in both directions, with those of DDS.  Detection
+As root, with iproute2 and /dev/net/tun.  Counts the bytes of Ethernet in both directions, including DDS's own.  Detection
 runs on the mount, so only stars and tilts cross.
 """
 

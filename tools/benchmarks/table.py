@@ -50,7 +50,7 @@ class Row:
 
 
 def digits(value: float, number: int) -> str:
-    """The value to so many digits, never as a power of ten."""
+    """The value to a number of digits, never as a power of ten."""
     if value == 0 or not math.isfinite(value):
         return f"{value:g}"
     return f"{value:.{max(0, number - 1 - math.floor(math.log10(abs(value))))}f}"

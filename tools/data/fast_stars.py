@@ -22,7 +22,7 @@ from starpos.units import ARCSEC
 # hhmmss.ss, +-ddmmss.s at J2000, motions in mas/yr
 ROW = re.compile(r"(\d\d)(\d\d)(\d\d\.\d\d) ([+-])(\d\d)(\d\d)(\d\d\.\d) ([+-]\d{6}\.\d)([+-]\d{6}\.\d)")
 OBSERVED = 1991.4
-# a star so near is that of Hipparcos; one a little further goes with it
+# a star this near is Hipparcos's; one a little further goes with it
 SAME_ARCSEC, TOGETHER_ARCSEC = 3.0, 8.0
 BRIGHTER = 11.0
 EDGES = (-2, 3, 4, 5, 6, 7, 8, 9)

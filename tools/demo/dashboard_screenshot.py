@@ -77,7 +77,7 @@ def browser(size: tuple[int, int]):
 
 
 def photograph(url: str, path: Path, fixes: int = FIXES, size: tuple[int, int] = SIZE) -> None:
-    """Write a PNG of the whole page once it shows so many fixes and a frame; ScreenshotError if it never does."""
+    """Write a PNG of the whole page once it shows a number of fixes and a frame; ScreenshotError if it never does."""
     from selenium.common.exceptions import WebDriverException
 
     with browser(size) as driver:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The whole instrument under a simulated sky, live: the four installed nodes, an emulated inclinometer on a pty.
 
-The place is drawn at random; nothing tells it to the solver.  Exit status 0 if the truth lies within 4 sigma and no
+The place is drawn at random and not given to the solver.  Exit status 0 if the truth lies within 4 sigma and no
 node took more memory than it may.  All of it runs in a ROS domain of its own: no other graph hears it.  The dashboard
 shows it meanwhile, and with --stay goes on until Ctrl-C.
 """
@@ -83,7 +83,7 @@ def start(processes: Processes, place: Place, seed: int, port: Path):
 
 
 def picture(watcher: PictureWatcher, errors: np.ndarray, covariance: np.ndarray, path: Path) -> bool:
-    """Draw the fixes and the frame that was kept; return False if there is none, or if its stars were not heard."""
+    """Draw the fixes and the frame that was kept; return False without one, or if its stars were not heard."""
     from picture import draw
 
     from starpos.frames.annotate import Identified, annotate

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Run of the installed nodes for some frames at a place that they are not told, and comparison with it.
+"""Run of the installed nodes for some frames at a place unknown to them, and comparison with it.
 
 tools/demo/demo.py and tools/demo/emulated_instrument.py share this.
 """
@@ -73,7 +73,7 @@ class Processes:
         self.folder, self.running = folder, {}
 
     def start(self, name: str, command: list[str], **options) -> subprocess.Popen:
-        """Start a program; options: those of Popen."""
+        """Start a program; options: as for Popen."""
         with open(self.folder / f"{name}.log", "w") as log:
             options = {"stdout": log, "stderr": log, "start_new_session": True} | options
             self.running[name] = subprocess.Popen(command, **options)
@@ -166,7 +166,7 @@ class Watcher:
         print(_row(len(self.solutions), message, self.place, self.seconds[-1]), flush=True)
 
     def watch(self, frames: float, *processes: Processes, patience_s: float = PATIENCE_S) -> str | None:
-        """Wait until so many frames are solved; return a sentence if that will not happen."""
+        """Wait until a number of frames is solved; return a sentence if that will not happen."""
         end = time.monotonic() + patience_s
         while len(self.solutions) < frames:
             self.rclpy.spin_once(self.node, timeout_sec=0.2)
@@ -257,7 +257,7 @@ def trouble_of(watcher: Watcher, codes: dict, trouble: str | None) -> str | None
 def why_none(solutions) -> str:
     """Count the solutions without a fix by their status."""
     lost = [s for s in solutions if s.status != s.OK]
-    # the message's constants are those of its status
+    # the message's constants name its status
     constants = [(name, getattr(s, name)) for s in lost[:1] for name in dir(s) if name.isupper()]
     names = {number: name for name, number in constants if isinstance(number, int)}
     told = Counter(names[s.status].replace("_", " ").lower() for s in lost)

@@ -96,7 +96,7 @@ class Truth:
         east = math.radians((longitude - self.longitude + 180) % 360 - 180)
         north = math.radians(latitude - self.latitude)
         apart = np.array([east * prime * math.cos(math.radians(self.latitude)), north * meridian])
-        # NaN if the covariance is none, which counts as wrong.
+        # NaN if the covariance is invalid, which counts as wrong.
         sigmas = float(np.sqrt(apart @ np.linalg.solve(covariance_m2, apart)))
         return sigmas, f"{np.hypot(*apart):.0f} m, {math.sqrt(np.trace(covariance_m2) / 2):.0f} claimed"
 
@@ -211,7 +211,7 @@ class World:
                 break
 
     def spin(self, seconds: float):
-        """Spin for a while, for things that nobody waits for."""
+        """Spin for a while, for things without an event to wait for."""
         self.graph.comes(lambda: False, seconds)
 
     def good(self, sent: list | None = None) -> bool:

@@ -78,7 +78,7 @@ class Outcome:
         return flat and not (self.wrong or self.crashes or self.stuck)
 
     def add(self, other: "Outcome"):
-        """Take in those of another instrument."""
+        """Take in the faults of another instrument."""
         for name, row in other.rows.items():
             mine = self.rows.setdefault(name, Row(about=row.about))
             for counted in ("injected", "statuses", "right", "wrong", "frames", "seconds"):
@@ -218,7 +218,7 @@ def _yaml(value) -> str:
 
 
 def soaked(faults: int, seed: int) -> Outcome:
-    """Inject so many faults into one instrument, in a ROS domain of its own."""
+    """Inject a number of faults into one instrument, in a ROS domain of its own."""
     restarts = max(4, faults // FAULTS_A_RESTART)
     with own_domain(), tempfile.TemporaryDirectory() as folder:
         soak, memory = Soak(Path(folder), seed), {}
@@ -249,7 +249,7 @@ def soaked(faults: int, seed: int) -> Outcome:
 
 
 def run_lanes(faults: int, seed: int, lanes: int) -> list[Outcome]:
-    """Share the faults among so many instruments at a time."""
+    """Share the faults among a number of instruments at a time."""
     if lanes == 1:
         return [soaked(faults, seed)]
     shares = [len(range(k, faults, lanes)) for k in range(lanes)]

@@ -30,8 +30,8 @@ from starpos_testing.nodes import take_domain
 from starpos_testing.patience import WAIT_S
 
 STALL_S = (0.5, 10.0)
-# How far a stamp may be off: a device's clock tells times to some ms, on a busy machine at the start to some tens; a
-# line without one is late by up to a period, and JITTER_S of starpos_inclinometer.clock, before anybody can tell.
+# How far a stamp may be off: a device's clock gives times to some ms, on a busy machine at the start to some tens. A
+# line without one is late by up to a period, and JITTER_S of starpos_inclinometer.clock, before it can be noticed.
 STAMP_S = {"serial": 0.1, "ascii": 0.25}
 TILT_SIGMAS = 6.0
 # Patiences of solvers with a frame whose tilts have not come.
@@ -129,7 +129,7 @@ class Instrument:
     # what goes in ----------------------------------------------------------------------------------------------------
 
     def expose(self, now_s: float):
-        """Send the star lists of the exposures that are over; leave out those that nobody had time for."""
+        """Send the star lists of the exposures that are over; leave out those that came too late."""
         from starpos_testing.graph.shots import EXPOSURE_S, shot_of
 
         while self._next[0] + EXPOSURE_S < now_s:

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A bag again and again through fresh nodes, beside busy processes: are all outputs the same to the last byte?
+"""A bag again and again through fresh nodes, next to busy processes: are all outputs the same to the last byte?
 
-Plays the first 10 s of the tests' night (--inputs images: 10 s of its images, by the detector), records what comes of
-them by a listener that listens to the inputs too, and compares `fix`, `attitude`, `solver/solution` and
-`fix_averaged`.  In 4 processes: solver, detector, player, listener; in 1: all but the listener.  Exit status 0 only if
-all runs agree and every frame was answered.
+Plays the first 10 s of the tests' night (--inputs images: 10 s of its images, by the detector), records the results by a
+listener that listens to the inputs too, and compares `fix`, `attitude`, `solver/solution` and `fix_averaged`.  In 4
+processes: solver, detector, player, listener; in 1: all but the listener.  Exit status 0 only if all runs agree and
+every frame was answered.
 """
 
 import argparse
@@ -39,7 +39,7 @@ OUTPUTS = {
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of a run: how many messages of each output, a digest of their bytes, why it is none."""
+    """The result of a run: how many messages of each output, a digest of their bytes, why it failed."""
 
     messages: tuple[int, ...] = ()
     digest: str = ""

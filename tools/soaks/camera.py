@@ -4,7 +4,7 @@
     soak.py camera files files.path:=/nights/1 files.loop:=true
     soak.py camera simulated simulated.width:=1404 simulated.height:=936 focal_mm:=150.0
 
-The parameters are those of the node `camera`; a camera, or the server of one, has to be there.  Exit status 1 if the
+The parameters are as for the node `camera`; a camera, or the server of one, has to be there.  Exit status 1 if the
 last half's memory has grown by more than 2 MB against the half before, or a frame did not come.
 """
 

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Frames made of two different skies: no answer may be wrong unless it is flagged.
 
-Each frame has 10 to 90 % of one sky and the rest of another: of the exposure, so that all stars of both are there but
-fainter, or of the stars themselves. The other sky is any, or that of a camera that was turned by less than a field. The
-errors of the centroids, the faintest star and the field of view vary. An answer is bad if it is neither one of the two
-skies nor has a warning. Exit status: 1 where there was one. Needs no ROS.
+Each frame has 10 to 90 % of one sky and the rest of another. The share is of the exposure, so that all stars of both are
+there but fainter, or of the stars themselves. The other sky is any, or as seen by a camera that was turned by less than
+a field. The errors of the centroids, the faintest star and the field of view vary. An answer is bad if it is neither one
+of the two skies nor has a warning. Exit status: 1 where there was one. Needs no ROS.
 """
 
 import json

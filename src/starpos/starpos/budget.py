@@ -14,7 +14,7 @@ class Budget:
 
     @classmethod
     def of(cls, seconds: float) -> "Budget":
-        """The limit of so many seconds from now."""
+        """The limit of a number of seconds from now."""
         return cls(time.process_time() + seconds)
 
     @property

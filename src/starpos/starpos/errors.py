@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """All errors starpos raises. Every message is one sentence: what happened, where, and what to do about it."""
 
-# Longest part of a library's message that a sentence of ours quotes.
+# Maximum length of a library's message quoted in a sentence.
 LETTERS = 120
 
 
 class StarposError(Exception):
-    """The root of all errors starpos raises on purpose."""
+    """The base of all errors that starpos raises on purpose."""
 
 
 class FrameError(StarposError):
-    """A frame, or a list of stars, cannot be read or does not hold together."""
+    """A frame, or a list of stars, cannot be read or is inconsistent."""
 
 
 class TiltError(StarposError):
@@ -42,11 +42,11 @@ class GeoidError(StarposError):
 
 
 class GnssError(StarposError):
-    """What a GNSS receiver states cannot be used, or a table of it is missing or broken."""
+    """A GNSS receiver's data cannot be used, or its table is missing or broken."""
 
 
 class PlaceError(StarposError):
-    """A place that is said to be known cannot be, or the stars contradict it."""
+    """A known place is impossible, or the stars contradict it."""
 
 
 class BagError(StarposError):
@@ -61,8 +61,12 @@ class FixError(StarposError):
     """The stars do not support a fix."""
 
 
+class StationError(StarposError):
+    """The result of a zenith camera's session is missing or broken, or contradicts that of another."""
+
+
 class VoyageError(StarposError):
-    """The record of a voyage (inertial readings, velocities) is missing or broken, or does not go with its stars."""
+    """The record of a voyage (inertial readings, velocities) is missing or broken, or contradicts its stars."""
 
 
 def one_line(error: object) -> str:

@@ -19,9 +19,9 @@ MARK, HEAD = b"starpos", 400
 
 
 def open_regular(path: Path | str) -> BinaryIO:
-    """Open a regular file to read its bytes; OSError, whose `strerror` says why, if it cannot be or is another thing.
+    """Open a regular file to read its bytes; OSError, whose `strerror` says why, if that is impossible.
 
-    Whoever opens a pipe would wait until somebody writes into it, and a device may do something when it is opened.
+    Opening a pipe would wait for a writer, and opening a device may have side effects.
     """
     try:
         _check_regular(os.stat(path))
@@ -131,7 +131,7 @@ def _open_at_once(path: str, flags: int) -> int:
 
 
 def _check_regular(status: os.stat_result) -> None:
-    """Raise OSError unless a status is that of a regular file."""
+    """Raise OSError unless a status describes a regular file."""
     if stat.S_ISDIR(status.st_mode):
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
     if not stat.S_ISREG(status.st_mode):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What medians of normally distributed numbers tell, which a few outliers do not move."""
+"""Estimates from medians of normally distributed numbers, which a few outliers do not change."""
 
 import math
 

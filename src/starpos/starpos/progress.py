@@ -3,7 +3,7 @@
 
 from collections.abc import Callable
 
-# Called with a text that says what is being done, and the share of it that is done, 0..1.
+# Called with a text about the work, and the share that is done, 0..1.
 Progress = Callable[[str, float], None]
 
 

@@ -33,10 +33,10 @@ def cache_folder() -> Path:
 def load_or_build(
     folder: Path, prefix: str, load: Callable[[], Table | None], build: Callable[[], Table], what: str
 ) -> Table:
-    """The table that `load` maps from a folder of the cache; built and kept there if there is none, or a broken one.
+    """The table that `load` maps from a folder of the cache; built and kept there if it is missing or broken.
 
     prefix: of the folder's name, KIND-FORMAT-; folders of other formats are removed.
-    what: is kept, for a warning where it cannot be; '' for what is built soon enough to say nothing.
+    what: name of the table in a warning if it cannot be kept; '' for a table that is quick to build, without a warning.
     """
     if (stored := load()) is not None:
         return stored
@@ -55,7 +55,7 @@ def load_or_build(
                     stacklevel=3,
                 )
             return built
-        # the one that is mapped takes its place in memory
+        # the mapped table takes its place in memory
         del built
     return load() or build()
 
@@ -73,7 +73,7 @@ def mapped(kind: type, folder: Path, number_kinds: str) -> Any | None:
 
 
 def rising(start: np.ndarray, end: int) -> bool:
-    """Whether these are the first rows of bins of so many rows."""
+    """Whether these are the first rows of bins of a number of rows."""
     return bool(start[0] == 0 and start[-1] == end and np.all(np.diff(start) >= 0))
 
 

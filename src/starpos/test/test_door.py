@@ -49,7 +49,7 @@ def test_the_door_itself_imports_nothing_heavy():
 
 
 def simulated(folder, *options):
-    """A night with smaller frames than those of `starpos simulate night`."""
+    """A night with smaller frames than `starpos simulate night` writes."""
     from starpos.cli import main
 
     wide = ["--focal-mm", "29.67", "--pixel-um", "6.4", "--size", "1000", "700"]

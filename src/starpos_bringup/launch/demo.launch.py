@@ -4,7 +4,7 @@
     ros2 launch starpos_bringup demo.launch.py latitude:=48.1 longitude:=11.6
     ros2 topic echo /fix
 
-Compare `fix` with the given place. The time is that of this computer.
+Compare `fix` with the given place. The time is this computer's.
 tools/demo/demo.py does the same with a place drawn at random.
 """
 

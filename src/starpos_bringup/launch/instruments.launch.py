@@ -3,7 +3,8 @@
 
     ros2 launch starpos_bringup instruments.launch.py instruments:=left,right params_file:=robot.yaml
 
-In the file /**/solver is each solver, /left/solver that of `left`. The frames of `left` are left_starpos_link and so on,
+In the file /**/solver stands for each solver, /left/solver for the one of `left`. The frames of `left` are
+left_starpos_link and so on,
 unless the file names others: tf knows no namespaces.
 """
 

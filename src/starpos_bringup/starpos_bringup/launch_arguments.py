@@ -20,7 +20,7 @@ def is_true(told: Mapping[str, str], name: str) -> bool:
 
 
 def names(told: Mapping[str, str], name: str) -> list[str]:
-    """Read an argument of names of namespaces, separated by commas; LaunchError if one is none, or comes twice."""
+    """Read an argument of names of namespaces, separated by commas; LaunchError if one is invalid, or comes twice."""
     found = [word.strip().strip("/") for word in told[name].split(",")]
     sound = all(re.fullmatch(r"[A-Za-z]\w*(/[A-Za-z]\w*)*", word, re.ASCII) for word in found)
     if not sound or len(set(found)) < len(found):
@@ -31,14 +31,14 @@ def names(told: Mapping[str, str], name: str) -> list[str]:
 
 
 def one_of(told: Mapping[str, str], name: str, words: Collection[str]) -> str:
-    """Read an argument; LaunchError if it is none of the words."""
+    """Read an argument; LaunchError if it is not one of the words."""
     if told[name].lower() not in words:
         raise LaunchError(f"{name}:={told[name]}: give {', '.join(words)}")
     return told[name].lower()
 
 
 def number(told: Mapping[str, str], name: str, low: float, high: float) -> float:
-    """Read an argument; LaunchError if it is no number from `low` to `high`."""
+    """Read an argument; LaunchError if it is not a number from `low` to `high`."""
     try:
         value = float(told[name])
     except ValueError:

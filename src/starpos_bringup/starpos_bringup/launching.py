@@ -74,7 +74,7 @@ class Common:
 
 
 def declared(arguments: Arguments) -> list[DeclareLaunchArgument]:
-    """Convert arguments to those of launch."""
+    """Convert arguments to launch's own."""
     return [
         DeclareLaunchArgument(name, default_value=value, description=text) for name, value, text in arguments
     ]

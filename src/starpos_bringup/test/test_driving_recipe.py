@@ -116,7 +116,7 @@ def test_yaw_between_fixes_is_as_good_as_the_odometry(driven):
 
 @pytest.mark.montecarlo
 def test_robot_localizations_own_process_noise_does_not_do(recipe):
-    """So that the drives would tell: its place claims a tenth of its error, its yaw knows nothing after 3 s."""
+    """A broken filter that the drives must detect: its place claims a tenth of its error, its yaw drifts."""
     driven = drive(recipe | {"process_noise_covariance": DEFAULT})
     assert driven.chi2.mean() > 20
     assert np.degrees(driven.yaw_sigma_rad).max() > 17

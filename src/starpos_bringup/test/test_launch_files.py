@@ -21,7 +21,7 @@ INSTRUMENT = ["camera_detector", "inclinometer", "solver"]
 
 @dataclass(frozen=True)
 class Process:
-    """A process that would be started; parameters by node, those of files that count less and more than the user's."""
+    """A process that would be started; parameters by node, from files before and after the user's."""
 
     namespace: str
     executable: str
@@ -98,7 +98,7 @@ def enclave_of(process) -> str:
 
 @pytest.fixture
 def bag(tmp_path):
-    """The path of a bag, which nobody opens."""
+    """The path of a bag, which is not opened."""
     (tmp_path / "night").mkdir()
     return str(tmp_path / "night")
 
@@ -257,7 +257,7 @@ def test_a_replay_takes_the_stars_or_finds_them_again(bag):
     assert list(stars) == ["solver", "replay"]
     assert stars["replay"].words[:6] == ["--rate", "0", "--inputs", "stars", "--", bag]
     assert stars["solver"].more == {"/**": {"use_sim_time": True}}
-    # its own time is that of the bag
+    # its own time is the bag's
     assert stars["replay"].more == {}
     assert {p.namespace for p in stars.values()} == {"/rover"}
     images = started("replay", bag=bag, detector="true", dashboard="true")

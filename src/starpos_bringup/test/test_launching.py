@@ -16,7 +16,7 @@ def launching(launch):
 
 @pytest.fixture
 def environment(launching, tmp_path, monkeypatch):
-    """What a process of ours gets beside the environment, given variables of the user's."""
+    """Variables of a process besides the environment's, given variables of the user's."""
     parameters = tmp_path / "mine.yaml"
     parameters.write_text("")
     common = launching.Common(str(parameters), "info", "/starpos")

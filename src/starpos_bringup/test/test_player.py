@@ -46,7 +46,7 @@ def node(context):
 
 @pytest.fixture
 def player_of(context):
-    """Makes a player of topics, beside nodes that take part and at once take everything; and the list of what it says."""
+    """Makes a player of topics, with nodes that take part and at once take everything; and the list of its sentences."""
     players = []
 
     def player_of(topics, *nodes):

@@ -17,7 +17,7 @@ ARCSEC_PER_S = 15.041
 
 
 def time_is_simulated(node: Node) -> bool:
-    """Tell whether the node takes its time from /clock (use_sim_time)."""
+    """Whether the node takes its time from /clock (use_sim_time)."""
     clock = node.get_clock()
     return isinstance(clock, ROSClock) and clock.ros_time_is_active
 
@@ -60,8 +60,10 @@ class ClockReport:
         if now - self._stepped_at < TOLD_S:
             return Diagnosis(Level.WARN, f"{self._said(self._step_s)}.", values)
         if state is None:
-            cure = "the solver takes it for as good as its clock_stddev says"
-            return Diagnosis(Level.WARN, f"the system does not tell how good its clock is; {cure}.", values)
+            cure = "the solver assumes the error in clock_stddev"
+            return Diagnosis(
+                Level.WARN, f"the system does not report the error of its clock; {cure}.", values
+            )
         return Diagnosis(Level.OK if state.synchronised else Level.WARN, state.sentence, values)
 
     def _said(self, step_s: float) -> str:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Messages that were published and never arrived, told by the numbers that DDS gives a publisher's messages."""
+"""Messages that were published and never arrived, found by DDS's numbers of a publisher's messages."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -11,7 +11,7 @@ from rclpy.qos import DurabilityPolicy
 class Dropped:
     """Counts them by topic, and warns at the first of each, with the cure.
 
-    Only one publisher's numbers can be told: where a topic has several, nothing is said of it.
+    This works for a single publisher: a topic with several is not reported.
     """
 
     def __init__(self, node: Node, cure: str) -> None:
@@ -19,11 +19,11 @@ class Dropped:
         self.counts: dict[str, int] = {}
         self._warned: set[str] = set()
         self._last: dict[str, int] = {}
-        # what a publisher sent before its first message that came, until the graph shows the publisher
+        # messages that a publisher sent before the first received one, until the graph shows the publisher
         self._before: dict[str, int] = {}
 
     def came(self, name: str, info: Mapping[str, Any]) -> None:
-        """Note a message of a topic, by its relative name, and what the middleware tells of it."""
+        """Note a message of a topic, by its relative name, and the middleware's information on it."""
         number = info.get("publication_sequence_number")
         if number is None:
             return

@@ -16,7 +16,7 @@ from starpos.session.job import Outcome, outcome_of
 class JobRunner:
     """Runs one job at a time and gives its outcome back in the node's executor.
 
-    then: called when all who wait for an outcome have it.
+    then: called when the outcome has been delivered.
     """
 
     def __init__(self, node: Node, then: Callable[[], object] = lambda: None) -> None:

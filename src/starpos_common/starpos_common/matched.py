@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A subscription to a topic of somebody else's driver: it takes the reliability that is offered."""
+"""A subscription to a topic of another driver: it takes the offered reliability."""
 
 from collections.abc import Callable, Collection, Sequence
 from typing import Any
@@ -12,7 +12,7 @@ from rclpy.topic_endpoint_info import TopicEndpointInfo
 from starpos_common.topics import Take, subscription
 
 RELIABLE, BEST_EFFORT = ReliabilityPolicy.RELIABLE, ReliabilityPolicy.BEST_EFFORT
-# publishers and topics named in a sentence at most
+# maximum number of publishers and topics named in a sentence
 MOST_NAMED = 3
 
 
@@ -63,7 +63,7 @@ class MatchedSubscription:
         self._node.destroy_subscription(self._subscription)
 
     def unheard(self) -> str:
-        """Sentence on the publishers that cannot be heard and why; '' if there is none."""
+        """Sentence on the publishers that cannot be heard and why; '' without any."""
         others = [p for p in self._offered() if p.topic_type != self._type]
         if others:
             kinds = _named({p.topic_type for p in others})
@@ -81,7 +81,7 @@ class MatchedSubscription:
         )
 
     def elsewhere(self) -> str:
-        """The other topics that carry this type, as the rest of a sentence; '' if there are none."""
+        """The other topics that carry this type, as the rest of a sentence; '' without any."""
         topics = [
             name
             for name, types in self._node.get_topic_names_and_types()

@@ -64,7 +64,7 @@ def stars_to_message(stars: Stars, frame_id: str) -> msg.StarArray:
 
 
 def shutter_fields(shutter: Shutter | None) -> dict[str, Any]:
-    """The fields of a StarArray or a Capture that tell a shutter; none if it is not known."""
+    """The fields of a StarArray or a Capture for a shutter; empty if it is not known."""
     if shutter is None:
         return {}
     return {

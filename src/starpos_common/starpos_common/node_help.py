@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the executable of a node says to `--help`."""
+"""The text of a node's executable for `--help`."""
 
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence

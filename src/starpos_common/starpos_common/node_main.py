@@ -27,12 +27,12 @@ def run(
     args: list[str] | None = None,
     help_text: Callable[[], str] | None = None,
 ) -> int:
-    """Run the nodes that `make_nodes()` yields until they are told to stop; return the process's exit status.
+    """Run the nodes that `make_nodes()` yields until a signal stops them; return the process's exit status.
 
     make_nodes: a generator, started after rclpy.init; it may raise StarposError or one of rclpy's parameter errors to
     refuse to start.
     args: the command line, by default sys.argv.
-    help_text: makes what is printed instead where `--help` or `-h` is given; None: they mean nothing here.
+    help_text: makes the text for `--help` or `-h`; None: they have no meaning here.
 
     The status is 0 after SIGINT (once or twice) or SIGTERM, and 1 with one line on standard error when the start is
     refused. Any other exception of a callback is a defect: it ends the process with its traceback.

@@ -8,7 +8,7 @@ from rclpy.publisher import Publisher
 
 
 def other_publishers(node: Node, publishers: Iterable[Publisher]) -> str:
-    """Sentence that names them and the remap that ends it; '' if there are none."""
+    """Sentence that names them and the remap that ends it; '' without any."""
     own = node.get_fully_qualified_name()
     said = []
     for publisher in publishers:

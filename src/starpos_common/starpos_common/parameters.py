@@ -108,7 +108,7 @@ def declare(
         try:
             reason = check({**values, **wanted}, frozenset(wanted)) if check and wanted else None
         except Exception as error:
-            # A defect costs this change only; the node goes on.
+            # A defect loses only this change; the node goes on.
             reason = f"the new values could not be checked ({type(error).__name__}: {str(error)[:200]})"
         return SetParametersResult(successful=not reason, reason=reason or "")
 

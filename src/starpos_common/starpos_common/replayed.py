@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A node's part in a replay: it takes the messages in the order in which they were played, and says so.
+"""A node's part in a replay: it takes the messages in the order in which they were played, and acknowledges them.
 
 No order holds between the topics of ROS, and a clock that is played is a topic of its own.  So the player
-(starpos_bringup's `replay`) says on /replay/played what it has published and when that was recorded; a node whose time
-is simulated holds each message back until its turn, and answers on /replay/taken.
+(starpos_bringup's `replay`) announces on /replay/played each message and its time of recording; a node whose time is
+simulated holds each message back until its turn, and answers on /replay/taken.
 """
 
 import time
@@ -25,12 +25,12 @@ PLAYED, TAKEN = "/replay/played", "/replay/taken"
 # Many more than a player publishes before it waits for an answer.
 DEPTH = 5000
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-# How often it is looked at whether there is something new to say.
+# Intervals of repeated messages, and of checks for new ones.
 HEARTBEAT_S, LOOK_S = 1.0, 0.1
-# A player says something at least so often, while it plays.
+# Maximum interval between a player's messages while it plays.
 WORD_S = 1.0
-# One that says nothing for so long has ended if the graph does not show it: a busy machine may lose sight of one that
-# has not.  The graph shows a killed one for many seconds: so long without a word is enough.
+# Silence after which a player has ended if the graph does not show it: a busy machine may lose sight of a running one.
+# The graph shows a killed one for many seconds, so a longer silence alone is enough.
 ENDED_S, SILENT_S = 5.0, 15.0
 STRANGERS = (
     "{} messages on {} are left out, which were neither played nor made of what was: stop the node that sends them, or "
@@ -42,8 +42,8 @@ BROKEN_OFF = "the player ended in the middle, and {} messages are left out: play
 class Replayed:
     """Holds back the messages of a replay until it is their turn.
 
-    takes: what takes the messages of a topic, by its relative name.
-    makes: the node's publishers, first that of what it makes of a frame, or of an IMU's messages; the node tells `note`.
+    takes: functions that take the messages of a topic, by its relative name.
+    makes: the node's publishers, first the one for results of a frame, or of an IMU's messages; the node calls `note`.
     busy: whether the node still works on what it has taken; it calls `go_on` when that is done.
     begin, end: called before the first message of a replay, and when no more come.
     """
@@ -67,11 +67,11 @@ class Replayed:
         self._playing = False
         # newest index that was heard
         self._heard = 0
-        # for how long the player has said nothing while this node listened, and when this was last counted
+        # how long the player was silent while this node listened, and when this was last counted
         self._silent_s, self._beat_s = 0.0, time.monotonic()
         self._turns: deque[Played] = deque()
         self._taking: Played | None = None
-        # stamps of what was made of the last message that was taken
+        # stamps of the results of the last message taken
         self._stamps: list[Time] = []
         self._held: dict[str, deque[tuple[Any, Mapping[str, Any]]]] = {}
         node.create_subscription(Played, PLAYED, self._on_played, DEPTH)
@@ -167,12 +167,12 @@ class Replayed:
             self._leave(
                 STRANGERS.format("{}", ", ".join(sorted(n for n, held in self._held.items() if held)))
             )
-        # who does not take a topic is not waited for
+        # nodes that do not take a topic are not waited for
         if turn.answer and (not turn.topic or turn.topic in self._takes):
             self._say()
 
     def _leave(self, why: str) -> None:
-        """Take part no more; why: says of how many messages that wait for their turn."""
+        """Take part no more; why: a sentence with the number of messages that wait for their turn."""
         if number := sum(map(len, self._held.values())):
             self._node.get_logger().warning(why.format(number))
         self._playing, self._taking, self.unix_s = False, None, None
@@ -192,7 +192,7 @@ class Replayed:
 
     def _player_is_gone(self) -> bool:
         now_s = time.monotonic()
-        # what was said while this node stood still it reads only now
+        # messages sent while this node stood still are read only now
         self._silent_s += min(now_s - self._beat_s, 2 * LOOK_S)
         self._beat_s = now_s
         shown = self._node.count_publishers(PLAYED) > 0

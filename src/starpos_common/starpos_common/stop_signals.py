@@ -29,7 +29,7 @@ def stop_signals() -> Iterator[list[int]]:
 
 
 class _UnlessLate:
-    """A hook for errors that nobody catches, without those of signals that came while they were made to be ignored.
+    """A hook for uncaught errors, except from signals that came while they were being ignored.
 
     Another thread may take a signal before the change and note it after; Python then prints "ignored due to race
     condition". No order of calls prevents it.

@@ -17,14 +17,14 @@ from starpos_common.parameters import ParameterError
 
 MOST_DEPTH = 100_000
 T = TypeVar("T")
-# A message, and what the middleware tells of it.
+# A message, and the middleware's information on it.
 Take = Callable[[Any, Mapping[str, Any]], object]
 
 
 def publisher(node: Node, kind: type, topic: str, depth: int, latched: bool = False) -> Publisher:
     """Make a RELIABLE publisher that keeps the newest `depth` messages; ParameterError if an override is not allowed.
 
-    latched: transient_local, so that who subscribes later gets the newest messages too.
+    latched: transient_local, so that late subscribers get the newest messages too.
     """
     durability = DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE
     qos = QoSProfile(depth=depth, durability=durability)

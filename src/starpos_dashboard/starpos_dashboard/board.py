@@ -13,7 +13,7 @@ from sensor_msgs.msg import Imu, NavSatFix
 from starpos_dashboard import readings
 from starpos_interfaces.msg import GnssCheck, Solution, Tilt
 
-# Messages that come at 1 Hz or faster are old after so long.
+# Age at which messages of 1 Hz or faster are old.
 FAST_S = 5.0
 # Diagnostics kept.
 LIGHTS = 64
@@ -45,7 +45,7 @@ class Board:
         self._count = 0
 
     def keep_track_of(self, fixes: int) -> None:
-        """Keep so many fixes from now on."""
+        """Keep this number of fixes from now on."""
         self._track = deque(self._track, maxlen=fixes)
 
     @property
@@ -91,11 +91,11 @@ class Board:
             self.changed = True
 
     def show_frame(self, number: int, stamp_s: float | None, trouble: str = "") -> None:
-        """Note that a picture has this number, or why there is none."""
+        """Note the number of a picture, or why it is missing."""
         self._keep("frame", {"number": number, "stamp": stamp_s, "trouble": readings.text(trouble)})
 
     def hide_frame(self) -> None:
-        """Forget the frame, because nobody looks and it would get old."""
+        """Forget the frame, because no page shows it and it would get old."""
         self._heard.pop("frame", None)
 
     def only_lights_of(self, nodes: frozenset[str]) -> None:

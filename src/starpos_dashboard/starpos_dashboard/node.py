@@ -21,7 +21,7 @@ from starpos_dashboard.parameters import PARAMETERS, names
 from starpos_dashboard.server import DashboardServer, listen
 from starpos_interfaces.msg import GnssCheck, Solution, Tilt
 
-# An open page gets a state at least so often, because ages grow even if no message comes.
+# Maximum interval between states sent to an open page, because ages grow even if no message comes.
 HEARTBEAT_S = 1.0
 
 

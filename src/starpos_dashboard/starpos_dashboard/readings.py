@@ -15,20 +15,20 @@ from sensor_msgs.msg import Imu, NavSatFix, NavSatStatus
 from starpos.messages.stamp import stamp_to_unix
 from starpos_interfaces.msg import GnssCheck, Solution, Tilt
 
-# Most letters of a text from outside.
+# Maximum length of a text from outside.
 NAME_LETTERS, SENTENCE_LETTERS = 80, 300
-# Most terms of an error budget, and warnings of an identification.
+# Maximum number of terms of an error budget, and of warnings of an identification.
 TERMS, WARNINGS = 16, 4
 # Levels of DiagnosticStatus.
 STALE, ERROR = 3, 2
-# By so much the length of a quaternion may differ from 1.
+# Tolerance on the length of a quaternion.
 UNIT = 1e-3
 TILT_FLAGS = (
     (Tilt.OUT_OF_RANGE, "beyond the sensor's range"),
     (Tilt.STUCK, "the sensor repeats one value"),
     (Tilt.SATURATED, "the converter is at its limit"),
     (Tilt.GAP, "readings were lost"),
-    (Tilt.TIME_UNKNOWN, "nobody knows when it was read"),
+    (Tilt.TIME_UNKNOWN, "its time is unknown"),
 )
 
 GNSS_WORDS = {
@@ -40,7 +40,7 @@ GNSS_WORDS = {
 
 
 def number(value: float) -> float | None:
-    """Return a number, None if it is not finite: JSON cannot hold it, and nobody should read it as a number."""
+    """Return a number, None if it is not finite: JSON cannot hold it, and it must not be read as a number."""
     value = float(value)
     return value if math.isfinite(value) else None
 
@@ -63,7 +63,7 @@ def position(message: NavSatFix) -> dict:
     covariance = _covariance(message)
     return told | {
         "good": True,
-        "trouble": "" if covariance else "how far it may be off is not known",
+        "trouble": "" if covariance else "its error is not known",
         "latitude": latitude,
         "longitude": math.remainder(longitude, 360.0),
         "altitude": number(message.altitude),
@@ -155,7 +155,7 @@ def seen_from(namespace: str, name: str) -> str:
 
 
 def light(status: DiagnosticStatus, name: str) -> dict:
-    """Convert a diagnostic to a light; a level that is none of the four is an error."""
+    """Convert a diagnostic to a light; a level other than the four is an error."""
     level = status.level[0] if isinstance(status.level, bytes) else int(status.level)
     return {
         "name": text(name, NAME_LETTERS),

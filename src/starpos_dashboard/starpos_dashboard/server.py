@@ -29,10 +29,10 @@ from starpos_dashboard import access
 
 # For a page to take what is sent.
 PATIENCE_S = 10.0
-# A connection without a request is closed after so long.
+# Time after which a connection without a request is closed.
 QUIET_S = 20.0
 END_S = 2.0
-# A page that lost its connection tries again after so long.
+# Time after which a page that lost its connection tries again.
 RETRY_MS = 3000
 HEADER_LIMIT, BODY_LIMIT, READ_LIMIT = 1 << 14, 1 << 10, 1 << 16
 # Besides the six connections for each page that a browser opens.
@@ -83,7 +83,7 @@ def listen(address: str, port: int) -> list[socket]:
 def files() -> dict[str, tuple[str, bytes]]:
     """Read content type and content of all files, by path, so that no request can name any other file.
 
-    The coast lines are those of starpos's reports.
+    The coast lines are the same as in starpos's reports.
     """
     root = resources.files(__package__) / "assets"
     found = {}
@@ -99,7 +99,7 @@ def files() -> dict[str, tuple[str, bytes]]:
 class DashboardServer:
     """Serves the page from `start` to `stop`; any thread may `show` a new state.
 
-    sockets: from `listen`.  names: host names under which it is served.  clients: most pages at once.
+    sockets: from `listen`.  names: host names under which it is served.  clients: maximum number of pages at once.
     """
 
     def __init__(self, sockets: list[socket], names: frozenset[str], clients: int) -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the page is told: never a number that is none, never more than it can hold."""
+"""The state sent to the page: never an invalid number, never more than it can hold."""
 
 import json
 import math
@@ -111,7 +111,7 @@ def test_a_gnss_place_that_is_not_on_earth_or_an_unknown_status_is_not_shown():
 
 def test_the_flags_of_a_tilt_are_said_in_words():
     flags = readings.tilt(said.tilt(31.0, 0.0, flags=Tilt.OUT_OF_RANGE | Tilt.TIME_UNKNOWN))["flags"]
-    assert flags == ["beyond the sensor's range", "nobody knows when it was read"]
+    assert flags == ["beyond the sensor's range", "its time is unknown"]
     flags = {v for v in (getattr(Tilt, name) for name in dir(Tilt) if name.isupper()) if isinstance(v, int)}
     assert {flag for flag, _ in readings.TILT_FLAGS} == flags
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether the dashboard's page, and that of a report, can be read and worked: by night, on a phone, by keyboard."""
+"""Whether the dashboard's page, and a report's, can be read and used: by night, on a phone, by keyboard."""
 
 from contextlib import contextmanager
 
@@ -47,7 +47,7 @@ const depth = (a, b) => Math.min(Math.min(a.right, b.right) - Math.max(a.left, b
 return texts.flatMap(([s, a], i) => texts.slice(i + 1).filter(([, b]) => depth(a, b) > 3).map(([t]) => [s, t]));
 """
 
-# In CSS pixels as they reach the eye: those of a drawing are scaled with it.
+# In CSS pixels as they reach the eye: a drawing's are scaled with it.
 LETTERS = """
 return [...document.querySelectorAll("body *")].filter((e) => e.checkVisibility() && !e.closest("noscript, sub")
   && [...e.childNodes].some((n) => n.nodeType === 3 && n.data.trim())).map((e) => [

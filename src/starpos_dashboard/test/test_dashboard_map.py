@@ -64,7 +64,7 @@ def test_the_track_has_a_dot_for_every_fix_before(page):
 
 def test_a_fix_without_a_known_error_has_no_ellipse(page):
     page.instrument.works(fix=said.fix(48.1373, 11.5755, (nan := math.nan, nan, nan)))
-    page.shows(sigma_east="± —", status_sentence="how far it may be off is not known")
+    page.shows(sigma_east="± —", status_sentence="its error is not known")
     drawn = "return ['inner', 'outer'].map((q) => document.querySelector(`#ellipse-newest .${q}`).getAttribute('d'))"
     page.until(lambda: page.run(drawn) == ["", ""])
     assert page.run("return document.querySelector('#ellipse-newest .mark').checkVisibility()")

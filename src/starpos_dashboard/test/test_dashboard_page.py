@@ -134,6 +134,14 @@ def test_lights_have_their_colours_words_and_sentences_and_hostile_text_stays_te
     assert page.run("return document.querySelectorAll('#lights img, #lights script').length") == 0
 
 
+def test_the_card_of_the_deflection_is_there_while_one_is_measured(page):
+    seen = "return document.getElementById('deflection-card').checkVisibility()"
+    assert not page.run(seen)
+    sentence = "enough; xi +3.120 +- 0.070, eta -1.020 +- 0.080 arcsec, 8 faces, 192 frames"
+    page.instrument.works(__diagnostics=said.diagnostics(("solver: Deflection", 0, sentence)))
+    page.until(lambda: page.run(seen) and sentence in page.text("deflection"))
+
+
 def test_a_node_that_has_never_spoken_is_silent_not_missing(page):
     def silent():
         return [lamp[0] for lamp in page.run(LAMPS) if lamp[1] == "SILENT" and "nothing heard" in lamp[2]]
@@ -189,7 +197,7 @@ def test_a_frame_that_cannot_be_shown_says_why(page):
 
 def test_no_fix_looks_like_no_fix_and_nan_is_no_number(page):
     nan = math.nan
-    sentence = "none of the sky fits these 41 stars: look at the frame"
+    sentence = "no part of the sky matches these 41 stars: look at the frame"
     page.instrument.works(
         fix=said.fix(nan),
         fix_averaged=None,

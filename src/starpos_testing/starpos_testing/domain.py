@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A ROS domain that nobody has, for tests, demonstrations and soaks."""
+"""An unused ROS domain, for tests, demonstrations and soaks."""
 
 import os
 import socket
@@ -16,7 +16,7 @@ FIRST_PORT, PORTS = 7400, 250
 
 
 def _inhabited() -> set[int]:
-    """The domains in which somebody on this machine listens."""
+    """The domains with listeners on this machine."""
     tables = [Path("/proc/net/udp"), Path("/proc/net/udp6")]
     rows = [row.split() for table in tables if table.is_file() for row in table.read_text().splitlines()[1:]]
     return {(int(row[1].rpartition(":")[2], 16) - FIRST_PORT) // PORTS for row in rows}
@@ -24,7 +24,7 @@ def _inhabited() -> set[int]:
 
 @contextmanager
 def own_domain() -> Iterator[int]:
-    """Set ROS_DOMAIN_ID to one in which nobody is and that nobody else takes meanwhile, on this machine only."""
+    """Set ROS_DOMAIN_ID to an empty domain and reserve it, on this machine only."""
     taken = _inhabited() | {int(os.environ.get("ROS_DOMAIN_ID") or 0)}
     for number in DOMAINS:
         if number in taken:

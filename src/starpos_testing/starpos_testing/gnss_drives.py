@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Drives of a robot with GNSS: what camera, inclinometer and receiver tell, drawn from stated laws; no stars are drawn.
+"""Drives of a robot with GNSS: readings of camera, inclinometer and receiver, drawn from stated laws; no stars are drawn.
 
 The laws are written down here anew, so that they hold starpos.gnss to account.
 """

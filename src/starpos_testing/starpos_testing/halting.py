@@ -9,9 +9,9 @@ from scipy.interpolate import CubicSpline
 
 STEP_S = 0.05
 SPEED, TURNING = 0.8, 2 * np.pi / 150
-# of the ground under the wheels: leans of so much, 1 sigma, over such lengths
+# of the ground under the wheels: leans, 1 sigma, and range of lengths
 LEAN, SHORTEST_M, LONGEST_M = np.radians(4), 8.0, 40.0
-# wheels slip to the side by so much, 1 sigma, for so many seconds
+# slip of the wheels to the side, 1 sigma, and range of durations, s
 SLIP, SLIP_S = 0.05, (4, 30)
 FERRY_SPEED = 4.0
 
@@ -36,7 +36,7 @@ def smooth(t, begin_s, length_s):
 
 
 def spells(rng, seconds, driven_s, stood_s):
-    """Begin and end (S, 2) of standstills, s, with so long drives between, both drawn from such ranges."""
+    """Begin and end (S, 2) of standstills, s, with drives in between, both drawn from the given ranges."""
     at, found = rng.uniform(5, 60), []
     while at < seconds:
         end = at + rng.uniform(*stood_s)
@@ -48,7 +48,7 @@ def spells(rng, seconds, driven_s, stood_s):
 def halting(driven_s=(100, 240), stood_s=(20, 40), ground=LEAN, sway=None):
     """A rover that curves over uneven ground and stands now and then: a function of seconds and generator.
 
-    sway: it turns once in its first drive, and then keeps to a course within so many rad, 1 sigma.
+    sway: it turns once in its first drive, and then keeps to a course, 1 sigma in rad.
     """
 
     def drive(seconds, rng):
@@ -144,7 +144,7 @@ def _steps(grid, values):
 
 
 def _on_ground(rng, grid, speed, yaw, ground, slip):
-    """A Drive with this speed and course over ground that leans, with wheels that slip by so much."""
+    """A Drive with this speed and course over ground that leans, with wheels that slip."""
     way = _sum(speed)
     rate, phase = 2 * np.pi / rng.uniform(SHORTEST_M, LONGEST_M, (2, 5)), rng.uniform(0, 2 * np.pi, (2, 5))
     lean = ground * np.sqrt(2 / 5) * np.sin(np.multiply.outer(way, rate) + phase).sum(-1)

@@ -176,7 +176,7 @@ class PopLaunchConfigurations(Action):
 
 
 class PushRosNamespace(Action):
-    """A namespace within that of before, or from the root where it begins with a slash."""
+    """A namespace within the previous one, or from the root if it begins with a slash."""
 
     def __init__(self, namespace: Texts) -> None:
         self.namespace = normalized(namespace)
@@ -212,7 +212,7 @@ class ExecuteLocal(Action):
 
 
 class ExecuteProcess(ExecuteLocal):
-    """A process with its command line, and variables beside the environment's."""
+    """A process with its command line, and variables besides the environment's."""
 
     def __init__(
         self,

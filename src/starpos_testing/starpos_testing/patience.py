@@ -4,7 +4,7 @@
 import time
 from collections.abc import Callable
 
-# For any event: ten times what the slowest takes on a machine that is not busy, and more.
+# For any event: over ten times the slowest one's time on an idle machine.
 WAIT_S = 120.0
 
 

@@ -118,7 +118,7 @@ def turbulent_wind(stddev, outer_s=600.0, terms=160):
 
 
 def swinging_wind(stddev, period_s):
-    """A wind that swings back and forth in so many seconds, by an amplitude of that standard deviation, m/s; likewise."""
+    """A wind that swings with a period in s, and an amplitude of that standard deviation, m/s; likewise."""
 
     def way(rng, seconds):
         rate, phase, amplitude = 2 * np.pi / period_s, rng.uniform(0, 2 * np.pi), rng.normal(0, stddev)
@@ -206,8 +206,8 @@ def made(
 ):
     """Record a voyage; without `errors` the readings are exact, the mount as believed and the stars where they are.
 
-    more_wind: of a drone, an axis, beside a steady one: `walking_wind`, `turbulent_wind`, `swinging_wind`.
-    drive: in place of the kind's way, one of `halting`, whose wheels shake the accelerometer by so many m/s2.
+    more_wind: of a drone, an axis, besides a steady one: `walking_wind`, `turbulent_wind`, `swinging_wind`.
+    drive: in place of the kind's way, one of `halting`, whose wheels shake the accelerometer, m/s2.
     """
     rng, on = np.random.default_rng(seed), float(errors)
     if drive is None:

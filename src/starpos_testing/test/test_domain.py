@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A ROS domain of one's own: nobody is in it, and nobody else takes it."""
+"""A ROS domain of one's own: it is empty, and no one else takes it."""
 
 import os
 import socket

@@ -81,7 +81,7 @@ class Alpaca(FrameSource):
         self._gain: float | None = None
 
     def lacking(self) -> None:
-        """Return None, because only a call to the server would tell."""
+        """Return None, because only a call to the server would show it."""
 
     def capture(self, settings: CaptureSettings) -> CapturedFrame:
         try:
@@ -115,7 +115,7 @@ class Alpaca(FrameSource):
             camera.AbortExposure()
         width, height = int(camera.CameraXSize), int(camera.CameraYSize)
         if min(width, height) < 1 or width * height > MAX_PIXELS:
-            raise CaptureError(f"its sensor of {width} x {height} px is none.")
+            raise CaptureError(f"its sensor of {width} x {height} px is not valid.")
         camera.BinX = camera.BinY = 1
         camera.StartX = camera.StartY = 0
         camera.NumX, camera.NumY = width, height
@@ -220,7 +220,7 @@ def _sentence(error: Exception) -> str:
     if isinstance(error, CaptureError):
         return str(error)
     if isinstance(error, (requests.Timeout, urllib3.exceptions.TimeoutError)):
-        return "it does not answer in time; look after the server and the network."
+        return "it does not answer in time; check the server and the network."
     if isinstance(error, (requests.ConnectionError, urllib3.exceptions.ProtocolError, ConnectionError)):
         return "there is no Alpaca server, or it has gone; start it, or correct alpaca.address."
     words = " ".join(str(getattr(error, "message", error)).split())[:160].rstrip(".")

@@ -93,7 +93,7 @@ class Session(requests.Session):
         return response
 
     def picture(self, url: str, width: int, height: int) -> np.ndarray:
-        """Fetch the newest picture, (height, width) with row 0 on top, as transmitted; CaptureError if there is none."""
+        """Fetch the newest picture, (height, width) with row 0 on top, as transmitted; CaptureError without one."""
         accept = {"Accept": "application/imagebytes", "Accept-Encoding": "identity"}
         with self.get(url, headers=accept, timeout=(CALL_S, PICTURE_S), stream=True) as response:
             if "application/imagebytes" not in response.headers.get("Content-Type", ""):
@@ -112,7 +112,7 @@ def _decode(stream: Any, width: int, height: int) -> np.ndarray:
     if error:
         raise CaptureError(f"it has no picture: {_words(stream.read(200))}.")
     if version != 1 or not METADATA.size <= begin <= MAX_METADATA:
-        raise CaptureError("a picture's metadata are none of version 1.")
+        raise CaptureError("a picture's metadata are not of version 1.")
     if (rank, columns, rows) != (2, width, height):
         raise CaptureError(
             f"a picture of {columns} x {rows} px in {rank} dimensions came from a sensor of {width} x {height} px: "

@@ -148,7 +148,7 @@ class Files(FrameSource):
                 return f"{self._path}: there are no frames here; check files.path."
         except (OSError, RuntimeError) as error:
             # There is no permission, or no home of such a user.
-            return f"{self._path}: it cannot be looked into ({error}); check files.path."
+            return f"{self._path}: it cannot be listed ({error}); check files.path."
         return None
 
     def capture(self, settings: CaptureSettings) -> CapturedFrame:
@@ -191,9 +191,7 @@ class Files(FrameSource):
             found = watched.next()
         except OSError as error:
             reason = error.strerror or error
-            raise CaptureError(
-                f"{self._path}: it cannot be looked into ({reason}); check files.path."
-            ) from None
+            raise CaptureError(f"{self._path}: it cannot be listed ({reason}); check files.path.") from None
         if found is None:
             raise NothingYet(f"waiting for frames that come into {self._path}.")
         path, last_chance = found
@@ -249,7 +247,7 @@ def split(path: str) -> tuple[Path, str]:
 
 
 def fits(name: str, pattern: str) -> bool:
-    """Whether a name is that of a frame; hidden files are not finished, and names of other encodings cannot be shown."""
+    """Whether a name belongs to a frame; hidden files are not finished, and names of other encodings cannot be shown."""
     if not name.isprintable() or name.startswith("."):
         return False
     return fnmatch.fnmatchcase(name, pattern) if pattern else name.lower().endswith(SUFFIXES)

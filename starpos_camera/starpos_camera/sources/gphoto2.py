@@ -95,7 +95,7 @@ class Gphoto2(FrameSource):
         self._camera: Gphoto2Camera | None = None
 
     def lacking(self) -> None:
-        """Return None, because only a look at the bus would tell."""
+        """Return None, because only a look at the bus would show it."""
 
     def capture(self, settings: CaptureSettings) -> CapturedFrame:
         import gphoto2

@@ -227,7 +227,7 @@ def sentence(code: int) -> str:
         gphoto2.GP_ERROR_CAMERA_BUSY: "it is busy; let it finish, or switch it off and on.",
         gphoto2.GP_ERROR_NO_MEMORY: "its memory or card is full; empty it.",
         gphoto2.GP_ERROR_NO_SPACE: "its memory or card is full; empty it.",
-        gphoto2.GP_ERROR_TIMEOUT: "it does not answer; look after the cable, or switch it off and on.",
+        gphoto2.GP_ERROR_TIMEOUT: "it does not answer; check the cable, or switch it off and on.",
     }
     told = gphoto2.gp_result_as_string(code)
-    return known.get(code, f"{told} ({code}); look after the cable, or switch it off and on.")
+    return known.get(code, f"{told} ({code}); check the cable, or switch it off and on.")

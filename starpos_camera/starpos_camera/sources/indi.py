@@ -162,7 +162,7 @@ def _unpacked(blob: Blob) -> bytes:
     if not 0 < blob.size <= BLOB_MAX:
         raise CaptureError(f"its frame claims {blob.size} bytes; a frame has at most {BLOB_MAX}.")
     data = blob.data
-    # astropy unpacks this format; the stated size is that of the unpacked image.
+    # astropy unpacks this format; the stated size is the unpacked image's.
     if blob.format == ".fits.fz":
         return data
     if blob.format == ".fits.z":

@@ -59,9 +59,7 @@ async def connect(device: IndiDevice) -> None:
         lambda: refused() or (connected() and all(device.has(v) for v in wanted)), CONNECT_S
     )
     if refused() or not connected() or not await device.settled(ANSWER_S):
-        raise CaptureError(
-            f"the driver does not reach its camera{device.said()}: look after cable and power."
-        )
+        raise CaptureError(f"the driver does not reach its camera{device.said()}: check cable and power.")
     if lacks := [v for v in wanted if not device.has(v)]:
         raise CaptureError(f"{device.name} has no {lacks[0]}, so it is no camera: correct indi.device.")
     await device.enable_blobs("CCD1")

@@ -111,7 +111,7 @@ class IndiServer:
             try:
                 await asyncio.wait_for(self._changed.wait(), min(left, BEAT_S))
             except asyncio.TimeoutError:
-                # Only writing shows that a server has gone. No device has this name, so nobody answers.
+                # Only writing shows that a server has gone. No device has this name, so none answers.
                 await self._client.send_getProperties("starpos", "CONNECTION")
         return bool(found)
 
@@ -181,17 +181,17 @@ class IndiDevice:
         return await self.server.until(lambda: answers() > 1, seconds)
 
     def state(self, vector: str) -> str | None:
-        """Idle, Ok, Busy or Alert; None if there is no such vector."""
+        """Idle, Ok, Busy or Alert; None without such a vector."""
         found = self._vector(vector)
         return found.state if found is not None else None
 
     def value(self, vector: str, member: str) -> str | None:
-        """Text of a member; None if there is none."""
+        """Text of a member; None without one."""
         found = self._vector(vector)
         return found.get(member) if found is not None else None
 
     def number(self, vector: str, member: str) -> float | None:
-        """Value of a member as a number; None if there is none, or if it is no number."""
+        """Value of a member as a number; None without one."""
         return _number(self.value(vector, member))
 
     def limits(self, vector: str, member: str) -> tuple[float | None, float | None]:
@@ -203,7 +203,7 @@ class IndiDevice:
         return _number(found.min), _number(found.max)
 
     def said(self) -> str:
-        """Last message of the device since `forget`, in brackets; "" if there is none."""
+        """Last message of the device since `forget`, in brackets; "" without one."""
         messages = self._client[self.name].messages if self.name in self._client else ()
         return f" ({one_line(messages[0][1])})" if messages else ""
 

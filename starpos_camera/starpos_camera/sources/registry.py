@@ -2,6 +2,7 @@
 """The sources by their name in the parameter `source`. A new camera needs a module here and a line below."""
 
 from starpos_camera.sources.alpaca import Alpaca
+from starpos_camera.sources.aravis import Aravis
 from starpos_camera.sources.files import Files
 from starpos_camera.sources.gphoto2 import Gphoto2
 from starpos_camera.sources.indi import Indi
@@ -13,6 +14,7 @@ SOURCES: dict[str, type[FrameSource]] = {
     "files": Files,
     "simulated": Simulated,
     "alpaca": Alpaca,
+    "aravis": Aravis,
     "gphoto2": Gphoto2,
     "indi": Indi,
     "video": Video,

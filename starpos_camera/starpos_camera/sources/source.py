@@ -42,7 +42,7 @@ class CaptureSettings:
 class CapturedFrame:
     """One frame and how it was taken.
 
-    frame         with its time: mid_unix_s and stamp_stddev_s are set, clock_stddev_s if another machine told the time,
+    frame         with its time: mid_unix_s and stamp_stddev_s are set, clock_stddev_s if another machine gave the time,
                   shutter if anything is known of it
     stamp_source  one of starpos_interfaces/Capture's constants
     camera        intrinsics that the source knows; None: use the node's

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Middle of an exposure, from the times that a camera tells."""
+"""Middle of an exposure, from the times that a camera reports."""
 
 import math
 import re
@@ -12,7 +12,7 @@ from starpos_interfaces.msg import Capture
 
 # Hosts whose clock is this machine's.
 LOCAL = ("127.0.0.1", "localhost", "::1")
-# Between the times that a driver tells of an exposure and those of its command and its arrival.
+# Tolerance between a driver's times of an exposure and the times of command and arrival.
 CLOCK_TOLERANCE_S = 0.05
 
 
@@ -55,7 +55,7 @@ class Stamp:
 def stamp_of(
     told: str, clock_stddev_s: float, exposure_s: float, commanded_s: float, ready_s: float, values: Mapping
 ) -> Stamp:
-    """Choose the better stamp: from the start that the driver tells (`told`, ISO 8601), or from the command.
+    """Choose the better stamp: from the start that the driver reports (`told`, ISO 8601), or from the command.
 
     clock_stddev_s: of the driver's clock; 0: it is this machine's clock; NaN: unknown, and the start is not used.
     commanded_s, ready_s: Unix times between which the exposure lies; a start that contradicts them is not used.
@@ -86,13 +86,13 @@ def middle_of_commanded(commanded_s: float, exposure_s: float, values: Mapping) 
 def middle_of_started(
     start_s: float, resolution_s: float, exposure_s: float, values: Mapping
 ) -> tuple[float, float]:
-    """Middle and its standard deviation from the start that the driver tells, rounded or cut at its resolution."""
+    """Middle and its standard deviation from the start that the driver reports, rounded or cut at its resolution."""
     stddev_s = math.hypot(values["driver_lag_stddev"], 1.5 * resolution_s / math.sqrt(12))
     return start_s + values["driver_lag"] + resolution_s / 4 + exposure_s / 2, stddev_s
 
 
 def read_utc(text: str) -> tuple[float, float] | None:
-    """Read a UTC time in ISO 8601; return Unix time and the resolution of its last digit (s); None if it is none."""
+    """Read a UTC time in ISO 8601; return Unix time and the resolution of its last digit (s); None if invalid."""
     match = re.fullmatch(
         r"(\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d)(?:\.(\d+))?(?:Z|\+00:00)?", text.strip(), re.ASCII
     )

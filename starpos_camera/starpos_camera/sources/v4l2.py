@@ -3,8 +3,8 @@
 
 OpenCV's V4L2 backend (tried: 4.6 and 5.0) gives the kernel's buffer time as CAP_PROP_POS_MSEC. With
 CAP_PROP_CONVERT_RGB at 0 it gives the buffer itself, in the shape of its format or as plain bytes. It waits at most 10 s
-for a frame. Exposure is V4L2_CID_EXPOSURE_ABSOLUTE, in 100 us, if the menu of auto exposure is at 1. OpenCV does not tell
-that a buffer is short, but the kernel's uvcvideo drops such frames (its parameter nodrop is 0).
+for a frame. Exposure is V4L2_CID_EXPOSURE_ABSOLUTE, in 100 us, if the menu of auto exposure is at 1. OpenCV does not
+report that a buffer is short, but the kernel's uvcvideo drops such frames (its parameter nodrop is 0).
 """
 
 import math
@@ -30,11 +30,11 @@ MANUAL = 1
 # V4L2_EXPOSURE_AUTO, V4L2_EXPOSURE_APERTURE_PRIORITY.
 AUTOMATIC = (0, 3)
 MAX_EXPOSURE_S = 60.0
-# So many frames a camera may still take with the old settings.
+# Number of frames that a camera may still take with the old settings.
 SETTLE_FRAMES = 4
 # Longest wait besides the time of the frames themselves.
 MAX_WAIT_S = 10.0
-# Frames per second if the driver tells none; a low value is the careful one.
+# Frames per second if the driver reports none; a low value is the cautious one.
 DEFAULT_RATE = 5.0
 MAX_AGE_S = 600.0
 MONO = {"GREY": "u1", "Y16 ": "<u2", "Y12 ": "<u2", "Y10 ": "<u2"}
@@ -142,7 +142,7 @@ class V4l2Device:
     def _settings(
         self, cv2: ModuleType, capture: "VideoCapture", settings: CaptureSettings
     ) -> tuple[float | None, str]:
-        """Make the settings; return the exposure as the driver tells it (s, None unknown), and a remark."""
+        """Make the settings; return the exposure as the driver reports it (s, None unknown), and a remark."""
         remark = ""
         if self._set != (settings.exposure_s, settings.gain):
             if settings.exposure_s is not None:
@@ -181,7 +181,7 @@ class V4l2Device:
         unstamped = 0
         while time.monotonic() < end_s and not self.closing:
             if not capture.grab():
-                raise CaptureError("it gives no frame; look after its plug.")
+                raise CaptureError("it gives no frame; check its plug.")
             steady_s, now_s = self._clocks()
             stamp_s = capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
             # Drivers stamp with one clock or the other.

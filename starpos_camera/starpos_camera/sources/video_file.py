@@ -107,7 +107,7 @@ class Film:
                 head = file.read(16)
         except OSError as error:
             raise CaptureError(
-                f"{self._path}: it cannot be read ({error.strerror}); look after its disk."
+                f"{self._path}: it cannot be read ({error.strerror}); check its disk."
             ) from None
         # FFmpeg would take a playlist of other files under any name.
         if head[at : at + 4] not in beginnings:

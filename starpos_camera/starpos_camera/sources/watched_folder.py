@@ -16,11 +16,11 @@ import numpy as np
 
 # More than the coarsest time stamps of folders (FAT: 2 s): a second change within the same tick does not show.
 TICK_S = 3.0
-# The folder is listed so often even if it seems unchanged: some network disks do not update its time.
+# Interval at which the folder is listed even if it seems unchanged: some network disks do not update its time.
 IDLE_S = 60.0
 # Largest share of the time for listing.
 LISTING_SHARE = 0.1
-# A file that cannot be read is given up after so many times the time of rest.
+# A file that cannot be read is given up after this multiple of the time of rest.
 PATIENCE = 10.0
 # Most new files in one look; the others wait.
 MOST_LOOKED_AT = 200
@@ -50,7 +50,7 @@ class WatchedFolder:
         rest_s: float,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """Watch a folder; wanted: whether a name is that of a frame; rest_s: a file unchanged for so long is complete."""
+        """Watch a folder; wanted: whether a name is a frame's; rest_s: a file unchanged for so long is complete."""
         self._folder, self._wanted, self._rest_s, self._clock = folder, wanted, rest_s, clock
         self._arrivals: dict[str, NewFile] = {}
         # Hashes of the names of the last listing.
@@ -67,7 +67,7 @@ class WatchedFolder:
         self._newest_ns: int | None = None
 
     def next(self) -> tuple[Path, bool] | None:
-        """Return the oldest complete file, and whether this is its last chance; None if there is none.
+        """Return the oldest complete file, and whether this is its last chance; None without one.
 
         Call `try_again` or `done` afterwards. Raises OSError if there is no such folder.
         """

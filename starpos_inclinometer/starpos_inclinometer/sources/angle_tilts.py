@@ -46,7 +46,7 @@ class AngleTilts:
         self._stuck_samples, self._range = stuck_samples, range_rad
 
     def reading(self, measured: Angles, moment: Moment, late_s: float | None) -> Reading:
-        """Convert a reading that came at a moment, late by so many seconds, or None where nobody can know."""
+        """Convert a reading that came at a moment, late by some seconds, or None if unknown."""
         angles = measured.angles
         flags = self._flags(measured) | (TIME_UNKNOWN if late_s is None else 0)
         if flags & GAP:

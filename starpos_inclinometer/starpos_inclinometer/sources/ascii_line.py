@@ -48,8 +48,8 @@ PARAMETERS = (
     Parameter(
         "ascii.pattern",
         rf"(?P<x>{NUMBER})[,;\s]+(?P<y>{NUMBER})",
-        "Regular expression (Python's) that a whole line must match, with the named groups x, y, and where the device "
-        "tells them z, temperature [deg C], sequence, milliseconds or seconds (of its own clock).",
+        "Regular expression (Python's) that a whole line must match, with the named groups x, y, and where "
+        "the device sends them z, temperature [deg C], sequence, milliseconds or seconds (of its own clock).",
         read_only=True,
     ),
     Parameter(
@@ -94,7 +94,8 @@ PARAMETERS = (
     Parameter(
         "ascii.stuck_samples",
         100,
-        "So many equal lines in a row are a stuck device; 0: never, for one whose steps are coarser than its noise.",
+        "Number of equal lines in a row after which the device counts as stuck; 0: never, for one whose "
+        "steps are coarser than its noise.",
         unit="",
         minimum=0,
         maximum=1_000_000,
@@ -111,7 +112,7 @@ class Line:
     y: float
     z: float | None
     step: float
-    # NaN if the line does not tell it; not compared, because NaN is not equal to itself.
+    # NaN if the line does not hold it; not compared, because NaN is not equal to itself.
     temperature_c: float = field(compare=False)
     sequence: int | None
     # Time of the device's clock, 32 bits.

@@ -75,7 +75,8 @@ PARAMETERS = (
     Parameter(
         "iio.stuck_samples",
         100,
-        "So many equal inclinations in a row are a stuck device; 0: never, for one whose steps are coarser than its "
+        "Number of equal inclinations in a row after which the device counts as stuck; 0: never, for one "
+        "whose steps are coarser than its "
         "noise, as those of an ADIS16209 are.",
         unit="",
         minimum=0,
@@ -92,7 +93,7 @@ class IioLink:
         self._trigger, self._sampling_hz = values["iio.trigger"].strip(), values["iio.sampling_frequency"]
         self.rate_hz = values["rate"]
         self._clock, self._wake = host.clock, host.wake
-        # Arrivals of raw values; `identity` is the device, None where nobody knows when they were taken.
+        # Arrivals of raw values; `identity` is the device, None if the time of the values is unknown.
         self._queue: deque[tuple[IioDevice, Arrival]] = deque(maxlen=QUEUE)
         self._recent: deque[float] = deque(maxlen=QUEUE)
         self._good = self._failed = 0
@@ -167,7 +168,7 @@ class IioLink:
             try:
                 raw = device.read_raw()
             except ValueError:
-                self._fail(good_s, before, f"{device.folder} tells no numbers")
+                self._fail(good_s, before, f"{device.folder} shows no numbers")
                 continue
             except OSError as error:
                 if error.errno == errno.EBUSY:
@@ -248,7 +249,7 @@ class IioTilts:
         self.forces.configure(values)
 
     def read(self, device: IioDevice, arrival: Arrival) -> Reading | None:
-        """Convert one reading; None while accelerations are being averaged, or it tells no tilt."""
+        """Convert one reading; None while accelerations are being averaged, or if it gives no tilt."""
         broken = self.device is not None and device is not self.device
         if device is not self.device:
             self.device = device

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Buffered reading of an Industrial I/O device: whole scans from /dev, with the kernel's own time stamps.
 
-The layout of a scan, and the order of what is set, are those of the kernel's document "Industrial IIO device buffers".
+The layout of a scan, and the order of the settings, follow the kernel's document "Industrial IIO device "
+    "buffers".
 """
 
 import contextlib
@@ -45,7 +46,7 @@ def element(name: str, index: int, text: str) -> Element:
     match = _TYPE.fullmatch(text.strip())
     if match is None or int(match[4]) % 8:
         raise DeviceError(
-            f"{name} is stored as {text.strip()!r}, which nobody can read: unset `iio.trigger`."
+            f"{name} is stored as {text.strip()!r}, a format that is not known: unset `iio.trigger`."
         )
     order, sign, bits, storage, shift = match.groups()
     return Element(

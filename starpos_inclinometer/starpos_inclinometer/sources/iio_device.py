@@ -155,7 +155,7 @@ def _describe(folder: Path) -> IioDevice:
 
 
 def _channel(folder: Path, kind: str, axis: str) -> Channel | None:
-    """Find a channel whose values have a unit; without a scale nobody knows it."""
+    """Find a channel whose values have a unit; without a scale it is unknown."""
     name = f"in_{kind}_{axis}"
     if not (folder / f"{name}_raw").exists():
         return None

@@ -12,7 +12,7 @@ from rclpy.qos import ReliabilityPolicy
 from sensor_msgs.msg import Imu
 
 from starpos.instrument.noise_tracker import noise_text
-from starpos.messages.imu_tilts import LEAST, ImuTilts
+from starpos.messages.imu_tilts import MIN_MESSAGES, ImuTilts
 from starpos.messages.tilt import Reading
 from starpos.session import inclinometer_parameters
 from starpos_common.matched import MatchedSubscription
@@ -138,6 +138,6 @@ class ImuSource(TiltSource):
             return (
                 Phase.GARBLED,
                 f"{self._topic} brings no usable messages: check its stamps against this host's clock, and that "
-                f"at least {LEAST} come in {average_s:g} s.",
+                f"at least {MIN_MESSAGES} come in {average_s:g} s.",
             )
         return Phase.RECEIVING, f"receiving from {self._topic}"

@@ -214,7 +214,7 @@ class McuDecoder:
         ]
         if self._gate.rejected != rejected or any(a.sample.restarted for a in believed):
             # After a reset the MCU runs at its default rate, perhaps with another firmware; samples that do not fit may
-            # come from a reset that nobody saw.
+            # come from an unseen reset.
             self._ask = True
         return believed
 
@@ -248,7 +248,7 @@ class McuTilts:
     def read(self, arrivals: list[Arrival]) -> list[Reading]:
         """Convert the arrivals that an `McuDecoder` believed, in order.
 
-        Until the unit has told which sensor it has, nobody can say what its codes mean, and they are left out.
+        Until the unit has named its sensor, the meaning of its codes is unknown, and they are left out.
         The times of pulses among them go to `pulses`.
         """
         readings = []
@@ -270,11 +270,11 @@ class McuTilts:
         self.pulses.add(arrival.sample, arrival.moment, sent_s)
 
     def _sample_to_arrival_s(self) -> float:
-        """From the time that a line tells to its arrival, the shortest there is."""
+        """Shortest delay from the time in a line to its arrival."""
         return (self._delay_ms * 1e-3 if math.isnan(self._latency_s) else self._latency_s) + self._line_s
 
     def _follow(self, identity: Identity) -> None:
-        """Take over the sensor, rate and delay that the MCU had told when it sent the next sample."""
+        """Take over the sensor, rate and delay that the MCU had reported when it sent the next sample."""
         self.sensor = self._scl3300 if identity.kind == SensorKind.SCL3300 else self._sca100t
         # At a lower rate a sample is the mean of more conversions, so its noise is another.
         if identity.rate_hz != self._rate_hz:

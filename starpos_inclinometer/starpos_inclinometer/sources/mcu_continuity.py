@@ -11,11 +11,11 @@ from dataclasses import replace
 from starpos_inclinometer.sources.mcu_protocol import Sample, SampleStatus
 from starpos_inclinometer.sources.reading import Arrival
 
-# So many times the usual change from sample to sample is still near.
+# Multiple of the usual change from sample to sample that still counts as near.
 TOLERANCE_OF_CHANGE = 8.0
 # Weight of a new sample in the usual change.
 CHANGE_SHARE = 1 / 8
-# So many samples in a row are believed even if no two are near each other: the instrument moves.
+# Number of samples in a row that are used even if no two are near each other: the instrument moves.
 WITNESSES = 3
 
 # Both ends of a period are rounded down to ms.

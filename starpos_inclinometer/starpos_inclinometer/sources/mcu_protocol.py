@@ -22,7 +22,7 @@ _LINE = re.compile(rb"\$([^$*\r\n]{1,40})\*([0-9A-F]{4})\r\n")
 _SAMPLE = re.compile(
     rb"T,([0-9A-F]{4}),([0-9A-F]{8}),([0-9A-F]{6}),([0-9A-F]{6}),([0-9A-F]{2}),([0-9A-F]{2})"
 )
-# Version 1 had no kind: its firmware was that of the SCA100T alone.
+# Version 1 had no kind: its firmware was for the SCA100T alone.
 _IDENTITY = re.compile(
     rb"I,([0-9A-F]{2}),([0-9A-F]{4}),([0-9A-F]{8}),([0-9A-F]{2}),([0-9A-F]{4})(?:,([0-9A-F]{2}))?"
 )
@@ -121,7 +121,7 @@ class Pulse:
     # One of Input.
     input: int
     rising: bool
-    # 8 bits; a jump tells how many were lost.
+    # 8 bits; a jump shows how many were lost.
     number: int
     # Edges of this input since the one before, within 2 ms of one another: they have no line.
     bounces: int

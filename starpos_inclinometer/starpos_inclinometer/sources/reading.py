@@ -27,7 +27,7 @@ __all__ = [
 class Phase(Enum):
     """State of a source."""
 
-    # The port cannot be opened, or it went away; nobody publishes.
+    # The port cannot be opened, or it went away; the topic has no publisher.
     ABSENT = "absent"
     # Open, but nothing comes.
     SILENT = "silent"
@@ -66,7 +66,7 @@ class Arrival:
 
     sample: Any
     moment: Moment
-    # What the device had told about itself when it sent this.
+    # The device's identity when it sent this.
     identity: Any = None
 
 

@@ -30,8 +30,8 @@ DIVIDER = 31.0
 TEMPERATURE_ZERO_COUNTS = 197
 TEMPERATURE_COUNTS_PER_C = -1.083
 
-# The 24-bit codes of a working converter have noise of tens of counts. So many equal codes in a row on one axis are no
-# chance, and neither are so many on both axes.
+# The 24-bit codes of a working converter have noise of tens of counts. Numbers of equal codes in a row, on one axis and
+# on both axes, that are not chance.
 STUCK_SAMPLES, STUCK_PAIRS = 10, 3
 
 
@@ -168,7 +168,7 @@ class Sensor:
         c = self.calibration
         noise = self.noise.sigma or (SCA100T_NOISE_RAD, SCA100T_NOISE_RAD)
         step = [c.volts_per_code / c.sensitivity_volts_per_g[axis] for axis in range(2)]
-        # Variances of each axis in g^2; the noise of an angle is that of g over the cosine.
+        # Variances of each axis in g^2; the noise of an angle is the noise of g over the cosine.
         vx, vy = (
             max(noise[i], c.noise_floor_rad) ** 2 * (1 - g[i] ** 2) + step[i] ** 2 / 12 for i in range(2)
         )

@@ -28,7 +28,7 @@ FAULTS = SampleStatus.NO_ANSWER | SampleStatus.MEANINGLESS | SampleStatus.SELF_T
 class Scl3300Calibration:
     """What the owner found out.
 
-    cross_axis: matrix (xx, xy, yx, yy) from the sines of the sensor's angles to those of S.
+    cross_axis: matrix (xx, xy, yx, yy) from the sines of the sensor's angles to the sines of S's.
     noise_floor_rad: smallest noise of one sample, even if the samples show less.
     """
 

@@ -24,7 +24,7 @@ RETRY_S = 0.4
 # How soon a stop, a command or silence is noticed.
 READ_TIMEOUT_S = 0.1
 MIN_SILENCE_S, SILENT_PERIODS = 1.0, 1.5
-# Lines of which none is believed are reported after so many times the patience with silence.
+# Lines of which none is used are reported after this multiple of the patience with silence.
 UNFIT_PATIENCES = 3.0
 READ_BYTES = 4096
 # 10 s at the highest rate.
@@ -103,7 +103,7 @@ class LinkState:
     counts: Counts = field(default_factory=Counts)
     # How often the port was opened.
     connections: int = 0
-    # Samples that nobody fetched in time.
+    # Samples that were not fetched in time.
     dropped: int = 0
     # Rate of the recent samples.
     rate_hz: float = 0.0

@@ -17,7 +17,8 @@ from starpos_inclinometer.sources.reading import Health, Reading, TimedPulse
 class Surroundings:
     """What a node gives its source: itself, for topics; the host's clock; `wake`, which any thread may call.
 
-    in_turn: the callback of a topic by its relative name and what takes its messages: in a replay each has its turn.
+    in_turn: makes a topic's callback, from its relative name and the function that takes its messages: in a replay each
+    has its turn.
     replays: whether the node's time is simulated.
     """
 
@@ -46,7 +47,7 @@ class TiltSource(Protocol):
 
     @property
     def takes(self) -> Mapping[str, Take]:
-        """What takes the messages of each topic, by its relative name."""
+        """Functions that take the messages of topics, by relative name."""
         return {}
 
     def start(self) -> None:

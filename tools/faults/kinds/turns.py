@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tilts that are lost, late or unread when the instrument has been turned, and those of another inclinometer."""
+"""Tilts that are lost, late or unread when the instrument has been turned, and tilts of another inclinometer."""
 
 import math
 import signal
@@ -28,7 +28,7 @@ def publish(w: World, times_s, scene=None):
 
 
 def until(end_s: float, seconds: float) -> np.ndarray:
-    """Times of readings over so many seconds until shortly before `end_s`."""
+    """Times of readings over some seconds until shortly before `end_s`."""
     return np.arange(end_s - seconds, end_s - 1e-3, PERIOD_S)
 
 

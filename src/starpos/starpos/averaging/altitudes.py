@@ -86,8 +86,8 @@ def circle_of(
     sine = np.hypot(seen[0], seen[1])
     if sine < LEAST_SINE or seen[2] < MIN_COS_ZENITH:
         raise FixError(
-            f"{pointing.place}: the camera looks {np.degrees(np.arctan2(sine, seen[2])):.1f} deg from the zenith, an "
-            "elevation tells a place between 0.6 and 87: lean it"
+            f"{pointing.place}: the camera looks {np.degrees(np.arctan2(sine, seen[2])):.1f} deg from the "
+            f"zenith; an elevation determines a place only between 0.6 and 87: lean it"
         )
     # up that errs by a small rotation of L lies nearer to the axis, or further
     rows = np.array([[-seen[1], seen[0], 0.0]]) / sine
@@ -120,8 +120,8 @@ def place_of_circles(circles: Sequence[Circle], near: tuple[float, float] | None
     number = len(whole.covariance)
     if number < 2 or (number == 2 and near is None):
         raise FixError(
-            f"{len(circles)} elevations in {number} {'direction' if number == 1 else 'directions'} tell no place: "
-            "without a roll it takes three (frames of a camera that stands still are one)"
+            f"{len(circles)} elevations in {number} {'direction' if number == 1 else 'directions'} do not "
+            f"determine a place: without a roll it takes three (frames of a camera that stands still are one)"
             + (", or two and --near LAT LON, because two circles meet in two places" if number == 2 else "")
         )
     part = whole.take(_sound(whole))
@@ -279,7 +279,8 @@ def _answer(part: Directions, near: tuple[float, float] | None) -> _Answer:
             found.append(one)
     if not found:
         raise FixError(
-            "the elevations do not meet in a place: check A3, the clock, and that nothing was moved between"
+            "the elevations do not agree on one place: check A3, the clock, and that nothing was moved "
+            "between them"
         )
     found.sort(key=lambda f: f.chi2)
     scatter2 = max(found[0].chi2 / max(len(part.circles) - 2, 1), 1.0)
@@ -350,8 +351,8 @@ def _average(part: Directions, answer: _Answer, frames: int) -> Average:
     free = len(part.circles) - 2
     if free == 1 and answer.chi2 > CONTRADICT_SIGMA**2:
         raise FixError(
-            f"the elevations of three directions contradict each other by {np.sqrt(answer.chi2):.0f} sigma: one is "
-            "wrong, or all err by more than is stated: add directions, or state larger errors"
+            f"the elevations of three directions contradict each other by {np.sqrt(answer.chi2):.0f} sigma: "
+            f"one is wrong, or their errors are larger than stated: add directions, or state larger errors"
         )
     beyond = excess(answer.chi2, free)
     terms.append(term(SCATTER, beyond * metres @ part.covariance @ metres.T))

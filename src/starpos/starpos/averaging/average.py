@@ -94,8 +94,8 @@ def average(fixes: Sequence[Fix]) -> Average:
     if whole.left_out >= whole.frames:
         raise FixError(
             f"of {whole.frames + whole.left_out} frames {whole.left_out} lie further from the others than their errors "
-            "allow, too many to say which are right: they are not of one place, the mount or the clock slipped, or the "
-            "instrument turned and its A3 is not what it was said to be (--self-calibrate finds it)"
+            "allow, too many to say which are right: the frames are of several places, the mount or the "
+            "clock slipped, or the instrument turned and its stated A3 is wrong (--self-calibrate finds it)"
         )
     return whole
 

@@ -199,7 +199,7 @@ class PlaceFilter:
         Raises ValueError if the fix has other terms.
         """
         if tuple(t.name for t in f.terms) != self.names:
-            raise ValueError("fixes with other error terms: they are not of one program")
+            raise ValueError("fixes have different error terms: they were not made by one program")
         keys, own = list(self.keys), np.array([t.shared is None for t in f.terms])
         # what is left of each shared error, and the variance that it gains
         left, gained = np.ones(len(self.state)), np.zeros((len(keys), len(self.state)))

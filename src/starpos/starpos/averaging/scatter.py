@@ -86,8 +86,8 @@ class Frames:
 class Scatter:
     """The result of the frames, as means over all hypotheses.
 
-    pose_sigma (rad): root of the mean variance of errors that do not average out within a pose; frame_sigma (rad): the
-    same of all errors of a frame in addition to its own stated error; noise_sigma (rad): of errors new in each frame.
+    pose_sigma (rad): root of the mean variance of errors that do not average out within a pose. frame_sigma (rad): the
+    same of all errors of a frame in addition to its own stated error. noise_sigma (rad): of errors new in each frame.
     evident: whether it is improbable that the frames scatter as stated; response_evident: that the response
     errs as stated.
     moved (n,), covariance (n, n): of the parameters.  stated (n, n): their covariance if all is as stated, and the

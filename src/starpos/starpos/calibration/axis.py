@@ -119,7 +119,7 @@ def find_axis(
             found.append(one)
     if not found:
         raise FixError(
-            "the elevations determine no A3: check the tilts, the clock and that nothing was moved"
+            "the elevations do not determine A3: check the tilts, the clock and that nothing was moved"
         )
     found.sort(key=lambda f: f[0])
     best = found[0][1]

@@ -83,7 +83,8 @@ def calibrate_camera(
             )
     if wide.is_wide(given) and any(level is None for level in levels):
         raise CalibrationError(
-            "what refraction does to the stars of a fisheye would be taken for its lens: give the --tilt of its frames"
+            "without tilts refraction cannot be separated from a fisheye's distortion: give the --tilt of "
+            "its frames"
         )
     catalogue = deeper.for_field(catalogue, given, progress)
     table = triangle_cache.cached(catalogue, wide.field_rad(given), progress)
@@ -99,7 +100,8 @@ def calibrate_camera(
             progress("camera", (k + (n + 1) / len(skies)) / (len(FIRST_FREE) + ROUNDS))
         if not sightings:
             raise CalibrationError(
-                f"none of the sky fits any of the {len(frames)} frames: check the focal length ({given.fx:.0f} px given, "
+                f"no part of the sky matches any of the {len(frames)} frames: check the focal length "
+                f"({given.fx:.0f} px given, "
                 "3 % is allowed), clouds and exposure"
             )
         fit = fit_camera(list(sightings.values()), given, atmosphere, free)

@@ -50,7 +50,8 @@ def calibrate_fixed(
     fixes = found.fixes
     if poses_of(fixes).any():
         raise FixError(
-            "the camera was touched between the frames, or their clock was set: give frames of one that nothing moved"
+            "the camera was touched between the frames, or their clock was set: give frames of a camera "
+            "that nothing moved"
         )
     attitudes = np.array([f.camera_to_itrs for f in fixes])
     mean = rotation.best_rotation(

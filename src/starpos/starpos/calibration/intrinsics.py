@@ -158,7 +158,8 @@ def check_sound(fitted: Intrinsics, given: Camera) -> None:
     """Raise CalibrationError if the fit is not good enough to work with."""
     if (np.abs(fitted.values - camera_values(given)) > BEYOND_PRIOR * fitted.prior_sigma).any():
         raise CalibrationError(
-            "the stars want a camera too unlike the given one: check focal length and pixel size, and that the frames "
+            "the stars fit a camera too different from the given one: check focal length and pixel size, "
+            "and that the frames "
             "are of one camera"
         )
     if fitted.scatter_px > MAX_SCATTER_PX:
@@ -175,7 +176,8 @@ def check_invertible(camera: Camera) -> None:
         camera.directions(*_grid(camera, BORDER).T)
     except InstrumentError:
         raise CalibrationError(
-            "the distortion these stars tell folds inside the frame: give more frames, with stars in the corners"
+            "the distortion fitted to these stars folds inside the frame: give more frames, with stars in "
+            "the corners"
         ) from None
 
 

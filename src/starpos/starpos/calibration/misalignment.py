@@ -222,8 +222,9 @@ class _Agreement:
         if not told:
             return ""
         return (
-            f"the tilts err by more than is stated of the inclinometer: {', '.join(told)}; the claim holds it, and so "
-            f"does the file that is written with A3; in another, state {', '.join(state)}"
+            f"the tilts err by more than the inclinometer's stated errors: {', '.join(told)}; the errors "
+            f"stated of A3 and the file written with it include this; in another instrument file, state "
+            f"{', '.join(state)}"
         )
 
     @property

@@ -58,7 +58,7 @@ class Readings:
         plumb = np.array([s.tilt.up for s in solved])
         axes = {s.tilt.axes for s in solved}
         if len(axes) != 1:
-            raise FixError("some tilts have two axes and some three: give those of one inclinometer")
+            raise FixError("some tilts have two axes and some three: give the tilts of one inclinometer")
         mean = rotation.normalised(plumb.sum(0))
         zeroed = Zeroed.at(mean, min(axes))
         response = np.array([response_columns(s.tilt.theta, s.tilt.up, zeroed) for s in solved])

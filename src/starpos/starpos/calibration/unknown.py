@@ -27,9 +27,9 @@ MODEL_BY_PARAMETERS = "set inclinometer.model, or name it or its errors in the f
 UNKNOWN_DEG = 60.0
 # a turn that is known better than so is said to be known; a place that is wider is worth a word
 KNOWN_DEG, WIDE_M = 5.0, 10_000.0
-TELL_IT = (
-    "calibrate with leans of some degrees between the frames, or say with --misalignment and --turn-stddev how the mount "
-    "has it"
+FIND_TURN = (
+    "calibrate with leans of some degrees between the frames, or state it with --misalignment and "
+    "--turn-stddev"
 )
 
 
@@ -44,15 +44,16 @@ def unknown_a3(
     metres = float(np.sqrt(np.diag(covariance)[:2].max()))
     if calibration.unknown:
         return (
-            f"the misalignment of camera and inclinometer is not known, which makes the place {metres / 1000:.0f} km "
-            f"wide (1 sigma): {ways}"
+            f"the misalignment of camera and inclinometer is not known, so the position error is "
+            f"{metres / 1000:.0f} km (1 sigma): {ways}"
         )
     own = sum(np.trace(t.covariance[:2, :2]) for t in terms if t.name == CALIBRATION)
     if metres < WIDE_M or own < 0.5 * np.trace(covariance[:2, :2]) or not may_turn(calibration):
         return ""
     return (
         "the instrument leans otherwise than when A3 was found, and A3's turn about the plumb line, "
-        f"{_known(calibration)}, makes the place {metres / 1000:.0f} km wide (1 sigma): lean it as then, or {TELL_IT}"
+        f"{_known(calibration)}, makes the position error {metres / 1000:.0f} km (1 sigma): lean it as then, "
+        f"or {FIND_TURN}"
     )
 
 
@@ -61,7 +62,7 @@ def unnamed_inclinometer(instrument: Instrument, ways: str = MODEL_BY_OPTIONS) -
     if instrument.vertical is not None or instrument.inclinometer_model or instrument.inclinometer != UNNAMED:
         return ""
     return (
-        "nobody has said which inclinometer this is: its errors are taken for those of an SCA100T as sold, "
+        "the inclinometer's model is not stated: the errors of an SCA100T as sold are assumed, "
         f"{np.degrees(UNNAMED.pose_rad):.2f} deg, 7 km or more (1 sigma): {ways}"
     )
 
@@ -73,7 +74,7 @@ def may_turn(calibration: Calibration) -> bool:
 
 def at_another_lean(calibration: Calibration) -> str:
     """Say how well A3's turn about the plumb line is known, which counts at another lean."""
-    return f"at another lean A3's turn about the plumb line counts, {_known(calibration)}"
+    return f"at another lean A3's turn about the plumb line matters, {_known(calibration)}"
 
 
 def _known(calibration: Calibration) -> str:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The input of `solve`: the frames of one night with their table of tilts, or an archive with a folder per night."""
+"""The input of `solve`: one night's frames with a table of tilts, or an archive with a folder per night."""
 
 import os
 from dataclasses import dataclass
@@ -24,7 +24,7 @@ class NightFolder:
 def frames_among(given: list[str], *tables: str | None) -> list[str]:
     """The frames among files that a shell's *.csv, or *, has taken in: without tables, tilt.csv and truth.json.
 
-    Files that are nothing else stay, and each says why it is no frame.
+    Other files stay, and each one reports why it is not a frame.
     """
     beside = {os.path.realpath(table) for table in tables if table is not None}
     frames = [
@@ -38,9 +38,9 @@ def nights_of(
 ) -> list[NightFolder | FrameError]:
     """One night from frames and a table, or without one for a camera fixed to the ground or at a known place.
 
-    Else a night for each folder, or the error why it is none.
+    Else a night for each folder, or its error.
 
-    A folder's frames are its FITS files, or if there are none its CSV files, in the order of their names.
+    A folder's frames are its FITS files, or without FITS files its CSV files, in the order of their names.
     Raises FrameError for a path that does not exist, TiltError for frames without a table.
     """
     if tilt is not None:

@@ -38,7 +38,7 @@ from starpos.sky import catalogue
 
 # Exit status.
 NOTHING = 1
-# the stars of a frame, and what is identified of them
+# the stars of a frame, and their identification
 _Seen = tuple[Stars, Identification | None]
 
 
@@ -51,7 +51,7 @@ def define(parser: argparse.ArgumentParser) -> None:
         help="write the camera's calibration (CameraInfo YAML): focal lengths, principal point, distortion",
     )
     parser.add_argument(
-        "--map", metavar="PNG", help="draw where the stars lie off the given and the fitted camera (--camera)"
+        "--map", metavar="PNG", help="draw the residuals of the given and of the fitted camera (--camera)"
     )
     options.add_stamps(parser)
     options.add_instrument(parser)
@@ -69,10 +69,10 @@ def run(args: argparse.Namespace) -> int:
     if args.camera is None and args.site is None:
         raise InstrumentError("nothing to calibrate: give --camera OUT.yaml, --site LAT LON, or both")
     if args.map is not None and args.camera is None:
-        raise InstrumentError("--map is of the camera: give --camera OUT.yaml too")
+        raise InstrumentError("--map draws the camera's residuals: give --camera OUT.yaml too")
     options.check_frames(args)
     if args.pointings is not None and args.camera is not None:
-        raise InstrumentError("--pointings say nothing of the camera: give frames for --camera")
+        raise InstrumentError("--pointings hold no stars: give frames for --camera")
     calibrate_site.check(args)
     overwriting.check(args, *_written(args))
     if args.map is not None and find_spec("matplotlib") is None:
@@ -87,7 +87,7 @@ def run(args: argparse.Namespace) -> int:
         return console.UNREADABLE
     # an error of the axis that all frames share becomes part of the A3 that is found
     instrument, _ = with_frame_size(options.instrument_of(args, first), first)
-    # an instrument that cannot be used is refused before all frames are worked on
+    # an unusable instrument is refused before the work on all frames
     calibrate_site.check_output(args, instrument)
     sights, unreadable = _sights(args.frames, read, replace(given_of(args, first), instrument=instrument))
     solver, frames = of_one_camera(Solver(instrument, catalogue.load_catalogue()), sights)
@@ -180,7 +180,7 @@ def _sights(paths: Sequence[str], read: Reader, given: Given) -> tuple[list[Sigh
 
 
 def _known(frames: Sequence[_Seen]) -> dict[int, Identification]:
-    """What is identified of frames, by their numbers."""
+    """Identifications of frames, by their numbers."""
     return {n: found for n, (_, found) in enumerate(frames) if found is not None}
 
 
@@ -192,7 +192,7 @@ def _camera(
     given = instrument.camera_for(first.width, first.height, first.origin_px)
     if {(f.width, f.height, f.origin_px) for f, _ in seen} != {(given.width, given.height, first.origin_px)}:
         raise InstrumentError(
-            "the frames are not all of one size and one part of the sensor: give such ones for --camera"
+            "the frames differ in size or part of the sensor: give frames of one for --camera"
         )
     levels: Sequence[np.ndarray | None] = [None] * len(seen)
     if tilts is not None:
@@ -200,7 +200,7 @@ def _camera(
     frames, bar = [stars for stars, _ in seen], console.ProgressBar()
     found = calibrate_camera(frames, levels, given, catalogue.load_catalogue(), air, bar, _known(seen))
     for k in sorted(set(range(len(frames))) - set(found.used)):
-        console.complain("calibrate", f"{frames[k].source}: none of the sky fits it, it is left out")
+        console.complain("calibrate", f"{frames[k].source}: no part of the sky matches it: it is left out")
     if tilts is None:
         _tell_what_tilts_would(found.fit, air, frames)
     about = _about(found)
@@ -231,9 +231,7 @@ def _levelled(
         except StarposError as e:
             console.complain("calibrate", f"{stars.source} is left out: {e}")
     if not kept:
-        raise CalibrationError(
-            "no frame has a tilt: check that --tilt is of the same night, or leave it away"
-        )
+        raise CalibrationError("no frame has a tilt: check that --tilt is of the same night, or leave it out")
     return kept, levels
 
 
@@ -246,8 +244,8 @@ def _tell_what_tilts_would(fit: Intrinsics, air: Atmosphere, frames: Sequence[St
     cost = np.hypot(cost, UNTIMED * timeless)
     console.complain(
         "calibrate",
-        f"without --tilt {what} is not known: {1e6 * cost:.0f} ppm, {cost * fit.camera.fx:.2g} px, of fx and fy, "
-        "which their sigmas hold",
+        f"without --tilt {what} is not known: {1e6 * cost:.0f} ppm, {cost * fit.camera.fx:.2g} px, of fx "
+        f"and fy, which their sigmas include",
     )
 
 
@@ -260,11 +258,9 @@ def _about(found: FromSky) -> str:
     ]
     for name, value, sigma, told in zip(parameters(fit.camera), fit.values, fit.sigma, fit.told, strict=True):
         digits = max(0, 1 - int(np.floor(np.log10(sigma))))
-        by = "told by the sky" if told else "held by the prior"
+        by = "from the stars" if told else "from the prior"
         lines.append(f"  {name:<4} {value:>16.{digits}f} +- {sigma:<12.{digits}f} {by}")
-    lines.append(
-        f"its predictions, attitude and scale aside: +- {fit.worst_sigma_px:.3f} px where they are worst"
-    )
+    lines.append(f"predicted positions (attitude and scale aside): +- {fit.worst_sigma_px:.3f} px at worst")
     return "\n".join(lines) + "\n"
 
 

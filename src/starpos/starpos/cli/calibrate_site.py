@@ -10,7 +10,7 @@ import numpy as np
 
 from starpos.calibration.fixed_camera import calibrate_fixed
 from starpos.calibration.misalignment import NOTHING_KNOWN, Calibrated, Known, calibrate_at
-from starpos.calibration.unknown import TELL_IT, at_another_lean, may_turn
+from starpos.calibration.unknown import FIND_TURN, at_another_lean, may_turn
 from starpos.cli import console, options
 from starpos.cli.overwriting import save_instrument
 from starpos.cli.vertical import add_vertical, vertical_of
@@ -42,21 +42,22 @@ def define(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--fixed",
         action="store_true",
-        help="a camera that is fixed to the ground, without an inclinometer: its pose at --site is its vertical, and "
-        "`solve` with the file that -o writes needs no --tilt; it gives place and heading while the stars show it in "
-        "that pose, and else says that it has moved; where to, it cannot tell",
+        help="a camera fixed to the ground, without an inclinometer: its pose at --site serves as its "
+        "vertical, and `solve` with the file that -o writes needs no --tilt; it gives position and "
+        "heading as long as the stars show the camera in that pose; once the camera has moved, it says "
+        "so and gives no position",
     )
     parser.add_argument(
         "--sag",
         type=options.number(0, MOST_SAG_ARCSEC),
         metavar="ARCSEC",
         help="how far a --fixed camera sags in an hour, 1 sigma about each axis; it grows with the root of the time "
-        f"({SAG_ARCSEC_PER_SQRT_HOUR:g}, 300 m; after a week 13 times that)",
+        f"({SAG_ARCSEC_PER_SQRT_HOUR:g}, 300 m; after a week 13 times as much)",
     )
     parser.add_argument(
         "--geodetic",
         action="store_true",
-        help="--site is on WGS 84, as a map or a receiver has it: the deflection of the vertical is put on",
+        help="--site is on WGS 84, as a map or a receiver gives it: the deflection of the vertical is added",
     )
     add_vertical(parser)
     options.add_turn(parser)
@@ -97,11 +98,12 @@ def check(args: argparse.Namespace) -> None:
     if args.fixed:
         if (args.tilt, args.misalignment, args.turn_stddev, args.inclinometer) != (None,) * 4:
             raise InstrumentError(
-                "--fixed is of a camera without an inclinometer: leave out --tilt, --misalignment, --turn-stddev and "
+                "--fixed is for a camera without an inclinometer: leave out --tilt, --misalignment, "
+                "--turn-stddev and "
                 "--inclinometer"
             )
     elif args.sag is not None:
-        raise InstrumentError("--sag is of a camera fixed to the ground: give --fixed too")
+        raise InstrumentError("--sag is for a camera fixed to the ground: give --fixed too")
     if args.output is None or (args.tilt is None and not args.fixed):
         raise InstrumentError(
             "--site needs the tilts and a file to write: give --tilt CSV and -o INSTRUMENT.yaml (or --fixed in place of "
@@ -113,7 +115,7 @@ def check(args: argparse.Namespace) -> None:
 
 
 def check_output(args: argparse.Namespace, instrument: Instrument) -> None:
-    """Raise InstrumentError if the file of -o is there and is of another instrument."""
+    """Raise InstrumentError if the file of -o exists and describes another instrument."""
     if args.site is not None:
         instrument_update.check_fits(
             Path(args.output), instrument, fixed=args.fixed, camera_found=args.camera is not None
@@ -127,9 +129,9 @@ def run(
     tilts: TiltLog | None,
     known: Known = NOTHING_KNOWN,
 ) -> None:
-    """Find A3, or the vertical of a fixed camera, write and print it; raises FixError if the frames do not tell it.
+    """Find A3, or the vertical of a fixed camera, write and print it; raises FixError if the frames do not determine it.
 
-    known: what is identified of the frames already.
+    known: identifications of the frames so far.
     """
     solver = Solver(instrument, catalogue.load_catalogue(), options.atmosphere_of(args))
     (site, stddev_arcsec), bar = _site(args), console.ProgressBar()
@@ -138,7 +140,8 @@ def run(
         found = calibrate_fixed(solver, frames, site, stddev_arcsec, sag, bar, known)
     elif instrument.vertical is not None:
         raise InstrumentError(
-            f"{args.instrument} is of a camera that is fixed to the ground: give --fixed, or another instrument file"
+            f"{args.instrument} describes a camera fixed to the ground: give --fixed, or another instrument "
+            f"file"
         )
     else:
         found = calibrate_at(solver, frames, tilts, site, stddev_arcsec, options.turn_of(args), bar, known)
@@ -182,8 +185,8 @@ def run_elevations(
         f"A3 of {calibration.frames} elevations in {found.directions} directions at {site.latitude_deg:+.6f} "
         f"{site.longitude_deg:+.6f} (by gravity): "
         "{:.5f} {:.5f} {:.5f} deg\n".format(*calibration.misalignment_deg)
-        + f"the frame's centre in the inclinometer is known to {found.stddev_arcsec:.2f} arcsec; elevations alone "
-        "tell no turn about it: for pointings without a roll it does not count\n"
+        + f"the frame's centre in the inclinometer is known to {found.stddev_arcsec:.2f} arcsec; elevations "
+        f"alone do not determine the turn about it, which does not matter for pointings without a roll\n"
     )
     whole = replace(instrument, calibration=calibration)
     save_instrument("calibrate", args.output, whole, about)
@@ -217,7 +220,7 @@ def _about(found: Calibrated, site: Site) -> str:
         + at_another_lean(c),
     ]
     if may_turn(c):
-        lines.append(f"to tell that turn as well, {TELL_IT}")
+        lines.append(f"to find that turn as well, {FIND_TURN}")
     return "\n".join(lines) + "\n"
 
 
@@ -225,7 +228,7 @@ def _against(given: Calibration, found: Calibration) -> str:
     """A line on how far apart two A3 have the plumb line in the camera, at the lean of the calibration."""
     up = up_of(np.radians(found.tilt_deg))
     apart = np.degrees(np.arccos(np.clip(up @ found.a3 @ given.a3.T @ up, -1, 1)))
-    return f"the --misalignment given has the plumb line {apart:.2g} deg from there: if that cannot be, check the site\n"
+    return f"the --misalignment given has the plumb line {apart:.2g} deg from there: check the site if it cannot be\n"
 
 
 def _json_of(found: Calibrated, path: str) -> dict:

@@ -3,6 +3,7 @@
 
 import argparse
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,12 @@ from starpos.table_cache import cache_folder
 ORIGINALS = """The original Tycho-2 files are in Debian's and Ubuntu's source package tycho2:
     apt-get source --download-only tycho2        (with a deb-src line in the apt sources)
 which brings tycho2_2.orig.tar.xz; give that archive, or a folder with tyc2.dat.00 .. 19 and suppl_1.dat."""
+
+GAIA = """A table of the Gaia archive has the columns ra, dec (deg), ra_error, dec_error, parallax (mas), pmra, pmdec,
+pmra_error, pmdec_error (mas/yr), ref_epoch (Julian year), phot_g_mean_mag, and perhaps ruwe; docs/how-to/gaia.md has
+the query. Stars keep their names and V; those that the table does not have keep Tycho-2's places and errors."""
+
+LIMIT_MAG = 11.0
 
 DEEPER = """The catalogue that comes with starpos goes to V = 11. Fields that hold too few of its stars take
 the deeper one (70 MB in the cache) by themselves. `starpos catalogue deepen --fetch` is all it needs; without
@@ -33,12 +40,30 @@ def define(parser: argparse.ArgumentParser) -> None:
     )
     info.set_defaults(run=show)
     build = kinds.add_parser(
-        "build", help="make the compact file from Tycho-2's original files", epilog=ORIGINALS
+        "build",
+        help="make the compact file from Tycho-2's original files, or put the places of a Gaia extract into it",
+        epilog=f"{GAIA}\n\n{ORIGINALS}",
     )
     build.formatter_class = argparse.RawDescriptionHelpFormatter
-    build.add_argument("originals", metavar="ORIGINALS", help="folder or archive of the original files")
     build.add_argument(
-        "--limit-mag", type=options.number(0, 20), default=11.0, metavar="V", help="faintest V kept (11.0)"
+        "originals",
+        nargs="?",
+        metavar="ORIGINALS",
+        help="folder or archive of the original files; with --gaia alone the catalogue in use takes its places",
+    )
+    build.add_argument(
+        "--gaia", metavar="TABLE", help="table of stars from the Gaia archive (CSV, ECSV, FITS, VOTable)"
+    )
+    build.add_argument(
+        "--year",
+        type=options.number(1990, 2100),
+        help="Julian year at which Gaia's places are exact to 1 mas (this year)",
+    )
+    build.add_argument(
+        "--limit-mag",
+        type=options.number(0, 20),
+        metavar="V",
+        help="faintest V kept of the original files (11.0)",
     )
     build.add_argument(
         "--out", default="tycho2.npz", metavar="FILE", help="STARPOS_CATALOGUE=FILE then uses it"
@@ -87,7 +112,7 @@ def show(args: argparse.Namespace) -> int:
     if args.path is None:
         more = deeper.kept()
         print(
-            "no deeper catalogue in the cache: small fields want one (`starpos catalogue deepen --fetch`)"
+            "no deeper catalogue in the cache: small fields need one (`starpos catalogue deepen --fetch`)"
             if more is None
             else f"{len(more)} stars of the deeper catalogue are in the cache, for small fields"
         )
@@ -96,17 +121,35 @@ def show(args: argparse.Namespace) -> int:
 
 
 def build_file(args: argparse.Namespace) -> int:
-    """Build a catalogue from the original files; raises CatalogueError."""
-    from starpos.sky import tycho2
+    """Build a catalogue from the original files, or from Gaia's places; raises CatalogueError."""
+    from starpos.sky import gaia, tycho2
 
+    if args.originals is None and args.gaia is None:
+        raise CatalogueError("catalogue build: give the original files of Tycho-2, or --gaia TABLE, or both")
+    if args.gaia is None and args.year is not None:
+        raise CatalogueError("--year is for --gaia: give both")
+    if args.originals is None and args.limit_mag is not None:
+        raise CatalogueError("--limit-mag is for the original files: give both")
     overwriting.check(args, Written("--out", args.out, overwriting.stars))
-    made = tycho2.build(args.originals, args.limit_mag, console.ProgressBar())
+    extract = None if args.gaia is None else gaia.read(Path(args.gaia))
+    if args.originals is None:
+        made = catalogue.load_catalogue()
+    else:
+        limit_mag = LIMIT_MAG if args.limit_mag is None else args.limit_mag
+        made = tycho2.build(args.originals, limit_mag, console.ProgressBar())
+    said = ""
+    if extract is not None:
+        year = float(time.gmtime().tm_year) if args.year is None else args.year
+        made, number = gaia.with_gaia(made, extract, year)
+        said = f", {number} of them with Gaia's places about {year:g}"
     try:
         catalogue.save(made, args.out)
     except OSError as e:
         raise CatalogueError(f"{args.out}: cannot be written ({e.strerror}): give another --out") from None
     size = Path(args.out).stat().st_size / 1e6
-    print(f"{args.out}: {len(made)} stars with V < {args.limit_mag:g}, {size:.1f} MB", file=sys.stderr)
+    print(
+        f"{args.out}: {len(made)} stars to V = {made.vmag().max():.2f}{said}, {size:.1f} MB", file=sys.stderr
+    )
     return 0
 
 
@@ -129,7 +172,7 @@ def show_triangles(args: argparse.Namespace) -> int:
 
 
 def show_paper() -> int:
-    """Count the paper's triangles again and print them beside its own numbers."""
+    """Count the paper's triangles again and print them next to its own numbers."""
     from starpos.identification import paper
 
     c = catalogue.load_catalogue()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The commands of `starpos`: what each does, examples of it, and what may come next."""
+"""The commands of `starpos`: a summary, examples and next steps for each."""
 
 from dataclasses import dataclass
 
@@ -28,7 +28,7 @@ COMMANDS = {
             "starpos solve *.fits --tilt tilt.csv --focal-mm 600 --pixel-um 6.4 --self-calibrate --save mine.yaml",
             "starpos solve *.fits --tilt tilt.csv --instrument mine.yaml --near 35.7 51.4 --csv > places.csv",
         ),
-        "starpos report draws the same night; starpos calibrate and --self-calibrate tell A3",
+        "starpos report draws the same night; starpos calibrate and --self-calibrate find A3",
     ),
     "navigate": Command(
         "position, heading and velocity of a voyage: frames and an IMU, while driving, sailing, flying",
@@ -44,7 +44,7 @@ COMMANDS = {
             "starpos detect frame.fits",
             "starpos detect *.fits --csv > stars.csv",
         ),
-        "starpos identify tells which stars they are",
+        "starpos identify names them",
     ),
     "identify": Command(
         "where frames look, lost in space",
@@ -52,10 +52,10 @@ COMMANDS = {
             "starpos identify photo.jpg",
             "starpos identify *.fits --focal-mm 600 --pixel-um 6.4 --jobs auto --csv > where.csv",
         ),
-        "starpos solve makes a place of frames with their tilts and times",
+        "starpos solve computes the position from frames with their tilts and times",
     ),
     "replay": Command(
-        "recorded nights (rosbag2) by the solver's own code: the same fixes as in the running graph",
+        "solve recorded nights (rosbag2) with the solver's own code: the same fixes as in the running graph",
         (
             "starpos replay recorded_night",
             "starpos replay nights/* --params-file mine.yaml --jobs auto --json",
@@ -75,8 +75,19 @@ COMMANDS = {
         (
             "starpos deflection *.fits --tilt tilt.csv --site 47.3 8.5 560 --instrument zenith.yaml --pressure-hpa 950 "
             "--temperature-c 12",
+            "starpos deflection --plan 0.1 --site 47.3 8.5 560 --instrument zenith.yaml",
         ),
-        "docs/how-to/deflection.md leads from a mount and a tiltmeter to a value",
+        "starpos stations and starpos report read what --json prints; docs/how-to/deflection.md has the whole way",
+    ),
+    "stations": Command(
+        "many sessions of starpos deflection: repeats, differences from a geoid grid, levelling, GeoJSON",
+        (
+            "starpos deflection *.fits --tilt tilt.csv --site 47.3 8.5 560 --station P1 --instrument z.yaml --json > "
+            "p1.json",
+            "starpos stations p1.json p2.json --geoid egm96_15.gtx --level P1 P2",
+            "starpos stations *.json --geojson > stations.geojson",
+        ),
+        "starpos report p1.json makes the station's page",
     ),
     "report": Command(
         "nights on one page: stability, scatter, residuals, sky, error budget",
@@ -92,10 +103,10 @@ COMMANDS = {
             "starpos simulate night",
             "starpos simulate turned -n 8 --turn 45 --stars-only --misalignment 1 -2 100 --latitude 47.3 --longitude 8.5",
         ),
-        "starpos solve FOLDER, starpos report FOLDER; truth.json says what is true",
+        "starpos solve FOLDER, starpos report FOLDER; truth.json has the true values",
     ),
     "catalogue": Command(
-        "build the star catalogue, or say what it and its triangles hold",
+        "build the star catalogue, or describe it and its triangles",
         (
             "starpos catalogue info",
             "starpos catalogue deepen --fetch",
@@ -103,12 +114,12 @@ COMMANDS = {
         "starpos identify and starpos solve take the catalogue by themselves",
     ),
     "montecarlo": Command(
-        "identify random fields and work random nights, and count: the paper's tables",
+        "identify random fields, solve random nights, and count successes: the paper's tables",
         ("starpos montecarlo --fields 100", "starpos montecarlo nights --help"),
         "docs/the_paper.md compares the tables with the paper's",
     ),
     "doctor": Command(
-        "what this machine has of what starpos needs, what is missing, and what to type",
+        "which parts that starpos needs this machine has, which are missing, and what to type",
         (
             "starpos doctor",
             "starpos doctor --live --json",

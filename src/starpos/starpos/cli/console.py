@@ -44,7 +44,7 @@ def complain(command: str, error: object) -> None:
 
 
 class ProgressBar:
-    """Progress on standard error: a bar for work of more than BAR_AFTER_S, or lines now and then if it is no terminal.
+    """Progress on standard error: a bar for work of more than BAR_AFTER_S, or occasional lines if it is not a terminal.
 
     terminal_only: no such lines, for work whose results show how far it is.
     """

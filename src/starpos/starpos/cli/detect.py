@@ -15,7 +15,7 @@ from starpos.night.work import OnFile, detected
 if TYPE_CHECKING:
     from starpos.detection import Detection
 
-# of --csv; the stars of --json have the same, without the file
+# columns of --csv; the stars of --json have the same, without the file
 COLUMNS = ("file", "x", "y", "flux", "snr", "sigma_x", "sigma_y", "flags")
 JSON_HELP = (
     "one JSON object a frame: stars, each [x, y, flux, snr, sigma_x, sigma_y, flags], cpu_ms and negative"

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`starpos doctor`: what this machine has of what starpos needs, what is missing, and what to type.
+"""`starpos doctor`: which parts that starpos needs this machine has, which are missing, and what to type.
 
-Nothing that may be missing is imported but inside the check of it.
+A package that may be missing is imported only inside its check.
 """
 
 import argparse
@@ -40,7 +40,7 @@ CV2 = ("opencv-python-headless", "opencv-python", "opencv-contrib-python")
 SERIAL = ("dev/serial/by-id/*", "dev/ttyUSB*", "dev/ttyACM*")
 # interface class of a photo camera, in USB's list
 STILL_IMAGE = "06"
-# What the system tells of a device is far shorter.
+# Maximum size of the system's description of a device.
 MOST_BYTES = 4096
 
 
@@ -65,8 +65,8 @@ def define(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--live",
         action="store_true",
-        help="for an instrument that runs here: a clock that nothing keeps to UTC, no serial port and no camera are "
-        "missing too, and not only noted",
+        help="for an instrument that runs on this machine: also count an unsynchronised clock, no serial "
+        "port and no camera as missing",
     )
     parser.add_argument("--json", action="store_true", help="one JSON object a check instead of lines")
     parser.set_defaults(run=run)
@@ -90,12 +90,12 @@ def _lines(name: str, finding: Finding) -> str:
 
 
 def _safely(check: Callable[[], Finding]) -> Finding:
-    """The finding of a check; one that cannot be made for want of a package, or of a right, says so."""
+    """The finding of a check; a check that lacks a package or a permission says so."""
     try:
         return check()
     except ImportError as error:
         return Finding(
-            State.MISSING, f"cannot be told: {one_line(error)}", "see the packages that are missing"
+            State.MISSING, f"cannot be determined: {one_line(error)}", "see the packages that are missing"
         )
     except (StarposError, OSError) as error:
         return Finding(State.MISSING, one_line(error))
@@ -155,7 +155,7 @@ def star_catalogue() -> Finding:
     where = os.environ.get("STARPOS_CATALOGUE") or "the one that comes with starpos"
     found = f"{len(stars)} stars to V = {stars.vmag().max():.1f}, {where}"
     if deeper.kept() is None:
-        found += "; none deeper, which fields under about 1 deg want (starpos catalogue deepen --fetch)"
+        found += "; no deeper one, which fields under about 1 deg need (starpos catalogue deepen --fetch)"
     return Finding(State.OK, found)
 
 
@@ -203,17 +203,18 @@ def earth_rotation() -> Finding:
 
 
 def clock() -> Finding:
-    """What the kernel says of this machine's clock."""
+    """The kernel's state of this machine's clock."""
     from starpos.session import system_clock
 
     state = system_clock.read()
     if state is None:
-        return Finding(State.NOTE, "the system does not tell whether it is kept to UTC")
+        return Finding(State.NOTE, "the system does not report whether it is kept to UTC")
     if state.synchronised:
         return Finding(State.OK, f"kept to UTC within {state.max_error_s:.2g} s; 1 s is 464 m at the equator")
     return Finding(
         State.NOTE,
-        "nothing keeps it to UTC: frames that are stamped here tell no longitude; recorded ones are not concerned",
+        "nothing keeps it to UTC: frames stamped on this machine give no longitude; recorded ones are not "
+        "affected",
         "sudo apt-get install chrony   # or: sudo timedatectl set-ntp true",
     )
 
@@ -295,5 +296,5 @@ CHECKS: dict[str, Callable[[], Finding]] = {
     "cameras": cameras,
     "ROS 2": ros,
 }
-# what only an instrument that runs here needs
+# checks that only an instrument on this machine needs
 LIVE = ("clock", "serial ports", "cameras")

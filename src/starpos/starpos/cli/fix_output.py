@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The lines, the keys of JSON and the columns of a CSV that tell of fixes: of a frame, and of a night together."""
+"""The lines, JSON keys and CSV columns of fixes: of a frame, and of a night together."""
 
 from collections.abc import Sequence
 
@@ -20,10 +20,10 @@ from starpos.utc import utc_text
 COUNTS = ("frames", "poses", "left_out", "moved")
 # the first line for people
 HEAD = (
-    "file: latitude and longitude (deg, astronomic: as the plumb line has them) +- 1 sigma, heading (deg, from true "
+    "file: latitude and longitude (deg, astronomic: by the plumb line) +- 1 sigma, heading (deg, from true "
     "north over east) +- 1 sigma"
 )
-# of --csv: keys of --json that are one value
+# columns of --csv: keys of --json with a single value
 COLUMNS = ("file", "combined", "night", "status", "utc", "latitude", "longitude", "heading", "latitude_geodetic",
            "longitude_geodetic", "sigma_east_m", "sigma_north_m", "sigma_heading_deg", "stars_detected",
            "stars_matched", "residual_arcsec", "log_odds", "warnings", "frames")  # fmt: skip
@@ -107,10 +107,10 @@ def json_about(s: Solution) -> dict:
 
 
 def line_of(path: str, s: Solution, turning: bool) -> str:
-    """The line of a frame; turning: its place waits for the other headings."""
+    """The line of a frame; turning: its place needs the other headings."""
     if s.fix is None:
         return f"{path}: {s.status.value}, {s.stars_detected} stars detected"
-    # one frame of a turn does not tell A3, so its own place would be over 1000 km wide
+    # one frame of a turn does not determine A3, so the error of its own place would exceed 1000 km
     where = "its place waits for the whole turn" if turning else str(s.fix.in_degrees)
     stars = f", {len(s.names)} of {s.stars_detected} stars" if s.stars_detected else ""
     return f"{path}: {where}{stars}"
@@ -125,7 +125,7 @@ def put_combined(
     vertical: Vertical,
     about: dict | None = None,
 ) -> None:
-    """Write the average of a night, or that there is none; about: more keys of JSON."""
+    """Write the average of a night, or that it is missing; about: more keys of JSON."""
     name = {} if night.folder is None else {"night": night.folder}
     counts = dict.fromkeys(COUNTS) if all_together is None else {k: getattr(all_together, k) for k in COUNTS}
     of_stars = {
@@ -150,7 +150,7 @@ def put_combined(
 
 
 def _lines_of(night: NightFolder, together: Average, vertical: Vertical) -> str:
-    """The lines of an average: its place, the place on WGS 84, where the error comes from, the IERS table."""
+    """The lines of an average: its place, the place on WGS 84, the sources of error, the IERS table."""
     ground = geodetic(together.latitude, together.longitude, 0.0, together.covariance, vertical)
     turned = f" (the last of {together.poses} poses)" if together.poses > 1 else ""
     folder = "" if night.folder is None else f"{night.folder}: "

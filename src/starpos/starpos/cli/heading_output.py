@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The line, the keys of JSON and the columns of a CSV that tell of headings at a known place."""
+"""The line, JSON keys and CSV columns of headings at a known place."""
 
 from collections.abc import Sequence
 
@@ -23,7 +23,7 @@ HEAD = (
     "file: heading (deg, from true north over east) by the plumb line and on WGS 84, pitch (nose up) and roll (left side "
     "up) by the plumb line, each +- 1 sigma"
 )
-# besides those of a fix
+# besides the columns of a fix
 COLUMNS = (*fix_output.COLUMNS, "pitch", "roll", "sigma_pitch_deg", "sigma_roll_deg", "heading_geodetic",
            "sigma_heading_geodetic_deg", "pitch_geodetic", "roll_geodetic")  # fmt: skip
 KEYS = ("heading", "sigma_heading_deg", "pitch", "sigma_pitch_deg", "roll", "sigma_roll_deg", "covariance_attitude",
@@ -38,7 +38,7 @@ def with_heading(
 ) -> dict:
     """The keys of a fix and of the heading at a known place; keys without a value are None.
 
-    The place in the covariances stays a fix's, without the correlation with a heading that does not come from it.
+    The covariances keep the fix's place, without correlation with this heading, which does not come from the fix.
     """
     if found is None or place is None:
         none = {k: _with_variance(values[k], np.nan) for k in COVARIANCES if values[k] is not None}

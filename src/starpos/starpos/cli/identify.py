@@ -39,7 +39,7 @@ def define(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--instrument",
         metavar="FILE",
-        help="instrument file (YAML), whose camera is taken, instead of the next three",
+        help="instrument file (YAML) with the camera, instead of the next three options",
     )
     options.add_optics(parser)
     options.add_lens(parser)
@@ -48,7 +48,7 @@ def define(parser: argparse.ArgumentParser) -> None:
         type=options.number(0.1, 86400),
         default=SEARCH_S,
         metavar="S",
-        help=f"CPU time of the search for a frame of which neither scale nor lens is known ({SEARCH_S:g} s)",
+        help=f"CPU time of the search where neither scale nor lens is known ({SEARCH_S:g} s)",
     )
     jobs.add_jobs(parser)
     parser.set_defaults(run=run)
@@ -90,7 +90,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def as_json(path: str, s: Solution) -> dict:
-    """The solution of a frame as JSON has it; angles in deg, None for what was not found."""
+    """The solution of a frame as JSON has it; angles in deg, None for missing values."""
     a = s.attitude
     return {
         "file": path,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the options say of a night's frames: how they are read, their instrument, tilts, and where it should be."""
+"""What the options state of a night's frames: how they are read, their instrument, tilts, and expected place."""
 
 import argparse
 import math
@@ -19,7 +19,7 @@ def reader_of(args: argparse.Namespace) -> Reader:
 
 
 def given_of(args: argparse.Namespace, first: About | None) -> Given:
-    """The instrument of each frame, whose focal length is that of its header unless the options give one.
+    """The instrument of each frame; the focal length is from its header unless the options give one.
 
     Raises InstrumentError if the options do not fit together, or the first frame has no focal length either.
     """
@@ -48,14 +48,15 @@ def add_near(parser: argparse.ArgumentParser) -> None:
         type=float,
         nargs=2,
         metavar=("LAT", "LON"),
-        help="roughly where the instrument is, deg: a fix that is far from there is told, with what may be wrong, and "
-        "never changed; of pointings without a roll it says which of two places it is, where their elevations leave two",
+        help="approximate position of the instrument, deg: a fix far from it is reported with likely causes "
+        "and never changed; for pointings without a roll it selects between two possible places",
     )
     parser.add_argument(
         "--near-km",
         type=float,
         metavar="KM",
-        help=f"how near that is ({NEAR_KM:g}; 4 sigma of the fix are added)",
+        help=f"distance from --near within which the fix is expected ({NEAR_KM:g}; 4 sigma of the fix are "
+        f"added)",
     )
 
 

@@ -21,13 +21,13 @@ AUTO = "auto"
 
 
 def add_jobs(parser: argparse.ArgumentParser, what: str = "frames") -> None:
-    """Add the options that `workers_of` reads; what: that which is worked."""
+    """Add the options that `workers_of` reads; what: the object of the work."""
     parser.add_argument(
         "-j",
         "--jobs",
         type=_jobs,
         metavar="N|auto",
-        help=f"work {what} on so many processes of this machine (1; auto or 0: one a processor)",
+        help=f"work {what} on this number of processes (1; auto or 0: one per processor)",
     )
     parser.add_argument(
         "--scheduler",
@@ -47,16 +47,18 @@ def workers_of(args: argparse.Namespace, frames: int) -> Workers:
     """The workers that the options ask for, with no more processes than frames; raises InstrumentError."""
     if args.scheduler is not None:
         if args.jobs is not None:
-            raise InstrumentError("--scheduler names machines, --jobs processes of this one: give either")
+            raise InstrumentError(
+                "--scheduler names machines, --jobs processes of this one: give one of the two"
+            )
         return Cluster(args.scheduler)
     number = min(processors() if args.jobs == 0 else args.jobs or 1, frames)
     return Here() if number <= 1 else Processes(number)
 
 
 def watched(answers: Iterable, number: int, what: str = "frame", silent: bool = True) -> Iterator:
-    """The answers as they are, with a progress bar unless standard output shows them on the same terminal.
+    """The answers unchanged, with a progress bar unless standard output shows them on the same terminal.
 
-    silent: whether, where no terminal is, the answers are lines that show how far the work is.
+    silent: whether, without a terminal, the answers are lines that show the progress.
     """
     bar = console.ProgressBar(terminal_only=silent)
     for k, answer in enumerate(answers, 1):
@@ -66,7 +68,7 @@ def watched(answers: Iterable, number: int, what: str = "frame", silent: bool = 
 
 
 def prepare(command: str, instrument: Instrument, about: About) -> None:
-    """Put the tables of a field into the cache, where all processes of a machine find them; says what it lacks."""
+    """Put the tables of a field into the cache, for all processes of a machine; reports what the catalogue lacks."""
     solver = Solver(instrument, catalogue.load_catalogue(), progress=console.ProgressBar())
     # the frames report the error
     with suppress(StarposError):

@@ -21,11 +21,11 @@ from starpos.simulation import montecarlo_fields
 from starpos.sky import catalogue, deeper
 from starpos.sky.catalogue import Catalogue
 
-# % identified of 1000 fields with so many false stars, and of fields of so many stars
+# % identified of 1000 fields by number of false stars, and by number of stars
 PAPER_FALSE = {0: "99.2", 1: "98.1", 2: "96.7"}
 PAPER_FEW = {5: "> 95", 6: "> 99", 7: "> 99.9"}
 PAPER_CAMERA = Camera.from_focal(5616, 3744, 93750.0)
-# a field of the paper holds so many stars on average
+# limiting magnitude of the paper's fields, and their mean number of stars
 PAPER_LIMIT_MAG, PAPER_STARS = 9.0, 24.9
 
 EPILOG = """Realistic fields: brightness off by 0.3 mag, 5 % of the stars not detected, stars closer than 4 px one.
@@ -55,7 +55,7 @@ def define(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--stars", type=options.number(1, 100, int), nargs="*", default=[5, 6, 7], metavar="K",
-        help="fields of only so many stars (5 6 7)",
+        help="star counts of the fields reduced to their brightest stars (5 6 7)",
     )  # fmt: skip
     parser.add_argument(
         "--points",
@@ -69,7 +69,7 @@ def define(parser: argparse.ArgumentParser) -> None:
         "--limit-mag",
         type=options.number(0, 20),
         metavar="V",
-        help="faintest star (9; what gives as many in other fields)",
+        help="faintest star (9; in fields of another size the limit that gives as many stars)",
     )
     parser.add_argument(
         "--noise-px", type=options.number(0.001, 10), default=0.05, metavar="PX", help="centroids' (0.05)"

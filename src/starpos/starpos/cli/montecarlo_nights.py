@@ -30,8 +30,8 @@ TARGETS_ARCSEC = (1.0, 0.15)
 ALLOWED = 0.10
 
 NIGHTS = """The paper's fifty nights: a new place, date, pointing, A3 and zero each night, 25 frames at each of four
-headings, A3 told to nobody, clock to 1 ms; mean absolute errors on the ground (longitude times the cosine of latitude)
-beside the paper's 30.2 and 49.0 arcsec (932 and 1510 m).  Exit status: 0; 1 where they are above the aim of 1 arcsec
+headings, A3 unknown, clock to 1 ms; mean absolute errors on the ground (longitude times the cosine of latitude)
+next to the paper's 30.2 and 49.0 arcsec (932 and 1510 m).  Exit status: 0; 1 where they are above the aim of 1 arcsec
 (0.15 with a tiltmeter of 0.1 arcsec, and in proportion)."""
 HONESTY = """Nights turned on the spot, and nights calibrated at one place and used days later at another, every source of
 error drawn at random: the errors squared over their claimed covariance should average 2 (position) and 1 (heading).
@@ -132,7 +132,7 @@ def _errors(args: argparse.Namespace) -> montecarlo_nights.InclinometerErrors:
 def _either(
     rng: np.random.Generator, stars: Catalogue, errors: montecarlo_nights.InclinometerErrors
 ) -> NightOutcome:
-    """A night of either kind, with fewer frames than the paper's so that more nights can be worked."""
+    """A night of either kind, with fewer frames than the paper's so that more nights can be solved."""
     if rng.random() < 0.5:
         headings = int(rng.integers(3, 9))
         return montecarlo_nights.turned_night(rng, stars, errors, headings, int(rng.integers(1, 7)))
@@ -140,7 +140,7 @@ def _either(
 
 
 def _all(args: argparse.Namespace, night: Callable) -> list[NightOutcome]:
-    """Every night's outcome, the same ones however many processes there are."""
+    """Every night's outcome, independent of the number of processes."""
     seeds, outcomes, bar = np.random.SeedSequence(args.seed).spawn(args.nights), {}, console.ProgressBar()
     for k, outcome in _each(night, seeds, min(args.jobs, args.nights)):
         outcomes[k] = outcome

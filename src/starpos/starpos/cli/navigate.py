@@ -71,15 +71,16 @@ def define(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--vehicle",
         choices=tuple(LAWS),
-        help="parked: it stands; without --velocity the law by which its speed changes, and a rover's standstills as the "
-        "record shows them (anything that moves)",
+        help="parked: it stands still; any other, without --velocity, sets the law by which its speed "
+        "changes, for a rover also standstills found in the record (default: anything that moves)",
     )
     parser.add_argument(
         "--mount-stddev",
         type=options.number(1e-4, MOST_MOUNT_DEG),
         default=MOUNT_STDDEV_DEG,
         metavar="DEG",
-        help="how well the camera sits as the instrument says, an axis: z up, the top of the frame forward "
+        help="error of the camera's stated orientation on the vehicle, 1 sigma an axis: z up, the top of "
+        "the frame forward "
         f"({MOUNT_STDDEV_DEG:g})",
     )
     parser.add_argument(
@@ -95,9 +96,9 @@ def define(parser: argparse.ArgumentParser) -> None:
         type=options.number(0.01, 50),
         default=math.nan,
         metavar="M_PER_S",
-        help="what wind or current change in ten minutes, 1 sigma an axis, where you know it: the claim is that of what "
-        "is stated. Without --velocity minutes of the record may widen it (a ship's current 0.07, a drone's wind 0.3); "
-        "with --velocity it is of --drift-stddev (a fifth of it)",
+        help="what wind or current change in ten minutes, 1 sigma an axis, if you know it: the claimed "
+        "error follows from it. Unset, without --velocity: a ship's current 0.07, a drone's wind 0.3, "
+        "widened where the record shows more; with --velocity: a fifth of --drift-stddev",
     )
     options.add_stamps(parser)
     parser.add_argument(
@@ -113,7 +114,7 @@ def define(parser: argparse.ArgumentParser) -> None:
 
 @dataclass(frozen=True)
 class FrameSeen:
-    """A frame's time, its stars as far as they are identified, and else why not, or what else is to be said of it."""
+    """A frame's time, its identified stars, or why it has none, or a remark."""
 
     utc_unix_s: float | None
     sighting: IdentifiedFrame | None
@@ -186,13 +187,13 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _mount_stddev(args: argparse.Namespace, doubt: AxisDoubt | None) -> float:
-    """1 sigma in rad of the mount, of which an axis that nobody knows is a part; InstrumentError if that is too wide."""
+    """1 sigma in rad of the mount, including an unknown optical axis; InstrumentError if it is too large."""
     stddev = math.radians(args.mount_stddev)
     if doubt is None:
         return stddev
     said, stddev = doubt.counted_as("the mount"), math.hypot(stddev, doubt.error_rad)
     if math.degrees(stddev) > MOST_MOUNT_DEG:
-        raise InstrumentError(f"{said}; a mount that is known no better tells no place under way")
+        raise InstrumentError(f"{said}; with a mount known no better, there is no position under way")
     console.complain("navigate", said)
     return stddev
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Options that several commands have: frames, instrument and air, and what is made of them."""
+"""Options shared by several commands: frames, instrument and air, and the objects made from them."""
 
 import argparse
 from collections.abc import Callable
@@ -31,10 +31,12 @@ def add_frames(parser: argparse.ArgumentParser, pointings: bool = False) -> None
         parser.add_argument(
             "--pointings",
             metavar="CSV",
-            help="instead of frames, what a plate solver found of them: utc_unix_s (mid-exposure), ra_deg, dec_deg, "
+            help="instead of frames, what a plate solver found for them: utc_unix_s (mid-exposure), ra_deg, "
+            "dec_deg, "
             "roll_deg, sigma_arcsec, sigma_roll_arcsec[, exposure_s]: ICRS of the frame's centre, the position angle of "
             "its top from north over east, 1 sigma of the centre along each of two axes and of the turn about it; "
-            "without a roll elevations alone tell the place, from three directions or more, and no heading",
+            "without a roll only elevations count: they give a position from three directions or more, and "
+            "no heading",
         )
 
 
@@ -49,7 +51,7 @@ def add_parameters(parser: argparse.ArgumentParser, whose: str, such_as: str) ->
         action="append",
         default=[],
         metavar="[NODE:]NAME:=VALUE",
-        help=f"a parameter, such as {such_as}, by default of the solver; it counts more than the file's",
+        help=f"a parameter, such as {such_as}, of the solver unless a node is named; it overrides the file's",
     )
 
 
@@ -60,7 +62,7 @@ def add_remaps(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="NAME:=TOPIC",
-        help=f"the topic of a bag that serves as one of {', '.join(drivers.DRIVER_INPUTS)}, such as "
+        help=f"the bag's topic to use as one of {', '.join(drivers.DRIVER_INPUTS)}, such as "
         "camera/image_raw:=/cam0/image_raw; without it the one with this name, or the only one of its type",
     )
 
@@ -76,7 +78,7 @@ def check_frames(args: argparse.Namespace) -> None:
         raise InstrumentError("give either frames or --pointings CSV" + (", not both" if args.frames else ""))
     if args.pointings is not None and (args.shutter_delay, args.readout) != (None, None):
         raise InstrumentError(
-            "--shutter-delay and --readout are for frames: the times in --pointings are those when the sky was seen"
+            "--shutter-delay and --readout are for frames: the times in --pointings are when the sky was seen"
         )
 
 
@@ -89,7 +91,8 @@ def has_own_level(args: argparse.Namespace) -> bool:
         return False
     if args.tilt is not None or getattr(args, "self_calibrate", False):
         raise InstrumentError(
-            f"{args.instrument} is of a camera that is fixed to the ground, without an inclinometer: leave out --tilt "
+            f"{args.instrument} describes a camera fixed to the ground, without an inclinometer: leave out "
+            f"--tilt "
             "and --self-calibrate, or give another instrument file"
         )
     return True
@@ -177,7 +180,8 @@ def add_instrument(parser: argparse.ArgumentParser) -> None:
         "--misalignment-stddev",
         type=number(0, 360_000),
         metavar="ARCSEC",
-        help="error of A3 about each axis; without it A3 is not known (10 deg and any turn, over 1000 km)",
+        help="error of A3 about each axis; without it A3 counts as unknown (10 deg and any turn, over 1000 "
+        "km)",
     )
     parser.add_argument(
         "--inclinometer",
@@ -214,7 +218,8 @@ def add_turn(parser: argparse.ArgumentParser) -> None:
         "--turn-stddev",
         type=number(1e-6, 180),
         metavar="DEG",
-        help="how well the given A3 has its turn about the plumb line, the way the inclinometer faces (180: not at all)",
+        help="error of the given A3's turn about the plumb line, the direction the inclinometer faces (180: "
+        "unknown)",
     )
 
 
@@ -241,6 +246,12 @@ def check_self_calibration(args: argparse.Namespace) -> None:
 
 def add_size(parser: argparse.ArgumentParser) -> None:
     """Add the frame size, and make the paper's optics the default."""
+    add_frame_size(parser)
+    parser.set_defaults(focal_mm=600.0, pixel_um=6.4)
+
+
+def add_frame_size(parser: "argparse._ActionsContainer") -> None:
+    """Add --size, the paper's by default."""
     parser.add_argument(
         "--size",
         type=number(16, 100_000, int),
@@ -249,7 +260,6 @@ def add_size(parser: argparse.ArgumentParser) -> None:
         metavar=("W", "H"),
         help="frame size in px (5616 3744)",
     )
-    parser.set_defaults(focal_mm=600.0, pixel_um=6.4)
 
 
 def camera_of(args: argparse.Namespace) -> Camera:
@@ -269,7 +279,10 @@ def add_air(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--temperature-c", type=float, metavar="C", help="air temperature")
     parser.add_argument("--humidity", type=float, metavar="0..1", help="relative humidity")
     parser.add_argument(
-        "--wavelength-um", type=float, metavar="UM", help="middle of the light that the camera sees (0.55)"
+        "--wavelength-um",
+        type=float,
+        metavar="UM",
+        help="mean wavelength of the light that the camera sees (0.55)",
     )
 
 
@@ -288,7 +301,7 @@ def number(low: float, high: float, kind: type[int] | type[float] = float) -> Ca
 
 
 def atmosphere_of(args: argparse.Namespace) -> Atmosphere:
-    """The air from the options, as far as they give it; `args.air` is that of a field report."""
+    """The air from the options, as far as they give it; `args.air`: from a field report."""
     if (stated := getattr(args, "air", None)) is not None:
         return stated
     pressure_pa = None if args.pressure_hpa is None else args.pressure_hpa * 100
@@ -346,8 +359,8 @@ def _with_times(known: instrument.Instrument, args: argparse.Namespace) -> instr
 
 
 class HasFocalLength(Protocol):
-    """A frame, or what is known of it."""
+    """A frame, or its header's facts."""
 
     @property
     def focal_px(self) -> float | None:
-        """Focal length in px that the frame's header states; None if it states none."""
+        """Focal length in px from the frame's header; None without one."""

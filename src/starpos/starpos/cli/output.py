@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Standard output of a command: a table for people, JSON objects, or the rows of a CSV, as its options ask."""
+"""Standard output of a command: a table for people, JSON objects, or CSV rows, by its options."""
 
 import argparse
 import csv
@@ -18,7 +18,7 @@ def add_formats(parser: argparse.ArgumentParser, json_help: str, csv_help: str |
 
 
 class Output:
-    """Writes one answer after another; the first line says what follows, in JSON each object itself.
+    """Writes one answer after another; the first line describes them, except in JSON.
 
     columns: keys of the answers that are columns of the CSV.  head: the first line for people.
     """
@@ -46,5 +46,5 @@ class Output:
 
 
 def _cell(value: object) -> object:
-    """A value of JSON in a CSV: of several, the words with spaces between."""
+    """A value of JSON in a CSV; several words are joined by spaces."""
     return " ".join(map(str, value)) if isinstance(value, list) else value

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files that options name to be written: refused, before the work, where they would replace what is not theirs."""
+"""Files that options name to be written: refused, before the work, if they would replace files of another kind."""
 
 import argparse
 import json
@@ -17,7 +17,7 @@ from starpos.instrument.instrument import Instrument
 from starpos.sky import catalogue
 
 # options of which a command reads a file, or several
-INPUTS = ("frames", "tilt", "pointings", "imu", "geoid", "originals")
+INPUTS = ("frames", "tilt", "pointings", "imu", "geoid", "originals", "gaia")
 # the name in the camera's file, which the camera node uses
 CAMERA_NAME = "camera"
 # 'a.fits[2]' is an image in the file a.fits
@@ -29,7 +29,7 @@ MOST_LIST_BYTES = 1_000_000
 class Written:
     """A file that an option names to be written.
 
-    check: raises InstrumentError, without what to do, unless the file of that name, which is there, may be replaced.
+    check: raises InstrumentError, without advice, unless the existing file of that name may be replaced.
     """
 
     option: str
@@ -40,8 +40,8 @@ class Written:
 def check(args: argparse.Namespace, *written: Written) -> None:
     """Raise InstrumentError unless each of these files may be written.
 
-    One that is there may be if it is of the kind that the command writes. An input may not, whatever it is, nor may two
-    be one file. The file of --instrument may: it keeps all that was not found anew.
+    An existing file may be replaced if it is of the kind that the command writes. An input may not, and no two outputs
+    may be one file. The file of --instrument may: it keeps everything that was not found anew.
     """
     read, names = set(_inputs(args)), set()
     for output in written:
@@ -75,13 +75,13 @@ def _inputs(args: argparse.Namespace) -> Iterator[str]:
 def camera(path: Path) -> None:
     """The check of a camera's calibration file."""
     if not camera_file.as_written(path, CAMERA_NAME):
-        raise _there(path, "starpos calibrate has not made it as it is")
+        raise _there(path, "starpos calibrate did not write it in this form")
 
 
 def picture(path: Path) -> None:
-    """The check of a picture: a PNG can say who has made it."""
+    """The check of a picture: a PNG names the program that made it."""
     if not (path.is_file() and path.suffix.lower() == ".png" and files.has_mark(path)):
-        raise _there(path, "no picture of starpos")
+        raise _there(path, "not a picture made by starpos")
 
 
 def stars(path: Path) -> None:
@@ -89,7 +89,7 @@ def stars(path: Path) -> None:
     try:
         catalogue.load_catalogue(str(path))
     except CatalogueError:
-        raise _there(path, "no catalogue of starpos") from None
+        raise _there(path, "not a catalogue made by starpos") from None
 
 
 def failed_fields(folder: Path) -> None:
@@ -103,7 +103,7 @@ def failed_fields(folder: Path) -> None:
         except (ValueError, TypeError, RecursionError):
             is_ours = False
         if not is_ours:
-            raise _there(path, "starpos montecarlo has not made it")
+            raise _there(path, "starpos montecarlo did not write it")
 
 
 def save_instrument(

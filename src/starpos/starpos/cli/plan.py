@@ -12,9 +12,9 @@ from starpos.night.work import OnFile
 
 @dataclass(frozen=True)
 class Plan:
-    """How to work on a night: what is done on each frame, the instruments, and the solver of its first frame.
+    """How to solve a night: the work on each frame, the instruments, and the solver of its first frame.
 
-    solver: None if no frame can be read; each one reports why then.
+    solver: None if no frame can be read; then each one reports why.
     """
 
     night: NightFolder

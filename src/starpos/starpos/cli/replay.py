@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`starpos replay`: what the node `solver` makes of recorded nights, by the node's own code, without ROS."""
+"""`starpos replay`: solve recorded nights with the code of the node `solver`, without ROS."""
 
 import argparse
 from collections.abc import Sequence
@@ -59,7 +59,7 @@ def define(parser: argparse.ArgumentParser) -> None:
 
 @dataclass
 class PlayedNight:
-    """What came of a bag: frames read, solutions, the average of its place, what was said; trouble: why it broke off."""
+    """The result of a bag: frames read, solutions, the average of its place, sentences; trouble: why it broke off."""
 
     frames: int = 0
     solutions: list[Solution] = field(default_factory=list)
@@ -69,7 +69,7 @@ class PlayedNight:
 
     @property
     def summary(self) -> str:
-        """How many frames there were, and what came of them."""
+        """Numbers of frames, answers and fixes."""
         fixes = sum(s.fix is not None for s in self.solutions)
         return f"{self.frames} frames, {len(self.solutions)} answers, {fixes} fixes"
 
@@ -81,16 +81,16 @@ class _Said:
         self._said = night.said
 
     def came(self, name: str) -> None:
-        """Nothing is said of a sound message."""
+        """A good message is not mentioned."""
 
     def refuse(self, name: str, sentence: str) -> None:
         self.error(sentence)
 
     def info(self, message: str) -> None:
-        """Fixes speak for themselves."""
+        """Each fix has its own line."""
 
     def warning(self, message: str) -> None:
-        """The frame's own line tells it."""
+        """The frame's own line shows it."""
 
     def error(self, message: str) -> None:
         if message not in self._said:
@@ -136,7 +136,7 @@ def _light(solution: Solution) -> Solution:
 def run(args: argparse.Namespace) -> int:
     settings = settings_of(args.params_file, args.param, args.namespace)
     output = Output(args, COLUMNS, HEAD)
-    # a wrong parameter is told once, not of each bag
+    # a wrong parameter is reported once, not for each bag
     drivers_of(args.params_file, args.param, args.namespace)
     work = Playing(args.params_file, tuple(args.param), args.namespace, options.remaps_of(args))
     with jobs.workers_of(args, len(args.bags)) as workers:

@@ -7,17 +7,16 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from starpos.cli import console, options
+from starpos.cli import bags, console, options
 from starpos.cli.inputs import given_of
 from starpos.cli.solve_gnss import read_receiver
 from starpos.cli.vertical import add_vertical, vertical_of
 from starpos.errors import FrameError, InstrumentError
-from starpos.frames.stars import no_stars
 from starpos.night.folder import exposures, frames_in
 from starpos.night.night import Night
 from starpos.night.reading import First, Given, Reader
 from starpos.night.solving import Exposures, solved_night
-from starpos.session.parameter_file import drivers_of, of_solver
+from starpos.session.parameter_file import of_solver
 from starpos.sky import catalogue
 from starpos.utc import utc_text
 
@@ -26,9 +25,10 @@ if TYPE_CHECKING:
     from starpos.night.recorded import OfBag
 
 NO_FIX = 1
-# so many nights get all their figures; more get the table and the errors only
+# maximum number of nights with all figures; more nights get the table and the errors only
 ALL_FIGURES = 6
-PIP = "pip install matplotlib rosbags"
+# ending of a session's result
+SESSION = ".json"
 
 
 def define(parser: argparse.ArgumentParser) -> None:
@@ -37,7 +37,7 @@ def define(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         metavar="NIGHT",
         help="a folder of frames (FITS, or CSV of stars) with tilt.csv and perhaps truth.json, or a rosbag2, of the "
-        "instrument or of a robot's own camera and IMU",
+        "instrument or of a robot's own camera and IMU; or sessions of starpos deflection --json (.json)",
     )
     parser.add_argument(
         "-o", "--out", default="starpos-report", metavar="FOLDER", help="index.html and PNGs (starpos-report)"
@@ -48,14 +48,7 @@ def define(parser: argparse.ArgumentParser) -> None:
         help="instead of a page, write one night's lists of stars, tilts, instrument, air, versions and truth.json into "
         "one file that can be sent and `starpos solve` reads: no pictures, paths, names or serial numbers",
     )
-    parser.add_argument("--namespace", metavar="NAME", help="of the instrument, in a bag that holds several")
-    options.add_parameters(
-        parser,
-        "of detector and inclinometer, where stars and tilts are made of a robot's images and IMU; what the solver's are "
-        "is given by the other options",
-        "detector:stamp:=start",
-    )
-    options.add_remaps(parser)
+    bags.add_bag(parser)
     options.add_instrument(parser)
     options.add_air(parser)
     add_vertical(parser)
@@ -79,12 +72,14 @@ def run(args: argparse.Namespace) -> int:
     if args.field is not None:
         return _pack(args)
     if find_spec("matplotlib") is None:
-        raise InstrumentError(f"a report is drawn with matplotlib, which is not here: {PIP}")
+        raise InstrumentError(f"a report is drawn with matplotlib, which is not here: {bags.PIP}")
     from starpos.report.page import page
     from starpos.report.pictures import nights_picture, pictures_of
     from starpos.report.writing import PAGE, check, write
 
     check(Path(args.out))
+    if _are_sessions(args.nights):
+        return _stations(args)
     nights = [_night(Path(path), args) for path in args.nights]
     for night in nights:
         for sentence in (*night.remarks, *([night.why_not] if night.why_not else [])):
@@ -97,7 +92,7 @@ def run(args: argparse.Namespace) -> int:
         bar("figures", (k + 1) / len(nights))
     known = [(k, n) for k, n in enumerate(nights, 1) if n.truth and n.combined]
     overall = [nights_picture(known)] if len(nights) > 1 and known else []
-    html = page(nights, each, overall, utc_text(time.time())[:16].replace("T", " ") + " UTC")
+    html = page(nights, each, overall, _now_text())
     files = {f"{p.name}.png": p.png for p in overall}
     for k, pictures in enumerate(each, 1):
         prefix = f"night{k}-" if len(nights) > 1 else ""
@@ -112,6 +107,41 @@ def _check_gnss(args: argparse.Namespace) -> None:
         raise InstrumentError(
             "--gnss is of one night, and goes with neither --self-calibrate nor --field: leave one out"
         )
+
+
+def _are_sessions(paths: list[str]) -> bool:
+    """Whether the results of deflection sessions are given; raises FrameError for these and nights together."""
+    results = [path for path in paths if path.lower().endswith(SESSION)]
+    if results and len(results) < len(paths):
+        raise FrameError(f"{results[0]}: give either nights or sessions of starpos deflection, not both")
+    return bool(results)
+
+
+def _stations(args: argparse.Namespace) -> int:
+    """Write the page of a zenith camera's stations."""
+    from starpos.earth import geoid
+    from starpos.report.station_page import station_page
+    from starpos.report.writing import PAGE, write
+    from starpos.zenith import session_file
+    from starpos.zenith.stations import against_grid, stations_of
+
+    stations = stations_of([session_file.read(path) for path in args.nights])
+    for station in stations:
+        if station.doubt:
+            console.complain("report", station.doubt)
+    grid = None if args.geoid is None else geoid.read(args.geoid)
+    compared = [None if grid is None else against_grid(station, grid) for station in stations]
+    html, pictures = station_page(
+        stations, compared, "" if args.geoid is None else Path(args.geoid).name, _now_text()
+    )
+    files = {f"{name}.png": picture.png for name, picture in pictures.items()}
+    write(Path(args.out), files | {PAGE: html.encode(errors="replace")})
+    print(Path(args.out) / PAGE)
+    return 0
+
+
+def _now_text() -> str:
+    return utc_text(time.time())[:16].replace("T", " ") + " UTC"
 
 
 def _pack(args: argparse.Namespace) -> int:
@@ -149,9 +179,9 @@ def _night(path: Path, args: argparse.Namespace) -> Night:
 
 def _exposures(path: Path, args: argparse.Namespace) -> "Exposures | tuple[Recorded, OfBag]":
     """The exposures of a folder, or what a bag holds; raises StarposError if there is nothing to work on."""
-    from starpos.night import bag, recorded
+    from starpos.night import bag
 
-    air, vertical, progress = options.atmosphere_of(args), vertical_of(args), console.ProgressBar()
+    air, vertical = options.atmosphere_of(args), vertical_of(args)
     if not path.exists():
         raise FrameError(f"{path}: there is no such night: give a folder, or a rosbag2")
     if not bag.is_bag(path):
@@ -162,11 +192,4 @@ def _exposures(path: Path, args: argparse.Namespace) -> "Exposures | tuple[Recor
         about = First(Reader())(tuple(map(str, frames_in(path))))
         given = Given(None) if about is None else given_of(args, about)
         return exposures(path, given, air, vertical)
-    if find_spec("rosbags") is None:
-        raise FrameError(f"{path}: bags are read with rosbags, which is not here: {PIP}")
-    any_camera = options.instrument_of(args, no_stars(100, 100, focal_px=1000.0))
-    drivers = drivers_of(args.params_file, args.param, args.namespace, options.remaps_of(args))
-    found = bag.read(path, args.namespace, any_camera.inclinometer.noise_rad, drivers, progress)
-    told = (args.instrument, args.focal_mm) != (None, None)
-    cameras = found.cameras if args.focal_mm is None else {}
-    return found, recorded.OfBag(any_camera, cameras, any_size=told)
+    return bags.read_bag(path, args)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The options for a place that is known, at which the stars alone tell heading, pitch and roll."""
+"""The options for a known place, at which the stars alone determine heading, pitch and roll."""
 
 import argparse
 from dataclasses import replace
@@ -19,8 +19,9 @@ def add_site(parser: argparse.ArgumentParser) -> None:
         type=float,
         nargs="+",
         metavar=("LAT", "LON HEIGHT"),
-        help="the place is known, deg, by gravity unless --geodetic says otherwise, and maybe its height above the "
-        "ellipsoid, m: heading, pitch and roll of each frame there; needs no --tilt, without which the place is null",
+        help="known position, deg (by gravity unless --geodetic), and optionally its height above the "
+        "ellipsoid, m: gives heading, pitch and roll of each frame; needs no --tilt; without tilts the "
+        "position of a frame is null",
     )
     parser.add_argument(
         "--geodetic",
@@ -36,7 +37,7 @@ def add_site(parser: argparse.ArgumentParser) -> None:
 
 
 def place_of(args: argparse.Namespace, vertical: Vertical) -> KnownPlace | None:
-    """The place of --site, None without it; InstrumentError for options that do not fit, PlaceError for no place.
+    """The place of --site, None without it; InstrumentError for bad options, PlaceError for an impossible place.
 
     vertical: the deflection by the other options.
     """
@@ -46,7 +47,8 @@ def place_of(args: argparse.Namespace, vertical: Vertical) -> KnownPlace | None:
         return None
     if len(args.site) not in (2, 3):
         raise InstrumentError(
-            f"--site has {len(args.site)} numbers: give latitude, longitude and maybe the height in m, after the frames"
+            f"--site has {len(args.site)} numbers: give latitude, longitude and optionally the height in m, "
+            f"after the frames"
         )
     if args.self_calibrate:
         raise InstrumentError(

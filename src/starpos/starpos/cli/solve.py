@@ -59,7 +59,7 @@ def define(parser: argparse.ArgumentParser) -> None:
         "--save",
         metavar="OUT",
         help="write the A3 of --self-calibrate into an instrument file (YAML); one that is there keeps its other keys; "
-        "exit status 1 if the headings hardly tell A3, and nothing is written",
+        "exits with status 1 and writes nothing if the headings do not determine A3",
     )
     jobs.add_jobs(parser)
     parser.set_defaults(run=run)
@@ -121,14 +121,14 @@ def _run(args: argparse.Namespace) -> int:
             except TiltError as error:
                 statuses.append(_refused(error, given))
         calls = ((plan.work, path) for plan in plans for path in plan.night.frames)
-        # the lines of a turn wait for its end, and show no progress
+        # the lines of a turn come at its end, and show no progress
         answers = jobs.watched(
             workers.map(calls),
             sum(len(p.night.frames) for p in plans),
             silent=not (args.self_calibrate or args.gnss),
         )
         for plan in plans:
-            # takes the answers of this night, and leaves the others
+            # takes the answers of this night, and leaves the rest
             rows: Iterable = zip(plan.night.frames, answers, strict=False)
             if receiver is not None:
                 statuses.append(solve_gnss.run(args, output, plan, list(rows), receiver, vertical))
@@ -179,7 +179,7 @@ def _plan(
 
 
 def _turned(args: argparse.Namespace, plan: Plan, rows: list) -> tuple[list, int]:
-    """(path, Solution or FrameError) of frames (path, Identifying's answer or FrameError), with the A3 that they tell.
+    """(path, Solution or FrameError) of frames (path, Identifying's answer or FrameError), with their A3.
 
     Returns the exit status of saving that A3 too.
     """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`starpos solve --gnss`: frames with a GNSS receiver beside them, which teaches the instrument and is guarded."""
+"""`starpos solve --gnss`: frames with a GNSS receiver, which teaches the instrument and is guarded."""
 
 import argparse
 from dataclasses import replace

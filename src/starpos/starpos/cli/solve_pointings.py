@@ -30,20 +30,20 @@ from starpos.night.together import turned
 from starpos.sky import catalogue
 from starpos.utc import utc_text
 
-# the status of a row that tells an elevation
+# the status of a row that gives an elevation
 ELEVATION = "elevation alone"
-ELEVATIONS_HEAD = "row: how far from the zenith its direction is; together these tell the place"
+ELEVATIONS_HEAD = "row: the zenith distance of its direction; together these give the position"
 
 
 def run(args: argparse.Namespace) -> int:
-    """Work on the table of --pointings; returns the exit status."""
+    """Solve the table of --pointings; returns the exit status."""
     near = near_of(args)
     pointings, vertical = read_pointings(args.pointings), vertical_of(args)
     own_level = options.has_own_level(args)
     if args.tilt is None and not own_level:
         raise InstrumentError("--pointings needs the tilts: give --tilt CSV")
     if args.jobs is not None or args.scheduler is not None:
-        raise InstrumentError("--jobs and --scheduler are for frames: --pointings are worked in a moment")
+        raise InstrumentError("--jobs and --scheduler are for frames: --pointings take only a moment")
     solver, saving = _solver_of(args), 0
     check_save(args, solver.instrument)
     tilts = NO_TILTS if own_level else checked_tilts("solve", args.tilt, solver.instrument)
@@ -78,7 +78,7 @@ def _from_elevations(
     vertical: Vertical,
     near: Near | None,
 ) -> int:
-    """Print the zenith distance of each row and the place that they tell together; returns the exit status."""
+    """Print each row's zenith distance and the place that they give together; returns the exit status."""
     found = from_elevations(solver, pointings, tilts, near, args.self_calibrate)
     for p, circle in zip(pointings, found.circles, strict=True):
         if isinstance(circle, StarposError):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Words what a night comes to: a line for each frame, A3 where it was found by turning, the place of all together."""
+"""Prints the result of a night: a line for each frame, A3 if it was found by turning, the place of all together."""
 
 import argparse
 from collections.abc import Iterable
@@ -32,9 +32,9 @@ def tell(
     given: Instrument | None = None,
     place: KnownPlace | None = None,
 ) -> tuple[int, str]:
-    """Write (path, Solution or FrameError) of each frame, and what they come to together.
+    """Write (path, Solution or FrameError) of each frame, and their common result.
 
-    given: the instrument whose A3 was taken as it is; None where it was found by turning.
+    given: the instrument whose A3 was used unchanged; None if A3 was found by turning.
     place: the known place, whose headings are then reported; None without one.
     Returns the exit status, and a frame that was not identified if no frame has a fix, else ''.
     """
@@ -82,13 +82,13 @@ def tell(
 
 
 def check_save(args: argparse.Namespace, instrument: Instrument) -> None:
-    """Raise InstrumentError if the file of --save is there and is of another instrument."""
+    """Raise InstrumentError if the file of --save exists and describes another instrument."""
     if args.save is not None:
         instrument_update.check_fits(Path(args.save), instrument)
 
 
 def tell_turned(args: argparse.Namespace, night: NightFolder, turned: TurnedNight) -> int:
-    """Say what was found by turning, and write A3 as --save asks; NO_FIX where that is asked and nothing is written."""
+    """Say what was found by turning, and write A3 as --save asks; NO_FIX if it is asked for and not written."""
     if turned.calibrated is None or not turned.worth_saving:
         say(night, *turned.remarks, *([] if args.save is None else [f"{args.save} is not written"]))
         return 0 if args.save is None else NO_FIX

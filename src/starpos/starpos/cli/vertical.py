@@ -28,28 +28,30 @@ def add_vertical(parser: argparse.ArgumentParser) -> None:
         "--altitude-m",
         type=options.number(-1000, 100_000),
         metavar="M",
-        help="height above the ellipsoid: plumb lines curve by 0.17 arcsec (5 m) a km at 45 deg; not with --xi and "
-        "--eta, which are those at the instrument",
+        help="height above the ellipsoid: plumb lines curve by 0.17 arcsec (5 m) a km at 45 deg; not with "
+        "--xi and --eta, which hold at the instrument",
     )
 
 
 def vertical_of(args: argparse.Namespace) -> Vertical:
     """The deflection that is given by hand or by a geoid; without either an unknown one.  Raises StarposError.
 
-    One given by hand is that at the instrument; the others are those at the geoid, and plumb lines curve above it.
+    A deflection given by hand holds at the instrument; others hold at the geoid, and plumb lines curve above it.
     """
     by_hand = args.xi, args.eta, args.deflection_stddev
     if args.geoid is not None:
         if by_hand != (None, None, None):
             raise InstrumentError(
-                "--geoid tells the deflection and its error: give either it or --xi, --eta and theirs"
+                "--geoid gives the deflection and its error: give either --geoid or --xi, --eta and "
+                "--deflection-stddev"
             )
         return _at_height(geoid.read(args.geoid), args)
     if by_hand == (None, None, None):
         return _at_height(Deflection(), args)
     if args.altitude_m is not None:
         raise InstrumentError(
-            "--altitude-m is for a deflection at the geoid: leave it out, --xi and --eta are those at the instrument"
+            "--altitude-m is for a deflection at the geoid: leave it out, --xi and --eta hold at the "
+            "instrument"
         )
     stddev = args.deflection_stddev
     if stddev is None:

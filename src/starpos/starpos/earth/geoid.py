@@ -4,6 +4,7 @@
 import math
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -11,6 +12,9 @@ from starpos.earth.ellipsoid import curvature_radii_m
 from starpos.earth.geoid_file import Grid, read_grid
 from starpos.earth.vertical import Deflection
 from starpos.units import ARCSEC
+
+if TYPE_CHECKING:
+    from scipy.interpolate import RectBivariateSpline
 
 # Nodes under the spline in each direction: with 8 its ends have no effect (0.27^8), with 2 it is a single cubic.
 REACHES = (8, 4, 2)
@@ -59,8 +63,27 @@ class Geoid:
             return Deflection()
         return Deflection(xi, eta, stddev)
 
+    def undulation_m(self, latitude: float, longitude: float) -> float:
+        """Height (m) of the geoid above WGS 84 at a place in rad; NaN without data."""
+        spline, row, column, _, _ = self._spline(float(np.degrees(latitude)), float(np.degrees(longitude)))
+        return math.nan if spline is None else float(spline(row, column).item())
+
+    def node_m(self, latitude: float) -> float:
+        """Distance (m) between nodes to the north at a latitude in rad."""
+        return self._spacing_m(float(np.degrees(latitude)))[0]
+
     def _slopes(self, phi: float, lam: float) -> tuple[float, float]:
         """Components xi and eta in arcsec; NaN without data."""
+        spline, row, column, north_m, east_m = self._spline(phi, lam)
+        if spline is None:
+            return math.nan, math.nan
+        xi, eta = -spline(row, column, dx=1) / north_m, -spline(row, column, dy=1) / east_m
+        return float(xi.item() / ARCSEC), float(eta.item() / ARCSEC)
+
+    def _spline(
+        self, phi: float, lam: float
+    ) -> "tuple[RectBivariateSpline | None, float, float, float, float]":
+        """Spline of undulations (m) around a place, None without data; its row and column there; m for one of each."""
         # slow to import, and only needed with a grid
         from scipy.interpolate import RectBivariateSpline
 
@@ -69,10 +92,8 @@ class Geoid:
             nodes, row, column = self._window(phi, lam, reach, reach, stride)
             if np.isfinite(nodes).all():
                 at = np.arange(2 * reach)
-                spline = RectBivariateSpline(at, at, nodes)
-                xi, eta = -spline(row, column, dx=1) / north_m, -spline(row, column, dy=1) / east_m
-                return float(xi.item() / ARCSEC), float(eta.item() / ARCSEC)
-        return math.nan, math.nan
+                return RectBivariateSpline(at, at, nodes), row, column, north_m, east_m
+        return None, math.nan, math.nan, north_m, east_m
 
     def _roughness(self, phi: float, lam: float) -> float:
         """Root mean square change of the slope from node to node around a place, arcsec; NaN without data."""

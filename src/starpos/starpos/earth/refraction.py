@@ -62,7 +62,7 @@ class Atmosphere:
         humidity: float | None = None,
         wavelength_um: float | None = None,
     ) -> "Atmosphere":
-        """The air as far as it was measured, and the middle of the light that the camera sees.
+        """The air as far as it was measured, and the mean wavelength of the light that the camera sees.
 
         An unknown pressure or temperature (None) becomes a middle value with a sigma that covers sea level to 3000 m, or
         frost to summer; an unknown humidity or wavelength one that covers dry to damp, or the filters of cameras.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The attitude and plate scale that fit a frame's stars best, and which of the stars do not go with the others.
+"""The attitude and plate scale that fit a frame's stars best, and which stars are outliers.
 
 The residuals are formed in pixels, because the errors of the stars are known there.
 """
@@ -20,9 +20,9 @@ from starpos.instrument.camera import Camera
 
 MAX_ROUNDS = 6
 MIN_STARS = 3
-# the iteration ends at a step below this, in rad and as a share of the scale: what is left is a thousandth of it
+# the iteration ends at a step below this, in rad and as a share of the scale: the remaining error is a thousandth of it
 SETTLED, MOST_STEPS = 1e-11, 20
-# the rounds end where the scatter changes by a smaller share of itself and of so much, px2
+# the rounds end when the scatter changes by less than this share of itself, and of this minimum, px2
 SAME_SHARE, SAME_PX2 = 0.02, 1e-6
 # a covariance that is the same in all directions
 ISOTROPIC = np.eye(2)
@@ -31,11 +31,11 @@ ISOTROPIC = np.eye(2)
 @at_once
 @dataclass(frozen=True, kw_only=True)
 class Fitted:
-    """A4 (3, 3), ITRS into L, and the factor on the focal length, as N stars have it.
+    """A4 (3, 3), ITRS into L, and the factor on the focal length, from N stars.
 
     slope (N, 2, 4): derivatives of their places, px, by a small rotation about L's axes and a relative change of scale.
-    residual (N, 2): their places by the fit minus those seen, px.
-    keep (N,): which of them go with the others.  jitter2: how much more than stated these scatter, px2.
+    residual (N, 2): places by the fit minus seen places, px.
+    keep (N,): which of them are not outliers.  jitter2: their scatter beyond the stated errors, px2.
     """
 
     a4: np.ndarray
@@ -47,7 +47,7 @@ class Fitted:
 
     @cached_property
     def kept(self) -> slice | np.ndarray:
-        """Which rows go with the others: all, as is usual, without a copy of them."""
+        """Rows that are not outliers; a slice of all, without a copy, in the usual case."""
         return slice(None) if self.keep.all() else self.keep
 
 
@@ -66,7 +66,7 @@ def adjustment_of(
 def fitted(problem: Adjustment, local: np.ndarray, stated: np.ndarray) -> Fitted:
     """The fit of the stars, from a closed solution by Gauss-Newton over the rotation A4 and the plate scale.
 
-    The derivatives are computed once: they hardly change over the arcseconds that are left.
+    The derivatives are computed once: they hardly change over the remaining arcseconds.
     local (N, 3): unrefracted directions in L by the given focal length.  stated (N, 2, 2): covariances of places, px2.
     Raises FixError if the stars are too few or do not agree.
     """

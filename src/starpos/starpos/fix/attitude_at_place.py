@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Heading, pitch and roll at a known place: stars give the camera's attitude, the place gives up and north.
 
-It is the fix turned round: there the level is known and A4, which holds the place, is fitted; here A4 is known.
+It is the reverse of the fix: there the level is known and A4, which holds the place, is fitted; here A4 is known.
 """
 
 import math
@@ -28,7 +28,7 @@ from starpos.units import ARCSEC
 
 # the level settles to this, rad; refraction turns with it, and settles a thousand times faster, or ten times at 10 deg
 SETTLED, MOST_ROUNDS = 1e-9, 10
-# less refraction than this share of what the place makes of it, by so many sigma, is that of another place
+# minimum share of the refraction expected at the place, and significance in sigma: less belongs to another place
 LEAST_SHARE, SIGMAS = 0.5, 5.0
 
 
@@ -37,7 +37,7 @@ LEAST_SHARE, SIGMAS = 0.5, 5.0
 class LinkAttitude:
     """Attitude of the base link in east, north, up: link_to_enu (3, 3), and its error budget.
 
-    terms: as those of a fix; the place is given, so its rows are 0.
+    terms: as in a fix; the place is given, so its rows are 0.
     """
 
     link_to_enu: np.ndarray
@@ -55,7 +55,7 @@ class LinkAttitude:
 
     @property
     def pitch(self) -> float:
-        """Elevation (rad) of the link's x axis: positive with the nose up, as people say it and not as ROS's y axis."""
+        """Elevation (rad) of the link's x axis: positive with the nose up, unlike a turn about ROS's y axis."""
         return math.asin(min(max(self.link_to_enu[2, 0], -1.0), 1.0))
 
     @property
@@ -65,7 +65,7 @@ class LinkAttitude:
 
     @cached_property
     def covariance(self) -> np.ndarray:
-        """Covariance (3, 3) in rad2 of heading, pitch, roll; beyond all bounds where x is vertical."""
+        """Covariance (3, 3) in rad2 of heading, pitch, roll; unbounded where x is vertical."""
         return self._slope @ self.attitude_covariance @ self._slope.T
 
     @property
@@ -117,7 +117,7 @@ def attitude_at_place(
 ) -> AttitudeAtPlace:
     """Heading, pitch and roll of the base link from identified stars at a known place.
 
-    mounting: of which only how the base link sits on the camera counts.
+    mounting: only its base link on the camera is used.
     axis_stddev: error in rad of the camera's optical axis.
     clock_stddev_s, stamp_stddev_s, shutter: as `solve_fix` has them.
     Raises FixError if the stars are too few or do not agree, PlaceError if they are below the horizon of this place.
@@ -129,7 +129,7 @@ def attitude_at_place(
     check_visible(float((rays @ g[2]).min()))
     for _ in range(MOST_ROUNDS):
         seen = fit_stars(stars, camera, g, refraction, itrs)
-        # the fitted A4 differs from the A4 of the place by as much as the level was
+        # the fitted A4 differs from the A4 of the place by the error of the level
         off = a4 @ seen.fit.a4.T
         g = off @ g
         if np.linalg.norm(rotation.to_small_vector(off)) < SETTLED:
@@ -182,7 +182,7 @@ def _check_refraction(seen: StarFit, atmosphere: Atmosphere) -> None:
     if atmosphere.pressure_pa == 0:
         return
     share, sigma = seen.refraction_seen(atmosphere)
-    # of few stars the scatter is hardly known, as Student's t has it
+    # few stars hardly determine their scatter (Student's t)
     sigmas = SIGMAS * (1 + 5 / len(seen.residual))
     if share < LEAST_SHARE and 1 - share > sigmas * sigma:
         raise PlaceError(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The pointing of a frame whose scale, and lens, nobody has said."""
+"""The pointing of a frame of unknown scale and lens."""
 
 import time
 from dataclasses import dataclass, replace
@@ -27,7 +27,7 @@ SEARCH_S = 20.0
 
 @dataclass(frozen=True)
 class BlindSolver:
-    """Identifies frames of any scale, those of fisheyes too; where EXIF tells a scale or a fisheye, first by that.
+    """Identifies frames of any scale, including fisheyes; if EXIF states a scale or a fisheye, it tries that first.
 
     stages, fisheye_stages: of the search; fewer are quicker.
     search_s: CPU time after which the search of a frame ends.
@@ -97,12 +97,14 @@ def _why(seen: Stars, search_s: float, budget: Budget) -> str:
     )
     if budget.spent:
         what = (
-            f"in {search_s:g} s of CPU none of the sky was found to fit its {len(seen)} stars at any scale ({tried}): "
+            f"in {search_s:g} s of CPU no part of the sky was found to match its {len(seen)} stars at any "
+            f"scale ({tried}): "
             "give more time (--search-time) or the focal length"
         )
     else:
         what = (
-            f"none of the sky fits its {len(seen)} stars at any scale ({tried}, were tried): give the focal length if it "
+            f"no part of the sky matches its {len(seen)} stars at any scale ({tried}, were tried): give the "
+            f"focal length if it "
             "is known, check clouds and exposure"
         )
     if disc_radius_px(np.stack([seen.x, seen.y], 1), seen.width, seen.height) is not None:

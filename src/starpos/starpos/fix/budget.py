@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The error budget of a fix: each source of error as what it does to place, heading and attitude."""
+"""The error budget of a fix: the effect of each source of error on place, heading and attitude."""
 
 import math
 from collections.abc import Iterable
@@ -19,11 +19,11 @@ from starpos.instrument.mounting import LocalLevel, Mounting
 from starpos.units import HOUR_S
 
 ALWAYS = ("always",)
-# the key of a pose, which only the average of several fixes knows, takes its place
+# replaced by the key of a pose, which only the average of several fixes knows
 EACH_POSE = ("pose",)
 # the name of A3's own term
 CALIBRATION = "calibration"
-# 1 sigma of the difference of two temperatures that nobody measured: a warm room and a clear night
+# 1 sigma of the difference of two unmeasured temperatures: a warm room and a clear night
 UNKNOWN_TEMPERATURE_C = 14.0
 
 
@@ -35,9 +35,9 @@ class ErrorTerm:
     factor (6, m): rows are east m, north m, heading rad, and the attitude's small rotation about east, north, up in rad.
     shared: None if the error is new in every frame.  Otherwise the error is the mean of several readings, and these are
     their keys: the m errors of two frames have the `correlation` of their keys.  ALWAYS: for a calibration or a clock.
-    EACH_POSE: the same as long as nobody touches the instrument.
+    EACH_POSE: the same as long as the instrument is not touched.
     walk_s: growth of the variance per second, for an error that wanders.
-    posed: the true factor is constant while nobody touches the camera; differences between frames are noise.
+    posed: the true factor is constant while the camera is not touched; differences between frames are noise.
     """
 
     name: str
@@ -86,7 +86,7 @@ class Place:
 
 
 def place_of(a4: np.ndarray) -> Place:
-    """Place from A4 (3, 3), which takes ITRS into L.  At a pole the longitude is 0, and north is that of longitude 0."""
+    """Place from A4 (3, 3), which takes ITRS into L.  At a pole longitude is 0 and north points along it."""
     latitude, longitude = place_of_zenith(a4[2])
     x, y, _ = (a4 @ enu_axes(latitude, longitude)[1]).tolist()
     level = math.hypot(x, y)
@@ -139,7 +139,7 @@ def heading_row(link_to_enu: np.ndarray) -> np.ndarray:
 
 
 def mount_term(name: str, link_to_enu: np.ndarray, stddev: float) -> tuple[ErrorTerm, ...]:
-    """The error of the base link against the sky that the camera sees, stddev rad about each axis; none if that is 0."""
+    """The error of the base link against the sky that the camera sees, stddev rad about each axis; empty if that is 0."""
     if not stddev:
         return ()
     factor = np.vstack([np.zeros((2, 3)), heading_row(link_to_enu), np.eye(3)]) * stddev
@@ -174,7 +174,7 @@ class StarErrors:
 
     def rotated(self, errors_px: np.ndarray) -> np.ndarray:
         """Rotation (3, ...) of A4 in rad that errors (N, 2, ...) of the predicted places in px make."""
-        # the gain is for errors of the places seen, which are the other way round
+        # the gain is for errors of the seen places, which have the opposite sign
         number = 2 * len(errors_px)
         return -self.gain.reshape(3, number) @ errors_px.reshape(number, *errors_px.shape[2:])
 
@@ -220,7 +220,7 @@ def error_terms(
 def tilt_terms(
     rows: np.ndarray, level: LocalLevel, tilt: Tilt, mounting: Mounting, utc_unix_s: float
 ) -> tuple[ErrorTerm, ...]:
-    """The sources of error of the level, A3's first; rows (n, 3): those of the factors for a small rotation of L."""
+    """The sources of error of the level, A3's first; rows (n, 3): the factors' rows for a small rotation of L."""
     calibration, by_axes = np.empty((3, 4)), rows @ level.turns
     np.matmul(level.a2, mounting.calibration_root, out=calibration[:, :3])
     calibration[:, 3] = _turn_error(level, mounting)
@@ -243,7 +243,7 @@ def time_terms(
     pole[[0, 2, 5], 0], pole[1, 1] = (prime, north_turns, -north_turns), meridian
     return (
         ErrorTerm("clock", second_of_time * clock_stddev_s, shared=ALWAYS),
-        # a constant lag does not average away, and nobody can exclude one
+        # a constant lag does not average away and cannot be excluded
         ErrorTerm("time stamp", second_of_time * stamp_stddev_s, shared=ALWAYS),
         ErrorTerm("ut1", second_of_time * earth.orientation.ut1_sigma_s, shared=ALWAYS),
         ErrorTerm("pole", pole * earth.orientation.pole_sigma, shared=ALWAYS),
@@ -266,7 +266,7 @@ def _turn_error(level: LocalLevel, mounting: Mounting) -> np.ndarray:
 def _inclinometer_terms(
     rows: np.ndarray, tilt: Tilt, mounting: Mounting, utc_unix_s: float
 ) -> tuple[ErrorTerm, ...]:
-    """The inclinometer's terms; rows (n, axes): those of an ErrorTerm for an error of each angle.
+    """The inclinometer's terms; rows (n, axes): an ErrorTerm's rows for an error of each angle.
 
     Its zero is not among them: the calibration's covariance includes it.
     """
@@ -293,9 +293,9 @@ def _inclinometer_terms(
 
 
 def _warmer_c(tilt: Tilt, mounting: Mounting) -> float:
-    """The inclinometer's temperature less that of its calibration; if it is not known, what may be expected of it.
+    """The inclinometer's temperature minus the calibration's; if unknown, its expected 1 sigma.
 
-    The stated error of a calibration with neither a date nor a temperature is for all temperatures.
+    If a calibration has neither a date nor a temperature, its stated error holds for all temperatures.
     """
     warmer = tilt.temperature_c - mounting.calibrated_temperature_c
     if math.isfinite(warmer):

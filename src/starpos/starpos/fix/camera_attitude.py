@@ -12,8 +12,8 @@ class CameraAttitude:
 
     utc_unix_s: middle of the exposure, None where it is not known; stamp_stddev_s, clock_stddev_s: of that stamp, and
     of the clock that made it against UTC.  frame_id: the camera's, in a graph of nodes.
-    camera_to_gcrs (3, 3): axes of the camera to those of GCRS, which are ICRS's, of directions without annual aberration
-    but with refraction and diurnal aberration, which only a place tells.
+    camera_to_gcrs (3, 3): axes of the camera to the axes of GCRS, which are ICRS's, for directions without annual
+    aberration but with refraction and diurnal aberration, which need a place.
     covariance (3, 3): rad2, of its small rotation about the camera's axes.  stars, log_odds: of the identification.
     """
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A4 from one frame: the place and the attitude of the instrument, with their covariance.
 
-The equation is that of the paper's section 4, A2 A3 W = A4 A1 V, with refraction in L and the diurnal aberration of the
+The equation is the paper's, section 4: A2 A3 W = A4 A1 V, with refraction in L and the diurnal aberration of the
 site.
 """
 

@@ -45,9 +45,9 @@ def identified(
 def suspicions(
     stars: Stars, field: FrameStars | wide.WideField, sky: Sky, found: Identification
 ) -> tuple[tuple[str, ...], Explained]:
-    """Names, sorted, of what is suspicious about the stars' identification, and what it explains.
+    """Sorted names of suspicions about the stars' identification, and how much it explains.
 
-    Of a fisheye the part with most identified stars is judged.
+    For a fisheye, the part with most identified stars is judged.
     """
     flux = stars.flux
     if isinstance(field, wide.WideField):
@@ -67,7 +67,7 @@ def attitude_of(found: Identification, sky: Sky, camera: Camera) -> Attitude:
         across, down, row = camera.centre_from_axis
         centre, above = (across, down, scale), (across, down - row, scale)
     else:
-        # a mirrored fisheye's attitude is that of its picture turned over about the axis, which need not be the middle
+        # a mirrored fisheye's attitude is given for its picture flipped about the axis, which need not be the middle
         turned = found.mirrored and wide.is_wide(camera)
         x, y = camera.centre_px
         centre, above = camera.scaled(scale).directions([x, x], [y, y + 1.0 if turned else y - 1.0])

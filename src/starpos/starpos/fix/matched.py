@@ -19,17 +19,17 @@ from starpos.frozen import at_once
 from starpos.identification import Identification
 from starpos.instrument.camera import Camera
 
-# share of the frame's diagonal; stars that scatter more were not identified rightly
+# maximum scatter as a share of the frame's diagonal; stars that scatter more were misidentified
 MAX_SCATTER = 0.003
 STEP_REFRACTION = 0.01
-# so many stars tell whether two frames show the same ones
+# number of stars that determine whether two frames show the same ones
 MARKS = 20
 
 
 @at_once
 @dataclass(frozen=True)
 class MatchedStars:
-    """N identified stars; ValueError if the arrays do not fit to each other, FixError if a place's error is not finite.
+    """N identified stars; ValueError if the arrays do not fit together, FixError if a place's error is not finite.
 
     xy (N, 2) in px and covariance_px2 (N, 2, 2): where they are on the frame.
     places (N, 3): ICRS directions at the date; place_sigma (N,): their standard deviation per axis in rad.
@@ -46,7 +46,7 @@ class MatchedStars:
         n = len(self.xy)
         shapes = (self.xy.shape, self.covariance_px2.shape, self.places.shape, self.place_sigma.shape)
         if shapes != ((n, 2), (n, 2, 2), (n, 3), (n,)) or (self.index is not None and len(self.index) != n):
-            raise ValueError(f"arrays of identified stars do not fit to each other: {shapes}")
+            raise ValueError(f"arrays of identified stars differ in length or shape: {shapes}")
         if not np.isfinite(self.covariance_px2).all():
             raise FixError("the error of a star's place is not a finite number: leave that star out")
 
@@ -56,7 +56,7 @@ class MatchedStars:
 class SeenFrame:
     """What a fit of a frame's stars comes to, whatever it was made for.
 
-    used (M,): rows of the given stars that were kept; residual_px (M, 2): their fitted places minus their seen ones.
+    used (M,): rows of the given stars that were kept; residual_px (M, 2): their fitted places minus their seen places.
     jitter_px: scatter of the stars beyond the centroids' own errors (seeing, optics).
     focal_scale: factor on the given focal length.
     zenith_distance: of the optical axis, rad.
@@ -79,7 +79,7 @@ class SeenFrame:
 
 
 def sound_matches(stars: Stars, found: Identification, enough: int) -> np.ndarray:
-    """Mask (M,) of the matches to use: those of stars without a flag, or all if fewer than `enough` have none."""
+    """Mask (M,) of the matches to use: stars without a flag, or all if fewer than `enough` are without."""
     sound = stars.sound[found.star]
     return sound if sound.sum() >= enough else np.ones(len(sound), bool)
 
@@ -89,7 +89,7 @@ def sound_matches(stars: Stars, found: Identification, enough: int) -> np.ndarra
 class StarFit:
     """A fit of N stars: the problem, its solution, the errors of the M stars that are kept.
 
-    residual (M, 2): fitted places minus those seen, px.
+    residual (M, 2): fitted places minus seen places, px.
     """
 
     problem: Adjustment
@@ -109,14 +109,14 @@ class StarFit:
     def refraction_seen(self, atmosphere: Atmosphere) -> tuple[float, float]:
         """Share of the refraction that the field shows, relative to the air at the fitted zenith, and its 1 sigma.
 
-        An attitude and a plate scale take up most of it; what is left squeezes the field along the vertical.
+        An attitude and a plate scale absorb most of it; the rest compresses the field along the vertical.
         """
         slope = np.dstack([self.fit.slope[self.fit.kept], self._bent(atmosphere) / STEP_REFRACTION])
         whole = self.errors.centroids + self.errors.catalogue
         weighted = np.linalg.solve(whole, slope)
         covariance = np.linalg.pinv(np.einsum("nki,nkj->ij", slope, weighted))
         found = covariance @ np.einsum("nki,nk->i", weighted, -self.residual)
-        # the scatter of the stars may be that of a refraction which is not theirs
+        # the scatter of the stars may stem from a wrong refraction
         left = -self.residual - slope @ found
         free = max(left.size - len(found), 1)
         scatter2 = np.vdot(left, np.linalg.solve(whole, left[..., None])[..., 0]) / free
@@ -162,8 +162,8 @@ def fit_stars(
     errors = StarErrors.of(fit.slope[kept], centroids, catalogue_px2[kept], same_stars)
     if not np.isfinite(errors.gain).all() or not math.isfinite(claimed2):
         raise FixError(
-            f"the {len(residual)} stars do not tell the attitude and how well it is known: more stars are needed, "
-            "further apart, with sound errors"
+            f"the {len(residual)} stars do not determine the attitude and its error: more stars are needed, "
+            f"further apart, with realistic errors"
         )
     return StarFit(problem=problem, fit=fit, errors=errors, residual=residual)
 

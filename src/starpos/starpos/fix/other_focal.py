@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The focal length at which a frame is identified that was not with the given one."""
+"""The focal length at which a frame is identified after the given one failed."""
 
 import math
 import time
@@ -9,15 +9,15 @@ from starpos.fix.solver import Solver
 from starpos.frames.stars import Stars
 from starpos.identification import FEWEST_STARS, Sky, identify_directions
 
-# Each try bears an error of 3 %; so many are made on either side.
+# Ratio of successive tries, each of which tolerates an error of 3 %; number of tries on either side.
 STEP, TRIES = 1.055, 6
 
 
 def focal_that_fits(solver: Solver, stars: Stars, until_s: float = math.inf) -> float | None:
-    """The focal length in px at which a frame is identified, from 0.7 to 1.4 times the solver's; None if there is none.
+    """The focal length in px at which a frame is identified, from 0.7 to 1.4 times the solver's; None without one.
 
     No try is begun after until_s (time.monotonic).
-    Triangles are found by their angles, which hardly depend on the focal length, so those of the given field serve.
+    Triangles are found by their angles, which hardly depend on the focal length, so the given field's triangles serve.
     """
     on = stars.take(stars.on_frame.nonzero()[0])
     if len(on) < FEWEST_STARS:

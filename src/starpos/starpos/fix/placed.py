@@ -15,7 +15,7 @@ from starpos.fix.solution import Solution, status_of
 from starpos.fix.solver import Solver, check_explained
 from starpos.frames.stars import Stars
 
-# a place that is right lies further from the stars' own once in 1e6 frames
+# a correct place lies further from the stars' own once in 1e6 frames
 SIGMAS = 5.3
 
 
@@ -42,7 +42,7 @@ def placed(solver: Solver, stars: Stars, answer: Solution, places: Places) -> So
 
 
 def check_agrees(fix: Fix, place: KnownPlace) -> None:
-    """Raise PlaceError if the stars' own place lies further from a known one than both claim."""
+    """Raise PlaceError if the stars' own place is further from a known one than their errors allow."""
     latitude, longitude = place.plumb
     prime, meridian = radii = np.array(curvature_radii_m(latitude))
     east = math.remainder(fix.longitude - longitude, 2 * math.pi) * prime * math.cos(latitude)
@@ -51,6 +51,7 @@ def check_agrees(fix: Fix, place: KnownPlace) -> None:
     sigmas = math.sqrt(off @ np.linalg.solve(claim, off))
     if sigmas > SIGMAS:
         raise PlaceError(
-            f"stars and tilt have a place {length_text(float(np.linalg.norm(off)))} from the given one, {sigmas:.0f} "
-            "times what both claim: check latitude and longitude, their order and signs, the tilts, A3 and the clock"
+            f"stars and tilt give a position {length_text(float(np.linalg.norm(off)))} from the given one, "
+            f"{sigmas:.0f} times their stated errors: check latitude and longitude, their order and signs, "
+            f"the tilts, A3 and the clock"
         )

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A4 from a pointing that a plate solver found, by the same adjustment as from stars.
 
-A few stars are made up around the frame's centre where the pointing has them.  So aberration, the Earth's rotation and
-refraction act on them as on real ones.  The errors are those of the pointing.
+A few artificial stars are placed around the frame's centre according to the pointing. So aberration, the Earth's
+rotation and refraction act on them as on real ones. The errors are the pointing's.
 """
 
 from dataclasses import replace
@@ -21,10 +21,10 @@ from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import Tilt
 from starpos.instrument.mounting import Mounting
 
-# the camera that sees the stars, and stands for one that is not known: only its axes count
+# the camera that sees the stars, in place of an unknown one: only its axes count
 IDEAL = Camera.from_focal(201, 201, 10_000.0)
 STARS, RING_PX = 6, 40.0
-# the terms of the errors of stars, whose place that of the pointing takes
+# the terms of the errors of stars, which the pointing's error replaces
 OF_STARS = ("centroids", "catalogue")
 
 
@@ -50,7 +50,7 @@ def pointing_fix(
     seen = replace(mounting, a3=mounting.a3 @ to_frame.T, link_to_camera=to_frame @ mounting.link_to_camera)
     angle = 2 * np.pi * np.arange(STARS) / STARS
     xy = np.array(IDEAL.centre_px) + RING_PX * np.stack([np.cos(angle), np.sin(angle)], -1)
-    # so large that what refraction and aberration do to the shape of the ring is nothing beside it
+    # so large that refraction's and aberration's effect on the ring's shape is negligible
     spread = STARS * (pointing.sigma * IDEAL.fx) ** 2
     stars = MatchedStars(
         xy,
@@ -60,7 +60,7 @@ def pointing_fix(
     )
     fix = solve_fix(stars, IDEAL, tilt, seen, atmosphere, earth, clock_stddev_s, pointing.stamp_stddev_s)
     g, to_itrs = seen.level(tilt).camera, fix.camera_to_itrs
-    # the centre's error turns the frame about two axes across its own, that of the roll about that axis
+    # the centre's error turns the frame about two axes across its own, the roll's error about its own axis
     own = np.diag([pointing.sigma, pointing.sigma, pointing.sigma_roll]) ** 2
     sensitivity = Sensitivity.of(place_of(g @ to_itrs.T), fix.link_to_enu)
     return replace(
@@ -79,7 +79,7 @@ def pointing_fix(
 
 
 def _frame_to_icrs(pointing: Pointing) -> np.ndarray:
-    """Rotation (3, 3) of the frame's axes into those of ICRS."""
+    """Rotation (3, 3) of the frame's axes into the axes of ICRS."""
     ra, dec, roll = pointing.ra, pointing.dec, pointing.roll
     east, north = np.array([-np.sin(ra), np.cos(ra), 0.0]), rotation.unit_vector(ra, dec + np.pi / 2)
     centre, up = rotation.unit_vector(ra, dec), np.cos(roll) * north + np.sin(roll) * east

@@ -8,7 +8,7 @@ import numpy as np
 
 from starpos.units import ARCSEC
 
-# lengths from here on are told in km
+# lengths from here on are given in km
 LONG_M = 10_000.0
 
 
@@ -60,7 +60,7 @@ class InDegrees:
     def facing(self) -> str:
         """The heading with its error; that it is not known."""
         if math.isnan(self.heading):
-            return "heading not known: the camera was touched, or nobody knows its roll"
+            return "heading not known: the camera was touched, or its roll is unknown"
         return f"heading {self.heading:.4f} +- {self.sigma_heading:.4f} deg"
 
     def __str__(self) -> str:

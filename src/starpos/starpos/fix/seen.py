@@ -12,7 +12,7 @@ from starpos.identification.search import through
 from starpos.instrument.camera import Camera
 from starpos.instrument.lens import EQUIDISTANT
 
-# Lower stars of a fisheye make no fix: what refraction does near the horizon no model tells.
+# A fisheye's lower stars are not used: no model describes refraction near the horizon.
 LEAST_ALTITUDE_RAD = math.radians(10)
 
 

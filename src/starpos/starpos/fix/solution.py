@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The solution of a frame: its status, and as much of the answer as there is."""
+"""The solution of a frame: its status, and the part of the answer that was found."""
 
 from dataclasses import KW_ONLY, dataclass, replace
 from enum import Enum
@@ -19,8 +19,8 @@ from starpos.identification.hint import Hint
 from starpos.instrument.inclinometer import Tilt
 from starpos.instrument.lens import PLUMB_BOB
 
-# Names in `Solution.warnings`: bright stars that were not identified are a sky of their own; most bright detections are
-# not identified, nor are the bright stars there that should be.
+# Names in `Solution.warnings`. TWO_SKIES: unidentified bright stars form a sky of their own. UNEXPLAINED: most bright
+# detections are not identified, and bright stars that should be there are missing.
 TWO_SKIES, UNEXPLAINED = "two_skies", "unexplained"
 
 
@@ -58,18 +58,18 @@ class Attitude:
 @at_once
 @dataclass(frozen=True)
 class Solution:
-    """Solution of one frame: a status, a sentence, and as much of the answer as there is.
+    """Solution of one frame: a status, a sentence, and the part of the answer that was found.
 
     star, magnitudes (M,): row in the input's stars and V of the catalogue, for each of `names`.
     identify_s, fix_s: seconds that the two steps took.
     extrapolated_days: how far behind the end of the IERS table the frame's date lies; 0 within it.
-    warnings: names, sorted, of what is suspicious about an identification: TWO_SKIES, UNEXPLAINED. There is no fix then.
+    warnings: sorted names of suspicions about an identification: TWO_SKIES, UNEXPLAINED. There is no fix then.
     explained: how much of the frame the identification explains.
     at_place: heading, pitch and roll at a known place; None if not asked for or not found.
-    found: the identification itself, whose rows are those of the input's stars.
+    found: the identification itself; its rows refer to the input's stars.
     negative: whether the stars are dark on a bright sky.
     hint: helps to identify the next frame.
-    remark: what is to be said of a frame although it was identified; '' if nothing is.
+    remark: a warning on an identified frame; '' without one.
     """
 
     status: Status
@@ -99,7 +99,7 @@ class Solution:
     def of(
         cls, frame: Stars | Pointing, message: str = "identified", status: Status = Status.OK, **found: Any
     ) -> "Solution":
-        """The solution of a frame; found: what there is of the answer, by the names of the fields."""
+        """The solution of a frame; found: the known parts of the answer, by the names of the fields."""
         number, negative = (len(frame.x), frame.negative) if isinstance(frame, Stars) else (0, False)
         return cls(
             status,
@@ -113,12 +113,12 @@ class Solution:
 
     @classmethod
     def failed(cls, frame: Stars | Pointing, status: Status, message: str) -> "Solution":
-        """A solution that has nothing but its status and message."""
+        """A solution with only its status and message."""
         return cls.of(frame, message, status)
 
     @classmethod
     def refused(cls, frame: Stars | Pointing, error: StarposError) -> "Solution":
-        """A solution that has nothing but the error with which the work on its frame ended."""
+        """A solution with only the error that ended the work on its frame."""
         return cls.failed(frame, status_of(frame, error), str(error))
 
     @classmethod
@@ -127,7 +127,7 @@ class Solution:
         return cls(Status.BAD_INPUT, str(error), source=source, utc_unix_s=None, stars_detected=0)
 
     def among(self, stars: Stars, rows: np.ndarray) -> "Solution":
-        """The solution of `stars` that is found by those in `rows` (n,) alone."""
+        """The solution of `stars` that is found by the stars in `rows` (n,) alone."""
         star = None if self.star is None else rows[self.star]
         found = self.found and self.found.but(star=rows[self.found.star])
         return replace(self, star=star, found=found, stars_detected=len(stars))
@@ -138,12 +138,12 @@ class Solution:
 
     @property
     def lost(self) -> bool:
-        """Whether the stars tell nothing, so that another search might find them."""
+        """Whether nothing was identified, so that another search may succeed."""
         return self.status in (Status.NOT_IDENTIFIED, Status.TOO_FEW_STARS)
 
     @property
     def ok(self) -> bool:
-        """Whether all that was asked for is there."""
+        """Whether everything asked for was found."""
         return self.status is Status.OK
 
 

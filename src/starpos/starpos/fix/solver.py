@@ -49,7 +49,7 @@ SMALLEST_FIELD_DEG, LARGEST_FIELD_DEG = 0.3, 100.0
 class Solver:
     """Solver for one instrument in its surroundings: `solve` makes a fix, `identify` a pointing alone, by one search.
 
-    What else there is to try with a frame that this search does not find: `starpos.night.searching`.
+    Other ways to identify a frame are in `starpos.night.searching`.
 
     catalogue: or the deeper one in its stead, for a field that needs it.
     """
@@ -72,9 +72,10 @@ class Solver:
     def identify(
         self, stars: Stars, predicted: Priors = (), look: Look | None = None, part: float = 1.0
     ) -> Solution:
-        """Names of the stars and pointing of the camera, predicted or anywhere.  Stars without a time: J2000 places.
+        """Names of the stars and pointing of the camera, near a prediction or anywhere.
 
-        look: what their frame shows where stars should be, asked if the stars alone are too few.
+        Stars without a time have J2000 places.
+        look: shows what the frame holds where stars should be; used if the stars alone are too few.
         part: of the frame in which its stars lie, as a share of its size: triangles that are looked up are no larger.
         """
         begin = time.perf_counter()
@@ -109,9 +110,9 @@ class Solver:
     ) -> Solution:
         """The fix of one frame; a fault of the frame, the tilt or the time is a status and never an exception.
 
-        tilts: not asked of a camera that is its own level.
+        tilts: not used for a camera that is its own level.
         predicted, hint: where to look, the latter of an earlier solution; a wrong one costs 0.5 ms and does no harm.
-        known: what `identify` found of these stars, where the search here may be too short for them.
+        known: the identification of these stars by `identify`, if the search here may be too short.
         """
         if (rows := self._inside(stars)) is not None:
             known = known and known.but(star=np.searchsorted(rows, known.star))
@@ -157,9 +158,7 @@ class Solver:
         begin = time.perf_counter()
         try:
             if not pointing.has_roll:
-                raise FixError(
-                    f"{pointing.place}: no roll: an elevation alone makes no fix, those of several do"
-                )
+                raise FixError(f"{pointing.place}: no roll: one elevation gives no fix, several together do")
             state, tilt = self.levelled(pointing, tilts)
             camera, clock_s = self.instrument.camera or IDEAL, self.clock_stddev_s(pointing)
             fix = pointing_fix(
@@ -185,7 +184,7 @@ class Solver:
         state = earth_state(frame.mid_unix_s)
         if self.instrument.vertical is not None:
             tilts = OWN_LEVEL
-        # the width of an even distribution of that standard deviation, as rounding makes it
+        # the width of a uniform distribution with this standard deviation, as rounding causes
         spread_s = math.sqrt(12) * frame.stamp_stddev_s
         tilt = tilts.average(frame.mid_unix_s, frame.exposure_s or 0.0, spread_s)
         self.instrument.calibration.check_age(frame.mid_unix_s)
@@ -232,7 +231,7 @@ class Solver:
         state: EarthState,
         catalogue: Catalogue,
     ) -> tuple[np.ndarray, MatchedStars]:
-        """Which of the identified stars to use (M,), and these; up (3,): the zenith in C, roughly."""
+        """Mask (M,) of the identified stars to use, and these; up (3,): rough zenith in C."""
         if len(found.star) < self.min_stars:
             raise FixError(f"only {len(found.star)} stars identified, min_stars is {self.min_stars}: no fix")
         if found.mirrored:
@@ -252,9 +251,9 @@ class Solver:
         )
 
     def attitude_at(self, stars: Stars, found: Identification, place: KnownPlace) -> AttitudeAtPlace:
-        """Heading, pitch and roll at a known place, from what is identified of a frame's stars; needs no tilt.
+        """Heading, pitch and roll at a known place, from a frame's identified stars; needs no tilt.
 
-        Raises StarposError where the stars, the place or the time do not tell them.
+        Raises StarposError if the stars, the place or the time do not determine them.
         """
         if stars.mid_unix_s is None:
             raise TimeError(f"{stars.place}: no time of exposure: {why_no_time(stars)}")
@@ -286,7 +285,7 @@ class Solver:
 
     @cached_property
     def _views(self) -> dict[tuple, tuple[Camera, Catalogue, TriangleCatalogue]]:
-        """What `view` has given last, by size and origin."""
+        """The latest results of `view`, by size and origin."""
         return {}
 
     def view(
@@ -341,11 +340,12 @@ def _unidentified(stars: Stars, camera: Camera, sky: Sky, begin_s: float) -> Sol
 
 
 def check_explained(answer: Solution) -> None:
-    """Raise FixError if what was identified is suspicious."""
+    """Raise FixError if the identification is suspicious."""
     place, seen = answer.source or "the frame", answer.explained
     if TWO_SKIES in answer.warnings:
         raise FixError(
-            f"{place}: two skies in one frame, its bright stars are those of two pointings: keep the camera still "
+            f"{place}: two skies in one frame, its bright stars belong to two pointings: keep the camera "
+            f"still "
             "while it exposes, and expose once"
         )
     if UNEXPLAINED in answer.warnings and seen is not None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Why a frame was not identified, in a sentence: what can be told from its stars, its field and the catalogue."""
+"""Why a frame was not identified, in a sentence: likely causes from its stars, its field and the catalogue."""
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from starpos.sky.catalogue import Catalogue
 
 # Images wider than this (FWHM, px) are out of focus, or the frame has more pixels than its lens resolves.
 WIDE_PX = 8.0
-# If so many of the brightest detections are saturated, their order of brightness may be wrong.
+# If this share of the brightest detections is saturated, their order of brightness may be wrong.
 BRIGHTEST, MANY = 20, 0.5
 
 
@@ -40,4 +40,4 @@ def why_unidentified(stars: Stars, camera: Camera, catalogue: Catalogue) -> str:
             "of brightness says little: expose for a shorter time"
         )
     causes.append(f"check the focal length ({camera.fx:.0f} px given, 3 % is allowed), clouds and exposure")
-    return f"{stars.place}: none of the sky fits its {n} stars: {'; '.join(causes)}"
+    return f"{stars.place}: no part of the sky matches its {n} stars: {'; '.join(causes)}"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tells a camera that stands as it did at its calibration from one that was moved since, by the stars alone."""
+"""Detects by the stars alone whether a camera was moved since its calibration."""
 
 import numpy as np
 

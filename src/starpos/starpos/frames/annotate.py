@@ -17,19 +17,19 @@ Colour = tuple[int, int, int]
 
 # Length of the picture's longer side, at most.
 SHOWN_PX = 1600
-# White is the higher of this percentile and so many sigma above the background.
+# White is the higher of this percentile and this number of sigma above the background.
 WHITE_PERCENTILE, WHITE_SIGMAS = 99.95, 30.0
 # A scaled-down picture is blurred by this, so that a star smaller than its pixels is still seen.
 DOT_SIGMA_PX = 0.7
-# So many pixels are enough to find black and white.
+# Number of pixels that is enough to find black and white.
 COARSEST_SAMPLE = 1 << 18
 # Two values this far apart differ by noise only: the distance is larger than a star, and the sky changes more slowly.
 NOISE_LAG = 12
 # Smallest and largest radius of a circle; many stars get small ones.
 RADII_PX = (3.0, 9.0)
-# At most so many names, and not more than one for this part of the picture.
+# Maximum number of names, and area of the picture per name, px2.
 NAMED, NAME_PX2 = 40, 12000
-# Marks of pixels that hold a circle, which a name may cover, and of those that no name may cover.
+# Marks of pixels with a circle, which a name may cover, and of pixels that no name may cover.
 CIRCLE, KEPT = 1, 2
 FONT, SCALE, LINE_PX, MARGIN_PX = cv2.FONT_HERSHEY_SIMPLEX, 0.45, 18, 6
 # Bits of the fraction in OpenCV's fixed-point coordinates.
@@ -123,7 +123,7 @@ def _circle(picture: np.ndarray, centre: Sequence[float], radius: float, colour:
 def _label(
     picture: np.ndarray, taken: np.ndarray, centre: Sequence[float], radius: float, text: str, colour: Colour
 ) -> None:
-    """Write a text beside, above or below a star, where it covers least, and mark its pixels; do nothing without room."""
+    """Write a text next to, above or below a star, where it covers least, and mark its pixels, if there is room."""
     (width, ascent), descent = cv2.getTextSize(text, FONT, SCALE, 1)
     x, y = centre
     away = radius + 4

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the time stamp of a camera driver means, of which the images themselves tell nothing.
+"""What the time stamp of a camera driver means; the images themselves do not say.
 
 Drivers stamp the start of an exposure, its middle or its end, or the arrival of the image, and `sensor_msgs/Image` has
 no field that says which.
@@ -15,22 +15,22 @@ from starpos.frames.shutter import Shutter
 
 MIDDLE, START, END, ARRIVAL, UNKNOWN = "middle", "start", "end", "arrival", ""
 KINDS = (UNKNOWN, MIDDLE, START, END, ARRIVAL)
-# 1 sigma where nobody has said what is stamped, and of an image's way to the host
+# 1 sigma if the stamped moment is not stated, and of an image's way to the host
 UNKNOWN_STDDEV_S = 0.3
 # 1 sigma where the moment is known: from it until the driver reads its clock
 KNOWN_STDDEV_S = 0.02
-# of longitude at the equator, for sentences
+# m of longitude per s at the equator, for sentences
 METRES_PER_S = 464
 
 
 @dataclass(frozen=True)
 class DriverStamp:
-    """The meaning of a driver's stamps; all moments are those of the row that is read first.
+    """The meaning of a driver's stamps; all moments are of the row that is read first.
 
     kind        MIDDLE, START or END of the exposure, ARRIVAL of the image after its last row was read; UNKNOWN
     stddev_s    of the stamp; NaN: what the kind allows
     exposure_s  None: unknown
-    readout_s   as that of a Shutter; NaN: unknown
+    readout_s   as in Shutter; NaN: unknown
     """
 
     kind: str = UNKNOWN
@@ -43,7 +43,7 @@ class DriverStamp:
             raise FrameError(f"a stamp is of the {self.kind!r}: give {', '.join(KINDS[1:])}, or nothing")
         if self.exposure_s is not None and not 0 < self.exposure_s <= MOST_EXPOSURE_S:
             raise FrameError(
-                f"an exposure of {self.exposure_s} s cannot be: give up to {MOST_EXPOSURE_S:g} s"
+                f"an exposure of {self.exposure_s} s is impossible: give up to {MOST_EXPOSURE_S:g} s"
             )
 
     @property
@@ -68,7 +68,7 @@ class DriverStamp:
 
     @property
     def unsaid(self) -> str:
-        """Sentence on what has to be stated for a narrower claim; '' if all is."""
+        """Sentence on what has to be stated for a smaller error; '' if nothing."""
         if self.kind == UNKNOWN and math.isnan(self.stddev_s):
             lacks = (
                 f"nothing says which moment the frames' stamps are ({', '.join(KINDS[1:])}): set the parameters stamp, "
@@ -88,7 +88,7 @@ class DriverStamp:
         return f"{lacks}. Until then the time is taken as {stddev_s:.2g} s off, {metres:.0f} m at the equator (1 sigma)."
 
     def dated(self, frame: Frame) -> Frame:
-        """The frame, whose mid_unix_s is the stamp, with the middle of its exposure and what is known of it."""
+        """The frame, whose mid_unix_s is the stamp, with the middle and the facts of its exposure."""
         mid_s = None if frame.mid_unix_s is None else frame.mid_unix_s + self.to_middle_s
         return replace(
             frame,

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The pixels in an image message, by the name of their encoding.
 
-The names are those of sensor_msgs/image_encodings.hpp, with cv_bridge's numbers of a type (`16UC1`), and GenICam's of
+The names are from sensor_msgs/image_encodings.hpp, with cv_bridge's numbers of a type (`16UC1`), and GenICam's of
 packed pixels (Pixel Format Naming Convention: `Mono12p`; GigE Vision: `Mono12Packed`), in upper or lower case.
 """
 
@@ -23,8 +23,8 @@ class Encoding:
 
     dtype     of a number of the row
     numbers   of a pixel in the row; a fraction where pixels are packed into bytes
-    convert   takes the rows (h, w, numbers), or (h, w) of one number, or (h, bytes) of packed pixels; returns the
-              pixels of a Frame, those of packed rows with what pads them
+    convert   takes the rows (h, w, numbers), or (h, w) of one number, or (h, bytes) of packed pixels; returns the pixels
+              of a Frame, with the padding of packed rows
     pattern   of a colour mosaic, as a Frame's
     """
 

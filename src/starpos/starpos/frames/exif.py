@@ -28,14 +28,14 @@ FIRST_YEAR = 1996
 FILM_MM = 43.267
 # Units of FocalPlaneResolutionUnit in mm: inch, cm, mm, um.
 UNITS_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
-# A zone is a multiple of this. GPS tells the time of its last fix, and a camera's clock is off by less than half of it.
+# A zone is a multiple of this. GPS gives the time of its last fix, and a camera's clock is off by less than half of it.
 ZONE_STEP_S, GPS_APART_S = 900.0, 450.0
 # Sides of a picture over those that the camera made: both alike, or it was cropped, but for rounding.
 SAME_SHAPE = 0.02
 # A lens, or a camera with its lens, that is called a fisheye: "EF8-15mm f/4L FISHEYE USM", "AF Fish-Eye-Nikkor 16mm".
 FISHEYE = re.compile(r"fish[ _-]?eye", re.IGNORECASE)
 NAMES = ("EXIF LensModel", "EXIF LensMake", "Image Model", "Image Make")
-# A focal length over the frame's diagonal that no lens has lies beyond these.
+# Limits of the focal length over the frame's diagonal, beyond any lens.
 SHORTEST, LONGEST = 0.1, 1000.0
 
 
@@ -62,7 +62,7 @@ class CameraClock:
 def told(data: bytes, place: str, clock: CameraClock | None, shape: tuple[int, ...]) -> dict[str, Any]:
     """Read from the EXIF of a TIFF, JPEG, PNG or TIFF-like raw file (DNG, CR2, NEF ...) what a Frame has fields for.
 
-    shape is that of the pixels, rows first. exposure_s comes from ExposureTime, rough_focal_px from
+    shape: of the pixels, rows first. exposure_s comes from ExposureTime, rough_focal_px from
     FocalLengthIn35mmFilm, else from FocalLength and FocalPlaneXResolution; fisheye from the names of lens and camera;
     origin_px is NaN if the picture has another shape than the camera gave it (ExifImageWidth, ExifImageLength). With a
     clock also mid_unix_s, stamp_stddev_s and clock_stddev_s, or untimed: DateTimeOriginal and SubSecTimeOriginal are the
@@ -117,7 +117,7 @@ def _cropped(tags: Mapping, width: int, height: int) -> bool:
 
 
 def _focal_px(tags: Mapping, width: int, height: int) -> float | None:
-    """About the focal length in px of a picture of this size, as the whole sensor makes one; None if nothing tells it."""
+    """About the focal length in px of a picture of this size, as the whole sensor makes one; None if unknown."""
     film_mm, focal_mm = _number(tags, "FocalLengthIn35mmFilm"), _number(tags, "FocalLength")
     per_unit, unit = (_number(tags, f"FocalPlane{name}") for name in ("XResolution", "ResolutionUnit"))
     diagonal_px = math.hypot(width, height)
@@ -125,7 +125,7 @@ def _focal_px(tags: Mapping, width: int, height: int) -> float | None:
     if film_mm is not None:
         focal_px = film_mm / FILM_MM * diagonal_px
     elif focal_mm is not None and per_unit is not None:
-        # the resolution is that of the picture as the camera made it, which may have been reduced since
+        # the resolution is of the picture as the camera made it, which may have been reduced since
         made = max(_number(tags, name) or 0.0 for name in ("ExifImageWidth", "ExifImageLength"))
         reduced = max(width, height) / made if made else 1.0
         focal_px = focal_mm * per_unit / UNITS_MM.get(int(unit or 2), UNITS_MM[2]) * reduced
@@ -147,7 +147,7 @@ def _number(tags: Mapping, name: str) -> float | None:
 def _start(tags: Mapping, clock: CameraClock) -> tuple[float, float]:
     """Unix time of the exposure's start (middle of the clock's last step before it), and the length of a step (s).
 
-    The zone is the clock's, else OffsetTimeOriginal's, else what GPS's time says; TimeError if there is no time, no zone,
+    The zone is the clock's, else OffsetTimeOriginal's, else by GPS's time; TimeError if there is no time, no zone,
     or if GPS contradicts it.
     """
     text = _text(tags, "EXIF DateTimeOriginal")
@@ -189,7 +189,7 @@ def _stated_offset_s(tags: Mapping, clock: CameraClock) -> float | None:
 
 
 def _gps_unix_s(tags: Mapping) -> float | None:
-    """GPSDateStamp and GPSTimeStamp, UTC of the last fix, as a Unix time; None without them, or if they are no time."""
+    """GPSDateStamp and GPSTimeStamp, UTC of the last fix, as a Unix time; None if missing or invalid."""
     try:
         day = datetime.strptime(str(tags["GPS GPSDate"].values).strip("\0 "), "%Y:%m:%d")
         hours, minutes, seconds = (value.num / value.den for value in tags["GPS GPSTimeStamp"].values)

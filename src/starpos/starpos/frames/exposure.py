@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Facts of an exposure beside its pixels: when it was, how long, how well both are known, and where it came from."""
+"""Facts of an exposure besides its pixels: its time and length, how well both are known, and its source."""
 
 from dataclasses import dataclass, fields
 from typing import Any
@@ -11,7 +11,7 @@ from starpos.frames.shutter import Shutter
 
 # In a longer exposure the tilts of several poses would be averaged.
 MOST_EXPOSURE_S = 3600.0
-# A time known less well is unknown; and squares must not overflow.
+# A time known less well counts as unknown, and its square must not overflow.
 MOST_STDDEV_S = 1e9
 LARGEST_SIDE_PX = 1_000_000
 
@@ -27,11 +27,11 @@ class Exposure:
     pixel_um        pixel size by the file's header (XPIXSZ), um; None: unknown
     rough_focal_px  focal length by the camera's EXIF, px: where a search for it begins; None: unknown
     fisheye         whether the camera's EXIF calls its lens a fisheye
-    origin_px       column and row of the sensor's whole frame at which this one begins; NaN: it is a part, and nobody
-                    knows which; None: nobody has said that it is one
+    origin_px       column and row of the sensor's whole frame at which this one begins; NaN: an unknown part; None: not
+                    stated to be a part
     stamp_stddev_s  standard deviation of mid_unix_s against the clock it was read from; 0: unknown
     clock_stddev_s  standard deviation of that clock against UTC, an error that all frames share; 0: unknown
-    shutter         times of the rows; None: nobody has said
+    shutter         times of the rows; None: not stated
     untimed         why mid_unix_s is None, for messages; '': its file has no time
 
     FrameError if a time, a standard deviation or the focal length is an impossible number.

@@ -9,13 +9,13 @@ from typing import BinaryIO
 from starpos import files
 from starpos.errors import FrameError, one_line
 
-# A file, and the pixels it unpacks to, may have so many bytes: both fit into a small robot's memory.
+# Maximum bytes of a file, and of the pixels it unpacks to: both fit into a small robot's memory.
 MAX_BYTES = 800_000_000
 
 
 @contextmanager
 def opened(path: Path) -> Iterator[BinaryIO]:
-    """Open a frame's file, as a context manager; FrameError if there is none, or it is empty or too large.
+    """Open a frame's file, as a context manager; FrameError if it is missing, empty or too large.
 
     OSError if the file may not be read.
     """
@@ -38,7 +38,7 @@ def opened(path: Path) -> Iterator[BinaryIO]:
 
 
 def check_pixels(width: int, height: int, bytes_each: float, place: str) -> None:
-    """Raise FrameError unless width x height pixels of so many bytes fit into MAX_BYTES, by what a header claims."""
+    """Raise FrameError unless width x height pixels, of bytes_each as a header claims, fit into MAX_BYTES."""
     if min(width, height) < 1 or width * height * bytes_each > MAX_BYTES:
         raise FrameError(
             f"{place}: its header claims {width} x {height} pixels of {bytes_each:g} bytes; a frame has at least one and "

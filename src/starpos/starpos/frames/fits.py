@@ -22,14 +22,14 @@ from starpos.frames.header import KEYS, about
 FITS_START, GZIP_START = b"SIMPLE", b"\x1f\x8b"
 # Planes of a stack or of a camera of colours.
 COLOURS = 3
-# The image is among so many first parts (HDUs) of a file.
+# Number of the first parts (HDUs) of a file that are searched for an image.
 MOST_PARTS = 100
 # Columns of a .fz whose cells may be gzip.
 TILES = ("COMPRESSED_DATA", "GZIP_COMPRESSED_DATA")
 # What astropy unpacks safely: a damaged HCOMPRESS_1 ends the whole program, with astropy 6.0 to 8.0 at least.
 PACKINGS = ("RICE_1", "RICE_ONE", "GZIP_1", "GZIP_2", "NOCOMPRESS")
 STEP = 1 << 20
-# Comments of a DATE-OBS that is the end of the exposure (early SharpCap), and of one that comes later still (Seestar).
+# Comments of a DATE-OBS that is the end of the exposure (early SharpCap), and of one that is later still (Seestar).
 GRABBED, CREATED = "frame grabbed", "image created"
 # zlib's name for data in the form of gzip
 GZIP_BITS = 31
@@ -79,7 +79,7 @@ def _read(file: BinaryIO, place: str, part: str) -> tuple[Frame, dict[str, Any]]
 
 
 def _plain(file: BinaryIO, place: str) -> BinaryIO:
-    """The file itself, or unpacked if it is a .gz; ValueError if it is no FITS file, FrameError if it is too large.
+    """The file itself, or unpacked if it is a .gz; ValueError if it is not a FITS file, FrameError if it is too large.
 
     astropy would unpack it too, and other formats, but to any size.
     """
@@ -145,12 +145,12 @@ def _parts(hdus: Iterable) -> list[Any]:
 
 
 def _axes(hdu: Any) -> list[int]:
-    """The axes of an HDU's image, the rows before the columns; empty if it is none."""
+    """The axes of an HDU's image, the rows before the columns; empty if it is not an image."""
     return [int(n) for n in hdu.shape] if hdu.is_image else []
 
 
 def _is_frame(axes: list[int]) -> bool:
-    """Whether they are those of one plane, or of three colours."""
+    """Whether these are the axes of one plane, or of three colours."""
     return len(axes) > 1 and [n for n in axes[:-2] if n != 1] in ([], [COLOURS])
 
 
@@ -167,7 +167,7 @@ def _check_frame(hdu: Any, place: str) -> None:
 
 
 def _content(file: BinaryIO, image: _Image, place: str) -> tuple[dict[str, Any], np.ndarray]:
-    """Header (a dict of KEYS) and data (h, w) of an image; what its header lacks is that of the primary one.
+    """Header (a dict of KEYS) and data (h, w) of an image; what its header lacks comes from the primary one.
 
     Colours become their mean.
     """

@@ -11,7 +11,7 @@ from starpos.frames.trail import Trail
 
 # A header may claim any size; this many pixels fit into a small robot's memory.
 MAX_PIXELS = 200_000_000
-# A pixel more than so many times the noise above or below the sky is an error: no sensor has such a range.
+# Ratio to the noise above or below the sky from which a pixel is an error: no sensor has such a range.
 LOUDEST = 30_000
 PATTERNS = ("", "rggb", "bggr", "grbg", "gbrg")
 

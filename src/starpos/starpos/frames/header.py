@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a frame's header says of its exposure: time, focal length, shutter, and the place of a crop on the sensor.
 
-A header is a mapping of FITS keywords (those of KEYS) to values of any kind; every value is checked.
+A header is a mapping of FITS keywords (KEYS) to values of any kind; every value is checked.
 """
 
 import math
@@ -14,14 +14,14 @@ from starpos.frames import times
 from starpos.frames.shutter import Shutter
 from starpos.units import ARCSEC
 
-# By which cards a frame may say the column and the row of the sensor's frame at which it begins: the number itself, in
-# the pixels of this frame (SBFITSEXT: MaxIm, APT, Seestar and others), or its negative (IRAF's physical coordinates)
+# Cards with the column and row of the sensor's frame at which a frame begins, in pixels of this frame, and their sign:
+# positive by SBFITSEXT (MaxIm, APT, Seestar and others), negative in IRAF's physical coordinates
 CROPS = ((("XORGSUBF", "YORGSUBF"), 1.0), (("LTV1", "LTV2"), -1.0))
 # IRAF's size of a pixel in physical ones
 LTM = ("LTM1_1", "LTM2_2")
 # arcsec per px, by INDI, Sequence Generator Pro and others
 SCALES = ("SCALE", "PIXSCALE", "SECPIX1")
-# a focal length, a pixel or a scale below this is none
+# minimum of a focal length, a pixel or a scale that counts as stated
 LEAST = 1e-9
 KEYS = (
     *times.KEYS,
@@ -38,7 +38,7 @@ KEYS = (
 
 
 def about(header: Mapping, place: str) -> dict[str, Any]:
-    """Read the fields of an Exposure that a header tells; FrameError for a bad shutter. place names it in messages."""
+    """Read the fields of an Exposure that a header states; FrameError for a bad shutter. place names it in messages."""
     return times.times(header) | {
         "source": place,
         "focal_px": focal_px(header),
@@ -94,6 +94,6 @@ def _positive(header: Mapping, key: str) -> float | None:
 
 
 def focal_mm(focal_px: float, pixel_um: float) -> float:
-    """FOCALLEN, mm, of a focal length in px and pixels of so many um."""
-    # so many digits make 29.67 of 29.669999999999998
+    """FOCALLEN, mm, from a focal length in px and the size of a pixel in um."""
+    # 12 digits turn 29.669999999999998 into 29.67
     return float(f"{focal_px * pixel_um / 1000:.12g}")

@@ -13,10 +13,10 @@ from starpos.frames.pictures import frame_pixels
 
 
 def heif_frame(data: bytes, place: str, clock: exif.CameraClock | None = None) -> Frame:
-    """Read the first picture of a HEIF file by the rules of `reading.read_frame`; FrameError if it is none.
+    """Read the first picture of a HEIF file by the rules of `reading.read_frame`; FrameError if it is not one.
 
-    Where the camera was held upright, or a phone so, the picture is turned to be looked at.
-    place says where the bytes came from, for messages; clock is that of the camera, if it may be trusted.
+    A picture taken in portrait format is turned upright.
+    place says where the bytes came from, for messages; clock: of the camera, if it may be trusted.
     """
     try:
         import pillow_heif

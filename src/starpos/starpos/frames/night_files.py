@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Names of what lies beside the frames of a night on the disk."""
+"""Names of the files next to the frames of a night on disk."""
 
 # readings of the inclinometer; fixes of a GNSS receiver; what is known to be true of the night
 TILTS, GNSS, TRUTH = "tilt.csv", "gnss.csv", "truth.json"

@@ -26,7 +26,7 @@ WIDTH, HEIGHT, BITS, SAMPLES = 256, 257, 258, 277
 def picture_frame(data: bytes, place: str, clock: exif.CameraClock | None = None) -> Frame:
     """Read the bytes of a PNG, TIFF, JPEG or BMP by the rules of `reading.read_frame`; FrameError for anything else.
 
-    place says where the bytes came from, for messages; clock is that of the camera, if it may be trusted.
+    place says where the bytes came from, for messages; clock: of the camera, if it may be trusted.
     """
     pixels = picture_pixels(data, place)
     return Frame(pixels, source=place, **exif.told(data, place, clock, pixels.shape))
@@ -45,7 +45,7 @@ def picture_pixels(data: bytes, place: str) -> np.ndarray:
 
 
 def frame_pixels(pixels: np.ndarray, place: str) -> np.ndarray:
-    """Pixels (h, w) or (h, w, channels) of a picture in the form that a Frame has; FrameError if they are no numbers."""
+    """Pixels (h, w) or (h, w, channels) of a picture in the form that a Frame has; FrameError if they are not numbers."""
     import cv2
 
     if pixels.ndim == 3:

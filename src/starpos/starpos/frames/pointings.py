@@ -14,7 +14,7 @@ from starpos.units import ARCSEC
 MAX_CSV_BYTES, MOST_ROWS = 20_000_000, 100_000
 NEEDED = ("utc_unix_s", "ra_deg", "dec_deg", "sigma_arcsec")
 ROLL = ("roll_deg", "sigma_roll_arcsec")
-# an error of a degree is no pointing; one of nothing is a mistake
+# limits of a stated sigma: with an error of a degree a pointing is useless, an error of 0 is a mistake
 LEAST_ARCSEC, MOST_ARCSEC = 1e-4, 3600.0
 MOST_ROLL_ARCSEC = 36_000.0
 # what each column may hold, in its own unit
@@ -55,7 +55,7 @@ def read_pointings(path: Path | str) -> list[Pointing]:
     """Read a CSV whose first line names utc_unix_s, ra_deg, dec_deg, roll_deg, sigma_arcsec, sigma_roll_arcsec.
 
     The columns of the roll may be empty or absent, exposure_s may be added; other columns are not read.
-    The `source` of each pointing is the table and its line.  FrameError says why a table cannot be used.
+    `source` of a pointing: the table and the line.  FrameError says why a table cannot be used.
     """
     try:
         text = read_regular(path, MAX_CSV_BYTES).decode("utf-8-sig")

@@ -17,9 +17,9 @@ MOST_IFDS, MOST_VALUES = 64, 1 << 20
 
 
 def raw_frame(data: bytes, place: str, clock: exif.CameraClock | None = None) -> Frame:
-    """Read the mosaic as the sensor gave it, with its pattern, from the bytes of a raw file; FrameError if it is none.
+    """Read the mosaic as the sensor gave it, with its pattern, from the bytes of a raw file; FrameError if it is not one.
 
-    place says where the bytes came from, for messages; clock is that of the camera, if it may be trusted.
+    place says where the bytes came from, for messages; clock: of the camera, if it may be trusted.
     """
     try:
         import rawpy
@@ -87,7 +87,7 @@ def _end(data: bytes) -> int:
 
 
 def _ifd(data: bytes, at: int, order: str) -> tuple[dict[int, tuple[int, ...]], int]:
-    """Values of those tags of an IFD that are named above, and the offset of the next IFD; struct.error if it is none."""
+    """Values of the tags above in an IFD, and the offset of the next IFD; struct.error if it is not an IFD."""
     (count,) = struct.unpack_from(order + "H", data, at)
     tags = {}
     for k in range(count):

@@ -21,7 +21,7 @@ from starpos.frames.stars import Stars
 
 FITS = (".fits", ".fit", ".fts", ".fz", ".gz")
 PICTURE = (".png", ".tif", ".tiff", ".bmp")
-# Beside raw files usually a copy of them.
+# Next to raw files usually a copy of them.
 JPEG = (".jpg", ".jpeg")
 HEIF = (".heic", ".heif", ".hif")
 RAW = (".cr2", ".cr3", ".nef", ".arw", ".dng", ".raf", ".orf", ".rw2", ".pef")
@@ -30,18 +30,19 @@ RAW = (".cr2", ".cr3", ".nef", ".arw", ".dng", ".raf", ".orf", ".rw2", ".pef")
 def read_frame(path: Path | str, clock: CameraClock | None = None) -> Frame | Stars:
     """Read one exposure, or the star list of one; the file's suffix says which.
 
-    clock is that of the camera which wrote the file, if it may be trusted.
+    clock: of the camera that wrote the file, if it may be trusted.
 
     FITS (also .fz and .gz): DATE-OBS (or DATE-BEG, MJD-OBS, MJD-BEG) is the start of the exposure in UTC (or in
-    TIMESYS), whose last digit is its error, EXPTIME or EXPOSURE its length in s, where 0 is unknown; a DATE-AVG is its
-    middle, a DATE-END its end. Where these contradict each other, or a stack is told (STACKCNT), there is no time.
+    TIMESYS), whose last digit is its error. EXPTIME or EXPOSURE is its length in s, where 0 is unknown; a DATE-AVG is
+    its middle, a DATE-END its end. Where these contradict each other, or the frame is a stack (STACKCNT), there is no
+    time.
     XORGSUBF and YORGSUBF (or LTV1 and LTV2) say of which part of the sensor a frame is. BAYERPAT (XBAYROFF, YBAYROFF) is
     the mosaic; FOCALLEN (mm) and XPIXSZ (um), or SCALE (arcsec), give focal_px. The first row of the file is row 0.
     Values that fit 16 bits are only rounded. Others are shifted to begin at 0, and scaled to fill 16 bits if their
     range is wider than that or, for floats, narrower than 4096. A few NaN or infinite pixels become the median.
     Values farther from it than any light (frame.LOUDEST) are clipped. Of several images (HDUs) the first is taken,
     with a warning; `a.fits[2]` or `a.fits[SCI]` is another one, by its number from 0 or its EXTNAME. What its header
-    lacks is that of the primary one.
+    lacks comes from the primary one.
     Three planes (NAXIS3 = 3) are colours, and become their mean.
     TIFF, PNG, JPEG, BMP: 8 or 16 bits, grey or colour; TIFF also of floats, by the rule above. Colours of more than 8
     bits become the mean of the three. HEIF: the same, through pillow-heif.
@@ -49,8 +50,8 @@ def read_frame(path: Path | str, clock: CameraClock | None = None) -> Frame | St
     The exposure of pictures and raw files, and about their focal length, come from EXIF if exifread is installed; their
     time too, but only with a clock.
     CSV: a first line `# {"NAXIS1": ..., "NAXIS2": ..., "DATE-OBS": ..., "EXPTIME": ...}`, in which the NAXIS pair is
-    required, then columns x, y, flux and optionally sigma (px); without it sigma is 0.1 px. The SNR is 1 px / sigma, that
-    of a star image whose standard deviation is 1 px.
+    required, then columns x, y, flux and optionally sigma (px); without it sigma is 0.1 px. The SNR is 1 px / sigma, as
+    for a star image whose standard deviation is 1 px.
 
     Without a time or an exposure mid_unix_s is None, and untimed says why. FrameError for everything
     that is not as described here.
@@ -66,7 +67,7 @@ def read_frame(path: Path | str, clock: CameraClock | None = None) -> Frame | St
 
 
 def _part_of(path: Path) -> tuple[Path, str]:
-    """The file that a path names, and the part of it: of `a.fits[2]` a.fits and 2."""
+    """The file that a path names, and the part of it: a.fits and 2 for `a.fits[2]`."""
     parts = re.fullmatch(r"(.+)\[([\w ,.-]+)\]", str(path))
     if parts is None or Path(parts[1]).suffix.lower() not in FITS or path.exists():
         return path, ""

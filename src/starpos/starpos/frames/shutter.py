@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """A camera's shutter: when each row of a frame was exposed.
 
-A rolling shutter begins and ends the exposure of each row a little later than that of the row before. A driver, and
-DATE-OBS, tell when the row began that is read first: its exposure is what a stamp is the middle of. While the rows
-follow, the sky turns, by 15 arcsec a second: so stars lie later the further down they are, the field looks sheared and
-turned, and a field of few degrees makes a large turn out of it.
+A rolling shutter begins and ends the exposure of each row a little later than the row before. A driver and DATE-OBS give
+the time of the row that is read first: a stamp is the middle of this row's exposure. While the rows follow, the sky
+turns by 15 arcsec a second. So the field looks sheared and turned, and in a field of few degrees this becomes a large
+turn.
 """
 
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ import numpy as np
 
 from starpos.errors import FrameError
 
-# 1 sigma of a readout of which nobody has said anything: evenly up to 50 ms, from the top or from the bottom
+# 1 sigma of an unstated readout: evenly up to 50 ms, from the top or from the bottom
 UNKNOWN_READOUT_S = 0.03
 MOST_READOUT_S = 10.0
 # 1 sigma of the time from a consumer camera's stamp to the opening of its shutter: evenly up to 100 ms
@@ -25,8 +25,8 @@ class Shutter:
     """Times of a frame's rows; FrameError for impossible values.
 
     readout_s         from the row that is read first to the last, s: positive where the top row is first, negative
-                      where it is the bottom row; 0 where all rows are exposed at once (a global shutter), or where
-                      nobody knows which is first
+                      where it is the bottom row; 0 where all rows are exposed at once (a global shutter), or where it is
+                      unknown which is first
     readout_stddev_s  its standard deviation
     """
 
@@ -36,7 +36,8 @@ class Shutter:
     def __post_init__(self) -> None:
         if not (abs(self.readout_s) <= MOST_READOUT_S and 0 <= self.readout_stddev_s <= MOST_READOUT_S):
             raise FrameError(
-                f"a shutter's readout of {self.readout_s:g} s +- {self.readout_stddev_s:g} s cannot be: give at most "
+                f"a shutter's readout of {self.readout_s:g} s +- {self.readout_stddev_s:g} s is impossible: "
+                f"give at most "
                 f"{MOST_READOUT_S:g} s from the first row to the last, negative where the bottom row is first, and its "
                 "standard deviation"
             )
@@ -47,7 +48,7 @@ class Shutter:
 
     def errors_s(self, y: np.ndarray, height: int) -> np.ndarray:
         """Change (N, 2) of `later_s` for two independent errors of 1 sigma, which all frames share."""
-        # from an unknown end: what differs from row to row has either sign, and their mean comes too late by half
+        # from an unknown end: the difference from row to row has either sign, and their mean is late by half the readout
         middle = 0.0 if self.readout_s else 0.5
         errors = np.empty((len(y), 2))
         errors[:, 0], errors[:, 1] = self._share(y, height) - middle, middle

@@ -36,7 +36,7 @@ class Stars(Exposure):
     flags           (N,) uint8, a sum of SATURATED, EDGE, ELONGATED, BLENDED
     width, height   px, of the frame
     fwhm_px         width of the star images, px; None: unknown
-    window          px, the part of the frame that shows something, where the rest is white; None: all of it
+    window          px, the part of the frame that holds a picture, if the rest is white; None: all of it
     negative        whether they are dark on a bright sky, as on a plate
 
     Sequences are converted to arrays. FrameError if the columns do not fit together or hold impossible values.

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""When a frame was exposed, by its header: what the cards say of its start, middle, end and length, held together.
+"""When a frame was exposed, by its header: its cards of start, middle, end and length, compared with each other.
 
-Cards that contradict each other tell no time, and a length of 0 is unknown. A header that tells no time says why.
+Cards that contradict each other give no time, and a length of 0 is unknown. Without a time `untimed` says why.
 """
 
 import math
@@ -26,9 +26,9 @@ START, MIDDLE, END = (
 )
 # UTC of the start, where DATE-OBS or DATE-BEG is a day alone
 HOURS = ("TIME-OBS", "UT", "UTSTART")
-# s: of one exposure (EXP: DWARF), then the light of all (LIVETIME: Siril, TOTALEXP: Seestar)
+# lengths in s: of one exposure (EXP: DWARF), then of all together (LIVETIME: Siril, TOTALEXP: Seestar)
 LENGTHS = ("EXPTIME", "EXPOSURE", "XPOSURE", "EXP", "LIVETIME", "TOTALEXP")
-# exposures that are stacked (Seestar and Siril, IRAF, MaxIm and others)
+# number of stacked exposures (Seestar and Siril, IRAF, MaxIm and others)
 COUNTS = ("STACKCNT", "NCOMBINE", "SNAPSHOT")
 KEYS = (*START, *MIDDLE, *END, *HOURS, *LENGTHS, *COUNTS, "TIMESYS")
 # Time scales of TIMESYS that are read; UT1 would need tables.
@@ -38,7 +38,7 @@ MOST_APART_S = 0.5
 ISO_TIME = re.compile(r"(\d{4})-(\d\d)-(\d\d)T(\d\d):(\d\d)(?::(\d\d?(?:\.\d*)?))?Z?", re.ASCII)
 DAY = re.compile(r"\d{4}-\d\d-\d\d", re.ASCII)
 MJD_ZERO_JD, FARTHEST_MJD = 2400000.5, 1e7
-# an MJD's last digit counts from here: below it lie the last bits of a double
+# smallest step of an MJD's last digit: below it lie the last bits of a double
 LEAST_MJD_STEP_S = 1e-3
 
 
@@ -65,10 +65,10 @@ class _Middle:
 
 
 def times(header: Mapping) -> dict[str, Any]:
-    """Read the fields of an Exposure that tell when it was: mid_unix_s, exposure_s, stamp_stddev_s, or untimed.
+    """Read the time of an Exposure: mid_unix_s, exposure_s, stamp_stddev_s, or untimed.
 
-    stamp_stddev_s comes from the last digit of a time, which may be rounded or cut off, and from how far cards are apart
-    that should agree. Where the header has no card of a time, nothing is said of why.
+    stamp_stddev_s comes from the last digit of a time, which may be rounded or cut off, and from how far cards that
+    should agree are apart. A header without any card of a time has an empty untimed.
     """
     try:
         _check_single(header)
@@ -100,7 +100,7 @@ def times(header: Mapping) -> dict[str, Any]:
 
 
 def _apart_s(one: _Middle, other: _Middle) -> float:
-    """How much farther two middles are apart than digits that are cut off or rounded explain."""
+    """How much farther two middles are apart than rounding of their digits explains."""
     step_s = math.sqrt(3) * (one.stddev_s + other.stddev_s)
     # and the last bits of sums
     return max(0.0, abs(one.after_s - other.after_s) - step_s - 1e-6)
@@ -117,7 +117,7 @@ def _check_single(header: Mapping) -> None:
 
 
 def _lengths(header: Mapping) -> dict[str, float]:
-    """The lengths of the exposure in s by card; 0 is none. TimeError for one that is no length."""
+    """The lengths of the exposure in s by card; 0 is missing. TimeError for a value that is not a length."""
     lengths = {}
     for key in LENGTHS:
         if (value := header.get(key)) in (None, ""):
@@ -143,7 +143,7 @@ def _no_length(header: Mapping) -> str:
 
 
 def _instants(header: Mapping) -> dict[str, _Instant]:
-    """The times in the header by card; TimeError for one that is no time."""
+    """The times in the header by card; TimeError for a value that is not a time."""
     keys = [key for key in (*START, *MIDDLE, *END) if header.get(key) not in (None, "")]
     scale = str(header.get("TIMESYS") or "UTC").strip().lower()
     if keys and scale not in SCALES:
@@ -155,7 +155,7 @@ def _instants(header: Mapping) -> dict[str, _Instant]:
 def _middles(
     told: Mapping[str, _Instant], lengths: Mapping[str, float]
 ) -> tuple[list[_Middle], _Instant | None]:
-    """The middles of the exposure by the cards, and the instant after which they are; TimeError if the end is early."""
+    """The middles of the exposure by the cards, and the instant they count from; TimeError if they end early."""
     if not told:
         return [], None
     zero = next(iter(told.values()))
@@ -170,11 +170,11 @@ def _middles(
             span_s = end.since_s(start)
             if span_s < 0:
                 raise TimeError(f"its {last} is before its {key}: correct the header")
-            # an end is often when the frame had come: a start and a length count for more
+            # an end is often the arrival of the frame: a start and a length are better
             stddev_s = math.hypot(start.stddev_s, end.stddev_s)
             found.append(_Middle(at_s + span_s / 2, stddev_s, f"{key} with {last}"))
     if not starts:
-        # what reads the clock when the frame has come is late
+        # a clock read on arrival of the frame is late
         found += [
             _Middle(
                 end.since_s(zero) - s / 2,
@@ -188,7 +188,7 @@ def _middles(
 
 
 def _span_s(told: Mapping[str, _Instant]) -> float | None:
-    """The length of the exposure from its start to its end, as far as these are told."""
+    """The length of the exposure from its start to its end, as far as these are known."""
     start, end = (next((told[key] for key in keys if key in told), None) for keys in (START, END))
     if start is None or end is None:
         return None
@@ -197,7 +197,7 @@ def _span_s(told: Mapping[str, _Instant]) -> float | None:
 
 
 def _instant(header: Mapping, key: str, scale: str) -> _Instant | None:
-    """The time of a card; None if it is a day without an hour. TimeError if it is no time."""
+    """The time of a card; None if it is a day without an hour. TimeError if it is not a time."""
     value = header[key]
     if key.startswith("MJD"):
         try:
@@ -220,7 +220,7 @@ def _instant(header: Mapping, key: str, scale: str) -> _Instant | None:
             value = f"{value}T{str(hours).strip()}"
     try:
         with warnings.catch_warnings():
-            # of years whose leap seconds nobody knows
+            # of years whose leap seconds are not known yet
             warnings.simplefilter("ignore", erfa.ErfaWarning)
             # a second beyond the end of its minute
             warnings.filterwarnings("error", ".*(after end of day|both of)", erfa.ErfaWarning)
@@ -234,7 +234,7 @@ def _instant(header: Mapping, key: str, scale: str) -> _Instant | None:
 
 
 def _unix_s(day: float, part: float) -> float:
-    """Unix time of a Julian date in TAI; as sums are made in TAI, exposures across a leap second come out right."""
+    """Unix time of a Julian date in TAI; as sums are formed in TAI, exposures across a leap second come out right."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", erfa.ErfaWarning)
         day, part = erfa.taiutc(day, part)
@@ -250,7 +250,7 @@ def _as_today(start: Any) -> Any:
 
 
 def _rounding(start: float | str) -> float:
-    """Standard deviation (s) from the last digit of a text or an MJD, rounded or cut off; 0 of an MJD with many."""
+    """Standard deviation (s) from the last digit of a text or an MJD, rounded or cut off; 0 for a long MJD."""
     if not isinstance(start, str):
         digits = repr(start).partition(".")[2].rstrip("0")
         sigma_s = DAY_S * 10.0 ** -len(digits) / math.sqrt(3)
@@ -263,7 +263,7 @@ def _rounding(start: float | str) -> float:
 
 
 def _day_of(start: float | str, scale: str) -> tuple[float, float]:
-    """Julian date of a time in its scale, in two parts: ERFA's quasi-JD where that is UTC; ValueError for no time.
+    """Julian date of a time in its scale, in two parts: ERFA's quasi-JD for UTC; ValueError if invalid.
 
     By ERFA alone: astropy's times, which are ERFA's, take as long to import as the rest of a program's start.
     """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How the stars of a frame move during its exposure, where somebody knows: a gyro, or who made the frame."""
+"""How the stars of a frame move during its exposure, where it is known: by a gyro, or by the frame's maker."""
 
 import math
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from starpos.frames.exposure import LARGEST_SIDE_PX
 
 @dataclass(frozen=True, kw_only=True)
 class Trail:
-    """The way of stars from the beginning of an exposure to its end; FrameError for what is no way.
+    """The way of stars from the beginning of an exposure to its end; FrameError for impossible values.
 
     middle_px  (x, y) px of a star in the middle of the frame
     roll_rad   by which all stars turn about the middle, from x towards y; a camera that looks up rolls when its vehicle
@@ -44,7 +44,7 @@ class Trail:
         return np.outer(self.middle_px, self.middle_px) + self._chord**2 * np.diag([height**2, width**2]) / 12
 
     def varies_px(self, width: int, height: int) -> float:
-        """Px by which the way in a corner of a frame differs from that in the middle."""
+        """Px by which the way in a corner of a frame differs from the way in the middle."""
         return abs(self._chord) * math.hypot(width, height) / 2
 
     def halved(self) -> "Trail":

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""GNSS beside the stars: it teaches A3, the inclinometer's errors and the deflection of the vertical, and is guarded."""
+"""GNSS with the stars: it teaches A3, the inclinometer's errors and the deflection of the vertical, and is guarded."""

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tells a GNSS place that is led astray, at once or slowly, from one that is good.
+"""Detects a GNSS place that is spoofed or wrong, suddenly or slowly.
 
-At several moments of the last half hour a witness was set aside: a filter that began with what was known then, and that
-goes on with one more unknown, an error of GNSS that began at that moment, as a step or growing evenly.  If GNSS is good
-that error is 0 within its covariance, which holds all that the stars' place may err by; a likelihood ratio tells
-(Willsky and Jones, IEEE Trans. Automatic Control 21(1), 1976, 108, from memory).  So a drag shows although each frame of
-it agrees with the frame before, and although the filter that learns has followed it.
+At several moments of the last half hour a witness was set aside: a filter that began with the state of that time. It has
+one more unknown, an error of GNSS that began at that moment, as a step or growing evenly. If GNSS is good, that error is
+0 within its covariance, which includes all errors of the stars' place; a likelihood ratio decides (Willsky and Jones,
+IEEE Trans. Automatic Control 21(1), 1976, 108, from memory).  So a drag shows although each frame of it agrees with the
+frame before, and although the filter that learns has followed it.
 """
 
 from dataclasses import dataclass, replace
@@ -15,9 +15,9 @@ import numpy as np
 from starpos.gnss.sighting import Innovation
 from starpos.gnss.states import Ageing, Learned
 
-# A witness is set aside every so many s, and heard for so long.
+# Interval at which witnesses are set aside, and time for which each one is kept, s.
 EVERY_S, LONGEST_S = 110.0, 3000.0
-# The growing error is counted from this time on, in units of that many s.
+# Time from which the growing error is counted, and its unit, s.
 GROWS_AFTER_S, UNIT_S = 240.0, 600.0
 # 1 sigma of an error of which nothing is known, as an angle at the Earth's centre: 600 km.
 NOTHING_RAD = 0.1
@@ -39,7 +39,7 @@ class Witnesses:
 
     @classmethod
     def none(cls, size: int) -> "Witnesses":
-        """No witness, for filters of so many states."""
+        """No witness, for filters of a number of states."""
         n = size + OFFSETS
         return cls((), np.zeros(0), np.zeros(0, int), np.zeros((0, n)), np.zeros((0, n, n)))
 

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What an instrument should do so that GNSS teaches more."""
+"""Advice on how an instrument lets GNSS teach more."""
 
 import numpy as np
 
 from starpos.gnss.filter import LINEAR_TURN_RAD
 from starpos.gnss.states import Learned
 
-# A3 and the deflection that are correlated by more have not been told apart.
+# Correlation of A3 and the deflection above which they are not separated.
 ALIKE = 0.8
 # Fewer poses average the inclinometer's errors badly.
 FEW_POSES = 6

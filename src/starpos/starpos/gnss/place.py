@@ -30,7 +30,7 @@ OTHER_DATUMS = (
     "sk42",
     "sk-42",
 )
-# A receiver that states a larger error tells no place.
+# A receiver that states a larger error gives no place.
 MOST_SIGMA_M = 10_000.0
 # A receiver's default output before it has a place.
 NULL_ISLAND_DEG = 1e-5
@@ -65,9 +65,9 @@ class GnssPlace:
 def checked(
     utc_unix_s: float, latitude_deg: float, longitude_deg: float, covariance: np.ndarray, status: float
 ) -> GnssPlace:
-    """The place of a receiver's output; GnssError that says why it tells none.
+    """The place of a receiver's output; GnssError that says why it gives none.
 
-    covariance (2, 2): of east and north, m2.  status: as that of NavSatStatus, below 0 without a fix.
+    covariance (2, 2): of east and north, m2.  status: as in NavSatStatus, below 0 without a fix.
     """
     if not status >= 0:
         raise GnssError("GNSS has no fix: give its antenna a clear view of the sky")
@@ -98,7 +98,7 @@ def checked(
 def message_to_gnss(message: Any, unstated_m: float = math.nan) -> GnssPlace:
     """The place of a sensor_msgs/NavSatFix; GnssError that says why it has none.
 
-    unstated_m: 1 sigma an axis of a fix that states no error; NaN: such a fix is none.
+    unstated_m: 1 sigma an axis of a fix that states no error; NaN: such a fix is refused.
     """
     unix_s = stamp_to_unix(message.header.stamp)
     if unix_s is None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The solution of a frame with what GNSS has taught before it, and what the guard says of the GNSS place at it."""
+"""The solution of a frame with what GNSS has taught before it, and the guard's verdict on the GNSS place at it."""
 
 from dataclasses import dataclass, replace
 
@@ -95,7 +95,7 @@ def watched(
 
 
 def _up(watch: GnssWatch, fix: Fix, tilt: Tilt, gnss: GnssPlace | None) -> np.ndarray | None:
-    """Up (3,) in C: as it was learned where that tells a place, else by GNSS; None if neither tells it."""
+    """Up (3,) in C: as learned if that gives a place, else by GNSS; None without either."""
     if watch.tells_place(LevelSight.of(fix, tilt)):
         return watch.up_in_camera(tilt)
     if gnss is None:
@@ -135,7 +135,7 @@ def _kept_terms(fix: Fix) -> tuple[ErrorTerm, ...]:
 
 
 def _budgeted(fix: Fix, sighting: LevelSight, learned: Learned) -> Fix:
-    """The fix with the error of what was learned in the place of those of A3 and the inclinometer."""
+    """The fix with the error of the learned states in place of the errors of A3 and the inclinometer."""
     rows = _zenith_rows(fix, sighting, learned)
     root = symmetric_root(rows @ learned.covariance @ rows.T)
     term = ErrorTerm(LEARNED_TERM, _zenith_moved(fix) @ root, shared=ALWAYS)

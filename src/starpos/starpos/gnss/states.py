@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What GNSS teaches of an instrument: A3, the errors of its inclinometer, the deflection of the vertical; all together.
 
-All are angles in rad, or shares. Their covariance is kept whole, because at once most of them cannot be told apart: at
+All are angles in rad, or shares. Their covariance is kept whole, because at first most of them cannot be separated: at
 one pose a turn of A3 looks like a zero, and at one heading like a deflection.
 """
 
@@ -26,9 +26,9 @@ CONSTANT_SHARE = 0.5
 FIELD_LENGTH_M = 37_000.0
 # An error of GNSS that it does not state: multipath, which changes within minutes.
 GNSS_SLOW_RAD, GNSS_SLOW_S = 10.0 / 6.371e6, 300.0
-# 1 sigma about each axis of an A3 of which nobody knows anything.
+# 1 sigma about each axis of an unknown A3.
 NO_A3_RAD = 1.0
-# A night cools by so much in that time: the wandering of a temperature that nobody measures.
+# A night's cooling: the random walk of an unmeasured temperature.
 UNMEASURED_C_PER_SQRT_HOUR = 14.0 / np.sqrt(6.0)
 
 
@@ -73,7 +73,7 @@ class Layout:
 
     @property
     def constant(self) -> slice:
-        """Deflection, east and north, that is the same everywhere, beyond that of the `Vertical`."""
+        """Deflection, east and north, that is the same everywhere, beyond the `Vertical`'s."""
         return self._slice(5)
 
     @property
@@ -148,7 +148,7 @@ class Learned:
         return response_columns(tilt.theta, tilt.up, zeroed), tilt.slope
 
     def warmer_c(self, tilt: Tilt) -> float:
-        """How much warmer a tilt's sensor is than `temperature_c`; 0 where nobody measured."""
+        """How much warmer a tilt's sensor is than `temperature_c`; 0 if not measured."""
         warmer = tilt.temperature_c - self.temperature_c
         return float(warmer) if np.isfinite(warmer) else 0.0
 
@@ -169,7 +169,7 @@ class Learned:
         return rows
 
     def deflection_rad(self, vertical: Vertical, latitude: float, longitude: float) -> np.ndarray:
-        """Deflection (2,) east, north at a place: that of a Vertical, and what was learned beyond it."""
+        """Deflection (2,) east, north at a place: a Vertical's, and what was learned beyond it."""
         stated, at = vertical.at(latitude, longitude), self.layout
         known = np.array([stated.eta_arcsec, stated.xi_arcsec]) * ARCSEC
         return known + self.state[at.constant] + self.state[at.field]

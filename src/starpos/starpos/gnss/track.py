@@ -6,9 +6,9 @@ import numpy as np
 from starpos.errors import GnssError
 from starpos.gnss.place import GnssPlace
 
-# An older or a later place says nothing of a frame, s.
+# Maximum time between a GNSS place and a frame, s.
 NEAREST_S = 3.0
-# The way of a vehicle between two places is at most this many m/s, and so many sigma of both beyond it.
+# Maximum speed of a vehicle between two places, m/s, and tolerance beyond it, in sigma of both.
 MOST_SPEED, SIGMAS = 150.0, 8.0
 # Stamps closer than this are one.
 SAME_S = 1e-4
@@ -17,7 +17,7 @@ SAME_S = 1e-4
 class GnssTrack:
     """GNSS places by time.
 
-    Two places of one moment that contradict each other tell none: two receivers, or one that is led astray.
+    Two places of one moment that contradict each other give none: two receivers, or a spoofed one.
     """
 
     def __init__(self, places: list[GnssPlace]) -> None:
@@ -70,7 +70,7 @@ def agree(a: GnssPlace, b: GnssPlace) -> bool:
 
 
 def _agreeing(ordered: list[GnssPlace]) -> list[GnssPlace]:
-    """One place for each moment; none where those of a moment contradict each other."""
+    """One place for each moment; none if a moment's places contradict each other."""
     kept: list[GnssPlace] = []
     start = 0
     for end in range(1, len(ordered) + 1):

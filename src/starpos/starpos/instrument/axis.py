@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where the optical axis pierces the frames of a night, as far as anybody has said of which sensor they are a part."""
+"""Where the optical axis pierces the frames of a night, as far as their part of the sensor is known."""
 
 import math
 from dataclasses import dataclass, replace
@@ -10,20 +10,20 @@ import numpy as np
 from starpos.instrument.instrument import Instrument
 from starpos.units import ARCSEC
 
-# Longer over shorter side of sensors, and of what cameras keep of their middle; real ones differ by this share.
+# Longer over shorter side of sensors and of cameras' crops, and tolerance on it.
 SHAPES = (1.0, 5 / 4, 4 / 3, 3 / 2, 8 / 5, 16 / 9)
 SHAPE_OFF = 0.05
-# Sizes of whole frames of some cameras, to which programs also cut the frames of larger sensors.
+# Frame sizes of some cameras; programs also crop larger sensors to these sizes.
 STANDARD_SIZES = {(320, 240), (640, 480), (800, 600), (1024, 768), (1280, 720), (1280, 960), (1280, 1024), (1600, 1200),
                   (1920, 1080)}  # fmt: skip
-# 1 sigma of the axis from a frame's centre where nobody knows of which part of the sensor it is: its longer side, and at
-# least this, as most sensors have up to 7000 px
+# 1 sigma of the axis from a frame's centre if the frame's part of the sensor is unknown: its longer side, and at least
+# this, as most sensors have up to 7000 px
 LEAST_UNKNOWN_PX = 2000.0
 SIZE_IN_FILE = "camera: {focal_mm, pixel_um, width, height} in the instrument file"
 
 
 class Framed(Protocol):
-    """A frame, or what is known of it, in px."""
+    """A frame's geometry, in px."""
 
     @property
     def width(self) -> int:
@@ -40,14 +40,14 @@ class Framed(Protocol):
 
 @dataclass(frozen=True)
 class AxisDoubt:
-    """Why nobody knows where the optical axis pierces frames; 1 sigma of it in px and rad, 0 where it does not count."""
+    """Why the optical axis's place in frames is unknown; its 1 sigma in px and rad, 0 if it does not count."""
 
     why: str
     error_px: float = 0.0
     error_rad: float = 0.0
 
     def counted_as(self, error: str) -> str:
-        """The doubt as a sentence; error: the one that it becomes a part of."""
+        """The doubt as a sentence; error: the error that it becomes a part of."""
         if not self.error_px:
             return (
                 f"{self.why}: if they are cut out of larger ones, the optical axis may be off their middle and the place "
@@ -80,21 +80,21 @@ def framed(instrument: Instrument, first: Framed) -> tuple[Instrument, AxisDoubt
         why = f"no sensor has the shape of frames of {width} x {height} px"
     elif np.isfinite(origin_px).all():
         left, top = origin_px
-        # a crop is taken from the middle, for want of better; frames that begin elsewhere then agree with it
+        # a crop is assumed to be from the middle, for lack of better; frames that begin elsewhere then agree with it
         whole_size = round(width + 2 * max(left, 0.0)), round(height + 2 * max(top, 0.0))
         instrument = replace(instrument, frame_size=whole_size)
         why = (
-            f"these frames of {width} x {height} px begin at column {left:g}, row {top:g} of a sensor whose size nobody "
-            "says"
+            f"these frames of {width} x {height} px begin at column {left:g}, row {top:g} of a sensor whose "
+            f"size is not stated"
         )
     else:
-        why = f"these frames of {width} x {height} px are cut out of larger ones, nobody says where"
+        why = f"these frames of {width} x {height} px are cut out of larger ones at an unstated position"
     error_px = max(longer, LEAST_UNKNOWN_PX)
     return instrument, AxisDoubt(why, error_px, math.atan(error_px / instrument.focal_px))
 
 
 def with_frame_size(instrument: Instrument, first: Framed) -> tuple[Instrument, str]:
-    """The instrument as `framed` has it, with the error of the axis in A3's, and its doubt; '' where A3 is not known.
+    """The instrument as `framed` has it, with the axis's error included in A3's, and its doubt; '' if A3 is not known.
 
     The error stands in axis_stddev_rad too, for headings at a known place, which need no A3.
     """

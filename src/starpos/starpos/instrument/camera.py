@@ -67,7 +67,7 @@ class Camera:
 
     @cached_property
     def lens(self) -> Lens:
-        """Its lens: directions in C, and places in focal lengths."""
+        """Its lens: between directions in C and places in focal lengths."""
         return lens_of(self.model, self.distortion)
 
     @cached_property
@@ -110,11 +110,11 @@ class Camera:
         return replace(self, fx=self.fx * factor, fy=self.fy * factor)
 
     def part(self, left: float, top: float, width: int, height: int) -> "Camera":
-        """The camera of a part of its frame, of a size in px and with its first pixel at that column and row."""
+        """The camera of a part of its frame: its size in px, and column and row of its first pixel."""
         return replace(self, width=width, height=height, cx=self.cx - left, cy=self.cy - top)
 
     def sees(self, x: ArrayLike, y: ArrayLike) -> np.ndarray:
-        """Whether pixels x, y (N,) lie within the lens's picture: around that of a fisheye the frame may be black."""
+        """Whether pixels x, y (N,) lie within the lens's picture: around a fisheye's picture the frame may be black."""
         places = self._places(x, y)
         if not isinstance(self.lens, Equidistant):
             return np.ones(places.shape[:-1], bool)

@@ -59,7 +59,7 @@ def write(path: Path, camera: Camera, name: str, comment: str = "") -> None:
 
 
 def as_written(path: Path, name: str) -> bool:
-    """Whether a file is what `write` has written with a comment and this name, and nobody has changed it."""
+    """Whether a file is unchanged since `write` wrote it with a comment and this name."""
     try:
         text = yaml_file.text_at(path, "calibration file")
         comment = yaml_file.own_comment(text)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A camera that is fixed to the ground and has no inclinometer: its pose at a known place is its vertical.
 
-It is an inclinometer made up for the purpose, whose Z' is the camera's vertical of the calibration and which always reads
-zero. A3 takes C into it, its drift is the sag of the camera. So all that is known of calibrations and budgets holds.
+It is modelled as an inclinometer that always reads zero and whose Z' is the camera's vertical at the calibration. A3
+takes C into it; its drift is the sag of the camera. So calibrations and budgets work as usual.
 """
 
 from dataclasses import dataclass, replace
@@ -13,9 +13,9 @@ from starpos.errors import InstrumentError
 from starpos.instrument.inclinometer import EXACT, InclinometerErrors, Tilt
 from starpos.units import ARCSEC
 
-# what stands on a pillar or a heavy tripod does in a night, where nobody says how much
+# default sag: a camera on a pillar or a heavy tripod during a night
 SAG_ARCSEC_PER_SQRT_HOUR, MOST_SAG_ARCSEC = 10.0, 3600.0
-# noise of a reading that is none, in rad: smaller than anything
+# noise of the fictitious reading, rad: negligible
 NO_NOISE = 1e-9
 
 
@@ -54,7 +54,7 @@ class CameraVertical:
 
 
 def level_errors(sag_arcsec_per_sqrt_hour: float) -> InclinometerErrors:
-    """Errors of the level that a fixed camera is for itself: its sag alone."""
+    """Errors of a fixed camera as its own level: its sag alone."""
     return replace(EXACT, noise_rad=NO_NOISE, drift_rad_per_sqrt_hour=sag_arcsec_per_sqrt_hour * ARCSEC)
 
 

@@ -22,15 +22,15 @@ SCA100T_SENSITIVITY_V_PER_G = 4.0
 SCA100T_NOISE_RAD = np.radians(0.0035)
 
 
-# sines of three axes that are square have a sum of squares of 1; scale and cross-axis errors of any sensor change it by
-# less than SQUARE, errors that nobody states (zeros, 0.3 deg of a pose, 3 % of scale) by less than LEAST_SQUARE
+# The squared sines of three orthogonal axes add up to 1. Scale and cross-axis errors of any sensor change this by less
+# than SQUARE, unstated errors (zeros, 0.3 deg of a pose, 3 % of scale) by less than LEAST_SQUARE.
 SQUARE, LEAST_SQUARE = 0.1, 0.06
 SQUARE_SIGMA = 5.0
-# what the stated errors explain of it
+# deviation that the stated errors explain, in sigma
 EXPLAINED_SIGMA = 3.0
-# no inclinometer measures at a higher temperature
+# Maximum temperature at which an inclinometer measures
 MOST_CELSIUS = 300.0
-# one vertical axis: L's X, which lies below S's X', is taken below Y' instead
+# sine above which X' counts as vertical: then L's X is taken below Y' instead
 STEEP = 0.999
 
 
@@ -45,7 +45,7 @@ class Tilt:
     temperature_c     NaN: unknown
     times             Unix times of the readings, if they are known
     theta_z           rad; NaN of a two-axis sensor, whose Z' points upwards
-    variance_z        rad2 of theta_z; NaN: that of the other two
+    variance_z        rad2 of theta_z; NaN: as for the other two
 
     The sensor may lean in any way. TiltError if a value is not finite, or no direction of gravity gives these angles.
     """
@@ -77,7 +77,7 @@ class Tilt:
             )
 
     def average(self, mid_unix_s: float, exposure_s: float, spread_s: float = 0.0) -> "Tilt":
-        """Return itself: one tilt is that of any exposure, as `starpos.instrument.tilts.Tilts` has it."""
+        """Return itself: a single tilt serves any exposure, as `starpos.instrument.tilts.Tilts`."""
         return self
 
     @property
@@ -107,9 +107,9 @@ class Tilt:
 
     @property
     def slope(self) -> np.ndarray:
-        """Change (3, axes) of `up` for an error of each axis in rad: of the angle of two, of the sine of three.
+        """Change (3, axes) of `up` for an error of each axis in rad: of the angle for two axes, of the sine for three.
 
-        Three accelerometers err alike whichever way they lean, and so does the direction that they give.
+        The error of three accelerometers, and of the direction they give, does not depend on the lean.
         """
         if self.axes == 3:
             up = self.up
@@ -119,7 +119,7 @@ class Tilt:
 
 @dataclass(frozen=True, kw_only=True)
 class InclinometerErrors:
-    """Errors of an inclinometer, 1 sigma; the defaults are those of an SCA100T-D01, compensated and calibrated.
+    """Errors of an inclinometer, 1 sigma; the defaults are an SCA100T-D01's, compensated and calibrated.
 
     noise_rad                white noise of one reading
     quantum_rad              step of its readings
@@ -173,9 +173,9 @@ class InclinometerErrors:
             )
 
     def contradiction(self, tilt: Tilt) -> float:
-        """Error of each axis' sine by which three axes contradict each other beyond the stated errors; 0 of two axes.
+        """Error of each axis' sine by which three axes contradict each other beyond the stated errors; 0 for two axes.
 
-        A sum of squares tells the error along gravity alone; those across it are taken to be as large.
+        A sum of squares shows only the error along gravity; the errors across it are assumed equal.
         """
         if tilt.axes == 2:
             return 0.0
@@ -183,7 +183,7 @@ class InclinometerErrors:
         return max(abs(off) - EXPLAINED_SIGMA * sigma, 0.0) / 2
 
     def _off_square(self, tilt: Tilt) -> tuple[float, float]:
-        """How far the squares of the sines of three axes are from adding up to 1, and the stated sigma of that."""
+        """Deviation from 1 of the sum of three axes' squared sines, and its stated sigma."""
         sines = np.sin(tilt.theta)
         squares = sines**2
         # each axis shows a share of the other two
@@ -200,8 +200,8 @@ class InclinometerErrors:
     def undithered_rad(self, tilt: Tilt) -> float:
         """Error (rad) that rounding leaves in the mean of many readings; noise larger than half a step removes it.
 
-        It is the first harmonic of a quantiser's mean error under Gaussian noise (Widrow and Kollar, Quantization Noise,
-        2008).
+        It is the first harmonic of a quantiser's mean error under Gaussian noise, after Widrow and Kollar,
+        "Quantization Noise", 2008.
         """
         if self.quantum_rad == 0:
             return 0.0
@@ -223,8 +223,8 @@ EXACT = InclinometerErrors(
 def elevations(angles: np.ndarray) -> np.ndarray:
     """Elevations (..., axes) in rad from angles (..., axes) in rad that a sensor may count from 0 to 360 deg; NaN of inf.
 
-    A third axis tells which way is up, so of three axes an angle beyond 90 deg has the elevation of its supplement.
-    Of two it stays, and `Tilt` refuses it: the sensor is upside down.
+    A third axis shows which way is up, so with three axes an angle beyond 90 deg has the elevation of its supplement.
+    With two axes it stays, and `Tilt` refuses it: the sensor is upside down.
     """
     angles = np.asarray(angles, float)
     with np.errstate(invalid="ignore"):
@@ -271,7 +271,7 @@ def level_of(up: np.ndarray) -> np.ndarray:
 
 
 def levelling_of(a2: np.ndarray) -> np.ndarray:
-    """What takes a move of up (3,) in S into a small rotation (3,) of L about its axes: (3, 3); none about Z.
+    """Matrix (3, 3) from a change of up (3,) in S to a small rotation (3,) of L about its axes; zero about Z.
 
     a2 (3, 3): S into L.
     """

@@ -23,12 +23,12 @@ from starpos.utc import utc_text
 
 # x of the base link is the top of the frame (-y of C), z the optical axis (docs/frames_and_symbols.md#frames)
 TOP_OF_FRAME = ((0.0, 1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.0, 1.0))
-# 1 sigma about S's axes of an A3 of which nobody has said how well it is known: 10 deg, and any turn about the plumb line
+# 1 sigma about S's axes of an A3 without a stated error: 10 deg, and any turn about the plumb line
 UNKNOWN_ARCSEC = (36000.0, 36000.0, 324000.0)
-# An error of several turns means that nothing is known; no inclinometer is so hot.
+# Limits of a calibration: an error of several turns means unknown; no inclinometer is hotter.
 MOST_ARCSEC, MOST_C = 1e7, 200.0
 MOST_CLOCK_S = 86400.0
-# 1 sigma of a clock of which nobody has said anything, if it is kept by NTP
+# 1 sigma of a clock without a stated error, if it is kept by NTP
 UNKNOWN_CLOCK_S = 0.1
 MOST_RESPONSE = 0.5
 
@@ -49,7 +49,7 @@ class Calibration:
     tilt_deg            its two or three angles then; an error of the scale grows with the distance from them
     frames              number of frames it was found from
     valid_days          how long it may be used
-    response            coefficients of the inclinometer's response that were found with A3 (response.py), or none
+    response            coefficients of the inclinometer's response that were found with A3 (response.py), or ()
     response_covariance square, of these
     """
 
@@ -84,7 +84,8 @@ class Calibration:
             or np.sum(np.sin(np.radians(self.tilt_deg[:2])) ** 2) > 1
         ):
             raise InstrumentError(
-                "tilt_deg of the calibration cannot be: give the elevations of the inclinometer's axes, in deg"
+                "tilt_deg of the calibration is impossible: give the elevations of the inclinometer's axes, "
+                "in deg"
             )
         if not (np.isnan(self.temperature_c) or abs(self.temperature_c) < MOST_C):
             raise InstrumentError(f"temperature_c of the calibration is {self.temperature_c:g}: give deg C")
@@ -96,7 +97,7 @@ class Calibration:
         if covariance.shape != (3, 3) or not np.allclose(covariance, covariance.T, rtol=1e-6):
             raise InstrumentError("the calibration's covariance must be a symmetric 3 x 3 matrix, arcsec2")
         if np.linalg.eigvalsh(covariance)[0] < -1e-9 * max(np.trace(covariance), 1e-300):
-            raise InstrumentError("the calibration's covariance is none: a variance in it is negative")
+            raise InstrumentError("the calibration's covariance has a negative variance: correct it")
         self._check_response()
         if not 0 <= self.remounted_arcsec <= MOST_ARCSEC:
             raise InstrumentError(
@@ -106,14 +107,14 @@ class Calibration:
             raise InstrumentError(f"valid_days is {self.valid_days}: must be positive")
         for name in ("utc_unix_s", "temperature_c"):
             if math.isnan(getattr(self, name)):
-                # the one that is found equal to itself, in sequences
+                # one NaN object, which compares equal to itself in sequences
                 object.__setattr__(self, name, math.nan)
 
     def _all(self) -> tuple:
         return tuple(getattr(self, f.name) for f in fields(self))
 
     def __eq__(self, other: object) -> bool:
-        """Whether all is equal, what is unknown too: Python 3.13's dataclasses with a NaN are unlike themselves."""
+        """Whether all fields are equal, unknown ones too: in Python 3.13 a dataclass with a NaN differs from itself."""
         return self._all() == other._all() if isinstance(other, Calibration) else NotImplemented
 
     def __hash__(self) -> int:
@@ -134,8 +135,8 @@ class Calibration:
         ] > -1e-9 * np.trace(covariance)
         if max(abs(c) for c in self.response) > MOST_RESPONSE or not sound:
             raise InstrumentError(
-                f"the calibration's response is none: its coefficients are at most {MOST_RESPONSE:g}, their covariance "
-                "is symmetric and without negative variances"
+                f"the calibration's response is not valid: its coefficients must be at most "
+                f"{MOST_RESPONSE:g}, their covariance symmetric and without negative variances"
             )
 
     @classmethod
@@ -216,13 +217,13 @@ class Instrument:
     focal_px            focal length, px
     camera              full intrinsics; None: an ideal camera
     frame_size          (width, height) px of the whole frame of that ideal camera, in whose middle its axis lies, and to
-                        which A3 belongs; None: nobody has said, the axis is in the middle of any frame
+                        which A3 belongs; None: not stated, the axis is in the middle of any frame
     model               of the lens of that ideal camera: PLUMB_BOB, or EQUIDISTANT for a fisheye
     calibration         A3 and its errors
     link_to_camera      (3, 3): base link into C
-    mount_stddev_arcsec 1 sigma of link_to_camera about each axis; 0 of a link that is the camera's own axes
-    axis_stddev_rad     1 sigma of the optical axis in frames that are a part of a sensor, nobody knows which
-    inclinometer        its errors; unless stated, those of an SCA100T as sold
+    mount_stddev_arcsec 1 sigma of link_to_camera about each axis; 0 for a link along the camera's own axes
+    axis_stddev_rad     1 sigma of the optical axis in frames that are an unknown part of a sensor
+    inclinometer        its errors; unless stated, an SCA100T's as sold
     inclinometer_model  name in sensors.PRESETS that these errors began with; '': none
     clock_stddev_s      standard deviation of the clock against UTC, s
     shutter             times of the camera's rows; None: as the source of the frames states them
@@ -282,7 +283,7 @@ class Instrument:
 
     @property
     def size(self) -> tuple[int, int] | None:
-        """Width and height (px) of the whole frame, to which camera and A3 belong; None: nobody has said."""
+        """Width and height (px) of the whole frame, to which camera and A3 belong; None: not stated."""
         return self.frame_size if self.camera is None else (self.camera.width, self.camera.height)
 
     def camera_for(self, width: int, height: int, origin_px: tuple[float, float] | None = None) -> Camera:
@@ -306,7 +307,7 @@ class Instrument:
         return whole.part(left, top, width, height) if (width, height) != self.size else whole
 
     def whole_of(self, camera: Camera, origin_px: tuple[float, float] | None) -> Camera:
-        """The camera of the whole frame from that of a part which begins at a column and row, if both are known."""
+        """The camera of the whole frame from the camera of a part which begins at a column and row, if both are known."""
         if self.size is None or origin_px is None:
             return camera
         return camera.part(-origin_px[0], -origin_px[1], *self.size)

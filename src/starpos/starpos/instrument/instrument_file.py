@@ -23,7 +23,7 @@ from starpos.utc import unix_of, utc_text
 
 FORMAT = 1
 MOST_FRAMES = 1 << 31
-# focal length of a camera that a file for pointings does not name: it counts for nothing
+# placeholder of a focal length that a file for pointings does not state: it is not used
 POINTED_FOCAL_PX = 10_000.0
 # By key of the file: field of InclinometerErrors, and unit (rad or 1).
 INCLINOMETER = {
@@ -70,7 +70,7 @@ def read(path: Path | str, needs_camera: bool = True) -> Instrument:
 
     starpos_instrument: 1
     camera: {focal_mm, pixel_um}, {focal_px} or {width, height, fx, fy, cx, cy, distortion: [k1, k2, p1, p2, k3]}
-            or {calibration: camera.yaml}, a CameraInfo calibration file beside this one or at a full path; each of the
+            or {calibration: camera.yaml}, a CameraInfo calibration file next to this one or at a full path; each of the
             first three may have `model: equidistant`, of a fisheye, whose distortion is [k1, k2, k3, k4], and the first
             two width and height: of the whole frame, in whose middle the optical axis is, and to which A3 belongs
     misalignment_deg: [rx, ry, rz]                       without one of the next two it is not known: 10 deg
@@ -222,7 +222,7 @@ def _with_vertical(instrument: Instrument, about: object) -> Instrument:
 
 
 def _camera(camera: object, folder: Path) -> tuple[Camera | None, float, str]:
-    """Intrinsics (None if only the focal length is given), focal length (px), and the lens of a camera without them."""
+    """Intrinsics (None if only the focal length is given), focal length (px), and lens of a camera without intrinsics."""
     if not isinstance(camera, dict):
         raise InstrumentError(
             f"camera is {_short(camera)}: give {{focal_mm, pixel_um}} or {{width, height, fx, fy, cx, cy}}"
@@ -315,7 +315,7 @@ def _calibration(content: dict) -> Calibration:
 def _sensor(content: dict, stated: bool) -> tuple[str, InclinometerErrors]:
     """Model of the inclinometer ('' without one) and the errors that this gives; stated: whether the file states some.
 
-    A file that states some without a model speaks of a sensor that was measured: the others are those of a good one.
+    A file that states some errors without a model describes a measured sensor: the other errors are a good sensor's.
     """
     if "inclinometer" not in content and stated:
         return "", InclinometerErrors()
@@ -363,7 +363,7 @@ def _error(mapping: dict, key: str, unit: float) -> float:
 
 
 def _in_unit(value: float, unit: float) -> float:
-    """A value in a unit, with as few digits as `read` needs to have the very same value again."""
+    """A value in a unit, with as few digits as `read` needs to restore it exactly."""
     exact = float(value / unit)
     short = (float(f"{exact:.{digits}g}") for digits in range(1, 17))
     return next((number for number in short if number * unit == value), exact)

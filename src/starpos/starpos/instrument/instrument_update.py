@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Instrument files that are there already: a calibration puts A3 into them and leaves what people have written."""
+"""Existing instrument files: a calibration puts A3 into them and keeps what people have written."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -9,7 +9,7 @@ from starpos.instrument import instrument_file, yaml_file
 from starpos.instrument.inclinometer import InclinometerErrors
 from starpos.instrument.instrument import Instrument
 
-# what a calibration finds of A3, or of the vertical of a fixed camera; of these a file may have one or another
+# keys that a calibration finds, of A3 or of a fixed camera's vertical; a file may have some of them
 FOUND = (
     "misalignment_deg",
     "calibration_stddev_arcsec",
@@ -39,7 +39,7 @@ def check_replaceable(path: Path) -> None:
 def check_fits(
     path: Path, instrument: Instrument, *, fixed: bool = False, camera_found: bool = False
 ) -> None:
-    """Raise InstrumentError if a file is there that is of another instrument than the one to be calibrated.
+    """Raise InstrumentError if the file describes another instrument than the one to be calibrated.
 
     fixed: of a camera fixed to the ground.  camera_found: the file's camera will be replaced too.
     """
@@ -75,12 +75,12 @@ def _sensor(instrument: Instrument) -> InclinometerErrors:
 
 
 def _says_sensor(instrument: Instrument) -> bool:
-    """Whether an instrument has other errors of its inclinometer than those that hold where nobody says any."""
+    """Whether an instrument's inclinometer errors differ from the defaults."""
     return bool(instrument.inclinometer_model) or _sensor(instrument) != _sensor(Instrument(1.0))
 
 
 def write(path: Path, instrument: Instrument, comment: str, *, camera_found: bool = False) -> None:
-    """Write an instrument file; one that is there keeps all keys but those of A3, and of the camera if it was found.
+    """Write an instrument file; an existing one keeps all keys except A3's, and the camera's if it was found.
 
     InstrumentError if it cannot be written.
     """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""ROS's lens models by name: of a pinhole `plumb_bob` and `rational_polynomial`, of a fisheye `equidistant`.
+"""ROS's lens models by name: `plumb_bob` and `rational_polynomial` for a pinhole, `equidistant` for a fisheye.
 
 The code is in `_lens`.
 """
@@ -20,7 +20,7 @@ COEFFICIENTS = {
     EQUIDISTANT: ("k1", "k2", "k3", "k4"),
     RATIONAL: ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
 }
-# numbers of coefficients that OpenCV knows of a pinhole: its 12 and 14 have a thin prism and a tilted sensor
+# numbers of a pinhole's coefficients in OpenCV: 12 and 14 include a thin prism and a tilted sensor
 OPENCV_NUMBERS = (0, 4, 5, 8, 12, 14)
 
 
@@ -30,10 +30,10 @@ def lens_of(model: str, d: tuple[float, ...]) -> Lens:
 
 
 def stated_lens(model: str, d: Sequence[float], place: str) -> tuple[str, tuple[float, ...]]:
-    """Model and coefficients for a Camera, from those of a message or file as OpenCV and ROS mean them.
+    """Model and coefficients for a Camera, from a message's or file's as OpenCV and ROS define them.
 
-    A pinhole's coefficients are OpenCV's by their number, whichever of the two names stands with them. Without a name
-    they are a pinhole's. Zeros at the end say nothing.
+    A pinhole's coefficients are OpenCV's by their number, under either of the two names. Without a name they are a
+    pinhole's. Trailing zeros are ignored.
     InstrumentError where the model is another one or has another number of coefficients.
     """
     model = model or PLUMB_BOB

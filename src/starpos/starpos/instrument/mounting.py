@@ -13,7 +13,7 @@ from starpos.frozen import at_once
 from starpos.instrument.inclinometer import EXACT, InclinometerErrors, Tilt, level_of, levelling_of, up_of
 from starpos.instrument.response import COEFFICIENTS, Zeroed, angles_at, response_columns, stated_variances
 
-# an error of its sine is none of the angle of a vertical axis
+# lower bound of the cosine that turns an error of the sine into one of the angle
 LEAST_COSINE = 0.1
 
 
@@ -35,7 +35,7 @@ class LocalLevel:
 
     @cached_property
     def turns(self) -> np.ndarray:
-        """What takes a move of up (3,) in S into a small rotation (3,) of L about its axes: (3, 3); none about Z."""
+        """Matrix (3, 3) from a change of up (3,) in S to a small rotation (3,) of L about its axes; zero about Z."""
         return levelling_of(self.a2)
 
 
@@ -45,16 +45,16 @@ class Mounting:
 
     a3                        (3, 3): camera C into inclinometer S
     link_to_camera            (3, 3): base link into C
-    link_stddev_rad           1 sigma of that about each axis
+    link_stddev_rad           1 sigma of link_to_camera about each axis
     calibration_covariance    (3, 3) rad2 of A3 as a small rotation about S's axes; it includes the inclinometer's zero,
-                              because only the sum of the two matters
-    remounted_rad             1 sigma about each axis of a turn of A3 since then
+                              because only their sum matters
+    remounted_rad             1 sigma about each axis of a turn of A3 since the calibration
     inclinometer              its errors
     calibrated_unix_s         time of the calibration; NaN: unknown, then the covariance includes the drift until now
     calibrated_temperature_c  temperature of the inclinometer then; NaN: unknown
     calibrated_tilt           its two or three angles then, rad; an error of its response grows with the distance from
                               them
-    response                  (m,) coefficients of its response that were found, or none
+    response                  (m,) coefficients of its response that were found, or ()
     response_covariance       (m, m) of these
     """
 
@@ -81,9 +81,9 @@ class Mounting:
         return symmetric_root(self.calibration_covariance)
 
     def level(self, tilt: Tilt) -> LocalLevel:
-        """The level at a tilt; InstrumentError if the response that was found is not of such a sensor.
+        """The level at a tilt; InstrumentError if the response is of a sensor with another number of axes.
 
-        Zeros that nobody found are as wrong as the axes contradict each other.
+        Zeros that were not calibrated are assumed to err by the contradiction of the axes.
         """
         zeroed = self._zeroed[tilt.axes]
         if self.response:
@@ -98,7 +98,7 @@ class Mounting:
                 columns @ self._response_root,
             )
         else:
-            # of three axes those that agree, as the calibration's do: so nothing counts at its lean
+            # with three axes the consistent angles, as at the calibration: so nothing counts at its lean
             up, theta = tilt.up, angles_at(tilt.up, tilt.axes)
             variances = stated_variances(self.inclinometer, tilt.axes)
             wrong = self.inclinometer.contradiction(tilt) / np.maximum(np.cos(theta), LEAST_COSINE)
@@ -113,5 +113,5 @@ class Mounting:
 
     @cached_property
     def _zeroed(self) -> dict[int, Zeroed]:
-        """Where the response counts nothing, by the number of axes."""
+        """The lean at which the response counts nothing, for a number of axes."""
         return {axes: Zeroed.at(self.calibrated_up, axes) for axes in COEFFICIENTS}

@@ -6,9 +6,9 @@ from collections import deque
 
 import numpy as np
 
-from starpos.instrument.tilt_log import ENOUGH_NEIGHBOURS, SIGNIFICANT, white_noise
+from starpos.instrument.tilt_log import MIN_NEIGHBOURS, SIGNIFICANT, white_noise
 
-# A sensor of 18 Hz remembers 9 ms, so means over this time are independent.
+# A sensor of 18 Hz has a memory of 9 ms, so means over this time are independent.
 BLOCK_S = 0.1
 # Blocks further apart than this differ by drift rather than by noise.
 APART_S = 3.0
@@ -19,8 +19,8 @@ LONG, SHORT = 200, 30
 class NoiseTracker:
     """Estimates the white noise of each axis: `sigma` in rad for one sample, as averages of samples show it.
 
-    Neighbouring samples of a sensor with a limited bandwidth are alike. So it takes the means over BLOCK_S and the
-    differences of successive means, and scales them to the noise of one sample as if the samples were independent.
+    Neighbouring samples of a sensor with a limited bandwidth are correlated. So it takes the means over BLOCK_S and the
+    differences of successive means, and scales them to the noise of one sample as if samples were independent.
     """
 
     def __init__(self) -> None:
@@ -60,7 +60,7 @@ class NoiseTracker:
             return
         scale = math.sqrt(2 / (1 / n + 1 / before[1]))
         self._differences.append([scale * (a - b) for a, b in zip(mean[2:], before[2:], strict=True)])
-        if len(self._differences) >= ENOUGH_NEIGHBOURS:
+        if len(self._differences) >= MIN_NEIGHBOURS:
             self.sigma = self._estimate()
 
     def _estimate(self) -> tuple[float, ...]:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The response of an inclinometer: how its angles err at another lean than that of the calibration.
+"""The response of an inclinometer: how its angles err at another lean than at the calibration.
 
 Each axis has a zero and a scale, and each pair of axes an angle that is not square. A3 is fitted at the calibration's
-lean, so these count only away from it; a zero does so because an angle that is wrong by a constant is no rotation.
+lean, so these count only away from it; even a zero does, because a constant error of an angle is not a rotation.
 """
 
 from dataclasses import dataclass
@@ -34,7 +34,7 @@ class Zeroed:
 
     @classmethod
     def at(cls, up: np.ndarray, axes: int) -> "Zeroed":
-        """The lean at which up (3,) in S is, for a sensor of so many axes."""
+        """The lean with up (3,) in S, for a sensor of `axes` axes."""
         theta = angles_at(up, axes)
         return cls(theta, rotation.cross(up, up_slope(theta, up).T))
 

@@ -3,7 +3,8 @@
 
 What a sheet states becomes 1 sigma by one rule. A standard deviation, an rms and a typical value count as they are.
 Murata's minimum and maximum are 3 sigma, as its sheets say. Another limit (a maximum, "<", the largest deviation from a
-straight line) is a uniform distribution: `limit`. A noise density is that of a filter of first order: `rms`.
+straight line) is a uniform distribution: `limit`. A noise density becomes the noise behind a filter of first order:
+`rms`.
 """
 
 from dataclasses import replace
@@ -15,7 +16,7 @@ from starpos.units import ARCSEC
 
 # Rad: an acceleration of 1 mg looks like this tilt.
 MG = 1e-3
-# Noise bandwidth of a filter of first order, in its -3 dB bandwidths: pi / 2.
+# Noise bandwidth of a filter of first order, in units of its -3 dB bandwidth: pi / 2.
 FIRST_ORDER = 1.57
 
 
@@ -50,7 +51,7 @@ SCA100T = InclinometerErrors(
 )
 
 # Murata SCL3300-D01, Doc. 4921 Rev. 2, table 2, in mode 1 (40 Hz), which alone measures at any lean. Linearity,
-# sensitivity and cross axis are those of the SCA3300-D01, the same element (Doc. 3165 Rev. 3, table 2).
+# sensitivity and cross axis are the SCA3300-D01's, the same element (Doc. 3165 Rev. 3, table 2).
 SCL3300 = InclinometerErrors(
     # estimate: the 0.001 deg/sqrt(Hz) of its product page, in mode 1's 40 Hz
     noise_rad=rms(radians(0.001), 40),
@@ -165,11 +166,11 @@ ADXL355 = InclinometerErrors(
     range_rad=radians(90),
 )
 
-# the SCA100T with a good converter, compensated for temperature and calibrated by its owner; each figure is an
-# estimate of what that leaves
+# the SCA100T with a good converter, compensated for temperature and calibrated by its owner; each figure is an estimate
+# of the remaining error
 SCA100T_CALIBRATED = InclinometerErrors()
 
-# what holds where nobody names the inclinometer or states its errors: those of a sensor as sold, at any lean
+# default if neither inclinometer nor errors are stated: a sensor as sold, at any lean
 UNNAMED = replace(SCA100T, range_rad=pi / 2)
 
 PRESETS = {

@@ -5,15 +5,15 @@ import numpy as np
 
 from starpos.instrument.tilt_log import BRACKET_S, TiltLog, white_noise
 
-# The noise of readings in radians that are taken for degrees is 57.3 times too small. So many differences tell it, to
-# this factor.
+# The noise of readings in radians that are taken for degrees is 57.3 times too small. Number of differences that
+# determine it, and to which factor.
 ENOUGH_STEPS, ALIKE_NOISE = 8, 3.0
 
 
 def like_radians(log: TiltLog) -> str:
     """Say that a table of tilts looks like radians; '' if it does not.
 
-    Its noise tells: taken for degrees, that of radians is 57 times less than the sensor's.
+    The noise shows it: radians taken for degrees have 57 times less than the sensor's.
     """
     order = np.argsort(log.utc_unix_s, kind="stable")
     apart = np.diff(log.utc_unix_s[order])
@@ -30,6 +30,7 @@ def like_radians(log: TiltLog) -> str:
     if not stated_rad / ALIKE_NOISE < noise < stated_rad * ALIKE_NOISE:
         return ""
     return (
-        f"the tilts look like radians: none is above pi/2, and their noise of {noise:.2g} would be that of the "
-        f"inclinometer ({stated_rad:.2g} rad): write them in deg, or state the inclinometer's noise if it is so quiet"
+        f"the tilts look like radians: none is above pi/2, and their noise of {noise:.2g} would be the "
+        f"inclinometer's ({stated_rad:.2g} rad): write them in deg, or state the inclinometer's noise if it "
+        f"is so quiet"
     )

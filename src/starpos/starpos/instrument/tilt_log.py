@@ -11,16 +11,16 @@ from starpos.errors import TiltError
 from starpos.instrument.inclinometer import SCA100T_NOISE_RAD, Tilt
 from starpos.normal import SIGMA_PER_MAD
 
-# The noise is measured from readings that are so close in time, if there are so many.
-NEIGHBOURS_S, ENOUGH_NEIGHBOURS = 1.0, 20
-# Readings more than so many sigma away are left out; an instrument whose readings scatter so much more than their noise
+# The noise is measured from readings at most NEIGHBOURS_S apart, if there are MIN_NEIGHBOURS of them.
+NEIGHBOURS_S, MIN_NEIGHBOURS = 1.0, 20
+# Readings further away, in sigma, are left out; an instrument whose readings scatter by a larger multiple of their noise
 # is not at rest.
-OUTLIER_SIGMA, REST = 6.0, 6.0
+OUTLIER_SIGMA, MAX_SCATTER_SIGMA = 6.0, 6.0
 # The noise comes from the smallest 80 % of a Gaussian's deviations, which have this variance.
 KEPT, KEPT_VARIANCE = 0.8, 0.4377
 # Over sqrt(steps) it is three times the relative error of `white_noise`.
 SIGNIFICANT = 4.0
-# by how much a reading may miss the exposure's edge: rounding
+# tolerance for rounding at the exposure's edges
 TOUCH_S = 1e-6
 # two readings that are further apart do not bracket an exposure
 BRACKET_S = 1.5
@@ -29,12 +29,12 @@ AGREE_SIGMA = 5.0
 USUAL_GAPS = 2.5
 # an end of the exposure longer than this share of it is open if the reading beyond disagrees
 OPEN_END = 0.25
-# Half of an exposure, and what a time that was rounded may miss; so many readings tell how rare they are.
-HALF, ENOUGH_TIMES = 0.6, 5
-# So many equal readings in a row are a stuck sensor, as in the node, if equal neighbours are rare elsewhere: at 0.1
-# chance makes one such row in 10^9 readings.
+# Half of an exposure with a margin for rounded times; number of readings that determine their usual interval.
+HALF, MIN_TIMES = 0.6, 5
+# Number of equal readings in a row that show a stuck sensor, as in the node, if equal neighbours are rare elsewhere: at
+# 0.1, chance makes one such row in 10^9 readings.
 STUCK_READINGS, RARE = 10, 0.1
-# a sensor that stands still more often than it moves is coarse, or quiet
+# a sensor whose readings repeat this often is coarse, or quiet
 MOSTLY_STUCK = 2.0
 
 
@@ -51,11 +51,11 @@ def white_noise(steps: np.ndarray) -> np.ndarray:
 def noise_excess(steps: np.ndarray, stated_rad: float) -> float:
     """Noise of readings over the stated one, from their differences (N, axes) from one to the next; 1 or more.
 
-    The readings of a pair are not more than NEIGHBOURS_S apart. Fewer than ENOUGH_NEIGHBOURS pairs tell nothing: 1.
+    The readings of a pair are not more than NEIGHBOURS_S apart. Fewer than MIN_NEIGHBOURS pairs give 1.
     """
     # of an instrument at rest: while it moves, readings differ by more than any noise that is let pass
-    steps = steps[(np.abs(steps) < np.sqrt(2) * OUTLIER_SIGMA * REST * stated_rad).all(1)]
-    if len(steps) < ENOUGH_NEIGHBOURS:
+    steps = steps[(np.abs(steps) < np.sqrt(2) * OUTLIER_SIGMA * MAX_SCATTER_SIGMA * stated_rad).all(1)]
+    if len(steps) < MIN_NEIGHBOURS:
         return 1.0
     found = float(white_noise(steps).max() / stated_rad)
     return found if found > 1 + SIGNIFICANT / np.sqrt(len(steps)) else 1.0
@@ -67,8 +67,8 @@ class TiltLog:
 
     utc_unix_s (N,).  theta_x, theta_y (N,) in rad.  temperature_c (N,).
     covariance (N, 2, 2) in rad2 of each reading's theta_x, theta_y.
-    theta_z (N,) in rad; None or NaN of a two-axis sensor.
-    variance_z (N,) in rad2; None or NaN: that of the other two.
+    theta_z (N,) in rad; None or NaN for a two-axis sensor.
+    variance_z (N,) in rad2; None or NaN: as for the other two.
     earlier_excess  noise over the stated one that earlier readings showed, which are not in the log
     """
 
@@ -122,7 +122,7 @@ class TiltLog:
 
     @cached_property
     def theta(self) -> np.ndarray:
-        """The elevations (N, axes) in rad; where some readings have a third axis, it is NaN of those without."""
+        """The elevations (N, axes) in rad; where only some readings have a third axis, it is NaN in the others."""
         if self.theta_z is None or np.isnan(self.theta_z).all():
             return np.stack([self.theta_x, self.theta_y], -1)
         return np.stack([self.theta_x, self.theta_y, self.theta_z], -1)
@@ -152,8 +152,8 @@ class TiltLog:
         and agree are of a turn. If the readings scatter more than stated (wind, footsteps), the covariance is larger.
         TiltError if they do not cover the exposure, the instrument moved, or the sensor was stuck.
 
-        spread_s: the whole width in which the middle may lie, where a clock counts in whole seconds; then readings within
-        it stand for the exposure, if all of them agree.
+        spread_s: the full width within which the middle may lie, for a clock of whole seconds; then readings within it
+        represent the exposure, if all of them agree.
         """
         use = self._of_exposure(mid_unix_s, exposure_s, spread_s)
         if self.stuck[use].any():
@@ -166,12 +166,12 @@ class TiltLog:
     def mean(self) -> Tilt:
         """The mean of all readings, of an instrument that is at rest between them too; TiltError if it moved."""
         if not self._finite.all():
-            raise TiltError("some tilts have two axes and some three: give those of one inclinometer")
+            raise TiltError("some tilts have two axes and some three: give the tilts of one inclinometer")
         return self._mean(np.argsort(self.utc_unix_s, kind="stable"))
 
     @property
     def _finite(self) -> np.ndarray:
-        """Mask (N,) of the readings whose time and angles are all there."""
+        """Mask (N,) of the readings whose time and angles are finite."""
         return np.isfinite(self.utc_unix_s) & np.isfinite(self.theta).all(1)
 
     @cached_property
@@ -184,8 +184,8 @@ class TiltLog:
     def stuck(self) -> np.ndarray:
         """Mask (N,) of the readings that stand in a row of STUCK_READINGS or more that are equal to the last digit.
 
-        None does where noise does not clearly exceed the steps of the readings, by the stated noise and by how rarely
-        other neighbours are equal.
+        No reading counts as stuck if the noise does not clearly exceed the steps of the readings, judged by the stated
+        noise and by how rarely other neighbours are equal.
         """
         stuck = np.zeros(len(self.utc_unix_s), bool)
         order = self._once
@@ -201,7 +201,7 @@ class TiltLog:
         free &= (np.abs(steps) < np.sqrt(2) * OUTLIER_SIGMA * noise).all(1)
         for first, last in zip(begin, end, strict=True):
             free[first:last] = False
-        if free.sum() < max(ENOUGH_NEIGHBOURS, (end - begin).sum() / MOSTLY_STUCK):
+        if free.sum() < max(MIN_NEIGHBOURS, (end - begin).sum() / MOSTLY_STUCK):
             return stuck
         moved = np.abs(steps[free])
         coarse = np.where(moved > 0, moved, np.inf).min() > noise
@@ -221,8 +221,8 @@ class TiltLog:
         # wild readings differ from each other; neighbours that agree are of another lean
         turned = any(self._agree(use[k], use[k + 1]) for k in wild[:-1] if not sane[k + 1])
         turned = turned or any(self._agree(a, b) for a, b in self._edges(use) if not sane[use == a].all())
-        if turned or spread.max() > REST * noise:
-            # angles that cannot be, as in another unit, scatter as well
+        if turned or spread.max() > MAX_SCATTER_SIGMA * noise:
+            # impossible angles, as in another unit, scatter as well
             _check_possible(theta[from_middle.max(1).argmin()])
             raise TiltError(
                 f"the tilt moved by {np.degrees(np.ptp(theta, axis=0).max()):.3f} deg during the exposure: "
@@ -267,8 +267,8 @@ class TiltLog:
     def _of_exposure(self, mid_unix_s: float, exposure_s: float, spread_s: float) -> np.ndarray:
         """Indices of the readings that `average` takes, in order of time, one for each time.
 
-        They are those inside the exposure, which must cover it. If none is inside, two do that bracket it closely and
-        agree: what happened between two readings that differ nobody knows.
+        They are those inside the exposure, which must cover it. If none is inside, two are taken that bracket it closely
+        and agree: between two readings that differ the tilt is unknown.
         """
         index = self._once
         t, half = self.utc_unix_s[index], max(exposure_s, 0.0) / 2 + TOUCH_S
@@ -302,16 +302,16 @@ class TiltLog:
     def _check_cover(
         self, index: np.ndarray, first: int, end: int, mid_unix_s: float, exposure_s: float
     ) -> None:
-        """TiltError if no readings tell whether the instrument was at rest in a part of the exposure.
+        """TiltError if no readings show whether the instrument was at rest in a part of the exposure.
 
         Such a part lies between two readings and is longer than half of the exposure, and than is usual; or it is an end
         of the exposure. An end may be HALF of it where no reading is near beyond, and any where readings are that rare,
-        one a frame perhaps. It may be OPEN_END of it where the one beyond disagrees: nobody knows when the turn began.
+        one a frame perhaps. It may be OPEN_END of it where the one beyond disagrees: it is unknown when the turn began.
         """
         t = self.utc_unix_s[index]
         begin, over = mid_unix_s - exposure_s / 2, mid_unix_s + exposure_s / 2
         usual_s = USUAL_GAPS * self.period_s
-        rare = len(t) >= ENOUGH_TIMES and self.period_s > BRACKET_S
+        rare = len(t) >= MIN_TIMES and self.period_s > BRACKET_S
         gaps = [(float(gap), max(exposure_s / 2, usual_s)) for gap in np.diff(t[first:end])]
         for gap, one in ((t[first] - begin, first - 1), (over - t[end - 1], end - 1)):
             if not (0 <= one < len(t) - 1 and t[one + 1] - t[one] <= BRACKET_S):
@@ -327,17 +327,17 @@ class TiltLog:
 
     @cached_property
     def period_s(self) -> float:
-        """The usual time from one reading to the next; 0 of fewer than three."""
+        """The usual time from one reading to the next; 0 for fewer than three."""
         apart = np.diff(np.unique(self.utc_unix_s[np.isfinite(self.utc_unix_s)]))
         return float(np.median(apart)) if len(apart) > 1 else 0.0
 
     def _agree(self, a: int, b: int) -> bool:
-        """Whether two readings are of one lean, as far as their noise tells."""
+        """Whether two readings are of one lean within their noise."""
         variance = (self.variance[a] + self.variance[b]) * self.excess**2
         return bool(((self.theta[a] - self.theta[b]) ** 2 <= AGREE_SIGMA**2 * variance).all())
 
 
 def _check_possible(theta: np.ndarray) -> None:
-    """TiltError if elevations (axes,) in rad are none of any lean."""
+    """TiltError if elevations (axes,) in rad are impossible."""
     theta_x, theta_y, *third = theta.tolist()
     Tilt(theta_x, theta_y, np.zeros((2, 2)), utc_unix_s=0.0, theta_z=third[0] if third else np.nan)

@@ -27,20 +27,20 @@ CURE = (
     f"give a CSV with a line of names, {','.join(NEEDED)}[,{','.join(OPTIONAL)}], and readings: the elevations of "
     "the sensor's axes"
 )
-# a cell, but a line's first, that holds nothing
+# an empty cell, other than a line's first
 EMPTY = re.compile(r",[ \t]*(?=[,\r\n]|\Z)")
-# a column's name so much like one that is read may be meant for it
+# similarity from which an unknown column's name may be meant for a known one
 ALIKE_NAME = 0.7
-# no angle is less certain, and still one
+# largest sigma at which an angle still means anything
 MOST_SIGMA_DEG = 45.0
-# Readings alternate where, of three in a row, the outer two are nearer to each other than two neighbours in so large a
-# share. Of white noise it is a half, and so many sigma above it less than once in 10^7 tables.
+# Readings alternate if, of three in a row, the outer two are closer than two neighbours in more than this share. White
+# noise has a share of a half, and exceeds it by this many sigma less than once in 10^7 tables.
 ALTERNATING, ALTERNATING_SIGMA = 0.75, 6.0
-# Readings that leap to another tilt and back within BRACKET_S: so many sigma of noise, and steps of the readings, are a
-# leap. So many leaps, of one size but for a few, and so large a share of the readings are no wild ones. Sizes are one
-# within their noise, or that share.
+# Readings that leap to another tilt and back within BRACKET_S: minimum size of a leap in sigma of noise and in steps of
+# the readings; minimum number of leaps, minimum share of one size, and minimum share of all readings. Beyond these they
+# are not outliers. Last: tolerance on one size.
 LEAP_SIGMA, LEAP_STEPS, FEWEST_LEAPS, ONE_SIZE, LEAPING, ALIKE_SIZE = 12.0, 3.0, 5, 0.8, 0.03, 0.1
-# a quarter of a Gaussian's deviations are below so many sigma
+# a quarter of a Gaussian's deviations are below this many sigma
 QUARTER = 0.3186
 
 
@@ -49,7 +49,7 @@ def read_tilt_csv(path: Path | str, noise_rad: float = SCA100T_NOISE_RAD) -> Til
 
     Columns: utc_unix_s, theta_x_deg, theta_y_deg; theta_z_deg of a three-axis sensor; temperature_c, unknown (NaN) where
     it is beyond MOST_CELSIUS; sigma_deg, 1 sigma of the white noise of that line's angles. Where no sigma is stated (no
-    column, an empty cell, or NaN) it is noise_rad. Columns of other names are left alone.
+    column, an empty cell, or NaN) it is noise_rad. Other columns are ignored.
     """
     path = Path(path)
     try:
@@ -70,7 +70,8 @@ def read_tilt_csv(path: Path | str, noise_rad: float = SCA100T_NOISE_RAD) -> Til
     for name in set(names) - {*NEEDED, *OPTIONAL}:
         for meant in difflib.get_close_matches(name.lower(), OPTIONAL, 1, ALIKE_NAME):
             raise TiltError(
-                f"{path}: its column {name} is not read: call it {meant} if it is that, else otherwise"
+                f"{path}: its column {name} is not read: call it {meant} if it holds that, else give it "
+                f"another name"
             )
     column = dict(zip(names, rows.T, strict=True))
     if not np.isfinite([column[name] for name in NEEDED]).all(0).any():
@@ -119,8 +120,8 @@ def _opened(path: Path) -> TextIO:
 def _check_one_sensor(path: Path, column: Mapping[str, np.ndarray], rows: np.ndarray) -> None:
     """TiltError if the rows seem to be readings of two sensors, one after the other or alternating.
 
-    One after the other, their times go back into those that the table already holds. A table may hold nights in any
-    order, and a part of itself once more.
+    One after the other, the second sensor's times go back into times that the table already holds. A table may hold
+    nights in any order, and repeat a part of itself.
     """
     finite = np.flatnonzero(np.isfinite(column["utc_unix_s"]))
     _, first = np.unique(rows[finite], axis=0, return_index=True)
@@ -159,14 +160,14 @@ def _alternate(t: np.ndarray, angles: np.ndarray) -> bool:
 def _leaps(t: np.ndarray, angle: np.ndarray) -> bool:
     """Whether readings (N,) of an axis, in the order of their times t (N,), leap to another tilt and back time and again.
 
-    So do those of two sensors of which one is read more often; a mount does not go there and back so quickly.
+    So do readings of two sensors of which one is read more often; a mount does not go there and back so quickly.
     """
     known = np.isfinite(angle)
     t, angle = t[known], angle[known]
     step, near = np.diff(angle), np.diff(t) <= BRACKET_S
     if len(step) < FEWEST_LEAPS:
         return False
-    # of readings that alternate, those of one sensor are two apart
+    # if readings alternate, every second one is of the same sensor
     apart = [np.quantile(np.abs(angle[lag:] - angle[:-lag]), 0.25) for lag in (1, 2, 3)]
     noise = min(apart) / QUARTER / np.sqrt(2)
     quantum = np.diff(np.unique(angle)).min(initial=np.inf)

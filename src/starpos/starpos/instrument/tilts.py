@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whatever tells the tilt of an exposure: a log of readings, those that have just arrived, or one tilt alone."""
+"""Sources of the tilt of an exposure: a log of readings, readings that have just arrived, or a single tilt."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ from starpos.instrument.inclinometer import Tilt
 
 
 class Tilts(Protocol):
-    """The tilts of a night; a `TiltLog` is one, and so is a `Tilt`, of whatever exposure it is asked for."""
+    """The tilts of a night; a `TiltLog` is one, and so is a `Tilt`, which serves any exposure."""
 
     def average(self, mid_unix_s: float, exposure_s: float, spread_s: float = 0.0) -> Tilt:
         """Average over an exposure, whose middle may lie spread_s off; raises TiltError."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""YAML files that hold a calibration: whoever reads them checks the content; they are written whole or not at all."""
+"""YAML files that hold a calibration: the reader checks the content; they are written whole or not at all."""
 
 import hashlib
 import re
@@ -21,7 +21,7 @@ def load(path: Path, what: str) -> Any:
 
 
 def text_at(path: Path, what: str) -> str:
-    """Read the text of a file; InstrumentError as `load` raises it, and if it is no UTF-8."""
+    """Read the text of a file; InstrumentError as `load` raises it, and if it is not UTF-8."""
     try:
         return _bytes_at(path, what).decode()
     except UnicodeDecodeError:
@@ -36,7 +36,7 @@ def _bytes_at(path: Path, what: str) -> bytes:
 
 
 def parse(text: bytes | str, complaint: str) -> Any:
-    """Read YAML without aliases or keys given twice; InstrumentError that begins with the complaint if it is none."""
+    """Read YAML without aliases or keys given twice; InstrumentError that begins with the complaint if it is not."""
     import yaml
 
     class Loader(yaml.SafeLoader):
@@ -95,7 +95,7 @@ def text_of(content: dict, comment: str = "") -> str:
 
 
 def own_comment(text: str) -> str:
-    """The comment of a file's text that `save` wrote and nobody has changed; '' without one."""
+    """The comment of a file's text that `save` wrote, if it is unchanged; '' without one."""
     found = BY_STARPOS.search(text)
     if found is None or _digest(found[2]) != found[1]:
         return ""
@@ -107,7 +107,7 @@ def line_of_comment(text: str) -> int:
     import yaml
 
     if own_comment(text):
-        # as many lines as it had
+        # keep the number of lines
         text = BY_STARPOS.sub(lambda found: "\n" * found[0].count("\n"), text, count=1)
     end = 0
     for token in yaml.scan(text, yaml.SafeLoader):

@@ -19,8 +19,8 @@ def message_to_camera(
 ) -> Camera:
     """Camera of the images that a CameraInfo goes with; raises InstrumentError unless it is calibrated.
 
-    Its model is plumb_bob, also where none is named, rational_polynomial or equidistant. K is that of the whole sensor;
-    the camera's is that of the region and the binning that the message states.
+    Its model is plumb_bob, also where none is named, rational_polynomial or equidistant. K is for the whole sensor; the
+    camera's is for the message's region and binning.
     size: width and height of the images, px, for a message that leaves its own at 0.
     """
     k = np.array(message.k, float)
@@ -56,7 +56,7 @@ def message_to_camera(
 
 
 def leaves_size_open(message: Any) -> bool:
-    """Whether a CameraInfo states no size, which is then that of the images."""
+    """Whether a CameraInfo states no size; then the images' size holds."""
     region = message.roi
     return not (message.width or region.width) or not (message.height or region.height)
 
@@ -65,8 +65,8 @@ def _image_side(whole: int, offset: int, cut: int, binned_by: int, source: str) 
     """Pixels along a side of the images: the binned ones of the sensor, or of a part `cut` of it; 0 if not stated."""
     if whole and offset + cut > whole:
         raise InstrumentError(
-            f"{source}: the region of interest ends at pixel {offset + cut} of {whole}; width and height are those of "
-            "the whole sensor: correct the camera's driver or its calibration file."
+            f"{source}: the region of interest ends at pixel {offset + cut} of {whole}; width and height "
+            f"must be the whole sensor's: correct the camera's driver or its calibration file."
         )
     return (cut or max(0, whole - offset)) // binned_by
 

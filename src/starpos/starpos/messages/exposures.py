@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is known of the exposure of a frame: from its Capture message, or from the parameters where none comes."""
+"""The exposure of a frame as far as known: from its Capture message, or from the parameters without one."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -20,7 +20,7 @@ NANO = 10**9
 
 @dataclass(frozen=True)
 class _Facts:
-    """What a Capture tells of an exposure; exposure_s: 0 where it is not known."""
+    """The exposure by a Capture; exposure_s: 0 if unknown."""
 
     exposure_s: float
     stamp_stddev_s: float
@@ -29,18 +29,18 @@ class _Facts:
 
 
 class ExposureFacts:
-    """Keeps Captures by their stamps, and adds what they tell to their frames.
+    """Keeps Captures by their stamps, and adds their contents to their frames.
 
     values: the parameters of the detector.
     """
 
     def __init__(self, values: Mapping[str, Any]) -> None:
         self._values = values
-        # whether Captures have come that tell nothing but exposures
+        # whether Captures have come that state only exposures
         self._exposures_come = False
         # the oldest first
         self._captures: dict[tuple[int, int], Any] = {}
-        # what holds for a frame whose Capture is lost; None: no Capture has ever come
+        # facts for a frame whose Capture is lost; None: no Capture has ever come
         self._usual: _Facts | None = None
 
     def take(self, message: Any) -> None:
@@ -55,16 +55,16 @@ class ExposureFacts:
 
     @property
     def unsaid(self) -> str:
-        """Sentence on what the user has to state of the camera; '' where Captures come, or all is stated."""
+        """Sentence on the parameters to state of the camera; '' if Captures come, or all are stated."""
         return "" if self._usual else self._driver_stamp(1.0 if self._exposures_come else 0.0).unsaid
 
     def of(self, header: Any) -> tuple[int, Callable[[Frame], Frame]]:
         """The middle of a frame's exposure, ns since 1970, and what adds the exposure to the frame.
 
         From its Capture; where that is lost, with the errors and the shutter of the last one; where none has ever come,
-        from the parameters. Where `stamp` is set, a Capture without a stamp source tells the exposure alone, which
-        changes with automatic ones, and the parameters tell the rest. The frame has the stamp of its message.
-        Raises StarposError for what no exposure can have.
+        from the parameters. If `stamp` is set, a Capture without a stamp source gives only the exposure, which varies
+        under automatic exposure, and the parameters give the rest. The frame has the stamp of its message.
+        Raises StarposError for impossible values.
         """
         stamp_ns = header.stamp.sec * NANO + header.stamp.nanosec
         capture = self._captures.pop(key_of(header), None)
@@ -86,16 +86,16 @@ class ExposureFacts:
             "clock_stddev_s": facts.clock_stddev_s,
             "shutter": facts.shutter,
         }
-        # the errors of a camera's times and its shutter are those of its other frames; its exposure may not be
+        # the errors of a camera's times and its shutter are the same in all its frames; its exposure may differ
         self._usual = replace(facts, exposure_s=0.0)
         return stamp_ns, lambda frame: replace(frame, **known)
 
     def _is_of_driver(self, capture: Any) -> bool:
-        """Whether a Capture leaves it to the parameters what the stamp is."""
+        """Whether a Capture leaves the meaning of the stamp to the parameters."""
         return capture.stamp_source == UNKNOWN_SOURCE and self._values["stamp"] != UNKNOWN
 
     def _driver_stamp(self, exposure_s: float) -> DriverStamp:
-        """The meaning of a driver's stamp by the parameters; exposure_s: that a Capture tells, 0 where none does."""
+        """The meaning of a driver's stamp by the parameters; exposure_s: from a Capture, 0 without one."""
         v = self._values
         exposure_s = exposure_s or v["exposure"]
         return DriverStamp(v["stamp"], v["stamp_stddev"], exposure_s or None, v["readout"])
@@ -108,12 +108,12 @@ def _facts_of(capture: Any) -> _Facts:
 
 
 def key_of(header: Any) -> tuple[int, int]:
-    """The stamp of a message, s and ns: by it messages of one frame find each other."""
+    """The stamp of a message, s and ns, which identifies the messages of one frame."""
     return header.stamp.sec, header.stamp.nanosec
 
 
 def check_stamp(header: Any) -> None:
-    """Raise TimeError if the stamp of an image is not set, or is no time."""
+    """Raise TimeError if the stamp of an image is not set, or is not a time."""
     sec, nanosec = key_of(header)
     if not sec and not nanosec:
         raise TimeError(

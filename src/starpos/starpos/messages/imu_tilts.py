@@ -13,18 +13,18 @@ from starpos.messages.tilt import GAP, STUCK, Reading
 
 # m/s2; true within 0.3 % everywhere on the ground
 STANDARD_GRAVITY = 9.80665
-# An average needs so many messages: fewer show no scatter.
-LEAST = 3
+# Minimum number of messages in an average: fewer show no scatter.
+MIN_MESSAGES = 3
 # Share of the time of an average that its messages must cover.
-COVERED = 0.5
+MIN_COVERED = 0.5
 # A stamp further ahead is wrong: the clocks of two hosts differ by less.
 FUTURE_S = 0.1
 # If stamps go back further than this, the clock was set.
 NEW_TIME_S = 1.0
-# A floor, for a simulated accelerometer may have no noise.
+# A lower bound, because a simulated accelerometer may have no noise.
 LEAST_STDDEV_RAD = 1e-6
-# So many averages with noise make one without it that of a stuck sensor.
-NOISY = 20
+# Number of averages with noise after which one without noise means a stuck sensor.
+MIN_NOISY = 20
 # Most messages in an average.
 MAX_MESSAGES = 10_000
 
@@ -43,7 +43,7 @@ class Felt:
 
 
 class BadMessage(ValueError):
-    """A message cannot be used; the text says what is wrong with it."""
+    """A message cannot be used; the text says why."""
 
 
 def felt(message: Any) -> Felt:
@@ -90,12 +90,12 @@ class MeanForce:
 
     @property
     def excess(self) -> float:
-        """How many times larger the stated standard deviation is than the scatter, by the axis where it is least so."""
+        """Ratio of the stated standard deviation to the scatter, for the axis where it is smallest."""
         scatter = self.forces.var(0, ddof=1)
         return float(np.sqrt(np.min(self.variance / scatter))) if scatter.all() else 0.0
 
     def unrest(self, max_force_error: float, max_rotation: float) -> str:
-        """Say why it gives no tilt (limits: a share of g, rad/s); empty if it gives one."""
+        """Say why it gives no tilt (limits: a share of g, rad/s); '' if it gives one."""
         strength = float(np.linalg.norm(self.force))
         if abs(strength / STANDARD_GRAVITY - 1) > max_force_error:
             return f"it feels {strength:.3g} m/s2 where gravity is 9.81"
@@ -135,7 +135,7 @@ class ForceAverager:
         self._last_ns = 0
 
     def add(self, message: Felt) -> MeanForce | None:
-        """Take a message; return the average that it ends, if it ends one that has enough messages."""
+        """Take a message; return the average that it completes, if that has enough messages."""
         last_ns, messages = self._last_ns, self._messages
         if message.stamp_ns == last_ns:
             self.duplicates += 1
@@ -152,18 +152,21 @@ class ForceAverager:
             messages.append(message)
             return None
         self._messages = [message]
-        if len(messages) < LEAST or messages[-1].stamp_ns - messages[0].stamp_ns < COVERED * length_ns:
+        if (
+            len(messages) < MIN_MESSAGES
+            or messages[-1].stamp_ns - messages[0].stamp_ns < MIN_COVERED * length_ns
+        ):
             self.breaks += bool(messages)
             return None
         return MeanForce.of(messages)
 
 
 class ImuTilts:
-    """Averages the messages of an IMU, or the readings of any accelerometer, to tilts; counts what it leaves out.
+    """Averages the messages of an IMU, or the readings of any accelerometer, to tilts; counts rejected messages.
 
     values: the parameters noise_stddev, latency and imu.* of the inclinometer.
     unrest: why the last average gave no tilt; '' where it gave one.  frame: of the last message.
-    age_s: of the last message's stamp.  excess: how many times the last average's scatter its stated noise is.
+    age_s: of the last message's stamp.  excess: ratio of the last average's stated noise to its scatter.
     """
 
     def __init__(self, values: Mapping[str, Any]) -> None:
@@ -190,7 +193,7 @@ class ImuTilts:
 
     @property
     def noise(self) -> tuple[float, ...] | None:
-        """White noise of a tilt by axis, rad, as the tilts show it; None: too few yet."""
+        """White noise of a tilt by axis, rad, measured from the tilts; None: too few yet."""
         return self._noise.sigma
 
     def take(self, message: Any, now_ns: int) -> Reading | None:
@@ -213,7 +216,7 @@ class ImuTilts:
     def add(self, said: Felt, temperature_c: float = math.nan, step_rad: float = 0.0) -> Reading | None:
         """Take a reading of an accelerometer; return the tilt that it completes.
 
-        step_rad: the step of a reading, as a share of g; where it exceeds the noise no average takes the rounding away.
+        step_rad: the step of a reading, as a share of g; if it exceeds the noise, averaging does not remove the rounding.
         """
         breaks = self.averager.breaks
         average = self.averager.add(said)
@@ -255,8 +258,8 @@ class ImuTilts:
         flags = GAP if self._gap else 0
         self._gap = False
         still = not np.ptp(average.forces, axis=0).any()
-        # a simulated IMU may have no noise at all, but while it turns
-        if still and self._noisy >= NOISY:
+        # a simulated IMU may have no noise at all, except while it turns
+        if still and self._noisy >= MIN_NOISY:
             flags |= STUCK
         elif still:
             self._noisy = 0

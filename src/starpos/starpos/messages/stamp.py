@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The time stamp of a message, and a header of one that no middleware has sent."""
+"""The time stamp of a message, and a header for a message made without middleware."""
 
 from dataclasses import dataclass
 from typing import Any

@@ -39,7 +39,7 @@ def message_to_stars(message: Any, source: str = "stars") -> Stars:
 
 
 def message_to_shutter(message: Any) -> Shutter | None:
-    """Shutter that a StarArray or a Capture tells, None if it is not known; FrameError if it cannot be."""
+    """Shutter stated in a StarArray or a Capture, None if unknown; FrameError if impossible."""
     # older bags do not have it
     if not getattr(message, "shutter_known", False):
         return None

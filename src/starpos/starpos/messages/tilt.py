@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A tilt from its message, and a message from what an inclinometer reads."""
+"""A tilt from its message, and a message from an inclinometer's reading."""
 
 import math
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from starpos.messages.stamp import PlainHeader, PlainStamp, stamp_to_unix
 # bits of Tilt.flags, as starpos_interfaces defines them
 OUT_OF_RANGE, STUCK, SATURATED, GAP, TIME_UNKNOWN = 1, 2, 4, 8, 16
 UNUSABLE = OUT_OF_RANGE | STUCK | SATURATED | TIME_UNKNOWN
-# rad2; a larger variance says nothing, and might overflow
+# rad2; a larger variance is meaningless, and might overflow
 MOST_TILT_VARIANCE = 1.0
 
 
@@ -39,7 +39,7 @@ class Reading:
 
     stamp_ns: the host's time.  x, y: rad, always finite.  covariance: rad2 (xx, xy, yx, yy).
     temperature_c: deg C, or NaN if it is not known.
-    z, z_variance: rad, rad2; NaN of a two-axis sensor.
+    z, z_variance: rad, rad2; NaN for a two-axis sensor.
     """
 
     stamp_ns: int
@@ -70,7 +70,7 @@ class Reading:
 def message_to_tilt(message: Any, unknown_stddev_rad: float = SCA100T_NOISE_RAD) -> Tilt:
     """Tilt from a message; an unknown covariance (all zeros) becomes unknown_stddev_rad on both axes.
 
-    A tilt has two axes where the third is NaN, not filled in, or not there, as in the first release's messages.
+    A tilt has two axes if the third is NaN, not filled in, or absent, as in the first release's messages.
     An impossible temperature becomes NaN, unknown.  The flags are left to the caller.  Raises TiltError for NaN, no
     stamp, angles that cannot hold together, or an impossible covariance.
     """
@@ -102,10 +102,10 @@ def message_to_tilt(message: Any, unknown_stddev_rad: float = SCA100T_NOISE_RAD)
 
 
 def _third_axis(message: Any) -> tuple[float, float]:
-    """Elevation in rad and variance in rad2 of the third axis, NaN where they are not known; TiltError if they cannot be.
+    """Elevation in rad and variance in rad2 of the third axis, NaN if unknown; TiltError if impossible.
 
-    A publisher that knows of two axes only may leave both at 0. Where x and y leave room for no third axis but a level
-    one, 0 may as well be what it reads; such a tilt is refused, because the two differ by degrees.
+    A publisher that knows only two axes may leave both at 0. If x and y allow only a level third axis, 0 may also be a
+    real reading; such a tilt is refused, because the two differ by degrees.
     """
     z, variance = getattr(message, "z", math.nan), getattr(message, "z_variance", math.nan)
     if math.isnan(z):
@@ -113,7 +113,8 @@ def _third_axis(message: Any) -> tuple[float, float]:
     if z == variance == 0:
         if math.sin(message.x) ** 2 + math.sin(message.y) ** 2 > 1 - SQUARE:
             raise TiltError(
-                "a tilt message leaves z and z_variance at 0, and its x and y alone are those of a sensor on its side: "
+                "a tilt message leaves z and z_variance at 0, and its x and y alone fit a sensor on its "
+                "side: "
                 "send z and its variance, or NaN for a sensor of two axes."
             )
         return math.nan, math.nan

@@ -83,9 +83,7 @@ class Adjustment:
         self.vibration = vibration
         self.odometry = None if velocity is None else Odometry.of(velocity, nodes, pieces)
         if self.odometry is not None and not len(self.odometry.node):
-            raise VoyageError(
-                "no velocity lies on the voyage: check that its clock and that of the camera agree"
-            )
+            raise VoyageError("no velocity lies on the voyage: check that its clock and the camera's agree")
         self.law = self._law(vessel)
         self.unknowns = MEASURED if self.law is None else BY_LAW
         self.known = Beforehand(
@@ -121,7 +119,7 @@ class Adjustment:
     def faults(self) -> tuple[str, ...]:
         """What of the record does not go with the rest, in sentences."""
         said = [
-            f"{number} {kind} do not go with the rest: left out"
+            f"{number} {kind} contradict the rest: left out"
             for kind, number in self.left_out.items()
             if number
         ]
@@ -172,8 +170,8 @@ class Adjustment:
                 progress("adjusting", 1.0)
                 return motion, solution, k + 1
         raise FixError(
-            f"the voyage's place does not settle (the last step was {step:.0f} m): check the IMU's axes and units, "
-            "and what is said of the vehicle"
+            f"the voyage's position does not converge (the last step was {step:.0f} m): check the IMU's "
+            f"axes and units, and the stated vehicle"
         )
 
     def _begin(self) -> tuple[StarAttitudes, Motion]:

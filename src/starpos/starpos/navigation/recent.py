@@ -139,8 +139,8 @@ class Recent:
             )
         if not LEAST_SIGMA <= sigma <= MOST_SIGMA:
             raise VoyageError(
-                f"a velocity's sigma is {sigma:g} m/s, not between {LEAST_SIGMA:g} and {MOST_SIGMA:g}: state that of "
-                "each axis, or zeros for velocity_stddev"
+                f"a velocity's sigma is {sigma:g} m/s, not between {LEAST_SIGMA:g} and {MOST_SIGMA:g}: "
+                f"state each axis's sigma, or zeros for velocity_stddev"
             )
         if self._velocities and utc_unix_s <= self._velocities[-1][0]:
             raise VoyageError("a velocity is not later than the one before: it is left out")

@@ -87,7 +87,7 @@ def _check_turns(stars: StarAttitudes, pieces: Pieces, model: ImuModel, camera_t
         share = float(np.median(np.linalg.norm(others - turns, axis=1) / np.linalg.norm(turns, axis=1)))
         if share > MOST_SHARE:
             raise VoyageError(
-                f"the gyro's turns differ from those of the stars by {100 * share:.0f} %: {_cause(turns, others)}"
+                f"the gyro's turns differ from the stars' by {100 * share:.0f} %: {_cause(turns, others)}"
             )
     scatter = float(np.median(np.linalg.norm(off - bias, axis=1) / noise))
     if not clear.any() and scatter > MOST_SCATTER:

@@ -120,13 +120,13 @@ def sighting_of(stars: Stars, eye: solver.Solver, answer: Solution) -> Identifie
     camera, catalogue, _ = eye.view(stars.width, stars.height, stars.origin_px)
     if wide.is_wide(camera):
         raise InstrumentError(
-            f"{stars.place}: frames of a fisheye tell no place under way: take a narrower lens"
+            f"{stars.place}: frames of a fisheye give no position under way: use a narrower lens"
         )
     if answer.found is None:
         raise FrameError(answer.message)
     if answer.warnings:
         raise FrameError(
-            f"{stars.place}: its stars are not those of one sky ({', '.join(answer.warnings)}): left out"
+            f"{stars.place}: its stars do not belong to one sky ({', '.join(answer.warnings)}): left out"
         )
     if answer.found.mirrored:
         raise InstrumentError(f"{stars.place}: the frame is mirrored (its rows run bottom-up): flip it")

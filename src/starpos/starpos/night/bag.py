@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reads what a rosbag2 holds of one instrument."""
+"""Reads one instrument's messages from a rosbag2."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -36,7 +36,7 @@ class Recorded:
 
     drivers: how a robot's own messages are used.  cameras: by (width, height) of their frames in px.
     star_count: star lists, or images that stars are detected in.  solutions: as the solver published them.
-    deflection: that the solver applied, None if no solution says so.
+    deflection: as the solver applied it, None if no solution states it.
     """
 
     path: Path
@@ -66,7 +66,7 @@ def is_bag(path: Path) -> bool:
 def read(
     path: Path, namespace: str | None, tilt_noise_rad: float, drivers: Drivers, progress: Progress
 ) -> Recorded:
-    """Read all of one instrument, or of a robot's own drivers, but the stars.
+    """Read everything of one instrument, or of a robot's own drivers, except the stars.
 
     namespace: the instrument's; None where there is only one.  tilt_noise_rad: sigma of readings that state none.
     Raises BagError if the bag cannot be read, FrameError if the instrument is not in it.
@@ -127,7 +127,7 @@ class _Reading:
         self._why_no_camera = ""
 
     def take(self, kind: str, message: Any, log_s: float) -> None:
-        """Take in a message of a type; a tilt or a camera that cannot be is remarked only."""
+        """Take in a message of a type; an impossible tilt or camera only leads to a remark."""
         if kind == IMU:
             kind, message = TILT, self._messages.tilt_of(message, log_s)
             if message is None:
@@ -154,12 +154,12 @@ class _Reading:
                 self._why_no_camera = str(error)
 
     def tilt_log(self) -> TiltLog | None:
-        """The usable tilts; None if there are none."""
+        """The usable tilts; None without any."""
         in_time = sorted(self._tilts, key=lambda tilt: tilt.utc_unix_s)
         return TiltLog.of_readings(in_time) if in_time else None
 
     def remarks(self, path: Path, made: str) -> tuple[Remark, ...]:
-        """What is to be said of what was left out, and of what was made of a robot's own messages."""
+        """Remarks on left-out messages, and on how a robot's own messages were used."""
         said = [Remark(Kind.RECORDED, f"{path.name}: {made}")] if made else []
         said += [Remark(Kind.TILTS, sentence) for sentence in self._messages.remarks()]
         if self._unusable:

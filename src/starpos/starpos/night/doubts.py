@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Doubts about an answer: tilts with their columns exchanged or in radians, a place that is far from where it should be.
 
-They are told, and change no answer.
+They are reported, and change no answer.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -22,14 +22,14 @@ from starpos.rotation import half_turn
 from starpos.units import HOUR_S
 
 NEAR_KM = 50.0
-# a place is far if it lies so many sigma further than that
+# a place is far if it lies this many sigma beyond the stated distance
 FAR_SIGMA = 4.0
-# Frames of one place whose tilts are mistaken lie so far apart, and so many times nearer if they are not.
+# Minimum distance between frames of one place whose tilts are mistaken, and factor by which the right tilts reduce it.
 APART_M, NEARER = 20_000.0, 20.0
-# clocks that are not on UTC are mostly wrong by a multiple of this
+# clocks that are not on UTC are usually wrong by a multiple of this
 ZONE_H = 0.5
 
-# what may be wrong with tilts, and the angles (N, 2) in rad that it makes of those that were read
+# possible mistakes in tilts, and functions that give the corrected angles (N, 2), rad
 MISTAKES: tuple[tuple[str, Callable[[np.ndarray], np.ndarray]], ...] = (
     ("theta_x and theta_y exchanged", lambda theta: theta[:, ::-1]),
     ("the other sign of theta_x", lambda theta: theta * [-1, 1]),
@@ -63,9 +63,9 @@ class Near:
 def doubts(
     frames: Sequence[Levelled], whole: Fix | Average, mounting: Mounting | None, near: Near | None
 ) -> Iterator[Remark]:
-    """Doubt places that tilts must have set apart, and one that lies far from `near`.
+    """Report places that mistaken tilts set apart, and a place far from `near`.
 
-    mounting: of the frames, None where A3 was not given, and tells nothing.
+    mounting: of the frames, None if A3 was not given: then it is not checked.
     """
     if apart := _mistaken(mounting, frames):
         yield Remark(Kind.MISTAKEN, apart)
@@ -85,7 +85,7 @@ def _far(near: Near, fix: Fix | Average, mounting: Mounting | None, frames: Sequ
     sigma_m = float(np.sqrt(np.diag(fix.covariance)[:2].max()))
     if km <= near.km + FAR_SIGMA * sigma_m / 1000:
         return ""
-    told = f"the place is {km:.0f} km from that of --near, and should be within {near.km:g} km"
+    told = f"the place is {km:.0f} km from --near, and should be within {near.km:g} km"
     for name, places in _places(mounting, frames):
         off = [near.km_from(*place) for place in places]
         if max(off) <= near.km:
@@ -107,7 +107,7 @@ def _hours_ahead(near: Near, fix: Fix | Average) -> float:
 def _mistaken(mounting: Mounting | None, frames: Sequence[Levelled]) -> str:
     """Say which mistake has set the places of frames far apart; '' if none explains it.
 
-    One heading alone never tells: the same mistake then moves all places alike.
+    One heading alone never shows it: the same mistake then moves all places alike.
     """
     if mounting is None:
         return ""
@@ -139,7 +139,7 @@ def _places(
 
 
 def _place(frame: Levelled, theta: np.ndarray, mounting: Mounting) -> tuple[float, float]:
-    """Latitude, longitude (rad) of a frame with a tilt, but for refraction."""
+    """Latitude, longitude (rad) of a frame with a tilt, without refraction."""
     place = place_of(level_of(up_of(theta)) @ mounting.a3 @ frame.camera_to_itrs.T)
     return place.latitude, place.longitude
 

@@ -25,7 +25,7 @@ IMAGES = (IMAGE, PICTURE)
 
 @dataclass(frozen=True)
 class Drivers:
-    """How a robot's messages are used: parameters of detector and inclinometer by name, and which topics.
+    """How a robot's messages are used: parameters of detector and inclinometer by name, and the topics.
 
     settings: the detector's parameters as the detection takes them.
     """
@@ -36,7 +36,7 @@ class Drivers:
     remaps: Remaps = NO_REMAPS
 
     def begin(self) -> "DriverMessages":
-        """What takes the messages of one bag."""
+        """A DriverMessages for one bag."""
         return DriverMessages(self)
 
 
@@ -54,7 +54,7 @@ class DriverMessages:
         self._exposures.take(message)
 
     def stars_of(self, kind: str, message: Any) -> tuple[Stars, PlainHeader]:
-        """The stars of an image of this type and the header of their message; raises StarposError if there are none."""
+        """The stars of an image of this type and the header of their message; raises StarposError without any."""
         from starpos.detection import detect
 
         self._frames += 1
@@ -73,7 +73,7 @@ class DriverMessages:
         return reading.message(self._drivers.inclinometer["frame_id"])
 
     def remarks(self) -> list[str]:
-        """Sentences on what the user has to state, and on accelerations that gave no tilt."""
+        """Sentences on missing parameters, and on accelerations that gave no tilt."""
         said = [self._exposures.unsaid] if self._frames else []
         imu = self._imu
         heard = imu.good + imu.malformed + imu.future
@@ -102,7 +102,7 @@ def _as_sent(stars: Stars, header: PlainHeader) -> Stars:
 
 
 def named_image(kind: str, message: Any, messages: DriverMessages) -> tuple[str, Stars | FrameError]:
-    """A name for an image, and its stars, or the error for which there are none."""
+    """A name for an image, and its stars, or the error."""
     stamp_s = stamp_to_unix(message.header.stamp)
     name = "image " + ("of unknown time" if stamp_s is None else utc_text(stamp_s))
     try:

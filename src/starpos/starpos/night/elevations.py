@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The place from pointings without a roll: each tells its distance from the zenith, several tell the place."""
+"""The place from pointings without a roll: each gives its distance from the zenith, several give the place."""
 
 from collections.abc import Sequence
 from contextlib import suppress
@@ -27,9 +27,9 @@ from starpos.units import ARCSEC
 
 @dataclass(frozen=True)
 class Elevations:
-    """The circle of each pointing on which its place lies, or the error for which it has none; the place of all.
+    """Each pointing's circle on which its place lies, or the error; the place of all.
 
-    axis: A3 whose axis the elevations determined too, None where A3 was known well enough or they do not.
+    axis: A3 whose axis the elevations determined too; None if A3 was known well enough or they do not determine it.
     """
 
     circles: tuple[Circle | StarposError, ...]
@@ -46,7 +46,7 @@ def from_elevations(
 ) -> Elevations:
     """Find the place of pointings, and A3's axis where it is not known to a few arcmin.
 
-    near: which of two places it is, where the elevations leave two.  self_calibrate: take A3 for unknown.
+    near: selects between two places that the elevations leave. self_calibrate: treat A3 as unknown.
     """
     if self_calibrate:
         unknown = Calibration.of(solver.instrument.calibration.misalignment_deg)
@@ -60,7 +60,7 @@ def from_elevations(
         directions = Directions.of(sorted(sound, key=lambda c: c.utc_unix_s))
         if self_calibrate or (directions.wide and len(directions.circles) >= FEWEST_WITHOUT_SITE):
             axis = axis_of(solver, pointings, tilts, there)
-            # A3 counts as known as before: from where it was given, or from what was found where nothing was
+            # A3's error is counted from the given A3, or from the one found if none was given
             sound = axis.about(axis.a3 if self_calibrate else solver.instrument.calibration.a3)
         place = place_of_circles(sound, there)
         together = Together(place, "", (*of_inclinometer(solver.instrument), *doubts((), place, None, near)))
@@ -81,7 +81,7 @@ def axis_of(
 
     levelled = []
     for pointing in pointings:
-        # whoever asks for the circles is told why one has none
+        # `circles_of` reports why a pointing has no circle
         with suppress(StarposError):
             levelled.append((pointing, *solver.levelled(pointing, tilts)))
 
@@ -99,7 +99,7 @@ def axis_of(
 
 
 def circles_of(solver: Solver, pointings: Sequence[Pointing], tilts: Tilts) -> list[Circle | StarposError]:
-    """The circle of each pointing, or why it has none."""
+    """Each pointing's circle, or the error."""
     circles: list[Circle | StarposError] = []
     for pointing in pointings:
         try:

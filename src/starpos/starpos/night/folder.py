@@ -37,8 +37,8 @@ def exposures(
 ) -> Exposures:
     """The frames of a folder in the order of their names, to be solved.
 
-    place: that is known, where each frame has a heading.  If tilt.csv is missing, headings alone are wanted there;
-    without a known place each frame says that it is missing.
+    place: a known place, where each frame has a heading. If tilt.csv is missing, only headings are computed there;
+    without a known place each frame reports that it is missing.
 
     Raises FrameError if there are no frames, or truth.json cannot be used.
     """
@@ -74,7 +74,7 @@ def exposures(
 
 
 def frames_in(folder: Path) -> list[Path]:
-    """Paths of the frames in a folder by name, at least one; raises FrameError if there is none."""
+    """Paths of the frames in a folder by name, at least one; raises FrameError without any."""
     try:
         files = sorted(p for p in folder.iterdir() if p.is_file())
     except OSError as e:

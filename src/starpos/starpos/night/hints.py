@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Frames whose focal length only their header gives: where it fits nothing, the search goes on without it.
+"""Frames whose focal length comes only from their header: if it fits nothing, the search goes on without it.
 
 A header is a hint. Programs write the focal length of another telescope, the pixels of an unbinned frame, or metres.
 """
@@ -32,9 +32,9 @@ def without_hint(
     work: Callable[[Solver], Sight],
     progress: Progress,
 ) -> Sight:
-    """The sight of a frame, or if its header's focal length identifies nothing, that with the focal length that fits.
+    """The sight of a frame with its header's focal length, or if that identifies nothing, with the one that fits.
 
-    solver: with the header's focal length.  work: what was done to get the sight, with any solver.
+    solver: with the header's focal length. work: gives the sight with any solver.
     """
     if not _misled(solver, item, sight):
         return sight
@@ -51,7 +51,7 @@ def without_hint(
 def of_one_camera(
     solver: Solver, sights: Sequence[Sight]
 ) -> tuple[Solver, list[tuple[Stars, Identification | None]]]:
-    """A solver with the focal length of a night's frames, and each frame with what is identified of it by that one.
+    """A solver with the focal length of a night's frames, and each frame with its identification by this solver.
 
     solver: with the header's focal length, which holds unless a frame was identified with another one.
     """

@@ -22,7 +22,7 @@ from starpos.night.watching import WatchedNight
 
 NO_TILT = (float("nan"), float("nan"))
 NO_STARS = np.zeros((0, 2))
-# so many frames are shown in a notebook
+# maximum number of frames shown in a notebook
 SHOWN = 20
 
 
@@ -30,7 +30,7 @@ SHOWN = 20
 class ReportedPlace:
     """Astronomic latitude, longitude and heading (rad), with their errors.
 
-    heading: that of the last pose; NaN if there is no one heading.  poses: number of poses that the place comes from.
+    heading: of the last pose; NaN without a common heading. poses: number of poses that the place comes from.
     covariance (3, 3): of east m, north m, heading rad, the sum of the `terms`.
     """
 
@@ -81,12 +81,12 @@ class ReportedPlace:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Shot:
-    """One frame: its status, and as much of its answer as there is.
+    """One frame: its status, and the part of its answer that was found.
 
     utc_unix_s: NaN if unknown.  size: of the frame in px.  tilt: in rad.
     xy, residual_px (M, 2): seen places of the stars of its fix, and these minus the fitted ones.
     camera_to_itrs (3, 3): attitude against the Earth by the stars alone.
-    at_place: heading, pitch and roll at a known place; None where none is known.
+    at_place: heading, pitch and roll at a known place; None without one.
     warnings: what is suspicious about its identification, as `Solution.warnings`.
     """
 
@@ -112,7 +112,7 @@ class Shot:
 
     @classmethod
     def of(cls, name: str, s: Solution, stars: Stars | None) -> "Shot":
-        """The part of a solution that is shown; stars: those that gave it, None of a frame that cannot be read."""
+        """The part of a solution that is shown; stars: its stars, None for a frame that cannot be read."""
         shot = cls(
             name=name,
             status=s.status,
@@ -178,7 +178,7 @@ class Night:
 
     origin: a sentence that says where the fixes come from.
     shots: one for each frame.
-    combined: the average, astronomic and in rad; None if there is none, and why_not says why.
+    combined: the average, astronomic and in rad; None without one, and why_not says why.
     wgs84: the same for a map, in deg.
     steady (N, 3): latitude, longitude, heading (rad) of the fixes with one tilt for all; None if the camera moved.
     watched: what GNSS taught and what its guard said, of each frame that can be read; None without GNSS.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A night on the disk for programs and notebooks: `starpos.open_night`."""
+"""A night on disk for programs and notebooks: `starpos.open_night`."""
 
 from dataclasses import KW_ONLY, dataclass, replace
 from pathlib import Path
@@ -20,7 +20,7 @@ from starpos.progress import Progress, quiet
 
 @dataclass(frozen=True)
 class NightOnDisk:
-    """A folder of frames with tilt.csv, and what is known of its instrument and the air; `solve` works on it.
+    """A folder of frames with tilt.csv, its instrument and air as far as known; `solve` solves it.
 
     instrument: None if the frames' headers have the focal length.  calibration: A3 in place of the instrument's.
     inclinometer: name of its model in place of the instrument's; '' for the instrument's.
@@ -44,8 +44,8 @@ class NightOnDisk:
     ) -> Night:
         """The place, and the fix of each frame; a frame's fault is its status.
 
-        self_calibrate: find A3 too, from frames of one place at several headings; turn_stddev_deg: how well the given A3
-        has its turn about the plumb line.  Raises StarposError where the folder or the instrument cannot be used.
+        self_calibrate: find A3 too, from frames of one place at several headings; turn_stddev_deg: sigma of the given
+        A3's turn about the plumb line.  Raises StarposError where the folder or the instrument cannot be used.
         """
         given = self.instrument
         if given is None:
@@ -78,9 +78,9 @@ def open_night(
     """A night: a folder of FITS frames, or else of CSV lists of stars, with tilt.csv; not read yet.
 
     instrument: or the path of its file (YAML); None if the frames' headers have the focal length.
-    calibration: A3 in place of the instrument's; while nobody knows A3 the place is over 1000 km wide, unless the night
-    is solved with self_calibrate=True.  inclinometer: name of its model, in place of the instrument's; where nobody names
-    it or states its errors they are those of an SCA100T as sold, 7 km or more.  atmosphere: None: not measured.
+    calibration: A3 in place of the instrument's; without a known A3 the position error exceeds 1000 km, unless the night
+    is solved with self_calibrate=True. inclinometer: name of its model, in place of the instrument's; without a name or
+    stated errors it counts as an SCA100T as sold, 7 km or more.  atmosphere: None: not measured.
     vertical: its deflection; None: not known.
     place: where the instrument is known to be: each frame's `Shot.at_place` is its heading there, and tilt.csv may lack.
     Raises StarposError if there is no frame, or the instrument's file cannot be used.

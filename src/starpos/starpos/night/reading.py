@@ -72,7 +72,7 @@ class About:
     origin_px: tuple[float, float] | None = None
 
 
-# of pointings only the camera's axes count
+# for pointings only the camera's axes count
 NO_CAMERA = About(IDEAL.width, IDEAL.height, IDEAL.fx)
 
 
@@ -92,9 +92,9 @@ class First:
 
 
 class Instruments(Protocol):
-    """The instrument of each frame of a night, with its camera; None where nobody knows its focal length.
+    """Finds the instrument for a frame of a night, with its camera; None if its focal length is unknown.
 
-    instrument: whose A3 and inclinometer all frames have; None where nobody knows anything.
+    instrument: with all frames' A3 and inclinometer; None if nothing is known.
     """
 
     @property
@@ -109,7 +109,7 @@ class Instruments(Protocol):
 
 @dataclass(frozen=True)
 class Given:
-    """One instrument for all frames; by_header: but for the focal length that a frame's own header states."""
+    """One instrument for all frames; by_header: except for the focal length in a frame's own header."""
 
     instrument: Instrument | None
     by_header: bool = False

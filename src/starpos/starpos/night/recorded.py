@@ -29,7 +29,7 @@ from starpos.rotation import full_turn, half_turns
 class OfBag:
     """The instrument of a bag's frames, with the bag's camera for their size.
 
-    any_size: whether frames of other sizes have the instrument as it is.
+    any_size: whether frames of other sizes use the instrument unchanged.
     """
 
     instrument: Instrument
@@ -103,8 +103,8 @@ def _as_recorded(r: Recorded, atmosphere: Atmosphere, vertical: Vertical) -> Nig
     places = [s.place for s in r.solutions if s.place]
     bound = Remark(
         Kind.RECORDED,
-        "the error of the mean is that of one frame, an upper bound: a recorded solution does not tell how its errors go "
-        "with those of others",
+        "the error stated for the mean is the error of one frame, an upper bound: recorded solutions do not "
+        "state how their errors correlate",
     )
     return Night(
         name=r.name,

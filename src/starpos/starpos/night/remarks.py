@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is to be said of a night: each remark is a kind and a sentence, which whoever shows the night shows."""
+"""Remarks on a night: each is a kind and a sentence, shown with the night."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -11,8 +11,8 @@ from starpos.averaging.average import Average
 from starpos.calibration.misalignment import Calibrated
 from starpos.calibration.unknown import (
     BY_OPTIONS,
+    FIND_TURN,
     MODEL_BY_OPTIONS,
-    TELL_IT,
     at_another_lean,
     may_turn,
     unknown_a3,
@@ -24,7 +24,7 @@ from starpos.instrument.tilt_doubt import like_radians
 from starpos.instrument.tilt_log import TiltLog
 from starpos.utc import utc_text
 
-# an A3 that is known less well than so (arcsec) is hardly told by the headings
+# with a larger error of A3 (arcsec) the headings hardly determine it
 WORTH_SAVING_ARCSEC = 600.0
 
 
@@ -65,13 +65,13 @@ def of_tilts(log: TiltLog, path: str) -> tuple[Remark, ...]:
 
 
 def of_inclinometer(instrument: Instrument, ways: str = MODEL_BY_OPTIONS) -> tuple[Remark, ...]:
-    """Say that nobody has said which inclinometer it is; ways: what to do then."""
+    """Say that the inclinometer's model is not stated; ways: what to do then."""
     sentence = unnamed_inclinometer(instrument, ways)
     return (Remark(Kind.INCLINOMETER, sentence),) if sentence else ()
 
 
 def of_axis(doubt: str) -> tuple[Remark, ...]:
-    """Say that the optical axis of a night's frames is not known; doubt: the sentence, '' if it is."""
+    """Say that the optical axis of a night's frames is not known; doubt: the sentence, '' if it is known."""
     return (Remark(Kind.AXIS, doubt),) if doubt else ()
 
 
@@ -81,7 +81,7 @@ def of_focal_length(place: str, focal_px: float) -> Remark:
 
 
 def of_extrapolation(fix: Fix, days: float) -> tuple[Remark, ...]:
-    """Say that a fix lies so many days beyond the IERS table, and how far it may be off for that."""
+    """Say by how many days a fix lies beyond the IERS table, and how far it may be off for that."""
     if days <= 0:
         return ()
     (ut1,) = (t for t in fix.terms if t.name == "ut1")
@@ -93,7 +93,7 @@ def of_extrapolation(fix: Fix, days: float) -> tuple[Remark, ...]:
 
 
 def of_average(whole: Average) -> Iterator[Remark]:
-    """Say what an average does not hold."""
+    """Say what an average leaves out."""
     if whole.moved:
         begin = utc_text(whole.began_unix_s)
         yield Remark(
@@ -108,7 +108,7 @@ def of_average(whole: Average) -> Iterator[Remark]:
 
 
 def of_a3(calibration: Calibration, place: Fix | Average, ways: str = BY_OPTIONS) -> tuple[Remark, ...]:
-    """Say that A3, as far as it is not known, makes a place wide; ways: what to do then."""
+    """Say that A3's error makes the position error large; ways: what to do then."""
     sentence = unknown_a3(calibration, place.covariance, place.terms, ways)
     return (Remark(Kind.UNKNOWN_A3, sentence),) if sentence else ()
 
@@ -118,12 +118,12 @@ def of_turn(turned: Calibrated) -> Iterator[Remark]:
     error = f"the plumb line in the camera is known to {turned.plumb_stddev_arcsec:.2f} arcsec"
     if turned.plumb_stddev_arcsec > WORTH_SAVING_ARCSEC:
         yield Remark(
-            Kind.NOT_CALIBRATED, f"not calibrated: the headings hardly tell A3, {error}: turn it further"
+            Kind.NOT_CALIBRATED, f"not calibrated: the headings hardly determine A3, {error}: turn it further"
         )
         return
     found = turned.instrument.calibration
     yield Remark(Kind.CALIBRATED, f"calibrated: {error}; {at_another_lean(found)}")
     if may_turn(found):
-        yield Remark(Kind.CALIBRATED, f"to use A3 at another lean, {TELL_IT}")
+        yield Remark(Kind.CALIBRATED, f"to use A3 at another lean, {FIND_TURN}")
     if turned.beyond:
         yield Remark(Kind.INCLINOMETER, turned.beyond)

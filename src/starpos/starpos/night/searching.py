@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Identify a frame by every way there is, one after another, until one succeeds or its time is over.
+"""Identify a frame by every way there is, one after another, until one succeeds or time is up.
 
-Its stars as they are, with a second look at the frame; smaller triangles, where stars fill a part of the frame only; then
-the same with stars that are detected otherwise. A list of stars has no other way to be seen.
+First its stars as they are, with a second look at the frame; then smaller triangles, in case stars fill only a part of
+the frame; then the same with stars from other detections. A list of stars has no other detections.
 """
 
 import itertools
@@ -32,15 +32,15 @@ from starpos.instrument.tilts import Tilts
 if TYPE_CHECKING:
     from starpos.detection.second_look import SecondLook
 
-# Each of at most so many other ways to see a frame is another try, with a second look of its own: together they add 0.01
-# wrong answers in 1e9 frames.
+# Maximum number of other detections of a frame. Each is another try, with a second look of its own: together they add
+# 0.01 wrong answers in 1e9 frames.
 MOST_WAYS = 3
 ENOUGH_OTHERWISE = ENOUGH + math.log(10 * MOST_WAYS)
-# Where stars fill a part of a frame only (a roof, clouds, a white half), triangles of a field this share as large are.
+# If stars fill only a part of a frame (a roof, clouds, a white half), triangles of a field of this relative size help.
 PART = 0.6
-# of the search at every scale, for stars that are detected otherwise
+# stages of the search at every scale, for stars from other detections
 QUICK, QUICK_FISHEYE = STAGES[:2], blind_fisheye.STAGES[:1]
-# what the stars are not asked before
+# statuses that were found before any identification
 UNASKED = (Status.NO_TILT, Status.TILT_OUT_OF_RANGE)
 # a deadline, by time.monotonic, that is never reached
 NEVER_S = math.inf
@@ -48,9 +48,9 @@ NEVER_S = math.inf
 
 @dataclass(frozen=True, eq=False)
 class Sight:
-    """A frame as it was seen: stars of it, and the solution that they gave.
+    """A detection of a frame: its stars, and their solution.
 
-    instrument: with the focal length that fits, where that of the frame's header does not; else None.
+    instrument: with the focal length that fits, if the frame header's does not; else None.
     """
 
     stars: Stars
@@ -59,16 +59,16 @@ class Sight:
 
     @property
     def found(self) -> Identification | None:
-        """Which stars they are; None where nothing was identified."""
+        """The identification; None without one."""
         return self.solution.found
 
 
 def identified(
     solver: Solver, item: Frame | Stars, stars: Stars, predicted: Priors = (), until_s: float = NEVER_S
 ) -> Sight:
-    """Identify a frame or a list, whose stars these are; no way is begun after until_s (time.monotonic).
+    """Identify a frame or a list with these stars; no way is begun after until_s (time.monotonic).
 
-    Returns the stars that identified it, or those given with the first answer where nothing did.
+    Returns the stars that identified it, or the given ones with the first answer if none did.
     """
 
     first = Sight(stars, solver.identify(stars, predicted, look_at(item, stars)))
@@ -85,7 +85,7 @@ def identified(
 
 
 def identified_blind(solver: BlindSolver, item: Frame | Stars, stars: Stars) -> Sight:
-    """Identify a frame or a list of any scale, as `identified` does one whose scale is known.
+    """Identify a frame or a list of any scale, as `identified` does for a known scale.
 
     All ways together have the CPU time that the solver has for a search.
     """
@@ -109,9 +109,9 @@ def solved(
     until_s: float = NEVER_S,
     known: Identification | None = None,
 ) -> Sight:
-    """The fix of a frame or a list, whose stars these are, identified by every way there is until until_s.
+    """The fix of a frame or a list with these stars, identified by every way there is until until_s.
 
-    known: what is identified of these stars already.
+    known: the identification of these stars, if there is one already.
     """
     answer = solver.solve(stars, tilts, hint, predicted, known)
     if answer.lost and time.monotonic() < until_s:
@@ -135,7 +135,7 @@ def answered(
 ) -> Sight:
     """The fix of a frame or a list by its tilt, as `solved` has it, and its heading where the place is known.
 
-    tilts: None where headings alone are wanted.
+    tilts: None if only headings are wanted.
     """
     if tilts is None:
         sight = identified(solver, item, stars, predicted, until_s)
@@ -153,7 +153,7 @@ def answered(
 
 
 def focal_px_that_fits(solver: Solver, stars: Stars) -> float | None:
-    """A focal length in px at which stars are identified that are not with the given one; None if none is found.
+    """A focal length in px at which stars are identified after the given one failed; None if none is found.
 
     Near the given one, or wherever the first stage of the search at every scale finds it, if its quads are built.
     """
@@ -180,9 +180,9 @@ def _another(
     ways: Callable[[Stars], Iterator[Solution]],
     is_over: Callable[[], bool],
 ) -> Sight:
-    """The next sight of a frame that is identified beyond doubt, by some way and some stars; else the first.
+    """The next sight of a frame that is identified beyond doubt, by any way and detection; else the first.
 
-    That is the answer where it is not lost.  No way is begun once the time is over.
+    A first sight that is not lost is the answer. No way is begun once time is up.
     """
     if not first.solution.lost or is_over():
         return first
@@ -196,7 +196,7 @@ def _another(
 
 
 def _seen(item: Frame | Stars, stars: Stars) -> Iterator[tuple[Stars, float]]:
-    """Yield the stars of a frame, then those detected otherwise, each with the least log-odds that accept an answer."""
+    """Yield the stars of a frame, then of its other detections, each with its minimum log-odds."""
     yield stars, -math.inf
     if isinstance(item, Stars):
         return

@@ -22,7 +22,7 @@ from starpos.zenith.sighting import Mark, ZenithSighting, sighting
 
 @dataclass(frozen=True)
 class ZenithSighted:
-    """Makes the ZenithSighting of a frame at a mark; a frame's fault is a Solution that says why there is none."""
+    """Makes the ZenithSighting of a frame at a mark; a frame's fault is a Solution that gives the reason."""
 
     instruments: Instruments
     atmosphere: Atmosphere

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Converts recorded stars and solutions (messages) into those of a night."""
+"""Converts recorded stars and solutions (messages) into a night's."""
 
 from typing import Any
 
@@ -25,7 +25,7 @@ STATUS = (Status.OK, Status.TOO_FEW_STARS, Status.NOT_IDENTIFIED, Status.NO_TILT
 
 
 def named_stars(m: Any) -> tuple[str, Stars | FrameError]:
-    """A name for a StarArray, and its stars, or the error for which they cannot be used."""
+    """A name for a StarArray, and its stars, or the error."""
     name = _name("stars", stamp_to_unix(m.header.stamp))
     try:
         return name, message_to_stars(m, name)
@@ -102,12 +102,12 @@ def shot_of(m: Any, cameras: dict[tuple[int, int], Camera]) -> Shot:
 
 
 def _finite(value: float) -> float:
-    """The value, or NaN for one that no instrument can give."""
+    """The value, or NaN if it is impossible."""
     return float(value) if abs(value) < 1e9 else float("nan")
 
 
 def deflection_of(m: Any) -> Deflection | None:
-    """The deflection that the solver applied; its sigma follows from how much wider the geodetic covariance is."""
+    """The deflection that the solver applied; its sigma follows from the excess of the geodetic covariance."""
     prime, meridian = curvature_radii_m(np.radians(m.latitude))
     # east and north together, because the axes turn close to a pole
     wider = sum(m.covariance_geodetic[k] - m.covariance[k] for k in (0, 4))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the frames of a night come to together: A3 where they are turned, the average of their fixes, and its doubts."""
+"""The common result of a night's frames: A3 if they are turned, the average of their fixes, and doubts about it."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -52,7 +52,7 @@ class Solved:
 
 @dataclass(frozen=True)
 class Together:
-    """The average of a night's fixes, None if there is none, as why_not says; and what is to be said of it."""
+    """The average of a night's fixes, None if it is missing, as why_not says; and remarks on it."""
 
     average: Average | None = None
     why_not: str = ""
@@ -60,9 +60,9 @@ class Together:
 
 
 def together(solved: Sequence[Solved], given: Instrument | None, near: Near | None = None) -> Together:
-    """Average the fixes of a night, and doubt them.
+    """Average the fixes of a night, and check them.
 
-    given: the instrument whose A3 was taken as it is; None where it was found by turning.
+    given: the instrument whose A3 was used unchanged; None if A3 was found by turning.
     near: where the instrument should be.
     """
     if not solved:
@@ -114,7 +114,7 @@ def turned(
     tilts: Tilts,
     turn_stddev_deg: float,
 ) -> TurnedNight:
-    """Find A3 and the fixes of a night's frames, each with what is identified of it already.
+    """Find A3 and the fixes of a night's frames, each with its identification so far.
 
     turn_stddev_deg: sigma of the turn of the solver's A3 about the plumb line.
     """

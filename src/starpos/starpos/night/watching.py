@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A night with GNSS beside it: its frames one after another, each with what GNSS has taught before it."""
+"""A night with GNSS: its frames one after another, each with what GNSS has taught before it."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -30,7 +30,7 @@ class Receiver:
 
 @dataclass(frozen=True)
 class WatchedNight:
-    """The answer to each frame, in the order in which they were given; what is known at their end; remarks."""
+    """The answer to each frame in the given order; what GNSS taught by the end; remarks."""
 
     answers: tuple[Watched, ...]
     learned: Learned | None
@@ -44,7 +44,7 @@ def watched_night(
     receiver: Receiver,
     vertical: Vertical,
 ) -> WatchedNight:
-    """Solve a night's frames in the order of their times, each with what is identified of it already.
+    """Solve a night's frames in the order of their times, each with its identification so far.
 
     tilts: None where headings alone are wanted.
     """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The work on one frame, as small objects that can go to any process or machine, where `OnFile` calls them."""
+"""The work on one frame, as small objects that can be sent to any process or machine, where `OnFile` calls them."""
 
 import time
 from collections.abc import Callable
@@ -57,7 +57,7 @@ def detected(item: Frame | Stars) -> tuple["Detection | Stars", float]:
 
 @dataclass(frozen=True)
 class Identifying:
-    """Identifies a frame by every way there is, of any scale where nobody knows its focal length.
+    """Identifies a frame by every way there is, at any scale if its focal length is unknown.
 
     Gives its Sight, and the CPU time in ms.
     search_s: CPU time after which the search at every scale ends.
@@ -118,8 +118,8 @@ class Fitting:
 class Solving:
     """Solves a frame, identified by every way there is: its Solution.
 
-    tilts: not asked of a camera that is fixed to the ground; None where headings alone are wanted.
-    places: where the instrument is known to be, for its heading there; None where nobody says.
+    tilts: not used for a camera fixed to the ground; None if only headings are wanted.
+    places: where the instrument is known to be, for its heading there; None if unknown.
     progress: of the search for a focal length.
     """
 
@@ -133,7 +133,7 @@ class Solving:
         return self.sight(item).solution
 
     def solver(self, item: Frame | Stars) -> Solver:
-        """The solver of a frame; InstrumentError if nobody knows its focal length."""
+        """The solver of a frame; InstrumentError if its focal length is unknown."""
         instrument = self.instruments.of(item)
         if instrument is None:
             raise InstrumentError(

@@ -30,8 +30,8 @@ class Workers(Protocol):
 def worked(work: Callable, files: Files) -> bytes:
     """Do the work and return its answer, or its StarposError, pickled.
 
-    Work in this process uses it too: the sum of an array that is a view of another may differ in the last digit from that
-    of its pickled copy, and the answers must be the same everywhere.
+    Work in this process uses it too: the sum of an array that is a view may differ in the last digit from the sum of its
+    pickled copy, and the answers must be the same everywhere.
     """
     try:
         answer = work(files)

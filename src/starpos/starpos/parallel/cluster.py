@@ -19,10 +19,10 @@ from starpos.parallel.same import Same, differing, same_here
 
 PIP = "pip install distributed"
 ANSWER_WITHIN_S = 10
-# Calls sent to the cluster before their answers are asked for: so many for each thread, and at least so many.
+# Calls sent to the cluster before their answers are needed: number per thread, and minimum.
 AHEAD, FEWEST_AHEAD = 3, 64
 SCHEMES = ("tcp", "tls", "ws", "wss", "ucx")
-# The cluster's threads are counted again after so many calls.
+# Number of calls after which the cluster's threads are counted again.
 COUNT_EVERY = 100
 
 
@@ -31,7 +31,7 @@ class ClusterError(StarposError):
 
 
 class Cluster:
-    """An existing cluster, by its scheduler's address; on leaving nothing of ours stays there."""
+    """An existing cluster, by its scheduler's address; nothing of ours stays there on leaving."""
 
     def __init__(self, address: str) -> None:
         self._address = address
@@ -137,7 +137,10 @@ class Cluster:
             return self._begun(call, here).result()
         except KilledWorker as error:
             return pickle.dumps(
-                given_up(call[1], f"the workers that worked it died, at last alone ({one_line(error)})")
+                given_up(
+                    call[1],
+                    f"the workers that took it died, the last one with no other work ({one_line(error)})",
+                )
             )
 
     def _begun(self, call: Call, here: Same) -> Any:
@@ -153,13 +156,13 @@ class Cluster:
                 return worked(work, files)
             sizes[os.path.abspath(path)] = status.st_size
         files = os.path.abspath(files) if isinstance(files, str) else tuple(map(os.path.abspath, files))
-        # sent as bytes that the worker unpickles itself: so a failure to load them is an error that we are told
+        # sent as bytes that the worker unpickles itself: so a failure to load them reaches us as an error
         return self._client.submit(pickle.loads, pickle.dumps(_Task(work, files, sizes, here)), pure=False)
 
 
 @dataclass(frozen=True)
 class _Task:
-    """A call as it is sent to a worker; to unpickle it is to do it, and gives its pickled answer."""
+    """A call as it is sent to a worker; unpickling it does the work and gives the pickled answer."""
 
     work: Callable
     files: Files
@@ -181,7 +184,7 @@ def _is_address(text: str) -> bool:
 
 
 def _on_worker(work: Callable, files: Files, sizes: dict[str, int], here: Same) -> bytes:
-    """Do a call on this worker, if its starpos and its files are the same as those of the sender."""
+    """Do a call on this worker, if its starpos and its files are the same as the sender's."""
     from distributed import get_worker
 
     name = get_worker().address

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Do calls in several processes of this machine.
 
-concurrent.futures does not serve: if one process dies, its whole pool breaks and does not say at which call, and its
+concurrent.futures is not suitable: if one process dies, its whole pool breaks and does not say at which call, and its
 processes go on after their parent was killed.
 """
 
@@ -21,8 +21,8 @@ from starpos.parallel.call import Call, answer_of, given_up, worked
 
 # Calls for each process whose answers may wait for an earlier one.
 AHEAD = 4
-# So many processes in a row may end before they are ready.
-STILLBORN = 3
+# Maximum number of processes in a row that end before they are ready.
+MAX_STILLBORN = 3
 # Time for a process that no longer answers to end.
 DYING_S = 1.0
 # There is a process for each processor, so the libraries need no threads of their own.
@@ -92,12 +92,12 @@ class Processes:
     def _replace(self, k: int, board: "_Board", task: Task) -> None:
         """Start a process in place of one that has died, and put its task back on the board.
 
-        A task that it had not begun did not end it: somebody else did, between two calls.
+        A task that it had not begun did not end it: something else did, between two calls.
         """
         dead = self._workers[k]
         why = dead.end(DYING_S)
         self._stillborn += not dead.ready
-        if self._stillborn > STILLBORN:
+        if self._stillborn > MAX_STILLBORN:
             del self._workers[k]
             raise ProcessError(f"the processes of --jobs do not start ({why}): use fewer, or --jobs 1")
         self._workers[k] = _Worker()
@@ -122,7 +122,7 @@ class _Board:
         self._given = self._told = 0
 
     def take(self) -> Task | None:
-        """The next task; None if there is none, or if it may not be done beside those under way."""
+        """The next task; None if nothing is left, or if it must not run together with the tasks under way."""
         if self._under_way & self._tried or (self._again and self._under_way):
             return None
         task: Task | None = None
@@ -169,7 +169,7 @@ class _Board:
 class _Worker:
     """A process.
 
-    task   the one it was given and has not answered
+    task   given and not answered yet
     begun  whether it has begun that one
     ready  whether it has started to work at all
     """
@@ -208,7 +208,7 @@ class _Worker:
         code = self._process.exitcode
         self._process.close()
         if code == -signal.SIGKILL:
-            return "killed, perhaps for want of memory: try fewer --jobs"
+            return "killed, perhaps for lack of memory: try fewer --jobs"
         if code is not None and code < 0:
             return signal.strsignal(-code) or f"signal {-code}"
         return f"exit status {code}"
@@ -240,7 +240,7 @@ def _serve(pipe: Connection) -> None:
         pipe.send_bytes(word)
         while True:
             call = pipe.recv_bytes()
-            # before anything is done with it, that may end this process
+            # before any work on it, which may end this process
             pipe.send_bytes(word)
             work, files = pickle.loads(call)
             with warnings.catch_warnings(record=True) as said:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reads a rosbag2 without ROS, by `rosbags`; whatever is wrong with it is a BagError of one sentence."""
+"""Reads a rosbag2 without ROS, by `rosbags`; any fault of it is a BagError of one sentence."""
 
 import os
 from collections.abc import Iterator, Sequence

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Bounds for rosbag2 files that `rosbags` reads: a small file must not unpack to more than memory or disk can hold.
 
-rosbags (0.11) unpacks whatever a chunk, a message or a file holds, without a limit.  This module replaces its functions
-that unpack by bounded ones.  The errors here do not name the bag: its reader does that (bag.py).
+rosbags (0.11) unpacks whatever a chunk, a message or a file holds, without a limit.  This module replaces its unpacking
+functions by bounded ones.  The errors here do not name the bag: its reader does that (bag.py).
 """
 
 import re
@@ -23,7 +23,7 @@ MOST_UNPACKED = 1 << 29
 MOST_AT_ONCE = 1 << 30
 # the first and the last bytes of a file
 MCAP = b"\x89MCAP0\r\n"
-# what rosbag2 calls the files that are read, .mcap and .db3
+# rosbag2's names of the supported storages, .mcap and .db3
 STORAGES = ("mcap", "sqlite3")
 # bytes that stay free in the folder for temporary files, when a packed file is unpacked there
 LEFT_ON_DISK = 1 << 30
@@ -69,7 +69,7 @@ def _is_cut_off(file: Path) -> bool:
 
 
 def bound_rosbags() -> None:
-    """Make rosbags raise BagError for what unpacks to too much, in all of the process.  Call it before a bag is opened.
+    """Make rosbags raise BagError for data that unpack to too much, in this process. Call it before a bag is opened.
 
     Raises BagError if this version of rosbags unpacks in another way.
     """
@@ -83,7 +83,7 @@ def bound_rosbags() -> None:
         reader.zstd = _Zstd(zstd)  # type: ignore[assignment]  # takes the place of a module
     except AttributeError:
         raise BagError(
-            "this version of rosbags unpacks as none we know, without bounds: pip install rosbags==0.11.9"
+            "this version of rosbags unpacks in an unknown way, without bounds: pip install rosbags==0.11.9"
         ) from None
 
 
@@ -122,7 +122,7 @@ class _Zstd:
 
 
 class _Bounded:
-    """A file that gives at most so many bytes."""
+    """A file that gives a limited number of bytes."""
 
     def __init__(self, file: Any, most: int):
         self._file, self._left, self._most = file, most, most

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The topics of a robot's own camera and IMU in a bag: by name, by the user's word, or the only one of its type."""
+"""The topics of a robot's own camera and IMU in a bag: by name, by the user's choice, or the only one of its type."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -25,7 +25,7 @@ MADE_OF = {IMAGE: "stars", PICTURE: "stars", IMU: "tilts"}
 
 
 class Connected(Protocol):
-    """What is known of a topic of a bag: rosbags' Connection."""
+    """A topic of a bag: rosbags' Connection."""
 
     @property
     def topic(self) -> str: ...
@@ -42,7 +42,7 @@ C = TypeVar("C", bound=Connected)
 
 @dataclass(frozen=True)
 class Remaps:
-    """Topics of a bag by the relative names of what they are used as; FrameError if a name is no input."""
+    """Topics of a bag by the relative names of the inputs they serve as; FrameError if a name is not an input."""
 
     topics: Mapping[str, str]
 
@@ -74,11 +74,11 @@ def driver_topics(
 ) -> dict[str, str]:
     """Topics by the names of the DRIVER_INPUTS that they serve as; {} without images.
 
-    A topic counts that the user names, else that has the input's own name, else that is beside the images (as
-    image_transport has camera_info), else the only one of its type.  Accelerations count where no tilts are, or where
-    the user names them.
-    namespace: only topics in it count, but for those that the user names.
-    Raises FrameError where several topics may be meant, or a topic that the user names is not there or is no such input.
+    The topic is the one that the user names, else the one with the input's own name, else the one next to the images (as
+    image_transport places camera_info), else the only one of its type. Accelerations are used if there are no tilts, or
+    if the user names them.
+    namespace: only topics in it count, except for topics that the user names.
+    Raises FrameError if several topics may be meant, or if a topic that the user names is missing or of another type.
     """
     bag = _Topics(connections, remaps, namespace, f"{place}")
     images = bag.of(RAW, "")
@@ -94,13 +94,13 @@ def driver_topics(
 
 
 def named_topics(connections: Sequence[Connected], remaps: Remaps, place: Path | str) -> dict[str, str]:
-    """The topics that the user names, by what they serve as; raises FrameError as `driver_topics` does."""
+    """The topics that the user names, by the inputs they serve as; raises FrameError as `driver_topics` does."""
     bag = _Topics(connections, remaps, None, f"{place}")
     return {name: topic for name in remaps.topics if (topic := bag.of(name, ""))}
 
 
 def told(found: Mapping[str, str], connections: Sequence[Connected]) -> str:
-    """Sentence on what is made of topics that were found."""
+    """Sentence on the use of the topics that were found."""
     kinds = {c.topic: c.msgtype for c in connections}
     made = [f"{MADE_OF[kinds[t]]} from {t}" for t in found.values() if kinds[t] in MADE_OF]
     plain = [f"{name} is {t}" for name, t in found.items() if kinds[t] not in MADE_OF]
@@ -117,7 +117,7 @@ class _Topics:
     place: str
 
     def of(self, name: str, beside: str) -> str | None:
-        """The topic of an input, preferred beside others; None if there is none."""
+        """The topic of an input, preferably next to `others`; None without one."""
         if name in self.remaps.topics:
             return self._named(name, self.remaps.topics[name])
         for kind in DRIVER_INPUTS[name]:

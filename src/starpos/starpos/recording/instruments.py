@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The topics of one instrument among those of a bag."""
+"""The topics of one instrument in a bag."""
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
@@ -24,16 +24,16 @@ if TYPE_CHECKING:
     from rosbags.interfaces import Connection
 
 STARS, SOLUTION = (f"{PACKAGE}/msg/{name}" for name in ("StarArray", "Solution"))
-# types by the relative names of what a solver takes
+# types by the relative names of the solver's inputs
 NAV_SAT_FIX = "sensor_msgs/msg/NavSatFix"
 INPUTS = {"stars": STARS, "tilt": TILT, "camera/camera_info": CAMERA_INFO}
-# what it takes besides, with gnss.use
+# further inputs, with gnss.use
 GNSS = {"gnss/fix": NAV_SAT_FIX}
 
 
 @dataclass(frozen=True)
 class Chosen:
-    """An instrument's namespace and connections; made: what is made of a robot's own messages, '' where nothing is."""
+    """An instrument's namespace and connections; made: how a robot's own messages are used, '' if they are not."""
 
     namespace: str
     connections: "Sequence[Connection]"
@@ -48,11 +48,11 @@ def instrument_in(
     needed: Collection[str],
     remaps: Remaps = NO_REMAPS,
 ) -> Chosen:
-    """Find namespace and connections of an instrument, or of a robot's own drivers where no instrument is.
+    """Find namespace and connections of an instrument, or of a robot's own drivers without an instrument.
 
-    topics: types by relative names.  needed: types of which one has to be there, with a message.
-    remaps: images that the user names count more than star lists; accelerations that he names more than tilts.
-    FrameError if there is none, or several and none is named.
+    topics: types by relative names. needed: types of which at least one must have a message.
+    remaps: images that the user names take precedence over star lists, named accelerations over tilts. FrameError if
+    there is no instrument, or if there are several and `namespace` is None.
     """
     found: dict[str, list[Connection]] = {}
     for c in bag.connections:

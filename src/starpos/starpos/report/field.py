@@ -39,7 +39,7 @@ from starpos.utc import date_obs
 ABOUT, INSTRUMENT = "field.json", "instrument.yaml"
 FORMAT = 1
 SUFFIX = ".zip"
-# A night of 10,000 lists of 1000 stars; a file that unpacks to more is none of ours.
+# A night of 10,000 lists of 1000 stars; a file that unpacks to more is not ours.
 MOST_BYTES, MOST_FILES = 400_000_000, 20_000
 PACKAGES = ("starpos", "numpy", "scipy", "astropy", "astropy-iers-data", "pyerfa", "opencv-python-headless")
 
@@ -50,7 +50,7 @@ def write(path: Path, exposures: Exposures, progress: Progress = quiet) -> int:
     Raises FrameError for a night without a usable frame or tilt, WriteError if the file cannot be written.
     """
     if not isinstance(exposures.work.tilts, TiltLog):
-        raise FrameError(f"{exposures.name}: no tilts: a field report needs those of the night")
+        raise FrameError(f"{exposures.name}: no tilts: a field report needs the night's tilts")
     lists: dict[str, bytes] = {}
     instrument, unreadable = None, 0
     with tempfile.TemporaryDirectory() as folder:
@@ -75,7 +75,7 @@ def write(path: Path, exposures: Exposures, progress: Progress = quiet) -> int:
     packed = io.BytesIO()
     with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as file:
         for name in sorted(lists):
-            # a date of its own would tell of the computer's clock and zone
+            # a date of its own would reveal the computer's clock and zone
             file.writestr(zipfile.ZipInfo(name), lists[name], zipfile.ZIP_DEFLATED)
     try:
         write_whole(path, packed.getvalue())
@@ -93,7 +93,7 @@ def is_field(path: Path | str) -> bool:
 def opened(path: Path | str) -> Iterator[tuple[Path, Atmosphere]]:
     """Unpack a field report as a night's folder, which lasts as long as the context, and give the air it states.
 
-    Raises FrameError for a file that is none.
+    Raises FrameError for another file.
     """
     with tempfile.TemporaryDirectory() as base:
         folder = Path(base) / Path(path).stem

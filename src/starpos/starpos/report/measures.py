@@ -87,7 +87,7 @@ def around(night: Night, latitude: float, longitude: float) -> np.ndarray:
 
 
 def middle(night: Night) -> tuple[float, float]:
-    """Latitude, longitude (rad) of the centre of the scatter: the average, or if there is none the mean of the fixes."""
+    """Latitude, longitude (rad) of the centre of the scatter: the average, or without one the mean of the fixes."""
     if night.combined:
         return night.combined.latitude, night.combined.longitude
     return place_of_zenith(np.mean([zenith_of(p.latitude, p.longitude) for p in night.places], axis=0))

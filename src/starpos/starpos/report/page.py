@@ -4,7 +4,6 @@
 The page holds its pictures and loads nothing, and all text that comes from files is escaped.
 """
 
-import base64
 from collections import Counter
 from collections.abc import Sequence
 from html import escape
@@ -15,37 +14,12 @@ from starpos import __version__
 from starpos.fix.readable import length_text
 from starpos.night.night import Night, ReportedPlace, Truth
 from starpos.report import measures
-from starpos.report.pictures import Picture
+from starpos.report.html import Picture, document, figures, sexagesimal, table, wide_table
 from starpos.report.style import figures_of
 from starpos.utc import utc_text
 
-# so many names of frames are listed
+# maximum number of frames listed by name
 LISTED = 200
-STYLE = """
-:root { color-scheme: light dark; --ink: #1d2329; --soft: #5a646e; --paper: #fbfbf9; --card: #ffffff; --line: #dcdfe2;
-  --bad: #b3401f; }
-@media (prefers-color-scheme: dark) { :root { --ink: #e4e7ea; --soft: #a2abb3; --paper: #15181b; --card: #1d2125;
-  --line: #363c42; --bad: #ff9a76; } img { filter: invert(0.89) hue-rotate(180deg); } }
-* { box-sizing: border-box; }
-body { margin: 0 auto; padding: 1.2rem; max-width: 80rem; background: var(--paper); color: var(--ink);
-  font: 1rem/1.5 system-ui, sans-serif; overflow-wrap: anywhere; }
-h1 { font-size: 1.6rem; margin: .4rem 0; } h2 { font-size: 1.3rem; margin: 2.4rem 0 .6rem; }
-.place { font-size: 1.25rem; font-variant-numeric: tabular-nums; margin: .2rem 0; }
-.soft, figcaption, footer { color: var(--soft); font-size: .92rem; } .bad { color: var(--bad); }
-.wide { overflow-x: auto; }
-table { border-collapse: collapse; width: 100%; background: var(--card); font-variant-numeric: tabular-nums; }
-th, td { text-align: left; vertical-align: top; padding: .4rem .7rem; border: 1px solid var(--line); }
-th { font-weight: 600; width: 13rem; } thead th { width: auto; }
-.wide { margin-bottom: 1.2rem; } .wide table { white-space: nowrap; } a { color: inherit; }
-.figures { display: grid; gap: 1.2rem; grid-template-columns: repeat(auto-fit, minmax(min(100%, 36rem), 1fr)); }
-figure { margin: 0; padding: .8rem; background: var(--card); border: 1px solid var(--line); border-radius: .5rem; }
-figure h3 { margin: 0 0 .5rem; font-size: 1.05rem; }
-img { display: block; width: 100%; height: auto; background: #fff; }
-figcaption { margin-top: .6rem; } details { margin: .6rem 0 1.2rem; } summary { cursor: pointer; }
-@media (max-width: 40rem) { body { padding: .7rem; } th { width: 8rem; }
-  th, td { padding: .4rem .5rem; font-size: .92rem; } }
-@media print { img { filter: none; } }
-"""
 
 
 def page(
@@ -60,7 +34,7 @@ def page(
     )
     parts = [f"<h1>{escape(title)}</h1>"]
     if len(nights) > 1:
-        parts += [_table_of_nights(nights), _figures(overall)]
+        parts += [_table_of_nights(nights), figures(overall)]
         if not any(each):
             parts.append(
                 '<p class="soft">Too many nights for the figures of each: report on fewer to see them.</p>'
@@ -68,21 +42,13 @@ def page(
     for number, (night, pictures) in enumerate(zip(nights, each, strict=True), 1):
         if len(nights) > 1:
             parts.append(f'<h2 id="night{number}">{number}. {escape(night.name)}</h2>')
-        parts += [_place(night), _simulated(night), _summary(night), _figures(pictures)]
+        parts += [_place(night), _simulated(night), _summary(night), figures(pictures)]
     parts.append(
         f"<footer><p>Made by starpos {escape(__version__)} on {escape(made_utc)}. Positions are astronomic unless "
         "said otherwise; errors are 1 sigma. The paper is Izadmehr &amp; Khakian Ghomi, &ldquo;Design and construction "
         "of a high resolution, portable and low-cost positioner by a star tracking system&rdquo;.</p></footer>"
     )
-    body = "\n".join(parts)
-    return (
-        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        f'<meta name="generator" content="starpos {escape(__version__)}">\n'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        '<meta http-equiv="Content-Security-Policy" content="default-src \'none\'; img-src data:; '
-        "style-src 'unsafe-inline'\">\n"
-        f"<title>{escape(title)}</title>\n<style>{STYLE}</style>\n</head>\n<body>\n{body}\n</body>\n</html>\n"
-    )
+    return document(title, parts)
 
 
 def _simulated(night: Night) -> str:
@@ -90,7 +56,7 @@ def _simulated(night: Night) -> str:
 
 
 def _place(night: Night) -> str:
-    """The answer of a night, or the reason why there is none."""
+    """The answer of a night, or the reason why it is missing."""
     if night.combined is None:
         return f'<p class="place bad">No position: {escape(night.why_not)}</p>'
     c = night.combined
@@ -122,7 +88,7 @@ def _summary(night: Night) -> str:
     if night.combined:
         c = night.combined
         ground = c.on_ground(night.vertical)
-        rows.append(("WGS 84", f"{_sexagesimal(ground.latitude, 'NS')}, {_sexagesimal(ground.longitude, 'EW')}, "
+        rows.append(("WGS 84", f"{sexagesimal(ground.latitude, 'NS')}, {sexagesimal(ground.longitude, 'EW')}, "
                      f"{_errors(ground.covariance)}, the deflection of the vertical included"))  # fmt: skip
         rows.append(
             (
@@ -157,8 +123,7 @@ def _summary(night: Night) -> str:
         rows += _rows_on_fixes(night)
     rows.append(("Source", escape(night.origin)))
     rows += [("Note", escape(remark.text)) for remark in night.remarks]
-    cells = "".join(f"<tr><th>{name}</th><td>{text}</td></tr>\n" for name, text in rows)
-    return f"<table>\n{cells}</table>\n{_names(night)}"
+    return f"{table(rows)}\n{_names(night)}"
 
 
 def _rows_on_fixes(night: Night) -> list[tuple[str, str]]:
@@ -233,27 +198,5 @@ def _table_of_nights(nights: Sequence[Night]) -> str:
             cells[3] = ", ".join(f"{v:+.2f}&Prime;" for v in measures.error_arcsec(n.combined, n.truth))
         name = f'<a href="#night{number}">{escape(n.name)}</a>'
         row = [str(number), name, *cells, f"{len(n.fixed)} of {len(n.shots)}"]
-        rows.append("<tr>" + "".join(f"<td>{c}</td>" for c in row) + "</tr>")
-    head = "".join(f"<th>{t}</th>" for t in titles)
-    return f'<div class="wide"><table><thead><tr>{head}</tr></thead>\n' + "\n".join(rows) + "</table></div>"
-
-
-def _figures(pictures: Sequence[Picture]) -> str:
-    if not pictures:
-        return ""
-    cards = "\n".join(
-        f'<figure><h3>{escape(p.title)}</h3><img alt="{escape(p.title)}" '
-        f'src="data:image/png;base64,{base64.b64encode(p.png).decode()}">'
-        f"<figcaption>{escape(p.caption)}</figcaption></figure>"
-        for p in pictures
-    )
-    return f'<div class="figures">\n{cards}\n</div>'
-
-
-def _sexagesimal(angle: float, sides: str) -> str:
-    hundredths = round(abs(np.degrees(angle)) * 360_000)
-    seconds, hundredths = divmod(hundredths, 100)
-    minutes, seconds = divmod(seconds, 60)
-    degrees, minutes = divmod(minutes, 60)
-    side = sides[0] if angle >= 0 else sides[1]
-    return f"{degrees}&deg; {minutes:02d}&prime; {seconds:02d}.{hundredths:02d}&Prime; {side}"
+        rows.append(row)
+    return wide_table(titles, rows)

@@ -3,7 +3,6 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,22 +13,13 @@ from starpos.gnss.solving import Watched
 from starpos.gnss.watch import DISAGREES
 from starpos.night.night import Night
 from starpos.report import coast, drive_figure, frame_figures, measures, place_figures, sky_figure
+from starpos.report.html import Picture
 from starpos.report.style import figures_of, mark_simulated, new_figure, png_of
 from starpos.sky.catalogue import Catalogue
 from starpos.utc import utc_text
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-
-@dataclass(frozen=True, eq=False)
-class Picture:
-    """A figure as PNG; name: of its file, without suffix; title, caption: plain text."""
-
-    name: str
-    title: str
-    caption: str
-    png: bytes
 
 
 def pictures_of(night: Night, catalogue: Catalogue) -> Iterator[Picture]:

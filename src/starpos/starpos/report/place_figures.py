@@ -68,7 +68,7 @@ def _with_errors(axes: "Axes", x: np.ndarray, value: np.ndarray, sigma: np.ndarr
 
 
 def draw_scatter(figure: "Figure", night: Night) -> None:
-    """Draw the fixes in m about the average, the ellipses of one frame's own errors and those of the average."""
+    """Draw the fixes in m about the average, the ellipses of one frame's own errors and of the average's."""
     axes = figure.subplots()
     latitude, longitude = measures.middle(night)
     points = measures.around(night, latitude, longitude)

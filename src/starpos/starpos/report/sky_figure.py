@@ -20,9 +20,9 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# so many frames are shown with outline and stars
+# maximum number of frames shown with outline and stars
 OUTLINES = 12
-# so many of the brightest stars are shown, whether a frame saw them or not
+# number of the brightest stars that are shown, whether a frame saw them or not
 BRIGHT = 60
 REACHES_DEG = (5, 10, 15, 20, 30, 45, 60, 90)
 FAINTEST_DOT = 11.0

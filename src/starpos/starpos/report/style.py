@@ -61,7 +61,7 @@ def number_axis(axes: "Axes", numbers: Sequence[int] | np.ndarray) -> None:
 
 
 def figures_of(value: float, digits: int = 3) -> str:
-    """A number with so many significant digits, and with an exponent only if it is very large or small."""
+    """A number with a few significant digits, and with an exponent only if it is very large or small."""
     if not np.isfinite(value):
         return "unknown"
     if value == 0:

@@ -20,7 +20,7 @@ from starpos.session.log import Log
 def asked(
     solver: Solver, stars: Stars, answer: Solution, predicted: Priors = (), until_s: float = NEVER_S
 ) -> Solution:
-    """The answer that a solver has given to a frame, or where it did not ask the stars what they say."""
+    """The solver's answer to a frame; if it stopped before identification, identify the stars now."""
     if answer.found is None and answer.status in UNASKED:
         return identified(solver, stars, stars, predicted, until_s).solution
     return answer
@@ -29,9 +29,9 @@ def asked(
 def camera_attitude_of(
     solver: Solver, stars: Stars, answer: Solution, frame_id: str
 ) -> CameraAttitude | None:
-    """The attitude of a frame whose stars a solver has been asked for, None where they tell none.
+    """The attitude of a frame whose stars a solver has identified; None without one.
 
-    That is where they are not identified beyond suspicion, or seen through a fisheye or a mirror.
+    An identification in doubt, a fisheye and a mirrored frame give no attitude.
     """
     found = answer.found
     if found is None or answer.warnings or found.mirrored or stars.mid_unix_s is None:
@@ -76,6 +76,6 @@ def attitude_seen(
             gyro.saw(stars, answer.found, solver)
         return attitude
     except Exception:
-        # A defect costs this attitude only.
+        # A defect loses only this attitude.
         log.error(traceback.format_exc())
         return None

@@ -14,11 +14,11 @@ from starpos.fix.fix import Fix
 from starpos.session.diagnosis import Diagnosis, Level
 from starpos.units import ARCSEC
 
-# With a larger error of A3 its square, which a linear filter leaves out, exceeds 2 arcsec.
+# With a larger A3 error the quadratic term, which a linear filter ignores, exceeds 2 arcsec.
 WIDE_RAD = 600 * ARCSEC
-# A place so far from that of a turn is another one. A false alarm only costs precision.
+# A fix this far from the place of a turn is at another place. A false alarm only costs precision.
 ELSEWHERE_SIGMA = 3.0
-# For so many fixes the diagnostics say that the instrument has moved.
+# Number of fixes for which the diagnostics report that the instrument has moved.
 JUST_MOVED = 10
 
 
@@ -117,7 +117,7 @@ class Averaging:
 
 
 def _is_wide(fix: Fix) -> bool:
-    """Whether A3 may be so wrong that a linear filter cannot separate its error from the place."""
+    """Whether A3's error is too large for a linear filter to separate it from the place."""
     of_a3 = [t.covariance[:2, :2] for t in fix.terms if t.name in (CALIBRATION, "remounting")]
     # what GNSS taught of A3 is a term of its own, and linear
     calibration = sum(of_a3, np.zeros((2, 2)))

@@ -7,18 +7,18 @@ from collections import deque
 
 from starpos.session.frames import Waiting
 
-# Most frames that wait. While the triangles are built, only the newest few, since the others would be answered late.
-MOST, MOST_NEWEST = 1000, 4
-# The usual time an answer takes is the median of so many.
+# Maximum number of waiting frames. While the triangles are built, only the newest few: others would be answered late.
+MAX_WAITING, MAX_NEWEST = 1000, 4
+# Number of answers whose median is the usual time of an answer.
 COSTS = 9
-# Answers may come so late where others were before them: a processor that others use now and then loses no frame by it.
-FRESH_S = 0.1
+# Tolerated delay of an answer behind others: short load by other programs then loses no frame.
+MAX_LATE_S = 0.1
 
 
 class Backlog:
     """Frames in the order in which they came.
 
-    A new frame is taken if those before it can be answered by the time its own tilts come or within FRESH_S, or if at
+    A new frame is taken if those before it can be answered by the time its own tilts come or within MAX_LATE_S, or if at
     most one is before it. So no frame pushes out another one that waits, the processor always has work while too many
     frames come, and answers come at an even rate and hardly later than their tilts allow.
     """
@@ -45,17 +45,17 @@ class Backlog:
 
     def has_room(self, delay_s: float) -> bool:
         """Whether another frame can be answered in time; delay_s: for how long frames wait for their tilts."""
-        if len(self) >= MOST:
+        if len(self) >= MAX_WAITING:
             return False
         cost_s = statistics.median(self._costs_s) if self._costs_s else 0.0
-        return len(self) * cost_s <= max(delay_s, FRESH_S) + cost_s
+        return len(self) * cost_s <= max(delay_s, MAX_LATE_S) + cost_s
 
     def add(self, frame: Waiting) -> None:
         self._frames.append(frame)
 
     def keep_newest(self) -> int:
         """Drop all but the newest few; returns how many were dropped."""
-        dropped = max(len(self) - MOST_NEWEST, 0)
+        dropped = max(len(self) - MAX_NEWEST, 0)
         for _ in range(dropped):
             self._frames.popleft()
         return dropped

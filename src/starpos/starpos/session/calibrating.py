@@ -30,10 +30,11 @@ from starpos.sky.site import Site
 FEWEST_HEADINGS, FEWEST_BY_ITSELF = 3, 4
 TURN_IT = "turn it on the spot"
 CALIBRATE_IT = (
-    "fixes are over 1000 km wide. Set calibration_url or misalignment_stddev, call solver/calibrate at a known place, or "
+    "fixes have errors of over 1000 km. Set calibration_url or misalignment_stddev, call solver/calibrate "
+    "at a known place, or "
     "set self_calibration and turn it on the spot"
 )
-# So many old frames in a row, in order, are not late: a bag is played again.
+# Number of old frames in a row, in order, that show that a bag is played again.
 LATE_FRAMES = 3
 # A calibration replaces one that the solver has found itself only if its error is smaller by this factor.
 BETTER = 0.8
@@ -50,9 +51,9 @@ OF_AVERAGE = OF_CALIBRATION | {
 
 
 class Calibrating:
-    """Keeps the calibration from frames: `found`, None while that of the parameters holds.
+    """Keeps the calibration from frames: `found`, None while the parameters' calibration holds.
 
-    solver: returns the solver in use, or raises an InstrumentError that says why there is none.
+    solver: returns the solver in use, or raises an InstrumentError that says why there is no solver.
     changed: called when `found` changes.
     """
 
@@ -203,7 +204,7 @@ class Calibrating:
     # at a known place ------------------------------------------------------------------------------------------------
 
     async def at_known_place(self, latitude: float, longitude: float, frames: int) -> Outcome:
-        """Find A3 from so many of the newest frames (0: all) at a place by gravity (deg), and use it: a Calibrated."""
+        """Find A3 from a number of the newest frames (0: all) at a place by gravity (deg), and use it: a Calibrated."""
         outcome = await self._asked_for(lambda: self._at_known_place(latitude, longitude, frames))
         if not outcome.trouble:
             self._adopt(outcome.value)
@@ -214,7 +215,7 @@ class Calibrating:
         most = self._values["calibration_frames"]
         if not (abs(latitude) <= 90 and abs(longitude) <= 360):
             raise InstrumentError(
-                f"latitude {latitude:g}, longitude {longitude:g}: give those of the place, by gravity, in deg"
+                f"latitude {latitude:g}, longitude {longitude:g}: give the place's, by gravity, in deg"
             )
         if wanted > most:
             raise FixError(
@@ -257,7 +258,7 @@ class Calibrating:
         return lambda: turn_on_the_spot(solver, poses, turn_deg)
 
     def _turn_by_itself(self) -> None:
-        """Calibrate from the present poses; if a job runs, do it afterwards, from the poses of that time."""
+        """Calibrate from the present poses; if a job runs, do it afterwards, from the poses kept then."""
         self._again = self._worker.busy or self._asked
         if self._again:
             return
@@ -275,7 +276,7 @@ class Calibrating:
         if era == self._era:
             said = outcome.trouble or self._why_not(outcome.value, FEWEST_BY_ITSELF)
             if not said and not self._is_better(outcome.value.calibrated):
-                said = "the headings here tell the calibration in use no better"
+                said = "the headings here do not improve the calibration in use"
             self._said = said
             if not said:
                 self._adopt_turned(outcome.value)
@@ -295,13 +296,14 @@ class Calibrating:
             )
         if not found <= limit:
             return (
-                f"the headings tell the plumb line in the camera to {found:.0f} arcsec only, self_calibration_limit is "
+                f"the headings determine the plumb line in the camera to {found:.0f} arcsec only, "
+                f"self_calibration_limit is "
                 f"{limit:g}: turn the instrument further, or to more headings"
             )
         return ""
 
     def _is_better(self, calibrated: Calibrated) -> bool:
-        """Whether it is so much better than the calibration in use that the average should start again for it.
+        """Whether it improves on the calibration in use by enough to start the average again.
 
         The zero of the inclinometer drifts, so the calibration in use gets worse with time.
         """
@@ -352,8 +354,10 @@ class Calibrating:
             values |= {"plumb line (arcsec)": self._plumb_arcsec, "found of frames": self.found.frames}
         if self.unknown:
             remedy = (self._said or TURN_IT) if self._values["self_calibration"] else CALIBRATE_IT
-            return Diagnosis(Level.WARN, f"camera against inclinometer is not known: {remedy}", values)
-        return Diagnosis(Level.OK, self._about or "that of the parameters", values)
+            return Diagnosis(
+                Level.WARN, f"the misalignment of camera and inclinometer is not known: {remedy}", values
+            )
+        return Diagnosis(Level.OK, self._about or "from the parameters", values)
 
 
 def _about(found: Calibrated) -> str:

@@ -50,7 +50,7 @@ class CameraSolver:
 
     @property
     def solver_now(self) -> Solver:
-        """The solver; InstrumentError with the reason while there is none."""
+        """The solver; InstrumentError with the reason while it is missing."""
         if self.solver is not None:
             return self.solver
         waiting = f"{self._topic}: no camera calibration has arrived: start the camera"
@@ -70,7 +70,7 @@ class CameraSolver:
             self._take(camera, stamp_to_unix(message.header.stamp), at_once)
 
     def frame_came(self, width: int, height: int, at_once: bool) -> None:
-        """Note the size of a frame, px: it is that of a camera whose CameraInfo leaves it open."""
+        """Note the size of a frame, px: a CameraInfo that leaves its size open takes it."""
         if (width, height) != self._frame_px:
             self._frame_px = width, height
             if self._of_open_size is not None:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Doubt about time stamps that contradict the stars: a clock was set, or a frame was stamped wrongly.
 
-Nobody knows which stamp is wrong, so the size of the contradiction is taken as the error of the clock.
+It is unknown which stamp is wrong, so the size of the contradiction is taken as the error of the clock.
 """
 
 import math
@@ -12,7 +12,7 @@ from starpos.averaging.slip import CREEP_RAD, SIGMAS, slip_s
 from starpos.earth.ellipsoid import EARTH_RADIUS_M, zenith_of
 from starpos.fix.fix import Fix
 
-# So many frames that agree outvote a single earlier one: that one was stamped wrongly, and no clock was set.
+# Number of agreeing frames that outvote a single earlier one: that one was stamped wrongly, and no clock was set.
 OUTVOTE_ONE = 10
 
 
@@ -26,7 +26,7 @@ class ClockDoubt:
         self.clear()
 
     def clear(self) -> None:
-        """Forget all doubt, because the user says that the clocks are right."""
+        """Forget all doubt, because the user confirms the clocks."""
         self.seconds, self.leans_otherwise = 0.0, False
         # The first fix of this pose, the stated and the assumed error of its clock, and how many fixes agree with it.
         self._first: Fix | None = None
@@ -64,7 +64,7 @@ class ClockDoubt:
         self._other, self.seconds = None, doubt_s
 
     def _both(self, stated_s: float) -> float:
-        """Standard deviation of the difference between a stamp and that of the first fix."""
+        """Standard deviation of the difference between a stamp and the first fix's stamp."""
         return math.hypot(stated_s, self._first_stated_s)
 
 

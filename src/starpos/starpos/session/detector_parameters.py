@@ -18,8 +18,8 @@ PARAMETERS = (
     Parameter(
         "threshold",
         5.0,
-        "Standard deviations of the smoothed noise a peak must stand out by; too low finds noise, too high loses "
-        "the faint stars that half of the accuracy comes from.",
+        "Detection threshold, in standard deviations of the smoothed noise; too low finds noise, too high "
+        "loses the faint stars that half of the accuracy comes from.",
         unit="",
         minimum=3.0,
         maximum=1000.0,
@@ -27,7 +27,7 @@ PARAMETERS = (
     Parameter(
         "min_snr",
         6.5,
-        "Signal to noise a star must have to be published; too low lets false stars through.",
+        "Minimum signal-to-noise ratio of a star that is published; too low lets false stars through.",
         unit="",
         minimum=0.0,
         maximum=1000.0,
@@ -35,7 +35,7 @@ PARAMETERS = (
     Parameter(
         "max_stars",
         10000,
-        "The brightest so many are published; a frame takes time in proportion to them.",
+        "Maximum number of stars published, brightest first; a frame takes time in proportion.",
         unit="",
         minimum=1,
         maximum=100000,
@@ -43,7 +43,8 @@ PARAMETERS = (
     Parameter(
         "threads",
         1,
-        "Threads that search a frame; more answer sooner where processors are idle, and cost others time where none is.",
+        "Threads that search a frame; more are faster where processors are idle, and slow other programs "
+        "where none is.",
         unit="",
         minimum=1,
         maximum=64,
@@ -51,8 +52,8 @@ PARAMETERS = (
     Parameter(
         "max_rate",
         math.nan,
-        "Most frames that are worked on in a second, chosen evenly by their stamps; unset, as many as the processor can: "
-        "then all of them, or an even share, which costs other programs their time.",
+        "Maximum rate of the frames that are searched, chosen evenly by their stamps; unset, as many as the "
+        "processor can: then all of them, or an even share, which slows other programs.",
         unit="Hz",
         minimum=0.01,
         maximum=MOST_RATE,
@@ -60,8 +61,8 @@ PARAMETERS = (
     Parameter(
         "saturation",
         math.nan,
-        "Pixel value from which a pixel is full; unset finds it in each frame. Too high, and the centroids of "
-        "saturated stars pass as good.",
+        "Pixel value from which a pixel counts as saturated; unset finds it in each frame. If too high, "
+        "centroids of saturated stars pass as good.",
         unit="DN",
         minimum=1.0,
         maximum=65535.0,
@@ -69,8 +70,8 @@ PARAMETERS = (
     Parameter(
         "exposure",
         0.0,
-        "Exposure time of frames that come without a Capture message, 0 unknown: the tilt is averaged over it, and it "
-        "tells where the middle of an exposure is whose start or end is stamped.",
+        "Exposure time of frames that come without a Capture message, 0 unknown: the tilt is averaged over "
+        "it, and it gives the middle of an exposure whose start or end is stamped.",
         unit="s",
         minimum=0.0,
         maximum=MOST_EXPOSURE_S,
@@ -78,7 +79,8 @@ PARAMETERS = (
     Parameter(
         "stamp",
         UNKNOWN,
-        "Which moment is stamped of frames without a Capture message: middle, start or end of the exposure of the row "
+        "Moment that the stamps of frames without a Capture message mark: middle, start or end of the "
+        "exposure of the row "
         "that is read first, or arrival of the image, after its last row was read; '' unknown: 0.3 s off (1 sigma). "
         "A wrong one shifts longitudes by 15 arcsec for each second.",
         choices=KINDS,
@@ -87,7 +89,7 @@ PARAMETERS = (
         "stamp_stddev",
         math.nan,
         "How far these stamps may be off; 0.1 s is 46 m at the equator. Unset: 0.02 s for middle, start and end, 0.3 s "
-        "for arrival and unknown. Too small makes fixes claim too much.",
+        "for arrival and unknown. If too small, fixes claim errors that are too small.",
         unit="s",
         minimum=0.0,
         maximum=60.0,
@@ -96,8 +98,8 @@ PARAMETERS = (
         "readout",
         math.nan,
         "From the row of these frames that is read first to the last: positive where the top row is first, negative "
-        "where the bottom one is; 0 for a global shutter. Unset: unknown, and fixes hold 0.03 s. The wrong sign makes a "
-        "fix wrong by twice what it would be without.",
+        "where the bottom one is; 0 for a global shutter. Unset: unknown, and fixes include an error of "
+        "0.03 s. The wrong sign doubles the error that it should remove.",
         unit="s",
         minimum=-MOST_READOUT_S,
         maximum=MOST_READOUT_S,
@@ -114,7 +116,7 @@ PARAMETERS = (
         "calibration_url",
         "",
         "Instrument file (YAML), as the solver's, whose link_to_camera says how the camera sits on the IMU; '' for its "
-        "axis along z and the top of the frame forward. Used with gyro; wrong, it helps nothing.",
+        "axis along z and the top of the frame forward. Used with gyro; a wrong one is of no use.",
         read_only=True,
     ),
 )

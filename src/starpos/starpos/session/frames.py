@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A frame in a session: while it waits, and what becomes of it."""
+"""A frame in a session: while it waits, and its answer."""
 
 from dataclasses import dataclass, replace
 from typing import Any
@@ -16,11 +16,11 @@ from starpos.session.now import Now
 
 @dataclass(frozen=True, kw_only=True)
 class Answered:
-    """What became of a frame: its message's stamp, its solution, the place on the ellipsoid, None without one.
+    """The answer to a frame: its message's stamp, its solution, the place on the ellipsoid, None without one.
 
     no_camera: no camera calibration has arrived.
-    attitude: the camera's, by its stars; None where they tell none.
-    beside: with GNSS, what it taught and what the guard says of it; None without.
+    attitude: the camera's, by its stars; None if they do not determine it.
+    `beside`: with GNSS, what it taught and what the guard says of it; None without.
     """
 
     stamp: Any
@@ -59,7 +59,7 @@ class Waiting:
     doubted: bool = False
 
     def dated(self, now: Now) -> "Waiting":
-        """Correct how far it is ahead of a played clock, whose tick may have been heard only after the frame."""
+        """Correct how far it is ahead of a played clock, whose tick may have arrived only after the frame."""
         if not now.played:
             return self
         return replace(self, ahead_s=min(now.ahead_s(self.stars.mid_unix_s), self.ahead_s))

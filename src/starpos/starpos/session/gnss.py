@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Satellites' place beside the stars': compared, never fused, so that either can tell of the other that it is wrong."""
+"""Compare the GNSS position with the star fix and never fuse them, so that each can expose an error in the other."""
 
 import numpy as np
 
 from starpos.earth.vertical import Geodetic
 from starpos.gnss.place import GnssPlace
 
-# of a fix that states no error, m an axis
+# 1 sigma of a fix that states no error, m an axis
 UNSTATED_M = 30.0
-# places that differ by more sigmas are not the same
+# places that differ by more, in sigma, contradict each other
 SIGMAS = 5.0
-# an older one says nothing of now, s
+# maximum age of a GNSS place in a comparison, s
 OLDEST_S = 5.0
 
 
@@ -26,5 +26,6 @@ def contradiction(gnss: GnssPlace, ground: Geodetic, utc_unix_s: float, speed: f
     if sigmas < SIGMAS:
         return apart, ""
     return apart, (
-        f"GNSS has a place {apart:.3g} m from here, {sigmas:.2g} times what both claim: one of them is wrong"
+        f"GNSS has a place {apart:.3g} m from here, {sigmas:.2g} times their stated errors: one of them is "
+        f"wrong"
     )

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether GNSS, where it comes, has the place that the stars have."""
+"""Whether GNSS, if present, agrees with the stars' place."""
 
 from typing import Any
 
@@ -18,7 +18,7 @@ class GnssComparison:
         self._place: GnssPlace | None = None
 
     def take(self, message: Any) -> None:
-        """Take a sensor_msgs/NavSatFix; one without a place that can be used is forgotten."""
+        """Take a sensor_msgs/NavSatFix; one without a usable place is forgotten."""
         try:
             self._place = message_to_gnss(message, UNSTATED_M)
         except GnssError:

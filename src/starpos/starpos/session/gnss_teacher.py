@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""GNSS beside a session: its fixes as they come, what they teach, and the file that keeps it."""
+"""GNSS in a session: its fixes as they come, what they teach, and the file that keeps it."""
 
 import math
 import traceback
@@ -34,7 +34,7 @@ TOPIC = "gnss/fix"
 KEPT = 100
 # a fix that comes later than this after its stamp is of another clock, s
 OLDEST_S = 30.0
-# what was learned is written at most so often, s
+# minimum interval between writings of what was learned, s
 SAVE_EVERY_S = 60.0
 
 
@@ -83,12 +83,12 @@ class GnssTeacher:
         try:
             answer = watched(solver, stars, rough, gnss, watch)
         except Exception as e:
-            # A defect costs this frame only.
+            # A defect loses only this frame.
             self._log.error(traceback.format_exc())
             why = f"what GNSS taught could not be used on this frame ({type(e).__name__}: {e})"
             answer = Watched(solution=Solution.failed(stars, Status.BAD_INPUT, why))
         if self._settings.site is not None:
-            # the heading there is better than that of any fix
+            # the heading there is better than any fix's
             answer = replace(answer, solution=replace(answer.solution, at_place=rough.at_place))
         if compared:
             self.newest = answer
@@ -110,7 +110,7 @@ class GnssTeacher:
         return self._watch
 
     def other_camera(self) -> None:
-        """Forget what was learned, which is of the other camera."""
+        """Forget what was learned of the other camera."""
         if self._watch is not None and self._instrument is not None:
             self._log.warning("another camera_info: what GNSS taught of the other camera is forgotten")
             self._watch = GnssWatch(self._instrument, self._settings.vertical)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where a camera looks, by the last attitude that its stars have told and what a gyro has turned since.
+"""Where a camera looks, by the last attitude from its stars and the gyro's turn since.
 
-It is a prior: stars still decide, so what is wrong here costs half a millisecond a frame and no answer.
+It is a prior: the stars decide, so an error here costs half a millisecond a frame and no answer.
 """
 
 import math
@@ -22,13 +22,13 @@ if TYPE_CHECKING:
     from starpos.session.gyro_readings import GyroReadings
 
 IMU_TOPIC = "imu/data"
-# a frame does not wait for readings: the last rate holds so long, and gaps may be so long together
+# a frame does not wait for readings: longest time for which the last rate is extrapolated, and total of gaps
 MOST_MISSING_S = 0.1
-# the worst case, 1 sigma an axis: a cheap IMU, how it sits on the camera, and an attitude by few stars about the axis
+# worst case, 1 sigma an axis: a cheap IMU, its mounting on the camera, and an attitude by few stars about the axis
 WORST, MOUNT_RAD, STARS_RAD = ImuModel(), math.radians(1.0), 1e-3
-# rad/s; no bias is known better
+# rad/s; lower bound of the bias's sigma
 LEAST_BIAS_STDDEV = 1e-3
-# a gyro that is off by so many sigma measures in another unit, or along other axes
+# a gyro off by more sigma measures in another unit, or along other axes
 CONTRADICTION = 6.0
 
 
@@ -36,7 +36,7 @@ class Gyro:
     """Takes a gyro's readings and a camera's attitudes, and predicts the next one.
 
     The prediction's error grows with time by the gyro's noise and bias, and with the turn by its scale and mount.  Each
-    pair of attitudes tells the bias better.
+    pair of attitudes improves the bias.
     """
 
     def __init__(self, heard: Heard) -> None:
@@ -55,7 +55,7 @@ class Gyro:
         self._bias_stddev = WORST.gyroscope_bias_stddev
 
     def take(self, message: Any, now: Now) -> None:
-        """Take a sensor_msgs/Imu; none of recorded data, whose answers may not hang on what was read before a frame."""
+        """Take a live sensor_msgs/Imu. Answers to recorded data must not depend on what was read before a frame."""
         if now.played:
             return
         if self._readings is None:
@@ -79,7 +79,7 @@ class Gyro:
         return (turned,) if useful else ()
 
     def saw(self, stars: Stars, found: Identification, solver: Solver) -> None:
-        """Take the attitude that a frame's stars have told beyond suspicion, and learn the bias from it."""
+        """Take an attitude from stars identified beyond doubt, and learn the bias from it."""
         mid_s, (camera, _, _) = stars.mid_unix_s, solver.view(stars.width, stars.height)
         if mid_s is None:
             return
@@ -94,7 +94,7 @@ class Gyro:
         self._seen, self._seen_s = seen, mid_s
 
     def _learn(self, off: np.ndarray, error: float, since_s: float) -> None:
-        """Learn from how far the gyro (3,), rad along its axes, and with which error, is off after a time."""
+        """Learn the bias from the gyro's error (3,), rad along its axes, after a time, and the sigma of this error."""
         if np.linalg.norm(off) > CONTRADICTION * error:
             degrees = math.degrees(np.linalg.norm(off))
             self._heard.refuse(

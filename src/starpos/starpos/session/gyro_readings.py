@@ -12,9 +12,9 @@ from starpos.navigation.imu import clipped
 from starpos.navigation.preintegration import turn_between
 from starpos.navigation.recent import BACK_S, RecentReadings
 
-# readings are kept so long, in blocks of so much
+# time for which readings are kept, and length of a block
 KEPT_S, BLOCK_S = 60.0, 1.0
-# rad/s; each gyro measures as much, so that what it repeats below is no limit of its range
+# rad/s; every gyro measures up to this, so values repeated below it are not clipping
 LEAST_RANGE = 1.0
 NO_RATES = np.zeros((0, 3))
 
@@ -31,7 +31,7 @@ class GyroReadings:
         w, time_s = message.angular_velocity, stamp_to_unix(message.header.stamp)
         if message.angular_velocity_covariance[0] == -1:
             raise VoyageError(
-                "the IMU says by a covariance of -1 that it measures no rates: take one that does"
+                "the IMU says by a covariance of -1 that it measures no rates: use one that does"
             )
         if time_s is None:
             raise VoyageError(
@@ -57,7 +57,7 @@ class GyroReadings:
         if not (np.isfinite(recent.last_s) and recent.last_s - KEPT_S < begin_s < end_s):
             return None
         recent.close()
-        # what is newer than all readings is by the last one
+        # beyond the newest reading its rate is extrapolated
         imu = recent.since(min(begin_s, recent.last_s - 1e-6))
         rows = (block[block[:, 0] > begin_s, 1:4] for block in recent.blocks() if block[-1, 0] > begin_s)
         rates = np.concatenate([NO_RATES, *rows])

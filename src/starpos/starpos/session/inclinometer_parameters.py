@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Parameters of the node `inclinometer` that tilts of an IMU depend on; those of its other sources are with these."""
+"""Parameters of the node `inclinometer` for tilts from an IMU; the parameters of other sources are with the sources."""
 
 import math
 
@@ -19,8 +19,8 @@ SHARED = (
     Parameter(
         "noise_stddev",
         math.nan,
-        "White noise of one sample and axis, at least; unset takes what the samples show, 0.0035 deg until there are "
-        "enough. Too large widens fixes for nothing.",
+        "Lower bound of the white noise of one sample and axis; unset takes the samples' scatter, 0.0035 "
+        "deg until there are enough. If too large, fixes are wider than necessary.",
         unit="deg",
         minimum=1e-6,
         maximum=10.0,
@@ -48,14 +48,16 @@ IMU = (
     Parameter(
         "imu.variance",
         STATED,
-        "What tells the noise of an IMU's accelerations: stated, the variance in its messages, or their scatter if that "
-        "is more; scatter alone, where the driver states a placeholder. A placeholder that is too large widens fixes.",
+        "Source of the noise of an IMU's accelerations. stated: the variance in its messages, or their "
+        "scatter if that is more; scatter: their scatter alone, where the driver states a placeholder. A "
+        "placeholder that is too large widens fixes.",
         choices=(STATED, SCATTER),
     ),
     Parameter(
         "imu.max_force_error",
         0.05,
-        "Share by which the acceleration may differ from 9.81 m/s2; beyond it is not at rest and tells no tilt. "
+        "Share by which the acceleration may differ from 9.81 m/s2; beyond it is not at rest and gives no "
+        "tilt. "
         "Too small refuses an uncalibrated accelerometer, too large takes driving for leaning.",
         unit="",
         minimum=0.0001,

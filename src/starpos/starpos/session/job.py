@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Jobs of several seconds: what comes of one, the interface of who runs them, and a runner without a thread."""
+"""Jobs of several seconds: the outcome, the runner's interface, and a runner without a thread."""
 
 import traceback
 from collections.abc import Callable, Generator

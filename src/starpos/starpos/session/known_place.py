@@ -20,7 +20,7 @@ class SessionPlaces:
 
     @property
     def known(self) -> bool:
-        """Whether anybody is to say where the instrument is."""
+        """Whether a source of the place is set."""
         return self._settings.site is not None or self._gnss is not None
 
     def at(self, utc_unix_s: float) -> KnownPlace:

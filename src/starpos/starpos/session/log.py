@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a session needs from whoever drives it: a log for its sentences, and an account of its messages."""
+"""What a session needs from its driver: a log for its sentences, and an account of its messages."""
 
 from typing import Protocol
 
@@ -15,7 +15,7 @@ class Log(Protocol):
 
 
 class Changes:
-    """Logs what is so, once until it changes."""
+    """Logs a state once until it changes."""
 
     def __init__(self, log: Log) -> None:
         self._log = log

@@ -21,7 +21,7 @@ MOST_TILTS = 64
 
 @dataclass(frozen=True)
 class Seen:
-    """The stars of a frame that has a time, with its tilt; found: which stars they are, None if that is not known."""
+    """The stars of a frame that has a time, with its tilt; found: their identification, None without one."""
 
     stars: Stars
     tilt: Tilt
@@ -48,11 +48,11 @@ class RecentFrames:
             self._frames.append(seen)
 
     def keep(self, most: int) -> None:
-        """Keep so many frames from now on; the newest of the present ones stay."""
+        """Keep this number of frames from now on; the newest of the present ones stay."""
         self._frames = deque(self._frames, maxlen=most)
 
     def newest(self, count: int) -> list[Seen]:
-        """Return the newest frames in the order they came; fewer if there are not so many."""
+        """Return up to this number of the newest frames in the order they came."""
         return list(self._frames)[max(0, len(self._frames) - count) :]
 
     def clear(self) -> None:
@@ -75,7 +75,7 @@ class _Pose:
 
 
 class PoseMemory:
-    """Keeps the stars of the last frame of each pose, with the mean tilt of its frames; drops the oldest poses."""
+    """Keeps each pose's last frame with the mean tilt of the pose; drops the oldest poses."""
 
     def __init__(self) -> None:
         self._poses: deque[_Pose] = deque(maxlen=MOST_POSES)
@@ -98,7 +98,7 @@ class PoseMemory:
             try:
                 made.append(replace(pose.newest, tilt=mean_tilt(pose.tilts)))
             except TiltError:
-                # The tilts contradict each other, and nobody knows which is right.
+                # The tilts contradict each other, and it is unknown which is right.
                 continue
         return made
 
@@ -123,5 +123,5 @@ def tilts_of(seen: Sequence[Seen]) -> TiltsByTime:
 
 
 def known_of(seen: Sequence[Seen]) -> dict[int, Identification]:
-    """Which stars those of the frames are, by the frames' numbers."""
+    """Identifications of the frames' stars, by the frames' numbers."""
     return {k: s.found for k, s in enumerate(seen) if s.found is not None}

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The navigator's decisions: when the newest part of a voyage is adjusted, how it is carried on, what is told.
+"""The navigator's decisions: when the newest part of a voyage is adjusted, how it is carried on, what is published.
 
-A state machine without a clock or a thread of its own, as session.py is for frames: it is told each message with the
-time it came at, and returns what to publish.  The adjustment is a job; until its outcome comes the IMU carries the last
-one on.
+A state machine without a clock or a thread of its own, as session.py is for frames: its driver passes each message with
+its time of arrival; it returns what to publish.  The adjustment is a job; until its outcome comes the IMU carries the
+last one on.
 """
 
 import math
@@ -41,7 +41,7 @@ from starpos.session.navigator_parameters import NavigatorSettings
 from starpos.session.now import Now
 from starpos.session.reports import AHEAD_S
 
-# the window holds so much at least before it is adjusted, s, and so many frames a second of the period
+# minimum length of the window before it is adjusted, s, and minimum frames per second of the period
 SHORTEST_S, FRAMES_PER_S = 10.0, 30.0
 # fixes of GNSS that are kept: attitudes come later than they
 GNSS_KEPT = 100
@@ -79,7 +79,7 @@ class Navigated:
 class NavigatorSession:
     """Messages of an IMU, a camera's attitudes and velocities to places under way.
 
-    jobs: makes who runs the adjustment.
+    jobs: makes the runner of the adjustment.
     """
 
     def __init__(self, settings: NavigatorSettings, jobs: Callable[[], Jobs], heard: Heard, log: Log) -> None:
@@ -127,7 +127,8 @@ class NavigatorSession:
                 or message.linear_acceleration_covariance[0] == -1
             ):
                 raise VoyageError(
-                    "the IMU says by a covariance of -1 that it measures no rates or no accelerations: take one that does"
+                    "the IMU says by a covariance of -1 that it measures no rates or no accelerations: use "
+                    "one that does"
                 )
             self._check_time(row[0], now, "an inertial reading")
             self._begin_anew(row[0])
@@ -184,7 +185,7 @@ class NavigatorSession:
                 raise VoyageError(
                     "a velocity's variance is NaN or below 0: state it, or zeros for velocity_stddev"
                 )
-            # an axis that states none moves as little as the others, or is not measured
+            # an axis without a stated variance moves as little as the others, or is not measured
             sigma = math.sqrt(variance.max()) or self._values["velocity_stddev"]
             self._recent.add_velocity(time_s, (v.x, v.y, v.z), sigma)
         except StarposError as e:
@@ -207,7 +208,8 @@ class NavigatorSession:
             raise VoyageError(f"{what} has no time stamp: set header.stamp to when it was measured")
         if now.ahead_s(unix_s) > AHEAD_S:
             raise VoyageError(
-                f"{what} is stamped {now.ahead_s(unix_s):.3g} s before its time: set the clocks of camera, IMU and "
+                f"{what} is stamped {now.ahead_s(unix_s):.3g} s in the future: set the clocks of camera, "
+                f"IMU and "
                 "navigator by one source"
             )
 

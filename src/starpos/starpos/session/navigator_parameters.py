@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Parameters of the navigator, and what they and their files say of the vehicle."""
+"""Parameters of the navigator, and the vehicle that they and their files describe."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -155,7 +155,7 @@ class NavigatorSettings:
 
     def __init__(self, values: Mapping[str, Any]) -> None:
         self.values = values
-        # those in use, and those of the last check
+        # the files in use, and the files of the last check
         self._files: tuple[Instrument, ImuModel, Geoid | None] = ANY_INSTRUMENT, ImuModel(), None
         self._read: tuple[Instrument, ImuModel, Geoid | None] = self._files
 
@@ -187,7 +187,7 @@ class NavigatorSettings:
 
     @property
     def vertical(self) -> Vertical:
-        """The deflection of the vertical, or the geoid that tells it."""
+        """The deflection of the vertical, or the geoid that gives it."""
         return parameters.vertical_of(self.values, self._files[2])
 
     @property

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The time as a session is told it with each message."""
+"""The time that a session receives with each message."""
 
 import math
 from dataclasses import dataclass
@@ -10,10 +10,10 @@ ANOTHER_TIME_S = 3600.0
 
 @dataclass(frozen=True)
 class Sent:
-    """What the middleware tells of a message.
+    """What the middleware reports of a message.
 
-    number: its place among those of its publisher; None where that is not told.
-    unix_s: when it was written, by the clock of its publisher's host; None where that is not told.
+    number: its place among its publisher's messages; None where that is unknown.
+    unix_s: when it was written, by the clock of its publisher's host; None where that is unknown.
     """
 
     number: int | None = None
@@ -26,7 +26,7 @@ class Now:
 
     unix_s: by the clock of whoever takes the messages; None while it is not known.
     waiting_s: by the clock in which waiting is counted; NaN while it is not known.
-    played: whether both are the clock of recorded data: then nothing depends on how quick anybody is.
+    played: whether both are the clock of recorded data: then nothing depends on speed.
     """
 
     unix_s: float | None

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which frames are left out where more come than are wanted or can be worked on, and what is said of it."""
+"""Which frames are left out if too many come, and the diagnostics of it."""
 
 import math
 from collections import deque
 
-# The share of dropped frames is of so long, and of at least so many frames.
-LATELY_S, FEWEST = 10.0, 10
+# Interval over which the share of dropped frames is taken, and minimum number of frames.
+LATELY_S, MIN_FRAMES = 10.0, 10
 MOST_KEPT = 2000
 MOST_DROPPED = 0.5
 # Share of the interval by which a frame may come early, so that jitter of the stamps costs none.
@@ -16,7 +16,7 @@ MOST_RATE = 1000.0
 class Pace:
     """Thins frames to a rate, evenly by their stamps, and counts those that were left out.
 
-    left_out: frames that a rate left out.  dropped: those that nobody asked to leave out.
+    left_out: frames left out by max_rate.  dropped: frames left out for lack of time.
     """
 
     def __init__(self) -> None:
@@ -29,7 +29,7 @@ class Pace:
         self._lately: deque[tuple[float, bool]] = deque(maxlen=MOST_KEPT)
 
     def wants(self, unix_s: float | None, most_hz: float) -> bool:
-        """Whether a frame of this stamp is wanted, at most so many a second; NaN: all are, as those without a stamp."""
+        """Whether a frame of this stamp is wanted at a rate of at most most_hz; NaN: all, as without a stamp."""
         if math.isnan(most_hz) or unix_s is None:
             return True
         period_s = 1 / most_hz
@@ -44,9 +44,9 @@ class Pace:
         return True
 
     def numbered(self, number: int | None, now_s: float) -> None:
-        """Drop the frames that the middleware lost before this one, by its number among those of its publisher.
+        """Drop the frames that the middleware lost before this one, by its number among its publisher's messages.
 
-        None: the middleware tells none.  A lower number is another publisher's.
+        None: the middleware reports none.  A lower number is another publisher's.
         """
         last, self._number = self._number, number
         if last is not None and number is not None and number > last + 1:
@@ -87,7 +87,7 @@ class Pace:
         """Sentence, where most of the latest frames were dropped; '' where they were not."""
         frames = len(self._lately)
         dropped = sum(not taken for _, taken in self._lately)
-        if frames < FEWEST or dropped <= MOST_DROPPED * frames:
+        if frames < MIN_FRAMES or dropped <= MOST_DROPPED * frames:
             return ""
         return (
             f"{100 * dropped / frames:.0f} % of the frames of the last {LATELY_S:.0f} s were dropped: more come than "

@@ -17,15 +17,15 @@ from starpos.session.settings import Settings
 
 SOLVER, DETECTOR, INCLINOMETER = "solver", "detector", "inclinometer"
 NODES = (SOLVER, DETECTOR, INCLINOMETER)
-# a name in a file is a misspelt one if it is as much like a parameter as this
+# similarity to a parameter's name from which an unknown name counts as misspelt
 MISSPELT = 0.85
 WILDCARDS = ("*", "**")
 
 
 def settings_of(file: Path | None, given: Sequence[str], namespace: str | None = None) -> Settings:
-    """The Settings of a parameter file (None: none) and of texts NAME:=VALUE, which count more, as the node has them.
+    """The Settings of a parameter file (None: no file) and of texts NAME:=VALUE, which override it, as the node has them.
 
-    namespace: that of the solver; None: whatever it is, if the file is of one instrument.
+    namespace: the solver's; None: any, if the file is of one instrument.
     Raises ParameterError if a value is not allowed, InstrumentError if something cannot be read, or is no parameter.
     """
     values = _values(SOLVER, PARAMETERS, file, given, namespace)
@@ -39,7 +39,7 @@ def settings_of(file: Path | None, given: Sequence[str], namespace: str | None =
 def drivers_of(
     file: Path | None, given: Sequence[str], namespace: str | None = None, remaps: Remaps = NO_REMAPS
 ) -> Drivers:
-    """The parameters of detector and inclinometer, read as those of the solver; texts NODE:NAME:=VALUE are theirs."""
+    """The parameters of detector and inclinometer, read like the solver's; texts NODE:NAME:=VALUE are theirs."""
     detector = _values(DETECTOR, detector_parameters.PARAMETERS, file, given, namespace)
     of_imu = (*inclinometer_parameters.SHARED, *inclinometer_parameters.IMU)
     return Drivers(
@@ -51,7 +51,7 @@ def drivers_of(
 
 
 def of_solver(given: Sequence[str]) -> list[str]:
-    """Select those of the texts [NODE:]NAME:=VALUE that are the solver's; raises InstrumentError for one that is none."""
+    """Select from the texts [NODE:]NAME:=VALUE the solver's own; raises InstrumentError for any other text."""
     return [text for text in given if _assigned(text)[0] == SOLVER]
 
 

@@ -55,8 +55,9 @@ PARAMETERS = (
     Parameter(
         "misalignment_stddev",
         NAN,
-        "Error of the misalignment and of the inclinometer's zero together, each axis; 1 arcsec is 31 m. Too small "
-        "makes fixes claim more than they hold; unset, the misalignment is not known: over 1000 km.",
+        "Error of the misalignment and of the inclinometer's zero together, each axis; 1 arcsec is 31 m. If "
+        "too small, fixes claim errors that are too small; unset, the misalignment is not known: over 1000 "
+        "km.",
         unit="arcsec",
         minimum=0.0,
         maximum=36000.0,
@@ -70,7 +71,8 @@ PARAMETERS = (
     Parameter(
         "calibration_frames",
         100,
-        "Newest frames kept for solver/calibrate. Few leave the tilts' noise in A3; many take seconds to work out.",
+        "Newest frames kept for solver/calibrate. Few leave the tilts' noise in A3; many take seconds to "
+        "solve.",
         unit="",
         minimum=1,
         maximum=1000,
@@ -78,9 +80,10 @@ PARAMETERS = (
     Parameter(
         "calibration_turn_stddev",
         180.0,
-        "How well the misalignment in use has its turn about the plumb line (the way the inclinometer faces) when a "
-        "calibration begins; frames at one lean, or turned about one leaning axis, do not tell it. 180 is not at all: "
-        "then fixes at another lean, or of a leaning turn, claim little. Too small makes them wrong.",
+        "Error of the turn about the plumb line (the direction the inclinometer faces) of the misalignment "
+        "in use when a calibration begins; frames at one lean, or turned about one leaning axis, do not "
+        "determine it. 180: unknown, and fixes at another lean, or of a leaning turn, state large errors. "
+        "If too small, they are wrong.",
         unit="deg",
         minimum=0.000001,
         maximum=180.0,
@@ -88,14 +91,15 @@ PARAMETERS = (
     Parameter(
         "self_calibration",
         False,
-        "Take the misalignment for unknown and find it whenever the instrument has been turned on the spot to four "
-        "headings or more; until then fixes carry an error of 10 deg. Needs a solver/reset after driving on, until it "
-        "has found it once.",
+        "Treat the misalignment as unknown and find it whenever the instrument has been turned on the spot "
+        "to four headings or more; until then fixes carry an error of 10 deg. Until it has been found once, "
+        "call solver/reset after driving on.",
     ),
     Parameter(
         "self_calibration_limit",
         60.0,
-        "Error of the plumb line in the camera up to which what turning on the spot tells is used; 1 arcsec is 31 m.",
+        "Largest error of the plumb line in the camera with which a calibration by turning on the spot is "
+        "used; 1 arcsec is 31 m.",
         unit="arcsec",
         minimum=0.0,
         maximum=36000.0,
@@ -128,7 +132,7 @@ PARAMETERS = (
     Parameter(
         "refraction.wavelength",
         NAN,
-        "Middle of the light that the camera sees; unset is 0.55, give or take 0.08.",
+        "Mean wavelength of the light that the camera sees; unset is 0.55, give or take 0.08.",
         unit="um",
         minimum=0.2,
         maximum=10.0,
@@ -136,10 +140,10 @@ PARAMETERS = (
     Parameter(
         "altitude",
         NAN,
-        "Height above the WGS 84 ellipsoid, put into fix, and up to which plumb lines curve (5 m of latitude a km at 45 "
-        "deg; not where deflection.xi or deflection.eta is set): the height above sea level of a map plus the geoid's "
-        "undulation there (-107 to 86 m), by which it is wrong without. The stars cannot tell it; unset leaves NaN, and "
-        "some consumers drop such a fix.",
+        "Height above the WGS 84 ellipsoid, published in fix and used for the curvature of plumb lines (5 m "
+        "of latitude a km at 45 deg; not where deflection.xi or deflection.eta is set): a map's height "
+        "above sea level plus the geoid's undulation there (-107 to 86 m). The stars do not determine it; "
+        "unset leaves NaN, and some consumers drop such a fix.",
         unit="m",
         minimum=-1000.0,
         maximum=100000.0,
@@ -149,7 +153,8 @@ PARAMETERS = (
         "clock_stddev",
         NAN,
         "Error of the clock that stamps the frames against UTC; unset takes what the camera's host says of its clock, at "
-        "least the instrument file's, or 0.01. 1 s is 464 m at the equator. Too small makes fixes claim too much.",
+        "least the instrument file's, or 0.01. 1 s is 464 m at the equator. If too small, fixes claim "
+        "errors that are too small.",
         unit="s",
         minimum=0.0,
         maximum=3600.0,
@@ -173,7 +178,7 @@ PARAMETERS = (
     Parameter(
         "deflection.stddev",
         UNKNOWN_STDDEV_ARCSEC,
-        "Error of each component; the default is that of knowing nothing.",
+        "Error of each component; the default holds where the deflection is unknown.",
         unit="arcsec",
         minimum=0.0,
         maximum=120.0,
@@ -183,8 +188,19 @@ PARAMETERS = (
         "",
         "Geoid grid (GTX, NGS .bin, GeoTIFF; in m) whose slopes are the deflection and whose roughness its error, "
         "instead of the three above: a path, or a name among PROJ's grids such as egm96_15.gtx. '' for none. A coarse "
-        "one misses 1 arcsec in plains and 10 in mountains, and outside its area nothing is known again: 6 arcsec, "
+        "one misses 1 arcsec in plains and 10 in mountains, and outside its area the deflection is unknown: "
+        "6 arcsec, "
         "190 m.",
+    ),
+    Parameter(
+        "deflection.wanted",
+        NAN,
+        "Measure the deflection of the vertical at the site (site.geodetic, altitude) until it errs by at most this; "
+        "~/deflection and the dashboard say how far it is. Unset: it is not measured.",
+        unit="arcsec",
+        minimum=0.001,
+        maximum=3.0,
+        read_only=True,
     ),
     Parameter(
         "site.latitude",
@@ -231,8 +247,8 @@ PARAMETERS = (
     Parameter(
         "max_rate",
         NAN,
-        "Most frames that are answered in a second, chosen evenly by their stamps; unset, as many as the processor can: "
-        "then all of them, or an even share, which costs other programs their time.",
+        "Maximum rate of the frames that are answered, chosen evenly by their stamps; unset, as many as the "
+        "processor can: then all of them, or an even share, which slows other programs.",
         unit="Hz",
         minimum=0.01,
         maximum=MOST_RATE,
@@ -241,7 +257,8 @@ PARAMETERS = (
         "gyro",
         False,
         "Take imu/data, whose turn rates say where a camera that turns looks: frames of four stars are identified too. "
-        "Its axes are frame_id's, as calibration_url's link_to_camera has them; wrong ones help nothing, harm nothing. "
+        "Its axes are frame_id's, as calibration_url's link_to_camera has them; wrong ones neither help nor "
+        "harm. "
         "Of no effect with use_sim_time: a replay gives the same answers at any rate.",
         read_only=True,
     ),
@@ -249,8 +266,8 @@ PARAMETERS = (
         "gnss.use",
         False,
         "Take gnss/fix, which teaches the misalignment, the inclinometer's errors and the deflection while the stars "
-        "agree with it, and is guarded by them; fix stays the stars' own. A GNSS that is led astray from the first frame "
-        "on teaches what is wrong.",
+        "agree with it, and is guarded by them; fix stays the stars' own. GNSS that is spoofed from the "
+        "first frame on teaches wrong values.",
         read_only=True,
     ),
     Parameter(
@@ -300,7 +317,7 @@ def instrument_of(
     """Make the Instrument from an instrument file (`known`, or None) or from the parameters, with camera_info's camera.
 
     clock_stddev and tilt_stddev, if they are set, replace the values of the file. A calibration from frames (`found`)
-    replaces that of file and parameters; with self_calibration, and before there is a `found`, it counts as unknown.
+    replaces the one from file and parameters; with self_calibration, and before there is a `found`, it counts as unknown.
     """
     if known is None:
         model, errors = sensors.find(values["inclinometer.model"])
@@ -353,8 +370,8 @@ def check_camera(known: Instrument | None, url: str, camera: Camera) -> None:
             return
         width, height = known.size
         raise InstrumentError(
-            f"{url}: its A3 is of frames of {width} x {height} px, camera_info's are {camera.width} x {camera.height}: "
-            "calibrate with these"
+            f"{url}: its A3 was found with frames of {width} x {height} px, camera_info has {camera.width} "
+            f"x {camera.height}: calibrate with these"
         )
     raise InstrumentError(
         f"{url}: it is of another camera: its focal length is {known.focal_px:.0f} px, camera_info's {camera.fx:.0f}"
@@ -379,6 +396,18 @@ def site_of(values: Mapping, vertical: Vertical) -> KnownPlace | None:
     return make(latitude, longitude, vertical, np.eye(2) * values["site.stddev"] ** 2)
 
 
+def check_deflection(values: Mapping) -> None:
+    """Raise PlaceError if deflection.wanted lacks the mark."""
+    if math.isnan(values["deflection.wanted"]):
+        return
+    mark = (values["site.latitude"], values["site.longitude"], values["altitude"])
+    if not values["site.geodetic"] or any(math.isnan(value) for value in mark):
+        raise PlaceError(
+            "deflection.wanted is measured at a mark on WGS 84: set site.latitude, site.longitude, site.geodetic true "
+            "and altitude too"
+        )
+
+
 def geoid_file(name: str) -> Geoid | None:
     """Read the Geoid that deflection.geoid names, None for ''; GeoidError with the reason if it is broken."""
     return geoid.read(name) if name else None
@@ -399,6 +428,7 @@ def vertical_of(values: Mapping, known: Geoid | None) -> Vertical:
         )
     if xi or eta:
         raise GeoidError(
-            "deflection.geoid tells the deflection: set deflection.xi and deflection.eta to 0, or it to ''"
+            "deflection.geoid gives the deflection: set deflection.xi and deflection.eta to 0, or "
+            "deflection.geoid to ''"
         )
     return AtHeight(known, values["altitude"], values["altitude_stddev"])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A recorded night through a session, as the nodes work it when `replay` plays the bag to them."""
+"""A recorded night through a session, as the nodes solve it when `replay` plays the bag to them."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -24,7 +24,7 @@ class Replay:
 
     drivers: how the messages of a robot's own camera and IMU are used; None: by default parameters.
     frames: star lists and images read so far.
-    remarks: sentences on what is made of a robot's own messages.
+    remarks: sentences on how a robot's own messages are used.
     """
 
     def __init__(self, settings: Settings, heard: Heard, log: Log, drivers: Drivers | None = None) -> None:
@@ -65,7 +65,7 @@ class Replay:
         self.remarks += messages.remarks()
 
     def _taken(self, kind: str, message: Any, messages: DriverMessages, now: Now) -> list[Output]:
-        """Have the session take a message, or what is made of it."""
+        """Have the session take a message, or the stars or tilt made from it."""
         session = self.session
         if kind == TILT:
             return self._take_tilt(message, now)

@@ -18,14 +18,14 @@ from starpos.session.now import ANOTHER_TIME_S
 from starpos.units import ARCSEC
 
 WIDE_CLOCK_S = 0.1
-# Frames that are older when they come are of another clock, unless they are of another evening, as recorded ones; those
-# that are older still are stamped since the boot of their host.
+# Age on arrival above which frames are stamped by another clock or recorded on another evening, and age above which
+# stamps count from the boot of their host.
 OLD_S, SINCE_BOOT_S = 40.0, 1e9
 AHEAD_S = 1.0
 ONE_CLOCK = "set the clocks of camera, inclinometer and solver by one source"
 
 OTHER_TILTS = (
-    "by its stars the camera stands as it stood, by the tilts of its stamp it leans otherwise: they are of another time; "
+    "by its stars the camera has not moved, by the tilts at its stamp it has: these are of another time; "
     + ONE_CLOCK
 )
 
@@ -79,14 +79,15 @@ def of_clock(clock_stddev_s: float, stamp_stddev_s: float, ahead_s: float, doubt
     if ahead_s > AHEAD_S:
         return Diagnosis(
             Level.WARN,
-            f"frames come {ahead_s:.3g} s before their time and are refused: {ONE_CLOCK}",
+            f"frames are stamped {ahead_s:.3g} s in the future and are refused: {ONE_CLOCK}",
             values,
         )
     if doubt_s:
         return Diagnosis(
             Level.WARN,
-            f"by their stamps the camera at rest has turned with the Earth for {doubt_s:.3g} s: a clock was set, or a "
-            "frame stamped wrongly. Fixes are as wide as that until it is back, or solver/reset is called",
+            f"the camera is at rest, but the sky has turned by {doubt_s:.3g} s more than the stamps say: a "
+            f"clock was set, or a frame stamped wrongly. Fixes include this error until the clock is back "
+            f"or solver/reset is called",
             values,
         )
     if OLD_S < -ahead_s < ANOTHER_TIME_S or -ahead_s > SINCE_BOOT_S:
@@ -110,9 +111,9 @@ def of_clock(clock_stddev_s: float, stamp_stddev_s: float, ahead_s: float, doubt
 def of_conditions(
     values: Mapping, instrument: Instrument, tilt: Tilt | None, shutter: Shutter | None
 ) -> Diagnosis:
-    """Report what nobody knows of the air, of the inclinometer, its temperatures, and of the shutter.
+    """Report what is unknown of the air, the inclinometer, its temperatures, and the shutter.
 
-    values: the parameters.  tilt, shutter: those of the newest frame, None without one.
+    values: the parameters.  tilt, shutter: of the newest frame, None without one.
     """
     calibration = instrument.calibration
     now_c = math.nan if tilt is None else tilt.temperature_c

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How a session searches its frames: by every way there is, for as long as the next frame need not wait."""
+"""How a session searches its frames: by every way there is, as long as the next frame need not wait."""
 
 import math
 import time
@@ -23,7 +23,7 @@ from starpos.session.now import Now
 
 # Share of the time between frames in which one may be searched.
 MOST_OF_INTERVAL = 0.5
-# a deadline that is over: one search and no other
+# a deadline in the past: one search only
 AT_ONCE_S = 0.0
 
 

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The solver's decisions: which camera and which tilts belong to a frame, how long it waits, what is made of it.
+"""The solver's decisions: which camera and tilts belong to a frame, how long it waits, and its answer.
 
-A state machine without a clock or a thread of its own: it is told each message with the time it came at, or the time
-alone, and returns what to publish.  The node `solver` drives it with what ROS brings, replay.py with what a bag holds:
-the same messages at the same times give the same answers.
+A state machine without a clock or a thread of its own: its driver passes each message with its time of arrival, or the
+time alone; it returns what to publish.  The node `solver` drives it with ROS's messages, replay.py with a bag's: the
+same messages at the same times give the same answers.
 """
 
 import math
@@ -28,10 +28,11 @@ from starpos.messages.stamp import stamp_to_unix
 from starpos.messages.stars import message_to_stars
 from starpos.session import reports
 from starpos.session.attitude import attitude_seen
-from starpos.session.backlog import MOST, Backlog
+from starpos.session.backlog import MAX_WAITING, Backlog
 from starpos.session.calibrating import Calibrating
 from starpos.session.camera_solver import CameraSolver
 from starpos.session.clock_doubt import ClockDoubt
+from starpos.session.deflection import LiveDeflection
 from starpos.session.frames import Answered, Averaged, Output, Waiting, ground_of
 from starpos.session.gnss_teacher import GnssTeacher, solved_beside
 from starpos.session.gyro import Gyro
@@ -50,9 +51,9 @@ from starpos.sky import catalogue
 
 NOTHING_TOLD = Sent()
 J2000_UNIX_S = 946_728_000.0
-# A stamp in the future is wrong beyond AHEAD_S and so many stated errors.
+# A stamp further in the future than AHEAD_S and this many stated sigmas is wrong.
 CLOCK_SIGMAS = 6.0
-# A clock that goes back by so much was set.
+# A clock that goes back by more was set.
 STEP_S = 0.05
 CAMERA_TOPIC = "camera/camera_info"
 
@@ -60,7 +61,7 @@ CAMERA_TOPIC = "camera/camera_info"
 class SolverSession:
     """An instrument's messages to its solutions.
 
-    jobs: makes who runs what takes long; when an Outcome has come, call `at`.
+    jobs: makes the runner of long jobs; when an Outcome has come, call `at`.
     arrived, arrived_stars: give the tilts, and the star lists, that have come but are not taken yet.
     topic: full name of the topic of the camera's intrinsics, for sentences.
     """
@@ -80,15 +81,16 @@ class SolverSession:
         self.answer: Solution | None = None
         self.pace = Pace()
         # whether another frame can be answered at once, live: whoever drives the session calls `at` again, so that
-        # what has come meanwhile has its turn
+        # messages that arrived meanwhile are taken first
         self.more = False
         self.tilts = TiltBuffer()
-        # of the frames that the messages taken are in
+        # of the frames of the messages taken
         self.names = FrameNames()
         self.doubt = ClockDoubt()
         self.gyro = Gyro(heard)
         self.gnss = GnssTeacher(settings, jobs(), heard, log) if settings.values["gnss.use"] else None
         self.places = SessionPlaces(settings, self.gnss)
+        self.deflection = LiveDeflection(settings, jobs())
         self._search = Search(settings.values)
         self._settings, self._values = settings, settings.values
         self._catalogue = catalogue.load_catalogue()
@@ -126,6 +128,7 @@ class SolverSession:
         if self.gnss is not None:
             self.gnss.other_camera()
         self.calibrating.camera_changed()
+        self.deflection.forget()
 
     @property
     def waits(self) -> bool:
@@ -135,7 +138,7 @@ class SolverSession:
     @property
     def busy(self) -> bool:
         """Whether a job runs: what comes meanwhile may be answered with its outcome, or without."""
-        return self.instrument.preparing or self.calibrating.busy
+        return self.instrument.preparing or self.calibrating.busy or self.deflection.busy
 
     # parameters ------------------------------------------------------------------------------------------------------
 
@@ -144,6 +147,7 @@ class SolverSession:
         if "clock_stddev" in names:
             self.doubt.clear()
         self.calibrating.parameters_set(names)
+        self.deflection.parameters_set(names)
         self.instrument.remake()
 
     # inputs ----------------------------------------------------------------------------------------------------------
@@ -220,9 +224,9 @@ class SolverSession:
         if not math.isnan(self._values["clock_stddev"]):
             stars = replace(stars, clock_stddev_s=0.0)
         self.instrument.frame_came(stars.width, stars.height, at_once=not now.played)
-        if len(self._backlog) >= MOST:
+        if len(self._backlog) >= MAX_WAITING:
             self.pace.drop(now.waiting_s)
-            self._heard.refuse("stars", f"a frame was dropped: {MOST} wait for their tilts")
+            self._heard.refuse("stars", f"a frame was dropped: {MAX_WAITING} wait for their tilts")
             return
         self._backlog.add(Waiting(header, stars, now.waiting_s, now.ahead_s(stars.mid_unix_s)))
         if self.instrument.preparing and not now.played:
@@ -240,8 +244,6 @@ class SolverSession:
             self.gnss.take(message, now)
         return self.at(now)
 
-    # time ------------------------------------------------------------------------------------------------------------
-
     def at(self, now: Now) -> list[Output]:
         """Go on to a time."""
         self._advance(now)
@@ -253,7 +255,7 @@ class SolverSession:
         return self._work(now) if now.played else []
 
     def begin(self) -> None:
-        """Note that recorded messages begin: who published on `tilt` before was another player, no rival."""
+        """Note that recorded messages begin: an earlier publisher of tilts was another player, no second inclinometer."""
         self.tilts.forget_publishers()
 
     def end(self, now: Now) -> list[Output]:
@@ -272,8 +274,6 @@ class SolverSession:
             self.tilts.forget_after(now.unix_s)
         if now.unix_s > was_s:
             self._intake.go_on(now)
-
-    # work ------------------------------------------------------------------------------------------------------------
 
     def _work(self, now: Now) -> list[Output]:
         """Answer the first frames that have everything they need: of recorded ones all, live one at a time."""
@@ -327,7 +327,7 @@ class SolverSession:
         if answer.ok and answer.fix is not None:
             frame, answer = self._with_doubt(frame, answer, answer.fix)
         self.latest = frame
-        # of a frame whose time is in doubt GNSS's place is in doubt too
+        # if a frame's time is in doubt, so is GNSS's place for it
         beside = solved_beside(
             self.gnss, self.instrument.solver, frame.stars, answer, compared=not frame.doubted
         )
@@ -371,7 +371,7 @@ class SolverSession:
             solver = self.instrument.solver_now
             if frame.ahead_s > reports.AHEAD_S + CLOCK_SIGMAS * solver.clock_stddev_s(stars):
                 raise TimeError(
-                    f"the frame is stamped {frame.ahead_s:.3g} s before its time: {reports.ONE_CLOCK}"
+                    f"the frame is stamped {frame.ahead_s:.3g} s in the future: {reports.ONE_CLOCK}"
                 )
             tilts = self.tilts.over(self._span(stars))
             places = self.places if self.places.known else None
@@ -379,7 +379,7 @@ class SolverSession:
         except (InstrumentError, TimeError) as e:
             return Solution.failed(stars, Status.BAD_INPUT, str(e))
         except Exception as e:
-            # A defect costs this frame only; the session goes on.
+            # A defect loses only this frame; the session goes on.
             self._log.error(traceback.format_exc())
             return Solution.failed(
                 stars, Status.BAD_INPUT, f"the solver failed on this frame ({type(e).__name__}: {e})"
@@ -399,12 +399,11 @@ class SolverSession:
             tilt = answer.tilt or self.tilts.average(stars.mid_unix_s, self._span(stars))
         except StarposError:
             return []
+        self.deflection.take(self.instrument.solver, stars, tilt, answer.found)
         place = self.calibrating.learn(Seen(stars, tilt, answer.found), answer.fix)
         if place is None:
             return []
         return [Averaged(frame.header.stamp, place, ground_of(place, self._settings.vertical))]
-
-    # outputs ---------------------------------------------------------------------------------------------------------
 
     def _answered(self, stamp: Any, answer: Solution, now: Now, beside: Watched | None = None) -> Answered:
         if now.played:
@@ -445,3 +444,4 @@ class SolverSession:
             self.gnss.forget_places()
         self.doubt.clear()
         self.calibrating.forget()
+        self.deflection.forget()

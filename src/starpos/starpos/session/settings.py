@@ -55,6 +55,7 @@ class Settings:
                 self.learned = learned_file.read_if_there(path_of(values["gnss.learned"]))
             parameters.check_gnss(values, parameters.instrument_of(values, ANY_CAMERA, known))
             parameters.atmosphere_of(values)
+            parameters.check_deflection(values)
             parameters.site_of(values, parameters.vertical_of(values, grid))
         except StarposError as e:
             return str(e)
@@ -71,7 +72,7 @@ class Settings:
 
     @property
     def vertical(self) -> Vertical:
-        """The deflection of the vertical, or the geoid that tells it."""
+        """The deflection of the vertical, or the geoid that gives it."""
         return parameters.vertical_of(self.values, self._geoid)
 
     @property

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which pulse of a shutter belongs to which frame, and the lag of the camera that the pulses show.
 
-A pulse is believed to be a frame's only if nothing else can be: it is the only one between the command and the frame's
-arrival, no edge near it was lost, and both its lag after the command and its length are those that the camera's frames
-have shown before. Until enough frames agree, none is paired. So a pulse that is missed, doubled, of a flash fired by hand
-or of a spark costs a frame its hardware time, and never gives it a wrong one.
+A pulse is paired with a frame only if it is unambiguous. It is the only one between the command and the frame's arrival,
+and no edge near it was lost. Its lag after the command and its length are as in earlier frames of the camera. Until
+enough frames agree, none is paired. So a pulse that is missed, doubled, from a flash fired by hand or from a spark costs
+a frame its hardware time, and never gives it a wrong one.
 """
 
 from collections import deque
@@ -15,17 +15,17 @@ from statistics import stdev
 
 # Frames that must agree before a pulse is believed.
 LEARNED = 5
-# As many of the last frames as this tell the camera's lag.
+# Number of the last frames that determine the camera's lag.
 KEPT = 30
 # Lags within this of the usual one are the camera's own; a camera whose lag scatters more is not paired.
 LEAST_LAG_SPREAD_S, MOST_LAG_SPREAD_S = 0.005, 0.05
-# The same of lengths. A spark just before the contact closes makes a pulse longer by what it makes it early.
+# The same of lengths. A spark just before the contact closes makes a pulse begin early, and longer by the same time.
 LEAST_LENGTH_SPREAD_S, MOST_LENGTH_SPREAD_S = 0.0001, 0.002
-# A robust standard deviation is the median deviation times this; so many of them are the camera's own scatter.
+# A robust standard deviation is the median deviation times this; the camera's own scatter is within this many of them.
 OF_MEDIAN, SIGMAS = 1.4826, 4.0
-# A driver may tell the begin of an exposure so much too late.
+# Time by which a driver may report the begin of an exposure too late.
 EARLY_S = 0.1
-# Pulses are remembered so long after they ended.
+# Time for which pulses are remembered after their end.
 REMEMBERED_S = 4000.0
 
 
@@ -62,7 +62,7 @@ class Unpaired:
 
 @dataclass(frozen=True, slots=True)
 class Lag:
-    """Lag of the camera from the command, or the begin that a driver told: median and standard deviation of `frames`."""
+    """Lag of the camera from the command, or a driver's begin: median and standard deviation of `frames`."""
 
     median_s: float
     stddev_s: float
@@ -90,7 +90,7 @@ class ShutterPulses:
             self._open = None
         if not edge.rising:
             if self._open is not None:
-                # It opened unseen in between: which of the two closings began a pulse, nobody knows.
+                # It opened unseen in between: it is unknown which of the two closings began a pulse.
                 self._gaps.append((self._open.time_s, edge.time_s))
             self._open = edge
         elif self._open is not None:
@@ -100,7 +100,7 @@ class ShutterPulses:
                     begin_s=opened.time_s,
                     length_s=edge.time_s - opened.time_s,
                     stddev_s=max(opened.stddev_s, edge.stddev_s),
-                    # a length across two clocks is none
+                    # a length across two clocks is not valid
                     disciplined=opened.disciplined and edge.disciplined,
                 )
             )
@@ -111,7 +111,7 @@ class ShutterPulses:
     ) -> ShutterPulse | Unpaired:
         """Find the pulse of a frame.
 
-        told_s: its begin by the command, or as a driver told it.  since_s, until_s: when it was commanded and had
+        told_s: its begin by the command, or as a driver reported it.  since_s, until_s: when it was commanded and had
         arrived: no other frame of this camera was exposed between them. All in Unix s.
         """
         if exposure_s != self._exposure_s:
@@ -171,7 +171,7 @@ class ShutterPulses:
 
 
 def _doubt(lag_s: float, length_s: float, usual: list[tuple[float, float]]) -> str:
-    """Say why a pulse is not the camera's own, by its lag and length beside the usual ones; '' if it may be."""
+    """Say why a pulse is not the camera's own, by its lag and length compared with the usual ones; '' if it may be."""
     lags, lengths = zip(*usual, strict=True)
     lag, length = _median(lags), _median(lengths)
     if abs(lag_s - lag) > _spread(lags, lag, LEAST_LAG_SPREAD_S, MOST_LAG_SPREAD_S):

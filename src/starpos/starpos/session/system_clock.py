@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""State of this machine's clock from the kernel: whether anything keeps it to UTC, and how far off it may be.
+"""State of this machine's clock from the kernel: whether it is kept to UTC, and how far off it may be.
 
 Source: adjtimex(2). maxerror has NTP's meaning: the largest possible error of the clock (RFC 5905, root distance). It
 grows by 500 ppm while nothing corrects the clock. chrony, systemd-timesyncd, ntpd and linuxptp all maintain it.
@@ -69,13 +69,14 @@ class SystemClock:
         if self.synchronised:
             return f"the system's clock is kept to UTC within {self.max_error_s:.2g} s."
         return (
-            "the system's clock is not synchronised, and fixes tell no longitude: start chrony, systemd-timesyncd or "
+            "the system's clock is not synchronised, so fixes have no valid longitude: start chrony, "
+            "systemd-timesyncd or "
             "linuxptp, or set the solver's clock_stddev where you know how good the clock is."
         )
 
 
 def read() -> SystemClock | None:
-    """Read the present state; None if the system does not tell it (a container may forbid it)."""
+    """Read the present state; None if the system does not report it (a container may forbid it)."""
     state = _Timex()
     try:
         answer = ctypes.CDLL(None, use_errno=True).adjtimex(ctypes.byref(state))

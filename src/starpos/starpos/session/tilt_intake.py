@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tilts on their way into the buffer of a session: which of them are kept, and when."""
+"""Tilts on their way into a session's buffer: which are kept, and when."""
 
 from collections import deque
 from dataclasses import replace
@@ -18,7 +18,7 @@ MOST_EARLY = 1000
 
 
 class TiltIntake:
-    """Gives tilts to a buffer; names: of the frames that the messages taken are in."""
+    """Gives tilts to a buffer; names: of the frames of the messages taken."""
 
     def __init__(self, tilts: TiltBuffer, names: FrameNames, settings: Settings, heard: Heard) -> None:
         self._tilts, self._names, self._settings, self._heard = tilts, names, settings, heard
@@ -60,7 +60,7 @@ class TiltIntake:
         """Keep a tilt, unless it is broken, or of the future: the instrument may lean otherwise when its time comes."""
         try:
             if (ahead_s := now.ahead_s(stamp_to_unix(message.header.stamp))) > reports.AHEAD_S:
-                raise TiltError(f"a tilt is stamped {ahead_s:.3g} s before its time: {reports.ONE_CLOCK}")
+                raise TiltError(f"a tilt is stamped {ahead_s:.3g} s in the future: {reports.ONE_CLOCK}")
             self._tilts.add(message, self._settings.tilt_stddev_rad)
             self._tilts.came_late(-ahead_s)
             self._heard.came("tilt")

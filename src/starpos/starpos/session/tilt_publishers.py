@@ -1,24 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
 """Whether the tilts come from one inclinometer alone.
 
-ROS lets anybody publish on `tilt`, and the readings of two inclinometers, mixed, make confident wrong fixes: while two
-are heard, neither is believed. A publisher that was killed stays in the graph for a while, so what counts is who is
-heard. One publisher is told from another by the frame of its messages and by the numbers that DDS gives them, which grow
-from message to message of one publisher.
+Any ROS node may publish on `tilt`, and mixed readings of two inclinometers make confident wrong fixes: while two are
+heard, neither is used. A killed publisher stays in the graph for a while, so only received messages count. Publishers
+are distinguished by the frame of their messages and by DDS's message numbers, which grow with each message of one
+publisher.
 """
 
 from dataclasses import dataclass
 
-# one publisher alone is believed again after so long; where the other sent seldom, after so many of its periods, up to so
-# long
+# time after which a single publisher is used again: a minimum, periods of the other if it sent seldom, a maximum
 ALONE_S, ALONE_PERIODS, MOST_ALONE_S = 1.0, 2.5, 10.0
-# no inclinometer sends more often: what is missing between two messages of one publisher was sent between them
+# highest rate of an inclinometer; it bounds how many messages between two received ones can be lost
 MOST_HZ = 500.0
 
 
 @dataclass
 class _Voice:
-    """One publisher as far as its messages tell: their frame, the last one's number, when it came and how long after."""
+    """One publisher as known from its messages: their frame, the last one's number, arrival and interval."""
 
     frame_id: str
     number: int | None
@@ -32,14 +31,14 @@ class _Voice:
 
 
 class TiltPublishers:
-    """Hears of every message and says whether its publisher is the only one."""
+    """Notes every message and says whether its publisher is the only one."""
 
     def __init__(self) -> None:
         self._voices: list[_Voice] = []
         self._speaking: list[_Voice] = []
 
     def heard(self, frame_id: str, number: int | None, now_s: float) -> None:
-        """Note a message; number: that of its publisher's messages, None where the middleware tells none."""
+        """Note a message; number: its number among its publisher's messages, None where the middleware gives none."""
         mine = self._voice_of(frame_id, number, now_s) or _Voice(frame_id, number, now_s)
         mine.number, mine.heard_s, mine.period_s = number, now_s, abs(now_s - mine.heard_s)
         # one that sends seldom is remembered, to learn how seldom
@@ -48,9 +47,9 @@ class TiltPublishers:
         self._speaking = [v for v in self._voices if v.speaks(now_s)]
 
     def _voice_of(self, frame_id: str, number: int | None, now_s: float) -> _Voice | None:
-        """The publisher that this message continues: of the same number rather one that goes on than one of long ago.
+        """The publisher that this message continues: among equal candidates one still speaking rather than an old one.
 
-        A number that is further on than messages can have been lost meanwhile is another publisher's.
+        A number that is ahead by more than messages can have been lost is another publisher's.
         """
         of_frame = [v for v in self._voices if v.frame_id == frame_id]
         if number is None:
@@ -64,7 +63,7 @@ class TiltPublishers:
 
     @property
     def several(self) -> str:
-        """A sentence that names those that are heard at a time; '' where there is but one."""
+        """A sentence that names the publishers heard at the same time; '' if there is only one."""
         if len(self._speaking) < 2:
             return ""
         frames = sorted({v.frame_id for v in self._speaking})

@@ -6,7 +6,7 @@ import numpy as np
 from starpos.instrument.inclinometer import Tilt
 from starpos.instrument.tilt_log import NEIGHBOURS_S, noise_excess
 
-# The noise is measured from so many samples.
+# Number of samples from which the noise is measured.
 CAPACITY = 2000
 
 
@@ -24,7 +24,7 @@ class TiltSteps:
     def note(self, before: Tilt, sample: Tilt) -> None:
         """Take two successive samples, if they are neighbours in time."""
         apart_s = sample.utc_unix_s - before.utc_unix_s
-        # a sample that comes again tells nothing new, and would make chance look like noise
+        # a repeated sample adds nothing, and counting it would distort the noise
         if self._number and sample.utc_unix_s <= self._rows[self._number - 1, 0]:
             return
         if not 0 < apart_s < NEIGHBOURS_S or sample.axes != before.axes:

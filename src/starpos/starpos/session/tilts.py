@@ -19,18 +19,18 @@ from starpos.session.tilt_steps import TiltSteps
 
 # Ten minutes at 10 Hz.
 CAPACITY = 6000
-# How late samples come, and how often, is told by so many. Those that come later than this are of another clock.
+# Number of samples from which delay and period are taken; a sample that arrives later than LATEST_S is of another clock.
 USUAL, LATEST_S = 10, 2.0
-# A frame waits for its tilts so long, or so many times as long as they usually take to come.
+# Time that a frame waits for its tilts, or multiple of the tilts' usual delay.
 PATIENCE_S, DELAYS = 0.5, 1.5
-# Between two samples of one exposure at most so many others arrive.
+# Between two samples of one exposure at most this number of others arrives.
 TOGETHER = 20
-# Samples so near to an exposure may bracket it; a flagged one explains why it has no good one.
+# Samples this near to an exposure may bracket it; a flagged one explains why there is no good one.
 NEAR_S = BRACKET_S
-# One inclinometer's samples come in the order of their times but for so much; one that comes after samples of later
-# times shows that these were stamped by a clock ahead.
+# Tolerated disorder of one inclinometer's samples; a sample that arrives after others with later times shows that those
+# were stamped by a clock ahead.
 ORDER_S = 1.0
-# Time between samples if there are too few to tell, and the share of it by which the next may come early.
+# Assumed time between samples if there are too few, and the share of it by which the next may come early.
 USUAL_PERIOD_S, JITTER = 0.1, 0.9
 
 
@@ -65,9 +65,9 @@ class TiltBuffer:
         self._publishers = TiltPublishers()
 
     def heard(self, message: Any, number: int | None, now_s: float) -> None:
-        """Note who publishes, before `add`; number: that of its publisher's messages, None if there is none.
+        """Note who publishes, before `add`; number: its number among its publisher's messages, None without one.
 
-        TiltError while two publish: whose samples are the instrument's own nobody knows, so none is kept.
+        TiltError while two publish: it is unknown which samples are the instrument's own, so none is kept.
         """
         self._publishers.heard(message.header.frame_id, number, now_s)
         if several := self._publishers.several:
@@ -91,7 +91,7 @@ class TiltBuffer:
         self._latest_unix_s = max(self._latest_unix_s, sample.utc_unix_s)
 
     def forget_after(self, unix_s: float) -> None:
-        """Drop later samples: their clock was ahead, and the instrument may lean otherwise when their time comes."""
+        """Drop later samples: their clock was ahead, and the instrument may lean otherwise by then."""
         if self._latest_unix_s > unix_s:
             self._latest_unix_s = unix_s
             self._good = deque((s for s in self._good if s[1].utc_unix_s <= unix_s), maxlen=CAPACITY)
@@ -104,14 +104,14 @@ class TiltBuffer:
 
     @property
     def delay_s(self) -> float:
-        """Longest time until the sample that follows a moment usually is here; 0 while that is not known."""
+        """Longest usual time until the sample after a moment arrives; 0 while unknown."""
         if not self._late_s or not self._apart_s:
             return 0.0
         late_s, apart_s = max(self._late_s), float(np.median(self._apart_s))
         return late_s + apart_s if late_s < LATEST_S and apart_s < BRACKET_S else 0.0
 
     def patience_s(self, stated_s: float) -> float:
-        """How long a frame waits for its tilts, s; NaN for what is stated: by how long they take to come."""
+        """How long a frame waits for its tilts, s; a stated NaN: by the tilts' own delay."""
         return max(PATIENCE_S, DELAYS * self.delay_s) if math.isnan(stated_s) else stated_s
 
     def complete(self, mid_unix_s: float, span_s: float) -> bool:
@@ -121,7 +121,7 @@ class TiltBuffer:
         if not times or times[-1] >= end:
             return bool(times)
         period = float(np.median(np.diff(times))) if len(times) > 2 else USUAL_PERIOD_S
-        # a sample that comes after an exposure is needed where the last one in it leaves much of it open
+        # a sample after the exposure is needed if the last one inside leaves much of it uncovered
         return times[-1] >= max(end - JITTER * period, end - OPEN_END * span_s)
 
     def _near(self, mid_unix_s: float, span_s: float) -> list[Tilt]:
@@ -144,7 +144,7 @@ class TiltBuffer:
         return [near[t] for t in sorted(near)]
 
     def average(self, mid_unix_s: float, span_s: float) -> Tilt:
-        """Average over an exposure; TiltRangeError or TiltError with the reason if there is none."""
+        """Average over an exposure; TiltRangeError or TiltError with the reason if it is impossible."""
         if several := self._publishers.several:
             raise TiltError(several)
         near = self._near(mid_unix_s, span_s)
@@ -152,10 +152,10 @@ class TiltBuffer:
         if not inside:
             self._explain(mid_unix_s, span_s, bool(near))
         else:
-            # Later samples must not count, because it is chance how many have arrived by now; one may be waited for.
+            # Later samples must not count, because their number depends on chance; one may be waited for.
             open_end = mid_unix_s + span_s / 2 - near[inside[-1]].utc_unix_s > OPEN_END * span_s
             near = near[max(inside[0] - 1, 0) : inside[-1] + 1 + open_end]
-        # by samples up to the exposure's end: it is chance how many came since
+        # by samples up to the exposure's end: the number since then depends on chance
         excess = self._steps.excess(mid_unix_s + span_s / 2)
         return TiltLog.of_readings(near, excess).average(mid_unix_s, span_s)
 

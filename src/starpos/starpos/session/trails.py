@@ -14,7 +14,7 @@ from starpos.session.parameters import known_instrument
 
 # this share of an exposure may be without readings
 MOST_MISSING = 0.1
-# of the angle by which a camera may turn in an exposure: 60 deg
+# cosine of the largest turn in an exposure: 60 deg
 LEAST_COSINE = 0.5
 
 
@@ -40,7 +40,7 @@ class Trails:
 
     def take_camera(self, message: Any) -> None:
         """Take a CameraInfo; InstrumentError in a sentence if it cannot be used."""
-        # a size that it may leave open is of no consequence here
+        # a size that it leaves open does not matter here
         self._focal_px = message_to_camera(message, size=(1, 1)).fx
 
     def told(self, frame: Frame) -> Frame:
@@ -54,7 +54,7 @@ class Trails:
         # of directions at the beginning into those at the end; its last column is where a star on the axis goes
         moved = self._link @ turn.T @ self._link.T
         x, y = self._focal_px * moved[:2, 2] / max(moved[2, 2], LEAST_COSINE)
-        # turned so far that stars cross the frame: they leave no trail that could be told
+        # turned so far that stars cross the frame: their trail cannot be determined
         if np.trace(moved) < 1 + 2 * LEAST_COSINE or np.hypot(x, y) > frame.width + frame.height:
             return frame
         roll_rad = np.arctan2(moved[1, 0] - moved[0, 1], moved[0, 0] + moved[1, 1])

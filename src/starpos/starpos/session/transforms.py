@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The instrument as a tree of frames: base link, camera, inclinometer, as far as the solver knows how they are turned."""
+"""The instrument as a tree of frames: base link, camera, inclinometer, as far as their rotations are known."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -13,21 +13,21 @@ from starpos.session.parameter import FRAME_NAME
 
 @dataclass
 class FrameNames:
-    """The names that messages give the frames of camera and inclinometer; '' of one that has none yet."""
+    """The frame names of camera and inclinometer in their messages; '' before the first one."""
 
     camera: str = ""
     inclinometer: str = ""
 
 
 def name_in(message: Any) -> str:
-    """The frame of a message with a header; '' where it is no name for a frame."""
+    """The frame of a message with a header; '' if it is not a valid name."""
     name: str = message.header.frame_id
     return name if FRAME_NAME.fits(name) else ""
 
 
 @dataclass(frozen=True)
 class Transform:
-    """How a frame is turned in another one; where it is there nobody has measured.
+    """Rotation of a frame in another one; its position there is not measured.
 
     quaternion  (x, y, z, w): takes vectors of the child into the parent
     """
@@ -40,7 +40,7 @@ class Transform:
 def transforms_of(instrument: Instrument, link: str, camera: str, inclinometer: str) -> tuple[Transform, ...]:
     """Make the transforms of an instrument whose frames have these names; a frame without a name is left out.
 
-    So is the inclinometer where A3 is not known, or where there is none, and a frame that is in the tree already.
+    So is the inclinometer without a known A3, a missing inclinometer, and a frame that is in the tree already.
     """
     if not camera:
         return ()

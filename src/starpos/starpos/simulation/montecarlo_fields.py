@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Random star fields of known pointing, and a tally of the answers that identification gives for them.
 
-The fields repeat the paper's table.  Their places are those of the catalogue at J2000, without aberration.  Seed and
+The fields repeat the paper's table.  Their places are the catalogue's at J2000, without aberration.  Seed and
 number determine the stars of a field, whatever is done to them afterwards.
 """
 
@@ -22,7 +22,7 @@ from starpos.units import ARCSEC
 TOLERANCE_ARCSEC = 20.0
 # each false star is brighter than the next by this
 FALSE_STEP_MAG = 0.1
-# fewest and most of a field of random points
+# minimum and maximum number of points in a random field
 POINTS = (5, 60)
 
 # direction (3,) in ICRS of the frame's centre, None if not identified
@@ -57,7 +57,7 @@ def ideal(camera: Camera, limit_mag: float = 9.0, **more: float) -> Conditions:
 
 
 def limit_for(camera: Camera, catalogue: Catalogue, stars: float) -> float:
-    """Limiting magnitude at which a frame of this camera holds so many stars on average."""
+    """Limiting magnitude at which a frame of this camera holds this number of stars on average."""
     frames_in_sky = 4 * np.pi * camera.fx * camera.fy / (camera.width * camera.height)
     rank = min(int(stars * frames_in_sky), len(catalogue) - 1)
     return round(float(np.partition(catalogue.vmag_centi, rank)[rank]) / 100, 2)
@@ -67,7 +67,7 @@ def limit_for(camera: Camera, catalogue: Catalogue, stars: float) -> float:
 class Field:
     """Stars of a frame at xy (N, 2) px, brightest first.
 
-    centre (3,): ICRS direction of the frame's centre; None if the field is no part of the sky.
+    centre (3,): ICRS direction of the frame's centre; None for random points.
     """
 
     xy: np.ndarray
@@ -85,7 +85,7 @@ class Field:
     def with_false(self, n: int, camera: Camera) -> "Field":
         """The field with n random points brighter than all its stars.
 
-        The points of n are the last n of those of n + 1.
+        The points of n are the last n of the points of n + 1.
         """
         rng = np.random.default_rng(list(self.name.encode()))
         points = rng.uniform(0, [camera.width - 1, camera.height - 1], (n, 2))[::-1]
@@ -136,7 +136,7 @@ def draw(catalogue: Catalogue, conditions: Conditions, seed: int, number: int) -
 
 
 def draw_points(conditions: Conditions, seed: int, number: int) -> Field:
-    """Draw a field of random points, which is no part of the sky."""
+    """Draw a field of random points."""
     rng, camera = np.random.default_rng([seed, number, 1]), conditions.camera
     n = int(rng.integers(*POINTS))
     xy = rng.uniform(0, [camera.width - 1, camera.height - 1], (n, 2))
@@ -217,7 +217,7 @@ class Tally:
 
 
 def wilson(successes: int, n: int) -> tuple[float, float]:
-    """95 % confidence interval of a probability, after so many successes in n trials (Wilson 1927)."""
+    """95 % confidence interval of a probability, after a number of successes in n trials (Wilson 1927)."""
     if n == 0:
         return 0.0, 1.0
     z2, p = 1.96**2, successes / n

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Random nights, worked as a user would and compared with their truth: they test whether stated errors are right.
+"""Random nights, solved as a user would and compared with their truth: they test whether stated errors are right.
 
 The paper has fifty such nights.  Drawn at random are the place, how camera and inclinometer are fixed to each other, the
 inclinometer's zero, drift, scale and temperature, the air, the clock, the Earth's rotation and the errors of the
-catalogue.  The instrument is told only how large these are.
+catalogue.  The instrument knows only their sizes.
 """
 
 from collections.abc import Callable, Sequence
@@ -52,11 +52,11 @@ def tiltmeter(noise_arcsec: float) -> InclinometerErrors:
 
 @dataclass(frozen=True, kw_only=True)
 class NightWorld:
-    """The truth of a night, and what the instrument is told of it.
+    """The truth of a night, and the instrument's knowledge of it.
 
     scene: the instrument with its errors at its place, under the stars of `sky`.  site: its place by gravity.
     clock_s: its time stamps minus UTC.  per_c (2,): change of the inclinometer's zero in rad per deg C.
-    told, air: instrument and air as the user knows them.
+    `told`, air: instrument and air as the user knows them.
     """
 
     scene: Scene
@@ -265,7 +265,7 @@ def calibrated_night(
     clock_stddev_s: float = 0.01,
     camera: Camera = CAMERA,
 ) -> NightOutcome:
-    """A night after a calibration: that one at a known place with two leans, this one days later at another place."""
+    """A night after a calibration: calibrated at a known place with two leans, days before at another place."""
     world, begin = draw(rng, catalogue, errors, clock_stddev_s, camera)
     zero = Zero(errors, rng, begin)
     stars, tilts, _ = photograph(world, zero, begin, [0.0], frames, rng)

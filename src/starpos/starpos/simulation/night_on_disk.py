@@ -78,7 +78,7 @@ def write_night(
 
 
 def _made(folder: Path) -> dict:
-    """The files that were simulated, each with its digest; none if nothing says so.  Raises OSError."""
+    """The files that were simulated, each with its digest; none without a record.  Raises OSError."""
     try:
         said = json.loads(read_regular(folder / TRUTH, MOST_BYTES))
         return {Path(name).name: digest for name, digest in said[SIMULATED].items()}
@@ -87,7 +87,7 @@ def _made(folder: Path) -> dict:
 
 
 def _take_away_simulated(folder: Path) -> None:
-    """Remove the simulated night that a folder holds; FrameError if it holds files of a night that is none, or changed.
+    """Remove the simulated night that a folder holds; FrameError for other or changed files.
 
     Raises OSError.
     """
@@ -98,7 +98,8 @@ def _take_away_simulated(folder: Path) -> None:
         strange.append(TRUTH)
     if strange:
         raise FrameError(
-            f"{folder / min(strange)}: it is there already, and starpos simulate has not made it as it is: "
+            f"{folder / min(strange)}: it is there already, and starpos simulate did not write it in this "
+            f"form: "
             "give another folder, or move it away"
         )
     for name in there:

@@ -24,7 +24,7 @@ from starpos.sky.catalogue import Catalogue
 from starpos.sky.site import Site, camera_to_enu
 
 FWHM_PER_SIGMA = 2.354820045
-# how well the A3 of a simulated instrument is said to be known
+# stated error of a simulated instrument's A3
 STATED_ARCSEC = (5.0, 5.0, 5.0)
 STAMP_SIGMAS = 5.0
 STRIP_PX = 1 << 20

@@ -78,7 +78,7 @@ class Catalogue:
         return digest.hexdigest()[:16]
 
     def check(self) -> None:
-        """Raise ValueError if the columns do not fit together, or a place is none: the compiled loops trust both."""
+        """Raise ValueError for columns of different length or impossible places: the compiled loops trust both."""
         n = len(self)
         columns = (
             self.dec_mas,
@@ -244,7 +244,7 @@ def read(path: Path | str) -> Catalogue:
     """Read the catalogue from a compact file; CatalogueError if it is missing, broken or of another format."""
     path = Path(path)
     try:
-        # numpy leaves a file open that turns out to be none of its own
+        # numpy leaves a file open that is not in its format
         with open_regular(path) as file, np.load(file, allow_pickle=False) as f:
             if int(f["format"]) != FORMAT:
                 raise CatalogueError(
@@ -274,7 +274,7 @@ def read(path: Path | str) -> Catalogue:
         raise CatalogueError(f"{path}: no catalogue there: run `starpos catalogue build --help`") from None
     except CatalogueError:
         raise
-    # a damaged zip file raises many kinds
+    # a damaged zip file raises many kinds of exception
     except Exception as e:
         raise CatalogueError(
             f"{path}: not a readable catalogue ({e}): restore it or build it again"
@@ -283,7 +283,7 @@ def read(path: Path | str) -> Catalogue:
 
 @lru_cache(maxsize=2)
 def load_catalogue(path: str | None = None) -> Catalogue:
-    """The catalogue at `path`, else that named by STARPOS_CATALOGUE, else the committed one; each is read once.
+    """The catalogue at `path`, else the file named by STARPOS_CATALOGUE, else the committed one; each is read once.
 
     The committed one is kept unpacked in the cache, by its contents, and memory-mapped from there.
     """
@@ -293,7 +293,7 @@ def load_catalogue(path: str | None = None) -> Catalogue:
         with zipfile.ZipFile(COMMITTED) as packed:
             key = repr((FORMAT, [(column.filename, column.CRC) for column in packed.infolist()]))
     except (OSError, zipfile.BadZipFile):
-        # which says what is wrong with it
+        # raises the error of a broken file
         return read(COMMITTED)
     folder = cache_folder() / f"{PREFIX}{hashlib.sha256(key.encode()).hexdigest()[:16]}"
     return load_or_build(folder, PREFIX, lambda: _map(folder), lambda: read(COMMITTED), "")

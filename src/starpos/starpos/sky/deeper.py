@@ -11,11 +11,11 @@ from starpos.sky.catalogue import Catalogue
 from starpos.sky.depth import Depth
 from starpos.table_cache import cache_folder, load_or_build, mapped
 
-# Name of the folder in the cache; the number is that of the format.
+# Cache folder; the number is the format version.
 PREFIX = "stars-1-"
 # The variable of the environment that names the original files: a folder, or Debian's archive of them.
 ORIGINALS = "STARPOS_TYCHO2"
-# Fainter than all stars of Tycho-2, and how many it has.
+# A magnitude fainter than all stars of Tycho-2, and their number.
 ALL_MAG, TYCHO2_STARS = 20.0, 2_550_000
 # How to get the deeper catalogue.
 GET_IT = "type `starpos catalogue deepen --fetch` (121 MB, once)"
@@ -25,9 +25,9 @@ _in_use: dict[Path, Catalogue] = {}
 
 
 def for_field(catalogue: Catalogue, camera: Camera, progress: Progress = quiet) -> Catalogue:
-    """The catalogue, or the deeper one where a camera's field holds too few of its stars.
+    """The catalogue, or the deeper one if a camera's field holds too few of its stars.
 
-    The deeper one is that in the cache; where STARPOS_TYCHO2 names the original files it is built now.  Raises
+    The deeper one comes from the cache; if STARPOS_TYCHO2 names the original files, it is built now.  Raises
     CatalogueError if these cannot be used.
     """
     if Depth.of(camera, catalogue).enough:
@@ -39,7 +39,7 @@ def for_field(catalogue: Catalogue, camera: Camera, progress: Progress = quiet) 
 
 
 def too_thin(catalogue: Catalogue, camera: Camera) -> str:
-    """What a camera's field holds of its catalogue, what it needs and how to get that: '' if it holds enough."""
+    """Sentence on how few catalogue stars a camera's field holds, what it needs and how to get it; '' if enough."""
     depth = Depth.of(camera, catalogue)
     if depth.enough:
         return ""
@@ -68,7 +68,7 @@ def kept() -> Catalogue | None:
 def build(originals: Path | str, progress: Progress = quiet, *, anew: bool = False) -> Catalogue:
     """Build the deeper catalogue from a folder or an archive of the original files, and keep it in the cache.
 
-    One that was built meanwhile is taken, unless it is wanted anew.  Raises CatalogueError as `tycho2.build` does.
+    A catalogue built meanwhile is used, unless a new one is wanted.  Raises CatalogueError as `tycho2.build` does.
     """
     from starpos.sky import tycho2
 

@@ -11,13 +11,13 @@ from starpos.instrument.camera import Camera
 from starpos.sky.catalogue import Catalogue
 from starpos.sky.zones import CELLS, ZONES
 
-# So many of the catalogue's stars should be on a frame, in all but this share of the sky.
+# Number of the catalogue's stars that should be on a frame, in all but this share of the sky.
 ENOUGH_ON_FRAME, SPARSE = 12, 0.1
-# Stars are counted in blocks of so many degrees.
+# Size of the blocks in which stars are counted, deg.
 BLOCK_DEG = 10
-# That share of the sky has so many stars per deg2 to V = 11, and about so many times more with each magnitude.
+# Stars per deg2 to V = 11 in that share of the sky, and factor for each magnitude.
 SPARSE_TO_V11, TIMES_A_MAG = 10.0, 2.2
-# The faintest stars of a catalogue, which this share of it is, are no measure of its depth.
+# Share of a catalogue's faintest stars that is ignored in its depth.
 FAINTEST_SHARE = 0.01
 
 
@@ -27,7 +27,7 @@ class Depth:
 
     width_deg, height_deg  of the field
     limit_mag              V to which the catalogue goes
-    mean, sparse           stars on a frame: on average, and in the tenth of the sky that has fewest
+    mean, sparse           stars on a frame: on average, and in the tenth of the sky with the fewest
     needed_mag             V to which a catalogue for the field should go, to half a magnitude
     """
 
@@ -83,6 +83,6 @@ def _densities(catalogue: Catalogue) -> tuple[float, float, float]:
 def _solid_angle_deg2(width: float, height: float) -> float:
     """Solid angle of a pinhole's frame of this size in focal lengths."""
     u, v = (np.arange(-20, 21) / 20 * n / 2 for n in (width, height))
-    # that of a pixel falls with the cube of the cosine
+    # a pixel's solid angle falls with the cube of the cosine
     share = np.mean((1 + u[:, None] ** 2 + v**2) ** -1.5)
     return float(width * height * share * np.degrees(1) ** 2)

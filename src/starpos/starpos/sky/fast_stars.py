@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Motions of the fast stars for which Tycho-2 has none.
 
-Tycho-2 compares the satellite's places with those on old plates. Of bright stars, which the plates show as blots, and of
-fast ones, which were not found again, it has only the place that the satellite saw (pflag X). Some of these move by
-arcminutes until today. Their motions here are those of Hipparcos (ESA SP-1200, 1997); tools/data/fast_stars.py made the
+Tycho-2 compares the satellite's places with places on old plates. Of bright stars, which the plates show as blots, and of
+fast ones, which were not found again, it has only the satellite's place (pflag X). Some of these move by
+arcminutes until today. Their motions here are from Hipparcos (ESA SP-1200, 1997); tools/data/fast_stars.py made the
 table, of all faster than LEAST_MAS_YEAR and V < 9.
 """
 

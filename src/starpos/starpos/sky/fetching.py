@@ -19,9 +19,9 @@ from starpos.table_cache import cache_folder
 ARCHIVE = "tycho2_2.orig.tar.xz"
 IN_MIRROR = f"pool/main/t/tycho2/{ARCHIVE}"
 SHA256, BYTES = "b0d74bd4280e53f7cfc4b37ccb30a1cfbbc30131907dda81c706bbbab5632dfa", 121_142_216
-# Debian's mirrors near everybody, and its archive of all that it ever had.
+# Debian's mirror network, and its archive of all former packages.
 MIRRORS = "https://deb.debian.org/debian", "https://snapshot.debian.org/archive/debian/20250520T000000Z"
-# A server that is silent for so long is given up.
+# Time after which a silent server is given up.
 SILENCE_S = 30.0
 CHUNK_BYTES = 1 << 18
 CURE = (
@@ -34,7 +34,7 @@ def fetch(mirror: str | None = None, progress: Progress = quiet) -> Path:
     """Fetch the archive of the original files into the cache; the caller removes it once it is used.
 
     mirror: URL of a Debian mirror, or of the file itself (it ends in .xz); None: Debian's own.
-    What has come stays where the connection breaks off, and the next call goes on from there.  Proxies are those of the
+    If the connection breaks off, the received part stays, and the next call goes on from there.  Proxies come from the
     environment (https_proxy).  Raises CatalogueError if no mirror has the file, or if its checksum is another one.
     """
     path = cache_folder() / f"{ARCHIVE}.part"
@@ -94,7 +94,7 @@ def _append(file: BinaryIO, address: str, progress: Progress) -> str:
         return ""
     request = urllib.request.Request(address, headers={"Range": f"bytes={have}-"} if have else {})
     try:
-        # that of urlopen would keep the proxies of its first call
+        # urlopen's opener would keep the proxies of its first call
         with urllib.request.build_opener().open(request, timeout=SILENCE_S) as answer:
             # a server that knows no ranges sends all of it
             if have and answer.status != http.client.PARTIAL_CONTENT:

@@ -18,9 +18,9 @@ from starpos.sky.catalogue import EPOCH, Catalogue, pack
 from starpos.sky.fast_stars import FAST, FAST_SIGMA_MAS_YEAR
 
 SUPPLEMENT_EPOCH = 1991.25
-# 1 sigma of a motion, along one axis, that Tycho-2 does not have. It is the root mean square that Hipparcos measured of
-# these very stars, less the fast ones (63 to 97 from V = 2 to 9; tools/data/fast_stars.py). They move faster than other
-# stars, because fast stars were not found again on old plates.
+# 1 sigma of a motion, along one axis, that Tycho-2 does not have. It is the root mean square in Hipparcos of the same
+# stars, without the fast ones (63 to 97 from V = 2 to 9; tools/data/fast_stars.py). They move faster than other stars,
+# because fast stars were not found again on old plates.
 UNMEASURED_MAS_YEAR = 100.0
 # A record and its newline.
 MAIN_BYTES, SUPPLEMENT_BYTES = 207, 123
@@ -66,7 +66,7 @@ def build(source: Path | str, limit_mag: float, progress: Progress = quiet) -> C
 
 
 def table_of(name: str, text: bytes) -> dict[str, np.ndarray]:
-    """Columns of the original file of a name; CatalogueError if its content is no such table."""
+    """Columns of the original file of a name; CatalogueError if its content is not such a table."""
     if name.startswith("suppl"):
         return _read(text, _SUPPLEMENT, SUPPLEMENT_BYTES, name)
     return _read(text, _MAIN, MAIN_BYTES, name)
@@ -86,7 +86,7 @@ def originals(source: Path) -> Iterator[tuple[str, bytes]]:
                 if file is not None and Path(member.name).name in wanted:
                     yield Path(member.name).name, file.read()
     except (OSError, tarfile.TarError, lzma.LZMAError, EOFError) as e:
-        # what tarfile says of a file that is no archive is a table of all it tried
+        # for a file that is not an archive tarfile's message is a table of all its attempts
         reason = f" ({e.strerror})" if isinstance(e, OSError) and e.strerror else ""
         raise CatalogueError(
             f"{source}: not a folder or archive of Tycho-2's original files{reason}: {CURE}"
@@ -125,7 +125,7 @@ def johnson_v(bt: np.ndarray, vt: np.ndarray) -> np.ndarray:
 
 
 def _motions(t: dict) -> dict[str, np.ndarray]:
-    """Proper motions and their errors, mas/yr; a motion that Tycho-2 does not have is that of `FAST`, or 0."""
+    """Proper motions and their errors, mas/yr; a motion that Tycho-2 does not have is taken from `FAST`, or 0."""
     measured = np.isfinite(t["pm_ra"])
     motion = np.nan_to_num(np.stack([t["pm_ra"], t["pm_dec"]], -1))
     sigma = np.where(
@@ -185,7 +185,7 @@ def _supplement_stars(t: dict) -> dict[str, np.ndarray]:
 def _at_epoch(
     ra: np.ndarray, dec: np.ndarray, motions: dict[str, np.ndarray], year_ra: np.ndarray, year_dec: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Places (deg) at EPOCH of stars that were observed at ra, dec (deg), each in years of its own."""
+    """Places (deg) at EPOCH of stars observed at ra, dec (deg), each in its own year."""
     east, north = (EPOCH - year_ra) * motions["pm_ra"], (EPOCH - year_dec) * motions["pm_dec"]
     return (ra + east / 3.6e6 / np.cos(np.radians(dec))) % 360, dec + north / 3.6e6
 

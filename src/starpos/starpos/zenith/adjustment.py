@@ -21,16 +21,20 @@ from starpos.zenith.errors import Errors, errors_of
 from starpos.zenith.faces import faces_of
 from starpos.zenith.lines import LeanEstimate, Lines, start_of
 from starpos.zenith.places import StarPlaces
+from starpos.zenith.quality import FaceQuality, Leftover, StarQuality, face_qualities
 from starpos.zenith.sighting import Mark, ZenithSighting
 
 STEPS = 8
+# closer to a pole, a deflection is no longer small beside the distance from it
+LEAST_COSINE = 1e-3
 # of its sigma: a smaller step is the last
 SETTLED = 1e-3
 # Anomalous refraction over image motion: a twenty-minute mean of zenith cameras scatters by 0.05 arcsec (Hirt 2006, A&A
 # 459, 283: 0.05 to 0.2 over hours) where a frame's image motion is 0.4; in air that moves no image nothing bends slowly.
 AIR_SHARE = 1 / 8
-# and a night's share above that is within this factor of it (1 sigma)
-AIR_FACTOR = 1.5
+# and a night's share above that is within this factor of it (1 sigma), and within three sigma: a face that is off by more
+# is no air
+AIR_FACTOR, MOST_SIGMA = 1.5, 3.0
 # size of the image motion at which its search begins, rad
 MOTION_RAD = 0.3 * ARCSEC
 # and below which it makes no difference
@@ -56,9 +60,7 @@ class Adjusted:
     frame_stddev_arcsec (N, 2): what these should scatter by.
     catalogue_factor: size of the catalogue's errors over what it states, by the session's own stars.
     chi2_per_degree: of the residuals; 1 where the stated errors and those of the air explain them.
-    by_lean (N, 2, 2), by_second (N, 2): derivatives of the readings by eta and xi, and by a second of the clock, rad.
-    projector (2 N, 2 N), weighted (2 N,): weights of the readings that the unknowns leave, and of their residuals, for
-    tests of what else there may be.
+    face_quality: each face against the others.  stars: the residuals and the leverage of each star.
     """
 
     xi_arcsec: float
@@ -73,10 +75,9 @@ class Adjusted:
     air: Air
     catalogue_factor: float
     chi2_per_degree: float
-    by_lean: np.ndarray
-    by_second: np.ndarray
-    projector: np.ndarray
-    weighted: np.ndarray
+    face_quality: tuple[FaceQuality, ...]
+    stars: StarQuality
+    leftover: Leftover
 
     @property
     def sigma_arcsec(self) -> np.ndarray:
@@ -105,14 +106,22 @@ class _Fit:
 
 
 def adjusted(
-    sightings: Sequence[ZenithSighting], instrument: Instrument, atmosphere: Atmosphere, mark: Mark
+    sightings: Sequence[ZenithSighting],
+    instrument: Instrument,
+    atmosphere: Atmosphere,
+    mark: Mark,
+    air: Air | None = None,
 ) -> Adjusted:
     """The deflection of a session; sightings: in order of time, at least three.
 
-    Raises FixError where there are fewer, or the equations have no solution.
+    air: its size where it is known, as for a session that is only planned; else the residuals determine it.
+
+    Raises FixError where there are fewer, at the poles, or where the equations have no solution.
     """
     if len(sightings) < 3:
         raise FixError(f"{len(sightings)} frames make no session: at least 3, in several faces, are needed")
+    if np.cos(mark.latitude) < LEAST_COSINE:
+        raise FixError("the mark is within 6 km of a pole, where eta has no direction")
     places = StarPlaces.of(sightings)
     sightings = places.applied(sightings)
     faces, prior = faces_of(sightings), _prior_of(instrument)
@@ -120,8 +129,7 @@ def adjusted(
     given = instrument.calibration
     start = start_of(sightings)
     estimate = start if given.unknown else LeanEstimate(lean=np.zeros(2), a3=given.a3)
-    offset, sized = np.zeros(5), False
-    air = Air(motion=MOTION_RAD, anomalous=MOTION_RAD * AIR_SHARE)
+    offset, size = np.zeros(5), air
     for _ in range(STEPS):
         lines = Lines.at(estimate, sightings, bending)
         errors = errors_of(
@@ -129,13 +137,14 @@ def adjusted(
         )
         stated = np.sum([s.covariance for s in errors.sources], axis=0)
         # A3's prior stays where it was
-        if not sized:
-            air, sized = _air_of(lines, stated, errors, prior, offset), True
-        fit = _fitted(lines, _whole(stated, errors, air), prior, offset)
+        if size is None:
+            size = _air_of(lines, stated, errors, prior, offset)
+        fit = _fitted(lines, _whole(stated, errors, size), prior, offset)
         estimate, offset = estimate.moved(fit.step), offset + fit.step
         if np.abs(fit.step).max() < SETTLED * np.sqrt(np.diag(fit.covariance)).min():
             break
-    return _adjusted(estimate, sightings, lines, errors, fit, air, faces, mark, places.factor)
+    assert size is not None
+    return _adjusted(estimate, sightings, lines, errors, fit, size, faces, mark, places)
 
 
 def _prior_of(instrument: Instrument) -> np.ndarray:
@@ -159,14 +168,17 @@ def _air_of(lines: Lines, stated: np.ndarray, errors: Errors, prior: np.ndarray,
 
     def of(p: np.ndarray) -> Air:
         motion = float(np.hypot(LEAST_RAD, MOTION_RAD * np.exp(p[0])))
-        return Air(motion=motion, anomalous=motion * AIR_SHARE * AIR_FACTOR ** max(float(p[1]), 0.0))
+        return Air(
+            motion=motion, anomalous=motion * AIR_SHARE * AIR_FACTOR ** min(max(float(p[1]), 0.0), MOST_SIGMA)
+        )
 
     def cost(p: np.ndarray) -> float:
         return _fitted(lines, _whole(stated, errors, of(p)), prior, offset).cost + float(p[1] ** 2)
 
-    found = minimize(
-        cost, np.zeros(2), method="Nelder-Mead", options={"xatol": 0.02, "fatol": 0.02, "maxfev": 120}
-    )
+    # wide: in still air the cost hardly changes over a factor of ten
+    simplex = np.array([[0.0, 0.0], [-3.0, 0.0], [0.0, 1.0]])
+    options = {"initial_simplex": simplex, "xatol": 0.05, "fatol": 0.002, "maxfev": 120}
+    found = minimize(cost, simplex[0], method="Nelder-Mead", options=options)
     return of(found.x)
 
 
@@ -198,7 +210,7 @@ def _adjusted(
     air: Air,
     faces: np.ndarray,
     mark: Mark,
-    catalogue_factor: float,
+    places: StarPlaces,
 ) -> Adjusted:
     # slow to import
     from scipy.linalg import cho_solve
@@ -214,7 +226,7 @@ def _adjusted(
         term = gain @ covariance @ gain.T
         total += term
         if term.any():
-            xi, eta = np.sqrt(np.diag(term)).tolist()
+            xi, eta = np.sqrt(np.maximum(np.diag(term), 0.0)).tolist()
             terms.append((name, xi, eta))
     whole = fit.covariance[:2, :2][::-1, ::-1] / ARCSEC**2
     given = np.sqrt(np.maximum(np.diag(whole - total), 0.0))
@@ -228,9 +240,15 @@ def _adjusted(
     own = own.reshape(n, 2, n, 2)[np.arange(n), :, np.arange(n)]
     per_frame = np.einsum("nab,nbc,ndc->nad", back, own, back)
     up = estimate.a3 @ np.append(estimate.lean, 1.0)
-    xi_eta = estimate.lean[::-1] / ARCSEC
+    xi_eta = estimate.deflection(mark.latitude) / ARCSEC
     inverse = cho_solve((fit.root, True), np.eye(2 * n))
     design = inverse @ lines.by_parameters.reshape(-1, 5)
+    leftover = Leftover(
+        by_lean=lines.by_lean,
+        by_second=lines.by_sky @ (mark.enu[:, 2] * ROTATION_RAD_S),
+        projector=inverse - design @ fit.covariance @ design.T,
+        weighted=inverse @ left.reshape(-1),
+    )
     return Adjusted(
         xi_arcsec=float(xi_eta[0]),
         eta_arcsec=float(xi_eta[1]),
@@ -242,10 +260,9 @@ def _adjusted(
         frame_arcsec=np.einsum("nab,nb->na", back, left)[:, ::-1] / ARCSEC,
         frame_stddev_arcsec=np.sqrt(np.diagonal(per_frame, axis1=1, axis2=2))[:, ::-1] / ARCSEC,
         air=air,
-        catalogue_factor=catalogue_factor,
+        catalogue_factor=places.factor,
         chi2_per_degree=fit.chi2 / max(left.size - 5, 1),
-        by_lean=lines.by_lean,
-        by_second=lines.by_sky @ (mark.enu[:, 2] * ROTATION_RAD_S),
-        projector=inverse - design @ fit.covariance @ design.T,
-        weighted=inverse @ left.reshape(-1),
+        face_quality=face_qualities(leftover, sightings, faces),
+        stars=StarQuality.of(sightings, places, lines, gain),
+        leftover=leftover,
     )

@@ -6,11 +6,14 @@ from collections.abc import Sequence
 import numpy as np
 
 from starpos.earth.ellipsoid import EARTH_RADIUS_M
+from starpos.earth.orientation import earth_motion
 from starpos.errors import FixError
+from starpos.sky.catalogue import load_catalogue
 from starpos.units import ARCSEC
 from starpos.utc import utc_text
 from starpos.zenith.adjustment import Adjusted
 from starpos.zenith.faces import mean_headings
+from starpos.zenith.quality import FaceQuality
 from starpos.zenith.sighting import ZenithSighting
 
 # A deflection whose sigma is larger is none: maps of the geoid know it better.
@@ -19,8 +22,13 @@ MOST_SIGMA_ARCSEC = 3.0
 LARGE_ARCSEC, MOST_ARCSEC = 25.0, 120.0
 # chi-square of a step or of a face, which chance exceeds in one session of 10^5 with hundreds of frames
 DOUBTED_CHI2 = 36.0
+# a face above that is named: chance does it in one of 1000 sessions of eight faces
+UNLIKE_CHI2 = 18.0
 # a face with a smaller share of the usual number of frames is thin
 THIN = 0.5
+# Tycho-2 over 6 deg and more: less than 1 mas in places, of 1991.25, and about 0.5 mas a year in proper motions (Hog et
+# al. 2000, A&A 355, L27, section 3).  A catalogue whose stars err by less than LIKE_GAIA_ARCSEC has no such zones.
+ZONES_ARCSEC, ZONES_ARCSEC_PER_YEAR, ZONES_EPOCH, LIKE_GAIA_ARCSEC = 0.001, 0.0005, 1991.25, 0.005
 # Differences of lean that the scale turns into more than so many sigma of the deflection rest on the scale being the same
 # everywhere, which nobody states.
 UNLEVEL_SIGMA = 3.0
@@ -37,7 +45,7 @@ def check_session(found: Adjusted, sightings: Sequence[ZenithSighting]) -> None:
             "the deflection undetermined: turn the instrument by half a turn, better to four faces, or calibrate A3"
         )
     chi2, sentence = max(
-        (_clock(found, sightings), _zero(found, sightings), _face(found, headings)),
+        (_clock(found, sightings), _zero(found, sightings), _face(found)),
         key=lambda doubt: doubt[0],
     )
     if chi2 > DOUBTED_CHI2:
@@ -68,6 +76,16 @@ def remarks(found: Adjusted, sightings: Sequence[ZenithSighting], frames: int, s
             f"face {face + 1} has {number[face]} frames of the usual {np.median(number):.0f}: clouds, or its tilts were "
             "refused"
         )
+    for quality in found.face_quality:
+        if quality.chi2 > UNLIKE_CHI2:
+            xi, eta = quality.stddev_arcsec
+            said.append(f"{_face_off(quality)} (1 sigma {xi:.2f}, {eta:.2f}): look at its frames")
+    zones = _zones_arcsec(found, sightings)
+    if found.sigma_arcsec.min() < zones:
+        said.append(
+            f"zonal errors of Tycho-2, up to {zones:.3f} arcsec here, are not in the covariance: all sessions under "
+            "these stars share them: use Gaia's places (starpos catalogue build --gaia)"
+        )
     if frames > len(sightings):
         said.append(f"{frames - len(sightings)} of {frames} frames are left out")
     lean = max(np.ptp([s.tilt.theta[k] for s in sightings]) for k in (0, 1)) / ARCSEC
@@ -78,6 +96,15 @@ def remarks(found: Adjusted, sightings: Sequence[ZenithSighting], frames: int, s
             f"{found.sigma_arcsec.max() / scale:.0f} arcsec"
         )
     return said
+
+
+def _zones_arcsec(found: Adjusted, sightings: Sequence[ZenithSighting]) -> float:
+    """Zonal errors of the catalogue at the session's date, at most; 0 for a catalogue like Gaia's."""
+    year, _ = earth_motion(sightings[0].utc_unix_s)
+    sigma = float(np.median(load_catalogue().sigma(found.stars.stars, year))) / ARCSEC
+    if sigma < LIKE_GAIA_ARCSEC:
+        return 0.0
+    return ZONES_ARCSEC + ZONES_ARCSEC_PER_YEAR * abs(year - ZONES_EPOCH)
 
 
 def _off(found: Adjusted) -> str:
@@ -91,7 +118,7 @@ def _off(found: Adjusted) -> str:
 
 def _clock(found: Adjusted, sightings: Sequence[ZenithSighting]) -> tuple[float, str]:
     """Chi-square of the likeliest jump of the clock, and the sentence about it."""
-    step, chi2, at = _steps(found, found.by_second[..., None])
+    step, chi2, at = _steps(found, found.leftover.by_second[..., None])
     when = utc_text(sightings[at].utc_unix_s)
     return chi2, (
         f"the clock that stamps the frames seems to have jumped by {step[0]:+.3f} s before {when}: use the frames "
@@ -110,34 +137,26 @@ def _zero(found: Adjusted, sightings: Sequence[ZenithSighting]) -> tuple[float, 
     )
 
 
-def _face(found: Adjusted, headings: np.ndarray) -> tuple[float, str]:
+def _face(found: Adjusted) -> tuple[float, str]:
     """Chi-square of the face that goes least with the others, and the sentence about it."""
-    best, sentence = 0.0, ""
-    # of two faces nobody knows which is wrong
-    for face in range(len(headings) if len(headings) > 2 else 0):
-        rows = (found.faces == face)[:, None, None]
-        step, chi2 = _test(found, found.by_lean * rows)
-        if chi2 - 2 > best:
-            best = chi2 - 2
-            sentence = (
-                f"face {face + 1} (top of the frame at {headings[face]:.0f} deg, {rows.sum()} frames) is "
-                f"{np.hypot(*step) / ARCSEC:.2f} arcsec off what the others have: leave its frames out, or repeat it"
-            )
-    return best, sentence
+    if not found.face_quality:
+        return 0.0, ""
+    worst = max(found.face_quality, key=lambda face: face.chi2)
+    # two parameters where the clock has one
+    return worst.chi2 - 2, f"{_face_off(worst)}: leave its frames out, or repeat it"
+
+
+def _face_off(face: FaceQuality) -> str:
+    return (
+        f"face {face.number + 1} (top of the frame at {face.heading_deg:.0f} deg, {face.frames} frames) is "
+        f"{np.hypot(*face.off_arcsec):.2f} arcsec off what the others have"
+    )
 
 
 def _steps(found: Adjusted, columns: np.ndarray) -> tuple[np.ndarray, float, int]:
     """The likeliest jump (m,) along columns (N, 2, m), its chi-square, and the frame from which on it holds."""
     late = np.arange(len(columns))
-    every = [_test(found, columns * (late >= k)[:, None, None]) for k in late[1:]]
-    at = int(np.argmax([chi2 for _, chi2 in every]))
-    return *every[at], at + 1
-
-
-def _test(found: Adjusted, columns: np.ndarray) -> tuple[np.ndarray, float]:
-    """The best multiple (m,) of further columns (N, 2, m) of the equations, and by how much chi-square falls."""
-    flat = columns.reshape(-1, columns.shape[2])
-    normal = flat.T @ found.projector @ flat
-    right = flat.T @ found.weighted
-    step = np.linalg.lstsq(normal, right, rcond=1e-9)[0]
-    return step, float(step @ right)
+    every = [found.leftover.tested(columns * (late >= k)[:, None, None]) for k in late[1:]]
+    at = int(np.argmax([chi2 for _, _, chi2 in every]))
+    step, _, chi2 = every[at]
+    return step, chi2, at + 1

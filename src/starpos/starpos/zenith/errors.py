@@ -8,13 +8,18 @@ import numpy as np
 
 from starpos.earth.orientation import ROTATION_RAD_S
 from starpos.instrument.inclinometer import InclinometerErrors
+from starpos.units import ARCSEC
 from starpos.zenith.lines import Lines
 from starpos.zenith.places import StarPlaces
 from starpos.zenith.sighting import Mark, ZenithSighting
 
 HOUR_S = 3600.0
-# Temperature of a tiltmeter that nobody measured: it follows a clear night's air, some degrees in a few hours.
+# Unmeasured temperature of a tiltmeter: it follows a clear night's air, some degrees in a few hours.
 UNKNOWN_WALK_C_PER_SQRT_HOUR = 2.0
+# Daily and half-daily terms of UT1 and of the pole, which tables of a value a day have not: root mean square of the ocean
+# tides' terms (IERS Conventions (2010), tables 8.2 and 8.3: M2 alone is 0.33 mas of the pole, O1 0.02 ms of UT1), and of
+# interpolating UT1 linearly across a day of its fortnightly tide (0.8 ms, table 8.1).
+DAILY_UT1_S, DAILY_POLE_RAD = 3e-5, 3e-4 * ARCSEC
 # Correlation time of anomalous refraction, within the minutes to hours of Hirt (2006), A&A 459, 283.
 AIR_TAU_S = 1200.0
 
@@ -42,7 +47,7 @@ class Source:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Errors:
-    """All errors of the readings but those of the air: sources; and those of the air for 1 rad of each.
+    """All errors of the readings: sources without the air, and the air's errors for 1 rad of each.
 
     motion: image motion, new in each frame.  air: anomalous refraction, that changes within AIR_TAU_S.
     """
@@ -141,6 +146,6 @@ def _of_time(lines: Lines, sightings: Sequence[ZenithSighting], mark: Mark) -> l
     pole = np.array([s.orientation.pole_sigma for s in sightings])
     return [
         Source.shared("clock", (second * clock[:, None])[..., None]),
-        Source.shared("ut1", (second * ut1[:, None])[..., None]),
-        Source.shared("pole", lines.by_sky @ mark.enu[:, :2] * pole[:, None, None]),
+        Source.shared("ut1", (second * np.hypot(ut1, DAILY_UT1_S)[:, None])[..., None]),
+        Source.shared("pole", lines.by_sky @ mark.enu[:, :2] * np.hypot(pole, DAILY_POLE_RAD)[:, None, None]),
     ]

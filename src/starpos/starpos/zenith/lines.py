@@ -27,6 +27,18 @@ class LeanEstimate:
         """The estimate after a step (5,): eta, xi, and a small rotation of A3 about S's axes."""
         return LeanEstimate(lean=self.lean + step[:2], a3=rotation.from_vector(step[2:]) @ self.a3)
 
+    def deflection(self, latitude: float) -> np.ndarray:
+        """Deflection (2,) xi, eta in rad at a geodetic latitude, by the astronomic latitude and longitude of up.
+
+        xi is the difference of the latitudes, eta that of the longitudes times cos(latitude) (Heiskanen and Moritz 1967,
+        section 5-4).  It differs from up's lean by xi eta tan(latitude), 3 mas at 80 deg for 10 arcsec of each.
+        """
+        east, north = self.lean
+        sine, cosine = np.sin(latitude), np.cos(latitude)
+        across = cosine - sine * north
+        astronomic = np.arctan2(sine + cosine * north, np.hypot(east, across))
+        return np.array([astronomic - latitude, np.arctan2(east, across) * cosine])
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Lines:

@@ -23,11 +23,12 @@ MOST_FACTOR = 5.0
 class StarPlaces:
     """Corrections of S stars' places along the axes of ICRS, in units of their sigmas in the catalogue.
 
-    rows: for each frame, which of the S stars are its (N,).  correction (S, 3).
+    stars (S,): rows of the catalogue.  rows: for each frame, which of the S stars are its (N,).  correction (S, 3).
     root (3 S, 3 S): lower triangular, of the weights that the corrections have.
     factor: size of the catalogue's errors over what it states.
     """
 
+    stars: np.ndarray
     rows: tuple[np.ndarray, ...]
     correction: np.ndarray
     root: np.ndarray
@@ -42,18 +43,21 @@ class StarPlaces:
         names, inverse = np.unique(np.concatenate([s.stars for s in sightings]), return_inverse=True)
         rows = tuple(np.split(inverse, np.cumsum([len(s.stars) for s in sightings])[:-1]))
         number = len(names)
-        weights, right = np.zeros((number, 3, number, 3)), np.zeros((number, 3))
-        for k, s in zip(rows, sightings, strict=True):
-            # a frame's attitude and scale take up what its stars have in common
-            taken = np.einsum("pni,pmj->nimj", s.star_common, s.star_common)
-            weights[k[:, None], :, k] -= taken.transpose(0, 2, 1, 3)
-            weights[k, :, k] += s.star_weight
-            right[k] += s.star_pull
-        flat, pull = weights.reshape(3 * number, -1), right.ravel()
+        own, right = np.zeros((number, 3, 3)), np.zeros((number, 3))
+        # a frame's attitude and scale take up what its stars have in common
+        taken = np.zeros((len(sightings), 4, number, 3))
+        for k, (row, s) in enumerate(zip(rows, sightings, strict=True)):
+            taken[k][:, row] = s.star_common
+            own[row] += s.star_weight
+            right[row] += s.star_pull
+        common = taken.reshape(-1, 3 * number)
+        flat, pull = -common.T @ common, right.ravel()
+        blocks, each = flat.reshape(number, 3, number, 3), np.arange(number)
+        blocks[each, :, each] += own
         factor = _factor(flat, pull)
         root = cholesky(flat + np.eye(len(flat)) / factor**2, lower=True)
         correction = cho_solve((root, True), pull).reshape(-1, 3)
-        return cls(rows=rows, correction=correction, root=root, factor=factor)
+        return cls(stars=names, rows=rows, correction=correction, root=root, factor=factor)
 
     def applied(self, sightings: Sequence[ZenithSighting]) -> list[ZenithSighting]:
         """The sightings with the attitudes that the corrected places give."""

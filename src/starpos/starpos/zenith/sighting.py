@@ -128,9 +128,8 @@ def sighting(solver: Solver, stars: Stars, found: Identification, mark: Mark, ti
     # the catalogue's errors do not weigh here: `places` adjusts them with those of all frames
     fit = fitted(problem, camera.directions(*matched.xy.T), matched.covariance_px2)
     kept, residual = fit.kept, fit.residual[fit.kept]
-    catalogue_px2 = float(np.mean((matched.place_sigma[kept] * camera.fx) ** 2))
-    extra2 = expected_extra(residual, matched.covariance_px2[kept], share_free(fit.keep))
-    centroids = matched.covariance_px2[kept] + ISOTROPIC * max(extra2 - catalogue_px2, 0.0)
+    placed_px = matched.place_sigma[kept] * camera.fx
+    centroids = centroids_of(residual, matched.covariance_px2[kept], placed_px, share_free(fit.keep))
     errors = StarErrors.of(fit.slope[kept], centroids, np.zeros_like(centroids), ())
     if not np.isfinite(errors.gain).all():
         raise FixError(
@@ -168,6 +167,16 @@ def sighting(solver: Solver, stars: Stars, found: Identification, mark: Mark, ti
         clock_stddev_s=solver.clock_stddev_s(stars),
         stamp_stddev_s=stars.stamp_stddev_s,
     )
+
+
+def centroids_of(residual: np.ndarray, stated: np.ndarray, placed_px: np.ndarray, share: float) -> np.ndarray:
+    """Covariances (N, 2, 2) px2 of centroids, as stated (N, 2, 2) or larger where the residuals (N, 2) show it.
+
+    placed_px (N,): 1 sigma of the stars' own places, each with its star: one of unknown motion would otherwise hide the
+    scatter of all centroids.  share: part of the coordinates that the fit leaves free.
+    """
+    whole = stated + ISOTROPIC * placed_px[:, None, None] ** 2
+    return stated + ISOTROPIC * expected_extra(residual, whole, share)
 
 
 def _seen(stars: MatchedStars, state: EarthState, shutter: Shutter, height: int, mark: Mark) -> np.ndarray:

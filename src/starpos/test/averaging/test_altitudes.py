@@ -64,7 +64,7 @@ def test_claims_are_true_over_many_nights(azimuths, noise, least):
 
 
 def test_three_directions_that_contradict_each_other_are_no_place():
-    """One residual does not tell by how much they err: 8 of 100 such nights were beyond 5 sigma."""
+    """One residual does not show by how much they err: 8 of 100 such nights were beyond 5 sigma."""
     refused = []
     for seed in range(12):
         night = pointed_night(np.random.default_rng(seed), THREE, frames=1, noise=120.0)
@@ -100,7 +100,7 @@ def test_directions_around_the_horizon_cancel_an_error_of_a3():
 
 def test_one_direction_is_no_place_however_the_sky_turns(rng):
     night = pointed_night(rng, (10.0,), frames=6)
-    with pytest.raises(FixError, match="6 elevations in 1 direction tell no place"):
+    with pytest.raises(FixError, match="6 elevations in 1 direction do not determine a place"):
         place_of_circles(circles(night))
 
 

@@ -142,7 +142,7 @@ def test_a_better_frame_counts_more(rng):
 
 def test_two_frames_of_two_places_have_no_average(rng):
     here, there = SkyField(), replace(SkyField(), latitude=SkyField().latitude + 0.5)
-    with pytest.raises(FixError, match="not of one place"):
+    with pytest.raises(FixError, match="the frames are of several places"):
         average(in_order(fixes(here, rng, [40.0]) + fixes(there, rng, [40.0])))
 
 
@@ -245,7 +245,7 @@ def test_as_they_come_or_all_at_once(rng):
     for f in made:
         averager.add(f)
     a, b = average(made[::-1]), averager.average
-    # at once, the first frames too are judged by what all tell of their scatter
+    # at once, the first frames too are judged by the scatter of all
     assert (a.frames, a.poses) == (b.frames, b.poses) == (10, 2)
     apart = np.array([a.latitude - b.latitude, a.longitude - b.longitude]) * 6.37e6
     assert np.all(np.abs(apart) < 0.3 * sigmas(b)[:2])
@@ -253,7 +253,7 @@ def test_as_they_come_or_all_at_once(rng):
 
 
 def test_frames_that_share_a_few_readings_are_believed_and_no_more_than_is_due(rng):
-    """Every third frame has lost its own readings: it is told by the last before it and the first after it."""
+    """Every third frame has lost its own readings: its tilt comes from the readings around it."""
     field, off, n = SkyField(altitude=85.0), [], 30
     for _ in range(n):
         readings = rng.normal(0, 5 * ARCSEC, (30, 2))
@@ -286,7 +286,7 @@ def spoiled(f, east_m=0.0, north_m=0.0):
 
 
 def check_not_moved(spoiled_fixes, sound, field):
-    """Check that the average of these is that of the sound ones, within a fraction of its error."""
+    """Check that the average of these equals the sound ones' average, within a fraction of its error."""
     a, b = average(in_order(spoiled_fixes)), average(in_order(sound))
     off = moved_m(a, field) - moved_m(b, field)
     assert np.all(np.abs(off) < 0.5 * sigmas(b)[:2])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Sequences of fixes nobody would think of: never an exception, never a number that is none, and true of the place."""
+"""Random sequences of fixes: never an exception, never an invalid number, and true of the place."""
 
 import pickle
 import warnings
@@ -104,7 +104,7 @@ def run(made):
         for f in made.fixes:
             averager.add(f)
             a = averager.average
-            # Nobody believes a fix since the camera was touched.
+            # No fix since the camera was touched is used.
             rows = 2 if np.isnan(a.heading) else 3
             covariance = a.covariance[:rows, :rows]
             assert np.isfinite([a.utc_unix_s, a.latitude, a.longitude, a.began_unix_s]).all()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A camera at rest, touched, or with stamps that contradict each other: told by its attitude on the Earth alone."""
+"""A camera at rest, touched, or with stamps that contradict each other: detected by its attitude on the Earth alone."""
 
 from dataclasses import replace
 

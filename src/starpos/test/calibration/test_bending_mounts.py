@@ -2,7 +2,7 @@
 """Nights whose errors of a pose are smooth functions of the camera's attitude, as two real ones have them.
 
 One has 13 directions of 35 to 54 deg of lean with an SCL3300 by its public figures (steps of 90 deg / 2^14, a noise of
-0.001 deg per root Hz at 10 Hz), bends of 0.1 deg and, in the second night, three poses that are off by 0.5 deg. The other
+0.001 deg per root Hz at 10 Hz). It bends by 0.1 deg, and in the second night three poses are off by 0.5 deg. The other
 has an IMU with 1.4 % of scale and 0.09 deg of noise, and two leans in two poses. No error is stated but the noise of a
 good sensor.
 """

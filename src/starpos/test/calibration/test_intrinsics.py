@@ -72,7 +72,7 @@ def test_what_a_few_stars_of_a_narrow_field_cannot_tell_the_prior_holds(rng):
 
 
 def test_what_the_prior_holds_stays_near_its_middle(rng):
-    """The best guess, not the likeliest: stars that hardly tell the principal point hardly move it."""
+    """The best guess, not the likeliest: stars that hardly determine the principal point hardly move it."""
     given = ideal(3.4)
     fits = [fit_camera(sightings(given, 1, 40, rng, sigma=1.0), given, VACUUM) for _ in range(12)]
     moved = np.array([(f.values - values(given)) / f.prior_sigma for f in fits])[:, 2:4]
@@ -179,12 +179,12 @@ def test_refraction_is_undone_where_the_level_is_known(rng):
     assert np.abs(fit.values - values(true))[:2].max() < 0.02
     assert np.abs(prediction_errors(true, fit.camera)).max() < 2e-3
     without = fit_camera([replace(s, level=None) for s in seen], ideal(11), VACUUM)
-    # 3e-4 of the focal length: the test can tell.
+    # 3e-4 of the focal length: the test can see it.
     assert np.abs(without.values - values(true))[:2].min() > 1.0
 
 
 def test_air_that_is_stronger_than_said_is_in_the_sigma(rng):
-    """Near the zenith, where it is nothing but scale; further down the stars tell how strong it is."""
+    """Near the zenith, where it is nothing but scale; further down the stars show how strong it is."""
     true, air = random_camera(11, rng), Atmosphere.measured(None, None)
     stronger = 1 + 2 * air.relative_sigma
     high, low = (
@@ -247,7 +247,7 @@ def test_stars_that_agree_on_too_little(rng):
 def test_a_camera_of_another_focal_length(rng):
     true = ideal(11).scaled(1.2)
     fit = fit_camera(sightings(true, 5, 60, rng), ideal(11), VACUUM)
-    with pytest.raises(CalibrationError, match="too unlike the given one"):
+    with pytest.raises(CalibrationError, match="too different from the given one"):
         check_sound(fit, ideal(11))
 
 

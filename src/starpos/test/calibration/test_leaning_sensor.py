@@ -39,7 +39,7 @@ STATED = InclinometerErrors(noise_rad=NOISE_RAD, quantum_rad=STEP_RAD)
 
 @dataclass(frozen=True)
 class Night:
-    """Frames with the tilt of each, by its time; `bad`: numbers of the frames whose tilt is off by 0.5 deg."""
+    """Frames with their tilts by time; `bad`: numbers of the frames whose tilt is off by 0.5 deg."""
 
     scene: Scene
     frames: list[Stars]

@@ -63,7 +63,7 @@ def test_one_lean_is_right_at_that_lean_and_wide_at_another(catalogue, rng, fram
     assert np.sqrt(np.linalg.eigvalsh(found.instrument.calibration.covariance_arcsec2)[-1]) > 90 * 3600
     same, metres, sigmas = solved(shots(catalogue, rng, [0.0], start=START + 900), found, catalogue)
     assert sigmas < 4
-    # the noise of both readings, 390 m each, and the lean by which they differ turned by nobody knows what
+    # the noise of both readings, 390 m each, and the lean by which they differ, turned by an unknown angle
     assert metres < 4 * 390 * np.sqrt(1 + 1 / frames)
     assert sigma_m(same) < 3000
     # As wide as the turn is unknown: sideways and, beyond half a turn, along the lean.
@@ -85,9 +85,9 @@ def test_two_leans_tell_all_of_a3(catalogue, rng, given):
     off, chi2 = a3_error(shot, found.instrument.calibration)
     assert np.all(np.abs(off) < 4 * stddev(found.instrument.calibration))
     assert chi2 < 25
-    # 12.6 arcsec / sqrt(2) at both ends of 6 deg, of which one axis across tells the turn
+    # 12.6 arcsec / sqrt(2) at both ends of 6 deg, of which one axis across determines the turn
     turn = np.sqrt(np.linalg.eigvalsh(found.instrument.calibration.covariance_arcsec2)[-1])
-    # two leans cannot tell it from axes that are not square
+    # two leans cannot separate it from axes that are not square
     assert 0.7 < turn / (NOISE_ARCSEC / np.sin(np.radians(6))) < 3
     elsewhere, metres, sigmas = solved(shots(catalogue, rng, [-3.0], start=START + 900), found, catalogue)
     assert sigmas < 4
@@ -137,7 +137,7 @@ def test_a_bad_tilt_among_ten_does_not_move_it(catalogue, ten, off_deg, which):
 
 @pytest.mark.parametrize("bad", [[0], [0, 1], [1, 2, 3]])
 def test_frames_that_do_not_agree(catalogue, rng, bad):
-    """No noise of any inclinometer explains degrees: which of two or four frames are right cannot be told."""
+    """No noise of any inclinometer explains degrees: which of two or four frames are right is undetermined."""
     shot = shots(catalogue, rng, [0.0] * max(2, 2 * len(bad)))
     for k in bad:
         shot.spoil(k, 2.0 * (k + 1))
@@ -152,13 +152,13 @@ def test_frames_that_noise_explains_are_not_refused_but_claim_little(catalogue, 
     shot.spoil(0, 0.2)
     found = found_at(shot, catalogue)
     assert 0.05 < found.plumb_stddev_arcsec / 3600 < 0.5
-    assert "more than is stated of the inclinometer" in found.beyond and "state tilt_" in found.beyond
+    assert "more than the inclinometer's stated errors" in found.beyond and "state tilt_" in found.beyond
     assert found_at(shots(catalogue, rng, [0.0] * 4), catalogue).beyond == ""
 
 
 @pytest.mark.montecarlo
 def test_frames_that_scatter_more_than_they_say_claim_less(catalogue):
-    """A mount that creeps by 24 arcsec from frame to frame, which nobody told."""
+    """A mount that creeps by 24 arcsec from frame to frame, which is not stated."""
     calm, creeping = (shots(catalogue, np.random.default_rng(3), [0.0] * 8) for _ in range(2))
     rng = np.random.default_rng(4)
     for k in range(8):
@@ -240,7 +240,7 @@ def test_what_is_said_of_the_turn_holds_where_the_leans_tell_little(catalogue, r
     # As it was said to be.
     assert told.misalignment_deg[2] == pytest.approx(128.0, abs=0.2)
     assert a3_error(shot, told)[1] < 16
-    # against leans that tell it to 0.04 deg it has nothing to say
+    # against leans that determine it to 0.04 deg it has no weight
     leaning = shots(catalogue, rng, [0.0, 0.0, 6.0, 6.0])
     free, held = (
         found_at(leaning, catalogue, near, turn_stddev_deg=t).instrument.calibration for t in (180, 2.0)
@@ -249,8 +249,7 @@ def test_what_is_said_of_the_turn_holds_where_the_leans_tell_little(catalogue, r
 
 
 def test_a_turn_said_wide_counts_from_what_was_said(catalogue):
-    """Leans that tell the turn to some 20 deg, and one said to be good to 30: between the two, not at a turn in between
-    that nobody named."""
+    """Leans determine the turn to some 20 deg, and the stated one is good to 30: the answer lies between the two."""
     shot = shots(catalogue, np.random.default_rng(2), [0.0, 0.01])
     for said in (130.0, 100.0, 40.0):
         c = found_at(shot, catalogue, (1.5, -2.0, said), turn_stddev_deg=30.0).instrument.calibration

@@ -140,7 +140,7 @@ def test_leans_by_hand_tell_the_turn_of_a3_too():
 
 @pytest.mark.parametrize("noise", [SCA100T, QUIET])
 def test_without_a_lean_the_turn_stays_what_it_was(noise):
-    """Its error is that of any angle."""
+    """Its error is as for any angle."""
     for seed in range(10):
         made, truth = readings(np.random.default_rng(seed), FOUR, noise)
         found = level(made, truth.given)
@@ -155,7 +155,7 @@ def test_without_a_lean_the_turn_stays_what_it_was(noise):
 @pytest.mark.parametrize("lean", [0.05, 1.0])
 @pytest.mark.parametrize("headings", [(0, 180), FOUR, MANY])
 def test_about_an_axis_that_leans_the_zenith_is_lost_on_a_circle(headings, lean, noise):
-    """However often: turn A3 about it, and the zenith goes round it.  A foot raised tells (above), or a prior."""
+    """However often: turn A3 about it, and the zenith goes round it.  A raised foot decides (above), or a prior."""
     for seed in range(6):
         made, truth = readings(np.random.default_rng(seed), headings, noise, lean=lean)
         found = level(made, truth.given)
@@ -229,7 +229,7 @@ def test_misread_tilts_stand_out_and_pull_no_harder_than_three_sigma(bad, noise)
         off = np.linalg.norm(found.left, axis=1) / noise
         assert set(np.argsort(off)[-len(bad) :]) == set(bad)
         assert off[list(bad)].min() > 20 > 6 > np.delete(off, bad).max()
-        # the pull of 3 sigma from each, beside the noise
+        # the pull of 3 sigma from each, besides the noise
         pull = (4 + 3.5 * len(bad)) * noise * np.sqrt(2) / np.sqrt(len(MANY))
         assert np.linalg.norm(plumb_error(found, truth, made.mean_plumb)) < pull * 1.5
 
@@ -282,7 +282,7 @@ def test_a_turn_that_is_held_stays_near_the_given():
 
 
 def test_a_weak_lean_and_a_wide_prior_meet_between_them():
-    """Leans tell the turn to 30 deg, the given A3 is said to be good to 30 deg: it ends half way, wherever it began."""
+    """Leans determine the turn to 30 deg, the given A3 is stated to 30 deg: it ends half way, wherever it began."""
     lean = np.degrees(SCA100T / np.radians(30) * np.sqrt(2))
     off, chi2 = [], []
     for seed in range(50):
@@ -307,7 +307,7 @@ def test_a_weak_lean_and_a_wide_prior_meet_between_them():
 
 
 def test_the_prior_of_the_turn_counts_from_the_given_a3():
-    """Half a turn off by leans that tell it to 15 deg, and said to be good to 30: the answer lies between, towards the
+    """Half a turn off by leans that determine it to 15 deg, and stated to 30: the answer lies between, towards the
     leans; where every start had a prior of its own, it was theirs alone."""
     lean = np.degrees(SCA100T / np.radians(15) * np.sqrt(2))
     between = []

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Turning on the spot: the place without a calibration, or an error that says there is none."""
+"""Turning on the spot: the place without a calibration, or an error that says why not."""
 
 from dataclasses import replace
 
@@ -22,7 +22,7 @@ from starpos_testing.skies.scenes import FOCAL_PX, START, stars_of, tilt_of, wid
 
 
 def turned(catalogue, rng, headings, misalignment=(1.5, -2.0, 130.0), zero_deg=(0.2, -0.1), lean=0.0):
-    """Frames at these azimuths of an instrument that is told nothing of its A3, its tilts, and the scene.
+    """Frames at these azimuths of an instrument with an unknown A3, its tilts, and the scene.
 
     lean: by how many deg the axis of the turn is off the plumb line.
     """

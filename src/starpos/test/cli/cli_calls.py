@@ -37,7 +37,7 @@ def objects(out):
 
 @lru_cache(maxsize=1)
 def promised():
-    """What refuses an object that the schema does not promise."""
+    """A validator that refuses any object outside the schema."""
     import fastjsonschema
 
     return fastjsonschema.compile(json.loads(SCHEMA.read_text()))

@@ -71,8 +71,8 @@ def test_the_file_holds_the_camera_the_table_says_how_well(skies, run, tmp_path)
     shown = np.array([float(line.split()[1]) for line in table])
     assert (np.abs(shown - values(camera)) < 0.6 * sigma).all()
     assert (np.abs(values(camera) - values(true)) < 4.2 * sigma).all()
-    assert all(line.endswith("told by the sky") for line in table)
-    assert "px where they are worst" in last
+    assert all(line.endswith("from the stars") for line in table)
+    assert "px at worst" in last
     comment = [line for line in out.read_text().splitlines() if line.startswith("#")]
     rows = np.array([[float(v) for v in line[1:].split()] for line in comment[-9:]])
     np.testing.assert_allclose(np.sqrt(np.diag(rows)), sigma, rtol=0.06)
@@ -162,7 +162,7 @@ def test_a_frame_without_a_tilt_and_one_that_is_none(skies, run, tmp_path):
 REFUSED = {
     "nothing": ((), 2, "give --camera OUT.yaml"),
     "no focal length": (("--camera", "OUT"), 2, "no focal length"),
-    "wrong focal length": (("--camera", "OUT", "--focal-mm", "40", "--pixel-um", "10"), 1, "none of the sky fits any"),
+    "wrong focal length": (("--camera", "OUT", "--focal-mm", "40", "--pixel-um", "10"), 1, "no part of the sky matches"),
     "two instruments": (("--camera", "OUT", *OPTICS, "--instrument", "x.yaml"), 2, "give either"),
     "no such instrument": (("--camera", "OUT", "--instrument", "x.yaml"), 2, "x.yaml: not a readable"),
     "no such tilts": (("--camera", "OUT", *OPTICS, "--tilt", "x.csv"), 2, "x.csv"),

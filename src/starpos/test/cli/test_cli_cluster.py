@@ -68,7 +68,7 @@ def test_a_cluster_gives_the_same_answers(more, cluster, archive, capfd, monkeyp
     monkeypatch.chdir(archive / "turned")
     command = [Path(a).name if a.endswith(".csv") else a for a in solve(archive / "turned", "--json", *more)]
     status, out, err = run(capfd, command)
-    # It tells of the broken frame.
+    # It reports the broken frame.
     assert status == 2
     there = run(capfd, [*command, "--scheduler", cluster])
     assert there[:2] == (status, out)
@@ -97,7 +97,7 @@ def test_a_frame_that_ends_every_worker_is_given_up(cluster, tmp_path):
     with Cluster(cluster) as workers:
         error, good = workers.map([(killed, str(bad)), (read, str(bad))])
     assert isinstance(error, FrameError)
-    assert "bad.fits: given up: the workers that worked it died, at last alone" in str(error)
+    assert "bad.fits: given up: the workers that took it died, the last one with no other work" in str(error)
     assert good == "bad"
 
 

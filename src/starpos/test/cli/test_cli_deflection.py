@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`starpos deflection`, on lists of the stars above a place whose plumb line is not that of the ellipsoid."""
+"""`starpos deflection`, on lists of the stars above a place whose plumb line differs from the ellipsoid's normal."""
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -10,7 +11,13 @@ from cli_calls import objects
 from starpos import rotation
 from starpos.earth.orientation import earth_state
 from starpos.earth.refraction import Atmosphere
+from starpos.errors import InstrumentError
+from starpos.frames.reading import read_frame
 from starpos.instrument.camera import Camera
+from starpos.instrument.tilt_table import read_tilt_csv
+from starpos.session.diagnosis import Level
+from starpos.session.parameter_file import settings_of
+from starpos.session.replay import Replay
 from starpos.sky.site import Site
 from starpos.units import ARCSEC
 from starpos.utc import utc_text
@@ -88,6 +95,108 @@ def test_the_deflection_of_four_faces(run, session):
     fallen = whole["reduced"]["mark_arcsec"][0] - whole["reduced"]["geoid_arcsec"][0]
     assert fallen == pytest.approx(0.171 * np.sin(2 * np.radians(LATITUDE)) * 0.9, rel=0.01)
     assert sum(v[0] ** 2 for v in whole["errors"].values()) == pytest.approx(sigma**2, rel=1e-6)
+
+
+def test_each_face_and_star_has_its_residuals(run, session):
+    _, out, _ = run(*arguments(session), "--json", "--station", "Pillar 1")
+    whole = objects(out)[-1]
+    assert whole["station"] == "Pillar 1" and whole["site"]["height_m"] == HEIGHT_M
+    assert [face["frames"] for face in whole["by_face"]] == [2] * 4
+    assert all(face["chi2"] < 20 for face in whole["by_face"])
+    lever = [np.hypot(*star["leverage_arcsec"]) for star in whole["by_star"]]
+    assert lever == sorted(lever, reverse=True) and lever[0] > 0
+    assert whole["stars"] >= len(lever) and all(1 <= star["frames"] <= 8 for star in whole["by_star"])
+    assert whole["by_star"][0]["star"].startswith(("HIP ", "TYC "))
+
+
+@pytest.fixture(scope="module")
+def recorded(session, tmp_path_factory):
+    """Record the same session in a bag."""
+    pytest.importorskip("rosbags")
+    from starpos_testing.skies.bags import NightBag
+
+    path = tmp_path_factory.mktemp("recorded") / "bag"
+    with NightBag(path) as bag:
+        bag.camera(CAMERA.fx, CAMERA.width, CAMERA.height)
+        for name in sorted(session.glob("stars_*.csv")):
+            bag.stars(read_frame(name))
+        bag.tilts(read_tilt_csv(session / "tilt.csv"))
+    return path
+
+
+def test_a_bag_gives_what_its_files_give(run, session, recorded):
+    _, out, _ = run(*arguments(session), "--json")
+    options = arguments(session)[11:]
+    status, of_bag, err = run("deflection", recorded, *options, "--json")
+    files, bag = objects(out)[-1], objects(of_bag)[-1]
+    assert status == 0 and bag["frames"] == 8
+    # messages have the times of tilts in microseconds
+    for key in ("xi_arcsec", "eta_arcsec", "sigma_xi_arcsec", "sigma_eta_arcsec"):
+        assert bag[key] == pytest.approx(files[key], abs=2e-3)
+    status, _, err = run("deflection", recorded, *options, "--tilt", session / "tilt.csv")
+    assert status == 2 and "has its own tilts" in err[-1]
+
+
+def played(recorded, session, wanted):
+    """Play the frames to the solver's session, which has the node's service and light say what it says."""
+    values = {
+        "deflection.wanted": wanted,
+        "site.latitude": LATITUDE,
+        "site.longitude": LONGITUDE,
+        "site.geodetic": "true",
+        "altitude": HEIGHT_M,
+        "calibration_url": session / "instrument.yaml",
+        "refraction.pressure": 90000.0,
+        "refraction.temperature": 5.0,
+        "refraction.humidity": 0.3,
+    }
+    replay = Replay(settings_of(None, [f"{k}:={v}" for k, v in values.items()]), Silent(), Silent())
+    assert len(list(replay.play(recorded))) >= 8
+    return replay.session.deflection
+
+
+class Silent:
+    """Hears and logs nothing."""
+
+    def __getattr__(self, name):
+        return lambda *said: None
+
+
+def test_live_the_session_says_when_enough_is_enough(run, session, recorded):
+    live = played(recorded, session, 1.0)
+    told = live.report()
+    whole = objects(run("deflection", recorded, *arguments(session)[11:], "--json")[1])[-1]
+    assert told.level == Level.OK and told.message.startswith("enough; xi ")
+    assert told.values["xi arcsec"] == pytest.approx(whole["xi_arcsec"], abs=2e-3)
+    assert told.values["sigma eta arcsec"] == pytest.approx(whole["sigma_eta_arcsec"], rel=0.02)
+    assert told.values["frames"] == 8 and told.values["enough"]
+    live.forget()
+    assert live.report().message.startswith("0 frames so far")
+
+
+def test_live_a_session_that_lacks_something_says_what(session, recorded):
+    told = played(recorded, session, 0.005).report()
+    assert told.level == Level.WARN and not told.values["enough"]
+    assert re.match(
+        r"not enough: (about \d+ min more|more frames do not help, [a-z0-9 ]+ alone leaves)", told.message
+    )
+    with pytest.raises(InstrumentError, match=r"set site\.latitude"):
+        settings_of(None, ["deflection.wanted:=0.1"])
+
+
+def test_a_plan_needs_no_frames(run, session):
+    site = ("--site", LATITUDE, LONGITUDE, HEIGHT_M, "--instrument", session / "instrument.yaml")
+    status, out, _ = run(
+        "deflection", "--plan", 0.5, *site, "--size", 1000, 700, "--limit-mag", 7.5, "--json"
+    )
+    (plan,) = objects(out)
+    assert (
+        status == 0 and plan["faces"] == 4 and max(plan["sigma_xi_arcsec"], plan["sigma_eta_arcsec"]) <= 0.5
+    )
+    status, out, _ = run("deflection", "--plan", 0.5, *site, "--size", 1000, 700, "--limit-mag", 7.5)
+    assert status == 0 and "4 faces" in out and "largest errors" in out
+    status, _, err = run("deflection", *site)
+    assert status == 2 and "--plan SIGMA" in err[0]
 
 
 def test_its_lines_for_people_and_its_table(run, session):

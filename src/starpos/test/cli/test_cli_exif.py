@@ -59,7 +59,7 @@ def test_the_errors_of_the_cameras_clock_are_in_the_budget(night, capsys):
     )
     east_m = (together["longitude"] - LONGITUDE_DEG) * 111_320 * np.cos(np.radians(47.3))
     assert abs(east_m) < 3 * together["sigma_east_m"] < 11 * M_PER_S
-    # frames at whole seconds of cadence are all rounded alike: nobody may count on an average
+    # frames at whole seconds of cadence are all rounded alike: averaging does not help
     for name in ("clock", "time stamp"):
         assert together["budget"][name][0] == pytest.approx(first["budget"][name][0], rel=0.01)
 

@@ -105,8 +105,8 @@ def test_the_file_is_not_mixed_with_an_inclinometer(instrument, first, tmp_path,
     assert read(instrument).vertical is not None
     for more in (("--tilt", tilt), ("--self-calibrate",)):
         status, _, errors = run(capsys, "solve", *first, "--instrument", instrument, *more)
-        assert status == 2 and "is of a camera that is fixed to the ground" in errors[0]
+        assert status == 2 and "describes a camera fixed to the ground" in errors[0]
     again = ("calibrate", *first, "--instrument", instrument, *AIR, *SITE, "-o", tmp_path / "again.yaml")
     status, _, errors = run(capsys, *again, "--tilt", tilt)
-    assert status == 2 and "is of a camera that is fixed to the ground" in errors[0]
+    assert status == 2 and "describes a camera fixed to the ground" in errors[0]
     assert run(capsys, *again, "--fixed")[0] == 0

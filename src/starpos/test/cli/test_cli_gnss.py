@@ -14,7 +14,7 @@ HEAD = "utc_unix_s,latitude,longitude,altitude_m,sigma_east_m,sigma_north_m,stat
 
 @pytest.fixture(scope="module")
 def drive(tmp_path_factory):
-    """Two frames of one pose, and a receiver that stands still beside them."""
+    """Two frames of one pose, and a receiver that stands still next to them."""
     folder = tmp_path_factory.mktemp("drive")
     place = [f"--{k}={v}" for k, v in PLACE.items()]
     command = [

@@ -71,7 +71,7 @@ def test_where_nobody_says_the_size_of_the_sensor_a3_counts_as_not_known(lists, 
     status, answer, errors = solve(paths, *KNOWN)
     # 2000 px are 23 deg here
     assert (status, answer["latitude"]) == (1, None)
-    assert any("of a sensor whose size nobody says" in line for line in errors)
+    assert any("of a sensor whose size is not stated" in line for line in errors)
 
 
 def test_frames_of_another_size_than_the_first_or_the_files_have_no_fix(lists, solve, tmp_path):

@@ -34,7 +34,7 @@ def test_headings_without_tilts(solve, truth):
         assert abs(told["heading"] - heading) < 4 * told["sigma_heading_deg"] < 4 * 3 / 3600
         assert told["covariance_attitude"][0][0] == pytest.approx(told["sigma_heading_deg"] ** 2)
         assert told["covariance"][2][2] == pytest.approx(told["sigma_heading_deg"] ** 2)
-        # 6 arcsec of deflection that nobody knows
+        # 6 arcsec of unknown deflection
         assert told["sigma_heading_geodetic_deg"] * 3600 > 5
         assert told["budget"]["centroids"][:2] == [None, None] and told["budget"]["centroids"][2] > 0
     # the camera turns by 40 deg from frame to frame

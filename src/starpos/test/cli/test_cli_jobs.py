@@ -32,7 +32,7 @@ from starpos_testing.patience import WAIT_S
 )
 def test_solve_gives_the_same_however_many_processes(more, jobs, archive, capfd):
     one = run(capfd, solve(archive / "turned", *more))
-    # It tells of the broken frame.
+    # It reports the broken frame.
     assert one[0] == 2
     assert one[1].count('"status": "ok"') == (8 + 1 if "--json" in more else 0)
     assert one[2].count("stars_0002b.csv") == 1
@@ -165,9 +165,9 @@ def test_without_distributed_the_line_to_install_it_is_told(archive, capfd, monk
 
 @contextmanager
 def started(archive, times=13, **options):
-    """`starpos solve --jobs 2` of eight frames, so many times each, in a process group of its own; its first answer.
+    """`starpos solve --jobs 2` of eight frames, several times each, in a process group of its own; its first answer.
 
-    The answers are, unless told otherwise, more than a pipe holds: it cannot have ended before somebody reads them.
+    The answers are by default more than a pipe holds: it cannot have ended before they are read.
     """
     night = archive / "turned"
     many = [p for p in frames(night) if "2b" not in p] * times
@@ -201,7 +201,7 @@ def workers_of(pid):
 
 
 def complaints(err):
-    """Lines of standard error but those of progress, which come where a busy machine takes long."""
+    """Lines of standard error without progress, which appears on a busy machine."""
     return [line for line in err.splitlines() if not line.endswith("% done")]
 
 

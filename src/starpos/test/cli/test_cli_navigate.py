@@ -175,7 +175,7 @@ def test_crops_of_a_sensor_of_which_nobody_says_the_size_are_refused_as_of_a_mou
     status, out, errors = navigate(capsys, tmp_path)
     # 2000 px are 23 deg here
     assert (status, out, len(errors)) == (2, "", 1)
-    assert "size nobody says" in errors[0] and "an error of the mount" in errors[0]
+    assert "size is not stated" in errors[0] and "an error of the mount" in errors[0]
 
 
 def test_an_axis_that_nobody_knows_widens_the_mount(capsys):

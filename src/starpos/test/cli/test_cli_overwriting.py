@@ -63,7 +63,7 @@ def test_a_camera_and_its_map_are_replaced_until_somebody_changes_them(lists, ru
     camera.write_text(camera.read_text().replace("camera_name: camera", "camera_name: mine"))
     changed = camera.read_bytes()
     status, _, errors = run(*both)
-    assert status == 2 and "has not made it as it is" in errors[-1] and camera.read_bytes() == changed
+    assert status == 2 and "did not write it in this form" in errors[-1] and camera.read_bytes() == changed
 
 
 def test_calibrating_again_keeps_what_a_person_wrote_into_the_instrument_file(lists, run, tmp_path):

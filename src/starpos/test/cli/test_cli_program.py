@@ -89,7 +89,7 @@ def test_python_m_starpos(tmp_path):
 
 
 def starpos(*args, **environment):
-    """A whole process: its exit status and its lines of standard error but those of progress."""
+    """A whole process: its exit status and its lines of standard error without progress."""
     done = subprocess.run(
         [sys.executable, "-m", "starpos", *map(str, args)],
         env={**os.environ, **environment},

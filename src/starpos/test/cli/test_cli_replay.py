@@ -73,7 +73,7 @@ OF_TWO = """
 
 
 def test_frames_that_got_no_answer_are_counted(capsys, told, monkeypatch):
-    monkeypatch.setattr(session, "MOST", 0)
+    monkeypatch.setattr(session, "MAX_WAITING", 0)
     status, _, errors = run(capsys, NIGHT, *told)
     assert status == 1 and "10 frames, 0 answers, 0 fixes" in errors
 

@@ -71,7 +71,7 @@ def test_the_instrument_file_states_the_shutter(night, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("shutter", "sentence"),
     [("5", "shutter is 5"), ("{readout_s: 0.1}", "readout_stddev_s is missing"),
-     ("{readout_s: 99, readout_stddev_s: 0}", "cannot be"), ("{row_s: 1}", "unknown key 'row_s'")],
+     ("{readout_s: 99, readout_stddev_s: 0}", "is impossible"), ("{row_s: 1}", "unknown key 'row_s'")],
 )  # fmt: skip
 def test_a_shutter_that_cannot_be_is_refused(tmp_path, capsys, shutter, sentence):
     file = tmp_path / "bad.yaml"

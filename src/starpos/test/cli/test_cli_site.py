@@ -164,9 +164,9 @@ def test_valid_days_and_the_turn_that_is_known(known, run, tmp_path):
     # 5 deg further north
     moved = ("--site", LAT + 5, LON)
     said = run(*args, *moved, "--misalignment", 1.5, -2, 129.5)[1]
-    assert "given has the plumb line 5.1 deg from there: if that cannot be, check the site" in said
+    assert "given has the plumb line 5.1 deg from there: check the site if it cannot be" in said
     status, said, _ = run(*args)
-    assert "to tell that turn as well, calibrate with leans of some degrees" in said.splitlines()[-1]
+    assert "to find that turn as well, calibrate with leans of some degrees" in said.splitlines()[-1]
     assert np.sqrt(np.linalg.eigvalsh(instrument_file.read(out).calibration.covariance_arcsec2)[-1]) > 1e5
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`starpos solve --self-calibrate` on a night whose A3 nobody tells it, and the instrument file it leaves."""
+"""`starpos solve --self-calibrate` on a night with an unknown A3, and the instrument file it leaves."""
 
 import json
 
@@ -42,7 +42,7 @@ def test_the_place_is_found_and_a3_saved_for_another_night(turned, tmp_path, cap
     assert combined["sigma_north_m"] < 400
     said, caveat, kept = errors
     assert "the plumb line in the camera is known to" in said and f"{saved} is written" in kept
-    assert "plumb line counts, which is not known" in said and "--turn-stddev" in caveat
+    assert "plumb line matters, which is not known" in said and "--turn-stddev" in caveat
     assert read(saved).calibration.frames == 8
 
     later = simulated(tmp_path / "later", "-n", "4", "--seed", "9", "--azimuth", "100")

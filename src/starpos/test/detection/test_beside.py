@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What pixels beside peaks tell, by compiled code, beside its plain form on stamps of them."""
+"""Evidence of pixels next to peaks, by compiled code, against its plain form on stamps of them."""
 
 import numpy as np
 import pytest

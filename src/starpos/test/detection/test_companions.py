@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Near points, light that a fit leaves, and fluxes of phases, of compiled code, beside their plain forms."""
+"""Near points, light that a fit leaves, and fluxes of phases, of compiled code, against their plain forms."""
 
 import numpy as np
 import pytest

@@ -10,7 +10,7 @@ from starpos.frames.frame import Frame
 
 
 def blobs(number, sigma_px, size=(600, 900), seed=1):
-    """A frame of so many Gaussian blobs at random places."""
+    """A frame of a number of Gaussian blobs at random places."""
     rng = np.random.default_rng(seed)
     light = np.zeros(size)
     light[rng.integers(0, size[0], number), rng.integers(0, size[1], number)] += rng.uniform(1e4, 2e5, number)

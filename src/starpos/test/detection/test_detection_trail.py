@@ -95,7 +95,7 @@ def test_stars_enough_to_learn_from_decide_alone(rng):
 
 
 def rolled(number, roll, rng, fwhm=FWHM, size=(400, 600)):
-    """A frame of a camera that rolled by so many rad about its axis, and its stars (number, 3)."""
+    """A frame of a camera that rolled by an angle, rad, about its axis, and its stars (number, 3)."""
     rows, columns = np.divmod(np.arange(number), 6)
     place = np.stack([60 + 96 * columns, 60 + 380 * rows * 6 / number], 1) + rng.uniform(-15, 15, (number, 2))
     stars = np.column_stack([place, 10 ** rng.uniform(3.6, 4.8, number)])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A PSF at places of the field, and which of its terms are taken, of compiled code, beside their plain forms."""
+"""A PSF at places of the field, and which of its terms are taken, of compiled code, against their plain forms."""
 
 import numpy as np
 import pytest
@@ -89,7 +89,7 @@ def test_values_over_the_field_are_those_of_least_squares(rng):
     plain = np.linalg.lstsq(field, own, rcond=None)[0]
     np.testing.assert_allclose(over_field(field, own), plain, rtol=1e-8, atol=1e-9)
     assert over_field(np.zeros((40, 6)), own) is None
-    # on a line much is not told, and what is told is
+    # on a line much is undetermined, and the determined part is right
     field = plain_monomials(x, 20 + 0 * y, np.array([[0.0, 19.0], [420.0, 22.0]]))
     plain = np.linalg.lstsq(field, own, rcond=None)[0]
     np.testing.assert_allclose(field @ over_field(field, own), field @ plain, atol=1e-6)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""PSF and fit of compiled code beside their plain forms."""
+"""PSF and fit of compiled code against their plain forms."""
 
 import numpy as np
 import pytest
@@ -97,7 +97,7 @@ def psfs(rng, n):
 
 
 def stamps(rng, n, gain):
-    """Noisy stamps of n stars with a hot pixel beside the second and a bad one on the third."""
+    """Noisy stamps of n stars with a hot pixel next to the second and a bad one on the third."""
     axes, series = psfs(rng, n)
     column, row = rng.integers(SIZE, 100, (2, n))
     x, y = np.stack([column, row]) + rng.uniform(-1, 1, (2, n))
@@ -118,7 +118,7 @@ def stamps(rng, n, gain):
 
 
 def rules(gain, settled=0.0):
-    """Rules by which all rounds are made, unless a star may be off by so many sigmas."""
+    """Rules by which all rounds are made, unless a star may be off by a number of sigmas."""
     return Rules(gain, SPREAD, DN_PER_PHOTON, MISFIT, FIT_WIDTHS, OUTLIER, FAINT, settled)
 
 

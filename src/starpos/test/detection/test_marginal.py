@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Normal equations of a PSF's terms, of compiled code, beside their plain form."""
+"""Normal equations of a PSF's terms, of compiled code, against their plain form."""
 
 import numpy as np
 import pytest

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Meshes of the sky, sparse looks at a frame, and medians, of compiled code, beside their plain forms."""
+"""Meshes of the sky, sparse looks at a frame, and medians, of compiled code, against their plain forms."""
 
 import numpy as np
 import pytest

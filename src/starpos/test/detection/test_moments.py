@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Windowed moments of compiled code beside their plain sums."""
+"""Windowed moments of compiled code against their plain sums."""
 
 import numpy as np
 import pytest

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The noise that grows with light, of compiled code, beside its plain form."""
+"""The noise that grows with light, of compiled code, against its plain form."""
 
 import numpy as np
 import pytest

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Shapes of stars through windows that follow them, of compiled code, beside their plain forms."""
+"""Shapes of stars through windows that follow them, of compiled code, against their plain forms."""
 
 import numpy as np
 import pytest

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The fit of two stars at once of compiled code beside its plain form."""
+"""The fit of two stars at once of compiled code against its plain form."""
 
 import numpy as np
 import pytest

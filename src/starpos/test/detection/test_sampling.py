@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cells of the background and pixels around stars, of compiled code, beside their plain forms."""
+"""Cells of the background and pixels around stars, of compiled code, against their plain forms."""
 
 import numpy as np
 import pytest

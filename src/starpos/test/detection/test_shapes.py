@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Closed forms of covariances beside those of a library."""
+"""Closed forms of covariances against a library's."""
 
 import numpy as np
 import pytest

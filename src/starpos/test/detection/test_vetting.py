@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What pixels say of stars, of compiled code, beside its plain form."""
+"""Evidence of pixels for stars, of compiled code, against its plain form."""
 
 import numpy as np
 import pytest

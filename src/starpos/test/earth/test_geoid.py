@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Slopes of grids that are known exactly, in every orientation; the stated error; grids that are none."""
+"""Slopes of grids that are known exactly, in every orientation; the stated error; invalid grids."""
 
 import os
 import struct
@@ -196,7 +196,7 @@ def test_outside_nothing_is_known(tmp_path):
         assert grid.at(*np.radians(place)) == unknown, place
     phi = np.radians(36.1)
     expected = deflection(phi, np.degrees(0.8), -np.degrees(0.4) / np.cos(phi))
-    # Beside the hole it answers.
+    # Next to the hole it answers.
     for longitude in (175.1, 179.99, 180, -180, -179.6, -175, 177, 178.9, 185 - 720):
         d = grid.at(phi, np.radians(longitude))
         assert (d.xi_arcsec, d.eta_arcsec) == pytest.approx(expected, rel=1e-4), longitude

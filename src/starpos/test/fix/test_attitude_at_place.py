@@ -208,7 +208,7 @@ def test_errors_of_stars_are_as_large_as_claimed(rng):
 )
 def test_a_place_that_cannot_see_these_stars_is_refused(latitude, longitude):
     stars, _ = ring(200.0, 60.0, 20.0)
-    with pytest.raises(PlaceError, match="below the horizon, and stars tell a heading"):
+    with pytest.raises(PlaceError, match="below the horizon, and a heading needs stars"):
         attitude_of(stars, KnownPlace.by_gravity(latitude, longitude, EXACT))
 
 

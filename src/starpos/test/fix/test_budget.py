@@ -47,7 +47,7 @@ def test_drift_grows_with_the_root_of_the_hours(rng):
         assert sigma_m(fix, "tilt drift") == pytest.approx(
             2 * np.sqrt(abs(hours)) * np.array(ARCSEC_M), rel=0.01
         )
-    # Since nobody knows when.
+    # Since an unknown time.
     assert sigma_m(fixed(field, rng, errors), "tilt drift").max() == 0
 
 
@@ -105,7 +105,7 @@ def test_an_unknown_turn_against_instruments_turned_at_random(turn_deg, rng):
 
 @pytest.mark.parametrize("noise", [0.0, 0.2, 0.5, 1.0])
 def test_what_rounding_leaves_in_a_mean(noise, rng):
-    """Rounded readings of angles anywhere on the step: the error of their mean beside their noise's own."""
+    """Rounded readings of angles anywhere on the step: the error of their mean compared with their noise's own."""
     quantum, n, angles = 1e-5, 400, 3000
     true = rng.uniform(-0.5, 0.5, angles) * quantum
     own = rng.normal(0, noise * quantum, (angles, n)) if noise else np.zeros((angles, n))
@@ -115,7 +115,7 @@ def test_what_rounding_leaves_in_a_mean(noise, rng):
     claimed = stated.undithered_rad(
         Tilt(0.1, 0.1, np.eye(2) * (noise * quantum) ** 2 / n, utc_unix_s=UTC, samples=n)
     )
-    # a reading's rounding is noise too, of a share sqrt(1 / 12 n) of a step, which the scatter of the readings tells
+    # a reading's rounding is noise too, of a share sqrt(1 / 12 n) of a step, which the scatter of the readings shows
     floor = quantum / np.sqrt(12 * n)
     assert rounding < 1.1 * np.hypot(claimed, floor)
     if noise < 0.4:

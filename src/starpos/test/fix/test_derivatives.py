@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What compiled code computes for a fix, beside plain forms of it: derivatives, directions, scatter, roots."""
+"""Results of compiled code for a fix, against plain forms: derivatives, directions, scatter, roots."""
 
 import numpy as np
 import pytest

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fisheyes of up to the whole sky: identified by their middle or, where that is covered, beside it; a true fix."""
+"""Fisheyes of up to the whole sky: identified by their middle or, where that is covered, next to it; a true fix."""
 
 from dataclasses import replace
 
@@ -27,7 +27,7 @@ from starpos_testing.skies.scenes import (
 )
 
 SIDE, FOCAL_PX = 2000, 600.0
-# k1 .. k4 of a lens that is nearly equisolid: its picture ends 1.5 % nearer than that of an ideal one
+# k1 .. k4 of a lens that is nearly equisolid: its picture ends 1.5 % nearer than an ideal one's
 LENS = (-0.0417, 5e-4, 1e-5, -2e-6)
 
 

@@ -201,7 +201,7 @@ def test_stars_whose_arrays_do_not_fit_are_refused(part, rng):
     field = SkyField(stars=12)
     xy, places = field.places(STATE, rng)
     few = {"covariance_px2": 0.01 * np.eye(2)[None], "place_sigma": np.array([1e-8])}[part]
-    with pytest.raises(ValueError, match="do not fit"):
+    with pytest.raises(ValueError, match="differ in length or shape"):
         field.solve(xy, places, STATE, **{part: few})
 
 
@@ -233,7 +233,7 @@ def drawn(
     ut1=0.0,
     refraction=0.0,
 ):
-    """A fix whose every error is drawn from the sigma it was told: px, four in arcsec, s, s, s, fraction."""
+    """A fix whose every error is drawn from its stated sigma: px, four in arcsec, s, s, s, fraction."""
     state = replace(STATE, orientation=replace(STATE.orientation, ut1_sigma_s=ut1, pole_sigma=0.0))
     true = replace(field, utc=field.utc + rng.normal(0, clock) + rng.normal(0, stamp) + rng.normal(0, ut1))
     air = Atmosphere(
@@ -246,7 +246,7 @@ def drawn(
         wavelength_stddev_um=0.0,
     )
     true_air = replace(air, pressure_pa=air.pressure_pa * (1 + rng.normal(0, refraction)))
-    # the true mount is the told one and a little more about the inclinometer's axes
+    # the true mount is the stated one and a little more about the inclinometer's axes
     slip = rotation.from_vector(rng.normal(0, np.hypot(calibration, remounting) * ARCSEC, 3))
     up = slip @ field.a3 @ true.attitude[2]
     reading = np.arcsin(up[:2]) + rng.normal(0, tilt * ARCSEC, 2)

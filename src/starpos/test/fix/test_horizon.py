@@ -20,7 +20,7 @@ def upside_down(tilt):
 
 @pytest.mark.parametrize(("sigma_arcsec", "sees"), [((5.0,) * 3, False), (None, True)])
 def test_a_camera_does_not_see_through_the_ground(night, sigma_arcsec, sees):
-    """Nobody can say while A3 is not known, as before it is found by turning."""
+    """It is unknown while A3 is not known, as before it is found by turning."""
     scene, stars, tilt, solver = night
     angles = scene.instrument.calibration.misalignment_deg
     calibration = Calibration.of(angles, sigma_arcsec) if sigma_arcsec else Calibration.of(angles)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Detections that are noise are not searched; stars are, faint ones and those of stretched pictures too."""
+"""Detections that are noise are not searched; stars are, faint ones and stars of stretched pictures too."""
 
 import cv2
 import numpy as np
@@ -15,14 +15,14 @@ SHAPE = (800, 1200)
 
 
 def jpeg(pixels, quality):
-    """What a JPEG of that quality makes of pixels that are cut off at black."""
+    """Pixels that are cut off at black, after a JPEG of that quality."""
     whole = pixels.clip(0, 255).astype(np.uint8)
     stored = cv2.imencode(".jpg", whole, [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
     return detect(Frame(pixels=cv2.imdecode(stored, cv2.IMREAD_GRAYSCALE))).stars
 
 
 def sky(number, gamma, rng):
-    """A sky of so many stars, their numbers as those of the sky, stretched by a gamma."""
+    """A number of stars, distributed as on the sky, stretched by a gamma."""
     pixels = np.zeros(SHAPE)
     light = 750 * 10 ** (-0.4 * np.log10(np.arange(1, number + 1)) / 0.45)
     x, y = (rng.uniform(6, n - 6, number) for n in reversed(SHAPE))

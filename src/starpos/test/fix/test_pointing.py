@@ -90,7 +90,7 @@ def test_claims_are_true_over_many_nights(catalogue):
 
 
 def test_a_camera_with_intrinsics_points_with_its_frames_centre(catalogue, rng):
-    """What is off the optical axis is right too, if A3 is that of the real axes."""
+    """Directions off the optical axis are right too, if A3 is of the real axes."""
     night = pointed_night(rng, **EXACT)
     camera = Camera(
         width=1000, height=700, fx=4636.0, fy=4630.0, cx=520.0, cy=340.0, distortion=(-0.1, 0, 0, 0, 0)

@@ -48,7 +48,7 @@ def test_the_covariance_of_a_geodetic_place_at_a_pole_is_true(latitude, rng):
         )
         ground = geodetic(fix.latitude, fix.longitude, fix.heading, fix.covariance, d)
         assert np.isfinite(ground.covariance).all()
-        # the truth is the true zenith, turned as that of the fix
+        # the truth is the true zenith, turned as the fix's
         found = enu_axes(fix.latitude, fix.longitude)
         turned = rotation.shortest_turn(found[2], zenith_of(ground.latitude, ground.longitude))
         true = turned @ zenith_of(*np.radians([field.latitude, field.longitude]))

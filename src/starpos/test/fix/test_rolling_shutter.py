@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A fix from the frames of a rolling shutter: known, unknown, and told wrongly."""
+"""A fix from the frames of a rolling shutter: known, unknown, and stated wrongly."""
 
 from dataclasses import replace
 
@@ -40,7 +40,7 @@ def night(catalogue, readout_s, seed=3):
 
 
 def fix_of(catalogue, scene, stars, tilt, shutter, instrument=None):
-    """The fix of a frame whose source tells a shutter."""
+    """The fix of a frame whose source states a shutter."""
     solver = Solver(instrument or scene.instrument, catalogue, scene.site.atmosphere)
     answer = solver.solve(replace(stars, shutter=shutter), tilt)
     assert answer.ok, answer.message

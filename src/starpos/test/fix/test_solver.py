@@ -266,7 +266,7 @@ def test_poor_fit(night, catalogue):
 
 
 def test_every_status_is_tested_here():
-    """Each name of Status stands in a test above, or in that of times."""
+    """Each name of Status stands in a test above, or in the test of times."""
     text = "".join(path.read_text() for path in Path(__file__).parent.glob("test_solver*.py"))
     assert all(f"Status.{s.name}" in text for s in Status)
 

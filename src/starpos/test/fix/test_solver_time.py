@@ -34,7 +34,7 @@ def test_what_a_host_says_of_its_clock_widens_the_fix_and_never_narrows_it(catal
 
 
 def test_what_is_not_known_of_the_time_does_not_average(catalogue, rng):
-    """A lag that nobody measured is the same in every frame."""
+    """An unmeasured lag is the same in every frame."""
     scene = wide_scene(tilt_noise_deg=0.0)
     stars, tilt, solver = stars_of(scene, catalogue, rng), tilt_of(scene, rng), solver_of(scene, catalogue)
     for told in ({"stamp_stddev_s": 1.0}, {"clock_stddev_s": 1.0}):

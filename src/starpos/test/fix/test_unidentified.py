@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The sentence for a frame that is not identified tells its causes apart."""
+"""The sentence for a frame that is not identified distinguishes the causes."""
 
 import numpy as np
 
@@ -71,5 +71,5 @@ def test_an_order_of_brightness_that_says_little(catalogue, rng):
 def test_nothing_but_the_focal_length_and_the_weather_where_nothing_else_can_be_told(catalogue, rng):
     _, message = said_of(points(25, rng), catalogue)
     assert message.startswith(
-        "a.fits: none of the sky fits its 25 stars: check the focal length (4000 px given"
+        "a.fits: no part of the sky matches its 25 stars: check the focal length (4000 px given"
     )

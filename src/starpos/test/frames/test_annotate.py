@@ -182,7 +182,7 @@ def test_names_keep_off_each_other_and_their_stars_and_stay_inside(monkeypatch, 
 def test_the_caption_tells_time_counts_and_remarks_and_wraps(monkeypatch):
     texts = written(monkeypatch)
     frame = frame_of([])
-    remark = "none of the sky fits its 27 stars: check the focal length, clouds and exposure " * 2
+    remark = "no part of the sky matches its 27 stars: check the focal length, clouds and exposure " * 2
     one, many = (
         annotate(frame, no_stars(*SIZE, mid_unix_s=1.8e9)),
         annotate(frame, no_stars(*SIZE, mid_unix_s=1.8e9), remarks=[remark]),

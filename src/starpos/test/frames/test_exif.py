@@ -176,7 +176,7 @@ def test_without_a_start_or_an_exposure_there_is_no_time_and_it_is_said_which_la
 
 @needs_exifread
 def test_gps_time_gives_the_zone_and_is_held_against_the_one_that_is_stated(tmp_path):
-    """18:00:00 in a zone of 3.5 h is 14:30 UTC; GPS told the time of its last fix, 40 s before."""
+    """18:00:00 in a zone of 3.5 h is 14:30 UTC; GPS gave the time of its last fix, 40 s before."""
     path = write(tmp_path / "a.jpg", jpeg(gps=("2026:11:02", (14, 29, 20))))
     for clock in (CameraClock(), TEHRAN):
         assert read_frame(path, clock).mid_unix_s == pytest.approx(SHOWN_S - 3.5 * 3600 + 0.75)

@@ -35,7 +35,7 @@ def unix(text):
     return datetime.fromisoformat(text).replace(tzinfo=timezone.utc).timestamp()
 
 
-# name: (cards, middle of the exposure or words of why there is none, its length, focal length in px, place on the sensor)
+# name: (cards, middle of the exposure or words of the reason, its length, focal length in px, place on the sensor)
 FITS = {
     "MaxIm DL": (
         {"DATE-OBS": "2018-07-04T14:03:03", "EXPTIME": 300.0, "EXPOSURE": 300.0, "XPIXSZ": 7.4, "FOCALLEN": 1425.0,

@@ -108,7 +108,7 @@ HARD_TIMES = [
 
 @pytest.mark.parametrize("scale", ["UTC", "TAI", "TT", "TDB"])
 def test_times_are_those_of_astropy(scale):
-    """Leap seconds, years without them, dates that are none: the middle of exposures to a microsecond, or a refusal."""
+    """Leap seconds, years without them, invalid dates: the middle of exposures to a microsecond, or a refusal."""
     iers.conf.auto_download = False
     for start in HARD_TIMES:
         key, form = ("DATE-OBS", "isot") if isinstance(start, str) else ("MJD-OBS", "mjd")

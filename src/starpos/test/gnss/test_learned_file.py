@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What was learned is there again, whole, and a file that is none says so."""
+"""What was learned is there again, whole, and another file is refused."""
 
 import json
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a receiver may state, and the sentence for each thing that tells no place."""
+"""Values that a receiver may state, and the sentence for each one without a place."""
 
 from types import SimpleNamespace
 

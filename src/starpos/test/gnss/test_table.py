@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tables of a receiver, and the place that their rows tell at a frame."""
+"""Tables of a receiver, and the place from their rows at a frame."""
 
 import numpy as np
 import pytest

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What GNSS teaches on drives whose errors are drawn from stated laws, and what is made of a GNSS that is led astray."""
+"""What GNSS teaches on drives whose errors are drawn from stated laws, and the response to spoofed GNSS."""
 
 from dataclasses import dataclass
 
@@ -16,14 +16,14 @@ from starpos_testing.gnss_drives import GnssDrive
 
 UNKNOWN = Deflection(stddev_arcsec=6.0)
 DRIVE = GnssDrive()
-# after so many s of good GNSS something happens
+# time of good GNSS, s, after which something happens
 THEN_S = 1200.0
 ROVER = GnssDrive(stops=25)
 
 
 @dataclass
 class Told:
-    """What a watch tells of a frame: the check, None without GNSS; its place's error east, north in m, and covariance."""
+    """A watch's answer on a frame: the check, None without GNSS; its place's error east, north in m, and covariance."""
 
     at_s: float
     check: object

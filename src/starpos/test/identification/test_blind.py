@@ -103,7 +103,7 @@ def test_a_wrong_focal_length_of_exif_costs_time_only(off, solver, catalogue, rn
 
 
 def test_a_telephone_s_widest_lens_is_found_where_exif_tells_it(solver, catalogue, rng):
-    """Lens of 13 mm on film's frame: wider than the fields that are searched where nothing is told."""
+    """Lens of 13 mm on film's frame: wider than the fields that are searched by default."""
     xy, axis, focal_px = seen(catalogue, 114.0, 3.5, rng)
     s = solver.identify(replace(listed(xy), rough_focal_px=1.05 * focal_px))
     assert s.ok
@@ -196,7 +196,7 @@ def test_the_focal_lengths_that_are_tried_cover_all():
 
 
 def test_a_poor_answer_near_the_focal_length_of_exif_does_not_bind(solver, catalogue, rng):
-    """Eight stars of one sky fit the focal length that is told; sixty of another fit a third of it."""
+    """Eight stars of one sky fit the stated focal length; sixty of another fit a third of it."""
     few, _, told_px = seen(catalogue, 6.0, 8.5, rng)
     many, axis, focal_px = seen(catalogue, 20.0, 7.0, rng)
     xy = np.concatenate([few[:8], many[:60]])

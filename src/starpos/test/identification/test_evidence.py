@@ -22,7 +22,7 @@ FOUR_STARS = 3360, 4849, 5625, 7250, 7450, 10342, 11075, 11546
 
 
 def largest(fields, rng, catalogue, priors=tuple):
-    """The largest evidence of all that is tried in each of so many fields of random points."""
+    """The largest evidence of all tries in each of a number of fields of random points."""
     sky, best = sky_for(catalogue, SMALL), []
     for _ in range(fields):
         n = int(rng.integers(5, 10))
@@ -182,7 +182,7 @@ def integral(prior, made, zenith, reach_rad, rng):
 
 
 def test_a_prior_is_a_probability(rng):
-    """The density of each over all poses makes its share, and its widths leave room for no more."""
+    """Integrated over all poses, each density gives its share; the widths leave room for no more."""
     field = stars_at(SMALL, np.zeros((0, 2)), np.zeros(0))
     made = Pose(random_attitude(rng), SMALL.fx, False)
     zenith = random_attitude(rng)[2]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How much of a frame an answer explains: false stars and clouds are told from an answer that is not the frame's."""
+"""How much of a frame an answer explains: false stars and clouds are distinguished from a wrong answer."""
 
 from dataclasses import replace
 

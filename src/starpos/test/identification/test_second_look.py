@@ -27,7 +27,7 @@ def solver(catalogue):
 
 
 def exposed(catalogue, attitude, rng, faint_px=0.0, mirrored=False):
-    """A frame on which the stars below BRIGHT are too faint to be detected, and lie faint_px beside their places."""
+    """A frame on which the stars below BRIGHT are too faint to be detected, and lie faint_px off their places."""
     index = catalogue.cone(attitude[2], CAMERA.half_diagonal_rad, FAINT)
     v, vmag = catalogue.directions(index, 2000.0), catalogue.vmag(index)
     xy = CAMERA.project(v @ attitude.T) + np.outer(vmag > BRIGHT, [faint_px, 0])

@@ -64,7 +64,7 @@ def test_the_first_frame_of_a_night_counts_as_a_whole_one_where_a_sensor_has_its
         (
             frame(600, 400, (0.0, 0.0)),
             (600, 400),
-            "begin at column 0, row 0 of a sensor whose size nobody says",
+            "begin at column 0, row 0 of a sensor whose size is not stated",
         ),
         (frame(600, 400, (100.0, 50.0)), (800, 500), "begin at column 100, row 50"),
         (frame(600, 400, (math.nan, math.nan)), None, "cut out of larger ones"),

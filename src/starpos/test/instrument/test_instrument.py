@@ -70,7 +70,7 @@ def test_the_covariance_of_the_angles_is_that_of_turned_a3s(angles, rng):
             "beyond any turn",
         ),
         ({"tilt_deg": (0.0,)}, "two or three"),
-        ({"tilt_deg": (80.0, 80.0)}, "cannot be: give the elevations"),
+        ({"tilt_deg": (80.0, 80.0)}, "is impossible: give the elevations"),
         ({"tilt_deg": (np.inf, 0.0)}, "finite"),
         ({"temperature_c": np.inf}, "temperature_c"),
         ({"temperature_c": -1e300}, "temperature_c"),
@@ -122,7 +122,7 @@ def test_age():
         with pytest.raises(InstrumentError, match=r"2001-09-09T01:46:40\.000Z is 10 days .* holds for 10"):
             c.check_age(1e9 + off * 86400)
     replace(c, valid_days=float("inf")).check_age(1e12)
-    # Nobody knows how old it is.
+    # Its age is unknown.
     Calibration(valid_days=1.0).check_age(1e9)
 
 

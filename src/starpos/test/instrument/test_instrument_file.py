@@ -238,7 +238,7 @@ REFUSED = {
     "valid for words": (DATED % "valid_days: soon", "valid_days is 'soon': give a number"),
     "four tilts": (DATED % "tilt_deg: [1, 2, 3, 4]", "tilt_deg of a calibration two or three"),
     "one tilt": (DATED % "tilt_deg: 5", "tilt_deg is 5: give a list"),
-    "a tilt beyond range": (DATED % "tilt_deg: [80, 80]", "cannot be: give the elevations"),
+    "a tilt beyond range": (DATED % "tilt_deg: [80, 80]", "is impossible: give the elevations"),
     "as hot as a star": (DATED % "temperature_c: 6000", "temperature_c of the calibration is 6000"),
     "a drift back": (
         SIMPLE + "tilt_drift_arcsec_per_sqrt_hour: -1\n",
@@ -423,7 +423,7 @@ def test_a_disk_that_is_full_leaves_the_old_file(tmp_path):
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     assert path.read_bytes() == before
-    # Nothing half written beside it.
+    # Nothing half written next to it.
     assert list(tmp_path.iterdir()) == [path]
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The angles that tf2_echo prints of a camera in an IMU's frame are those of A3."""
+"""The angles that tf2_echo prints of a camera in an IMU's frame are A3's."""
 
 import numpy as np
 import pytest

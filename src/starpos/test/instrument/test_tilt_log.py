@@ -51,7 +51,7 @@ def test_a_mount_that_shakes_widens_the_covariance(rng):
 
 @pytest.mark.parametrize("factor", [1.0, 2.0, 3.0, 4.0])
 def test_more_noise_than_stated_is_paid_for(factor, rng):
-    """A night of exposures of five readings whose noise nobody stated."""
+    """A night of exposures of five readings with unstated noise."""
     mids = 1000.0 + 10.0 * np.arange(200)
     t = (mids[:, None] + 0.1 * np.arange(-2, 3)).ravel()
     x, y = 3 * DEG + rng.normal(0, factor * SCA100T_NOISE_RAD, (2, len(t)))
@@ -123,7 +123,7 @@ def test_two_readings_far_apart_do_not_bracket_an_exposure():
 
 
 def lost(keep, length=101):
-    """Readings at 10 Hz from 1000 s on, of which those of `keep` have come."""
+    """Readings at 10 Hz from 1000 s on, of which the indices `keep` have come."""
     t = 1000 + 0.1 * np.arange(length)
     t = t[keep(t)]
     return TiltLog.of(t, np.zeros(len(t)), np.zeros(len(t)), np.zeros(len(t)))
@@ -233,7 +233,7 @@ def test_noise_beyond_the_stated_and_angles_that_cannot_be_are_named_as_such(rng
 
 
 def froze(rng, step_deg, readings, noise_deg=SCA100T_NOISE_RAD / DEG):
-    """A log of 60 readings in steps, of which so many from the 30th on are equal."""
+    """A log of 60 readings in steps, of which some from the 30th on are equal."""
     x, y = np.round(rng.normal(0, noise_deg, (2, 60)) / step_deg) * step_deg * DEG
     x[30 : 30 + readings], y[30 : 30 + readings] = x[30], y[30]
     return TiltLog.of(1000 + 0.1 * np.arange(60), x, y, np.full(60, 15.0))

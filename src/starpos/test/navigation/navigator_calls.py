@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Voyages that are told to a NavigatorSession message by message, as a node would."""
+"""Voyages given to a NavigatorSession message by message, as by a node."""
 
 from types import SimpleNamespace
 
@@ -96,7 +96,7 @@ class Navigator:
         self.session = NavigatorSession(settings, lambda: self._jobs, self.told, self.told)
 
     def play(self, events):
-        """Tell (unix_s, take's name, arguments) in the order of time."""
+        """Pass (unix_s, take's name, arguments) in the order of time."""
         for unix_s, take, *arguments in sorted(events, key=lambda e: e[0]):
             now = Now(unix_s, unix_s)
             take_it = getattr(self.session, f"take_{take}")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Records with faults: each is told in a sentence, and the claim holds or there is no answer."""
+"""Records with faults: each is reported in a sentence, and the claim holds or there is no answer."""
 
 from dataclasses import replace
 
@@ -59,7 +59,7 @@ def test_a_gyro_in_degrees_is_named_where_nothing_turns():
     still = made("parked", 20, 3, rate_hz=50)
     with pytest.raises(VoyageError, match=r"gyro.* as if it was in deg/s: give rad/s"):
         navigated(with_imu(still, gyro=np.degrees(still.imu.gyro)), "parked")
-    # of one that has hardly a bias only the noise tells
+    # with hardly any bias only the noise shows it
     unbiased = still.imu.gyro - still.imu.gyro.mean(0)
     with pytest.raises(VoyageError, match=r"scatters by [0-9]+ times the noise of its model"):
         navigated(with_imu(still, gyro=np.degrees(unbiased)), "parked")
@@ -89,9 +89,7 @@ def test_a_wheel_that_slips_is_left_out(record):
 
     slipped = navigated(with_velocity(record, slip))
     assert nees(slipped, record) < 16
-    assert (
-        50 < slipped.left_out["velocities"] < 70 and "velocities do not go with the rest" in slipped.faults[0]
-    )
+    assert 50 < slipped.left_out["velocities"] < 70 and "velocities contradict the rest" in slipped.faults[0]
 
 
 def test_velocities_worse_than_stated_widen_the_claim(record, rng):

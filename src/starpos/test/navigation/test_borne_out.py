@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A law of motion weighed by a record: what its means tell of the wind, and the claims that follow."""
+"""A law of motion weighed by a record: what its means say of the wind, and the claims that follow."""
 
 import numpy as np
 import pytest
@@ -67,7 +67,7 @@ def test_a_wind_that_changes_more_widens_the_claim_and_is_told():
 
 
 def test_a_steady_wind_is_not_believed_to_stay_so():
-    """An unseen trend of 0.3 m/s in ten minutes remains possible; gusts that nobody saw do not."""
+    """An unseen trend of 0.3 m/s in ten minutes remains possible; unseen gusts do not."""
     _, voyage = voyage_in(None, 6)
     law = voyage.last.law
     assert law.drift_walk == pytest.approx(LAWS["drone"].drift_walk, rel=0.05)

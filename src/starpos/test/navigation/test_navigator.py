@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The session behind the node `navigator`: what it makes of voyages that it is told message by message."""
+"""The session behind the node `navigator`: voyages given to it message by message."""
 
 from dataclasses import asdict, replace
 from types import SimpleNamespace
@@ -182,7 +182,7 @@ NO_G = [0.0, 0.0, 9.8]
         (imu_message(1.7e9, [0, 0, np.nan], NO_G), "NaN"),
         (imu_message(1.7e9, [0, 0, 0], [0, 0, 1e200]), "beyond"),
         (imu_message(0.0, [0, 0, 0], NO_G), "no time stamp"),
-        (imu_message(1.7e9 + 60, [0, 0, 0], NO_G), "before its time"),
+        (imu_message(1.7e9 + 60, [0, 0, 0], NO_G), "in the future"),
     ],
 )
 def test_a_reading_that_cannot_be_is_refused_with_a_sentence(message, said):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An attitude that nobody knew the place of, under a zenith: as the stars themselves would tell it there."""
+"""An attitude without a known place, under a zenith: as from the stars there."""
 
 import numpy as np
 import pytest
@@ -45,7 +45,7 @@ def frame_at(zenith_distance_deg, seed):
 
 
 def told(frame):
-    """The frame as an attitude tells it."""
+    """The frame as given by an attitude."""
     seen = frame.placeless()
     return PlacelessFrame.of(
         CameraAttitude(

@@ -30,7 +30,7 @@ def seen(turn, shaking, push=None, **stars):
 
 
 def recorded(turn, shaking, push=None, t=T, sigma=FINE):
-    """Stars and readings of it, at frames t (K,), s, that tell the attitude to sigma (3,), rad."""
+    """Stars and readings of it, at frames t (K,), s, that give the attitude to sigma (3,), rad."""
     rng = np.random.default_rng(3)
     end = np.arange(0.02, t[-1] + 0.02, 0.02)
     noise = rng.normal(0, 1, (len(end), 3)) * np.interp(end, t, shaking)[:, None]
@@ -139,7 +139,7 @@ def test_only_a_rover_is_taken_to_stand(vehicle):
 
 
 def driven(drive, seed=3, noisier=1.0):
-    """A record and its voyage, with so many times the noise of the accelerometer that is stated."""
+    """A record and its voyage, with a multiple of the stated noise of the accelerometer."""
     model = replace(INDUSTRIAL, accelerometer_noise_density=noisier * INDUSTRIAL.accelerometer_noise_density)
     record = made("rover", 420, seed, rate_hz=25, cadence_s=2.0, drive=drive, model=model)
     return record, navigated(record, velocity=False)

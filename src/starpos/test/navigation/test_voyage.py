@@ -14,14 +14,14 @@ from starpos_testing.voyages import INDUSTRIAL, TACTICAL, made
     ids=["Europe", "pole", "south pole", "equator", "date line"],
 )
 def test_an_exact_voyage_is_found_to_a_metre_from_nothing(latitude_deg, longitude_deg):
-    """The vehicle drives and turns; neither place nor attitude nor level are told, and the height is as expected."""
+    """The vehicle drives and turns; neither place nor attitude nor level is given, and the height is as expected."""
     about = {"latitude_deg": latitude_deg, "longitude_deg": longitude_deg, "height_m": 500.0}
     exact = made("rover", 60, 3, rate_hz=100, errors=False, **about)
     voyage = navigated(exact)
     off = voyage.motion.place - exact.place
     up = exact.place / np.linalg.norm(exact.place, axis=1)[:, None]
     assert np.linalg.norm(off - up * np.sum(off * up, 1)[:, None], axis=1).max() < 1.0
-    # height is only told by the strength of gravity, of which the reference has fewer terms
+    # height is only determined by the strength of gravity, of which the reference has fewer terms
     assert np.abs(np.sum(off * up, 1)).max() < 5.0
     ahead = np.einsum("kij,kij->kj", voyage.motion.attitude, exact.body_to_itrs)
     assert np.degrees(np.arccos(np.minimum(ahead, 1))).max() * 3600 < 2.0

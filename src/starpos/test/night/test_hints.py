@@ -70,7 +70,7 @@ def test_a_right_header_is_not_doubted(seen):
 
 
 def test_each_frame_has_its_own_header(seen):
-    """The first frame's focal length is not that of the others."""
+    """The first frame's focal length differs from the others'."""
     given = Given(Instrument(1000.0 * 50 / PIXEL_UM), by_header=True)
     sight, _ = Identifying(given)(seen(RIGHT))
     assert sight.solution.ok and sight.solution.remark == ""
@@ -106,7 +106,7 @@ def never(*_):
 
 
 def test_a_frame_that_nothing_fits_keeps_its_sentence(lost, rng):
-    """Points of chance are searched within the time that a frame has, and told by the first sentence."""
+    """Random points are searched within the time that a frame has, and reported by the first sentence."""
     stars, solver, sight = lost
     points = replace(stars.take(np.arange(6)), x=rng.uniform(0, SIZE[0], 6), y=rng.uniform(0, SIZE[1], 6))
     assert without_hint(solver, points, points, sight, never, quiet) is sight

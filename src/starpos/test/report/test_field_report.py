@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A night in one file: the same fix from it, nothing of its owner in it, and no harm from files that are none."""
+"""A night in one file: the same fix from it, nothing of its owner in it, and no harm from other files."""
 
 import getpass
 import json

@@ -48,7 +48,7 @@ def settings_of_matplotlib():
 
 @pytest.fixture(scope="module")
 def touched():
-    """What the report that `drawn` makes has changed in matplotlib, by name."""
+    """Changes in matplotlib by the report of `drawn`, by name."""
     return {}
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`starpos report` on a rosbag2: the answer of the same night in files, what the solver said, and bags that are none."""
+"""`starpos report` on a rosbag2: the answer of the same night in files, the solver's sentences, and invalid bags."""
 
 import io
 import json
@@ -157,7 +157,7 @@ def test_solutions_alone_are_shown_as_they_were(said, lists, tmp_path, capsys):
     with NightBag(tmp_path / "bag") as bag:
         for stars, one in zip(lists, said, strict=True):
             bag.solution(stars.mid_unix_s, one)
-        bag.failure(lists[-1].mid_unix_s + 5.0, NOT_IDENTIFIED, "none of the sky fits <its> stars")
+        bag.failure(lists[-1].mid_unix_s + 5.0, NOT_IDENTIFIED, "no part of the sky matches <its> stars")
         bag.failure(lists[-1].mid_unix_s + 6.0, POOR_FIT, "two skies", warnings=["two_skies"])
     status, page, errors = report(capsys, tmp_path / "bag", tmp_path / "out")
     assert status == 0
@@ -166,7 +166,7 @@ def test_solutions_alone_are_shown_as_they_were(said, lists, tmp_path, capsys):
     assert f"{np.mean([one['heading'] for one in said]):.4f} ± " in page.text
     ground = [np.mean([one[f"{k}_geodetic"] for one in said]) for k in ("latitude", "longitude")]
     assert "{:+.6f}°, {:+.6f}° ±".format(*ground) in page.text
-    assert "as the solver recorded it" in page.text and "none of the sky fits <its> stars" in page.text
+    assert "as the solver recorded it" in page.text and "no part of the sky matches <its> stars" in page.text
     assert "8: 6 with a fix, 1 not identified, 1 poor fit" in page.text and "1 two_skies" in page.text
     assert any("upper bound" in line for line in errors)
     assert {
@@ -334,7 +334,7 @@ def test_broken_star_lists_cost_their_frame_only(solved_place, lists, tilts, tmp
 
 
 def test_without_rosbags_the_pip_line_is_said(lists, tilts, tmp_path, capsys, monkeypatch):
-    from starpos.cli import report as command
+    from starpos.cli import bags as command
 
     bag = record(tmp_path / "bag", lists, tilts)
     monkeypatch.setattr(command, "find_spec", lambda name: None if name == "rosbags" else name)

@@ -99,7 +99,7 @@ def test_one_frame_that_jumps_is_the_outlier(rng):
     latitudes[11] += 60 * ARCSEC
     s = measures.stability(night(latitudes, 0.5 + rng.normal(0, 3, 30) * ARCSEC, [1.0] * 30))
     assert np.flatnonzero(s.outlier).tolist() == [11]
-    # Too few to tell.
+    # Too few to decide.
     assert not measures.stability(night([0.7, 0.7, 0.8], [0.5] * 3, [1.0] * 3)).outlier.any()
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What becomes of the average when fixes go astray, the instrument moves, or a turn on the spot has told the place."""
+"""What becomes of the average when fixes go astray, the instrument moves, or a turn on the spot has found the place."""
 
 import math
 
@@ -76,7 +76,7 @@ def test_the_place_of_a_turn_is_given_up_when_the_instrument_moves():
     a = turned()
     assert News.MOVED in moved_after(a, 100.0)
     assert math.degrees(a.place.latitude) == pytest.approx(40.1, abs=1e-6)
-    # Those of the turn have told A3: they have no say any more.
+    # The turn's frames have determined A3: they do not count any more.
     assert a.place.frames == 4
     first = averaging_of([fix_at(0.0, 130.0)]).place
     assert np.linalg.eigvalsh(a.place.covariance)[0] <= np.linalg.eigvalsh(first.covariance)[0]

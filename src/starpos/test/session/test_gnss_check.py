@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""GNSS beside a fix: a place that cannot be is said, and only where it is of the same time."""
+"""GNSS next to a fix: an impossible place is reported, and only if it is of the same time."""
 
 import math
 from types import SimpleNamespace

@@ -57,7 +57,7 @@ def solver(scene, catalogue):
 
 @pytest.fixture
 def first(scene, catalogue, solver, rng):
-    """A frame and what its stars tell."""
+    """A frame and the attitude from its stars."""
     stars = stars_of(scene, catalogue, rng)
     return stars, solver.identify(stars).found
 

@@ -96,7 +96,7 @@ def test_an_instrument_file_of_another_camera_is_told_by_its_focal_length():
         with pytest.raises(InstrumentError, match=r"a\.yaml.*another camera"):
             check_camera(Instrument(1000.0 * factor), "a.yaml", CAMERA)
     check_camera(Instrument(1000.0, frame_size=(CAMERA.width, CAMERA.height)), "a.yaml", CAMERA)
-    with pytest.raises(InstrumentError, match=r"a\.yaml.*A3 is of frames of 90 x 60 px"):
+    with pytest.raises(InstrumentError, match=r"a\.yaml.*A3 was found with frames of 90 x 60 px"):
         check_camera(Instrument(1000.0, frame_size=(90, 60)), "a.yaml", CAMERA)
 
 

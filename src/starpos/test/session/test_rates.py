@@ -76,7 +76,7 @@ class Core:
         while self.now_s < begin_s + SECONDS + 2.0:
             made = []
             for kind in (TILT, STARS):
-                # one message of each topic has its turn, as with rclpy's executor
+                # one message per topic has its turn, as with rclpy's executor
                 message, told = next(self.come(kind), (None, None))
                 if message is not None:
                     made += self.told.tell(kind, message, self.now_s, played=False, sent=told)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the diagnostics say of conditions that nobody told."""
+"""The diagnostics of unstated conditions."""
 
 import math
 from dataclasses import replace
@@ -29,7 +29,7 @@ def tilt(temperature_c):
 def test_conditions_that_are_known_are_right():
     said = reports.of_conditions(TOLD, NOBODYS, tilt(12.0), GLOBAL)
     assert said.level == Level.OK and said.values["inclinometer (deg C)"] == 12.0
-    # before the first frame nobody can know what the tilts carry
+    # before the first frame the contents of the tilts are unknown
     assert reports.of_conditions(TOLD, NOBODYS, None, None).level == Level.OK
 
 
@@ -41,7 +41,7 @@ def test_conditions_that_are_known_are_right():
         ({}, NOBODYS, math.nan, GLOBAL, "the inclinometer's temperature is not known"),
         ({}, DATED, 12.0, Shutter(0.02, 0.001), "at its calibration is not known"),
         ({}, NOBODYS, 12.0, UNKNOWN, "the shutter's first row to its last is not known"),
-        ({}, Instrument(4000.0), 12.0, GLOBAL, "which inclinometer this is"),
+        ({}, Instrument(4000.0), 12.0, GLOBAL, "the inclinometer's model is not stated"),
     ],
 )
 def test_what_nobody_told_is_a_warning(values, instrument, temperature_c, shutter, words):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A session told the messages of a recorded night: what waits for what, and that only the data count."""
+"""A session with the messages of a recorded night: what waits for what, and that only the data count."""
 
 import math
 from copy import deepcopy
@@ -58,7 +58,7 @@ NOTHING_TOLD = Sent()
 
 
 class Told:
-    """A session that is told messages, and its jobs, which are done when a test says so."""
+    """A session that receives messages, and its jobs, which are done when a test says so."""
 
     def __init__(self, *parameters):
         self.said, self.jobs = Said(), []
@@ -121,7 +121,7 @@ def test_that_nobody_has_named_the_inclinometer_is_said_once(model, times, messa
     told = Told(f"inclinometer.model:={model!r}")
     told.tell(CAMERA_INFO, first(messages, CAMERA_INFO)[0], begin_s)
     told.work(begin_s)
-    said = [warning for warning in told.said.warnings if "which inclinometer" in warning]
+    said = [warning for warning in told.said.warnings if "model is not stated" in warning]
     assert len(said) == times and all("set inclinometer.model" in warning for warning in said)
 
 
@@ -216,11 +216,11 @@ def test_tilts_ahead_of_a_played_clock_wait_for_its_next_tick(told, messages, be
     tilt.header.stamp.sec += 50
     told.tell(TILT, tilt, begin_s + 6.0)
     told.at(begin_s + 7.0)
-    assert "before its time" in told.said.refused[0][1]
+    assert "in the future" in told.said.refused[0][1]
 
 
 def answers_of(messages, delay):
-    """The solutions of a night that turns, with jobs that are done so many messages after they were begun."""
+    """The solutions of a night that turns, with jobs that are done a number of messages after they were begun."""
     told, made, left = Told("self_calibration:=true"), [], 0
     for kind, message, at_s in messages:
         made += told.tell(kind, message, at_s)

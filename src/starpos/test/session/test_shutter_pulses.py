@@ -26,7 +26,7 @@ class Camera:
         self.sequence += 1
 
     def frame(self, commanded_s, faults=()):
-        """The frame's pulse and those of the faults, in the order of time; what it is paired with, and its begin."""
+        """The frame's pulse and the faults' pulses, in the order of time; the frame's pair, and its begin."""
         rng = self.rng
         true_s = commanded_s + self.lag_s + rng.normal(0, self.jitter_s)
         arrived_s = true_s + self.exposure_s + rng.uniform(0.03, 0.1)
@@ -69,7 +69,7 @@ def test_of_ten_thousand_frames_with_faulty_pulses_none_is_paired_wrongly():
 
 
 def test_a_flash_fired_by_hand_where_the_own_pulse_is_missed_is_not_taken():
-    """Fires as long as the frames' own pulse, the worst there is: only its lag tells."""
+    """Fires as long as the frames' own pulse, the worst there is: only its lag differs."""
     camera = Camera(5, jitter_s=0.0005)
     for k in range(50):
         camera.frame(BEGIN_S + k)

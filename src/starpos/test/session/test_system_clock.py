@@ -42,7 +42,7 @@ def test_what_is_claimed_of_a_clock():
     assert SystemClock(True, 0.03, 0.002).stddev_s == pytest.approx(0.03 / math.sqrt(3))
     # The kernel's own estimate, where that is larger.
     assert SystemClock(True, 0.001, 0.02).stddev_s == 0.02
-    # Nobody knows the hour.
+    # The hour is unknown.
     assert SystemClock(False, 16.0, 16.0).stddev_s > 20000
     assert "not synchronised" in SystemClock(False, 16.0, 16.0).sentence
     assert "0.03 s" in SystemClock(True, 0.03, 0.002).sentence

@@ -63,7 +63,7 @@ def test_a_stated_covariance_is_used():
 
 
 def test_the_noise_is_measured_from_all_samples_so_far():
-    """Five tell little; what came after the exposure is there by chance and does not count."""
+    """Five show little; samples after the exposure are there by chance and do not count."""
     rng = np.random.default_rng(3)
     noisy = [
         sample(-60 + k / 10, *([1, -2] + 3 * np.degrees(NOISE) * rng.normal(size=2))) for k in range(603)
@@ -94,7 +94,7 @@ def test_a_cleared_buffer_measures_the_noise_as_a_new_one():
 
 
 def test_a_night_that_is_played_again_measures_the_same_noise():
-    """Three exposures of few samples tell nothing; with both times counted they told of noise that is not there."""
+    """Three exposures of few samples show nothing; with both times counted they showed noise that is not there."""
     rng = np.random.default_rng(5)
     buffer, shots = TiltBuffer(), [0.0, 3.0, 6.0]
     night = [

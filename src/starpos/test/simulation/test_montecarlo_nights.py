@@ -36,8 +36,8 @@ def outcomes(catalogue):
 def test_claims_are_true(kind, outcomes):
     """The normalised errors squared of 12 nights scatter by 0.6 about their 2: 4.3 is four sigma up.
 
-    These twelve come to 2.2 calibrated and 1.7 turned; without the drift of the days it is 58, without the noise of the
-    tilts no night is worked at all, and errors claimed twice as large as they are would leave 0.5.
+    These twelve come to 2.2 calibrated and 1.7 turned; without the drift of the days it is 58. Without the noise of the
+    tilts no night is solved at all, and errors claimed twice as large as they are would leave 0.5.
     """
     assert [o.trouble for o in outcomes[kind]] == [""] * 12
     assert {o.kind for o in outcomes[kind]} == {kind}
@@ -48,7 +48,7 @@ def test_claims_are_true(kind, outcomes):
 
 @pytest.mark.montecarlo
 def test_the_ground_is_less_well_known_than_the_plumb_line(outcomes):
-    """The difference is the 6 arcsec, 185 m, of a deflection nobody knows."""
+    """The difference is the 6 arcsec, 185 m, of an unknown deflection."""
     for o in outcomes["turned"]:
         more = np.sqrt(np.diag(o.covariance_ground - o.covariance)[:2])
         assert more == pytest.approx([185.5, 185.5], abs=2)
@@ -74,7 +74,7 @@ def test_a_quiet_inclinometer_makes_a_better_night(catalogue):
 
 
 def test_nothing_told_is_what_was_drawn(catalogue):
-    """Else the nights would flatter: A3, zero, scale, air and stars are all other than the instrument is told."""
+    """Else the nights would flatter: A3, zero, scale, air and stars all differ from the stated ones."""
     rng = np.random.default_rng(1)
     world, begin = montecarlo_nights.draw(rng, catalogue, SCA100T_CALIBRATED, 0.01, CAMERA)
     assert montecarlo_nights.FIRST_UNIX_S < begin < montecarlo_nights.LAST_UNIX_S

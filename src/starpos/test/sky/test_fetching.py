@@ -31,7 +31,7 @@ def archive(tmp_path_factory):
 class Mirror:
     """A server of one file; it keeps what was asked for: path and range.
 
-    cut: it breaks off after so many bytes.  ranges: whether it knows them.
+    cut: number of bytes after which it breaks off.  ranges: whether it knows them.
     """
 
     def __init__(self, content, cut=None, ranges=True):

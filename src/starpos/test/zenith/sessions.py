@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from starpos import rotation
+from starpos.earth.ellipsoid import enu_axes
 from starpos.earth.orientation import EarthOrientation
 from starpos.earth.refraction import Atmosphere
 from starpos.instrument.inclinometer import EXACT, Tilt
@@ -42,7 +43,8 @@ class Drawn:
 def drawn(rng, *, azimuths=(0, 90, 180, 270) * 2, frames=6, motion=0.4, air=0.05, turn_deg=4.0, lean=10.0):
     """A session of frames 5 s apart in faces at these azimuths (deg), a minute from face to face; sizes in arcsec."""
     eta, xi = rng.normal(0, 10, 2)
-    up = rotation.normalised(np.array([eta * ARCSEC, xi * ARCSEC, 1.0]))
+    astronomic = MARK.latitude + xi * ARCSEC, MARK.longitude + eta * ARCSEC / np.cos(MARK.latitude)
+    up = MARK.enu @ enu_axes(*astronomic)[2]
     a3 = rotation.about_axis(2, np.radians(turn_deg)) @ rotation.from_vector([*rng.normal(0, 0.002, 2), 0.0])
     zero, scale = rng.normal(0, 60, 2) * ARCSEC, rng.normal(0, SCALE, 2)
     quiet = motion == 0 and air == 0

@@ -5,9 +5,13 @@ import numpy as np
 import pytest
 from sessions import INSTRUMENT, MARK, VACUUM, drawn
 
+from starpos.earth.ellipsoid import enu_axes
+from starpos.earth.refraction import Atmosphere
 from starpos.errors import FixError
+from starpos.units import ARCSEC
 from starpos.zenith.adjustment import adjusted
 from starpos.zenith.faces import faces_of
+from starpos.zenith.lines import LeanEstimate
 
 
 @pytest.mark.parametrize("turn_deg", [0.0, 94.0, 180.0, 271.0])
@@ -47,6 +51,30 @@ def test_more_faces_do_not_average_what_their_air_shares(rng):
 def test_faces_are_runs_of_one_heading(rng):
     sightings = drawn(rng, azimuths=(350, 5, 350), frames=2).sightings
     assert faces_of(sightings).tolist() == [0, 0, 1, 1, 2, 2]
+
+
+def test_eta_is_the_difference_of_longitudes_where_meridians_converge():
+    latitude, (xi, eta) = np.radians(80.0), np.array([20.0, 25.0]) * ARCSEC
+    up, place = enu_axes(latitude + xi, eta / np.cos(latitude))[2], enu_axes(latitude, 0.0)
+    east, north, height = place @ up
+    lean = LeanEstimate(lean=np.array([east, north]) / height, a3=np.eye(3))
+    assert lean.deflection(latitude) / ARCSEC == pytest.approx([20.0, 25.0], abs=1e-6)
+    assert abs(lean.lean[0] - eta) / ARCSEC > 0.01
+
+
+def test_layers_of_air_lie_along_the_plumb_line(rng):
+    # Laplace's formula fitted to the Pulkovo tables: 57.085 arcsec tan z in dry air, 15 C, 1013.25 hPa, 0.59 um
+    air = Atmosphere(pressure_pa=101_325.0, temperature_c=15.0, humidity=0.0, wavelength_um=0.59)
+    sightings = drawn(rng, motion=0.0, air=0.0, frames=2).sightings
+    bent, straight = (adjusted(sightings, INSTRUMENT, a, MARK) for a in (air, VACUUM))
+    size = [np.hypot(a.xi_arcsec, a.eta_arcsec) for a in (bent, straight)]
+    assert (size[0] / size[1] - 1) / ARCSEC == pytest.approx(57.085, rel=0.01)
+
+
+def test_daily_terms_of_the_pole_and_of_ut1_are_in_the_covariance(rng):
+    terms = {name: (xi, eta) for name, xi, eta in drawn(rng, frames=2).adjusted().terms}
+    assert terms["pole"] == pytest.approx([3e-4, 3e-4 * np.sin(MARK.latitude)], rel=0.05)
+    assert terms["ut1"][1] == pytest.approx(15.041 * 3e-5 * np.cos(MARK.latitude), rel=0.1)
 
 
 def test_two_frames_are_no_session(rng):

@@ -10,6 +10,7 @@ from sessions import INSTRUMENT, MARK, SCALE, VACUUM, Drawn, drawn, shifted
 from starpos.errors import FixError
 from starpos.night.sightings import DeflectionSession
 from starpos.units import ARCSEC
+from starpos.zenith import doubts
 from starpos.zenith.doubts import remarks
 
 
@@ -71,6 +72,21 @@ def test_clouds_in_one_face(rng):
 
 def test_a_tiltmeter_that_is_not_level_enough(rng):
     assert "level every face to" in said(drawn(rng, lean=300.0).sightings)
+
+
+def test_a_value_better_than_the_catalogues_zones_says_so(rng, monkeypatch):
+    quiet = drawn(rng, motion=0.01, air=0.0, frames=12).sightings
+    # 1 mas, and 0.5 mas for each of 34 years
+    assert "zonal errors of Tycho-2, up to 0.018 arcsec" in said(quiet)
+    monkeypatch.setattr(doubts, "load_catalogue", LikeGaia)
+    assert said(quiet) == ""
+
+
+class LikeGaia:
+    """A catalogue whose stars err by 0.1 mas."""
+
+    def sigma(self, index, year):
+        return np.full(len(index), 1e-4 * ARCSEC)
 
 
 def test_no_sighting_is_no_deflection():

@@ -58,7 +58,7 @@ def test_corrected_places_move_the_attitudes_towards_the_truth(rng):
             rotation.to_small_vector(a.enu_to_camera @ b.enu_to_camera.T)[0]
             for a, b in zip(seen, frames, strict=True)
         ]
-        # what all frames share no star tells
+        # no star determines errors that all frames share
         return np.std(turns) / SIGMA
 
     assert off(corrected) < 0.7 * off(sightings)

@@ -48,10 +48,10 @@ class Bag:
         self._reader.__exit__(*exception)
 
     def inputs(self, needed: str, others: tuple[str, ...], remaps: Remaps = NO_REMAPS) -> list[str]:
-        """Find the topics of these relative names in any namespace, or those of a robot's own camera and IMU.
+        """Find the topics of these relative names in any namespace, or the topics of a robot's own camera and IMU.
 
-        Accelerations count where no tilts are.  Raises BagError if the needed one is missing, FrameError where several
-        topics may be a robot's, or one of the remaps cannot be.
+        Accelerations are used without tilts. Raises BagError if the needed one is missing, FrameError if several topics
+        may be a robot's, or a remap is impossible.
         """
         connections = self._reader.connections
         names = sorted({c.topic for c in connections})

@@ -16,7 +16,7 @@ class BagWriteError(Exception):
 
 
 class BagWriter:
-    """Writes serialized messages unchanged, compressed; the folder is a bag once it is closed.
+    """Writes messages unchanged, compressed; the folder is a bag once it is closed.
 
     Raises BagWriteError if rosbags is not installed, or if the folder exists already or cannot be made.
     """
@@ -49,7 +49,7 @@ class BagWriter:
             )
 
     def write(self, topic: str, log_ns: int, data: bytes) -> None:
-        """Write a serialized message; BagWriteError if the disk does not take it."""
+        """Write a message's bytes; BagWriteError if the disk does not take it."""
         try:
             self._writer.write(self._connections[topic], log_ns, data)
         except OSError as error:

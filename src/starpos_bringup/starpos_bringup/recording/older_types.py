@@ -13,8 +13,8 @@ if TYPE_CHECKING:
 Appended = dict[str, dict[str, Any]]
 
 SHUTTER = {"shutter_known": False, "readout": 0.0, "readout_stddev": 0.0}
-# The fields that types got at their end, each with the value that says that it is not known: newest first, the last ones
-# are those that the first release lacked.
+# Fields added at the end of types, each with its value for unknown: newest first, last the fields that the first release
+# lacked.
 VERSIONS: tuple[Appended, ...] = (
     {f"{PACKAGE}/msg/Solution": {"warnings": []}},
     {
@@ -42,7 +42,7 @@ class OlderTypes:
             message = self._completed(store.deserialize_cdr(data, type_name), type_name)
             return bytes(self._now.serialize_cdr(message, type_name))
         except Exception:
-            # hostile bytes may cause any error of a conversion; who plays them says that they are broken
+            # hostile bytes may cause any error of a conversion; the player reports that they are broken
             return data
 
     def _completed(self, message: Any, type_name: str) -> Any:

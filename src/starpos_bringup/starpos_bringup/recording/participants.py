@@ -13,18 +13,18 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from starpos_common.replayed import DEPTH, PLAYED, TAKEN
 from starpos_interfaces.msg import Played, Taken
 
-# A node that says nothing for so long has ended, or hangs; they speak once a second.
+# A node that is silent for longer has ended, or hangs; nodes send once a second.
 SILENCE_S = 30.0
-# A node that waits for so long for a message that was published has lost it.
+# A node that waits longer for a message that was published has lost it.
 LOST_S = 30.0
-# All nodes speak on one topic: with a depth of one, the word of one that is not read yet would replace another's.
+# All nodes send on one topic: with a depth of one, a message that is not read yet would replace another node's.
 WORDS = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 class _Participant:
     """A node: its newest Taken, when that came, since when it has taken nothing new, and what it made in replays.
 
-    gone: it is not waited for any more.  left: it took part in this replay and names it no more.
+    gone: it is not waited for any more. left: it took part in this replay and has left it.
     """
 
     def __init__(self, words: Taken) -> None:
@@ -34,7 +34,7 @@ class _Participant:
         self.made = self.fixes = 0
 
     def hear(self, words: Taken, replay: int) -> None:
-        """Take what it says; replay: the one under way."""
+        """Take its message; replay: the one under way."""
         self.heard_s = time.monotonic()
         before, self.words = self.words, words
         if words.busy or (words.replay, words.index) != (before.replay, before.index):
@@ -43,13 +43,13 @@ class _Participant:
             if words.replay != replay:
                 self.left = True
                 return
-            # what it said before may be a second old, and leave out an answer to somebody else's frame
+            # its earlier message may be a second old, and lack an answer to another player's frame
             self.made += words.made - before.made
             self.fixes += words.fixes - before.fixes
 
 
 class Participants:
-    """Tells the nodes that take part what is played, and keeps what each has taken.
+    """Informs the nodes that take part of what is played, and keeps what each has taken.
 
     say: takes a sentence for the person at the terminal.
     """
@@ -57,10 +57,10 @@ class Participants:
     def __init__(self, node: Node, say: Callable[[str], None]) -> None:
         self._node, self._say = node, say
         self._heard: dict[str, _Participant] = {}
-        # those of this replay; None before it begins. Who comes later takes part in the next.
+        # the nodes of this replay; None before it begins. Later ones take part in the next.
         self._members: list[_Participant] | None = None
         self._replay, self._index = 0, -1
-        # when it was asked what is taken, and of which topic; '': of all
+        # when the last question was asked, and about which topic; '': about all
         self._asked_s, self._asked_topic = 0.0, ""
         # whether one was lost on the way
         self.lost = False
@@ -97,13 +97,13 @@ class Participants:
         return {p.words.makes[0] for p in self.taking(topic) if p.words.makes}
 
     def newly_made(self, topic: str) -> list[tuple[str, Time]]:
-        """Topics and stamps of what was made of the newest message that was told, one of this topic."""
+        """Topics and stamps of the messages made from the newest announced one, of this topic."""
         newest = self._replay, self._index
         makers = [p for p in self.taking(topic) if (p.words.replay, p.words.index) == newest]
         return [(p.words.makes[0], stamp) for p in makers for stamp in p.words.stamps]
 
     def making(self, topic: str) -> list[list[str]]:
-        """What each of those that publish a topic takes."""
+        """The inputs of each publisher of a topic."""
         return [list(p.words.takes) for p in self._present if topic in p.words.makes]
 
     def answers(self, topic: str) -> tuple[int, int]:
@@ -112,7 +112,7 @@ class Participants:
         return sum(p.made for p in takers), sum(p.fixes for p in takers)
 
     def begin(self) -> None:
-        """Begin a replay with those that are here now, also with those that were given up in the last but are heard."""
+        """Begin a replay with the nodes that are here now, including nodes given up in the last one but heard again."""
         now_s = time.monotonic()
         self._members = [p for p in self._heard.values() if now_s - p.heard_s <= SILENCE_S]
         for p in self._members:
@@ -122,7 +122,7 @@ class Participants:
         self.tell(Played.BEGIN, 0, answer=True)
 
     def begin_again(self) -> None:
-        """Say once more that the replay begins: a node that had not found the player yet has not heard it."""
+        """Announce the replay again, for a node that had not found the player before."""
         with self._speaking:
             self._publish(Played.BEGIN, 0, answer=True)
 
@@ -135,7 +135,7 @@ class Participants:
     def tell(
         self, kind: int, now_ns: int, topic: str = "", stamp: Time | None = None, *, answer: bool = False
     ) -> None:
-        """Say what is played; answer: and ask whether it is taken."""
+        """Announce what is played; answer: ask whether it is taken."""
         if answer:
             self._asked_s, self._asked_topic = time.monotonic(), topic
         with self._speaking:
@@ -159,7 +159,7 @@ class Participants:
         )
 
     def have_taken_all(self) -> bool:
-        """Whether what was asked for is taken, with all before it, by those of its takers who are still there."""
+        """Whether the message in question and all before it are taken by all its remaining takers."""
         asked = self.taking(self._asked_topic) if self._asked_topic else self._present
         for p in asked:
             if (p.words.replay, p.words.index) == (self._replay, self._index):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Publishes the messages of a bag at the wanted pace, each frame when the one before is worked off."""
+"""Publishes the messages of a bag at the wanted pace, each frame when the previous one is finished."""
 
 import math
 import sys
@@ -29,22 +29,22 @@ FRAMES = (STARS, *IMAGES)
 IMU = "sensor_msgs/msg/Imu"
 CLOCK_PERIOD_S = 0.025
 ACKNOWLEDGED_S = 3.0
-# So many messages are on their way at most: queues hold some hundred.
+# Maximum number of messages on their way: queues hold some hundred.
 BURST = 50
-# Where nobody takes part nobody says what is taken: at rate 0 listeners get so long to empty their queues.
+# Without participants there are no acknowledgements: at rate 0 listeners get this time to empty their queues.
 BURST_REST_S = 0.05
 BEGIN_S, AGAIN_S = 30.0, 1.0
-# Who is never found must not stop it.
+# Time after which missing subscribers are ignored.
 FOUND_S = 10.0
-# A listener that takes no part is found within so long of another, mostly within a tenth of that.
+# Time after the discovery of one listener within which others are found, mostly within a tenth of it.
 SETTLED_S = 1.0
 
 
 class Player:
     """Publishes the topics of a bag, and has the nodes that take part take them one after another.
 
-    frames: how many frames a solver could answer: star lists that were played, or made of played images; images of which
-    none was made, unless nobody takes images while somebody takes star lists.
+    frames: number of frames that a solver could answer: star lists that were played, or made from played images, and
+    images without a star list, unless only star lists have subscribers.
     """
 
     def __init__(
@@ -72,7 +72,7 @@ class Player:
         kinds = {self._publishers[name].topic_name: t.type_name for name, t in by_name.items()}
         self._frame_topics = [name for name, kind in kinds.items() if kind in FRAMES]
         self._imu_topics = [name for name, kind in kinds.items() if kind == IMU]
-        # those of star lists, which a solver answers
+        # topics of star lists, which a solver answers
         self._star_topics = {name for name, kind in kinds.items() if kind == STARS}
         self._participants = Participants(self._node, say)
         self._listeners: list[int] = []
@@ -113,22 +113,24 @@ class Player:
         return self._participants.lost
 
     def wait(self, at_most_s: float, *, for_solver: bool) -> None:
-        """Wait until all who listen are found, or the time is over; then report missing ones and other publishers.
+        """Wait until all listeners are found, or time is up; then report missing ones and other publishers.
 
         for_solver: wait for nodes that take part, too, from the frames to the solver.
         """
         self._spin(at_most_s, lambda: self._all_listen() and (not for_solver or self._chain()))
-        # who takes part may not be heard yet, and who listens not be found
+        # participants may not be heard yet, nor listeners found
         self._spin(min(at_most_s, FOUND_S), self._settled)
         heard = [n for n in self._frame_topics if self._played[n].get_subscription_count()]
         if self._frame_topics and not heard and not self._stopped:
             self._say(
-                f"nobody subscribes to {', '.join(self._frame_topics)}: start detector or solver in its namespace, with "
+                f"no node subscribes to {', '.join(self._frame_topics)}: start detector or solver in its "
+                f"namespace, with "
                 "use_sim_time, or remap (--ros-args -r)"
             )
         elif self._frame_topics and not any(map(self._participants.taking, heard)):
             self._say(
-                f"those who subscribe to {', '.join(heard)} do not say what they take: start detector and solver with "
+                f"the subscribers of {', '.join(heard)} do not report what they take: start detector and "
+                f"solver with "
                 "use_sim_time"
             )
         self._say_doubled()
@@ -157,7 +159,7 @@ class Player:
         return all(p.get_subscription_count() for p in every)
 
     def _chain(self) -> bool:
-        """Whether somebody takes the frames, the star lists that are made of them, and accelerations if there are any."""
+        """Whether the frames, the star lists made from them, and any accelerations have takers."""
         makers = self._made_of_frames()
         solvers = [*self._star_topics, *makers]
         takers = self._participants.taking
@@ -170,7 +172,7 @@ class Player:
         )
 
     def _settled(self) -> bool:
-        """Whether all who listen are found, and nobody new has come for SETTLED_S: strangers do not say they will."""
+        """Whether all listeners are found, and no new one has come for SETTLED_S."""
         listeners = [self._node.count_subscribers(name) for name in self._played]
         if listeners != self._listeners:
             self._listeners, self._unchanged_since_s = listeners, time.monotonic()
@@ -235,7 +237,7 @@ class Player:
 
     def _agree(self, topic: str, stamp: Any, is_frame: bool) -> bool:
         """Wait until the nodes have taken a message, and then what they made of it; return whether star lists came."""
-        # what others take of what is made of it has its turn before the next message
+        # results of this message that other nodes take have their turn before the next message
         links = any(map(self._participants.taking, self._participants.topics_made_of(topic)))
         answer = is_frame or links or self.count % BURST == 0
         self._tell(topic, stamp, answer)
@@ -265,7 +267,7 @@ class Player:
             pass
 
     def _pace(self, log_ns: int, often: bool) -> None:
-        """Wait for the time of a message; often: one of so many that the clock need not tick for each."""
+        """Wait for the time of a message; often: often: one of several for which the clock need not tick each time."""
         if self._first_ns is None:
             self._first_ns = log_ns
         while self._rate and not self._stopped:
@@ -280,7 +282,7 @@ class Player:
         self._tick(log_ns, CLOCK_PERIOD_S if often else 0.0)
 
     def _tick(self, now_ns: int, least_s: float = 0.0) -> None:
-        """Go on to a time; it is published unless the clock was within so many seconds before."""
+        """Go on to a time; it is published unless the clock was published within some seconds before."""
         if self._now_ns is not None and now_ns <= self._now_ns:
             return
         self._now_ns = now_ns

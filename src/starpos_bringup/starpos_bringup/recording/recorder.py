@@ -13,11 +13,11 @@ from starpos_bringup.recording.bag_writer import BagWriteError, BagWriter
 from starpos_common.diagnostics import Diagnosis, Diagnostics, Level
 from starpos_common.topics import subscription
 
-# With less left on the disk there is a warning.
+# Free space on the disk below which there is a warning.
 LITTLE_BYTES = 1_000_000_000
 # An image may have 42 MB.
 DEPTH, IMAGE_DEPTH = 1000, 3
-# Those that are published transient_local.
+# Topics that are published transient_local.
 LATCHED = ("camera/camera_info",)
 
 

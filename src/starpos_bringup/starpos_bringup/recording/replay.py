@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """`ros2 run starpos_bringup replay BAG`: play a rosbag2 into the running graph, byte for byte, with its time on /clock.
 
-For machines without `ros2 bag play`, and to play as fast as the solver answers, with the same result, which that cannot.
+For machines without `ros2 bag play`, and to play as fast as the solver answers with the same result, which `ros2 bag
+play` cannot.
 """
 
 import argparse
@@ -82,24 +83,28 @@ def _parser() -> argparse.ArgumentParser:
     some.add_argument(
         "--inputs",
         choices=tuple(INPUTS),
-        help="only what a solver takes (stars), or detector, solver and, where no tilts are, inclinometer (images), in "
-        "whatever namespace, or of a robot's own drivers; not what they gave then",
+        help="only the inputs of the solver (stars), or of detector, solver and, where no tilts are, "
+        "inclinometer (images), in any namespace or from a robot's own drivers; their recorded outputs "
+        "are left out",
     )
     parser.add_argument(
         "--remap",
         action="append",
         default=[],
         metavar="NAME:=TOPIC",
-        help=f"with --inputs images: the bag's topic that serves as one of {', '.join(DRIVER_INPUTS)}; without it the "
+        help=f"with --inputs images: the bag's topic to use as one of {', '.join(DRIVER_INPUTS)}; without "
+        f"it the "
         "one with this name, or the only one of its type. It is played under its own name: remap the nodes, or the "
         "player (--ros-args -r)",
     )
-    parser.add_argument("--loop", action="store_true", help="again and again; the time begins anew as well")
+    parser.add_argument(
+        "--loop", action="store_true", help="play again and again; the time begins anew as well"
+    )
     parser.add_argument(
         "--wait",
         type=_rate,
         metavar="S",
-        help="at most so long for those who listen (3; with --inputs 30, for the solver too)",
+        help="longest wait for subscribers (3; with --inputs 30, for the solver too)",
     )
     return parser
 

@@ -62,6 +62,9 @@ function render() {
   const lights = state.lights.map((light) => ({ ...light, age: heardAgo(light) }));
   showLights(element("lights"), lights, state.old_after.fast);
   showLights(element("clocks"), lights.filter((l) => l.name.endsWith(": Clock")), state.old_after.fast);
+  const deflections = lights.filter((l) => l.name.endsWith(": Deflection"));
+  element("deflection-card").hidden = !deflections.length;
+  showLights(element("deflection"), deflections, state.old_after.fast);
   say("lights-note", lights.length ? "" : "no diagnostics yet");
   dressFrame();
 }

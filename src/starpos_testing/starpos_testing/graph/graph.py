@@ -28,7 +28,7 @@ def executable(package: str, name: str) -> str:
 
 
 class Executable:
-    """An executable of this workspace as a process; its output goes to a file, as a pipe that nobody reads blocks."""
+    """An executable of this workspace as a process; its output goes to a file, as a pipe without a reader blocks."""
 
     def __init__(self, log: Path, package: str, name: str, arguments=(), parameters=()):
         options = [word for p in parameters for word in ("-p", p)]
@@ -126,7 +126,7 @@ class Graph:
         return self.processes[-1]
 
     def comes(self, condition, seconds: float) -> bool:
-        """Whether a condition becomes true within so many seconds."""
+        """Whether a condition becomes true within a time in s."""
         end = time.monotonic() + seconds
         while not condition():
             if time.monotonic() > end:
@@ -135,7 +135,7 @@ class Graph:
         return True
 
     def spin_once(self, seconds: float) -> None:
-        """Take a message, if one comes within so many seconds."""
+        """Take a message, if one comes within a time in s."""
         self._executor.spin_once(timeout_sec=seconds)
 
     def wait(self, condition, why="") -> None:

@@ -236,7 +236,7 @@ class Ear:
         return sorted(stamp for stamp, s in self.solutions.items() if s.status == Solution.OK)
 
     def comes(self, condition, seconds: float) -> bool:
-        """Whether a condition becomes true within so many seconds."""
+        """Whether a condition becomes true within a time in s."""
         end = time.monotonic() + seconds
         while not condition():
             if time.monotonic() > end:

@@ -20,7 +20,7 @@ TILT_RATE_HZ = 10
 
 @dataclass(frozen=True)
 class LinkedInstrument:
-    """Two hosts, their cable, and an ear beside the solver."""
+    """Two hosts, their cable, and an ear next to the solver."""
 
     mount: Host
     robot: Host
@@ -91,9 +91,9 @@ class Traffic:
 
 
 def traffic(folder: Path, frames: int, cadence_s: float, quiet_s: float = 10.0) -> Traffic:
-    """Measure the traffic of so many full frames; the first, during which nodes find each other, do not count.
+    """Measure the traffic of a number of full frames; the first, during which nodes find each other, do not count.
 
-    quiet_s: how long without a camera, to see what the tilts take.
+    quiet_s: time without a camera, to measure the tilts' traffic.
     """
     with two_hosts() as instrument:
         camera = start(instrument, folder, FULL, cadence_s)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Distances of answers from the true place, in their sigmas; and instruments that differ from what the solver is told."""
+"""Distances of answers from the true place, in their sigmas; and instruments that differ from the solver's parameters."""
 
 from dataclasses import replace
 

@@ -35,7 +35,7 @@ ament_package()
 
 
 def built(folder: Path) -> dict[str, str]:
-    """Variables that let a process import tf2_msgs: those of a build in this folder, none where it is installed.
+    """Variables that let a process import tf2_msgs: from a build in this folder, none where it is installed.
 
     It is built once: a whole build of the same files, which stands there already, is taken.
     """

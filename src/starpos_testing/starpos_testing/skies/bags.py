@@ -15,7 +15,7 @@ EMPTY = {"string": "", "bool": False, "float32": 0.0, "float64": 0.0}
 
 
 def typestore():
-    """Message types of ROS and our own; skips the test if our own are not beside this package."""
+    """Message types of ROS and our own; skips the test if our own are not next to this package."""
     if not MESSAGES.is_dir():
         pytest.skip("starpos_interfaces is not beside this package")
     store = get_typestore(Stores.ROS2_JAZZY)
@@ -25,7 +25,7 @@ def typestore():
 
 
 def part_of(bag: Path, folder: Path, begin_s: float, seconds: float) -> Path:
-    """Write a part of a bag, from so many seconds after its beginning, as a bag of its own."""
+    """Write the part of a bag from a time in s after its beginning, as a bag of its own."""
     with AnyReader([bag]) as reader, Writer(folder, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
         begin_ns, made = reader.start_time + round(begin_s * 1e9), {}
         for c, log_ns, data in reader.messages(start=begin_ns, stop=begin_ns + round(seconds * 1e9)):
@@ -36,7 +36,7 @@ def part_of(bag: Path, folder: Path, begin_s: float, seconds: float) -> Path:
 
 
 def knowing(truth: dict) -> list[str]:
-    """Parameters of a solver that knows the instrument of the night test/data/night, from the JSON beside it."""
+    """Parameters of a solver that knows the instrument of the night test/data/night, from the JSON next to it."""
     values = {
         "use_sim_time": "true",
         "refraction.pressure": truth["pressure_pa"],

@@ -46,7 +46,7 @@ def pointing_of(
 ) -> Pointing:
     """The pointing, with its stated errors in rad, of a camera with an attitude (3, 3), C into east, north, up."""
     state = earth_state(utc_unix_s)
-    # refraction shears the field, so the roll is that of a whole ring, as of a solver that fits all stars
+    # refraction shears the field, so the roll comes from a whole ring, as with a solver that fits all stars
     ring = np.array([[0, 0, 1.0]] + [[x, y, 1.0] for x, y in RING_RAD])
     ring /= np.linalg.norm(ring, axis=1)[:, None]
     sky = np.array([icrs_of(site, attitude @ v, state) for v in ring])
@@ -68,7 +68,7 @@ def pointing_of(
 
 @dataclass(frozen=True)
 class PointedNight:
-    """Pointings and tilts (K) of a night, the place and the last heading (rad), and the instrument as it is told."""
+    """Pointings and tilts (K) of a night, the place and the last heading (rad), and the instrument as stated."""
 
     site: Site
     heading: float

@@ -28,7 +28,7 @@ def exif_tags(
     gps=None,
     lens=None,
 ):
-    """The tags of an Exif IFD, with those of the GPS IFD under 0x8825; None leaves one out.
+    """The tags of an Exif IFD, with the GPS IFD's under 0x8825; None leaves one out.
 
     gps: UTC by GPS, a day like '2026:11:02' and whole hours, minutes and seconds.
     film_mm, focal (ratio of mm), plane (ratio of px per unit), unit, size (px) are of the focal length; lens: its name.
@@ -69,7 +69,7 @@ def tiff(tags, exif, order="<", pixels=b""):
 
 
 def dng(mosaic, pattern="rggb", order="<", **exif):
-    """The bytes of a DNG of a (h, w) uint16 mosaic; the keywords are those of `exif_tags`."""
+    """The bytes of a DNG of a (h, w) uint16 mosaic; the keywords are as for `exif_tags`."""
     height, width = mosaic.shape
     pixels = mosaic.astype(order + "u2").tobytes()
     tags = {

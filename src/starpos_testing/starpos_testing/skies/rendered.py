@@ -84,7 +84,7 @@ def grid(size, spacing, electrons, rng):
 
 
 def match(found, stars, within=2.0):
-    """Index (N,) of the found star nearest to each true one; -1 if none lies within so many px."""
+    """Index (N,) of the found star nearest to each true one; -1 if none lies within the tolerance in px."""
     if len(found) == 0:
         return np.full(len(stars), -1)
     apart = np.hypot(stars[:, None, 0] - found.x, stars[:, None, 1] - found.y)

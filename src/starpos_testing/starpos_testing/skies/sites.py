@@ -42,7 +42,7 @@ class Shots:
         return self.scene.instrument.calibration.a3
 
     def solver(self, catalogue, given=(0.0, 0.0, 0.0)) -> Solver:
-        """The solver of an instrument whose A3 is said to be as given; how well, nobody says, so it is not known."""
+        """The solver of an instrument with the given A3 without a stated error, so it is not known."""
         instrument = Instrument(
             FOCAL_PX, calibration=Calibration(misalignment_deg=given), inclinometer=SCA100T_CALIBRATED
         )

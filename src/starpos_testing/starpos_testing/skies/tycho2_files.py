@@ -61,7 +61,7 @@ FAINT_SUPPLEMENT = supplement((2, 1, 1), "T", 2.0, 1.0, vt="14.000", bt="14.500"
 
 
 def write_files(folder: Path, contents: dict[str, bytes]) -> Path:
-    """Write all files into a folder: those of `contents` by name, the others with one faint star each."""
+    """Write all files into a folder: from `contents` by name, the others with one faint star each."""
     folder.mkdir(parents=True)
     for name in NAMES:
         faint = FAINT_SUPPLEMENT if name.startswith("suppl") else FAINT

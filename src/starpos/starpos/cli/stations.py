@@ -1,0 +1,187 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`starpos stations`: a table of many sessions of `starpos deflection`: repeats, a geoid grid, levelling."""
+
+import argparse
+import csv
+import json
+import sys
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from starpos.cli import console
+from starpos.earth import geoid
+from starpos.earth.geoid import Geoid
+from starpos.errors import StationError
+from starpos.utc import utc_text
+from starpos.zenith import session_file
+from starpos.zenith.levelling import GeoidStep, levelled
+from starpos.zenith.stations import Station, against_grid, stations_of
+
+
+def define(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "sessions",
+        nargs="+",
+        metavar="SESSION",
+        help="what starpos deflection --json printed, a file a session; those of one --station, or of one mark, are a "
+        "station",
+    )
+    parser.add_argument(
+        "--geoid",
+        metavar="FILE",
+        help="compare with the deflections of a geoid grid (EGM96, EGM2008, a national one: GTX, NGS .bin, GeoTIFF)",
+    )
+    parser.add_argument(
+        "--level",
+        nargs="+",
+        metavar="STATION",
+        help="print how much the geoid rises along these stations, two or more (astrogeodetic levelling); with --geoid "
+        "by the grid's shape between them",
+    )
+    formats = parser.add_mutually_exclusive_group()
+    formats.add_argument("--csv", action="store_true", help="a CSV, a row a station")
+    formats.add_argument(
+        "--geojson", action="store_true", help="GeoJSON (RFC 7946), a point a station, for any GIS"
+    )
+    formats.add_argument(
+        "--json", action="store_true", help="one JSON object a station, then one a step of --level"
+    )
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    stations = stations_of([session_file.read(path) for path in args.sessions])
+    grid = None if args.geoid is None else geoid.read(args.geoid)
+    for station in stations:
+        if station.doubt:
+            console.complain("stations", station.doubt)
+    values = [station_json(station, grid) for station in stations]
+    if grid is not None and (without := [v["station"] for v in values if v["grid_arcsec"] is None]):
+        console.complain("stations", f"{args.geoid}: no data at {', '.join(without)}")
+    steps = [] if args.level is None else levelled(_line(stations, args.level), grid)
+    if args.csv:
+        _print_csv(values)
+    elif args.geojson:
+        print(json.dumps(console.plain(_geojson(values))))
+    else:
+        for value in values:
+            console.print_json(value) if args.json else print(_station_line(value))
+    if args.csv or args.geojson:
+        for step in steps:
+            print(step_line(step), file=sys.stderr)
+    else:
+        for step in steps:
+            console.print_json(step_json(step)) if args.json else print(step_line(step))
+    return 0
+
+
+def _line(stations: Sequence[Station], names: Sequence[str]) -> list[Station]:
+    found = {station.name: station for station in stations}
+    if len(names) < 2:
+        raise StationError("--level takes two stations or more")
+    if missing := [name for name in names if name not in found]:
+        raise StationError(f"--level {missing[0]}: the stations are {', '.join(found)}")
+    return [found[name] for name in names]
+
+
+def station_json(station: Station, grid: Geoid | None) -> dict:
+    """A station for --json; its keys with a grid are None without one, or where that has no data."""
+    sigma_xi, sigma_eta = station.sigma
+    compared = None if grid is None else against_grid(station, grid)
+    return {
+        "station": station.name,
+        "latitude": np.degrees(station.latitude),
+        "longitude": np.degrees(station.longitude),
+        "height_m": station.height_m,
+        "sessions": len(station.sessions),
+        "frames": sum(s.frame_count for s in station.sessions),
+        "first_utc": utc_text(min(s.utc_unix_s for s in station.sessions)),
+        "last_utc": utc_text(max(s.utc_unix_s for s in station.sessions)),
+        "mark_arcsec": station.at_mark,
+        "geoid_arcsec": station.at_geoid,
+        "sigma_xi_arcsec": sigma_xi,
+        "sigma_eta_arcsec": sigma_eta,
+        "covariance_arcsec2": station.covariance,
+        "session_off_arcsec": station.off,
+        "chi2": station.chi2,
+        "degrees": station.degrees,
+        "probability": station.probability,
+        "grid_arcsec": None if compared is None else [compared.grid.xi_arcsec, compared.grid.eta_arcsec],
+        "minus_grid_arcsec": None if compared is None else compared.off,
+        "minus_grid_sigma_arcsec": None if compared is None else compared.stddev,
+    }
+
+
+def step_json(step: GeoidStep) -> dict:
+    """A step of --level for --json."""
+    return {
+        "from": step.begin.name,
+        "to": step.end.name,
+        "distance_m": step.distance_m,
+        "azimuth": np.degrees(step.azimuth),
+        "rise_m": step.rise_m,
+        "sigma_m": step.stddev_m,
+        "sigma_deflections_m": step.measured_m,
+        "sigma_between_m": step.between_m,
+    }
+
+
+def step_line(step: GeoidStep) -> str:
+    """Return the same for people."""
+    return (
+        f"geoid {step.begin.name} to {step.end.name}: {step.rise_m:+.4f} m +- {step.stddev_m:.4f} (deflections "
+        f"{step.measured_m:.4f}, between the stations {step.between_m:.4f}), {step.distance_m / 1000:.3f} km at "
+        f"{np.degrees(step.azimuth):.1f} deg"
+    )
+
+
+def _station_line(value: Mapping) -> str:
+    (xi, eta), (xi0, eta0) = value["mark_arcsec"], value["geoid_arcsec"]
+    text = (
+        f"{value['station']}: {value['latitude']:.6f} {value['longitude']:.6f} {value['height_m']:.1f} m, xi {xi:+.3f} "
+        f"+- {value['sigma_xi_arcsec']:.3f}, eta {eta:+.3f} +- {value['sigma_eta_arcsec']:.3f} arcsec at the mark, "
+        f"{xi0:+.3f} {eta0:+.3f} at the geoid, {value['sessions']} sessions"
+    )
+    if value["degrees"]:
+        text += f" (chi-square {value['chi2']:.1f} of {value['degrees']})"
+    if value["minus_grid_arcsec"] is not None:
+        (off_xi, off_eta), (sigma_xi, sigma_eta) = (
+            value["minus_grid_arcsec"],
+            value["minus_grid_sigma_arcsec"],
+        )
+        text += f"; minus the grid {off_xi:+.2f} +- {sigma_xi:.2f}, {off_eta:+.2f} +- {sigma_eta:.2f}"
+    return text
+
+
+def flat(value: Mapping) -> dict:
+    """A station's values, each pair as two, for tables."""
+    row = {k: v for k, v in value.items() if np.ndim(v) == 0 and not k.endswith("_arcsec")}
+    for key in ("mark_arcsec", "geoid_arcsec", "grid_arcsec", "minus_grid_arcsec", "minus_grid_sigma_arcsec"):
+        xi, eta = (None, None) if value[key] is None else value[key]
+        row |= {f"xi_{key}": xi, f"eta_{key}": eta}
+    row |= {k: value[k] for k in ("sigma_xi_arcsec", "sigma_eta_arcsec")}
+    return row
+
+
+def _print_csv(values: Sequence[Mapping]) -> None:
+    rows = [console.plain(flat(value)) for value in values]
+    writer = csv.DictWriter(sys.stdout, list(rows[0]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+
+
+def _geojson(values: Sequence[Mapping]) -> dict:
+    """A FeatureCollection of RFC 7946: longitude, latitude in deg and height in m on WGS 84."""
+    features = []
+    for value in values:
+        row = flat(value)
+        place = [row.pop("longitude"), row.pop("latitude"), row.pop("height_m")]
+        features.append(
+            {
+                "type": "Feature",
+                "geometry": {"type": "Point", "coordinates": place},
+                "properties": {k: v for k, v in row.items() if v is not None},
+            }
+        )
+    return {"type": "FeatureCollection", "features": features}
