@@ -19,7 +19,7 @@ from starpos.earth.refraction import Atmosphere
 from starpos.errors import FixError, PlaceError
 from starpos.fix.budget import ALWAYS, ErrorTerm, heading_of, heading_row, mount_term, total_covariance
 from starpos.fix.horizon import check_visible
-from starpos.fix.matched import MatchedStars, StarFit, apparent, fit_stars
+from starpos.fix.matched import MatchedStars, SeenFrame, StarFit, apparent, fit_stars
 from starpos.frames.shutter import GLOBAL, Shutter
 from starpos.frozen import at_once
 from starpos.instrument.camera import Camera
@@ -81,31 +81,17 @@ class LinkAttitude:
 
 @at_once
 @dataclass(frozen=True, kw_only=True)
-class AttitudeAtPlace:
+class AttitudeAtPlace(SeenFrame):
     """Attitude of the instrument at a known place, by the stars alone.
 
     plumb: in east, north, up by the plumb line (astronomic).  ellipsoid: by WGS 84's normal (geodetic).
     true_north: level by the plumb line, north by the ellipsoid, as the fix's attitude in a graph of nodes.
-    used, residual_px, residual_arcsec, jitter_px, focal_scale, zenith_distance, refraction_arcsec,
-    diurnal_aberration_arcsec, ut1_minus_utc_s, camera_to_itrs, camera_covariance: as in Fix.
     """
 
-    utc_unix_s: float
     place: KnownPlace
     plumb: LinkAttitude
     ellipsoid: LinkAttitude
     true_north: LinkAttitude
-    used: np.ndarray
-    residual_px: np.ndarray
-    residual_arcsec: float
-    jitter_px: float
-    focal_scale: float
-    zenith_distance: float
-    refraction_arcsec: float
-    diurnal_aberration_arcsec: float
-    ut1_minus_utc_s: float
-    camera_to_itrs: np.ndarray
-    camera_covariance: np.ndarray
 
     @property
     def text(self) -> str:

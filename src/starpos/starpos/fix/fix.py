@@ -22,7 +22,7 @@ from starpos.fix.budget import (
     place_of,
     total_covariance,
 )
-from starpos.fix.matched import MatchedStars, apparent, fit_stars
+from starpos.fix.matched import MatchedStars, SeenFrame, apparent, fit_stars
 from starpos.fix.readable import InDegrees
 from starpos.frames.shutter import GLOBAL, Shutter
 from starpos.frozen import at_once
@@ -34,36 +34,20 @@ from starpos.units import ARCSEC
 
 @at_once
 @dataclass(frozen=True, kw_only=True)
-class Fix:
+class Fix(SeenFrame):
     """Astronomic latitude, longitude and heading (rad) at one instant, with the error budget.
 
     link_to_enu (3, 3): attitude of the base link.
-    used (M,): rows of the given stars that were kept; residual_px (M, 2): their fitted places minus their seen ones.
-    jitter_px: scatter of the stars beyond the centroids' own errors (seeing, optics).
-    focal_scale: factor on the given focal length.
     levelling (6, 2): change of the rows of an ErrorTerm for errors, in rad, of up about two axes fixed to the
-    inclinometer. camera_to_itrs (3, 3): attitude of the camera against the Earth by the stars alone; camera_covariance
-    (3, 3) in rad2: of its small rotation about the Earth's axes.
+    inclinometer.
     """
 
-    utc_unix_s: float
     latitude: float
     longitude: float
     heading: float
     link_to_enu: np.ndarray
     terms: tuple[ErrorTerm, ...]
     levelling: np.ndarray
-    used: np.ndarray
-    residual_px: np.ndarray
-    residual_arcsec: float
-    jitter_px: float
-    focal_scale: float
-    zenith_distance: float
-    refraction_arcsec: float
-    diurnal_aberration_arcsec: float
-    ut1_minus_utc_s: float
-    camera_to_itrs: np.ndarray
-    camera_covariance: np.ndarray
 
     @property
     def covariance(self) -> np.ndarray:
