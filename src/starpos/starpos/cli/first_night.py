@@ -131,7 +131,7 @@ def _frames(folder: Path) -> list[Path]:
 
 
 def _tilts(folder: Path, night: FirstNight, stars: Stars) -> TiltLog | str:
-    """The tilts up to some time after the frame, which are waited for; or why there are none."""
+    """The tilts up to some time after the frame, which are waited for; or why they are missing."""
     end_s = (stars.mid_unix_s or 0.0) + max((stars.exposure_s or 0.0) / 2, AROUND_S)
     begin = time.monotonic()
     while True:
