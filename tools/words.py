@@ -26,7 +26,7 @@ READ = (
     "starpos_*/test/*.py",
     "src/*/test/**/*.py",
     "tools/*.py",
-    "tools/[bfs]*/**/*.py",
+    "tools/*/**/*.py",
     "starpos_*/*.md",
     "src/*/*.md",
     "starpos_interfaces/*/*.[ms][sr][gv]",

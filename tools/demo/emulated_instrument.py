@@ -4,10 +4,10 @@
 The inclinometer's firmware, as it is flashed, runs on an emulated ATmega8 with its converter and sensor
 (starpos_inclinometer/firmware/sim). The camera is the CCD simulator of a real indiserver; indi_sky.py gives it the sky of
 each exposure, and a shutter that opens 0.3 s after the command: its contact and a receiver's pulse per second go to the
-board. The four nodes are the installed ones. The place is drawn at random, and the nodes are told neither it nor the
-lag: the frames with a time of their shutter (the sixth and later ones) make the place.  The same frames are solved once
-more with the true times.  Exit status 0 if the truth lies within 4 sigma, both places are within 10 m, the camera node
-has measured the lag within 10 ms, and all ended cleanly; 2 where something is not installed.
+board. The four nodes are the installed ones. The place is drawn at random, and the nodes know neither it nor the lag:
+the frames with a time of their shutter (the sixth and later ones) make the place.  The same frames are solved once more
+with the true times.  Exit status 0 if the truth lies within 4 sigma, both places are within 10 m, the camera node has
+measured the lag within 10 ms, and all ended cleanly; 2 where something is not installed.
 """
 
 import json
@@ -106,7 +106,7 @@ def start_devices(devices: Processes, place: Place, seed: int) -> dict[str, dict
         raise RuntimeError(f"the sky does not come up: {said}{sky.stderr.read()}")
     board.stdin.write(f"pps {1e3 * (1 - time.time() % 1):.3f} 1000\n".encode())
     board.stdin.flush()
-    # Nobody has told the lag, but that there may be one as long.
+    # The lag is not stated, only that there may be one as long.
     lag = {"driver_lag_stddev": LAG_S, "pulses": True, "pulses.curtain_stddev": EXACT_S}
     camera = {
         "source": "indi",
@@ -132,7 +132,7 @@ def wait_for(port: int):
 
 def known_by(place: Place) -> dict:
     """Parameters of the solver."""
-    # A3 is exact here, and the clock is also that of the sky, so their usual errors would only widen the covariance.
+    # A3 is exact here, and the sky has the same clock, so their usual errors would only widen the covariance.
     exact = {"misalignment_stddev": EXACT_ARCSEC, "inclinometer.model": "sca100t_calibrated"}
     return known_of(place) | exact
 
@@ -145,7 +145,7 @@ def start_nodes(nodes: Processes, place: Place, found: dict):
 
 
 class Recorder:
-    """Listens, on the watcher's node, to what the solver hears and to the lag that the camera reports."""
+    """Listens, on the watcher's node, to the solver's inputs and to the lag that the camera reports."""
 
     def __init__(self, watcher: Watcher):
         from diagnostic_msgs.msg import DiagnosticArray

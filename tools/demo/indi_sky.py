@@ -4,10 +4,10 @@
     indi_sky.py PORT FOLDER EXPOSURE_S SEED PLACE LAG_S LAG_STDDEV_S       PLACE: instrument_run.Place as JSON
 
 The simulator reads its frames from a folder when an exposure is commanded.  The folder has one file, and this process
-holds a lease on it (fcntl(2), F_SETLEASE). When the simulator opens the file, the kernel tells this process, and the
+holds a lease on it (fcntl(2), F_SETLEASE). When the simulator opens the file, the kernel notifies this process, and the
 simulator waits until the lease is given back.  As in a single-lens reflex the shutter opens a lag after the command: the
-contact of its hot shoe closes (`shutter`, with bounces, for the emulated board, on standard output), the sky of that
-moment is drawn, and the lease is given back when the exposure is over.  Only this process knows the place and the lag.
+contact of its hot shoe closes (`shutter`, with bounces, for the emulated board, on standard output), and the sky of that
+moment is drawn.  The lease is given back when the exposure is over.  Only this process knows the place and the lag.
 Prints `ready` on standard error, then the Unix time of each exposure's begin.
 """
 
@@ -53,7 +53,7 @@ class Picture:
         np.bitwise_xor(pixels, 0x8000, out=self._pixels, casting="unsafe")
 
     def lease(self):
-        """Wait until nobody reads the file; from then on a reader has to wait, and SIGIO tells of it."""
+        """Wait until the file has no reader; from then on a reader has to wait, and SIGIO announces it."""
         end = time.monotonic() + PATIENCE_S
         while True:
             try:
