@@ -191,7 +191,7 @@ def test_an_a3_whose_error_nobody_stated_is_a_warning_and_is_not_saved(graph, so
     assert graph.state("solver: Calibration", "misalignment_stddev").level == b"\x01"
     assert "not known" in save(graph, "/nowhere/x.yaml").message
     assert graph.set("solver", misalignment_stddev=0.5)[0]
-    assert graph.state("solver: Calibration", "that of the parameters").level == b"\x00"
+    assert graph.state("solver: Calibration", "from the parameters").level == b"\x00"
 
 
 def test_a_calibration_of_another_camera_info_counts_as_unknown(graph, solver):
