@@ -249,7 +249,9 @@ def run(seed: int, frames: int, out: Path) -> int:
 def conclude(
     watcher: Watcher, recorder: Recorder, trouble: str | None, begun: str, memory: dict, out: Path
 ) -> int:
-    timed = [s for s in watcher.good() if watcher.captures[stamp_of(s)].stamp_source == HARDWARE]
+    # A busy machine may lose a Capture.
+    heard = [s for s in watcher.good() if stamp_of(s) in watcher.captures]
+    timed = [s for s in heard if watcher.captures[stamp_of(s)].stamp_source == HARDWARE]
     if not trouble and not timed:
         trouble = "no frame has a time of its shutter"
     if trouble:

@@ -55,7 +55,7 @@ return [...document.querySelectorAll("body *")].filter((e) => e.checkVisibility(
 """
 # Of each card: the share of its height that lies empty below what it shows.
 EMPTY = """
-return [...document.querySelectorAll("section:not(#map-card)")].map((card) => {
+return [...document.querySelectorAll("section:not(#map-card)")].filter((c) => c.checkVisibility()).map((card) => {
   const box = card.getBoundingClientRect();
   const ends = [...card.querySelectorAll("*")].filter((e) => e.checkVisibility() && (e.tagName === "IMG"
     || (e.textContent.trim() && !e.children.length))).map((e) => e.getBoundingClientRect().bottom);

@@ -144,7 +144,9 @@ def test_the_card_of_the_deflection_is_there_while_one_is_measured(page):
 
 def test_a_node_that_has_never_spoken_is_silent_not_missing(page):
     def silent():
-        return [lamp[0] for lamp in page.run(LAMPS) if lamp[1] == "SILENT" and "nothing heard" in lamp[2]]
+        lamps = [lamp for lamp in page.run(LAMPS) if lamp[1] == "SILENT" and "nothing heard" in lamp[2]]
+        # A diagnostic that another test sent has grown old on a busy machine.
+        return [name for name, *_ in lamps if ":" not in name]
 
     page.until(lambda: silent() == ["detector", "inclinometer"])
 
