@@ -127,7 +127,9 @@ def draw_budget(figure: "Figure", night: Night) -> None:
     places = [("one frame", one, SKY)]
     if night.combined and len(night.fixed) > 1:
         places.append((f"average of {len(night.fixed)}", _shares(night.combined, night), BLUE))
-    names = sorted(one, key=lambda n: np.hypot(*one[n][:2]))
+    # An average may have sources that one frame has not, such as the frames' scatter.
+    largest = {n: np.hypot(*share[:2]) for _, shares, _ in places for n, share in shares.items()}
+    names = sorted(largest, key=lambda n: largest[n])
     panels = figure.subplots(1, 3, sharey=True)
     height = 0.8 / len(places)
     for k, (axes, title) in enumerate(zip(panels, ("east, m", "north, m", "heading, arcsec"), strict=True)):

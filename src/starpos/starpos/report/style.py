@@ -30,7 +30,7 @@ def new_figure(height_in: float) -> "Figure":
 
 def mark_simulated(figure: "Figure") -> None:
     """Write into the corner of a figure that no camera took its frames."""
-    figure.text(0.995, 0.004, "simulated", ha="right", va="bottom", fontsize=8, color=GREY)
+    figure.text(0.005, 0.004, "simulated", ha="left", va="bottom", fontsize=8, color=GREY)
 
 
 def png_of(figure: "Figure") -> bytes:

@@ -19,7 +19,7 @@ from starpos.instrument.sensors import SCA100T_CALIBRATED
 from starpos.night import folder
 from starpos.report import measures
 from starpos.report.pictures import nights_picture
-from starpos.report.place_figures import draw_scatter
+from starpos.report.place_figures import draw_budget, draw_scatter
 from starpos_testing.skies.reports import AIR, KNOWN, PLACE, Page, assert_drawn, run, simulate, solved
 
 pytest.importorskip("matplotlib")
@@ -158,6 +158,15 @@ def test_a_scatter_of_many_kilometres_is_told_in_them(sigma_deg, unit, still, ca
     draw_scatter(figure, night)
     (axes,) = figure.axes
     assert (axes.get_xlabel(), axes.get_ylabel()) == (f"east, {unit}", f"north, {unit}")
+
+
+def test_the_budget_has_the_sources_that_only_the_average_has(still):
+    from matplotlib.figure import Figure
+
+    night, figure = worked(still, KNOWN_A3), Figure()
+    assert "tilt drift" not in {t.name for t in night.places[0].terms if t.covariance.any()}
+    draw_budget(figure, night)
+    assert "tilt drift" in {label.get_text() for label in figure.axes[0].get_yticklabels()}
 
 
 @pytest.mark.usefixtures("unpainted")
