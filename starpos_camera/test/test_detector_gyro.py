@@ -47,10 +47,11 @@ def test_a_star_is_found_by_the_trail_that_the_readings_tell(feed, listener):
     assert len(alone) == 0 and len(told) == 1
     info = camera_to_message(Camera.from_focal(*SIZE[::-1], FOCAL_PX), "optical", 1793642400.0)
 
-    # what is not read yet when a frame comes does not count, and what is sent before the node knows its sender is lost
+    # What is not read yet when a frame comes does not count: the readings are sent a frame ahead.
+    # What is sent before the node knows its sender is lost.
     def as_told():
         feed.infos.publish(info)
-        turn(feed, 1793642400 + feed.stamp + 1 + 0.123456789)
+        turn(feed, 1793642400 + feed.stamp + 2 + 0.123456789)
         stars = feed.wait_for(feed.send(frame, exposure=EXPOSURE_S)).stars
         return len(stars) == 1 and abs(stars[0].x - told.x[0]) < 1e-4
 
