@@ -171,7 +171,8 @@ class GnssWatch:
         if self._begins:
             return self._check(self._while_it_begins(single, sighting.tilt), sighting, gnss)
         witnesses = self._witnesses if len(self._witnesses.since) else Witnesses.none(len(self.learned.state))
-        if not self.disagrees and witnesses.due(sighting.utc_unix_s):
+        # While GNSS is not believed its one witness grows too old where GNSS was away for long: hope begins anew.
+        if not len(witnesses.since) or (not self.disagrees and witnesses.due(sighting.utc_unix_s)):
             witnesses = witnesses.set_aside(self.learned)
         self._witnesses = witnesses.heard(seen, self.learned.state, sighting.utc_unix_s)
         against = self._witnesses.against(sighting.utc_unix_s)
