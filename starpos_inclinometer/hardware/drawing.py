@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The same sheets as SVG, for documents."""
+"""SVG drawings, for documents, of the sheets that `kicad` writes for KiCad."""
 
 from xml.sax.saxutils import escape
 

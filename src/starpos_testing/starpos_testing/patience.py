@@ -4,6 +4,8 @@
 import time
 from collections.abc import Callable
 
+# Between two looks.
+POLL_S = 0.005
 # For any event: over ten times the slowest one's time on an idle machine.
 WAIT_S = 120.0
 
@@ -13,3 +15,4 @@ def until(condition: Callable[[], object]) -> None:
     end = time.monotonic() + WAIT_S
     while not condition():
         assert time.monotonic() < end, f"waited {WAIT_S:g} s in vain"
+        time.sleep(POLL_S)

@@ -31,8 +31,7 @@ def add_frames(parser: argparse.ArgumentParser, pointings: bool = False) -> None
         parser.add_argument(
             "--pointings",
             metavar="CSV",
-            help="instead of frames, what a plate solver found for them: utc_unix_s (mid-exposure), ra_deg, "
-            "dec_deg, "
+            help="instead of frames, what a plate solver found for them: utc_unix_s (mid-exposure), ra_deg, dec_deg, "
             "roll_deg, sigma_arcsec, sigma_roll_arcsec[, exposure_s]: ICRS of the frame's centre, the position angle of "
             "its top from north over east, 1 sigma of the centre along each of two axes and of the turn about it; "
             "without a roll only elevations count: they give a position from three directions or more, and "
@@ -91,8 +90,7 @@ def has_own_level(args: argparse.Namespace) -> bool:
         return False
     if args.tilt is not None or getattr(args, "self_calibrate", False):
         raise InstrumentError(
-            f"{args.instrument} describes a camera fixed to the ground, without an inclinometer: leave out "
-            f"--tilt "
+            f"{args.instrument} describes a camera fixed to the ground, without an inclinometer: leave out --tilt "
             "and --self-calibrate, or give another instrument file"
         )
     return True

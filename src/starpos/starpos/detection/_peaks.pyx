@@ -27,7 +27,7 @@ cdef float ROUNDING = 1e-5
 
 
 cdef struct Group:
-    # Of pixels side by side that are all peaks, as in a saturated disc: one of them stands for those it is merged into.
+    # Pixels side by side that are all peaks, as in a saturated disc, are one group; `into`: the group that this one joined.
     int into
     double x
     double y
@@ -59,7 +59,7 @@ cdef struct Smoother:
     Py_ssize_t end
     # Of each row of the plane that has been taken the highest pixel; NULL if nobody asked.
     int *highest
-    # No smoothed pixel is above half so many times the highest sum of two neighbours among those it is made of.
+    # A smoothed pixel is at most over / 2 times the highest sum of two neighbours under the kernel.
     float over
 
 
@@ -100,7 +100,7 @@ cdef int _begin(Smoother *s, Py_ssize_t width, const float[::1] weight) except -
 
 
 def smoothed(const pixel_t[:, ::1] plane, const float[::1] weight, const Py_ssize_t[::1] rows, int step):
-    """Some rows (R,) of a plane (h, w), and of these every so manieth pixel, smoothed along both axes.
+    """Some rows (R,) of a plane (h, w), and of these every `step`-th pixel, smoothed along both axes.
 
     weight  (reach + 1,): from the middle outwards
 

@@ -40,7 +40,7 @@ cdef bint _is_flat(const pixel_t *block, Py_ssize_t width) noexcept nogil:
 
 
 def bright_squares(const pixel_t[:, ::1] plane, const int[::1] highest, int step, int limit):
-    """Pixels of every so manieth row and column of a plane that are above a limit, with one more to the right and below.
+    """Pixels of every `step`-th row and column of a plane that are above a limit, with one more to the right and below.
 
     highest (h,): of each row the highest pixel
 

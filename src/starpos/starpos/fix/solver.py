@@ -344,8 +344,7 @@ def check_explained(answer: Solution) -> None:
     place, seen = answer.source or "the frame", answer.explained
     if TWO_SKIES in answer.warnings:
         raise FixError(
-            f"{place}: two skies in one frame, its bright stars belong to two pointings: keep the camera "
-            f"still "
+            f"{place}: two skies in one frame, its bright stars belong to two pointings: keep the camera still "
             "while it exposes, and expose once"
         )
     if UNEXPLAINED in answer.warnings and seen is not None:

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Detects a GNSS place that is spoofed or wrong, suddenly or slowly.
 
-At several moments of the last half hour a witness was set aside: a filter that began with the state of that time. It has
-one more unknown, an error of GNSS that began at that moment, as a step or growing evenly. If GNSS is good, that error is
-0 within its covariance, which includes all errors of the stars' place; a likelihood ratio decides (Willsky and Jones,
-IEEE Trans. Automatic Control 21(1), 1976, 108, from memory).  So a drag shows although each frame of it agrees with the
-frame before, and although the filter that learns has followed it.
+Every EVERY_S seconds a witness is set aside, and kept for LONGEST_S: a filter that begins with the state of that time.
+It has one more unknown, an error of GNSS that began at that moment, as a step or growing evenly. If GNSS is good, that
+error is 0 within its covariance, which includes all errors of the stars' place; a likelihood ratio decides (Willsky and
+Jones, IEEE Trans. Automatic Control 21(1), 1976, 108, from memory).  So a drag shows although each frame of it agrees
+with the frame before, and although the filter that learns has followed it.
 """
 
 from dataclasses import dataclass, replace
@@ -98,11 +98,11 @@ class Witnesses:
         )
 
     def against(self, utc_unix_s: float) -> np.ndarray:
-        """How much each speaks against GNSS (W,): the larger chi-square, of two degrees of freedom, of its two errors."""
+        """Evidence of each against GNSS (W,): the larger chi-square (2 degrees of freedom) of step and growth."""
         n = self.state.shape[1] - OFFSETS
         weight = np.linalg.inv(self.covariance[:, n:, n:])
         pull = np.einsum("wij,wj->wi", weight, self.state[:, n:])
-        # less what was taken for known at the beginning
+        # without the prior's weight: only measurements count
         weight = weight - np.eye(OFFSETS) / NOTHING_RAD**2
         step = _chi2(weight[:, :2, :2], pull[:, :2])
         growth = _chi2(weight[:, 2:, 2:], pull[:, 2:])

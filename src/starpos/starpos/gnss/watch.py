@@ -52,7 +52,7 @@ class GnssCheck:
     def sentence(self) -> str:
         """Sentence that says the same."""
         if math.isnan(self.distance_m):
-            return "A3 is learned from GNSS: the stars tell no place of their own yet"
+            return "A3 is learned from GNSS: the stars give no place of their own yet"
         where = COMPASS[round(self.bearing_deg / 45) % 8]
         off, sigma = _length_text(self.distance_m), _length_text(self.sigma_m)
         sentence = f"GNSS is {off} {where} of where the stars put us ({sigma})"
@@ -180,13 +180,14 @@ class GnssWatch:
         if self.disagrees:
             self._hope(worst, sighting.utc_unix_s)
         elif worst > ALARM:
+            # where the frame alone raised the alarm, this is still the likeliest moment at which the error began
             self._take_back(int(np.argmax(against)), sighting)
         if self.disagrees:
             return self._check(DISAGREES, sighting, gnss)
         return self._check(DOUBTFUL if worst > DOUBT else AGREES, sighting, gnss)
 
     def _while_it_begins(self, single: float, tilt: Tilt) -> str:
-        """The status while A3 is hardly known: an alarm needs two frames, for readings that err by chance say it once."""
+        """The status while A3 is hardly known: an alarm needs two frames without a common reading of the level."""
         readings = frozenset(tilt.times)
         again = self._suspicious is not None and not (readings & self._suspicious)
         if single <= ALARM:
@@ -197,7 +198,7 @@ class GnssWatch:
         return DISAGREES if again else DOUBTFUL
 
     def _take_back(self, witness: int, sighting: LevelSight) -> None:
-        """Know again what was known one witness before the one who speaks most against GNSS."""
+        """Return to the state saved one witness before this one, whose evidence against GNSS is the strongest."""
         self.disagrees = True
         self.learned = self._witnesses.before[max(witness - 1, 0)]
         self._witnesses = Witnesses.none(0)

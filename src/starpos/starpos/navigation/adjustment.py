@@ -100,6 +100,8 @@ class Adjustment:
         # nodes whose measurement of a kind is wrong, and velocities that are
         self.wrong: dict[str, np.ndarray] = {kind: np.zeros(0, int) for kind in ("frames", "velocities")}
         self.strays = 0
+        # frames whose own stars do not agree
+        self.unsound = 0
         # where it stands, None before it is looked for; and whether the rest of the record contradicts that it does
         self.standing: Standstills | None = None if self.odometry is None and vessel.halts else NOWHERE
         self.contradicted = False
@@ -113,7 +115,8 @@ class Adjustment:
     @property
     def left_out(self) -> dict[str, int]:
         """How many measurements of each kind are left out."""
-        return {"frames": self.strays + len(self.wrong["frames"]), "velocities": int(self.slipped.sum())}
+        frames = self.unsound + self.strays + len(self.wrong["frames"])
+        return {"frames": frames, "velocities": int(self.slipped.sum())}
 
     @property
     def faults(self) -> tuple[str, ...]:
@@ -270,6 +273,7 @@ class Adjustment:
                 used.append(frame)
             except FixError:
                 pass
+        self.unsound = len(self.frames) - len(used)
         if len(used) < FEWEST_FRAMES:
             raise VoyageError(f"the stars of {len(used)} frames agree: at least {FEWEST_FRAMES} are needed")
         return StarAttitudes(
@@ -329,8 +333,8 @@ class Adjustment:
     def _sound(self, lacks: Lacks, before: Smoothed | None, kind: str) -> Lacks:
         """Equations without outliers, with wider errors where most of them scatter by more than is stated.
 
-        Where no solution is near, those that were left out stay so: the step that their absence makes would bring them
-        back.
+        Where no solution is near, those that were left out stay so: leaving them out moves the solution, and judged
+        from there they would look good again.
         """
         used = self.excess[kind]
         if before is not None and len(lacks.index):

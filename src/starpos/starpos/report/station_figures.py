@@ -43,7 +43,7 @@ def draw_frames(figure: "Figure", session: SessionResult) -> None:
         axes.axhline(session.seen[k], color=GREY, lw=1)
         axes.set_ylabel(f"{name}, arcsec")
         plain(axes)
-    axes.set_xlabel("minutes; the numbers above are those of the faces")
+    axes.set_xlabel("minutes (above: the number of the face)")
 
 
 def draw_faces(figure: "Figure", session: SessionResult) -> None:

@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 ALL_FIGURES = 12
 XI, ETA = "&xi;", "&eta;"
 MAP = (
-    "North on top. An arrow shows to where the zenith of the plumb line stands from that of the ellipsoid; red, what it "
-    "has more than the geoid grid. Suspicious: one red arrow unlike its neighbours (a wrong mark, a bad session)."
+    "North on top. An arrow goes from the zenith of the ellipsoid to the zenith of the plumb line; a red arrow is the "
+    "difference from the geoid grid. Suspicious: one red arrow unlike its neighbours (a wrong mark, a bad session)."
 )
 FRAMES = (
     "Each frame alone, with 1 sigma of what is new in it; grey, the session and its whole error. Suspicious: a step or a "

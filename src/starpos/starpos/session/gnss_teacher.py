@@ -53,6 +53,8 @@ class GnssTeacher:
         self._instrument: Instrument | None = None
         self._stored: Learned | None = settings.learned
         self._saved_s = -math.inf
+        # what the file holds
+        self._saved = settings.learned
         self._trouble = ""
 
     @property
@@ -141,6 +143,7 @@ class GnssTeacher:
             self._saved_s = now.waiting_s
             path, learned = path_of(self._values["gnss.learned"]), self.learned
             assert learned is not None
+            self._saved = learned
             coming = self._jobs.run(lambda: learned_file.save(path, learned))
             coming.add_done_callback(lambda f: self._note(f.result().trouble))
 
@@ -155,11 +158,11 @@ class GnssTeacher:
 
     @property
     def _worth_saving(self) -> bool:
-        """Whether there is a file to write, and what was learned is whole and newer than it."""
+        """Whether there is a file to write, and what was learned is whole and from other frames than the file's."""
         watch = self._watch
         if not self._values["gnss.learned"] or watch is None or watch.learned is None or watch.is_learning:
             return False
-        return watch.learned.frames > 0
+        return watch.learned.frames not in (0, 0 if self._saved is None else self._saved.frames)
 
     def _note(self, trouble: str) -> None:
         if trouble and trouble != self._trouble:

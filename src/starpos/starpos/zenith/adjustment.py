@@ -4,7 +4,7 @@
 Unknown are xi, eta and A3 (its two tilts, which hold the tiltmeter's zero, and its turn).  All else is in the covariance
 of the readings.  The session's residuals determine the size of image motion and anomalous refraction, by restricted
 maximum likelihood (Patterson and Thompson 1971, Biometrika 58, 545).  A session hardly shows an error that changes as
-slowly as the second, so that is never taken to be smaller than the share AIR_SHARE of the first.
+slowly as the second, so anomalous refraction is at least AIR_SHARE times the image motion.
 """
 
 from collections.abc import Sequence
@@ -32,8 +32,8 @@ SETTLED = 1e-3
 # Anomalous refraction over image motion: a twenty-minute mean of zenith cameras scatters by 0.05 arcsec (Hirt 2006, A&A
 # 459, 283: 0.05 to 0.2 over hours) where a frame's image motion is 0.4. In air that moves no image nothing bends slowly.
 AIR_SHARE = 1 / 8
-# and a night's share above that is within this factor of it (1 sigma), and within three sigma: a face that is off by more
-# is no air
+# A night's share exceeds AIR_SHARE by this factor (1 sigma), at most by MOST_SIGMA of these: a face that is off by more
+# is no air.
 AIR_FACTOR, MOST_SIGMA = 1.5, 3.0
 # size of the image motion at which its search begins, rad
 MOTION_RAD = 0.3 * ARCSEC

@@ -43,7 +43,7 @@ class LeanEstimate:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Lines:
-    """The equations of N frames, linear about an LeanEstimate.
+    """The equations of N frames, linear about a LeanEstimate.
 
     off (N, 2): readings minus those that the estimate predicts, rad.
     Derivatives of the prediction: by_parameters (N, 2, 5) as in `LeanEstimate.moved`; by_camera (N, 2, 3), by a small

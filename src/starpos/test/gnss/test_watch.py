@@ -35,12 +35,12 @@ class Told:
         return self.error_m @ np.linalg.solve(self.covariance, self.error_m)
 
 
-def driven(drive, seed, gnss_until_s=np.inf, astray=lambda t: np.zeros(2), watch=None):
+def driven(drive, seed, gnss_until_s=np.inf, gnss_again_s=np.inf, astray=lambda t: np.zeros(2), watch=None):
     watch, told = watch or GnssWatch(drive.instrument, UNKNOWN), []
     for moment in drive.moments(np.random.default_rng(seed), astray):
         t, sighting = moment.sighting.utc_unix_s - 1.7e9, moment.sighting
         watch.go_on(sighting)
-        check = watch.judge(sighting, moment.gnss) if t < gnss_until_s else None
+        check = watch.judge(sighting, moment.gnss) if t < gnss_until_s or t > gnss_again_s else None
         error = covariance = None
         if watch.tells_place(sighting):
             latitude, longitude, covariance = place_of_stars(sighting, watch.learned, UNKNOWN)
@@ -119,6 +119,19 @@ def test_a_gnss_that_comes_back_is_believed_after_ten_minutes_and_not_at_once():
         frame.check.status == DISAGREES for frame in after(told, THEN_S + 60) if frame.at_s < back_s + 480
     )
     assert told[-1].check.status == AGREES
+
+
+def test_a_gnss_that_was_led_astray_and_then_away_for_an_hour_is_judged_again():
+    again_s = THEN_S + 4200
+    told, _ = driven(
+        GnssDrive(stops=54),
+        42,
+        THEN_S + 600,
+        again_s,
+        lambda t: np.array([2000.0, 0.0]) * (THEN_S < t < again_s),
+    )
+    back = [frame.check.status for frame in after(told, again_s)]
+    assert back[0] == DISAGREES and back[-1] == AGREES
 
 
 def test_a_sentence_says_where_gnss_is():
