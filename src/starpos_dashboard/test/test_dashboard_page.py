@@ -261,13 +261,13 @@ def test_everything_grows_old_when_the_instrument_falls_silent_and_lives_again(p
           [".name", ".sentence"].map((part) => li.querySelector(part).getBoundingClientRect().top))""")
 
     # Each is old and has its sentence, which else is not shown, under its name; the page may still be laying them out.
-    page.until(lambda: len(found := tops()) == 4 and 0 < found[0] and found == sorted(found))
+    page.until(lambda: len(found := tops()) == 4 and found[0] > 0 and found == sorted(found))
     lamps = page.until(lambda: all(lamp[1] == "SILENT" for lamp in page.run(LAMPS)) and page.run(LAMPS))
     for *_, colour in lamps:
         r, g, b = (int(v) for v in colour[4:-1].split(","))
         assert max(r, g, b) - min(r, g, b) < 50, "a silent light is grey"
-    assert page.text("average") == "—" and page.text("stars") == "—"
-    assert page.text("heading") == "217.250°" and page.text("heading-age").endswith(" old")
+    page.shows(average="—", stars="—", heading="217.250°")
+    page.until(lambda: page.text("heading-age").endswith(" old"))
     page.instrument.says = speaks
     page.shows(status_word="Fix", heading_age="", tilt_age="")
     page.until(lambda: page.is_dressed("old") == [])
