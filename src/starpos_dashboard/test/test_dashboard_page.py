@@ -53,9 +53,13 @@ def test_both_places_are_shown_and_what_the_guard_says_of_gnss(page):
       const status = document.querySelector("#map-gnss").dataset.status;
       return [...mid(rect("#map-gnss")), ...mid(rect("#ellipse-newest .mark")), rect("#map").y, status];
     """
-    x, y, fix_x, fix_y, top, status = page.run(places)
-    # north of the fix, on the map
-    assert abs(x - fix_x) < 1.5 and top < y < fix_y - 50 and status == "disagrees"
+
+    def north_of_the_fix_on_the_map():
+        x, y, fix_x, fix_y, top, status = page.run(places)
+        return abs(x - fix_x) < 1.5 and top < y < fix_y - 50 and status == "disagrees"
+
+    # the map is drawn after the words
+    page.until(north_of_the_fix_on_the_map)
     page.instrument.works(gnss__check=said.gnss(GnssCheck.AGREES, 48.1374))
     page.shows(gnss_word="agrees")
 
