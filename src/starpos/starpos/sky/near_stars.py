@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Parallaxes of the near stars, which Tycho-2 does not have.
 
-They are of Hipparcos' stars (ESA SP-1200, 1997) with LEAST_MAS and more, and of stars that stand within 8 arcsec of one;
-tools/data/near_stars.py made the table.  Hipparcos' own err by 1 to 3 mas, of some pairs more; those of Gaia DR2, which
-many have, hardly.
+They are of Hipparcos' stars (ESA SP-1200, 1997) with LEAST_MAS and more, and of stars within 8 arcsec of one;
+tools/data/near_stars.py made the table.  Many are Gaia DR2's.  Hipparcos' own err by 1 to 3 mas, of some pairs more.
 """
 
 from functools import lru_cache

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Stars are seen from where the Earth stands: their parallaxes against ERFA's own, in every answer and every catalogue."""
+"""Stars are seen from where the Earth stands: their parallaxes against ERFA's, in every answer and every catalogue."""
 
 from dataclasses import replace
 
@@ -66,7 +66,7 @@ def test_near_stars_are_few_and_their_tables_stay(catalogue):
     assert 6_000 < near.sum() < 7_000 and catalogue.parallax_mas()[near].min() >= 20
     # stars of one parallax move together: half of all near ones by more than this, mas a year
     assert np.median(np.hypot(*catalogue.motions(near))) > 100
-    # the triangles of the user's cache stay those of these stars
+    # so the triangles in a user's cache still belong to it
     assert catalogue.fingerprint == "15e0a9fd5bc29a88"
 
 
@@ -152,9 +152,9 @@ def _ground(site):
 
 
 ANSWERS = {
-    "deflection": lambda solver, stars, found, tilt: sighting(
-        solver, stars, found.found, Mark(*np.radians(PLACE), 0.0), tilt
-    ).enu_to_camera,
+    "deflection": lambda solver, stars, found, tilt: (
+        sighting(solver, stars, found.found, Mark(*np.radians(PLACE), 0.0), tilt).enu_to_camera
+    ),
     "fix": lambda solver, stars, found, tilt: solver.solve(stars, tilt).fix,
     "under way": lambda solver, stars, found, tilt: (
         sighting_of(stars, solver, found).under(Site(*PLACE).enu[2], VACUUM).camera_to_itrs.T
