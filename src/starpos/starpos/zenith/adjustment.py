@@ -53,8 +53,7 @@ class Air:
 class Adjusted:
     """The deflection of a session at the mark, arcsec, with its errors.
 
-    covariance_arcsec2 (2, 2): of xi, eta, the sum of the `terms`.
-    terms: 1 sigma of xi and eta for each source of error.
+    covariance_arcsec2 (2, 2): of xi, eta, the sum of those of the sources of error, by_source (2, 2).
     a3 (3, 3): C into S, with the tiltmeter's zero.  turn_stddev_rad: of its turn about the plumb line.
     faces (N,): number of each frame's face.  frame_arcsec (N, 2): xi, eta of each frame minus the session's.
     frame_stddev_arcsec (N, 2): what these should scatter by.
@@ -66,7 +65,7 @@ class Adjusted:
     xi_arcsec: float
     eta_arcsec: float
     covariance_arcsec2: np.ndarray
-    terms: tuple[tuple[str, float, float], ...]
+    by_source: dict[str, np.ndarray]
     a3: np.ndarray
     turn_stddev_rad: float
     faces: np.ndarray
@@ -82,7 +81,18 @@ class Adjusted:
     @property
     def sigma_arcsec(self) -> np.ndarray:
         """Standard deviations (2,) of xi, eta."""
-        return np.sqrt(np.diag(self.covariance_arcsec2))
+        return _sigma(self.covariance_arcsec2)
+
+    @property
+    def terms(self) -> tuple[tuple[str, float, float], ...]:
+        """1 sigma of xi and eta for each source of error."""
+        return tuple((name, *_sigma(c).tolist()) for name, c in self.by_source.items())
+
+    @property
+    def correlations(self) -> dict[str, float]:
+        """Correlation of xi and eta for each source of error."""
+        sizes = {name: float(np.prod(_sigma(c))) for name, c in self.by_source.items()}
+        return {name: float(self.by_source[name][0, 1]) / s if s else 0.0 for name, s in sizes.items()}
 
     @property
     def misalignment_deg(self) -> tuple[float, ...]:
@@ -145,6 +155,11 @@ def adjusted(
             break
     assert size is not None
     return _adjusted(estimate, sightings, lines, errors, fit, size, faces, mark, places)
+
+
+def _sigma(covariance: np.ndarray) -> np.ndarray:
+    """Standard deviations (2,); rounding may leave a variance of zero below it."""
+    return np.sqrt(np.maximum(np.diag(covariance), 0.0))
 
 
 def _prior_of(instrument: Instrument) -> np.ndarray:
@@ -221,16 +236,12 @@ def _adjusted(
     )
     sources = [(s.name, s.covariance) for s in errors.sources] + list(scaled)
     gain = fit.gain[[1, 0]] / ARCSEC
-    terms, total = [], np.zeros((2, 2))
-    for name, covariance in sources:
-        term = gain @ covariance @ gain.T
-        total += term
-        if term.any():
-            xi, eta = np.sqrt(np.maximum(np.diag(term), 0.0)).tolist()
-            terms.append((name, xi, eta))
+    by_source = {name: gain @ covariance @ gain.T for name, covariance in sources}
     whole = fit.covariance[:2, :2][::-1, ::-1] / ARCSEC**2
-    given = np.sqrt(np.maximum(np.diag(whole - total), 0.0))
-    terms.append(("A3 as given", *given.tolist()))
+    values, axes = np.linalg.eigh(whole - np.sum(list(by_source.values()), 0))
+    by_source = {name: term for name, term in by_source.items() if term.any()}
+    # the rest, without what rounding leaves of it
+    by_source["A3 as given"] = (axes * np.maximum(values, 0.0)) @ axes.T
     left = (lines.off.reshape(-1) - lines.by_parameters.reshape(-1, 5) @ fit.step).reshape(-1, 2)
     back = np.linalg.inv(lines.by_lean)
     own = np.array([c for name, c in sources if name in ("tilt readings", "centroids", "image motion")]).sum(
@@ -253,7 +264,7 @@ def _adjusted(
         xi_arcsec=float(xi_eta[0]),
         eta_arcsec=float(xi_eta[1]),
         covariance_arcsec2=whole,
-        terms=tuple(terms),
+        by_source=by_source,
         a3=estimate.a3,
         turn_stddev_rad=float(np.sqrt(up @ fit.covariance[2:, 2:] @ up)),
         faces=faces,
