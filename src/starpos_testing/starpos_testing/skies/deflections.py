@@ -20,7 +20,8 @@ def result(
     correlation=0.0,
 ):
     """Write a session's result: tide free xi, eta at the geoid (arcsec), errors of two sources; the file's path."""
-    variance, tide, curvature = new**2 + common**2, [0.01, -0.02], 0.1
+    variance, both = new**2 + common**2, correlation * common**2
+    tide, curvature = [0.01, -0.02], 0.1
     mark = [xi + curvature, eta]
     frames = [
         {
@@ -34,7 +35,7 @@ def result(
         "combined": True, "status": "ok", "station": station, "utc": "2026-03-01T20:06:00.000Z", "duration_s": 660.0,
         "site": {"latitude": latitude, "longitude": longitude, "height_m": height_m},
         "xi_arcsec": mark[0] + tide[0], "eta_arcsec": mark[1] + tide[1],
-        "covariance_arcsec2": [[variance, correlation * common**2], [correlation * common**2, variance]], "faces": 4, "frames": 12,
+        "covariance_arcsec2": [[variance, both], [both, variance]], "faces": 4, "frames": 12,
         "errors": {"image motion": [new, new], "catalogue": [common, common]}, "image_motion_arcsec": 0.3, "stars": 40,
         "correlations": {"image motion": 0.0, "catalogue": correlation},
         "reduced": {
