@@ -46,9 +46,9 @@ LEAST_RAD = 1e-3 * ARCSEC
 # Fields of the inclinometer's errors that a session can show to be larger, their sources, and the size at which a search
 # begins where none is stated: rad per root of an hour, and a share.
 SHOWN = (("drift_rad_per_sqrt_hour", "tilt drift", 0.01 * ARCSEC), ("scale", "tilt scale", 1e-4))
-# The residuals have to show it: by so many sigma of what they would have by chance, and then by so much of twice the log
-# of the likelihood, which chance exceeds in one session of 140.
-SHOWN_SIGMA, SHOWN_GAIN = 2.0, 6.0
+# The search begins where the residuals have an excess of SHOWN_SIGMA over chance. Its result is taken where twice the log
+# of the likelihood gains SHOWN_GAIN, as by chance in one session of 13: that makes the errors a little larger.
+SHOWN_SIGMA, SHOWN_GAIN, MOST_FACTOR = 1.0, 2.0, 100.0
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -68,8 +68,8 @@ class Adjusted:
     faces (N,): number of each frame's face.  frame_arcsec (N, 2): xi, eta of each frame minus the session's.
     frame_stddev_arcsec (N, 2): what these should scatter by.
     catalogue_factor: size of the catalogue's errors over what it states, by the session's own stars.
-    inclinometer: the errors that were assumed.  as_stated: the session with those of the tiltmeter's file, where the
-    residuals show larger ones.  same_air: that with the air of this one.  gain: of twice the log of the likelihood over it.
+    inclinometer: the errors that were assumed.  as_stated: where the residuals show larger ones, the session with those of
+    the tiltmeter's file; same_air: likewise, with the air of this one.  gain: of twice the log of the likelihood over it.
     chi2_per_degree: of the residuals; 1 where the stated errors and the air's explain them.
     face_quality: each face against the others.  stars: the residuals and the leverage of each star.
     """
@@ -245,7 +245,7 @@ class _Session:
             return None
 
         def factors(p: np.ndarray) -> np.ndarray:
-            return np.exp(np.maximum(p[2:], 0.0))
+            return np.exp(np.clip(p[2:], 0.0, np.log(MOST_FACTOR)))
 
         def cost(p: np.ndarray) -> float:
             tilts = sum(f**2 * unit for f, unit in zip(factors(p), units.values(), strict=True))

@@ -24,6 +24,9 @@ LARGE_ARCSEC, MOST_ARCSEC = 25.0, 120.0
 DOUBTED_CHI2 = 36.0
 # a face above that is named: chance does it in one of 1000 sessions of eight faces
 UNLIKE_CHI2 = 18.0
+# A tiltmeter is worse than stated where twice the log of the likelihood gains by this: chance does it in one session of
+# 500.
+WORSE_GAIN = 9.0
 # a face with a smaller share of the usual number of frames is thin
 THIN = 0.5
 # Tycho-2 over 6 deg and more: less than 1 mas in places, of 1991.25, and about 0.5 mas a year in proper motions (Hog et
@@ -78,7 +81,7 @@ def remarks(found: Adjusted, sightings: Sequence[ZenithSighting], frames: int, s
     for quality in unlike:
         xi, eta = quality.stddev_arcsec
         said.append(f"{_face_off(quality)} (1 sigma {xi:.2f}, {eta:.2f}): look at its frames")
-    if not unlike:
+    if not unlike and found.gain > WORSE_GAIN:
         said += _worse(found)
     zones = _zones_arcsec(found, sightings)
     if found.sigma_arcsec.min() < zones:
@@ -118,7 +121,7 @@ def _unlike(found: Adjusted) -> list[FaceQuality]:
 
 
 def _worse(found: Adjusted) -> list[str]:
-    """What the residuals show of the tiltmeter that its file does not state."""
+    """Errors of the tiltmeter that the residuals show larger than its file states them."""
     if found.as_stated is None:
         return []
     stated, shown = found.as_stated.inclinometer, found.inclinometer
