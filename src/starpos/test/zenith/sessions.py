@@ -42,7 +42,7 @@ class Drawn:
 
 @dataclass(frozen=True)
 class Worse:
-    """Factors of a tiltmeter's errors over those of its file; jump_arcsec: of its zero, before the fourth face."""
+    """Factors of a tiltmeter's errors over the stated ones; jump_arcsec: of its zero, before the fourth face."""
 
     noise: float = 1.0
     drift: float = 1.0
