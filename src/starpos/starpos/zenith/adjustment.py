@@ -68,9 +68,9 @@ class Adjusted:
     faces (N,): number of each frame's face.  frame_arcsec (N, 2): xi, eta of each frame minus the session's.
     frame_stddev_arcsec (N, 2): what these should scatter by.
     catalogue_factor: size of the catalogue's errors over what it states, by the session's own stars.
-    inclinometer: the errors that were assumed.  as_stated: the same session with the errors of the tiltmeter's file,
-    where the residuals show larger ones.  same_air: likewise, with the air of this adjustment.  gain: twice the log of the
-    likelihood minus the one of same_air.
+    inclinometer: the errors that were assumed.
+    as_stated: the session with the errors of the tiltmeter's file, where the residuals show larger ones.  same_air:
+    likewise, with the air of this adjustment.  gain: twice the log of the likelihood minus the one of same_air.
     chi2_per_degree: of the residuals; 1 where the stated errors and the air's explain them.
     face_quality: each face against the others.  stars: the residuals and the leverage of each star.
     """
