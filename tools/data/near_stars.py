@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from starpos.sky.catalogue import load_catalogue
-from starpos.sky.near_stars import LEAST_MAS
+from starpos.sky.near_stars import MIN_MAS
 from starpos.units import ARCSEC
 
 # Stellarium's Star1: a header of 8 numbers, the fifth of which is the level of its grid; how many stars a zone has; stars
@@ -53,7 +53,7 @@ def main() -> None:
     args = parser.parse_args()
     catalogue = load_catalogue()
     parallax = hipparcos(args.folder)[catalogue.hip]
-    near = np.flatnonzero(parallax >= LEAST_MAS)
+    near = np.flatnonzero(parallax >= MIN_MAS)
     there = catalogue.directions(slice(None), OBSERVED)
     apart, which = cKDTree(there[near]).query(there, distance_upper_bound=TOGETHER_ARCSEC * ARCSEC)
     # also the companions that Hipparcos does not have

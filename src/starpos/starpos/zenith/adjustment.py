@@ -30,25 +30,25 @@ from starpos.zenith.sighting import Mark, ZenithSighting
 
 STEPS = 8
 # closer to a pole, a deflection is no longer small compared with the distance from it
-LEAST_COSINE = 1e-3
+MIN_COSINE = 1e-3
 # of its sigma: a smaller step is the last
 SETTLED = 1e-3
 # Anomalous refraction over image motion: a twenty-minute mean of zenith cameras scatters by 0.05 arcsec (Hirt 2006, A&A
 # 459, 283: 0.05 to 0.2 over hours) where a frame's image motion is 0.4. In air that moves no image nothing bends slowly.
 AIR_SHARE = 1 / 8
-# A night's share exceeds AIR_SHARE by this factor (1 sigma), at most by MOST_SIGMA of these: a face that is off by more
+# A night's share exceeds AIR_SHARE by this factor (1 sigma), at most by MAX_SIGMA of these: a face that is off by more
 # is no air.
-AIR_FACTOR, MOST_SIGMA = 1.5, 3.0
+AIR_FACTOR, MAX_SIGMA = 1.5, 3.0
 # size of the image motion at which its search begins, rad
 MOTION_RAD = 0.3 * ARCSEC
 # and below which it makes no difference
-LEAST_RAD = 1e-3 * ARCSEC
+MIN_RAD = 1e-3 * ARCSEC
 # Fields of the inclinometer's errors that a session can show to be larger, their sources, and the size at which a search
 # begins where none is stated: rad per root of an hour, and a share.
 SHOWN = (("drift_rad_per_sqrt_hour", "tilt drift", 0.01 * ARCSEC), ("scale", "tilt scale", 1e-4))
 # The search begins where the residuals have an excess of SHOWN_SIGMA over chance. Its result is taken where twice the log
 # of the likelihood gains SHOWN_GAIN, as by chance in one session of 13: that makes the errors a little larger.
-SHOWN_SIGMA, SHOWN_GAIN, MOST_FACTOR = 1.0, 2.0, 100.0
+SHOWN_SIGMA, SHOWN_GAIN, MAX_FACTOR = 1.0, 2.0, 100.0
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -147,7 +147,7 @@ def adjusted(
     """
     if len(sightings) < 3:
         raise FixError(f"{len(sightings)} frames make no session: at least 3, in several faces, are needed")
-    if np.cos(mark.latitude) < LEAST_COSINE:
+    if np.cos(mark.latitude) < MIN_COSINE:
         raise FixError("the mark is within 6 km of a pole, where eta has no direction")
     places = StarPlaces.of(sightings)
     sightings = places.applied(sightings)
@@ -246,14 +246,14 @@ class _Session:
             return None
 
         def factors(p: np.ndarray) -> np.ndarray:
-            return np.exp(np.clip(p[2:], 0.0, np.log(MOST_FACTOR)))
+            return np.exp(np.clip(p[2:], 0.0, np.log(MAX_FACTOR)))
 
         def cost(p: np.ndarray) -> float:
             tilts = sum(f**2 * unit for f, unit in zip(factors(p), units.values(), strict=True))
             covariance = _whole(base + tilts, stated.errors, _air(p))
             return _fitted(lines, covariance, self.prior, stated.offset).cost + float(p[1] ** 2)
 
-        motion = max(stated.air.motion, 2 * LEAST_RAD)
+        motion = max(stated.air.motion, 2 * MIN_RAD)
         slow = np.log(stated.air.anomalous / stated.air.motion / AIR_SHARE) / np.log(AIR_FACTOR)
         begin = np.array([np.log(motion / MOTION_RAD), slow, *np.zeros(len(units))])
         simplex = begin + np.vstack([np.zeros(len(begin)), np.diag([-0.5, 0.7, *np.full(len(units), 1.5)])])
@@ -291,7 +291,7 @@ def _prior_of(instrument: Instrument) -> np.ndarray:
     c = instrument.calibration
     weights = np.zeros((5, 5))
     covariance = np.asarray(c.covariance_arcsec2, float) + np.eye(3) * c.remounted_arcsec**2
-    weights[2:, 2:] = np.linalg.inv(covariance * ARCSEC**2 + np.eye(3) * LEAST_RAD**2)
+    weights[2:, 2:] = np.linalg.inv(covariance * ARCSEC**2 + np.eye(3) * MIN_RAD**2)
     return weights
 
 
@@ -317,8 +317,8 @@ def _air_of(lines: Lines, stated: np.ndarray, errors: Errors, prior: np.ndarray,
 
 def _air(p: np.ndarray) -> Air:
     """Sizes of image motion and anomalous refraction by two parameters."""
-    motion = float(np.hypot(LEAST_RAD, MOTION_RAD * np.exp(p[0])))
-    slow = AIR_FACTOR ** min(max(float(p[1]), 0.0), MOST_SIGMA)
+    motion = float(np.hypot(MIN_RAD, MOTION_RAD * np.exp(p[0])))
+    slow = AIR_FACTOR ** min(max(float(p[1]), 0.0), MAX_SIGMA)
     return Air(motion=motion, anomalous=motion * AIR_SHARE * slow)
 
 
