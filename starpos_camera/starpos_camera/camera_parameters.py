@@ -3,7 +3,7 @@
 
 import math
 
-from starpos.frames.shutter import MOST_READOUT_S
+from starpos.frames.shutter import MAX_READOUT_S
 from starpos_camera import shutter_times
 from starpos_camera.sources.registry import SOURCES
 from starpos_common.parameters import FRAME_NAME, Parameter
@@ -95,8 +95,8 @@ COMMON = (
         "source knows; if it knows nothing, fixes include an error of 0.03 s. The wrong sign "
         "doubles the error that it should remove.",
         unit="s",
-        minimum=-MOST_READOUT_S,
-        maximum=MOST_READOUT_S,
+        minimum=-MAX_READOUT_S,
+        maximum=MAX_READOUT_S,
     ),
     Parameter(
         "readout_stddev",
@@ -104,7 +104,7 @@ COMMON = (
         "Error of `readout` where it is set, 1 sigma; 0.03 s moves all fixes alike, by some tens of metres.",
         unit="s",
         minimum=0.0,
-        maximum=MOST_READOUT_S,
+        maximum=MAX_READOUT_S,
     ),
     Parameter(
         "calibration_url",

@@ -98,7 +98,7 @@ class OnsetFilters:
         )
 
     def evidence(self, utc_unix_s: float) -> np.ndarray:
-        """Evidence of each filter (W,) that GNSS is wrong: the larger chi-square (2 degrees of freedom) of step and growth."""
+        """Evidence of each filter (W,) that GNSS is wrong: the larger chi-square (2 dof) of step and growth."""
         n = self.state.shape[1] - OFFSETS
         weight = np.linalg.inv(self.covariance[:, n:, n:])
         pull = np.einsum("wij,wj->wi", weight, self.state[:, n:])

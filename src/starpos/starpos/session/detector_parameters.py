@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from starpos.frames.driver_stamp import KINDS, UNKNOWN
-from starpos.frames.exposure import MOST_EXPOSURE_S
-from starpos.frames.shutter import MOST_READOUT_S
-from starpos.session.pace import MOST_RATE
+from starpos.frames.exposure import MAX_EXPOSURE_S
+from starpos.frames.shutter import MAX_READOUT_S
+from starpos.session.pace import MAX_RATE
 from starpos.session.parameter import Parameter
 
 if TYPE_CHECKING:
@@ -57,7 +57,7 @@ PARAMETERS = (
         "programs.",
         unit="Hz",
         minimum=0.01,
-        maximum=MOST_RATE,
+        maximum=MAX_RATE,
     ),
     Parameter(
         "saturation",
@@ -75,7 +75,7 @@ PARAMETERS = (
         "averaged over it. Where stamps mark start or end, it gives the middle of the exposure.",
         unit="s",
         minimum=0.0,
-        maximum=MOST_EXPOSURE_S,
+        maximum=MAX_EXPOSURE_S,
     ),
     Parameter(
         "stamp",
@@ -103,8 +103,8 @@ PARAMETERS = (
         "unknown, and fixes include an error of 0.03 s. The wrong sign doubles the error that it "
         "should remove.",
         unit="s",
-        minimum=-MOST_READOUT_S,
-        maximum=MOST_READOUT_S,
+        minimum=-MAX_READOUT_S,
+        maximum=MAX_READOUT_S,
     ),
     Parameter(
         "gyro",
