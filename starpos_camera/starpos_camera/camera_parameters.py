@@ -3,7 +3,7 @@
 
 import math
 
-from starpos.frames.shutter import MOST_READOUT_S
+from starpos.frames.shutter import MAX_READOUT_S
 from starpos_camera import shutter_times
 from starpos_camera.sources.registry import SOURCES
 from starpos_common.parameters import FRAME_NAME, Parameter
@@ -92,8 +92,8 @@ COMMON = (
         "first, negative where the bottom one is; 0 for a global shutter. Unset: as the source knows it, and where that "
         "knows nothing, fixes hold 0.03 s. The wrong sign makes a fix wrong by twice what it would be without.",
         unit="s",
-        minimum=-MOST_READOUT_S,
-        maximum=MOST_READOUT_S,
+        minimum=-MAX_READOUT_S,
+        maximum=MAX_READOUT_S,
     ),
     Parameter(
         "readout_stddev",
@@ -101,7 +101,7 @@ COMMON = (
         "How far `readout` may be off, where that is set; 0.03 s is some tens of metres, all frames alike.",
         unit="s",
         minimum=0.0,
-        maximum=MOST_READOUT_S,
+        maximum=MAX_READOUT_S,
     ),
     Parameter(
         "calibration_url",

@@ -30,7 +30,7 @@ from starpos.units import ARCSEC
 
 CLOCK_S, PLACE_M, ALTITUDE_DEG = 0.001, 2.0, 70.0
 # of errors squared over claims
-LEAST_RATIO, MOST_RATIO = 0.8, 1.2
+MIN_RATIO, MAX_RATIO = 0.8, 1.2
 
 
 @dataclass(frozen=True)
@@ -112,7 +112,7 @@ def row(case: Case, answers: Sequence[np.ndarray | str]) -> tuple[str, bool]:
     rms, claimed = np.sqrt((off**2).mean(0)), np.sqrt((claim**2).mean(0))
     ratio = ((off / claim) ** 2).mean(0)
     cells = [f"{r:.2f} | {c:.2f} | {q:.2f}" for r, c, q in zip(rms, claimed, ratio, strict=True)]
-    holds = rms[0] < case.limit_arcsec and LEAST_RATIO <= ratio[0] <= MOST_RATIO
+    holds = rms[0] < case.limit_arcsec and MIN_RATIO <= ratio[0] <= MAX_RATIO
     return (
         f"| {case.name} | {len(found)} of {len(answers)} | {' | '.join(cells)} | {case.limit_arcsec:g} |",
         holds,

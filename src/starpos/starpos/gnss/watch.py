@@ -26,10 +26,10 @@ BACK_S, BACK_FRAMES, BACK = 600.0, 10, 7.4
 # a place wider than this (1 sigma, m) is not used: the filter is not linear over it
 WIDEST_M = 50_000.0
 # the place of a lean at which A3 was not learned may be bent by this share of its least sigma
-MOST_BENT = 0.3
+MAX_BENT = 0.3
 NOISE_SIGMA = 2.0
 # before A3 is known: maximum number of frames of a pose that teach, and of all that are kept
-FEW_OF_POSE, MOST_HELD = 12, 200
+FEW_OF_POSE, MAX_HELD = 12, 200
 # a place further off, in sigma, is another one, with a deflection of its own
 ELSEWHERE_SIGMA = 3.0
 COMPASS = ("north", "north-east", "east", "south-east", "south", "south-west", "west", "north-west")
@@ -77,7 +77,7 @@ class GnssWatch:
         self._instrument = instrument
         # whether A3 may still be anything, and frames are held to begin again with
         self._begins = learned is None
-        self._held: deque[GnssFrame] = deque(maxlen=MOST_HELD)
+        self._held: deque[GnssFrame] = deque(maxlen=MAX_HELD)
         self._of_pose = 0
         self._pose: LevelSight | None = None
         self._new_pose = True
@@ -150,7 +150,7 @@ class GnssWatch:
         if wide >= WIDEST_M**2:
             return False
         # a turn makes the place wide along an arc, and the bend leaves it across
-        return not self._held or self._bent_m(sighting.tilt) < MOST_BENT * math.sqrt(narrow)
+        return not self._held or self._bent_m(sighting.tilt) < MAX_BENT * math.sqrt(narrow)
 
     def _bent_m(self, tilt: Tilt) -> float:
         """Effect on the place, beyond a linear error, of a hardly known turn of A3 about the plumb line."""

@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from starpos.frames.driver_stamp import KINDS, UNKNOWN
-from starpos.frames.exposure import MOST_EXPOSURE_S
-from starpos.frames.shutter import MOST_READOUT_S
-from starpos.session.pace import MOST_RATE
+from starpos.frames.exposure import MAX_EXPOSURE_S
+from starpos.frames.shutter import MAX_READOUT_S
+from starpos.session.pace import MAX_RATE
 from starpos.session.parameter import Parameter
 
 if TYPE_CHECKING:
@@ -56,7 +56,7 @@ PARAMETERS = (
         "processor can: then all of them, or an even share, which slows other programs.",
         unit="Hz",
         minimum=0.01,
-        maximum=MOST_RATE,
+        maximum=MAX_RATE,
     ),
     Parameter(
         "saturation",
@@ -74,7 +74,7 @@ PARAMETERS = (
         "it, and it gives the middle of an exposure whose start or end is stamped.",
         unit="s",
         minimum=0.0,
-        maximum=MOST_EXPOSURE_S,
+        maximum=MAX_EXPOSURE_S,
     ),
     Parameter(
         "stamp",
@@ -101,8 +101,8 @@ PARAMETERS = (
         "where the bottom one is; 0 for a global shutter. Unset: unknown, and fixes include an error of "
         "0.03 s. The wrong sign doubles the error that it should remove.",
         unit="s",
-        minimum=-MOST_READOUT_S,
-        maximum=MOST_READOUT_S,
+        minimum=-MAX_READOUT_S,
+        maximum=MAX_READOUT_S,
     ),
     Parameter(
         "gyro",

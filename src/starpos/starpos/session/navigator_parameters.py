@@ -143,8 +143,8 @@ PARAMETERS = (
     *(p for p in parameters.PARAMETERS if p.name in SHARED),
 )
 # of a stated altitude: the vehicle goes up and down by more than its file says
-LEAST_HEIGHT_STDDEV_M = 10.0
-ANY_INSTRUMENT = Instrument(1000.0, clock_stddev_s=parameters.LEAST_CLOCK_S)
+MIN_HEIGHT_STDDEV_M = 10.0
+ANY_INSTRUMENT = Instrument(1000.0, clock_stddev_s=parameters.MIN_CLOCK_S)
 
 
 class NavigatorSettings:
@@ -205,7 +205,7 @@ class NavigatorSettings:
             if np.isnan(height)
             else {
                 "height_m": height,
-                "height_stddev_m": max(values["altitude_stddev"], LEAST_HEIGHT_STDDEV_M),
+                "height_stddev_m": max(values["altitude_stddev"], MIN_HEIGHT_STDDEV_M),
             }
         )
         return Vessel(

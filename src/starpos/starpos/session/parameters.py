@@ -17,14 +17,14 @@ from starpos.files import path_of
 from starpos.instrument import instrument_file, sensors
 from starpos.instrument.camera import Camera
 from starpos.instrument.instrument import Calibration, Instrument
-from starpos.session.pace import MOST_RATE
+from starpos.session.pace import MAX_RATE
 from starpos.session.parameter import FRAME_NAME, Parameter
 
 NAN = math.nan
 # Share by which the focal length of one camera may change.
 SAME_FOCAL = 0.05
 # A clock is trusted no further than this without an instrument file.
-LEAST_CLOCK_S = 0.01
+MIN_CLOCK_S = 0.01
 
 PARAMETERS = (
     Parameter(
@@ -251,7 +251,7 @@ PARAMETERS = (
         "processor can: then all of them, or an even share, which slows other programs.",
         unit="Hz",
         minimum=0.01,
-        maximum=MOST_RATE,
+        maximum=MAX_RATE,
     ),
     Parameter(
         "gyro",
@@ -325,7 +325,7 @@ def instrument_of(
             camera.fx,
             calibration=_stated(values),
             # each host states its own
-            clock_stddev_s=LEAST_CLOCK_S,
+            clock_stddev_s=MIN_CLOCK_S,
             inclinometer=errors,
             inclinometer_model=model,
         )
