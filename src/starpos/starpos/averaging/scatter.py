@@ -39,7 +39,8 @@ EVIDENT = 0.25
 RESPONSES = (0.0, 3e-4, 1e-3, 3e-3, 1e-2, 3e-2)
 # prior probability that all is as stated; a larger error is the less likely, in proportion
 AS_STATED = 0.7
-# minimum degrees of freedom of frames or poses; MIN_FREE_CONTRADICTING if they contradict stated errors by CONTRADICT_SIGMA
+# minimum degrees of freedom of frames or poses; MIN_FREE_CONTRADICTING if they contradict the stated errors by
+# CONTRADICT_SIGMA
 MIN_FREE, MIN_FREE_CONTRADICTING, CONTRADICT_SIGMA = 2.5, 0.5, 4.0
 # maximum number of frames or means of frames; more are averaged first
 MAX_ROWS = 64
