@@ -69,6 +69,18 @@ def about_commands() -> str:
     return "\n".join(made)
 
 
+# Words that newcomers search for, by the page that the site's search should give first.
+SEARCHED = {
+    "docs/how-to/calibrate": ("calibration", "calibrate", "misalignment", "boresight"),
+    "docs/how-to/deflection": ("zenith camera", "plumb line", "deflection of the vertical"),
+    "docs/how-to/gnss": ("GPS", "GNSS", "jamming", "spoofing"),
+    "docs/how-to/time": ("clock", "wrong clock", "chrony", "NTP", "PPS"),
+    "docs/sensors": ("tilt", "tiltmeter", "inclinometer", "accelerometer", "level"),
+    "docs/navigation": ("gyro", "gyroscope", "IMU", "moving"),
+    "docs/tutorials/azimuth": ("compass", "north", "true north", "gyrocompass", "azimuth"),
+    "docs/tutorials/disk": ("plate solving", "plate solve", "plate solver", "astrometry", "plate scale"),
+    "docs/tutorials/robot": ("GPS denied", "GNSS denied", "star tracker", "celestial navigation", "robot"),
+}
 MADE = {
     "<!-- commands -->": about_commands,
     "<!-- public names -->": about_names,
@@ -76,10 +88,14 @@ MADE = {
 
 
 def fill_in(app: object, name: str, source: list[str]) -> None:
-    """Put what is made of the code into a page."""
+    """Put what is made of the code into a page, and the words by which the search finds it."""
     for mark, make in MADE.items():
         if mark in source[0]:
             source[0] = source[0].replace(mark, make())
+    if words := SEARCHED.get(name):
+        title, _, rest = source[0].partition("\n")
+        entries = "".join(f"   ! single: {word}\n" for word in words)
+        source[0] = f"{title}\n\n```{{eval-rst}}\n.. index::\n{entries}```\n{rest}"
 
 
 def as_written(app: object, what: str, name: str, thing: object, options: object, lines: list[str]) -> None:
@@ -98,8 +114,12 @@ def as_written(app: object, what: str, name: str, thing: object, options: object
 
 
 def lead_in(app: object, error: Exception | None) -> None:
-    """Lead from the site's root to its first page."""
+    """Lead from the site's root to its first page; raise ValueError where SEARCHED names a page that is not there."""
     if error is None:
+        if gone := SEARCHED.keys() - app.env.all_docs.keys():
+            raise ValueError(
+                f"docs/conf.py: SEARCHED names pages that are not there: {', '.join(sorted(gone))}"
+            )
         page = '<!doctype html><title>starpos</title><meta http-equiv="refresh" content="0; url=docs/index.html">\n'
         (Path(app.outdir) / "index.html").write_text(page)
 
