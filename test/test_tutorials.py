@@ -161,12 +161,21 @@ def test_the_methods_commands_give_the_numbers_it_begins_with(tmp_path, monkeypa
 def test_the_error_budgets_page_explains_every_term_of_a_fix(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert run(capsys, "simulate", "night", "-n", "2", "--stars-only")[0] == 0
-    night = [*sorted(map(str, (tmp_path / "night").glob("stars_*"))), "--focal-mm", "600", "--pixel-um", "6.4", "--json"]
+    night = [
+        *sorted(map(str, (tmp_path / "night").glob("stars_*"))),
+        "--focal-mm",
+        "600",
+        "--pixel-um",
+        "6.4",
+        "--json",
+    ]
     known = ("--misalignment", "0", "0", "0", "--misalignment-stddev", "5", "--tilt", "night/tilt.csv")
     _, fixed, _ = run(capsys, "solve", *night, *known)
     _, faced, _ = run(capsys, "solve", *night, "--site", "35.7046", "51.4106")
     page = (ROOT / "docs" / "error_budget.md").read_text()
-    explained, more = (re.findall(r"^\| `([^`]+)` \|", t, re.MULTILINE) for t in page.split("Some inputs add terms", 1))
+    explained, more = (
+        re.findall(r"^\| `([^`]+)` \|", t, re.MULTILINE) for t in page.split("Some inputs add terms", 1)
+    )
     assert list(json.loads(fixed.splitlines()[-1])["budget"]) == explained
     assert set(json.loads(faced.splitlines()[-1])["budget"]) <= {*explained, *more}
     sources = "".join(f.read_text() for f in (ROOT / "src" / "starpos" / "starpos").rglob("*.py"))
