@@ -6,15 +6,12 @@ Sphinx reads from the root of the repository, so that the packages' READMEs are 
 
 import os
 import re
-import sys
 from pathlib import Path
 
 import starpos
 from starpos.cli import COMMANDS, parser_for
 
 ROOT = Path(__file__).resolve().parents[1]
-INTERFACES = ROOT / "starpos_interfaces"
-PARAMETERS = ROOT / "src" / "starpos_bringup" / "config" / "starpos.yaml"
 # lines of a docstring that tell of something by its name, in columns or after a colon
 COLUMNS, NAMED = re.compile(r"[\w, ]*\w(?: \([^)]*\))? {2,}\S"), re.compile(r"[\w, ]*\w(?: \([^)]*\))?: \S")
 
@@ -48,23 +45,6 @@ autodoc_member_order = "bysource"
 autodoc_typehints = "none"
 
 
-def about_parameters() -> str:
-    """Tables of all parameters, from the comments of starpos.yaml, which is made from the nodes' own tables."""
-    made: list[str] = []
-    said: list[str] = []
-    for line in PARAMETERS.read_text().splitlines():
-        if node := re.match(r"/\*\*/(\w+):", line):
-            made += [f"\n## {node[1]}\n", "| parameter | what it is |", "| --- | --- |"]
-            said = []
-        elif line.startswith("    # "):
-            said.append(line[6:].replace("|", "\\|"))
-        elif value := re.match(r"    ([\w./]+): (.*)", line):
-            default = "unset" if value[2] == ".nan" else value[2]
-            made.append(f"| `{value[1]}` | {' '.join(said)} Default: `{default}`. |")
-            said = []
-    return "\n".join(made)
-
-
 def about_names() -> str:
     """Directives of autodoc for the public names, by the folder of `starpos` that they live in."""
     made, folder = [], ""
@@ -89,27 +69,9 @@ def about_commands() -> str:
     return "\n".join(made)
 
 
-def about_troubles() -> str:
-    """The messages of commands and nodes, from the code."""
-    sys.path.insert(0, str(ROOT / "tools"))
-    import messages
-
-    return messages.page()
-
-
-def about_messages() -> str:
-    """The definitions of messages and services, which say of each field what it is."""
-    files = [*sorted(INTERFACES.glob("msg/*.msg")), *sorted(INTERFACES.glob("srv/*.srv"))]
-    about = ((f.stem, f.read_text().split("\n", 1)[1].strip()) for f in files)
-    return "\n".join(f"## {name}\n\n```\n{text}\n```\n" for name, text in about)
-
-
 MADE = {
     "<!-- commands -->": about_commands,
-    "<!-- messages -->": about_messages,
-    "<!-- parameters -->": about_parameters,
     "<!-- public names -->": about_names,
-    "<!-- troubles -->": about_troubles,
 }
 
 

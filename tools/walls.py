@@ -45,7 +45,7 @@ AT_THE_DOOR = {"starpos.parallel.same"}
 # names that the whole field writes in this way
 USUAL = {("numpy", "np"), ("xml.etree.ElementTree", "ET"), ("matplotlib.pyplot", "plt")}
 DOCUMENTED = ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef
-MOST_LINES = 450
+MAX_LINES = 450
 # Words that begin no docstring: it begins with a verb or a noun, which "as many stars" is.
 NO_BEGINNING = re.compile(
     r"(Of|The same|By|At which|As(?! many\b)|And|But|Also|In|With|Within|That|Those|Until|Under)\b"
@@ -312,7 +312,7 @@ def words(house: list[Module]) -> Iterator[str]:
             if NO_BEGINNING.match(said):
                 yield module.at_line(line, "a docstring begins with a verb or a noun")
         lines = len(module.text.splitlines())
-        if lines > MOST_LINES:
+        if lines > MAX_LINES:
             yield module.at_line(1, f"{lines} lines: more than one topic?")
 
 

@@ -18,7 +18,7 @@ from starpos_camera.camera_parameters import PARAMETERS
 from starpos_camera.sources import watched_folder
 from starpos_camera.sources.files import Files
 from starpos_camera.sources.source import CaptureError, CaptureSettings, NothingYet
-from starpos_camera.sources.watched_folder import IDLE_S, MOST_LOOKED_AT, PATIENCE, WatchedFolder
+from starpos_camera.sources.watched_folder import IDLE_S, MAX_LOOKED_AT, PATIENCE, WatchedFolder
 from starpos_testing.patience import WAIT_S
 
 REST_S = 2.0
@@ -85,7 +85,7 @@ def test_what_was_there_is_not_new_and_what_comes_is_taken_once(watch):
 
 
 def test_many_at_once_come_in_the_order_of_their_times_then_of_their_names(watch):
-    count = MOST_LOOKED_AT - 2
+    count = MAX_LOOKED_AT - 2
     for k in range(count):
         put(watch.path / f"{k:03d}.fits", age_s=10 * k + 100)
     for name in ("b.fits", "a.fits"):
@@ -95,10 +95,10 @@ def test_many_at_once_come_in_the_order_of_their_times_then_of_their_names(watch
 
 
 def test_more_than_are_looked_at_in_one_go_all_come(watch):
-    for k in range(3 * MOST_LOOKED_AT):
+    for k in range(3 * MAX_LOOKED_AT):
         put(watch.path / f"{k:03d}.fits")
     taken = [name for _ in range(5) for name in watch.take()]
-    assert sorted(taken) == [f"{k:03d}.fits" for k in range(3 * MOST_LOOKED_AT)]
+    assert sorted(taken) == [f"{k:03d}.fits" for k in range(3 * MAX_LOOKED_AT)]
 
 
 def test_a_file_that_grows_is_left_until_it_rests(watch):

@@ -89,6 +89,7 @@ def photograph(
     begin: float,
     shots: tuple[int, int, float],
     rng: np.random.Generator,
+    exposure_s: float = EXPOSURE_S,
 ) -> tuple[list[Stars], list[tuple]]:
     """Frames at several headings, turned by hand between them; stars, and rows of a tilt log."""
     headings, frames, cadence_s = shots
@@ -105,13 +106,13 @@ def photograph(
         )
         wrong = pose + response.matrix @ np.array(scene.tilt)
         for _ in range(frames):
-            light = expose(scene, world.sky, now, EXPOSURE_S, rng)
-            stars.append(detected(scene, light, now + EXPOSURE_S / 2 + world.clock_s, EXPOSURE_S, rng))
+            light = expose(scene, world.sky, now, exposure_s, rng)
+            stars.append(detected(scene, light, now + exposure_s / 2 + world.clock_s, exposure_s, rng))
             warm = warmth + trend * (now - begin) / 3600
             off = zero.at(now) + scene.tilt_errors.zero + warm * world.per_c + wrong
             told = replace(scene, tilt_errors=replace(scene.tilt_errors, zero=tuple(off), scale=(0.0, 0.0)))
             for j in range(READINGS):
-                moment = now + (j + 0.5) * EXPOSURE_S / READINGS + world.clock_s
+                moment = now + (j + 0.5) * exposure_s / READINGS + world.clock_s
                 rows.append((moment, *read_tilt(told, 0.0, rng), 15.0 + warm))
             now += cadence_s
         now += TURN_S

@@ -16,7 +16,7 @@ HEAD = "| what | here | peer | peer's | ratio |\n| --- | ---: | --- | ---: | ---
 # In a document, a printed table stands between these.
 BEGIN, END = "<!-- table -->\n", "<!-- end of table -->"
 # A work is repeated until it has taken so long, so that the clock's step does not matter, and at most so often.
-LEAST_S, MOST_TIMES = 0.02, 1000
+MIN_S, MAX_TIMES = 0.02, 1000
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ def cpu_s() -> float:
 def spent_ms(work: Callable[[], object]) -> float:
     """CPU time (ms) of a work, the mean of as many times as it takes to measure it well."""
     begin, times = cpu_s(), 0
-    while times == 0 or (cpu_s() - begin < LEAST_S and times < MOST_TIMES):
+    while times == 0 or (cpu_s() - begin < MIN_S and times < MAX_TIMES):
         work()
         times += 1
     return 1000 * (cpu_s() - begin) / times

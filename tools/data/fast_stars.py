@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 
 from starpos.rotation import unit_vector
 from starpos.sky import tycho2
-from starpos.sky.fast_stars import LEAST_MAS_YEAR
+from starpos.sky.fast_stars import MIN_MAS_YEAR
 from starpos.units import ARCSEC
 
 # hhmmss.ss, +-ddmmss.s at J2000, motions in mas/yr
@@ -63,7 +63,7 @@ def main() -> None:
     directions, motion = hipparcos(args.stars)
     apart, row = cKDTree(directions).query(there)
     motion, apart = motion[row], apart / ARCSEC
-    fast = (np.hypot(*motion.T) >= LEAST_MAS_YEAR) & (apart < TOGETHER_ARCSEC)
+    fast = (np.hypot(*motion.T) >= MIN_MAS_YEAR) & (apart < TOGETHER_ARCSEC)
     for k in np.flatnonzero(fast)[np.lexsort(tyc[fast].T[::-1])]:
         print("    ({}, {}, {}): ({}, {}),".format(*tyc[k], *motion[k]))
     known = (apart < SAME_ARCSEC) & motion.any(1)

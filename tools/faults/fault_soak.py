@@ -34,7 +34,7 @@ LEGITIMATE = 0.04
 # Most good frames after a fault, of at most a second each.
 PATIENCE = 30
 # With fewer faults memory is not compared, because the first of each kind takes memory for good.
-FEWEST_FOR_MEMORY = 2000
+MIN_FOR_MEMORY = 2000
 # Largest growth of a node: its allocator's memory varies by 10 MB however long it runs.
 GROWN_MB = 12.0
 
@@ -73,7 +73,7 @@ class Outcome:
     @property
     def good(self) -> bool:
         """Whether nothing went wrong, and no node has grown."""
-        told = self.injected >= FEWEST_FOR_MEMORY
+        told = self.injected >= MIN_FOR_MEMORY
         flat = not told or all(last - first < GROWN_MB for _, first, last in self.memory)
         return flat and not (self.wrong or self.crashes or self.stuck)
 

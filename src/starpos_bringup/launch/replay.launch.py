@@ -23,7 +23,7 @@ ARGUMENTS = (
     ("detector", "false", "true: stars from the bag's images instead of the bag's stars"),
     ("dashboard", "false", "true: also the web page, at http://127.0.0.1:8042"),
 )
-MOST_RATE = 1e6
+MAX_RATE = 1e6
 SIMULATED = {"**": {"use_sim_time": True}}
 
 
@@ -36,7 +36,7 @@ def over(event, context):
 
 def nodes(context):
     told = given(context, ARGUMENTS)
-    rate = number(told, "rate", 0, MOST_RATE)
+    rate = number(told, "rate", 0, MAX_RATE)
     bag = Path(told["bag"]).expanduser()
     if not bag.exists():
         raise LaunchError(f"bag:={bag}: there is no such bag")

@@ -7,7 +7,7 @@ import numpy as np
 KEPT = [0, 1, 5, 6, 7, 11, 12, 13]
 X, Y, YAW, VX, VY, VYAW, AX, AY = range(8)
 # it takes no measurement for better
-LEAST_VARIANCE = 1e-9
+MIN_VARIANCE = 1e-9
 
 
 def half_turn(angle: np.ndarray) -> np.ndarray:
@@ -47,7 +47,7 @@ class Ekf:
         if YAW in which:
             k = which.index(YAW)
             innovation[:, k] = half_turn(innovation[:, k])
-        noise = np.diag(np.maximum(variances, LEAST_VARIANCE))
+        noise = np.diag(np.maximum(variances, MIN_VARIANCE))
         cross = self.covariance @ pick.T
         gain = cross @ np.linalg.inv(pick @ cross + noise)
         self.state = self.state + (gain @ innovation[..., None])[..., 0]

@@ -27,7 +27,7 @@ def test_a_message_that_unpacks_to_too_much_ends_the_replay(tmp_path, monkeypatc
         topic = writer.add_connection("/a", KIND, typestore=get_typestore(Stores.ROS2_JAZZY))
         for size in (1 << 20, 1 << 21):
             writer.write(topic, size, bytes(size))
-    monkeypatch.setattr(bounds, "MOST_UNPACKED", 1 << 20)
+    monkeypatch.setattr(bounds, "MAX_UNPACKED", 1 << 20)
     with Bag(tmp_path / "night") as bag:
         messages = bag.messages(bag.topics(None, left_out=pytest.fail))
         assert next(messages)[2] == bytes(1 << 20)
@@ -37,7 +37,7 @@ def test_a_message_that_unpacks_to_too_much_ends_the_replay(tmp_path, monkeypatc
 
 def test_metadata_of_many_megabytes_is_not_read(tmp_path):
     with (tmp_path / "metadata.yaml").open("wb") as file:
-        file.truncate(bounds.MOST_METADATA + 1)
+        file.truncate(bounds.MAX_METADATA + 1)
     with pytest.raises(BagError, match="not the description of a bag"), Bag(tmp_path):
         pass
 

@@ -13,7 +13,7 @@ from starpos_common.topics import Take, subscription
 
 RELIABLE, BEST_EFFORT = ReliabilityPolicy.RELIABLE, ReliabilityPolicy.BEST_EFFORT
 # maximum number of publishers and topics named in a sentence
-MOST_NAMED = 3
+MAX_NAMED = 3
 
 
 class MatchedSubscription:
@@ -99,5 +99,5 @@ def _nodes(publishers: Sequence[TopicEndpointInfo]) -> str:
 
 def _named(names: Collection[str]) -> str:
     shown = sorted(names)
-    more = f" and {len(shown) - MOST_NAMED} more" if len(shown) > MOST_NAMED else ""
-    return ", ".join(shown[:MOST_NAMED]) + more
+    more = f" and {len(shown) - MAX_NAMED} more" if len(shown) > MAX_NAMED else ""
+    return ", ".join(shown[:MAX_NAMED]) + more

@@ -15,7 +15,7 @@ from rclpy.subscription import Subscription
 
 from starpos_common.parameters import ParameterError
 
-MOST_DEPTH = 100_000
+MAX_DEPTH = 100_000
 T = TypeVar("T")
 # A message, and the middleware's information on it.
 Take = Callable[[Any, Mapping[str, Any]], object]
@@ -93,8 +93,8 @@ def _options() -> QoSOverridingOptions:
 
 def _checked(qos: QoSProfile) -> QosCallbackResult:
     result = QosCallbackResult()
-    result.successful = 1 <= qos.depth <= MOST_DEPTH
-    result.reason = f"depth must be from 1 to {MOST_DEPTH}; {qos.depth} was given"
+    result.successful = 1 <= qos.depth <= MAX_DEPTH
+    result.reason = f"depth must be from 1 to {MAX_DEPTH}; {qos.depth} was given"
     return result
 
 

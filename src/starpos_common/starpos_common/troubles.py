@@ -10,7 +10,7 @@ from rclpy.node import Node
 # A trouble is over when something goes right after so long without a failure.
 QUIET_S = 10.0
 # Most sentences logged for one trouble: their words may come from outside, in any number.
-MOST_KINDS = 8
+MAX_KINDS = 8
 
 
 @dataclass
@@ -34,7 +34,7 @@ class Troubles:
         trouble = self._troubles.setdefault(what, _Trouble(0.0, ""))
         trouble.since_s, trouble.sentence = time.monotonic(), sentence
         kind = re.sub(r"[\d.e+-]+", "", sentence)
-        if kind not in trouble.kinds and len(trouble.kinds) < MOST_KINDS:
+        if kind not in trouble.kinds and len(trouble.kinds) < MAX_KINDS:
             trouble.kinds.add(kind)
             self._log.warning(sentence)
 

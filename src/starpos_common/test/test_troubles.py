@@ -5,7 +5,7 @@ import pytest
 import rclpy
 
 from starpos_common import troubles
-from starpos_common.troubles import MOST_KINDS, QUIET_S, Troubles
+from starpos_common.troubles import MAX_KINDS, QUIET_S, Troubles
 from starpos_testing.nodes import take_domain
 
 
@@ -49,4 +49,4 @@ def test_one_line_when_it_begins_and_one_when_it_is_over(told, clock, capfd):
 def test_words_from_outside_do_not_flood_the_log(told, clock, capfd):
     for k in range(1000):
         told.wrong("frames", f"the encoding {'abcdefghijkl'[k % 12] * (k % 7 + 1)} is unknown")
-    assert capfd.readouterr().err.count("\n") == MOST_KINDS
+    assert capfd.readouterr().err.count("\n") == MAX_KINDS

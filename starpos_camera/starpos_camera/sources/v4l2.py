@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from starpos.frames.frame import MAX_PIXELS, Frame
-from starpos.frames.shutter import MOST_READOUT_S, Shutter
+from starpos.frames.shutter import MAX_READOUT_S, Shutter
 from starpos_camera.sources.opencv_video import quiet
 from starpos_camera.sources.source import CapturedFrame, CaptureError, CaptureSettings
 from starpos_interfaces.msg import Capture
@@ -98,7 +98,7 @@ class V4l2Device:
             source=self._path,
             stamp_stddev_s=stddev_s,
             # from either end, and no longer than from one frame to the next
-            shutter=Shutter(0.0, min(period_s, MOST_READOUT_S) / math.sqrt(3)),
+            shutter=Shutter(0.0, min(period_s, MAX_READOUT_S) / math.sqrt(3)),
         )
         return CapturedFrame(frame, stamp, remark=remark and f"{self._path}: {remark}")
 

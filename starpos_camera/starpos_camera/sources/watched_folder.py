@@ -23,7 +23,7 @@ LISTING_SHARE = 0.1
 # A file that cannot be read is given up after this multiple of the time of rest.
 PATIENCE = 10.0
 # Most new files in one look; the others wait.
-MOST_LOOKED_AT = 200
+MAX_LOOKED_AT = 200
 
 
 @dataclass(frozen=True)
@@ -117,7 +117,7 @@ class WatchedFolder:
         idle_s = max(IDLE_S, self._listing_s / LISTING_SHARE**2)
         if now >= self._listed_s + (idle_s if settled else self._listing_s / LISTING_SHARE):
             self._list(status)
-        for name, arrival in list(self._arrivals.items())[:MOST_LOOKED_AT]:
+        for name, arrival in list(self._arrivals.items())[:MAX_LOOKED_AT]:
             self._follow(name, arrival)
 
     def _list(self, status: os.stat_result) -> None:

@@ -29,12 +29,12 @@ from starpos.sky.site import Site
 from starpos.units import ARCSEC
 
 # so near the zenith a direction has hardly an elevation to speak of
-LEAST_SINE = 0.01
+MIN_SINE = 0.01
 # with a worse A3 the circles are no longer what a linear error makes of them: its axis is fitted first
 LINEAR_A3_RAD = 360 * ARCSEC
 # maximum distance of frames that look in one direction, in rad and in sigma
 SAME_RAD, SAME_SIGMA = 60 * ARCSEC, 6.0
-MOST_DIRECTIONS = 1000
+MAX_DIRECTIONS = 1000
 # number of directions that give the first places to try
 STARTS = 8
 ROUNDS, SETTLED = 30, 1e-12
@@ -43,7 +43,7 @@ ALIKE = 1e-7
 # an answer is excluded if its fit is worse by this
 EXCLUDED_SIGMA = 6.0
 # outliers: their distance, minimum number of directions, maximum share left out, maximum number of rounds
-OUTLIER_SIGMA, FEWEST_JUDGED, MOST_OUTLIERS, JUDGED = 6.0, 6, 1 / 3, 6
+OUTLIER_SIGMA, MIN_JUDGED, MAX_OUTLIERS, JUDGED = 6.0, 6, 1 / 3, 6
 WITHIN = 0.95
 # three directions that contradict each other by more have errors of unknown size
 CONTRADICT_SIGMA = 5.0
@@ -84,7 +84,7 @@ def circle_of(
     level = mounting.level(tilt)
     seen = level.camera @ camera.centre_ray
     sine = np.hypot(seen[0], seen[1])
-    if sine < LEAST_SINE or seen[2] < MIN_COS_ZENITH:
+    if sine < MIN_SINE or seen[2] < MIN_COS_ZENITH:
         raise FixError(
             f"{pointing.place}: the camera looks {np.degrees(np.arctan2(sine, seen[2])):.1f} deg from the "
             f"zenith; an elevation determines a place only between 0.6 and 87: lean it"
@@ -144,9 +144,9 @@ class Directions:
                 groups[-1].append(c)
             else:
                 groups.append([c])
-        if len(groups) > MOST_DIRECTIONS:
+        if len(groups) > MAX_DIRECTIONS:
             raise FixError(
-                f"{len(groups)} directions, of which {MOST_DIRECTIONS} can be worked: split the table"
+                f"{len(groups)} directions, of which {MAX_DIRECTIONS} can be worked: split the table"
             )
         own = np.diag([sum(c.sigma**2 for c in g) / len(g) ** 2 for g in groups])
         return cls(groups, {"pointing": own} | _tilt_sources(groups))
@@ -244,7 +244,7 @@ def _sound(whole: Directions) -> np.ndarray:
     """
     number = len(whole.circles)
     every = np.arange(number)
-    if number < FEWEST_JUDGED:
+    if number < MIN_JUDGED:
         return every
     sigma = np.sqrt(np.diag(whole.covariance))
 
@@ -259,7 +259,7 @@ def _sound(whole: Directions) -> np.ndarray:
         off = size(zenith)
         usual = SIGMA_PER_MAD * (1 + 5 / (number - 2)) * float(np.median(off))
         agree = np.flatnonzero(off < OUTLIER_SIGMA * max(usual, 1.0))
-        if len(agree) < (1 - MOST_OUTLIERS) * number:
+        if len(agree) < (1 - MAX_OUTLIERS) * number:
             return every
         if np.array_equal(agree, rows):
             break

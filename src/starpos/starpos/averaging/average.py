@@ -27,9 +27,9 @@ GATE_SIGMA = 6.0
 MOVED_FIXES, MOVED_SIGMA = 3, 4.5
 # minimum number of steps from pose to pose that show their scatter, share of the smaller ones that are used, and
 # maximum error of an inclinometer
-FEWEST_STEPS, SMALLER, MOST_POSE_RAD = 6, 1 / 3, np.radians(0.25)
+MIN_STEPS, SMALLER, MAX_POSE_RAD = 6, 1 / 3, np.radians(0.25)
 # if fewer than this share of the fixes agree, they do not describe one place
-MOST_OF_ALL = 2 / 3
+MAX_OF_ALL = 2 / 3
 # a rival with fewer fixes is kept when the camera is touched again
 RIVAL_FIXES = 10
 
@@ -86,7 +86,7 @@ def average(fixes: Sequence[Fix]) -> Average:
     whole = averager.average
     if whole is None:
         raise FixError("there is no fix to average: none of the frames has one")
-    if whole.frames < MOST_OF_ALL * len(in_order) and (sound := _about_one_place(in_order)):
+    if whole.frames < MAX_OF_ALL * len(in_order) and (sound := _about_one_place(in_order)):
         # fixes that scatter from pose to pose look like moves before it shows how much they do
         at_rest = _averaged(sound, 0.0).average
         if at_rest is not None and not at_rest.moved and at_rest.frames > whole.frames:
@@ -115,7 +115,7 @@ def _about_one_place(in_order: Sequence[Fix]) -> list[Fix]:
     then from how far the poses lie from their middle.
     """
     pose = poses_of(in_order)
-    if pose[-1] < FEWEST_STEPS:
+    if pose[-1] < MIN_STEPS:
         return []
     zeniths = np.array([erfa.s2c(f.longitude, f.latitude) for f in in_order])
     means = np.array([zeniths[pose == k].mean(0) for k in range(pose[-1] + 1)])
@@ -124,7 +124,7 @@ def _about_one_place(in_order: Sequence[Fix]) -> list[Fix]:
     # squares in units of the sigma per axis are exponential, with a mean of 2; of a step, which two poses share, of 4
     by_steps = steps[int(SMALLER * len(steps))] / np.sqrt(-4 * np.log(1 - SMALLER))
     by_middle = np.median(off) / np.sqrt(2 * np.log(2))
-    if by_middle > MOST_POSE_RAD or np.mean(off < GATE_SIGMA * by_steps) < MOST_OF_ALL:
+    if by_middle > MAX_POSE_RAD or np.mean(off < GATE_SIGMA * by_steps) < MAX_OF_ALL:
         return []
     near = off < GATE_SIGMA * by_middle
     # what drove on is elsewhere at the end

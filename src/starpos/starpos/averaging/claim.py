@@ -13,7 +13,7 @@ import numpy as np
 
 from starpos._numeric.roots import symmetric_root
 from starpos.averaging.filter import Plane
-from starpos.averaging.scatter import MOST_ROWS, Frames, Scatter, scatter_of
+from starpos.averaging.scatter import MAX_ROWS, Frames, Scatter, scatter_of
 from starpos.earth.ellipsoid import EARTH_RADIUS_M, zenith_of
 from starpos.fix.budget import EACH_POSE, ErrorTerm
 from starpos.fix.fix import Fix
@@ -21,7 +21,7 @@ from starpos.fix.fix import Fix
 # sigma of a place in rad before anything is known of it
 ANYWHERE_RAD = np.pi
 # number of remembered fixes at which they are averaged two by two
-MOST_REMEMBERED = 2 * MOST_ROWS
+MAX_REMEMBERED = 2 * MAX_ROWS
 # one more fix changes little among many: the scatter is computed again after an increase by this share
 NEWS = 0.3
 
@@ -106,7 +106,7 @@ class Claim:
         """The claim with one more fix, after which the filter has the place at east_north_m (2,)."""
         kept = (*self.seen, seen)
         more = replace(
-            self, seen=_shortened(kept) if len(kept) > MOST_REMEMBERED else kept, fixes=self.fixes + 1
+            self, seen=_shortened(kept) if len(kept) > MAX_REMEMBERED else kept, fixes=self.fixes + 1
         )
         return more if more.fixes < (1 + NEWS) * self.looked else more.looked_at(east_north_m)
 
@@ -168,4 +168,4 @@ def _shortened(seen: tuple[Remembered, ...]) -> tuple[Remembered, ...]:
             short[-1] = short[-1].with_next(s)
         else:
             short.append(s)
-    return tuple(short[-MOST_ROWS:] if len(short) > MOST_REMEMBERED - MOST_ROWS // 2 else short)
+    return tuple(short[-MAX_ROWS:] if len(short) > MAX_REMEMBERED - MAX_ROWS // 2 else short)

@@ -23,7 +23,7 @@ UNIT = np.array([1.0, 1.0, 1e-6])
 # a fix further off than this pulls no harder
 HUBER_SIGMA = 4.0
 # a step of the place may leave the plane by this share of the place's sigma
-MOST_BENT = 0.2
+MAX_BENT = 0.2
 # tangent of the latitude beyond which parallels count as no more curved
 STEEPEST = 30.0
 
@@ -191,7 +191,7 @@ class PlaceFilter:
         latitude, _ = before.plane.place(before.state[:2])
         bent = step @ step / (2 * before.plane.radii[1]) * (1 + min(abs(np.tan(latitude)), STEEPEST))
         least = np.linalg.eigvalsh(self.sources.sum(0)[:2, :2])[0]
-        return bool(bent <= MOST_BENT * np.sqrt(max(least, 0.0)))
+        return bool(bent <= MAX_BENT * np.sqrt(max(least, 0.0)))
 
     def _at(self, f: Fix, pose: Fix) -> tuple["PlaceFilter", np.ndarray]:
         """The filter at the time of a fix, before it is added; and a mask (T,) of the terms whose error is new in it.

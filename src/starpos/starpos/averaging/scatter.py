@@ -21,10 +21,10 @@ import numpy as np
 from starpos.units import ARCSEC
 
 # sizes: from a share of a frame's own error to the most that any sensor has
-LEAST_SHARE, MOST_RAD, SIZES = 0.5, 3600 * ARCSEC, 12
+MIN_SHARE, MAX_RAD, SIZES = 0.5, 3600 * ARCSEC, 12
 # correlation times of an error, and maximum mean correlation of the frames: an error that hardly changes in the whole
 # time looks like a constant
-FORGETS_S, MOST_ALIKE = (15.0, 60.0, 240.0, 1000.0, 4000.0), 0.75
+FORGETS_S, MAX_ALIKE = (15.0, 60.0, 240.0, 1000.0, 4000.0), 0.75
 # lengths in rad over which an error of the pose changes with the lean, and with the attitude
 LEAN_RAD, ATTITUDE_RAD = (0.05, 0.15, 0.5), (0.2, 0.6, 1.5)
 # share of its variance that is new at each pose all the same
@@ -39,10 +39,11 @@ EVIDENT = 0.25
 RESPONSES = (0.0, 3e-4, 1e-3, 3e-3, 1e-2, 3e-2)
 # prior probability that all is as stated; a larger error is the less likely, in proportion
 AS_STATED = 0.7
-# minimum degrees of freedom of frames or poses; LEAST_FREE if they contradict stated errors by CONTRADICT_SIGMA
-FEWEST_FREE, LEAST_FREE, CONTRADICT_SIGMA = 2.5, 0.5, 4.0
+# minimum degrees of freedom of frames or poses; MIN_FREE_CONTRADICTING if they contradict the stated errors by
+# CONTRADICT_SIGMA
+MIN_FREE, MIN_FREE_CONTRADICTING, CONTRADICT_SIGMA = 2.5, 0.5, 4.0
 # maximum number of frames or means of frames; more are averaged first
-MOST_ROWS = 64
+MAX_ROWS = 64
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -70,12 +71,12 @@ class Frames:
     zero_free: bool
 
     def blocks(self) -> np.ndarray:
-        """Weights (B, K) that average frames next to each other in a pose, so that at most about MOST_ROWS are left."""
+        """Weights (B, K) that average frames next to each other in a pose, so that at most about MAX_ROWS are left."""
         order = np.lexsort((self.utc_unix_s, self.pose))
         number = np.bincount(self.pose)
         rank = np.empty(len(order), int)
         rank[order] = np.concatenate([np.arange(n) for n in number])
-        size = -(-len(order) // MOST_ROWS)
+        size = -(-len(order) // MAX_ROWS)
         block = np.unique(self.pose * len(order) + rank // size, return_inverse=True)[1]
         weight = np.zeros((block.max() + 1, len(order)))
         weight[block, np.arange(len(order))] = 1 / self.sigma**2
@@ -129,10 +130,10 @@ def scatter_of(frames: Frames) -> Scatter:
         of_poses = np.einsum("pk,kin->pin", poses, frames.design)
         each = np.diag(poses**2 @ frames.sigma**2 + frames.pose_sigma**2)
         free, tell = _freedom(poses @ frames.residual, of_poses, each, frames.prior_sigma)
-        few = tell and free < FEWEST_FREE
+        few = tell and free < MIN_FREE
         wandering, posed = _wandering(frames, share, poses), shapes if tell else []
-        least = LEAST_SHARE * float(np.sqrt(np.median(frames.sigma**2)))
-        sizes = np.geomspace(least, max(MOST_RAD, 10 * least), SIZES)
+        least = MIN_SHARE * float(np.sqrt(np.median(frames.sigma**2)))
+        sizes = np.geomspace(least, max(MAX_RAD, 10 * least), SIZES)
         prior = (1 - AS_STATED) * _shrinking(sizes) / (len(wandering) + len(posed))
         tried += _sized(stated, wandering, sizes, prior)
         noises = _noises(frames)
@@ -187,12 +188,12 @@ def _freedom(y: np.ndarray, j: np.ndarray, stated: np.ndarray, prior_sigma: np.n
     """Degrees of freedom of data (B, 2), and whether these show that they scatter more than (B, B) states."""
     normal, pull, _ = _sums(y, j, stated[None])
     free = 2 * len(y) - _told(normal[0], prior_sigma)
-    if free >= FEWEST_FREE:
+    if free >= MIN_FREE:
         return free, True
     scaled, pulled = normal[0] * np.outer(prior_sigma, prior_sigma), pull[0] * prior_sigma
     fitted = pulled @ np.linalg.solve(scaled + np.eye(len(scaled)), pulled)
     chi2 = np.sum(y * np.linalg.solve(stated, y)) - fitted
-    return free, bool(free >= LEAST_FREE and chi2 > free + CONTRADICT_SIGMA * np.sqrt(2 * free))
+    return free, bool(free >= MIN_FREE_CONTRADICTING and chi2 > free + CONTRADICT_SIGMA * np.sqrt(2 * free))
 
 
 def _shapes(frames: Frames, share: np.ndarray, poses: np.ndarray) -> list[_Kind]:
@@ -206,7 +207,7 @@ def _shapes(frames: Frames, share: np.ndarray, poses: np.ndarray) -> list[_Kind]
     alike = [np.exp(-leans2 / (2 * length**2)) for length in LEAN_RAD]
     alike += [np.exp(-turns2 / (2 * length**2)) for length in ATTITUDE_RAD]
     new = (frames.pose[:, None] == frames.pose).astype(float)
-    smooth = [a for a in alike if a.mean() < MOST_ALIKE]
+    smooth = [a for a in alike if a.mean() < MAX_ALIKE]
     if frames.zero_free:
         # what is left of a smooth function once its mean over the poses is part of the zero
         mean = poses.mean(0)
@@ -237,7 +238,7 @@ def _wandering(frames: Frames, share: np.ndarray, poses: np.ndarray) -> list[_Ki
         kinds.append(_kind(share, poses, np.minimum(t[:, None], t) / longest))
         kinds.append(_kind(share, poses, np.outer(t, t) / longest**2))
     alike = [np.exp(-apart / forgets_s) for forgets_s in FORGETS_S]
-    return kinds + [_kind(share, poses, a) for a in alike if a.mean() < MOST_ALIKE]
+    return kinds + [_kind(share, poses, a) for a in alike if a.mean() < MAX_ALIKE]
 
 
 def _kind(share: np.ndarray, poses: np.ndarray, covariance: np.ndarray, noise: float = 0.0) -> _Kind:

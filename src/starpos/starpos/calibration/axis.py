@@ -21,13 +21,13 @@ from starpos.units import ARCSEC
 
 ROUNDS, SETTLED_CHI2, FIRST_DAMPING, LAST_DAMPING = 80, 1e-6, 1e-3, 1e9
 # an axis that is known better than this (rad) is known
-LEAST_RAD = 1e-9
+MIN_RAD = 1e-9
 # number of zeniths that are tried, the ones that fit best at first
 TRIED = 4
 # an answer is excluded if its fit is worse by this
 EXCLUDED_SIGMA = 6.0
 # minimum number of directions that determine an axis, with the zenith known and unknown
-FEWEST, FEWEST_WITHOUT_SITE = 2, 4
+FEWEST, MIN_WITHOUT_SITE = 2, 4
 # how long A3 may be used
 VALID_DAYS = 365.0
 # the term of the circles that holds A3's error, which is fitted here
@@ -101,7 +101,7 @@ def find_axis(
     Raises FixError if the directions are too few, or leave two answers.
     """
     first = Directions.of(sorted(circles_of(given.a3), key=lambda c: c.utc_unix_s))
-    number, fewest = len(first.circles), FEWEST_WITHOUT_SITE if site is None else FEWEST
+    number, fewest = len(first.circles), MIN_WITHOUT_SITE if site is None else FEWEST
     if number < fewest:
         raise FixError(
             f"elevations in {number} {'direction' if number == 1 else 'directions'} do not determine A3: without a roll "
@@ -245,7 +245,7 @@ def _normal(
     # how far the axis is from where it was given, in units of what is known of it
     turns = np.cross(axis, across)
     about = np.asarray(given.covariance_arcsec2, float) * ARCSEC**2
-    prior = np.linalg.inv(turns @ about @ turns.T + LEAST_RAD**2 * np.eye(2))
+    prior = np.linalg.inv(turns @ about @ turns.T + MIN_RAD**2 * np.eye(2))
     off = across @ (axis - given.a3 @ ray)
     weighted = np.linalg.solve(stated, np.column_stack([left, slope]))
     matrix, pull = slope.T @ weighted[:, 1:], slope.T @ weighted[:, 0]

@@ -10,7 +10,7 @@ import numpy as np
 from starpos.averaging.scatter import Scatter
 from starpos.averaging.slip import poses_of
 from starpos.calibration.plumb_fit import PlumbLine
-from starpos.calibration.plumb_line import FEWEST_POSES, hang, settled, typical
+from starpos.calibration.plumb_line import MIN_POSES, hang, settled, typical
 from starpos.calibration.readings import FixedFrame, Readings
 from starpos.earth.ellipsoid import EARTH_RADIUS_M, enu_axes
 from starpos.errors import FixError
@@ -23,7 +23,7 @@ from starpos.frames.stars import Stars
 from starpos.identification import Identification
 from starpos.identification.hint import Hint
 from starpos.instrument.inclinometer import InclinometerErrors, up_of
-from starpos.instrument.instrument import MOST_C, UNKNOWN_ARCSEC, Calibration, Instrument
+from starpos.instrument.instrument import MAX_C, UNKNOWN_ARCSEC, Calibration, Instrument
 from starpos.instrument.response import angles_at, stated_variances
 from starpos.instrument.tilts import Tilts
 from starpos.progress import Progress, quiet
@@ -38,17 +38,17 @@ VALID_DAYS = 365.0
 # factor on the sigma of A3's turn from the leans that the fixes use, because both come from the same tilts
 TURN_SIGMA = 3.0
 # frames further off are left out, up to this share of all, and so often are those left judged again
-OUTLIER_SIGMA, MOST_OUTLIERS, JUDGED = 6.0, 1 / 3, 5
+OUTLIER_SIGMA, MAX_OUTLIERS, JUDGED = 6.0, 1 / 3, 5
 # number of poses of which two thirds leave the fit, with its five parameters, free enough to judge the others
 MANY_POSES = 10
 # frames that scatter more than any inclinometer or mount were moved, or are of several places
-MOST_POSE_RAD = np.radians(0.5)
+MAX_POSE_RAD = np.radians(0.5)
 # minimum noise over a frame's own error that is worth stating
 NOISIER = 1.0
 # minimum significance of a coefficient of the response, in sigma
 SHOWN_SIGMA = 3.0
 # maximum chi-square per degree of freedom of frames too few to estimate their scatter
-MOST_SCATTER = 16.0
+MAX_SCATTER = 16.0
 # share by which a coefficient of the response must be known better, or worse, than stated to be worth keeping
 WORTH = 0.05
 
@@ -236,14 +236,14 @@ class _Agreement:
         """Raise FixError if the frames are not of one zenith."""
         of = len(self.sound) + len(self.left_out)
         why = "the instrument was moved, its inclinometer or clock was disturbed, or the place given is wrong"
-        if len(self.left_out) > MOST_OUTLIERS * of:
+        if len(self.left_out) > MAX_OUTLIERS * of:
             raise FixError(
                 f"{len(self.left_out)} of {of} frames disagree with the others on the zenith: {why}"
             )
         scatter = self.scatter_left
         # frames too few to show an error of the tilts must agree as they state
         shown = self.scatter.evident or self.scatter.response_evident
-        if scatter > MOST_POSE_RAD or (self.plumb.scatter > MOST_SCATTER and not shown):
+        if scatter > MAX_POSE_RAD or (self.plumb.scatter > MAX_SCATTER and not shown):
             raise FixError(
                 f"{of} frames do not agree on one zenith (they scatter by "
                 f"{np.degrees(scatter):.2f} deg): {why}"
@@ -299,7 +299,7 @@ def _agreeing(
     their own poses, and the fit from which half of the frames are less far counts.
     """
     starts, calm = [_unhidden(find, whole, solved, a3)], _calm(whole)
-    if (1 - MOST_OUTLIERS) * len(solved) <= len(calm) < len(starts[0]):
+    if (1 - MAX_OUTLIERS) * len(solved) <= len(calm) < len(starts[0]):
         starts.append(calm)
     found = [_kept(find, whole, solved, a3, errors, rows) for rows in starts]
     return min(found, key=lambda f: typical(_left(whole, f[1]), 5))
@@ -319,7 +319,7 @@ def _kept(
         size = np.linalg.norm(plumb.left, axis=1)
         usual = np.hypot(whole.take(rows).sigma, max(typical(plumb.left, 5), errors.pose_rad))
         agree = size < OUTLIER_SIGMA * usual
-        if agree.all() or agree.sum() < (1 - MOST_OUTLIERS) * len(solved):
+        if agree.all() or agree.sum() < (1 - MAX_OUTLIERS) * len(solved):
             break
         rows = rows[agree]
     return rows, plumb
@@ -343,7 +343,7 @@ def _unhidden(find: FindPlumbLine, whole: Readings, solved: list[FixedFrame], a3
     """
     everyone: np.ndarray = np.arange(len(solved))
     rows = everyone
-    most = int(np.ceil((1 - MOST_OUTLIERS) * len(solved)))
+    most = int(np.ceil((1 - MAX_OUTLIERS) * len(solved)))
     if len(np.unique(whole.pose)) < MANY_POSES:
         return everyone
     # the closest alone, until they are the same; then all that agree with them, until these are
@@ -418,9 +418,9 @@ def _found(agreement: _Agreement, errors: InclinometerErrors) -> Calibration:
     stated = np.diag(stated_variances(errors, axes))
     known, most = np.sqrt(np.diag(plumb.response_covariance)), np.sqrt(np.diag(stated))
     # few poses show no response, nor do poses that scatter so much that they will be refused
-    enough = agreement.readings.pose.max() + 1 >= FEWEST_POSES
+    enough = agreement.readings.pose.max() + 1 >= MIN_POSES
     told = enough and (np.abs(known - most) > WORTH * np.maximum(known, most)).any()
-    if not told or agreement.scatter.pose_sigma > MOST_POSE_RAD:
+    if not told or agreement.scatter.pose_sigma > MAX_POSE_RAD:
         return found
     return replace(
         found,
@@ -430,6 +430,6 @@ def _found(agreement: _Agreement, errors: InclinometerErrors) -> Calibration:
 
 
 def _mean_temperature_c(solved: list[FixedFrame]) -> float:
-    # an unknown temperature is NaN, which is not below MOST_C
-    known = [s.tilt.temperature_c for s in solved if abs(s.tilt.temperature_c) < MOST_C]
+    # an unknown temperature is NaN, which is not below MAX_C
+    known = [s.tilt.temperature_c for s in solved if abs(s.tilt.temperature_c) < MAX_C]
     return float(np.mean(known)) if known else float("nan")

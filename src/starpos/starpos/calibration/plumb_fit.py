@@ -12,7 +12,7 @@ from starpos.units import ARCSEC
 
 # a frame further off than this pulls no harder
 ROBUST_SIGMA = 3.0
-MOST_STEPS, LONGEST_STEP = 60, 0.5
+MAX_STEPS, LONGEST_STEP = 60, 0.5
 # a step that would lower chi-square by less (1e-5 sigma) is the last
 SETTLED_CHI2 = 1e-10
 
@@ -175,7 +175,7 @@ def fits(
     now = _State(a3=starts, up=model.zenith, p=p, start=np.arange(len(starts)))
     best = np.full(len(starts), np.inf)
     answer = _State(a3=starts.copy(), up=model.zenith.copy(), p=p.copy(), start=now.start)
-    for _ in range(MOST_STEPS):
+    for _ in range(MAX_STEPS):
         slopes = _slopes(model, now)
         # if the headings hardly differ, later steps may lead away again
         better = slopes.cost < best[now.start]

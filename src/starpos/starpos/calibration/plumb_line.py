@@ -20,7 +20,7 @@ from starpos.normal import MEDIAN_OF_CHI2
 ROBUST_ROUNDS = 10
 TURNS_TRIED = 8
 # one pose does not show the inclinometer's response
-FEWEST_POSES = 2
+MIN_POSES = 2
 # chi-square per degree of freedom above which the search ended in a wrong minimum
 FOUND_SCATTER = 16.0
 # chi-square per degree of freedom above which the poses scatter
@@ -132,7 +132,7 @@ def settled(plumb: PlumbLine, readings: Readings) -> tuple[PlumbLine, Scatter]:
     if not leans:
         prior_sigma[2] = KNOWN
     response = np.zeros(len(prior_sigma), bool)
-    response[5 + readings.response.start :] = readings.pose.max() + 1 >= FEWEST_POSES
+    response[5 + readings.response.start :] = readings.pose.max() + 1 >= MIN_POSES
     scatter = scatter_of(
         Frames(
             utc_unix_s=readings.utc_unix_s,
@@ -146,7 +146,7 @@ def settled(plumb: PlumbLine, readings: Readings) -> tuple[PlumbLine, Scatter]:
             pose_sigma=readings.pose_sigma,
             prior_sigma=prior_sigma,
             response=(np.arange(len(prior_sigma)) >= 5 + readings.response.start)
-            & (readings.pose.max() + 1 >= FEWEST_POSES),
+            & (readings.pose.max() + 1 >= MIN_POSES),
             # with an unknown zenith an error of all poses moves that too
             zero_free=bool(prior_sigma[3] < TOLD_ZENITH),
         )

@@ -13,12 +13,12 @@ if TYPE_CHECKING:
     from matplotlib.collections import QuadMesh
 
 # more stars than this are drawn as the means of cells
-MOST_ARROWS = 400
+MAX_ARROWS = 400
 # How many stand along the longer side.
 ARROW_CELLS, COLOUR_CELLS = 22, 12
 # length of the key's arrow, in cells of ARROW_CELLS
 USUAL_ARROW = 0.8
-FEWEST_IN_CELL = 3
+MIN_IN_CELL = 3
 
 
 def draw(path: Path | str, fit: Intrinsics, title: str) -> None:
@@ -48,9 +48,9 @@ def draw(path: Path | str, fit: Intrinsics, title: str) -> None:
 def draw_residuals(axes: "Axes", xy: np.ndarray, residual: np.ndarray, width: int, height: int) -> None:
     """Draw residuals (N, 2) px of stars at xy (N, 2) px as arrows over a frame, with a key for their length.
 
-    More than MOST_ARROWS stars are drawn as the means of cells with FEWEST_IN_CELL or more.
+    More than MAX_ARROWS stars are drawn as the means of cells with MIN_IN_CELL or more.
     """
-    if len(xy) > MOST_ARROWS:
+    if len(xy) > MAX_ARROWS:
         xy, residual = _Cells(xy, ARROW_CELLS, width, height).means(xy, residual)
     usual = float(np.median(np.hypot(*residual.T))) if len(residual) else 0.0
     key = _round_number(usual) if usual > 0 else 1.0
@@ -87,7 +87,7 @@ class _Cells:
         column, row = np.clip(np.floor((xy + 0.5) / self.size).astype(int), 0, last).T
         self.cell = row * self.shape[1] + column
         self.count = np.bincount(self.cell, minlength=self.shape[0] * self.shape[1])
-        self.filled = self.count >= FEWEST_IN_CELL
+        self.filled = self.count >= MIN_IN_CELL
 
     def means(self, *values: np.ndarray) -> list[np.ndarray]:
         """Means (M, ...) over the filled cells of each array (N, ...)."""

@@ -20,7 +20,7 @@ from starpos.fix.solver import Solver
 from starpos.frames.pointings import Pointing
 from starpos.frames.stars import Stars
 from starpos.instrument import instrument_update
-from starpos.instrument.camera_vertical import MOST_SAG_ARCSEC, SAG_ARCSEC_PER_SQRT_HOUR
+from starpos.instrument.camera_vertical import MAX_SAG_ARCSEC, SAG_ARCSEC_PER_SQRT_HOUR
 from starpos.instrument.inclinometer import up_of
 from starpos.instrument.instrument import Calibration, Instrument
 from starpos.instrument.tilt_log import TiltLog
@@ -49,7 +49,7 @@ def define(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--sag",
-        type=options.number(0, MOST_SAG_ARCSEC),
+        type=options.number(0, MAX_SAG_ARCSEC),
         metavar="ARCSEC",
         help="how far a --fixed camera sags in an hour, 1 sigma about each axis; it grows with the root of the time "
         f"({SAG_ARCSEC_PER_SQRT_HOUR:g}, 300 m; after a week 13 times as much)",

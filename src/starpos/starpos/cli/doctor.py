@@ -41,7 +41,7 @@ SERIAL = ("dev/serial/by-id/*", "dev/ttyUSB*", "dev/ttyACM*")
 # interface class of a photo camera, in USB's list
 STILL_IMAGE = "06"
 # Maximum size of the system's description of a device.
-MOST_BYTES = 4096
+MAX_BYTES = 4096
 
 
 class State(str, Enum):
@@ -263,7 +263,7 @@ def _devices(paths: list[str], group: str, names: list[str] | None = None) -> Fi
 def _text(path: Path) -> str:
     try:
         with path.open("rb") as file:
-            return file.read(MOST_BYTES).decode(errors="replace").strip()
+            return file.read(MAX_BYTES).decode(errors="replace").strip()
     except OSError:
         return ""
 

@@ -16,7 +16,7 @@ from starpos.parallel.cluster import Cluster
 from starpos.parallel.processes import Processes, processors
 from starpos.sky import catalogue
 
-MOST_JOBS = 1000
+MAX_JOBS = 1000
 AUTO = "auto"
 
 
@@ -38,7 +38,7 @@ def add_jobs(parser: argparse.ArgumentParser, what: str = "frames") -> None:
 
 def _jobs(text: str) -> int:
     try:
-        return 0 if text == AUTO else options.number(0, MOST_JOBS, int)(text)
+        return 0 if text == AUTO else options.number(0, MAX_JOBS, int)(text)
     except ValueError:
         raise argparse.ArgumentTypeError(f"{text!r} is neither a whole number nor {AUTO}") from None
 

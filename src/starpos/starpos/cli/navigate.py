@@ -32,7 +32,7 @@ from starpos.night.work import Identifying
 from starpos.sky import catalogue
 
 NO_ANSWER = 1
-MOUNT_STDDEV_DEG, MOST_MOUNT_DEG = 1.0, 20.0
+MOUNT_STDDEV_DEG, MAX_MOUNT_DEG = 1.0, 20.0
 # of --altitude-m: the geoid, and hills on the way
 GIVEN_HEIGHT_STDDEV_M = 100.0
 OK, CARRIED, NO_READINGS, BAD_INPUT = "ok", "carried", "no inertial readings", "bad input"
@@ -76,7 +76,7 @@ def define(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--mount-stddev",
-        type=options.number(1e-4, MOST_MOUNT_DEG),
+        type=options.number(1e-4, MAX_MOUNT_DEG),
         default=MOUNT_STDDEV_DEG,
         metavar="DEG",
         help="error of the camera's stated orientation on the vehicle, 1 sigma an axis: z up, the top of "
@@ -192,7 +192,7 @@ def _mount_stddev(args: argparse.Namespace, doubt: AxisDoubt | None) -> float:
     if doubt is None:
         return stddev
     said, stddev = doubt.counted_as("the mount"), math.hypot(stddev, doubt.error_rad)
-    if math.degrees(stddev) > MOST_MOUNT_DEG:
+    if math.degrees(stddev) > MAX_MOUNT_DEG:
         raise InstrumentError(f"{said}; with a mount known no better, there is no position under way")
     console.complain("navigate", said)
     return stddev

@@ -10,7 +10,7 @@ from typing import Any, Protocol
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import InstrumentError
 from starpos.frames.exif import UNTENDED_STDDEV_S, ZONES_H, CameraClock
-from starpos.frames.shutter import MOST_READOUT_S, UNKNOWN, Shutter
+from starpos.frames.shutter import MAX_READOUT_S, UNKNOWN, Shutter
 from starpos.instrument import instrument, instrument_file, sensors
 from starpos.instrument.camera import Camera
 from starpos.instrument.instrument import UNKNOWN_CLOCK_S
@@ -189,7 +189,7 @@ def add_instrument(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--readout",
-        type=number(-MOST_READOUT_S, MOST_READOUT_S),
+        type=number(-MAX_READOUT_S, MAX_READOUT_S),
         nargs=2,
         metavar=("S", "STDDEV"),
         help="rolling shutter: s from the row read first to the last, negative where the bottom row is first, and its "

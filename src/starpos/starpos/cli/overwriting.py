@@ -22,7 +22,7 @@ INPUTS = ("frames", "tilt", "pointings", "imu", "geoid", "originals", "gaia")
 CAMERA_NAME = "camera"
 # 'a.fits[2]' is an image in the file a.fits
 HDU = re.compile(r"\[[^]]*\]$")
-MOST_LIST_BYTES = 1_000_000
+MAX_LIST_BYTES = 1_000_000
 
 
 @dataclass(frozen=True)
@@ -97,7 +97,7 @@ def failed_fields(folder: Path) -> None:
     if not folder.is_dir():
         raise _there(folder, "no folder")
     for path in sorted(folder.glob("*.csv")):
-        head = files.read_regular(path, MOST_LIST_BYTES).partition(b"\n")[0]
+        head = files.read_regular(path, MAX_LIST_BYTES).partition(b"\n")[0]
         try:
             is_ours = "VERDICT" in json.loads(head.removeprefix(b"#"))
         except (ValueError, TypeError, RecursionError):

@@ -6,7 +6,7 @@ import argparse
 import numpy as np
 
 from starpos.cli import console, options
-from starpos.frames.shutter import MOST_READOUT_S
+from starpos.frames.shutter import MAX_READOUT_S
 from starpos.instrument.instrument import focal_px_of
 from starpos.simulation.night_on_disk import write_night
 from starpos.simulation.scene import scene_of
@@ -82,7 +82,7 @@ def define(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--readout",
-        type=options.number(-MOST_READOUT_S, MOST_READOUT_S),
+        type=options.number(-MAX_READOUT_S, MAX_READOUT_S),
         default=0.0,
         metavar="S",
         help="rolling shutter: s from the first row to the last, negative: the bottom row is first (0: global)",

@@ -25,7 +25,7 @@ WHITE = 0.03
 # A JPEG has smoothed the sky where this share of blocks is flat; a block of the smallest step is then a peak of 4 sigma.
 FLAT, FAINTEST, BLOCK_NOISE = 0.1, 0.1, 2.0
 # Rows and columns of blocks that are looked at.
-MOST_BLOCKS = 40
+MAX_BLOCKS = 40
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -151,8 +151,8 @@ def _lost_noise(plane: np.ndarray) -> float:
 
 
 def _spread(count: int) -> np.ndarray:
-    """At most MOST_BLOCKS of the numbers 0 to count - 1, evenly."""
-    most = min(count, MOST_BLOCKS)
+    """At most MAX_BLOCKS of the numbers 0 to count - 1, evenly."""
+    most = min(count, MAX_BLOCKS)
     return np.arange(most) * (count - 1) // max(most - 1, 1)
 
 

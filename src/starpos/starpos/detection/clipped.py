@@ -23,7 +23,7 @@ OWN = 0.5
 # Minimum number of pixels of a clipped image, and its share of the pixels of a star that is just not clipped.
 FEWEST, NARROWER = 4, 0.8
 # Reach of the window around the peak, in widths of a star, and its minimum in px.
-REACH, LEAST_REACH = 6.0, 12
+REACH, MIN_REACH = 6.0, 12
 
 
 def with_clipped(
@@ -57,7 +57,7 @@ def with_clipped(
     lost |= any_near(own_x[untold], own_y[untold], at_x, at_y, NEAR)
     # what stands on a roof is the roof's
     lost = (lost & (top - level > OWN * (top - sky))).nonzero()[0][:MOST]
-    reach = max(LEAST_REACH, round(REACH * fwhm_px))
+    reach = max(MIN_REACH, round(REACH * fwhm_px))
     images = [_image(plane, x[k], y[k], level[k], top[k], reach) for k in lost.tolist()]
     least = max(FEWEST, NARROWER * np.pi / 4 * fwhm_px**2)
     # several peaks may belong to one image

@@ -14,7 +14,7 @@ from starpos.frames.stars import SATURATED
 # Pixels above this share of the frame's brightest discs belong to a disc: a plate or a JPEG has no sharp limit.
 FLAT = 0.8
 # Minimum radius of a disc over the FWHM of the stars (smaller ones are fitted by their wings), and in px.
-WIDER, LEAST_PX = 1.3, 4.0
+WIDER, MIN_PX = 1.3, 4.0
 # A disc's radius is at most this share of the frame's shorter side: larger ones are lamps, roofs or the Moon.
 WIDEST = 0.05
 # Minimum height of the disc's top above the sky, in sigma of a pixel's noise.
@@ -37,7 +37,7 @@ def find_discs(
     highest (h,) int32: the brightest pixel of each row.
     """
     level, noise = background.typical
-    least = max(WIDER * fwhm_px, LEAST_PX)
+    least = max(WIDER * fwhm_px, MIN_PX)
     # any disc of this radius has a sample whose neighbours to the right, below and between lie on it too
     step = int(np.sqrt(2) * (least - np.sqrt(0.5)))
     # no single hot pixel

@@ -57,7 +57,7 @@ FINE_FWHM, FINE_STARS, FINE_ROUNDS = 2.3, 6, 4
 RING_FWHM, POOR, RING_ROUNDS, RING_ORDER = 5.0, 0.05, 6, 14
 # Rounds in which the gains of a mosaic's phases are averaged, limit of outliers in sigma; DN far below any star's;
 # the least gain, and the least and the largest scatter of single stars' gains.
-GAIN_ROUNDS, OUTLYING_GAIN, DARKEST_MEAN, LEAST_GAIN, SPREADS = 4, 4.0, 1e-3, 0.02, (0.01, 0.5)
+GAIN_ROUNDS, OUTLYING_GAIN, DARKEST_MEAN, MIN_GAIN, SPREADS = 4, 4.0, 1e-3, 0.02, (0.01, 0.5)
 # Residuals of more sigma teach nothing of the noise.
 DEVIANT = 5.0
 # Largest distance from a star's centre to its stamp's edge, px.
@@ -286,7 +286,7 @@ def _gains(stamps: Stamps, value: np.ndarray, before: Response) -> tuple[np.ndar
         stamps.signal, stamps.noise, stamps.good, stamps.phase, value, before.dn_per_photon, before.misfit,
         len(before.gain),
     )  # fmt: skip
-    gain, spread = typical_gains(own, information, DARKEST_MEAN, LEAST_GAIN, OUTLYING_GAIN, GAIN_ROUNDS)
+    gain, spread = typical_gains(own, information, DARKEST_MEAN, MIN_GAIN, OUTLYING_GAIN, GAIN_ROUNDS)
     return gain, float(np.clip(spread, *SPREADS))
 
 

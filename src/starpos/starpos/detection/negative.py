@@ -7,7 +7,7 @@ from starpos.detection.pipeline import Detection, detect
 from starpos.frames.frame import Frame
 
 # Fewer stars identify no frame, so nothing is lost where its negative is looked at instead.
-FEWEST_STARS = 4
+MIN_STARS = 4
 
 
 def negative_of(frame: Frame) -> Frame:
@@ -18,9 +18,9 @@ def negative_of(frame: Frame) -> Frame:
 def detect_dark_too(frame: Frame) -> Detection:
     """The Detection of a frame, or of its negative where only that shows stars (`Stars.negative`)."""
     found = detect(frame)
-    if len(found.stars) >= FEWEST_STARS or frame.pixels.size == 0:
+    if len(found.stars) >= MIN_STARS or frame.pixels.size == 0:
         return found
     dark = detect(negative_of(frame))
-    if len(dark.stars) < FEWEST_STARS:
+    if len(dark.stars) < MIN_STARS:
         return found
     return replace(dark, stars=replace(dark.stars, negative=True))

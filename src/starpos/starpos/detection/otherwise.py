@@ -26,7 +26,7 @@ MESH_PX = 16
 # Minimum length (px) of a reduced frame's shorter side.
 SHORTEST_PX = 64
 # A flattened plane is stretched to at most this, by whole numbers: DN of 8 bits are coarse.
-HIGHEST, MOST_STRETCH = 40_000, 32
+HIGHEST, MAX_STRETCH = 40_000, 32
 
 
 def otherwise(frame: Frame, window: tuple[int, int, int, int] | None) -> Iterator[Stars]:
@@ -52,7 +52,7 @@ def _flattened(plane: np.ndarray) -> np.ndarray:
     """The plane (h, w), uint16, without what is wider than WIDEST_PX, stretched."""
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (WIDEST_PX, WIDEST_PX))
     rest = cv2.morphologyEx(plane, cv2.MORPH_TOPHAT, disc).astype(np.uint16)
-    return rest * np.uint16(max(1, min(MOST_STRETCH, HIGHEST // max(1, int(rest.max())))))
+    return rest * np.uint16(max(1, min(MAX_STRETCH, HIGHEST // max(1, int(rest.max())))))
 
 
 def _enlarged(stars: Stars, times: int, frame: Frame, window: tuple[int, int, int, int] | None) -> Stars:

@@ -37,7 +37,7 @@ PIXELS_PER_PEAK = 100
 # They are taken if more of them are like stars. SHORTEST_PX is the minimum of a reduced frame's shorter side.
 WIDE_FWHM, SHORTEST_PX = 8.0, 150
 # Maximum number of reductions: light that is still wider is a cloud.
-MOST_HALVINGS = 3
+MAX_HALVINGS = 3
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -149,7 +149,7 @@ def detect(frame: Frame, settings: DetectionSettings = DetectionSettings()) -> D
         mosaic=mosaic,
         settings=settings,
         about=about,
-        halvings=MOST_HALVINGS,
+        halvings=MAX_HALVINGS,
         trail=frame.trail,
     )
     return _detect(picture)
@@ -207,7 +207,7 @@ def _detect_at_full_size(picture: _Picture) -> Detection:
         lesson = with_trail(lesson, plane, background, x, y, saturation, picture.trail)
     pixels = (2 * lesson.reach + 1) ** 2
     chunk = max(1, int(np.clip(plane.size // 32, *CHUNK_PIXELS)) // pixels)
-    most = min(len(x), limit * (PIXELS_PER_PEAK >> MOST_HALVINGS - picture.halvings) // pixels)
+    most = min(len(x), limit * (PIXELS_PER_PEAK >> MAX_HALVINGS - picture.halvings) // pixels)
     columns = measure(plane, background, x[:most], y[:most], lesson, saturation, settings.min_snr, chunk)
     columns = resolve(columns, lesson.psf)
     fwhm_px = lesson.psf.fwhm_px

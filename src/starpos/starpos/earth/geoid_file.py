@@ -21,7 +21,7 @@ BYTE_ORDERS = "><"
 GTX_NODATA = np.float32(-88.8888)
 # A grid of the whole globe with 1 arcmin has 233 million nodes of 4 bytes.
 MAX_BYTES = 1_200_000_000
-LEAST_NODES = 4
+MIN_NODES = 4
 STEPS_DEG = (1e-4, 2.0)
 # Undulations are -107 to 86 m; a value beyond this limit means "no data".
 UNDULATION_LIMIT_M = 150.0
@@ -52,9 +52,9 @@ class Grid:
         steps = self.step_latitude, self.step_longitude
         if not np.isfinite([self.south, self.west, *steps]).all():
             raise GeoidError("its corner or spacing is not a finite number")
-        if min(rows, columns) < LEAST_NODES:
+        if min(rows, columns) < MIN_NODES:
             raise GeoidError(
-                f"{columns} x {rows} nodes are too few for slopes: {LEAST_NODES} each way are the least"
+                f"{columns} x {rows} nodes are too few for slopes: {MIN_NODES} each way are the least"
             )
         if not STEPS_DEG[0] <= min(steps) <= max(steps) <= STEPS_DEG[1]:
             raise GeoidError(

@@ -16,7 +16,7 @@ from starpos.errors import InstrumentError
 STANDARD_PRESSURE_PA = 101_325.0
 STANDARD_TEMPERATURE_C = 15.0
 # from the highest mountain to the lowest shore; hPa given as Pa, or Pa as hPa, lie outside
-LEAST_PRESSURE_PA, MOST_PRESSURE_PA = 30_000.0, 120_000.0
+MIN_PRESSURE_PA, MAX_PRESSURE_PA = 30_000.0, 120_000.0
 # ERFA's own limit: below 3 deg of altitude the two-constant model has no meaning.
 MIN_COS_ZENITH = 0.05
 
@@ -37,11 +37,11 @@ class Atmosphere:
     wavelength_stddev_um: float = 0.08
 
     def __post_init__(self) -> None:
-        if self.pressure_pa != 0 and not LEAST_PRESSURE_PA <= self.pressure_pa <= MOST_PRESSURE_PA:
+        if self.pressure_pa != 0 and not MIN_PRESSURE_PA <= self.pressure_pa <= MAX_PRESSURE_PA:
             raise InstrumentError(
                 f"pressure {self.pressure_pa:g} Pa ({self.pressure_pa / 100:g} hPa): must lie between "
-                f"{LEAST_PRESSURE_PA:.0f} and {MOST_PRESSURE_PA:.0f} Pa ({LEAST_PRESSURE_PA / 100:.0f} and "
-                f"{MOST_PRESSURE_PA / 100:.0f} hPa), or be 0 for a vacuum"
+                f"{MIN_PRESSURE_PA:.0f} and {MAX_PRESSURE_PA:.0f} Pa ({MIN_PRESSURE_PA / 100:.0f} and "
+                f"{MAX_PRESSURE_PA / 100:.0f} hPa), or be 0 for a vacuum"
             )
         checks = (
             ("temperature", self.temperature_c, -100.0, 80.0, "deg C"),

@@ -14,7 +14,7 @@ cdef enum:
     # determinants whose product is a number, points of an integral, steps of a search
     TOGETHER = 8
     POINTS = 128
-    MOST_TURNS = 100
+    MAX_TURNS = 100
 
 
 cdef inline double distance2_of(
@@ -193,7 +193,7 @@ cdef double searched(Columns *c, double share, double median_of_chi2, double lea
     # the logarithm of the size falls with that of the variance: not at all at first, at last as fast
     before, here = log(size(c, high, median_of_chi2) / share), log(high)
     low, high = here + log(least), here
-    for turn in range(MOST_TURNS):
+    for turn in range(MAX_TURNS):
         there = here + before / falls
         if not (low < there < high):
             there = (low + high) / 2

@@ -21,7 +21,7 @@ from starpos.instrument.camera import Camera
 MAX_ROUNDS = 6
 MIN_STARS = 3
 # the iteration ends at a step below this, in rad and as a share of the scale: the remaining error is a thousandth of it
-SETTLED, MOST_STEPS = 1e-11, 20
+SETTLED, MAX_STEPS = 1e-11, 20
 # the rounds end when the scatter changes by less than this share of itself, and of this minimum, px2
 SAME_SHARE, SAME_PX2 = 0.02, 1e-6
 # a covariance that is the same in all directions
@@ -80,7 +80,7 @@ def fitted(problem: Adjustment, local: np.ndarray, stated: np.ndarray) -> Fitted
             )
         covariance = np.ascontiguousarray(stated + ISOTROPIC * jitter2)
         a4, scale, residual = problem.refine(
-            a4, scale, slope, covariance, keep.view(np.uint8), SETTLED, MOST_STEPS
+            a4, scale, slope, covariance, keep.view(np.uint8), SETTLED, MAX_STEPS
         )
         if residual is None:
             raise FixError(

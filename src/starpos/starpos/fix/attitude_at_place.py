@@ -27,9 +27,9 @@ from starpos.instrument.mounting import Mounting
 from starpos.units import ARCSEC
 
 # the level settles to this, rad; refraction turns with it, and settles a thousand times faster, or ten times at 10 deg
-SETTLED, MOST_ROUNDS = 1e-9, 10
+SETTLED, MAX_ROUNDS = 1e-9, 10
 # minimum share of the refraction expected at the place, and significance in sigma: less belongs to another place
-LEAST_SHARE, SIGMAS = 0.5, 5.0
+MIN_SHARE, SIGMAS = 0.5, 5.0
 
 
 @at_once
@@ -127,7 +127,7 @@ def attitude_at_place(
     rays = camera.directions(*stars.xy.T)
     g = a4 @ rotation.best_rotation(rays, itrs)
     check_visible(float((rays @ g[2]).min()))
-    for _ in range(MOST_ROUNDS):
+    for _ in range(MAX_ROUNDS):
         seen = fit_stars(stars, camera, g, refraction, itrs)
         # the fitted A4 differs from the A4 of the place by the error of the level
         off = a4 @ seen.fit.a4.T
@@ -184,7 +184,7 @@ def _check_refraction(seen: StarFit, atmosphere: Atmosphere) -> None:
     share, sigma = seen.refraction_seen(atmosphere)
     # few stars hardly determine their scatter (Student's t)
     sigmas = SIGMAS * (1 + 5 / len(seen.residual))
-    if share < LEAST_SHARE and 1 - share > sigmas * sigma:
+    if share < MIN_SHARE and 1 - share > sigmas * sigma:
         raise PlaceError(
             f"from the given place the air would bend this field more than the stars show ({share:.2f} +- {sigma:.2f} of "
             "it): check latitude and longitude, their order and signs, the clock, and the camera's fx and fy"

@@ -12,7 +12,7 @@ from starpos.fix.identified import identified
 from starpos.fix.noise_alone import why_noise
 from starpos.fix.solution import Solution, Status
 from starpos.frames.stars import Stars
-from starpos.identification import FEWEST_STARS, Identification, Sky, blind_fisheye, quad_cache
+from starpos.identification import MIN_STARS, Identification, Sky, blind_fisheye, quad_cache
 from starpos.identification.blind import LARGEST_DEG, SMALLEST_DEG, STAGES, identify_blind
 from starpos.identification.blind_fisheye import NARROWEST_DEG, WIDEST_DEG, disc_radius_px, identify_fisheye
 from starpos.identification.search import field_of
@@ -48,9 +48,9 @@ class BlindSolver:
         begin, budget = time.perf_counter(), Budget.of(self.search_s)
         inside = np.flatnonzero(stars.on_frame)
         seen = stars.take(inside)
-        if len(seen) < FEWEST_STARS:
+        if len(seen) < MIN_STARS:
             message = (
-                f"{stars.place}: {len(seen)} stars detected, at least {FEWEST_STARS} are needed: check clouds, focus "
+                f"{stars.place}: {len(seen)} stars detected, at least {MIN_STARS} are needed: check clouds, focus "
                 "and exposure"
             )
             return Solution.failed(stars, Status.TOO_FEW_STARS, message)

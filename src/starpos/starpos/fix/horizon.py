@@ -8,7 +8,7 @@ from starpos.errors import FixError, PlaceError
 from starpos.instrument.instrument import Calibration
 
 # Lowest altitude with a known refraction.
-LEAST_DEG = np.degrees(np.arcsin(MIN_COS_ZENITH))
+MIN_DEG = np.degrees(np.arcsin(MIN_COS_ZENITH))
 
 
 def check_above_horizon(sine: float, calibration: Calibration) -> None:
@@ -19,7 +19,7 @@ def check_above_horizon(sine: float, calibration: Calibration) -> None:
     """
     if not calibration.unknown and sine < MIN_COS_ZENITH:
         raise FixError(
-            f"by the tilts and A3 the stars are {_where(sine)}, and a position needs stars {LEAST_DEG:.0f} "
+            f"by the tilts and A3 the stars are {_where(sine)}, and a position needs stars {MIN_DEG:.0f} "
             f"deg or more above it: check the signs and the order of the inclinometer's axes, and A3"
         )
 
@@ -29,7 +29,7 @@ def check_visible(sine: float) -> None:
     if sine < MIN_COS_ZENITH:
         raise PlaceError(
             f"from the given place the stars, or some, are {_where(sine)}, and a heading needs stars "
-            f"{LEAST_DEG:.0f} deg or more above it: check latitude and longitude, their order and signs, "
+            f"{MIN_DEG:.0f} deg or more above it: check latitude and longitude, their order and signs, "
             f"and the clock"
         )
 

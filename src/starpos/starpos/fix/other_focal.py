@@ -7,7 +7,7 @@ import time
 from starpos.errors import StarposError
 from starpos.fix.solver import Solver
 from starpos.frames.stars import Stars
-from starpos.identification import FEWEST_STARS, Sky, identify_directions
+from starpos.identification import MIN_STARS, Sky, identify_directions
 
 # Ratio of successive tries, each of which tolerates an error of 3 %; number of tries on either side.
 STEP, TRIES = 1.055, 6
@@ -20,7 +20,7 @@ def focal_that_fits(solver: Solver, stars: Stars, until_s: float = math.inf) -> 
     Triangles are found by their angles, which hardly depend on the focal length, so the given field's triangles serve.
     """
     on = stars.take(stars.on_frame.nonzero()[0])
-    if len(on) < FEWEST_STARS:
+    if len(on) < MIN_STARS:
         return None
     try:
         given, catalogue, triangles = solver.view(on.width, on.height, on.origin_px)

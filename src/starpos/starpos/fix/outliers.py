@@ -11,7 +11,7 @@ OUTLIER_SIGMA = 5.0
 # of the sum of the squared residuals
 GRID_LEAST, GRID_MOST = 1e-3, 1e2
 # the search of the extra variance: minimum as a share of the maximum, and relative precision
-LEAST_EXTRA, GOOD_EXTRA = 1e-12, 2e-4
+MIN_EXTRA, GOOD_EXTRA = 1e-12, 2e-4
 
 
 def judged(
@@ -29,7 +29,7 @@ def judged(
         share,
         MEDIAN_OF_CHI2,
         OUTLIER_SIGMA**2,
-        LEAST_EXTRA,
+        MIN_EXTRA,
         GOOD_EXTRA,
     )
 

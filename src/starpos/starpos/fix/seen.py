@@ -7,13 +7,13 @@ import numpy as np
 
 from starpos.frames.stars import EDGE_PX, Stars
 from starpos.identification._frame import FrameStars, all_within, ideal_frame, unit_vectors
-from starpos.identification.pose import LEAST_SIGMA_PX, TEST_STARS
+from starpos.identification.pose import MIN_SIGMA_PX, TEST_STARS
 from starpos.identification.search import through
 from starpos.instrument.camera import Camera
 from starpos.instrument.lens import EQUIDISTANT
 
 # A fisheye's lower stars are not used: no model describes refraction near the horizon.
-LEAST_ALTITUDE_RAD = math.radians(10)
+MIN_ALTITUDE_RAD = math.radians(10)
 
 
 def inside(stars: Stars, camera: Camera) -> np.ndarray | None:
@@ -38,10 +38,10 @@ def as_seen(camera: Camera, stars: Stars) -> FrameStars | None:
     """
     if not camera.is_ideal:
         return None
-    field = ideal_frame(stars.x, stars.y, stars.covariance, camera, EDGE_PX, LEAST_SIGMA_PX, TEST_STARS)
+    field = ideal_frame(stars.x, stars.y, stars.covariance, camera, EDGE_PX, MIN_SIGMA_PX, TEST_STARS)
     return None if field is None else through(field, camera, stars.window)
 
 
 def high_enough(sines: np.ndarray) -> np.ndarray:
     """Whether stars are above the worst of the air, by the sines (N,) of their altitudes."""
-    return sines > math.sin(LEAST_ALTITUDE_RAD)
+    return sines > math.sin(MIN_ALTITUDE_RAD)

@@ -26,7 +26,7 @@ from starpos.frames.pointings import Pointing
 from starpos.frames.reading import why_no_time
 from starpos.frames.shutter import UNKNOWN, Shutter
 from starpos.frames.stars import Stars
-from starpos.identification import FEWEST_STARS, Identification, PointingPrior, Sky, triangle_cache, wide
+from starpos.identification import MIN_STARS, Identification, PointingPrior, Sky, triangle_cache, wide
 from starpos.identification._frame import FrameStars, mean_sigma
 from starpos.identification.hint import Hint
 from starpos.identification.search import Priors, field_of, identify_frame
@@ -334,7 +334,7 @@ class Solver:
 
 
 def _unidentified(stars: Stars, camera: Camera, sky: Sky, begin_s: float) -> Solution:
-    status = Status.TOO_FEW_STARS if len(stars) < FEWEST_STARS else Status.NOT_IDENTIFIED
+    status = Status.TOO_FEW_STARS if len(stars) < MIN_STARS else Status.NOT_IDENTIFIED
     failed = Solution.failed(stars, status, why_unidentified(stars, camera, sky.catalogue))
     return replace(failed, identify_s=time.perf_counter() - begin_s)
 

@@ -4,7 +4,7 @@
 import numpy as np
 
 from starpos.frames.stars import SATURATED, Stars
-from starpos.identification import FEWEST_STARS
+from starpos.identification import MIN_STARS
 from starpos.instrument.camera import Camera
 from starpos.sky import deeper
 from starpos.sky.catalogue import Catalogue
@@ -20,7 +20,7 @@ def why_unidentified(stars: Stars, camera: Camera, catalogue: Catalogue) -> str:
     n = len(stars)
     wide = stars.fwhm_px is not None and stars.fwhm_px > WIDE_PX
     saturated = (stars.flags & SATURATED) != 0
-    if n < FEWEST_STARS:
+    if n < MIN_STARS:
         hint = f" ({int(saturated.sum())} saturated)" if saturated.any() else ""
         found = f"{n} stars detected{hint}"
         focus = (
@@ -28,7 +28,7 @@ def why_unidentified(stars: Stars, camera: Camera, catalogue: Catalogue) -> str:
             if wide
             else "check clouds, focus and exposure"
         )
-        return f"{stars.place}: {found}, at least {FEWEST_STARS} are needed: {focus}"
+        return f"{stars.place}: {found}, at least {MIN_STARS} are needed: {focus}"
     causes = []
     if thin := deeper.too_thin(catalogue, camera):
         causes.append(thin)

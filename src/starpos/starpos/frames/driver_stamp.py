@@ -9,7 +9,7 @@ import math
 from dataclasses import dataclass, replace
 
 from starpos.errors import FrameError
-from starpos.frames.exposure import MOST_EXPOSURE_S
+from starpos.frames.exposure import MAX_EXPOSURE_S
 from starpos.frames.frame import Frame
 from starpos.frames.shutter import Shutter
 
@@ -41,9 +41,9 @@ class DriverStamp:
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
             raise FrameError(f"a stamp is of the {self.kind!r}: give {', '.join(KINDS[1:])}, or nothing")
-        if self.exposure_s is not None and not 0 < self.exposure_s <= MOST_EXPOSURE_S:
+        if self.exposure_s is not None and not 0 < self.exposure_s <= MAX_EXPOSURE_S:
             raise FrameError(
-                f"an exposure of {self.exposure_s} s is impossible: give up to {MOST_EXPOSURE_S:g} s"
+                f"an exposure of {self.exposure_s} s is impossible: give up to {MAX_EXPOSURE_S:g} s"
             )
 
     @property

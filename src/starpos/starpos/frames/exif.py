@@ -15,7 +15,7 @@ from datetime import datetime, timezone
 from typing import Any
 
 from starpos.errors import FrameError, TimeError
-from starpos.frames.exposure import MOST_EXPOSURE_S
+from starpos.frames.exposure import MAX_EXPOSURE_S
 from starpos.frames.shutter import UNKNOWN_LATENCY_S
 
 # Canon and Nikon allow their clocks an error of a minute a month.
@@ -107,7 +107,7 @@ def told(data: bytes, place: str, clock: CameraClock | None, shape: tuple[int, .
 def _exposure_s(tags: Mapping) -> float | None:
     """ExposureTime in s; None if it is missing or impossible."""
     seconds = _number(tags, "ExposureTime")
-    return seconds if seconds is not None and seconds <= MOST_EXPOSURE_S else None
+    return seconds if seconds is not None and seconds <= MAX_EXPOSURE_S else None
 
 
 def _cropped(tags: Mapping, width: int, height: int) -> bool:

@@ -10,9 +10,9 @@ from starpos.errors import FrameError
 from starpos.frames.shutter import Shutter
 
 # In a longer exposure the tilts of several poses would be averaged.
-MOST_EXPOSURE_S = 3600.0
+MAX_EXPOSURE_S = 3600.0
 # A time known less well counts as unknown, and its square must not overflow.
-MOST_STDDEV_S = 1e9
+MAX_STDDEV_S = 1e9
 LARGEST_SIDE_PX = 1_000_000
 
 
@@ -56,16 +56,16 @@ class Exposure:
             raise FrameError(
                 f"{place}: the time of the exposure's middle is {self.mid_unix_s}; give a Unix time or None."
             )
-        if self.exposure_s is not None and not 0 <= self.exposure_s <= MOST_EXPOSURE_S:
+        if self.exposure_s is not None and not 0 <= self.exposure_s <= MAX_EXPOSURE_S:
             raise FrameError(
-                f"{place}: the exposure is {self.exposure_s} s; give 0 to {MOST_EXPOSURE_S:g} s, or None where it "
+                f"{place}: the exposure is {self.exposure_s} s; give 0 to {MAX_EXPOSURE_S:g} s, or None where it "
                 "is unknown."
             )
         for name in ("stamp_stddev_s", "clock_stddev_s"):
             value = getattr(self, name)
-            if not 0 <= value <= MOST_STDDEV_S:
+            if not 0 <= value <= MAX_STDDEV_S:
                 raise FrameError(
-                    f"{place}: {name} is {value}; it must be from 0 (unknown) to {MOST_STDDEV_S:g} s."
+                    f"{place}: {name} is {value}; it must be from 0 (unknown) to {MAX_STDDEV_S:g} s."
                 )
         for focal_px in (self.focal_px, self.rough_focal_px):
             if focal_px is not None and not (np.isfinite(focal_px) and focal_px > 0):

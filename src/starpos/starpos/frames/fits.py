@@ -23,7 +23,7 @@ FITS_START, GZIP_START = b"SIMPLE", b"\x1f\x8b"
 # Planes of a stack or of a camera of colours.
 COLOURS = 3
 # Number of the first parts (HDUs) of a file that are searched for an image.
-MOST_PARTS = 100
+MAX_PARTS = 100
 # Columns of a .fz whose cells may be gzip.
 TILES = ("COMPRESSED_DATA", "GZIP_COMPRESSED_DATA")
 # What astropy unpacks safely: a damaged HCOMPRESS_1 ends the whole program, with astropy 6.0 to 8.0 at least.
@@ -133,10 +133,10 @@ def _image(hdus: Iterable, place: str, part: str) -> _Image:
 
 
 def _parts(hdus: Iterable) -> list[Any]:
-    """The first HDUs of a file, up to MOST_PARTS; damage behind an image is passed over."""
+    """The first HDUs of a file, up to MAX_PARTS; damage behind an image is passed over."""
     parts: list[Any] = []
     try:
-        parts.extend(itertools.islice(hdus, MOST_PARTS))
+        parts.extend(itertools.islice(hdus, MAX_PARTS))
     # damaged bytes make astropy raise any kind of exception
     except Exception:
         if not any(_axes(hdu) for hdu in parts):

@@ -11,20 +11,20 @@ from starpos.files import read_regular
 from starpos.frames.exposure import Exposure
 from starpos.units import ARCSEC
 
-MAX_CSV_BYTES, MOST_ROWS = 20_000_000, 100_000
+MAX_CSV_BYTES, MAX_ROWS = 20_000_000, 100_000
 NEEDED = ("utc_unix_s", "ra_deg", "dec_deg", "sigma_arcsec")
 ROLL = ("roll_deg", "sigma_roll_arcsec")
 # limits of a stated sigma: with an error of a degree a pointing is useless, an error of 0 is a mistake
-LEAST_ARCSEC, MOST_ARCSEC = 1e-4, 3600.0
-MOST_ROLL_ARCSEC = 36_000.0
+MIN_ARCSEC, MAX_ARCSEC = 1e-4, 3600.0
+MAX_ROLL_ARCSEC = 36_000.0
 # what each column may hold, in its own unit
 LIMITS = {
     "utc_unix_s": (-1e11, 1e11),
     "ra_deg": (-360.0, 360.0),
     "dec_deg": (-90.0, 90.0),
     "roll_deg": (-360.0, 360.0),
-    "sigma_arcsec": (LEAST_ARCSEC, MOST_ARCSEC),
-    "sigma_roll_arcsec": (LEAST_ARCSEC, MOST_ROLL_ARCSEC),
+    "sigma_arcsec": (MIN_ARCSEC, MAX_ARCSEC),
+    "sigma_roll_arcsec": (MIN_ARCSEC, MAX_ROLL_ARCSEC),
     "exposure_s": (0.0, 3600.0),
 }
 
@@ -76,8 +76,8 @@ def read_pointings(path: Path | str) -> list[Pointing]:
             f"{path}: a table of pointings needs a first line with the names {', '.join(NEEDED)}, and may have "
             f"{', '.join(ROLL)}, exposure_s, each once, and a row a frame"
         )
-    if len(rows) - 1 > MOST_ROWS:
-        raise FrameError(f"{path}: {len(rows) - 1} pointings, of which {MOST_ROWS} are read: split the table")
+    if len(rows) - 1 > MAX_ROWS:
+        raise FrameError(f"{path}: {len(rows) - 1} pointings, of which {MAX_ROWS} are read: split the table")
     return [_pointing(f"{path}:{number}", dict(zip(names, row, strict=False)), len(row) == len(names))
             for number, row in rows[1:]]  # fmt: skip
 

@@ -13,7 +13,7 @@ from starpos.frames.frame import PATTERNS, Frame, to_unsigned
 
 # Tags of TIFF 6.0: offsets and lengths of an image's strips, the same of its tiles, and the IFDs below this one.
 STRIPS, TILES, BELOW = (273, 279), (324, 325), 330
-MOST_IFDS, MOST_VALUES = 64, 1 << 20
+MAX_IFDS, MAX_VALUES = 64, 1 << 20
 
 
 def raw_frame(data: bytes, place: str, clock: exif.CameraClock | None = None) -> Frame:
@@ -70,7 +70,7 @@ def _end(data: bytes) -> int:
         return 0
     seen: set[int] = set()
     waiting, end = [struct.unpack_from(order + "I", data, 4)[0]], 0
-    while waiting and len(seen) < MOST_IFDS:
+    while waiting and len(seen) < MAX_IFDS:
         at = waiting.pop()
         if at in seen or not at:
             continue
@@ -94,7 +94,7 @@ def _ifd(data: bytes, at: int, order: str) -> tuple[dict[int, tuple[int, ...]], 
         entry = at + 2 + 12 * k
         tag, kind, n = struct.unpack_from(order + "HHI", data, entry)
         letter = {3: "H", 4: "I", 13: "I"}.get(kind)
-        if tag in (*STRIPS, *TILES, BELOW) and letter and n <= MOST_VALUES:
+        if tag in (*STRIPS, *TILES, BELOW) and letter and n <= MAX_VALUES:
             form = f"{order}{n}{letter}"
             place = entry + 8
             if struct.calcsize(form) > 4:

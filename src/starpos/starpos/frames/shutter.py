@@ -15,7 +15,7 @@ from starpos.errors import FrameError
 
 # 1 sigma of an unstated readout: evenly up to 50 ms, from the top or from the bottom
 UNKNOWN_READOUT_S = 0.03
-MOST_READOUT_S = 10.0
+MAX_READOUT_S = 10.0
 # 1 sigma of the time from a consumer camera's stamp to the opening of its shutter: evenly up to 100 ms
 UNKNOWN_LATENCY_S = 0.06
 
@@ -34,11 +34,11 @@ class Shutter:
     readout_stddev_s: float = UNKNOWN_READOUT_S
 
     def __post_init__(self) -> None:
-        if not (abs(self.readout_s) <= MOST_READOUT_S and 0 <= self.readout_stddev_s <= MOST_READOUT_S):
+        if not (abs(self.readout_s) <= MAX_READOUT_S and 0 <= self.readout_stddev_s <= MAX_READOUT_S):
             raise FrameError(
                 f"a shutter's readout of {self.readout_s:g} s +- {self.readout_stddev_s:g} s is impossible: "
                 f"give at most "
-                f"{MOST_READOUT_S:g} s from the first row to the last, negative where the bottom row is first, and its "
+                f"{MAX_READOUT_S:g} s from the first row to the last, negative where the bottom row is first, and its "
                 "standard deviation"
             )
 

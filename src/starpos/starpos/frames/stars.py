@@ -20,7 +20,7 @@ COLUMNS = ("x", "y", "flux", "snr", "covariance", "flags")
 # A centroid farther outside the frame than this is not a star's.
 EDGE_PX = 2.0
 # Larger than any frame; squares must not overflow.
-MOST_VARIANCE_PX2 = 1e12
+MAX_VARIANCE_PX2 = 1e12
 # The two halves of a covariance may differ by this share of the variances.
 SYMMETRIC = 1e-6
 
@@ -73,7 +73,7 @@ class Stars(Exposure):
             )
         object.__setattr__(self, "flags", self.flags.astype(np.uint8))
         c = self.covariance
-        if (c > MOST_VARIANCE_PX2).any():
+        if (c > MAX_VARIANCE_PX2).any():
             raise FrameError(f"{place}: a star's error is {np.sqrt(c.max()):.1g} px; leave such stars out.")
         variances = c[:, 0, 0] * c[:, 1, 1]
         definite = (c[:, 0, 0] > 0) & (c[:, 1, 1] > 0) & (variances > c[:, 0, 1] ** 2)

@@ -14,7 +14,7 @@ from typing import Any
 import erfa
 
 from starpos.errors import TimeError, one_line
-from starpos.frames.exposure import MOST_EXPOSURE_S
+from starpos.frames.exposure import MAX_EXPOSURE_S
 from starpos.frames.shutter import UNKNOWN_LATENCY_S
 from starpos.units import DAY_S
 from starpos.utc import UNIX_EPOCH_JD
@@ -34,12 +34,12 @@ KEYS = (*START, *MIDDLE, *END, *HOURS, *LENGTHS, *COUNTS, "TIMESYS")
 # Time scales of TIMESYS that are read; UT1 would need tables.
 SCALES = ("utc", "tai", "tt", "tdb")
 # Cards that set the middle of the exposure farther apart than this, beyond their rounding, contradict each other.
-MOST_APART_S = 0.5
+MAX_APART_S = 0.5
 ISO_TIME = re.compile(r"(\d{4})-(\d\d)-(\d\d)T(\d\d):(\d\d)(?::(\d\d?(?:\.\d*)?))?Z?", re.ASCII)
 DAY = re.compile(r"\d{4}-\d\d-\d\d", re.ASCII)
 MJD_ZERO_JD, FARTHEST_MJD = 2400000.5, 1e7
 # smallest step of an MJD's last digit: below it lie the last bits of a double
-LEAST_MJD_STEP_S = 1e-3
+MIN_MJD_STEP_S = 1e-3
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ def times(header: Mapping) -> dict[str, Any]:
         return {"exposure_s": exposure_s} | ({} if zero is None else {"untimed": _no_length(header)})
     best = min(middles, key=lambda m: m.stddev_s)
     other = max(middles, key=lambda m: _apart_s(m, best))
-    if (apart_s := _apart_s(other, best)) > MOST_APART_S:
+    if (apart_s := _apart_s(other, best)) > MAX_APART_S:
         return {
             "untimed": f"the middle of its exposure by {best.by} and by {other.by} differ by "
             f"{abs(other.after_s - best.after_s):.3g} s: these cards contradict each other, correct the header"
@@ -126,9 +126,9 @@ def _lengths(header: Mapping) -> dict[str, float]:
             length = float(value)
         except (TypeError, ValueError, OverflowError):
             length = math.nan
-        if not 0 <= length <= MOST_EXPOSURE_S:
+        if not 0 <= length <= MAX_EXPOSURE_S:
             raise TimeError(
-                f"its {key} is {one_line(repr(value))}: give 0 to {MOST_EXPOSURE_S:g} s, correct the header"
+                f"its {key} is {one_line(repr(value))}: give 0 to {MAX_EXPOSURE_S:g} s, correct the header"
             )
         if length > 0:
             lengths[key] = length
@@ -193,7 +193,7 @@ def _span_s(told: Mapping[str, _Instant]) -> float | None:
     if start is None or end is None:
         return None
     span_s = end.since_s(start)
-    return span_s if 0 < span_s <= MOST_EXPOSURE_S else None
+    return span_s if 0 < span_s <= MAX_EXPOSURE_S else None
 
 
 def _instant(header: Mapping, key: str, scale: str) -> _Instant | None:
@@ -254,7 +254,7 @@ def _rounding(start: float | str) -> float:
     if not isinstance(start, str):
         digits = repr(start).partition(".")[2].rstrip("0")
         sigma_s = DAY_S * 10.0 ** -len(digits) / math.sqrt(3)
-        return sigma_s if sigma_s > LEAST_MJD_STEP_S else 0.0
+        return sigma_s if sigma_s > MIN_MJD_STEP_S else 0.0
     decimals = re.search(r":\d\d:\d\d(?:\.(\d*))?", start)
     # a time without seconds
     if decimals is None:

@@ -12,7 +12,7 @@ from starpos.errors import GnssError
 from starpos.gnss.states import Learned, layout_of
 
 VERSION, KEY = 1, "starpos_learned"
-MOST_BYTES = 200_000
+MAX_BYTES = 200_000
 # a covariance may miss being positive by this share of its trace of correlations, by rounding
 ROUNDING = 1e-9
 CURE = "delete it to learn anew, or give another file"
@@ -46,7 +46,7 @@ def save(path: Path, learned: Learned) -> None:
 def read_if_there(path: Path) -> Learned | None:
     """Read what was learned; None without a file.  GnssError if it cannot be that."""
     try:
-        text = files.read_regular(path, MOST_BYTES)
+        text = files.read_regular(path, MAX_BYTES)
     except FileNotFoundError:
         return None
     except OSError as error:

@@ -31,7 +31,7 @@ OTHER_DATUMS = (
     "sk-42",
 )
 # A receiver that states a larger error gives no place.
-MOST_SIGMA_M = 10_000.0
+MAX_SIGMA_M = 10_000.0
 # A receiver's default output before it has a place.
 NULL_ISLAND_DEG = 1e-5
 
@@ -85,8 +85,8 @@ def checked(
         )
     if not np.isfinite(covariance).all() or np.linalg.eigvalsh(covariance)[0] <= 0:
         raise GnssError("GNSS states no error of its place: have its driver fill in the covariance")
-    if np.sqrt(np.trace(covariance)) > MOST_SIGMA_M:
-        raise GnssError(f"GNSS states an error of over {MOST_SIGMA_M / 1000:g} km: it is left out")
+    if np.sqrt(np.trace(covariance)) > MAX_SIGMA_M:
+        raise GnssError(f"GNSS states an error of over {MAX_SIGMA_M / 1000:g} km: it is left out")
     return GnssPlace(
         utc_unix_s=utc_unix_s,
         latitude=float(np.radians(latitude_deg)),

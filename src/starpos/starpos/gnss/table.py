@@ -17,7 +17,7 @@ from starpos.gnss.track import GnssTrack
 NEEDED = ("utc_unix_s", "latitude", "longitude", "sigma_east_m", "sigma_north_m")
 COLUMNS = ("utc_unix_s", "latitude", "longitude", "altitude_m", "sigma_east_m", "sigma_north_m", "status")
 # a month of 1 Hz
-MOST_BYTES = 300_000_000
+MAX_BYTES = 300_000_000
 CURE = f"give a CSV with a line of names, {','.join(COLUMNS)}, and a row a fix, deg on WGS 84"
 
 
@@ -28,7 +28,7 @@ def read_gnss_csv(path: Path | str) -> tuple[GnssTrack, tuple[str, ...]]:
     there is no such column).  Cells may be empty.  Rows may come in any order.
     """
     try:
-        text = read_regular(path, MOST_BYTES).decode("utf-8-sig")
+        text = read_regular(path, MAX_BYTES).decode("utf-8-sig")
     except FileNotFoundError:
         raise GnssError(f"{path}: there is no such file: {CURE}") from None
     except (OSError, UnicodeDecodeError) as e:

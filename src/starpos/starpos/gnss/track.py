@@ -9,7 +9,7 @@ from starpos.gnss.place import GnssPlace
 # Maximum time between a GNSS place and a frame, s.
 NEAREST_S = 3.0
 # Maximum speed of a vehicle between two places, m/s, and tolerance beyond it, in sigma of both.
-MOST_SPEED, SIGMAS = 150.0, 8.0
+MAX_SPEED, SIGMAS = 150.0, 8.0
 # Stamps closer than this are one.
 SAME_S = 1e-4
 
@@ -66,7 +66,7 @@ def agree(a: GnssPlace, b: GnssPlace) -> bool:
     """Whether a vehicle may have gone from one place to the other in the time between them."""
     apart_m = float(np.linalg.norm(a.from_place_m(b.latitude, b.longitude)))
     sigma_m = float(np.sqrt(np.linalg.eigvalsh(a.covariance + b.covariance)[-1]))
-    return apart_m <= MOST_SPEED * abs(a.utc_unix_s - b.utc_unix_s) + SIGMAS * sigma_m
+    return apart_m <= MAX_SPEED * abs(a.utc_unix_s - b.utc_unix_s) + SIGMAS * sigma_m
 
 
 def _agreeing(ordered: list[GnssPlace]) -> list[GnssPlace]:

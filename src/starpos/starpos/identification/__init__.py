@@ -8,11 +8,11 @@ accepted by its probability, never by a number of stars. Then the fainter stars 
 
 from starpos.identification.full import Identification
 from starpos.identification.prior import PlumbPrior, PointingPrior
-from starpos.identification.search import FEWEST_STARS, identify, identify_directions
+from starpos.identification.search import MIN_STARS, identify, identify_directions
 from starpos.identification.sky import Sky
 
 __all__ = [
-    "FEWEST_STARS",
+    "MIN_STARS",
     "Identification",
     "PlumbPrior",
     "PointingPrior",

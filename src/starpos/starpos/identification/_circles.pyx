@@ -13,7 +13,7 @@ from starpos.identification._triangles cimport CODES, bin_of, code_of, is_counte
 
 
 cdef enum:
-    MOST_TAKEN = 32
+    MAX_TAKEN = 32
     # Triangles whose places in memory are asked for before they are written.
     AHEAD = 16
 
@@ -110,11 +110,11 @@ def well_apart(const double[:, ::1] v, double nearest):
 def triples_of_circles(const double[:, ::1] v, const double[:, ::1] centres, double radius, int most):
     """The triples a < b < c among the `most` first of the stars v (n, 3) in each circle: a (T,), and b, c as one number (T,)."""
     cdef Cells cells = Cells(v, radius)
-    cdef int[MOST_TAKEN] taken
+    cdef int[MAX_TAKEN] taken
     cdef int count, i, j, k
     cdef Py_ssize_t circle, place = 0
-    if not 3 <= most <= MOST_TAKEN:
-        raise ValueError(f"{most} stars of each circle: it must be 3 to {MOST_TAKEN}")
+    if not 3 <= most <= MAX_TAKEN:
+        raise ValueError(f"{most} stars of each circle: it must be 3 to {MAX_TAKEN}")
     room = len(centres) * (most * (most - 1) * (most - 2) // 6)
     brightest, others = np.empty(room, np.int32), np.empty(room, np.int64)
     cdef int[::1] a = brightest

@@ -10,7 +10,7 @@ import numpy as np
 from starpos._numeric.algebra cimport best_rotation, fetch, length, turned
 from starpos.identification._frame cimport FrameStars, axis_of, direction_of, on_frame, pixel_of, pixels_of
 from starpos.identification._matching cimport Matching, begin, match, order
-from starpos.identification._sky cimport MOST_RUNS, Date, StarTable, runs_near
+from starpos.identification._sky cimport MAX_RUNS, Date, StarTable, runs_near
 from starpos.identification._triangles cimport Candidate
 
 # Stars so far beyond a frame are on it.
@@ -92,7 +92,7 @@ cdef class BrightTable:
         most_stars  so many of the brightest catalogue stars on the frame are looked at
         log_false   logarithm of the share of detections that may be false
         """
-        cdef int[2 * MOST_RUNS] runs
+        cdef int[2 * MAX_RUNS] runs
         cdef double[3] axis
         cdef double total = 0.0, best = -1e300, variance, area_px2 = 4 * frame.reach[0] * frame.reach[1]
         cdef Matching m

@@ -19,7 +19,7 @@ from starpos.identification._triangles cimport Candidate, TriangleTable
 
 
 cdef enum:
-    MOST_STAGES = 8
+    MAX_STAGES = 8
     LOOKS = 3
 
 
@@ -250,7 +250,7 @@ cdef class Limits:
 cdef class Lost:
     """An iterator over what is identified of a frame lost in space, as `Finder.lost` makes it.
 
-    stages   (number of brightest stars, their error in px), at most MOST_STAGES: triangles of these are looked up, none
+    stages   (number of brightest stars, their error in px), at most MAX_STAGES: triangles of these are looked up, none
              twice with one error. Before the first stage come looks at few stars: of each the best candidate that others
              support is judged, which mostly is right
     crowded  most of the brightest stars may be false: only candidates that two others support are judged, all of them;
@@ -261,8 +261,8 @@ cdef class Lost:
     cdef TriangleTable table
     cdef BrightTable bright
     cdef Limits limits
-    cdef int[MOST_STAGES] stars
-    cdef double[MOST_STAGES] stage_px
+    cdef int[MAX_STAGES] stars
+    cdef double[MAX_STAGES] stage_px
     cdef int stages, stage, looks
     cdef bint crowded, ranked
     cdef double error_px
@@ -277,8 +277,8 @@ cdef class Lost:
         cdef int most = max(limits.most_looked_at, limits.most_supported) + 1, k
         self.judge, self.table, self.bright, self.limits = judge, table, bright, limits
         self.crowded, self.looks, self.stages = crowded, LOOKS if crowded else 0, len(stages)
-        if not 0 < self.stages <= MOST_STAGES:
-            raise ValueError(f"{self.stages} stages of a search: 1 to {MOST_STAGES} are possible")
+        if not 0 < self.stages <= MAX_STAGES:
+            raise ValueError(f"{self.stages} stages of a search: 1 to {MAX_STAGES} are possible")
         for k in range(self.stages):
             self.stars[k], self.stage_px[k] = stages[k]
         self.error_px = self.stage_px[0]

@@ -7,7 +7,7 @@ cdef enum:
     ZONES = 180
     CELLS = 360
     # Of rows: two in each zone.
-    MOST_RUNS = 360
+    MAX_RUNS = 360
 
 
 cdef struct Date:

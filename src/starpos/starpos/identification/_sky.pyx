@@ -24,7 +24,7 @@ cdef enum:
 
 cdef double MAS = M_PI / 180 / DEGREE
 # Where the plane is as far (rad) from the sphere as this share of a frame's radius, it is no plane.
-cdef double MOST_CURVED = 0.5
+cdef double MAX_CURVED = 0.5
 
 # Sine and cosine of the middle of each degree of right ascension, and of declination from -90.
 cdef double[CELLS] sin_ra, cos_ra
@@ -131,7 +131,7 @@ cdef class StarTable:
         double margin_px, int most, double blend_px, Visible *out,
     ) except -1 nogil:
         """Set `out` to the stars of `on_frame`; its memory is the caller's to free, even after an error."""
-        cdef int[2 * MOST_RUNS] runs
+        cdef int[2 * MAX_RUNS] runs
         cdef double[3] axis
         # the cells reach beyond the frame
         cdef int cut = 4 * most + 100, i, n = 0, count
@@ -298,7 +298,7 @@ cdef void _flatten(
         return
     steep, slant = tan(fabs(dec) + radius), sqrt(max(1 - ahead * ahead, 0.0)) / ahead
     bend = radius * radius * (steep + 2 * slant + 2 * radius * (1 + steep * steep))
-    if bend > MOST_CURVED * radius:
+    if bend > MAX_CURVED * radius:
         return
     bend += MOVED * MAS
     east[0], east[1], east[2] = -axis[1] / norm, axis[0] / norm, 0.0

@@ -25,7 +25,7 @@ cdef enum:
 
 # Tolerances of smallest and largest angles that are too wide to tell anything, rad.
 cdef double WORST_SMALLEST = 0.1, WORST_LARGEST = 0.2
-cdef double LEAST_SIDE = 1e-9
+cdef double MIN_SIDE = 1e-9
 
 ctypedef unsigned long long key_t
 
@@ -148,10 +148,10 @@ cdef class TriangleTable:
                 if out.side[j] < out.side[j + 1]:
                     out.side[j], out.side[j + 1] = out.side[j + 1], out.side[j]
                     out.star[j], out.star[j + 1] = out.star[j + 1], out.star[j]
-        x, y, z = out.side[0], max(out.side[1], LEAST_SIDE), max(out.side[2], LEAST_SIDE)
+        x, y, z = out.side[0], max(out.side[1], MIN_SIDE), max(out.side[2], MIN_SIDE)
         error = self.sigmas * max(s.error[a], max(s.error[b], s.error[c]))
         out.tolerance[0] = error * sqrt(1 / (y * y) + 1 / (z * z) + (x / (y * z)) ** 2)
-        x = max(x, LEAST_SIDE)
+        x = max(x, MIN_SIDE)
         out.tolerance[1] = error * sqrt(1 / (x * x) + 1 / (y * y) + (z / (x * y)) ** 2)
         out.tolerance[2] = self.scale_tolerance * x + error
         out.usable = out.tolerance[1] < WORST_SMALLEST and out.tolerance[0] < WORST_LARGEST
@@ -175,7 +175,7 @@ cdef class TriangleTable:
         least[0], least[1], least[2] = M_PI / 3, 0.0, 0.0
         for i in range(3):
             turn = _angle(s, shape.star[i], shape.star[(i + 1) % 3], shape.star[(i + 2) % 3], &angle[i])
-        middle[0], middle[1], middle[2] = angle[0], angle[2], max(shape.side[0], LEAST_SIDE)
+        middle[0], middle[1], middle[2] = angle[0], angle[2], max(shape.side[0], MIN_SIDE)
         for swap in range(3):
             if swap > 0 and not angle[swap - 1] - angle[swap] < 2 * shape.tolerance[0]:
                 continue

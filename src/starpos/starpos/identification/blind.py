@@ -19,7 +19,7 @@ from starpos.frames.stars import Window
 from starpos.identification._frame import FrameStars
 from starpos.identification.evidence import any_scale
 from starpos.identification.explained import ENOUGH_EXPLAINED, explained_by
-from starpos.identification.full import ENOUGH, FEWEST_STARS, Identification, identified
+from starpos.identification.full import ENOUGH, MIN_STARS, Identification, identified
 from starpos.identification.pose import Pose, stars_at
 from starpos.identification.quad_poses import Matches, QuadPoses, most_agreed
 from starpos.identification.quads import QuadCatalogue
@@ -38,7 +38,7 @@ STAGES = (10, 0.4), (15, 0.4), (21, 0.4), (12, 2.0)
 # A step of the focal length is at most this; and so small that it changes the shape of no quad by more than that.
 LARGEST_STEP, BENT = 0.1, 0.003
 # Poses judged in each stage: the ones with most votes.
-MOST_JUDGED = 40
+MAX_JUDGED = 40
 # Log-odds of an answer that ends the search though most bright detections are not its stars.
 SURE = 6 * ENOUGH
 
@@ -74,7 +74,7 @@ def identify_blind(
     Returns the camera, whose focal length `Identification.focal_scale` refines, and the identification; None without
     an identification beyond doubt.
     """
-    if len(xy) < FEWEST_STARS:
+    if len(xy) < MIN_STARS:
         return None
     half_diagonal_px = np.hypot(width, height) / 2
     told, shortest, longest = (
@@ -144,7 +144,7 @@ def _poses(
             return
         matches.append(Matches.of(field, quads, stars, error_px, focal_px, step))
     found = QuadPoses.of(field, sky, Matches.together(matches), error_px, focal_range)
-    for k in most_agreed(found.poses, half_diagonal_px, MOST_JUDGED):
+    for k in most_agreed(found.poses, half_diagonal_px, MAX_JUDGED):
         if budget.spent:
             return
         yield found.poses[k], found.radius_px(field, k, error_px)

@@ -18,7 +18,7 @@ from starpos.identification import wide
 from starpos.identification._frame import FrameStars
 from starpos.identification.blind import ROUGHLY
 from starpos.identification.evidence import any_scale
-from starpos.identification.full import FEWEST_STARS, Identification, identified
+from starpos.identification.full import MIN_STARS, Identification, identified
 from starpos.identification.outwards import outwards
 from starpos.identification.pose import Poses
 from starpos.identification.quad_poses import Matches, QuadPoses, most_agreed
@@ -42,10 +42,10 @@ STEP = 0.02
 # Frames are scaled to this radius of the picture (px); the error of stars (px) allows for the assumed lens.
 RADIUS_PX, ERROR_PX = 500.0, 0.6
 # The brightest stars of a part that make quads, in turn; and how many poses of each part are judged.
-STAGES, MOST_JUDGED = (12, 18), 60
-# Parts look at the middle, and in AROUND directions at OFF_RAD from it. LEAST_SEEN is the minimum share of a part
+STAGES, MAX_JUDGED = (12, 18), 60
+# Parts look at the middle, and in AROUND directions at OFF_RAD from it. MIN_SEEN is the minimum share of a part
 # that shows sky, counted on a grid of GRID x GRID points.
-OFF_RAD, AROUND, LEAST_SEEN, GRID = math.radians(40), 6, 0.6, 9
+OFF_RAD, AROUND, MIN_SEEN, GRID = math.radians(40), 6, 0.6, 9
 _TURNS = [
     np.eye(3),
     *(
@@ -54,11 +54,11 @@ _TURNS = [
     ),
 ]
 # Stars lie in a disc if chance would leave the corners empty as seldom as this, and these have such a share of the frame.
-LOG_CHANCE, LEAST_OUTSIDE = math.log(1e-3), 0.1
+LOG_CHANCE, MIN_OUTSIDE = math.log(1e-3), 0.1
 # The radius of a picture over the frame's shorter side is at least this.
-LEAST_RADIUS = 0.25
+MIN_RADIUS = 0.25
 # Stars outside the disc, over all: lettering, hot pixels.
-MOST_OUTSIDE = 0.03
+MAX_OUTSIDE = 0.03
 
 
 def disc_radius_px(xy: np.ndarray, width: int, height: int) -> float | None:
@@ -66,16 +66,16 @@ def disc_radius_px(xy: np.ndarray, width: int, height: int) -> float | None:
 
     It is the radius of the stars: the picture of a fisheye may reach farther.
     """
-    if len(xy) < FEWEST_STARS:
+    if len(xy) < MIN_STARS:
         return None
     away = np.sort(np.hypot(*(xy - np.array([width - 1, height - 1]) / 2).T))
-    outside = int(MOST_OUTSIDE * len(away))
+    outside = int(MAX_OUTSIDE * len(away))
     radius_px = float(away[-1 - outside])
     beyond = _share_beyond(radius_px, width, height)
     inside = len(away) - outside
     ways = math.lgamma(len(away) + 1) - math.lgamma(outside + 1) - math.lgamma(inside + 1)
-    by_chance = beyond > LEAST_OUTSIDE and ways + inside * math.log1p(-beyond) > LOG_CHANCE
-    round_enough = beyond > LEAST_OUTSIDE and radius_px > LEAST_RADIUS * min(width, height)
+    by_chance = beyond > MIN_OUTSIDE and ways + inside * math.log1p(-beyond) > LOG_CHANCE
+    round_enough = beyond > MIN_OUTSIDE and radius_px > MIN_RADIUS * min(width, height)
     return radius_px if round_enough and not by_chance else None
 
 
@@ -135,7 +135,7 @@ def identify_fisheye(
 
     Returns a camera that is near the true one, and the identification; None without one beyond doubt.
     """
-    if len(xy) < FEWEST_STARS:
+    if len(xy) < MIN_STARS:
         return None
     disc_px = disc_radius_px(xy, width, height)
     radius_px = disc_px or math.hypot(width, height) / 2
@@ -194,7 +194,7 @@ def _guesses(
             if budget.spent:
                 return
             part, field = _part(picture, float(focal_px), lens, turn)
-            if field is None or len(field) < FEWEST_STARS:
+            if field is None or len(field) < MIN_STARS:
                 continue
             matches = Matches.of(field, quads, min(stars, len(field)), ERROR_PX, field.focal_px, STEP)
             scales = field.focal_px * (1 - STEP), field.focal_px * (1 + STEP)
@@ -212,7 +212,7 @@ def _part(
     pinhole = wide.pinhole_of(Camera.from_focal(width, height, focal_px / shrink, EQUIDISTANT))
     part = wide.part_at(replace(seen, sigma_px=seen.sigma_px / shrink), pinhole, turn)
     share = _share_seen(picture, seen.camera, pinhole, turn)
-    if share < LEAST_SEEN:
+    if share < MIN_SEEN:
         return part, None
     return part, part.field.but(area_px2=share * part.field.area_px2)
 
@@ -239,6 +239,6 @@ def _most_agreed(guesses: Sequence[_Guess]) -> Iterator[tuple[_Guess, int]]:
     )
     first = np.cumsum([0, *(len(g.found.poses) for g in guesses)])
     half_diagonal_px = float(np.hypot(*guesses[0].field.half))
-    for k in most_agreed(poses, half_diagonal_px, MOST_JUDGED):
+    for k in most_agreed(poses, half_diagonal_px, MAX_JUDGED):
         owner = int(np.searchsorted(first, k, side="right")) - 1
         yield guesses[owner], k - int(first[owner])

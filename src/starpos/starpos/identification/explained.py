@@ -9,7 +9,7 @@ from starpos.identification.full import Identification
 from starpos.identification.pose import TEST_STARS
 
 # Minimum number of catalogue stars looked for, if the frame has as many.
-LEAST_DUE = 8
+MIN_DUE = 8
 # An identification explains a frame if it explains this share of its bright detections, or if this share of the bright
 # stars that should be there are: then the other detections are false stars.
 ENOUGH_EXPLAINED, ENOUGH_SEEN = 0.5, 0.6
@@ -42,5 +42,5 @@ def explained_by(found: Identification, field: FrameStars) -> Explained:
     stars of the sky, nearly all are seen, however faint the frame goes; where they are chance, few are.
     """
     bright = min(len(field), TEST_STARS)
-    number, seen, due = found.explains(bright, LEAST_DUE)
+    number, seen, due = found.explains(bright, MIN_DUE)
     return Explained(number, bright, seen, due)

@@ -15,12 +15,12 @@ from starpos.identification.sky import Sky
 from starpos.normal import SIGMA_PER_MAD
 
 # Minimum number of stars of an identification.
-FEWEST_STARS = 4
+MIN_STARS = 4
 # Log-odds: one try identifies at most one of 1e9 frames without stars.
 ENOUGH = np.log(1e9)
 ROUNDS = 3
-# A star may be GATE_SIGMA of the spread from its place, plus GATE_PX; the spread is at least LEAST_SPREAD_PX.
-LEAST_SPREAD_PX, GATE_SIGMA, GATE_PX = 0.02, 4.0, 0.2
+# A star may be GATE_SIGMA of the spread from its place, plus GATE_PX; the spread is at least MIN_SPREAD_PX.
+MIN_SPREAD_PX, GATE_SIGMA, GATE_PX = 0.02, 4.0, 0.2
 # Number of the brightest detections that take part.
 FAINTEST_FIT = 2000
 # Errors of catalogue and lens, which a centroid's own error does not include.
@@ -37,12 +37,12 @@ EDGE_PX, INSIDE_PX = 2.0, 5.0
 
 RULES = Rules(
     rounds=ROUNDS,
-    fewest_stars=FEWEST_STARS,
+    fewest_stars=MIN_STARS,
     steps=STEPS,
     small_step=SMALL_STEP,
     floor_px=FLOOR_PX,
     sigma_per_mad=SIGMA_PER_MAD,
-    least_spread_px=LEAST_SPREAD_PX,
+    least_spread_px=MIN_SPREAD_PX,
     gate_sigma=GATE_SIGMA,
     gate_px=GATE_PX,
     edge_px=EDGE_PX,

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from starpos import rotation
-from starpos.identification.full import FAINTEST_FIT, FEWEST_STARS, GATE_SIGMA, Identification, OnFrame
+from starpos.identification.full import FAINTEST_FIT, GATE_SIGMA, MIN_STARS, Identification, OnFrame
 from starpos.identification.pairs import mutual_nearest
 from starpos.identification.sky import Sky
 from starpos.identification.wide import FAR_PX, FLIP, LensPose, Part, WideField, error_px, spread_px, stars_on
@@ -24,7 +24,7 @@ TERMS, STEP, STEPS = 8, 1e-6, 3
 # Radius about the part's middle in which stars are matched first, its growth in each round, number of final rounds.
 FIRST_RAD, NEXT_RAD, LAST_ROUNDS = math.radians(32), math.radians(15), 2
 # Maximum distance of a star from its predicted place (focal lengths), in addition to the residuals' spread.
-GATE_RAD, LEAST_SPREAD_PX = 0.004, 0.2
+GATE_RAD, MIN_SPREAD_PX = 0.004, 0.2
 # Stars beyond the part bear it out if chance makes as many pairs as seldom as this (logarithm).
 LOG_CHANCE = math.log(1e-6)
 
@@ -57,13 +57,13 @@ def outwards(field: WideField, sky: Sky, part: Part, found: Identification) -> O
     for k in range(rounds):
         error = np.hypot(sigma[star], error_px(xy[star] - pose.project(w)))
         pose = _fitted(pose, field.camera, xy[star], w, error)
-        spread = max(spread_px(xy[star] - pose.project(w)), LEAST_SPREAD_PX)
+        spread = max(spread_px(xy[star] - pose.project(w)), MIN_SPREAD_PX)
         gate = GATE_SIGMA * np.hypot(spread, sigma) + GATE_RAD * pose.camera.fx
         near = stars_on(pose, sky, len(xy))
         reach = math.cos(min(FIRST_RAD + k * NEXT_RAD, math.pi))
         near = _within(near, near.directions @ pose.attitude.T @ middle > reach)
         pair = np.stack(mutual_nearest(xy, pose.project(near.directions), gate))
-        if pair.shape[1] < FEWEST_STARS:
+        if pair.shape[1] < MIN_STARS:
             return None
         star, w = pair[0], near.directions[pair[1]]
         if inner is None:

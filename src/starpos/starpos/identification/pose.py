@@ -15,7 +15,7 @@ STEPS, SMALL_STEP = 2, 3e-5
 # Number of a frame's brightest stars that decide, normally and if most of the brightest may be false.
 TEST_STARS, CROWD_STARS = 50, 200
 # No centroid is better than this.
-LEAST_SIGMA_PX = 1e-3
+MIN_SIGMA_PX = 1e-3
 # Maximum distance of a star from its predicted place, in sigma.
 MATCH_SIGMA = 3.5
 
@@ -31,7 +31,7 @@ def stars_at(camera: Camera, xy: np.ndarray, sigma: np.ndarray) -> FrameStars:
     flipped = np.stack([xy[:, 0], camera.height - 1 - xy[:, 1]], -1)
     return FrameStars(
         xy=np.stack([xy, flipped]) - principal,
-        sigma=np.maximum(sigma, LEAST_SIGMA_PX),
+        sigma=np.maximum(sigma, MIN_SIGMA_PX),
         middle=np.array(camera.centre_px) - principal,
         half=np.array([camera.width, camera.height]) / 2,
         focal_px=camera.fx,

@@ -41,7 +41,7 @@ def cached(catalogue: Catalogue, progress: Progress = quiet) -> QuadCatalogue:
 
 
 def _digest(catalogue: Catalogue) -> str:
-    settings = repr((catalogue.fingerprint, quads.LEVELS, quads.SPACING, quads.STARS_PER_CIRCLE, quads.LEAST_SIDE,
+    settings = repr((catalogue.fingerprint, quads.LEVELS, quads.SPACING, quads.STARS_PER_CIRCLE, quads.MIN_SIDE,
                      quads.SHORTEST, quads.BINS, quads.SIZE_BINS, quads.SIZES_RAD))  # fmt: skip
     return hashlib.sha256(settings.encode()).hexdigest()[:16]
 

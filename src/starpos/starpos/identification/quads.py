@@ -27,12 +27,12 @@ LEVELS = (
 )  # fmt: skip
 SPACING, STARS_PER_CIRCLE = 0.7, 20
 # The longest side over the circle's radius is at least this, the shortest over the longest one this.
-LEAST_SIDE, SHORTEST = 0.6, 0.08
+MIN_SIDE, SHORTEST = 0.6, 0.08
 # Shapes are kept to 1/65535; these are the bins of four of their sides, and of the logarithm of the longest.
 CODES, BINS, SIZE_BINS = 65535, 12, 56
 SIZES_RAD = np.log(0.004), np.log(1.2)
 # Maximum number of similar pairs of quads for one focal length: more come from close stars and add no information.
-MOST_ALIKE = 2000
+MAX_ALIKE = 2000
 # Which pairs of a quad's stars its sides are: AB is the longest.
 SIDES = np.array(list(combinations(range(4), 2)))
 
@@ -57,7 +57,7 @@ class QuadCatalogue:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Quads within tolerance (N,) of shapes (N, 5) and within log_tolerance of their sizes (N,), as logarithms.
 
-        Returns arrays of query (M,) and quad (M,), M at most MOST_ALIKE.
+        Returns arrays of query (M,) and quad (M,), M at most MAX_ALIKE.
         """
         query, quad = near(
             self.bin_start,
@@ -71,7 +71,7 @@ class QuadCatalogue:
             BINS,
             SIZE_BINS,
             *SIZES_RAD,
-            MOST_ALIKE,
+            MAX_ALIKE,
         )
         return query, quad
 
@@ -110,7 +110,7 @@ def build(catalogue: Catalogue, progress: Progress = quiet) -> QuadCatalogue:
         radius = np.radians(degrees)
         pool = by_light[: int(STARS_PER_CIRCLE * 4 / radius**2)]
         v = catalogue.directions(pool)
-        alone = well_apart(v, SHORTEST * LEAST_SIDE * radius)
+        alone = well_apart(v, SHORTEST * MIN_SIDE * radius)
         pool, v = pool[alone], v[alone]
         parts.append(_quads(cKDTree(v), v, pool, radius, most))
         progress("star quads", (k + 1) / (len(LEVELS) + 1))
@@ -140,7 +140,7 @@ def _quads(
     corners, shape, log_size = [], [], []
     for block in np.array_split(rows, len(rows) // 200_000 + 1):
         order, ratio, size = shapes(v[block])
-        good = (size > LEAST_SIDE * radius) & (ratio.min(1) > SHORTEST)
+        good = (size > MIN_SIDE * radius) & (ratio.min(1) > SHORTEST)
         corners.append(pool[np.take_along_axis(block, order, 1)[good]].astype(np.int32))
         shape.append(ratio[good].astype(np.float32))
         log_size.append(np.log(size[good]).astype(np.float32))

@@ -14,8 +14,8 @@ from starpos.identification import wide
 from starpos.identification._frame import FrameStars, projected
 from starpos.identification._search import Finder, Limits
 from starpos.identification.evidence import CHANCES, anywhere
-from starpos.identification.full import ENOUGH, FEWEST_STARS, RULES, Identification, identified
-from starpos.identification.pose import CROWD_STARS, LEAST_SIGMA_PX, MATCH_SIGMA, TEST_STARS, stars_at
+from starpos.identification.full import ENOUGH, MIN_STARS, RULES, Identification, identified
+from starpos.identification.pose import CROWD_STARS, MATCH_SIGMA, MIN_SIGMA_PX, TEST_STARS, stars_at
 from starpos.identification.prior import PlumbPrior, PointingPrior
 from starpos.identification.sky import Sky
 from starpos.identification.triangles import TriangleCatalogue
@@ -32,7 +32,7 @@ EDGE_PX, WIDEST_MARGIN = 2.0, 0.25
 CROWD_STAGES = (60, 0.3), (140, 0.1)
 # Cells along each side of a frame, of each of which the brightest star is taken if this leaves less than that share of
 # the brightest: else these are spread evenly already. Half of the cells decide. Such a second try needs more evidence.
-CELLS, MOST_EVEN, SECOND_TRY = 10, 0.65, math.log(10)
+CELLS, MAX_EVEN, SECOND_TRY = 10, 0.65, math.log(10)
 LIMITS = Limits(
     first_stars=(4, 5, 7),
     match_sigma=MATCH_SIGMA,
@@ -119,7 +119,7 @@ def frame_stars(directions: np.ndarray, sigma_px: np.ndarray, camera: Camera) ->
     squeeze = camera.fx / camera.fy
     width, height = camera.width, max(1, round(camera.height * squeeze))
     cx, cy = camera.cx, camera.cy * squeeze
-    xy, sigma, beyond = projected(directions, sigma_px, camera.fx, cx, cy, width, height, LEAST_SIGMA_PX)
+    xy, sigma, beyond = projected(directions, sigma_px, camera.fx, cx, cy, width, height, MIN_SIGMA_PX)
     # without distortion, stars that a lens has drawn in may lie beyond the frame: it gets a margin
     margin = math.ceil(min(beyond - EDGE_PX, WIDEST_MARGIN * max(width, height))) if beyond > EDGE_PX else 0
     return FrameStars(
@@ -146,7 +146,7 @@ def identifications(
     field: FrameStars, sky: Sky, priors: Priors, enough: float = ENOUGH
 ) -> Iterator[Identification]:
     """All of `near_or_lost`, then what `_crowded_or_uneven` yields."""
-    if len(field) < FEWEST_STARS:
+    if len(field) < MIN_STARS:
         return iter(())
     return chain(
         near_or_lost(field, sky, priors, STAGES, enough), _crowded_or_uneven(field, sky, priors, enough)
@@ -185,8 +185,8 @@ def _crowded(
 def second_try(field: FrameStars) -> np.ndarray | None:
     """Rows of the stars that are tried where the brightest crowd in few cells; None where they are spread already."""
     rows = evenly_spread(field)
-    uneven = np.count_nonzero(rows < TEST_STARS) < MOST_EVEN * min(len(field), TEST_STARS)
-    return rows if uneven and len(rows) >= FEWEST_STARS else None
+    uneven = np.count_nonzero(rows < TEST_STARS) < MAX_EVEN * min(len(field), TEST_STARS)
+    return rows if uneven and len(rows) >= MIN_STARS else None
 
 
 def evenly_spread(field: FrameStars) -> np.ndarray:

@@ -24,7 +24,7 @@ Look = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 # stops, exceeds y in 1 of y frames; so its product with what a look finds exceeds x in (1 + log(x / worth)) / x of them:
 # once in 1e10 frames. So all tries together fail at most 1.2 times in 1e9.
 WORTH, ENOUGH = 5.0, 26.2
-MOST_LOOKS = 20
+MAX_LOOKS = 20
 # Places nearer to a detection add no information; places nearer to a brighter catalogue star show that star's light.
 DETECTED_PX, NEAR_PX = 8.0, 6.0
 # Brightness of stars over the prediction from identified ones (common to all), probability that a star is missing, and
@@ -48,7 +48,7 @@ def second_look(
         log_odds = found.log_odds + _log_ratio(field, sky, camera, found, look)
         if log_odds >= ENOUGH:
             return found.but(log_odds=log_odds)
-        if len(seen) == MOST_LOOKS:
+        if len(seen) == MAX_LOOKS:
             break
     return None
 

@@ -16,7 +16,7 @@ from starpos.table_cache import cache_folder, load_or_build, mapped
 
 # Cache folders; the number is the format version. Up to 10, tables of over 2 million stars may be wrong.
 PREFIX = "triangles-11-"
-MOST_IN_USE = 4
+MAX_IN_USE = 4
 
 
 def cached(catalogue: Catalogue, half_diagonal_rad: float, progress: Progress = quiet) -> TriangleCatalogue:
@@ -28,7 +28,7 @@ def cached(catalogue: Catalogue, half_diagonal_rad: float, progress: Progress = 
     with _lock:
         key = (catalogue.fingerprint, half_diagonal)
         if key not in _in_use:
-            while len(_in_use) >= MOST_IN_USE:
+            while len(_in_use) >= MAX_IN_USE:
                 _in_use.pop(next(iter(_in_use)))
             _in_use[key] = _load_or_build(catalogue, half_diagonal, progress)
         return _in_use[key]

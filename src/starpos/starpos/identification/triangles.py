@@ -36,10 +36,10 @@ BEACONS = 0.25
 # Circles over the whole sky: (radius over the field's half diagonal, spacing over radius, brightest stars taken). The
 # first fits into a field of 3:2 or 4:3, the last contains the whole field.
 CIRCLES = ((0.6, 0.7, 7), (0.8, 0.7, 8), (1.0, 0.7, 9))
-# Limits, counted before duplicates of overlapping circles are removed. Beyond MAX_TRIANGLES there are no larger circles.
-# Beyond MOST_TRIANGLES fewer stars are taken of the smallest circles, down to FEWEST_TAKEN, and one less beyond twice as
-# many triangles: the table of a field of 0.3 deg has 600 MB.
-MAX_TRIANGLES, MOST_TRIANGLES, FEWEST_TAKEN = 9_000_000, 16_000_000, 5
+# Limits, counted before duplicates of overlapping circles are removed. Beyond ENOUGH_TRIANGLES there are no larger
+# circles. Beyond MAX_TRIANGLES fewer stars are taken of the smallest circles, down to MIN_TAKEN, and one less beyond
+# twice as many triangles: the table of a field of 0.3 deg has 600 MB.
+ENOUGH_TRIANGLES, MAX_TRIANGLES, MIN_TAKEN = 9_000_000, 16_000_000, 5
 
 
 def sides(v1: np.ndarray, v2: np.ndarray) -> np.ndarray:
@@ -184,14 +184,14 @@ def build(catalogue: Catalogue, half_diagonal: float, progress: Progress = quiet
 def affordable(half_diagonal: float) -> list[tuple[float, float, int]]:
     """CIRCLES that a field can afford; a small one without the larger ones, whose triangles seldom fit on a frame."""
     taken = list(CIRCLES)
-    while len(taken) > 1 and _made(taken, half_diagonal) > MAX_TRIANGLES:
+    while len(taken) > 1 and _made(taken, half_diagonal) > ENOUGH_TRIANGLES:
         taken.pop()
     radius, spacing, most = taken[0]
-    while _made(taken, half_diagonal) > MOST_TRIANGLES and most > FEWEST_TAKEN:
+    while _made(taken, half_diagonal) > MAX_TRIANGLES and most > MIN_TAKEN:
         most -= 1
         taken[0] = radius, spacing, most
-    if _made(taken, half_diagonal) > 2 * MOST_TRIANGLES:
-        taken[0] = radius, spacing, FEWEST_TAKEN - 1
+    if _made(taken, half_diagonal) > 2 * MAX_TRIANGLES:
+        taken[0] = radius, spacing, MIN_TAKEN - 1
     return taken
 
 

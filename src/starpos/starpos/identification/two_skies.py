@@ -25,11 +25,11 @@ from starpos.identification.search import STAGES, near_or_lost
 from starpos.identification.sky import Sky
 
 # Minimum number and share of the TEST_STARS brightest that a second sky leaves unidentified.
-LEAST_LEFT, LEAST_SHARE_LEFT = 4, 0.12
+MIN_LEFT, MIN_SHARE_LEFT = 4, 0.12
 # Number of the brightest stars searched for twins, and of the leftover ones searched for another pose.
-MOST_STARS = 2 * TEST_STARS
+MAX_STARS = 2 * TEST_STARS
 # Maximum ratio of the two skies' exposures, in magnitudes (2.5 mag: 1 to 10).
-MOST_FAINTER_MAG = 2.5
+MAX_FAINTER_MAG = 2.5
 # Maximum deviation of a star's magnitude offset between the two skies.
 SAME_MAG = 1.0
 # Offsets of twins agree to one of these: the widest is for a camera that was turned too, or a lens that bends.
@@ -41,24 +41,24 @@ NEAREST_PX, NEAREST, FARTHEST = 4.0, 2.0, 0.25
 AROUND = 4
 # Minimum share of twins among the bright stars, minimum spread of twins as a share of the frame in every direction, and
 # maximum share of twins on both sides, which a row or a lattice of lights has.
-LEAST_SHARE, LEAST_SPREAD, MOST_IN_ROWS = 0.25, 0.05, 0.25
+MIN_SHARE, MIN_SPREAD, MAX_IN_ROWS = 0.25, 0.05, 0.25
 # Minimum number of twins with one identified and one unidentified star.
-LEAST_LINKED = 3
+MIN_LINKED = 3
 # Stages of the search for another pose; the poor ones are for lenses that the first identification has dealt with.
 QUICK_STAGES = STAGES[:2]
 # Maximum difference of the other pose's focal length (share); maximum residuals over the first pose's (factor, px).
 SAME_FOCAL, WORSE, WORSE_PX = 0.01, 2.0, 0.5
 # Minimum share of equally bright leftovers that the second sky must explain.
-LEAST_SHARE_SECOND = 0.5
+MIN_SHARE_SECOND = 0.5
 # From a star of the first sky to its neighbour, what a lens bends changes by at most this share of their distance.
 STEEPEST_BEND = 0.2
 # Minimum difference of neighbours' residuals between two skies: in px; in their errors, times the first number plus the
 # second over the square root of the number of stars; and as a share of the difference of distant stars.
 MIXED_PX, MIXED, MIXED_BY_CHANCE, MIXED_EVERYWHERE = 1.2, 1.4, 2.0, 0.3
 # With a smaller mean square of all residuals no two skies are mixed.
-LEAST_MIXED_PX2 = MIXED_PX**2 * MIXED_EVERYWHERE
+MIN_MIXED_PX2 = MIXED_PX**2 * MIXED_EVERYWHERE
 # Minimum error of centroids (px), for errors that are not stated.
-LEAST_ERROR_PX = 0.1
+MIN_ERROR_PX = 0.1
 # From this number of stars on, only this share of them, the best-fitting ones, is compared.
 FEW_WRONG, ROBUST = 32, 0.9
 # Minimum number of stars, and number of terms of the polynomial of the lens's distortion.
@@ -73,10 +73,10 @@ def two_skies(
     flux (N,): of the field's stars, in any unit, brightest first.
     explained: how much of the field it explains.
     """
-    if found.mean_square_px2 >= LEAST_MIXED_PX2 and _between_two(field, sky, found):
+    if found.mean_square_px2 >= MIN_MIXED_PX2 and _between_two(field, sky, found):
         return True
     bright = explained.bright
-    if bright - explained.explained < max(LEAST_LEFT, LEAST_SHARE_LEFT * bright):
+    if bright - explained.explained < max(MIN_LEFT, MIN_SHARE_LEFT * bright):
         return False
     left = np.ones(len(flux), bool)
     left[found.star] = False
@@ -89,7 +89,7 @@ def two_skies(
 def _between_two(field: FrameStars, sky: Sky, found: Identification) -> bool:
     """Whether the residuals of neighbouring stars differ by more than one sky can explain."""
     stars = len(found.star)
-    xy, error2 = field.xy[int(found.mirrored)][found.star], field.sigma[found.star] ** 2 + LEAST_ERROR_PX**2
+    xy, error2 = field.xy[int(found.mirrored)][found.star], field.sigma[found.star] ** 2 + MIN_ERROR_PX**2
     residual = xy - _pose(field, found).project(sky.directions(found.catalogue))
     u, v = ((xy - field.middle) / field.half.max()).T
     powers = np.stack([u**0, u, v, u * u, u * v, v * v, u**3, u * u * v, u * v * v, v**3], 1)
@@ -121,11 +121,11 @@ def _every_star_twice(xy: np.ndarray, mag: np.ndarray, left: np.ndarray, size: n
 
     left (N,): which of them are not identified.
     """
-    xy, mag, left = xy[:MOST_STARS], mag[:MOST_STARS], left[:MOST_STARS]
+    xy, mag, left = xy[:MAX_STARS], mag[:MAX_STARS], left[:MAX_STARS]
     one, other = np.triu_indices(len(xy), 1)
     farthest = FARTHEST * size.max() + AROUND * max(OFFSETS_PX)
     offset = xy[other] - xy[one]
-    near = (mag[other] - mag[one] < MOST_FAINTER_MAG + SAME_MAG) & (np.square(offset).sum(1) < farthest**2)
+    near = (mag[other] - mag[one] < MAX_FAINTER_MAG + SAME_MAG) & (np.square(offset).sum(1) < farthest**2)
     one, other, offset = one[near], other[near], offset[near]
     # from left to right
     swap = offset[:, 0] < 0
@@ -159,7 +159,7 @@ def _most_alike(
     twin = np.flatnonzero(away2 < within_px**2)
     share = np.median(fainter[twin])
     twin = twin[np.abs(fainter[twin] - share) < SAME_MAG]
-    if abs(share) > MOST_FAINTER_MAG or len(twin) < 2:
+    if abs(share) > MAX_FAINTER_MAG or len(twin) < 2:
         return none, 0.0
     # each pair counts in both directions
     nearest2 = np.minimum(away2, np.square(offset + centre).sum(1))
@@ -175,10 +175,10 @@ def _are_a_sky(
     """Whether twins, the rows `one` and `other` (K,) of xy (N, 2), are many, spread out, and partly identified."""
     linked, known = np.sum(left[one] != left[other]), np.sum(~left[one] & ~left[other])
     return bool(
-        2 * len(one) >= LEAST_SHARE * len(xy)
-        and len(np.intersect1d(one, other)) <= MOST_IN_ROWS * len(one)
-        and linked >= max(LEAST_LINKED, known)
-        and np.linalg.eigvalsh(np.cov(xy[one].T))[0] > (LEAST_SPREAD * size.min()) ** 2
+        2 * len(one) >= MIN_SHARE * len(xy)
+        and len(np.intersect1d(one, other)) <= MAX_IN_ROWS * len(one)
+        and linked >= max(MIN_LINKED, known)
+        and np.linalg.eigvalsh(np.cov(xy[one].T))[0] > (MIN_SPREAD * size.min()) ** 2
     )
 
 
@@ -186,8 +186,8 @@ def _another_pose(
     field: FrameStars, mag: np.ndarray, left: np.ndarray, sky: Sky, found: Identification
 ) -> bool:
     """Whether the stars of the field that are left over (N,) fit another pose of the same camera."""
-    row, first = np.flatnonzero(left)[:MOST_STARS], _pose(field, found)
-    while len(row) >= LEAST_LEFT:
+    row, first = np.flatnonzero(left)[:MAX_STARS], _pose(field, found)
+    while len(row) >= MIN_LEFT:
         rest = field.take(row).but(focal_px=first.focal_px)
         second = _same_camera(rest, sky, first, WORSE * found.residual_px + WORSE_PX)
         if second is None:
@@ -196,7 +196,7 @@ def _another_pose(
         if new.all():
             # a pose that is slightly wrong still puts companions near catalogue stars
             bright = int(np.median(second.star)) + 1
-            return bool(np.sum(second.star < bright) >= LEAST_SHARE_SECOND * bright)
+            return bool(np.sum(second.star < bright) >= MIN_SHARE_SECOND * bright)
         # the evidence must do without the others
         row = np.delete(row, second.star[~new])
     return False
@@ -230,7 +230,7 @@ def _new(
     has its neighbours in place.
     """
     share = _zero(mag[row], sky, second) - _zero(mag[found.star], sky, found)
-    if abs(share) > MOST_FAINTER_MAG:
+    if abs(share) > MAX_FAINTER_MAG:
         return np.zeros(len(row), bool)
     first, xy = _pose(field, found), field.xy[int(found.mirrored)]
     away = np.linalg.norm(xy[row][:, None] - xy[found.star], axis=2).min(1)

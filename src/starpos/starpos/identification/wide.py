@@ -19,12 +19,12 @@ from starpos.identification.full import (
     EDGE_PX,
     ENOUGH,
     FAINTEST_FIT,
-    FEWEST_STARS,
     FLOOR_PX,
     GATE_PX,
     GATE_SIGMA,
     INSIDE_PX,
-    LEAST_SPREAD_PX,
+    MIN_SPREAD_PX,
+    MIN_STARS,
     Identification,
     OnFrame,
 )
@@ -248,7 +248,7 @@ def everywhere(field: WideField, sky: Sky, part: Part, found: Identification) ->
             gate[beyond] = 0.0
         predicted = pose.project(there.directions)
         pair = mutual_nearest(xy, predicted, gate)
-        if len(pair[0]) < FEWEST_STARS:
+        if len(pair[0]) < MIN_STARS:
             return None
         same = np.array_equal(pair[0], star) and np.array_equal(there.index[pair[1]], index)
         star, index, w = pair[0], there.index[pair[1]], there.directions[pair[1]]
@@ -265,7 +265,7 @@ def error_px(residual: np.ndarray) -> float:
 
 def _gate_px(residual: np.ndarray, sigma: np.ndarray) -> np.ndarray:
     """Maximum distance (N,) px of a star from its place, from the residuals (M, 2) of the stars matched so far."""
-    return GATE_SIGMA * np.hypot(max(spread_px(residual), LEAST_SPREAD_PX), sigma) + GATE_PX
+    return GATE_SIGMA * np.hypot(max(spread_px(residual), MIN_SPREAD_PX), sigma) + GATE_PX
 
 
 def spread_px(residual: np.ndarray) -> float:

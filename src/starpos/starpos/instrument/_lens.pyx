@@ -13,7 +13,7 @@ cdef enum:
 
 # Where they have converged, in focal lengths and rad, and what is good enough of the first; sine of an angle off the axis
 # that is as good as none.
-cdef double SETTLED = 1e-14, GOOD = 1e-12, SETTLED_RAD = 1e-15, LEAST_OFF = 1e-12
+cdef double SETTLED = 1e-14, GOOD = 1e-12, SETTLED_RAD = 1e-15, MIN_OFF = 1e-12
 
 
 cdef class Lens:
@@ -190,14 +190,14 @@ cdef class Equidistant(Lens):
         place[0], place[1] = v[0] * stretch, v[1] * stretch
 
     cdef void seen_slopes(self, const double *v, double *slope) noexcept nogil:
-        cdef double off = fmax(hypot(v[0], v[1]), LEAST_OFF), theta = atan2(off, v[2])
+        cdef double off = fmax(hypot(v[0], v[1]), MIN_OFF), theta = atan2(off, v[2])
         cdef double length2 = v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
         cdef double grows = self.stretched(theta) / length2, stretch = self.distance(theta) / off
         cdef double[2] outward
         cdef int i, j
         # on the axis any azimuth will do
-        outward[0] = v[0] / off if off > LEAST_OFF else 1.0
-        outward[1] = v[1] / off if off > LEAST_OFF else 0.0
+        outward[0] = v[0] / off if off > MIN_OFF else 1.0
+        outward[1] = v[1] / off if off > MIN_OFF else 0.0
         if not theta < self.reach:
             grows = NAN
         # away from the axis the angle grows, around it the direction of the place turns

@@ -18,7 +18,7 @@ STANDARD_SIZES = {(320, 240), (640, 480), (800, 600), (1024, 768), (1280, 720), 
                   (1920, 1080)}  # fmt: skip
 # 1 sigma of the axis from a frame's centre if the frame's part of the sensor is unknown: its longer side, and at least
 # this, as most sensors have up to 7000 px
-LEAST_UNKNOWN_PX = 2000.0
+MIN_UNKNOWN_PX = 2000.0
 SIZE_IN_FILE = "camera: {focal_mm, pixel_um, width, height} in the instrument file"
 
 
@@ -89,7 +89,7 @@ def framed(instrument: Instrument, first: Framed) -> tuple[Instrument, AxisDoubt
         )
     else:
         why = f"these frames of {width} x {height} px are cut out of larger ones at an unstated position"
-    error_px = max(longer, LEAST_UNKNOWN_PX)
+    error_px = max(longer, MIN_UNKNOWN_PX)
     return instrument, AxisDoubt(why, error_px, math.atan(error_px / instrument.focal_px))
 
 

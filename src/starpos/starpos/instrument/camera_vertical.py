@@ -14,7 +14,7 @@ from starpos.instrument.inclinometer import EXACT, InclinometerErrors, Tilt
 from starpos.units import ARCSEC
 
 # default sag: a camera on a pillar or a heavy tripod during a night
-SAG_ARCSEC_PER_SQRT_HOUR, MOST_SAG_ARCSEC = 10.0, 3600.0
+SAG_ARCSEC_PER_SQRT_HOUR, MAX_SAG_ARCSEC = 10.0, 3600.0
 # noise of the fictitious reading, rad: negligible
 NO_NOISE = 1e-9
 

@@ -23,13 +23,13 @@ SCA100T_NOISE_RAD = np.radians(0.0035)
 
 
 # The squared sines of three orthogonal axes add up to 1. Scale and cross-axis errors of any sensor change this by less
-# than SQUARE, unstated errors (zeros, 0.3 deg of a pose, 3 % of scale) by less than LEAST_SQUARE.
-SQUARE, LEAST_SQUARE = 0.1, 0.06
+# than SQUARE, unstated errors (zeros, 0.3 deg of a pose, 3 % of scale) by less than MIN_SQUARE.
+SQUARE, MIN_SQUARE = 0.1, 0.06
 SQUARE_SIGMA = 5.0
 # deviation that the stated errors explain, in sigma
 EXPLAINED_SIGMA = 3.0
 # Maximum temperature at which an inclinometer measures
-MOST_CELSIUS = 300.0
+MAX_CELSIUS = 300.0
 # sine above which X' counts as vertical: then L's X is taken below Y' instead
 STEEP = 0.999
 
@@ -163,7 +163,7 @@ class InclinometerErrors:
         if tilt.axes == 2:
             return
         off, sigma = self._off_square(tilt)
-        most = min(SQUARE, LEAST_SQUARE + SQUARE_SIGMA * sigma)
+        most = min(SQUARE, MIN_SQUARE + SQUARE_SIGMA * sigma)
         if abs(off) > most:
             angles = ", ".join(f"{angle:.3f}" for angle in np.degrees(tilt.theta))
             raise TiltError(

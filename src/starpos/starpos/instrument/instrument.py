@@ -26,11 +26,11 @@ TOP_OF_FRAME = ((0.0, 1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.0, 1.0))
 # 1 sigma about S's axes of an A3 without a stated error: 10 deg, and any turn about the plumb line
 UNKNOWN_ARCSEC = (36000.0, 36000.0, 324000.0)
 # Limits of a calibration: an error of several turns means unknown; no inclinometer is hotter.
-MOST_ARCSEC, MOST_C = 1e7, 200.0
-MOST_CLOCK_S = 86400.0
+MAX_ARCSEC, MAX_C = 1e7, 200.0
+MAX_CLOCK_S = 86400.0
 # 1 sigma of a clock without a stated error, if it is kept by NTP
 UNKNOWN_CLOCK_S = 0.1
-MOST_RESPONSE = 0.5
+MAX_RESPONSE = 0.5
 
 # every frame asks for its camera
 _ideal = lru_cache(maxsize=4)(Camera.from_focal)
@@ -87,21 +87,21 @@ class Calibration:
                 "tilt_deg of the calibration is impossible: give the elevations of the inclinometer's axes, "
                 "in deg"
             )
-        if not (np.isnan(self.temperature_c) or abs(self.temperature_c) < MOST_C):
+        if not (np.isnan(self.temperature_c) or abs(self.temperature_c) < MAX_C):
             raise InstrumentError(f"temperature_c of the calibration is {self.temperature_c:g}: give deg C")
         covariance = np.asarray(self.covariance_arcsec2, float)
-        if np.abs(covariance).max() > MOST_ARCSEC**2:
+        if np.abs(covariance).max() > MAX_ARCSEC**2:
             raise InstrumentError(
-                f"the calibration's covariance is beyond any turn: give variances of at most {MOST_ARCSEC**2:g} arcsec2"
+                f"the calibration's covariance is beyond any turn: give variances of at most {MAX_ARCSEC**2:g} arcsec2"
             )
         if covariance.shape != (3, 3) or not np.allclose(covariance, covariance.T, rtol=1e-6):
             raise InstrumentError("the calibration's covariance must be a symmetric 3 x 3 matrix, arcsec2")
         if np.linalg.eigvalsh(covariance)[0] < -1e-9 * max(np.trace(covariance), 1e-300):
             raise InstrumentError("the calibration's covariance has a negative variance: correct it")
         self._check_response()
-        if not 0 <= self.remounted_arcsec <= MOST_ARCSEC:
+        if not 0 <= self.remounted_arcsec <= MAX_ARCSEC:
             raise InstrumentError(
-                f"remounted_arcsec of the calibration is {self.remounted_arcsec:g}: give 0 to {MOST_ARCSEC:g}"
+                f"remounted_arcsec of the calibration is {self.remounted_arcsec:g}: give 0 to {MAX_ARCSEC:g}"
             )
         if not self.valid_days > 0:
             raise InstrumentError(f"valid_days is {self.valid_days}: must be positive")
@@ -133,10 +133,10 @@ class Calibration:
         sound = np.allclose(covariance, covariance.T) and np.linalg.eigvalsh(covariance)[
             0
         ] > -1e-9 * np.trace(covariance)
-        if max(abs(c) for c in self.response) > MOST_RESPONSE or not sound:
+        if max(abs(c) for c in self.response) > MAX_RESPONSE or not sound:
             raise InstrumentError(
                 f"the calibration's response is not valid: its coefficients must be at most "
-                f"{MOST_RESPONSE:g}, their covariance symmetric and without negative variances"
+                f"{MAX_RESPONSE:g}, their covariance symmetric and without negative variances"
             )
 
     @classmethod
@@ -153,10 +153,10 @@ class Calibration:
             if np.shape(numbers) != (3,):
                 raise InstrumentError(f"{name} is three numbers, one for each axis: give three")
         if not (
-            np.isfinite(stddev_arcsec).all() and 0 <= min(stddev_arcsec) <= max(stddev_arcsec) <= MOST_ARCSEC
+            np.isfinite(stddev_arcsec).all() and 0 <= min(stddev_arcsec) <= max(stddev_arcsec) <= MAX_ARCSEC
         ):
             raise InstrumentError(
-                f"calibration_stddev_arcsec must be finite numbers of 0 or more, at most {MOST_ARCSEC:g}"
+                f"calibration_stddev_arcsec must be finite numbers of 0 or more, at most {MAX_ARCSEC:g}"
             )
         covariance = np.diag(np.square(np.asarray(stddev_arcsec, float)))
         return cls(
@@ -257,13 +257,13 @@ class Instrument:
             raise InstrumentError(
                 f"focal length {self.focal_px:g} px: must be positive (focal_mm * 1000 / pixel_um)"
             )
-        if not 0 <= self.clock_stddev_s <= MOST_CLOCK_S:
+        if not 0 <= self.clock_stddev_s <= MAX_CLOCK_S:
             raise InstrumentError(
                 f"clock_stddev_s of the instrument is {self.clock_stddev_s:g}: it must be 0 or more, at most a day"
             )
-        if not 0 <= self.mount_stddev_arcsec <= MOST_ARCSEC:
+        if not 0 <= self.mount_stddev_arcsec <= MAX_ARCSEC:
             raise InstrumentError(
-                f"link_to_camera_stddev_arcsec is {self.mount_stddev_arcsec:g}: give 0 to {MOST_ARCSEC:g}"
+                f"link_to_camera_stddev_arcsec is {self.mount_stddev_arcsec:g}: give 0 to {MAX_ARCSEC:g}"
             )
         # with noise 0 every instrument would count as moving
         if self.inclinometer.noise_rad <= 0:
@@ -302,7 +302,8 @@ class Instrument:
             what = "focal length and A3 are" if self.camera is None else "the camera's intrinsics are"
             raise InstrumentError(
                 f"the frame is {width} x {height} px{where} but {what} of {whole.width} x {whole.height} px: "
-                "use those of this frame size, or frames whose header says which part they are (XORGSUBF, YORGSUBF)"
+                "use an instrument file of this frame size, or frames whose header states their part of the sensor "
+                "(XORGSUBF, YORGSUBF)"
             )
         return whole.part(left, top, width, height) if (width, height) != self.size else whole
 

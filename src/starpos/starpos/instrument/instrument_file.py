@@ -14,7 +14,7 @@ from starpos.frames.shutter import Shutter
 from starpos.instrument import camera_file, sensors, yaml_file
 from starpos.instrument.camera import Camera
 from starpos.instrument.camera_file import LARGEST_SIDE
-from starpos.instrument.camera_vertical import MOST_SAG_ARCSEC, CameraVertical, level_errors
+from starpos.instrument.camera_vertical import MAX_SAG_ARCSEC, CameraVertical, level_errors
 from starpos.instrument.inclinometer import InclinometerErrors
 from starpos.instrument.instrument import Calibration, Instrument, focal_px_of
 from starpos.instrument.lens import COEFFICIENTS, PLUMB_BOB
@@ -22,7 +22,7 @@ from starpos.units import ARCSEC
 from starpos.utc import unix_of, utc_text
 
 FORMAT = 1
-MOST_FRAMES = 1 << 31
+MAX_FRAMES = 1 << 31
 # placeholder of a focal length that a file for pointings does not state: it is not used
 POINTED_FOCAL_PX = 10_000.0
 # By key of the file: field of InclinometerErrors, and unit (rad or 1).
@@ -215,8 +215,8 @@ def _with_vertical(instrument: Instrument, about: object) -> Instrument:
     if math.isnan(instrument.calibration.utc_unix_s):
         raise InstrumentError("a vertical sags with time: say when it was found, calibrated: {utc: ...}")
     sag = _number(about, VERTICAL[2])
-    if not 0 <= sag <= MOST_SAG_ARCSEC:
-        raise InstrumentError(f"{VERTICAL[2]} is {sag:g}: give a number from 0 to {MOST_SAG_ARCSEC:g}")
+    if not 0 <= sag <= MAX_SAG_ARCSEC:
+        raise InstrumentError(f"{VERTICAL[2]} is {sag:g}: give a number from 0 to {MAX_SAG_ARCSEC:g}")
     vertical = CameraVertical(*(_matrix(about.get(key), key) for key in VERTICAL[:2]))
     return replace(instrument, vertical=vertical, inclinometer=level_errors(sag))
 
@@ -307,7 +307,7 @@ def _calibration(content: dict) -> Calibration:
                 "response_covariance has not as many rows and columns as response has numbers"
             )
     frames = about.get("frames", 0)
-    if isinstance(frames, bool) or not isinstance(frames, int) or not 0 <= frames < MOST_FRAMES:
+    if isinstance(frames, bool) or not isinstance(frames, int) or not 0 <= frames < MAX_FRAMES:
         raise InstrumentError(f"calibrated: frames is {_short(frames)}: give a whole number")
     return replace(calibration, utc_unix_s=utc, frames=frames, **more)
 

@@ -14,7 +14,7 @@ from starpos.instrument.inclinometer import EXACT, InclinometerErrors, Tilt, lev
 from starpos.instrument.response import COEFFICIENTS, Zeroed, angles_at, response_columns, stated_variances
 
 # lower bound of the cosine that turns an error of the sine into one of the angle
-LEAST_COSINE = 0.1
+MIN_COSINE = 0.1
 
 
 @at_once
@@ -101,7 +101,7 @@ class Mounting:
             # with three axes the consistent angles, as at the calibration: so nothing counts at its lean
             up, theta = tilt.up, angles_at(tilt.up, tilt.axes)
             variances = stated_variances(self.inclinometer, tilt.axes)
-            wrong = self.inclinometer.contradiction(tilt) / np.maximum(np.cos(theta), LEAST_COSINE)
+            wrong = self.inclinometer.contradiction(tilt) / np.maximum(np.cos(theta), MIN_COSINE)
             variances[: tilt.axes] += wrong**2
             response = response_columns(theta, tilt.up, zeroed) * np.sqrt(variances)
         a2 = level_of(up)

@@ -15,7 +15,7 @@ import numpy as np
 
 from starpos.errors import TiltError
 from starpos.files import open_regular
-from starpos.instrument.inclinometer import MOST_CELSIUS, SCA100T_NOISE_RAD, elevations
+from starpos.instrument.inclinometer import MAX_CELSIUS, SCA100T_NOISE_RAD, elevations
 from starpos.instrument.tilt_log import BRACKET_S, OUTLIER_SIGMA, TiltLog
 
 # A week at 10 Hz.
@@ -32,14 +32,14 @@ EMPTY = re.compile(r",[ \t]*(?=[,\r\n]|\Z)")
 # similarity from which an unknown column's name may be meant for a known one
 ALIKE_NAME = 0.7
 # largest sigma at which an angle still means anything
-MOST_SIGMA_DEG = 45.0
+MAX_SIGMA_DEG = 45.0
 # Readings alternate if, of three in a row, the outer two are closer than two neighbours in more than this share. White
 # noise has a share of a half, and exceeds it by this many sigma less than once in 10^7 tables.
 ALTERNATING, ALTERNATING_SIGMA = 0.75, 6.0
 # Readings that leap to another tilt and back within BRACKET_S: minimum size of a leap in sigma of noise and in steps of
 # the readings; minimum number of leaps, minimum share of one size, and minimum share of all readings. Beyond these they
 # are not outliers. Last: tolerance on one size.
-LEAP_SIGMA, LEAP_STEPS, FEWEST_LEAPS, ONE_SIZE, LEAPING, ALIKE_SIZE = 12.0, 3.0, 5, 0.8, 0.03, 0.1
+LEAP_SIGMA, LEAP_STEPS, MIN_LEAPS, ONE_SIZE, LEAPING, ALIKE_SIZE = 12.0, 3.0, 5, 0.8, 0.03, 0.1
 # a quarter of a Gaussian's deviations are below this many sigma
 QUARTER = 0.3186
 
@@ -48,7 +48,7 @@ def read_tilt_csv(path: Path | str, noise_rad: float = SCA100T_NOISE_RAD) -> Til
     """Read a TiltLog from a CSV, one reading of a sensor a line; TiltError if it cannot be one.
 
     Columns: utc_unix_s, theta_x_deg, theta_y_deg; theta_z_deg of a three-axis sensor; temperature_c, unknown (NaN) where
-    it is beyond MOST_CELSIUS; sigma_deg, 1 sigma of the white noise of that line's angles. Where no sigma is stated (no
+    it is beyond MAX_CELSIUS; sigma_deg, 1 sigma of the white noise of that line's angles. Where no sigma is stated (no
     column, an empty cell, or NaN) it is noise_rad. Other columns are ignored.
     """
     path = Path(path)
@@ -91,7 +91,7 @@ def read_tilt_csv(path: Path | str, noise_rad: float = SCA100T_NOISE_RAD) -> Til
         column["utc_unix_s"][order],
         theta[0],
         theta[1],
-        np.where(np.abs(celsius) <= MOST_CELSIUS, celsius, np.nan),
+        np.where(np.abs(celsius) <= MAX_CELSIUS, celsius, np.nan),
         np.where(np.isnan(sigma), noise_rad, sigma),
         theta_z=theta[2] if len(theta) == 3 else None,
     )
@@ -99,11 +99,11 @@ def read_tilt_csv(path: Path | str, noise_rad: float = SCA100T_NOISE_RAD) -> Til
 
 def _sigma_deg(path: Path, sigma: np.ndarray) -> np.ndarray:
     """The stated sigmas (N,), in deg; TiltError if one cannot be."""
-    wrong = ~np.isnan(sigma) & ~((sigma > 0) & (sigma <= MOST_SIGMA_DEG))
+    wrong = ~np.isnan(sigma) & ~((sigma > 0) & (sigma <= MAX_SIGMA_DEG))
     if wrong.any():
         raise TiltError(
             f"{path}: a sigma_deg is {sigma[wrong][0]:g}: give 1 sigma of the angles in deg, above 0 and at most "
-            f"{MOST_SIGMA_DEG:g}, or nan where it is not known"
+            f"{MAX_SIGMA_DEG:g}, or nan where it is not known"
         )
     return sigma
 
@@ -165,7 +165,7 @@ def _leaps(t: np.ndarray, angle: np.ndarray) -> bool:
     known = np.isfinite(angle)
     t, angle = t[known], angle[known]
     step, near = np.diff(angle), np.diff(t) <= BRACKET_S
-    if len(step) < FEWEST_LEAPS:
+    if len(step) < MIN_LEAPS:
         return False
     # if readings alternate, every second one is of the same sensor
     apart = [np.quantile(np.abs(angle[lag:] - angle[:-lag]), 0.25) for lag in (1, 2, 3)]
@@ -176,7 +176,7 @@ def _leaps(t: np.ndarray, angle: np.ndarray) -> bool:
     alike = np.maximum(OUTLIER_SIGMA * np.sqrt(2) * noise, ALIKE_SIZE * np.abs(there))
     returns = (np.abs(there + back) <= alike) & (t[leaps[1:]] - t[leaps[:-1] + 1] <= BRACKET_S)
     size = np.abs(there[returns])
-    if len(size) < max(FEWEST_LEAPS, LEAPING * len(step)):
+    if len(size) < max(MIN_LEAPS, LEAPING * len(step)):
         return False
     return bool(np.mean(np.abs(size - np.median(size)) <= alike[returns]) >= ONE_SIZE)
 

@@ -10,7 +10,7 @@ from starpos import files
 from starpos.errors import InstrumentError, one_line
 
 # Ten times what a calibration needs. A parser of YAML reads about 100 kB in a second.
-MOST_BYTES = 64_000
+MAX_BYTES = 64_000
 # The line above the comment that `save` writes, with the digest of that comment, and the lines of that.
 BY_STARPOS = re.compile(r"^# by starpos, ([0-9a-f]{8}):\n((?:#.*\n)+)", re.MULTILINE)
 
@@ -30,7 +30,7 @@ def text_at(path: Path, what: str) -> str:
 
 def _bytes_at(path: Path, what: str) -> bytes:
     try:
-        return files.read_regular(path, MOST_BYTES)
+        return files.read_regular(path, MAX_BYTES)
     except OSError as e:
         raise InstrumentError(f"{path}: not a readable {what} ({e.strerror})") from None
 

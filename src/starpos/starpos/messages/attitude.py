@@ -11,7 +11,7 @@ from starpos.fix.camera_attitude import CameraAttitude
 from starpos.messages.stamp import stamp_to_unix
 
 # of an attitude's quaternion, and the most that its covariance may say, rad2
-OFF_UNIT, MOST_ATTITUDE_VARIANCE = 1e-3, 0.01
+OFF_UNIT, MAX_ATTITUDE_VARIANCE = 1e-3, 0.01
 
 
 def message_to_attitude(message: Any, source: str = "attitude") -> CameraAttitude:
@@ -36,7 +36,7 @@ def message_to_attitude(message: Any, source: str = "attitude") -> CameraAttitud
     if not (
         np.allclose(covariance, covariance.T, rtol=1e-6, atol=0)
         and np.linalg.eigvalsh(covariance)[0] > 0
-        and covariance.trace() < MOST_ATTITUDE_VARIANCE
+        and covariance.trace() < MAX_ATTITUDE_VARIANCE
     ):
         raise FrameError(f"{source}: the covariance is not symmetric, positive and below 0.01 rad2.")
     return CameraAttitude(

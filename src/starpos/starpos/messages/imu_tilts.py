@@ -22,7 +22,7 @@ FUTURE_S = 0.1
 # If stamps go back further than this, the clock was set.
 NEW_TIME_S = 1.0
 # A lower bound, because a simulated accelerometer may have no noise.
-LEAST_STDDEV_RAD = 1e-6
+MIN_STDDEV_RAD = 1e-6
 # Number of averages with noise after which one without noise means a stuck sensor.
 MIN_NOISY = 20
 # Most messages in an average.
@@ -120,7 +120,7 @@ class MeanForce:
         # d asin(u) = du / cos, du = (1 - u u^T) df / |f|
         slope = (np.eye(3) - np.outer(up, up)) / strength
         slope /= np.sqrt(np.maximum(1 - up**2, 0.01))[:, None]
-        return slope @ forces @ slope.T / len(self.forces) + LEAST_STDDEV_RAD**2 * np.eye(3)
+        return slope @ forces @ slope.T / len(self.forces) + MIN_STDDEV_RAD**2 * np.eye(3)
 
 
 class ForceAverager:

@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 
 from starpos.errors import TiltError
-from starpos.instrument.inclinometer import MOST_CELSIUS, SCA100T_NOISE_RAD, SQUARE, Tilt
+from starpos.instrument.inclinometer import MAX_CELSIUS, SCA100T_NOISE_RAD, SQUARE, Tilt
 from starpos.messages.stamp import PlainHeader, PlainStamp, stamp_to_unix
 
 # bits of Tilt.flags, as starpos_interfaces defines them
 OUT_OF_RANGE, STUCK, SATURATED, GAP, TIME_UNKNOWN = 1, 2, 4, 8, 16
 UNUSABLE = OUT_OF_RANGE | STUCK | SATURATED | TIME_UNKNOWN
 # rad2; a larger variance is meaningless, and might overflow
-MOST_TILT_VARIANCE = 1.0
+MAX_TILT_VARIANCE = 1.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -86,9 +86,9 @@ def message_to_tilt(message: Any, unknown_stddev_rad: float = SCA100T_NOISE_RAD)
             raise TiltError(
                 "a tilt message's covariance is not symmetric and positive: send zeros where it is unknown."
             )
-        if max(xx, yy) > MOST_TILT_VARIANCE:
+        if max(xx, yy) > MAX_TILT_VARIANCE:
             raise TiltError("a tilt message's covariance is beyond 1 rad2: send zeros where it is unknown.")
-    celsius = message.temperature if abs(message.temperature) <= MOST_CELSIUS else math.nan
+    celsius = message.temperature if abs(message.temperature) <= MAX_CELSIUS else math.nan
     z, z_variance = _third_axis(message)
     return Tilt(
         message.x,
@@ -120,7 +120,7 @@ def _third_axis(message: Any) -> tuple[float, float]:
         return math.nan, math.nan
     if not math.isfinite(z):
         raise TiltError("a tilt message's z is not a finite number: send NaN for a sensor of two axes.")
-    if variance < 0 or variance > MOST_TILT_VARIANCE:
+    if variance < 0 or variance > MAX_TILT_VARIANCE:
         raise TiltError(
             "a tilt message's z_variance is not from 0 to 1 rad2: send NaN or 0 where it is unknown."
         )

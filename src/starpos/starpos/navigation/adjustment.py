@@ -30,7 +30,7 @@ from starpos.navigation.odometry import Odometry
 from starpos.navigation.preintegration import Pieces, Sums, summed
 from starpos.navigation.sightings import FrameUnderWay
 from starpos.navigation.standstill import (
-    FEWEST_STANDSTILLS,
+    MIN_STANDSTILLS,
     NOWHERE,
     Standstills,
     by_the_rest,
@@ -42,7 +42,7 @@ from starpos.navigation.velocity import VelocityLog
 from starpos.navigation.vessel import Vessel
 from starpos.progress import Progress
 
-FEWEST_FRAMES = 3
+MIN_FRAMES = 3
 # the place has settled where a step is below it, in m and as a share of its sigma
 SETTLED_M, SETTLED_SHARE = 1.0, 0.02
 # equations of a place farther off are wrong by more than the stars' errors: the square of the angle
@@ -50,9 +50,9 @@ NEAR_M = 2000.0
 # minimum ratio of found to stated variances that is reported
 NOTABLE = 4.0
 # no step on the Earth is longer
-FARTHEST_M, MOST_ROUNDS = 2e7, 25
+FARTHEST_M, MAX_ROUNDS = 2e7, 25
 # a law is weighed until its terms change by a smaller factor, and so often at most
-LAW_CHANGE, MOST_WEIGHINGS = 1.1, 4
+LAW_CHANGE, MAX_WEIGHINGS = 1.1, 4
 # stars are seen anew where the zenith has moved by more: 2 m of refraction
 ZENITH_MOVED = 1e-3
 # a standstill, m/s: of each node, and of a middle one alone on trial
@@ -61,7 +61,7 @@ STANDING_SIGMA, TRIAL_SIGMA = 2e-3, 5e-3
 MEDIAN_OF_CHI2, OUTLIER_CHI2 = 2.366, 30.7
 # steps of the accelerometer's noise, how many at most, and when to stop: a factor of e^8; of e^3 by a law, since much
 # more noise would take the law's errors too, and be likely again
-FACTOR, MOST_FACTORS, UNLIKELY, UNLIKELY_BY_LAW = 2**0.5, 16, 8.0, 3.0
+FACTOR, MAX_FACTORS, UNLIKELY, UNLIKELY_BY_LAW = 2**0.5, 16, 8.0, 3.0
 
 
 class Adjustment:
@@ -151,7 +151,7 @@ class Adjustment:
         stars, motion = self._begin()
         solution: Smoothed | None = None
         zenith, step, sigma = np.zeros(3), np.inf, 1.0
-        for k in range(MOST_ROUNDS):
+        for k in range(MAX_ROUNDS):
             # equations for another place show neither how the stars are seen nor which measurements are wrong
             near = step < min(NEAR_M, sigma)
             up = zenith_at(motion.place[len(motion) // 2])
@@ -208,7 +208,7 @@ class Adjustment:
             nodes = np.concatenate([chain.nodes[:, : -trial.rows.shape[1]], self._by_law(motion, trial)], 1)
             rest = by_the_rest(trial, TRIAL_SIGMA, smoothed(replace(chain, nodes=nodes)))
             self.contradicted |= rest.contradicted
-            enough = rest.checked.sum() >= FEWEST_STANDSTILLS and not rest.contradicted
+            enough = rest.checked.sum() >= MIN_STANDSTILLS and not rest.contradicted
             seeming = seeming.but(rest.checked & enough)
         self.standing = seeming
         return len(seeming) != before
@@ -223,12 +223,7 @@ class Adjustment:
             self.noise_weighed = True
             return True
         stated = self._law(self.vessel)
-        if (
-            self.odometry is not None
-            or self.law is None
-            or stated is None
-            or self.weighings == MOST_WEIGHINGS
-        ):
+        if self.odometry is not None or self.law is None or stated is None or self.weighings == MAX_WEIGHINGS:
             return False
         self.weighings += 1
         law = borne_out(stated, motion)
@@ -245,7 +240,7 @@ class Adjustment:
         unlikely = UNLIKELY_BY_LAW if self.odometry is None else UNLIKELY
         factors: list[float] = []
         likely: list[float] = []
-        while len(factors) < MOST_FACTORS and (not likely or likely[-1] > max(likely) - unlikely):
+        while len(factors) < MAX_FACTORS and (not likely or likely[-1] > max(likely) - unlikely):
             factors.append(FACTOR ** len(factors))
             excess = at_rest * np.where(self._shaken, factors[-1] ** 2, 1.0)
             noisy = links.noisier((excess - 1) * stated2, self.pieces)
@@ -274,8 +269,8 @@ class Adjustment:
             except FixError:
                 pass
         self.unsound = len(self.frames) - len(used)
-        if len(used) < FEWEST_FRAMES:
-            raise VoyageError(f"the stars of {len(used)} frames agree: at least {FEWEST_FRAMES} are needed")
+        if len(used) < MIN_FRAMES:
+            raise VoyageError(f"the stars of {len(used)} frames agree: at least {MIN_FRAMES} are needed")
         return StarAttitudes(
             index=np.searchsorted(self.nodes, [frame.utc_unix_s for frame in used]),
             camera_to_itrs=np.array([a.camera_to_itrs for a in found]),

@@ -94,12 +94,12 @@ class Lacks:
         share = np.linalg.solve(root, np.linalg.solve(root, explained).transpose(0, 2, 1))
         size, axes = np.linalg.eigh(share)
         # a solution takes its own error from the residuals it has seen, at most nearly all, and adds it to others
-        spread = np.where(left_out[:, None], 1 + size, np.maximum(1 - size, LEAST_LEFT))
+        spread = np.where(left_out[:, None], 1 + size, np.maximum(1 - size, MIN_LEFT))
         seen = np.einsum("kji,kj->ki", axes, np.linalg.solve(root, short[..., None])[..., 0])
         return np.sum(seen**2 / spread, 1)
 
 
-LEAST_LEFT = 0.02
+MIN_LEFT = 0.02
 
 
 def star_lacks(motion: Motion, stars: StarAttitudes, sums: Sums, pieces: Pieces, n: int) -> Lacks:

@@ -12,7 +12,7 @@ from starpos.errors import VoyageError
 from starpos.navigation.imu import GAP, ImuLog
 from starpos.navigation.placeless import PlacelessFrame
 from starpos.navigation.thinning import thinned
-from starpos.navigation.velocity import FASTEST, LEAST_SIGMA, MOST_SIGMA, VelocityLog
+from starpos.navigation.velocity import FASTEST, MAX_SIGMA, MIN_SIGMA, VelocityLog
 from starpos.navigation.vessel import Vessel
 from starpos.navigation.voyage import Voyage, navigate
 
@@ -21,9 +21,9 @@ READING_S = 0.02
 # an IMU that is silent for longer, or whose clock goes back by more, begins a new voyage
 LONGEST_GAP_S, BACK_S = 30.0, 1.0
 # of frames with stars, whatever their stamps
-MOST_FRAMES = 100_000
+MAX_FRAMES = 100_000
 # no vehicle turns or is pushed as much, rad/s and m/s2
-MOST_RATE, MOST_FORCE = 100.0, 1000.0
+MAX_RATE, MAX_FORCE = 100.0, 1000.0
 
 
 class RecentReadings:
@@ -38,7 +38,7 @@ class RecentReadings:
     def add(self, row: tuple[float, ...]) -> None:
         """Take a reading; VoyageError in a sentence if it cannot be used."""
         # sums, because they are NaN where one is
-        if not (sum(map(abs, row[1:4])) < MOST_RATE and sum(map(abs, row[4:])) < MOST_FORCE):
+        if not (sum(map(abs, row[1:4])) < MAX_RATE and sum(map(abs, row[4:])) < MAX_FORCE):
             raise VoyageError(
                 "an inertial reading is NaN, or beyond 100 rad/s or 1000 m/s2: it is left out; check the IMU and its "
                 "units"
@@ -129,7 +129,7 @@ class Recent:
         if k < len(self._frames) and self._frames[k].utc_unix_s == frame.utc_unix_s:
             raise VoyageError("two attitudes have one stamp: the second one is left out")
         insort(self._frames, frame, key=_time)
-        del self._frames[:-MOST_FRAMES]
+        del self._frames[:-MAX_FRAMES]
 
     def add_velocity(self, utc_unix_s: float, velocity: Sequence[float], sigma: float) -> None:
         """Take a velocity in m/s along the body's axes; VoyageError in a sentence if it cannot be used."""
@@ -137,9 +137,9 @@ class Recent:
             raise VoyageError(
                 f"a velocity is NaN or beyond {FASTEST:g} m/s: it is left out; give m/s along the body's axes"
             )
-        if not LEAST_SIGMA <= sigma <= MOST_SIGMA:
+        if not MIN_SIGMA <= sigma <= MAX_SIGMA:
             raise VoyageError(
-                f"a velocity's sigma is {sigma:g} m/s, not between {LEAST_SIGMA:g} and {MOST_SIGMA:g}: "
+                f"a velocity's sigma is {sigma:g} m/s, not between {MIN_SIGMA:g} and {MAX_SIGMA:g}: "
                 f"state each axis's sigma, or zeros for velocity_stddev"
             )
         if self._velocities and utc_unix_s <= self._velocities[-1][0]:

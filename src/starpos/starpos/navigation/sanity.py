@@ -14,15 +14,15 @@ from starpos.navigation.preintegration import Pieces, Sums
 
 GRAVITY = 9.8
 # maximum difference of the mean force from gravity, and the same in sigmas of the model
-MOST_OFF, SIGMAS = 0.5, 6.0
+MAX_OFF, SIGMAS = 0.5, 6.0
 # so low, in the mean, no camera on a vehicle looks for stars: so far from the plumb line, deg
 LOWEST_DEG = 80.0
 # turns that are seen so far above their noise show the gyro's axes; and what part of them may be off
-CLEARLY, MOST_SHARE = 20.0, 0.3
+CLEARLY, MAX_SHARE = 20.0, 0.3
 # maximum scatter of a gyro's turns over its model's noise while the stars show no turn; more means another unit
-MOST_SCATTER = 8.0
+MAX_SCATTER = 8.0
 # minimum error (rad) of the turn of a stray frame, and maximum number of stray frames in a row
-STRAY, MOST_STRAYS = np.radians(3.0), 5
+STRAY, MAX_STRAYS = np.radians(3.0), 5
 # rad/s in other units
 UNITS = {"deg/s": np.degrees(1.0), "rev/min": 30 / np.pi}
 
@@ -46,7 +46,7 @@ def _check_gravity(pieces: Pieces, sums: Sums, model: ImuModel, camera_to_body: 
         )
     force = sums.speed[whole] / pieces.span_s[whole, None]
     size = float(np.median(np.linalg.norm(force, axis=1)))
-    allowed = MOST_OFF + SIGMAS * (model.accelerometer_bias_stddev + GRAVITY * model.scale_stddev)
+    allowed = MAX_OFF + SIGMAS * (model.accelerometer_bias_stddev + GRAVITY * model.scale_stddev)
     if abs(size - 1) < 0.1:
         raise VoyageError(f"the IMU's force is {size:.3f} in the median, as if it was in g: give m/s2")
     if abs(size - GRAVITY) > allowed:
@@ -85,18 +85,18 @@ def _check_turns(stars: StarAttitudes, pieces: Pieces, model: ImuModel, camera_t
     if clear.any():
         turns, others = seen[clear] - np.median(seen, axis=0), felt[clear] - np.median(felt, axis=0)
         share = float(np.median(np.linalg.norm(others - turns, axis=1) / np.linalg.norm(turns, axis=1)))
-        if share > MOST_SHARE:
+        if share > MAX_SHARE:
             raise VoyageError(
                 f"the gyro's turns differ from the stars' by {100 * share:.0f} %: {_cause(turns, others)}"
             )
     scatter = float(np.median(np.linalg.norm(off - bias, axis=1) / noise))
-    if not clear.any() and scatter > MOST_SCATTER:
+    if not clear.any() and scatter > MAX_SCATTER:
         raise VoyageError(
             f"the gyro scatters by {scatter:.0f} times the noise of its model, where the stars see no turn, as if it was "
             "in deg/s: give rad/s, or the model of the IMU"
         )
     allowed = SIGMAS * (model.gyroscope_bias_stddev + float(np.median(noise)))
-    allowed += MOST_SHARE * float(np.linalg.norm(np.median(seen, axis=0)))
+    allowed += MAX_SHARE * float(np.linalg.norm(np.median(seen, axis=0)))
     if np.abs(bias).max() > allowed:
         raise VoyageError(
             f"the gyro turns by {np.degrees(np.abs(bias).max()):.3g} deg/s more than the stars, its model allows "
@@ -124,16 +124,16 @@ def strays(
         if off > most and lost[last] == lost[first]:
             breaks.append(k)
     size = np.diff([*breaks, len(body)])
-    return np.repeat(size <= MOST_STRAYS, size) if len(breaks) > 1 else np.zeros(len(body), bool)
+    return np.repeat(size <= MAX_STRAYS, size) if len(breaks) > 1 else np.zeros(len(body), bool)
 
 
 def _cause(seen: np.ndarray, felt: np.ndarray) -> str:
     """The change that would make the gyro's turns (N, 3) equal the stars' (N, 3)."""
     ratio = float(np.median(np.linalg.norm(felt, axis=1) / np.linalg.norm(seen, axis=1)))
     for unit, size in UNITS.items():
-        if abs(ratio / size - 1) < MOST_SHARE:
+        if abs(ratio / size - 1) < MAX_SHARE:
             return f"they seem to be in {unit}: give rad/s"
-    best, misses = "", MOST_SHARE
+    best, misses = "", MAX_SHARE
     for axes in permutations(range(3)):
         for signs in product((1, -1), repeat=3):
             missed = np.linalg.norm(felt[:, axes] * signs - seen, axis=1)

@@ -25,16 +25,16 @@ LEARNT_S, QUIET_PERCENT = 60.0, 5.0
 # maximum scatter of a standstill over the scatter of these quiet seconds; time (s) before and after that it covers
 QUIETER, AROUND_S = 0.5, 1.0
 # minimum number of frames of a standstill, and minimum time (s) from the first to the last
-FEWEST_FRAMES, SHORTEST_S = 4, 8.0
+MIN_FRAMES, SHORTEST_S = 4, 8.0
 # maximum error (rad) of a fine frame's two axes; maximum ratio of the variances of their attitudes to the stated ones
 FINE, STEADY = 10 * ARCSEC, 2.0
 # forces add up to no more, in m/s, than their mean
 LEAP = 0.02
 # maximum error (m/s an axis) of the velocity from the rest of the record, for a check; value of a chi-squared of three
 # degrees of freedom that one in a thousand exceeds; minimum number of standstills that agree beyond chance
-CHECKED, ONE_IN_1000, FEWEST_STANDSTILLS = 0.1, 16.3, 3
+CHECKED, ONE_IN_1000, MIN_STANDSTILLS = 0.1, 16.3, 3
 # of a residual's variance such a share is left at least: less is rounding
-LEAST_LEFT = 1e-5
+MIN_LEFT = 1e-5
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -75,7 +75,7 @@ NOWHERE = Standstills(first=np.zeros(0, int), last=np.zeros(0, int))
 def standstills(stars: StarAttitudes, pieces: Pieces) -> Standstills:
     """The stretches in which the vehicle seems to stand, by attitudes and readings alone."""
     fine = np.linalg.eigvalsh(stars.covariance)[:, 1] < FINE**2
-    if fine.sum() < FEWEST_FRAMES:
+    if fine.sum() < MIN_FRAMES:
         return NOWHERE
     index, attitude = stars.index[fine], Rotation.from_matrix(stars.camera_to_itrs[fine])
     t = np.append(0.0, np.cumsum(pieces.span_s))
@@ -88,7 +88,7 @@ def standstills(stars: StarAttitudes, pieces: Pieces) -> Standstills:
     found = []
     for first, last in edges.reshape(-1, 2):
         inside = (index >= first) & (index <= last)
-        if inside.sum() < FEWEST_FRAMES:
+        if inside.sum() < MIN_FRAMES:
             continue
         begin, end = index[inside][[0, -1]]
         if (
@@ -134,7 +134,7 @@ def by_the_rest(trial: Lacks, sigma: float, solution: Smoothed) -> ByTheRest:
     told = slope @ solution.covariance[trial.index] @ slope.transpose(0, 2, 1)
     # the errors of the residuals: where they nearly vanish, only the equation itself determines the velocity
     size, axes = np.linalg.eigh(np.eye(3) - told / sigma**2)
-    inverse = (axes / np.maximum(size, LEAST_LEFT)[:, None]) @ axes.transpose(0, 2, 1)
+    inverse = (axes / np.maximum(size, MIN_LEFT)[:, None]) @ axes.transpose(0, 2, 1)
     return ByTheRest(
         velocity=-np.einsum("jik,jk->ji", inverse, left),
         covariance=sigma**2 * (inverse - np.eye(3)),

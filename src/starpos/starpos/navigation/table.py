@@ -14,7 +14,7 @@ from starpos.errors import VoyageError, one_line
 from starpos.files import open_regular
 
 # a night of 400 Hz
-MOST_BYTES = 1_500_000_000
+MAX_BYTES = 1_500_000_000
 TIME = "utc_unix_s"
 # Unix times of the years 1973 to 2100
 EARLIEST_S, LATEST_S = 9.4e7, 4.1e9
@@ -38,8 +38,8 @@ def read_record(path: Path | str, columns: Sequence[str], what: str) -> Record:
     cure = f"give a CSV with a line of names, {','.join((TIME, *columns))}, and a row a reading"
     try:
         with open_regular(path) as file:
-            if os.fstat(file.fileno()).st_size > MOST_BYTES:
-                raise ValueError(f"it is larger than {MOST_BYTES // 10**6} MB")
+            if os.fstat(file.fileno()).st_size > MAX_BYTES:
+                raise ValueError(f"it is larger than {MAX_BYTES // 10**6} MB")
             text = io.TextIOWrapper(file, "utf-8-sig")
             names = [name.strip() for name in text.readline().lstrip("# ").split(",")]
             lacking = [name for name in (TIME, *columns) if names.count(name) != 1]

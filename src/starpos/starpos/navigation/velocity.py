@@ -11,7 +11,7 @@ from starpos.navigation.table import read_record
 
 COLUMNS = ("vx", "vy", "vz", "sigma")
 # below it a stated error is a mistake; above it nothing is measured
-LEAST_SIGMA, MOST_SIGMA = 1e-6, 1000.0
+MIN_SIGMA, MAX_SIGMA = 1e-6, 1000.0
 # In m/s.
 FASTEST = 1000.0
 
@@ -30,9 +30,9 @@ def read_velocity(path: Path | str) -> VelocityLog:
     """Read a CSV of utc_unix_s, vx, vy, vz, sigma (m/s); VoyageError says why one cannot be used."""
     record = read_record(path, COLUMNS, "velocities")
     velocity, sigma = record.values[:, :3], record.values[:, 3]
-    if not ((sigma >= LEAST_SIGMA) & (sigma <= MOST_SIGMA)).all():
+    if not ((sigma >= MIN_SIGMA) & (sigma <= MAX_SIGMA)).all():
         raise VoyageError(
-            f"{path}: a sigma is not between {LEAST_SIGMA:g} and {MOST_SIGMA:g} m/s: state 1 sigma of an axis"
+            f"{path}: a sigma is not between {MIN_SIGMA:g} and {MAX_SIGMA:g} m/s: state 1 sigma of an axis"
         )
     if np.abs(velocity).max() > FASTEST:
         raise VoyageError(f"{path}: a velocity is beyond {FASTEST:g} m/s: give m/s along the body's axes")

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from starpos.errors import VoyageError
-from starpos.navigation.adjustment import FEWEST_FRAMES, Adjustment
+from starpos.navigation.adjustment import MIN_FRAMES, Adjustment
 from starpos.navigation.chain import Smoothed
 from starpos.navigation.estimate import Estimate
 from starpos.navigation.imu import ImuLog
@@ -20,7 +20,7 @@ from starpos.navigation.vessel import Vessel
 from starpos.navigation.voyage_fix import TimeErrors, VoyageFix, fix_of
 from starpos.progress import Progress, quiet
 
-MOST_APART_S = 1.5
+MAX_APART_S = 1.5
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -56,14 +56,14 @@ def navigate(
     times = np.array([f.utc_unix_s for f in frames]) if times is None else np.asarray(times, float)
     begin, end = imu.utc_unix_s[0] - imu.length_s[0], imu.utc_unix_s[-1]
     within = sorted((f for f in frames if begin <= f.utc_unix_s <= end), key=lambda f: f.utc_unix_s)
-    if len({f.utc_unix_s for f in within}) < FEWEST_FRAMES:
+    if len({f.utc_unix_s for f in within}) < MIN_FRAMES:
         raise VoyageError(
-            f"{len(within)} frames with stars have inertial readings at their times: at least {FEWEST_FRAMES} are "
+            f"{len(within)} frames with stars have inertial readings at their times: at least {MIN_FRAMES} are "
             "needed; check that the clocks of camera and IMU agree"
         )
     inside = (times >= begin) & (times <= end)
     asked = np.concatenate([times[inside], [f.utc_unix_s for f in within]])
-    nodes = nodes_of(np.unique(asked), MOST_APART_S)
+    nodes = nodes_of(np.unique(asked), MAX_APART_S)
     adjustment = Adjustment(within, nodes, Pieces.cut(imu, nodes), velocity, vessel, imu.vibration)
     motion, solution, rounds = adjustment.settle(progress)
     stamp_s = float(np.median([f.stamp_stddev_s for f in within]))

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from starpos.averaging.altitudes import Circle, Directions, circle_of, place_of_circles
-from starpos.calibration.axis import FEWEST_WITHOUT_SITE, FoundAxis, find_axis
+from starpos.calibration.axis import MIN_WITHOUT_SITE, FoundAxis, find_axis
 from starpos.earth.orientation import EarthState
 from starpos.errors import FixError, StarposError
 from starpos.fix.pointing import IDEAL
@@ -58,7 +58,7 @@ def from_elevations(
     there, axis = None if near is None else (near.latitude, near.longitude), None
     try:
         directions = Directions.of(sorted(sound, key=lambda c: c.utc_unix_s))
-        if self_calibrate or (directions.wide and len(directions.circles) >= FEWEST_WITHOUT_SITE):
+        if self_calibrate or (directions.wide and len(directions.circles) >= MIN_WITHOUT_SITE):
             axis = axis_of(solver, pointings, tilts, there)
             # A3's error is counted from the given A3, or from the one found if none was given
             sound = axis.about(axis.a3 if self_calibrate else solver.instrument.calibration.a3)

@@ -26,14 +26,14 @@ from starpos.night.together import TurnedNight, turned
 NARROWEST_PX, WIDEST_PX = 1.2, 4.0
 # Number of frames in a row that are as sharp as the sharpest so far, within this share.
 SHARP_FRAMES, AS_SHARP = 3, 1.1
-FEWEST_STARS = 20
+MIN_STARS = 20
 # Number of the brightest stars, and the share of them that may be saturated.
-BRIGHTEST, MOST_SATURATED = 20, 0.2
+BRIGHTEST, MAX_SATURATED = 20, 0.2
 # The level is watched so long; a lean that moves less than its noise, times this, is still.
 LEVEL_S, STILL = 10.0, 3.0
 # A level is still around a frame for so long before and after its middle.
 AROUND_S = 1.5
-LEAST_LEAN_DEG, MOST_LEAN_DEG = 0.5, 10.0
+MIN_LEAN_DEG, MAX_LEAN_DEG = 0.5, 10.0
 # Two leans are about axes that differ by this at least.
 OTHER_LEAN_DEG = 40.0
 # The stars lean as the level does within this share. A turn of A3 beyond OFF_DEG contradicts what was stated.
@@ -145,9 +145,9 @@ class FirstNight:
         )
         if stars.fwhm_px is not None and stars.fwhm_px < NARROWEST_PX:
             found += f", FWHM {stars.fwhm_px:.1f} px: too sharp for its pixels"
-        if saturated > MOST_SATURATED:
+        if saturated > MAX_SATURATED:
             return Look(Stage.EXPOSURE, False, found, "halve the exposure, or the gain")
-        if len(stars) < FEWEST_STARS:
+        if len(stars) < MIN_STARS:
             return Look(Stage.EXPOSURE, False, found, "double the exposure, or the gain")
         if sight.found is None:
             return Look(Stage.EXPOSURE, False, found, sight.solution.message)
@@ -205,7 +205,7 @@ class FirstNight:
         moved = pose.up - base.up
         lean_deg = np.degrees(np.arccos(np.clip(pose.up @ base.up, -1, 1)))
         found = f"it leans by {lean_deg:.2f} deg from before"
-        if not LEAST_LEAN_DEG <= lean_deg <= MOST_LEAN_DEG:
+        if not MIN_LEAN_DEG <= lean_deg <= MAX_LEAN_DEG:
             return self._lean(found)
         direction = float(np.arctan2(moved[1], moved[0]))
         if self._leans:

@@ -34,8 +34,8 @@ if TYPE_CHECKING:
 
 # Maximum number of other detections of a frame. Each is another try, with a second look of its own: together they add
 # 0.01 wrong answers in 1e9 frames.
-MOST_WAYS = 3
-ENOUGH_OTHERWISE = ENOUGH + math.log(10 * MOST_WAYS)
+MAX_WAYS = 3
+ENOUGH_OTHERWISE = ENOUGH + math.log(10 * MAX_WAYS)
 # If stars fill only a part of a frame (a roof, clouds, a white half), triangles of a field of this relative size help.
 PART = 0.6
 # stages of the search at every scale, for stars from other detections
@@ -205,5 +205,5 @@ def _seen(item: Frame | Stars, stars: Stars) -> Iterator[tuple[Stars, float]]:
     from starpos.detection.otherwise import otherwise
 
     seen = otherwise(negative_of(item) if stars.negative else item, stars.window)
-    for others in itertools.islice(seen, MOST_WAYS):
+    for others in itertools.islice(seen, MAX_WAYS):
         yield replace(others, negative=stars.negative), ENOUGH_OTHERWISE

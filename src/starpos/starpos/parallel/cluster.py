@@ -20,7 +20,7 @@ from starpos.parallel.same import Same, differing, same_here
 PIP = "pip install distributed"
 ANSWER_WITHIN_S = 10
 # Calls sent to the cluster before their answers are needed: number per thread, and minimum.
-AHEAD, FEWEST_AHEAD = 3, 64
+AHEAD, MIN_AHEAD = 3, 64
 SCHEMES = ("tcp", "tls", "ws", "wss", "ucx")
 # Number of calls after which the cluster's threads are counted again.
 COUNT_EVERY = 100
@@ -100,7 +100,7 @@ class Cluster:
         told = ahead = 0
         while True:
             if told % COUNT_EVERY == 0:
-                ahead = max(FEWEST_AHEAD, AHEAD * sum(self._client.nthreads().values()))
+                ahead = max(MIN_AHEAD, AHEAD * sum(self._client.nthreads().values()))
             while len(under_way) < ahead and (call := next(calls, None)) is not None:
                 under_way.append((call, self._begun(call, here)))
             if not under_way:

@@ -16,11 +16,11 @@ from starpos.errors import BagError
 from starpos.files import open_regular
 
 # a bag of a thousand files has 250 kB; a parser of YAML reads about 100 kB in a second
-MOST_METADATA = 1 << 20
+MAX_METADATA = 1 << 20
 # bytes of a chunk or a message; a frame of 21 megapixels has a twelfth of it
-MOST_UNPACKED = 1 << 29
+MAX_UNPACKED = 1 << 29
 # bytes of the chunks of a file that overlap in time: rosbags has all of them in memory
-MOST_AT_ONCE = 1 << 30
+MAX_AT_ONCE = 1 << 30
 # the first and the last bytes of a file
 MCAP = b"\x89MCAP0\r\n"
 # rosbag2's names of the supported storages, .mcap and .db3
@@ -49,8 +49,8 @@ def check_folder(path: Path) -> None:
     metadata = path / "metadata.yaml"
     if not metadata.is_file():
         return
-    if metadata.stat().st_size > MOST_METADATA:
-        raise BagError(f"its metadata.yaml has over {MOST_METADATA >> 20} MB, not the description of a bag")
+    if metadata.stat().st_size > MAX_METADATA:
+        raise BagError(f"its metadata.yaml has over {MAX_METADATA >> 20} MB, not the description of a bag")
     named = re.search(rb"^\s*storage_identifier:[ \t]*(.*?)\s*$", metadata.read_bytes(), re.MULTILINE)
     storage = named[1].decode("ascii", "replace").strip("'\"") if named else STORAGES[0]
     if storage not in STORAGES:
@@ -99,9 +99,9 @@ def check_chunks(reader: Any) -> None:
         at_once = 0
         for _, _, size in sorted(edges):
             at_once += size
-            if at_once > MOST_AT_ONCE:
+            if at_once > MAX_AT_ONCE:
                 raise BagError(
-                    f"chunks of over {MOST_AT_ONCE >> 20} MB have the same times: write it anew, in the order of time"
+                    f"chunks of over {MAX_AT_ONCE >> 20} MB have the same times: write it anew, in the order of time"
                 )
 
 
@@ -113,7 +113,7 @@ class _Zstd:
 
     def decompress(self, data: bytes) -> bytes:
         """Unpack a message."""
-        return _unpacked(self._zstd, data, MOST_UNPACKED)
+        return _unpacked(self._zstd, data, MAX_UNPACKED)
 
     def open(self, file: IO[bytes], mode: str) -> "_Bounded":
         """Open a file of a bag, which rosbags unpacks into the folder for temporary files."""
@@ -176,8 +176,8 @@ def _lz4(data: bytes, size: int) -> bytes:
 
 
 def _check_size(size: int) -> None:
-    if size > MOST_UNPACKED:
-        raise BagError(f"a part of it unpacks to {size >> 20} MB, over {MOST_UNPACKED >> 20} MB")
+    if size > MAX_UNPACKED:
+        raise BagError(f"a part of it unpacks to {size >> 20} MB, over {MAX_UNPACKED >> 20} MB")
 
 
 def _too_large(size: int) -> BagError:

@@ -40,7 +40,7 @@ ABOUT, INSTRUMENT = "field.json", "instrument.yaml"
 FORMAT = 1
 SUFFIX = ".zip"
 # A night of 10,000 lists of 1000 stars; a file that unpacks to more is not ours.
-MOST_BYTES, MOST_FILES = 400_000_000, 20_000
+MAX_BYTES, MAX_FILES = 400_000_000, 20_000
 PACKAGES = ("starpos", "numpy", "scipy", "astropy", "astropy-iers-data", "pyerfa", "opencv-python-headless")
 
 
@@ -99,9 +99,9 @@ def opened(path: Path | str) -> Iterator[tuple[Path, Atmosphere]]:
         folder = Path(base) / Path(path).stem
         folder.mkdir()
         try:
-            with zipfile.ZipFile(io.BytesIO(read_regular(path, MOST_BYTES))) as file:
+            with zipfile.ZipFile(io.BytesIO(read_regular(path, MAX_BYTES))) as file:
                 entries = file.infolist()
-                if len(entries) > MOST_FILES or sum(e.file_size for e in entries) > MOST_BYTES:
+                if len(entries) > MAX_FILES or sum(e.file_size for e in entries) > MAX_BYTES:
                     raise ValueError("it unpacks to more than a night")
                 for entry in entries:
                     if not _ours(entry.filename):

@@ -12,7 +12,7 @@ from starpos.rotation import half_turns
 from starpos.units import ARCSEC
 
 OUTLIER_SIGMA, CLAIMED_SIGMA = 5.0, 3.0
-FEWEST_FOR_OUTLIERS = 5
+MIN_FOR_OUTLIERS = 5
 SAME_TIME_S = 0.01
 # if headings are further from their mean, the instrument was turned
 TURNED_RAD, TURNED_SIGMA = np.radians(0.1), 10.0
@@ -129,7 +129,7 @@ def _angles(covariance: np.ndarray, latitude: float) -> np.ndarray:
 
 def _outliers(away: np.ndarray, sigma: np.ndarray) -> np.ndarray:
     """Mask (N,) of frames far outside the scatter of all, and further off than their own sigma (N, 2) allows."""
-    if len(away) < FEWEST_FOR_OUTLIERS:
+    if len(away) < MIN_FOR_OUTLIERS:
         return np.zeros(len(away), bool)
     far = np.abs(away - np.median(away, axis=0))
     wide = OUTLIER_SIGMA * (SIGMA_PER_MAD * np.median(far, axis=0) + 1e-12)

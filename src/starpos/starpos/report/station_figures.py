@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 COLOURS = (BLUE, ORANGE, GREEN, RED, SKY, PURPLE)
 COMPONENTS = ("\N{GREEK SMALL LETTER XI} (north)", "\N{GREEK SMALL LETTER ETA} (east)")
 # sources with a smaller share of the largest are left out of the figure
-LEAST_SHARE = 0.02
+MIN_SHARE = 0.02
 # length of the longest arrow over the width of the map
 ARROW = 0.15
 
@@ -67,7 +67,7 @@ def draw_errors(figure: "Figure", session: SessionResult) -> None:
     """1 sigma by each source, the largest on top."""
     axes = figure.subplots()
     most = max(max(xi, eta) for _, xi, eta in session.terms)
-    terms = sorted((t for t in session.terms if max(t[1:]) > LEAST_SHARE * most), key=lambda t: max(t[1:]))
+    terms = sorted((t for t in session.terms if max(t[1:]) > MIN_SHARE * most), key=lambda t: max(t[1:]))
     at = np.arange(len(terms))
     for k, (name, colour) in enumerate(zip(COMPONENTS, (BLUE, ORANGE), strict=True)):
         axes.barh(at + 0.2 - 0.4 * k, [t[1 + k] for t in terms], 0.4, color=colour, label=name)

@@ -27,7 +27,7 @@ from starpos.session.turned import Turned, turn_on_the_spot
 from starpos.sky.site import Site
 
 # Fewer headings cannot show that they are of one place. The caller of the service asserts it, so it needs one less.
-FEWEST_HEADINGS, FEWEST_BY_ITSELF = 3, 4
+MIN_HEADINGS, MIN_BY_ITSELF = 3, 4
 TURN_IT = "turn it on the spot"
 CALIBRATE_IT = (
     "fixes have errors of over 1000 km. Set calibration_url or misalignment_stddev, call solver/calibrate "
@@ -240,7 +240,7 @@ class Calibrating:
         outcome = await self._asked_for(self._on_the_spot)
         if outcome.trouble:
             return None, outcome.trouble
-        why_not = self._why_not(outcome.value, FEWEST_HEADINGS)
+        why_not = self._why_not(outcome.value, MIN_HEADINGS)
         if not why_not:
             self._adopt_turned(outcome.value)
         return outcome.value, why_not
@@ -251,7 +251,7 @@ class Calibrating:
         if len(poses) < 2:
             raise FixError(
                 f"the instrument has stood at {_headings(len(poses))} here: turn it on the spot, to "
-                f"{FEWEST_HEADINGS} headings or more"
+                f"{MIN_HEADINGS} headings or more"
             )
         solver = self._solver()
         turn_deg = self._values["calibration_turn_stddev"]
@@ -262,8 +262,8 @@ class Calibrating:
         self._again = self._worker.busy or self._asked
         if self._again:
             return
-        if len(self._poses) < FEWEST_BY_ITSELF:
-            self._said = f"{_headings(len(self._poses))} so far, {FEWEST_BY_ITSELF} are needed"
+        if len(self._poses) < MIN_BY_ITSELF:
+            self._said = f"{_headings(len(self._poses))} so far, {MIN_BY_ITSELF} are needed"
             return
         try:
             job, era = self._on_the_spot(), self._era
@@ -274,7 +274,7 @@ class Calibrating:
 
     def _turned_by_itself(self, outcome: Outcome, era: int) -> None:
         if era == self._era:
-            said = outcome.trouble or self._why_not(outcome.value, FEWEST_BY_ITSELF)
+            said = outcome.trouble or self._why_not(outcome.value, MIN_BY_ITSELF)
             if not said and not self._is_better(outcome.value.calibrated):
                 said = "the headings here do not improve the calibration in use"
             self._said = said

@@ -12,7 +12,7 @@ from starpos.messages.camera import leaves_size_open, message_to_camera
 from starpos.messages.stamp import stamp_to_unix
 from starpos.session.job import Jobs, Outcome
 
-MOST_CHANGES = 1000
+MAX_CHANGES = 1000
 
 
 class CameraSolver:
@@ -41,7 +41,7 @@ class CameraSolver:
         # the last CameraInfo, if it states no size
         self._of_open_size: Any = None
         # cameras that hold from a stamp on which no frame has reached yet
-        self._changes: deque[tuple[float | None, Camera]] = deque(maxlen=MOST_CHANGES)
+        self._changes: deque[tuple[float | None, Camera]] = deque(maxlen=MAX_CHANGES)
 
     @property
     def preparing(self) -> bool:

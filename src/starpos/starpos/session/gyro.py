@@ -23,11 +23,11 @@ if TYPE_CHECKING:
 
 IMU_TOPIC = "imu/data"
 # a frame does not wait for readings: longest time for which the last rate is extrapolated, and total of gaps
-MOST_MISSING_S = 0.1
+MAX_MISSING_S = 0.1
 # worst case, 1 sigma an axis: a cheap IMU, its mounting on the camera, and an attitude by few stars about the axis
 WORST, MOUNT_RAD, STARS_RAD = ImuModel(), math.radians(1.0), 1e-3
 # rad/s; lower bound of the bias's sigma
-LEAST_BIAS_STDDEV = 1e-3
+MIN_BIAS_STDDEV = 1e-3
 # a gyro off by more sigma measures in another unit, or along other axes
 CONTRADICTION = 6.0
 
@@ -106,13 +106,13 @@ class Gyro:
             return
         share = (self._bias_stddev * since_s / error) ** 2
         self._bias = self._bias + share * off / since_s
-        self._bias_stddev = max(self._bias_stddev * math.sqrt(1 - share), LEAST_BIAS_STDDEV)
+        self._bias_stddev = max(self._bias_stddev * math.sqrt(1 - share), MIN_BIAS_STDDEV)
 
     def _turned(self, mid_s: float, solver: Solver) -> PointingPrior | None:
         """The last attitude, turned on to a time; None without one, or where readings lack."""
         if self._seen is None or self._readings is None:
             return None
-        turn = self._readings.turn(self._seen_s, mid_s, MOST_MISSING_S, self._bias)
+        turn = self._readings.turn(self._seen_s, mid_s, MAX_MISSING_S, self._bias)
         if turn is None:
             return None
         link = _link(solver)

@@ -15,7 +15,7 @@ from starpos.navigation.recent import BACK_S, RecentReadings
 # time for which readings are kept, and length of a block
 KEPT_S, BLOCK_S = 60.0, 1.0
 # rad/s; every gyro measures up to this, so values repeated below it are not clipping
-LEAST_RANGE = 1.0
+MIN_RANGE = 1.0
 NO_RATES = np.zeros((0, 3))
 
 
@@ -61,7 +61,7 @@ class GyroReadings:
         imu = recent.since(min(begin_s, recent.last_s - 1e-6))
         rows = (block[block[:, 0] > begin_s, 1:4] for block in recent.blocks() if block[-1, 0] > begin_s)
         rates = np.concatenate([NO_RATES, *rows])
-        if len(rates) and (np.abs(rates[clipped(rates)]) > LEAST_RANGE).any():
+        if len(rates) and (np.abs(rates[clipped(rates)]) > MIN_RANGE).any():
             return None
         turn, missing_s = turn_between(replace(imu, gyro=imu.gyro - bias), begin_s, end_s)
         return turn if missing_s <= most_missing_s else None

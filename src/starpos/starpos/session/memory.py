@@ -14,9 +14,9 @@ from starpos.instrument.inclinometer import Tilt
 from starpos.instrument.tilt_log import TiltLog
 from starpos.instrument.tilts import TiltsByTime
 
-MOST_POSES = 36
+MAX_POSES = 36
 # The newest tilts of a pose.
-MOST_TILTS = 64
+MAX_TILTS = 64
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class _Pose:
     first: Fix
     newest: Seen
     frames: int = 0
-    tilts: deque[Tilt] = field(default_factory=lambda: deque(maxlen=MOST_TILTS))
+    tilts: deque[Tilt] = field(default_factory=lambda: deque(maxlen=MAX_TILTS))
 
     def add(self, seen: Seen) -> None:
         self.newest = seen
@@ -78,7 +78,7 @@ class PoseMemory:
     """Keeps each pose's last frame with the mean tilt of the pose; drops the oldest poses."""
 
     def __init__(self) -> None:
-        self._poses: deque[_Pose] = deque(maxlen=MOST_POSES)
+        self._poses: deque[_Pose] = deque(maxlen=MAX_POSES)
 
     def __len__(self) -> int:
         return len(self._poses)

@@ -23,7 +23,7 @@ from starpos.gnss.place import GnssPlace, known_place, message_to_gnss
 from starpos.gnss.track import GnssTrack
 from starpos.messages.attitude import message_to_attitude
 from starpos.messages.stamp import stamp_to_unix
-from starpos.navigation.adjustment import FEWEST_FRAMES
+from starpos.navigation.adjustment import MIN_FRAMES
 from starpos.navigation.at_place import BodyAttitude, attitude_at_place
 from starpos.navigation.estimate import Estimate
 from starpos.navigation.motion import PLACE
@@ -244,7 +244,7 @@ class NavigatorSession:
             return
         record = recent.record()
         inside = [f for f in record.frames if f.utc_unix_s <= time_s]
-        if len(inside) < FEWEST_FRAMES or time_s - record.blocks[0][0, 0] < SHORTEST_S:
+        if len(inside) < MIN_FRAMES or time_s - record.blocks[0][0, 0] < SHORTEST_S:
             return
         self._adjusted_s = time_s
         vessel, voyage = self._settings.vessel(self._clock_stddev_s), self._voyage
@@ -341,7 +341,7 @@ class NavigatorSession:
             "velocities in the window": recent.velocities,
         }
         if estimate is None or known is None:
-            apart = recent.frames >= FEWEST_FRAMES and recent.newest_frame_s == -math.inf
+            apart = recent.frames >= MIN_FRAMES and recent.newest_frame_s == -math.inf
             return Diagnosis(Level.WARN, APART if apart else self._trouble, values)
         since_s = recent.readings.last_s - self._seen_s
         speed = float(np.sqrt(np.trace(estimate.fix.velocity_covariance) / 3))

@@ -6,11 +6,11 @@ from collections import deque
 
 # Interval over which the share of dropped frames is taken, and minimum number of frames.
 LATELY_S, MIN_FRAMES = 10.0, 10
-MOST_KEPT = 2000
-MOST_DROPPED = 0.5
+MAX_KEPT = 2000
+MAX_DROPPED = 0.5
 # Share of the interval by which a frame may come early, so that jitter of the stamps costs none.
 JITTER = 0.25
-MOST_RATE = 1000.0
+MAX_RATE = 1000.0
 
 
 class Pace:
@@ -26,7 +26,7 @@ class Pace:
         self._most_hz = self._before_s = self._due_s = math.nan
         self._number: int | None = None
         # when each frame came, and whether it was taken
-        self._lately: deque[tuple[float, bool]] = deque(maxlen=MOST_KEPT)
+        self._lately: deque[tuple[float, bool]] = deque(maxlen=MAX_KEPT)
 
     def wants(self, unix_s: float | None, most_hz: float) -> bool:
         """Whether a frame of this stamp is wanted at a rate of at most most_hz; NaN: all, as without a stamp."""
@@ -74,7 +74,7 @@ class Pace:
     def drop(self, now_s: float, frames: int = 1) -> None:
         """Note frames that cannot be worked on."""
         self.dropped += frames
-        for _ in range(min(frames, MOST_KEPT)):
+        for _ in range(min(frames, MAX_KEPT)):
             self._note(now_s, False)
 
     def _note(self, now_s: float, taken: bool) -> None:
@@ -87,7 +87,7 @@ class Pace:
         """Sentence, where most of the latest frames were dropped; '' where they were not."""
         frames = len(self._lately)
         dropped = sum(not taken for _, taken in self._lately)
-        if frames < MIN_FRAMES or dropped <= MOST_DROPPED * frames:
+        if frames < MIN_FRAMES or dropped <= MAX_DROPPED * frames:
             return ""
         return (
             f"{100 * dropped / frames:.0f} % of the frames of the last {LATELY_S:.0f} s were dropped: more come than "

@@ -22,7 +22,7 @@ from starpos.night.searching import NEVER_S
 from starpos.session.now import Now
 
 # Share of the time between frames in which one may be searched.
-MOST_OF_INTERVAL = 0.5
+MAX_OF_INTERVAL = 0.5
 # a deadline in the past: one search only
 AT_ONCE_S = 0.0
 
@@ -54,7 +54,7 @@ class Search:
         if now is not None and now.played:
             return NEVER_S if most_s > 0 else AT_ONCE_S
         if now is not None:
-            most_s = min(most_s, 0.0 if others_wait else MOST_OF_INTERVAL * self._interval_s)
+            most_s = min(most_s, 0.0 if others_wait else MAX_OF_INTERVAL * self._interval_s)
         return time.monotonic() + most_s
 
     def solved(

@@ -18,9 +18,9 @@ LEARNED = 5
 # Number of the last frames that determine the camera's lag.
 KEPT = 30
 # Lags within this of the usual one are the camera's own; a camera whose lag scatters more is not paired.
-LEAST_LAG_SPREAD_S, MOST_LAG_SPREAD_S = 0.005, 0.05
+MIN_LAG_SPREAD_S, MAX_LAG_SPREAD_S = 0.005, 0.05
 # The same of lengths. A spark just before the contact closes makes a pulse begin early, and longer by the same time.
-LEAST_LENGTH_SPREAD_S, MOST_LENGTH_SPREAD_S = 0.0001, 0.002
+MIN_LENGTH_SPREAD_S, MAX_LENGTH_SPREAD_S = 0.0001, 0.002
 # A robust standard deviation is the median deviation times this; the camera's own scatter is within this many of them.
 OF_MEDIAN, SIGMAS = 1.4826, 4.0
 # Time by which a driver may report the begin of an exposure too late.
@@ -159,7 +159,7 @@ class ShutterPulses:
         agreeing = [
             (lag, length)
             for lag, length in self._seen
-            if abs(lag - lag_s) <= MOST_LAG_SPREAD_S and abs(length - length_s) <= MOST_LENGTH_SPREAD_S
+            if abs(lag - lag_s) <= MAX_LAG_SPREAD_S and abs(length - length_s) <= MAX_LENGTH_SPREAD_S
         ]
         return agreeing if len(agreeing) >= LEARNED and 2 * len(agreeing) > len(self._seen) else []
 
@@ -174,9 +174,9 @@ def _doubt(lag_s: float, length_s: float, usual: list[tuple[float, float]]) -> s
     """Say why a pulse is not the camera's own, by its lag and length compared with the usual ones; '' if it may be."""
     lags, lengths = zip(*usual, strict=True)
     lag, length = _median(lags), _median(lengths)
-    if abs(lag_s - lag) > _spread(lags, lag, LEAST_LAG_SPREAD_S, MOST_LAG_SPREAD_S):
+    if abs(lag_s - lag) > _spread(lags, lag, MIN_LAG_SPREAD_S, MAX_LAG_SPREAD_S):
         return f"its pulse came {lag_s:.3f} s after the command where others come after {lag:.3f} s"
-    if abs(length_s - length) > _spread(lengths, length, LEAST_LENGTH_SPREAD_S, MOST_LENGTH_SPREAD_S):
+    if abs(length_s - length) > _spread(lengths, length, MIN_LENGTH_SPREAD_S, MAX_LENGTH_SPREAD_S):
         return f"its pulse lasted {length_s:.4f} s where others last {length:.4f} s"
     return ""
 

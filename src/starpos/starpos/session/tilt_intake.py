@@ -14,7 +14,7 @@ from starpos.session.settings import Settings
 from starpos.session.tilts import TiltBuffer
 from starpos.session.transforms import FrameNames, name_in
 
-MOST_EARLY = 1000
+MAX_EARLY = 1000
 
 
 class TiltIntake:
@@ -23,7 +23,7 @@ class TiltIntake:
     def __init__(self, tilts: TiltBuffer, names: FrameNames, settings: Settings, heard: Heard) -> None:
         self._tilts, self._names, self._settings, self._heard = tilts, names, settings, heard
         # those ahead of a clock that may have been heard only after them
-        self._early: deque[Any] = deque(maxlen=MOST_EARLY)
+        self._early: deque[Any] = deque(maxlen=MAX_EARLY)
 
     @property
     def waits(self) -> bool:
@@ -52,7 +52,7 @@ class TiltIntake:
 
     def go_on(self, now: Now) -> None:
         """Look again at those that were ahead of the clock."""
-        early, self._early = self._early, deque(maxlen=MOST_EARLY)
+        early, self._early = self._early, deque(maxlen=MAX_EARLY)
         for message in early:
             self._add(message, now)
 

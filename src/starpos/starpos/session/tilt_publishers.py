@@ -10,9 +10,9 @@ publisher.
 from dataclasses import dataclass
 
 # time after which a single publisher is used again: a minimum, periods of the other if it sent seldom, a maximum
-ALONE_S, ALONE_PERIODS, MOST_ALONE_S = 1.0, 2.5, 10.0
+ALONE_S, ALONE_PERIODS, MAX_ALONE_S = 1.0, 2.5, 10.0
 # highest rate of an inclinometer; it bounds how many messages between two received ones can be lost
-MOST_HZ = 500.0
+MAX_HZ = 500.0
 
 
 @dataclass
@@ -26,7 +26,7 @@ class _Voice:
 
     def speaks(self, now_s: float) -> bool:
         """Whether it may be going on."""
-        silence_s = min(max(ALONE_S, ALONE_PERIODS * self.period_s), MOST_ALONE_S)
+        silence_s = min(max(ALONE_S, ALONE_PERIODS * self.period_s), MAX_ALONE_S)
         return abs(now_s - self.heard_s) <= silence_s
 
 
@@ -42,7 +42,7 @@ class TiltPublishers:
         mine = self._voice_of(frame_id, number, now_s) or _Voice(frame_id, number, now_s)
         mine.number, mine.heard_s, mine.period_s = number, now_s, abs(now_s - mine.heard_s)
         # one that sends seldom is remembered, to learn how seldom
-        others = [v for v in self._voices if v is not mine and abs(now_s - v.heard_s) <= MOST_ALONE_S]
+        others = [v for v in self._voices if v is not mine and abs(now_s - v.heard_s) <= MAX_ALONE_S]
         self._voices = [*others, mine]
         self._speaking = [v for v in self._voices if v.speaks(now_s)]
 
@@ -57,7 +57,7 @@ class TiltPublishers:
         before = [
             v
             for v in of_frame
-            if v.number is not None and v.number < number <= v.number + 1 + abs(now_s - v.heard_s) * MOST_HZ
+            if v.number is not None and v.number < number <= v.number + 1 + abs(now_s - v.heard_s) * MAX_HZ
         ]
         return max(before, key=lambda v: (v.number, v.speaks(now_s), v.heard_s), default=None)
 

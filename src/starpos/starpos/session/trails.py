@@ -13,9 +13,9 @@ from starpos.messages.camera import message_to_camera
 from starpos.session.parameters import known_instrument
 
 # this share of an exposure may be without readings
-MOST_MISSING = 0.1
+MAX_MISSING = 0.1
 # cosine of the largest turn in an exposure: 60 deg
-LEAST_COSINE = 0.5
+MIN_COSINE = 0.5
 
 
 class Trails:
@@ -48,14 +48,14 @@ class Trails:
         if self._focal_px is None or frame.mid_unix_s is None or not frame.exposure_s:
             return frame
         begin_s, end_s = (frame.mid_unix_s + share * frame.exposure_s for share in (-0.5, 0.5))
-        turn = self._readings.turn(begin_s, end_s, MOST_MISSING * frame.exposure_s, np.zeros(3))
+        turn = self._readings.turn(begin_s, end_s, MAX_MISSING * frame.exposure_s, np.zeros(3))
         if turn is None:
             return frame
         # of directions at the beginning into those at the end; its last column is where a star on the axis goes
         moved = self._link @ turn.T @ self._link.T
-        x, y = self._focal_px * moved[:2, 2] / max(moved[2, 2], LEAST_COSINE)
+        x, y = self._focal_px * moved[:2, 2] / max(moved[2, 2], MIN_COSINE)
         # turned so far that stars cross the frame: their trail cannot be determined
-        if np.trace(moved) < 1 + 2 * LEAST_COSINE or np.hypot(x, y) > frame.width + frame.height:
+        if np.trace(moved) < 1 + 2 * MIN_COSINE or np.hypot(x, y) > frame.width + frame.height:
             return frame
         roll_rad = np.arctan2(moved[1, 0] - moved[0, 1], moved[0, 0] + moved[1, 1])
         return replace(frame, trail=Trail(middle_px=(float(x), float(y)), roll_rad=float(roll_rad)))

@@ -21,7 +21,7 @@ from starpos.sky.catalogue import Catalogue
 from starpos.utc import date_obs, unix_of
 
 TILT_RATE_HZ = 10.0
-MOST_BYTES = 1 << 31
+MAX_BYTES = 1 << 31
 
 
 def write_night(
@@ -80,7 +80,7 @@ def write_night(
 def _made(folder: Path) -> dict:
     """The files that were simulated, each with its digest; none without a record.  Raises OSError."""
     try:
-        said = json.loads(read_regular(folder / TRUTH, MOST_BYTES))
+        said = json.loads(read_regular(folder / TRUTH, MAX_BYTES))
         return {Path(name).name: digest for name, digest in said[SIMULATED].items()}
     except (ValueError, TypeError, LookupError, AttributeError, RecursionError, FileNotFoundError):
         return {}
@@ -107,7 +107,7 @@ def _take_away_simulated(folder: Path) -> None:
 
 
 def _digest(path: Path) -> str:
-    return hashlib.sha256(read_regular(path, MOST_BYTES)).hexdigest()
+    return hashlib.sha256(read_regular(path, MAX_BYTES)).hexdigest()
 
 
 def write_fits(path: Path | str, frame: Frame, start_utc: str, pixel_um: float = 1.0) -> None:

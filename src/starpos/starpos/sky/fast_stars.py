@@ -4,10 +4,10 @@
 Tycho-2 compares the satellite's places with places on old plates. Of bright stars, which the plates show as blots, and of
 fast ones, which were not found again, it has only the satellite's place (pflag X). Some of these move by
 arcminutes until today. Their motions here are from Hipparcos (ESA SP-1200, 1997); tools/data/fast_stars.py made the
-table, of all faster than LEAST_MAS_YEAR and V < 9.
+table, of all faster than MIN_MAS_YEAR and V < 9.
 """
 
-LEAST_MAS_YEAR = 400.0
+MIN_MAS_YEAR = 400.0
 # Many are pairs, whose orbits Hipparcos saw for three years only.
 FAST_SIGMA_MAS_YEAR = 10.0
 # Tycho identifier: motion in right ascension times cos dec, and in declination, mas/yr.

@@ -44,7 +44,7 @@ UNITS = {
 }
 # read where it is there: a star's errors are larger by it (Lindegren et al. 2021, A&A 649, A2)
 RUWE = "ruwe"
-MOST_BYTES = 4_000_000_000
+MAX_BYTES = 4_000_000_000
 # A star of Tycho-2 is one of Gaia's within this number of sigma of its place, and this distance besides,
 MATCH_SIGMA, MATCH_MAS = 5.0, 200.0
 # whose G is V within this: V - G is 0 to 0.5 for most stars and up to 3 for the reddest (Riello et al. 2021, A&A 649, A3)
@@ -121,8 +121,8 @@ def _table(path: Path) -> "Table":
                 with gzip.open(file) as unpacked:
                     start = unpacked.read(16)
             file.seek(0, 2)
-            if file.tell() > MOST_BYTES:
-                raise CatalogueError(f"{path}: more than {MOST_BYTES / 1e9:g} GB: give an extract")
+            if file.tell() > MAX_BYTES:
+                raise CatalogueError(f"{path}: more than {MAX_BYTES / 1e9:g} GB: give an extract")
         kinds = {b"# %ECSV": "ascii.ecsv", b"SIMPLE": "fits", b"<": "votable"}
         kind = next((kind for mark, kind in kinds.items() if start.startswith(mark)), "ascii.csv")
         return Table.read(path, format=kind)

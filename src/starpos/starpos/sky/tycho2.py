@@ -25,7 +25,7 @@ UNMEASURED_MAS_YEAR = 100.0
 # A record and its newline.
 MAIN_BYTES, SUPPLEMENT_BYTES = 207, 123
 # Four times the largest of the original files.
-MOST_BYTES = 120_000_000
+MAX_BYTES = 120_000_000
 CURE = "give tycho2_2.orig.tar.xz, or a folder with tyc2.dat.00 .. 19 and suppl_1.dat"
 
 # Each column's first byte (from 0) and length, by name.
@@ -78,7 +78,7 @@ def originals(source: Path) -> Iterator[tuple[str, bytes]]:
     try:
         if source.is_dir():
             for path in sorted(p for p in source.rglob("*") if p.name in wanted):
-                yield path.name, read_regular(path, MOST_BYTES)
+                yield path.name, read_regular(path, MAX_BYTES)
             return
         with open_regular(source) as packed, tarfile.open(fileobj=packed) as archive:
             for member in archive:

@@ -26,19 +26,19 @@ from starpos.zenith.sighting import Mark, ZenithSighting
 
 STEPS = 8
 # closer to a pole, a deflection is no longer small compared with the distance from it
-LEAST_COSINE = 1e-3
+MIN_COSINE = 1e-3
 # of its sigma: a smaller step is the last
 SETTLED = 1e-3
 # Anomalous refraction over image motion: a twenty-minute mean of zenith cameras scatters by 0.05 arcsec (Hirt 2006, A&A
 # 459, 283: 0.05 to 0.2 over hours) where a frame's image motion is 0.4. In air that moves no image nothing bends slowly.
 AIR_SHARE = 1 / 8
-# A night's share exceeds AIR_SHARE by this factor (1 sigma), at most by MOST_SIGMA of these: a face that is off by more
+# A night's share exceeds AIR_SHARE by this factor (1 sigma), at most by MAX_SIGMA of these: a face that is off by more
 # is no air.
-AIR_FACTOR, MOST_SIGMA = 1.5, 3.0
+AIR_FACTOR, MAX_SIGMA = 1.5, 3.0
 # size of the image motion at which its search begins, rad
 MOTION_RAD = 0.3 * ARCSEC
 # and below which it makes no difference
-LEAST_RAD = 1e-3 * ARCSEC
+MIN_RAD = 1e-3 * ARCSEC
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -120,7 +120,7 @@ def adjusted(
     """
     if len(sightings) < 3:
         raise FixError(f"{len(sightings)} frames make no session: at least 3, in several faces, are needed")
-    if np.cos(mark.latitude) < LEAST_COSINE:
+    if np.cos(mark.latitude) < MIN_COSINE:
         raise FixError("the mark is within 6 km of a pole, where eta has no direction")
     places = StarPlaces.of(sightings)
     sightings = places.applied(sightings)
@@ -152,7 +152,7 @@ def _prior_of(instrument: Instrument) -> np.ndarray:
     c = instrument.calibration
     weights = np.zeros((5, 5))
     covariance = np.asarray(c.covariance_arcsec2, float) + np.eye(3) * c.remounted_arcsec**2
-    weights[2:, 2:] = np.linalg.inv(covariance * ARCSEC**2 + np.eye(3) * LEAST_RAD**2)
+    weights[2:, 2:] = np.linalg.inv(covariance * ARCSEC**2 + np.eye(3) * MIN_RAD**2)
     return weights
 
 
@@ -167,9 +167,9 @@ def _air_of(lines: Lines, stated: np.ndarray, errors: Errors, prior: np.ndarray,
     from scipy.optimize import minimize
 
     def of(p: np.ndarray) -> Air:
-        motion = float(np.hypot(LEAST_RAD, MOTION_RAD * np.exp(p[0])))
+        motion = float(np.hypot(MIN_RAD, MOTION_RAD * np.exp(p[0])))
         return Air(
-            motion=motion, anomalous=motion * AIR_SHARE * AIR_FACTOR ** min(max(float(p[1]), 0.0), MOST_SIGMA)
+            motion=motion, anomalous=motion * AIR_SHARE * AIR_FACTOR ** min(max(float(p[1]), 0.0), MAX_SIGMA)
         )
 
     def cost(p: np.ndarray) -> float:

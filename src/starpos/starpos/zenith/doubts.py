@@ -17,9 +17,9 @@ from starpos.zenith.quality import FaceQuality
 from starpos.zenith.sighting import ZenithSighting
 
 # A deflection with a larger sigma is useless: maps of the geoid know it better.
-MOST_SIGMA_ARCSEC = 3.0
+MAX_SIGMA_ARCSEC = 3.0
 # On land 6 arcsec are usual, over 25 are found in high mountains only, over 120 nowhere.
-LARGE_ARCSEC, MOST_ARCSEC = 25.0, 120.0
+LARGE_ARCSEC, MAX_ARCSEC = 25.0, 120.0
 # chi-square of a step or of a face, which chance exceeds in one session of 10^5 with hundreds of frames
 DOUBTED_CHI2 = 36.0
 # a face above that is named: chance does it in one of 1000 sessions of eight faces
@@ -38,7 +38,7 @@ def check_session(found: Adjusted, sightings: Sequence[ZenithSighting]) -> None:
     """Raise FixError, with a sentence, where the readings do not bear a deflection."""
     sigma = float(np.sqrt(np.linalg.eigvalsh(found.covariance_arcsec2)[-1]))
     headings = np.degrees(mean_headings(sightings, found.faces))
-    if sigma > MOST_SIGMA_ARCSEC:
+    if sigma > MAX_SIGMA_ARCSEC:
         shown = ", ".join(f"{h:.0f}" for h in headings[:8])
         raise FixError(
             f"the faces do not come round: the top of the frame was at {shown} deg, which leaves {sigma:.3g} arcsec of "
@@ -51,7 +51,7 @@ def check_session(found: Adjusted, sightings: Sequence[ZenithSighting]) -> None:
     if chi2 > DOUBTED_CHI2:
         raise FixError(sentence)
     size = float(np.hypot(found.xi_arcsec, found.eta_arcsec))
-    if size > MOST_ARCSEC:
+    if size > MAX_ARCSEC:
         raise FixError(
             f"the deflection would be {size:.0f} arcsec, as on no place of the Earth: the site is "
             f"{_off(found)}, or the clock is wrong"

@@ -26,7 +26,7 @@ FIELD_LENGTH_M = 8_000.0
 # points of the path at which the field is evaluated
 POINTS = 65
 # The mean latitude serves for distance and azimuth, to 1e-6 of the distance up to here.
-MOST_STEP_M = 200_000.0
+MAX_STEP_M = 200_000.0
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -77,10 +77,10 @@ class _Step:
     def of(cls, begin: Station, end: Station, geoid: Geoid | None) -> "_Step":
         north, east = offset_m(begin, end)
         distance = float(np.hypot(north, east))
-        if distance > MOST_STEP_M:
+        if distance > MAX_STEP_M:
             raise StationError(
                 f"{begin.name} and {end.name} are {distance / 1000:.0f} km apart, levelling takes steps of at most "
-                f"{MOST_STEP_M / 1000:.0f} km: add stations between them"
+                f"{MAX_STEP_M / 1000:.0f} km: add stations between them"
             )
         # s times the unit vector along the azimuth is (north, east)
         slope = -0.5 * ARCSEC * np.array([north, east])

@@ -16,7 +16,7 @@ from starpos import rotation
 from starpos.zenith.sighting import ZenithSighting
 
 # factor by which the catalogue's errors may be smaller or larger than stated
-MOST_FACTOR = 5.0
+MAX_FACTOR = 5.0
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -101,6 +101,6 @@ def _factor(weights: np.ndarray, pull: np.ndarray) -> float:
         # a log-normal of a factor of 2 about what is stated, for sessions of few stars
         return size - float(half @ half) + (log_factor / np.log(2)) ** 2
 
-    most = float(np.log(MOST_FACTOR))
+    most = float(np.log(MAX_FACTOR))
     found = minimize_scalar(cost, bounds=(-most, most), method="bounded", options={"xatol": 0.02})
     return float(np.exp(found.x))

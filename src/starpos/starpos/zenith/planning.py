@@ -25,7 +25,7 @@ from starpos.zenith.sighting import Mark, ZenithSighting
 # a round: a quarter turn from face to face
 FACES = 4
 ROUNDS = (1, 2, 3, 4, 6)
-LEAST_FRAMES, MOST_FRAMES = 3, 240
+MIN_FRAMES, MAX_FRAMES = 3, 240
 # number of stars planned in a frame; they get a smaller error if the frame has more
 GROUPS = 12
 # How faces happen to lean decides how well the tiltmeter's turn is known, and so up to a third of the error: number of
@@ -161,8 +161,8 @@ class Planner:
         """The quickest plan whose xi and eta have at most that error; FixError, with the reason, where none has."""
         best, longest = None, None
         for rounds in ROUNDS:
-            low, high = LEAST_FRAMES - 1, MOST_FRAMES // (FACES * rounds)
-            if best is not None and best.duration_s < self._duration_s(rounds, LEAST_FRAMES):
+            low, high = MIN_FRAMES - 1, MAX_FRAMES // (FACES * rounds)
+            if best is not None and best.duration_s < self._duration_s(rounds, MIN_FRAMES):
                 break
             plan = longest = self.plan(rounds, high)
             if plan.largest_arcsec > sigma_arcsec:

@@ -12,7 +12,7 @@ from starpos.errors import StarposError, StationError
 from starpos.files import read_regular
 from starpos.utc import unix_of
 
-MOST_BYTES = 50_000_000
+MAX_BYTES = 50_000_000
 MADE_BY = "starpos deflection --json > session.json"
 # Errors that are new in each session.  All others are common to the sessions of an instrument, as far as anyone knows,
 # and no number of them averages these.
@@ -101,7 +101,7 @@ def read(path: Path | str) -> SessionResult:
     path = Path(path)
     try:
         lines = [
-            json.loads(line) for line in read_regular(path, MOST_BYTES).decode().splitlines() if line.strip()
+            json.loads(line) for line in read_regular(path, MAX_BYTES).decode().splitlines() if line.strip()
         ]
         whole = [line for line in lines if line.get("combined") is True and "xi_arcsec" in line]
         if len(whole) != 1:

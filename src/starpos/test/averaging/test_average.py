@@ -7,7 +7,7 @@ import pytest
 
 from starpos import rotation
 from starpos.averaging.average import Averager, average
-from starpos.averaging.claim import MOST_REMEMBERED
+from starpos.averaging.claim import MAX_REMEMBERED
 from starpos.averaging.filter import UNIT, PlaceFilter, Plane
 from starpos.earth.ellipsoid import curvature_radii_m
 from starpos.earth.orientation import earth_state
@@ -391,13 +391,13 @@ def test_a_clock_that_was_far_off_bends_no_average(rng):
 def test_memory_does_not_grow(rng):
     averager, two = Averager(), fixes(SkyField(), rng, [40.0] * 2)
     sizes = []
-    for k in range(3 * MOST_REMEMBERED):
+    for k in range(3 * MAX_REMEMBERED):
         averager.add(read_at(replace(two[k % 2], utc_unix_s=UTC + k), UTC + k, UTC + k + 1))
         sizes.append(len(pickle.dumps(vars(averager))))
     # once as much is remembered as ever
-    settled = MOST_REMEMBERED + 10
+    settled = MAX_REMEMBERED + 10
     # Counts have grown.
-    assert max(sizes[settled:]) <= max(sizes[:settled]) + 8 * MOST_REMEMBERED
+    assert max(sizes[settled:]) <= max(sizes[:settled]) + 8 * MAX_REMEMBERED
 
 
 def test_the_heading_of_a_pose_that_nobody_believed_is_none(rng):

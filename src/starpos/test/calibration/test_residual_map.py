@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 
 from starpos.calibration import residual_map
 from starpos.calibration.intrinsics import fit_camera
-from starpos.calibration.residual_map import MOST_ARROWS, draw_residuals, draw_rms
+from starpos.calibration.residual_map import MAX_ARROWS, draw_residuals, draw_rms
 from starpos_testing.skies.lenses import VACUUM, ideal, sightings
 
 
@@ -33,7 +33,7 @@ def test_each_of_a_few_stars_has_its_arrow(rng):
 
 
 def test_many_stars_are_the_means_of_their_cells(rng):
-    n = 20 * MOST_ARROWS
+    n = 20 * MAX_ARROWS
     xy = rng.uniform(-0.5, [999.5, 699.5], (n, 2))
     residual = np.stack([xy[:, 0] / 1000, -xy[:, 1] / 1000], -1) + rng.normal(0, 0.01, (n, 2))
     _, arrows, _ = drawn(xy, residual)

@@ -12,7 +12,7 @@ from starpos.earth.refraction import MIN_COS_ZENITH, Atmosphere
 from starpos.fix._adjustment import gain_of, spread
 from starpos.fix._scatter import extra_variance
 from starpos.fix.adjustment import adjustment_of, fitted
-from starpos.fix.outliers import GOOD_EXTRA, LEAST_EXTRA, distance2, expected_extra, judged
+from starpos.fix.outliers import GOOD_EXTRA, MIN_EXTRA, distance2, expected_extra, judged
 from starpos.instrument.camera import Camera
 from starpos.instrument.lens import EQUIDISTANT
 from starpos.normal import MEDIAN_OF_CHI2
@@ -167,7 +167,7 @@ def test_scatter_is_what_halving_finds(stars, median_of_chi2, rng):
     for scatter in (0.01, 0.1, 3.0):
         residual = rng.normal(0, scatter, (stars, 2))
         expected = searched(residual, covariance, 0.9, median_of_chi2)
-        found = extra_variance(residual, covariance, 0.9, median_of_chi2, LEAST_EXTRA, GOOD_EXTRA)
+        found = extra_variance(residual, covariance, 0.9, median_of_chi2, MIN_EXTRA, GOOD_EXTRA)
         assert found == pytest.approx(expected, rel=1e-3)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from starpos.errors import InstrumentError
-from starpos.instrument.axis import LEAST_UNKNOWN_PX, with_frame_size
+from starpos.instrument.axis import MIN_UNKNOWN_PX, with_frame_size
 from starpos.instrument.camera import Camera
 from starpos.instrument.instrument import Calibration, Instrument
 
@@ -74,7 +74,7 @@ def test_an_axis_of_which_nobody_says_where_it_is_is_an_error_of_a3_and_told(fir
     instrument, said = with_frame_size(Instrument(90000.0, calibration=KNOWN), first)
     assert instrument.size == size and words in said and "width, height" in said
     sigma = np.sqrt(np.diag(instrument.calibration.covariance_arcsec2))
-    assert sigma == pytest.approx(np.full(3, np.degrees(LEAST_UNKNOWN_PX / 90000) * 3600), rel=1e-3)
+    assert sigma == pytest.approx(np.full(3, np.degrees(MIN_UNKNOWN_PX / 90000) * 3600), rel=1e-3)
     # parts of one sensor lie as their headers say, wherever its axis is
     if size is not None and first.origin_px is not None:
         one, other = (instrument.camera_for(300, 200, (x, 40.0)) for x in (50.0, 90.0))

@@ -27,8 +27,8 @@ TOPIC, KIND = "/stars", "std_msgs/msg/UInt8MultiArray"
 @pytest.fixture
 def small(monkeypatch):
     """Bounds of a megabyte, so that a test need not have gigabytes."""
-    monkeypatch.setattr(bounds, "MOST_UNPACKED", 1 << 20)
-    monkeypatch.setattr(bounds, "MOST_AT_ONCE", 1 << 21)
+    monkeypatch.setattr(bounds, "MAX_UNPACKED", 1 << 20)
+    monkeypatch.setattr(bounds, "MAX_AT_ONCE", 1 << 21)
 
 
 def text(value: str) -> bytes:

@@ -181,7 +181,7 @@ def test_a_file_that_unpacks_to_too_much_or_is_no_zip_is_refused(report, tmp_pat
     broken.write_bytes(report.read_bytes()[:3000])
     assert main(["solve", str(broken)]) == 2
     # the file itself has 15 kB, and its contents 25
-    for limit, most in (("MOST_BYTES", 18_000), ("MOST_FILES", 3)):
+    for limit, most in (("MAX_BYTES", 18_000), ("MAX_FILES", 3)):
         with monkeypatch.context() as limits:
             limits.setattr(field, limit, most)
             assert main(["solve", str(report)]) == 2

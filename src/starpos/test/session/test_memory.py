@@ -6,7 +6,7 @@ import pytest
 from fixes import NOISE, T0, fix_at, seen_at, tilt_at
 
 from starpos.errors import TiltError
-from starpos.session.memory import MOST_POSES, MOST_TILTS, PoseMemory, RecentFrames, mean_tilt, tilts_of
+from starpos.session.memory import MAX_POSES, MAX_TILTS, PoseMemory, RecentFrames, mean_tilt, tilts_of
 
 
 def test_days_of_frames_stay_bounded_and_the_newest_are_kept():
@@ -54,9 +54,9 @@ def test_a_camera_that_stands_still_is_one_pose_with_its_last_stars_and_mean_til
 
 def test_many_frames_of_one_pose_and_many_poses_stay_bounded():
     poses = poses_of(*((k, 40.0) for k in range(3000)))
-    assert len(poses) == 1 and poses.frames()[0].tilt.samples == 5 * MOST_TILTS
+    assert len(poses) == 1 and poses.frames()[0].tilt.samples == 5 * MAX_TILTS
     poses = poses_of(*((k, k) for k in range(5000)))
-    assert len(poses) == MOST_POSES == len(poses.frames())
+    assert len(poses) == MAX_POSES == len(poses.frames())
     assert poses.frames()[-1].stars.mid_unix_s == T0 + 4999
 
 

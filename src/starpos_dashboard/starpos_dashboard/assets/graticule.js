@@ -6,14 +6,14 @@ const STEPS = [30, 15, 10, 5, 2, 1, ...[30, 20, 10, 5, 2, 1].map((m) => m / 60)]
   [30, 20, 10, 5, 2, 1, 0.5, 0.2, 0.1, 0.05, 0.02, 0.01, 0.005, 0.002, 0.001, 0.0005, 0.0002, 0.0001].map((s) => s * SECOND),
 );
 const WIDE = 0.9; // rad from the centre to a corner, from which all there are are drawn
-const LEAST_PX = { parallels: 80, meridians: 130 };
-const MOST_LINES = 80;
+const MIN_PX = { parallels: 80, meridians: 130 };
+const MAX_LINES = 80;
 
 const finest = (pxPerDegree, leastPx) => STEPS.filter((s) => s * pxPerDegree >= leastPx).pop() ?? STEPS[0];
 
 function multiples(step, from, to) {
   const list = [];
-  for (let i = Math.ceil(from / step - 1e-9); i * step <= to + 1e-9 * step && list.length < MOST_LINES; i++) list.push(i * step);
+  for (let i = Math.ceil(from / step - 1e-9); i * step <= to + 1e-9 * step && list.length < MAX_LINES; i++) list.push(i * step);
   return list;
 }
 
@@ -29,8 +29,8 @@ export function graticule(view, corner) {
   const narrowest = Math.cos((Math.max(Math.abs(south), Math.abs(north)) * Math.PI) / 180);
   const round = whole || degrees / Math.max(narrowest, 1e-12) > 180;
   const half = round ? 180 : degrees / narrowest;
-  const latStep = finest(pxPerDegree, LEAST_PX.parallels);
-  const lonStep = finest(pxPerDegree * Math.cos((view.lat * Math.PI) / 180), LEAST_PX.meridians);
+  const latStep = finest(pxPerDegree, MIN_PX.parallels);
+  const lonStep = finest(pxPerDegree * Math.cos((view.lat * Math.PI) / 180), MIN_PX.meridians);
   return {
     parallels: { step: latStep, at: multiples(latStep, south, north).filter((v) => Math.abs(v) < 90) },
     meridians: { step: lonStep, at: multiples(lonStep, view.lon - half, view.lon + half - (round ? 1e-6 : 0)) },

@@ -12,7 +12,7 @@ import * as text from "/text.js";
 
 const TICK_MS = 500;
 const AHEAD_S = 1; // a stamp further in the future is told
-const MOST_TRACK = 10000;
+const MAX_TRACK = 10000;
 const OWN_SOLUTION = /^[^/]+: Solution$/; // another instrument's name has its namespace
 
 let state = { lights: [], old_after: { slow: 15, fast: 5 } };
@@ -30,7 +30,7 @@ const link = new Link({
     render();
   },
   hearTrack({ begin, points }) {
-    track = (begin ? points : track.concat(points)).slice(-MOST_TRACK);
+    track = (begin ? points : track.concat(points)).slice(-MAX_TRACK);
   },
   hearFull(places) {
     full = places;
