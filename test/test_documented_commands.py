@@ -183,6 +183,7 @@ def test_the_instrument_file_that_is_shown_can_be_read(tmp_path):
     path = tmp_path / "mine.yaml"
     path.write_text(re.sub(r"^    ", "", shown, flags=re.MULTILINE))
     assert instrument_file.read(path).inclinometer_model == "scl3300"
+    assert [key for key in instrument_file.KEYS if not re.search(rf"\b{key}\b", page)] == []
 
 
 @pytest.mark.parametrize("name", ["docs/tutorials/robot.md", "src/starpos_bringup/README.md"])

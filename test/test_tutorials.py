@@ -17,8 +17,8 @@ from starpos_testing.command_line import run
 
 # frames are written as lists of their stars, which is quick and gives the same answers to some metres
 LISTS = ("--stars-only", "--focal-mm", "600", "--pixel-um", "6.4")
-# a photo that is identified with no option, a painted report and a cluster have tests of their own
-ELSEWHERE = re.compile("starpos (?:identify photo.jpg|report|doctor|.* --scheduler )")
+# photos that are identified with no option, a painted report and a cluster have tests of their own
+ELSEWHERE = re.compile("starpos (?:identify photo|report|doctor|.* --scheduler )")
 
 
 def typed(page, folder, monkeypatch, capsys) -> dict[str, str]:
@@ -156,3 +156,28 @@ def test_the_methods_commands_give_the_numbers_it_begins_with(tmp_path, monkeypa
     assert f"{pointing['stars_matched']} of {pointing['stars_detected']} stars" in page
     _, reading, *_ = (tmp_path / "one" / "tilt.csv").read_text().splitlines()
     assert all(f"radians({angle})" in page for angle in reading.split(",")[1:3])
+
+
+def test_the_error_budgets_page_explains_every_term_of_a_fix(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert run(capsys, "simulate", "night", "-n", "2", "--stars-only")[0] == 0
+    night = [
+        *sorted(map(str, (tmp_path / "night").glob("stars_*"))),
+        "--focal-mm",
+        "600",
+        "--pixel-um",
+        "6.4",
+        "--json",
+    ]
+    known = ("--misalignment", "0", "0", "0", "--misalignment-stddev", "5", "--tilt", "night/tilt.csv")
+    _, fixed, _ = run(capsys, "solve", *night, *known)
+    _, faced, _ = run(capsys, "solve", *night, "--site", "35.7046", "51.4106")
+    page = (ROOT / "docs" / "error_budget.md").read_text()
+    explained, more = (
+        re.findall(r"^\| `([^`]+)` \|", t, re.MULTILINE) for t in page.split("Some inputs add terms", 1)
+    )
+    assert list(json.loads(fixed.splitlines()[-1])["budget"]) == explained
+    assert set(json.loads(faced.splitlines()[-1])["budget"]) <= {*explained, *more}
+    sources = "".join(f.read_text() for f in (ROOT / "src" / "starpos" / "starpos").rglob("*.py"))
+    named = set(re.findall(r'(?:ErrorTerm|mount_term)\(\s*"([^"]+)"', sources))
+    assert {"mount", "pointing", "turn"} < named and named <= {*explained, *more}
