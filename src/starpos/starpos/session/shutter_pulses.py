@@ -13,6 +13,8 @@ from dataclasses import dataclass
 from itertools import takewhile
 from statistics import stdev
 
+from starpos.normal import SIGMA_PER_MAD
+
 # Frames that must agree before a pulse is believed.
 LEARNED = 5
 # Number of the last frames that determine the camera's lag.
