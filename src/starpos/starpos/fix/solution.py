@@ -44,7 +44,7 @@ class Attitude:
     """Pointing of the camera: ICRS place of the frame's centre pixel, and the position angle `roll` of its top (rad).
 
     model: of its lens.
-    focal_stddev_px: error of focal_px by the stars' residuals, without that of refraction; NaN where it is unknown.
+    focal_stddev_px: error of focal_px by the stars' residuals, refraction left out; NaN where it is unknown.
     """
 
     ra: float
