@@ -3,9 +3,9 @@
 
 Nights of `bench.py full accuracy` with A3 found by turning (30 headings of 4 frames, an hour), seen through each lens.
 Printed are the stars of a frame, and for each level the rms error of one axis of the place against the astronomic truth
-and, in brackets, the claimed error.  Two headings of one frame follow: from the nights with each level, whose place is
-known from the stars only, against the plumb line's north; and at a known place, as `bench.py full heading` measures it,
-against the north of WGS 84.  Lenses are ideal: their distortion is calibrated.
+and, in brackets, the claimed error.  The headings follow: at the end of the nights with each level, whose place is known
+from the stars only, against the plumb line's north; and of one frame at a known place, as `bench.py full heading`
+measures it, against the north of WGS 84.  Lenses are ideal: their distortion is calibrated.
 """
 
 import sys
@@ -27,6 +27,7 @@ from accuracy_by_configuration import (
 )
 from benchmark_heading import CASES, Case, headings
 
+from starpos.averaging.average import average
 from starpos.calibration.turning import turn
 from starpos.errors import StarposError
 from starpos.fix.solver import Solver
@@ -61,7 +62,7 @@ LEVELS = {"SCL3300 as sold": sensors.SCL3300, "tiltmeter of 0.1 arcsec": tiltmet
 
 
 def night_of(task: tuple) -> tuple[Night, list[int], np.ndarray]:
-    """A turned night's outcome, the stars of its frames, and errors and claims (n, 2) of their headings in rad."""
+    """A turned night's outcome, the stars of its frames, and error and claim (2,) of its last heading in rad."""
     case, errors, seed = task
     rng, catalogue = np.random.default_rng(seed), load_catalogue()
     world, begin = draw(rng, catalogue, errors, CLOCK_S, case.camera)
@@ -72,12 +73,11 @@ def night_of(task: tuple) -> tuple[Night, list[int], np.ndarray]:
     counts = [len(s.x) for s in stars]
     try:
         found = turn(solver, stars, tilts)
+        last = average(found.fixes)
     except StarposError as e:
-        return lost(e), counts, np.empty((0, 2))
-    fixes = [(s.fix, face) for s, face in zip(found.solutions, faces, strict=True) if s.fix]
-    off = half_turns(np.array([fix.heading - face for fix, face in fixes]))
-    claim = np.sqrt([fix.covariance[2, 2] for fix, _ in fixes])
-    return outcome(lambda: found.fixes, world), counts, np.stack([off, claim], 1)
+        return lost(e), counts, np.full(2, np.nan)
+    heading = np.array([half_turns(last.heading - faces[-1]), np.sqrt(last.covariance[2, 2])])
+    return outcome(lambda: found.fixes, world), counts, heading
 
 
 def field(camera: Camera) -> str:
@@ -111,7 +111,7 @@ def run(args) -> int:
                 counts += [count for _, frames, _ in done for count in frames]
                 error, claim, _ = cell(nights)
                 places.append(f"{metres(error)} ({metres(claim)})")
-                off, claim = np.sqrt((np.concatenate([h for *_, h in done]) ** 2).mean(0)) / ARCSEC
+                off, claim = np.sqrt(np.nanmean([h**2 for *_, h in done], 0)) / ARCSEC
                 faces.append(f"{off:.2g} ({claim:.2g}) arcsec")
             seeds = np.random.SeedSequence([args.seed, len(LEVELS)]).spawn(args.frames)
             answers = list(pool.map(headings, [(case, seed) for seed in seeds], chunksize=10))
