@@ -3,9 +3,9 @@
 
 Nights of `bench.py full accuracy` with A3 found by turning (30 headings of 4 frames, an hour), seen through each lens.
 Printed are the stars of a frame, and for each level the rms error of one axis of the place against the astronomic truth
-and, in brackets, the claimed error.  The headings follow: at the end of the nights with each level, whose place is known
-from the stars only, against the plumb line's north; and of one frame at a known place, as `bench.py full heading`
-measures it, against the north of WGS 84.  Lenses are ideal: their distortion is calibrated.
+and, in brackets, the claimed error.  Then come headings at the end of the nights with each level, whose place is known
+from the stars only, against the plumb line's north.  The last heading is of one frame at a known place, as `bench.py
+full heading` measures it, against the north of WGS 84.  Lenses are ideal: their distortion is calibrated.
 """
 
 import sys
