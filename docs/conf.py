@@ -6,15 +6,12 @@ Sphinx reads from the root of the repository, so that the packages' READMEs are 
 
 import os
 import re
-import sys
 from pathlib import Path
 
 import starpos
 from starpos.cli import COMMANDS, parser_for
 
 ROOT = Path(__file__).resolve().parents[1]
-INTERFACES = ROOT / "starpos_interfaces"
-PARAMETERS = ROOT / "src" / "starpos_bringup" / "config" / "starpos.yaml"
 # lines of a docstring that tell of something by its name, in columns or after a colon
 COLUMNS, NAMED = re.compile(r"[\w, ]*\w(?: \([^)]*\))? {2,}\S"), re.compile(r"[\w, ]*\w(?: \([^)]*\))?: \S")
 
@@ -48,23 +45,6 @@ autodoc_member_order = "bysource"
 autodoc_typehints = "none"
 
 
-def about_parameters() -> str:
-    """Tables of all parameters, from the comments of starpos.yaml, which is made from the nodes' own tables."""
-    made: list[str] = []
-    said: list[str] = []
-    for line in PARAMETERS.read_text().splitlines():
-        if node := re.match(r"/\*\*/(\w+):", line):
-            made += [f"\n## {node[1]}\n", "| parameter | what it is |", "| --- | --- |"]
-            said = []
-        elif line.startswith("    # "):
-            said.append(line[6:].replace("|", "\\|"))
-        elif value := re.match(r"    ([\w./]+): (.*)", line):
-            default = "unset" if value[2] == ".nan" else value[2]
-            made.append(f"| `{value[1]}` | {' '.join(said)} Default: `{default}`. |")
-            said = []
-    return "\n".join(made)
-
-
 def about_names() -> str:
     """Directives of autodoc for the public names, by the folder of `starpos` that they live in."""
     made, folder = [], ""
@@ -89,35 +69,33 @@ def about_commands() -> str:
     return "\n".join(made)
 
 
-def about_troubles() -> str:
-    """The messages of commands and nodes, from the code."""
-    sys.path.insert(0, str(ROOT / "tools"))
-    import messages
-
-    return messages.page()
-
-
-def about_messages() -> str:
-    """The definitions of messages and services, which say of each field what it is."""
-    files = [*sorted(INTERFACES.glob("msg/*.msg")), *sorted(INTERFACES.glob("srv/*.srv"))]
-    about = ((f.stem, f.read_text().split("\n", 1)[1].strip()) for f in files)
-    return "\n".join(f"## {name}\n\n```\n{text}\n```\n" for name, text in about)
-
-
+# Words that newcomers search for, by the page that the site's search should give first.
+SEARCHED = {
+    "docs/how-to/calibrate": ("calibration", "calibrate", "misalignment", "boresight"),
+    "docs/how-to/deflection": ("zenith camera", "plumb line", "deflection of the vertical"),
+    "docs/how-to/gnss": ("GPS", "GNSS", "jamming", "spoofing"),
+    "docs/how-to/time": ("clock", "wrong clock", "chrony", "NTP", "PPS"),
+    "docs/sensors": ("tilt", "tiltmeter", "inclinometer", "accelerometer", "level"),
+    "docs/navigation": ("gyro", "gyroscope", "IMU", "moving"),
+    "docs/tutorials/azimuth": ("compass", "north", "true north", "gyrocompass", "azimuth"),
+    "docs/tutorials/disk": ("plate solving", "plate solve", "plate solver", "astrometry", "plate scale"),
+    "docs/tutorials/robot": ("GPS denied", "GNSS denied", "star tracker", "celestial navigation", "robot"),
+}
 MADE = {
     "<!-- commands -->": about_commands,
-    "<!-- messages -->": about_messages,
-    "<!-- parameters -->": about_parameters,
     "<!-- public names -->": about_names,
-    "<!-- troubles -->": about_troubles,
 }
 
 
 def fill_in(app: object, name: str, source: list[str]) -> None:
-    """Put what is made of the code into a page."""
+    """Put what is made of the code into a page, and the words by which the search finds it."""
     for mark, make in MADE.items():
         if mark in source[0]:
             source[0] = source[0].replace(mark, make())
+    if words := SEARCHED.get(name):
+        title, _, rest = source[0].partition("\n")
+        entries = "".join(f"   ! single: {word}\n" for word in words)
+        source[0] = f"{title}\n\n```{{eval-rst}}\n.. index::\n{entries}```\n{rest}"
 
 
 def as_written(app: object, what: str, name: str, thing: object, options: object, lines: list[str]) -> None:
@@ -136,8 +114,12 @@ def as_written(app: object, what: str, name: str, thing: object, options: object
 
 
 def lead_in(app: object, error: Exception | None) -> None:
-    """Lead from the site's root to its first page."""
+    """Lead from the site's root to its first page; raise ValueError where SEARCHED names a page that is not there."""
     if error is None:
+        if gone := SEARCHED.keys() - app.env.all_docs.keys():
+            raise ValueError(
+                f"docs/conf.py: SEARCHED names pages that are not there: {', '.join(sorted(gone))}"
+            )
         page = '<!doctype html><title>starpos</title><meta http-equiv="refresh" content="0; url=docs/index.html">\n'
         (Path(app.outdir) / "index.html").write_text(page)
 

@@ -4,6 +4,8 @@
 import ast
 import io
 import re
+import subprocess
+import sys
 import tokenize
 from pathlib import Path
 
@@ -67,6 +69,12 @@ def test_the_architecture_names_every_folder_of_starpos():
     [_, section] = (ROOT / "docs" / "architecture.md").read_text().split("## Folders of starpos\n", 1)
     folders = {p.parent.name for p in MODULES["starpos"].glob("*/__init__.py")}
     assert folders and {name for name in folders if f"`{name}`" not in section} == set()
+
+
+def test_pages_of_the_reference_are_what_the_code_makes():
+    tool = [sys.executable, ROOT / "tools" / "reference.py", "--check"]
+    done = subprocess.run(tool, check=False, capture_output=True, text=True)
+    assert (done.returncode, done.stdout) == (0, ""), done.stderr
 
 
 def test_the_readme_is_short():

@@ -17,8 +17,8 @@ from starpos_testing.command_line import run
 
 # frames are written as lists of their stars, which is quick and gives the same answers to some metres
 LISTS = ("--stars-only", "--focal-mm", "600", "--pixel-um", "6.4")
-# a photo that is identified with no option, a painted report and a cluster have tests of their own
-ELSEWHERE = re.compile("starpos (?:identify photo.jpg|report|doctor|.* --scheduler )")
+# photos that are identified with no option, a painted report and a cluster have tests of their own
+ELSEWHERE = re.compile("starpos (?:identify photo|report|doctor|.* --scheduler )")
 
 
 def typed(page, folder, monkeypatch, capsys) -> dict[str, str]:
@@ -55,7 +55,7 @@ def test_the_disks_commands_print_what_the_page_says(tmp_path, monkeypatch, caps
     page = (ROOT / "docs" / "tutorials" / "disk.md").read_text()
     [turned] = re.findall(r"^    (turn: 12 frames together: .*)$", page, re.MULTILINE)
     assert any(turned in out.splitlines() for out in said.values())
-    assert (tmp_path / "mine.yaml").is_file()
+    assert (tmp_path / "instrument.yaml").is_file()
     # of frames instead of lists the last digits are others
     [night] = re.findall(r"^    (night: 10 frames together: .*)$", page, re.MULTILINE)
     assert any(numbers(line) == pytest.approx(numbers(night), rel=0.05) for line in lines(said))
@@ -73,7 +73,7 @@ def test_a3_is_found_by_the_commands_that_say_how(tmp_path, monkeypatch, capsys)
     [night] = [out for line, out in said.items() if line.startswith("starpos solve night")]
     [where] = [line for line in night.splitlines() if "2 frames together" in line]
     assert numbers(where)[1:3] == pytest.approx([35.7046, 51.4106], abs=0.005)
-    assert {f.name for f in tmp_path.glob("*.yaml")} == {"mine.yaml", "pillar.yaml"}
+    assert {f.name for f in tmp_path.glob("*.yaml")} == {"instrument.yaml", "pillar.yaml"}
 
 
 def test_the_camera_is_calibrated_by_the_command_that_says_how(tmp_path, monkeypatch, capsys):
@@ -110,7 +110,7 @@ def test_another_solvers_pointings_make_a_place_by_the_command_that_says_how(tmp
     known = "camera: {focal_mm: 600, pixel_um: 6.4}\nmisalignment_deg: [0, 0, 0]"
     known += "\ncalibration_stddev_arcsec: [5, 5, 20]\ninclinometer: {model: sca100t_calibrated}"
     known = f"starpos_instrument: 1\n{known}\n"
-    (tmp_path / "mine.yaml").write_text(known)
+    (tmp_path / "instrument.yaml").write_text(known)
     [solved] = typed("docs/how-to/pointings.md", tmp_path, monkeypatch, capsys).values()
     [night] = [line for line in solved.splitlines() if "3 frames together" in line]
     assert numbers(night)[1:3] == pytest.approx([35.7046, 51.4106], abs=0.005)
@@ -156,3 +156,28 @@ def test_the_methods_commands_give_the_numbers_it_begins_with(tmp_path, monkeypa
     assert f"{pointing['stars_matched']} of {pointing['stars_detected']} stars" in page
     _, reading, *_ = (tmp_path / "one" / "tilt.csv").read_text().splitlines()
     assert all(f"radians({angle})" in page for angle in reading.split(",")[1:3])
+
+
+def test_the_error_budgets_page_explains_every_term_of_a_fix(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert run(capsys, "simulate", "night", "-n", "2", "--stars-only")[0] == 0
+    night = [
+        *sorted(map(str, (tmp_path / "night").glob("stars_*"))),
+        "--focal-mm",
+        "600",
+        "--pixel-um",
+        "6.4",
+        "--json",
+    ]
+    known = ("--misalignment", "0", "0", "0", "--misalignment-stddev", "5", "--tilt", "night/tilt.csv")
+    _, fixed, _ = run(capsys, "solve", *night, *known)
+    _, faced, _ = run(capsys, "solve", *night, "--site", "35.7046", "51.4106")
+    page = (ROOT / "docs" / "error_budget.md").read_text()
+    explained, more = (
+        re.findall(r"^\| `([^`]+)` \|", t, re.MULTILINE) for t in page.split("Some inputs add terms", 1)
+    )
+    assert list(json.loads(fixed.splitlines()[-1])["budget"]) == explained
+    assert set(json.loads(faced.splitlines()[-1])["budget"]) <= {*explained, *more}
+    sources = "".join(f.read_text() for f in (ROOT / "src" / "starpos" / "starpos").rglob("*.py"))
+    named = set(re.findall(r'(?:ErrorTerm|mount_term)\(\s*"([^"]+)"', sources))
+    assert {"mount", "pointing", "turn"} < named and named <= {*explained, *more}

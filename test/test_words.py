@@ -34,7 +34,6 @@ def found(path: Path, text: str) -> tuple[int, list[str]]:
         ("The center of the frame.", "spelling"),
         ("An optimized fit.", "spelling"),
         (f"It has {FORTY}.", "long"),
-        ("```{glossary}\nlevel\n  It tells which way is down.\n```", "tells"),
     ],
 )
 def test_a_breach_is_found_on_its_line(tmp_path, text, kind):

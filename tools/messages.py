@@ -1,12 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Print the messages of commands and nodes, by the part of the program that writes them, from the code.
-
-`messages.py` prints Markdown: what happened, and what to do. docs/reference/troubleshooting.md shows it on the site.
-"""
+"""The messages of commands and nodes, from the code, for docs/reference/troubleshooting.md (see reference.py)."""
 
 import ast
 import re
-import sys
 from collections.abc import Iterator, Mapping
 from functools import cache
 from pathlib import Path
@@ -29,6 +25,8 @@ MIN_WORDS, MIN_WORDS_A_VALUE = 4, 1.5
 GAP = "…"
 WORD = re.compile(r"[A-Za-z]{2,}")
 MARKUP = re.compile(r"<|&\w+;")
+# The end of another message, or a line to type.
+FRAGMENT = re.compile(rf"\W*{GAP}[,;]|[,;.]|(?:pip|sudo|export|of) ")
 # What happened, in three words or more, and behind a colon or semicolon what to do.
 PARTS = re.compile(r"^(?P<happened>(?:\S+ ){2,}?\S+?)(?:: |; )(?P<advice>.+)$", re.DOTALL)
 
@@ -119,7 +117,8 @@ def messages(folder: str, errors: set[str], shared: Mapping[str, str]) -> list[M
             # the place, such as a file, comes first
             plain = re.sub(rf"^{GAP}: ", "", " ".join(text.split())).rstrip(".")
             words = len(WORD.findall(plain))
-            if words >= max(MIN_WORDS, MIN_WORDS_A_VALUE * plain.count(GAP)) and not MARKUP.search(plain):
+            long_enough = words >= max(MIN_WORDS, MIN_WORDS_A_VALUE * plain.count(GAP))
+            if long_enough and not MARKUP.search(plain) and not FRAGMENT.match(plain):
                 parts = PARTS.match(plain)
                 found.add(Message(parts["happened"], parts["advice"]) if parts else Message(plain, ""))
     return sorted(found, key=lambda message: (message.happened.lstrip(f"{GAP} ").lower(), message))
@@ -133,7 +132,7 @@ def about(package: Path) -> str:
 
 def cell(text: str) -> str:
     """A text as code in a table."""
-    return f"`` {text} ``".replace("|", "\\|") if text else ""
+    return f"`` {text} ``".replace("|", "\\|") if WORD.search(text) else ""
 
 
 def page() -> str:
@@ -148,8 +147,4 @@ def page() -> str:
             made += [f"\n## {folder.name}\n", about(folder / "__init__.py"), ""]
             made += ["| what happened | what it means, what to do |", "| --- | --- |"]
             made += [f"| {cell(message.happened)} | {cell(message.advice)} |" for message in found]
-    return "\n".join(made)
-
-
-if __name__ == "__main__":
-    sys.stdout.write(page() + "\n")
+    return "\n".join(made) + "\n"

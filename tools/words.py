@@ -75,9 +75,9 @@ PATTERNS = [
         for wrong, advice in AMERICAN.items()
     ),
 ]
-# Generated tables, comments and code of Markdown, which are left out; a glossary stands between fences, too.
+# Generated tables, comments and code of Markdown, which are left out.
 LEFT_OUT = re.compile(
-    r"<!-- table -->.*?<!-- end of table -->|<!--.*?-->|^ *```(?!\{glossary\}).*?^ *```$|^(?: {4}|\t)[^\n]*(?=\n)",
+    r"<!-- table -->.*?<!-- end of table -->|<!--.*?-->|^ *```.*?^ *```$|^(?: {4}|\t)[^\n]*(?=\n)",
     re.DOTALL | re.MULTILINE,
 )
 # What a program reads or prints, and addresses, are quoted as they are.

@@ -26,7 +26,8 @@ COMMON = (
     Parameter(
         "cadence",
         5.0,
-        "From the start of one exposure to the start of the next; shorter than a frame takes, frames are skipped.",
+        "Time from the start of one exposure to the start of the next. If a frame takes longer, "
+        "some are skipped.",
         unit="s",
         minimum=0.01,
         maximum=86400.0,
@@ -51,8 +52,9 @@ COMMON = (
     Parameter(
         "command_lag",
         0.0,
-        "From the command to the start of the exposure, for cameras that do not report when it began. Each "
-        "second it is set too small moves longitudes 15 arcsec east, which a known place shows.",
+        "Time from the command to the start of the exposure, for cameras that do not report the "
+        "start. Each second that it is set too small moves longitudes 15 arcsec east; a known place "
+        "shows that.",
         unit="s",
         minimum=-10.0,
         maximum=60.0,
@@ -60,8 +62,8 @@ COMMON = (
     Parameter(
         "command_lag_stddev",
         0.3,
-        "How far that lag may be off; 0.1 s is 46 m at the equator. The default is for a camera that was "
-        "not measured.",
+        "Error of command_lag, 1 sigma; 0.1 s is 46 m at the equator. The default is for a camera "
+        "whose lag was not measured.",
         unit="s",
         minimum=0.0,
         maximum=60.0,
@@ -69,9 +71,9 @@ COMMON = (
     Parameter(
         "driver_lag",
         0.0,
-        "From the start of an exposure that a driver reports (INDI, Alpaca) to the opening of the shutter: "
-        "a driver reports when it sent the command. A single-lens reflex takes tenths of a second more. "
-        "Same effect as command_lag.",
+        "Time from the start that a driver (INDI, Alpaca) reports to the opening of the shutter: a "
+        "driver reports when it sent the command, and a single-lens reflex opens tenths of a second "
+        "later. Its error has the same effect as that in command_lag.",
         unit="s",
         minimum=-10.0,
         maximum=60.0,
@@ -79,8 +81,8 @@ COMMON = (
     Parameter(
         "driver_lag_stddev",
         0.05,
-        "How far that lag may be off; 0.05 s is 23 m at the equator. If too small, fixes claim errors that "
-        "are too small.",
+        "Error of driver_lag, 1 sigma; 0.05 s is 23 m at the equator. If too small, fixes claim "
+        "errors that are too small.",
         unit="s",
         minimum=0.0,
         maximum=60.0,
@@ -88,9 +90,10 @@ COMMON = (
     Parameter(
         "readout",
         math.nan,
-        "From the row of a frame that is read first to the last, of a rolling shutter: positive where the top row is "
-        "first, negative where the bottom one is; 0 for a global shutter. Unset: as the source knows it, and where that "
-        "knows nothing, fixes hold 0.03 s. The wrong sign makes a fix wrong by twice what it would be without.",
+        "Time a rolling shutter takes from the first row to the last: positive if the top row is "
+        "read first, negative if the bottom row is; 0 for a global shutter. Unset takes what the "
+        "source knows; if it knows nothing, fixes include an error of 0.03 s. The wrong sign "
+        "doubles the error that it should remove.",
         unit="s",
         minimum=-MAX_READOUT_S,
         maximum=MAX_READOUT_S,
@@ -98,7 +101,7 @@ COMMON = (
     Parameter(
         "readout_stddev",
         0.0,
-        "How far `readout` may be off, where that is set; 0.03 s is some tens of metres, all frames alike.",
+        "Error of `readout` where it is set, 1 sigma; 0.03 s moves all fixes alike, by some tens of metres.",
         unit="s",
         minimum=0.0,
         maximum=MAX_READOUT_S,
@@ -106,14 +109,15 @@ COMMON = (
     Parameter(
         "calibration_url",
         "",
-        "Calibration YAML of the camera (file:///... or a path), written by set_camera_info; without one the "
-        "camera is ideal, of focal_mm and pixel_um. One of another lens or frame size gives no fix, or a wrong heading.",
+        "Calibration YAML of the camera (file:///... or a path), written by set_camera_info; "
+        "without it, an ideal lens with focal_mm and pixel_um. The calibration of another lens or "
+        "frame size gives no fix, or a wrong heading.",
         read_only=True,
     ),
     Parameter(
         "focal_mm",
         600.0,
-        "Focal length where there is no calibration; some percent off and no star is identified.",
+        "Focal length, used without a calibration. If it is wrong by some percent, no star is identified.",
         unit="mm",
         minimum=0.1,
         maximum=100000.0,
@@ -121,7 +125,7 @@ COMMON = (
     Parameter(
         "pixel_um",
         6.4,
-        "Size of a pixel where there is no calibration; only focal_mm / pixel_um counts.",
+        "Size of a pixel, used without a calibration; only focal_mm / pixel_um counts.",
         unit="um",
         minimum=0.1,
         maximum=1000.0,

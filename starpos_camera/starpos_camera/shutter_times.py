@@ -26,15 +26,16 @@ PARAMETERS = (
     Parameter(
         "pulses",
         False,
-        "Take the times of frames from the shutter's pulses on the topic `pulses`, where they are a frame's beyond "
-        "doubt; others have the lag that those have shown.",
+        "Take the time of a frame from the shutter's pulse on the topic `pulses` if it belongs to "
+        "the frame without doubt. Other frames get the lag that these pulses have shown.",
         read_only=True,
     ),
     Parameter(
         "pulses.curtain",
         0.0,
-        "From the begin of the exposure of the row that is read first to the pulse: the travel of the curtain, as X sync "
-        "marks the shutter fully open, some 0.004 s; 0 of a strobe line. 1 ms is 0.5 m at the equator.",
+        "Time from the start of the first row's exposure to the pulse. X sync marks the fully open "
+        "shutter, so this is the travel of the curtain, some 0.004 s; it is 0 for a strobe line. 1 "
+        "ms is 0.5 m at the equator.",
         unit="s",
         minimum=0.0,
         maximum=1.0,
@@ -42,7 +43,7 @@ PARAMETERS = (
     Parameter(
         "pulses.curtain_stddev",
         0.003,
-        "How far that may be off, of all frames alike.",
+        "Error of pulses.curtain, 1 sigma, the same in all frames.",
         unit="s",
         minimum=0.0,
         maximum=1.0,

@@ -12,8 +12,8 @@ COMMON = (
     Parameter(
         "source",
         "serial",
-        "Where tilts come from: serial is the starpos microcontroller, imu a sensor_msgs/Imu on imu/data, ascii lines "
-        "of text from a digital tiltmeter, iio a sensor that Linux's own driver reads (Industrial I/O).",
+        "Where tilts come from: starpos's board (serial), an IMU on imu/data (imu), a tiltmeter that sends text "
+        "(ascii), a sensor behind Linux's driver (iio).",
         choices=tuple(SOURCES),
         read_only=True,
     ),

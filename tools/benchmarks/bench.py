@@ -46,6 +46,7 @@ FULL = {
     "identification": "benchmark_identification",
     "instructions": "instructions",
     "jobs": "benchmark_jobs",
+    "lenses": "accuracy_by_lens",
     "link": "link_bandwidth",
     "navigation": "benchmark_navigation",
     "nodes": "latency",

@@ -65,10 +65,10 @@ CASES = (
 )
 
 
-def headings(task: tuple[int, np.random.SeedSequence]) -> np.ndarray | str:
+def headings(task: tuple[Case, np.random.SeedSequence]) -> np.ndarray | str:
     """Errors and claims (2, 2) in arcsec of one frame's heading, by WGS 84 and by the plumb line; or why it has none."""
-    number, seed = task
-    case, rng, catalogue = CASES[number], np.random.default_rng(seed), load_catalogue()
+    case, seed = task
+    rng, catalogue = np.random.default_rng(seed), load_catalogue()
     world, begin = draw(rng, catalogue, SCA100T_CALIBRATED, CLOCK_S, case.camera)
     scene = replace(world.scene, optics=case.optics, altitude_deg=ALTITUDE_DEG)
     light = expose(scene, world.sky, begin, case.exposure_s, rng)
@@ -128,7 +128,7 @@ def run(args) -> int:
     with ProcessPoolExecutor(args.jobs) as pool:
         for number, case in enumerate(CASES):
             seeds = np.random.SeedSequence([args.seed, number]).spawn(args.frames)
-            answers = list(pool.map(headings, [(number, seed) for seed in seeds], chunksize=10))
+            answers = list(pool.map(headings, [(case, seed) for seed in seeds], chunksize=10))
             line, holds = row(case, answers)
             print(line, flush=True)
             all_hold &= holds

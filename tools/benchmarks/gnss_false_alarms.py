@@ -37,7 +37,7 @@ def counted(drive: GnssDrive, frames: int, rng: np.random.Generator) -> Counter:
     while number["frames"] < frames:
         watch, before = GnssWatch(drive.instrument, Deflection(stddev_arcsec=drive.deflection_arcsec)), ""
         for moment in drive.moments(rng):
-            watch.go_on(moment.sighting)
+            watch.advance(moment.sighting)
             check = watch.judge(moment.sighting, moment.gnss)
             watch.learn(moment.sighting, moment.gnss, check)
             number["frames"] += 1

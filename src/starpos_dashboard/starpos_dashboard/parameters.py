@@ -12,15 +12,15 @@ PARAMETERS = (
     Parameter(
         "address",
         "127.0.0.1",
-        "Address the page is served on; 0.0.0.0 or :: is every network of this machine, and whoever reaches it reads "
-        "where the instrument is, without a password.",
+        "Address that the page is served on; 0.0.0.0 and :: are all networks of this machine. Everyone who "
+        "reaches it sees where the instrument is, without a password.",
         read_only=True,
         form=ADDRESS,
     ),
     Parameter(
         "port",
         8042,
-        "Port the page is served on; 0 takes any free one, which the log names.",
+        "Port that the page is served on; 0 takes a free one and logs it.",
         unit="",
         minimum=0,
         maximum=65535,
@@ -36,7 +36,7 @@ PARAMETERS = (
     Parameter(
         "clients",
         8,
-        "Pages that may be open at once; each costs a connection.",
+        "Maximum number of open pages; each takes a connection.",
         unit="",
         minimum=1,
         maximum=64,
@@ -44,7 +44,7 @@ PARAMETERS = (
     Parameter(
         "rate",
         5.0,
-        "How often an open page gets new values; often costs CPU here and on the phone.",
+        "How often an open page gets new values. A high rate takes CPU time here and on the phone.",
         unit="Hz",
         minimum=1.0,
         maximum=20.0,
@@ -52,8 +52,9 @@ PARAMETERS = (
     Parameter(
         "stale_after",
         15.0,
-        "Age at which fix, heading and frame are shown as old; longer than the cadence of the camera, else they are old "
-        "between any two frames. Tilt and diagnostics are old after 5 s, or this where it is shorter.",
+        "Age at which fix, heading and frame are shown as old. Make it longer than the cadence of "
+        "the camera, or they are old between any two frames. Tilt and diagnostics are old after 5 "
+        "s, or earlier if this is shorter.",
         unit="s",
         minimum=1.0,
         maximum=86400.0,
@@ -61,7 +62,7 @@ PARAMETERS = (
     Parameter(
         "track",
         1000,
-        "Newest fixes drawn on the map; many cost the browser time.",
+        "Number of newest fixes drawn on the map. Many slow down the browser.",
         unit="",
         minimum=1,
         maximum=10000,
@@ -69,19 +70,25 @@ PARAMETERS = (
     Parameter(
         "image_side",
         1280,
-        "Longest side of the annotated frame as it is shown; large ones cost the network.",
+        "Longest side of the annotated frame that is shown. Large frames load the network.",
         unit="px",
         minimum=64,
         maximum=4096,
     ),
     Parameter(
-        "image_rate", 1.0, "Most frames a second that are shown.", unit="Hz", minimum=0.01, maximum=10.0
+        "image_rate",
+        1.0,
+        "Maximum number of frames per second that are shown.",
+        unit="Hz",
+        minimum=0.01,
+        maximum=10.0,
     ),
     Parameter(
         "lights",
         "camera, detector, inclinometer, solver",
-        "Nodes whose diagnostics are shown, separated by commas, and named where they say nothing: those of the "
-        "dashboard's own namespace, or by whole names such as /b/solver; '' shows those of every node there is.",
+        "Nodes whose diagnostics are shown, separated by commas; a node that sends none is named. "
+        "Give names in the dashboard's own namespace, or whole names such as /b/solver. '' shows "
+        "the diagnostics of all nodes.",
     ),
 )
 

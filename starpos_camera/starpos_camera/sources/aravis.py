@@ -21,34 +21,37 @@ PARAMETERS = (
     Parameter(
         "aravis.device",
         "",
-        "The camera's name, as the program `arv-tool-0.8` prints it; empty: the only one there.",
+        "The camera's name, as the program `arv-tool-0.8` prints it. Empty takes the only camera there is.",
         read_only=True,
     ),
     Parameter(
         "aravis.trigger",
         "Software",
-        "The trigger's source in the camera's own words: `Software` lets this node trigger each frame, `Line0` or "
-        "another line waits for a signal there.",
+        "The trigger's source by the camera's name for it. With `Software` this node triggers each "
+        "frame; with `Line0` or another line the camera waits for a signal there.",
         read_only=True,
     ),
     Parameter(
         "aravis.pixel_format",
         "",
-        "Such as Mono8, Mono12, Mono16, BayerRG12; empty: the deepest that the camera has and this source knows.",
+        "Pixel format, such as Mono8, Mono12, Mono16, BayerRG12. Empty takes the one with the most "
+        "bits that both the camera and this source support.",
         read_only=True,
     ),
     Parameter(
         "aravis.region_as_set",
         False,
-        "Take the part of the sensor and the binning that the camera is set to. A calibration and pixel_um hold for one "
-        "of them only; false sets the whole sensor, unbinned.",
+        "Keep the region of the sensor and the binning that the camera is set to; false sets the "
+        "whole sensor without binning. A calibration and pixel_um hold for one region and binning "
+        "only.",
         read_only=True,
     ),
     Parameter(
         "aravis.timestamp",
         "unknown",
-        "Which moment of an exposure the camera's own times are of; a wrong one makes the stamp wrong by the exposure. "
-        "Where it is unknown, it is taken from what is possible between trigger and arrival.",
+        "Moment of the exposure that the camera's own times mark. A wrong one makes the stamp wrong "
+        "by the exposure time. If it is unknown, the stamp's error covers all that is possible "
+        "between trigger and arrival.",
         choices=("start", "end", "unknown"),
         read_only=True,
     ),

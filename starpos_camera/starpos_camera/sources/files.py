@@ -37,15 +37,17 @@ PARAMETERS = (
     Parameter(
         "files.watch",
         False,
-        "Take the frames that come into the folder from now on, for ever; a name counts once. With a `cadence` longer "
-        "than theirs they are taken later and later.",
+        "Take the frames that are written into the folder from now on, until the node stops; each "
+        "name is taken once. If `cadence` is longer than the time between them, the node falls "
+        "behind.",
         read_only=True,
     ),
     Parameter(
         "files.rest",
         2.0,
-        "A file that comes is whole once it has not changed for so long; one that cannot be read then is given up after "
-        "ten times that. Too short and frames are lost that are written with pauses.",
+        "A file counts as complete if it has not changed for this time. If it cannot be read then, "
+        "it is given up after ten times this time. If too short, frames that are written with "
+        "pauses are lost.",
         unit="s",
         minimum=0.01,
         maximum=600.0,
@@ -54,22 +56,22 @@ PARAMETERS = (
     Parameter(
         "files.restamp",
         False,
-        "Stamp the frames with the node's clock instead of their own time. For frames without a time; old ones "
-        "restamped give a wrong longitude, 15 arcsec for each second.",
+        "Stamp the frames with the node's clock instead of their own time. Only for frames without "
+        "a time: old frames get a wrong longitude, by 15 arcsec for each second.",
         read_only=True,
     ),
     Parameter(
         "files.exif",
         False,
-        "Take the time of raw files and TIFF from EXIF, that is from the camera's own clock. It was set by hand: 1 s is "
-        "464 m at the equator.",
+        "Take the time of raw files and TIFF from EXIF, that is from the camera's own clock, which "
+        "was set by hand. An error of 1 s is 464 m at the equator.",
         read_only=True,
     ),
     Parameter(
         "files.exif_utc_offset",
         math.nan,
-        "By how much the camera's clock is ahead of UTC, summer time included; nan: as each file says, which those of "
-        "older cameras do not. An hour wrong is 15 deg of longitude.",
+        "Hours that the camera's clock is ahead of UTC, summer time included. Unset takes what each "
+        "file states; files of older cameras state nothing. An hour wrong is 15 deg of longitude.",
         unit="h",
         minimum=-ZONES_H,
         maximum=ZONES_H,
@@ -78,7 +80,7 @@ PARAMETERS = (
     Parameter(
         "files.exif_clock_stddev",
         UNTENDED_STDDEV_S,
-        "How far the camera's clock may be off; its whole seconds come on top.",
+        "Error of the camera's clock, 1 sigma. That it counts whole seconds is added to it.",
         unit="s",
         minimum=0.0,
         maximum=86400.0,

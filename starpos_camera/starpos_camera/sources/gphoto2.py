@@ -24,46 +24,48 @@ PARAMETERS = (
     Parameter(
         "gphoto2.model",
         "",
-        "The camera's name or a part of it, as the program `gphoto2 --auto-detect` prints it; empty: the only one there.",
+        "The camera's name or a part of it, as the program `gphoto2 --auto-detect` prints it. Empty "
+        "takes the only camera there is.",
         read_only=True,
     ),
     Parameter(
         "gphoto2.port",
         "",
-        "Its port, like ptpip:192.168.1.1 (then with gphoto2.model in full), or usb:001,004, which changes each time the "
-        "camera is plugged in; empty: any.",
+        "The camera's port, such as ptpip:192.168.1.1 (then give gphoto2.model in full), or "
+        "usb:001,004, which changes each time the camera is plugged in. Empty takes any.",
         read_only=True,
     ),
     Parameter(
         "gphoto2.shutter_setting",
         "shutterspeed",
-        "The camera's name of its setting of the exposure time (gphoto2 --list-config); shutterspeed2 for some Nikon.",
+        "The camera's name for its exposure time setting (gphoto2 --list-config); shutterspeed2 for "
+        "some Nikon cameras.",
         read_only=True,
     ),
     Parameter(
         "gphoto2.iso_setting",
         "iso",
-        "The camera's name of the setting of ISO, which is what `gain` sets.",
+        "The camera's name for its ISO setting, which `gain` sets.",
         read_only=True,
     ),
     Parameter(
         "gphoto2.raw",
         True,
-        "Set the camera to its raw format, where it has one; false leaves the format as it is. A JPEG has 8 bits, and "
-        "its noise and faint stars are smoothed away.",
+        "Set the camera to its raw format if it has one; false leaves the format as it is. A JPEG "
+        "has 8 bits, and the camera smooths faint stars away.",
         read_only=True,
     ),
     Parameter(
         "gphoto2.target",
         "memory",
-        "Where the camera puts a frame before it is fetched; some can do only one of them.",
+        "Where the camera stores a frame before it is fetched; some cameras can do only one of the two.",
         choices=tuple(TARGETS),
         read_only=True,
     ),
     Parameter(
         "gphoto2.keep",
         False,
-        "Leave the frames in the camera too; its card fills up, and then there are no more.",
+        "Leave the frames in the camera too. When its card is full, no more frames come.",
         read_only=True,
     ),
 )

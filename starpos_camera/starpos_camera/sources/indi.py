@@ -21,10 +21,10 @@ PARAMETERS = (
     Parameter(
         "indi.host",
         "127.0.0.1",
-        "Where indiserver runs, in a trusted network: it knows no passwords.",
+        "Host that runs indiserver. Use a trusted network: INDI has no passwords.",
         read_only=True,
     ),
-    Parameter("indi.port", 7624, "Its port.", unit="", minimum=1, maximum=65535, read_only=True),
+    Parameter("indi.port", 7624, "Port of indiserver.", unit="", minimum=1, maximum=65535, read_only=True),
     Parameter(
         "indi.device",
         "",
@@ -34,7 +34,8 @@ PARAMETERS = (
     Parameter(
         "indi.binning",
         1,
-        "Pixels that become one, each way. A calibration and pixel_um hold for one binning only.",
+        "Binning: pixels that become one, along each axis. A calibration and pixel_um hold for one "
+        "binning only.",
         unit="px",
         minimum=1,
         maximum=16,
@@ -42,8 +43,9 @@ PARAMETERS = (
     Parameter(
         "indi.readout",
         15.0,
-        "The frame has to be here so long after its exposure; too short for the camera or the network, none ever comes, "
-        "too long, and a camera that hangs is noticed late.",
+        "Longest time from the end of an exposure to the arrival of its frame. If too short for the "
+        "camera or the network, every frame is given up; if too long, a camera that hangs is "
+        "noticed late.",
         unit="s",
         minimum=0.5,
         maximum=600.0,

@@ -21,8 +21,9 @@ def server_clock(source: str) -> Parameter:
     return Parameter(
         f"{source}.clock_stddev",
         math.nan,
-        "How well the clock of the server's machine is kept to UTC, where it is another one than this. Unset: its times "
-        "are not used, but those of the commands, on this machine's clock. Too small a value claims a wrong longitude.",
+        "Error of the clock of the server's machine against UTC, 1 sigma, if the server runs on "
+        "another machine. Unset uses the times of the commands by this machine's clock instead of "
+        "the server's. If too small, fixes claim errors of longitude that are too small.",
         unit="s",
         # 0 would mean this machine's clock.
         minimum=1e-9,

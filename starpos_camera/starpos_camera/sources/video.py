@@ -23,8 +23,8 @@ PARAMETERS = (
     Parameter(
         "video.format",
         "",
-        f"Four letters of the pixels that a V4L2 camera sends: {', '.join(f.strip() for f in FORMATS)}; unset: what "
-        "OpenCV takes first. Compressed or 8-bit ones lose faint stars.",
+        "Pixel format of a V4L2 camera by its four letters, such as Y16 or RG12; an unknown one is refused with the "
+        "list of the known. '' takes OpenCV's first choice. Compressed or 8-bit formats lose faint stars.",
         read_only=True,
     ),
     Parameter(
@@ -48,9 +48,9 @@ PARAMETERS = (
     Parameter(
         "video.lag",
         math.nan,
-        "From the middle of an exposure to the time that the kernel gives the frame; command_lag_stddev says how well it "
-        "is known. Unset: nothing is assumed, and a stamp is as wide as the exposure and the frame's period. Longitudes "
-        "come out 15 arcsec off for each second it is wrong.",
+        "Time from the middle of an exposure to the kernel's time of the frame; command_lag_stddev "
+        "is its error. If unset, a stamp's error covers the exposure and the frame period. "
+        "Longitudes err by 15 arcsec for each second that it is wrong.",
         unit="s",
         minimum=-10.0,
         maximum=60.0,
@@ -58,8 +58,8 @@ PARAMETERS = (
     Parameter(
         "video.start",
         "",
-        "UTC of the start of a video file's first frame, as 2026-11-02T18:00:00.00 with as many decimals as are right. "
-        "Longitudes come out 15 arcsec off for each second it is wrong.",
+        "UTC of the start of a video file's first frame, such as 2026-11-02T18:00:00.00, with as "
+        "many decimals as are known. Longitudes err by 15 arcsec for each second that it is wrong.",
         read_only=True,
     ),
 )
@@ -76,7 +76,7 @@ class Video(FrameSource):
         if not device or "://" in device:
             return (
                 f"video.device must be a V4L2 camera or a video file of this machine, not {device!r}: streams of a "
-                "network do not tell when a frame was taken."
+                "network do not state when a frame was taken."
             )
         if is_camera(device):
             if values["video.format"] and values["video.format"].ljust(4) not in FORMATS:
@@ -91,7 +91,7 @@ class Video(FrameSource):
             )
         if read_utc(values["video.start"]) is None:
             return (
-                "a video file does not tell when it was taken: set video.start to the UTC of its first frame, as "
+                "a video file does not state when it was taken: set video.start to the UTC of its first frame, as "
                 "2026-11-02T18:00:00.00."
             )
         if settings.exposure_s is not None or settings.gain:

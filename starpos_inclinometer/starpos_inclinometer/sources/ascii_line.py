@@ -48,21 +48,23 @@ PARAMETERS = (
     Parameter(
         "ascii.pattern",
         rf"(?P<x>{NUMBER})[,;\s]+(?P<y>{NUMBER})",
-        "Regular expression (Python's) that a whole line must match, with the named groups x, y, and where "
-        "the device sends them z, temperature [deg C], sequence, milliseconds or seconds (of its own clock).",
+        "Regular expression (Python's) that a whole line must match. It has the named groups x and "
+        "y and, if the device sends them, z, temperature [deg C], sequence, and milliseconds or "
+        "seconds of its own clock.",
         read_only=True,
     ),
     Parameter(
         "ascii.unit",
         "deg",
-        "Unit of x, y and z; g, mg and percent_g are the sine of the tilt. A wrong one is wrong by its factor.",
+        "Unit of x, y and z; g, mg and percent_g are the sine of the tilt. A wrong unit makes all "
+        "tilts wrong by its factor.",
         choices=UNITS,
         read_only=True,
     ),
     Parameter(
         "ascii.resolution",
         math.nan,
-        "Step of x, y and z in ascii.unit; unset takes the last digit a line shows.",
+        "Step of x, y and z in ascii.unit. Unset takes the last digit of a line.",
         unit="",
         minimum=0.0,
         maximum=1e6,
@@ -71,7 +73,8 @@ PARAMETERS = (
     Parameter(
         "ascii.range",
         math.nan,
-        "Largest tilt of x and y that the device measures; unset: any. Beyond it readings are flagged and not used.",
+        "Largest tilt of x and y that the device measures; readings beyond it are flagged and not "
+        "used. Unset: no limit.",
         unit="deg",
         minimum=0.1,
         maximum=90.0,
@@ -79,7 +82,8 @@ PARAMETERS = (
     Parameter(
         "ascii.period",
         0.1,
-        "From line to line, or from request to request; the device counts as silent after 1.5 of them, at least 1 s.",
+        "Time from line to line, or from request to request. The device counts as silent after 1.5 "
+        "periods, at least 1 s.",
         unit="s",
         minimum=0.02,
         maximum=60.0,
@@ -88,14 +92,15 @@ PARAMETERS = (
     Parameter(
         "ascii.request",
         "",
-        "What to send once a period, for a device that speaks when it is asked, with its line end; empty: nothing.",
+        "Text to send once a period, with its line end, for a device that answers only when asked. "
+        "Empty sends nothing.",
         read_only=True,
     ),
     Parameter(
         "ascii.stuck_samples",
         100,
-        "Number of equal lines in a row after which the device counts as stuck; 0: never, for one whose "
-        "steps are coarser than its noise.",
+        "Number of equal lines in a row after which the device counts as stuck; 0: never, for a "
+        "device whose steps are coarser than its noise.",
         unit="",
         minimum=0,
         maximum=1_000_000,

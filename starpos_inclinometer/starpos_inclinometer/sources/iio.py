@@ -45,7 +45,7 @@ PARAMETERS = (
     Parameter(
         "iio.root",
         "/sys/bus/iio/devices",
-        "Where Linux shows its Industrial I/O devices.",
+        "Folder where Linux shows its Industrial I/O devices.",
         read_only=True,
     ),
     Parameter(
@@ -65,8 +65,8 @@ PARAMETERS = (
     Parameter(
         "iio.sampling_frequency",
         math.nan,
-        "Sampling frequency that the device is set to; unset leaves it. A lower one has less noise, where the device's "
-        "filter follows it.",
+        "Sampling frequency to set the device to; unset leaves it as it is. A lower one has less "
+        "noise if the device's filter follows it.",
         unit="Hz",
         minimum=0.01,
         maximum=1e5,
@@ -75,9 +75,8 @@ PARAMETERS = (
     Parameter(
         "iio.stuck_samples",
         100,
-        "Number of equal inclinations in a row after which the device counts as stuck; 0: never, for one "
-        "whose steps are coarser than its "
-        "noise, as those of an ADIS16209 are.",
+        "Number of equal inclinations in a row after which the device counts as stuck; 0: never, "
+        "for a device whose steps are coarser than its noise, such as an ADIS16209.",
         unit="",
         minimum=0,
         maximum=1_000_000,

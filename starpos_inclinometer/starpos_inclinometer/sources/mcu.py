@@ -29,8 +29,8 @@ SMALLEST_DETERMINANT = 0.5
 RATE_PARAMETER = Parameter(
     "rate",
     10,
-    "Samples a second from the microcontroller, or of source iio without a trigger; above the sensor's bandwidth, 18 Hz "
-    "of the SCA100T, they add little.",
+    "Samples a second from the microcontroller, or from source iio without a trigger. Above the "
+    "sensor's bandwidth (SCA100T: 18 Hz) more samples add little.",
     unit="Hz",
     minimum=mcu_protocol.MIN_RATE_HZ,
     maximum=mcu_protocol.MAX_RATE_HZ,
@@ -65,8 +65,8 @@ PARAMETERS = (
     Parameter(
         "reference_volts",
         sca100t.ADC_NOMINAL_REFERENCE_V,
-        "Reference of the ADC and supply of the sensor that offset_volts and sensitivity were measured at; "
-        "the circuit is ratiometric, so what it is at work does not matter.",
+        "Voltage of ADC reference and sensor supply when offset_volts and sensitivity were "
+        "measured. The circuit is ratiometric, so today's voltage does not matter.",
         unit="V",
         minimum=4.5,
         maximum=5.5,
@@ -74,8 +74,9 @@ PARAMETERS = (
     Parameter(
         "cross_axis",
         (1.0, 0.0, 0.0, 1.0),
-        "Matrix (xx, xy, yx, yy) that takes what the sensor's two axes feel, in g, into X' and Y' of S; 0.01 off in xy "
-        "is 0.6 deg of x at 90 deg of y, 360 arcsec at 10 deg.",
+        "Matrix (xx, xy, yx, yy) from the accelerations along the sensor's two axes, in g, to X' "
+        "and Y' of S. An error of 0.01 in xy is 0.6 deg in x at 90 deg of y, and 360 arcsec at 10 "
+        "deg.",
         unit="",
         minimum=-2.0,
         maximum=2.0,
@@ -83,7 +84,8 @@ PARAMETERS = (
     Parameter(
         "temperature.reference",
         25.0,
-        "Temperature that offset_volts and sensitivity hold at; the four polynomials below are in T less this.",
+        "Temperature at which offset_volts and sensitivity were measured. The four polynomials "
+        "below are in T minus this temperature.",
         unit="deg C",
         minimum=-40.0,
         maximum=125.0,
@@ -92,8 +94,8 @@ PARAMETERS = (
         Parameter(
             f"temperature.offset_{axis}",
             (0.0, 0.0, 0.0),
-            f"What is added to the offset of {axis}: linear, square and cubic term; 0.5 mV/deg C left out is 26 arcsec "
-            "a degree. All zeros: no compensation.",
+            f"Change of the offset of {axis} with temperature: linear, square and cubic term; 0.5 mV/deg C left out "
+            "is 26 arcsec a degree. All zeros: no compensation.",
             unit="V/deg C^n",
             minimum=-0.1,
             maximum=0.1,
@@ -104,8 +106,8 @@ PARAMETERS = (
         Parameter(
             f"temperature.sensitivity_{axis}",
             (0.0, 0.0, 0.0),
-            f"Share by which the sensitivity of {axis} grows: linear, square and cubic term; 0.0001/deg C left out is "
-            "3.6 arcsec a degree at 10 deg of tilt.",
+            f"Relative change of the sensitivity of {axis} with temperature: linear, square and cubic term. At 10 deg "
+            "of tilt, 0.0001/deg C left out is 3.6 arcsec a degree.",
             unit="1/deg C^n",
             minimum=-0.01,
             maximum=0.01,

@@ -40,14 +40,14 @@ SERIAL_PARAMETERS = (
     Parameter(
         "port",
         "/dev/ttyUSB0",
-        "Serial port; a stable path such as /dev/serial/by-id/... survives replugging, /dev/ttyUSB0 may "
-        "become another device.",
+        "Serial port. A path such as /dev/serial/by-id/... stays the same after replugging; "
+        "/dev/ttyUSB0 may become another device.",
         read_only=True,
     ),
     Parameter(
         "baud",
         mcu_protocol.BAUD,
-        "Speed of the serial line; with a wrong one nothing but garbage comes.",
+        "Speed of the serial line. With a wrong one no line can be read.",
         unit="baud",
         minimum=1200,
         maximum=1_000_000,

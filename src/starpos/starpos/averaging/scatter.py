@@ -39,8 +39,9 @@ EVIDENT = 0.25
 RESPONSES = (0.0, 3e-4, 1e-3, 3e-3, 1e-2, 3e-2)
 # prior probability that all is as stated; a larger error is the less likely, in proportion
 AS_STATED = 0.7
-# minimum degrees of freedom of frames or poses; MIN_FREE if they contradict stated errors by CONTRADICT_SIGMA
-MIN_FREE, MIN_FREE, CONTRADICT_SIGMA = 2.5, 0.5, 4.0
+# minimum degrees of freedom of frames or poses; MIN_FREE_CONTRADICTING if they contradict the stated errors by
+# CONTRADICT_SIGMA
+MIN_FREE, MIN_FREE_CONTRADICTING, CONTRADICT_SIGMA = 2.5, 0.5, 4.0
 # maximum number of frames or means of frames; more are averaged first
 MAX_ROWS = 64
 
@@ -192,7 +193,7 @@ def _freedom(y: np.ndarray, j: np.ndarray, stated: np.ndarray, prior_sigma: np.n
     scaled, pulled = normal[0] * np.outer(prior_sigma, prior_sigma), pull[0] * prior_sigma
     fitted = pulled @ np.linalg.solve(scaled + np.eye(len(scaled)), pulled)
     chi2 = np.sum(y * np.linalg.solve(stated, y)) - fitted
-    return free, bool(free >= MIN_FREE and chi2 > free + CONTRADICT_SIGMA * np.sqrt(2 * free))
+    return free, bool(free >= MIN_FREE_CONTRADICTING and chi2 > free + CONTRADICT_SIGMA * np.sqrt(2 * free))
 
 
 def _shapes(frames: Frames, share: np.ndarray, poses: np.ndarray) -> list[_Kind]:

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Detects a GNSS place that is spoofed or wrong, suddenly or slowly.
 
-Every EVERY_S seconds a witness is set aside, and kept for LONGEST_S: a filter that begins with the state of that time.
-It has one more unknown, an error of GNSS that began at that moment, as a step or growing evenly. If GNSS is good, that
-error is 0 within its covariance, which includes all errors of the stars' place; a likelihood ratio decides (Willsky and
-Jones, IEEE Trans. Automatic Control 21(1), 1976, 108, from memory).  So a drag shows although each frame of it agrees
-with the frame before, and although the filter that learns has followed it.
+Every EVERY_S seconds the filter is copied, and the copy is kept for LONGEST_S. A copy has one more unknown, an error of
+GNSS that began when it was made, as a step or growing evenly. If GNSS is good, that error is 0 within its covariance,
+which includes all errors of the stars' place; a likelihood ratio decides (Willsky and Jones, IEEE Trans. Automatic
+Control 21(1), 1976, 108, from memory). So a slow drag shows although each of its frames agrees with the one before, and
+although the filter that learns has followed it.
 """
 
 from dataclasses import dataclass, replace
@@ -15,20 +15,20 @@ import numpy as np
 from starpos.gnss.sighting import Innovation
 from starpos.gnss.states import Ageing, Learned
 
-# Interval at which witnesses are set aside, and time for which each one is kept, s.
+# Interval at which the filter is copied, and time for which each copy is kept, s.
 EVERY_S, LONGEST_S = 110.0, 3000.0
 # Time from which the growing error is counted, and its unit, s.
 GROWS_AFTER_S, UNIT_S = 240.0, 600.0
-# 1 sigma of an error of which nothing is known, as an angle at the Earth's centre: 600 km.
+# 1 sigma of an unknown error, as an angle at the Earth's centre: 600 km.
 NOTHING_RAD = 0.1
 OFFSETS = 4
 
 
 @dataclass(frozen=True, eq=False)
-class Witnesses:
+class OnsetFilters:
     """W filters, each with n states and then the error of GNSS: east, north of a step, and of a growth in UNIT_S.
 
-    before: what was known when each was set aside.  since (W,): that time.  frames (W,): heard by each.
+    before: the state that each was copied from.  since (W,): time of the copy.  frames (W,): number used since.
     """
 
     before: tuple[Learned, ...]
@@ -38,18 +38,18 @@ class Witnesses:
     covariance: np.ndarray
 
     @classmethod
-    def none(cls, size: int) -> "Witnesses":
-        """No witness, for filters of a number of states."""
+    def empty(cls, size: int) -> "OnsetFilters":
+        """No filters yet, for a number of states."""
         n = size + OFFSETS
         return cls((), np.zeros(0), np.zeros(0, int), np.zeros((0, n)), np.zeros((0, n, n)))
 
-    def set_aside(self, learned: Learned) -> "Witnesses":
-        """Add one, who knows what is known now."""
+    def started(self, learned: Learned) -> "OnsetFilters":
+        """Add a copy of the present filter."""
         n = len(learned.state)
         state, covariance = np.zeros((1, n + OFFSETS)), np.zeros((1, n + OFFSETS, n + OFFSETS))
         state[0, :n], covariance[0, :n, :n] = learned.state, learned.covariance
         covariance[0, n:, n:] = np.eye(OFFSETS) * NOTHING_RAD**2
-        return Witnesses(
+        return OnsetFilters(
             (*self.before, learned),
             np.append(self.since, learned.utc_unix_s),
             np.append(self.frames, 0),
@@ -58,26 +58,26 @@ class Witnesses:
         )
 
     def due(self, utc_unix_s: float) -> bool:
-        """Whether another witness should be set aside."""
+        """Whether another copy should be made."""
         return not len(self.since) or utc_unix_s - self.since[-1] >= EVERY_S
 
-    def recent(self, utc_unix_s: float) -> "Witnesses":
-        """Drop those that were heard for long enough."""
+    def recent(self, utc_unix_s: float) -> "OnsetFilters":
+        """Drop those that are older than LONGEST_S."""
         return self._take(utc_unix_s - self.since <= LONGEST_S)
 
-    def _take(self, which: np.ndarray) -> "Witnesses":
+    def _take(self, which: np.ndarray) -> "OnsetFilters":
         before = tuple(b for b, kept in zip(self.before, which, strict=True) if kept)
-        return Witnesses(
+        return OnsetFilters(
             before, self.since[which], self.frames[which], self.state[which], self.covariance[which]
         )
 
-    def aged(self, by: Ageing) -> "Witnesses":
-        """Age them all alike."""
+    def aged(self, by: Ageing) -> "OnsetFilters":
+        """Add the process noise of the time that passed to all."""
         state, covariance = by.of(self.state, self.covariance)
         return replace(self, state=state, covariance=covariance)
 
-    def heard(self, seen: Innovation, about: np.ndarray, utc_unix_s: float) -> "Witnesses":
-        """Let all hear a frame with a GNSS place, whose innovation is about the states (n,)."""
+    def updated(self, seen: Innovation, about: np.ndarray, utc_unix_s: float) -> "OnsetFilters":
+        """Update all with a frame's GNSS place; its innovation is linear about the states (n,)."""
         n, grown = len(about), (utc_unix_s - self.since) / UNIT_S
         rows = np.empty((len(self.since), 2, n + OFFSETS))
         rows[:, :, :n] = seen.rows
@@ -97,12 +97,12 @@ class Witnesses:
             frames=self.frames + 1,
         )
 
-    def against(self, utc_unix_s: float) -> np.ndarray:
-        """Evidence of each against GNSS (W,): the larger chi-square (2 degrees of freedom) of step and growth."""
+    def evidence(self, utc_unix_s: float) -> np.ndarray:
+        """Evidence of each filter (W,) that GNSS is wrong: the larger chi-square (2 dof) of step and growth."""
         n = self.state.shape[1] - OFFSETS
         weight = np.linalg.inv(self.covariance[:, n:, n:])
         pull = np.einsum("wij,wj->wi", weight, self.state[:, n:])
-        # without the prior's weight: only measurements count
+        # the prior's weight is taken off: only measurements count
         weight = weight - np.eye(OFFSETS) / NOTHING_RAD**2
         step = _chi2(weight[:, :2, :2], pull[:, :2])
         growth = _chi2(weight[:, 2:, 2:], pull[:, 2:])
@@ -111,7 +111,9 @@ class Witnesses:
 
 
 def _chi2(weight: np.ndarray, pull: np.ndarray) -> np.ndarray:
-    """pull^T weight^-1 pull for each (2, 2) weight, 0 where it says nothing."""
-    told = np.linalg.eigvalsh(weight)[:, 0] > 1.0
-    safe = np.where(told[:, None, None], weight, np.eye(2))
-    return np.where(told, np.einsum("wi,wi->w", pull, np.linalg.solve(safe, pull[..., None])[..., 0]), 0.0)
+    """pull^T weight^-1 pull for each (2, 2) weight, 0 where it holds no information."""
+    informative = np.linalg.eigvalsh(weight)[:, 0] > 1.0
+    safe = np.where(informative[:, None, None], weight, np.eye(2))
+    return np.where(
+        informative, np.einsum("wi,wi->w", pull, np.linalg.solve(safe, pull[..., None])[..., 0]), 0.0
+    )

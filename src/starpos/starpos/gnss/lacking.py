@@ -19,7 +19,7 @@ def what_would_tell_more(learned: Learned) -> str:
     if turn > LINEAR_TURN_RAD:
         return f"lean it otherwise at each pose: A3's turn about the plumb line is known to {np.degrees(turn):.2g} deg"
     if _correlation(covariance, at.a3, at.constant) > ALIKE:
-        return "turn it to other headings: at one heading A3 cannot be told from the deflection"
+        return "turn it to other headings: at one heading A3 cannot be separated from the deflection"
     if learned.poses < FEW_POSES:
         return "let it stand at more poses, newly turned"
     return ""

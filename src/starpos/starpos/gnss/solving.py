@@ -66,7 +66,7 @@ def watched(
         compared = None if gnss is None else Compared(gnss, GnssCheck(LEARNING), 0, 0)
         return Watched(solution=rough, compared=compared)
     tilt = rough.tilt
-    watch.go_on(LevelSight.of(rough.fix, tilt))
+    watch.advance(LevelSight.of(rough.fix, tilt))
     up = _up(watch, rough.fix, tilt, gnss)
     levelled, check = _levelled(solver, stars, rough, up), None
     if gnss is not None and levelled.fix is not None:

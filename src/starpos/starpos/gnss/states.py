@@ -11,6 +11,7 @@ from functools import cached_property, lru_cache
 import numpy as np
 
 from starpos import rotation
+from starpos.earth.ellipsoid import EARTH_RADIUS_M
 from starpos.earth.vertical import Vertical
 from starpos.instrument.inclinometer import InclinometerErrors, Tilt
 from starpos.instrument.instrument import Instrument
@@ -25,7 +26,7 @@ CONSTANT_SHARE = 0.5
 # geoid are smooth at d = 0 (Jordan, JGR 77(20), 1972): an exponential forgets more on a short way.
 FIELD_LENGTH_M = 37_000.0
 # An error of GNSS that it does not state: multipath, which changes within minutes.
-GNSS_SLOW_RAD, GNSS_SLOW_S = 10.0 / 6.371e6, 300.0
+GNSS_SLOW_RAD, GNSS_SLOW_S = 10.0 / EARTH_RADIUS_M, 300.0
 # 1 sigma about each axis of an unknown A3.
 NO_A3_RAD = 1.0
 # A night's cooling: the random walk of an unmeasured temperature.

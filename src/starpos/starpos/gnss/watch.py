@@ -11,7 +11,7 @@ from starpos.averaging.slip import slip_s
 from starpos.earth.ellipsoid import EARTH_RADIUS_M
 from starpos.earth.vertical import Vertical
 from starpos.gnss.filter import GnssFrame, begun, chi2, is_linear, stddev_rad, updated
-from starpos.gnss.guard import Witnesses
+from starpos.gnss.guard import OnsetFilters
 from starpos.gnss.place import GnssPlace
 from starpos.gnss.sighting import LevelSight, innovation, place_of_stars
 from starpos.gnss.states import Learned, aged, ageing, prior
@@ -84,15 +84,15 @@ class GnssWatch:
         self._readings: frozenset[float] = frozenset()
         # the readings of a frame that would have been an alarm, before A3 was known
         self._suspicious: frozenset[float] | None = None
-        self._witnesses = Witnesses.none(0)
+        self._onsets = OnsetFilters.empty(0)
 
     @property
     def is_learning(self) -> bool:
         """Whether A3 is not known yet as well as a filter needs."""
         return self._begins
 
-    def go_on(self, sighting: LevelSight) -> None:
-        """Go on to the time of a frame, seen with any A3: only the attitude of its camera counts."""
+    def advance(self, sighting: LevelSight) -> None:
+        """Advance to the time of a frame, seen with any A3: only the attitude of its camera counts."""
         tilt = sighting.tilt
         self._new_pose = self._pose is None or slip_s(sighting, self._pose) is None
         if self._new_pose:
@@ -112,7 +112,7 @@ class GnssWatch:
         self.learned, self._begins, self.disagrees = None, True, False
         self._held.clear()
         self._suspicious = None
-        self._witnesses = Witnesses.none(0)
+        self._onsets = OnsetFilters.empty(0)
 
     def _age(self, sighting: LevelSight) -> None:
         learned, tilt = self.learned, sighting.tilt
@@ -135,8 +135,8 @@ class GnssWatch:
             self._new_pose,
         )
         self.learned = replace(aged(learned, passed, sighting.utc_unix_s), place=here)
-        if len(self._witnesses.since):
-            self._witnesses = self._witnesses.aged(passed).recent(sighting.utc_unix_s)
+        if len(self._onsets.since):
+            self._onsets = self._onsets.aged(passed).recent(sighting.utc_unix_s)
 
     def up_in_camera(self, tilt: Tilt) -> np.ndarray | None:
         """Up (3,) in C at a tilt by what was learned; None if nothing is known."""
@@ -170,15 +170,15 @@ class GnssWatch:
         single = chi2(self.learned, seen)
         if self._begins:
             return self._check(self._while_it_begins(single, sighting.tilt), sighting, gnss)
-        witnesses = self._witnesses if len(self._witnesses.since) else Witnesses.none(len(self.learned.state))
-        # While GNSS is not believed its one witness grows too old where GNSS was away for long: hope begins anew.
-        if not len(witnesses.since) or (not self.disagrees and witnesses.due(sighting.utc_unix_s)):
-            witnesses = witnesses.set_aside(self.learned)
-        self._witnesses = witnesses.heard(seen, self.learned.state, sighting.utc_unix_s)
-        against = self._witnesses.against(sighting.utc_unix_s)
+        onsets = self._onsets if len(self._onsets.since) else OnsetFilters.empty(len(self.learned.state))
+        # While GNSS is not believed there is one filter. If GNSS was away for long, it was dropped for its age.
+        if not len(onsets.since) or (not self.disagrees and onsets.due(sighting.utc_unix_s)):
+            onsets = onsets.started(self.learned)
+        self._onsets = onsets.updated(seen, self.learned.state, sighting.utc_unix_s)
+        against = self._onsets.evidence(sighting.utc_unix_s)
         worst = max(single, float(against.max()))
         if self.disagrees:
-            self._hope(worst, sighting.utc_unix_s)
+            self._may_return(worst, sighting.utc_unix_s)
         elif worst > ALARM:
             # where the frame alone raised the alarm, this is still the likeliest moment at which the error began
             self._take_back(int(np.argmax(against)), sighting)
@@ -197,22 +197,22 @@ class GnssWatch:
             self._suspicious = readings
         return DISAGREES if again else DOUBTFUL
 
-    def _take_back(self, witness: int, sighting: LevelSight) -> None:
-        """Return to the state saved one witness before this one, whose evidence against GNSS is the strongest."""
+    def _take_back(self, onset: int, sighting: LevelSight) -> None:
+        """Return to the state one copy before the likeliest onset of the error."""
         self.disagrees = True
-        self.learned = self._witnesses.before[max(witness - 1, 0)]
-        self._witnesses = Witnesses.none(0)
+        self.learned = self._onsets.before[max(onset - 1, 0)]
+        self._onsets = OnsetFilters.empty(0)
         self._new_pose = True
         self._age(sighting)
         assert self.learned is not None
-        self._witnesses = Witnesses.none(len(self.learned.state)).set_aside(self.learned)
+        self._onsets = OnsetFilters.empty(len(self.learned.state)).started(self.learned)
 
-    def _hope(self, worst: float, utc_unix_s: float) -> None:
-        """Believe GNSS again after it has agreed for long enough, by a witness that begins anew at each contradiction."""
+    def _may_return(self, worst: float, utc_unix_s: float) -> None:
+        """Believe GNSS again once it has agreed for BACK_S; each contradiction begins that time anew."""
         assert self.learned is not None
         if worst > BACK:
-            self._witnesses = Witnesses.none(len(self.learned.state)).set_aside(self.learned)
-        elif utc_unix_s - self._witnesses.since[0] >= BACK_S and self._witnesses.frames[0] >= BACK_FRAMES:
+            self._onsets = OnsetFilters.empty(len(self.learned.state)).started(self.learned)
+        elif utc_unix_s - self._onsets.since[0] >= BACK_S and self._onsets.frames[0] >= BACK_FRAMES:
             self.disagrees = False
 
     def _check(self, status: str, sighting: LevelSight, gnss: GnssPlace) -> GnssCheck:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from starpos import rotation
-from starpos.identification.full import FAINTEST_FIT, MIN_STARS, GATE_SIGMA, Identification, OnFrame
+from starpos.identification.full import FAINTEST_FIT, GATE_SIGMA, MIN_STARS, Identification, OnFrame
 from starpos.identification.pairs import mutual_nearest
 from starpos.identification.sky import Sky
 from starpos.identification.wide import FAR_PX, FLIP, LensPose, Part, WideField, error_px, spread_px, stars_on

@@ -15,7 +15,7 @@ from starpos.identification._frame import FrameStars, projected
 from starpos.identification._search import Finder, Limits
 from starpos.identification.evidence import CHANCES, anywhere
 from starpos.identification.full import ENOUGH, MIN_STARS, RULES, Identification, identified
-from starpos.identification.pose import CROWD_STARS, MIN_SIGMA_PX, MATCH_SIGMA, TEST_STARS, stars_at
+from starpos.identification.pose import CROWD_STARS, MATCH_SIGMA, MIN_SIGMA_PX, TEST_STARS, stars_at
 from starpos.identification.prior import PlumbPrior, PointingPrior
 from starpos.identification.sky import Sky
 from starpos.identification.triangles import TriangleCatalogue

@@ -36,9 +36,9 @@ BEACONS = 0.25
 # Circles over the whole sky: (radius over the field's half diagonal, spacing over radius, brightest stars taken). The
 # first fits into a field of 3:2 or 4:3, the last contains the whole field.
 CIRCLES = ((0.6, 0.7, 7), (0.8, 0.7, 8), (1.0, 0.7, 9))
-# Limits, counted before duplicates of overlapping circles are removed. Beyond ENOUGH_TRIANGLES there are no larger circles.
-# Beyond MAX_TRIANGLES fewer stars are taken of the smallest circles, down to MIN_TAKEN, and one less beyond twice as
-# many triangles: the table of a field of 0.3 deg has 600 MB.
+# Limits, counted before duplicates of overlapping circles are removed. Beyond ENOUGH_TRIANGLES there are no larger
+# circles. Beyond MAX_TRIANGLES fewer stars are taken of the smallest circles, down to MIN_TAKEN, and one less beyond
+# twice as many triangles: the table of a field of 0.3 deg has 600 MB.
 ENOUGH_TRIANGLES, MAX_TRIANGLES, MIN_TAKEN = 9_000_000, 16_000_000, 5
 
 

@@ -19,12 +19,12 @@ from starpos.identification.full import (
     EDGE_PX,
     ENOUGH,
     FAINTEST_FIT,
-    MIN_STARS,
     FLOOR_PX,
     GATE_PX,
     GATE_SIGMA,
     INSIDE_PX,
     MIN_SPREAD_PX,
+    MIN_STARS,
     Identification,
     OnFrame,
 )

@@ -302,7 +302,8 @@ class Instrument:
             what = "focal length and A3 are" if self.camera is None else "the camera's intrinsics are"
             raise InstrumentError(
                 f"the frame is {width} x {height} px{where} but {what} of {whole.width} x {whole.height} px: "
-                "use those of this frame size, or frames whose header says which part they are (XORGSUBF, YORGSUBF)"
+                "use an instrument file of this frame size, or frames whose header states their part of the sensor "
+                "(XORGSUBF, YORGSUBF)"
             )
         return whole.part(left, top, width, height) if (width, height) != self.size else whole
 

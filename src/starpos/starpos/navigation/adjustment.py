@@ -223,12 +223,7 @@ class Adjustment:
             self.noise_weighed = True
             return True
         stated = self._law(self.vessel)
-        if (
-            self.odometry is not None
-            or self.law is None
-            or stated is None
-            or self.weighings == MAX_WEIGHINGS
-        ):
+        if self.odometry is not None or self.law is None or stated is None or self.weighings == MAX_WEIGHINGS:
             return False
         self.weighings += 1
         law = borne_out(stated, motion)

@@ -12,7 +12,7 @@ from starpos.errors import VoyageError
 from starpos.navigation.imu import GAP, ImuLog
 from starpos.navigation.placeless import PlacelessFrame
 from starpos.navigation.thinning import thinned
-from starpos.navigation.velocity import FASTEST, MIN_SIGMA, MAX_SIGMA, VelocityLog
+from starpos.navigation.velocity import FASTEST, MAX_SIGMA, MIN_SIGMA, VelocityLog
 from starpos.navigation.vessel import Vessel
 from starpos.navigation.voyage import Voyage, navigate
 

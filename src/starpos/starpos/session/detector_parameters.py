@@ -35,7 +35,7 @@ PARAMETERS = (
     Parameter(
         "max_stars",
         10000,
-        "Maximum number of stars published, brightest first; a frame takes time in proportion.",
+        "Maximum number of stars published, brightest first. The time a frame takes grows in proportion.",
         unit="",
         minimum=1,
         maximum=100000,
@@ -43,8 +43,8 @@ PARAMETERS = (
     Parameter(
         "threads",
         1,
-        "Threads that search a frame; more are faster where processors are idle, and slow other programs "
-        "where none is.",
+        "Threads that search a frame. More are faster if processors are idle, and slow down other "
+        "programs if none is.",
         unit="",
         minimum=1,
         maximum=64,
@@ -52,8 +52,9 @@ PARAMETERS = (
     Parameter(
         "max_rate",
         math.nan,
-        "Maximum rate of the frames that are searched, chosen evenly by their stamps; unset, as many as the "
-        "processor can: then all of them, or an even share, which slows other programs.",
+        "Maximum rate of frames that are searched, chosen evenly by their stamps. Unset searches "
+        "all frames, or as large an even share as the processor can, which slows down other "
+        "programs.",
         unit="Hz",
         minimum=0.01,
         maximum=MAX_RATE,
@@ -70,8 +71,8 @@ PARAMETERS = (
     Parameter(
         "exposure",
         0.0,
-        "Exposure time of frames that come without a Capture message, 0 unknown: the tilt is averaged over "
-        "it, and it gives the middle of an exposure whose start or end is stamped.",
+        "Exposure time of frames that come without a Capture message; 0 is unknown. The tilt is "
+        "averaged over it. Where stamps mark start or end, it gives the middle of the exposure.",
         unit="s",
         minimum=0.0,
         maximum=MAX_EXPOSURE_S,
@@ -79,17 +80,17 @@ PARAMETERS = (
     Parameter(
         "stamp",
         UNKNOWN,
-        "Moment that the stamps of frames without a Capture message mark: middle, start or end of the "
-        "exposure of the row "
-        "that is read first, or arrival of the image, after its last row was read; '' unknown: 0.3 s off (1 sigma). "
-        "A wrong one shifts longitudes by 15 arcsec for each second.",
+        "Moment that stamps mark in frames without a Capture message: middle, start or end of the "
+        "first row's exposure, or arrival of the whole image. '' is unknown, with an error of 0.3 s "
+        "(1 sigma). A wrong one shifts longitudes by 15 arcsec for each second.",
         choices=KINDS,
     ),
     Parameter(
         "stamp_stddev",
         math.nan,
-        "How far these stamps may be off; 0.1 s is 46 m at the equator. Unset: 0.02 s for middle, start and end, 0.3 s "
-        "for arrival and unknown. If too small, fixes claim errors that are too small.",
+        "Error of these stamps, 1 sigma; 0.1 s is 46 m at the equator. Unset: 0.02 s for middle, "
+        "start and end, 0.3 s for arrival and unknown. If too small, fixes claim errors that are "
+        "too small.",
         unit="s",
         minimum=0.0,
         maximum=60.0,
@@ -97,9 +98,10 @@ PARAMETERS = (
     Parameter(
         "readout",
         math.nan,
-        "From the row of these frames that is read first to the last: positive where the top row is first, negative "
-        "where the bottom one is; 0 for a global shutter. Unset: unknown, and fixes include an error of "
-        "0.03 s. The wrong sign doubles the error that it should remove.",
+        "Time a rolling shutter takes from the first row of these frames to the last: positive if "
+        "the top row is read first, negative if the bottom row is; 0 for a global shutter. Unset: "
+        "unknown, and fixes include an error of 0.03 s. The wrong sign doubles the error that it "
+        "should remove.",
         unit="s",
         minimum=-MAX_READOUT_S,
         maximum=MAX_READOUT_S,
@@ -107,16 +109,17 @@ PARAMETERS = (
     Parameter(
         "gyro",
         False,
-        "Take imu/data, by whose turn rates stars trail: frames with fewer than five stars to learn from are measured "
-        "better. A trail that does not fit is left out. Of no effect with use_sim_time: a replay gives the same stars at "
-        "any rate.",
+        "Predict the trails of stars from the turn rates in imu/data, so that frames with fewer "
+        "than five stars are measured better. A predicted trail that does not fit is not used. "
+        "Without effect under use_sim_time, so that a replay gives the same stars at any rate.",
         read_only=True,
     ),
     Parameter(
         "calibration_url",
         "",
-        "Instrument file (YAML), as the solver's, whose link_to_camera says how the camera sits on the IMU; '' for its "
-        "axis along z and the top of the frame forward. Used with gyro; a wrong one is of no use.",
+        "Instrument file (YAML), as the solver's, whose link_to_camera says how the camera sits on "
+        "the IMU; '' means the optical axis along z and the top of the frame forward. Used with "
+        "gyro; a wrong one brings no benefit.",
         read_only=True,
     ),
 )

@@ -12,15 +12,16 @@ SHARED = (
     Parameter(
         "frame_id",
         "starpos_inclinometer_frame",
-        "Frame of the tilts: S, the sensor's X', Y', Z'; of source imu, the IMU's own axes.",
+        "Frame of the tilts: S, the sensor's X', Y', Z'. With source imu: the IMU's own axes.",
         read_only=True,
         form=FRAME_NAME,
     ),
     Parameter(
         "noise_stddev",
         math.nan,
-        "Lower bound of the white noise of one sample and axis; unset takes the samples' scatter, 0.0035 "
-        "deg until there are enough. If too large, fixes are wider than necessary.",
+        "Lower bound of the white noise of one sample on one axis. Unset takes the samples' "
+        "scatter, or 0.0035 deg until there are enough samples. If too large, fixes claim errors "
+        "that are too large.",
         unit="deg",
         minimum=1e-6,
         maximum=10.0,
@@ -28,8 +29,9 @@ SHARED = (
     Parameter(
         "latency",
         math.nan,
-        "From the middle of a sample to the first byte of its line, of source imu to its stamp; unset takes what the "
-        "microcontroller reports, 0 of other sources. Matters only while the tilt moves.",
+        "Time from the middle of a sample to the first byte of its line, or to its stamp with "
+        "source imu. Unset takes what the microcontroller reports, and 0 for other sources. It "
+        "matters only while the tilt changes.",
         unit="s",
         minimum=0.0,
         maximum=10.0,
@@ -39,8 +41,8 @@ IMU = (
     Parameter(
         "imu.average",
         0.5,
-        "Time over which accelerations are averaged to one tilt, of sources imu and iio; short ones are noisy, long "
-        "ones late.",
+        "Time over which sources imu and iio average accelerations to one tilt. If short, tilts are "
+        "noisy; if long, they come late.",
         unit="s",
         minimum=0.02,
         maximum=60.0,
@@ -56,9 +58,9 @@ IMU = (
     Parameter(
         "imu.max_force_error",
         0.05,
-        "Share by which the acceleration may differ from 9.81 m/s2; beyond it is not at rest and gives no "
-        "tilt. "
-        "Too small refuses an uncalibrated accelerometer, too large takes driving for leaning.",
+        "Largest relative difference of the acceleration from 9.81 m/s2 at rest; beyond it there is "
+        "no tilt. If too small, an uncalibrated accelerometer gives no tilt; if too large, driving "
+        "counts as leaning.",
         unit="",
         minimum=0.0001,
         maximum=0.5,

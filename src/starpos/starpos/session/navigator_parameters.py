@@ -39,32 +39,32 @@ PARAMETERS = (
     Parameter(
         "frame_id",
         "starpos_link",
-        "Frame of the IMU's axes, x forward, y left, z up, whose place and attitude is told.",
+        "Frame of the IMU's axes, x forward, y left, z up, whose position and attitude are published.",
         form=FRAME_NAME,
     ),
     Parameter(
         "odometry_frame_id",
         "map",
-        "Frame of navigator/odometry: east, north, up at the first place that was found.",
+        "Frame of navigator/odometry: east, north, up at the first fix.",
         form=FRAME_NAME,
     ),
     Parameter(
         "publish_tf",
         False,
-        "Publish on /tf where frame_id is in odometry_frame_id; false where a filter tells that, or frame_id hangs on "
-        "base_link: a frame with two parents breaks the tree.",
+        "Publish the pose of frame_id in odometry_frame_id on /tf. Set false if a filter publishes "
+        "it, or if frame_id has base_link as its parent: a frame with two parents breaks the tree.",
     ),
     Parameter(
         "calibration_url",
         "",
-        "Instrument file (YAML) whose link_to_camera says how the camera sits on the IMU; '' for its axis along z and "
-        "the top of the frame forward.",
+        "Instrument file (YAML) whose link_to_camera says how the camera sits on the IMU; '' means "
+        "the optical axis along z and the top of the frame forward.",
     ),
     Parameter(
         "mount_stddev",
         1.0,
-        "How well the camera sits so, an axis. Too small makes a place that is wrong by up to 111 km a degree, until the "
-        "vehicle has turned.",
+        "Error of link_to_camera on each axis, 1 sigma. If too small, the position errs by up to "
+        "111 km a degree until the vehicle has turned.",
         unit="deg",
         minimum=1e-4,
         maximum=20.0,
@@ -72,20 +72,21 @@ PARAMETERS = (
     Parameter(
         "imu_model",
         "",
-        "kalibr's imu.yaml, with the sigma of the biases; '' for a cheap IMU. A bias beyond its sigma makes a place that "
-        "is wrong by up to that: 1 mg is 6 km until the vehicle has turned.",
+        "kalibr's imu.yaml, with the sigma of the biases; '' for a cheap IMU. A bias far beyond its "
+        "sigma moves the position: 1 mg by up to 6 km until the vehicle has turned.",
     ),
     Parameter(
         "vehicle",
         "",
-        "parked: it stands; where no velocity comes the law by which its speed changes; '' for anything that moves, "
-        "whose fix is wide. A law that the vehicle does not keep makes a fix that claims too much.",
+        "What moves. parked: it stands still. Others name the law by which the speed changes where "
+        "no velocity comes. '' is anything that moves, with a large position error. If the vehicle "
+        "does not keep to the law, the fix claims an error that is too small.",
         choices=("", *LAWS),
     ),
     Parameter(
         "velocity_stddev",
         0.05,
-        "Error of a velocity whose message states none, an axis; 0.05 m/s over 20 minutes is 27 m.",
+        "Error on each axis of a velocity whose message states none; 0.05 m/s over 20 minutes is 27 m.",
         unit="m/s",
         minimum=1e-4,
         maximum=100.0,
@@ -93,8 +94,9 @@ PARAMETERS = (
     Parameter(
         "drift_stddev",
         0.0,
-        "Of current or wind, an axis, where the velocity is not over ground but through water or air; half of it may "
-        "change in an hour. A drift that nobody states is an error of the place.",
+        "Speed of current or wind on each axis, 1 sigma, if the velocity is through water or air "
+        "and not over ground; half of it may change in an hour. A drift that is not stated is an "
+        "error of the position.",
         unit="m/s",
         minimum=0.0,
         maximum=50.0,
@@ -102,18 +104,19 @@ PARAMETERS = (
     Parameter(
         "drift_change",
         float("nan"),
-        "What wind or current change in ten minutes, 1 sigma an axis, where it is known; nan: of drift_stddev a fifth, "
-        "or where no velocity comes a ship's current 0.07, a drone's wind 0.3. Too small makes a place that claims too "
-        "much: 0.1 m/s are 108 m.",
+        "Change of wind or current in ten minutes, 1 sigma on each axis. Unset takes a fifth of "
+        "drift_stddev or, where no velocity comes, 0.07 for a ship and 0.3 for a drone. If too "
+        "small, fixes claim errors that are too small: 0.1 m/s is 108 m.",
         unit="m/s",
         minimum=0.01,
         maximum=50.0,
     ),
-    Parameter("rate", 10.0, "Outputs a second.", unit="Hz", minimum=0.1, maximum=100.0),
+    Parameter("rate", 10.0, "Outputs per second.", unit="Hz", minimum=0.1, maximum=100.0),
     Parameter(
         "window",
         1200.0,
-        "Time that is adjusted at once; what is older is forgotten. A short one knows the place less well.",
+        "Length of time that is adjusted at once; older measurements are dropped. A short one "
+        "determines the position less well.",
         unit="s",
         minimum=30.0,
         maximum=7200.0,
@@ -121,7 +124,8 @@ PARAMETERS = (
     Parameter(
         "adjust_period",
         10.0,
-        "How often it is adjusted anew, and more rarely where the window holds much; between, the IMU carries on.",
+        "Time between adjustments, longer if the window holds many measurements. In between, the "
+        "IMU continues the position.",
         unit="s",
         minimum=1.0,
         maximum=600.0,
@@ -129,7 +133,7 @@ PARAMETERS = (
     Parameter(
         "stars_timeout",
         120.0,
-        "How long the IMU carries on without stars; then there is no fix.",
+        "Longest time that the IMU continues the position without stars; after that there is no fix.",
         unit="s",
         minimum=1.0,
         maximum=3600.0,
@@ -137,8 +141,9 @@ PARAMETERS = (
     Parameter(
         "gnss.use",
         False,
-        "Take the place of gnss/fix for navigator/heading, before there is a fix; navigator/fix stays the stars' own. A "
-        "GNSS that is 10 km astray turns the heading by up to 0.1 deg, more near a pole.",
+        "Use the position in gnss/fix for navigator/heading until there is a fix; navigator/fix "
+        "remains the stars' own. A GNSS error of 10 km turns the heading by up to 0.1 deg, more "
+        "near a pole.",
     ),
     *(p for p in parameters.PARAMETERS if p.name in SHARED),
 )

@@ -33,16 +33,17 @@ PARAMETERS = (
     Parameter(
         "publish_tf",
         True,
-        "Publish on /tf_static how camera and inclinometer are turned against frame_id; false where "
-        "robot_state_publisher does, or where the inclinometer is an IMU that has its place in the robot's tree: a frame "
-        "with two parents breaks the tree.",
+        "Publish the rotations of camera and inclinometer relative to frame_id on /tf_static. Set "
+        "false if robot_state_publisher does, or if the inclinometer is an IMU that is in the "
+        "robot's tree: a frame with two parents breaks the tree.",
     ),
     Parameter(
         "calibration_url",
         "",
-        "Instrument file (YAML): misalignment and its error, mount, inclinometer, clock, shutter; '' uses the next three "
-        "parameters. A wrong misalignment is the largest error there is: 1 deg of it moves the fix by 111 km. One "
-        "whose focal length is 5 % from camera_info's is refused.",
+        "Instrument file (YAML): misalignment and its error, mount, inclinometer, clock, shutter; "
+        "'' uses the next three parameters. 1 deg of wrong misalignment moves the fix by 111 km, "
+        "the largest error of all. A file whose focal length differs from camera_info's by 5 % is "
+        "refused.",
     ),
     Parameter(
         "misalignment",
@@ -55,9 +56,9 @@ PARAMETERS = (
     Parameter(
         "misalignment_stddev",
         NAN,
-        "Error of the misalignment and of the inclinometer's zero together, each axis; 1 arcsec is 31 m. If "
-        "too small, fixes claim errors that are too small; unset, the misalignment is not known: over 1000 "
-        "km.",
+        "Error of the misalignment and of the inclinometer's zero together, each axis; 1 arcsec is "
+        "31 m. If too small, fixes claim errors that are too small. If unset, the misalignment is "
+        "unknown and the position error is over 1000 km.",
         unit="arcsec",
         minimum=0.0,
         maximum=36000.0,
@@ -65,14 +66,14 @@ PARAMETERS = (
     Parameter(
         "inclinometer.model",
         "",
-        f"Take the inclinometer's errors from its data sheet: {', '.join(sensors.PRESETS)}; used without "
-        "calibration_url, whose file names its own. '' for an SCA100T as sold (7 km or more).",
+        f"Inclinometer by its name, with the errors of its data sheet: {', '.join(sensors.PRESETS)}. Used without "
+        "calibration_url, whose file names its own inclinometer. '' means an SCA100T as sold (7 km or more).",
     ),
     Parameter(
         "calibration_frames",
         100,
-        "Newest frames kept for solver/calibrate. Few leave the tilts' noise in A3; many take seconds to "
-        "solve.",
+        "Number of newest frames kept for solver/calibrate. With few, the tilts' noise stays in A3; "
+        "many take seconds to solve.",
         unit="",
         minimum=1,
         maximum=1000,
@@ -80,10 +81,10 @@ PARAMETERS = (
     Parameter(
         "calibration_turn_stddev",
         180.0,
-        "Error of the turn about the plumb line (the direction the inclinometer faces) of the misalignment "
-        "in use when a calibration begins; frames at one lean, or turned about one leaning axis, do not "
-        "determine it. 180: unknown, and fixes at another lean, or of a leaning turn, state large errors. "
-        "If too small, they are wrong.",
+        "When a calibration begins: error of the misalignment's rotation about the plumb line, that "
+        "is of the direction the inclinometer faces. Frames at one lean, or turned about one "
+        "leaning axis, do not determine it. 180 means unknown: fixes at another lean then claim "
+        "large errors. If too small, those fixes are wrong.",
         unit="deg",
         minimum=0.000001,
         maximum=180.0,
@@ -91,15 +92,15 @@ PARAMETERS = (
     Parameter(
         "self_calibration",
         False,
-        "Treat the misalignment as unknown and find it whenever the instrument has been turned on the spot "
-        "to four headings or more; until then fixes carry an error of 10 deg. Until it has been found once, "
-        "call solver/reset after driving on.",
+        "Treat the misalignment as unknown and find it whenever the instrument has been turned on "
+        "the spot to four headings or more. Until then fixes claim an error of 10 deg, and "
+        "solver/reset must be called after driving on.",
     ),
     Parameter(
         "self_calibration_limit",
         60.0,
-        "Largest error of the plumb line in the camera with which a calibration by turning on the spot is "
-        "used; 1 arcsec is 31 m.",
+        "A calibration by turning is used if the plumb line in the camera errs by at most this; 1 "
+        "arcsec is 31 m.",
         unit="arcsec",
         minimum=0.0,
         maximum=36000.0,
@@ -124,7 +125,7 @@ PARAMETERS = (
     Parameter(
         "refraction.humidity",
         NAN,
-        "Relative humidity; it hardly matters in visible light. Unset is 0.3, give or take 0.25.",
+        "Relative humidity; it hardly matters in visible light. Unset takes 0.3 +- 0.25.",
         unit="",
         minimum=0.0,
         maximum=1.0,
@@ -132,7 +133,7 @@ PARAMETERS = (
     Parameter(
         "refraction.wavelength",
         NAN,
-        "Mean wavelength of the light that the camera sees; unset is 0.55, give or take 0.08.",
+        "Mean wavelength of the light that the camera sees. Unset takes 0.55 +- 0.08.",
         unit="um",
         minimum=0.2,
         maximum=10.0,
@@ -140,21 +141,23 @@ PARAMETERS = (
     Parameter(
         "altitude",
         NAN,
-        "Height above the WGS 84 ellipsoid, published in fix and used for the curvature of plumb lines (5 m "
-        "of latitude a km at 45 deg; not where deflection.xi or deflection.eta is set): a map's height "
-        "above sea level plus the geoid's undulation there (-107 to 86 m). The stars do not determine it; "
-        "unset leaves NaN, and some consumers drop such a fix.",
+        "Height above the WGS 84 ellipsoid: a map's height above sea level plus the geoid's "
+        "undulation there (-107 to 86 m). It is published in fix, and corrects the plumb line's "
+        "curvature (5 m of latitude a km at 45 deg) unless deflection.xi or deflection.eta is set. "
+        "The stars do not determine it. Unset publishes NaN, and some consumers drop such a fix.",
         unit="m",
         minimum=-1000.0,
         maximum=100000.0,
     ),
-    Parameter("altitude_stddev", 100.0, "Its error.", unit="m", minimum=0.0, maximum=100000.0),
+    Parameter(
+        "altitude_stddev", 100.0, "Error of altitude, 1 sigma.", unit="m", minimum=0.0, maximum=100000.0
+    ),
     Parameter(
         "clock_stddev",
         NAN,
-        "Error of the clock that stamps the frames against UTC; unset takes what the camera's host says of its clock, at "
-        "least the instrument file's, or 0.01. 1 s is 464 m at the equator. If too small, fixes claim "
-        "errors that are too small.",
+        "Error against UTC of the clock that stamps the frames. Unset takes what the camera's host "
+        "reports of its clock, at least the instrument file's value, or 0.01. 1 s is 464 m at the "
+        "equator. If too small, fixes claim errors that are too small.",
         unit="s",
         minimum=0.0,
         maximum=3600.0,
@@ -162,7 +165,7 @@ PARAMETERS = (
     Parameter(
         "deflection.xi",
         0.0,
-        "Deflection of the vertical to the north, at the instrument; 1 arcsec is 31 m of the geodetic latitude.",
+        "Deflection of the vertical to the north, at the instrument; 1 arcsec is 31 m of geodetic latitude.",
         unit="arcsec",
         minimum=-120.0,
         maximum=120.0,
@@ -186,17 +189,17 @@ PARAMETERS = (
     Parameter(
         "deflection.geoid",
         "",
-        "Geoid grid (GTX, NGS .bin, GeoTIFF; in m) whose slopes are the deflection and whose roughness its error, "
-        "instead of the three above: a path, or a name among PROJ's grids such as egm96_15.gtx. '' for none. A coarse "
-        "one misses 1 arcsec in plains and 10 in mountains, and outside its area the deflection is unknown: "
-        "6 arcsec, "
-        "190 m.",
+        "Geoid grid (GTX, NGS .bin, GeoTIFF; in m) that replaces the three above: its slopes are "
+        "the deflection, and its roughness gives the error. Give a path, or the name of one of "
+        "PROJ's grids such as egm96_15.gtx; '' for none. A coarse grid errs by 1 arcsec in plains "
+        "and 10 in mountains. Outside its area the deflection is unknown: 6 arcsec, 190 m.",
     ),
     Parameter(
         "deflection.wanted",
         NAN,
-        "Measure the deflection of the vertical at the site (site.geodetic, altitude) until it errs by at most this; "
-        "~/deflection and the dashboard say how far it is. Unset: it is not measured.",
+        "Measure the deflection of the vertical at the site (needs site.geodetic and altitude) "
+        "until each component errs by at most this. The service ~/deflection and the dashboard show "
+        "the progress. Unset: it is not measured.",
         unit="arcsec",
         minimum=0.001,
         maximum=3.0,
@@ -205,8 +208,8 @@ PARAMETERS = (
     Parameter(
         "site.latitude",
         NAN,
-        "Latitude of a place that is known, as of a pillar: heading/imu is published there without any tilt. Unset: the "
-        "place is not known. One that the stars contradict gives no heading.",
+        "Latitude of a known place, such as a pillar. heading/imu then needs no tilt. Unset: the "
+        "place is unknown. If the stars contradict the place, no heading is published.",
         unit="deg",
         minimum=-90.0,
         maximum=90.0,
@@ -214,7 +217,7 @@ PARAMETERS = (
     Parameter(
         "site.longitude",
         NAN,
-        "Its longitude, east positive.",
+        "Longitude of the known place, east positive.",
         unit="deg",
         minimum=-360.0,
         maximum=360.0,
@@ -222,8 +225,9 @@ PARAMETERS = (
     Parameter(
         "site.geodetic",
         False,
-        "Whether the site is on WGS 84, as a map or a receiver has it; false: by gravity, as a fix's astronomic place. "
-        "Where the deflection is not known, this decides which heading has its error: by gravity or on WGS 84.",
+        "True if the site is on WGS 84, as maps and receivers give it; false if it is astronomic, "
+        "as in a fix without a deflection. If the deflection is unknown, the heading in the other "
+        "system gets the deflection's error.",
     ),
     Parameter(
         "site.stddev",
@@ -233,13 +237,16 @@ PARAMETERS = (
         minimum=0.0,
         maximum=100000.0,
     ),
-    Parameter("min_stars", 5, "Fewest identified stars that make a fix.", unit="", minimum=4, maximum=1000),
+    Parameter(
+        "min_stars", 5, "Minimum number of identified stars for a fix.", unit="", minimum=4, maximum=1000
+    ),
     Parameter(
         "search_time",
         0.3,
-        "How long a frame that is not identified at once may be searched by other ways: smaller triangles, where stars "
-        "fill a part of it only; other focal lengths, to say which fits. At most half of the time between frames; "
-        "recorded frames are searched to the end. 0: not at all.",
+        "Time limit for further searches of a frame that is not identified at once: with smaller "
+        "triangles, where stars fill only a part of it; with other focal lengths, to report which "
+        "one fits. They take at most half of the time between frames; recorded frames are searched "
+        "to the end. 0: no further search.",
         unit="s",
         minimum=0.0,
         maximum=60.0,
@@ -247,8 +254,8 @@ PARAMETERS = (
     Parameter(
         "max_rate",
         NAN,
-        "Maximum rate of the frames that are answered, chosen evenly by their stamps; unset, as many as the "
-        "processor can: then all of them, or an even share, which slows other programs.",
+        "Maximum rate of frames that are answered, chosen evenly by their stamps. Unset answers all "
+        "frames, or as large an even share as the processor can, which slows down other programs.",
         unit="Hz",
         minimum=0.01,
         maximum=MAX_RATE,
@@ -256,31 +263,32 @@ PARAMETERS = (
     Parameter(
         "gyro",
         False,
-        "Take imu/data, whose turn rates say where a camera that turns looks: frames of four stars are identified too. "
-        "Its axes are frame_id's, as calibration_url's link_to_camera has them; wrong ones neither help nor "
-        "harm. "
-        "Of no effect with use_sim_time: a replay gives the same answers at any rate.",
+        "Use the turn rates in imu/data to predict where a turning camera looks, so that frames of "
+        "four stars are identified too. The IMU has the axes of frame_id, related to the camera "
+        "by calibration_url's link_to_camera; wrong ones do no harm. Without effect under "
+        "use_sim_time, so that a replay gives the same answers at any rate.",
         read_only=True,
     ),
     Parameter(
         "gnss.use",
         False,
-        "Take gnss/fix, which teaches the misalignment, the inclinometer's errors and the deflection while the stars "
-        "agree with it, and is guarded by them; fix stays the stars' own. GNSS that is spoofed from the "
-        "first frame on teaches wrong values.",
+        "Learn the misalignment, the inclinometer's errors and the deflection from gnss/fix while "
+        "the stars agree with it, and warn when they do not. `fix` remains the stars' own. GNSS "
+        "that is spoofed from the first frame on teaches wrong values.",
         read_only=True,
     ),
     Parameter(
         "gnss.learned",
         "",
-        "File that keeps what GNSS taught, read at the start if it is there; '' for none. Delete it after camera or "
-        "inclinometer was remounted: the old one makes fixes wrong until GNSS disagrees.",
+        "File that keeps what was learned from GNSS; it is read at the start. '' for none. Delete "
+        "it after camera or inclinometer was remounted: an old file makes fixes wrong until GNSS "
+        "disagrees.",
         read_only=True,
     ),
     Parameter(
         "tilt_window",
         0.5,
-        "Span of tilts averaged where the exposure is unknown.",
+        "Time over which tilts are averaged if the exposure is unknown.",
         unit="s",
         minimum=0.01,
         maximum=60.0,
@@ -288,8 +296,8 @@ PARAMETERS = (
     Parameter(
         "tilt_timeout",
         NAN,
-        "How long a frame waits for the tilts of its exposure; later ones come too late. Unset: 0.5 s, or 1.5 times as "
-        "long as tilts take to come, by their interval and their delay.",
+        "Longest time that a frame waits for the tilts of its exposure. Unset: 1.5 times the "
+        "interval and delay of the tilts, at least 0.5 s.",
         unit="s",
         minimum=0.0,
         maximum=60.0,
@@ -297,7 +305,8 @@ PARAMETERS = (
     Parameter(
         "tilt_stddev",
         NAN,
-        "Error of a tilt sample whose message states none; unset takes the instrument file's, or inclinometer.model's.",
+        "Error of a tilt sample whose message states none. Unset takes the value of the instrument "
+        "file or of inclinometer.model.",
         unit="deg",
         minimum=1e-7,
         maximum=10.0,

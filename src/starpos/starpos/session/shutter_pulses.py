@@ -13,6 +13,8 @@ from dataclasses import dataclass
 from itertools import takewhile
 from statistics import stdev
 
+from starpos.normal import SIGMA_PER_MAD
+
 # Frames that must agree before a pulse is believed.
 LEARNED = 5
 # Number of the last frames that determine the camera's lag.
@@ -21,8 +23,8 @@ KEPT = 30
 MIN_LAG_SPREAD_S, MAX_LAG_SPREAD_S = 0.005, 0.05
 # The same of lengths. A spark just before the contact closes makes a pulse begin early, and longer by the same time.
 MIN_LENGTH_SPREAD_S, MAX_LENGTH_SPREAD_S = 0.0001, 0.002
-# A robust standard deviation is the median deviation times this; the camera's own scatter is within this many of them.
-OF_MEDIAN, SIGMAS = 1.4826, 4.0
+# The camera's own scatter is within this many robust standard deviations.
+SIGMAS = 4.0
 # Time by which a driver may report the begin of an exposure too late.
 EARLY_S = 0.1
 # Time for which pulses are remembered after their end.
@@ -183,7 +185,7 @@ def _doubt(lag_s: float, length_s: float, usual: list[tuple[float, float]]) -> s
 
 def _spread(values: Sequence[float], middle: float, least: float, most: float) -> float:
     """How far a value may be from the median; robust, because a wrong one must not open the door to others."""
-    return min(max(SIGMAS * OF_MEDIAN * _median([abs(v - middle) for v in values]), least), most)
+    return min(max(SIGMAS * SIGMA_PER_MAD * _median([abs(v - middle) for v in values]), least), most)
 
 
 def _median(values: Sequence[float]) -> float:

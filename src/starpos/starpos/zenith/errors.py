@@ -8,12 +8,11 @@ import numpy as np
 
 from starpos.earth.orientation import ROTATION_RAD_S
 from starpos.instrument.inclinometer import InclinometerErrors
-from starpos.units import ARCSEC
+from starpos.units import ARCSEC, HOUR_S
 from starpos.zenith.lines import Lines
 from starpos.zenith.places import StarPlaces
 from starpos.zenith.sighting import Mark, ZenithSighting
 
-HOUR_S = 3600.0
 # Unmeasured temperature of a tiltmeter: it follows a clear night's air, some degrees in a few hours.
 UNKNOWN_WALK_C_PER_SQRT_HOUR = 2.0
 # Daily and half-daily terms of UT1 and of the pole, which daily tables do not have. The values are the root mean square

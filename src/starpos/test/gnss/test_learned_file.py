@@ -19,7 +19,7 @@ DRIVE = GnssDrive(stops=6)
 def learned():
     watch = GnssWatch(DRIVE.instrument, Deflection())
     for moment in DRIVE.moments(np.random.default_rng(3)):
-        watch.go_on(moment.sighting)
+        watch.advance(moment.sighting)
         watch.learn(moment.sighting, moment.gnss, watch.judge(moment.sighting, moment.gnss))
     return watch.learned
 

@@ -39,7 +39,7 @@ def driven(drive, seed, gnss_until_s=np.inf, gnss_again_s=np.inf, astray=lambda 
     watch, told = watch or GnssWatch(drive.instrument, UNKNOWN), []
     for moment in drive.moments(np.random.default_rng(seed), astray):
         t, sighting = moment.sighting.utc_unix_s - 1.7e9, moment.sighting
-        watch.go_on(sighting)
+        watch.advance(sighting)
         check = watch.judge(sighting, moment.gnss) if t < gnss_until_s or t > gnss_again_s else None
         error = covariance = None
         if watch.tells_place(sighting):
@@ -153,7 +153,7 @@ def test_one_lean_tells_no_turn_and_the_diagnostic_says_what_would():
 def test_readings_that_two_frames_share_teach_once():
     moment = next(iter(DRIVE.moments(np.random.default_rng(1))))
     watch = GnssWatch(DRIVE.instrument, UNKNOWN)
-    watch.go_on(moment.sighting)
+    watch.advance(moment.sighting)
     check = watch.judge(moment.sighting, moment.gnss)
     object.__setattr__(moment.sighting.tilt, "times", (1.0, 2.0))
     watch.learn(moment.sighting, moment.gnss, check)

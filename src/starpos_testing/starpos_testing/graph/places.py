@@ -5,13 +5,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from starpos.earth.ellipsoid import EARTH_RADIUS_M
 from starpos.instrument.instrument import Calibration
 from starpos.sky.site import Site
 from starpos_testing.graph.graph import stamp_of
 from starpos_testing.graph.shots import scene_at, shoot
-
-# A sphere will do.
-METRES = 6.371e6
 
 
 def misaligned(misalignment_deg=(0.3, -0.2, 0.5), azimuth_deg=40.0):
@@ -40,7 +38,7 @@ def answer_in(graph, heard: list, shot):
 def moved_m(site: Site, latitude_deg: float, longitude_deg: float) -> np.ndarray:
     """East, north (2,) in m of a place (deg) from the true one."""
     east = np.radians(longitude_deg - site.longitude_deg) * np.cos(np.radians(site.latitude_deg))
-    return np.array([east, np.radians(latitude_deg - site.latitude_deg)]) * METRES
+    return np.array([east, np.radians(latitude_deg - site.latitude_deg)]) * EARTH_RADIUS_M
 
 
 def sigmas(site: Site, latitude_deg: float, longitude_deg: float, covariance) -> float:

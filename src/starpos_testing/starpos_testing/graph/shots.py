@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from sensor_msgs.msg import CameraInfo, Image
 
+from starpos.earth.ellipsoid import EARTH_RADIUS_M
 from starpos.earth.refraction import Atmosphere
 from starpos.frames.stars import no_stars
 from starpos.instrument.inclinometer import Tilt
@@ -56,7 +57,7 @@ class SimulatedShot:
     def error_m(self, solution) -> np.ndarray:
         """East, north (2,) in m of a solution's place from the true one, on a sphere."""
         east = np.radians(solution.longitude - LONGITUDE_DEG) * np.cos(np.radians(LATITUDE_DEG))
-        return np.array([east, np.radians(solution.latitude - LATITUDE_DEG)]) * 6.371e6
+        return np.array([east, np.radians(solution.latitude - LATITUDE_DEG)]) * EARTH_RADIUS_M
 
     def heading_error_deg(self, heading_deg: float) -> float:
         return (heading_deg - np.degrees(self.scene.heading) + 180) % 360 - 180
