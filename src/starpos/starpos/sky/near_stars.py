@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Parallaxes of the near stars, which Tycho-2 does not have.
 
-They are of Hipparcos' stars (ESA SP-1200, 1997) with MIN_MAS and more, and of stars within 8 arcsec of one;
-tools/data/near_stars.py made the table.  Many are Gaia DR2's.  Hipparcos' own err by 1 to 3 mas, of some pairs more.
+They are Hipparcos' stars (ESA SP-1200, 1997) of MIN_MAS and more, and stars within 8 arcsec of one. The table is made by
+tools/data/near_stars.py from Stellarium's list, which has later values for some. Hipparcos' own err by 1 to 3 mas, of
+some pairs more.
 """
 
 from functools import lru_cache
@@ -10,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-MIN_MAS = 20.0
+MIN_MAS = 100.0
 # Columns tyc1, tyc2, tyc3, parallax_mas.
 PARALLAXES = Path(__file__).with_name("data") / "near_stars.csv"
 

@@ -63,9 +63,9 @@ def test_the_committed_catalogue_has_the_nearest_stars_parallaxes(name, catalogu
 
 def test_near_stars_are_few_and_their_tables_stay(catalogue):
     near = catalogue.parallax_mas() > 0
-    assert 6_000 < near.sum() < 7_000 and catalogue.parallax_mas()[near].min() >= 20
+    assert 100 < near.sum() < 200 and catalogue.parallax_mas()[near].min() >= 100
     # stars of one parallax move together: half of all near ones by more than this, mas a year
-    assert np.median(np.hypot(*catalogue.motions(near))) > 100
+    assert np.median(np.hypot(*catalogue.motions(near))) > 500
     # so the triangles in a user's cache still belong to it
     assert catalogue.fingerprint == "15e0a9fd5bc29a88"
 
@@ -74,7 +74,7 @@ def test_near_stars_are_few_and_their_tables_stay(catalogue):
 def near(rng):
     """A few stars with the identifiers of near ones."""
     committed = load_catalogue()
-    rows = np.flatnonzero(committed.parallax_tenths)[::300]
+    rows = np.flatnonzero(committed.parallax_tenths)[::7]
     n = len(rows)
     return pack(
         committed.tyc[rows], np.arange(1, n + 1), np.full(n, 9.0), rng.uniform(0, 360, n), rng.uniform(-80, 80, n),
