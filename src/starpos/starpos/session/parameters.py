@@ -66,8 +66,8 @@ PARAMETERS = (
     Parameter(
         "inclinometer.model",
         "",
-        "; used without calibration_url, whose file names its own inclinometer. '' means an SCA100T "
-        "as sold (7 km or more).",
+        f"Inclinometer by its name, with the errors of its data sheet: {', '.join(sensors.PRESETS)}. Used without "
+        "calibration_url, whose file names its own inclinometer. '' means an SCA100T as sold (7 km or more).",
     ),
     Parameter(
         "calibration_frames",
