@@ -233,7 +233,7 @@ def error_terms(
 def tilt_terms(
     rows: np.ndarray, level: LocalLevel, tilt: Tilt, mounting: Mounting, utc_unix_s: float
 ) -> tuple[ErrorTerm, ...]:
-    """The terms of A3, then those of the inclinometer; rows (n, 3): the factors' rows for a small rotation of L.
+    """The terms of A3, then of the inclinometer; rows (n, 3): the factors' rows for a small rotation of L.
 
     None of them has Origin.OTHER: GNSS would count it twice.
     """

@@ -17,7 +17,7 @@ from starpos.frames.stars import Stars
 from starpos.gnss.place import GnssPlace
 from starpos.gnss.sighting import LEARNED_ORIGINS, LevelSight, zenith_rows
 from starpos.gnss.states import Learned
-from starpos.gnss.watch import LEARNING, GnssCheck, GnssWatch
+from starpos.gnss.watch import GnssCheck, GnssStatus, GnssWatch
 from starpos.instrument.inclinometer import Tilt
 from starpos.instrument.instrument import Calibration
 from starpos.units import ARCSEC
@@ -63,7 +63,7 @@ def watched(
     gnss: that place, None without one.
     """
     if rough.fix is None or rough.tilt is None:
-        compared = None if gnss is None else Compared(gnss, GnssCheck(LEARNING), 0, 0)
+        compared = None if gnss is None else Compared(gnss, GnssCheck(GnssStatus.LEARNING), 0, 0)
         return Watched(solution=rough, compared=compared)
     tilt = rough.tilt
     watch.advance(LevelSight.of(rough.fix, tilt))
