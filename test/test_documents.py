@@ -2,6 +2,7 @@
 """What the documents name is there: links, headings, files, tools, parameters."""
 
 import ast
+import importlib
 import io
 import re
 import subprocess
@@ -75,6 +76,16 @@ def test_pages_of_the_reference_are_what_the_code_makes():
     tool = [sys.executable, ROOT / "tools" / "reference.py", "--check"]
     done = subprocess.run(tool, check=False, capture_output=True, text=True)
     assert (done.returncode, done.stdout) == (0, ""), done.stderr
+
+
+@pytest.mark.parametrize("marks", [0, 2])
+def test_a_page_of_the_reference_without_its_mark_is_an_error_and_is_left_alone(marks, tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(ROOT / "tools")
+    reference = importlib.import_module("reference")
+    page = tmp_path / "parameters.md"
+    page.write_text("# By hand\n" + marks * f"{reference.MARK}Table\n")
+    with pytest.raises(SystemExit, match=f"must be there once, and is there {marks} times"):
+        reference.above_the_mark(page)
 
 
 def test_the_readme_is_short():

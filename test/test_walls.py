@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A breach of each kind of the walls of the house is seen; that they hold, `make lint` sees."""
+"""Each kind of breach of the rules of imports and names is seen; whether there are any, `make lint` says."""
 
 import importlib.util
 import os
@@ -40,8 +40,8 @@ def walls():
 
 FIELDS = "".join(f"    {name}: float\n" for name in "abcdef")
 BREACHES = [
-    ("outside", {"starpos.frames.new": "from starpos import Solver"}, "opens every floor"),
-    ("outside", {"starpos.frames.new": "import starpos"}, "opens every floor"),
+    ("outside", {"starpos.frames.new": "from starpos import Solver"}, "brings in every folder"),
+    ("outside", {"starpos.frames.new": "import starpos"}, "brings in every folder"),
     ("outside", {"starpos.fix.new": "def f():\n    from rclpy.node import Node"}, "which is ROS"),
     ("outside", {"starpos.fix.new": "from sensor_msgs.msg import Image"}, "which is ROS"),
     ("outside", {"starpos.fix.new": "from starpos_interfaces.msg import Tilt"}, "which is ROS"),
@@ -89,7 +89,7 @@ BREACHES = [
 ]
 
 
-def house_of(walls, sources):
+def modules_of(walls, sources):
     return [
         (walls.Compiled if "._" in name else walls.Module)(name, ROOT / "new.py", text)
         for name, text in sources.items()
@@ -105,7 +105,7 @@ def table(heading: str) -> list[list[str]]:
 
 def test_the_plan_has_the_floors_that_the_contracts_have(walls):
     assert walls.floors() == {
-        name: 0 if floor == "ground" else int(floor)
+        name: int(floor)
         for floor, cell, _ in table("Folders of starpos")
         for name in re.findall(r"`(\w+)`", cell)
     }
@@ -137,8 +137,10 @@ def test_the_plan_allows_what_the_contracts_allow():
 
 
 def test_import_linter_sees_what_the_contracts_forbid(walls, tmp_path):
-    rooms = [f"starpos.{room}" for room in walls.floors()]
-    sources = dict.fromkeys([*walls.packages(), *rooms], "") | {m: text for m, (text, _) in FORBIDDEN.items()}
+    folders = [f"starpos.{folder}" for folder in walls.floors()]
+    sources = dict.fromkeys([*walls.packages(), *folders], "") | {
+        m: text for m, (text, _) in FORBIDDEN.items()
+    }
     for name, text in sources.items():
         path = tmp_path.joinpath(*name.split("."))
         is_folder = name in walls.packages() or any(other.startswith(f"{name}.") for other in sources)
@@ -158,7 +160,7 @@ def test_import_linter_sees_what_the_contracts_forbid(walls, tmp_path):
 
 @pytest.mark.parametrize(("rule", "sources", "sentence"), BREACHES)
 def test_a_breach_is_seen(walls, rule, sources, sentence):
-    found = list(getattr(walls, rule)(house_of(walls, sources)))
+    found = list(getattr(walls, rule)(modules_of(walls, sources)))
     assert len(found) == 1 and sentence in found[0]
 
 
@@ -171,8 +173,8 @@ def test_what_is_allowed_is_no_breach(walls):
         "starpos.cli.new": "from starpos import __version__, rotation",
         "starpos_bringup.new": "import starpos\nimport tf2_ros",
     }
-    house = house_of(walls, sources)
-    assert [*walls.outside(house), *walls.aliases(house)] == []
+    modules = modules_of(walls, sources)
+    assert [*walls.outside(modules), *walls.aliases(modules)] == []
 
 
 def test_what_a_compiled_module_may_is_no_breach(walls):
@@ -183,11 +185,11 @@ def test_what_a_compiled_module_may_is_no_breach(walls):
         'cdef extern from *:\n    """\n    By C.\n    """\n    void f()\n'
         'def f():\n    """As many as `many`."""\n    return "# no comment"\n'
     )
-    house = house_of(walls, {"starpos.fix._new": text, "starpos.fix.a": "from starpos.fix._new import f"})
-    compiled = house[:1]
+    modules = modules_of(walls, {"starpos.fix._new": text, "starpos.fix.a": "from starpos.fix._new import f"})
+    compiled = modules[:1]
     assert [
         *walls.cimports(compiled),
-        *walls.uncalled(house),
-        *walls.words(house),
-        *walls.comments(house),
+        *walls.uncalled(modules),
+        *walls.words(modules),
+        *walls.comments(modules),
     ] == []

@@ -3,8 +3,8 @@
 
     python tools/reference.py [--check]
 
-Each page keeps what stands above its mark. With --check nothing is written, and pages that the code would make
-otherwise are named (exit status 1).
+Each page keeps what stands above its mark; a page without the mark is an error. With --check nothing is written, and
+pages that differ from what the code makes are named (exit status 1).
 """
 
 import re
@@ -55,9 +55,19 @@ def pages() -> dict[Path, str]:
     made = {}
     for name, make in PAGES.items():
         path = ROOT / "docs" / "reference" / f"{name}.md"
-        written_by_hand, _, _ = path.read_text(encoding="utf-8").partition(MARK)
-        made[path] = written_by_hand + MARK + make()
+        made[path] = above_the_mark(path) + MARK + make()
     return made
+
+
+def above_the_mark(path: Path) -> str:
+    """The part of a page that is written by hand; ends the program if the mark is missing, or is there twice."""
+    parts = path.read_text(encoding="utf-8").split(MARK)
+    if len(parts) != 2:
+        sys.exit(
+            f"{path}: this line must be there once, and is there {len(parts) - 1} times: {MARK.strip()}. "
+            "Put it below what is written by hand, and run python tools/reference.py again."
+        )
+    return parts[0]
 
 
 def main() -> int:

@@ -61,8 +61,8 @@ CHECKS = ("linters", "documents", "versions")
 # parts that mostly wait run next to parts that mostly compute
 FIRST = ("graph", "starpos", "starpos_camera", "starpos_inclinometer")
 UBUNTU = "Ubuntu's "
-# the rooms of starpos whose answers depend on the table of the Earth's rotation, which is older there
-ROTATING = [f"src/starpos/test/{room}" for room in ("earth", "fix", "session", "sky")]
+# the folders of starpos whose answers depend on the table of the Earth's rotation, which is older there
+ROTATING = [f"src/starpos/test/{folder}" for folder in ("earth", "fix", "session", "sky")]
 UNDERLAY = ROOT / ".underlay"
 # interpreters with which the core's tests run too, where they are at hand; Ubuntu's versions run with Python 3.12
 OTHERS = ("python3.10", "python3.13")
@@ -335,7 +335,7 @@ def others(pytest_args: list[str]) -> Tests:
 def ubuntus(pytest_args: list[str]) -> Tests:
     """Tests of all packages with Ubuntu's versions, and of what the Earth's rotation enters with Ubuntu's table of it."""
     rotating = [
-        str(p.relative_to(ROOT)) for room in ROTATING for p in sorted((ROOT / room).glob("test_*.py"))
+        str(p.relative_to(ROOT)) for folder in ROTATING for p in sorted((ROOT / folder).glob("test_*.py"))
     ]
     tests = {
         f"{UBUNTU}{name}": partial(older, files, f"{name.replace(' ', '-')}-ubuntu", pytest_args)

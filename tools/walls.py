@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Hold those walls of the house that import-linter does not see (tools/imports.ini): ROS, Cython, a few rules of names.
+"""Check the rules of imports that import-linter cannot (tools/imports.ini): ROS, Cython; and a few rules of names.
 
 `walls.py` prints a line for each breach and exits 1 where there is one. `make lint` runs it.
 """
@@ -37,11 +37,11 @@ FOREIGN = {
     "scipy",
     "yaml",
 }
-# What compiled modules may import besides compiled modules of their own room and of the floors below.
+# What compiled modules may import besides compiled modules of their own folder and of lower floor numbers.
 OF_CYTHON = {"cpython", "libc", "numpy"}
 IMPORTED = re.compile(r"\bfrom\s+([\w.]+)\s+c?import\b|\bc?import\s+(.+)")
-# What asks the package itself, for its file and its version.
-AT_THE_DOOR = {"starpos.parallel.same"}
+# Modules that may import the package `starpos` itself: they ask for its file and its version.
+MAY_IMPORT_STARPOS = {"starpos.parallel.same"}
 # names that the whole field writes in this way
 USUAL = {("numpy", "np"), ("xml.etree.ElementTree", "ET"), ("matplotlib.pyplot", "plt")}
 DOCUMENTED = ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef
@@ -77,8 +77,8 @@ class Module:
         return self.name.partition(".")[0]
 
     @property
-    def room(self) -> str:
-        """The folder or the ground's module of `starpos` that it lies in."""
+    def folder(self) -> str:
+        """The folder of `starpos` that it lies in, or its own name if it is a module of floor 0."""
         return self.name.split(".")[1] if "." in self.name else ""
 
     def at(self, node: ast.AST, sentence: str) -> str:
@@ -175,7 +175,7 @@ def compiled() -> list[Compiled]:
 
 @cache
 def floors() -> dict[str, int]:
-    """The floor of each folder of `starpos`, from the ground's modules, 0, upwards."""
+    """The floor number of each folder of `starpos`; single modules (`errors`, `units` and others) have 0."""
     contracts = ConfigParser()
     contracts.read(CONTRACTS)
     lines = contracts["importlinter:contract:floors"]["layers"].split("\n")
@@ -195,56 +195,60 @@ def imports(module: Module) -> Iterator[tuple[ast.AST, str]]:
             yield from ((node, f"{node.module}.{alias.name}") for alias in node.names)
 
 
-def outside(house: list[Module]) -> Iterator[str]:
-    """Imports of `starpos` that no contract sees: of ROS, and of its own public names, which opens every floor."""
-    for module in house:
+def outside(sources: list[Module]) -> Iterator[str]:
+    """Imports of `starpos` that no contract sees: of ROS, and of the package itself, which imports all folders."""
+    for module in sources:
         for node, target in imports(module) if module.package == "starpos" else ():
             package, _, rest = target.partition(".")
             if package not in {"starpos", *FOREIGN, *sys.stdlib_module_names}:
                 yield module.at(
                     node, f"starpos imports {package}, which is ROS, or not yet in FOREIGN of walls.py"
                 )
-            elif package != "starpos" or rest == "__version__" or module.name in AT_THE_DOOR:
+            elif package != "starpos" or rest == "__version__" or module.name in MAY_IMPORT_STARPOS:
                 continue
             elif rest.partition(".")[0] not in floors():
-                yield module.at(node, f"import of {target} opens every floor: import a name from its folder")
+                yield module.at(
+                    node, f"import of {target} brings in every folder: import the name from its own folder"
+                )
 
 
 def cimports(files: list[Compiled]) -> Iterator[str]:
-    """Imports of compiled modules: of others in Cython only, in their own room or on a floor below."""
-    floor, folder = floors(), packages()["starpos"]
+    """Imports of compiled modules: of others in Cython only, in their own folder or one with a smaller floor number."""
+    floor, root = floors(), packages()["starpos"]
     for file in files:
         for line, name in file.imported():
-            package, room, module = (*name.split("."), "", "")[:3]
+            package, folder, module = (*name.split("."), "", "")[:3]
             if package in OF_CYTHON:
                 continue
-            if package != "starpos" or not (folder / room / f"{module}.pxd").is_file():
+            if package != "starpos" or not (root / folder / f"{module}.pxd").is_file():
                 yield file.at_line(line, f"a compiled module imports {name}")
-            elif room != file.room and floor[room] >= floor[file.room]:
-                sentence = f"{file.room} (floor {floor[file.room]}) imports {room} (floor {floor[room]})"
+            elif folder != file.folder and floor[folder] >= floor[file.folder]:
+                sentence = (
+                    f"{file.folder} (floor {floor[file.folder]}) imports {folder} (floor {floor[folder]})"
+                )
                 yield file.at_line(line, sentence)
 
 
-def uncalled(house: list[Module]) -> Iterator[str]:
-    """Compiled modules that nothing in their own room calls; the modules of `_numeric` are shared on purpose."""
+def uncalled(sources: list[Module]) -> Iterator[str]:
+    """Compiled modules that nothing in their own folder calls; the modules of `_numeric` are shared on purpose."""
     called = set()
-    for module in house:
+    for module in sources:
         if isinstance(module, Compiled):
-            called |= {(module.room, name) for _, name in module.imported()}
+            called |= {(module.folder, name) for _, name in module.imported()}
         else:
-            called |= {(module.room, target.rpartition(".")[0]) for _, target in imports(module)}
-    for module in house:
+            called |= {(module.folder, target.rpartition(".")[0]) for _, target in imports(module)}
+    for module in sources:
         if (
             isinstance(module, Compiled)
-            and module.room != "_numeric"
-            and (module.room, module.name) not in called
+            and module.folder != "_numeric"
+            and (module.folder, module.name) not in called
         ):
-            yield module.at_line(1, f"nothing in {module.room} calls it: put it where it is called")
+            yield module.at_line(1, f"nothing in {module.folder} calls it: put it where it is called")
 
 
-def aliases(house: list[Module]) -> Iterator[str]:
+def aliases(sources: list[Module]) -> Iterator[str]:
     """Imports under another name: two things have one name."""
-    for module in house:
+    for module in sources:
         for node in ast.walk(module.tree):
             if isinstance(node, (ast.Import, ast.ImportFrom)):
                 for alias in node.names:
@@ -254,10 +258,10 @@ def aliases(house: list[Module]) -> Iterator[str]:
                         )
 
 
-def twins(house: list[Module]) -> Iterator[str]:
+def twins(sources: list[Module]) -> Iterator[str]:
     """Class names that stand for two things."""
     classes: dict[str, list[str]] = defaultdict(list)
-    for module in house:
+    for module in sources:
         for node in ast.walk(module.tree):
             if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
                 classes[node.name].append(module.at(node, node.name))
@@ -266,11 +270,11 @@ def twins(house: list[Module]) -> Iterator[str]:
             yield f"{name} stands for {len(places)} things: {', '.join(p.rsplit(': ', 1)[0] for p in places)}"
 
 
-def same_functions(house: list[Module]) -> Iterator[str]:
+def same_functions(sources: list[Module]) -> Iterator[str]:
     """Names of functions that one folder imports from two modules."""
-    functions = {f"{module.name}.{name}" for module in house for name in module.functions()}
+    functions = {f"{module.name}.{name}" for module in sources for name in module.functions()}
     homes_of: dict[tuple[str, str], set[str]] = defaultdict(set)
-    for module in house:
+    for module in sources:
         if isinstance(module, Compiled):
             continue
         for node, target in imports(module):
@@ -291,9 +295,9 @@ def dataclass_call(node: ast.ClassDef) -> ast.expr | None:
     return None
 
 
-def keywords(house: list[Module]) -> Iterator[str]:
+def keywords(sources: list[Module]) -> Iterator[str]:
     """Dataclasses of many fields that may be made by position."""
-    for module in house:
+    for module in sources:
         for node in ast.walk(module.tree):
             decorator = dataclass_call(node) if isinstance(node, ast.ClassDef) else None
             if decorator is None:
@@ -305,9 +309,9 @@ def keywords(house: list[Module]) -> Iterator[str]:
                 yield module.at(node, f"{node.name} has {len(fields)} fields: make it by keyword (kw_only)")
 
 
-def words(house: list[Module]) -> Iterator[str]:
+def words(sources: list[Module]) -> Iterator[str]:
     """Docstrings that make a reader stop, and files of two topics, of the product, its tests and its tools."""
-    for module in house:
+    for module in sources:
         for line, said in module.docstrings():
             if NO_BEGINNING.match(said):
                 yield module.at_line(line, "a docstring begins with a verb or a noun")
@@ -316,9 +320,9 @@ def words(house: list[Module]) -> Iterator[str]:
             yield module.at_line(1, f"{lines} lines: more than one topic?")
 
 
-def comments(house: list[Module]) -> Iterator[str]:
+def comments(sources: list[Module]) -> Iterator[str]:
     """Comments that do not stand above their line, in the product, its tests and its tools."""
-    for module in house:
+    for module in sources:
         for line, code, comment in module.comments():
             if code and not FOR_TOOLS.match(comment):
                 yield module.at_line(line, "a comment stands above its line")
@@ -326,18 +330,18 @@ def comments(house: list[Module]) -> Iterator[str]:
 
 def breaches() -> list[str]:
     """All that is against the rules."""
-    house, in_cython = modules(), compiled()
-    everything = [*house, *in_cython, *beside()]
-    return [line for rule in (outside, aliases, twins, keywords) for line in rule(house)] + [
+    sources, in_cython = modules(), compiled()
+    everything = [*sources, *in_cython, *beside()]
+    return [line for rule in (outside, aliases, twins, keywords) for line in rule(sources)] + [
         *words(everything),
         *comments(everything),
-        *same_functions([*house, *in_cython]),
+        *same_functions([*sources, *in_cython]),
         *cimports(in_cython),
-        *uncalled([*house, *in_cython]),
+        *uncalled([*sources, *in_cython]),
     ]
 
 
 if __name__ == "__main__":
     found = breaches()
-    print("\n".join(found) or "the walls hold")
+    print("\n".join(found) or "the rules of imports and names hold")
     sys.exit(bool(found))

@@ -15,7 +15,7 @@ from starpos.fix.attitude_at_place import AttitudeAtPlace
 from starpos.fix.fix import Fix
 from starpos.fix.solution import Solution, Status
 from starpos.gnss.solving import Compared
-from starpos.gnss.watch import AGREES, DISAGREES, DOUBTFUL, LEARNING
+from starpos.gnss.watch import GnssStatus
 from starpos_common.messages import tilt_to_message
 from starpos_interfaces import msg
 
@@ -30,10 +30,10 @@ STATUS = {
     Status.POOR_FIT: msg.Solution.POOR_FIT,
 }
 GNSS_STATUS = {
-    LEARNING: msg.GnssCheck.LEARNING,
-    AGREES: msg.GnssCheck.AGREES,
-    DOUBTFUL: msg.GnssCheck.DOUBTFUL,
-    DISAGREES: msg.GnssCheck.DISAGREES,
+    GnssStatus.LEARNING: msg.GnssCheck.LEARNING,
+    GnssStatus.AGREES: msg.GnssCheck.AGREES,
+    GnssStatus.DOUBTFUL: msg.GnssCheck.DOUBTFUL,
+    GnssStatus.DISAGREES: msg.GnssCheck.DISAGREES,
 }
 # An entry of the error budget that concerns the geodetic position only.
 DEFLECTION = "deflection"

@@ -15,7 +15,7 @@ import numpy as np
 from scipy import stats
 
 from starpos.earth.vertical import Deflection
-from starpos.gnss.watch import DISAGREES, GnssWatch
+from starpos.gnss.watch import GnssStatus, GnssWatch
 from starpos.instrument import sensors
 from starpos_testing.gnss_drives import GnssDrive
 
@@ -42,7 +42,7 @@ def counted(drive: GnssDrive, frames: int, rng: np.random.Generator) -> Counter:
             watch.learn(moment.sighting, moment.gnss, check)
             number["frames"] += 1
             number[check.status] += 1
-            number["alarms"] += check.status == DISAGREES != before
+            number["alarms"] += check.status == GnssStatus.DISAGREES != before
             before = check.status
     return number
 
@@ -60,7 +60,7 @@ def main() -> int:
         total += number
         print(
             f"{name}: {number['frames']} frames, {number['agrees']} agree, {number['doubtful']} doubt, "
-            f"{number['alarms']} alarms that last {number[DISAGREES]} frames",
+            f"{number['alarms']} alarms that last {number[GnssStatus.DISAGREES]} frames",
             flush=True,
         )
     most = stats.chi2.ppf(0.95, 2 * (total["alarms"] + 1)) / 2 / total["frames"]

@@ -16,7 +16,7 @@ import numpy as np
 
 from starpos.earth.ellipsoid import curvature_radii_m
 from starpos.earth.vertical import Deflection
-from starpos.gnss.watch import AGREES, DISAGREES, DOUBTFUL, LEARNING, GnssWatch
+from starpos.gnss.watch import GnssStatus, GnssWatch
 from starpos.instrument import sensors
 from starpos.report.style import BLUE, GREEN, GREY, ORANGE, RED, mark_simulated, new_figure, plain, png_of
 from starpos.units import HOUR_S
@@ -41,7 +41,12 @@ ASSUMED = ("--misalignment", "0", "0", "20", "--inclinometer", "sca100t_calibrat
 # The receiver's place is dragged away from this moment on, at this speed.
 DRAGGED_FROM_S, DRAG_M_S = 2.0 * HOUR_S, 1.0
 SEED = 9
-STATUS = {LEARNING: GREY, AGREES: GREEN, DOUBTFUL: ORANGE, DISAGREES: RED}
+STATUS = {
+    GnssStatus.LEARNING: GREY,
+    GnssStatus.AGREES: GREEN,
+    GnssStatus.DOUBTFUL: ORANGE,
+    GnssStatus.DISAGREES: RED,
+}
 
 
 def solved(folder: Path, *options: str) -> list[dict]:

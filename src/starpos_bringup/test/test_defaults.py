@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The parameter file that is installed says what the nodes declare."""
 
+import re
 from pathlib import Path
 
 import yaml
@@ -20,6 +21,13 @@ def test_every_parameter_of_every_node_is_in_it():
     content = yaml.safe_load(CONFIG.read_text())
     for node, table in NODES.items():
         assert set(content[f"/**/{node}"]["ros__parameters"]) == {p.name for p in table}
+
+
+def test_every_description_is_made_of_whole_sentences():
+    """One that was cut at either end says nothing, or half of it."""
+    whole = re.compile(r"""[A-Z`'"].*\.""", re.DOTALL)
+    descriptions = {f"{node}: {p.name}": p.description for node, table in NODES.items() for p in table}
+    assert {name: said for name, said in descriptions.items() if not whole.fullmatch(said)} == {}
 
 
 def test_the_names_the_contract_fixes_are_the_solvers():

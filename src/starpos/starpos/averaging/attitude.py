@@ -61,5 +61,7 @@ def _mean_term(terms: Sequence[ErrorTerm]) -> ErrorTerm:
     first = terms[0]
     if first.shared is None:
         covariance = np.sum([t.covariance for t in terms], axis=0) / len(terms) ** 2
-        return ErrorTerm(first.name, symmetric_root(covariance))
-    return ErrorTerm(first.name, np.mean([t.factor for t in terms], axis=0), shared=first.shared)
+        return ErrorTerm(first.name, symmetric_root(covariance), origin=first.origin)
+    return ErrorTerm(
+        first.name, np.mean([t.factor for t in terms], axis=0), shared=first.shared, origin=first.origin
+    )

@@ -54,7 +54,8 @@ class Remembered:
         new = [t for t in f.terms if t.shared == EACH_POSE]
         turn, first_turn = plane.turn(f)[:2], plane.turn(first)[:2]
         factors = [
-            math.sqrt(t.variance) * (first_turn @ like.factor[:3] if t.posed else turn @ t.factor[:3])
+            math.sqrt(t.variance)
+            * (first_turn @ like.factor[:3] if t.constant_within_pose else turn @ t.factor[:3])
             for t, like in zip(f.terms, first.terms, strict=True)
             if t.common
         ]

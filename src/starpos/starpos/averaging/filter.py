@@ -146,7 +146,7 @@ class PlaceFilter:
         shared, noise = np.zeros((3, len(now.state))), np.zeros((len(own), 3, 3))
         turn, pose_turn = self.plane.turn(f), self.plane.turn(pose)
         for k, t in enumerate(f.terms):
-            factor = pose_turn @ pose.terms[k].factor[:3] if t.posed else turn @ t.factor[:3]
+            factor = pose_turn @ pose.terms[k].factor[:3] if t.constant_within_pose else turn @ t.factor[:3]
             if own[k]:
                 noise[k] = t.variance * factor @ factor.T
             else:
@@ -235,7 +235,12 @@ class PlaceFilter:
         """The budget of `place`, with factors (3, 3); names and keys as in the terms `like`."""
         latitude, _ = self.plane.place(self.state[:2] * UNIT[:2])
         return tuple(
-            ErrorTerm(t.name, self.plane.local(latitude, symmetric_root(source[:3, :3])), shared=t.shared)
+            ErrorTerm(
+                t.name,
+                self.plane.local(latitude, symmetric_root(source[:3, :3])),
+                shared=t.shared,
+                origin=t.origin,
+            )
             for t, source in zip(like, self.sources, strict=True)
         )
 

@@ -139,7 +139,7 @@ def json_of_watched(told: Watched) -> dict:
 def json_of_check(check: GnssCheck) -> dict:
     """The key `gnss` of --json."""
     return {
-        "status": check.status,
+        "status": check.status.value,
         "distance_m": check.distance_m,
         "bearing_deg": check.bearing_deg,
         "sigma_m": check.sigma_m,

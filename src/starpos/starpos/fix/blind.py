@@ -8,7 +8,7 @@ import numpy as np
 
 from starpos.budget import Budget
 from starpos.errors import StarposError
-from starpos.fix.identified import identified
+from starpos.fix.identified import solution_of
 from starpos.fix.noise_alone import why_noise
 from starpos.fix.solution import Solution, Status
 from starpos.frames.stars import Stars
@@ -68,7 +68,7 @@ class BlindSolver:
             )
         camera, found = match
         field = field_of(camera.directions(seen.x, seen.y), seen.sigma, camera, seen.window)
-        return identified(seen, field, sky, camera, found, begin).among(stars, inside)
+        return solution_of(seen, field, sky, camera, found, begin).among(stars, inside)
 
     def _match(self, seen: Stars, sky: Sky, budget: Budget) -> tuple[Camera, Identification] | None:
         """A camera and its identification of stars: of a pinhole, else of a fisheye, first where it looks like one."""

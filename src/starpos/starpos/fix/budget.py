@@ -4,7 +4,8 @@
 import math
 from collections.abc import Iterable
 from dataclasses import KW_ONLY, dataclass
-from functools import cached_property
+from enum import Enum
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -18,13 +19,22 @@ from starpos.instrument.inclinometer import Tilt
 from starpos.instrument.mounting import LocalLevel, Mounting
 from starpos.units import HOUR_S
 
-ALWAYS = ("always",)
-# replaced by the key of a pose, which only the average of several fixes knows
-EACH_POSE = ("pose",)
-# the name of A3's own term
+# Values of `ErrorTerm.shared`. The average of several fixes replaces EACH_POSE by the key of the pose, which a single fix
+# does not know.
+ALWAYS, EACH_POSE = ("always",), ("pose",)
+# Name of the term of the calibrated A3.
 CALIBRATION = "calibration"
 # 1 sigma of the difference of two unmeasured temperatures: a warm room and a clear night
 UNKNOWN_TEMPERATURE_C = 14.0
+
+
+class Origin(Enum):
+    """Origin of an error. What GNSS teaches (starpos.gnss) replaces the terms of A3 and INCLINOMETER."""
+
+    A3 = "the angle between camera and inclinometer"
+    INCLINOMETER = "errors of the inclinometer that last longer than one frame"
+    READINGS = "noise of the tilts of one frame"
+    OTHER = "stars, air, time, mount"
 
 
 @at_once
@@ -33,11 +43,13 @@ class ErrorTerm:
     """One source of error: its covariance is variance * factor @ factor.T.
 
     factor (6, m): rows are east m, north m, heading rad, and the attitude's small rotation about east, north, up in rad.
-    shared: None if the error is new in every frame.  Otherwise the error is the mean of several readings, and these are
-    their keys: the m errors of two frames have the `correlation` of their keys.  ALWAYS: for a calibration or a clock.
-    EACH_POSE: the same as long as the instrument is not touched.
+    shared: which frames have the same error.  None: each frame has a new one.  ALWAYS: all frames share it, as for a
+    calibration or a clock.  EACH_POSE: all frames share it until the instrument is touched.  Any other tuple: the keys of
+    the readings or stars of which the error is the mean; the errors of two frames have the `correlation` of their keys.
     walk_s: growth of the variance per second, for an error that wanders.
-    posed: the true factor is constant while the camera is not touched; differences between frames are noise.
+    constant_within_pose: the true factor stays the same until the camera is touched.  Factors of the frames of a pose
+    differ only by noise, so an average uses the first one's.
+    origin: what the error comes from.
     """
 
     name: str
@@ -46,7 +58,8 @@ class ErrorTerm:
     shared: tuple | None = None
     variance: float = 1.0
     walk_s: float = 0.0
-    posed: bool = False
+    constant_within_pose: bool = False
+    origin: Origin = Origin.OTHER
 
     @property
     def covariance(self) -> np.ndarray:
@@ -184,6 +197,7 @@ class StarErrors:
 
 
 def error_terms(
+    *,
     sensitivity: Sensitivity,
     stars: StarErrors,
     level: LocalLevel,
@@ -196,23 +210,22 @@ def error_terms(
     clock_stddev_s: float,
     stamp_stddev_s: float,
 ) -> tuple[ErrorTerm, ...]:
-    """All known sources of error.
+    """The terms of a fix's budget, without the base link's (`mount_term`) and the deflection of the vertical.
 
-    refraction_rotation (3,), shutter_rotation (3, 2): rotation of A4 in rad for 1 sigma of the refraction, and of the two
-    errors of the rows' times.
+    refraction_rotation (3,): rotation of A4 in rad for 1 sigma of the refraction.
+    shutter_rotation (3, 2): rotation of A4 in rad for 1 sigma of each of the two errors of the rows' times.
+    clock_stddev_s, stamp_stddev_s: of the clock, and of the frame's time stamp by that clock.
     """
 
     def of_stars(covariance: np.ndarray) -> np.ndarray:
         return sensitivity.stars @ symmetric_root(stars.rotation_covariance(covariance))
 
-    calibration, *readings = tilt_terms(sensitivity.level, level, tilt, mounting, earth.utc_unix_s)
     return (
         ErrorTerm("centroids", of_stars(stars.centroids)),
         ErrorTerm("catalogue", of_stars(stars.catalogue), shared=stars.same_stars),
-        calibration,
-        *readings,
+        *tilt_terms(sensitivity.level, level, tilt, mounting, earth.utc_unix_s),
         ErrorTerm("refraction", (sensitivity.stars @ refraction_rotation)[:, None], shared=ALWAYS),
-        ErrorTerm("shutter", sensitivity.stars @ shutter_rotation, shared=ALWAYS, posed=True),
+        ErrorTerm("shutter", sensitivity.stars @ shutter_rotation, shared=ALWAYS, constant_within_pose=True),
         *time_terms(latitude, earth, clock_stddev_s, stamp_stddev_s),
     )
 
@@ -220,15 +233,25 @@ def error_terms(
 def tilt_terms(
     rows: np.ndarray, level: LocalLevel, tilt: Tilt, mounting: Mounting, utc_unix_s: float
 ) -> tuple[ErrorTerm, ...]:
-    """The sources of error of the level, A3's first; rows (n, 3): the factors' rows for a small rotation of L."""
+    """The terms of A3, then of the inclinometer; rows (n, 3): the factors' rows for a small rotation of L.
+
+    None of them has Origin.OTHER: GNSS would count it twice.
+    """
     calibration, by_axes = np.empty((3, 4)), rows @ level.turns
     np.matmul(level.a2, mounting.calibration_root, out=calibration[:, :3])
     calibration[:, 3] = _turn_error(level, mounting)
+    of_a3 = partial(ErrorTerm, shared=ALWAYS, constant_within_pose=True, origin=Origin.A3)
     return (
-        ErrorTerm(CALIBRATION, rows @ calibration, shared=ALWAYS, posed=True),
-        ErrorTerm("remounting", rows @ level.a2 * mounting.remounted_rad, shared=ALWAYS, posed=True),
+        of_a3(CALIBRATION, rows @ calibration),
+        of_a3("remounting", rows @ level.a2 * mounting.remounted_rad),
         *_inclinometer_terms(by_axes @ tilt.slope, tilt, mounting, utc_unix_s),
-        ErrorTerm("tilt response", by_axes @ level.response, shared=ALWAYS, posed=True),
+        ErrorTerm(
+            "tilt response",
+            by_axes @ level.response,
+            shared=ALWAYS,
+            constant_within_pose=True,
+            origin=Origin.INCLINOMETER,
+        ),
     )
 
 
@@ -251,14 +274,15 @@ def time_terms(
 
 
 def _turn_error(level: LocalLevel, mounting: Mounting) -> np.ndarray:
-    """Error (3,) of L, as a small rotation about its axes, that an A3 with a large turn about the plumb line causes.
+    """Second-order error (3,) of L, as a small rotation about its axes, from A3's error about the plumb line.
 
-    To first order a turn moves the lean since the calibration sideways only, which the calibration's own term holds.
-    A large turn also makes that lean shorter, by its cosine.
+    The lean is the change of the tilt since the calibration. If A3 is off by an angle about the plumb line, the lean is
+    turned by that angle. To first order this shifts it sideways, which the calibration's own covariance covers. To second
+    order it shortens the lean by the angle's cosine: that part is here.
     """
     then = mounting.calibrated_up
     variance = then @ mounting.calibration_covariance @ then + mounting.remounted_rad**2
-    # the mean of (1 - cos)^2 over a Gaussian turn
+    # the mean of (1 - cos)^2 over a Gaussian angle of this variance
     shorter2 = 1.5 - 2 * math.exp(-variance / 2) + math.exp(-2 * variance) / 2
     return level.turns @ (level.up - then) * math.sqrt(max(shorter2, 0.0))
 
@@ -270,21 +294,21 @@ def _inclinometer_terms(
 
     Its zero is not among them: the calibration's covariance includes it.
     """
-    errors = mounting.inclinometer
+    errors, term = mounting.inclinometer, partial(ErrorTerm, origin=Origin.INCLINOMETER)
     since_s = abs(utc_unix_s - mounting.calibrated_unix_s)
     return (
-        ErrorTerm("tilt", rows @ symmetric_root(tilt.noise), shared=tilt.times),
-        ErrorTerm("tilt quantisation", rows * errors.undithered_rad(tilt), shared=errors.steps(tilt)),
-        ErrorTerm("tilt pose", rows * errors.pose_rad, shared=EACH_POSE),
-        ErrorTerm(
+        ErrorTerm("tilt", rows @ symmetric_root(tilt.noise), shared=tilt.times, origin=Origin.READINGS),
+        term("tilt quantisation", rows * errors.undithered_rad(tilt), shared=errors.steps(tilt)),
+        term("tilt pose", rows * errors.pose_rad, shared=EACH_POSE),
+        term(
             "tilt drift",
             rows * errors.drift_rad_per_sqrt_hour / math.sqrt(HOUR_S),
             shared=ALWAYS,
             variance=since_s if math.isfinite(since_s) else 0.0,
             walk_s=1.0,
-            posed=True,
+            constant_within_pose=True,
         ),
-        ErrorTerm(
+        term(
             "tilt temperature",
             rows * errors.temperature_rad_per_c * _warmer_c(tilt, mounting),
             shared=ALWAYS,

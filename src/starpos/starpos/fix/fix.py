@@ -96,17 +96,17 @@ def solve_fix(
     axes = rotation.shortest_turn(np.array([0.0, 0.0, 1.0]), level.up)[:, :2]
     terms = (
         *error_terms(
-            sensitivity,
-            errors,
-            level,
-            tilt,
-            mounting,
-            seen.bending(atmosphere),
-            seen.rolling(shutter, camera.height),
-            place.latitude,
-            earth,
-            clock_stddev_s,
-            stamp_stddev_s,
+            sensitivity=sensitivity,
+            stars=errors,
+            level=level,
+            tilt=tilt,
+            mounting=mounting,
+            refraction_rotation=seen.bending(atmosphere),
+            shutter_rotation=seen.rolling(shutter, camera.height),
+            latitude=place.latitude,
+            earth=earth,
+            clock_stddev_s=clock_stddev_s,
+            stamp_stddev_s=stamp_stddev_s,
         ),
         *mount_term("mount", link_to_enu, mounting.link_stddev_rad),
     )

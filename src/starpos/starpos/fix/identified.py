@@ -16,7 +16,7 @@ from starpos.instrument.camera import Camera
 from starpos.units import ARCSEC
 
 
-def identified(
+def solution_of(
     stars: Stars,
     field: FrameStars | wide.WideField,
     sky: Sky,

@@ -15,7 +15,7 @@ from starpos.errors import FieldError, FixError, InstrumentError, StarposError, 
 from starpos.fix.attitude_at_place import AttitudeAtPlace, attitude_at_place
 from starpos.fix.fix import Fix, solve_fix
 from starpos.fix.horizon import check_above_horizon
-from starpos.fix.identified import identified
+from starpos.fix.identified import solution_of
 from starpos.fix.matched import MatchedStars, sound_matches
 from starpos.fix.pointing import IDEAL, pointing_fix
 from starpos.fix.seen import as_seen, directions_of, high_enough, inside
@@ -98,7 +98,7 @@ class Solver:
             return Solution.refused(stars, e)
         if found is None:
             return _unidentified(stars, camera, sky, begin)
-        return identified(stars, field, sky, camera, found, begin)
+        return solution_of(stars, field, sky, camera, found, begin)
 
     def solve(
         self,
@@ -133,7 +133,7 @@ class Solver:
             return Solution.refused(stars, e)
         if found is None:
             return replace(_unidentified(stars, camera, sky, begin), tilt=tilt)
-        answer, done = identified(stars, field, sky, camera, found, begin), time.perf_counter()
+        answer, done = solution_of(stars, field, sky, camera, found, begin), time.perf_counter()
         assert answer.magnitudes is not None
         try:
             check_explained(answer)

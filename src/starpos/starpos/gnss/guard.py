@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Detects a GNSS place that is spoofed or wrong, suddenly or slowly.
 
-Every EVERY_S seconds the filter is copied, and the copy is kept for LONGEST_S. A copy has one more unknown, an error of
-GNSS that began when it was made, as a step or growing evenly. If GNSS is good, that error is 0 within its covariance,
-which includes all errors of the stars' place; a likelihood ratio decides (Willsky and Jones, IEEE Trans. Automatic
-Control 21(1), 1976, 108, from memory). So a slow drag shows although each of its frames agrees with the one before, and
-although the filter that learns has followed it.
+Every COPY_INTERVAL_S seconds the filter is copied, and the copy is kept for LONGEST_S. A copy has one more unknown, an
+error of GNSS that began when it was made, as a step or growing evenly. If GNSS is good, that error is 0 within its
+covariance, which includes all errors of the stars' place; a likelihood ratio decides (Willsky and Jones, IEEE Trans.
+Automatic Control 21(1), 1976, 108, from memory). So a slow drag shows although each of its frames agrees with the one
+before, and although the filter that learns has followed it.
 """
 
 from dataclasses import dataclass, replace
@@ -16,12 +16,14 @@ from starpos.gnss.sighting import Innovation
 from starpos.gnss.states import Ageing, Learned
 
 # Interval at which the filter is copied, and time for which each copy is kept, s.
-EVERY_S, LONGEST_S = 110.0, 3000.0
+COPY_INTERVAL_S, LONGEST_S = 110.0, 3000.0
 # Time from which the growing error is counted, and its unit, s.
 GROWS_AFTER_S, UNIT_S = 240.0, 600.0
 # 1 sigma of an unknown error, as an angle at the Earth's centre: 600 km.
 NOTHING_RAD = 0.1
 OFFSETS = 4
+# Minimum information (1/rad2) on the error of GNSS: an error of 1 rad, the whole Earth, would be 1 sigma.
+MIN_INFORMATION = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +46,7 @@ class OnsetFilters:
         return cls((), np.zeros(0), np.zeros(0, int), np.zeros((0, n)), np.zeros((0, n, n)))
 
     def started(self, learned: Learned) -> "OnsetFilters":
-        """Add a copy of the present filter."""
+        """These filters and a copy of the present one."""
         n = len(learned.state)
         state, covariance = np.zeros((1, n + OFFSETS)), np.zeros((1, n + OFFSETS, n + OFFSETS))
         state[0, :n], covariance[0, :n, :n] = learned.state, learned.covariance
@@ -59,10 +61,10 @@ class OnsetFilters:
 
     def due(self, utc_unix_s: float) -> bool:
         """Whether another copy should be made."""
-        return not len(self.since) or utc_unix_s - self.since[-1] >= EVERY_S
+        return not len(self.since) or utc_unix_s - self.since[-1] >= COPY_INTERVAL_S
 
     def recent(self, utc_unix_s: float) -> "OnsetFilters":
-        """Drop those that are older than LONGEST_S."""
+        """The filters that are not older than LONGEST_S."""
         return self._take(utc_unix_s - self.since <= LONGEST_S)
 
     def _take(self, which: np.ndarray) -> "OnsetFilters":
@@ -72,12 +74,12 @@ class OnsetFilters:
         )
 
     def aged(self, by: Ageing) -> "OnsetFilters":
-        """Add the process noise of the time that passed to all."""
+        """These filters with the process noise of the time that passed."""
         state, covariance = by.of(self.state, self.covariance)
         return replace(self, state=state, covariance=covariance)
 
     def updated(self, seen: Innovation, about: np.ndarray, utc_unix_s: float) -> "OnsetFilters":
-        """Update all with a frame's GNSS place; its innovation is linear about the states (n,)."""
+        """These filters updated with a frame's GNSS place; its innovation is linear about the states (n,)."""
         n, grown = len(about), (utc_unix_s - self.since) / UNIT_S
         rows = np.empty((len(self.since), 2, n + OFFSETS))
         rows[:, :, :n] = seen.rows
@@ -112,7 +114,7 @@ class OnsetFilters:
 
 def _chi2(weight: np.ndarray, pull: np.ndarray) -> np.ndarray:
     """pull^T weight^-1 pull for each (2, 2) weight, 0 where it holds no information."""
-    informative = np.linalg.eigvalsh(weight)[:, 0] > 1.0
+    informative = np.linalg.eigvalsh(weight)[:, 0] > MIN_INFORMATION
     safe = np.where(informative[:, None, None], weight, np.eye(2))
     return np.where(
         informative, np.einsum("wi,wi->w", pull, np.linalg.solve(safe, pull[..., None])[..., 0]), 0.0

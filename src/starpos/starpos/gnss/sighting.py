@@ -8,22 +8,14 @@ import numpy as np
 from starpos import rotation
 from starpos.earth.ellipsoid import curvature_radii_m, enu_axes, place_of_zenith
 from starpos.earth.vertical import Vertical
-from starpos.fix.budget import total_covariance
+from starpos.fix.budget import Origin, total_covariance
 from starpos.fix.fix import Fix
 from starpos.gnss.place import GnssPlace
 from starpos.gnss.states import Learned
 from starpos.instrument.inclinometer import Tilt
 
-# terms of a fix that the states replace
-LEARNED_TERMS = (
-    "calibration",
-    "remounting",
-    "tilt quantisation",
-    "tilt pose",
-    "tilt drift",
-    "tilt temperature",
-    "tilt response",
-)
+# Origin of the terms of a fix that the states replace.
+LEARNED_ORIGINS = (Origin.A3, Origin.INCLINOMETER)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -46,7 +38,7 @@ class LevelSight:
     @classmethod
     def of(cls, fix: Fix, tilt: Tilt) -> "LevelSight":
         """The sighting of a fix."""
-        stars = [t for t in fix.terms if t.name not in LEARNED_TERMS and t.name != "tilt"]
+        stars = [t for t in fix.terms if t.origin is Origin.OTHER]
         radii = np.array(curvature_radii_m(fix.latitude))
         axes = enu_axes(fix.latitude, fix.longitude)[:2]
         covariance = total_covariance(stars)[:2, :2] / np.outer(radii, radii)

@@ -15,9 +15,9 @@ from starpos.fix.solution import Solution, Status
 from starpos.fix.solver import Solver
 from starpos.frames.stars import Stars
 from starpos.gnss.place import GnssPlace
-from starpos.gnss.sighting import LEARNED_TERMS, LevelSight, zenith_rows
+from starpos.gnss.sighting import LEARNED_ORIGINS, LevelSight, zenith_rows
 from starpos.gnss.states import Learned
-from starpos.gnss.watch import LEARNING, GnssCheck, GnssWatch
+from starpos.gnss.watch import GnssCheck, GnssStatus, GnssWatch
 from starpos.instrument.inclinometer import Tilt
 from starpos.instrument.instrument import Calibration
 from starpos.units import ARCSEC
@@ -63,7 +63,7 @@ def watched(
     gnss: that place, None without one.
     """
     if rough.fix is None or rough.tilt is None:
-        compared = None if gnss is None else Compared(gnss, GnssCheck(LEARNING), 0, 0)
+        compared = None if gnss is None else Compared(gnss, GnssCheck(GnssStatus.LEARNING), 0, 0)
         return Watched(solution=rough, compared=compared)
     tilt = rough.tilt
     watch.advance(LevelSight.of(rough.fix, tilt))
@@ -131,7 +131,7 @@ def _zenith_rows(fix: Fix, sighting: LevelSight, learned: Learned) -> np.ndarray
 
 
 def _kept_terms(fix: Fix) -> tuple[ErrorTerm, ...]:
-    return tuple(t for t in fix.terms if t.name not in LEARNED_TERMS)
+    return tuple(t for t in fix.terms if t.origin not in LEARNED_ORIGINS)
 
 
 def _budgeted(fix: Fix, sighting: LevelSight, learned: Learned) -> Fix:

@@ -4,6 +4,7 @@
 import math
 from collections import deque
 from dataclasses import dataclass, replace
+from enum import Enum
 
 import numpy as np
 
@@ -18,8 +19,10 @@ from starpos.gnss.states import Learned, aged, ageing, prior
 from starpos.instrument.inclinometer import Tilt
 from starpos.instrument.instrument import Instrument
 
-LEARNING, AGREES, DOUBTFUL, DISAGREES = "learning", "agrees", "doubtful", "disagrees"
-# chi-square of two degrees of freedom that a good GNSS exceeds once in 1000 and, of each test, once in 3e6 frames
+# Chi-square (two degrees of freedom) above which a frame is doubtful, and above which it is an alarm. One test of a good
+# GNSS exceeds them once in 1000 and once in 3.3 million times. A frame has one test of its own and up to two of each copy
+# of the filter (about 28 of them, see guard.py); the largest decides. tools/benchmarks/gnss_false_alarms.py measures how
+# often that maximum exceeds them.
 DOUBT, ALARM = 13.8, 30.0
 # GNSS is used again once it has agreed for this time, over this number of frames, within this chi-square
 BACK_S, BACK_FRAMES, BACK = 600.0, 10, 7.4
@@ -35,6 +38,18 @@ ELSEWHERE_SIGMA = 3.0
 COMPASS = ("north", "north-east", "east", "south-east", "south", "south-west", "west", "north-west")
 
 
+class GnssStatus(str, Enum):
+    """The guard's verdict on a GNSS place."""
+
+    LEARNING = "learning"
+    AGREES = "agrees"
+    DOUBTFUL = "doubtful"
+    DISAGREES = "disagrees"
+
+    def __str__(self) -> str:
+        return self.value
+
+
 @dataclass(frozen=True)
 class GnssCheck:
     """What the guard says of a GNSS fix: a status, and how far it is from the stars' place.
@@ -43,7 +58,7 @@ class GnssCheck:
     All three are NaN where the stars give no place yet.
     """
 
-    status: str
+    status: GnssStatus
     distance_m: float = math.nan
     bearing_deg: float = math.nan
     sigma_m: float = math.nan
@@ -56,7 +71,7 @@ class GnssCheck:
         where = COMPASS[round(self.bearing_deg / 45) % 8]
         off, sigma = _length_text(self.distance_m), _length_text(self.sigma_m)
         sentence = f"GNSS is {off} {where} of where the stars put us ({sigma})"
-        return sentence + (": it is not believed" if self.status == DISAGREES else "")
+        return sentence + (": it is not believed" if self.status == GnssStatus.DISAGREES else "")
 
 
 def _length_text(metres: float) -> str:
@@ -66,7 +81,7 @@ def _length_text(metres: float) -> str:
 class GnssWatch:
     """Keeps what is known of an instrument, learned from GNSS while the stars agree with it.
 
-    For each frame `go_on`, then `judge` where there is a GNSS place, then `learn`.
+    Call `advance` for each frame; where there is a GNSS place, then `judge` and `learn`.
     learned: None before the first frame.
     """
 
@@ -75,8 +90,8 @@ class GnssWatch:
         self.disagrees = False
         self.vertical = vertical
         self._instrument = instrument
-        # whether A3 may still be anything, and frames are held to begin again with
-        self._begins = learned is None
+        # Whether A3 is too uncertain for the linear filter. Until it is not, each frame solves anew for all frames held.
+        self._starting = learned is None
         self._held: deque[GnssFrame] = deque(maxlen=MAX_HELD)
         self._of_pose = 0
         self._pose: LevelSight | None = None
@@ -88,8 +103,8 @@ class GnssWatch:
 
     @property
     def is_learning(self) -> bool:
-        """Whether A3 is not known yet as well as a filter needs."""
-        return self._begins
+        """Whether A3 is still too uncertain for the linear filter."""
+        return self._starting
 
     def advance(self, sighting: LevelSight) -> None:
         """Advance to the time of a frame, seen with any A3: only the attitude of its camera counts."""
@@ -105,11 +120,11 @@ class GnssWatch:
                 return
             stddev = stddev_rad(self.vertical, sighting.latitude, sighting.longitude)
             self.learned = prior(self._instrument, tilt, stddev, sighting.utc_unix_s)
-            self._begins = not is_linear(self.learned, tilt)
+            self._starting = not is_linear(self.learned, tilt)
         self._age(sighting)
 
     def _forget(self) -> None:
-        self.learned, self._begins, self.disagrees = None, True, False
+        self.learned, self._starting, self.disagrees = None, True, False
         self._held.clear()
         self._suspicious = None
         self._onsets = OnsetFilters.empty(0)
@@ -165,11 +180,11 @@ class GnssWatch:
     def judge(self, sighting: LevelSight, gnss: GnssPlace) -> GnssCheck:
         """Compare a GNSS place with the stars'; where they disagree, take back what GNSS taught meanwhile."""
         if self.learned is None or not self.tells_place(sighting):
-            return GnssCheck(LEARNING)
+            return GnssCheck(GnssStatus.LEARNING)
         seen = innovation(sighting, gnss, self.learned, self.vertical)
         single = chi2(self.learned, seen)
-        if self._begins:
-            return self._check(self._while_it_begins(single, sighting.tilt), sighting, gnss)
+        if self._starting:
+            return self._check(self._while_starting(single, sighting.tilt), sighting, gnss)
         onsets = self._onsets if len(self._onsets.since) else OnsetFilters.empty(len(self.learned.state))
         # While GNSS is not believed there is one filter. If GNSS was away for long, it was dropped for its age.
         if not len(onsets.since) or (not self.disagrees and onsets.due(sighting.utc_unix_s)):
@@ -183,19 +198,19 @@ class GnssWatch:
             # where the frame alone raised the alarm, this is still the likeliest moment at which the error began
             self._take_back(int(np.argmax(against)), sighting)
         if self.disagrees:
-            return self._check(DISAGREES, sighting, gnss)
-        return self._check(DOUBTFUL if worst > DOUBT else AGREES, sighting, gnss)
+            return self._check(GnssStatus.DISAGREES, sighting, gnss)
+        return self._check(GnssStatus.DOUBTFUL if worst > DOUBT else GnssStatus.AGREES, sighting, gnss)
 
-    def _while_it_begins(self, single: float, tilt: Tilt) -> str:
+    def _while_starting(self, single: float, tilt: Tilt) -> GnssStatus:
         """The status while A3 is hardly known: an alarm needs two frames without a common reading of the level."""
         readings = frozenset(tilt.times)
         again = self._suspicious is not None and not (readings & self._suspicious)
         if single <= ALARM:
             self._suspicious = None
-            return DOUBTFUL if single > DOUBT else LEARNING
+            return GnssStatus.DOUBTFUL if single > DOUBT else GnssStatus.LEARNING
         if self._suspicious is None:
             self._suspicious = readings
-        return DISAGREES if again else DOUBTFUL
+        return GnssStatus.DISAGREES if again else GnssStatus.DOUBTFUL
 
     def _take_back(self, onset: int, sighting: LevelSight) -> None:
         """Return to the state one copy before the likeliest onset of the error."""
@@ -215,7 +230,7 @@ class GnssWatch:
         elif utc_unix_s - self._onsets.since[0] >= BACK_S and self._onsets.frames[0] >= BACK_FRAMES:
             self.disagrees = False
 
-    def _check(self, status: str, sighting: LevelSight, gnss: GnssPlace) -> GnssCheck:
+    def _check(self, status: GnssStatus, sighting: LevelSight, gnss: GnssPlace) -> GnssCheck:
         assert self.learned is not None
         latitude, longitude, covariance = place_of_stars(sighting, self.learned, self.vertical)
         apart = gnss.from_place_m(latitude, longitude)
@@ -231,10 +246,10 @@ class GnssWatch:
     def learn(self, sighting: LevelSight, gnss: GnssPlace, check: GnssCheck) -> None:
         """Learn from a frame if GNSS is believed, and its readings are new."""
         readings = frozenset(sighting.tilt.times)
-        if check.status not in (LEARNING, AGREES) or readings & self._readings:
+        if check.status not in (GnssStatus.LEARNING, GnssStatus.AGREES) or readings & self._readings:
             return
         self._readings = readings
-        if not self._begins:
+        if not self._starting:
             assert self.learned is not None
             seen = innovation(sighting, gnss, self.learned, self.vertical)
             first = not math.isfinite(self.learned.since_unix_s)
@@ -252,8 +267,8 @@ class GnssWatch:
         self._held.append(GnssFrame(sighting, gnss, first, up))
         self._of_pose += 1
         self.learned = begun(self._instrument, self._held, self.vertical)
-        self._begins = not is_linear(self.learned, sighting.tilt)
-        if not self._begins:
+        self._starting = not is_linear(self.learned, sighting.tilt)
+        if not self._starting:
             self._held.clear()
 
 

@@ -18,8 +18,8 @@ from starpos.budget import ENDLESS, Budget
 from starpos.frames.stars import Window
 from starpos.identification._frame import FrameStars
 from starpos.identification.evidence import any_scale
-from starpos.identification.explained import ENOUGH_EXPLAINED, explained_by
-from starpos.identification.full import ENOUGH, MIN_STARS, Identification, identified
+from starpos.identification.explained import MIN_EXPLAINED, explained_by
+from starpos.identification.full import MIN_LOG_ODDS, MIN_STARS, Identification, verify_pose
 from starpos.identification.pose import Pose, stars_at
 from starpos.identification.quad_poses import Matches, QuadPoses, most_agreed
 from starpos.identification.quads import QuadCatalogue
@@ -40,7 +40,7 @@ LARGEST_STEP, BENT = 0.1, 0.003
 # Poses judged in each stage: the ones with most votes.
 MAX_JUDGED = 40
 # Log-odds of an answer that ends the search though most bright detections are not its stars.
-SURE = 6 * ENOUGH
+SURE = 6 * MIN_LOG_ODDS
 
 
 @dataclass(frozen=True)
@@ -85,10 +85,10 @@ def identify_blind(
         spans.insert(0, (max(told, near_px / ROUGHLY), min(longest, near_px * ROUGHLY)))
     camera = Camera.from_focal(width, height, shortest)
     frame = stars_at(camera, xy, sigma_px)
-    tries = [_Try(np.arange(len(xy)), 1.0, ENOUGH)]
+    tries = [_Try(np.arange(len(xy)), 1.0, MIN_LOG_ODDS)]
     if (even := second_try(through(frame, camera, window))) is not None:
         # only one star is taken from a cell, which leaves less area for the others
-        tries.append(_Try(even, 0.5, ENOUGH + SECOND_TRY))
+        tries.append(_Try(even, 0.5, MIN_LOG_ODDS + SECOND_TRY))
     # the quick stages of all tries come before the slow ones of any
     work = [
         (t, stage, span)
@@ -104,7 +104,7 @@ def identify_blind(
             camera = Camera.from_focal(width, height, pose.focal_px)
             seen = through(stars_at(camera, xy[t.rows], sigma_px[t.rows]), camera, window)
             seen = seen.but(area_px2=t.share * seen.area_px2)
-            found = identified(seen, sky, pose, radius_px, prior, t.enough)
+            found = verify_pose(seen, sky, pose, radius_px, prior, t.enough)
             if found and (best is None or found.log_odds > best[1].log_odds):
                 best = camera, found.but(star=t.rows[found.star])
                 if is_sure(found, seen):
@@ -122,7 +122,7 @@ def stages_of(stages: Sequence[tuple[int, float]], stars: int) -> list[tuple[int
 def is_sure(found: Identification, field: FrameStars) -> bool:
     """Whether no better answer needs to be looked for."""
     explained = explained_by(found, field)
-    return explained.explained >= ENOUGH_EXPLAINED * explained.bright or (
+    return explained.explained >= MIN_EXPLAINED * explained.bright or (
         explained.enough and found.log_odds >= SURE
     )
 

@@ -18,7 +18,7 @@ from starpos.identification import wide
 from starpos.identification._frame import FrameStars
 from starpos.identification.blind import ROUGHLY
 from starpos.identification.evidence import any_scale
-from starpos.identification.full import MIN_STARS, Identification, identified
+from starpos.identification.full import MIN_STARS, Identification, verify_pose
 from starpos.identification.outwards import outwards
 from starpos.identification.pose import Poses
 from starpos.identification.quad_poses import Matches, QuadPoses, most_agreed
@@ -156,7 +156,7 @@ def identify_fisheye(
             if budget.spent:
                 return best
             pose, radius = guess.found.poses[row], guess.found.radius_px(guess.field, row, ERROR_PX)
-            found = identified(guess.field, sky, pose, radius, prior, need)
+            found = verify_pose(guess.field, sky, pose, radius, prior, need)
             if found is None or (best is not None and found.log_odds <= best[1].log_odds):
                 continue
             whole = outwards(picture.seen_by(guess.focal_px, guess.lens), sky, guess.part, found)

@@ -2,9 +2,9 @@
 """Evidence of a frame's stars that a pose is right, against chance.
 
 By chance the detections are random points anywhere on the frame. If the pose is right, each detection, from the brightest
-down, is one of two things. It is a false star, as often as those before it (a rule of succession that starts with two
-right and one wrong). Or it is the j-th brightest of the catalogue's stars not yet seen, with probability
-1 / ((j + 1) (j + 2)), at that star's place to within its error.
+down, is one of two things. It is a false star, with a probability that follows from the share of false ones before it (a
+rule of succession that starts with two right and one wrong). Or it is the j-th brightest of the catalogue's stars not yet
+seen, with probability 1 / ((j + 1) (j + 2)), at that star's place to within its error.
 
 The evidence is the ratio of the two probabilities, averaged over all possible poses. Under chance its mean is 1, so it
 exceeds x in at most one of x frames of random points, at whatever detection one stops (Ville's inequality) and however
@@ -27,7 +27,7 @@ from starpos.identification.triangles import SCALE_TOLERANCE
 
 # Extra centroid errors (px) and their prior probabilities: none, errors of the catalogue, unknown lenses.
 ERRORS_PX, LOG_SHARES = np.array([0.0, 0.3, 1.0, 3.0]), np.log([0.6, 0.2, 0.1, 0.1])
-# Limits on the error of its logarithm, and their probabilities.
+# Limits on the error of the focal length's logarithm, and their probabilities.
 SCALES = (0.003, 0.5), (SCALE_TOLERANCE + 0.005, 0.5)
 # Probability that a frame is mirrored.
 MIRRORED = 0.1

@@ -10,9 +10,9 @@ from starpos.identification.pose import TEST_STARS
 
 # Minimum number of catalogue stars looked for, if the frame has as many.
 MIN_DUE = 8
-# An identification explains a frame if it explains this share of its bright detections, or if this share of the bright
-# stars that should be there are: then the other detections are false stars.
-ENOUGH_EXPLAINED, ENOUGH_SEEN = 0.5, 0.6
+# Minimum share of the bright detections that are identified, and of the bright stars due that are seen. One of the two is
+# enough: if most stars due are seen, the other detections are false stars.
+MIN_EXPLAINED, MIN_SEEN = 0.5, 0.6
 
 
 @at_once
@@ -20,7 +20,7 @@ ENOUGH_EXPLAINED, ENOUGH_SEEN = 0.5, 0.6
 class Explained:
     """Counts of what an identification explains.
 
-        explained, bright  catalogue stars among the brightest detections, and the number of these detections
+    explained, bright  catalogue stars among the brightest detections, and the number of these detections
     seen, due          detections among the brightest catalogue stars on the frame, and the number of these stars
     """
 
@@ -32,7 +32,7 @@ class Explained:
     @property
     def enough(self) -> bool:
         """Whether the frame is explained."""
-        return self.explained >= ENOUGH_EXPLAINED * self.bright or self.seen >= ENOUGH_SEEN * self.due
+        return self.explained >= MIN_EXPLAINED * self.bright or self.seen >= MIN_SEEN * self.due
 
 
 def explained_by(found: Identification, field: FrameStars) -> Explained:

@@ -16,8 +16,9 @@ from starpos.normal import SIGMA_PER_MAD
 
 # Minimum number of stars of an identification.
 MIN_STARS = 4
-# Log-odds: one try identifies at most one of 1e9 frames without stars.
-ENOUGH = np.log(1e9)
+# Minimum log-odds of an identification: one try identifies at most one in 1e9 frames of random points. With all further
+# tries it is 1.2 in 1e9 (second_look.py).
+MIN_LOG_ODDS = np.log(1e9)
 ROUNDS = 3
 # A star may be GATE_SIGMA of the spread from its place, plus GATE_PX; the spread is at least MIN_SPREAD_PX.
 MIN_SPREAD_PX, GATE_SIGMA, GATE_PX = 0.02, 4.0, 0.2
@@ -85,7 +86,7 @@ class OnFrame:
         return cls(*found)
 
 
-def judge(field: FrameStars, sky: Sky, prior: Prior, enough: float = ENOUGH) -> Judge:
+def judge(field: FrameStars, sky: Sky, prior: Prior, enough: float = MIN_LOG_ODDS) -> Judge:
     """What judges poses of a frame by a prior, for compiled code; enough: log-odds of an identification."""
     return Judge(
         field,
@@ -99,8 +100,13 @@ def judge(field: FrameStars, sky: Sky, prior: Prior, enough: float = ENOUGH) -> 
     )
 
 
-def identified(
-    field: FrameStars, sky: Sky, near_pose: Pose, radius_px: np.ndarray, prior: Prior, enough: float = ENOUGH
+def verify_pose(
+    field: FrameStars,
+    sky: Sky,
+    near_pose: Pose,
+    radius_px: np.ndarray,
+    prior: Prior,
+    enough: float = MIN_LOG_ODDS,
 ) -> Identification | None:
     """Identify a frame's stars, starting from those within radius_px (N,) of their places by a pose near the right one.
 

@@ -14,7 +14,7 @@ from starpos.identification import wide
 from starpos.identification._frame import FrameStars, projected
 from starpos.identification._search import Finder, Limits
 from starpos.identification.evidence import CHANCES, anywhere
-from starpos.identification.full import ENOUGH, MIN_STARS, RULES, Identification, identified
+from starpos.identification.full import MIN_LOG_ODDS, MIN_STARS, RULES, Identification, verify_pose
 from starpos.identification.pose import CROWD_STARS, MATCH_SIGMA, MIN_SIGMA_PX, TEST_STARS, stars_at
 from starpos.identification.prior import PlumbPrior, PointingPrior
 from starpos.identification.sky import Sky
@@ -143,7 +143,7 @@ def identify_frame(
 
 
 def identifications(
-    field: FrameStars, sky: Sky, priors: Priors, enough: float = ENOUGH
+    field: FrameStars, sky: Sky, priors: Priors, enough: float = MIN_LOG_ODDS
 ) -> Iterator[Identification]:
     """All of `near_or_lost`, then what `_crowded_or_uneven` yields."""
     if len(field) < MIN_STARS:
@@ -204,7 +204,7 @@ def near_or_lost(
     sky: Sky,
     priors: Priors,
     stages: Stages,
-    enough: float = ENOUGH,
+    enough: float = MIN_LOG_ODDS,
     crowded: bool = False,
 ) -> Iterator[Identification]:
     """Yield identifications with log-odds of `enough`: by the priors, then lost in space by `stages`.
@@ -223,7 +223,7 @@ def _near_or_lost(
     """Yield what is identified by the priors, which have half of the probability, then what is without them."""
     for prior in priors:
         for pose, radius_px, known in prior.attempts(field, sky, LOG_HALF - np.log(len(priors))):
-            if found := identified(field, sky, pose, radius_px, known, enough):
+            if found := verify_pose(field, sky, pose, radius_px, known, enough):
                 yield found
     yield from _lost(field, sky, stages, LOG_HALF, enough, crowded)
 

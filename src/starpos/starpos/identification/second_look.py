@@ -20,10 +20,11 @@ from starpos.instrument.camera import Camera
 
 # What a frame shows at pixels x, y (N,), in sigma of a normal distribution by rank, and the SNR; NaN where it cannot say.
 Look = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
-# Log-odds of a pose that is looked at, and those that accept it. The largest evidence of the detections, at whichever one
-# stops, exceeds y in 1 of y frames; so its product with what a look finds exceeds x in (1 + log(x / worth)) / x of them:
-# once in 1e10 frames. So all tries together fail at most 1.2 times in 1e9.
-WORTH, ENOUGH = 5.0, 26.2
+# Log-odds from which a pose is looked at, and those that accept it with what the look finds. For random points the
+# largest evidence of the detections exceeds y in 1 of y frames. So its product with the look's exceeds x in
+# (1 + log(x / y)) / x of the frames, with y the evidence from which one looks: 0.1 in 1e9 frames. The first try adds 1 in
+# 1e9, the evenly spread stars (SECOND_TRY in search.py) 0.1: all tries with one list of stars are wrong in 1.2 in 1e9.
+MIN_LOG_ODDS_TO_LOOK, MIN_LOG_ODDS_WITH_LOOK = 5.0, 26.2
 MAX_LOOKS = 20
 # Places nearer to a detection add no information; places nearer to a brighter catalogue star show that star's light.
 DETECTED_PX, NEAR_PX = 8.0, 6.0
@@ -40,13 +41,13 @@ def second_look(
     field, priors  as `identify_frame` takes them; the field is in the camera's pixels, without refraction
     """
     seen: set[tuple[bytes, bytes]] = set()
-    for found in near_or_lost(field, sky, priors, STAGES, WORTH):
+    for found in near_or_lost(field, sky, priors, STAGES, MIN_LOG_ODDS_TO_LOOK):
         pairs = found.star.tobytes(), found.catalogue.tobytes()
         if pairs in seen:
             continue
         seen.add(pairs)
         log_odds = found.log_odds + _log_ratio(field, sky, camera, found, look)
-        if log_odds >= ENOUGH:
+        if log_odds >= MIN_LOG_ODDS_WITH_LOOK:
             return found.but(log_odds=log_odds)
         if len(seen) == MAX_LOOKS:
             break

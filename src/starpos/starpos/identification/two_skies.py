@@ -17,7 +17,7 @@ import numpy as np
 from starpos.identification._frame import FrameStars
 from starpos.identification.evidence import DOUBLE_PX
 from starpos.identification.explained import Explained
-from starpos.identification.full import ENOUGH, Identification
+from starpos.identification.full import MIN_LOG_ODDS, Identification
 from starpos.identification.pairs import close_pairs
 from starpos.identification.pose import TEST_STARS, Pose
 from starpos.identification.prior import PointingPrior
@@ -136,7 +136,7 @@ def _every_star_twice(xy: np.ndarray, mag: np.ndarray, left: np.ndarray, size: n
     )
     for within_px in OFFSETS_PX:
         twin, log_chance = _most_alike(offset, mag[other] - mag[one], within_px, FARTHEST * size.max())
-        if log_chance < -ENOUGH and _are_a_sky(xy, left, one[twin], other[twin], size):
+        if log_chance < -MIN_LOG_ODDS and _are_a_sky(xy, left, one[twin], other[twin], size):
             return True
     return False
 

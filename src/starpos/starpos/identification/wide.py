@@ -17,12 +17,12 @@ from starpos.identification.full import (
     BENT_PX,
     BLEND_PX,
     EDGE_PX,
-    ENOUGH,
     FAINTEST_FIT,
     FLOOR_PX,
     GATE_PX,
     GATE_SIGMA,
     INSIDE_PX,
+    MIN_LOG_ODDS,
     MIN_SPREAD_PX,
     MIN_STARS,
     Identification,
@@ -145,7 +145,7 @@ def _turns(camera: Camera, pinhole: Camera) -> list[np.ndarray]:
 
 def enough(part_count: int) -> float:
     """Log-odds that one of `part_count` parts needs, so that all together are as safe as a frame."""
-    return float(ENOUGH) + math.log(part_count)
+    return float(MIN_LOG_ODDS) + math.log(part_count)
 
 
 def part_of(field: WideField, sky: Sky, found: Identification) -> tuple[Part, Identification]:

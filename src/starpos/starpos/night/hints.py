@@ -17,7 +17,7 @@ from starpos.frames.header import focal_mm
 from starpos.frames.stars import Stars
 from starpos.identification import Identification
 from starpos.instrument.instrument import Instrument
-from starpos.night.searching import Sight, identified_blind
+from starpos.night.searching import Sight, identify_blind_every_way
 from starpos.progress import Progress
 
 # CPU time, s, of the search at every scale for a frame with a header: under clouds each frame of a night takes it.
@@ -94,5 +94,5 @@ def _fitting(solver: Solver, item: Frame | Stars, stars: Stars, progress: Progre
         return replace(solver.instrument, focal_px=focal_px)
     blind = BlindSolver(solver.catalogue, progress, search_s=SEARCH_S)
     blind.prepare()
-    seen = identified_blind(blind, item, stars).solution.attitude
+    seen = identify_blind_every_way(blind, item, stars).solution.attitude
     return None if seen is None else replace(solver.instrument, focal_px=seen.focal_px, model=seen.model)

@@ -25,17 +25,17 @@ from starpos.identification import Identification, blind_fisheye, quad_cache
 from starpos.identification.blind import STAGES
 from starpos.identification.hint import Hint
 from starpos.identification.search import Priors
-from starpos.identification.second_look import ENOUGH
+from starpos.identification.second_look import MIN_LOG_ODDS_WITH_LOOK
 from starpos.instrument.instrument import Instrument
 from starpos.instrument.tilts import Tilts
 
 if TYPE_CHECKING:
     from starpos.detection.second_look import SecondLook
 
-# Maximum number of other detections of a frame. Each is another try, with a second look of its own: together they add
-# 0.01 wrong answers in 1e9 frames.
+# Maximum number of other detections of a frame. Each is another try, with a second look of its own, and needs log-odds of
+# MIN_LOG_ODDS_OTHERWISE: together they add 0.01 wrong answers in 1e9 frames.
 MAX_WAYS = 3
-ENOUGH_OTHERWISE = ENOUGH + math.log(10 * MAX_WAYS)
+MIN_LOG_ODDS_OTHERWISE = MIN_LOG_ODDS_WITH_LOOK + math.log(10 * MAX_WAYS)
 # If stars fill only a part of a frame (a roof, clouds, a white half), triangles of a field of this relative size help.
 PART = 0.6
 # stages of the search at every scale, for stars from other detections
@@ -63,7 +63,7 @@ class Sight:
         return self.solution.found
 
 
-def identified(
+def identify_every_way(
     solver: Solver, item: Frame | Stars, stars: Stars, predicted: Priors = (), until_s: float = NEVER_S
 ) -> Sight:
     """Identify a frame or a list with these stars; no way is begun after until_s (time.monotonic).
@@ -84,8 +84,8 @@ def identified(
     return _another(item, first, ways, lambda: time.monotonic() >= until_s)
 
 
-def identified_blind(solver: BlindSolver, item: Frame | Stars, stars: Stars) -> Sight:
-    """Identify a frame or a list of any scale, as `identified` does for a known scale.
+def identify_blind_every_way(solver: BlindSolver, item: Frame | Stars, stars: Stars) -> Sight:
+    """Identify a frame or a list of any scale, as `identify_every_way` does for a known scale.
 
     All ways together have the CPU time that the solver has for a search.
     """
@@ -99,7 +99,7 @@ def identified_blind(solver: BlindSolver, item: Frame | Stars, stars: Stars) -> 
     return _another(item, Sight(stars, solver.identify(stars)), ways, lambda: budget.spent)
 
 
-def solved(
+def solve_every_way(
     solver: Solver,
     item: Frame | Stars,
     stars: Stars,
@@ -115,14 +115,14 @@ def solved(
     """
     answer = solver.solve(stars, tilts, hint, predicted, known)
     if answer.lost and time.monotonic() < until_s:
-        sight = identified(solver, item, stars, predicted, until_s)
+        sight = identify_every_way(solver, item, stars, predicted, until_s)
         if sight.found is not None:
             again = solver.solve(sight.stars, tilts, hint, predicted, known=sight.found)
             return Sight(sight.stars, replace(again, identify_s=answer.identify_s + again.identify_s))
     return Sight(stars, answer)
 
 
-def answered(
+def answer_frame(
     solver: Solver,
     item: Frame | Stars,
     stars: Stars,
@@ -133,19 +133,19 @@ def answered(
     until_s: float = NEVER_S,
     known: Identification | None = None,
 ) -> Sight:
-    """The fix of a frame or a list by its tilt, as `solved` has it, and its heading where the place is known.
+    """The fix of a frame or a list by its tilt, as `solve_every_way` has it, and its heading where the place is known.
 
     tilts: None if only headings are wanted.
     """
     if tilts is None:
-        sight = identified(solver, item, stars, predicted, until_s)
+        sight = identify_every_way(solver, item, stars, predicted, until_s)
     else:
-        sight = solved(solver, item, stars, tilts, hint, predicted, until_s, known)
+        sight = solve_every_way(solver, item, stars, tilts, hint, predicted, until_s, known)
     if places is None:
         return sight
     answer = sight.solution
     if answer.found is None and answer.status in UNASKED:
-        sight = identified(solver, item, stars, predicted, until_s)
+        sight = identify_every_way(solver, item, stars, predicted, until_s)
         if sight.found is None:
             return sight
         answer = replace(sight.solution, status=answer.status, message=answer.message)
@@ -206,4 +206,4 @@ def _seen(item: Frame | Stars, stars: Stars) -> Iterator[tuple[Stars, float]]:
 
     seen = otherwise(negative_of(item) if stars.negative else item, stars.window)
     for others in itertools.islice(seen, MAX_WAYS):
-        yield replace(others, negative=stars.negative), ENOUGH_OTHERWISE
+        yield replace(others, negative=stars.negative), MIN_LOG_ODDS_OTHERWISE

@@ -17,7 +17,7 @@ from starpos.gnss.watch import GnssWatch
 from starpos.identification import Identification
 from starpos.instrument.tilts import Tilts
 from starpos.night.remarks import Kind, Remark
-from starpos.night.searching import answered
+from starpos.night.searching import answer_frame
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ def watched_night(
         stars, found = frames[k]
         gnss = place_at(stars)
         place = None if gnss is None else known_place(gnss, vertical)
-        rough = answered(solver, stars, stars, tilts, place, known=found).solution
+        rough = answer_frame(solver, stars, stars, tilts, place, known=found).solution
         answers[k] = watched(solver, stars, rough, gnss, watch)
     remarks = tuple(Remark(Kind.GNSS, f"{number} frames: {why}") for why, number in said.items())
     return WatchedNight(tuple(answers[k] for k in range(len(frames))), watch.learned, remarks)

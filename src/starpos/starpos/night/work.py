@@ -74,7 +74,7 @@ class Identifying:
             blind = BlindSolver(stars_known, self.progress, search_s=self.search_s)
             blind.prepare()
             begin = time.process_time()
-            sight = searching.identified_blind(blind, item, stars_of(item))
+            sight = searching.identify_blind_every_way(blind, item, stars_of(item))
         else:
             solver = Solver(instrument, stars_known)
             # the frame reports the error
@@ -88,7 +88,7 @@ class Identifying:
         stars = stars_of(item)
 
         def work(solver: Solver) -> Sight:
-            return searching.identified(solver, item, stars)
+            return searching.identify_every_way(solver, item, stars)
 
         sight = work(solver)
         return (
@@ -146,7 +146,7 @@ class Solving:
         solver, stars = self.solver(item), stars_of(item)
 
         def work(solver: Solver) -> Sight:
-            return searching.answered(solver, item, stars, self.tilts, self.places, hint)
+            return searching.answer_frame(solver, item, stars, self.tilts, self.places, hint)
 
         sight = work(solver)
         return (

@@ -8,7 +8,7 @@ import numpy as np
 
 from starpos.gnss.place import GnssPlace
 from starpos.gnss.solving import Watched
-from starpos.gnss.watch import AGREES, DISAGREES, DOUBTFUL, LEARNING
+from starpos.gnss.watch import GnssStatus
 from starpos.report.style import BLUE, GREEN, GREY, ORANGE, PURPLE, RED, SKY, plain
 from starpos.units import ARCSEC, HOUR_S
 
@@ -16,7 +16,12 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-COLOURS = {LEARNING: GREY, AGREES: GREEN, DOUBTFUL: ORANGE, DISAGREES: RED}
+COLOURS = {
+    GnssStatus.LEARNING: GREY,
+    GnssStatus.AGREES: GREEN,
+    GnssStatus.DOUBTFUL: ORANGE,
+    GnssStatus.DISAGREES: RED,
+}
 
 
 def compared_of(answers: Sequence[Watched]) -> list[Watched]:
@@ -62,7 +67,14 @@ def _draw_map(axes: "Axes", timed: Sequence[Watched]) -> None:
         if which:
             seen = np.array([km(p.latitude, p.longitude) for p in which])
             axes.plot(
-                *seen.T, "D", color=colour, ms=4, mec="black", mew=0.4, label=f"GNSS, {status}", zorder=3
+                *seen.T,
+                "D",
+                color=colour,
+                ms=4,
+                mec="black",
+                mew=0.4,
+                label=f"GNSS, {status}",
+                zorder=3,
             )
     axes.set(xlabel="east, km", ylabel="north, km")
     axes.set_aspect("equal", adjustable="datalim")

@@ -10,7 +10,7 @@ import numpy as np
 from starpos.calibration import residual_map
 from starpos.errors import TimeError
 from starpos.gnss.solving import Watched
-from starpos.gnss.watch import DISAGREES
+from starpos.gnss.watch import GnssStatus
 from starpos.night.night import Night
 from starpos.report import coast, drive_figure, frame_figures, measures, place_figures, sky_figure
 from starpos.report.html import Picture
@@ -140,7 +140,9 @@ NIGHTS = (
 
 def _drive_caption(answers: Sequence[Watched]) -> str:
     compared = drive_figure.compared_of(answers)
-    alarm = next((a for a in compared if a.compared and a.compared.check.status == DISAGREES), None)
+    alarm = next(
+        (a for a in compared if a.compared and a.compared.check.status == GnssStatus.DISAGREES), None
+    )
     if alarm is None or alarm.compared is None:
         told = "No alarm: GNSS never disagreed."
     else:

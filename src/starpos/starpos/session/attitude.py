@@ -12,7 +12,7 @@ from starpos.frames.stars import Stars
 from starpos.identification import wide
 from starpos.identification.search import Priors
 from starpos.navigation.sightings import sighted
-from starpos.night.searching import NEVER_S, UNASKED, identified
+from starpos.night.searching import NEVER_S, UNASKED, identify_every_way
 from starpos.session.gyro import Gyro
 from starpos.session.log import Log
 
@@ -22,7 +22,7 @@ def asked(
 ) -> Solution:
     """The solver's answer to a frame; if it stopped before identification, identify the stars now."""
     if answer.found is None and answer.status in UNASKED:
-        return identified(solver, stars, stars, predicted, until_s).solution
+        return identify_every_way(solver, stars, stars, predicted, until_s).solution
     return answer
 
 

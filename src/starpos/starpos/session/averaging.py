@@ -9,7 +9,7 @@ import numpy as np
 from starpos.averaging.average import MOVED_FIXES, Average, Averager
 from starpos.averaging.slip import slip_s
 from starpos.earth.ellipsoid import EARTH_RADIUS_M, curvature_radii_m, enu_axes, zenith_of
-from starpos.fix.budget import CALIBRATION
+from starpos.fix.budget import Origin
 from starpos.fix.fix import Fix
 from starpos.session.diagnosis import Diagnosis, Level
 from starpos.units import ARCSEC
@@ -118,7 +118,7 @@ class Averaging:
 
 def _is_wide(fix: Fix) -> bool:
     """Whether A3's error is too large for a linear filter to separate it from the place."""
-    of_a3 = [t.covariance[:2, :2] for t in fix.terms if t.name in (CALIBRATION, "remounting")]
+    of_a3 = [t.covariance[:2, :2] for t in fix.terms if t.origin is Origin.A3]
     # what GNSS taught of A3 is a term of its own, and linear
     calibration = sum(of_a3, np.zeros((2, 2)))
     return bool(np.linalg.eigvalsh(calibration)[-1] > (WIDE_RAD * EARTH_RADIUS_M) ** 2)

@@ -18,7 +18,7 @@ from starpos.gnss.place import GnssPlace, message_to_gnss
 from starpos.gnss.solving import Watched, watched
 from starpos.gnss.states import Learned
 from starpos.gnss.track import GnssTrack
-from starpos.gnss.watch import DISAGREES, DOUBTFUL, GnssWatch
+from starpos.gnss.watch import GnssStatus, GnssWatch
 from starpos.instrument.instrument import Instrument
 from starpos.session.diagnosis import Diagnosis, Level
 from starpos.session.job import Jobs
@@ -186,14 +186,14 @@ class GnssTeacher:
             return Diagnosis(Level.WARN, f"{since}: the stars' place goes on with what was learned", values)
         check = compared.check
         values |= {
-            "status": check.status,
+            "status": check.status.value,
             "distance (m)": check.distance_m,
             "bearing (deg)": check.bearing_deg,
             "sigma (m)": check.sigma_m,
         }
-        if check.status == DISAGREES:
+        if check.status == GnssStatus.DISAGREES:
             return Diagnosis(Level.ERROR, check.sentence, values)
-        if check.status == DOUBTFUL:
+        if check.status == GnssStatus.DOUBTFUL:
             return Diagnosis(Level.WARN, f"{check.sentence}: it teaches nothing now", values)
         return Diagnosis(Level.OK, check.sentence, values)
 

@@ -72,8 +72,8 @@ PARAMETERS = (
     Parameter(
         "imu_model",
         "",
-        "kalibr's imu.yaml, with the sigma of the biases; '' for a cheap IMU. A bias far beyond its "
-        "sigma moves the position: 1 mg by up to 6 km until the vehicle has turned.",
+        "File of the IMU's errors, kalibr's imu.yaml with the sigma of the biases; '' for a cheap IMU. "
+        "A bias far beyond its sigma moves the position: 1 mg by up to 6 km until the vehicle has turned.",
     ),
     Parameter(
         "vehicle",

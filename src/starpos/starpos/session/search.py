@@ -68,8 +68,19 @@ class Search:
         until_s: float,
         known: Identification | None,
     ) -> Solution:
-        """Solve a frame, as `searching.answered` does a list; while none is identified, say which focal length fits."""
-        seen = searching.answered(solver, stars, stars, tilts, places, hint, predicted, until_s, known)
+        """Solve a list by `searching.answer_frame`; while none is identified, say which focal length fits."""
+        # a node has no picture to look at, only the list
+        seen = searching.answer_frame(
+            solver,
+            item=stars,
+            stars=stars,
+            tilts=tilts,
+            places=places,
+            hint=hint,
+            predicted=predicted,
+            until_s=until_s,
+            known=known,
+        )
         answer = seen.solution
         self._identified |= answer.found is not None
         if self._identified or answer.status is not Status.NOT_IDENTIFIED:

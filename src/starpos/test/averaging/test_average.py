@@ -189,7 +189,7 @@ def dense(made):
     whole = np.zeros((n, 3, n, 3))
     for k, term in enumerate(made[0].terms):
         # They are of one pose.
-        like = [made[0] if term.posed else f for f in made]
+        like = [made[0] if term.constant_within_pose else f for f in made]
         factors = [plane.turn(f) @ f.terms[k].factor[:3] * UNIT[:, None] for f in like]
         for i, f in enumerate(made):
             for j, g in enumerate(made):

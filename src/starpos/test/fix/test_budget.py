@@ -8,6 +8,7 @@ import pytest
 
 from starpos import rotation
 from starpos.earth.orientation import earth_state
+from starpos.fix.budget import Origin
 from starpos.fix.fix import Mounting
 from starpos.instrument.inclinometer import EXACT, InclinometerErrors, Tilt
 from starpos.units import ARCSEC
@@ -37,6 +38,34 @@ def fixed(field, rng, errors=EXACT, turn_sigma=None, **mounting):
 def sigma_m(fix, name) -> np.ndarray:
     (term,) = (t for t in fix.terms if t.name == name)
     return np.sqrt(np.diag(term.covariance)[:2])
+
+
+def test_each_term_says_whether_gnss_replaces_it(rng):
+    """A term of the level with the wrong origin would be counted twice, or not at all, once GNSS has taught the rest."""
+    of = {origin: {t.name for t in fixed(SkyField(), rng).terms if t.origin is origin} for origin in Origin}
+    others = {
+        "centroids",
+        "catalogue",
+        "refraction",
+        "shutter",
+        "clock",
+        "time stamp",
+        "ut1",
+        "pole",
+        "mount",
+    }
+    assert of.pop(Origin.OTHER) <= others
+    assert of == {
+        Origin.A3: {"calibration", "remounting"},
+        Origin.INCLINOMETER: {
+            "tilt quantisation",
+            "tilt pose",
+            "tilt drift",
+            "tilt temperature",
+            "tilt response",
+        },
+        Origin.READINGS: {"tilt"},
+    }
 
 
 def test_drift_grows_with_the_root_of_the_hours(rng):

@@ -10,7 +10,7 @@ from starpos.earth.vertical import Deflection
 from starpos.gnss.lacking import what_would_tell_more
 from starpos.gnss.place import GnssPlace
 from starpos.gnss.sighting import place_of_stars
-from starpos.gnss.watch import AGREES, DISAGREES, DOUBTFUL, LEARNING, GnssWatch
+from starpos.gnss.watch import GnssStatus, GnssWatch
 from starpos.instrument import sensors
 from starpos_testing.gnss_drives import GnssDrive
 
@@ -64,7 +64,7 @@ def carried():
 
 def test_there_is_no_place_before_anything_was_learned(carried):
     for told in carried:
-        assert told[0].error_m is None and told[0].check.status == LEARNING
+        assert told[0].error_m is None and told[0].check.status == GnssStatus.LEARNING
 
 
 def test_the_place_goes_on_without_gnss_and_its_claim_is_true_and_grows(carried):
@@ -78,8 +78,8 @@ def test_the_place_goes_on_without_gnss_and_its_claim_is_true_and_grows(carried)
 
 def test_a_good_gnss_agrees_and_teaches_more_and_more():
     told, watch = driven(DRIVE, 11)
-    assert all(frame.check.status != DISAGREES for frame in told)
-    assert np.mean([frame.check.status == AGREES for frame in after(told, THEN_S)]) > 0.95
+    assert all(frame.check.status != GnssStatus.DISAGREES for frame in told)
+    assert np.mean([frame.check.status == GnssStatus.AGREES for frame in after(told, THEN_S)]) > 0.95
     assert np.sqrt(np.trace(told[-1].covariance) / 2) < 215
     assert watch.learned.poses == DRIVE.stops and what_would_tell_more(watch.learned) == ""
 
@@ -87,7 +87,7 @@ def test_a_good_gnss_agrees_and_teaches_more_and_more():
 def test_multipath_of_30_m_is_no_spoofing():
     for seed in (21, 22):
         told, _ = driven(ROVER, seed, astray=lambda t: np.array([0.0, 30.0]) * (1200 < t < 1500))
-        assert all(frame.check.status != DISAGREES for frame in told)
+        assert all(frame.check.status != GnssStatus.DISAGREES for frame in told)
 
 
 ATTACKS = {
@@ -101,10 +101,10 @@ def test_a_gnss_that_is_led_astray_is_not_believed_and_what_it_taught_is_taken_b
     drive = GnssDrive(stops=30)
     for seed in (31, 32):
         told, watch = driven(drive, seed, astray=ATTACKS[kind])
-        first = next(frame.at_s for frame in told if frame.check.status == DISAGREES)
+        first = next(frame.at_s for frame in told if frame.check.status == GnssStatus.DISAGREES)
         assert THEN_S < first < THEN_S + by_s
         since = after(told, first)
-        assert all(frame.check.status == DISAGREES for frame in since)
+        assert all(frame.check.status == GnssStatus.DISAGREES for frame in since)
         # the covariance is whole: the same drive without that GNSS knows as much
         assert np.mean([frame.nees for frame in since]) < 4 and max(frame.nees for frame in since) < 30
         assert watch.disagrees and "not believed" in told[-1].check.sentence
@@ -116,9 +116,11 @@ def test_a_gnss_that_comes_back_is_believed_after_ten_minutes_and_not_at_once():
         GnssDrive(stops=36), 41, astray=lambda t: np.array([2000.0, 0.0]) * (THEN_S < t < back_s)
     )
     assert all(
-        frame.check.status == DISAGREES for frame in after(told, THEN_S + 60) if frame.at_s < back_s + 480
+        frame.check.status == GnssStatus.DISAGREES
+        for frame in after(told, THEN_S + 60)
+        if frame.at_s < back_s + 480
     )
-    assert told[-1].check.status == AGREES
+    assert told[-1].check.status == GnssStatus.AGREES
 
 
 def test_a_gnss_that_was_led_astray_and_then_away_for_an_hour_is_judged_again():
@@ -131,7 +133,7 @@ def test_a_gnss_that_was_led_astray_and_then_away_for_an_hour_is_judged_again():
         lambda t: np.array([2000.0, 0.0]) * (THEN_S < t < again_s),
     )
     back = [frame.check.status for frame in after(told, again_s)]
-    assert back[0] == DISAGREES and back[-1] == AGREES
+    assert back[0] == GnssStatus.DISAGREES and back[-1] == GnssStatus.AGREES
 
 
 def test_a_sentence_says_where_gnss_is():
@@ -167,7 +169,7 @@ def test_an_error_of_each_pose_is_claimed_before_a3_is_known_too(model):
     drive = GnssDrive(errors=sensors.PRESETS[model], lean_deg=0.03 if model == "nivel210" else 4.0, stops=12)
     told = [frame for seed in (1, 2) for frame in driven(drive, seed)[0] if frame.error_m is not None]
     assert np.mean([frame.nees for frame in told]) < 4
-    assert all(frame.check.status != DISAGREES for frame in told)
+    assert all(frame.check.status != GnssStatus.DISAGREES for frame in told)
 
 
 def test_one_pose_tells_no_turn_of_a3_however_good_the_inclinometer():
@@ -183,4 +185,9 @@ def test_before_a3_is_known_an_alarm_needs_two_frames():
     # good for two frames of a pose, then 30 km off
     drive = GnssDrive(stops=1, frames=4)
     told, _ = driven(drive, 71, astray=lambda t: np.array([0.0, 30_000.0]) * (t > 9))
-    assert [frame.check.status for frame in told] == [LEARNING, LEARNING, DOUBTFUL, DISAGREES]
+    assert [frame.check.status for frame in told] == [
+        GnssStatus.LEARNING,
+        GnssStatus.LEARNING,
+        GnssStatus.DOUBTFUL,
+        GnssStatus.DISAGREES,
+    ]

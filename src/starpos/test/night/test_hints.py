@@ -113,7 +113,7 @@ def test_a_frame_that_nothing_fits_keeps_its_sentence(lost, rng):
 
 
 def test_a_focal_length_near_the_headers_needs_no_search_at_every_scale(catalogue, rng, monkeypatch):
-    monkeypatch.setattr(hints, "identified_blind", never)
+    monkeypatch.setattr(hints, "identify_blind_every_way", never)
     wide, header = Camera.from_focal(1000, 700, 5000.0), about({"FOCALLEN": 34, "XPIXSZ": 6.4}, "frame.fits")
     sight, _ = Identifying(Given(None, by_header=True))(
         stars_of_cygnus(catalogue, rng, wide, 6.5, 0.05, **header)
@@ -135,7 +135,7 @@ def test_a_scale_and_a_lens_that_then_identify_nothing_are_not_told(lost, monkey
         tried.append((solver.instrument.focal_px, solver.instrument.model))
         return sight
 
-    monkeypatch.setattr(hints, "identified_blind", blind)
+    monkeypatch.setattr(hints, "identify_blind_every_way", blind)
     assert without_hint(solver, stars, stars, sight, again, quiet) is sight
     assert (searched, tried) == ([hints.SEARCH_S], [(900.0, EQUIDISTANT)])
 

@@ -14,7 +14,7 @@ from starpos.frames.stars import no_stars
 from starpos.instrument.camera import Camera
 from starpos.instrument.instrument import Instrument
 from starpos.night import searching
-from starpos.night.searching import PART, identified
+from starpos.night.searching import PART, identify_every_way
 from starpos_testing.skies.cygnus import DEC_DEG, stars_of_cygnus
 
 SIZE, FOCAL_PX = (1280, 960), 2657.0
@@ -34,7 +34,7 @@ def test_a_part_of_a_frame_without_the_brightest_stars_around_it(catalogue, left
     assert solver.identify(stars).status is Status.NOT_IDENTIFIED
     found = solver.identify(stars, part=PART)
     assert found.ok and found.attitude.dec == pytest.approx(np.radians(DEC_DEG), abs=1e-4)
-    assert identified(solver, stars, stars).solution.star.tolist() == found.star.tolist()
+    assert identify_every_way(solver, stars, stars).solution.star.tolist() == found.star.tolist()
 
 
 @pytest.fixture
@@ -58,22 +58,22 @@ def test_an_answer_by_stars_detected_otherwise_needs_more_evidence(frame, catalo
     lost = Solution.failed(stars, Status.NOT_IDENTIFIED, "lost")
     others = [replace(stars, source=str(k)) for k in range(4)]
     monkeypatch.setattr(ways, "otherwise", lambda frame, window: iter(others))
-    weak = replace(good, attitude=replace(good.attitude, log_odds=searching.ENOUGH_OTHERWISE - 0.1))
-    sight = identified(Answering(lost, lost, weak, weak, lost, good), frame, stars)
+    weak = replace(good, attitude=replace(good.attitude, log_odds=searching.MIN_LOG_ODDS_OTHERWISE - 0.1))
+    sight = identify_every_way(Answering(lost, lost, weak, weak, lost, good), frame, stars)
     assert sight.solution is good and sight.stars.source == "1"
-    sight = identified(Answering(lost, lost, *6 * [weak]), frame, stars)
+    sight = identify_every_way(Answering(lost, lost, *6 * [weak]), frame, stars)
     assert sight.solution is lost and sight.stars is stars
     # the stars that were detected first need no more than a star list does
-    assert identified(Answering(lost, weak), frame, stars).solution is weak
+    assert identify_every_way(Answering(lost, weak), frame, stars).solution is weak
 
 
 def test_an_answer_a_list_and_a_bad_frame_are_left_as_they_are(frame):
     stars = no_stars(300, 200)
     for item, status, ways_tried in ((frame, Status.BAD_INPUT, 1), (stars, Status.TOO_FEW_STARS, 2)):
         answer = Solution.failed(stars, status, "as it was")
-        assert identified(Answering(*ways_tried * [answer]), item, stars).solution is answer
+        assert identify_every_way(Answering(*ways_tried * [answer]), item, stars).solution is answer
 
 
 def test_no_other_way_is_begun_when_the_time_is_over(frame):
     lost = Solution.failed(no_stars(300, 200), Status.NOT_IDENTIFIED, "lost")
-    assert identified(Answering(lost), frame, no_stars(300, 200), until_s=0.0).solution is lost
+    assert identify_every_way(Answering(lost), frame, no_stars(300, 200), until_s=0.0).solution is lost
