@@ -61,6 +61,7 @@ READS_WHOLE = {
     "starpos/earth/orientation.py": "the table of the Earth's rotation that astropy brings",
     "starpos/parallel/same.py": "our own source",
     "starpos/identification/paper.py": "of the package",
+    "starpos/sky/near_stars.py": "of the package",
     "starpos/report/coast.py": "of the package",
     "starpos/report/field.py": "MAX_BYTES",
     "starpos/recording/bag.py": "installed messages",
