@@ -97,11 +97,14 @@ def named(action: str) -> set[str]:
     return {name for rules in allowed().values() for _, what, name in rules if what == action}
 
 
+# the namespace of robot.launch.py
+OF_ROBOT = "/starpos"
+
+
 @pytest.mark.parametrize("call", calls("ros2 topic echo "))
 def test_a_topic_is_there(call):
     _, _, _, name, *_ = words(call)
-    # /starpos is the namespace of robot.launch.py
-    assert name.removeprefix("/starpos") in named("publish")
+    assert name.removeprefix(OF_ROBOT) in named("publish")
 
 
 @pytest.mark.parametrize("call", calls("ros2 service "))
@@ -109,7 +112,7 @@ def test_a_service_and_its_request_are_there(call):
     _, _, _, name, kind, *request = words(call)
     package, _, service = kind.split("/")
     fields = getattr(import_module(f"{package}.srv"), service).Request.get_fields_and_field_types()
-    assert name in named("reply")
+    assert name.removeprefix(OF_ROBOT) in named("reply")
     assert set(yaml.safe_load(request[0]) if request else {}) <= set(fields)
 
 

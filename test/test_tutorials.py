@@ -55,7 +55,7 @@ def test_the_disks_commands_print_what_the_page_says(tmp_path, monkeypatch, caps
     page = (ROOT / "docs" / "tutorials" / "disk.md").read_text()
     [turned] = re.findall(r"^    (turn: 12 frames together: .*)$", page, re.MULTILINE)
     assert any(turned in out.splitlines() for out in said.values())
-    assert (tmp_path / "mine.yaml").is_file()
+    assert (tmp_path / "instrument.yaml").is_file()
     # of frames instead of lists the last digits are others
     [night] = re.findall(r"^    (night: 10 frames together: .*)$", page, re.MULTILINE)
     assert any(numbers(line) == pytest.approx(numbers(night), rel=0.05) for line in lines(said))
@@ -73,7 +73,7 @@ def test_a3_is_found_by_the_commands_that_say_how(tmp_path, monkeypatch, capsys)
     [night] = [out for line, out in said.items() if line.startswith("starpos solve night")]
     [where] = [line for line in night.splitlines() if "2 frames together" in line]
     assert numbers(where)[1:3] == pytest.approx([35.7046, 51.4106], abs=0.005)
-    assert {f.name for f in tmp_path.glob("*.yaml")} == {"mine.yaml", "pillar.yaml"}
+    assert {f.name for f in tmp_path.glob("*.yaml")} == {"instrument.yaml", "pillar.yaml"}
 
 
 def test_the_camera_is_calibrated_by_the_command_that_says_how(tmp_path, monkeypatch, capsys):
@@ -110,7 +110,7 @@ def test_another_solvers_pointings_make_a_place_by_the_command_that_says_how(tmp
     known = "camera: {focal_mm: 600, pixel_um: 6.4}\nmisalignment_deg: [0, 0, 0]"
     known += "\ncalibration_stddev_arcsec: [5, 5, 20]\ninclinometer: {model: sca100t_calibrated}"
     known = f"starpos_instrument: 1\n{known}\n"
-    (tmp_path / "mine.yaml").write_text(known)
+    (tmp_path / "instrument.yaml").write_text(known)
     [solved] = typed("docs/how-to/pointings.md", tmp_path, monkeypatch, capsys).values()
     [night] = [line for line in solved.splitlines() if "3 frames together" in line]
     assert numbers(night)[1:3] == pytest.approx([35.7046, 51.4106], abs=0.005)

@@ -253,11 +253,11 @@ def test_captures_that_come_after_the_next_frame_are_still_of_their_frames(stand
 
 def test_a_frame_whose_capture_is_lost_has_the_errors_of_the_last_and_does_not_wait_for_it(standing, frame):
     usual = {"stamp_stddev": 0.1, "clock_stddev": 0.2, "shutter_known": True, "readout": 0.02}
-    standing.wait_for(standing.send(frame, exposure=0.5, **usual))
     got = []
 
-    # the newest frame wins, so the one that waited may be dropped for the next
+    # the newest frame wins, so the one that waited may be dropped for the next, whose Capture is then the last
     def answered():
+        standing.wait_for(standing.send(frame, exposure=0.5, **usual))
         lost = standing.message(frame)
         standing.images.publish(lost)
         standing.listener.wait(lambda: standing.images.wait_for_all_acked(Duration(seconds=0.1)))

@@ -90,10 +90,10 @@ def photograph(
     shots: tuple[int, int, float],
     rng: np.random.Generator,
     exposure_s: float = EXPOSURE_S,
-) -> tuple[list[Stars], list[tuple]]:
-    """Frames at several headings, turned by hand between them; stars, and rows of a tilt log."""
+) -> tuple[list[Stars], list[tuple], list[float]]:
+    """Frames at several headings, turned by hand between them; stars, rows of a tilt log, true headings in rad."""
     headings, frames, cadence_s = shots
-    stars, rows, now = [], [], begin
+    stars, rows, faces, now = [], [], [], begin
     # deg C, and deg C per hour
     warmth, trend = rng.normal(0, 2.0), rng.normal(0, 1.0)
     for k in range(headings):
@@ -108,6 +108,7 @@ def photograph(
         for _ in range(frames):
             light = expose(scene, world.sky, now, exposure_s, rng)
             stars.append(detected(scene, light, now + exposure_s / 2 + world.clock_s, exposure_s, rng))
+            faces.append(scene.heading)
             warm = warmth + trend * (now - begin) / 3600
             off = zero.at(now) + scene.tilt_errors.zero + warm * world.per_c + wrong
             told = replace(scene, tilt_errors=replace(scene.tilt_errors, zero=tuple(off), scale=(0.0, 0.0)))
@@ -116,7 +117,7 @@ def photograph(
                 rows.append((moment, *read_tilt(told, 0.0, rng), 15.0 + warm))
             now += cadence_s
         now += TURN_S
-    return stars, rows
+    return stars, rows, faces
 
 
 def log_of(rows: Sequence[tuple], errors: InclinometerErrors) -> TiltLog:
@@ -131,7 +132,7 @@ def turned(errors: InclinometerErrors, catalogue: Catalogue, rng: np.random.Gene
     for shots in TURNED.values():
         world, begin = draw(rng, catalogue, errors, CLOCK_S, CAMERA)
         zero, response = Zero(errors, rng, begin), Response.drawn(errors, rng)
-        stars, rows = photograph(world, zero, response, begin, shots, rng)
+        stars, rows, _ = photograph(world, zero, response, begin, shots, rng)
         solver, tilts = Solver(world.told, catalogue, world.air), log_of(rows, errors)
         nights.append(outcome(partial(turned_fixes, solver, stars, tilts), world))
     return nights
@@ -149,9 +150,9 @@ def given(errors: InclinometerErrors, catalogue: Catalogue, rng: np.random.Gener
     """
     world, begin = draw(rng, catalogue, errors, CLOCK_S, CAMERA)
     zero, response = Zero(errors, rng, begin), Response.drawn(errors, rng)
-    stars, rows = photograph(world, zero, response, begin, CALIBRATED, rng)
+    stars, rows, _ = photograph(world, zero, response, begin, CALIBRATED, rng)
     lower = replace(world, scene=replace(world.scene, altitude_deg=world.scene.altitude_deg - 5))
-    more, readings = photograph(lower, zero, response, begin + 3600, CALIBRATED, rng)
+    more, readings, _ = photograph(lower, zero, response, begin + 3600, CALIBRATED, rng)
     solver, known = Solver(world.told, catalogue, world.air), log_of(rows + readings, errors)
     try:
         found = calibrate_at(solver, stars + more, known, world.site)
@@ -165,7 +166,7 @@ def given(errors: InclinometerErrors, catalogue: Catalogue, rng: np.random.Gener
     )
     nights = []
     for shots in GIVEN.values():
-        frames, levels = photograph(there, zero, response, later, shots, rng)
+        frames, levels, _ = photograph(there, zero, response, later, shots, rng)
         nights.append(outcome(partial(single_fixes, ready, frames, log_of(levels, errors)), there))
         later += 3600
     return nights

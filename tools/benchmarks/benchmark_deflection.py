@@ -85,7 +85,9 @@ def write_list(path, stars, displaced: np.ndarray, site, at: float, axes: np.nda
     """Write the stars that a camera with these axes (3, 3), rows in east, north, up, sees."""
     state = earth_state(at)
     index = site.overhead(stars, state, axes[2], CAMERA.half_diagonal_rad, LIMIT_MAG)
-    seen = site.refracted(rotation.normalised(stars.directions(index, state.year) + displaced[index]), state)
+    seen = site.refracted(
+        rotation.normalised(stars.directions(index, state.year, state.observer_au) + displaced[index]), state
+    )
     xy = CAMERA.project(seen @ axes.T) + rng.normal(0, SCATTER_PX, (len(index), 2))
     on = ((xy > 2) & (xy < [CAMERA.width - 3, CAMERA.height - 3])).all(1)
     flux = 10 ** (-0.4 * (stars.vmag(index) - 14))

@@ -64,7 +64,7 @@ class Shot:
         matched = MatchedStars(
             np.stack([self.stars.x, self.stars.y], -1)[found.star],
             self.stars.covariance[found.star],
-            self.solver.catalogue.directions(index, state.year),
+            self.solver.catalogue.directions(index, state.year, state.observer_au),
             self.solver.catalogue.sigma(index, state.year),
             index,
         )

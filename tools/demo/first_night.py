@@ -98,7 +98,7 @@ def run(out: Path, scratch: Path) -> int:
     """Run it; return the exit status."""
     from starpos.simulation.scene import scene_of
 
-    night, saved = out / "night", out / "mine.yaml"
+    night, saved = out / "night", out / "instrument.yaml"
     night.mkdir(parents=True)
     scene = scene_of(
         size=SIZE,

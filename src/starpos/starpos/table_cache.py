@@ -60,16 +60,29 @@ def load_or_build(
     return load() or build()
 
 
-def mapped(kind: type, folder: Path, number_kinds: str) -> Any | None:
-    """The table, a dataclass of arrays, memory-mapped; None if a column is missing or not of its kind of numbers."""
+def mapped(
+    kind: type,
+    folder: Path,
+    number_kinds: str,
+    newer: Callable[[dict[str, np.ndarray]], dict[str, np.ndarray]] = lambda columns: {},
+) -> Any | None:
+    """The table, a dataclass of arrays, memory-mapped; None if a column is missing or not of its kind of numbers.
+
+    newer: makes the columns that folders of earlier versions lack, from the others.
+    """
     try:
         columns = {
-            f.name: np.asarray(np.load(folder / f"{f.name}.npy", mmap_mode="r", allow_pickle=False))
+            path.stem: np.asarray(np.load(path, mmap_mode="r", allow_pickle=False))
             for f in fields(kind)
+            if (path := folder / f"{f.name}.npy").exists()
         }
-    except (OSError, ValueError, EOFError):
+        names = [f.name for f in fields(kind)]
+        if len(columns) < len(names):
+            columns = {**newer(columns), **columns}
+        ordered = {name: columns[name] for name in names}
+    except (OSError, ValueError, EOFError, KeyError):
         return None
-    return kind(**columns) if [c.dtype.kind for c in columns.values()] == list(number_kinds) else None
+    return kind(**ordered) if [c.dtype.kind for c in ordered.values()] == list(number_kinds) else None
 
 
 def rising(start: np.ndarray, end: int) -> bool:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Replay of a recorded night through the solver, with its own time on /clock; everything ends with the bag.
 
-    ros2 launch starpos_bringup replay.launch.py bag:=night rate:=0 params_file:=mine.yaml
+    ros2 launch starpos_bringup replay.launch.py bag:=night rate:=0 params_file:=robot.yaml
 
 If a bag holds images and no stars, detector:=true finds the stars again.
 """

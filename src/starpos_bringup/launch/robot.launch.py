@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Detector, inclinometer and solver on the camera and the IMU that a robot has.
 
-    ros2 launch starpos_bringup robot.launch.py image:=/cam0/image_raw imu:=/imu/data params_file:=mine.yaml
+    ros2 launch starpos_bringup robot.launch.py image:=/cam0/image_raw imu:=/imu/data params_file:=robot.yaml
 
 `camera_info:=` names the intrinsics. The file states what the drivers do not: begin with a copy of
 config/existing_robot.yaml.

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The instrument: camera and detector in one process, inclinometer, solver.
 
-    ros2 launch starpos_bringup starpos.launch.py port:=/dev/serial/by-id/... params_file:=mine.yaml
+    ros2 launch starpos_bringup starpos.launch.py port:=/dev/serial/by-id/... params_file:=robot.yaml
 
 Without an argument the value of the parameter file holds.
 """

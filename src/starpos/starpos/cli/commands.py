@@ -25,8 +25,8 @@ COMMANDS = {
         (
             "starpos simulate night && starpos solve night --misalignment 0 0 0 --misalignment-stddev 5 "
             "--inclinometer sca100t_calibrated",
-            "starpos solve *.fits --tilt tilt.csv --focal-mm 600 --pixel-um 6.4 --self-calibrate --save mine.yaml",
-            "starpos solve *.fits --tilt tilt.csv --instrument mine.yaml --near 35.7 51.4 --csv > places.csv",
+            "starpos solve *.fits --tilt tilt.csv --focal-mm 600 --pixel-um 6.4 --self-calibrate --save instrument.yaml",
+            "starpos solve *.fits --tilt tilt.csv --instrument instrument.yaml --near 35.7 51.4 --csv > places.csv",
         ),
         "starpos report draws the same night; starpos calibrate and --self-calibrate find A3",
     ),
@@ -34,7 +34,7 @@ COMMANDS = {
         "position, heading and velocity of a voyage: frames and an IMU, while driving, sailing, flying",
         (
             "starpos navigate *.csv --imu imu.csv --focal-mm 16 --pixel-um 3.45",
-            "starpos navigate *.fits --imu imu.csv --velocity wheels.csv --instrument mine.yaml --json",
+            "starpos navigate *.fits --imu imu.csv --velocity wheels.csv --instrument instrument.yaml --json",
         ),
         "starpos solve, for an instrument that stands still",
     ),
@@ -58,7 +58,7 @@ COMMANDS = {
         "solve recorded nights (rosbag2) with the solver's own code: the same fixes as in the running graph",
         (
             "starpos replay recorded_night",
-            "starpos replay nights/* --params-file mine.yaml --jobs auto --json",
+            "starpos replay nights/* --params-file robot.yaml --jobs auto --json",
         ),
         "starpos report draws the same bags",
     ),
@@ -121,8 +121,8 @@ COMMANDS = {
     "first-night": Command(
         "focus, exposure, level, clock, the level's signs, then A3 by turning: step by step, live, until it is saved",
         (
-            "starpos first-night NIGHT --focal-mm 600 --pixel-um 6.4 --save mine.yaml",
-            "starpos first-night NIGHT --save mine.yaml --field night.zip",
+            "starpos first-night NIGHT --focal-mm 600 --pixel-um 6.4 --save instrument.yaml",
+            "starpos first-night NIGHT --save instrument.yaml --field night.zip",
         ),
         "starpos solve --instrument with the file that was written",
     ),

@@ -16,8 +16,8 @@ COLUMNS = ("file", "combined", "status", "utc", "face", "heading", "xi_arcsec", 
 HEAD = "file: face, heading of the frame's top (deg), xi and eta (arcsec) of the frame alone, with the session's A3"
 JSON_HELP = (
     "one JSON object a frame, and one with combined: true: xi_arcsec, eta_arcsec at the mark as the plumb line stood, "
-    "covariance_arcsec2 (2 x 2), errors (1 sigma of xi, eta for each source), reduced (without the tide; at the geoid), "
-    "by_face and by_star (residuals, leverage); starpos stations and starpos report read it"
+    "covariance_arcsec2 (2 x 2), errors (1 sigma of xi, eta for each source) and correlations, reduced (without the "
+    "tide; at the geoid), by_face and by_star (residuals, leverage); starpos stations and starpos report read it"
 )
 # number of stars listed, largest leverage first
 STARS_LISTED = 50
@@ -78,6 +78,7 @@ def combined_json(
         "faces": int(found.faces.max()) + 1,
         "frames": len(session.sightings),
         "errors": {name: [xi, eta] for name, xi, eta in found.terms},
+        "correlations": found.correlations,
         "image_motion_arcsec": found.air.motion / ARCSEC,
         "anomalous_refraction_arcsec": found.air.anomalous / ARCSEC,
         "catalogue_factor": found.catalogue_factor,

@@ -2,6 +2,7 @@
 """`starpos identify`: where frames look, from their stars alone."""
 
 import argparse
+import math
 
 import numpy as np
 
@@ -18,13 +19,15 @@ from starpos.night.work import Fitting, Identifying, OnFile
 from starpos.parallel.call import Here
 from starpos.progress import quiet
 from starpos.sky.catalogue import load_catalogue
+from starpos.units import ARCSEC
 
 # of --csv
-COLUMNS = ("file", "status", "ra", "dec", "roll", "focal_px", "stars_detected", "stars_matched", "residual_arcsec",
-           "log_odds", "lens", "mirrored", "negative", "warnings", "cpu_ms")  # fmt: skip
+COLUMNS = ("file", "status", "ra", "dec", "roll", "focal_px", "focal_stddev_px", "stars_detected", "stars_matched",
+           "residual_arcsec", "log_odds", "lens", "mirrored", "negative", "warnings", "cpu_ms")  # fmt: skip
 JSON_HELP = (
     "one JSON object a frame: ra, dec of the middle of the frame and roll, the position angle of its top, in deg (ICRS), "
-    "focal_px, lens, residual_arcsec, log_odds of the answer against chance; status is ok, or why these are null"
+    "focal_px and its error focal_stddev_px, lens, residual_arcsec, log_odds of the answer against chance; status is ok, "
+    "or why these are null"
 )
 HEAD = (
     "file: right ascension and declination of the middle of the frame (deg, ICRS), direction of its top (deg, from north "
@@ -98,6 +101,7 @@ def as_json(path: str, s: Solution) -> dict:
         "dec": np.degrees(a.dec) if a else None,
         "roll": np.degrees(a.roll) if a else None,
         "focal_px": a.focal_px if a else None,
+        "focal_stddev_px": a.focal_stddev_px if a else None,
         "stars_detected": s.stars_detected,
         "stars_matched": len(s.names),
         "residual_arcsec": a.residual_arcsec if a else None,
@@ -117,10 +121,12 @@ def _line(path: str, s: Solution) -> str:
     if s.attitude is None:
         return f"{path}: {s.status.value}, {s.stars_detected} stars detected"
     a = s.attitude
+    digits = 1 - math.floor(math.log10(min(max(a.focal_stddev_px, 1e-3), 1.0)))
     return (
         f"{path}: RA {np.degrees(a.ra):.5f} Dec {np.degrees(a.dec):+.5f} top at {np.degrees(a.roll):.3f} deg, "
         f"{len(s.names)} of {s.stars_detected} stars, residual {a.residual_arcsec:.2f} arcsec, "
-        f"focal length {a.focal_px:.1f} px, log-odds {a.log_odds:.0f}"
+        f"focal length {a.focal_px:.{digits}f} +- {a.focal_stddev_px:.{digits}f} px "
+        f"({1 / a.focal_px / ARCSEC:.5g} arcsec/px), log-odds {a.log_odds:.0f}"
         + (", a fisheye" if a.model == EQUIDISTANT else "")
         + (", mirrored" if a.mirrored else "")
         + (", a negative" if s.negative else "")

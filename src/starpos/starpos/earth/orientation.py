@@ -74,6 +74,11 @@ class EarthState:
         return np.array(self.astrom["v"], float)
 
     @property
+    def observer_au(self) -> np.ndarray:
+        """The Earth's barycentric place (3,), au, ICRS axes: stars are seen from there."""
+        return np.array(self.astrom["eb"], float)
+
+    @property
     def gcrs_to_itrs(self) -> np.ndarray:
         """Rotation (3, 3) of apparent directions, which include aberration, from the axes of ICRS into ITRS."""
         return self.cirs_to_itrs @ np.asarray(self.astrom["bpn"]).reshape(3, 3)

@@ -4,6 +4,8 @@
 import math
 import time
 
+import numpy as np
+
 from starpos.fix.solution import TWO_SKIES, UNEXPLAINED, Attitude, Solution
 from starpos.frames.stars import Stars
 from starpos.identification import Identification, Sky, wide
@@ -34,7 +36,7 @@ def solution_of(
         names=names,
         star=found.star,
         magnitudes=magnitudes,
-        attitude=attitude_of(found, sky, camera),
+        attitude=attitude_of(found, sky, camera, np.stack([stars.x, stars.y], -1)[found.star]),
         warnings=warnings,
         explained=explained,
         found=found,
@@ -60,9 +62,13 @@ def suspicions(
     return names, explained
 
 
-def attitude_of(found: Identification, sky: Sky, camera: Camera) -> Attitude:
-    """Pointing of the frame's centre; of a mirrored frame, after it was turned the right way up."""
+def attitude_of(found: Identification, sky: Sky, camera: Camera, xy: np.ndarray) -> Attitude:
+    """Pointing of the frame's centre; of a mirrored frame, after it was turned the right way up.
+
+    xy (M, 2): places of the identified stars, px.
+    """
     scale = found.focal_scale
+    spread_px = math.sqrt(np.square(xy - xy.mean(0)).sum())
     if camera.is_ideal:
         across, down, row = camera.centre_from_axis
         centre, above = (across, down, scale), (across, down - row, scale)
@@ -79,6 +85,7 @@ def attitude_of(found: Identification, sky: Sky, camera: Camera) -> Attitude:
         dec=dec,
         roll=roll,
         focal_px=camera.fx * scale,
+        focal_stddev_px=camera.fx * scale * found.residual_px / spread_px,
         residual_arcsec=found.residual_px / (scale * math.sqrt(camera.fx * camera.fy)) / ARCSEC,
         log_odds=found.log_odds,
         mirrored=found.mirrored,

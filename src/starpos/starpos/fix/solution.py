@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The solution of a frame: its status, and the part of the answer that was found."""
 
+import math
 from dataclasses import KW_ONLY, dataclass, replace
 from enum import Enum
 from typing import Any
@@ -43,6 +44,7 @@ class Attitude:
     """Pointing of the camera: ICRS place of the frame's centre pixel, and the position angle `roll` of its top (rad).
 
     model: of its lens.
+    focal_stddev_px: error of focal_px by the stars' residuals, refraction left out; NaN where it is unknown.
     """
 
     ra: float
@@ -53,6 +55,7 @@ class Attitude:
     log_odds: float
     mirrored: bool
     model: str = PLUMB_BOB
+    focal_stddev_px: float = math.nan
 
 
 @at_once

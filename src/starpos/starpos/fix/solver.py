@@ -245,7 +245,7 @@ class Solver:
         return use, MatchedStars(
             np.stack([stars.x, stars.y], -1)[star],
             stars.covariance[star],
-            catalogue.directions(index, state.year),
+            catalogue.directions(index, state.year, state.observer_au),
             np.hypot(catalogue.sigma(index, state.year), found.blend_px[use] / camera.fx),
             index,
         )

@@ -150,7 +150,7 @@ def sighted(
         xy=directions[:, :2] / directions[:, 2:] * camera.fx,
         covariance_px2=stars.covariance[star] * np.outer(squeeze, squeeze)
         + np.eye(2) * (catalogue_px**2)[:, None, None],
-        itrs=state.to_itrs(catalogue.directions(index, state.year)),
+        itrs=state.to_itrs(catalogue.directions(index, state.year, state.observer_au)),
         focal_px=camera.fx * found.focal_scale,
         camera_to_itrs=state.gcrs_to_itrs @ found.attitude.T,
     )

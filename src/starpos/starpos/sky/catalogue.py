@@ -8,6 +8,7 @@ give half of the accuracy of the roll about the optical axis, and so of the posi
 import hashlib
 import os
 import zipfile
+import zlib
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -18,6 +19,7 @@ from numpy.typing import ArrayLike
 from starpos.errors import CatalogueError
 from starpos.files import open_regular
 from starpos.rotation import normalised
+from starpos.sky import near_stars
 from starpos.sky._labels import Labels
 from starpos.sky.zones import ZONES, cell_starts, rows_near
 from starpos.table_cache import cache_folder, load_or_build, mapped, rising
@@ -29,8 +31,11 @@ FORMAT = 3
 EPOCH_ZERO = 1900.0
 # A stored error is the smallest times CODE_STEP ** code.
 SMALLEST_MAS, SMALLEST_MAS_YEAR, CODE_STEP = 1.0, 0.1, 1.03
-# Names of the unpacked catalogue's folders in the cache, and kinds of numbers of its columns.
-PREFIX, KINDS = "stars-1-", "uiiiiuuuiii"
+# Parts of a mas/yr and of a mas in the columns that are finer.
+CENTI, TENTH = 0.01, 0.1
+# Names of the unpacked catalogue's folders in the cache, and kinds of numbers of its columns. The number stays as long as
+# older folders can be read: the deeper catalogue of a user without a network is there, too.
+PREFIX, KINDS = "stars-1-", "uiiiiuuuiiiiiu"
 COMMITTED = Path(__file__).with_name("data") / "tycho2.npz"
 
 Rows = np.ndarray | slice
@@ -49,6 +54,8 @@ class Catalogue:
     tyc              (N, 3) Tycho identifier
     hip              (N,) Hipparcos number, 0 for none
     zone_start       (181,) first row of each zone of 1 deg of declination, and the end
+    pm_ra_centi, pm_dec_centi  (N,) what the motions are more than pm_ra and pm_dec, 0.01 mas/yr
+    parallax_tenths  (N,) parallax, 0.1 mas, 0 if unknown
     """
 
     ra_mas: np.ndarray
@@ -62,6 +69,9 @@ class Catalogue:
     tyc: np.ndarray
     hip: np.ndarray
     zone_start: np.ndarray
+    pm_ra_centi: np.ndarray
+    pm_dec_centi: np.ndarray
+    parallax_tenths: np.ndarray
 
     def __repr__(self) -> str:
         return f"<{len(self)} stars of a catalogue>"
@@ -87,6 +97,9 @@ class Catalogue:
             self.vmag_centi,
             self.sigma_code,
             self.pm_sigma_code,
+            self.pm_ra_centi,
+            self.pm_dec_centi,
+            self.parallax_tenths,
         )
         if (
             any(column.shape != (n,) for column in (self.ra_mas, *columns, self.epoch_code, self.hip))
@@ -115,22 +128,33 @@ class Catalogue:
         """Johnson V magnitudes (n,) of the rows `index`."""
         return self.vmag_centi[index] * 0.01
 
-    def directions(self, index: Rows, year: float = EPOCH) -> np.ndarray:
-        """Barycentric ICRS unit vectors (n, 3) of the rows `index` at a Julian year, by linear motion.
+    def motions(self, index: Rows = slice(None)) -> np.ndarray:
+        """Proper motions (2, n) of the rows `index`, mas/yr, that in right ascension times cos(dec)."""
+        fine = np.stack([self.pm_ra_centi[index], self.pm_dec_centi[index]]) * CENTI
+        return np.stack([self.pm_ra[index], self.pm_dec[index]]) + fine
 
-        Parallax is left out: it is 0.75 arcsec for the nearest star and below 0.03 for nearly all.
+    def parallax_mas(self, index: Rows = slice(None)) -> np.ndarray:
+        """Parallaxes (n,) of the rows `index`, mas; 0 if unknown."""
+        return self.parallax_tenths[index] * TENTH
+
+    def directions(
+        self, index: Rows, year: float = EPOCH, observer_au: np.ndarray | None = None
+    ) -> np.ndarray:
+        """ICRS unit vectors (n, 3) of the rows `index` at a Julian year, by linear motion.
+
+        Barycentric ones, or as seen from a barycentric place (3,), au, along ICRS's axes.
         """
         ra, dec = self.ra_mas[index] * MAS, self.dec_mas[index] * MAS
         cr, sr, cd, sd = np.cos(ra), np.sin(ra), np.cos(dec), np.sin(dec)
         v = np.empty((*ra.shape, 3))
         v[..., 0], v[..., 1], v[..., 2] = cd * cr, cd * sr, sd
-        if year == EPOCH:
+        if year == EPOCH and observer_au is None:
             return v
-        east = (
-            np.stack([-sr, cr, np.zeros_like(sr)], -1) * (self.pm_ra[index] * (year - EPOCH) * MAS)[:, None]
-        )
-        north = np.stack([-sd * cr, -sd * sr, cd], -1) * (self.pm_dec[index] * (year - EPOCH) * MAS)[:, None]
-        v = v + east + north
+        moved = self.motions(index)[..., None] * (year - EPOCH) * MAS
+        v += np.stack([-sr, cr, np.zeros_like(sr)], -1) * moved[0]
+        v += np.stack([-sd * cr, -sd * sr, cd], -1) * moved[1]
+        if observer_au is not None:
+            v -= self.parallax_mas(index)[..., None] * MAS * observer_au
         return normalised(v)
 
     def sigma(self, index: Rows, year: float) -> np.ndarray:
@@ -167,11 +191,14 @@ def pack(
     sigma_mas: ArrayLike,
     sigma_pm: ArrayLike,
     epoch: ArrayLike,
+    parallax_mas: ArrayLike = 0.0,
 ) -> Catalogue:
     """Make a Catalogue from columns (N,), tyc (N, 3), in deg, mas/yr (pm_ra times cos dec), mas and Julian years.
 
     Errors are rounded up.
     """
+    whole = np.round([pm_ra, pm_dec])
+    finer = (np.array([pm_ra, pm_dec]) - whole) / CENTI
     dec_mas = np.round(np.asarray(dec_deg) * 3.6e6).astype(np.int32)
     ra_mas = (np.round(np.asarray(ra_deg) * 3.6e6) % 1_296_000_000).astype(np.uint32)
     zone = np.clip(dec_mas // 3_600_000 + 90, 0, ZONES - 1)
@@ -184,8 +211,11 @@ def pack(
     return Catalogue(
         ra_mas=ra_mas[order],
         dec_mas=dec_mas[order],
-        pm_ra=column(pm_ra, np.int16),
-        pm_dec=column(pm_dec, np.int16),
+        pm_ra=column(whole[0], np.int16),
+        pm_dec=column(whole[1], np.int16),
+        pm_ra_centi=column(finer[0], np.int8),
+        pm_dec_centi=column(finer[1], np.int8),
+        parallax_tenths=column(np.broadcast_to(np.asarray(parallax_mas) / TENTH, order.shape), np.uint16),
         vmag_centi=column(np.asarray(vmag) * 100, np.int16),
         sigma_code=column(_code(sigma_mas, SMALLEST_MAS), np.uint8),
         pm_sigma_code=column(_code(sigma_pm, SMALLEST_MAS_YEAR), np.uint8),
@@ -227,6 +257,9 @@ def save(catalogue: Catalogue, path: Path | str) -> None:
             tyc3=c.tyc[:, 2].astype(np.uint8),
             hip_step=_split(np.diff(named, prepend=0).astype(np.uint16)),
             hip=_split(c.hip[named]),
+            pm_ra_centi=c.pm_ra_centi,
+            pm_dec_centi=c.pm_dec_centi,
+            parallax_tenths=_split(c.parallax_tenths),
         )
 
 
@@ -238,6 +271,13 @@ def _split(column: np.ndarray) -> np.ndarray:
 def _join(planes: np.ndarray, dtype: type[np.integer]) -> np.ndarray:
     """The column (N,) of byte planes; the inverse of `_split`."""
     return np.ascontiguousarray(planes.T).view(dtype)[:, 0]
+
+
+def _newer(tyc: np.ndarray) -> dict[str, np.ndarray]:
+    """The columns that older files lack, for stars of these identifiers (N, 3)."""
+    zeros = np.zeros(len(tyc), np.int8)
+    tenths = np.round(near_stars.parallaxes_mas(tyc) / TENTH).astype(np.uint16)
+    return {"pm_ra_centi": zeros, "pm_dec_centi": zeros, "parallax_tenths": tenths}
 
 
 def read(path: Path | str) -> Catalogue:
@@ -255,6 +295,7 @@ def read(path: Path | str) -> Catalogue:
             hip = np.zeros(len(zone), np.int32)
             hip[np.cumsum(_join(f["hip_step"], np.uint16), dtype=np.int64)] = _join(f["hip"], np.int32)
             tyc1 = np.cumsum(_join(f["tyc1"], np.int16), dtype=np.int16)
+            tyc = np.stack([tyc1, _join(f["tyc2"], np.int16), f["tyc3"].astype(np.int16)], -1)
             found = Catalogue(
                 ra_mas=np.cumsum(_join(f["ra_step"], np.uint32), dtype=np.uint32),
                 dec_mas=_join(f["dec_within"], np.uint32).astype(np.int32) + (zone - 90) * 3_600_000,
@@ -264,9 +305,18 @@ def read(path: Path | str) -> Catalogue:
                 sigma_code=f["sigma_code"],
                 pm_sigma_code=f["pm_sigma_code"],
                 epoch_code=f["epoch_code"],
-                tyc=np.stack([tyc1, _join(f["tyc2"], np.int16), f["tyc3"].astype(np.int16)], -1),
+                tyc=tyc,
                 hip=hip,
                 zone_start=zone_start,
+                **(
+                    {
+                        "pm_ra_centi": f["pm_ra_centi"],
+                        "pm_dec_centi": f["pm_dec_centi"],
+                        "parallax_tenths": _join(f["parallax_tenths"], np.uint16),
+                    }
+                    if "parallax_tenths" in f
+                    else _newer(tyc)
+                ),
             )
             found.check()
             return found
@@ -291,17 +341,18 @@ def load_catalogue(path: str | None = None) -> Catalogue:
         return read(named)
     try:
         with zipfile.ZipFile(COMMITTED) as packed:
-            key = repr((FORMAT, [(column.filename, column.CRC) for column in packed.infolist()]))
+            columns = [(column.filename, column.CRC) for column in packed.infolist()]
+        key = repr((FORMAT, columns, zlib.crc32(near_stars.PARALLAXES.read_bytes())))
     except (OSError, zipfile.BadZipFile):
         # raises the error of a broken file
         return read(COMMITTED)
     folder = cache_folder() / f"{PREFIX}{hashlib.sha256(key.encode()).hexdigest()[:16]}"
-    return load_or_build(folder, PREFIX, lambda: _map(folder), lambda: read(COMMITTED), "")
+    return load_or_build(folder, PREFIX, lambda: stored(folder), lambda: read(COMMITTED), "")
 
 
-def _map(folder: Path) -> Catalogue | None:
-    """The stored catalogue; None if it is missing or its columns do not fit together."""
-    found: Catalogue | None = mapped(Catalogue, folder, KINDS)
+def stored(folder: Path) -> Catalogue | None:
+    """The catalogue in a folder of the cache; None if it is missing or its columns do not fit together."""
+    found: Catalogue | None = mapped(Catalogue, folder, KINDS, lambda columns: _newer(columns["tyc"]))
     try:
         if found is not None:
             found.check()

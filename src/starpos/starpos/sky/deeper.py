@@ -7,12 +7,10 @@ from pathlib import Path
 
 from starpos.instrument.camera import Camera
 from starpos.progress import Progress, quiet
-from starpos.sky.catalogue import Catalogue
+from starpos.sky.catalogue import PREFIX, Catalogue, stored
 from starpos.sky.depth import Depth
-from starpos.table_cache import cache_folder, load_or_build, mapped
+from starpos.table_cache import cache_folder, load_or_build
 
-# Cache folder; the number is the format version.
-PREFIX = "stars-1-"
 # The variable of the environment that names the original files: a folder, or Debian's archive of them.
 ORIGINALS = "STARPOS_TYCHO2"
 # A magnitude fainter than all stars of Tycho-2, and their number.
@@ -58,7 +56,7 @@ def kept() -> Catalogue | None:
     folder = _folder()
     with _lock:
         if folder not in _in_use:
-            if (found := _map(folder)) is None:
+            if (found := stored(folder)) is None:
                 return None
             _in_use.clear()
             _in_use[folder] = found
@@ -78,7 +76,7 @@ def build(originals: Path | str, progress: Progress = quiet, *, anew: bool = Fal
         _in_use[folder] = load_or_build(
             folder,
             PREFIX,
-            lambda: None if anew else _map(folder),
+            lambda: None if anew else stored(folder),
             lambda: tycho2.build(originals, ALL_MAG, progress),
             "stars of the deeper catalogue",
         )
@@ -100,14 +98,3 @@ def fetched(mirror: str | None = None, progress: Progress = quiet) -> Catalogue:
 
 def _folder() -> Path:
     return cache_folder() / f"{PREFIX}tycho2"
-
-
-def _map(folder: Path) -> Catalogue | None:
-    """The stored catalogue; None if it is missing or its columns do not fit together."""
-    c = mapped(Catalogue, folder, "uiiiiuuuiii")
-    try:
-        if c is not None:
-            c.check()
-    except ValueError:
-        return None
-    return c

@@ -15,6 +15,7 @@ import numpy as np
 from starpos.errors import CatalogueError
 from starpos.files import open_regular
 from starpos.sky.catalogue import (
+    CENTI,
     CODE_STEP,
     EPOCH,
     EPOCH_ZERO,
@@ -42,8 +43,11 @@ UNITS = {
     "ref_epoch": "yr",
     "phot_g_mean_mag": "mag",
 }
-# read where it is there: a star's errors are larger by it (Lindegren et al. 2021, A&A 649, A2)
-RUWE = "ruwe"
+# read where they are there: a star's errors are larger by its RUWE (Lindegren et al. 2021, A&A 649, A2), and the parallax
+# has an error of its own; else twice the place's, as for bright stars (0.02 to 0.03 mas and 0.01 to 0.02; Gaia
+# Collaboration 2021, A&A 649, A1)
+RUWE, PARALLAX_ERROR = "ruwe", "parallax_error"
+PARALLAX_TO_PLACE = 2.0
 MAX_BYTES = 4_000_000_000
 # A star of Tycho-2 is one of Gaia's within this number of sigma of its place, and this distance besides,
 MATCH_SIGMA, MATCH_MAS = 5.0, 200.0
@@ -51,9 +55,9 @@ MATCH_SIGMA, MATCH_MAS = 5.0, 200.0
 MATCH_MAG = (-1.0, 3.0)
 # Another star of Gaia so near and so bright shifts the photocentre that Tycho-2 and a camera see: such a star stays.
 NEIGHBOUR_MAS, NEIGHBOUR_MAG = 5000.0, 4.0
-# the catalogue's motions are whole mas/yr, and its places mas: 1 sigma of the rounding
+# the catalogue's places are mas, and its motions 0.01 mas/yr: 1 sigma of the rounding, in these units
 ROUNDING = 1 / np.sqrt(12)
-# the yearly parallax, which no place has, as an error of a coordinate
+# an error of the parallax as an error of a coordinate, over a year
 PARALLAX_SHARE = 1 / np.sqrt(2)
 
 
@@ -68,6 +72,7 @@ class Extract:
     pm_dec: np.ndarray
     sigma_pm: np.ndarray
     parallax_mas: np.ndarray
+    sigma_parallax: np.ndarray
     epoch: np.ndarray
     gmag: np.ndarray
 
@@ -96,14 +101,20 @@ def read(path: Path) -> Extract:
     c = {name: values[known] for name, values in column.items()}
     worse = np.ones(len(table)) if RUWE not in names else _column(path, table[names[RUWE]], RUWE, "")
     worse = np.maximum(np.nan_to_num(worse[known], nan=1.0), 1.0)
+    place = np.hypot(c["ra_error"], c["dec_error"]) / np.sqrt(2)
+    parallax_error = PARALLAX_TO_PLACE * place
+    if PARALLAX_ERROR in names:
+        given = _column(path, table[names[PARALLAX_ERROR]], PARALLAX_ERROR, "mas")[known]
+        parallax_error = np.where(np.isfinite(given), given, parallax_error)
     return Extract(
         ra_deg=c["ra"],
         dec_deg=c["dec"],
-        sigma_mas=worse * np.hypot(c["ra_error"], c["dec_error"]) / np.sqrt(2),
+        sigma_mas=worse * place,
         pm_ra=c["pmra"],
         pm_dec=c["pmdec"],
         sigma_pm=worse * np.hypot(c["pmra_error"], c["pmdec_error"]) / np.sqrt(2),
         parallax_mas=np.maximum(c["parallax"], 0.0),
+        sigma_parallax=worse * parallax_error,
         epoch=c["ref_epoch"],
         gmag=c["phot_g_mean_mag"],
     )
@@ -150,28 +161,29 @@ def _column(path: Path, column: "Table.Column", name: str, unit: str) -> np.ndar
 
 
 def with_gaia(base: Catalogue, extract: Extract, year: float) -> tuple[Catalogue, int]:
-    """Return the catalogue with the extract's places, exact to 1 mas about a Julian year, and how many stars have them.
+    """Return the catalogue with the extract's places and parallaxes, and how many stars have them.
 
-    Motions are stored in whole mas/yr, so places are rounded at that year and not at J2000.
+    Places are exact to 1 mas at a Julian year and for some decades about it: motions are stored to 0.01 mas/yr.
     """
     row, star = _matched(base, extract)
     ra, dec = base.ra_mas * MAS_DEG, base.dec_mas * MAS_DEG
-    pm_ra, pm_dec = base.pm_ra.astype(float), base.pm_dec.astype(float)
+    pm_ra, pm_dec = base.motions()
+    parallax = base.parallax_mas()
     sigma, sigma_pm = _errors(base)
     epoch = EPOCH_ZERO + base.epoch_code.astype(float)
     gaia = _rows(extract, star)
     there_ra, there_dec = gaia.at(year)
-    pm_ra[row], pm_dec[row] = np.round(gaia.pm_ra), np.round(gaia.pm_dec)
+    pm_ra[row], pm_dec[row], parallax[row] = gaia.pm_ra, gaia.pm_dec, gaia.parallax_mas
     back = (EPOCH - year) * MAS_DEG
     dec[row] = there_dec + pm_dec[row] * back
     ra[row] = (there_ra + pm_ra[row] * back / np.cos(np.radians(there_dec))) % 360
     moved = gaia.sigma_pm * (year - gaia.epoch)
     sigma[row] = np.sqrt(
-        gaia.sigma_mas**2 + moved**2 + ROUNDING**2 + (PARALLAX_SHARE * gaia.parallax_mas) ** 2
+        gaia.sigma_mas**2 + moved**2 + ROUNDING**2 + (PARALLAX_SHARE * gaia.sigma_parallax) ** 2
     )
-    sigma_pm[row] = np.hypot(gaia.sigma_pm, ROUNDING)
+    sigma_pm[row] = np.hypot(gaia.sigma_pm, CENTI * ROUNDING)
     epoch[row] = round(year)
-    made = pack(base.tyc, base.hip, base.vmag(), ra, dec, pm_ra, pm_dec, sigma, sigma_pm, epoch)
+    made = pack(base.tyc, base.hip, base.vmag(), ra, dec, pm_ra, pm_dec, sigma, sigma_pm, epoch, parallax)
     return made, len(row)
 
 

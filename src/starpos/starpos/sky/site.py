@@ -27,7 +27,7 @@ class Site:
 
     def observed(self, catalogue: Catalogue, index: np.ndarray, state: EarthState) -> np.ndarray:
         """Refracted directions (n, 3) in ENU of the catalogue's rows `index` (n,)."""
-        return self.refracted(catalogue.directions(index, state.year), state)
+        return self.refracted(catalogue.directions(index, state.year, state.observer_au), state)
 
     def refracted(self, icrs: np.ndarray, state: EarthState) -> np.ndarray:
         """Refracted directions (n, 3) in ENU of ICRS directions (n, 3) at the state's date."""

@@ -16,6 +16,7 @@ from starpos.files import open_regular, read_regular
 from starpos.progress import Progress, quiet
 from starpos.sky.catalogue import EPOCH, Catalogue, pack
 from starpos.sky.fast_stars import FAST, FAST_SIGMA_MAS_YEAR
+from starpos.sky.near_stars import parallaxes_mas
 
 SUPPLEMENT_EPOCH = 1991.25
 # 1 sigma of a motion, along one axis, that Tycho-2 does not have. It is the root mean square in Hipparcos of the same
@@ -62,7 +63,8 @@ def build(source: Path | str, limit_mag: float, progress: Progress = quiet) -> C
         raise CatalogueError(f"{source}: it holds {seen} of the 21 original files of Tycho-2: {CURE}")
     stars = {k: np.concatenate([p[k] for p in parts]) for k in parts[0]}
     stars = _merge_photocentres(stars)
-    return pack(**{k: v[stars["vmag"] < limit_mag] for k, v in stars.items() if k != "photocentre"})
+    kept = {k: v[stars["vmag"] < limit_mag] for k, v in stars.items() if k != "photocentre"}
+    return pack(**kept, parallax_mas=parallaxes_mas(kept["tyc"]))
 
 
 def table_of(name: str, text: bytes) -> dict[str, np.ndarray]:

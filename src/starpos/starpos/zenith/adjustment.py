@@ -5,16 +5,20 @@ Unknown are xi, eta and A3 (its two tilts, which hold the tiltmeter's zero, and 
 of the readings.  The session's residuals determine the size of image motion and anomalous refraction, by restricted
 maximum likelihood (Patterson and Thompson 1971, Biometrika 58, 545).  A session hardly shows an error that changes as
 slowly as the second, so anomalous refraction is at least AIR_SHARE times the image motion.
+
+Where the residuals show that the tiltmeter's zero drifts more than its file states, or that its scale is off by more,
+they determine that size, too, and the errors grow by it.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from starpos.earth.orientation import ROTATION_RAD_S
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import FixError
+from starpos.instrument.inclinometer import InclinometerErrors
 from starpos.instrument.instrument import Calibration, Instrument
 from starpos.units import ARCSEC
 from starpos.zenith.errors import Errors, errors_of
@@ -39,6 +43,12 @@ AIR_FACTOR, MAX_SIGMA = 1.5, 3.0
 MOTION_RAD = 0.3 * ARCSEC
 # and below which it makes no difference
 MIN_RAD = 1e-3 * ARCSEC
+# Fields of the inclinometer's errors that a session can show to be larger, their sources, and the size at which a search
+# begins where none is stated: rad per root of an hour, and a share.
+SHOWN = (("drift_rad_per_sqrt_hour", "tilt drift", 0.01 * ARCSEC), ("scale", "tilt scale", 1e-4))
+# The search begins where the residuals have an excess of SHOWN_SIGMA over chance. Its result is taken where twice the log
+# of the likelihood gains SHOWN_GAIN, as by chance in one session of 13: that makes the errors a little larger.
+SHOWN_SIGMA, SHOWN_GAIN, MAX_FACTOR = 1.0, 2.0, 100.0
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -53,12 +63,14 @@ class Air:
 class Adjusted:
     """The deflection of a session at the mark, arcsec, with its errors.
 
-    covariance_arcsec2 (2, 2): of xi, eta, the sum of the `terms`.
-    terms: 1 sigma of xi and eta for each source of error.
+    covariance_arcsec2 (2, 2): of xi, eta, the sum over sources of error, by_source (2, 2).
     a3 (3, 3): C into S, with the tiltmeter's zero.  turn_stddev_rad: of its turn about the plumb line.
     faces (N,): number of each frame's face.  frame_arcsec (N, 2): xi, eta of each frame minus the session's.
     frame_stddev_arcsec (N, 2): what these should scatter by.
     catalogue_factor: size of the catalogue's errors over what it states, by the session's own stars.
+    inclinometer: the errors that were assumed.
+    as_stated: the session with the errors of the tiltmeter's file, where the residuals show larger ones.  same_air:
+    likewise, with the air of this adjustment.  gain: twice the log of the likelihood minus the one of same_air.
     chi2_per_degree: of the residuals; 1 where the stated errors and the air's explain them.
     face_quality: each face against the others.  stars: the residuals and the leverage of each star.
     """
@@ -66,7 +78,7 @@ class Adjusted:
     xi_arcsec: float
     eta_arcsec: float
     covariance_arcsec2: np.ndarray
-    terms: tuple[tuple[str, float, float], ...]
+    by_source: dict[str, np.ndarray]
     a3: np.ndarray
     turn_stddev_rad: float
     faces: np.ndarray
@@ -78,11 +90,26 @@ class Adjusted:
     face_quality: tuple[FaceQuality, ...]
     stars: StarQuality
     leftover: Leftover
+    inclinometer: InclinometerErrors
+    as_stated: "Adjusted | None" = None
+    same_air: "Adjusted | None" = None
+    gain: float = 0.0
 
     @property
     def sigma_arcsec(self) -> np.ndarray:
         """Standard deviations (2,) of xi, eta."""
-        return np.sqrt(np.diag(self.covariance_arcsec2))
+        return _sigma(self.covariance_arcsec2)
+
+    @property
+    def terms(self) -> tuple[tuple[str, float, float], ...]:
+        """1 sigma of xi and eta for each source of error."""
+        return tuple((name, *_sigma(c).tolist()) for name, c in self.by_source.items())
+
+    @property
+    def correlations(self) -> dict[str, float]:
+        """Correlation of xi and eta for each source of error."""
+        sizes = {name: float(np.prod(_sigma(c))) for name, c in self.by_source.items()}
+        return {name: float(self.by_source[name][0, 1]) / s if s else 0.0 for name, s in sizes.items()}
 
     @property
     def misalignment_deg(self) -> tuple[float, ...]:
@@ -124,27 +151,139 @@ def adjusted(
         raise FixError("the mark is within 6 km of a pole, where eta has no direction")
     places = StarPlaces.of(sightings)
     sightings = places.applied(sightings)
-    faces, prior = faces_of(sightings), _prior_of(instrument)
-    bending = atmosphere.refraction().a
-    given = instrument.calibration
-    start = start_of(sightings)
-    estimate = start if given.unknown else LeanEstimate(lean=np.zeros(2), a3=given.a3)
-    offset, size = np.zeros(5), air
-    for _ in range(STEPS):
-        lines = Lines.at(estimate, sightings, bending)
-        errors = errors_of(
-            lines, sightings, places, faces, instrument.inclinometer, mark, since_unix_s=given.utc_unix_s
+    session = _Session(
+        sightings=sightings,
+        places=places,
+        faces=faces_of(sightings),
+        prior=_prior_of(instrument),
+        bending=atmosphere.refraction().a,
+        given=instrument.calibration,
+        mark=mark,
+    )
+    stated = session.solved(instrument.inclinometer, air)
+    if air is not None or (shown := session.shown(stated)) is None:
+        return _adjusted(session, stated)
+    inclinometer, size = shown
+    # under one air: what is wrong with the tiltmeter had seemed to be the air's
+    more, less = session.solved(inclinometer, size), session.solved(instrument.inclinometer, size)
+    return replace(
+        _adjusted(session, more),
+        as_stated=_adjusted(session, stated),
+        same_air=_adjusted(session, less),
+        gain=less.fit.cost - more.fit.cost,
+    )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Solved:
+    """A session's unknowns; offset (5,): how far the estimate was from the prior's before the last step, `fit`."""
+
+    estimate: LeanEstimate
+    lines: Lines
+    errors: Errors
+    fit: _Fit
+    air: Air
+    offset: np.ndarray
+    inclinometer: InclinometerErrors
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Session:
+    """What is given: sightings with the stars' places that they adjusted, and what is known before."""
+
+    sightings: Sequence[ZenithSighting]
+    places: StarPlaces
+    faces: np.ndarray
+    prior: np.ndarray
+    bending: float
+    given: Calibration
+    mark: Mark
+
+    def errors(self, lines: Lines, inclinometer: InclinometerErrors) -> Errors:
+        since = self.given.utc_unix_s
+        return errors_of(lines, self.sightings, self.places, self.faces, inclinometer, self.mark, since)
+
+    def solved(self, inclinometer: InclinometerErrors, air: Air | None) -> _Solved:
+        """The unknowns with a tiltmeter of these errors; air: its size, else the residuals determine it."""
+        known = not self.given.unknown
+        estimate = LeanEstimate(lean=np.zeros(2), a3=self.given.a3) if known else start_of(self.sightings)
+        offset, size = np.zeros(5), air
+        for _ in range(STEPS):
+            lines = Lines.at(estimate, self.sightings, self.bending)
+            errors = self.errors(lines, inclinometer)
+            stated = _stated(errors)
+            # A3's prior stays where it was
+            if size is None:
+                size = _air_of(lines, stated, errors, self.prior, offset)
+            fit = _fitted(lines, _whole(stated, errors, size), self.prior, offset)
+            before, estimate, offset = offset, estimate.moved(fit.step), offset + fit.step
+            if np.abs(fit.step).max() < SETTLED * np.sqrt(np.diag(fit.covariance)).min():
+                break
+        assert size is not None
+        return _Solved(
+            estimate=estimate,
+            lines=lines,
+            errors=errors,
+            fit=fit,
+            air=size,
+            offset=before,
+            inclinometer=inclinometer,
         )
-        stated = np.sum([s.covariance for s in errors.sources], axis=0)
-        # A3's prior stays where it was
-        if size is None:
-            size = _air_of(lines, stated, errors, prior, offset)
-        fit = _fitted(lines, _whole(stated, errors, size), prior, offset)
-        estimate, offset = estimate.moved(fit.step), offset + fit.step
-        if np.abs(fit.step).max() < SETTLED * np.sqrt(np.diag(fit.covariance)).min():
-            break
-    assert size is not None
-    return _adjusted(estimate, sightings, lines, errors, fit, size, faces, mark, places)
+
+    def shown(self, stated: _Solved) -> tuple[InclinometerErrors, Air] | None:
+        """The tiltmeter's errors and the air as the residuals show them; None: as stated, or hardly more."""
+        # slow to import
+        from scipy.optimize import minimize
+
+        given, lines = stated.inclinometer, stated.lines
+        leftover, units, base = _leftover(stated, self.mark), {}, _stated(stated.errors)
+        for field, source, _ in SHOWN:
+            unit = _of_source(self.errors(lines, _larger(given, {field: 1.0})), source)
+            if leftover.excess(unit) > SHOWN_SIGMA:
+                units[field] = unit
+                base = base - _of_source(stated.errors, source)
+        if not units:
+            return None
+
+        def factors(p: np.ndarray) -> np.ndarray:
+            return np.exp(np.clip(p[2:], 0.0, np.log(MAX_FACTOR)))
+
+        def cost(p: np.ndarray) -> float:
+            tilts = sum(f**2 * unit for f, unit in zip(factors(p), units.values(), strict=True))
+            covariance = _whole(base + tilts, stated.errors, _air(p))
+            return _fitted(lines, covariance, self.prior, stated.offset).cost + float(p[1] ** 2)
+
+        motion = max(stated.air.motion, 2 * MIN_RAD)
+        slow = np.log(stated.air.anomalous / stated.air.motion / AIR_SHARE) / np.log(AIR_FACTOR)
+        begin = np.array([np.log(motion / MOTION_RAD), slow, *np.zeros(len(units))])
+        simplex = begin + np.vstack([np.zeros(len(begin)), np.diag([-0.5, 0.7, *np.full(len(units), 1.5)])])
+        options = {"initial_simplex": simplex, "xatol": 0.05, "fatol": 0.02, "maxfev": 200}
+        found = minimize(cost, begin, method="Nelder-Mead", options=options)
+        if cost(begin) - float(found.fun) < SHOWN_GAIN:
+            return None
+        shown = dict(zip(units, factors(found.x).tolist(), strict=True))
+        return _larger(given, shown), _air(found.x)
+
+
+def _larger(given: InclinometerErrors, factors: dict[str, float]) -> InclinometerErrors:
+    """The errors with fields larger by factors; a field of zero is at least what SHOWN has."""
+    least = {field: size for field, _, size in SHOWN}
+    return replace(given, **{n: min(max(getattr(given, n), least[n]) * f, 1.0) for n, f in factors.items()})
+
+
+def _of_source(errors: Errors, source: str) -> np.ndarray:
+    """Covariance (2 N, 2 N) of a source of error."""
+    return next(s.covariance for s in errors.sources if s.name == source)
+
+
+def _stated(errors: Errors) -> np.ndarray:
+    """Covariance (2 N, 2 N) of the readings without the air's."""
+    return np.sum([s.covariance for s in errors.sources], axis=0)
+
+
+def _sigma(covariance: np.ndarray) -> np.ndarray:
+    """Standard deviations (2,); rounding may leave a variance of zero below it."""
+    return np.sqrt(np.maximum(np.diag(covariance), 0.0))
 
 
 def _prior_of(instrument: Instrument) -> np.ndarray:
@@ -166,20 +305,21 @@ def _air_of(lines: Lines, stated: np.ndarray, errors: Errors, prior: np.ndarray,
     # slow to import
     from scipy.optimize import minimize
 
-    def of(p: np.ndarray) -> Air:
-        motion = float(np.hypot(MIN_RAD, MOTION_RAD * np.exp(p[0])))
-        return Air(
-            motion=motion, anomalous=motion * AIR_SHARE * AIR_FACTOR ** min(max(float(p[1]), 0.0), MAX_SIGMA)
-        )
-
     def cost(p: np.ndarray) -> float:
-        return _fitted(lines, _whole(stated, errors, of(p)), prior, offset).cost + float(p[1] ** 2)
+        return _fitted(lines, _whole(stated, errors, _air(p)), prior, offset).cost + float(p[1] ** 2)
 
     # wide: in still air the cost hardly changes over a factor of ten
     simplex = np.array([[0.0, 0.0], [-3.0, 0.0], [0.0, 1.0]])
     options = {"initial_simplex": simplex, "xatol": 0.05, "fatol": 0.002, "maxfev": 120}
     found = minimize(cost, simplex[0], method="Nelder-Mead", options=options)
-    return of(found.x)
+    return _air(found.x)
+
+
+def _air(p: np.ndarray) -> Air:
+    """Sizes of image motion and anomalous refraction by two parameters."""
+    motion = float(np.hypot(MIN_RAD, MOTION_RAD * np.exp(p[0])))
+    slow = AIR_FACTOR ** min(max(float(p[1]), 0.0), MAX_SIGMA)
+    return Air(motion=motion, anomalous=motion * AIR_SHARE * slow)
 
 
 def _fitted(lines: Lines, covariance: np.ndarray, prior: np.ndarray, offset: np.ndarray) -> _Fit:
@@ -201,36 +341,37 @@ def _fitted(lines: Lines, covariance: np.ndarray, prior: np.ndarray, offset: np.
     return _Fit(step=step, covariance=inverse, gain=gain, root=root, cost=cost, chi2=chi2)
 
 
-def _adjusted(
-    estimate: LeanEstimate,
-    sightings: Sequence[ZenithSighting],
-    lines: Lines,
-    errors: Errors,
-    fit: _Fit,
-    air: Air,
-    faces: np.ndarray,
-    mark: Mark,
-    places: StarPlaces,
-) -> Adjusted:
+def _leftover(solved: _Solved, mark: Mark) -> Leftover:
     # slow to import
     from scipy.linalg import cho_solve
 
+    fit, lines = solved.fit, solved.lines
+    parameters = lines.by_parameters.reshape(-1, 5)
+    inverse = cho_solve((fit.root, True), np.eye(len(parameters)))
+    design = inverse @ parameters
+    return Leftover(
+        by_lean=lines.by_lean,
+        by_second=lines.by_sky @ (mark.enu[:, 2] * ROTATION_RAD_S),
+        projector=inverse - design @ fit.covariance @ design.T,
+        weighted=inverse @ (lines.off.reshape(-1) - parameters @ fit.step),
+    )
+
+
+def _adjusted(session: _Session, solved: _Solved) -> Adjusted:
+    sightings, faces, places, mark = session.sightings, session.faces, session.places, session.mark
+    estimate, lines, errors, fit, air = solved.estimate, solved.lines, solved.errors, solved.fit, solved.air
     scaled = (
         (errors.motion.name, air.motion**2 * errors.motion.covariance),
         (errors.air.name, air.anomalous**2 * errors.air.covariance),
     )
     sources = [(s.name, s.covariance) for s in errors.sources] + list(scaled)
     gain = fit.gain[[1, 0]] / ARCSEC
-    terms, total = [], np.zeros((2, 2))
-    for name, covariance in sources:
-        term = gain @ covariance @ gain.T
-        total += term
-        if term.any():
-            xi, eta = np.sqrt(np.maximum(np.diag(term), 0.0)).tolist()
-            terms.append((name, xi, eta))
+    by_source = {name: gain @ covariance @ gain.T for name, covariance in sources}
     whole = fit.covariance[:2, :2][::-1, ::-1] / ARCSEC**2
-    given = np.sqrt(np.maximum(np.diag(whole - total), 0.0))
-    terms.append(("A3 as given", *given.tolist()))
+    values, axes = np.linalg.eigh(whole - np.sum(list(by_source.values()), 0))
+    by_source = {name: term for name, term in by_source.items() if term.any()}
+    # the rest, without what rounding leaves of it
+    by_source["A3 as given"] = (axes * np.maximum(values, 0.0)) @ axes.T
     left = (lines.off.reshape(-1) - lines.by_parameters.reshape(-1, 5) @ fit.step).reshape(-1, 2)
     back = np.linalg.inv(lines.by_lean)
     own = np.array([c for name, c in sources if name in ("tilt readings", "centroids", "image motion")]).sum(
@@ -241,19 +382,12 @@ def _adjusted(
     per_frame = np.einsum("nab,nbc,ndc->nad", back, own, back)
     up = estimate.a3 @ np.append(estimate.lean, 1.0)
     xi_eta = estimate.deflection(mark.latitude) / ARCSEC
-    inverse = cho_solve((fit.root, True), np.eye(2 * n))
-    design = inverse @ lines.by_parameters.reshape(-1, 5)
-    leftover = Leftover(
-        by_lean=lines.by_lean,
-        by_second=lines.by_sky @ (mark.enu[:, 2] * ROTATION_RAD_S),
-        projector=inverse - design @ fit.covariance @ design.T,
-        weighted=inverse @ left.reshape(-1),
-    )
+    leftover = _leftover(solved, mark)
     return Adjusted(
         xi_arcsec=float(xi_eta[0]),
         eta_arcsec=float(xi_eta[1]),
         covariance_arcsec2=whole,
-        terms=tuple(terms),
+        by_source=by_source,
         a3=estimate.a3,
         turn_stddev_rad=float(np.sqrt(up @ fit.covariance[2:, 2:] @ up)),
         faces=faces,
@@ -265,4 +399,5 @@ def _adjusted(
         face_quality=face_qualities(leftover, sightings, faces),
         stars=StarQuality.of(sightings, places, lines, gain),
         leftover=leftover,
+        inclinometer=solved.inclinometer,
     )

@@ -24,6 +24,9 @@ LARGE_ARCSEC, MAX_ARCSEC = 25.0, 120.0
 DOUBTED_CHI2 = 36.0
 # a face above that is named: chance does it in one of 1000 sessions of eight faces
 UNLIKE_CHI2 = 18.0
+# A tiltmeter is worse than stated where twice the log of the likelihood gains by this: chance does it in one session of
+# 500.
+WORSE_GAIN = 9.0
 # a face with a smaller share of the usual number of frames is thin
 THIN = 0.5
 # Tycho-2 over 6 deg and more: less than 1 mas in places, of 1991.25, and about 0.5 mas a year in proper motions (Hog et
@@ -44,12 +47,10 @@ def check_session(found: Adjusted, sightings: Sequence[ZenithSighting]) -> None:
             f"the faces do not come round: the top of the frame was at {shown} deg, which leaves {sigma:.3g} arcsec of "
             "the deflection undetermined: turn the instrument by half a turn, better to four faces, or calibrate A3"
         )
-    chi2, sentence = max(
-        (_clock(found, sightings), _zero(found, sightings), _face(found)),
-        key=lambda doubt: doubt[0],
-    )
-    if chi2 > DOUBTED_CHI2:
-        raise FixError(sentence)
+    for fit in (found.as_stated, found):
+        chi2, sentence = (0.0, "") if fit is None else _doubt(fit, sightings)
+        if chi2 > DOUBTED_CHI2 and not (fit is found.as_stated and _no_jump(found, sightings)):
+            raise FixError(sentence)
     size = float(np.hypot(found.xi_arcsec, found.eta_arcsec))
     if size > MAX_ARCSEC:
         raise FixError(
@@ -76,10 +77,12 @@ def remarks(found: Adjusted, sightings: Sequence[ZenithSighting], frames: int, s
             f"face {face + 1} has {number[face]} frames of the usual {np.median(number):.0f}: clouds, or its tilts were "
             "refused"
         )
-    for quality in found.face_quality:
-        if quality.chi2 > UNLIKE_CHI2:
-            xi, eta = quality.stddev_arcsec
-            said.append(f"{_face_off(quality)} (1 sigma {xi:.2f}, {eta:.2f}): look at its frames")
+    unlike = _unlike(found)
+    for quality in unlike:
+        xi, eta = quality.stddev_arcsec
+        said.append(f"{_face_off(quality)} (1 sigma {xi:.2f}, {eta:.2f}): look at its frames")
+    if not unlike and found.gain > WORSE_GAIN:
+        said += _worse(found)
     zones = _zones_arcsec(found, sightings)
     if found.sigma_arcsec.min() < zones:
         said.append(
@@ -96,6 +99,45 @@ def remarks(found: Adjusted, sightings: Sequence[ZenithSighting], frames: int, s
             f"{found.sigma_arcsec.max() / scale:.0f} arcsec"
         )
     return said
+
+
+def _doubt(fit: Adjusted, sightings: Sequence[ZenithSighting]) -> tuple[float, str]:
+    """Chi-square of what speaks most against an adjustment, and the sentence about it."""
+    return max((_clock(fit, sightings), _zero(fit, sightings), _face(fit)), key=lambda doubt: doubt[0])
+
+
+def _no_jump(found: Adjusted, sightings: Sequence[ZenithSighting]) -> bool:
+    """Whether a tiltmeter that is worse than stated explains the residuals better than one jump or one face does."""
+    return found.same_air is not None and _doubt(found.same_air, sightings)[0] < found.gain
+
+
+def _unlike(found: Adjusted) -> list[FaceQuality]:
+    """The faces that are unlike the others."""
+    if found.as_stated is None or found.same_air is None:
+        return [face for face in found.face_quality if face.chi2 > UNLIKE_CHI2]
+    # a larger drift or scale hides a face, which counts where it explains the residuals better
+    both = zip(found.as_stated.face_quality, found.same_air.face_quality, strict=True)
+    return [face for face, here in both if face.chi2 > UNLIKE_CHI2 and here.chi2 > found.gain]
+
+
+def _worse(found: Adjusted) -> list[str]:
+    """Errors of the tiltmeter that the residuals show larger than its file states them."""
+    if found.as_stated is None:
+        return []
+    stated, shown = found.as_stated.inclinometer, found.inclinometer
+    fields = (
+        ("tilt_drift_arcsec_per_sqrt_hour", "drift_rad_per_sqrt_hour", ARCSEC),
+        ("tilt_scale", "scale", 1.0),
+    )
+    sizes = [
+        (name, getattr(stated, field) / unit, getattr(shown, field) / unit) for name, field, unit in fields
+    ]
+    return [
+        f"the tiltmeter shows a {name} of {more:.2g}, its file states {less:.2g}: the errors hold what it "
+        "shows; state that, or calibrate it"
+        for name, less, more in sizes
+        if more > 1.01 * less
+    ]
 
 
 def _zones_arcsec(found: Adjusted, sightings: Sequence[ZenithSighting]) -> float:

@@ -118,8 +118,8 @@ def _told(steps: Sequence[_Step]) -> GeoidStep:
             stations[id(station)] = station
     own = sum(float(slopes[k] @ (s.covariance - s.common) @ slopes[k]) for k, s in stations.items())
     whole = np.sum(list(slopes.values()), 0)
-    common = np.max([s.common for s in stations.values()], 0)
-    measured = float(np.sqrt(own + whole @ common @ whole))
+    common = max(float(whole @ s.common @ whole) for s in stations.values())
+    measured = float(np.sqrt(own + common))
     between = float(np.sqrt(sum(s.between_m**2 for s in steps)))
     return GeoidStep(
         begin=steps[0].begin,

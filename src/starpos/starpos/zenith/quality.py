@@ -91,6 +91,13 @@ class Leftover:
         step = np.linalg.lstsq(normal, right, rcond=1e-9)[0]
         return step, normal, float(step @ right)
 
+    def excess(self, covariance: np.ndarray) -> float:
+        """How many sigma more of an error of this covariance (2 N, 2 N) the residuals have than the weights assume."""
+        weighted = self.projector @ covariance
+        more = self.weighted @ covariance @ self.weighted - np.trace(weighted)
+        spread = np.sqrt(2 * np.sum(weighted * weighted.T))
+        return float(more / spread) if spread > 0 else 0.0
+
 
 def face_qualities(
     leftover: Leftover, sightings: Sequence[ZenithSighting], faces: np.ndarray

@@ -13,6 +13,8 @@ from starpos.files import read_regular
 from starpos.utc import unix_of
 
 MAX_BYTES = 50_000_000
+# of a correlation
+ROUNDING = 1e-6
 MADE_BY = "starpos deflection --json > session.json"
 # Errors that are new in each session.  All others are common to the sessions of an instrument, as far as anyone knows,
 # and no number of them averages these.
@@ -126,7 +128,14 @@ def _session(path: Path, value: Mapping, frames: list) -> SessionResult:
     site, reduced = value["site"], value["reduced"]
     covariance = _array(value["covariance_arcsec2"], (2, 2))
     terms = tuple((str(name), float(xi), float(eta)) for name, (xi, eta) in value["errors"].items())
-    shared = np.array([term[1:] for term in terms if term[0] not in NEW] or [(0.0, 0.0)])
+    # sessions from before correlations were written have none
+    correlations = value.get("correlations", {})
+    common = np.zeros((2, 2))
+    for name, *sizes in terms:
+        r = 0.0 if name in NEW else float(correlations.get(name, 0.0))
+        if not abs(r) <= 1 + ROUNDING:
+            raise ValueError(f"correlations has {r} for {name}")
+        common += np.outer(sizes, sizes) * [[1.0, r], [r, 1.0]] * (name not in NEW)
     if not (np.linalg.eigvalsh(covariance) > 0).all():
         raise ValueError("covariance_arcsec2 is no covariance")
     latitude, longitude, height_m = (float(site[k]) for k in ("latitude", "longitude", "height_m"))
@@ -146,7 +155,7 @@ def _session(path: Path, value: Mapping, frames: list) -> SessionResult:
         mark=_array(reduced["mark_arcsec"], (2,)),
         geoid=_array(reduced["geoid_arcsec"], (2,)),
         covariance=covariance,
-        common=np.diag((shared**2).sum(0)),
+        common=common,
         terms=terms,
         motion_arcsec=float(value["image_motion_arcsec"]),
         stars=int(value["stars"]),

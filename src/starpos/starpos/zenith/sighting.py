@@ -107,7 +107,7 @@ def sighting(solver: Solver, stars: Stars, found: Identification, mark: Mark, ti
     matched = MatchedStars(
         np.stack([stars.x, stars.y], -1)[star],
         stars.covariance[star],
-        catalogue.directions(index, state.year),
+        catalogue.directions(index, state.year, state.observer_au),
         np.hypot(catalogue.sigma(index, state.year), found.blend_px[use] / camera.fx),
         index,
     )

@@ -119,7 +119,8 @@ def _station(sessions: list[SessionResult], number: str) -> Station:
     scaled = max(1.0, chi2 / degrees) if degrees else 1.0
     common = np.einsum("kia,kab,kjb->ij", share, np.array([s.common for s in sessions]), share)
     # errors that all share are not of independent sessions: they do not average
-    common = np.maximum(common, np.mean([s.common for s in sessions], 0))
+    values, axes = np.linalg.eigh(np.mean([s.common for s in sessions], 0) - common)
+    common = common + (axes * np.maximum(values, 0.0)) @ axes.T
     first = sessions[0]
     return Station(
         name=next((s.station for s in sessions if s.station), number),

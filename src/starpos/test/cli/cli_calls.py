@@ -19,8 +19,9 @@ AIR = ("--pressure-hpa", "1000", "--temperature-c", "5")
 SOLVE_KEYS = {"utc", "latitude", "longitude", "heading", "latitude_geodetic", "longitude_geodetic",
               "sigma_east_m", "sigma_north_m", "sigma_heading_deg", "covariance", "stars_detected", "stars_matched",
               "residual_arcsec", "log_odds", "status", "warnings"}  # fmt: skip
-IDENTIFY_KEYS = {"file", "ra", "dec", "roll", "focal_px", "stars_detected", "stars_matched", "residual_arcsec",
-                 "log_odds", "negative", "status", "warnings", "bright_explained", "bright_seen", "cpu_ms"}  # fmt: skip
+IDENTIFY_KEYS = {"file", "ra", "dec", "roll", "focal_px", "focal_stddev_px", "stars_detected", "stars_matched",
+                 "residual_arcsec", "log_odds", "negative", "status", "warnings", "bright_explained", "bright_seen",
+                 "cpu_ms"}  # fmt: skip
 
 
 def objects(out):

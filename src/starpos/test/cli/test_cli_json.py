@@ -84,3 +84,29 @@ def test_every_field_says_what_it_is():
         for key, value in line["properties"].items()
         if "description" not in value and "const" not in value
     } == set()
+
+
+@pytest.mark.parametrize("focal_mm", [50, 600])
+def test_the_focal_length_errs_as_it_claims(capsys, tmp_path, focal_mm):
+    lens = ("--focal-mm", focal_mm, "--pixel-um", 6.4)
+    sky = (
+        "-n",
+        30,
+        "--turn",
+        12,
+        "--altitude",
+        80,
+        "--pressure-hpa",
+        0,
+        "--size",
+        2808,
+        1872,
+        "--stars-only",
+    )
+    assert run(capsys, "simulate", tmp_path / "night", *sky, *lens)[0] == 0
+    lists = sorted((tmp_path / "night").glob("stars_*.csv"))
+    answers = objects(run(capsys, "identify", *lists, *lens, "--json")[1])
+    error = np.array([a["focal_px"] for a in answers]) - focal_mm / 6.4e-3
+    pull = error / [a["focal_stddev_px"] for a in answers]
+    # 30 true claims give 0.63 to 1.40 in 999 of 1000 cases
+    assert 0.6 < np.sqrt(np.mean(pull**2)) < 1.45

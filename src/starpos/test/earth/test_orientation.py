@@ -36,7 +36,7 @@ def unix_of(*utc):
 def space_moved(star, state):
     """Barycentric catalogue place with proper motion AND parallax at the date (ERFA eraPmpx), unit vector (1, 3).
 
-    The catalogue carries no parallax, so published cases get it here.
+    The catalogue rounds places and parallaxes, so published cases do without it.
     """
     years = (
         state.year

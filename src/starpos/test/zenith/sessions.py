@@ -40,28 +40,52 @@ class Drawn:
         return adjusted(self.sightings, INSTRUMENT, VACUUM, MARK)
 
 
-def drawn(rng, *, azimuths=(0, 90, 180, 270) * 2, frames=6, motion=0.4, air=0.05, turn_deg=4.0, lean=10.0):
+@dataclass(frozen=True)
+class Worse:
+    """Factors of a tiltmeter's errors over the stated ones; jump_arcsec: of its zero, before the fourth face."""
+
+    noise: float = 1.0
+    drift: float = 1.0
+    scale: float = 1.0
+    jump_arcsec: float = 0.0
+
+
+AS_STATED = Worse()
+
+
+def drawn(
+    rng,
+    *,
+    azimuths=(0, 90, 180, 270) * 2,
+    frames=6,
+    motion=0.4,
+    air=0.05,
+    turn_deg=4.0,
+    lean=10.0,
+    worse=AS_STATED,
+):
     """A session of frames 5 s apart in faces at these azimuths (deg), a minute from face to face; sizes in arcsec."""
     eta, xi = rng.normal(0, 10, 2)
     astronomic = MARK.latitude + xi * ARCSEC, MARK.longitude + eta * ARCSEC / np.cos(MARK.latitude)
     up = MARK.enu @ enu_axes(*astronomic)[2]
     a3 = rotation.about_axis(2, np.radians(turn_deg)) @ rotation.from_vector([*rng.normal(0, 0.002, 2), 0.0])
-    zero, scale = rng.normal(0, 60, 2) * ARCSEC, rng.normal(0, SCALE, 2)
+    zero, scale = rng.normal(0, 60, 2) * ARCSEC, rng.normal(0, SCALE * worse.scale, 2)
     quiet = motion == 0 and air == 0
     walk, slow = np.zeros(2), rng.normal(0, 1, 2) * air
     sightings, t = [], 0.0
-    for azimuth in azimuths:
+    for face, azimuth in enumerate(azimuths):
+        zero = zero + worse.jump_arcsec * ARCSEC * (face == 3)
         level = rotation.from_vector([*rng.normal(0, lean, 2) * ARCSEC, 0.0])
         sensor = level @ rotation.about_axis(2, np.radians(azimuth + rng.normal()))
         for _ in range(frames):
             passed, t = 5.0, t + 5.0
             keep = np.exp(-passed / 1200)
             slow = slow * keep + rng.normal(0, 1, 2) * air * np.sqrt(1 - keep**2)
-            walk = walk + rng.normal(0, DRIFT_ARCSEC, 2) * np.sqrt(passed / 3600) * (not quiet)
+            walk = walk + rng.normal(0, DRIFT_ARCSEC * worse.drift, 2) * np.sqrt(passed / 3600) * (not quiet)
             seen = (slow + rng.normal(0, 1, 2) * motion) * ARCSEC
             attitude = a3.T @ sensor @ rotation.from_vector([-seen[1], seen[0], 0.0])
             theta = np.arcsin(sensor[:2] @ up) * (1 + scale * (not quiet)) + zero
-            theta = theta + (walk + rng.normal(0, NOISE_ARCSEC, 2) * (not quiet)) * ARCSEC
+            theta = theta + (walk + rng.normal(0, NOISE_ARCSEC * worse.noise, 2) * (not quiet)) * ARCSEC
             sightings.append(_sighting(len(sightings), BEGIN + t, attitude, theta))
         t += 60.0
     return Drawn(sightings, xi, eta)

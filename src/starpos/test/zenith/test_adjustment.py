@@ -33,8 +33,11 @@ def test_claimed_errors_are_true(rng):
 
 def test_the_covariance_is_the_sum_of_its_sources(rng):
     found = drawn(rng, frames=3).adjusted()
-    variances = np.sum([np.square(term[1:]) for term in found.terms], axis=0)
-    assert variances == pytest.approx(np.diag(found.covariance_arcsec2), rel=1e-6)
+    terms = [
+        np.outer(sizes, sizes) * [[1, found.correlations[name]], [found.correlations[name], 1]]
+        for name, *sizes in found.terms
+    ]
+    assert np.sum(terms, axis=0) == pytest.approx(found.covariance_arcsec2, rel=1e-6, abs=1e-9)
 
 
 def test_the_size_of_the_image_motion_comes_from_the_frames_own_scatter(rng):

@@ -99,6 +99,29 @@ def test_levelling_climbs_the_geoid_it_stands_on(tmp_path, grid):
         assert first.distance_m == pytest.approx(np.hypot(0.02 * 111177, 0.03 * 76000), rel=2e-3)
 
 
+def test_what_stations_share_tilts_a_line_by_its_correlation(tmp_path):
+    ends = {"A": (47.0, 8.0), "B": (47.02, 8.03)}
+    told = []
+    for correlation in (-0.9, 0.0, 0.9):
+        sessions = [
+            session_file.read(
+                result(tmp_path / f"{name}{k}.json", *end, 2, 1, station=name, correlation=correlation)
+            )
+            for name, end in ends.items()
+            for k in range(50)
+        ]
+        line = stations_of(sessions)
+        for found in line:
+            assert found.covariance[0, 1] == pytest.approx(correlation * COMMON_ARCSEC**2, abs=1e-9)
+        told.append(levelled(line, None)[0])
+    # to the north-east: errors of xi and eta add if they are of one sign, and fifty sessions average all else
+    azimuth, shared = told[1].azimuth, COMMON_ARCSEC * ARCSEC * told[1].distance_m
+    new = NEW_ARCSEC * ARCSEC * told[1].distance_m / np.sqrt(2 * 50)
+    for step, correlation in zip(told, (-0.9, 0.0, 0.9), strict=True):
+        expected = np.hypot(shared * np.sqrt(1 + correlation * np.sin(2 * azimuth)), new)
+        assert step.measured_m == pytest.approx(expected, rel=0.01)
+
+
 def test_what_lies_between_stations_is_in_the_error(rng):
     """Random fields of the stated covariance, integrated."""
     at = np.linspace(0, 12_000.0, 241)

@@ -7,10 +7,21 @@ NEW_ARCSEC, COMMON_ARCSEC = 0.06, 0.03
 
 
 def result(
-    path, latitude, longitude, xi, eta, *, station="", height_m=500.0, new=NEW_ARCSEC, common=COMMON_ARCSEC
+    path,
+    latitude,
+    longitude,
+    xi,
+    eta,
+    *,
+    station="",
+    height_m=500.0,
+    new=NEW_ARCSEC,
+    common=COMMON_ARCSEC,
+    correlation=0.0,
 ):
     """Write a session's result: tide free xi, eta at the geoid (arcsec), errors of two sources; the file's path."""
-    variance, tide, curvature = new**2 + common**2, [0.01, -0.02], 0.1
+    variance, both = new**2 + common**2, correlation * common**2
+    tide, curvature = [0.01, -0.02], 0.1
     mark = [xi + curvature, eta]
     frames = [
         {
@@ -24,8 +35,9 @@ def result(
         "combined": True, "status": "ok", "station": station, "utc": "2026-03-01T20:06:00.000Z", "duration_s": 660.0,
         "site": {"latitude": latitude, "longitude": longitude, "height_m": height_m},
         "xi_arcsec": mark[0] + tide[0], "eta_arcsec": mark[1] + tide[1],
-        "covariance_arcsec2": [[variance, 0.0], [0.0, variance]], "faces": 4, "frames": 12,
+        "covariance_arcsec2": [[variance, both], [both, variance]], "faces": 4, "frames": 12,
         "errors": {"image motion": [new, new], "catalogue": [common, common]}, "image_motion_arcsec": 0.3, "stars": 40,
+        "correlations": {"image motion": 0.0, "catalogue": correlation},
         "reduced": {
             "tide_arcsec": tide, "curvature_arcsec": [curvature, 0.0], "mark_arcsec": mark, "geoid_arcsec": [xi, eta],
         },
