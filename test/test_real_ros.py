@@ -32,6 +32,10 @@ def has(package: str) -> bool:
 
 
 def needs(*packages: str) -> pytest.MarkDecorator:
+    """A mark of tests that skip without packages of ROS; with STARPOS_COMPLETE, too, unlike `lacking.needs`.
+
+    No machine with PyPI's ROS can bring them, so a complete one lacks them as well.
+    """
     absent = [package for package in packages if not has(package)]
     return pytest.mark.skipif(bool(absent), reason=f"ROS from apt alone has {', '.join(packages)}")
 
