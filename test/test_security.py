@@ -62,6 +62,7 @@ READS_WHOLE = {
     "starpos/parallel/same.py": "our own source",
     "starpos/identification/paper.py": "of the package",
     "starpos/sky/near_stars.py": "of the package",
+    "starpos/sky/catalogue.py": "the checksum of the table of parallaxes, of the package",
     "starpos/report/coast.py": "of the package",
     "starpos/report/field.py": "MAX_BYTES",
     "starpos/recording/bag.py": "installed messages",
