@@ -97,7 +97,7 @@ def modules_of(walls, sources):
 
 
 def table(heading: str) -> list[list[str]]:
-    """The cells of the table under a heading of the plan."""
+    """The cells of the table under a heading of docs/architecture.md."""
     section = PLAN.read_text().split(f"## {heading}\n", 1)[1].split("\n## ", 1)[0]
     lines = [line for line in section.splitlines() if line.startswith("|")]
     return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines[2:]]

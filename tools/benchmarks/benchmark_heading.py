@@ -56,7 +56,7 @@ CASES = (
     ),
     # frames as in cedar-solve's examples: 30.9 arcsec a pixel, 20 to 45 stars that scatter by 0.15 px
     Case(
-        "16 mm, 50 ms: a Raspberry Pi's HQ camera",
+        "11 x 8.2 deg, 31 arcsec a pixel, 50 ms",
         Camera.from_focal(1280, 960, 6675.0),
         Optics(fwhm_px=2.4, zero_point_e_s=8e5, read_noise_e=3.0, seeing_arcsec=4.6, limit_mag=8.0),
         0.05,

@@ -13,7 +13,7 @@ CONFIG = Path(__file__).parent.parent / "config" / "starpos.yaml"
 
 def test_the_committed_file_is_the_nodes_own_tables():
     assert CONFIG.read_text() == parameter_file(), (
-        "run `python -m starpos_bringup.defaults > config/starpos.yaml`"
+        "run `python -m starpos_bringup.defaults > src/starpos_bringup/config/starpos.yaml` in the root"
     )
 
 
@@ -30,7 +30,7 @@ def test_every_description_is_made_of_whole_sentences():
     assert {name: said for name, said in descriptions.items() if not whole.fullmatch(said)} == {}
 
 
-def test_the_names_the_contract_fixes_are_the_solvers():
+def test_the_solver_keeps_the_names_that_users_files_have():
     fixed = {"refraction.pressure", "refraction.temperature", "refraction.humidity", "altitude", "altitude_stddev",
              "clock_stddev", "deflection.xi", "deflection.eta", "deflection.stddev", "min_stars", "frame_id",
              "calibration_url"}  # fmt: skip

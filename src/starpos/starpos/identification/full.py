@@ -17,7 +17,7 @@ from starpos.normal import SIGMA_PER_MAD
 # Minimum number of stars of an identification.
 MIN_STARS = 4
 # Minimum log-odds of an identification: one try identifies at most one in 1e9 frames of random points. With all further
-# tries it is 1.2 in 1e9 (second_look.py).
+# tries it is 1.2 in 1e9 (second_look.py), and up to 14 more where other focal lengths are tried (fix/other_focal.py).
 MIN_LOG_ODDS = np.log(1e9)
 ROUNDS = 3
 # A star may be GATE_SIGMA of the spread from its place, plus GATE_PX; the spread is at least MIN_SPREAD_PX.

@@ -38,7 +38,7 @@ class Search:
 
     def other_camera(self) -> None:
         """Note that the camera is another one."""
-        # whether a frame of this camera has been
+        # whether a frame of this camera was identified
         self._identified = False
 
     def frame_came(self, now: Now) -> None:

@@ -154,7 +154,7 @@ def test_space_motion_is_linear_and_needs_no_index_array(catalogue):
     np.testing.assert_array_equal(catalogue.directions(index.tolist(), 2020), v2)
 
 
-def test_errors_grow_with_time_as_design_section_5_says(catalogue):
+def test_errors_grow_with_time(catalogue):
     sigma = [
         np.median(catalogue.sigma(slice(None, None, 50), year)) / MAS for year in (1995, 2010, 2026, 2040)
     ]
