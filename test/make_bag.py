@@ -19,7 +19,7 @@ from starpos.earth.refraction import Atmosphere
 from starpos.instrument.inclinometer import Tilt
 from starpos.simulation.scene import Optics, detected, expose, read_tilt, render, scene_of
 from starpos.sky.catalogue import load_catalogue
-from starpos_bringup.recording.bag_writer import BagWriter
+from starpos_bringup.bag import BagWriter
 from starpos_common.messages import camera_to_message, frame_to_message, stars_to_message, tilt_to_message
 from starpos_interfaces.msg import Capture
 

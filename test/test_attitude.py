@@ -7,8 +7,8 @@ from scipy.spatial.transform import Rotation
 
 from starpos.earth.ellipsoid import enu_axes
 from starpos.earth.refraction import Atmosphere
-from starpos.messages.attitude import message_to_attitude
-from starpos.navigation.placeless import PlacelessFrame
+from starpos.messages.stars import message_to_attitude
+from starpos.navigation.sightings import PlacelessFrame
 from starpos_interfaces.msg import Attitude, Solution
 from starpos_testing.graph.graph import stamp_of
 from starpos_testing.graph.shots import (

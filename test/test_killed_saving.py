@@ -9,7 +9,7 @@ import sys
 import pytest
 from sensor_msgs.srv import SetCameraInfo
 
-from starpos.instrument import camera_file, instrument_file
+from starpos.instrument import instrument_file
 from starpos.instrument.camera import Camera
 from starpos.instrument.instrument import Instrument
 from starpos_common.messages import camera_to_message
@@ -108,7 +108,7 @@ def _is_solved(graph) -> bool:
 def test_a_camera_killed_while_it_saves_starts_again_with_a_whole_file(graph, run, tmp_path, round_):
     path = tmp_path / "camera.yaml"
     cameras = [Camera.from_focal(*FULL, FULL_FOCAL_PX * k) for k in (1.0, 1.01)]
-    camera_file.write(path, cameras[0], "camera")
+    instrument_file.write_camera(path, cameras[0], "camera")
     parameters = ("source:=simulated", "cadence:=100.0", f"calibration_url:={path}")
     process = run("starpos_camera", "camera", *parameters)
     client = graph.node.create_client(SetCameraInfo, "camera/set_camera_info")
@@ -123,7 +123,7 @@ def test_a_camera_killed_while_it_saves_starts_again_with_a_whole_file(graph, ru
     process.signal(signal.SIGKILL)
     process.wait()
     graph.node.destroy_client(client)
-    assert camera_file.read(path) in cameras
+    assert instrument_file.read_camera(path) in cameras
     again = run("starpos_camera", "camera", *parameters)
     graph.wait(lambda: graph.state("camera: Capture", "").level is not None)
     values = {v.key: v.value for v in graph.state("camera: Capture", "").values}

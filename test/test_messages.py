@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from starpos.session.diagnosis import Level
+from starpos.session.driver import Level
 from starpos.session.reports import of_clock
 from starpos_testing.command_line import run
 

@@ -21,8 +21,8 @@ from rosgraph_msgs.msg import Clock
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
-from starpos_bringup.recording.bag_writer import offered_qos
-from starpos_bringup.recording.participants import Participants
+from starpos_bringup.bag import offered_qos
+from starpos_bringup.player import Participants
 from starpos_common import replayed
 from starpos_interfaces.msg import Played, Solution, StarArray, Taken
 from starpos_testing.graph.graph import stamp_of

@@ -17,7 +17,7 @@ from std_srvs.srv import Trigger
 from starpos.session.frames import Answered
 from starpos.session.parameter_file import settings_of
 from starpos.session.replay import Replay
-from starpos_bringup.recording.bag import Bag
+from starpos_bringup.bag import Bag
 from starpos_common.messages import attitude_to_message, unix_to_stamp
 from starpos_interfaces.msg import Attitude, Tilt
 from starpos_testing.graph.graph import stamp_of

@@ -7,13 +7,13 @@ from pathlib import Path
 
 import pytest
 
-from starpos.earth import geoid_file
+from starpos.earth import geoid
 from starpos.errors import StarposError
 from starpos.frames.reading import read_frame
-from starpos.instrument import camera_file, instrument_file
+from starpos.instrument import instrument_file
 from starpos.instrument.tilt_table import read_tilt_csv
 from starpos.messages.stars import MAX_STARS, message_to_stars
-from starpos.navigation.table import read_record
+from starpos.navigation.records import read_record
 from starpos_interfaces.msg import Star, StarArray
 
 ROOT = Path(__file__).parents[1]
@@ -42,9 +42,8 @@ FORBIDDEN_ATTRIBUTES = {
 YAML = {"safe_load", "safe_dump", "YAMLError", "YAMLObject", "SafeDumper"}
 ALLOWED = {
     # between the processes of one command; a cluster runs what its scheduler sends, by its nature (README)
-    "starpos/parallel/call.py": {"pickle"},
-    "starpos/parallel/cluster.py": {"pickle"},
     "starpos/parallel/processes.py": {"pickle"},
+    "starpos/parallel/cluster.py": {"pickle"},
     # as dataclasses does: of the names of this program's own fields
     "starpos/frozen.py": {"exec"},
     # a SafeLoader that refuses aliases too; a scan makes pieces of text, no objects
@@ -59,20 +58,16 @@ ALLOWED = {
 # Who reads a file whole, or a table, and what bounds it: a limit, or that it came with the package.
 READS_WHOLE = {
     "starpos/earth/orientation.py": "the table of the Earth's rotation that astropy brings",
-    "starpos/parallel/same.py": "our own source",
+    "starpos/parallel/cluster.py": "our own source",
     "starpos/identification/paper.py": "of the package",
-    "starpos/sky/near_stars.py": "of the package",
-    "starpos/sky/catalogue.py": "the checksum of the table of parallaxes, of the package",
+    "starpos/sky/catalogue.py": "of the package, and the checksum of its table of parallaxes",
     "starpos/report/coast.py": "of the package",
     "starpos/report/field.py": "MAX_BYTES",
-    "starpos/recording/bag.py": "installed messages",
-    "starpos/recording/bounds.py": "MAX_METADATA",
+    "starpos/recording/bag.py": "installed messages; MAX_METADATA",
     "starpos/instrument/tilt_table.py": "MAX_CSV_BYTES",
-    "starpos/navigation/table.py": "MAX_BYTES",
-    "starpos_bringup/recording/bag.py": "installed messages",
-    "starpos_bringup/recording/bag_writer.py": "installed messages",
+    "starpos/navigation/records.py": "MAX_BYTES",
+    "starpos_bringup/bag.py": "installed messages",
     "starpos_dashboard/server.py": "of the package",
-    "starpos_inclinometer/sources/iio_buffer.py": "an attribute of the kernel is a page at most",
     "starpos_inclinometer/sources/iio_device.py": "an attribute of the kernel is a page at most",
 }
 WHOLE = {"read_text", "read_bytes", "loadtxt", "genfromtxt", "fromfile", "readlines"}
@@ -168,9 +163,9 @@ def test_the_search_covers_the_product_and_would_find(monkeypatch):
         ("tilt.csv", b"utc_unix_s,theta_x_deg,theta_y_deg\n", 1 << 40, read_tilt_csv),
         ("imu.csv", b"utc_unix_s,wx\n", 1 << 40, lambda path: read_record(path, ["wx"], "readings")),
         ("instrument.yaml", b"starpos_instrument: 1\n", 1 << 40, instrument_file.read),
-        ("camera.yaml", b"image_width: 1\n", 1 << 40, camera_file.read),
-        ("geoid.tif", b"II*\0", 1 << 40, geoid_file.read_grid),
-        ("geoid.gtx", b"\x40" * 40, 1 << 40, geoid_file.read_grid),
+        ("camera.yaml", b"image_width: 1\n", 1 << 40, instrument_file.read_camera),
+        ("geoid.tif", b"II*\0", 1 << 40, geoid.read_grid),
+        ("geoid.gtx", b"\x40" * 40, 1 << 40, geoid.read_grid),
     ],
 )
 def test_a_file_of_a_terabyte_is_refused_unread(tmp_path, name, head, size, read):

@@ -12,7 +12,7 @@ from sensor_msgs.msg import Imu
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
-from starpos.messages.attitude import message_to_attitude
+from starpos.messages.stars import message_to_attitude
 from starpos_common.messages import unix_to_stamp
 from starpos_interfaces.msg import Attitude, Solution
 from starpos_testing.graph.graph import stamp_of

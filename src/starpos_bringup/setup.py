@@ -26,9 +26,9 @@ setup(
     extras_require={"test": ["pytest"]},
     entry_points={
         "console_scripts": [
-            "record = starpos_bringup.recording.record:record",
-            "replay = starpos_bringup.recording.replay:replay",
-            "folder = starpos_bringup.recording.folder:folder",
+            "record = starpos_bringup.record:record",
+            "replay = starpos_bringup.replay:replay",
+            "folder = starpos_bringup.record:folder",
         ]
     },
 )

@@ -13,11 +13,10 @@ from sensor_msgs.msg import Image
 from std_msgs.msg import Header
 
 from starpos.frames.annotate import Identified, annotate
-from starpos.frames.frame import Frame
-from starpos.frames.stars import Stars
+from starpos.frames.frame import Frame, Stars
+from starpos_common.diagnostics import Troubles
 from starpos_common.messages import frame_to_message
 from starpos_common.topics import publisher, subscription
-from starpos_common.troubles import Troubles
 from starpos_common.worker import Worker
 from starpos_interfaces.msg import Solution
 

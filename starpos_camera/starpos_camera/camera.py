@@ -20,20 +20,17 @@ from std_msgs.msg import Header
 
 from starpos.errors import InstrumentError, StarposError
 from starpos.files import path_of
+from starpos.frames.exposure import Shutter
 from starpos.frames.frame import Frame
-from starpos.frames.shutter import Shutter
-from starpos.instrument import camera_file
+from starpos.instrument import instrument_file
 from starpos.instrument.camera import Camera
 from starpos.instrument.instrument import focal_px_of
 from starpos.messages.camera import message_to_camera
 from starpos.session import system_clock
-from starpos_camera.camera_parameters import PARAMETERS
-from starpos_camera.shutter_times import ShutterTimes
-from starpos_camera.sources.registry import SOURCES
+from starpos_camera.parameters import PARAMETERS, SOURCES
 from starpos_camera.sources.source import CapturedFrame, CaptureSettings, FrameSource, NothingYet, SourceEnded
-from starpos_camera.stamping import OF_SYSTEM_CLOCK, in_one_time
-from starpos_common.clock_report import ClockReport, time_is_simulated
-from starpos_common.diagnostics import Diagnosis, Diagnostics, Level
+from starpos_camera.sources.timing import OF_SYSTEM_CLOCK, ShutterTimes, in_one_time
+from starpos_common.diagnostics import ClockReport, Diagnosis, Diagnostics, Level, time_is_simulated
 from starpos_common.messages import camera_to_message, frame_to_message, shutter_fields, unix_to_stamp
 from starpos_common.parameters import declare
 from starpos_common.topics import publisher, subscription
@@ -89,7 +86,7 @@ class CameraNode(Node):
             self._calibration_path = path_of(self._values["calibration_url"])
             # Path.exists would raise if a name is too long.
             if os.path.exists(self._calibration_path):
-                self._calibration = camera_file.read(self._calibration_path)
+                self._calibration = instrument_file.read_camera(self._calibration_path)
             else:
                 self.get_logger().warning(
                     f"{self._calibration_path}: there is no calibration yet; the camera is ideal, of focal_mm "
@@ -308,7 +305,7 @@ class CameraNode(Node):
 
     def _keep(self, path: Path, camera: Camera) -> None:
         try:
-            camera_file.write(path, camera, self.get_name())
+            instrument_file.write_camera(path, camera, self.get_name())
         except InstrumentError as error:
             raise InstrumentError(f"{error}; the calibration holds for this session only.") from None
 

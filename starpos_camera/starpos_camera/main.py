@@ -57,8 +57,8 @@ def camera_detector() -> int:
 
 def _help(executable: str, about: str, *nodes: str) -> str:
     from starpos.session import detector_parameters
-    from starpos_camera import camera_parameters
-    from starpos_common.node_help import node_help
+    from starpos_camera import parameters
+    from starpos_common.parameters import node_help
 
-    tables = {"camera": camera_parameters.PARAMETERS, "detector": detector_parameters.PARAMETERS}
+    tables = {"camera": parameters.PARAMETERS, "detector": detector_parameters.PARAMETERS}
     return node_help("starpos_camera", executable, about, {node: tables[node] for node in nodes})

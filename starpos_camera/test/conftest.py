@@ -4,8 +4,7 @@
 import numpy as np
 import pytest
 
-from starpos.simulation.night_on_disk import write_fits
-from starpos.simulation.scene import expose, render, scene_of
+from starpos.simulation.scene import expose, render, scene_of, write_fits
 from starpos.sky.catalogue import load_catalogue
 from starpos_testing.nodes import Listener, Process, take_domain
 

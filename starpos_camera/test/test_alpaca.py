@@ -13,7 +13,7 @@ from alpaca_servers import HEIGHT, WIDTH, Liar, Simulator, free_port, image_byte
 from attempts import SHORT, attempt, in_thread
 from sensor_msgs.msg import Image
 
-from starpos_camera.camera_parameters import PARAMETERS
+from starpos_camera.parameters import PARAMETERS
 from starpos_camera.sources.alpaca import Alpaca
 from starpos_camera.sources.source import CaptureSettings
 from starpos_interfaces.msg import Capture

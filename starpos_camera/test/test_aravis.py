@@ -15,18 +15,20 @@ import numpy as np
 import pytest
 from attempts import attempt, in_thread
 
-from starpos_camera.camera_parameters import PARAMETERS
+from starpos_camera.parameters import PARAMETERS
 from starpos_camera.sources import aravis as source_module
-from starpos_camera.sources.aravis import Aravis
-from starpos_camera.sources.aravis_camera import (
+from starpos_camera.sources.aravis import (
     FORMATS,
+    Aravis,
     AravisCamera,
+    ClockRelation,
+    FrameTimes,
     best_format,
     clock_relation,
     library,
     pixels_of,
+    stamp_of_camera,
 )
-from starpos_camera.sources.aravis_times import ClockRelation, FrameTimes, stamp_of_camera
 from starpos_camera.sources.source import CaptureError, CaptureSettings
 from starpos_interfaces.msg import Capture
 from starpos_testing.lacking import lacks

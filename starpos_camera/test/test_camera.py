@@ -15,9 +15,9 @@ from sensor_msgs.srv import SetCameraInfo
 from std_msgs.msg import Header
 
 from starpos.detection import detect
+from starpos.frames.exposure import UNKNOWN_LATENCY_S
 from starpos.frames.reading import read_frame
-from starpos.frames.shutter import UNKNOWN_LATENCY_S
-from starpos.instrument import camera_file
+from starpos.instrument import instrument_file
 from starpos.instrument.camera import Camera
 from starpos.messages.camera import message_to_camera, message_to_frame
 from starpos.messages.stamp import stamp_to_unix
@@ -205,7 +205,7 @@ def test_set_camera_info_is_validated_kept_and_there_after_a_restart(start, list
     answer = listener.call(SetCameraInfo, "camera/set_camera_info", request)
     assert answer.success and str(path) in answer.status_message
     listener.wait(lambda: message_to_camera(infos[-1]) == camera)
-    assert camera_file.read(path) == camera
+    assert instrument_file.read_camera(path) == camera
     assert [p.name for p in path.parent.iterdir()] == ["camera.yaml"]
     status, out = node.end(signal.SIGINT)
     assert status == 0 and "there is no calibration yet" in out

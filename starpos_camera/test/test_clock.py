@@ -12,7 +12,7 @@ from starpos.frames.frame import Frame
 from starpos.messages.stamp import stamp_to_unix
 from starpos.session.system_clock import StepWatch
 from starpos_camera.sources.source import CapturedFrame, CaptureError
-from starpos_camera.stamping import in_one_time
+from starpos_camera.sources.timing import in_one_time
 from starpos_interfaces.msg import Capture
 from starpos_testing.lacking import lacks
 

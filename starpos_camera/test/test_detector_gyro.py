@@ -12,8 +12,8 @@ from std_msgs.msg import Header
 from test_detector import Feed
 
 from starpos.detection import detect
+from starpos.frames.exposure import Trail
 from starpos.frames.frame import Frame
-from starpos.frames.trail import Trail
 from starpos.instrument.camera import Camera
 from starpos_common.messages import camera_to_message, unix_to_stamp
 from starpos_testing.skies.rendered import field, noisy

@@ -9,7 +9,7 @@ import pytest
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CompressedImage, Image
 
-from starpos_camera.frame_topics import wants_compressed
+from starpos_camera.detector import wants_compressed
 from starpos_interfaces.msg import StarArray
 from starpos_testing.nodes import Listener, Process
 

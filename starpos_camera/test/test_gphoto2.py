@@ -11,9 +11,8 @@ import pytest
 from attempts import SHORT, attempt, in_thread
 from sensor_msgs.msg import Image
 
-from starpos_camera.camera_parameters import PARAMETERS
-from starpos_camera.sources.gphoto2 import RAW_ALONE, Gphoto2, named_off_s
-from starpos_camera.sources.gphoto2_camera import nearest, seconds, sentence
+from starpos_camera.parameters import PARAMETERS
+from starpos_camera.sources.gphoto2 import RAW_ALONE, Gphoto2, named_off_s, nearest, seconds, sentence
 from starpos_camera.sources.source import CaptureError, CaptureSettings
 from starpos_interfaces.msg import Capture
 from starpos_interfaces.srv import SetCapture

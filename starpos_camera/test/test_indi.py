@@ -12,7 +12,7 @@ from astropy.io import fits
 from attempts import SHORT, in_thread
 from indi_servers import DEVICE, IndiServer, OtherClient, executable_liar
 
-from starpos_camera.camera_parameters import PARAMETERS
+from starpos_camera.parameters import PARAMETERS
 from starpos_camera.sources import timing
 from starpos_camera.sources.indi import Indi
 from starpos_camera.sources.source import CaptureError, CaptureSettings

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from starpos.frames.frame import Frame
-from starpos_camera.camera_parameters import PARAMETERS
-from starpos_camera.shutter_times import ENOUGH_FOR_LAG, ShutterTimes
+from starpos_camera.parameters import PARAMETERS
 from starpos_camera.sources.source import CapturedFrame
+from starpos_camera.sources.timing import ENOUGH_FOR_LAG, ShutterTimes
 from starpos_common.messages import unix_to_stamp
 from starpos_interfaces.msg import Capture, Pulse
 from starpos_testing.patience import WAIT_S

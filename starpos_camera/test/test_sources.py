@@ -7,11 +7,10 @@ import pytest
 
 from starpos.detection import detect
 from starpos.errors import FrameError
-from starpos.frames.shutter import UNKNOWN_LATENCY_S
+from starpos.frames.exposure import UNKNOWN_LATENCY_S
 from starpos.simulation.scene import expose
 from starpos.sky.catalogue import load_catalogue
-from starpos_camera.camera_parameters import PARAMETERS
-from starpos_camera.sources.registry import SOURCES
+from starpos_camera.parameters import PARAMETERS, SOURCES
 from starpos_camera.sources.source import CaptureSettings, SourceEnded
 from starpos_interfaces.msg import Capture
 from starpos_testing.lacking import require

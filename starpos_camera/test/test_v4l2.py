@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from starpos_camera.sources.source import CaptureError
-from starpos_camera.sources.v4l2 import _from_jpeg
+from starpos_camera.sources.video import _from_jpeg
 from starpos_interfaces.msg import Capture
 from starpos_testing.lacking import lacks
 from starpos_testing.patience import WAIT_S

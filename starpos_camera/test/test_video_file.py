@@ -11,7 +11,7 @@ import pytest
 from sensor_msgs.msg import Image
 
 from starpos.errors import FrameError
-from starpos_camera.camera_parameters import PARAMETERS
+from starpos_camera.parameters import PARAMETERS
 from starpos_camera.sources.source import CaptureError, CaptureSettings, SourceEnded
 from starpos_camera.sources.video import Video
 from starpos_interfaces.msg import Capture

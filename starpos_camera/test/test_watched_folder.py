@@ -13,12 +13,11 @@ import pytest
 from sensor_msgs.msg import Image
 
 from starpos.errors import FrameError, StarposError
-from starpos.simulation.night_on_disk import write_fits
-from starpos_camera.camera_parameters import PARAMETERS
-from starpos_camera.sources import watched_folder
-from starpos_camera.sources.files import Files
+from starpos.simulation.scene import write_fits
+from starpos_camera.parameters import PARAMETERS
+from starpos_camera.sources import files
+from starpos_camera.sources.files import IDLE_S, MAX_LOOKED_AT, PATIENCE, Files, WatchedFolder
 from starpos_camera.sources.source import CaptureError, CaptureSettings, NothingYet
-from starpos_camera.sources.watched_folder import IDLE_S, MAX_LOOKED_AT, PATIENCE, WatchedFolder
 from starpos_testing.patience import WAIT_S
 
 REST_S = 2.0
@@ -231,7 +230,7 @@ def test_of_a_file_in_the_folder_eight_bytes_are_kept(watch):
 
 def kept_by_the_folder() -> int:
     """Bytes that the watched folder's own code holds; other threads may allocate meanwhile."""
-    own = tracemalloc.Filter(True, watched_folder.__file__)
+    own = tracemalloc.Filter(True, files.__file__)
     return sum(s.size for s in tracemalloc.take_snapshot().filter_traces([own]).statistics("filename"))
 
 

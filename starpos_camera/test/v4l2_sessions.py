@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from starpos_camera.camera_parameters import PARAMETERS
+from starpos_camera.parameters import PARAMETERS
 from starpos_camera.sources.source import CaptureError, CaptureSettings
 from starpos_camera.sources.video import Video
 

@@ -20,7 +20,7 @@ from dataclasses import dataclass, field, fields
 from typing import Any
 
 from starpos.instrument.inclinometer import sca100t_volts
-from starpos_inclinometer.sources import mcu_protocol, sca100t
+from starpos_inclinometer.sources import mcu_protocol, tilts
 
 FIRMWARE = 0x0200
 UNIT = 0x53494D00
@@ -88,7 +88,7 @@ class Mcu:
         rate_hz: int = DEFAULT_RATE_HZ,
         drift_ppm: float = 0.0,
         seed: int | None = None,
-        calibration: sca100t.Sca100tCalibration | None = None,
+        calibration: tilts.Sca100tCalibration | None = None,
     ) -> None:
         self.tilt = tilt
         self.noise_rad = noise_rad
@@ -98,9 +98,9 @@ class Mcu:
         self._power_up_rate = rate_hz
         self._tick = 1.0 + drift_ppm * 1e-6
         self._rng = random.Random(seed)
-        self._calibration = calibration or sca100t.Sca100tCalibration()
+        self._calibration = calibration or tilts.Sca100tCalibration()
         self._commands = mcu_protocol.LineSplitter()
-        self._codes = (sca100t.CODE_ZERO, sca100t.CODE_ZERO)
+        self._codes = (tilts.CODE_ZERO, tilts.CODE_ZERO)
         self.reset(0.0)
 
     def reset(self, now: float) -> bytes:
@@ -129,7 +129,7 @@ class Mcu:
         if not self.frozen:
             x, y = self.tilt(at)
             self._codes = (self._code(0, x), self._code(1, y))
-        counts = sca100t.temperature_counts(self.temperature_c)
+        counts = tilts.sca100t_counts(self.temperature_c)
         ms = int((at - self._boot) * self._tick * 1e3)
         line = mcu_protocol.sample_line(self._sequence, ms, *self._codes, counts, self._status)
         self._sequence += 1
@@ -176,7 +176,7 @@ class Mcu:
         # The sensor's output ends at the rails.
         code = c.code(min(max(volts, 0.0), c.reference_volts))
         noisy = code + round(self._rng.gauss(0.0, ADC_NOISE_CODES))
-        return min(max(noisy, 0), sca100t.CODE_MAX) if 0 < code < sca100t.CODE_MAX else code
+        return min(max(noisy, 0), tilts.CODE_MAX) if 0 < code < tilts.CODE_MAX else code
 
 
 class Pty:

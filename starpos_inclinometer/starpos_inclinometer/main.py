@@ -19,7 +19,7 @@ def inclinometer() -> int:
         yield InclinometerNode()
 
     def help_text() -> str:
-        from starpos_common.node_help import node_help
+        from starpos_common.parameters import node_help
         from starpos_inclinometer.parameters import PARAMETERS
 
         about = "The readings of an inclinometer, or of an IMU, on `tilt`, until Ctrl-C."
@@ -30,7 +30,7 @@ def inclinometer() -> int:
 
 def emulator() -> int:
     """Run the emulated microcontroller until SIGINT or SIGTERM."""
-    from starpos_common.stop_signals import stop_signals
+    from starpos_common.node_main import stop_signals
 
     with stop_signals() as stopped:
         from starpos_inclinometer.emulator import main

@@ -1,12 +1,26 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Parameters of the node `inclinometer`; a source's own are in its module."""
+"""The sources by their name in the parameter `source`, and the parameters of the node `inclinometer`. A new sensor needs
+a module in `sources` and a line below.
+"""
 
 from collections.abc import Mapping
 from typing import Any
 
 from starpos.session.inclinometer_parameters import SHARED
 from starpos_common.parameters import Parameter
-from starpos_inclinometer.sources.registry import SOURCES
+from starpos_inclinometer.sources.ascii_line import AsciiSource
+from starpos_inclinometer.sources.iio import IioSource
+from starpos_inclinometer.sources.imu import ImuSource
+from starpos_inclinometer.sources.mcu import McuSource
+from starpos_inclinometer.sources.source import TiltSource
+
+SOURCES: dict[str, type[TiltSource]] = {
+    "serial": McuSource,
+    "imu": ImuSource,
+    "ascii": AsciiSource,
+    "iio": IioSource,
+}
+
 
 COMMON = (
     Parameter(

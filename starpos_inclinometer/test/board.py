@@ -9,8 +9,7 @@ import subprocess
 import tty
 from pathlib import Path
 
-from starpos_inclinometer.sources.mcu_continuity import Continuity
-from starpos_inclinometer.sources.mcu_protocol import LineParser, Sample
+from starpos_inclinometer.sources.mcu_protocol import Continuity, LineParser, Sample
 from starpos_testing.lacking import lacks
 from starpos_testing.patience import WAIT_S
 

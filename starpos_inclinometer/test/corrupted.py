@@ -3,7 +3,7 @@
 
 import numpy as np
 
-from starpos_inclinometer.host_clock import Moment
+from starpos_inclinometer.clock import Moment
 from starpos_inclinometer.sources import mcu_protocol
 
 RATE_HZ = 50

@@ -4,7 +4,7 @@
 import threading
 import time
 
-from starpos_inclinometer.host_clock import HostClock
+from starpos_inclinometer.clock import HostClock
 from starpos_inclinometer.sources.mcu import McuDecoder
 from starpos_inclinometer.sources.mcu_protocol import BAUD
 from starpos_inclinometer.sources.serial_link import LinkState, SerialLink

@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from starpos_inclinometer.host_clock import Moment
+from starpos_inclinometer.clock import Moment
 from starpos_inclinometer.sources import mcu_protocol
 from starpos_inclinometer.sources.mcu import NEAR_CODES, McuDecoder
 from starpos_inclinometer.sources.mcu_protocol import SampleStatus, SensorKind

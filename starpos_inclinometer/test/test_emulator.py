@@ -13,7 +13,7 @@ import pytest
 from starpos_inclinometer.emulator import Mcu, Pty
 from starpos_inclinometer.sources import mcu_protocol
 from starpos_inclinometer.sources.mcu_protocol import Identity, LineParser, Reason, Refusal, SampleStatus
-from starpos_inclinometer.sources.sca100t import OUT_OF_RANGE, SATURATED, Sensor
+from starpos_inclinometer.sources.tilts import OUT_OF_RANGE, SATURATED, Sca100t
 from starpos_testing.patience import WAIT_S
 
 COMMAND = [
@@ -24,7 +24,7 @@ COMMAND = [
 
 
 def readings(mcu, n):
-    sensor, parser = Sensor(), LineParser()
+    sensor, parser = Sca100t(), LineParser()
     return [
         sensor.measure(s, s.milliseconds * 1e-3)
         for s in parser.feed(b"".join(mcu.sample() for _ in range(n)))

@@ -17,14 +17,13 @@ from corrupted import RATE_HZ, as_sent, decode, flipped, forged, lines
 from diagnostic_msgs.msg import DiagnosticArray
 from wire import Wire
 
+from starpos_inclinometer.clock import HostClock
 from starpos_inclinometer.emulator import Faults
-from starpos_inclinometer.host_clock import HostClock
+from starpos_inclinometer.node import Reporter
 from starpos_inclinometer.parameters import PARAMETERS
-from starpos_inclinometer.report import Reporter
 from starpos_inclinometer.sources import mcu_protocol
 from starpos_inclinometer.sources.mcu import McuDecoder, McuSource
-from starpos_inclinometer.sources.reading import STUCK, TIME_UNKNOWN, Phase
-from starpos_inclinometer.sources.source import Surroundings
+from starpos_inclinometer.sources.source import STUCK, TIME_UNKNOWN, Phase, Surroundings
 from starpos_interfaces.msg import Tilt
 from starpos_testing.nodes import Listener, Process, take_domain
 from starpos_testing.patience import WAIT_S

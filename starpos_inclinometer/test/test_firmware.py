@@ -25,7 +25,7 @@ from starpos_inclinometer.sources.mcu_protocol import (
     Sample,
     SampleStatus,
 )
-from starpos_inclinometer.sources.sca100t import DIVIDER, Sensor
+from starpos_inclinometer.sources.tilts import DIVIDER, Sca100t
 
 # Reset, calibration and a first sample.
 BOOT_MS = 1000
@@ -60,7 +60,7 @@ def samples(messages):
 
 def angles(messages):
     """deg, (n, 2)."""
-    sensor = Sensor()
+    sensor = Sca100t()
     return np.degrees([(r.x, r.y) for r in (sensor.measure(s, 0.0) for s in samples(messages))])
 
 
@@ -178,7 +178,7 @@ def test_temperature(board, celsius):
     board.tell(f"temperature {celsius}")
     sample = samples(board.messages(BOOT_MS))[-1]
     assert sample.status == 0
-    assert Sensor().measure(sample, 0.0).temperature_c == pytest.approx(celsius, abs=0.47)
+    assert Sca100t().measure(sample, 0.0).temperature_c == pytest.approx(celsius, abs=0.47)
 
 
 def test_without_the_sensors_answer_it_says_so_and_sends_on(board):

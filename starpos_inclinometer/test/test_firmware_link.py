@@ -8,7 +8,7 @@ import pytest
 from board import Board
 from diagnostic_msgs.msg import DiagnosticArray
 
-from starpos_inclinometer.sources.reading import Phase
+from starpos_inclinometer.sources.source import Phase
 from starpos_interfaces.msg import Pulse, Tilt
 from starpos_testing.nodes import Listener, Process, take_domain
 

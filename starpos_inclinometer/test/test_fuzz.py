@@ -9,7 +9,7 @@ import tracemalloc
 import numpy as np
 from corrupted import IDENTITY, RATE_HZ, as_sent, lines
 
-from starpos_inclinometer.host_clock import Moment
+from starpos_inclinometer.clock import Moment
 from starpos_inclinometer.parameters import PARAMETERS
 from starpos_inclinometer.sources import mcu_protocol
 from starpos_inclinometer.sources.ascii_line import LineDecoder

@@ -5,7 +5,7 @@ import time
 
 import pytest
 
-from starpos_inclinometer.host_clock import TRIES, HostClock
+from starpos_inclinometer.clock import TRIES, HostClock
 
 
 class Host:

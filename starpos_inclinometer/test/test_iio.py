@@ -10,13 +10,26 @@ import numpy as np
 import pytest
 from iio_tree import adxl355, node, plug, scan, scl3300
 
-from starpos_inclinometer.host_clock import HostClock, Moment
+from starpos_inclinometer.clock import HostClock, Moment
 from starpos_inclinometer.parameters import PARAMETERS
 from starpos_inclinometer.sources.iio import IioLink, IioTilts
-from starpos_inclinometer.sources.iio_buffer import Buffer, ScanLayout, element
-from starpos_inclinometer.sources.iio_device import DeviceError, find, set_sampling_frequency
-from starpos_inclinometer.sources.reading import GAP, OUT_OF_RANGE, STUCK, TIME_UNKNOWN, Arrival, Phase
-from starpos_inclinometer.sources.source import Surroundings
+from starpos_inclinometer.sources.iio_device import (
+    Buffer,
+    DeviceError,
+    ScanLayout,
+    element,
+    find,
+    set_sampling_frequency,
+)
+from starpos_inclinometer.sources.source import (
+    GAP,
+    OUT_OF_RANGE,
+    STUCK,
+    TIME_UNKNOWN,
+    Arrival,
+    Phase,
+    Surroundings,
+)
 from starpos_testing.patience import WAIT_S
 
 DEFAULTS = {p.name: p.default for p in PARAMETERS}

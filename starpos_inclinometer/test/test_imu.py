@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from sensor_msgs.msg import Imu
 
-from starpos.messages.imu_tilts import BadMessage, ForceAverager, MeanForce, felt
+from starpos.messages.tilt import BadMessage, ForceAverager, MeanForce, felt
 from starpos_interfaces.msg import Tilt
 from starpos_testing.nodes import Listener, Process, take_domain
 

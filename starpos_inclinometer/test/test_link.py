@@ -9,7 +9,7 @@ import pytest
 
 from starpos_inclinometer.emulator import Mcu
 from starpos_inclinometer.sources import serial_link
-from starpos_inclinometer.sources.reading import Phase
+from starpos_inclinometer.sources.source import Phase
 
 NOBODY = 65534
 

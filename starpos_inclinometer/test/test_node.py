@@ -13,7 +13,7 @@ from rcl_interfaces.srv import DescribeParameters
 
 from starpos_inclinometer.emulator import Mcu
 from starpos_inclinometer.node import PARAMETERS
-from starpos_inclinometer.sources import reading
+from starpos_inclinometer.sources import source
 from starpos_interfaces.msg import Tilt
 from starpos_testing.nodes import Listener, Process, take_domain
 
@@ -165,4 +165,4 @@ def test_readme_names_every_parameter():
 
 def test_flags_are_those_of_the_message():
     for name in ("OUT_OF_RANGE", "STUCK", "SATURATED", "GAP", "TIME_UNKNOWN"):
-        assert getattr(reading, name) == getattr(Tilt, name)
+        assert getattr(source, name) == getattr(Tilt, name)

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from board import Board
 
-from starpos.instrument.noise_tracker import LONG, SHORT, NoiseTracker
+from starpos.instrument.tilt_log import LONG_RUN, SHORT_RUN, NoiseTracker
 from starpos_inclinometer.emulator import Mcu
 from starpos_inclinometer.sources import mcu_protocol
-from starpos_inclinometer.sources.sca100t import Sensor
+from starpos_inclinometer.sources.tilts import Sca100t
 
 SIGMA = math.radians(0.0035)
 
@@ -29,7 +29,7 @@ def white(n, sigma=SIGMA, seed=1):
 
 def measured(samples):
     """(N, 2) tilts and (N, 2) 1 sigma of them, once the noise is known."""
-    sensor = Sensor()
+    sensor = Sca100t()
     got = [(sensor.measure(s, s.milliseconds * 1e-3), sensor.noise.sigma) for s in samples]
     known = [m for m, sigma in got if sigma is not None]
     return np.array([(m.x, m.y) for m in known]), np.sqrt([m.covariance[::3] for m in known])
@@ -96,10 +96,10 @@ def test_coarse_samples(step, expected):
 
 
 def test_noise_that_grows_is_noticed_within_three_seconds_and_forgotten_within_twenty():
-    tracker = tracked(white(2 * LONG), 10)
-    tracked(white(SHORT, 4 * SIGMA, seed=2), 10, tracker, begin_s=2 * LONG / 10)
+    tracker = tracked(white(2 * LONG_RUN), 10)
+    tracked(white(SHORT_RUN, 4 * SIGMA, seed=2), 10, tracker, begin_s=2 * LONG_RUN / 10)
     assert tracker.sigma == pytest.approx([4 * SIGMA] * 2, rel=0.4)
-    tracked(white(LONG + 1, seed=3), 10, tracker, begin_s=100.0)
+    tracked(white(LONG_RUN + 1, seed=3), 10, tracker, begin_s=100.0)
     assert tracker.sigma == pytest.approx([SIGMA] * 2, rel=0.2)
 
 

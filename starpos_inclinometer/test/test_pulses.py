@@ -5,12 +5,11 @@ import numpy as np
 import pytest
 from board import Board
 
-from starpos.session.shutter_pulses import Edge, ShutterPulse, ShutterPulses
-from starpos_inclinometer.host_clock import Moment
+from starpos_common.shutter_pulses import Edge, ShutterPulse, ShutterPulses
+from starpos_inclinometer.clock import Moment
 from starpos_inclinometer.parameters import PARAMETERS
-from starpos_inclinometer.sources.mcu import McuDecoder, McuTilts
+from starpos_inclinometer.sources.mcu import LINE_STDDEV_S, SECOND_STDDEV_S, McuDecoder, McuTilts, PulseTimes
 from starpos_inclinometer.sources.mcu_protocol import Input, LineParser, Pulse, Sample, frame, pulse_line
-from starpos_inclinometer.sources.pulse_times import LINE_STDDEV_S, SECOND_STDDEV_S, PulseTimes
 
 VALUES = {p.name: p.default for p in PARAMETERS}
 BOOT_MS = 600

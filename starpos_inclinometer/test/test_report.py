@@ -6,13 +6,13 @@ import math
 import numpy as np
 import pytest
 
+from starpos_inclinometer.clock import Moment, Step
 from starpos_inclinometer.emulator import Mcu
-from starpos_inclinometer.host_clock import Moment, Step
+from starpos_inclinometer.node import Reporter
 from starpos_inclinometer.parameters import PARAMETERS
-from starpos_inclinometer.report import Reporter
 from starpos_inclinometer.sources.mcu import McuDecoder, McuTilts
 from starpos_inclinometer.sources.mcu_protocol import Identity, Sample
-from starpos_inclinometer.sources.reading import (
+from starpos_inclinometer.sources.source import (
     GAP,
     OUT_OF_RANGE,
     SATURATED,

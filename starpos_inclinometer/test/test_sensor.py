@@ -6,13 +6,13 @@ import math
 import numpy as np
 import pytest
 
-from starpos_inclinometer.sources import sca100t
+from starpos_inclinometer.sources import tilts
 from starpos_inclinometer.sources.mcu_protocol import Sample, SampleStatus
-from starpos_inclinometer.sources.sca100t import Sca100tCalibration, Sensor
+from starpos_inclinometer.sources.tilts import Sca100t, Sca100tCalibration
 
 
 def measure(sample, *calibration):
-    return Sensor(*calibration).measure(sample, 0.0)
+    return Sca100t(*calibration).measure(sample, 0.0)
 
 
 def sample(x=0x800000, y=0x800000, temperature=175, status=0, **more):
@@ -41,9 +41,9 @@ def test_offset_sensitivity_divider_and_reference_of_each_axis():
 
 
 def test_temperature_of_the_data_sheet():
-    assert sca100t.temperature_c(197) == 0.0
-    assert sca100t.temperature_c(170) == pytest.approx(24.93, abs=0.01)
-    assert [sca100t.temperature_c(sca100t.temperature_counts(t)) for t in (-40, 20, 85)] == pytest.approx(
+    assert tilts.sca100t_celsius(197) == 0.0
+    assert tilts.sca100t_celsius(170) == pytest.approx(24.93, abs=0.01)
+    assert [tilts.sca100t_celsius(tilts.sca100t_counts(t)) for t in (-40, 20, 85)] == pytest.approx(
         [-40, 20, 85], abs=0.47
     )
     assert math.isnan(measure(sample(status=SampleStatus.NO_TEMPERATURE)).temperature_c)
@@ -58,7 +58,7 @@ def test_until_the_noise_is_known_it_is_the_stated_one_and_the_quantisation():
 def test_the_noise_parameter_is_a_floor_that_the_samples_may_rise_above():
     rng = np.random.default_rng(1)
     for floor, noise, expected in ((0.004, 0.001, 0.004), (0.001, 0.004, 0.004)):
-        s = Sensor(Sca100tCalibration(noise_floor_rad=math.radians(floor)))
+        s = Sca100t(Sca100tCalibration(noise_floor_rad=math.radians(floor)))
         for k in range(300):
             volts = 2.5 + 4 * np.radians(noise) * rng.standard_normal(2)
             last = s.measure(sample(*map(Sca100tCalibration().code, volts)), 0.1 * k)
@@ -109,8 +109,8 @@ def test_temperature_polynomials(celsius):
         2.5 + 5e-4 * t - 2e-6 * t**2 + 1e-8 * t**3 + 4.0 * (1 + 1e-4 * t + 1e-6 * t**2) * 0.1,
         2.5 - 3e-4 * t + 1e-6 * t**2 + 4.0 * (1 - 2e-4 * t + 1e-8 * t**3) * -0.2,
     )
-    counts = sca100t.temperature_counts(celsius)
-    s = Sensor(WARM)
+    counts = tilts.sca100t_counts(celsius)
+    s = Sca100t(WARM)
     reading = s.measure(sample(*map(WARM.code, volts), temperature=counts), 0.0)
     # one count is 0.92 deg C, of which the offset of x makes 0.007 deg
     error = np.abs(np.sin([reading.x, reading.y]) - [0.1, -0.2])
@@ -120,7 +120,7 @@ def test_temperature_polynomials(celsius):
 
 
 def test_one_count_of_temperature_comes_slowly_and_a_missing_one_changes_nothing_but_the_error():
-    s = Sensor(WARM)
+    s = Sca100t(WARM)
     x, y = turned(0.1, -0.2, WARM)
     first = s.measure(sample(x, y, temperature=175), 0.0)
     stepped = s.measure(sample(x, y, temperature=174), 0.1)
@@ -142,7 +142,7 @@ def offset_x(linear, square):
 
 def test_a_polynomial_far_outside_of_its_range_does_not_turn_an_axis_round():
     c = Sca100tCalibration(sensitivity_per_c=((-0.01, 0.0, 0.0), (-0.01, -1e-4, 0.0)))
-    counts = sca100t.temperature_counts(125.0)
+    counts = tilts.sca100t_counts(125.0)
     reading = measure(sample(x=0x880000, y=0x780000, temperature=counts), c)
     assert reading.x > 0 > reading.y and np.isfinite(reading.covariance).all()
 
@@ -152,7 +152,7 @@ def test_a_polynomial_far_outside_of_its_range_does_not_turn_an_axis_round():
     [{"lost": 1}, {"status": SampleStatus.NO_ANSWER}, {"x": 0}, {"x": Sca100tCalibration().code(4.9)}],
 )
 def test_what_is_flagged_tells_no_noise(odd):
-    s = Sensor()
+    s = Sca100t()
     for k in range(100):
         s.measure(sample(**({"x": 0x800000 + 37 * k % 101, "y": 0x800000 + k} | odd)), 0.1 * k)
     assert s.noise.sigma is None
@@ -177,14 +177,14 @@ def test_a_temperature_never_known_widens_the_error_by_all_it_may_be():
     ("what", "flags"),
     [
         (sample(), 0),
-        (sample(x=Sca100tCalibration().code(2.5 + 4 * math.sin(math.radians(30.01)))), sca100t.OUT_OF_RANGE),
-        (sample(y=0), sca100t.OUT_OF_RANGE | sca100t.SATURATED),
-        (sample(y=0xFFFFFF), sca100t.OUT_OF_RANGE | sca100t.SATURATED),
-        (sample(lost=3), sca100t.GAP),
-        (sample(restarted=True), sca100t.GAP),
-        (sample(resumed=True), sca100t.GAP),
-        (sample(status=SampleStatus.NO_ANSWER), sca100t.STUCK),
-        (sample(status=SampleStatus.MEANINGLESS), sca100t.STUCK),
+        (sample(x=Sca100tCalibration().code(2.5 + 4 * math.sin(math.radians(30.01)))), tilts.OUT_OF_RANGE),
+        (sample(y=0), tilts.OUT_OF_RANGE | tilts.SATURATED),
+        (sample(y=0xFFFFFF), tilts.OUT_OF_RANGE | tilts.SATURATED),
+        (sample(lost=3), tilts.GAP),
+        (sample(restarted=True), tilts.GAP),
+        (sample(resumed=True), tilts.GAP),
+        (sample(status=SampleStatus.NO_ANSWER), tilts.STUCK),
+        (sample(status=SampleStatus.MEANINGLESS), tilts.STUCK),
         (sample(status=SampleStatus.OVERRUN | 0xC0), 0),
     ],
 )
@@ -197,18 +197,19 @@ def test_flags(what, flags):
 def test_angles_stay_finite_where_there_is_none():
     reading = measure(sample(x=0, y=0xFFFFFF), Sca100tCalibration(sensitivity_volts_per_g=(1.0, 1.0)))
     assert (reading.x, reading.y) == pytest.approx((-math.pi / 2, math.pi / 2))
-    assert reading.flags & sca100t.OUT_OF_RANGE
+    assert reading.flags & tilts.OUT_OF_RANGE
 
 
 def test_a_code_that_repeats_is_stuck_until_it_moves():
-    s = Sensor()
+    s = Sca100t()
     flags = [
-        s.measure(sample(x=0x800000 + i, y=0x812345), 0.1 * i).flags for i in range(sca100t.STUCK_SAMPLES + 1)
+        s.measure(sample(x=0x800000 + i, y=0x812345), 0.1 * i).flags
+        for i in range(tilts.SCA100T_STUCK_SAMPLES + 1)
     ]
-    assert flags == [0] * (sca100t.STUCK_SAMPLES - 1) + [sca100t.STUCK] * 2
+    assert flags == [0] * (tilts.SCA100T_STUCK_SAMPLES - 1) + [tilts.STUCK] * 2
     assert s.measure(sample(y=0x812346), 9.0).flags == 0
 
 
 def test_both_codes_repeating_are_stuck_sooner():
-    s = Sensor()
-    assert [s.measure(sample(), 0.1 * i).flags for i in range(4)] == [0, 0, sca100t.STUCK, sca100t.STUCK]
+    s = Sca100t()
+    assert [s.measure(sample(), 0.1 * i).flags for i in range(4)] == [0, 0, tilts.STUCK, tilts.STUCK]

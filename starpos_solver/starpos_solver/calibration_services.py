@@ -2,6 +2,7 @@
 """The services `~/calibrate`, `~/self_calibrate` and `~/save_calibration`."""
 
 import math
+from pathlib import Path
 from typing import TypeVar
 
 from rclpy.callback_groups import ReentrantCallbackGroup
@@ -10,10 +11,37 @@ from rclpy.node import Node
 from starpos.calibration.misalignment import Calibrated
 from starpos.errors import InstrumentError, StarposError
 from starpos.files import path_of
+from starpos.instrument import instrument_file
+from starpos.instrument.instrument import Instrument
 from starpos.session.session import SolverSession
 from starpos_interfaces.srv import Calibrate, SaveCalibration, SelfCalibrate
-from starpos_solver import saving
-from starpos_solver.settings import SolverSettings
+from starpos_solver.driver import SolverSettings
+
+
+def save_instrument(path: str, calibration_url: str, instrument: Instrument) -> Path:
+    """Write an instrument file to `path`, or without one to calibration_url; return its Path.
+
+    Raises InstrumentError if it cannot be written, or if the file there is no instrument file or has a person's comment.
+    """
+    if not path and not calibration_url:
+        raise InstrumentError("there is no file to write: give a path, or set calibration_url")
+    if path and not path_of(path).is_absolute():
+        raise InstrumentError(
+            f"{path}: give a full path, from / on: the node would write it into the folder it was started in"
+        )
+    where = path_of(path or calibration_url)
+    try:
+        occupied = where.exists()
+    except (OSError, ValueError) as e:
+        raise InstrumentError(f"{where}: the file cannot be written there ({e})") from None
+    if occupied:
+        try:
+            instrument_file.check_replaceable(where)
+        except InstrumentError as e:
+            raise InstrumentError(f"{e}: move it away, or give another path") from None
+    instrument_file.write(where, instrument)
+    return where
+
 
 R = TypeVar("R", Calibrate.Response, SelfCalibrate.Response)
 
@@ -65,7 +93,7 @@ class CalibrationServices:
             instrument = self._session.instrument.solver_now.instrument
             if self._calibrating.unknown:
                 raise InstrumentError("the calibration in use is not known: calibrate first")
-            written = saving.save(request.path, url, instrument)
+            written = save_instrument(request.path, url, instrument)
         except StarposError as e:
             response.message = str(e)
             return response

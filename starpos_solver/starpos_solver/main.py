@@ -18,8 +18,8 @@ def solver() -> int:
         yield SolverNode()
 
     def help_text() -> str:
-        from starpos.session.parameters import PARAMETERS
-        from starpos_common.node_help import node_help
+        from starpos.session.settings import PARAMETERS
+        from starpos_common.parameters import node_help
 
         about = "Stars and tilts in, position and heading out, until Ctrl-C."
         return node_help("starpos_solver", "solver", about, {"solver": PARAMETERS})
@@ -39,7 +39,7 @@ def navigator() -> int:
 
     def help_text() -> str:
         from starpos.session.navigator_parameters import PARAMETERS
-        from starpos_common.node_help import node_help
+        from starpos_common.parameters import node_help
 
         about = (
             "An IMU, attitudes and velocities in, position, heading and velocity under way out, until Ctrl-C."

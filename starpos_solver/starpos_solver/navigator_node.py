@@ -10,18 +10,16 @@ from rclpy.qos import ReliabilityPolicy
 from sensor_msgs.msg import Imu, NavSatFix
 from std_srvs.srv import Trigger
 
+from starpos.session.driver import Now
 from starpos.session.navigator import NavigatorSession
 from starpos.session.navigator_parameters import PARAMETERS, NavigatorSettings
-from starpos.session.now import Now
-from starpos_common.clock_report import time_is_simulated
-from starpos_common.diagnostics import Diagnostics
-from starpos_common.job import JobRunner
+from starpos_common.diagnostics import Diagnostics, time_is_simulated
 from starpos_common.parameters import declare
 from starpos_common.topics import subscription
+from starpos_common.worker import JobRunner
 from starpos_interfaces.msg import Attitude
-from starpos_solver.inputs import IMU_QUEUE, Inputs
-from starpos_solver.navigator_outputs import NavigatorPublishers
-from starpos_solver.node_log import NodeLog
+from starpos_solver.driver import IMU_QUEUE, Inputs, NodeLog
+from starpos_solver.publishing import NavigatorPublishers
 
 
 class NavigatorNode(Node):

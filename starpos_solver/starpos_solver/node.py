@@ -15,26 +15,21 @@ from sensor_msgs.msg import CameraInfo, Imu, NavSatFix
 from std_srvs.srv import Trigger
 
 from starpos.instrument.camera import Camera
-from starpos.session import gnss_check, gnss_teacher, reports
+from starpos.session import reports
+from starpos.session.driver import Now, Sent
 from starpos.session.frames import Answered, Output
+from starpos.session.gnss import GNSS_TOPIC, GnssComparison
 from starpos.session.gyro import IMU_TOPIC
-from starpos.session.now import Now, Sent
 from starpos.session.session import CAMERA_TOPIC, SolverSession
-from starpos_common.clock_report import time_is_simulated
-from starpos_common.diagnostics import Diagnosis, Diagnostics, Level
-from starpos_common.dropped import Dropped
-from starpos_common.job import JobRunner
-from starpos_common.others import other_publishers
+from starpos_common.diagnostics import Diagnosis, Diagnostics, Level, time_is_simulated
 from starpos_common.replayed import Replayed
-from starpos_common.topics import Take, subscription, subscription_from_any
+from starpos_common.topics import Dropped, Take, other_publishers, subscription, subscription_from_any
+from starpos_common.worker import JobRunner
 from starpos_interfaces import msg
 from starpos_interfaces.srv import Solve
 from starpos_solver.calibration_services import CalibrationServices
-from starpos_solver.inputs import IMU_QUEUE, Inputs
-from starpos_solver.node_log import NodeLog
-from starpos_solver.publishing import SolutionPublishers
-from starpos_solver.settings import SolverSettings
-from starpos_solver.transforms import StaticTransforms
+from starpos_solver.driver import IMU_QUEUE, Inputs, NodeLog, SolverSettings
+from starpos_solver.publishing import SolutionPublishers, StaticTransforms
 
 POLL_S = 0.02
 TILT_QUEUE, STARS_QUEUE = 1000, 100
@@ -53,7 +48,7 @@ class SolverNode(Node):
         self._values = self._settings.values
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         gyro = (IMU_TOPIC,) * self._values["gyro"]
-        gnss = (gnss_teacher.TOPIC,) * self._values["gnss.use"]
+        gnss = (GNSS_TOPIC,) * self._values["gnss.use"]
         # at a known place a heading needs no tilt
         tilt = ("tilt",) * (self._settings.site is None and not gnss)
         self._inputs = Inputs(self, ("camera_info", "stars", *tilt, *gyro, *gnss))
@@ -85,7 +80,7 @@ class SolverNode(Node):
             "stars": lambda m, info: self._publish(session.take_stars(m, self._now(), _sent(info))),
         }
         if session.gnss is not None:
-            takes[gnss_teacher.TOPIC] = lambda m, _: self._publish(session.take_gnss(m, self._now()))
+            takes[GNSS_TOPIC] = lambda m, _: self._publish(session.take_gnss(m, self._now()))
         if time_is_simulated(self):
             self._replayed = Replayed(
                 self,
@@ -102,10 +97,10 @@ class SolverNode(Node):
         if self._values["gyro"]:
             best_effort = ReliabilityPolicy.BEST_EFFORT
             subscription(self, Imu, IMU_TOPIC, self._on_imu, IMU_QUEUE, best_effort)
-        self._gnss = gnss_check.GnssComparison()
-        take = self._gnss.take if session.gnss is None else self._taker(gnss_teacher.TOPIC, takes)
+        self._gnss = GnssComparison()
+        take = self._gnss.take if session.gnss is None else self._taker(GNSS_TOPIC, takes)
         # receivers' drivers publish in either way
-        subscription(self, NavSatFix, gnss_teacher.TOPIC, take, 10, ReliabilityPolicy.BEST_EFFORT)
+        subscription(self, NavSatFix, GNSS_TOPIC, take, 10, ReliabilityPolicy.BEST_EFFORT)
         self.create_service(Solve, "~/solve", self._on_solve)
         self.create_service(Trigger, "~/reset", self._on_reset)
         self.create_service(Trigger, "~/deflection", self._on_deflection)

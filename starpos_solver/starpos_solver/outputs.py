@@ -11,8 +11,8 @@ from std_msgs.msg import Header
 
 from starpos import rotation
 from starpos.earth.vertical import Geodetic
-from starpos.fix.attitude_at_place import AttitudeAtPlace
 from starpos.fix.fix import Fix
+from starpos.fix.heading import AttitudeAtPlace
 from starpos.fix.solution import Solution, Status
 from starpos.gnss.solving import Compared
 from starpos.gnss.watch import GnssStatus

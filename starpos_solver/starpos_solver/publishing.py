@@ -1,22 +1,130 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The solver's topics: `fix`, `heading/imu`, `attitude`, `solver/solution` of frames, `fix_averaged` of the average.
+"""The topics and transforms that the solver and the navigator publish."""
 
-With gnss.use `gnss/check` too.
-"""
+from functools import cached_property
+from importlib.util import find_spec
 
+import numpy as np
 from builtin_interfaces.msg import Time
+from geometry_msgs.msg import Point, Quaternion, TransformStamped, Vector3
+from nav_msgs.msg import Odometry
 from rclpy.node import Node
 from rclpy.publisher import Publisher
+from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import Imu, NavSatFix
 from std_msgs.msg import Header
 
 from starpos.earth.vertical import Geodetic
+from starpos.instrument.instrument import Instrument
+from starpos.navigation.estimate import VoyageFix
 from starpos.session.frames import Answered, Averaged, Output
-from starpos_common.messages import attitude_to_message
+from starpos.session.navigator import Navigated, Position
+from starpos.session.navigator_parameters import NavigatorSettings
+from starpos.session.transforms import FrameNames, Transform, transforms_of
+from starpos_common.messages import attitude_to_message, unix_to_stamp
 from starpos_common.topics import publisher
 from starpos_interfaces import msg
 from starpos_solver import outputs
-from starpos_solver.settings import SolverSettings
+from starpos_solver.driver import SolverSettings
+
+STATIC, MOVING = "/tf_static", "/tf"
+# as tf2_ros has them
+STATIC_QOS = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+MOVING_QOS = QoSProfile(depth=100)
+
+
+class StaticTransforms:
+    """Publishes the transforms of an instrument."""
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self._publisher: Publisher | None = None
+        self._published: tuple[Transform, ...] = ()
+
+    def update(self, wanted: bool, link: str, names: FrameNames, instrument: Instrument | None) -> None:
+        """Publish the known transforms, if they differ from before; withdraw them if they are not wanted.
+
+        link: name of the base link.  names: of the others.  instrument: that in use, None before there is one.
+        """
+        if not wanted:
+            self._close()
+        elif self._possible:
+            self._publish(
+                transforms_of(instrument, link, names.camera, names.inclinometer) if instrument else ()
+            )
+
+    @cached_property
+    def _possible(self) -> bool:
+        return _can_be_told(self._node, STATIC)
+
+    def _publish(self, transforms: tuple[Transform, ...]) -> None:
+        from tf2_msgs.msg import TFMessage
+
+        if self._publisher is None:
+            self._publisher = self._node.create_publisher(TFMessage, STATIC, STATIC_QOS)
+        if transforms != self._published:
+            self._published = transforms
+            self._publisher.publish(TFMessage(transforms=[self._message(t) for t in transforms]))
+
+    def _close(self) -> None:
+        if self._publisher is not None:
+            # and with it what is latched
+            self._node.destroy_publisher(self._publisher)
+            self._publisher, self._published = None, ()
+
+    def _message(self, transform: Transform) -> TransformStamped:
+        message = TransformStamped(child_frame_id=transform.child)
+        message.header.frame_id = transform.parent
+        message.header.stamp = self._node.get_clock().now().to_msg()
+        x, y, z, w = transform.quaternion
+        message.transform.rotation = Quaternion(x=x, y=y, z=z, w=w)
+        return message
+
+
+class MovingTransform:
+    """Publishes where the child frame of an Odometry is in the frame of its header."""
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self._publisher: Publisher | None = None
+
+    def open(self, wanted: bool) -> None:
+        """Have the topic if it is wanted and possible, before there is a pose; remove it if not."""
+        if not wanted:
+            if self._publisher is not None:
+                self._node.destroy_publisher(self._publisher)
+                self._publisher = None
+        elif self._publisher is None and self._possible:
+            from tf2_msgs.msg import TFMessage
+
+            self._publisher = self._node.create_publisher(TFMessage, MOVING, MOVING_QOS)
+
+    @cached_property
+    def _possible(self) -> bool:
+        return _can_be_told(self._node, MOVING)
+
+    def publish(self, odometry: Odometry) -> None:
+        """Publish a pose if the topic is open."""
+        if self._publisher is None:
+            return
+        from tf2_msgs.msg import TFMessage
+
+        pose = odometry.pose.pose
+        message = TransformStamped(header=odometry.header, child_frame_id=odometry.child_frame_id)
+        message.transform.translation = Vector3(x=pose.position.x, y=pose.position.y, z=pose.position.z)
+        message.transform.rotation = pose.orientation
+        self._publisher.publish(TFMessage(transforms=[message]))
+
+
+def _can_be_told(node: Node, topic: str) -> bool:
+    """Whether there are messages of tf; says in the log if not. Looking takes longer than a fix: ask once."""
+    if find_spec("tf2_msgs") is not None:
+        return True
+    node.get_logger().info(
+        f"tf2_msgs is not installed, so there is no {topic}: sudo apt install ros-jazzy-tf2-msgs, or set publish_tf to "
+        "false"
+    )
+    return False
 
 
 class SolutionPublishers:
@@ -72,3 +180,55 @@ class SolutionPublishers:
 
     def _nav_sat_fix(self, header: Header, ground: Geodetic | None) -> NavSatFix:
         return outputs.nav_sat_fix(header, ground, self._values["altitude"], self._values["altitude_stddev"])
+
+
+class NavigatorPublishers:
+    """Publishes what the session makes, with the present parameters."""
+
+    def __init__(self, node: Node, settings: NavigatorSettings) -> None:
+        self._values = settings.values
+        self._fix = publisher(node, NavSatFix, "navigator/fix", 10)
+        self._heading = publisher(node, Imu, "navigator/heading", 10)
+        self._odometry = publisher(node, Odometry, "navigator/odometry", 10)
+        self._transform = MovingTransform(node)
+        self.parameters_set()
+
+    def parameters_set(self) -> None:
+        """Create the topics that the parameters ask for."""
+        self._transform.open(self._values["publish_tf"])
+
+    def publish(self, output: Navigated) -> None:
+        """Publish one output; without support it is a NO_FIX alone, and at a known place a heading."""
+        frame = self._values["frame_id"]
+        header = Header(stamp=unix_to_stamp(output.utc_unix_s), frame_id=frame)
+        if output.at_place is not None:
+            self._heading.publish(outputs.imu_at_place(header, output.at_place))
+            return
+        altitude = self._values["altitude"], self._values["altitude_stddev"]
+        self._fix.publish(outputs.nav_sat_fix(header, output.ground, *altitude))
+        if output.fix is None or output.ground is None:
+            return
+        self._heading.publish(outputs.imu(header, output.fix, output.ground))
+        if output.position is None:
+            return
+        start = Header(stamp=header.stamp, frame_id=self._values["odometry_frame_id"])
+        message = odometry(start, frame, output.fix, output.ground, output.position)
+        self._odometry.publish(message)
+        self._transform.publish(message)
+
+
+def odometry(header: Header, child: str, fix: VoyageFix, ground: Geodetic, position: Position) -> Odometry:
+    """Make the Odometry: pose in the frame of the header, ENU; velocity along the axes of the child's."""
+    message = Odometry(header=header, child_frame_id=child)
+    message.pose.pose.position = Point(**dict(zip("xyz", position.enu.tolist(), strict=True)))
+    message.pose.pose.orientation, turn = outputs.attitude(fix, ground)
+    pose, twist = np.zeros((2, 6, 6))
+    pose[:3, :3], pose[3:, 3:] = position.covariance, turn
+    message.pose.covariance = pose.ravel()
+    velocity = fix.link_to_enu.T @ fix.velocity
+    message.twist.twist.linear = Vector3(**dict(zip("xyz", velocity.tolist(), strict=True)))
+    twist[:3, :3] = fix.link_to_enu.T @ fix.velocity_covariance @ fix.link_to_enu
+    # rates are the IMU's own
+    twist[3, 3] = -1.0
+    message.twist.covariance = twist.ravel()
+    return message

@@ -11,9 +11,9 @@ from std_msgs.msg import Header
 
 from starpos.earth.known_place import KnownPlace
 from starpos.earth.vertical import Deflection
-from starpos.fix.attitude_at_place import AttitudeAtPlace, LinkAttitude
 from starpos.fix.budget import ErrorTerm, heading_of, heading_row
 from starpos.fix.fix import Fix
+from starpos.fix.heading import AttitudeAtPlace, LinkAttitude
 from starpos.fix.solution import Solution, Status
 from starpos.session.frames import ground_of
 from starpos_interfaces import msg

@@ -10,7 +10,7 @@ from rclpy.parameter import Parameter
 from starpos.instrument import instrument_file, sensors
 from starpos.instrument.camera import Camera
 from starpos.instrument.instrument import Instrument
-from starpos_solver.settings import SolverSettings
+from starpos_solver.driver import SolverSettings
 from starpos_testing.nodes import take_domain
 
 CAMERA = Camera.from_focal(1000, 800, 2000.0)

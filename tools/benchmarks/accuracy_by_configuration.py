@@ -16,13 +16,12 @@ from functools import partial
 import numpy as np
 
 from starpos.averaging.average import average
-from starpos.calibration.misalignment import calibrate_at
-from starpos.calibration.turning import turn
+from starpos.calibration.misalignment import calibrate_at, turn
 from starpos.earth.ellipsoid import curvature_radii_m
 from starpos.errors import StarposError
 from starpos.fix.fix import Fix
 from starpos.fix.solver import Solver
-from starpos.frames.stars import Stars
+from starpos.frames.frame import Stars
 from starpos.instrument import sensors
 from starpos.instrument.inclinometer import InclinometerErrors
 from starpos.instrument.tilt_log import TiltLog

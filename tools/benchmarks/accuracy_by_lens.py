@@ -28,7 +28,7 @@ from accuracy_by_configuration import (
 from benchmark_heading import CASES, Case, headings
 
 from starpos.averaging.average import average
-from starpos.calibration.turning import turn
+from starpos.calibration.misalignment import turn
 from starpos.errors import StarposError
 from starpos.fix.solver import Solver
 from starpos.instrument import sensors

@@ -20,8 +20,7 @@ from starpos.earth.refraction import Atmosphere
 from starpos.instrument.camera import Camera
 from starpos.sky import catalogue
 from starpos.sky.site import Site
-from starpos.units import ARCSEC, MAS
-from starpos.utc import utc_text
+from starpos.units import ARCSEC, MAS, utc_text
 
 FACES, FRAMES, CADENCE_S, TURNING_S, LIMIT_MAG = 8, 24, 5.0, 60.0, 9.8
 NOISE, LEAN, SCATTER_PX = 0.1 * ARCSEC, 10 * ARCSEC, 0.09

@@ -19,8 +19,7 @@ from starpos.earth.ellipsoid import curvature_radii_m, enu_axes
 from starpos.earth.known_place import KnownPlace
 from starpos.earth.vertical import UNKNOWN_STDDEV_ARCSEC, Deflection, geodetic
 from starpos.fix.budget import heading_of
-from starpos.fix.placed import placed
-from starpos.fix.solver import Solver
+from starpos.fix.solver import Solver, placed
 from starpos.instrument.camera import Camera
 from starpos.rotation import half_turns
 from starpos.simulation.montecarlo_nights import CAMERA, SCA100T_CALIBRATED, draw

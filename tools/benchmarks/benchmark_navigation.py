@@ -15,10 +15,8 @@ import numpy as np
 from table import Cost, Row
 
 from starpos.earth.refraction import Atmosphere
-from starpos.navigation.imu import ImuModel
-from starpos.navigation.laws import LAWS
-from starpos.navigation.velocity import VelocityLog
-from starpos.navigation.vessel import Vessel
+from starpos.navigation.records import ImuModel, VelocityLog
+from starpos.navigation.vessel import LAWS, Vessel
 from starpos.navigation.voyage import Voyage, navigate
 from starpos.units import ARCSEC
 from starpos_testing.halting import even, halting, idling, on_a_ferry, on_carriers

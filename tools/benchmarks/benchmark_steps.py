@@ -26,10 +26,9 @@ from starpos.cli import main as starpos
 from starpos.earth.orientation import earth_state
 from starpos.earth.refraction import Atmosphere
 from starpos.fix.fix import Fix, solve_fix
-from starpos.fix.matched import MatchedStars
 from starpos.fix.solver import Solver
-from starpos.frames.frame import Frame
-from starpos.frames.stars import Stars
+from starpos.fix.star_fit import MatchedStars
+from starpos.frames.frame import Frame, Stars
 from starpos.identification import triangles
 from starpos.instrument.inclinometer import Tilt
 from starpos.simulation.scene import Scene, detected, expose, read_tilt, scene_of

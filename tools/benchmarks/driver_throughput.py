@@ -6,8 +6,8 @@ from collections.abc import Iterator
 
 from table import Cost, Row
 
+from starpos_inclinometer.clock import Moment
 from starpos_inclinometer.emulator import Mcu
-from starpos_inclinometer.host_clock import Moment
 from starpos_inclinometer.parameters import PARAMETERS
 from starpos_inclinometer.sources import mcu_protocol
 from starpos_inclinometer.sources.ascii_line import LineDecoder

@@ -172,10 +172,9 @@ def write_frames(folder: Path):
     """Draw FILES frames of the paper's camera and the tilts of each, in order of time."""
     import numpy as np
 
-    from starpos.simulation.night_on_disk import write_fits
-    from starpos.simulation.scene import expose, render, scene_of
+    from starpos.simulation.scene import expose, render, scene_of, write_fits
     from starpos.sky.catalogue import load_catalogue
-    from starpos.utc import utc_text
+    from starpos.units import utc_text
     from starpos_testing.graph.shots import EXPOSURE_S, NOISE_DEG, START_S, tilts_of
 
     rng, scene, tilts = np.random.default_rng(1), scene_of(tilt_noise_deg=NOISE_DEG), []

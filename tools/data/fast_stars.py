@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Stars without a motion in Tycho-2: how fast they are by Hipparcos, and the fast ones for starpos.sky.fast_stars.
+"""Stars without a motion in Tycho-2: how fast they are by Hipparcos, and the fast ones for starpos.sky.tycho2.
 
     python tools/data/fast_stars.py tycho2_2.orig.tar.xz stars.dat
 
@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 
 from starpos.rotation import unit_vector
 from starpos.sky import tycho2
-from starpos.sky.fast_stars import MIN_MAS_YEAR
+from starpos.sky.tycho2 import MIN_MAS_YEAR
 from starpos.units import ARCSEC
 
 # hhmmss.ss, +-ddmmss.s at J2000, motions in mas/yr

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Parallaxes of the near stars by Hipparcos, for starpos.sky.near_stars.
+"""Parallaxes of the near stars by Hipparcos, for starpos.sky.catalogue.
 
     python tools/data/near_stars.py FOLDER > src/starpos/starpos/sky/data/near_stars.csv
 
@@ -14,8 +14,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
-from starpos.sky.catalogue import load_catalogue
-from starpos.sky.near_stars import MIN_MAS
+from starpos.sky.catalogue import NEAR_MIN_MAS, load_catalogue
 from starpos.units import ARCSEC
 
 # Stellarium's Star1: a header of 8 numbers, the fifth of which is the level of its grid; how many stars a zone has; stars
@@ -53,7 +52,7 @@ def main() -> None:
     args = parser.parse_args()
     catalogue = load_catalogue()
     parallax = hipparcos(args.folder)[catalogue.hip]
-    near = np.flatnonzero(parallax >= MIN_MAS)
+    near = np.flatnonzero(parallax >= NEAR_MIN_MAS)
     there = catalogue.directions(slice(None), OBSERVED)
     apart, which = cKDTree(there[near]).query(there, distance_upper_bound=TOGETHER_ARCSEC * ARCSEC)
     # also the companions that Hipparcos does not have

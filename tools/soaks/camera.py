@@ -15,8 +15,7 @@ import yaml
 from runner import Memory, Progress
 
 from starpos.errors import StarposError
-from starpos_camera.camera_parameters import PARAMETERS
-from starpos_camera.sources.registry import SOURCES
+from starpos_camera.parameters import PARAMETERS, SOURCES
 from starpos_camera.sources.source import CaptureSettings
 from starpos_common.parameters import ParameterError
 

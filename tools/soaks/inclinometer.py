@@ -13,8 +13,8 @@ from pathlib import Path
 
 from runner import Memory, Progress
 
+from starpos_inclinometer.clock import HostClock
 from starpos_inclinometer.emulator import Faults, Mcu, Pty
-from starpos_inclinometer.host_clock import HostClock
 from starpos_inclinometer.parameters import PARAMETERS
 from starpos_inclinometer.sources.mcu import McuSource
 from starpos_inclinometer.sources.source import Surroundings

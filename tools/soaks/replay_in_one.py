@@ -8,7 +8,7 @@ import threading
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
 
-from starpos_bringup.recording import replay
+from starpos_bringup import replay
 from starpos_camera.detector import DetectorNode
 from starpos_solver.node import SolverNode
 

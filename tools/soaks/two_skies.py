@@ -15,7 +15,7 @@ from runner import Progress
 
 from starpos import rotation
 from starpos.fix.solver import Solver
-from starpos.frames.stars import Stars
+from starpos.frames.frame import Stars
 from starpos.instrument.camera import Camera
 from starpos.instrument.instrument import Instrument
 from starpos.simulation.montecarlo_fields import Conditions, Field, blended

@@ -26,9 +26,8 @@ from std_msgs.msg import Header
 
 from starpos.frames.reading import read_frame
 from starpos.instrument.instrument import Instrument, focal_px_of
-from starpos.navigation.imu import read_imu
-from starpos.navigation.velocity import read_velocity
-from starpos_bringup.recording.bag_writer import BagWriter
+from starpos.navigation.records import read_imu, read_velocity
+from starpos_bringup.bag import BagWriter
 from starpos_common.messages import camera_to_message, stars_to_message, unix_to_stamp
 from starpos_testing.graph.graph import Graph
 from starpos_testing.nodes import take_domain

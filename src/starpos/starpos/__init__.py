@@ -39,7 +39,7 @@ _HOMES = {
     "Detection": "detection",
     "Fix": "fix.fix",
     "Frame": "frames.frame",
-    "InDegrees": "fix.readable",
+    "InDegrees": "fix.fix",
     "Instrument": "instrument.instrument",
     "KnownPlace": "earth.known_place",
     "Night": "night.night",
@@ -50,7 +50,7 @@ _HOMES = {
     "Solution": "fix.solution",
     "Solver": "fix.solver",
     "StarposError": "errors",
-    "Stars": "frames.stars",
+    "Stars": "frames.frame",
     "Status": "fix.solution",
     "Tilt": "instrument.inclinometer",
     "TiltLog": "instrument.tilt_log",
@@ -62,7 +62,7 @@ _HOMES = {
     "open_night": "night.opening",
     "read_frame": "frames.reading",
     "read_tilt_csv": "instrument.tilt_table",
-    "turn": "calibration.turning",
+    "turn": "calibration.misalignment",
 }
 __all__ = list(_HOMES)
 

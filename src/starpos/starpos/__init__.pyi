@@ -2,7 +2,6 @@
 from starpos.averaging.average import Average as Average
 from starpos.averaging.average import average as average
 from starpos.calibration.misalignment import calibrate_at as calibrate_at
-from starpos.calibration.turning import turn as turn
 from starpos.detection import Detection as Detection
 from starpos.detection import detect as detect
 from starpos.earth.known_place import KnownPlace as KnownPlace
@@ -11,13 +10,11 @@ from starpos.earth.vertical import Deflection as Deflection
 from starpos.earth.vertical import geodetic as geodetic
 from starpos.errors import StarposError as StarposError
 from starpos.fix.fix import Fix as Fix
-from starpos.fix.readable import InDegrees as InDegrees
 from starpos.fix.solution import Solution as Solution
 from starpos.fix.solution import Status as Status
 from starpos.fix.solver import Solver as Solver
 from starpos.frames.frame import Frame as Frame
 from starpos.frames.reading import read_frame as read_frame
-from starpos.frames.stars import Stars as Stars
 from starpos.instrument.camera import Camera as Camera
 from starpos.instrument.inclinometer import Tilt as Tilt
 from starpos.instrument.instrument import Calibration as Calibration

@@ -4,18 +4,18 @@
 python -m starpos_bringup.defaults > config/starpos.yaml
 """
 
-import starpos_camera.camera_parameters
+import starpos_camera.parameters
 import starpos_dashboard.parameters
 import starpos_inclinometer.parameters
-import starpos_solver.settings
+import starpos_solver.driver
 from starpos.session import detector_parameters, navigator_parameters
 from starpos_common.parameters import to_yaml
 
 NODES = {
-    "camera": starpos_camera.camera_parameters.PARAMETERS,
+    "camera": starpos_camera.parameters.PARAMETERS,
     "detector": detector_parameters.PARAMETERS,
     "inclinometer": starpos_inclinometer.parameters.PARAMETERS,
-    "solver": starpos_solver.settings.PARAMETERS,
+    "solver": starpos_solver.driver.PARAMETERS,
     "navigator": navigator_parameters.PARAMETERS,
     "dashboard": starpos_dashboard.parameters.PARAMETERS,
 }

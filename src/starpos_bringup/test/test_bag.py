@@ -12,9 +12,8 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from starpos.errors import BagError
-from starpos.recording import bounds
-from starpos_bringup.recording.bag import Bag
-from starpos_bringup.recording.bag_writer import BagWriter
+from starpos.recording import bag as bounds
+from starpos_bringup.bag import Bag, BagWriter
 from starpos_testing.skies.bags import NightBag
 
 KIND = "std_msgs/msg/UInt8MultiArray"

@@ -6,8 +6,8 @@ from types import SimpleNamespace
 import pytest
 import rclpy
 
-from starpos_bringup.recording import participants
-from starpos_bringup.recording.participants import LOST_S, SILENCE_S, Participants
+from starpos_bringup import player
+from starpos_bringup.player import LOST_S, SILENCE_S, Participants
 from starpos_interfaces.msg import Played, Taken
 from starpos_testing.nodes import take_domain
 
@@ -31,7 +31,7 @@ class Seat:
 
     def __init__(self, node, monkeypatch):
         self.now_s, self.said, self.made = 1000.0, [], dict.fromkeys(TAKES, 0)
-        monkeypatch.setattr(participants, "time", SimpleNamespace(monotonic=lambda: self.now_s))
+        monkeypatch.setattr(player, "time", SimpleNamespace(monotonic=lambda: self.now_s))
         self.player = Participants(node, self.said.append)
 
     def hears(self, name, *, behind=0, replay=None, busy=False):

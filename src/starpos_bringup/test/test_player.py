@@ -8,8 +8,8 @@ from rclpy.serialization import serialize_message
 from sensor_msgs.msg import Image, Imu
 from std_msgs.msg import String
 
-from starpos_bringup.recording.bag import Topic
-from starpos_bringup.recording.player import FRAMES, IMU, Player
+from starpos_bringup.bag import Topic
+from starpos_bringup.player import FRAMES, IMU, Player
 from starpos_interfaces.msg import StarArray, Taken
 from starpos_testing.nodes import take_domain
 

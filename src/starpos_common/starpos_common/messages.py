@@ -14,9 +14,8 @@ from std_msgs.msg import Header
 from starpos import rotation
 from starpos.errors import TimeError
 from starpos.fix.camera_attitude import CameraAttitude
-from starpos.frames.frame import Frame
-from starpos.frames.shutter import Shutter
-from starpos.frames.stars import Stars
+from starpos.frames.exposure import Shutter
+from starpos.frames.frame import Frame, Stars
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import Tilt
 from starpos_interfaces import msg

@@ -1,21 +1,57 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The main function of every node: start, spin, and end cleanly whatever signal comes, whenever it comes.
-
-Nothing heavy is imported before the signal handlers are in place, so that a signal during start-up also gives a
-clean exit. The module of an executable therefore imports its node inside `make_nodes`.
+"""The main function of every node: start, spin, and end cleanly whatever signal comes, whenever it comes.  Nothing heavy
+is imported before the signal handlers are in place, so that a signal during start-up also gives a clean exit. The
+module of an executable therefore imports its node inside `make_nodes`.
 """
 
+import contextlib
 import os
+import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
-
-from starpos_common.stop_signals import stop_signals
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from rclpy.node import Node
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+
+@contextlib.contextmanager
+def stop_signals() -> Iterator[list[int]]:
+    """Give a list that every such signal is added to; after the block they are ignored, for good.
+
+    launch sends a second SIGINT: Python's own handler must not get it while the interpreter ends.
+    """
+    stopped: list[int] = []
+    for number in SIGNALS:
+        signal.signal(number, lambda signum, frame: stopped.append(signum))
+    try:
+        yield stopped
+    finally:
+        if not isinstance(sys.unraisablehook, _UnlessLate):
+            sys.unraisablehook = _UnlessLate(sys.unraisablehook)
+        for number in SIGNALS:
+            signal.signal(number, signal.SIG_IGN)
+
+
+class _UnlessLate:
+    """A hook for uncaught errors, except from signals that came while they were being ignored.
+
+    Another thread may take a signal before the change and note it after; Python then prints "ignored due to race
+    condition". No order of calls prevents it.
+    """
+
+    def __init__(self, told: Callable[[Any], Any]) -> None:
+        self._told = told
+
+    def __call__(self, unraisable: Any) -> None:
+        error = unraisable.exc_value
+        if not (isinstance(error, OSError) and "ignored due to race condition" in str(error)):
+            self._told(unraisable)
+
 
 # rclpy's signal handler wakes the executor at once, but rarely misses it when two signals come together (rclpy 7.1).
 # So the main loop looks itself that often.

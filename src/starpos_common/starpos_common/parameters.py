@@ -1,7 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Parameters from one table: declared with descriptors, refused with a sentence, applied once they are set."""
+"""Parameters from one table: declared with descriptors, refused with a sentence, applied once they are set, and
+explained.
+"""
 
 import math
+import textwrap
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
@@ -11,7 +14,6 @@ from rclpy.node import Node
 
 from starpos.session.parameter import FRAME_NAME, Form, Parameter, ParameterError
 
-# for the tables of the nodes
 __all__ = [
     "FRAME_NAME",
     "Form",
@@ -23,6 +25,8 @@ __all__ = [
     "warn_of_unknown",
     "yaml_value",
 ]
+
+# for the tables of the nodes
 
 INT64_MIN, INT64_MAX = -(2**63), 2**63 - 1
 
@@ -196,3 +200,28 @@ def yaml_value(value: Any) -> str:
         # rcl's YAML parser reads 1e5, which has no point, as a text.
         return repr(value) if "e" not in repr(value) else f"{value:.17f}".rstrip("0")
     return str(value)
+
+
+WIDTH = 110
+HOW = """A parameter is set with -p NAME:=VALUE, or in a FILE like config/starpos.yaml of starpos_bringup;
+most also while the node runs: ros2 param set /{node} NAME VALUE. -r __ns:=/NAMESPACE moves its topics and services.
+The README of {package} says what it hears and publishes.
+"""
+
+
+def node_help(package: str, executable: str, about: str, nodes: Mapping[str, Sequence[Parameter]]) -> str:
+    """Write what an executable is, how its parameters are set, and each of them; nodes: the parameters of each node."""
+    options = "[-p NAME:=VALUE]... [--params-file FILE] [-r FROM:=TO]..."
+    usage = f"usage: ros2 run {package} {executable} [--ros-args {options}]"
+    lines = [usage, "", about, "", HOW.rstrip().format(package=package, node=next(iter(nodes)))]
+    for node, parameters in nodes.items():
+        lines += ["", f"parameters of the node {node}:"]
+        lines += [line for p in parameters for line in _lines(p)]
+    return "\n".join(lines)
+
+
+def _lines(parameter: Parameter) -> Iterator[str]:
+    fixed = "; fixed while the node runs" if parameter.read_only else ""
+    said = f"{parameter.description} Must be {parameter.constraint}{fixed}."
+    yield f"  {parameter.name}: {yaml_value(parameter.default)}"
+    yield textwrap.fill(said, WIDTH, initial_indent="      ", subsequent_indent="      ")

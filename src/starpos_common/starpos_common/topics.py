@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Publishers and subscriptions whose QoS the user may override for each topic (parameters `qos_overrides.TOPIC...`)."""
+"""Publishers and subscriptions: QoS that the user may override, a driver's reliability, lost messages, other publishers.
+The QoS of each topic is in the parameters `qos_overrides.TOPIC...`.
+"""
 
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from typing import Any, TypeVar
 
 from rclpy._rclpy_pybind11 import RCLError
@@ -12,6 +14,7 @@ from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import InvalidQosOverridesError, QosCallbackResult, QoSOverridingOptions
 from rclpy.subscription import Subscription
+from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from starpos_common.parameters import ParameterError
 
@@ -107,3 +110,169 @@ def _made(node: Node, topic: str, make: Callable[[], T]) -> T:
         # The policy has no such value, or the depth is not allowed.
         name = f"qos_overrides.{node.resolve_topic_name(topic)}"
         raise ParameterError(f"{name}: {error}.") from None
+
+
+RELIABLE, BEST_EFFORT = ReliabilityPolicy.RELIABLE, ReliabilityPolicy.BEST_EFFORT
+# maximum number of publishers and topics named in a sentence
+MAX_NAMED = 3
+
+
+class MatchedSubscription:
+    """A subscription that is reliable unless all publishers of its topic offer best effort only.
+
+    Reliable ones do not hear best effort at all, and best effort loses most large images of a reliable publisher.
+    Where the user's qos_overrides say best effort, it stays so.
+    """
+
+    def __init__(self, node: Node, kind: type, topic: str, callback: Take, depth: int) -> None:
+        self._node, self._kind = node, kind
+        # rclpy's types know callbacks of one argument only
+        self._callback: Callable[..., Any] = callback
+        self._subscription = subscription(
+            node, kind, topic, callback, depth, events=SubscriptionEventCallbacks(use_default_callbacks=False)
+        )
+        self.topic = self._subscription.topic_name
+        self._qos: QoSProfile = self._subscription.qos_profile
+        self._fixed = self._qos.reliability != RELIABLE
+        package = kind.__module__.partition(".")[0]
+        self._type = f"{package}/msg/{kind.__name__}"
+
+    @property
+    def publishers(self) -> list[TopicEndpointInfo]:
+        """The publishers of this topic and type that the graph shows."""
+        return [p for p in self._offered() if p.topic_type == self._type]
+
+    def look(self) -> None:
+        """Take the reliability that is offered now."""
+        offered = {p.qos_profile.reliability for p in self.publishers}
+        wanted = BEST_EFFORT if offered == {BEST_EFFORT} else RELIABLE
+        if self._fixed or wanted == self._qos.reliability:
+            return
+        self._qos = QoSProfile(history=self._qos.history, depth=self._qos.depth, reliability=wanted)
+        self.destroy()
+        self._subscription = self._node.create_subscription(
+            self._kind,
+            self.topic,
+            self._callback,
+            self._qos,
+            event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
+        )
+        how = "best effort, as its publisher" if wanted == BEST_EFFORT else "reliably"
+        self._node.get_logger().info(f"{self.topic} is heard {how}.")
+
+    def destroy(self) -> None:
+        self._node.destroy_subscription(self._subscription)
+
+    def unheard(self) -> str:
+        """Sentence on the publishers that cannot be heard and why; '' without any."""
+        others = [p for p in self._offered() if p.topic_type != self._type]
+        if others:
+            kinds = _named({p.topic_type for p in others})
+            return (
+                f"{_nodes(others)} sends {kinds} on {self.topic}, which takes {self._type}: remap it to the topic "
+                "that carries this type."
+            )
+        silent = [p for p in self.publishers if self._qos.reliability == RELIABLE]
+        silent = [p for p in silent if p.qos_profile.reliability == BEST_EFFORT]
+        if not silent:
+            return ""
+        return (
+            f"{_nodes(silent)} cannot be heard on {self.topic}: it offers best effort, and another publisher of the "
+            "same topic reliable delivery. Give one of them another topic."
+        )
+
+    def elsewhere(self) -> str:
+        """The other topics that carry this type, as the rest of a sentence; '' without any."""
+        topics = [
+            name
+            for name, types in self._node.get_topic_names_and_types()
+            if self._type in types and name != self.topic and self._node.count_publishers(name)
+        ]
+        return _named(topics)
+
+    def _offered(self) -> list[TopicEndpointInfo]:
+        return self._node.get_publishers_info_by_topic(self.topic)
+
+
+def _nodes(publishers: Sequence[TopicEndpointInfo]) -> str:
+    return _named({f"{p.node_namespace.rstrip('/')}/{p.node_name}" for p in publishers})
+
+
+def _named(names: Collection[str]) -> str:
+    shown = sorted(names)
+    more = f" and {len(shown) - MAX_NAMED} more" if len(shown) > MAX_NAMED else ""
+    return ", ".join(shown[:MAX_NAMED]) + more
+
+
+class Dropped:
+    """Counts them by topic, and warns at the first of each, with the cure.
+
+    This works for a single publisher: a topic with several is not reported.
+    """
+
+    def __init__(self, node: Node, cure: str) -> None:
+        self._node, self._cure = node, cure
+        self.counts: dict[str, int] = {}
+        self._warned: set[str] = set()
+        self._last: dict[str, int] = {}
+        # messages that a publisher sent before the first received one, until the graph shows the publisher
+        self._before: dict[str, int] = {}
+
+    def came(self, name: str, info: Mapping[str, Any]) -> None:
+        """Note a message of a topic, by its relative name, and the middleware's information on it."""
+        number = info.get("publication_sequence_number")
+        if number is None:
+            return
+        last = self._last.get(name)
+        self._last[name] = number
+        # a lower number comes from another publisher
+        if last is None or number < last:
+            self._before[name] = number - 1
+        elif number - last > 1:
+            self._note_missing(name, number - last - 1)
+        if name in self._before:
+            self._note_before(name)
+
+    def _note_missing(self, name: str, missing: int) -> None:
+        topic = self._node.resolve_topic_name(name)
+        if self._node.count_publishers(topic) > 1:
+            return
+        if name not in self._warned:
+            self._warned.add(name)
+            self._node.get_logger().warning(
+                f"{topic}: {missing} messages were dropped on the way: {self._cure}"
+            )
+        self.counts[name] = self.counts.get(name, 0) + missing
+
+    def _note_before(self, name: str) -> None:
+        topic = self._node.resolve_topic_name(name)
+        publishers = self._node.get_publishers_info_by_topic(topic)
+        if not publishers:
+            return
+        missing = self._before.pop(name)
+        # of a latched topic the newest message is all there is
+        if (
+            missing
+            and len(publishers) == 1
+            and publishers[0].qos_profile.durability == DurabilityPolicy.VOLATILE
+        ):
+            self.counts[name] = self.counts.get(name, 0) + missing
+            self._node.get_logger().warning(
+                f"{topic}: {missing} messages came before this node listened: start it first"
+            )
+
+
+def other_publishers(node: Node, publishers: Iterable[Publisher]) -> str:
+    """Sentence that names them and the remap that ends it; '' without any."""
+    own = node.get_fully_qualified_name()
+    said = []
+    for publisher in publishers:
+        offered = node.get_publishers_info_by_topic(publisher.topic_name)
+        names = {f"{p.node_namespace.rstrip('/')}/{p.node_name}" for p in offered} - {own}
+        if names:
+            name = publisher.topic_name.removeprefix(node.get_namespace().rstrip("/") + "/")
+            said.append(
+                f"{', '.join(sorted(names))} publishes on {publisher.topic_name}, too: put this node's elsewhere "
+                f"(-r {name}:=stars/{name}, or outputs:=stars of the launch files)"
+            )
+    return "; ".join(said)

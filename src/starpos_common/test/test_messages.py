@@ -12,9 +12,8 @@ from rclpy.serialization import serialize_message
 from sensor_msgs.msg import CameraInfo, Image
 
 from starpos.errors import FrameError, InstrumentError, TiltError, TimeError
-from starpos.frames.frame import Frame
-from starpos.frames.shutter import GLOBAL, Shutter
-from starpos.frames.stars import EDGE, Stars, no_stars
+from starpos.frames.exposure import GLOBAL_SHUTTER, Shutter
+from starpos.frames.frame import EDGE, Frame, Stars, no_stars
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import Tilt
 from starpos.messages import tilt as tilts
@@ -95,7 +94,7 @@ def test_stars_round_trip(heard):
     assert got.mid_unix_s == pytest.approx(MID, abs=1e-6)
 
 
-@pytest.mark.parametrize("shutter", [None, GLOBAL, Shutter(-0.03, 0.001)])
+@pytest.mark.parametrize("shutter", [None, GLOBAL_SHUTTER, Shutter(-0.03, 0.001)])
 def test_the_shutter_of_stars_round_trips(heard, shutter):
     message = heard(messages.stars_to_message(replace(stars(), shutter=shutter), "c"))
     assert message_to_stars(message).shutter == shutter
@@ -103,7 +102,7 @@ def test_the_shutter_of_stars_round_trips(heard, shutter):
 
 
 def test_a_shutter_that_cannot_be_is_refused(heard):
-    message = messages.stars_to_message(replace(stars(), shutter=GLOBAL), "c")
+    message = messages.stars_to_message(replace(stars(), shutter=GLOBAL_SHUTTER), "c")
     message.readout = math.nan
     with pytest.raises(FrameError, match="readout"):
         message_to_stars(heard(message))

@@ -11,8 +11,8 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_msgs.msg import Header
 
 from starpos_common import replayed
-from starpos_common.dropped import Dropped
 from starpos_common.replayed import ENDED_S, SILENT_S, Replayed
+from starpos_common.topics import Dropped
 from starpos_interfaces.msg import Played, Tilt
 from starpos_testing.nodes import take_domain
 

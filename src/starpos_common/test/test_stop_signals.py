@@ -9,7 +9,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from starpos_common import stop_signals
+from starpos_common import node_main
 
 SENDER = """
 import os, signal
@@ -26,7 +26,7 @@ HEARD = 1000
 @pytest.fixture
 def sender():
     """A process that sends this one SIGINT as fast as it can."""
-    handlers = {number: signal.signal(number, signal.SIG_IGN) for number in stop_signals.SIGNALS}
+    handlers = {number: signal.signal(number, signal.SIG_IGN) for number in node_main.SIGNALS}
     command = [sys.executable, "-c", SENDER.format(os.getpid())]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout.readline() == "sending\n"
@@ -40,7 +40,7 @@ def test_a_signal_in_the_moment_it_is_ignored_is_no_error(sender, monkeypatch):
     said, heard = [], 0
     monkeypatch.setattr(sys, "unraisablehook", said.append)
     while heard < HEARD:
-        with stop_signals.stop_signals() as stopped:
+        with node_main.stop_signals() as stopped:
             while not stopped:
                 pass
         heard += len(stopped)
@@ -50,10 +50,10 @@ def test_a_signal_in_the_moment_it_is_ignored_is_no_error(sender, monkeypatch):
 def test_other_errors_that_nobody_catches_are_told(monkeypatch):
     said = []
     monkeypatch.setattr(sys, "unraisablehook", said.append)
-    handlers = [signal.getsignal(number) for number in stop_signals.SIGNALS]
-    with stop_signals.stop_signals():
+    handlers = [signal.getsignal(number) for number in node_main.SIGNALS]
+    with node_main.stop_signals():
         pass
-    for number, handler in zip(stop_signals.SIGNALS, handlers, strict=True):
+    for number, handler in zip(node_main.SIGNALS, handlers, strict=True):
         signal.signal(number, handler)
     for error in (OSError("broken"), ValueError("Signal 2 ignored due to race condition")):
         sys.unraisablehook(SimpleNamespace(exc_value=error))
@@ -63,7 +63,7 @@ def test_other_errors_that_nobody_catches_are_told(monkeypatch):
 def test_signals_are_counted_in_the_block_and_ignored_after_it():
     script = (
         "import os, signal\n"
-        "from starpos_common.stop_signals import SIGNALS, stop_signals\n"
+        "from starpos_common.node_main import SIGNALS, stop_signals\n"
         "with stop_signals() as stopped:\n"
         "    for number in SIGNALS:\n"
         "        os.kill(os.getpid(), number)\n"

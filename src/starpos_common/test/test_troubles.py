@@ -4,15 +4,15 @@
 import pytest
 import rclpy
 
-from starpos_common import troubles
-from starpos_common.troubles import MAX_KINDS, QUIET_S, Troubles
+from starpos_common import diagnostics
+from starpos_common.diagnostics import MAX_KINDS, QUIET_S, Troubles
 from starpos_testing.nodes import take_domain
 
 
 @pytest.fixture
 def clock(monkeypatch):
     now = [100.0]
-    monkeypatch.setattr(troubles.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(diagnostics.time, "monotonic", lambda: now[0])
     return now
 
 

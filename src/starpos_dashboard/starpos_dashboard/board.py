@@ -1,17 +1,177 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The newest message of each kind and when it came: the state that a page shows."""
+"""The newest message of each kind as JSON for the page, in the units that people read, and when it came.  A number that
+is not finite becomes null. A text is shortened and loses characters that could rearrange the text of the page. An
+inconsistent message is shown as trouble, never as a value.
+"""
 
 import json
+import math
 import time
 from collections import deque
 from collections.abc import Callable
 from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticArray
-from sensor_msgs.msg import Imu, NavSatFix
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from sensor_msgs.msg import Imu, NavSatFix, NavSatStatus
 
-from starpos_dashboard import readings
+from starpos.messages.stamp import stamp_to_unix
 from starpos_interfaces.msg import GnssCheck, Solution, Tilt
+
+# Maximum length of a text from outside.
+NAME_LETTERS, SENTENCE_LETTERS = 80, 300
+# Maximum number of terms of an error budget, and of warnings of an identification.
+TERMS, WARNINGS = 16, 4
+# Levels of DiagnosticStatus.
+STALE, ERROR = 3, 2
+# Tolerance on the length of a quaternion.
+UNIT = 1e-3
+TILT_FLAGS = (
+    (Tilt.OUT_OF_RANGE, "beyond the sensor's range"),
+    (Tilt.STUCK, "the sensor repeats one value"),
+    (Tilt.SATURATED, "the converter is at its limit"),
+    (Tilt.GAP, "readings were lost"),
+    (Tilt.TIME_UNKNOWN, "its time is unknown"),
+)
+
+GNSS_WORDS = {
+    GnssCheck.LEARNING: "learning",
+    GnssCheck.AGREES: "agrees",
+    GnssCheck.DOUBTFUL: "doubtful",
+    GnssCheck.DISAGREES: "disagrees",
+}
+
+
+def number(value: float) -> float | None:
+    """Return a number, None if it is not finite: JSON cannot hold it, and it must not be read as a number."""
+    value = float(value)
+    return value if math.isfinite(value) else None
+
+
+def text(value: str, letters: int = SENTENCE_LETTERS) -> str:
+    """Shorten a text to one line, without control characters and marks that change the reading direction."""
+    line = "".join(c if c.isprintable() else " " for c in value[: 2 * letters])
+    line = " ".join(line.split())
+    return line if len(line) <= letters else line[: letters - 1] + "…"
+
+
+def position(message: NavSatFix) -> dict:
+    """Place [deg], altitude [m], covariance of (east, north) [m2] as [ee, en, nn]; good: False if it is no fix."""
+    told: dict[str, Any] = {"good": False, "trouble": "", "stamp": stamp_to_unix(message.header.stamp)}
+    latitude, longitude = number(message.latitude), number(message.longitude)
+    if message.status.status == NavSatStatus.STATUS_NO_FIX:
+        return told | {"trouble": "no fix"}
+    if latitude is None or longitude is None or abs(latitude) > 90 or abs(longitude) > 360:
+        return told | {"trouble": "the position is not on Earth: it is not shown"}
+    covariance = _covariance(message)
+    return told | {
+        "good": True,
+        "trouble": "" if covariance else "its error is not known",
+        "latitude": latitude,
+        "longitude": math.remainder(longitude, 360.0),
+        "altitude": number(message.altitude),
+        "covariance": covariance,
+    }
+
+
+def _covariance(message: NavSatFix) -> list[float] | None:
+    if message.position_covariance_type == NavSatFix.COVARIANCE_TYPE_UNKNOWN:
+        return None
+    ee, en, _, ne, nn = (float(v) for v in message.position_covariance[:5])
+    sound = all(map(math.isfinite, (ee, en, ne, nn))) and ee > 0 and nn > 0 and ee * nn >= en * en
+    return [ee, (en + ne) / 2, nn] if sound else None
+
+
+def heading(message: Imu) -> dict | None:
+    """Azimuth of the frame's x axis, clockwise from north, and its sigma [deg]; None if there is no attitude."""
+    q = message.orientation
+    x, y, z, w = q.x, q.y, q.z, q.w
+    length = math.sqrt(x * x + y * y + z * z + w * w)
+    if message.orientation_covariance[0] == -1 or not abs(length - 1) < UNIT:
+        return None
+    east, north = 1 - 2 * (y * y + z * z), 2 * (x * y + w * z)
+    variance = float(message.orientation_covariance[8])
+    return {
+        "azimuth": math.degrees(math.atan2(east, north)) % 360.0,
+        "sigma": math.degrees(math.sqrt(variance)) if 0 < variance < math.inf else None,
+        "frame": text(message.header.frame_id, NAME_LETTERS),
+        "stamp": stamp_to_unix(message.header.stamp),
+    }
+
+
+def tilt(message: Tilt) -> dict:
+    """Elevations of the inclinometer's axes and their sigmas [deg], temperature [deg C], the flags in words."""
+    xx, _, _, yy = (float(v) for v in message.covariance)
+    sigma_x, sigma_y = (math.degrees(math.sqrt(v)) if 0 < v < math.inf else None for v in (xx, yy))
+    return {
+        "x": number(math.degrees(message.x)),
+        "y": number(math.degrees(message.y)),
+        "sigma_x": sigma_x,
+        "sigma_y": sigma_y,
+        "temperature": number(message.temperature),
+        "flags": [said for flag, said in TILT_FLAGS if message.flags & flag],
+    }
+
+
+def gnss(message: GnssCheck) -> dict | None:
+    """Place [deg] of GNSS, and its comparison with the stars; None for an unknown status."""
+    if message.status not in GNSS_WORDS:
+        return None
+    latitude, longitude = number(message.latitude), number(message.longitude)
+    on_earth = latitude is not None and longitude is not None and max(abs(latitude), abs(longitude) / 4) <= 90
+    return {
+        "status": GNSS_WORDS[message.status],
+        "sentence": text(message.status_text),
+        "latitude": latitude if on_earth else None,
+        "longitude": longitude if on_earth else None,
+        "stamp": stamp_to_unix(message.header.stamp),
+    }
+
+
+def solution(message: Solution) -> dict:
+    """Result of the newest frame in words and counts, and the error budget (1 sigma: position [m], heading [deg])."""
+    terms = [
+        {
+            "name": text(term.name, NAME_LETTERS),
+            "position": number(np.hypot(term.east, term.north)),
+            "heading": number(term.heading),
+            "common": bool(term.common),
+        }
+        for term in message.budget[:TERMS]
+    ]
+    return {
+        "good": message.status == Solution.OK,
+        "sentence": text(message.status_text),
+        "stars_detected": int(message.stars_detected),
+        "stars_matched": int(message.stars_matched),
+        "residual": number(message.residual),
+        "warnings": [text(w, NAME_LETTERS) for w in message.warnings[:WARNINGS]],
+        "budget": terms,
+        "stamp": stamp_to_unix(message.header.stamp),
+    }
+
+
+def seen_from(namespace: str, name: str) -> str:
+    """Name of a diagnostic seen from a namespace: `solver: Solution` inside it, else whole: `/b/solver: Solution`."""
+    whole = name if name.startswith("/") else f"/{name}"
+    return whole.removeprefix(namespace.rstrip("/") + "/")
+
+
+def light(status: DiagnosticStatus, name: str) -> dict:
+    """Convert a diagnostic to a light; a level other than the four is an error."""
+    level = status.level[0] if isinstance(status.level, bytes) else int(status.level)
+    return {
+        "name": text(name, NAME_LETTERS),
+        "level": level if 0 <= level <= STALE else ERROR,
+        "sentence": text(status.message),
+    }
+
+
+def silence(node: str) -> dict:
+    """Make the light of a node that has said nothing yet; otherwise an all-green page might lack the solver."""
+    name = text(node, NAME_LETTERS)
+    return {"name": name, "level": STALE, "sentence": "nothing heard yet"}
+
 
 # Age at which messages of 1 Hz or faster are old.
 FAST_S = 5.0
@@ -54,7 +214,7 @@ class Board:
         return tuple(self._track)
 
     def hear_fix(self, message: NavSatFix) -> None:
-        told = readings.position(message)
+        told = position(message)
         self._keep("fix", told)
         if told["good"]:
             self._keep("last_fix", told)
@@ -62,27 +222,27 @@ class Board:
             self._track.append((self._count, told["latitude"], told["longitude"]))
 
     def hear_average(self, message: NavSatFix) -> None:
-        self._keep("averaged", readings.position(message))
+        self._keep("averaged", position(message))
 
     def hear_heading(self, message: Imu) -> None:
-        self._keep("heading", readings.heading(message))
+        self._keep("heading", heading(message))
 
     def hear_tilt(self, message: Tilt) -> None:
-        self._keep("tilt", readings.tilt(message))
+        self._keep("tilt", tilt(message))
 
     def hear_solution(self, message: Solution) -> None:
-        self._keep("solution", readings.solution(message))
+        self._keep("solution", solution(message))
 
     def hear_gnss(self, message: GnssCheck) -> None:
-        self._keep("gnss", readings.gnss(message))
+        self._keep("gnss", gnss(message))
 
     def hear_diagnostics(self, message: DiagnosticArray) -> None:
         """Keep the diagnostics of the nodes that have lights."""
         for status in message.status[:STATUSES]:
-            name = readings.seen_from(self._namespace, status.name)
+            name = seen_from(self._namespace, status.name)
             if self._nodes and _node_of(name) not in self._nodes:
                 continue
-            told = readings.light(status, name)
+            told = light(status, name)
             # The newest has to be the last.
             self._lights.pop(told["name"], None)
             self._lights[told["name"]] = self._clock(), told
@@ -92,7 +252,7 @@ class Board:
 
     def show_frame(self, number: int, stamp_s: float | None, trouble: str = "") -> None:
         """Note the number of a picture, or why it is missing."""
-        self._keep("frame", {"number": number, "stamp": stamp_s, "trouble": readings.text(trouble)})
+        self._keep("frame", {"number": number, "stamp": stamp_s, "trouble": text(trouble)})
 
     def hide_frame(self) -> None:
         """Forget the frame, because no page shows it and it would get old."""
@@ -105,7 +265,7 @@ class Board:
             self._lights = {n: light for n, light in self._lights.items() if _node_of(n) in self._nodes}
 
     def _seen(self, nodes: frozenset[str]) -> frozenset[str]:
-        return frozenset(readings.seen_from(self._namespace, n) if n[0] == "/" else n for n in nodes)
+        return frozenset(seen_from(self._namespace, n) if n[0] == "/" else n for n in nodes)
 
     def _keep(self, name: str, told: dict[str, Any] | None) -> None:
         self.changed = True
@@ -126,7 +286,7 @@ class Board:
         }
         lights = [{**light, "age": now - since} for since, light in self._lights.values()]
         silent = self._nodes - {_node_of(name) for name in self._lights}
-        lights += [{**readings.silence(node), "age": now - self._since} for node in silent]
+        lights += [{**silence(node), "age": now - self._since} for node in silent]
         told["lights"] = sorted(lights, key=lambda light: light["name"])
         told["now"] = now_s
         told["old_after"] = {"slow": slow_s, "fast": min(FAST_S, slow_s)}

@@ -17,7 +17,7 @@ def dashboard() -> int:
 
 def help_text() -> str:
     """What `--help` says."""
-    from starpos_common.node_help import node_help
+    from starpos_common.parameters import node_help
     from starpos_dashboard.parameters import PARAMETERS
 
     about = (

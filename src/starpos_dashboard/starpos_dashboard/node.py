@@ -3,6 +3,8 @@
 
 import time
 
+import cv2
+import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.clock import Clock
 from rclpy.clock_type import ClockType
@@ -11,15 +13,41 @@ from rclpy.subscription import Subscription
 from sensor_msgs.msg import Image, Imu, NavSatFix
 
 from starpos.errors import FrameError
+from starpos.messages.camera import message_to_frame
 from starpos.messages.stamp import stamp_to_unix
 from starpos_common.diagnostics import Diagnosis, Diagnostics, Level
 from starpos_common.parameters import declare
 from starpos_common.topics import subscription
-from starpos_dashboard import access, picture
+from starpos_dashboard import server
 from starpos_dashboard.board import Board
 from starpos_dashboard.parameters import PARAMETERS, names
 from starpos_dashboard.server import DashboardServer, listen
 from starpos_interfaces.msg import GnssCheck, Solution, Tilt
+
+ENCODINGS = ("bgr8", "mono8")
+LARGEST_PX = 1 << 26
+QUALITY = 82
+
+
+def jpeg(message: Image, side: int) -> bytes:
+    """Convert a picture to a JPEG of at most `side` px; FrameError if it is not a consistent picture of 8 bits."""
+    if message.encoding not in ENCODINGS:
+        raise FrameError(
+            f"the frame's encoding is {message.encoding[:32]!r}: only {', '.join(ENCODINGS)} are shown"
+        )
+    if message.width * message.height > LARGEST_PX:
+        raise FrameError(f"the frame has {message.width} x {message.height} px: it is too large to be shown")
+    pixels = message_to_frame(message, "the frame").pixels
+    height, width = pixels.shape[:2]
+    scale = side / max(height, width)
+    if scale < 1:
+        size = max(1, round(width * scale)), max(1, round(height * scale))
+        pixels = cv2.resize(np.ascontiguousarray(pixels), size, interpolation=cv2.INTER_AREA)
+    done, data = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
+    if not done:
+        raise FrameError(f"the frame of {width} x {height} px cannot be made a JPEG")
+    return data.tobytes()
+
 
 # Maximum interval between states sent to an open page, because ages grow even if no message comes.
 HEARTBEAT_S = 1.0
@@ -37,7 +65,7 @@ class DashboardNode(Node):
         address = self._values["address"]
         self._server = DashboardServer(
             listen(address, self._values["port"]),
-            access.own_names() | {address.lower()} | {n.lower() for n in names(self._values["hosts"])},
+            server.own_names() | {address.lower()} | {n.lower() for n in names(self._values["hosts"])},
             self._values["clients"],
         )
         # The newest that is not shown yet.
@@ -75,7 +103,7 @@ class DashboardNode(Node):
         host = f"[{address}]" if ":" in address else address
         self._url = f"http://{host}:{self._server.port}"
         self.get_logger().info(f"the instrument is shown at {self._url}")
-        if not access.is_loopback(address):
+        if not server.is_loopback(address):
             self.get_logger().warning(
                 f"every machine that reaches {address} can read there, without a password, where the instrument is"
             )
@@ -131,7 +159,7 @@ class DashboardNode(Node):
         self._shown += 1
         trouble = ""
         try:
-            self._server.show_frame(picture.jpeg(image, self._values["image_side"]))
+            self._server.show_frame(jpeg(image, self._values["image_side"]))
         except FrameError as e:
             trouble = str(e)
             self._server.show_frame(None)
@@ -144,7 +172,7 @@ class DashboardNode(Node):
             "pages": self._server.pages,
             "pages refused": self._server.refused,
             "frames shown": self._shown,
-            "loopback only": access.is_loopback(self._values["address"]),
+            "loopback only": server.is_loopback(self._values["address"]),
         }
         if not self._server.alive:
             trouble = self._server.trouble or "the server has ended"

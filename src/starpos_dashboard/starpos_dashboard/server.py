@@ -1,20 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
-"""HTTP server of the page, in a thread of its own: files of this package, the newest frame, and events.
+"""Rules of access: which requests are answered, and how a browser may show the page.
+
+HTTP server of the page, in a thread of its own: files of this package, the newest frame, and events.
 
 An open page is one request that does not end (server-sent events). A page gets the newest state whenever it has taken the
 one before. So a slow page misses some states, and a hung page is closed; neither delays anything or takes memory.
 """
 
 import asyncio
+import ipaddress
 import json
 import logging
+import re
+import socket
 import threading
 import weakref
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
 from importlib import resources
-from socket import socket
 from typing import Any
 
 from tornado.http1connection import HTTP1Connection
@@ -25,7 +29,55 @@ from tornado.web import Application, HTTPError, RequestHandler
 
 from starpos.errors import StarposError, one_line
 from starpos.report.coast import COAST_FILE
-from starpos_dashboard import access
+
+HOST_NAME = re.compile(r"\[[0-9a-fA-F:.%]+\]|[A-Za-z0-9._-]+")
+HEADERS = {
+    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; "
+    "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'; "
+    "require-trusted-types-for 'script'; trusted-types 'none'",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Permissions-Policy": "camera=(), geolocation=(), microphone=()",
+    "Referrer-Policy": "no-referrer",
+    "X-Content-Type-Options": "nosniff",
+    "X-Frame-Options": "DENY",
+}
+
+
+def own_names() -> frozenset[str]:
+    """The names of this machine."""
+    name = socket.gethostname().lower()
+    return frozenset({"localhost", name, f"{name}.local"})
+
+
+def is_loopback(address: str) -> bool:
+    """Whether only this machine reaches an address."""
+    try:
+        return ipaddress.ip_address(address).is_loopback
+    except ValueError:
+        return address == "localhost"
+
+
+def host_is_known(header: str, names: frozenset[str]) -> bool:
+    """Whether a request's Host is a plain address or one of the names.
+
+    A foreign page whose name was changed to lead here (DNS rebinding) sends its own name.
+    """
+    match = re.fullmatch(rf"({HOST_NAME.pattern})(:\d{{1,5}})?", header)
+    if not match:
+        return False
+    name = match[1].strip("[]").lower().rstrip(".")
+    try:
+        ipaddress.ip_address(name)
+        return True
+    except ValueError:
+        return name in names
+
+
+def comes_from_elsewhere(site: str | None, mode: str | None) -> bool:
+    """Whether another site's page asks, except by a link, judged by a browser's Sec-Fetch-Site and Sec-Fetch-Mode."""
+    return site not in (None, "none", "same-origin") and mode != "navigate"
+
 
 # For a page to take what is sent.
 PATIENCE_S = 10.0
@@ -61,7 +113,7 @@ class OpenPage:
     sent: int = 0
 
 
-def listen(address: str, port: int) -> list[socket]:
+def listen(address: str, port: int) -> list[socket.socket]:
     """Bind the sockets; DashboardError that says what to do if they cannot be bound."""
     try:
         return bind_sockets(port, address)
@@ -102,7 +154,7 @@ class DashboardServer:
     sockets: from `listen`.  names: host names under which it is served.  clients: maximum number of pages at once.
     """
 
-    def __init__(self, sockets: list[socket], names: frozenset[str], clients: int) -> None:
+    def __init__(self, sockets: list[socket.socket], names: frozenset[str], clients: int) -> None:
         self.clients = clients
         # Pages for which there was no place.
         self.refused = 0
@@ -226,7 +278,7 @@ class Reply(RequestHandler):
 
     def set_default_headers(self) -> None:
         self.clear_header("Server")
-        for name, value in access.HEADERS.items():
+        for name, value in HEADERS.items():
             self.set_header(name, value)
         self.set_header("Cache-Control", "no-store")
 
@@ -235,11 +287,11 @@ class Reply(RequestHandler):
         if self.request.method not in ("GET", "HEAD"):
             self.set_header("Allow", "GET, HEAD")
             raise HTTPError(405, reason="this page only shows: GET and HEAD")
-        if not access.host_is_known(headers.get("Host", ""), self.server.names):
+        if not host_is_known(headers.get("Host", ""), self.server.names):
             raise HTTPError(
                 421, reason="not served under this name: the parameter hosts lists those that are"
             )
-        if access.comes_from_elsewhere(headers.get("Sec-Fetch-Site"), headers.get("Sec-Fetch-Mode")):
+        if comes_from_elsewhere(headers.get("Sec-Fetch-Site"), headers.get("Sec-Fetch-Mode")):
             raise HTTPError(403, reason="not for pages of other sites")
 
     def write_error(self, status_code: int, **about: Any) -> None:

@@ -11,9 +11,9 @@ import said
 from sensor_msgs.msg import NavSatFix
 
 from starpos.errors import FrameError
-from starpos_dashboard import board, readings
+from starpos_dashboard import board
 from starpos_dashboard.board import Board
-from starpos_dashboard.picture import jpeg
+from starpos_dashboard.node import jpeg
 from starpos_interfaces.msg import Tilt
 
 NAN, INF = math.nan, math.inf
@@ -48,7 +48,7 @@ def test_a_fix_comes_with_its_covariance_and_where_it_was_before():
 def test_a_place_that_is_not_on_earth_is_no_fix(latitude, longitude):
     message = said.fix(1.0, longitude)
     message.latitude = latitude
-    assert not readings.position(message)["good"]
+    assert not board.position(message)["good"]
     b = Board(10, ALL)
     b.hear_fix(message)
     assert b.track == () and "last_fix" not in told(b)
@@ -58,19 +58,19 @@ def test_a_place_that_is_not_on_earth_is_no_fix(latitude, longitude):
     "covariance", [(NAN, 0.0, 1.0), (0.0, 0.0, 1.0), (-1.0, 0.0, 1.0), (1.0, 2.0, 1.0), (INF, 0.0, 1.0)]
 )
 def test_an_impossible_covariance_is_an_unknown_one(covariance):
-    place = readings.position(said.fix(1.0, 2.0, covariance))
+    place = board.position(said.fix(1.0, 2.0, covariance))
     assert place["good"] and place["covariance"] is None and place["trouble"]
 
 
 def test_a_covariance_of_unknown_type_is_not_used():
     message = said.fix(1.0, 2.0)
     message.position_covariance_type = NavSatFix.COVARIANCE_TYPE_UNKNOWN
-    assert readings.position(message)["covariance"] is None
+    assert board.position(message)["covariance"] is None
 
 
 @pytest.mark.parametrize("azimuth", [0.0, 90.0, 180.0, 270.0, 217.25])
 def test_the_heading_is_the_azimuth_of_the_x_axis(azimuth):
-    heading = readings.heading(said.imu(azimuth, 0.25))
+    heading = board.heading(said.imu(azimuth, 0.25))
     assert math.isclose(math.remainder(heading["azimuth"] - azimuth, 360.0), 0.0, abs_tol=1e-9)
     assert math.isclose(heading["sigma"], 0.25)
 
@@ -103,24 +103,24 @@ def test_nan_everywhere_is_null_everywhere():
 
 
 def test_a_gnss_place_that_is_not_on_earth_or_an_unknown_status_is_not_shown():
-    assert readings.gnss(said.gnss())["latitude"] == 48.1553
-    assert readings.gnss(said.gnss(latitude=math.nan))["latitude"] is None
-    assert readings.gnss(said.gnss(longitude=400.0))["longitude"] is None
-    assert readings.gnss(said.gnss(status=9)) is None
+    assert board.gnss(said.gnss())["latitude"] == 48.1553
+    assert board.gnss(said.gnss(latitude=math.nan))["latitude"] is None
+    assert board.gnss(said.gnss(longitude=400.0))["longitude"] is None
+    assert board.gnss(said.gnss(status=9)) is None
 
 
 def test_the_flags_of_a_tilt_are_said_in_words():
-    flags = readings.tilt(said.tilt(31.0, 0.0, flags=Tilt.OUT_OF_RANGE | Tilt.TIME_UNKNOWN))["flags"]
+    flags = board.tilt(said.tilt(31.0, 0.0, flags=Tilt.OUT_OF_RANGE | Tilt.TIME_UNKNOWN))["flags"]
     assert flags == ["beyond the sensor's range", "its time is unknown"]
     flags = {v for v in (getattr(Tilt, name) for name in dir(Tilt) if name.isupper()) if isinstance(v, int)}
-    assert {flag for flag, _ in readings.TILT_FLAGS} == flags
+    assert {flag for flag, _ in board.TILT_FLAGS} == flags
 
 
 def test_texts_are_short_and_cannot_rearrange_the_page():
-    assert readings.text("a\nb\x00c\u202ed\u2066e") == "a b c d e"
-    assert len(readings.text("x" * 10**6)) == readings.SENTENCE_LETTERS
+    assert board.text("a\nb\x00c\u202ed\u2066e") == "a b c d e"
+    assert len(board.text("x" * 10**6)) == board.SENTENCE_LETTERS
     # The page shows it as it is.
-    assert readings.text("<b>&amp;") == "<b>&amp;"
+    assert board.text("<b>&amp;") == "<b>&amp;"
 
 
 def test_lights_are_the_newest_of_their_name_and_bounded():
@@ -132,7 +132,7 @@ def test_lights_are_the_newest_of_their_name_and_bounded():
     b.hear_diagnostics(said.diagnostics(("solver: Inputs", 1, "bad"), ("x: Y", 200, "?")))
     assert [(x["name"], x["level"], x["age"]) for x in told(b)["lights"]] == [
         ("solver: Inputs", 1, 0.0),
-        ("x: Y", readings.ERROR, 0.0),
+        ("x: Y", board.ERROR, 0.0),
     ]
     for k in range(1000):
         b.hear_diagnostics(said.diagnostics((f"n{k}: T", 0, "")))
@@ -176,7 +176,7 @@ def test_a_node_that_has_said_nothing_has_a_light_too_or_all_seems_green_without
     lights = told(b)["lights"]
     assert [(x["name"], x["level"], x["age"]) for x in lights] == [
         ("camera: Capture", 0, 0.0),
-        ("solver", readings.STALE, 6.0),
+        ("solver", board.STALE, 6.0),
     ]
     b.only_lights_of(frozenset({"camera"}))
     assert len(told(b)["lights"]) == 1
@@ -185,7 +185,7 @@ def test_a_node_that_has_said_nothing_has_a_light_too_or_all_seems_green_without
 def test_a_hostile_budget_is_cut():
     message = said.solution()
     message.budget = message.budget * 500
-    assert len(readings.solution(message)["budget"]) == readings.TERMS
+    assert len(board.solution(message)["budget"]) == board.TERMS
 
 
 def test_the_track_forgets_its_oldest_and_counts_on():

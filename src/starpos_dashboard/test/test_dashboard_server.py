@@ -9,7 +9,7 @@ from contextlib import ExitStack, closing
 
 import pytest
 
-from starpos_dashboard import access
+from starpos_dashboard import server as access
 from starpos_testing.lacking import require
 from starpos_testing.patience import WAIT_S, until
 

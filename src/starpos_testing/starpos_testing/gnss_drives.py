@@ -10,8 +10,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from starpos.earth.ellipsoid import curvature_radii_m, enu_axes
-from starpos.gnss.place import GnssPlace
-from starpos.gnss.sighting import LevelSight
+from starpos.gnss.filter import LevelSight
+from starpos.gnss.receiver import GnssPlace
 from starpos.instrument.inclinometer import InclinometerErrors, Tilt
 from starpos.instrument.instrument import Calibration, Instrument
 from starpos.rotation import about_axis, from_vector

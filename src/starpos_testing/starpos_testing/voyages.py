@@ -10,9 +10,8 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
-from starpos.navigation.imu import ImuLog, ImuModel
+from starpos.navigation.records import ImuLog, ImuModel, VelocityLog
 from starpos.navigation.sightings import IdentifiedFrame
-from starpos.navigation.velocity import VelocityLog
 
 # Unix, in November 2026.
 BEGIN_S = 1.7937e9

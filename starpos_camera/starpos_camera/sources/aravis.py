@@ -1,17 +1,368 @@
 # SPDX-License-Identifier: Apache-2.0
-"""GenICam cameras (GigE Vision, USB3 Vision) through Aravis 0.8 and its GObject introspection."""
+"""Middle of an exposure from a GenICam camera's time of it, on its own clock.
 
+One GenICam camera through Aravis: its settings, its clock, and its buffers as pixels.
+
+Names of features follow GenICam's Standard Features Naming Convention and GigE Vision. Aravis's functions:
+https://aravisproject.github.io/docs/aravis-0.8/.
+
+GenICam cameras (GigE Vision, USB3 Vision) through Aravis 0.8 and its GObject introspection.
+"""
+
+import math
 import threading
 import time
 from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from importlib.util import find_spec
+from types import ModuleType
 from typing import Any
 
-from starpos.frames.frame import Frame
-from starpos_camera.sources.aravis_camera import AravisCamera, fault, library
-from starpos_camera.sources.aravis_times import FrameTimes, stamp_of_camera
+import numpy as np
+
+from starpos.errors import StarposError, one_line
+from starpos.frames.exposure import Shutter
+from starpos.frames.frame import MAX_PIXELS, Frame
 from starpos_camera.sources.source import CapturedFrame, CaptureError, CaptureSettings, FrameSource
+from starpos_camera.sources.timing import Stamp, middle_of_commanded, middle_of_started
 from starpos_common.parameters import Parameter
+from starpos_interfaces.msg import Capture
+
+# Between a camera's time and the moment of the light, where the clocks are related.
+TIMESTAMP_STDDEV_S = 1e-3
+# By so much a stamp may contradict the times of trigger and arrival.
+TOLERANCE_S = 5e-3
+
+
+@dataclass(frozen=True)
+class ClockRelation:
+    """Host's clock minus camera's clock (s), and its standard deviation."""
+
+    offset_s: float
+    stddev_s: float
+
+
+@dataclass(frozen=True)
+class FrameTimes:
+    """What is known of the time of one frame; all but camera_s in Unix seconds of the node's clock.
+
+    commanded_s  time just before the software trigger; None: a line has triggered
+    received_s   arrival of the frame's first or last data
+    camera_s     the frame's time on the camera's clock; None: not reported
+    relation     None: the camera does not let its clock be read
+    """
+
+    exposure_s: float
+    commanded_s: float | None
+    received_s: float
+    camera_s: float | None
+    relation: ClockRelation | None
+
+
+def stamp_of_camera(times: FrameTimes, moment: str, values: Mapping) -> Stamp:
+    """Choose the better stamp: from the camera's time, or from command or arrival alone.
+
+    moment: start, end or unknown: the moment of the exposure that the camera's times are of.
+    """
+    otherwise = _by_host(times, values)
+    if times.camera_s is None:
+        return otherwise
+    at_s, stddev_s = _on_host_clock(times)
+    if math.isnan(at_s):
+        return otherwise
+    earliest_s = -math.inf if times.commanded_s is None else times.commanded_s - TOLERANCE_S
+    half_s = times.exposure_s / 2
+    middles_s = {"start": at_s + half_s, "end": at_s - half_s}
+    possible = [
+        name
+        for name, mid_s in middles_s.items()
+        if mid_s - half_s >= earliest_s and mid_s + half_s <= times.received_s + TOLERANCE_S
+    ]
+    wanted = [name for name in possible if moment in (name, "unknown")]
+    if not wanted:
+        told = "its times of frames contradict trigger and arrival, and are not used"
+        return replace(otherwise, remark=told)
+    middle_s = sum(middles_s[name] for name in wanted) / len(wanted)
+    if len(wanted) > 1:
+        stddev_s = math.hypot(stddev_s, half_s)
+    if stddev_s > otherwise.stddev_s:
+        return otherwise
+    return Stamp(middle_s, stddev_s, Capture.HARDWARE)
+
+
+def _by_host(times: FrameTimes, values: Mapping) -> Stamp:
+    """Stamp from the command, or from the arrival of a frame that a line has triggered."""
+    if times.commanded_s is not None:
+        return Stamp(*middle_of_commanded(times.commanded_s, times.exposure_s, values), Capture.COMMAND)
+    start_s = times.received_s - times.exposure_s
+    return Stamp(*middle_of_started(start_s, 0.0, times.exposure_s, values), Capture.DRIVER)
+
+
+def _on_host_clock(times: FrameTimes) -> tuple[float, float]:
+    """The camera's time of a frame on the host's clock, and its standard deviation (s); NaN: the clocks are not related.
+
+    A camera whose clock cannot be read may keep UTC (PTP), but its error is not stated. Exposure and stamp then lie
+    anywhere between trigger and arrival: the error is the one of a stamp at either edge.
+    """
+    assert times.camera_s is not None
+    if times.relation is not None:
+        stddev_s = math.hypot(times.relation.stddev_s, TIMESTAMP_STDDEV_S)
+        return times.camera_s + times.relation.offset_s, stddev_s
+    if times.commanded_s is None or not times.commanded_s <= times.camera_s <= times.received_s + TOLERANCE_S:
+        return math.nan, math.nan
+    slack_s = max(0.0, times.received_s - times.commanded_s - times.exposure_s)
+    return times.camera_s, math.hypot(slack_s / math.sqrt(3), TIMESTAMP_STDDEV_S)
+
+
+# Buffers that wait for frames.
+BUFFERS = 4
+# Share by which the camera's exposure may differ from what was set.
+EXPOSURE_TOLERANCE = 0.01
+# A clock is read so often, and the quickest reading counts.
+CLOCK_READINGS = 5
+BITS = {"16": 16, "14": 14, "12": 12, "10": 10, "8": 8}
+PATTERNS = {"RG": "rggb", "GR": "grbg", "GB": "gbrg", "BG": "bggr"}
+# Names of unpacked formats (GenICam's Pixel Format Naming Convention): Bayer's pattern, '' for grey, and bits.
+FORMATS = {f"Mono{name}": ("", bits) for name, bits in BITS.items()} | {
+    f"Bayer{letters}{name}": (pattern, bits)
+    for name, bits in BITS.items()
+    for letters, pattern in PATTERNS.items()
+}
+# The commands that hold a clock, the features with what was held, and with the ticks of a second ('' for 1e9).
+CLOCKS = (
+    ("TimestampLatch", "TimestampLatchValue", ""),
+    ("GevTimestampControlLatch", "GevTimestampValue", "GevTimestampTickFrequency"),
+)
+
+
+@dataclass(frozen=True, eq=False)
+class ArrivedFrame:
+    """A frame as it came.
+
+    pixels      (height, width) uint8 or uint16
+    pattern     of its mosaic; '' for none
+    camera_s    its time on the camera's clock; None: not reported
+    received_s  its arrival, Unix time by the system's clock
+    """
+
+    pixels: np.ndarray
+    pattern: str
+    camera_s: float | None
+    received_s: float
+
+
+def library() -> ModuleType:
+    """Import Aravis; ImportError or ValueError if it is not installed."""
+    import gi
+
+    gi.require_version("Aravis", "0.8")
+    from gi.repository import Aravis
+
+    return Aravis
+
+
+def fault(error: Exception) -> str:
+    """Say in a sentence what an exception of Aravis means."""
+    if isinstance(error, StarposError):
+        return str(error)
+    words = one_line(getattr(error, "message", error)).rstrip(".")
+    return f"{words or type(error).__name__}; check its cable, its power, and programs that hold it."
+
+
+class AravisCamera:
+    """An open camera that acquires frames, each at a trigger."""
+
+    def __init__(self, values: Mapping) -> None:
+        self._aravis = library()
+        self._camera = self._aravis.Camera.new(_found(self._aravis, values["aravis.device"]))
+        self._exposure_s: float | None = None
+        self._gain: float | None = None
+        self._size = self._set_region(values["aravis.region_as_set"])
+        self._pattern, self._bits = self._set_format(values["aravis.pixel_format"])
+        self.shutter = self._shutter()
+        self._camera.set_acquisition_mode(self._aravis.AcquisitionMode.CONTINUOUS)
+        self._camera.set_trigger(values["aravis.trigger"])
+        self._stream = self._camera.create_stream(None, None)
+        if self._stream is None:
+            raise CaptureError("it sends no frames; another program holds it.")
+        for _ in range(BUFFERS):
+            self._stream.push_buffer(self._aravis.Buffer.new_allocate(self._camera.get_payload()))
+        self._camera.start_acquisition()
+
+    def release(self) -> None:
+        """Stop and forget the camera, which may have gone."""
+        with suppress(Exception):
+            self._camera.stop_acquisition()
+        self._stream = self._camera = None
+
+    def set_exposure(self, wanted_s: float | None) -> tuple[float, str]:
+        """Set the exposure if it was not set last; return the camera's own (s), and a remark if it is another one."""
+        camera = self._camera
+        if wanted_s is not None and wanted_s != self._exposure_s:
+            if camera.is_exposure_auto_available():
+                camera.set_exposure_time_auto(self._aravis.Auto.OFF)
+            camera.set_exposure_time(1e6 * wanted_s)
+            self._exposure_s = wanted_s
+        told_s = camera.get_exposure_time() / 1e6
+        if not (math.isfinite(told_s) and told_s > 0):
+            raise CaptureError(f"it says that its exposure is {told_s:g} s.")
+        if wanted_s is not None and abs(told_s - wanted_s) > EXPOSURE_TOLERANCE * wanted_s:
+            return told_s, f"it exposes for {told_s:g} s, not for {wanted_s:g} s"
+        return told_s, ""
+
+    def set_gain(self, wanted: float | None) -> str:
+        """Set the gain if it was not set last; return a remark if the camera has another one."""
+        camera = self._camera
+        if wanted is None:
+            return ""
+        if wanted != self._gain:
+            if camera.is_gain_auto_available():
+                camera.set_gain_auto(self._aravis.Auto.OFF)
+            camera.set_gain(wanted)
+            self._gain = wanted
+        told = camera.get_gain()
+        return (
+            "" if abs(told - wanted) <= 0.01 * max(1.0, wanted) else f"its gain is {told:g}, not {wanted:g}"
+        )
+
+    def trigger(self) -> None:
+        self._camera.software_trigger()
+
+    def drain(self) -> None:
+        """Leave out the frames that came before."""
+        while (buffer := self._stream.try_pop_buffer()) is not None:
+            self._stream.push_buffer(buffer)
+
+    def pop(self, patience_s: float) -> ArrivedFrame | None:
+        """Take the next frame; None if none comes in time. CaptureError if it is incomplete."""
+        buffer = self._stream.timeout_pop_buffer(round(1e6 * patience_s))
+        if buffer is None:
+            return None
+        try:
+            return self._read(buffer)
+        finally:
+            self._stream.push_buffer(buffer)
+
+    def clock_relation(self, now: Callable[[], float]) -> ClockRelation | None:
+        """Compare the camera's clock with `now` (Unix s); None if it cannot be read."""
+        return clock_relation(self._camera, now)
+
+    def _read(self, buffer: Any) -> ArrivedFrame:
+        if buffer.get_status() != self._aravis.BufferStatus.SUCCESS:
+            raise CaptureError(f"a frame is incomplete ({buffer.get_status().value_nick}).")
+        size = buffer.get_image_width(), buffer.get_image_height()
+        if size != self._size:
+            raise CaptureError(
+                f"a frame has {size[0]} x {size[1]} px, not {self._size[0]} x {self._size[1]}."
+            )
+        camera_ns = buffer.get_timestamp()
+        return ArrivedFrame(
+            pixels=pixels_of(buffer.get_data(), self._size, self._bits),
+            pattern=self._pattern,
+            camera_s=camera_ns * 1e-9 if camera_ns else None,
+            received_s=buffer.get_system_timestamp() * 1e-9,
+        )
+
+    def _set_region(self, as_set: bool) -> tuple[int, int]:
+        """Set the whole sensor, unless its present region is meant; return width and height (px)."""
+        camera = self._camera
+        sensor = camera.get_sensor_size()
+        if not as_set:
+            if camera.is_binning_available():
+                camera.set_binning(1, 1)
+            camera.set_region(0, 0, sensor.width, sensor.height)
+        region = camera.get_region()
+        if not as_set and (region.width, region.height) != (sensor.width, sensor.height):
+            raise CaptureError(
+                f"its frames have {region.width} x {region.height} px, its sensor {sensor.width} x {sensor.height}; "
+                "set aravis.region_as_set where that is meant."
+            )
+        if min(region.width, region.height) < 1 or region.width * region.height > MAX_PIXELS:
+            raise CaptureError(f"frames of {region.width} x {region.height} px cannot be used.")
+        return region.width, region.height
+
+    def _set_format(self, wanted: str) -> tuple[str, int]:
+        """Set the pixel format; return its pattern and bits."""
+        offered = self._camera.dup_available_pixel_formats_as_strings()
+        if wanted and (wanted not in FORMATS or wanted not in offered):
+            raise CaptureError(
+                f"aravis.pixel_format is {wanted}; it offers {' '.join(offered)}, and this source knows unpacked Mono "
+                "and Bayer formats."
+            )
+        name = wanted or best_format(offered, self._camera.get_pixel_format_as_string())
+        self._camera.set_pixel_format_from_string(name)
+        return FORMATS[name]
+
+    def _shutter(self) -> Shutter | None:
+        """A global shutter where the camera says that it has one; else nothing is known."""
+        name = "SensorShutterMode"
+        if self._camera.is_feature_available(name) and self._camera.get_string(name) == "Global":
+            return Shutter(0.0, 0.0)
+        return None
+
+
+def _found(aravis: ModuleType, wanted: str) -> str:
+    """Name the camera to open; CaptureError if it is not there."""
+    aravis.update_device_list()
+    names = [aravis.get_device_id(i) for i in range(aravis.get_n_devices())]
+    if wanted in names or (not wanted and len(names) == 1):
+        return wanted or names[0]
+    if not names:
+        raise CaptureError("no GenICam camera is found; check its cable, power and network address.")
+    raise CaptureError(f"aravis.device must be one of: {', '.join(names)}.")
+
+
+def best_format(offered: list[str], present: str) -> str:
+    """Choose the deepest format that is known; of a colour sensor its mosaic, of several the present one.
+
+    A mosaic alone has the sensor's own pixels: a colour camera makes its Mono by interpolation. A camera that offers
+    several patterns has only one at a time, so those other than the present format's are no choice.
+    """
+    known = [name for name in offered if name in FORMATS]
+    mosaics = [name for name in known if FORMATS[name][0]]
+    patterns = {FORMATS[name][0] for name in mosaics}
+    if len(patterns) > 1:
+        known = [name for name in known if FORMATS[name][0] == FORMATS.get(present, ("", 0))[0]]
+    elif mosaics:
+        known = mosaics
+    if not known:
+        raise CaptureError(
+            f"it offers {' '.join(offered)}; this source knows unpacked Mono and Bayer formats."
+        )
+    return max(known, key=lambda name: FORMATS[name][1])
+
+
+def pixels_of(data: bytes, size: tuple[int, int], bits: int) -> np.ndarray:
+    """Convert a buffer to pixels, (height, width) uint8 or uint16; CaptureError if it has another length."""
+    width, height = size
+    kind = np.dtype("u1" if bits == 8 else "<u2")
+    if len(data) != width * height * kind.itemsize:
+        raise CaptureError(f"a frame has {len(data)} bytes instead of {width * height * kind.itemsize}.")
+    pixels = np.frombuffer(data, kind).reshape(height, width)
+    return pixels.astype(kind.newbyteorder("="), copy=False)
+
+
+def clock_relation(camera: Any, now: Callable[[], float]) -> ClockRelation | None:
+    """Hold a camera's clock and read it between two readings of `now`; None if it has no such feature."""
+    known = (c for c in CLOCKS if camera.is_feature_available(c[0]) and camera.is_feature_available(c[1]))
+    latch, value, frequency = next(known, ("", "", ""))
+    if not latch:
+        return None
+    ticks_a_second = float(camera.get_integer(frequency)) if frequency else 1e9
+    if not ticks_a_second > 0:
+        return None
+    quickest: tuple[float, float] | None = None
+    for _ in range(CLOCK_READINGS):
+        before_s = now()
+        camera.execute_command(latch)
+        took_s = now() - before_s
+        camera_s = camera.get_integer(value) / ticks_a_second
+        if quickest is None or took_s < quickest[0]:
+            quickest = took_s, before_s + took_s / 2 - camera_s
+    assert quickest is not None
+    return ClockRelation(quickest[1], quickest[0] / math.sqrt(12))
+
 
 # A frame has to be here so long after its exposure.
 READOUT_S = 10.0

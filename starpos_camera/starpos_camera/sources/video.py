@@ -1,16 +1,427 @@
 # SPDX-License-Identifier: Apache-2.0
-"""V4L2 cameras and video files, through OpenCV."""
+"""OpenCV without its messages, for V4L2 cameras and video files.
+
+A Video4Linux camera through OpenCV: the sensor's own pixels if the camera sends them, the kernel's time of each frame.
+
+OpenCV's V4L2 backend (tried: 4.6 and 5.0) gives the kernel's buffer time as CAP_PROP_POS_MSEC. With
+CAP_PROP_CONVERT_RGB at 0 it gives the buffer itself, in the shape of its format or as plain bytes. It waits at most 10 s
+for a frame. Exposure is V4L2_CID_EXPOSURE_ABSOLUTE, in 100 us, if the menu of auto exposure is at 1. OpenCV does not
+report that a buffer is short, but the kernel's uvcvideo drops such frames (its parameter nodrop is 0).
+
+Frames of a video file, each with the time of its place in the file.
+
+V4L2 cameras and video files, through OpenCV.
+"""
 
 import math
+import os
 import threading
-from collections.abc import Callable, Mapping
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
 
-from starpos_camera.sources.source import CapturedFrame, CaptureSettings, FrameSource
+import numpy as np
+
+from starpos.errors import FrameError
+from starpos.frames.exposure import MAX_READOUT_S, Shutter
+from starpos.frames.frame import MAX_PIXELS, Frame
+from starpos_camera.sources.source import (
+    CapturedFrame,
+    CaptureError,
+    CaptureSettings,
+    FrameSource,
+    SourceEnded,
+)
 from starpos_camera.sources.timing import read_utc
-from starpos_camera.sources.v4l2 import FORMATS, V4l2Device
-from starpos_camera.sources.video_file import SUFFIXES, Film
 from starpos_common.parameters import Parameter
+from starpos_interfaces.msg import Capture
+
+if TYPE_CHECKING:
+    from cv2 import VideoCapture
+
+
+@contextmanager
+def quiet() -> Iterator[ModuleType]:
+    """Import cv2 and keep it from printing meanwhile: our own sentences report the errors."""
+    import cv2
+
+    # OpenCV 4.6 has the function at the top level.
+    log: Any = getattr(cv2.utils, "logging", cv2)
+    level = log.setLogLevel(0)
+    try:
+        yield cv2
+    finally:
+        log.setLogLevel(level)
+
+
+EXPOSURE_UNIT_S = 1e-4
+# V4L2_EXPOSURE_MANUAL
+MANUAL = 1
+# V4L2_EXPOSURE_AUTO, V4L2_EXPOSURE_APERTURE_PRIORITY.
+AUTOMATIC = (0, 3)
+MAX_EXPOSURE_S = 60.0
+# Number of frames that a camera may still take with the old settings.
+SETTLE_FRAMES = 4
+# Longest wait besides the time of the frames themselves.
+MAX_WAIT_S = 10.0
+# Frames per second if the driver reports none; a low value is the cautious one.
+DEFAULT_RATE = 5.0
+MAX_AGE_S = 600.0
+MONO = {"GREY": "u1", "Y16 ": "<u2", "Y12 ": "<u2", "Y10 ": "<u2"}
+# Index of Y in its pair of bytes.
+LUMA = {"YUYV": 0, "YVYU": 0, "UYVY": 1, "VYUY": 1}
+# In these formats all Y come first.
+PLANAR = ("NV12", "NV21", "YU12", "YV12")
+# Formats of 8, 10, 12 and 16 bits.
+MOSAIC = {
+    letters: (pattern, "<u2" if deep else "u1")
+    for pattern, family in {
+        "rggb": ("RGGB", "RG10", "RG12", "RG16"),
+        "bggr": ("BA81", "BG10", "BG12", "BYR2"),
+        "grbg": ("GRBG", "BA10", "BA12", "GR16"),
+        "gbrg": ("GBRG", "GB10", "GB12", "GB16"),
+    }.items()
+    for deep, letters in enumerate(family)
+}
+COLOUR = ("BGR3", "RGB3")
+JPEG = ("MJPG", "JPEG")
+FORMATS = (*MONO, *LUMA, *PLANAR, *MOSAIC, *COLOUR, *JPEG)
+
+
+class V4l2Device:
+    """Keeps the camera streaming; `capture` returns the first frame that was exposed after the call."""
+
+    def __init__(self, path: str, values: Mapping, now: Callable[[], float]) -> None:
+        self.closing = False
+        self._path = path
+        self._values = values
+        self._now = now
+        self._capture: VideoCapture | None = None
+        self._format, self._size = "", (0, 0)
+        # Exposure and gain that were set last.
+        self._set: tuple[float | None, float | None] | None = None
+        # Frames before this steady time have other settings.
+        self._not_before_s = 0.0
+
+    def capture(self, settings: CaptureSettings) -> CapturedFrame:
+        try:
+            with quiet() as cv2:
+                if self._capture is None:
+                    self._capture = self._opened(cv2)
+                camera = self._capture
+                exposure_s, remark = self._settings(cv2, camera, settings)
+                mid_s, stddev_s, stamp = self._grab(cv2, camera, exposure_s)
+                period_s = _period_s(cv2, camera)
+                came, raw = camera.retrieve()
+                if not came:
+                    raise CaptureError("it gave no frame.")
+                pixels, pattern = self._pixels(cv2, raw)
+        except Exception as error:
+            self.close()
+            text = str(error) if isinstance(error, CaptureError) else f"{type(error).__name__}: {error}."
+            raise CaptureError(f"{self._path}: {' '.join(text.split())}") from error
+        frame = Frame(
+            pixels,
+            pattern=pattern,
+            mid_unix_s=mid_s,
+            exposure_s=exposure_s,
+            source=self._path,
+            stamp_stddev_s=stddev_s,
+            # from either end, and no longer than from one frame to the next
+            shutter=Shutter(0.0, min(period_s, MAX_READOUT_S) / math.sqrt(3)),
+        )
+        return CapturedFrame(frame, stamp, remark=remark and f"{self._path}: {remark}")
+
+    def close(self) -> None:
+        if self._capture is not None:
+            self._capture.release()
+        self._capture = None
+
+    def _opened(self, cv2: ModuleType) -> "VideoCapture":
+        capture = cv2.VideoCapture(self._path, cv2.CAP_V4L2)
+        if not capture.isOpened():
+            raise CaptureError(
+                "it cannot be opened as a camera; it is unplugged, in use, or not yours (be in the group video)."
+            )
+        self._set = None
+        # Controls are in the driver's units, whatever the environment says.
+        capture.set(cv2.CAP_PROP_MODE, 0)
+        capture.set(cv2.CAP_PROP_CONVERT_RGB, 0)
+        wanted = self._values["video.format"].ljust(4) if self._values["video.format"] else ""
+        if wanted:
+            capture.set(cv2.CAP_PROP_FOURCC, cv2.VideoWriter_fourcc(*wanted))
+        size = self._values["video.width"], self._values["video.height"]
+        if size[0]:
+            capture.set(cv2.CAP_PROP_FRAME_WIDTH, size[0])
+            capture.set(cv2.CAP_PROP_FRAME_HEIGHT, size[1])
+        self._format = (
+            (int(capture.get(cv2.CAP_PROP_FOURCC)) & 0xFFFFFFFF).to_bytes(4, "little").decode("latin-1")
+        )
+        width, height = (int(capture.get(p)) for p in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
+        self._size = width, height
+        if self._format not in FORMATS or (wanted and self._format != wanted):
+            raise CaptureError(
+                f"it sends {self._format!r}, not {wanted or 'a known format'}; set video.format."
+            )
+        if min(width, height) < 1 or width * height > MAX_PIXELS or (size[0] and size != (width, height)):
+            raise CaptureError(
+                f"it has frames of {width} x {height} px; correct video.width and video.height."
+            )
+        return capture
+
+    def _settings(
+        self, cv2: ModuleType, capture: "VideoCapture", settings: CaptureSettings
+    ) -> tuple[float | None, str]:
+        """Make the settings; return the exposure as the driver reports it (s, None unknown), and a remark."""
+        remark = ""
+        if self._set != (settings.exposure_s, settings.gain):
+            if settings.exposure_s is not None:
+                capture.set(cv2.CAP_PROP_AUTO_EXPOSURE, MANUAL)
+                capture.set(cv2.CAP_PROP_EXPOSURE, max(1, round(settings.exposure_s / EXPOSURE_UNIT_S)))
+            if settings.gain is not None:
+                capture.set(cv2.CAP_PROP_GAIN, settings.gain)
+            self._set = settings.exposure_s, settings.gain
+            self._not_before_s = time.monotonic() + SETTLE_FRAMES * _period_s(cv2, capture)
+        units = capture.get(cv2.CAP_PROP_EXPOSURE)
+        told = 0 < units <= MAX_EXPOSURE_S / EXPOSURE_UNIT_S
+        told = told and capture.get(cv2.CAP_PROP_AUTO_EXPOSURE) not in AUTOMATIC
+        exposure_s = units * EXPOSURE_UNIT_S if told else None
+        if settings.exposure_s is not None:
+            if exposure_s is None:
+                raise CaptureError("its driver does not let its exposure be set; leave `exposure` unset.")
+            if abs(exposure_s - settings.exposure_s) > max(EXPOSURE_UNIT_S, 0.01 * settings.exposure_s):
+                remark = f"it exposes for {exposure_s:g} s, not for {settings.exposure_s:g} s."
+        if settings.gain is not None and (gain := capture.get(cv2.CAP_PROP_GAIN)) != settings.gain:
+            if gain < 0:
+                raise CaptureError("its driver does not let its gain be set; leave `gain` unset.")
+            remark = f"its gain is {gain:g}, though {settings.gain:g} was set."
+        return exposure_s, remark
+
+    def _grab(
+        self, cv2: ModuleType, capture: "VideoCapture", exposure_s: float | None
+    ) -> tuple[float, float, int]:
+        """Grab a frame for `retrieve`; return its middle, its standard deviation (s) and the source of the stamp."""
+        asked_s = max(time.monotonic(), self._not_before_s)
+        buffers = int(capture.get(cv2.CAP_PROP_BUFFERSIZE))
+        stale = buffers if 1 <= buffers <= 32 else 4
+        period_s = max(_period_s(cv2, capture), exposure_s or 0.0)
+        end_s = asked_s + MAX_WAIT_S + (stale + SETTLE_FRAMES) * period_s
+        before_s: float | None = None
+        apart_s: list[float] = []
+        unstamped = 0
+        while time.monotonic() < end_s and not self.closing:
+            if not capture.grab():
+                raise CaptureError("it gives no frame; check its plug.")
+            steady_s, now_s = self._clocks()
+            stamp_s = capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
+            # Drivers stamp with one clock or the other.
+            age_s = min(steady_s - stamp_s, time.time() - stamp_s, key=abs)
+            stamped = stamp_s > 0 and -0.1 < age_s < MAX_AGE_S
+            if not stamped:
+                age_s, unstamped = 0.0, unstamped + 1
+            at_s = steady_s - age_s
+            if before_s is not None:
+                # In the dark a camera may be slower than it says. After a late read the next one looks early.
+                apart_s.append(at_s - before_s)
+                frame_s = min(apart_s) if stamped else max(apart_s)
+                lag_s, stddev_s, latest_s = self._lag(exposure_s, max(period_s, frame_s))
+                # Without stamps: skip the buffers that were filled before, and the one that was being filled.
+                if at_s - latest_s >= asked_s and (stamped or unstamped > stale + 1):
+                    return now_s - age_s - lag_s, stddev_s, Capture.HARDWARE if stamped else Capture.DRIVER
+            before_s = at_s
+        if self.closing:
+            raise CaptureError("the node ends.")
+        raise CaptureError(
+            "it gives frames, but none that was exposed after it was asked for; its clock is wrong."
+        )
+
+    def _clocks(self) -> tuple[float, float]:
+        """Read steady time and the node's time (s) within half a millisecond; other threads may delay a reading."""
+        for _ in range(5):
+            before_s, now_s, after_s = time.monotonic(), self._now(), time.monotonic()
+            if after_s - before_s < 1e-3:
+                break
+        return (before_s + after_s) / 2, now_s
+
+    def _lag(self, exposure_s: float | None, period_s: float) -> tuple[float, float, float]:
+        """Time from an exposure's middle to its stamp, its standard deviation, and the longest from its start (s)."""
+        # An unknown exposure is no longer than the period.
+        exposed_s = exposure_s or period_s
+        lag_s = self._values["video.lag"]
+        if not math.isnan(lag_s):
+            return lag_s, self._values["command_lag_stddev"], lag_s + exposed_s / 2
+        # Drivers stamp the start of the exposure, its end, or the end of the transfer, one period later at most.
+        return period_s / 2, (period_s + exposed_s) / math.sqrt(12), period_s + exposed_s
+
+    def _pixels(self, cv2: ModuleType, raw: np.ndarray) -> tuple[np.ndarray, str]:
+        """Convert a buffer to pixels and the pattern of their mosaic; CaptureError if it is incomplete."""
+        width, height = self._size
+        raw = np.ascontiguousarray(raw).view(np.uint8).ravel()
+        if self._format in JPEG:
+            return _from_jpeg(cv2, raw, width, height), ""
+        pattern, kind = MOSAIC.get(self._format, ("", MONO.get(self._format, "u1")))
+        each = {"NV12": 1.5, "NV21": 1.5, "YU12": 1.5, "YV12": 1.5, "BGR3": 3, "RGB3": 3}.get(self._format)
+        each = each or (2 if self._format in LUMA else np.dtype(kind).itemsize)
+        if len(raw) != int(width * height * each):
+            raise CaptureError(f"a frame has {len(raw)} bytes instead of {int(width * height * each)}.")
+        if self._format in LUMA:
+            pixels = raw.reshape(height, width, 2)[..., LUMA[self._format]]
+        elif self._format in PLANAR:
+            pixels = raw[: width * height].reshape(height, width)
+        elif self._format in COLOUR:
+            pixels = raw.reshape(height, width, 3)[..., :: 1 if self._format == "BGR3" else -1]
+        else:
+            pixels = raw.view(kind).astype(kind.lstrip("<"), copy=False).reshape(height, width)
+        # A copy, because OpenCV's memory may be the driver's.
+        return np.array(pixels, order="C"), pattern
+
+
+def _period_s(cv2: ModuleType, capture: "VideoCapture") -> float:
+    rate = capture.get(cv2.CAP_PROP_FPS)
+    return 1 / rate if 0.01 < rate < 10000 else 1 / DEFAULT_RATE
+
+
+def _from_jpeg(cv2: ModuleType, raw: np.ndarray, width: int, height: int) -> np.ndarray:
+    """Decode the brightness of a JPEG, (height, width) uint8."""
+    data = raw.tobytes().rstrip(b"\0")
+    pixels = (
+        cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
+        if data.endswith(b"\xff\xd9")
+        else None
+    )
+    if pixels is None or pixels.shape != (height, width):
+        raise CaptureError(f"a frame of {len(data)} bytes is no whole JPEG of {width} x {height} px.")
+    return pixels
+
+
+# A QuickTime or MP4 file begins with one of these.
+BOXES = (b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip")
+BEGINNINGS = {
+    ".avi": (0, (b"RIFF",)),
+    ".mkv": (0, (b"\x1aE\xdf\xa3",)),
+    ".mov": (4, BOXES),
+    ".mp4": (4, BOXES),
+}
+SUFFIXES = tuple(BEGINNINGS)
+# In frames a second.
+MAX_RATE = 1000.0
+# The longest time between two frames.
+MAX_GAP_S = 3600.0
+# Cut-off or damaged frames are dropped, and a file must not lead to the network.
+OPTIONS = "fflags;discardcorrupt|err_detect;explode|protocol_whitelist;file"
+OPTIONS_IN = "OPENCV_FFMPEG_CAPTURE_OPTIONS"
+# FFmpeg's tags of pixel formats: Y800, and Y1 of 16 bits.
+GREY_8, GREY_16 = 0x30303859, 0x10003159
+
+
+class Film:
+    """Plays a file once. If its disk goes away and comes back, it goes on at the next frame."""
+
+    # Set by the source; a frame of a file takes no time, so nothing waits for it.
+    closing = False
+
+    def __init__(self, path: str, start: str) -> None:
+        self._path = path
+        started = read_utc(start)
+        # Video.refusal has checked it.
+        assert started is not None
+        self._start_s, self._start_resolution_s = started
+        self._capture: VideoCapture | None = None
+        self._grey = False
+        self._period_s = 0.0
+        self._taken = 0
+        # In the file's own time.
+        self._first_s = self._last_s = -math.inf
+        self._ended = ""
+
+    def capture(self, settings: CaptureSettings) -> CapturedFrame:
+        if self._ended:
+            raise SourceEnded(self._ended)
+        if not Path(self._path).is_file():
+            self.close()
+            raise CaptureError(f"{self._path}: it is not there; correct video.device, or mount its disk.")
+        with quiet() as cv2:
+            if self._capture is None:
+                self._capture = self._opened(cv2)
+            came, pixels = self._capture.read()
+            at_s = self._capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
+            frames = self._capture.get(cv2.CAP_PROP_FRAME_COUNT)
+        if not came:
+            self._ended = f"all {self._taken} frames of {self._path} are played."
+            if self._taken < frames:
+                raise FrameError(
+                    f"{self._path}: it breaks off after {self._taken} of {frames:.0f} frames; copy it again."
+                )
+            raise SourceEnded(self._ended)
+        if not self._last_s < at_s <= max(self._last_s, 0.0) + MAX_GAP_S:
+            self._ended = f"{self._path}: the times of its frames make no sense."
+            raise FrameError(
+                f"{self._ended[:-1]}: {self._last_s:g} s, then {at_s:g} s; convert it to a steady rate."
+            )
+        self._first_s = at_s if not self._taken else self._first_s
+        self._last_s = at_s
+        self._taken += 1
+        # OpenCV 4.6 makes three channels of one.
+        if self._grey and pixels.ndim == 3:
+            pixels = np.ascontiguousarray(pixels[..., 0])
+        # The exposure is somewhere within the period of the frame; its length is not known.
+        mid_s = self._start_s + at_s - self._first_s + self._period_s / 2
+        stddev_s = math.hypot(self._period_s, self._start_resolution_s) / math.sqrt(12)
+        frame = Frame(pixels, mid_unix_s=mid_s, source=self._path, stamp_stddev_s=stddev_s)
+        return CapturedFrame(frame, Capture.FILE)
+
+    def close(self) -> None:
+        if self._capture is not None:
+            self._capture.release()
+        self._capture = None
+
+    def _opened(self, cv2: ModuleType) -> "VideoCapture":
+        at, beginnings = BEGINNINGS[Path(self._path).suffix.lower()]
+        try:
+            with open(self._path, "rb") as file:
+                head = file.read(16)
+        except OSError as error:
+            raise CaptureError(
+                f"{self._path}: it cannot be read ({error.strerror}); check its disk."
+            ) from None
+        # FFmpeg would take a playlist of other files under any name.
+        if head[at : at + 4] not in beginnings:
+            raise FrameError(
+                f"{self._path}: this is no {Path(self._path).suffix[1:].upper()} file; convert it to one."
+            )
+        before = os.environ.get(OPTIONS_IN)
+        os.environ[OPTIONS_IN] = OPTIONS
+        try:
+            capture = cv2.VideoCapture(self._path, cv2.CAP_FFMPEG)
+        finally:
+            if before is None:
+                del os.environ[OPTIONS_IN]
+            else:
+                os.environ[OPTIONS_IN] = before
+        if not capture.isOpened():
+            raise FrameError(
+                f"{self._path}: this is not a video that OpenCV's FFmpeg can read; convert it to FFV1."
+            )
+        width, height = capture.get(cv2.CAP_PROP_FRAME_WIDTH), capture.get(cv2.CAP_PROP_FRAME_HEIGHT)
+        rate = capture.get(cv2.CAP_PROP_FPS)
+        if not (1 <= width * height <= MAX_PIXELS and 0 < rate <= MAX_RATE):
+            raise FrameError(
+                f"{self._path}: {width:g} x {height:g} px at {rate:g} frames a second are no video."
+            )
+        kind = int(capture.get(cv2.CAP_PROP_CODEC_PIXEL_FORMAT)) & 0xFFFFFFFF
+        self._grey = kind in (GREY_8, GREY_16)
+        if self._grey and not capture.set(cv2.CAP_PROP_CONVERT_RGB, 0) and kind == GREY_16:
+            raise FrameError(
+                f"{self._path}: OpenCV {cv2.__version__} makes 8 bits of its 16; use 4.7 or newer."
+            )
+        self._period_s = 1 / rate
+        for _ in range(self._taken):
+            capture.grab()
+        return capture
+
 
 PARAMETERS = (
     Parameter(

@@ -11,16 +11,14 @@ from typing import Any
 import numpy as np
 
 from starpos.instrument.inclinometer import elevations
-from starpos.instrument.noise_tracker import noise_text
+from starpos.instrument.tilt_log import noise_text
 from starpos.units import ARCSEC
 from starpos_common.parameters import Parameter
-from starpos_inclinometer.clock import ArrivalFilter, PaceWatch
-from starpos_inclinometer.host_clock import Moment
-from starpos_inclinometer.sources.angle_tilts import Angles, AngleTilts
-from starpos_inclinometer.sources.mcu_continuity import HOST_TOLERANCE_S, HOST_TOLERANCE_SHARE, Gate
-from starpos_inclinometer.sources.reading import Arrival, Counts, Health, Reading
+from starpos_inclinometer.clock import ArrivalFilter, Moment, PaceWatch
+from starpos_inclinometer.sources.mcu_protocol import HOST_TOLERANCE_S, HOST_TOLERANCE_SHARE, Gate
 from starpos_inclinometer.sources.serial_link import SERIAL_PARAMETERS, SerialLink, port_refusal
-from starpos_inclinometer.sources.source import Surroundings, TiltSource
+from starpos_inclinometer.sources.source import Arrival, Counts, Health, Reading, Surroundings, TiltSource
+from starpos_inclinometer.sources.tilts import Angles, AngleTilts
 
 # In bytes.
 MAX_LINE = 256

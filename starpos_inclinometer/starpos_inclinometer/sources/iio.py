@@ -10,24 +10,31 @@ from pathlib import Path
 from typing import Any
 
 from starpos.instrument import sensors
-from starpos.instrument.noise_tracker import noise_text
-from starpos.messages.imu_tilts import Felt, ImuTilts
+from starpos.instrument.tilt_log import noise_text
+from starpos.messages.tilt import Felt, ImuTilts
 from starpos.session import inclinometer_parameters
 from starpos_common.parameters import Parameter
-from starpos_inclinometer.host_clock import Moment
-from starpos_inclinometer.sources.angle_tilts import Angles, AngleTilts
-from starpos_inclinometer.sources.iio_buffer import Buffer
+from starpos_inclinometer.clock import Moment
 from starpos_inclinometer.sources.iio_device import (
     FAILED_READS,
     INCLINATION,
+    Buffer,
     DeviceError,
     IioDevice,
     find,
     set_sampling_frequency,
 )
 from starpos_inclinometer.sources.mcu import RATE_PARAMETER
-from starpos_inclinometer.sources.reading import Arrival, Counts, Health, Phase, Reading
-from starpos_inclinometer.sources.source import Surroundings, TiltSource
+from starpos_inclinometer.sources.source import (
+    Arrival,
+    Counts,
+    Health,
+    Phase,
+    Reading,
+    Surroundings,
+    TiltSource,
+)
+from starpos_inclinometer.sources.tilts import Angles, AngleTilts
 
 # A device that came back is read again within a second.
 RETRY_S = 0.4

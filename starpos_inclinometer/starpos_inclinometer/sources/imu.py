@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The source `imu`: tilts from sensor_msgs/Imu at rest; what they are is starpos.messages.imu_tilts's."""
+"""The source `imu`: tilts from sensor_msgs/Imu at rest; what they are is starpos.messages.tilt's."""
 
 import math
 from collections import deque
@@ -11,14 +11,11 @@ from rclpy.clock_type import ClockType
 from rclpy.qos import ReliabilityPolicy
 from sensor_msgs.msg import Imu
 
-from starpos.instrument.noise_tracker import noise_text
-from starpos.messages.imu_tilts import MIN_MESSAGES, ImuTilts
-from starpos.messages.tilt import Reading
+from starpos.instrument.tilt_log import noise_text
+from starpos.messages.tilt import MIN_MESSAGES, ImuTilts, Reading
 from starpos.session import inclinometer_parameters
-from starpos_common.matched import MatchedSubscription
-from starpos_common.topics import Take, subscription
-from starpos_inclinometer.sources.reading import Counts, Health, Phase
-from starpos_inclinometer.sources.source import Surroundings, TiltSource
+from starpos_common.topics import MatchedSubscription, Take, subscription
+from starpos_inclinometer.sources.source import Counts, Health, Phase, Surroundings, TiltSource
 
 TOPIC = "imu/data"
 QUEUE, DEPTH = 512, 1000

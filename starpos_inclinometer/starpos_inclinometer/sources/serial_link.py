@@ -15,9 +15,9 @@ from typing import Any, Protocol
 import serial
 
 from starpos_common.parameters import Parameter
-from starpos_inclinometer.host_clock import HostClock, Moment, Step
+from starpos_inclinometer.clock import HostClock, Moment, Step
 from starpos_inclinometer.sources import mcu_protocol
-from starpos_inclinometer.sources.reading import Arrival, Counts, Phase
+from starpos_inclinometer.sources.source import Arrival, Counts, Phase
 
 # A device that came back is read again within a second.
 RETRY_S = 0.4

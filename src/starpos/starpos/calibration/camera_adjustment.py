@@ -14,9 +14,8 @@ import numpy as np
 from starpos import rotation
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import CalibrationError
-from starpos.fix.outliers import distance2, judged
-from starpos.instrument.camera import Camera
-from starpos.instrument.lens import COEFFICIENTS, EQUIDISTANT, PLUMB_BOB, RATIONAL
+from starpos.fix.star_fit import distance2, judged
+from starpos.instrument.camera import COEFFICIENTS, EQUIDISTANT, PLUMB_BOB, RATIONAL, Camera
 
 # 1 sigma of the priors about the given camera: relative focal length, fx over fy, principal point (share of the longer
 # side), and the shift of a corner by k1, k2, p1, p2, k3 (share of half the diagonal)

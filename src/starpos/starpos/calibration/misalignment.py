@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A3 from frames: at a known place, or at several headings of an unknown place (turning.py)."""
+"""A3 from frames: at a known place, at several headings of an unknown one, or of a fixed camera that is its own level."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -7,30 +7,47 @@ from types import MappingProxyType
 
 import numpy as np
 
+from starpos import rotation
+from starpos.averaging.poses import poses_of
 from starpos.averaging.scatter import Scatter
-from starpos.averaging.slip import poses_of
-from starpos.calibration.plumb_fit import PlumbLine
-from starpos.calibration.plumb_line import MIN_POSES, hang, settled, typical
-from starpos.calibration.readings import FixedFrame, Readings
+from starpos.calibration.plumb_line import (
+    MIN_POSES,
+    FixedFrame,
+    PlumbLine,
+    Readings,
+    hang,
+    level,
+    settled,
+    typical,
+)
 from starpos.earth.ellipsoid import EARTH_RADIUS_M, enu_axes
 from starpos.errors import FixError
 from starpos.fix.budget import ALWAYS, ErrorTerm, Sensitivity, place_of
 from starpos.fix.fix import Fix
 from starpos.fix.solution import Solution, Status
 from starpos.fix.solver import Solver
-from starpos.frames.pointings import Pointing
-from starpos.frames.stars import Stars
+from starpos.frames.frame import Stars
+from starpos.frames.tables import Pointing
 from starpos.identification import Identification
 from starpos.identification.hint import Hint
 from starpos.instrument.inclinometer import InclinometerErrors, up_of
-from starpos.instrument.instrument import MAX_C, UNKNOWN_ARCSEC, Calibration, Instrument
-from starpos.instrument.response import angles_at, stated_variances
-from starpos.instrument.tilts import Tilts
+from starpos.instrument.instrument import (
+    MAX_C,
+    OWN_LEVEL,
+    SAG_ARCSEC_PER_SQRT_HOUR,
+    UNKNOWN_ARCSEC,
+    Calibration,
+    CameraVertical,
+    Instrument,
+    level_errors,
+)
+from starpos.instrument.mounting import angles_at, stated_variances
+from starpos.instrument.tilt_log import Tilts
 from starpos.progress import Progress, quiet
 from starpos.sky.site import Site
 from starpos.units import ARCSEC
 
-ROUNDS = 4
+SOLVING_ROUNDS = 4
 SETTLED_RAD = 0.02 * ARCSEC
 # terms that move the zenith, of all frames about alike
 OF_PLACE = ("refraction", "shutter", "clock", "time stamp", "ut1", "pole")
@@ -135,14 +152,14 @@ def calibrate(
     solutions: list[Solution] = []
     hints: list[Hint | None] = [None] * len(frames)
     agreement: _Agreement | None = None
-    for k in range(ROUNDS):
+    for k in range(SOLVING_ROUNDS):
         solutions = []
         for n, (frame, hint) in enumerate(zip(frames, hints, strict=True)):
             if isinstance(frame, Pointing):
                 solutions.append(solver.solve_pointing(frame, tilts))
             else:
                 solutions.append(solver.solve(frame, tilts, hint, known=known.get(n)))
-            progress("calibrating", (k + (n + 1) / len(frames)) / ROUNDS)
+            progress("calibrating", (k + (n + 1) / len(frames)) / SOLVING_ROUNDS)
         hints = [s.hint for s in solutions]
         solved = [FixedFrame(s.fix, s.tilt) for s in solutions if s.fix and s.tilt]
         if len(solved) < fewest:
@@ -433,3 +450,70 @@ def _mean_temperature_c(solved: list[FixedFrame]) -> float:
     # an unknown temperature is NaN, which is not below MAX_C
     known = [s.tilt.temperature_c for s in solved if abs(s.tilt.temperature_c) < MAX_C]
     return float(np.mean(known)) if known else float("nan")
+
+
+def turn(
+    solver: Solver,
+    frames: Sequence[Stars | Pointing],
+    tilts: Tilts,
+    turn_stddev_deg: float = 180.0,
+    progress: Progress = quiet,
+    known: Known = NOTHING_KNOWN,
+) -> Calibrated:
+    """A3, and fixes, from frames of one place at several headings; the solver's A3 need not be near.
+
+    known: the stars of frames, by the frames' numbers, that only a longer search identifies than the solver's.
+    turn_stddev_deg: sigma of the turn of the solver's A3 about the plumb line; it matters if the axis of the turn leans.
+    The `average` of the fixes is the place; its covariance says how well the headings separate it from A3.  With fewer
+    than two fixes A3 stays as it was.
+    Raises FixError if the instrument leans and the headings leave two places, or if the frames have no common zenith.
+    """
+
+    def find(readings: Readings, a3: np.ndarray, fixes: list[Fix]) -> PlumbLine:
+        return level(readings, a3, np.radians(turn_stddev_deg))
+
+    return calibrate(solver, frames, tilts, find, fewest=2, progress=progress, known=known)
+
+
+# the level that the camera is for itself has no direction to face
+TURN_DEG = 1e-3
+
+
+def calibrate_fixed(
+    solver: Solver,
+    frames: Sequence[Stars | Pointing],
+    site: Site,
+    site_stddev_arcsec: float = 0.0,
+    sag_arcsec_per_sqrt_hour: float = SAG_ARCSEC_PER_SQRT_HOUR,
+    progress: Progress = quiet,
+    known: Known = NOTHING_KNOWN,
+) -> Calibrated:
+    """The instrument with the camera's own vertical, from frames of a camera at rest at a known astronomic place.
+
+    known: the stars of frames, as `calibrate_at` has them.
+    Raises FixError if there is no fix, the frames do not agree, or the camera was touched between them.
+    """
+    level = level_errors(sag_arcsec_per_sqrt_hour)
+    bare = replace(
+        solver,
+        instrument=replace(solver.instrument, inclinometer=level, inclinometer_model="", vertical=None),
+    )
+    found = calibrate_at(bare, frames, OWN_LEVEL, site, site_stddev_arcsec, TURN_DEG, progress, known)
+    fixes = found.fixes
+    if poses_of(fixes).any():
+        raise FixError(
+            "the camera was touched between the frames, or their clock was set: give frames of a camera "
+            "that nothing moved"
+        )
+    attitudes = np.array([f.camera_to_itrs for f in fixes])
+    mean = rotation.best_rotation(
+        np.tile(np.eye(3), (len(fixes), 1)), np.concatenate(attitudes.swapaxes(1, 2))
+    )
+    covariance = np.mean([f.camera_covariance for f in fixes], axis=0) / ARCSEC**2
+    vertical = CameraVertical(*(tuple(map(tuple, m.tolist())) for m in (mean, covariance)))
+    # a level that always reads zero has no response
+    calibration = replace(found.instrument.calibration, response=(), response_covariance=())
+    return replace(
+        found,
+        instrument=replace(found.instrument, calibration=calibration, inclinometer=level, vertical=vertical),
+    )

@@ -1,21 +1,399 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The plumb line in the camera: A3 from the attitudes of frames and their tilts, with a known or an unknown zenith.
+"""The plumb line in the camera: A3 from the attitudes of frames and their tilts, with a known or an unknown zenith."""
 
-The stars of each frame give the attitude R of the camera against the Earth without A3.  The zenith is a fixed direction
-of the Earth, z = R^T A3^T s, where s is the plumb line as the inclinometer reads it.  With a wrong A3 the z of several
-headings lie on a circle; with the right one they agree.  Only the sum of A3's tilts and the inclinometer's zero matters.
-"""
-
-from dataclasses import replace
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from starpos import rotation
+from starpos.averaging.poses import poses_of
 from starpos.averaging.scatter import Frames, Scatter, scatter_of
-from starpos.calibration.plumb_fit import Known, PlumbLine, fits, huber, robust, symmetric
-from starpos.calibration.readings import KNOWN, Readings
+from starpos.earth.ellipsoid import EARTH_RADIUS_M
 from starpos.errors import FixError
-from starpos.normal import MEDIAN_OF_CHI2
+from starpos.fix.budget import EACH_POSE
+from starpos.fix.fix import Fix
+from starpos.instrument.inclinometer import InclinometerErrors, Tilt
+from starpos.instrument.instrument import UNKNOWN_ARCSEC
+from starpos.instrument.mounting import RESPONSE_COEFFICIENTS, Zeroed, response_columns, stated_variances
+from starpos.units import ARCSEC, MEDIAN_OF_CHI2
+
+# sigma of a coefficient that is as good as known
+KNOWN = 1e-9
+# minimum significance of a lean, which errors of the tilts do not reach
+LEAN_SIGMA = 5.0
+
+
+@dataclass(frozen=True)
+class FixedFrame:
+    """A frame's fix, and the tilt that it was made with."""
+
+    fix: Fix
+    tilt: Tilt
+
+
+@dataclass(frozen=True, kw_only=True)
+class Readings:
+    """Attitudes and tilts of K frames.
+
+    utc_unix_s (K,).  to_camera (K, 3, 3): ITRS into C.  plumb (K, 3): up in S as the inclinometer reads it.  heading
+    (K,) in rad. sigma (K,) in rad: of the zenith from each frame alone.
+    pose (K,): number of each frame's pose, from 0.  pose_sigma (rad): of an error that is new at each pose.
+    columns (K, 3, M): change of `plumb` for each of M errors of the inclinometer that frames share: its drift and its
+    temperature in units of their sigma, then its response.  column_sigma (M,): 1 sigma of these.
+    """
+
+    utc_unix_s: np.ndarray
+    to_camera: np.ndarray
+    plumb: np.ndarray
+    heading: np.ndarray
+    sigma: np.ndarray
+    pose: np.ndarray
+    pose_sigma: float
+    columns: np.ndarray
+    column_sigma: np.ndarray
+
+    @classmethod
+    def of(cls, solved: Sequence[FixedFrame], errors: InclinometerErrors) -> "Readings":
+        """Readings of frames with a fix; FixError if some have two axes and some three."""
+        fixes = [s.fix for s in solved]
+        plumb = np.array([s.tilt.up for s in solved])
+        axes = {s.tilt.axes for s in solved}
+        if len(axes) != 1:
+            raise FixError("some tilts have two axes and some three: give the tilts of one inclinometer")
+        mean = rotation.normalised(plumb.sum(0))
+        zeroed = Zeroed.at(mean, min(axes))
+        response = np.array([response_columns(s.tilt.theta, s.tilt.up, zeroed) for s in solved])
+        walked = _wandering(solved, errors)
+        variances = stated_variances(errors, axes.pop())
+        return cls(
+            utc_unix_s=np.array([f.utc_unix_s for f in fixes]),
+            to_camera=np.array([f.camera_to_itrs.T for f in fixes]),
+            plumb=plumb,
+            heading=np.array([f.heading for f in fixes]),
+            sigma=_own_sigma(fixes),
+            pose=poses_of(fixes),
+            pose_sigma=errors.pose_rad,
+            columns=np.concatenate([walked, response], 2),
+            column_sigma=np.concatenate([np.ones(walked.shape[2]), np.maximum(np.sqrt(variances), KNOWN)]),
+        )
+
+    def take(self, rows: np.ndarray) -> "Readings":
+        """The readings of the frames in `rows`."""
+        per_frame = ("utc_unix_s", "to_camera", "plumb", "heading", "sigma", "columns")
+        pose = np.unique(self.pose[rows], return_inverse=True)[1]
+        return replace(self, pose=pose, **{name: getattr(self, name)[rows] for name in per_frame})
+
+    @property
+    def mean_plumb(self) -> np.ndarray:
+        """Mean direction (3,) of `plumb`."""
+        return rotation.normalised(self.plumb.sum(0))
+
+    @property
+    def spread(self) -> np.ndarray:
+        """Sigma (K,) in rad of frames with the errors of poses, so that all frames of a pose are no better than one."""
+        return np.sqrt(self.sigma**2 + np.bincount(self.pose)[self.pose] * self.pose_sigma**2)
+
+    def lean(self, pose_sigma: float) -> bool:
+        """Whether the tilt changes from pose to pose by more than errors of that sigma (rad) make it seem to."""
+        off = np.linalg.norm(self.plumb - self.mean_plumb, axis=1)
+        return bool((off > LEAN_SIGMA * replace(self, pose_sigma=pose_sigma).spread).any())
+
+    @property
+    def response(self) -> slice:
+        """The columns of the response."""
+        return slice(self.columns.shape[2] - RESPONSE_COEFFICIENTS[self._axes], self.columns.shape[2])
+
+    @property
+    def _axes(self) -> int:
+        # drift and temperature have a column an axis
+        return {2 * axes + number: axes for axes, number in RESPONSE_COEFFICIENTS.items()}[
+            self.columns.shape[2]
+        ]
+
+
+def _own_sigma(fixes: Sequence[Fix]) -> np.ndarray:
+    """Sigma per axis (K,) in rad of each frame's zenith, without the errors of poses and those that all frames share.
+
+    An error that some frames share (a reading, the same stars) counts as an own error of each of them, enlarged so much
+    that together they know the zenith no better than one.
+    """
+    terms = [[(k, t) for k, t in enumerate(f.terms) if not t.common and t.shared != EACH_POSE] for f in fixes]
+    frames = Counter((k, key) for own in terms for k, t in own for key in t.shared or ())
+    variance = [
+        sum(
+            np.trace(t.covariance[:2, :2]) / 2 * max((frames[k, key] for key in t.shared or ()), default=1)
+            for k, t in own
+        )
+        for own in terms
+    ]
+    return np.sqrt(variance) / EARTH_RADIUS_M
+
+
+def _wandering(solved: Sequence[FixedFrame], errors: InclinometerErrors) -> np.ndarray:
+    """Change (K, 3, 2 axes) of up by drift and temperature of each axis, counted from the means of the frames."""
+    hours = np.array([s.fix.utc_unix_s for s in solved]) / 3600
+    warm = np.array([s.tilt.temperature_c for s in solved])
+    late = (hours - hours.mean()) / max(np.sqrt(np.ptp(hours)), 1e-9)
+    warm = warm - np.mean(warm) if np.isfinite(warm).all() else np.zeros(len(warm))
+    slope = np.array([s.tilt.slope for s in solved])
+    known = late * errors.drift_rad_per_sqrt_hour, warm * errors.temperature_rad_per_c
+    return np.concatenate([slope * off[:, None, None] for off in known], 2)
+
+
+# a frame further off than this pulls no harder
+ROBUST_SIGMA = 3.0
+MAX_STEPS, LONGEST_STEP = 60, 0.5
+# a step that would lower chi-square by less (1e-5 sigma) is the last
+SETTLED_CHI2 = 1e-10
+
+
+@dataclass(frozen=True)
+class Linear:
+    """A fit about its answer: p holds A3's turns (3) about `turns`, the zenith's moves (2) along `across`, and the
+    columns.
+
+    residual (K, 2) in rad with p = 0 for the columns, design (K, 2, n): its derivatives.  prior_sigma (n,).
+    turns (3, 3): axes in S, two across the plumb line and it.  across (2, 3): axes in ITRS, across the zenith.
+    """
+
+    residual: np.ndarray
+    design: np.ndarray
+    prior_sigma: np.ndarray
+    turns: np.ndarray
+    across: np.ndarray
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlumbLine:
+    """a3 (3, 3) with covariance (3, 3) in rad2 about S's axes, and the zenith (3,) in ITRS with its sigma in rad.
+
+    cost: half the robust chi-square.  scatter: chi-square per degree of freedom, 1 for frames of one zenith.
+    left (K, 2): what the fit leaves of each frame's reading, in rad across the plumb line.
+    response (m,), response_covariance (m, m): of the inclinometer's response.
+    linear: the fit about its answer.
+    astray (rad): sigma by which the zenith may be off together with A3's turn about a leaning axis; no heading shows it.
+    """
+
+    a3: np.ndarray
+    covariance: np.ndarray
+    zenith: np.ndarray
+    zenith_sigma: float
+    cost: float
+    scatter: float
+    left: np.ndarray
+    response: np.ndarray
+    response_covariance: np.ndarray
+    linear: "Linear"
+    astray: float = 0.0
+
+    def stddev_across(self, plumb: np.ndarray) -> float:
+        """Sigma in rad of the direction that A3 takes to `plumb` (3,), on the worse of two axes."""
+        across = np.linalg.svd(plumb[None])[2][1:]
+        return float(np.sqrt(np.linalg.eigvalsh(across @ self.covariance @ across.T)[-1]))
+
+
+@dataclass(frozen=True)
+class PlumbLinePrior:
+    """Prior knowledge of the fit: the zenith (3,) or None, its sigma, and the sigma of A3's turn, in rad."""
+
+    zenith: np.ndarray | None = None
+    zenith_sigma: float = np.inf
+    turn_sigma: float = np.pi
+
+
+def huber(off: np.ndarray) -> np.ndarray:
+    """Square root of Huber's weight of residuals (..., K) in sigma: beyond a limit they pull no harder."""
+    size = np.abs(off)
+    # far from the answer all residuals are large and none is an outlier
+    limit = np.maximum(ROBUST_SIGMA, 2 * np.median(size, axis=-1, keepdims=True))
+    return np.sqrt(np.minimum(1.0, limit / np.maximum(size, 1e-300)))
+
+
+def robust(off: np.ndarray) -> np.ndarray:
+    """Contribution of each residual (in sigma) to the robust chi-square."""
+    size = np.abs(off)
+    return np.where(size > ROBUST_SIGMA, ROBUST_SIGMA * (2 * size - ROBUST_SIGMA), size**2)
+
+
+def symmetric(covariance: np.ndarray) -> np.ndarray:
+    """The symmetric part of a covariance (n, n)."""
+    return (covariance + covariance.T) / 2
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Model:
+    """What all starts of a fit share, and what each begins with.
+
+    turns (3, 3): axes in S, two across the plumb line and it.  columns (K, 2, M): as Readings', across the plumb line.
+    prior_sigma (n,): of A3's turns (3), the zenith's moves (2) and the columns (M).
+    zenith (T, 3), across (T, 2, 3): of each start, in ITRS.  seen_across (T, 2, K, 3): `across` in the camera.
+    """
+
+    readings: Readings
+    spread: np.ndarray
+    turns: np.ndarray
+    columns: np.ndarray
+    prior_sigma: np.ndarray
+    zenith: np.ndarray
+    across: np.ndarray
+    seen_across: np.ndarray
+
+    @classmethod
+    def of(cls, readings: Readings, starts: np.ndarray, known: PlumbLinePrior) -> "_Model":
+        to_camera, mean = readings.to_camera, readings.mean_plumb
+        if known.zenith is None:
+            zenith = np.einsum("kji,tlj,kl->ti", to_camera, starts, readings.plumb)
+        else:
+            zenith = np.tile(known.zenith, (len(starts), 1))
+        zenith = rotation.normalised(zenith)
+        across = np.linalg.svd(zenith[:, None])[2][:, 1:]
+        turns = np.vstack([np.linalg.svd(mean[None])[2][1:], mean]).T
+        loose = UNKNOWN_ARCSEC[0] * ARCSEC
+        zenith_sigma = min(known.zenith_sigma, np.pi)
+        return cls(
+            readings=readings,
+            spread=readings.spread,
+            turns=turns,
+            columns=-np.einsum("kim,ij->kjm", readings.columns, turns[:, :2]),
+            prior_sigma=np.array(
+                [loose, loose, known.turn_sigma, zenith_sigma, zenith_sigma, *readings.column_sigma]
+            ),
+            zenith=zenith,
+            across=across,
+            seen_across=np.einsum("kij,tdj->tdki", to_camera, across),
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class _State:
+    """Where T fits stand: a3 (T, 3, 3), up (T, 3) of any length, p (T, n) as in Linear, start (T,): its number."""
+
+    a3: np.ndarray
+    up: np.ndarray
+    p: np.ndarray
+    start: np.ndarray
+
+    def take(self, rows: np.ndarray) -> "_State":
+        return _State(a3=self.a3[rows], up=self.up[rows], p=self.p[rows], start=self.start[rows])
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Slopes:
+    """A linearisation at T states, and what it costs.
+
+    residual (T, K, 2) in rad without the columns, slope (T, K, 2, n), off (T, K, 2) in sigma, cost (T,).
+    """
+
+    residual: np.ndarray
+    slope: np.ndarray
+    off: np.ndarray
+    cost: np.ndarray
+
+
+def fits(
+    readings: Readings, starts: np.ndarray, known: PlumbLinePrior, turned: np.ndarray | float = 0.0
+) -> list[PlumbLine]:
+    """Fit A3, the zenith and the errors of the inclinometer by robust Gauss-Newton, from each of T starts.
+
+    starts (T, 3, 3): the given A3, turned by `turned` (T,) rad about the plumb line.  The residuals compare
+    the readings with the plumb line of the stars, whose error is small compared with theirs.  The prior of A3's tilts is
+    UNKNOWN_ARCSEC.
+    """
+    model = _Model.of(readings, starts, known)
+    p = np.zeros((len(starts), len(model.prior_sigma)))
+    p[:, 2] = turned
+    now = _State(a3=starts, up=model.zenith, p=p, start=np.arange(len(starts)))
+    best = np.full(len(starts), np.inf)
+    answer = _State(a3=starts.copy(), up=model.zenith.copy(), p=p.copy(), start=now.start)
+    for _ in range(MAX_STEPS):
+        slopes = _slopes(model, now)
+        # if the headings hardly differ, later steps may lead away again
+        better = slopes.cost < best[now.start]
+        rows = now.start[better]
+        best[rows] = slopes.cost[better]
+        answer.a3[rows], answer.up[rows], answer.p[rows] = now.a3[better], now.up[better], now.p[better]
+        step, gain = _step(model, slopes, now.p)
+        now = _stepped(model, now, step).take(gain >= SETTLED_CHI2)
+        if not len(now.start):
+            break
+    slopes = _slopes(model, answer)
+    return [_plumb_line(model, answer, slopes, t) for t in range(len(starts))]
+
+
+def _slopes(model: _Model, now: _State) -> _Slopes:
+    """Residuals and their derivatives at T states."""
+    plumb, flat = model.readings.plumb, model.turns[:, :2]
+    count, frames, n = len(now.start), len(plumb), len(model.prior_sigma)
+    length = np.linalg.norm(now.up, axis=1)
+    seen = np.tensordot(now.up / length[:, None], model.readings.to_camera, (1, 2))
+    read = seen @ now.a3.swapaxes(1, 2)
+    residual = (plumb - read) @ flat
+    slope = np.empty((count, frames, 2, n))
+    # a turn about an axis moves the reading by axis x reading
+    slope[..., :3] = np.tensordot(read, np.cross(model.turns.T, flat.T[:, None]), (2, 2))
+    moved = model.seen_across[now.start].reshape(count, 2 * frames, 3) @ (now.a3.swapaxes(1, 2) @ flat)
+    slope[..., 3:5] = -moved.reshape(count, 2, frames, 2).transpose(0, 2, 3, 1) / length[:, None, None, None]
+    slope[..., 5:] = model.columns
+    off = (residual + np.tensordot(now.p[:, 5:], model.columns, (1, 2))) / model.spread[:, None]
+    prior = np.sum((now.p / model.prior_sigma) ** 2, axis=1)
+    cost = (robust(off).sum((1, 2)) + prior) / 2
+    return _Slopes(residual=residual, slope=slope, off=off, cost=cost)
+
+
+def _design(model: _Model, slopes: _Slopes) -> tuple[np.ndarray, np.ndarray]:
+    """Weighted design (T, 2 K, n) in units of the prior, and weighted residuals (T, 2 K) in sigma."""
+    off = slopes.off.reshape(len(slopes.off), -1)
+    weight = huber(off)
+    # the prior's own units keep the loose and the tight of one size
+    scaled = slopes.slope.reshape(*off.shape, -1) * model.prior_sigma
+    return scaled * (weight / np.repeat(model.spread, 2))[..., None], off * weight
+
+
+def _step(model: _Model, slopes: _Slopes, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Gauss-Newton steps (T, n), none longer than LONGEST_STEP, and how much (T,) a whole one would lower chi-square."""
+    design, off = _design(model, slopes)
+    transposed = design.swapaxes(1, 2)
+    pull = (transposed @ off[..., None])[..., 0] + p / model.prior_sigma
+    normal = transposed @ design + np.eye(design.shape[2])
+    moved = np.linalg.solve(normal, pull[..., None])[..., 0]
+    step = -model.prior_sigma * moved
+    longest = np.linalg.norm(step[:, :5], axis=1, keepdims=True)
+    return step * LONGEST_STEP / np.maximum(longest, LONGEST_STEP), np.sum(moved * pull, axis=1)
+
+
+def _stepped(model: _Model, now: _State, step: np.ndarray) -> _State:
+    turned = np.array([rotation.from_vector(model.turns @ s) for s in step[:, :3]]) @ now.a3
+    p = now.p + step
+    moved = np.einsum("td,tdi->ti", p[:, 3:5], model.across[now.start])
+    return _State(a3=turned, up=model.zenith[now.start] + moved, p=p, start=now.start)
+
+
+def _plumb_line(model: _Model, answer: _State, slopes: _Slopes, t: int) -> PlumbLine:
+    """The answer from start t."""
+    readings, turns, prior_sigma, p = model.readings, model.turns, model.prior_sigma, answer.p[t]
+    scaled = _design(model, slopes)[0][t]
+    normal = scaled.T @ scaled + np.eye(len(prior_sigma))
+    whole = np.outer(prior_sigma, prior_sigma) * np.linalg.inv(normal)
+    # without the turn about the plumb line, which may be as good as unknown
+    told = np.delete(np.arange(len(prior_sigma)), 2)
+    given_turn = np.outer(prior_sigma[told], prior_sigma[told]) * np.linalg.inv(normal[np.ix_(told, told)])
+    response = slice(5 + readings.response.start, 5 + readings.response.stop)
+    cost = float(slopes.cost[t])
+    return PlumbLine(
+        a3=answer.a3[t],
+        covariance=symmetric(turns @ whole[:3, :3] @ turns.T),
+        zenith=rotation.normalised(answer.up[t]),
+        zenith_sigma=float(np.sqrt(np.linalg.eigvalsh(given_turn[2:4, 2:4])[-1])),
+        cost=cost,
+        scatter=2 * cost / max(2 * len(model.spread) - 5, 1),
+        left=slopes.residual[t] + model.columns @ p[5:],
+        response=p[response],
+        response_covariance=symmetric(whole[response, response]),
+        linear=Linear(slopes.residual[t], slopes.slope[t], prior_sigma, turns, model.across[t]),
+    )
+
 
 ROBUST_ROUNDS = 10
 TURNS_TRIED = 8
@@ -52,7 +430,7 @@ def level(readings: Readings, given: np.ndarray, turn_sigma: float = np.pi) -> P
     """
     mean = readings.mean_plumb
     start = _axis_of_turn(readings, given)
-    known = Known(turn_sigma=turn_sigma)
+    known = PlumbLinePrior(turn_sigma=turn_sigma)
     [nearest] = fits(readings, start[None], known)
     leans = _leans(readings)
     if nearest.scatter < FOUND_SCATTER and not leans:
@@ -98,7 +476,7 @@ def hang(
     mean = readings.mean_plumb
     up = np.einsum("kij,j->ki", readings.to_camera, zenith).sum(0)
     start = rotation.shortest_turn(given @ rotation.normalised(up), mean) @ given
-    known = Known(zenith, max(zenith_sigma, 1e-12), turn_sigma)
+    known = PlumbLinePrior(zenith, max(zenith_sigma, 1e-12), turn_sigma)
     angles, starts = _turns(mean, start) if turn_sigma > NARROW_TURN else (np.zeros(1), start[None])
     found = fits(readings, starts, known, angles)
     best = min(found, key=_cost)

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from starpos.calibration.intrinsics import Intrinsics, rms
+from starpos.calibration.camera import Intrinsics, rms
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

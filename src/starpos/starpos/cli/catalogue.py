@@ -199,7 +199,7 @@ def show_paper() -> int:
 def show_field(camera: Camera) -> int:
     """Print the catalogue of triangles for a camera."""
     from starpos.fix.solver import Solver
-    from starpos.identification import triangle_cache
+    from starpos.identification import triangles
     from starpos.instrument.instrument import Instrument
 
     progress = console.ProgressBar()
@@ -207,7 +207,7 @@ def show_field(camera: Camera) -> int:
         camera.width, camera.height
     )
     c = deeper.for_field(catalogue.load_catalogue(), camera)
-    table = triangle_cache.cached(c, camera.half_diagonal_rad)
+    table = triangles.cached_triangles(c, camera.half_diagonal_rad)
     used = np.unique(table.corners)
     size = sum(getattr(table, column).nbytes for column in table.__dataclass_fields__) / 1e6
     width, height = np.degrees(2 * np.arctan([camera.width / 2 / camera.fx, camera.height / 2 / camera.fy]))

@@ -3,38 +3,308 @@
 
 import argparse
 import os
+import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from starpos.cli import bags, console, deflection_plan, jobs, options
-from starpos.cli.archive import frames_among
-from starpos.cli.deflection_output import (
-    COLUMNS,
-    HEAD,
-    JSON_HELP,
-    combined_json,
-    combined_text,
-    frame_json,
-    frame_line,
-)
-from starpos.cli.inputs import checked_tilts, given_of, reader_of
-from starpos.cli.output import Output, add_formats
+from starpos.cli import console, inputs, options
+from starpos.cli.console import Output, add_formats
+from starpos.cli.inputs import checked_tilts, frames_among, given_of, reader_of
+from starpos.earth.orientation import earth_state
 from starpos.errors import FixError, FrameError, InstrumentError, TiltError
 from starpos.fix.solution import Solution
 from starpos.fix.solver import Solver
-from starpos.instrument.axis import with_frame_size
-from starpos.instrument.instrument import Instrument
+from starpos.instrument.instrument import Instrument, with_frame_size
 from starpos.night.bag import each_frame, is_bag
 from starpos.night.reading import First
 from starpos.night.remarks import of_inclinometer
-from starpos.night.sightings import DeflectionSession, ZenithSighted
-from starpos.night.work import OnFile
+from starpos.night.work import DeflectionSession, OnFile, ZenithSighted
 from starpos.sky.catalogue import Catalogue, load_catalogue
+from starpos.units import ARCSEC, utc_text
+from starpos.zenith.adjustment import FaceQuality, Reduced, StarQuality, reduced
 from starpos.zenith.doubts import remarks
-from starpos.zenith.reductions import reduced
+from starpos.zenith.planning import Planner, Routine, SessionPlan, ZenithSky
 from starpos.zenith.sighting import Mark, ZenithSighting
+
+COLUMNS = ("file", "combined", "status", "utc", "face", "heading", "xi_arcsec", "eta_arcsec", "sigma_xi_arcsec",
+           "sigma_eta_arcsec", "stars_matched", "residual_arcsec", "faces", "frames")  # fmt: skip
+HEAD = "file: face, heading of the frame's top (deg), xi and eta (arcsec) of the frame alone, with the session's A3"
+JSON_HELP = (
+    "one JSON object a frame, and one with combined: true: xi_arcsec, eta_arcsec at the mark as the plumb line stood, "
+    "covariance_arcsec2 (2 x 2), errors (1 sigma of xi, eta for each source) and correlations, reduced (without the "
+    "tide; at the geoid), by_face and by_star (residuals, leverage); starpos stations and starpos report read it"
+)
+# number of stars listed, largest leverage first
+STARS_LISTED = 50
+
+
+def frame_json(path: str, session: DeflectionSession, k: int) -> dict:
+    """Frame k of a session, with the deflection that it alone has."""
+    s, found = session.sightings[k], session.adjusted
+    xi, eta = found.frame_arcsec[k] + [found.xi_arcsec, found.eta_arcsec]
+    sigma_xi, sigma_eta = found.frame_stddev_arcsec[k]
+    return {
+        "file": path,
+        "status": "ok",
+        "utc": utc_text(s.utc_unix_s),
+        "face": int(found.faces[k]) + 1,
+        "heading": np.degrees(s.heading),
+        "xi_arcsec": xi,
+        "eta_arcsec": eta,
+        "sigma_xi_arcsec": sigma_xi,
+        "sigma_eta_arcsec": sigma_eta,
+        "tilt_arcsec": s.tilt.theta[:2] / ARCSEC,
+        "stars_matched": len(s.stars),
+        "residual_arcsec": s.residual_rms_arcsec,
+    }
+
+
+def frame_line(value: dict) -> str:
+    """A line for people of what `frame_json` returns."""
+    return (
+        f"{value['file']}: face {value['face']}, {value['heading']:.2f}, xi {value['xi_arcsec']:+.3f}, eta "
+        f"{value['eta_arcsec']:+.3f} +- {value['sigma_xi_arcsec']:.3f} {value['sigma_eta_arcsec']:.3f}, "
+        f"{value['stars_matched']} stars"
+    )
+
+
+def combined_json(
+    session: DeflectionSession, without: Reduced, mark: Mark, station: str, catalogue: Catalogue
+) -> dict:
+    """The session's value; station: name of the mark, '' for none.  catalogue: of which its stars are rows."""
+    found = session.adjusted
+    sigma_xi, sigma_eta = found.sigma_arcsec
+    return {
+        "combined": True,
+        "status": "ok",
+        "station": station,
+        "site": {
+            "latitude": np.degrees(mark.latitude),
+            "longitude": np.degrees(mark.longitude),
+            "height_m": mark.height_m,
+        },
+        "utc": utc_text(session.mid_unix_s),
+        "duration_s": session.sightings[-1].utc_unix_s - session.sightings[0].utc_unix_s,
+        "xi_arcsec": found.xi_arcsec,
+        "eta_arcsec": found.eta_arcsec,
+        "sigma_xi_arcsec": sigma_xi,
+        "sigma_eta_arcsec": sigma_eta,
+        "covariance_arcsec2": found.covariance_arcsec2,
+        "faces": int(found.faces.max()) + 1,
+        "frames": len(session.sightings),
+        "errors": {name: [xi, eta] for name, xi, eta in found.terms},
+        "correlations": found.correlations,
+        "image_motion_arcsec": found.air.motion / ARCSEC,
+        "anomalous_refraction_arcsec": found.air.anomalous / ARCSEC,
+        "catalogue_factor": found.catalogue_factor,
+        "chi2_per_degree": found.chi2_per_degree,
+        "misalignment_deg": found.misalignment_deg,
+        "reduced": {
+            "tide_arcsec": without.tide_arcsec,
+            "curvature_arcsec": [without.curvature_arcsec, 0.0],
+            "mark_arcsec": without.mark_arcsec,
+            "geoid_arcsec": without.geoid_arcsec,
+        },
+        "by_face": [_face_json(face) for face in found.face_quality],
+        "stars": len(found.stars.stars),
+        "by_star": _stars_json(found.stars, catalogue),
+    }
+
+
+def _face_json(face: FaceQuality) -> dict:
+    return {
+        "face": face.number + 1,
+        "heading": face.heading_deg,
+        "frames": face.frames,
+        "off_arcsec": face.off_arcsec,
+        "stddev_arcsec": face.stddev_arcsec,
+        "chi2": face.chi2,
+    }
+
+
+def _stars_json(stars: StarQuality, catalogue: Catalogue) -> list[dict]:
+    """The stars with the largest leverage, in order of it."""
+    first = np.argsort(-np.hypot(*stars.leverage_arcsec.T), kind="stable")[:STARS_LISTED]
+    names, magnitudes = catalogue.labels(stars.stars[first])
+    return [
+        {
+            "star": name,
+            "vmag": vmag,
+            "frames": stars.frames[k],
+            "mean_arcsec": stars.mean_arcsec[k],
+            "rms_arcsec": stars.rms_arcsec[k],
+            "leverage_arcsec": stars.leverage_arcsec[k],
+        }
+        for name, vmag, k in zip(names, magnitudes.tolist(), first.tolist(), strict=True)
+    ]
+
+
+def combined_text(session: DeflectionSession, value: dict) -> str:
+    """The session's value in a few lines for people."""
+    found, without = session.adjusted, value["reduced"]
+    parts = sorted(found.terms, key=lambda term: -np.hypot(*term[1:]))[:5]
+    sizes = ", ".join(f"{name} {xi:.3f} {eta:.3f}" for name, xi, eta in parts)
+    mark, geoid = without["mark_arcsec"], without["geoid_arcsec"]
+    return "\n".join(
+        (
+            f"xi {found.xi_arcsec:+.3f} +- {value['sigma_xi_arcsec']:.3f}, eta {found.eta_arcsec:+.3f} +- "
+            f"{value['sigma_eta_arcsec']:.3f} arcsec at the mark, of {value['frames']} frames in {value['faces']} faces",
+            f"without the tide {mark[0]:+.3f} {mark[1]:+.3f}, at the geoid {geoid[0]:+.3f} {geoid[1]:+.3f} (normal "
+            "plumb line)",
+            f"image motion {value['image_motion_arcsec']:.2f} a frame, anomalous refraction "
+            f"{value['anomalous_refraction_arcsec']:.3f}; largest errors (xi, eta): {sizes}",
+            *(_face_text(face) for face in value["by_face"]),
+            *(_star_text(star, value["stars"]) for star in value["by_star"][:1]),
+        )
+    )
+
+
+def _face_text(face: dict) -> str:
+    (xi, eta), (sigma_xi, sigma_eta) = face["off_arcsec"], face["stddev_arcsec"]
+    return (
+        f"face {face['face']} ({face['heading']:.0f} deg, {face['frames']} frames) minus the others: xi {xi:+.3f} +- "
+        f"{sigma_xi:.3f}, eta {eta:+.3f} +- {sigma_eta:.3f}, chi-square {face['chi2']:.1f}"
+    )
+
+
+def _star_text(star: dict, stars: int) -> str:
+    xi, eta = star["leverage_arcsec"]
+    return (
+        f"of {stars} stars {star['star']} (V {star['vmag']:.1f}, {star['frames']} frames) counts most: 1 sigma of its "
+        f"catalogue place would move xi by {xi:.4f}, eta by {eta:.4f}, if the session did not correct it"
+    )
+
+
+NO_PLAN = 1
+
+
+def add_plan(parser: argparse.ArgumentParser) -> None:
+    """Add --plan and what it takes."""
+    plan = parser.add_argument_group("plan a session instead")
+    plan.add_argument(
+        "--plan",
+        type=options.number(0.001, 3),
+        metavar="SIGMA",
+        help="print the faces, frames and time for this error (arcsec) of xi and of eta; takes --site, --instrument, "
+        "the air, and no frames",
+    )
+    plan.add_argument(
+        "--motion",
+        type=options.number(0, 5),
+        default=0.4,
+        metavar="ARCSEC",
+        help="image motion of a frame (0.4; starpos deflection prints that of a session)",
+    )
+    plan.add_argument(
+        "--centroid",
+        type=options.number(0.001, 5),
+        default=0.1,
+        metavar="PX",
+        help="error of a star's centroid (0.1)",
+    )
+    plan.add_argument(
+        "--limit-mag",
+        type=options.number(2, 20),
+        default=9.5,
+        metavar="V",
+        help="faintest stars on a frame (9.5)",
+    )
+    plan.add_argument(
+        "--cadence",
+        type=options.number(0.01, 600),
+        default=5.0,
+        metavar="S",
+        help="from frame to frame (5)",
+    )
+    plan.add_argument(
+        "--turning",
+        type=options.number(0.01, 3600),
+        default=60.0,
+        metavar="S",
+        help="from the last frame of a face to the first of the next (60)",
+    )
+    plan.add_argument(
+        "--readings",
+        type=options.number(1, 10_000, int),
+        default=5,
+        metavar="N",
+        help="of the tiltmeter in a frame (5)",
+    )
+    plan.add_argument(
+        "--level",
+        type=options.number(0, 3600),
+        default=10.0,
+        metavar="ARCSEC",
+        help="how well each face is levelled (10)",
+    )
+    options.add_frame_size(plan)
+
+
+def run_plan(args: argparse.Namespace, mark: Mark) -> int:
+    """Print the plan; returns the exit status."""
+    if args.frames or args.tilt is not None:
+        raise InstrumentError("--plan is for a session that has no frames yet: leave out frames and --tilt")
+    instrument = options.instrument_of(args, None)
+    camera = instrument.camera or instrument.camera_for(*(instrument.size or args.size))
+    state = earth_state(time.time())
+    sky = ZenithSky.of(load_catalogue(), camera, mark.latitude, args.limit_mag, args.centroid, state.year)
+    planner = Planner(
+        instrument=instrument,
+        camera=camera,
+        atmosphere=options.atmosphere_of(args),
+        mark=mark,
+        sky=sky,
+        routine=Routine(
+            frame_s=args.cadence,
+            turning_s=args.turning,
+            readings=args.readings,
+            level_rad=args.level * ARCSEC,
+        ),
+        motion_rad=args.motion * ARCSEC,
+        state=state,
+    )
+    try:
+        plan = planner.quickest(args.plan)
+    except FixError as error:
+        console.complain("deflection", error)
+        return NO_PLAN
+    value = _plan_json(plan, sky)
+    if args.json:
+        console.print_json(value)
+    else:
+        print(_plan_text(value))
+    return 0
+
+
+def _plan_json(plan: SessionPlan, sky: ZenithSky) -> dict:
+    sigma_xi, sigma_eta = plan.sigma_arcsec
+    return {
+        "plan": True,
+        "rounds": plan.rounds,
+        "faces": plan.faces,
+        "frames_a_face": plan.frames,
+        "frames": plan.faces * plan.frames,
+        "duration_s": plan.duration_s,
+        "sigma_xi_arcsec": sigma_xi,
+        "sigma_eta_arcsec": sigma_eta,
+        "stars_a_frame": sky.stars,
+        "errors": {name: [xi, eta] for name, xi, eta in plan.terms},
+    }
+
+
+def _plan_text(value: dict) -> str:
+    largest = sorted(value["errors"].items(), key=lambda item: -max(item[1]))[:4]
+    sizes = ", ".join(f"{name} {xi:.3f} {eta:.3f}" for name, (xi, eta) in largest)
+    return (
+        f"{value['faces']} faces (a quarter turn from one to the next, {value['rounds']} "
+        f"{'round' if value['rounds'] == 1 else 'rounds'}) of {value['frames_a_face']} frames, "
+        f"{value['duration_s'] / 60:.0f} min: xi +- {value['sigma_xi_arcsec']:.3f}, eta +- "
+        f"{value['sigma_eta_arcsec']:.3f} arcsec, {value['stars_a_frame']:.0f} stars a frame\n"
+        f"largest errors (xi, eta): {sizes}"
+    )
+
 
 NO_DEFLECTION = 1
 
@@ -68,19 +338,19 @@ def define(parser: argparse.ArgumentParser) -> None:
         metavar="NAME",
         help="name of the mark, for starpos stations and starpos report",
     )
-    deflection_plan.add_plan(parser)
-    bags.add_bag(parser)
+    add_plan(parser)
+    inputs.add_bag(parser)
     options.add_stamps(parser)
     options.add_instrument(parser)
     options.add_air(parser)
-    jobs.add_jobs(parser)
+    inputs.add_jobs(parser)
     parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
     mark = _mark_of(args)
     if args.plan is not None:
-        return deflection_plan.run(args, mark)
+        return run_plan(args, mark)
     taken = _of_bag(args, mark) if _is_bag(args) else _of_files(args, mark)
     return console.UNREADABLE if taken is None else _tell(args, taken, mark)
 
@@ -104,7 +374,7 @@ def _of_files(args: argparse.Namespace, mark: Mark) -> _Taken | None:
         raise InstrumentError("give frames and --tilt CSV, or a bag, or --plan SIGMA")
     read = reader_of(args)
     frames = frames_among(args.frames, args.tilt)
-    with jobs.workers_of(args, len(frames)) as workers:
+    with inputs.workers_of(args, len(frames)) as workers:
         (about,) = workers.map([(First(read), tuple(frames))])
         if about is None:
             # says why
@@ -115,9 +385,11 @@ def _of_files(args: argparse.Namespace, mark: Mark) -> _Taken | None:
             console.complain("deflection", doubt)
         given = replace(given_of(args, about), instrument=instrument)
         tilts = checked_tilts("deflection", os.path.abspath(args.tilt), instrument)
-        jobs.prepare("deflection", instrument, about)
+        inputs.prepare("deflection", instrument, about)
         work = OnFile(read, ZenithSighted(given, options.atmosphere_of(args), tilts, mark))
-        answers = list(jobs.watched(workers.map((work, path) for path in frames), len(frames), silent=False))
+        answers = list(
+            inputs.watched(workers.map((work, path) for path in frames), len(frames), silent=False)
+        )
     _, catalogue, _ = Solver(instrument, load_catalogue()).view(about.width, about.height, about.origin_px)
     return _Taken(frames, answers, instrument, catalogue)
 
@@ -134,7 +406,7 @@ def _is_bag(args: argparse.Namespace) -> bool:
 def _of_bag(args: argparse.Namespace, mark: Mark) -> _Taken:
     """The sightings of a bag's frames."""
     path = Path(args.frames[0])
-    found, instruments = bags.read_bag(path, args)
+    found, instruments = inputs.read_bag(path, args)
     for remark in found.remarks:
         console.complain("deflection", remark)
     if found.tilts is None:
@@ -143,7 +415,7 @@ def _of_bag(args: argparse.Namespace, mark: Mark) -> _Taken:
         raise FrameError(f"{path}: no stars and no images in it: record the topic stars too")
     work = ZenithSighted(instruments, options.atmosphere_of(args), found.tilts, mark)
     names, answers, instrument, catalogue = [], [], instruments.instrument, load_catalogue()
-    for name, item in jobs.watched(each_frame(found), found.star_count, silent=False):
+    for name, item in inputs.watched(each_frame(found), found.star_count, silent=False):
         names.append(name)
         answers.append(item if isinstance(item, FrameError) else work(item))
         if isinstance(answers[-1], ZenithSighting) and (own := instruments.of(item)) is not None:

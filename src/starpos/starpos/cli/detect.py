@@ -4,11 +4,11 @@
 import argparse
 from typing import TYPE_CHECKING
 
-from starpos.cli import console, jobs, options
-from starpos.cli.archive import frames_among
-from starpos.cli.output import Output, add_formats
+from starpos.cli import console, inputs, options
+from starpos.cli.console import Output, add_formats
+from starpos.cli.inputs import frames_among
 from starpos.errors import FrameError
-from starpos.frames.stars import Stars
+from starpos.frames.frame import Stars
 from starpos.night.reading import Reader
 from starpos.night.work import OnFile, detected
 
@@ -25,7 +25,7 @@ JSON_HELP = (
 def define(parser: argparse.ArgumentParser) -> None:
     options.add_frames(parser)
     add_formats(parser, JSON_HELP, "a row of a CSV a star")
-    jobs.add_jobs(parser)
+    inputs.add_jobs(parser)
     parser.set_defaults(run=run)
 
 
@@ -33,8 +33,8 @@ def run(args: argparse.Namespace) -> int:
     output = Output(args, COLUMNS, "")
     args.frames = frames_among(args.frames)
     status, work, number = 0, OnFile(Reader(), detected), len(args.frames)
-    with jobs.workers_of(args, number) as workers:
-        answers = jobs.watched(workers.map((work, path) for path in args.frames), number)
+    with inputs.workers_of(args, number) as workers:
+        answers = inputs.watched(workers.map((work, path) for path in args.frames), number)
         for path, answer in zip(args.frames, answers, strict=True):
             if isinstance(answer, FrameError):
                 status = console.UNREADABLE

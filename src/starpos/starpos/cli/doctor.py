@@ -186,7 +186,7 @@ def cache() -> Finding:
 def earth_rotation() -> Finding:
     """The age of the IERS table against now."""
     from starpos.earth import orientation
-    from starpos.utc import utc_text
+    from starpos.units import utc_text
 
     now = time.time()
     until = orientation.measured_until()

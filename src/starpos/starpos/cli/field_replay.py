@@ -5,11 +5,11 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from starpos.earth.refraction import Atmosphere
-from starpos.frames.night_files import TILTS
 from starpos.frames.reading import read_frame
+from starpos.frames.tables import TILTS
 from starpos.instrument import instrument_file
 from starpos.instrument.tilt_table import read_tilt_csv
-from starpos.night.folder import frames_in
+from starpos.night.opening import frames_in
 from starpos.night.reading import stars_of
 from starpos.report.field import INSTRUMENT
 from starpos.session.frames import Output

@@ -11,19 +11,19 @@ from starpos.cli.inputs import given_of
 from starpos.earth.vertical import Deflection
 from starpos.errors import FrameError, TiltError
 from starpos.fix.solver import Solver
-from starpos.frames.night_files import TILTS
+from starpos.frames.frame import Stars
 from starpos.frames.reading import read_frame
-from starpos.frames.stars import Stars
-from starpos.instrument import instrument_update
+from starpos.frames.tables import TILTS
+from starpos.instrument import instrument_file
 from starpos.instrument.tilt_log import BRACKET_S, TiltLog
 from starpos.instrument.tilt_table import read_tilt_csv
 from starpos.night.first_night import AROUND_S, FirstNight, Look, Stage
-from starpos.night.folder import exposures, frames_in
+from starpos.night.opening import exposures, frames_in
 from starpos.night.reading import About, Given, stars_of
 from starpos.night.work import Identifying
 from starpos.report import field
 from starpos.sky import catalogue
-from starpos.utc import utc_text
+from starpos.units import utc_text
 
 NOT_YET = 1
 POLL_S = 0.5
@@ -60,7 +60,7 @@ def define(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    overwriting.check(args, overwriting.Written("--save", args.save, instrument_update.check_replaceable))
+    overwriting.check(args, overwriting.Written("--save", args.save, instrument_file.check_replaceable))
     folder = Path(args.folder)
     if not folder.is_dir():
         raise FrameError(

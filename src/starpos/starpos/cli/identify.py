@@ -6,17 +6,16 @@ import math
 
 import numpy as np
 
-from starpos.cli import console, jobs, options
-from starpos.cli.archive import frames_among
-from starpos.cli.inputs import given_of, is_untold, reader_of
-from starpos.cli.output import Output, add_formats
+from starpos.cli import console, inputs, options
+from starpos.cli.console import Output, add_formats
+from starpos.cli.inputs import frames_among, given_of, is_untold, reader_of
 from starpos.errors import FrameError
 from starpos.fix.blind import SEARCH_S, BlindSolver
 from starpos.fix.solution import Solution, Status
-from starpos.instrument.lens import EQUIDISTANT
+from starpos.instrument.camera import EQUIDISTANT
 from starpos.night.reading import First, Given
 from starpos.night.work import Fitting, Identifying, OnFile
-from starpos.parallel.call import Here
+from starpos.parallel.processes import Here
 from starpos.progress import quiet
 from starpos.sky.catalogue import load_catalogue
 from starpos.units import ARCSEC
@@ -53,7 +52,7 @@ def define(parser: argparse.ArgumentParser) -> None:
         metavar="S",
         help=f"CPU time of the search where neither scale nor lens is known ({SEARCH_S:g} s)",
     )
-    jobs.add_jobs(parser)
+    inputs.add_jobs(parser)
     parser.set_defaults(run=run)
 
 
@@ -62,19 +61,19 @@ def run(args: argparse.Namespace) -> int:
     any_found, unreadable, number = False, False, len(args.frames)
     lost: str | None = None
     read, output = reader_of(args), Output(args, COLUMNS, HEAD)
-    with jobs.workers_of(args, number) as workers:
+    with inputs.workers_of(args, number) as workers:
         (about,) = workers.map([(First(read), tuple(args.frames))])
         given = Given(None, by_header=True)
         if about is not None and is_untold(args) and about.focal_px is None:
             BlindSolver(load_catalogue(), console.ProgressBar()).prepare()
         elif about is not None:
             given = given_of(args, about)
-            jobs.prepare("identify", options.instrument_of(args, about), about)
+            inputs.prepare("identify", options.instrument_of(args, about), about)
         # without a frame that can be read, each one reports why it cannot
         # several at once would write over each other's progress
         progress = console.ProgressBar() if isinstance(workers, Here) else quiet
         work = OnFile(read, Identifying(given, args.search_time, progress))
-        answers = jobs.watched(workers.map((work, path) for path in args.frames), number)
+        answers = inputs.watched(workers.map((work, path) for path in args.frames), number)
         for path, answer in zip(args.frames, answers, strict=True):
             if isinstance(answer, FrameError):
                 unreadable, found, cpu_ms = True, Solution.unreadable(path, answer), 0.0

@@ -1,16 +1,33 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the options state of a night's frames: how they are read, their instrument, tilts, and expected place."""
+"""What commands work on: frames, nights, bags, their instrument and tilts; and the workers that do it."""
 
 import argparse
 import math
+import os
+import sys
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 from starpos.cli import console, options
-from starpos.errors import InstrumentError
+from starpos.errors import FrameError, InstrumentError, StarposError, TiltError
+from starpos.fix.solver import Solver
+from starpos.frames.frame import no_stars
+from starpos.frames.tables import TILTS, TRUTH
+from starpos.instrument.camera import PLUMB_BOB
 from starpos.instrument.instrument import Instrument
-from starpos.instrument.lens import PLUMB_BOB
-from starpos.night.doubts import NEAR_KM, Near
 from starpos.night.reading import About, Given, Reader, TiltFile
-from starpos.night.remarks import of_tilts
+from starpos.night.remarks import NEAR_KM, Near, of_tilts
+from starpos.parallel.cluster import Cluster
+from starpos.parallel.processes import Here, Processes, Workers, processors
+from starpos.session.parameter_file import drivers_of
+from starpos.sky import catalogue
+
+if TYPE_CHECKING:
+    from starpos.night.bag import OfBag, Recorded
 
 
 def reader_of(args: argparse.Namespace) -> Reader:
@@ -73,3 +90,149 @@ def near_of(args: argparse.Namespace) -> Near | None:
     if not 0 < km <= 20_000:
         raise InstrumentError(f"--near-km {km:g}: give a distance above 0 and at most 20000")
     return Near(math.radians(latitude), math.radians(longitude), km)
+
+
+@dataclass(frozen=True)
+class NightFolder:
+    """Frames with one table of tilts that make one fix together.
+
+    tilt: absolute path; None where none is needed.  folder: None if the frames were named one by one.
+    """
+
+    frames: tuple[str, ...]
+    tilt: str | None
+    folder: str | None = None
+
+
+def frames_among(given: list[str], *tables: str | None) -> list[str]:
+    """The frames among files that a shell's *.csv, or *, has taken in: without tables, tilt.csv and truth.json.
+
+    Other files stay, and each one reports why it is not a frame.
+    """
+    beside = {os.path.realpath(table) for table in tables if table is not None}
+    frames = [
+        p for p in given if os.path.basename(p) not in (TILTS, TRUTH) and os.path.realpath(p) not in beside
+    ]
+    return frames or given
+
+
+def nights_of(
+    given: list[str], tilt: str | None, needs_no_tilt: bool = False
+) -> list[NightFolder | FrameError]:
+    """One night from frames and a table, or without one for a camera fixed to the ground or at a known place.
+
+    Else a night for each folder, or its error.
+
+    A folder's frames are its FITS files, or without FITS files its CSV files, in the order of their names.
+    Raises FrameError for a path that does not exist, TiltError for frames without a table.
+    """
+    if tilt is not None:
+        return [NightFolder(tuple(given), os.path.abspath(tilt))]
+    if needs_no_tilt:
+        return [NightFolder(tuple(given), None)]
+    if missing := next((path for path in given if not os.path.exists(path)), None):
+        raise FrameError(f"{missing}: there is no such file or folder")
+    if single := next((path for path in given if not os.path.isdir(path)), None):
+        raise TiltError(
+            f"{single}: no tilts: give --tilt with frames, or nights alone: folders of frames, each with its tilt.csv"
+        )
+    return [_night(folder) for folder in given]
+
+
+def _night(folder: str) -> NightFolder | FrameError:
+    from starpos.night.opening import frames_in
+
+    try:
+        frames = tuple(map(str, frames_in(Path(folder))))
+    except FrameError as error:
+        return error
+    return NightFolder(frames, os.path.abspath(os.path.join(folder, TILTS)), folder)
+
+
+PIP = "pip install matplotlib rosbags"
+
+
+def add_bag(parser: argparse.ArgumentParser) -> None:
+    """Add the options that `read_bag` reads."""
+    parser.add_argument("--namespace", metavar="NAME", help="of the instrument, in a bag that holds several")
+    options.add_parameters(
+        parser,
+        "of detector and inclinometer, where stars and tilts are made of a robot's images and IMU; the "
+        "solver's parameters come from the other options",
+        "detector:stamp:=start",
+    )
+    options.add_remaps(parser)
+
+
+def read_bag(path: Path, args: argparse.Namespace) -> "tuple[Recorded, OfBag]":
+    """One instrument's part of a bag, and the instrument of its frames; raises StarposError."""
+    if find_spec("rosbags") is None:
+        raise FrameError(f"{path}: bags are read with rosbags, which is not here: {PIP}")
+    from starpos.night import bag
+
+    any_camera = options.instrument_of(args, no_stars(100, 100, focal_px=1000.0))
+    drivers = drivers_of(args.params_file, args.param, args.namespace, options.remaps_of(args))
+    found = bag.read(path, args.namespace, any_camera.inclinometer.noise_rad, drivers, console.ProgressBar())
+    told = (args.instrument, args.focal_mm) != (None, None)
+    cameras = found.cameras if args.focal_mm is None else {}
+    return found, bag.OfBag(any_camera, cameras, any_size=told)
+
+
+MAX_JOBS = 1000
+AUTO = "auto"
+
+
+def add_jobs(parser: argparse.ArgumentParser, what: str = "frames") -> None:
+    """Add the options that `workers_of` reads; what: the object of the work."""
+    parser.add_argument(
+        "-j",
+        "--jobs",
+        type=_jobs,
+        metavar="N|auto",
+        help=f"work {what} on this number of processes (1; auto or 0: one per processor)",
+    )
+    parser.add_argument(
+        "--scheduler",
+        metavar="ADDRESS",
+        help="work them on a dask.distributed cluster whose workers have this starpos and see the files",
+    )
+
+
+def _jobs(text: str) -> int:
+    try:
+        return 0 if text == AUTO else options.number(0, MAX_JOBS, int)(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is neither a whole number nor {AUTO}") from None
+
+
+def workers_of(args: argparse.Namespace, frames: int) -> Workers:
+    """The workers that the options ask for, with no more processes than frames; raises InstrumentError."""
+    if args.scheduler is not None:
+        if args.jobs is not None:
+            raise InstrumentError(
+                "--scheduler names machines, --jobs processes of this one: give one of the two"
+            )
+        return Cluster(args.scheduler)
+    number = min(processors() if args.jobs == 0 else args.jobs or 1, frames)
+    return Here() if number <= 1 else Processes(number)
+
+
+def watched(answers: Iterable, number: int, what: str = "frame", silent: bool = True) -> Iterator:
+    """The answers unchanged, with a progress bar unless standard output shows them on the same terminal.
+
+    silent: whether, without a terminal, the answers are lines that show the progress.
+    """
+    bar = console.ProgressBar(terminal_only=silent)
+    for k, answer in enumerate(answers, 1):
+        if not (silent and sys.stdout.isatty()):
+            bar(f"{what} {k} of {number}", k / number)
+        yield answer
+
+
+def prepare(command: str, instrument: Instrument, about: About) -> None:
+    """Put the tables of a field into the cache, for all processes of a machine; reports what the catalogue lacks."""
+    solver = Solver(instrument, catalogue.load_catalogue(), progress=console.ProgressBar())
+    # the frames report the error
+    with suppress(StarposError):
+        if thin := solver.prepare(about.width, about.height, about.origin_px):
+            console.complain(command, thin)

@@ -8,25 +8,22 @@ from pathlib import Path
 
 import numpy as np
 
-from starpos.cli import console, jobs, options
-from starpos.cli.archive import frames_among
+from starpos.cli import console, inputs, options
+from starpos.cli.console import Output, add_formats
 from starpos.cli.fix_output import HEAD, in_degrees
-from starpos.cli.inputs import given_of, reader_of
-from starpos.cli.output import Output, add_formats
-from starpos.cli.vertical import add_vertical, tell_unknown, vertical_of
+from starpos.cli.inputs import frames_among, given_of, reader_of
+from starpos.cli.options import add_vertical, tell_unknown, vertical_of
 from starpos.earth.orientation import earth_orientation
 from starpos.earth.vertical import Vertical, geodetic
 from starpos.errors import FixError, FrameError, InstrumentError, TimeError, VoyageError
-from starpos.fix.readable import InDegrees
+from starpos.fix.fix import InDegrees
 from starpos.fix.solver import Solver
-from starpos.instrument.axis import AxisDoubt, framed
-from starpos.navigation.imu import ImuModel, read_imu, read_imu_model
-from starpos.navigation.laws import LAWS
+from starpos.instrument.instrument import AxisDoubt, framed
+from starpos.navigation.estimate import VoyageFix
+from starpos.navigation.records import ImuModel, read_imu, read_imu_model, read_velocity
 from starpos.navigation.sightings import IdentifiedFrame, sighting_of
-from starpos.navigation.velocity import read_velocity
-from starpos.navigation.vessel import Vessel
+from starpos.navigation.vessel import LAWS, Vessel
 from starpos.navigation.voyage import Voyage, navigate
-from starpos.navigation.voyage_fix import VoyageFix
 from starpos.night.reading import First, Given, Reader
 from starpos.night.work import Identifying
 from starpos.sky import catalogue
@@ -108,7 +105,7 @@ def define(parser: argparse.ArgumentParser) -> None:
     options.add_clock(parser)
     options.add_air(parser)
     add_vertical(parser)
-    jobs.add_jobs(parser)
+    inputs.add_jobs(parser)
     parser.set_defaults(run=run)
 
 
@@ -151,15 +148,15 @@ def run(args: argparse.Namespace) -> int:
     imu = read_imu(args.imu)
     model = ImuModel() if args.imu_model is None else read_imu_model(Path(args.imu_model))
     velocity = None if args.velocity is None else read_velocity(args.velocity)
-    with jobs.workers_of(args, number) as workers:
+    with inputs.workers_of(args, number) as workers:
         (about,) = workers.map([(First(read), tuple(args.frames))])
         if about is None:
             raise VoyageError(f"none of the {number} frames can be read: give star lists or frames")
         instrument, doubt = framed(options.instrument_of(args, about), about)
         mount_stddev = _mount_stddev(args, doubt)
-        jobs.prepare("navigate", instrument, about)
+        inputs.prepare("navigate", instrument, about)
         work = Seeing(read, replace(given_of(args, about), instrument=instrument))
-        answers = jobs.watched(workers.map((work, path) for path in args.frames), number)
+        answers = inputs.watched(workers.map((work, path) for path in args.frames), number)
         seen = [FrameSeen(None, None, str(a)) if isinstance(a, FrameError) else a for a in answers]
     for frame in seen:
         if frame.message:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Options shared by several commands: frames, instrument and air, and the objects made from them."""
+"""Options shared by several commands: frames, instrument, air, deflection, known place; the objects made from them."""
 
 import argparse
 from collections.abc import Callable
@@ -7,15 +7,20 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Protocol
 
+import numpy as np
+
+from starpos.cli import console
+from starpos.earth import geoid
+from starpos.earth.known_place import KnownPlace
 from starpos.earth.refraction import Atmosphere
+from starpos.earth.vertical import UNKNOWN_STDDEV_ARCSEC, AtHeight, Deflection, Vertical
 from starpos.errors import InstrumentError
 from starpos.frames.exif import UNTENDED_STDDEV_S, ZONES_H, CameraClock
-from starpos.frames.shutter import MAX_READOUT_S, UNKNOWN, Shutter
+from starpos.frames.exposure import MAX_READOUT_S, UNKNOWN_SHUTTER, Shutter
 from starpos.instrument import instrument, instrument_file, sensors
-from starpos.instrument.camera import Camera
+from starpos.instrument.camera import EQUIDISTANT, PLUMB_BOB, Camera
 from starpos.instrument.instrument import UNKNOWN_CLOCK_S
-from starpos.instrument.lens import EQUIDISTANT, PLUMB_BOB
-from starpos.recording import drivers
+from starpos.recording import topics
 
 
 def add_frames(parser: argparse.ArgumentParser, pointings: bool = False) -> None:
@@ -61,14 +66,14 @@ def add_remaps(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="NAME:=TOPIC",
-        help=f"the bag's topic to use as one of {', '.join(drivers.DRIVER_INPUTS)}, such as "
+        help=f"the bag's topic to use as one of {', '.join(topics.DRIVER_INPUTS)}, such as "
         "camera/image_raw:=/cam0/image_raw; without it the one with this name, or the only one of its type",
     )
 
 
-def remaps_of(args: argparse.Namespace) -> drivers.Remaps:
+def remaps_of(args: argparse.Namespace) -> topics.Remaps:
     """The topics of --remap; raises FrameError."""
-    return drivers.Remaps.of(args.remap)
+    return topics.Remaps.of(args.remap)
 
 
 def check_frames(args: argparse.Namespace) -> None:
@@ -194,7 +199,7 @@ def add_instrument(parser: argparse.ArgumentParser) -> None:
         metavar=("S", "STDDEV"),
         help="rolling shutter: s from the row read first to the last, negative where the bottom row is first, and its "
         "error; 0 0 is a global shutter (that of the instrument file, else ROLLSHUT of the frames, else not known, "
-        f"{UNKNOWN.readout_s:g} {UNKNOWN.readout_stddev_s:g})",
+        f"{UNKNOWN_SHUTTER.readout_s:g} {UNKNOWN_SHUTTER.readout_stddev_s:g})",
     )
     add_clock(parser)
 
@@ -362,3 +367,122 @@ class HasFocalLength(Protocol):
     @property
     def focal_px(self) -> float | None:
         """Focal length in px from the frame's header; None without one."""
+
+
+# sigma of a deflection that is given by hand without one
+GIVEN_STDDEV_ARCSEC = 1.0
+
+
+def add_vertical(parser: argparse.ArgumentParser) -> None:
+    """Add the options that `vertical_of` reads."""
+    parser.add_argument("--xi", type=float, metavar="ARCSEC", help="deflection of the vertical, north (0)")
+    parser.add_argument("--eta", type=float, metavar="ARCSEC", help="deflection of the vertical, east (0)")
+    parser.add_argument(
+        "--deflection-stddev", type=float, metavar="ARCSEC", help="its error a component (6, or 1 if given)"
+    )
+    parser.add_argument(
+        "--geoid",
+        metavar="FILE",
+        help="deflection and its error from a geoid grid (GTX, NGS .bin, GeoTIFF), such as egm96_15.gtx of proj-data",
+    )
+    parser.add_argument(
+        "--altitude-m",
+        type=number(-1000, 100_000),
+        metavar="M",
+        help="height above the ellipsoid: plumb lines curve by 0.17 arcsec (5 m) a km at 45 deg; not with "
+        "--xi and --eta, which hold at the instrument",
+    )
+
+
+def vertical_of(args: argparse.Namespace) -> Vertical:
+    """The deflection that is given by hand or by a geoid; without either an unknown one.  Raises StarposError.
+
+    A deflection given by hand holds at the instrument; others hold at the geoid, and plumb lines curve above it.
+    """
+    by_hand = args.xi, args.eta, args.deflection_stddev
+    if args.geoid is not None:
+        if by_hand != (None, None, None):
+            raise InstrumentError(
+                "--geoid gives the deflection and its error: give either --geoid or --xi, --eta and "
+                "--deflection-stddev"
+            )
+        return _at_height(geoid.read(args.geoid), args)
+    if by_hand == (None, None, None):
+        return _at_height(Deflection(), args)
+    if args.altitude_m is not None:
+        raise InstrumentError(
+            "--altitude-m is for a deflection at the geoid: leave it out, --xi and --eta hold at the "
+            "instrument"
+        )
+    stddev = args.deflection_stddev
+    if stddev is None:
+        stddev = GIVEN_STDDEV_ARCSEC if args.xi or args.eta else UNKNOWN_STDDEV_ARCSEC
+    return Deflection(args.xi or 0.0, args.eta or 0.0, stddev)
+
+
+def _at_height(vertical: Vertical, args: argparse.Namespace) -> AtHeight:
+    return AtHeight(vertical) if args.altitude_m is None else AtHeight(vertical, args.altitude_m)
+
+
+def tell_unknown(command: str, args: argparse.Namespace, deflection: Deflection) -> None:
+    """Complain if the geoid that was given has no data at the place."""
+    if args.geoid is not None and not deflection.known:
+        stddev = deflection.stddev_arcsec
+        console.complain(
+            command,
+            f"{args.geoid}: no data around this place; the deflection is unknown, {stddev:.2g} arcsec",
+        )
+
+
+def add_site(parser: argparse.ArgumentParser) -> None:
+    """Add the options that `place_of` reads."""
+    parser.add_argument(
+        "--site",
+        type=float,
+        nargs="+",
+        metavar=("LAT", "LON HEIGHT"),
+        help="known position, deg (by gravity unless --geodetic), and optionally its height above the "
+        "ellipsoid, m: gives heading, pitch and roll of each frame; needs no --tilt; without tilts the "
+        "position of a frame is null",
+    )
+    parser.add_argument(
+        "--geodetic",
+        action="store_true",
+        help="--site is on WGS 84, as a map or a receiver has it",
+    )
+    parser.add_argument(
+        "--site-stddev",
+        type=number(0, 100_000),
+        metavar="M",
+        help="error of --site to the east and to the north (0; 31 m are 1 arcsec)",
+    )
+
+
+def place_of(args: argparse.Namespace, vertical: Vertical) -> KnownPlace | None:
+    """The place of --site, None without it; InstrumentError for bad options, PlaceError for an impossible place.
+
+    vertical: the deflection by the other options.
+    """
+    if args.site is None:
+        if args.geodetic or args.site_stddev is not None:
+            raise InstrumentError("--geodetic and --site-stddev are for --site: give it too")
+        return None
+    if len(args.site) not in (2, 3):
+        raise InstrumentError(
+            f"--site has {len(args.site)} numbers: give latitude, longitude and optionally the height in m, "
+            f"after the frames"
+        )
+    if args.self_calibrate:
+        raise InstrumentError(
+            "--self-calibrate is for an unknown place: leave out --site, or find A3 by starpos calibrate --site"
+        )
+    if args.pointings is not None:
+        raise InstrumentError("--site is for frames, and --pointings has none: leave out one of them")
+    if len(args.site) == 3 and isinstance(vertical, AtHeight):
+        if args.altitude_m is not None:
+            raise InstrumentError("--site has a height, and --altitude-m another: give one")
+        vertical = replace(vertical, height_m=args.site[2])
+    covariance = np.eye(2) * (args.site_stddev or 0.0) ** 2
+    make = KnownPlace.on_ellipsoid if args.geodetic else KnownPlace.by_gravity
+    latitude_deg, longitude_deg, *_ = args.site
+    return make(latitude_deg, longitude_deg, vertical, covariance)

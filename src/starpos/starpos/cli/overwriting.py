@@ -12,7 +12,7 @@ from pathlib import Path
 from starpos import files
 from starpos.cli import console
 from starpos.errors import CatalogueError, InstrumentError
-from starpos.instrument import camera_file, instrument_file, instrument_update
+from starpos.instrument import instrument_file
 from starpos.instrument.instrument import Instrument
 from starpos.sky import catalogue
 
@@ -74,7 +74,7 @@ def _inputs(args: argparse.Namespace) -> Iterator[str]:
 
 def camera(path: Path) -> None:
     """The check of a camera's calibration file."""
-    if not camera_file.as_written(path, CAMERA_NAME):
+    if not instrument_file.camera_as_written(path, CAMERA_NAME):
         raise _there(path, "starpos calibrate did not write it in this form")
 
 
@@ -110,7 +110,7 @@ def save_instrument(
     command: str, name: str, found: Instrument, about: str, *, camera_found: bool = False
 ) -> None:
     """Write A3 into an instrument file, new or there already; raises InstrumentError."""
-    instrument_update.write(Path(name), found, about, camera_found=camera_found)
+    instrument_file.update(Path(name), found, about, camera_found=camera_found)
     if arcsec := instrument_file.read(name, needs_camera=False).calibration.remounted_arcsec:
         console.complain(
             command,

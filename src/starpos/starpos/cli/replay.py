@@ -7,9 +7,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from starpos.averaging.average import Average
-from starpos.calibration.unknown import BY_PARAMETERS, MODEL_BY_PARAMETERS
-from starpos.cli import console, field_replay, jobs, options
-from starpos.cli.archive import NightFolder
+from starpos.cli import console, field_replay, inputs, options
+from starpos.cli.console import Output, add_formats
 from starpos.cli.fix_output import (
     COLUMNS,
     CSV_HELP,
@@ -20,21 +19,22 @@ from starpos.cli.fix_output import (
     line_of,
     put_combined,
 )
-from starpos.cli.output import Output, add_formats
-from starpos.cli.solved_night import NO_FIX
+from starpos.cli.inputs import NightFolder
+from starpos.cli.solve import NO_FIX
 from starpos.earth.vertical import Vertical
 from starpos.errors import StarposError
+from starpos.fix.checks import BY_PARAMETERS, MODEL_BY_PARAMETERS
 from starpos.fix.solution import Solution
 from starpos.instrument.instrument import Instrument
 from starpos.night.remarks import of_a3, of_inclinometer
 from starpos.night.together import Solved, extrapolated
-from starpos.recording.drivers import NO_REMAPS, Remaps
+from starpos.recording.topics import NO_REMAPS, Remaps
 from starpos.report.field import is_field, opened
 from starpos.session import frames
 from starpos.session.frames import Answered, Averaged
 from starpos.session.parameter_file import drivers_of, settings_of
 from starpos.session.replay import Replay
-from starpos.utc import utc_text
+from starpos.units import utc_text
 
 
 def define(parser: argparse.ArgumentParser) -> None:
@@ -55,7 +55,7 @@ def define(parser: argparse.ArgumentParser) -> None:
     )
     options.add_remaps(parser)
     add_formats(parser, JSON_HELP, CSV_HELP)
-    jobs.add_jobs(parser, "bags")
+    inputs.add_jobs(parser, "bags")
     parser.set_defaults(run=run)
 
 
@@ -151,8 +151,8 @@ def run(args: argparse.Namespace) -> int:
     # a wrong parameter is reported once, not for each bag
     drivers_of(args.params_file, args.param, args.namespace)
     work = Playing(args.params_file, tuple(args.param), args.namespace, options.remaps_of(args))
-    with jobs.workers_of(args, len(args.bags)) as workers:
-        answers = jobs.watched(workers.map((work, bag) for bag in args.bags), len(args.bags), "bag")
+    with inputs.workers_of(args, len(args.bags)) as workers:
+        answers = inputs.watched(workers.map((work, bag) for bag in args.bags), len(args.bags), "bag")
         return max(
             tell(args, output, bag, night, settings.vertical)
             for bag, night in zip(args.bags, answers, strict=True)

@@ -7,22 +7,21 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from starpos.cli import bags, console, options
+from starpos.cli import console, inputs, options
 from starpos.cli.inputs import given_of
-from starpos.cli.solve_gnss import read_receiver
-from starpos.cli.vertical import add_vertical, vertical_of
+from starpos.cli.options import add_vertical, vertical_of
+from starpos.cli.solve import read_receiver
 from starpos.errors import FrameError, InstrumentError
-from starpos.night.folder import exposures, frames_in
 from starpos.night.night import Night
+from starpos.night.opening import exposures, frames_in
 from starpos.night.reading import First, Given, Reader
 from starpos.night.solving import Exposures, solved_night
 from starpos.session.parameter_file import of_solver
 from starpos.sky import catalogue
-from starpos.utc import utc_text
+from starpos.units import utc_text
 
 if TYPE_CHECKING:
-    from starpos.night.bag import Recorded
-    from starpos.night.recorded import OfBag
+    from starpos.night.bag import OfBag, Recorded
 
 NO_FIX = 1
 # maximum number of nights with all figures; more nights get the table and the errors only
@@ -48,7 +47,7 @@ def define(parser: argparse.ArgumentParser) -> None:
         help="instead of a page, write one night's lists of stars, tilts, instrument, air, versions and truth.json into "
         "one file that can be sent and `starpos solve` reads: no pictures, paths, names or serial numbers",
     )
-    bags.add_bag(parser)
+    inputs.add_bag(parser)
     options.add_instrument(parser)
     options.add_air(parser)
     add_vertical(parser)
@@ -72,12 +71,11 @@ def run(args: argparse.Namespace) -> int:
     if args.field is not None:
         return _pack(args)
     if find_spec("matplotlib") is None:
-        raise InstrumentError(f"a report is drawn with matplotlib, which is not here: {bags.PIP}")
-    from starpos.report.page import page
-    from starpos.report.pictures import nights_picture, pictures_of
-    from starpos.report.writing import PAGE, check, write
+        raise InstrumentError(f"a report is drawn with matplotlib, which is not here: {inputs.PIP}")
+    from starpos.report.html import PAGE, check_folder, write_files
+    from starpos.report.page import nights_picture, page, pictures_of
 
-    check(Path(args.out))
+    check_folder(Path(args.out))
     if _are_sessions(args.nights):
         return _stations(args)
     nights = [_night(Path(path), args) for path in args.nights]
@@ -97,7 +95,7 @@ def run(args: argparse.Namespace) -> int:
     for k, pictures in enumerate(each, 1):
         prefix = f"night{k}-" if len(nights) > 1 else ""
         files |= {f"{prefix}{p.name}.png": p.png for p in pictures}
-    write(Path(args.out), files | {PAGE: html.encode(errors="replace")})
+    write_files(Path(args.out), files | {PAGE: html.encode(errors="replace")})
     print(Path(args.out) / PAGE)
     return 0 if any(n.combined for n in nights) else NO_FIX
 
@@ -120,8 +118,8 @@ def _are_sessions(paths: list[str]) -> bool:
 def _stations(args: argparse.Namespace) -> int:
     """Write the page of a zenith camera's stations."""
     from starpos.earth import geoid
+    from starpos.report.html import PAGE, write_files
     from starpos.report.station_page import station_page
-    from starpos.report.writing import PAGE, write
     from starpos.zenith import session_file
     from starpos.zenith.stations import against_grid, stations_of
 
@@ -135,7 +133,7 @@ def _stations(args: argparse.Namespace) -> int:
         stations, compared, "" if args.geoid is None else Path(args.geoid).name, _now_text()
     )
     files = {f"{name}.png": picture.png for name, picture in pictures.items()}
-    write(Path(args.out), files | {PAGE: html.encode(errors="replace")})
+    write_files(Path(args.out), files | {PAGE: html.encode(errors="replace")})
     print(Path(args.out) / PAGE)
     return 0
 
@@ -146,7 +144,7 @@ def _now_text() -> str:
 
 def _pack(args: argparse.Namespace) -> int:
     """Write a field report of one night."""
-    from starpos.night import recorded
+    from starpos.night import bag
     from starpos.report import field
 
     if len(args.nights) > 1:
@@ -155,7 +153,7 @@ def _pack(args: argparse.Namespace) -> int:
         raise FrameError(f"--field {args.field}: give it a name that ends in {field.SUFFIX}")
     found = _exposures(Path(args.nights[0]), args)
     if not isinstance(found, Exposures):
-        found = recorded.exposures(*found, options.atmosphere_of(args), vertical_of(args))
+        found = bag.exposures(*found, options.atmosphere_of(args), vertical_of(args))
     count = field.write(Path(args.field), found, console.ProgressBar())
     print(f"{args.field}: {count} frames")
     return 0
@@ -163,7 +161,7 @@ def _pack(args: argparse.Namespace) -> int:
 
 def _night(path: Path, args: argparse.Namespace) -> Night:
     """The Night of a folder or a bag; raises StarposError if there is nothing to work on."""
-    from starpos.night import recorded
+    from starpos.night import bag
 
     turn_stddev_deg = options.turn_of(args) if args.self_calibrate else None
     found = _exposures(path, args)
@@ -172,7 +170,7 @@ def _night(path: Path, args: argparse.Namespace) -> Night:
         return solved_night(found, turn_stddev_deg, console.ProgressBar(), receiver)
     if receiver is not None:
         raise FrameError(f"{path}: --gnss goes with a folder of frames, and this is a bag: leave it out")
-    return recorded.night(
+    return bag.night(
         *found, options.atmosphere_of(args), vertical_of(args), turn_stddev_deg, console.ProgressBar()
     )
 
@@ -192,4 +190,4 @@ def _exposures(path: Path, args: argparse.Namespace) -> "Exposures | tuple[Recor
         about = First(Reader())(tuple(map(str, frames_in(path))))
         given = Given(None) if about is None else given_of(args, about)
         return exposures(path, given, air, vertical)
-    return bags.read_bag(path, args)
+    return inputs.read_bag(path, args)

@@ -6,10 +6,9 @@ import argparse
 import numpy as np
 
 from starpos.cli import console, options
-from starpos.frames.shutter import MAX_READOUT_S
+from starpos.frames.exposure import MAX_READOUT_S
 from starpos.instrument.instrument import focal_px_of
-from starpos.simulation.night_on_disk import write_night
-from starpos.simulation.scene import scene_of
+from starpos.simulation.scene import scene_of, write_night
 from starpos.sky import catalogue
 
 

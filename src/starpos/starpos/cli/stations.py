@@ -13,10 +13,9 @@ from starpos.cli import console
 from starpos.earth import geoid
 from starpos.earth.geoid import Geoid
 from starpos.errors import StationError
-from starpos.utc import utc_text
+from starpos.units import utc_text
 from starpos.zenith import session_file
-from starpos.zenith.levelling import GeoidStep, levelled
-from starpos.zenith.stations import Station, against_grid, stations_of
+from starpos.zenith.stations import GeoidStep, Station, against_grid, levelled, stations_of
 
 
 def define(parser: argparse.ArgumentParser) -> None:

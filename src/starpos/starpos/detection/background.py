@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Background and noise of a frame: clipped means on a coarse mesh, from a sparse sample of the pixels."""
+"""The plane that detection works on, the part of it that shows the sky, and its background and noise."""
 
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
+import cv2
 import numpy as np
 from scipy import ndimage
 
@@ -11,7 +12,103 @@ from starpos.detection._background import near, sampled
 from starpos.detection._mesh import evened
 from starpos.detection._order import median
 from starpos.detection._sparse import any_flat
-from starpos.normal import SIGMA_PER_MAD
+from starpos.frames.frame import Frame, Window
+from starpos.units import SIGMA_PER_MAD
+
+# Minimum noise of measured pixels over the noise of interpolated ones.
+NATIVE = 1.1
+
+
+def plane_of(frame: Frame) -> tuple[np.ndarray, bool | None]:
+    """The pixels (h, w) of a Frame as they were measured, and whether they are a mosaic.
+
+    The second value is True, False, or None if the file does not say: then only the pixels can show it. In colours made
+    from a mosaic two thirds of the numbers are interpolated. That correlates the noise of neighbours and spreads a hot
+    pixel to a star's width, so only the measured third is taken. Other colours are added, as uint16.
+    """
+    pixels = frame.pixels
+    if pixels.ndim == 2:
+        return np.ascontiguousarray(pixels), True if frame.pattern else None
+    measured = _measured(pixels)
+    if measured is None:
+        blue, green, red = cv2.split(pixels)
+        return cv2.add(cv2.add(blue, green, dtype=cv2.CV_16U), red, dtype=cv2.CV_16U), False
+    plane = np.empty(pixels.shape[:2], np.uint8)
+    for row, column in np.ndindex(2, 2):
+        colour = measured[:, row, column].argmax()
+        plane[row::2, column::2] = pixels[row::2, column::2, colour]
+    return plane, True
+
+
+def halved(plane: np.ndarray) -> tuple[np.ndarray, int]:
+    """The plane (h // 2, w // 2), uint16, of sums over squares of 2 x 2 px, and the flux of 1 DN in it.
+
+    Sums that would not fit into 16 bits are means, rounded. A mosaic becomes grey.
+    """
+    height, width = (n // 2 * 2 for n in plane.shape)
+    four = plane[:height, :width].reshape(height // 2, 2, width // 2, 2).sum((1, 3), dtype=np.uint32)
+    gain = 1 if plane.dtype == np.uint8 or four.max(initial=0) < 1 << 16 else 4
+    return ((four + gain // 2) // gain).astype(np.uint16), gain
+
+
+def _measured(pixels: np.ndarray) -> np.ndarray | None:
+    """Whether each colour was measured at (row, column) modulo 2, (3, 2, 2) bool; None if no mosaic is seen.
+
+    An average is less noisy than the values it is made of, so each colour is noisiest where it was measured.
+    """
+    height, width = pixels.shape[:2]
+    if min(height, width) < 32:
+        return None
+    # 200 rows of a phase are enough
+    step = 2 * max(1, height // 400)
+    noise = np.empty((3, 2, 2))
+    for row, column in np.ndindex(2, 2):
+        phase = pixels[row::step, column::2].astype(np.int16)
+        noise[:, row, column] = np.abs(np.diff(phase, axis=1)).mean((0, 1))
+    noise /= np.maximum(noise.mean((1, 2), keepdims=True), 1e-9)
+    for row, column in np.ndindex(2, 2):
+        measured = np.zeros((3, 2, 2), bool)
+        measured[2, row, column] = measured[0, 1 - row, 1 - column] = True
+        measured[1] = ~(measured[0] | measured[2])
+        low, high = np.where(measured, noise, np.inf).min((1, 2)), np.where(measured, 0, noise).max((1, 2))
+        if np.all(low > high) and noise[measured].mean() > NATIVE * noise[~measured].mean():
+            return measured
+    return None
+
+
+# A row or a column is white where this share of its pixels is.
+WHITE_SIDE = 0.9
+# Number of pixels of a side that are looked at first.
+FEW = 32
+
+
+def window_of(plane: np.ndarray, highest: int, sky_dn: float) -> Window | None:
+    """The Window of plane (h, w) between the white rows and columns along its sides; None if it has none, as is usual.
+
+    White is the frame's largest value, highest. Rows and columns as dark as sky_dn may be a sky that is cut off at 0.
+    """
+    sides = plane[0], plane[-1], plane[:, 0], plane[:, -1]
+    if highest <= sky_dn or not any(_is_white(side, highest) for side in sides):
+        return None
+    white = plane == highest
+    columns = np.flatnonzero(white.mean(0) < WHITE_SIDE)
+    if len(columns) == 0:
+        return None
+    left, right = int(columns[0]), int(columns[-1]) + 1
+    rows = np.flatnonzero(white[:, left:right].mean(1) < WHITE_SIDE)
+    if len(rows) == 0:
+        return None
+    window = left, int(rows[0]), right, int(rows[-1]) + 1
+    return None if window == (0, 0, plane.shape[1], plane.shape[0]) else window
+
+
+def _is_white(side: np.ndarray, highest: int) -> bool:
+    """Whether most pixels (N,) along a side are white; a few of them, far apart, are enough to recognise a dark side."""
+    few = side[:: len(side) // FEW + 1]
+    if 2 * np.count_nonzero(few == highest) <= len(few):
+        return False
+    return bool(np.count_nonzero(side == highest) >= WHITE_SIDE * len(side))
+
 
 # Maximum difference of neighbouring cells of continuous sky, in sigmas of a cell.
 STEEP = 5
@@ -21,7 +118,7 @@ QUANTISATION = 12**-0.5
 # median of the differences, or, if most pixels are equal (a sky cut off at 0), from the 75 and 90 % quantiles.
 CLIP = (SIGMA_PER_MAD, 1 / 0.607, 3.5, 0.9969)
 # A cell is partly white where this share of its pixels has the frame's largest value.
-WHITE = 0.03
+WHITE_CELL = 0.03
 # A JPEG has smoothed the sky where this share of blocks is flat; a block of the smallest step is then a peak of 4 sigma.
 FLAT, FAINTEST, BLOCK_NOISE = 0.1, 0.1, 2.0
 # Rows and columns of blocks that are looked at.
@@ -120,9 +217,11 @@ def _beside_lamps(white: np.ndarray, level: np.ndarray, noise: np.ndarray) -> tu
     white (rows, columns): the share of pixels with the frame's largest value. Else the sky next to a white wall would be
     too bright, and its stars lost.
     """
-    if white.mean() < WHITE or not (white < WHITE).any():
+    if white.mean() < WHITE_CELL or not (white < WHITE_CELL).any():
         return level, noise
-    row, column = ndimage.distance_transform_edt(white >= WHITE, return_distances=False, return_indices=True)
+    row, column = ndimage.distance_transform_edt(
+        white >= WHITE_CELL, return_distances=False, return_indices=True
+    )
     level, noise = (np.ascontiguousarray(mesh[:, row, column]) for mesh in (level, noise))
     return level, noise
 

@@ -1,12 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Learn a frame's PSF, colour gains and photon noise from its own bright stars."""
+"""Learn a frame's PSF, colour gains and photon noise from its own bright stars, or along a known trail."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
 
 import numpy as np
 from scipy import spatial
 
+from starpos.detection._field import agreed, over_field
+from starpos.detection._marginal import chosen, marginal
 from starpos.detection._moments import own_shapes
 from starpos.detection._neighbours import near_pairs
 from starpos.detection._noise import light_noise, of_phases, strangeness, typical_gains, unit_light
@@ -15,20 +18,190 @@ from starpos.detection._shapes import squared_widths
 from starpos.detection._stamps import greyed
 from starpos.detection.background import Background
 from starpos.detection.fit import Fit, Response, fit_stars
-from starpos.detection.psf import BROAD, NARROW, FieldPsf, Psf, gaussian
-from starpos.detection.refine import Terms, all_terms, even_terms, refine, widened
-from starpos.detection.shape import (
+from starpos.detection.psf import BROAD, MONOMIALS, NARROW, FieldPsf, Psf, gaussian, power, trailed
+from starpos.detection.stamps import (
     FARTHEST,
     NARROWEST,
     NARROWEST_WINDOW,
+    Stamps,
+    are_dots,
     centroid,
+    cut,
     frame_shape,
+    lights,
     moments,
     own_shape,
     relative_widths,
     window_for,
 )
-from starpos.detection.stamps import Stamps, are_dots, cut, lights
+from starpos.frames.exposure import Trail
+
+# Minimum number of stars for a variation over the field,
+PLACES = 12
+# and widths that vary over the field must be better than constant ones by this F.
+SIGNIFICANT = 4.0
+# and maximum distance of any of these stars from it, over the median distance.
+OUTLYING = 6.0
+# Prior of each coefficient, 1 sigma.
+LIKELY = 0.3
+# So much must each further coefficient lower chi-square: the Akaike criterion, and twice that for coefficients whose
+# errors move all stars of a frame, or of a part of it, together.
+WORTH, DEAR = 2.0, 4.0
+# Order of the odd terms.
+COMA = 3
+COMA_ORDERS = np.array([(i, COMA - i) for i in range(COMA + 1)], np.int32)
+# Highest order of the even terms that may vary over the field.
+FIELD_ORDER = 4
+# Steps in which stars are longer than wide.
+STEPS = 32
+
+
+def widened(psf: Psf, x: np.ndarray, y: np.ndarray, ratio: np.ndarray, weight: np.ndarray) -> Psf:
+    """The Psf with squared widths that vary over the field as N stars' widths do; psf itself if they do not.
+
+    psf     the same everywhere
+    x, y    (N,) px
+    ratio   (N, 2, 2): the stars' covariances along the axes of psf
+    weight  (N,) inverse variances of ratio, in any unit
+    """
+    # pairs are wide but say nothing about the optics
+    found = agreed(psf.monomials(x, y), ratio.reshape(-1, 4), weight, OUTLYING, PLACES, 4)
+    if found is None:
+        return psf
+    fitted, before, after, count = found
+    if (before - after) / (MONOMIALS - 1) < SIGNIFICANT * after / (count - MONOMIALS):
+        return psf
+    return psf.with_widths(fitted.reshape(-1, 2, 2))
+
+
+@dataclass(frozen=True, eq=False)
+class Terms:
+    """Terms of the series, and the sets of coefficients that are tried one after the other.
+
+    orders      (T, 2) int32: (i, j) of each term, without (0, 0), which is always there
+    candidates  (C, T, K) bool: sets of coefficients, of T terms in K monomials of the field; each is added to those
+                accepted before
+    price       (T, K): what each coefficient must lower chi-square by
+    """
+
+    orders: np.ndarray
+    candidates: np.ndarray
+    price: np.ndarray
+
+    @cached_property
+    def second(self) -> list[int]:
+        """Rows of the terms (2, 0), (1, 1) and (0, 2)."""
+        return [self.orders.tolist().index(term) for term in ([2, 0], [1, 1], [0, 2])]
+
+
+def even_terms(psf: Psf, highest: int) -> Terms:
+    """Terms of even order, up to `highest` across the trail and, for a long star, up to twice that along it."""
+    return _even_terms(_lengthened(psf), highest)
+
+
+def all_terms(psf: Psf, highest: int, count: int) -> Terms:
+    """The even terms, then coma, then variations over the field if there are enough stars, `count`."""
+    return _all_terms(_lengthened(psf), highest, count >= PLACES)
+
+
+def _lengthened(psf: Psf) -> float:
+    """How many times longer than wide a star is, from 1 to 2, in steps: the terms of each are made once."""
+    across, along = (math.hypot(*axis) for axis in psf.axes[::-1].tolist())
+    return round(STEPS * min(max(across / along, 1.0), 2.0)) / STEPS
+
+
+def _rank(orders: np.ndarray, longer: float) -> np.ndarray:
+    """The order that terms (T, 2) count as: along a trail they count less, by the ratio of its length to its width."""
+    return orders[:, 0] / longer + orders[:, 1]
+
+
+@lru_cache(maxsize=64)
+def _even_terms(longer: float, highest: int) -> Terms:
+    grid = [(i, j) for i in range(2 * highest + 1) for j in range(highest + 1) if (i + j) % 2 == 0]
+    orders = np.array(grid[1:], np.int32)
+    orders = orders[_rank(orders, longer) <= highest]
+    steps = np.arange(2, highest + 1, 2)
+    candidates = (_rank(orders, longer) <= steps[:, None])[..., None]
+    return Terms(orders, candidates, np.full((len(orders), 1), WORTH))
+
+
+@lru_cache(maxsize=64)
+def _all_terms(longer: float, highest: int, varied: bool) -> Terms:
+    even = _even_terms(longer, highest)
+    orders = np.concatenate([even.orders, COMA_ORDERS])
+    first = np.arange(MONOMIALS if varied else 1) == 0
+    steps = np.concatenate(
+        [even.candidates[..., 0], np.zeros((len(even.candidates), len(COMA_ORDERS)), bool)], 1
+    )
+    width, coma = orders.sum(1) == 2, orders.sum(1) == COMA
+    shape = (_rank(orders, longer) <= FIELD_ORDER) & ~width & ~coma
+    everywhere = [terms[:, None] & first for terms in (*steps, coma)]
+    field = [terms[:, None] & ~first for terms in (width, coma, shape)] if varied else []
+    return Terms(orders, np.array(everywhere + field), np.where(coma[:, None] | ~first, DEAR, WORTH))
+
+
+def refine(
+    psf: Psf,
+    x: np.ndarray,
+    y: np.ndarray,
+    left: np.ndarray,
+    top: np.ndarray,
+    brightness: np.ndarray,
+    weight: np.ndarray,
+    phase: np.ndarray,
+    phases: int,
+    terms: Terms,
+) -> Psf:
+    """The Psf whose series fits N stars best, by weighted linear least squares with free positions and gains.
+
+    x, y        (N,) px: the stars' places
+    left, top   (N,) px: first column and row of a stamp, from the centre of the star
+    brightness  (N, S, S): the pixels over their stars' fluxes and gains
+    weight      (N, S, S): inverse variances of brightness; 0 for a pixel that is not used
+    phase       (N, S, S): the pixels' phases in the mosaic, counted from 0; phases: their number
+    terms       the terms that are tried; they are taken if they are worth their price
+    """
+    local = psf.at(x, y)
+    normal, right = marginal(
+        local.axes, local.series, left, top, brightness, weight, phase, phases, terms.orders
+    )
+    count, places = terms.candidates.shape[1:]
+    field = psf.monomials(x, y)[:, :places]
+    each = (field[:, :, None] * field[:, None]).reshape(len(x), -1).T @ normal.reshape(len(x), -1)
+    normal = each.reshape(places, places, count, count).transpose(2, 0, 3, 1).reshape(count * places, -1)
+    right = (right.T @ field).ravel()
+    candidates = terms.candidates.reshape(-1, len(right)).view(np.uint8)
+    normal.flat[:: len(right) + 1] += LIKELY**-2
+    found = chosen(normal, right, candidates, terms.price.ravel())
+    if not np.isfinite(found).all():
+        return psf
+    found = found.reshape(count, places)
+    if places > 1:
+        psf, found = _absorbed(psf, field, terms, found)
+    used = found.any(1)
+    i, j = np.concatenate([[(0, 0)], terms.orders[used]]).T
+    series = np.zeros((places if found[:, 1:].any() else 1, i.max() + 1, j.max() + 1))
+    # unit flux: the other terms integrate to zero
+    series[0, 0, 0] = 1
+    series[:, i[1:], j[1:]] = found[used, : len(series)].T
+    return replace(psf, series=series)
+
+
+def _absorbed(psf: Psf, field: np.ndarray, terms: Terms, found: np.ndarray) -> tuple[Psf, np.ndarray]:
+    """Psf and coefficients with the field's second-order terms moved into the widths, which hold any amount of them."""
+    varied = found[terms.second, 1:]
+    if not varied.any():
+        return psf, found
+    a, b, c = varied @ field[:, 1:].T
+    change = np.stack([1 + np.sqrt(2) * a, b, b, 1 + np.sqrt(2) * c], -1).reshape(-1, 2, 2)
+    root = power(np.tensordot(field[:, : len(psf.widths)], psf.widths, 1), 0.5)
+    widths = over_field(field, (root @ change @ root).reshape(-1, 4))
+    if widths is None:
+        return psf, found
+    found = found.copy()
+    found[terms.second, 1:] = 0
+    return psf.with_widths(widths.reshape(-1, 2, 2)), found
+
 
 # Widths of the PSF, px, tried in a frame with fewer than ALIKE stars, and number of the highest peaks that decide.
 USUAL_SIGMAS, FEW = (1.1, 0.55, 2.2, 4.4), 10
@@ -300,3 +473,71 @@ def _refined(stamps: Stamps, psf: Psf, fit: Fit, sound: np.ndarray, response: Re
     )  # fmt: skip
     left, top = stamps.corner(x, y)
     return refine(psf, x, y, left, top, brightness, weight, stamps.phase, len(response.gain), terms)
+
+
+# px; a shorter trail makes no star longer
+SHORTEST_PX = 1.0
+# A long star has its peaks off its middle: a fit from there takes longer.
+TRAIL_ROUNDS = 10
+# Where trails differ over the frame the highest peaks belong to the shortest: factor by which more peaks are looked at.
+MORE = 4
+# Factors by which the width is sought further, after the usual ones.
+FINER = 2**0.5, 2**0.25
+# Unknowns of a learnt Gaussian; minimum decrease of chi-square against a width that is not learnt from stars.
+OF_SHAPE, CLEAR = 3, 10.0
+
+
+def with_trail(
+    lesson: Lesson,
+    plane: np.ndarray,
+    background: Background,
+    x: np.ndarray,
+    y: np.ndarray,
+    saturation: float,
+    trail: Trail,
+) -> Lesson:
+    """The Lesson with a PSF along a Trail where fewer than ALIKE stars have taught, and it fits no worse.
+
+    Where the camera rolled, so that each star has its own trail, also where more have taught, and it fits better.
+    x, y (N,) int px: the peaks, highest first.  Across the trail it is as wide as fits best.  What few stars have taught
+    may fit better by as much as its own unknowns are worth.
+    """
+    size = background.width, background.height
+    differ = trail.varies_px(*size) > SHORTEST_PX
+    taught = lesson.teachers >= ALIKE
+    if not differ and (taught or np.hypot(*trail.middle_px) < SHORTEST_PX):
+        return lesson
+    few = FEW * MORE if differ else FEW
+    peaks = np.flatnonzero(~are_dots(plane, background, x[: 10 * few], y[: 10 * few]))[:few]
+    own = float(np.sqrt(np.linalg.eigvalsh(lesson.psf.shape)[0]))
+    tried = [trailed(sigma, trail, *size) for sigma in (own, *USUAL_SIGMAS)]
+    stamps = cut(plane, background, x[peaks], y[peaks], max(map(reach_of, (lesson.psf, *tried))), saturation)
+
+    def fitted(psf: FieldPsf) -> Fit:
+        start = stamps.x.astype(float), stamps.y.astype(float)
+        return fit_stars(stamps, psf, *start, lesson.response, TRAIL_ROUNDS, leverage=True, whole=True)
+
+    fits = [fitted(lesson.psf), *map(fitted, tried)]
+    for factor in FINER:
+        best = tried[int(np.argmin(_left(stamps, fits, lesson)[1:]))]
+        finer = [trailed(best.sigma * f, trail, *size) for f in (factor, 1 / factor)]
+        tried, fits = tried + finer, fits + [fitted(psf) for psf in finer]
+    left = _left(stamps, fits, lesson)
+    best_of = int(np.argmin(left[1:]))
+    unknowns = OF_SHAPE + np.count_nonzero(lesson.psf.at(x[:1].astype(float), y[:1].astype(float)).series) - 1
+    allowed = 0.0 if taught else WORTH * unknowns if lesson.teachers else -CLEAR
+    # 0 of no stamp
+    if not (left[0] > 0 and left[1 + best_of] < left[0] + allowed):
+        return lesson
+    psf, fit, response = tried[best_of], fits[1 + best_of], lesson.response
+    sound = (fit.flux > BRIGHT * fit.flux_sigma) & np.isfinite(fit.covariance).all((1, 2))
+    if sound.any():
+        response = respond(stamps.take(sound), psf, fit.x[sound], fit.y[sound], fit, sound, response)
+    return replace(lesson, psf=psf, response=response, reach=reach_of(psf))
+
+
+def _left(stamps: Stamps, fits: list[Fit], lesson: Lesson) -> np.ndarray:
+    """Chi-square that fits with different PSFs leave in the same stamps, by the noise of the first one's light."""
+    noise2 = lesson.response.variance(stamps.noise, fits[0].model)
+    left = np.array([(stamps.good * fit.residual**2 / noise2).sum((1, 2)) for fit in fits])
+    return left[:, np.isfinite(left).all(0)].sum(1)

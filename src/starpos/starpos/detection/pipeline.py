@@ -11,20 +11,14 @@ import cv2
 import numpy as np
 
 from starpos.detection._sparse import third_highest
-from starpos.detection.background import measure_background
-from starpos.detection.clipped import with_clipped
-from starpos.detection.discs import find_discs, with_discs
-from starpos.detection.finding import find_peaks
-from starpos.detection.learn import learn
-from starpos.detection.plane import halved, plane_of
-from starpos.detection.streak import find_streaks
-from starpos.detection.trail import with_trail
+from starpos.detection.background import halved, measure_background, plane_of, window_of
+from starpos.detection.finding import find_peaks, find_streaks
+from starpos.detection.learn import learn, with_trail
+from starpos.detection.saturated import find_discs, with_clipped, with_discs
 from starpos.detection.vet import measure, resolve
-from starpos.detection.window import window_of
 from starpos.errors import FrameError
-from starpos.frames.frame import Frame
-from starpos.frames.stars import BLENDED, EDGE, ELONGATED, Stars, no_stars
-from starpos.frames.trail import Trail
+from starpos.frames.exposure import Trail
+from starpos.frames.frame import BLENDED, EDGE, ELONGATED, Frame, Stars, no_stars
 
 # Pixels of stars that are fitted together, give or take half, on a small and on a large frame: about 2 and 6 MB.
 CHUNK_PIXELS = 30_000, 120_000

@@ -9,14 +9,31 @@ from starpos.detection._neighbours import near_pairs
 from starpos.detection._shapes import squared_widths
 from starpos.detection._vetting import level, looks, one_pixel, own_light, without_spikes
 from starpos.detection.background import Background
-from starpos.detection.blend import Fitted, joined, pairs_among, rows_of, surprising
-from starpos.detection.fit import OUTLIER, Fit, Response, fit_stars
+from starpos.detection.fit import (
+    OUTLIER,
+    Fit,
+    Fitted,
+    Response,
+    fit_stars,
+    joined,
+    pairs_among,
+    rows_of,
+    surprising,
+)
 from starpos.detection.learn import Lesson, grey
 from starpos.detection.psf import FieldPsf
-from starpos.detection.shape import centroid, moments, relative_widths, window_for
-from starpos.detection.stamps import RAISED, UNEVEN, Stamps, cut
-from starpos.frames.stars import BLENDED, EDGE, ELONGATED, SATURATED
-from starpos.normal import SIGMA_PER_MAD
+from starpos.detection.stamps import (
+    RAISED,
+    UNEVEN,
+    Stamps,
+    centroid,
+    cut,
+    moments,
+    relative_widths,
+    window_for,
+)
+from starpos.frames.frame import BLENDED, EDGE, ELONGATED, SATURATED
+from starpos.units import SIGMA_PER_MAD
 
 # Maximum size in pixels of an outlier that is a hot pixel or a cosmic ray on the star, not another source.
 SPECK = 3

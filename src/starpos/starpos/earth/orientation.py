@@ -17,8 +17,7 @@ import numpy as np
 
 from starpos.earth.ellipsoid import ECCENTRICITY2, EQUATOR_RADIUS_M
 from starpos.errors import TimeError
-from starpos.units import ARCSEC, DAY_S
-from starpos.utc import UNIX_EPOCH_JD, utc_text
+from starpos.units import ARCSEC, DAY_S, UNIX_EPOCH_JD, utc_text
 
 TT_MINUS_TAI_S = 32.184
 # Since 2017; in 1900 it was 72 s less, which changes the aberration by 0.3 mas.

@@ -8,13 +8,21 @@ import numpy as np
 
 from starpos.budget import Budget
 from starpos.errors import StarposError
-from starpos.fix.identified import solution_of
-from starpos.fix.noise_alone import why_noise
-from starpos.fix.solution import Solution, Status
-from starpos.frames.stars import Stars
-from starpos.identification import MIN_STARS, Identification, Sky, blind_fisheye, quad_cache
-from starpos.identification.blind import LARGEST_DEG, SMALLEST_DEG, STAGES, identify_blind
-from starpos.identification.blind_fisheye import NARROWEST_DEG, WIDEST_DEG, disc_radius_px, identify_fisheye
+from starpos.fix.checks import why_noise
+from starpos.fix.solution import Solution, Status, solution_of
+from starpos.frames.frame import Stars
+from starpos.identification import MIN_STARS, Identification, Sky, blind
+from starpos.identification.blind import (
+    LARGEST_DEG,
+    NARROWEST_DEG,
+    SMALLEST_DEG,
+    STAGES,
+    WIDEST_DEG,
+    disc_radius_px,
+    identify_blind,
+    identify_fisheye,
+)
+from starpos.identification.quads import cached_quads
 from starpos.identification.search import field_of
 from starpos.identification.triangles import no_triangles
 from starpos.instrument.camera import Camera
@@ -36,12 +44,12 @@ class BlindSolver:
     catalogue: Catalogue
     progress: Progress = quiet
     stages: tuple[tuple[int, float], ...] = STAGES
-    fisheye_stages: tuple[int, ...] = blind_fisheye.STAGES
+    fisheye_stages: tuple[int, ...] = blind.FISHEYE_STAGES
     search_s: float = SEARCH_S
 
     def prepare(self) -> None:
         """Load the quads, or build them."""
-        quad_cache.cached(self.catalogue, self.progress)
+        cached_quads(self.catalogue, self.progress)
 
     def identify(self, stars: Stars) -> Solution:
         """Names of the stars, pointing, focal length and lens of a camera with its axis near the middle of the frame."""
@@ -72,7 +80,7 @@ class BlindSolver:
 
     def _match(self, seen: Stars, sky: Sky, budget: Budget) -> tuple[Camera, Identification] | None:
         """A camera and its identification of stars: of a pinhole, else of a fisheye, first where it looks like one."""
-        quads = quad_cache.cached(self.catalogue, self.progress)
+        quads = cached_quads(self.catalogue, self.progress)
         xy = np.stack([seen.x, seen.y], 1)
         about = xy, seen.sigma, seen.width, seen.height, sky, quads
         near_px = seen.rough_focal_px

@@ -1,16 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A4 from one frame: the place and the attitude of the instrument, with their covariance.
-
-The equation is the paper's, section 4: A2 A3 W = A4 A1 V, with refraction in L and the diurnal aberration of the
-site.
+"""A4 from one frame, by its stars or a plate solver's pointing: place and attitude of the instrument, with their
+covariance.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from starpos import rotation
+from starpos._numeric.roots import symmetric_root
 from starpos.earth.orientation import EarthState, station_velocity
 from starpos.earth.refraction import Atmosphere
 from starpos.fix.budget import (
@@ -22,14 +21,72 @@ from starpos.fix.budget import (
     place_of,
     total_covariance,
 )
-from starpos.fix.matched import MatchedStars, SeenFrame, apparent, fit_stars
-from starpos.fix.readable import InDegrees
-from starpos.frames.shutter import GLOBAL, Shutter
+from starpos.fix.star_fit import MatchedStars, SeenFrame, apparent, fit_stars
+from starpos.frames.exposure import GLOBAL_SHUTTER, Shutter
+from starpos.frames.tables import Pointing
 from starpos.frozen import at_once
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import Tilt
 from starpos.instrument.mounting import Mounting
 from starpos.units import ARCSEC
+
+# lengths from here on are given in km
+LONG_M = 10_000.0
+
+
+def length_text(metres: float, digits: int = 0) -> str:
+    """A length in m, or where metres mean nothing in km."""
+    return f"{metres:.{digits}f} m" if abs(metres) < LONG_M else f"{metres / 1000:.0f} km"
+
+
+def angle_text(rad: float) -> str:
+    """An angle in arcsec, or from 1 deg in deg."""
+    arcsec = rad / ARCSEC
+    return f"{arcsec:.0f} arcsec" if arcsec < 3600 else f"{arcsec / 3600:.2f} deg"
+
+
+@dataclass(frozen=True, kw_only=True)
+class InDegrees:
+    """A place and a heading in degrees, with 1 sigma of each; a heading that is not known is NaN.
+
+    sigma_east_m, sigma_north_m: of the place.
+    """
+
+    latitude: float
+    longitude: float
+    heading: float
+    sigma_east_m: float
+    sigma_north_m: float
+    sigma_heading: float
+
+    @classmethod
+    def of(cls, latitude: float, longitude: float, heading: float, covariance: np.ndarray) -> "InDegrees":
+        """Make it of angles in rad and the covariance (3, 3) of east m, north m, heading rad."""
+        east, north, turn = np.sqrt(np.diag(covariance)).tolist()
+        return cls(
+            latitude=math.degrees(latitude),
+            longitude=math.degrees(longitude),
+            heading=math.degrees(heading),
+            sigma_east_m=east,
+            sigma_north_m=north,
+            sigma_heading=math.degrees(turn),
+        )
+
+    @property
+    def where(self) -> str:
+        """The place with its errors."""
+        errors = f"+- {length_text(self.sigma_north_m)} N {length_text(self.sigma_east_m)} E"
+        return f"{self.latitude:+.6f} {self.longitude:+.6f} {errors}"
+
+    @property
+    def facing(self) -> str:
+        """The heading with its error; that it is not known."""
+        if math.isnan(self.heading):
+            return "heading not known: the camera was touched, or its roll is unknown"
+        return f"heading {self.heading:.4f} +- {self.sigma_heading:.4f} deg"
+
+    def __str__(self) -> str:
+        return f"{self.where}, {self.facing}"
 
 
 @at_once
@@ -77,7 +134,7 @@ def solve_fix(
     earth: EarthState,
     clock_stddev_s: float,
     stamp_stddev_s: float = 0.0,
-    shutter: Shutter = GLOBAL,
+    shutter: Shutter = GLOBAL_SHUTTER,
 ) -> Fix:
     """The fix of one frame from identified stars.
 
@@ -132,3 +189,68 @@ def solve_fix(
         camera_to_itrs=fit.a4.T @ g,
         camera_covariance=fit.a4.T @ errors.rotation_covariance(errors.centroids) @ fit.a4,
     )
+
+
+# the camera that sees the stars, in place of an unknown one: only its axes count
+IDEAL = Camera.from_focal(201, 201, 10_000.0)
+RING_STARS, RING_PX = 6, 40.0
+# the terms of the errors of stars, which the pointing's error replaces
+OF_STARS = ("centroids", "catalogue")
+
+
+def frame_axes(camera: Camera) -> np.ndarray:
+    """Rotation (3, 3) of C into the axes of the frame: z through its centre, y down from there, x to the right."""
+    x, y = camera.centre_px
+    axis, above = camera.directions([x, x], [y, y - 1.0])
+    up = rotation.normalised(above - (above @ axis) * axis)
+    return np.stack([np.cross(axis, up), -up, axis])
+
+
+def pointing_fix(
+    pointing: Pointing,
+    camera: Camera,
+    tilt: Tilt,
+    mounting: Mounting,
+    atmosphere: Atmosphere,
+    earth: EarthState,
+    clock_stddev_s: float,
+) -> Fix:
+    """The fix of a frame whose pointing and roll are known; FixError if it cannot be."""
+    to_frame = frame_axes(camera)
+    seen = replace(mounting, a3=mounting.a3 @ to_frame.T, link_to_camera=to_frame @ mounting.link_to_camera)
+    angle = 2 * np.pi * np.arange(RING_STARS) / RING_STARS
+    xy = np.array(IDEAL.centre_px) + RING_PX * np.stack([np.cos(angle), np.sin(angle)], -1)
+    # so large that refraction's and aberration's effect on the ring's shape is negligible
+    spread = RING_STARS * (pointing.sigma * IDEAL.fx) ** 2
+    stars = MatchedStars(
+        xy,
+        np.tile(np.eye(2) * spread, (RING_STARS, 1, 1)),
+        IDEAL.directions(*xy.T) @ _frame_to_icrs(pointing).T,
+        np.zeros(RING_STARS),
+    )
+    fix = solve_fix(stars, IDEAL, tilt, seen, atmosphere, earth, clock_stddev_s, pointing.stamp_stddev_s)
+    g, to_itrs = seen.level(tilt).camera, fix.camera_to_itrs
+    # the centre's error turns the frame about two axes across its own, the roll's error about its own axis
+    own = np.diag([pointing.sigma, pointing.sigma, pointing.sigma_roll]) ** 2
+    sensitivity = Sensitivity.of(place_of(g @ to_itrs.T), fix.link_to_enu)
+    return replace(
+        fix,
+        terms=(
+            ErrorTerm("pointing", sensitivity.stars @ symmetric_root(g @ own @ g.T)),
+            *(t for t in fix.terms if t.name not in OF_STARS),
+        ),
+        used=np.zeros(0, int),
+        residual_px=np.zeros((0, 2)),
+        residual_arcsec=float("nan"),
+        jitter_px=0.0,
+        camera_to_itrs=to_itrs @ to_frame,
+        camera_covariance=to_itrs @ own @ to_itrs.T,
+    )
+
+
+def _frame_to_icrs(pointing: Pointing) -> np.ndarray:
+    """Rotation (3, 3) of the frame's axes into the axes of ICRS."""
+    ra, dec, roll = pointing.ra, pointing.dec, pointing.roll
+    east, north = np.array([-np.sin(ra), np.cos(ra), 0.0]), rotation.unit_vector(ra, dec + np.pi / 2)
+    centre, up = rotation.unit_vector(ra, dec), np.cos(roll) * north + np.sin(roll) * east
+    return np.stack([np.cross(centre, up), -up, centre], 1)

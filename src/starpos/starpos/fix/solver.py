@@ -8,38 +8,68 @@ from functools import cached_property
 
 import numpy as np
 
-from starpos.earth.known_place import KnownPlace
+from starpos.earth.ellipsoid import curvature_radii_m
+from starpos.earth.known_place import KnownPlace, Places
 from starpos.earth.orientation import EarthState, earth_state
 from starpos.earth.refraction import Atmosphere
-from starpos.errors import FieldError, FixError, InstrumentError, StarposError, TimeError
-from starpos.fix.attitude_at_place import AttitudeAtPlace, attitude_at_place
-from starpos.fix.fix import Fix, solve_fix
-from starpos.fix.horizon import check_above_horizon
-from starpos.fix.identified import solution_of
-from starpos.fix.matched import MatchedStars, sound_matches
-from starpos.fix.pointing import IDEAL, pointing_fix
-from starpos.fix.seen import as_seen, directions_of, high_enough, inside
-from starpos.fix.solution import TWO_SKIES, UNEXPLAINED, Solution, Status, status_of
-from starpos.fix.unidentified import why_unidentified
-from starpos.fix.unmoved import check_unmoved
-from starpos.frames.pointings import Pointing
+from starpos.errors import FieldError, FixError, InstrumentError, PlaceError, StarposError, TimeError
+from starpos.fix.checks import check_above_horizon, check_unmoved, why_unidentified
+from starpos.fix.fix import IDEAL, Fix, length_text, pointing_fix, solve_fix
+from starpos.fix.heading import AttitudeAtPlace, attitude_at_place
+from starpos.fix.solution import TWO_SKIES, UNEXPLAINED, Solution, Status, solution_of, status_of
+from starpos.fix.star_fit import MatchedStars, sound_matches
+from starpos.frames.exposure import UNKNOWN_SHUTTER, Shutter
+from starpos.frames.frame import EDGE_PX, Stars
 from starpos.frames.reading import why_no_time
-from starpos.frames.shutter import UNKNOWN, Shutter
-from starpos.frames.stars import Stars
-from starpos.identification import MIN_STARS, Identification, PointingPrior, Sky, triangle_cache, wide
-from starpos.identification._frame import FrameStars, mean_sigma
+from starpos.frames.tables import Pointing
+from starpos.identification import MIN_STARS, Identification, PointingPrior, Sky, fisheye, identify_directions
+from starpos.identification._frame import FrameStars, all_within, ideal_frame, mean_sigma, unit_vectors
 from starpos.identification.hint import Hint
-from starpos.identification.search import Priors, field_of, identify_frame
-from starpos.identification.second_look import Look, second_look
-from starpos.identification.triangles import TriangleCatalogue
-from starpos.instrument.camera import Camera
-from starpos.instrument.camera_vertical import OWN_LEVEL
+from starpos.identification.pose import MIN_SIGMA_PX, TEST_STARS
+from starpos.identification.search import Look, Priors, field_of, identify_frame, second_look, through
+from starpos.identification.triangles import TriangleCatalogue, cached_triangles
+from starpos.instrument.camera import EQUIDISTANT, Camera
 from starpos.instrument.inclinometer import Tilt
-from starpos.instrument.instrument import Instrument
-from starpos.instrument.tilts import NO_TILTS, Tilts
+from starpos.instrument.instrument import OWN_LEVEL, Instrument
+from starpos.instrument.tilt_log import NO_TILTS, Tilts
 from starpos.progress import Progress, quiet
 from starpos.sky import deeper
 from starpos.sky.catalogue import Catalogue
+
+# A fisheye's lower stars are not used: no model describes refraction near the horizon.
+MIN_ALTITUDE_RAD = math.radians(10)
+
+
+def inside(stars: Stars, camera: Camera) -> np.ndarray | None:
+    """Rows of the stars that lie on their frame and in its lens's picture; None if all do, as is usual."""
+    if camera.model != EQUIDISTANT and all_within(stars.x, stars.y, stars.width, stars.height, EDGE_PX):
+        return None
+    on = stars.on_frame & camera.sees(stars.x, stars.y)
+    return None if on.all() else np.flatnonzero(on)
+
+
+def directions_of(camera: Camera, stars: Stars) -> np.ndarray:
+    """Unit vectors (N, 3) in C of the stars' pixels."""
+    if not camera.is_ideal:
+        return camera.directions(stars.x, stars.y)
+    return unit_vectors(stars.x, stars.y, camera.fx, camera.fy, camera.cx, camera.cy)
+
+
+def as_seen(camera: Camera, stars: Stars) -> FrameStars | None:
+    """The stars as `identify_frame` takes them, refracted; None unless all lie on the frame of an ideal camera.
+
+    For such a camera this is quicker than by their directions.
+    """
+    if not camera.is_ideal:
+        return None
+    field = ideal_frame(stars.x, stars.y, stars.covariance, camera, EDGE_PX, MIN_SIGMA_PX, TEST_STARS)
+    return None if field is None else through(field, camera, stars.window)
+
+
+def high_enough(sines: np.ndarray) -> np.ndarray:
+    """Whether stars are above the worst of the air, by the sines (N,) of their altitudes."""
+    return sines > math.sin(MIN_ALTITUDE_RAD)
+
 
 ENOUGH_SOUND = 8
 SMALLEST_FIELD_DEG, LARGEST_FIELD_DEG = 0.3, 100.0
@@ -49,7 +79,7 @@ SMALLEST_FIELD_DEG, LARGEST_FIELD_DEG = 0.3, 100.0
 class Solver:
     """Solver for one instrument in its surroundings: `solve` makes a fix, `identify` a pointing alone, by one search.
 
-    Other ways to identify a frame are in `starpos.night.searching`.
+    Other ways to identify a frame are in `starpos.fix.searching`.
 
     catalogue: or the deeper one in its stead, for a field that needs it.
     """
@@ -84,7 +114,7 @@ class Solver:
             if part != 1.0:
                 triangles = self.triangles_of(stars.width, stars.height, part, stars.origin_px)
             sky = Sky.at(catalogue, triangles, stars.mid_unix_s)
-            field: FrameStars | wide.WideField | None = as_seen(camera, stars)
+            field: FrameStars | fisheye.WideField | None = as_seen(camera, stars)
             if field is None:
                 if (rows := inside(stars, camera)) is not None:
                     return self.identify(stars.take(rows), predicted, look, part).among(stars, rows)
@@ -203,7 +233,7 @@ class Solver:
     ) -> Fix:
         up = self.instrument.mounting.level(tilt).camera[2]
         use, matched = self._matched(stars, found, camera, up, state, catalogue)
-        if wide.is_wide(camera):
+        if fisheye.is_wide(camera):
             sines = directions_of(camera, stars)[found.star] @ up
             check_above_horizon(float(sines.mean()), self.instrument.calibration)
         fix = solve_fix(
@@ -217,7 +247,7 @@ class Solver:
             stars.stamp_stddev_s,
             self.shutter(stars),
         )
-        if not wide.is_wide(camera):
+        if not fisheye.is_wide(camera):
             check_above_horizon(math.cos(fix.zenith_distance), self.instrument.calibration)
         check_unmoved(fix, self.instrument, self.clock_stddev_s(stars))
         return replace(fix, used=np.flatnonzero(use)[fix.used])
@@ -239,7 +269,7 @@ class Solver:
                 "the frame is mirrored (its rows run bottom-up): flip it, a position needs to know which side is up"
             )
         use = sound_matches(stars, found, max(self.min_stars, ENOUGH_SOUND))
-        if wide.is_wide(camera):
+        if fisheye.is_wide(camera):
             use &= high_enough(directions_of(camera, stars)[found.star] @ up)
         star, index = found.star[use], found.catalogue[use]
         return use, MatchedStars(
@@ -281,7 +311,7 @@ class Solver:
 
     def shutter(self, stars: Stars) -> Shutter:
         """The shutter as the instrument states it, else as the stars' source does."""
-        return self.instrument.shutter or stars.shutter or UNKNOWN
+        return self.instrument.shutter or stars.shutter or UNKNOWN_SHUTTER
 
     @cached_property
     def _views(self) -> dict[tuple, tuple[Camera, Catalogue, TriangleCatalogue]]:
@@ -298,7 +328,7 @@ class Solver:
         key = width, height, origin_px
         if key not in self._views:
             camera, catalogue = self._field(width, height, origin_px)
-            triangles = triangle_cache.cached(catalogue, wide.field_rad(camera), self.progress)
+            triangles = cached_triangles(catalogue, fisheye.field_rad(camera), self.progress)
             # one size is usual
             self._views.clear()
             self._views[key] = camera, catalogue, triangles
@@ -309,7 +339,7 @@ class Solver:
     ) -> tuple[Camera, Catalogue]:
         camera = self.instrument.camera_for(width, height, origin_px)
         field_deg = math.degrees(2 * camera.half_diagonal_rad)
-        if field_deg < SMALLEST_FIELD_DEG or (field_deg > LARGEST_FIELD_DEG and not wide.is_wide(camera)):
+        if field_deg < SMALLEST_FIELD_DEG or (field_deg > LARGEST_FIELD_DEG and not fisheye.is_wide(camera)):
             raise FieldError(
                 f"focal length {camera.fx:.0f} px makes a field of {field_deg:.2f} deg across, this program works "
                 f"from {SMALLEST_FIELD_DEG:g} to {LARGEST_FIELD_DEG:g} deg: check focal length and pixel size, and "
@@ -322,7 +352,7 @@ class Solver:
     ) -> TriangleCatalogue:
         """Triangles for a part of such frames, as `identify` has it, from the cache or built."""
         camera, catalogue, _ = self.view(width, height, origin_px)
-        return triangle_cache.cached(catalogue, part * wide.field_rad(camera), self.progress)
+        return cached_triangles(catalogue, part * fisheye.field_rad(camera), self.progress)
 
     def _inside(self, stars: Stars) -> np.ndarray | None:
         """Rows of the stars that lie on their frame and in its lens's picture; None if all do, as is usual."""
@@ -352,3 +382,75 @@ def check_explained(answer: Solution) -> None:
             f"{place}: only {seen.explained} of its {seen.bright} brightest detections are stars of the sky found, and "
             f"only {seen.seen} of the {seen.due} brightest stars there are detected: look at the frame"
         )
+
+
+# a correct place lies further from the stars' own once in 1e6 frames
+PLACE_SIGMAS = 5.3
+
+
+def placed(solver: Solver, stars: Stars, answer: Solution, places: Places) -> Solution:
+    """The answer to a frame with heading, pitch and roll at its known place, if its stars are identified.
+
+    Where there is a fix, a place that contradicts it gives no heading, and the remark says so. Without a fix the status
+    says why there is no heading.
+    """
+    if answer.found is None or stars.mid_unix_s is None:
+        return answer
+    try:
+        check_explained(answer)
+        place = places.at(stars.mid_unix_s)
+        if answer.fix is not None:
+            check_agrees(answer.fix, place)
+        attitude = solver.attitude_at(stars, answer.found, place)
+        alone = answer.ok and answer.fix is None
+        return replace(answer, at_place=attitude, message=attitude.text if alone else answer.message)
+    except StarposError as e:
+        if answer.fix is not None:
+            return replace(answer, remark=f"{stars.place}: no heading at the known place: {e}")
+        return replace(answer, status=status_of(stars, e), message=str(e))
+
+
+def check_agrees(fix: Fix, place: KnownPlace) -> None:
+    """Raise PlaceError if the stars' own place is further from a known one than their errors allow."""
+    latitude, longitude = place.plumb
+    prime, meridian = radii = np.array(curvature_radii_m(latitude))
+    east = math.remainder(fix.longitude - longitude, 2 * math.pi) * prime * math.cos(latitude)
+    off = np.array([east, (fix.latitude - latitude) * meridian])
+    claim = fix.covariance[:2, :2] + place.covariance + np.diag((radii * place.plumb_stddev) ** 2)
+    sigmas = math.sqrt(off @ np.linalg.solve(claim, off))
+    if sigmas > PLACE_SIGMAS:
+        raise PlaceError(
+            f"stars and tilt give a position {length_text(float(np.linalg.norm(off)))} from the given one, "
+            f"{sigmas:.0f} times their stated errors: check latitude and longitude, their order and signs, "
+            f"the tilts, A3 and the clock"
+        )
+
+
+# Ratio of successive tries, each of which tolerates an error of 3 %; number of tries on either side.
+FOCAL_STEP, FOCAL_TRIES = 1.055, 6
+
+
+def focal_that_fits(solver: Solver, stars: Stars, until_s: float = math.inf) -> float | None:
+    """The focal length in px at which a frame is identified, from 0.7 to 1.4 times the solver's; None without one.
+
+    No try is begun after until_s (time.monotonic).
+    Triangles are found by their angles, which hardly depend on the focal length, so the given field's triangles serve.
+    """
+    on = stars.take(stars.on_frame.nonzero()[0])
+    if len(on) < MIN_STARS:
+        return None
+    try:
+        given, catalogue, triangles = solver.view(on.width, on.height, on.origin_px)
+        sky = Sky.at(catalogue, triangles, on.mid_unix_s)
+        for k in sorted(range(-FOCAL_TRIES, FOCAL_TRIES + 1), key=abs):
+            if time.monotonic() >= until_s:
+                break
+            camera = given.scaled(FOCAL_STEP**k)
+            seen = on.take(camera.sees(on.x, on.y).nonzero()[0])
+            found = identify_directions(camera.directions(seen.x, seen.y), seen.sigma, camera, sky)
+            if found is not None:
+                return camera.fx * found.focal_scale
+    except StarposError:
+        # the frame's own sentence says it
+        return None
+    return None

@@ -9,8 +9,7 @@ from datetime import datetime, timezone
 import cv2
 import numpy as np
 
-from starpos.frames.frame import Frame
-from starpos.frames.stars import Stars
+from starpos.frames.frame import Frame, Stars
 
 # Blue, green, red.
 Colour = tuple[int, int, int]

@@ -9,9 +9,8 @@ import math
 from dataclasses import dataclass, replace
 
 from starpos.errors import FrameError
-from starpos.frames.exposure import MAX_EXPOSURE_S
+from starpos.frames.exposure import MAX_EXPOSURE_S, Shutter
 from starpos.frames.frame import Frame
-from starpos.frames.shutter import Shutter
 
 MIDDLE, START, END, ARRIVAL, UNKNOWN = "middle", "start", "end", "arrival", ""
 KINDS = (UNKNOWN, MIDDLE, START, END, ARRIVAL)

@@ -15,8 +15,7 @@ from datetime import datetime, timezone
 from typing import Any
 
 from starpos.errors import FrameError, TimeError
-from starpos.frames.exposure import MAX_EXPOSURE_S
-from starpos.frames.shutter import UNKNOWN_LATENCY_S
+from starpos.frames.exposure import MAX_EXPOSURE_S, UNKNOWN_LATENCY_S
 
 # Canon and Nikon allow their clocks an error of a minute a month.
 UNTENDED_STDDEV_S = 60.0

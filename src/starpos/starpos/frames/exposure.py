@@ -1,13 +1,107 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Facts of an exposure besides its pixels: its time and length, how well both are known, and its source."""
+"""Facts of an exposure besides its pixels: time and length, the times of its rows, the trail of its stars."""
 
+import math
 from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
 
 from starpos.errors import FrameError
-from starpos.frames.shutter import Shutter
+
+# 1 sigma of an unstated readout: evenly up to 50 ms, from the top or from the bottom
+UNKNOWN_READOUT_S = 0.03
+MAX_READOUT_S = 10.0
+# 1 sigma of the time from a consumer camera's stamp to the opening of its shutter: evenly up to 100 ms
+UNKNOWN_LATENCY_S = 0.06
+
+
+@dataclass(frozen=True)
+class Shutter:
+    """Times of a frame's rows; FrameError for impossible values.
+
+    readout_s         from the row that is read first to the last, s: positive where the top row is first, negative
+                      where it is the bottom row; 0 where all rows are exposed at once (a global shutter), or where it is
+                      unknown which is first
+    readout_stddev_s  its standard deviation
+    """
+
+    readout_s: float = 0.0
+    readout_stddev_s: float = UNKNOWN_READOUT_S
+
+    def __post_init__(self) -> None:
+        if not (abs(self.readout_s) <= MAX_READOUT_S and 0 <= self.readout_stddev_s <= MAX_READOUT_S):
+            raise FrameError(
+                f"a shutter's readout of {self.readout_s:g} s +- {self.readout_stddev_s:g} s is impossible: "
+                f"give at most "
+                f"{MAX_READOUT_S:g} s from the first row to the last, negative where the bottom row is first, and its "
+                "standard deviation"
+            )
+
+    def later_s(self, y: np.ndarray, height: int) -> np.ndarray:
+        """Time (N,) in s from the stamp to the middle of the exposure of the rows y (N,) px of a frame of that height."""
+        return abs(self.readout_s) * self._share(y, height)
+
+    def errors_s(self, y: np.ndarray, height: int) -> np.ndarray:
+        """Change (N, 2) of `later_s` for two independent errors of 1 sigma, which all frames share."""
+        # from an unknown end: the difference from row to row has either sign, and their mean is late by half the readout
+        middle = 0.0 if self.readout_s else 0.5
+        errors = np.empty((len(y), 2))
+        errors[:, 0], errors[:, 1] = self._share(y, height) - middle, middle
+        return self.readout_stddev_s * errors
+
+    def _share(self, y: np.ndarray, height: int) -> np.ndarray:
+        """Share (N,) of the readout that is over when the rows y (N,) are read."""
+        down = np.asarray(y, float) / max(height - 1, 1)
+        return 1 - down if self.readout_s < 0 else down
+
+
+GLOBAL_SHUTTER = Shutter(0.0, 0.0)
+UNKNOWN_SHUTTER = Shutter()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Trail:
+    """The way of stars from the beginning of an exposure to its end; FrameError for impossible values.
+
+    middle_px  (x, y) px of a star in the middle of the frame
+    roll_rad   by which all stars turn about the middle, from x towards y; a camera that looks up rolls when its vehicle
+               turns
+    """
+
+    middle_px: tuple[float, float]
+    roll_rad: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not (np.hypot(*self.middle_px) < LARGEST_SIDE_PX and abs(self.roll_rad) < np.pi):
+            raise FrameError(
+                f"the trail is {self.middle_px} px with a roll of {self.roll_rad} rad; give finite numbers, a roll "
+                "of less than half a turn, or None where it is unknown."
+            )
+
+    @property
+    def _chord(self) -> float:
+        """Way of a star by the roll, over its distance from the middle."""
+        return 2 * math.sin(self.roll_rad / 2)
+
+    def at(self, x: np.ndarray, y: np.ndarray, width: int, height: int) -> np.ndarray:
+        """The ways (N, 2) px of stars that are at x, y (N,) px at mid-exposure, on a frame of that size."""
+        across = np.stack([(height - 1) / 2 - y, x - (width - 1) / 2], -1)
+        return np.array(self.middle_px) + self._chord * across
+
+    def mean_square(self, width: int, height: int) -> np.ndarray:
+        """The mean (2, 2) px2 of the products of a way's components, over a frame."""
+        return np.outer(self.middle_px, self.middle_px) + self._chord**2 * np.diag([height**2, width**2]) / 12
+
+    def varies_px(self, width: int, height: int) -> float:
+        """Px by which the way in a corner of a frame differs from the way in the middle."""
+        return abs(self._chord) * math.hypot(width, height) / 2
+
+    def halved(self) -> "Trail":
+        """The trail on a frame reduced by two."""
+        x, y = self.middle_px
+        return Trail(middle_px=(x / 2, y / 2), roll_rad=self.roll_rad)
+
 
 # In a longer exposure the tilts of several poses would be averaged.
 MAX_EXPOSURE_S = 3600.0

@@ -15,8 +15,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from starpos.errors import FrameError, one_line
-from starpos.frames.files import MAX_BYTES, check_pixels
-from starpos.frames.frame import PATTERNS, Frame, to_unsigned
+from starpos.frames.frame import MAX_BYTES, PATTERNS, Frame, check_pixels, to_unsigned
 from starpos.frames.header import KEYS, about
 
 FITS_START, GZIP_START = b"SIMPLE", b"\x1f\x8b"

@@ -11,7 +11,7 @@ from typing import Any
 
 from starpos.errors import FrameError
 from starpos.frames import times
-from starpos.frames.shutter import Shutter
+from starpos.frames.exposure import Shutter
 from starpos.units import ARCSEC
 
 # Cards with the column and row of the sensor's frame at which a frame begins, in pixels of this frame, and their sign:

@@ -10,14 +10,10 @@ from starpos.errors import FrameError, one_line
 from starpos.files import bytes_of
 from starpos.frames.exif import CameraClock
 from starpos.frames.exposure import Exposure
-from starpos.frames.files import MAX_BYTES, opened
 from starpos.frames.fits import read_fits
-from starpos.frames.frame import Frame
-from starpos.frames.heif import heif_frame
-from starpos.frames.pictures import JPEG_START, PNG_START, picture_frame
-from starpos.frames.raw import raw_frame
-from starpos.frames.star_list import read_star_list
-from starpos.frames.stars import Stars
+from starpos.frames.frame import MAX_BYTES, Frame, Stars, opened
+from starpos.frames.pictures import JPEG_START, PNG_START, heif_frame, picture_frame, raw_frame
+from starpos.frames.tables import read_star_list
 
 FITS = (".fits", ".fit", ".fts", ".fz", ".gz")
 PICTURE = (".png", ".tif", ".tiff", ".bmp")

@@ -14,10 +14,8 @@ from typing import Any
 import erfa
 
 from starpos.errors import TimeError, one_line
-from starpos.frames.exposure import MAX_EXPOSURE_S
-from starpos.frames.shutter import UNKNOWN_LATENCY_S
-from starpos.units import DAY_S
-from starpos.utc import UNIX_EPOCH_JD
+from starpos.frames.exposure import MAX_EXPOSURE_S, UNKNOWN_LATENCY_S
+from starpos.units import DAY_S, UNIX_EPOCH_JD
 
 START, MIDDLE, END = (
     ("DATE-OBS", "DATE-BEG", "MJD-OBS", "MJD-BEG"),

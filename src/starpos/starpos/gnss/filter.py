@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A Kalman filter over what GNSS teaches, and its start while A3 is hardly known."""
+"""A Kalman filter over what GNSS teaches: the equations of a frame, the start while A3 is hardly known, and advice."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -7,13 +7,133 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from starpos import rotation
+from starpos.earth.ellipsoid import curvature_radii_m, enu_axes, place_of_zenith
 from starpos.earth.vertical import Vertical
-from starpos.gnss.place import GnssPlace
-from starpos.gnss.sighting import Innovation, LevelSight, innovation
+from starpos.fix.budget import Origin, total_covariance
+from starpos.fix.fix import Fix
+from starpos.gnss.receiver import GnssPlace
 from starpos.gnss.states import Learned, aged, ageing, prior
 from starpos.instrument.inclinometer import Tilt
 from starpos.instrument.instrument import Instrument
 from starpos.units import ARCSEC
+
+# Origin of the terms of a fix that the states replace.
+LEARNED_ORIGINS = (Origin.A3, Origin.INCLINOMETER)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class LevelSight:
+    """Attitude of the camera by the stars, camera_to_itrs (3, 3), and the tilt of a frame.
+
+    camera_covariance (3, 3): as in a Fix.
+    zenith_covariance (3, 3): of a zenith in ITRS by the errors of the stars, the air and the time, rad2.
+    latitude, longitude (rad): of the fix, whose A3 may be wrong.
+    """
+
+    utc_unix_s: float
+    camera_to_itrs: np.ndarray
+    camera_covariance: np.ndarray
+    tilt: Tilt
+    zenith_covariance: np.ndarray
+    latitude: float
+    longitude: float
+
+    @classmethod
+    def of(cls, fix: Fix, tilt: Tilt) -> "LevelSight":
+        """The sighting of a fix."""
+        stars = [t for t in fix.terms if t.origin is Origin.OTHER]
+        radii = np.array(curvature_radii_m(fix.latitude))
+        axes = enu_axes(fix.latitude, fix.longitude)[:2]
+        covariance = total_covariance(stars)[:2, :2] / np.outer(radii, radii)
+        return cls(
+            utc_unix_s=fix.utc_unix_s,
+            camera_to_itrs=fix.camera_to_itrs,
+            camera_covariance=fix.camera_covariance,
+            tilt=tilt,
+            zenith_covariance=axes.T @ covariance @ axes,
+            latitude=fix.latitude,
+            longitude=fix.longitude,
+        )
+
+
+def zenith_of_stars(sighting: LevelSight, learned: Learned) -> np.ndarray:
+    """Up (3,) in ITRS by the plumb line, as camera and inclinometer have it with what was learned."""
+    up_in_camera = learned.rotation.T @ learned.up(sighting.tilt)
+    return sighting.camera_to_itrs @ up_in_camera
+
+
+def zenith_rows(sighting: LevelSight, learned: Learned, up: np.ndarray) -> np.ndarray:
+    """Derivatives (3, n) of `zenith_of_stars` by the states; up (3,): in S."""
+    rows = learned.tilted(sighting.tilt)
+    rows[:, learned.layout.a3] = rotation.cross_matrix(up)
+    return sighting.camera_to_itrs @ learned.rotation.T @ rows
+
+
+@dataclass(frozen=True, eq=False)
+class Innovation:
+    """What a frame with a GNSS place says of the states: value (2,) = rows (2, n) @ (true - state) + noise (2, 2).
+
+    offset (2, 2): change of `value` for an error of the GNSS place, east and north as angles at the Earth's centre.
+    """
+
+    value: np.ndarray
+    rows: np.ndarray
+    noise: np.ndarray
+    offset: np.ndarray
+
+
+def innovation(
+    sighting: LevelSight,
+    gnss: GnssPlace,
+    learned: Learned,
+    vertical: Vertical,
+    up_in_camera: np.ndarray | None = None,
+) -> Innovation:
+    """Compare the plumb line that GNSS and the deflection expect with the one by the stars and the tilt.
+
+    up_in_camera (3,): about which the comparison is linear; None: as GNSS has it at this frame.
+    """
+    at, axes = learned.layout, gnss.axes
+    east_north = learned.state[at.gnss]
+    deflection = learned.deflection_rad(vertical, gnss.latitude, gnss.longitude)
+    expected = rotation.normalised(axes[2] + (deflection - east_north) @ axes[:2])
+    # along two directions at the place
+    seen = axes[:2] @ (zenith_of_stars(sighting, learned) - expected)
+    # the stars' plumb line has no noise of the tilts, by which an unknown turn of A3 would seem to be determined
+    up = learned.rotation @ (sighting.camera_to_itrs.T @ expected if up_in_camera is None else up_in_camera)
+    rows = -axes[:2] @ zenith_rows(sighting, learned, up)
+    rows[:, at.constant] += np.eye(2)
+    rows[:, at.field] += np.eye(2)
+    rows[:, at.gnss] -= np.eye(2)
+    radii = np.array(curvature_radii_m(gnss.latitude))
+    noise = axes[:2] @ (sighting.zenith_covariance + tilt_noise(sighting, learned)) @ axes[:2].T
+    return Innovation(seen, rows, noise + gnss.covariance / np.outer(radii, radii), -np.eye(2))
+
+
+def tilt_noise(sighting: LevelSight, learned: Learned) -> np.ndarray:
+    """Covariance (3, 3) of the zenith in ITRS by the noise of the readings."""
+    back = sighting.camera_to_itrs @ learned.rotation.T @ sighting.tilt.slope
+    return back @ sighting.tilt.noise @ back.T
+
+
+def place_of_stars(
+    sighting: LevelSight, learned: Learned, vertical: Vertical
+) -> tuple[float, float, np.ndarray]:
+    """Geodetic latitude, longitude (rad) by the stars alone, and its covariance (2, 2) of east, north, m2."""
+    zenith = zenith_of_stars(sighting, learned)
+    latitude, longitude = place_of_zenith(zenith)
+    axes = enu_axes(latitude, longitude)
+    east_north = learned.deflection_rad(vertical, latitude, longitude)
+    rows = axes[:2] @ zenith_rows(sighting, learned, learned.up(sighting.tilt))
+    at = learned.layout
+    rows[:, at.constant] -= np.eye(2)
+    rows[:, at.field] -= np.eye(2)
+    noise = axes[:2] @ (sighting.zenith_covariance + tilt_noise(sighting, learned)) @ axes[:2].T
+    covariance = rows @ learned.covariance @ rows.T + noise
+    radii = np.array(curvature_radii_m(latitude))
+    latitude, longitude = place_of_zenith(rotation.normalised(axes[2] - east_north @ axes[:2]))
+    return latitude, longitude, covariance * np.outer(radii, radii)
+
 
 # An A3 known so well, across the plumb line and about it, is linear: the squares of what is left are below 0.5 arcsec.
 LINEAR_ACROSS_RAD, LINEAR_TURN_RAD = 120 * ARCSEC, 900 * ARCSEC
@@ -115,3 +235,32 @@ def taught(learned: Learned, frame: GnssFrame, instrument: Instrument, vertical:
 def stddev_rad(vertical: Vertical, latitude: float, longitude: float) -> float:
     """1 sigma of each component of what a Vertical does not know of the deflection."""
     return vertical.at(latitude, longitude).stddev_arcsec * ARCSEC
+
+
+# Correlation of A3 and the deflection above which they are not separated.
+ALIKE = 0.8
+# Fewer poses average the inclinometer's errors badly.
+FEW_POSES = 6
+
+
+def what_would_tell_more(learned: Learned) -> str:
+    """Say in a sentence what would teach most; '' if nothing stands out."""
+    at, covariance = learned.layout, learned.covariance
+    _, turn = learned.a3_stddev_rad
+    if turn > LINEAR_TURN_RAD:
+        return f"lean it otherwise at each pose: A3's turn about the plumb line is known to {np.degrees(turn):.2g} deg"
+    if _correlation(covariance, at.a3, at.constant) > ALIKE:
+        return "turn it to other headings: at one heading A3 cannot be separated from the deflection"
+    if learned.poses < FEW_POSES:
+        return "let it stand at more poses, newly turned"
+    return ""
+
+
+def _correlation(covariance: np.ndarray, a: slice, b: slice) -> float:
+    """Largest correlation of any combination of some states with any of others; 0 where one of them is known."""
+    of_a, of_b = covariance[a, a], covariance[b, b]
+    if min(np.linalg.eigvalsh(of_a)[0], np.linalg.eigvalsh(of_b)[0]) <= 0:
+        return 0.0
+    root_a, root_b = np.linalg.cholesky(of_a), np.linalg.cholesky(of_b)
+    whitened = np.linalg.solve(root_a, np.linalg.solve(root_b, covariance[b, a]).T)
+    return float(np.linalg.svd(whitened, compute_uv=False)[0])

@@ -13,9 +13,9 @@ from starpos.fix.budget import ALWAYS, ErrorTerm, Sensitivity, place_of, total_c
 from starpos.fix.fix import Fix
 from starpos.fix.solution import Solution, Status
 from starpos.fix.solver import Solver
-from starpos.frames.stars import Stars
-from starpos.gnss.place import GnssPlace
-from starpos.gnss.sighting import LEARNED_ORIGINS, LevelSight, zenith_rows
+from starpos.frames.frame import Stars
+from starpos.gnss.filter import LEARNED_ORIGINS, LevelSight, zenith_rows
+from starpos.gnss.receiver import GnssPlace
 from starpos.gnss.states import Learned
 from starpos.gnss.watch import GnssCheck, GnssStatus, GnssWatch
 from starpos.instrument.inclinometer import Tilt

@@ -1,21 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
 """What GNSS teaches of an instrument: A3, the errors of its inclinometer, the deflection of the vertical; all together.
-
-All are angles in rad, or shares. Their covariance is kept whole, because at first most of them cannot be separated: at
-one pose a turn of A3 looks like a zero, and at one heading like a deflection.
+All are angles in rad, or shares. Their covariance is kept whole, because at first most of them cannot be separated:
+at one pose a turn of A3 looks like a zero, and at one heading like a deflection.
 """
 
+import json
+import math
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
+from pathlib import Path
 
 import numpy as np
 
-from starpos import rotation
+from starpos import files, rotation
 from starpos.earth.ellipsoid import EARTH_RADIUS_M
 from starpos.earth.vertical import Vertical
+from starpos.errors import GnssError
 from starpos.instrument.inclinometer import InclinometerErrors, Tilt
 from starpos.instrument.instrument import Instrument
-from starpos.instrument.response import COEFFICIENTS, Zeroed, response_columns, stated_variances
+from starpos.instrument.mounting import RESPONSE_COEFFICIENTS, Zeroed, response_columns, stated_variances
 from starpos.units import ARCSEC, HOUR_S
 
 # Share of the deflection's variance that is the same everywhere the instrument goes; the rest is a field.
@@ -41,7 +44,7 @@ class Layout:
 
     @cached_property
     def _ends(self) -> list[int]:
-        widths = (3, self.axes, COEFFICIENTS[self.axes], self.axes, self.axes, 2, 2, 2)
+        widths = (3, self.axes, RESPONSE_COEFFICIENTS[self.axes], self.axes, self.axes, 2, 2, 2)
         return np.cumsum((0, *widths)).tolist()
 
     def _slice(self, k: int) -> slice:
@@ -192,7 +195,7 @@ def prior(instrument: Instrument, tilt: Tilt, deflection_stddev_rad: float, utc_
     since_s = abs(utc_unix_s - calibration.utc_unix_s)
     drift2 = errors.drift_rad_per_sqrt_hour**2 * (since_s if np.isfinite(since_s) else 0.0) / HOUR_S
     state = np.zeros(at.size)
-    if calibration.response and len(calibration.response) == COEFFICIENTS[tilt.axes]:
+    if calibration.response and len(calibration.response) == RESPONSE_COEFFICIENTS[tilt.axes]:
         state[at.response] = calibration.response
         variance[at.response, at.response] = calibration.response_covariance
     else:
@@ -271,3 +274,87 @@ def aged(learned: Learned, by: Ageing, utc_unix_s: float) -> Learned:
     """What is left of what was learned after an ageing."""
     state, covariance = by.of(learned.state, learned.covariance)
     return replace(learned, state=state, covariance=covariance, utc_unix_s=utc_unix_s)
+
+
+VERSION, KEY = 1, "starpos_learned"
+MAX_BYTES = 200_000
+# a covariance may miss being positive by this share of its trace of correlations, by rounding
+ROUNDING = 1e-9
+CURE = "delete it to learn anew, or give another file"
+
+
+def save_learned(path: Path, learned: Learned) -> None:
+    """Write what was learned; GnssError if the file cannot be written."""
+    unknown = math.isnan(learned.temperature_c)
+    content = {
+        KEY: VERSION,
+        "axes": learned.axes,
+        "utc_unix_s": learned.utc_unix_s,
+        "since_unix_s": None if math.isnan(learned.since_unix_s) else learned.since_unix_s,
+        "frames": learned.frames,
+        "poses": learned.poses,
+        "place_rad": learned.place,
+        "temperature_c": None if unknown else learned.temperature_c,
+        "calibrated_up": learned.calibrated_up.tolist(),
+        "a3": learned.a3.tolist(),
+        "state": learned.state.tolist(),
+        "covariance": learned.covariance.tolist(),
+    }
+    try:
+        files.write_whole(path, (json.dumps(content) + "\n").encode())
+    # ValueError: the name contains a NUL
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise GnssError(f"{path}: what was learned cannot be written there ({reason})") from None
+
+
+def read_learned(path: Path) -> Learned | None:
+    """Read what was learned; None without a file.  GnssError if it cannot be that."""
+    try:
+        text = files.read_regular(path, MAX_BYTES)
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        raise GnssError(
+            f"{path}: not a readable file of what GNSS taught ({error.strerror}): {CURE}"
+        ) from None
+    try:
+        return _learned(json.loads(text))
+    except (ValueError, TypeError, KeyError, IndexError, AttributeError) as error:
+        reason = f"it has no {error}" if isinstance(error, KeyError) else error
+        raise GnssError(f"{path}: not a file of what GNSS taught ({reason}): {CURE}") from None
+
+
+def _learned(content: dict) -> Learned:
+    if content.get(KEY) != VERSION:
+        raise ValueError(f"{KEY} is not {VERSION}")
+    axes = content["axes"]
+    if axes not in (2, 3):
+        raise ValueError("axes is neither 2 nor 3")
+    n = layout_of(axes).size
+    arrays = {name: np.array(content[name], float) for name in ("a3", "calibrated_up", "state", "covariance")}
+    shapes = {"a3": (3, 3), "calibrated_up": (3,), "state": (n,), "covariance": (n, n)}
+    for name, array in arrays.items():
+        if array.shape != shapes[name] or not np.isfinite(array).all():
+            raise ValueError(f"{name} is not {shapes[name]} finite numbers")
+    covariance, a3 = arrays["covariance"], arrays["a3"]
+    scale = np.sqrt(np.maximum(np.diag(covariance), 1e-40))
+    correlation = covariance / np.outer(scale, scale)
+    if (
+        not np.allclose(correlation, correlation.T, atol=1e-6)
+        or np.linalg.eigvalsh(correlation)[0] < -ROUNDING * n
+    ):
+        raise ValueError("its covariance is not symmetric and positive")
+    if not np.allclose(a3 @ a3.T, np.eye(3), atol=1e-9) or np.linalg.det(a3) < 0:
+        raise ValueError("a3 is no rotation")
+    place, since, celsius = content["place_rad"], content["since_unix_s"], content["temperature_c"]
+    return Learned(
+        axes=axes,
+        temperature_c=math.nan if celsius is None else float(celsius),
+        utc_unix_s=float(content["utc_unix_s"]),
+        place=None if place is None else (float(place[0]), float(place[1])),
+        frames=int(content["frames"]),
+        poses=int(content["poses"]),
+        since_unix_s=math.nan if since is None else float(since),
+        **arrays,
+    )

@@ -6,7 +6,7 @@ paper's search). The pose of each is fitted to the brightest stars that agree, a
 accepted by its probability, never by a number of stars. Then the fainter stars are matched too.
 """
 
-from starpos.identification.full import Identification
+from starpos.identification.evidence import Identification
 from starpos.identification.prior import PlumbPrior, PointingPrior
 from starpos.identification.search import MIN_STARS, identify, identify_directions
 from starpos.identification.sky import Sky

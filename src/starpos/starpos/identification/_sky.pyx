@@ -330,7 +330,7 @@ cdef void _marked(const unsigned int *ra, const int *dec, int n, const Patch *pa
 cdef int runs_near(const int *cell_start, const double *axis, double radius, int *runs) noexcept nogil:
     """Write the first rows and the ends of all runs of cells that a cone about a vector (3,) touches; how many.
 
-    As `starpos.sky.zones.rows_near` does.
+    As `starpos.sky.catalogue.rows_near` does.
     """
     cdef double flat = hypot(axis[0], axis[1]), ra = atan2(axis[1], axis[0]) * 180 / M_PI, dec = atan2(axis[2], flat)
     cdef double wide = 180.0

@@ -9,8 +9,7 @@ import numpy as np
 
 from starpos import rotation
 from starpos.identification._frame import FrameStars
-from starpos.identification.evidence import SCALE_TOLERANCE, Prior
-from starpos.identification.full import OnFrame
+from starpos.identification.evidence import SCALE_TOLERANCE, OnFrame, Prior
 from starpos.identification.pose import MATCH_SIGMA, Pose, directions
 from starpos.identification.sky import Sky
 

@@ -15,11 +15,8 @@ import math
 import numpy as np
 
 from starpos.identification._frame import FrameStars
-from starpos.identification.evidence import DOUBLE_PX
-from starpos.identification.explained import Explained
-from starpos.identification.full import MIN_LOG_ODDS, Identification
-from starpos.identification.pairs import close_pairs
-from starpos.identification.pose import TEST_STARS, Pose
+from starpos.identification.evidence import DOUBLE_PX, MIN_LOG_ODDS, Explained, Identification
+from starpos.identification.pose import TEST_STARS, Pose, close_pairs
 from starpos.identification.prior import PointingPrior
 from starpos.identification.search import STAGES, near_or_lost
 from starpos.identification.sky import Sky

@@ -77,7 +77,7 @@ class Tilt:
             )
 
     def average(self, mid_unix_s: float, exposure_s: float, spread_s: float = 0.0) -> "Tilt":
-        """Return itself: a single tilt serves any exposure, as `starpos.instrument.tilts.Tilts`."""
+        """Return itself: a single tilt serves any exposure, as `starpos.instrument.tilt_log.Tilts`."""
         return self
 
     @property

@@ -5,21 +5,74 @@ import math
 from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass, field, fields, replace
 from functools import lru_cache
+from typing import Protocol
 
 import numpy as np
 
 from starpos import rotation
 from starpos.errors import InstrumentError
-from starpos.frames.shutter import Shutter
-from starpos.instrument.camera import Camera
-from starpos.instrument.camera_vertical import CameraVertical
-from starpos.instrument.inclinometer import InclinometerErrors
-from starpos.instrument.lens import PLUMB_BOB
-from starpos.instrument.mounting import Mounting
-from starpos.instrument.response import COEFFICIENTS
+from starpos.frames.exposure import Shutter
+from starpos.instrument.camera import PLUMB_BOB, Camera
+from starpos.instrument.inclinometer import EXACT, InclinometerErrors, Tilt
+from starpos.instrument.mounting import RESPONSE_COEFFICIENTS, Mounting
 from starpos.instrument.sensors import UNNAMED
-from starpos.units import ARCSEC, DAY_S
-from starpos.utc import utc_text
+from starpos.units import ARCSEC, DAY_S, utc_text
+
+# default sag: a camera on a pillar or a heavy tripod during a night
+SAG_ARCSEC_PER_SQRT_HOUR, MAX_SAG_ARCSEC = 10.0, 3600.0
+# noise of the fictitious reading, rad: negligible
+NO_NOISE = 1e-9
+
+
+@dataclass(frozen=True)
+class CameraVertical:
+    """Attitude of a fixed camera at its calibration; InstrumentError for impossible values.
+
+    camera_to_itrs      (3, 3): C into ITRS
+    covariance_arcsec2  (3, 3) of it as a small rotation about the Earth's axes, by the stars alone
+    """
+
+    camera_to_itrs: tuple
+    covariance_arcsec2: tuple
+
+    def __post_init__(self) -> None:
+        turn, covariance = (np.asarray(m, float) for m in (self.camera_to_itrs, self.covariance_arcsec2))
+        rotation = (
+            np.isfinite(turn).all()
+            and turn.shape == (3, 3)
+            and np.abs(turn).max() < 2
+            and np.allclose(turn @ turn.T, np.eye(3), atol=1e-6)
+            and np.linalg.det(turn) > 0
+        )
+        if not rotation:
+            raise InstrumentError("the vertical's camera_to_itrs must be a 3 x 3 rotation matrix")
+        sound = (
+            covariance.shape == (3, 3)
+            and np.isfinite(covariance).all()
+            and np.allclose(covariance, covariance.T)
+            and np.linalg.eigvalsh(covariance)[0] >= 0
+        )
+        if not sound:
+            raise InstrumentError(
+                "the vertical's covariance_arcsec2 must be a symmetric 3 x 3 matrix without negative variances"
+            )
+
+
+def level_errors(sag_arcsec_per_sqrt_hour: float) -> InclinometerErrors:
+    """Errors of a fixed camera as its own level: its sag alone."""
+    return replace(EXACT, noise_rad=NO_NOISE, drift_rad_per_sqrt_hour=sag_arcsec_per_sqrt_hour * ARCSEC)
+
+
+class OwnLevel:
+    """The tilts of that level, as `starpos.instrument.tilt_log.Tilts`: always zero."""
+
+    def average(self, mid_unix_s: float, exposure_s: float, spread_s: float = 0.0) -> Tilt:
+        """Zero, read at the middle of the exposure."""
+        return Tilt(0.0, 0.0, np.eye(2) * NO_NOISE**2, utc_unix_s=mid_unix_s)
+
+
+OWN_LEVEL = OwnLevel()
+
 
 # x of the base link is the top of the frame (-y of C), z the optical axis (docs/frames_and_symbols.md#frames)
 TOP_OF_FRAME = ((0.0, 1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.0, 1.0))
@@ -49,7 +102,7 @@ class Calibration:
     tilt_deg            its two or three angles then; an error of the scale grows with the distance from them
     frames              number of frames it was found from
     valid_days          how long it may be used
-    response            coefficients of the inclinometer's response that were found with A3 (response.py), or ()
+    response            coefficients of the inclinometer's response that were found with A3 (mounting.py), or ()
     response_covariance square, of these
     """
 
@@ -125,7 +178,7 @@ class Calibration:
         if not self.response:
             return
         n, covariance = len(self.response), np.asarray(self.response_covariance, float)
-        if n not in COEFFICIENTS.values() or covariance.shape != (n, n):
+        if n not in RESPONSE_COEFFICIENTS.values() or covariance.shape != (n, n):
             raise InstrumentError(
                 f"the calibration's response has {n} coefficients: give the 5 of two axes or the 9 of three, and a "
                 "covariance of as many rows and columns"
@@ -339,3 +392,102 @@ def focal_px_of(focal_mm: float, pixel_um: float) -> float:
             f"focal length {focal_mm:g} mm with {pixel_um:g} um pixels: both must be positive"
         )
     return focal_mm * 1000 / pixel_um
+
+
+# Longer over shorter side of sensors and of cameras' crops, and tolerance on it.
+SENSOR_SHAPES = (1.0, 5 / 4, 4 / 3, 3 / 2, 8 / 5, 16 / 9)
+SHAPE_OFF = 0.05
+# Frame sizes of some cameras; programs also crop larger sensors to these sizes.
+STANDARD_SIZES = {(320, 240), (640, 480), (800, 600), (1024, 768), (1280, 720), (1280, 960), (1280, 1024), (1600, 1200),
+                  (1920, 1080)}  # fmt: skip
+# 1 sigma of the axis from a frame's centre if the frame's part of the sensor is unknown: its longer side, and at least
+# this, as most sensors have up to 7000 px
+MIN_UNKNOWN_PX = 2000.0
+SIZE_IN_FILE = "camera: {focal_mm, pixel_um, width, height} in the instrument file"
+
+
+class Framed(Protocol):
+    """A frame's geometry, in px."""
+
+    @property
+    def width(self) -> int:
+        """Its width."""
+
+    @property
+    def height(self) -> int:
+        """Its height."""
+
+    @property
+    def origin_px(self) -> tuple[float, float] | None:
+        """Column and row of the sensor's whole frame at which it begins, as an Exposure has it."""
+
+
+@dataclass(frozen=True)
+class AxisDoubt:
+    """Why the optical axis's place in frames is unknown; its 1 sigma in px and rad, 0 if it does not count."""
+
+    why: str
+    error_px: float = 0.0
+    error_rad: float = 0.0
+
+    def counted_as(self, error: str) -> str:
+        """The doubt as a sentence; error: the error that it becomes a part of."""
+        if not self.error_px:
+            return (
+                f"{self.why}: if they are cut out of larger ones, the optical axis may be off their middle and the place "
+                f"wrong: give the whole frame's size, {SIZE_IN_FILE}"
+            )
+        return (
+            f"{self.why}: the optical axis may be {self.error_px:.0f} px from their centre, "
+            f"{math.degrees(self.error_rad):.2g} deg that count as an error of {error}: give the whole frame's size, "
+            f"{SIZE_IN_FILE}"
+        )
+
+
+def framed(instrument: Instrument, first: Framed) -> tuple[Instrument, AxisDoubt | None]:
+    """The instrument for the frames of a night by the first of them; and a doubt if their axis is not known.
+
+    An instrument that knows its frame's size stays as it is.  Else a frame counts as a whole one, and its size holds for
+    the others, unless its header says that it begins somewhere on a sensor, or no sensor has its shape.  A standard size
+    may be either: that is a doubt, which is not counted.
+    """
+    if instrument.size is not None:
+        return instrument, None
+    width, height, origin_px = first.width, first.height, first.origin_px
+    longer, shorter = max(width, height), min(width, height)
+    if origin_px is None:
+        instrument = replace(instrument, frame_size=(width, height))
+        if any(abs(longer / shorter / shape - 1) < SHAPE_OFF for shape in SENSOR_SHAPES):
+            doubtful = (longer, shorter) in STANDARD_SIZES
+            whole = AxisDoubt(f"frames of {width} x {height} px count as whole ones")
+            return instrument, whole if doubtful else None
+        why = f"no sensor has the shape of frames of {width} x {height} px"
+    elif np.isfinite(origin_px).all():
+        left, top = origin_px
+        # a crop is assumed to be from the middle, for lack of better; frames that begin elsewhere then agree with it
+        whole_size = round(width + 2 * max(left, 0.0)), round(height + 2 * max(top, 0.0))
+        instrument = replace(instrument, frame_size=whole_size)
+        why = (
+            f"these frames of {width} x {height} px begin at column {left:g}, row {top:g} of a sensor whose "
+            f"size is not stated"
+        )
+    else:
+        why = f"these frames of {width} x {height} px are cut out of larger ones at an unstated position"
+    error_px = max(longer, MIN_UNKNOWN_PX)
+    return instrument, AxisDoubt(why, error_px, math.atan(error_px / instrument.focal_px))
+
+
+def with_frame_size(instrument: Instrument, first: Framed) -> tuple[Instrument, str]:
+    """The instrument as `framed` has it, with the axis's error included in A3's, and its doubt; '' if A3 is not known.
+
+    The error stands in axis_stddev_rad too, for headings at a known place, which need no A3.
+    """
+    instrument, doubt = framed(instrument, first)
+    if doubt is not None:
+        instrument = replace(instrument, axis_stddev_rad=doubt.error_rad)
+    calibration = instrument.calibration
+    if doubt is None or calibration.unknown:
+        return instrument, ""
+    widened = np.asarray(calibration.covariance_arcsec2, float) + np.eye(3) * (doubt.error_rad / ARCSEC) ** 2
+    wide = replace(calibration, covariance_arcsec2=tuple(map(tuple, widened.tolist())))
+    return replace(instrument, calibration=wide), doubt.counted_as("A3")

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The instrument file: YAML, format 1, for people, nodes and the command line."""
+"""Files of the instrument (YAML, format 1) and of its camera (ROS's calibration YAML): read, written, updated."""
 
 import math
 import reprlib
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,16 +11,95 @@ from typing import Any
 import numpy as np
 
 from starpos.errors import FrameError, InstrumentError, TimeError
-from starpos.frames.shutter import Shutter
-from starpos.instrument import camera_file, sensors, yaml_file
-from starpos.instrument.camera import Camera
-from starpos.instrument.camera_file import LARGEST_SIDE
-from starpos.instrument.camera_vertical import MAX_SAG_ARCSEC, CameraVertical, level_errors
+from starpos.frames.exposure import Shutter
+from starpos.instrument import sensors, yaml_file
+from starpos.instrument.camera import COEFFICIENTS, PLUMB_BOB, Camera, stated_lens
 from starpos.instrument.inclinometer import InclinometerErrors
-from starpos.instrument.instrument import Calibration, Instrument, focal_px_of
-from starpos.instrument.lens import COEFFICIENTS, PLUMB_BOB
-from starpos.units import ARCSEC
-from starpos.utc import unix_of, utc_text
+from starpos.instrument.instrument import (
+    MAX_SAG_ARCSEC,
+    Calibration,
+    CameraVertical,
+    Instrument,
+    focal_px_of,
+    level_errors,
+)
+from starpos.units import ARCSEC, unix_of, utc_text
+
+# Most pixels along a frame's side.
+LARGEST_SIDE = 1_000_000
+
+
+def read_camera(path: Path) -> Camera:
+    """Read the camera from a calibration file; InstrumentError says why a file cannot be used."""
+    content = yaml_file.load(path, "calibration file")
+    try:
+        model = content.get("distortion_model", "plumb_bob")
+        width, height = content["image_width"], content["image_height"]
+        k = _ros_numbers(content["camera_matrix"], 9)
+        terms = content.get("distortion_coefficients")
+        d = () if terms is None else tuple(float(value) for value in terms["data"])
+    except (AttributeError, KeyError, TypeError, ValueError, OverflowError) as error:
+        raise InstrumentError(
+            f"{path}: a key of this calibration file is missing or of the wrong kind ({repr(error)[:120]}); "
+            "it needs image_width, image_height, camera_matrix, distortion_coefficients."
+        ) from None
+    model, d = stated_lens(model if isinstance(model, str) else reprlib.repr(model), d, str(path))
+    if any(type(side) is not int or side > LARGEST_SIDE for side in (width, height)):
+        raise InstrumentError(f"{path}: image_width and image_height must be whole numbers of px.")
+    if any(k[i] for i in (1, 3, 6, 7)) or k[8] != 1:
+        raise InstrumentError(
+            f"{path}: camera_matrix is not [fx 0 cx, 0 fy cy, 0 0 1]; calibrate without skew."
+        )
+    try:
+        return Camera(
+            width=width, height=height, fx=k[0], fy=k[4], cx=k[2], cy=k[5], distortion=d, model=model
+        )
+    except InstrumentError as error:
+        raise InstrumentError(f"{path}: {error}") from None
+
+
+def _ros_numbers(matrix: dict, count: int) -> tuple[float, ...]:
+    values = tuple(float(value) for value in matrix["data"])
+    if len(values) != count:
+        raise ValueError(f"{len(values)} values for {count}")
+    return values
+
+
+def write_camera(path: Path, camera: Camera, name: str, comment: str = "") -> None:
+    """Write a calibration file, whole or not at all; `comment` is text for people that every reader ignores.
+
+    InstrumentError if the file cannot be written.
+    """
+    yaml_file.save(path, _camera_content(camera, name), comment)
+
+
+def camera_as_written(path: Path, name: str) -> bool:
+    """Whether a file is unchanged since `write` wrote it with a comment and this name."""
+    try:
+        text = yaml_file.text_at(path, "calibration file")
+        comment = yaml_file.own_comment(text)
+        return bool(comment) and text == yaml_file.text_of(_camera_content(read_camera(path), name), comment)
+    except InstrumentError:
+        return False
+
+
+def _camera_content(camera: Camera, name: str) -> dict:
+    fx, fy, cx, cy = camera.fx, camera.fy, camera.cx, camera.cy
+    return {
+        "image_width": camera.width,
+        "image_height": camera.height,
+        "camera_name": name,
+        "camera_matrix": _ros_matrix(3, 3, (fx, 0, cx, 0, fy, cy, 0, 0, 1)),
+        "distortion_model": camera.model,
+        "distortion_coefficients": _ros_matrix(1, len(camera.distortion), camera.distortion),
+        "rectification_matrix": _ros_matrix(3, 3, (1, 0, 0, 0, 1, 0, 0, 0, 1)),
+        "projection_matrix": _ros_matrix(3, 4, (fx, 0, cx, 0, 0, fy, cy, 0, 0, 0, 1, 0)),
+    }
+
+
+def _ros_matrix(rows: int, columns: int, values: Sequence[float]) -> dict:
+    return {"rows": rows, "cols": columns, "data": [float(value) for value in values]}
+
 
 FORMAT = 1
 MAX_FRAMES = 1 << 31
@@ -242,7 +322,7 @@ def _camera(camera: object, folder: Path) -> tuple[Camera | None, float, str]:
             raise InstrumentError(
                 f"the camera's calibration is {_short(camera['calibration'])}: give the name of a file"
             )
-        full = camera_file.read(folder / camera["calibration"])
+        full = read_camera(folder / camera["calibration"])
         return full, full.fx, PLUMB_BOB
     _refuse_others(camera, ("width", "height", "fx", "fy", "cx", "cy", "distortion", "model"))
     width, height = _size(camera)
@@ -381,3 +461,99 @@ def _short(value: object) -> str:
         return "a number beyond any sense"
     text = "missing" if value is None else reprlib.repr(value)
     return text if len(text) < 60 else text[:57] + "..."
+
+
+# keys that a calibration finds, of A3 or of a fixed camera's vertical; a file may have some of them
+CALIBRATION_KEYS = (
+    "misalignment_deg",
+    "calibration_stddev_arcsec",
+    "calibration_covariance_arcsec2",
+    "calibrated",
+    "vertical",
+)
+
+
+def check_replaceable(path: Path) -> None:
+    """Raise InstrumentError unless the file there is an instrument file, without a comment that a person wrote.
+
+    The sentence does not say what to do.
+    """
+    try:
+        read(path, needs_camera=False)
+    except InstrumentError:
+        raise InstrumentError(
+            f"{path}: it is there already, and no instrument file that can be read"
+        ) from None
+    if line := yaml_file.line_of_comment(yaml_file.text_at(path, "instrument file")):
+        raise InstrumentError(
+            f"{path}: it is there already, and its line {line} has a comment, which would be lost"
+        )
+
+
+def check_fits(
+    path: Path, instrument: Instrument, *, fixed: bool = False, camera_found: bool = False
+) -> None:
+    """Raise InstrumentError if the file describes another instrument than the one to be calibrated.
+
+    fixed: of a camera fixed to the ground.  camera_found: the file's camera will be replaced too.
+    """
+    if not path.exists():
+        return
+    kept = read(path, needs_camera=False)
+    if (kept.vertical is not None) != fixed:
+        other = "an instrument with an inclinometer" if fixed else "a camera that is fixed to the ground"
+        raise InstrumentError(
+            f"{path}: it is there already, and of {other}: move it away, or write another file"
+        )
+    if not camera_found and _lens(kept) != _lens(instrument):
+        what = "camera"
+    elif not camera_found and None not in (kept.size, instrument.size) and kept.size != instrument.size:
+        what = "frame size"
+    elif not fixed and _says_sensor(instrument) and _sensor_errors(kept) != _sensor_errors(instrument):
+        what = "inclinometer"
+    else:
+        return
+    raise InstrumentError(
+        f"{path}: it is there already, with another {what} than this calibration's: give --instrument {path}, or write "
+        "another file"
+    )
+
+
+def _lens(instrument: Instrument) -> tuple:
+    return instrument.focal_px, instrument.camera, instrument.model if instrument.camera is None else None
+
+
+def _sensor_errors(instrument: Instrument) -> InclinometerErrors:
+    # a calibration finds the errors of its poses and its noise
+    return replace(instrument.inclinometer, pose_rad=0.0, noise_rad=0.0)
+
+
+def _says_sensor(instrument: Instrument) -> bool:
+    """Whether an instrument's inclinometer errors differ from the defaults."""
+    return bool(instrument.inclinometer_model) or _sensor_errors(instrument) != _sensor_errors(
+        Instrument(1.0)
+    )
+
+
+def update(path: Path, instrument: Instrument, comment: str, *, camera_found: bool = False) -> None:
+    """Write an instrument file; an existing one keeps all keys except A3's, and the camera's if it was found.
+
+    InstrumentError if it cannot be written.
+    """
+    new = content_of(instrument)
+    if path.exists():
+        stated = read(path, needs_camera=False).inclinometer
+        says = _says_sensor(instrument)
+        pose = says and stated.pose_rad < instrument.inclinometer.pose_rad
+        noise = says and stated.noise_rad < instrument.inclinometer.noise_rad
+        found = {*CALIBRATION_KEYS, *["camera"] * camera_found}
+        found |= {*["tilt_pose_arcsec"] * bool(pose), *["tilt_noise_deg"] * bool(noise)}
+        kept = yaml_file.load(path, "instrument file")
+        changed = {k: v for k, v in kept.items() if k not in found} | {k: new[k] for k in found if k in new}
+        if not camera_found and instrument.frame_size is not None:
+            # to which the new A3 belongs
+            sides = dict(zip(SIDES, instrument.frame_size, strict=True))
+            changed["camera"] = kept["camera"] | sides
+        order = ["starpos_instrument", *KEYS]
+        new = {k: changed[k] for k in sorted(changed, key=order.index)}
+    yaml_file.save(path, new, comment)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The table of tilt readings on disk, a CSV."""
+"""The table of tilt readings on disk, a CSV; and doubt whether its degrees are radians."""
 
 import difflib
 import io
@@ -16,7 +16,7 @@ import numpy as np
 from starpos.errors import TiltError
 from starpos.files import open_regular
 from starpos.instrument.inclinometer import MAX_CELSIUS, SCA100T_NOISE_RAD, elevations
-from starpos.instrument.tilt_log import BRACKET_S, OUTLIER_SIGMA, TiltLog
+from starpos.instrument.tilt_log import BRACKET_S, OUTLIER_SIGMA, TiltLog, white_noise
 
 # A week at 10 Hz.
 MAX_CSV_BYTES = 300_000_000
@@ -183,3 +183,34 @@ def _leaps(t: np.ndarray, angle: np.ndarray) -> bool:
 
 def _first_line(error: Exception) -> str:
     return (str(error).splitlines() or [type(error).__name__])[0]
+
+
+# The noise of readings in radians that are taken for degrees is 57.3 times too small. Number of differences that
+# determine it, and to which factor.
+ENOUGH_STEPS, ALIKE_NOISE = 8, 3.0
+
+
+def like_radians(log: TiltLog) -> str:
+    """Say that a table of tilts looks like radians; '' if it does not.
+
+    The noise shows it: radians taken for degrees have 57 times less than the sensor's.
+    """
+    order = np.argsort(log.utc_unix_s, kind="stable")
+    apart = np.diff(log.utc_unix_s[order])
+    every = np.diff(log.theta[order, :2], axis=0)
+    sound = (apart > 0) & np.isfinite(every).all(1)
+    steps = every[sound & (apart < BRACKET_S)]
+    if len(steps) < ENOUGH_STEPS:
+        # one reading a frame: an instrument that stands differs from frame to frame by its noise alone
+        steps = every[sound]
+    if len(steps) < ENOUGH_STEPS or np.nanmax(np.abs(np.degrees(log.theta[:, :2]))) > np.pi / 2:
+        return ""
+    noise = float(np.degrees(white_noise(steps).mean()))
+    stated_rad = float(np.sqrt(np.nanmean(log.variance)))
+    if not stated_rad / ALIKE_NOISE < noise < stated_rad * ALIKE_NOISE:
+        return ""
+    return (
+        f"the tilts look like radians: none is above pi/2, and their noise of {noise:.2g} would be the "
+        f"inclinometer's ({stated_rad:.2g} rad): write them in deg, or state the inclinometer's noise if it "
+        f"is so quiet"
+    )

@@ -1,13 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Stars, and the shutter that they were seen through, from a StarArray."""
+"""Stars and the shutter that they were seen through, from a StarArray, and a camera's attitude, from an Attitude."""
 
 from typing import Any
 
 import numpy as np
 
+from starpos import rotation
 from starpos.errors import FrameError
-from starpos.frames.shutter import Shutter
-from starpos.frames.stars import Stars
+from starpos.fix.camera_attitude import CameraAttitude
+from starpos.frames.exposure import Shutter
+from starpos.frames.frame import Stars
 from starpos.messages.stamp import stamp_to_unix
 
 # a detector publishes no more
@@ -44,3 +46,44 @@ def message_to_shutter(message: Any) -> Shutter | None:
     if not getattr(message, "shutter_known", False):
         return None
     return Shutter(message.readout, message.readout_stddev)
+
+
+# of an attitude's quaternion, and the most that its covariance may say, rad2
+OFF_UNIT, MAX_ATTITUDE_VARIANCE = 1e-3, 0.01
+
+
+def message_to_attitude(message: Any, source: str = "attitude") -> CameraAttitude:
+    """Attitude of a camera from a message; raises FrameError unless stamp, quaternion and covariance can be right."""
+    unix_s = stamp_to_unix(message.header.stamp)
+    if unix_s is None:
+        raise FrameError(
+            f"{source}: the message has no time stamp: set header.stamp to the middle of the exposure."
+        )
+    q = message.orientation
+    quaternion = np.array([q.x, q.y, q.z, q.w])
+    if not abs(np.linalg.norm(quaternion) - 1) < OFF_UNIT:
+        raise FrameError(
+            f"{source}: the quaternion {quaternion.tolist()} is not of length 1: send a rotation."
+        )
+    covariance = np.array(message.covariance, float).reshape(3, 3)
+    errors = message.stamp_stddev, message.clock_stddev
+    if not np.isfinite([*covariance.flat, *errors]).all() or min(errors) < 0:
+        raise FrameError(
+            f"{source}: the covariance or an error of its time is not a finite number of at least 0."
+        )
+    if not (
+        np.allclose(covariance, covariance.T, rtol=1e-6, atol=0)
+        and np.linalg.eigvalsh(covariance)[0] > 0
+        and covariance.trace() < MAX_ATTITUDE_VARIANCE
+    ):
+        raise FrameError(f"{source}: the covariance is not symmetric, positive and below 0.01 rad2.")
+    return CameraAttitude(
+        utc_unix_s=unix_s,
+        stamp_stddev_s=message.stamp_stddev,
+        clock_stddev_s=message.clock_stddev,
+        frame_id=message.header.frame_id,
+        camera_to_gcrs=rotation.from_quaternion(quaternion),
+        covariance=covariance,
+        stars=message.stars_matched,
+        log_odds=message.log_odds,
+    )

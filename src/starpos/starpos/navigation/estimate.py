@@ -1,18 +1,98 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is known at one time of a voyage, carried on by the inertial readings that come after it."""
+"""What is known at one time of a voyage: its fix, how later readings carry it on, and what would improve it."""
 
 from dataclasses import dataclass, fields, replace
 from typing import TypeVar
 
 import numpy as np
 
-from starpos.navigation.imu import ImuLog, ImuModel
-from starpos.navigation.laws import MotionLaw
-from starpos.navigation.links import arrived, links_of
-from starpos.navigation.motion import CONSTANTS, Motion
+from starpos.earth.ellipsoid import curvature_radii_m, enu_axes, meridian_turn
+from starpos.earth.gravity import geodetic_place
+from starpos.earth.orientation import earth_state
+from starpos.fix.budget import heading_of, heading_row, time_terms, total_covariance
+from starpos.navigation.equations import (
+    ACCEL_BIAS,
+    BY_LAW,
+    CONSTANTS,
+    DRIFT,
+    MOUNT,
+    PLACE,
+    SPEED,
+    TURN,
+    VELOCITY,
+    Motion,
+    arrived,
+    links_of,
+)
 from starpos.navigation.preintegration import Pieces, Sums, summed
+from starpos.navigation.records import ImuLog, ImuModel
 from starpos.navigation.start import nodes_of
-from starpos.navigation.voyage_fix import TimeErrors, VoyageFix, fix_of
+from starpos.navigation.vessel import MotionLaw
+
+
+@dataclass(frozen=True, kw_only=True)
+class TimeErrors:
+    """Errors of time that all fixes share, 1 sigma: of the clock against UTC, and of the frames' stamps; s."""
+
+    clock_s: float
+    stamp_s: float
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class VoyageFix:
+    """Astronomic latitude, longitude and heading of the body's x (rad) at one time of a voyage.
+
+    covariance (3, 3): east m, north m, heading rad.  velocity (3,): east, north, up, m/s; velocity_covariance (3, 3).
+    link_to_enu (3, 3): the body's axes, x forward, into east, north, up; attitude_covariance (3, 3): rad2, about these.
+    gyro_bias, accel_bias (3,): rad/s, m/s2.
+    """
+
+    utc_unix_s: float
+    latitude: float
+    longitude: float
+    heading: float
+    covariance: np.ndarray
+    velocity: np.ndarray
+    velocity_covariance: np.ndarray
+    link_to_enu: np.ndarray
+    attitude_covariance: np.ndarray
+    gyro_bias: np.ndarray
+    accel_bias: np.ndarray
+
+
+def fix_of(motion: Motion, k: int, covariance: np.ndarray, errors: TimeErrors) -> VoyageFix:
+    """The fix at node k, of whose unknowns this is the covariance; the errors of time and Earth rotation are added."""
+    latitude, longitude, _ = (float(x) for x in geodetic_place(motion.place[k]))
+    enu, (prime, meridian) = enu_axes(latitude, longitude), curvature_radii_m(latitude)
+    attitude = enu @ motion.attitude[k]
+    # turns of east, north, up about themselves for a metre to the east and to the north
+    carried = np.array([[0, -1 / meridian], [1 / prime, 0], [meridian_turn(latitude) / prime, 0]])
+    # east m, north m, and the small rotation of the attitude about east, north, up
+    slope = np.zeros((5, 6))
+    slope[:2, :3] = enu[:2]
+    slope[2:, :3] = -carried @ enu[:2]
+    slope[2:, 3:] = enu
+    columns = np.r_[PLACE, TURN]
+    place_and_turn = slope @ covariance[np.ix_(columns, columns)] @ slope.T
+    to_heading = np.zeros((3, 5))
+    to_heading[:2, :2] = np.eye(2)
+    to_heading[2:, 2:] = heading_row(attitude)
+    earth = earth_state(float(motion.utc_unix_s[k]))
+    shared = total_covariance(time_terms(latitude, earth, errors.clock_s, errors.stamp_s))
+    return VoyageFix(
+        utc_unix_s=float(motion.utc_unix_s[k]),
+        latitude=latitude,
+        longitude=longitude,
+        heading=heading_of(attitude),
+        covariance=to_heading @ place_and_turn @ to_heading.T + shared[:3, :3],
+        velocity=enu @ motion.velocity[k],
+        velocity_covariance=enu @ covariance[VELOCITY, VELOCITY] @ enu.T,
+        link_to_enu=attitude,
+        attitude_covariance=place_and_turn[2:, 2:] + shared[3:, 3:],
+        gyro_bias=motion.gyro_bias[k],
+        accel_bias=motion.accel_bias[k],
+    )
+
 
 # the equations of a link hold for so long
 LONGEST_S = 1.5
@@ -78,3 +158,47 @@ class Estimate:
 def _part(table: T, k: int) -> T:
     """Interval k alone."""
     return type(table)(**{f.name: getattr(table, f.name)[k : k + 1] for f in fields(table)})
+
+
+# a claim of less needs no advice, m an axis
+ENOUGH_M = 200.0
+# an unknown counts by which at least this share of the error comes
+SHARE = 0.5
+BIAS, CAMERA, MOTION, WHOLE = (
+    "turn once: the accelerometer's bias is not known",
+    "turn once: how the camera sits on the IMU is not known",
+    "measure the velocity: how it changes is not known",
+    "go on and turn: the longer the record, the narrower the claim",
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Observability:
+    """What is known of the place, 1 sigma an axis in m, and what is missing, '' where that is enough."""
+
+    sigma_m: float
+    missing: str
+
+
+def observability(estimate: Estimate, measured: bool) -> Observability:
+    """Which unknown an estimate's place depends on: by how much its error would shrink if that were known.
+
+    measured: whether a velocity is measured, so that nothing else would determine it.
+    """
+    covariance = estimate.covariance
+    latitude, longitude, _ = (float(x) for x in geodetic_place(estimate.motion.place[0]))
+    level = enu_axes(latitude, longitude)[:2]
+    place = level @ covariance[PLACE, PLACE] @ level.T
+    sigma_m = float(np.sqrt(np.trace(place) / 2))
+    if sigma_m < ENOUGH_M:
+        return Observability(sigma_m=sigma_m, missing="")
+    n = estimate.unknowns
+    speed = np.r_[VELOCITY, SPEED, DRIFT] if n == BY_LAW else np.r_[VELOCITY]
+    groups = {BIAS: np.r_[ACCEL_BIAS], CAMERA: n + np.r_[MOUNT]} | ({} if measured else {MOTION: speed})
+    share = {}
+    for sentence, columns in groups.items():
+        across = level @ covariance[PLACE, columns]
+        told = across @ np.linalg.pinv(covariance[np.ix_(columns, columns)]) @ across.T
+        share[sentence] = float(np.trace(told) / np.trace(place))
+    most = max(share, key=lambda sentence: share[sentence])
+    return Observability(sigma_m=sigma_m, missing=most if share[most] > SHARE else WHOLE)

@@ -9,10 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from starpos.errors import VoyageError
-from starpos.navigation.imu import GAP, ImuLog
-from starpos.navigation.placeless import PlacelessFrame
-from starpos.navigation.thinning import thinned
-from starpos.navigation.velocity import FASTEST, MAX_SIGMA, MIN_SIGMA, VelocityLog
+from starpos.navigation.preintegration import thinned
+from starpos.navigation.records import FASTEST, GAP, MAX_SIGMA, MIN_SIGMA, ImuLog, VelocityLog
+from starpos.navigation.sightings import PlacelessFrame
 from starpos.navigation.vessel import Vessel
 from starpos.navigation.voyage import Voyage, navigate
 

@@ -1,28 +1,36 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The stars of a frame under way, and the attitude of the camera against the Earth that they give.
-
-No level is needed: only refraction and the diurnal aberration depend on the zenith, and hardly.
+"""Frames under way: the attitude of the camera against the Earth by their stars, and the body's at a known place.  No
+level is needed: only refraction and the diurnal aberration depend on the zenith, and hardly.
 """
 
+import math
 from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
 
 from starpos import rotation
-from starpos.earth.orientation import EarthState, earth_state, station_velocity
+from starpos.earth.ellipsoid import meridian_turn
+from starpos.earth.known_place import KnownPlace
+from starpos.earth.orientation import (
+    ROTATION_RAD_S,
+    EarthState,
+    earth_orientation,
+    earth_state,
+    station_velocity,
+)
 from starpos.earth.refraction import Atmosphere, Refraction
 from starpos.errors import FixError, FrameError, InstrumentError, TimeError
 from starpos.fix import solver
-from starpos.fix.adjustment import share_free
-from starpos.fix.matched import sound_matches
-from starpos.fix.outliers import expected_extra, judged
+from starpos.fix.camera_attitude import CameraAttitude
 from starpos.fix.solution import Solution
+from starpos.fix.star_fit import expected_extra, judged, share_free, sound_matches
+from starpos.frames.frame import Stars
 from starpos.frames.reading import why_no_time
-from starpos.frames.stars import Stars
-from starpos.identification import Identification, wide
+from starpos.identification import Identification, fisheye
 from starpos.identification.pose import Pose
 from starpos.instrument.camera import Camera
+from starpos.navigation.vessel import Vessel
 from starpos.sky.catalogue import Catalogue
 from starpos.units import ARCSEC
 
@@ -118,7 +126,7 @@ def sighting_of(stars: Stars, eye: solver.Solver, answer: Solution) -> Identifie
     if mid_unix_s is None:
         raise TimeError(f"{stars.place}: no time of exposure: {why_no_time(stars)}")
     camera, catalogue, _ = eye.view(stars.width, stars.height, stars.origin_px)
-    if wide.is_wide(camera):
+    if fisheye.is_wide(camera):
         raise InstrumentError(
             f"{stars.place}: frames of a fisheye give no position under way: use a narrower lens"
         )
@@ -230,3 +238,99 @@ def _slopes(pose: Pose, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     slope[:, 1, 0], slope[:, 1, 1], slope[:, 1, 2], slope[:, 1, 3] = -1 - y * y, x * y, x, y
     slope *= pose.focal_px
     return slope[:, :, 3].copy(), slope
+
+
+# Refraction squeezes a frame more along the vertical than across. This turns the attitude across the axis if the middle
+# of the stars is off the axis (rad), and about it if stars spread farther one way than the other (share): 1 sigma.
+OFF_AXIS, SPREAD = 0.03, 0.25
+# sine of the lowest altitude that this is for
+LOWEST = 0.1
+CIRCLE = np.array([[np.cos(a), np.sin(a)] for a in np.arange(8) * np.pi / 4])
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PlacelessFrame:
+    """An attitude camera_to_itrs (3, 3) without refraction and diurnal aberration, as CameraAttitude has it."""
+
+    utc_unix_s: float
+    stamp_stddev_s: float
+    camera_to_itrs: np.ndarray
+    covariance: np.ndarray
+
+    @classmethod
+    def of(cls, attitude: CameraAttitude) -> "PlacelessFrame":
+        """The frame of an attitude that has a time; TimeError outside the IERS tables."""
+        assert attitude.utc_unix_s is not None
+        return cls(
+            utc_unix_s=attitude.utc_unix_s,
+            stamp_stddev_s=attitude.stamp_stddev_s,
+            camera_to_itrs=earth_state(attitude.utc_unix_s).gcrs_to_itrs @ attitude.camera_to_gcrs,
+            covariance=attitude.covariance,
+        )
+
+    def rough(self) -> StarAttitude:
+        """The attitude where nothing is known of the place."""
+        return roughly(self.camera_to_itrs)
+
+    def under(self, zenith: np.ndarray, atmosphere: Atmosphere) -> StarAttitude:
+        """The attitude under a zenith (3,) in ITRS, from where stars around the camera's axis would be seen there.
+
+        The attitude's covariance gives the distance of the frame's own stars from it.  The fitted plate scale has
+        absorbed the effect of refraction that is the same in all directions.  The covariance contains the rest, which
+        depends on the directions in which the stars lie.
+        """
+        across, about = np.diag(self.covariance)[:2].mean(), self.covariance[2, 2]
+        ring = np.column_stack([np.sqrt(across / about) * CIRCLE, np.ones(len(CIRCLE))])
+        true = rotation.normalised(ring) @ self.camera_to_itrs.T
+        apparent = rotation.normalised(true + station_velocity(zenith))
+        level = rotation.shortest_turn(zenith, np.array([0.0, 0.0, 1.0]))
+        seen = atmosphere.refraction().bend(apparent @ level.T) @ level
+        camera = rotation.best_rotation(true, seen) @ self.camera_to_itrs
+        raised = rotation.to_small_vector(rotation.best_rotation(apparent, seen))
+        height = max(float(seen.mean(0) @ zenith), LOWEST)
+        squeezed = float(np.linalg.norm(raised)) * np.sqrt(1 - min(height, 1.0) ** 2) / height
+        uneven = squeezed * np.array([OFF_AXIS, OFF_AXIS, SPREAD])
+        return StarAttitude(
+            camera_to_itrs=camera,
+            covariance=self.covariance + np.diag(uneven**2),
+            by_refraction=camera.T @ raised,
+        )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class BodyAttitude:
+    """The body's axes, x forward, in east, north, up: level by the plumb line, north by WGS 84.
+
+    link_to_enu (3, 3); attitude_covariance (3, 3): rad2, of its small rotation about east, north, up.
+    """
+
+    utc_unix_s: float
+    link_to_enu: np.ndarray
+    attitude_covariance: np.ndarray
+
+
+def attitude_at_place(frame: PlacelessFrame, place: KnownPlace, vessel: Vessel) -> BodyAttitude:
+    """The attitude of the body at a known place, with the errors of stars, air, time, place, deflection and mount."""
+    a4, air = place.plumb_axes, vessel.atmosphere
+    seen = frame.under(a4[2], air)
+    g = a4 @ seen.camera_to_itrs
+    late_s = [frame.stamp_stddev_s, vessel.clock_stddev_s, earth_orientation(frame.utc_unix_s).ut1_sigma_s]
+    # a zenith further east, or north, turns level and north
+    level = np.array([[0.0, 1.0], [-1.0, 0.0]])
+    north = -meridian_turn(place.plumb[0]) * np.array([[1.0, 0.0]])
+    deflection = np.vstack([level * place.plumb_stddev, north * place.ellipsoid_stddev])
+    columns = np.column_stack([
+        g @ seen.by_refraction * air.relative_sigma,
+        a4[:, 2] * ROTATION_RAD_S * math.hypot(*late_s),
+        np.vstack([level, north]) @ place.zenith_root,
+        deflection,
+    ])  # fmt: skip
+    to_ellipsoid = place.ellipsoid_axes @ a4.T
+    turn = rotation.about_axis(2, -math.atan2(to_ellipsoid[0, 1], to_ellipsoid[1, 1]))
+    return BodyAttitude(
+        utc_unix_s=frame.utc_unix_s,
+        link_to_enu=turn @ g @ vessel.camera_to_body.T,
+        attitude_covariance=g @ seen.covariance @ g.T
+        + columns @ columns.T
+        + np.eye(3) * vessel.mount_stddev**2,
+    )

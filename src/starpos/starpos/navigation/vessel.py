@@ -1,15 +1,122 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is known of instrument and vehicle before a voyage."""
+"""What is known of instrument and vehicle before a voyage, with the laws of motion where nothing measures the speed."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import VoyageError
-from starpos.navigation.imu import ImuModel
-from starpos.navigation.laws import ANYTHING, LAWS, MotionLaw, carried, drifting
+from starpos.navigation.records import ImuModel
+
+
+@dataclass(frozen=True, kw_only=True)
+class MotionLaw:
+    """Velocity of a vehicle over ground as a speed along its nose, a drift, and a rest; m/s, 1 sigma.
+
+    speed_stddev, speed_walk: of the speed along the nose, level, at the start, and its change in m/s/sqrt(s)
+    drift_stddev, drift_walk: an axis of what carries the vehicle along (wind, current), level, likewise
+    rest_stddev, climb_stddev: of what is left, level an axis, and of climbing, which is 0 in the mean
+    rest_s: so long either keeps its sign
+    """
+
+    speed_stddev: float
+    speed_walk: float
+    drift_stddev: float
+    drift_walk: float
+    rest_stddev: float
+    climb_stddev: float
+    rest_s: float
+
+    def rest_at(self, apart_s: float) -> float:
+        """The rest at times so far apart, m/s: as white noise that in the long run scatters as what keeps its sign."""
+        return self.rest_stddev * self._longer(apart_s)
+
+    def climb_at(self, apart_s: float) -> float:
+        """Climbing likewise."""
+        return self.climb_stddev * self._longer(apart_s)
+
+    def _longer(self, apart_s: float) -> float:
+        return max(1.0, 2 * self.rest_s / apart_s) ** 0.5
+
+
+LAWS = {
+    # a path at a walk, that turns and stops as it likes
+    "rover": MotionLaw(
+        speed_stddev=2.0,
+        speed_walk=0.3,
+        drift_stddev=0.01,
+        drift_walk=1e-4,
+        rest_stddev=0.1,
+        climb_stddev=0.2,
+        rest_s=3.0,
+    ),
+    # under way, in waves of seconds, in a current that is steady over an hour
+    "ship": MotionLaw(
+        speed_stddev=10.0,
+        speed_walk=0.05,
+        drift_stddev=1.0,
+        drift_walk=0.003,
+        rest_stddev=0.7,
+        climb_stddev=0.7,
+        rest_s=3.0,
+    ),
+    # a steady airspeed in a wind that changes by 0.3 m/s in ten minutes; gusts of seconds
+    "drone": MotionLaw(
+        speed_stddev=50.0,
+        speed_walk=0.1,
+        drift_stddev=15.0,
+        drift_walk=0.012,
+        rest_stddev=0.8,
+        climb_stddev=0.8,
+        rest_s=4.0,
+    ),
+    "parked": MotionLaw(
+        speed_stddev=1e-3,
+        speed_walk=1e-6,
+        drift_stddev=1e-3,
+        drift_walk=1e-6,
+        rest_stddev=2e-3,
+        climb_stddev=2e-3,
+        rest_s=1.0,
+    ),
+}
+# what is said of a drift is how much it changes in so long
+CHANGE_S = 600.0
+# of a drift such a share changes in an hour
+DRIFT_CHANGE, DRIFT_CHANGE_S = 0.5, 3600.0
+
+
+def carried(drift_stddev: float) -> MotionLaw:
+    """The law of a vehicle that measures its velocity against water or air; their drift's 1 sigma, m/s an axis."""
+    return MotionLaw(
+        speed_stddev=1e-3,
+        speed_walk=1e-6,
+        drift_stddev=drift_stddev,
+        drift_walk=DRIFT_CHANGE * drift_stddev / DRIFT_CHANGE_S**0.5,
+        rest_stddev=1e-3,
+        climb_stddev=1e-3,
+        rest_s=1.0,
+    )
+
+
+# default: any vehicle on land, at sea or in the air
+ANYTHING = MotionLaw(
+    speed_stddev=100.0,
+    speed_walk=1.0,
+    drift_stddev=30.0,
+    drift_walk=0.3,
+    rest_stddev=5.0,
+    climb_stddev=3.0,
+    rest_s=10.0,
+)
+
+
+def drifting(law: MotionLaw, change: float) -> MotionLaw:
+    """The law with a drift that changes by so much in ten minutes, 1 sigma, m/s an axis, as it walks at random."""
+    return replace(law, drift_walk=change / CHANGE_S**0.5)
+
 
 PARKED, ROVER = "parked", "rover"
 

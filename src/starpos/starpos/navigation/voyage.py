@@ -1,24 +1,352 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Place, heading and velocity of a recorded voyage, from all its stars, inertial readings and velocities at once."""
+"""Place, heading and velocity of a recorded voyage, from all its stars, inertial readings and velocities at once.  The
+equations are solved again and again until the place settles. Equations of a wrong place make a filter sure of it: of
+each round nothing is kept but the motion that it led to.
+"""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from starpos.errors import VoyageError
-from starpos.navigation.adjustment import MIN_FRAMES, Adjustment
-from starpos.navigation.chain import Smoothed
-from starpos.navigation.estimate import Estimate
-from starpos.navigation.imu import ImuLog
-from starpos.navigation.motion import Motion
-from starpos.navigation.preintegration import Pieces
+from starpos.earth.gravity import zenith_at
+from starpos.errors import FixError, VoyageError
+from starpos.navigation import start
+from starpos.navigation.chain import Chain, Smoothed, log_likelihood, smoothed
+from starpos.navigation.equations import (
+    BY_LAW,
+    CONSTANTS,
+    MEASURED,
+    PLACE,
+    Beforehand,
+    Lacks,
+    Links,
+    Motion,
+    Odometry,
+    StarAttitudes,
+    first_rows,
+    law_lacks,
+    links_of,
+    standing_lacks,
+    star_lacks,
+)
+from starpos.navigation.estimate import Estimate, TimeErrors, VoyageFix, fix_of
+from starpos.navigation.evidence import (
+    MIN_STANDSTILLS,
+    NOWHERE,
+    Standstills,
+    borne_out,
+    by_the_rest,
+    noise_density2,
+    standstills,
+)
+from starpos.navigation.preintegration import Pieces, Sums, summed
+from starpos.navigation.records import ImuLog, VelocityLog
 from starpos.navigation.sightings import FrameUnderWay
-from starpos.navigation.start import nodes_of
-from starpos.navigation.velocity import VelocityLog
-from starpos.navigation.vessel import Vessel
-from starpos.navigation.voyage_fix import TimeErrors, VoyageFix, fix_of
+from starpos.navigation.start import first_motion, nodes_of
+from starpos.navigation.vessel import MotionLaw, Vessel
 from starpos.progress import Progress, quiet
+
+MIN_FRAMES = 3
+# the place has settled where a step is below it, in m and as a share of its sigma
+SETTLED_M, SETTLED_SHARE = 1.0, 0.02
+# equations of a place farther off are wrong by more than the stars' errors: the square of the angle
+NEAR_M = 2000.0
+# minimum ratio of found to stated variances that is reported
+NOTABLE = 4.0
+# no step on the Earth is longer
+FARTHEST_M, MAX_ROUNDS = 2e7, 25
+# a law is weighed until its terms change by a smaller factor, and so often at most
+LAW_CHANGE, MAX_WEIGHINGS = 1.1, 4
+# stars are seen anew where the zenith has moved by more: 2 m of refraction
+ZENITH_MOVED = 1e-3
+# a standstill, m/s: of each node, and of a middle one alone on trial
+STANDING_SIGMA, TRIAL_SIGMA = 2e-3, 5e-3
+# of a chi-squared of three degrees of freedom: the median, and what one in a million exceeds
+MEDIAN_OF_CHI2, OUTLIER_CHI2 = 2.366, 30.7
+# steps of the accelerometer's noise, how many at most, and when to stop: a factor of e^8; of e^3 by a law, since much
+# more noise would take the law's errors too, and be likely again
+FACTOR, MAX_FACTORS, UNLIKELY, UNLIKELY_BY_LAW = 2**0.5, 16, 8.0, 3.0
+
+
+class Adjustment:
+    """The equations of a voyage, and how much more than stated its measurements scatter.
+
+    excess: of the variances of each kind of measurement over those that are stated.
+    """
+
+    def __init__(
+        self,
+        frames: Sequence[FrameUnderWay],
+        nodes: np.ndarray,
+        pieces: Pieces,
+        velocity: VelocityLog | None,
+        vessel: Vessel,
+        vibration: float,
+    ) -> None:
+        self.frames, self.nodes, self.pieces, self.vessel = frames, nodes, pieces, vessel
+        self.vibration = vibration
+        self.odometry = None if velocity is None else Odometry.of(velocity, nodes, pieces)
+        if self.odometry is not None and not len(self.odometry.node):
+            raise VoyageError("no velocity lies on the voyage: check that its clock and the camera's agree")
+        self.law = self._law(vessel)
+        self.unknowns = MEASURED if self.law is None else BY_LAW
+        self.known = Beforehand(
+            mount=vessel.mount_stddev,
+            refraction=vessel.atmosphere.relative_sigma,
+            height_m=vessel.height_m,
+            height_stddev_m=vessel.height_stddev_m,
+        )
+        self.model = vessel.model
+        self.excess = {"frames": 1.0, "velocities": 1.0, "forces": 1.0, "forces at rest": 1.0}
+        # how many times as much wind or current change as their law says
+        self.weighings, self.more_drift = 0, 1.0
+        self.noise_weighed = False
+        # nodes whose measurement of a kind is wrong, and velocities that are
+        self.wrong: dict[str, np.ndarray] = {kind: np.zeros(0, int) for kind in ("frames", "velocities")}
+        self.strays = 0
+        # frames whose own stars do not agree
+        self.unsound = 0
+        # where it stands, None before it is looked for; and whether the rest of the record contradicts that it does
+        self.standing: Standstills | None = None if self.odometry is None and vessel.halts else NOWHERE
+        self.contradicted = False
+        self.slipped = np.zeros(0 if self.odometry is None else len(self.odometry.node), bool)
+
+    def _law(self, vessel: Vessel) -> MotionLaw | None:
+        if self.odometry is not None:
+            return vessel.carried if vessel.drift_stddev > 0 else None
+        return None if vessel.parked else vessel.law
+
+    @property
+    def left_out(self) -> dict[str, int]:
+        """How many measurements of each kind are left out."""
+        frames = self.unsound + self.strays + len(self.wrong["frames"])
+        return {"frames": frames, "velocities": int(self.slipped.sum())}
+
+    @property
+    def faults(self) -> tuple[str, ...]:
+        """What of the record does not go with the rest, in sentences."""
+        said = [
+            f"{number} {kind} contradict the rest: left out"
+            for kind, number in self.left_out.items()
+            if number
+        ]
+        said += [
+            f"the {kind} scatter {excess**0.5:.1f} times as much as stated: their errors are widened by that"
+            for kind, excess in self.excess.items()
+            if excess > NOTABLE
+        ]
+        if self.more_drift**2 > NOTABLE:
+            said.append(
+                f"wind or current change {self.more_drift:.1f} times as much as the law of motion says: the claim is "
+                "widened by that"
+            )
+        if self.contradicted:
+            said.append(
+                "it seems to stand now and then, but the rest of the record contradicts that: not believed; check that "
+                "the ground stays where it is, and the IMU's noise"
+            )
+        return tuple(said)
+
+    def settle(self, progress: Progress) -> tuple[Motion, Smoothed, int]:
+        """The motion, the solution of the last round, and how many rounds there were.
+
+        VoyageError where the measurements do not go together, FixError where the place does not settle.
+        """
+        stars, motion = self._begin()
+        solution: Smoothed | None = None
+        zenith, step, sigma = np.zeros(3), np.inf, 1.0
+        for k in range(MAX_ROUNDS):
+            # equations for another place show neither how the stars are seen nor which measurements are wrong
+            near = step < min(NEAR_M, sigma)
+            up = zenith_at(motion.place[len(motion) // 2])
+            seen_anew = near and bool(np.linalg.norm(up - zenith) > ZENITH_MOVED)
+            if seen_anew:
+                zenith, stars = up, self._attitudes(up)
+            chain, links = self._chain(motion, stars, solution if near and not seen_anew else None)
+            solution = smoothed(chain)
+            motion = motion.moved(solution.nodes, solution.constants)
+            step = float(np.linalg.norm(solution.nodes[:, PLACE], axis=1).max())
+            # true for NaN too
+            if not step < FARTHEST_M:
+                break
+            variance = np.trace(solution.covariance[:, PLACE, PLACE], axis1=1, axis2=2)
+            sigma = float(np.sqrt(variance.min()))
+            progress("adjusting", min(0.95, (k + 1) / 8))
+            settled = near and not seen_anew and step < max(SETTLED_M, SETTLED_SHARE * sigma)
+            if settled and not self._revised(motion, chain, links, stars):
+                progress("adjusting", 1.0)
+                return motion, solution, k + 1
+        raise FixError(
+            f"the voyage's position does not converge (the last step was {step:.0f} m): check the IMU's "
+            f"axes and units, and the stated vehicle"
+        )
+
+    def _begin(self) -> tuple[StarAttitudes, Motion]:
+        """Rough attitudes of the frames that go with the gyro, and a first motion from them."""
+        stars = self._attitudes(None)
+        zero, none = np.zeros((len(self.nodes) - 1, 3)), np.zeros((3, 3))
+        sums = summed(self.pieces, zero, zero, none, none)
+        believed = self.vessel.camera_to_body
+        start.check_readings(stars, self.pieces, sums, self.model, believed)
+        stray = start.stray_frames(stars, self.pieces, sums, self.model, believed)
+        if stray.any():
+            self.strays = int(stray.sum())
+            self.frames = [frame for frame, wrong in zip(self.frames, stray, strict=True) if not wrong]
+            stars = self._attitudes(None)
+        motion = first_motion(self.nodes, stars, self.pieces, sums, self.odometry, believed)
+        return stars, motion
+
+    def _revised(self, motion: Motion, chain: Chain, links: Links, stars: StarAttitudes) -> bool:
+        """Whether the motion, settled, changes what is believed of noise, law or standstills."""
+        weighed = self._weighed(motion, chain, links)
+        # standstills are judged by the law alone at first, and again by what is known in the end
+        judged = self.standing is not None and weighed
+        return weighed if judged else self._stopped(motion, chain, stars) or weighed
+
+    def _stopped(self, motion: Motion, chain: Chain, stars: StarAttitudes) -> bool:
+        """Whether it is believed to stand elsewhere than before: where it seems to, and the rest bears that out."""
+        before = len(self.standing or NOWHERE)
+        seeming = standstills(stars, self.pieces) if self.standing is None else self.standing
+        if len(seeming):
+            trial = standing_lacks(motion, seeming.middle, TRIAL_SIGMA, self.unknowns)
+            nodes = np.concatenate([chain.nodes[:, : -trial.rows.shape[1]], self._by_law(motion, trial)], 1)
+            rest = by_the_rest(trial, TRIAL_SIGMA, smoothed(replace(chain, nodes=nodes)))
+            self.contradicted |= rest.contradicted
+            enough = rest.checked.sum() >= MIN_STANDSTILLS and not rest.contradicted
+            seeming = seeming.but(rest.checked & enough)
+        self.standing = seeming
+        return len(seeming) != before
+
+    def _weighed(self, motion: Motion, chain: Chain, links: Links) -> bool:
+        """Whether the record changes the weight of its own noise, or of the law that stands in for velocities.
+
+        The noise only if velocities or standstills show it: a law's errors hide it.
+        """
+        if (self.odometry is not None or self.standing) and not self.noise_weighed:
+            self._weigh(chain, links)
+            self.noise_weighed = True
+            return True
+        stated = self._law(self.vessel)
+        if self.odometry is not None or self.law is None or stated is None or self.weighings == MAX_WEIGHINGS:
+            return False
+        self.weighings += 1
+        law = borne_out(stated, motion)
+        change = np.log([law.drift_walk / self.law.drift_walk, law.rest_stddev / self.law.rest_stddev])
+        if np.abs(change).max() < np.log(LAW_CHANGE):
+            return False
+        self.law, self.more_drift = law, law.drift_walk / stated.drift_walk
+        return True
+
+    def _weigh(self, chain: Chain, links: Links) -> None:
+        """Raise the accelerometer's noise to what the voyage shows: of vibration some is left in sums."""
+        stated2 = self.model.accelerometer_noise_density**2
+        at_rest = max(1.0, noise_density2(self.pieces, self.standing or NOWHERE) / stated2)
+        unlikely = UNLIKELY_BY_LAW if self.odometry is None else UNLIKELY
+        factors: list[float] = []
+        likely: list[float] = []
+        while len(factors) < MAX_FACTORS and (not likely or likely[-1] > max(likely) - unlikely):
+            factors.append(FACTOR ** len(factors))
+            excess = at_rest * np.where(self._shaken, factors[-1] ** 2, 1.0)
+            noisy = links.noisier((excess - 1) * stated2, self.pieces)
+            likely.append(log_likelihood(replace(chain, links=noisy.whitened())) - noisy.log_determinant)
+            # what is stated, or shown at rest, is believed within a factor of e, where the record says nothing
+            likely[-1] -= np.log(factors[-1]) ** 2 / 2
+        weight = np.exp(np.array(likely) - max(likely))
+        self.excess["forces at rest"] = at_rest
+        self.excess["forces"] = at_rest * float(weight @ np.square(factors) / weight.sum())
+        density = self.model.accelerometer_noise_density * np.sqrt(self.excess["forces"])
+        self.model = replace(self.model, accelerometer_noise_density=density)
+
+    @property
+    def _shaken(self) -> np.ndarray:
+        """Mask (K - 1,) of the intervals in which the vehicle is not known to stand."""
+        return ~(self.standing or NOWHERE).links(len(self.nodes))
+
+    def _attitudes(self, zenith: np.ndarray | None) -> StarAttitudes:
+        """Attitudes of all frames whose stars agree, as seen under a zenith, or roughly."""
+        found, used = [], []
+        for frame in self.frames:
+            try:
+                air = self.vessel.atmosphere
+                found.append(frame.rough() if zenith is None else frame.under(zenith, air))
+                used.append(frame)
+            except FixError:
+                pass
+        self.unsound = len(self.frames) - len(used)
+        if len(used) < MIN_FRAMES:
+            raise VoyageError(f"the stars of {len(used)} frames agree: at least {MIN_FRAMES} are needed")
+        return StarAttitudes(
+            index=np.searchsorted(self.nodes, [frame.utc_unix_s for frame in used]),
+            camera_to_itrs=np.array([a.camera_to_itrs for a in found]),
+            covariance=np.array([a.covariance for a in found]),
+            by_refraction=np.array([a.by_refraction for a in found]),
+            stamp_stddev_s=np.array([frame.stamp_stddev_s for frame in used]),
+        )
+
+    def _chain(self, motion: Motion, stars: StarAttitudes, before: Smoothed | None) -> tuple[Chain, Links]:
+        """The equations about a motion, without measurements that a solution has shown to be wrong."""
+        n, count = self.unknowns, len(motion)
+        sums = summed(
+            self.pieces,
+            motion.gyro_bias[:-1],
+            motion.accel_bias[:-1],
+            motion.gyro_matrix,
+            motion.accel_matrix,
+        )
+        parts = [self._sound(star_lacks(motion, stars, sums, self.pieces, n), before, "frames")]
+        if self.odometry is not None:
+            parts.append(self._sound(self._velocities(motion, sums, before), before, "velocities"))
+        if self.vessel.parked:
+            parts.append(standing_lacks(motion, np.arange(count), STANDING_SIGMA, n))
+        rows = [part.whitened(count) for part in parts]
+        if self.law is not None and self.odometry is None:
+            stands = standing_lacks(motion, (self.standing or NOWHERE).nodes, STANDING_SIGMA, n)
+            rows.append(self._by_law(motion, stands))
+        links = links_of(motion, sums, self.pieces, self.model, self.law)
+        # what shakes the accelerometer while it drives is not there where it stands
+        at_rest2 = self.excess["forces at rest"] * self.vessel.model.accelerometer_noise_density**2
+        less = at_rest2 - self.model.accelerometer_noise_density**2
+        links = links.noisier(less * ~self._shaken, self.pieces)
+        chain = Chain(
+            first=first_rows(motion, self.model, self.known, self.law),
+            nodes=np.concatenate(rows, 1),
+            links=links.whitened(),
+            constants=CONSTANTS,
+        )
+        return chain, links
+
+    def _by_law(self, motion: Motion, stands: Lacks) -> np.ndarray:
+        """Whitened equations (K, 3, n + m + 1) of the law of motion, replaced by the equations of standstills."""
+        assert self.law is not None
+        rows = law_lacks(motion, self.law).whitened(len(motion))
+        rows[stands.index] = stands.whitened(len(motion))[stands.index]
+        return rows
+
+    def _velocities(self, motion: Motion, sums: Sums, before: Smoothed | None) -> Lacks:
+        assert self.odometry is not None
+        missed = self.odometry.missed(motion, sums, self.pieces)
+        if before is not None:
+            self.slipped = ~self.odometry.sound(missed)
+        return self.odometry.lacks(motion, missed, ~self.slipped, self.vibration, self.unknowns)
+
+    def _sound(self, lacks: Lacks, before: Smoothed | None, kind: str) -> Lacks:
+        """Equations without outliers, with wider errors where most of them scatter by more than is stated.
+
+        Where no solution is near, those that were left out stay so: leaving them out moves the solution, and judged
+        from there they would look good again.
+        """
+        used = self.excess[kind]
+        if before is not None and len(lacks.index):
+            left_out = np.isin(lacks.index, self.wrong[kind])
+            stated = replace(lacks, covariance=lacks.covariance * used)
+            distance2 = stated.distance2(before.covariance, left_out)
+            change = max(1 / used, float(np.median(distance2)) / MEDIAN_OF_CHI2)
+            self.wrong[kind] = lacks.index[distance2 > OUTLIER_CHI2 * change]
+            self.excess[kind] = used = used * change
+        keep = ~np.isin(lacks.index, self.wrong[kind])
+        return Lacks(index=lacks.index[keep], rows=lacks.rows[keep], covariance=lacks.covariance[keep] * used)
+
 
 MAX_APART_S = 1.5
 

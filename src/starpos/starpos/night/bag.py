@@ -1,28 +1,50 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reads one instrument's messages from a rosbag2."""
+"""A night in a rosbag2: one instrument's messages, solved again if there are stars and tilts, else as recorded."""
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from starpos.earth.vertical import Deflection
-from starpos.errors import FrameError, InstrumentError, TiltError
-from starpos.frames.stars import Stars
+import numpy as np
+
+from starpos.earth.ellipsoid import curvature_radii_m
+from starpos.earth.refraction import Atmosphere
+from starpos.earth.vertical import Deflection, Vertical, geodetic
+from starpos.errors import FrameError, InstrumentError, StarposError, TiltError
+from starpos.fix.budget import ALWAYS, ErrorTerm
+from starpos.fix.solution import Attitude, Status
+from starpos.frames.frame import Frame, Stars
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import Tilt
-from starpos.instrument.tilt_log import TiltLog
+from starpos.instrument.instrument import Instrument
+from starpos.instrument.tilt_log import NoTilts, TiltLog, Tilts
 from starpos.messages.camera import message_to_camera
+from starpos.messages.stamp import stamp_to_unix
+from starpos.messages.stars import message_to_stars
 from starpos.messages.tilt import UNUSABLE, message_to_tilt
 from starpos.night.drivers import IMAGES, DriverMessages, Drivers, named_image
-from starpos.night.folder import truth_in
-from starpos.night.night import Shot, Truth
+from starpos.night.night import NO_TILT, Night, ReportedPlace, Shot, Truth, offset_m, why_none
+from starpos.night.opening import truth_in
+from starpos.night.reading import Instruments
 from starpos.night.remarks import Kind, Remark
-from starpos.night.solutions import deflection_of, named_stars, shot_of
-from starpos.progress import Progress
+from starpos.night.solving import Exposures, solved_night
+from starpos.night.work import Solving
+from starpos.progress import Progress, quiet
 from starpos.recording.bag import BagReader
-from starpos.recording.drivers import CAMERA_INFO, CAPTURE, IMU, TILT
-from starpos.recording.instruments import INPUTS, SOLUTION, STARS, Chosen, instrument_in
+from starpos.recording.topics import (
+    CAMERA_INFO,
+    CAPTURE,
+    IMU,
+    INPUTS,
+    SOLUTION,
+    STARS,
+    TILT,
+    Chosen,
+    instrument_in,
+)
+from starpos.rotation import full_turn, half_turns
+from starpos.units import ARCSEC, utc_text
 
 SUFFIXES = (".mcap", ".db3")
 TOPICS = INPUTS | {"solver/solution": SOLUTION}
@@ -168,3 +190,217 @@ class _Reading:
         if self._why_no_camera and not self.cameras:
             said.append(Remark(Kind.RECORDED, f"{path.name}: {self._why_no_camera}"))
         return tuple(said)
+
+
+# by the number in Solution.status
+STATUS = (Status.OK, Status.TOO_FEW_STARS, Status.NOT_IDENTIFIED, Status.NO_TILT, Status.TILT_OUT_OF_RANGE,
+          Status.TIME_OUTSIDE_TABLES, Status.BAD_INPUT, Status.POOR_FIT)  # fmt: skip
+
+
+def named_stars(m: Any) -> tuple[str, Stars | FrameError]:
+    """A name for a StarArray, and its stars, or the error."""
+    name = _name("stars", stamp_to_unix(m.header.stamp))
+    try:
+        return name, message_to_stars(m, name)
+    except FrameError as error:
+        return name, error
+
+
+def _name(what: str, utc_unix_s: float | None) -> str:
+    return f"{what} " + ("of unknown time" if utc_unix_s is None else utc_text(utc_unix_s))
+
+
+def shot_of(m: Any, cameras: dict[tuple[int, int], Camera]) -> Shot:
+    """The frame of a Solution message, whose geodetic heading becomes astronomic.  cameras: by size of frame."""
+    status = STATUS[m.status] if m.status < len(STATUS) else Status.BAD_INPUT
+    at = stamp_to_unix(m.header.stamp)
+    utc = float("nan") if at is None else at
+    place = pointing = None
+    unit = np.array([1.0, 1.0, np.radians(1.0)])
+    covariance = np.asarray(m.covariance, float).reshape(3, 3) * np.outer(unit, unit)
+    angles = np.radians([m.latitude, m.longitude, m.heading])
+    sane = np.isfinite(angles).all() and abs(m.latitude) <= 90 and np.abs([m.xi, m.eta]).max() < 3600
+    sane &= bool(np.isfinite(covariance).all() and (np.diag(covariance) >= 0).all())
+    if status is Status.OK and sane:
+        applied = Deflection(m.xi, m.eta, 0.0)
+        heading = angles[2] - geodetic(angles[0], angles[1], 0.0, covariance, applied).azimuth_turn
+        terms = tuple(
+            ErrorTerm(
+                t.name,
+                np.vstack([np.diag([t.east, t.north, np.radians(t.heading)]), np.zeros((3, 3))]),
+                shared=ALWAYS if t.common else None,
+            )
+            for t in m.budget
+            if t.name != "deflection" and np.isfinite([t.east, t.north, t.heading]).all()
+        )
+        place = ReportedPlace(
+            utc_unix_s=utc,
+            latitude=float(angles[0]),
+            longitude=float(angles[1]),
+            heading=full_turn(heading),
+            covariance=covariance,
+            terms=terms,
+        )
+    elif status is Status.OK:
+        status = Status.BAD_INPUT
+    looking = np.radians([m.right_ascension, m.declination, m.roll])
+    if np.isfinite([*looking, m.focal_px]).all() and m.focal_px > 0:
+        ra, dec, roll = looking.tolist()
+        pointing = Attitude(
+            ra=ra,
+            dec=dec,
+            roll=roll,
+            focal_px=m.focal_px,
+            residual_arcsec=m.residual,
+            log_odds=m.log_odds,
+            mirrored=bool(m.mirrored),
+        )
+    return Shot(
+        name=_name("solution", at),
+        status=status,
+        message=m.status_text,
+        utc_unix_s=utc,
+        place=place,
+        pointing=pointing,
+        size=next(iter(cameras)) if len(cameras) == 1 else None,
+        stars_detected=int(m.stars_detected),
+        stars_matched=int(m.stars_matched),
+        residual_arcsec=_finite(m.residual),
+        tilt=(_finite(m.tilt.x), _finite(m.tilt.y)) if m.tilt_samples else NO_TILT,
+        identify_s=_finite(m.identify_seconds),
+        fix_s=_finite(m.fix_seconds),
+        # older bags do not have it
+        warnings=tuple(getattr(m, "warnings", ())),
+    )
+
+
+def _finite(value: float) -> float:
+    """The value, or NaN if it is impossible."""
+    return float(value) if abs(value) < 1e9 else float("nan")
+
+
+def deflection_of(m: Any) -> Deflection | None:
+    """The deflection that the solver applied; its sigma follows from the excess of the geodetic covariance."""
+    prime, meridian = curvature_radii_m(np.radians(m.latitude))
+    # east and north together, because the axes turn close to a pole
+    wider = sum(m.covariance_geodetic[k] - m.covariance[k] for k in (0, 4))
+    try:
+        return Deflection(m.xi, m.eta, float(np.sqrt(max(wider, 0.0)) / np.hypot(prime, meridian) / ARCSEC))
+    except StarposError:
+        return None
+
+
+@dataclass(frozen=True)
+class OfBag:
+    """The instrument of a bag's frames, with the bag's camera for their size.
+
+    any_size: whether frames of other sizes use the instrument unchanged.
+    """
+
+    instrument: Instrument
+    cameras: Mapping[tuple[int, int], Camera]
+    any_size: bool
+
+    @property
+    def hinted(self) -> bool:
+        """Whether only headers give the focal length: a bag has none."""
+        return False
+
+    def of(self, frame: Frame | Stars) -> Instrument | None:
+        """The instrument of a frame."""
+        camera = self.cameras.get((frame.width, frame.height))
+        if camera is None:
+            return self.instrument if self.any_size else None
+        return replace(self.instrument, camera=camera, focal_px=camera.fx)
+
+
+def night(
+    recorded: Recorded,
+    instruments: Instruments,
+    atmosphere: Atmosphere,
+    vertical: Vertical,
+    turn_stddev_deg: float | None = None,
+    progress: Progress = quiet,
+) -> Night:
+    """The night of a bag, by options as `solved_night` has them; raises StarposError if nothing in it can be used."""
+    r = recorded
+    if r.star_count and (r.tilts or not r.solutions):
+        try:
+            solved = solved_night(exposures(r, instruments, atmosphere, vertical), turn_stddev_deg, progress)
+            return replace(solved, remarks=(*solved.remarks, *_against_recorded(solved, r)))
+        except InstrumentError:
+            if not r.solutions:
+                raise
+    return _as_recorded(r, atmosphere, vertical)
+
+
+def exposures(r: Recorded, instruments: Instruments, atmosphere: Atmosphere, vertical: Vertical) -> Exposures:
+    """The stars of a bag, to be solved."""
+    tilts: Tilts = r.tilts or NoTilts(f"{r.path}: no usable tilt in it: record the topic tilt too")
+    return Exposures(
+        name=r.name,
+        origin=f"solved from stars and tilt of the bag {r.path.name}, namespace {r.namespace}",
+        count=r.star_count,
+        each=lambda: each_frame(r),
+        work=Solving(instruments, atmosphere, tilts),
+        vertical=vertical,
+        truth=r.truth,
+        remarks=r.remarks,
+    )
+
+
+def _against_recorded(solved: Night, r: Recorded) -> tuple[Remark, ...]:
+    """A remark if the recorded solutions differ from the new ones."""
+    if solved.combined is None or not any(s.place for s in r.solutions):
+        return ()
+    said = _bound([s.place for s in r.solutions if s.place])
+    apart = np.hypot(*offset_m(said, solved.combined.latitude, solved.combined.longitude))
+    if apart < np.hypot(*solved.combined.sigma[:2]):
+        return ()
+    sentence = (
+        f"the solver's own solutions in the bag lie {apart:.0f} m from these: it had another A3, calibration or air than "
+        "these options give"
+    )
+    return (Remark(Kind.RECORDED, sentence),)
+
+
+def _as_recorded(r: Recorded, atmosphere: Atmosphere, vertical: Vertical) -> Night:
+    places = [s.place for s in r.solutions if s.place]
+    bound = Remark(
+        Kind.RECORDED,
+        "the error stated for the mean is the error of one frame, an upper bound: recorded solutions do not "
+        "state how their errors correlate",
+    )
+    return Night(
+        name=r.name,
+        origin=f"as the solver recorded it in the bag {r.path.name}, namespace {r.namespace}",
+        shots=r.solutions,
+        combined=_bound(places) if places else None,
+        why_not="" if places else why_none(r.solutions),
+        vertical=r.deflection or vertical,
+        atmosphere=atmosphere,
+        truth=r.truth,
+        remarks=(*r.remarks, bound) if len(places) > 1 else r.remarks,
+    )
+
+
+def _bound(places: list[ReportedPlace]) -> ReportedPlace:
+    """The plain mean of places, with the mean of their covariances: an upper bound, whatever their correlation is."""
+    seen = np.array([[p.latitude, p.longitude, p.heading] for p in places])
+    away = half_turns(seen - seen[0])
+    mean = seen[0] + away.mean(0)
+    still = np.ptp(away[:, 2]) < 10 * np.median([p.sigma[2] for p in places]) or len(places) == 1
+    names = [t.name for t in places[0].terms]
+    terms = [
+        ErrorTerm(t.name, np.sqrt(np.mean([p.terms[k].factor ** 2 for p in places], axis=0)), shared=t.shared)
+        for k, t in enumerate(places[0].terms)
+        if all([u.name for u in p.terms] == names for p in places)
+    ]
+    return ReportedPlace(
+        utc_unix_s=float(np.mean([p.utc_unix_s for p in places])),
+        latitude=float(mean[0]),
+        longitude=float(half_turns(mean[1])),
+        heading=full_turn(mean[2]) if still else float("nan"),
+        covariance=np.mean([p.covariance for p in places], axis=0),
+        terms=tuple(terms),
+    )

@@ -8,14 +8,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from starpos.errors import FrameError, StarposError
-from starpos.frames.stars import Stars
-from starpos.messages.camera import message_to_frame, message_to_picture
-from starpos.messages.exposures import ExposureFacts, check_stamp
-from starpos.messages.imu_tilts import ImuTilts
+from starpos.frames.frame import Stars
+from starpos.messages.camera import ExposureFacts, check_stamp, message_to_frame, message_to_picture
 from starpos.messages.stamp import PlainHeader, PlainStamp, stamp_to_unix
-from starpos.messages.tilt import TiltMessage
-from starpos.recording.drivers import IMAGE, NO_REMAPS, PICTURE, Remaps
-from starpos.utc import utc_text
+from starpos.messages.tilt import ImuTilts, TiltMessage
+from starpos.recording.topics import IMAGE, NO_REMAPS, PICTURE, Remaps
+from starpos.units import utc_text
 
 if TYPE_CHECKING:
     from starpos.detection import DetectionSettings

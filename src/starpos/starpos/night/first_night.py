@@ -13,13 +13,12 @@ import numpy as np
 from starpos import rotation
 from starpos.earth.orientation import earth_state
 from starpos.errors import StarposError
+from starpos.fix.searching import Sight, of_one_camera
 from starpos.fix.solver import Solver
-from starpos.frames.stars import SATURATED, Stars
+from starpos.frames.frame import SATURATED, Stars
 from starpos.instrument.inclinometer import up_of
 from starpos.instrument.instrument import Calibration, Instrument
 from starpos.instrument.tilt_log import TiltLog
-from starpos.night.hints import of_one_camera
-from starpos.night.searching import Sight
 from starpos.night.together import TurnedNight, turned
 
 # Widths of star images that the detector measures well, px.

@@ -11,14 +11,13 @@ from starpos.averaging.average import Average
 from starpos.earth.ellipsoid import curvature_radii_m, enu_axes, zenith_of
 from starpos.earth.refraction import Atmosphere
 from starpos.earth.vertical import Geodetic, Vertical, geodetic
-from starpos.fix.attitude_at_place import AttitudeAtPlace
 from starpos.fix.budget import ErrorTerm
-from starpos.fix.fix import Fix
-from starpos.fix.readable import InDegrees
+from starpos.fix.fix import Fix, InDegrees
+from starpos.fix.heading import AttitudeAtPlace
 from starpos.fix.solution import Attitude, Solution, Status
-from starpos.frames.stars import Stars
+from starpos.frames.frame import Stars
 from starpos.night.remarks import Remark
-from starpos.night.watching import WatchedNight
+from starpos.night.together import WatchedNight
 
 NO_TILT = (float("nan"), float("nan"))
 NO_STARS = np.zeros((0, 2))

@@ -10,14 +10,12 @@ from pathlib import Path
 from typing import Protocol
 
 from starpos.errors import FrameError
-from starpos.fix.pointing import IDEAL
+from starpos.fix.fix import IDEAL
 from starpos.frames.exif import CameraClock
-from starpos.frames.frame import Frame
+from starpos.frames.frame import Frame, Stars
 from starpos.frames.reading import read_frame
-from starpos.frames.stars import Stars
-from starpos.instrument.axis import with_frame_size
 from starpos.instrument.inclinometer import Tilt
-from starpos.instrument.instrument import Instrument
+from starpos.instrument.instrument import Instrument, with_frame_size
 from starpos.instrument.tilt_log import TiltLog
 from starpos.instrument.tilt_table import read_tilt_csv
 from starpos.night.remarks import Remark, of_axis
@@ -57,7 +55,7 @@ def stars_of(item: Frame | Stars) -> Stars:
     """The stars of a list, or those detected on a frame."""
     if isinstance(item, Stars):
         return item
-    from starpos.detection.negative import detect_dark_too
+    from starpos.detection.second_look import detect_dark_too
 
     return detect_dark_too(item).stars
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Remarks on a night: each is a kind and a sentence, shown with the night."""
+"""Remarks on a night, each a kind and a sentence; among them doubts: mistaken tilts, a place far from the stated one."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from enum import Enum
 
@@ -9,7 +9,10 @@ import numpy as np
 
 from starpos.averaging.average import Average
 from starpos.calibration.misalignment import Calibrated
-from starpos.calibration.unknown import (
+from starpos.earth.ellipsoid import EARTH_RADIUS_M, zenith_of
+from starpos.earth.orientation import ROTATION_RAD_S
+from starpos.fix.budget import place_of
+from starpos.fix.checks import (
     BY_OPTIONS,
     FIND_TURN,
     MODEL_BY_OPTIONS,
@@ -18,11 +21,14 @@ from starpos.calibration.unknown import (
     unknown_a3,
     unnamed_inclinometer,
 )
-from starpos.fix.fix import Fix
+from starpos.fix.fix import Fix, length_text
+from starpos.instrument.inclinometer import Tilt, level_of, up_of
 from starpos.instrument.instrument import Calibration, Instrument
-from starpos.instrument.tilt_doubt import like_radians
+from starpos.instrument.mounting import Mounting
 from starpos.instrument.tilt_log import TiltLog
-from starpos.utc import utc_text
+from starpos.instrument.tilt_table import like_radians
+from starpos.rotation import half_turn
+from starpos.units import HOUR_S, utc_text
 
 # with a larger error of A3 (arcsec) the headings hardly determine it
 WORTH_SAVING_ARCSEC = 600.0
@@ -127,3 +133,130 @@ def of_turn(turned: Calibrated) -> Iterator[Remark]:
         yield Remark(Kind.CALIBRATED, f"to use A3 at another lean, {FIND_TURN}")
     if turned.beyond:
         yield Remark(Kind.INCLINOMETER, turned.beyond)
+
+
+NEAR_KM = 50.0
+# a place is far if it lies this many sigma beyond the stated distance
+FAR_SIGMA = 4.0
+# Minimum distance between frames of one place whose tilts are mistaken, and factor by which the right tilts reduce it.
+APART_M, NEARER = 20_000.0, 20.0
+# clocks that are not on UTC are usually wrong by a multiple of this
+ZONE_H = 0.5
+
+# possible mistakes in tilts, and functions that give the corrected angles (N, 2), rad
+MISTAKES: tuple[tuple[str, Callable[[np.ndarray], np.ndarray]], ...] = (
+    ("theta_x and theta_y exchanged", lambda theta: theta[:, ::-1]),
+    ("the other sign of theta_x", lambda theta: theta * [-1, 1]),
+    ("the other sign of theta_y", lambda theta: theta * [1, -1]),
+    ("the other sign of both tilts", lambda theta: -theta),
+    ("tilts that were radians", np.degrees),
+)
+
+
+@dataclass(frozen=True)
+class Levelled:
+    """A frame's attitude by its stars, camera_to_itrs (3, 3), and its tilt."""
+
+    camera_to_itrs: np.ndarray
+    tilt: Tilt
+
+
+@dataclass(frozen=True)
+class Near:
+    """A place, in rad, at which the instrument is said to be within some km."""
+
+    latitude: float
+    longitude: float
+    km: float = NEAR_KM
+
+    def km_from(self, latitude: float, longitude: float) -> float:
+        """Distance in km, on a sphere, to a place in rad."""
+        return apart_m((self.latitude, self.longitude), (latitude, longitude)) / 1000
+
+
+def doubts(
+    frames: Sequence[Levelled], whole: Fix | Average, mounting: Mounting | None, near: Near | None
+) -> Iterator[Remark]:
+    """Report places that mistaken tilts set apart, and a place far from `near`.
+
+    mounting: of the frames, None if A3 was not given: then it is not checked.
+    """
+    if apart := _mistaken(mounting, frames):
+        yield Remark(Kind.MISTAKEN, apart)
+    if near is not None and (away := _far(near, whole, mounting, frames[-1:])):
+        yield Remark(Kind.FAR, away)
+
+
+def apart_m(a: tuple[float, float], b: tuple[float, float]) -> float:
+    """Distance in m on a sphere of two places (latitude, longitude) in rad."""
+    up, other = zenith_of(*a), zenith_of(*b)
+    return EARTH_RADIUS_M * float(np.arctan2(np.linalg.norm(np.cross(up, other)), up @ other))
+
+
+def _far(near: Near, fix: Fix | Average, mounting: Mounting | None, frames: Sequence[Levelled]) -> str:
+    """Say that a fix lies far from a place, and which mistake would explain it; '' if it does not."""
+    km = near.km_from(fix.latitude, fix.longitude)
+    sigma_m = float(np.sqrt(np.diag(fix.covariance)[:2].max()))
+    if km <= near.km + FAR_SIGMA * sigma_m / 1000:
+        return ""
+    told = f"the place is {km:.0f} km from --near, and should be within {near.km:g} km"
+    for name, places in _places(mounting, frames):
+        off = [near.km_from(*place) for place in places]
+        if max(off) <= near.km:
+            return f"{told}: with {name} it would be {max(off):.0f} km from there: check the tilts"
+    if ahead_h := _hours_ahead(near, fix):
+        side = "ahead of" if ahead_h > 0 else "behind"
+        return f"{told}: its times may be {abs(ahead_h):g} h {side} UTC: check the clock of the camera"
+    return f"{told}: check the times (UTC), the tilts and A3"
+
+
+def _hours_ahead(near: Near, fix: Fix | Average) -> float:
+    """Hours ahead of UTC by which wrong times explain a place; 0 if none do."""
+    east = half_turn(fix.longitude - near.longitude)
+    hours = round(-east / ROTATION_RAD_S / HOUR_S / ZONE_H) * ZONE_H
+    turned = fix.longitude + hours * HOUR_S * ROTATION_RAD_S
+    return hours if near.km_from(fix.latitude, turned) <= near.km else 0.0
+
+
+def _mistaken(mounting: Mounting | None, frames: Sequence[Levelled]) -> str:
+    """Say which mistake has set the places of frames far apart; '' if none explains it.
+
+    One heading alone never shows it: the same mistake then moves all places alike.
+    """
+    if mounting is None:
+        return ""
+    spread_m = _spread_m([_place(f, f.tilt.theta, mounting) for f in frames])
+    if spread_m < APART_M:
+        return ""
+    for name, places in _places(mounting, frames):
+        if (left_m := _spread_m(places)) < spread_m / NEARER:
+            return (
+                f"the frames' places lie {length_text(spread_m)} apart, and with {name} {length_text(left_m)}: "
+                "check the table of tilts"
+            )
+    return ""
+
+
+def _places(
+    mounting: Mounting | None, frames: Sequence[Levelled]
+) -> list[tuple[str, list[tuple[float, float]]]]:
+    """The places of frames with two-axis tilts, by mistake."""
+    if mounting is None or not frames or any(f.tilt.axes != 2 for f in frames):
+        return []
+    theta = np.array([f.tilt.theta for f in frames])
+    found = []
+    for name, corrected in MISTAKES:
+        angles = corrected(theta)
+        if np.abs(angles).max() < np.pi / 2:
+            found.append((name, [_place(f, one, mounting) for f, one in zip(frames, angles, strict=True)]))
+    return found
+
+
+def _place(frame: Levelled, theta: np.ndarray, mounting: Mounting) -> tuple[float, float]:
+    """Latitude, longitude (rad) of a frame with a tilt, without refraction."""
+    place = place_of(level_of(up_of(theta)) @ mounting.a3 @ frame.camera_to_itrs.T)
+    return place.latitude, place.longitude
+
+
+def _spread_m(places: Sequence[tuple[float, float]]) -> float:
+    return max((apart_m(places[0], place) for place in places), default=0.0)

@@ -11,20 +11,25 @@ from starpos.earth.ellipsoid import EARTH_RADIUS_M
 from starpos.earth.vertical import Vertical
 from starpos.errors import FrameError, StarposError
 from starpos.fix.budget import heading_of, place_of
+from starpos.fix.searching import Sight, of_one_camera
 from starpos.fix.solution import Solution, Status
 from starpos.fix.solver import Solver
-from starpos.frames.frame import Frame
-from starpos.frames.stars import Stars
+from starpos.frames.frame import Frame, Stars
 from starpos.identification.hint import Hint
 from starpos.instrument.inclinometer import level_of, up_of
 from starpos.instrument.instrument import Instrument
-from starpos.instrument.tilts import NO_TILTS
-from starpos.night.hints import of_one_camera
+from starpos.instrument.tilt_log import NO_TILTS
 from starpos.night.night import Night, ReportedPlace, Shot, Truth, why_none
 from starpos.night.remarks import Kind, Remark
-from starpos.night.searching import Sight
-from starpos.night.together import Solved, TurnedNight, together, turned
-from starpos.night.watching import Receiver, WatchedNight, watched_night
+from starpos.night.together import (
+    Receiver,
+    Solved,
+    TurnedNight,
+    WatchedNight,
+    together,
+    turned,
+    watched_night,
+)
 from starpos.night.work import Fitting, Identifying, Solving
 from starpos.progress import Progress, quiet
 from starpos.rotation import half_turns

@@ -1,27 +1,48 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The common result of a night's frames: A3 if they are turned, the average of their fixes, and doubts about it."""
+"""What a night's frames give together: an average, A3 by turning, a place from elevations, what GNSS teaches; and
+doubts.
+"""
 
+from collections import Counter
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from starpos.averaging.altitudes import (
+    MIN_WITHOUT_SITE,
+    Circle,
+    Directions,
+    FoundAxis,
+    circle_of,
+    find_axis,
+    place_of_circles,
+)
 from starpos.averaging.average import Average, average
-from starpos.calibration.misalignment import Calibrated
-from starpos.calibration.turning import turn
-from starpos.errors import FixError
-from starpos.fix.fix import Fix
+from starpos.calibration.misalignment import Calibrated, turn
+from starpos.earth.orientation import EarthState
+from starpos.earth.vertical import Vertical
+from starpos.errors import FixError, GnssError, StarposError
+from starpos.fix.fix import IDEAL, Fix
+from starpos.fix.searching import answer_frame
 from starpos.fix.solution import Solution, Status
 from starpos.fix.solver import Solver
-from starpos.frames.pointings import Pointing
-from starpos.frames.stars import Stars
+from starpos.frames.frame import Stars
+from starpos.frames.tables import Pointing
+from starpos.gnss.receiver import GnssPlace, GnssTrack, known_place
+from starpos.gnss.solving import Watched, watched
+from starpos.gnss.states import Learned
+from starpos.gnss.watch import GnssWatch
 from starpos.identification import Identification
 from starpos.instrument.inclinometer import Tilt
-from starpos.instrument.instrument import Instrument
-from starpos.instrument.tilts import Tilts
+from starpos.instrument.instrument import Calibration, Instrument
+from starpos.instrument.mounting import Mounting
+from starpos.instrument.tilt_log import Tilts
 from starpos.night import remarks
-from starpos.night.doubts import Levelled, Near, doubts
-from starpos.night.remarks import Remark
+from starpos.night.remarks import Kind, Levelled, Near, Remark, doubts, of_inclinometer
+from starpos.sky.site import Site
+from starpos.units import ARCSEC
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -128,3 +149,144 @@ def turned(
     if any(s.fix is not None for s in found.solutions):
         said += remarks.of_inclinometer(solver.instrument)
     return TurnedNight(found.solutions, found, said)
+
+
+@dataclass(frozen=True)
+class Elevations:
+    """Each pointing's circle on which its place lies, or the error; the place of all.
+
+    axis: A3 whose axis the elevations determined too; None if A3 was known well enough or they do not determine it.
+    """
+
+    circles: tuple[Circle | StarposError, ...]
+    together: Together
+    axis: FoundAxis | None = None
+
+
+def from_elevations(
+    solver: Solver,
+    pointings: Sequence[Pointing],
+    tilts: Tilts,
+    near: Near | None = None,
+    self_calibrate: bool = False,
+) -> Elevations:
+    """Find the place of pointings, and A3's axis where it is not known to a few arcmin.
+
+    near: selects between two places that the elevations leave. self_calibrate: treat A3 as unknown.
+    """
+    if self_calibrate:
+        unknown = Calibration.of(solver.instrument.calibration.misalignment_deg)
+        solver = replace(solver, instrument=replace(solver.instrument, calibration=unknown))
+    circles = circles_of(solver, pointings, tilts)
+    sound = [c for c in circles if isinstance(c, Circle)]
+    if not sound:
+        return Elevations(tuple(circles), Together())
+    there, axis = None if near is None else (near.latitude, near.longitude), None
+    try:
+        directions = Directions.of(sorted(sound, key=lambda c: c.utc_unix_s))
+        if self_calibrate or (directions.wide and len(directions.circles) >= MIN_WITHOUT_SITE):
+            axis = axis_of(solver, pointings, tilts, there)
+            # A3's error is counted from the given A3, or from the one found if none was given
+            sound = axis.about(axis.a3 if self_calibrate else solver.instrument.calibration.a3)
+        place = place_of_circles(sound, there)
+        together = Together(place, "", (*of_inclinometer(solver.instrument), *doubts((), place, None, near)))
+    except FixError as error:
+        together = Together(None, str(error))
+    return Elevations(tuple(circles), together, axis)
+
+
+def axis_of(
+    solver: Solver,
+    pointings: Sequence[Pointing],
+    tilts: Tilts,
+    near: tuple[float, float] | None = None,
+    site: Site | None = None,
+    site_stddev_arcsec: float = 0.0,
+) -> FoundAxis:
+    """A3's axis from pointings at a site, or at an unknown place; FixError if they do not determine it."""
+
+    levelled = []
+    for pointing in pointings:
+        # `circles_of` reports why a pointing has no circle
+        with suppress(StarposError):
+            levelled.append((pointing, *solver.levelled(pointing, tilts)))
+
+    def with_a3(a3: np.ndarray) -> list[Circle]:
+        mounting = replace(solver.instrument.mounting, a3=a3)
+        circles = []
+        for pointing, state, tilt in levelled:
+            with suppress(FixError):
+                circles.append(_circle(solver, pointing, tilt, mounting, state))
+        return circles
+
+    ray = (solver.instrument.camera or IDEAL).centre_ray
+    given = solver.instrument.calibration
+    return find_axis(with_a3, given, ray, site, site_stddev_arcsec * ARCSEC, near)
+
+
+def circles_of(solver: Solver, pointings: Sequence[Pointing], tilts: Tilts) -> list[Circle | StarposError]:
+    """Each pointing's circle, or the error."""
+    circles: list[Circle | StarposError] = []
+    for pointing in pointings:
+        try:
+            state, tilt = solver.levelled(pointing, tilts)
+            circles.append(_circle(solver, pointing, tilt, solver.instrument.mounting, state))
+        except StarposError as error:
+            circles.append(error)
+    return circles
+
+
+def _circle(solver: Solver, pointing: Pointing, tilt: Tilt, mounting: Mounting, state: EarthState) -> Circle:
+    camera, clock_s = solver.instrument.camera or IDEAL, solver.clock_stddev_s(pointing)
+    return circle_of(pointing, camera, tilt, mounting, solver.atmosphere, state, clock_s)
+
+
+@dataclass(frozen=True)
+class Receiver:
+    """The GNSS places of a night, and what earlier nights learned of the instrument; None where nothing."""
+
+    track: GnssTrack
+    learned: Learned | None = None
+
+
+@dataclass(frozen=True)
+class WatchedNight:
+    """The answer to each frame in the given order; what GNSS taught by the end; remarks."""
+
+    answers: tuple[Watched, ...]
+    learned: Learned | None
+    remarks: tuple[Remark, ...]
+
+
+def watched_night(
+    solver: Solver,
+    frames: Sequence[tuple[Stars, Identification | None]],
+    tilts: Tilts | None,
+    receiver: Receiver,
+    vertical: Vertical,
+) -> WatchedNight:
+    """Solve a night's frames in the order of their times, each with its identification so far.
+
+    tilts: None where headings alone are wanted.
+    """
+    watch = GnssWatch(solver.instrument, vertical, receiver.learned)
+    said: Counter[str] = Counter()
+
+    def place_at(stars: Stars) -> GnssPlace | None:
+        if stars.mid_unix_s is None:
+            return None
+        try:
+            return receiver.track.at(stars.mid_unix_s)
+        except GnssError as error:
+            said[str(error)] += 1
+            return None
+
+    answers: dict[int, Watched] = {}
+    for k in sorted(range(len(frames)), key=lambda k: frames[k][0].mid_unix_s or 0.0):
+        stars, found = frames[k]
+        gnss = place_at(stars)
+        place = None if gnss is None else known_place(gnss, vertical)
+        rough = answer_frame(solver, stars, stars, tilts, place, known=found).solution
+        answers[k] = watched(solver, stars, rough, gnss, watch)
+    remarks = tuple(Remark(Kind.GNSS, f"{number} frames: {why}") for why, number in said.items())
+    return WatchedNight(tuple(answers[k] for k in range(len(frames))), watch.learned, remarks)

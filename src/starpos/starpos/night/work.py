@@ -2,28 +2,30 @@
 """The work on one frame, as small objects that can be sent to any process or machine, where `OnFile` calls them."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from starpos.earth.known_place import Places
 from starpos.earth.refraction import Atmosphere
-from starpos.errors import InstrumentError, StarposError
+from starpos.errors import FixError, InstrumentError, StarposError
+from starpos.fix import searching
 from starpos.fix.blind import SEARCH_S, BlindSolver
+from starpos.fix.searching import Sight, without_hint
 from starpos.fix.solution import Solution
-from starpos.fix.solver import Solver
-from starpos.frames.frame import Frame
-from starpos.frames.stars import Stars
+from starpos.fix.solver import Solver, check_explained
+from starpos.frames.frame import Frame, Stars
 from starpos.identification.hint import Hint
-from starpos.instrument.tilts import NO_TILTS, Tilts
-from starpos.night import searching
-from starpos.night.hints import without_hint
+from starpos.instrument.instrument import Instrument
+from starpos.instrument.tilt_log import NO_TILTS, Tilts
 from starpos.night.reading import Instruments, Reader, TiltFile, stars_of
 from starpos.night.remarks import Remark, of_focal_length
-from starpos.night.searching import Sight
 from starpos.progress import Progress, quiet
 from starpos.sky import catalogue
+from starpos.zenith.adjustment import Adjusted, adjusted
+from starpos.zenith.doubts import check_session
+from starpos.zenith.sighting import Mark, ZenithSighting, sighting
 
 if TYPE_CHECKING:
     from starpos.detection import Detection
@@ -48,7 +50,7 @@ class OnFile:
 
 def detected(item: Frame | Stars) -> tuple["Detection | Stars", float]:
     """The Detection of a frame, or the Stars of a list, and the CPU time in ms."""
-    from starpos.detection.negative import detect_dark_too
+    from starpos.detection.second_look import detect_dark_too
 
     begin = time.process_time()
     found = item if isinstance(item, Stars) else detect_dark_too(item)
@@ -154,3 +156,51 @@ class Solving:
             if self.instruments.hinted
             else sight
         )
+
+
+@dataclass(frozen=True)
+class ZenithSighted:
+    """Makes the ZenithSighting of a frame at a mark; a frame's fault is a Solution that gives the reason."""
+
+    instruments: Instruments
+    atmosphere: Atmosphere
+    tilts: Tilts
+    mark: Mark
+
+    def __call__(self, item: Frame | Stars) -> ZenithSighting | Solution:
+        """The sighting of a frame, identified by every way there is."""
+        sight, _ = Identifying(self.instruments)(item)
+        instrument = sight.instrument or self.instruments.of(item)
+        if sight.found is None or instrument is None:
+            return sight.solution
+        solver = Solver(instrument, catalogue.load_catalogue(), self.atmosphere)
+        try:
+            check_explained(sight.solution)
+            return sighting(solver, sight.stars, sight.found, self.mark, self.tilts)
+        except StarposError as error:
+            return Solution.refused(sight.stars, error)
+
+
+@dataclass(frozen=True, eq=False)
+class DeflectionSession:
+    """A session: its sightings in order of time, and the deflection that they give."""
+
+    sightings: tuple[ZenithSighting, ...]
+    adjusted: Adjusted
+
+    @classmethod
+    def of(
+        cls, sightings: Sequence[ZenithSighting], instrument: Instrument, atmosphere: Atmosphere, mark: Mark
+    ) -> "DeflectionSession":
+        """Adjust the sightings; FixError, with a sentence, where they do not bear a deflection."""
+        if not sightings:
+            raise FixError("no frame with stars and a tilt: there is no deflection")
+        in_time = tuple(sorted(sightings, key=lambda s: s.utc_unix_s))
+        found = adjusted(in_time, instrument, atmosphere, mark)
+        check_session(found, in_time)
+        return cls(in_time, found)
+
+    @property
+    def mid_unix_s(self) -> float:
+        """Mean time of its frames, UTC."""
+        return sum(s.utc_unix_s for s in self.sightings) / len(self.sightings)

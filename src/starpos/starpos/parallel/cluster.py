@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Do calls on a dask.distributed cluster; its workers need the same files under the same paths and the same starpos."""
 
+import hashlib
 import logging
 import os
 import pickle
@@ -10,12 +11,41 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import CancelledError
 from dataclasses import dataclass
+from functools import lru_cache
+from importlib import metadata
+from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
+import starpos
 from starpos.errors import StarposError, one_line
-from starpos.parallel.call import Call, Files, answer_of, given_up, worked
-from starpos.parallel.same import Same, differing, same_here
+from starpos.parallel.processes import Call, Files, answer_of, given_up, worked
+from starpos.sky import catalogue, deeper
+
+# Versions by name.
+Same = dict[str, str]
+
+
+@lru_cache(maxsize=1)
+def same_here() -> Same:
+    """Versions of starpos, its catalogues and the Earth orientation tables in this process."""
+    root = Path(starpos.__file__).parent
+    digest = hashlib.sha256()
+    for source in sorted(root.rglob("*.py")):
+        digest.update(str(source.relative_to(root)).encode() + b"\0" + source.read_bytes())
+    return {
+        "starpos": f"{starpos.__version__} ({digest.hexdigest()[:8]})",
+        "star catalogue": catalogue.load_catalogue().fingerprint,
+        "deeper catalogue": "none" if (more := deeper.kept()) is None else more.fingerprint,
+        "astropy-iers-data": metadata.version("astropy-iers-data"),
+    }
+
+
+def differing(there: Same, here: Same) -> str:
+    """Part of a sentence: the first version that differs, and what to do."""
+    what = next(name for name in here if there.get(name) != here[name])
+    return f"the {what} of this worker is {there.get(what)}, here it is {here[what]}: install the same there"
+
 
 PIP = "pip install distributed"
 ANSWER_WITHIN_S = 10

@@ -23,9 +23,8 @@ import numpy as np
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import FrameError
 from starpos.files import read_regular, write_whole
-from starpos.frames.night_files import SIMULATED, TILTS, TRUTH
-from starpos.frames.star_list import write_star_list
-from starpos.frames.stars import Stars
+from starpos.frames.frame import Stars
+from starpos.frames.tables import SIMULATED, TILTS, TRUTH, write_star_list
 from starpos.instrument import instrument_file
 from starpos.instrument.instrument import Instrument
 from starpos.instrument.tilt_log import TiltLog
@@ -33,8 +32,8 @@ from starpos.night.night import Truth
 from starpos.night.reading import stars_of
 from starpos.night.solving import Exposures
 from starpos.progress import Progress, quiet
-from starpos.report.writing import WriteError
-from starpos.utc import date_obs
+from starpos.report.html import WriteError
+from starpos.units import date_obs
 
 ABOUT, INSTRUMENT = "field.json", "instrument.yaml"
 FORMAT = 1

@@ -1,14 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What all pages of a report are made of: the document, figures, angles."""
+"""What all pages of a report are made of: the document, figures, angles; and its files, each written whole or not at
+all.
+"""
 
 import base64
-from collections.abc import Sequence
+import tempfile
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from html import escape
+from pathlib import Path
 
 import numpy as np
 
 from starpos import __version__
+from starpos.errors import StarposError
+from starpos.files import has_mark, write_whole
 
 STYLE = """
 :root { color-scheme: light dark; --ink: #1d2329; --soft: #5a646e; --paper: #fbfbf9; --card: #ffffff; --line: #dcdfe2;
@@ -94,3 +101,51 @@ def wide_table(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     head = "".join(f"<th>{t}</th>" for t in titles)
     body = "\n".join("<tr>" + "".join(f"<td>{c}</td>" for c in row) + "</tr>" for row in rows)
     return f'<div class="wide"><table><thead><tr>{head}</tr></thead>\n{body}</table></div>'
+
+
+PAGE = "index.html"
+
+
+class WriteError(StarposError):
+    """A report cannot be written."""
+
+
+def check_folder(folder: Path) -> None:
+    """Raise WriteError, before a night is worked on, where its report could not be written; leaves nothing behind."""
+    made: list[Path] = []
+    try:
+        made = [path for path in (folder, *folder.parents) if not path.exists()]
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+        _check_ours(folder / PAGE)
+    except (OSError, ValueError) as error:
+        raise _refused(folder, error) from None
+    finally:
+        for path in made:
+            with suppress(OSError):
+                path.rmdir()
+
+
+def write_files(folder: Path, files: Mapping[str, bytes]) -> None:
+    """Write files by name; raises WriteError if one cannot be written, or would replace a file that is no report's."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for name in files:
+            _check_ours(folder / name)
+        for name, content in files.items():
+            write_whole(folder / name, content)
+    except (OSError, ValueError) as error:
+        raise _refused(folder, error) from None
+
+
+def _refused(folder: Path, error: Exception) -> WriteError:
+    """The error for a folder; a ValueError comes from a NUL in its name."""
+    reason = getattr(error, "strerror", None) or error
+    return WriteError(f"{folder}: the report cannot be written there ({reason}): give another --out")
+
+
+def _check_ours(path: Path) -> None:
+    if not path.exists() or (path.is_file() and has_mark(path)):
+        return
+    raise WriteError(f"{path}: it is there already and no report of starpos: move it, or give another --out")

@@ -7,9 +7,8 @@ import numpy as np
 
 from starpos.earth.ellipsoid import curvature_radii_m, place_of_zenith, zenith_of
 from starpos.night.night import Night, ReportedPlace, Truth, offset_m
-from starpos.normal import SIGMA_PER_MAD
 from starpos.rotation import half_turns
-from starpos.units import ARCSEC
+from starpos.units import ARCSEC, SIGMA_PER_MAD
 
 OUTLIER_SIGMA, CLAIMED_SIGMA = 5.0, 3.0
 MIN_FOR_OUTLIERS = 5

@@ -1,30 +1,183 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Calibration by the solver itself, at a known place or from headings on the spot, and the average of the fixes.
-
-Both are here because they must forget at the same events: an average holds for one instrument, poses for one place.
+"""Calibration by the solver itself, at a known place or from headings on the spot, and the average of the fixes.  Both
+are here because they must forget at the same events: an average holds for one instrument, poses for one place.
 """
 
 import math
 import traceback
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from starpos.averaging.average import Average
-from starpos.calibration.misalignment import Calibrated, calibrate_at
-from starpos.calibration.unknown import at_another_lean
-from starpos.errors import FixError, InstrumentError, StarposError
+from starpos.averaging.average import Average, Averager, average
+from starpos.averaging.poses import slip_s
+from starpos.calibration.misalignment import Calibrated, calibrate_at, turn
+from starpos.errors import FixError, InstrumentError, StarposError, TiltError
+from starpos.fix.checks import at_another_lean
 from starpos.fix.fix import Fix
 from starpos.fix.solver import Solver
+from starpos.frames.frame import Stars
+from starpos.identification import Identification
+from starpos.instrument.inclinometer import Tilt
 from starpos.instrument.instrument import Calibration
-from starpos.session.averaging import Averaging, News
-from starpos.session.diagnosis import Diagnosis, Level
-from starpos.session.job import Coming, Jobs, Outcome
-from starpos.session.log import Log
-from starpos.session.memory import PoseMemory, RecentFrames, Seen, known_of, tilts_of
+from starpos.instrument.tilt_log import TiltLog, TiltsByTime
+from starpos.session.driver import Coming, Diagnosis, Jobs, Level, Log, Outcome
 from starpos.session.settings import Settings
-from starpos.session.turned import Turned, turn_on_the_spot
+from starpos.session.standing import Averaging, News
 from starpos.sky.site import Site
+
+MAX_POSES = 36
+# The newest tilts of a pose.
+MAX_TILTS = 64
+
+
+@dataclass(frozen=True)
+class Seen:
+    """The stars of a frame that has a time, with its tilt; found: their identification, None without one."""
+
+    stars: Stars
+    tilt: Tilt
+    found: Identification | None = None
+
+    @property
+    def mid_unix_s(self) -> float:
+        """Middle of the exposure."""
+        assert self.stars.mid_unix_s is not None
+        return self.stars.mid_unix_s
+
+
+class RecentFrames:
+    """The newest frames with stars and a tilt."""
+
+    def __init__(self, most: int) -> None:
+        self._frames: deque[Seen] = deque(maxlen=most)
+
+    def __len__(self) -> int:
+        return len(self._frames)
+
+    def add(self, seen: Seen) -> None:
+        if len(seen.stars):
+            self._frames.append(seen)
+
+    def keep(self, most: int) -> None:
+        """Keep this number of frames from now on; the newest of the present ones stay."""
+        self._frames = deque(self._frames, maxlen=most)
+
+    def newest(self, count: int) -> list[Seen]:
+        """Return up to this number of the newest frames in the order they came."""
+        return list(self._frames)[max(0, len(self._frames) - count) :]
+
+    def clear(self) -> None:
+        self._frames.clear()
+
+
+@dataclass
+class _Pose:
+    """A camera that has stood still on the Earth since `first`."""
+
+    first: Fix
+    newest: Seen
+    frames: int = 0
+    tilts: deque[Tilt] = field(default_factory=lambda: deque(maxlen=MAX_TILTS))
+
+    def add(self, seen: Seen) -> None:
+        self.newest = seen
+        self.frames += 1
+        self.tilts.append(seen.tilt)
+
+
+class PoseMemory:
+    """Keeps each pose's last frame with the mean tilt of the pose; drops the oldest poses."""
+
+    def __init__(self) -> None:
+        self._poses: deque[_Pose] = deque(maxlen=MAX_POSES)
+
+    def __len__(self) -> int:
+        return len(self._poses)
+
+    def add(self, seen: Seen, fix: Fix) -> bool:
+        """Add a frame; return whether a new calibration is worthwhile: a new pose, or one with twice as many frames."""
+        if not self._poses or slip_s(fix, self._poses[-1].first) != 0:
+            self._poses.append(_Pose(fix, seen))
+        pose = self._poses[-1]
+        pose.add(seen)
+        return pose.frames & (pose.frames - 1) == 0
+
+    def frames(self) -> list[Seen]:
+        """Return a frame for each pose whose tilts agree, the oldest first."""
+        made = []
+        for pose in self._poses:
+            try:
+                made.append(replace(pose.newest, tilt=mean_tilt(pose.tilts)))
+            except TiltError:
+                # The tilts contradict each other, and it is unknown which is right.
+                continue
+        return made
+
+    def forget_before(self, utc_unix_s: float) -> None:
+        """Drop the poses before that time, because the instrument has moved then."""
+        while self._poses and self._poses[0].newest.mid_unix_s < utc_unix_s:
+            self._poses.popleft()
+
+    def clear(self) -> None:
+        self._poses.clear()
+
+
+def mean_tilt(tilts: Sequence[Tilt]) -> Tilt:
+    """Average the tilts of an instrument at rest without outliers; TiltError if the tilts contradict each other."""
+    mean = TiltLog.of_readings(tilts).mean()
+    return replace(mean, samples=sum(t.samples for t in tilts))
+
+
+def tilts_of(seen: Sequence[Seen]) -> TiltsByTime:
+    """The tilts of frames, as a solver takes them."""
+    return TiltsByTime({s.mid_unix_s: s.tilt for s in seen})
+
+
+def known_of(seen: Sequence[Seen]) -> dict[int, Identification]:
+    """Identifications of the frames' stars, by the frames' numbers."""
+    return {k: s.found for k, s in enumerate(seen) if s.found is not None}
+
+
+@dataclass(frozen=True)
+class Turned:
+    """Result of headings on the spot: A3 and the place."""
+
+    calibrated: Calibrated
+    place: Average
+
+
+def turn_on_the_spot(solver: Solver, poses: list[Seen], turn_stddev_deg: float) -> Turned:
+    """Calibrate from poses on the spot; FixError if they give no place, or more than one."""
+    calibrated = turn(
+        solver, [p.stars for p in poses], tilts_of(poses), turn_stddev_deg, known=known_of(poses)
+    )
+    if not calibrated.fixes:
+        raise FixError(f"no heading has a fix: {calibrated.solutions[0].message}")
+    place = average(calibrated.fixes)
+    if place.moved:
+        raise FixError(
+            "the headings are of more than one place: call solver/reset, and turn the instrument on the spot"
+        )
+    if _newest_is_off(calibrated.fixes):
+        raise FixError(
+            "the newest heading does not fit the others: the instrument has moved, then call solver/reset, or its tilt "
+            "was wrong"
+        )
+    return Turned(calibrated, place)
+
+
+def _newest_is_off(fixes: list[Fix]) -> bool:
+    averager = Averager()
+    before = after = averager.average
+    for fix in sorted(fixes, key=lambda f: f.utc_unix_s):
+        before = after
+        averager.add(fix)
+        after = averager.average
+    return before is not None and after is not None and after.left_out > before.left_out
+
 
 # Fewer headings cannot show that they are of one place. The caller of the service asserts it, so it needs one less.
 MIN_HEADINGS, MIN_BY_ITSELF = 3, 4

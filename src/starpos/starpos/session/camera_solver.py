@@ -10,7 +10,7 @@ from starpos.fix.solver import Solver
 from starpos.instrument.camera import Camera
 from starpos.messages.camera import leaves_size_open, message_to_camera
 from starpos.messages.stamp import stamp_to_unix
-from starpos.session.job import Jobs, Outcome
+from starpos.session.driver import Jobs, Outcome
 
 MAX_CHANGES = 1000
 

@@ -8,13 +8,12 @@ import numpy as np
 
 from starpos.errors import StarposError
 from starpos.fix.solver import Solver
-from starpos.frames.stars import Stars
+from starpos.frames.frame import Stars
 from starpos.identification import Identification
-from starpos.instrument.tilts import Tilts
-from starpos.night.sightings import DeflectionSession
+from starpos.instrument.tilt_log import Tilts
+from starpos.night.work import DeflectionSession
 from starpos.session.calibrating import OF_AVERAGE
-from starpos.session.diagnosis import Diagnosis, Level
-from starpos.session.job import Jobs
+from starpos.session.driver import Diagnosis, Jobs, Level
 from starpos.session.settings import Settings
 from starpos.zenith.adjustment import Adjusted
 from starpos.zenith.session_file import NEW

@@ -6,8 +6,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from starpos.frames.driver_stamp import KINDS, UNKNOWN
-from starpos.frames.exposure import MAX_EXPOSURE_S
-from starpos.frames.shutter import MAX_READOUT_S
+from starpos.frames.exposure import MAX_EXPOSURE_S, MAX_READOUT_S
 from starpos.session.pace import MAX_RATE
 from starpos.session.parameter import Parameter
 

@@ -9,9 +9,9 @@ from starpos.earth.vertical import Geodetic, Vertical, geodetic
 from starpos.fix.camera_attitude import CameraAttitude
 from starpos.fix.fix import Fix
 from starpos.fix.solution import Solution
-from starpos.frames.stars import Stars
+from starpos.frames.frame import Stars
 from starpos.gnss.solving import Watched
-from starpos.session.now import Now
+from starpos.session.driver import Now
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,15 +1,40 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Compare the GNSS position with the star fix and never fuse them, so that each can expose an error in the other."""
+"""GNSS in a session: its fixes as they come, the comparison with the stars, what they teach, the known place.  The GNSS
+position is compared with the star fix and never fused with it, so that each can expose an error in the other.
+"""
+
+import math
+import traceback
+from collections import deque
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
-from starpos.earth.vertical import Geodetic
-from starpos.gnss.place import GnssPlace
+from starpos.earth.known_place import KnownPlace
+from starpos.earth.vertical import Geodetic, Vertical
+from starpos.errors import GnssError, PlaceError, StarposError
+from starpos.files import path_of
+from starpos.fix.solution import Solution, Status
+from starpos.fix.solver import Solver
+from starpos.frames.frame import Stars
+from starpos.gnss import states
+from starpos.gnss.filter import what_would_tell_more
+from starpos.gnss.receiver import NEAREST_S, GnssPlace, GnssTrack, known_place, message_to_gnss
+from starpos.gnss.solving import Watched, watched
+from starpos.gnss.states import Learned
+from starpos.gnss.watch import GnssStatus, GnssWatch
+from starpos.instrument.instrument import Instrument
+from starpos.session.driver import ANOTHER_TIME_S, Diagnosis, Heard, Jobs, Level, Log, Now
+from starpos.session.frames import ground_of
+from starpos.session.reports import AHEAD_S, ONE_CLOCK
+from starpos.session.settings import Settings
+from starpos.units import ARCSEC, utc_text
 
 # 1 sigma of a fix that states no error, m an axis
 UNSTATED_M = 30.0
 # places that differ by more, in sigma, contradict each other
-SIGMAS = 5.0
+CONTRADICTION_SIGMAS = 5.0
 # maximum age of a GNSS place in a comparison, s
 OLDEST_S = 5.0
 
@@ -23,9 +48,251 @@ def contradiction(gnss: GnssPlace, ground: Geodetic, utc_unix_s: float, speed: f
     on_the_way = speed * (utc_unix_s - gnss.utc_unix_s)
     claim = ground.covariance[:2, :2] + gnss.covariance + np.eye(2) * on_the_way**2
     apart, sigmas = float(np.linalg.norm(off)), float(np.sqrt(off @ np.linalg.solve(claim, off)))
-    if sigmas < SIGMAS:
+    if sigmas < CONTRADICTION_SIGMAS:
         return apart, ""
     return apart, (
         f"GNSS has a place {apart:.3g} m from here, {sigmas:.2g} times their stated errors: one of them is "
         f"wrong"
     )
+
+
+class GnssComparison:
+    """Keeps the last place of GNSS; it never changes a fix."""
+
+    def __init__(self) -> None:
+        self._place: GnssPlace | None = None
+
+    def take(self, message: Any) -> None:
+        """Take a sensor_msgs/NavSatFix; one without a usable place is forgotten."""
+        try:
+            self._place = message_to_gnss(message, UNSTATED_M)
+        except GnssError:
+            self._place = None
+
+    def remark(self, answer: Solution | None, vertical: Vertical) -> str:
+        """Sentence with the distance, where both places cannot be right; '' otherwise."""
+        fix = None if answer is None else answer.fix
+        if fix is None or self._place is None or abs(fix.utc_unix_s - self._place.utc_unix_s) > OLDEST_S:
+            return ""
+        _, wrong = contradiction(self._place, ground_of(fix, vertical), fix.utc_unix_s, 0.0)
+        return f"{wrong}: check how frames are turned, A3 and the inclinometer's axes" if wrong else ""
+
+
+GNSS_TOPIC = "gnss/fix"
+# fixes that are kept: frames wait for their tilts meanwhile
+KEPT = 100
+# a fix that comes later than this after its stamp is of another clock, s
+MAX_LATE_S = 30.0
+# minimum interval between writings of what was learned, s
+SAVE_EVERY_S = 60.0
+
+
+class GnssTeacher:
+    """Keeps the newest fixes of GNSS, and what they have taught of the instrument in use.
+
+    jobs: writes the file.
+    """
+
+    def __init__(self, settings: Settings, jobs: Jobs, heard: Heard, log: Log) -> None:
+        self.newest: Watched | None = None
+        self._settings, self._values, self._jobs = settings, settings.values, jobs
+        self._heard, self._log = heard, log
+        self._places: deque[GnssPlace] = deque(maxlen=KEPT)
+        self._watch: GnssWatch | None = None
+        self._instrument: Instrument | None = None
+        self._stored: Learned | None = settings.learned
+        self._saved_s = -math.inf
+        # what the file holds
+        self._saved = settings.learned
+        self._trouble = ""
+
+    @property
+    def learned(self) -> Learned | None:
+        """What is known of the instrument now."""
+        return self._stored if self._watch is None else self._watch.learned
+
+    def take(self, message: Any, now: Now) -> None:
+        """Take a sensor_msgs/NavSatFix; one that cannot be used is refused with the reason."""
+        try:
+            place = message_to_gnss(message)
+            ahead_s = now.ahead_s(place.utc_unix_s)
+            if ahead_s > AHEAD_S or -ANOTHER_TIME_S < ahead_s < -MAX_LATE_S:
+                side = "ahead of" if ahead_s > 0 else "behind"
+                raise GnssError(f"GNSS's stamps are {abs(ahead_s):.3g} s {side} this clock: {ONE_CLOCK}")
+            if self._places and place.utc_unix_s < self._places[-1].utc_unix_s:
+                raise GnssError("GNSS's stamps go back: check that one receiver publishes, not two")
+        except GnssError as error:
+            self._heard.refuse(GNSS_TOPIC, str(error))
+            return
+        self._heard.came(GNSS_TOPIC)
+        self._places.append(place)
+
+    def solved(self, solver: Solver, stars: Stars, rough: Solution, compared: bool = True) -> Watched:
+        """Solve a frame with what GNSS taught before it; compared: with GNSS's place of its time too."""
+        watch = self._watch_of(solver.instrument)
+        gnss = self._compared_with(stars) if compared else None
+        try:
+            answer = watched(solver, stars, rough, gnss, watch)
+        except Exception as e:
+            # A defect loses only this frame.
+            self._log.error(traceback.format_exc())
+            why = f"what GNSS taught could not be used on this frame ({type(e).__name__}: {e})"
+            answer = Watched(solution=Solution.failed(stars, Status.BAD_INPUT, why))
+        if self._settings.site is not None:
+            # the heading there is better than any fix's
+            answer = replace(answer, solution=replace(answer.solution, at_place=rough.at_place))
+        if compared:
+            self.newest = answer
+        return answer
+
+    def _watch_of(self, instrument: Instrument) -> GnssWatch:
+        """The watch of an instrument; a new one where A3 or the inclinometer is stated otherwise."""
+        before = self._instrument
+        if self._watch is None:
+            self._watch = GnssWatch(instrument, self._settings.vertical, self._stored)
+        elif before is not None and (
+            before.calibration != instrument.calibration or before.inclinometer != instrument.inclinometer
+        ):
+            self._log.warning(
+                "another A3 or inclinometer is stated: what GNSS taught of the other is forgotten"
+            )
+            self._watch = GnssWatch(instrument, self._settings.vertical)
+        self._instrument = instrument
+        return self._watch
+
+    def other_camera(self) -> None:
+        """Forget what was learned of the other camera."""
+        if self._watch is not None and self._instrument is not None:
+            self._log.warning("another camera_info: what GNSS taught of the other camera is forgotten")
+            self._watch = GnssWatch(self._instrument, self._settings.vertical)
+
+    def place_at(self, utc_unix_s: float) -> GnssPlace | None:
+        """GNSS's place at a time, None without one; GnssError if its places contradict each other."""
+        return GnssTrack(list(self._places)).at(utc_unix_s)
+
+    def forget_places(self) -> None:
+        """Forget where GNSS had the instrument, not what it taught."""
+        self._places.clear()
+
+    def _compared_with(self, stars: Stars) -> GnssPlace | None:
+        if stars.mid_unix_s is None:
+            return None
+        try:
+            return self.place_at(stars.mid_unix_s)
+        except GnssError as error:
+            self._heard.refuse(GNSS_TOPIC, str(error))
+            return None
+
+    # the file --------------------------------------------------------------------------------------------------------
+
+    def save_if_due(self, now: Now) -> None:
+        """Write what was learned, as a job, if the last time is long enough ago."""
+        due = not self._jobs.busy and abs(now.waiting_s - self._saved_s) >= SAVE_EVERY_S
+        if due and self._worth_saving:
+            self._saved_s = now.waiting_s
+            path, learned = path_of(self._values["gnss.learned"]), self.learned
+            assert learned is not None
+            self._saved = learned
+            coming = self._jobs.run(lambda: states.save_learned(path, learned))
+            coming.add_done_callback(lambda f: self._note(f.result().trouble))
+
+    def close(self) -> None:
+        """Write what was learned, at the end."""
+        if self._worth_saving:
+            assert self.learned is not None
+            try:
+                states.save_learned(path_of(self._values["gnss.learned"]), self.learned)
+            except StarposError as error:
+                self._note(str(error))
+
+    @property
+    def _worth_saving(self) -> bool:
+        """Whether there is a file to write, and what was learned is whole and from other frames than the file's."""
+        watch = self._watch
+        if not self._values["gnss.learned"] or watch is None or watch.learned is None or watch.is_learning:
+            return False
+        return watch.learned.frames not in (0, 0 if self._saved is None else self._saved.frames)
+
+    def _note(self, trouble: str) -> None:
+        if trouble and trouble != self._trouble:
+            self._log.warning(trouble)
+        self._trouble = trouble
+
+    # diagnostics -----------------------------------------------------------------------------------------------------
+
+    def report(self) -> Diagnosis:
+        """Make the diagnostic `GNSS`."""
+        compared = None if self.newest is None else self.newest.compared
+        values = self._values_of(self.learned)
+        if self._trouble:
+            return Diagnosis(Level.WARN, self._trouble, values)
+        if compared is None:
+            since = (
+                "no frame with a GNSS place yet"
+                if self.newest is None
+                else "no GNSS place at the newest frame"
+            )
+            return Diagnosis(Level.WARN, f"{since}: the stars' place goes on with what was learned", values)
+        check = compared.check
+        values |= {
+            "status": check.status.value,
+            "distance (m)": check.distance_m,
+            "bearing (deg)": check.bearing_deg,
+            "sigma (m)": check.sigma_m,
+        }
+        if check.status == GnssStatus.DISAGREES:
+            return Diagnosis(Level.ERROR, check.sentence, values)
+        if check.status == GnssStatus.DOUBTFUL:
+            return Diagnosis(Level.WARN, f"{check.sentence}: it teaches nothing now", values)
+        return Diagnosis(Level.OK, check.sentence, values)
+
+    def _values_of(self, learned: Learned | None) -> dict[str, object]:
+        if learned is None or not learned.frames:
+            return {"frames learned from": 0}
+        across, about = learned.a3_stddev_rad
+        return {
+            "frames learned from": learned.frames,
+            "poses learned from": learned.poses,
+            "learned since": utc_text(learned.since_unix_s),
+            "A3 across the plumb line (arcsec, 1 sigma)": across / ARCSEC,
+            "A3 about the plumb line (arcsec, 1 sigma)": about / ARCSEC,
+            "deflection (arcsec, 1 sigma)": learned.deflection_stddev_rad / ARCSEC,
+            "more would tell": what_would_tell_more(learned),
+        }
+
+
+def solved_beside(
+    gnss: GnssTeacher | None, solver: Solver | None, stars: Stars, rough: Solution, compared: bool
+) -> Watched | None:
+    """Solve a frame as a teacher does; None without one, or without a solver."""
+    return gnss.solved(solver, stars, rough, compared) if gnss is not None and solver is not None else None
+
+
+class SessionPlaces:
+    """The known place at each time, as `Places`.
+
+    gnss: None without gnss.use.
+    """
+
+    def __init__(self, settings: Settings, gnss: GnssTeacher | None) -> None:
+        self._settings, self._gnss = settings, gnss
+
+    @property
+    def known(self) -> bool:
+        """Whether a source of the place is set."""
+        return self._settings.site is not None or self._gnss is not None
+
+    def at(self, utc_unix_s: float) -> KnownPlace:
+        """The place at a time; raises PlaceError where it is not known."""
+        if (site := self._settings.site) is not None:
+            return site
+        try:
+            gnss = None if self._gnss is None else self._gnss.place_at(utc_unix_s)
+        except GnssError as error:
+            raise PlaceError(f"no heading at a known place: {error}") from None
+        if gnss is None:
+            raise PlaceError(
+                f"no GNSS place within {NEAREST_S:g} s of the frame: no heading at a known place: check gnss/fix and the "
+                "clocks, or set site.latitude and site.longitude"
+            )
+        return known_place(gnss, self._settings.vertical)

@@ -12,11 +12,10 @@ import numpy as np
 from starpos import rotation
 from starpos.errors import VoyageError
 from starpos.fix.solver import Solver
-from starpos.frames.stars import Stars
+from starpos.frames.frame import Stars
 from starpos.identification import Identification, PointingPrior
-from starpos.navigation.imu import ImuModel
-from starpos.session.log import Heard
-from starpos.session.now import Now
+from starpos.navigation.records import ImuModel
+from starpos.session.driver import Heard, Now
 
 if TYPE_CHECKING:
     from starpos.session.gyro_readings import GyroReadings

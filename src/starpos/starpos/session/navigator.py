@@ -19,26 +19,18 @@ from starpos.earth.gravity import geodetic_place
 from starpos.earth.known_place import KnownPlace
 from starpos.earth.vertical import Geodetic, geodetic
 from starpos.errors import GnssError, StarposError, VoyageError
-from starpos.gnss.place import GnssPlace, known_place, message_to_gnss
-from starpos.gnss.track import GnssTrack
-from starpos.messages.attitude import message_to_attitude
+from starpos.gnss.receiver import GnssPlace, GnssTrack, known_place, message_to_gnss
 from starpos.messages.stamp import stamp_to_unix
-from starpos.navigation.adjustment import MIN_FRAMES
-from starpos.navigation.at_place import BodyAttitude, attitude_at_place
-from starpos.navigation.estimate import Estimate
-from starpos.navigation.motion import PLACE
-from starpos.navigation.observability import Observability, observability
-from starpos.navigation.placeless import PlacelessFrame
+from starpos.messages.stars import message_to_attitude
+from starpos.navigation.equations import PLACE
+from starpos.navigation.estimate import Estimate, Observability, VoyageFix, observability
 from starpos.navigation.recent import BACK_S, LONGEST_GAP_S, Recent
+from starpos.navigation.sightings import BodyAttitude, PlacelessFrame, attitude_at_place
 from starpos.navigation.vessel import PARKED
-from starpos.navigation.voyage import Voyage
-from starpos.navigation.voyage_fix import VoyageFix
-from starpos.session.diagnosis import Diagnosis, Level
+from starpos.navigation.voyage import MIN_FRAMES, Voyage
+from starpos.session.driver import Diagnosis, Heard, Jobs, Level, Log, Now, Outcome
 from starpos.session.gnss import OLDEST_S, UNSTATED_M, contradiction
-from starpos.session.job import Jobs, Outcome
-from starpos.session.log import Heard, Log
 from starpos.session.navigator_parameters import NavigatorSettings
-from starpos.session.now import Now
 from starpos.session.reports import AHEAD_S
 
 # minimum length of the window before it is adjusted, s, and minimum frames per second of the period

@@ -12,10 +12,9 @@ from starpos.earth.vertical import Vertical
 from starpos.errors import StarposError
 from starpos.files import path_of
 from starpos.instrument.instrument import Instrument
-from starpos.navigation.imu import ImuModel, read_imu_model
-from starpos.navigation.laws import LAWS
-from starpos.navigation.vessel import Vessel, check_drift
-from starpos.session import parameters
+from starpos.navigation.records import ImuModel, read_imu_model
+from starpos.navigation.vessel import LAWS, Vessel, check_drift
+from starpos.session import settings
 from starpos.session.parameter import FRAME_NAME, Parameter
 
 SHARED = (
@@ -145,11 +144,11 @@ PARAMETERS = (
         "remains the stars' own. A GNSS error of 10 km turns the heading by up to 0.1 deg, more "
         "near a pole.",
     ),
-    *(p for p in parameters.PARAMETERS if p.name in SHARED),
+    *(p for p in settings.PARAMETERS if p.name in SHARED),
 )
 # of a stated altitude: the vehicle goes up and down by more than its file says
 MIN_HEIGHT_STDDEV_M = 10.0
-ANY_INSTRUMENT = Instrument(1000.0, clock_stddev_s=parameters.MIN_CLOCK_S)
+ANY_INSTRUMENT = Instrument(1000.0, clock_stddev_s=settings.MIN_CLOCK_S)
 
 
 class NavigatorSettings:
@@ -172,14 +171,14 @@ class NavigatorSettings:
         known, model, grid = self._files
         try:
             if "calibration_url" in names:
-                known = parameters.known_instrument(values["calibration_url"]) or ANY_INSTRUMENT
+                known = settings.known_instrument(values["calibration_url"]) or ANY_INSTRUMENT
             if "imu_model" in names:
                 name = values["imu_model"]
                 model = read_imu_model(path_of(name)) if name else ImuModel()
             if "deflection.geoid" in names:
-                grid = parameters.geoid_file(values["deflection.geoid"])
-            parameters.atmosphere_of(values)
-            parameters.site_of(values, parameters.vertical_of(values, grid))
+                grid = settings.geoid_file(values["deflection.geoid"])
+            settings.atmosphere_of(values)
+            settings.site_of(values, settings.vertical_of(values, grid))
             check_drift(values["vehicle"], values["drift_stddev"], values["drift_change"])
         except StarposError as e:
             return str(e)
@@ -193,12 +192,12 @@ class NavigatorSettings:
     @property
     def vertical(self) -> Vertical:
         """The deflection of the vertical, or the geoid that gives it."""
-        return parameters.vertical_of(self.values, self._files[2])
+        return settings.vertical_of(self.values, self._files[2])
 
     @property
     def site(self) -> KnownPlace | None:
         """The place that is known; None where none is set."""
-        return parameters.site_of(self.values, self.vertical)
+        return settings.site_of(self.values, self.vertical)
 
     def vessel(self, clock_stddev_s: float) -> Vessel:
         """Instrument and vehicle, of which the frames' clock states its error."""
@@ -218,7 +217,7 @@ class NavigatorSettings:
             model=model,
             camera_to_body=np.asarray(known.link_to_camera, float).T,
             mount_stddev=float(np.radians(values["mount_stddev"])),
-            atmosphere=parameters.atmosphere_of(values),
+            atmosphere=settings.atmosphere_of(values),
             clock_stddev_s=max(known.clock_stddev_s, clock_stddev_s) if np.isnan(clock) else clock,
             drift_stddev=values["drift_stddev"],
             drift_change=values["drift_change"],

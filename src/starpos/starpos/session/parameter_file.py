@@ -9,11 +9,10 @@ from typing import Any
 from starpos.errors import InstrumentError
 from starpos.instrument import yaml_file
 from starpos.night.drivers import Drivers
-from starpos.recording.drivers import NO_REMAPS, Remaps
+from starpos.recording.topics import NO_REMAPS, Remaps
 from starpos.session import detector_parameters, inclinometer_parameters
 from starpos.session.parameter import Parameter
-from starpos.session.parameters import PARAMETERS
-from starpos.session.settings import Settings
+from starpos.session.settings import PARAMETERS, Settings
 
 SOLVER, DETECTOR, INCLINOMETER = "solver", "detector", "inclinometer"
 NODES = (SOLVER, DETECTOR, INCLINOMETER)

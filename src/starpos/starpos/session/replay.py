@@ -7,19 +7,16 @@ from pathlib import Path
 from typing import Any
 
 from starpos.errors import StarposError
-from starpos.frames.stars import Stars
+from starpos.frames.frame import Stars
 from starpos.instrument.camera import Camera
 from starpos.instrument.tilt_log import TiltLog
 from starpos.messages.stamp import PlainHeader, PlainStamp
 from starpos.messages.tilt import Reading, TiltMessage
 from starpos.night.drivers import IMAGES, DriverMessages, Drivers
 from starpos.recording.bag import BagReader
-from starpos.recording.drivers import CAPTURE, IMU
-from starpos.recording.instruments import GNSS, INPUTS, NAV_SAT_FIX, STARS, TILT, instrument_in
+from starpos.recording.topics import CAPTURE, GNSS, IMU, INPUTS, NAV_SAT_FIX, STARS, TILT, instrument_in
+from starpos.session.driver import Heard, JobsInTurn, Log, Now, Sent
 from starpos.session.frames import Output
-from starpos.session.job import JobsInTurn
-from starpos.session.log import Heard, Log
-from starpos.session.now import Now, Sent
 from starpos.session.parameter_file import drivers_of
 from starpos.session.session import SolverSession
 from starpos.session.settings import Settings

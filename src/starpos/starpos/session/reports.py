@@ -6,15 +6,14 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from starpos.calibration.unknown import MODEL_BY_PARAMETERS, unnamed_inclinometer
 from starpos.earth.orientation import EQUATOR_M_PER_S, table_age_days
-from starpos.fix.attitude_at_place import AttitudeAtPlace
+from starpos.fix.checks import MODEL_BY_PARAMETERS, unnamed_inclinometer
+from starpos.fix.heading import AttitudeAtPlace
 from starpos.fix.solution import Solution
-from starpos.frames.shutter import UNKNOWN, Shutter
+from starpos.frames.exposure import UNKNOWN_SHUTTER, Shutter
 from starpos.instrument.inclinometer import Tilt
 from starpos.instrument.instrument import Instrument
-from starpos.session.diagnosis import Diagnosis, Level
-from starpos.session.now import ANOTHER_TIME_S
+from starpos.session.driver import ANOTHER_TIME_S, Diagnosis, Level
 from starpos.units import ARCSEC
 
 WIDE_CLOCK_S = 0.1
@@ -132,7 +131,7 @@ def of_conditions(
         unknown.append(
             "the inclinometer's temperature at its calibration is not known, which widens the fix: calibrate again"
         )
-    if shutter == UNKNOWN:
+    if shutter == UNKNOWN_SHUTTER:
         unknown.append(
             "the time from the shutter's first row to its last is not known, which widens the fix: give the instrument "
             "file's shutter, readout_s: 0 for a global one"

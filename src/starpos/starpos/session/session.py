@@ -12,13 +12,13 @@ from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import Any
 
-from starpos.calibration.unknown import MODEL_BY_PARAMETERS, unnamed_inclinometer
 from starpos.earth.orientation import earth_state
 from starpos.errors import InstrumentError, StarposError, TimeError
+from starpos.fix.checks import MODEL_BY_PARAMETERS, unnamed_inclinometer
 from starpos.fix.fix import Fix
 from starpos.fix.solution import Solution, Status
 from starpos.fix.solver import Solver
-from starpos.frames.stars import Stars
+from starpos.frames.frame import Stars
 from starpos.gnss.solving import Watched
 from starpos.identification import Identification
 from starpos.identification.hint import Hint
@@ -27,25 +27,18 @@ from starpos.instrument.camera import Camera
 from starpos.messages.stamp import stamp_to_unix
 from starpos.messages.stars import message_to_stars
 from starpos.session import reports
-from starpos.session.attitude import attitude_seen
-from starpos.session.backlog import MAX_WAITING, Backlog
-from starpos.session.calibrating import Calibrating
+from starpos.session.calibrating import Calibrating, Seen
 from starpos.session.camera_solver import CameraSolver
-from starpos.session.clock_doubt import ClockDoubt
 from starpos.session.deflection import LiveDeflection
+from starpos.session.driver import Changes, Heard, Jobs, Log, Now, Sent
 from starpos.session.frames import Answered, Averaged, Output, Waiting, ground_of
-from starpos.session.gnss_teacher import GnssTeacher, solved_beside
+from starpos.session.gnss import GnssTeacher, SessionPlaces, solved_beside
 from starpos.session.gyro import Gyro
-from starpos.session.job import Jobs
-from starpos.session.known_place import SessionPlaces
-from starpos.session.log import Changes, Heard, Log
-from starpos.session.memory import Seen
-from starpos.session.now import Now, Sent
-from starpos.session.pace import Pace
-from starpos.session.search import AT_ONCE_S, Search
+from starpos.session.pace import MAX_WAITING, Backlog, Pace
 from starpos.session.settings import Settings
-from starpos.session.tilt_intake import TiltIntake
-from starpos.session.tilts import TiltBuffer
+from starpos.session.solving import AT_ONCE_S, Search, attitude_seen
+from starpos.session.standing import ClockDoubt
+from starpos.session.tilts import TiltBuffer, TiltIntake
 from starpos.session.transforms import FrameNames, name_in
 from starpos.sky import catalogue
 

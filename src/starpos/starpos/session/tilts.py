@@ -1,21 +1,142 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The tilts that have arrived, and their average over an exposure."""
+"""The tilts of a session: which are kept, who publishes them, and their average over an exposure."""
 
 import math
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from starpos.errors import TiltError, TiltRangeError
+from starpos.errors import StarposError, TiltError, TiltRangeError
 from starpos.instrument.inclinometer import Tilt
-from starpos.instrument.tilt_log import BRACKET_S, OPEN_END, TOUCH_S, TiltLog
-from starpos.instrument.tilts import Tilts
+from starpos.instrument.tilt_log import (
+    BRACKET_S,
+    NEIGHBOURS_S,
+    OPEN_END,
+    TOUCH_S,
+    TiltLog,
+    Tilts,
+    noise_excess,
+)
 from starpos.messages.stamp import stamp_to_unix
 from starpos.messages.tilt import OUT_OF_RANGE, SATURATED, STUCK, UNUSABLE, message_to_tilt
-from starpos.session.tilt_publishers import TiltPublishers
-from starpos.session.tilt_steps import TiltSteps
+from starpos.session import reports
+from starpos.session.driver import Heard, Now, Sent
+from starpos.session.settings import Settings
+from starpos.session.transforms import FrameNames, name_in
+
+# Number of samples from which the noise is measured.
+STEPS_KEPT = 2000
+
+
+class TiltSteps:
+    """Differences of neighbouring samples, in order of time: the newest CAPACITY of them."""
+
+    def __init__(self) -> None:
+        self._number = self._axes = 0
+        # time of the later sample, stated variance, difference of up to three axes; twice as long as what is kept
+        self._rows = np.empty((2 * STEPS_KEPT, 5))
+
+    def clear(self) -> None:
+        self._number = 0
+
+    def note(self, before: Tilt, sample: Tilt) -> None:
+        """Take two successive samples, if they are neighbours in time."""
+        apart_s = sample.utc_unix_s - before.utc_unix_s
+        # a repeated sample adds nothing, and counting it would distort the noise
+        if self._number and sample.utc_unix_s <= self._rows[self._number - 1, 0]:
+            return
+        if not 0 < apart_s < NEIGHBOURS_S or sample.axes != before.axes:
+            return
+        # of another number of axes they are of another sensor
+        if sample.axes != self._axes:
+            self._axes, self._number = sample.axes, 0
+        if self._number == len(self._rows):
+            self._rows[:STEPS_KEPT] = self._rows[STEPS_KEPT:]
+            self._number = STEPS_KEPT
+        row = self._rows[self._number]
+        row[0], row[1] = sample.utc_unix_s, np.diag(sample.covariance).mean()
+        row[2 : 2 + self._axes] = sample.theta - before.theta
+        self._number += 1
+
+    def forget_after(self, unix_s: float) -> None:
+        """Drop the steps to samples of later times."""
+        self._number = int(np.searchsorted(self._rows[: self._number, 0], unix_s, side="right"))
+
+    def excess(self, end_unix_s: float) -> float:
+        """Measured noise over the stated one, 1 or more, by samples up to a time."""
+        rows = self._rows[max(self._number - STEPS_KEPT, 0) : self._number]
+        rows = rows[: np.searchsorted(rows[:, 0], end_unix_s, side="right")]
+        if not len(rows):
+            return 1.0
+        return noise_excess(rows[:, 2 : 2 + self._axes], float(np.sqrt(rows[:, 1].mean())))
+
+
+# time after which a single publisher is used again: a minimum, periods of the other if it sent seldom, a maximum
+ALONE_S, ALONE_PERIODS, MAX_ALONE_S = 1.0, 2.5, 10.0
+# highest rate of an inclinometer; it bounds how many messages between two received ones can be lost
+MAX_HZ = 500.0
+
+
+@dataclass
+class _Voice:
+    """One publisher as known from its messages: their frame, the last one's number, arrival and interval."""
+
+    frame_id: str
+    number: int | None
+    heard_s: float
+    period_s: float = 0.0
+
+    def speaks(self, now_s: float) -> bool:
+        """Whether it may be going on."""
+        silence_s = min(max(ALONE_S, ALONE_PERIODS * self.period_s), MAX_ALONE_S)
+        return abs(now_s - self.heard_s) <= silence_s
+
+
+class TiltPublishers:
+    """Notes every message and says whether its publisher is the only one."""
+
+    def __init__(self) -> None:
+        self._voices: list[_Voice] = []
+        self._speaking: list[_Voice] = []
+
+    def heard(self, frame_id: str, number: int | None, now_s: float) -> None:
+        """Note a message; number: its number among its publisher's messages, None where the middleware gives none."""
+        mine = self._voice_of(frame_id, number, now_s) or _Voice(frame_id, number, now_s)
+        mine.number, mine.heard_s, mine.period_s = number, now_s, abs(now_s - mine.heard_s)
+        # one that sends seldom is remembered, to learn how seldom
+        others = [v for v in self._voices if v is not mine and abs(now_s - v.heard_s) <= MAX_ALONE_S]
+        self._voices = [*others, mine]
+        self._speaking = [v for v in self._voices if v.speaks(now_s)]
+
+    def _voice_of(self, frame_id: str, number: int | None, now_s: float) -> _Voice | None:
+        """The publisher that this message continues: among equal candidates one still speaking rather than an old one.
+
+        A number that is ahead by more than messages can have been lost is another publisher's.
+        """
+        of_frame = [v for v in self._voices if v.frame_id == frame_id]
+        if number is None:
+            return of_frame[0] if of_frame else None
+        before = [
+            v
+            for v in of_frame
+            if v.number is not None and v.number < number <= v.number + 1 + abs(now_s - v.heard_s) * MAX_HZ
+        ]
+        return max(before, key=lambda v: (v.number, v.speaks(now_s), v.heard_s), default=None)
+
+    @property
+    def several(self) -> str:
+        """A sentence that names the publishers heard at the same time; '' if there is only one."""
+        if len(self._speaking) < 2:
+            return ""
+        frames = sorted({v.frame_id for v in self._speaking})
+        named = " and ".join(map(repr, frames)) if len(frames) > 1 else f"both with the frame {frames[0]!r}"
+        return (
+            f"{len(self._speaking)} inclinometers publish on tilt ({named}): stop all but one, or give each instrument a "
+            "namespace of its own"
+        )
+
 
 # Ten minutes at 10 Hz.
 CAPACITY = 6000
@@ -196,3 +317,58 @@ class _Over:
     def average(self, mid_unix_s: float, exposure_s: float, spread_s: float = 0.0) -> Tilt:
         """Average over the span about a time."""
         return self.buffer.average(mid_unix_s, self.span_s)
+
+
+MAX_EARLY = 1000
+
+
+class TiltIntake:
+    """Gives tilts to a buffer; names: of the frames of the messages taken."""
+
+    def __init__(self, tilts: TiltBuffer, names: FrameNames, settings: Settings, heard: Heard) -> None:
+        self._tilts, self._names, self._settings, self._heard = tilts, names, settings, heard
+        # those ahead of a clock that may have been heard only after them
+        self._early: deque[Any] = deque(maxlen=MAX_EARLY)
+
+    @property
+    def waits(self) -> bool:
+        """Whether a tilt waits for its time."""
+        return bool(self._early)
+
+    def clear(self) -> None:
+        self._early.clear()
+
+    def take(self, message: Any, sent: Sent, now: Now) -> None:
+        """Take a Tilt."""
+        stamp_s = stamp_to_unix(message.header.stamp)
+        if sent.unix_s is not None and not now.played:
+            # A process that stood still may read it only when its time has come.
+            now = replace(now, unix_s=min(sent.unix_s, sent.unix_s if now.unix_s is None else now.unix_s))
+        try:
+            self._tilts.heard(message, sent.number, now.waiting_s)
+            ahead_s = now.ahead_s(stamp_s)
+        except StarposError as e:
+            self._heard.refuse("tilt", str(e))
+            return
+        if now.played and ahead_s > reports.AHEAD_S:
+            self._early.append(message)
+        else:
+            self._add(message, now)
+
+    def go_on(self, now: Now) -> None:
+        """Look again at those that were ahead of the clock."""
+        early, self._early = self._early, deque(maxlen=MAX_EARLY)
+        for message in early:
+            self._add(message, now)
+
+    def _add(self, message: Any, now: Now) -> None:
+        """Keep a tilt, unless it is broken, or of the future: the instrument may lean otherwise when its time comes."""
+        try:
+            if (ahead_s := now.ahead_s(stamp_to_unix(message.header.stamp))) > reports.AHEAD_S:
+                raise TiltError(f"a tilt is stamped {ahead_s:.3g} s in the future: {reports.ONE_CLOCK}")
+            self._tilts.add(message, self._settings.tilt_stddev_rad)
+            self._tilts.came_late(-ahead_s)
+            self._heard.came("tilt")
+            self._names.inclinometer = name_in(message)
+        except StarposError as e:
+            self._heard.refuse("tilt", str(e))

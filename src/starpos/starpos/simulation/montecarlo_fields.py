@@ -13,7 +13,7 @@ from itertools import count
 import numpy as np
 
 from starpos.errors import CatalogueError
-from starpos.frames.stars import Stars
+from starpos.frames.frame import Stars
 from starpos.instrument.camera import Camera
 from starpos.sky.catalogue import Catalogue
 from starpos.units import ARCSEC

@@ -13,15 +13,14 @@ import numpy as np
 
 from starpos import rotation
 from starpos.averaging.average import Average, average
-from starpos.calibration.misalignment import calibrate_at
-from starpos.calibration.turning import turn
+from starpos.calibration.misalignment import calibrate_at, turn
 from starpos.earth.ellipsoid import curvature_radii_m
 from starpos.earth.orientation import ROTATION_RAD_S, earth_orientation
 from starpos.earth.refraction import Atmosphere
 from starpos.earth.vertical import Deflection, geodetic
 from starpos.errors import StarposError
 from starpos.fix.solver import Solver
-from starpos.frames.stars import Stars
+from starpos.frames.frame import Stars
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import InclinometerErrors
 from starpos.instrument.instrument import Calibration, Instrument

@@ -1,16 +1,28 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The star catalogue: a compact Tycho-2 in declination zones, with directions at any date and their errors.
+"""Find the rows of a table that lie in a part of the sky, by cells of 1 deg of declination and 1 deg of right ascension.
+
+The table is in declination zones, each sorted by right ascension, so that the rows of a cell follow each other.
+
+Parallaxes of the near stars, which Tycho-2 does not have.
+
+They are Hipparcos' stars (ESA SP-1200, 1997) of MIN_MAS and more, and stars within 8 arcsec of one. The table is made by
+tools/data/near_stars.py from Stellarium's list, which has later values for some. Hipparcos' own err by 1 to 3 mas, of
+some pairs more.
+
+The star catalogue: a compact Tycho-2 in declination zones, with directions at any date and their errors.
 
 The committed file holds all stars with V < 11, which the instrument sees in half a second. Stars fainter than V = 9.5
 give half of the accuracy of the roll about the optical axis, and so of the position.
 """
 
 import hashlib
+import math
 import os
 import zipfile
 import zlib
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -19,11 +31,81 @@ from numpy.typing import ArrayLike
 from starpos.errors import CatalogueError
 from starpos.files import open_regular
 from starpos.rotation import normalised
-from starpos.sky import near_stars
 from starpos.sky._labels import Labels
-from starpos.sky.zones import ZONES, cell_starts, rows_near
 from starpos.table_cache import cache_folder, load_or_build, mapped, rising
 from starpos.units import MAS, MAS_DEG
+
+# Zones of declination.
+ZONES = 180
+# Cells of right ascension in each zone.
+CELLS = 360
+
+
+def cell_starts(zone_start: np.ndarray, ra_deg: np.ndarray) -> np.ndarray:
+    """First row of each cell, and the end (ZONES * CELLS + 1,); zone_start (181,) is the first row of each zone."""
+    edges = np.arange(CELLS)
+    starts = [first + np.searchsorted(ra_deg[first:last], edges) for first, last in pairwise(zone_start)]
+    return np.append(np.concatenate(starts), zone_start[-1]).astype(np.int32)
+
+
+def rows_near(cell_start: np.ndarray, centre: np.ndarray, radius_rad: float) -> np.ndarray:
+    """Rows (M,) in all cells that a cone about the vector centre (3,), of any length, touches."""
+    x, y, z = centre.tolist()
+    flat = math.hypot(x, y)
+    ra, dec = math.degrees(math.atan2(y, x)), math.atan2(z, flat)
+    # half the cone's width in right ascension; if a pole is inside, it has all of it
+    half = 180.0
+    if abs(dec) + radius_rad < math.pi / 2 - 1e-9:
+        half = math.degrees(math.asin(min(math.sin(radius_rad) / math.cos(dec), 1.0)))
+    low = max(int(math.degrees(dec - radius_rad) + 90), 0)
+    high = min(int(math.degrees(dec + radius_rad) + 90), ZONES - 1)
+    first = math.floor(ra - half)
+    width = min(math.floor(ra + half) - first + 1, CELLS)
+    first %= CELLS
+    # a run that passes 360 deg continues at 0
+    runs = [(first, min(first + width, CELLS))] + (
+        [(0, first + width - CELLS)] if first + width > CELLS else []
+    )
+    runs = [
+        (zone * CELLS + begin, zone * CELLS + end) for zone in range(low, high + 1) for begin, end in runs
+    ]
+    return np.concatenate([np.arange(cell_start[begin], cell_start[end]) for begin, end in runs])
+
+
+def ranges(first: np.ndarray, count: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The numbers first[i] .. first[i] + count[i] - 1 of all i, one after the other: arrays of i (M,) and number (M,)."""
+    owner = np.repeat(np.arange(len(count)), count)
+    before = np.cumsum(count) - count
+    return owner, np.arange(len(owner)) + (first - before)[owner]
+
+
+NEAR_MIN_MAS = 100.0
+# Columns tyc1, tyc2, tyc3, parallax_mas.
+PARALLAXES = Path(__file__).with_name("data") / "near_stars.csv"
+
+
+def parallaxes_mas(tyc: np.ndarray) -> np.ndarray:
+    """Parallaxes (N,) of stars with these Tycho identifiers (N, 3), mas; 0 for those that are not near."""
+    number, parallax = _near_stars()
+    wanted = _tycho_numbers(tyc)
+    row = np.minimum(np.searchsorted(number, wanted), len(number) - 1)
+    return np.where(number[row] == wanted, parallax[row], 0.0)
+
+
+@lru_cache(maxsize=1)
+def _near_stars() -> tuple[np.ndarray, np.ndarray]:
+    """Numbers (M,) of the near stars, rising, and their parallaxes (M,) in mas."""
+    rows = np.loadtxt(PARALLAXES, delimiter=",", skiprows=1, ndmin=2)
+    number = _tycho_numbers(rows[:, :3])
+    order = np.argsort(number)
+    return number[order], rows[order, 3]
+
+
+def _tycho_numbers(tyc: np.ndarray) -> np.ndarray:
+    """One number (N,) for each identifier (N, 3)."""
+    region, within, component = np.asarray(tyc, np.int64).T
+    return (region << 20) + (within << 4) + component
+
 
 # Julian year of ra and dec.
 EPOCH = 2000.0
@@ -276,7 +358,7 @@ def _join(planes: np.ndarray, dtype: type[np.integer]) -> np.ndarray:
 def _newer(tyc: np.ndarray) -> dict[str, np.ndarray]:
     """The columns that older files lack, for stars of these identifiers (N, 3)."""
     zeros = np.zeros(len(tyc), np.int8)
-    tenths = np.round(near_stars.parallaxes_mas(tyc) / TENTH).astype(np.uint16)
+    tenths = np.round(parallaxes_mas(tyc) / TENTH).astype(np.uint16)
     return {"pm_ra_centi": zeros, "pm_dec_centi": zeros, "parallax_tenths": tenths}
 
 
@@ -342,7 +424,7 @@ def load_catalogue(path: str | None = None) -> Catalogue:
     try:
         with zipfile.ZipFile(COMMITTED) as packed:
             columns = [(column.filename, column.CRC) for column in packed.infolist()]
-        key = repr((FORMAT, columns, zlib.crc32(near_stars.PARALLAXES.read_bytes())))
+        key = repr((FORMAT, columns, zlib.crc32(PARALLAXES.read_bytes())))
     except (OSError, zipfile.BadZipFile):
         # raises the error of a broken file
         return read(COMMITTED)

@@ -1,15 +1,98 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A deeper catalogue for small fields: all stars of Tycho-2's original files, built once and kept in the user's cache."""
+"""How deep a catalogue a field needs, and a deeper one for small fields: all of Tycho-2, built once and kept in the
+cache.
+"""
 
+import math
 import os
 import threading
+from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
+
+import numpy as np
 
 from starpos.instrument.camera import Camera
 from starpos.progress import Progress, quiet
-from starpos.sky.catalogue import PREFIX, Catalogue, stored
-from starpos.sky.depth import Depth
+from starpos.sky.catalogue import CELLS, PREFIX, ZONES, Catalogue, stored
 from starpos.table_cache import cache_folder, load_or_build
+
+# Number of the catalogue's stars that should be on a frame, in all but this share of the sky.
+ENOUGH_ON_FRAME, SPARSE = 12, 0.1
+# Size of the blocks in which stars are counted, deg.
+BLOCK_DEG = 10
+# Stars per deg2 to V = 11 in that share of the sky, and factor for each magnitude.
+SPARSE_TO_V11, TIMES_A_MAG = 10.0, 2.2
+# Share of a catalogue's faintest stars that is ignored in its depth.
+FAINTEST_SHARE = 0.01
+
+
+@dataclass(frozen=True, kw_only=True)
+class Depth:
+    """How many stars of a catalogue a field holds.
+
+    width_deg, height_deg  of the field
+    limit_mag              V to which the catalogue goes
+    mean, sparse           stars on a frame: on average, and in the tenth of the sky with the fewest
+    needed_mag             V to which a catalogue for the field should go, to half a magnitude
+    """
+
+    width_deg: float
+    height_deg: float
+    limit_mag: float
+    mean: float
+    sparse: float
+    needed_mag: float
+
+    @classmethod
+    @lru_cache(maxsize=16)
+    def of(cls, camera: Camera, catalogue: Catalogue) -> "Depth":
+        """The Depth of a catalogue for a camera's field."""
+        size = camera.width / camera.fx, camera.height / camera.fy
+        width_deg, height_deg = (math.degrees(2 * math.atan(s / 2)) for s in size)
+        limit_mag, mean, sparse = _densities(catalogue)
+        area_deg2 = _solid_angle_deg2(*size)
+        more = math.log(ENOUGH_ON_FRAME / (SPARSE_TO_V11 * area_deg2)) / math.log(TIMES_A_MAG)
+        return cls(
+            width_deg=width_deg,
+            height_deg=height_deg,
+            limit_mag=limit_mag,
+            mean=mean * area_deg2,
+            sparse=sparse * area_deg2,
+            needed_mag=math.ceil(2 * (11 + more)) / 2,
+        )
+
+    @property
+    def enough(self) -> bool:
+        """Whether nearly all frames of the field hold enough stars."""
+        return self.sparse >= ENOUGH_ON_FRAME
+
+
+@lru_cache(maxsize=4)
+def _densities(catalogue: Catalogue) -> tuple[float, float, float]:
+    """V to which a catalogue goes, its stars per deg2 on average, and in the sparsest share of the sky."""
+    if not len(catalogue):
+        return 0.0, 0.0, 0.0
+    cells = np.diff(catalogue.cell_start).reshape(
+        ZONES // BLOCK_DEG, BLOCK_DEG, CELLS // BLOCK_DEG, BLOCK_DEG
+    )
+    edges = np.sin(np.radians(np.arange(-90, 91, BLOCK_DEG)))
+    area = np.repeat(np.diff(edges) * np.radians(BLOCK_DEG) * np.degrees(1) ** 2, CELLS // BLOCK_DEG)
+    density = cells.sum((1, 3)).ravel() / area
+    order = np.argsort(density)
+    sparse = density[order[np.searchsorted(area[order].cumsum(), SPARSE * area.sum())]]
+    last = int((1 - FAINTEST_SHARE) * len(catalogue))
+    faint = np.partition(catalogue.vmag_centi, last)[last] / 100
+    return float(faint), float(len(catalogue) / area.sum()), float(sparse)
+
+
+def _solid_angle_deg2(width: float, height: float) -> float:
+    """Solid angle of a pinhole's frame of this size in focal lengths."""
+    u, v = (np.arange(-20, 21) / 20 * n / 2 for n in (width, height))
+    # a pixel's solid angle falls with the cube of the cosine
+    share = np.mean((1 + u[:, None] ** 2 + v**2) ** -1.5)
+    return float(width * height * share * np.degrees(1) ** 2)
+
 
 # The variable of the environment that names the original files: a folder, or Debian's archive of them.
 ORIGINALS = "STARPOS_TYCHO2"
@@ -88,7 +171,7 @@ def fetched(mirror: str | None = None, progress: Progress = quiet) -> Catalogue:
 
     Raises CatalogueError if they cannot be fetched; what has come stays for the next call.
     """
-    from starpos.sky.fetching import fetch
+    from starpos.sky.tycho2 import fetch
 
     archive = fetch(mirror, progress)
     made = build(archive, progress, anew=True)

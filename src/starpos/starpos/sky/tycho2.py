@@ -1,22 +1,183 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Build the compact catalogue from the original Tycho-2 files (CDS I/259): tyc2.dat.* and suppl_1.dat.
+"""Motions of the fast stars for which Tycho-2 has none.
+
+Tycho-2 compares the satellite's places with places on old plates. Of bright stars, which the plates show as blots, and of
+fast ones, which were not found again, it has only the satellite's place (pflag X). Some of these move by
+arcminutes until today. Their motions here are from Hipparcos (ESA SP-1200, 1997); tools/data/fast_stars.py made the
+table, of all faster than MIN_MAS_YEAR and V < 9.
+
+Fetch Tycho-2's original files from a mirror of Debian: resumed where it broke off, checked before they are used.
+
+Build the compact catalogue from the original Tycho-2 files (CDS I/259): tyc2.dat.* and suppl_1.dat.
 
 Sources: Tycho-2, Hog et al. 2000, A&A 355, L27; byte positions from the catalogue's own ReadMe.
 """
 
+import hashlib
+import http.client
 import lzma
+import ssl
 import tarfile
+import urllib.error
+import urllib.request
 from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 
-from starpos.errors import CatalogueError
+from starpos.errors import LETTERS, CatalogueError
 from starpos.files import open_regular, read_regular
 from starpos.progress import Progress, quiet
-from starpos.sky.catalogue import EPOCH, Catalogue, pack
-from starpos.sky.fast_stars import FAST, FAST_SIGMA_MAS_YEAR
-from starpos.sky.near_stars import parallaxes_mas
+from starpos.sky.catalogue import EPOCH, Catalogue, pack, parallaxes_mas
+from starpos.table_cache import cache_folder
+
+MIN_MAS_YEAR = 400.0
+# Many are pairs, whose orbits Hipparcos saw for three years only.
+FAST_SIGMA_MAS_YEAR = 10.0
+# Tycho identifier: motion in right ascension times cos dec, and in declination, mas/yr.
+FAST = {
+    (52, 1686, 1): (1806.3, 1442.5), (583, 1456, 1): (432.1, -111.9), (590, 343, 1): (447.3, 181.4),
+    (728, 3142, 1): (373.0, -483.8), (834, 654, 1): (359.9, -770.1), (958, 1468, 1): (183.4, -418.7),
+    (958, 1468, 2): (183.4, -418.7), (1310, 2544, 1): (-79.8, -420.0), (1496, 2119, 1): (311.2, -1282.2),
+    (2582, 3158, 1): (-462.6, 345.1), (2582, 3158, 2): (-462.6, 345.1), (2822, 2210, 1): (-172.6, -381.0),
+    (2900, 2157, 1): (519.4, -664.8), (2986, 1978, 1): (-487.7, -219.3), (3014, 574, 1): (4003.7, -5813.0),
+    (3168, 2800, 1): (4155.1, 3258.9), (3246, 874, 1): (892.5, -136.5), (3246, 874, 2): (847.1, -152.0),
+    (3420, 2149, 1): (-441.1, -215.2), (3432, 1451, 1): (-947.1, -535.6), (3663, 2669, 1): (1087.1, -559.6),
+    (3664, 1985, 1): (523.4, -180.4), (3930, 1791, 1): (-1314.4, 1753.4), (3990, 2431, 1): (476.4, 50.0),
+    (4437, 1491, 1): (531.1, -351.6), (4715, 1106, 1): (-230.4, -768.7), (4949, 1120, 1): (-616.7, 60.7),
+    (4949, 1120, 2): (-616.7, 60.7), (4982, 1645, 1): (-25.8, -419.8), (5312, 2325, 1): (-2239.3, -3419.9),
+    (5521, 1366, 1): (142.0, -483.3), (5827, 1181, 1): (-477.1, -1180.2), (5827, 1181, 2): (-477.1, -1180.2),
+    (5855, 2292, 1): (-1721.8, 854.1), (5862, 1720, 1): (614.8, 202.3), (5930, 2197, 1): (-292.4, -368.4),
+    (6116, 1517, 1): (-1069.9, -1063.8), (6152, 754, 1): (221.9, -375.3), (6445, 990, 1): (371.5, 612.3),
+    (6820, 326, 1): (-473.7, -1143.9), (6820, 326, 2): (-473.7, -1143.9), (7370, 850, 1): (1149.2, -90.8),
+    (7370, 850, 2): (1149.2, -90.8), (7512, 1263, 1): (6767.3, 1326.7), (7966, 1201, 1): (-3259.0, -1147.0),
+    (8399, 2186, 1): (303.6, -364.3), (8431, 60, 1): (-29.8, -817.3), (8502, 1080, 1): (784.9, 396.1),
+    (8514, 2241, 1): (-45.5, 731.8), (8672, 855, 1): (-294.0, -323.9), (8690, 554, 1): (-454.5, -810.0),
+    (8791, 434, 1): (63.0, -1066.7), (8863, 1552, 1): (1336.1, 616.3), (8863, 1557, 1): (1331.1, 646.8),
+    (9027, 5712, 1): (-188.4, -401.9), (9111, 1423, 1): (81.1, 800.7), (9136, 1758, 1): (416.6, 76.0),
+    (9136, 1758, 2): (416.6, 76.0), (9333, 1274, 1): (461.3, -287.2), (9345, 214, 1): (141.1, -736.9),
+    (9354, 780, 1): (433.9, -58.0), (9386, 2614, 1): (312.0, 1050.2),
+}  # fmt: skip
+
+
+# The archive of Debian's source package tycho2 (2-4), and where a mirror has it.
+ARCHIVE = "tycho2_2.orig.tar.xz"
+IN_MIRROR = f"pool/main/t/tycho2/{ARCHIVE}"
+SHA256, BYTES = "b0d74bd4280e53f7cfc4b37ccb30a1cfbbc30131907dda81c706bbbab5632dfa", 121_142_216
+# Debian's mirror network, and its archive of all former packages.
+MIRRORS = "https://deb.debian.org/debian", "https://snapshot.debian.org/archive/debian/20250520T000000Z"
+# Time after which a silent server is given up.
+SILENCE_S = 30.0
+CHUNK_BYTES = 1 << 18
+FETCH_CURE = (
+    "check the network, or give another mirror of Debian or the address of the file "
+    "(`starpos catalogue deepen --fetch URL`)"
+)
+
+
+def fetch(mirror: str | None = None, progress: Progress = quiet) -> Path:
+    """Fetch the archive of the original files into the cache; the caller removes it once it is used.
+
+    mirror: URL of a Debian mirror, or of the file itself (it ends in .xz); None: Debian's own.
+    If the connection breaks off, the received part stays, and the next call goes on from there.  Proxies come from the
+    environment (https_proxy).  Raises CatalogueError if no mirror has the file, or if its checksum is another one.
+    """
+    path = cache_folder() / f"{ARCHIVE}.part"
+    addresses = [_address(m) for m in ((mirror,) if mirror else MIRRORS)]
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with open(path, "ab") as file, _alone(file, path):
+            _complete(file, addresses, progress)
+    except OSError as e:
+        raise CatalogueError(
+            f"{path}: cannot be written ({e.strerror}): make room, or set XDG_CACHE_HOME"
+        ) from None
+    return path
+
+
+def _address(mirror: str) -> str:
+    """The address of the archive on a mirror, or the mirror itself where that is a file."""
+    if "://" not in mirror:
+        raise CatalogueError(
+            f"{mirror}: no URL of a mirror: give one that begins with https://, or `starpos catalogue deepen FILE` "
+            "for a file that is here"
+        )
+    return mirror if mirror.endswith(".xz") else f"{mirror.rstrip('/')}/{IN_MIRROR}"
+
+
+@contextmanager
+def _alone(file: BinaryIO, path: Path) -> Iterator[None]:
+    """Let one process write the file, if files can be locked; a killed process holds no lock."""
+    with suppress(ImportError):
+        import fcntl
+
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise CatalogueError(f"{path}: another process fetches it: wait for that one") from None
+    yield
+
+
+def _complete(file: BinaryIO, addresses: list[str], progress: Progress) -> None:
+    """Append what a file lacks of the archive, from the first address that has it; CatalogueError if none has."""
+    reasons = []
+    for address in addresses:
+        if reason := _append(file, address, progress):
+            reasons.append(f"{address}: {reason}")
+        elif _is_right(file):
+            return
+        else:
+            _empty(file)
+            reasons.append(f"{address}: the checksum is not that of Tycho-2's original files")
+    raise CatalogueError(f"{'; '.join(reasons)}: {FETCH_CURE}")
+
+
+def _append(file: BinaryIO, address: str, progress: Progress) -> str:
+    """Append what an address has beyond the end of a file; returns why the file is not whole yet, or ''."""
+    have = file.tell()
+    if have == BYTES:
+        return ""
+    request = urllib.request.Request(address, headers={"Range": f"bytes={have}-"} if have else {})
+    try:
+        # urlopen's opener would keep the proxies of its first call
+        with urllib.request.build_opener().open(request, timeout=SILENCE_S) as answer:
+            # a server that knows no ranges sends all of it
+            if have and answer.status != http.client.PARTIAL_CONTENT:
+                _empty(file)
+            while chunk := answer.read(CHUNK_BYTES):
+                if file.tell() + len(chunk) > BYTES:
+                    _empty(file)
+                    return f"it has more than {BYTES} bytes"
+                file.write(chunk)
+                progress(f"fetching {ARCHIVE}", file.tell() / BYTES)
+    except urllib.error.HTTPError as e:
+        return f"the server answers {e.code} {e.reason}"
+    except urllib.error.URLError as e:
+        return str(getattr(e.reason, "strerror", None) or e.reason)[:LETTERS]
+    except (http.client.HTTPException, ssl.SSLError, TimeoutError, ConnectionError) as e:
+        return f"the connection broke off ({str(e)[:LETTERS] or type(e).__name__})"
+    if file.tell() < BYTES:
+        return f"it ended after {file.tell()} of {BYTES} bytes"
+    return ""
+
+
+def _empty(file: BinaryIO) -> None:
+    """Remove the content of a file that is open for writing."""
+    file.seek(0)
+    file.truncate()
+
+
+def _is_right(file: BinaryIO) -> bool:
+    """Whether a file that is open for writing holds the archive."""
+    file.flush()
+    with open(file.name, "rb") as written:
+        digest = hashlib.sha256()
+        while chunk := written.read(CHUNK_BYTES):
+            digest.update(chunk)
+    return digest.hexdigest() == SHA256
+
 
 SUPPLEMENT_EPOCH = 1991.25
 # 1 sigma of a motion, along one axis, that Tycho-2 does not have. It is the root mean square in Hipparcos of the same

@@ -9,12 +9,9 @@ from starpos.earth.ellipsoid import EARTH_RADIUS_M
 from starpos.earth.orientation import earth_motion
 from starpos.errors import FixError
 from starpos.sky.catalogue import load_catalogue
-from starpos.units import ARCSEC
-from starpos.utc import utc_text
-from starpos.zenith.adjustment import Adjusted
-from starpos.zenith.faces import mean_headings
-from starpos.zenith.quality import FaceQuality
-from starpos.zenith.sighting import ZenithSighting
+from starpos.units import ARCSEC, utc_text
+from starpos.zenith.adjustment import Adjusted, FaceQuality
+from starpos.zenith.sighting import ZenithSighting, mean_headings
 
 # A deflection with a larger sigma is useless: maps of the geoid know it better.
 MAX_SIGMA_ARCSEC = 3.0

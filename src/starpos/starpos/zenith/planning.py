@@ -13,7 +13,7 @@ from starpos import rotation
 from starpos.earth.orientation import ROTATION_RAD_S, EarthState
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import FixError
-from starpos.frames.shutter import UNKNOWN
+from starpos.frames.exposure import UNKNOWN_SHUTTER
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import Tilt
 from starpos.instrument.instrument import Instrument
@@ -208,7 +208,7 @@ class Planner:
         by_star = across * sky.catalogue_rad / np.sqrt(sky.stars * GROUPS)
         roll = sky.centroid_rad / sky.radius_rad
         rows = np.linspace(0, self.camera.height - 1, 9)
-        late_s = (instrument.shutter or UNKNOWN).errors_s(rows, self.camera.height).mean(0)
+        late_s = (instrument.shutter or UNKNOWN_SHUTTER).errors_s(rows, self.camera.height).mean(0)
         drift = -ROTATION_RAD_S * (attitude @ self.mark.enu[:, 2])
         return ZenithSighting(
             source="",

@@ -10,7 +10,7 @@ import numpy as np
 
 from starpos.errors import StarposError, StationError
 from starpos.files import read_regular
-from starpos.utc import unix_of
+from starpos.units import unix_of
 
 MAX_BYTES = 50_000_000
 # of a correlation

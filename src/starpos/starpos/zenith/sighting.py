@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One frame at a known site: the camera's attitude by its stars, its errors, and the tilt."""
+"""Frames at a known site: attitude, errors and tilt of each, their faces, and the stars' places on which they agree."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -11,16 +12,15 @@ from starpos.earth.orientation import ROTATION_RAD_S, EarthOrientation, EarthSta
 from starpos.earth.refraction import Refraction
 from starpos.errors import FixError, InstrumentError
 from starpos.fix._adjustment import Adjustment
-from starpos.fix.adjustment import ISOTROPIC, fitted, share_free
 from starpos.fix.budget import StarErrors
-from starpos.fix.matched import MatchedStars, sound_matches
-from starpos.fix.outliers import expected_extra
 from starpos.fix.solver import ENOUGH_SOUND, Solver
-from starpos.frames.shutter import Shutter
-from starpos.frames.stars import Stars
+from starpos.fix.star_fit import ISOTROPIC, MatchedStars, expected_extra, fitted, share_free, sound_matches
+from starpos.frames.exposure import Shutter
+from starpos.frames.frame import Stars
 from starpos.identification import Identification
 from starpos.instrument.inclinometer import Tilt
-from starpos.instrument.tilts import Tilts
+from starpos.instrument.tilt_log import Tilts
+from starpos.rotation import half_turns
 
 # refraction is put on the stars, so nothing bends between them and the camera
 BENT_ALREADY = Refraction(0.0, 0.0)
@@ -185,3 +185,115 @@ def _seen(stars: MatchedStars, state: EarthState, shutter: Shutter, height: int,
     if shutter.readout_s:
         itrs = later(itrs, shutter.later_s(stars.xy[:, 1], height))
     return rotation.normalised(itrs + station_velocity(mark.enu[2]))
+
+
+# within a face the heading stays: a turntable or a foot that settles moves it by less than this
+SAME_FACE_RAD = np.radians(5.0)
+
+
+def faces_of(sightings: Sequence[ZenithSighting]) -> np.ndarray:
+    """Number (N,) of the face of each frame, from 0, of frames in order of time."""
+    headings = np.array([s.heading for s in sightings])
+    faces, first = np.zeros(len(headings), int), headings[0]
+    for k in range(1, len(headings)):
+        turned = abs(half_turns(headings[k] - first)) > SAME_FACE_RAD
+        faces[k] = faces[k - 1] + turned
+        first = headings[k] if turned else first
+    return faces
+
+
+def mean_headings(sightings: Sequence[ZenithSighting], faces: np.ndarray) -> np.ndarray:
+    """Azimuth (F,) in rad of the top of the frame in each face."""
+    towards = np.exp(1j * np.array([s.heading for s in sightings]))
+    return np.angle([towards[faces == k].sum() for k in range(faces.max() + 1)]) % (2 * np.pi)
+
+
+# factor by which the catalogue's errors may be smaller or larger than stated
+MAX_FACTOR = 5.0
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class StarPlaces:
+    """Corrections of S stars' places along the axes of ICRS, in units of their sigmas in the catalogue.
+
+    stars (S,): rows of the catalogue.  rows: for each frame, which of the S stars are its (N,).  correction (S, 3).
+    root (3 S, 3 S): lower triangular, of the weights that the corrections have.
+    factor: size of the catalogue's errors over what it states.
+    """
+
+    stars: np.ndarray
+    rows: tuple[np.ndarray, ...]
+    correction: np.ndarray
+    root: np.ndarray
+    factor: float
+
+    @classmethod
+    def of(cls, sightings: Sequence[ZenithSighting]) -> "StarPlaces":
+        """The corrections that all frames agree on best."""
+        # slow to import
+        from scipy.linalg import cho_solve, cholesky
+
+        names, inverse = np.unique(np.concatenate([s.stars for s in sightings]), return_inverse=True)
+        rows = tuple(np.split(inverse, np.cumsum([len(s.stars) for s in sightings])[:-1]))
+        number = len(names)
+        own, right = np.zeros((number, 3, 3)), np.zeros((number, 3))
+        # a frame's attitude and scale take up what its stars have in common
+        taken = np.zeros((len(sightings), 4, number, 3))
+        for k, (row, s) in enumerate(zip(rows, sightings, strict=True)):
+            taken[k][:, row] = s.star_common
+            own[row] += s.star_weight
+            right[row] += s.star_pull
+        common = taken.reshape(-1, 3 * number)
+        flat, pull = -common.T @ common, right.ravel()
+        blocks, each = flat.reshape(number, 3, number, 3), np.arange(number)
+        blocks[each, :, each] += own
+        factor = _factor(flat, pull)
+        root = cholesky(flat + np.eye(len(flat)) / factor**2, lower=True)
+        correction = cho_solve((root, True), pull).reshape(-1, 3)
+        return cls(stars=names, rows=rows, correction=correction, root=root, factor=factor)
+
+    def applied(self, sightings: Sequence[ZenithSighting]) -> list[ZenithSighting]:
+        """The sightings with the attitudes that the corrected places give."""
+        return [
+            replace(s, enu_to_camera=rotation.from_vector(-self._turn(k, s)) @ s.enu_to_camera)
+            for k, s in zip(self.rows, sightings, strict=True)
+        ]
+
+    def _turn(self, rows: np.ndarray, s: ZenithSighting) -> np.ndarray:
+        return np.einsum("inj,nj->i", s.by_star, self.correction[rows])
+
+    def columns(self, by_camera: np.ndarray, sightings: Sequence[ZenithSighting]) -> np.ndarray:
+        """Errors of 1 sigma (N, 2, 3 S) of the readings, by what remains unknown of the places.
+
+        by_camera (N, 2, 3): derivatives of the readings by a small rotation of the camera.
+        """
+        # slow to import
+        from scipy.linalg import solve_triangular
+
+        whole = np.zeros((len(sightings), 2, len(self.correction), 3))
+        for k, (rows, s) in enumerate(zip(self.rows, sightings, strict=True)):
+            whole[k][:, rows] = np.einsum("ai,inj->anj", by_camera[k], s.by_star)
+        flat = whole.reshape(2 * len(sightings), -1)
+        return solve_triangular(self.root, flat.T, lower=True).T.reshape(len(sightings), 2, -1)
+
+
+def _factor(weights: np.ndarray, pull: np.ndarray) -> float:
+    """The size of the catalogue's errors, over what it states, that makes the residuals likeliest.
+
+    weights (M, M), pull (M,): normal equations of the stars' displacements in units of their stated sigmas.
+    """
+    # slow to import
+    from scipy.linalg import cholesky, solve_triangular
+    from scipy.optimize import minimize_scalar
+
+    def cost(log_factor: float) -> float:
+        prior = np.exp(-2 * log_factor)
+        root = cholesky(weights + prior * np.eye(len(pull)), lower=True)
+        half = solve_triangular(root, pull, lower=True)
+        size = len(pull) * 2 * log_factor + 2 * float(np.log(np.diag(root)).sum())
+        # a log-normal of a factor of 2 about what is stated, for sessions of few stars
+        return size - float(half @ half) + (log_factor / np.log(2)) ** 2
+
+    most = float(np.log(MAX_FACTOR))
+    found = minimize_scalar(cost, bounds=(-most, most), method="bounded", options={"xatol": 0.02})
+    return float(np.exp(found.x))

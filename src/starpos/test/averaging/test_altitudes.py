@@ -10,7 +10,7 @@ from scipy.special import fdtri
 from starpos.averaging.altitudes import circle_of, f_quantile, place_of_circles
 from starpos.earth.orientation import earth_state
 from starpos.errors import FixError
-from starpos.fix.pointing import IDEAL
+from starpos.fix.fix import IDEAL
 from starpos.instrument.inclinometer import InclinometerErrors
 from starpos.units import ARCSEC
 from starpos_testing.skies.pointings import pointed_night, without_roll

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from starpos import rotation
-from starpos.averaging.average import Averager, average
-from starpos.averaging.claim import MAX_REMEMBERED
+from starpos.averaging.average import MAX_REMEMBERED, Averager, average
 from starpos.averaging.filter import UNIT, PlaceFilter, Plane
 from starpos.earth.ellipsoid import curvature_radii_m
 from starpos.earth.orientation import earth_state

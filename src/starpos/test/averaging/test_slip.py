@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from starpos import rotation
-from starpos.averaging.slip import slip_s
+from starpos.averaging.poses import slip_s
 from starpos.earth.orientation import ROTATION_RAD_S, earth_state
 from starpos.units import ARCSEC
 from starpos_testing.skies.fields import SkyField

@@ -14,12 +14,11 @@ import pytest
 
 from starpos import rotation
 from starpos.averaging.average import average
-from starpos.calibration.misalignment import calibrate_at
-from starpos.calibration.turning import turn
+from starpos.calibration.misalignment import calibrate_at, turn
 from starpos.fix.solver import Solver
 from starpos.instrument.inclinometer import InclinometerErrors, Tilt
 from starpos.instrument.instrument import Instrument
-from starpos.instrument.tilts import TiltsByTime
+from starpos.instrument.tilt_log import TiltsByTime
 from starpos.sky.site import Site, camera_to_enu
 from starpos.units import ARCSEC
 from starpos_testing.skies.pointings import PointedNight, pointing_of

@@ -7,13 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from starpos.calibration.camera import calibrate_camera
-from starpos.calibration.intrinsics import rms
+from starpos.calibration.camera import calibrate_camera, rms
 from starpos.detection import detect
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import CalibrationError, InstrumentError
+from starpos.frames.frame import SATURATED, Stars, no_stars
 from starpos.frames.reading import read_frame
-from starpos.frames.stars import SATURATED, Stars, no_stars
 from starpos.instrument.camera import Camera
 from starpos_testing.skies.lenses import (
     AIR,

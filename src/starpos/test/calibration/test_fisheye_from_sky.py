@@ -6,12 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from starpos.calibration.camera import calibrate_camera
+from starpos.calibration.camera import calibrate_camera, fit_camera, rms
 from starpos.calibration.camera_adjustment import parameters
-from starpos.calibration.intrinsics import fit_camera, rms
 from starpos.errors import CalibrationError
-from starpos.instrument.camera import Camera
-from starpos.instrument.lens import EQUIDISTANT
+from starpos.instrument.camera import EQUIDISTANT, Camera
 from starpos_testing.skies.lenses import AIR, VACUUM, night, sightings, values
 
 IDEAL = Camera.from_focal(2000, 2000, 600.0, EQUIDISTANT)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from starpos import rotation
-from starpos.calibration.fixed_camera import calibrate_fixed
+from starpos.calibration.misalignment import calibrate_fixed
 from starpos.errors import FixError, InstrumentError
 from starpos.fix.solution import Status
 from starpos.fix.solver import Solver

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from starpos import rotation
+from starpos.calibration.camera import check_sound, fewest_stars, fit_camera, rms
 from starpos.calibration.camera_adjustment import Sighting, parameters, unbent
-from starpos.calibration.intrinsics import check_sound, fewest_stars, fit_camera, rms
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import CalibrationError
 from starpos.instrument.camera import Camera

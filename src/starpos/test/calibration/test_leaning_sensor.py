@@ -13,16 +13,15 @@ import pytest
 
 from starpos import rotation
 from starpos.averaging.average import average
-from starpos.calibration.misalignment import calibrate_at
-from starpos.calibration.turning import turn
+from starpos.calibration.misalignment import calibrate_at, turn
 from starpos.earth.ellipsoid import curvature_radii_m
 from starpos.errors import FixError
 from starpos.fix.solution import Status
 from starpos.fix.solver import Solver
-from starpos.frames.stars import Stars
+from starpos.frames.frame import Stars
 from starpos.instrument.inclinometer import InclinometerErrors, Tilt
 from starpos.instrument.instrument import Calibration, Instrument
-from starpos.instrument.tilts import TiltsByTime
+from starpos.instrument.tilt_log import TiltsByTime
 from starpos.simulation.scene import Scene
 from starpos.sky.site import camera_to_enu
 from starpos.units import DAY_S

@@ -11,7 +11,7 @@ from starpos.calibration.misalignment import VALID_DAYS, calibrate_at
 from starpos.earth.ellipsoid import curvature_radii_m
 from starpos.errors import FixError
 from starpos.fix.solution import Status
-from starpos.frames.stars import no_stars
+from starpos.frames.frame import no_stars
 from starpos.instrument.inclinometer import EXACT
 from starpos.instrument.instrument import Calibration
 from starpos.units import DAY_S

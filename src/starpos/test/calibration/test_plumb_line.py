@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from starpos import rotation
-from starpos.calibration.plumb_line import hang, level
-from starpos.calibration.readings import KNOWN, Readings
+from starpos.calibration.plumb_line import KNOWN, Readings, hang, level
 from starpos.instrument.inclinometer import up_of
 from starpos.units import ARCSEC
 

@@ -7,7 +7,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from starpos.calibration import residual_map
-from starpos.calibration.intrinsics import fit_camera
+from starpos.calibration.camera import fit_camera
 from starpos.calibration.residual_map import MAX_ARROWS, draw_residuals, draw_rms
 from starpos_testing.skies.lenses import VACUUM, ideal, sightings
 

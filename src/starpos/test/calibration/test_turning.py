@@ -8,15 +8,15 @@ import pytest
 
 from starpos import rotation
 from starpos.averaging.average import average
-from starpos.calibration.turning import turn
+from starpos.calibration.misalignment import turn
 from starpos.earth.ellipsoid import curvature_radii_m
 from starpos.fix.solution import Status
 from starpos.fix.solver import Solver
-from starpos.frames.stars import no_stars
+from starpos.frames.frame import no_stars
 from starpos.instrument.inclinometer import Tilt, up_of
 from starpos.instrument.instrument import Calibration, Instrument
 from starpos.instrument.sensors import SCA100T_CALIBRATED
-from starpos.instrument.tilts import TiltsByTime
+from starpos.instrument.tilt_log import TiltsByTime
 from starpos.sky.site import camera_to_enu
 from starpos_testing.skies.scenes import FOCAL_PX, START, stars_of, tilt_of, wide_scene
 

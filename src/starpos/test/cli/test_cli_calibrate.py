@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from cli_calls import without_focal_length
 
-from starpos.frames.star_list import write_star_list
-from starpos.instrument import camera_file
+from starpos.frames.tables import write_star_list
+from starpos.instrument import instrument_file
 from starpos.instrument.instrument import Calibration
-from starpos.utc import utc_text
+from starpos.units import utc_text
 from starpos_testing.skies.lenses import FIELDS, night, random_camera, values
 
 AIR = ("--pressure-hpa", "880", "--temperature-c", "12")
@@ -63,7 +63,7 @@ def test_the_file_holds_the_camera_the_table_says_how_well(skies, run, tmp_path)
         tmp_path / "map.png",
     )  # fmt: skip
     assert (status, errors) == (0, [A3_TOO])
-    camera = camera_file.read(out)
+    camera = instrument_file.read_camera(out)
     first, *table, last = said.splitlines()
     assert first.startswith("4 frames, ")
     assert [line.split()[0] for line in table] == NAMES
@@ -87,7 +87,7 @@ def test_json_and_the_camera_in_an_instrument_file(skies, run, tmp_path):
     )  # fmt: skip
     assert (status, errors) == (0, [A3_TOO])
     answer = json.loads(said)
-    camera = camera_file.read(tmp_path / "camera.yaml")
+    camera = instrument_file.read_camera(tmp_path / "camera.yaml")
     found = [*(answer[k] for k in ("fx", "fy", "cx", "cy")), *answer["distortion"]]
     np.testing.assert_array_equal(found, values(camera))
     covariance = np.array(answer["covariance"])
@@ -122,7 +122,7 @@ def test_json_and_the_camera_in_an_instrument_file(skies, run, tmp_path):
         "calibrate", *frames(folder), "--tilt", folder / "tilt.csv", "--instrument", instrument, *AIR, "--camera",
         tmp_path / "again.yaml", "--json",
     )  # fmt: skip
-    again = values(camera_file.read(tmp_path / "again.yaml"))
+    again = values(instrument_file.read_camera(tmp_path / "again.yaml"))
     assert (np.abs(again - found) < 0.3 * np.sqrt(np.diag(covariance))).all()
 
 

@@ -13,8 +13,7 @@ from archives import frames, run, solve
 import starpos
 from starpos.errors import FrameError
 from starpos.parallel import cluster as cluster_module
-from starpos.parallel.cluster import Cluster, ClusterError
-from starpos.parallel.same import same_here
+from starpos.parallel.cluster import Cluster, ClusterError, same_here
 from starpos_testing.lacking import needs
 
 # a scheduler and its workers start as processes of their own, each with the whole of Python's science

@@ -15,12 +15,11 @@ from starpos.errors import InstrumentError
 from starpos.frames.reading import read_frame
 from starpos.instrument.camera import Camera
 from starpos.instrument.tilt_table import read_tilt_csv
-from starpos.session.diagnosis import Level
+from starpos.session.driver import Level
 from starpos.session.parameter_file import settings_of
 from starpos.session.replay import Replay
 from starpos.sky.site import Site
-from starpos.units import ARCSEC
-from starpos.utc import utc_text
+from starpos.units import ARCSEC, utc_text
 
 LATITUDE, LONGITUDE, HEIGHT_M = 61.2, 24.5, 900.0
 # large, so that refraction towards the plumb line, not the ellipsoid's normal, is 7 mas of it

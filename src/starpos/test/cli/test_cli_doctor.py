@@ -10,7 +10,7 @@ from starpos.cli import doctor
 from starpos.earth import orientation
 from starpos.session import system_clock
 from starpos.session.system_clock import SystemClock
-from starpos.utc import unix_of
+from starpos.units import unix_of
 
 
 @pytest.fixture

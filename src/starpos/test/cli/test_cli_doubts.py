@@ -11,7 +11,7 @@ from astropy.io import fits
 from cli_calls import AIR, KNOWN, PLACE, WIDE, objects, solve
 
 from starpos import open_night
-from starpos.fix.readable import length_text
+from starpos.fix.fix import length_text
 from starpos.frames.reading import read_frame
 from starpos_testing.command_line import run
 

@@ -7,7 +7,7 @@ import pytest
 from cli_calls import AIR, PLACE, objects, without_focal_length
 
 from starpos.cli import main
-from starpos.instrument import camera_file
+from starpos.instrument import instrument_file
 from starpos_testing.command_line import A3
 
 # 500 px.
@@ -63,7 +63,7 @@ def test_its_camera_is_found_and_serves(skies, run, tmp_path):
         abs(k) < 5 * answer["sigma"][name]
         for name, k in zip(("k1", "k2", "k3", "k4"), answer["distortion"], strict=True)
     )
-    assert camera_file.read(camera).model == "equidistant"
+    assert instrument_file.read_camera(camera).model == "equidistant"
     (tmp_path / "mine.yaml").write_text("starpos_instrument: 1\ncamera: {calibration: camera.yaml}\n")
     status, out, _ = run("identify", lists[0], "--instrument", tmp_path / "mine.yaml", "--json")
     assert status == 0 and json.loads(out)["status"] == "ok"

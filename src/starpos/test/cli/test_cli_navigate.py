@@ -12,12 +12,12 @@ from cli_calls import AIR, WIDE, objects
 from starpos.cli.navigate import _mount_stddev
 from starpos.earth.orientation import earth_state
 from starpos.earth.refraction import Atmosphere
-from starpos.frames.star_list import write_star_list
-from starpos.frames.stars import Stars
-from starpos.instrument.axis import AxisDoubt
+from starpos.frames.frame import Stars
+from starpos.frames.tables import write_star_list
 from starpos.instrument.camera import Camera
+from starpos.instrument.instrument import AxisDoubt
 from starpos.sky.site import Site
-from starpos.utc import utc_text
+from starpos.units import utc_text
 from starpos_testing.command_line import run
 from starpos_testing.voyages import INDUSTRIAL, made
 

@@ -16,9 +16,9 @@ from cli_calls import KNOWN, PLACE, objects, solve
 from starpos.earth import orientation
 from starpos.errors import TimeError
 from starpos.fix.solution import Solution, Status
-from starpos.frames.stars import no_stars
+from starpos.frames.frame import no_stars
 from starpos.session import reports
-from starpos.utc import unix_of
+from starpos.units import unix_of
 
 TABLE = Path(__file__).parent / "data" / "finals2000A-2024-02.gz"
 DAY_S = 86400

@@ -10,7 +10,7 @@ import pytest
 from cli_calls import WIDE
 
 from starpos import cli
-from starpos.cli import console, jobs, parser_for
+from starpos.cli import console, inputs, parser_for
 from starpos.cli.commands import COMMANDS
 from starpos_testing.command_line import run
 from starpos_testing.lacking import require
@@ -142,7 +142,7 @@ def test_progress_is_told_where_no_terminal_is(capsys, monkeypatch):
 
 def test_frames_of_a_turn_whose_lines_wait_are_counted_on_standard_error(capsys, monkeypatch):
     monkeypatch.setattr(console, "LINE_EVERY_S", -1.0)
-    assert list(jobs.watched("ab", 2, silent=False)) == ["a", "b"]
+    assert list(inputs.watched("ab", 2, silent=False)) == ["a", "b"]
     assert capsys.readouterr().err == "frame 1 of 2: 50 % done\nframe 2 of 2: 100 % done\n"
 
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from starpos.cli import main
+from starpos.frames.exposure import Shutter
 from starpos.frames.reading import read_frame
-from starpos.frames.shutter import Shutter
 from starpos.instrument import instrument_file
 from starpos.instrument.instrument import Instrument
 from starpos_testing.command_line import A3

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from cli_calls import WIDE, without_focal_length
 
-from starpos.frames.star_list import write_star_list
-from starpos.instrument import camera_file, instrument_file
-from starpos.utc import utc_text
+from starpos.frames.tables import write_star_list
+from starpos.instrument import instrument_file
+from starpos.units import utc_text
 from starpos_testing.command_line import SENSOR
 from starpos_testing.skies.sites import TRUE_A3_DEG, a3_error, shots
 
@@ -115,7 +115,7 @@ def test_json_is_an_object_a_line(known, elsewhere, run, tmp_path):
     assert site["instrument"] == str(b)
     i = instrument_file.read(b)
     # The camera that was found, and A3 with it.
-    assert i.camera == camera_file.read(a)
+    assert i.camera == instrument_file.read_camera(a)
     assert i.focal_px == i.camera.fx == camera["fx"]
     assert site["misalignment_deg"] == pytest.approx(i.calibration.misalignment_deg)
     np.testing.assert_allclose(site["covariance_arcsec2"], i.calibration.covariance_arcsec2)

@@ -6,7 +6,7 @@ import pytest
 
 from starpos.detection._beside import dots, lonely, rims
 from starpos.detection._stamps import around
-from starpos.normal import SIGMA_PER_MAD
+from starpos.units import SIGMA_PER_MAD
 
 
 @pytest.fixture(params=[(1, np.uint8), (1, np.uint16), (4, np.uint8), (4, np.uint16)], ids=str)

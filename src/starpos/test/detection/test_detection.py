@@ -5,8 +5,7 @@ from scipy import ndimage
 
 from starpos.detection import DetectionSettings, detect
 from starpos.errors import FrameError
-from starpos.frames.frame import Frame
-from starpos.frames.stars import BLENDED, EDGE, ELONGATED, SATURATED
+from starpos.frames.frame import BLENDED, EDGE, ELONGATED, SATURATED, Frame
 from starpos_testing.skies.rendered import BIAS, bound, coloured, field, grid, match, noisy
 
 # In px: half a second of the sky.

@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 
 from starpos.detection import DetectionSettings, detect
-from starpos.frames.frame import Frame
-from starpos.frames.stars import SATURATED
+from starpos.frames.frame import SATURATED, Frame
 from starpos_testing.skies.rendered import grid, match
 
 SIZE = (480, 640)

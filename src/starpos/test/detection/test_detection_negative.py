@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from starpos.detection import detect
-from starpos.detection.negative import detect_dark_too, negative_of
+from starpos.detection.second_look import detect_dark_too, negative_of
+from starpos.fix.searching import look_at
 from starpos.frames.frame import Frame
 from starpos.night.reading import stars_of
-from starpos.night.searching import look_at
 from starpos_testing.skies.rendered import field, grid, noisy
 
 SIZE = (400, 600)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from starpos.detection import detect
-from starpos.detection.otherwise import WAYS, otherwise
+from starpos.detection.second_look import WAYS, otherwise
 from starpos.frames.frame import Frame
 from starpos_testing.skies.rendered import field, grid
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from starpos.detection import detect
-from starpos.detection.plane import plane_of
+from starpos.detection.background import plane_of
 from starpos.frames.frame import PATTERNS, Frame
 from starpos_testing.skies.rendered import field, grid, match
 

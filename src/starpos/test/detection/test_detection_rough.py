@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from starpos.detection import detect
-from starpos.detection.shape import frame_shape
+from starpos.detection.stamps import frame_shape
 from starpos.frames.frame import Frame
 from starpos_testing.skies.rendered import field, grid, noisy
 

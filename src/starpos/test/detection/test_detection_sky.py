@@ -10,8 +10,7 @@ from scipy import ndimage
 from starpos.detection import detect
 from starpos.detection.background import measure_background
 from starpos.detection.finding import find_peaks
-from starpos.frames.frame import Frame, to_unsigned
-from starpos.frames.stars import BLENDED, SATURATED
+from starpos.frames.frame import BLENDED, SATURATED, Frame, to_unsigned
 from starpos_testing.skies.rendered import bound, coloured, errors, field, grid, match, noisy, rms
 
 SIZE = (600, 900)

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from starpos.detection import detect
-from starpos.detection.streak import CELL, FEWEST, GAP, SHORTEST, _may_be_a_line, _through
-from starpos.frames.frame import Frame
-from starpos.frames.stars import ELONGATED
+from starpos.detection.finding import CELL, FEWEST, GAP, SHORTEST, _may_be_a_line, _through
+from starpos.frames.frame import ELONGATED, Frame
 from starpos_testing.skies.rendered import bound, field, grid, match, noisy
 
 SIZE = (700, 900)

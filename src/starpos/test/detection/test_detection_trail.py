@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from starpos.detection import detect
-from starpos.detection.trailed import trailed
+from starpos.detection.psf import trailed
 from starpos.errors import FrameError
+from starpos.frames.exposure import Trail
 from starpos.frames.frame import Frame
-from starpos.frames.trail import Trail
 from starpos_testing.skies.rendered import bound, errors, field, grid, match, noisy, rms, star
 
 FWHM, STARS = 2.4, 12

@@ -8,7 +8,7 @@ from scipy import ndimage
 from starpos.detection._background import between, sampled
 from starpos.detection._stamps import around, light_around
 from starpos.detection.background import CLIP
-from starpos.normal import SIGMA_PER_MAD
+from starpos.units import SIGMA_PER_MAD
 
 
 def plain_cell(values):

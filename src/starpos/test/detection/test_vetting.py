@@ -6,7 +6,7 @@ import pytest
 from scipy import ndimage
 
 from starpos.detection._vetting import level, looks, one_pixel, own_light, without_spikes
-from starpos.normal import SIGMA_PER_MAD
+from starpos.units import SIGMA_PER_MAD
 
 N, SIZE = 12, 11
 

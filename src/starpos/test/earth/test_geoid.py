@@ -10,7 +10,7 @@ import pytest
 
 from starpos.earth import geoid
 from starpos.earth.ellipsoid import curvature_radii_m
-from starpos.earth.geoid_file import find, read_grid
+from starpos.earth.geoid import find, read_grid
 from starpos.earth.vertical import UNKNOWN_STDDEV_ARCSEC, Deflection, geodetic
 from starpos.errors import GeoidError
 from starpos.units import ARCSEC

@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from starpos.earth import tides
+from starpos.earth import gravity as tides
 from starpos.earth.ellipsoid import enu_axes
 from starpos.earth.gravity import gravity, itrs_place
 

@@ -14,14 +14,13 @@ from starpos.earth.orientation import EarthOrientation, earth_orientation, earth
 from starpos.earth.refraction import Atmosphere
 from starpos.earth.vertical import Deflection
 from starpos.errors import PlaceError
-from starpos.fix.attitude_at_place import attitude_at_place
-from starpos.fix.matched import MatchedStars
-from starpos.fix.placed import placed
+from starpos.fix.heading import attitude_at_place
+from starpos.fix.solver import placed
+from starpos.fix.star_fit import MatchedStars
 from starpos.instrument.camera import Camera
 from starpos.instrument.instrument import TOP_OF_FRAME, Instrument
 from starpos.sky.site import Site, camera_to_enu
-from starpos.units import ARCSEC
-from starpos.utc import UNIX_EPOCH_JD, unix_of
+from starpos.units import ARCSEC, UNIX_EPOCH_JD, unix_of
 
 EXACT = Deflection(0.0, 0.0, 0.0)
 CAMERA = Camera.from_focal(1000, 700, 4636.0)

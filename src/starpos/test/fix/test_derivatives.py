@@ -11,11 +11,17 @@ from starpos.earth.orientation import station_velocity
 from starpos.earth.refraction import MIN_COS_ZENITH, Atmosphere
 from starpos.fix._adjustment import gain_of, spread
 from starpos.fix._scatter import extra_variance
-from starpos.fix.adjustment import adjustment_of, fitted
-from starpos.fix.outliers import GOOD_EXTRA, MIN_EXTRA, distance2, expected_extra, judged
-from starpos.instrument.camera import Camera
-from starpos.instrument.lens import EQUIDISTANT
-from starpos.normal import MEDIAN_OF_CHI2
+from starpos.fix.star_fit import (
+    GOOD_EXTRA,
+    MIN_EXTRA,
+    adjustment_of,
+    distance2,
+    expected_extra,
+    fitted,
+    judged,
+)
+from starpos.instrument.camera import EQUIDISTANT, Camera
+from starpos.units import MEDIAN_OF_CHI2
 
 LENSES = {
     "pinhole": Camera.from_focal(1400, 1000, 1800.0),

@@ -8,13 +8,12 @@ import pytest
 from solved_night import off_by_sigma
 
 from starpos.errors import InstrumentError
-from starpos.fix.other_focal import focal_that_fits
 from starpos.fix.solution import Status
-from starpos.identification import wide
-from starpos.identification.triangle_cache import cached
-from starpos.instrument.camera import Camera
+from starpos.fix.solver import focal_that_fits
+from starpos.identification import fisheye as wide
+from starpos.identification.triangles import cached_triangles
+from starpos.instrument.camera import EQUIDISTANT, Camera
 from starpos.instrument.inclinometer import Tilt
-from starpos.instrument.lens import EQUIDISTANT
 from starpos.navigation.sightings import sighting_of
 from starpos.simulation.scene import Optics
 from starpos_testing.skies.scenes import (
@@ -208,4 +207,6 @@ def test_parts_look_at_the_frame_where_they_say(catalogue):
     for part in made:
         np.testing.assert_allclose(part.directions @ part.turn, directions[part.row], atol=1e-12)
         assert len(part.row) > 50
-    assert cached(catalogue, wide.field_rad(camera)).longest_allowed[0] == pytest.approx(1.37, rel=0.06)
+    assert cached_triangles(catalogue, wide.field_rad(camera)).longest_allowed[0] == pytest.approx(
+        1.37, rel=0.06
+    )

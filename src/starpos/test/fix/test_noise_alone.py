@@ -7,7 +7,7 @@ import pytest
 
 from starpos.detection import detect
 from starpos.fix.blind import BlindSolver
-from starpos.fix.noise_alone import why_noise
+from starpos.fix.checks import why_noise
 from starpos.fix.solution import Status
 from starpos.frames.frame import Frame
 

@@ -7,13 +7,12 @@ import numpy as np
 import pytest
 
 from starpos.averaging.average import average
-from starpos.calibration.misalignment import calibrate_at
-from starpos.calibration.turning import turn
+from starpos.calibration.misalignment import calibrate_at, turn
 from starpos.fix.solution import Status
 from starpos.fix.solver import Solver
-from starpos.frames.pointings import Pointing
+from starpos.frames.tables import Pointing
 from starpos.instrument.camera import Camera
-from starpos.instrument.tilts import NO_TILTS
+from starpos.instrument.tilt_log import NO_TILTS
 from starpos.rotation import half_turn
 from starpos.units import ARCSEC
 from starpos_testing.skies.pointings import TRUE_A3, pointed_night, without_roll

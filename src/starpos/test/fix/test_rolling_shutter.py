@@ -9,7 +9,7 @@ import pytest
 from starpos.averaging.average import average
 from starpos.earth.ellipsoid import curvature_radii_m
 from starpos.fix.solver import Solver
-from starpos.frames.shutter import GLOBAL, UNKNOWN, Shutter
+from starpos.frames.exposure import GLOBAL_SHUTTER, UNKNOWN_SHUTTER, Shutter
 from starpos.instrument.inclinometer import EXACT, Tilt
 from starpos.instrument.instrument import Calibration
 from starpos.simulation.scene import detected, expose, scene_of
@@ -84,7 +84,8 @@ def test_an_unknown_readout_is_in_the_claim(catalogue, readout_s):
 def test_a_readout_from_the_wrong_end_is_seen(catalogue):
     """The place is out of its claim, and the stars fit worse, twice as much as without any readout."""
     right, ignored, wrong = (
-        together(catalogue, READOUT_S, s) for s in (Shutter(READOUT_S, 0.0), GLOBAL, Shutter(-READOUT_S, 0.0))
+        together(catalogue, READOUT_S, s)
+        for s in (Shutter(READOUT_S, 0.0), GLOBAL_SHUTTER, Shutter(-READOUT_S, 0.0))
     )
     assert ignored[2] > 20
     assert wrong[2] > 20
@@ -95,7 +96,7 @@ def test_a_readout_from_the_wrong_end_is_seen(catalogue):
 def test_what_is_not_known_of_the_shutter_does_not_average(catalogue):
     """All frames of a camera share it."""
     scene, stars, tilt = night(catalogue, 0.0)
-    fix = fix_of(catalogue, scene, stars, tilt, UNKNOWN)
+    fix = fix_of(catalogue, scene, stars, tilt, UNKNOWN_SHUTTER)
     (term,) = (t for t in fix.terms if t.name == "shutter")
     assert term.common
     many = average([replace(fix, utc_unix_s=fix.utc_unix_s + k) for k in range(25)])
@@ -106,7 +107,7 @@ def test_what_the_instrument_states_counts_before_what_a_frame_states(catalogue)
     scene, stars, tilt = night(catalogue, READOUT_S)
     known = replace(scene.instrument, shutter=Shutter(READOUT_S, 0.0))
     right = fix_of(catalogue, scene, stars, tilt, Shutter(READOUT_S, 0.0))
-    assert fix_of(catalogue, scene, stars, tilt, GLOBAL, known).longitude == right.longitude
+    assert fix_of(catalogue, scene, stars, tilt, GLOBAL_SHUTTER, known).longitude == right.longitude
 
 
 def test_what_all_rows_are_late_by_moves_the_place_with_the_earths_rotation(catalogue):

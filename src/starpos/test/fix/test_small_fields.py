@@ -4,16 +4,15 @@
 import numpy as np
 import pytest
 
-from starpos.fix.other_focal import focal_that_fits
 from starpos.fix.solution import Status
-from starpos.fix.solver import Solver
-from starpos.frames.stars import Stars
+from starpos.fix.solver import Solver, focal_that_fits
+from starpos.frames.frame import Stars
 from starpos.instrument.camera import Camera
 from starpos.instrument.instrument import Instrument
 from starpos.rotation import normalised
 from starpos.sky import deeper
 from starpos.sky.catalogue import pack
-from starpos.sky.depth import Depth
+from starpos.sky.deeper import Depth
 from starpos_testing.skies.tycho2_files import write_sky
 
 pytestmark = pytest.mark.montecarlo

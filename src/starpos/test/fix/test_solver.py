@@ -15,7 +15,7 @@ from starpos.earth.orientation import earth_state, station_velocity
 from starpos.errors import TiltError
 from starpos.fix.solution import Status
 from starpos.fix.solver import Solver
-from starpos.frames.stars import SATURATED, Stars, no_stars
+from starpos.frames.frame import SATURATED, Stars, no_stars
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import EXACT, Tilt
 from starpos.instrument.instrument import Calibration, Instrument

@@ -11,8 +11,7 @@ from starpos.averaging.average import average
 from starpos.earth.orientation import earth_state
 from starpos.fix.solution import Status
 from starpos.night.together import Solved, extrapolated
-from starpos.units import ARCSEC
-from starpos.utc import utc_text
+from starpos.units import ARCSEC, utc_text
 from starpos_testing.skies.scenes import EXPOSURE, START, solver_of, stars_of, tilt_of, wide_scene
 
 

@@ -3,10 +3,10 @@
 
 import numpy as np
 
+from starpos.fix.checks import why_unidentified
 from starpos.fix.solution import Status
 from starpos.fix.solver import Solver
-from starpos.fix.unidentified import why_unidentified
-from starpos.frames.stars import SATURATED, Stars, no_stars
+from starpos.frames.frame import SATURATED, Stars, no_stars
 from starpos.instrument.camera import Camera
 from starpos.instrument.instrument import Instrument
 from starpos.sky import deeper

@@ -9,8 +9,7 @@ import pytest
 
 from starpos.frames import annotate as module
 from starpos.frames.annotate import DETECTED, FLAGGED, IDENTIFIED, Identified, annotate, shrink
-from starpos.frames.frame import Frame
-from starpos.frames.stars import SATURATED, Stars, no_stars
+from starpos.frames.frame import SATURATED, Frame, Stars, no_stars
 
 SIZE = (641, 483)
 

@@ -8,8 +8,8 @@ import pytest
 
 from starpos.errors import FrameError
 from starpos.frames.driver_stamp import KINDS, DriverStamp
+from starpos.frames.exposure import Shutter
 from starpos.frames.frame import Frame
-from starpos.frames.shutter import Shutter
 
 STAMP_S = 1793642400.25
 FRAME = Frame(np.zeros((4, 5), np.uint16), mid_unix_s=STAMP_S)

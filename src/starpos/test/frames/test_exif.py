@@ -13,9 +13,9 @@ import pytest
 
 from starpos.errors import FrameError, TimeError
 from starpos.frames.exif import CameraClock
+from starpos.frames.exposure import UNKNOWN_LATENCY_S
 from starpos.frames.frame import Frame
 from starpos.frames.reading import decode_frame, read_frame, why_no_time
-from starpos.frames.shutter import UNKNOWN_LATENCY_S
 from starpos_testing.lacking import needs
 from starpos_testing.skies import raws
 

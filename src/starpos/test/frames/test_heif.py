@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from starpos.errors import FrameError
-from starpos.frames import files as frame_files
+from starpos.frames import frame as frame_files
 from starpos.frames.exif import CameraClock
 from starpos.frames.frame import Frame
 from starpos.frames.reading import read_frame

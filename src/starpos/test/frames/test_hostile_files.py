@@ -12,8 +12,8 @@ import pytest
 from astropy.io import fits
 
 from starpos.errors import FrameError
-from starpos.frames import files as frame_files
 from starpos.frames import fits as frames_fits
+from starpos.frames import frame as frame_files
 from starpos.frames.frame import Frame
 from starpos.frames.reading import read_frame
 

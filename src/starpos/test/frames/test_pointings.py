@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from starpos.errors import FrameError
-from starpos.frames.pointings import MAX_CSV_BYTES, read_pointings
+from starpos.frames.tables import MAX_CSV_BYTES, read_pointings
 from starpos.units import ARCSEC
 
 FULL = "utc_unix_s,ra_deg,dec_deg,roll_deg,sigma_arcsec,sigma_roll_arcsec\n"

@@ -13,8 +13,8 @@ import pytest
 from astropy.io import fits
 
 from starpos.frames.exif import CameraClock
+from starpos.frames.exposure import UNKNOWN_LATENCY_S
 from starpos.frames.reading import read_frame, why_no_time
-from starpos.frames.shutter import UNKNOWN_LATENCY_S
 from starpos_testing.lacking import needs
 from starpos_testing.skies import raws
 

@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from starpos.errors import FrameError
-from starpos.frames.stars import EDGE, SATURATED, Stars, no_stars
+from starpos.frames.frame import EDGE, SATURATED, Stars, no_stars
 
 GOOD = {
     "x": [1.5, 20.25],

@@ -7,7 +7,7 @@ from datetime import datetime, timezone
 import numpy as np
 import pytest
 
-from starpos.frames.shutter import UNKNOWN_LATENCY_S
+from starpos.frames.exposure import UNKNOWN_LATENCY_S
 from starpos.frames.times import times
 
 START_S = datetime(2026, 11, 2, 18, tzinfo=timezone.utc).timestamp()

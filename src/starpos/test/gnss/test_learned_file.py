@@ -8,7 +8,7 @@ import pytest
 
 from starpos.earth.vertical import Deflection
 from starpos.errors import GnssError
-from starpos.gnss import learned_file
+from starpos.gnss import states
 from starpos.gnss.watch import GnssWatch
 from starpos_testing.gnss_drives import GnssDrive
 
@@ -26,12 +26,12 @@ def learned():
 
 @pytest.fixture
 def saved(learned, tmp_path):
-    learned_file.save(tmp_path / "learned.json", learned)
+    states.save_learned(tmp_path / "learned.json", learned)
     return tmp_path / "learned.json"
 
 
 def test_it_is_the_same_after_a_restart(learned, saved):
-    again = learned_file.read_if_there(saved)
+    again = states.read_learned(saved)
     for name in ("a3", "state", "covariance", "calibrated_up"):
         assert np.array_equal(getattr(again, name), getattr(learned, name))
     for name in ("axes", "utc_unix_s", "place", "frames", "poses", "since_unix_s", "temperature_c"):
@@ -39,7 +39,7 @@ def test_it_is_the_same_after_a_restart(learned, saved):
 
 
 def test_without_a_file_nothing_is_known(tmp_path):
-    assert learned_file.read_if_there(tmp_path / "none.json") is None
+    assert states.read_learned(tmp_path / "none.json") is None
 
 
 @pytest.mark.parametrize(
@@ -57,11 +57,11 @@ def test_a_file_that_is_broken_says_what_is_wrong_and_what_to_do(saved, key, val
     content = json.loads(saved.read_text()) | {key: value}
     saved.write_text(json.dumps(content))
     with pytest.raises(GnssError, match=said) as error:
-        learned_file.read_if_there(saved)
+        states.read_learned(saved)
     assert "delete it" in str(error.value)
 
 
 def test_a_place_that_cannot_be_written_is_an_error_of_one_sentence(learned, tmp_path):
     (tmp_path / "folder").mkdir()
     with pytest.raises(GnssError, match="cannot be written"):
-        learned_file.save(tmp_path / "folder", learned)
+        states.save_learned(tmp_path / "folder", learned)

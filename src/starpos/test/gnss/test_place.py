@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from starpos.errors import GnssError
-from starpos.gnss.place import message_to_gnss
+from starpos.gnss.receiver import message_to_gnss
 
 SOUND = {
     "status": 0,

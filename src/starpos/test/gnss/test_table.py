@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from starpos.errors import GnssError
-from starpos.gnss.table import COLUMNS, read_gnss_csv
+from starpos.gnss.receiver import COLUMNS, read_gnss_csv
 
 HEAD = ",".join(COLUMNS)
 START_S = 1.7e9

@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 from starpos.earth.vertical import Deflection
-from starpos.gnss.lacking import what_would_tell_more
-from starpos.gnss.place import GnssPlace
-from starpos.gnss.sighting import place_of_stars
+from starpos.gnss.filter import place_of_stars, what_would_tell_more
+from starpos.gnss.receiver import GnssPlace
 from starpos.gnss.watch import GnssStatus, GnssWatch
 from starpos.instrument import sensors
 from starpos_testing.gnss_drives import GnssDrive

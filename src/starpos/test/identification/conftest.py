@@ -2,10 +2,10 @@
 import pytest
 from crowds import CAMERA
 
-from starpos.identification import Sky, triangle_cache
+from starpos.identification import Sky, triangles
 
 
 @pytest.fixture(scope="module")
 def sky(catalogue):
     """The sky of the field of `crowds`."""
-    return Sky(catalogue, triangle_cache.cached(catalogue, CAMERA.half_diagonal_rad))
+    return Sky(catalogue, triangles.cached_triangles(catalogue, CAMERA.half_diagonal_rad))

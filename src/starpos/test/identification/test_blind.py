@@ -13,11 +13,11 @@ from starpos.detection import detect
 from starpos.fix.blind import BlindSolver
 from starpos.fix.solution import Status
 from starpos.fix.solver import Solver
+from starpos.frames.frame import Stars
 from starpos.frames.reading import read_frame
-from starpos.frames.stars import Stars
-from starpos.identification import Sky, blind, quad_cache, quads
+from starpos.identification import Sky, blind, quads
 from starpos.identification.pose import stars_at
-from starpos.identification.quad_poses import Matches
+from starpos.identification.quads import Matches
 from starpos.identification.triangles import no_triangles
 from starpos.instrument.camera import Camera
 from starpos.instrument.instrument import Instrument
@@ -160,7 +160,7 @@ def test_at_any_scale_the_quads_of_a_frame_are_those_of_the_sky(catalogue, rng):
     """Every quad of the sky that a frame can hold is found again, whatever the focal length of that frame."""
     sky, table, half_px = (
         Sky(catalogue, no_triangles()),
-        quad_cache.cached(catalogue),
+        quads.cached_quads(catalogue),
         np.hypot(WIDTH, HEIGHT) / 2,
     )
     span = [half_px / np.tan(np.radians(d / 2)) for d in (blind.LARGEST_DEG, blind.SMALLEST_DEG)]
@@ -221,14 +221,14 @@ def test_a_shape_is_that_of_the_quad_turned_scaled_and_mirrored(rng):
 def test_a_damaged_cache_is_built_again(catalogue, tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setattr(quads, "LEVELS", ((19.4, 6), (29.0, 6)))
-    monkeypatch.setattr(quad_cache, "_in_use", {})
+    monkeypatch.setattr(quads, "_in_use", {})
     # a copy, because the file below it is damaged
-    first = quad_cache.cached(catalogue).shape.copy()
-    assert quad_cache.is_built(catalogue) and len(first) > 100
+    first = quads.cached_quads(catalogue).shape.copy()
+    assert quads.is_built(catalogue) and len(first) > 100
     (folder,) = (tmp_path / "starpos").glob("quads-*")
     (folder / "shape.npy").write_bytes(b"no")
-    quad_cache._in_use.clear()
-    assert np.array_equal(quad_cache.cached(catalogue).shape, first)
+    quads._in_use.clear()
+    assert np.array_equal(quads.cached_quads(catalogue).shape, first)
     assert (folder / "shape.npy").stat().st_size > 100
 
 

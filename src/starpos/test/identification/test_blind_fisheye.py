@@ -9,8 +9,8 @@ import pytest
 from starpos.detection import detect
 from starpos.fix.blind import BlindSolver
 from starpos.fix.solution import Status
-from starpos.identification.blind_fisheye import disc_radius_px
-from starpos.instrument.lens import EQUIDISTANT
+from starpos.identification.blind import disc_radius_px
+from starpos.instrument.camera import EQUIDISTANT
 from starpos_testing.skies.all_sky import LENSES, AllSky
 
 # what stands in the way, and what is no star
@@ -126,7 +126,7 @@ def test_a_frame_whose_lens_is_called_a_fisheye_is_searched_as_one_first(catalog
 
 
 def scattered(x, y):
-    from starpos.frames.stars import Stars
+    from starpos.frames.frame import Stars
 
     n = len(x)
     return Stars(

@@ -6,7 +6,8 @@ import pytest
 from test_identification import seen, sky_for
 
 from starpos import rotation
-from starpos.identification import PlumbPrior, PointingPrior, full, identify, search
+from starpos.identification import PlumbPrior, PointingPrior, identify, search
+from starpos.identification import evidence as full
 from starpos.identification._poses import log_ratio
 from starpos.identification.evidence import CHANCES, DOUBLE_PX, LOG_SHARES, WIDTH, Prior, anywhere
 from starpos.identification.pose import Pose, directions, stars_at

@@ -9,9 +9,9 @@ from crowds import CAMERA, SIGMA_PX, stars_on, under
 
 from starpos.fix.solution import TWO_SKIES, UNEXPLAINED, Status
 from starpos.fix.solver import Solver
-from starpos.frames.stars import Stars
+from starpos.frames.frame import Stars
 from starpos.identification import identify
-from starpos.identification.explained import Explained, explained_by
+from starpos.identification.evidence import Explained, explained_by
 from starpos.identification.pose import stars_at
 from starpos.instrument.instrument import Instrument
 from starpos_testing.skies.scenes import random_attitude, solver_of, stars_of, tilt_of, wide_scene
@@ -55,7 +55,7 @@ def test_an_answer_that_leaves_the_frame_unexplained_has_a_warning_and_gives_no_
 ):
     scene = wide_scene()
     once, tilt = stars_of(scene, catalogue, rng), tilt_of(scene, rng)
-    monkeypatch.setattr("starpos.fix.identified.explained_by", lambda *_: Explained(10, 50, 4, 10))
+    monkeypatch.setattr("starpos.fix.solution.explained_by", lambda *_: Explained(10, 50, 4, 10))
     s = solver_of(scene, catalogue).solve(once, tilt)
     assert s.status is Status.POOR_FIT and s.warnings == (UNEXPLAINED,) and s.fix is None
     assert "only 10 of its 50 brightest detections" in s.message

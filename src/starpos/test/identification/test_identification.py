@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from starpos.errors import InstrumentError
-from starpos.identification import Sky, identify, identify_directions, search, triangle_cache
+from starpos.identification import Sky, identify, identify_directions, search, triangles
 from starpos.instrument.camera import Camera
 from starpos_testing.skies.scenes import FOCAL_PX, SIZE, random_attitude, random_stars
 
@@ -19,7 +19,7 @@ FIELDS = {
 
 
 def sky_for(catalogue, camera, **more):
-    return Sky(catalogue, triangle_cache.cached(catalogue, camera.half_diagonal_rad), **more)
+    return Sky(catalogue, triangles.cached_triangles(catalogue, camera.half_diagonal_rad), **more)
 
 
 def seen(sky, camera, attitude, limit_mag, rng, sigma=0.05, missing=0.0):

@@ -6,10 +6,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from starpos.fix.seen import as_seen, directions_of
-from starpos.frames.stars import Stars
+from starpos.fix.solver import as_seen, directions_of
+from starpos.frames.frame import Stars
 from starpos.identification import Sky
-from starpos.identification.full import EDGE_PX, OnFrame
+from starpos.identification.evidence import EDGE_PX, OnFrame
 from starpos.identification.pose import Pose, stars_at
 from starpos.identification.search import field_of
 from starpos.identification.triangles import no_triangles

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from starpos.detection import detect
-from starpos.detection.negative import detect_dark_too, negative_of
+from starpos.detection.second_look import detect_dark_too, negative_of
 from starpos.fix.solution import Status
 from starpos.fix.solver import Solver
 from starpos.frames.reading import read_frame

@@ -8,7 +8,7 @@ from starpos.detection import detect
 from starpos.detection.second_look import SecondLook
 from starpos.fix.solver import Solver
 from starpos.frames.frame import Frame
-from starpos.identification import second_look
+from starpos.identification import search
 from starpos.instrument.camera import Camera
 from starpos.instrument.instrument import Instrument
 from starpos_testing.skies.rendered import field, noisy
@@ -85,16 +85,16 @@ def test_a_frame_that_is_identified_is_not_looked_at(solver, catalogue, rng):
 @pytest.mark.parametrize("stars", [1, 10, 100])
 def test_its_mean_is_at_most_one_without_stars(stars, rng):
     expected = rng.uniform(0.5, 6, stars)
-    ratios = np.exp([second_look.log_ratio(rng.normal(size=stars), expected) for _ in range(20_000)])
+    ratios = np.exp([search.log_ratio(rng.normal(size=stars), expected) for _ in range(20_000)])
     assert ratios.mean() < 1.1
     assert np.mean(ratios > 100) < 0.01
 
 
 def test_it_grows_with_stars(rng):
     expected = np.full(20, 2.0)
-    assert second_look.log_ratio(rng.normal(size=20) + 2, expected) > 12
-    assert second_look.log_ratio(rng.normal(size=20), expected) < 0
+    assert search.log_ratio(rng.normal(size=20) + 2, expected) > 12
+    assert search.log_ratio(rng.normal(size=20), expected) < 0
 
 
 def test_places_that_say_nothing_change_nothing():
-    assert second_look.log_ratio(np.zeros(0), np.zeros(0)) == pytest.approx(0)
+    assert search.log_ratio(np.zeros(0), np.zeros(0)) == pytest.approx(0)

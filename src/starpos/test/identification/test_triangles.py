@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from starpos.identification import triangle_cache, triangles
+from starpos.identification import triangles
 from starpos.identification.pose import directions, stars_at
 from starpos.instrument.camera import Camera
 from starpos.rotation import shortest_turn
@@ -24,7 +24,7 @@ BROAD = np.radians(25)
 
 @pytest.fixture(scope="module")
 def table(catalogue):
-    return triangle_cache.cached(catalogue, WIDE)
+    return triangles.cached_triangles(catalogue, WIDE)
 
 
 @pytest.fixture(scope="module")
@@ -37,9 +37,9 @@ def places(table, catalogue):
 def own_cache(tmp_path, monkeypatch):
     """An empty cache and nothing remembered from it, before and after."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    triangle_cache._in_use.clear()
+    triangles._in_use.clear()
     yield tmp_path / "cache" / "starpos"
-    triangle_cache._in_use.clear()
+    triangles._in_use.clear()
 
 
 def angles(v):
@@ -180,35 +180,35 @@ def test_every_part_of_the_sky_has_enough(table, places, catalogue, rng):
 
 def test_it_is_built_once_then_mapped(own_cache, catalogue, monkeypatch):
     built = []
-    table = triangle_cache.cached(catalogue, BROAD, lambda what, done: built.append(done))
+    table = triangles.cached_triangles(catalogue, BROAD, lambda what, done: built.append(done))
     assert built[-1] == pytest.approx(1)
     (folder,) = own_cache.iterdir()
-    triangle_cache._in_use.clear()
+    triangles._in_use.clear()
     monkeypatch.setattr(triangles, "build", lambda *_: pytest.fail("built again"))
-    again = triangle_cache.cached(catalogue, BROAD)
+    again = triangles.cached_triangles(catalogue, BROAD)
     np.testing.assert_array_equal(again.corners, table.corners)
     # a refined focal length does not build another
-    assert triangle_cache.cached(catalogue, BROAD * 1.0001) is not None
+    assert triangles.cached_triangles(catalogue, BROAD * 1.0001) is not None
     assert [p.name for p in own_cache.iterdir()] == [folder.name]
 
 
 def test_who_waited_for_another_process_that_built_does_not_build_again(own_cache, catalogue, monkeypatch):
-    triangle_cache.cached(catalogue, BROAD)
+    triangles.cached_triangles(catalogue, BROAD)
     (folder,) = own_cache.iterdir()
     away = folder.rename(own_cache.parent / "away")
-    triangle_cache._in_use.clear()
-    absent, built, load = threading.Event(), [], triangle_cache._map
+    triangles._in_use.clear()
+    absent, built, load = threading.Event(), [], triangles._map
 
     def looked(*of):
         found = load(*of)
         absent.set()
         return found
 
-    monkeypatch.setattr(triangle_cache, "_map", looked)
+    monkeypatch.setattr(triangles, "_map", looked)
     other = os.open(own_cache, os.O_RDONLY)
     fcntl.flock(other, fcntl.LOCK_EX)
     waiting = threading.Thread(
-        target=triangle_cache.cached, args=(catalogue, BROAD, lambda what, done: built.append(done))
+        target=triangles.cached_triangles, args=(catalogue, BROAD, lambda what, done: built.append(done))
     )
     waiting.start()
     assert absent.wait(WAIT_S)
@@ -243,17 +243,17 @@ DAMAGE = {
 
 @pytest.mark.parametrize("damage", DAMAGE)
 def test_a_broken_cache_is_built_anew(damage, own_cache, catalogue):
-    good = triangle_cache.cached(catalogue, BROAD)
+    good = triangles.cached_triangles(catalogue, BROAD)
     (folder,) = own_cache.iterdir()
     column, harm = DAMAGE[damage]
     kept = {path.name: path.read_bytes() for path in folder.iterdir()}
-    triangle_cache._in_use.clear()
+    triangles._in_use.clear()
     path = folder / f"{column}.npy"
     # Otherwise the harm would reach what is still mapped.
     path.unlink()
     path.write_bytes(kept[path.name])
     harm(path)
-    again = triangle_cache.cached(catalogue, BROAD)
+    again = triangles.cached_triangles(catalogue, BROAD)
     np.testing.assert_array_equal(again.corners, good.corners)
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == kept
 
@@ -269,8 +269,8 @@ def test_what_older_versions_left_in_the_cache_goes(own_cache, catalogue):
     os.utime(own_cache / "unfinished-old", (0, 0))
     (own_cache / "unfinished-now").mkdir()
     (own_cache / "somebody's").mkdir()
-    triangle_cache.cached(catalogue, BROAD)
-    left = sorted(p.name for p in own_cache.iterdir() if not p.name.startswith(triangle_cache.PREFIX))
+    triangles.cached_triangles(catalogue, BROAD)
+    left = sorted(p.name for p in own_cache.iterdir() if not p.name.startswith(triangles.PREFIX))
     assert left == ["somebody's", "unfinished-now"]
 
 
@@ -279,13 +279,13 @@ def test_a_cache_that_cannot_be_written(tmp_path, monkeypatch, catalogue):
     (tmp_path / "cache").write_text("in the way")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     with pytest.warns(UserWarning, match="XDG_CACHE_HOME"):
-        assert len(triangle_cache.cached(catalogue, BROAD).corners) > 1000
+        assert len(triangles.cached_triangles(catalogue, BROAD).corners) > 1000
 
 
 def test_two_processes_at_once(own_cache):
     program = (
-        "import numpy as np; from starpos.sky import catalogue; from starpos.identification import triangle_cache\n"
-        f"t = triangle_cache.cached(catalogue.load_catalogue(), {BROAD}); print(len(t.corners), int(t.corners.sum()))"
+        "import numpy as np; from starpos.sky import catalogue; from starpos.identification import triangles\n"
+        f"t = triangles.cached_triangles(catalogue.load_catalogue(), {BROAD}); print(len(t.corners), int(t.corners.sum()))"
     )
     environment = os.environ | {"XDG_CACHE_HOME": str(own_cache.parent)}
     running = [

@@ -11,9 +11,8 @@ from starpos import rotation
 from starpos.detection import detect
 from starpos.fix.solution import TWO_SKIES, Status
 from starpos.fix.solver import Solver
-from starpos.frames.frame import Frame
-from starpos.frames.stars import Stars
-from starpos.identification.explained import explained_by
+from starpos.frames.frame import Frame, Stars
+from starpos.identification.evidence import explained_by
 from starpos.identification.search import frame_stars, identify_frame
 from starpos.identification.two_skies import two_skies
 from starpos.instrument.camera import Camera

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 from starpos.errors import InstrumentError
-from starpos.instrument.axis import MIN_UNKNOWN_PX, with_frame_size
 from starpos.instrument.camera import Camera
-from starpos.instrument.instrument import Calibration, Instrument
+from starpos.instrument.instrument import MIN_UNKNOWN_PX, Calibration, Instrument, with_frame_size
 
 KNOWN = Calibration.of((0.0, 0.0, 0.0), (5.0, 5.0, 5.0))
 LENS = Camera(

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from starpos.errors import InstrumentError
-from starpos.instrument import camera_file
+from starpos.instrument import instrument_file
 from starpos.instrument.camera import Camera
 
 CAMERA = Camera(
@@ -50,7 +50,7 @@ projection_matrix:
 def test_reads_what_ros_writes(tmp_path):
     path = tmp_path / "camera.yaml"
     path.write_text(WRITTEN_BY_ROS)
-    assert camera_file.read(path) == CAMERA
+    assert instrument_file.read_camera(path) == CAMERA
 
 
 def test_reads_and_writes_a_fisheye(tmp_path):
@@ -58,9 +58,9 @@ def test_reads_and_writes_a_fisheye(tmp_path):
     written = WRITTEN_BY_ROS.replace("plumb_bob", "equidistant").replace("cols: 5", "cols: 4")
     path.write_text(written.replace("[0.1, -0.2, 0.0001, -0.0002, 0.05]", four))
     fisheye = replace(CAMERA, model="equidistant", distortion=(-0.04, 5e-4, 1e-5, -2e-6))
-    assert camera_file.read(path) == fisheye
-    camera_file.write(path, fisheye, "camera")
-    assert camera_file.read(path) == fisheye and "cols: 4" in path.read_text()
+    assert instrument_file.read_camera(path) == fisheye
+    instrument_file.write_camera(path, fisheye, "camera")
+    assert instrument_file.read_camera(path) == fisheye and "cols: 4" in path.read_text()
 
 
 def test_reads_and_writes_a_rational_lens(tmp_path):
@@ -68,15 +68,15 @@ def test_reads_and_writes_a_rational_lens(tmp_path):
     written = WRITTEN_BY_ROS.replace("plumb_bob", "rational_polynomial").replace("cols: 5", "cols: 8")
     path.write_text(written.replace("[0.1, -0.2, 0.0001, -0.0002, 0.05]", str(list(eight))))
     rational = replace(CAMERA, model="rational_polynomial", distortion=eight)
-    assert camera_file.read(path) == rational
-    camera_file.write(path, rational, "camera")
-    assert camera_file.read(path) == rational and "cols: 8" in path.read_text()
+    assert instrument_file.read_camera(path) == rational
+    instrument_file.write_camera(path, rational, "camera")
+    assert instrument_file.read_camera(path) == rational and "cols: 8" in path.read_text()
 
 
 def test_reads_what_it_writes_even_into_a_new_folder(tmp_path):
     path = tmp_path / "new" / "camera.yaml"
-    camera_file.write(path, CAMERA, "camera")
-    assert camera_file.read(path) == CAMERA
+    instrument_file.write_camera(path, CAMERA, "camera")
+    assert instrument_file.read_camera(path) == CAMERA
     assert [p.name for p in path.parent.iterdir()] == ["camera.yaml"]
 
 
@@ -102,14 +102,14 @@ def test_bad_files_are_refused_in_a_sentence(tmp_path, old, new, sentence):
     path = tmp_path / "camera.yaml"
     path.write_text(WRITTEN_BY_ROS.replace(old, new, 1))
     with pytest.raises(InstrumentError, match=sentence) as caught:
-        camera_file.read(path)
+        instrument_file.read_camera(path)
     assert str(path) in str(caught.value) and "\n" not in str(caught.value)
 
 
 def test_another_reader_finds_every_key_where_it_should_be(tmp_path):
     """OpenCV's parser, which wants its own first line; the comment says nothing to it."""
     path = tmp_path / "camera.yaml"
-    camera_file.write(path, CAMERA, "camera", "sigma: fx 0.1\nimage_width: 5")
+    instrument_file.write_camera(path, CAMERA, "camera", "sigma: fx 0.1\nimage_width: 5")
     file = cv2.FileStorage(
         "%YAML:1.0\n---\n" + path.read_text(), cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY
     )
@@ -129,28 +129,28 @@ def test_another_reader_finds_every_key_where_it_should_be(tmp_path):
     assert (file.getNode("image_width").real(), file.getNode("image_height").real()) == (640, 480)
     assert file.getNode("distortion_model").string() == "plumb_bob"
     assert file.getNode("camera_name").string() == "camera"
-    assert camera_file.read(path) == CAMERA
+    assert instrument_file.read_camera(path) == CAMERA
 
 
 def test_a_file_is_parsed_up_to_64_kb_only(tmp_path):
     path = tmp_path / "camera.yaml"
-    camera_file.write(path, CAMERA, "camera")
+    instrument_file.write_camera(path, CAMERA, "camera")
     whole = path.read_bytes()
     path.write_bytes(whole + b"#" * (64_000 - len(whole)))
-    assert camera_file.read(path) == CAMERA
+    assert instrument_file.read_camera(path) == CAMERA
     path.write_bytes(whole + b"#" * (64_001 - len(whole)))
     with pytest.raises(InstrumentError, match="64001 bytes, and may have 64000"):
-        camera_file.read(path)
+        instrument_file.read_camera(path)
 
 
 def test_a_link_stays_one_when_a_calibration_is_written_through_it(tmp_path):
     (tmp_path / "store").mkdir()
     path = tmp_path / "camera.yaml"
     path.symlink_to("store/cam1.yaml")
-    camera_file.write(path, CAMERA, "camera")
+    instrument_file.write_camera(path, CAMERA, "camera")
     other = Camera(width=1234, height=567, fx=1e3, fy=1e3, cx=1.0, cy=2.0)
-    camera_file.write(path, other, "camera")
-    assert path.is_symlink() and camera_file.read(tmp_path / "store" / "cam1.yaml") == other
+    instrument_file.write_camera(path, other, "camera")
+    assert path.is_symlink() and instrument_file.read_camera(tmp_path / "store" / "cam1.yaml") == other
     assert [p.name for p in (tmp_path / "store").iterdir()] == ["cam1.yaml"]
 
 
@@ -158,7 +158,7 @@ def test_a_pipe_is_not_waited_for(tmp_path):
     path = tmp_path / "camera.yaml"
     os.mkfifo(path)
     with pytest.raises(InstrumentError, match="no regular file"):
-        camera_file.read(path)
+        instrument_file.read_camera(path)
 
 
 @pytest.mark.parametrize("content", [b"", b"[1, 2]", b"\xff\xfe", b" " * (1 << 21)])
@@ -166,23 +166,23 @@ def test_what_is_no_calibration_at_all(tmp_path, content):
     path = tmp_path / "camera.yaml"
     path.write_bytes(content)
     with pytest.raises(InstrumentError):
-        camera_file.read(path)
+        instrument_file.read_camera(path)
 
 
 def test_a_reader_never_sees_half_a_file(tmp_path):
     path = tmp_path / "camera.yaml"
     other = Camera(width=1234, height=567, fx=1e3, fy=1e3, cx=1.0, cy=2.0)
-    camera_file.write(path, CAMERA, "camera")
+    instrument_file.write_camera(path, CAMERA, "camera")
 
     def write():
         for _ in range(20):
-            camera_file.write(path, other, "camera")
-            camera_file.write(path, CAMERA, "camera")
+            instrument_file.write_camera(path, other, "camera")
+            instrument_file.write_camera(path, CAMERA, "camera")
 
     writer = threading.Thread(target=write)
     writer.start()
     while writer.is_alive():
-        assert camera_file.read(path) in (CAMERA, other)
+        assert instrument_file.read_camera(path) in (CAMERA, other)
     writer.join()
 
 
@@ -190,5 +190,5 @@ def test_where_it_cannot_be_written_the_old_file_stays_and_nothing_is_left(tmp_p
     path = tmp_path / "camera.yaml"
     path.mkdir()
     with pytest.raises(InstrumentError, match="cannot be written"):
-        camera_file.write(path, CAMERA, "camera")
+        instrument_file.write_camera(path, CAMERA, "camera")
     assert [p.name for p in tmp_path.iterdir()] == ["camera.yaml"]

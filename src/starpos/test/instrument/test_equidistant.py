@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from starpos.errors import InstrumentError
-from starpos.instrument.camera import Camera
-from starpos.instrument.lens import EQUIDISTANT
+from starpos.instrument.camera import EQUIDISTANT, Camera
 
 # of a lens that is nearly equisolid, one that is nearly stereographic, one that ends its picture at 100 deg
 EQUISOLID, STEREOGRAPHIC, SHORT = (

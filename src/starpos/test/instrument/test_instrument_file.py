@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from starpos.errors import InstrumentError
-from starpos.instrument import camera_file
+from starpos.instrument import instrument_file
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import InclinometerErrors
 from starpos.instrument.instrument import Calibration, Instrument
@@ -78,7 +78,7 @@ def test_the_camera_of_a_calibration_file_beside_it_or_elsewhere(reads, tmp_path
         cy=520.0,
         distortion=(-0.1, 0.01, 1e-3, -2e-3, 0.0),
     )
-    camera_file.write(tmp_path / "optics" / "camera.yaml", camera, "camera")
+    instrument_file.write_camera(tmp_path / "optics" / "camera.yaml", camera, "camera")
     for name in ("optics/camera.yaml", tmp_path / "optics" / "camera.yaml"):
         i = reads(f"starpos_instrument: 1\ncamera: {{calibration: {name}}}\n")
         assert (i.camera, i.focal_px) == (camera, 5200.5)

@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 
 from starpos.errors import InstrumentError
-from starpos.instrument import instrument_file, instrument_update
+from starpos.instrument import instrument_file
 from starpos.instrument.instrument import Calibration, Instrument
 from starpos.instrument.yaml_file import line_of_comment, own_comment, text_of
 
@@ -49,8 +49,8 @@ def test_a3_is_replaced_and_all_else_stays(tmp_path):
     )
     before = instrument_file.read(path)
     new = Instrument(93750.0, calibration=Calibration.of((1.0, 2.0, 3.0), (4.0, 5.0, 6.0)))
-    instrument_update.check_fits(path, new)
-    instrument_update.write(path, new, "about it")
+    instrument_file.check_fits(path, new)
+    instrument_file.update(path, new, "about it")
     after = instrument_file.read(path)
     assert after.calibration.misalignment_deg == (1, 2, 3)
     assert after.calibration.covariance_arcsec2 == new.calibration.covariance_arcsec2
@@ -63,8 +63,8 @@ def test_the_size_of_the_frames_goes_with_a3_and_one_of_other_frames_is_refused(
     path = tmp_path / "mine.yaml"
     path.write_text("starpos_instrument: 1\ncamera: {focal_mm: 600, pixel_um: 6.4}\n")
     new = Instrument(93750.0, calibration=Calibration.of((1.0, 2.0, 3.0)), frame_size=(2808, 1872))
-    instrument_update.check_fits(path, new)
-    instrument_update.write(path, new, "about it")
+    instrument_file.check_fits(path, new)
+    instrument_file.update(path, new, "about it")
     assert instrument_file.read(path).size == (2808, 1872) and "focal_mm: 600" in path.read_text()
     with pytest.raises(InstrumentError, match="another frame size"):
-        instrument_update.check_fits(path, replace(new, frame_size=(1600, 1200)))
+        instrument_file.check_fits(path, replace(new, frame_size=(1600, 1200)))

@@ -4,8 +4,8 @@
 import numpy as np
 import pytest
 
-from starpos.instrument.tilt_doubt import like_radians
 from starpos.instrument.tilt_log import TiltLog
+from starpos.instrument.tilt_table import like_radians
 
 NOISE = np.radians(0.0035)
 

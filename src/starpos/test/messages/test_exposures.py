@@ -8,7 +8,7 @@ import pytest
 
 from starpos.errors import TimeError
 from starpos.frames.frame import Frame
-from starpos.messages.exposures import ExposureFacts
+from starpos.messages.camera import ExposureFacts
 from starpos.messages.stamp import PlainHeader, PlainStamp
 
 S = 10**9

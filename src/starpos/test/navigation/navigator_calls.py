@@ -8,10 +8,9 @@ from voyage_calls import EARTH_M, wrapped
 
 from starpos import rotation
 from starpos.earth.orientation import earth_state
-from starpos.session.job import JobsInTurn
+from starpos.session.driver import JobsInTurn, Now
 from starpos.session.navigator import NavigatorSession
 from starpos.session.navigator_parameters import PARAMETERS, NavigatorSettings
-from starpos.session.now import Now
 
 # of an attitude behind its frame, as the solver takes it
 LATE_S = 0.5

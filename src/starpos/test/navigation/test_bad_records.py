@@ -9,8 +9,7 @@ from scipy.spatial.transform import Rotation
 from voyage_calls import navigated, nees, sigma_m
 
 from starpos.errors import VoyageError
-from starpos.navigation.imu import ImuLog
-from starpos.navigation.table import in_order
+from starpos.navigation.records import ImuLog, in_order
 from starpos_testing.voyages import made
 
 

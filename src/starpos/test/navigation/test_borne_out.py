@@ -7,8 +7,8 @@ from scipy.stats import multivariate_normal
 from voyage_calls import navigated, nees, sigma_m
 
 from starpos.errors import VoyageError
-from starpos.navigation.borne_out import independent_means
-from starpos.navigation.laws import LAWS
+from starpos.navigation.evidence import independent_means
+from starpos.navigation.vessel import LAWS
 from starpos_testing.voyages import made, turbulent_wind, walking_wind
 
 T = np.arange(0.0, 420.0, 1.5)

@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 from voyage_calls import vessel
 
-from starpos.navigation.imu import ImuLog
-from starpos.navigation.preintegration import Pieces, summed
-from starpos.navigation.thinning import thinned
+from starpos.navigation.preintegration import Pieces, summed, thinned
+from starpos.navigation.records import ImuLog
 from starpos.navigation.voyage import navigate
 from starpos_testing.voyages import made
 

@@ -24,11 +24,9 @@ from starpos.earth.ellipsoid import enu_axes
 from starpos.earth.known_place import KnownPlace
 from starpos.earth.refraction import Atmosphere
 from starpos.earth.vertical import Deflection
-from starpos.navigation.at_place import attitude_at_place
-from starpos.navigation.placeless import PlacelessFrame
+from starpos.navigation.sightings import PlacelessFrame, attitude_at_place
 from starpos.navigation.vessel import Vessel
-from starpos.session.diagnosis import Level
-from starpos.session.now import Now
+from starpos.session.driver import Level, Now
 from starpos_testing.voyages import INDUSTRIAL, made
 
 SECONDS = 60

@@ -9,8 +9,7 @@ from starpos import rotation
 from starpos.earth.orientation import earth_state, station_velocity
 from starpos.earth.refraction import Atmosphere
 from starpos.fix.camera_attitude import CameraAttitude
-from starpos.navigation.placeless import PlacelessFrame
-from starpos.navigation.sightings import IdentifiedFrame
+from starpos.navigation.sightings import IdentifiedFrame, PlacelessFrame
 from starpos.units import ARCSEC
 
 AIR = Atmosphere()

@@ -3,8 +3,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from starpos.navigation.imu import ImuLog
 from starpos.navigation.preintegration import Pieces, summed
+from starpos.navigation.records import ImuLog
 
 NONE, ZERO = np.zeros((3, 3)), np.zeros((1, 3))
 

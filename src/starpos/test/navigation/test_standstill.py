@@ -10,11 +10,10 @@ from scipy.stats import chi2
 from voyage_calls import navigated, nees, sigma_m, vessel
 
 from starpos.navigation.chain import Chain, smoothed
-from starpos.navigation.imu import ImuLog
-from starpos.navigation.measures import Lacks, StarAttitudes
-from starpos.navigation.motion import CONSTANTS, MEASURED, VELOCITY
+from starpos.navigation.equations import CONSTANTS, MEASURED, VELOCITY, Lacks, StarAttitudes
+from starpos.navigation.evidence import NOWHERE, Standstills, by_the_rest, noise_density2, standstills
 from starpos.navigation.preintegration import Pieces
-from starpos.navigation.standstill import NOWHERE, Standstills, by_the_rest, noise_density2, standstills
+from starpos.navigation.records import ImuLog
 from starpos_testing.halting import even, halting, idling, on_carriers
 from starpos_testing.voyages import INDUSTRIAL, made
 

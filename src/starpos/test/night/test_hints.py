@@ -7,16 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from starpos.fix import searching
+from starpos.fix.searching import Sight, of_one_camera, without_hint
 from starpos.fix.solution import Attitude, Solution, Status
 from starpos.fix.solver import Solver
 from starpos.frames.header import about
-from starpos.instrument.camera import Camera
+from starpos.instrument.camera import EQUIDISTANT, Camera
 from starpos.instrument.instrument import Instrument
-from starpos.instrument.lens import EQUIDISTANT
-from starpos.night import hints
-from starpos.night.hints import of_one_camera, without_hint
 from starpos.night.reading import Given
-from starpos.night.searching import Sight
 from starpos.night.work import Identifying
 from starpos.progress import quiet
 from starpos.sky.catalogue import load_catalogue
@@ -113,7 +111,7 @@ def test_a_frame_that_nothing_fits_keeps_its_sentence(lost, rng):
 
 
 def test_a_focal_length_near_the_headers_needs_no_search_at_every_scale(catalogue, rng, monkeypatch):
-    monkeypatch.setattr(hints, "identify_blind_every_way", never)
+    monkeypatch.setattr(searching, "identify_blind_every_way", never)
     wide, header = Camera.from_focal(1000, 700, 5000.0), about({"FOCALLEN": 34, "XPIXSZ": 6.4}, "frame.fits")
     sight, _ = Identifying(Given(None, by_header=True))(
         stars_of_cygnus(catalogue, rng, wide, 6.5, 0.05, **header)
@@ -135,9 +133,9 @@ def test_a_scale_and_a_lens_that_then_identify_nothing_are_not_told(lost, monkey
         tried.append((solver.instrument.focal_px, solver.instrument.model))
         return sight
 
-    monkeypatch.setattr(hints, "identify_blind_every_way", blind)
+    monkeypatch.setattr(searching, "identify_blind_every_way", blind)
     assert without_hint(solver, stars, stars, sight, again, quiet) is sight
-    assert (searched, tried) == ([hints.SEARCH_S], [(900.0, EQUIDISTANT)])
+    assert (searched, tried) == ([searching.HINT_SEARCH_S], [(900.0, EQUIDISTANT)])
 
 
 @pytest.mark.parametrize(
@@ -148,7 +146,7 @@ def test_a_scale_and_a_lens_that_then_identify_nothing_are_not_told(lost, monkey
     ],
 )
 def test_what_no_focal_length_can_help_is_not_searched(instrument, status, seen, monkeypatch):
-    monkeypatch.setattr(hints, "focal_that_fits", never)
+    monkeypatch.setattr(searching, "focal_that_fits", never)
     stars = seen(RIGHT).take(np.arange(3))
     solver = replace(_solver(187500.0), instrument=instrument)
     sight = Identifying(Given(instrument))(stars)[0]

@@ -16,18 +16,15 @@ import pytest
 from starpos import open_night
 from starpos.cli import main
 from starpos.fix.solution import Status
-from starpos.frames.night_files import TILTS
 from starpos.frames.reading import read_frame
-from starpos.frames.star_list import write_star_list
+from starpos.frames.tables import TILTS, write_star_list
 from starpos.instrument.instrument import Calibration
 from starpos.night.reading import stars_of as stars_in
-from starpos.session.job import JobsInTurn
-from starpos.session.now import Now, Sent
+from starpos.session.driver import JobsInTurn, Now, Sent
 from starpos.session.parameter_file import settings_of
 from starpos.session.session import SolverSession
-from starpos.simulation.night_on_disk import write_fits
-from starpos.simulation.scene import Exposed, expose, render
-from starpos.utc import utc_text
+from starpos.simulation.scene import Exposed, expose, render, write_fits
+from starpos.units import utc_text
 from starpos_testing.skies.scenes import (
     EXPOSURE,
     FOCAL_PX,

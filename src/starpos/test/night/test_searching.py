@@ -6,15 +6,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from starpos.detection import otherwise as ways
+from starpos.detection import second_look as ways
+from starpos.fix import searching
+from starpos.fix.searching import PART, identify_every_way
 from starpos.fix.solution import Solution, Status
 from starpos.fix.solver import Solver
-from starpos.frames.frame import Frame
-from starpos.frames.stars import no_stars
+from starpos.frames.frame import Frame, no_stars
 from starpos.instrument.camera import Camera
 from starpos.instrument.instrument import Instrument
-from starpos.night import searching
-from starpos.night.searching import PART, identify_every_way
 from starpos_testing.skies.cygnus import DEC_DEG, stars_of_cygnus
 
 SIZE, FOCAL_PX = (1280, 960), 2657.0

@@ -11,8 +11,7 @@ from pathlib import Path
 import pytest
 
 from starpos.errors import CatalogueError, FrameError
-from starpos.parallel.call import Here
-from starpos.parallel.processes import AHEAD, ONE_THREAD, ProcessError, Processes
+from starpos.parallel.processes import AHEAD, ONE_THREAD, Here, ProcessError, Processes
 
 # the work, which goes to other processes by name
 

@@ -13,10 +13,10 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, Reader, StorageP
 from rosbags.typesys import Stores, get_typestore
 
 from starpos.errors import BagError
-from starpos.recording import bounds
+from starpos.recording import bag
 from starpos.recording.bag import BagReader
 
-bounds.bound_rosbags()
+bag.bound_rosbags()
 # The module that rosbags found.
 zstd = reader.zstd._zstd
 PACKERS = {"zstd": zstd.compress, "lz4": lz4, "": bytes}
@@ -27,8 +27,8 @@ TOPIC, KIND = "/stars", "std_msgs/msg/UInt8MultiArray"
 @pytest.fixture
 def small(monkeypatch):
     """Bounds of a megabyte, so that a test need not have gigabytes."""
-    monkeypatch.setattr(bounds, "MAX_UNPACKED", 1 << 20)
-    monkeypatch.setattr(bounds, "MAX_AT_ONCE", 1 << 21)
+    monkeypatch.setattr(bag, "MAX_UNPACKED", 1 << 20)
+    monkeypatch.setattr(bag, "MAX_AT_ONCE", 1 << 21)
 
 
 def text(value: str) -> bytes:
@@ -63,7 +63,7 @@ def mcap(path, payloads, compression, stated=None, indexed=False):
 def read(path) -> list[bytes]:
     """Read as replay does."""
     with Reader(path) as opened:
-        bounds.check_chunks(opened)
+        bag.check_chunks(opened)
         return [bytes(data) for _, _, data in opened.messages()]
 
 
@@ -125,7 +125,7 @@ def test_a_compressed_file_is_unpacked_only_where_there_is_room(tmp_path, monkey
     path = packed_as(CompressionMode.FILE, tmp_path / "a", bytes(1 << 21))
     assert read(path) == [bytes(1 << 21)]
     # As on a disk that is nearly full.
-    monkeypatch.setattr(bounds, "LEFT_ON_DISK", 1 << 60)
+    monkeypatch.setattr(bag, "LEFT_ON_DISK", 1 << 60)
     with pytest.raises(BagError, match="more than there is room for"):
         read(path)
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import pytest
 
 from starpos.errors import FrameError
-from starpos.recording.drivers import Remaps, driver_topics
+from starpos.recording.topics import Remaps, driver_topics
 
 IMAGE, PICTURE, INFO, IMU = (
     f"sensor_msgs/msg/{n}" for n in ("Image", "CompressedImage", "CameraInfo", "Imu")

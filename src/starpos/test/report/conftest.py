@@ -7,7 +7,7 @@ def unpainted(monkeypatch):
     """Figures are made and not painted, which takes most of a report's time; for tests that look at its text."""
     from matplotlib.figure import Figure
 
-    from starpos.report import pictures
+    from starpos.report import page
 
-    blank = pictures.png_of(Figure(figsize=(0.1, 0.1)))
-    monkeypatch.setattr(pictures, "png_of", lambda figure: blank)
+    blank = page.png_of(Figure(figsize=(0.1, 0.1)))
+    monkeypatch.setattr(page, "png_of", lambda figure: blank)

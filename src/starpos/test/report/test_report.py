@@ -16,10 +16,10 @@ from starpos.cli import main
 from starpos.earth.refraction import Atmosphere
 from starpos.instrument.instrument import Calibration, Instrument
 from starpos.instrument.sensors import SCA100T_CALIBRATED
-from starpos.night import folder
+from starpos.night import opening
 from starpos.report import measures
-from starpos.report.pictures import nights_picture
-from starpos.report.place_figures import draw_budget, draw_scatter
+from starpos.report.night_figures import draw_budget, draw_scatter
+from starpos.report.page import nights_picture
 from starpos_testing.skies.reports import AIR, KNOWN, PLACE, Page, assert_drawn, run, simulate, solved
 
 pytest.importorskip("matplotlib")
@@ -117,11 +117,11 @@ def test_the_place_on_maps_comes_first_and_a_simulated_night_is_called_that(draw
     assert "Simulated: no camera took these frames." in page.text
     assert page.text.count("Simulated. ") == len(page.pictures) == 8
     truth = json.loads((still / "truth.json").read_text())
-    assert folder.truth_in(still).simulated
+    assert opening.truth_in(still).simulated
     (tmp_path / "truth.json").write_text(
         json.dumps({k: v for k, v in truth.items() if k != "simulated_files"})
     )
-    assert not folder.truth_in(tmp_path).simulated
+    assert not opening.truth_in(tmp_path).simulated
 
 
 def test_pictures_are_drawn_and_lie_beside_the_page(drawn):

@@ -334,7 +334,7 @@ def test_broken_star_lists_cost_their_frame_only(solved_place, lists, tilts, tmp
 
 
 def test_without_rosbags_the_pip_line_is_said(lists, tilts, tmp_path, capsys, monkeypatch):
-    from starpos.cli import bags as command
+    from starpos.cli import inputs as command
 
     bag = record(tmp_path / "bag", lists, tilts)
     monkeypatch.setattr(command, "find_spec", lambda name: None if name == "rosbags" else name)

@@ -13,11 +13,10 @@ from starpos.earth.refraction import Atmosphere
 from starpos.earth.vertical import Deflection
 from starpos.fix.budget import ALWAYS, ErrorTerm
 from starpos.fix.solution import Attitude, Status
-from starpos.instrument.camera import Camera
+from starpos.instrument.camera import EQUIDISTANT, Camera
 from starpos.instrument.instrument import Calibration, Instrument
-from starpos.instrument.lens import EQUIDISTANT
 from starpos.night.night import Night, ReportedPlace, Shot, Truth
-from starpos.report import measures, sky_figure
+from starpos.report import measures, night_figures
 from starpos.sky.site import Site, camera_to_enu
 from starpos.units import ARCSEC
 from starpos_testing.skies.reports import simulate
@@ -150,8 +149,8 @@ def test_stars_are_drawn_where_they_stand_on_the_sky(lists):
     n = work(lists)
     site = Site(np.degrees(n.combined.latitude), np.degrees(n.combined.longitude), AIR)
     for shot in n.shots:
-        icrs = sky_figure.View(shot, shot.pointing, shot.size).directions(shot.xy)
-        azimuth, zenith_deg = sky_figure.polar(site.refracted(icrs, earth_state(shot.utc_unix_s)))
+        icrs = night_figures.View(shot, shot.pointing, shot.size).directions(shot.xy)
+        azimuth, zenith_deg = night_figures.polar(site.refracted(icrs, earth_state(shot.utc_unix_s)))
         camera = Camera.from_focal(*shot.size, FOCAL_PX)
         # As `simulate` points.
         true = camera.directions(*shot.xy.T) @ camera_to_enu(40.0, 78.0, 15.0).T
@@ -186,7 +185,7 @@ def test_a_fisheye_sees_to_the_horizon_on_the_map():
         model=EQUIDISTANT,
     )
     shot = Shot(name="a", status=Status.OK, message="", pointing=looking, size=(2001, 2001))
-    view = sky_figure.View(shot, looking, (2001, 2001))
+    view = night_figures.View(shot, looking, (2001, 2001))
     middle, edge = view.directions(np.array([[1000.0, 1000.0], [1000.0 + 300 * np.pi, 1000.0]]))
     assert abs(middle @ edge) < 1e-12
     assert np.arctan2(middle[1], middle[0]) == pytest.approx(1.0)

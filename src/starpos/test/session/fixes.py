@@ -9,9 +9,9 @@ import numpy as np
 from starpos import rotation
 from starpos.fix.budget import ALWAYS, ErrorTerm, heading_of
 from starpos.fix.fix import Fix
-from starpos.frames.stars import Stars
+from starpos.frames.frame import Stars
 from starpos.instrument.inclinometer import Tilt
-from starpos.session.memory import Seen
+from starpos.session.calibrating import Seen
 from starpos.sky.site import Site, camera_to_enu
 
 T0 = 1_793_642_400.0

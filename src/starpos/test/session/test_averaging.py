@@ -8,8 +8,8 @@ import pytest
 from fixes import fix_at, north_of
 
 from starpos.averaging.average import average
-from starpos.session.averaging import Averaging, News
-from starpos.session.diagnosis import Level
+from starpos.session.driver import Level
+from starpos.session.standing import Averaging, News
 
 
 def averaging_of(fixes) -> Averaging:

@@ -8,7 +8,7 @@ import pytest
 from starpos.errors import InstrumentError
 from starpos.instrument.camera import Camera
 from starpos.session.camera_solver import CameraSolver
-from starpos.session.job import JobsInTurn
+from starpos.session.driver import JobsInTurn
 
 CAMERA = Camera.from_focal(1000, 700, 80_000.0)
 

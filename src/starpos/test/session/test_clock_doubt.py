@@ -11,7 +11,7 @@ from fixes import fix_at, north_of
 from starpos import rotation
 from starpos.earth.ellipsoid import zenith_of
 from starpos.earth.orientation import ROTATION_RAD_S
-from starpos.session.clock_doubt import ClockDoubt
+from starpos.session.standing import ClockDoubt
 
 STATED_S = 0.01
 

@@ -10,7 +10,7 @@ from fixes import T0, fix_at
 
 from starpos.earth.vertical import Deflection
 from starpos.fix.solution import Status
-from starpos.session.gnss_check import GnssComparison
+from starpos.session.gnss import GnssComparison
 
 
 def gnss(latitude_deg, longitude_deg, seconds=0.0):

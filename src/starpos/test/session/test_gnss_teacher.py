@@ -6,10 +6,9 @@ from types import SimpleNamespace
 
 import pytest
 
-from starpos.frames.stars import no_stars
-from starpos.session.gnss_teacher import TOPIC, GnssTeacher
-from starpos.session.job import JobsInTurn
-from starpos.session.now import Now
+from starpos.frames.frame import no_stars
+from starpos.session.driver import JobsInTurn, Now
+from starpos.session.gnss import GNSS_TOPIC, GnssTeacher
 from starpos.session.parameter_file import settings_of
 
 START_S = 1_790_000_000
@@ -26,7 +25,7 @@ class Account:
         self.taken += 1
 
     def refuse(self, name, sentence):
-        assert name == TOPIC
+        assert name == GNSS_TOPIC
         self.refused.append(sentence)
 
 

@@ -9,9 +9,9 @@ from imu_readings import reading
 from scipy.spatial.transform import Rotation
 
 from starpos.fix.solution import Status
+from starpos.session.driver import Now
 from starpos.session.gyro import Gyro
 from starpos.session.gyro_readings import GyroReadings
-from starpos.session.now import Now
 from starpos_testing.skies.scenes import (
     EXPOSURE,
     SIZE,

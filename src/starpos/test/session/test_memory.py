@@ -6,7 +6,7 @@ import pytest
 from fixes import NOISE, T0, fix_at, seen_at, tilt_at
 
 from starpos.errors import TiltError
-from starpos.session.memory import MAX_POSES, MAX_TILTS, PoseMemory, RecentFrames, mean_tilt, tilts_of
+from starpos.session.calibrating import MAX_POSES, MAX_TILTS, PoseMemory, RecentFrames, mean_tilt, tilts_of
 
 
 def test_days_of_frames_stay_bounded_and_the_newest_are_kept():

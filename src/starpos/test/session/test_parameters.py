@@ -12,7 +12,7 @@ from starpos.instrument import sensors
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import InclinometerErrors
 from starpos.instrument.instrument import Calibration, Instrument
-from starpos.session.parameters import (
+from starpos.session.settings import (
     PARAMETERS,
     atmosphere_of,
     check_camera,

@@ -8,12 +8,12 @@ import pytest
 
 from starpos.earth.orientation import measured_until
 from starpos.fix.solution import Solution, Status
-from starpos.frames.shutter import GLOBAL, UNKNOWN, Shutter
-from starpos.frames.stars import no_stars
+from starpos.frames.exposure import GLOBAL_SHUTTER, UNKNOWN_SHUTTER, Shutter
+from starpos.frames.frame import no_stars
 from starpos.instrument.instrument import Calibration, Instrument
 from starpos.instrument.sensors import SCL3300
 from starpos.session import reports
-from starpos.session.diagnosis import Level
+from starpos.session.driver import Level
 from starpos_testing.skies.fields import SkyField
 
 TOLD = {"refraction.pressure": 95000.0, "refraction.temperature": 8.0}
@@ -27,7 +27,7 @@ def tilt(temperature_c):
 
 
 def test_conditions_that_are_known_are_right():
-    said = reports.of_conditions(TOLD, NOBODYS, tilt(12.0), GLOBAL)
+    said = reports.of_conditions(TOLD, NOBODYS, tilt(12.0), GLOBAL_SHUTTER)
     assert said.level == Level.OK and said.values["inclinometer (deg C)"] == 12.0
     # before the first frame the contents of the tilts are unknown
     assert reports.of_conditions(TOLD, NOBODYS, None, None).level == Level.OK
@@ -36,12 +36,18 @@ def test_conditions_that_are_known_are_right():
 @pytest.mark.parametrize(
     ("values", "instrument", "temperature_c", "shutter", "words"),
     [
-        ({"refraction.pressure": math.nan}, NOBODYS, 12.0, GLOBAL, "the air's pressure is not known"),
-        ({"refraction.temperature": math.nan}, NOBODYS, 12.0, GLOBAL, "the air's temperature is not known"),
-        ({}, NOBODYS, math.nan, GLOBAL, "the inclinometer's temperature is not known"),
+        ({"refraction.pressure": math.nan}, NOBODYS, 12.0, GLOBAL_SHUTTER, "the air's pressure is not known"),
+        (
+            {"refraction.temperature": math.nan},
+            NOBODYS,
+            12.0,
+            GLOBAL_SHUTTER,
+            "the air's temperature is not known",
+        ),
+        ({}, NOBODYS, math.nan, GLOBAL_SHUTTER, "the inclinometer's temperature is not known"),
         ({}, DATED, 12.0, Shutter(0.02, 0.001), "at its calibration is not known"),
-        ({}, NOBODYS, 12.0, UNKNOWN, "the shutter's first row to its last is not known"),
-        ({}, Instrument(4000.0), 12.0, GLOBAL, "the inclinometer's model is not stated"),
+        ({}, NOBODYS, 12.0, UNKNOWN_SHUTTER, "the shutter's first row to its last is not known"),
+        ({}, Instrument(4000.0), 12.0, GLOBAL_SHUTTER, "the inclinometer's model is not stated"),
     ],
 )
 def test_what_nobody_told_is_a_warning(values, instrument, temperature_c, shutter, words):
@@ -62,7 +68,7 @@ def test_the_age_of_the_iers_table_is_told_with_each_frame():
 
 def test_each_lack_has_a_sentence():
     nothing = dict.fromkeys(TOLD, math.nan)
-    said = reports.of_conditions(nothing, DATED, tilt(math.nan), UNKNOWN)
+    said = reports.of_conditions(nothing, DATED, tilt(math.nan), UNKNOWN_SHUTTER)
     assert said.level == Level.WARN and said.message.count("is not known") == 4
 
 

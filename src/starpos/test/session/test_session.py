@@ -14,12 +14,10 @@ pytest.importorskip("rosbags")
 from starpos.fix.solution import Status
 from starpos.messages.stamp import stamp_to_unix
 from starpos.recording.bag import BagReader
-from starpos.recording.instruments import CAMERA_INFO, INPUTS, STARS, TILT, instrument_in
+from starpos.recording.topics import CAMERA_INFO, INPUTS, STARS, TILT, instrument_in
 from starpos.session import reports
-from starpos.session.diagnosis import Level
+from starpos.session.driver import JobsInTurn, Level, Now, Sent
 from starpos.session.frames import Answered
-from starpos.session.job import JobsInTurn
-from starpos.session.now import Now, Sent
 from starpos.session.parameter_file import settings_of
 from starpos.session.replay import Replay
 from starpos.session.session import SolverSession

@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from starpos.session.shutter_pulses import LEARNED, Edge, ShutterPulse, ShutterPulses, Unpaired
+from starpos_common.shutter_pulses import LEARNED, Edge, ShutterPulse, ShutterPulses, Unpaired
 
 BEGIN_S = 1.7e9
 

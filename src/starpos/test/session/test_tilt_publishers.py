@@ -3,7 +3,7 @@
 
 import pytest
 
-from starpos.session.tilt_publishers import TiltPublishers
+from starpos.session.tilts import TiltPublishers
 
 
 def heard(messages) -> TiltPublishers:

@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 from starpos.errors import InstrumentError, VoyageError
 from starpos.frames.frame import Frame
 from starpos.instrument.instrument import TOP_OF_FRAME
-from starpos.session import trails
-from starpos.session.trails import Trails
+from starpos.session import gyro_readings
+from starpos.session.gyro_readings import Trails
 
 MID_S, EXPOSURE_S, FOCAL_PX = 1793642400.0, 0.02, 4636.0
 FRAME = Frame(np.zeros((400, 500), np.uint8), mid_unix_s=MID_S, exposure_s=EXPOSURE_S)
@@ -22,7 +22,7 @@ FRAME = Frame(np.zeros((400, 500), np.uint8), mid_unix_s=MID_S, exposure_s=EXPOS
 def told(monkeypatch):
     """Trails of a camera; CameraInfo is its test's own."""
     camera = type("Camera", (), {"fx": FOCAL_PX})
-    monkeypatch.setattr(trails, "message_to_camera", lambda message, **_: camera)
+    monkeypatch.setattr(gyro_readings, "message_to_camera", lambda message, **_: camera)
     told = Trails("")
     told.take_camera(None)
     return told

@@ -13,10 +13,9 @@ from starpos.errors import FrameError, TimeError
 from starpos.frames.reading import read_frame
 from starpos.instrument.inclinometer import level_of, up_of
 from starpos.instrument.tilt_table import read_tilt_csv
-from starpos.simulation.night_on_disk import write_night
-from starpos.simulation.scene import Exposed, Optics, TiltErrors, expose, read_tilt, render
+from starpos.simulation.scene import Exposed, Optics, TiltErrors, expose, read_tilt, render, write_night
 from starpos.sky.site import Site, camera_to_enu
-from starpos.utc import unix_of
+from starpos.units import unix_of
 from starpos_testing.skies.scenes import EXPOSURE, FOCAL_PX, SIZE, START, stars_of, wide_scene
 
 

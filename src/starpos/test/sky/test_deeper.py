@@ -10,7 +10,7 @@ from starpos.errors import CatalogueError
 from starpos.instrument.camera import Camera
 from starpos.sky import deeper
 from starpos.sky.catalogue import pack
-from starpos.sky.depth import Depth
+from starpos.sky.deeper import Depth
 from starpos_testing.command_line import run
 from starpos_testing.skies.tycho2_files import write_sky
 

@@ -11,7 +11,7 @@ from starpos import rotation
 from starpos.earth.orientation import earth_state
 from starpos.earth.refraction import Atmosphere
 from starpos.fix.solver import Solver
-from starpos.frames.stars import Stars
+from starpos.frames.frame import Stars
 from starpos.instrument.inclinometer import EXACT, Tilt
 from starpos.instrument.instrument import Instrument
 from starpos.navigation.sightings import sighting_of

@@ -10,8 +10,8 @@ from starpos.earth.refraction import Atmosphere
 from starpos.errors import FixError
 from starpos.units import ARCSEC
 from starpos.zenith.adjustment import adjusted
-from starpos.zenith.faces import faces_of
-from starpos.zenith.lines import LeanEstimate
+from starpos.zenith.equations import LeanEstimate
+from starpos.zenith.sighting import faces_of
 
 
 @pytest.mark.parametrize("turn_deg", [0.0, 94.0, 180.0, 271.0])

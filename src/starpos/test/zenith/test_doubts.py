@@ -8,7 +8,7 @@ import pytest
 from sessions import INSTRUMENT, MARK, SCALE, VACUUM, Drawn, drawn, shifted
 
 from starpos.errors import FixError
-from starpos.night.sightings import DeflectionSession
+from starpos.night.work import DeflectionSession
 from starpos.units import ARCSEC
 from starpos.zenith import doubts
 from starpos.zenith.doubts import remarks

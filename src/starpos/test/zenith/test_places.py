@@ -8,7 +8,7 @@ import pytest
 from sessions import drawn
 
 from starpos import rotation
-from starpos.zenith.places import StarPlaces
+from starpos.zenith.sighting import StarPlaces
 
 # a frame's stars, of all that pass; error of a seen place in units of the catalogue's sigma; that sigma in rad
 WIDE, STARS, SEEN, SIGMA = 20, 60, 0.5, 2e-7

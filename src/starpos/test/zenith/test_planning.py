@@ -9,7 +9,7 @@ from sessions import BEGIN, INSTRUMENT, MARK, VACUUM, drawn
 
 from starpos.earth.orientation import earth_state
 from starpos.errors import FixError
-from starpos.frames.shutter import GLOBAL
+from starpos.frames.exposure import GLOBAL_SHUTTER
 from starpos.instrument.camera import Camera
 from starpos.units import ARCSEC
 from starpos.zenith.planning import Planner, Routine, ZenithSky
@@ -22,7 +22,7 @@ SKY = ZenithSky(stars=40, centroid_rad=0.06 * ARCSEC, catalogue_rad=1e-12, radiu
 def planner():
     """A planner of sessions as `sessions.drawn` has them."""
     return Planner(
-        instrument=replace(INSTRUMENT, shutter=GLOBAL),
+        instrument=replace(INSTRUMENT, shutter=GLOBAL_SHUTTER),
         camera=CAMERA,
         atmosphere=VACUUM,
         mark=MARK,

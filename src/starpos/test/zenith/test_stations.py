@@ -6,13 +6,11 @@ import json
 import numpy as np
 import pytest
 
-from starpos.earth.geoid import Geoid
-from starpos.earth.geoid_file import Grid
+from starpos.earth.geoid import Geoid, Grid
 from starpos.errors import StationError
 from starpos.units import ARCSEC
 from starpos.zenith import session_file
-from starpos.zenith.levelling import between_m, levelled
-from starpos.zenith.stations import against_grid, stations_of
+from starpos.zenith.stations import against_grid, between_m, levelled, stations_of
 from starpos_testing.skies.deflections import COMMON_ARCSEC, NEW_ARCSEC, result
 
 # a geoid that is a sum of two waves, m by deg

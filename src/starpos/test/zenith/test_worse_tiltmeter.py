@@ -6,7 +6,7 @@ import pytest
 from sessions import AS_STATED, INSTRUMENT, MARK, SCALE, VACUUM, Worse, drawn
 
 from starpos.errors import FixError
-from starpos.night.sightings import DeflectionSession
+from starpos.night.work import DeflectionSession
 from starpos.zenith.doubts import remarks
 
 SESSIONS = 30

@@ -8,7 +8,7 @@ from sensor_msgs.msg import CameraInfo, Image
 
 from starpos.earth.ellipsoid import EARTH_RADIUS_M
 from starpos.earth.refraction import Atmosphere
-from starpos.frames.stars import no_stars
+from starpos.frames.frame import no_stars
 from starpos.instrument.inclinometer import Tilt
 from starpos.simulation.scene import Scene, detected, expose, read_tilt, render, scene_of
 from starpos.sky.catalogue import load_catalogue

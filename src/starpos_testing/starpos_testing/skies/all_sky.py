@@ -7,8 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from starpos import rotation
-from starpos.frames.frame import Frame
-from starpos.frames.stars import Stars
+from starpos.frames.frame import Frame, Stars
 from starpos.sky.catalogue import Catalogue
 
 # What lenses make of the angle off their axis, in focal lengths.

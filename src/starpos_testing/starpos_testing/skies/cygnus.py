@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from starpos.frames.stars import Stars
+from starpos.frames.frame import Stars
 from starpos.instrument.camera import Camera
 from starpos.rotation import unit_vector
 from starpos.sky.catalogue import Catalogue

@@ -10,7 +10,7 @@ from starpos import rotation
 from starpos.earth.orientation import EarthState, earth_state, station_velocity
 from starpos.earth.refraction import Atmosphere
 from starpos.fix.fix import Fix, Mounting, solve_fix
-from starpos.fix.matched import MatchedStars
+from starpos.fix.star_fit import MatchedStars
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import Tilt
 from starpos.instrument.instrument import TOP_OF_FRAME

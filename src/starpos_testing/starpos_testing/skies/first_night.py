@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 
 from starpos import rotation
-from starpos.frames.star_list import write_star_list
+from starpos.frames.tables import write_star_list
 from starpos.simulation.scene import Scene, detected, expose, read_tilt, scene_of
 from starpos.sky.catalogue import load_catalogue
-from starpos.utc import date_obs
+from starpos.units import date_obs
 
 # Seconds from frame to frame, and between tilts.
 CADENCE_S, TILT_S = 5.0, 0.1

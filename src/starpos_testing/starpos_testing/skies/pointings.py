@@ -8,11 +8,11 @@ import numpy as np
 
 from starpos import rotation
 from starpos.earth.orientation import EarthState, earth_state, station_velocity
-from starpos.frames.pointings import Pointing
+from starpos.frames.tables import Pointing
 from starpos.instrument.inclinometer import InclinometerErrors, Tilt
 from starpos.instrument.instrument import Calibration, Instrument
 from starpos.instrument.sensors import SCA100T_CALIBRATED
-from starpos.instrument.tilts import TiltsByTime
+from starpos.instrument.tilt_log import TiltsByTime
 from starpos.sky.site import Site, camera_to_enu
 from starpos.units import ARCSEC
 from starpos_testing.skies.scenes import AIR

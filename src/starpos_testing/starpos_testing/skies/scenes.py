@@ -7,7 +7,7 @@ import numpy as np
 
 from starpos.earth.refraction import Atmosphere
 from starpos.fix.solver import Solver
-from starpos.frames.stars import Stars
+from starpos.frames.frame import Stars
 from starpos.instrument.inclinometer import Tilt
 from starpos.simulation.scene import Optics, Scene, detected, expose, read_tilt, scene_of
 

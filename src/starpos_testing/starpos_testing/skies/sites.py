@@ -7,11 +7,11 @@ import numpy as np
 
 from starpos import rotation
 from starpos.fix.solver import Solver
-from starpos.frames.stars import Stars
+from starpos.frames.frame import Stars
 from starpos.instrument.inclinometer import Tilt
 from starpos.instrument.instrument import Calibration, Instrument
 from starpos.instrument.sensors import SCA100T_CALIBRATED
-from starpos.instrument.tilts import TiltsByTime
+from starpos.instrument.tilt_log import TiltsByTime
 from starpos.simulation.scene import Scene
 from starpos.units import ARCSEC
 from starpos_testing.skies.scenes import FOCAL_PX, START, stars_of, tilt_of, wide_scene

@@ -1,0 +1,235 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Saturated stars that no PSF fits: flat discs, and small images clipped to one height."""
+
+import cv2
+import numpy as np
+
+from starpos.detection._neighbours import any_near
+from starpos.detection._sparse import bright_squares, thirds
+from starpos.detection.background import Background
+from starpos.frames.frame import SATURATED
+
+# Pixels above this share of the frame's brightest discs belong to a disc: a plate or a JPEG has no sharp limit.
+FLAT = 0.8
+# Minimum radius of a disc over the FWHM of the stars (smaller ones are fitted by their wings), and in px.
+WIDER, MIN_PX = 1.3, 4.0
+# A disc's radius is at most this share of the frame's shorter side: larger ones are lamps, roofs or the Moon.
+WIDEST = 0.05
+# Minimum height of the disc's top above the sky, in sigma of a pixel's noise.
+CLEAR = 20.0
+# The squared axes of an ellipse of the disc's moments differ at most by this factor; it has that share of its area.
+LONGEST, FULLEST = 3.0, 0.8
+# Maximum number of discs; the largest are kept.
+MOST = 500
+# The centre of a disc is known to this share of its radius.
+OFF_CENTRE = 0.04
+# Light grows with this power of the area, as the wings of stars fall.
+GROWTH = 2.0
+
+
+def find_discs(
+    plane: np.ndarray, background: Background, fwhm_px: float, highest: np.ndarray
+) -> dict[str, np.ndarray]:
+    """Discs of plane (h, w) far wider than its stars of fwhm_px: columns x, y, radius px, flux DN and covariance px2.
+
+    highest (h,) int32: the brightest pixel of each row.
+    """
+    level, noise = background.typical
+    least = max(WIDER * fwhm_px, MIN_PX)
+    # any disc of this radius has a sample whose neighbours to the right, below and between lie on it too
+    step = int(np.sqrt(2) * (least - np.sqrt(0.5)))
+    # no single hot pixel
+    y, x, height = bright_squares(plane, highest, step, int(level + CLEAR * noise))
+    if height.max(initial=0) < level + CLEAR * noise:
+        return columns_of([], fwhm_px, 0.0)
+    top = float(height.max())
+    limit = level + FLAT * (top - level)
+    bright = height >= limit
+    boxes = _groups(y[bright] // step, x[bright] // step)
+    most = WIDEST * min(plane.shape)
+    fits = boxes[:, [cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT]].max(1) * step < 2 * most
+    discs = [_disc(plane, box[:4] * step, 2 * step, limit, least) for box in boxes[fits][:MOST]]
+    return columns_of([d for d in discs if d is not None and d[2] < most], fwhm_px, top - level)
+
+
+def _groups(row: np.ndarray, column: np.ndarray) -> np.ndarray:
+    """Boxes (left, top, width, height) of the groups of places row, column (N,) side by side, the largest group first.
+
+    Only neighbours of rows and columns with a place are looked at: most frames have a few places.
+    """
+    kept = [np.unique(np.stack([place, place + 1])) for place in (row, column)]
+    mask = np.zeros([len(places) for places in kept], np.uint8)
+    mask[np.searchsorted(kept[0], row), np.searchsorted(kept[1], column)] = 1
+    _, _, boxes, _ = cv2.connectedComponentsWithStats(mask, connectivity=8)
+    boxes = boxes[1:][np.argsort(-boxes[1:, cv2.CC_STAT_AREA], kind="stable")]
+    boxes[:, cv2.CC_STAT_LEFT] = kept[1][boxes[:, cv2.CC_STAT_LEFT]]
+    boxes[:, cv2.CC_STAT_TOP] = kept[0][boxes[:, cv2.CC_STAT_TOP]]
+    return boxes
+
+
+def _disc(
+    plane: np.ndarray, box: np.ndarray, around: int, limit: float, least: float
+) -> tuple[float, float, float] | None:
+    """Centre x, y and radius (px) of the disc of pixels above the limit in a box (left, top, width, height) px.
+
+    None if it is not round, not wider than the least radius, or goes on beyond the box and `around` px more.
+    """
+    left, top = (max(0, int(v) - around) for v in box[:2])
+    right, bottom = (int(v + size) + around for v, size in zip(box[:2], box[2:], strict=True))
+    window = (plane[top:bottom, left:right] >= limit).astype(np.uint8)
+    number, _, boxes, _ = cv2.connectedComponentsWithStats(window, connectivity=8)
+    if number < 2:
+        return None
+    k = 1 + int(boxes[1:, cv2.CC_STAT_AREA].argmax())
+    x0, y0, width, height, area = boxes[k]
+    if x0 == 0 or y0 == 0 or x0 + width == window.shape[1] or y0 + height == window.shape[0]:
+        return None
+    if width * height <= np.pi * least**2:
+        return None
+    # holes, as some sensors have where they overflow, count
+    outline, _ = cv2.findContours(
+        window[y0 : y0 + height, x0 : x0 + width], cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE
+    )
+    filled = cv2.drawContours(np.zeros((height, width), np.uint8), [max(outline, key=len)], -1, 1, cv2.FILLED)
+    rows, columns = np.nonzero(filled)
+    area = len(rows)
+    if area <= np.pi * least**2:
+        return None
+    spread = np.linalg.eigvalsh(np.cov(columns, rows))
+    if (
+        spread[0] <= 0
+        or spread[1] > LONGEST * spread[0]
+        or area < FULLEST * 4 * np.pi * np.sqrt(spread.prod())
+    ):
+        return None
+    return left + x0 + columns.mean(), top + y0 + rows.mean(), float(np.sqrt(area / np.pi))
+
+
+def columns_of(
+    discs: list[tuple[float, float, float]], fwhm_px: float, height: float
+) -> dict[str, np.ndarray]:
+    """Discs as columns; height: of their tops above the sky, DN. One as wide as a star's FWHM has that star's flux."""
+    x, y, radius = np.array(discs, float).reshape(-1, 3).T
+    flux = 1.133 * fwhm_px**2 * height * (2 * radius / fwhm_px) ** (2 * GROWTH)
+    return {
+        "x": x,
+        "y": y,
+        "radius": radius,
+        "flux": flux,
+        "covariance": (OFF_CENTRE * radius[:, None, None]) ** 2 * np.eye(2),
+    }
+
+
+def with_discs(
+    stars: dict[str, np.ndarray], discs: dict[str, np.ndarray], fwhm_px: float
+) -> dict[str, np.ndarray]:
+    """The columns of measured stars and of the discs, brightest first.
+
+    A star measured by its wings, near a disc's middle, keeps its place. All else on the disc and its rim is its light.
+    """
+    if not len(discs["x"]):
+        return stars
+    apart = np.hypot(stars["x"][:, None] - discs["x"], stars["y"][:, None] - discs["y"])
+    rows = np.arange(len(discs["x"]))
+    middle = (apart < 0.5 * discs["radius"]) & ((stars["flags"] & SATURATED) != 0)[:, None]
+    fitted = (
+        np.where(middle.any(0), np.argmin(np.where(middle, apart, np.inf), axis=0), -1)
+        if len(apart)
+        else -1 + 0 * rows
+    )
+    own = {
+        "x": discs["x"],
+        "y": discs["y"],
+        "flux": discs["flux"],
+        "snr": np.sqrt(discs["flux"]),
+        "covariance": discs["covariance"],
+        "flags": np.full(len(rows), SATURATED, stars["flags"].dtype),
+        "chi2": np.ones(len(rows)),
+    }
+    known = fitted >= 0
+    for name in ("x", "y", "covariance", "chi2"):
+        own[name][known] = stars[name][fitted[known]]
+    own["flux"][known] = np.maximum(own["flux"][known], stars["flux"][fitted[known]])
+    rest = ~(apart < discs["radius"] + fwhm_px).any(1)
+    columns = {name: np.concatenate([own[name], stars[name][rest]]) for name in own}
+    order = np.argsort(-columns["flux"], kind="stable")
+    return {name: column[order] for name, column in columns.items()}
+
+
+# Maximum relative error at which a fit gives a clipped star's light, and maximum chi2 at which it gives another's.
+TOLD, STRANGE = 0.1, 3.0
+# px. A star measured so near a peak is the peak's.
+NEAR = 2.0
+# Minimum share of the light above sky that belongs to the source itself.
+OWN = 0.5
+# Minimum number of pixels of a clipped image, and its share of the pixels of a star that is just not clipped.
+FEWEST, NARROWER = 4, 0.8
+# Reach of the window around the peak, in widths of a star, and its minimum in px.
+REACH, MIN_REACH = 6.0, 12
+
+
+def with_clipped(
+    stars: dict[str, np.ndarray],
+    plane: np.ndarray,
+    background: Background,
+    x: np.ndarray,
+    y: np.ndarray,
+    fwhm_px: float,
+) -> dict[str, np.ndarray]:
+    """The columns of measured stars and of clipped ones among the peaks x, y (N,) int px, brightest first.
+
+    A saturated star is measured anew if its wings constrain its light weakly, and so is what seems to be several stars in
+    one flat image.
+    """
+    saturated = (stars["flags"] & SATURATED) != 0
+    told = np.sqrt(np.maximum(stars["chi2"], 1.0)) < TOLD * stars["snr"]
+    told |= ~saturated & (stars["chi2"] < STRANGE)
+    # the third highest pixel, because hot ones may exceed saturation
+    level, top = background.near(x, y)[0].mean(1), thirds(plane, x, y)
+    sky = background.typical[0]
+    lost = top - sky > FLAT * (top.max() - sky)
+    at_x, at_y, own_x, own_y, untold = (
+        x.astype(float),
+        y.astype(float),
+        stars["x"],
+        stars["y"],
+        saturated & ~told,
+    )
+    lost[lost] = ~any_near(own_x[told], own_y[told], at_x[lost], at_y[lost], NEAR)
+    lost |= any_near(own_x[untold], own_y[untold], at_x, at_y, NEAR)
+    # what stands on a roof is the roof's
+    lost = (lost & (top - level > OWN * (top - sky))).nonzero()[0][:MOST]
+    reach = max(MIN_REACH, round(REACH * fwhm_px))
+    images = [_image(plane, x[k], y[k], level[k], top[k], reach) for k in lost.tolist()]
+    least = max(FEWEST, NARROWER * np.pi / 4 * fwhm_px**2)
+    # several peaks may belong to one image
+    clipped = [
+        image for image in dict.fromkeys(images) if image is not None and np.pi * image[2] ** 2 >= least
+    ]
+    if not clipped:
+        return stars
+    discs = columns_of(clipped, fwhm_px, float(top.max()) - sky)
+    apart = np.hypot(own_x[:, None] - discs["x"], own_y[:, None] - discs["y"])
+    known = told | ~(apart < discs["radius"]).any(1)
+    return with_discs({name: column[known] for name, column in stars.items()}, discs, fwhm_px)
+
+
+def _image(
+    plane: np.ndarray, x: int, y: int, level: float, highest: float, reach: int
+) -> tuple[float, float, float] | None:
+    """Centre x, y and radius (px) of the pixels around a peak above half its height; None if they are not round."""
+    left, top, half = max(0, x - reach), max(0, y - reach), (highest - level) / 2
+    signal = plane[top : y + reach + 1, left : x + reach + 1] - (level + half)
+    _, group, boxes, _ = cv2.connectedComponentsWithStats((signal > 0).astype(np.uint8), connectivity=8)
+    k = group[y - top, x - left]
+    x0, y0, across, down, area = boxes[k]
+    if k == 0 or min(x0, y0) == 0 or x0 + across == signal.shape[1] or y0 + down == signal.shape[0]:
+        return None
+    rows, columns = np.nonzero(group == k)
+    # with a pixel's own width
+    low, high = np.linalg.eigvalsh(np.cov(columns, rows, bias=True) + np.eye(2) / 12)
+    if high > LONGEST * low or area < FULLEST * 4 * np.pi * np.sqrt(low * high):
+        return None
+    weight = np.minimum(signal[rows, columns], half)
+    centre = np.average(columns, weights=weight), np.average(rows, weights=weight)
+    return left + float(centre[0]), top + float(centre[1]), float(np.sqrt(area / np.pi))

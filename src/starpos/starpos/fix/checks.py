@@ -1,0 +1,216 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Sentences about frames and fixes that cannot be right: noise, no sky, below the horizon, a moved camera, an unknown
+A3.
+"""
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from starpos import rotation
+from starpos.earth.ellipsoid import EARTH_RADIUS_M
+from starpos.earth.orientation import ROTATION_RAD_S
+from starpos.earth.refraction import MIN_COS_ZENITH
+from starpos.errors import FixError, PlaceError
+from starpos.fix.budget import CALIBRATION, ErrorTerm
+from starpos.fix.fix import Fix, angle_text
+from starpos.frames.frame import SATURATED, Stars
+from starpos.identification import MIN_STARS
+from starpos.instrument.camera import Camera
+from starpos.instrument.instrument import Calibration, Instrument
+from starpos.instrument.sensors import UNNAMED
+from starpos.sky import deeper
+from starpos.sky.catalogue import Catalogue
+from starpos.units import ARCSEC, HOUR_S, utc_text
+
+# Lowest altitude with a known refraction.
+MIN_DEG = np.degrees(np.arcsin(MIN_COS_ZENITH))
+
+
+def check_above_horizon(sine: float, calibration: Calibration) -> None:
+    """Raise FixError if a camera's stars are below the horizon, or where no refraction is known.
+
+    sine: of the altitude of their middle by the tilts and A3. While A3 is not known, as before it is found by turning,
+    this has no meaning.
+    """
+    if not calibration.unknown and sine < MIN_COS_ZENITH:
+        raise FixError(
+            f"by the tilts and A3 the stars are {_altitude_text(sine)}, and a position needs stars {MIN_DEG:.0f} "
+            f"deg or more above it: check the signs and the order of the inclinometer's axes, and A3"
+        )
+
+
+def check_visible(sine: float) -> None:
+    """Raise PlaceError if a camera's stars cannot be seen from a known place; sine: of the altitude of the lowest."""
+    if sine < MIN_COS_ZENITH:
+        raise PlaceError(
+            f"from the given place the stars, or some, are {_altitude_text(sine)}, and a heading needs stars "
+            f"{MIN_DEG:.0f} deg or more above it: check latitude and longitude, their order and signs, "
+            f"and the clock"
+        )
+
+
+def _altitude_text(sine: float) -> str:
+    altitude_deg = np.degrees(np.arcsin(max(sine, -1.0)))
+    return f"{abs(altitude_deg):.1f} deg {'above' if altitude_deg > 0 else 'below'} the horizon"
+
+
+# a camera at rest gets beyond it once in 900 frames
+UNMOVED_SIGMAS = 4.0
+
+
+def check_unmoved(fix: Fix, instrument: Instrument, clock_stddev_s: float) -> None:
+    """Raise FixError if a camera with a vertical of its own has turned against the Earth since its calibration.
+
+    A camera that was moved looks like one at another place, but not like the same camera at the same place.
+    """
+    vertical = instrument.vertical
+    if vertical is None:
+        return
+    then = np.asarray(vertical.camera_to_itrs, float)
+    turned = fix.camera_to_itrs @ then.T
+    since_s = abs(fix.utc_unix_s - instrument.calibration.utc_unix_s)
+    sag2 = instrument.inclinometer.drift_rad_per_sqrt_hour**2 * since_s / HOUR_S
+    # the air bends the whole field by about as much as it moves the zenith, then and now
+    air2 = (
+        sum(np.trace(t.covariance[:2, :2]) for t in fix.terms if t.name == "refraction") / EARTH_RADIUS_M**2
+    )
+    covariance = fix.camera_covariance + np.asarray(vertical.covariance_arcsec2) * ARCSEC**2
+    covariance = covariance + np.eye(3) * (sag2 + air2)
+    covariance[2, 2] += 2 * (ROTATION_RAD_S * clock_stddev_s) ** 2
+    angle = float(np.arccos(np.clip((np.trace(turned) - 1) / 2, -1, 1)))
+    small = rotation.to_small_vector(turned)
+    if angle < 0.5 and small @ np.linalg.solve(covariance, small) <= UNMOVED_SIGMAS**2:
+        return
+    raise FixError(
+        f"the camera has moved, by {angle_text(angle)} against the Earth since its calibration of "
+        f"{utc_text(instrument.calibration.utc_unix_s)}, where {angle_text(UNMOVED_SIGMAS * np.sqrt(sag2))} of sag are "
+        "allowed for (or the clock is off): calibrate it again at a known place, or use an inclinometer"
+    )
+
+
+# Number of detections that show the distribution of their brightness.
+MIN_DETECTIONS = 150
+# If the brightest hundredth is less than this many times as bright as the median, all are noise.
+MIN_RANGE, BRIGHTEST_SHARE = 3.5, 0.01
+
+
+def why_noise(stars: Stars) -> str:
+    """A sentence that says why the detections on a frame are noise; '' if they may be stars, and for a list of stars."""
+    # only a detector says how wide images are; the flux of a list may be anything that sorts it
+    if stars.fwhm_px is None or len(stars) < MIN_DETECTIONS:
+        return ""
+    brightest = float(stars.flux[int(BRIGHTEST_SHARE * len(stars))] / np.median(stars.flux))
+    if brightest >= MIN_RANGE:
+        return ""
+    return (
+        f"{stars.place}: its {len(stars)} detections are noise, because nearly all are equally bright (the brightest "
+        f"hundredth {brightest:.1f} times the median): check exposure and lens cap, and save pictures without compression"
+    )
+
+
+# Images wider than this (FWHM, px) are out of focus, or the frame has more pixels than its lens resolves.
+WIDE_PX = 8.0
+# If this share of the brightest detections is saturated, their order of brightness may be wrong.
+BRIGHTEST_STARS, MANY_SATURATED = 20, 0.5
+
+
+def why_unidentified(stars: Stars, camera: Camera, catalogue: Catalogue) -> str:
+    """The sentence for a frame of which no part of the sky was found."""
+    n = len(stars)
+    wide = stars.fwhm_px is not None and stars.fwhm_px > WIDE_PX
+    saturated = (stars.flags & SATURATED) != 0
+    if n < MIN_STARS:
+        hint = f" ({int(saturated.sum())} saturated)" if saturated.any() else ""
+        found = f"{n} stars detected{hint}"
+        focus = (
+            f"they are {stars.fwhm_px:.0f} px wide (FWHM): focus"
+            if wide
+            else "check clouds, focus and exposure"
+        )
+        return f"{stars.place}: {found}, at least {MIN_STARS} are needed: {focus}"
+    causes = []
+    if thin := deeper.too_thin(catalogue, camera):
+        causes.append(thin)
+    if wide:
+        causes.append(f"its stars are {stars.fwhm_px:.0f} px wide (FWHM): focus, or bin the pixels")
+    if np.mean(saturated[:BRIGHTEST_STARS]) >= MANY_SATURATED:
+        causes.append(
+            f"{int(saturated[:BRIGHTEST_STARS].sum())} of its {min(n, BRIGHTEST_STARS)} brightest are saturated, so that "
+            "their order of brightness says little: expose for a shorter time"
+        )
+    causes.append(f"check the focal length ({camera.fx:.0f} px given, 3 % is allowed), clouds and exposure")
+    return f"{stars.place}: no part of the sky matches its {n} stars: {'; '.join(causes)}"
+
+
+# what to do, in the options of `starpos solve` and in the parameters of the node
+BY_OPTIONS = (
+    "turn the instrument on the spot and give --self-calibrate, find it at a known place with starpos calibrate "
+    "--site, or state it with --misalignment and --misalignment-stddev"
+)
+BY_PARAMETERS = (
+    "turn the instrument on the spot and set self_calibration:=true, find it at a known place with solver/calibrate or "
+    "starpos calibrate --site and set calibration_url, or set misalignment and misalignment_stddev"
+)
+# the same for the errors of the inclinometer
+MODEL_BY_OPTIONS = (
+    "name it with --inclinometer MODEL, or its model or errors (tilt_...) in an instrument file"
+)
+MODEL_BY_PARAMETERS = "set inclinometer.model, or name it or its errors in the file of calibration_url"
+# of one lean nothing is known of the turn about the plumb line: then an angle has a sigma of some 100 deg
+UNKNOWN_DEG = 60.0
+# a turn that is known better than so is said to be known; a place that is wider is worth a word
+KNOWN_DEG, WIDE_M = 5.0, 10_000.0
+FIND_TURN = (
+    "calibrate with leans of some degrees between the frames, or state it with --misalignment and "
+    "--turn-stddev"
+)
+
+
+def unknown_a3(
+    calibration: Calibration, covariance: np.ndarray, terms: Iterable[ErrorTerm], ways: str = BY_OPTIONS
+) -> str:
+    """Say in a sentence that A3, or its turn about the plumb line, makes a place wide, and what to do; '' if not.
+
+    covariance: of the place, (2, 2) or larger, of east m and north m first.  terms: the budget of it, or of a fix there.
+    ways: what to do where nothing is known of A3.
+    """
+    metres = float(np.sqrt(np.diag(covariance)[:2].max()))
+    if calibration.unknown:
+        return (
+            f"the misalignment of camera and inclinometer is not known, so the position error is "
+            f"{metres / 1000:.0f} km (1 sigma): {ways}"
+        )
+    own = sum(np.trace(t.covariance[:2, :2]) for t in terms if t.name == CALIBRATION)
+    if metres < WIDE_M or own < 0.5 * np.trace(covariance[:2, :2]) or not may_turn(calibration):
+        return ""
+    return (
+        "the instrument leans otherwise than when A3 was found, and A3's turn about the plumb line, "
+        f"{_turn_text(calibration)}, makes the position error {metres / 1000:.0f} km (1 sigma): lean it as then, "
+        f"or {FIND_TURN}"
+    )
+
+
+def unnamed_inclinometer(instrument: Instrument, ways: str = MODEL_BY_OPTIONS) -> str:
+    """Say that no inclinometer is stated, and which one is assumed; '' if one is stated."""
+    if instrument.vertical is not None or instrument.inclinometer_model or instrument.inclinometer != UNNAMED:
+        return ""
+    return (
+        "the inclinometer's model is not stated: the errors of an SCA100T as sold are assumed, "
+        f"{np.degrees(UNNAMED.pose_rad):.2f} deg, 7 km or more (1 sigma): {ways}"
+    )
+
+
+def may_turn(calibration: Calibration) -> bool:
+    """Whether A3's turn about the plumb line is hardly known."""
+    return calibration.turn_stddev_deg > KNOWN_DEG
+
+
+def at_another_lean(calibration: Calibration) -> str:
+    """Say how well A3's turn about the plumb line is known, which counts at another lean."""
+    return f"at another lean A3's turn about the plumb line matters, {_turn_text(calibration)}"
+
+
+def _turn_text(calibration: Calibration) -> str:
+    turn_deg = calibration.turn_stddev_deg
+    return "which is not known" if turn_deg > UNKNOWN_DEG else f"known to {turn_deg:.2g} deg"

@@ -1,0 +1,284 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Identify or solve a frame by every way there is, one after another, until one succeeds or time is up.  First its stars
+as they are, with a second look at the frame; then smaller triangles, in case stars fill only a part of the frame;
+then the same with stars from other detections. A list of stars has no other detections. A focal length that only a
+header states is a hint: if it fits nothing, the search goes on without it.
+"""
+
+import itertools
+import math
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+from starpos.budget import Budget
+from starpos.earth.known_place import Places
+from starpos.errors import FieldError, StarposError
+from starpos.fix.blind import BlindSolver
+from starpos.fix.solution import Solution, Status
+from starpos.fix.solver import Solver, focal_that_fits, placed
+from starpos.frames.frame import Frame, Stars
+from starpos.frames.header import focal_mm
+from starpos.identification import Identification, blind, quads
+from starpos.identification.blind import STAGES
+from starpos.identification.hint import Hint
+from starpos.identification.search import MIN_LOG_ODDS_WITH_LOOK, Priors
+from starpos.instrument.instrument import Instrument
+from starpos.instrument.tilt_log import Tilts
+from starpos.progress import Progress
+
+if TYPE_CHECKING:
+    from starpos.detection.second_look import SecondLook
+
+# Maximum number of other detections of a frame. Each is another try, with a second look of its own, and needs log-odds of
+# MIN_LOG_ODDS_OTHERWISE: together they add 0.01 wrong answers in 1e9 frames.
+MAX_WAYS = 3
+MIN_LOG_ODDS_OTHERWISE = MIN_LOG_ODDS_WITH_LOOK + math.log(10 * MAX_WAYS)
+# If stars fill only a part of a frame (a roof, clouds, a white half), triangles of a field of this relative size help.
+PART = 0.6
+# stages of the search at every scale, for stars from other detections
+QUICK, QUICK_FISHEYE = STAGES[:2], blind.FISHEYE_STAGES[:1]
+# statuses that were found before any identification
+UNASKED = (Status.NO_TILT, Status.TILT_OUT_OF_RANGE)
+# a deadline, by time.monotonic, that is never reached
+NEVER_S = math.inf
+
+
+@dataclass(frozen=True, eq=False)
+class Sight:
+    """A detection of a frame: its stars, and their solution.
+
+    instrument: with the focal length that fits, if the frame header's does not; else None.
+    """
+
+    stars: Stars
+    solution: Solution
+    instrument: Instrument | None = None
+
+    @property
+    def found(self) -> Identification | None:
+        """The identification; None without one."""
+        return self.solution.found
+
+
+def identify_every_way(
+    solver: Solver, item: Frame | Stars, stars: Stars, predicted: Priors = (), until_s: float = NEVER_S
+) -> Sight:
+    """Identify a frame or a list with these stars; no way is begun after until_s (time.monotonic).
+
+    Returns the stars that identified it, or the given ones with the first answer if none did.
+    """
+
+    first = Sight(stars, solver.identify(stars, predicted, look_at(item, stars)))
+    if not first.solution.lost:
+        return first
+
+    def ways(seen: Stars) -> Iterator[Solution]:
+        look = look_at(item, seen)
+        if seen is not stars:
+            yield solver.identify(seen, predicted, look)
+        yield solver.identify(seen, predicted, look, part=PART)
+
+    return _another(item, first, ways, lambda: time.monotonic() >= until_s)
+
+
+def identify_blind_every_way(solver: BlindSolver, item: Frame | Stars, stars: Stars) -> Sight:
+    """Identify a frame or a list of any scale, as `identify_every_way` does for a known scale.
+
+    All ways together have the CPU time that the solver has for a search.
+    """
+    budget = Budget.of(solver.search_s)
+
+    def ways(seen: Stars) -> Iterator[Solution]:
+        if seen is not stars:
+            quick = replace(solver, stages=QUICK, fisheye_stages=QUICK_FISHEYE, search_s=budget.left_s)
+            yield quick.identify(seen)
+
+    return _another(item, Sight(stars, solver.identify(stars)), ways, lambda: budget.spent)
+
+
+def solve_every_way(
+    solver: Solver,
+    item: Frame | Stars,
+    stars: Stars,
+    tilts: Tilts,
+    hint: Hint | None = None,
+    predicted: Priors = (),
+    until_s: float = NEVER_S,
+    known: Identification | None = None,
+) -> Sight:
+    """The fix of a frame or a list with these stars, identified by every way there is until until_s.
+
+    known: the identification of these stars, if there is one already.
+    """
+    answer = solver.solve(stars, tilts, hint, predicted, known)
+    if answer.lost and time.monotonic() < until_s:
+        sight = identify_every_way(solver, item, stars, predicted, until_s)
+        if sight.found is not None:
+            again = solver.solve(sight.stars, tilts, hint, predicted, known=sight.found)
+            return Sight(sight.stars, replace(again, identify_s=answer.identify_s + again.identify_s))
+    return Sight(stars, answer)
+
+
+def answer_frame(
+    solver: Solver,
+    item: Frame | Stars,
+    stars: Stars,
+    tilts: Tilts | None,
+    places: Places | None,
+    hint: Hint | None = None,
+    predicted: Priors = (),
+    until_s: float = NEVER_S,
+    known: Identification | None = None,
+) -> Sight:
+    """The fix of a frame or a list by its tilt, as `solve_every_way` has it, and its heading where the place is known.
+
+    tilts: None if only headings are wanted.
+    """
+    if tilts is None:
+        sight = identify_every_way(solver, item, stars, predicted, until_s)
+    else:
+        sight = solve_every_way(solver, item, stars, tilts, hint, predicted, until_s, known)
+    if places is None:
+        return sight
+    answer = sight.solution
+    if answer.found is None and answer.status in UNASKED:
+        sight = identify_every_way(solver, item, stars, predicted, until_s)
+        if sight.found is None:
+            return sight
+        answer = replace(sight.solution, status=answer.status, message=answer.message)
+    return replace(sight, solution=placed(solver, sight.stars, answer, places))
+
+
+def focal_px_that_fits(solver: Solver, stars: Stars) -> float | None:
+    """A focal length in px at which stars are identified after the given one failed; None if none is found.
+
+    Near the given one, or wherever the first stage of the search at every scale finds it, if its quads are built.
+    """
+    found = focal_that_fits(solver, stars)
+    if found is None and quads.is_built(solver.catalogue):
+        answer = BlindSolver(solver.catalogue, stages=STAGES[:1], fisheye_stages=()).identify(stars)
+        found = None if answer.attitude is None else answer.attitude.focal_px
+    return found
+
+
+def look_at(item: Frame | Stars, stars: Stars) -> "SecondLook | None":
+    """A second look at the frame of the stars; None for a list."""
+    if isinstance(item, Stars):
+        return None
+    from starpos.detection.second_look import SecondLook, negative_of
+
+    return SecondLook.of(negative_of(item) if stars.negative else item, stars)
+
+
+def _another(
+    item: Frame | Stars,
+    first: Sight,
+    ways: Callable[[Stars], Iterator[Solution]],
+    is_over: Callable[[], bool],
+) -> Sight:
+    """The next sight of a frame that is identified beyond doubt, by any way and detection; else the first.
+
+    A first sight that is not lost is the answer. No way is begun once time is up.
+    """
+    if not first.solution.lost or is_over():
+        return first
+    for seen, enough in _seen(item, first.stars):
+        for answer in ways(seen):
+            if answer.attitude is not None and answer.attitude.log_odds >= enough:
+                return Sight(seen, answer)
+            if is_over():
+                return first
+    return first
+
+
+def _seen(item: Frame | Stars, stars: Stars) -> Iterator[tuple[Stars, float]]:
+    """Yield the stars of a frame, then of its other detections, each with its minimum log-odds."""
+    yield stars, -math.inf
+    if isinstance(item, Stars):
+        return
+    # slow to import, and seldom needed
+    from starpos.detection.second_look import negative_of, otherwise
+
+    seen = otherwise(negative_of(item) if stars.negative else item, stars.window)
+    for others in itertools.islice(seen, MAX_WAYS):
+        yield replace(others, negative=stars.negative), MIN_LOG_ODDS_OTHERWISE
+
+
+# CPU time, s, of the search at every scale for a frame with a header: under clouds each frame of a night takes it.
+HINT_SEARCH_S = 5.0
+
+
+def without_hint(
+    solver: Solver,
+    item: Frame | Stars,
+    stars: Stars,
+    sight: Sight,
+    work: Callable[[Solver], Sight],
+    progress: Progress,
+) -> Sight:
+    """The sight of a frame with its header's focal length, or if that identifies nothing, with the one that fits.
+
+    solver: with the header's focal length. work: gives the sight with any solver.
+    """
+    if not _misled(solver, item, sight):
+        return sight
+    fitting = _fitting(solver, item, stars, progress)
+    if fitting is None:
+        return sight
+    again = work(replace(solver, instrument=fitting))
+    if again.solution.attitude is None:
+        return sight
+    remark = wrong_header(item, again.solution.attitude.focal_px)
+    return replace(again, solution=replace(again.solution, remark=remark), instrument=fitting)
+
+
+def of_one_camera(
+    solver: Solver, sights: Sequence[Sight]
+) -> tuple[Solver, list[tuple[Stars, Identification | None]]]:
+    """A solver with the focal length of a night's frames, and each frame with its identification by this solver.
+
+    solver: with the header's focal length, which holds unless a frame was identified with another one.
+    """
+    other = next((s.instrument for s in sights if s.instrument is not None), None)
+    if other is not None:
+        solver = replace(solver, instrument=other)
+    return solver, [(s.stars, s.found if s.instrument is other else None) for s in sights]
+
+
+def wrong_header(item: Frame | Stars, focal_px: float) -> str:
+    """A sentence that says which focal length fits a frame in place of its header's."""
+    told = "" if item.focal_px is None else f": it makes a focal length of {item.focal_px:.0f} px"
+    fits = f"{focal_px:.0f} px"
+    if item.focal_px is not None and item.pixel_um is not None:
+        told += f" ({focal_mm(item.focal_px, item.pixel_um):.4g} mm, pixels of {item.pixel_um:g} um)"
+        fits += f", {focal_mm(focal_px, item.pixel_um):.4g} mm for such pixels,"
+    return f"{item.place}: its header is wrong{told}; {fits} fits"
+
+
+def _misled(solver: Solver, item: Frame | Stars, sight: Sight) -> bool:
+    """Whether another focal length may identify a frame that is not identified."""
+    if sight.solution.status is Status.NOT_IDENTIFIED:
+        return True
+    if sight.solution.status is not Status.BAD_INPUT:
+        return False
+    try:
+        solver.view(item.width, item.height, item.origin_px)
+    except FieldError:
+        return True
+    # the solution has the sentence
+    except StarposError:
+        return False
+    return False
+
+
+def _fitting(solver: Solver, item: Frame | Stars, stars: Stars, progress: Progress) -> Instrument | None:
+    """The solver's instrument with the focal length, and the lens, that a frame's stars fit; None if none is found."""
+    focal_px = focal_that_fits(solver, stars)
+    if focal_px is not None:
+        return replace(solver.instrument, focal_px=focal_px)
+    blind = BlindSolver(solver.catalogue, progress, search_s=HINT_SEARCH_S)
+    blind.prepare()
+    seen = identify_blind_every_way(blind, item, stars).solution.attitude
+    return None if seen is None else replace(solver.instrument, focal_px=seen.focal_px, model=seen.model)

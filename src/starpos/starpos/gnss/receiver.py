@@ -1,0 +1,275 @@
+# SPDX-License-Identifier: Apache-2.0
+"""GNSS places of a receiver, by messages or a table: checked, and in the order of their time."""
+
+import csv
+import io
+import math
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from starpos.earth.ellipsoid import curvature_radii_m, enu_axes, zenith_of
+from starpos.earth.known_place import KnownPlace
+from starpos.earth.vertical import Vertical
+from starpos.errors import GnssError, one_line
+from starpos.files import read_regular
+from starpos.messages.stamp import stamp_to_unix
+from starpos.rotation import half_turn
+
+# Names of datums that lie up to kilometres off NavSatFix's, WGS 84.
+OTHER_DATUMS = (
+    "nad27",
+    "nad83",
+    "ed50",
+    "osgb",
+    "gcj02",
+    "gcj-02",
+    "bd09",
+    "bd-09",
+    "pz90",
+    "pz-90",
+    "tokyo",
+    "sk42",
+    "sk-42",
+)
+# A receiver that states a larger error gives no place.
+MAX_SIGMA_M = 10_000.0
+# A receiver's default output before it has a place.
+NULL_ISLAND_DEG = 1e-5
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class GnssPlace:
+    """Latitude and longitude on WGS 84 (rad), and the covariance (2, 2) of east and north, m2."""
+
+    utc_unix_s: float
+    latitude: float
+    longitude: float
+    covariance: np.ndarray
+
+    @property
+    def zenith(self) -> np.ndarray:
+        """Up (3,) in ITRS by the ellipsoid."""
+        return zenith_of(self.latitude, self.longitude)
+
+    @property
+    def axes(self) -> np.ndarray:
+        """East, north, up (3, 3) in ITRS by the ellipsoid."""
+        return enu_axes(self.latitude, self.longitude)
+
+    def from_place_m(self, latitude: float, longitude: float) -> np.ndarray:
+        """East, north (2,) in m from a geodetic place (rad) to this one."""
+        prime, meridian = curvature_radii_m(latitude)
+        east = half_turn(self.longitude - longitude) * prime * np.cos(latitude)
+        return np.array([east, (self.latitude - latitude) * meridian])
+
+
+def checked(
+    utc_unix_s: float, latitude_deg: float, longitude_deg: float, covariance: np.ndarray, status: float
+) -> GnssPlace:
+    """The place of a receiver's output; GnssError that says why it gives none.
+
+    covariance (2, 2): of east and north, m2.  status: as in NavSatStatus, below 0 without a fix.
+    """
+    if not status >= 0:
+        raise GnssError("GNSS has no fix: give its antenna a clear view of the sky")
+    if not np.isfinite([utc_unix_s, latitude_deg, longitude_deg]).all():
+        raise GnssError(
+            "GNSS states a fix whose time, latitude or longitude is not a number: check its driver"
+        )
+    if abs(latitude_deg) > 90 or abs(longitude_deg) > 360:
+        raise GnssError(
+            f"GNSS states latitude {latitude_deg:g}, longitude {longitude_deg:g}: send deg, latitude first"
+        )
+    if max(abs(latitude_deg), abs(longitude_deg)) < NULL_ISLAND_DEG:
+        raise GnssError(
+            "GNSS states a fix at 0 N 0 E, a receiver's output before it has a place: it is left out"
+        )
+    if not np.isfinite(covariance).all() or np.linalg.eigvalsh(covariance)[0] <= 0:
+        raise GnssError("GNSS states no error of its place: have its driver fill in the covariance")
+    if np.sqrt(np.trace(covariance)) > MAX_SIGMA_M:
+        raise GnssError(f"GNSS states an error of over {MAX_SIGMA_M / 1000:g} km: it is left out")
+    return GnssPlace(
+        utc_unix_s=utc_unix_s,
+        latitude=float(np.radians(latitude_deg)),
+        longitude=half_turn(np.radians(longitude_deg)),
+        covariance=covariance,
+    )
+
+
+def message_to_gnss(message: Any, unstated_m: float = math.nan) -> GnssPlace:
+    """The place of a sensor_msgs/NavSatFix; GnssError that says why it has none.
+
+    unstated_m: 1 sigma an axis of a fix that states no error; NaN: such a fix is refused.
+    """
+    unix_s = stamp_to_unix(message.header.stamp)
+    if unix_s is None:
+        raise GnssError("a GNSS message has no time stamp: set header.stamp to the time of its fix")
+    frame = message.header.frame_id.lower().replace("-", "").replace("_", "")
+    if any(datum in frame for datum in OTHER_DATUMS):
+        raise GnssError(
+            f"GNSS's frame_id {message.header.frame_id[:40]!r} names another datum than WGS 84: set the receiver to that"
+        )
+    covariance = np.reshape(np.array(message.position_covariance, float), (3, 3))[:2, :2]
+    stated = np.isfinite(covariance).all() and np.linalg.eigvalsh(covariance)[0] > 0
+    if message.position_covariance_type == 0 or not stated:
+        covariance = np.eye(2) * unstated_m**2
+    return checked(unix_s, message.latitude, message.longitude, covariance, message.status.status)
+
+
+def known_place(gnss: GnssPlace, vertical: Vertical) -> KnownPlace:
+    """A GNSS place as one that is known, with the deflection there."""
+    latitude, longitude = np.degrees([gnss.latitude, gnss.longitude]).tolist()
+    return KnownPlace.on_ellipsoid(latitude, longitude, vertical, gnss.covariance)
+
+
+# Maximum time between a GNSS place and a frame, s.
+NEAREST_S = 3.0
+# Maximum speed of a vehicle between two places, m/s, and tolerance beyond it, in sigma of both.
+MAX_SPEED, SIGMAS = 150.0, 8.0
+# Stamps closer than this are one.
+SAME_S = 1e-4
+
+
+class GnssTrack:
+    """GNSS places by time.
+
+    Two places of one moment that contradict each other give none: two receivers, or a spoofed one.
+    """
+
+    def __init__(self, places: list[GnssPlace]) -> None:
+        ordered = sorted(places, key=lambda p: p.utc_unix_s)
+        self._places = _agreeing(ordered)
+        self._times = np.array([p.utc_unix_s for p in self._places])
+
+    def __len__(self) -> int:
+        return len(self._places)
+
+    def at(self, utc_unix_s: float) -> GnssPlace | None:
+        """The place at a time, between the two nearest to it; None without one near.
+
+        GnssError if those contradict each other.
+        """
+        k = int(np.searchsorted(self._times, utc_unix_s))
+        near = [p for p in self._places[max(k - 1, 0) : k + 1] if abs(p.utc_unix_s - utc_unix_s) <= NEAREST_S]
+        if not near:
+            return None
+        if len(near) == 1:
+            return self._carried(near[0], utc_unix_s)
+        before, after = near
+        if not agree(before, after):
+            raise GnssError(
+                "GNSS's places leap by more than any vehicle drives: check that one receiver publishes, not two"
+            )
+        step_s = after.utc_unix_s - before.utc_unix_s
+        return _between(before, after, (utc_unix_s - before.utc_unix_s) / step_s if step_s > SAME_S else 0.5)
+
+    def _carried(self, place: GnssPlace, utc_unix_s: float) -> GnssPlace:
+        """A place carried to a time after the last one, or before the first, with the error of that way."""
+        k = int(np.searchsorted(self._times, place.utc_unix_s))
+        other = self._places[k - 1] if k else self._places[1] if len(self._places) > 1 else place
+        span_s = max(abs(place.utc_unix_s - other.utc_unix_s), 1.0)
+        speed = float(np.linalg.norm(place.from_place_m(other.latitude, other.longitude))) / span_s
+        way_m = speed * (utc_unix_s - place.utc_unix_s)
+        return GnssPlace(
+            utc_unix_s=utc_unix_s,
+            latitude=place.latitude,
+            longitude=place.longitude,
+            covariance=place.covariance + np.eye(2) * way_m**2,
+        )
+
+
+def agree(a: GnssPlace, b: GnssPlace) -> bool:
+    """Whether a vehicle may have gone from one place to the other in the time between them."""
+    apart_m = float(np.linalg.norm(a.from_place_m(b.latitude, b.longitude)))
+    sigma_m = float(np.sqrt(np.linalg.eigvalsh(a.covariance + b.covariance)[-1]))
+    return apart_m <= MAX_SPEED * abs(a.utc_unix_s - b.utc_unix_s) + SIGMAS * sigma_m
+
+
+def _agreeing(ordered: list[GnssPlace]) -> list[GnssPlace]:
+    """One place for each moment; none if a moment's places contradict each other."""
+    kept: list[GnssPlace] = []
+    start = 0
+    for end in range(1, len(ordered) + 1):
+        if end < len(ordered) and ordered[end].utc_unix_s - ordered[start].utc_unix_s <= SAME_S:
+            continue
+        if all(agree(ordered[start], other) for other in ordered[start + 1 : end]):
+            kept.append(ordered[start])
+        start = end
+    return kept
+
+
+def _between(before: GnssPlace, after: GnssPlace, share: float) -> GnssPlace:
+    """The place at a share of the way, with the larger error of the two."""
+    latitude = before.latitude + share * (after.latitude - before.latitude)
+    turn = np.remainder(after.longitude - before.longitude + np.pi, 2 * np.pi) - np.pi
+    larger = max(before, after, key=lambda p: float(np.trace(p.covariance)))
+    return GnssPlace(
+        utc_unix_s=before.utc_unix_s + share * (after.utc_unix_s - before.utc_unix_s),
+        latitude=latitude,
+        longitude=before.longitude + share * float(turn),
+        covariance=larger.covariance,
+    )
+
+
+NEEDED = ("utc_unix_s", "latitude", "longitude", "sigma_east_m", "sigma_north_m")
+COLUMNS = ("utc_unix_s", "latitude", "longitude", "altitude_m", "sigma_east_m", "sigma_north_m", "status")
+# a month of 1 Hz
+MAX_BYTES = 300_000_000
+CURE = f"give a CSV with a line of names, {','.join(COLUMNS)}, and a row a fix, deg on WGS 84"
+
+
+def read_gnss_csv(path: Path | str) -> tuple[GnssTrack, tuple[str, ...]]:
+    """Read the fixes of a receiver, and a sentence for each kind of row that was left out; GnssError if it cannot be.
+
+    Columns: utc_unix_s, latitude, longitude in deg on WGS 84, sigma_east_m, sigma_north_m; status as NavSatStatus's (0 if
+    there is no such column).  Cells may be empty.  Rows may come in any order.
+    """
+    try:
+        text = read_regular(path, MAX_BYTES).decode("utf-8-sig")
+    except FileNotFoundError:
+        raise GnssError(f"{path}: there is no such file: {CURE}") from None
+    except (OSError, UnicodeDecodeError) as e:
+        reason = getattr(e, "strerror", None) or one_line(e)
+        raise GnssError(f"{path}: not a readable table of GNSS ({reason}): {CURE}") from None
+    reader = csv.DictReader(io.StringIO(text), skipinitialspace=True)
+    names = [name.strip().lstrip("# ") for name in reader.fieldnames or ()]
+    reader.fieldnames = names
+    lacking = [name for name in NEEDED if names.count(name) != 1]
+    if lacking:
+        raise GnssError(
+            f"{path}: not a readable table of GNSS (it has no column {lacking[0]}, or two): {CURE}"
+        )
+    places: list[GnssPlace] = []
+    faults: Counter[str] = Counter()
+    try:
+        for row in reader:
+            try:
+                places.append(_place(row))
+            except GnssError as error:
+                faults[str(error)] += 1
+    except csv.Error as e:
+        raise GnssError(f"{path}: not a readable table of GNSS ({one_line(e)}): {CURE}") from None
+    track = GnssTrack(places)
+    if len(track) < len(places):
+        faults["places of one moment contradict each other: give the fixes of one receiver"] += len(
+            places
+        ) - len(track)
+    return track, tuple(f"{path}: {number} rows left out: {why}" for why, number in faults.most_common())
+
+
+def _place(row: dict[str, str]) -> GnssPlace:
+    t, latitude, longitude, east, north = (_number(row.get(name)) for name in NEEDED)
+    status = _number(row.get("status", "0"))
+    covariance = np.diag(np.square([east, north])) if min(east, north) > 0 else np.full((2, 2), np.nan)
+    return checked(t, latitude, longitude, covariance, status)
+
+
+def _number(cell: str | None) -> float:
+    try:
+        return float(cell or "nan")
+    except (TypeError, ValueError):
+        return math.nan

@@ -1,0 +1,456 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Identify the stars of a fisheye, whose field no plane can hold.
+
+A part of the field is taken as a pinhole would see it, first the middle, then others in case that is covered, and
+identified like any frame. Then all stars are matched, with the lens itself.
+
+Extend the identification of a part of a fisheye's frame to the whole of it, and find out its lens on the way.
+
+Stars near identified ones are matched first. Each ring of them improves the lens (focal length, axis and distortion),
+which then predicts the next ring.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from starpos import rotation
+from starpos.identification._frame import FrameStars
+from starpos.identification.evidence import (
+    BENT_PX,
+    BLEND_PX,
+    EDGE_PX,
+    FAINTEST_FIT,
+    FLOOR_PX,
+    GATE_PX,
+    GATE_SIGMA,
+    INSIDE_PX,
+    MIN_LOG_ODDS,
+    MIN_SPREAD_PX,
+    MIN_STARS,
+    Identification,
+    OnFrame,
+)
+from starpos.identification.pose import Pose, close_pairs, mutual_nearest, stars_at
+from starpos.identification.prior import PlumbPrior, PointingPrior
+from starpos.identification.sky import Sky
+from starpos.instrument.camera import EQUIDISTANT, Camera
+from starpos.sky.catalogue import Catalogue, rows_near
+from starpos.units import SIGMA_PER_MAD
+
+# A fisheye whose corners are farther off the middle than this is worked by parts.
+WIDE_RAD = math.radians(25)
+# Half the sides of a part; how far off the axis the middles of the other parts lie, and in how many directions.
+HALF_RAD, OFF_RAD, AROUND = math.radians(30), math.radians(45), 4
+# Rounds of matching, steps of a fit, its numerical derivative (rad), and the step that ends it.
+ROUNDS, STEPS, STEP_RAD, SETTLED = 6, 8, 1e-6, 1e-10
+# A coordinate where no star is.
+FAR_PX = -1e7
+# The rows of a mirrored frame run bottom-up.
+FLIP = np.diag([1.0, -1.0, 1.0])
+
+
+def is_wide(camera: Camera) -> bool:
+    """Whether the frames of a camera are worked by parts."""
+    return camera.model == EQUIDISTANT and camera.half_diagonal_rad > WIDE_RAD
+
+
+def field_rad(camera: Camera) -> float:
+    """Half the diagonal, rad, of what is identified at once: of the frame, or of a part of it."""
+    return pinhole_of(camera).half_diagonal_rad if is_wide(camera) else camera.half_diagonal_rad
+
+
+@dataclass(frozen=True)
+class WideField:
+    """N stars of a fisheye's frame, brightest first.
+
+    directions  (N, 3) in C
+    sigma_px    (N,): their errors along one axis
+    """
+
+    directions: np.ndarray
+    sigma_px: np.ndarray
+    camera: Camera
+
+
+@dataclass(frozen=True)
+class Part:
+    """The stars of a part of a frame, as an ideal camera that looks there sees them.
+
+    turn        (3, 3): C into that camera
+    row         (n,): which of the frame's stars they are
+    directions  (n, 3): in that camera
+    sigma_px    (n,): their errors on its frame
+    """
+
+    camera: Camera
+    turn: np.ndarray
+    row: np.ndarray
+    directions: np.ndarray
+    sigma_px: np.ndarray
+
+    @property
+    def field(self) -> FrameStars:
+        """The stars on the frame of the part's camera."""
+        return stars_at(self.camera, self.camera.project(self.directions), self.sigma_px)
+
+    def turned(self, priors: Sequence[PointingPrior | PlumbPrior]) -> tuple[PointingPrior | PlumbPrior, ...]:
+        """Priors of the frame, turned into this part."""
+        return tuple(
+            replace(p, attitude=self.turn @ p.attitude)
+            if isinstance(p, PointingPrior)
+            else replace(p, zenith_camera=self.turn @ p.zenith_camera)
+            for p in priors
+        )
+
+
+def parts(field: WideField) -> list[Part]:
+    """The parts of a frame: first its middle."""
+    pinhole = pinhole_of(field.camera)
+    return [part_at(field, pinhole, turn) for turn in _turns(field.camera, pinhole)]
+
+
+def part_at(field: WideField, pinhole: Camera, turn: np.ndarray) -> Part:
+    """The part that an ideal camera sees into which a rotation (3, 3) takes C."""
+    seen = field.directions @ turn.T
+    xy = pinhole.project(seen)
+    with np.errstate(invalid="ignore"):
+        row = np.flatnonzero(((xy >= 0) & (xy <= [pinhole.width - 1, pinhole.height - 1])).all(1))
+    # a pinhole's picture is stretched away from its middle
+    return Part(pinhole, turn, row, seen[row], field.sigma_px[row] / seen[row, 2] ** 2)
+
+
+def pinhole_of(camera: Camera) -> Camera:
+    """The ideal camera of a part: as wide as the frame, but at most HALF_RAD to each side."""
+    across = np.minimum(
+        [camera.cx, camera.cy], np.array([camera.width, camera.height]) - 1 - [camera.cx, camera.cy]
+    )
+    half = np.minimum(np.maximum(across, 1) / [camera.fx, camera.fy], HALF_RAD)
+    width, height = (2 * max(1, round(camera.fx * math.tan(angle))) for angle in half)
+    return Camera.from_focal(width, height, camera.fx)
+
+
+def _turns(camera: Camera, pinhole: Camera) -> list[np.ndarray]:
+    """Rotations (3, 3) of C into the cameras of the parts: all but the first lie wholly on the frame."""
+    turns = [np.eye(3)]
+    x, y = np.meshgrid(np.linspace(0, pinhole.width - 1, 5), np.linspace(0, pinhole.height - 1, 5))
+    grid = pinhole.directions(x.ravel(), y.ravel())
+    for angle in 2 * np.pi * np.arange(AROUND) / AROUND:
+        turn = rotation.from_vector(OFF_RAD * np.array([math.cos(angle), math.sin(angle), 0.0]))
+        xy = camera.project(grid @ turn)
+        if ((xy >= 0) & (xy <= [camera.width - 1, camera.height - 1])).all():
+            turns.append(turn)
+    return turns
+
+
+def enough(part_count: int) -> float:
+    """Log-odds that one of `part_count` parts needs, so that all together are as safe as a frame."""
+    return float(MIN_LOG_ODDS) + math.log(part_count)
+
+
+def part_of(field: WideField, sky: Sky, found: Identification) -> tuple[Part, Identification]:
+    """The part with most identified stars of a frame, and the identification in terms of the part."""
+    best = max(parts(field), key=lambda p: np.isin(found.star, p.row).sum())
+    inside = np.isin(found.star, best.row)
+    star, catalogue = np.searchsorted(best.row, found.star[inside]), found.catalogue[inside]
+    flip = FLIP if found.mirrored else np.eye(3)
+    stars = best.field
+    pose = Pose(flip @ best.turn @ flip @ found.attitude, stars.focal_px * found.focal_scale, found.mirrored)
+    residual = stars.xy[int(found.mirrored)][star] - pose.project(sky.directions(catalogue))
+    from_middle = np.abs(pose.project(sky.directions(found.expected)) - stars.middle)
+    return best, found.but(
+        star=star,
+        catalogue=catalogue,
+        blend_px=found.blend_px[inside],
+        attitude=pose.attitude,
+        mean_square_px2=_mean_square(residual),
+        expected=found.expected[(from_middle < stars.half - INSIDE_PX).all(1)],
+    )
+
+
+@dataclass(frozen=True)
+class LensPose:
+    """A pose of the fisheye among the stars: attitude (3, 3), `Sky`'s directions into C."""
+
+    camera: Camera
+    attitude: np.ndarray
+    mirrored: bool
+
+    def project(self, w: np.ndarray) -> np.ndarray:
+        """Pixels (n, 2) of directions w (n, 3); NaN outside the lens's picture."""
+        u = w @ self.attitude.T
+        return self.camera.project(u @ FLIP if self.mirrored else u)
+
+    def moved(self, turn: np.ndarray, scale: float) -> "LensPose":
+        """The pose turned by turn (3,) rad about C's axes, its focal length longer by the share `scale`."""
+        return replace(
+            self, camera=self.camera.scaled(1 + scale), attitude=rotation.from_vector(turn) @ self.attitude
+        )
+
+    def fitted(self, xy: np.ndarray, w: np.ndarray, error_px: np.ndarray) -> "LensPose":
+        """Fit attitude and focal length to pixels xy (n, 2), with errors (n,) px, of directions w (n, 3)."""
+        pose = self
+        for _ in range(STEPS):
+            here = pose.project(w)
+            ahead = [pose.moved(turn, 0.0).project(w) for turn in np.eye(3) * STEP_RAD]
+            ahead.append(pose.moved(np.zeros(3), STEP_RAD).project(w))
+            slope = (np.stack(ahead, -1) - here[..., None]) / STEP_RAD
+            on = np.isfinite(slope).all((1, 2))
+            weight = 1 / error_px[on]
+            j = (slope[on] * weight[:, None, None]).reshape(-1, 4)
+            step = np.linalg.lstsq(j, ((xy - here)[on] * weight[:, None]).ravel(), rcond=None)[0]
+            pose = pose.moved(step[:3], float(step[3]))
+            if np.abs(step).max() < SETTLED:
+                break
+        return pose
+
+    def identified(
+        self, field: WideField, xy: np.ndarray, there: OnFrame, pair: np.ndarray, found: Identification
+    ) -> Identification:
+        """The identification of a field, its stars at xy (N, 2), that pairs (2, M) of stars and those there make."""
+        star, sigma = pair[0], field.sigma_px[pair[0]]
+        residual = xy[star] - self.project(there.directions[pair[1]])
+        return Identification(
+            star=star,
+            catalogue=there.index[pair[1]],
+            blend_px=there.blend_px[pair[1]],
+            attitude=self.attitude,
+            focal_scale=self.camera.fx / field.camera.fx,
+            residual_px=_rms_px(residual, np.hypot(sigma, FLOOR_PX)),
+            mean_square_px2=_mean_square(residual),
+            log_odds=found.log_odds,
+            expected=there.index[_within(self.project(there.directions), field.camera, -INSIDE_PX)],
+            mirrored=found.mirrored,
+        )
+
+
+def everywhere(field: WideField, sky: Sky, part: Part, found: Identification) -> Identification | None:
+    """Extend the identification of a part to the whole frame.
+
+    None if the lens puts the identified stars in other places.
+    """
+    flip = FLIP if found.mirrored else np.eye(3)
+    attitude = flip @ part.turn.T @ flip @ found.attitude
+    pose = LensPose(field.camera.scaled(found.focal_scale), attitude, found.mirrored)
+    # ignore stars that fall outside the picture once refraction is removed
+    xy = np.nan_to_num(field.camera.project(field.directions[:FAINTEST_FIT]), nan=FAR_PX)
+    sigma = field.sigma_px[:FAINTEST_FIT]
+    star, index = part.row[found.star], found.catalogue
+    star, index = star[star < len(xy)], index[star < len(xy)]
+    w, beyond = sky.directions(index), ~np.isin(np.arange(len(xy)), part.row)
+    for _ in range(ROUNDS):
+        pose = pose.fitted(xy[star], w, np.hypot(sigma[star], error_px(xy[star] - pose.project(w))))
+        residual = xy[star] - pose.project(w)
+        there = stars_on(pose, sky, len(xy))
+        gate = _gate_px(residual, sigma)
+        # a lens that is not known well has other stars than its own in their places farther out
+        if spread_px(residual) > BENT_PX:
+            gate[beyond] = 0.0
+        predicted = pose.project(there.directions)
+        pair = mutual_nearest(xy, predicted, gate)
+        if len(pair[0]) < MIN_STARS:
+            return None
+        same = np.array_equal(pair[0], star) and np.array_equal(there.index[pair[1]], index)
+        star, index, w = pair[0], there.index[pair[1]], there.directions[pair[1]]
+        if same:
+            break
+    return pose.identified(field, xy, there, np.stack(pair), found)
+
+
+def error_px(residual: np.ndarray) -> float:
+    """Extra error: where the lens is poorly known, it dominates, so all stars get the same weight."""
+    spread = spread_px(residual[np.isfinite(residual).all(1)])
+    return spread if spread > BENT_PX else FLOOR_PX
+
+
+def _gate_px(residual: np.ndarray, sigma: np.ndarray) -> np.ndarray:
+    """Maximum distance (N,) px of a star from its place, from the residuals (M, 2) of the stars matched so far."""
+    return GATE_SIGMA * np.hypot(max(spread_px(residual), MIN_SPREAD_PX), sigma) + GATE_PX
+
+
+def spread_px(residual: np.ndarray) -> float:
+    """Standard deviation (px) that the median of residuals (M, 2) shows."""
+    return SIGMA_PER_MAD * float(np.sort(np.abs(residual), axis=None)[residual.size // 2])
+
+
+def _rms_px(residual: np.ndarray, sigma_px: np.ndarray) -> float:
+    """Root mean square of residuals (M, 2) along one axis, with the weights of the fit."""
+    weight = 1 / np.square(sigma_px)
+    return float(np.sqrt(np.square(residual).sum(1) @ weight / (2 * weight.sum())))
+
+
+def _mean_square(residual: np.ndarray) -> float:
+    """Mean square (px2) of residuals (M, 2) along one axis, all alike."""
+    return float(np.square(residual).mean())
+
+
+def _within(pixel: np.ndarray, camera: Camera, margin_px: float) -> np.ndarray:
+    """Whether pixels (n, 2) lie on the frame or so far beyond it; those that are NaN do not."""
+    least, most = -0.5 - margin_px, np.array([camera.width, camera.height]) - 0.5 + margin_px
+    with np.errstate(invalid="ignore"):
+        return np.asarray(((pixel > least) & (pixel < most)).all(1))
+
+
+def stars_on(pose: LensPose, sky: Sky, stars: int) -> OnFrame:
+    """The catalogue stars that this number of detections may be."""
+    camera, catalogue = pose.camera, sky.catalogue
+    axis = (FLIP[2] if pose.mirrored else np.array([0.0, 0.0, 1.0])) @ pose.attitude
+    index = rows_near(catalogue.cell_start, axis, min(1.05 * camera.half_diagonal_rad + 0.02, math.pi))
+    light = catalogue.vmag_centi[index]
+    # more than are on a frame of the widest field
+    most = 24 * stars + 600
+    if len(index) > most:
+        brightest = np.argpartition(light, most)[:most]
+        index, light = index[brightest], light[brightest]
+    index = index[np.argsort(light, kind="stable")]
+    w = sky.directions(index)
+    pixel = pose.project(w)
+    on = np.flatnonzero(_within(pixel, camera, EDGE_PX))[: 3 * stars + 50]
+    single, drawn = _resolved(catalogue, index[on], pixel[on], w[on], camera.fx)
+    on = on[single]
+    return OnFrame(index[on], w[on], drawn[single])
+
+
+def _resolved(
+    catalogue: Catalogue, index: np.ndarray, pixel: np.ndarray, w: np.ndarray, focal_px: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Which stars (N,), brightest first, are not blended with a brighter one; how far fainter ones move them (px)."""
+    single, drawn = np.ones(len(index), bool), np.zeros(len(index))
+    brighter, fainter = close_pairs(pixel, BLEND_PX)
+    ratio = 10 ** (-0.4 * (catalogue.vmag(index[fainter]) - catalogue.vmag(index[brighter])))
+    # from directions and rounded, so that it does not depend on the pose
+    apart = np.round(focal_px * np.linalg.norm(w[fainter] - w[brighter], axis=1), 6)
+    np.add.at(drawn, brighter, apart * ratio / (1 + ratio))
+    single[fainter] = False
+    return single, drawn
+
+
+# Prior of an unknown lens, 1 sigma: the position of the axis in focal lengths (x, y), k1 and k2.
+LENS_PRIOR = np.array([0.08, 0.08, 0.06, 0.02])
+# Terms of a fit: rotations, logarithm of the focal length, and the terms of PRIOR. Size and number of its steps.
+LENS_TERMS, LENS_STEP, LENS_STEPS = 8, 1e-6, 3
+# Radius about the part's middle in which stars are matched first, its growth in each round, number of final rounds.
+FIRST_RAD, NEXT_RAD, LAST_ROUNDS = math.radians(32), math.radians(15), 2
+# Maximum distance of a star from its predicted place (focal lengths), in addition to the residuals' spread.
+GATE_RAD, MIN_LENS_SPREAD_PX = 0.004, 0.2
+# Stars beyond the part bear it out if chance makes as many pairs as seldom as this (logarithm).
+LOG_CHANCE_PAIRS = math.log(1e-6)
+
+
+@dataclass(frozen=True)
+class Outwards:
+    """A camera fitted to its stars, the identification of a frame, and whether stars beyond the part bear it out.
+
+    If they do not, the camera and the identification stay as the part gave them.
+    """
+
+    camera: Camera
+    found: Identification
+    borne_out: bool
+
+
+def outwards(field: WideField, sky: Sky, part: Part, found: Identification) -> Outwards | None:
+    """Extend the identification of a part; None if the lens does not have in their places the stars of the part."""
+    flip = FLIP if found.mirrored else np.eye(3)
+    attitude = flip @ part.turn.T @ flip @ found.attitude
+    pose = LensPose(field.camera.scaled(found.focal_scale), attitude, found.mirrored)
+    xy = np.nan_to_num(field.camera.project(field.directions[:FAINTEST_FIT]), nan=FAR_PX)
+    sigma, beyond = field.sigma_px[:FAINTEST_FIT], ~np.isin(np.arange(len(xy)), part.row)
+    star, index = part.row[found.star], found.catalogue
+    star, index = star[star < len(xy)], index[star < len(xy)]
+    w = sky.directions(index)
+    middle = part.turn[2] * [1, -1, 1] if found.mirrored else part.turn[2]
+    rounds = math.ceil((math.pi - FIRST_RAD) / NEXT_RAD) + LAST_ROUNDS
+    inner: Outwards | None = None
+    for k in range(rounds):
+        error = np.hypot(sigma[star], error_px(xy[star] - pose.project(w)))
+        pose = _fitted(pose, field.camera, xy[star], w, error)
+        spread = max(spread_px(xy[star] - pose.project(w)), MIN_LENS_SPREAD_PX)
+        gate = GATE_SIGMA * np.hypot(spread, sigma) + GATE_RAD * pose.camera.fx
+        near = stars_on(pose, sky, len(xy))
+        reach = math.cos(min(FIRST_RAD + k * NEXT_RAD, math.pi))
+        near = _rows_of(near, near.directions @ pose.attitude.T @ middle > reach)
+        pair = np.stack(mutual_nearest(xy, pose.project(near.directions), gate))
+        if pair.shape[1] < MIN_STARS:
+            return None
+        star, w = pair[0], near.directions[pair[1]]
+        if inner is None:
+            inner = _answer(field, pose, xy, near, pair, found, False)
+    if _borne_out(int(beyond[star].sum()), xy[beyond], len(near.index), gate[beyond]):
+        return _answer(field, pose, xy, near, pair, found, True)
+    return inner
+
+
+def _answer(
+    field: WideField,
+    pose: LensPose,
+    xy: np.ndarray,
+    there: OnFrame,
+    pair: np.ndarray,
+    found: Identification,
+    borne_out: bool,
+) -> Outwards:
+    whole = replace(field, camera=pose.camera)
+    return Outwards(pose.camera, pose.identified(whole, xy, there, pair, found), borne_out)
+
+
+def _rows_of(there: OnFrame, which: np.ndarray) -> OnFrame:
+    return OnFrame(there.index[which], there.directions[which], there.blend_px[which])
+
+
+def _borne_out(pairs: int, xy: np.ndarray, places: int, gate: np.ndarray) -> bool:
+    """Whether this number of pairs of stars xy (n, 2) and places, within gate (n,) px, is more than chance makes."""
+    if pairs == 0:
+        return False
+    area = float(np.prod(np.ptp(xy, axis=0))) * math.pi / 4
+    expected = places * float(np.square(gate).sum()) * math.pi / max(area, 1.0)
+    return pairs > expected and _log_tail(pairs, expected) < LOG_CHANCE_PAIRS
+
+
+def _log_tail(count: int, expected: float) -> float:
+    """Chernoff's bound of the logarithm of the probability of `count` or more events."""
+    return count - expected - count * math.log(count / expected) if expected > 0 else -math.inf
+
+
+def _fitted(pose: LensPose, given: Camera, xy: np.ndarray, w: np.ndarray, error: np.ndarray) -> LensPose:
+    """Fit pose and lens to pixels xy (n, 2), with errors (n,) px, of directions w (n, 3), and to PRIOR about `given`."""
+    for _ in range(LENS_STEPS):
+        here = pose.project(w)
+        ahead = [_moved(pose, step).project(w) for step in np.eye(LENS_TERMS) * LENS_STEP]
+        slope = (np.stack(ahead, -1) - here[..., None]) / LENS_STEP
+        on = np.isfinite(slope).all((1, 2))
+        j = (slope[on] / error[on, None, None]).reshape(-1, LENS_TERMS)
+        prior = np.hstack(
+            [np.zeros((len(LENS_PRIOR), LENS_TERMS - len(LENS_PRIOR))), np.diag(1 / LENS_PRIOR)]
+        )
+        target = np.append(
+            ((xy - here)[on] / error[on, None]).ravel(), _from_prior(pose.camera, given) / LENS_PRIOR
+        )
+        step = np.linalg.lstsq(np.vstack([j, prior]), target, rcond=None)[0]
+        pose = _moved(pose, step)
+        if np.abs(step).max() < LENS_STEP:
+            break
+    return pose
+
+
+def _from_prior(camera: Camera, given: Camera) -> np.ndarray:
+    """How far (4,) a camera has still to go to `given`, in the terms of PRIOR."""
+    axis = (given.cx - camera.cx) / camera.fx, (given.cy - camera.cy) / camera.fx
+    return np.array([*axis, *np.subtract(given.distortion[:2], camera.distortion[:2])])
+
+
+def _moved(pose: LensPose, step: np.ndarray) -> LensPose:
+    """The pose turned, its focal length longer, axis elsewhere and lens another by the terms (TERMS,) of a step."""
+    c = pose.camera
+    k1, k2, *rest = c.distortion
+    camera = replace(
+        c,
+        fx=c.fx * (1 + step[3]),
+        fy=c.fy * (1 + step[3]),
+        cx=c.cx + c.fx * step[4],
+        cy=c.cy + c.fx * step[5],
+        distortion=(k1 + step[6], k2 + step[7], *rest),
+    )
+    return replace(pose, camera=camera, attitude=rotation.from_vector(step[:3]) @ pose.attitude)

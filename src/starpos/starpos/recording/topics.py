@@ -1,0 +1,223 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The topics of one instrument in a bag, or of a robot's own camera and IMU."""
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Protocol, TypeVar
+
+from starpos.errors import FrameError
+from starpos.recording.bag import PACKAGE, BagReader
+
+if TYPE_CHECKING:
+    from rosbags.interfaces import Connection
+
+IMAGE, PICTURE, IMU = (f"sensor_msgs/msg/{name}" for name in ("Image", "CompressedImage", "Imu"))
+CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
+TILT, CAPTURE = f"{PACKAGE}/msg/Tilt", f"{PACKAGE}/msg/Capture"
+RAW, IMU_DATA = "camera/image_raw", "imu/data"
+# what each input may be, the preferred type first
+DRIVER_INPUTS = {
+    RAW: (IMAGE, PICTURE),
+    "camera/camera_info": (CAMERA_INFO,),
+    "camera/capture": (CAPTURE,),
+    "tilt": (TILT,),
+    IMU_DATA: (IMU,),
+}
+MADE_OF = {IMAGE: "stars", PICTURE: "stars", IMU: "tilts"}
+
+
+class Connected(Protocol):
+    """A topic of a bag: rosbags' Connection."""
+
+    @property
+    def topic(self) -> str: ...
+
+    @property
+    def msgtype(self) -> str: ...
+
+    @property
+    def msgcount(self) -> int: ...
+
+
+C = TypeVar("C", bound=Connected)
+
+
+@dataclass(frozen=True)
+class Remaps:
+    """Topics of a bag by the relative names of the inputs they serve as; FrameError if a name is not an input."""
+
+    topics: Mapping[str, str]
+
+    def __post_init__(self) -> None:
+        for name in self.topics:
+            if name not in DRIVER_INPUTS:
+                raise FrameError(f"--remap {name}:=...: the inputs are {', '.join(DRIVER_INPUTS)}")
+
+    @classmethod
+    def of(cls, texts: Sequence[str]) -> "Remaps":
+        """Read texts NAME:=TOPIC; raises FrameError."""
+        topics = {}
+        for text in texts:
+            name, sign, topic = text.partition(":=")
+            if not (name and sign and topic):
+                raise FrameError(f"--remap {text}: write NAME:=TOPIC, such as {RAW}:=/cam0/image_raw")
+            topics[name.strip("/")] = "/" + topic.strip("/")
+        return cls(topics)
+
+
+NO_REMAPS = Remaps({})
+
+
+def driver_topics(
+    connections: Sequence[C],
+    remaps: Remaps = NO_REMAPS,
+    namespace: str | None = None,
+    place: Path | str = "the bag",
+) -> dict[str, str]:
+    """Topics by the names of the DRIVER_INPUTS that they serve as; {} without images.
+
+    The topic is the one that the user names, else the one with the input's own name, else the one next to the images (as
+    image_transport places camera_info), else the only one of its type. Accelerations are used if there are no tilts, or
+    if the user names them.
+    namespace: only topics in it count, except for topics that the user names.
+    Raises FrameError if several topics may be meant, or if a topic that the user names is missing or of another type.
+    """
+    bag = _Topics(connections, remaps, namespace, f"{place}")
+    images = bag.of(RAW, "")
+    if images is None:
+        return {}
+    beside = images.removesuffix("/compressed").rpartition("/")[0]
+    found = {RAW: images}
+    levels = (IMU_DATA,) if IMU_DATA in remaps.topics else ("tilt", IMU_DATA)
+    for name in ("camera/camera_info", "camera/capture", *levels):
+        if not (name == IMU_DATA and "tilt" in found) and (topic := bag.of(name, beside)):
+            found[name] = topic
+    return found
+
+
+def named_topics(connections: Sequence[Connected], remaps: Remaps, place: Path | str) -> dict[str, str]:
+    """The topics that the user names, by the inputs they serve as; raises FrameError as `driver_topics` does."""
+    bag = _Topics(connections, remaps, None, f"{place}")
+    return {name: topic for name in remaps.topics if (topic := bag.of(name, ""))}
+
+
+def sentence_on_use(found: Mapping[str, str], connections: Sequence[Connected]) -> str:
+    """Sentence on the use of the topics that were found."""
+    kinds = {c.topic: c.msgtype for c in connections}
+    made = [f"{MADE_OF[kinds[t]]} from {t}" for t in found.values() if kinds[t] in MADE_OF]
+    plain = [f"{name} is {t}" for name, t in found.items() if kinds[t] not in MADE_OF]
+    return ", ".join(made + plain)
+
+
+@dataclass(frozen=True)
+class _Topics:
+    """The topics of a bag that have messages."""
+
+    connections: Sequence[Connected]
+    remaps: Remaps
+    namespace: str | None
+    place: str
+
+    def of(self, name: str, beside: str) -> str | None:
+        """The topic of an input, preferably next to `others`; None without one."""
+        if name in self.remaps.topics:
+            return self._named(name, self.remaps.topics[name])
+        for kind in DRIVER_INPUTS[name]:
+            topics = self._of_type(kind)
+            own = [t for t in topics if t.removesuffix("/compressed").endswith(f"/{name}")]
+            near = [t for t in topics if beside and t.rpartition("/")[0] == beside]
+            for some in (own, near, topics):
+                if len(some) == 1:
+                    return some[0]
+            if topics:
+                raise FrameError(
+                    f"{self.place}: {', '.join(topics)} are all {kind}: choose one with --remap {name}:={topics[0]}"
+                )
+        return None
+
+    def _of_type(self, kind: str) -> list[str]:
+        below = "/" + (self.namespace or "").strip("/")
+        return sorted(
+            {
+                c.topic
+                for c in self.connections
+                if c.msgtype == kind and c.msgcount and (below == "/" or c.topic.startswith(f"{below}/"))
+            }
+        )
+
+    def _named(self, name: str, topic: str) -> str:
+        kinds = {c.topic: c.msgtype for c in self.connections}
+        if topic not in kinds:
+            raise FrameError(f"{self.place}: no topic {topic} in it; it has {', '.join(sorted(kinds))}")
+        if kinds[topic] not in DRIVER_INPUTS[name]:
+            raise FrameError(
+                f"{self.place}: {topic} has {kinds[topic]}; {name} takes {', '.join(DRIVER_INPUTS[name])}"
+            )
+        return topic
+
+
+STARS, SOLUTION = (f"{PACKAGE}/msg/{name}" for name in ("StarArray", "Solution"))
+# types by the relative names of the solver's inputs
+NAV_SAT_FIX = "sensor_msgs/msg/NavSatFix"
+INPUTS = {"stars": STARS, "tilt": TILT, "camera/camera_info": CAMERA_INFO}
+# further inputs, with gnss.use
+GNSS = {"gnss/fix": NAV_SAT_FIX}
+
+
+@dataclass(frozen=True)
+class Chosen:
+    """An instrument's namespace and connections; made: how a robot's own messages are used, '' if they are not."""
+
+    namespace: str
+    connections: "Sequence[Connection]"
+    made: str = ""
+
+
+def instrument_in(
+    bag: BagReader,
+    path: Path,
+    namespace: str | None,
+    topics: Mapping[str, str],
+    needed: Collection[str],
+    remaps: Remaps = NO_REMAPS,
+) -> Chosen:
+    """Find namespace and connections of an instrument, or of a robot's own drivers without an instrument.
+
+    topics: types by relative names. needed: types of which at least one must have a message.
+    remaps: images that the user names take precedence over star lists, named accelerations over tilts. FrameError if
+    there is no instrument, or if there are several and `namespace` is None.
+    """
+    found: dict[str, list[Connection]] = {}
+    for c in bag.connections:
+        for suffix, kind in topics.items():
+            if c.msgtype == kind and c.topic.endswith(f"/{suffix}"):
+                found.setdefault(c.topic.removesuffix(suffix).rstrip("/") or "/", []).append(c)
+    able = sorted(n for n, cs in found.items() if any(c.msgtype in needed and c.msgcount for c in cs))
+    if not able or RAW in remaps.topics:
+        drivers = driver_topics(bag.connections, remaps, namespace, path)
+        if drivers:
+            return _of_drivers(bag, drivers, namespace)
+        names = " nor ".join(name for name, kind in topics.items() if kind in needed)
+        raise FrameError(
+            f"{path}: {'neither ' if len(needed) > 1 else 'no '}{names} in it, and no images: record stars, tilt and "
+            "camera/camera_info, or the images and the IMU of a robot"
+        )
+    wanted = "/" + namespace.strip("/") if namespace is not None else able[0]
+    if able == ["/"] and wanted != "/":
+        raise FrameError(
+            f"{path}: the instrument in it has no namespace, not {wanted}: leave --namespace out"
+        )
+    if wanted not in able or (namespace is None and len(able) > 1):
+        raise FrameError(f"{path}: the instruments in it are {', '.join(able)}: choose one with --namespace")
+    named = named_topics(bag.connections, remaps, path)
+    replaced = {INPUTS.get("tilt" if name == IMU_DATA else name) for name in named}
+    own = [c for c in found[wanted] if c.msgtype not in replaced]
+    others = [c for c in bag.connections if c.topic in named.values()]
+    return Chosen(wanted, [*own, *others], sentence_on_use(named, others))
+
+
+def _of_drivers(bag: BagReader, drivers: Mapping[str, str], namespace: str | None) -> Chosen:
+    used = set(drivers.values())
+    connections = [c for c in bag.connections if c.topic in used]
+    return Chosen("/" + (namespace or "").strip("/"), connections, sentence_on_use(drivers, connections))

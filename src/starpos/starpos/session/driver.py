@@ -1,0 +1,198 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a session and its driver exchange: times, sentences, diagnostics, and jobs of several seconds."""
+
+import math
+import traceback
+from collections.abc import Callable, Generator, Mapping
+from dataclasses import dataclass, field
+from enum import IntEnum
+from typing import Any, Protocol
+
+from starpos.errors import StarposError
+
+# Times that differ by more are not of the same evening.
+ANOTHER_TIME_S = 3600.0
+
+
+@dataclass(frozen=True)
+class Sent:
+    """What the middleware reports of a message.
+
+    number: its place among its publisher's messages; None where that is unknown.
+    unix_s: when it was written, by the clock of its publisher's host; None where that is unknown.
+    """
+
+    number: int | None = None
+    unix_s: float | None = None
+
+
+@dataclass(frozen=True)
+class Now:
+    """A moment.
+
+    unix_s: by the clock of whoever takes the messages; None while it is not known.
+    waiting_s: by the clock in which waiting is counted; NaN while it is not known.
+    played: whether both are the clock of recorded data: then nothing depends on speed.
+    """
+
+    unix_s: float | None
+    waiting_s: float
+    played: bool = False
+
+    @classmethod
+    def in_data(cls, unix_s: float | None) -> "Now":
+        """A moment by the clock of recorded data."""
+        return cls(unix_s, math.nan if unix_s is None else unix_s, played=True)
+
+    def ahead_s(self, unix_s: float | None) -> float:
+        """How far a time is ahead of this one (s); 0 if one of them is not known.
+
+        It is also 0 if the two are not of the same evening: a night is played without /clock, or the robot does not
+        know the date.
+        """
+        if unix_s is None or self.unix_s is None:
+            return 0.0
+        ahead_s = unix_s - self.unix_s
+        return 0.0 if ahead_s > ANOTHER_TIME_S and not self.played else ahead_s
+
+
+class Log(Protocol):
+    """Takes sentences, as rclpy's logger does; of an error, which is a defect, the traceback."""
+
+    def info(self, message: str) -> object: ...
+
+    def warning(self, message: str) -> object: ...
+
+    def error(self, message: str) -> object: ...
+
+
+class Changes:
+    """Logs a state once until it changes."""
+
+    def __init__(self, log: Log) -> None:
+        self._log = log
+        self._logged: object = None
+
+    def say(self, sentence: str, good: bool, state: object = None) -> None:
+        """Log a sentence, unless its state (or it itself) was logged last."""
+        state = state or sentence
+        if state == self._logged:
+            return
+        self._logged = state
+        if good:
+            self._log.info(sentence)
+        else:
+            self._log.warning(sentence)
+
+
+class Heard(Protocol):
+    """Keeps account of the messages, by the relative name of their topic."""
+
+    def came(self, name: str) -> object: ...
+
+    def refuse(self, name: str, sentence: str) -> object: ...
+
+
+class Level(IntEnum):
+    OK = 0
+    WARN = 1
+    ERROR = 2
+    STALE = 3
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """Result of a diagnostic task: a level, a sentence, and named values (numbers, strings, booleans)."""
+
+    level: Level
+    message: str
+    values: Mapping[str, object] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """The value that a job returned, or the sentence that says why it failed."""
+
+    value: Any = None
+    trouble: str = ""
+
+
+class Coming(Protocol):
+    """An Outcome that will come, as rclpy's Future."""
+
+    def add_done_callback(self, callback: Callable[[Any], None]) -> None: ...
+
+    def result(self) -> Any: ...
+
+    def __await__(self) -> Generator[Any, Any, Any]: ...
+
+
+class Jobs(Protocol):
+    """Runs one job at a time; its Outcome comes when its owner is free for it, never within `run`."""
+
+    @property
+    def busy(self) -> bool: ...
+
+    def run(self, job: Callable[[], Any]) -> Coming: ...
+
+
+def outcome_of(job: Callable[[], Any], say: Callable[[str], object]) -> Outcome:
+    """Do a job; a defect ends this job only, and `say` gets its traceback."""
+    try:
+        return Outcome(job())
+    except StarposError as e:
+        return Outcome(trouble=str(e))
+    except Exception as e:
+        say(traceback.format_exc())
+        return Outcome(trouble=f"it failed ({type(e).__name__}: {e})")
+
+
+class _Promised:
+    """The Outcome of a job that JobsInTurn runs."""
+
+    def __init__(self) -> None:
+        self._outcome: Outcome | None = None
+        self._callbacks: list[Callable[[Any], None]] = []
+
+    def add_done_callback(self, callback: Callable[[Any], None]) -> None:
+        self._callbacks.append(callback)
+
+    def result(self) -> Outcome | None:
+        return self._outcome
+
+    def __await__(self) -> Generator[Any, Any, Any]:
+        while self._outcome is None:
+            yield
+        return self._outcome
+
+    def come(self, outcome: Outcome) -> None:
+        self._outcome = outcome
+        for callback in self._callbacks:
+            callback(self)
+
+
+class JobsInTurn:
+    """Jobs that are done in this thread, each at the next `work`."""
+
+    def __init__(self, say: Callable[[str], object]) -> None:
+        self._say = say
+        self._next: tuple[Callable[[], Any], _Promised] | None = None
+
+    @property
+    def busy(self) -> bool:
+        """Whether a job waits."""
+        return self._next is not None
+
+    def run(self, job: Callable[[], Any]) -> _Promised:
+        """Keep a job for `work`; must not be called while one waits."""
+        assert self._next is None
+        self._next = job, _Promised()
+        return self._next[1]
+
+    def work(self) -> None:
+        """Do the job that waits, if there is one."""
+        if self._next is not None:
+            job, promised = self._next
+            outcome = outcome_of(job, self._say)
+            self._next = None
+            promised.come(outcome)

@@ -1,0 +1,160 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How a session solves a frame: the ways to identify it, as long as the next frame need not wait, and its attitude."""
+
+import math
+import time
+import traceback
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+from starpos.earth.known_place import Places
+from starpos.earth.orientation import earth_state
+from starpos.errors import StarposError
+from starpos.fix import searching
+from starpos.fix.camera_attitude import CameraAttitude
+from starpos.fix.searching import NEVER_S, UNASKED, identify_every_way
+from starpos.fix.solution import Solution, Status
+from starpos.fix.solver import Solver, focal_that_fits
+from starpos.frames.frame import Stars
+from starpos.identification import Identification, fisheye
+from starpos.identification.hint import Hint
+from starpos.identification.search import Priors
+from starpos.instrument.tilt_log import Tilts
+from starpos.navigation.sightings import sighted
+from starpos.night.remarks import of_focal_length
+from starpos.session.driver import Log, Now
+from starpos.session.gyro import Gyro
+
+# Share of the time between frames in which one may be searched.
+MAX_OF_INTERVAL = 0.5
+# a deadline in the past: one search only
+AT_ONCE_S = 0.0
+
+
+class Search:
+    """Solves frames, and ends with each in time; values: the parameters."""
+
+    def __init__(self, values: Mapping[str, Any]) -> None:
+        self._values = values
+        # since the last frame, and when that came, by the clock in which waiting is counted
+        self._interval_s, self._came_s = math.inf, -math.inf
+        self.other_camera()
+
+    def other_camera(self) -> None:
+        """Note that the camera is another one."""
+        # whether a frame of this camera was identified
+        self._identified = False
+
+    def frame_came(self, now: Now) -> None:
+        """Note that a frame has come."""
+        self._interval_s, self._came_s = now.waiting_s - self._came_s, now.waiting_s
+
+    def until_s(self, now: Now | None, others_wait: bool) -> float:
+        """Time, by time.monotonic, until which another way to identify a frame may be begun.
+
+        now: None for a frame that somebody asks for.  In recorded data no time passes, so all ways are tried.
+        """
+        most_s = self._values["search_time"]
+        if now is not None and now.played:
+            return NEVER_S if most_s > 0 else AT_ONCE_S
+        if now is not None:
+            most_s = min(most_s, 0.0 if others_wait else MAX_OF_INTERVAL * self._interval_s)
+        return time.monotonic() + most_s
+
+    def solved(
+        self,
+        solver: Solver,
+        stars: Stars,
+        tilts: Tilts,
+        places: Places | None,
+        hint: Hint | None,
+        predicted: Priors,
+        until_s: float,
+        known: Identification | None,
+    ) -> Solution:
+        """Solve a list by `searching.answer_frame`; while none is identified, say which focal length fits."""
+        # a node has no picture to look at, only the list
+        seen = searching.answer_frame(
+            solver,
+            item=stars,
+            stars=stars,
+            tilts=tilts,
+            places=places,
+            hint=hint,
+            predicted=predicted,
+            until_s=until_s,
+            known=known,
+        )
+        answer = seen.solution
+        self._identified |= answer.found is not None
+        if self._identified or answer.status is not Status.NOT_IDENTIFIED:
+            return answer
+        focal_px = focal_that_fits(solver, stars, until_s)
+        if focal_px is None:
+            return answer
+        return replace(answer, message=str(of_focal_length(stars.place, focal_px)))
+
+
+def asked(
+    solver: Solver, stars: Stars, answer: Solution, predicted: Priors = (), until_s: float = NEVER_S
+) -> Solution:
+    """The solver's answer to a frame; if it stopped before identification, identify the stars now."""
+    if answer.found is None and answer.status in UNASKED:
+        return identify_every_way(solver, stars, stars, predicted, until_s).solution
+    return answer
+
+
+def camera_attitude_of(
+    solver: Solver, stars: Stars, answer: Solution, frame_id: str
+) -> CameraAttitude | None:
+    """The attitude of a frame whose stars a solver has identified; None without one.
+
+    An identification in doubt, a fisheye and a mirrored frame give no attitude.
+    """
+    found = answer.found
+    if found is None or answer.warnings or found.mirrored or stars.mid_unix_s is None:
+        return None
+    try:
+        camera, catalogue, _ = solver.view(stars.width, stars.height, stars.origin_px)
+        if fisheye.is_wide(camera):
+            return None
+        state = earth_state(stars.mid_unix_s)
+        seen = sighted(stars, found, (camera, catalogue), state).placeless()
+    except StarposError:
+        return None
+    return CameraAttitude(
+        utc_unix_s=stars.mid_unix_s,
+        stamp_stddev_s=stars.stamp_stddev_s,
+        clock_stddev_s=solver.clock_stddev_s(stars),
+        frame_id=frame_id,
+        camera_to_gcrs=state.gcrs_to_itrs.T @ seen.camera_to_itrs,
+        covariance=seen.covariance,
+        stars=len(found.star),
+        log_odds=found.log_odds,
+    )
+
+
+def attitude_seen(
+    solver: Solver | None,
+    stars: Stars,
+    answer: Solution,
+    frame_id: str,
+    predicted: Priors,
+    until_s: float,
+    gyro: Gyro,
+    log: Log,
+) -> CameraAttitude | None:
+    """The attitude of an answered frame, also given to the gyro; None without a solver or identified stars."""
+    if solver is None:
+        return None
+    try:
+        answer = asked(solver, stars, answer, predicted, until_s)
+        attitude = camera_attitude_of(solver, stars, answer, frame_id)
+        if attitude is not None and answer.found is not None:
+            gyro.saw(stars, answer.found, solver)
+        return attitude
+    except Exception:
+        # A defect loses only this attitude.
+        log.error(traceback.format_exc())
+        return None

@@ -1,0 +1,96 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A node as the driver of a session: its log, its account of the inputs, its parameters."""
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+
+from rclpy.impl.rcutils_logger import RcutilsLogger
+from rclpy.node import Node
+
+from starpos.instrument.camera import Camera
+from starpos.session.settings import PARAMETERS, Settings
+from starpos_common.diagnostics import Diagnosis, Level, Troubles
+from starpos_common.parameters import declare
+
+
+class NodeLog:
+    """The node's logger for a session.  rclpy ties a severity to the calling line, so each has its own line."""
+
+    def __init__(self, logger: RcutilsLogger) -> None:
+        self._logger = logger
+
+    def info(self, message: str) -> None:
+        self._logger.info(message)
+
+    def warning(self, message: str) -> None:
+        self._logger.warning(message)
+
+    def error(self, message: str) -> None:
+        self._logger.error(message, throttle_duration_sec=60.0)
+
+
+STALE_S = 5.0
+# seconds of an IMU at 400 Hz that may wait while a node does something else
+IMU_QUEUE = 4000
+
+
+class Inputs:
+    """Keeps account of the messages, by the relative name of their topic.
+
+    needed: names without which there is no output.
+    """
+
+    def __init__(self, node: Node, needed: Sequence[str]) -> None:
+        self.refused = 0
+        self._needed = needed
+        self._came_s: dict[str, float] = {}
+        self._troubles = Troubles(node)
+
+    def came(self, name: str) -> None:
+        """Note a message that is sound as far as is known."""
+        self._came_s[name] = time.monotonic()
+        self._troubles.right(name)
+
+    def refuse(self, name: str, sentence: str) -> None:
+        """Note a message that is refused, with the reason."""
+        self._came_s[name] = time.monotonic()
+        self.refused += 1
+        self._troubles.wrong(name, sentence)
+
+    def report(self, kept: Mapping[str, int], dropped: Mapping[str, int]) -> Diagnosis:
+        """Make the diagnostic `Inputs`; kept: what the node has of them; dropped: what was lost on the way, by topic."""
+        now = time.monotonic()
+        ages_s = {name: now - came for name, came in self._came_s.items()}
+        missing = [name for name in self._needed if ages_s.get(name, STALE_S) >= STALE_S]
+        values: dict[str, object] = {f"{name} age (s)": age for name, age in ages_s.items()}
+        values |= {**kept, "refused": self.refused}
+        values |= {f"{name} dropped": count for name, count in dropped.items()}
+        refusals = self._troubles.lately(STALE_S)
+        said = [f"nothing on {', '.join(missing)} for {STALE_S:g} s"] if missing else []
+        said += [f"refused: {'; '.join(refusals)}"] if refusals else []
+        if said:
+            return Diagnosis(Level.WARN, "; ".join(said), values)
+        return Diagnosis(Level.OK, "all inputs arrive", values)
+
+
+class SolverSettings(Settings):
+    """Settings that are declared by a node and may be set while it runs.
+
+    camera: returns the camera in use, None before there is one.
+    apply: called with the names that were set.
+    """
+
+    def __init__(
+        self, node: Node, camera: Callable[[], Camera | None], apply: Callable[[frozenset[str]], None]
+    ) -> None:
+        super().__init__({})
+        self._camera, self._apply = camera, apply
+        self.values = declare(node, PARAMETERS, apply=self._adopted, check=self._check)
+        self.adopt()
+
+    def _check(self, values: Mapping, names: frozenset[str]) -> str | None:
+        return self.check(values, names, self._camera())
+
+    def _adopted(self, names: frozenset[str]) -> None:
+        self.adopt()
+        self._apply(names)
