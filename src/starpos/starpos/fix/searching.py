@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from starpos.budget import Budget
-from starpos.earth.known_place import Places
+from starpos.earth.place import Places
 from starpos.errors import FieldError, StarposError
 from starpos.fix.blind import BlindSolver
 from starpos.fix.solution import Solution, Status
