@@ -99,8 +99,8 @@ class Place:
             ellipsoid_stddev=ground.deflection.stddev_arcsec * ARCSEC,
         )
 
+    def deflected(self, vertical: Vertical) -> "Place":
         """This place on the ellipsoid, with the plumb line leaning as a Vertical has it there."""
-        """The same place on the ellipsoid, whose plumb line leans as a Vertical has it there."""
         if vertical is UNDEFLECTED:
             return self
         d = vertical.at(self.latitude, self.longitude)
