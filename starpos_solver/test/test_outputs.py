@@ -11,7 +11,8 @@ from std_msgs.msg import Header
 
 from starpos.earth.place import Place
 from starpos.earth.vertical import Deflection
-from starpos.fix.budget import ErrorTerm, heading_of, heading_row
+from starpos.fix.attitude import heading_of, heading_row
+from starpos.fix.budget import ErrorTerm
 from starpos.fix.fix import Fix
 from starpos.fix.heading import AttitudeAtPlace, LinkAttitude
 from starpos.fix.solution import Solution, Status

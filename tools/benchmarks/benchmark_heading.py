@@ -18,7 +18,7 @@ import numpy as np
 from starpos.earth.ellipsoid import curvature_radii_m, enu_axes
 from starpos.earth.place import Place
 from starpos.earth.vertical import UNKNOWN_STDDEV_ARCSEC, Deflection, geodetic
-from starpos.fix.budget import heading_of
+from starpos.fix.attitude import heading_of
 from starpos.fix.solver import Solver, placed
 from starpos.instrument.camera import Camera
 from starpos.rotation import half_turns

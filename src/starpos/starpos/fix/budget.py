@@ -14,6 +14,7 @@ from starpos._numeric.roots import symmetric_root
 from starpos.earth.ellipsoid import curvature_radii_m, enu_axes, meridian_turn, place_of_zenith
 from starpos.earth.orientation import ROTATION_RAD_S, EarthState
 from starpos.fix._adjustment import gain_of, spread
+from starpos.fix.attitude import ENU, LINK, Attitude, heading_row
 from starpos.frozen import at_once
 from starpos.instrument.inclinometer import Tilt
 from starpos.instrument.mounting import LocalLevel, Mounting
@@ -74,7 +75,8 @@ class ErrorTerm:
 
 def total_covariance(terms: Iterable[ErrorTerm]) -> np.ndarray:
     """Sum of the covariances of independent terms, (6, 6) if their factors have six rows."""
-    return np.sum([t.covariance for t in terms], axis=0)
+    roots = np.hstack([t.factor if t.variance == 1.0 else t.factor * math.sqrt(t.variance) for t in terms])
+    return roots @ roots.T
 
 
 def correlation(a: tuple, b: tuple) -> float:
@@ -138,17 +140,9 @@ class Sensitivity:
         return cls(stars, level)
 
 
-def heading_of(link_to_enu: np.ndarray) -> float:
-    """Azimuth (rad, 0 to 2 pi) of the base link's x axis."""
-    return rotation.full_turn(np.arctan2(link_to_enu[0, 0], link_to_enu[1, 0]))
-
-
-def heading_row(link_to_enu: np.ndarray) -> np.ndarray:
-    """Change (3,) of the heading for small rotations of the attitude link_to_enu (3, 3) about east, north, up."""
-    east, north, up = link_to_enu[:, 0].tolist()
-    level = max(east * east + north * north, 1e-12)
-    # d azimuth = (north d_east - east d_north) / level, with d(forward) = spin x forward
-    return np.array([east * up / level, north * up / level, -1.0])
+def link_attitude(link_to_enu: np.ndarray, terms: tuple[ErrorTerm, ...]) -> Attitude:
+    """The attitude of the base link in east, north, up, with its budget."""
+    return Attitude(link_to_enu, total_covariance(terms)[3:, 3:], LINK, ENU, terms)
 
 
 def mount_term(name: str, link_to_enu: np.ndarray, stddev: float) -> tuple[ErrorTerm, ...]:

@@ -47,8 +47,8 @@ class LevelSight:
         covariance = total_covariance(stars)[:2, :2] / np.outer(radii, radii)
         return cls(
             utc_unix_s=fix.utc_unix_s,
-            camera_to_itrs=fix.camera_to_itrs,
-            camera_covariance=fix.camera_covariance,
+            camera_to_itrs=fix.camera.rotation,
+            camera_covariance=fix.camera.covariance,
             tilt=tilt,
             zenith_covariance=axes.T @ covariance @ axes,
             latitude=fix.latitude,

@@ -102,7 +102,7 @@ def _up(watch: GnssWatch, fix: Fix, tilt: Tilt, gnss: GnssPlace | None) -> np.nd
         return None
     stated, axes = watch.vertical.at(gnss.latitude, gnss.longitude), gnss.axes
     lean = ARCSEC * (stated.eta_arcsec * axes[0] + stated.xi_arcsec * axes[1])
-    return fix.camera_to_itrs.T @ rotation.normalised(axes[2] + lean)
+    return fix.camera.rotation.T @ rotation.normalised(axes[2] + lean)
 
 
 def _levelled(solver: Solver, stars: Stars, answer: Solution, up_in_camera: np.ndarray | None) -> Solution:

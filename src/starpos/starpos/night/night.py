@@ -137,7 +137,7 @@ class Shot:
             place=ReportedPlace.of(s.fix),
             residual_px=-s.fix.residual_px,
             residual_arcsec=s.fix.residual_arcsec,
-            camera_to_itrs=s.fix.camera_to_itrs,
+            camera_to_itrs=s.fix.camera.rotation,
         )
 
     def __repr__(self) -> str:

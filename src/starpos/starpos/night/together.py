@@ -102,7 +102,7 @@ def together(solved: Sequence[Solved], given: Instrument | None, near: Near | No
         said += remarks.of_a3(given.calibration, place)
         if given.vertical is None and not given.calibration.unknown:
             mounting = given.mounting
-    frames = [Levelled(s.fix.camera_to_itrs, s.tilt) for s in solved if s.tilt is not None]
+    frames = [Levelled(s.fix.camera.rotation, s.tilt) for s in solved if s.tilt is not None]
     said += doubts(frames, place, mounting, near)
     return Together(whole, why_not, tuple(said))
 

@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from starpos import rotation
-from starpos.fix.budget import ALWAYS, ErrorTerm, heading_of
+from starpos.fix.attitude import heading_of
+from starpos.fix.budget import ALWAYS, ErrorTerm
 from starpos.fix.fix import Fix
 from starpos.frames.frame import Stars
 from starpos.instrument.inclinometer import Tilt
