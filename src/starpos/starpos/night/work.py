@@ -10,9 +10,16 @@ from typing import TYPE_CHECKING, Any
 from starpos.earth.known_place import Places
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import FixError, InstrumentError, StarposError
-from starpos.fix import searching
 from starpos.fix.blind import SEARCH_S, BlindSolver
-from starpos.fix.searching import Sight, without_hint
+from starpos.fix.searching import (
+    Question,
+    Sight,
+    answer_by_header,
+    answer_frame,
+    focal_px_that_fits,
+    identify_blind_every_way,
+    other_focal_length,
+)
 from starpos.fix.solution import Solution
 from starpos.fix.solver import Solver, check_explained
 from starpos.frames.frame import Frame, Stars
@@ -20,7 +27,7 @@ from starpos.identification.hint import Hint
 from starpos.instrument.instrument import Instrument
 from starpos.instrument.tilt_log import NO_TILTS, Tilts
 from starpos.night.reading import Instruments, Reader, TiltFile, stars_of
-from starpos.night.remarks import Remark, of_focal_length
+from starpos.night.remarks import Kind, Remark
 from starpos.progress import Progress, quiet
 from starpos.sky import catalogue
 from starpos.zenith.adjustment import Adjusted, adjusted
@@ -76,28 +83,15 @@ class Identifying:
             blind = BlindSolver(stars_known, self.progress, search_s=self.search_s)
             blind.prepare()
             begin = time.process_time()
-            sight = searching.identify_blind_every_way(blind, item, stars_of(item))
+            sight = identify_blind_every_way(blind, item, stars_of(item))
         else:
             solver = Solver(instrument, stars_known)
             # the frame reports the error
             with suppress(StarposError):
                 solver.prepare(item.width, item.height, item.origin_px)
             begin = time.process_time()
-            sight = self._by_focal_length(solver, item)
+            sight = _answered(self, solver, Question(item=item, stars=stars_of(item)))
         return sight, 1000 * (time.process_time() - begin)
-
-    def _by_focal_length(self, solver: Solver, item: Frame | Stars) -> Sight:
-        stars = stars_of(item)
-
-        def work(solver: Solver) -> Sight:
-            return searching.identify_every_way(solver, item, stars)
-
-        sight = work(solver)
-        return (
-            without_hint(solver, item, stars, sight, work, self.progress)
-            if self.instruments.hinted
-            else sight
-        )
 
 
 @dataclass(frozen=True)
@@ -112,8 +106,10 @@ class Fitting:
         if instrument is None or self.instruments.hinted:
             return ()
         solver = Solver(instrument, catalogue.load_catalogue())
-        focal_px = searching.focal_px_that_fits(solver, stars_of(item))
-        return () if focal_px is None else (of_focal_length(item.place, focal_px),)
+        focal_px = focal_px_that_fits(solver, stars_of(item))
+        return (
+            () if focal_px is None else (Remark(Kind.FOCAL_LENGTH, other_focal_length(item.place, focal_px)),)
+        )
 
 
 @dataclass(frozen=True)
@@ -145,17 +141,14 @@ class Solving:
 
     def sight(self, item: Frame | Stars, hint: Hint | None = None) -> Sight:
         """The solution of a frame, and the stars that gave it; hint: of the frame before."""
-        solver, stars = self.solver(item), stars_of(item)
+        question = Question(item=item, stars=stars_of(item), tilts=self.tilts, places=self.places, hint=hint)
+        return _answered(self, self.solver(item), question)
 
-        def work(solver: Solver) -> Sight:
-            return searching.answer_frame(solver, item, stars, self.tilts, self.places, hint)
 
-        sight = work(solver)
-        return (
-            without_hint(solver, item, stars, sight, work, self.progress)
-            if self.instruments.hinted
-            else sight
-        )
+def _answered(work: Identifying | Solving, solver: Solver, question: Question) -> Sight:
+    if work.instruments.hinted:
+        return answer_by_header(solver, question, work.progress)
+    return answer_frame(solver, question)
 
 
 @dataclass(frozen=True)

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from starpos.fix import searching
-from starpos.fix.searching import Sight, of_one_camera, without_hint
+from starpos.fix.searching import Question, Sight, answer_by_header, of_one_camera
 from starpos.fix.solution import Attitude, Solution, Status
 from starpos.fix.solver import Solver
 from starpos.frames.header import about
-from starpos.instrument.camera import EQUIDISTANT, Camera
+from starpos.instrument.camera import EQUIDISTANT, PLUMB_BOB, Camera
 from starpos.instrument.instrument import Instrument
 from starpos.night.reading import Given
 from starpos.night.work import Identifying
@@ -93,10 +93,12 @@ def test_turning_takes_the_focal_length_that_fits(seen):
 
 @pytest.fixture
 def lost(seen):
-    """Stars whose header is wrong, the solver by that header, and the sight that it gives."""
-    stars = seen(RIGHT | {"XPIXSZ": 3.2})
-    solver = _solver(187500.0)
-    return stars, solver, Identifying(Given(solver.instrument))(stars)[0]
+    """Stars whose header is wrong, and the solver by that header."""
+    return seen(RIGHT | {"XPIXSZ": 3.2}), _solver(187500.0)
+
+
+def asked(stars, solver):
+    return answer_by_header(solver, Question(item=stars, stars=stars), quiet)
 
 
 def never(*_):
@@ -105,9 +107,11 @@ def never(*_):
 
 def test_a_frame_that_nothing_fits_keeps_its_sentence(lost, rng):
     """Random points are searched within the time that a frame has, and reported by the first sentence."""
-    stars, solver, sight = lost
+    stars, solver = lost
     points = replace(stars.take(np.arange(6)), x=rng.uniform(0, SIZE[0], 6), y=rng.uniform(0, SIZE[1], 6))
-    assert without_hint(solver, points, points, sight, never, quiet) is sight
+    sight = asked(points, solver)
+    assert sight.solution.status is Status.NOT_IDENTIFIED and sight.instrument is None
+    assert sight.solution.message == solver.identify(points).message
 
 
 def test_a_focal_length_near_the_headers_needs_no_search_at_every_scale(catalogue, rng, monkeypatch):
@@ -120,7 +124,7 @@ def test_a_focal_length_near_the_headers_needs_no_search_at_every_scale(catalogu
 
 
 def test_a_scale_and_a_lens_that_then_identify_nothing_are_not_told(lost, monkeypatch):
-    stars, solver, sight = lost
+    stars, solver = lost
     searched, tried = [], []
 
     def blind(solver, *_):
@@ -129,13 +133,15 @@ def test_a_scale_and_a_lens_that_then_identify_nothing_are_not_told(lost, monkey
                              mirrored=False, model=EQUIDISTANT)  # fmt: skip
         return Sight(stars, Solution.of(stars, attitude=a_fisheye))
 
-    def again(solver):
+    def identify(solver, question):
         tried.append((solver.instrument.focal_px, solver.instrument.model))
         return sight
 
+    sight = Sight(stars, solver.identify(stars))
+    monkeypatch.setattr(searching, "answer_frame", identify)
     monkeypatch.setattr(searching, "identify_blind_every_way", blind)
-    assert without_hint(solver, stars, stars, sight, again, quiet) is sight
-    assert (searched, tried) == ([searching.HINT_SEARCH_S], [(900.0, EQUIDISTANT)])
+    assert asked(stars, solver) is sight
+    assert (searched, tried) == ([searching.HINT_SEARCH_S], [(187500.0, PLUMB_BOB), (900.0, EQUIDISTANT)])
 
 
 @pytest.mark.parametrize(
@@ -149,9 +155,7 @@ def test_what_no_focal_length_can_help_is_not_searched(instrument, status, seen,
     monkeypatch.setattr(searching, "focal_that_fits", never)
     stars = seen(RIGHT).take(np.arange(3))
     solver = replace(_solver(187500.0), instrument=instrument)
-    sight = Identifying(Given(instrument))(stars)[0]
-    assert sight.solution.status is status
-    assert without_hint(solver, stars, stars, sight, never, quiet) is sight
+    assert asked(stars, solver).solution.status is status
 
 
 def _solver(focal_px):
