@@ -239,7 +239,7 @@ def _light(stamps: Stamps, psf: FieldPsf, fit: Fit) -> np.ndarray:
 
 
 def _first_places(stamps: Stamps, fit: Fit, psf: FieldPsf) -> np.ndarray:
-    """First places (2, 2, N) px of pairs: the star's, and the pixel off its centre with the most light that its fit leaves."""
+    """First places (2, 2, N) px of pairs: the star's, and the pixel off its centre where its fit leaves most light."""
     row, column = brightest_left(
         fit.residual,
         stamps.good,
