@@ -2,14 +2,14 @@
 """The work on one frame, as small objects that can be sent to any process or machine, where `OnFile` calls them."""
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from starpos.earth.place import Places
 from starpos.earth.refraction import Atmosphere
-from starpos.errors import FixError, InstrumentError, StarposError
+from starpos.errors import InstrumentError, StarposError
 from starpos.fix.blind import SEARCH_S, BlindSolver
 from starpos.fix.searching import (
     Question,
@@ -24,14 +24,11 @@ from starpos.fix.solution import Solution
 from starpos.fix.solver import Solver, check_explained
 from starpos.frames.frame import Frame, Stars
 from starpos.identification.hint import Hint
-from starpos.instrument.instrument import Instrument
 from starpos.instrument.tilt_log import NO_TILTS, Tilts
 from starpos.night.reading import Instruments, Reader, TiltFile, stars_of
 from starpos.night.remarks import Kind, Remark
 from starpos.progress import Progress, quiet
 from starpos.sky import catalogue
-from starpos.zenith.adjustment import Adjusted, adjusted
-from starpos.zenith.doubts import check_session
 from starpos.zenith.sighting import Mark, ZenithSighting, sighting
 
 if TYPE_CHECKING:
@@ -172,28 +169,3 @@ class ZenithSighted:
             return sighting(solver, sight.stars, sight.found, self.mark, self.tilts)
         except StarposError as error:
             return Solution.refused(sight.stars, error)
-
-
-@dataclass(frozen=True, eq=False)
-class DeflectionSession:
-    """A session: its sightings in order of time, and the deflection that they give."""
-
-    sightings: tuple[ZenithSighting, ...]
-    adjusted: Adjusted
-
-    @classmethod
-    def of(
-        cls, sightings: Sequence[ZenithSighting], instrument: Instrument, atmosphere: Atmosphere, mark: Mark
-    ) -> "DeflectionSession":
-        """Adjust the sightings; FixError, with a sentence, where they do not bear a deflection."""
-        if not sightings:
-            raise FixError("no frame with stars and a tilt: there is no deflection")
-        in_time = tuple(sorted(sightings, key=lambda s: s.utc_unix_s))
-        found = adjusted(in_time, instrument, atmosphere, mark)
-        check_session(found, in_time)
-        return cls(in_time, found)
-
-    @property
-    def mid_unix_s(self) -> float:
-        """Mean time of its frames, UTC."""
-        return sum(s.utc_unix_s for s in self.sightings) / len(self.sightings)

@@ -9,7 +9,6 @@ from dataclasses import replace
 from typing import Any
 
 from starpos.earth.orientation import earth_state
-from starpos.earth.place import Places
 from starpos.errors import StarposError
 from starpos.fix.camera_attitude import CameraAttitude
 from starpos.fix.searching import (
