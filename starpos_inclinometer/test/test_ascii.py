@@ -13,10 +13,10 @@ import pytest
 
 from starpos.parameters.table import defaults_of
 from starpos_inclinometer.clock import HostClock, Moment
-from starpos_inclinometer.emulator import Pty
 from starpos_inclinometer.sources.ascii_line import MAX_LINE, UNITS, AsciiSource, LineDecoder, TextLines
 from starpos_inclinometer.sources.registry import refusal
 from starpos_inclinometer.sources.source import GAP, OUT_OF_RANGE, STUCK, TIME_UNKNOWN, Phase, Surroundings
+from starpos_testing.emulator import Pty
 from starpos_testing.patience import WAIT_S
 
 NUMBER = r"[-+]?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?"

@@ -8,7 +8,6 @@ import pytest
 
 from starpos.parameters.table import defaults_of
 from starpos_inclinometer.clock import Moment, Step
-from starpos_inclinometer.emulator import Mcu
 from starpos_inclinometer.node import Reporter
 from starpos_inclinometer.sources.mcu import McuDecoder, McuTilts
 from starpos_inclinometer.sources.mcu_protocol import Identity, Sample
@@ -22,6 +21,7 @@ from starpos_inclinometer.sources.source import (
     Health,
     Phase,
 )
+from starpos_testing.emulator import Mcu
 
 VALUES = defaults_of("inclinometer")
 
