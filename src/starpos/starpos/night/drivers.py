@@ -36,7 +36,7 @@ class Drivers:
         namespace: str | None = None,
         remaps: Remaps = NO_REMAPS,
     ) -> "Drivers":
-        """By a parameter file and texts NODE:NAME:=VALUE; errors as `values_of` raises them."""
+        """Read them from a parameter file and texts NODE:NAME:=VALUE; errors as `values_of` raises them."""
         detector, inclinometer = (values_of(n, file, given, namespace) for n in ("detector", "inclinometer"))
         return cls(detector, inclinometer, remaps)
 
