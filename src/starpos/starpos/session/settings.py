@@ -184,7 +184,7 @@ class Settings:
     def of(
         cls, file: Path | None = None, given: Sequence[str] = (), namespace: str | None = None
     ) -> "Settings":
-        """Read them from a parameter file and texts NAME:=VALUE, as the node has them; errors as `values_of` raises them."""
+        """Read them from a parameter file and texts NAME:=VALUE, as the node does; errors as `values_of` raises them."""
         settings = cls(values_of("solver", file, given, namespace))
         if trouble := settings.check(settings.values, frozenset(settings.values), None):
             raise InstrumentError(trouble)
