@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A session's deflection, and what speaks against it: faces that do not come round, a jump of the clock or of a zero.
+"""A zenith session: its deflection, and what speaks against it: faces that do not come round, a jump of clock or zero."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
