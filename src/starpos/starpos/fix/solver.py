@@ -120,7 +120,7 @@ class Solver:
         return self._identified(stars, part, lambda field, sky, _: identify_frame(field, sky, predicted))
 
     def look_again(self, stars: Stars, look: Look, predicted: Priors = (), part: float = 1.0) -> Solution:
-        """The same where the stars alone are too few, by what the frame shows where others should be.
+        """Identify stars that alone are too few, by what their frame shows where others should be.
 
         Only for a frame on which `identify` has failed; a fisheye's stays unidentified.
         """
