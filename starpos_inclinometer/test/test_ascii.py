@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 from starpos_inclinometer.clock import HostClock, Moment
-from starpos_inclinometer.emulator import Pty
 from starpos_inclinometer.parameters import PARAMETERS, refusal
 from starpos_inclinometer.sources.ascii_line import MAX_LINE, UNITS, AsciiSource, LineDecoder, TextLines
 from starpos_inclinometer.sources.source import GAP, OUT_OF_RANGE, STUCK, TIME_UNKNOWN, Phase, Surroundings
+from starpos_testing.emulator import Pty
 from starpos_testing.patience import WAIT_S
 
 NUMBER = r"[-+]?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?"

@@ -11,10 +11,10 @@ import pytest
 from diagnostic_msgs.msg import DiagnosticArray
 from rcl_interfaces.srv import DescribeParameters
 
-from starpos_inclinometer.emulator import Mcu
 from starpos_inclinometer.node import PARAMETERS
 from starpos_inclinometer.sources import source
 from starpos_interfaces.msg import Tilt
+from starpos_testing.emulator import Mcu
 from starpos_testing.nodes import Listener, Process, take_domain
 
 

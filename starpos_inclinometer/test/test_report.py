@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from starpos_inclinometer.clock import Moment, Step
-from starpos_inclinometer.emulator import Mcu
 from starpos_inclinometer.node import Reporter
 from starpos_inclinometer.parameters import PARAMETERS
 from starpos_inclinometer.sources.mcu import McuDecoder, McuTilts
@@ -22,6 +21,7 @@ from starpos_inclinometer.sources.source import (
     Health,
     Phase,
 )
+from starpos_testing.emulator import Mcu
 
 VALUES = {p.name: p.default for p in PARAMETERS}
 

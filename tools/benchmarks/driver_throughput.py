@@ -7,11 +7,11 @@ from collections.abc import Iterator
 from table import Cost, Row
 
 from starpos_inclinometer.clock import Moment
-from starpos_inclinometer.emulator import Mcu
 from starpos_inclinometer.parameters import PARAMETERS
 from starpos_inclinometer.sources import mcu_protocol
 from starpos_inclinometer.sources.ascii_line import LineDecoder
 from starpos_inclinometer.sources.mcu import McuDecoder, McuTilts
+from starpos_testing.emulator import Mcu
 
 RATE_HZ = 50
 COMPENSATED = {

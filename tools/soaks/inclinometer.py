@@ -14,10 +14,10 @@ from pathlib import Path
 from runner import Memory, Progress
 
 from starpos_inclinometer.clock import HostClock
-from starpos_inclinometer.emulator import Faults, Mcu, Pty
 from starpos_inclinometer.parameters import PARAMETERS
 from starpos_inclinometer.sources.mcu import McuSource
 from starpos_inclinometer.sources.source import Surroundings
+from starpos_testing.emulator import Faults, Mcu, Pty
 
 RATE_HZ, ALLOWED_MB, ENOUGH = 50, 1.0, 0.6
 RESET_S, PULL_S, PULLED_S = 300.0, 420.0, 20.0

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from starpos.averaging.average import Average
-from starpos.cli import console, field_replay, inputs, options
+from starpos.cli import console, inputs, options
 from starpos.cli.console import Output, add_formats
 from starpos.cli.fix_output import (
     COLUMNS,
@@ -21,15 +21,22 @@ from starpos.cli.fix_output import (
 )
 from starpos.cli.inputs import NightFolder
 from starpos.cli.solve import NO_FIX
+from starpos.earth.refraction import Atmosphere
 from starpos.earth.vertical import Vertical
 from starpos.errors import StarposError
 from starpos.fix.checks import BY_PARAMETERS, MODEL_BY_PARAMETERS
 from starpos.fix.solution import Solution
+from starpos.frames.reading import read_frame
+from starpos.frames.tables import TILTS
+from starpos.instrument import instrument_file
 from starpos.instrument.instrument import Instrument
+from starpos.instrument.tilt_table import read_tilt_csv
+from starpos.night.opening import frames_in
+from starpos.night.reading import stars_of
 from starpos.night.remarks import of_a3, of_inclinometer
 from starpos.night.together import Solved, extrapolated
 from starpos.recording.topics import NO_REMAPS, Remaps
-from starpos.report.field import is_field, opened
+from starpos.report.field import INSTRUMENT, is_field, opened
 from starpos.session import frames
 from starpos.session.frames import Answered, Averaged
 from starpos.session.parameter_file import drivers_of, settings_of
@@ -113,8 +120,8 @@ class Playing:
         if is_field(bag):
             with opened(bag) as (folder, air):
                 told = self.given or self.params_file is not None
-                given = self.given if told else field_replay.parameters_in(folder, air)
-                return self._played(lambda replay: field_replay.played(replay, folder), given)
+                given = self.given if told else _parameters_in(folder, air)
+                return self._played(lambda replay: _played(replay, folder), given)
         return self._played(lambda replay: replay.play(Path(bag), self.namespace), self.given)
 
     def _played(self, play: Callable[[Replay], Iterator[frames.Output]], given: Sequence[str]) -> PlayedNight:
@@ -143,6 +150,21 @@ class Playing:
 def _light(solution: Solution) -> Solution:
     """A solution without what only its solver needs."""
     return replace(solution, hint=None)
+
+
+def _parameters_in(folder: Path, air: Atmosphere) -> list[str]:
+    """The solver's parameters, NAME:=VALUE, of an unpacked field report."""
+    measured = {"pressure": air.pressure_pa, "temperature": air.temperature_c, "humidity": air.humidity}
+    refraction = [f"refraction.{name}:={float(value)}" for name, value in measured.items()]
+    return [f"calibration_url:={folder / INSTRUMENT}", *refraction]
+
+
+def _played(replay: Replay, folder: Path) -> Iterator[frames.Output]:
+    """What the session publishes of an unpacked field report."""
+    instrument = instrument_file.read(folder / INSTRUMENT)
+    stars = [stars_of(read_frame(path)) for path in frames_in(folder)]
+    tilts = read_tilt_csv(folder / TILTS, instrument.inclinometer.noise_rad)
+    return replay.play_lists(instrument.camera_for(stars[0].width, stars[0].height), stars, tilts)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from starpos.budget import Budget
 from starpos.errors import StarposError
 from starpos.fix.checks import why_noise
 from starpos.fix.solution import Solution, Status, solution_of
@@ -26,7 +25,7 @@ from starpos.identification.quads import cached_quads
 from starpos.identification.search import field_of
 from starpos.identification.triangles import no_triangles
 from starpos.instrument.camera import Camera
-from starpos.progress import Progress, quiet
+from starpos.progress import CpuLimit, Progress, quiet
 from starpos.sky.catalogue import Catalogue
 
 # CPU time, s, of the search for one frame.
@@ -53,7 +52,7 @@ class BlindSolver:
 
     def identify(self, stars: Stars) -> Solution:
         """Names of the stars, pointing, focal length and lens of a camera with its axis near the middle of the frame."""
-        begin, budget = time.perf_counter(), Budget.of(self.search_s)
+        begin, limit = time.perf_counter(), CpuLimit.of(self.search_s)
         inside = np.flatnonzero(stars.on_frame)
         seen = stars.take(inside)
         if len(seen) < MIN_STARS:
@@ -68,17 +67,17 @@ class BlindSolver:
             sky = Sky.at(self.catalogue, no_triangles(), stars.mid_unix_s)
         except StarposError as e:
             return Solution.refused(stars, e)
-        match = self._match(seen, sky, budget)
+        match = self._match(seen, sky, limit)
         if match is None:
             return replace(
-                Solution.failed(stars, Status.NOT_IDENTIFIED, _why(seen, self.search_s, budget)),
+                Solution.failed(stars, Status.NOT_IDENTIFIED, _why(seen, self.search_s, limit)),
                 identify_s=time.perf_counter() - begin,
             )
         camera, found = match
         field = field_of(camera.directions(seen.x, seen.y), seen.sigma, camera, seen.window)
         return solution_of(seen, field, sky, camera, found, begin).among(stars, inside)
 
-    def _match(self, seen: Stars, sky: Sky, budget: Budget) -> tuple[Camera, Identification] | None:
+    def _match(self, seen: Stars, sky: Sky, limit: CpuLimit) -> tuple[Camera, Identification] | None:
         """A camera and its identification of stars: of a pinhole, else of a fisheye, first where it looks like one."""
         quads = cached_quads(self.catalogue, self.progress)
         xy = np.stack([seen.x, seen.y], 1)
@@ -86,10 +85,10 @@ class BlindSolver:
         near_px = seen.rough_focal_px
 
         def by_fisheye() -> tuple[Camera, Identification] | None:
-            return identify_fisheye(*about, self.fisheye_stages, near_px, budget, self.progress)
+            return identify_fisheye(*about, self.fisheye_stages, near_px, limit, self.progress)
 
         def by_pinhole() -> tuple[Camera, Identification] | None:
-            return identify_blind(*about, self.stages, near_px, seen.window, budget, self.progress)
+            return identify_blind(*about, self.stages, near_px, seen.window, limit, self.progress)
 
         ways = (by_pinhole, by_fisheye)
         if seen.fisheye or disc_radius_px(xy, seen.width, seen.height) is not None:
@@ -97,13 +96,13 @@ class BlindSolver:
         return ways[0]() or ways[1]()
 
 
-def _why(seen: Stars, search_s: float, budget: Budget) -> str:
+def _why(seen: Stars, search_s: float, limit: CpuLimit) -> str:
     """A sentence that says why stars were not identified, and what to do."""
     tried = (
         f"fields of {SMALLEST_DEG:g} to {LARGEST_DEG:g} deg from corner to corner, fisheyes of {NARROWEST_DEG:g} to "
         f"{WIDEST_DEG:g} deg"
     )
-    if budget.spent:
+    if limit.reached:
         what = (
             f"in {search_s:g} s of CPU no part of the sky was found to match its {len(seen)} stars at any "
             f"scale ({tried}): "

@@ -12,8 +12,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from starpos.budget import Budget
-from starpos.earth.known_place import Places
+from starpos.earth.place import Places
 from starpos.errors import FieldError, StarposError
 from starpos.fix.blind import BlindSolver
 from starpos.fix.solution import Solution, Status
@@ -26,7 +25,7 @@ from starpos.identification.hint import Hint
 from starpos.identification.search import MIN_LOG_ODDS_WITH_LOOK, Priors
 from starpos.instrument.instrument import Instrument
 from starpos.instrument.tilt_log import Tilts
-from starpos.progress import Progress
+from starpos.progress import CpuLimit, Progress
 
 if TYPE_CHECKING:
     from starpos.detection.second_look import SecondLook
@@ -88,14 +87,14 @@ def identify_blind_every_way(solver: BlindSolver, item: Frame | Stars, stars: St
 
     All ways together have the CPU time that the solver has for a search.
     """
-    budget = Budget.of(solver.search_s)
+    limit = CpuLimit.of(solver.search_s)
 
     def ways(seen: Stars) -> Iterator[Solution]:
         if seen is not stars:
-            quick = replace(solver, stages=QUICK, fisheye_stages=QUICK_FISHEYE, search_s=budget.left_s)
+            quick = replace(solver, stages=QUICK, fisheye_stages=QUICK_FISHEYE, search_s=limit.left_s)
             yield quick.identify(seen)
 
-    return _another(item, Sight(stars, solver.identify(stars)), ways, lambda: budget.spent)
+    return _another(item, Sight(stars, solver.identify(stars)), ways, lambda: limit.reached)
 
 
 def solve_every_way(

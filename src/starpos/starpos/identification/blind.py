@@ -21,7 +21,6 @@ from itertools import product
 import numpy as np
 
 from starpos import rotation
-from starpos.budget import ENDLESS, Budget
 from starpos.frames.frame import Window
 from starpos.identification import fisheye
 from starpos.identification._frame import FrameStars
@@ -40,7 +39,7 @@ from starpos.identification.quads import Matches, QuadCatalogue, QuadPoses, most
 from starpos.identification.search import SECOND_TRY, second_try, through
 from starpos.identification.sky import Sky
 from starpos.instrument.camera import EQUIDISTANT, Camera
-from starpos.progress import Progress, quiet
+from starpos.progress import UNLIMITED, CpuLimit, Progress, quiet
 
 # Fields from corner to corner that are tried, deg.
 SMALLEST_DEG, LARGEST_DEG = 0.6, 100.0
@@ -76,14 +75,14 @@ def identify_blind(
     stages: Sequence[tuple[int, float]] = STAGES,
     near_px: float | None = None,
     window: Window | None = None,
-    budget: Budget = ENDLESS,
+    limit: CpuLimit = UNLIMITED,
     progress: Progress = quiet,
 ) -> tuple[Camera, Identification] | None:
     """Identify stars at pixels xy (N, 2), brightest first, of a pinhole camera of unknown focal length.
 
     near_px: a likely focal length, with which the search begins; it has half of the probability.
     window: the part of the frame that shows something, as `Stars` has it; None: all of it.
-    budget: CPU time after which the search ends; what it has found until then counts.
+    limit: CPU time after which the search ends; what it has found until then counts.
 
     Returns the camera, whose focal length `Identification.focal_scale` refines, and the identification; None without
     an identification beyond doubt.
@@ -114,7 +113,7 @@ def identify_blind(
     for k, (t, (stars, error_px), (low, high)) in enumerate(work):
         progress("searching all scales", k / len(work))
         prior = any_scale(low, high, -math.log(len(spans)))
-        for pose, radius_px in _poses(frame.take(t.rows), sky, quads, (low, high), stars, error_px, budget):
+        for pose, radius_px in _poses(frame.take(t.rows), sky, quads, (low, high), stars, error_px, limit):
             camera = Camera.from_focal(width, height, pose.focal_px)
             seen = through(stars_at(camera, xy[t.rows], sigma_px[t.rows]), camera, window)
             seen = seen.but(area_px2=t.share * seen.area_px2)
@@ -123,7 +122,7 @@ def identify_blind(
                 best = camera, found.but(star=t.rows[found.star])
                 if is_sure(found, seen):
                     return best
-        if budget.spent:
+        if limit.reached:
             break
     return best
 
@@ -148,18 +147,18 @@ def _poses(
     focal_range: tuple[float, float],
     stars: int,
     error_px: float,
-    budget: Budget,
+    limit: CpuLimit,
 ) -> Iterator[tuple[Pose, np.ndarray]]:
     """Yield poses, those first on which most quads agree, and the distance (N,) px by which each star may be off."""
     half_diagonal_px = float(np.hypot(*field.half))
     matches = []
     for focal_px, step in focal_lengths(half_diagonal_px, *focal_range):
-        if budget.spent:
+        if limit.reached:
             return
         matches.append(Matches.of(field, quads, stars, error_px, focal_px, step))
     found = QuadPoses.of(field, sky, Matches.together(matches), error_px, focal_range)
     for k in most_agreed(found.poses, half_diagonal_px, MAX_JUDGED):
-        if budget.spent:
+        if limit.reached:
             return
         yield found.poses[k], found.radius_px(field, k, error_px)
 
@@ -269,13 +268,13 @@ def identify_fisheye(
     quads: QuadCatalogue,
     stages: Sequence[int] = FISHEYE_STAGES,
     near_px: float | None = None,
-    budget: Budget = ENDLESS,
+    limit: CpuLimit = UNLIMITED,
     progress: Progress = quiet,
 ) -> tuple[Camera, Identification] | None:
     """Identify stars at pixels xy (N, 2), brightest first, with errors (N,) px, of a fisheye with its axis in the middle.
 
     stages: numbers of the brightest stars of a part that make quads.  near_px: a focal length that it may have.
-    budget: CPU time after which the search ends.
+    limit: CPU time after which the search ends.
 
     Returns a camera that is near the true one, and the identification; None without one beyond doubt.
     """
@@ -295,9 +294,9 @@ def identify_fisheye(
     best: tuple[Camera, Identification] | None = None
     for done, (stars, k) in enumerate(work):
         progress("searching fisheyes", done / len(work))
-        guesses = list(_guesses(picture, spans, _TURNS[k], stars, sky, quads, budget))
+        guesses = list(_guesses(picture, spans, _TURNS[k], stars, sky, quads, limit))
         for guess, row in _most_agreed(guesses):
-            if budget.spent:
+            if limit.reached:
                 return best
             pose, radius = guess.found.poses[row], guess.found.radius_px(guess.field, row, FISHEYE_ERROR_PX)
             found = verify_pose(guess.field, sky, pose, radius, prior, need)
@@ -328,14 +327,14 @@ def _guesses(
     stars: int,
     sky: Sky,
     quads: QuadCatalogue,
-    budget: Budget,
+    limit: CpuLimit,
 ) -> Iterator[_Guess]:
     """Yield what each lens and focal length makes of a part of the picture."""
     for lens, (shortest, longest) in zip(LENSES, spans, strict=True):
         for focal_px in np.geomspace(
             shortest, longest, math.ceil(math.log(longest / shortest) / (2 * FISHEYE_STEP)) + 1
         ):
-            if budget.spent:
+            if limit.reached:
                 return
             part, field = _part(picture, float(focal_px), lens, turn)
             if field is None or len(field) < MIN_STARS:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from starpos.earth.geoid import Geoid
-from starpos.earth.known_place import KnownPlace
+from starpos.earth.place import Place
 from starpos.earth.vertical import Vertical
 from starpos.errors import StarposError
 from starpos.files import path_of
@@ -195,7 +195,7 @@ class NavigatorSettings:
         return settings.vertical_of(self.values, self._files[2])
 
     @property
-    def site(self) -> KnownPlace | None:
+    def site(self) -> Place | None:
         """The place that is known; None where none is set."""
         return settings.site_of(self.values, self.vertical)
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from starpos.earth import geoid
 from starpos.earth.geoid import Geoid
-from starpos.earth.known_place import KnownPlace
+from starpos.earth.place import Place
 from starpos.earth.refraction import Atmosphere
 from starpos.earth.vertical import UNKNOWN_STDDEV_ARCSEC, AtHeight, Deflection, Vertical
 from starpos.errors import GeoidError, InstrumentError, PlaceError, StarposError
@@ -399,14 +399,14 @@ def atmosphere_of(values: Mapping) -> Atmosphere:
     return Atmosphere.measured(*(None if math.isnan(value) else value for value in set_to))
 
 
-def site_of(values: Mapping, vertical: Vertical) -> KnownPlace | None:
+def site_of(values: Mapping, vertical: Vertical) -> Place | None:
     """Make the place of site.latitude and site.longitude, None where they are unset; PlaceError if only one is."""
     latitude, longitude = values["site.latitude"], values["site.longitude"]
     if math.isnan(latitude) and math.isnan(longitude):
         return None
     if math.isnan(latitude) or math.isnan(longitude):
         raise PlaceError("site.latitude and site.longitude belong together: set both, or neither")
-    make = KnownPlace.on_ellipsoid if values["site.geodetic"] else KnownPlace.by_gravity
+    make = Place.on_ellipsoid if values["site.geodetic"] else Place.by_gravity
     return make(latitude, longitude, vertical, np.eye(2) * values["site.stddev"] ** 2)
 
 
@@ -505,7 +505,7 @@ class Settings:
         return vertical_of(self.values, self._geoid)
 
     @property
-    def site(self) -> KnownPlace | None:
+    def site(self) -> Place | None:
         """The place that is known; None where none is set."""
         return site_of(self.values, self.vertical)
 

@@ -10,8 +10,7 @@ import pytest
 from cli_calls import WIDE
 
 from starpos import cli
-from starpos.cli import console, inputs, parser_for
-from starpos.cli.commands import COMMANDS
+from starpos.cli import COMMANDS, console, inputs, parser_for
 from starpos_testing.command_line import run
 from starpos_testing.lacking import require
 from starpos_testing.patience import WAIT_S

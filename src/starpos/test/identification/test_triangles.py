@@ -285,7 +285,8 @@ def test_a_cache_that_cannot_be_written(tmp_path, monkeypatch, catalogue):
 def test_two_processes_at_once(own_cache):
     program = (
         "import numpy as np; from starpos.sky import catalogue; from starpos.identification import triangles\n"
-        f"t = triangles.cached_triangles(catalogue.load_catalogue(), {BROAD}); print(len(t.corners), int(t.corners.sum()))"
+        f"t = triangles.cached_triangles(catalogue.load_catalogue(), {BROAD}); "
+        "print(len(t.corners), int(t.corners.sum()))"
     )
     environment = os.environ | {"XDG_CACHE_HOME": str(own_cache.parent)}
     running = [

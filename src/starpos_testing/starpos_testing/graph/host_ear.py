@@ -27,10 +27,15 @@ def end_with_input():
     rclpy.try_shutdown()
 
 
-rclpy.init()
-node = rclpy.create_node("ear")
-for name in sys.argv[1:]:
-    node.create_subscription(KINDS[name], name, tell(name), 100, raw=True)
-threading.Thread(target=end_with_input, daemon=True).start()
-with contextlib.suppress(ExternalShutdownException):
-    rclpy.spin(node)
+def main():
+    rclpy.init()
+    node = rclpy.create_node("ear")
+    for name in sys.argv[1:]:
+        node.create_subscription(KINDS[name], name, tell(name), 100, raw=True)
+    threading.Thread(target=end_with_input, daemon=True).start()
+    with contextlib.suppress(ExternalShutdownException):
+        rclpy.spin(node)
+
+
+if __name__ == "__main__":
+    main()
