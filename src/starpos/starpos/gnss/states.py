@@ -279,7 +279,7 @@ def aged(learned: Learned, by: Ageing, tilt: Tilt, utc_unix_s: float) -> Learned
 
 
 def at_temperature(learned: Learned, tilt: Tilt) -> Learned:
-    """The same at the temperature of a tilt.
+    """Carry what was learned to the temperature of a tilt.
 
     While temperatures are not measured, the zero walks with them: from then on they count from the next measured one.
     """
