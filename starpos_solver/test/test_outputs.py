@@ -9,7 +9,7 @@ import pytest
 from sensor_msgs.msg import NavSatFix, NavSatStatus
 from std_msgs.msg import Header
 
-from starpos.earth.known_place import KnownPlace
+from starpos.earth.place import Place
 from starpos.earth.vertical import Deflection
 from starpos.fix.budget import ErrorTerm, heading_of, heading_row
 from starpos.fix.fix import Fix
@@ -196,7 +196,7 @@ def at_place_facing(azimuth_deg: float, **places) -> AttitudeAtPlace:
     term = ErrorTerm("centroids", np.vstack([np.zeros((2, 3)), heading, np.eye(3)]) * 1e-4)
     link = LinkAttitude(link_to_enu=fix.link_to_enu, terms=(term,))
     shared = {f.name: getattr(fix, f.name) for f in fields(AttitudeAtPlace) if hasattr(fix, f.name)}
-    where = KnownPlace.on_ellipsoid(40.0, 57.0, EXACT)
+    where = Place.on_ellipsoid(40.0, 57.0, EXACT)
     return AttitudeAtPlace(**shared, place=where, plumb=link, ellipsoid=link, true_north=link)
 
 

@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from starpos.earth.ellipsoid import curvature_radii_m, enu_axes
-from starpos.earth.known_place import KnownPlace
+from starpos.earth.place import Place
 from starpos.earth.vertical import UNKNOWN_STDDEV_ARCSEC, Deflection, geodetic
 from starpos.fix.budget import heading_of
 from starpos.fix.solver import Solver, placed
@@ -79,7 +79,7 @@ def headings(task: tuple[Case, np.random.SeedSequence]) -> np.ndarray | str:
     ground = geodetic(*plumb.tolist(), 0.0, np.zeros((3, 3)), true)
     prime, meridian = curvature_radii_m(ground.latitude)
     east, north = rng.normal(0, PLACE_M, 2)
-    told = KnownPlace.on_ellipsoid(
+    told = Place.on_ellipsoid(
         float(np.degrees(ground.latitude + north / meridian)),
         float(np.degrees(ground.longitude + east / prime / np.cos(ground.latitude))),
         Deflection(),

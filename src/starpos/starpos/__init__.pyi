@@ -4,7 +4,7 @@ from starpos.averaging.average import average as average
 from starpos.calibration.misalignment import calibrate_at as calibrate_at
 from starpos.detection import Detection as Detection
 from starpos.detection import detect as detect
-from starpos.earth.known_place import KnownPlace as KnownPlace
+from starpos.earth.place import Place as Place
 from starpos.earth.refraction import Atmosphere as Atmosphere
 from starpos.earth.vertical import Deflection as Deflection
 from starpos.earth.vertical import geodetic as geodetic

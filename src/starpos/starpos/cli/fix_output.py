@@ -9,8 +9,8 @@ from starpos.averaging.average import Average
 from starpos.averaging.poses import MeanAttitude, mean_attitude
 from starpos.cli.console import Output
 from starpos.cli.inputs import NightFolder
-from starpos.earth.known_place import KnownPlace
 from starpos.earth.orientation import measured_until, table_age_days
+from starpos.earth.place import Place
 from starpos.earth.vertical import Geodetic, Vertical, geodetic
 from starpos.errors import FixError
 from starpos.fix.fix import Fix, InDegrees, length_text
@@ -191,7 +191,7 @@ COVARIANCES = ("covariance", "covariance_geodetic")
 
 
 def with_heading(
-    values: dict, found: AttitudeAtPlace | MeanAttitude | None, place: KnownPlace | None = None
+    values: dict, found: AttitudeAtPlace | MeanAttitude | None, place: Place | None = None
 ) -> dict:
     """The keys of a fix and of the heading at a known place; keys without a value are None.
 
@@ -262,7 +262,7 @@ def put_mean(
     night: NightFolder,
     answers: Sequence[Solution],
     mean: MeanAttitude | None,
-    place: KnownPlace,
+    place: Place,
     vertical: Vertical,
 ) -> None:
     """Write the mean attitude of frames without a place of their own."""

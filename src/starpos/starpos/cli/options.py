@@ -11,7 +11,7 @@ import numpy as np
 
 from starpos.cli import console
 from starpos.earth import geoid
-from starpos.earth.known_place import KnownPlace
+from starpos.earth.place import Place
 from starpos.earth.refraction import Atmosphere
 from starpos.earth.vertical import UNKNOWN_STDDEV_ARCSEC, AtHeight, Deflection, Vertical
 from starpos.errors import InstrumentError
@@ -458,7 +458,7 @@ def add_site(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def place_of(args: argparse.Namespace, vertical: Vertical) -> KnownPlace | None:
+def place_of(args: argparse.Namespace, vertical: Vertical) -> Place | None:
     """The place of --site, None without it; InstrumentError for bad options, PlaceError for an impossible place.
 
     vertical: the deflection by the other options.
@@ -483,6 +483,6 @@ def place_of(args: argparse.Namespace, vertical: Vertical) -> KnownPlace | None:
             raise InstrumentError("--site has a height, and --altitude-m another: give one")
         vertical = replace(vertical, height_m=args.site[2])
     covariance = np.eye(2) * (args.site_stddev or 0.0) ** 2
-    make = KnownPlace.on_ellipsoid if args.geodetic else KnownPlace.by_gravity
+    make = Place.on_ellipsoid if args.geodetic else Place.by_gravity
     latitude_deg, longitude_deg, *_ = args.site
     return make(latitude_deg, longitude_deg, vertical, covariance)

@@ -38,7 +38,7 @@ from starpos.cli.inputs import (
 )
 from starpos.cli.options import add_site, add_vertical, place_of, tell_unknown, vertical_of
 from starpos.cli.overwriting import Written, save_instrument
-from starpos.earth.known_place import KnownPlace
+from starpos.earth.place import Place
 from starpos.earth.vertical import Vertical
 from starpos.errors import FrameError, InstrumentError, StarposError, TiltError
 from starpos.fix.searching import of_one_camera
@@ -94,7 +94,7 @@ def tell(
     rows: Iterable,
     vertical: Vertical,
     given: Instrument | None = None,
-    place: KnownPlace | None = None,
+    place: Place | None = None,
 ) -> tuple[int, str]:
     """Write (path, Solution or FrameError) of each frame, and their common result.
 
@@ -527,7 +527,7 @@ def _plan(
     about: About | None,
     read: Reader,
     own_level: bool,
-    place: KnownPlace | None,
+    place: Place | None,
 ) -> Plan:
     # without a frame that can be read, each one reports why it cannot
     if about is None:

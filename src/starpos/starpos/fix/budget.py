@@ -84,7 +84,7 @@ def correlation(a: tuple, b: tuple) -> float:
 
 @at_once
 @dataclass(frozen=True)
-class Place:
+class LocalNorth:
     """The place that A4 contains: latitude, longitude (rad); east and north as unit vectors (3,) of L."""
 
     latitude: float
@@ -98,13 +98,13 @@ class Place:
         return np.array([self.east, self.north, [0.0, 0.0, 1.0]])
 
 
-def place_of(a4: np.ndarray) -> Place:
+def local_north(a4: np.ndarray) -> LocalNorth:
     """Place from A4 (3, 3), which takes ITRS into L.  At a pole longitude is 0 and north points along it."""
     latitude, longitude = place_of_zenith(a4[2])
     x, y, _ = (a4 @ enu_axes(latitude, longitude)[1]).tolist()
     level = math.hypot(x, y)
     north = np.array([x / level, y / level, 0.0])
-    return Place(latitude, longitude, np.array([y / level, -x / level, 0.0]), north)
+    return LocalNorth(latitude, longitude, np.array([y / level, -x / level, 0.0]), north)
 
 
 @at_once
@@ -120,7 +120,7 @@ class Sensitivity:
     level: np.ndarray
 
     @classmethod
-    def of(cls, place: Place, link_to_enu: np.ndarray) -> "Sensitivity":
+    def of(cls, place: LocalNorth, link_to_enu: np.ndarray) -> "Sensitivity":
         """Sensitivity at a place with the attitude link_to_enu (3, 3)."""
         prime, meridian = curvature_radii_m(place.latitude)
         east, north = place.east, place.north

@@ -17,8 +17,8 @@ from starpos.fix.budget import (
     Sensitivity,
     error_terms,
     heading_of,
+    local_north,
     mount_term,
-    place_of,
     total_covariance,
 )
 from starpos.fix.star_fit import MatchedStars, SeenFrame, apparent, fit_stars
@@ -146,7 +146,7 @@ def solve_fix(
     g = level.camera
     seen = fit_stars(stars, camera, g, refraction, apparent(stars, earth, shutter, camera.height))
     fit, errors = seen.fit, seen.errors
-    place = place_of(fit.a4)
+    place = local_north(fit.a4)
     link_to_enu = place.local_to_enu @ g @ mounting.link_to_camera
     sensitivity = Sensitivity.of(place, link_to_enu)
     # the two axes go with the inclinometer, however it leans
@@ -232,7 +232,7 @@ def pointing_fix(
     g, to_itrs = seen.level(tilt).camera, fix.camera_to_itrs
     # the centre's error turns the frame about two axes across its own, the roll's error about its own axis
     own = np.diag([pointing.sigma, pointing.sigma, pointing.sigma_roll]) ** 2
-    sensitivity = Sensitivity.of(place_of(g @ to_itrs.T), fix.link_to_enu)
+    sensitivity = Sensitivity.of(local_north(g @ to_itrs.T), fix.link_to_enu)
     return replace(
         fix,
         terms=(

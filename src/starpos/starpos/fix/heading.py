@@ -12,8 +12,8 @@ import numpy as np
 from starpos import rotation
 from starpos._numeric.roots import symmetric_root
 from starpos.earth.ellipsoid import meridian_turn
-from starpos.earth.known_place import KnownPlace
 from starpos.earth.orientation import ROTATION_RAD_S, EarthState, station_velocity
+from starpos.earth.place import Place
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import FixError, PlaceError
 from starpos.fix.budget import ALWAYS, ErrorTerm, heading_of, heading_row, mount_term, total_covariance
@@ -87,7 +87,7 @@ class AttitudeAtPlace(SeenFrame):
     true_north: level by the plumb line, north by the ellipsoid, as the fix's attitude in a graph of nodes.
     """
 
-    place: KnownPlace
+    place: Place
     plumb: LinkAttitude
     ellipsoid: LinkAttitude
     true_north: LinkAttitude
@@ -105,7 +105,7 @@ class AttitudeAtPlace(SeenFrame):
 def attitude_at_place(
     stars: MatchedStars,
     camera: Camera,
-    place: KnownPlace,
+    place: Place,
     mounting: Mounting,
     atmosphere: Atmosphere,
     earth: EarthState,
@@ -139,7 +139,7 @@ def attitude_at_place(
     axis = g @ camera.centre_ray
     terms = _rotations(seen, atmosphere, earth, shutter, camera.height, clock_stddev_s, stamp_stddev_s, a4)
     link = g @ mounting.link_to_camera
-    to_ellipsoid = place.ellipsoid_axes @ a4.T
+    to_ellipsoid = place.axes @ a4.T
     turn = math.atan2(to_ellipsoid[0, 1], to_ellipsoid[1, 1])
     north = rotation.about_axis(2, -turn)
 

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from starpos.earth.known_place import Places
+from starpos.earth.place import Places
 from starpos.errors import FieldError, StarposError
 from starpos.fix.blind import BlindSolver
 from starpos.fix.solution import Solution, Status

@@ -9,8 +9,8 @@ from functools import cached_property
 import numpy as np
 
 from starpos.earth.ellipsoid import curvature_radii_m
-from starpos.earth.known_place import KnownPlace, Places
 from starpos.earth.orientation import EarthState, earth_state
+from starpos.earth.place import Place, Places
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import FieldError, FixError, InstrumentError, PlaceError, StarposError, TimeError
 from starpos.fix.checks import check_above_horizon, check_unmoved, why_unidentified
@@ -280,7 +280,7 @@ class Solver:
             index,
         )
 
-    def attitude_at(self, stars: Stars, found: Identification, place: KnownPlace) -> AttitudeAtPlace:
+    def attitude_at(self, stars: Stars, found: Identification, place: Place) -> AttitudeAtPlace:
         """Heading, pitch and roll at a known place, from a frame's identified stars; needs no tilt.
 
         Raises StarposError if the stars, the place or the time do not determine them.
@@ -410,7 +410,7 @@ def placed(solver: Solver, stars: Stars, answer: Solution, places: Places) -> So
         return replace(answer, status=status_of(stars, e), message=str(e))
 
 
-def check_agrees(fix: Fix, place: KnownPlace) -> None:
+def check_agrees(fix: Fix, place: Place) -> None:
     """Raise PlaceError if the stars' own place is further from a known one than their errors allow."""
     latitude, longitude = place.plumb
     prime, meridian = radii = np.array(curvature_radii_m(latitude))

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from starpos.earth.ellipsoid import curvature_radii_m, enu_axes, zenith_of
-from starpos.earth.known_place import KnownPlace
+from starpos.earth.place import Place
 from starpos.earth.vertical import Vertical
 from starpos.errors import GnssError, one_line
 from starpos.files import read_regular
@@ -120,10 +120,10 @@ def message_to_gnss(message: Any, unstated_m: float = math.nan) -> GnssPlace:
     return checked(unix_s, message.latitude, message.longitude, covariance, message.status.status)
 
 
-def known_place(gnss: GnssPlace, vertical: Vertical) -> KnownPlace:
+def known_place(gnss: GnssPlace, vertical: Vertical) -> Place:
     """A GNSS place as one that is known, with the deflection there."""
     latitude, longitude = np.degrees([gnss.latitude, gnss.longitude]).tolist()
-    return KnownPlace.on_ellipsoid(latitude, longitude, vertical, gnss.covariance)
+    return Place.on_ellipsoid(latitude, longitude, vertical, gnss.covariance)
 
 
 # Maximum time between a GNSS place and a frame, s.

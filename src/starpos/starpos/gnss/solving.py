@@ -9,7 +9,7 @@ from starpos import rotation
 from starpos._numeric.roots import symmetric_root
 from starpos.earth.ellipsoid import curvature_radii_m, enu_axes, meridian_turn
 from starpos.earth.vertical import Deflection, Geodetic, Vertical, geodetic
-from starpos.fix.budget import ALWAYS, ErrorTerm, Sensitivity, place_of, total_covariance
+from starpos.fix.budget import ALWAYS, ErrorTerm, Sensitivity, local_north, total_covariance
 from starpos.fix.fix import Fix
 from starpos.fix.solution import Solution, Status
 from starpos.fix.solver import Solver
@@ -119,7 +119,7 @@ def _levelled(solver: Solver, stars: Stars, answer: Solution, up_in_camera: np.n
 def _zenith_moved(fix: Fix) -> np.ndarray:
     """Change (6, 2) of the rows of an ErrorTerm for a zenith of the level that lies 1 rad further east, or north."""
     # with east, north, up for L
-    level = Sensitivity.of(place_of(enu_axes(fix.latitude, fix.longitude)), fix.link_to_enu).level
+    level = Sensitivity.of(local_north(enu_axes(fix.latitude, fix.longitude)), fix.link_to_enu).level
     return np.stack([-level[:, 1], level[:, 0]], 1)
 
 

@@ -11,7 +11,6 @@ import numpy as np
 
 from starpos import rotation
 from starpos.earth.ellipsoid import meridian_turn
-from starpos.earth.known_place import KnownPlace
 from starpos.earth.orientation import (
     ROTATION_RAD_S,
     EarthState,
@@ -19,6 +18,7 @@ from starpos.earth.orientation import (
     earth_state,
     station_velocity,
 )
+from starpos.earth.place import Place
 from starpos.earth.refraction import Atmosphere, Refraction
 from starpos.errors import FixError, FrameError, InstrumentError, TimeError
 from starpos.fix import solver
@@ -309,7 +309,7 @@ class BodyAttitude:
     attitude_covariance: np.ndarray
 
 
-def attitude_at_place(frame: PlacelessFrame, place: KnownPlace, vessel: Vessel) -> BodyAttitude:
+def attitude_at_place(frame: PlacelessFrame, place: Place, vessel: Vessel) -> BodyAttitude:
     """The attitude of the body at a known place, with the errors of stars, air, time, place, deflection and mount."""
     a4, air = place.plumb_axes, vessel.atmosphere
     seen = frame.under(a4[2], air)
@@ -325,7 +325,7 @@ def attitude_at_place(frame: PlacelessFrame, place: KnownPlace, vessel: Vessel) 
         np.vstack([level, north]) @ place.zenith_root,
         deflection,
     ])  # fmt: skip
-    to_ellipsoid = place.ellipsoid_axes @ a4.T
+    to_ellipsoid = place.axes @ a4.T
     turn = rotation.about_axis(2, -math.atan2(to_ellipsoid[0, 1], to_ellipsoid[1, 1]))
     return BodyAttitude(
         utc_unix_s=frame.utc_unix_s,

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from starpos.earth.known_place import KnownPlace
+from starpos.earth.place import Place
 from starpos.earth.refraction import Atmosphere
 from starpos.earth.vertical import Deflection, Vertical
 from starpos.errors import FrameError, TiltError
@@ -36,7 +36,7 @@ def exposures(
     given: Given,
     atmosphere: Atmosphere,
     vertical: Vertical,
-    place: KnownPlace | None = None,
+    place: Place | None = None,
 ) -> Exposures:
     """The frames of a folder in the order of their names, to be solved.
 
@@ -133,7 +133,7 @@ class NightOnDisk:
     inclinometer: str
     atmosphere: Atmosphere
     vertical: Vertical
-    place: KnownPlace | None = None
+    place: Place | None = None
 
     def __repr__(self) -> str:
         return f"<{self.folder}: {self.count} frames and {TILTS}, to be solved>"
@@ -172,7 +172,7 @@ def open_night(
     inclinometer: str = "",
     atmosphere: Atmosphere | None = None,
     vertical: Vertical | None = None,
-    place: KnownPlace | None = None,
+    place: Place | None = None,
 ) -> NightOnDisk:
     """A night: a folder of FITS frames, or else of CSV lists of stars, with tilt.csv; not read yet.
 

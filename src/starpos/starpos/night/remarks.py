@@ -11,7 +11,7 @@ from starpos.averaging.average import Average
 from starpos.calibration.misalignment import Calibrated
 from starpos.earth.ellipsoid import EARTH_RADIUS_M, zenith_of
 from starpos.earth.orientation import ROTATION_RAD_S
-from starpos.fix.budget import place_of
+from starpos.fix.budget import local_north
 from starpos.fix.checks import (
     BY_OPTIONS,
     FIND_TURN,
@@ -254,7 +254,7 @@ def _places(
 
 def _place(frame: Levelled, theta: np.ndarray, mounting: Mounting) -> tuple[float, float]:
     """Latitude, longitude (rad) of a frame with a tilt, without refraction."""
-    place = place_of(level_of(up_of(theta)) @ mounting.a3 @ frame.camera_to_itrs.T)
+    place = local_north(level_of(up_of(theta)) @ mounting.a3 @ frame.camera_to_itrs.T)
     return place.latitude, place.longitude
 
 

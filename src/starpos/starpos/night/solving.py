@@ -10,7 +10,7 @@ import numpy as np
 from starpos.earth.ellipsoid import EARTH_RADIUS_M
 from starpos.earth.vertical import Vertical
 from starpos.errors import FrameError, StarposError
-from starpos.fix.budget import heading_of, place_of
+from starpos.fix.budget import heading_of, local_north
 from starpos.fix.searching import Sight, of_one_camera
 from starpos.fix.solution import Solution, Status
 from starpos.fix.solver import Solver
@@ -199,7 +199,7 @@ def _steady(night: Night, instrument: Instrument) -> np.ndarray | None:
     g = level_of(up_of(tilts.mean(0))) @ instrument.mounting.a3
     steady = []
     for camera_to_itrs in attitudes:
-        place = place_of(g @ camera_to_itrs.T)
+        place = local_north(g @ camera_to_itrs.T)
         link_to_enu = place.local_to_enu @ g @ instrument.mounting.link_to_camera
         steady.append((place.latitude, place.longitude, heading_of(link_to_enu)))
     return np.array(steady)

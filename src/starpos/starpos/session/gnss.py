@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from starpos.earth.known_place import KnownPlace
+from starpos.earth.place import Place
 from starpos.earth.vertical import Geodetic, Vertical
 from starpos.errors import GnssError, PlaceError, StarposError
 from starpos.files import path_of
@@ -282,7 +282,7 @@ class SessionPlaces:
         """Whether a source of the place is set."""
         return self._settings.site is not None or self._gnss is not None
 
-    def at(self, utc_unix_s: float) -> KnownPlace:
+    def at(self, utc_unix_s: float) -> Place:
         """The place at a time; raises PlaceError where it is not known."""
         if (site := self._settings.site) is not None:
             return site

@@ -16,7 +16,7 @@ import numpy as np
 
 from starpos.earth.ellipsoid import enu_axes
 from starpos.earth.gravity import geodetic_place
-from starpos.earth.known_place import KnownPlace
+from starpos.earth.place import Place
 from starpos.earth.vertical import Geodetic, geodetic
 from starpos.errors import GnssError, StarposError, VoyageError
 from starpos.gnss.receiver import GnssPlace, GnssTrack, known_place, message_to_gnss
@@ -159,7 +159,7 @@ class NavigatorSession:
         found = attitude_at_place(frame, place, self._settings.vessel(self._clock_stddev_s))
         return [Navigated(utc_unix_s=frame.utc_unix_s, at_place=found)]
 
-    def _by_gnss(self, utc_unix_s: float) -> KnownPlace | None:
+    def _by_gnss(self, utc_unix_s: float) -> Place | None:
         if not self._values["gnss.use"]:
             return None
         gnss = GnssTrack(list(self._gnss)).at(utc_unix_s)

@@ -7,145 +7,15 @@ from typing import Any
 import numpy as np
 
 from starpos.earth.geoid import Geoid
-from starpos.earth.known_place import KnownPlace
+from starpos.earth.place import Place
 from starpos.earth.vertical import Vertical
 from starpos.errors import StarposError
 from starpos.files import path_of
 from starpos.instrument.instrument import Instrument
 from starpos.navigation.records import ImuModel, read_imu_model
-from starpos.navigation.vessel import LAWS, Vessel, check_drift
+from starpos.navigation.vessel import Vessel, check_drift
 from starpos.session import settings
-from starpos.session.parameter import FRAME_NAME, Parameter
 
-SHARED = (
-    "refraction.pressure",
-    "refraction.temperature",
-    "refraction.humidity",
-    "refraction.wavelength",
-    "altitude",
-    "altitude_stddev",
-    "clock_stddev",
-    "deflection.xi",
-    "deflection.eta",
-    "deflection.stddev",
-    "deflection.geoid",
-    "site.latitude",
-    "site.longitude",
-    "site.geodetic",
-    "site.stddev",
-)
-PARAMETERS = (
-    Parameter(
-        "frame_id",
-        "starpos_link",
-        "Frame of the IMU's axes, x forward, y left, z up, whose position and attitude are published.",
-        form=FRAME_NAME,
-    ),
-    Parameter(
-        "odometry_frame_id",
-        "map",
-        "Frame of navigator/odometry: east, north, up at the first fix.",
-        form=FRAME_NAME,
-    ),
-    Parameter(
-        "publish_tf",
-        False,
-        "Publish the pose of frame_id in odometry_frame_id on /tf. Set false if a filter publishes "
-        "it, or if frame_id has base_link as its parent: a frame with two parents breaks the tree.",
-    ),
-    Parameter(
-        "calibration_url",
-        "",
-        "Instrument file (YAML) whose link_to_camera says how the camera sits on the IMU; '' means "
-        "the optical axis along z and the top of the frame forward.",
-    ),
-    Parameter(
-        "mount_stddev",
-        1.0,
-        "Error of link_to_camera on each axis, 1 sigma. If too small, the position errs by up to "
-        "111 km a degree until the vehicle has turned.",
-        unit="deg",
-        minimum=1e-4,
-        maximum=20.0,
-    ),
-    Parameter(
-        "imu_model",
-        "",
-        "File of the IMU's errors, kalibr's imu.yaml with the sigma of the biases; '' for a cheap IMU. "
-        "A bias far beyond its sigma moves the position: 1 mg by up to 6 km until the vehicle has turned.",
-    ),
-    Parameter(
-        "vehicle",
-        "",
-        "What moves. parked: it stands still. Others name the law by which the speed changes where "
-        "no velocity comes. '' is anything that moves, with a large position error. If the vehicle "
-        "does not keep to the law, the fix claims an error that is too small.",
-        choices=("", *LAWS),
-    ),
-    Parameter(
-        "velocity_stddev",
-        0.05,
-        "Error on each axis of a velocity whose message states none; 0.05 m/s over 20 minutes is 27 m.",
-        unit="m/s",
-        minimum=1e-4,
-        maximum=100.0,
-    ),
-    Parameter(
-        "drift_stddev",
-        0.0,
-        "Speed of current or wind on each axis, 1 sigma, if the velocity is through water or air "
-        "and not over ground; half of it may change in an hour. A drift that is not stated is an "
-        "error of the position.",
-        unit="m/s",
-        minimum=0.0,
-        maximum=50.0,
-    ),
-    Parameter(
-        "drift_change",
-        float("nan"),
-        "Change of wind or current in ten minutes, 1 sigma on each axis. Unset takes a fifth of "
-        "drift_stddev or, where no velocity comes, 0.07 for a ship and 0.3 for a drone. If too "
-        "small, fixes claim errors that are too small: 0.1 m/s is 108 m.",
-        unit="m/s",
-        minimum=0.01,
-        maximum=50.0,
-    ),
-    Parameter("rate", 10.0, "Outputs per second.", unit="Hz", minimum=0.1, maximum=100.0),
-    Parameter(
-        "window",
-        1200.0,
-        "Length of time that is adjusted at once; older measurements are dropped. A short one "
-        "determines the position less well.",
-        unit="s",
-        minimum=30.0,
-        maximum=7200.0,
-    ),
-    Parameter(
-        "adjust_period",
-        10.0,
-        "Time between adjustments, longer if the window holds many measurements. In between, the "
-        "IMU continues the position.",
-        unit="s",
-        minimum=1.0,
-        maximum=600.0,
-    ),
-    Parameter(
-        "stars_timeout",
-        120.0,
-        "Longest time that the IMU continues the position without stars; after that there is no fix.",
-        unit="s",
-        minimum=1.0,
-        maximum=3600.0,
-    ),
-    Parameter(
-        "gnss.use",
-        False,
-        "Use the position in gnss/fix for navigator/heading until there is a fix; navigator/fix "
-        "remains the stars' own. A GNSS error of 10 km turns the heading by up to 0.1 deg, more "
-        "near a pole.",
-    ),
-    *(p for p in settings.PARAMETERS if p.name in SHARED),
-)
 # of a stated altitude: the vehicle goes up and down by more than its file says
 MIN_HEIGHT_STDDEV_M = 10.0
 ANY_INSTRUMENT = Instrument(1000.0, clock_stddev_s=settings.MIN_CLOCK_S)
@@ -195,7 +65,7 @@ class NavigatorSettings:
         return settings.vertical_of(self.values, self._files[2])
 
     @property
-    def site(self) -> KnownPlace | None:
+    def site(self) -> Place | None:
         """The place that is known; None where none is set."""
         return settings.site_of(self.values, self.vertical)
 

@@ -8,8 +8,8 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-from starpos.earth.known_place import Places
 from starpos.earth.orientation import earth_state
+from starpos.earth.place import Places
 from starpos.errors import StarposError
 from starpos.fix import searching
 from starpos.fix.camera_attitude import CameraAttitude

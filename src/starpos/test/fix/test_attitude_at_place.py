@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from starpos import rotation
-from starpos.earth.known_place import KnownPlace
 from starpos.earth.orientation import EarthOrientation, earth_orientation, earth_state
+from starpos.earth.place import Place
 from starpos.earth.refraction import Atmosphere
 from starpos.earth.vertical import Deflection
 from starpos.errors import PlaceError
@@ -55,7 +55,7 @@ def ring(azimuth_deg, altitude_deg, roll_deg, number=24, unix_s=NIGHT):
     return stars, attitude @ np.asarray(TOP_OF_FRAME)
 
 
-def place(deflection=EXACT, make=KnownPlace.by_gravity, **more):
+def place(deflection=EXACT, make=Place.by_gravity, **more):
     return make(LATITUDE, LONGITUDE, deflection, **more)
 
 
@@ -105,7 +105,7 @@ def test_azimuth_by_the_hour_angle_of_the_textbook():
     # from the equinox to the origin of ERFA's right ascensions
     tt = unix_s + 55.7
     ra += erfa.eo06a(UNIX_EPOCH_JD, tt / 86400)
-    where = KnownPlace.by_gravity(38 + 55 / 60 + 17 / 3600, -(77 + 3 / 60 + 56 / 3600), EXACT)
+    where = Place.by_gravity(38 + 55 / 60 + 17 / 3600, -(77 + 3 / 60 + 56 / 3600), EXACT)
     east, north, up = where.plumb_axes @ state.cirs_to_itrs @ rotation.unit_vector(ra, dec)
     assert math.degrees(math.atan2(east, north)) % 360 == pytest.approx(248.0337, abs=2e-4)
     assert math.degrees(math.asin(up)) == pytest.approx(15.1249, abs=2e-4)
@@ -131,7 +131,7 @@ def test_norths_by_the_plumb_line_and_the_ellipsoid_differ_by_laplaces_equation(
 @pytest.mark.parametrize("geodetic", [False, True])
 def test_the_deflections_error_is_in_the_heading_of_the_north_that_was_not_stated(geodetic):
     stars, _ = ring(200.0, 85.0, 20.0)
-    make = KnownPlace.on_ellipsoid if geodetic else KnownPlace.by_gravity
+    make = Place.on_ellipsoid if geodetic else Place.by_gravity
     found = attitude_of(stars, place(Deflection(0.0, 0.0, 6.0), make))
     sigma = [math.sqrt(a.covariance[0, 0]) / ARCSEC for a in (found.plumb, found.ellipsoid)]
     own, other = sigma[::-1] if geodetic else sigma
@@ -165,7 +165,7 @@ def test_a_wrong_place_turns_the_attitude_by_its_term():
     east, north = np.array([310.0, 155.0])
     found = attitude_of(stars, place(covariance=np.outer([east, north], [east, north])))
     per_deg = 111_320.0 * math.cos(math.radians(LATITUDE))
-    away = KnownPlace.by_gravity(LATITUDE + north / 111_268.0, LONGITUDE + east / per_deg, EXACT)
+    away = Place.by_gravity(LATITUDE + north / 111_268.0, LONGITUDE + east / per_deg, EXACT)
     moved = angles(attitude_of(stars, away).plumb) - angles(found.plumb)
     of_place = next(t for t in found.plumb.terms if t.name == "place")
     assert of_place.covariance[2, 2] == pytest.approx(moved[0] ** 2, rel=0.02)
@@ -208,14 +208,14 @@ def test_errors_of_stars_are_as_large_as_claimed(rng):
 def test_a_place_that_cannot_see_these_stars_is_refused(latitude, longitude):
     stars, _ = ring(200.0, 60.0, 20.0)
     with pytest.raises(PlaceError, match="below the horizon, and a heading needs stars"):
-        attitude_of(stars, KnownPlace.by_gravity(latitude, longitude, EXACT))
+        attitude_of(stars, Place.by_gravity(latitude, longitude, EXACT))
 
 
 def test_a_place_half_round_the_earth_is_refused_by_the_refraction_though_the_stars_are_up_there():
     # the zenith of 52 deg N is 14 deg high at the other side of the pole
     stars, _ = ring(0.0, 89.0, 20.0)
     with pytest.raises(PlaceError, match="air would bend this field more"):
-        attitude_of(stars, KnownPlace.by_gravity(LATITUDE, LONGITUDE + 180, EXACT))
+        attitude_of(stars, Place.by_gravity(LATITUDE, LONGITUDE + 180, EXACT))
 
 
 @pytest.mark.parametrize("pressure_pa", [80000.0, 97000.0])
@@ -229,7 +229,7 @@ def test_air_that_is_not_quite_as_stated_refuses_no_place(pressure_pa):
     ("latitude", "longitude"), [(91.0, 0.0), (51.4, 361.0), (math.nan, 5.0), (52.0, math.inf)]
 )
 def test_a_place_that_is_none_is_refused(latitude, longitude):
-    for make in (KnownPlace.by_gravity, KnownPlace.on_ellipsoid):
+    for make in (Place.by_gravity, Place.on_ellipsoid):
         with pytest.raises(PlaceError, match="no place is at latitude"):
             make(latitude, longitude, EXACT)
 
@@ -248,7 +248,7 @@ class TestOfAFrame:
 
     def test_heading_is_that_of_the_scene_within_its_claim(self, night):
         scene, stars, _, solver = night
-        where = KnownPlace.by_gravity(scene.site.latitude_deg, scene.site.longitude_deg, EXACT)
+        where = Place.by_gravity(scene.site.latitude_deg, scene.site.longitude_deg, EXACT)
         answer = placed(solver, stars, solver.identify(stars), where)
         link = answer.at_place.plumb
         assert answer.ok and answer.fix is None and "heading" in answer.message
@@ -257,19 +257,19 @@ class TestOfAFrame:
 
     def test_with_a_tilt_the_place_stays_the_stars_own(self, night):
         scene, stars, tilt, solver = night
-        where = KnownPlace.by_gravity(scene.site.latitude_deg, scene.site.longitude_deg, EXACT)
+        where = Place.by_gravity(scene.site.latitude_deg, scene.site.longitude_deg, EXACT)
         alone = solver.solve(stars, tilt)
         answer = placed(solver, stars, alone, where)
         assert answer.fix is alone.fix and answer.at_place is not None and answer.message == "fix"
 
     def test_a_place_that_fix_and_tilt_contradict_gives_no_heading(self, night):
         scene, stars, tilt, solver = night
-        where = KnownPlace.by_gravity(scene.site.latitude_deg + 1, scene.site.longitude_deg, EXACT)
+        where = Place.by_gravity(scene.site.latitude_deg + 1, scene.site.longitude_deg, EXACT)
         answer = placed(solver, stars, solver.solve(stars, tilt), where)
         assert answer.ok and answer.at_place is None and "from the given one" in answer.remark
 
     def test_a_frame_without_a_time_has_none(self, night):
         scene, stars, _, solver = night
         timeless = replace(stars, mid_unix_s=None)
-        where = KnownPlace.by_gravity(scene.site.latitude_deg, scene.site.longitude_deg, EXACT)
+        where = Place.by_gravity(scene.site.latitude_deg, scene.site.longitude_deg, EXACT)
         assert placed(solver, timeless, solver.identify(timeless), where).at_place is None

@@ -10,7 +10,7 @@ from starpos import rotation
 from starpos.earth.ellipsoid import EARTH_RADIUS_M, curvature_radii_m, enu_axes, meridian_turn, zenith_of
 from starpos.earth.orientation import earth_state
 from starpos.earth.vertical import Deflection, geodetic
-from starpos.fix.budget import Sensitivity, heading_of, place_of
+from starpos.fix.budget import Sensitivity, heading_of, local_north
 from starpos.units import ARCSEC
 from starpos_testing.skies.fields import UTC, SkyField, random_field
 
@@ -81,10 +81,10 @@ def test_heading_and_attitude_change_with_the_place_as_a_fixed_camera_shows(lati
     """A level that is off by a small angle is another place, from which the camera's attitude is another."""
     phi, step = np.radians(latitude), 1e-6
     axes, link = enu_axes(phi, 0.7), rotation.from_vector(rng.normal(size=3))
-    level = Sensitivity.of(place_of(axes), link).level
+    level = Sensitivity.of(local_north(axes), link).level
     for k in range(3):
         turn = rotation.from_vector(np.eye(3)[k] * step)
-        place = place_of(turn @ axes)
+        place = local_north(turn @ axes)
         moved = axes[:2] @ zenith_of(place.latitude, place.longitude) * curvature_radii_m(phi) / step
         seen = enu_axes(place.latitude, place.longitude) @ axes.T @ link
         turned = rotation.to_small_vector(seen @ link.T) / step

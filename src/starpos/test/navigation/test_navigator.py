@@ -21,7 +21,7 @@ from voyage_calls import navigated
 
 from starpos import rotation
 from starpos.earth.ellipsoid import enu_axes
-from starpos.earth.known_place import KnownPlace
+from starpos.earth.place import Place
 from starpos.earth.refraction import Atmosphere
 from starpos.earth.vertical import Deflection
 from starpos.navigation.sightings import PlacelessFrame, attitude_at_place
@@ -280,7 +280,7 @@ def test_a_heading_at_a_known_place_claims_what_it_errs_by_when_the_mount_is_kno
     nees = []
     truth = zip(record.latitude, record.longitude, record.body_to_itrs, strict=True)
     for frame, (latitude, longitude, body_to_itrs) in zip(record.frames, truth, strict=True):
-        place = KnownPlace.by_gravity(*np.degrees([latitude, longitude]), Deflection(0.0, 0.0, 0.0))
+        place = Place.by_gravity(*np.degrees([latitude, longitude]), Deflection(0.0, 0.0, 0.0))
         seen = frame.placeless()
         placeless = PlacelessFrame(
             utc_unix_s=frame.utc_unix_s,
