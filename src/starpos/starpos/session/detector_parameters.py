@@ -5,8 +5,7 @@ import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from starpos.frames.driver_stamp import KINDS, UNKNOWN
-from starpos.frames.exposure import MAX_EXPOSURE_S, MAX_READOUT_S
+from starpos.frames.exposure import MAX_EXPOSURE_S, MAX_READOUT_S, STAMPS, UNKNOWN_STAMP
 from starpos.session.pace import MAX_RATE
 from starpos.session.parameter import Parameter
 
@@ -78,11 +77,11 @@ PARAMETERS = (
     ),
     Parameter(
         "stamp",
-        UNKNOWN,
+        UNKNOWN_STAMP,
         "Moment that stamps mark in frames without a Capture message: middle, start or end of the "
         "first row's exposure, or arrival of the whole image. '' is unknown, with an error of 0.3 s "
         "(1 sigma). A wrong one shifts longitudes by 15 arcsec for each second.",
-        choices=KINDS,
+        choices=STAMPS,
     ),
     Parameter(
         "stamp_stddev",
