@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a camera writes into its own files (EXIF 2.31): time, exposure, focal length, and how well they are known.
 
-`Exif` reads the tags of any picture or raw file, one fact a property, and `read_exposure` makes an Exposure of them. A new
-fact is a new property there, and a field of Exposure. `SensorGrid` says which pixels of the sensor a picture shows.
+`Exif` reads the tags of any picture or raw file, one fact a property, and `read_exposure` makes an Exposure of them. A
+new fact is a new property there, and a field of Exposure. `SensorGrid` says which pixels of the sensor a picture shows.
 
 A camera's clock is set by hand to the time of some zone, and often shows whole seconds only. So its time is used only if
 a person has said how good the clock is (CameraClock).
