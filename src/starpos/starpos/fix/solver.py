@@ -144,7 +144,7 @@ class Solver:
             field: FrameStars | fisheye.WideField | None = as_seen(camera, stars)
             if field is None:
                 if (rows := inside(stars, camera)) is not None:
-                    return self._identified(stars.take(rows), part, search).among(stars, rows)
+                    return self._identified(stars.select(rows), part, search).among(stars, rows)
                 field = field_of(
                     directions_of(camera, stars), mean_sigma(stars.covariance), camera, stars.window
                 )
@@ -171,7 +171,7 @@ class Solver:
         """
         if (rows := self._inside(stars)) is not None:
             known = known and known.but(star=np.searchsorted(rows, known.star))
-            return self.solve(stars.take(rows), tilts, hint, predicted, known).among(stars, rows)
+            return self.solve(stars.select(rows), tilts, hint, predicted, known).among(stars, rows)
         try:
             state, tilt = self.levelled(stars, tilts)
             camera, catalogue, triangles = self.view(stars.width, stars.height, stars.origin_px)
@@ -471,7 +471,7 @@ def focal_that_fits(solver: Solver, stars: Stars, until_s: float = math.inf) -> 
     No try is begun after until_s (time.monotonic).
     Triangles are found by their angles, which hardly depend on the focal length, so the given field's triangles serve.
     """
-    on = stars.take(stars.on_frame.nonzero()[0])
+    on = stars.select(stars.on_frame.nonzero()[0])
     if len(on) < MIN_STARS:
         return None
     try:
@@ -481,7 +481,7 @@ def focal_that_fits(solver: Solver, stars: Stars, until_s: float = math.inf) -> 
             if time.monotonic() >= until_s:
                 break
             camera = given.scaled(FOCAL_STEP**k)
-            seen = on.take(camera.sees(on.x, on.y).nonzero()[0])
+            seen = on.select(camera.sees(on.x, on.y).nonzero()[0])
             found = identify_directions(camera.directions(seen.x, seen.y), seen.sigma, camera, sky)
             if found is not None:
                 return camera.fx * found.focal_scale

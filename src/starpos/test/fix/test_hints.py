@@ -11,7 +11,7 @@ from starpos.fix import searching
 from starpos.fix.searching import Question, Sight, answer_by_header, of_one_camera
 from starpos.fix.solution import Attitude, Solution, Status
 from starpos.fix.solver import Solver
-from starpos.frames.header import about
+from starpos.frames.header import read_exposure
 from starpos.instrument.camera import EQUIDISTANT, PLUMB_BOB, Camera
 from starpos.instrument.instrument import Instrument
 from starpos.night.reading import Given
@@ -31,7 +31,7 @@ def seen(catalogue, rng):
     camera = Camera.from_focal(*SIZE, FOCAL_PX)
 
     def stars(header):
-        return stars_of_cygnus(catalogue, rng, camera, 9.0, 0.05, **about(header, "frame.fits"))
+        return stars_of_cygnus(catalogue, rng, camera, 9.0, 0.05, **read_exposure(header, "frame.fits").facts)
 
     return stars
 
@@ -108,7 +108,7 @@ def never(*_):
 def test_a_frame_that_nothing_fits_keeps_its_sentence(lost, rng):
     """Random points are searched within the time that a frame has, and reported by the first sentence."""
     stars, solver = lost
-    points = replace(stars.take(np.arange(6)), x=rng.uniform(0, SIZE[0], 6), y=rng.uniform(0, SIZE[1], 6))
+    points = replace(stars.select(np.arange(6)), x=rng.uniform(0, SIZE[0], 6), y=rng.uniform(0, SIZE[1], 6))
     sight = asked(points, solver)
     assert sight.solution.status is Status.NOT_IDENTIFIED and sight.instrument is None
     assert sight.solution.message == solver.identify(points).message
@@ -116,7 +116,10 @@ def test_a_frame_that_nothing_fits_keeps_its_sentence(lost, rng):
 
 def test_a_focal_length_near_the_headers_needs_no_search_at_every_scale(catalogue, rng, monkeypatch):
     monkeypatch.setattr(searching, "identify_blind_every_way", never)
-    wide, header = Camera.from_focal(1000, 700, 5000.0), about({"FOCALLEN": 34, "XPIXSZ": 6.4}, "frame.fits")
+    wide, header = (
+        Camera.from_focal(1000, 700, 5000.0),
+        read_exposure({"FOCALLEN": 34, "XPIXSZ": 6.4}, "frame.fits").facts,
+    )
     sight, _ = Identifying(Given(None, by_header=True))(
         stars_of_cygnus(catalogue, rng, wide, 6.5, 0.05, **header)
     )
@@ -153,7 +156,7 @@ def test_a_scale_and_a_lens_that_then_identify_nothing_are_not_told(lost, monkey
 )
 def test_what_no_focal_length_can_help_is_not_searched(instrument, status, seen, monkeypatch):
     monkeypatch.setattr(searching, "focal_that_fits", never)
-    stars = seen(RIGHT).take(np.arange(3))
+    stars = seen(RIGHT).select(np.arange(3))
     solver = replace(_solver(187500.0), instrument=instrument)
     assert asked(stars, solver).solution.status is status
 
