@@ -37,9 +37,12 @@ KEYS = (
 )
 
 
-def about(header: Mapping, place: str) -> dict[str, Any]:
-    """Read the fields of an Exposure that a header states; FrameError for a bad shutter. place names it in messages."""
-    return times.times(header) | {
+def about(header: Mapping, place: str, comments: Mapping[str, str] = times.NO_COMMENTS) -> dict[str, Any]:
+    """Read the fields of an Exposure that a header states; FrameError for a bad shutter. place names it in messages.
+
+    comments: of cards, by their keywords.
+    """
+    return times.times(header, comments) | {
         "source": place,
         "focal_px": focal_px(header),
         "pixel_um": _positive(header, "XPIXSZ"),
