@@ -10,7 +10,7 @@ import yaml
 
 from starpos.frames.driver_stamp import KINDS
 from starpos.frames.encodings import ENCODINGS, pixels_of
-from starpos.session.detector_parameters import PARAMETERS
+from starpos.parameters.table import defaults_of
 
 PAGE = Path(__file__).parents[2] / "docs" / "how-to" / "existing_robot.md"
 if not PAGE.is_file():
@@ -49,4 +49,4 @@ def test_the_file_of_the_page_says_what_no_driver_does():
     config = PAGE.parents[2] / "src" / "starpos_bringup" / "config" / "existing_robot.yaml"
     stated = yaml.safe_load(config.read_text())["/**/detector"]["ros__parameters"]
     assert list(stated) == ["stamp", "stamp_stddev", "exposure", "readout"]
-    assert set(stated) <= {p.name for p in PARAMETERS}
+    assert set(stated) <= set(defaults_of("detector"))

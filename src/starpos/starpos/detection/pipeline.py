@@ -4,6 +4,8 @@
 Where stars are wider than the peaks' kernels can find, the same is done with the frame reduced by two.
 """
 
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -53,6 +55,17 @@ class DetectionSettings:
     mesh_px: int = 64
     threads: int = 1
     saturation_dn: float | None = None
+
+    @classmethod
+    def by_parameters(cls, values: Mapping[str, Any]) -> "DetectionSettings":
+        """The settings by the values of the parameters of the node `detector`."""
+        return cls(
+            threshold=values["threshold"],
+            min_snr=values["min_snr"],
+            max_stars=values["max_stars"],
+            threads=values["threads"],
+            saturation_dn=None if math.isnan(values["saturation"]) else values["saturation"],
+        )
 
     def __post_init__(self) -> None:
         for name, low in (

@@ -10,11 +10,9 @@ from starpos.earth.orientation import earth_motion
 from starpos.errors import FixError
 from starpos.sky.catalogue import load_catalogue
 from starpos.units import ARCSEC, utc_text
-from starpos.zenith.adjustment import Adjusted, FaceQuality
-from starpos.zenith.sighting import ZenithSighting, mean_headings
+from starpos.zenith.adjustment import Adjusted, FaceQuality, check_round
+from starpos.zenith.sighting import ZenithSighting
 
-# A deflection with a larger sigma is useless: maps of the geoid know it better.
-MAX_SIGMA_ARCSEC = 3.0
 # On land 6 arcsec are usual, over 25 are found in high mountains only, over 120 nowhere.
 LARGE_ARCSEC, MAX_ARCSEC = 25.0, 120.0
 # chi-square of a step or of a face, which chance exceeds in one session of 10^5 with hundreds of frames
@@ -36,14 +34,7 @@ UNLEVEL_SIGMA = 3.0
 
 def check_session(found: Adjusted, sightings: Sequence[ZenithSighting]) -> None:
     """Raise FixError, with a sentence, where the readings do not bear a deflection."""
-    sigma = float(np.sqrt(np.linalg.eigvalsh(found.covariance_arcsec2)[-1]))
-    headings = np.degrees(mean_headings(sightings, found.faces))
-    if sigma > MAX_SIGMA_ARCSEC:
-        shown = ", ".join(f"{h:.0f}" for h in headings[:8])
-        raise FixError(
-            f"the faces do not come round: the top of the frame was at {shown} deg, which leaves {sigma:.3g} arcsec of "
-            "the deflection undetermined: turn the instrument by half a turn, better to four faces, or calibrate A3"
-        )
+    check_round(found.covariance_arcsec2, sightings, found.faces)
     for fit in (found.as_stated, found):
         chi2, sentence = (0.0, "") if fit is None else _doubt(fit, sightings)
         if chi2 > DOUBTED_CHI2 and not (fit is found.as_stated and _no_jump(found, sightings)):
