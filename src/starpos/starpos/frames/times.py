@@ -71,7 +71,7 @@ UNITS_S = {"us": 1e-6, "ms": 1e-3, "msec": 1e-3, "s": 1.0, "sec": 1.0, "second":
            "h": 3600.0, "d": 86400.0}  # fmt: skip
 # What the comment of a start may say. Names of zones count in capitals only.
 UNIVERSAL = re.compile(r"\b(utc?|gmt|universal)\b(?! *[+-] *\d)", re.IGNORECASE)
-OFFSET = re.compile(r"\b(?:utc?|gmt) *[+-] *(?!0*(?::?00)?\b)\d", re.IGNORECASE)
+OFFSET = re.compile(r"\b(?:utc?|gmt) *[+-] *0*[1-9]", re.IGNORECASE)
 ZONE = re.compile(
     r"\b(CES?T|MES?Z|EES?T|WEST|BST|MSK|[ECMP][SD]T|AK[SD]T|HST|[JK]ST|A[ECW][SD]T|NZ[SD]T|IST|SAST|BRT|ART|CLS?T)\b"
 )
@@ -129,13 +129,13 @@ def times(header: Mapping, comments: Mapping[str, str] = NO_COMMENTS) -> dict[st
     should agree are apart. A header without any card of a time has an empty untimed.
     """
     try:
-        header = _as_commented(header, comments)
         _check_single(header)
         lengths = _lengths(header, comments)
     except TimeError as e:
         return {"untimed": str(e)}
     exposure_s = next(iter(lengths.values()), None)
     try:
+        header = _as_commented(header, comments)
         told = _instants(header)
         middles, zero = _middles(told, lengths)
     except TimeError as e:
@@ -174,12 +174,12 @@ def _as_commented(header: Mapping, comments: Mapping[str, str]) -> Mapping:
         local = OFFSET.search(comment) or ZONE.search(comment) or LOCALLY.search(comment)
         if local and not UNIVERSAL.search(comment):
             raise TimeError(
-                f"its {key} is a local time by its comment ({one_line(comment)}): write UTC into it, or correct the comment"
+                f"its {key} is a local time by its comment ({one_line(comment)}): write UTC into it"
             )
         if CREATED.search(comment):
             raise TimeError(
-                f"its {key} is the time when the file was made by its comment ({one_line(comment)}), not of the exposure: "
-                "write the start of the exposure into it"
+                f"its {key} is when the file was made by its comment ({one_line(comment)}): write the start of the "
+                "exposure into it"
             )
         if GPS.search(comment) and not UNIVERSAL.search(comment) and not values.get("TIMESYS"):
             raise TimeError(
@@ -214,7 +214,7 @@ def _other_time(key: str, later_s: float) -> str:
     hours = later_s / 3600
     local = abs(math.remainder(later_s, QUARTER_S)) < FOUND_S and abs(hours) < 15
     return (
-        f"its {key} is {hours:+.4g} h from the exposure by its other cards"
+        f"its {key} is {hours:+.2f} h from the exposure by its other cards"
         + (": one of them is a local time" if local else ": these cards contradict each other")
         + ", correct the header"
     )
