@@ -434,7 +434,7 @@ class DetectorNode(Node):
 
     def _unsaid(self) -> str:
         """Sentence on the parameters to state of the camera; '' if there is nothing."""
-        unsaid = self._exposures.unsaid if self._topics.where and not self._captures_come() else ""
+        unsaid = self._exposures.missing_statement if self._topics.where and not self._captures_come() else ""
         if unsaid:
             self._troubles.wrong("stamps", unsaid)
         return unsaid

@@ -147,7 +147,7 @@ class _Picture:
 
 def detect(frame: Frame, settings: DetectionSettings = DetectionSettings()) -> Detection:
     """Measure the stars of a Frame. Without stars the Detection is empty and fwhm_px NaN."""
-    about = {"width": frame.width, "height": frame.height} | frame.about
+    about = {"width": frame.width, "height": frame.height} | frame.facts
     # OpenCV would take all processors for a little, and wait for them where others work
     cv2.setNumThreads(settings.threads)
     plane, mosaic = plane_of(frame)
