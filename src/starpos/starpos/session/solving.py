@@ -18,7 +18,7 @@ from starpos.fix.solution import Solution, Status
 from starpos.fix.solver import Solver, focal_that_fits
 from starpos.frames.frame import Stars
 from starpos.identification import Identification, fisheye
-from starpos.identification.hint import Hint
+from starpos.identification.prior import Hint
 from starpos.identification.search import Priors
 from starpos.instrument.tilt_log import Tilts
 from starpos.navigation.sightings import sighted
