@@ -50,7 +50,7 @@ def near_pairs(const double[::1] x, const double[::1] y, double reach):
         free(pair)
 
 
-def groups(const Py_ssize_t[:, ::1] pairs, Py_ssize_t n):
+def group_points(const Py_ssize_t[:, ::1] pairs, Py_ssize_t n):
     """The number (N,) of each of n points' group: those that pairs (M, 2) of them join. Groups are numbered by their first point.
 
     As scipy's `connected_components`, which takes longer to begin, in every frame, than this does to end.
@@ -111,7 +111,7 @@ def any_near(const double[::1] x, const double[::1] y, const double[::1] to_x, c
     return out.view(bool)
 
 
-def nearest(const double[::1] x, const double[::1] y, Py_ssize_t count):
+def nearest_distances(const double[::1] x, const double[::1] y, Py_ssize_t count):
     """How far each of the first `count` of the points x, y (N,) is from the nearest other one; infinity if it is alone.
 
     They are numbers.

@@ -8,10 +8,8 @@ import cv2
 import numpy as np
 from scipy import ndimage
 
-from starpos.detection._background import near, sampled
-from starpos.detection._mesh import evened
-from starpos.detection._order import median
-from starpos.detection._sparse import any_flat
+from starpos.detection._pixels import any_flat
+from starpos.detection._sky import even_out, median, sample_sky, sky_at
 from starpos.frames.frame import Frame, Window
 from starpos.units import SIGMA_PER_MAD
 
@@ -160,7 +158,7 @@ class Background:
     def near(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Level and noise (N, P) float32, DN, for sums over pixels around the pixels x, y (N,): with the correlation."""
         x, y = (np.ascontiguousarray(v, np.intp) for v in (x, y))
-        return near(self.level, self.noise, x, y, self.width, self.height, self.correlation)
+        return sky_at(self.level, self.noise, x, y, self.width, self.height, self.correlation)
 
     def of_pixels(
         self, x: np.ndarray, y: np.ndarray, rows: np.ndarray, columns: np.ndarray
@@ -196,7 +194,7 @@ def measure_background(plane: np.ndarray, cell_px: int = 64, mosaic: bool | None
     mosaic says whether the plane is a colour mosaic; None: it is one if the four phases see different skies.
     """
     rows, columns = (_sample(n, cell_px) for n in plane.shape)
-    level, noise, highest, count = sampled(plane, rows, columns, *CLIP)
+    level, noise, highest, count = sample_sky(plane, rows, columns, *CLIP)
     samples = rows.shape[1] * columns.shape[1] // 4
     level, noise = _beside_lamps(np.where(highest == highest.max(), count, 0).mean(0) / samples, level, noise)
     if mosaic is None:
@@ -206,7 +204,7 @@ def measure_background(plane: np.ndarray, cell_px: int = 64, mosaic: bool | None
     error = np.maximum(noise, QUANTISATION) * samples**-0.5
     # cells that differ by more lie at an edge, of a roof for example
     steep = STEEP * np.array([median(e) for e in error.reshape(len(error), -1)])
-    level, noise = evened(level, steep, False), evened(noise, steep, True)
+    level, noise = even_out(level, steep, False), even_out(noise, steep, True)
     noise = np.maximum(noise, max(QUANTISATION, _lost_noise(plane)))
     return Background(level=level, noise=noise, width=plane.shape[1], height=plane.shape[0])
 

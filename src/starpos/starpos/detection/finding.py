@@ -9,11 +9,9 @@ import cv2
 import numpy as np
 from scipy import ndimage, spatial
 
-from starpos.detection._background import between
-from starpos.detection._mesh import above
-from starpos.detection._neighbours import groups, near_pairs, nearest
-from starpos.detection._order import median
-from starpos.detection._peaks import peaks, smoothed
+from starpos.detection._neighbours import group_points, near_pairs, nearest_distances
+from starpos.detection._peaks import find_maxima, smooth_rows
+from starpos.detection._sky import interpolated, median, scores
 from starpos.detection.background import Background
 from starpos.detection.stamps import are_alone, are_dots, surroundings
 from starpos.units import SIGMA_PER_MAD
@@ -93,7 +91,7 @@ def find_streaks(
 def _may_be_a_line(x: np.ndarray, y: np.ndarray) -> bool:
     """Whether enough peaks x, y (N,) int px are joined by gaps that a line may have."""
     pairs = near_pairs(x.astype(float), y.astype(float), np.sqrt(2) * (GAP + 2) * CELL)
-    return len(pairs) > 0 and bool(np.bincount(groups(pairs, len(x))).max() >= FEWEST)
+    return len(pairs) > 0 and bool(np.bincount(group_points(pairs, len(x))).max() >= FEWEST)
 
 
 def _through(points: np.ndarray, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
@@ -245,7 +243,9 @@ def _crowded(peaks: Peaks) -> bool:
         return False
     leaders = min(len(peaks.x), LEADERS)
     alike = peaks.height > 0.5 * peaks.height[leaders - 1]
-    return median(nearest(peaks.x[alike].astype(float), peaks.y[alike].astype(float), leaders)) < CROWD
+    return (
+        median(nearest_distances(peaks.x[alike].astype(float), peaks.y[alike].astype(float), leaders)) < CROWD
+    )
 
 
 def _are_rings(size: tuple[int, ...], sharp: Peaks, wide: Peaks) -> bool:
@@ -308,7 +308,7 @@ def _peaks_of(
     floor = (level + threshold * noise).astype(np.float32)[rows].min(1)
     x, y, value, highest = _in_parts(plane, kernel, floor, threads)
     x, y = np.rint(x).astype(int), np.rint(y).astype(int)
-    local, sigma = between(np.stack([level, noise]), *background.cell(x, y)).T
+    local, sigma = interpolated(np.stack([level, noise]), *background.cell(x, y)).T
     height = (value - local) / sigma
     left_out = max(0, len(height) - 4 * limit)
     keep = np.argsort(-height, kind="stable")[: 4 * limit]
@@ -337,7 +337,7 @@ def _in_parts(plane: np.ndarray, kernel: Kernel, limit: np.ndarray, threads: int
     ends = [len(limit) * k // parts * STRIP for k in range(parts)] + [height]
 
     def found(k: int) -> tuple[np.ndarray, ...]:
-        return peaks(plane, kernel.weight, kernel.flat, limit, STRIP, ends[k], ends[k + 1])
+        return find_maxima(plane, kernel.weight, kernel.flat, limit, STRIP, ends[k], ends[k + 1])
 
     if parts == 1:
         return found(0)
@@ -353,9 +353,9 @@ def _noise_of_smooth(plane: np.ndarray, background: Background, kernel: Kernel) 
     """
     tops = np.linspace(0, max(0, len(plane) - 16), 8).astype(int)
     rows = (tops[:, None] + np.arange(0, min(16, len(plane)), 4)).ravel()
-    value = smoothed(plane, kernel.weight, rows, 4)
+    value = smooth_rows(plane, kernel.weight, rows, 4)
     place = background.cell(np.arange(0, plane.shape[1], 4), rows)
-    score = above(value, background.level, background.noise, *place)
+    score = scores(value, background.level, background.noise, *place)
     # stars widen the scatter upwards; where they are many, only the lowest values are free of them
     low, sigma_below, usual = _low_side(score.ravel())
     scatter = min(usual - sigma_below, sigma_below - low) / kernel.norm
@@ -421,7 +421,7 @@ def _join_plateaus(
     pairs = near_pairs(x.astype(float), y.astype(float), flat + 0.5)
     if len(pairs) == 0:
         return x.astype(int), y.astype(int), height
-    x, y, height = _merged(x, y, height, groups(pairs, len(x)))
+    x, y, height = _merged(x, y, height, group_points(pairs, len(x)))
     order = np.argsort(-height, kind="stable")
     return x[order], y[order], height[order]
 

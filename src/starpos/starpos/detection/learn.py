@@ -8,14 +8,21 @@ from functools import cached_property, lru_cache
 import numpy as np
 from scipy import spatial
 
-from starpos.detection._field import agreed, over_field
-from starpos.detection._marginal import chosen, marginal
-from starpos.detection._moments import own_shapes
+from starpos.detection._learn import (
+    choose_terms,
+    fit_field,
+    fit_field_robustly,
+    light_noise,
+    marginal_equations,
+    phase_fluxes,
+    strangeness,
+    typical_gains,
+    unit_light,
+)
+from starpos.detection._moments import own_shapes, squared_widths
 from starpos.detection._neighbours import near_pairs
-from starpos.detection._noise import light_noise, of_phases, strangeness, typical_gains, unit_light
-from starpos.detection._order import median, quantile
-from starpos.detection._shapes import squared_widths
-from starpos.detection._stamps import greyed
+from starpos.detection._pixels import smooth_mosaic
+from starpos.detection._sky import median, quantile
 from starpos.detection.background import Background
 from starpos.detection.fit import Fit, Response, fit_stars
 from starpos.detection.psf import BROAD, MONOMIALS, NARROW, FieldPsf, Psf, gaussian, power, trailed
@@ -28,7 +35,6 @@ from starpos.detection.stamps import (
     centroid,
     cut,
     frame_shape,
-    lights,
     moments,
     own_shape,
     relative_widths,
@@ -65,7 +71,7 @@ def widened(psf: Psf, x: np.ndarray, y: np.ndarray, ratio: np.ndarray, weight: n
     weight  (N,) inverse variances of ratio, in any unit
     """
     # pairs are wide but say nothing about the optics
-    found = agreed(psf.monomials(x, y), ratio.reshape(-1, 4), weight, OUTLYING, PLACES, 4)
+    found = fit_field_robustly(psf.monomials(x, y), ratio.reshape(-1, 4), weight, OUTLYING, PLACES, 4)
     if found is None:
         return psf
     fitted, before, after, count = found
@@ -162,7 +168,7 @@ def refine(
     terms       the terms that are tried; they are taken if they are worth their price
     """
     local = psf.at(x, y)
-    normal, right = marginal(
+    normal, right = marginal_equations(
         local.axes, local.series, left, top, brightness, weight, phase, phases, terms.orders
     )
     count, places = terms.candidates.shape[1:]
@@ -172,7 +178,7 @@ def refine(
     right = (right.T @ field).ravel()
     candidates = terms.candidates.reshape(-1, len(right)).view(np.uint8)
     normal.flat[:: len(right) + 1] += LIKELY**-2
-    found = chosen(normal, right, candidates, terms.price.ravel())
+    found = choose_terms(normal, right, candidates, terms.price.ravel())
     if not np.isfinite(found).all():
         return psf
     found = found.reshape(count, places)
@@ -195,7 +201,7 @@ def _absorbed(psf: Psf, field: np.ndarray, terms: Terms, found: np.ndarray) -> t
     a, b, c = varied @ field[:, 1:].T
     change = np.stack([1 + np.sqrt(2) * a, b, b, 1 + np.sqrt(2) * c], -1).reshape(-1, 2, 2)
     root = power(np.tensordot(field[:, : len(psf.widths)], psf.widths, 1), 0.5)
-    widths = over_field(field, (root @ change @ root).reshape(-1, 4))
+    widths = fit_field(field, (root @ change @ root).reshape(-1, 4))
     if widths is None:
         return psf, found
     found = found.copy()
@@ -283,7 +289,7 @@ def learn(
         strange, error = strangeness(stamps.noise, fit.model, fit.residual, fit.used, fit.leverage, DARKEST)
         # compared with the best 30 %, because most of the brightest may be pairs
         sound &= strange < 3 * max(0, quantile(strange[sound], 0.3)) + 3 * error + UNLIKE
-        stamps, x, y = stamps.take(sound), fit.x[sound], fit.y[sound]
+        stamps, x, y = stamps.select(sound), fit.x[sound], fit.y[sound]
         response = respond(stamps, psf, x, y, fit, sound, response)
         ring = round_ >= rounds
         if ring and (psf.fwhm_px < RING_FWHM or response.misfit < POOR):
@@ -316,7 +322,8 @@ def _teachers(
     choices = (clear & alone & (height > BRIGHT), clear & alone, clear & high)
     bright = next((c for c in choices if c.any()), choices[-1]).nonzero()[0]
     bright = bright[~are_dots(plane, background, x[bright], y[bright])][:TEACHERS]
-    light, full = lights(plane, background, x[bright], y[bright], SIGHT, saturation)
+    around = cut(plane, background, x[bright], y[bright], SIGHT, saturation)
+    light, full = around.signal, around.full.any((1, 2))
     # the shapes of fainter stars are noise
     clearly_many = np.count_nonzero(height[bright] > BRIGHT) > ALIKE
     bright, light = bright[~full], _those(light, ~full)
@@ -332,7 +339,7 @@ def _teachers(
         around = _highest(plane, background, x[clear], y[clear], saturation)
         shape, learnt = _likeliest(around, shape, Response(np.ones(len(background.level)), 0.3, 0.0, 0.0))
         if not learnt:
-            return gaussian(shape), around.take(slice(0)), np.zeros(0), np.zeros(0)
+            return gaussian(shape), around.select(slice(0)), np.zeros(0), np.zeros(0)
     psf = gaussian(shape, x[bright], y[bright])
     stamps = cut(plane, background, x[bright], y[bright], reach_of(psf), saturation)
     smooth, blur = grey(stamps.signal, background)
@@ -350,14 +357,14 @@ def _teachers(
     widths = relative_widths(seen, psf.shapes_at(x, y) + blur * np.eye(2), window)
     alike = ((widths[:, 0] > 0.6) & (widths[:, 1] < 1.4)).nonzero()[0]
     alike = alike[: max(TEACHING_PIXELS // stamps.signal[0].size, 40)]
-    return psf, stamps.take(alike), x[alike], y[alike]
+    return psf, stamps.select(alike), x[alike], y[alike]
 
 
 def _highest(
     plane: np.ndarray, background: Background, x: np.ndarray, y: np.ndarray, saturation: float
 ) -> Stamps:
     """Stamps of the first FEW of the peaks x, y (N,) int px, of those that are not saturated if there are any."""
-    _, full = lights(plane, background, x[:TEACHERS], y[:TEACHERS], 1, saturation)
+    full = cut(plane, background, x[:TEACHERS], y[:TEACHERS], 1, saturation).full.any((1, 2))
     few = np.argsort(full, kind="stable")[:FEW]
     return cut(plane, background, x[few], y[few], SIGHT, saturation)
 
@@ -423,7 +430,7 @@ def grey(signal: np.ndarray, background: Background) -> tuple[np.ndarray, float]
     """Signals (N, S, S) smoothed so that the mosaic's pattern vanishes, and the px2 which that added to covariances."""
     if not background.is_mosaic:
         return signal, 0.0
-    return greyed(signal), SMOOTHING_WIDTH
+    return smooth_mosaic(signal), SMOOTHING_WIDTH
 
 
 def _isolated(x: np.ndarray, y: np.ndarray, height: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -455,7 +462,7 @@ def _gains(stamps: Stamps, value: np.ndarray, before: Response) -> tuple[np.ndar
 
     value (N, S, S): the PSF at the stars' pixels.
     """
-    own, information = of_phases(
+    own, information = phase_fluxes(
         stamps.signal, stamps.noise, stamps.good, stamps.phase, value, before.dn_per_photon, before.misfit,
         len(before.gain),
     )  # fmt: skip
@@ -532,7 +539,7 @@ def with_trail(
     psf, fit, response = tried[best_of], fits[1 + best_of], lesson.response
     sound = (fit.flux > BRIGHT * fit.flux_sigma) & np.isfinite(fit.covariance).all((1, 2))
     if sound.any():
-        response = respond(stamps.take(sound), psf, fit.x[sound], fit.y[sound], fit, sound, response)
+        response = respond(stamps.select(sound), psf, fit.x[sound], fit.y[sound], fit, sound, response)
     return replace(lesson, psf=psf, response=response, reach=reach_of(psf))
 
 

@@ -4,13 +4,15 @@
 Where stars are wider than the peaks' kernels can find, the same is done with the frame reduced by two.
 """
 
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
 import numpy as np
 
-from starpos.detection._sparse import third_highest
+from starpos.detection._pixels import third_highest
 from starpos.detection.background import halved, measure_background, plane_of, window_of
 from starpos.detection.finding import find_peaks, find_streaks
 from starpos.detection.learn import learn, with_trail
@@ -18,7 +20,7 @@ from starpos.detection.saturated import find_discs, with_clipped, with_discs
 from starpos.detection.vet import measure, resolve
 from starpos.errors import FrameError
 from starpos.frames.exposure import Trail
-from starpos.frames.frame import BLENDED, EDGE, ELONGATED, Frame, Stars, no_stars
+from starpos.frames.frame import BLENDED, COLUMNS, EDGE, ELONGATED, Frame, Stars, no_stars
 
 # Pixels of stars that are fitted together, give or take half, on a small and on a large frame: about 2 and 6 MB.
 CHUNK_PIXELS = 30_000, 120_000
@@ -53,6 +55,17 @@ class DetectionSettings:
     mesh_px: int = 64
     threads: int = 1
     saturation_dn: float | None = None
+
+    @classmethod
+    def by_parameters(cls, values: Mapping[str, Any]) -> "DetectionSettings":
+        """The settings by the values of the parameters of the node `detector`."""
+        return cls(
+            threshold=values["threshold"],
+            min_snr=values["min_snr"],
+            max_stars=values["max_stars"],
+            threads=values["threads"],
+            saturation_dn=None if math.isnan(values["saturation"]) else values["saturation"],
+        )
 
     def __post_init__(self) -> None:
         for name, low in (
@@ -134,7 +147,7 @@ class _Picture:
 
 def detect(frame: Frame, settings: DetectionSettings = DetectionSettings()) -> Detection:
     """Measure the stars of a Frame. Without stars the Detection is empty and fwhm_px NaN."""
-    about = {"width": frame.width, "height": frame.height} | frame.about
+    about = {"width": frame.width, "height": frame.height} | frame.facts
     # OpenCV would take all processors for a little, and wait for them where others work
     cv2.setNumThreads(settings.threads)
     plane, mosaic = plane_of(frame)
@@ -202,20 +215,15 @@ def _detect_at_full_size(picture: _Picture) -> Detection:
     pixels = (2 * lesson.reach + 1) ** 2
     chunk = max(1, int(np.clip(plane.size // 32, *CHUNK_PIXELS)) // pixels)
     most = min(len(x), limit * (PIXELS_PER_PEAK >> MAX_HALVINGS - picture.halvings) // pixels)
-    columns = measure(plane, background, x[:most], y[:most], lesson, saturation, settings.min_snr, chunk)
-    columns = resolve(columns, lesson.psf)
+    found = measure(plane, background, x[:most], y[:most], lesson, saturation, settings.min_snr, chunk)
+    found = resolve(found, lesson.psf)
     fwhm_px = lesson.psf.fwhm_px
-    columns = with_discs(columns, find_discs(plane, background, fwhm_px, peaks.highest), fwhm_px)
+    found = with_discs(found, *find_discs(plane, background, fwhm_px, peaks.highest), fwhm_px)
     if fwhm_px < WIDE_FWHM:
-        columns = with_clipped(columns, plane, background, x, y, fwhm_px)
-    columns = {name: column[: settings.max_stars] for name, column in columns.items()}
+        found = with_clipped(found, plane, background, x, y, fwhm_px)
+    found = found[: settings.max_stars]
     stars = Stars(
-        x=columns["x"],
-        y=columns["y"],
-        flux=columns["flux"],
-        snr=columns["snr"],
-        covariance=columns["covariance"],
-        flags=columns["flags"],
+        **{name: found[name] for name in COLUMNS},
         fwhm_px=fwhm_px,
         window=window_of(plane, int(peaks.highest.max()), level),
         **about,
@@ -225,7 +233,7 @@ def _detect_at_full_size(picture: _Picture) -> Detection:
         background=level,
         noise=noise,
         fwhm_px=fwhm_px if len(stars) else float("nan"),
-        chi2=columns["chi2"],
+        chi2=np.ascontiguousarray(found["chi2"]),
         left_out=peaks.left_out + len(x) - most,
     )
 
@@ -241,5 +249,5 @@ def _saturation(plane: np.ndarray, x: np.ndarray, y: np.ndarray, settings: Detec
     if settings.saturation_dn is not None:
         return settings.saturation_dn
     # the third highest pixel of a star, because a hot pixel may exceed saturation; noise does not make three equal
-    highest, count = third_highest(plane, x.astype(np.intp), y.astype(np.intp), 2)
-    return highest if count >= 3 else np.iinfo(plane.dtype).max
+    third, alike = third_highest(plane, x.astype(np.intp), y.astype(np.intp), 2)
+    return float(third.max()) if alike[third == third.max()].max() >= 3 else np.iinfo(plane.dtype).max

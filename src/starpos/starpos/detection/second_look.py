@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from scipy import ndimage, special
 
-from starpos.detection._peaks import smoothed
+from starpos.detection._peaks import smooth_rows
 from starpos.detection.background import halved, plane_of
 from starpos.detection.finding import SHARP, Kernel
 from starpos.detection.pipeline import Detection, DetectionSettings, detect
@@ -120,7 +120,7 @@ class SecondLook:
     @cached_property
     def _smooth(self) -> np.ndarray:
         plane, _ = plane_of(self.frame)
-        return smoothed(plane, self._kernel.weight, np.arange(len(plane)), 1)
+        return smooth_rows(plane, self._kernel.weight, np.arange(len(plane)), 1)
 
     def __call__(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """How bright the places x, y (N,) px are: in sigma of a normal distribution, by rank; and the SNR.

@@ -1,14 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
 """The pixels around each star, all stars at once, and their Gaussian-windowed moments."""
 
-from dataclasses import dataclass, fields
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from typing import TypeVar
 
 import numpy as np
 
-from starpos.detection._beside import dots, lonely, rims
-from starpos.detection._moments import centred, settled, windowed
-from starpos.detection._shapes import before, clipped, inverted, relative, through
-from starpos.detection._stamps import around, light_around
+from starpos.detection._moments import (
+    centroids,
+    clip_widths,
+    invert_shapes,
+    through_window,
+    typical_shape,
+    width_ratios,
+    window_moments,
+    without_window,
+)
+from starpos.detection._pixels import cut_stamps, mark_dots, mark_isolated, measure_rims
 from starpos.detection.background import Background
 from starpos.units import SIGMA_PER_MAD
 
@@ -22,8 +31,29 @@ ALONE, NOTHING = 0.25, 3.0
 HALF, QUARTER = 0.5, 0.25
 
 
+Each = TypeVar("Each", bound="StarRows")
+
+
+class StarRows:
+    """A dataclass of arrays that have a row for each of N stars."""
+
+    def select(self: Each, index: np.ndarray | slice) -> Each:
+        """The rows that index selects; a mask (N,) that selects all copies nothing."""
+        if isinstance(index, np.ndarray) and index.dtype == bool and index.all():
+            return self
+        return replace(self, **{f.name: getattr(self, f.name)[index] for f in fields(self)})
+
+
+def joined(parts: Sequence[Each]) -> Each:
+    """The rows of several objects of one class, one after the other."""
+    if len(parts) == 1:
+        return parts[0]
+    rows = {f.name: np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(parts[0])}
+    return replace(parts[0], **rows)
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Stamps:
+class Stamps(StarRows):
     """Squares of S x S px around N stars, S odd.
 
     x, y    (N,) int: the central pixel of each
@@ -32,6 +62,7 @@ class Stamps:
     good    (N, S, S) bool: on the frame and not saturated
     full    (N, S, S) bool: saturated
     phase   (N, S, S) uint8: number 0..3 in the colour mosaic's 2 x 2 pattern; 0 everywhere without a mosaic
+    spike   (N, S, S) bool: much brighter than its neighbours, as in no star; the signal has their mean instead
     """
 
     x: np.ndarray
@@ -41,6 +72,7 @@ class Stamps:
     good: np.ndarray
     full: np.ndarray
     phase: np.ndarray
+    spike: np.ndarray
 
     @property
     def size(self) -> int:
@@ -52,18 +84,9 @@ class Stamps:
         """Pixels from the centre to the edge, (S - 1) / 2."""
         return self.signal.shape[1] // 2
 
-    def take(self, index: np.ndarray | slice) -> "Stamps":
-        """The stamps that index selects; a mask (N,) that selects all copies nothing."""
-        if isinstance(index, np.ndarray) and index.dtype == bool and index.all():
-            return self
-        return Stamps(**{name: getattr(self, name)[index] for name in COLUMNS})
-
     def corner(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Offsets (N,) px of the first column and row from the points x, y (N,) px."""
         return self.x - self.reach - x, self.y - self.reach - y
-
-
-COLUMNS = tuple(f.name for f in fields(Stamps))
 
 
 def cut(
@@ -71,25 +94,13 @@ def cut(
 ) -> Stamps:
     """The Stamps of (2 reach + 1) px around the pixels x, y (N,) int of plane (h, w)."""
     x, y = (np.ascontiguousarray(v, np.intp) for v in (x, y))
-    signal, noise, good, full, phase = around(plane, x, y, reach, *background.near(x, y), saturation)
+    signal, noise, good, full, phase = cut_stamps(plane, x, y, reach, *background.near(x, y), saturation)
     grid = np.arange(-reach, reach + 1)
     for streak in background.streaks:
         more, least = streak.at((y[:, None] + grid)[:, :, None], (x[:, None] + grid)[:, None, :])
         signal, noise = (signal - more).astype(np.float32), np.maximum(noise, least).astype(np.float32)
-    return Stamps(x=x, y=y, signal=signal, noise=noise, good=good, full=full, phase=phase)
-
-
-def lights(
-    plane: np.ndarray, background: Background, x: np.ndarray, y: np.ndarray, reach: int, saturation: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """The signal (N, S, S) of the Stamps that `cut` makes, and whether one of their pixels is saturated, (N,) bool."""
-    x, y = (np.ascontiguousarray(v, np.intp) for v in (x, y))
-    signal, full = light_around(plane, x, y, reach, background.near(x, y)[0], saturation)
-    grid = np.arange(-reach, reach + 1)
-    for streak in background.streaks:
-        more, _ = streak.at((y[:, None] + grid)[:, :, None], (x[:, None] + grid)[:, None, :])
-        signal = (signal - more).astype(np.float32)
-    return signal, full
+    spike = np.zeros(good.shape, bool)
+    return Stamps(x=x, y=y, signal=signal, noise=noise, good=good, full=full, phase=phase, spike=spike)
 
 
 def are_dots(plane: np.ndarray, background: Background, x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -102,13 +113,13 @@ def are_dots(plane: np.ndarray, background: Background, x: np.ndarray, y: np.nda
     # a streak is wider than nine pixels
     for streak in background.streaks:
         level = level + streak.at(y, x)[0][:, None].astype(np.float32)
-    return dots(plane, x, y, level, HALF, QUARTER)
+    return mark_dots(plane, x, y, level, HALF, QUARTER)
 
 
 def are_alone(plane: np.ndarray, background: Background, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Whether the pixels x, y (N,) int are certainly hot: almost no light in the 24 pixels around them, or of streaks."""
     x, y = (np.ascontiguousarray(v, np.intp) for v in (x, y))
-    return lonely(plane, x, y, *background.near(x, y), 2, ALONE, NOTHING)
+    return mark_isolated(plane, x, y, *background.near(x, y), 2, ALONE, NOTHING)
 
 
 def surroundings(
@@ -120,7 +131,7 @@ def surroundings(
     even than the background's mesh says.
     """
     x, y = (np.ascontiguousarray(v, np.intp) for v in (x, y))
-    return rims(plane, x, y, *background.near(x, y), reach, SIGMA_PER_MAD, RAISED, UNEVEN)
+    return measure_rims(plane, x, y, *background.near(x, y), reach, SIGMA_PER_MAD, RAISED, UNEVEN)
 
 
 # px2. A single pixel has 1/12, and a star's light never falls on one pixel only.
@@ -136,7 +147,7 @@ FARTHEST = 2.0
 
 def at_least(shape: np.ndarray, floor: float) -> np.ndarray:
     """The covariance shape (..., 2, 2) px2 with no principal axis below floor px2."""
-    return clipped(_each(shape), floor, np.inf, 1.0).reshape(shape.shape)
+    return clip_widths(_each(shape), floor, np.inf, 1.0).reshape(shape.shape)
 
 
 def _each(shape: np.ndarray) -> np.ndarray:
@@ -155,7 +166,7 @@ def moments(
     image; NaN where there is no light. Pixels off the frame and saturated ones count as they are: without them the
     centroid would be biased away from the edge.
     """
-    return windowed(signal, left, top, _each(window))
+    return window_moments(signal, left, top, _each(window))
 
 
 def centroid(
@@ -167,8 +178,8 @@ def centroid(
     """
     window = window_for(shape)
     # through the window an offset looks smaller than it is
-    gain = np.eye(2) + shape @ inverted(_each(window)).reshape(window.shape)
-    return centred(signal, x, y, _each(window), _each(gain), rounds, FARTHEST)
+    gain = np.eye(2) + shape @ invert_shapes(_each(window)).reshape(window.shape)
+    return centroids(signal, x, y, _each(window), _each(gain), rounds, FARTHEST)
 
 
 def window_for(shape: np.ndarray) -> np.ndarray:
@@ -185,7 +196,7 @@ def frame_shape(signal: np.ndarray, blur: float = 0.0, rounds: int = 12) -> np.n
     reach = signal.shape[1] // 2
     for width in (max(1.5, reach / 4), 1.5):
         # a stamp does not hold a wider star than half its reach
-        shape = settled(
+        shape = typical_shape(
             signal, width**2, NARROWEST_WINDOW, NARROWEST, (reach / 2) ** 2, rounds, NEAR, THINNEST, SETTLED
         )  # fmt: skip
         if shape is not None:
@@ -195,7 +206,7 @@ def frame_shape(signal: np.ndarray, blur: float = 0.0, rounds: int = 12) -> np.n
 
 def own_shape(seen: np.ndarray, window: np.ndarray) -> np.ndarray:
     """Covariances (N, 2, 2) px2 of stars from the windowed images' covariances seen (N, 2, 2); NaN where impossible."""
-    return before(seen, _each(window))
+    return without_window(seen, _each(window))
 
 
 def relative_widths(seen: np.ndarray, shape: np.ndarray, window: np.ndarray) -> np.ndarray:
@@ -204,4 +215,4 @@ def relative_widths(seen: np.ndarray, shape: np.ndarray, window: np.ndarray) -> 
     Both are 1 for a star of that shape and near 0 for a hot pixel. Along a streak the larger reaches 2 if the window is
     the shape. NaN counts as 0.
     """
-    return relative(seen, through(_each(shape), _each(window)))
+    return width_ratios(seen, through_window(_each(shape), _each(window)))

@@ -16,7 +16,7 @@ import numpy as np
 
 from starpos.errors import FrameError, one_line
 from starpos.frames.frame import MAX_BYTES, PATTERNS, Frame, check_pixels, to_unsigned
-from starpos.frames.header import KEYS, about
+from starpos.frames.header import KEYS, read_exposure
 
 FITS_START, GZIP_START = b"SIMPLE", b"\x1f\x8b"
 # Planes of a stack or of a camera of colours.
@@ -73,8 +73,8 @@ def _read(file: BinaryIO, place: str, part: str) -> tuple[Frame, dict[str, Any]]
             f"like '{place}[{image.others[0]}]'",
             stacklevel=3,
         )
-    frame = Frame(to_unsigned(values, place), pattern=_pattern(header, place), **about(header, place))
-    return frame, header
+    pixels, pattern = to_unsigned(values, place), _pattern(header, place)
+    return Frame(pixels, pattern=pattern, **read_exposure(header, place).facts), header
 
 
 def _plain(file: BinaryIO, place: str) -> BinaryIO:

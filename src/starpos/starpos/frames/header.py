@@ -1,33 +1,60 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a frame's header says of its exposure: time, focal length, shutter, and the place of a crop on the sensor.
 
-A header is a mapping of FITS keywords (KEYS) to values of any kind; every value is checked.
+A header is a mapping of FITS keywords (KEYS) to values of any kind; every value is checked. Its cards of start,
+middle, end and length are compared: those that contradict each other give no time, and a length of 0 is unknown. Without
+a time `untimed` says why.
 """
 
 import math
+import re
+import warnings
 from collections.abc import Mapping
 from contextlib import suppress
+from dataclasses import dataclass, replace
 from typing import Any
 
-from starpos.errors import FrameError
-from starpos.frames import times
-from starpos.frames.exposure import Shutter
-from starpos.units import ARCSEC
+import erfa
 
+from starpos.errors import FrameError, TimeError, one_line
+from starpos.frames.exposure import MAX_EXPOSURE_S, UNKNOWN_LATENCY_S, Exposure, Shutter
+from starpos.units import ARCSEC, DAY_S, UNIX_EPOCH_JD
+
+START, MIDDLE, END = (
+    ("DATE-OBS", "DATE-BEG", "MJD-OBS", "MJD-BEG"),
+    ("DATE-AVG", "MJD-AVG"),
+    ("DATE-END", "MJD-END"),
+)
+# UTC of the start, where DATE-OBS or DATE-BEG is a day alone
+HOURS = ("TIME-OBS", "UT", "UTSTART")
+# lengths in s: of one exposure (EXP: DWARF), then of all together (LIVETIME: Siril, TOTALEXP: Seestar)
+LENGTHS = ("EXPTIME", "EXPOSURE", "XPOSURE", "EXP", "LIVETIME", "TOTALEXP")
+# number of stacked exposures (Seestar and Siril, IRAF, MaxIm and others)
+COUNTS = ("STACKCNT", "NCOMBINE", "SNAPSHOT")
+TIME_KEYS = (*START, *MIDDLE, *END, *HOURS, *LENGTHS, *COUNTS, "TIMESYS")
+# Time scales of TIMESYS that are read; UT1 would need tables.
+TIME_SCALES = ("utc", "tai", "tt", "tdb")
+# Cards that set the middle of the exposure farther apart than this, beyond their rounding, contradict each other.
+MAX_APART_S = 0.5
+ISO_TIME = re.compile(r"(\d{4})-(\d\d)-(\d\d)T(\d\d):(\d\d)(?::(\d\d?(?:\.\d*)?))?Z?", re.ASCII)
+DAY = re.compile(r"\d{4}-\d\d-\d\d", re.ASCII)
+MJD_ZERO_JD, FARTHEST_MJD = 2400000.5, 1e7
+# smallest step of an MJD's last digit: below it lie the last bits of a double
+MIN_MJD_STEP_S = 1e-3
 # Cards with the column and row of the sensor's frame at which a frame begins, in pixels of this frame, and their sign:
 # positive by SBFITSEXT (MaxIm, APT, Seestar and others), negative in IRAF's physical coordinates
 CROPS = ((("XORGSUBF", "YORGSUBF"), 1.0), (("LTV1", "LTV2"), -1.0))
 # IRAF's size of a pixel in physical ones
 LTM = ("LTM1_1", "LTM2_2")
 # arcsec per px, by INDI, Sequence Generator Pro and others
-SCALES = ("SCALE", "PIXSCALE", "SECPIX1")
+PLATE_SCALES = ("SCALE", "PIXSCALE", "SECPIX1")
 # minimum of a focal length, a pixel or a scale that counts as stated
 LEAST = 1e-9
 KEYS = (
-    *times.KEYS,
+    *TIME_KEYS,
     *(key for keys, _ in CROPS for key in keys),
     *LTM,
-    *SCALES,
+    *PLATE_SCALES,
     "BAYERPAT",
     "XBAYROFF",
     "YBAYROFF",
@@ -37,15 +64,16 @@ KEYS = (
 )
 
 
-def about(header: Mapping, place: str) -> dict[str, Any]:
-    """Read the fields of an Exposure that a header states; FrameError for a bad shutter. place names it in messages."""
-    return times.times(header) | {
-        "source": place,
-        "focal_px": focal_px(header),
-        "pixel_um": _positive(header, "XPIXSZ"),
-        "shutter": shutter(header, place),
-        "origin_px": origin_px(header),
-    }
+def read_exposure(header: Mapping, place: str) -> Exposure:
+    """Read the Exposure that a header states; FrameError for a bad shutter. place names it in messages."""
+    return replace(
+        read_times(header),
+        source=place,
+        focal_px=focal_px(header),
+        pixel_um=_positive(header, "XPIXSZ"),
+        shutter=shutter(header, place),
+        origin_px=origin_px(header),
+    )
 
 
 def origin_px(header: Mapping) -> tuple[float, float] | None:
@@ -86,7 +114,7 @@ def focal_px(header: Mapping) -> float | None:
     focal, pixel_um = _positive(header, "FOCALLEN"), _positive(header, "XPIXSZ")
     if focal is not None and pixel_um is not None:
         return focal * 1000.0 / pixel_um
-    scales = (_positive(header, key) for key in SCALES)
+    scales = (_positive(header, key) for key in PLATE_SCALES)
     return next((1.0 / (scale * ARCSEC) for scale in scales if scale is not None), None)
 
 
@@ -102,3 +130,251 @@ def focal_mm(focal_px: float, pixel_um: float) -> float:
     """FOCALLEN, mm, from a focal length in px and the size of a pixel in um."""
     # 12 digits turn 29.669999999999998 into 29.67
     return float(f"{focal_px * pixel_um / 1000:.12g}")
+
+
+@dataclass(frozen=True)
+class _Instant:
+    """A time of a card: Julian date in TAI in two parts, and its standard deviation (s) by its last digit."""
+
+    day: float
+    part: float
+    stddev_s: float
+
+    def since_s(self, other: "_Instant") -> float:
+        """Time in s from another instant to this one."""
+        return ((self.day - other.day) + (self.part - other.part)) * DAY_S
+
+
+@dataclass(frozen=True)
+class _Middle:
+    """The middle of the exposure, s after an instant, by some cards."""
+
+    after_s: float
+    stddev_s: float
+    by: str
+
+
+def read_times(header: Mapping) -> Exposure:
+    """Read when a frame was exposed: mid_unix_s, exposure_s, stamp_stddev_s, or untimed.
+
+    stamp_stddev_s comes from the last digit of a time, which may be rounded or cut off, and from how far cards that
+    should agree are apart. A header without any card of a time has an empty untimed.
+    """
+    try:
+        _check_single(header)
+        lengths = _lengths(header)
+    except TimeError as e:
+        return Exposure(untimed=str(e))
+    exposure_s = next(iter(lengths.values()), None)
+    try:
+        instants = _instants(header)
+        middles, zero = _middles(instants, lengths)
+    except TimeError as e:
+        return Exposure(exposure_s=exposure_s, untimed=str(e))
+    if zero is None or not middles:
+        return Exposure(exposure_s=exposure_s, untimed="" if zero is None else _no_length(header))
+    best = min(middles, key=lambda m: m.stddev_s)
+    other = max(middles, key=lambda m: _apart_s(m, best))
+    if (apart_s := _apart_s(other, best)) > MAX_APART_S:
+        return Exposure(
+            untimed=f"the middle of its exposure by {best.by} and by {other.by} differ by "
+            f"{abs(other.after_s - best.after_s):.3g} s: these cards contradict each other, correct the header"
+        )
+    return Exposure(
+        mid_unix_s=_unix_s(zero.day, zero.part + best.after_s / DAY_S),
+        exposure_s=_span_s(instants) if exposure_s is None else exposure_s,
+        stamp_stddev_s=math.hypot(best.stddev_s, apart_s),
+    )
+
+
+def _apart_s(one: _Middle, other: _Middle) -> float:
+    """How much farther two middles are apart than rounding of their digits explains."""
+    step_s = math.sqrt(3) * (one.stddev_s + other.stddev_s)
+    # and the last bits of sums
+    return max(0.0, abs(one.after_s - other.after_s) - step_s - 1e-6)
+
+
+def _check_single(header: Mapping) -> None:
+    """Raise TimeError for a stack: it shows the sky of one of its exposures, which need not be the middle one."""
+    for key in COUNTS:
+        count = header.get(key)
+        if isinstance(count, (int, float)) and count > 1:
+            raise TimeError(
+                f"it is a stack of {count:g} exposures ({key}), whose light has no one time: give single exposures"
+            )
+
+
+def _lengths(header: Mapping) -> dict[str, float]:
+    """The lengths of the exposure in s by card; 0 is missing. TimeError for a value that is not a length."""
+    lengths = {}
+    for key in LENGTHS:
+        if (value := header.get(key)) in (None, ""):
+            continue
+        try:
+            length = float(value)
+        except (TypeError, ValueError, OverflowError):
+            length = math.nan
+        if not 0 <= length <= MAX_EXPOSURE_S:
+            raise TimeError(
+                f"its {key} is {one_line(repr(value))}: give 0 to {MAX_EXPOSURE_S:g} s, correct the header"
+            )
+        if length > 0:
+            lengths[key] = length
+    return lengths
+
+
+def _no_length(header: Mapping) -> str:
+    zero = [key for key in LENGTHS if header.get(key) not in (None, "")]
+    if zero:
+        return f"how long it was exposed is unknown, its {zero[0]} is 0: correct the header"
+    return "how long it was exposed is unknown: its header needs EXPTIME"
+
+
+def _instants(header: Mapping) -> dict[str, _Instant]:
+    """The times in the header by card; TimeError for a value that is not a time."""
+    keys = [key for key in (*START, *MIDDLE, *END) if header.get(key) not in (None, "")]
+    scale = str(header.get("TIMESYS") or "UTC").strip().lower()
+    if keys and scale not in TIME_SCALES:
+        raise TimeError(f"its TIMESYS is {scale[:20]!r}: it must be one of {', '.join(TIME_SCALES)}")
+    instants = {key: _instant(header, key, scale) for key in keys}
+    return {key: instant for key, instant in instants.items() if instant is not None}
+
+
+def _middles(
+    instants: Mapping[str, _Instant], lengths: Mapping[str, float]
+) -> tuple[list[_Middle], _Instant | None]:
+    """The middles of the exposure by the cards, and the instant they count from; TimeError if they end early."""
+    if not instants:
+        return [], None
+    zero = next(iter(instants.values()))
+    starts, middles, ends = (
+        {key: instants[key] for key in keys if key in instants} for keys in (START, MIDDLE, END)
+    )
+    by_cards = [_Middle(m.since_s(zero), m.stddev_s, key) for key, m in middles.items()]
+    for key, start in starts.items():
+        at_s = start.since_s(zero)
+        by_cards += [
+            _Middle(at_s + s / 2, start.stddev_s, f"{key} with {length}") for length, s in lengths.items()
+        ]
+        for last, end in ends.items():
+            span_s = end.since_s(start)
+            if span_s < 0:
+                raise TimeError(f"its {last} is before its {key}: correct the header")
+            # an end is often the arrival of the frame: a start and a length are better
+            stddev_s = math.hypot(start.stddev_s, end.stddev_s)
+            by_cards.append(_Middle(at_s + span_s / 2, stddev_s, f"{key} with {last}"))
+    if not starts:
+        # a clock read on arrival of the frame is late
+        by_cards += [
+            _Middle(
+                end.since_s(zero) - s / 2,
+                math.hypot(end.stddev_s, UNKNOWN_LATENCY_S),
+                f"{last} with {length}",
+            )
+            for last, end in ends.items()
+            for length, s in lengths.items()
+        ]
+    return by_cards, zero
+
+
+def _span_s(instants: Mapping[str, _Instant]) -> float | None:
+    """The length of the exposure from its start to its end, as far as these are known."""
+    start, end = (next((instants[key] for key in keys if key in instants), None) for keys in (START, END))
+    if start is None or end is None:
+        return None
+    span_s = end.since_s(start)
+    return span_s if 0 < span_s <= MAX_EXPOSURE_S else None
+
+
+def _instant(header: Mapping, key: str, scale: str) -> _Instant | None:
+    """The time of a card; None if it is a day without an hour. TimeError if it is not a time."""
+    value = header[key]
+    if key.startswith("MJD"):
+        try:
+            value = float(value)
+        except (TypeError, ValueError, OverflowError):
+            raise TimeError(
+                f"its {key} is {one_line(repr(value))}, which is no number: give an MJD"
+            ) from None
+    else:
+        value = _as_today(value)
+        # a number of another keyword (a Julian date, Unix time) would pass for an MJD
+        if not isinstance(value, str):
+            raise TimeError(
+                f"its {key} is {value!r}, which is no text: write it like 2026-11-02T18:00:00.000"
+            )
+        if DAY.fullmatch(value):
+            hours = next((header[k] for k in HOURS if header.get(k) not in (None, "")), None)
+            if hours is None or key in (*MIDDLE, *END):
+                return None
+            value = f"{value}T{str(hours).strip()}"
+    try:
+        with warnings.catch_warnings():
+            # of years whose leap seconds are not known yet
+            warnings.simplefilter("ignore", erfa.ErfaWarning)
+            # a second beyond the end of its minute
+            warnings.filterwarnings("error", ".*(after end of day|both of)", erfa.ErfaWarning)
+            day, part = _tai(*_day_of(value, scale), scale)
+    except (erfa.ErfaError, erfa.ErfaWarning, ValueError, TypeError, OverflowError):
+        raise TimeError(
+            f"its {key} is {one_line(repr(value))}, which is no time of an exposure (hours to 23, minutes and seconds to "
+            "59): write it like 2026-11-02T18:00:00.000"
+        ) from None
+    return _Instant(day, part, _rounding(value))
+
+
+def _unix_s(day: float, part: float) -> float:
+    """Unix time of a Julian date in TAI; as sums are formed in TAI, exposures across a leap second come out right."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", erfa.ErfaWarning)
+        day, part = erfa.taiutc(day, part)
+    return float((day - UNIX_EPOCH_JD) * DAY_S + part * DAY_S)
+
+
+def _as_today(start: Any) -> Any:
+    """Text as FITS wants it today, of a day of the 20th century as FITS had it before 1999, or with a space for the T."""
+    if not isinstance(start, str):
+        return start
+    text = re.sub(r"^(\d\d)/(\d\d)/(\d\d)(?!\d)", r"19\3-\2-\1", start.strip())
+    return re.sub(r"^(\d{4}-\d\d-\d\d) +(?=\d\d:)", r"\1T", text)
+
+
+def _rounding(start: float | str) -> float:
+    """Standard deviation (s) from the last digit of a text or an MJD, rounded or cut off; 0 for a long MJD."""
+    if not isinstance(start, str):
+        digits = repr(start).partition(".")[2].rstrip("0")
+        sigma_s = DAY_S * 10.0 ** -len(digits) / math.sqrt(3)
+        return sigma_s if sigma_s > MIN_MJD_STEP_S else 0.0
+    decimals = re.search(r":\d\d:\d\d(?:\.(\d*))?", start)
+    # a time without seconds
+    if decimals is None:
+        return 60 / math.sqrt(3)
+    return 10.0 ** -len(decimals[1] or "") / math.sqrt(3)
+
+
+def _day_of(start: float | str, scale: str) -> tuple[float, float]:
+    """Julian date of a time in its scale, in two parts: ERFA's quasi-JD for UTC; ValueError if invalid.
+
+    By ERFA alone: astropy's times, which are ERFA's, take as long to import as the rest of a program's start.
+    """
+    if not isinstance(start, str):
+        if not abs(start) < FARTHEST_MJD:
+            raise ValueError(start)
+        return MJD_ZERO_JD, start
+    found = ISO_TIME.fullmatch(start.strip())
+    if found is None:
+        raise ValueError(start)
+    *whole, seconds = found.groups()
+    return tuple(erfa.dtf2d(scale.upper(), *map(int, whole), float(seconds or 0)))
+
+
+def _tai(day: float, part: float, scale: str) -> tuple[float, float]:
+    """The Julian date in TAI of one in another scale, each in two parts."""
+    if scale == "tai":
+        return day, part
+    if scale == "utc":
+        return tuple(erfa.utctai(day, part))
+    if scale == "tdb":
+        # at the geocentre; the time of day has no part in it there
+        day, part = erfa.tdbtt(day, part, erfa.dtdb(day, part, 0.0, 0.0, 0.0, 0.0))
+    return tuple(erfa.tttai(day, part))

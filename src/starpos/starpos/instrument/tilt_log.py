@@ -267,7 +267,7 @@ class TiltLog:
             variance_z=float(variance[2]) / n if third else np.nan,
             utc_unix_s=float(self.utc_unix_s[use].mean()),
             samples=n,
-            temperature_c=float(self.temperature_c[use].mean()),
+            temperature_c=_mean_known(self.temperature_c[use]),
             times=tuple(self.utc_unix_s[use].tolist()),
         )
 
@@ -354,6 +354,12 @@ class TiltLog:
         """Whether two readings are of one lean within their noise."""
         variance = (self.variance[a] + self.variance[b]) * self.excess**2
         return bool(((self.theta[a] - self.theta[b]) ** 2 <= AGREE_SIGMA**2 * variance).all())
+
+
+def _mean_known(celsius: np.ndarray) -> float:
+    """Mean of the temperatures (N,) that are known; NaN without one."""
+    known = celsius[np.isfinite(celsius)]
+    return float(known.mean()) if len(known) else np.nan
 
 
 def _check_possible(theta: np.ndarray) -> None:

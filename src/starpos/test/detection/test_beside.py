@@ -4,8 +4,7 @@
 import numpy as np
 import pytest
 
-from starpos.detection._beside import dots, lonely, rims
-from starpos.detection._stamps import around
+from starpos.detection._pixels import cut_stamps, mark_dots, mark_isolated, measure_rims
 from starpos.units import SIGMA_PER_MAD
 
 
@@ -28,7 +27,7 @@ def squares(peaks, reach):
     plane, x, y, level, noise = peaks
     return [
         values.reshape(len(x), -1).astype(float)
-        for values in around(plane, x, y, reach, level, noise, 1e9)[:2]
+        for values in cut_stamps(plane, x, y, reach, level, noise, 1e9)[:2]
     ]
 
 
@@ -37,7 +36,7 @@ def test_dots_have_their_light_in_one_or_two_pixels(peaks):
     peak, second, rest = core[:, 8], core[:, 7], core[:, :7].sum(1)
     expected = (rest + second < 0.5 * peak) | (rest < 0.25 * peak)
     assert 20 < expected.sum() < 280
-    np.testing.assert_array_equal(dots(*peaks[:4], 0.5, 0.25), expected)
+    np.testing.assert_array_equal(mark_dots(*peaks[:4], 0.5, 0.25), expected)
 
 
 @pytest.mark.parametrize("reach", [1, 2])
@@ -46,7 +45,7 @@ def test_lonely_pixels_have_no_light_beside_them(reach, peaks):
     beside = signal.sum(1) - signal.max(1)
     expected = beside < np.minimum(0.25 * signal.max(1), 3.0 * np.sqrt((noise**2).sum(1)))
     assert 20 < expected.sum() < 280
-    np.testing.assert_array_equal(lonely(*peaks, reach, 0.25, 3.0), expected)
+    np.testing.assert_array_equal(mark_isolated(*peaks, reach, 0.25, 3.0), expected)
 
 
 @pytest.mark.parametrize("reach", [1, 3])
@@ -64,16 +63,18 @@ def test_rims_are_the_edges_of_squares(reach, peaks):
     spread = SIGMA_PER_MAD * np.median(np.abs(score - sky[:, None]), axis=1)
     assert 20 < (sky > 0.3).sum() < 280 and 20 < (spread > 1.3).sum() < 280
     expected = np.where(sky > 0.3, sky, 0), np.where(spread > 1.3, spread, 1)
-    np.testing.assert_allclose(rims(*peaks, reach, SIGMA_PER_MAD, 0.3, 1.3), expected, rtol=1e-6, atol=1e-6)
+    np.testing.assert_allclose(
+        measure_rims(*peaks, reach, SIGMA_PER_MAD, 0.3, 1.3), expected, rtol=1e-6, atol=1e-6
+    )
 
 
 def test_columns_that_do_not_fit_together_are_refused(peaks):
     plane, x, y, level, noise = peaks
     with pytest.raises(ValueError, match="phases"):
-        dots(plane, x, y[1:], level, 0.5, 0.25)
+        mark_dots(plane, x, y[1:], level, 0.5, 0.25)
     with pytest.raises(ValueError, match="phases"):
-        lonely(plane, x, y, level, noise[:, :0], 2, 0.25, 3.0)
+        mark_isolated(plane, x, y, level, noise[:, :0], 2, 0.25, 3.0)
     with pytest.raises(ValueError, match="no edge"):
-        rims(*peaks, 0, 1.0, 0.0, 0.0)
+        measure_rims(*peaks, 0, 1.0, 0.0, 0.0)
     with pytest.raises(ValueError, match="nothing to see"):
-        dots(plane[:0], x, y, level, 0.5, 0.25)
+        mark_dots(plane[:0], x, y, level, 0.5, 0.25)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from starpos.frames.exposure import UNKNOWN_LATENCY_S
-from starpos.frames.times import times
+from starpos.frames.header import read_times
 
 START_S = datetime(2026, 11, 2, 18, tzinfo=timezone.utc).timestamp()
 START = {"DATE-OBS": "2026-11-02T18:00:00.000"}
@@ -31,9 +31,9 @@ STEP_S = 0.001 / np.sqrt(3)
     ],
 )
 def test_what_agrees_is_the_middle_of_the_exposure(cards, middle_s, exposure_s):
-    told = times(cards)
-    assert told["mid_unix_s"] - START_S == pytest.approx(middle_s, abs=1e-5)
-    assert told["exposure_s"] == (exposure_s if exposure_s is None else pytest.approx(exposure_s))
+    read = read_times(cards)
+    assert read.mid_unix_s - START_S == pytest.approx(middle_s, abs=1e-5)
+    assert read.exposure_s == (exposure_s if exposure_s is None else pytest.approx(exposure_s))
 
 
 @pytest.mark.parametrize(
@@ -68,34 +68,38 @@ def test_what_agrees_is_the_middle_of_the_exposure(cards, middle_s, exposure_s):
     ],
 )
 def test_what_contradicts_itself_or_is_none_tells_no_time_and_says_why(cards, words):
-    told = times(cards)
-    assert "mid_unix_s" not in told
-    assert re.search(words, told["untimed"]), told["untimed"]
-    assert "\n" not in told["untimed"]
+    read = read_times(cards)
+    assert read.mid_unix_s is None
+    assert re.search(words, read.untimed), read.untimed
+    assert "\n" not in read.untimed
 
 
 def test_cards_that_are_a_little_apart_are_in_the_claim():
     """A DATE-END 0.6 s late by the time the frame took to come: the middle may be 0.3 s later."""
-    late = times({**START, "EXPTIME": 4, "DATE-END": "2026-11-02T18:00:04.600"})
-    assert late["mid_unix_s"] - START_S == pytest.approx(2.0, abs=1e-5)
-    assert late["stamp_stddev_s"] == pytest.approx(0.3, abs=0.01)
+    late = read_times({**START, "EXPTIME": 4, "DATE-END": "2026-11-02T18:00:04.600"})
+    assert late.mid_unix_s - START_S == pytest.approx(2.0, abs=1e-5)
+    assert late.stamp_stddev_s == pytest.approx(0.3, abs=0.01)
     # whole seconds are only cut off
-    cut = times({**START, "EXPTIME": 4, "DATE-END": "2026-11-02T18:00:04"})
-    assert cut["stamp_stddev_s"] == pytest.approx(STEP_S)
-    assert times({**START, "EXPTIME": 4, "DATE-END": "2026-11-02T18:00:06.000"}).keys() == {"untimed"}
+    cut = read_times({**START, "EXPTIME": 4, "DATE-END": "2026-11-02T18:00:04"})
+    assert cut.stamp_stddev_s == pytest.approx(STEP_S)
+    assert read_times({**START, "EXPTIME": 4, "DATE-END": "2026-11-02T18:00:06.000"}).untimed
 
 
 def test_the_finest_of_several_times_is_the_one_that_counts():
-    told = times({"DATE-OBS": "2026-11-02T18:00:00", "DATE-AVG": "2026-11-02T18:00:02.7500", "EXPTIME": 4})
-    assert told["mid_unix_s"] - START_S == pytest.approx(2.75, abs=1e-5)
-    assert told["stamp_stddev_s"] == pytest.approx(1e-4 / np.sqrt(3))
+    read = read_times(
+        {"DATE-OBS": "2026-11-02T18:00:00", "DATE-AVG": "2026-11-02T18:00:02.7500", "EXPTIME": 4}
+    )
+    assert read.mid_unix_s - START_S == pytest.approx(2.75, abs=1e-5)
+    assert read.stamp_stddev_s == pytest.approx(1e-4 / np.sqrt(3))
 
 
 def test_an_end_alone_tells_the_middle_but_for_the_delay_of_who_reads_the_clock():
-    told = times({"DATE-END": "2026-11-02T18:00:04.000", "EXPTIME": 4})
-    assert told["mid_unix_s"] - START_S == pytest.approx(2.0, abs=1e-5)
-    assert told["stamp_stddev_s"] == pytest.approx(np.hypot(STEP_S, UNKNOWN_LATENCY_S))
+    read = read_times({"DATE-END": "2026-11-02T18:00:04.000", "EXPTIME": 4})
+    assert read.mid_unix_s - START_S == pytest.approx(2.0, abs=1e-5)
+    assert read.stamp_stddev_s == pytest.approx(np.hypot(STEP_S, UNKNOWN_LATENCY_S))
 
 
 def test_without_any_card_nothing_is_said():
-    assert times({"EXPTIME": 2}) == {"exposure_s": 2.0} and times({}) == {"exposure_s": None}
+    for cards, exposure_s in (({"EXPTIME": 2}, 2.0), ({}, None)):
+        nothing = read_times(cards)
+        assert (nothing.exposure_s, nothing.mid_unix_s, nothing.untimed) == (exposure_s, None, "")
