@@ -23,7 +23,7 @@ from starpos.frames.frame import Frame, Stars
 from starpos.frames.header import focal_mm
 from starpos.identification import Identification, blind, quads
 from starpos.identification.blind import STAGES
-from starpos.identification.hint import Hint
+from starpos.identification.prior import Hint
 from starpos.identification.search import MIN_LOG_ODDS_WITH_LOOK, Priors
 from starpos.instrument.instrument import Instrument
 from starpos.instrument.tilt_log import Tilts

@@ -18,7 +18,7 @@ from starpos.frozen import at_once
 from starpos.identification import Identification, Sky, fisheye
 from starpos.identification._frame import FrameStars
 from starpos.identification.evidence import Explained, explained_by
-from starpos.identification.hint import Hint
+from starpos.identification.prior import Hint
 from starpos.identification.two_skies import two_skies
 from starpos.instrument.camera import PLUMB_BOB, Camera
 from starpos.instrument.inclinometer import Tilt

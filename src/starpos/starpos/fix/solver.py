@@ -25,8 +25,8 @@ from starpos.frames.reading import why_no_time
 from starpos.frames.tables import Pointing
 from starpos.identification import MIN_STARS, Identification, PointingPrior, Sky, fisheye, identify_directions
 from starpos.identification._frame import FrameStars, all_within, ideal_frame, mean_sigma, unit_vectors
-from starpos.identification.hint import Hint
 from starpos.identification.pose import MIN_SIGMA_PX, TEST_STARS
+from starpos.identification.prior import Hint
 from starpos.identification.search import (
     Look,
     Priors,

@@ -11,6 +11,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from starpos.errors import TiltError
+from starpos.frozen import at_once
 from starpos.instrument.inclinometer import SCA100T_NOISE_RAD, Tilt
 from starpos.units import SIGMA_PER_MAD
 
@@ -64,6 +65,7 @@ def noise_excess(steps: np.ndarray, stated_rad: float) -> float:
     return found if found > 1 + SIGNIFICANT / np.sqrt(len(steps)) else 1.0
 
 
+@at_once
 @dataclass(frozen=True)
 class TiltLog:
     """N readings of one sensor.

@@ -23,7 +23,7 @@ from starpos.fix.searching import (
 from starpos.fix.solution import Solution
 from starpos.fix.solver import Solver, check_explained
 from starpos.frames.frame import Frame, Stars
-from starpos.identification.hint import Hint
+from starpos.identification.prior import Hint
 from starpos.instrument.tilt_log import NO_TILTS, Tilts
 from starpos.night.reading import Instruments, Reader, TiltFile, stars_of
 from starpos.night.remarks import Kind, Remark

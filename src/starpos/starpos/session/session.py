@@ -22,7 +22,7 @@ from starpos.fix.solver import Solver
 from starpos.frames.frame import Stars
 from starpos.gnss.solving import Watched
 from starpos.identification import Identification
-from starpos.identification.hint import Hint
+from starpos.identification.prior import Hint
 from starpos.identification.search import Priors
 from starpos.instrument.camera import Camera
 from starpos.messages.stamp import stamp_to_unix
