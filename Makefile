@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 # make demo    the whole instrument on a simulated night      make test    linters, unit tests, whole-graph tests
 # make emulated   firmware on an emulated MCU, INDI camera under a sky, nodes: tools/demo/emulated_instrument.py
-# make build   set-up (once) and build                        make lint    linters only
+# make build   set-up (once) and build                        make lint    linters only, without a build
+# make quick   in a minute: fast linters, and unit tests of the core
 # make bench   what everything takes, beside other programs: tools/benchmarks/bench.py      ARGS=--quick: in a minute
 # make docs    the documents as a site: build/docs/index.html
 # make clean   removes what was built                         make distclean   and the set-up
@@ -18,7 +19,7 @@ INPUTS := colcon.meta tools/build $(foreach p,$(PACKAGES),$(wildcard $(p)/packag
   $(p)/layouts $(p)/layouts/* $(p)/sros2 $(p)/sros2/* $(p)/urdf $(p)/urdf/* $(p)/resource/* \
   $(p)/$(notdir $(p))/*/*.pyx $(p)/$(notdir $(p))/*/*.pxd))
 
-.PHONY: build demo bench docs emulated test lint clean distclean FORCE
+.PHONY: build demo bench docs emulated test quick lint clean distclean FORCE
 build: install/.built
 
 install/.built: .underlay/stamp $(INPUTS)
@@ -45,8 +46,12 @@ bench: build
 docs: build
 	@. tools/env.sh && python tools/test.py --docs
 
-lint: build
-	@. tools/env.sh && python tools/test.py --lint
+quick: build
+	@. tools/env.sh && python tools/test.py --quick
+
+# linters read sources; nothing has to be compiled
+lint: .underlay/stamp
+	@PATH="$(CURDIR)/.underlay/venv/bin:$$PATH" python tools/test.py --lint
 
 clean:
 	rm -rf src/starpos/starpos/*/*.c src/starpos/starpos/*/*.so

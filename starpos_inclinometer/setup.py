@@ -15,13 +15,12 @@ setup(
     zip_safe=True,
     maintainer="starpos maintainers",
     maintainer_email="maintainers@starpos.invalid",
-    description="The starpos inclinometer: serial protocol, driver, node and emulator.",
+    description="The starpos inclinometer: serial protocol, driver and node.",
     license="Apache-2.0",
     extras_require={"test": ["pytest"]},
     entry_points={
         "console_scripts": [
             "inclinometer = starpos_inclinometer.main:inclinometer",
-            "emulator = starpos_inclinometer.main:emulator",
         ],
     },
 )

@@ -17,7 +17,7 @@ CAMERA = (
 @pytest.mark.parametrize("signals", [(signal.SIGINT, signal.SIGINT), (signal.SIGTERM,)])
 def test_all_at_work_end_with_status_0(graph, run, tmp_path, signals):
     port = tmp_path / "port"
-    emulator = run("starpos_inclinometer", "emulator", arguments=("--link", str(port), "--tilt-x", "3"))
+    emulator = run("starpos_testing", "emulator", arguments=("--link", str(port), "--tilt-x", "3"))
     graph.wait(port.exists, "for the emulated port")
     processes = [
         run("starpos_camera", "camera", *CAMERA),

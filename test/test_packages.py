@@ -43,7 +43,7 @@ HELPERS |= {"late_starpos"}
 # starpos_testing stands on these, so they cannot name it: colcon would find a circle
 BELOW_TESTING = {"starpos", "starpos_common"}
 # Programs, which nothing imports.
-RUN_BY_COMMAND = {"libxml2-utils", "ros2launch", "xacro"}
+RUN_BY_COMMAND = {"libxml2-utils", "ros2launch", "starpos_testing", "xacro"}
 
 
 @pytest.mark.parametrize("folder", FOLDERS, ids=lambda folder: folder.name)

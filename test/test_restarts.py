@@ -41,7 +41,7 @@ def instrument(graph, tmp_path_factory):
     tilt = scene_of(SMALL, focal_of(SMALL), LATITUDE_DEG, LONGITUDE_DEG, air).tilt
     texts = [f"{math.degrees(t):.9f}" for t in tilt]
     emulated = ("--link", str(port), "--tilt-x", texts[0], "--tilt-y", texts[1])
-    graph.start(folder / "emulator.log", "starpos_inclinometer", "emulator", arguments=emulated)
+    graph.start(folder / "emulator.log", "starpos_testing", "emulator", arguments=emulated)
     graph.wait(port.exists, "for the emulated port")
 
     def start(name):

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Run everything that can fail in this project: linters, each package's tests, the tests of the whole graph.
 
-`test.py [PYTEST ARGUMENTS]`, `test.py --lint`. The last line counts what passed, failed and was skipped (a
-linter counts as one test); the exit status is 0 only where nothing failed. `test.py --ubuntu` runs packages' tests with
-the versions that Ubuntu 24.04 has (tools/setup/ubuntu), in an environment as bare as a newcomer's: without the
+`test.py [PYTEST ARGUMENTS]`, `test.py --lint`, `test.py --quick` (fast linters, and unit tests of the core). The last
+line counts what passed, failed and was skipped (a linter counts as one test); the exit status is 0 only where nothing
+failed. `test.py --ubuntu` runs packages' tests with the versions that Ubuntu 24.04 has (tools/setup/ubuntu), in an
+environment as bare as a newcomer's: without the
 counterparts that tools/setup/counterparts brings. `test.py --both` runs all, and the core's tests with other interpreters
 that are at hand (tools/setup/core); it builds the documents' site, looks through the licences and checks the package,
 which `test.py --docs` does alone: a warning is a failure.
@@ -25,12 +26,15 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 ROOT = Path(__file__).resolve().parent.parent
-LINTERS = [
+FAST_LINTERS = [
     *(f"ruff {check} --output-format concise" for check in ("check", "format --check")),
-    "codespell",
-    "mypy",
     "lint-imports --config tools/imports.ini --no-cache",
     f"{sys.executable} tools/walls.py",
+]
+LINTERS = [
+    *FAST_LINTERS,
+    "codespell",
+    "mypy",
     f"{sys.executable} tools/words.py",
     "actionlint -no-color",
 ]
@@ -85,6 +89,13 @@ CORE = [
         "instrument/test_camera",
     )
 ]
+# `make quick`: the core, and rooms of starpos whose tests take a second each
+QUICK = {
+    "quick": [
+        *CORE,
+        *(f"src/starpos/test/{room}" for room in ("earth", "instrument", "messages", "recording")),
+    ]
+}
 # with the newest versions only: what waits for nodes or other processes, what takes long and is
 # in other tests too, and what draws many nights (montecarlo)
 NEWEST_ONLY = [
@@ -154,10 +165,14 @@ def run(command: list[str], out=None, environment: dict[str, str] | None = None)
 
 def lint(linters: list[str], out) -> Outcome:
     """Run linters; of those that pass only the names are shown."""
+    # import-linter looks for the packages, which need not be built
+    sources = [str(path.parent) for pattern in ("*", "src/*") for path in ROOT.glob(f"{pattern}/package.xml")]
+    path = os.pathsep.join([*sources, os.environ.get("PYTHONPATH", "")])
+    environment = os.environ | {"PYTHONPATH": path}
     total = Outcome()
     for linter in linters:
         with tempfile.TemporaryFile("w+") as said:
-            failed = run(shlex.split(linter), said) != 0
+            failed = run(shlex.split(linter), said, environment) != 0
             said.seek(0)
             print(
                 f"{linter}: {'failed' if failed else 'passed'}\n{said.read() if failed else ''}",
@@ -374,10 +389,13 @@ def all_of(tests: Tests) -> Outcome:
 
 
 def main(args: list[str]) -> int:
-    which = {"--docs", "--lint", "--ubuntu", "--both"} & set(args)
+    which = {"--docs", "--lint", "--quick", "--ubuntu", "--both"} & set(args)
     pytest_args = [a for a in args if a not in which]
-    tests = {} if which & {"--docs", "--lint", "--ubuntu"} else newest(pytest_args)
-    if not which & {"--docs", "--ubuntu"}:
+    tests = {} if which & {"--docs", "--lint", "--quick", "--ubuntu"} else newest(pytest_args)
+    if "--quick" in which:
+        tests["fast linters"] = partial(lint, FAST_LINTERS)
+        tests |= {name: partial(pytest, files, name, pytest_args) for name, files in QUICK.items()}
+    if not which & {"--docs", "--quick", "--ubuntu"}:
         tests["linters"] = partial(lint, LINTERS)
     if which & {"--docs", "--both"}:
         tests["documents"] = partial(lint, DOCS)

@@ -16,6 +16,7 @@ setup(
         ("share/ament_index/resource_index/packages", [f"resource/{package}"]),
         (f"share/{package}", ["package.xml"]),
     ],
+    entry_points={"console_scripts": ["emulator = starpos_testing.emulator:main"]},
     install_requires=["setuptools"],
     extras_require={"test": ["pytest"]},
 )

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The firmware on an emulated board (firmware/sim): built, started, given a tilt, and read."""
+"""The firmware on an emulated board (sim): built, started, given a tilt, and read."""
 
 import json
 import os

@@ -7,7 +7,7 @@ import pytest
 from board import build
 from reader import Reader
 
-from starpos_inclinometer.emulator import Emulator, Mcu
+from starpos_testing.emulator import Emulator, Mcu
 
 
 class Bench:

@@ -5,19 +5,18 @@ import numpy as np
 
 from starpos_inclinometer.clock import Moment
 from starpos_inclinometer.sources import mcu_protocol
+from starpos_testing import emulator
 
 RATE_HZ = 50
 HEX = np.frombuffer(b"0123456789ABCDEF", np.uint8)
-IDENTITY = mcu_protocol.identity_line(
-    mcu_protocol.Identity(version=1, firmware=0x0100, unit=7, rate_hz=RATE_HZ, delay_ms=14)
-)
+IDENTITY = emulator.identity_line(RATE_HZ, 14)
 
 
 def lines(n, rng, first=0):
     """n lines of an instrument at rest at RATE_HZ, (n, SAMPLE_LINE) bytes."""
     codes = 0x812345 + rng.normal(0, 770, (n, 2)).round().astype(int)
     made = (
-        mcu_protocol.sample_line(first + k, 1000 * (first + k) // RATE_HZ, x, y, 175, 0)
+        emulator.sample_line(first + k, 1000 * (first + k) // RATE_HZ, x, y, 175, 0)
         for k, (x, y) in enumerate(codes.tolist())
     )
     return np.frombuffer(b"".join(made), np.uint8).reshape(n, mcu_protocol.SAMPLE_LINE)
@@ -42,7 +41,7 @@ def forged(sent, rng):
 
 def as_sent(sample):
     """The line of a sample that was believed."""
-    return mcu_protocol.sample_line(
+    return emulator.sample_line(
         sample.sequence, sample.milliseconds, sample.x, sample.y, sample.temperature, sample.status
     )
 

@@ -8,18 +8,17 @@ from starpos_inclinometer.clock import Moment
 from starpos_inclinometer.sources import mcu_protocol
 from starpos_inclinometer.sources.mcu import NEAR_CODES, McuDecoder
 from starpos_inclinometer.sources.mcu_protocol import SampleStatus, SensorKind
+from starpos_testing import emulator
 
 CODE = 0x812345
 
 
 def line(sequence, ms=None, x=CODE, y=CODE, status=0):
-    return mcu_protocol.sample_line(sequence, 100 * sequence if ms is None else ms, x, y, 175, status)
+    return emulator.sample_line(sequence, 100 * sequence if ms is None else ms, x, y, 175, status)
 
 
 def identity(rate_hz=10):
-    return mcu_protocol.identity_line(
-        mcu_protocol.Identity(version=1, firmware=0x0100, unit=7, rate_hz=rate_hz, delay_ms=14)
-    )
+    return emulator.identity_line(rate_hz, 14)
 
 
 class Line:
@@ -66,14 +65,14 @@ def test_a_fault_is_told_at_once_its_end_when_it_is_said_twice(cable):
 
 def test_without_temperature_its_number_means_nothing(cable):
     cable.send(line(0), line(1))
-    odd = mcu_protocol.sample_line(2, 200, CODE, CODE, 0xFF, SampleStatus.NO_TEMPERATURE)
+    odd = emulator.sample_line(2, 200, CODE, CODE, 0xFF, SampleStatus.NO_TEMPERATURE)
     assert numbers(cable.send(odd, line(3))) == [2, 3]
 
 
 @pytest.mark.parametrize(
     "wrong",
     [
-        mcu_protocol.sample_line(3, 300, CODE, CODE, 0xAF ^ 0x40, 0),
+        emulator.sample_line(3, 300, CODE, CODE, 0xAF ^ 0x40, 0),
         line(3, x=CODE + 4 * NEAR_CODES[SensorKind.SCA100T]),
         line(3, y=0xFFFFFF),
         line(3, ms=350),

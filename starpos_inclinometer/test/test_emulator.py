@@ -10,16 +10,16 @@ import sys
 import numpy as np
 import pytest
 
-from starpos_inclinometer.emulator import Mcu, Pty
 from starpos_inclinometer.sources import mcu_protocol
 from starpos_inclinometer.sources.mcu_protocol import Identity, LineParser, Reason, Refusal, SampleStatus
 from starpos_inclinometer.sources.tilts import OUT_OF_RANGE, SATURATED, Sca100t
+from starpos_testing.emulator import Mcu, Pty
 from starpos_testing.patience import WAIT_S
 
 COMMAND = [
     sys.executable,
     "-c",
-    "import sys; from starpos_inclinometer.main import emulator; sys.exit(emulator())",
+    "import sys; from starpos_testing.emulator import main; sys.exit(main())",
 ]
 
 
@@ -63,8 +63,15 @@ def test_commands_are_answered():
     parser = LineParser()
     stream = mcu_protocol.identify_command() + mcu_protocol.rate_command(25)
     assert [m.rate_hz for m in parser.feed(mcu.receive(stream[:5]) + mcu.receive(stream[5:]))] == [10, 25]
-    stream = mcu_protocol.frame(b"R,00") + mcu_protocol.frame(b"X") + b"$Q*0000\r\n"
-    refusals = [Refusal(r) for r in (Reason.OUT_OF_RANGE, Reason.UNKNOWN, Reason.CHECKSUM)]
+    stream = (
+        mcu_protocol.frame(b"R,00")
+        + mcu_protocol.frame(b"R,33")
+        + mcu_protocol.frame(b"R,A")
+        + b"$Q*0000\r\n"
+    )
+    refusals = [
+        Refusal(r) for r in (Reason.OUT_OF_RANGE, Reason.OUT_OF_RANGE, Reason.UNKNOWN, Reason.CHECKSUM)
+    ]
     assert parser.feed(mcu.receive(stream)) == refusals
 
 

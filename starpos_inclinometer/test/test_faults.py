@@ -17,14 +17,14 @@ from corrupted import RATE_HZ, as_sent, decode, flipped, forged, lines
 from diagnostic_msgs.msg import DiagnosticArray
 from wire import Wire
 
+from starpos.parameters.table import defaults_of
 from starpos_inclinometer.clock import HostClock
-from starpos_inclinometer.emulator import Faults
 from starpos_inclinometer.node import Reporter
-from starpos_inclinometer.parameters import PARAMETERS
 from starpos_inclinometer.sources import mcu_protocol
 from starpos_inclinometer.sources.mcu import McuDecoder, McuSource
 from starpos_inclinometer.sources.source import STUCK, TIME_UNKNOWN, Phase, Surroundings
 from starpos_interfaces.msg import Tilt
+from starpos_testing.emulator import Faults
 from starpos_testing.nodes import Listener, Process, take_domain
 from starpos_testing.patience import WAIT_S
 
@@ -258,7 +258,7 @@ def test_what_a_checksum_lets_pass(tell):
 
 
 def values(**changed):
-    return {p.name: p.default for p in PARAMETERS} | changed
+    return defaults_of("inclinometer") | changed
 
 
 class Taken:

@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 from board import ELF, FIRMWARE, SIM, Board
 
-from starpos_inclinometer.emulator import DEFAULT_RATE_HZ, Mcu
 from starpos_inclinometer.sources import mcu_protocol
 from starpos_inclinometer.sources.mcu_protocol import (
     Identity,
@@ -26,6 +25,7 @@ from starpos_inclinometer.sources.mcu_protocol import (
     SampleStatus,
 )
 from starpos_inclinometer.sources.tilts import DIVIDER, Sca100t
+from starpos_testing.emulator import DEFAULT_RATE_HZ, Mcu
 
 # Reset, calibration and a first sample.
 BOOT_MS = 1000

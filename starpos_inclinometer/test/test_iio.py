@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from iio_tree import adxl355, node, plug, scan, scl3300
 
+from starpos.parameters.table import defaults_of
 from starpos_inclinometer.clock import HostClock, Moment
-from starpos_inclinometer.parameters import PARAMETERS
 from starpos_inclinometer.sources.iio import IioLink, IioTilts
 from starpos_inclinometer.sources.iio_device import (
     Buffer,
@@ -32,7 +32,7 @@ from starpos_inclinometer.sources.source import (
 )
 from starpos_testing.patience import WAIT_S
 
-DEFAULTS = {p.name: p.default for p in PARAMETERS}
+DEFAULTS = defaults_of("inclinometer")
 
 
 def arrivals(device, raws, period_s=0.01, dated=True):

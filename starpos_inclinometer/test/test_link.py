@@ -7,9 +7,9 @@ import threading
 
 import pytest
 
-from starpos_inclinometer.emulator import Mcu
 from starpos_inclinometer.sources import serial_link
 from starpos_inclinometer.sources.source import Phase
+from starpos_testing.emulator import Mcu
 
 NOBODY = 65534
 

@@ -9,9 +9,9 @@ import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.executors import SingleThreadedExecutor
 
-from starpos_inclinometer.emulator import Mcu
 from starpos_inclinometer.node import InclinometerNode
 from starpos_interfaces.msg import Tilt
+from starpos_testing.emulator import Mcu
 from starpos_testing.nodes import take_domain
 from starpos_testing.patience import WAIT_S
 

@@ -8,9 +8,9 @@ import pytest
 from board import Board
 
 from starpos.instrument.tilt_log import LONG_RUN, SHORT_RUN, NoiseTracker
-from starpos_inclinometer.emulator import Mcu
 from starpos_inclinometer.sources import mcu_protocol
 from starpos_inclinometer.sources.tilts import Sca100t
+from starpos_testing.emulator import Mcu
 
 SIGMA = math.radians(0.0035)
 

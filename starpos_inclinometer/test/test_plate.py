@@ -25,7 +25,7 @@ def _volume_mm3(triangles):
 
 @pytest.fixture(scope="module")
 def flexure():
-    return runpy.run_path(str(HARDWARE / "flexure.py"))
+    return runpy.run_path(str(HARDWARE.parents[1] / "tools" / "plate_flexure.py"))
 
 
 @pytest.fixture(scope="module")

@@ -3,6 +3,7 @@
 
 import re
 from binascii import crc_hqx
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -10,13 +11,14 @@ import pytest
 
 from starpos_inclinometer.sources import mcu_protocol
 from starpos_inclinometer.sources.mcu_protocol import Identity, LineParser, Reason, Refusal, Sample
+from starpos_testing import emulator
 
 PROTOCOL = Path(__file__).parent.parent / "PROTOCOL.md"
 
 
 def lines(n, start=0):
     return [
-        mcu_protocol.sample_line(start + i, 100 * (start + i), 0x800000 + 37 * i, 0x7F0000 + i, 0xAF, 0)
+        emulator.sample_line(start + i, 100 * (start + i), 0x800000 + 37 * i, 0x7F0000 + i, 0xAF, 0)
         for i in range(n)
     ]
 
@@ -45,13 +47,13 @@ def test_the_documents_example_is_a_line_of_this_protocol():
     assert sample == Sample(
         sequence=0x12, milliseconds=0x70A, x=0x800000, y=0xA8C9C5, temperature=0xAF, status=0
     )
-    assert example == mcu_protocol.sample_line(0x12, 0x70A, 0x800000, 0xA8C9C5, 0xAF, 0)
+    assert example == emulator.sample_line(0x12, 0x70A, 0x800000, 0xA8C9C5, 0xAF, 0)
     assert len(example) == mcu_protocol.SAMPLE_LINE
 
 
 def test_messages_round_trip():
     identity = Identity(version=1, firmware=0x0102, unit=0xDEADBEEF, rate_hz=10, delay_ms=20)
-    stream = mcu_protocol.identity_line(identity) + lines(1)[0] + mcu_protocol.refusal_line(Reason.UNKNOWN)
+    stream = emulator.identity_line(**asdict(identity)) + lines(1)[0] + emulator.refusal_line(Reason.UNKNOWN)
     messages = LineParser().feed(stream)
     assert messages == [
         identity,
@@ -140,7 +142,7 @@ def test_flipped_bits_never_make_a_wrong_sample(share):
     parser = LineParser()
     samples = parser.feed((data ^ flips).tobytes())
     for s in samples:
-        line = mcu_protocol.sample_line(s.sequence, s.milliseconds, s.x, s.y, s.temperature, s.status)
+        line = emulator.sample_line(s.sequence, s.milliseconds, s.x, s.y, s.temperature, s.status)
         assert line == truth[s.sequence]
     clean = sum(not line.any() for line in flips.reshape(len(sent), -1))
     assert clean <= len(samples) <= clean + 3
@@ -160,9 +162,5 @@ def test_every_single_and_double_bit_error_in_a_line_is_found():
 
 
 def test_commands():
-    assert mcu_protocol.parse_command(b"Q") == ("Q", 0)
-    assert mcu_protocol.parse_command(b"R,0A") == ("R", 10)
-    assert mcu_protocol.parse_command(b"R,00") is Reason.OUT_OF_RANGE
-    assert mcu_protocol.parse_command(b"R,33") is Reason.OUT_OF_RANGE
-    assert mcu_protocol.parse_command(b"R,A") is Reason.UNKNOWN
-    assert mcu_protocol.rate_command(50) == mcu_protocol.frame(b"R,32")
+    assert mcu_protocol.identify_command() == emulator.frame(b"Q")
+    assert mcu_protocol.rate_command(50) == emulator.frame(b"R,32")

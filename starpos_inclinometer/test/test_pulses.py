@@ -1,17 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
 """Edges of the shutter and of a receiver's second: timed by the firmware of both boards, dated by the driver."""
 
+from dataclasses import asdict
+
 import numpy as np
 import pytest
 from board import Board
 
+from starpos.parameters.table import defaults_of
 from starpos_common.shutter_pulses import Edge, ShutterPulse, ShutterPulses
 from starpos_inclinometer.clock import Moment
-from starpos_inclinometer.parameters import PARAMETERS
 from starpos_inclinometer.sources.mcu import LINE_STDDEV_S, SECOND_STDDEV_S, McuDecoder, McuTilts, PulseTimes
-from starpos_inclinometer.sources.mcu_protocol import Input, LineParser, Pulse, Sample, frame, pulse_line
+from starpos_inclinometer.sources.mcu_protocol import Input, LineParser, Pulse, Sample, frame
+from starpos_testing import emulator
 
-VALUES = {p.name: p.default for p in PARAMETERS}
+VALUES = defaults_of("inclinometer")
 BOOT_MS = 600
 
 
@@ -117,7 +120,7 @@ def test_lines_of_edges_are_read_as_they_are_written():
     most = {"number": 255, "bounces": 3, "milliseconds": 0xFFFFFFFF, "microseconds": 999}
     sent = [Pulse(input=i, rising=r, **most) for i in (0, 1) for r in (False, True)]
     parser = LineParser()
-    assert parser.feed(b"".join(map(pulse_line, sent))) == sent
+    assert parser.feed(b"".join(emulator.pulse_line(**asdict(p)) for p in sent)) == sent
     bad = [b"P,02,00,00,00000000,0000", b"P,00,00,00,00000000,03E8", b"P,0,00,00,00000000,0000"]
     assert parser.feed(b"".join(map(frame, bad))) == [] and parser.malformed == 3
 

@@ -6,10 +6,9 @@ import math
 import numpy as np
 import pytest
 
+from starpos.parameters.table import defaults_of
 from starpos_inclinometer.clock import Moment, Step
-from starpos_inclinometer.emulator import Mcu
 from starpos_inclinometer.node import Reporter
-from starpos_inclinometer.parameters import PARAMETERS
 from starpos_inclinometer.sources.mcu import McuDecoder, McuTilts
 from starpos_inclinometer.sources.mcu_protocol import Identity, Sample
 from starpos_inclinometer.sources.source import (
@@ -22,8 +21,9 @@ from starpos_inclinometer.sources.source import (
     Health,
     Phase,
 )
+from starpos_testing.emulator import Mcu
 
-VALUES = {p.name: p.default for p in PARAMETERS}
+VALUES = defaults_of("inclinometer")
 
 
 def health(phase=Phase.RECEIVING, **more):

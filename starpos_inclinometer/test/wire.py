@@ -7,8 +7,8 @@ import select
 import threading
 import tty
 
-from starpos_inclinometer.emulator import Faults, Pty
 from starpos_inclinometer.sources.mcu_protocol import LineParser, Sample
+from starpos_testing.emulator import Faults, Pty
 
 WATCH_S = 0.05
 

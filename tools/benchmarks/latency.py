@@ -94,7 +94,7 @@ class Run:
         """Emulate an inclinometer on a pty; gives the port, and the node to start on it."""
         port = self.folder / f"port{time.monotonic_ns()}"
         arguments = ("--link", str(port), "--tilt-x", f"{tilt_deg[0]:.9f}", "--tilt-y", f"{tilt_deg[1]:.9f}")
-        self.start("starpos_inclinometer", "emulator", arguments=arguments)
+        self.start("starpos_testing", "emulator", arguments=arguments)
         self.graph.wait(port.exists, "for the emulated port")
         return f"port:={port}"
 

@@ -72,7 +72,7 @@ def start(processes: Processes, place: Place, seed: int, port: Path):
     theta_x, theta_y = np.degrees(place.scene().tilt)
     link = str(port)
     tilt = ["--tilt-x", f"{theta_x:.9f}", "--tilt-y", f"{theta_y:.9f}", "--seed", str(seed)]
-    processes.start("emulator", [executable("starpos_inclinometer", "emulator"), "--link", link, *tilt])
+    processes.start("emulator", [executable("starpos_testing", "emulator"), "--link", link, *tilt])
     processes.node("starpos_inclinometer", "inclinometer", {"port": link})
     processes.node("starpos_solver", "solver", known_of(place))
     processes.node("starpos_camera", "detector", {})

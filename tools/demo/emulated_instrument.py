@@ -2,7 +2,7 @@
 """The whole instrument with emulated devices: firmware, hot shoe, GNSS pulses, INDI camera, detector, solver.
 
 The inclinometer's firmware, as it is flashed, runs on an emulated ATmega8 with its converter and sensor
-(starpos_inclinometer/firmware/sim). The camera is the CCD simulator of a real indiserver; indi_sky.py gives it the sky of
+(starpos_inclinometer/test/sim). The camera is the CCD simulator of a real indiserver; indi_sky.py gives it the sky of
 each exposure, and a shutter that opens 0.3 s after the command: its contact and a receiver's pulse per second go to the
 board. The four nodes are the installed ones. The place is drawn at random, and the nodes know neither it nor the lag:
 the frames with a time of their shutter (the sixth and later ones) make the place.  The same frames are solved once more
@@ -168,11 +168,11 @@ class Recorder:
         """The fix of a frame whose middle of the exposure is known."""
         from starpos.messages.camera import message_to_camera
         from starpos.messages.stars import message_to_stars
-        from starpos.session.parameter_file import settings_of
+        from starpos.session.settings import Settings
         from starpos.session.tilts import TiltBuffer
         from starpos.sky.catalogue import load_catalogue
 
-        settings = settings_of(None, [f"{name}:={value}" for name, value in known_by(place).items()])
+        settings = Settings.of(None, [f"{name}:={value}" for name, value in known_by(place).items()])
         solver = settings.solver(message_to_camera(self.infos[-1]), None, load_catalogue())
         tilts = TiltBuffer()
         for tilt in self.tilts:

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from starpos.simulation.scene import Scene
-from starpos_inclinometer.emulator import Emulator, Mcu, Pty
+from starpos_testing.emulator import Emulator, Mcu, Pty
 from starpos_testing.graph.shots import EXPOSURE_S, SMALL, scene_at
 
 NOISE_RAD = math.radians(0.001)

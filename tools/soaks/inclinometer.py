@@ -13,11 +13,11 @@ from pathlib import Path
 
 from runner import Memory, Progress
 
+from starpos.parameters.table import defaults_of
 from starpos_inclinometer.clock import HostClock
-from starpos_inclinometer.emulator import Faults, Mcu, Pty
-from starpos_inclinometer.parameters import PARAMETERS
 from starpos_inclinometer.sources.mcu import McuSource
 from starpos_inclinometer.sources.source import Surroundings
+from starpos_testing.emulator import Faults, Mcu, Pty
 
 RATE_HZ, ALLOWED_MB, ENOUGH = 50, 1.0, 0.6
 RESET_S, PULL_S, PULLED_S = 300.0, 420.0, 20.0
@@ -66,7 +66,7 @@ def run(options) -> int:
     def fast_ns() -> int:
         return round((time.monotonic_ns() - begin_ns) * speed)
 
-    values = {p.name: p.default for p in PARAMETERS} | {"rate": RATE_HZ}
+    values = defaults_of("inclinometer") | {"rate": RATE_HZ}
     stop, woken, progress, got = threading.Event(), threading.Event(), Progress(samples, "samples due"), 0
     with tempfile.TemporaryDirectory() as folder:
         values["port"] = str(Path(folder) / "port")

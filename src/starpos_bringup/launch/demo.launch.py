@@ -74,7 +74,7 @@ def nodes(context):
         "misalignment_stddev": 5.0,
         "inclinometer.model": "sca100t_calibrated",
     }
-    emulator = ExecutableInPackage("emulator", "starpos_inclinometer")
+    emulator = ExecutableInPackage("emulator", "starpos_testing")
     device = [emulator, "--link", link, "--tilt-x", f"{theta_x:.9f}", "--tilt-y", f"{theta_y:.9f}"]
     processes = [
         # The emulator is a device, not a node.

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Interface between the node and a camera. A new camera is a FrameSource in a module here, and a line in `registry`."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib.util import find_spec
 from typing import Protocol
@@ -9,7 +9,6 @@ from typing import Protocol
 from starpos.errors import StarposError
 from starpos.frames.frame import Frame
 from starpos.instrument.camera import Camera
-from starpos_common.parameters import Parameter
 
 
 class CaptureError(StarposError):
@@ -64,7 +63,6 @@ class FrameSource(Protocol):
     """
 
     # Each named `source.something`.
-    parameters: Sequence[Parameter]
     hardware_id: str
     # True: nothing is captured before somebody subscribes to the images.
     waits_for_listener: bool

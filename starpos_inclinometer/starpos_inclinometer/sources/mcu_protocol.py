@@ -34,7 +34,6 @@ _IDENTITY = re.compile(
 )
 _PULSE = re.compile(rb"P,([0-9A-F]{2}),([0-9A-F]{2}),([0-9A-F]{2}),([0-9A-F]{8}),([0-9A-F]{4})")
 _REFUSAL = re.compile(rb"N,([0-9A-F]{2})")
-_RATE = re.compile(rb"R,([0-9A-F]{2})")
 
 
 class SampleStatus(IntFlag):
@@ -164,28 +163,6 @@ def rate_command(rate_hz: int) -> bytes:
     return frame(b"R,%02X" % rate_hz)
 
 
-def sample_line(sequence: int, milliseconds: int, x: int, y: int, temperature: int, status: int) -> bytes:
-    """Make a `$T` line; sequence and milliseconds wrap at 16 and 32 bits."""
-    numbers = (sequence & 0xFFFF, milliseconds & 0xFFFFFFFF, x, y, temperature, status)
-    return frame(b"T,%04X,%08X,%06X,%06X,%02X,%02X" % numbers)
-
-
-def identity_line(identity: Identity) -> bytes:
-    i = identity
-    numbers = (i.version, i.firmware, i.unit, i.rate_hz, i.delay_ms, i.kind)
-    return frame(b"I,%02X,%04X,%08X,%02X,%04X,%02X" % numbers)
-
-
-def pulse_line(pulse: Pulse) -> bytes:
-    p = pulse
-    kind = p.input | (RISING if p.rising else 0)
-    return frame(b"P,%02X,%02X,%02X,%08X,%04X" % (kind, p.number, p.bounces, p.milliseconds, p.microseconds))
-
-
-def refusal_line(reason: Reason) -> bytes:
-    return frame(b"N,%02X" % reason)
-
-
 class LineSplitter:
     """Collects framed lines from chunks of bytes; keeps at most one line; never raises, whatever comes."""
 
@@ -281,16 +258,6 @@ def _possible(identity: Identity) -> bool:
         and MIN_RATE_HZ <= rate <= MAX_RATE_HZ
         and identity.delay_ms <= 1000 / rate + MAX_SENDING_MS
     )
-
-
-def parse_command(body: bytes) -> tuple[str, int] | Reason:
-    """Read a command as the MCU does: ('Q', 0), ('R', rate in Hz), or the reason of its refusal."""
-    if body == b"Q":
-        return "Q", 0
-    if match := _RATE.fullmatch(body):
-        rate = int(match[1], 16)
-        return ("R", rate) if MIN_RATE_HZ <= rate <= MAX_RATE_HZ else Reason.OUT_OF_RANGE
-    return Reason.UNKNOWN
 
 
 # Multiple of the usual change from sample to sample that still counts as near.

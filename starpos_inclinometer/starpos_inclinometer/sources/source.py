@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Interface between the node and a sensor. A new sensor is a TiltSource in a module here, and a line in `parameters`."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from enum import Enum
 from typing import Any, Protocol
@@ -9,7 +9,6 @@ from typing import Any, Protocol
 from rclpy.node import Node
 
 from starpos.messages.tilt import GAP, OUT_OF_RANGE, SATURATED, STUCK, TIME_UNKNOWN, Reading
-from starpos_common.parameters import Parameter
 from starpos_common.topics import Take
 from starpos_inclinometer.clock import HostClock, Moment, Step
 
@@ -131,7 +130,6 @@ class TiltSource(Protocol):
     Only the node's thread calls it.
     """
 
-    parameters: Sequence[Parameter]
     # The port or topic of the device, for diagnostics.
     name: str
 

@@ -56,7 +56,7 @@ def start(
     tilt_x, tilt_y = np.degrees(scene_of(size, focal_px).tilt)
     tilts = ("--link", str(port), f"--tilt-x={tilt_x:.9f}", f"--tilt-y={tilt_y:.9f}", "--seed", "11")
     robot.start(folder / "solver.log", "starpos_solver", "solver", "misalignment_stddev:=5.0", *patience)
-    mount.start(folder / "emulator.log", "starpos_inclinometer", "emulator", arguments=tilts)
+    mount.start(folder / "emulator.log", "starpos_testing", "emulator", arguments=tilts)
     mount.start(
         folder / "inclinometer.log",
         "starpos_inclinometer",

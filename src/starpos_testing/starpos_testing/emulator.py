@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An emulated inclinometer: the microcontroller's side of the protocol, byte for byte, on a pseudo-terminal.
+"""An emulated inclinometer: the microcontroller's side of PROTOCOL.md, byte for byte, on a pseudo-terminal.
 
 `Mcu` is the device without I/O; the caller gives it the time. `Pty` is the cable. `Emulator` runs an `Mcu` on a `Pty`
-in real time.
+in real time. Nothing here is the driver's: protocol, converter and sensor are written down a second time, as a check.
 """
 
 import argparse
@@ -11,27 +11,83 @@ import errno
 import math
 import os
 import random
+import re
 import select
 import sys
 import time
 import tty
+from binascii import crc_hqx
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields
 from typing import Any
 
-from starpos.instrument.inclinometer import sca100t_volts
-from starpos_inclinometer.sources import mcu_protocol, tilts
-
-FIRMWARE = 0x0200
-UNIT = 0x53494D00
+BAUD, MAX_RATE_HZ = 38400, 50
+PROTOCOL_VERSION, FIRMWARE, UNIT = 2, 0x0200, 0x53494D00
+# Bit of the K field of a `$P` line, the status of the first sample, the reasons of a refusal.
+RISING, FIRST = 0x80, 0x08
+CHECKSUM, UNKNOWN, OUT_OF_RANGE = 1, 2, 3
+COMMAND = re.compile(rb"\$([^$*\r\n]{1,40})\*([0-9A-F]{4})\r\n")
+# The AD7730's codes: offset binary, 80 mV at a reference of 5 V; the divider of 30 and 1 kohm before it.
+CODE_ZERO, CODE_MAX, ADC_RANGE_V, REFERENCE_V, DIVIDER = 1 << 23, (1 << 24) - 1, 0.080, 5.0, 31.0
+# The SCA100T-D01's output, and its temperature counts.
+OFFSET_V, SENSITIVITY_V_PER_G = 2.5, 4.0
+ZERO_COUNTS, COUNTS_PER_C = 197, -1.083
 DEFAULT_RATE_HZ = 10
 # 260 nV rms (AD7730 data sheet, +-80 mV, 200 Hz, chopped) over 9.54 nV per code.
 ADC_NOISE_CODES = 27.0
-LINE_S = mcu_protocol.SAMPLE_LINE * 10 / mcu_protocol.BAUD
+# A `$T` line has 43 bytes, each with a start and a stop bit.
+LINE_S = 43 * 10 / BAUD
 # Length of a burst of conversions. As in the firmware, a sample is the mean of the bursts in its period.
 WINDOW_MS = 20
 # How soon a stop is noticed while nothing is due.
 POLL_S = 0.2
+
+
+def checksum(body: bytes) -> int:
+    """Compute the CRC-16/XMODEM (polynomial 0x1021, start 0) of the bytes between '$' and '*'."""
+    return crc_hqx(body, 0)
+
+
+def frame(body: bytes) -> bytes:
+    """Make the line of a body: `$body*CRC` CR LF."""
+    return b"$%s*%04X\r\n" % (body, checksum(body))
+
+
+def sample_line(sequence: int, milliseconds: int, x: int, y: int, temperature: int, status: int) -> bytes:
+    """Make a `$T` line; sequence and milliseconds wrap at 16 and 32 bits."""
+    numbers = (sequence & 0xFFFF, milliseconds & 0xFFFFFFFF, x, y, temperature, status)
+    return frame(b"T,%04X,%08X,%06X,%06X,%02X,%02X" % numbers)
+
+
+def identity_line(
+    rate_hz: int, delay_ms: int, *, version: int = 1, firmware: int = 0x0100, unit: int = 7, kind: int = 0
+) -> bytes:
+    """Make a `$I` line."""
+    numbers = (version, firmware, unit, rate_hz, delay_ms, kind)
+    return frame(b"I,%02X,%04X,%08X,%02X,%04X,%02X" % numbers)
+
+
+def pulse_line(
+    *, input: int, rising: bool, number: int, bounces: int, milliseconds: int, microseconds: int
+) -> bytes:
+    """Make a `$P` line; input: 0 shutter, 1 second."""
+    kind = input | (RISING if rising else 0)
+    return frame(b"P,%02X,%02X,%02X,%08X,%04X" % (kind, number, bounces, milliseconds, microseconds))
+
+
+def refusal_line(reason: int) -> bytes:
+    return frame(b"N,%02X" % reason)
+
+
+def code_of(volts: float, divider: float = DIVIDER, reference_v: float = REFERENCE_V) -> int:
+    """Code of a sensor's output voltage, limited to the converter's range; both share their supply."""
+    per_code = divider * ADC_RANGE_V * reference_v / REFERENCE_V / CODE_ZERO
+    return min(max(CODE_ZERO + round((volts - reference_v / 2) / per_code), 0), CODE_MAX)
+
+
+def temperature_counts(celsius: float) -> int:
+    """The sensor's temperature counts, limited to 8 bits."""
+    return min(max(round(ZERO_COUNTS + COUNTS_PER_C * celsius), 0), 255)
 
 
 def _fault(what: str) -> Any:
@@ -88,7 +144,6 @@ class Mcu:
         rate_hz: int = DEFAULT_RATE_HZ,
         drift_ppm: float = 0.0,
         seed: int | None = None,
-        calibration: tilts.Sca100tCalibration | None = None,
     ) -> None:
         self.tilt = tilt
         self.noise_rad = noise_rad
@@ -98,9 +153,9 @@ class Mcu:
         self._power_up_rate = rate_hz
         self._tick = 1.0 + drift_ppm * 1e-6
         self._rng = random.Random(seed)
-        self._calibration = calibration or tilts.Sca100tCalibration()
-        self._commands = mcu_protocol.LineSplitter()
-        self._codes = (tilts.CODE_ZERO, tilts.CODE_ZERO)
+        # Bytes of a command that is not complete.
+        self._received = b""
+        self._codes = (CODE_ZERO, CODE_ZERO)
         self.reset(0.0)
 
     def reset(self, now: float) -> bytes:
@@ -108,7 +163,7 @@ class Mcu:
         self._boot = now
         self._rate_hz = self._power_up_rate
         self._sequence = 0
-        self._status = mcu_protocol.SampleStatus.FIRST
+        self._status = FIRST
         self._next = now + self._period
         return self._identify()
 
@@ -128,12 +183,12 @@ class Mcu:
         self._next = at + self._period
         if not self.frozen:
             x, y = self.tilt(at)
-            self._codes = (self._code(0, x), self._code(1, y))
-        counts = tilts.sca100t_counts(self.temperature_c)
+            self._codes = (self._code(x), self._code(y))
+        counts = temperature_counts(self.temperature_c)
         ms = int((at - self._boot) * self._tick * 1e3)
-        line = mcu_protocol.sample_line(self._sequence, ms, *self._codes, counts, self._status)
+        line = sample_line(self._sequence, ms, *self._codes, counts, self._status)
         self._sequence += 1
-        self._status = mcu_protocol.SampleStatus(0)
+        self._status = 0
         return line
 
     def skip_to(self, now: float) -> None:
@@ -145,38 +200,43 @@ class Mcu:
 
     def receive(self, data: bytes) -> bytes:
         """Return the answers to bytes from the host."""
-        return b"".join(self._answer(body, right) for body, right in self._commands.feed(data))
+        data, answers, end = self._received + data, b"", 0
+        for match in COMMAND.finditer(data):
+            end = match.end()
+            answers += self._answer(match[1], int(match[2], 16) == checksum(match[1]))
+        self._received = data[end:][-48:]
+        return answers
 
     def _answer(self, body: bytes, right: bool) -> bytes:
-        command = mcu_protocol.parse_command(body) if right else mcu_protocol.Reason.CHECKSUM
-        if isinstance(command, mcu_protocol.Reason):
-            return mcu_protocol.refusal_line(command)
-        name, rate = command
-        if name == "R" and rate != self._rate_hz:
+        rate = re.fullmatch(rb"R,([0-9A-F]{2})", body)
+        if not right:
+            return refusal_line(CHECKSUM)
+        if rate and not 1 <= int(rate[1], 16) <= MAX_RATE_HZ:
+            return refusal_line(OUT_OF_RANGE)
+        if rate:
             self._next -= self._period
-            self._rate_hz = rate
+            self._rate_hz = int(rate[1], 16)
             self._next += self._period
+        elif body != b"Q":
+            return refusal_line(UNKNOWN)
         return self._identify()
 
     def _identify(self) -> bytes:
-        return mcu_protocol.identity_line(
-            mcu_protocol.Identity(
-                version=mcu_protocol.VERSION,
-                firmware=FIRMWARE,
-                unit=UNIT,
-                rate_hz=self._rate_hz,
-                delay_ms=delay_ms(self._rate_hz),
-            )
+        return identity_line(
+            self._rate_hz,
+            delay_ms(self._rate_hz),
+            version=PROTOCOL_VERSION,
+            firmware=FIRMWARE,
+            unit=UNIT,
         )
 
-    def _code(self, axis: int, angle: float) -> int:
-        c = self._calibration
+    def _code(self, angle: float) -> int:
         angle += self._rng.gauss(0.0, self.noise_rad) if self.noise_rad else 0.0
-        volts = float(sca100t_volts(angle, c.offset_volts[axis], c.sensitivity_volts_per_g[axis]))
         # The sensor's output ends at the rails.
-        code = c.code(min(max(volts, 0.0), c.reference_volts))
+        volts = min(max(OFFSET_V + SENSITIVITY_V_PER_G * math.sin(angle), 0.0), REFERENCE_V)
+        code = code_of(volts)
         noisy = code + round(self._rng.gauss(0.0, ADC_NOISE_CODES))
-        return min(max(noisy, 0), tilts.CODE_MAX) if 0 < code < tilts.CODE_MAX else code
+        return min(max(noisy, 0), CODE_MAX) if 0 < code < CODE_MAX else code
 
 
 class Pty:
@@ -267,8 +327,16 @@ class Emulator:
         select.select(watched, [], [], max(seconds, 0.0))
 
 
-def main(arguments: list[str], stopped: list[int]) -> int:
-    """Run the command `emulator` until a signal handler puts something into `stopped`."""
+def main() -> int:
+    """Run the command `emulator` until SIGINT or SIGTERM."""
+    from starpos_common.node_main import stop_signals
+
+    with stop_signals() as stopped:
+        return serve(sys.argv[1:], stopped)
+
+
+def serve(arguments: list[str], stopped: list[int]) -> int:
+    """Emulate the device of the command line until a signal handler puts something into `stopped`; return exit status."""
     options = _parser().parse_args(arguments)
     tilt = (math.radians(options.tilt_x), math.radians(options.tilt_y))
     mcu = Mcu(
@@ -312,7 +380,7 @@ def _parser() -> argparse.ArgumentParser:
     add(
         "--rate",
         type=int,
-        choices=range(1, mcu_protocol.MAX_RATE_HZ + 1),
+        choices=range(1, MAX_RATE_HZ + 1),
         default=DEFAULT_RATE_HZ,
         metavar="HZ",
         help="samples a second (%(default)s)",

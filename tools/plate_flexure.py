@@ -13,7 +13,7 @@ import math
 import re
 from pathlib import Path
 
-PLATE = Path(__file__).resolve().parent / "plate.scad"
+PLATE = Path(__file__).resolve().parents[1] / "starpos_inclinometer" / "hardware" / "plate.scad"
 GRAVITY = 9.81
 ARCSEC = math.radians(1 / 3600)
 # Young's modulus (Pa).
