@@ -95,7 +95,7 @@ def headings(task: tuple[Case, np.random.SeedSequence]) -> np.ndarray | str:
     off = half_turns(
         np.array([a.heading - heading_of(t) for a, t in zip(found, (on_ground, link), strict=True)])
     )
-    return np.array([off, [np.sqrt(a.covariance[0, 0]) for a in found]]) / ARCSEC
+    return np.array([off, [np.sqrt(a.angles_covariance[0, 0]) for a in found]]) / ARCSEC
 
 
 def options(parser) -> None:

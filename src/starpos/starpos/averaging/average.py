@@ -16,6 +16,7 @@ from starpos.earth.ellipsoid import EARTH_RADIUS_M, zenith_of
 from starpos.errors import FixError
 from starpos.fix.budget import EACH_POSE, ErrorTerm
 from starpos.fix.fix import Fix, PlaceFix
+from starpos.frozen import at_once
 
 # sigma of a place in rad before anything is known of it
 ANYWHERE_RAD = np.pi
@@ -186,7 +187,8 @@ MAX_OF_ALL = 2 / 3
 RIVAL_FIXES = 10
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@at_once
+@dataclass(frozen=True, kw_only=True)
 class Average(PlaceFix):
     """The averaged place, and the heading of the last pose, with the budget of their errors.
 

@@ -282,9 +282,7 @@ class _Agreement:
         return solution
 
 
-def _agreed(
-    find: FindPlumbLine, solved: list[Fix], a3: np.ndarray, errors: InclinometerErrors
-) -> _Agreement:
+def _agreed(find: FindPlumbLine, solved: list[Fix], a3: np.ndarray, errors: InclinometerErrors) -> _Agreement:
     """The plumb line that `find` gives for the frames that agree with each other."""
     whole = Readings.of(solved, errors)
     rows, plumb = _agreeing(find, whole, solved, a3, errors)

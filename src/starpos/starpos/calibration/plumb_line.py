@@ -14,7 +14,7 @@ from starpos.earth.ellipsoid import EARTH_RADIUS_M
 from starpos.errors import FixError
 from starpos.fix.budget import EACH_POSE
 from starpos.fix.fix import Fix
-from starpos.instrument.inclinometer import InclinometerErrors, Tilt
+from starpos.instrument.inclinometer import InclinometerErrors
 from starpos.instrument.instrument import UNKNOWN_ARCSEC
 from starpos.instrument.mounting import RESPONSE_COEFFICIENTS, Zeroed, response_columns, stated_variances
 from starpos.units import ARCSEC, MEDIAN_OF_CHI2

@@ -13,8 +13,8 @@ from starpos.earth.orientation import measured_until, table_age_days
 from starpos.earth.place import Place
 from starpos.earth.vertical import Geodetic, Vertical, geodetic
 from starpos.errors import FixError
-from starpos.fix.fix import Fix, InDegrees, length_text
 from starpos.fix.attitude import Attitude
+from starpos.fix.fix import Fix, InDegrees, length_text
 from starpos.fix.heading import AttitudeAtPlace
 from starpos.fix.solution import Solution, Status
 from starpos.night.together import Solved
@@ -202,7 +202,9 @@ def with_heading(
         none = {k: _with_variance(values[k], np.nan) for k in COVARIANCES if values[k] is not None}
         return values | dict.fromkeys(HEADING_KEYS) | none
     plumb, ellipsoid = found.plumb, found.ellipsoid
-    covariance, covariance_geodetic = (np.degrees(np.degrees(a.angles_covariance)) for a in (plumb, ellipsoid))
+    covariance, covariance_geodetic = (
+        np.degrees(np.degrees(a.angles_covariance)) for a in (plumb, ellipsoid)
+    )
     sigma = np.sqrt(np.diag(covariance))
     told = (
         np.degrees(plumb.heading),

@@ -9,7 +9,6 @@ from functools import cached_property, partial
 
 import numpy as np
 
-from starpos import rotation
 from starpos._numeric.roots import symmetric_root
 from starpos.earth.ellipsoid import curvature_radii_m, enu_axes, meridian_turn, place_of_zenith
 from starpos.earth.orientation import ROTATION_RAD_S, EarthState

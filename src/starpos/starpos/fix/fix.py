@@ -94,7 +94,7 @@ class InDegrees:
 
 
 @at_once
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, kw_only=True)
 class PlaceFix:
     """Astronomic latitude, longitude and heading (rad) at one time, with the budget of their errors.
 
@@ -126,7 +126,7 @@ class PlaceFix:
 
 
 @at_once
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, kw_only=True)
 class Fix(PlaceFix, FittedSighting):
     """The place and attitude of the instrument, from one frame and its level.
 

@@ -5,14 +5,13 @@ reverse of the fix: there the level is known and A4, which holds the place, is f
 
 import math
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
 from starpos import rotation
 from starpos._numeric.roots import symmetric_root
 from starpos.earth.ellipsoid import meridian_turn
-from starpos.earth.orientation import ROTATION_RAD_S, EarthState, station_velocity
+from starpos.earth.orientation import ROTATION_RAD_S, EarthState
 from starpos.earth.place import Place
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import FixError, PlaceError
@@ -25,7 +24,6 @@ from starpos.frames.exposure import GLOBAL_SHUTTER, Shutter
 from starpos.frozen import at_once
 from starpos.instrument.camera import Camera
 from starpos.instrument.mounting import Mounting
-from starpos.units import ARCSEC
 
 # the level settles to this, rad; refraction turns with it, and settles a thousand times faster, or ten times at 10 deg
 SETTLED_RAD, MAX_ROUNDS = 1e-9, 10
@@ -34,7 +32,7 @@ MIN_SHARE, REFRACTION_SIGMAS = 0.5, 5.0
 
 
 @at_once
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, kw_only=True)
 class AttitudeAtPlace(FittedSighting):
     """Attitude of the instrument at a known place, by the stars alone.
 

@@ -19,13 +19,14 @@ from starpos.earth.gravity import geodetic_place
 from starpos.earth.place import Place
 from starpos.earth.vertical import Geodetic, geodetic
 from starpos.errors import GnssError, StarposError, VoyageError
+from starpos.fix.attitude import Attitude
 from starpos.gnss.receiver import GnssPlace, GnssTrack, known_place, message_to_gnss
 from starpos.messages.stamp import stamp_to_unix
 from starpos.messages.stars import message_to_attitude
 from starpos.navigation.equations import PLACE
 from starpos.navigation.estimate import Estimate, Observability, VoyageFix, observability
 from starpos.navigation.recent import BACK_S, LONGEST_GAP_S, Recent
-from starpos.navigation.sightings import BodyAttitude, PlacelessFrame, attitude_at_place
+from starpos.navigation.sightings import PlacelessFrame, body_attitude
 from starpos.navigation.vessel import PARKED
 from starpos.navigation.voyage import MIN_FRAMES, Voyage
 from starpos.session.driver import Diagnosis, Heard, Jobs, Level, Log, Now, Outcome
@@ -65,7 +66,7 @@ class Navigated:
     fix: VoyageFix | None = None
     ground: Geodetic | None = None
     position: Position | None = None
-    at_place: BodyAttitude | None = None
+    at_place: Attitude | None = None
 
 
 class NavigatorSession:
@@ -156,7 +157,7 @@ class NavigatorSession:
             return []
         if place is None:
             return []
-        found = attitude_at_place(frame, place, self._settings.vessel(self._clock_stddev_s))
+        found = body_attitude(frame, place, self._settings.vessel(self._clock_stddev_s))
         return [Navigated(utc_unix_s=frame.utc_unix_s, at_place=found)]
 
     def _by_gnss(self, utc_unix_s: float) -> Place | None:

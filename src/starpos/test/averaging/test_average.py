@@ -314,7 +314,9 @@ def slipped(f, seconds):
     """A fix whose frame was stamped late: the Earth turns under the camera, and the place runs east to west."""
     angle = 7.292115e-5 * seconds
     return replace(
-        f, longitude=f.longitude - angle, camera_to_itrs=rotation.about_axis(2, -angle) @ f.camera_to_itrs
+        f,
+        longitude=f.longitude - angle,
+        camera=replace(f.camera, rotation=rotation.about_axis(2, -angle) @ f.camera.rotation),
     )
 
 

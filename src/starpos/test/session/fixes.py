@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from starpos import rotation
-from starpos.fix.attitude import heading_of
+from starpos.fix.attitude import CAMERA, ITRS, Attitude, heading_of
 from starpos.fix.budget import ALWAYS, ErrorTerm
 from starpos.fix.fix import Fix
 from starpos.frames.frame import Stars
@@ -75,8 +75,7 @@ def fix_at(seconds: float, azimuth_deg=40.0, latitude_deg=40.0, noise_m=100.0, c
         refraction_arcsec=12.0,
         diurnal_aberration_arcsec=0.3,
         ut1_minus_utc_s=-0.05,
-        camera_to_itrs=site.enu.T @ attitude,
-        camera_covariance=np.eye(3) * 1e-12,
+        camera=Attitude(site.enu.T @ attitude, np.eye(3) * 1e-12, CAMERA, ITRS),
     )
 
 
