@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from std_srvs.srv import Trigger
 
-from starpos.night.drivers import Drivers
+from starpos.recording.drivers import Drivers
 from starpos.session.replay import Replay
 from starpos.session.settings import Settings
 from starpos_testing.skies import robots

@@ -253,10 +253,9 @@ class DetectorNode(Node):
         """Forget all Captures: a replay begins."""
         self._exposures = ExposureFacts(self._values)
 
-    def destroy_node(self) -> None:
+    def close(self) -> None:
         self._worker.stop()
         self._annotator.stop()
-        super().destroy_node()
 
     @property
     def wanted(self) -> bool:
@@ -434,7 +433,7 @@ class DetectorNode(Node):
 
     def _unsaid(self) -> str:
         """Sentence on the parameters to state of the camera; '' if there is nothing."""
-        unsaid = self._exposures.unsaid if self._topics.where and not self._captures_come() else ""
+        unsaid = self._exposures.missing_statement if self._topics.where and not self._captures_come() else ""
         if unsaid:
             self._troubles.wrong("stamps", unsaid)
         return unsaid

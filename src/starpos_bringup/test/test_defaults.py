@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from starpos.frames.driver_stamp import KINDS
+from starpos.frames.exposure import STAMPS
 from starpos.instrument.sensors import PRESETS
 from starpos.navigation.vessel import LAWS
 from starpos.parameters.table import NODES, parameter_file, parameters_of
@@ -43,7 +43,7 @@ def test_a_row_is_whole(name):
     [
         ("camera: source", CAMERAS),
         ("inclinometer: source", INCLINOMETERS),
-        ("detector: stamp", KINDS),
+        ("detector: stamp", STAMPS),
         ("navigator: vehicle", ("", *LAWS)),
     ],
 )

@@ -19,11 +19,11 @@ from starpos.frames.frame import no_stars
 from starpos.frames.tables import TILTS, TRUTH
 from starpos.instrument.camera import PLUMB_BOB
 from starpos.instrument.instrument import Instrument
-from starpos.night.drivers import Drivers
 from starpos.night.reading import About, Given, Reader, TiltFile
 from starpos.night.remarks import NEAR_KM, Near, of_tilts
 from starpos.parallel.cluster import Cluster
 from starpos.parallel.processes import Here, Processes, Workers, processors
+from starpos.recording.drivers import Drivers
 from starpos.sky import catalogue
 
 if TYPE_CHECKING:

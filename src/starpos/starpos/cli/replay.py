@@ -31,11 +31,11 @@ from starpos.frames.tables import TILTS
 from starpos.instrument import instrument_file
 from starpos.instrument.instrument import Instrument
 from starpos.instrument.tilt_table import read_tilt_csv
-from starpos.night.drivers import Drivers
 from starpos.night.opening import frames_in
 from starpos.night.reading import stars_of
 from starpos.night.remarks import of_a3, of_inclinometer
 from starpos.night.together import Solved, extrapolated
+from starpos.recording.drivers import Drivers
 from starpos.recording.topics import NO_REMAPS, Remaps
 from starpos.report.field import INSTRUMENT, is_field, opened
 from starpos.session import frames

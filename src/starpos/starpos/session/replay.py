@@ -12,8 +12,8 @@ from starpos.instrument.camera import Camera
 from starpos.instrument.tilt_log import TiltLog
 from starpos.messages.stamp import PlainHeader, PlainStamp
 from starpos.messages.tilt import Reading, TiltMessage
-from starpos.night.drivers import IMAGES, DriverMessages, Drivers
 from starpos.recording.bag import BagReader
+from starpos.recording.drivers import IMAGES, DriverMessages, Drivers
 from starpos.recording.topics import CAPTURE, GNSS, IMU, INPUTS, NAV_SAT_FIX, STARS, TILT, instrument_in
 from starpos.session.driver import Heard, JobsInTurn, Log, Now, Sent
 from starpos.session.frames import Output

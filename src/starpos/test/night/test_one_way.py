@@ -42,7 +42,7 @@ BRIGHTEST, LEFT, SHARE = 4, 14, 0.45
 
 def part_of(stars):
     """A few of the stars in a part of the frame."""
-    return stars.take(np.flatnonzero(stars.x < SHARE * SIZE[0])[BRIGHTEST : BRIGHTEST + LEFT])
+    return stars.select(np.flatnonzero(stars.x < SHARE * SIZE[0])[BRIGHTEST : BRIGHTEST + LEFT])
 
 
 @pytest.fixture(scope="module")

@@ -81,7 +81,7 @@ class DriverMessages:
 
     def remarks(self) -> list[str]:
         """Sentences on missing parameters, and on accelerations that gave no tilt."""
-        said = [self._exposures.unsaid] if self._frames else []
+        said = [self._exposures.missing_statement] if self._frames else []
         imu = self._imu
         heard = imu.good + imu.malformed + imu.future
         if heard and not self._tilts:
