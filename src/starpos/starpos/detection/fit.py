@@ -56,7 +56,7 @@ class Response:
         return noise**2 + np.float32(self.dn_per_photon) * light + np.float32(self.misfit**2) * light**2
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Fit(StarRows):
     """N fitted stars.
 
@@ -89,10 +89,10 @@ class Fit(StarRows):
     leverage: np.ndarray
 
 
-# Which columns each of several stars in one stamp has; the others are the stamp's.
-OF_STAR = tuple(
-    f.name in ("x", "y", "flux", "flux_sigma", "covariance", "gains", "model") for f in fields(Fit)
-)
+# Columns of a Fit, and whether each of several stars in one stamp has its own; the others are the stamp's.
+COLUMNS = {
+    f.name: f.name in ("x", "y", "flux", "flux_sigma", "covariance", "gains", "model") for f in fields(Fit)
+}
 
 
 def fit_stars(
@@ -143,7 +143,7 @@ def _fit(
         response.rules, *settings,
     )  # fmt: skip
     return [
-        Fit(*(column[k] if own else column for column, own in zip(columns, OF_STAR, strict=True)))
+        Fit(**{name: c[k] if own else c for (name, own), c in zip(COLUMNS.items(), columns, strict=True)})
         for k in range(len(x))
     ]
 
