@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The sources by their name in the parameter `source`, and the parameters of the node `inclinometer`. A new sensor needs
-a module in `sources` and a line below.
+"""The sources by their name in the parameter `source`, and the parameters of the node `inclinometer`.
+
+A new sensor needs a module in `sources` and a line below.
 """
 
 from collections.abc import Mapping

@@ -110,7 +110,6 @@ class Simulated(FrameSource):
     """Renders the exposure that has just ended, through an ideal camera."""
 
     parameters = PARAMETERS
-    waits_for_listener = False
 
     @staticmethod
     def refusal(values: Mapping, settings: CaptureSettings) -> str | None:
@@ -132,13 +131,10 @@ class Simulated(FrameSource):
         return None
 
     def __init__(self, values: Mapping, now: Callable[[], float]) -> None:
-        self._now = now
+        super().__init__(values, now)
         self._rng = np.random.default_rng(values["simulated.seed"])
         self._scene = scene_from(values)
         self.hardware_id = "simulated sky"
-
-    def lacking(self) -> None:
-        """Return None, because the sky is always there."""
 
     def capture(self, settings: CaptureSettings) -> CapturedFrame:
         from starpos.simulation.scene import expose, render
@@ -153,9 +149,6 @@ class Simulated(FrameSource):
 
     def update(self, values: Mapping) -> None:
         self._scene = scene_from(values)
-
-    def close(self) -> None:
-        """Do nothing, because nothing is held open."""
 
 
 def air_from(values: Mapping) -> Atmosphere:

@@ -173,7 +173,7 @@ PULSE_PARAMETERS = (
 class ShutterTimes:
     """Replaces the times of a source's frames by the times of their pulses.
 
-    `hear` is called by the executor's thread, `timed` by the one that captures.
+    `hear` is called by the executor's thread, `date_frame` by the one that captures.
     """
 
     def __init__(self, values: Mapping[str, Any], patience_s: float = PULSE_PATIENCE_S) -> None:
@@ -204,7 +204,7 @@ class ShutterTimes:
             self.heard += 1
             self._changed.notify_all()
 
-    def timed(self, exposure: CapturedFrame, since_s: float, until_s: float) -> CapturedFrame:
+    def date_frame(self, exposure: CapturedFrame, since_s: float, until_s: float) -> CapturedFrame:
         """Date a frame that was captured between two times (Unix s) by its pulse, or by the lag of other frames' ones.
 
         A frame with neither, or of a source that gives better times itself, is returned unchanged.

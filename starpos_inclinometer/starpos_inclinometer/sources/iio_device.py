@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A sensor that Linux's Industrial I/O drives: its channels in sysfs, and its buffer in /dev with the kernel's time
-stamps.  Sources: Documentation/ABI/testing/sysfs-bus-iio; the kernel's document "Industrial IIO device buffers" for
-the layout of a scan and the order of the settings.
+"""A sensor that Linux's Industrial I/O drives: its channels in sysfs, its buffer in /dev with the kernel's time stamps.
+
+Sources: Documentation/ABI/testing/sysfs-bus-iio; the kernel's document "Industrial IIO device buffers" for the layout
+of a scan and the order of the settings.
 """
 
 import contextlib

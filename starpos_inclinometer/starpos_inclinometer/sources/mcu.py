@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The source `serial`: tilts and the times of pulses from the microcontroller's lines, and the commands that it gets.
+"""The source `serial`: tilts and times of pulses from the microcontroller's lines, and the commands that it gets.
+
 The host's clock is good enough to say which second a receiver's pulse begins. Between two pulses the board's clock
 counts, at the rate that the last two have shown: so an edge has the receiver's time, whatever the serial line and the
 host's clock add.

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The protocol of the board's serial line, as PROTOCOL.md defines it, and the check that its samples fit one another.  A
-16-bit checksum lets one corrupted line in 65,536 pass, and a line without a checksum passes far more often. Such a
+"""The protocol of the board's serial line, as PROTOCOL.md defines it, and the check that its samples fit one another.
+
+A 16-bit checksum lets one corrupted line in 65,536 pass, and a line without a checksum passes far more often. Such a
 sample does not fit the samples around it: its number, its time or its tilt is wrong. No I/O, no clock.
 """
 

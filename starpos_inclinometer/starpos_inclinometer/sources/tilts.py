@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tilts from a sensor's angles or codes, their covariance and their faults.  Sources: data sheets SCA100T series (Murata
-8261800 rev. B2), AD7730/AD7730L (Analog Devices rev. A), SCL3300-D01 (Murata Doc. 4921 Rev. 2); PROTOCOL.md says what
-the board makes of its registers.
+"""Tilts from a sensor's angles or codes, their covariance and their faults.
+
+Sources: data sheets SCA100T series (Murata 8261800 rev. B2), AD7730/AD7730L (Analog Devices rev. A), SCL3300-D01
+(Murata Doc. 4921 Rev. 2); PROTOCOL.md says what the board makes of its registers.
 """
 
 import math
