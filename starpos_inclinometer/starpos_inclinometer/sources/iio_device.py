@@ -308,6 +308,7 @@ class Buffer:
             self._write("buffer/enable", "1")
             self._file = os.open(nodes / self._folder.name, os.O_RDONLY | os.O_NONBLOCK)
         except OSError as error:
+            self._switch_off()
             raise DeviceError(
                 f"the buffer of {self._folder} cannot be started ({error.strerror}: {error.filename}): check "
                 f"`iio.trigger` ({trigger}) and the right to write there; it is retried."
@@ -329,6 +330,10 @@ class Buffer:
 
     def close(self) -> None:
         os.close(self._file)
+        self._switch_off()
+
+    def _switch_off(self) -> None:
+        """End the kernel's sampling; while it goes on no program can read the device."""
         # A device that is gone needs no end.
         with contextlib.suppress(OSError):
             self._write("buffer/enable", "0")
