@@ -220,11 +220,13 @@ class IioTilts:
 
     def _begin(self, device: IioDevice) -> int:
         """Begin with another device, whose noise is its own; return the flag of its first reading."""
-        flags = 0 if self.device is None else GAP
+        flags = 0
+        if self.device is not None:
+            flags = GAP
+            self.forces.restart()
         self.device = device
         preset = sensors.PRESETS.get(device.model)
         self.angles = SensorTilts(preset.noise_rad, preset.range_rad) if preset else SensorTilts()
-        self.forces.restart()
         self.configure(self._values)
         return flags
 

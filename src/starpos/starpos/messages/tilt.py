@@ -320,6 +320,7 @@ class ImuTilts:
         """Forget the sensor: another one takes its place."""
         self._noise.restart()
         self._noisy = 0
+        self._gap = True
         self.averager.restart()
 
     @property
