@@ -6,7 +6,7 @@ from importlib.metadata import entry_points
 
 import pytest
 
-from starpos_bringup.defaults import NODES
+from starpos.parameters.table import NODES, parameters_of
 from starpos_testing.graph.graph import executable
 from starpos_testing.patience import WAIT_S
 
@@ -34,6 +34,6 @@ def test_help_says_what_it_is_and_its_parameters(package, name):
     assert done.stdout.startswith("usage: ") and name in done.stdout.splitlines()[0]
     for node in NODES_OF.get(name, ()):
         assert f"ros2 run {package} {name}" in done.stdout and "--params-file" in done.stdout
-        for parameter in NODES[node]:
+        for parameter in parameters_of(node):
             assert f"\n  {parameter.name}: " in done.stdout
             assert parameter.constraint.split()[0] in done.stdout

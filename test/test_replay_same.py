@@ -15,8 +15,8 @@ from sensor_msgs.msg import NavSatFix
 from std_srvs.srv import Trigger
 
 from starpos.session.frames import Answered
-from starpos.session.parameter_file import settings_of
 from starpos.session.replay import Replay
+from starpos.session.settings import Settings
 from starpos_bringup.bag import Bag
 from starpos_common.messages import attitude_to_message, unix_to_stamp
 from starpos_interfaces.msg import Attitude, Tilt
@@ -49,7 +49,7 @@ class Quiet:
 def expected(bag):
     """(fixes, averages, attitudes) of the bag without ROS, by stamp; angles in deg, attitudes as messages."""
     fixes, averages, attitudes = {}, {}, {}
-    for made in Replay(settings_of(None, KNOWN), Quiet(), Quiet()).play(bag):
+    for made in Replay(Settings.of(None, KNOWN), Quiet(), Quiet()).play(bag):
         kept = fixes if isinstance(made, Answered) else averages
         ground = made.ground
         if isinstance(made, Answered):

@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 from std_srvs.srv import Trigger
 
-from starpos.session.parameter_file import drivers_of, settings_of
+from starpos.recording.drivers import Drivers
 from starpos.session.replay import Replay
+from starpos.session.settings import Settings
 from starpos_testing.skies import robots
 
 PARAMETERS = Path(__file__).parents[1] / "src" / "starpos_bringup" / "config" / "existing_robot.yaml"
@@ -40,7 +41,7 @@ def told(latitude_deg, longitude_deg, covariance):
 @pytest.fixture(scope="module")
 def expected(bag):
     """The fixes of the bag without ROS, by stamp."""
-    replay = Replay(settings_of(PARAMETERS, ()), Quiet(), Quiet(), drivers_of(PARAMETERS, ()))
+    replay = Replay(Settings.of(PARAMETERS, ()), Quiet(), Quiet(), Drivers.of(PARAMETERS, ()))
     fixes = {}
     for made in replay.play(bag):
         if (ground := getattr(made, "ground", None)) and hasattr(made, "solution"):

@@ -5,7 +5,7 @@ import pytest
 from rcl_interfaces.srv import GetParameters
 from sensor_msgs.msg import CameraInfo, NavSatFix
 
-from starpos.session.parameter_file import settings_of
+from starpos.session.settings import Settings
 from starpos_interfaces.msg import StarArray, Tilt
 from starpos_testing.graph.shots import PRESSURE_PA, TEMPERATURE_C, shoot
 
@@ -48,7 +48,7 @@ def test_each_has_its_parameters_and_what_is_for_both_and_so_has_starpos_replay(
     assert left == ["left_starpos_link", 6, 5.0, PRESSURE_PA]
     assert right == ["right_starpos_link", 5, 0.5, PRESSURE_PA]
     for side, values in (("left", left), ("right", right)):
-        alone = settings_of(file, (), side).values
+        alone = Settings.of(file, (), side).values
         assert [alone[name] for name in NAMES] == values
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Write the reference pages that are made from the code: parameters, messages and services, troubleshooting.
+"""Write what is made from the code: starpos.yaml and its reference page, messages and services, troubleshooting.
 
     python tools/reference.py [--check]
 
@@ -7,32 +7,30 @@ Each page keeps what stands above its mark; a page without the mark is an error.
 pages that differ from what the code makes are named (exit status 1).
 """
 
-import re
 import sys
 from pathlib import Path
 
 import messages
 
 ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT / "src" / "starpos"))
+
+from starpos.parameters.table import NODES, parameter_file, parameters_of, yaml_value  # noqa: E402
+
 INTERFACES = ROOT / "starpos_interfaces"
 PARAMETERS = ROOT / "src" / "starpos_bringup" / "config" / "starpos.yaml"
 MARK = "<!-- from here on made by tools/reference.py -->\n"
 
 
 def about_parameters() -> str:
-    """Tables of all parameters, from the comments of starpos.yaml, which is made from the nodes' own tables."""
+    """Tables of all parameters, from the rows that the nodes read."""
     made: list[str] = []
-    said: list[str] = []
-    for line in PARAMETERS.read_text().splitlines():
-        if node := re.match(r"/\*\*/(\w+):", line):
-            made += [f"\n## {node[1]}\n", "| parameter | what it is |", "| --- | --- |"]
-            said = []
-        elif line.startswith("    # "):
-            said.append(line[6:].replace("|", "\\|"))
-        elif value := re.match(r"    ([\w./]+): (.*)", line):
-            default = "unset" if value[2] == ".nan" else value[2]
-            made.append(f"| `{value[1]}` | {' '.join(said)} Default: `{default}`. |")
-            said = []
+    for node in NODES:
+        made += [f"\n## {node}\n", "| parameter | what it is |", "| --- | --- |"]
+        for p in parameters_of(node):
+            said = f"{p.description} {p.rule}".replace("|", "\\|")
+            value = yaml_value(p.default)
+            made.append(f"| `{p.name}` | {said} Default: `{'unset' if value == '.nan' else value}`. |")
     return "\n".join(made) + "\n"
 
 
@@ -51,8 +49,8 @@ PAGES = {
 
 
 def pages() -> dict[Path, str]:
-    """Text of each page as the code makes it."""
-    made = {}
+    """Text of each page as the code makes it, and of the parameter file that is installed."""
+    made = {PARAMETERS: parameter_file()}
     for name, make in PAGES.items():
         path = ROOT / "docs" / "reference" / f"{name}.md"
         made[path] = above_the_mark(path) + MARK + make()

@@ -26,8 +26,9 @@ from starpos.instrument import instrument_file
 from starpos.instrument.camera import Camera
 from starpos.instrument.instrument import focal_px_of
 from starpos.messages.camera import message_to_camera
+from starpos.parameters.table import parameters_of
 from starpos.session import system_clock
-from starpos_camera.parameters import PARAMETERS, SOURCES
+from starpos_camera.sources.registry import SOURCES
 from starpos_camera.sources.source import CapturedFrame, CaptureSettings, FrameSource, NothingYet, SourceEnded
 from starpos_camera.sources.timing import OF_SYSTEM_CLOCK, ShutterTimes, in_one_time
 from starpos_common.diagnostics import ClockReport, Diagnosis, Diagnostics, Level, time_is_simulated
@@ -70,7 +71,7 @@ class CameraNode(Node):
         """Make the node; options: as for rclpy's Node (context, namespace, parameter_overrides ...)."""
         super().__init__("camera", **options)
         self._values = declare(
-            self, PARAMETERS, apply=self._apply, check=lambda values, _: _complaint(values)
+            self, parameters_of("camera"), apply=self._apply, check=lambda values, _: _complaint(values)
         )
         self._calibration_path: Path | None = None
         self._calibration: Camera | None = None

@@ -19,7 +19,7 @@ from rclpy.time import Time
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Imu
 from std_msgs.msg import Header
 
-from starpos.detection import Detection, detect
+from starpos.detection import Detection, DetectionSettings, detect
 from starpos.errors import StarposError
 from starpos.frames.frame import Frame
 from starpos.messages.camera import (
@@ -31,7 +31,7 @@ from starpos.messages.camera import (
     message_to_picture,
 )
 from starpos.messages.stamp import stamp_to_unix
-from starpos.session.detector_parameters import PARAMETERS, detection_settings
+from starpos.parameters.table import parameters_of
 from starpos.session.gyro_readings import Trails
 from starpos.session.pace import MAX_LATE_S, Pace
 from starpos_camera.annotator import Annotator
@@ -185,8 +185,8 @@ class DetectorNode(Node):
     def __init__(self, **options: Any) -> None:
         """Make the node; options: as for rclpy's Node (context, namespace, parameter_overrides ...)."""
         super().__init__("detector", **options)
-        self._values = declare(self, PARAMETERS, apply=self._apply)
-        self._settings = detection_settings(self._values)
+        self._values = declare(self, parameters_of("detector"), apply=self._apply)
+        self._settings = DetectionSettings.by_parameters(self._values)
         self._exposures = ExposureFacts(self._values)
         # images until their Captures come, oldest first, and how long they wait for them, s of the clock below
         self._held: deque[tuple[Image | CompressedImage, float]] = deque()
@@ -300,7 +300,7 @@ class DetectorNode(Node):
         self._last_frame_s = now
 
     def _apply(self, names: frozenset[str]) -> None:
-        self._settings = detection_settings(self._values)
+        self._settings = DetectionSettings.by_parameters(self._values)
 
     def _on_capture(self, message: Capture, info: Mapping[str, Any]) -> None:
         self._exposures.take(message)
@@ -430,7 +430,7 @@ class DetectorNode(Node):
 
     def _unsaid(self) -> str:
         """Sentence on the parameters to state of the camera; '' if there is nothing."""
-        unsaid = self._exposures.unsaid if self._topics.where and not self._captures_come() else ""
+        unsaid = self._exposures.missing_statement if self._topics.where and not self._captures_come() else ""
         if unsaid:
             self._troubles.wrong("stamps", unsaid)
         return unsaid

@@ -56,9 +56,6 @@ def camera_detector() -> int:
 
 
 def _help(executable: str, about: str, *nodes: str) -> str:
-    from starpos.session import detector_parameters
-    from starpos_camera import parameters
     from starpos_common.parameters import node_help
 
-    tables = {"camera": parameters.PARAMETERS, "detector": detector_parameters.PARAMETERS}
-    return node_help("starpos_camera", executable, about, {node: tables[node] for node in nodes})
+    return node_help("starpos_camera", executable, about, *nodes)

@@ -13,7 +13,7 @@ from alpaca_servers import HEIGHT, WIDTH, Liar, Simulator, free_port, image_byte
 from attempts import SHORT, attempt, in_thread
 from sensor_msgs.msg import Image
 
-from starpos_camera.parameters import PARAMETERS
+from starpos.parameters.table import defaults_of
 from starpos_camera.sources.alpaca import Alpaca
 from starpos_camera.sources.source import CaptureSettings
 from starpos_interfaces.msg import Capture
@@ -26,7 +26,7 @@ EXPOSING = 2
 
 
 def values(address, **changes):
-    table = {p.name: p.default for p in PARAMETERS} | {"source": "alpaca", "alpaca.address": address}
+    table = defaults_of("camera") | {"source": "alpaca", "alpaca.address": address}
     return table | {name.replace("__", "."): value for name, value in changes.items()}
 
 

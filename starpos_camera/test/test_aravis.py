@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from attempts import attempt, in_thread
 
-from starpos_camera.parameters import PARAMETERS
+from starpos.parameters.table import defaults_of
 from starpos_camera.sources import aravis as source_module
 from starpos_camera.sources.aravis import (
     FORMATS,
@@ -39,7 +39,7 @@ DEBIAN = Path("/usr/lib/python3/dist-packages/gi")
 
 
 def values(**changes):
-    table = {p.name: p.default for p in PARAMETERS} | {"source": "aravis"}
+    table = defaults_of("camera") | {"source": "aravis"}
     return table | {f"aravis.{name}": value for name, value in changes.items()}
 
 

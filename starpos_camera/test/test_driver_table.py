@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import yaml
 
-from starpos.frames.driver_stamp import KINDS
 from starpos.frames.encodings import ENCODINGS, pixels_of
-from starpos.session.detector_parameters import PARAMETERS
+from starpos.frames.exposure import STAMPS
+from starpos.parameters.table import defaults_of
 
 PAGE = Path(__file__).parents[2] / "docs" / "how-to" / "existing_robot.md"
 if not PAGE.is_file():
@@ -42,11 +42,11 @@ def test_what_a_driver_sends_becomes_a_frame(row):
 
 @pytest.mark.parametrize("row", ROWS, ids=lambda row: row[0].split()[0])
 def test_the_stamps_it_is_to_set_are_there(row):
-    assert set(re.findall(r"`(\w+)`", row[4])) <= set(KINDS) and "`" in row[4]
+    assert set(re.findall(r"`(\w+)`", row[4])) <= set(STAMPS) and "`" in row[4]
 
 
 def test_the_file_of_the_page_says_what_no_driver_does():
     config = PAGE.parents[2] / "src" / "starpos_bringup" / "config" / "existing_robot.yaml"
     stated = yaml.safe_load(config.read_text())["/**/detector"]["ros__parameters"]
     assert list(stated) == ["stamp", "stamp_stddev", "exposure", "readout"]
-    assert set(stated) <= {p.name for p in PARAMETERS}
+    assert set(stated) <= set(defaults_of("detector"))

@@ -13,7 +13,7 @@ import pytest
 from attempts import SHORT, attempt, in_thread
 from sensor_msgs.msg import Image
 
-from starpos_camera.parameters import PARAMETERS
+from starpos.parameters.table import defaults_of
 from starpos_camera.sources import gphoto2 as gphoto2_source
 from starpos_camera.sources.gphoto2 import RAW_ALONE, Gphoto2, named_off_s, nearest, seconds, sentence
 from starpos_camera.sources.source import CaptureError, CaptureSettings
@@ -69,7 +69,7 @@ def folder(tmp_path, monkeypatch):
 
 
 def values(**changes):
-    table = {p.name: p.default for p in PARAMETERS} | {"source": "gphoto2"}
+    table = defaults_of("camera") | {"source": "gphoto2"}
     return table | {name.replace("__", "."): value for name, value in changes.items()}
 
 

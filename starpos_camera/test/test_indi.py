@@ -12,7 +12,7 @@ from astropy.io import fits
 from attempts import SHORT, in_thread
 from indi_servers import DEVICE, IndiServer, OtherClient, executable_liar
 
-from starpos_camera.parameters import PARAMETERS
+from starpos.parameters.table import defaults_of
 from starpos_camera.sources import timing
 from starpos_camera.sources.indi import Indi
 from starpos_camera.sources.source import CaptureError, CaptureSettings
@@ -26,7 +26,7 @@ SIZE = (1024, 1280)
 
 
 def make(server, **changes):
-    values = {p.name: p.default for p in PARAMETERS} | {
+    values = defaults_of("camera") | {
         "source": "indi",
         "indi.port": server.port,
         "indi.device": DEVICE,
@@ -128,7 +128,7 @@ def test_what_another_client_has_set_does_not_stay(source, other):
     # All that was set before is there.
     assert server.run(heard)
     assert source.capture(SHORT).frame.pixels.shape == SIZE
-    source.update({p.name: p.default for p in PARAMETERS} | {"indi.binning": 2})
+    source.update(defaults_of("camera") | {"indi.binning": 2})
     assert source.capture(SHORT).frame.pixels.shape == (SIZE[0] // 2, SIZE[1] // 2)
 
 
@@ -233,7 +233,7 @@ def test_a_frame_that_does_not_come_in_time_is_given_up(server, source, other):
 
 
 def test_a_camera_is_named_and_one_that_is_not_there_said(server):
-    values = {p.name: p.default for p in PARAMETERS}
+    values = defaults_of("camera")
     assert "indi.device must name the camera" in Indi.refusal(values, SHORT)
     source = make(server, indi__device="Canon")
     assert f"the server has {DEVICE}: start the camera's driver" in sentence(source)

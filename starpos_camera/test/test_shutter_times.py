@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from starpos.frames.frame import Frame
-from starpos_camera.parameters import PARAMETERS
+from starpos.parameters.table import defaults_of
 from starpos_camera.sources.source import CapturedFrame
 from starpos_camera.sources.timing import ENOUGH_FOR_LAG, ShutterTimes
 from starpos_common.messages import unix_to_stamp
@@ -16,7 +16,7 @@ from starpos_interfaces.msg import Capture, Pulse
 from starpos_testing.patience import WAIT_S
 
 BEGIN_S, EXPOSURE_S = 1.7e9, 0.5
-VALUES = {p.name: p.default for p in PARAMETERS} | {"pulses": True, "command_lag": 0.1, "driver_lag": 0.2}
+VALUES = defaults_of("camera") | {"pulses": True, "command_lag": 0.1, "driver_lag": 0.2}
 PIXELS = np.zeros((16, 16), np.uint8)
 
 

@@ -8,9 +8,10 @@ import pytest
 from starpos.detection import detect
 from starpos.errors import FrameError
 from starpos.frames.exposure import UNKNOWN_LATENCY_S
+from starpos.parameters.table import defaults_of
 from starpos.simulation.scene import expose
 from starpos.sky.catalogue import load_catalogue
-from starpos_camera.parameters import PARAMETERS, SOURCES
+from starpos_camera.sources.registry import SOURCES
 from starpos_camera.sources.source import CaptureSettings, SourceEnded
 from starpos_interfaces.msg import Capture
 from starpos_testing.lacking import require
@@ -21,7 +22,7 @@ SETTINGS = CaptureSettings(None, None, 5.0)
 
 
 def values(**changes):
-    table = {p.name: p.default for p in PARAMETERS}
+    table = defaults_of("camera")
     return table | {name.replace("__", "."): value for name, value in changes.items()}
 
 

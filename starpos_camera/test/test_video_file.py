@@ -11,7 +11,7 @@ import pytest
 from sensor_msgs.msg import Image
 
 from starpos.errors import FrameError
-from starpos_camera.parameters import PARAMETERS
+from starpos.parameters.table import defaults_of
 from starpos_camera.sources.source import CaptureError, CaptureSettings, SourceEnded
 from starpos_camera.sources.video import Video
 from starpos_interfaces.msg import Capture
@@ -46,7 +46,7 @@ def film(tmp_path):
 
 
 def values(path, **changes):
-    table = {p.name: p.default for p in PARAMETERS} | {"source": "video", "video.device": str(path)}
+    table = defaults_of("camera") | {"source": "video", "video.device": str(path)}
     return (
         table | {"video.start": START} | {name.replace("__", "."): value for name, value in changes.items()}
     )

@@ -13,8 +13,8 @@ import pytest
 from sensor_msgs.msg import Image
 
 from starpos.errors import FrameError, StarposError
+from starpos.parameters.table import defaults_of
 from starpos.simulation.scene import write_fits
-from starpos_camera.parameters import PARAMETERS
 from starpos_camera.sources import files
 from starpos_camera.sources.files import IDLE_S, MAX_LOOKED_AT, PATIENCE, Files, WatchedFolder
 from starpos_camera.sources.source import CaptureError, CaptureSettings, NothingYet
@@ -251,7 +251,7 @@ def test_of_a_file_that_came_and_went_nothing_is_kept(watch):
 
 
 def values(path, **changes):
-    table = {p.name: p.default for p in PARAMETERS} | {"files.path": str(path), "files.watch": True}
+    table = defaults_of("camera") | {"files.path": str(path), "files.watch": True}
     return table | {name.replace("__", "."): value for name, value in changes.items()}
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from starpos_camera.parameters import PARAMETERS
+from starpos.parameters.table import defaults_of
 from starpos_camera.sources.source import CaptureError, CaptureSettings
 from starpos_camera.sources.video import Video
 
@@ -75,7 +75,7 @@ def unplugged(source):
 if __name__ == "__main__":
     session, given = sys.argv[1], json.loads(sys.argv[2])
     options = given.pop("options", {})
-    values = {p.name: p.default for p in PARAMETERS} | {"video.device": "/dev/starpos-emulated"} | given
+    values = defaults_of("camera") | {"video.device": "/dev/starpos-emulated"} | given
     assert Video.refusal(values, SETTINGS) is None
     source = Video(values, time.time)
     print(json.dumps(globals()[session](source, **options)))

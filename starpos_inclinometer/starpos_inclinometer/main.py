@@ -19,9 +19,8 @@ def inclinometer() -> int:
 
     def help_text() -> str:
         from starpos_common.parameters import node_help
-        from starpos_inclinometer.parameters import PARAMETERS
 
         about = "The readings of an inclinometer, or of an IMU, on `tilt`, until Ctrl-C."
-        return node_help("starpos_inclinometer", "inclinometer", about, {"inclinometer": PARAMETERS})
+        return node_help("starpos_inclinometer", "inclinometer", about, "inclinometer")
 
     return run(make_nodes, help_text=help_text)

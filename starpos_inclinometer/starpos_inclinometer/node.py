@@ -10,12 +10,13 @@ from rclpy.node import Node
 from rclpy.time import Time
 
 from starpos.messages.tilt import OUT_OF_RANGE, SATURATED, STUCK, Reading
+from starpos.parameters.table import parameters_of
 from starpos_common.diagnostics import Diagnosis, Diagnostics, Level, time_is_simulated
 from starpos_common.parameters import declare
 from starpos_common.replayed import Replayed
 from starpos_common.topics import Take, publisher
 from starpos_inclinometer.clock import HostClock, Step
-from starpos_inclinometer.parameters import PARAMETERS, SOURCES, refusal
+from starpos_inclinometer.sources.registry import SOURCES, refusal
 from starpos_inclinometer.sources.source import Counts, Health, Phase, Surroundings, TimedPulse
 from starpos_interfaces.msg import Pulse, Tilt
 
@@ -100,7 +101,9 @@ class InclinometerNode(Node):
 
     def __init__(self) -> None:
         super().__init__("inclinometer")
-        self._values = declare(self, PARAMETERS, apply=self._apply, check=lambda values, _: refusal(values))
+        self._values = declare(
+            self, parameters_of("inclinometer"), apply=self._apply, check=lambda values, _: refusal(values)
+        )
         self._publisher = publisher(self, Tilt, "tilt", 100)
         self._pulses = publisher(self, Pulse, "pulses", 100)
         self._logged: tuple[Phase, str] | None = None

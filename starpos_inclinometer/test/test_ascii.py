@@ -12,9 +12,10 @@ import numpy as np
 import pytest
 
 from starpos.messages.tilt import GAP, OUT_OF_RANGE, STUCK, TIME_UNKNOWN
+from starpos.parameters.table import defaults_of
 from starpos_inclinometer.clock import HostClock, Moment
-from starpos_inclinometer.parameters import PARAMETERS, refusal
 from starpos_inclinometer.sources.ascii_line import MAX_LINE, UNITS, AsciiSource, LineDecoder, TextLines
+from starpos_inclinometer.sources.registry import refusal
 from starpos_inclinometer.sources.source import Phase, Surroundings
 from starpos_testing.emulator import Pty
 from starpos_testing.patience import WAIT_S
@@ -25,7 +26,7 @@ FULL = rf"\$TILT,(?P<sequence>\d+),(?P<milliseconds>\d+),{PLAIN},(?P<temperature
 
 
 def values(**changed):
-    return {p.name: p.default for p in PARAMETERS} | {"source": "ascii", "ascii.pattern": PLAIN} | changed
+    return defaults_of("inclinometer") | {"source": "ascii", "ascii.pattern": PLAIN} | changed
 
 
 class Feeder:
@@ -216,7 +217,7 @@ def test_bad_patterns_are_refused_in_one_sentence(pattern, words):
 
 def test_good_patterns_and_requests():
     assert refusal(values(**{"ascii.pattern": FULL, "ascii.request": "?\r\n"})) is None
-    assert refusal({p.name: p.default for p in PARAMETERS} | {"source": "ascii"}) is None
+    assert refusal(defaults_of("inclinometer") | {"source": "ascii"}) is None
     assert "ASCII" in refusal(values(**{"ascii.request": "\xe9"}))
 
 

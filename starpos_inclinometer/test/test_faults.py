@@ -18,9 +18,9 @@ from diagnostic_msgs.msg import DiagnosticArray
 from wire import Wire
 
 from starpos.messages.tilt import STUCK, TIME_UNKNOWN
+from starpos.parameters.table import defaults_of
 from starpos_inclinometer.clock import HostClock
 from starpos_inclinometer.node import Reporter
-from starpos_inclinometer.parameters import PARAMETERS
 from starpos_inclinometer.sources import mcu_protocol
 from starpos_inclinometer.sources.mcu import McuDecoder, McuSource
 from starpos_inclinometer.sources.source import Phase, Surroundings
@@ -259,7 +259,7 @@ def test_what_a_checksum_lets_pass(tell):
 
 
 def values(**changed):
-    return {p.name: p.default for p in PARAMETERS} | changed
+    return defaults_of("inclinometer") | changed
 
 
 class Taken:

@@ -9,13 +9,13 @@ import tracemalloc
 import numpy as np
 from corrupted import IDENTITY, RATE_HZ, as_sent, lines
 
+from starpos.parameters.table import defaults_of
 from starpos_inclinometer.clock import Moment
-from starpos_inclinometer.parameters import PARAMETERS
 from starpos_inclinometer.sources import mcu_protocol
 from starpos_inclinometer.sources.ascii_line import LineDecoder
 from starpos_inclinometer.sources.mcu import McuDecoder, McuTilts
 
-VALUES = {p.name: p.default for p in PARAMETERS}
+VALUES = defaults_of("inclinometer")
 # Bytes of each kind.
 PART = 340_000
 

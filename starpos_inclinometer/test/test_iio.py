@@ -11,8 +11,8 @@ import pytest
 from iio_tree import adxl355, node, plug, scan, scl3300
 
 from starpos.messages.tilt import GAP, OUT_OF_RANGE, STUCK, TIME_UNKNOWN
+from starpos.parameters.table import defaults_of
 from starpos_inclinometer.clock import HostClock, Moment
-from starpos_inclinometer.parameters import PARAMETERS
 from starpos_inclinometer.sources.iio import IioLink, IioTilts
 from starpos_inclinometer.sources.iio_device import (
     Buffer,
@@ -25,7 +25,7 @@ from starpos_inclinometer.sources.iio_device import (
 from starpos_inclinometer.sources.source import Arrival, Phase, Surroundings
 from starpos_testing.patience import WAIT_S
 
-DEFAULTS = {p.name: p.default for p in PARAMETERS}
+DEFAULTS = defaults_of("inclinometer")
 
 
 def arrivals(device, raws, period_s=0.01, dated=True):

@@ -12,7 +12,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rcl_interfaces.srv import DescribeParameters
 
 from starpos.messages import tilt
-from starpos_inclinometer.node import PARAMETERS
+from starpos.parameters.table import parameters_of
 from starpos_interfaces.msg import Tilt
 from starpos_testing.emulator import Mcu
 from starpos_testing.nodes import Listener, Process, take_domain
@@ -160,7 +160,7 @@ def test_bad_parameter_ends_with_one_line(start, parameter, sentence):
 
 def test_readme_names_every_parameter():
     readme = (Path(__file__).parent.parent / "README.md").read_text()
-    assert [p.name for p in PARAMETERS if f"| `{p.name}` |" not in readme] == []
+    assert [p.name for p in parameters_of("inclinometer") if f"| `{p.name}` |" not in readme] == []
 
 
 def test_flags_are_those_of_the_message():

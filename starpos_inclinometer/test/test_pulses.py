@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 from board import Board
 
+from starpos.parameters.table import defaults_of
 from starpos_common.shutter_pulses import Edge, ShutterPulse, ShutterPulses
 from starpos_inclinometer.clock import Moment
-from starpos_inclinometer.parameters import PARAMETERS
 from starpos_inclinometer.sources.mcu import LINE_STDDEV_S, SECOND_STDDEV_S, McuDecoder, McuTilts, PulseTimes
 from starpos_inclinometer.sources.mcu_protocol import Input, LineParser, Pulse, Sample, frame
 from starpos_testing import emulator
 
-VALUES = {p.name: p.default for p in PARAMETERS}
+VALUES = defaults_of("inclinometer")
 BOOT_MS = 600
 
 

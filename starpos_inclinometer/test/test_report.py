@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 
 from starpos.messages.tilt import GAP, OUT_OF_RANGE, SATURATED, STUCK
+from starpos.parameters.table import defaults_of
 from starpos_inclinometer.clock import Moment, Step
 from starpos_inclinometer.node import Reporter
-from starpos_inclinometer.parameters import PARAMETERS
 from starpos_inclinometer.sources.mcu import McuDecoder, McuTilts
 from starpos_inclinometer.sources.mcu_protocol import Identity, Sample
 from starpos_inclinometer.sources.source import Arrival, Counts, Health, Phase
 from starpos_testing.emulator import Mcu
 
-VALUES = {p.name: p.default for p in PARAMETERS}
+VALUES = defaults_of("inclinometer")
 
 
 def health(phase=Phase.RECEIVING, **more):

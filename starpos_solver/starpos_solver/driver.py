@@ -8,7 +8,8 @@ from rclpy.impl.rcutils_logger import RcutilsLogger
 from rclpy.node import Node
 
 from starpos.instrument.camera import Camera
-from starpos.session.settings import PARAMETERS, Settings
+from starpos.parameters.table import parameters_of
+from starpos.session.settings import Settings
 from starpos_common.diagnostics import Diagnosis, Level, Troubles
 from starpos_common.parameters import declare
 
@@ -85,7 +86,7 @@ class SolverSettings(Settings):
     ) -> None:
         super().__init__({})
         self._camera, self._apply = camera, apply
-        self.values = declare(node, PARAMETERS, apply=self._adopted, check=self._check)
+        self.values = declare(node, parameters_of("solver"), apply=self._adopted, check=self._check)
         self.adopt()
 
     def _check(self, values: Mapping, names: frozenset[str]) -> str | None:

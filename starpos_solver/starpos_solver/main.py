@@ -18,11 +18,10 @@ def solver() -> int:
         yield SolverNode()
 
     def help_text() -> str:
-        from starpos.session.settings import PARAMETERS
         from starpos_common.parameters import node_help
 
         about = "Stars and tilts in, position and heading out, until Ctrl-C."
-        return node_help("starpos_solver", "solver", about, {"solver": PARAMETERS})
+        return node_help("starpos_solver", "solver", about, "solver")
 
     # A thread may still build triangles.
     return leave(run(make_nodes, help_text=help_text))
@@ -38,13 +37,12 @@ def navigator() -> int:
         yield NavigatorNode()
 
     def help_text() -> str:
-        from starpos.session.navigator_parameters import PARAMETERS
         from starpos_common.parameters import node_help
 
         about = (
             "An IMU, attitudes and velocities in, position, heading and velocity under way out, until Ctrl-C."
         )
-        return node_help("starpos_solver", "navigator", about, {"navigator": PARAMETERS})
+        return node_help("starpos_solver", "navigator", about, "navigator")
 
     # A thread may still adjust.
     return leave(run(make_nodes, help_text=help_text))

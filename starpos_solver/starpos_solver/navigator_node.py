@@ -10,9 +10,10 @@ from rclpy.qos import ReliabilityPolicy
 from sensor_msgs.msg import Imu, NavSatFix
 from std_srvs.srv import Trigger
 
+from starpos.parameters.table import parameters_of
 from starpos.session.driver import Now
 from starpos.session.navigator import NavigatorSession
-from starpos.session.navigator_parameters import PARAMETERS, NavigatorSettings
+from starpos.session.navigator_parameters import NavigatorSettings
 from starpos_common.diagnostics import Diagnostics, time_is_simulated
 from starpos_common.parameters import declare
 from starpos_common.topics import subscription
@@ -28,7 +29,9 @@ class NavigatorNode(Node):
     def __init__(self) -> None:
         super().__init__("navigator")
         self._settings = NavigatorSettings({})
-        self._settings.values = declare(self, PARAMETERS, apply=self._adopted, check=self._settings.check)
+        self._settings.values = declare(
+            self, parameters_of("navigator"), apply=self._adopted, check=self._settings.check
+        )
         self._settings.adopt()
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._played = time_is_simulated(self)

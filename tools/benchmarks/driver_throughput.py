@@ -6,8 +6,8 @@ from collections.abc import Iterator
 
 from table import Cost, Row
 
+from starpos.parameters.table import defaults_of
 from starpos_inclinometer.clock import Moment
-from starpos_inclinometer.parameters import PARAMETERS
 from starpos_inclinometer.sources import mcu_protocol
 from starpos_inclinometer.sources.ascii_line import LineDecoder
 from starpos_inclinometer.sources.mcu import McuDecoder, McuTilts
@@ -23,7 +23,7 @@ COMPENSATED = {
 
 def each(samples: int) -> Iterator[tuple[str, float]]:
     """What is measured, and its CPU time a sample in us."""
-    values = {p.name: p.default for p in PARAMETERS}
+    values = defaults_of("inclinometer")
     yield "serial, as it is", serial(samples, values)
     yield "serial, compensated", serial(samples, values | COMPENSATED)
     yield "ascii, lines alone", ascii_lines(samples, values["ascii.pattern"])

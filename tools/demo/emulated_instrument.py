@@ -168,11 +168,11 @@ class Recorder:
         """The fix of a frame whose middle of the exposure is known."""
         from starpos.messages.camera import message_to_camera
         from starpos.messages.stars import message_to_stars
-        from starpos.session.parameter_file import settings_of
+        from starpos.session.settings import Settings
         from starpos.session.tilts import TiltBuffer
         from starpos.sky.catalogue import load_catalogue
 
-        settings = settings_of(None, [f"{name}:={value}" for name, value in known_by(place).items()])
+        settings = Settings.of(None, [f"{name}:={value}" for name, value in known_by(place).items()])
         solver = settings.solver(message_to_camera(self.infos[-1]), None, load_catalogue())
         tilts = TiltBuffer()
         for tilt in self.tilts:

@@ -15,9 +15,9 @@ import yaml
 from runner import Memory, Progress
 
 from starpos.errors import StarposError
-from starpos_camera.parameters import PARAMETERS, SOURCES
+from starpos.parameters.table import ParameterError, defaults_of, parameters_of
+from starpos_camera.sources.registry import SOURCES
 from starpos_camera.sources.source import CaptureSettings
-from starpos_common.parameters import ParameterError
 
 ALLOWED_MB = 2.0
 
@@ -73,8 +73,8 @@ def run(options) -> int:
 
 def values_of(words: list[str]) -> dict:
     """Make the camera's parameters from words NAME:=VALUE; ParameterError in a sentence."""
-    table = {p.name: p for p in PARAMETERS}
-    values = {p.name: p.default for p in PARAMETERS}
+    table = {p.name: p for p in parameters_of("camera")}
+    values = defaults_of("camera")
     for word in words:
         key, given, value = word.partition(":=")
         if not given or key not in table:

@@ -13,8 +13,8 @@ from pathlib import Path
 
 from runner import Memory, Progress
 
+from starpos.parameters.table import defaults_of
 from starpos_inclinometer.clock import HostClock
-from starpos_inclinometer.parameters import PARAMETERS
 from starpos_inclinometer.sources.mcu import McuSource
 from starpos_inclinometer.sources.source import Surroundings
 from starpos_testing.emulator import Faults, Mcu, Pty
@@ -66,7 +66,7 @@ def run(options) -> int:
     def fast_ns() -> int:
         return round((time.monotonic_ns() - begin_ns) * speed)
 
-    values = {p.name: p.default for p in PARAMETERS} | {"rate": RATE_HZ}
+    values = defaults_of("inclinometer") | {"rate": RATE_HZ}
     stop, woken, progress, got = threading.Event(), threading.Event(), Progress(samples, "samples due"), 0
     with tempfile.TemporaryDirectory() as folder:
         values["port"] = str(Path(folder) / "port")

@@ -4,9 +4,11 @@
 import inspect
 from dataclasses import KW_ONLY, FrozenInstanceError, dataclass, field, replace
 
+import numpy as np
 import pytest
 
 from starpos.frozen import at_once
+from starpos.instrument.inclinometer import Tilt
 
 
 def made() -> type:
@@ -61,3 +63,39 @@ def test_fields_with_a_factory_are_refused():
 
     with pytest.raises(TypeError, match="factory"):
         at_once(Value)
+
+
+@at_once
+@dataclass(frozen=True)
+class Held:
+    name: str
+    numbers: np.ndarray
+    more: tuple = ()
+    number: float = float("nan")
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "equal"),
+    [
+        (Held("a", np.arange(3.0)), Held("a", np.arange(3.0)), True),
+        (Held("a", np.arange(3.0)), Held("b", np.arange(3.0)), False),
+        (Held("a", np.arange(3.0)), Held("a", np.arange(4.0)), False),
+        (Held("a", np.array([1.0, np.nan])), Held("a", np.array([1.0, np.nan])), True),
+        (Held("a", np.array(["x"])), Held("a", np.array(["x"])), True),
+        (Held("a", np.zeros(2), (np.ones(2), 1)), Held("a", np.zeros(2), (np.ones(2), 1)), True),
+        (Held("a", np.zeros(2), (np.ones(2), 1)), Held("a", np.zeros(2), (np.zeros(2), 1)), False),
+        (Held("a", np.zeros(2)), Held("a", np.zeros(2), number=1.0), False),
+        (Held("a", np.zeros(2)), "a", False),
+        (Tilt(0.1, 0.2, np.eye(2), utc_unix_s=3.0), Tilt(0.1, 0.2, np.eye(2), utc_unix_s=3.0), True),
+        (Tilt(0.1, 0.2, np.eye(2), utc_unix_s=3.0), Tilt(0.1, 0.2, 2 * np.eye(2), utc_unix_s=3.0), False),
+    ],
+)
+def test_arrays_are_compared_by_what_they_hold(one, other, equal):
+    assert (one == other) is equal
+    assert (one != other) is not equal
+
+
+def test_what_holds_an_array_has_no_hash():
+    with pytest.raises(TypeError, match="unhashable"):
+        hash(Held("a", np.zeros(2)))
+    assert hash(Quick(1, third=3.0)) == hash(Quick(1, third=3.0))

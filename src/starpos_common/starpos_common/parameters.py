@@ -1,7 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Parameters from one table: declared with descriptors, refused with a sentence, applied once they are set, and
-explained.
-"""
+"""Parameters of a node: declared with descriptors, refused with a sentence, applied once they are set, and explained."""
 
 import math
 import textwrap
@@ -12,21 +10,7 @@ import rclpy.parameter
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
 from rclpy.node import Node
 
-from starpos.session.parameter import FRAME_NAME, Form, Parameter, ParameterError
-
-__all__ = [
-    "FRAME_NAME",
-    "Form",
-    "Parameter",
-    "ParameterError",
-    "Values",
-    "declare",
-    "to_yaml",
-    "warn_of_unknown",
-    "yaml_value",
-]
-
-# for the tables of the nodes
+from starpos.parameters.table import Parameter, ParameterError, parameters_of, yaml_value
 
 INT64_MIN, INT64_MAX = -(2**63), 2**63 - 1
 
@@ -174,34 +158,6 @@ def _prepared(
         return _Refused(node.get_parameter(change.name), str(error))
 
 
-def to_yaml(node_name: str, parameters: Sequence[Parameter]) -> str:
-    """Write a parameter file with every default, each below a comment with its meaning, unit and constraint."""
-    # REUSE-IgnoreStart
-    lines = ["# SPDX-License-Identifier: Apache-2.0", f"/**/{node_name}:", "  ros__parameters:"]
-    # REUSE-IgnoreEnd
-    for p in parameters:
-        fixed = "; fixed while the node runs" if p.read_only else ""
-        lines += [f"    # {p.description}", f"    # {p.name} must be {p.constraint}{fixed}."]
-        lines.append(f"    {p.name}: {yaml_value(p.default)}")
-    return "\n".join(lines) + "\n"
-
-
-def yaml_value(value: Any) -> str:
-    """Write the value of a parameter as YAML that rcl reads."""
-    if isinstance(value, tuple):
-        return "[" + ", ".join(map(yaml_value, value)) + "]"
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, str):
-        return '"' + value.replace("\\", "\\\\").replace('"', '\\"') + '"'
-    if isinstance(value, float):
-        if math.isnan(value):
-            return ".nan"
-        # rcl's YAML parser reads 1e5, which has no point, as a text.
-        return repr(value) if "e" not in repr(value) else f"{value:.17f}".rstrip("0")
-    return str(value)
-
-
 WIDTH = 110
 HOW = """A parameter is set with -p NAME:=VALUE, or in a FILE like config/starpos.yaml of starpos_bringup;
 most also while the node runs: ros2 param set /{node} NAME VALUE. -r __ns:=/NAMESPACE moves its topics and services.
@@ -209,14 +165,14 @@ The README of {package} says what it hears and publishes.
 """
 
 
-def node_help(package: str, executable: str, about: str, nodes: Mapping[str, Sequence[Parameter]]) -> str:
-    """Write what an executable is, how its parameters are set, and each of them; nodes: the parameters of each node."""
+def node_help(package: str, executable: str, about: str, *nodes: str) -> str:
+    """Write what an executable is, how the parameters of its nodes are set, and each of them."""
     options = "[-p NAME:=VALUE]... [--params-file FILE] [-r FROM:=TO]..."
     usage = f"usage: ros2 run {package} {executable} [--ros-args {options}]"
-    lines = [usage, "", about, "", HOW.rstrip().format(package=package, node=next(iter(nodes)))]
-    for node, parameters in nodes.items():
+    lines = [usage, "", about, "", HOW.rstrip().format(package=package, node=nodes[0])]
+    for node in nodes:
         lines += ["", f"parameters of the node {node}:"]
-        lines += [line for p in parameters for line in _lines(p)]
+        lines += [line for p in parameters_of(node) for line in _lines(p)]
     return "\n".join(lines)
 
 

@@ -16,7 +16,7 @@ from rclpy.qos_overriding_options import InvalidQosOverridesError, QosCallbackRe
 from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
-from starpos_common.parameters import ParameterError
+from starpos.parameters.table import ParameterError
 
 MAX_DEPTH = 100_000
 T = TypeVar("T")

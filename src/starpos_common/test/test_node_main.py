@@ -96,7 +96,7 @@ def test_second_signal_at_any_later_time_changes_nothing(start):
             "no frames in /x; give others",
         ),
         (
-            "from starpos_common.parameters import ParameterError; raise ParameterError('a must be b')",
+            "from starpos.parameters.table import ParameterError; raise ParameterError('a must be b')",
             "a must be b",
         ),
     ],

@@ -8,14 +8,8 @@ import rclpy
 import rclpy.parameter
 import yaml
 
-from starpos_common.parameters import (
-    FRAME_NAME,
-    Parameter,
-    ParameterError,
-    declare,
-    to_yaml,
-    warn_of_unknown,
-)
+from starpos.parameters.table import FRAME_NAME, Parameter, ParameterError, yaml_value
+from starpos_common.parameters import declare, warn_of_unknown
 from starpos_testing.nodes import take_domain
 
 TABLE = (
@@ -268,13 +262,15 @@ def test_other_parameters_of_the_node_are_left_alone(make):
     assert change(node, theirs=2).successful
 
 
-def test_yaml_holds_every_default_and_its_constraint(make, tmp_path):
-    text = to_yaml("params", TABLE)
-    loaded = yaml.safe_load(text)["/**/params"]["ros__parameters"]
-    assert loaded["offsets"] == [2.5, 2.5] and loaded["port"] == "/dev/x" and loaded["loop"] is False
-    assert "# rate must be a whole number from 1 to 50 Hz." in text
-    assert "fixed while the node runs" in text
-    assert (
-        Parameter("x", 1e-9, "").default
-        == yaml.safe_load(to_yaml("n", [Parameter("x", 1e-9, "")]))["/**/n"]["ros__parameters"]["x"]
-    )
+@pytest.mark.parametrize("value", [(2.5, 2.5), "/dev/x", 'The "port" \\', False, 1e-9, 1e5, 7, ""])
+def test_a_default_is_written_as_yaml_that_rcl_reads(value):
+    text = yaml_value(value)
+    read = yaml.safe_load(text)
+    assert (tuple(read) if isinstance(read, list) else read) == value and type(read) in (type(value), list)
+    assert isinstance(value, str) or "e-" not in text
+
+
+def test_a_rule_states_the_constraint_and_whether_it_is_fixed():
+    rules = {p.name: p.rule for p in TABLE}
+    assert rules["rate"] == "rate must be a whole number from 1 to 50 Hz."
+    assert "fixed while the node runs" in rules["port"]

@@ -9,7 +9,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import String
 
-from starpos_common.parameters import ParameterError
+from starpos.parameters.table import ParameterError
 from starpos_common.topics import publisher, subscription, subscription_from_any
 from starpos_testing.nodes import take_domain
 from starpos_testing.patience import WAIT_S

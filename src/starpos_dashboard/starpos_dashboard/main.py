@@ -18,12 +18,11 @@ def dashboard() -> int:
 def help_text() -> str:
     """What `--help` says."""
     from starpos_common.parameters import node_help
-    from starpos_dashboard.parameters import PARAMETERS
 
     about = (
         "The instrument in a browser, at http://127.0.0.1:8042 unless parameters say otherwise, until Ctrl-C."
     )
-    return node_help("starpos_dashboard", "dashboard", about, {"dashboard": PARAMETERS})
+    return node_help("starpos_dashboard", "dashboard", about, "dashboard")
 
 
 def make_nodes() -> "Iterator[Node]":

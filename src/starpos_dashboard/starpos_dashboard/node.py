@@ -15,12 +15,12 @@ from sensor_msgs.msg import Image, Imu, NavSatFix
 from starpos.errors import FrameError
 from starpos.messages.camera import message_to_frame
 from starpos.messages.stamp import stamp_to_unix
+from starpos.parameters.table import parameters_of
 from starpos_common.diagnostics import Diagnosis, Diagnostics, Level
 from starpos_common.parameters import declare
 from starpos_common.topics import subscription
 from starpos_dashboard import server
 from starpos_dashboard.board import Board
-from starpos_dashboard.parameters import PARAMETERS, names
 from starpos_dashboard.server import DashboardServer, listen
 from starpos_interfaces.msg import GnssCheck, Solution, Tilt
 
@@ -58,7 +58,7 @@ class DashboardNode(Node):
 
     def __init__(self) -> None:
         super().__init__("dashboard")
-        self._values = declare(self, PARAMETERS, apply=self._apply)
+        self._values = declare(self, parameters_of("dashboard"), apply=self._apply)
         self._board = Board(
             self._values["track"], names(self._values["lights"]), namespace=self.get_namespace()
         )
@@ -182,3 +182,8 @@ class DashboardNode(Node):
     def destroy_node(self) -> None:
         self._server.stop()
         super().destroy_node()
+
+
+def names(text: str) -> frozenset[str]:
+    """Split a list separated by commas into its words."""
+    return frozenset(word.strip() for word in text.split(",") if word.strip())

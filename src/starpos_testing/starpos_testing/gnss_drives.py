@@ -4,7 +4,7 @@
 The laws are written down here anew, so that they hold starpos.gnss to account.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -38,7 +38,7 @@ class GnssDrive:
     """A robot that stands every `every_s`, newly turned and leaning, for `frames` frames, and drives on.
 
     deflection_arcsec: 1 sigma a component of the deflection, half of its variance the same all along, half forgotten over
-    field_m.
+    field_m.  unmeasured: whether the tilt of a frame, by its number from 0, has no temperature.
     """
 
     stops: int = 40
@@ -51,6 +51,7 @@ class GnssDrive:
     errors: InclinometerErrors = field(default_factory=InclinometerErrors)
     deflection_arcsec: float = 6.0
     field_m: float = 37_000.0
+    unmeasured: Callable[[int], bool] = lambda k: False
 
     @property
     def instrument(self) -> Instrument:
@@ -104,7 +105,7 @@ class GnssDrive:
                     np.eye(2) * noise**2,
                     utc_unix_s=1.7e9 + t,
                     samples=READINGS,
-                    temperature_c=celsius,
+                    temperature_c=np.nan if self.unmeasured(stop * self.frames + k) else celsius,
                 )
                 yield DriveFrame(
                     LevelSight(

@@ -10,8 +10,7 @@ import numpy as np
 
 from starpos.frames.frame import MAX_PIXELS, Frame
 from starpos_camera.sources.source import CapturedFrame, CaptureError, CaptureSettings, DeviceSource, missing
-from starpos_camera.sources.timing import CLOCK_TOLERANCE_S, clock_stddev_of, server_clock, stamp_of
-from starpos_common.parameters import Parameter
+from starpos_camera.sources.timing import CLOCK_TOLERANCE_S, clock_stddev_of, stamp_of
 
 if TYPE_CHECKING:
     from alpaca.camera import Camera
@@ -29,30 +28,10 @@ MONOCHROME, RGGB = 0, 2
 PATTERNS = {(0, 0): "rggb", (1, 0): "grbg", (0, 1): "gbrg", (1, 1): "bggr"}
 # ASCOM's camera states.
 IDLE, ERROR = 0, 5
-PARAMETERS = (
-    Parameter(
-        "alpaca.address",
-        "127.0.0.1:11111",
-        "HOST:PORT of the Alpaca server, which must be in a trusted network: it knows no passwords.",
-        read_only=True,
-    ),
-    Parameter(
-        "alpaca.device",
-        0,
-        "Number of the camera on this server; no other program may use it meanwhile.",
-        unit="",
-        minimum=0,
-        maximum=2**32 - 1,
-        read_only=True,
-    ),
-    server_clock("alpaca"),
-)
 
 
 class Alpaca(DeviceSource["Camera"]):
     """Takes whole, unbinned frames; `capture` commands an exposure, waits for it and fetches it."""
-
-    parameters = PARAMETERS
 
     @staticmethod
     def refusal(values: Mapping, settings: CaptureSettings) -> str | None:

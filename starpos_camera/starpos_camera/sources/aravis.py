@@ -25,7 +25,6 @@ from starpos.frames.exposure import Shutter
 from starpos.frames.frame import MAX_PIXELS, Frame
 from starpos_camera.sources.source import CapturedFrame, CaptureError, CaptureSettings, DeviceSource
 from starpos_camera.sources.timing import Stamp, middle_of_commanded, middle_of_started
-from starpos_common.parameters import Parameter
 from starpos_interfaces.msg import Capture
 
 # Between a camera's time and the moment of the light, where the clocks are related.
@@ -359,51 +358,10 @@ def clock_relation(camera: Any, now: Callable[[], float]) -> ClockRelation | Non
 READOUT_S = 10.0
 # Interval at which a waiting `capture` looks whether the node ends.
 WATCH_S = 0.2
-PARAMETERS = (
-    Parameter(
-        "aravis.device",
-        "",
-        "The camera's name, as the program `arv-tool-0.8` prints it. Empty takes the only camera there is.",
-        read_only=True,
-    ),
-    Parameter(
-        "aravis.trigger",
-        "Software",
-        "The trigger's source by the camera's name for it. With `Software` this node triggers each "
-        "frame; with `Line0` or another line the camera waits for a signal there.",
-        read_only=True,
-    ),
-    Parameter(
-        "aravis.pixel_format",
-        "",
-        "Pixel format, such as Mono8, Mono12, Mono16, BayerRG12. Empty takes the one with the most "
-        "bits that both the camera and this source support.",
-        read_only=True,
-    ),
-    Parameter(
-        "aravis.region_as_set",
-        False,
-        "Keep the region of the sensor and the binning that the camera is set to; false sets the "
-        "whole sensor without binning. A calibration and pixel_um hold for one region and binning "
-        "only.",
-        read_only=True,
-    ),
-    Parameter(
-        "aravis.timestamp",
-        "unknown",
-        "Moment of the exposure that the camera's own times mark. A wrong one makes the stamp wrong "
-        "by the exposure time. If it is unknown, the stamp's error covers all that is possible "
-        "between trigger and arrival.",
-        choices=("start", "end", "unknown"),
-        read_only=True,
-    ),
-)
 
 
 class Aravis(DeviceSource[AravisCamera]):
     """Triggers each exposure, or waits for the line's signal, and takes the whole sensor's frame."""
-
-    parameters = PARAMETERS
 
     @staticmethod
     def refusal(values: Mapping, settings: CaptureSettings) -> str | None:

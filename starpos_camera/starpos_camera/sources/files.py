@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from starpos.errors import FrameError
-from starpos.frames.exif import UNTENDED_STDDEV_S, ZONES_H, CameraClock
+from starpos.frames.exif import CameraClock
 from starpos.frames.frame import Frame
 from starpos.frames.reading import FITS, JPEG, PICTURE, RAW, read_frame
 from starpos_camera.sources.source import (
@@ -26,7 +26,6 @@ from starpos_camera.sources.source import (
     SourceEnded,
     missing,
 )
-from starpos_common.parameters import Parameter
 from starpos_interfaces.msg import Capture
 
 # More than the coarsest time stamps of folders (FAT: 2 s): a second change within the same tick does not show.
@@ -173,67 +172,6 @@ class WatchedFolder:
 
 
 SUFFIXES = FITS + PICTURE + RAW
-PARAMETERS = (
-    Parameter(
-        "files.path",
-        "",
-        "Folder of frames (FITS, TIFF, PNG, raw), or a pattern like /nights/1/*.fits; played by name.",
-        read_only=True,
-    ),
-    Parameter("files.loop", False, "Begin again after the last frame.", read_only=True),
-    Parameter(
-        "files.watch",
-        False,
-        "Take the frames that are written into the folder from now on, until the node stops; each "
-        "name is taken once. If `cadence` is longer than the time between them, the node falls "
-        "behind.",
-        read_only=True,
-    ),
-    Parameter(
-        "files.rest",
-        2.0,
-        "A file counts as complete if it has not changed for this time. If it cannot be read then, "
-        "it is given up after ten times this time. If too short, frames that are written with "
-        "pauses are lost.",
-        unit="s",
-        minimum=0.01,
-        maximum=600.0,
-        read_only=True,
-    ),
-    Parameter(
-        "files.restamp",
-        False,
-        "Stamp the frames with the node's clock instead of their own time. Only for frames without "
-        "a time: old frames get a wrong longitude, by 15 arcsec for each second.",
-        read_only=True,
-    ),
-    Parameter(
-        "files.exif",
-        False,
-        "Take the time of raw files and TIFF from EXIF, that is from the camera's own clock, which "
-        "was set by hand. An error of 1 s is 464 m at the equator.",
-        read_only=True,
-    ),
-    Parameter(
-        "files.exif_utc_offset",
-        math.nan,
-        "Hours that the camera's clock is ahead of UTC, summer time included. Unset takes what each "
-        "file states; files of older cameras state nothing. An hour wrong is 15 deg of longitude.",
-        unit="h",
-        minimum=-ZONES_H,
-        maximum=ZONES_H,
-        read_only=True,
-    ),
-    Parameter(
-        "files.exif_clock_stddev",
-        UNTENDED_STDDEV_S,
-        "Error of the camera's clock, 1 sigma. That it counts whole seconds is added to it.",
-        unit="s",
-        minimum=0.0,
-        maximum=86400.0,
-        read_only=True,
-    ),
-)
 
 
 class Files(FrameSource):
@@ -241,8 +179,6 @@ class Files(FrameSource):
 
     A file that cannot be read raises FrameError and is left out in later rounds; the next call takes the next file.
     """
-
-    parameters = PARAMETERS
 
     @staticmethod
     def refusal(values: Mapping, settings: CaptureSettings) -> str | None:

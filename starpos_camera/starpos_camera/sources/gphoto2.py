@@ -14,7 +14,6 @@ from typing import Any
 from starpos.frames.reading import RAW, decode_frame
 from starpos_camera.sources.source import CapturedFrame, CaptureError, CaptureSettings, DeviceSource, missing
 from starpos_camera.sources.timing import middle_of_commanded
-from starpos_common.parameters import Parameter
 from starpos_interfaces.msg import Capture
 
 # Largest difference of an exposure or a gain from one that the camera has, as a share.
@@ -241,61 +240,10 @@ TARGETS = {"memory": "ram", "card": "card"}
 # Names of the setting with Canon and with Nikon.
 FORMATS = ("imageformat", "imagequality")
 RAW_ALONE = r"^(?!.*(jpe?g|\+|fine|large)).*\b(raw|nef)\b"
-PARAMETERS = (
-    Parameter(
-        "gphoto2.model",
-        "",
-        "The camera's name or a part of it, as the program `gphoto2 --auto-detect` prints it. Empty "
-        "takes the only camera there is.",
-        read_only=True,
-    ),
-    Parameter(
-        "gphoto2.port",
-        "",
-        "The camera's port, such as ptpip:192.168.1.1 (then give gphoto2.model in full), or "
-        "usb:001,004, which changes each time the camera is plugged in. Empty takes any.",
-        read_only=True,
-    ),
-    Parameter(
-        "gphoto2.shutter_setting",
-        "shutterspeed",
-        "The camera's name for its exposure time setting (gphoto2 --list-config); shutterspeed2 for "
-        "some Nikon cameras.",
-        read_only=True,
-    ),
-    Parameter(
-        "gphoto2.iso_setting",
-        "iso",
-        "The camera's name for its ISO setting, which `gain` sets.",
-        read_only=True,
-    ),
-    Parameter(
-        "gphoto2.raw",
-        True,
-        "Set the camera to its raw format if it has one; false leaves the format as it is. A JPEG "
-        "has 8 bits, and the camera smooths faint stars away.",
-        read_only=True,
-    ),
-    Parameter(
-        "gphoto2.target",
-        "memory",
-        "Where the camera stores a frame before it is fetched; some cameras can do only one of the two.",
-        choices=tuple(TARGETS),
-        read_only=True,
-    ),
-    Parameter(
-        "gphoto2.keep",
-        False,
-        "Leave the frames in the camera too. When its card is full, no more frames come.",
-        read_only=True,
-    ),
-)
 
 
 class Gphoto2(DeviceSource[Gphoto2Camera]):
     """Commands each exposure, waits for its file, fetches and deletes it. The camera's dial must stand at M."""
-
-    parameters = PARAMETERS
 
     @staticmethod
     def refusal(values: Mapping, settings: CaptureSettings) -> str | None:

@@ -17,8 +17,7 @@ from starpos.errors import one_line
 from starpos.frames.fits import decode_fits
 from starpos.frames.frame import MAX_PIXELS
 from starpos_camera.sources.source import CapturedFrame, CaptureError, CaptureSettings, DeviceSource, missing
-from starpos_camera.sources.timing import CLOCK_TOLERANCE_S, clock_stddev_of, server_clock, stamp_of
-from starpos_common.parameters import Parameter
+from starpos_camera.sources.timing import CLOCK_TOLERANCE_S, clock_stddev_of, stamp_of
 
 if TYPE_CHECKING:
     from indipyclient import IPyClient
@@ -396,47 +395,10 @@ def _check_limits(device: IndiDevice, vector: str, member: str, value: float, na
 DEFAULT_EXPOSURE_S = 0.5
 # In bytes.
 BLOB_MAX = 4 * MAX_PIXELS
-PARAMETERS = (
-    Parameter(
-        "indi.host",
-        "127.0.0.1",
-        "Host that runs indiserver. Use a trusted network: INDI has no passwords.",
-        read_only=True,
-    ),
-    Parameter("indi.port", 7624, "Port of indiserver.", unit="", minimum=1, maximum=65535, read_only=True),
-    Parameter(
-        "indi.device",
-        "",
-        "The camera's name, such as `CCD Simulator`, on the left of what `indi_getprop` prints.",
-        read_only=True,
-    ),
-    Parameter(
-        "indi.binning",
-        1,
-        "Binning: pixels that become one, along each axis. A calibration and pixel_um hold for one "
-        "binning only.",
-        unit="px",
-        minimum=1,
-        maximum=16,
-    ),
-    Parameter(
-        "indi.readout",
-        15.0,
-        "Longest time from the end of an exposure to the arrival of its frame. If too short for the "
-        "camera or the network, every frame is given up; if too long, a camera that hangs is "
-        "noticed late.",
-        unit="s",
-        minimum=0.5,
-        maximum=600.0,
-    ),
-    server_clock("indi"),
-)
 
 
 class Indi(DeviceSource[IndiServer]):
     """Takes whole light frames as FITS. Connects the device if need be; aborts an exposure that is given up."""
-
-    parameters = PARAMETERS
 
     @staticmethod
     def refusal(values: Mapping, settings: CaptureSettings) -> str | None:

@@ -11,7 +11,6 @@ from starpos.earth.refraction import Atmosphere
 from starpos.errors import InstrumentError
 from starpos.instrument.instrument import focal_px_of
 from starpos_camera.sources.source import CapturedFrame, CaptureSettings, FrameSource
-from starpos_common.parameters import Parameter
 from starpos_interfaces.msg import Capture
 
 if TYPE_CHECKING:
@@ -22,94 +21,10 @@ DEFAULT_EXPOSURE_S = 0.5
 MAX_EXPOSURE_S = 10.0
 MAX_PIXELS = 100_000_000
 STAMP_ROUNDING_S = 1e-6
-PARAMETERS = (
-    Parameter(
-        "simulated.latitude",
-        35.7046,
-        "Astronomic latitude of the simulated place.",
-        unit="deg",
-        minimum=-90.0,
-        maximum=90.0,
-    ),
-    Parameter(
-        "simulated.longitude",
-        51.4106,
-        "Astronomic longitude of the simulated place, east positive.",
-        unit="deg",
-        minimum=-180.0,
-        maximum=360.0,
-    ),
-    Parameter(
-        "simulated.azimuth",
-        40.0,
-        "Azimuth of the optical axis, clockwise from north.",
-        unit="deg",
-        minimum=-360.0,
-        maximum=360.0,
-    ),
-    Parameter(
-        "simulated.altitude",
-        78.0,
-        "Altitude of the optical axis above the horizon; below 60 deg the inclinometer is out of its range.",
-        unit="deg",
-        minimum=5.0,
-        maximum=90.0,
-    ),
-    Parameter(
-        "simulated.roll",
-        15.0,
-        "Roll about the optical axis; 0: rows are level.",
-        unit="deg",
-        minimum=-360.0,
-        maximum=360.0,
-    ),
-    Parameter(
-        "simulated.pressure",
-        101325.0,
-        "Air pressure of the simulated place, 30000 Pa or more, or 0 for a vacuum; the solver's refraction.pressure has "
-        "to agree.",
-        unit="Pa",
-        minimum=0.0,
-        maximum=120000.0,
-    ),
-    Parameter(
-        "simulated.temperature",
-        15.0,
-        "Air temperature of the simulated place; the solver's refraction.temperature has to agree.",
-        unit="deg C",
-        minimum=-100.0,
-        maximum=80.0,
-    ),
-    Parameter(
-        "simulated.humidity",
-        0.5,
-        "Relative humidity of the simulated place, 0 to 1; the solver's refraction.humidity has to agree.",
-        unit="",
-        minimum=0.0,
-        maximum=1.0,
-    ),
-    Parameter(
-        "simulated.width", 5616, "Width of the simulated frames.", unit="px", minimum=16, maximum=20000
-    ),
-    Parameter(
-        "simulated.height", 3744, "Height of the simulated frames.", unit="px", minimum=16, maximum=20000
-    ),
-    Parameter(
-        "simulated.seed",
-        1,
-        "Seed of the simulated noise.",
-        unit="",
-        minimum=0,
-        maximum=2**31 - 1,
-        read_only=True,
-    ),
-)
 
 
 class Simulated(FrameSource):
     """Renders the exposure that has just ended, through an ideal camera."""
-
-    parameters = PARAMETERS
 
     @staticmethod
     def refusal(values: Mapping, settings: CaptureSettings) -> str | None:

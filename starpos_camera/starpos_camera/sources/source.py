@@ -2,7 +2,7 @@
 """Interface between the node and a camera. A new camera is a FrameSource in a module here, and a line in `registry`."""
 
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib.util import find_spec
 from typing import Generic, TypeVar
@@ -10,7 +10,6 @@ from typing import Generic, TypeVar
 from starpos.errors import StarposError
 from starpos.frames.frame import Frame
 from starpos.instrument.camera import Camera
-from starpos_common.parameters import Parameter
 
 
 class CaptureError(StarposError):
@@ -65,7 +64,6 @@ class FrameSource:
     """
 
     # Each named `source.something`.
-    parameters: Sequence[Parameter]
     hardware_id: str
     # True: nothing is captured before somebody subscribes to the images.
     waits_for_listener = False

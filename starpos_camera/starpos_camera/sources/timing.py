@@ -141,34 +141,6 @@ RECEIVER_STDDEV_S = 1e-5
 # The lag that a source's stamps already contain, by where they come from.
 LAGS = {Capture.COMMAND: "command_lag", Capture.DRIVER: "driver_lag"}
 
-PULSE_PARAMETERS = (
-    Parameter(
-        "pulses",
-        False,
-        "Take the time of a frame from the shutter's pulse on the topic `pulses` if it belongs to "
-        "the frame without doubt. Other frames get the lag that these pulses have shown.",
-        read_only=True,
-    ),
-    Parameter(
-        "pulses.curtain",
-        0.0,
-        "Time from the start of the first row's exposure to the pulse. X sync marks the fully open "
-        "shutter, so this is the travel of the curtain, some 0.004 s; it is 0 for a strobe line. 1 "
-        "ms is 0.5 m at the equator.",
-        unit="s",
-        minimum=0.0,
-        maximum=1.0,
-    ),
-    Parameter(
-        "pulses.curtain_stddev",
-        0.003,
-        "Error of pulses.curtain, 1 sigma, the same in all frames.",
-        unit="s",
-        minimum=0.0,
-        maximum=1.0,
-    ),
-)
-
 
 class ShutterTimes:
     """Replaces the times of a source's frames by the times of their pulses.

@@ -36,7 +36,6 @@ from starpos_camera.sources.source import (
     SourceEnded,
 )
 from starpos_camera.sources.timing import read_utc
-from starpos_common.parameters import Parameter
 from starpos_interfaces.msg import Capture
 
 if TYPE_CHECKING:
@@ -423,63 +422,8 @@ class Film:
         return capture
 
 
-PARAMETERS = (
-    Parameter(
-        "video.device",
-        "",
-        "A V4L2 camera: its number, /dev/videoN, or better a stable path under /dev/v4l/by-id; or a video file "
-        f"({', '.join(SUFFIXES)}). Numbers change when cameras are plugged in another order.",
-        read_only=True,
-    ),
-    Parameter(
-        "video.format",
-        "",
-        "Pixel format of a V4L2 camera by its four letters, such as Y16 or RG12; an unknown one is refused with the "
-        "list of the known. '' takes OpenCV's first choice. Compressed or 8-bit formats lose faint stars.",
-        read_only=True,
-    ),
-    Parameter(
-        "video.width",
-        0,
-        "Width of a V4L2 camera's frames; it must be one that the camera has. 0: 640.",
-        unit="px",
-        minimum=0,
-        maximum=20000,
-        read_only=True,
-    ),
-    Parameter(
-        "video.height",
-        0,
-        "Height of a V4L2 camera's frames; it must be one that the camera has. 0: 480.",
-        unit="px",
-        minimum=0,
-        maximum=20000,
-        read_only=True,
-    ),
-    Parameter(
-        "video.lag",
-        math.nan,
-        "Time from the middle of an exposure to the kernel's time of the frame; command_lag_stddev "
-        "is its error. If unset, a stamp's error covers the exposure and the frame period. "
-        "Longitudes err by 15 arcsec for each second that it is wrong.",
-        unit="s",
-        minimum=-10.0,
-        maximum=60.0,
-    ),
-    Parameter(
-        "video.start",
-        "",
-        "UTC of the start of a video file's first frame, such as 2026-11-02T18:00:00.00, with as "
-        "many decimals as are known. Longitudes err by 15 arcsec for each second that it is wrong.",
-        read_only=True,
-    ),
-)
-
-
 class Video(FrameSource):
     """A live V4L2 camera, or the frames of a video file, one after the other."""
-
-    parameters = PARAMETERS
 
     @staticmethod
     def refusal(values: Mapping, settings: CaptureSettings) -> str | None:

@@ -14,10 +14,9 @@ from starpos.instrument.inclinometer import elevations
 from starpos.instrument.tilt_log import noise_text
 from starpos.messages.tilt import GAP, TIME_UNKNOWN, Reading
 from starpos.units import ARCSEC
-from starpos_common.parameters import Parameter
 from starpos_inclinometer.clock import ArrivalFilter, Moment, PaceWatch
 from starpos_inclinometer.sources.mcu_protocol import HOST_TOLERANCE_S, HOST_TOLERANCE_SHARE, Gate
-from starpos_inclinometer.sources.serial_link import SERIAL_PARAMETERS, SerialLink, port_refusal
+from starpos_inclinometer.sources.serial_link import SerialLink, port_refusal
 from starpos_inclinometer.sources.source import Arrival, Counts, LinkSource, Surroundings
 from starpos_inclinometer.sources.tilts import SensorTilts, noise_floor_rad
 
@@ -42,69 +41,6 @@ SINES = {"g": 1.0, "mg": 1e-3, "percent_g": 1e-2}
 UNITS = (*ANGLES_RAD, *SINES)
 NUMBER = r"[-+]?\d+\.?\d*"
 MAX_REQUEST = 256
-PARAMETERS = (
-    *SERIAL_PARAMETERS,
-    Parameter(
-        "ascii.pattern",
-        rf"(?P<x>{NUMBER})[,;\s]+(?P<y>{NUMBER})",
-        "Regular expression (Python's) that a whole line must match. It has the named groups x and "
-        "y and, if the device sends them, z, temperature [deg C], sequence, and milliseconds or "
-        "seconds of its own clock.",
-        read_only=True,
-    ),
-    Parameter(
-        "ascii.unit",
-        "deg",
-        "Unit of x, y and z; g, mg and percent_g are the sine of the tilt. A wrong unit makes all "
-        "tilts wrong by its factor.",
-        choices=UNITS,
-        read_only=True,
-    ),
-    Parameter(
-        "ascii.resolution",
-        math.nan,
-        "Step of x, y and z in ascii.unit. Unset takes the last digit of a line.",
-        unit="",
-        minimum=0.0,
-        maximum=1e6,
-        read_only=True,
-    ),
-    Parameter(
-        "ascii.range",
-        math.nan,
-        "Largest tilt of x and y that the device measures; readings beyond it are flagged and not "
-        "used. Unset: no limit.",
-        unit="deg",
-        minimum=0.1,
-        maximum=90.0,
-    ),
-    Parameter(
-        "ascii.period",
-        0.1,
-        "Time from line to line, or from request to request. The device counts as silent after 1.5 "
-        "periods, at least 1 s.",
-        unit="s",
-        minimum=0.02,
-        maximum=60.0,
-        read_only=True,
-    ),
-    Parameter(
-        "ascii.request",
-        "",
-        "Text to send once a period, with its line end, for a device that answers only when asked. "
-        "Empty sends nothing.",
-        read_only=True,
-    ),
-    Parameter(
-        "ascii.stuck_samples",
-        100,
-        "Number of equal lines in a row after which the device counts as stuck; 0: never, for a "
-        "device whose steps are coarser than its noise.",
-        unit="",
-        minimum=0,
-        maximum=1_000_000,
-    ),
-)
 _END = re.compile(rb"[\r\n]+")
 
 
@@ -313,8 +249,6 @@ def _follows(a: Arrival, b: Arrival) -> bool:
 
 class AsciiSource(LinkSource):
     """Reads the lines of a digital tiltmeter."""
-
-    parameters = PARAMETERS
 
     def __init__(self, host: Surroundings, values: Mapping[str, Any]) -> None:
         self.name = values["port"]

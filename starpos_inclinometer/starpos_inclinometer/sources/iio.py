@@ -11,8 +11,6 @@ from typing import Any
 from starpos.instrument import sensors
 from starpos.instrument.tilt_log import noise_text
 from starpos.messages.tilt import GAP, TIME_UNKNOWN, Felt, ImuTilts, Reading
-from starpos.session import inclinometer_parameters
-from starpos_common.parameters import Parameter
 from starpos_inclinometer.clock import Moment
 from starpos_inclinometer.sources.iio_device import (
     FAILED_READS,
@@ -23,7 +21,6 @@ from starpos_inclinometer.sources.iio_device import (
     find,
     set_sampling_frequency,
 )
-from starpos_inclinometer.sources.mcu import RATE_PARAMETER
 from starpos_inclinometer.sources.source import Arrival, Counts, Health, Link, LinkSource, Phase, Surroundings
 from starpos_inclinometer.sources.tilts import SensorTilts, noise_floor_rad
 
@@ -32,50 +29,6 @@ WAIT_S = 0.1
 PATIENCE_S = 1.0
 # If reading the channels takes longer, this process stood still in between.
 SLOW_S = 0.1
-
-PARAMETERS = (
-    RATE_PARAMETER,
-    *inclinometer_parameters.IMU,
-    Parameter(
-        "iio.root",
-        "/sys/bus/iio/devices",
-        "Folder where Linux shows its Industrial I/O devices.",
-        read_only=True,
-    ),
-    Parameter(
-        "iio.device",
-        "",
-        "Name or number of the device, such as scl3300, iio:device0 or 0; a number may change when it is replugged. "
-        "Empty takes the only inclinometer or accelerometer there is.",
-        read_only=True,
-    ),
-    Parameter(
-        "iio.trigger",
-        "",
-        "Trigger that paces the device's buffer, such as adxl355-dev0, so that the kernel stamps each reading; empty "
-        "reads the values `rate` times a second.",
-        read_only=True,
-    ),
-    Parameter(
-        "iio.sampling_frequency",
-        math.nan,
-        "Sampling frequency to set the device to; unset leaves it as it is. A lower one has less "
-        "noise if the device's filter follows it.",
-        unit="Hz",
-        minimum=0.01,
-        maximum=1e5,
-        read_only=True,
-    ),
-    Parameter(
-        "iio.stuck_samples",
-        100,
-        "Number of equal inclinations in a row after which the device counts as stuck; 0: never, "
-        "for a device whose steps are coarser than its noise, such as an ADIS16209.",
-        unit="",
-        minimum=0,
-        maximum=1_000_000,
-    ),
-)
 
 
 class IioLink(Link):
@@ -234,7 +187,6 @@ class IioTilts:
 class IioSource(LinkSource):
     """An inclinometer or accelerometer of Linux's Industrial I/O."""
 
-    parameters = PARAMETERS
     _link: IioLink
 
     def __init__(self, host: Surroundings, values: Mapping[str, Any]) -> None:

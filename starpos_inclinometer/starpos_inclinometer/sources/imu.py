@@ -13,7 +13,6 @@ from sensor_msgs.msg import Imu
 
 from starpos.instrument.tilt_log import noise_text
 from starpos.messages.tilt import MIN_MESSAGES, ImuTilts, Reading
-from starpos.session import inclinometer_parameters
 from starpos_common.topics import MatchedSubscription, Take, subscription
 from starpos_inclinometer.sources.source import Counts, Health, Phase, Surroundings, TiltSource
 
@@ -33,7 +32,7 @@ PATIENCE_S = 0.8
 class ImuSource(TiltSource):
     """Averages the messages on TOPIC to readings."""
 
-    parameters, name = inclinometer_parameters.IMU, TOPIC
+    name = TOPIC
 
     def __init__(self, host: Surroundings, values: Mapping[str, Any]) -> None:
         self._clock, self._wake = host.clock, host.wake
@@ -111,7 +110,7 @@ class ImuSource(TiltSource):
         if self._tilts.excess > PLACEHOLDER:
             return (
                 f"the variance on {self._topic} is a placeholder: {self._tilts.excess:.2g} times the scatter of its "
-                f"messages (1 sigma), and it widens fixes; set imu.variance to {inclinometer_parameters.SCATTER}."
+                f"messages (1 sigma), and it widens fixes; set imu.variance to scatter."
             )
         return ""
 

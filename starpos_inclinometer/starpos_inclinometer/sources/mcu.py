@@ -14,9 +14,8 @@ from typing import Any
 
 from starpos.instrument.tilt_log import noise_text
 from starpos.messages.tilt import TIME_UNKNOWN, Reading
-from starpos_common.parameters import Parameter
 from starpos_inclinometer.clock import ArrivalFilter, Moment
-from starpos_inclinometer.sources import mcu_protocol, tilts
+from starpos_inclinometer.sources import mcu_protocol
 from starpos_inclinometer.sources.mcu_protocol import (
     Continuity,
     Gate,
@@ -28,7 +27,7 @@ from starpos_inclinometer.sources.mcu_protocol import (
     SensorKind,
     mcu_follows,
 )
-from starpos_inclinometer.sources.serial_link import SERIAL_PARAMETERS, SerialLink, port_refusal
+from starpos_inclinometer.sources.serial_link import SerialLink, port_refusal
 from starpos_inclinometer.sources.source import Arrival, Counts, LinkSource, Surroundings, TimedPulse
 from starpos_inclinometer.sources.tilts import (
     BoardSensor,
@@ -145,95 +144,6 @@ BITS_PER_BYTE = 10
 NEAR_CODES = {SensorKind.SCA100T: 11_000, SensorKind.SCL3300: 2_330}
 # Below this determinant of the cross-axis matrix the two axes are not independent.
 SMALLEST_DETERMINANT = 0.5
-RATE_PARAMETER = Parameter(
-    "rate",
-    10,
-    "Samples a second from the microcontroller, or from source iio without a trigger. Above the "
-    "sensor's bandwidth (SCA100T: 18 Hz) more samples add little.",
-    unit="Hz",
-    minimum=mcu_protocol.MIN_RATE_HZ,
-    maximum=mcu_protocol.MAX_RATE_HZ,
-)
-PARAMETERS = (
-    *SERIAL_PARAMETERS,
-    RATE_PARAMETER,
-    Parameter(
-        "offset_volts",
-        (2.5, 2.5),
-        "Sensor output of x and y at zero tilt; an error of 1 mV is 52 arcsec of tilt, 1.6 km of position.",
-        unit="V",
-        minimum=0.0,
-        maximum=5.5,
-    ),
-    Parameter(
-        "sensitivity",
-        (4.0, 4.0),
-        "Sensor sensitivity of x and y, 4 for the SCA100T-D01; 0.1 % off is 36 arcsec at 10 deg of tilt.",
-        unit="V/g",
-        minimum=0.1,
-        maximum=100.0,
-    ),
-    Parameter(
-        "divider",
-        tilts.DIVIDER,
-        "Divider between sensor and ADC, (R1 + R2) / R2; 0.1 % off is 36 arcsec at 10 deg of tilt.",
-        unit="",
-        minimum=1.0,
-        maximum=1000.0,
-    ),
-    Parameter(
-        "reference_volts",
-        tilts.ADC_NOMINAL_REFERENCE_V,
-        "Voltage of ADC reference and sensor supply when offset_volts and sensitivity were "
-        "measured. The circuit is ratiometric, so today's voltage does not matter.",
-        unit="V",
-        minimum=4.5,
-        maximum=5.5,
-    ),
-    Parameter(
-        "cross_axis",
-        (1.0, 0.0, 0.0, 1.0),
-        "Matrix (xx, xy, yx, yy) from the accelerations along the sensor's two axes, in g, to X' "
-        "and Y' of S. An error of 0.01 in xy is 0.6 deg in x at 90 deg of y, and 360 arcsec at 10 "
-        "deg.",
-        unit="",
-        minimum=-2.0,
-        maximum=2.0,
-    ),
-    Parameter(
-        "temperature.reference",
-        25.0,
-        "Temperature at which offset_volts and sensitivity were measured. The four polynomials "
-        "below are in T minus this temperature.",
-        unit="deg C",
-        minimum=-40.0,
-        maximum=125.0,
-    ),
-    *(
-        Parameter(
-            f"temperature.offset_{axis}",
-            (0.0, 0.0, 0.0),
-            f"Change of the offset of {axis} with temperature: linear, square and cubic term; 0.5 mV/deg C left out "
-            "is 26 arcsec a degree. All zeros: no compensation.",
-            unit="V/deg C^n",
-            minimum=-0.1,
-            maximum=0.1,
-        )
-        for axis in "xy"
-    ),
-    *(
-        Parameter(
-            f"temperature.sensitivity_{axis}",
-            (0.0, 0.0, 0.0),
-            f"Relative change of the sensitivity of {axis} with temperature: linear, square and cubic term. At 10 deg "
-            "of tilt, 0.0001/deg C left out is 3.6 arcsec a degree.",
-            unit="1/deg C^n",
-            minimum=-0.01,
-            maximum=0.01,
-        )
-        for axis in "xy"
-    ),
-)
 
 
 def calibration(values: Mapping[str, Any]) -> Sca100tCalibration:
@@ -423,8 +333,6 @@ class McuTilts:
 
 class McuSource(LinkSource):
     """The starpos microcontroller on a serial port; see `McuTilts`."""
-
-    parameters = PARAMETERS
 
     def __init__(self, host: Surroundings, values: Mapping[str, Any]) -> None:
         self.name = values["port"]

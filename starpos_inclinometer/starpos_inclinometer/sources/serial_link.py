@@ -11,7 +11,6 @@ from typing import Any, Protocol
 
 import serial
 
-from starpos_common.parameters import Parameter
 from starpos_inclinometer.clock import HostClock, Moment
 from starpos_inclinometer.sources import mcu_protocol
 from starpos_inclinometer.sources.source import Arrival, Counts, Link, Phase
@@ -27,25 +26,6 @@ PTY_MAJORS = range(136, 144)
 
 # pyserial raises its own error, passes on some errors of the system, and raises TypeError if its descriptor is gone.
 PORT_ERRORS = (OSError, termios.error, serial.SerialException, TypeError, ValueError)
-
-SERIAL_PARAMETERS = (
-    Parameter(
-        "port",
-        "/dev/ttyUSB0",
-        "Serial port. A path such as /dev/serial/by-id/... stays the same after replugging; "
-        "/dev/ttyUSB0 may become another device.",
-        read_only=True,
-    ),
-    Parameter(
-        "baud",
-        mcu_protocol.BAUD,
-        "Speed of the serial line. With a wrong one no line can be read.",
-        unit="baud",
-        minimum=1200,
-        maximum=1_000_000,
-        read_only=True,
-    ),
-)
 
 
 def port_refusal(values: Mapping[str, Any]) -> str | None:

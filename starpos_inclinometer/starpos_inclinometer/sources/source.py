@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Interface between the node and a sensor, and the link to a sensor that a thread reads.
 
-A new sensor is a TiltSource in a module here, and a line in `parameters`.
+A new sensor is a TiltSource in a module here, and a line in `registry`.
 """
 
 import threading
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from typing import Any
@@ -14,7 +14,6 @@ from typing import Any
 from rclpy.node import Node
 
 from starpos.messages.tilt import Reading
-from starpos_common.parameters import Parameter
 from starpos_common.topics import Take
 from starpos_inclinometer.clock import HostClock, Moment, Step
 
@@ -210,7 +209,6 @@ class TiltSource:
     Only the node's thread calls it.
     """
 
-    parameters: Sequence[Parameter]
     # The port or topic of the device, for diagnostics.
     name: str
 

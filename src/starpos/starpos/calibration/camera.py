@@ -305,7 +305,7 @@ class _Frame:
         catalogue: Catalogue,
         table: TriangleCatalogue,
     ) -> "_Frame":
-        return cls(stars.take(stars.on_frame), level, Sky.at(catalogue, table, stars.mid_unix_s))
+        return cls(stars.select(stars.on_frame), level, Sky.at(catalogue, table, stars.mid_unix_s))
 
     def sighting(
         self, camera: Camera, atmosphere: Atmosphere, attitude: np.ndarray | None
@@ -314,7 +314,7 @@ class _Frame:
 
         Raises InstrumentError for a mirrored frame.
         """
-        stars = self.stars.take(camera.sees(self.stars.x, self.stars.y))
+        stars = self.stars.select(camera.sees(self.stars.x, self.stars.y))
         seen = unbent(camera.directions(stars.x, stars.y), self.level, atmosphere)
         priors = () if attitude is None else (PointingPrior(attitude, camera.fx),)
         found = identify_directions(seen, stars.sigma, camera, self.sky, priors)

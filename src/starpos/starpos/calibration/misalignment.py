@@ -29,7 +29,7 @@ from starpos.fix.solver import Solver
 from starpos.frames.frame import Stars
 from starpos.frames.tables import Pointing
 from starpos.identification import Identification
-from starpos.identification.hint import Hint
+from starpos.identification.prior import Hint
 from starpos.instrument.inclinometer import InclinometerErrors, up_of
 from starpos.instrument.instrument import (
     MAX_C,

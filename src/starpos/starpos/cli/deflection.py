@@ -20,11 +20,11 @@ from starpos.instrument.instrument import Instrument, with_frame_size
 from starpos.night.bag import each_frame, is_bag
 from starpos.night.reading import First
 from starpos.night.remarks import of_inclinometer
-from starpos.night.work import DeflectionSession, OnFile, ZenithSighted
+from starpos.night.work import OnFile, ZenithSighted
 from starpos.sky.catalogue import Catalogue, load_catalogue
 from starpos.units import ARCSEC, utc_text
 from starpos.zenith.adjustment import FaceQuality, Reduced, StarQuality, reduced
-from starpos.zenith.doubts import remarks
+from starpos.zenith.doubts import DeflectionSession, remarks
 from starpos.zenith.planning import Planner, Routine, SessionPlan, ZenithSky
 from starpos.zenith.sighting import Mark, ZenithSighting
 

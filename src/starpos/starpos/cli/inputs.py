@@ -23,7 +23,7 @@ from starpos.night.reading import About, Given, Reader, TiltFile
 from starpos.night.remarks import NEAR_KM, Near, of_tilts
 from starpos.parallel.cluster import Cluster
 from starpos.parallel.processes import Here, Processes, Workers, processors
-from starpos.session.parameter_file import drivers_of
+from starpos.recording.drivers import Drivers
 from starpos.sky import catalogue
 
 if TYPE_CHECKING:
@@ -171,7 +171,7 @@ def read_bag(path: Path, args: argparse.Namespace) -> "tuple[Recorded, OfBag]":
     from starpos.night import bag
 
     any_camera = options.instrument_of(args, no_stars(100, 100, focal_px=1000.0))
-    drivers = drivers_of(args.params_file, args.param, args.namespace, options.remaps_of(args))
+    drivers = Drivers.of(args.params_file, args.param, args.namespace, options.remaps_of(args))
     found = bag.read(path, args.namespace, any_camera.inclinometer.noise_rad, drivers, console.ProgressBar())
     told = (args.instrument, args.focal_mm) != (None, None)
     cameras = found.cameras if args.focal_mm is None else {}

@@ -35,12 +35,13 @@ from starpos.night.opening import frames_in
 from starpos.night.reading import stars_of
 from starpos.night.remarks import of_a3, of_inclinometer
 from starpos.night.together import Solved, extrapolated
+from starpos.recording.drivers import Drivers
 from starpos.recording.topics import NO_REMAPS, Remaps
 from starpos.report.field import INSTRUMENT, is_field, opened
 from starpos.session import frames
 from starpos.session.frames import Answered, Averaged
-from starpos.session.parameter_file import drivers_of, settings_of
 from starpos.session.replay import Replay
+from starpos.session.settings import Settings
 from starpos.units import utc_text
 
 
@@ -125,14 +126,14 @@ class Playing:
         return self._played(lambda replay: replay.play(Path(bag), self.namespace), self.given)
 
     def _played(self, play: Callable[[Replay], Iterator[frames.Output]], given: Sequence[str]) -> PlayedNight:
-        settings = settings_of(self.params_file, given, self.namespace)
+        settings = Settings.of(self.params_file, given, self.namespace)
         night = PlayedNight(instrument=settings.instrument(None))
         said = _Said(night)
         replay = Replay(
             settings,
             said,
             said,
-            drivers_of(self.params_file, self.given, self.namespace, self.remaps),
+            Drivers.of(self.params_file, self.given, self.namespace, self.remaps),
         )
         try:
             for output in play(replay):
@@ -168,10 +169,10 @@ def _played(replay: Replay, folder: Path) -> Iterator[frames.Output]:
 
 
 def run(args: argparse.Namespace) -> int:
-    settings = settings_of(args.params_file, args.param, args.namespace)
+    settings = Settings.of(args.params_file, args.param, args.namespace)
     output = Output(args, COLUMNS, HEAD)
     # a wrong parameter is reported once, not for each bag
-    drivers_of(args.params_file, args.param, args.namespace)
+    Drivers.of(args.params_file, args.param, args.namespace)
     work = Playing(args.params_file, tuple(args.param), args.namespace, options.remaps_of(args))
     with inputs.workers_of(args, len(args.bags)) as workers:
         answers = inputs.watched(workers.map((work, bag) for bag in args.bags), len(args.bags), "bag")

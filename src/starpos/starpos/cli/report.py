@@ -16,7 +16,7 @@ from starpos.night.night import Night
 from starpos.night.opening import exposures, frames_in
 from starpos.night.reading import First, Given, Reader
 from starpos.night.solving import Exposures, solved_night
-from starpos.session.parameter_file import of_solver
+from starpos.parameters.given import of_solver
 from starpos.sky import catalogue
 from starpos.units import utc_text
 

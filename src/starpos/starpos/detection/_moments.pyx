@@ -1,8 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 # cython: language_level=3, boundscheck=False, wraparound=False, cdivision=True, initializedcheck=False
-"""Moments of images through elliptical Gaussian windows, and the places of images by them."""
+"""Moments of images through elliptical Gaussian windows, and covariances of two dimensions, many at once.
 
-from libc.math cimport INFINITY, NAN, exp, fabs, isnan, rint, sqrt
+The latter are closed forms of what takes a library longer to begin than to do.
+"""
+
+from libc.math cimport INFINITY, NAN, exp, fabs, isfinite, isnan, rint, sqrt
 from libc.stdlib cimport free, malloc
 from libc.string cimport memcpy, memset
 
@@ -10,7 +13,7 @@ import numpy as np
 
 cimport starpos._numeric.wide
 from starpos._numeric.algebra cimport middle
-from starpos.detection._shapes cimport Shape, clipped_to, inverse, put_shape, shape_before, sides, with_sides
+from starpos.detection._shapes cimport Shape, clipped_to, inverse, put_shape, shape_before, shape_of, sides, with_sides
 
 cdef extern from *:
     """
@@ -106,7 +109,7 @@ cdef struct Image:
     int stride
 
 
-cdef int _begin(Image *image, int size) except -1:
+cdef int _allocate(Image *image, int size) except -1:
     """Take memory for an image (size, size)."""
     image.size, image.stride = size, (size + LANES - 1) // LANES * LANES
     image.light = <float *>malloc(max(size * image.stride, 1) * sizeof(float))
@@ -115,7 +118,7 @@ cdef int _begin(Image *image, int size) except -1:
     return 0
 
 
-cdef void _take(Image *image, const float *signal) noexcept nogil:
+cdef void _load(Image *image, const float *signal) noexcept nogil:
     """Take the pixels (S, S) of an image."""
     cdef int j
     for j in range(image.size):
@@ -156,7 +159,7 @@ cdef void _moments(const Image *image, const double *window, double left, double
     out[5] -= out[2] * out[2]
 
 
-cdef int _sound(const float[:, :, ::1] signal, int places, int rows, const double[:, :, ::1] windows) except -1:
+cdef int _check_images(const float[:, :, ::1] signal, int places, int rows, const double[:, :, ::1] windows) except -1:
     """Raise ValueError unless there are a place and a window for each square image."""
     cdef Py_ssize_t n = signal.shape[0]
     if places != n or rows != n or signal.shape[1] != signal.shape[2] or windows.shape[0] not in (1, n):
@@ -166,7 +169,7 @@ cdef int _sound(const float[:, :, ::1] signal, int places, int rows, const doubl
     return 0
 
 
-def windowed(
+def window_moments(
     const float[:, :, ::1] signal, const double[::1] left, const double[::1] top, const double[:, :, ::1] window
 ):
     """Moments of N images (N, S, S) through windows about points.
@@ -179,15 +182,15 @@ def windowed(
     cdef int n = signal.shape[0], k
     cdef Image image
     cdef double[6] found
-    _sound(signal, left.shape[0], top.shape[0], window)
+    _check_images(signal, left.shape[0], top.shape[0], window)
     masses, means, shapes = np.empty(n), np.empty((n, 2)), np.empty((n, 2, 2))
     cdef double[::1] mass = masses
     cdef double[:, ::1] mean = means
     cdef double[:, :, ::1] shape = shapes
-    _begin(&image, signal.shape[1])
+    _allocate(&image, signal.shape[1])
     with nogil:
         for k in range(n):
-            _take(&image, &signal[k, 0, 0])
+            _load(&image, &signal[k, 0, 0])
             _moments(&image, &window[k if window.shape[0] > 1 else 0, 0, 0], left[k], top[k], found)
             mass[k], mean[k, 0], mean[k, 1] = found[0], found[1], found[2]
             shape[k, 0, 0], shape[k, 1, 1] = found[3], found[5]
@@ -196,7 +199,7 @@ def windowed(
     return masses, means, shapes
 
 
-def centred(
+def centroids(
     const float[:, :, ::1] signal, const Py_ssize_t[::1] column, const Py_ssize_t[::1] row,
     const double[:, :, ::1] window, const double[:, :, ::1] gain, int rounds, double farthest,
 ):
@@ -210,17 +213,17 @@ def centred(
     cdef int n = signal.shape[0], k, w
     cdef Image image
     cdef double[2] begin
-    _sound(signal, column.shape[0], row.shape[0], window)
-    _sound(signal, column.shape[0], row.shape[0], gain)
+    _check_images(signal, column.shape[0], row.shape[0], window)
+    _check_images(signal, column.shape[0], row.shape[0], gain)
     if gain.shape[0] != window.shape[0]:
         raise ValueError(f"{window.shape[0]} windows and {gain.shape[0]} gains: as many are needed")
     out = np.empty((n, 2))
     cdef double[:, ::1] places = out
-    _begin(&image, signal.shape[1])
+    _allocate(&image, signal.shape[1])
     with nogil:
         for k in range(n):
             w = k if window.shape[0] > 1 else 0
-            _take(&image, &signal[k, 0, 0])
+            _load(&image, &signal[k, 0, 0])
             begin[0], begin[1] = column[k], row[k]
             _centre(&image, &window[w, 0, 0], &gain[w, 0, 0], begin, rounds, farthest, &places[k, 0])
     free(image.light)
@@ -231,7 +234,7 @@ cdef void _centre(
     const Image *image, const double *window, const double *gain, const double *begin, int rounds, double farthest,
     double *place,
 ) noexcept nogil:
-    """Set place (2,) px by the mean of an image's light, as `centred` explains."""
+    """Set place (2,) px by the mean of an image's light, as `centroids` explains."""
     cdef double[6] found
     cdef double half = image.size // 2, step
     cdef int round_, i
@@ -286,10 +289,10 @@ def own_shapes(
     cdef double[:, ::1] width = widths
     low = high = first
     begin[0] = begin[1] = half
-    _begin(&image, signal.shape[1])
+    _allocate(&image, signal.shape[1])
     with nogil:
         for k in range(n):
-            _take(&image, &signal[k, 0, 0])
+            _load(&image, &signal[k, 0, 0])
             own = Shape(first, 0.0, first)
             for round_ in range(rounds):
                 through = clipped_to(own, narrowest_window, INFINITY, 1.0)
@@ -310,7 +313,7 @@ def own_shapes(
     return out, widths
 
 
-def settled(
+def typical_shape(
     const float[:, :, ::1] signal, double first, double narrowest_window, double narrowest, double widest, int rounds,
     double farthest, double thinnest, double enough,
 ):
@@ -331,7 +334,7 @@ def settled(
     cdef double *found
     if signal.shape[1] != signal.shape[2]:
         raise ValueError(f"images of {signal.shape[2]} x {signal.shape[1]} px: they must be square")
-    _begin(&image, signal.shape[1])
+    _allocate(&image, signal.shape[1])
     # of each image its place and moments; of the images that count each of three moments
     cdef double *room = <double *>malloc(max(11 * n, 1) * sizeof(double))
     if room == NULL:
@@ -346,7 +349,7 @@ def settled(
             _set_window(through, window)
             for k in range(n):
                 found = room + 8 * k
-                _take(&image, &signal[k, 0, 0])
+                _load(&image, &signal[k, 0, 0])
                 _moments(&image, window, -found[0], -found[1], found + 2)
                 if not (fabs(found[3]) < farthest and fabs(found[4]) < farthest):
                     found[2] = 0.0
@@ -376,3 +379,96 @@ def settled(
     free(room)
     free(image.light)
     return None if isnan(own.xx) else np.array([[own.xx, own.xy], [own.xy, own.yy]])
+
+
+cdef Py_ssize_t _count(const double[:, :, ::1] one, const double[:, :, ::1] other, const double[:, :, ::1] more) except -1:
+    """How many matrices (2, 2) there are; ValueError unless all are as many, or one."""
+    cdef Py_ssize_t n = max(one.shape[0], other.shape[0], more.shape[0])
+    if 0 in (one.shape[0], other.shape[0], more.shape[0]):
+        n = 0
+    for count, rows, columns in (
+        (one.shape[0], one.shape[1], one.shape[2]),
+        (other.shape[0], other.shape[1], other.shape[2]),
+        (more.shape[0], more.shape[1], more.shape[2]),
+    ):
+        if count not in (1, n) or (rows, columns) != (2, 2):
+            raise ValueError(f"{count} matrices of {rows} x {columns}: {n} of 2 x 2 are needed, or one")
+    return n
+
+
+def invert_shapes(const double[:, :, ::1] shape):
+    """Inverses of covariances (N, 2, 2)."""
+    cdef Py_ssize_t n = _count(shape, shape, shape), k
+    out = np.empty((n, 2, 2))
+    cdef double[:, :, ::1] found = out
+    with nogil:
+        for k in range(n):
+            put_shape(found, k, inverse(shape_of(shape, k)))
+    return out
+
+
+def squared_widths(const double[:, :, ::1] shape):
+    """Eigenvalues (N, 2) of covariances (N, 2, 2), the smaller first."""
+    cdef Py_ssize_t n = _count(shape, shape, shape), k
+    out = np.empty((n, 2))
+    cdef double[:, ::1] width = out
+    with nogil:
+        for k in range(n):
+            width[k, 0], width[k, 1] = sides(shape_of(shape, k))
+    return out
+
+
+def clip_widths(const double[:, :, ::1] shape, double least, double most, double exponent):
+    """Covariances (N, 2, 2) with eigenvalues of at least and at most so much, to a power."""
+    cdef Py_ssize_t n = _count(shape, shape, shape), k
+    out = np.empty((n, 2, 2))
+    cdef double[:, :, ::1] found = out
+    with nogil:
+        for k in range(n):
+            put_shape(found, k, clipped_to(shape_of(shape, k), least, most, exponent))
+    return out
+
+
+def through_window(const double[:, :, ::1] shape, const double[:, :, ::1] window):
+    """Covariances (N, 2, 2) of the images of stars of covariance `shape` through windows, each (N, 2, 2) or (1, 2, 2)."""
+    cdef Py_ssize_t n = _count(shape, window, window), k
+    cdef Shape a, b
+    out = np.empty((n, 2, 2))
+    cdef double[:, :, ::1] found = out
+    with nogil:
+        for k in range(n):
+            a, b = inverse(shape_of(shape, k)), inverse(shape_of(window, k))
+            put_shape(found, k, inverse(Shape(a.xx + b.xx, a.xy + b.xy, a.yy + b.yy)))
+    return out
+
+
+def without_window(const double[:, :, ::1] seen, const double[:, :, ::1] window):
+    """Covariances (N, 2, 2) of stars whose images through windows are seen; NaN where none is. The reverse of `through_window`."""
+    cdef Py_ssize_t n = _count(seen, window, window), k
+    out = np.empty((n, 2, 2))
+    cdef double[:, :, ::1] found = out
+    with nogil:
+        for k in range(n):
+            put_shape(found, k, shape_before(shape_of(seen, k), shape_of(window, k)))
+    return out
+
+
+def width_ratios(const double[:, :, ::1] seen, const double[:, :, ::1] expected):
+    """The smaller and the larger squared width (N, 2) of images, over those of expected ones; 0 for what is not a number."""
+    cdef Py_ssize_t n = _count(seen, expected, expected), k
+    cdef double a, b, c
+    cdef Shape s, e
+    out = np.zeros((n, 2))
+    cdef double[:, ::1] width = out
+    with nogil:
+        for k in range(n):
+            s, e = shape_of(seen, k), shape_of(expected, k)
+            # by the Cholesky factor of the expected one, a 0, b c
+            a = sqrt(e.xx)
+            b = e.xy / a
+            c = sqrt(e.yy - b * b)
+            s.xx, s.xy = s.xx / (a * a), (s.xy - b * s.xx / a) / (a * c)
+            s.yy = (s.yy - 2 * b * c * s.xy - b * b * s.xx) / (c * c)
+            if isfinite(s.xx + s.xy + s.yy):
+                width[k, 0], width[k, 1] = sides(s)
+    return out

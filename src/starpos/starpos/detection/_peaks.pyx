@@ -76,7 +76,7 @@ cdef struct Window:
     float *least
 
 
-cdef int _begin(Smoother *s, Py_ssize_t width, const float[::1] weight) except -1:
+cdef int _allocate(Smoother *s, Py_ssize_t width, const float[::1] weight) except -1:
     """Take memory for smoothing rows."""
     cdef int k
     cdef double share = 0.0
@@ -99,7 +99,7 @@ cdef int _begin(Smoother *s, Py_ssize_t width, const float[::1] weight) except -
     return 0
 
 
-def smoothed(const pixel_t[:, ::1] plane, const float[::1] weight, const Py_ssize_t[::1] rows, int step):
+def smooth_rows(const pixel_t[:, ::1] plane, const float[::1] weight, const Py_ssize_t[::1] rows, int step):
     """Some rows (R,) of a plane (h, w), and of these every `step`-th pixel, smoothed along both axes.
 
     weight  (reach + 1,): from the middle outwards
@@ -112,7 +112,7 @@ def smoothed(const pixel_t[:, ::1] plane, const float[::1] weight, const Py_ssiz
         raise ValueError(f"rows and steps of {step} px beyond the {width} x {plane.shape[0]} px of the frame")
     out = np.empty((rows.shape[0], (width + step - 1) // step), np.float32)
     cdef float[:, ::1] smooth = out
-    _begin(&s, width, weight)
+    _allocate(&s, width, weight)
     cdef float *across = <float *>malloc((s.stride + width) * sizeof(float))
     if across == NULL:
         free(s.plain)
@@ -129,11 +129,11 @@ def smoothed(const pixel_t[:, ::1] plane, const float[::1] weight, const Py_ssiz
     return out
 
 
-def peaks(
+def find_maxima(
     const pixel_t[:, ::1] plane, const float[::1] weight, int flat, const float[:, ::1] limit, int strip, int first,
     int last,
 ):
-    """Peaks of a plane (h, w) smoothed as in `smoothed`: pixels above a limit, of which none within `flat` px is higher.
+    """Peaks of a plane (h, w) smoothed as in `smooth_rows`: pixels above a limit, of which none within `flat` px is higher.
 
     limit        (strips, C): of each strip of so many rows, in cells that cover its width evenly, with one more beyond each
                  end; linear between them
@@ -152,7 +152,7 @@ def peaks(
         raise ValueError(f"limits of {limit.shape[0]} strips of {strip} rows, in {limit.shape[1]} cells, for rows {first} to {last}")
     w.kept, w.width, w.blocks = 2 * flat + 1, width, (width + BLOCK - 1) // BLOCK
     g.each, g.count, g.room, g.last = NULL, 0, 0, -3
-    _begin(&s, width, weight)
+    _allocate(&s, width, weight)
     s.highest = &highest[0]
     w.across = <float *>malloc((w.kept * (s.stride + width) + width + w.blocks) * sizeof(float))
     w.known = <unsigned char *>malloc(w.kept * w.blocks)
@@ -173,7 +173,7 @@ def peaks(
                     done += 1
                 if row == first or row % strip == 0:
                     _spread(&limit[row // strip, 0], limit.shape[1], &s, &w)
-                _take_peaks(&s, &w, height, row, flat, &g)
+                _find_in_row(&s, &w, height, row, flat, &g)
         return *_columns(&g), highest_[first:last]
     finally:
         free(w.across)
@@ -205,7 +205,7 @@ cdef inline Py_ssize_t _mirrored(Py_ssize_t k, Py_ssize_t n) noexcept nogil:
     return k if n > 1 else 0
 
 
-cdef wide_void _widen(const pixel_t *row, Py_ssize_t n, float *out, int *highest) noexcept nogil:
+cdef wide_void _load_row(const pixel_t *row, Py_ssize_t n, float *out, int *highest) noexcept nogil:
     """Take a row of n pixels, and its highest."""
     cdef pixel_t most = 0
     cdef Py_ssize_t k
@@ -265,7 +265,7 @@ cdef void _smooth_across(const pixel_t[:, ::1] plane, Smoother *s, Py_ssize_t ro
         s.end = max(row - s.reach, 0)
     s.last = row
     while s.end < min(row + s.reach + 1, height):
-        _widen(&plane[s.end, 0], width, s.plain + (s.end % s.slots) * width, &highest)
+        _load_row(&plane[s.end, 0], width, s.plain + (s.end % s.slots) * width, &highest)
         if s.highest != NULL:
             s.highest[s.end] = highest
         s.end += 1
@@ -300,7 +300,7 @@ cdef void _finish(const Smoother *s, Window *w, Py_ssize_t row, Py_ssize_t block
         )
 
 
-cdef int _take_peaks(const Smoother *s, Window *w, Py_ssize_t height, Py_ssize_t row, int flat, Groups *g) except -1 nogil:
+cdef int _find_in_row(const Smoother *s, Window *w, Py_ssize_t height, Py_ssize_t row, int flat, Groups *g) except -1 nogil:
     """Add the peaks of a row to their groups. Most blocks are too dark for a peak: they are not smoothed along the row."""
     cdef const float *own = w.smooth + (row % w.kept) * w.width
     # the first pixel that the row's first one is made of

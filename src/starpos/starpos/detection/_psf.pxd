@@ -5,6 +5,8 @@ cdef enum:
     # Pixels that are evaluated together, and terms of a series along one axis.
     BLOCK = 64
     ORDERS = 32
+    # Monomials that describe a variation over the field.
+    MONOMIALS = 6
 
 
 cdef inline int blocks(int pixels) noexcept nogil:

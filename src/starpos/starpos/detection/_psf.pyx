@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 # cython: language_level=3, boundscheck=False, wraparound=False, cdivision=True, initializedcheck=False
-"""The PSF of stars at pixels: a Gauss-Hermite series (`detection.psf`), its derivatives, and its single terms."""
+"""The PSF of stars: at places of the field, over which it may vary, and at pixels: a Gauss-Hermite series (`detection.psf`)."""
 
-from libc.math cimport M_PI, fabs, sqrt
+from libc.math cimport M_PI, fabs, isnan, sqrt
 from libc.stdlib cimport free, malloc
 
 import numpy as np
 
 from starpos._numeric.wide cimport fused_void
+from starpos.detection._shapes cimport Shape, clipped_to
 
 cdef extern from *:
     """
@@ -236,3 +237,93 @@ cdef void terms_at(
 ) noexcept nogil:
     """Set rows of `out`, so far apart, to terms h_i(u) h_j(v) of a block's pixels times the Gaussian; (i, j) in orders (T, 2)."""
     _terms(orders, count, highest, u, v, gauss, out, apart)
+
+
+cdef inline double _in_box(double place, double low, double high) noexcept nogil:
+    """A coordinate from -1 to 1 over the box, and beyond it as on its edge; 0 for what is not a number."""
+    cdef double scaled = 2 * (place - low) / max(high - low, 1.0) - 1
+    return 0.0 if isnan(scaled) else max(-1.0, min(scaled, 1.0))
+
+
+cdef inline void _monomials(double x, double y, const double[:, ::1] box, double *out) noexcept nogil:
+    cdef double p = _in_box(x, box[0, 0], box[1, 0]), q = _in_box(y, box[0, 1], box[1, 1])
+    out[0], out[1], out[2], out[3], out[4], out[5] = 1.0, p, q, p * p - 1.0 / 3, p * q, q * q - 1.0 / 3
+
+
+cdef int _check_box(const double[::1] x, const double[::1] y, const double[:, ::1] box) except -1:
+    if y.shape[0] != x.shape[0] or box.shape[0] != 2 or box.shape[1] != 2:
+        raise ValueError(f"{x.shape[0]} columns and {y.shape[0]} rows in a box of {box.shape[0]} corners: as many, and 2")
+    return 0
+
+
+def monomials(const double[::1] x, const double[::1] y, const double[:, ::1] box):
+    """Monomials (N, 6) of x, y (N,) scaled to -1..1 over the box (2, 2); all but the first have zero mean over it."""
+    cdef Py_ssize_t k
+    _check_box(x, y, box)
+    out = np.empty((x.shape[0], MONOMIALS))
+    cdef double[:, ::1] each = out
+    with nogil:
+        for k in range(x.shape[0]):
+            _monomials(x[k], y[k], box, &each[k, 0])
+    return out
+
+
+def psf_at(
+    const double[::1] x, const double[::1] y, const double[:, ::1] box, const double[:, ::1] axes,
+    const double[:, :, ::1] widths, const double[:, :, ::1] series, double least, double most,
+):
+    """Axes (N, 2, 2) and series (N, I, J) of a PSF at the places x, y (N,), as `detection.psf.Psf` has them.
+
+    What is the same everywhere comes once, (1, ...). Squared widths are at least and at most so much.
+    """
+    cdef Py_ssize_t n = x.shape[0], k, j, m, terms = series.shape[1] * series.shape[2]
+    cdef double[MONOMIALS] here
+    cdef Shape s
+    _check_box(x, y, box)
+    for count in (widths.shape[0], series.shape[0]):
+        if count not in (1, MONOMIALS):
+            raise ValueError(f"{count} monomials: they are 1 or {MONOMIALS}")
+    if (axes.shape[0], axes.shape[1], widths.shape[1], widths.shape[2]) != (2, 2, 2, 2):
+        raise ValueError("axes and widths of 2 x 2 numbers are needed")
+    cdef bint wide = widths.shape[0] > 1, varied = series.shape[0] > 1
+    out = np.empty((n if wide else 1, 2, 2))
+    shapes = np.zeros((n, series.shape[1], series.shape[2])) if varied else series
+    cdef double[:, :, ::1] own = out
+    cdef double[:, ::1] terms_of = shapes.reshape(n, terms) if varied else np.empty((0, 0))
+    if not wide:
+        own[0, :, :] = axes
+    with nogil:
+        for k in range(n if wide or varied else 0):
+            _monomials(x[k], y[k], box, here)
+            if wide:
+                s = Shape(0.0, 0.0, 0.0)
+                for m in range(MONOMIALS):
+                    s.xx += here[m] * widths[m, 0, 0]
+                    s.xy += here[m] * (widths[m, 0, 1] + widths[m, 1, 0]) / 2
+                    s.yy += here[m] * widths[m, 1, 1]
+                s = clipped_to(s, least, most, -0.5)
+                for j in range(2):
+                    own[k, 0, j] = s.xx * axes[0, j] + s.xy * axes[1, j]
+                    own[k, 1, j] = s.xy * axes[0, j] + s.yy * axes[1, j]
+            if varied:
+                for m in range(MONOMIALS):
+                    for j in range(terms):
+                        terms_of[k, j] += here[m] * (&series[m, 0, 0])[j]
+    return out, np.asarray(shapes)
+
+
+def shapes_of(const double[:, :, ::1] axes):
+    """Covariances (N, 2, 2) px2 of the Gaussians of PSFs with these axes (N, 2, 2)."""
+    cdef Py_ssize_t k
+    cdef double a, b, c, d, volume2
+    if axes.shape[1] != 2 or axes.shape[2] != 2:
+        raise ValueError(f"axes of {axes.shape[1]} x {axes.shape[2]} numbers: 2 x 2 are needed")
+    out = np.empty((axes.shape[0], 2, 2))
+    cdef double[:, :, ::1] shape = out
+    with nogil:
+        for k in range(axes.shape[0]):
+            a, b, c, d = axes[k, 0, 0], axes[k, 0, 1], axes[k, 1, 0], axes[k, 1, 1]
+            volume2 = (a * d - b * c) * (a * d - b * c)
+            shape[k, 0, 0], shape[k, 1, 1] = (b * b + d * d) / volume2, (a * a + c * c) / volume2
+            shape[k, 0, 1] = shape[k, 1, 0] = -(a * b + c * d) / volume2
+    return out

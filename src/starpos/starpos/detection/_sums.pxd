@@ -7,11 +7,11 @@ from libc.string cimport memset
 from starpos._numeric.wide cimport fused_void, lanes, sum_of, wide_void
 
 
-cdef inline wide_void take(
+cdef inline wide_void copy_pixels(
     const float *signal, const float *noise, const unsigned char *good, const unsigned char *outlier, int place, int n, int step,
     double x, double y, int *places, double *dx, double *dy, double *own_signal, double *noise2, double *weight,
 ) noexcept nogil:
-    """Take n pixels of a row, each `step` (1 or 2) after the one before.
+    """Copy n pixels of a row, each `step` (1 or 2) after the one before.
 
     That is their light, squared noise, whether they are good and no outliers, places in the stamp from `place` on, and offsets.
     """
@@ -41,7 +41,7 @@ cdef inline fused_void weigh(
         weight[p] /= noise2[p] + dn_per_photon * some + misfit2 * some * some
 
 
-cdef inline void of_sky(
+cdef inline void sky_sums(
     const double *weight, const double *noise2, const double *f, const double *signal, int n, double *out
 ) noexcept nogil:
     """Sums over n pixels of their PSF squared and times the signal, with the weights over the sky's variance."""
@@ -113,3 +113,23 @@ cdef inline fused_void products(
         out[k] = sum_of(&sums[k])
         for p in range(n // 4 * 4, n):
             out[k] += weight[p] * one[k][p] * other[k][p]
+
+
+cdef inline fused_void cross_products(
+    const double *weight, const double **one, const double **other, int n, double *out
+) noexcept nogil:
+    """Products of three columns with three others and the weights, summed over n pixels: ad, ae, af, bd, be, bf, cd, ce, cf."""
+    cdef lanes[9] sums
+    cdef lanes wa
+    cdef int a, b, p
+    memset(sums, 0, sizeof(sums))
+    for p in range(0, n - 3, 4):
+        for a in range(3):
+            wa = (<const lanes *>(weight + p))[0] * (<const lanes *>(one[a] + p))[0]
+            for b in range(3):
+                sums[3 * a + b] += wa * (<const lanes *>(other[b] + p))[0]
+    for a in range(3):
+        for b in range(3):
+            out[3 * a + b] = sum_of(&sums[3 * a + b])
+            for p in range(n // 4 * 4, n):
+                out[3 * a + b] += weight[p] * one[a][p] * other[b][p]

@@ -26,7 +26,7 @@ cdef float _highest(const float *v, int n) noexcept nogil:
     return highest
 
 
-cdef void _take_rim(const float *signal, const float *noise, int size, Rim *rim) noexcept nogil:
+cdef void _copy_rim(const float *signal, const float *noise, int size, Rim *rim) noexcept nogil:
     """Take the pixels at the edges of a stamp (S, S)."""
     cdef int row, place, step, n = 0
     rim.even = True
@@ -42,7 +42,7 @@ cdef void _take_rim(const float *signal, const float *noise, int size, Rim *rim)
     rim.count = n
 
 
-def level(float[:, :, ::1] signal, float[:, :, ::1] noise, double per_mad, double raised, double uneven, double own):
+def correct_sky(float[:, :, ::1] signal, float[:, :, ::1] noise, double per_mad, double raised, double uneven, double own):
     """Correct level and noise of the sky in stamps (N, S, S), in place, by what the pixels at their rims show.
 
     per_mad          sigma over the median of the absolute differences
@@ -54,14 +54,14 @@ def level(float[:, :, ::1] signal, float[:, :, ::1] noise, double per_mad, doubl
     cdef double sky, spread, light
     cdef float up, wider
     cdef Rim rim
-    _alike(signal.shape, noise.shape)
+    _check_shape(signal.shape, noise.shape)
     rim.score = <double *>malloc(2 * area * sizeof(double))
     if rim.score == NULL:
         raise MemoryError
     rim.noise = rim.score + area
     with nogil:
         for k in range(n):
-            _take_rim(&signal[k, 0, 0], &noise[k, 0, 0], size, &rim)
+            _copy_rim(&signal[k, 0, 0], &noise[k, 0, 0], size, &rim)
             sky, spread = level_and_scatter(rim.score, rim.count, per_mad, uneven)
             light = own * _highest(&signal[k, 0, 0], area) / (rim.noise[0] if rim.even else middle(rim.noise, rim.count))
             up = <float>sky if sky > raised and sky > light else 0
@@ -73,7 +73,7 @@ def level(float[:, :, ::1] signal, float[:, :, ::1] noise, double per_mad, doubl
     free(rim.score)
 
 
-def without_spikes(
+def replace_spikes(
     float[:, :, ::1] signal, const float[:, :, ::1] noise, unsigned char[:, :, ::1] good,
     const unsigned char[:, :, ::1] phase, const float[::1] gain, const float[::1] sharpest, float above,
 ):
@@ -91,9 +91,9 @@ def without_spikes(
     cdef float *own
     cdef const float *sky
     cdef const unsigned char *part
-    _alike(signal.shape, noise.shape)
-    _alike(signal.shape, good.shape)
-    _alike(signal.shape, phase.shape)
+    _check_shape(signal.shape, noise.shape)
+    _check_shape(signal.shape, good.shape)
+    _check_shape(signal.shape, phase.shape)
     if sharpest.shape[0] != n or (n and np.max(phase) >= gain.shape[0]):
         raise ValueError(f"{sharpest.shape[0]} sharpest and {gain.shape[0]} gains for {n} stars: one each, and of each phase")
     out = np.zeros((n, size, size), np.uint8)
@@ -132,7 +132,7 @@ cdef float _beside(const float *signal, const unsigned char *phase, const float 
     return total * <float>0.25
 
 
-cdef int _alike(const Py_ssize_t *stamps, const Py_ssize_t *other) except -1:
+cdef int _check_shape(const Py_ssize_t *stamps, const Py_ssize_t *other) except -1:
     """Raise ValueError unless other pixels have the shape of stamps, which are squares."""
     if stamps[1] != stamps[2] or not stamps[1] or not (other[0] == stamps[0] and other[1] == other[2] == stamps[1]):
         raise ValueError(
@@ -141,7 +141,7 @@ cdef int _alike(const Py_ssize_t *stamps, const Py_ssize_t *other) except -1:
     return 0
 
 
-def own_light(
+def restore_model(
     float[:, :, ::1] signal, const float[:, :, ::1] noise, const unsigned char[:, :, ::1] spike,
     const float[:, :, ::1] model, const unsigned char[:, :, ::1] outlier, int speck, float loud,
 ):
@@ -154,10 +154,10 @@ def own_light(
     cdef float least
     cdef float *own
     cdef const float *sky
-    _alike(signal.shape, noise.shape)
-    _alike(signal.shape, spike.shape)
-    _alike(signal.shape, model.shape)
-    _alike(signal.shape, outlier.shape)
+    _check_shape(signal.shape, noise.shape)
+    _check_shape(signal.shape, spike.shape)
+    _check_shape(signal.shape, model.shape)
+    _check_shape(signal.shape, outlier.shape)
     with nogil:
         for k in range(n):
             own, sky, outliers, least = &signal[k, 0, 0], &noise[k, 0, 0], 0, noise[k, 0, 0]
@@ -169,7 +169,7 @@ def own_light(
                     own[j] = (&model[k, 0, 0])[j]
 
 
-def looks(
+def describe_stars(
     const float[:, :, ::1] signal, const float[:, :, ::1] noise, const unsigned char[:, :, ::1] good,
     const unsigned char[:, :, ::1] full, const unsigned char[:, :, ::1] spike, const float[:, :, ::1] residual,
     const float[:, :, ::1] model, const unsigned char[:, :, ::1] used, const unsigned char[:, :, ::1] outlier,
@@ -187,14 +187,14 @@ def looks(
     cdef Py_ssize_t n = signal.shape[0], k, a
     cdef int size = signal.shape[1], row, column, place
     cdef double dx, dy, u, v, distance2, score, matched, foreign, near2 = core * core, far2 = wider * wider
-    _alike(signal.shape, noise.shape)
-    _alike(signal.shape, good.shape)
-    _alike(signal.shape, full.shape)
-    _alike(signal.shape, spike.shape)
-    _alike(signal.shape, residual.shape)
-    _alike(signal.shape, model.shape)
-    _alike(signal.shape, used.shape)
-    _alike(signal.shape, outlier.shape)
+    _check_shape(signal.shape, noise.shape)
+    _check_shape(signal.shape, good.shape)
+    _check_shape(signal.shape, full.shape)
+    _check_shape(signal.shape, spike.shape)
+    _check_shape(signal.shape, residual.shape)
+    _check_shape(signal.shape, model.shape)
+    _check_shape(signal.shape, used.shape)
+    _check_shape(signal.shape, outlier.shape)
     if left.shape[0] != n or top.shape[0] != n or axes.shape[0] not in (1, n) or axes.shape[1] != 2 or axes.shape[2] != 2:
         raise ValueError(f"{left.shape[0]} places and {axes.shape[0]} axes for {n} stars: one each is needed")
     sums_, marks_ = np.empty((2, n)), np.zeros((2, n), np.uint8)
@@ -226,7 +226,7 @@ def looks(
     return sums_[0], sums_[1], at_limit, cut_off
 
 
-def one_pixel(
+def compare_with_pixel(
     const float[:, :, ::1] signal, const float[:, :, ::1] noise, const unsigned char[:, :, ::1] good,
     const unsigned char[:, :, ::1] full, const float[:, :, ::1] residual, const float[:, :, ::1] model,
     double dn_per_photon, double misfit, int half,
@@ -239,11 +239,11 @@ def one_pixel(
     cdef Py_ssize_t n = signal.shape[0], k
     cdef int size = signal.shape[1], middle_ = size // 2, row, column, count, white
     cdef double score, most, one, star, light, sky2, variance
-    _alike(signal.shape, noise.shape)
-    _alike(signal.shape, good.shape)
-    _alike(signal.shape, full.shape)
-    _alike(signal.shape, residual.shape)
-    _alike(signal.shape, model.shape)
+    _check_shape(signal.shape, noise.shape)
+    _check_shape(signal.shape, good.shape)
+    _check_shape(signal.shape, full.shape)
+    _check_shape(signal.shape, residual.shape)
+    _check_shape(signal.shape, model.shape)
     if not 0 <= half <= middle_:
         raise ValueError(f"{half} px around the middle of stamps of {size} px: they have no such pixels")
     sums_, counts_ = np.empty((2, n)), np.empty((2, n), np.int64)
@@ -270,7 +270,7 @@ def one_pixel(
     return sums_[0], sums_[1], counts_[0], counts_[1]
 
 
-def counted(const unsigned char[:, :, ::1] mark):
+def count_marked(const unsigned char[:, :, ::1] mark):
     """How many pixels of each stamp (N, S, S) are marked: (N,)."""
     cdef Py_ssize_t n = mark.shape[0], area = mark.shape[1] * mark.shape[2], k, j
     cdef int count
@@ -298,7 +298,7 @@ def brightest_left(
     cdef Py_ssize_t n = residual.shape[0], k, a
     cdef int size = residual.shape[1], reach = weight.shape[0] - 1, row, column, j
     cdef double dx, dy, u, v, value, most
-    _alike(residual.shape, good.shape)
+    _check_shape(residual.shape, good.shape)
     if left.shape[0] != n or top.shape[0] != n or axes.shape[0] not in (1, n) or axes.shape[1] != 2 or axes.shape[2] != 2:
         raise ValueError(f"{left.shape[0]} places and {axes.shape[0]} axes for {n} stars: one each is needed")
     if not 0 <= reach < size:

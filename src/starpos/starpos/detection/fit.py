@@ -1,18 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Weighted least-squares fits of many stars at once with the frame's PSF: one star in each image, or two."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
-from typing import TypeVar
 
 import numpy as np
 
-from starpos.detection._fit import fitted
-from starpos.detection._pairs import fitted_pairs
-from starpos.detection._rules import Rules
-from starpos.detection._vetting import brightest_left, counted
-from starpos.detection.psf import FieldPsf, LocalPsf
-from starpos.detection.stamps import Stamps
+from starpos.detection._fit import Rules, fit_stamps
+from starpos.detection._vetting import brightest_left, count_marked
+from starpos.detection.psf import FieldPsf
+from starpos.detection.stamps import Stamps, StarRows, joined
 
 # Sigmas above the model, and that share of the star's brightest pixel, from which a pixel is not the star's alone.
 OUTLIER, FAINT = 6.0, 0.15
@@ -20,6 +17,8 @@ OUTLIER, FAINT = 6.0, 0.15
 FIT_WIDTHS = 4.0
 # Sigmas that a fit may be from the place that more rounds would find: of 26 000 simulated stars none was 0.01 off.
 SETTLED = 5e-4
+# Rounds of the fit of pairs; one step never leaves a star of a pair less than this share of its flux.
+PAIR_ROUNDS, LEAST = 10, 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +57,7 @@ class Response:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Fit:
+class Fit(StarRows):
     """N fitted stars.
 
     x, y              (N,) px
@@ -90,7 +89,8 @@ class Fit:
     leverage: np.ndarray
 
 
-COLUMNS = tuple(f.name for f in fields(Fit))
+# Columns that each of several stars in one stamp has; the others are the stamp's.
+OF_STAR = ("x", "y", "flux", "flux_sigma", "covariance", "gains", "model")
 
 
 def fit_stars(
@@ -112,12 +112,37 @@ def fit_stars(
     phase nor the star's colour moves the position. The weights come from the model: the pixels' own noise would bias
     the fit.
     """
-    local = psf.at(x, y)
-    columns = fitted(
-        stamps.signal, stamps.noise, stamps.good, stamps.phase, stamps.x, stamps.y, x, y, local.axes, local.series,
-        response.rules, rounds, leverage, whole,
+    return _fit(stamps, psf, np.stack([x, y])[:, None], response, rounds, leverage, whole)[0]
+
+
+def fit_pairs(
+    stamps: Stamps, psf: FieldPsf, places: np.ndarray, flux: np.ndarray, response: Response
+) -> list[Fit]:
+    """Fit a pair of stars to each of N stamps by Gauss-Newton on all their parameters.
+
+    The PSF is that of the first places.
+
+    places  (2, 2, N) px: first x, y of the stars and of their companions
+    flux    (N,) DN: of the star alone
+
+    Returns two Fits, with models of the whole stamps, and chi2, residual and pixels of both together.
+    """
+    return _fit(stamps, psf, places, response, PAIR_ROUNDS + 1, False, True, LEAST * flux, LEAST)
+
+
+def _fit(
+    stamps: Stamps, psf: FieldPsf, places: np.ndarray, response: Response, *settings: object
+) -> list[Fit]:
+    local = psf.at(*places[:, 0])
+    columns = fit_stamps(
+        stamps.signal, stamps.noise, stamps.good, stamps.phase, stamps.x, stamps.y, *map(np.ascontiguousarray, places),
+        local.axes, local.series, response.rules, *settings,
     )  # fmt: skip
-    return Fit(**dict(zip(COLUMNS, columns, strict=True)))
+    named = dict(zip((f.name for f in fields(Fit)), columns, strict=True))
+    return [
+        Fit(**{name: column[k] if name in OF_STAR else column for name, column in named.items()})
+        for k in range(places.shape[1])
+    ]
 
 
 def gains_at(gains: np.ndarray, phase: np.ndarray) -> np.ndarray:
@@ -137,174 +162,92 @@ FAINTEST = 5.0
 GAIN = 30.0
 # Companions fainter than this share of the star may be faults of the PSF.
 DIMMEST = 0.03
-ROUNDS = 10
 # It is looked for at least so far (px) from the star, with a Gaussian of 0.8 px, from its middle outwards.
 NEAREST_PX, SMOOTHING = 1.0, np.exp(-0.5 * (np.arange(4) / 0.8) ** 2)
 SMOOTHING /= 2 * SMOOTHING.sum() - SMOOTHING[0]
-# One step of the fit never leaves a star less than this share of its flux.
-LEAST = 0.05
-
-Rows = TypeVar("Rows", Fit, Stamps)
-# Stars with stamps, which of their pixels have the mean of their neighbours (N, S, S), and fits.
-Fitted = tuple[Stamps, np.ndarray, Fit]
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Pairs:
-    """N pairs of stars fitted together; the first axis is the star, 0 or its companion 1.
-
-    x, y, flux, flux_sigma  (2, N) px and DN
-    gains                   (2, N, P): gains of the mosaic's phases
-    covariance              (2, N, 2, 2) px2 of x, y
-    models                  (2, N, S, S) DN
-    used                    (N, S, S) bool: pixels that took part
-    chi2                    (N,): the whole chi-square
-    """
-
-    x: np.ndarray
-    y: np.ndarray
-    flux: np.ndarray
-    flux_sigma: np.ndarray
-    gains: np.ndarray
-    covariance: np.ndarray
-    models: np.ndarray
-    used: np.ndarray
-    chi2: np.ndarray
-
-
-def pairs_among(
-    stars: Fitted,
+def split_pairs(
+    stamps: Stamps,
+    alone: Fit,
     psf: FieldPsf,
     response: Response,
-    cut_at: Callable[[np.ndarray, np.ndarray], tuple[Stamps, np.ndarray]],
-) -> tuple[np.ndarray, Fitted | None]:
+    cut_at: Callable[[np.ndarray, np.ndarray], Stamps],
+) -> tuple[np.ndarray, tuple[Stamps, Fit] | None]:
     """Which of N surprising stars have companions, (N,) bool; and these stars, then the companions, if there are any.
 
-    Each star's stamp is without the other's light. cut_at(x, y) gives the Stamps around pixels x, y (N,) and which of
-    their pixels are spikes (N, S, S).
+    Each star's stamp is without the other's light. cut_at(x, y) gives the Stamps around pixels x, y (N,).
     """
-    crowd, spike, alone = stars
-    light = _light(crowd, psf, alone.x, alone.y, alone.flux, alone.gains)
-    alone = replace(alone, model=light, residual=crowd.signal - light)
-    real, pairs = _real_pairs(crowd, alone, psf, response)
+    light = _light(stamps, psf, alone)
+    alone = replace(alone, model=light, residual=stamps.signal - light)
+    first, second = fit_pairs(stamps, psf, _first_places(stamps, alone, psf), alone.flux, response)
+    real = _are_real(stamps, alone, first, second, psf, response)
     if not real.any():
         return real, None
-    both, models, chi2 = crowd.take(real), pairs.models, pairs.chi2 / _freedom(pairs)
-    one, other = (
-        {name: getattr(pairs, name)[k] for name in ("x", "y", "flux", "flux_sigma", "covariance", "gains")}
-        for k in (0, 1)
-    )
-    first = replace(
-        rows_of(alone, real), **one, chi2=chi2, pixels=_pixels(pairs), residual=both.signal - models.sum(0),
-        model=models[0], used=pairs.used, outlier=np.zeros_like(pairs.used),
-    )  # fmt: skip
-    first_stamps = replace(both, signal=both.signal - models[1])
-    second_stamps, second_spike = cut_at(np.rint(other["x"]).astype(int), np.rint(other["y"]).astype(int))
-    light = _light(second_stamps, psf, one["x"], one["y"], one["flux"], one["gains"])
-    noise = np.sqrt(response.variance(second_stamps.noise, light))
-    second_stamps = replace(second_stamps, signal=second_stamps.signal - light, noise=noise)
-    second = fit_stars(second_stamps, psf, other["x"], other["y"], response, rounds=3)
+    both, first, second = stamps.select(real), first.select(real), second.select(real)
+    x, y = (np.rint(v).astype(int) for v in (second.x, second.y))
+    around = cut_at(x, y)
+    light = _light(around, psf, first)
+    noise = np.sqrt(response.variance(around.noise, light))
+    around = replace(around, signal=around.signal - light, noise=noise)
+    apart = fit_stars(around, psf, second.x, second.y, response, rounds=3)
     # if the whole companion lies on the first star's stamp, the fit of both together is the better one
-    whole = _away(both, pairs)[1] < both.reach - 1
-    together = other | {"chi2": chi2}
-    for name, value in together.items():
-        own = getattr(second, name)
-        together[name] = np.where(whole.reshape(-1, *[1] * (own.ndim - 1)), value, own)
+    whole = _away(both, second) < both.reach - 1
+    better = {}
+    for name in ("x", "y", "flux", "flux_sigma", "covariance", "gains", "chi2"):
+        own = getattr(apart, name)
+        better[name] = np.where(whole.reshape(-1, *[1] * (own.ndim - 1)), getattr(second, name), own)
     return real, (
-        joined([first_stamps, second_stamps]),
-        np.concatenate([spike[real], second_spike]),
-        joined([first, replace(second, **together)]),
+        joined([replace(both, signal=both.signal - second.model), around]),
+        joined([first, replace(apart, **better)]),
     )
 
 
-def _real_pairs(stamps: Stamps, alone: Fit, psf: FieldPsf, response: Response) -> tuple[np.ndarray, Pairs]:
-    """Which of N stars, fitted alone, have companions, (N,) bool, and the Pairs of those that have."""
-    pairs = _fit_pairs(stamps, alone, psf, response)
-    x, y, flux = pairs.x, pairs.y, pairs.flux
-    apart = np.hypot(*(psf.at(x[0], y[0]).axes @ np.stack([x[1] - x[0], y[1] - y[0]], 1)[..., None]).T[0])
-    away = _away(stamps, pairs)
-    before = stamps.good * pairs.used * alone.residual**2 / response.variance(stamps.noise, alone.model)
+def _are_real(
+    stamps: Stamps, alone: Fit, first: Fit, second: Fit, psf: FieldPsf, response: Response
+) -> np.ndarray:
+    """Which of N stars, fitted alone and then with companions, have these, (N,) bool."""
+    way = np.stack([second.x - first.x, second.y - first.y], 1)[..., None]
+    apart = np.hypot(*(psf.at(first.x, first.y).axes @ way).T[0])
+    freedom = np.maximum(first.pixels - 6, 1)
+    before = stamps.good * first.used * alone.residual**2 / response.variance(stamps.noise, alone.model)
     with np.errstate(invalid="ignore"):
-        real = (flux > FAINTEST * pairs.flux_sigma).all(0) & np.isfinite(pairs.chi2) & (apart > CLOSEST)
-        real &= (away[0] < stamps.reach - 1) & (away[1] < stamps.reach + 2)
-        real &= before.sum((1, 2)) - pairs.chi2 > GAIN * np.maximum(pairs.chi2 / _freedom(pairs), 1)
-        real &= flux[1] > DIMMEST * flux[0]
-    of_stars = ("used", "chi2")
-    return real, Pairs(
-        **{
-            f.name: getattr(pairs, f.name)[real if f.name in of_stars else (slice(None), real)]
-            for f in fields(Pairs)
-        }
-    )
+        real = np.isfinite(first.chi2) & (apart > CLOSEST)
+        for fit, beyond in ((first, -1), (second, 2)):
+            real &= (fit.flux > FAINTEST * fit.flux_sigma) & (_away(stamps, fit) < stamps.reach + beyond)
+        real &= before.sum((1, 2)) - first.chi2 * freedom > GAIN * np.maximum(first.chi2, 1)
+        return real & (second.flux > DIMMEST * first.flux)
 
 
-def _pixels(pairs: Pairs) -> np.ndarray:
-    """How many pixels (N,) took part in the fits."""
-    return pairs.used.sum((1, 2))
-
-
-def _freedom(pairs: Pairs) -> np.ndarray:
-    """Degrees of freedom (N,) of the fits."""
-    return np.maximum(_pixels(pairs) - 6, 1)
-
-
-def _away(stamps: Stamps, pairs: Pairs) -> np.ndarray:
-    """How far both stars (2, N) are from the middles of their stamps, px along the farther axis."""
-    return np.maximum(np.abs(pairs.x - stamps.x), np.abs(pairs.y - stamps.y))
+def _away(stamps: Stamps, fit: Fit) -> np.ndarray:
+    """How far stars (N,) are from the middles of their stamps, px along the farther axis."""
+    return np.maximum(np.abs(fit.x - stamps.x), np.abs(fit.y - stamps.y))
 
 
 def surprising(stamps: Stamps, fit: Fit) -> np.ndarray:
     """Whether stars (N,) leave more light unexplained than a single star does."""
     freedom = np.maximum(fit.pixels - 3, 1)
     with np.errstate(invalid="ignore"):
-        odd = (fit.chi2 > 1 + SURPRISING * np.sqrt(2 / freedom)) | (counted(fit.outlier) > 2)
-    return odd & (counted(stamps.full) == 0) & np.isfinite(fit.covariance).all((1, 2)) & (fit.flux > 0)
+        odd = (fit.chi2 > 1 + SURPRISING * np.sqrt(2 / freedom)) | (count_marked(fit.outlier) > 2)
+    return odd & (count_marked(stamps.full) == 0) & np.isfinite(fit.covariance).all((1, 2)) & (fit.flux > 0)
 
 
-def _light(
-    stamps: Stamps, psf: FieldPsf, x: np.ndarray, y: np.ndarray, flux: np.ndarray, gains: np.ndarray
-) -> np.ndarray:
-    """The light (N, S, S) float32, DN, of stars at x, y (N,) px, with flux (N,) and gains (N, P), on whole stamps."""
-    light = psf.at(x, y).evaluate(*stamps.corner(x, y), stamps.size)
-    return light * (gains_at(gains, stamps.phase) * flux.astype(np.float32)[:, None, None])
+def _light(stamps: Stamps, psf: FieldPsf, fit: Fit) -> np.ndarray:
+    """The light (N, S, S) float32, DN, of fitted stars on whole stamps."""
+    light = psf.at(fit.x, fit.y).evaluate(*stamps.corner(fit.x, fit.y), stamps.size)
+    return light * (gains_at(fit.gains, stamps.phase) * fit.flux.astype(np.float32)[:, None, None])
 
 
-def _fit_pairs(stamps: Stamps, fit: Fit, psf: FieldPsf, response: Response) -> Pairs:
-    """Fit a star and a companion to each stamp by Gauss-Newton on all their parameters.
-
-    The companion starts where the single star's fit leaves the most light.
-    """
-    local = psf.at(fit.x, fit.y)
-    first = np.stack([np.stack([fit.x, fit.y], 1), np.stack(_brightest_left(stamps, fit, local), 1)])
-    columns = fitted_pairs(
-        stamps.signal, stamps.noise, stamps.good, stamps.phase, stamps.x, stamps.y, first, LEAST * fit.flux,
-        local.axes, local.series, response.rules, ROUNDS, LEAST,
-    )  # fmt: skip
-    return Pairs(**dict(zip((f.name for f in fields(Pairs)), columns, strict=True)))
-
-
-def _brightest_left(stamps: Stamps, fit: Fit, psf: LocalPsf) -> tuple[np.ndarray, np.ndarray]:
-    """Pixel x, y (N,) px, off the star's centre, where the fit leaves the most light."""
+def _first_places(stamps: Stamps, fit: Fit, psf: FieldPsf) -> np.ndarray:
+    """First places (2, 2, N) px of pairs: the star's, and the pixel off its centre where its fit leaves most light."""
     row, column = brightest_left(
         fit.residual,
         stamps.good,
         *stamps.corner(fit.x, fit.y),
-        psf.axes,
+        psf.at(fit.x, fit.y).axes,
         NEAREST_PX,
         FIT_WIDTHS + 2,
         SMOOTHING,
     )
-    return stamps.x + column - stamps.reach, stamps.y + row - stamps.reach
-
-
-def rows_of(fit: Fit, index: np.ndarray) -> Fit:
-    """The rows `index` of a Fit."""
-    return Fit(**{f.name: getattr(fit, f.name)[index] for f in fields(Fit)})
-
-
-def joined(parts: Sequence[Rows]) -> Rows:
-    """The rows of dataclasses of arrays, one after the other."""
-    if len(parts) == 1:
-        return parts[0]
-    rows = {f.name: np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(parts[0])}
-    return replace(parts[0], **rows)
+    left, top = stamps.corner(0, 0)
+    return np.array([[fit.x, left + column], [fit.y, top + row]])

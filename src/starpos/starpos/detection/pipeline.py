@@ -4,21 +4,23 @@
 Where stars are wider than the peaks' kernels can find, the same is done with the frame reduced by two.
 """
 
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
 import numpy as np
 
-from starpos.detection._sparse import third_highest
-from starpos.detection.background import halved, measure_background, plane_of, window_of
+from starpos.detection._pixels import third_highest
+from starpos.detection.background import halved, measure_sky, plane_of, window_of
 from starpos.detection.finding import find_peaks, find_streaks
 from starpos.detection.learn import learn, with_trail
 from starpos.detection.saturated import find_discs, with_clipped, with_discs
 from starpos.detection.vet import measure, resolve
 from starpos.errors import FrameError
 from starpos.frames.exposure import Trail
-from starpos.frames.frame import BLENDED, EDGE, ELONGATED, Frame, Stars, no_stars
+from starpos.frames.frame import BLENDED, COLUMNS, EDGE, ELONGATED, Frame, Stars, Window, no_stars
 
 # Pixels of stars that are fitted together, give or take half, on a small and on a large frame: about 2 and 6 MB.
 CHUNK_PIXELS = 30_000, 120_000
@@ -53,6 +55,17 @@ class DetectionSettings:
     mesh_px: int = 64
     threads: int = 1
     saturation_dn: float | None = None
+
+    @classmethod
+    def by_parameters(cls, values: Mapping[str, Any]) -> "DetectionSettings":
+        """The settings by the values of the parameters of the node `detector`."""
+        return cls(
+            threshold=values["threshold"],
+            min_snr=values["min_snr"],
+            max_stars=values["max_stars"],
+            threads=values["threads"],
+            saturation_dn=None if math.isnan(values["saturation"]) else values["saturation"],
+        )
 
     def __post_init__(self) -> None:
         for name, low in (
@@ -134,7 +147,7 @@ class _Picture:
 
 def detect(frame: Frame, settings: DetectionSettings = DetectionSettings()) -> Detection:
     """Measure the stars of a Frame. Without stars the Detection is empty and fwhm_px NaN."""
-    about = {"width": frame.width, "height": frame.height} | frame.about
+    about = {"width": frame.width, "height": frame.height} | frame.facts
     # OpenCV would take all processors for a little, and wait for them where others work
     cv2.setNumThreads(settings.threads)
     plane, mosaic = plane_of(frame)
@@ -158,20 +171,27 @@ def _detect(picture: _Picture) -> Detection:
     reduced = _detect(smaller)
     if _clear(reduced.stars) <= _clear(found.stars):
         return found
-    s = reduced.stars
-    stars = replace(
-        s,
-        x=2 * s.x + 0.5,
-        y=2 * s.y + 0.5,
-        flux=gain * s.flux,
-        covariance=4 * s.covariance,
-        fwhm_px=2 * reduced.fwhm_px,
-        width=picture.about["width"],
-        height=picture.about["height"],
-        window=found.stars.window,
-    )
+    width, height = picture.about["width"], picture.about["height"]
+    stars = enlarged(reduced.stars, 2, width, height, found.stars.window, gain)
     return replace(
         found, stars=stars, fwhm_px=2 * reduced.fwhm_px, chi2=reduced.chi2, left_out=reduced.left_out
+    )
+
+
+def enlarged(
+    stars: Stars, times: int, width: int, height: int, window: Window | None, gain: float = 1.0
+) -> Stars:
+    """The stars of a frame that was reduced so many times, on the original one, whose flux is `gain` times as large."""
+    return replace(
+        stars,
+        x=times * stars.x + (times - 1) / 2,
+        y=times * stars.y + (times - 1) / 2,
+        flux=gain * stars.flux,
+        covariance=times**2 * stars.covariance,
+        fwhm_px=None if stars.fwhm_px is None else times * stars.fwhm_px,
+        width=width,
+        height=height,
+        window=window,
     )
 
 
@@ -184,38 +204,33 @@ def _detect_at_full_size(picture: _Picture) -> Detection:
     plane, settings, about = picture.plane, picture.settings, picture.about
     if min(plane.shape) < 2:
         return _starless(about, float(np.median(plane)), 0.0)
-    background = measure_background(plane, settings.mesh_px, picture.mosaic)
-    level, noise = background.typical
+    sky = measure_sky(plane, settings.mesh_px, picture.mosaic)
+    level, noise = sky.typical
     limit = max(PEAKS, 2 * settings.max_stars)
-    peaks = find_peaks(plane, background, settings.threshold, limit, settings.threads)
+    peaks = find_peaks(sky, settings.threshold, limit, settings.threads)
     x, y, height = peaks.x, peaks.y, peaks.height
     if len(x) == 0:
         return _starless(about, level, noise)
-    background = replace(background, correlation=peaks.correlation)
-    streaks = find_streaks(plane, background, x, y)
-    if streaks:
-        background = replace(background, streaks=streaks)
     saturation = _saturation(plane, x, y, settings)
-    lesson = learn(plane, background, x, y, height, saturation)
+    sky = replace(sky, correlation=peaks.correlation, saturation=saturation)
+    streaks = find_streaks(sky, x, y)
+    if streaks:
+        sky = replace(sky, streaks=streaks)
+    lesson = learn(sky, x, y, height)
     if picture.trail is not None:
-        lesson = with_trail(lesson, plane, background, x, y, saturation, picture.trail)
+        lesson = with_trail(lesson, sky, x, y, picture.trail)
     pixels = (2 * lesson.reach + 1) ** 2
     chunk = max(1, int(np.clip(plane.size // 32, *CHUNK_PIXELS)) // pixels)
     most = min(len(x), limit * (PIXELS_PER_PEAK >> MAX_HALVINGS - picture.halvings) // pixels)
-    columns = measure(plane, background, x[:most], y[:most], lesson, saturation, settings.min_snr, chunk)
-    columns = resolve(columns, lesson.psf)
+    found = measure(sky, x[:most], y[:most], lesson, settings.min_snr, chunk)
+    found = resolve(found, lesson.psf)
     fwhm_px = lesson.psf.fwhm_px
-    columns = with_discs(columns, find_discs(plane, background, fwhm_px, peaks.highest), fwhm_px)
+    found = with_discs(found, *find_discs(sky, fwhm_px, peaks.highest), fwhm_px)
     if fwhm_px < WIDE_FWHM:
-        columns = with_clipped(columns, plane, background, x, y, fwhm_px)
-    columns = {name: column[: settings.max_stars] for name, column in columns.items()}
+        found = with_clipped(found, sky, x, y, fwhm_px)
+    found = found[: settings.max_stars]
     stars = Stars(
-        x=columns["x"],
-        y=columns["y"],
-        flux=columns["flux"],
-        snr=columns["snr"],
-        covariance=columns["covariance"],
-        flags=columns["flags"],
+        **{name: found[name] for name in COLUMNS},
         fwhm_px=fwhm_px,
         window=window_of(plane, int(peaks.highest.max()), level),
         **about,
@@ -225,7 +240,7 @@ def _detect_at_full_size(picture: _Picture) -> Detection:
         background=level,
         noise=noise,
         fwhm_px=fwhm_px if len(stars) else float("nan"),
-        chi2=columns["chi2"],
+        chi2=np.ascontiguousarray(found["chi2"]),
         left_out=peaks.left_out + len(x) - most,
     )
 
@@ -241,5 +256,5 @@ def _saturation(plane: np.ndarray, x: np.ndarray, y: np.ndarray, settings: Detec
     if settings.saturation_dn is not None:
         return settings.saturation_dn
     # the third highest pixel of a star, because a hot pixel may exceed saturation; noise does not make three equal
-    highest, count = third_highest(plane, x.astype(np.intp), y.astype(np.intp), 2)
-    return highest if count >= 3 else np.iinfo(plane.dtype).max
+    third, alike = third_highest(plane, x.astype(np.intp), y.astype(np.intp), 2)
+    return float(third.max()) if alike[third == third.max()].max() >= 3 else np.iinfo(plane.dtype).max

@@ -8,9 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.polynomial import hermite_e
 
-from starpos.detection._field import local, monomials, shapes_of
-from starpos.detection._psf import evaluated
-from starpos.detection._shapes import clipped, squared_widths
+from starpos.detection._moments import clip_widths, squared_widths
+from starpos.detection._psf import evaluated, monomials, psf_at, shapes_of
 from starpos.frames.exposure import Trail
 
 # How many monomials describe a variation over the field: up to second order in x and y.
@@ -95,11 +94,11 @@ class Psf(FieldPsf):
 
     def at(self, x: np.ndarray, y: np.ndarray) -> LocalPsf:
         """The PSF at the points x, y (N,) px."""
-        return LocalPsf(*local(*_points(x, y), self.box, self.axes, self.widths, self.series, NARROW, BROAD))
+        return LocalPsf(*psf_at(*_points(x, y), self.box, self.axes, self.widths, self.series, NARROW, BROAD))
 
     def shapes_at(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """Covariances (N, 2, 2) px2, or (1, 2, 2), of the Gaussians of the PSF at the points x, y (N,) px."""
-        return shapes_of(local(*_points(x, y), self.box, self.axes, self.widths, GAUSSIAN, NARROW, BROAD)[0])
+        return shapes_of(psf_at(*_points(x, y), self.box, self.axes, self.widths, GAUSSIAN, NARROW, BROAD)[0])
 
     def widest_px2(self) -> float:
         """The largest squared width of a star within the box."""
@@ -140,7 +139,7 @@ def gaussian(shape: np.ndarray, x: np.ndarray = ONE_PLACE, y: np.ndarray = ONE_P
 
 def power(widths: np.ndarray, exponent: float) -> np.ndarray:
     """Powers of the symmetric matrices of squared widths (N, 2, 2), with eigenvalues limited to NARROW..BROAD."""
-    return clipped(widths, NARROW, BROAD, exponent)
+    return clip_widths(widths, NARROW, BROAD, exponent)
 
 
 # of the series along the trail

@@ -5,8 +5,9 @@ import cv2
 import numpy as np
 
 from starpos.detection._neighbours import any_near
-from starpos.detection._sparse import bright_squares, thirds
-from starpos.detection.background import Background
+from starpos.detection._pixels import bright_squares, third_highest
+from starpos.detection.background import SkyPlane
+from starpos.detection.vet import MEASURED
 from starpos.frames.frame import SATURATED
 
 # Pixels above this share of the frame's brightest discs belong to a disc: a plate or a JPEG has no sharp limit.
@@ -27,29 +28,27 @@ OFF_CENTRE = 0.04
 GROWTH = 2.0
 
 
-def find_discs(
-    plane: np.ndarray, background: Background, fwhm_px: float, highest: np.ndarray
-) -> dict[str, np.ndarray]:
-    """Discs of plane (h, w) far wider than its stars of fwhm_px: columns x, y, radius px, flux DN and covariance px2.
+def find_discs(sky: SkyPlane, fwhm_px: float, highest: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Discs far wider than its stars of fwhm_px: as measured stars (N,), and their radii (N,) px.
 
     highest (h,) int32: the brightest pixel of each row.
     """
-    level, noise = background.typical
+    level, noise = sky.typical
     least = max(WIDER * fwhm_px, MIN_PX)
     # any disc of this radius has a sample whose neighbours to the right, below and between lie on it too
     step = int(np.sqrt(2) * (least - np.sqrt(0.5)))
     # no single hot pixel
-    y, x, height = bright_squares(plane, highest, step, int(level + CLEAR * noise))
+    y, x, height = bright_squares(sky.plane, highest, step, int(level + CLEAR * noise))
     if height.max(initial=0) < level + CLEAR * noise:
-        return columns_of([], fwhm_px, 0.0)
+        return measured_discs([], fwhm_px, 0.0)
     top = float(height.max())
     limit = level + FLAT * (top - level)
     bright = height >= limit
     boxes = _groups(y[bright] // step, x[bright] // step)
-    most = WIDEST * min(plane.shape)
+    most = WIDEST * min(sky.plane.shape)
     fits = boxes[:, [cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT]].max(1) * step < 2 * most
-    discs = [_disc(plane, box[:4] * step, 2 * step, limit, least) for box in boxes[fits][:MOST]]
-    return columns_of([d for d in discs if d is not None and d[2] < most], fwhm_px, top - level)
+    discs = [_disc(sky.plane, box[:4] * step, 2 * step, limit, least) for box in boxes[fits][:MOST]]
+    return measured_discs([d for d in discs if d is not None and d[2] < most], fwhm_px, top - level)
 
 
 def _groups(row: np.ndarray, column: np.ndarray) -> np.ndarray:
@@ -105,59 +104,44 @@ def _disc(
     return left + x0 + columns.mean(), top + y0 + rows.mean(), float(np.sqrt(area / np.pi))
 
 
-def columns_of(
+def measured_discs(
     discs: list[tuple[float, float, float]], fwhm_px: float, height: float
-) -> dict[str, np.ndarray]:
-    """Discs as columns; height: of their tops above the sky, DN. One as wide as a star's FWHM has that star's flux."""
+) -> tuple[np.ndarray, np.ndarray]:
+    """Discs as measured stars (N,) and their radii (N,) px; height: of their tops above the sky, DN.
+
+    One as wide as a star's FWHM has that star's flux.
+    """
     x, y, radius = np.array(discs, float).reshape(-1, 3).T
-    flux = 1.133 * fwhm_px**2 * height * (2 * radius / fwhm_px) ** (2 * GROWTH)
-    return {
-        "x": x,
-        "y": y,
-        "radius": radius,
-        "flux": flux,
-        "covariance": (OFF_CENTRE * radius[:, None, None]) ** 2 * np.eye(2),
-    }
+    stars = np.zeros(len(discs), MEASURED)
+    stars["x"], stars["y"], stars["flags"], stars["chi2"] = x, y, SATURATED, 1.0
+    stars["flux"] = 1.133 * fwhm_px**2 * height * (2 * radius / fwhm_px) ** (2 * GROWTH)
+    stars["snr"] = np.sqrt(stars["flux"])
+    stars["covariance"] = (OFF_CENTRE * radius[:, None, None]) ** 2 * np.eye(2)
+    return stars, radius
 
 
-def with_discs(
-    stars: dict[str, np.ndarray], discs: dict[str, np.ndarray], fwhm_px: float
-) -> dict[str, np.ndarray]:
-    """The columns of measured stars and of the discs, brightest first.
+def with_discs(stars: np.ndarray, discs: np.ndarray, radius: np.ndarray, fwhm_px: float) -> np.ndarray:
+    """The measured stars and the discs of these radii (N,) px, brightest first.
 
     A star measured by its wings, near a disc's middle, keeps its place. All else on the disc and its rim is its light.
     """
-    if not len(discs["x"]):
+    if not len(discs):
         return stars
     apart = np.hypot(stars["x"][:, None] - discs["x"], stars["y"][:, None] - discs["y"])
-    rows = np.arange(len(discs["x"]))
-    middle = (apart < 0.5 * discs["radius"]) & ((stars["flags"] & SATURATED) != 0)[:, None]
-    fitted = (
-        np.where(middle.any(0), np.argmin(np.where(middle, apart, np.inf), axis=0), -1)
-        if len(apart)
-        else -1 + 0 * rows
-    )
-    own = {
-        "x": discs["x"],
-        "y": discs["y"],
-        "flux": discs["flux"],
-        "snr": np.sqrt(discs["flux"]),
-        "covariance": discs["covariance"],
-        "flags": np.full(len(rows), SATURATED, stars["flags"].dtype),
-        "chi2": np.ones(len(rows)),
-    }
-    known = fitted >= 0
-    for name in ("x", "y", "covariance", "chi2"):
-        own[name][known] = stars[name][fitted[known]]
-    own["flux"][known] = np.maximum(own["flux"][known], stars["flux"][fitted[known]])
-    rest = ~(apart < discs["radius"] + fwhm_px).any(1)
-    columns = {name: np.concatenate([own[name], stars[name][rest]]) for name in own}
-    order = np.argsort(-columns["flux"], kind="stable")
-    return {name: column[order] for name, column in columns.items()}
+    middle = (apart < 0.5 * radius) & ((stars["flags"] & SATURATED) != 0)[:, None]
+    known = middle.any(0)
+    if known.any():
+        fitted = stars[np.argmin(np.where(middle, apart, np.inf), axis=0)[known]]
+        for name in ("x", "y", "covariance", "chi2"):
+            discs[name][known] = fitted[name]
+        discs["flux"][known] = np.maximum(discs["flux"][known], fitted["flux"])
+    rest = ~(apart < radius + fwhm_px).any(1)
+    stars = np.concatenate([discs, stars[rest]])
+    return stars[np.argsort(-stars["flux"], kind="stable")]
 
 
 # Maximum relative error at which a fit gives a clipped star's light, and maximum chi2 at which it gives another's.
-TOLD, STRANGE = 0.1, 3.0
+KNOWN, STRANGE = 0.1, 3.0
 # px. A star measured so near a peak is the peak's.
 NEAR = 2.0
 # Minimum share of the light above sky that belongs to the source itself.
@@ -169,38 +153,37 @@ REACH, MIN_REACH = 6.0, 12
 
 
 def with_clipped(
-    stars: dict[str, np.ndarray],
-    plane: np.ndarray,
-    background: Background,
+    stars: np.ndarray,
+    sky: SkyPlane,
     x: np.ndarray,
     y: np.ndarray,
     fwhm_px: float,
-) -> dict[str, np.ndarray]:
-    """The columns of measured stars and of clipped ones among the peaks x, y (N,) int px, brightest first.
+) -> np.ndarray:
+    """The measured stars and the clipped ones among the peaks x, y (N,) int px, brightest first.
 
     A saturated star is measured anew if its wings constrain its light weakly, and so is what seems to be several stars in
     one flat image.
     """
     saturated = (stars["flags"] & SATURATED) != 0
-    told = np.sqrt(np.maximum(stars["chi2"], 1.0)) < TOLD * stars["snr"]
-    told |= ~saturated & (stars["chi2"] < STRANGE)
+    constrained = np.sqrt(np.maximum(stars["chi2"], 1.0)) < KNOWN * stars["snr"]
+    constrained |= ~saturated & (stars["chi2"] < STRANGE)
     # the third highest pixel, because hot ones may exceed saturation
-    level, top = background.near(x, y)[0].mean(1), thirds(plane, x, y)
-    sky = background.typical[0]
-    lost = top - sky > FLAT * (top.max() - sky)
-    at_x, at_y, own_x, own_y, untold = (
+    level, top = sky.near(x, y)[0].mean(1), third_highest(sky.plane, x, y, 1)[0]
+    typical = sky.typical[0]
+    lost = top - typical > FLAT * (top.max() - typical)
+    at_x, at_y, own_x, own_y, weak = (
         x.astype(float),
         y.astype(float),
         stars["x"],
         stars["y"],
-        saturated & ~told,
+        saturated & ~constrained,
     )
-    lost[lost] = ~any_near(own_x[told], own_y[told], at_x[lost], at_y[lost], NEAR)
-    lost |= any_near(own_x[untold], own_y[untold], at_x, at_y, NEAR)
+    lost[lost] = ~any_near(own_x[constrained], own_y[constrained], at_x[lost], at_y[lost], NEAR)
+    lost |= any_near(own_x[weak], own_y[weak], at_x, at_y, NEAR)
     # what stands on a roof is the roof's
-    lost = (lost & (top - level > OWN * (top - sky))).nonzero()[0][:MOST]
+    lost = (lost & (top - level > OWN * (top - typical))).nonzero()[0][:MOST]
     reach = max(MIN_REACH, round(REACH * fwhm_px))
-    images = [_image(plane, x[k], y[k], level[k], top[k], reach) for k in lost.tolist()]
+    images = [_image(sky.plane, x[k], y[k], level[k], top[k], reach) for k in lost.tolist()]
     least = max(FEWEST, NARROWER * np.pi / 4 * fwhm_px**2)
     # several peaks may belong to one image
     clipped = [
@@ -208,10 +191,10 @@ def with_clipped(
     ]
     if not clipped:
         return stars
-    discs = columns_of(clipped, fwhm_px, float(top.max()) - sky)
+    discs, radius = measured_discs(clipped, fwhm_px, float(top.max()) - typical)
     apart = np.hypot(own_x[:, None] - discs["x"], own_y[:, None] - discs["y"])
-    known = told | ~(apart < discs["radius"]).any(1)
-    return with_discs({name: column[known] for name, column in stars.items()}, discs, fwhm_px)
+    known = constrained | ~(apart < radius).any(1)
+    return with_discs(stars[known], discs, radius, fwhm_px)
 
 
 def _image(

@@ -1,25 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
 """Turn peaks into measured stars: fit each, leave out what is not a star, flag the doubtful ones."""
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 
+from starpos.detection._moments import squared_widths, window_moments
 from starpos.detection._neighbours import near_pairs
-from starpos.detection._shapes import squared_widths
-from starpos.detection._vetting import level, looks, one_pixel, own_light, without_spikes
-from starpos.detection.background import Background
-from starpos.detection.fit import (
-    OUTLIER,
-    Fit,
-    Fitted,
-    Response,
-    fit_stars,
-    joined,
-    pairs_among,
-    rows_of,
-    surprising,
+from starpos.detection._vetting import (
+    compare_with_pixel,
+    correct_sky,
+    describe_stars,
+    replace_spikes,
+    restore_model,
 )
+from starpos.detection.background import SkyPlane
+from starpos.detection.fit import OUTLIER, Fit, Response, fit_stars, split_pairs, surprising
 from starpos.detection.learn import Lesson, grey
 from starpos.detection.psf import FieldPsf
 from starpos.detection.stamps import (
@@ -28,7 +25,7 @@ from starpos.detection.stamps import (
     Stamps,
     centroid,
     cut,
-    moments,
+    joined,
     relative_widths,
     window_for,
 )
@@ -56,97 +53,98 @@ OWN = 0.01
 # Minimum noise of pixels on a streak, over the quietest pixel of their stamp.
 LOUD = 3
 
+# A measured star: what `Stars` has of each, chi-square per degree of freedom, and whether its image is too wide.
+MEASURED = np.dtype(
+    [
+        *((name, float) for name in ("x", "y", "flux", "snr", "chi2")),
+        ("covariance", float, (2, 2)),
+        ("flags", np.uint8),
+        ("wide", bool),
+    ],
+    align=True,
+)
+
 
 def measure(
-    plane: np.ndarray,
-    background: Background,
+    sky: SkyPlane,
     x: np.ndarray,
     y: np.ndarray,
     lesson: Lesson,
-    saturation: float,
     min_snr: float,
     chunk: int,
-) -> dict[str, np.ndarray]:
-    """Measure the stars among the peaks x, y (N,) int px: columns x, y, flux, snr, covariance, flags, chi2, wide.
+) -> np.ndarray:
+    """Measure the stars among the peaks x, y (N,) int px: an array of MEASURED, in no order.
 
-    The rows are in no order. saturation is the DN from which a pixel is saturated, min_snr the SNR a star must have, and
-    chunk about how many are measured at once.
+    min_snr: the SNR a star must have; chunk: about how many are measured at once
     """
     psf = lesson.psf
 
-    def cut_at(x: np.ndarray, y: np.ndarray) -> tuple[Stamps, np.ndarray]:
-        stamps = cut(plane, background, x, y, lesson.reach, saturation)
-        level(stamps.signal, stamps.noise, SIGMA_PER_MAD, RAISED, UNEVEN, OWN)
-        return stamps, _take_spikes(stamps, lesson)
+    def cut_at(x: np.ndarray, y: np.ndarray) -> Stamps:
+        stamps = cut(sky, x, y, lesson.reach)
+        correct_sky(stamps.signal, stamps.noise, SIGMA_PER_MAD, RAISED, UNEVEN, OWN)
+        return _without_spikes(stamps, lesson)
 
-    def measured(stars: Fitted, wanted: np.ndarray) -> dict[str, np.ndarray]:
-        return _columns(*stars, background, lesson, min_snr, wanted)
-
-    def one_after_the_other(parts: list[Fitted]) -> Fitted:
-        stamps, spikes, fits = zip(*parts, strict=True)
-        return joined(stamps), np.concatenate(spikes), joined(fits)
+    def select(stamps: Stamps, fit: Fit, wanted: np.ndarray) -> np.ndarray:
+        return _measured(stamps, fit, sky, lesson, min_snr, wanted)
 
     # odd stars of several chunks together, because most chunks have a few
-    odd: list[Fitted] = []
+    odd: list[tuple[Stamps, Fit]] = []
 
-    def one_chunk(x: np.ndarray, y: np.ndarray) -> dict[str, np.ndarray]:
-        stamps, spike = cut_at(x, y)
-        begin = centroid(grey(stamps.signal, background)[0], stamps.x, stamps.y, psf.shapes_at(x, y))
+    def one_chunk(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        stamps = cut_at(x, y)
+        begin = centroid(grey(stamps.signal, sky)[0], stamps.x, stamps.y, psf.shapes_at(x, y))
         fit = fit_stars(stamps, psf, *begin, lesson.response)
         strange = surprising(stamps, fit)
         rows = strange.nonzero()[0]
         if len(rows):
-            odd.append((stamps.take(rows), spike[rows], rows_of(fit, rows)))
-        return measured((stamps, spike, fit), ~strange)
+            odd.append((stamps.select(rows), fit.select(rows)))
+        return select(stamps, fit, ~strange)
 
-    def with_companions() -> dict[str, np.ndarray]:
-        stars = one_after_the_other(odd)
+    def with_companions() -> np.ndarray:
+        stamps, fit = map(joined, zip(*odd, strict=True))
         odd.clear()
-        paired, pairs = pairs_among(stars, psf, lesson.response, cut_at)
+        paired, pairs = split_pairs(stamps, fit, psf, lesson.response, cut_at)
         if pairs is not None:
-            alone = stars[0].take(~paired), stars[1][~paired], rows_of(stars[2], ~paired)
-            stars = one_after_the_other([alone, pairs])
-        return measured(stars, np.ones(len(stars[1]), bool))
+            stamps = joined([stamps.select(~paired), pairs[0]])
+            fit = joined([fit.select(~paired), pairs[1]])
+        return select(stamps, fit, np.ones(len(fit.x), bool))
 
-    parts: list[dict[str, np.ndarray]] = []
+    parts: list[np.ndarray] = []
     # chunks of one size: a small one at the end would take nearly as long to begin
     count = max(1, round(len(x) / chunk))
     ends = [len(x) * k // count for k in range(count + 1)]
     for first, end in pairwise(ends):
         parts.append(one_chunk(x[first:end], y[first:end]))
-        if odd and (sum(len(star[1]) for star in odd) >= chunk or end == len(x)):
+        if odd and (sum(len(fit.x) for _, fit in odd) >= chunk or end == len(x)):
             parts.append(with_companions())
-    if len(parts) == 1:
-        return parts[0]
-    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    return np.concatenate(parts)
 
 
-def _columns(
+def _measured(
     stamps: Stamps,
-    spike: np.ndarray,
     fit: Fit,
-    background: Background,
+    sky: SkyPlane,
     lesson: Lesson,
     min_snr: float,
     wanted: np.ndarray,
-) -> dict[str, np.ndarray]:
-    """The columns that `measure` explains of fitted stars, of those that are wanted (N,) and are stars.
+) -> np.ndarray:
+    """The fitted stars as `measure` gives them, of those that are wanted (N,) and are stars.
 
-    spike (N, S, S): which pixels have the mean of their neighbours. The stamps' light is changed.
+    The stamps' light is changed.
     """
     psf = lesson.psf
     local = psf.at(fit.x, fit.y)
     corner = stamps.corner(fit.x, fit.y)
-    matched, foreign, full, edge = looks(
-        stamps.signal, stamps.noise, stamps.good, stamps.full, spike, fit.residual, fit.model, fit.used, fit.outlier,
-        *corner, local.axes, *CORE,
+    matched, foreign, full, edge = describe_stars(
+        stamps.signal, stamps.noise, stamps.good, stamps.full, stamps.spike, fit.residual, fit.model, fit.used,
+        fit.outlier, *corner, local.axes, *CORE,
     )  # fmt: skip
     dot = _is_dot(stamps, fit, lesson.response)
-    own_light(stamps.signal, stamps.noise, spike, fit.model, fit.outlier, SPECK, LOUD)
-    smooth, blur = grey(stamps.signal, background)
+    restore_model(stamps.signal, stamps.noise, stamps.spike, fit.model, fit.outlier, SPECK, LOUD)
+    smooth, blur = grey(stamps.signal, sky)
     shape = psf.shapes_at(stamps.x, stamps.y)
     window = window_for(shape)
-    _, _, seen = moments(smooth, *corner, window)
+    _, _, seen = window_moments(smooth, *corner, window)
     widths = relative_widths(seen, shape + blur * np.eye(2), window)
     misfit = _misfit(fit)
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -155,8 +153,8 @@ def _columns(
         sound = wanted & np.isfinite(snr) & (c[:, 0, 0] > 0) & (c[:, 0, 0] * c[:, 1, 1] > c[:, 0, 1] ** 2)
         sound &= np.hypot(fit.x - stamps.x, fit.y - stamps.y) < 2 + lesson.reach / 2
         sound &= (fit.flux > 0) & (matched >= min_snr) & ~dot
-        sound &= (fit.x >= 0) & (fit.x <= background.width - 1)
-        sound &= (fit.y >= 0) & (fit.y <= background.height - 1)
+        sound &= (fit.x >= 0) & (fit.x <= sky.width - 1)
+        sound &= (fit.y >= 0) & (fit.y <= sky.height - 1)
         slack = 3 / matched
         # through a window wider than the star, noise changes the width more
         loose = slack * np.sqrt(squared_widths(window).prod(1) / squared_widths(shape).prod(1))
@@ -166,9 +164,19 @@ def _columns(
         blended = (foreign > 0.05 * fit.flux) | (misfit > STRANGE) | wide
         elongated = (widths[:, 1] / np.maximum(widths[:, 0], 0.1) > 1.35 + slack) & ~full & ~edge
     flags = SATURATED * full + EDGE * edge + ELONGATED * elongated + BLENDED * blended
-    columns = {"x": fit.x, "y": fit.y, "flux": fit.flux, "snr": snr, "covariance": c, "flags": flags}
-    columns |= {"chi2": fit.chi2, "wide": wide}
-    return {name: column[sound] for name, column in columns.items()}
+    rows = np.empty(np.count_nonzero(sound), MEASURED)
+    for name, column in (
+        ("x", fit.x),
+        ("y", fit.y),
+        ("flux", fit.flux),
+        ("snr", snr),
+        ("chi2", fit.chi2),
+        ("covariance", c),
+        ("flags", flags),
+        ("wide", wide),
+    ):
+        rows[name] = column[sound]
+    return rows
 
 
 def _misfit(fit: Fit) -> np.ndarray:
@@ -177,15 +185,16 @@ def _misfit(fit: Fit) -> np.ndarray:
     return np.where(fit.chi2 > 1 + 4 * np.sqrt(2 / freedom), fit.chi2, 1.0)
 
 
-def _take_spikes(stamps: Stamps, lesson: Lesson) -> np.ndarray:
-    """Pixels (N, S, S) much brighter than their neighbours, as in no star: the stamps have the mean of these there."""
+def _without_spikes(stamps: Stamps, lesson: Lesson) -> Stamps:
+    """The stamps with the mean of their neighbours in pixels that are much brighter than these, as in no star."""
     beside = np.full(len(stamps.x), -1.0)
     star = lesson.psf.at(stamps.x, stamps.y).evaluate(beside, beside, 3)
     top, four = star[:, 1, 1], (star[:, 0, 1] + star[:, 2, 1] + star[:, 1, 0] + star[:, 1, 2]) * 0.25
     # at least 1, because a ring has a dark middle
     sharpest = SPIKE * np.maximum(1.0, top / np.maximum(four, 1e-3 * np.abs(top))).astype(np.float32)
     gain = lesson.response.gain.astype(np.float32)
-    return without_spikes(stamps.signal, stamps.noise, stamps.good, stamps.phase, gain, sharpest, OUTLIER)
+    spike = replace_spikes(stamps.signal, stamps.noise, stamps.good, stamps.phase, gain, sharpest, OUTLIER)
+    return replace(stamps, spike=spike)
 
 
 def _is_dot(stamps: Stamps, fit: Fit, response: Response) -> np.ndarray:
@@ -193,7 +202,7 @@ def _is_dot(stamps: Stamps, fit: Fit, response: Response) -> np.ndarray:
 
     Where one pixel does not describe them well either (a star on coarse pixels), the PSF must be twice as bad.
     """
-    one, star, pixels, full = one_pixel(
+    one, star, pixels, full = compare_with_pixel(
         stamps.signal, stamps.noise, stamps.good, stamps.full, fit.residual, fit.model, response.dn_per_photon,
         response.misfit, max(2, stamps.reach // 2 - 1),
     )  # fmt: skip
@@ -201,30 +210,26 @@ def _is_dot(stamps: Stamps, fit: Fit, response: Response) -> np.ndarray:
     return (one < star) & (likely | (one < 0.5 * star)) & (full < SPECK)
 
 
-def resolve(columns: dict[str, np.ndarray], psf: FieldPsf) -> dict[str, np.ndarray]:
-    """Sort the columns by flux, keep one of several fits of the same star, and flag close neighbours as BLENDED.
+def resolve(stars: np.ndarray, psf: FieldPsf) -> np.ndarray:
+    """Sort measured stars by flux, keep one of several fits of the same star, and flag close neighbours as BLENDED.
 
     A wide image is kept only if no better one was measured there.
     """
-    order = np.argsort(-columns["flux"], kind="stable")
-    columns = {name: column[order] for name, column in columns.items()}
-    wide = columns.pop("wide")
-    n = len(order)
-    if n == 0:
-        return columns
+    stars = stars[np.argsort(-stars["flux"], kind="stable")]
+    if not len(stars):
+        return stars
+    wide = stars["wide"]
     # in widths of the PSF
-    points = np.stack([columns["x"], columns["y"]], 1) @ psf.axes.T
+    points = np.stack([stars["x"], stars["y"]], 1) @ psf.axes.T
     # the brighter star of each pair first
     pairs = near_pairs(*np.ascontiguousarray(points.T), FAR)
     apart = np.hypot(*(points[pairs[:, 0]] - points[pairs[:, 1]]).T)
-    ratio = columns["flux"][pairs[:, 1]] / columns["flux"][pairs[:, 0]]
-    keep = np.ones(n, bool)
+    ratio = stars["flux"][pairs[:, 1]] / stars["flux"][pairs[:, 0]]
+    keep = np.ones(len(stars), bool)
     for one, other in (pairs.T, pairs.T[::-1]):
         keep[one[wide[one] & ~wide[other] & (apart < RESOLVED)]] = False
     keep[pairs[keep[pairs[:, 0]] & ((apart < 1.5) | (ratio < 0.01)), 1]] = False
     near = keep[pairs].all(1) & (apart < RESOLVED)
-    flags = columns["flags"].copy()
-    flags[pairs[near, 1]] |= BLENDED
-    flags[pairs[near & (ratio > 0.03), 0]] |= BLENDED
-    columns["flags"] = flags.astype(np.uint8)
-    return {name: column[keep] for name, column in columns.items()}
+    stars["flags"][pairs[near, 1]] |= BLENDED
+    stars["flags"][pairs[near & (ratio > 0.03), 0]] |= BLENDED
+    return stars[keep]

@@ -17,6 +17,7 @@ import numpy as np
 
 from starpos.earth.ellipsoid import ECCENTRICITY2, EQUATOR_RADIUS_M
 from starpos.errors import TimeError
+from starpos.frozen import at_once
 from starpos.units import ARCSEC, DAY_S, UNIX_EPOCH_JD, utc_text
 
 TT_MINUS_TAI_S = 32.184
@@ -52,6 +53,7 @@ class EarthOrientation:
     extrapolated_days: float = 0.0
 
 
+@at_once
 @dataclass(frozen=True)
 class EarthState:
     """All that A1 needs at one instant, computed once for a frame.
@@ -182,6 +184,7 @@ def table_age_days(utc_unix_s: float) -> float:
     return (utc_unix_s - measured_until()) / DAY_S
 
 
+@at_once
 @dataclass(frozen=True, kw_only=True)
 class _Table:
     """Daily values (N,): mjd, TAI-UTC (s), UT1-TAI (s; without leap seconds, so it can be interpolated), pole (rad)."""

@@ -18,6 +18,7 @@ from starpos.earth.ellipsoid import (
     place_of_zenith,
 )
 from starpos.errors import InstrumentError
+from starpos.frozen import at_once
 from starpos.rotation import full_turn
 from starpos.units import ARCSEC
 
@@ -42,11 +43,13 @@ class Deflection:
     """Components xi (north) and eta (east) in arcsec, with the 1 sigma of each; InstrumentError if not finite.
 
     North and east are at the place that the Deflection is asked for; close to a pole they change with every step.
+    curvature_arcsec: the part of xi that is the curvature of normal plumb lines, which a height alone gives.
     """
 
     xi_arcsec: float = 0.0
     eta_arcsec: float = 0.0
     stddev_arcsec: float = UNKNOWN_STDDEV_ARCSEC
+    curvature_arcsec: float = 0.0
 
     def __post_init__(self) -> None:
         if (
@@ -59,8 +62,9 @@ class Deflection:
 
     @property
     def known(self) -> bool:
-        """Whether anything is known of it."""
-        return self.eta_arcsec != 0 or self.stddev_arcsec < UNKNOWN_STDDEV_ARCSEC
+        """Whether anything is known of it beyond the curvature."""
+        own = self.xi_arcsec - self.curvature_arcsec, self.eta_arcsec
+        return own != (0, 0) or self.stddev_arcsec < UNKNOWN_STDDEV_ARCSEC
 
     def at(self, latitude: float, longitude: float) -> "Deflection":
         """The deflection itself, which is the same everywhere."""
@@ -91,6 +95,7 @@ class AtHeight:
         return replace(
             d,
             xi_arcsec=d.xi_arcsec + per_m * height_m,
+            curvature_arcsec=per_m * height_m,
             stddev_arcsec=float(np.hypot(d.stddev_arcsec, per_m * stddev_m)),
         )
 
@@ -106,6 +111,7 @@ def plumb_curvature_arcsec_per_m(latitude: float) -> float:
     return float(share * np.sin(2 * latitude) / meridian / ARCSEC)
 
 
+@at_once
 @dataclass(frozen=True, kw_only=True)
 class Geodetic:
     """Latitude, longitude and heading (rad) on WGS 84.

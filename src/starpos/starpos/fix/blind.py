@@ -54,7 +54,7 @@ class BlindSolver:
         """Names of the stars, pointing, focal length and lens of a camera with its axis near the middle of the frame."""
         begin, limit = time.perf_counter(), CpuLimit.of(self.search_s)
         inside = np.flatnonzero(stars.on_frame)
-        seen = stars.take(inside)
+        seen = stars.select(inside)
         if len(seen) < MIN_STARS:
             message = (
                 f"{stars.place}: {len(seen)} stars detected, at least {MIN_STARS} are needed: check clouds, focus "

@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Identify or solve a frame by every way there is, one after another, until one succeeds or time is up.  First its stars
-as they are, with a second look at the frame; then smaller triangles, in case stars fill only a part of the frame;
-then the same with stars from other detections. A list of stars has no other detections. A focal length that only a
-header states is a hint: if it fits nothing, the search goes on without it.
+"""Identify or solve a frame by every way there is, one after another, until one succeeds or time is up.
+
+First its stars as they are, then a second look at the frame; then both with smaller triangles, in case stars fill only a
+part of the frame; then the same with stars from other detections. A list of stars has no other detections. No way is
+tried again on the same stars. A focal length that only a header states is a hint: if it fits nothing, the search goes on
+without it.
 """
 
 import itertools
@@ -21,7 +23,7 @@ from starpos.frames.frame import Frame, Stars
 from starpos.frames.header import focal_mm
 from starpos.identification import Identification, blind, quads
 from starpos.identification.blind import STAGES
-from starpos.identification.hint import Hint
+from starpos.identification.prior import Hint
 from starpos.identification.search import MIN_LOG_ODDS_WITH_LOOK, Priors
 from starpos.instrument.instrument import Instrument
 from starpos.instrument.tilt_log import Tilts
@@ -44,6 +46,34 @@ UNASKED = (Status.NO_TILT, Status.TILT_OUT_OF_RANGE)
 NEVER_S = math.inf
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Question:
+    """A frame, what is asked of it, and what is known beforehand.
+
+    item: the frame, for a second look and for other detections, or its list of stars.
+    stars: the detected ones, or the list.
+    tilts: for a fix; None if only an identification, or a heading, is asked for.
+    places: where the instrument is known to be, for its heading there; None if unknown.
+    predicted, hint: where to look first, the latter of an earlier solution.
+    until_s: by time.monotonic, when no further way is begun.
+    known: an identification of `stars`, with which nothing is searched for a fix; None without one.
+    """
+
+    item: Frame | Stars
+    stars: Stars
+    tilts: Tilts | None = None
+    places: Places | None = None
+    predicted: Priors = ()
+    hint: Hint | None = None
+    until_s: float = NEVER_S
+    known: Identification | None = None
+
+    @property
+    def is_late(self) -> bool:
+        """Whether no further way may be begun."""
+        return time.monotonic() >= self.until_s
+
+
 @dataclass(frozen=True, eq=False)
 class Sight:
     """A detection of a frame: its stars, and their solution.
@@ -61,25 +91,27 @@ class Sight:
         return self.solution.found
 
 
-def identify_every_way(
-    solver: Solver, item: Frame | Stars, stars: Stars, predicted: Priors = (), until_s: float = NEVER_S
-) -> Sight:
-    """Identify a frame or a list with these stars; no way is begun after until_s (time.monotonic).
+def answer_frame(solver: Solver, question: Question) -> Sight:
+    """The fix of a frame by its tilt, and its heading where the place is known; without both its identification.
 
-    Returns the stars that identified it, or the given ones with the first answer if none did.
+    It is identified by every way there is, each tried once on the same stars.
     """
+    q = question
+    sight = identify_every_way(solver, q) if q.tilts is None else _solved(solver, q, q.tilts)
+    if q.places is None:
+        return sight
+    answer = sight.solution
+    if answer.found is None and answer.status in UNASKED:
+        sight = identify_every_way(solver, q)
+        if sight.found is None:
+            return sight
+        answer = replace(sight.solution, status=answer.status, message=answer.message)
+    return replace(sight, solution=placed(solver, sight.stars, answer, q.places))
 
-    first = Sight(stars, solver.identify(stars, predicted, look_at(item, stars)))
-    if not first.solution.lost:
-        return first
 
-    def ways(seen: Stars) -> Iterator[Solution]:
-        look = look_at(item, seen)
-        if seen is not stars:
-            yield solver.identify(seen, predicted, look)
-        yield solver.identify(seen, predicted, look, part=PART)
-
-    return _another(item, first, ways, lambda: time.monotonic() >= until_s)
+def identify_every_way(solver: Solver, question: Question) -> Sight:
+    """Identify a frame; its stars that identified it, or the given ones with the first answer if none did."""
+    return _otherwise(solver, question, solver.identify(question.stars, question.predicted))
 
 
 def identify_blind_every_way(solver: BlindSolver, item: Frame | Stars, stars: Stars) -> Sight:
@@ -97,57 +129,30 @@ def identify_blind_every_way(solver: BlindSolver, item: Frame | Stars, stars: St
     return _another(item, Sight(stars, solver.identify(stars)), ways, lambda: limit.reached)
 
 
-def solve_every_way(
-    solver: Solver,
-    item: Frame | Stars,
-    stars: Stars,
-    tilts: Tilts,
-    hint: Hint | None = None,
-    predicted: Priors = (),
-    until_s: float = NEVER_S,
-    known: Identification | None = None,
-) -> Sight:
-    """The fix of a frame or a list with these stars, identified by every way there is until until_s.
-
-    known: the identification of these stars, if there is one already.
-    """
-    answer = solver.solve(stars, tilts, hint, predicted, known)
-    if answer.lost and time.monotonic() < until_s:
-        sight = identify_every_way(solver, item, stars, predicted, until_s)
-        if sight.found is not None:
-            again = solver.solve(sight.stars, tilts, hint, predicted, known=sight.found)
-            return Sight(sight.stars, replace(again, identify_s=answer.identify_s + again.identify_s))
-    return Sight(stars, answer)
-
-
-def answer_frame(
-    solver: Solver,
-    item: Frame | Stars,
-    stars: Stars,
-    tilts: Tilts | None,
-    places: Places | None,
-    hint: Hint | None = None,
-    predicted: Priors = (),
-    until_s: float = NEVER_S,
-    known: Identification | None = None,
-) -> Sight:
-    """The fix of a frame or a list by its tilt, as `solve_every_way` has it, and its heading where the place is known.
-
-    tilts: None if only headings are wanted.
-    """
-    if tilts is None:
-        sight = identify_every_way(solver, item, stars, predicted, until_s)
-    else:
-        sight = solve_every_way(solver, item, stars, tilts, hint, predicted, until_s, known)
-    if places is None:
+def _solved(solver: Solver, q: Question, tilts: Tilts) -> Sight:
+    """The fix of a frame, whose stars are searched with refraction removed first."""
+    answer = solver.solve(q.stars, tilts, q.hint, q.predicted, q.known)
+    sight = _otherwise(solver, q, answer)
+    if sight.solution is answer:
         return sight
-    answer = sight.solution
-    if answer.found is None and answer.status in UNASKED:
-        sight = identify_every_way(solver, item, stars, predicted, until_s)
-        if sight.found is None:
-            return sight
-        answer = replace(sight.solution, status=answer.status, message=answer.message)
-    return replace(sight, solution=placed(solver, sight.stars, answer, places))
+    again = solver.solve(sight.stars, tilts, known=sight.found)
+    return replace(sight, solution=replace(again, identify_s=answer.identify_s + again.identify_s))
+
+
+def _otherwise(solver: Solver, q: Question, first: Solution) -> Sight:
+    """The sight of a frame by all ways but the search among its stars, which has given `first`."""
+
+    def ways(seen: Stars) -> Iterator[Solution]:
+        look = look_at(q.item, seen)
+        if seen is not q.stars:
+            yield solver.identify(seen, q.predicted)
+        if look is not None:
+            yield solver.look_again(seen, look, q.predicted)
+        yield solver.identify(seen, q.predicted, part=PART)
+        if look is not None:
+            yield solver.look_again(seen, look, q.predicted, part=PART)
+
+    return _another(q.item, Sight(q.stars, first), ways, lambda: q.is_late)
 
 
 def focal_px_that_fits(solver: Solver, stars: Stars) -> float | None:
@@ -160,6 +165,11 @@ def focal_px_that_fits(solver: Solver, stars: Stars) -> float | None:
         answer = BlindSolver(solver.catalogue, stages=STAGES[:1], fisheye_stages=()).identify(stars)
         found = None if answer.attitude is None else answer.attitude.focal_px
     return found
+
+
+def other_focal_length(place: str, focal_px: float) -> str:
+    """A sentence that says which focal length fits a frame that was not identified with the given one."""
+    return f"{place}: a focal length of {focal_px:.0f} px fits: give that one"
 
 
 def look_at(item: Frame | Stars, stars: Stars) -> "SecondLook | None":
@@ -198,9 +208,9 @@ def _seen(item: Frame | Stars, stars: Stars) -> Iterator[tuple[Stars, float]]:
     if isinstance(item, Stars):
         return
     # slow to import, and seldom needed
-    from starpos.detection.second_look import negative_of, otherwise
+    from starpos.detection.second_look import negative_of, other_views
 
-    seen = otherwise(negative_of(item) if stars.negative else item, stars.window)
+    seen = other_views(negative_of(item) if stars.negative else item, stars.window)
     for others in itertools.islice(seen, MAX_WAYS):
         yield replace(others, negative=stars.negative), MIN_LOG_ODDS_OTHERWISE
 
@@ -209,24 +219,16 @@ def _seen(item: Frame | Stars, stars: Stars) -> Iterator[tuple[Stars, float]]:
 HINT_SEARCH_S = 5.0
 
 
-def without_hint(
-    solver: Solver,
-    item: Frame | Stars,
-    stars: Stars,
-    sight: Sight,
-    work: Callable[[Solver], Sight],
-    progress: Progress,
-) -> Sight:
-    """The sight of a frame with its header's focal length, or if that identifies nothing, with the one that fits.
+def answer_by_header(solver: Solver, question: Question, progress: Progress) -> Sight:
+    """The answer to a frame with its header's focal length, or if that identifies nothing, with the one that fits.
 
-    solver: with the header's focal length. work: gives the sight with any solver.
+    solver: with the header's focal length.
     """
-    if not _misled(solver, item, sight):
-        return sight
-    fitting = _fitting(solver, item, stars, progress)
+    sight, item = answer_frame(solver, question), question.item
+    fitting = _fitting(solver, question, progress) if _misled(solver, item, sight) else None
     if fitting is None:
         return sight
-    again = work(replace(solver, instrument=fitting))
+    again = answer_frame(replace(solver, instrument=fitting), question)
     if again.solution.attitude is None:
         return sight
     remark = wrong_header(item, again.solution.attitude.focal_px)
@@ -272,12 +274,12 @@ def _misled(solver: Solver, item: Frame | Stars, sight: Sight) -> bool:
     return False
 
 
-def _fitting(solver: Solver, item: Frame | Stars, stars: Stars, progress: Progress) -> Instrument | None:
+def _fitting(solver: Solver, q: Question, progress: Progress) -> Instrument | None:
     """The solver's instrument with the focal length, and the lens, that a frame's stars fit; None if none is found."""
-    focal_px = focal_that_fits(solver, stars)
+    focal_px = focal_that_fits(solver, q.stars)
     if focal_px is not None:
         return replace(solver.instrument, focal_px=focal_px)
     blind = BlindSolver(solver.catalogue, progress, search_s=HINT_SEARCH_S)
     blind.prepare()
-    seen = identify_blind_every_way(blind, item, stars).solution.attitude
+    seen = identify_blind_every_way(blind, q.item, q.stars).solution.attitude
     return None if seen is None else replace(solver.instrument, focal_px=seen.focal_px, model=seen.model)

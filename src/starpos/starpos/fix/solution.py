@@ -18,7 +18,7 @@ from starpos.frozen import at_once
 from starpos.identification import Identification, Sky, fisheye
 from starpos.identification._frame import FrameStars
 from starpos.identification.evidence import Explained, explained_by
-from starpos.identification.hint import Hint
+from starpos.identification.prior import Hint
 from starpos.identification.two_skies import two_skies
 from starpos.instrument.camera import PLUMB_BOB, Camera
 from starpos.instrument.inclinometer import Tilt
@@ -185,7 +185,7 @@ def solution_of(
         names=names,
         star=found.star,
         magnitudes=magnitudes,
-        attitude=attitude_of(found, sky, camera, np.stack([stars.x, stars.y], -1)[found.star]),
+        attitude=attitude_of(found, sky, camera, found.spread_px(stars.x, stars.y)),
         warnings=warnings,
         explained=explained,
         found=found,
@@ -211,13 +211,12 @@ def suspicions(
     return names, explained
 
 
-def attitude_of(found: Identification, sky: Sky, camera: Camera, xy: np.ndarray) -> Attitude:
+def attitude_of(found: Identification, sky: Sky, camera: Camera, spread_px: float) -> Attitude:
     """Pointing of the frame's centre; of a mirrored frame, after it was turned the right way up.
 
-    xy (M, 2): places of the identified stars, px.
+    spread_px: of the identified stars on the frame, as `Identification.spread_px` has it.
     """
     scale = found.focal_scale
-    spread_px = math.sqrt(np.square(xy - xy.mean(0)).sum())
     if camera.is_ideal:
         across, down, row = camera.centre_from_axis
         centre, above = (across, down, scale), (across, down - row, scale)

@@ -3,6 +3,7 @@
 
 import math
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -24,9 +25,17 @@ from starpos.frames.reading import why_no_time
 from starpos.frames.tables import Pointing
 from starpos.identification import MIN_STARS, Identification, PointingPrior, Sky, fisheye, identify_directions
 from starpos.identification._frame import FrameStars, all_within, ideal_frame, mean_sigma, unit_vectors
-from starpos.identification.hint import Hint
 from starpos.identification.pose import MIN_SIGMA_PX, TEST_STARS
-from starpos.identification.search import Look, Priors, field_of, identify_frame, second_look, through
+from starpos.identification.prior import Hint
+from starpos.identification.search import (
+    Look,
+    Priors,
+    field_of,
+    identify_frame,
+    identify_near,
+    second_look,
+    through,
+)
 from starpos.identification.triangles import TriangleCatalogue, cached_triangles
 from starpos.instrument.camera import EQUIDISTANT, Camera
 from starpos.instrument.inclinometer import Tilt
@@ -71,6 +80,9 @@ def high_enough(sines: np.ndarray) -> np.ndarray:
     return sines > math.sin(MIN_ALTITUDE_RAD)
 
 
+# how stars are identified: the field, the sky, the camera
+_Search = Callable[[FrameStars | fisheye.WideField, Sky, Camera], Identification | None]
+
 ENOUGH_SOUND = 8
 SMALLEST_FIELD_DEG, LARGEST_FIELD_DEG = 0.3, 100.0
 
@@ -99,15 +111,30 @@ class Solver:
         Sky(catalogue, triangles).load()
         return deeper.too_thin(catalogue, camera)
 
-    def identify(
-        self, stars: Stars, predicted: Priors = (), look: Look | None = None, part: float = 1.0
-    ) -> Solution:
+    def identify(self, stars: Stars, predicted: Priors = (), part: float = 1.0) -> Solution:
         """Names of the stars and pointing of the camera, near a prediction or anywhere.
 
         Stars without a time have J2000 places.
-        look: shows what the frame holds where stars should be; used if the stars alone are too few.
         part: of the frame in which its stars lie, as a share of its size: triangles that are looked up are no larger.
         """
+        return self._identified(stars, part, lambda field, sky, _: identify_frame(field, sky, predicted))
+
+    def look_again(self, stars: Stars, look: Look, predicted: Priors = (), part: float = 1.0) -> Solution:
+        """Identify stars that alone are too few, by what their frame shows where others should be.
+
+        Only for a frame on which `identify` has failed; a fisheye's stays unidentified.
+        """
+
+        def by_looking(
+            field: FrameStars | fisheye.WideField, sky: Sky, camera: Camera
+        ) -> Identification | None:
+            if isinstance(field, FrameStars):
+                return second_look(field, sky, predicted, camera, look)
+            return None
+
+        return self._identified(stars, part, by_looking)
+
+    def _identified(self, stars: Stars, part: float, search: _Search) -> Solution:
         begin = time.perf_counter()
         try:
             camera, catalogue, triangles = self.view(stars.width, stars.height, stars.origin_px)
@@ -117,13 +144,11 @@ class Solver:
             field: FrameStars | fisheye.WideField | None = as_seen(camera, stars)
             if field is None:
                 if (rows := inside(stars, camera)) is not None:
-                    return self.identify(stars.take(rows), predicted, look, part).among(stars, rows)
+                    return self._identified(stars.select(rows), part, search).among(stars, rows)
                 field = field_of(
                     directions_of(camera, stars), mean_sigma(stars.covariance), camera, stars.window
                 )
-            found = identify_frame(field, sky, predicted)
-            if found is None and look is not None and isinstance(field, FrameStars):
-                found = second_look(field, sky, predicted, camera, look)
+            found = search(field, sky, camera)
         except StarposError as e:
             return Solution.refused(stars, e)
         if found is None:
@@ -142,11 +167,11 @@ class Solver:
 
         tilts: not used for a camera that is its own level.
         predicted, hint: where to look, the latter of an earlier solution; a wrong one costs 0.5 ms and does no harm.
-        known: the identification of these stars by `identify`, if the search here may be too short.
+        known: an identification of these stars, such as that of `identify`: then nothing is searched.
         """
         if (rows := self._inside(stars)) is not None:
             known = known and known.but(star=np.searchsorted(rows, known.star))
-            return self.solve(stars.take(rows), tilts, hint, predicted, known).among(stars, rows)
+            return self.solve(stars.select(rows), tilts, hint, predicted, known).among(stars, rows)
         try:
             state, tilt = self.levelled(stars, tilts)
             camera, catalogue, triangles = self.view(stars.width, stars.height, stars.origin_px)
@@ -155,10 +180,10 @@ class Solver:
             directions = self.atmosphere.refraction().unbend(directions_of(camera, stars) @ g.T) @ g
             sky = Sky(catalogue, triangles, state.year, tuple(state.velocity))
             field = field_of(directions, mean_sigma(stars.covariance), camera, stars.window)
-            priors = (*predicted, *(hint.priors(state, g[2]) if hint else ()))
-            if known is not None and not known.mirrored:
-                priors = PointingPrior(known.attitude, camera.fx * known.focal_scale), *priors
-            found = identify_frame(field, sky, priors) or known
+            if known is None:
+                found = identify_frame(field, sky, (*predicted, *(hint.priors(state, g[2]) if hint else ())))
+            else:
+                found = _refracted(known, field, sky, camera)
         except StarposError as e:
             return Solution.refused(stars, e)
         if found is None:
@@ -363,6 +388,16 @@ class Solver:
             return None
 
 
+def _refracted(
+    known: Identification, field: FrameStars | fisheye.WideField, sky: Sky, camera: Camera
+) -> Identification:
+    """A known identification where refraction is removed from the field; as it was if it cannot be confirmed."""
+    if known.mirrored:
+        return known
+    prior = PointingPrior(known.attitude, camera.fx * known.focal_scale)
+    return identify_near(field, sky, (prior,)) or known
+
+
 def _unidentified(stars: Stars, camera: Camera, sky: Sky, begin_s: float) -> Solution:
     status = Status.TOO_FEW_STARS if len(stars) < MIN_STARS else Status.NOT_IDENTIFIED
     failed = Solution.failed(stars, status, why_unidentified(stars, camera, sky.catalogue))
@@ -436,7 +471,7 @@ def focal_that_fits(solver: Solver, stars: Stars, until_s: float = math.inf) -> 
     No try is begun after until_s (time.monotonic).
     Triangles are found by their angles, which hardly depend on the focal length, so the given field's triangles serve.
     """
-    on = stars.take(stars.on_frame.nonzero()[0])
+    on = stars.select(stars.on_frame.nonzero()[0])
     if len(on) < MIN_STARS:
         return None
     try:
@@ -446,7 +481,7 @@ def focal_that_fits(solver: Solver, stars: Stars, until_s: float = math.inf) -> 
             if time.monotonic() >= until_s:
                 break
             camera = given.scaled(FOCAL_STEP**k)
-            seen = on.take(camera.sees(on.x, on.y).nonzero()[0])
+            seen = on.select(camera.sees(on.x, on.y).nonzero()[0])
             found = identify_directions(camera.directions(seen.x, seen.y), seen.sigma, camera, sky)
             if found is not None:
                 return camera.fx * found.focal_scale

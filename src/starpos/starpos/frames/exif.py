@@ -1,6 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a camera writes into its own files (EXIF 2.31): time, exposure, focal length, and how well they are known.
 
+`Exif` reads the tags of any picture or raw file, one fact a property, and `read_exposure` makes an Exposure of them. A
+new fact is a new property there, and a field of Exposure. `SensorGrid` says which pixels of the sensor a picture shows.
+
 A camera's clock is set by hand to the time of some zone, and often shows whole seconds only. So its time is used only if
 a person has said how good the clock is (CameraClock).
 """
@@ -10,12 +13,11 @@ import logging
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime, timezone
-from typing import Any
 
 from starpos.errors import FrameError, TimeError
-from starpos.frames.exposure import MAX_EXPOSURE_S, UNKNOWN_LATENCY_S
+from starpos.frames.exposure import MAX_EXPOSURE_S, UNKNOWN_LATENCY_S, Exposure
 
 # Canon and Nikon allow their clocks an error of a minute a month.
 UNTENDED_STDDEV_S = 60.0
@@ -58,148 +60,200 @@ class CameraClock:
             raise TimeError(f"a camera's clock is known to {self.stddev_s:g} s: give 0 to 86400 s")
 
 
-def told(data: bytes, place: str, clock: CameraClock | None, shape: tuple[int, ...]) -> dict[str, Any]:
-    """Read from the EXIF of a TIFF, JPEG, PNG or TIFF-like raw file (DNG, CR2, NEF ...) what a Frame has fields for.
+@dataclass(frozen=True)
+class SensorGrid:
+    """How a picture of width x height px lies on the pixels of the sensor that took it.
 
-    shape: of the pixels, rows first. exposure_s comes from ExposureTime, rough_focal_px from
-    FocalLengthIn35mmFilm, else from FocalLength and FocalPlaneXResolution; fisheye from the names of lens and camera;
-    origin_px is NaN if the picture has another shape than the camera gave it (ExifImageWidth, ExifImageLength). With a
-    clock also mid_unix_s, stamp_stddev_s and clock_stddev_s, or untimed: DateTimeOriginal and SubSecTimeOriginal are the
-    start of the exposure, rounded down; when the shutter opened is known less well. FrameError if exifread is missing
-    where a clock asks for it.
+    made_px  sides (px) of the picture as the camera made it, the longer one first; 0: not stated
+
+    Rows and columns are the sensor's, however the camera was held, because EXIF's Orientation is not applied. Only
+    libheif turns portraits upright.
+    """
+
+    width: int
+    height: int
+    made_px: tuple[float, float] = (0.0, 0.0)
+
+    @property
+    def diagonal_px(self) -> float:
+        return math.hypot(self.width, self.height)
+
+    @property
+    def scale(self) -> float:
+        """Pixels of the picture over those of the picture that the camera made, along a side; 1 if that is not stated."""
+        return max(self.width, self.height) / self.made_px[0] if self.made_px[0] else 1.0
+
+    @property
+    def is_cropped(self) -> bool:
+        """Whether the picture has another shape than the one that the camera made, in either orientation."""
+        longer, shorter = self.made_px
+        if not shorter:
+            return False
+        return (
+            abs(shorter / longer * max(self.width, self.height) / min(self.width, self.height) - 1)
+            > SAME_SHAPE
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Exif:
+    """What the EXIF of a picture of width x height px states; None for what it does not, or what is impossible.
+
+    tags  by the names that exifread gives them
+    """
+
+    tags: Mapping
+    width: int
+    height: int
+
+    @classmethod
+    def of(cls, data: bytes, width: int, height: int) -> "Exif":
+        """Read the EXIF of a TIFF, JPEG, PNG or TIFF-like raw file (DNG, CR2, NEF ...); ImportError without exifread."""
+        import exifread
+
+        # it warns about every file without EXIF
+        logging.getLogger("exifread").setLevel(logging.CRITICAL)
+        try:
+            return cls(exifread.process_file(io.BytesIO(data), details=False), width, height)
+        # damaged bytes make it raise any kind of exception
+        except Exception:
+            return cls({}, width, height)
+
+    def number(self, name: str) -> float | None:
+        """The positive number that is a tag's first value."""
+        try:
+            value = self.tags[f"EXIF {name}"].values[0]
+            number = value.num / value.den if hasattr(value, "den") else float(value)
+        except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError):
+            return None
+        return number if 0 < number < math.inf else None
+
+    def text(self, name: str) -> str:
+        """The text of a tag without padding, by its name in exifread; empty if the tag is missing."""
+        value = getattr(self.tags.get(name), "values", "")
+        return value.replace("\0", " ").strip() if isinstance(value, str) else ""
+
+    @property
+    def sensor(self) -> SensorGrid:
+        """How the picture lies on the sensor, by ExifImageWidth and ExifImageLength."""
+        shorter, longer = sorted(self.number(name) or 0.0 for name in ("ExifImageWidth", "ExifImageLength"))
+        return SensorGrid(self.width, self.height, (longer, shorter))
+
+    @property
+    def exposure_s(self) -> float | None:
+        """ExposureTime in s."""
+        seconds = self.number("ExposureTime")
+        return seconds if seconds is not None and seconds <= MAX_EXPOSURE_S else None
+
+    @property
+    def rough_focal_px(self) -> float | None:
+        """About the focal length in px: FocalLengthIn35mmFilm, else FocalLength and FocalPlaneXResolution."""
+        film_mm, focal_mm = self.number("FocalLengthIn35mmFilm"), self.number("FocalLength")
+        per_unit, unit = (self.number(f"FocalPlane{name}") for name in ("XResolution", "ResolutionUnit"))
+        sensor, focal_px = self.sensor, None
+        if film_mm is not None:
+            focal_px = film_mm / FILM_MM * sensor.diagonal_px
+        elif focal_mm is not None and per_unit is not None:
+            # the resolution is of the picture as the camera made it, which may have been reduced since
+            focal_px = focal_mm * per_unit / UNITS_MM.get(int(unit or 2), UNITS_MM[2]) * sensor.scale
+        if focal_px is None or not SHORTEST * sensor.diagonal_px < focal_px < LONGEST * sensor.diagonal_px:
+            return None
+        return focal_px
+
+    @property
+    def is_fisheye(self) -> bool:
+        """Whether lens or camera is called a fisheye."""
+        return any(FISHEYE.search(self.text(name)) for name in NAMES)
+
+    @property
+    def gps_unix_s(self) -> float | None:
+        """GPSDateStamp and GPSTimeStamp, UTC of the last fix, as a Unix time."""
+        try:
+            day = datetime.strptime(str(self.tags["GPS GPSDate"].values).strip("\0 "), "%Y:%m:%d")
+            hours, minutes, seconds = (
+                value.num / value.den for value in self.tags["GPS GPSTimeStamp"].values
+            )
+        except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError):
+            return None
+        if not (0 <= hours < 24 and 0 <= minutes < 60 and 0 <= seconds <= 60):
+            return None
+        return day.replace(tzinfo=timezone.utc).timestamp() + 3600 * hours + 60 * minutes + seconds
+
+    def ahead_of_utc_s(self, clock: CameraClock) -> float | None:
+        """Time in s by which the camera's clock was ahead of UTC, by the user or by OffsetTimeOriginal."""
+        if clock.utc_offset_h is not None:
+            return 3600 * clock.utc_offset_h
+        parts = re.fullmatch(r"([+-])(\d\d):(\d\d)", self.text("EXIF OffsetTimeOriginal"))
+        return float(parts[1] + "1") * (3600 * int(parts[2]) + 60 * int(parts[3])) if parts else None
+
+    def start(self, clock: CameraClock) -> tuple[float, float]:
+        """Unix time of the exposure's start (middle of the clock's last step before it), and the length of a step (s).
+
+        The zone is the clock's, else OffsetTimeOriginal's, else by GPS's time; TimeError if there is no time, no zone,
+        or if GPS contradicts it.
+        """
+        text = self.text("EXIF DateTimeOriginal")
+        try:
+            shown = datetime.strptime(text, "%Y:%m:%d %H:%M:%S")
+        except ValueError:
+            shown = datetime.min
+        if shown.year < FIRST_YEAR:
+            raise TimeError(f"its EXIF was taken at {text!r}, which is no time: set the camera's clock")
+        shown_s, gps_s = shown.replace(tzinfo=timezone.utc).timestamp(), self.gps_unix_s
+        ahead_s = None if gps_s is None else shown_s - gps_s
+        offset_s, zone = self.ahead_of_utc_s(clock), self.text("EXIF OffsetTimeOriginal")
+        if offset_s is None and ahead_s is not None and abs(ahead_s) <= 3600 * ZONES_H + GPS_APART_S:
+            offset_s = round(ahead_s / ZONE_STEP_S) * ZONE_STEP_S
+        if offset_s is None:
+            raise TimeError(
+                f"its EXIF has no zone (OffsetTimeOriginal is {zone!r}) and no time by GPS: say "
+                "by how many hours the camera's clock is before UTC"
+            )
+        if ahead_s is not None and abs(ahead_s - offset_s) > GPS_APART_S:
+            raise TimeError(
+                f"by the GPS time in its EXIF the camera's clock was {ahead_s / 3600:.2f} h ahead of UTC, and not "
+                f"{offset_s / 3600:g} h: state the zone that it showed, or set it"
+            )
+        digits = self.text("EXIF SubSecTimeOriginal")
+        # many cameras that count no fractions write zeros
+        if not re.fullmatch(r"\d{1,9}", digits) or not int(digits):
+            digits = ""
+        step_s = 10.0 ** -len(digits)
+        return shown_s - offset_s + (int(digits or 0) + 0.5) * step_s, step_s
+
+
+def read_exposure(data: bytes, place: str, clock: CameraClock | None, shape: tuple[int, ...]) -> Exposure:
+    """Read the Exposure that the EXIF of a picture or raw file states; shape: of the pixels, rows first.
+
+    origin_px is NaN if the picture is a crop. Only with a clock there is a time, or `untimed`: DateTimeOriginal and
+    SubSecTimeOriginal are the start of the exposure, rounded down; when the shutter opened is known less well. FrameError
+    if exifread is missing where a clock asks for it.
     """
     try:
-        import exifread
+        exif = Exif.of(data, shape[1], shape[0])
     except ImportError:
         if clock is None:
-            return {}
+            return Exposure(source=place)
         raise FrameError(f"{place}: reading EXIF needs exifread; run `pip install exifread`.") from None
-    # it warns about every file without EXIF
-    logging.getLogger("exifread").setLevel(logging.CRITICAL)
-    try:
-        tags = exifread.process_file(io.BytesIO(data), details=False)
-    # damaged bytes make it raise any kind of exception
-    except Exception:
-        tags = {}
-    exposure_s = _exposure_s(tags)
-    known: dict[str, Any] = {} if exposure_s is None else {"exposure_s": exposure_s}
-    known["rough_focal_px"] = _focal_px(tags, shape[1], shape[0])
-    known["fisheye"] = any(FISHEYE.search(_text(tags, name)) for name in NAMES)
-    if _cropped(tags, shape[1], shape[0]):
-        known["origin_px"] = (math.nan, math.nan)
+    exposure = Exposure(
+        source=place,
+        exposure_s=exif.exposure_s,
+        rough_focal_px=exif.rough_focal_px,
+        fisheye=exif.is_fisheye,
+        origin_px=(math.nan, math.nan) if exif.sensor.is_cropped else None,
+    )
     if clock is None:
-        return known
-    if exposure_s is None or "EXIF DateTimeOriginal" not in tags:
-        lacks = "ExposureTime" if exposure_s is None else "DateTimeOriginal"
-        return known | {"untimed": f"its EXIF has no {lacks}: give the file as the camera wrote it"}
+        return exposure
+    if exposure.exposure_s is None or "EXIF DateTimeOriginal" not in exif.tags:
+        missing = "ExposureTime" if exposure.exposure_s is None else "DateTimeOriginal"
+        return replace(exposure, untimed=f"its EXIF has no {missing}: give the file as the camera wrote it")
     try:
-        start_unix_s, step_s = _start(tags, clock)
+        start_unix_s, step_s = exif.start(clock)
     except TimeError as e:
-        return known | {"untimed": str(e)}
-    return known | {
-        "mid_unix_s": start_unix_s + exposure_s / 2,
-        "stamp_stddev_s": math.hypot(step_s / math.sqrt(12), UNKNOWN_LATENCY_S),
-        "clock_stddev_s": clock.stddev_s,
-    }
-
-
-def _exposure_s(tags: Mapping) -> float | None:
-    """ExposureTime in s; None if it is missing or impossible."""
-    seconds = _number(tags, "ExposureTime")
-    return seconds if seconds is not None and seconds <= MAX_EXPOSURE_S else None
-
-
-def _cropped(tags: Mapping, width: int, height: int) -> bool:
-    """Whether a picture of this size has another shape than the one that the camera made, in either orientation."""
-    made = sorted(_number(tags, name) or 0.0 for name in ("ExifImageWidth", "ExifImageLength"))
-    return made[0] > 0 and abs(made[0] / made[1] * max(width, height) / min(width, height) - 1) > SAME_SHAPE
-
-
-def _focal_px(tags: Mapping, width: int, height: int) -> float | None:
-    """About the focal length in px of a picture of this size, as the whole sensor makes one; None if unknown."""
-    film_mm, focal_mm = _number(tags, "FocalLengthIn35mmFilm"), _number(tags, "FocalLength")
-    per_unit, unit = (_number(tags, f"FocalPlane{name}") for name in ("XResolution", "ResolutionUnit"))
-    diagonal_px = math.hypot(width, height)
-    focal_px = None
-    if film_mm is not None:
-        focal_px = film_mm / FILM_MM * diagonal_px
-    elif focal_mm is not None and per_unit is not None:
-        # the resolution is of the picture as the camera made it, which may have been reduced since
-        made = max(_number(tags, name) or 0.0 for name in ("ExifImageWidth", "ExifImageLength"))
-        reduced = max(width, height) / made if made else 1.0
-        focal_px = focal_mm * per_unit / UNITS_MM.get(int(unit or 2), UNITS_MM[2]) * reduced
-    if focal_px is None or not SHORTEST * diagonal_px < focal_px < LONGEST * diagonal_px:
-        return None
-    return focal_px
-
-
-def _number(tags: Mapping, name: str) -> float | None:
-    """The positive number that is a tag's first value; None if it is missing or another thing."""
-    try:
-        value = tags[f"EXIF {name}"].values[0]
-        number = value.num / value.den if hasattr(value, "den") else float(value)
-    except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError):
-        return None
-    return number if 0 < number < math.inf else None
-
-
-def _start(tags: Mapping, clock: CameraClock) -> tuple[float, float]:
-    """Unix time of the exposure's start (middle of the clock's last step before it), and the length of a step (s).
-
-    The zone is the clock's, else OffsetTimeOriginal's, else by GPS's time; TimeError if there is no time, no zone,
-    or if GPS contradicts it.
-    """
-    text = _text(tags, "EXIF DateTimeOriginal")
-    try:
-        shown = datetime.strptime(text, "%Y:%m:%d %H:%M:%S")
-    except ValueError:
-        shown = datetime.min
-    if shown.year < FIRST_YEAR:
-        raise TimeError(f"its EXIF was taken at {text!r}, which is no time: set the camera's clock")
-    shown_s = shown.replace(tzinfo=timezone.utc).timestamp()
-    ahead_s = None if (gps_s := _gps_unix_s(tags)) is None else shown_s - gps_s
-    offset_s, zone = _stated_offset_s(tags, clock), _text(tags, "EXIF OffsetTimeOriginal")
-    if offset_s is None and ahead_s is not None and abs(ahead_s) <= 3600 * ZONES_H + GPS_APART_S:
-        offset_s = round(ahead_s / ZONE_STEP_S) * ZONE_STEP_S
-    if offset_s is None:
-        raise TimeError(
-            f"its EXIF has no zone (OffsetTimeOriginal is {zone!r}) and no time by GPS: say "
-            "by how many hours the camera's clock is before UTC"
-        )
-    if ahead_s is not None and abs(ahead_s - offset_s) > GPS_APART_S:
-        raise TimeError(
-            f"by the GPS time in its EXIF the camera's clock was {ahead_s / 3600:.2f} h ahead of UTC, and not "
-            f"{offset_s / 3600:g} h: state the zone that it showed, or set it"
-        )
-    digits = _text(tags, "EXIF SubSecTimeOriginal")
-    # many cameras that count no fractions write zeros
-    if not re.fullmatch(r"\d{1,9}", digits) or not int(digits):
-        digits = ""
-    step_s = 10.0 ** -len(digits)
-    return shown_s - offset_s + (int(digits or 0) + 0.5) * step_s, step_s
-
-
-def _stated_offset_s(tags: Mapping, clock: CameraClock) -> float | None:
-    """Time in s by which the camera's clock was ahead of UTC, by the user or by the file; None if neither says it."""
-    if clock.utc_offset_h is not None:
-        return 3600 * clock.utc_offset_h
-    parts = re.fullmatch(r"([+-])(\d\d):(\d\d)", _text(tags, "EXIF OffsetTimeOriginal"))
-    return float(parts[1] + "1") * (3600 * int(parts[2]) + 60 * int(parts[3])) if parts else None
-
-
-def _gps_unix_s(tags: Mapping) -> float | None:
-    """GPSDateStamp and GPSTimeStamp, UTC of the last fix, as a Unix time; None if missing or invalid."""
-    try:
-        day = datetime.strptime(str(tags["GPS GPSDate"].values).strip("\0 "), "%Y:%m:%d")
-        hours, minutes, seconds = (value.num / value.den for value in tags["GPS GPSTimeStamp"].values)
-    except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError):
-        return None
-    if not (0 <= hours < 24 and 0 <= minutes < 60 and 0 <= seconds <= 60):
-        return None
-    return day.replace(tzinfo=timezone.utc).timestamp() + 3600 * hours + 60 * minutes + seconds
-
-
-def _text(tags: Mapping, name: str) -> str:
-    """The text of a tag without padding, by its name in exifread; empty if the tag is missing."""
-    value = getattr(tags.get(name), "values", "")
-    return value.replace("\0", " ").strip() if isinstance(value, str) else ""
+        return replace(exposure, untimed=str(e))
+    return replace(
+        exposure,
+        mid_unix_s=start_unix_s + exposure.exposure_s / 2,
+        stamp_stddev_s=math.hypot(step_s / math.sqrt(12), UNKNOWN_LATENCY_S),
+        clock_stddev_s=clock.stddev_s,
+    )

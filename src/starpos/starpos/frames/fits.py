@@ -16,7 +16,7 @@ import numpy as np
 
 from starpos.errors import FrameError, one_line
 from starpos.frames.frame import MAX_BYTES, PATTERNS, Frame, check_pixels, to_unsigned
-from starpos.frames.header import KEYS, about
+from starpos.frames.header import KEYS, read_exposure
 
 FITS_START, GZIP_START = b"SIMPLE", b"\x1f\x8b"
 # Planes of a stack or of a camera of colours.
@@ -28,8 +28,6 @@ TILES = ("COMPRESSED_DATA", "GZIP_COMPRESSED_DATA")
 # What astropy unpacks safely: a damaged HCOMPRESS_1 ends the whole program, with astropy 6.0 to 8.0 at least.
 PACKINGS = ("RICE_1", "RICE_ONE", "GZIP_1", "GZIP_2", "NOCOMPRESS")
 STEP = 1 << 20
-# Comments of a DATE-OBS that is the end of the exposure (early SharpCap), and of one that is later still (Seestar).
-GRABBED, CREATED = "frame grabbed", "image created"
 # zlib's name for data in the form of gzip
 GZIP_BITS = 31
 
@@ -59,7 +57,7 @@ def _read(file: BinaryIO, place: str, part: str) -> tuple[Frame, dict[str, Any]]
             plain = _plain(file, place)
             with fits.open(plain, memmap=False, lazy_load_hdus=True) as hdus:
                 image = _image(hdus, place, part)
-                header, values = _content(plain, image, place)
+                header, comments, values = _content(plain, image, place)
     except FrameError:
         raise
     # damaged bytes make astropy, zlib and CFITSIO raise any kind of exception
@@ -73,8 +71,8 @@ def _read(file: BinaryIO, place: str, part: str) -> tuple[Frame, dict[str, Any]]
             f"like '{place}[{image.others[0]}]'",
             stacklevel=3,
         )
-    frame = Frame(to_unsigned(values, place), pattern=_pattern(header, place), **about(header, place))
-    return frame, header
+    pixels, pattern = to_unsigned(values, place), _pattern(header, place)
+    return Frame(pixels, pattern=pattern, **read_exposure(header, place, comments).facts), header
 
 
 def _plain(file: BinaryIO, place: str) -> BinaryIO:
@@ -165,8 +163,8 @@ def _check_frame(hdu: Any, place: str) -> None:
         )
 
 
-def _content(file: BinaryIO, image: _Image, place: str) -> tuple[dict[str, Any], np.ndarray]:
-    """Header (a dict of KEYS) and data (h, w) of an image; what its header lacks comes from the primary one.
+def _content(file: BinaryIO, image: _Image, place: str) -> tuple[dict[str, Any], dict[str, str], np.ndarray]:
+    """Header (a dict of KEYS), comments and data (h, w) of an image; what its header lacks comes from the primary one.
 
     Colours become their mean.
     """
@@ -179,17 +177,13 @@ def _content(file: BinaryIO, image: _Image, place: str) -> tuple[dict[str, Any],
         _check_tiles(file, image.number, place)
     headers = (hdu.header,) if hdu.header.get("INHERIT") is False else (image.primary, hdu.header)
     known = {key: header[key] for header in headers for key in KEYS if key in header}
-    remark = next((h.comments["DATE-OBS"].lower() for h in reversed(headers) if "DATE-OBS" in h), "")
-    if GRABBED in remark:
-        known.setdefault("DATE-END", known.pop("DATE-OBS"))
-    elif CREATED in remark:
-        known["DATE-OBS"] = f"{known['DATE-OBS']}, {CREATED} time"
+    comments = {key: str(header.comments[key]) for header in headers for key in KEYS if key in header}
     values = np.asarray(hdu.data)
     if planes == 1:
-        return known, values.reshape(shape[-2:])
+        return known, comments, values.reshape(shape[-2:])
     # its colours are made from the mosaic that the header may still name
     known.pop("BAYERPAT", None)
-    return known, values.reshape(planes, *shape[-2:]).mean(0, dtype=np.float32)
+    return known, comments, values.reshape(planes, *shape[-2:]).mean(0, dtype=np.float32)
 
 
 def _check_tiles(file: BinaryIO, number: int, place: str) -> None:

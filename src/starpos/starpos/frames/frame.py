@@ -1,44 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """One exposure of a camera: its pixels, or the stars that a detector measured on it."""
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 
-from starpos import files
-from starpos.errors import FrameError, one_line
+from starpos.errors import FrameError
 from starpos.frames.exposure import Exposure, Trail, check_size
 
 # Maximum bytes of a file, and of the pixels it unpacks to: both fit into a small robot's memory.
 MAX_BYTES = 800_000_000
-
-
-@contextmanager
-def opened(path: Path) -> Iterator[BinaryIO]:
-    """Open a frame's file, as a context manager; FrameError if it is missing, empty or too large.
-
-    OSError if the file may not be read.
-    """
-    try:
-        file = files.open_regular(path)
-    except (FileNotFoundError, NotADirectoryError):
-        raise FrameError(f"{one_line(path)}: there is no such file; check the path.") from None
-    except IsADirectoryError:
-        raise FrameError(
-            f"{path}: this is a folder; give the frames in it, like {path / '*.fits'}."
-        ) from None
-    with file:
-        size = file.seek(0, 2)
-        file.seek(0)
-        if size == 0:
-            raise FrameError(f"{path}: the file is empty; take the frame again.")
-        if size > MAX_BYTES:
-            raise FrameError(f"{path}: it has over {MAX_BYTES // 10**6} MB, too many for a frame.")
-        yield file
 
 
 def check_pixels(width: int, height: int, bytes_each: float, place: str) -> None:
@@ -257,7 +229,7 @@ class Stars(Exposure):
         """Whether each star (N,) has no flag; the centroid of a saturated, cut or blended image is biased."""
         return (self.flags & UNSOUND) == 0
 
-    def take(self, index: np.ndarray | slice) -> "Stars":
+    def select(self, index: np.ndarray | slice) -> "Stars":
         """The stars that an index array, a slice or a boolean mask (N,) selects; their order of flux must stay."""
         return replace(self, **{name: getattr(self, name)[index] for name in COLUMNS})
 

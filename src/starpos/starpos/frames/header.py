@@ -1,33 +1,117 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a frame's header says of its exposure: time, focal length, shutter, and the place of a crop on the sensor.
 
-A header is a mapping of FITS keywords (KEYS) to values of any kind; every value is checked.
+A header is a mapping of FITS keywords (KEYS) to values of any kind; every value is checked. Its cards of start,
+middle, end and length are compared, with other cards of UTC and with their comments: those that contradict each other
+give no time, and a length of 0 is unknown. Without a time `untimed` says why.
 """
 
 import math
+import re
+import warnings
 from collections.abc import Mapping
 from contextlib import suppress
+from dataclasses import dataclass, replace
 from typing import Any
 
-from starpos.errors import FrameError
-from starpos.frames import times
-from starpos.frames.exposure import Shutter
-from starpos.units import ARCSEC
+import erfa
 
+from starpos.errors import FrameError, TimeError, one_line
+from starpos.frames.exposure import MAX_EXPOSURE_S, UNKNOWN_LATENCY_S, Exposure, Shutter
+from starpos.units import ARCSEC, DAY_S, UNIX_EPOCH_JD
+
+START, MIDDLE, END = (
+    ("DATE-OBS", "DATE-BEG", "MJD-OBS", "MJD-BEG"),
+    ("DATE-AVG", "MJD-AVG"),
+    ("DATE-END", "MJD-END"),
+)
+# UTC of the start, where DATE-OBS or DATE-BEG is a day alone
+HOURS = ("TIME-OBS", "UT", "UTSTART", "UTC", "UTC-OBS", "UT-OBS", "UTSHUT")
+# Other cards with the UTC of some moment of the exposure, which have to agree with those above: dates as text or numbers
+DATES = (
+    "DATE-UTC",
+    "DATE_UTC",
+    "DATE-GPS",
+    "JD",
+    "JD-OBS",
+    "JD_UTC",
+    "JD-UTC",
+    "JUL-DATE",
+    "EXPSTART",
+    "UNIXTIME",
+)
+# a local time, and its zone: they show whether DATE-OBS is the local one
+LOCAL, ZONES = ("DATE-LOC", "DATE-LT", "LOCTIME", "LOCALTIM"), ("TIMEZONE", "TZ", "TIMEZ")
+# lengths in s: of one exposure (EXP: DWARF), then of all together (LIVETIME: Siril, TOTALEXP: Seestar)
+LENGTHS = ("EXPTIME", "EXPOSURE", "XPOSURE", "EXP", "LIVETIME", "TOTALEXP")
+# number of stacked exposures (Seestar and Siril, IRAF, MaxIm, infrared cameras, Astro Pixel Processor and others)
+COUNTS = ("STACKCNT", "NCOMBINE", "SNAPSHOT", "COADDS", "COADD", "NCOADD", "NCOADDS", "NFRAMES", "NSTACK", "NSTACKED",
+          "LIGH_CNT", "LUM_CNT")  # fmt: skip
+# the second of a stack's inputs (IRAF); the kind of a frame
+SECOND_INPUT, KIND = "IMCMB002", "IMAGETYP"
+STACKED = re.compile(r"\b(master|stack(ed)?|integration|co-?add(ed)?|sum(med)?)\b", re.IGNORECASE)
+TIME_KEYS = (
+    *START,
+    *MIDDLE,
+    *END,
+    *HOURS,
+    *DATES,
+    *LOCAL,
+    *ZONES,
+    *LENGTHS,
+    *COUNTS,
+    SECOND_INPUT,
+    KIND,
+    "TIMESYS",
+    "TIMEUNIT",
+)
+# Time scales of TIMESYS that are read; UT1 would need tables.
+TIME_SCALES = ("utc", "tai", "tt", "tdb", "gps")
+GPS_BEHIND_TAI_S = 19.0
+# Units in the comment of a length, in brackets as FITS has them, or in TIMEUNIT; the length is in s without one.
+UNITS_S = {"us": 1e-6, "ms": 1e-3, "msec": 1e-3, "s": 1.0, "sec": 1.0, "second": 1.0, "seconds": 1.0, "min": 60.0,
+           "h": 3600.0, "d": 86400.0}  # fmt: skip
+# What the comment of a start may say. Names of zones count in capitals only.
+UNIVERSAL = re.compile(r"\b(utc?|gmt|universal)\b(?! *[+-] *\d)", re.IGNORECASE)
+OFFSET = re.compile(r"\b(?:utc?|gmt) *[+-] *0*[1-9]", re.IGNORECASE)
+ZONE = re.compile(
+    r"\b(CES?T|MES?Z|EES?T|WEST|BST|MSK|[ECMP][SD]T|AK[SD]T|HST|[JK]ST|A[ECW][SD]T|NZ[SD]T|IST|SAST|BRT|ART|CLS?T)\b"
+)
+LOCALLY = re.compile(r"\blocal\b", re.IGNORECASE)
+OPENING = re.compile(r"\b(start|begin|beginning|open(ing)?)\b", re.IGNORECASE)
+CENTRE = re.compile(r"\b(mid|middle|midpoint|cent(er|re))\b", re.IGNORECASE)
+CLOSING = re.compile(r"\b(end|ending|finish|stop|clos(e|ing)|frame grabbed)\b", re.IGNORECASE)
+CREATED = re.compile(r"\b(image created|file (created|written))\b", re.IGNORECASE)
+GPS = re.compile(r"\bgps\b", re.IGNORECASE)
+# Cards of the UTC of some moment of the exposure may be off by the time in which a header is written. Up to FOUND_S the
+# difference is an error of the stamp; a larger one is another time, as a local one is.
+WRITING_S, FOUND_S = 5.0, 90.0
+QUARTER_S = 900.0
+NO_COMMENTS: Mapping[str, str] = {}
+# Cards that set the middle of the exposure farther apart than this, beyond their rounding, contradict each other.
+MAX_APART_S = 0.5
+ISO_TIME = re.compile(r"(\d{4})-(\d\d)-(\d\d)T(\d\d):(\d\d)(?::(\d\d?(?:\.\d*)?))?Z?", re.ASCII)
+DAY = re.compile(r"\d{4}-\d\d-\d\d", re.ASCII)
+MJD_ZERO_JD, FARTHEST_MJD = 2400000.5, 1e7
+CLOCK = re.compile(r"(\d\d?):(\d\d)(?::(\d\d(?:\.\d*)?))?", re.ASCII)
+# numbers above these are MJDs of the space age, Julian dates, Unix times of this century
+LEAST_MJD, LEAST_JD, LEAST_UNIX_S = 3e4, 2e6, 9e8
+# smallest step of an MJD's last digit: below it lie the last bits of a double
+MIN_MJD_STEP_S = 1e-3
 # Cards with the column and row of the sensor's frame at which a frame begins, in pixels of this frame, and their sign:
 # positive by SBFITSEXT (MaxIm, APT, Seestar and others), negative in IRAF's physical coordinates
 CROPS = ((("XORGSUBF", "YORGSUBF"), 1.0), (("LTV1", "LTV2"), -1.0))
 # IRAF's size of a pixel in physical ones
 LTM = ("LTM1_1", "LTM2_2")
 # arcsec per px, by INDI, Sequence Generator Pro and others
-SCALES = ("SCALE", "PIXSCALE", "SECPIX1")
+PLATE_SCALES = ("SCALE", "PIXSCALE", "SECPIX1")
 # minimum of a focal length, a pixel or a scale that counts as stated
 LEAST = 1e-9
 KEYS = (
-    *times.KEYS,
+    *TIME_KEYS,
     *(key for keys, _ in CROPS for key in keys),
     *LTM,
-    *SCALES,
+    *PLATE_SCALES,
     "BAYERPAT",
     "XBAYROFF",
     "YBAYROFF",
@@ -37,15 +121,19 @@ KEYS = (
 )
 
 
-def about(header: Mapping, place: str) -> dict[str, Any]:
-    """Read the fields of an Exposure that a header states; FrameError for a bad shutter. place names it in messages."""
-    return times.times(header) | {
-        "source": place,
-        "focal_px": focal_px(header),
-        "pixel_um": _positive(header, "XPIXSZ"),
-        "shutter": shutter(header, place),
-        "origin_px": origin_px(header),
-    }
+def read_exposure(header: Mapping, place: str, comments: Mapping[str, str] = NO_COMMENTS) -> Exposure:
+    """Read the Exposure that a header states; FrameError for a bad shutter. place names it in messages.
+
+    comments: of cards, by their keywords.
+    """
+    return replace(
+        read_times(header, comments),
+        source=place,
+        focal_px=focal_px(header),
+        pixel_um=_positive(header, "XPIXSZ"),
+        shutter=shutter(header, place),
+        origin_px=origin_px(header),
+    )
 
 
 def origin_px(header: Mapping) -> tuple[float, float] | None:
@@ -86,7 +174,7 @@ def focal_px(header: Mapping) -> float | None:
     focal, pixel_um = _positive(header, "FOCALLEN"), _positive(header, "XPIXSZ")
     if focal is not None and pixel_um is not None:
         return focal * 1000.0 / pixel_um
-    scales = (_positive(header, key) for key in SCALES)
+    scales = (_positive(header, key) for key in PLATE_SCALES)
     return next((1.0 / (scale * ARCSEC) for scale in scales if scale is not None), None)
 
 
@@ -102,3 +190,398 @@ def focal_mm(focal_px: float, pixel_um: float) -> float:
     """FOCALLEN, mm, from a focal length in px and the size of a pixel in um."""
     # 12 digits turn 29.669999999999998 into 29.67
     return float(f"{focal_px * pixel_um / 1000:.12g}")
+
+
+@dataclass(frozen=True)
+class _Instant:
+    """A time of a card: Julian date in TAI in two parts, and its standard deviation (s) by its last digit."""
+
+    day: float
+    part: float
+    stddev_s: float
+
+    def since_s(self, other: "_Instant") -> float:
+        """Time in s from another instant to this one."""
+        return ((self.day - other.day) + (self.part - other.part)) * DAY_S
+
+
+@dataclass(frozen=True)
+class _Middle:
+    """The middle of the exposure, s after an instant, by some cards."""
+
+    after_s: float
+    stddev_s: float
+    by: str
+
+
+def read_times(header: Mapping, comments: Mapping[str, str] = NO_COMMENTS) -> Exposure:
+    """Read when a frame was exposed: mid_unix_s, exposure_s, stamp_stddev_s, or untimed.
+
+    comments: of cards, by their keywords.
+
+    stamp_stddev_s comes from the last digit of a time, which may be rounded or cut off, and from how far cards that
+    should agree are apart. A header without any card of a time has an empty untimed.
+    """
+    try:
+        _check_single(header)
+        lengths = _lengths(header, comments)
+    except TimeError as e:
+        return Exposure(untimed=str(e))
+    exposure_s = next(iter(lengths.values()), None)
+    try:
+        header = _as_commented(header, comments)
+        instants = _instants(header)
+        middles, zero = _middles(instants, lengths)
+    except TimeError as e:
+        return Exposure(exposure_s=exposure_s, untimed=str(e))
+    if zero is None or not middles:
+        return Exposure(exposure_s=exposure_s, untimed="" if zero is None else _no_length(header))
+    best = min(middles, key=lambda m: m.stddev_s)
+    other = max(middles, key=lambda m: _apart_s(m, best))
+    if (apart_s := _apart_s(other, best)) > MAX_APART_S:
+        return Exposure(
+            untimed=f"the middle of its exposure by {best.by} and by {other.by} differ by "
+            f"{abs(other.after_s - best.after_s):.3g} s: these cards contradict each other, correct the header"
+        )
+    if exposure_s is None:
+        exposure_s = _span_s(instants)
+    mid_unix_s = _unix_s(zero.day, zero.part + best.after_s / DAY_S)
+    try:
+        off_s = _off_others_s(header, mid_unix_s, exposure_s or 0.0)
+        _check_zone(header, mid_unix_s, exposure_s or 0.0)
+    except TimeError as e:
+        return Exposure(exposure_s=exposure_s, untimed=str(e))
+    return Exposure(
+        mid_unix_s=mid_unix_s,
+        exposure_s=exposure_s,
+        stamp_stddev_s=math.hypot(best.stddev_s, apart_s, off_s),
+    )
+
+
+def _as_commented(header: Mapping, comments: Mapping[str, str]) -> Mapping:
+    """The header with its start as the comment calls it: the middle or the end; TimeError for a time that is not UTC."""
+    values = dict(header)
+    for key in START:
+        comment = comments.get(key, "")
+        if not comment or values.get(key) in (None, ""):
+            continue
+        local = OFFSET.search(comment) or ZONE.search(comment) or LOCALLY.search(comment)
+        if local and not UNIVERSAL.search(comment):
+            raise TimeError(
+                f"its {key} is a local time by its comment ({one_line(comment)}): write UTC into it"
+            )
+        if CREATED.search(comment):
+            raise TimeError(
+                f"its {key} is when the file was made by its comment ({one_line(comment)}): write the start of the "
+                "exposure into it"
+            )
+        if GPS.search(comment) and not UNIVERSAL.search(comment) and not values.get("TIMESYS"):
+            raise TimeError(
+                f"its {key} may be GPS time by its comment ({one_line(comment)}), 18 s ahead of UTC: add a card TIMESYS "
+                "with GPS or UTC"
+            )
+        if OPENING.search(comment):
+            continue
+        kind = MIDDLE if CENTRE.search(comment) else END if CLOSING.search(comment) else None
+        if kind is not None:
+            values.setdefault(kind[key.startswith("MJD")], values.pop(key))
+    return values
+
+
+def _off_others_s(header: Mapping, mid_unix_s: float, exposure_s: float) -> float:
+    """The time in s by which other cards of UTC lie outside the exposure; TimeError if it is another time."""
+    off_s = 0.0
+    for key in (*HOURS, *DATES):
+        other = _other_unix_s(header, key, mid_unix_s)
+        if other is None:
+            continue
+        at_unix_s, step_s = other
+        gap_s = abs(at_unix_s - mid_unix_s) - exposure_s / 2 - step_s - WRITING_S
+        if gap_s > FOUND_S:
+            raise TimeError(_other_time(key, at_unix_s - mid_unix_s))
+        off_s = max(off_s, gap_s)
+    return off_s
+
+
+def _other_time(key: str, later_s: float) -> str:
+    """The sentence on a card whose time is later than the exposure by that much."""
+    hours = later_s / 3600
+    local = abs(math.remainder(later_s, QUARTER_S)) < FOUND_S and abs(hours) < 15
+    return (
+        f"its {key} is {hours:+.2f} h from the exposure by its other cards"
+        + (": one of them is a local time" if local else ": these cards contradict each other")
+        + ", correct the header"
+    )
+
+
+def _other_unix_s(header: Mapping, key: str, near_unix_s: float) -> tuple[float, float] | None:
+    """The Unix time of a card of UTC, and the step of its last digit in s; None if it is not a time.
+
+    A time of day is of the day that is nearest to near_unix_s.
+    """
+    value = header.get(key)
+    if value in (None, "") or isinstance(value, bool):
+        return None
+    try:
+        if isinstance(value, str) and (text := _as_today(value)) and ISO_TIME.fullmatch(text):
+            return _unix_s(*_tai(*_day_of(text, "utc"), "utc")), math.sqrt(3) * _rounding(text)
+        if isinstance(value, str) and (clock := CLOCK.fullmatch(value.strip())):
+            hours, minutes, seconds = clock.groups()
+            of_day_s = int(hours) * 3600 + int(minutes) * 60 + float(seconds or 0)
+            step_s = math.sqrt(3) * _rounding(f"T{value.strip()}") if seconds else 60.0
+            later_s = math.remainder(of_day_s - near_unix_s, DAY_S)
+            return near_unix_s + later_s, step_s
+        number = float(value)
+    except (TypeError, ValueError, OverflowError, erfa.ErfaError):
+        return None
+    # a Unix time, a Julian date or an MJD, by its size
+    if key not in DATES or not math.isfinite(number):
+        return None
+    if number > LEAST_UNIX_S:
+        return number, 1.0
+    zero_jd = UNIX_EPOCH_JD if number > LEAST_JD else UNIX_EPOCH_JD - MJD_ZERO_JD
+    if not number > LEAST_MJD:
+        return None
+    return (number - zero_jd) * DAY_S, math.sqrt(3) * _rounding(number) + 1.0
+
+
+def _check_zone(header: Mapping, mid_unix_s: float, exposure_s: float) -> None:
+    """TimeError if the time of the exposure may be the local one of the header's zone."""
+    zone = next((key for key in ZONES if header.get(key) not in (None, "")), None)
+    offset_h = None if zone is None else _offset_h(header[zone])
+    if not offset_h:
+        return
+    if any(_other_unix_s(header, key, mid_unix_s) is not None for key in (*HOURS, *DATES)):
+        return
+    for key in LOCAL:
+        if (local := _other_unix_s(header, key, mid_unix_s)) is not None:
+            if abs(local[0] - mid_unix_s) > exposure_s + FOUND_S:
+                return
+            raise TimeError(
+                f"its time of exposure is its local time ({key}), {offset_h:+g} h from UTC by its {zone}: write UTC into "
+                "DATE-OBS"
+            )
+    raise TimeError(
+        f"its {zone} is {offset_h:+g} h, and no card shows whether DATE-OBS is UTC: add DATE-UTC or DATE-LOC, or take "
+        f"{zone} away"
+    )
+
+
+def _offset_h(value: Any) -> float | None:
+    """Hours of a zone from UTC, like 2, '+02:00' or 'UTC+2'; None for anything else."""
+    if isinstance(value, bool):
+        return None
+    if isinstance(value, (int, float)):
+        return float(value) if abs(value) <= 15 else None
+    found = re.fullmatch(r" *(?:UTC?|GMT)? *([+-]?) *(\d\d?)(?::?(\d\d))? *", str(value), re.IGNORECASE)
+    if found is None:
+        return None
+    hours = int(found[2]) + int(found[3] or 0) / 60
+    return -hours if found[1] == "-" else hours
+
+
+def _apart_s(one: _Middle, other: _Middle) -> float:
+    """How much farther two middles are apart than rounding of their digits explains."""
+    step_s = math.sqrt(3) * (one.stddev_s + other.stddev_s)
+    # and the last bits of sums
+    return max(0.0, abs(one.after_s - other.after_s) - step_s - 1e-6)
+
+
+def _check_single(header: Mapping) -> None:
+    """Raise TimeError for a stack: it shows the sky of one of its exposures, which need not be the middle one."""
+    for key in COUNTS:
+        count = header.get(key)
+        if isinstance(count, (int, float)) and count > 1:
+            raise TimeError(
+                f"it is a stack of {count:g} exposures ({key}), whose light has no one time: give single exposures"
+            )
+    kind = str(header.get(KIND) or "")
+    if header.get(SECOND_INPUT) not in (None, "") or STACKED.search(kind):
+        by = KIND if STACKED.search(kind) else SECOND_INPUT
+        raise TimeError(
+            f"it is a stack of exposures ({by}), whose light has no one time: give single exposures"
+        )
+
+
+def _lengths(header: Mapping, comments: Mapping[str, str]) -> dict[str, float]:
+    """The lengths of the exposure in s by card; 0 is missing. TimeError for a value that is not a length."""
+    lengths = {}
+    general = str(header.get("TIMEUNIT") or "s").strip().lower()
+    for key in LENGTHS:
+        if (value := header.get(key)) in (None, ""):
+            continue
+        named = re.search(r"\[ *(\w+) *\]", comments.get(key, ""))
+        unit_s = UNITS_S.get(named[1].lower() if named else general)
+        try:
+            length = float(value) * (unit_s or 1.0)
+        except (TypeError, ValueError, OverflowError):
+            length = math.nan
+        if not 0 <= length <= MAX_EXPOSURE_S:
+            raise TimeError(
+                f"its {key} is {one_line(repr(value))}: give 0 to {MAX_EXPOSURE_S:g} s, correct the header"
+            )
+        if length > 0:
+            lengths[key] = length
+    return lengths
+
+
+def _no_length(header: Mapping) -> str:
+    zero = [key for key in LENGTHS if header.get(key) not in (None, "")]
+    if zero:
+        return f"how long it was exposed is unknown, its {zero[0]} is 0: correct the header"
+    return "how long it was exposed is unknown: its header needs EXPTIME"
+
+
+def _instants(header: Mapping) -> dict[str, _Instant]:
+    """The times in the header by card; TimeError for a value that is not a time."""
+    keys = [key for key in (*START, *MIDDLE, *END) if header.get(key) not in (None, "")]
+    scale = str(header.get("TIMESYS") or "UTC").strip().lower()
+    if keys and scale not in TIME_SCALES:
+        raise TimeError(f"its TIMESYS is {scale[:20]!r}: it must be one of {', '.join(TIME_SCALES)}")
+    instants = {key: _instant(header, key, scale) for key in keys}
+    return {key: instant for key, instant in instants.items() if instant is not None}
+
+
+def _middles(
+    instants: Mapping[str, _Instant], lengths: Mapping[str, float]
+) -> tuple[list[_Middle], _Instant | None]:
+    """The middles of the exposure by the cards, and the instant they count from; TimeError if they end early."""
+    if not instants:
+        return [], None
+    zero = next(iter(instants.values()))
+    starts, middles, ends = (
+        {key: instants[key] for key in keys if key in instants} for keys in (START, MIDDLE, END)
+    )
+    by_cards = [_Middle(m.since_s(zero), m.stddev_s, key) for key, m in middles.items()]
+    for key, start in starts.items():
+        at_s = start.since_s(zero)
+        by_cards += [
+            _Middle(at_s + s / 2, start.stddev_s, f"{key} with {length}") for length, s in lengths.items()
+        ]
+        for last, end in ends.items():
+            span_s = end.since_s(start)
+            if span_s < 0:
+                raise TimeError(f"its {last} is before its {key}: correct the header")
+            # an end is often the arrival of the frame: a start and a length are better
+            stddev_s = math.hypot(start.stddev_s, end.stddev_s)
+            by_cards.append(_Middle(at_s + span_s / 2, stddev_s, f"{key} with {last}"))
+    if not starts:
+        # a clock read on arrival of the frame is late
+        by_cards += [
+            _Middle(
+                end.since_s(zero) - s / 2,
+                math.hypot(end.stddev_s, UNKNOWN_LATENCY_S),
+                f"{last} with {length}",
+            )
+            for last, end in ends.items()
+            for length, s in lengths.items()
+        ]
+    return by_cards, zero
+
+
+def _span_s(instants: Mapping[str, _Instant]) -> float | None:
+    """The length of the exposure from its start to its end, as far as these are known."""
+    start, end = (next((instants[key] for key in keys if key in instants), None) for keys in (START, END))
+    if start is None or end is None:
+        return None
+    span_s = end.since_s(start)
+    return span_s if 0 < span_s <= MAX_EXPOSURE_S else None
+
+
+def _instant(header: Mapping, key: str, scale: str) -> _Instant | None:
+    """The time of a card; None if it is a day without an hour. TimeError if it is not a time."""
+    value = header[key]
+    if key.startswith("MJD"):
+        try:
+            value = float(value)
+        except (TypeError, ValueError, OverflowError):
+            raise TimeError(
+                f"its {key} is {one_line(repr(value))}, which is no number: give an MJD"
+            ) from None
+    else:
+        value = _as_today(value)
+        # a number of another keyword (a Julian date, Unix time) would pass for an MJD
+        if not isinstance(value, str):
+            raise TimeError(
+                f"its {key} is {value!r}, which is no text: write it like 2026-11-02T18:00:00.000"
+            )
+        if DAY.fullmatch(value):
+            hours = next((header[k] for k in HOURS if header.get(k) not in (None, "")), None)
+            if hours is None or key in (*MIDDLE, *END):
+                return None
+            hours = str(hours).strip()
+            # a card of the hours may repeat the day
+            value = _as_today(hours) if str(_as_today(hours)).startswith(f"{value}T") else f"{value}T{hours}"
+    try:
+        with warnings.catch_warnings():
+            # of years whose leap seconds are not known yet
+            warnings.simplefilter("ignore", erfa.ErfaWarning)
+            # a second beyond the end of its minute
+            warnings.filterwarnings("error", ".*(after end of day|both of)", erfa.ErfaWarning)
+            day, part = _tai(*_day_of(value, scale), scale)
+    except (erfa.ErfaError, erfa.ErfaWarning, ValueError, TypeError, OverflowError):
+        raise TimeError(
+            f"its {key} is {one_line(repr(value))}, which is no time of an exposure (hours to 23, minutes and seconds to "
+            "59): write it like 2026-11-02T18:00:00.000"
+        ) from None
+    return _Instant(day, part, _rounding(value))
+
+
+def _unix_s(day: float, part: float) -> float:
+    """Unix time of a Julian date in TAI; as sums are formed in TAI, exposures across a leap second come out right."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", erfa.ErfaWarning)
+        day, part = erfa.taiutc(day, part)
+    return float((day - UNIX_EPOCH_JD) * DAY_S + part * DAY_S)
+
+
+def _as_today(start: Any) -> Any:
+    """Text as FITS wants it today, of a day of the 20th century as FITS had it before 1999, or with a space for the T."""
+    if not isinstance(start, str):
+        return start
+    text = re.sub(r"^(\d\d)/(\d\d)/(\d\d)(?!\d)", r"19\3-\2-\1", start.strip())
+    return re.sub(r"^(\d{4}-\d\d-\d\d) +(?=\d\d:)", r"\1T", text)
+
+
+def _rounding(start: float | str) -> float:
+    """Standard deviation (s) from the last digit of a text or an MJD, rounded or cut off; 0 for a long MJD."""
+    if not isinstance(start, str):
+        digits = repr(start).partition(".")[2].rstrip("0")
+        sigma_s = DAY_S * 10.0 ** -len(digits) / math.sqrt(3)
+        return sigma_s if sigma_s > MIN_MJD_STEP_S else 0.0
+    decimals = re.search(r":\d\d:\d\d(?:\.(\d*))?", start)
+    # a time without seconds
+    if decimals is None:
+        return 60 / math.sqrt(3)
+    return 10.0 ** -len(decimals[1] or "") / math.sqrt(3)
+
+
+def _day_of(start: float | str, scale: str) -> tuple[float, float]:
+    """Julian date of a time in its scale, in two parts: ERFA's quasi-JD for UTC; ValueError if invalid.
+
+    By ERFA alone: astropy's times, which are ERFA's, take as long to import as the rest of a program's start.
+    """
+    if not isinstance(start, str):
+        if not abs(start) < FARTHEST_MJD:
+            raise ValueError(start)
+        return MJD_ZERO_JD, start
+    found = ISO_TIME.fullmatch(start.strip())
+    if found is None:
+        raise ValueError(start)
+    *whole, seconds = found.groups()
+    # GPS time has no leap seconds, like TAI
+    return tuple(erfa.dtf2d("UTC" if scale == "utc" else "TAI", *map(int, whole), float(seconds or 0)))
+
+
+def _tai(day: float, part: float, scale: str) -> tuple[float, float]:
+    """The Julian date in TAI of one in another scale, each in two parts."""
+    if scale == "tai":
+        return day, part
+    if scale == "utc":
+        return tuple(erfa.utctai(day, part))
+    if scale == "gps":
+        return day, part + GPS_BEHIND_TAI_S / DAY_S
+    if scale == "tdb":
+        # at the geocentre; the time of day has no part in it there
+        day, part = erfa.tdbtt(day, part, erfa.dtdb(day, part, 0.0, 0.0, 0.0, 0.0))
+    return tuple(erfa.tttai(day, part))

@@ -4,6 +4,7 @@
 import io
 import struct
 import zlib
+from dataclasses import replace
 
 import numpy as np
 
@@ -29,7 +30,7 @@ def picture_frame(data: bytes, place: str, clock: exif.CameraClock | None = None
     place says where the bytes came from, for messages; clock: of the camera, if it may be trusted.
     """
     pixels = picture_pixels(data, place)
-    return Frame(pixels, source=place, **exif.told(data, place, clock, pixels.shape))
+    return Frame(pixels, **exif.read_exposure(data, place, clock, pixels.shape).facts)
 
 
 def picture_pixels(data: bytes, place: str) -> np.ndarray:
@@ -107,21 +108,33 @@ def _tiff_size(data: bytes) -> tuple[int, int, float] | None:
     if order is None:
         return None
     (at,) = struct.unpack_from(order + "I", data, 4)
-    (count,) = struct.unpack_from(order + "H", data, at)
-    # one sample of one bit, unless the file says more
-    values = {BITS: 1, SAMPLES: 1}
-    for k in range(count):
-        tag, kind, n = struct.unpack_from(order + "HHI", data, at + 2 + 12 * k)
-        if tag not in (WIDTH, HEIGHT, BITS, SAMPLES):
-            continue
-        # these are SHORT or LONG, in place; only the bits, one value for each of three samples or more, lie elsewhere
-        place = at + 10 + 12 * k
-        if kind == 3 and n > 2:
-            (place,) = struct.unpack_from(order + "I", data, place)
-        (values[tag],) = struct.unpack_from(order + ("H" if kind == 3 else "I"), data, place)
-    if not {WIDTH, HEIGHT} <= values.keys():
+    tags, _ = _directory(data, at, order, (WIDTH, HEIGHT, BITS, SAMPLES), 1)
+    if not {WIDTH, HEIGHT} <= tags.keys():
         return None
-    return values[WIDTH], values[HEIGHT], values[SAMPLES] * max(values[BITS], 8) / 8
+    # one sample of one bit, unless the file says more
+    (width,), (height,), (bits,), (samples,) = (tags.get(tag, (1,)) for tag in (WIDTH, HEIGHT, BITS, SAMPLES))
+    return width, height, samples * max(bits, 8) / 8
+
+
+def _directory(
+    data: bytes, at: int, order: str, wanted: tuple[int, ...], most: int
+) -> tuple[dict[int, tuple[int, ...]], int]:
+    """The first values, at most so many, of the wanted tags of a TIFF's directory, and the offset of the next one.
+
+    struct.error if it is not a directory. Values are SHORT or LONG.
+    """
+    (count,) = struct.unpack_from(order + "H", data, at)
+    tags = {}
+    for entry in range(at + 2, at + 2 + 12 * count, 12):
+        tag, kind, n = struct.unpack_from(order + "HHI", data, entry)
+        if tag not in wanted or not n:
+            continue
+        letter, place = "H" if kind == 3 else "I", entry + 8
+        if n * struct.calcsize(order + letter) > 4:
+            (place,) = struct.unpack_from(order + "I", data, place)
+        tags[tag] = struct.unpack_from(f"{order}{min(n, most)}{letter}", data, place)
+    (following,) = struct.unpack_from(order + "I", data, at + 2 + 12 * count)
+    return tags, following
 
 
 def _jpeg_size(data: bytes) -> tuple[int, int, float] | None:
@@ -184,14 +197,14 @@ def heif_frame(data: bytes, place: str, clock: exif.CameraClock | None = None) -
         check_pixels(width, height, 8.0 if ";16" in picture.mode else 4.0, place)
         pixels = np.array(picture)
         # a TIFF, behind its name
-        told = (picture.info.get("exif") or b"").removeprefix(b"Exif\0\0")
+        tags = (picture.info.get("exif") or b"").removeprefix(b"Exif\0\0")
     except FrameError:
         raise
     # damaged bytes make libheif raise any kind of exception
     except Exception as e:
         raise FrameError(f"{place}: this is not a whole HEIF picture ({one_line(e)}); copy it again.") from e
     pixels = frame_pixels(pixels, place)
-    return Frame(pixels, source=place, **exif.told(told, place, clock, pixels.shape))
+    return Frame(pixels, **exif.read_exposure(tags, place, clock, pixels.shape).facts)
 
 
 # Tags of TIFF 6.0: offsets and lengths of an image's strips, the same of its tiles, and the IFDs below this one.
@@ -235,15 +248,16 @@ def raw_frame(data: bytes, place: str, clock: exif.CameraClock | None = None) ->
         raise FrameError(
             f"{place}: its colour mosaic is {pattern!r}, not a 2 x 2 Bayer one; convert it to TIFF."
         )
-    about = exif.told(data, place, clock, pixels.shape)
+    exposure = exif.read_exposure(data, place, clock, pixels.shape)
     # the sensor's own pixels are all here, whatever shape the camera gave to its pictures
-    return Frame(to_unsigned(pixels, place), pattern=pattern, source=place, **about | {"origin_px": None})
+    exposure = replace(exposure, origin_px=None)
+    return Frame(to_unsigned(pixels, place), pattern=pattern, **exposure.facts)
 
 
 def _words(error: Exception) -> str:
     """Message of an exception; LibRaw's messages are bytes."""
-    told = error.args[0] if error.args else ""
-    return one_line(told.decode("ascii", "replace") if isinstance(told, bytes) else error)
+    first = error.args[0] if error.args else ""
+    return one_line(first.decode("ascii", "replace") if isinstance(first, bytes) else error)
 
 
 def _end(data: bytes) -> int:
@@ -259,7 +273,7 @@ def _end(data: bytes) -> int:
             continue
         seen.add(at)
         try:
-            tags, following = _ifd(data, at, order)
+            tags, following = _directory(data, at, order, (*STRIPS, *TILES, BELOW), MAX_VALUES)
         except struct.error:
             continue
         waiting += [following, *tags.get(BELOW, ())]
@@ -267,21 +281,3 @@ def _end(data: bytes) -> int:
             parts = zip(tags.get(offsets, ()), tags.get(lengths, ()), strict=False)
             end = max([end, *(sum(part) for part in parts)])
     return end
-
-
-def _ifd(data: bytes, at: int, order: str) -> tuple[dict[int, tuple[int, ...]], int]:
-    """Values of the tags above in an IFD, and the offset of the next IFD; struct.error if it is not an IFD."""
-    (count,) = struct.unpack_from(order + "H", data, at)
-    tags = {}
-    for k in range(count):
-        entry = at + 2 + 12 * k
-        tag, kind, n = struct.unpack_from(order + "HHI", data, entry)
-        letter = {3: "H", 4: "I", 13: "I"}.get(kind)
-        if tag in (*STRIPS, *TILES, BELOW) and letter and n <= MAX_VALUES:
-            form = f"{order}{n}{letter}"
-            place = entry + 8
-            if struct.calcsize(form) > 4:
-                (place,) = struct.unpack_from(order + "I", data, place)
-            tags[tag] = struct.unpack_from(form, data, place)
-    (following,) = struct.unpack_from(order + "I", data, at + 2 + 12 * count)
-    return tags, following

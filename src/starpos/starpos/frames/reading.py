@@ -2,16 +2,17 @@
 """Read frames from files: FITS, TIFF, PNG, JPEG, BMP, HEIF, camera raw; and stars from a CSV of centroids."""
 
 import re
-from collections.abc import Callable
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO
 
 from starpos.errors import FrameError, one_line
-from starpos.files import bytes_of
+from starpos.files import bytes_of, open_regular
 from starpos.frames.exif import CameraClock
 from starpos.frames.exposure import Exposure
 from starpos.frames.fits import read_fits
-from starpos.frames.frame import MAX_BYTES, Frame, Stars, opened
+from starpos.frames.frame import MAX_BYTES, Frame, Stars
 from starpos.frames.pictures import JPEG_START, PNG_START, heif_frame, picture_frame, raw_frame
 from starpos.frames.tables import read_star_list
 
@@ -55,8 +56,8 @@ def read_frame(path: Path | str, clock: CameraClock | None = None) -> Frame | St
     path = Path(path)
     file_path, part = _part_of(path)
     try:
-        with opened(file_path) as file:
-            return _reader_of(path, file_path.suffix.lower(), part)(file, clock)
+        with _opened(file_path) as file:
+            return _read(file, str(path), file_path.suffix.lower(), part, clock)
     except OSError as e:
         reason = e.strerror or one_line(e)
         raise FrameError(f"{path}: it cannot be read ({reason}); check its permissions and the disk.") from e
@@ -70,19 +71,41 @@ def _part_of(path: Path) -> tuple[Path, str]:
     return Path(parts[1]), parts[2].strip()
 
 
-def _reader_of(path: Path, suffix: str, part: str) -> Callable[[BinaryIO, CameraClock | None], Frame | Stars]:
-    """The function of the open file and the clock that reads files with this suffix."""
-    for suffixes, reader in (
-        (FITS, lambda file, _: read_fits(file, str(path), part)),
-        (PICTURE + JPEG, lambda file, clock: picture_frame(bytes_of(file, MAX_BYTES), str(path), clock)),
-        (HEIF, lambda file, clock: heif_frame(bytes_of(file, MAX_BYTES), str(path), clock)),
-        (RAW, lambda file, clock: raw_frame(bytes_of(file, MAX_BYTES), str(path), clock)),
-        ((".csv",), lambda file, _: read_star_list(file, str(path))),
-    ):
+def _read(file: BinaryIO, place: str, suffix: str, part: str, clock: CameraClock | None) -> Frame | Stars:
+    """Read an open file as files with this suffix are read."""
+    if suffix in FITS:
+        return read_fits(file, place, part)
+    if suffix == ".csv":
+        return read_star_list(file, place)
+    for suffixes, decode in ((PICTURE + JPEG, picture_frame), (HEIF, heif_frame), (RAW, raw_frame)):
         if suffix in suffixes:
-            return reader
+            return decode(bytes_of(file, MAX_BYTES), place, clock)
     known = " ".join(FITS + PICTURE + JPEG + HEIF + RAW + (".csv",))
-    raise FrameError(f"{path}: the suffix {suffix!r} is not one of a frame; use one of {known}.")
+    raise FrameError(f"{place}: the suffix {suffix!r} is not one of a frame; use one of {known}.")
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[BinaryIO]:
+    """Open a frame's file, as a context manager; FrameError if it is missing, empty or too large.
+
+    OSError if the file may not be read.
+    """
+    try:
+        file = open_regular(path)
+    except (FileNotFoundError, NotADirectoryError):
+        raise FrameError(f"{one_line(path)}: there is no such file; check the path.") from None
+    except IsADirectoryError:
+        raise FrameError(
+            f"{path}: this is a folder; give the frames in it, like {path / '*.fits'}."
+        ) from None
+    with file:
+        size = file.seek(0, 2)
+        file.seek(0)
+        if size == 0:
+            raise FrameError(f"{path}: the file is empty; take the frame again.")
+        if size > MAX_BYTES:
+            raise FrameError(f"{path}: it has over {MAX_BYTES // 10**6} MB, too many for a frame.")
+        yield file
 
 
 def decode_frame(data: bytes, source: str) -> Frame:

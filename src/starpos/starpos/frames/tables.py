@@ -15,16 +15,15 @@ from starpos.errors import FrameError, one_line
 from starpos.files import bytes_of, read_regular
 from starpos.frames.exposure import Exposure
 from starpos.frames.frame import Stars
-from starpos.frames.header import about, focal_mm, fwhm_px
+from starpos.frames.header import focal_mm, fwhm_px, read_exposure
 from starpos.units import ARCSEC
 
 # readings of the inclinometer; fixes of a GNSS receiver; true values of the night
 TILTS, GNSS, TRUTH = "tilt.csv", "gnss.csv", "truth.json"
 # in truth.json, of a simulated night: its other files, each with the digest of what was written
 SIMULATED = "simulated_files"
-
-
-MAX_LIST_BYTES = 20_000_000
+# of a list of stars or of pointings
+MAX_CSV_BYTES = 20_000_000
 # Error of a centroid if its file gives no sigma.
 DEFAULT_SIGMA_PX = 0.1
 
@@ -35,7 +34,7 @@ def read_star_list(file: BinaryIO, place: str) -> Stars:
     place says where it is, for messages. OSError if it is larger than MAX_CSV_BYTES.
     """
     try:
-        text = bytes_of(file, MAX_LIST_BYTES).decode("utf-8").replace("\r\n", "\n").replace("\r", "\n")
+        text = bytes_of(file, MAX_CSV_BYTES).decode("utf-8").replace("\r\n", "\n").replace("\r", "\n")
     except UnicodeDecodeError:
         raise FrameError(f"{place}: this is not a text file; give a CSV of centroids.") from None
     first, _, rest = text.partition("\n")
@@ -81,7 +80,7 @@ def read_star_list(file: BinaryIO, place: str) -> Stars:
         width=width,
         height=height,
         fwhm_px=fwhm_px(header),
-        **about(header, place),
+        **read_exposure(header, place).facts,
     )
 
 
@@ -110,7 +109,7 @@ def write_star_list(path: Path | str, stars: Stars, start_utc: str, pixel_um: fl
     Path(path).write_text(f"# {json.dumps(header)}\nx,y,flux,sigma,flags\n{rows}")
 
 
-MAX_CSV_BYTES, MAX_ROWS = 20_000_000, 100_000
+MAX_ROWS = 100_000
 NEEDED = ("utc_unix_s", "ra_deg", "dec_deg", "sigma_arcsec")
 ROLL = ("roll_deg", "sigma_roll_arcsec")
 # limits of a stated sigma: with an error of a degree a pointing is useless, an error of 0 is a mistake

@@ -221,7 +221,7 @@ def taught(learned: Learned, frame: GnssFrame, instrument: Instrument, vertical:
     passed = ageing(
         learned, instrument.inclinometer, sighting.tilt, sighting.utc_unix_s, moved_m, stddev, frame.new_pose
     )
-    learned = aged(learned, passed, sighting.utc_unix_s)
+    learned = aged(learned, passed, sighting.tilt, sighting.utc_unix_s)
     if frame.new_pose:
         learned = replace(learned, place=(gnss.latitude, gnss.longitude), poses=learned.poses + 1)
     # about A3 as it was taken: its turn by a few frames would mislead

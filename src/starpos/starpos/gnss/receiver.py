@@ -4,6 +4,7 @@
 import csv
 import io
 import math
+import re
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,22 +20,8 @@ from starpos.files import read_regular
 from starpos.messages.stamp import stamp_to_unix
 from starpos.rotation import half_turn
 
-# Names of datums that lie up to kilometres off NavSatFix's, WGS 84.
-OTHER_DATUMS = (
-    "nad27",
-    "nad83",
-    "ed50",
-    "osgb",
-    "gcj02",
-    "gcj-02",
-    "bd09",
-    "bd-09",
-    "pz90",
-    "pz-90",
-    "tokyo",
-    "sk42",
-    "sk-42",
-)
+# Names of datums that lie up to kilometres off NavSatFix's, WGS 84, as the last words of a frame_id.
+OTHER_DATUMS = ("nad27", "nad83", "ed50", "osgb", "osgb36", "gcj02", "bd09", "pz90", "tokyo", "sk42")
 # A receiver that states a larger error gives no place.
 MAX_SIGMA_M = 10_000.0
 # A receiver's default output before it has a place.
@@ -108,8 +95,7 @@ def message_to_gnss(message: Any, unstated_m: float = math.nan) -> GnssPlace:
     unix_s = stamp_to_unix(message.header.stamp)
     if unix_s is None:
         raise GnssError("a GNSS message has no time stamp: set header.stamp to the time of its fix")
-    frame = message.header.frame_id.lower().replace("-", "").replace("_", "")
-    if any(datum in frame for datum in OTHER_DATUMS):
+    if _names_other_datum(message.header.frame_id):
         raise GnssError(
             f"GNSS's frame_id {message.header.frame_id[:40]!r} names another datum than WGS 84: set the receiver to that"
         )
@@ -118,6 +104,12 @@ def message_to_gnss(message: Any, unstated_m: float = math.nan) -> GnssPlace:
     if message.position_covariance_type == 0 or not stated:
         covariance = np.eye(2) * unstated_m**2
     return checked(unix_s, message.latitude, message.longitude, covariance, message.status.status)
+
+
+def _names_other_datum(frame_id: str) -> bool:
+    """Whether the last words of a frame_id, with any signs between them, are the name of another datum."""
+    words = re.findall("[a-z0-9]+", frame_id.lower().rpartition("/")[2])
+    return any("".join(words[k:]) in OTHER_DATUMS for k in range(len(words)))
 
 
 def known_place(gnss: GnssPlace, vertical: Vertical) -> Place:

@@ -16,6 +16,7 @@ from starpos import files, rotation
 from starpos.earth.ellipsoid import EARTH_RADIUS_M
 from starpos.earth.vertical import Vertical
 from starpos.errors import GnssError
+from starpos.fix.budget import UNKNOWN_TEMPERATURE_C
 from starpos.instrument.inclinometer import InclinometerErrors, Tilt
 from starpos.instrument.instrument import Instrument
 from starpos.instrument.mounting import RESPONSE_COEFFICIENTS, Zeroed, response_columns, stated_variances
@@ -103,7 +104,8 @@ class Learned:
     """What is known of an instrument at a time and a place.
 
     a3 (3, 3): C into S, about which the states are linear.  calibrated_up (3,): where the response counts nothing.
-    temperature_c: from which temperatures count; NaN until one was measured.
+    temperature_c: at which the state `zero` is the whole of the zero; NaN while the temperature is not measured.
+    warmer_c: how much warmer the sensor is than that, as far as it was measured.
     state (n,), covariance (n, n): as `layout_of(axes)` has them.
     place: latitude and longitude (rad) to which the deflection's field belongs; None before there was one.
     frames, poses: from how many it was learned.  since_unix_s: time of the first of them, NaN without one.
@@ -116,6 +118,7 @@ class Learned:
     state: np.ndarray
     covariance: np.ndarray
     utc_unix_s: float
+    warmer_c: float = 0.0
     place: tuple[float, float] | None = None
     frames: int = 0
     poses: int = 0
@@ -151,16 +154,11 @@ class Learned:
         zeroed = _zeroed(tuple(self.calibrated_up.tolist()), self.axes)
         return response_columns(tilt.theta, tilt.up, zeroed), tilt.slope
 
-    def warmer_c(self, tilt: Tilt) -> float:
-        """How much warmer a tilt's sensor is than `temperature_c`; 0 if not measured."""
-        warmer = tilt.temperature_c - self.temperature_c
-        return float(warmer) if np.isfinite(warmer) else 0.0
-
     def up(self, tilt: Tilt) -> np.ndarray:
         """Up (3,) in S at a tilt, without the errors that are known."""
         at, (response, slope) = self.layout, self.columns(tilt)
         x = self.state
-        angles = x[at.zero] + x[at.pose] + x[at.temperature] * self.warmer_c(tilt)
+        angles = x[at.zero] + x[at.pose] + x[at.temperature] * self.warmer_c
         return rotation.normalised(tilt.up - response @ x[at.response] - slope @ angles)
 
     def tilted(self, tilt: Tilt) -> np.ndarray:
@@ -169,7 +167,7 @@ class Learned:
         rows = np.zeros((3, at.size))
         rows[:, at.response] = -response
         rows[:, at.zero] = rows[:, at.pose] = -slope
-        rows[:, at.temperature] = -slope * self.warmer_c(tilt)
+        rows[:, at.temperature] = -slope * self.warmer_c
         return rows
 
     def deflection_rad(self, vertical: Vertical, latitude: float, longitude: float) -> np.ndarray:
@@ -194,6 +192,10 @@ def prior(instrument: Instrument, tilt: Tilt, deflection_stddev_rad: float, utc_
     ) + np.eye(3) * mounting.remounted_rad**2
     since_s = abs(utc_unix_s - calibration.utc_unix_s)
     drift2 = errors.drift_rad_per_sqrt_hour**2 * (since_s if np.isfinite(since_s) else 0.0) / HOUR_S
+    warmer_c = tilt.temperature_c - calibration.temperature_c
+    dated = np.isfinite(since_s) or np.isfinite(calibration.temperature_c)
+    if dated and not np.isfinite(warmer_c):
+        drift2 += (errors.temperature_rad_per_c * UNKNOWN_TEMPERATURE_C) ** 2
     state = np.zeros(at.size)
     if calibration.response and len(calibration.response) == RESPONSE_COEFFICIENTS[tilt.axes]:
         state[at.response] = calibration.response
@@ -210,12 +212,12 @@ def prior(instrument: Instrument, tilt: Tilt, deflection_stddev_rad: float, utc_
         (at.gnss, GNSS_SLOW_RAD**2),
     ):
         variance[rows, rows] = np.eye(rows.stop - rows.start) * value
-    known = calibration.temperature_c
     return Learned(
         axes=tilt.axes,
         a3=mounting.a3,
         calibrated_up=mounting.calibrated_up,
-        temperature_c=known if np.isfinite(known) else tilt.temperature_c,
+        temperature_c=calibration.temperature_c if np.isfinite(warmer_c) else tilt.temperature_c,
+        warmer_c=warmer_c if np.isfinite(warmer_c) else 0.0,
         state=state,
         covariance=variance,
         utc_unix_s=utc_unix_s,
@@ -257,7 +259,7 @@ def ageing(
     share, variance = np.ones(at.size), np.zeros(at.size)
     seconds = abs(utc_unix_s - learned.utc_unix_s)
     walk = errors.drift_rad_per_sqrt_hour**2
-    if not np.isfinite(tilt.temperature_c):
+    if not np.isfinite(tilt.temperature_c - learned.temperature_c):
         walk += (errors.temperature_rad_per_c * UNMEASURED_C_PER_SQRT_HOUR) ** 2
     variance[at.zero] = walk * seconds / HOUR_S
     kept = np.exp(-moved_m / FIELD_LENGTH_M)
@@ -270,10 +272,23 @@ def ageing(
     return Ageing(share, variance)
 
 
-def aged(learned: Learned, by: Ageing, utc_unix_s: float) -> Learned:
-    """What is left of what was learned after an ageing."""
+def aged(learned: Learned, by: Ageing, tilt: Tilt, utc_unix_s: float) -> Learned:
+    """What is left of what was learned after an ageing, at the temperature of a tilt."""
     state, covariance = by.of(learned.state, learned.covariance)
-    return replace(learned, state=state, covariance=covariance, utc_unix_s=utc_unix_s)
+    return replace(at_temperature(learned, tilt), state=state, covariance=covariance, utc_unix_s=utc_unix_s)
+
+
+def at_temperature(learned: Learned, tilt: Tilt) -> Learned:
+    """Carry what was learned to the temperature of a tilt.
+
+    While temperatures are not measured, the zero walks with them: from then on they count from the next measured one.
+    """
+    measured_c, reference_c = tilt.temperature_c, learned.temperature_c
+    if math.isnan(measured_c):
+        return replace(learned, temperature_c=math.nan)
+    if math.isnan(reference_c):
+        return replace(learned, temperature_c=measured_c - learned.warmer_c)
+    return replace(learned, warmer_c=measured_c - reference_c)
 
 
 VERSION, KEY = 1, "starpos_learned"
@@ -295,6 +310,7 @@ def save_learned(path: Path, learned: Learned) -> None:
         "poses": learned.poses,
         "place_rad": learned.place,
         "temperature_c": None if unknown else learned.temperature_c,
+        "warmer_c": learned.warmer_c,
         "calibrated_up": learned.calibrated_up.tolist(),
         "a3": learned.a3.tolist(),
         "state": learned.state.tolist(),
@@ -351,6 +367,8 @@ def _learned(content: dict) -> Learned:
     return Learned(
         axes=axes,
         temperature_c=math.nan if celsius is None else float(celsius),
+        # files from before it was written have none
+        warmer_c=float(content.get("warmer_c", 0.0)),
         utc_unix_s=float(content["utc_unix_s"]),
         place=None if place is None else (float(place[0]), float(place[1])),
         frames=int(content["frames"]),

@@ -24,7 +24,7 @@ from starpos.gnss.filter import (
     updated,
 )
 from starpos.gnss.receiver import GnssPlace
-from starpos.gnss.states import Ageing, Learned, aged, ageing, prior
+from starpos.gnss.states import Ageing, Learned, aged, ageing, at_temperature, prior
 from starpos.instrument.inclinometer import Tilt
 from starpos.instrument.instrument import Instrument
 
@@ -247,7 +247,9 @@ class GnssWatch:
     def _age(self, sighting: LevelSight) -> None:
         learned, tilt = self.learned, sighting.tilt
         assert learned is not None
-        latitude, longitude, covariance = place_of_stars(sighting, learned, self.vertical)
+        latitude, longitude, covariance = place_of_stars(
+            sighting, at_temperature(learned, tilt), self.vertical
+        )
         here, moved_m = learned.place, 0.0
         if here is None:
             here = latitude, longitude
@@ -264,9 +266,12 @@ class GnssWatch:
             stddev_rad(self.vertical, latitude, longitude),
             self._new_pose,
         )
-        self.learned = replace(aged(learned, passed, sighting.utc_unix_s), place=here)
+        self.learned = replace(aged(learned, passed, tilt, sighting.utc_unix_s), place=here)
         if len(self._onsets.since):
-            self._onsets = self._onsets.aged(passed).recent(sighting.utc_unix_s)
+            self._onsets = self._onsets.aged(passed)
+            # the one that may bring GNSS back has to last for all of its frames, however far they are apart
+            if not self.disagrees:
+                self._onsets = self._onsets.recent(sighting.utc_unix_s)
 
     def up_in_camera(self, tilt: Tilt) -> np.ndarray | None:
         """Up (3,) in C at a tilt by what was learned; None if nothing is known."""

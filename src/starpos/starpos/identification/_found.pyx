@@ -90,6 +90,22 @@ cdef class Identification:
                     break
         return found, seen, due
 
+    def spread_px(self, across_px, down_px):
+        """Root of the summed squared distances of the matched stars from their mean; pixels (N,), (N,) of the frame's stars."""
+        cdef Py_ssize_t n = len(across_px), k
+        cdef const double *x = <const double *>numbers_of(across_px, n * sizeof(double))
+        cdef const double *y = <const double *>numbers_of(down_px, n * sizeof(double))
+        cdef double mean_x = 0.0, mean_y = 0.0, total = 0.0
+        if self.matched > 0 and not 0 <= self.row[0] <= self.row[self.matched - 1] < n:
+            raise IndexError(f"the stars that are matched are not among {n}")
+        for k in range(self.matched):
+            mean_x += x[self.row[k]]
+            mean_y += y[self.row[k]]
+        mean_x, mean_y = mean_x / self.matched, mean_y / self.matched
+        for k in range(self.matched):
+            total += (x[self.row[k]] - mean_x) ** 2 + (y[self.row[k]] - mean_y) ** 2
+        return sqrt(total)
+
     def pointing(self, centre, above, velocity):
         """Right ascension, declination and position angle of the top (rad) of the frame, ICRS without aberration.
 

@@ -22,6 +22,7 @@ import numpy as np
 
 from starpos import rotation
 from starpos.frames.frame import Window
+from starpos.frozen import at_once
 from starpos.identification import fisheye
 from starpos.identification._frame import FrameStars
 from starpos.identification.evidence import (
@@ -56,6 +57,7 @@ MAX_JUDGED = 40
 SURE = 6 * MIN_LOG_ODDS
 
 
+@at_once
 @dataclass(frozen=True)
 class _Try:
     """Stars that are searched: rows of them, their share of the frame's area, and the log-odds that they need."""
@@ -230,6 +232,7 @@ def _share_beyond(radius_px: float, width: int, height: int) -> float:
     return float(np.mean(x[:, None] ** 2 + y**2 > radius_px**2))
 
 
+@at_once
 @dataclass(frozen=True)
 class _Picture:
     """N stars at pixels xy (N, 2), with errors (N,) px, of a frame of that size, and the radius of its picture in px."""

@@ -47,6 +47,7 @@ DOUBLE_PX = 3.0
 CHANCES = Chances(ERRORS_PX, LOG_SHARES, DOUBLE_PX)
 
 
+@at_once
 @dataclass(frozen=True)
 class Prior:
     """Prior knowledge of the pose.
@@ -124,6 +125,7 @@ RULES = Rules(
 )
 
 
+@at_once
 @dataclass(frozen=True)
 class OnFrame:
     """S catalogue stars on a frame, brightest first.

@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from starpos import rotation
+from starpos.frozen import at_once
 from starpos.identification._frame import FrameStars
 from starpos.identification.evidence import (
     BENT_PX,
@@ -62,6 +63,7 @@ def field_rad(camera: Camera) -> float:
     return pinhole_of(camera).half_diagonal_rad if is_wide(camera) else camera.half_diagonal_rad
 
 
+@at_once
 @dataclass(frozen=True)
 class WideField:
     """N stars of a fisheye's frame, brightest first.
@@ -75,6 +77,7 @@ class WideField:
     camera: Camera
 
 
+@at_once
 @dataclass(frozen=True)
 class Part:
     """The stars of a part of a frame, as an ideal camera that looks there sees them.
@@ -170,6 +173,7 @@ def part_of(field: WideField, sky: Sky, found: Identification) -> tuple[Part, Id
     )
 
 
+@at_once
 @dataclass(frozen=True)
 class LensPose:
     """A pose of the fisheye among the stars: attitude (3, 3), `Sky`'s directions into C."""

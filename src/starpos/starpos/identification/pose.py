@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from starpos import rotation
+from starpos.frozen import at_once
 from starpos.identification._frame import FrameStars
 from starpos.identification._poses import fitted
 from starpos.instrument.camera import Camera
@@ -40,6 +41,7 @@ def stars_at(camera: Camera, xy: np.ndarray, sigma: np.ndarray) -> FrameStars:
     )
 
 
+@at_once
 @dataclass(frozen=True)
 class Pose:
     """A pose: attitude (3, 3), `Sky`'s directions into C; focal length in px; whether the frame's rows run bottom-up."""
@@ -59,6 +61,7 @@ class Pose:
         return Pose(attitude, focal_px, self.mirrored)
 
 
+@at_once
 @dataclass(frozen=True)
 class Poses:
     """K poses: attitude (K, 3, 3), focal_px (K,), mirrored (K,)."""

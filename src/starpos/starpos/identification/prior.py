@@ -8,10 +8,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from starpos import rotation
+from starpos.earth.ellipsoid import zenith_of
+from starpos.earth.orientation import EarthState
+from starpos.frozen import at_once
 from starpos.identification._frame import FrameStars
-from starpos.identification.evidence import SCALE_TOLERANCE, OnFrame, Prior
+from starpos.identification.evidence import SCALE_TOLERANCE, Identification, OnFrame, Prior
 from starpos.identification.pose import MATCH_SIGMA, Pose, directions
 from starpos.identification.sky import Sky
+from starpos.units import ARCSEC
 
 # The stars may be off by this where the prior is right.
 ERROR_PX = 5.0
@@ -31,6 +35,8 @@ RING_STARS = 8
 WIDEST_RAD = 0.1
 # Tolerance of checks of rotations and unit vectors.
 EXACT = 1e-6
+# 2.8 km of travel, or an error of the tilt of that size.
+PLUMB_TOLERANCE_RAD = 90 * ARCSEC
 # Aberration and most proper motions, which the beacons' directions do not include.
 J2000_RAD = 2.5e-4
 # Logarithm of the probabilities that the camera has stayed as it was, and that it has moved.
@@ -40,6 +46,7 @@ STANDS, WAS_MOVED = np.log(0.5), np.log(0.5)
 Attempt = tuple[Pose, np.ndarray, Prior]
 
 
+@at_once
 @dataclass(frozen=True)
 class PointingPrior:
     """An approximate attitude (3, 3), `Sky`'s directions into C, and focal length (px); ValueError if impossible."""
@@ -88,6 +95,7 @@ class PointingPrior:
         return Prior(density, 2 * most)
 
 
+@at_once
 @dataclass(frozen=True)
 class PlumbPrior:
     """A known zenith, but an unknown azimuth of the camera; ValueError if impossible.
@@ -171,3 +179,32 @@ def _most_voted(agree: np.ndarray) -> list[int]:
         pick.append(k)
         left &= ~agree[k]
     return pick
+
+
+@at_once
+@dataclass(frozen=True)
+class Hint:
+    """Attitude and place of the camera at the time of a fix.
+
+    itrs_to_camera  (3, 3): ITRS into C
+    up_itrs         (3,): the zenith in ITRS
+    focal_px        fitted focal length, px
+    """
+
+    itrs_to_camera: np.ndarray
+    up_itrs: np.ndarray
+    focal_px: float
+
+    @classmethod
+    def at(
+        cls, found: Identification, state: EarthState, focal_px: float, latitude: float, longitude: float
+    ) -> "Hint":
+        """Make a Hint from an identification, the fitted focal length, and the astronomic place (rad) of its fix."""
+        return cls(found.attitude @ state.gcrs_to_itrs.T, zenith_of(latitude, longitude), focal_px)
+
+    def priors(self, state: EarthState, zenith_camera: np.ndarray) -> tuple[PointingPrior, PlumbPrior]:
+        """Priors for `identify` at another time: the attitude if nothing moved, and the zenith (3,) in C."""
+        return (
+            PointingPrior(self.itrs_to_camera @ state.gcrs_to_itrs, self.focal_px),
+            PlumbPrior(self.up_itrs @ state.gcrs_to_itrs, zenith_camera, PLUMB_TOLERANCE_RAD),
+        )

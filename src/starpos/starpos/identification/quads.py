@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from starpos import rotation
+from starpos.frozen import at_once
 from starpos.identification._circles import well_apart
 from starpos.identification._frame import FrameStars
 from starpos.identification._quads import near
@@ -51,6 +52,7 @@ MAX_ALIKE = 2000
 SIDES = np.array(list(combinations(range(4), 2)))
 
 
+@at_once
 @dataclass(frozen=True, kw_only=True)
 class QuadCatalogue:
     """Q quads of the catalogue's stars, in bins of their shape.
@@ -253,6 +255,7 @@ SAME_AXIS, SAME_FOCAL = 0.03, 0.03
 BEYOND = 0.1
 
 
+@at_once
 @dataclass(frozen=True)
 class Matches:
     """K pairs of quads that look alike.
@@ -301,6 +304,7 @@ class Matches:
         )
 
 
+@at_once
 @dataclass(frozen=True)
 class QuadPoses:
     """K poses of a frame, and the quads of its stars (K, 4) from which they come."""

@@ -154,7 +154,7 @@ def identify_frame(
 ) -> Identification | None:
     """Identify stars as `identify` does, from the stars of a pinhole camera or of a fisheye."""
     if isinstance(field, fisheye.WideField):
-        return _by_parts(field, sky, priors)
+        return _by_parts(field, sky, priors, identify_frame)
     return next(identifications(field, sky, priors), None)
 
 
@@ -233,15 +233,30 @@ def near_or_lost(
     return _lost(field, sky, stages, 0.0, enough, crowded)
 
 
+def identify_near(field: FrameStars | fisheye.WideField, sky: Sky, priors: Priors) -> Identification | None:
+    """What the priors alone identify, such as a pose that is known already; nothing is searched elsewhere."""
+    if isinstance(field, fisheye.WideField):
+        return _by_parts(field, sky, priors, identify_near)
+    if len(field) < MIN_STARS:
+        return None
+    tries = (_near(stars, sky, priors, MIN_LOG_ODDS) for stars in (field, field.but(tested=CROWD_STARS)))
+    return next(chain.from_iterable(tries), None)
+
+
 def _near_or_lost(
     field: FrameStars, sky: Sky, priors: Priors, stages: Stages, enough: float, crowded: bool
 ) -> Iterator[Identification]:
     """Yield what is identified by the priors, which have half of the probability, then what is without them."""
+    yield from _near(field, sky, priors, enough)
+    yield from _lost(field, sky, stages, LOG_HALF, enough, crowded)
+
+
+def _near(field: FrameStars, sky: Sky, priors: Priors, enough: float) -> Iterator[Identification]:
+    """Yield what is identified by the priors, which have half of the probability."""
     for prior in priors:
         for pose, radius_px, known in prior.attempts(field, sky, LOG_HALF - np.log(len(priors))):
             if found := verify_pose(field, sky, pose, radius_px, known, enough):
                 yield found
-    yield from _lost(field, sky, stages, LOG_HALF, enough, crowded)
 
 
 def _lost(
@@ -260,11 +275,16 @@ def _finder(catalogue: Catalogue, triangles: TriangleCatalogue) -> Finder:
     return Finder(sky.stars, triangles.compiled, sky.brightest, RULES, CHANCES, LIMITS)
 
 
-def _by_parts(field: fisheye.WideField, sky: Sky, priors: Priors) -> Identification | None:
+def _by_parts(
+    field: fisheye.WideField,
+    sky: Sky,
+    priors: Priors,
+    identified: Callable[[FrameStars, Sky, Priors], Identification | None],
+) -> Identification | None:
     """Identify a part of a fisheye's frame, then all of it."""
     parts = fisheye.parts(field)
     for part in parts:
-        found = identify_frame(part.field, sky, part.turned(priors))
+        found = identified(part.field, sky, part.turned(priors))
         if found and found.log_odds >= fisheye.enough(len(parts)):
             return fisheye.everywhere(field, sky, part, found)
     return None

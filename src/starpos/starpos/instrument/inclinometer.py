@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from starpos import rotation
 from starpos.errors import InstrumentError, TiltError, TiltRangeError
+from starpos.frozen import at_once
 from starpos.units import ARCSEC
 
 # The -D01 variant.
@@ -34,6 +35,7 @@ MAX_CELSIUS = 300.0
 STEEP = 0.999
 
 
+@at_once
 @dataclass(frozen=True)
 class Tilt:
     """Elevation of S's X', Y' and, of a three-axis sensor, Z' above the horizon, averaged over readings.

@@ -36,6 +36,7 @@ def angles_at(up: np.ndarray, axes: int) -> np.ndarray:
     return np.arcsin(np.clip(up, -1, 1))[:axes]
 
 
+@at_once
 @dataclass(frozen=True)
 class Zeroed:
     """A lean at which the response counts nothing, because A3 was fitted there.
@@ -104,6 +105,7 @@ class LocalLevel:
         return levelling_of(self.a2)
 
 
+@at_once
 @dataclass(frozen=True, kw_only=True)
 class Mounting:
     """Rotations between camera, inclinometer and base link, and how well they are known.

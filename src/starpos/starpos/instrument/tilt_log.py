@@ -11,6 +11,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from starpos.errors import TiltError
+from starpos.frozen import at_once
 from starpos.instrument.inclinometer import SCA100T_NOISE_RAD, Tilt
 from starpos.units import SIGMA_PER_MAD
 
@@ -64,6 +65,7 @@ def noise_excess(steps: np.ndarray, stated_rad: float) -> float:
     return found if found > 1 + SIGNIFICANT / np.sqrt(len(steps)) else 1.0
 
 
+@at_once
 @dataclass(frozen=True)
 class TiltLog:
     """N readings of one sensor.
@@ -265,7 +267,7 @@ class TiltLog:
             variance_z=float(variance[2]) / n if third else np.nan,
             utc_unix_s=float(self.utc_unix_s[use].mean()),
             samples=n,
-            temperature_c=float(self.temperature_c[use].mean()),
+            temperature_c=_mean_known(self.temperature_c[use]),
             times=tuple(self.utc_unix_s[use].tolist()),
         )
 
@@ -352,6 +354,12 @@ class TiltLog:
         """Whether two readings are of one lean within their noise."""
         variance = (self.variance[a] + self.variance[b]) * self.excess**2
         return bool(((self.theta[a] - self.theta[b]) ** 2 <= AGREE_SIGMA**2 * variance).all())
+
+
+def _mean_known(celsius: np.ndarray) -> float:
+    """Mean of the temperatures (N,) that are known; NaN without one."""
+    known = celsius[np.isfinite(celsius)]
+    return float(known.mean()) if len(known) else np.nan
 
 
 def _check_possible(theta: np.ndarray) -> None:

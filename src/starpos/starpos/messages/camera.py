@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 
 from starpos.errors import InstrumentError, TimeError
-from starpos.frames.driver_stamp import UNKNOWN, DriverStamp
 from starpos.frames.encodings import pixels_of
-from starpos.frames.exposure import Shutter
+from starpos.frames.exposure import UNKNOWN_STAMP, DriverStamp, Shutter
 from starpos.frames.frame import Frame
 from starpos.frames.pictures import picture_pixels
 from starpos.instrument.camera import Camera, stated_lens
@@ -141,9 +140,11 @@ class ExposureFacts:
         return key_of(header) in self._captures
 
     @property
-    def unsaid(self) -> str:
+    def missing_statement(self) -> str:
         """Sentence on the parameters to state of the camera; '' if Captures come, or all are stated."""
-        return "" if self._usual else self._driver_stamp(1.0 if self._exposures_come else 0.0).unsaid
+        return (
+            "" if self._usual else self._driver_stamp(1.0 if self._exposures_come else 0.0).missing_statement
+        )
 
     def of(self, header: Any) -> tuple[int, Callable[[Frame], Frame]]:
         """The middle of a frame's exposure, ns since 1970, and what adds the exposure to the frame.
@@ -166,7 +167,7 @@ class ExposureFacts:
                 raise TimeError(
                     "image_raw: the middle of the exposure is before 1970; check the camera's clock."
                 )
-            return mid_ns, driver.dated
+            return mid_ns, driver.apply
         known: dict[str, Any] = {
             "exposure_s": facts.exposure_s or self._values["exposure"] or None,
             "stamp_stddev_s": facts.stamp_stddev_s,
@@ -179,7 +180,7 @@ class ExposureFacts:
 
     def _is_of_driver(self, capture: Any) -> bool:
         """Whether a Capture leaves the meaning of the stamp to the parameters."""
-        return capture.stamp_source == UNKNOWN_SOURCE and self._values["stamp"] != UNKNOWN
+        return capture.stamp_source == UNKNOWN_SOURCE and self._values["stamp"] != UNKNOWN_STAMP
 
     def _driver_stamp(self, exposure_s: float) -> DriverStamp:
         """The meaning of a driver's stamp by the parameters; exposure_s: from a Capture, 0 without one."""

@@ -23,7 +23,6 @@ from starpos.messages.camera import message_to_camera
 from starpos.messages.stamp import stamp_to_unix
 from starpos.messages.stars import message_to_stars
 from starpos.messages.tilt import UNUSABLE, message_to_tilt
-from starpos.night.drivers import IMAGES, DriverMessages, Drivers, named_image
 from starpos.night.night import NO_TILT, Night, ReportedPlace, Shot, Truth, offset_m, why_none
 from starpos.night.opening import truth_in
 from starpos.night.reading import Instruments
@@ -32,6 +31,7 @@ from starpos.night.solving import Exposures, solved_night
 from starpos.night.work import Solving
 from starpos.progress import Progress, quiet
 from starpos.recording.bag import BagReader
+from starpos.recording.drivers import IMAGES, DriverMessages, Drivers, named_image
 from starpos.recording.topics import (
     CAMERA_INFO,
     CAPTURE,

@@ -81,11 +81,6 @@ def of_axis(doubt: str) -> tuple[Remark, ...]:
     return (Remark(Kind.AXIS, doubt),) if doubt else ()
 
 
-def of_focal_length(place: str, focal_px: float) -> Remark:
-    """Say which focal length fits a frame that was not identified with the given one."""
-    return Remark(Kind.FOCAL_LENGTH, f"{place}: a focal length of {focal_px:.0f} px fits: give that one")
-
-
 def of_extrapolation(fix: Fix, days: float) -> tuple[Remark, ...]:
     """Say by how many days a fix lies beyond the IERS table, and how far it may be off for that."""
     if days <= 0:

@@ -15,7 +15,7 @@ from starpos.fix.searching import Sight, of_one_camera
 from starpos.fix.solution import Solution, Status
 from starpos.fix.solver import Solver
 from starpos.frames.frame import Frame, Stars
-from starpos.identification.hint import Hint
+from starpos.identification.prior import Hint
 from starpos.instrument.inclinometer import level_of, up_of
 from starpos.instrument.instrument import Instrument
 from starpos.instrument.tilt_log import NO_TILTS

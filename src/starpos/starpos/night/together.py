@@ -25,7 +25,7 @@ from starpos.earth.orientation import EarthState
 from starpos.earth.vertical import Vertical
 from starpos.errors import FixError, GnssError, StarposError
 from starpos.fix.fix import IDEAL, Fix
-from starpos.fix.searching import answer_frame
+from starpos.fix.searching import Question, answer_frame
 from starpos.fix.solution import Solution, Status
 from starpos.fix.solver import Solver
 from starpos.frames.frame import Stars
@@ -286,7 +286,8 @@ def watched_night(
         stars, found = frames[k]
         gnss = place_at(stars)
         place = None if gnss is None else known_place(gnss, vertical)
-        rough = answer_frame(solver, stars, stars, tilts, place, known=found).solution
+        question = Question(item=stars, stars=stars, tilts=tilts, places=place, known=found)
+        rough = answer_frame(solver, question).solution
         answers[k] = watched(solver, stars, rough, gnss, watch)
     remarks = tuple(Remark(Kind.GNSS, f"{number} frames: {why}") for why, number in said.items())
     return WatchedNight(tuple(answers[k] for k in range(len(frames))), watch.learned, remarks)

@@ -2,29 +2,33 @@
 """The work on one frame, as small objects that can be sent to any process or machine, where `OnFile` calls them."""
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from starpos.earth.place import Places
 from starpos.earth.refraction import Atmosphere
-from starpos.errors import FixError, InstrumentError, StarposError
-from starpos.fix import searching
+from starpos.errors import InstrumentError, StarposError
 from starpos.fix.blind import SEARCH_S, BlindSolver
-from starpos.fix.searching import Sight, without_hint
+from starpos.fix.searching import (
+    Question,
+    Sight,
+    answer_by_header,
+    answer_frame,
+    focal_px_that_fits,
+    identify_blind_every_way,
+    other_focal_length,
+)
 from starpos.fix.solution import Solution
 from starpos.fix.solver import Solver, check_explained
 from starpos.frames.frame import Frame, Stars
-from starpos.identification.hint import Hint
-from starpos.instrument.instrument import Instrument
+from starpos.identification.prior import Hint
 from starpos.instrument.tilt_log import NO_TILTS, Tilts
 from starpos.night.reading import Instruments, Reader, TiltFile, stars_of
-from starpos.night.remarks import Remark, of_focal_length
+from starpos.night.remarks import Kind, Remark
 from starpos.progress import Progress, quiet
 from starpos.sky import catalogue
-from starpos.zenith.adjustment import Adjusted, adjusted
-from starpos.zenith.doubts import check_session
 from starpos.zenith.sighting import Mark, ZenithSighting, sighting
 
 if TYPE_CHECKING:
@@ -76,28 +80,15 @@ class Identifying:
             blind = BlindSolver(stars_known, self.progress, search_s=self.search_s)
             blind.prepare()
             begin = time.process_time()
-            sight = searching.identify_blind_every_way(blind, item, stars_of(item))
+            sight = identify_blind_every_way(blind, item, stars_of(item))
         else:
             solver = Solver(instrument, stars_known)
             # the frame reports the error
             with suppress(StarposError):
                 solver.prepare(item.width, item.height, item.origin_px)
             begin = time.process_time()
-            sight = self._by_focal_length(solver, item)
+            sight = _answered(self, solver, Question(item=item, stars=stars_of(item)))
         return sight, 1000 * (time.process_time() - begin)
-
-    def _by_focal_length(self, solver: Solver, item: Frame | Stars) -> Sight:
-        stars = stars_of(item)
-
-        def work(solver: Solver) -> Sight:
-            return searching.identify_every_way(solver, item, stars)
-
-        sight = work(solver)
-        return (
-            without_hint(solver, item, stars, sight, work, self.progress)
-            if self.instruments.hinted
-            else sight
-        )
 
 
 @dataclass(frozen=True)
@@ -112,8 +103,10 @@ class Fitting:
         if instrument is None or self.instruments.hinted:
             return ()
         solver = Solver(instrument, catalogue.load_catalogue())
-        focal_px = searching.focal_px_that_fits(solver, stars_of(item))
-        return () if focal_px is None else (of_focal_length(item.place, focal_px),)
+        focal_px = focal_px_that_fits(solver, stars_of(item))
+        return (
+            () if focal_px is None else (Remark(Kind.FOCAL_LENGTH, other_focal_length(item.place, focal_px)),)
+        )
 
 
 @dataclass(frozen=True)
@@ -145,17 +138,14 @@ class Solving:
 
     def sight(self, item: Frame | Stars, hint: Hint | None = None) -> Sight:
         """The solution of a frame, and the stars that gave it; hint: of the frame before."""
-        solver, stars = self.solver(item), stars_of(item)
+        question = Question(item=item, stars=stars_of(item), tilts=self.tilts, places=self.places, hint=hint)
+        return _answered(self, self.solver(item), question)
 
-        def work(solver: Solver) -> Sight:
-            return searching.answer_frame(solver, item, stars, self.tilts, self.places, hint)
 
-        sight = work(solver)
-        return (
-            without_hint(solver, item, stars, sight, work, self.progress)
-            if self.instruments.hinted
-            else sight
-        )
+def _answered(work: Identifying | Solving, solver: Solver, question: Question) -> Sight:
+    if work.instruments.hinted:
+        return answer_by_header(solver, question, work.progress)
+    return answer_frame(solver, question)
 
 
 @dataclass(frozen=True)
@@ -179,28 +169,3 @@ class ZenithSighted:
             return sighting(solver, sight.stars, sight.found, self.mark, self.tilts)
         except StarposError as error:
             return Solution.refused(sight.stars, error)
-
-
-@dataclass(frozen=True, eq=False)
-class DeflectionSession:
-    """A session: its sightings in order of time, and the deflection that they give."""
-
-    sightings: tuple[ZenithSighting, ...]
-    adjusted: Adjusted
-
-    @classmethod
-    def of(
-        cls, sightings: Sequence[ZenithSighting], instrument: Instrument, atmosphere: Atmosphere, mark: Mark
-    ) -> "DeflectionSession":
-        """Adjust the sightings; FixError, with a sentence, where they do not bear a deflection."""
-        if not sightings:
-            raise FixError("no frame with stars and a tilt: there is no deflection")
-        in_time = tuple(sorted(sightings, key=lambda s: s.utc_unix_s))
-        found = adjusted(in_time, instrument, atmosphere, mark)
-        check_session(found, in_time)
-        return cls(in_time, found)
-
-    @property
-    def mid_unix_s(self) -> float:
-        """Mean time of its frames, UTC."""
-        return sum(s.utc_unix_s for s in self.sightings) / len(self.sightings)

@@ -11,11 +11,11 @@ from starpos.fix.solver import Solver
 from starpos.frames.frame import Stars
 from starpos.identification import Identification
 from starpos.instrument.tilt_log import Tilts
-from starpos.night.work import DeflectionSession
 from starpos.session.calibrating import OF_AVERAGE
 from starpos.session.driver import Diagnosis, Jobs, Level
 from starpos.session.settings import Settings
 from starpos.zenith.adjustment import Adjusted
+from starpos.zenith.doubts import DeflectionSession
 from starpos.zenith.session_file import NEW
 from starpos.zenith.sighting import Mark, ZenithSighting, sighting
 

@@ -12,12 +12,11 @@ from starpos.instrument.camera import Camera
 from starpos.instrument.tilt_log import TiltLog
 from starpos.messages.stamp import PlainHeader, PlainStamp
 from starpos.messages.tilt import Reading, TiltMessage
-from starpos.night.drivers import IMAGES, DriverMessages, Drivers
 from starpos.recording.bag import BagReader
+from starpos.recording.drivers import IMAGES, DriverMessages, Drivers
 from starpos.recording.topics import CAPTURE, GNSS, IMU, INPUTS, NAV_SAT_FIX, STARS, TILT, instrument_in
 from starpos.session.driver import Heard, JobsInTurn, Log, Now, Sent
 from starpos.session.frames import Output
-from starpos.session.parameter_file import drivers_of
 from starpos.session.session import SolverSession
 from starpos.session.settings import Settings
 
@@ -36,7 +35,7 @@ class Replay:
         self._tilts = 0
         self._jobs: list[JobsInTurn] = []
         self._heard, self._log = heard, log
-        self._drivers = drivers_of(None, ()) if drivers is None else drivers
+        self._drivers = Drivers.of() if drivers is None else drivers
         self.session = SolverSession(settings, self._new_jobs, heard, log)
 
     def _new_jobs(self) -> JobsInTurn:

@@ -16,12 +16,13 @@ from starpos.earth.orientation import earth_state
 from starpos.errors import InstrumentError, StarposError, TimeError
 from starpos.fix.checks import MODEL_BY_PARAMETERS, unnamed_inclinometer
 from starpos.fix.fix import Fix
+from starpos.fix.searching import Question
 from starpos.fix.solution import Solution, Status
 from starpos.fix.solver import Solver
 from starpos.frames.frame import Stars
 from starpos.gnss.solving import Watched
 from starpos.identification import Identification
-from starpos.identification.hint import Hint
+from starpos.identification.prior import Hint
 from starpos.identification.search import Priors
 from starpos.instrument.camera import Camera
 from starpos.messages.stamp import stamp_to_unix
@@ -368,7 +369,18 @@ class SolverSession:
                 )
             tilts = self.tilts.over(self._span(stars))
             places = self.places if self.places.known else None
-            return self._search.solved(solver, stars, tilts, places, hint, predicted, until_s, known)
+            # a node has no picture to look at, only the list
+            question = Question(
+                item=stars,
+                stars=stars,
+                tilts=tilts,
+                places=places,
+                predicted=predicted,
+                hint=hint,
+                until_s=until_s,
+                known=known,
+            )
+            return self._search.solved(solver, question)
         except (InstrumentError, TimeError) as e:
             return Solution.failed(stars, Status.BAD_INPUT, str(e))
         except Exception as e:

@@ -2,8 +2,9 @@
 """The parameters of the solver, and the settings that follow from them and from the named files."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ from starpos.earth import geoid
 from starpos.earth.geoid import Geoid
 from starpos.earth.place import Place
 from starpos.earth.refraction import Atmosphere
-from starpos.earth.vertical import UNKNOWN_STDDEV_ARCSEC, AtHeight, Deflection, Vertical
+from starpos.earth.vertical import AtHeight, Deflection, Vertical
 from starpos.errors import GeoidError, InstrumentError, PlaceError, StarposError
 from starpos.files import path_of
 from starpos.fix.solver import Solver
@@ -21,8 +22,7 @@ from starpos.gnss.states import Learned
 from starpos.instrument import instrument_file, sensors
 from starpos.instrument.camera import Camera
 from starpos.instrument.instrument import Calibration, Instrument
-from starpos.session.pace import MAX_RATE
-from starpos.session.parameter import FRAME_NAME, Parameter
+from starpos.parameters.given import values_of
 from starpos.sky.catalogue import Catalogue
 
 NAN = math.nan
@@ -30,293 +30,6 @@ NAN = math.nan
 SAME_FOCAL = 0.05
 # A clock is trusted no further than this without an instrument file.
 MIN_CLOCK_S = 0.01
-
-PARAMETERS = (
-    Parameter(
-        "frame_id", "starpos_link", "Frame of fix and heading: x forward, y left, z up.", form=FRAME_NAME
-    ),
-    Parameter(
-        "publish_tf",
-        True,
-        "Publish the rotations of camera and inclinometer relative to frame_id on /tf_static. Set "
-        "false if robot_state_publisher does, or if the inclinometer is an IMU that is in the "
-        "robot's tree: a frame with two parents breaks the tree.",
-    ),
-    Parameter(
-        "calibration_url",
-        "",
-        "Instrument file (YAML): misalignment and its error, mount, inclinometer, clock, shutter; "
-        "'' uses the next three parameters. 1 deg of wrong misalignment moves the fix by 111 km, "
-        "the largest error of all. A file whose focal length differs from camera_info's by 5 % is "
-        "refused.",
-    ),
-    Parameter(
-        "misalignment",
-        (0.0, 0.0, 0.0),
-        "A3 = R3(rz) R2(ry) R1(rx), camera into inclinometer; used without calibration_url.",
-        unit="deg",
-        minimum=-360.0,
-        maximum=360.0,
-    ),
-    Parameter(
-        "misalignment_stddev",
-        NAN,
-        "Error of the misalignment and of the inclinometer's zero together, each axis; 1 arcsec is "
-        "31 m. If too small, fixes claim errors that are too small. If unset, the misalignment is "
-        "unknown and the position error is over 1000 km.",
-        unit="arcsec",
-        minimum=0.0,
-        maximum=36000.0,
-    ),
-    Parameter(
-        "inclinometer.model",
-        "",
-        f"Inclinometer by its name, with the errors of its data sheet: {', '.join(sensors.PRESETS)}. Used without "
-        "calibration_url, whose file names its own inclinometer. '' means an SCA100T as sold (7 km or more).",
-    ),
-    Parameter(
-        "calibration_frames",
-        100,
-        "Number of newest frames kept for solver/calibrate. With few, the tilts' noise stays in A3; "
-        "many take seconds to solve.",
-        unit="",
-        minimum=1,
-        maximum=1000,
-    ),
-    Parameter(
-        "calibration_turn_stddev",
-        180.0,
-        "When a calibration begins: error of the misalignment's rotation about the plumb line, that "
-        "is of the direction the inclinometer faces. Frames at one lean, or turned about one "
-        "leaning axis, do not determine it. 180 means unknown: fixes at another lean then claim "
-        "large errors. If too small, those fixes are wrong.",
-        unit="deg",
-        minimum=0.000001,
-        maximum=180.0,
-    ),
-    Parameter(
-        "self_calibration",
-        False,
-        "Treat the misalignment as unknown and find it whenever the instrument has been turned on "
-        "the spot to four headings or more. Until then fixes claim an error of 10 deg, and "
-        "solver/reset must be called after driving on.",
-    ),
-    Parameter(
-        "self_calibration_limit",
-        60.0,
-        "A calibration by turning is used if the plumb line in the camera errs by at most this; 1 "
-        "arcsec is 31 m.",
-        unit="arcsec",
-        minimum=0.0,
-        maximum=36000.0,
-    ),
-    Parameter(
-        "refraction.pressure",
-        NAN,
-        "Air pressure at the instrument, not reduced to sea level, 30000 Pa or more, or 0 for a vacuum; unset widens "
-        "the fix.",
-        unit="Pa",
-        minimum=0.0,
-        maximum=120000.0,
-    ),
-    Parameter(
-        "refraction.temperature",
-        NAN,
-        "Air temperature; unset widens the fix.",
-        unit="deg C",
-        minimum=-100.0,
-        maximum=80.0,
-    ),
-    Parameter(
-        "refraction.humidity",
-        NAN,
-        "Relative humidity; it hardly matters in visible light. Unset takes 0.3 +- 0.25.",
-        unit="",
-        minimum=0.0,
-        maximum=1.0,
-    ),
-    Parameter(
-        "refraction.wavelength",
-        NAN,
-        "Mean wavelength of the light that the camera sees. Unset takes 0.55 +- 0.08.",
-        unit="um",
-        minimum=0.2,
-        maximum=10.0,
-    ),
-    Parameter(
-        "altitude",
-        NAN,
-        "Height above the WGS 84 ellipsoid: a map's height above sea level plus the geoid's "
-        "undulation there (-107 to 86 m). It is published in fix, and corrects the plumb line's "
-        "curvature (5 m of latitude a km at 45 deg) unless deflection.xi or deflection.eta is set. "
-        "The stars do not determine it. Unset publishes NaN, and some consumers drop such a fix.",
-        unit="m",
-        minimum=-1000.0,
-        maximum=100000.0,
-    ),
-    Parameter(
-        "altitude_stddev", 100.0, "Error of altitude, 1 sigma.", unit="m", minimum=0.0, maximum=100000.0
-    ),
-    Parameter(
-        "clock_stddev",
-        NAN,
-        "Error against UTC of the clock that stamps the frames. Unset takes what the camera's host "
-        "reports of its clock, at least the instrument file's value, or 0.01. 1 s is 464 m at the "
-        "equator. If too small, fixes claim errors that are too small.",
-        unit="s",
-        minimum=0.0,
-        maximum=3600.0,
-    ),
-    Parameter(
-        "deflection.xi",
-        0.0,
-        "Deflection of the vertical to the north, at the instrument; 1 arcsec is 31 m of geodetic latitude.",
-        unit="arcsec",
-        minimum=-120.0,
-        maximum=120.0,
-    ),
-    Parameter(
-        "deflection.eta",
-        0.0,
-        "Deflection of the vertical to the east.",
-        unit="arcsec",
-        minimum=-120.0,
-        maximum=120.0,
-    ),
-    Parameter(
-        "deflection.stddev",
-        UNKNOWN_STDDEV_ARCSEC,
-        "Error of each component; the default holds where the deflection is unknown.",
-        unit="arcsec",
-        minimum=0.0,
-        maximum=120.0,
-    ),
-    Parameter(
-        "deflection.geoid",
-        "",
-        "Geoid grid (GTX, NGS .bin, GeoTIFF; in m) that replaces the three above: its slopes are "
-        "the deflection, and its roughness gives the error. Give a path, or the name of one of "
-        "PROJ's grids such as egm96_15.gtx; '' for none. A coarse grid errs by 1 arcsec in plains "
-        "and 10 in mountains. Outside its area the deflection is unknown: 6 arcsec, 190 m.",
-    ),
-    Parameter(
-        "deflection.wanted",
-        NAN,
-        "Measure the deflection of the vertical at the site (needs site.geodetic and altitude) "
-        "until each component errs by at most this. The service ~/deflection and the dashboard show "
-        "the progress. Unset: it is not measured.",
-        unit="arcsec",
-        minimum=0.001,
-        maximum=3.0,
-        read_only=True,
-    ),
-    Parameter(
-        "site.latitude",
-        NAN,
-        "Latitude of a known place, such as a pillar. heading/imu then needs no tilt. Unset: the "
-        "place is unknown. If the stars contradict the place, no heading is published.",
-        unit="deg",
-        minimum=-90.0,
-        maximum=90.0,
-    ),
-    Parameter(
-        "site.longitude",
-        NAN,
-        "Longitude of the known place, east positive.",
-        unit="deg",
-        minimum=-360.0,
-        maximum=360.0,
-    ),
-    Parameter(
-        "site.geodetic",
-        False,
-        "True if the site is on WGS 84, as maps and receivers give it; false if it is astronomic, "
-        "as in a fix without a deflection. If the deflection is unknown, the heading in the other "
-        "system gets the deflection's error.",
-    ),
-    Parameter(
-        "site.stddev",
-        0.0,
-        "Error of the site to the east and to the north; 31 m are 1 arcsec of pitch and roll.",
-        unit="m",
-        minimum=0.0,
-        maximum=100000.0,
-    ),
-    Parameter(
-        "min_stars", 5, "Minimum number of identified stars for a fix.", unit="", minimum=4, maximum=1000
-    ),
-    Parameter(
-        "search_time",
-        0.3,
-        "Time limit for further searches of a frame that is not identified at once: with smaller "
-        "triangles, where stars fill only a part of it; with other focal lengths, to report which "
-        "one fits. They take at most half of the time between frames; recorded frames are searched "
-        "to the end. 0: no further search.",
-        unit="s",
-        minimum=0.0,
-        maximum=60.0,
-    ),
-    Parameter(
-        "max_rate",
-        NAN,
-        "Maximum rate of frames that are answered, chosen evenly by their stamps. Unset answers all "
-        "frames, or as large an even share as the processor can, which slows down other programs.",
-        unit="Hz",
-        minimum=0.01,
-        maximum=MAX_RATE,
-    ),
-    Parameter(
-        "gyro",
-        False,
-        "Use the turn rates in imu/data to predict where a turning camera looks, so that frames of "
-        "four stars are identified too. The IMU has the axes of frame_id, related to the camera "
-        "by calibration_url's link_to_camera; wrong ones do no harm. Without effect under "
-        "use_sim_time, so that a replay gives the same answers at any rate.",
-        read_only=True,
-    ),
-    Parameter(
-        "gnss.use",
-        False,
-        "Learn the misalignment, the inclinometer's errors and the deflection from gnss/fix while "
-        "the stars agree with it, and warn when they do not. `fix` remains the stars' own. GNSS "
-        "that is spoofed from the first frame on teaches wrong values.",
-        read_only=True,
-    ),
-    Parameter(
-        "gnss.learned",
-        "",
-        "File that keeps what was learned from GNSS; it is read at the start. '' for none. Delete "
-        "it after camera or inclinometer was remounted: an old file makes fixes wrong until GNSS "
-        "disagrees.",
-        read_only=True,
-    ),
-    Parameter(
-        "tilt_window",
-        0.5,
-        "Time over which tilts are averaged if the exposure is unknown.",
-        unit="s",
-        minimum=0.01,
-        maximum=60.0,
-    ),
-    Parameter(
-        "tilt_timeout",
-        NAN,
-        "Longest time that a frame waits for the tilts of its exposure. Unset: 1.5 times the "
-        "interval and delay of the tilts, at least 0.5 s.",
-        unit="s",
-        minimum=0.0,
-        maximum=60.0,
-    ),
-    Parameter(
-        "tilt_stddev",
-        NAN,
-        "Error of a tilt sample whose message states none. Unset takes the value of the instrument "
-        "file or of inclinometer.model.",
-        unit="deg",
-        minimum=1e-7,
-        maximum=10.0,
-    ),
-)
 
 
 def _stated(values: Mapping) -> Calibration:
@@ -466,6 +179,17 @@ class Settings:
         self._read: tuple[Instrument | None, Geoid | None] = None, None
         # what earlier sessions learned by GNSS; None without a file
         self.learned: Learned | None = None
+
+    @classmethod
+    def of(
+        cls, file: Path | None = None, given: Sequence[str] = (), namespace: str | None = None
+    ) -> "Settings":
+        """Read them from a parameter file and texts NAME:=VALUE, as the node does; errors as `values_of` raises them."""
+        settings = cls(values_of("solver", file, given, namespace))
+        if trouble := settings.check(settings.values, frozenset(settings.values), None):
+            raise InstrumentError(trouble)
+        settings.adopt()
+        return settings
 
     def check(self, values: Mapping, names: frozenset[str], camera: Camera | None) -> str | None:
         """Say in a sentence why values make no instrument together, such as with a broken file; None if they do.

@@ -9,20 +9,22 @@ from dataclasses import replace
 from typing import Any
 
 from starpos.earth.orientation import earth_state
-from starpos.earth.place import Places
 from starpos.errors import StarposError
-from starpos.fix import searching
 from starpos.fix.camera_attitude import CameraAttitude
-from starpos.fix.searching import NEVER_S, UNASKED, identify_every_way
+from starpos.fix.searching import (
+    NEVER_S,
+    UNASKED,
+    Question,
+    answer_frame,
+    identify_every_way,
+    other_focal_length,
+)
 from starpos.fix.solution import Solution, Status
 from starpos.fix.solver import Solver, focal_that_fits
 from starpos.frames.frame import Stars
-from starpos.identification import Identification, fisheye
-from starpos.identification.hint import Hint
+from starpos.identification import fisheye
 from starpos.identification.search import Priors
-from starpos.instrument.tilt_log import Tilts
 from starpos.navigation.sightings import sighted
-from starpos.night.remarks import of_focal_length
 from starpos.session.driver import Log, Now
 from starpos.session.gyro import Gyro
 
@@ -62,38 +64,16 @@ class Search:
             most_s = min(most_s, 0.0 if others_wait else MAX_OF_INTERVAL * self._interval_s)
         return time.monotonic() + most_s
 
-    def solved(
-        self,
-        solver: Solver,
-        stars: Stars,
-        tilts: Tilts,
-        places: Places | None,
-        hint: Hint | None,
-        predicted: Priors,
-        until_s: float,
-        known: Identification | None,
-    ) -> Solution:
-        """Solve a list by `searching.answer_frame`; while none is identified, say which focal length fits."""
-        # a node has no picture to look at, only the list
-        seen = searching.answer_frame(
-            solver,
-            item=stars,
-            stars=stars,
-            tilts=tilts,
-            places=places,
-            hint=hint,
-            predicted=predicted,
-            until_s=until_s,
-            known=known,
-        )
-        answer = seen.solution
+    def solved(self, solver: Solver, question: Question) -> Solution:
+        """Solve a list by `answer_frame`; while none is identified, say which focal length fits."""
+        answer = answer_frame(solver, question).solution
         self._identified |= answer.found is not None
         if self._identified or answer.status is not Status.NOT_IDENTIFIED:
             return answer
-        focal_px = focal_that_fits(solver, stars, until_s)
+        focal_px = focal_that_fits(solver, question.stars, question.until_s)
         if focal_px is None:
             return answer
-        return replace(answer, message=str(of_focal_length(stars.place, focal_px)))
+        return replace(answer, message=other_focal_length(question.stars.place, focal_px))
 
 
 def asked(
@@ -101,7 +81,8 @@ def asked(
 ) -> Solution:
     """The solver's answer to a frame; if it stopped before identification, identify the stars now."""
     if answer.found is None and answer.status in UNASKED:
-        return identify_every_way(solver, stars, stars, predicted, until_s).solution
+        question = Question(item=stars, stars=stars, predicted=predicted, until_s=until_s)
+        return identify_every_way(solver, question).solution
     return answer
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from starpos import rotation
 from starpos.instrument.instrument import Instrument
-from starpos.session.parameter import FRAME_NAME
+from starpos.parameters.table import FRAME_NAME
 
 
 @dataclass

@@ -86,7 +86,7 @@ class FaceQuality:
 class Leftover:
     """What the unknowns of an adjustment leave of N frames' readings, for tests of what else there may be.
 
-    by_lean (N, 2, 2), by_second (N, 2): derivatives of the readings by eta and xi, and by a second of the clock, rad.
+    by_lean (N, 2, 2), by_second (N, 2): derivatives of the readings by xi and eta, and by a second of the clock, rad.
     projector (2 N, 2 N), weighted (2 N,): weights that the unknowns leave, and the weighted residuals.
     """
 
@@ -130,13 +130,15 @@ def _quality(leftover: Leftover, number: int, heading_deg: float, member: np.nda
         number=number,
         heading_deg=heading_deg,
         frames=int(member.sum()),
-        off_arcsec=step[::-1] / ARCSEC,
-        stddev_arcsec=stddev[::-1] / ARCSEC,
+        off_arcsec=step / ARCSEC,
+        stddev_arcsec=stddev / ARCSEC,
         chi2=chi2,
     )
 
 
 STEPS = 8
+# A deflection with a larger sigma is useless: maps of the geoid know it better.
+MAX_SIGMA_ARCSEC = 3.0
 # closer to a pole, a deflection is no longer small compared with the distance from it
 MIN_COSINE = 1e-3
 # of its sigma: a smaller step is the last
@@ -227,7 +229,7 @@ class Adjusted:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _Fit:
-    """A weighted fit: step (5,), covariance (5, 5), gain (5, 2 N) by the readings.
+    """A weighted fit of xi, eta and A3's turns: step (5,), covariance (5, 5), gain (5, 2 N) by the readings, rad.
 
     root (2 N, 2 N): of the covariance of the readings.  cost: -2 log of the likelihood.
     """
@@ -251,7 +253,7 @@ def adjusted(
 
     air: its size where it is known, as for a session that is only planned; else the residuals determine it.
 
-    Raises FixError where there are fewer, at the poles, or where the equations have no solution.
+    Raises FixError where there are fewer, at the poles, or where the equations have no solution or do not settle.
     """
     if len(sightings) < 3:
         raise FixError(f"{len(sightings)} frames make no session: at least 3, in several faces, are needed")
@@ -268,12 +270,23 @@ def adjusted(
         given=instrument.calibration,
         mark=mark,
     )
-    stated = session.solved(instrument.inclinometer, air)
+    try:
+        return _whole_session(session, instrument.inclinometer, air)
+    except np.linalg.LinAlgError as error:
+        raise FixError(
+            f"the session's equations have no solution ({error}): turn the instrument to several faces, and state the "
+            "noise of the tiltmeter's readings"
+        ) from None
+
+
+def _whole_session(session: "_Session", inclinometer: InclinometerErrors, air: Air | None) -> Adjusted:
+    """The session with the errors of the tiltmeter as stated, or larger ones where the residuals show them."""
+    stated = session.solved(inclinometer, air)
     if air is not None or (shown := session.shown(stated)) is None:
         return _adjusted(session, stated)
-    inclinometer, size = shown
+    larger, size = shown
     # under one air: what is wrong with the tiltmeter had seemed to be the air's
-    more, less = session.solved(inclinometer, size), session.solved(instrument.inclinometer, size)
+    more, less = session.solved(larger, size), session.solved(inclinometer, size)
     return replace(
         _adjusted(session, more),
         as_stated=_adjusted(session, stated),
@@ -327,6 +340,12 @@ class _Session:
             before, estimate, offset = offset, estimate.moved(fit.step), offset + fit.step
             if np.abs(fit.step).max() < SETTLED * np.sqrt(np.diag(fit.covariance)).min():
                 break
+        else:
+            check_round(fit.covariance[:2, :2] / ARCSEC**2, self.sightings, self.faces)
+            raise FixError(
+                f"the session does not settle in {STEPS} steps (the last one was {np.abs(fit.step).max() / ARCSEC:.2g} "
+                "arcsec): check the site, and the order and the signs of the tiltmeter's axes"
+            )
         assert size is not None
         return _Solved(
             estimate=estimate,
@@ -371,6 +390,20 @@ class _Session:
             return None
         shown = dict(zip(units, factors(found.x).tolist(), strict=True))
         return _larger(given, shown), _air(found.x)
+
+
+def check_round(
+    covariance_arcsec2: np.ndarray, sightings: Sequence[ZenithSighting], faces: np.ndarray
+) -> None:
+    """Raise FixError where a session's faces (N,) leave its deflection undetermined, by its covariance (2, 2)."""
+    sigma = float(np.sqrt(np.linalg.eigvalsh(covariance_arcsec2)[-1]))
+    if sigma > MAX_SIGMA_ARCSEC:
+        headings = np.degrees(mean_headings(sightings, faces))
+        shown = ", ".join(f"{h:.0f}" for h in headings[:8])
+        raise FixError(
+            f"the faces do not come round: the top of the frame was at {shown} deg, which leaves {sigma:.3g} arcsec of "
+            "the deflection undetermined: turn the instrument by half a turn, better to four faces, or calibrate A3"
+        )
 
 
 def _larger(given: InclinometerErrors, factors: dict[str, float]) -> InclinometerErrors:
@@ -473,9 +506,9 @@ def _adjusted(session: _Session, solved: _Solved) -> Adjusted:
         (errors.air.name, air.anomalous**2 * errors.air.covariance),
     )
     sources = [(s.name, s.covariance) for s in errors.sources] + list(scaled)
-    gain = fit.gain[[1, 0]] / ARCSEC
+    gain = fit.gain[:2] / ARCSEC
     by_source = {name: gain @ covariance @ gain.T for name, covariance in sources}
-    whole = fit.covariance[:2, :2][::-1, ::-1] / ARCSEC**2
+    whole = fit.covariance[:2, :2] / ARCSEC**2
     values, axes = np.linalg.eigh(whole - np.sum(list(by_source.values()), 0))
     by_source = {name: term for name, term in by_source.items() if term.any()}
     # the rest, without what rounding leaves of it
@@ -488,7 +521,8 @@ def _adjusted(session: _Session, solved: _Solved) -> Adjusted:
     n = len(sightings)
     own = own.reshape(n, 2, n, 2)[np.arange(n), :, np.arange(n)]
     per_frame = np.einsum("nab,nbc,ndc->nad", back, own, back)
-    up = estimate.a3 @ np.append(estimate.lean, 1.0)
+    north, east = estimate.lean
+    up = estimate.a3 @ [east, north, 1.0]
     xi_eta = estimate.deflection(mark.latitude) / ARCSEC
     leftover = _leftover(solved, mark)
     return Adjusted(
@@ -499,8 +533,8 @@ def _adjusted(session: _Session, solved: _Solved) -> Adjusted:
         a3=estimate.a3,
         turn_stddev_rad=float(np.sqrt(up @ fit.covariance[2:, 2:] @ up)),
         faces=faces,
-        frame_arcsec=np.einsum("nab,nb->na", back, left)[:, ::-1] / ARCSEC,
-        frame_stddev_arcsec=np.sqrt(np.diagonal(per_frame, axis1=1, axis2=2))[:, ::-1] / ARCSEC,
+        frame_arcsec=np.einsum("nab,nb->na", back, left) / ARCSEC,
+        frame_stddev_arcsec=np.sqrt(np.diagonal(per_frame, axis1=1, axis2=2)) / ARCSEC,
         air=air,
         catalogue_factor=places.factor,
         chi2_per_degree=fit.chi2 / max(left.size - 5, 1),
@@ -537,7 +571,8 @@ def reduced(found: Adjusted, sightings: Sequence[ZenithSighting], mark: Mark) ->
     number = np.bincount(found.faces)
     middles = np.bincount(found.faces, t) / number
     tides = np.array([plumb_tide(middle, place, mark.enu) for middle in middles.tolist()])
-    tide = (number @ tides / number.sum())[::-1] / ARCSEC
+    east, north = number @ tides / number.sum() / ARCSEC
+    tide = np.array([north, east])
     curvature = plumb_curvature_arcsec_per_m(mark.latitude) * mark.height_m
     at_mark = np.array([found.xi_arcsec, found.eta_arcsec]) - tide
     return Reduced(

@@ -1,20 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What speaks against a session: faces that do not come round, a jump of the clock or of a zero, a face unlike others."""
+"""A zenith session: its deflection, and what speaks against it: faces that do not come round, a jump of clock or zero."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from starpos.earth.ellipsoid import EARTH_RADIUS_M
 from starpos.earth.orientation import earth_motion
+from starpos.earth.refraction import Atmosphere
 from starpos.errors import FixError
+from starpos.instrument.instrument import Instrument
 from starpos.sky.catalogue import load_catalogue
 from starpos.units import ARCSEC, utc_text
-from starpos.zenith.adjustment import Adjusted, FaceQuality
-from starpos.zenith.sighting import ZenithSighting, mean_headings
+from starpos.zenith.adjustment import Adjusted, FaceQuality, adjusted, check_round
+from starpos.zenith.sighting import Mark, ZenithSighting
 
-# A deflection with a larger sigma is useless: maps of the geoid know it better.
-MAX_SIGMA_ARCSEC = 3.0
 # On land 6 arcsec are usual, over 25 are found in high mountains only, over 120 nowhere.
 LARGE_ARCSEC, MAX_ARCSEC = 25.0, 120.0
 # chi-square of a step or of a face, which chance exceeds in one session of 10^5 with hundreds of frames
@@ -36,14 +37,7 @@ UNLEVEL_SIGMA = 3.0
 
 def check_session(found: Adjusted, sightings: Sequence[ZenithSighting]) -> None:
     """Raise FixError, with a sentence, where the readings do not bear a deflection."""
-    sigma = float(np.sqrt(np.linalg.eigvalsh(found.covariance_arcsec2)[-1]))
-    headings = np.degrees(mean_headings(sightings, found.faces))
-    if sigma > MAX_SIGMA_ARCSEC:
-        shown = ", ".join(f"{h:.0f}" for h in headings[:8])
-        raise FixError(
-            f"the faces do not come round: the top of the frame was at {shown} deg, which leaves {sigma:.3g} arcsec of "
-            "the deflection undetermined: turn the instrument by half a turn, better to four faces, or calibrate A3"
-        )
+    check_round(found.covariance_arcsec2, sightings, found.faces)
     for fit in (found.as_stated, found):
         chi2, sentence = (0.0, "") if fit is None else _doubt(fit, sightings)
         if chi2 > DOUBTED_CHI2 and not (fit is found.as_stated and _no_jump(found, sightings)):
@@ -199,3 +193,28 @@ def _steps(found: Adjusted, columns: np.ndarray) -> tuple[np.ndarray, float, int
     at = int(np.argmax([chi2 for _, _, chi2 in every]))
     step, _, chi2 = every[at]
     return step, chi2, at + 1
+
+
+@dataclass(frozen=True, eq=False)
+class DeflectionSession:
+    """A session: its sightings in order of time, and the deflection that they give."""
+
+    sightings: tuple[ZenithSighting, ...]
+    adjusted: Adjusted
+
+    @classmethod
+    def of(
+        cls, sightings: Sequence[ZenithSighting], instrument: Instrument, atmosphere: Atmosphere, mark: Mark
+    ) -> "DeflectionSession":
+        """Adjust the sightings; FixError, with a sentence, where they do not bear a deflection."""
+        if not sightings:
+            raise FixError("no frame with stars and a tilt: there is no deflection")
+        in_time = tuple(sorted(sightings, key=lambda s: s.utc_unix_s))
+        found = adjusted(in_time, instrument, atmosphere, mark)
+        check_session(found, in_time)
+        return cls(in_time, found)
+
+    @property
+    def mid_unix_s(self) -> float:
+        """Mean time of its frames, UTC."""
+        return sum(s.utc_unix_s for s in self.sightings) / len(self.sightings)

@@ -21,13 +21,13 @@ TURNS_TRIED = 360
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class LeanEstimate:
-    """A deflection, lean (2,): eta, xi in rad, and A3 (3, 3)."""
+    """A deflection, lean (2,): how far up leans to the north and to the east (xi, eta), rad; and A3 (3, 3)."""
 
     lean: np.ndarray
     a3: np.ndarray
 
     def moved(self, step: np.ndarray) -> "LeanEstimate":
-        """The estimate after a step (5,): eta, xi, and a small rotation of A3 about S's axes."""
+        """The estimate after a step (5,): xi, eta, and a small rotation of A3 about S's axes."""
         return LeanEstimate(lean=self.lean + step[:2], a3=rotation.from_vector(step[2:]) @ self.a3)
 
     def deflection(self, latitude: float) -> np.ndarray:
@@ -37,7 +37,7 @@ class LeanEstimate:
         Moritz 1967,
         section 5-4).  It differs from up's lean by xi eta tan(latitude), 3 mas at 80 deg for 10 arcsec of each.
         """
-        east, north = self.lean
+        north, east = self.lean
         sine, cosine = np.sin(latitude), np.cos(latitude)
         across = cosine - sine * north
         astronomic = np.arctan2(sine + cosine * north, np.hypot(east, across))
@@ -60,7 +60,7 @@ class Lines:
 
     @property
     def by_lean(self) -> np.ndarray:
-        """Derivatives (N, 2, 2) by up's lean to the east and to the north."""
+        """Derivatives (N, 2, 2) by xi and eta, up's lean to the north and to the east."""
         return self.by_parameters[..., :2]
 
     @classmethod
@@ -72,7 +72,8 @@ class Lines:
         """
         attitude = np.array([s.enu_to_camera for s in sightings])
         shown = 1 - bending
-        up = rotation.normalised(np.append(shown * estimate.lean, 1.0))
+        north, east = shown * estimate.lean
+        up = rotation.normalised(np.array([east, north, 1.0]))
         sensor = estimate.a3 @ attitude
         there = sensor @ up
         slope = 1 / np.sqrt(1 - there[:, :2] ** 2)
@@ -82,7 +83,7 @@ class Lines:
             """Change (N, 2, 3) of the angles, where up moves by `turn` (N, 3, 3)."""
             return slope[..., None] * turn[:, :2]
 
-        lean = of(sensor)[..., :2] * shown
+        lean = of(sensor)[..., [1, 0]] * shown
         a3 = of(np.array([-rotation.cross_matrix(v) for v in there]))
         in_camera = attitude @ up
         camera = of(estimate.a3 @ np.array([-rotation.cross_matrix(v) for v in in_camera]))
@@ -117,7 +118,7 @@ def start_of(sightings: Sequence[ZenithSighting]) -> LeanEstimate:
     a3 = rotation.about_axis(2, turns[best])
     # A3 takes C's x by `across` up and its y by `down`
     tilted = rotation.from_vector(a3 @ np.array([-down, across, 0.0]))
-    return LeanEstimate(lean=np.array([eta, xi]), a3=tilted @ a3)
+    return LeanEstimate(lean=np.array([xi, eta]), a3=tilted @ a3)
 
 
 # Unmeasured temperature of a tiltmeter: it follows a clear night's air, some degrees in a few hours.

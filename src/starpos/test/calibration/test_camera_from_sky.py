@@ -159,7 +159,7 @@ def test_nothing_identified_is_said(catalogue, rng):
 def test_too_few_stars_are_said(wide, catalogue):
     _, lists, levels = wide
     with pytest.raises(CalibrationError, match="are too few"):
-        calibrate_camera([lists[0].take(np.arange(15))], levels[:1], ideal(25), catalogue, AIR)
+        calibrate_camera([lists[0].select(np.arange(15))], levels[:1], ideal(25), catalogue, AIR)
 
 
 def test_frames_of_another_size(wide, catalogue):

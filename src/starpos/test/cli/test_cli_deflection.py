@@ -16,8 +16,8 @@ from starpos.frames.reading import read_frame
 from starpos.instrument.camera import Camera
 from starpos.instrument.tilt_table import read_tilt_csv
 from starpos.session.driver import Level
-from starpos.session.parameter_file import settings_of
 from starpos.session.replay import Replay
+from starpos.session.settings import Settings
 from starpos.sky.site import Site
 from starpos.units import ARCSEC, utc_text
 
@@ -149,7 +149,7 @@ def played(recorded, session, wanted):
         "refraction.temperature": 5.0,
         "refraction.humidity": 0.3,
     }
-    replay = Replay(settings_of(None, [f"{k}:={v}" for k, v in values.items()]), Silent(), Silent())
+    replay = Replay(Settings.of(None, [f"{k}:={v}" for k, v in values.items()]), Silent(), Silent())
     assert len(list(replay.play(recorded))) >= 8
     return replay.session.deflection
 
@@ -180,7 +180,7 @@ def test_live_a_session_that_lacks_something_says_what(session, recorded):
         r"not enough: (about \d+ min more|more frames do not help, [a-z0-9 ]+ alone leaves)", told.message
     )
     with pytest.raises(InstrumentError, match=r"set site\.latitude"):
-        settings_of(None, ["deflection.wanted:=0.1"])
+        Settings.of(None, ["deflection.wanted:=0.1"])
 
 
 def test_a_plan_needs_no_frames(run, session):

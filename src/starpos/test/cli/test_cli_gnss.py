@@ -106,7 +106,7 @@ def test_without_gnss_its_code_is_not_asked_and_no_key_is_new(drive, capsys, mon
     def never(*_):
         raise AssertionError("GNSS was asked")
 
-    for name in ("watch.GnssWatch.__init__", "track.GnssTrack.__init__", "table.read_gnss_csv"):
+    for name in ("watch.GnssWatch.__init__", "receiver.GnssTrack.__init__", "receiver.read_gnss_csv"):
         monkeypatch.setattr(f"starpos.gnss.{name}", never)
     assert run(capsys, *command) == before
     for line in objects(before[1]):

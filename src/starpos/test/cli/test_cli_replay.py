@@ -13,7 +13,7 @@ pytest.importorskip("rosbags")
 from starpos.cli import main
 from starpos.errors import InstrumentError
 from starpos.session import session
-from starpos.session.parameter_file import settings_of
+from starpos.session.settings import Settings
 
 NIGHT = Path(__file__).resolve().parents[4] / "test" / "data" / "night"
 if not NIGHT.is_dir():
@@ -81,14 +81,14 @@ def test_frames_that_got_no_answer_are_counted(capsys, told, monkeypatch):
 def test_a_file_of_two_instruments_is_read_as_their_nodes_read_it(tmp_path):
     path = tmp_path / "robot.yaml"
     path.write_text(OF_TWO)
-    left, right = (settings_of(path, (), name).values for name in ("left", "/right/"))
+    left, right = (Settings.of(path, (), name).values for name in ("left", "/right/"))
     assert left["misalignment"] == right["misalignment"] == (0.31, -0.22, 0.53)
     assert (left["misalignment_stddev"], left["min_stars"]) == (0.1, 1000)
     assert math.isnan(right["misalignment_stddev"]) and right["min_stars"] == 7
     with pytest.raises(
         InstrumentError, match="of the instruments /left, /right: choose one with --namespace"
     ):
-        settings_of(path, ())
+        Settings.of(path, ())
 
 
 def test_what_to_do_about_an_unknown_misalignment_is_said_in_parameters(capsys):

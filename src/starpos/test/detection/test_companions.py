@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 from scipy import ndimage, sparse, spatial
 
-from starpos.detection._neighbours import any_near, groups, near_pairs, nearest
-from starpos.detection._noise import of_phases, unit_light
-from starpos.detection._stamps import greyed
-from starpos.detection._vetting import brightest_left, counted
+from starpos.detection._learn import phase_fluxes, unit_light
+from starpos.detection._neighbours import any_near, group_points, near_pairs
+from starpos.detection._pixels import smooth_mosaic
+from starpos.detection._vetting import brightest_left, count_marked
 
 
 @pytest.mark.parametrize("number", [1, 2, 30, 300])
@@ -18,14 +18,14 @@ def test_groups_are_the_connected_components_of_a_graph(number, share, rng):
     pairs = rng.permutation(near_pairs(x, y, share * 100 / number**0.5))
     graph = sparse.coo_matrix((np.ones(len(pairs)), pairs.T), (number, number))
     expected = sparse.csgraph.connected_components(graph, directed=False)[1]
-    np.testing.assert_array_equal(groups(pairs, number), expected)
-    np.testing.assert_array_equal(groups(np.ascontiguousarray(pairs[:, ::-1]), number), expected)
+    np.testing.assert_array_equal(group_points(pairs, number), expected)
+    np.testing.assert_array_equal(group_points(np.ascontiguousarray(pairs[:, ::-1]), number), expected)
 
 
 def test_a_pair_of_what_is_no_point_is_refused():
     for pair in ([0, 3], [-1, 0]):
         with pytest.raises(ValueError, match="3 points"):
-            groups(np.array([pair]), 3)
+            group_points(np.array([pair]), 3)
 
 
 @pytest.mark.parametrize("number", [0, 1, 2, 300])
@@ -58,16 +58,6 @@ def test_points_near_others_are_those_of_distances(number, rng):
         any_near(x, y, others[0], others[1, 1:], 5.0)
 
 
-@pytest.mark.parametrize(("number", "count"), [(0, 0), (1, 1), (2, 1), (300, 100)])
-def test_the_nearest_point_is_that_of_distances(number, count, rng):
-    x, y = rng.integers(0, 99, (2, number)).astype(float)
-    apart = np.hypot(x[:, None] - x, y[:, None] - y)
-    np.fill_diagonal(apart, np.inf)
-    np.testing.assert_allclose(nearest(x, y, count), apart.min(1, initial=np.inf)[:count], rtol=1e-14)
-    with pytest.raises(ValueError, match="as many"):
-        nearest(x, y, number + 1)
-
-
 @pytest.mark.parametrize("phases", [1, 4])
 def test_light_over_fluxes_and_gains_is_that_of_plain_sums(phases, rng):
     rows, shape = np.array([0, 2, 3]), (3, 5, 5)
@@ -97,7 +87,7 @@ def test_images_are_made_grey_as_by_two_convolutions(rng):
     expected = ndimage.convolve1d(
         ndimage.convolve1d(images, weight, axis=1, mode="nearest"), weight, axis=2, mode="nearest"
     )
-    np.testing.assert_allclose(greyed(images), expected, atol=1e-5)
+    np.testing.assert_allclose(smooth_mosaic(images), expected, atol=1e-5)
 
 
 def test_the_brightest_pixel_left_is_that_of_a_filtered_image(rng):
@@ -118,7 +108,7 @@ def test_the_brightest_pixel_left_is_that_of_a_filtered_image(rng):
 
 def test_marks_are_counted(rng):
     marks = rng.random((6, 9, 9)) < 0.3
-    np.testing.assert_array_equal(counted(marks), marks.sum((1, 2)))
+    np.testing.assert_array_equal(count_marked(marks), marks.sum((1, 2)))
 
 
 def test_fluxes_of_phases_are_weighted_means(rng):
@@ -130,7 +120,7 @@ def test_fluxes_of_phases_are_weighted_means(rng):
     phase = rng.integers(0, 4, (8, 7, 7)).astype(np.uint8)
     light = np.maximum(signal, 0)
     weight = good / (noise**2 + 0.7 * light + (0.05 * light) ** 2)
-    flux, information = of_phases(signal, noise, good, phase, value, 0.7, 0.05, 4)
+    flux, information = phase_fluxes(signal, noise, good, phase, value, 0.7, 0.05, 4)
     for k in range(4):
         own = weight * (phase == k)
         np.testing.assert_allclose(information[:, k], (own * value**2).sum((1, 2)), rtol=1e-5)

@@ -4,8 +4,8 @@
 import numpy as np
 import pytest
 
-from starpos.detection._field import agreed, local, monomials, over_field, shapes_of
-from starpos.detection._marginal import chosen
+from starpos.detection._learn import choose_terms, fit_field, fit_field_robustly
+from starpos.detection._psf import monomials, psf_at, shapes_of
 
 BOX = np.array([[10.0, 20.0], [410.0, 20.5]])
 
@@ -33,7 +33,7 @@ def test_a_psf_at_places_is_the_sum_of_its_monomials(wide, varied, rng):
     axes_there = plain_power(np.tensordot(field[:, :wide], widths, 1), -0.5) @ axes
     axes_there = axes_there if wide > 1 else axes[None]
     series_there = series if varied == 1 else np.tensordot(field, series, 1)
-    found_axes, found_series = local(x, y, BOX, axes, widths, series, 0.25, 6.0)
+    found_axes, found_series = psf_at(x, y, BOX, axes, widths, series, 0.25, 6.0)
     np.testing.assert_allclose(found_axes, axes_there, rtol=1e-11, atol=1e-12)
     np.testing.assert_allclose(found_series, series_there, rtol=1e-11, atol=1e-12)
     plain = np.linalg.inv(axes_there.transpose(0, 2, 1) @ axes_there)
@@ -45,9 +45,9 @@ def test_what_is_no_psf_is_refused():
     with pytest.raises(ValueError, match="as many"):
         monomials(x, x[:2], BOX)
     with pytest.raises(ValueError, match="1 or 6"):
-        local(x, x, BOX, np.eye(2), one.repeat(5, 0), one, 0.25, 6.0)
+        psf_at(x, x, BOX, np.eye(2), one.repeat(5, 0), one, 0.25, 6.0)
     with pytest.raises(ValueError, match="2 x 2"):
-        local(x, x, BOX, np.eye(3), one, one, 0.25, 6.0)
+        psf_at(x, x, BOX, np.eye(3), one, one, 0.25, 6.0)
 
 
 def plain_chosen(normal, right, candidates, price):
@@ -70,29 +70,31 @@ def test_terms_are_taken_that_are_worth_their_price(rng):
         signal = design @ (rng.normal(0, 1, 30) * (rng.random(30) < 0.2)) + rng.normal(0, 3, 90)
         normal, right, price = design.T @ design, design.T @ signal, rng.uniform(0, 9, 30)
         plain = plain_chosen(normal, right, candidates, price)
-        np.testing.assert_allclose(chosen(normal, right, candidates.view(np.uint8), price), plain, rtol=1e-9)
+        np.testing.assert_allclose(
+            choose_terms(normal, right, candidates.view(np.uint8), price), plain, rtol=1e-9
+        )
         taken.add(np.count_nonzero(plain))
     assert len(taken) > 3
 
 
 def test_terms_that_nothing_tells_are_not_taken():
     normal, candidates = np.zeros((2, 2)), np.ones((1, 2), np.uint8)
-    assert not chosen(normal, np.ones(2), candidates, np.ones(2)).any()
-    assert not chosen(normal + np.nan, np.ones(2), candidates, np.ones(2)).any()
+    assert not choose_terms(normal, np.ones(2), candidates, np.ones(2)).any()
+    assert not choose_terms(normal + np.nan, np.ones(2), candidates, np.ones(2)).any()
     with pytest.raises(ValueError, match="2 are needed"):
-        chosen(normal, np.ones(2), candidates, np.ones(3))
+        choose_terms(normal, np.ones(2), candidates, np.ones(3))
 
 
 def test_values_over_the_field_are_those_of_least_squares(rng):
     x, y = rng.uniform(0, 420, 40), rng.uniform(19, 22, 40)
     field, own = plain_monomials(x, y, np.array([[0.0, 19.0], [420.0, 22.0]])), rng.normal(0, 1, (40, 4))
     plain = np.linalg.lstsq(field, own, rcond=None)[0]
-    np.testing.assert_allclose(over_field(field, own), plain, rtol=1e-8, atol=1e-9)
-    assert over_field(np.zeros((40, 6)), own) is None
+    np.testing.assert_allclose(fit_field(field, own), plain, rtol=1e-8, atol=1e-9)
+    assert fit_field(np.zeros((40, 6)), own) is None
     # on a line much is undetermined, and the determined part is right
     field = plain_monomials(x, 20 + 0 * y, np.array([[0.0, 19.0], [420.0, 22.0]]))
     plain = np.linalg.lstsq(field, own, rcond=None)[0]
-    np.testing.assert_allclose(field @ over_field(field, own), field @ plain, atol=1e-6)
+    np.testing.assert_allclose(field @ fit_field(field, own), field @ plain, atol=1e-6)
 
 
 def test_rows_that_disagree_are_left_out(rng):
@@ -101,7 +103,7 @@ def test_rows_that_disagree_are_left_out(rng):
     true, weight = rng.normal(0, 1, (6, 4)), rng.uniform(50, 100, 40)
     own = field @ true + rng.normal(0, 1, (40, 4)) / np.sqrt(weight)[:, None]
     own[3] += 40
-    fitted, before, after, count = agreed(field, own, weight, 6.0, 12, 4)
+    fitted, before, after, count = fit_field_robustly(field, own, weight, 6.0, 12, 4)
     keep = np.arange(40) != 3
     root = np.sqrt(weight[keep])[:, None]
     plain = np.linalg.lstsq(field[keep] * root, own[keep] * root, rcond=None)[0]
@@ -110,4 +112,4 @@ def test_rows_that_disagree_are_left_out(rng):
     assert after == pytest.approx(((own[keep] - field[keep] @ plain) ** 2 * root**2).sum(), rel=1e-9)
     mean = np.average(own[keep], axis=0, weights=weight[keep])
     assert before == pytest.approx(((own[keep] - mean) ** 2 * root**2).sum(), rel=1e-9)
-    assert agreed(field[:11], own[:11], weight[:11], 6.0, 12, 4) is None
+    assert fit_field_robustly(field[:11], own[:11], weight[:11], 6.0, 12, 4) is None

@@ -5,9 +5,8 @@ import numpy as np
 import pytest
 from numpy.polynomial import hermite_e
 
-from starpos.detection._fit import fitted
+from starpos.detection._fit import Rules, fit_stamps
 from starpos.detection._psf import evaluated
-from starpos.detection._rules import Rules
 from starpos.detection.fit import FAINT, FIT_WIDTHS, OUTLIER, SETTLED
 
 SIZE = 15
@@ -122,18 +121,24 @@ def rules(gain, settled=0.0):
     return Rules(gain, SPREAD, DN_PER_PHOTON, MISFIT, FIT_WIDTHS, OUTLIER, FAINT, settled)
 
 
+def fit_singles(signal, noise, good, phase, column, row, x, y, *given):
+    """The columns of single stars."""
+    columns = fit_stamps(signal, noise, good, phase, column, row, x[None], y[None], *given)
+    return tuple(c[0] if k in (*range(6), 9) else c for k, c in enumerate(columns))
+
+
 @pytest.mark.parametrize("gain", [np.ones(1), np.array([0.7, 1.1, 1.2, 1.0])], ids=["grey", "mosaic"])
 @pytest.mark.parametrize("rounds", [1, 3, 5])
 def test_fit_is_that_of_plain_sums(gain, rounds, rng):
     """Places agree to 1e-9 px, all else to what single precision keeps of images."""
     given = stamps(rng, 12, gain)
-    found, expected = fitted(*given, rules(gain), rounds, True, True), plain_fit(*given, gain, rounds)
+    found, expected = fit_singles(*given, rules(gain), rounds, True, True), plain_fit(*given, gain, rounds)
     for column, plain in zip(found[:7], expected[:7], strict=True):
         np.testing.assert_allclose(column, plain, rtol=1e-9, atol=1e-9)
     for image, plain in zip(found[8:], expected[7:], strict=True):
         np.testing.assert_allclose(image, plain, rtol=1e-5, atol=1e-3)
     assert expected[10][1].any() == (rounds > 2)
-    assert not fitted(*given, rules(gain), rounds, False, True)[12].size
+    assert not fit_singles(*given, rules(gain), rounds, False, True)[12].size
 
 
 @pytest.mark.parametrize("gain", [np.ones(1), np.array([0.7, 1.1, 1.2, 1.0])], ids=["grey", "mosaic"])
@@ -141,8 +146,8 @@ def test_a_settled_fit_is_that_of_many_rounds(gain, rng):
     """To a hundredth of a sigma, with the same outliers; and it is not made in all rounds."""
     given = stamps(rng, 40, gain)
     found, many = (
-        fitted(*given, rules(gain, SETTLED), 20, True, True),
-        fitted(*given, rules(gain), 20, True, True),
+        fit_singles(*given, rules(gain, SETTLED), 20, True, True),
+        fit_singles(*given, rules(gain), 20, True, True),
     )
     sigma = np.sqrt(np.einsum("nii->ni", many[4]))
     off = np.abs(np.stack(found[:2], 1) - np.stack(many[:2], 1)) / sigma
@@ -154,7 +159,7 @@ def test_a_settled_fit_is_that_of_many_rounds(gain, rng):
 
 def test_a_model_ends_where_the_fit_does_unless_the_whole_is_wanted(rng):
     given = stamps(rng, 12, np.ones(1))
-    whole, found = (fitted(*given, rules(np.ones(1)), 5, False, w) for w in (True, False))
+    whole, found = (fit_singles(*given, rules(np.ones(1)), 5, False, w) for w in (True, False))
     reach = whole[10] | whole[11] | ~given[2]
     np.testing.assert_array_equal(found[9], np.where(reach, whole[9], 0))
     np.testing.assert_array_equal(found[8], np.where(reach, whole[8], given[0]))
@@ -168,7 +173,7 @@ def test_phases_that_do_not_alternate_are_refused(rng):
     given = list(stamps(rng, 3, gain))
     given[3][1, 4, 7] ^= 1
     with pytest.raises(ValueError, match="alternate"):
-        fitted(*given, rules(gain), 5, False, False)
+        fit_singles(*given, rules(gain), 5, False, False)
 
 
 def test_psf_is_the_sum_of_its_terms(rng):
@@ -182,7 +187,7 @@ def test_a_star_without_light_has_no_place(rng):
     given = list(stamps(rng, 3, np.ones(1)))
     given[0] = given[0].copy()
     given[0][0] = 0
-    x, _, flux, _, covariance, _, chi2, *_ = fitted(*given, rules(np.ones(1)), 5, True, True)
+    x, _, flux, _, covariance, _, chi2, *_ = fit_singles(*given, rules(np.ones(1)), 5, True, True)
     for column in (x, flux, covariance, chi2):
         assert np.isnan(column[0]).all() and np.isfinite(column[1:]).all()
 
@@ -197,4 +202,4 @@ def test_what_does_not_fit_together_is_refused(which, change, rng):
     given = list(stamps(rng, 3, np.ones(1)))
     given[which] = change(given[which])
     with pytest.raises(ValueError, match=r"px|shape|needed|phase|of each|terms|axes"):
-        fitted(*given, rules(np.ones(1)), 5, True, True)
+        fit_singles(*given, rules(np.ones(1)), 5, True, True)

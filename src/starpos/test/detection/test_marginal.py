@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from test_fit import SIZE, hermite, plain_psf, psfs, scaled
 
-from starpos.detection._marginal import marginal
+from starpos.detection._learn import marginal_equations
 
 ORDERS = np.array([(2, 0), (1, 1), (0, 2), (3, 0), (4, 2)], np.int32)
 
@@ -48,14 +48,14 @@ def test_equations_are_those_of_plain_sums(phases, count, rng):
     """To what single precision keeps of the pixels."""
     stars = given(rng, 8, phases)
     expected = plain_marginal(*stars, ORDERS[:count])
-    for found, plain in zip(marginal(*stars, ORDERS[:count]), expected, strict=True):
+    for found, plain in zip(marginal_equations(*stars, ORDERS[:count]), expected, strict=True):
         np.testing.assert_allclose(found, plain, rtol=0, atol=3e-6 * np.abs(plain).max())
 
 
 def test_a_star_without_pixels_says_nothing(rng):
     stars = list(given(rng, 3, 1))
     stars[5][1] = 0
-    normal, right = marginal(*stars, ORDERS)
+    normal, right = marginal_equations(*stars, ORDERS)
     assert not normal[1].any() and not right[1].any()
     assert normal[0].any() and right[2].any()
 
@@ -69,6 +69,6 @@ def test_what_does_not_fit_together_is_refused(which, value, message, rng):
     stars = list(given(rng, 3, 1))
     stars[which] = value
     with pytest.raises(ValueError, match=message):
-        marginal(*stars, ORDERS)
+        marginal_equations(*stars, ORDERS)
     with pytest.raises(ValueError, match="orders"):
-        marginal(*given(rng, 3, 1), np.full((1, 2), 33, np.int32))
+        marginal_equations(*given(rng, 3, 1), np.full((1, 2), 33, np.int32))

@@ -5,11 +5,9 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from starpos.detection._background import between, near
-from starpos.detection._mesh import above, evened
-from starpos.detection._order import median, quantile
-from starpos.detection._peaks import peaks, smoothed
-from starpos.detection._sparse import any_flat, bright_squares, third_highest, thirds
+from starpos.detection._peaks import find_maxima, smooth_rows
+from starpos.detection._pixels import any_flat, bright_squares, third_highest
+from starpos.detection._sky import even_out, interpolated, median, quantile, scores, sky_at
 from starpos.detection.finding import SHARP, WIDE
 
 
@@ -27,7 +25,7 @@ def plain_evened(mesh, steep, level):
 def test_a_mesh_is_evened_as_by_filters(size, level, rng):
     mesh, steep = rng.normal(0, 1, (3, *size)), np.array([0.0, 0.3, 9.0])
     plain = [plain_evened(m, s, level) for m, s in zip(mesh, steep, strict=True)]
-    np.testing.assert_allclose(evened(mesh, steep, level), plain, rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(even_out(mesh, steep, level), plain, rtol=1e-12, atol=1e-12)
 
 
 @pytest.mark.parametrize("phases", [1, 4])
@@ -36,11 +34,11 @@ def test_scores_are_those_of_single_places(phases, rng):
     row, column = np.sort(rng.uniform(0, 2.99, 7)), np.sort(rng.uniform(0, 4.99, 11))
     value = rng.normal(0, 100, (7, 11)).astype(np.float32)
     places = [v.ravel() for v in np.meshgrid(row, column, indexing="ij")]
-    sky, sigma = between(level, *places).mean(1), np.sqrt((between(noise, *places) ** 2).mean(1))
+    sky, sigma = interpolated(level, *places).mean(1), np.sqrt((interpolated(noise, *places) ** 2).mean(1))
     plain = ((value.ravel() - sky) / sigma).reshape(value.shape)
-    np.testing.assert_allclose(above(value, level, noise, row, column), plain, rtol=1e-5)
+    np.testing.assert_allclose(scores(value, level, noise, row, column), plain, rtol=1e-5)
     with pytest.raises(ValueError, match="a mesh of 4"):
-        above(value, level, noise, row + 1, column)
+        scores(value, level, noise, row + 1, column)
 
 
 @pytest.mark.parametrize("kind", [np.uint8, np.uint16])
@@ -51,9 +49,9 @@ def test_some_rows_are_smoothed_as_by_convolution(kind, rng):
     for axis in (0, 1):
         plain = ndimage.convolve1d(plain, both, axis=axis, mode="mirror")
     rows = np.array([0, 4, 8])
-    np.testing.assert_allclose(smoothed(plane, weight, rows, 4), plain[rows, ::4], rtol=1e-5)
+    np.testing.assert_allclose(smooth_rows(plane, weight, rows, 4), plain[rows, ::4], rtol=1e-5)
     with pytest.raises(ValueError, match="beyond"):
-        smoothed(plane, weight, rows + 1, 4)
+        smooth_rows(plane, weight, rows + 1, 4)
 
 
 @pytest.mark.parametrize("kind", [np.uint8, np.uint16])
@@ -104,18 +102,20 @@ def test_nothing_has_no_median_and_no_quantile():
 
 
 @pytest.mark.parametrize("kind", [np.uint8, np.uint16])
-def test_the_third_highest_pixel_is_that_of_sorted_squares(kind, rng):
-    """Some squares lie partly beyond the frame."""
+@pytest.mark.parametrize("reach", [1, 2])
+def test_the_third_highest_pixel_is_that_of_sorted_squares(kind, reach, rng):
+    """Some squares lie partly beyond the frame, where there is no light."""
     for most in (3, 9, 200):
         plane = rng.integers(0, most, (20, 30)).astype(kind)
-        x, y = rng.integers(0, 30, 12), rng.integers(0, 20, 12)
-        around = np.pad(plane, 2)
-        squares = np.stack([around[j : j + 5, i : i + 5].ravel() for i, j in zip(x, y, strict=True)])
-        third = np.sort(squares, axis=1)[:, -3].max()
-        shared = (squares == third).sum(1)[np.sort(squares, axis=1)[:, -3] == third].max()
-        assert third_highest(plane, x, y, 2) == (third, shared)
-    with pytest.raises(ValueError, match="at least one"):
-        third_highest(plane, x[:0], y[:0], 2)
+        y, x = (v.ravel() for v in np.indices(plane.shape))
+        around, size = np.pad(plane, reach), 2 * reach + 1
+        squares = np.stack([around[j : j + size, i : i + size].ravel() for i, j in zip(x, y, strict=True)])
+        third, alike = third_highest(plane, x, y, reach)
+        np.testing.assert_array_equal(third, np.sort(squares, axis=1)[:, -3])
+        lit = third > 0
+        np.testing.assert_array_equal(alike[lit], (squares == third[:, None]).sum(1)[lit])
+    with pytest.raises(ValueError, match="as many"):
+        third_highest(plane, x, y[1:], reach)
 
 
 @pytest.mark.parametrize("phases", [1, 4])
@@ -123,13 +123,13 @@ def test_the_sky_near_a_pixel_lies_between_cells(phases, rng):
     level, noise = rng.uniform(5, 9, (2, phases, 5, 8))
     x, y = rng.integers(-3, 63, 40), rng.integers(-3, 33, 40)
     place = (y + 0.5) * 3 / 30 + 0.5, (x + 0.5) * 6 / 60 + 0.5
-    plain = between(level, *place), between(noise, *place) * 1.5
-    for found, expected in zip(near(level, noise, x, y, 60, 30, 1.5), plain, strict=True):
+    plain = interpolated(level, *place), interpolated(noise, *place) * 1.5
+    for found, expected in zip(sky_at(level, noise, x, y, 60, 30, 1.5), plain, strict=True):
         np.testing.assert_allclose(found, expected, rtol=1e-6)
     with pytest.raises(ValueError, match="as many"):
-        near(level, noise, x, y[1:], 60, 30, 1.5)
+        sky_at(level, noise, x, y[1:], 60, 30, 1.5)
     with pytest.raises(ValueError, match="as of level"):
-        near(level, noise[:, 1:].copy(), x, y, 60, 30, 1.5)
+        sky_at(level, noise[:, 1:].copy(), x, y, 60, 30, 1.5)
 
 
 @pytest.mark.parametrize("kind", [np.uint8, np.uint16])
@@ -139,12 +139,12 @@ def test_peaks_in_blocks_that_are_left_out_or_not_are_those_of_the_whole_smoothe
     plane[rng.random(plane.shape) < 0.01] += 190
     # a flat half, whose blocks are dark
     plane[:, :150] //= 8
-    smooth = smoothed(plane, kernel.weight, np.arange(70), 1)
+    smooth = smooth_rows(plane, kernel.weight, np.arange(70), 1)
     highest = ndimage.maximum_filter(smooth, 2 * kernel.flat + 1, mode="nearest")
     limit = np.quantile(smooth, 0.9)
     row, column = np.nonzero((smooth == highest) & (smooth > limit))
     cells = np.full((2, 4), limit, np.float32)
-    x, y, value, _ = peaks(plane, kernel.weight, kernel.flat, cells, 40, 0, 70)
+    x, y, value, _ = find_maxima(plane, kernel.weight, kernel.flat, cells, 40, 0, 70)
     np.testing.assert_array_equal((y, x, value), (row, column, smooth[row, column]))
 
 
@@ -154,21 +154,8 @@ def test_the_limit_of_peaks_is_linear_between_cells_and_another_in_each_strip(rn
     plane[row, column] = height = rng.integers(50, 250, len(row))
     place = (column + 0.5) * 6 / 60 + 0.5
     limit = np.where(row < 10, *(np.interp(place, np.arange(8), strip) for strip in cells))
-    x, y, value, highest = peaks(plane, np.array([1, 0], np.float32), 1, cells, 10, 0, 20)
+    x, y, value, highest = find_maxima(plane, np.array([1, 0], np.float32), 1, cells, 10, 0, 20)
     np.testing.assert_array_equal((y, x, value), np.stack([row, column, height])[:, height > limit])
     np.testing.assert_array_equal(highest, plane.max(1))
     with pytest.raises(ValueError, match="2 strips"):
-        peaks(plane, np.array([1, 0], np.float32), 1, cells, 9, 0, 20)
-
-
-@pytest.mark.parametrize("kind", [np.uint8, np.uint16])
-def test_the_third_highest_of_nine_pixels_is_that_of_a_sorted_square(kind, rng):
-    """On the frame's edge the square goes on as the edge."""
-    for most in (3, 200):
-        plane = rng.integers(0, most, (6, 9)).astype(kind)
-        y, x = (v.ravel() for v in np.indices(plane.shape))
-        around = np.pad(plane, 1, mode="edge")
-        squares = [np.sort(around[j : j + 3, i : i + 3], axis=None)[-3] for i, j in zip(x, y, strict=True)]
-        np.testing.assert_array_equal(thirds(plane, x, y), squares)
-    with pytest.raises(ValueError, match="as many"):
-        thirds(plane, x, y[1:])
+        find_maxima(plane, np.array([1, 0], np.float32), 1, cells, 9, 0, 20)

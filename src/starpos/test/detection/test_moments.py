@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from starpos.detection._moments import centred, windowed
+from starpos.detection._moments import centroids, window_moments
 
 
 def plain(signal, left, top, window):
@@ -30,7 +30,7 @@ def test_moments_are_those_of_plain_sums(size, off_px, rng):
     root = rng.normal(0, 1, (n, 2, 2))
     window = root @ root.transpose(0, 2, 1) + (1 + off_px**2) * np.eye(2)
     for found, expected in zip(
-        windowed(signal, left, top, window), plain(signal, left, top, window), strict=True
+        window_moments(signal, left, top, window), plain(signal, left, top, window), strict=True
     ):
         # what lies beyond five widths of a window is left out
         np.testing.assert_allclose(found, expected, rtol=2e-5, atol=2e-5)
@@ -38,7 +38,7 @@ def test_moments_are_those_of_plain_sums(size, off_px, rng):
 
 def test_without_light_there_is_no_place():
     signal = -np.ones((1, 7, 7), np.float32)
-    mass, mean, shape = windowed(signal, np.array([-3.0]), np.array([-3.0]), np.eye(2)[None])
+    mass, mean, shape = window_moments(signal, np.array([-3.0]), np.array([-3.0]), np.eye(2)[None])
     assert mass[0] < 0
     assert np.isnan(mean).all() and np.isnan(shape).all()
 
@@ -65,9 +65,9 @@ def test_places_are_those_of_means_through_windows(rounds, rng):
         step = np.clip((gain @ mean[..., None])[..., 0], -1, 1)
         step[0] = 0
         x, y = np.clip(x + step[:, 0], column - 2, column + 2), np.clip(y + step[:, 1], row - 2, row + 2)
-    found = centred(signal, column, row, window, gain, rounds, 2.0)
+    found = centroids(signal, column, row, window, gain, rounds, 2.0)
     np.testing.assert_allclose(found, (x, y), rtol=0, atol=1e-9)
-    alone = centred(signal[1:2], column[1:2], row[1:2], window[1:2], gain[1:2], rounds, 2.0)
+    alone = centroids(signal[1:2], column[1:2], row[1:2], window[1:2], gain[1:2], rounds, 2.0)
     np.testing.assert_allclose(np.ravel(alone), (x[1], y[1]), rtol=0, atol=1e-9)
 
 
@@ -75,6 +75,6 @@ def test_a_window_for_each_image_is_needed(rng):
     signal, window, gain = images(rng, 4)
     place = np.zeros(4, int)
     with pytest.raises(ValueError, match="windows"):
-        centred(signal, place, place, window[:2], gain, 3, 2.0)
+        centroids(signal, place, place, window[:2], gain, 3, 2.0)
     with pytest.raises(ValueError, match="places"):
-        windowed(signal, np.zeros(3), np.zeros(4), window)
+        window_moments(signal, np.zeros(3), np.zeros(4), window)

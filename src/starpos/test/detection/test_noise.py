@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from starpos.detection._noise import light_noise, strangeness, typical_gains
+from starpos.detection._learn import light_noise, strangeness, typical_gains
 
 N, SIZE = 20, 9
 

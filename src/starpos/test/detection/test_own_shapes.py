@@ -4,8 +4,15 @@
 import numpy as np
 import pytest
 
-from starpos.detection._moments import centred, own_shapes, settled, windowed
-from starpos.detection._shapes import before, clipped, inverted
+from starpos.detection._moments import (
+    centroids,
+    clip_widths,
+    invert_shapes,
+    own_shapes,
+    typical_shape,
+    window_moments,
+    without_window,
+)
 
 
 def stars(rng, n, size=13):
@@ -27,9 +34,11 @@ def plain_own_shapes(signal, first, narrowest_window, narrowest, widest):
     n, half = len(signal), signal.shape[1] // 2
     middle, shape = np.full(n, half), np.eye(2)[None].repeat(n, 0) * first
     for centrings in (0, 2, 2):
-        window = clipped(shape, narrowest_window, np.inf, 1.0)
-        x, y = centred(signal, middle, middle, window, np.eye(2) + shape @ inverted(window), centrings, 2.0)
-        own = np.nan_to_num(before(windowed(signal, -x, -y, window)[2], window))
+        window = clip_widths(shape, narrowest_window, np.inf, 1.0)
+        x, y = centroids(
+            signal, middle, middle, window, np.eye(2) + shape @ invert_shapes(window), centrings, 2.0
+        )
+        own = np.nan_to_num(without_window(window_moments(signal, -x, -y, window)[2], window))
         values, vectors = np.linalg.eigh(own)
         values = np.where(values > 0, np.clip(values, narrowest, widest), widest)
         shape = (vectors * values[:, None, :]) @ vectors.transpose(0, 2, 1)
@@ -42,16 +51,16 @@ def plain_settled(signal, first, narrowest_window, narrowest, widest):
     x, y = np.full((2, len(signal)), float(half))
     window, shape = np.eye(2) * first, None
     for _ in range(12):
-        _, step, seen = windowed(signal, -x, -y, window[None])
+        _, step, seen = window_moments(signal, -x, -y, window[None])
         usable = (np.abs(step).max(1) < 1.5) & (np.linalg.eigvalsh(np.nan_to_num(seen))[:, 0] > 0.1)
         if not usable.any():
             break
-        of_seen, of_window = inverted(np.stack([np.median(seen[usable], axis=0), window]))
-        own = clipped((of_seen - of_window)[None], 1 / widest, 1 / narrowest, -1.0)[0]
+        of_seen, of_window = invert_shapes(np.stack([np.median(seen[usable], axis=0), window]))
+        own = clip_widths((of_seen - of_window)[None], 1 / widest, 1 / narrowest, -1.0)[0]
         step = np.where(usable[:, None], step @ (np.eye(2) + own @ of_window).T, 0)
         x, y = x + np.clip(step[:, 0], -1, 1), y + np.clip(step[:, 1], -1, 1)
         change = np.inf if shape is None else np.abs(own - shape).max() / own.max()
-        shape, window = own, clipped(own[None], narrowest_window, np.inf, 1.0)[0]
+        shape, window = own, clip_widths(own[None], narrowest_window, np.inf, 1.0)[0]
         if change < 1e-3:
             break
     return shape
@@ -72,7 +81,7 @@ def test_own_shapes_are_those_of_windows_that_follow_them(rng):
 def test_the_typical_shape_is_that_of_medians(first, n, rng):
     for _ in range(20):
         signal = stars(rng, n)
-        found = settled(signal, first, 1.2, 0.2, 36.0, 12, 1.5, 0.1, 1e-3)
+        found = typical_shape(signal, first, 1.2, 0.2, 36.0, 12, 1.5, 0.1, 1e-3)
         plain = plain_settled(signal, first, 1.2, 0.2, 36.0)
         assert (found is None) == (plain is None)
         if plain is not None:
@@ -81,10 +90,10 @@ def test_the_typical_shape_is_that_of_medians(first, n, rng):
 
 def test_darkness_has_no_typical_shape_and_the_widest_of_its_own():
     dark = np.zeros((3, 9, 9), np.float32)
-    assert settled(dark, 4.0, 1.2, 0.2, 16.0, 12, 1.5, 0.1, 1e-3) is None
-    assert settled(dark[:0], 4.0, 1.2, 0.2, 16.0, 12, 1.5, 0.1, 1e-3) is None
+    assert typical_shape(dark, 4.0, 1.2, 0.2, 16.0, 12, 1.5, 0.1, 1e-3) is None
+    assert typical_shape(dark[:0], 4.0, 1.2, 0.2, 16.0, 12, 1.5, 0.1, 1e-3) is None
     np.testing.assert_array_equal(own_shapes(dark, 4.0, 1.2, 0.2, 16.0, 3, 2, 2.0)[1], 16.0)
     with pytest.raises(ValueError, match="square"):
-        settled(dark[:, :8].copy(), 4.0, 1.2, 0.2, 16.0, 12, 1.5, 0.1, 1e-3)
+        typical_shape(dark[:, :8].copy(), 4.0, 1.2, 0.2, 16.0, 12, 1.5, 0.1, 1e-3)
     with pytest.raises(ValueError, match="square"):
         own_shapes(dark[:, :8].copy(), 4.0, 1.2, 0.2, 16.0, 3, 2, 2.0)

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from starpos.detection._background import between, sampled
-from starpos.detection._stamps import around, light_around
+from starpos.detection._pixels import cut_stamps
+from starpos.detection._sky import interpolated, sample_sky
 from starpos.detection.background import CLIP
 from starpos.units import SIGMA_PER_MAD
 
@@ -29,7 +29,7 @@ def test_cells_are_those_of_sorted_values(kind, rng):
     plane[20:, 28:] = np.where(rng.random((20, 28)) < 0.7, 0, plane[20:, 28:])
     rows = np.stack([np.arange(0, 20), np.arange(20, 40)]).astype(np.int32)
     columns = np.stack([np.arange(0, 28), np.arange(28, 56)]).astype(np.int32)
-    level, noise, highest, count = sampled(plane, rows, columns, *CLIP)
+    level, noise, highest, count = sample_sky(plane, rows, columns, *CLIP)
     for i, j, phase in np.ndindex(2, 2, 4):
         values = plane[rows[i, phase // 2 :: 2]][:, columns[j, phase % 2 :: 2]].ravel().astype(float)
         expected = *plain_cell(values), values.max(), (values == values.max()).sum()
@@ -40,8 +40,10 @@ def test_cells_are_those_of_sorted_values(kind, rng):
 def test_between_cells_the_sky_is_linear_and_beyond_them_as_on_the_edge(rng):
     mesh, (row, column) = rng.normal(0, 1, (3, 5, 7)), rng.uniform(-1, 8, (2, 50))
     expected = [ndimage.map_coordinates(m, (row, column), order=1, mode="nearest") for m in mesh]
-    np.testing.assert_allclose(between(mesh, row, column), np.transpose(expected), rtol=1e-12, atol=1e-12)
-    assert np.isfinite(between(mesh, np.full(1, np.nan), np.full(1, np.inf))).all()
+    np.testing.assert_allclose(
+        interpolated(mesh, row, column), np.transpose(expected), rtol=1e-12, atol=1e-12
+    )
+    assert np.isfinite(interpolated(mesh, np.full(1, np.nan), np.full(1, np.inf))).all()
 
 
 @pytest.mark.parametrize("phases", [1, 4])
@@ -66,24 +68,19 @@ def test_stamps_are_the_pixels_around_stars(phases, kind, most, saturation, rng)
         on & (pixels >= saturation),
         phase,
     )
-    for found, plain in zip(around(plane, x, y, 3, level, noise, saturation), expected, strict=True):
+    for found, plain in zip(cut_stamps(plane, x, y, 3, level, noise, saturation), expected, strict=True):
         np.testing.assert_array_equal(found, plain)
-    signal, full = light_around(plane, x, y, 3, level, saturation)
-    np.testing.assert_array_equal(signal, expected[0])
-    np.testing.assert_array_equal(full, (pixels >= saturation).any((1, 2)))
 
 
 def test_what_lies_beyond_the_frame_is_refused():
     plane, rows = np.zeros((8, 8), np.uint16), np.array([[0, 1, 8, 9]], np.int32)
     with pytest.raises(ValueError, match="beyond"):
-        sampled(plane, rows, rows, *CLIP)
+        sample_sky(plane, rows, rows, *CLIP)
     with pytest.raises(ValueError, match="pairs"):
-        sampled(plane, rows[:, :3].copy(), rows, *CLIP)
+        sample_sky(plane, rows[:, :3].copy(), rows, *CLIP)
     with pytest.raises(ValueError, match="in 2 x 2 or more"):
-        between(np.zeros((1, 1, 5)), np.zeros(3), np.zeros(3))
+        interpolated(np.zeros((1, 1, 5)), np.zeros(3), np.zeros(3))
     with pytest.raises(ValueError, match="phases"):
-        around(plane, np.zeros(2, int), np.zeros(1, int), 1, *np.zeros((2, 2, 1), np.float32), 1.0)
-    with pytest.raises(ValueError, match="phases"):
-        light_around(plane, np.zeros(2, int), np.zeros(1, int), 1, np.zeros((2, 1), np.float32), 1.0)
+        cut_stamps(plane, np.zeros(2, int), np.zeros(1, int), 1, *np.zeros((2, 2, 1), np.float32), 1.0)
     with pytest.raises(ValueError, match="nothing to see"):
-        light_around(plane, np.zeros(1, int), np.zeros(1, int), -1, np.zeros((1, 1), np.float32), 1.0)
+        cut_stamps(plane, np.zeros(1, int), np.zeros(1, int), -1, *np.zeros((2, 1, 1), np.float32), 1.0)

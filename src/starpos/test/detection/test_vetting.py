@@ -5,7 +5,13 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from starpos.detection._vetting import level, looks, one_pixel, own_light, without_spikes
+from starpos.detection._vetting import (
+    compare_with_pixel,
+    correct_sky,
+    describe_stars,
+    replace_spikes,
+    restore_model,
+)
 from starpos.units import SIGMA_PER_MAD
 
 N, SIZE = 12, 11
@@ -49,7 +55,7 @@ def test_the_sky_at_the_rims_is_taken_off(stamps):
     sky = np.where((sky > 0.6) & (sky > own), sky, 0)[:, None, None]
     spread = np.where((spread > 1.6) & (spread > own), spread, 1)[:, None, None]
     expected = signal - sky * noise, noise * spread
-    level(signal, noise, SIGMA_PER_MAD, 0.6, 1.6, 0.01)
+    correct_sky(signal, noise, SIGMA_PER_MAD, 0.6, 1.6, 0.01)
     assert sky[:4].all() and not sky[6] and (spread[4:6] > 1).all()
     for found, plain in zip((signal, noise), expected, strict=True):
         np.testing.assert_allclose(found, plain, rtol=1e-6, atol=1e-5)
@@ -67,7 +73,7 @@ def test_spikes_become_the_mean_of_their_neighbours(stamps, rng):
     around = ndimage.convolve(grey.astype(float), four[None], mode="nearest")
     expected = (grey > sharpest[:, None, None] * (around + noise)) & (signal > 6 * noise)
     healed, kept = np.where(expected, around * gain[phase], signal), good & ~expected
-    found = without_spikes(signal, noise, good, phase, gain, sharpest, 6.0)
+    found = replace_spikes(signal, noise, good, phase, gain, sharpest, 6.0)
     assert expected.sum() > 5
     np.testing.assert_array_equal(found, expected)
     np.testing.assert_array_equal(good, kept)
@@ -82,7 +88,7 @@ def test_pixels_that_say_nothing_of_the_star_become_its_model(stamps, fits, rng)
     spike = rng.random(signal.shape) < 0.02
     speck = outlier & (outlier.sum((1, 2)) <= 3)[:, None, None]
     expected = np.where(speck | spike | (noise > 3 * noise.min((1, 2), keepdims=True)), model, signal)
-    own_light(signal, noise, spike, model, outlier, 3, 3.0)
+    restore_model(signal, noise, spike, model, outlier, 3, 3.0)
     np.testing.assert_array_equal(signal, expected)
 
 
@@ -102,7 +108,9 @@ def test_looks_are_those_of_plain_sums(many, stamps, fits, rng):
         (full & (distance < 2)).any((1, 2)),
         (~good & ~full & ~spike & (distance < 3)).any((1, 2)),
     )
-    found = looks(signal, noise, good, full, spike, residual, model, used, outlier, left, top, axes, 2.0, 3.0)
+    found = describe_stars(
+        signal, noise, good, full, spike, residual, model, used, outlier, left, top, axes, 2.0, 3.0
+    )
     assert 0 < expected[2].sum() < N
     for one, plain in zip(found, expected, strict=True):
         np.testing.assert_allclose(one, plain, rtol=1e-5)
@@ -122,7 +130,7 @@ def test_one_pixel_is_compared_with_the_star(half, stamps, fits):
         g.sum((1, 2)),
         full[:, c, c].sum((1, 2)),
     )
-    found = one_pixel(signal, noise, good, full, residual, model, 0.4, 0.01, half)
+    found = compare_with_pixel(signal, noise, good, full, residual, model, 0.4, 0.01, half)
     for one, plain in zip(found, expected, strict=True):
         np.testing.assert_allclose(one, plain, rtol=1e-5, atol=1e-5)
 
@@ -130,8 +138,8 @@ def test_one_pixel_is_compared_with_the_star(half, stamps, fits):
 def test_pixels_of_other_stamps_are_refused(stamps):
     signal, noise, good, full, phase = stamps
     with pytest.raises(ValueError, match="stamps"):
-        level(signal, noise[:3].copy(), SIGMA_PER_MAD, 0.6, 1.6, 0.01)
+        correct_sky(signal, noise[:3].copy(), SIGMA_PER_MAD, 0.6, 1.6, 0.01)
     with pytest.raises(ValueError, match="gains"):
-        without_spikes(signal, noise, good, phase, np.ones(2, np.float32), np.ones(N, np.float32), 6.0)
+        replace_spikes(signal, noise, good, phase, np.ones(2, np.float32), np.ones(N, np.float32), 6.0)
     with pytest.raises(ValueError, match="middle"):
-        one_pixel(signal, noise, good, full, signal, signal, 0.4, 0.01, SIZE)
+        compare_with_pixel(signal, noise, good, full, signal, signal, 0.4, 0.01, SIZE)

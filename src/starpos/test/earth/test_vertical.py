@@ -165,3 +165,21 @@ def test_an_unknown_height_widens_the_error_and_moves_nothing():
 def test_impossible_deflections_are_refused(values):
     with pytest.raises(InstrumentError, match="deflection"):
         Deflection(*values)
+
+
+@pytest.mark.parametrize(
+    ("vertical", "known"),
+    [
+        (Deflection(), False),
+        # 8 arcsec to the north alone, in mountains that a grid resolves to 7
+        (Deflection(8.0, 0.0, 7.0), True),
+        (Deflection(0.0, 8.0, 7.0), True),
+        (Deflection(0.0, 0.0, 1.0), True),
+        # a height bends plumb lines to the north wherever nothing else is known
+        (AtHeight(Deflection(), 3000.0), False),
+        (AtHeight(Deflection(), 3000.0, 50.0), False),
+        (AtHeight(Deflection(8.0, 0.0, 7.0), 3000.0), True),
+    ],
+)
+def test_a_deflection_to_the_north_alone_is_known(vertical, known):
+    assert vertical.at(0.7, 0.1).known is known

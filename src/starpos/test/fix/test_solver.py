@@ -143,7 +143,7 @@ def test_identify_gives_the_pointing_of_the_frames_centre(night, catalogue):
 def test_the_window_of_a_frame_counts_with_and_without_its_directions(night):
     _, stars, tilt, solver = night
     width = stars.width // 3
-    shown = stars.take(np.flatnonzero(stars.x < width))
+    shown = stars.select(np.flatnonzero(stars.x < width))
     windowed = replace(shown, window=(0, 0, width, stars.height))
     for ask in (solver.identify, lambda s: solver.solve(s, tilt)):
         assert ask(windowed).attitude.log_odds > ask(shown).attitude.log_odds + 10
@@ -184,11 +184,11 @@ def test_false_bright_stars_do_no_harm(night):
 def test_too_few_stars(night):
     _, stars, tilt, solver = night
     for n in range(4):
-        assert "at least 4" in refused(solver.solve(stars.take(slice(0, n)), tilt), Status.TOO_FEW_STARS)
-        assert solver.identify(stars.take(slice(0, n))).status is Status.TOO_FEW_STARS
+        assert "at least 4" in refused(solver.solve(stars.select(slice(0, n)), tilt), Status.TOO_FEW_STARS)
+        assert solver.identify(stars.select(slice(0, n))).status is Status.TOO_FEW_STARS
     burnt = no_stars(*SIZE, mid_unix_s=START, exposure_s=EXPOSURE)
     assert "0 stars detected" in refused(solver.solve(burnt, tilt), Status.TOO_FEW_STARS)
-    saturated = replace(stars.take(slice(0, 3)), flags=np.full(3, SATURATED))
+    saturated = replace(stars.select(slice(0, 3)), flags=np.full(3, SATURATED))
     assert "3 saturated" in refused(solver.solve(saturated, tilt), Status.TOO_FEW_STARS)
 
 

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from starpos.errors import FrameError
-from starpos.frames.driver_stamp import KINDS, DriverStamp
-from starpos.frames.exposure import Shutter
+from starpos.frames.exposure import STAMPS, DriverStamp, Shutter
 from starpos.frames.frame import Frame
 
 STAMP_S = 1793642400.25
@@ -29,7 +28,7 @@ FRAME = Frame(np.zeros((4, 5), np.uint16), mid_unix_s=STAMP_S)
     ],
 )
 def test_the_middle_of_the_exposure(kind, readout_s, later_s):
-    got = DriverStamp(kind, exposure_s=0.8, readout_s=readout_s).dated(FRAME)
+    got = DriverStamp(kind, exposure_s=0.8, readout_s=readout_s).apply(FRAME)
     assert got.mid_unix_s == pytest.approx(STAMP_S + later_s, abs=1e-6)
     assert got.exposure_s == 0.8
     assert got.shutter == (None if math.isnan(readout_s) else Shutter(readout_s, 0.0))
@@ -55,22 +54,22 @@ def test_the_middle_of_the_exposure(kind, readout_s, later_s):
     ],
 )
 def test_its_error_is_wide_until_the_moment_is_stated(stamp, stddev_s):
-    assert stamp.dated(FRAME).stamp_stddev_s == stamp.middle_stddev_s == stddev_s
+    assert stamp.apply(FRAME).stamp_stddev_s == stamp.middle_stddev_s == stddev_s
 
 
 def test_a_sentence_says_what_to_set_and_what_it_costs():
-    said = DriverStamp().unsaid
-    for word in (*KINDS[1:], "stamp_stddev", "0.3 s", "139 m"):
+    said = DriverStamp().missing_statement
+    for word in (*STAMPS[1:], "stamp_stddev", "0.3 s", "139 m"):
         assert word in said
-    assert "set the parameter exposure" in DriverStamp("end", stddev_s=0.001).unsaid
-    assert "set the parameter stamp_stddev" in DriverStamp("arrival", exposure_s=0.1).unsaid
+    assert "set the parameter exposure" in DriverStamp("end", stddev_s=0.001).missing_statement
+    assert "set the parameter stamp_stddev" in DriverStamp("arrival", exposure_s=0.1).missing_statement
     for stated in (
         DriverStamp("middle"),
         DriverStamp("start", exposure_s=0.1),
         DriverStamp("arrival", 0.05, 0.1),
         DriverStamp(stddev_s=0.05),
     ):
-        assert not stated.unsaid
+        assert not stated.missing_statement
 
 
 def test_impossible_ones_are_refused():

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from starpos.errors import FrameError
-from starpos.frames import frame as frame_files
+from starpos.frames import reading
 from starpos.frames.exif import CameraClock
 from starpos.frames.frame import Frame
 from starpos.frames.reading import read_frame
@@ -89,7 +89,7 @@ def test_a_header_that_claims_gigabytes_is_refused_before_any_is_taken(tmp_path,
     whole[at : at + 8] = (30_000).to_bytes(4, "big") * 2
     with pytest.raises(FrameError, match=r"claims|not a whole HEIF"):
         read_frame(write(tmp_path / "a.heic", whole))
-    monkeypatch.setattr(frame_files, "MAX_BYTES", 10_000)
+    monkeypatch.setattr(reading, "MAX_BYTES", 10_000)
     with pytest.raises(FrameError, match="too many for a frame"):
         read_frame(write(tmp_path / "a.heic", whole + bytes(10_000)))
 

@@ -14,6 +14,7 @@ from astropy.io import fits
 from starpos.errors import FrameError
 from starpos.frames import fits as frames_fits
 from starpos.frames import frame as frame_files
+from starpos.frames import reading
 from starpos.frames.frame import Frame
 from starpos.frames.reading import read_frame
 
@@ -124,7 +125,7 @@ def test_a_header_is_held_to_the_bytes_it_claims_not_to_pixels(tmp_path, name, f
 @pytest.fixture
 def small_limit(monkeypatch):
     """A limit of 100 kB, of files and of what they unpack to."""
-    for module in (frame_files, frames_fits):
+    for module in (frame_files, frames_fits, reading):
         monkeypatch.setattr(module, "MAX_BYTES", 100_000)
 
 

@@ -80,7 +80,7 @@ FITS = {
         "stack of 187", None, 250e3 / 2.90000009536743, WHOLE),
     "Seestar": (
         {"EXPOSURE": 10.0, "EXPTIME": 10.0, "DATE-OBS": ("2025-05-13T22:48:35.751879", "Image created time")},
-        "image created time", 10.0, None, None),
+        "Image created time", 10.0, None, None),
     "DWARF II": (
         {"DATE-OBS": ("2023-06-10T21:38:19.442", "Time start to exposure"), "DATE": "2023-06-10T21:38:35.938",
          "EXP": (15.0, "[s] Sub Exposure Time"), "BINNING": "2*2"},

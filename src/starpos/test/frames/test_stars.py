@@ -25,7 +25,7 @@ def test_sequences_become_arrays_of_double_precision():
 
 
 def test_taking_some_stars_keeps_the_frame_they_belong_to():
-    faint = Stars(**GOOD, mid_unix_s=1e9, source="a").take([False, True])
+    faint = Stars(**GOOD, mid_unix_s=1e9, source="a").select([False, True])
     assert (faint.x.tolist(), faint.flags.tolist(), faint.mid_unix_s, faint.source) == (
         [20.25],
         [EDGE],

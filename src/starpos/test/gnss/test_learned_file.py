@@ -34,8 +34,24 @@ def test_it_is_the_same_after_a_restart(learned, saved):
     again = states.read_learned(saved)
     for name in ("a3", "state", "covariance", "calibrated_up"):
         assert np.array_equal(getattr(again, name), getattr(learned, name))
-    for name in ("axes", "utc_unix_s", "place", "frames", "poses", "since_unix_s", "temperature_c"):
+    for name in (
+        "axes",
+        "utc_unix_s",
+        "place",
+        "frames",
+        "poses",
+        "since_unix_s",
+        "temperature_c",
+        "warmer_c",
+    ):
         assert getattr(again, name) == getattr(learned, name)
+
+
+def test_a_file_from_before_the_warmth_was_written_is_read(saved):
+    content = json.loads(saved.read_text())
+    del content["warmer_c"]
+    saved.write_text(json.dumps(content))
+    assert states.read_learned(saved).warmer_c == 0.0
 
 
 def test_without_a_file_nothing_is_known(tmp_path):

@@ -52,13 +52,23 @@ def test_a_sound_fix_is_a_place_without_an_altitude_too():
         ({"covariance": np.full((3, 3), np.nan)}, "states no error"),
         ({"covariance": np.diag([4.0, -4.0, 4.0])}, "states no error"),
         ({"covariance": np.diag([1e9, 1e9, 1e9])}, "over 10 km"),
-        ({"frame_id": "map_NAD-27"}, "another datum"),
+        *(
+            ({"frame_id": name}, "another datum")
+            for name in ("map_NAD-27", "PZ-90", "gcj_02", "rover/gps_ed50", "tokyo")
+        ),
         ({"stamp": 0}, "no time stamp"),
     ],
 )
 def test_what_tells_no_place_says_why_in_a_sentence(changes, said):
     with pytest.raises(GnssError, match=said):
         message_to_gnss(message(**changes))
+
+
+@pytest.mark.parametrize(
+    "frame_id", ["", "tokyo_rover/gps", "tokyo/gps", "speed50_gps", "led50", "led-50", "nad27_mast"]
+)
+def test_a_frame_whose_name_only_holds_the_letters_of_a_datum_is_taken(frame_id):
+    message_to_gnss(message(frame_id=frame_id))
 
 
 def test_an_error_may_be_taken_for_one_that_is_not_stated():

@@ -11,6 +11,8 @@ from starpos.gnss.filter import place_of_stars, what_would_tell_more
 from starpos.gnss.receiver import GnssPlace
 from starpos.gnss.watch import GnssStatus, GnssWatch
 from starpos.instrument import sensors
+from starpos.instrument.inclinometer import InclinometerErrors
+from starpos.units import ARCSEC
 from starpos_testing.gnss_drives import GnssDrive
 
 UNKNOWN = Deflection(stddev_arcsec=6.0)
@@ -87,6 +89,38 @@ def test_multipath_of_30_m_is_no_spoofing():
     for seed in (21, 22):
         told, _ = driven(ROVER, seed, astray=lambda t: np.array([0.0, 30.0]) * (1200 < t < 1500))
         assert all(frame.check.status != GnssStatus.DISAGREES for frame in told)
+
+
+WARM = InclinometerErrors(temperature_rad_per_c=20 * ARCSEC)
+# the frames whose tilt has no temperature
+UNMEASURED = {
+    "never": lambda k: False,
+    "at first": lambda k: k == 0,
+    "until GNSS goes": lambda k: k < 40,
+    "from then on": lambda k: k >= 40,
+    "now and then": lambda k: 60 < k % 90 < 80,
+}
+
+
+@pytest.mark.parametrize("when", UNMEASURED)
+def test_a_claim_holds_whatever_temperatures_are_measured(when):
+    """A level of 20 arcsec a C that cools by 6 C an hour; GNSS goes after half an hour."""
+    nees = []
+    for seed in range(4):
+        drive = GnssDrive(stops=60, cooling_c_per_hour=6.0, errors=WARM, unmeasured=UNMEASURED[when])
+        told, _ = driven(drive, seed, gnss_until_s=1800.0)
+        nees += [frame.nees for frame in after(told, 5400.0) if frame.error_m is not None]
+    assert len(nees) > 100 and np.mean(nees) < 4
+
+
+@pytest.mark.parametrize("every_s", [300.0, 400.0, 600.0, 1200.0])
+def test_a_gnss_that_comes_back_is_believed_however_far_apart_the_frames_are(every_s):
+    drive = GnssDrive(stops=80, frames=1, every_s=every_s)
+    begin_s, end_s = 30 * every_s, 33 * every_s
+    told, watch = driven(drive, 3, astray=lambda t: np.array([0.0, 3000.0]) * (begin_s < t < end_s))
+    at = {status: [f.at_s for f in told if f.check.status == status] for status in GnssStatus}
+    assert begin_s < at[GnssStatus.DISAGREES][0] < end_s < at[GnssStatus.DISAGREES][-1] < end_s + 20 * every_s
+    assert not watch.disagrees
 
 
 ATTACKS = {

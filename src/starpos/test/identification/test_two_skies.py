@@ -207,7 +207,7 @@ def merged(a: Stars, b: Stars) -> Stars:
 def test_there_is_no_fix_from_two_skies_but_a_sentence(catalogue, rng):
     scene = wide_scene()
     solver, stars, tilt = solver_of(scene, catalogue), stars_of(scene, catalogue, rng), tilt_of(scene, rng)
-    moved = stars.take(stars.x < SIZE[0] - 41)
+    moved = stars.select(stars.x < SIZE[0] - 41)
     s = solver.solve(merged(stars, replace(moved, x=moved.x + 40.0)), tilt)
     assert s.status is Status.POOR_FIT and s.fix is None and s.hint is None
     assert s.warnings == (TWO_SKIES,) and "two skies in one frame" in s.message

@@ -94,6 +94,13 @@ def test_readings_that_are_no_numbers_are_left_out():
     assert broken.average(1000.2, 1.0).samples == 3
 
 
+@pytest.mark.parametrize(("celsius", "mean"), [([np.nan, 14.0, np.nan, 16.0], 15.0), ([np.nan] * 4, np.nan)])
+def test_readings_without_a_temperature_leave_that_of_the_others(celsius, mean):
+    t = 1000 + np.arange(4) / 10
+    tilt = TiltLog.of(t, np.zeros(4), np.zeros(4), np.array(celsius)).average(1000.15, 0.4)
+    assert tilt.samples == 4 and tilt.temperature_c == pytest.approx(mean, nan_ok=True)
+
+
 @pytest.mark.parametrize("mid", [1000.05, 1000.55, 1000.951])
 def test_a_short_exposure_takes_the_two_readings_that_bracket_it(mid):
     reading = log(np.linspace(0, 0.01, 11))

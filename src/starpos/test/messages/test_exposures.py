@@ -40,7 +40,7 @@ def test_an_exposure_that_changes_from_frame_to_frame_moves_the_middle_of_each()
         mid_ns, frame = seen(facts, at_s)
         assert mid_ns == at_s * S + exposure / 2 * S and frame.mid_unix_s == mid_ns / S
         assert (frame.exposure_s, frame.stamp_stddev_s) == (exposure, 0.002)
-    assert facts.unsaid == ""
+    assert facts.missing_statement == ""
     # if one is lost its exposure is not taken from another frame
     mid_ns, frame = seen(facts, 102)
     assert (mid_ns, frame.exposure_s, frame.stamp_stddev_s) == (102 * S, None, 0.3)

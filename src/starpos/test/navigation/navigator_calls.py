@@ -8,9 +8,10 @@ from voyage_calls import EARTH_M, wrapped
 
 from starpos import rotation
 from starpos.earth.orientation import earth_state
+from starpos.parameters.table import defaults_of
 from starpos.session.driver import JobsInTurn, Now
 from starpos.session.navigator import NavigatorSession
-from starpos.session.navigator_parameters import PARAMETERS, NavigatorSettings
+from starpos.session.navigator_parameters import NavigatorSettings
 
 # of an attitude behind its frame, as the solver takes it
 LATE_S = 0.5
@@ -80,7 +81,7 @@ class Navigator:
     """A session whose jobs are done at once, while it works, and what it has made."""
 
     def __init__(self, **values):
-        values = {p.name: p.default for p in PARAMETERS} | {
+        values = defaults_of("navigator") | {
             "rate": 2.0,
             "refraction.pressure": 0.0,
             "clock_stddev": 1e-4,

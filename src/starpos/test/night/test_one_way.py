@@ -21,8 +21,8 @@ from starpos.frames.tables import TILTS, write_star_list
 from starpos.instrument.instrument import Calibration
 from starpos.night.reading import stars_of as stars_in
 from starpos.session.driver import JobsInTurn, Now, Sent
-from starpos.session.parameter_file import settings_of
 from starpos.session.session import SolverSession
+from starpos.session.settings import Settings
 from starpos.simulation.scene import Exposed, expose, render, write_fits
 from starpos.units import utc_text
 from starpos_testing.skies.scenes import (
@@ -42,7 +42,7 @@ BRIGHTEST, LEFT, SHARE = 4, 14, 0.45
 
 def part_of(stars):
     """A few of the stars in a part of the frame."""
-    return stars.take(np.flatnonzero(stars.x < SHARE * SIZE[0])[BRIGHTEST : BRIGHTEST + LEFT])
+    return stars.select(np.flatnonzero(stars.x < SHARE * SIZE[0])[BRIGHTEST : BRIGHTEST + LEFT])
 
 
 @pytest.fixture(scope="module")
@@ -141,7 +141,7 @@ def told(scene, stars, tilt, **parameters):
         jobs.append(JobsInTurn(lambda text: None))
         return jobs[-1]
 
-    session = SolverSession(settings_of(None, [f"{k}:={v}" for k, v in given.items()]), new, quiet, quiet)
+    session = SolverSession(Settings.of(None, [f"{k}:={v}" for k, v in given.items()]), new, quiet, quiet)
     now = Now(START + EXPOSURE, 0.0)
     camera = scene.instrument.camera_for(*SIZE)
     info = SimpleNamespace(

@@ -9,7 +9,7 @@ import pytest
 from starpos.frames.frame import no_stars
 from starpos.session.driver import JobsInTurn, Now
 from starpos.session.gnss import GNSS_TOPIC, GnssTeacher
-from starpos.session.parameter_file import settings_of
+from starpos.session.settings import Settings
 
 START_S = 1_790_000_000
 NORTH_3_KM = 0.027
@@ -33,7 +33,7 @@ class Account:
 def teacher():
     account = Account()
     log = SimpleNamespace(info=print, warning=print, error=print)
-    made = GnssTeacher(settings_of(None, ("gnss.use:=true",)), JobsInTurn(print), account, log)
+    made = GnssTeacher(Settings.of(None, ("gnss.use:=true",)), JobsInTurn(print), account, log)
     made.account = account
     return made
 
@@ -87,7 +87,7 @@ def test_two_receivers_on_one_topic_are_compared_with_nothing(teacher):
         teacher.take(fix(float(k), latitude=47.0 + NORTH_3_KM * (k % 2)), now(float(k)))
     stars = no_stars(100, 100, mid_unix_s=START_S + 2.5)
     rough = SimpleNamespace(fix=None, tilt=None, at_place=None, message="")
-    solver = SimpleNamespace(instrument=settings_of(None, ()).instrument(None))
+    solver = SimpleNamespace(instrument=Settings.of().instrument(None))
     answer = teacher.solved(solver, stars, rough)
     assert answer.compared is None and "one receiver publishes, not two" in teacher.account.refused[-1]
     assert teacher.learned is None

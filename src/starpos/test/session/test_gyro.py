@@ -201,7 +201,7 @@ def test_a_gyro_that_contradicts_the_stars_is_told(said, first, solver, kind):
 def few(stars, rng):
     """Four of a frame's brightest stars under four false ones that are brighter."""
     rows = np.sort(rng.choice(12, 4, replace=False))
-    return with_false_stars(stars.take(rows), rng.uniform(20, np.array(SIZE) - 20, (4, 2)))
+    return with_false_stars(stars.select(rows), rng.uniform(20, np.array(SIZE) - 20, (4, 2)))
 
 
 @pytest.mark.montecarlo

@@ -18,9 +18,9 @@ from starpos.recording.topics import CAMERA_INFO, INPUTS, STARS, TILT, instrumen
 from starpos.session import reports
 from starpos.session.driver import JobsInTurn, Level, Now, Sent
 from starpos.session.frames import Answered
-from starpos.session.parameter_file import settings_of
 from starpos.session.replay import Replay
 from starpos.session.session import SolverSession
+from starpos.session.settings import Settings
 
 NIGHT = Path(__file__).resolve().parents[4] / "test" / "data" / "night"
 if not NIGHT.is_dir():
@@ -61,7 +61,7 @@ class Told:
     def __init__(self, *parameters):
         self.said, self.jobs = Said(), []
         self.session = SolverSession(
-            settings_of(None, (*KNOWN, *parameters)), self._new, self.said, self.said
+            Settings.of(None, (*KNOWN, *parameters)), self._new, self.said, self.said
         )
 
     def _new(self):
@@ -253,7 +253,7 @@ def test_a_replay_twice_is_the_same():
     def played():
         said = Said()
         return [
-            repr(replace(m, stamp=None)) for m in Replay(settings_of(None, KNOWN), said, said).play(NIGHT)
+            repr(replace(m, stamp=None)) for m in Replay(Settings.of(None, KNOWN), said, said).play(NIGHT)
         ]
 
     first = played()
@@ -323,7 +323,7 @@ def test_a_site_that_the_stars_contradict_gives_a_sentence_and_no_heading(messag
 
 
 def test_half_a_site_is_refused():
-    settings = settings_of(None, KNOWN)
+    settings = Settings.of(None, KNOWN)
     said = settings.check(settings.values | {"site.latitude": 46.0}, frozenset({"site.latitude"}), None)
     assert "belong together" in said
 

@@ -1,10 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """The adjustment of a zenith camera's session: its value, and the truth of its covariance."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from sessions import INSTRUMENT, MARK, VACUUM, drawn
 
+from starpos import rotation
 from starpos.earth.ellipsoid import enu_axes
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import FixError
@@ -60,9 +63,9 @@ def test_eta_is_the_difference_of_longitudes_where_meridians_converge():
     latitude, (xi, eta) = np.radians(80.0), np.array([20.0, 25.0]) * ARCSEC
     up, place = enu_axes(latitude + xi, eta / np.cos(latitude))[2], enu_axes(latitude, 0.0)
     east, north, height = place @ up
-    lean = LeanEstimate(lean=np.array([east, north]) / height, a3=np.eye(3))
+    lean = LeanEstimate(lean=np.array([north, east]) / height, a3=np.eye(3))
     assert lean.deflection(latitude) / ARCSEC == pytest.approx([20.0, 25.0], abs=1e-6)
-    assert abs(lean.lean[0] - eta) / ARCSEC > 0.01
+    assert abs(lean.lean[1] - eta) / ARCSEC > 0.01
 
 
 def test_layers_of_air_lie_along_the_plumb_line(rng):
@@ -78,6 +81,32 @@ def test_daily_terms_of_the_pole_and_of_ut1_are_in_the_covariance(rng):
     terms = {name: (xi, eta) for name, xi, eta in drawn(rng, frames=2).adjusted().terms}
     assert terms["pole"] == pytest.approx([3e-4, 3e-4 * np.sin(MARK.latitude)], rel=0.05)
     assert terms["ut1"][1] == pytest.approx(15.041 * 3e-5 * np.cos(MARK.latitude), rel=0.1)
+
+
+NO_SESSION = {
+    "two faces close to each other": lambda rng: drawn(rng, azimuths=(0, 20), frames=4).sightings,
+    "attitudes that scatter by degrees": lambda rng: [
+        scattered(rng, s) for s in drawn(rng, frames=3).sightings
+    ],
+    "readings that state no noise": lambda rng: [silent(s) for s in drawn(rng, frames=3).sightings],
+}
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("kind", NO_SESSION)
+def test_equations_that_do_not_settle_are_an_error_and_no_value(kind, seed):
+    sightings = NO_SESSION[kind](np.random.default_rng(seed))
+    with pytest.raises(FixError, match=r"do not come round|does not settle|no solution"):
+        adjusted(sightings, INSTRUMENT, VACUUM, MARK)
+
+
+def scattered(rng, sighting):
+    turn = rotation.from_vector(rng.normal(0, 0.1, 3))
+    return replace(sighting, enu_to_camera=turn @ sighting.enu_to_camera)
+
+
+def silent(sighting):
+    return replace(sighting, tilt=replace(sighting.tilt, covariance=np.zeros((2, 2))))
 
 
 def test_two_frames_are_no_session(rng):

@@ -8,10 +8,9 @@ import pytest
 from sessions import INSTRUMENT, MARK, SCALE, VACUUM, Drawn, drawn, shifted
 
 from starpos.errors import FixError
-from starpos.night.work import DeflectionSession
 from starpos.units import ARCSEC
 from starpos.zenith import doubts
-from starpos.zenith.doubts import remarks
+from starpos.zenith.doubts import DeflectionSession, remarks
 
 
 def session(sightings):

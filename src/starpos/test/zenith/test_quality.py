@@ -8,10 +8,9 @@ import pytest
 from sessions import INSTRUMENT, MARK, SCALE, VACUUM, drawn, shifted
 
 from starpos import rotation
-from starpos.night.work import DeflectionSession
 from starpos.units import ARCSEC
 from starpos.zenith.adjustment import adjusted
-from starpos.zenith.doubts import remarks
+from starpos.zenith.doubts import DeflectionSession, remarks
 
 
 def adjust(sightings):

@@ -6,8 +6,7 @@ import pytest
 from sessions import AS_STATED, INSTRUMENT, MARK, SCALE, VACUUM, Worse, drawn
 
 from starpos.errors import FixError
-from starpos.night.work import DeflectionSession
-from starpos.zenith.doubts import remarks
+from starpos.zenith.doubts import DeflectionSession, remarks
 
 SESSIONS = 30
 NOISE, DRIFT, LOOSE = Worse(noise=3), Worse(drift=5), Worse(scale=10)

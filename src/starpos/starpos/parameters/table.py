@@ -1,15 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A parameter of a node: its name, default, meaning, unit and constraint; a table of them is what a node takes."""
+"""The parameters that a node takes: name, default, meaning, unit and constraint of each, read from data/NODE.yaml."""
 
 import math
 import reprlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import KW_ONLY, dataclass
+from functools import cache
+from importlib import resources
 from typing import Any
 
 from starpos.errors import StarposError
 from starpos.files import LONGEST_PATH
 
+NODES = ("camera", "detector", "inclinometer", "solver", "navigator", "dashboard")
 # Characters of a text, as of a path. Nothing else limits what a caller may send.
 LONGEST = LONGEST_PATH
 SHOWN = reprlib.Repr()
@@ -32,11 +35,16 @@ FRAME_NAME = Form(
     "a frame's name, not empty, without blanks, control characters or a leading /",
     lambda text: text.isprintable() and " " not in text and text[:1] not in ("", "/"),
 )
+# An empty address would silently mean every network of this machine.
+ADDRESS = Form(
+    "an address of this machine, such as 127.0.0.1, without blanks", lambda text: text.split() == [text]
+)
+FORMS = {"frame_name": FRAME_NAME, "address": ADDRESS}
 
 
 @dataclass(frozen=True)
 class Parameter:
-    """One parameter of a node.
+    """One parameter of a node: a row of its file, whose keys are these names.
 
     default      bool, int, float, str, or a tuple of one of these; it fixes the type, and the length of a tuple.
                  With a NaN default the parameter may be NaN, which means unset. Otherwise NaN is refused; infinity
@@ -45,7 +53,7 @@ class Parameter:
     unit         '' for a bare number or a text
     minimum, maximum   inclusive bounds of a number (of each number of a tuple); None: unbounded
     choices      the allowed values; () for any
-    form         the rule for a text; None for any of up to LONGEST characters
+    form         the rule for a text, in a file its name in FORMS; None for any of up to LONGEST characters
     read_only    cannot be changed while the node runs
     """
 
@@ -91,6 +99,13 @@ class Parameter:
             text = f"{len(self.default)} values, each {text}"
         return text + (", or nan for unset" if self.may_be_nan else "")
 
+    @property
+    def rule(self) -> str:
+        """The constraint, and whether the parameter is fixed, as a sentence."""
+        return (
+            f"{self.name} must be {self.constraint}{'; fixed while the node runs' if self.read_only else ''}."
+        )
+
     def convert(self, value: Any) -> Any:
         """Convert a value to this parameter's type (a whole number becomes a float where the default is one).
 
@@ -134,3 +149,67 @@ class Parameter:
 def _is_large(value: Any) -> bool:
     """Whether a text or an array is longer than any parameter's."""
     return hasattr(value, "__len__") and len(value) > LONGEST
+
+
+@cache
+def parameters_of(node: str) -> tuple[Parameter, ...]:
+    """The parameters of a node, in the order of its file.
+
+    A row that is the name of another node stands for the row of the same name there.
+    """
+    import yaml
+
+    # PyYAML's parser in C takes a tenth of the time; a build without it is rare
+    loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+    text = resources.files(__package__).joinpath("data", f"{node}.yaml").read_bytes()
+    return tuple(_parameter(name, row) for name, row in yaml.load(text, loader).items())
+
+
+def defaults_of(node: str) -> dict[str, Any]:
+    """The default values of a node's parameters, by name."""
+    return {p.name: p.default for p in parameters_of(node)}
+
+
+def _parameter(name: str, row: Any) -> Parameter:
+    if isinstance(row, str):
+        return next(p for p in parameters_of(row) if p.name == name)
+    made = dict(row)
+    if isinstance(made["default"], list):
+        made["default"] = tuple(made["default"])
+    if "form" in made:
+        made["form"] = FORMS[made["form"]]
+    return Parameter(name, **made | {"choices": tuple(made.get("choices", ()))})
+
+
+def parameter_file() -> str:
+    """ROS's parameter file of all nodes: every parameter at its default, below its meaning, unit and constraint."""
+    # REUSE-IgnoreStart
+    lines = ["# SPDX-License-Identifier: Apache-2.0"]
+    # REUSE-IgnoreEnd
+    lines.append("# All parameters at their defaults; keep what you change. Written by tools/reference.py.")
+    for node in NODES:
+        lines += ["", f"/**/{node}:", "  ros__parameters:"]
+        lines += [line for p in parameters_of(node) for line in _lines(p)]
+    return "\n".join(lines) + "\n"
+
+
+def _lines(p: Parameter) -> Iterator[str]:
+    yield f"    # {p.description}"
+    yield f"    # {p.rule}"
+    yield f"    {p.name}: {yaml_value(p.default)}"
+
+
+def yaml_value(value: Any) -> str:
+    """Write the value of a parameter as YAML that rcl reads."""
+    if isinstance(value, tuple):
+        return "[" + ", ".join(map(yaml_value, value)) + "]"
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, str):
+        return '"' + value.replace("\\", "\\\\").replace('"', '\\"') + '"'
+    if isinstance(value, float):
+        if math.isnan(value):
+            return ".nan"
+        # rcl's YAML parser reads 1e5, which has no point, as a text.
+        return repr(value) if "e" not in repr(value) else f"{value:.17f}".rstrip("0")
+    return str(value)

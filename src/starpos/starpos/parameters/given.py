@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The nodes' parameters from ROS's parameter files and NAME:=VALUE, without ROS."""
+"""Values of the nodes' parameters from ROS's parameter files and NAME:=VALUE, without ROS."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from difflib import get_close_matches
@@ -8,82 +8,42 @@ from typing import Any
 
 from starpos.errors import InstrumentError
 from starpos.instrument import yaml_file
-from starpos.night.drivers import Drivers
-from starpos.recording.topics import NO_REMAPS, Remaps
-from starpos.session import detector_parameters, inclinometer_parameters
-from starpos.session.parameter import Parameter
-from starpos.session.settings import PARAMETERS, Settings
+from starpos.parameters.table import parameters_of
 
-SOLVER, DETECTOR, INCLINOMETER = "solver", "detector", "inclinometer"
-NODES = (SOLVER, DETECTOR, INCLINOMETER)
-# similarity to a parameter's name from which an unknown name counts as misspelt
-MISSPELT = 0.85
+# the nodes whose work is done without ROS; a text without a node is the first one's
+NODES = ("solver", "detector", "inclinometer")
+SOLVER = NODES[0]
 WILDCARDS = ("*", "**")
 
 
-def settings_of(file: Path | None, given: Sequence[str], namespace: str | None = None) -> Settings:
-    """The Settings of a parameter file (None: no file) and of texts NAME:=VALUE, which override it, as the node has them.
+def values_of(
+    node: str, file: Path | None, given: Sequence[str], namespace: str | None = None
+) -> dict[str, Any]:
+    """The values of a node's parameters by name, as the node would have them.
 
-    namespace: the solver's; None: any, if the file is of one instrument.
+    file: a parameter file, None for none.  given: texts [NODE:]NAME:=VALUE, which override it.
+    namespace: the instrument's; None: any, if the file is of one instrument.
     Raises ParameterError if a value is not allowed, InstrumentError if something cannot be read, or is no parameter.
     """
-    values = _values(SOLVER, PARAMETERS, file, given, namespace)
-    settings = Settings(values)
-    if trouble := settings.check(values, frozenset(values), None):
-        raise InstrumentError(trouble)
-    settings.adopt()
-    return settings
-
-
-def drivers_of(
-    file: Path | None, given: Sequence[str], namespace: str | None = None, remaps: Remaps = NO_REMAPS
-) -> Drivers:
-    """The parameters of detector and inclinometer, read like the solver's; texts NODE:NAME:=VALUE are theirs."""
-    detector = _values(DETECTOR, detector_parameters.PARAMETERS, file, given, namespace)
-    of_imu = (*inclinometer_parameters.SHARED, *inclinometer_parameters.IMU)
-    return Drivers(
-        detector,
-        detector_parameters.detection_settings(detector),
-        _values(INCLINOMETER, of_imu, file, given, namespace),
-        remaps,
-    )
+    known = {p.name: p for p in parameters_of(node)}
+    values: dict[str, Any] = {p.name: p.default for p in known.values()}
+    stated = [] if file is None else list(_in_file(file, node, namespace))
+    stated += [(name, value) for whose, name, value in map(_assigned, given) if whose == node]
+    for name, value in stated:
+        # these are of every node
+        if name.startswith("qos_overrides.") or name == "use_sim_time":
+            continue
+        if name not in known:
+            near = get_close_matches(name, known, 1)
+            meant = f"did you mean {near[0]}?" if near else f"they are {', '.join(known)}"
+            raise InstrumentError(f"there is no parameter {name}: {meant}")
+        values[name] = known[name].convert(value)
+    return values
 
 
 def of_solver(given: Sequence[str]) -> list[str]:
     """Select from the texts [NODE:]NAME:=VALUE the solver's own; raises InstrumentError for any other text."""
     return [text for text in given if _assigned(text)[0] == SOLVER]
-
-
-def _values(
-    node: str, table: Sequence[Parameter], file: Path | None, given: Sequence[str], namespace: str | None
-) -> dict[str, Any]:
-    """The values of a node's parameters by name."""
-    known = {p.name: p for p in table}
-    values: dict[str, Any] = {p.name: p.default for p in table}
-    for name, value in () if file is None else _in_file(file, node, namespace):
-        if name in known:
-            values[name] = known[name].convert(value)
-        # qos_overrides, use_sim_time: they are of the node
-        elif not name.startswith("qos_overrides.") and name != "use_sim_time":
-            _check_unknown(name, known, node == SOLVER)
-    for text in given:
-        whose, name, value = _assigned(text)
-        if whose == node and name != "use_sim_time":
-            if name not in known:
-                _check_unknown(name, known, refused=True)
-            values[name] = known[name].convert(value)
-    return values
-
-
-def _check_unknown(name: str, known: Mapping[str, Parameter], refused: bool) -> None:
-    """Raise InstrumentError for a name that is refused, or that is a misspelt one.
-
-    The node `inclinometer` has parameters that no bag needs.
-    """
-    near = get_close_matches(name, known, 1, 0.6 if refused else MISSPELT)
-    if refused or near:
-        meant = f"did you mean {near[0]}?" if near else f"they are {', '.join(known)}"
-        raise InstrumentError(f"there is no parameter {name}: {meant}")
 
 
 def _assigned(text: str) -> tuple[str, str, Any]:

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """A robot's own messages as its instrument's: stars detected in its images, tilts made of its accelerations."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -12,26 +13,32 @@ from starpos.frames.frame import Stars
 from starpos.messages.camera import ExposureFacts, check_stamp, message_to_frame, message_to_picture
 from starpos.messages.stamp import PlainHeader, PlainStamp, stamp_to_unix
 from starpos.messages.tilt import ImuTilts, TiltMessage
+from starpos.parameters.given import values_of
 from starpos.recording.topics import IMAGE, NO_REMAPS, PICTURE, Remaps
 from starpos.units import utc_text
-
-if TYPE_CHECKING:
-    from starpos.detection import DetectionSettings
 
 IMAGES = (IMAGE, PICTURE)
 
 
 @dataclass(frozen=True)
 class Drivers:
-    """How a robot's messages are used: parameters of detector and inclinometer by name, and the topics.
-
-    settings: the detector's parameters as the detection takes them.
-    """
+    """How a robot's messages are used: parameters of detector and inclinometer by name, and the topics."""
 
     detector: Mapping[str, Any]
-    settings: "DetectionSettings"
     inclinometer: Mapping[str, Any]
     remaps: Remaps = NO_REMAPS
+
+    @classmethod
+    def of(
+        cls,
+        file: Path | None = None,
+        given: Sequence[str] = (),
+        namespace: str | None = None,
+        remaps: Remaps = NO_REMAPS,
+    ) -> "Drivers":
+        """Read them from a parameter file and texts NODE:NAME:=VALUE; errors as `values_of` raises them."""
+        detector, inclinometer = (values_of(n, file, given, namespace) for n in ("detector", "inclinometer"))
+        return cls(detector, inclinometer, remaps)
 
     def begin(self) -> "DriverMessages":
         """A DriverMessages for one bag."""
@@ -53,14 +60,16 @@ class DriverMessages:
 
     def stars_of(self, kind: str, message: Any) -> tuple[Stars, PlainHeader]:
         """The stars of an image of this type and the header of their message; raises StarposError without any."""
-        from starpos.detection import detect
+        from starpos.detection import DetectionSettings, detect
 
         self._frames += 1
         check_stamp(message.header)
         mid_ns, add = self._exposures.of(message.header)
         frame = add(message_to_frame(message) if kind == IMAGE else message_to_picture(message))
         header = PlainHeader(PlainStamp.of_ns(mid_ns), message.header.frame_id)
-        return _as_sent(detect(frame, self._drivers.settings).stars, header), header
+        return _as_sent(
+            detect(frame, DetectionSettings.by_parameters(self._drivers.detector)).stars, header
+        ), header
 
     def tilt_of(self, message: Any, now_s: float) -> TiltMessage | None:
         """The tilt that an IMU's message completes; now_s: when it was recorded."""
@@ -72,7 +81,7 @@ class DriverMessages:
 
     def remarks(self) -> list[str]:
         """Sentences on missing parameters, and on accelerations that gave no tilt."""
-        said = [self._exposures.unsaid] if self._frames else []
+        said = [self._exposures.missing_statement] if self._frames else []
         imu = self._imu
         heard = imu.good + imu.malformed + imu.future
         if heard and not self._tilts:

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from starpos.fix import searching
-from starpos.fix.searching import Sight, of_one_camera, without_hint
+from starpos.fix.searching import Question, Sight, answer_by_header, of_one_camera
 from starpos.fix.solution import Attitude, Solution, Status
 from starpos.fix.solver import Solver
-from starpos.frames.header import about
-from starpos.instrument.camera import EQUIDISTANT, Camera
+from starpos.frames.header import read_exposure
+from starpos.instrument.camera import EQUIDISTANT, PLUMB_BOB, Camera
 from starpos.instrument.instrument import Instrument
 from starpos.night.reading import Given
 from starpos.night.work import Identifying
@@ -31,7 +31,7 @@ def seen(catalogue, rng):
     camera = Camera.from_focal(*SIZE, FOCAL_PX)
 
     def stars(header):
-        return stars_of_cygnus(catalogue, rng, camera, 9.0, 0.05, **about(header, "frame.fits"))
+        return stars_of_cygnus(catalogue, rng, camera, 9.0, 0.05, **read_exposure(header, "frame.fits").facts)
 
     return stars
 
@@ -93,10 +93,12 @@ def test_turning_takes_the_focal_length_that_fits(seen):
 
 @pytest.fixture
 def lost(seen):
-    """Stars whose header is wrong, the solver by that header, and the sight that it gives."""
-    stars = seen(RIGHT | {"XPIXSZ": 3.2})
-    solver = _solver(187500.0)
-    return stars, solver, Identifying(Given(solver.instrument))(stars)[0]
+    """Stars whose header is wrong, and the solver by that header."""
+    return seen(RIGHT | {"XPIXSZ": 3.2}), _solver(187500.0)
+
+
+def asked(stars, solver):
+    return answer_by_header(solver, Question(item=stars, stars=stars), quiet)
 
 
 def never(*_):
@@ -105,14 +107,19 @@ def never(*_):
 
 def test_a_frame_that_nothing_fits_keeps_its_sentence(lost, rng):
     """Random points are searched within the time that a frame has, and reported by the first sentence."""
-    stars, solver, sight = lost
-    points = replace(stars.take(np.arange(6)), x=rng.uniform(0, SIZE[0], 6), y=rng.uniform(0, SIZE[1], 6))
-    assert without_hint(solver, points, points, sight, never, quiet) is sight
+    stars, solver = lost
+    points = replace(stars.select(np.arange(6)), x=rng.uniform(0, SIZE[0], 6), y=rng.uniform(0, SIZE[1], 6))
+    sight = asked(points, solver)
+    assert sight.solution.status is Status.NOT_IDENTIFIED and sight.instrument is None
+    assert sight.solution.message == solver.identify(points).message
 
 
 def test_a_focal_length_near_the_headers_needs_no_search_at_every_scale(catalogue, rng, monkeypatch):
     monkeypatch.setattr(searching, "identify_blind_every_way", never)
-    wide, header = Camera.from_focal(1000, 700, 5000.0), about({"FOCALLEN": 34, "XPIXSZ": 6.4}, "frame.fits")
+    wide, header = (
+        Camera.from_focal(1000, 700, 5000.0),
+        read_exposure({"FOCALLEN": 34, "XPIXSZ": 6.4}, "frame.fits").facts,
+    )
     sight, _ = Identifying(Given(None, by_header=True))(
         stars_of_cygnus(catalogue, rng, wide, 6.5, 0.05, **header)
     )
@@ -120,7 +127,7 @@ def test_a_focal_length_near_the_headers_needs_no_search_at_every_scale(catalogu
 
 
 def test_a_scale_and_a_lens_that_then_identify_nothing_are_not_told(lost, monkeypatch):
-    stars, solver, sight = lost
+    stars, solver = lost
     searched, tried = [], []
 
     def blind(solver, *_):
@@ -129,13 +136,15 @@ def test_a_scale_and_a_lens_that_then_identify_nothing_are_not_told(lost, monkey
                              mirrored=False, model=EQUIDISTANT)  # fmt: skip
         return Sight(stars, Solution.of(stars, attitude=a_fisheye))
 
-    def again(solver):
+    def identify(solver, question):
         tried.append((solver.instrument.focal_px, solver.instrument.model))
         return sight
 
+    sight = Sight(stars, solver.identify(stars))
+    monkeypatch.setattr(searching, "answer_frame", identify)
     monkeypatch.setattr(searching, "identify_blind_every_way", blind)
-    assert without_hint(solver, stars, stars, sight, again, quiet) is sight
-    assert (searched, tried) == ([searching.HINT_SEARCH_S], [(900.0, EQUIDISTANT)])
+    assert asked(stars, solver) is sight
+    assert (searched, tried) == ([searching.HINT_SEARCH_S], [(187500.0, PLUMB_BOB), (900.0, EQUIDISTANT)])
 
 
 @pytest.mark.parametrize(
@@ -147,11 +156,9 @@ def test_a_scale_and_a_lens_that_then_identify_nothing_are_not_told(lost, monkey
 )
 def test_what_no_focal_length_can_help_is_not_searched(instrument, status, seen, monkeypatch):
     monkeypatch.setattr(searching, "focal_that_fits", never)
-    stars = seen(RIGHT).take(np.arange(3))
+    stars = seen(RIGHT).select(np.arange(3))
     solver = replace(_solver(187500.0), instrument=instrument)
-    sight = Identifying(Given(instrument))(stars)[0]
-    assert sight.solution.status is status
-    assert without_hint(solver, stars, stars, sight, never, quiet) is sight
+    assert asked(stars, solver).solution.status is status
 
 
 def _solver(focal_px):

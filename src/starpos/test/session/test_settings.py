@@ -12,8 +12,8 @@ from starpos.instrument import sensors
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import InclinometerErrors
 from starpos.instrument.instrument import Calibration, Instrument
+from starpos.parameters.table import defaults_of, parameters_of
 from starpos.session.settings import (
-    PARAMETERS,
     atmosphere_of,
     check_camera,
     geoid_file,
@@ -26,7 +26,7 @@ CAMERA = Camera.from_focal(100, 80, 1000.0)
 
 
 def values(**changes):
-    return {p.name: p.default for p in PARAMETERS} | {k.replace("__", "."): v for k, v in changes.items()}
+    return defaults_of("solver") | {k.replace("__", "."): v for k, v in changes.items()}
 
 
 def test_unset_air_widens_the_refraction_and_measured_air_does_not():
@@ -106,7 +106,7 @@ def test_a_broken_instrument_file_is_refused_with_its_path(tmp_path):
 
 
 def test_the_altitude_says_which_one_it_is():
-    [altitude] = (p for p in PARAMETERS if p.name == "altitude")
+    [altitude] = (p for p in parameters_of("solver") if p.name == "altitude")
     assert "above the WGS 84 ellipsoid" in altitude.description
 
 
