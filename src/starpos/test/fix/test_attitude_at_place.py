@@ -252,8 +252,10 @@ class TestOfAFrame:
         answer = placed(solver, stars, solver.identify(stars), where)
         link = answer.at_place.plumb
         assert answer.ok and answer.fix is None and "heading" in answer.message
-        assert abs(rotation.half_turn(link.heading - scene.heading)) < 4 * math.sqrt(link.covariance[0, 0])
-        assert math.sqrt(link.covariance[0, 0]) < 3 * ARCSEC
+        assert abs(rotation.half_turn(link.heading - scene.heading)) < 4 * math.sqrt(
+            link.angles_covariance[0, 0]
+        )
+        assert math.sqrt(link.angles_covariance[0, 0]) < 3 * ARCSEC
 
     def test_with_a_tilt_the_place_stays_the_stars_own(self, night):
         scene, stars, tilt, solver = night
