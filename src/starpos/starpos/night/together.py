@@ -22,6 +22,7 @@ from starpos.averaging.altitudes import (
 from starpos.averaging.average import Average, average
 from starpos.calibration.misalignment import Calibrated, turn
 from starpos.earth.orientation import EarthState
+from starpos.earth.place import Place
 from starpos.earth.vertical import Vertical
 from starpos.errors import FixError, GnssError, StarposError
 from starpos.fix.fix import IDEAL, Fix
@@ -30,7 +31,7 @@ from starpos.fix.solution import Solution, Status
 from starpos.fix.solver import Solver
 from starpos.frames.frame import Stars
 from starpos.frames.tables import Pointing
-from starpos.gnss.receiver import GnssPlace, GnssTrack, known_place
+from starpos.gnss.receiver import GnssTrack
 from starpos.gnss.solving import Watched, watched
 from starpos.gnss.states import Learned
 from starpos.gnss.watch import GnssWatch
@@ -272,7 +273,7 @@ def watched_night(
     watch = GnssWatch(solver.instrument, vertical, receiver.learned)
     said: Counter[str] = Counter()
 
-    def place_at(stars: Stars) -> GnssPlace | None:
+    def place_at(stars: Stars) -> Place | None:
         if stars.mid_unix_s is None:
             return None
         try:
@@ -285,7 +286,7 @@ def watched_night(
     for k in sorted(range(len(frames)), key=lambda k: frames[k][0].mid_unix_s or 0.0):
         stars, found = frames[k]
         gnss = place_at(stars)
-        place = None if gnss is None else known_place(gnss, vertical)
+        place = None if gnss is None else gnss.deflected(vertical)
         question = Question(item=stars, stars=stars, tilts=tilts, places=place, known=found)
         rough = answer_frame(solver, question).solution
         answers[k] = watched(solver, stars, rough, gnss, watch)
