@@ -306,11 +306,11 @@ def identify_fisheye(
             if found is None or (best is not None and found.log_odds <= best[1].log_odds):
                 continue
             whole = outwards(picture.seen_by(guess.focal_px, guess.lens), sky, guess.part, found)
-            if whole is not None and whole.borne_out:
-                return whole.camera, whole.found
+            if whole is not None and whole[2]:
+                return whole[:2]
             # off the middle, a wrong lens would turn the axis elsewhere
             if whole is not None and k == 0:
-                best = whole.camera, whole.found
+                best = whole[:2]
     return best
 
 
