@@ -17,7 +17,7 @@ from starpos.frames.frame import Stars
 from starpos.frames.reading import read_frame
 from starpos.identification import Sky, blind, quads
 from starpos.identification.pose import stars_at
-from starpos.identification.quads import Matches
+from starpos.identification.quads import matches
 from starpos.identification.triangles import no_triangles
 from starpos.instrument.camera import Camera
 from starpos.instrument.instrument import Instrument
@@ -178,11 +178,11 @@ def test_at_any_scale_the_quads_of_a_frame_are_those_of_the_sky(catalogue, rng):
         tried += 1
         field = stars_at(camera, xy, np.full(4, 0.1))
         found = [
-            Matches.of(field, table, 4, 0.4, focal, step)
+            matches(field, table, 4, 0.4, focal, step)
             for focal, step in blind.focal_lengths(half_px, *span)
             if abs(np.log(focal / focal_px)) < 0.3
         ]
-        assert any((m.corner == table.corners[quad]).all(1).any() for m in found), focal_px
+        assert any((corner == table.corners[quad]).all(1).any() for _, corner, _ in found), focal_px
 
 
 def test_the_focal_lengths_that_are_tried_cover_all():
