@@ -9,13 +9,10 @@ Keep the quads of a star catalogue: in memory, and next to the triangles on the 
 Poses of a frame from quads of its brightest stars that look like quads of the sky, those first that most agree on.
 """
 
-import hashlib
-import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import combinations
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -30,7 +27,7 @@ from starpos.identification.sky import Sky
 from starpos.identification.triangles import circle_count, spread_points
 from starpos.progress import Progress, quiet
 from starpos.sky.catalogue import Catalogue
-from starpos.table_cache import cache_folder, load_or_build, mapped, rising
+from starpos.table_cache import KeptTables, digest_of, rising
 
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
@@ -67,6 +64,19 @@ class QuadCatalogue:
     shape: np.ndarray
     log_size: np.ndarray
     bin_start: np.ndarray
+
+    def check(self, catalogue_stars: int) -> None:
+        """Raise ValueError for columns that do not match each other or the stars: compiled loops trust them."""
+        count = len(self.corners)
+        if not (
+            self.corners.shape == (count, 4)
+            and self.shape.shape == (count, 5)
+            and self.log_size.shape == (count,)
+            and self.bin_start.shape == (BINS**4 * SIZE_BINS + 1,)
+            and rising(self.bin_start, count)
+            and (count == 0 or 0 <= self.corners.min() <= self.corners.max() < catalogue_stars)
+        ):
+            raise ValueError("the quads are not sorted, or not of the catalogue's stars")
 
     def near(
         self, shape: np.ndarray, tolerance: np.ndarray, log_size: np.ndarray, log_tolerance: float
@@ -190,60 +200,34 @@ def _key(bins: np.ndarray) -> np.ndarray:
     return (((a * BINS + b) * BINS + c) * BINS + d) * SIZE_BINS
 
 
-# Cache folder; the number is the format version.
-PREFIX = "quads-1-"
-
-_lock = threading.Lock()
-_in_use: dict[str, QuadCatalogue] = {}
+# The number of the folder's name is the format version.
+KEPT = KeptTables(QuadCatalogue, "quads-1-", "iufi", "star quads")
 
 
 def is_built(catalogue: Catalogue) -> bool:
     """Whether `cached_quads` need not build."""
-    return _digest(catalogue) in _in_use or _folder(catalogue).is_dir()
+    return KEPT.folder(_name(catalogue)).is_dir()
 
 
 def cached_quads(catalogue: Catalogue, progress: Progress = quiet) -> QuadCatalogue:
     """The QuadCatalogue of a star catalogue, memory-mapped from the cache (180 MB); built, in about 20 s, if missing."""
-    digest = _digest(catalogue)
-    with _lock:
-        if digest not in _in_use:
-            _in_use.clear()
-            folder = _folder(catalogue)
-            _in_use[digest] = load_or_build(
-                folder,
-                PREFIX,
-                lambda: _map(folder, len(catalogue)),
-                lambda: build(catalogue, progress),
-                "star quads",
-            )
-        return _in_use[digest]
+    return KEPT.built(_name(catalogue), lambda: build(catalogue, progress), len(catalogue))
 
 
-def _digest(catalogue: Catalogue) -> str:
-    settings = repr((catalogue.fingerprint, LEVELS, SPACING, STARS_PER_CIRCLE, MIN_SIDE,
-                     SHORTEST, BINS, SIZE_BINS, SIZES_RAD))  # fmt: skip
-    return hashlib.sha256(settings.encode()).hexdigest()[:16]
-
-
-def _folder(catalogue: Catalogue) -> Path:
-    return cache_folder() / f"{PREFIX}{_digest(catalogue)}"
-
-
-def _map(folder: Path, catalogue_stars: int) -> QuadCatalogue | None:
-    """The stored quads; None if they are missing or their columns do not fit together."""
-    q = mapped(QuadCatalogue, folder, "iufi")
-    if q is None:
-        return None
-    count = len(q.corners)
-    fit = (
-        q.corners.shape == (count, 4)
-        and q.shape.shape == (count, 5)
-        and q.log_size.shape == (count,)
-        and q.bin_start.shape == (BINS**4 * SIZE_BINS + 1,)
-        and rising(q.bin_start, count)
-        and (count == 0 or 0 <= q.corners.min() <= q.corners.max() < catalogue_stars)
+def _name(catalogue: Catalogue) -> str:
+    return digest_of(
+        (
+            catalogue.fingerprint,
+            LEVELS,
+            SPACING,
+            STARS_PER_CIRCLE,
+            MIN_SIDE,
+            SHORTEST,
+            BINS,
+            SIZE_BINS,
+            SIZES_RAD,
+        )
     )
-    return q if fit else None
 
 
 # Sides of quads over the longest may be off by this besides the errors of the stars: lenses bend.

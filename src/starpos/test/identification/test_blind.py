@@ -221,13 +221,13 @@ def test_a_shape_is_that_of_the_quad_turned_scaled_and_mirrored(rng):
 def test_a_damaged_cache_is_built_again(catalogue, tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setattr(quads, "LEVELS", ((19.4, 6), (29.0, 6)))
-    monkeypatch.setattr(quads, "_in_use", {})
+    quads.KEPT.forget()
     # a copy, because the file below it is damaged
     first = quads.cached_quads(catalogue).shape.copy()
     assert quads.is_built(catalogue) and len(first) > 100
     (folder,) = (tmp_path / "starpos").glob("quads-*")
     (folder / "shape.npy").write_bytes(b"no")
-    quads._in_use.clear()
+    quads.KEPT.forget()
     assert np.array_equal(quads.cached_quads(catalogue).shape, first)
     assert (folder / "shape.npy").stat().st_size > 100
 
