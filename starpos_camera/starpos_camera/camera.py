@@ -128,12 +128,11 @@ class CameraNode(Node):
         if lack := self._source.lacking():
             self._say(Level.WARN, lack)
 
-    def destroy_node(self) -> None:
+    def close(self) -> None:
         self._worker.retire()
         # An exposure may last another hour.
         self._source.close()
         self._worker.stop()
-        super().destroy_node()
 
     def hand_to(self, taker: Taker) -> None:
         """Give each frame to a detector in this process too, without a copy, in the executor's thread."""

@@ -253,10 +253,9 @@ class DetectorNode(Node):
         """Forget all Captures: a replay begins."""
         self._exposures = ExposureFacts(self._values)
 
-    def destroy_node(self) -> None:
+    def close(self) -> None:
         self._worker.stop()
         self._annotator.stop()
-        super().destroy_node()
 
     @property
     def wanted(self) -> bool:

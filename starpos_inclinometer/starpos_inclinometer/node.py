@@ -153,9 +153,8 @@ class InclinometerNode(Node):
 
         return on_turn
 
-    def destroy_node(self) -> None:
+    def close(self) -> None:
         self._source.stop()
-        super().destroy_node()
 
     def _apply(self, names: frozenset[str]) -> None:
         self._source.configure(self._values)

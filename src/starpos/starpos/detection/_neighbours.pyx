@@ -2,7 +2,6 @@
 # cython: language_level=3, boundscheck=False, wraparound=False, cdivision=True, initializedcheck=False
 """Which of many points are near each other."""
 
-from libc.math cimport INFINITY, sqrt
 from libc.stdlib cimport free, malloc, realloc
 
 import numpy as np
@@ -109,33 +108,3 @@ def any_near(const double[::1] x, const double[::1] y, const double[::1] to_x, c
             found[k] = dx * dx + dy * dy < reach * reach
             low += 1
     return out.view(bool)
-
-
-def nearest_distances(const double[::1] x, const double[::1] y, Py_ssize_t count):
-    """How far each of the first `count` of the points x, y (N,) is from the nearest other one; infinity if it is alone.
-
-    They are numbers.
-    """
-    cdef Py_ssize_t n = x.shape[0], i, j, k, step
-    cdef double dx, dy, least2
-    if y.shape[0] != n or not 0 <= count <= n:
-        raise ValueError(f"{count} of {n} columns and {y.shape[0]} rows of points: as many are needed")
-    out = np.empty(count)
-    cdef double[::1] apart = out
-    cdef const Py_ssize_t[::1] order = np.argsort(y)
-    for i in range(n):
-        k = order[i]
-        if k >= count:
-            continue
-        least2 = INFINITY
-        # upwards, then downwards, until rows are farther than what was found
-        for step in range(-1, 2, 2):
-            j = i + step
-            while 0 <= j < n:
-                dx, dy = x[order[j]] - x[k], y[order[j]] - y[k]
-                if dy * dy >= least2:
-                    break
-                least2 = min(least2, dx * dx + dy * dy)
-                j += step
-        apart[k] = sqrt(least2)
-    return out

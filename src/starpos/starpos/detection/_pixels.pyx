@@ -52,68 +52,37 @@ cdef int _check_sky(
     return 0
 
 
-def mark_dots(
-    const pixel_t[:, ::1] plane, const Py_ssize_t[::1] x, const Py_ssize_t[::1] y, const float[:, ::1] level, double half,
-    double quarter,
-):
-    """Whether peaks (N,) are one or two hot pixels: the others of the nine around each have little of the brightest's light.
-
-    half     share of it that all but the brightest have together
-    quarter  and all but the two brightest
-    """
-    cdef Py_ssize_t n = x.shape[0], k, row, column
-    cdef int phases = level.shape[1], i, j
-    cdef double light, first, second, sum_
-    _check_sky(plane.shape, n, y.shape[0], level.shape, level.shape)
-    out = np.empty(n, np.uint8)
-    cdef unsigned char[::1] dot = out
-    with nogil:
-        for k in range(n):
-            if k + 1 < n:
-                _fetch_rows(plane, x[k + 1], y[k + 1], 1)
-            first = second = -1e300
-            sum_ = 0.0
-            for i in range(-1, 2):
-                row = inside(y[k] + i, plane.shape[0])
-                for j in range(-1, 2):
-                    column = inside(x[k] + j, plane.shape[1])
-                    light = plane[row, column] - level[k, _phase(y[k] + i, x[k] + j, phases)]
-                    sum_ += light
-                    second = max(second, min(light, first))
-                    first = max(first, light)
-            dot[k] = sum_ - first < half * first or sum_ - first - second < quarter * first
-    return out.view(bool)
-
-
-def mark_isolated(
+def sum_squares(
     const pixel_t[:, ::1] plane, const Py_ssize_t[::1] x, const Py_ssize_t[::1] y, const float[:, ::1] level,
-    const float[:, ::1] noise, int reach, double share, double sigmas,
+    const float[:, ::1] noise, int reach,
 ):
-    """Whether the squares of (2 reach + 1) px around peaks (N,) have almost no light beside their brightest pixel's.
+    """The light of the squares of (2 reach + 1) px around peaks: (4, N).
 
-    That is less than this share of it and than so many sigma of the sky's noise.
+    Rows are the sum, the light of the brightest pixel and of the second, and 1 sigma of the sum in the sky's noise.
     """
     cdef Py_ssize_t n = x.shape[0], k, row, column
     cdef int phases = level.shape[1], i, j, phase
-    cdef double light, first, sum_, variance
+    cdef double light, first, second, total, variance
     _check_sky(plane.shape, n, y.shape[0], level.shape, noise.shape)
-    out = np.empty(n, np.uint8)
-    cdef unsigned char[::1] alone = out
+    out = np.empty((4, n))
+    cdef double[:, ::1] found = out
     with nogil:
         for k in range(n):
             if k + 1 < n:
                 _fetch_rows(plane, x[k + 1], y[k + 1], reach)
-            first, sum_, variance = -1e300, 0.0, 0.0
+            first = second = -1e300
+            total = variance = 0.0
             for i in range(-reach, reach + 1):
                 row = inside(y[k] + i, plane.shape[0])
                 for j in range(-reach, reach + 1):
                     column, phase = inside(x[k] + j, plane.shape[1]), _phase(y[k] + i, x[k] + j, phases)
                     light = plane[row, column] - level[k, phase]
-                    sum_ += light
+                    total += light
+                    second = max(second, min(light, first))
                     first = max(first, light)
                     variance += <double>noise[k, phase] * noise[k, phase]
-            alone[k] = sum_ - first < min(share * first, sigmas * sqrt(variance))
-    return out.view(bool)
+            found[0, k], found[1, k], found[2, k], found[3, k] = total, first, second, sqrt(variance)
+    return out
 
 
 def measure_rims(

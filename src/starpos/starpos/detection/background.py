@@ -124,21 +124,31 @@ MAX_BLOCKS = 40
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Background:
-    """The sky's level and noise in cells that cover a frame of width x height px evenly.
+class SkyPlane:
+    """A plane of pixels, and the sky's level and noise in cells that cover it evenly.
 
+    plane         (h, w) uint8 or uint16
     level, noise  (P, rows + 2, columns + 2) DN, with one more cell beyond each edge. P is 1, or 4 on a colour mosaic,
                   where each colour sees another sky: the phases (0, 0), (0, 1), (1, 0), (1, 1) of (row, column) modulo 2
     correlation   noise of the smoothed frame, over what independent pixels would give; 1 or more
     streaks       the satellite trails on the frame, as Streaks
+    saturation    DN from which a pixel is saturated
     """
 
+    plane: np.ndarray
     level: np.ndarray
     noise: np.ndarray
-    width: int
-    height: int
     correlation: float = 1.0
     streaks: tuple = ()
+    saturation: float = np.inf
+
+    @property
+    def height(self) -> int:
+        return self.plane.shape[0]
+
+    @property
+    def width(self) -> int:
+        return self.plane.shape[1]
 
     @property
     def is_mosaic(self) -> bool:
@@ -188,8 +198,8 @@ def phase_of(rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
     return (2 * (rows & 1)).astype(np.uint8) + (columns & 1).astype(np.uint8)
 
 
-def measure_background(plane: np.ndarray, cell_px: int = 64, mosaic: bool | None = None) -> Background:
-    """Measure the Background of plane (h, w), h and w >= 2, in cells of about cell_px.
+def measure_sky(plane: np.ndarray, cell_px: int = 64, mosaic: bool | None = None) -> SkyPlane:
+    """Measure the sky of plane (h, w), h and w >= 2, in cells of about cell_px.
 
     mosaic says whether the plane is a colour mosaic; None: it is one if the four phases see different skies.
     """
@@ -206,7 +216,7 @@ def measure_background(plane: np.ndarray, cell_px: int = 64, mosaic: bool | None
     steep = STEEP * np.array([median(e) for e in error.reshape(len(error), -1)])
     level, noise = even_out(level, steep, False), even_out(noise, steep, True)
     noise = np.maximum(noise, max(QUANTISATION, _lost_noise(plane)))
-    return Background(level=level, noise=noise, width=plane.shape[1], height=plane.shape[0])
+    return SkyPlane(plane=plane, level=level, noise=noise)
 
 
 def _beside_lamps(white: np.ndarray, level: np.ndarray, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 from scipy import ndimage, spatial
 
-from starpos.detection._neighbours import group_points, near_pairs, nearest_distances
+from starpos.detection._neighbours import group_points, near_pairs
 from starpos.detection._peaks import find_maxima, smooth_rows
 from starpos.detection._sky import interpolated, median, scores
-from starpos.detection.background import Background
+from starpos.detection.background import SkyPlane
 from starpos.detection.stamps import are_alone, are_dots, surroundings
 from starpos.units import SIGMA_PER_MAD
 
@@ -64,16 +64,14 @@ class Streak:
         return dx * along_x + dy * along_y, dy * along_x - dx * along_y
 
 
-def find_streaks(
-    plane: np.ndarray, background: Background, x: np.ndarray, y: np.ndarray
-) -> tuple[Streak, ...]:
+def find_streaks(sky: SkyPlane, x: np.ndarray, y: np.ndarray) -> tuple[Streak, ...]:
     """The Streaks on which peaks x, y (N,) int px lie. A row of stars without light between them is not a streak."""
     if len(x) < FEWEST:
         return ()
     found: list[Streak] = []
     if not _may_be_a_line(x, y):
         return ()
-    grid = np.zeros((background.height // CELL + 1, background.width // CELL + 1), np.uint8)
+    grid = np.zeros((sky.height // CELL + 1, sky.width // CELL + 1), np.uint8)
     grid[y // CELL, x // CELL] = 255
     lines = cv2.HoughLinesP(grid, 1, np.pi / 360, FEWEST, minLineLength=SHORTEST / CELL, maxLineGap=GAP)
     points, free = np.stack([x, y], 1).astype(float), np.ones(len(x), bool)
@@ -81,7 +79,7 @@ def find_streaks(
         line = _through(points[free], ends)
         if line is None:
             continue
-        streak = _measured(plane, background, *line)
+        streak = _measured(sky, *line)
         if streak is not None:
             found.append(streak)
             free &= streak.at(y, x)[0] == 0
@@ -116,11 +114,9 @@ def _through(points: np.ndarray, ends: np.ndarray) -> tuple[np.ndarray, np.ndarr
     return point, direction
 
 
-def _measured(
-    plane: np.ndarray, background: Background, point: np.ndarray, direction: np.ndarray
-) -> Streak | None:
+def _measured(sky: SkyPlane, point: np.ndarray, direction: np.ndarray) -> Streak | None:
     """The Streak along a line from edge to edge of the frame, or None if there is no light along it."""
-    size = np.array([background.width, background.height])
+    size = np.array([sky.width, sky.height])
     slope = np.where(np.abs(direction) < 1e-9, 1e-9, direction)
     walls = np.stack([-point / slope, (size - 1 - point) / slope])
     first, last = walls.min(0).max(), walls.max(0).min()
@@ -134,8 +130,8 @@ def _measured(
     row = np.rint(start[1] + along * direction[1] + across * direction[0]).astype(int)
     centre = column[:, HALF_WIDTH, BLOCK // 2], row[:, HALF_WIDTH, BLOCK // 2]
     row, column = np.clip(row, 0, size[1] - 1), np.clip(column, 0, size[0] - 1)
-    level, noise = background.of_pixels(*centre, row, column)
-    signal, sigma = plane[row, column] - level, np.median(noise, axis=-1)
+    level, noise = sky.of_pixels(*centre, row, column)
+    signal, sigma = sky.plane[row, column] - level, np.median(noise, axis=-1)
     middle = np.median(signal, axis=-1)
     # residuals of neighbouring pixels along the streak are correlated, so the noise is measured on sums of three
     rest = signal - middle[..., None]
@@ -211,29 +207,27 @@ class Peaks:
     left_out: int = 0
 
 
-def find_peaks(
-    plane: np.ndarray, background: Background, threshold: float, limit: int, threads: int = 1
-) -> Peaks:
-    """Find at most `limit` Peaks that stand out of plane (h, w) by `threshold` sigma.
+def find_peaks(sky: SkyPlane, threshold: float, limit: int, threads: int = 1) -> Peaks:
+    """Find at most `limit` Peaks that stand out of the sky by `threshold` sigma.
 
     A star through a defocused telescope with a central obstruction is a ring, with several peaks close together. If
     most bright peaks have such neighbours, a wider kernel is tried, and its peaks are taken if most of them are rings.
     The peaks along a streak or a twig are close together too, but continue to both sides; the peaks of a pair of
     stars are higher than the wide peak.
     """
-    sharp = _peaks_of(plane, background, SHARP, threshold, limit, threads)
-    bright = _no_dots(plane, background, sharp)
+    sharp = _peaks_of(sky, SHARP, threshold, limit, threads)
+    bright = _no_dots(sky, sharp)
     if not _crowded(bright):
         return sharp
-    wide = _peaks_of(plane, background, WIDE, threshold, limit, threads)
-    if not _are_rings(plane.shape, bright, _no_dots(plane, background, wide)):
+    wide = _peaks_of(sky, WIDE, threshold, limit, threads)
+    if not _are_rings(sky.plane.shape, bright, _no_dots(sky, wide)):
         return sharp
     return _with_others(wide, bright, limit)
 
 
-def _no_dots(plane: np.ndarray, background: Background, peaks: Peaks) -> Peaks:
+def _no_dots(sky: SkyPlane, peaks: Peaks) -> Peaks:
     """The Peaks without hot pixels."""
-    keep = ~are_dots(plane, background, peaks.x, peaks.y)
+    keep = ~are_dots(sky, peaks.x, peaks.y)
     return replace(peaks, x=peaks.x[keep], y=peaks.y[keep], height=peaks.height[keep])
 
 
@@ -243,9 +237,8 @@ def _crowded(peaks: Peaks) -> bool:
         return False
     leaders = min(len(peaks.x), LEADERS)
     alike = peaks.height > 0.5 * peaks.height[leaders - 1]
-    return (
-        median(nearest_distances(peaks.x[alike].astype(float), peaks.y[alike].astype(float), leaders)) < CROWD
-    )
+    pairs = near_pairs(peaks.x[alike].astype(float), peaks.y[alike].astype(float), CROWD)
+    return len(np.unique(pairs[pairs < leaders])) > leaders / 2
 
 
 def _are_rings(size: tuple[int, ...], sharp: Peaks, wide: Peaks) -> bool:
@@ -288,34 +281,32 @@ def _with_others(wide: Peaks, sharp: Peaks, limit: int) -> Peaks:
     return replace(wide, x=x, y=y, height=height)
 
 
-def _peaks_of(
-    plane: np.ndarray, background: Background, kernel: Kernel, threshold: float, limit: int, threads: int
-) -> Peaks:
+def _peaks_of(sky: SkyPlane, kernel: Kernel, threshold: float, limit: int, threads: int) -> Peaks:
     """The Peaks of the frame smoothed by a Kernel.
 
     A colour mosaic leaves no trace in the smoothed frame: it is a pattern at the Nyquist frequency, where the kernel's
     response vanishes.
     """
-    correlation, unevenness = _noise_of_smooth(plane, background, kernel)
+    correlation, unevenness = _noise_of_smooth(sky, kernel)
     threshold = threshold * unevenness
-    level, noise = background.level.mean(0), np.sqrt((background.noise**2).mean(0))
+    level, noise = sky.level.mean(0), np.sqrt((sky.noise**2).mean(0))
     noise = noise * kernel.norm * correlation
     # each strip against the lowest threshold of its mesh rows; the exact threshold follows below
-    strips = np.arange(0, plane.shape[0], STRIP)
-    (first, last), _ = background.cell(0, np.stack([strips, np.minimum(strips + STRIP, plane.shape[0]) - 1]))
+    strips = np.arange(0, sky.height, STRIP)
+    (first, last), _ = sky.cell(0, np.stack([strips, np.minimum(strips + STRIP, sky.height) - 1]))
     first, last = first.astype(int), last.astype(int) + 1
     rows = np.minimum(first[:, None] + np.arange((last - first).max() + 1), last[:, None])
     floor = (level + threshold * noise).astype(np.float32)[rows].min(1)
-    x, y, value, highest = _in_parts(plane, kernel, floor, threads)
+    x, y, value, highest = _in_parts(sky.plane, kernel, floor, threads)
     x, y = np.rint(x).astype(int), np.rint(y).astype(int)
-    local, sigma = interpolated(np.stack([level, noise]), *background.cell(x, y)).T
+    local, sigma = interpolated(np.stack([level, noise]), *sky.cell(x, y)).T
     height = (value - local) / sigma
     left_out = max(0, len(height) - 4 * limit)
     keep = np.argsort(-height, kind="stable")[: 4 * limit]
     x, y, height = x[keep].astype(int), y[keep].astype(int), height[keep]
-    starlike = ~are_alone(plane, background, x, y)
+    starlike = ~are_alone(sky, x, y)
     x, y, height = x[starlike], y[starlike], height[starlike]
-    raised, uneven = surroundings(plane, background, x, y, round(6.7 * kernel.sigma))
+    raised, uneven = surroundings(sky, x, y, round(6.7 * kernel.sigma))
     height = (height - raised / (kernel.norm * correlation)) / uneven
     keep = (height > _above_tail(height, threshold)).nonzero()[0]
     keep = keep[np.argsort(-height[keep], kind="stable")]
@@ -336,26 +327,29 @@ def _in_parts(plane: np.ndarray, kernel: Kernel, limit: np.ndarray, threads: int
     height, parts = plane.shape[0], min(threads, len(limit))
     ends = [len(limit) * k // parts * STRIP for k in range(parts)] + [height]
 
-    def found(k: int) -> tuple[np.ndarray, ...]:
+    def search_part(k: int) -> tuple[np.ndarray, ...]:
         return find_maxima(plane, kernel.weight, kernel.flat, limit, STRIP, ends[k], ends[k + 1])
 
     if parts == 1:
-        return found(0)
+        return search_part(0)
     with ThreadPoolExecutor(parts) as pool:
-        return tuple(np.concatenate(column) for column in zip(*pool.map(found, range(parts)), strict=True))
+        return tuple(
+            np.concatenate(column) for column in zip(*pool.map(search_part, range(parts)), strict=True)
+        )
 
 
-def _noise_of_smooth(plane: np.ndarray, background: Background, kernel: Kernel) -> tuple[float, float]:
+def _noise_of_smooth(sky: SkyPlane, kernel: Kernel) -> tuple[float, float]:
     """Two factors, 1 or more each, by which a smoothed frame is noisier than with independent pixels.
 
     The first is the correlation of neighbouring pixels, from demosaicing, resampling or lossy compression: it lowers the
     SNR of a star. The second is the sky's unevenness within the background's cells, from clouds: it raises the threshold.
     """
+    plane = sky.plane
     tops = np.linspace(0, max(0, len(plane) - 16), 8).astype(int)
     rows = (tops[:, None] + np.arange(0, min(16, len(plane)), 4)).ravel()
     value = smooth_rows(plane, kernel.weight, rows, 4)
-    place = background.cell(np.arange(0, plane.shape[1], 4), rows)
-    score = scores(value, background.level, background.noise, *place)
+    place = sky.cell(np.arange(0, plane.shape[1], 4), rows)
+    score = scores(value, sky.level, sky.noise, *place)
     # stars widen the scatter upwards; where they are many, only the lowest values are free of them
     low, sigma_below, usual = _low_side(score.ravel())
     scatter = min(usual - sigma_below, sigma_below - low) / kernel.norm

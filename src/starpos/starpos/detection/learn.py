@@ -19,11 +19,11 @@ from starpos.detection._learn import (
     typical_gains,
     unit_light,
 )
-from starpos.detection._moments import own_shapes, squared_widths
+from starpos.detection._moments import own_shapes, squared_widths, window_moments, without_window
 from starpos.detection._neighbours import near_pairs
 from starpos.detection._pixels import smooth_mosaic
 from starpos.detection._sky import median, quantile
-from starpos.detection.background import Background
+from starpos.detection.background import SkyPlane
 from starpos.detection.fit import Fit, Response, fit_stars
 from starpos.detection.psf import BROAD, MONOMIALS, NARROW, FieldPsf, Psf, gaussian, power, trailed
 from starpos.detection.stamps import (
@@ -35,8 +35,6 @@ from starpos.detection.stamps import (
     centroid,
     cut,
     frame_shape,
-    moments,
-    own_shape,
     relative_widths,
     window_for,
 )
@@ -261,21 +259,16 @@ class Lesson:
 
 
 def learn(
-    plane: np.ndarray,
-    background: Background,
+    sky: SkyPlane,
     x: np.ndarray,
     y: np.ndarray,
     height: np.ndarray,
-    saturation: float,
 ) -> Lesson:
-    """Learn from the peaks x, y (N,) int px and their height (N,), highest first; defaults where they teach nothing.
-
-    saturation is the DN from which a pixel is saturated.
-    """
-    response = Response(np.ones(len(background.level)), 0.3, 0.0, 0.0)
-    psf, stamps, x, y = _teachers(plane, background, x, y, height, saturation)
+    """Learn from the peaks x, y (N,) int px and their height (N,), highest first; defaults where they teach nothing."""
+    response = Response(np.ones(len(sky.level)), 0.3, 0.0, 0.0)
+    psf, stamps, x, y = _teachers(sky, x, y, height)
     teachers = len(x)
-    fine = background.is_mosaic and psf.fwhm_px < FINE_FWHM and len(x) >= FINE_STARS
+    fine = sky.is_mosaic and psf.fwhm_px < FINE_FWHM and len(x) >= FINE_STARS
     rounds = ROUNDS + FINE_ROUNDS * fine
     for round_ in range(rounds + RING_ROUNDS):
         if len(x) == 0:
@@ -306,47 +299,45 @@ def learn(
 
 
 def _teachers(
-    plane: np.ndarray,
-    background: Background,
+    sky: SkyPlane,
     x: np.ndarray,
     y: np.ndarray,
     height: np.ndarray,
-    saturation: float,
 ) -> tuple[Psf, Stamps, np.ndarray, np.ndarray]:
     """The isolated bright stars: a Gaussian Psf of their shape, their Stamps and their centroids x, y (N,) px."""
     clear = np.ones(len(x), bool)
-    for streak in background.streaks:
+    for streak in sky.streaks:
         clear &= streak.at(y, x)[0] == 0
     alone, high = _isolated(x, y, height)
     # where no bright star is isolated, fainter ones may be; where none is, stars are wider than their distances
     choices = (clear & alone & (height > BRIGHT), clear & alone, clear & high)
     bright = next((c for c in choices if c.any()), choices[-1]).nonzero()[0]
-    bright = bright[~are_dots(plane, background, x[bright], y[bright])][:TEACHERS]
-    around = cut(plane, background, x[bright], y[bright], SIGHT, saturation)
+    bright = bright[~are_dots(sky, x[bright], y[bright])][:TEACHERS]
+    around = cut(sky, x[bright], y[bright], SIGHT)
     light, full = around.signal, around.full.any((1, 2))
     # the shapes of fainter stars are noise
     clearly_many = np.count_nonzero(height[bright] > BRIGHT) > ALIKE
     bright, light = bright[~full], _those(light, ~full)
-    light, blur = grey(light, background)
+    light, blur = grey(light, sky)
     if clearly_many and len(bright):
         alike = _most_alike(light)
         bright, light = bright[alike], _those(light, alike)
     shape = frame_shape(light, blur) if len(bright) else None
     # a shape as wide as the stamps is the sky's
-    if shape is not None and squared_widths(shape[None])[0, 0] > 0.9 * (SIGHT / 2) ** 2:
+    if shape is not None and squared_widths(shape)[0, 0] > 0.9 * (SIGHT / 2) ** 2:
         shape = None
     if shape is None or len(bright) < ALIKE:
-        around = _highest(plane, background, x[clear], y[clear], saturation)
-        shape, learnt = _likeliest(around, shape, Response(np.ones(len(background.level)), 0.3, 0.0, 0.0))
+        around = _highest(sky, x[clear], y[clear])
+        shape, learnt = _likeliest(around, shape, Response(np.ones(len(sky.level)), 0.3, 0.0, 0.0))
         if not learnt:
-            return gaussian(shape), around.select(slice(0)), np.zeros(0), np.zeros(0)
-    psf = gaussian(shape, x[bright], y[bright])
-    stamps = cut(plane, background, x[bright], y[bright], reach_of(psf), saturation)
-    smooth, blur = grey(stamps.signal, background)
+            return gaussian(shape[0]), around.select(slice(0)), np.zeros(0), np.zeros(0)
+    psf = gaussian(shape[0], x[bright], y[bright])
+    stamps = cut(sky, x[bright], y[bright], reach_of(psf))
+    smooth, blur = grey(stamps.signal, sky)
     x, y = centroid(smooth, stamps.x, stamps.y, shape)
     window = window_for(shape)
-    mass, _, seen = moments(smooth, *stamps.corner(x, y), window)
-    ratio = psf.axes @ (own_shape(seen, window) - blur * np.eye(2)) @ psf.axes.T
+    mass, _, seen = window_moments(smooth, *stamps.corner(x, y), window)
+    ratio = psf.axes @ (without_window(seen, window) - blur * np.eye(2)) @ psf.axes.T
     ratio[np.isnan(ratio)] = 0
     extremes = squared_widths(ratio)
     near = (extremes[:, 0] > NARROW) & (extremes[:, 1] < BROAD)
@@ -360,25 +351,23 @@ def _teachers(
     return psf, stamps.select(alike), x[alike], y[alike]
 
 
-def _highest(
-    plane: np.ndarray, background: Background, x: np.ndarray, y: np.ndarray, saturation: float
-) -> Stamps:
+def _highest(sky: SkyPlane, x: np.ndarray, y: np.ndarray) -> Stamps:
     """Stamps of the first FEW of the peaks x, y (N,) int px, of those that are not saturated if there are any."""
-    full = cut(plane, background, x[:TEACHERS], y[:TEACHERS], 1, saturation).full.any((1, 2))
+    full = cut(sky, x[:TEACHERS], y[:TEACHERS], 1).full.any((1, 2))
     few = np.argsort(full, kind="stable")[:FEW]
-    return cut(plane, background, x[few], y[few], SIGHT, saturation)
+    return cut(sky, x[few], y[few], SIGHT)
 
 
 def _likeliest(stamps: Stamps, shape: np.ndarray | None, response: Response) -> tuple[np.ndarray, bool]:
-    """The Gaussian shape (2, 2) px2 that finds most light in the stamps, and whether it is the given one, if any."""
-    choices = [np.eye(2) * sigma**2 for sigma in USUAL_SIGMAS]
+    """The Gaussian shape (1, 2, 2) px2 that finds most light in the stamps, and whether it is the given one, if any."""
+    choices = [np.eye(2)[None] * sigma**2 for sigma in USUAL_SIGMAS]
     if not len(stamps.x):
         return choices[0], False
     # what is much wider than the learnt shape is not a star
     choices = choices if shape is None else [shape, *choices[:2]]
     found = []
     for choice in choices:
-        psf = gaussian(choice)
+        psf = gaussian(choice[0])
         fit = fit_stars(stamps, psf, stamps.x.astype(float), stamps.y.astype(float), response, rounds=3)
         found.append(np.median(np.nan_to_num(fit.flux / fit.flux_sigma)))
     best = int(np.argmax(found))
@@ -426,9 +415,9 @@ def reach_of(psf: FieldPsf) -> int:
     return min(max(math.ceil(3.5 * math.sqrt(psf.widest_px2())) + 1, 4), MAX_REACH)
 
 
-def grey(signal: np.ndarray, background: Background) -> tuple[np.ndarray, float]:
+def grey(signal: np.ndarray, sky: SkyPlane) -> tuple[np.ndarray, float]:
     """Signals (N, S, S) smoothed so that the mosaic's pattern vanishes, and the px2 which that added to covariances."""
-    if not background.is_mosaic:
+    if not sky.is_mosaic:
         return signal, 0.0
     return smooth_mosaic(signal), SMOOTHING_WIDTH
 
@@ -496,11 +485,9 @@ OF_SHAPE, CLEAR = 3, 10.0
 
 def with_trail(
     lesson: Lesson,
-    plane: np.ndarray,
-    background: Background,
+    sky: SkyPlane,
     x: np.ndarray,
     y: np.ndarray,
-    saturation: float,
     trail: Trail,
 ) -> Lesson:
     """The Lesson with a PSF along a Trail where fewer than ALIKE stars have taught, and it fits no worse.
@@ -509,16 +496,16 @@ def with_trail(
     x, y (N,) int px: the peaks, highest first.  Across the trail it is as wide as fits best.  What few stars have taught
     may fit better by as much as its own unknowns are worth.
     """
-    size = background.width, background.height
+    size = sky.width, sky.height
     differ = trail.varies_px(*size) > SHORTEST_PX
     taught = lesson.teachers >= ALIKE
     if not differ and (taught or np.hypot(*trail.middle_px) < SHORTEST_PX):
         return lesson
     few = FEW * MORE if differ else FEW
-    peaks = np.flatnonzero(~are_dots(plane, background, x[: 10 * few], y[: 10 * few]))[:few]
+    peaks = np.flatnonzero(~are_dots(sky, x[: 10 * few], y[: 10 * few]))[:few]
     own = float(np.sqrt(np.linalg.eigvalsh(lesson.psf.shape)[0]))
     tried = [trailed(sigma, trail, *size) for sigma in (own, *USUAL_SIGMAS)]
-    stamps = cut(plane, background, x[peaks], y[peaks], max(map(reach_of, (lesson.psf, *tried))), saturation)
+    stamps = cut(sky, x[peaks], y[peaks], max(map(reach_of, (lesson.psf, *tried))))
 
     def fitted(psf: FieldPsf) -> Fit:
         start = stamps.x.astype(float), stamps.y.astype(float)

@@ -13,14 +13,14 @@ import cv2
 import numpy as np
 
 from starpos.detection._pixels import third_highest
-from starpos.detection.background import halved, measure_background, plane_of, window_of
+from starpos.detection.background import halved, measure_sky, plane_of, window_of
 from starpos.detection.finding import find_peaks, find_streaks
 from starpos.detection.learn import learn, with_trail
 from starpos.detection.saturated import find_discs, with_clipped, with_discs
 from starpos.detection.vet import measure, resolve
 from starpos.errors import FrameError
 from starpos.frames.exposure import Trail
-from starpos.frames.frame import BLENDED, COLUMNS, EDGE, ELONGATED, Frame, Stars, no_stars
+from starpos.frames.frame import BLENDED, COLUMNS, EDGE, ELONGATED, Frame, Stars, Window, no_stars
 
 # Pixels of stars that are fitted together, give or take half, on a small and on a large frame: about 2 and 6 MB.
 CHUNK_PIXELS = 30_000, 120_000
@@ -171,20 +171,27 @@ def _detect(picture: _Picture) -> Detection:
     reduced = _detect(smaller)
     if _clear(reduced.stars) <= _clear(found.stars):
         return found
-    s = reduced.stars
-    stars = replace(
-        s,
-        x=2 * s.x + 0.5,
-        y=2 * s.y + 0.5,
-        flux=gain * s.flux,
-        covariance=4 * s.covariance,
-        fwhm_px=2 * reduced.fwhm_px,
-        width=picture.about["width"],
-        height=picture.about["height"],
-        window=found.stars.window,
-    )
+    width, height = picture.about["width"], picture.about["height"]
+    stars = enlarged(reduced.stars, 2, width, height, found.stars.window, gain)
     return replace(
         found, stars=stars, fwhm_px=2 * reduced.fwhm_px, chi2=reduced.chi2, left_out=reduced.left_out
+    )
+
+
+def enlarged(
+    stars: Stars, times: int, width: int, height: int, window: Window | None, gain: float = 1.0
+) -> Stars:
+    """The stars of a frame that was reduced so many times, on the original one, whose flux is `gain` times as large."""
+    return replace(
+        stars,
+        x=times * stars.x + (times - 1) / 2,
+        y=times * stars.y + (times - 1) / 2,
+        flux=gain * stars.flux,
+        covariance=times**2 * stars.covariance,
+        fwhm_px=None if stars.fwhm_px is None else times * stars.fwhm_px,
+        width=width,
+        height=height,
+        window=window,
     )
 
 
@@ -197,30 +204,30 @@ def _detect_at_full_size(picture: _Picture) -> Detection:
     plane, settings, about = picture.plane, picture.settings, picture.about
     if min(plane.shape) < 2:
         return _starless(about, float(np.median(plane)), 0.0)
-    background = measure_background(plane, settings.mesh_px, picture.mosaic)
-    level, noise = background.typical
+    sky = measure_sky(plane, settings.mesh_px, picture.mosaic)
+    level, noise = sky.typical
     limit = max(PEAKS, 2 * settings.max_stars)
-    peaks = find_peaks(plane, background, settings.threshold, limit, settings.threads)
+    peaks = find_peaks(sky, settings.threshold, limit, settings.threads)
     x, y, height = peaks.x, peaks.y, peaks.height
     if len(x) == 0:
         return _starless(about, level, noise)
-    background = replace(background, correlation=peaks.correlation)
-    streaks = find_streaks(plane, background, x, y)
-    if streaks:
-        background = replace(background, streaks=streaks)
     saturation = _saturation(plane, x, y, settings)
-    lesson = learn(plane, background, x, y, height, saturation)
+    sky = replace(sky, correlation=peaks.correlation, saturation=saturation)
+    streaks = find_streaks(sky, x, y)
+    if streaks:
+        sky = replace(sky, streaks=streaks)
+    lesson = learn(sky, x, y, height)
     if picture.trail is not None:
-        lesson = with_trail(lesson, plane, background, x, y, saturation, picture.trail)
+        lesson = with_trail(lesson, sky, x, y, picture.trail)
     pixels = (2 * lesson.reach + 1) ** 2
     chunk = max(1, int(np.clip(plane.size // 32, *CHUNK_PIXELS)) // pixels)
     most = min(len(x), limit * (PIXELS_PER_PEAK >> MAX_HALVINGS - picture.halvings) // pixels)
-    found = measure(plane, background, x[:most], y[:most], lesson, saturation, settings.min_snr, chunk)
+    found = measure(sky, x[:most], y[:most], lesson, settings.min_snr, chunk)
     found = resolve(found, lesson.psf)
     fwhm_px = lesson.psf.fwhm_px
-    found = with_discs(found, *find_discs(plane, background, fwhm_px, peaks.highest), fwhm_px)
+    found = with_discs(found, *find_discs(sky, fwhm_px, peaks.highest), fwhm_px)
     if fwhm_px < WIDE_FWHM:
-        found = with_clipped(found, plane, background, x, y, fwhm_px)
+        found = with_clipped(found, sky, x, y, fwhm_px)
     found = found[: settings.max_stars]
     stars = Stars(
         **{name: found[name] for name in COLUMNS},

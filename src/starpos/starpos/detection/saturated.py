@@ -6,7 +6,7 @@ import numpy as np
 
 from starpos.detection._neighbours import any_near
 from starpos.detection._pixels import bright_squares, third_highest
-from starpos.detection.background import Background
+from starpos.detection.background import SkyPlane
 from starpos.detection.vet import MEASURED
 from starpos.frames.frame import SATURATED
 
@@ -28,28 +28,26 @@ OFF_CENTRE = 0.04
 GROWTH = 2.0
 
 
-def find_discs(
-    plane: np.ndarray, background: Background, fwhm_px: float, highest: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Discs of plane (h, w) far wider than its stars of fwhm_px: as measured stars (N,), and their radii (N,) px.
+def find_discs(sky: SkyPlane, fwhm_px: float, highest: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Discs far wider than its stars of fwhm_px: as measured stars (N,), and their radii (N,) px.
 
     highest (h,) int32: the brightest pixel of each row.
     """
-    level, noise = background.typical
+    level, noise = sky.typical
     least = max(WIDER * fwhm_px, MIN_PX)
     # any disc of this radius has a sample whose neighbours to the right, below and between lie on it too
     step = int(np.sqrt(2) * (least - np.sqrt(0.5)))
     # no single hot pixel
-    y, x, height = bright_squares(plane, highest, step, int(level + CLEAR * noise))
+    y, x, height = bright_squares(sky.plane, highest, step, int(level + CLEAR * noise))
     if height.max(initial=0) < level + CLEAR * noise:
         return measured_discs([], fwhm_px, 0.0)
     top = float(height.max())
     limit = level + FLAT * (top - level)
     bright = height >= limit
     boxes = _groups(y[bright] // step, x[bright] // step)
-    most = WIDEST * min(plane.shape)
+    most = WIDEST * min(sky.plane.shape)
     fits = boxes[:, [cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT]].max(1) * step < 2 * most
-    discs = [_disc(plane, box[:4] * step, 2 * step, limit, least) for box in boxes[fits][:MOST]]
+    discs = [_disc(sky.plane, box[:4] * step, 2 * step, limit, least) for box in boxes[fits][:MOST]]
     return measured_discs([d for d in discs if d is not None and d[2] < most], fwhm_px, top - level)
 
 
@@ -156,8 +154,7 @@ REACH, MIN_REACH = 6.0, 12
 
 def with_clipped(
     stars: np.ndarray,
-    plane: np.ndarray,
-    background: Background,
+    sky: SkyPlane,
     x: np.ndarray,
     y: np.ndarray,
     fwhm_px: float,
@@ -171,9 +168,9 @@ def with_clipped(
     constrained = np.sqrt(np.maximum(stars["chi2"], 1.0)) < KNOWN * stars["snr"]
     constrained |= ~saturated & (stars["chi2"] < STRANGE)
     # the third highest pixel, because hot ones may exceed saturation
-    level, top = background.near(x, y)[0].mean(1), third_highest(plane, x, y, 1)[0]
-    sky = background.typical[0]
-    lost = top - sky > FLAT * (top.max() - sky)
+    level, top = sky.near(x, y)[0].mean(1), third_highest(sky.plane, x, y, 1)[0]
+    typical = sky.typical[0]
+    lost = top - typical > FLAT * (top.max() - typical)
     at_x, at_y, own_x, own_y, weak = (
         x.astype(float),
         y.astype(float),
@@ -184,9 +181,9 @@ def with_clipped(
     lost[lost] = ~any_near(own_x[constrained], own_y[constrained], at_x[lost], at_y[lost], NEAR)
     lost |= any_near(own_x[weak], own_y[weak], at_x, at_y, NEAR)
     # what stands on a roof is the roof's
-    lost = (lost & (top - level > OWN * (top - sky))).nonzero()[0][:MOST]
+    lost = (lost & (top - level > OWN * (top - typical))).nonzero()[0][:MOST]
     reach = max(MIN_REACH, round(REACH * fwhm_px))
-    images = [_image(plane, x[k], y[k], level[k], top[k], reach) for k in lost.tolist()]
+    images = [_image(sky.plane, x[k], y[k], level[k], top[k], reach) for k in lost.tolist()]
     least = max(FEWEST, NARROWER * np.pi / 4 * fwhm_px**2)
     # several peaks may belong to one image
     clipped = [
@@ -194,7 +191,7 @@ def with_clipped(
     ]
     if not clipped:
         return stars
-    discs, radius = measured_discs(clipped, fwhm_px, float(top.max()) - sky)
+    discs, radius = measured_discs(clipped, fwhm_px, float(top.max()) - typical)
     apart = np.hypot(own_x[:, None] - discs["x"], own_y[:, None] - discs["y"])
     known = constrained | ~(apart < radius).any(1)
     return with_discs(stars[known], discs, radius, fwhm_px)

@@ -12,7 +12,7 @@ from scipy import ndimage, special
 from starpos.detection._peaks import smooth_rows
 from starpos.detection.background import halved, plane_of
 from starpos.detection.finding import SHARP, Kernel
-from starpos.detection.pipeline import Detection, DetectionSettings, detect
+from starpos.detection.pipeline import Detection, DetectionSettings, detect, enlarged
 from starpos.frames.frame import Frame, Stars, Window
 from starpos.units import SIGMA_PER_MAD
 
@@ -37,7 +37,7 @@ def detect_dark_too(frame: Frame) -> Detection:
 
 
 # (how often the frame is reduced by two, whether what is wider than a star is taken away), in the order of their use
-WAYS = (0, True), (1, True), (2, False)
+VIEWS = (0, True), (1, True), (2, False)
 # Maximum width (px) of a star's light.
 WIDEST_PX = 9
 # Cells of the background (px): what is left of clouds ends sooner than a sky.
@@ -48,13 +48,13 @@ SHORTEST_PX = 64
 HIGHEST, MAX_STRETCH = 40_000, 32
 
 
-def otherwise(frame: Frame, window: tuple[int, int, int, int] | None) -> Iterator[Stars]:
-    """Yield the stars of a frame as it is seen in each of the WAYS that it is large enough for.
+def other_views(frame: Frame, window: Window | None) -> Iterator[Stars]:
+    """Yield the stars of a frame as it is seen in each of the VIEWS that it is large enough for.
 
     window: the part of the frame that shows something, as `Stars` has it.
     """
     plane, mosaic = plane_of(frame)
-    for halvings, flat in WAYS:
+    for halvings, flat in VIEWS:
         reduced = plane
         for _ in range(halvings):
             reduced = halved(reduced)[0]
@@ -62,9 +62,9 @@ def otherwise(frame: Frame, window: tuple[int, int, int, int] | None) -> Iterato
             continue
         if flat:
             reduced = _flattened(reduced if halvings or not mosaic else cv2.GaussianBlur(reduced, (3, 3), 0))
-        seen = replace(frame, pixels=reduced, pattern="", trail=None)
+        reduced_frame = replace(frame, pixels=reduced, pattern="", trail=None)
         settings = DetectionSettings(mesh_px=MESH_PX) if flat else DetectionSettings()
-        yield _enlarged(detect(seen, settings).stars, 2**halvings, frame, window)
+        yield enlarged(detect(reduced_frame, settings).stars, 2**halvings, frame.width, frame.height, window)
 
 
 def _flattened(plane: np.ndarray) -> np.ndarray:
@@ -72,20 +72,6 @@ def _flattened(plane: np.ndarray) -> np.ndarray:
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (WIDEST_PX, WIDEST_PX))
     rest = cv2.morphologyEx(plane, cv2.MORPH_TOPHAT, disc).astype(np.uint16)
     return rest * np.uint16(max(1, min(MAX_STRETCH, HIGHEST // max(1, int(rest.max())))))
-
-
-def _enlarged(stars: Stars, times: int, frame: Frame, window: tuple[int, int, int, int] | None) -> Stars:
-    """The stars of a reduced frame, on the original frame."""
-    return replace(
-        stars,
-        x=times * stars.x + (times - 1) / 2,
-        y=times * stars.y + (times - 1) / 2,
-        covariance=times**2 * stars.covariance,
-        fwhm_px=None if stars.fwhm_px is None else times * stars.fwhm_px,
-        width=frame.width,
-        height=frame.height,
-        window=window,
-    )
 
 
 FWHM_PER_SIGMA = 2.3548

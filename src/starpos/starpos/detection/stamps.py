@@ -14,11 +14,9 @@ from starpos.detection._moments import (
     through_window,
     typical_shape,
     width_ratios,
-    window_moments,
-    without_window,
 )
-from starpos.detection._pixels import cut_stamps, mark_dots, mark_isolated, measure_rims
-from starpos.detection.background import Background
+from starpos.detection._pixels import cut_stamps, measure_rims, sum_squares
+from starpos.detection.background import SkyPlane
 from starpos.units import SIGMA_PER_MAD
 
 # Around a star the sky counts as brighter or less even than the mesh says where about 50 pixels lie so far above it, or
@@ -89,49 +87,47 @@ class Stamps(StarRows):
         return self.x - self.reach - x, self.y - self.reach - y
 
 
-def cut(
-    plane: np.ndarray, background: Background, x: np.ndarray, y: np.ndarray, reach: int, saturation: float
-) -> Stamps:
-    """The Stamps of (2 reach + 1) px around the pixels x, y (N,) int of plane (h, w)."""
+def cut(sky: SkyPlane, x: np.ndarray, y: np.ndarray, reach: int) -> Stamps:
+    """The Stamps of (2 reach + 1) px around the pixels x, y (N,) int."""
     x, y = (np.ascontiguousarray(v, np.intp) for v in (x, y))
-    signal, noise, good, full, phase = cut_stamps(plane, x, y, reach, *background.near(x, y), saturation)
+    signal, noise, good, full, phase = cut_stamps(sky.plane, x, y, reach, *sky.near(x, y), sky.saturation)
     grid = np.arange(-reach, reach + 1)
-    for streak in background.streaks:
+    for streak in sky.streaks:
         more, least = streak.at((y[:, None] + grid)[:, :, None], (x[:, None] + grid)[:, None, :])
         signal, noise = (signal - more).astype(np.float32), np.maximum(noise, least).astype(np.float32)
     spike = np.zeros(good.shape, bool)
     return Stamps(x=x, y=y, signal=signal, noise=noise, good=good, full=full, phase=phase, spike=spike)
 
 
-def are_dots(plane: np.ndarray, background: Background, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+def are_dots(sky: SkyPlane, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Whether the pixels x, y (N,) int are hot, one or two together: the others of nine have hardly any light.
 
     Less than half the brightest's without it, or less than a quarter of it without the second too.
     """
     x, y = (np.ascontiguousarray(v, np.intp) for v in (x, y))
-    level, _ = background.near(x, y)
+    level, noise = sky.near(x, y)
     # a streak is wider than nine pixels
-    for streak in background.streaks:
+    for streak in sky.streaks:
         level = level + streak.at(y, x)[0][:, None].astype(np.float32)
-    return mark_dots(plane, x, y, level, HALF, QUARTER)
+    total, first, second, _ = sum_squares(sky.plane, x, y, level, noise, 1)
+    return (total - first < HALF * first) | (total - first - second < QUARTER * first)
 
 
-def are_alone(plane: np.ndarray, background: Background, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+def are_alone(sky: SkyPlane, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     """Whether the pixels x, y (N,) int are certainly hot: almost no light in the 24 pixels around them, or of streaks."""
     x, y = (np.ascontiguousarray(v, np.intp) for v in (x, y))
-    return mark_isolated(plane, x, y, *background.near(x, y), 2, ALONE, NOTHING)
+    total, first, _, sigma = sum_squares(sky.plane, x, y, *sky.near(x, y), 2)
+    return total - first < np.minimum(ALONE * first, NOTHING * sigma)
 
 
-def surroundings(
-    plane: np.ndarray, background: Background, x: np.ndarray, y: np.ndarray, reach: int
-) -> tuple[np.ndarray, np.ndarray]:
+def surroundings(sky: SkyPlane, x: np.ndarray, y: np.ndarray, reach: int) -> tuple[np.ndarray, np.ndarray]:
     """The sky's level and scatter on the edges of squares, reach px from the pixels x, y (N,) int, over the noise.
 
     0 and 1 where a difference may be chance. Near a roof, among twigs or under a cloud the sky is brighter and less
-    even than the background's mesh says.
+    even than its mesh says.
     """
     x, y = (np.ascontiguousarray(v, np.intp) for v in (x, y))
-    return measure_rims(plane, x, y, *background.near(x, y), reach, SIGMA_PER_MAD, RAISED, UNEVEN)
+    return measure_rims(sky.plane, x, y, *sky.near(x, y), reach, SIGMA_PER_MAD, RAISED, UNEVEN)
 
 
 # px2. A single pixel has 1/12, and a star's light never falls on one pixel only.
@@ -141,54 +137,28 @@ NARROWEST_WINDOW = 1.2
 # A star counts for the typical shape if its mean is so near the peak, px, and its windowed image wider than that, px2;
 # which is settled at a relative change of so little.
 NEAR, THINNEST, SETTLED = 1.5, 0.1, 1e-3
-# px. A centroid is not farther from the peak.
-FARTHEST = 2.0
+# px. A centroid is not farther from the peak, after so many rounds.
+FARTHEST, ROUNDS = 2.0, 3
 
 
-def at_least(shape: np.ndarray, floor: float) -> np.ndarray:
-    """The covariance shape (..., 2, 2) px2 with no principal axis below floor px2."""
-    return clip_widths(_each(shape), floor, np.inf, 1.0).reshape(shape.shape)
+def window_for(shape: np.ndarray) -> np.ndarray:
+    """The windows (N, 2, 2) px2 for stars of covariance shape: the same, unless too narrow for sums over pixels."""
+    return clip_widths(shape, NARROWEST_WINDOW, np.inf, 1.0)
 
 
-def _each(shape: np.ndarray) -> np.ndarray:
-    """Covariances (..., 2, 2) in one row (N, 2, 2)."""
-    return shape.reshape(-1, 2, 2)
-
-
-def moments(
-    signal: np.ndarray, left: np.ndarray, top: np.ndarray, window: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Moments of stamps' signals (N, S, S) through a window (2, 2) px2, or one window each (N, 2, 2), about points.
-
-    left, top (N,) px: first column and row of a stamp, from the point.
-
-    Returns the sum (N,), the mean offset (N, 2) px from the points and the covariance (N, 2, 2) px2 of the windowed
-    image; NaN where there is no light. Pixels off the frame and saturated ones count as they are: without them the
-    centroid would be biased away from the edge.
-    """
-    return window_moments(signal, left, top, _each(window))
-
-
-def centroid(
-    signal: np.ndarray, x: np.ndarray, y: np.ndarray, shape: np.ndarray, rounds: int = 3
-) -> tuple[np.ndarray, np.ndarray]:
-    """Windowed centroids x, y (N,) px of stars of covariance shape px2, near the peaks.
+def centroid(signal: np.ndarray, x: np.ndarray, y: np.ndarray, shape: np.ndarray) -> np.ndarray:
+    """Windowed centroids x, y (2, N) px of stars of covariance shape (N or 1, 2, 2) px2, near the peaks.
 
     signal (N, S, S): of stamps around the pixels x, y (N,) int.
     """
     window = window_for(shape)
     # through the window an offset looks smaller than it is
-    gain = np.eye(2) + shape @ invert_shapes(_each(window)).reshape(window.shape)
-    return centroids(signal, x, y, _each(window), _each(gain), rounds, FARTHEST)
-
-
-def window_for(shape: np.ndarray) -> np.ndarray:
-    """The window (..., 2, 2) px2 for stars of covariance shape: the same, unless too narrow for sums over pixels."""
-    return at_least(shape, NARROWEST_WINDOW)
+    gain = np.eye(2) + shape @ invert_shapes(window)
+    return centroids(signal, x, y, window, gain, ROUNDS, FARTHEST)
 
 
 def frame_shape(signal: np.ndarray, blur: float = 0.0, rounds: int = 12) -> np.ndarray | None:
-    """The typical covariance C (2, 2) px2 of stars, signals (N, S, S), measured through a window of the same shape.
+    """The typical covariance C (1, 2, 2) px2 of stars, signals (N, S, S), measured through a window of the same shape.
 
     blur, px2, is what smoothing added to their covariance. None if no star can be measured.
     """
@@ -200,19 +170,14 @@ def frame_shape(signal: np.ndarray, blur: float = 0.0, rounds: int = 12) -> np.n
             signal, width**2, NARROWEST_WINDOW, NARROWEST, (reach / 2) ** 2, rounds, NEAR, THINNEST, SETTLED
         )  # fmt: skip
         if shape is not None:
-            return at_least(shape - blur * np.eye(2), NARROWEST)
+            return clip_widths(shape[None] - blur * np.eye(2), NARROWEST, np.inf, 1.0)
     return None
 
 
-def own_shape(seen: np.ndarray, window: np.ndarray) -> np.ndarray:
-    """Covariances (N, 2, 2) px2 of stars from the windowed images' covariances seen (N, 2, 2); NaN where impossible."""
-    return without_window(seen, _each(window))
-
-
 def relative_widths(seen: np.ndarray, shape: np.ndarray, window: np.ndarray) -> np.ndarray:
-    """The smaller and the larger squared width (N, 2) of windowed images, over the widths of `shape` (..., 2, 2).
+    """The smaller and the larger squared width (N, 2) of images through windows, over those of stars of this shape.
 
     Both are 1 for a star of that shape and near 0 for a hot pixel. Along a streak the larger reaches 2 if the window is
     the shape. NaN counts as 0.
     """
-    return width_ratios(seen, through_window(_each(shape), _each(window)))
+    return width_ratios(seen, through_window(shape, window))

@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from starpos.detection._moments import squared_widths
+from starpos.detection._moments import squared_widths, window_moments
 from starpos.detection._neighbours import near_pairs
 from starpos.detection._vetting import (
     compare_with_pixel,
@@ -15,7 +15,7 @@ from starpos.detection._vetting import (
     replace_spikes,
     restore_model,
 )
-from starpos.detection.background import Background
+from starpos.detection.background import SkyPlane
 from starpos.detection.fit import OUTLIER, Fit, Response, fit_stars, split_pairs, surprising
 from starpos.detection.learn import Lesson, grey
 from starpos.detection.psf import FieldPsf
@@ -26,7 +26,6 @@ from starpos.detection.stamps import (
     centroid,
     cut,
     joined,
-    moments,
     relative_widths,
     window_for,
 )
@@ -67,36 +66,33 @@ MEASURED = np.dtype(
 
 
 def measure(
-    plane: np.ndarray,
-    background: Background,
+    sky: SkyPlane,
     x: np.ndarray,
     y: np.ndarray,
     lesson: Lesson,
-    saturation: float,
     min_snr: float,
     chunk: int,
 ) -> np.ndarray:
     """Measure the stars among the peaks x, y (N,) int px: an array of MEASURED, in no order.
 
-    saturation is the DN from which a pixel is saturated, min_snr the SNR a star must have, and
-    chunk about how many are measured at once.
+    min_snr: the SNR a star must have; chunk: about how many are measured at once
     """
     psf = lesson.psf
 
     def cut_at(x: np.ndarray, y: np.ndarray) -> Stamps:
-        stamps = cut(plane, background, x, y, lesson.reach, saturation)
+        stamps = cut(sky, x, y, lesson.reach)
         correct_sky(stamps.signal, stamps.noise, SIGMA_PER_MAD, RAISED, UNEVEN, OWN)
         return _without_spikes(stamps, lesson)
 
     def select(stamps: Stamps, fit: Fit, wanted: np.ndarray) -> np.ndarray:
-        return _measured(stamps, fit, background, lesson, min_snr, wanted)
+        return _measured(stamps, fit, sky, lesson, min_snr, wanted)
 
     # odd stars of several chunks together, because most chunks have a few
     odd: list[tuple[Stamps, Fit]] = []
 
     def one_chunk(x: np.ndarray, y: np.ndarray) -> np.ndarray:
         stamps = cut_at(x, y)
-        begin = centroid(grey(stamps.signal, background)[0], stamps.x, stamps.y, psf.shapes_at(x, y))
+        begin = centroid(grey(stamps.signal, sky)[0], stamps.x, stamps.y, psf.shapes_at(x, y))
         fit = fit_stars(stamps, psf, *begin, lesson.response)
         strange = surprising(stamps, fit)
         rows = strange.nonzero()[0]
@@ -127,7 +123,7 @@ def measure(
 def _measured(
     stamps: Stamps,
     fit: Fit,
-    background: Background,
+    sky: SkyPlane,
     lesson: Lesson,
     min_snr: float,
     wanted: np.ndarray,
@@ -145,10 +141,10 @@ def _measured(
     )  # fmt: skip
     dot = _is_dot(stamps, fit, lesson.response)
     restore_model(stamps.signal, stamps.noise, stamps.spike, fit.model, fit.outlier, SPECK, LOUD)
-    smooth, blur = grey(stamps.signal, background)
+    smooth, blur = grey(stamps.signal, sky)
     shape = psf.shapes_at(stamps.x, stamps.y)
     window = window_for(shape)
-    _, _, seen = moments(smooth, *corner, window)
+    _, _, seen = window_moments(smooth, *corner, window)
     widths = relative_widths(seen, shape + blur * np.eye(2), window)
     misfit = _misfit(fit)
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -157,8 +153,8 @@ def _measured(
         sound = wanted & np.isfinite(snr) & (c[:, 0, 0] > 0) & (c[:, 0, 0] * c[:, 1, 1] > c[:, 0, 1] ** 2)
         sound &= np.hypot(fit.x - stamps.x, fit.y - stamps.y) < 2 + lesson.reach / 2
         sound &= (fit.flux > 0) & (matched >= min_snr) & ~dot
-        sound &= (fit.x >= 0) & (fit.x <= background.width - 1)
-        sound &= (fit.y >= 0) & (fit.y <= background.height - 1)
+        sound &= (fit.x >= 0) & (fit.x <= sky.width - 1)
+        sound &= (fit.y >= 0) & (fit.y <= sky.height - 1)
         slack = 3 / matched
         # through a window wider than the star, noise changes the width more
         loose = slack * np.sqrt(squared_widths(window).prod(1) / squared_widths(shape).prod(1))

@@ -208,9 +208,9 @@ def _seen(item: Frame | Stars, stars: Stars) -> Iterator[tuple[Stars, float]]:
     if isinstance(item, Stars):
         return
     # slow to import, and seldom needed
-    from starpos.detection.second_look import negative_of, otherwise
+    from starpos.detection.second_look import negative_of, other_views
 
-    seen = otherwise(negative_of(item) if stars.negative else item, stars.window)
+    seen = other_views(negative_of(item) if stars.negative else item, stars.window)
     for others in itertools.islice(seen, MAX_WAYS):
         yield replace(others, negative=stars.negative), MIN_LOG_ODDS_OTHERWISE
 

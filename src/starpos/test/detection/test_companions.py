@@ -6,7 +6,7 @@ import pytest
 from scipy import ndimage, sparse, spatial
 
 from starpos.detection._learn import phase_fluxes, unit_light
-from starpos.detection._neighbours import any_near, group_points, near_pairs, nearest_distances
+from starpos.detection._neighbours import any_near, group_points, near_pairs
 from starpos.detection._pixels import smooth_mosaic
 from starpos.detection._vetting import brightest_left, count_marked
 
@@ -56,18 +56,6 @@ def test_points_near_others_are_those_of_distances(number, rng):
     np.testing.assert_array_equal(any_near(x, y, *others, 5.0), (apart < 5).any(0))
     with pytest.raises(ValueError, match="as many"):
         any_near(x, y, others[0], others[1, 1:], 5.0)
-
-
-@pytest.mark.parametrize(("number", "count"), [(0, 0), (1, 1), (2, 1), (300, 100)])
-def test_the_nearest_point_is_that_of_distances(number, count, rng):
-    x, y = rng.integers(0, 99, (2, number)).astype(float)
-    apart = np.hypot(x[:, None] - x, y[:, None] - y)
-    np.fill_diagonal(apart, np.inf)
-    np.testing.assert_allclose(
-        nearest_distances(x, y, count), apart.min(1, initial=np.inf)[:count], rtol=1e-14
-    )
-    with pytest.raises(ValueError, match="as many"):
-        nearest_distances(x, y, number + 1)
 
 
 @pytest.mark.parametrize("phases", [1, 4])

@@ -24,9 +24,9 @@ def measured(monkeypatch):
     monkeypatch.setattr(pipeline, "PEAKS", 1000)
     pixels, measure = [], pipeline.measure
 
-    def counted(plane, background, x, y, lesson, *more):
+    def counted(sky, x, y, lesson, *more):
         pixels.append(len(x) * (2 * lesson.reach + 1) ** 2)
-        return measure(plane, background, x, y, lesson, *more)
+        return measure(sky, x, y, lesson, *more)
 
     monkeypatch.setattr(pipeline, "measure", counted)
     return pixels

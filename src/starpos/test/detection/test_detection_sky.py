@@ -8,7 +8,7 @@ import pytest
 from scipy import ndimage
 
 from starpos.detection import detect
-from starpos.detection.background import measure_background
+from starpos.detection.background import measure_sky
 from starpos.detection.finding import find_peaks
 from starpos.frames.frame import BLENDED, SATURATED, Frame, to_unsigned
 from starpos_testing.skies.rendered import bound, coloured, errors, field, grid, match, noisy, rms
@@ -195,7 +195,7 @@ def test_many_pairs_teach_no_false_errors(ratio, rng):
 
 
 def peaks_of(pixels):
-    return find_peaks(pixels, measure_background(pixels, 64, None), 5.0, 10_000)
+    return find_peaks(measure_sky(pixels, 64, None), 5.0, 10_000)
 
 
 def test_hot_pixels_cost_no_fit_each_and_hardly_a_star(rng):

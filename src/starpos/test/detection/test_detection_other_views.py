@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from starpos.detection import detect
-from starpos.detection.second_look import WAYS, otherwise
+from starpos.detection.second_look import VIEWS, other_views
 from starpos.frames.frame import Frame
 from starpos_testing.skies.rendered import field, grid
 
@@ -34,7 +34,7 @@ def test_sharp_stars_before_a_nebula(rng):
     x, y = stars[:, :2].T
     light = field(SIZE, stars, fwhm=1.3, sky=10) + nebula(rng) + rng.normal(0, 1.5, SIZE)
     frame = Frame(light.clip(0, 255).round().astype(np.uint8))
-    first, flat = detect(frame).stars, next(otherwise(frame, None))
+    first, flat = detect(frame).stars, next(other_views(frame, None))
     assert np.mean(nearest(first, x, y) < 1) < 0.5
     assert np.mean(nearest(flat, x, y) < 1) > 0.8
     assert (flat.width, flat.height) == SIZE[::-1]
@@ -51,12 +51,12 @@ def test_wide_stars_under_noise_with_sharp_peaks(rng):
         pixels[cy - 12 : cy + 13, cx - 12 : cx + 13] += 60 * disc
     frame = Frame(pixels.clip(0, 255).astype(np.uint8))
     assert np.mean(nearest(detect(frame).stars, x, y) < 3) < 0.5
-    *_, reduced = otherwise(frame, (0, 0, 1600, 1000))
+    *_, reduced = other_views(frame, (0, 0, 1600, 1000))
     assert np.mean(nearest(reduced, x, y) < 3) > 0.8
     assert reduced.window == (0, 0, 1600, 1000)
 
 
 @pytest.mark.parametrize("size", [(1, 1), (70, 90), (2, 500)])
 def test_small_and_empty_frames_are_seen_in_the_ways_that_fit(size):
-    seen = list(otherwise(Frame(np.full(size, 7, np.uint8)), None))
-    assert len(seen) <= len(WAYS) and not any(map(len, seen))
+    seen = list(other_views(Frame(np.full(size, 7, np.uint8)), None))
+    assert len(seen) <= len(VIEWS) and not any(map(len, seen))
