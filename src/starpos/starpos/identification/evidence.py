@@ -156,7 +156,7 @@ class OnFrame:
         return cls(*found)
 
     def rows(self, which: np.ndarray) -> "OnFrame":
-        """Those of a mask (S,)."""
+        """The stars of a mask (S,)."""
         return OnFrame(self.index[which], self.directions[which], self.blend_px[which])
 
 

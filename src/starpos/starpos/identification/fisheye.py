@@ -257,7 +257,7 @@ class LensPose:
 
 
 @at_once
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class _Start:
     """A frame's N stars at xy (N, 2) px with errors (N,), and what a part of it says of them.
 
