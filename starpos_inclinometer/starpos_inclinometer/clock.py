@@ -28,6 +28,10 @@ class Moment:
     monotonic_s: float
     host_ns: int
 
+    def stamp_ns(self, late_s: float) -> int:
+        """The host's time so long before."""
+        return max(self.host_ns - round(late_s * 1e9), 0)
+
 
 @dataclass(frozen=True, slots=True)
 class Step:

@@ -126,11 +126,10 @@ class SolverNode(Node):
         self._diagnostics = Diagnostics(self, tasks, self._values["frame_id"])
         self._update_transforms()
 
-    def destroy_node(self) -> None:
-        """End the node; what GNSS taught is kept."""
+    def close(self) -> None:
+        """Keep what GNSS taught."""
         if self._session.gnss is not None:
             self._session.gnss.close()
-        super().destroy_node()
 
     def _apply(self, names: frozenset[str]) -> None:
         self._diagnostics.hardware_id = self._values["frame_id"]

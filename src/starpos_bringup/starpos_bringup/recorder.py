@@ -56,8 +56,7 @@ class Recorder(Node):
         self._diagnostics = Diagnostics(self, {"Bag": self._report}, str(writer.folder))
         say(f"{writer.folder}: recording {len(topics)} topics until Ctrl-C")
 
-    def destroy_node(self) -> None:
-        super().destroy_node()
+    def close(self) -> None:
         try:
             self._writer.close()
             self._say(f"{self._writer.folder}: {self._writer.count} messages")
@@ -111,8 +110,7 @@ class FolderWriter(Node):
         self._diagnostics = Diagnostics(self, {"Night": self._report}, str(folder))
         self.get_logger().info(f"{folder}: stars and tilts go there until Ctrl-C")
 
-    def destroy_node(self) -> None:
-        super().destroy_node()
+    def close(self) -> None:
         self._tilts.close()
 
     def _on_camera(self, message: CameraInfo) -> None:

@@ -5,13 +5,14 @@ module of an executable therefore imports its node inside `make_nodes`.
 """
 
 import contextlib
+import ctypes
 import os
 import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 if TYPE_CHECKING:
     from rclpy.node import Node
@@ -53,9 +54,55 @@ class _UnlessLate:
             self._told(unraisable)
 
 
+# The middleware ends a node in milliseconds. Once in some hundred ends it never does (rclpy 7.1, Fast DDS): it then holds
+# Python's lock, so that neither a thread nor a signal handler of Python could help.
+MAX_END_S = 5.0
+SIGEV_THREAD, CLOCK_MONOTONIC = 2, 1
+
+
+class _SigEvent(ctypes.Structure):
+    """struct sigevent of Linux: what happens when a timer is over."""
+
+    _fields_ = (
+        ("value", ctypes.c_void_p),
+        ("signal", ctypes.c_int),
+        ("notify", ctypes.c_int),
+        ("function", ctypes.c_void_p),
+        ("attributes", ctypes.c_void_p),
+        ("padding", ctypes.c_char * 32),
+    )
+
+
+@contextlib.contextmanager
+def end_within(seconds: float, status: int) -> Iterator[None]:
+    """End the process with a status if the block takes longer; without Python's lock, by a timer of the C library."""
+    libc, timer = ctypes.CDLL(None), ctypes.c_void_p()
+    event = _SigEvent(value=status, notify=SIGEV_THREAD, function=ctypes.cast(libc._exit, ctypes.c_void_p))
+    # struct itimerspec: interval, then time until the end
+    when = (ctypes.c_long * 4)(0, 0, int(seconds), int(seconds % 1 * 1e9))
+    # an older C library has timers elsewhere; there the end stays without a bound
+    bound = (
+        hasattr(libc, "timer_create")
+        and libc.timer_create(CLOCK_MONOTONIC, ctypes.byref(event), ctypes.byref(timer)) == 0
+    )
+    if bound:
+        libc.timer_settime(timer, 0, when, None)
+    yield
+    if bound:
+        libc.timer_delete(timer)
+
+
 # rclpy's signal handler wakes the executor at once, but rarely misses it when two signals come together (rclpy 7.1).
 # So the main loop looks itself that often.
 NOTICE_S = 0.5
+
+
+@runtime_checkable
+class Closing(Protocol):
+    """A node with something of its own to put away: threads, devices, files."""
+
+    def close(self) -> None:
+        """Put it away, however long that takes; called once, when no callback runs any more."""
 
 
 def run(
@@ -69,6 +116,8 @@ def run(
     refuse to start.
     args: the command line, by default sys.argv.
     help_text: makes the text for `--help` or `-h`; None: they have no meaning here.
+
+    At the end each node that is `Closing` is closed; then the middleware has MAX_END_S to end, or the process leaves.
 
     The status is 0 after SIGINT (once or twice) or SIGTERM, and 1 with one line on standard error when the start is
     refused. Any other exception of a callback is a defect: it ends the process with its traceback.
@@ -153,8 +202,12 @@ def _run(make_nodes: Callable[[], "Iterator[Node]"], args: list[str] | None, sto
             raise
     finally:
         for node in reversed(nodes):
-            node.destroy_node()
-        rclpy.try_shutdown()
+            if isinstance(node, Closing):
+                node.close()
+        with end_within(MAX_END_S, int(sys.exc_info()[0] is not None)):
+            for node in reversed(nodes):
+                node.destroy_node()
+            rclpy.try_shutdown()
     return 0
 
 

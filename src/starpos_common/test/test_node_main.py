@@ -163,3 +163,39 @@ def test_a_thread_at_work_does_not_hold_up_the_end():
     command = [sys.executable, "-c", script]
     ended = subprocess.run(command, check=False, capture_output=True, text=True, timeout=WAIT_S)
     assert (ended.returncode, ended.stdout) == (3, "said\n")
+
+
+STUCK = """
+import ctypes, sys
+from starpos_common import node_main
+from starpos_common.node_main import run
+
+node_main.MAX_END_S = 0.5
+
+def make_nodes():
+    from rclpy.node import Node
+    class Stuck(Node):
+        def __init__(self):
+            super().__init__("stuck")
+            self.create_timer(0.01, lambda: print("spinning", flush=True))
+        def close(self):
+            print("closed", flush=True)
+        def destroy_node(self):
+            # keeps Python's lock, as the middleware does
+            ctypes.PyDLL(None).sleep(100000)
+    yield Stuck()
+
+sys.exit(run(make_nodes))
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_middleware_that_never_ends_does_not_keep_the_process(number):
+    process = subprocess.Popen([sys.executable, "-c", STUCK], stdout=subprocess.PIPE, text=True)
+    try:
+        await_line(process, "spinning")
+        process.send_signal(number)
+        said, _ = process.communicate(timeout=WAIT_S)
+    finally:
+        process.kill()
+    assert process.returncode == 0 and "closed" in said

@@ -179,9 +179,8 @@ class DashboardNode(Node):
             return Diagnosis(Level.ERROR, f"{trouble}: start the dashboard again", values)
         return Diagnosis(Level.OK, f"shown at {self._url}", values)
 
-    def destroy_node(self) -> None:
+    def close(self) -> None:
         self._server.stop()
-        super().destroy_node()
 
 
 def names(text: str) -> frozenset[str]:

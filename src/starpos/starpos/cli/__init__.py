@@ -3,6 +3,7 @@
 """The command `starpos`: the instrument without ROS, for a night that is on disk.  Each command has a file."""
 
 import argparse
+import io
 import os
 import sys
 import warnings
@@ -209,13 +210,28 @@ def complete() -> None:
         autocomplete(parser_for(words[1:]), exclude=["-h"])
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Run one command; returns 0 for success, 1 for no result, 2 for a bad call or unreadable input."""
-    complete()
-    given = sys.argv[1:] if argv is None else argv
-    # numpy, which reads these, is loaded with the command
+def guard_surroundings() -> None:
+    """Make any inherited environment and terminal do: letters that it lacks are escaped, no window is drawn in."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
+    # numpy and matplotlib, which read these, are loaded with the command; a notebook's backend is of no use here
     for name in BLAS_THREADS:
         os.environ.setdefault(name, "1")
+    os.environ.pop("MPLBACKEND", None)
+
+
+def drop_output() -> None:
+    """Let what is still to be written go nowhere, so that the interpreter's end does not fail on it."""
+    with suppress(OSError, ValueError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run one command; returns 0 for success, 1 for no result, 2 for a bad call, unreadable input or lost output."""
+    complete()
+    given = sys.argv[1:] if argv is None else argv
+    guard_surroundings()
     try:
         args = parser_for(given).parse_args(given)
     except ModuleNotFoundError as e:
@@ -226,6 +242,9 @@ def main(argv: list[str] | None = None) -> int:
     try:
         with warnings.catch_warnings():
             warnings.showwarning = _one_line_each(args.command)
+            # PYTHONWARNINGS may make errors of them
+            if sys.warnoptions:
+                warnings.simplefilter("default")
             status: int = args.run(args)
         # a reader that has gone must be noticed here, and not while the interpreter ends
         sys.stdout.flush()
@@ -235,7 +254,14 @@ def main(argv: list[str] | None = None) -> int:
         return BAD_CALL
     # the reader of our output has gone, as in `starpos ... | head`
     except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        drop_output()
         return 0
+    except OSError as e:
+        # an error of a file names it
+        if e.filename is not None:
+            raise
+        drop_output()
+        print(f"starpos {args.command}: its output cannot be written ({e.strerror})", file=sys.stderr)
+        return BAD_CALL
     except KeyboardInterrupt:
         return 130

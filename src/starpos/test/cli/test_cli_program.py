@@ -132,6 +132,38 @@ def test_a_reader_that_goes_away_is_no_error(lists):
     assert errors == b""
 
 
+def _program(words, output=subprocess.PIPE, **variables):
+    return subprocess.run(
+        [sys.executable, "-m", "starpos", *map(str, words)],
+        stdout=output,
+        stderr=subprocess.PIPE,
+        text=True,
+        errors="replace",
+        env=os.environ | variables,
+        timeout=WAIT_S,
+        check=False,
+    )
+
+
+def test_a_full_disk_is_a_line(lists):
+    with open("/dev/full", "w") as full:
+        done = _program(["identify", *WIDE, *lists.glob("stars_*.csv")], output=full)
+    assert done.returncode == 2 and done.stderr.count("\n") == 1 and "cannot be written" in done.stderr
+
+
+@pytest.mark.parametrize("form", ["", "--csv"])
+def test_letters_that_a_terminal_lacks_are_escaped(lists, tmp_path, form):
+    named = tmp_path / "\u043d\u043e\u0447\u044c.csv"
+    named.write_bytes(next(lists.glob("stars_*.csv")).read_bytes())
+    done = _program(["identify", *WIDE, *([form] if form else []), named], PYTHONIOENCODING="cp1252")
+    assert done.returncode == 0 and "\\u043d" in done.stdout, done.stderr
+
+
+def test_warnings_that_the_environment_makes_errors_are_lines(tmp_path):
+    done = _program(["doctor"], PYTHONWARNINGS="error")
+    assert "Traceback" not in done.stderr
+
+
 def test_progress_is_told_where_no_terminal_is(capsys, monkeypatch):
     monkeypatch.setattr(console, "LINE_EVERY_S", -1.0)
     console.ProgressBar()("star triangles", 0.25)
