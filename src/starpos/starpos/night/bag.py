@@ -126,7 +126,7 @@ def each_frame(r: Recorded) -> Iterator[tuple[str, Stars | FrameError]]:
             if connection.msgtype == STARS:
                 yield named_stars(message)
             elif connection.msgtype == CAPTURE:
-                messages.take_capture(message)
+                messages.receive_capture(message)
             else:
                 yield named_image(connection.msgtype, message, messages)
 
