@@ -453,7 +453,7 @@ def _work(
     air = options.atmosphere_of(args)
     # without a frame that can be read, each one reports why it cannot
     if about is None:
-        return Solving(Given(None), air)
+        return Solving(Given(None), atmosphere=air)
     tilt = None if night.tilt is None else Path(night.tilt)
     work, remarks = work_of(given_of(args, about), about, tilt, air, place)
     for remark in remarks:

@@ -347,7 +347,7 @@ def exposures(r: Recorded, instruments: Instruments, atmosphere: Atmosphere, ver
         origin=f"solved from stars and tilt of the bag {r.path.name}, namespace {r.namespace}",
         count=r.star_count,
         each=each,
-        work=Solving(instruments, atmosphere, tilts),
+        work=Solving(instruments, atmosphere=atmosphere, tilts=tilts),
         vertical=vertical,
         truth=r.truth,
         remarks=r.remarks,

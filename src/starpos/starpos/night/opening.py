@@ -49,7 +49,7 @@ def exposures(
     """
     frames, read = frames_in(folder), Reader()
     first = First(read)(tuple(map(str, frames)))
-    work, remarks = Solving(given, atmosphere, None, place), tuple[Remark, ...]()
+    work, remarks = Solving(given, atmosphere=atmosphere, places=place), tuple[Remark, ...]()
     if first is not None:
         try:
             work, remarks = work_of(given, first, folder / TILTS, atmosphere, place)
@@ -83,12 +83,12 @@ def work_of(
     """
     instruments, remarks = given.framed(first)
     if tilts is None:
-        return Solving(instruments, atmosphere, None, place), remarks
+        return Solving(instruments, atmosphere=atmosphere, places=place), remarks
     known = instruments.instrument
     noise_rad = SCA100T_NOISE_RAD if known is None else known.inclinometer.noise_rad
     table = TiltFile(os.path.abspath(tilts), noise_rad)
     doubts = of_tilts(table.log, str(tilts))
-    return Solving(instruments, atmosphere, table, place), (*remarks, *doubts)
+    return Solving(instruments, atmosphere=atmosphere, tilts=table, places=place), (*remarks, *doubts)
 
 
 def frames_in(folder: Path) -> list[Path]:

@@ -4,7 +4,7 @@
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import KW_ONLY, dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 from starpos.earth.place import Places
@@ -72,6 +72,7 @@ class Solving:
     """
 
     instruments: Instruments
+    _: KW_ONLY
     atmosphere: Atmosphere = field(default_factory=lambda: Atmosphere.measured(None, None))
     tilts: Tilts | None = None
     places: Places | None = None
