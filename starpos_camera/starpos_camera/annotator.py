@@ -39,7 +39,7 @@ class Annotator:
     """Publishes sensor_msgs/Image on `~/image_annotated` for a node that detects stars.
 
     If there is a solver, the frame waits for its solver/solution. Frames that come meanwhile are left out, so that at
-    most one is kept, and none without subscribers. The node calls `take` and `stop` in its executor.
+    most one is kept, and none without subscribers. The node calls `offer` and `stop` in its executor.
     """
 
     def __init__(self, node: Node) -> None:
@@ -60,7 +60,7 @@ class Annotator:
     def stop(self) -> None:
         self._worker.stop()
 
-    def take(self, frame: Frame, stars: Stars, header: Header) -> None:
+    def offer(self, frame: Frame, stars: Stars, header: Header) -> None:
         """Offer a frame whose stars have just been published under `header`."""
         if not self._publisher.get_subscription_count():
             self._forget()

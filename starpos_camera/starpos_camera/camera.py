@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import rclpy.parameter
 from rclpy.clock import Clock
@@ -18,6 +18,7 @@ from sensor_msgs.msg import CameraInfo, Image
 from sensor_msgs.srv import SetCameraInfo
 from std_msgs.msg import Header
 
+from starpos import system_clock
 from starpos.errors import InstrumentError, StarposError
 from starpos.files import path_of
 from starpos.frames.exposure import Shutter
@@ -27,7 +28,6 @@ from starpos.instrument.camera import Camera
 from starpos.instrument.instrument import focal_px_of
 from starpos.messages.camera import message_to_camera
 from starpos.parameters.table import parameters_of
-from starpos.session import system_clock
 from starpos_camera.sources.registry import SOURCES
 from starpos_camera.sources.source import CapturedFrame, CaptureSettings, FrameSource, NothingYet, SourceEnded
 from starpos_camera.sources.timing import OF_SYSTEM_CLOCK, ShutterTimes, in_one_time
@@ -38,6 +38,9 @@ from starpos_common.topics import publisher, subscription
 from starpos_common.worker import Worker
 from starpos_interfaces.msg import Capture, Pulse
 from starpos_interfaces.srv import SetCapture
+
+if TYPE_CHECKING:
+    from starpos_camera.detector import DetectorNode
 
 # Time for which a trouble is shown; diagnostics come once a second.
 SHOWN_S = 5.0
@@ -59,17 +62,6 @@ class Taken:
     camera: Camera | None
     remark: str
     seconds: float
-
-
-class Taker(Protocol):
-    """A receiver of frames in the same process."""
-
-    @property
-    def wanted(self) -> bool:
-        """Whether its results have subscribers."""
-
-    def submit(self, frame: Frame, header: Header) -> None:
-        """Take a frame; returns at once."""
 
 
 class CameraNode(Node):
@@ -107,7 +99,7 @@ class CameraNode(Node):
         self._last_took_s = 0.0
         # Columns and rows of the frames.
         self._size: tuple[int, int] | None = None
-        self._takers: list[Taker] = []
+        self._detectors: list[DetectorNode] = []
         self._ended = False
         self._state = (Level.WARN, "no frame has been taken yet.")
         self._said_s = -math.inf
@@ -118,7 +110,7 @@ class CameraNode(Node):
         self.create_service(SetCameraInfo, "~/set_camera_info", self._on_set_camera_info)
         self.create_service(SetCapture, "~/set_capture", self._on_set_capture)
         self._wake = self.create_guard_condition(self._on_wake)
-        self._worker = Worker(self._take, self._wake.trigger, "capture")
+        self._worker = Worker(self._prepare, self._wake.trigger, "capture")
         self._clock_report = ClockReport(self, self._stamped_by_system)
         tasks: dict[str, Callable[[], Diagnosis]] = {"Capture": self._report, "Clock": self._clock_report}
         self._diagnostics = Diagnostics(self, tasks, self._source.hardware_id)
@@ -134,9 +126,9 @@ class CameraNode(Node):
         self._source.close()
         self._worker.stop()
 
-    def hand_to(self, taker: Taker) -> None:
+    def hand_to(self, detector: "DetectorNode") -> None:
         """Give each frame to a detector in this process too, without a copy, in the executor's thread."""
-        self._takers.append(taker)
+        self._detectors.append(detector)
 
     def _now_s(self) -> float:
         return self.get_clock().now().nanoseconds * 1e-9
@@ -165,21 +157,22 @@ class CameraNode(Node):
         elif self._source.waits_for_listener and not self._frames and not self._heard():
             # Missing parts are reported first, because a subscriber would not help.
             lack = self._source.lacking()
-            waiting = f"waiting for a subscriber of {self._images.topic_name}{' or of the stars' * bool(self._takers)}."
+            stars = " or of the stars" if self._detectors else ""
+            waiting = f"waiting for a subscriber of {self._images.topic_name}{stars}."
             self._say(Level.WARN if lack else Level.OK, lack or waiting)
         else:
             self._worker.offer(_settings(self._values))
 
     def _heard(self) -> bool:
-        return self._images.get_subscription_count() > 0 or any(t.wanted for t in self._takers)
+        return self._images.get_subscription_count() > 0 or any(d.wanted for d in self._detectors)
 
-    def _take(self, settings: CaptureSettings) -> Taken:
+    def _prepare(self, settings: CaptureSettings) -> Taken:
         """Take a frame and make it ready to be published, in the worker's thread."""
         begin = time.monotonic()
         if time_is_simulated(self):
             exposure, clock = self._source.capture(settings), None
         else:
-            exposure = self._captured(settings)
+            exposure = self._capture(settings)
             # If the source states an error, the clock is another machine's.
             ours = exposure.stamp_source in OF_SYSTEM_CLOCK and not exposure.frame.clock_stddev_s
             clock = system_clock.read() if ours else None
@@ -207,12 +200,12 @@ class CameraNode(Node):
             seconds=time.monotonic() - begin,
         )
 
-    def _captured(self, settings: CaptureSettings) -> CapturedFrame:
+    def _capture(self, settings: CaptureSettings) -> CapturedFrame:
         if self._shutter is None:
             return in_one_time(lambda: self._source.capture(settings), self._clock_report.watch)
         since_s = self._now_s()
         exposure = in_one_time(lambda: self._source.capture(settings), self._clock_report.watch)
-        return self._shutter.timed(exposure, since_s, self._now_s())
+        return self._shutter.date_frame(exposure, since_s, self._now_s())
 
     def _on_wake(self) -> None:
         for result in self._worker.fetch():
@@ -235,15 +228,15 @@ class CameraNode(Node):
                 self._publish(result)
 
     def _publish(self, taken: Taken) -> None:
-        frame, camera = taken.frame, self._camera(taken)
+        frame, camera = taken.frame, self._intrinsics(taken)
         info = camera_to_message(camera, taken.capture.header.frame_id)
         info.header = taken.capture.header
         self._captures.publish(taken.capture)
         self._infos.publish(info)
         if taken.image is not None:
             self._images.publish(taken.image)
-        for taker in self._takers:
-            taker.submit(frame, taken.capture.header)
+        for detector in self._detectors:
+            detector.submit(frame, taken.capture.header)
         self._frames += 1
         self._last, self._last_took_s = taken.capture, taken.seconds
         self._size = frame.width, frame.height
@@ -258,7 +251,7 @@ class CameraNode(Node):
         else:
             self._say(Level.OK, f"taking frames of {frame.width} x {frame.height} px.")
 
-    def _camera(self, taken: Taken) -> Camera:
+    def _intrinsics(self, taken: Taken) -> Camera:
         if known := self._calibration or taken.camera:
             return known
         focal_px = focal_px_of(self._values["focal_mm"], self._values["pixel_um"])

@@ -3,6 +3,7 @@
 
 import itertools
 import math
+import threading
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
@@ -74,7 +75,7 @@ class FrameTopics:
     @property
     def takes(self) -> dict[str, Take]:
         """What takes the messages of each topic."""
-        return {RAW: self._take_raw, self.compressed_topic: self._take_compressed}
+        return {RAW: self._pass_raw, self.compressed_topic: self._pass_compressed}
 
     def listen(self, taker: Callable[[str], Take], both: bool) -> None:
         """Subscribe; taker gives the callback of a topic, which calls the one in `takes` when a message has its turn.
@@ -133,16 +134,16 @@ class FrameTopics:
         if self._compressed is not None:
             self._compressed.look()
 
-    def _take_raw(self, message: Image, info: Mapping[str, Any]) -> None:
+    def _pass_raw(self, message: Image, info: Mapping[str, Any]) -> None:
         self._raw_sends = True
-        self._take_once(message, info, CompressedImage)
+        self._pass_once(message, info, CompressedImage)
 
-    def _take_compressed(self, message: CompressedImage, info: Mapping[str, Any]) -> None:
+    def _pass_compressed(self, message: CompressedImage, info: Mapping[str, Any]) -> None:
         if not self._raw_sends:
-            self._take_once(message, info, Image)
+            self._pass_once(message, info, Image)
 
-    def _take_once(self, message: Any, info: Mapping[str, Any], other: type) -> None:
-        """Take a message, unless its frame has come on the other topic."""
+    def _pass_once(self, message: Any, info: Mapping[str, Any], other: type) -> None:
+        """Pass a message on, unless its frame has come on the other topic."""
         self._stamps[type(message)] = key_of(message.header)
         if self._stamps.get(other) != key_of(message.header):
             self._take(message, info)
@@ -165,14 +166,6 @@ MAX_HELD = 3
 LOOK_S = 0.1
 # Silence is reported after this time, and after three times the interval between the last two frames.
 MIN_SILENCE_S = 5.0
-
-
-@dataclass(frozen=True, eq=False)
-class Job:
-    """A function that makes a frame, which may take long, and the header of its stars."""
-
-    frame: Callable[[], Frame]
-    header: Header
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,6 +209,8 @@ class DetectorNode(Node):
         self._captures_come: Callable[[], int] = lambda: 0
         self._annotator = Annotator(self)
         self._trails: Trails | None = None
+        # Held while the trails are used: the executor gives them readings, the worker's thread asks for a frame's.
+        self._turning = threading.Lock()
         if self._values["gyro"]:
             self._trails = Trails(self._values["calibration_url"])
             best_effort = ReliabilityPolicy.BEST_EFFORT
@@ -271,13 +266,9 @@ class DetectorNode(Node):
         self._offer(lambda: frame, header)
 
     def _offer(self, make: Callable[[], Frame], header: Header) -> None:
-        job = Job(make, header)
-        if self._trails is not None:
-            # the readings are taken in this thread
-            frame = self._trails.told(make())
-            job = Job(lambda: frame, header)
+        """Have the worker find the stars of the frame that `make` decodes, which may take long."""
         self._pace.took(time.monotonic())
-        if self._worker.offer(job):
+        if self._worker.offer((make, header)):
             self._drop()
 
     def _drop(self, frames: int = 1) -> None:
@@ -287,15 +278,16 @@ class DetectorNode(Node):
     def _on_imu(self, message: Imu) -> None:
         # in a replay the stars would depend on which readings came before a frame
         if not time_is_simulated(self):
-            self._tell_trails("imu/data", lambda trails: trails.take_imu(message))
+            self._tell_trails("imu/data", lambda trails: trails.receive_imu(message))
 
     def _on_camera(self, message: CameraInfo, info: Mapping[str, Any]) -> None:
-        self._tell_trails("camera_info", lambda trails: trails.take_camera(message))
+        self._tell_trails("camera_info", lambda trails: trails.receive_camera(message))
 
     def _tell_trails(self, name: str, tell: Callable[[Trails], None]) -> None:
         assert self._trails is not None
         try:
-            tell(self._trails)
+            with self._turning:
+                tell(self._trails)
             self._troubles.right(name)
         except StarposError as error:
             self._troubles.wrong(name, str(error))
@@ -386,15 +378,19 @@ class DetectorNode(Node):
             self._drop(sequence - last - 1)
         self._sequence = kind, sequence
 
-    def _detect(self, job: Job) -> DetectedFrame:
+    def _detect(self, job: tuple[Callable[[], Frame], Header]) -> DetectedFrame:
         """Find the stars of a frame, in the worker's thread."""
         # The CPU time of this thread alone: others may draw or render meanwhile.
         begin, cpu = time.monotonic(), time.thread_time()
-        frame = job.frame()
+        make, header = job
+        frame = make()
+        if self._trails is not None:
+            with self._turning:
+                frame = self._trails.told(frame)
         detection = detect(frame, self._settings)
-        message = stars_to_message(detection.stars, job.header.frame_id)
+        message = stars_to_message(detection.stars, header.frame_id)
         # The stamp must be the frame's to the nanosecond, because others match messages by it.
-        message.header = job.header
+        message.header = header
         cpu_ms = (time.thread_time() - cpu) * 1e3
         return DetectedFrame(frame, message, detection, cpu_ms, time.monotonic() - begin)
 
@@ -408,7 +404,7 @@ class DetectorNode(Node):
                 self._troubles.right("frames")
                 if result.frame is not None:
                     self._say_size(result.frame)
-                    self._annotator.take(result.frame, result.detection.stars, result.message.header)
+                    self._annotator.offer(result.frame, result.detection.stars, result.message.header)
                 self._last = replace(result, frame=None)
             elif isinstance(result, StarposError):
                 self._complain(str(result))

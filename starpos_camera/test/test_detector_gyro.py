@@ -1,13 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """The node `detector` with `gyro`: a star is found by the trail from the readings, and not without."""
 
+import threading
+import time
 from dataclasses import replace
 
 import numpy as np
 import pytest
+import rclpy
 from geometry_msgs.msg import Vector3
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
-from sensor_msgs.msg import CameraInfo, Imu
+from sensor_msgs.msg import CameraInfo, Image, Imu
 from std_msgs.msg import Header
 from test_detector import Feed
 
@@ -15,7 +20,11 @@ from starpos.detection import detect
 from starpos.frames.exposure import Trail
 from starpos.frames.frame import Frame
 from starpos.instrument.camera import Camera
-from starpos_common.messages import camera_to_message, unix_to_stamp
+from starpos_camera import detector
+from starpos_camera.detector import DetectorNode
+from starpos_common.messages import camera_to_message, frame_to_message, unix_to_stamp
+from starpos_interfaces.msg import StarArray
+from starpos_testing.patience import WAIT_S
 from starpos_testing.skies.rendered import field, noisy
 
 FOCAL_PX, EXPOSURE_S, TRAIL = 5000.0, 0.02, (9.0, -12.0)
@@ -56,3 +65,44 @@ def test_a_star_is_found_by_the_trail_that_the_readings_tell(feed, listener):
         return len(stars) == 1 and abs(stars[0].x - told.x[0]) < 1e-4
 
     listener.wait(as_told)
+
+
+def test_a_picture_that_takes_long_to_decode_leaves_the_executor_free(monkeypatch, frame):
+    """The picture of the compressed topic is decoded in the worker's thread, with a gyro as without one."""
+    context = rclpy.Context()
+    rclpy.init(context=context)
+    node = DetectorNode(context=context, parameter_overrides=[Parameter("gyro", value=True)])
+    executor = SingleThreadedExecutor(context=context)
+    executor.add_node(node)
+    node.listen()
+    begun, go_on, threads, stars = threading.Event(), threading.Event(), [], []
+
+    def slow(message):
+        threads.append(threading.current_thread())
+        begun.set()
+        assert go_on.wait(WAIT_S)
+        return frame
+
+    monkeypatch.setattr(detector, "message_to_frame", slow)
+    node.create_subscription(StarArray, "stars", stars.append, 10)
+    sender = node.create_publisher(Image, "camera/image_raw", 10)
+    ticks = []
+    node.create_timer(0.01, lambda: ticks.append(begun.is_set()))
+    try:
+        message = frame_to_message(frame, "optical")
+        end_s = time.monotonic() + WAIT_S
+        while not stars:
+            assert time.monotonic() < end_s
+            if not begun.is_set():
+                message.header.stamp.sec += 1
+                sender.publish(message)
+            # the executor has gone on while the picture is being decoded
+            if sum(ticks) > 5:
+                go_on.set()
+            executor.spin_once(timeout_sec=0.05)
+    finally:
+        go_on.set()
+        executor.shutdown()
+        node.destroy_node()
+        rclpy.shutdown(context=context)
+    assert threading.current_thread() not in threads

@@ -2,8 +2,10 @@
 """The source `gphoto2`, on libgphoto2 with its virtual USB camera, a Nikon D750 that returns the pictures of a folder."""
 
 import re
+import threading
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -12,6 +14,7 @@ from attempts import SHORT, attempt, in_thread
 from sensor_msgs.msg import Image
 
 from starpos.parameters.table import defaults_of
+from starpos_camera.sources import gphoto2 as gphoto2_source
 from starpos_camera.sources.gphoto2 import RAW_ALONE, Gphoto2, named_off_s, nearest, seconds, sentence
 from starpos_camera.sources.source import CaptureError, CaptureSettings
 from starpos_interfaces.msg import Capture
@@ -216,6 +219,26 @@ def test_a_camera_that_is_not_there_is_said_with_those_that_are(make):
     assert not isinstance(attempt(there), str)
     there = make(gphoto2__model="Nikon DSC D750", gphoto2__port="usb:001,001")
     assert not isinstance(attempt(there), str)
+
+
+@pytest.mark.parametrize("exposure_s", [0.5, 30.0])
+def test_the_waiting_time_that_is_named_is_the_one_that_was_waited(folder, monkeypatch, exposure_s):
+    """On a clock of its own, which the waiting alone moves, of a camera that never gives a file."""
+    now, closing = [100.0], threading.Event()
+    monkeypatch.setattr(gphoto2_source.time, "monotonic", lambda: now[0])
+    camera = gphoto2_source.Gphoto2Camera("", "", closing)
+
+    def wait(ms):
+        now[0] += ms / 1000
+        return camera._gp.GP_EVENT_TIMEOUT, None
+
+    camera._camera = SimpleNamespace(wait_for_event=wait, exit=lambda: None)
+    monkeypatch.setattr(closing, "wait", lambda seconds: wait(1000 * seconds))
+    with pytest.raises(CaptureError) as given_up:
+        camera.files(exposure_s)
+    (named_s,) = re.findall(r"in (\d+) s", str(given_up.value))
+    # with noise reduction a dark frame as long as the exposure comes first
+    assert float(named_s) == pytest.approx(now[0] - 100, abs=0.6) and now[0] - 100 > 2 * exposure_s
 
 
 def test_closing_ends_a_capture_soon(make):

@@ -123,7 +123,7 @@ def test_what_another_client_has_set_does_not_stay(source, other):
     other.tell("Switch", "CCD_TRANSFER_FORMAT", FORMAT_NATIVE="On")
     other.tell("Number", "CCD_BINNING", HOR_BIN=2, VER_BIN=2)
     other.tell("Number", "CCD_FRAME", X=10, Y=20, WIDTH=300, HEIGHT=200)
-    server = source._server
+    server = source._device
     heard = server.until(lambda: server.device(DEVICE).number("CCD_FRAME", "X") == 10, WAIT_S)
     # All that was set before is there.
     assert server.run(heard)

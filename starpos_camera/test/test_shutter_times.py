@@ -48,7 +48,7 @@ class Reflex:
             stamp_stddev_s=0.3,
             pixels=PIXELS,
         )
-        got = self.times.timed(CapturedFrame(frame, source), told_s, begin_s + EXPOSURE_S + 0.1)
+        got = self.times.date_frame(CapturedFrame(frame, source), told_s, begin_s + EXPOSURE_S + 0.1)
         return got, begin_s + EXPOSURE_S / 2
 
 

@@ -14,7 +14,7 @@ from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
-from starpos.session.system_clock import StepWatch
+from starpos.system_clock import StepWatch
 
 # If reading both clocks takes longer, they are read again.
 QUICK_S = 1e-3
@@ -27,6 +27,10 @@ class Moment:
 
     monotonic_s: float
     host_ns: int
+
+    def stamp_ns(self, late_s: float) -> int:
+        """The host's time so long before."""
+        return max(self.host_ns - round(late_s * 1e9), 0)
 
 
 @dataclass(frozen=True, slots=True)

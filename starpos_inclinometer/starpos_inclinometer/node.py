@@ -9,6 +9,7 @@ from typing import Any
 from rclpy.node import Node
 from rclpy.time import Time
 
+from starpos.messages.tilt import OUT_OF_RANGE, SATURATED, STUCK, Reading
 from starpos.parameters.table import parameters_of
 from starpos_common.diagnostics import Diagnosis, Diagnostics, Level, time_is_simulated
 from starpos_common.parameters import declare
@@ -16,17 +17,7 @@ from starpos_common.replayed import Replayed
 from starpos_common.topics import Take, publisher
 from starpos_inclinometer.clock import HostClock, Step
 from starpos_inclinometer.sources.registry import SOURCES, refusal
-from starpos_inclinometer.sources.source import (
-    OUT_OF_RANGE,
-    SATURATED,
-    STUCK,
-    Counts,
-    Health,
-    Phase,
-    Reading,
-    Surroundings,
-    TimedPulse,
-)
+from starpos_inclinometer.sources.source import Counts, Health, Phase, Surroundings, TimedPulse
 from starpos_interfaces.msg import Pulse, Tilt
 
 # Above this share of corrupted or lost lines since the last report the link gets a warning.
@@ -123,8 +114,8 @@ class InclinometerNode(Node):
         self.host_clock = HostClock(self._now_ns, lambda: time_is_simulated(self))
         host = Surroundings(self, self.host_clock, self._wake.trigger, self._in_turn, time_is_simulated(self))
         self._source = SOURCES[self._values["source"]](host, self._values)
-        if host.replays and self._source.takes:
-            takes = {name: self._at_once(take) for name, take in self._source.takes.items()}
+        if host.replays and self._source.handlers:
+            takes = {name: self._at_once(take) for name, take in self._source.handlers.items()}
             self._replayed = Replayed(
                 self, takes, [self._publisher], busy=lambda: False, begin=self._source.restart
             )
@@ -162,13 +153,13 @@ class InclinometerNode(Node):
     def _publish_readings(self) -> bool:
         """Publish what the source has; return whether one has a flag that was not reported yet."""
         urgent = False
-        for reading in self._source.take():
+        for reading in self._source.fetch():
             message = self._message(reading)
             self._publisher.publish(message)
             urgent |= self._reporter.count(reading.flags)
             if self._replayed is not None:
                 self._replayed.note(message.header.stamp)
-        for pulse in self._source.take_pulses():
+        for pulse in self._source.fetch_pulses():
             self._pulses.publish(_pulse_message(pulse))
         return urgent
 

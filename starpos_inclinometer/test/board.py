@@ -97,7 +97,7 @@ class Board:
 
     def parse(self, data) -> list:
         """Every message in the bytes, samples with what was lost before them: no other judgement."""
-        messages = self.parser.feed(data)
+        messages = self.parser.parse(data)
         return [self.continuity.follow(m) if isinstance(m, Sample) else m for m in messages]
 
     def close(self) -> str:

@@ -51,7 +51,7 @@ def decode(decoder, received, first=0):
     for begin in range(0, len(received), RATE_HZ):
         part = received[begin : begin + RATE_HZ]
         moment = Moment((first + begin + len(part)) / RATE_HZ, 0)
-        for arrival in decoder.feed(part.tobytes(), moment):
+        for arrival in decoder.decode(part.tobytes(), moment):
             yield arrival.sample
         if decoder.command() == mcu_protocol.identify_command():
-            decoder.feed(IDENTITY, moment)
+            decoder.decode(IDENTITY, moment)

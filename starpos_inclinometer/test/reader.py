@@ -7,7 +7,8 @@ import time
 from starpos_inclinometer.clock import HostClock
 from starpos_inclinometer.sources.mcu import McuDecoder
 from starpos_inclinometer.sources.mcu_protocol import BAUD
-from starpos_inclinometer.sources.serial_link import LinkState, SerialLink
+from starpos_inclinometer.sources.serial_link import SerialLink
+from starpos_inclinometer.sources.source import Health
 from starpos_testing.patience import WAIT_S
 
 
@@ -27,14 +28,14 @@ class Reader:
 
     def _wake(self):
         with self._event:
-            self.samples += self.link.take()
+            self.samples += self.link.fetch()
             self._event.notify_all()
 
-    def wait(self, condition) -> LinkState:
+    def wait(self, condition) -> Health:
         """The state, once condition(state, samples) is true."""
         with self._event:
-            met = self._event.wait_for(lambda: condition(self.link.state(), self.samples), WAIT_S)
-        state = self.link.state()
+            met = self._event.wait_for(lambda: condition(self.link.health(), self.samples), WAIT_S)
+        state = self.link.health()
         assert met, state
         return state
 

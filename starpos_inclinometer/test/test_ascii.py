@@ -11,11 +11,12 @@ import tty
 import numpy as np
 import pytest
 
+from starpos.messages.tilt import GAP, OUT_OF_RANGE, STUCK, TIME_UNKNOWN
 from starpos.parameters.table import defaults_of
 from starpos_inclinometer.clock import HostClock, Moment
 from starpos_inclinometer.sources.ascii_line import MAX_LINE, UNITS, AsciiSource, LineDecoder, TextLines
 from starpos_inclinometer.sources.registry import refusal
-from starpos_inclinometer.sources.source import GAP, OUT_OF_RANGE, STUCK, TIME_UNKNOWN, Phase, Surroundings
+from starpos_inclinometer.sources.source import Phase, Surroundings
 from starpos_testing.emulator import Pty
 from starpos_testing.patience import WAIT_S
 
@@ -40,7 +41,7 @@ class Feeder:
         for text in texts:
             self.now_s += 0.1
             data = text.encode("latin-1") + b"\r\n"
-            got += [a.sample for a in self.decoder.feed(data, Moment(self.now_s, 0))]
+            got += [a.sample for a in self.decoder.decode(data, Moment(self.now_s, 0))]
         return got
 
 
@@ -163,16 +164,16 @@ def test_lines_of_any_end_in_any_pieces():
     stream = b"1,2\r\n3,4\n5,6\r7,8\r\n\r\n" + b"x" * 1000 + b"\n9,10\n"
     for size in (1, 3, 7, 100, 5000):
         lines = TextLines()
-        got = [t for k in range(0, len(stream), size) for t in lines.feed(stream[k : k + size])]
+        got = [t for k in range(0, len(stream), size) for t in lines.split(stream[k : k + size])]
         assert got == ["1,2", "3,4", "5,6", "7,8", "9,10"]
         assert lines.garbage_bytes == 1000 and len(lines._rest) <= MAX_LINE
 
 
 def test_what_comes_first_on_a_new_connection_may_be_half_a_line():
     lines = TextLines()
-    lines.feed(b"1,23")
+    lines.split(b"1,23")
     lines.forget()
-    assert lines.feed(b"4,5\n6,7\n") == ["6,7"]
+    assert lines.split(b"4,5\n6,7\n") == ["6,7"]
 
 
 def test_a_million_bytes_of_anything_never_raise_and_are_never_believed():
@@ -181,7 +182,7 @@ def test_a_million_bytes_of_anything_never_raise_and_are_never_believed():
     alphabet = b"$TILT,0123456789.-+eE\r\n\x00\xff nai"
     for _ in range(250):
         noise = bytes(rng.choices(alphabet, k=2000)) + rng.randbytes(2000)
-        assert feeder.decoder.feed(noise, Moment(0.0, 0)) == []
+        assert feeder.decoder.decode(noise, Moment(0.0, 0)) == []
     lines = [f"$TILT,{k},{100 * k},1.25{k % 10},-2.50{k % 7},21.5\r\n".encode() for k in range(20_000)]
     said = {(k, 100 * k, f"1.25{k % 10}", f"-2.50{k % 7}") for k in range(20_000)}
     decoder, believed = LineDecoder(FULL, "deg"), 0
@@ -190,7 +191,7 @@ def test_a_million_bytes_of_anything_never_raise_and_are_never_believed():
         if rng.random() < 0.1:
             cut = rng.randrange(1, len(line) - 3)
             line = line[:cut]
-        for a in decoder.feed(line, Moment(0.1 * k, 0)):
+        for a in decoder.decode(line, Moment(0.1 * k, 0)):
             believed += 1
             s = a.sample
             x, y = (f"{math.degrees(v):.3f}" for v in (s.x, s.y))
@@ -273,7 +274,7 @@ def readings(path, enough, **parameters):
         while len(got) < enough:
             assert come.wait(WAIT_S), source.health()
             come.clear()
-            got += source.take()
+            got += source.fetch()
         return got, source.health()
     finally:
         source.stop()

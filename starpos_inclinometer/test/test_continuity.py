@@ -27,13 +27,13 @@ class Line:
     def __init__(self):
         self.decoder = McuDecoder(10)
         self.now_s = 100.0
-        self.decoder.feed(identity(), Moment(self.now_s, 0))
+        self.decoder.decode(identity(), Moment(self.now_s, 0))
 
     def send(self, *lines, apart_s=0.1):
         got = []
         for data in lines:
             self.now_s += apart_s
-            got += [a.sample for a in self.decoder.feed(data, Moment(self.now_s, 0))]
+            got += [a.sample for a in self.decoder.decode(data, Moment(self.now_s, 0))]
         return got
 
     @property
@@ -128,7 +128,7 @@ def test_a_leap_does_not_open_the_gate_for_what_comes_after(cable):
 def test_after_a_rejection_the_rate_is_asked_for_again(cable):
     """The MCU was reset to 10 Hz, and of what it said then nothing came through but samples."""
     cable.decoder.wanted_rate_hz = 50
-    cable.decoder.feed(identity(50), Moment(100.0, 0))
+    cable.decoder.decode(identity(50), Moment(100.0, 0))
     cable.send(*(line(k, ms=20 * k) for k in range(5)), apart_s=0.02)
     assert cable.decoder.command() == b""
     assert cable.send(*(line(k) for k in range(7, 12))) == []

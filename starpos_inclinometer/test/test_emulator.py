@@ -10,9 +10,10 @@ import sys
 import numpy as np
 import pytest
 
+from starpos.messages.tilt import OUT_OF_RANGE, SATURATED
 from starpos_inclinometer.sources import mcu_protocol
 from starpos_inclinometer.sources.mcu_protocol import Identity, LineParser, Reason, Refusal, SampleStatus
-from starpos_inclinometer.sources.tilts import OUT_OF_RANGE, SATURATED, Sca100t
+from starpos_inclinometer.sources.tilts import Sca100t
 from starpos_testing.emulator import Mcu, Pty
 from starpos_testing.patience import WAIT_S
 
@@ -27,7 +28,7 @@ def readings(mcu, n):
     sensor, parser = Sca100t(), LineParser()
     return [
         sensor.measure(s, s.milliseconds * 1e-3)
-        for s in parser.feed(b"".join(mcu.sample() for _ in range(n)))
+        for s in parser.parse(b"".join(mcu.sample() for _ in range(n)))
     ]
 
 
@@ -49,9 +50,9 @@ def test_beyond_its_range_it_says_so():
 
 def test_clock_and_sequence():
     mcu = Mcu(seed=1, rate_hz=20, drift_ppm=1000)
-    (identity,) = LineParser().feed(mcu.reset(5.0))
+    (identity,) = LineParser().parse(mcu.reset(5.0))
     assert identity == Identity(version=2, firmware=0x0200, unit=0x53494D00, rate_hz=20, delay_ms=24)
-    samples = LineParser().feed(b"".join(mcu.sample() for _ in range(101)))
+    samples = LineParser().parse(b"".join(mcu.sample() for _ in range(101)))
     assert samples[0].status == SampleStatus.FIRST and samples[1].status == 0
     # Its samples are due by its own clock, which is fast.
     assert samples[-1].milliseconds - samples[0].milliseconds == pytest.approx(5000, abs=1)
@@ -62,7 +63,7 @@ def test_commands_are_answered():
     mcu = Mcu(seed=1)
     parser = LineParser()
     stream = mcu_protocol.identify_command() + mcu_protocol.rate_command(25)
-    assert [m.rate_hz for m in parser.feed(mcu.receive(stream[:5]) + mcu.receive(stream[5:]))] == [10, 25]
+    assert [m.rate_hz for m in parser.parse(mcu.receive(stream[:5]) + mcu.receive(stream[5:]))] == [10, 25]
     stream = (
         mcu_protocol.frame(b"R,00")
         + mcu_protocol.frame(b"R,33")
@@ -72,7 +73,7 @@ def test_commands_are_answered():
     refusals = [
         Refusal(r) for r in (Reason.OUT_OF_RANGE, Reason.OUT_OF_RANGE, Reason.UNKNOWN, Reason.CHECKSUM)
     ]
-    assert parser.feed(mcu.receive(stream)) == refusals
+    assert parser.parse(mcu.receive(stream)) == refusals
 
 
 def test_a_link_replaces_a_link_but_nothing_else(tmp_path):

@@ -17,12 +17,13 @@ from corrupted import RATE_HZ, as_sent, decode, flipped, forged, lines
 from diagnostic_msgs.msg import DiagnosticArray
 from wire import Wire
 
+from starpos.messages.tilt import STUCK, TIME_UNKNOWN
 from starpos.parameters.table import defaults_of
 from starpos_inclinometer.clock import HostClock
 from starpos_inclinometer.node import Reporter
 from starpos_inclinometer.sources import mcu_protocol
 from starpos_inclinometer.sources.mcu import McuDecoder, McuSource
-from starpos_inclinometer.sources.source import STUCK, TIME_UNKNOWN, Phase, Surroundings
+from starpos_inclinometer.sources.source import Phase, Surroundings
 from starpos_interfaces.msg import Tilt
 from starpos_testing.emulator import Faults
 from starpos_testing.nodes import Listener, Process, take_domain
@@ -170,8 +171,8 @@ def test_microcontroller_reset(board, wire, read, tell):
     assert sequence == sorted(set(sequence))
     assert [s for s in wrong(reader, wire) if not s.restarted and s.sequence < sequence[first]] == []
     assert {(a.sample.x, a.sample.y) for a in reader.samples} <= {(s.x, s.y) for s in wire.sent}
-    state = reader.link.state()
-    assert (state.connections, state.counts.implausible, state.counts.lost) == (1, 0, 0)
+    state = reader.link.health()
+    assert (state.values["openings"], state.counts.implausible, state.counts.lost) == (1, 0, 0)
     tell(
         "MCU hangs, its watchdog resets it",
         f"samples again after {after - before:.1f} s, at the wanted rate, numbered on; 0 wrong",
@@ -275,7 +276,7 @@ class Taken:
         while not condition():
             assert self._come.wait(WAIT_S), self.source.health()
             self._come.clear()
-            self.readings += self.source.take()
+            self.readings += self.source.fetch()
 
 
 def test_converter_frozen(board, wire, node, ears, tell):
@@ -346,7 +347,7 @@ def test_two_processes_on_one_port(wire, node, ears, read, tell):
     n = len(reader.samples)
     reader.wait(lambda state, samples: len(samples) >= n + 50)
     assert not ears.tilts and wrong(reader, wire) == []
-    lost = reader.link.state().counts
+    lost = reader.link.health().counts
     assert (lost.lost, lost.crc_errors) == (0, 0)
     reader.link.stop()
     ears.wait(lambda: len(ears.tilts) >= 20)

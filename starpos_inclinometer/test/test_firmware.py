@@ -329,7 +329,7 @@ COMMANDS = [
 @pytest.mark.parametrize("command", COMMANDS, ids=lambda c: repr(c[-20:]))
 def test_answers_as_the_protocol_says(board, command):
     """The Python emulation reads the same bytes; only the delay is the board's own."""
-    said = LineParser().feed(Mcu().receive(command))
+    said = LineParser().parse(Mcu().receive(command))
     board.run(BOOT_MS)
     got = [m for m in board.messages(200, command + b"\r\n") if not isinstance(m, Sample)]
 

@@ -38,7 +38,7 @@ def test_the_link_sets_the_rate_and_sees_a_stuck_converter(board, read):
     board.tell("freeze 0")
     state = reader.wait(lambda state, samples: samples[-1].sample.status == 0)
     assert state.counts.crc_errors == state.counts.malformed == state.counts.lost == 0
-    assert (state.counts.restarts, state.counts.implausible, state.dropped) == (0, 0, 0)
+    assert (state.counts.restarts, state.counts.implausible, state.values["unfetched samples"]) == (0, 0, 0)
 
 
 def test_the_node_publishes_the_tilt_of_the_device(board):

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from board import ELF, FIRMWARE, Board
 
+from starpos.messages.tilt import OUT_OF_RANGE, STUCK
 from starpos_inclinometer.sources import mcu_protocol
 from starpos_inclinometer.sources.mcu_protocol import Identity, Sample, SampleStatus, SensorKind
-from starpos_inclinometer.sources.source import OUT_OF_RANGE, STUCK
 from starpos_inclinometer.sources.tilts import Scl3300
 from starpos_testing.emulator import DEFAULT_RATE_HZ
 

@@ -32,7 +32,7 @@ class Host:
 
     def take(self, data):
         moment = Moment(self.now_s, 1_700_000_000_000_000_000 + round(self.now_s * 1e9))
-        arrivals = self.decoder.feed(data, moment)
+        arrivals = self.decoder.decode(data, moment)
         self.samples += [a.sample for a in arrivals]
         for reading in self.tilts.read(arrivals):
             assert all(map(math.isfinite, (reading.x, reading.y, *reading.covariance)))
@@ -156,6 +156,6 @@ def test_the_ascii_decoders_memory_does_not_grow():
             line = b"1.%03d,-2.%03d\r\n" % (rng.randrange(20), rng.randrange(20))
             if rng.random() < 0.3:
                 line = mutated(line, rng)
-            decoder.feed(line, Moment(200.0 * k + 0.1 * i, 0))
+            decoder.decode(line, Moment(200.0 * k + 0.1 * i, 0))
 
     assert grown(feed, 10) < 5 * 5 * 2000

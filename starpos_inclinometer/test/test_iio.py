@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from iio_tree import adxl355, node, plug, scan, scl3300
 
+from starpos.messages.tilt import GAP, OUT_OF_RANGE, STUCK, TIME_UNKNOWN
 from starpos.parameters.table import defaults_of
 from starpos_inclinometer.clock import HostClock, Moment
 from starpos_inclinometer.sources.iio import IioLink, IioTilts
@@ -21,15 +22,7 @@ from starpos_inclinometer.sources.iio_device import (
     find,
     set_sampling_frequency,
 )
-from starpos_inclinometer.sources.source import (
-    GAP,
-    OUT_OF_RANGE,
-    STUCK,
-    TIME_UNKNOWN,
-    Arrival,
-    Phase,
-    Surroundings,
-)
+from starpos_inclinometer.sources.source import Arrival, Phase, Surroundings
 from starpos_testing.patience import WAIT_S
 
 DEFAULTS = defaults_of("inclinometer")
@@ -38,7 +31,7 @@ DEFAULTS = defaults_of("inclinometer")
 def arrivals(device, raws, period_s=0.01, dated=True):
     for k, raw in enumerate(raws):
         moment = Moment(100 + k * period_s, round(1.7e18 + k * period_s * 1e9))
-        yield Arrival(tuple(raw), moment, device if dated else None)
+        yield Arrival(tuple(raw), moment, device, dated)
 
 
 def test_an_scl3300_is_read_by_its_angles_with_its_presets_noise_and_temperature(tmp_path):
@@ -47,7 +40,7 @@ def test_an_scl3300_is_read_by_its_angles_with_its_presets_noise_and_temperature
     assert (device.model, device.kind, len(device.channels)) == ("scl3300", "incli", 3)
     tilts = IioTilts(DEFAULTS)
     (arrival,) = arrivals(device, [device.read_raw()])
-    reading = tilts.read(device, arrival)
+    reading = tilts.read(arrival)
     assert np.degrees([reading.x, reading.y, reading.z]) == pytest.approx([3.0, -1.5, 86.6], abs=0.003)
     # the sheet's -273 + TEMP / 18.9
     assert reading.temperature_c == pytest.approx(20.12, abs=0.01)
@@ -68,7 +61,7 @@ def test_offset_scale_and_range_are_the_channels_own(tmp_path):
     )
     device = find(tmp_path, "adis16209")
     (arrival,) = arrivals(device, [device.read_raw()])
-    reading = IioTilts(DEFAULTS).read(device, arrival)
+    reading = IioTilts(DEFAULTS).read(arrival)
     assert np.degrees([reading.x, reading.y]) == pytest.approx([2.5, -35.0])
     # its sheet's figures hold to 30 deg
     assert reading.flags == OUT_OF_RANGE and math.isnan(reading.z) and math.isnan(reading.temperature_c)
@@ -85,7 +78,7 @@ def test_accelerations_are_averaged_and_g_is_not_taken_for_metres(tmp_path):
         raw = rng.normal(up * one_g, one_g * noise, (60, 3)).round()
         temperature = [[1885.0]] * 60 if device.temperature else [[]] * 60
         raw = [(*r, *t) for r, t in zip(raw, temperature, strict=True)]
-        got = [r for a in arrivals(device, raw) if (r := tilts.read(device, a))]
+        got = [r for a in arrivals(device, raw) if (r := tilts.read(a))]
         assert len(got) == 1 and not tilts.forces.unrest
         assert np.degrees([got[0].x, got[0].y]) == pytest.approx([-3, 6], abs=0.02)
         sigma = math.sqrt(noise**2 / 50 + 1 / one_g**2 / 12)
@@ -97,18 +90,18 @@ def test_a_driving_accelerometer_gives_no_tilt(tmp_path):
     adxl355(tmp_path)
     device, tilts = find(tmp_path, ""), IioTilts(DEFAULTS)
     raw = [(30_000 * k, 0, 256417, 1885) for k in range(20)] * 3
-    assert [r for a in arrivals(device, raw) if (r := tilts.read(device, a))] == []
+    assert [r for a in arrivals(device, raw) if (r := tilts.read(a))] == []
     assert "m/s2" in tilts.forces.unrest
 
 
 def test_equal_readings_are_a_stuck_device_and_another_device_is_a_gap(tmp_path):
     scl3300(tmp_path)
     device, tilts = find(tmp_path, ""), IioTilts(DEFAULTS | {"iio.stuck_samples": 5})
-    flags = [tilts.read(device, a).flags for a in arrivals(device, [device.read_raw()] * 6)]
+    flags = [tilts.read(a).flags for a in arrivals(device, [device.read_raw()] * 6)]
     assert flags == [0] * 4 + [STUCK] * 2
     again = find(tmp_path, "")
     (arrival,) = arrivals(again, [(550, -273, 15760, 5540)], dated=False)
-    assert tilts.read(again, arrival).flags == GAP | TIME_UNKNOWN
+    assert tilts.read(arrival).flags == GAP | TIME_UNKNOWN
 
 
 @pytest.mark.parametrize(
@@ -208,6 +201,46 @@ def test_a_buffer_that_is_not_there_is_a_sentence(tmp_path):
         Buffer(find(tmp_path, "adxl355"), "any", tmp_path / "nowhere")
 
 
+@pytest.mark.parametrize("missing", ["dev/iio:device0", "iio:device0/scan_elements/in_temp_type"])
+def test_a_buffer_that_cannot_be_opened_is_off_again(tmp_path, missing):
+    """While the kernel fills it no program can read the device, and polling it would fail too."""
+    folder, nodes = adxl355(tmp_path), tmp_path / "dev"
+    nodes.mkdir()
+    writer = node(nodes)
+    (tmp_path / missing).unlink()
+    (folder / "buffer/enable").write_text("1\n")
+    with pytest.raises(DeviceError, match=r"check `iio\.trigger`"):
+        Buffer(find(tmp_path, ""), "adxl355-dev0", nodes)
+    assert (folder / "buffer/enable").read_text() == "0\n"
+    os.close(writer)
+
+
+@pytest.mark.parametrize("second", ["scl3300", "adis16209", "adxl355"])
+def test_another_device_has_its_own_noise(tmp_path, second):
+    """The first is ten times as noisy as any sheet says, and is replaced, as a number's owner is after a reboot."""
+    rng = np.random.default_rng(2)
+    scl3300(tmp_path)
+    values = DEFAULTS | {"iio.device": ""}
+    first, tilts = find(tmp_path, "scl3300"), IioTilts(values)
+    for a in arrivals(first, [(*rng.normal(0, 15, 3).round(), 5540.0) for _ in range(300)], 0.02):
+        tilts.read(a)
+    assert np.degrees(tilts.angles.noise.sigma[0]) > 0.05
+    if second == "adis16209":
+        shape = {"in_incli_scale": 0.025, "in_incli_x_raw": 0, "in_incli_y_raw": 0}
+        plug(tmp_path, 1, name=second, **shape)
+    elif second == "scl3300":
+        scl3300(tmp_path, 1)
+    else:
+        adxl355(tmp_path, 1)
+    device = find(tmp_path, "1")
+    raw = [device.read_raw()] * 60
+    got = [r for a in arrivals(device, raw, 0.01) if (r := tilts.read(a))]
+    assert got[0].flags & GAP
+    fresh = IioTilts(values)
+    alone = [r for a in arrivals(device, raw, 0.01) if (r := fresh.read(a))]
+    assert got[0].covariance == pytest.approx(alone[0].covariance)
+
+
 def test_a_device_that_goes_and_comes_back_is_read_again(tmp_path):
     """Comes back under another number, as the kernel may give it; a half-written value is dropped."""
     scl3300(tmp_path)
@@ -217,20 +250,20 @@ def test_a_device_that_goes_and_comes_back_is_read_again(tmp_path):
 
     def wait(condition):
         while not condition():
-            assert time.monotonic() < end_s, link.state()
-            link.take()
+            assert time.monotonic() < end_s, link.health()
+            link.fetch()
 
     link.start()
     try:
-        wait(lambda: link.state()[0] is Phase.RECEIVING)
+        wait(lambda: link.health().phase is Phase.RECEIVING)
         (tmp_path / "iio:device0/in_incli_x_raw").write_text("")
-        wait(lambda: link.state()[0] is Phase.GARBLED)
+        wait(lambda: link.health().phase is Phase.GARBLED)
         (tmp_path / "iio:device0/in_incli_x_raw").write_text("546\n")
-        wait(lambda: link.state()[0] is Phase.RECEIVING)
+        wait(lambda: link.health().phase is Phase.RECEIVING)
         shutil.rmtree(tmp_path / "iio:device0")
-        wait(lambda: link.state()[0] is Phase.ABSENT)
+        wait(lambda: link.health().phase is Phase.ABSENT)
         scl3300(tmp_path, 3)
-        wait(lambda: link.state()[0] is Phase.RECEIVING and "iio:device3" in link.state()[1])
-        assert link.connections == 2 and link.state()[3].malformed > 0
+        wait(lambda: link.health().phase is Phase.RECEIVING and "iio:device3" in link.health().sentence)
+        assert link.health().values["openings"] == 2 and link.health().counts.malformed > 0
     finally:
         link.stop()

@@ -11,8 +11,8 @@ import pytest
 from diagnostic_msgs.msg import DiagnosticArray
 from rcl_interfaces.srv import DescribeParameters
 
+from starpos.messages import tilt
 from starpos.parameters.table import parameters_of
-from starpos_inclinometer.sources import source
 from starpos_interfaces.msg import Tilt
 from starpos_testing.emulator import Mcu
 from starpos_testing.nodes import Listener, Process, take_domain
@@ -57,12 +57,12 @@ def start():
 
 
 def test_publishes_the_tilt_with_its_time_and_changes_rate(bench, start, listener):
-    tilt = (math.radians(3.0), math.radians(-1.0))
+    true = (math.radians(3.0), math.radians(-1.0))
     times = []
 
     def when(now):
         times.append(time.time())
-        return tilt
+        return true
 
     bench.plug(Mcu(when, seed=1))
     node = start(f"port:={bench.path}", "noise_stddev:=0.006", "rate:=20")
@@ -71,7 +71,7 @@ def test_publishes_the_tilt_with_its_time_and_changes_rate(bench, start, listene
     first = listener.tilts[0]
     assert first.header.frame_id == "starpos_inclinometer_frame"
     mean = [sum(getattr(t, axis) for t in listener.tilts) / len(listener.tilts) for axis in "xy"]
-    assert mean == pytest.approx(tilt, abs=4 * math.radians(0.0035) / math.sqrt(len(listener.tilts)))
+    assert mean == pytest.approx(true, abs=4 * math.radians(0.0035) / math.sqrt(len(listener.tilts)))
     assert list(first.covariance) == pytest.approx(
         [math.radians(0.006) ** 2, 0, 0, math.radians(0.006) ** 2], rel=1e-3
     )
@@ -165,4 +165,4 @@ def test_readme_names_every_parameter():
 
 def test_flags_are_those_of_the_message():
     for name in ("OUT_OF_RANGE", "STUCK", "SATURATED", "GAP", "TIME_UNKNOWN"):
-        assert getattr(source, name) == getattr(Tilt, name)
+        assert getattr(tilt, name) == getattr(Tilt, name)

@@ -48,7 +48,7 @@ def pull_of_means(tilts, sigmas, n):
 def test_claims_hold_at_every_rate_and_noise(rate_hz, noise_deg):
     mcu = Mcu(lambda now: (0.1, -0.2), math.radians(noise_deg), rate_hz=rate_hz, seed=rate_hz)
     mcu.reset(0.0)
-    tilts, sigmas = measured(mcu_protocol.LineParser().feed(b"".join(mcu.sample() for _ in range(3000))))
+    tilts, sigmas = measured(mcu_protocol.LineParser().parse(b"".join(mcu.sample() for _ in range(3000))))
     assert ((tilts - tilts.mean(0)) / sigmas).std() == pytest.approx(1, abs=0.1)
     assert pull_of_means(tilts, sigmas, max(rate_hz, 5)) == pytest.approx(1, abs=0.15)
     assert np.degrees(sigmas).mean() == pytest.approx(noise_deg, rel=0.12)

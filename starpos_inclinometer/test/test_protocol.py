@@ -43,7 +43,7 @@ def test_checksum_gives_the_published_check_values():
 
 def test_the_documents_example_is_a_line_of_this_protocol():
     example = re.search(r"\$T,[0-9A-F,]+\*[0-9A-F]{4}", PROTOCOL.read_text())[0].encode() + b"\r\n"
-    (sample,) = LineParser().feed(example)
+    (sample,) = LineParser().parse(example)
     assert sample == Sample(
         sequence=0x12, milliseconds=0x70A, x=0x800000, y=0xA8C9C5, temperature=0xAF, status=0
     )
@@ -54,7 +54,7 @@ def test_the_documents_example_is_a_line_of_this_protocol():
 def test_messages_round_trip():
     identity = Identity(version=1, firmware=0x0102, unit=0xDEADBEEF, rate_hz=10, delay_ms=20)
     stream = emulator.identity_line(**asdict(identity)) + lines(1)[0] + emulator.refusal_line(Reason.UNKNOWN)
-    messages = LineParser().feed(stream)
+    messages = LineParser().parse(stream)
     assert messages == [
         identity,
         Sample(sequence=0, milliseconds=0, x=0x800000, y=0x7F0000, temperature=0xAF, status=0),
@@ -65,11 +65,11 @@ def test_messages_round_trip():
 
 def test_chunks_of_any_size_give_the_same_samples():
     stream = b"".join(lines(50))
-    whole = LineParser().feed(stream)
+    whole = LineParser().parse(stream)
     assert len(whole) == 50
     for size in (1, 2, 7, 42, 43, 44, 1000):
         parser = LineParser()
-        pieces = [m for i in range(0, len(stream), size) for m in parser.feed(stream[i : i + size])]
+        pieces = [m for i in range(0, len(stream), size) for m in parser.parse(stream[i : i + size])]
         assert pieces == whole
         assert (parser.good, parser.crc_errors, parser.malformed, parser.garbage_bytes) == (50, 0, 0, 0)
 
@@ -78,30 +78,30 @@ def test_resynchronises_after_garbage_and_counts_it():
     parser = LineParser()
     a, b, c = lines(3)
     garbage = b"\x00\xff$T,00*\r\n$$$*"
-    assert [m.sequence for m in parser.feed(garbage + a + garbage + b[:20] + c)] == [0, 2]
+    assert [m.sequence for m in parser.parse(garbage + a + garbage + b[:20] + c)] == [0, 2]
     assert (parser.good, parser.garbage_bytes) == (2, 2 * len(garbage) + 20)
 
 
 def test_a_stray_start_does_not_cost_the_line_after_it():
     line = lines(1)[0]
     parser = LineParser()
-    assert parser.feed(b"$" + b"x" * 30 + line[:30]) == []
-    assert len(parser.feed(line[30:])) == 1
+    assert parser.parse(b"$" + b"x" * 30 + line[:30]) == []
+    assert len(parser.parse(line[30:])) == 1
 
 
 def test_memory_stays_bounded_whatever_comes():
     parser = LineParser()
     for chunk in (b"$" * 10_000, b"$" + b"A" * 10_000, b"x" * 10_000, b"$T,"):
-        assert parser.feed(chunk) == []
+        assert parser.parse(chunk) == []
         assert len(parser._splitter._rest) < mcu_protocol.MAX_LINE
-    assert [m.sequence for m in parser.feed(lines(1)[0])] == [0]
+    assert [m.sequence for m in parser.parse(lines(1)[0])] == [0]
 
 
 def test_wrong_checksum_and_unknown_line_are_counted_and_dropped():
     parser = LineParser()
     line = lines(1)[0]
-    assert parser.feed(line.replace(b"800000", b"800001")) == []
-    assert parser.feed(mcu_protocol.frame(b"Z,01") + mcu_protocol.frame(b"T,1,2,3")) == []
+    assert parser.parse(line.replace(b"800000", b"800001")) == []
+    assert parser.parse(mcu_protocol.frame(b"Z,01") + mcu_protocol.frame(b"T,1,2,3")) == []
     assert (parser.good, parser.crc_errors, parser.malformed) == (0, 1, 2)
 
 
@@ -119,7 +119,7 @@ def test_wrong_checksum_and_unknown_line_are_counted_and_dropped():
 )
 def test_right_checksum_but_impossible_fields_are_no_message(body):
     parser = LineParser()
-    assert parser.feed(mcu_protocol.frame(body)) == [] and parser.malformed == 1
+    assert parser.parse(mcu_protocol.frame(body)) == [] and parser.malformed == 1
 
 
 def test_random_bytes_never_raise_and_give_nothing():
@@ -128,7 +128,7 @@ def test_random_bytes_never_raise_and_give_nothing():
     alphabet = np.frombuffer(b"$*,\r\nTINR0123456789ABCDEF", np.uint8)
     for data in (rng.integers(0, 256, 100_000, np.uint8), rng.choice(alphabet, 100_000)):
         for chunk in np.array_split(data, 777):
-            assert parser.feed(chunk.tobytes()) == []
+            assert parser.parse(chunk.tobytes()) == []
     assert parser.garbage_bytes > 190_000
 
 
@@ -140,7 +140,7 @@ def test_flipped_bits_never_make_a_wrong_sample(share):
     data = np.frombuffer(b"".join(sent), np.uint8)
     flips = np.packbits(rng.random((len(data), 8)) < share, axis=1)[:, 0]
     parser = LineParser()
-    samples = parser.feed((data ^ flips).tobytes())
+    samples = parser.parse((data ^ flips).tobytes())
     for s in samples:
         line = emulator.sample_line(s.sequence, s.milliseconds, s.x, s.y, s.temperature, s.status)
         assert line == truth[s.sequence]
@@ -158,7 +158,7 @@ def test_every_single_and_double_bit_error_in_a_line_is_found():
             bad[i // 8] ^= 1 << i % 8
             if j is not None:
                 bad[j // 8] ^= 1 << j % 8
-            assert LineParser().feed(bytes(bad)) == []
+            assert LineParser().parse(bytes(bad)) == []
 
 
 def test_commands():

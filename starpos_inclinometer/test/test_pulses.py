@@ -120,9 +120,9 @@ def test_lines_of_edges_are_read_as_they_are_written():
     most = {"number": 255, "bounces": 3, "milliseconds": 0xFFFFFFFF, "microseconds": 999}
     sent = [Pulse(input=i, rising=r, **most) for i in (0, 1) for r in (False, True)]
     parser = LineParser()
-    assert parser.feed(b"".join(emulator.pulse_line(**asdict(p)) for p in sent)) == sent
+    assert parser.parse(b"".join(emulator.pulse_line(**asdict(p)) for p in sent)) == sent
     bad = [b"P,02,00,00,00000000,0000", b"P,00,00,00,00000000,03E8", b"P,0,00,00,00000000,0000"]
-    assert parser.feed(b"".join(map(frame, bad))) == [] and parser.malformed == 3
+    assert parser.parse(b"".join(map(frame, bad))) == [] and parser.malformed == 3
 
 
 class Line:
@@ -148,8 +148,8 @@ class Line:
         arrival_s = utc_s - 1.7e9 + self.rng.uniform(0.01, 0.03)
         moment = Moment(arrival_s, round((1.7e9 + arrival_s + self.off_s) * 1e9))
         known_s = utc_s - 1.7e9 + self.rng.uniform(0, 0.016) - (us % 1000) * 1e-6
-        self.times.add(pulse, moment, known_s)
-        return self.times.take()
+        self.times.date(pulse, moment, known_s)
+        return self.times.fetch()
 
 
 def test_by_the_receivers_second_an_edge_has_utc_whatever_the_line_and_the_hosts_clock_add():
@@ -196,8 +196,8 @@ def test_the_numbers_of_edges_go_on_over_their_wrap_and_tell_of_lost_ones():
     times = PulseTimes()
     for number in (254, 255, 0, 2):
         pulse = Pulse(input=0, rising=False, number=number, bounces=0, milliseconds=0, microseconds=0)
-        times.add(pulse, Moment(10, 10**10), 9.9)
-    assert [t.sequence for t in times.take()] == [0, 1, 2, 4]
+        times.date(pulse, Moment(10, 10**10), 9.9)
+    assert [t.sequence for t in times.fetch()] == [0, 1, 2, 4]
 
 
 def test_a_night_of_frames_has_the_times_of_their_light_though_nobody_stated_the_cameras_lag(board):
@@ -218,8 +218,8 @@ def test_a_night_of_frames_has_the_times_of_their_light_though_nobody_stated_the
             data = board.run(50, decoder.command() if k < 2 else b"")
             read_ms = board.tell("state")["ms"]
             host_ns = round((utc_s(read_ms) + off_s) * 1e9)
-            tilts.read(decoder.feed(data, Moment(read_ms * 1e-3, host_ns)))
-            for t in tilts.pulses.take():
+            tilts.read(decoder.decode(data, Moment(read_ms * 1e-3, host_ns)))
+            for t in tilts.pulses.fetch():
                 if t.input == Input.SHUTTER:
                     edge = Edge(
                         time_s=t.stamp_ns * 1e-9,
@@ -249,8 +249,8 @@ def test_edges_go_through_the_driver_with_the_relation_that_the_samples_showed(b
         data = board.run(100, decoder.command() if k < 4 else b"")
         now_s = board.tell("state")["ms"] * 1e-3
         moment = Moment(now_s, round(now_s * 1e9) + 10**18)
-        tilts.read(decoder.feed(data, moment))
-        got += tilts.pulses.take()
+        tilts.read(decoder.decode(data, moment))
+        got += tilts.pulses.fetch()
     assert tilts.pulses.undated == 0 and [t.rising for t in got] == [False, True]
     # read every 0.1 s, so the earliest lines came up to that late
     assert -0.02 < (got[0].stamp_ns - 10**18) * 1e-9 - told[0] < 0.12

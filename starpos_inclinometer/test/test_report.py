@@ -6,21 +6,13 @@ import math
 import numpy as np
 import pytest
 
+from starpos.messages.tilt import GAP, OUT_OF_RANGE, SATURATED, STUCK
 from starpos.parameters.table import defaults_of
 from starpos_inclinometer.clock import Moment, Step
 from starpos_inclinometer.node import Reporter
 from starpos_inclinometer.sources.mcu import McuDecoder, McuTilts
 from starpos_inclinometer.sources.mcu_protocol import Identity, Sample
-from starpos_inclinometer.sources.source import (
-    GAP,
-    OUT_OF_RANGE,
-    SATURATED,
-    STUCK,
-    Arrival,
-    Counts,
-    Health,
-    Phase,
-)
+from starpos_inclinometer.sources.source import Arrival, Counts, Health, Phase
 from starpos_testing.emulator import Mcu
 
 VALUES = defaults_of("inclinometer")
@@ -122,9 +114,9 @@ def played(rates_hz, at_once):
     for rate_hz in rates_hz:
         decoder.wanted_rate_hz = rate_hz
         for _ in range(12):
-            arrivals += decoder.feed(waiting, Moment(now_s, round(now_s * 1e9)))
+            arrivals += decoder.decode(waiting, Moment(now_s, round(now_s * 1e9)))
             waiting = mcu.receive(decoder.command())
-            arrivals += decoder.feed(waiting, Moment(now_s, round(now_s * 1e9)))
+            arrivals += decoder.decode(waiting, Moment(now_s, round(now_s * 1e9)))
             now_s = mcu.due
             waiting = mcu.sample()
             if not at_once:

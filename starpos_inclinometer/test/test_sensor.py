@@ -6,13 +6,22 @@ import math
 import numpy as np
 import pytest
 
+from starpos.messages.tilt import GAP, OUT_OF_RANGE, SATURATED, STUCK
 from starpos_inclinometer.sources import tilts
 from starpos_inclinometer.sources.mcu_protocol import Sample, SampleStatus
-from starpos_inclinometer.sources.tilts import Sca100t, Sca100tCalibration
+from starpos_inclinometer.sources.tilts import SQUARE_AXES, Sca100t, Sca100tCalibration
+from starpos_testing.emulator import code_of, temperature_counts
 
 
-def measure(sample, *calibration):
-    return Sca100t(*calibration).measure(sample, 0.0)
+def sensor(*calibration, **settings):
+    made = Sca100t(*calibration)
+    for name, value in settings.items():
+        setattr(made, name, value)
+    return made
+
+
+def measure(sample, *calibration, **settings):
+    return sensor(*calibration, **settings).measure(sample, 0.0)
 
 
 def sample(x=0x800000, y=0x800000, temperature=175, status=0, **more):
@@ -24,8 +33,8 @@ def test_codes_by_hand():
     c = Sca100tCalibration()
     assert c.volts(0x800000) == 2.5
     assert c.volts(0) == pytest.approx(0.02, abs=1e-12)
-    assert c.code(4.5) == 0x800000 + round(2.0 / 2.48 * 2**23)
-    reading = measure(sample(x=c.code(4.5) - 1, y=c.code(2.5 - 4 * math.sin(math.radians(5)))))
+    assert code_of(4.5) == 0x800000 + round(2.0 / 2.48 * 2**23)
+    reading = measure(sample(x=code_of(4.5) - 1, y=code_of(2.5 - 4 * math.sin(math.radians(5)))))
     assert math.degrees(reading.x) == pytest.approx(30.0, abs=2e-5)
     assert math.degrees(reading.y) == pytest.approx(-5.0, abs=1e-5)
     assert reading.flags == 0
@@ -35,17 +44,15 @@ def test_offset_sensitivity_divider_and_reference_of_each_axis():
     c = Sca100tCalibration(
         offset_volts=(2.4, 2.6), sensitivity_volts_per_g=(3.9, 4.1), divider=40.0, reference_volts=5.2
     )
-    reading = measure(sample(c.code(2.4 + 3.9 * 0.1), c.code(2.6 - 4.1 * 0.2)), c)
+    reading = measure(sample(*(code_of(v, 40.0, 5.2) for v in (2.4 + 3.9 * 0.1, 2.6 - 4.1 * 0.2))), c)
     assert math.sin(reading.x) == pytest.approx(0.1, abs=1e-6)
     assert math.sin(reading.y) == pytest.approx(-0.2, abs=1e-6)
 
 
 def test_temperature_of_the_data_sheet():
-    assert tilts.sca100t_celsius(197) == 0.0
-    assert tilts.sca100t_celsius(170) == pytest.approx(24.93, abs=0.01)
-    assert [tilts.sca100t_celsius(tilts.sca100t_counts(t)) for t in (-40, 20, 85)] == pytest.approx(
-        [-40, 20, 85], abs=0.47
-    )
+    counts = {197: 0.0, 170: 24.93} | {temperature_counts(t): t for t in (-40, 20, 85)}
+    got = [measure(sample(temperature=n)).temperature_c for n in counts]
+    assert got == pytest.approx(list(counts.values()), abs=0.47)
     assert math.isnan(measure(sample(status=SampleStatus.NO_TEMPERATURE)).temperature_c)
 
 
@@ -58,36 +65,36 @@ def test_until_the_noise_is_known_it_is_the_stated_one_and_the_quantisation():
 def test_the_noise_parameter_is_a_floor_that_the_samples_may_rise_above():
     rng = np.random.default_rng(1)
     for floor, noise, expected in ((0.004, 0.001, 0.004), (0.001, 0.004, 0.004)):
-        s = Sca100t(Sca100tCalibration(noise_floor_rad=math.radians(floor)))
+        s = sensor(noise_floor_rad=math.radians(floor))
         for k in range(300):
             volts = 2.5 + 4 * np.radians(noise) * rng.standard_normal(2)
-            last = s.measure(sample(*map(Sca100tCalibration().code, volts)), 0.1 * k)
+            last = s.measure(sample(*map(code_of, volts)), 0.1 * k)
         sigma = np.degrees(np.sqrt([last.covariance[0], last.covariance[3]]))
         assert sigma == pytest.approx([expected] * 2, rel=0.2)
 
 
-def turned(gx, gy, c, at=20.0):
+def turned(gx, gy, c, at=20.0, cross_axis=SQUARE_AXES):
     """The codes of what an instrument with the calibration's own errors feels."""
-    g = np.linalg.solve(np.array(c.cross_axis).reshape(2, 2), [gx, gy])
+    g = np.linalg.solve(np.array(cross_axis).reshape(2, 2), [gx, gy])
     pairs = (c.offset_and_sensitivity(axis, at) for axis in range(2))
     return [
-        c.code(offset + sensitivity * share) for (offset, sensitivity), share in zip(pairs, g, strict=True)
+        code_of(offset + sensitivity * share) for (offset, sensitivity), share in zip(pairs, g, strict=True)
     ]
 
 
 def test_cross_axis_matrix_and_its_covariance():
-    c = Sca100tCalibration(cross_axis=(0.99, 0.05, -0.03, 1.01))
+    c, matrix = Sca100tCalibration(), (0.99, 0.05, -0.03, 1.01)
     gx, gy = math.sin(math.radians(12)), math.sin(math.radians(-20))
-    reading = measure(sample(*turned(gx, gy, c)), c)
+    reading = measure(sample(*turned(gx, gy, c, cross_axis=matrix)), cross_axis=matrix)
     assert np.degrees([reading.x, reading.y]) == pytest.approx([12, -20], abs=1e-5)
     # by differences: one code more on each axis
-    x, y = turned(gx, gy, c)
+    x, y = turned(gx, gy, c, cross_axis=matrix)
     jump = 100_000
     slopes = []
     for k in range(2):
-        moved = measure(sample(x + jump * (k == 0), y + jump * (k == 1)), c)
+        moved = measure(sample(x + jump * (k == 0), y + jump * (k == 1)), cross_axis=matrix)
         slopes.append([(moved.x - reading.x), (moved.y - reading.y)])
-    raw = np.linalg.solve(np.array(c.cross_axis).reshape(2, 2), [gx, gy])
+    raw = np.linalg.solve(np.array(matrix).reshape(2, 2), [gx, gy])
     sigma_code = math.radians(0.0035) * np.sqrt(1 - raw**2) / (c.volts_per_code / 4.0)
     jacobian = np.array(slopes).T / jump * sigma_code
     expected = jacobian @ jacobian.T
@@ -109,9 +116,9 @@ def test_temperature_polynomials(celsius):
         2.5 + 5e-4 * t - 2e-6 * t**2 + 1e-8 * t**3 + 4.0 * (1 + 1e-4 * t + 1e-6 * t**2) * 0.1,
         2.5 - 3e-4 * t + 1e-6 * t**2 + 4.0 * (1 - 2e-4 * t + 1e-8 * t**3) * -0.2,
     )
-    counts = tilts.sca100t_counts(celsius)
+    counts = temperature_counts(celsius)
     s = Sca100t(WARM)
-    reading = s.measure(sample(*map(WARM.code, volts), temperature=counts), 0.0)
+    reading = s.measure(sample(*map(code_of, volts), temperature=counts), 0.0)
     # one count is 0.92 deg C, of which the offset of x makes 0.007 deg
     error = np.abs(np.sin([reading.x, reading.y]) - [0.1, -0.2])
     assert error.max() < 0.46 * 8e-4 / 4
@@ -142,14 +149,14 @@ def offset_x(linear, square):
 
 def test_a_polynomial_far_outside_of_its_range_does_not_turn_an_axis_round():
     c = Sca100tCalibration(sensitivity_per_c=((-0.01, 0.0, 0.0), (-0.01, -1e-4, 0.0)))
-    counts = tilts.sca100t_counts(125.0)
+    counts = temperature_counts(125.0)
     reading = measure(sample(x=0x880000, y=0x780000, temperature=counts), c)
     assert reading.x > 0 > reading.y and np.isfinite(reading.covariance).all()
 
 
 @pytest.mark.parametrize(
     "odd",
-    [{"lost": 1}, {"status": SampleStatus.NO_ANSWER}, {"x": 0}, {"x": Sca100tCalibration().code(4.9)}],
+    [{"lost": 1}, {"status": SampleStatus.NO_ANSWER}, {"x": 0}, {"x": code_of(4.9)}],
 )
 def test_what_is_flagged_tells_no_noise(odd):
     s = Sca100t()
@@ -177,14 +184,14 @@ def test_a_temperature_never_known_widens_the_error_by_all_it_may_be():
     ("what", "flags"),
     [
         (sample(), 0),
-        (sample(x=Sca100tCalibration().code(2.5 + 4 * math.sin(math.radians(30.01)))), tilts.OUT_OF_RANGE),
-        (sample(y=0), tilts.OUT_OF_RANGE | tilts.SATURATED),
-        (sample(y=0xFFFFFF), tilts.OUT_OF_RANGE | tilts.SATURATED),
-        (sample(lost=3), tilts.GAP),
-        (sample(restarted=True), tilts.GAP),
-        (sample(resumed=True), tilts.GAP),
-        (sample(status=SampleStatus.NO_ANSWER), tilts.STUCK),
-        (sample(status=SampleStatus.MEANINGLESS), tilts.STUCK),
+        (sample(x=code_of(2.5 + 4 * math.sin(math.radians(30.01)))), OUT_OF_RANGE),
+        (sample(y=0), OUT_OF_RANGE | SATURATED),
+        (sample(y=0xFFFFFF), OUT_OF_RANGE | SATURATED),
+        (sample(lost=3), GAP),
+        (sample(restarted=True), GAP),
+        (sample(resumed=True), GAP),
+        (sample(status=SampleStatus.NO_ANSWER), STUCK),
+        (sample(status=SampleStatus.MEANINGLESS), STUCK),
         (sample(status=SampleStatus.OVERRUN | 0xC0), 0),
     ],
 )
@@ -197,7 +204,7 @@ def test_flags(what, flags):
 def test_angles_stay_finite_where_there_is_none():
     reading = measure(sample(x=0, y=0xFFFFFF), Sca100tCalibration(sensitivity_volts_per_g=(1.0, 1.0)))
     assert (reading.x, reading.y) == pytest.approx((-math.pi / 2, math.pi / 2))
-    assert reading.flags & tilts.OUT_OF_RANGE
+    assert reading.flags & OUT_OF_RANGE
 
 
 def test_a_code_that_repeats_is_stuck_until_it_moves():
@@ -206,10 +213,10 @@ def test_a_code_that_repeats_is_stuck_until_it_moves():
         s.measure(sample(x=0x800000 + i, y=0x812345), 0.1 * i).flags
         for i in range(tilts.SCA100T_STUCK_SAMPLES + 1)
     ]
-    assert flags == [0] * (tilts.SCA100T_STUCK_SAMPLES - 1) + [tilts.STUCK] * 2
+    assert flags == [0] * (tilts.SCA100T_STUCK_SAMPLES - 1) + [STUCK] * 2
     assert s.measure(sample(y=0x812346), 9.0).flags == 0
 
 
 def test_both_codes_repeating_are_stuck_sooner():
     s = Sca100t()
-    assert [s.measure(sample(), 0.1 * i).flags for i in range(4)] == [0, 0, tilts.STUCK, tilts.STUCK]
+    assert [s.measure(sample(), 0.1 * i).flags for i in range(4)] == [0, 0, STUCK, STUCK]

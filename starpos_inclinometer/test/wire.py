@@ -58,7 +58,7 @@ class Wire:
                 *lines, rest = (rest + os.read(board, 4096)).split(b"\n")
                 for line in lines:
                     whole = line + b"\n"
-                    self.sent += [m for m in self._parser.feed(whole) if isinstance(m, Sample)]
+                    self.sent += [m for m in self._parser.parse(whole) if isinstance(m, Sample)]
                     port.write(self.faults.apply(whole, self._rng))
         finally:
             port.write(rest)

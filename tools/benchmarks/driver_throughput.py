@@ -46,10 +46,10 @@ def serial(samples: int, values) -> float:
     identity = mcu.reset(0.0)
     lines = [mcu.sample() for _ in range(samples)]
     decoder, tilts = McuDecoder(RATE_HZ), McuTilts(values)
-    decoder.feed(identity, Moment(0.0, 0))
+    decoder.decode(identity, Moment(0.0, 0))
     readings, began_s = 0, time.process_time()
     for k, line in enumerate(lines):
-        arrivals = decoder.feed(line, Moment(k / RATE_HZ, k * 10**9 // RATE_HZ))
+        arrivals = decoder.decode(line, Moment(k / RATE_HZ, k * 10**9 // RATE_HZ))
         readings += len(tilts.read(arrivals))
     took_s = time.process_time() - began_s
     assert readings == samples and isinstance(decoder.identity, mcu_protocol.Identity)
@@ -61,7 +61,7 @@ def ascii_lines(samples: int, pattern: str) -> float:
     decoder = LineDecoder(pattern, "deg")
     lines = [b"%.3f,%.3f\r\n" % (3 + k % 7 * 1e-3, -11 - k % 5 * 1e-3) for k in range(samples)]
     began_s = time.process_time()
-    believed = sum(len(decoder.feed(line, Moment(k / RATE_HZ, 0))) for k, line in enumerate(lines))
+    believed = sum(len(decoder.decode(line, Moment(k / RATE_HZ, 0))) for k, line in enumerate(lines))
     took_s = time.process_time() - began_s
     assert believed == samples
     return 1e6 * took_s / samples

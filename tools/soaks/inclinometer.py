@@ -79,7 +79,7 @@ def run(options) -> int:
         while due < samples:
             woken.wait(0.1)
             woken.clear()
-            got += len(source.take())
+            got += len(source.fetch())
             due = round(fast_ns() * 1e-9 * RATE_HZ)
             if due < samples / 10:
                 memory = Memory()

@@ -2,7 +2,6 @@
 """Cameras behind an ASCOM Alpaca server, through PyPI's alpyca."""
 
 import re
-import threading
 import time
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -10,7 +9,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 
 from starpos.frames.frame import MAX_PIXELS, Frame
-from starpos_camera.sources.source import CapturedFrame, CaptureError, CaptureSettings, FrameSource, missing
+from starpos_camera.sources.source import CapturedFrame, CaptureError, CaptureSettings, DeviceSource, missing
 from starpos_camera.sources.timing import CLOCK_TOLERANCE_S, clock_stddev_of, stamp_of
 
 if TYPE_CHECKING:
@@ -31,10 +30,8 @@ PATTERNS = {(0, 0): "rggb", (1, 0): "grbg", (0, 1): "gbrg", (1, 1): "bggr"}
 IDLE, ERROR = 0, 5
 
 
-class Alpaca(FrameSource):
+class Alpaca(DeviceSource["Camera"]):
     """Takes whole, unbinned frames; `capture` commands an exposure, waits for it and fetches it."""
-
-    waits_for_listener = False
 
     @staticmethod
     def refusal(values: Mapping, settings: CaptureSettings) -> str | None:
@@ -48,40 +45,16 @@ class Alpaca(FrameSource):
         return None
 
     def __init__(self, values: Mapping, now: Callable[[], float]) -> None:
+        super().__init__(values, now)
         self._address = values["alpaca.address"]
         self._number = values["alpaca.device"]
         self.hardware_id = f"Alpaca camera {self._number} at {self._address}"
-        self._values = values
-        self._now = now
-        self._closing = threading.Event()
-        self._camera: Camera | None = None
         self._size = (0, 0)
         self._pattern = ""
         # The gain that was set last.
         self._gain: float | None = None
 
-    def lacking(self) -> None:
-        """Return None, because only a call to the server would show it."""
-
-    def capture(self, settings: CaptureSettings) -> CapturedFrame:
-        try:
-            # Another program may have disconnected the camera.
-            if self._camera is None or not self._camera.Connected:
-                self._camera = self._opened()
-            return self._expose(self._camera, settings)
-        except Exception as error:
-            # alpyca, requests and urllib3 have many exceptions, and an absurd reply causes others.
-            self._camera = None
-            raise CaptureError(f"{self.hardware_id}: {_sentence(error)}") from error
-
-    def update(self, values: Mapping) -> None:
-        self._values = values
-
-    def close(self) -> None:
-        self._closing.set()
-        self._camera = None
-
-    def _opened(self) -> "Camera":
+    def _open(self) -> "Camera":
         from alpaca.camera import Camera
 
         from starpos_camera.sources.alpaca_http import Session
@@ -103,6 +76,9 @@ class Alpaca(FrameSource):
         return camera
 
     def _expose(self, camera: "Camera", settings: CaptureSettings) -> CapturedFrame:
+        # Another program may have disconnected the camera.
+        if not camera.Connected:
+            camera = self._device = self._open()
         wanted_s = settings.exposure_s or DEFAULT_EXPOSURE_S
         remark = self._set_gain(camera, settings.gain)
         commanded_s = self._now()
@@ -129,6 +105,20 @@ class Alpaca(FrameSource):
         )
         remark = f"{self.hardware_id}: {stamp.remark}." if stamp.remark else remark
         return CapturedFrame(frame, stamp.source, remark=remark)
+
+    def _explain(self, error: Exception) -> str:
+        # alpyca, requests and urllib3 have many exceptions, and an absurd reply causes others.
+        import requests
+        import urllib3
+
+        if isinstance(error, CaptureError):
+            return str(error)
+        if isinstance(error, (requests.Timeout, urllib3.exceptions.TimeoutError)):
+            return "it does not answer in time; check the server and the network."
+        if isinstance(error, (requests.ConnectionError, urllib3.exceptions.ProtocolError, ConnectionError)):
+            return "there is no Alpaca server, or it has gone; start it, or correct alpaca.address."
+        words = " ".join(str(getattr(error, "message", error)).split())[:160].rstrip(".")
+        return f"{words or 'no reason given'} ({type(error).__name__})."
 
     def _set_gain(self, camera: "Camera", gain: float | None) -> str:
         """Set the gain if it was not set last; return a remark if the camera has another one."""
@@ -190,18 +180,3 @@ def _unsigned(pixels: np.ndarray) -> np.ndarray:
         if low < 0 or high > 65535:
             raise CaptureError(f"its pixels are {low} to {high}; they must be 0 to 65535.")
     return np.ascontiguousarray(pixels, np.uint16)
-
-
-def _sentence(error: Exception) -> str:
-    """Say in a sentence what an exception of a library means."""
-    import requests
-    import urllib3
-
-    if isinstance(error, CaptureError):
-        return str(error)
-    if isinstance(error, (requests.Timeout, urllib3.exceptions.TimeoutError)):
-        return "it does not answer in time; check the server and the network."
-    if isinstance(error, (requests.ConnectionError, urllib3.exceptions.ProtocolError, ConnectionError)):
-        return "there is no Alpaca server, or it has gone; start it, or correct alpaca.address."
-    words = " ".join(str(getattr(error, "message", error)).split())[:160].rstrip(".")
-    return f"{words or 'no reason given'} ({type(error).__name__})."

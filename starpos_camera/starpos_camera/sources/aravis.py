@@ -10,7 +10,6 @@ GenICam cameras (GigE Vision, USB3 Vision) through Aravis 0.8 and its GObject in
 """
 
 import math
-import threading
 import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
@@ -24,7 +23,7 @@ import numpy as np
 from starpos.errors import StarposError, one_line
 from starpos.frames.exposure import Shutter
 from starpos.frames.frame import MAX_PIXELS, Frame
-from starpos_camera.sources.source import CapturedFrame, CaptureError, CaptureSettings, FrameSource
+from starpos_camera.sources.source import CapturedFrame, CaptureError, CaptureSettings, DeviceSource
 from starpos_camera.sources.timing import Stamp, middle_of_commanded, middle_of_started
 from starpos_interfaces.msg import Capture
 
@@ -159,14 +158,6 @@ def library() -> ModuleType:
     from gi.repository import Aravis
 
     return Aravis
-
-
-def fault(error: Exception) -> str:
-    """Say in a sentence what an exception of Aravis means."""
-    if isinstance(error, StarposError):
-        return str(error)
-    words = one_line(getattr(error, "message", error)).rstrip(".")
-    return f"{words or type(error).__name__}; check its cable, its power, and programs that hold it."
 
 
 class AravisCamera:
@@ -369,10 +360,8 @@ READOUT_S = 10.0
 WATCH_S = 0.2
 
 
-class Aravis(FrameSource):
+class Aravis(DeviceSource[AravisCamera]):
     """Triggers each exposure, or waits for the line's signal, and takes the whole sensor's frame."""
-
-    waits_for_listener = False
 
     @staticmethod
     def refusal(values: Mapping, settings: CaptureSettings) -> str | None:
@@ -385,39 +374,21 @@ class Aravis(FrameSource):
         return None
 
     def __init__(self, values: Mapping, now: Callable[[], float]) -> None:
-        self._values = values
-        self._now = now
+        super().__init__(values, now)
         self.hardware_id = f"GenICam camera {values['aravis.device']}".strip()
-        self._closing = threading.Event()
-        self._in_use = threading.Lock()
-        self._camera: AravisCamera | None = None
 
-    def lacking(self) -> None:
-        """Return None, because only a look at the network and the bus would show it."""
+    def _open(self) -> AravisCamera:
+        return AravisCamera(self._values)
 
-    def capture(self, settings: CaptureSettings) -> CapturedFrame:
-        with self._in_use:
-            try:
-                if self._camera is None:
-                    self._camera = AravisCamera(self._values)
-                return self._expose(self._camera, settings)
-            except Exception as error:
-                # Aravis reports everything as GLib.Error, and a camera's strange answers cause others.
-                self._release()
-                raise CaptureError(f"{self.hardware_id}: {fault(error)}") from error
+    def _close(self, device: AravisCamera) -> None:
+        device.release()
 
-    def update(self, values: Mapping) -> None:
-        self._values = values
-
-    def close(self) -> None:
-        self._closing.set()
-        with self._in_use:
-            self._release()
-
-    def _release(self) -> None:
-        if self._camera is not None:
-            self._camera.release()
-        self._camera = None
+    def _explain(self, error: Exception) -> str:
+        # Aravis reports everything as GLib.Error, and a camera's strange answers cause others.
+        if isinstance(error, StarposError):
+            return str(error)
+        words = one_line(getattr(error, "message", error)).rstrip(".")
+        return f"{words or type(error).__name__}; check its cable, its power, and programs that hold it."
 
     def _expose(self, camera: AravisCamera, settings: CaptureSettings) -> CapturedFrame:
         exposure_s, remark = camera.set_exposure(settings.exposure_s)

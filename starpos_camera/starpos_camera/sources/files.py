@@ -207,10 +207,10 @@ class Files(FrameSource):
         return None
 
     def __init__(self, values: Mapping, now: Callable[[], float]) -> None:
+        super().__init__(values, now)
         self.hardware_id = self._path = values["files.path"]
         self._loop = values["files.loop"]
         self._restamp = values["files.restamp"]
-        self._now = now
         self._clock = camera_clock(values)
         # The files that this round has left, last first; None before the first round.
         self._queue: list[Path] | None = None
@@ -247,12 +247,6 @@ class Files(FrameSource):
         except Exception:
             self._bad.add(path)
             raise
-
-    def update(self, values: Mapping) -> None:
-        """Do nothing, because no parameter of this source changes at run time."""
-
-    def close(self) -> None:
-        """Do nothing, because no file is held open."""
 
     def _read(self, path: Path) -> CapturedFrame:
         frame = read_frame(path, self._clock)

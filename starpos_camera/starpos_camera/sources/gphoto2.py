@@ -11,9 +11,8 @@ from dataclasses import replace
 from pathlib import PurePosixPath
 from typing import Any
 
-from starpos.errors import FrameError
 from starpos.frames.reading import RAW, decode_frame
-from starpos_camera.sources.source import CapturedFrame, CaptureError, CaptureSettings, FrameSource, missing
+from starpos_camera.sources.source import CapturedFrame, CaptureError, CaptureSettings, DeviceSource, missing
 from starpos_camera.sources.timing import middle_of_commanded
 from starpos_interfaces.msg import Capture
 
@@ -142,8 +141,9 @@ class Gphoto2Camera:
     def files(self, exposure_s: float) -> list[str]:
         """Wait for the files of the exposure and return their paths, at least one."""
         # With noise reduction a camera takes a dark frame, as long as the exposure, before it gives the file.
+        patience_s = 2 * exposure_s + AFTER_S
         found: list[str] = []
-        end = time.monotonic() + 2 * exposure_s + AFTER_S
+        end = time.monotonic() + patience_s
         while (now := time.monotonic()) < end:
             if self._closing.is_set():
                 raise CaptureError("the node ends.")
@@ -158,7 +158,7 @@ class Gphoto2Camera:
                 self._closing.wait(max(0.0, min(end, now + POLL_S) - time.monotonic()))
         if not found:
             raise CaptureError(
-                f"no file has come {exposure_s + AFTER_S:.0f} s after its exposure; look at its display."
+                f"no file of an exposure of {exposure_s:g} s has come in {patience_s:.0f} s; look at its display."
             )
         return found
 
@@ -242,10 +242,8 @@ FORMATS = ("imageformat", "imagequality")
 RAW_ALONE = r"^(?!.*(jpe?g|\+|fine|large)).*\b(raw|nef)\b"
 
 
-class Gphoto2(FrameSource):
+class Gphoto2(DeviceSource[Gphoto2Camera]):
     """Commands each exposure, waits for its file, fetches and deletes it. The camera's dial must stand at M."""
-
-    waits_for_listener = False
 
     @staticmethod
     def refusal(values: Mapping, settings: CaptureSettings) -> str | None:
@@ -258,46 +256,19 @@ class Gphoto2(FrameSource):
         return None
 
     def __init__(self, values: Mapping, now: Callable[[], float]) -> None:
-        self._values = values
-        self._now = now
+        super().__init__(values, now)
         which = filter(None, (values["gphoto2.model"], values["gphoto2.port"]))
         self.hardware_id = " ".join(("gphoto2", *which))
-        self._closing = threading.Event()
-        self._in_use = threading.Lock()
-        self._camera: Gphoto2Camera | None = None
 
-    def lacking(self) -> None:
-        """Return None, because only a look at the bus would show it."""
+    def _close(self, device: Gphoto2Camera) -> None:
+        device.release()
 
-    def capture(self, settings: CaptureSettings) -> CapturedFrame:
+    def _explain(self, error: Exception) -> str | None:
         import gphoto2
 
-        with self._in_use:
-            try:
-                if self._camera is None:
-                    self._camera = self._opened()
-                return self._expose(self._camera, settings)
-            except (CaptureError, FrameError) as error:
-                self._release()
-                raise CaptureError(f"{self.hardware_id}: {error}") from error
-            except gphoto2.GPhoto2Error as error:
-                self._release()
-                raise CaptureError(f"{self.hardware_id}: {sentence(error.code)}") from error
+        return sentence(error.code) if isinstance(error, gphoto2.GPhoto2Error) else super()._explain(error)
 
-    def update(self, values: Mapping) -> None:
-        self._values = values
-
-    def close(self) -> None:
-        self._closing.set()
-        with self._in_use:
-            self._release()
-
-    def _release(self) -> None:
-        if self._camera is not None:
-            self._camera.release()
-            self._camera = None
-
-    def _opened(self) -> Gphoto2Camera:
+    def _open(self) -> Gphoto2Camera:
         """Open the camera and make the settings that hold as long as it is open."""
         values = self._values
         camera = Gphoto2Camera(values["gphoto2.model"], values["gphoto2.port"], self._closing)

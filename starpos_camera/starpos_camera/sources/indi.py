@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cameras behind an INDI server (indilib.org), through PyPI's indipyclient, whose event loop runs in a thread of its
-own.
+"""Cameras behind an INDI server (indilib.org), through PyPI's indipyclient.
+
+Its event loop runs in a thread of its own.
 """
 
 import asyncio
@@ -12,10 +13,10 @@ from collections.abc import Callable, Coroutine, Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from starpos.errors import StarposError, one_line
+from starpos.errors import one_line
 from starpos.frames.fits import decode_fits
 from starpos.frames.frame import MAX_PIXELS
-from starpos_camera.sources.source import CapturedFrame, CaptureError, CaptureSettings, FrameSource, missing
+from starpos_camera.sources.source import CapturedFrame, CaptureError, CaptureSettings, DeviceSource, missing
 from starpos_camera.sources.timing import CLOCK_TOLERANCE_S, clock_stddev_of, stamp_of
 
 if TYPE_CHECKING:
@@ -208,7 +209,7 @@ class IndiDevice:
         found = found.member(member)
         return _number(found.min), _number(found.max)
 
-    def said(self) -> str:
+    def last_message(self) -> str:
         """Last message of the device since `forget`, in brackets; "" without one."""
         messages = self._client[self.name].messages if self.name in self._client else ()
         return f" ({one_line(messages[0][1])})" if messages else ""
@@ -256,16 +257,6 @@ SWITCHES = (
 GAINS = (("CCD_GAIN", "GAIN"), ("CCD_CONTROLS", "Gain"))
 
 
-@dataclass(frozen=True)
-class Wish:
-    """Settings of an exposure: its time (s), gain (None: as it is), binning (px each way), time for the readout (s)."""
-
-    exposure_s: float
-    gain: float | None
-    binning: int
-    readout_s: float
-
-
 async def find_device(server: IndiServer, name: str) -> IndiDevice:
     """Wait for the device of that name; CaptureError if it does not come."""
     if not await server.until(lambda: server.connected, LINK_S):
@@ -294,14 +285,19 @@ async def connect_camera(device: IndiDevice) -> None:
         lambda: refused() or (connected() and all(device.has(v) for v in wanted)), CONNECT_S
     )
     if refused() or not connected() or not await device.settled(ANSWER_S):
-        raise CaptureError(f"the driver does not reach its camera{device.said()}: check cable and power.")
+        raise CaptureError(
+            f"the driver does not reach its camera{device.last_message()}: check cable and power."
+        )
     if lacks := [v for v in wanted if not device.has(v)]:
         raise CaptureError(f"{device.name} has no {lacks[0]}, so it is no camera: correct indi.device.")
     await device.enable_blobs("CCD1")
 
 
-async def set_up(device: IndiDevice, wish: Wish) -> None:
-    """Make all settings of an exposure; CaptureError if the camera cannot do one of them."""
+async def set_up(device: IndiDevice, exposure_s: float, gain: float | None, binning: int) -> None:
+    """Make all settings of an exposure; CaptureError if the camera cannot do one of them.
+
+    gain: None leaves it as it is.  binning: px each way.
+    """
     # A client that was killed may have left an exposure.
     if device.state("CCD_EXPOSURE") == "Busy":
         await device.send("CCD_ABORT_EXPOSURE", ABORT="On")
@@ -310,20 +306,20 @@ async def set_up(device: IndiDevice, wish: Wish) -> None:
         if device.value(vector, member) == "Off":
             await _set(device, vector, **{member: "On"})
     if device.has("CCD_BINNING"):
-        await _set_numbers(device, "CCD_BINNING", HOR_BIN=wish.binning, VER_BIN=wish.binning)
-    elif wish.binning != 1:
+        await _set_numbers(device, "CCD_BINNING", HOR_BIN=binning, VER_BIN=binning)
+    elif binning != 1:
         raise CaptureError("it cannot bin: set indi.binning to 1.")
     if device.has("CCD_FRAME"):
         width, height = (device.number("CCD_INFO", f"CCD_MAX_{axis}") or 0.0 for axis in "XY")
         if width and height:
             await _set_numbers(device, "CCD_FRAME", X=0.0, Y=0.0, WIDTH=width, HEIGHT=height)
-    if wish.gain is not None:
+    if gain is not None:
         vector, member = await _gain_of(device)
-        _check_limits(device, vector, member, wish.gain, "`gain`")
-        if device.number(vector, member) != wish.gain:
+        _check_limits(device, vector, member, gain, "`gain`")
+        if device.number(vector, member) != gain:
             # The driver may round the gain to one that the camera has.
-            await _set(device, vector, **{member: repr(float(wish.gain))})
-    _check_limits(device, "CCD_EXPOSURE", "CCD_EXPOSURE_VALUE", wish.exposure_s, "`exposure` (s)")
+            await _set(device, vector, **{member: repr(float(gain))})
+    _check_limits(device, "CCD_EXPOSURE", "CCD_EXPOSURE_VALUE", exposure_s, "`exposure` (s)")
 
 
 async def _gain_of(device: IndiDevice) -> tuple[str, str]:
@@ -338,8 +334,8 @@ async def _gain_of(device: IndiDevice) -> tuple[str, str]:
     return there()[0]
 
 
-async def expose(device: IndiDevice, wish: Wish) -> Blob:
-    """Expose now and return the frame; an exposure that is given up is aborted."""
+async def expose(device: IndiDevice, exposure_s: float, readout_s: float) -> Blob:
+    """Expose now and return the frame, which may take readout_s after its end; an exposure given up is aborted."""
     server = device.server
 
     def state() -> str | None:
@@ -347,10 +343,8 @@ async def expose(device: IndiDevice, wish: Wish) -> Blob:
 
     device.forget()
     try:
-        await device.send("CCD_EXPOSURE", CCD_EXPOSURE_VALUE=repr(wish.exposure_s))
-        await server.until(
-            lambda: server.blob or state() in (None, "Alert", "Idle"), wish.exposure_s + wish.readout_s
-        )
+        await device.send("CCD_EXPOSURE", CCD_EXPOSURE_VALUE=repr(exposure_s))
+        await server.until(lambda: server.blob or state() in (None, "Alert", "Idle"), exposure_s + readout_s)
         if server.lost:
             raise CaptureError("the INDI server went away during the exposure; it is looked for again.")
         if state() is None:
@@ -360,7 +354,7 @@ async def expose(device: IndiDevice, wish: Wish) -> Blob:
         if not server.blob:
             ends = {"Alert": "failed", "Idle": "was aborted by another client"}
             end = ends.get(state() or "", "gave no frame in time")
-            raise CaptureError(f"the exposure {end}{device.said()}.")
+            raise CaptureError(f"the exposure {end}{device.last_message()}.")
     except BaseException:
         # This is for a cancellation too.
         await device.send("CCD_ABORT_EXPOSURE", ABORT="On")
@@ -377,7 +371,7 @@ async def _set(device: IndiDevice, vector: str, **members: str) -> None:
         raise CaptureError(f"the driver does not answer to {vector}: restart it.")
     if device.state(vector) not in ("Ok", "Idle"):
         asked = ", ".join(f"{m} {v}" for m, v in members.items())
-        raise CaptureError(f"the driver refuses {vector} {asked}{device.said()}.")
+        raise CaptureError(f"the driver refuses {vector} {asked}{device.last_message()}.")
 
 
 async def _set_numbers(device: IndiDevice, vector: str, **numbers: float) -> None:
@@ -403,10 +397,8 @@ DEFAULT_EXPOSURE_S = 0.5
 BLOB_MAX = 4 * MAX_PIXELS
 
 
-class Indi(FrameSource):
+class Indi(DeviceSource[IndiServer]):
     """Takes whole light frames as FITS. Connects the device if need be; aborts an exposure that is given up."""
-
-    waits_for_listener = False
 
     @staticmethod
     def refusal(values: Mapping, settings: CaptureSettings) -> str | None:
@@ -421,69 +413,38 @@ class Indi(FrameSource):
         return None
 
     def __init__(self, values: Mapping, now: Callable[[], float]) -> None:
+        super().__init__(values, now)
         self._host, self._port = values["indi.host"], values["indi.port"]
-        self._device = values["indi.device"]
-        self.hardware_id = f"{self._device} of indiserver at {self._host}:{self._port}"
-        self._values = values
-        self._now = now
-        self._server: IndiServer | None = None
-        self._closing = False
+        self._name = values["indi.device"]
+        self.hardware_id = f"{self._name} of indiserver at {self._host}:{self._port}"
 
-    def lacking(self) -> None:
-        """Return None, because only the server knows."""
+    def _open(self) -> IndiServer:
+        return IndiServer(self._host, self._port)
 
-    def update(self, values: Mapping) -> None:
-        self._values = values
+    def _close(self, device: IndiServer) -> None:
+        device.close()
 
-    def close(self) -> None:
-        """Close the connection; a `capture` that runs ends, and its exposure is aborted."""
-        self._closing = True
-        if server := self._server:
-            server.close()
+    # It ends the work that runs, and aborts its exposure.
+    _interrupt = _close
 
-    def capture(self, settings: CaptureSettings) -> CapturedFrame:
-        try:
-            return self._exposure(*self._take(settings))
-        except StarposError as error:
-            self._leave()
-            raise CaptureError(f"{self.hardware_id}: {error}") from error
-        except Exception:
-            self._leave()
-            raise
-
-    def _take(self, settings: CaptureSettings) -> tuple[Blob, float, float, float]:
-        """Expose; return the BLOB, the exposure asked for (s), and when it was commanded and ready (Unix time)."""
-        if self._closing:
+    def _expose(self, server: IndiServer, settings: CaptureSettings) -> CapturedFrame:
+        # The node may have ended while the server was opened.
+        if self._closing.is_set():
             raise CaptureError("the node ends.")
-        if self._server is None:
-            self._server = IndiServer(self._host, self._port)
-            # The node may have ended meanwhile.
-            if self._closing:
-                raise CaptureError("the node ends.")
-        server = self._server
+        exposure_s = settings.exposure_s or DEFAULT_EXPOSURE_S
+        values = self._values
 
-        async def take() -> tuple[Blob, float, float, float]:
-            wish = Wish(
-                settings.exposure_s or DEFAULT_EXPOSURE_S,
-                settings.gain,
-                self._values["indi.binning"],
-                self._values["indi.readout"],
-            )
-            device = await find_device(server, self._device)
+        async def take() -> tuple[Blob, float]:
+            device = await find_device(server, self._name)
             await connect_camera(device)
-            await set_up(device, wish)
+            await set_up(device, exposure_s, settings.gain, values["indi.binning"])
             commanded_s = self._now()
-            blob = await expose(device, wish)
-            return blob, wish.exposure_s, commanded_s, self._now()
+            return await expose(device, exposure_s, values["indi.readout"]), commanded_s
 
-        return server.run(take())
+        blob, commanded_s = server.run(take())
+        return self._frame(blob, exposure_s, commanded_s, self._now())
 
-    def _leave(self) -> None:
-        if self._server:
-            self._server.close()
-        self._server = None
-
-    def _exposure(self, blob: Blob, wanted_s: float, commanded_s: float, ready_s: float) -> CapturedFrame:
+    def _frame(self, blob: Blob, wanted_s: float, commanded_s: float, ready_s: float) -> CapturedFrame:
         frame, header = decode_fits(_unpacked(blob), "its frame")
         if frame.untimed:
             raise CaptureError(f"the header of its frame cannot be used: {frame.untimed}.")

@@ -26,8 +26,6 @@ STAMP_ROUNDING_S = 1e-6
 class Simulated(FrameSource):
     """Renders the exposure that has just ended, through an ideal camera."""
 
-    waits_for_listener = False
-
     @staticmethod
     def refusal(values: Mapping, settings: CaptureSettings) -> str | None:
         exposure_s = settings.exposure_s or DEFAULT_EXPOSURE_S
@@ -48,13 +46,10 @@ class Simulated(FrameSource):
         return None
 
     def __init__(self, values: Mapping, now: Callable[[], float]) -> None:
-        self._now = now
+        super().__init__(values, now)
         self._rng = np.random.default_rng(values["simulated.seed"])
         self._scene = scene_from(values)
         self.hardware_id = "simulated sky"
-
-    def lacking(self) -> None:
-        """Return None, because the sky is always there."""
 
     def capture(self, settings: CaptureSettings) -> CapturedFrame:
         from starpos.simulation.scene import expose, render
@@ -69,9 +64,6 @@ class Simulated(FrameSource):
 
     def update(self, values: Mapping) -> None:
         self._scene = scene_from(values)
-
-    def close(self) -> None:
-        """Do nothing, because nothing is held open."""
 
 
 def air_from(values: Mapping) -> Atmosphere:

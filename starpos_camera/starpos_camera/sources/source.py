@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Interface between the node and a camera. A new camera is a FrameSource in a module here, and a line in `registry`."""
 
+import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib.util import find_spec
-from typing import Protocol
+from typing import Generic, TypeVar
 
 from starpos.errors import StarposError
 from starpos.frames.frame import Frame
@@ -54,7 +55,7 @@ class CapturedFrame:
     remark: str = ""
 
 
-class FrameSource(Protocol):
+class FrameSource:
     """A camera, made as SourceClass(values, now): the node's parameters, and its clock in Unix seconds.
 
     Making one opens no device and cannot fail for lack of one. `capture` opens the device if it is not open, so a
@@ -65,16 +66,22 @@ class FrameSource(Protocol):
     # Each named `source.something`.
     hardware_id: str
     # True: nothing is captured before somebody subscribes to the images.
-    waits_for_listener: bool
+    waits_for_listener = False
 
-    def __init__(self, values: Mapping, now: Callable[[], float]) -> None: ...
+    def __init__(self, values: Mapping, now: Callable[[], float]) -> None:
+        self._values, self._now = values, now
 
     @staticmethod
     def refusal(values: Mapping, settings: CaptureSettings) -> str | None:
         """Say in a sentence why a source cannot be made of these parameters, or cannot take such frames; else None."""
+        return None
 
     def lacking(self) -> str | None:
-        """Say in a sentence why `capture` would find nothing; asked each cadence before the first frame."""
+        """Say in a sentence why `capture` would find nothing; asked each cadence before the first frame.
+
+        None also where only an attempt would show it.
+        """
+        return None
 
     def capture(self, settings: CaptureSettings) -> CapturedFrame:
         """Take the next frame; blocks until it is there, in a thread of the node.
@@ -82,12 +89,72 @@ class FrameSource(Protocol):
         Raises StarposError with a sentence if there is no frame: the node reports it and calls again one cadence
         later. Raises NothingYet while it waits for a frame, SourceEnded if there will be none.
         """
+        raise NotImplementedError
 
     def update(self, values: Mapping) -> None:
         """Apply changed parameters; may be called while `capture` runs."""
+        self._values = values
 
     def close(self) -> None:
         """Release the device; called once. A `capture` that still runs ends soon."""
+
+
+D = TypeVar("D")
+
+
+class DeviceSource(FrameSource, Generic[D]):
+    """A source whose device is kept open between frames, and opened again after a failure.
+
+    A subclass opens its device, exposes with it, and looks at `_closing` while it waits.
+    """
+
+    def __init__(self, values: Mapping, now: Callable[[], float]) -> None:
+        super().__init__(values, now)
+        self._closing = threading.Event()
+        self._in_use = threading.Lock()
+        self._device: D | None = None
+
+    def capture(self, settings: CaptureSettings) -> CapturedFrame:
+        with self._in_use:
+            try:
+                if self._device is None:
+                    self._device = self._open()
+                return self._expose(self._device, settings)
+            except Exception as error:
+                self._release()
+                why = self._explain(error)
+                if why is None:
+                    raise
+                raise CaptureError(f"{self.hardware_id}: {why}") from error
+
+    def close(self) -> None:
+        self._closing.set()
+        if self._device is not None:
+            self._interrupt(self._device)
+        with self._in_use:
+            self._release()
+
+    def _release(self) -> None:
+        device, self._device = self._device, None
+        if device is not None:
+            self._close(device)
+
+    def _open(self) -> D:
+        """Open the device; CaptureError if it is not there."""
+        raise NotImplementedError
+
+    def _expose(self, device: D, settings: CaptureSettings) -> CapturedFrame:
+        raise NotImplementedError
+
+    def _close(self, device: D) -> None:
+        """Give the device up, which may have gone."""
+
+    def _interrupt(self, device: D) -> None:
+        """End the waiting of a `capture` that does not look at `_closing`."""
+
+    def _explain(self, error: Exception) -> str | None:
+        """Say in a sentence what an error means; None for a defect, which the node reports as one."""
+        return str(error) if isinstance(error, StarposError) else None
 
 
 def missing(module: str, package: str) -> str | None:

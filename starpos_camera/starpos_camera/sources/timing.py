@@ -10,9 +10,8 @@ from datetime import datetime, timezone
 from typing import Any
 
 from starpos.messages.stamp import stamp_to_unix
-from starpos.session.system_clock import StepWatch
+from starpos.system_clock import StepWatch
 from starpos_camera.sources.source import CapturedFrame, CaptureError
-from starpos_common.parameters import Parameter
 from starpos_common.shutter_pulses import Edge, Lag, ShutterPulse, ShutterPulses
 from starpos_interfaces.msg import Capture, Pulse
 
@@ -20,21 +19,6 @@ from starpos_interfaces.msg import Capture, Pulse
 LOCAL = ("127.0.0.1", "localhost", "::1")
 # Tolerance between a driver's times of an exposure and the times of command and arrival.
 CLOCK_TOLERANCE_S = 0.05
-
-
-def server_clock(source: str) -> Parameter:
-    """Make the parameter `SOURCE.clock_stddev` for a source whose camera is behind a server."""
-    return Parameter(
-        f"{source}.clock_stddev",
-        math.nan,
-        "Error of the clock of the server's machine against UTC, 1 sigma, if the server runs on "
-        "another machine. Unset uses the times of the commands by this machine's clock instead of "
-        "the server's. If too small, fixes claim errors of longitude that are too small.",
-        unit="s",
-        # 0 would mean this machine's clock.
-        minimum=1e-9,
-        maximum=60.0,
-    )
 
 
 def clock_stddev_of(source: str, host: str, values: Mapping) -> float:
@@ -145,7 +129,7 @@ LAGS = {Capture.COMMAND: "command_lag", Capture.DRIVER: "driver_lag"}
 class ShutterTimes:
     """Replaces the times of a source's frames by the times of their pulses.
 
-    `hear` is called by the executor's thread, `timed` by the one that captures.
+    `hear` is called by the executor's thread, `date_frame` by the one that captures.
     """
 
     def __init__(self, values: Mapping[str, Any], patience_s: float = PULSE_PATIENCE_S) -> None:
@@ -176,7 +160,7 @@ class ShutterTimes:
             self.heard += 1
             self._changed.notify_all()
 
-    def timed(self, exposure: CapturedFrame, since_s: float, until_s: float) -> CapturedFrame:
+    def date_frame(self, exposure: CapturedFrame, since_s: float, until_s: float) -> CapturedFrame:
         """Date a frame that was captured between two times (Unix s) by its pulse, or by the lag of other frames' ones.
 
         A frame with neither, or of a source that gives better times itself, is returned unchanged.

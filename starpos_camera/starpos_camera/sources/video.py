@@ -454,6 +454,7 @@ class Video(FrameSource):
         return None
 
     def __init__(self, values: Mapping, now: Callable[[], float]) -> None:
+        super().__init__(values, now)
         device = values["video.device"]
         # Without a listener the first frames of a file would be played before the detector is ready.
         self.waits_for_listener = not is_camera(device)
@@ -473,9 +474,6 @@ class Video(FrameSource):
     def capture(self, settings: CaptureSettings) -> CapturedFrame:
         with self._in_use:
             return self._from.capture(settings)
-
-    def update(self, values: Mapping) -> None:
-        """Do nothing, because parameters that may change are read at each frame."""
 
     def close(self) -> None:
         self._from.closing = True

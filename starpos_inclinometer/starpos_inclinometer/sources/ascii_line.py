@@ -12,12 +12,13 @@ import numpy as np
 
 from starpos.instrument.inclinometer import elevations
 from starpos.instrument.tilt_log import noise_text
+from starpos.messages.tilt import GAP, TIME_UNKNOWN, Reading
 from starpos.units import ARCSEC
 from starpos_inclinometer.clock import ArrivalFilter, Moment, PaceWatch
 from starpos_inclinometer.sources.mcu_protocol import HOST_TOLERANCE_S, HOST_TOLERANCE_SHARE, Gate
 from starpos_inclinometer.sources.serial_link import SerialLink, port_refusal
-from starpos_inclinometer.sources.source import Arrival, Counts, Health, Reading, Surroundings, TiltSource
-from starpos_inclinometer.sources.tilts import Angles, AngleTilts
+from starpos_inclinometer.sources.source import Arrival, Counts, LinkSource, Surroundings
+from starpos_inclinometer.sources.tilts import SensorTilts, noise_floor_rad
 
 # In bytes.
 MAX_LINE = 256
@@ -127,9 +128,9 @@ class LineDecoder:
     def command(self) -> bytes:
         return self._request
 
-    def feed(self, data: bytes, moment: Moment) -> list[Arrival]:
+    def decode(self, data: bytes, moment: Moment) -> list[Arrival]:
         believed = []
-        for text in self._lines.feed(data):
+        for text in self._lines.split(data):
             line = self._parse(text)
             if line is None:
                 self._malformed += 1
@@ -209,7 +210,7 @@ class TextLines:
         self._rest = b""
         self._overlong = False
 
-    def feed(self, data: bytes) -> list[str]:
+    def split(self, data: bytes) -> list[str]:
         """Return the lines that end in `data`, stripped of blanks; empty and overlong lines are left out."""
         *ended, rest = _END.split(self._rest + data)
         lines = []
@@ -246,7 +247,7 @@ def _follows(a: Arrival, b: Arrival) -> bool:
     return elapsed > 0 and abs(elapsed * 1e-3 - apart_s) <= HOST_TOLERANCE_S + HOST_TOLERANCE_SHARE * apart_s
 
 
-class AsciiSource(TiltSource):
+class AsciiSource(LinkSource):
     """Reads the lines of a digital tiltmeter."""
 
     def __init__(self, host: Surroundings, values: Mapping[str, Any]) -> None:
@@ -261,7 +262,7 @@ class AsciiSource(TiltSource):
         )
         self._link = SerialLink(values["port"], self._baud, self._decoder, host.clock, host.wake)
         self._arrivals, self._pace = ArrivalFilter(), PaceWatch()
-        self._tilts = AngleTilts()
+        self._tilts, self._sequence = SensorTilts(), -1
         self.configure(values)
 
     @staticmethod
@@ -271,50 +272,39 @@ class AsciiSource(TiltSource):
             return f"ascii.request must be at most {MAX_REQUEST} ASCII characters."
         return port_refusal(values) or pattern_error(values["ascii.pattern"])
 
-    def start(self) -> None:
-        self._link.start()
-
-    def stop(self) -> None:
-        self._link.stop()
-
     def configure(self, values: Mapping[str, Any]) -> None:
         range_deg = values["ascii.range"]
-        self._tilts.configure(
-            values,
-            stuck_samples=values["ascii.stuck_samples"],
-            range_rad=math.pi / 2 if math.isnan(range_deg) else math.radians(range_deg),
-        )
+        self._tilts.range_rad = math.pi / 2 if math.isnan(range_deg) else math.radians(range_deg)
+        self._tilts.stuck = values["ascii.stuck_samples"]
+        self._tilts.noise_floor_rad = noise_floor_rad(values)
+        self._latency_s = 0.0 if math.isnan(values["latency"]) else values["latency"]
 
-    def take(self) -> list[Reading]:
-        return [self._read(arrival) for arrival in self._link.take()]
+    def fetch(self) -> list[Reading]:
+        return [self._read(arrival) for arrival in self._link.fetch()]
 
     def _read(self, arrival: Arrival) -> Reading:
         line, moment = arrival.sample, arrival.moment
-        known_s: float | None
+        late_s: float | None
         if line.milliseconds is None:
-            known_s = 0.0 if self._pace.on_time(moment.monotonic_s) else None
+            late_s = 0.0 if self._pace.on_time(moment.monotonic_s) else None
         else:
             if line.broken:
                 self._arrivals.restart()
-            known_s = self._arrivals.delay(line.milliseconds, moment.monotonic_s)
+            late_s = self._arrivals.delay(line.milliseconds, moment.monotonic_s)
         angles = (line.x, line.y) if line.z is None else (line.x, line.y, line.z)
-        measured = Angles(angles, line.step, line.temperature_c, line.lost, line.broken)
-        return self._tilts.reading(measured, moment, known_s)
+        self._sequence = (self._sequence + 1 + line.lost) & 0xFFFFFFFF
+        return self._tilts.reading(
+            angles,
+            (line.step,) * len(angles),
+            time_s=moment.monotonic_s - (late_s or 0.0),
+            stamp_ns=moment.stamp_ns((late_s or 0.0) + self._latency_s),
+            sequence=self._sequence,
+            temperature_c=line.temperature_c,
+            flags=(GAP if line.lost or line.broken else 0) | (TIME_UNKNOWN if late_s is None else 0),
+        )
 
-    def health(self) -> Health:
-        state = self._link.state()
-        values = {
-            "openings": state.connections,
-            "unfetched samples": state.dropped,
+    def _values(self) -> Mapping[str, object]:
+        return {
             "clock rate error (ppm)": self._arrivals.rate_ppm,
             "noise by axis (arcsec)": noise_text(self._tilts.noise.sigma),
         }
-        return Health(
-            phase=state.phase,
-            sentence=state.sentence,
-            rate_hz=state.rate_hz,
-            counts=state.counts,
-            complaint="",
-            step=state.step,
-            values=values,
-        )

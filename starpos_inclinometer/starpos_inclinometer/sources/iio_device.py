@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A sensor that Linux's Industrial I/O drives: its channels in sysfs, and its buffer in /dev with the kernel's time
-stamps.  Sources: Documentation/ABI/testing/sysfs-bus-iio; the kernel's document "Industrial IIO device buffers" for
-the layout of a scan and the order of the settings.
+"""A sensor that Linux's Industrial I/O drives: its channels in sysfs, its buffer in /dev with the kernel's time stamps.
+
+Sources: Documentation/ABI/testing/sysfs-bus-iio; the kernel's document "Industrial IIO device buffers" for the layout
+of a scan and the order of the settings.
 """
 
 import contextlib
@@ -307,6 +308,7 @@ class Buffer:
             self._write("buffer/enable", "1")
             self._file = os.open(nodes / self._folder.name, os.O_RDONLY | os.O_NONBLOCK)
         except OSError as error:
+            self._switch_off()
             raise DeviceError(
                 f"the buffer of {self._folder} cannot be started ({error.strerror}: {error.filename}): check "
                 f"`iio.trigger` ({trigger}) and the right to write there; it is retried."
@@ -328,6 +330,10 @@ class Buffer:
 
     def close(self) -> None:
         os.close(self._file)
+        self._switch_off()
+
+    def _switch_off(self) -> None:
+        """End the kernel's sampling; while it goes on no program can read the device."""
         # A device that is gone needs no end.
         with contextlib.suppress(OSError):
             self._write("buffer/enable", "0")

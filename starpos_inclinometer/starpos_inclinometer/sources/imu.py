@@ -51,19 +51,9 @@ class ImuSource(TiltSource):
             best_effort = ReliabilityPolicy.BEST_EFFORT
             self._topic = subscription(host.node, Imu, TOPIC, hear, DEPTH, best_effort).topic_name
 
-    @staticmethod
-    def refusal(values: Mapping[str, Any]) -> str | None:
-        return None
-
     @property
-    def takes(self) -> Mapping[str, Take]:
+    def handlers(self) -> Mapping[str, Take]:
         return {TOPIC: self._hear}
-
-    def start(self) -> None:
-        pass
-
-    def stop(self) -> None:
-        pass
 
     def restart(self) -> None:
         self._tilts = ImuTilts(self._values)
@@ -72,10 +62,10 @@ class ImuSource(TiltSource):
     def configure(self, values: Mapping[str, Any]) -> None:
         self._tilts.configure(values)
 
-    def take(self) -> list[Reading]:
-        taken = list(self._readings)
+    def fetch(self) -> list[Reading]:
+        readings = list(self._readings)
         self._readings.clear()
-        return taken
+        return readings
 
     def _hear(self, message: Imu, info: Mapping[str, Any]) -> None:
         self._heard_s = self._clock.read().monotonic_s

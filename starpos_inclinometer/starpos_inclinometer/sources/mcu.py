@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The source `serial`: tilts and the times of pulses from the microcontroller's lines, and the commands that it gets.
+"""The source `serial`: tilts and times of pulses from the microcontroller's lines, and the commands that it gets.
+
 The host's clock is good enough to say which second a receiver's pulse begins. Between two pulses the board's clock
 counts, at the rate that the last two have shown: so an edge has the receiver's time, whatever the serial line and the
 host's clock add.
@@ -12,6 +13,7 @@ from dataclasses import replace
 from typing import Any
 
 from starpos.instrument.tilt_log import noise_text
+from starpos.messages.tilt import TIME_UNKNOWN, Reading
 from starpos_inclinometer.clock import ArrivalFilter, Moment
 from starpos_inclinometer.sources import mcu_protocol
 from starpos_inclinometer.sources.mcu_protocol import (
@@ -26,17 +28,14 @@ from starpos_inclinometer.sources.mcu_protocol import (
     mcu_follows,
 )
 from starpos_inclinometer.sources.serial_link import SerialLink, port_refusal
-from starpos_inclinometer.sources.source import (
-    TIME_UNKNOWN,
-    Arrival,
-    Counts,
-    Health,
-    Reading,
-    Surroundings,
-    TiltSource,
-    TimedPulse,
+from starpos_inclinometer.sources.source import Arrival, Counts, LinkSource, Surroundings, TimedPulse
+from starpos_inclinometer.sources.tilts import (
+    BoardSensor,
+    Sca100t,
+    Sca100tCalibration,
+    Scl3300,
+    noise_floor_rad,
 )
-from starpos_inclinometer.sources.tilts import Sca100t, Sca100tCalibration, Scl3300, Scl3300Calibration
 
 # Error of a time through the serial line: an adapter's latency timer of 16 ms, evenly distributed.
 LINE_STDDEV_S = 0.016 / 12**0.5
@@ -67,13 +66,14 @@ class PulseTimes:
         """Forget the receiver's pulses, because the board's clock was reset."""
         self._seconds.clear()
 
-    def take(self) -> list[TimedPulse]:
-        taken = list(self._queue)
+    def fetch(self) -> list[TimedPulse]:
+        """Return the edges that were dated since the last call, in order."""
+        dated = list(self._queue)
         self._queue.clear()
-        return taken
+        return dated
 
-    def add(self, pulse: Pulse, moment: Moment, edge_s: float | None) -> None:
-        """Take an edge whose line came at a moment; edge_s: when it was, on the monotonic clock, by the lines alone."""
+    def date(self, pulse: Pulse, moment: Moment, edge_s: float | None) -> None:
+        """Date an edge whose line came at a moment; edge_s: when it was, on the monotonic clock, by the lines alone."""
         sequence = self._continued(pulse)
         device_s = pulse.milliseconds * 1e-3 + pulse.microseconds * 1e-6
         if edge_s is None:
@@ -148,17 +148,14 @@ SMALLEST_DETERMINANT = 0.5
 
 def calibration(values: Mapping[str, Any]) -> Sca100tCalibration:
     """Make the calibration of the sensor from the parameters."""
-    floor = values["noise_stddev"]
     return Sca100tCalibration(
         offset_volts=values["offset_volts"],
         sensitivity_volts_per_g=values["sensitivity"],
         divider=values["divider"],
         reference_volts=values["reference_volts"],
-        cross_axis=values["cross_axis"],
         temperature_reference_c=values["temperature.reference"],
         offset_per_c=(values["temperature.offset_x"], values["temperature.offset_y"]),
         sensitivity_per_c=(values["temperature.sensitivity_x"], values["temperature.sensitivity_y"]),
-        noise_floor_rad=0.0 if math.isnan(floor) else math.radians(floor),
     )
 
 
@@ -211,10 +208,10 @@ class McuDecoder:
         self._gate.reset()
         self._continuity.resume()
 
-    def feed(self, data: bytes, moment: Moment) -> list[Arrival]:
+    def decode(self, data: bytes, moment: Moment) -> list[Arrival]:
         believed = []
         self.answered = False
-        for message in self._parser.feed(data):
+        for message in self._parser.parse(data):
             if isinstance(message, mcu_protocol.Sample):
                 believed += self._admit(Arrival(message, moment, self.identity))
                 continue
@@ -257,9 +254,13 @@ class McuTilts:
     """Converts believed samples to readings."""
 
     def __init__(self, values: Mapping[str, Any]) -> None:
+        self._sca100t = Sca100t()
+        self._sensors: dict[int, BoardSensor] = {
+            SensorKind.SCA100T: self._sca100t,
+            SensorKind.SCL3300: Scl3300(),
+        }
         # The sensor of the unit that was last heard.
-        self.sensor: Sca100t | Scl3300 = Sca100t()
-        self._sca100t, self._scl3300 = self.sensor, Scl3300()
+        self.sensor: BoardSensor = self._sca100t
         self.arrivals = ArrivalFilter()
         self._line_s = mcu_protocol.SAMPLE_LINE * BITS_PER_BYTE / values["baud"]
         self._delay_ms = 0
@@ -271,9 +272,9 @@ class McuTilts:
 
     def configure(self, values: Mapping[str, Any]) -> None:
         self._sca100t.calibration = calibration(values)
-        self._scl3300.calibration = Scl3300Calibration(
-            values["cross_axis"], self._sca100t.calibration.noise_floor_rad
-        )
+        for sensor in self._sensors.values():
+            sensor.cross_axis = tuple(values["cross_axis"])
+            sensor.noise_floor_rad = noise_floor_rad(values)
         self._latency_s = values["latency"]
 
     def read(self, arrivals: list[Arrival]) -> list[Reading]:
@@ -285,7 +286,7 @@ class McuTilts:
         readings = []
         for arrival in arrivals:
             if isinstance(arrival.sample, Pulse):
-                self._take_pulse(arrival)
+                self._date_pulse(arrival)
             elif arrival.identity is None:
                 sample = arrival.sample
                 self._gap |= bool(sample.lost) or sample.restarted or sample.resumed
@@ -293,12 +294,12 @@ class McuTilts:
                 readings.append(self._reading(arrival))
         return readings
 
-    def _take_pulse(self, arrival: Arrival) -> None:
+    def _date_pulse(self, arrival: Arrival) -> None:
         """Date an edge through the clocks' relation that the samples have shown."""
         sent_s = self.arrivals.arrival_s(arrival.sample.milliseconds, arrival.moment.monotonic_s)
         if sent_s is not None:
             sent_s -= self._sample_to_arrival_s()
-        self.pulses.add(arrival.sample, arrival.moment, sent_s)
+        self.pulses.date(arrival.sample, arrival.moment, sent_s)
 
     def _sample_to_arrival_s(self) -> float:
         """Shortest delay from the time in a line to its arrival."""
@@ -306,7 +307,7 @@ class McuTilts:
 
     def _follow(self, identity: Identity) -> None:
         """Take over the sensor, rate and delay that the MCU had reported when it sent the next sample."""
-        self.sensor = self._scl3300 if identity.kind == SensorKind.SCL3300 else self._sca100t
+        self.sensor = self._sensors[identity.kind]
         # At a lower rate a sample is the mean of more conversions, so its noise is another.
         if identity.rate_hz != self._rate_hz:
             self._rate_hz = identity.rate_hz
@@ -325,19 +326,12 @@ class McuTilts:
             self.pulses.restart()
         known_s = self.arrivals.delay(sample.milliseconds, moment.monotonic_s)
         late_s = known_s or 0.0
-        measured = self.sensor.measure(sample, moment.monotonic_s - late_s)
-        return Reading(
-            stamp_ns=max(moment.host_ns - round((late_s + self._sample_to_arrival_s()) * 1e9), 0),
-            x=measured.x,
-            y=measured.y,
-            covariance=measured.covariance,
-            temperature_c=measured.temperature_c,
-            sequence=sample.sequence,
-            flags=measured.flags | (TIME_UNKNOWN if known_s is None else 0),
-        )
+        stamp_ns = moment.stamp_ns(late_s + self._sample_to_arrival_s())
+        reading = self.sensor.measure(sample, moment.monotonic_s - late_s, stamp_ns)
+        return reading if known_s is not None else replace(reading, flags=reading.flags | TIME_UNKNOWN)
 
 
-class McuSource(TiltSource):
+class McuSource(LinkSource):
     """The starpos microcontroller on a serial port; see `McuTilts`."""
 
     def __init__(self, host: Surroundings, values: Mapping[str, Any]) -> None:
@@ -356,48 +350,30 @@ class McuSource(TiltSource):
             )
         return port_refusal(values)
 
-    def start(self) -> None:
-        self._link.start()
-
-    def stop(self) -> None:
-        self._link.stop()
-
     def configure(self, values: Mapping[str, Any]) -> None:
         self._tilts.configure(values)
         self._decoder.wanted_rate_hz = values["rate"]
 
-    def take(self) -> list[Reading]:
-        return self._tilts.read(self._link.take())
+    def fetch(self) -> list[Reading]:
+        return self._tilts.read(self._link.fetch())
 
-    def take_pulses(self) -> list[TimedPulse]:
-        return self._tilts.pulses.take()
+    def fetch_pulses(self) -> list[TimedPulse]:
+        return self._tilts.pulses.fetch()
 
-    def health(self) -> Health:
-        state = self._link.state()
-        identity = self._decoder.identity
-        complaint = ""
-        if self._decoder.refused:
-            wanted = self._decoder.wanted_rate_hz
-            complaint = f"the microcontroller refused {wanted} Hz: set another `rate`."
-        sensor = self._tilts.sensor
-        values = {
-            "openings": state.connections,
-            "unfetched samples": state.dropped,
-            "clock rate error (ppm)": self._tilts.arrivals.rate_ppm,
-            "noise x, y (arcsec)": noise_text(sensor.noise.sigma),
-            "sensor temperature (deg C)": sensor.temperature.celsius(math.nan),
-            "pulses, and without a time": f"{self._tilts.pulses.dated}, {self._tilts.pulses.undated}",
-            "receiver's second": self._tilts.pulses.second,
+    def _complaint(self) -> str:
+        if not self._decoder.refused:
+            return ""
+        return f"the microcontroller refused {self._decoder.wanted_rate_hz} Hz: set another `rate`."
+
+    def _values(self) -> Mapping[str, object]:
+        identity, tilts = self._decoder.identity, self._tilts
+        return {
+            "clock rate error (ppm)": tilts.arrivals.rate_ppm,
+            "noise x, y (arcsec)": noise_text(tilts.sensor.noise.sigma),
+            "sensor temperature (deg C)": tilts.sensor.temperature.celsius(math.nan),
+            "pulses, and without a time": f"{tilts.pulses.dated}, {tilts.pulses.undated}",
+            "receiver's second": tilts.pulses.second,
             "firmware": f"{identity.firmware >> 8}.{identity.firmware & 255}" if identity else "unknown",
             "sensor": SensorKind(identity.kind).name if identity else "unknown",
             "unit": f"{identity.unit:08X}" if identity else "unknown",
         }
-        return Health(
-            phase=state.phase,
-            sentence=state.sentence,
-            rate_hz=state.rate_hz,
-            counts=state.counts,
-            complaint=complaint,
-            step=state.step,
-            values=values,
-        )

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The protocol of the board's serial line, as PROTOCOL.md defines it, and the check that its samples fit one another.  A
-16-bit checksum lets one corrupted line in 65,536 pass, and a line without a checksum passes far more often. Such a
+"""The protocol of the board's serial line, as PROTOCOL.md defines it, and the check that its samples fit one another.
+
+A 16-bit checksum lets one corrupted line in 65,536 pass, and a line without a checksum passes far more often. Such a
 sample does not fit the samples around it: its number, its time or its tilt is wrong. No I/O, no clock.
 """
 
@@ -170,7 +171,7 @@ class LineSplitter:
         self.garbage_bytes = 0
         self._rest = b""
 
-    def feed(self, data: bytes) -> list[tuple[bytes, bool]]:
+    def split(self, data: bytes) -> list[tuple[bytes, bool]]:
         """Return the bodies of the lines that end in `data`, each with whether its checksum is right."""
         buffer = self._rest + data
         lines = []
@@ -204,10 +205,10 @@ class LineParser:
     def garbage_bytes(self) -> int:
         return self._splitter.garbage_bytes
 
-    def feed(self, data: bytes) -> list[Message]:
+    def parse(self, data: bytes) -> list[Message]:
         """Return the messages that `data` completes, in order; none with a wrong checksum or an impossible field."""
         messages: list[Message] = []
-        for body, right in self._splitter.feed(data):
+        for body, right in self._splitter.split(data):
             if not right:
                 self.crc_errors += 1
             elif (message := _parse(body)) is None:

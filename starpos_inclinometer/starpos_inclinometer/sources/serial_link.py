@@ -6,29 +6,21 @@ import errno
 import fcntl
 import os
 import termios
-import threading
-from collections import deque
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import serial
 
-from starpos_inclinometer.clock import HostClock, Moment, Step
+from starpos_inclinometer.clock import HostClock, Moment
 from starpos_inclinometer.sources import mcu_protocol
-from starpos_inclinometer.sources.source import Arrival, Counts, Phase
+from starpos_inclinometer.sources.source import Arrival, Counts, Link, Phase
 
-# A device that came back is read again within a second.
-RETRY_S = 0.4
 # How soon a stop, a command or silence is noticed.
 READ_TIMEOUT_S = 0.1
 MIN_SILENCE_S, SILENT_PERIODS = 1.0, 1.5
 # Lines of which none is used are reported after this multiple of the patience with silence.
 UNFIT_PATIENCES = 3.0
 READ_BYTES = 4096
-# 10 s at the highest rate.
-QUEUE_SAMPLES = 512
-RATE_WINDOW_S = 5.0
 # pseudo-terminals, Linux's devices.txt.
 PTY_MAJORS = range(136, 144)
 
@@ -56,7 +48,7 @@ class Decoder(Protocol):
     def period_s(self) -> float:
         """Time from one sample to the next."""
 
-    def feed(self, data: bytes, moment: Moment) -> list[Arrival]:
+    def decode(self, data: bytes, moment: Moment) -> list[Arrival]:
         """Take bytes that were read at that moment; return the samples that are believed now; never raises."""
 
     def resume(self) -> None:
@@ -74,29 +66,11 @@ class Decoder(Protocol):
         """Whether the last bytes answered a command, so that the next command need not wait."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class LinkState:
-    """State of the link, for a person to read."""
-
-    phase: Phase = Phase.ABSENT
-    sentence: str = "the port has not been opened yet"
-    counts: Counts = field(default_factory=Counts)
-    # How often the port was opened.
-    connections: int = 0
-    # Samples that were not fetched in time.
-    dropped: int = 0
-    # Rate of the recent samples.
-    rate_hz: float = 0.0
-    # The last step of the host's clock.
-    step: Step | None = None
-
-
-class SerialLink:
-    """Reads samples from `port` until `stop`.
+class SerialLink(Link):
+    """Reads the samples that come through a serial port.
 
     port: use a stable path (/dev/serial/by-id/...); it is resolved at each opening, and opened exclusively.
     clock: read once for each chunk of bytes.
-    wake: called from the reader's thread when there are samples to take or the phase changed; it must be quick.
     """
 
     def __init__(
@@ -107,68 +81,25 @@ class SerialLink:
         clock: HostClock,
         wake: Callable[[], object] = lambda: None,
     ) -> None:
+        super().__init__(clock, wake, "serial link")
         self._port = port
         self._baud = baud
         self._decoder = decoder
-        self._clock = clock
-        self._wake = wake
-        self._queue: deque[Arrival] = deque(maxlen=QUEUE_SAMPLES)
-        self._recent: deque[float] = deque(maxlen=int(RATE_WINDOW_S * 64))
-        self._lock = threading.Lock()
-        self._phase = Phase.ABSENT
-        self._sentence = LinkState.sentence
-        self._connections = self._dropped = 0
         self._next_command = 0.0
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="serial link", daemon=True)
 
-    def start(self) -> None:
-        self._thread.start()
+    def _counts(self) -> Counts:
+        return self._decoder.counts
 
-    def stop(self) -> None:
-        """Close the port and end the thread; takes at most a few READ_TIMEOUT_S."""
-        self._stop.set()
-        if self._thread.is_alive():
-            self._thread.join(timeout=5.0)
-
-    def take(self) -> list[Arrival]:
-        """Return the samples since the last call, in order."""
-        taken = []
-        with self._lock:
-            while self._queue:
-                taken.append(self._queue.popleft())
-        return taken
-
-    def state(self) -> LinkState:
-        with self._lock:
-            horizon = self._clock.monotonic_s() - RATE_WINDOW_S
-            recent = [t for t in self._recent if t >= horizon]
-            span = recent[-1] - recent[0] if len(recent) > 1 else 0.0
-            return LinkState(
-                phase=self._phase,
-                sentence=self._sentence,
-                counts=self._decoder.counts,
-                connections=self._connections,
-                dropped=self._dropped,
-                rate_hz=(len(recent) - 1) / span if span > 0 and self._phase is Phase.RECEIVING else 0.0,
-                step=self._clock.step,
-            )
-
-    # All that follows runs in the reader's thread.
-
-    def _run(self) -> None:
-        while not self._stop.is_set():
-            device = None
-            try:
-                device = self._open()
-                self._serve(device)
-            except PORT_ERRORS as error:
-                self._enter(Phase.ABSENT, self._explain(error, opened=device is not None))
-            finally:
-                if device is not None:
-                    _close(device)
-            self._clock.read()
-            self._stop.wait(RETRY_S)
+    def _serve(self) -> None:
+        device = None
+        try:
+            device = self._open()
+            self._read(device)
+        except PORT_ERRORS as error:
+            self._enter(Phase.ABSENT, self._explain(error, opened=device is not None))
+        finally:
+            if device is not None:
+                _close(device)
 
     def _open(self) -> serial.Serial:
         device = serial.Serial(
@@ -180,7 +111,7 @@ class SerialLink:
             fcntl.ioctl(device.fileno(), termios.TIOCEXCL)
         return device
 
-    def _serve(self, device: serial.Serial) -> None:
+    def _read(self, device: serial.Serial) -> None:
         """Read until the link is stopped or the path leads to another device; raises when something goes wrong."""
         with self._lock:
             self._connections += 1
@@ -222,30 +153,18 @@ class SerialLink:
         """Take bytes; return whether they held valid lines, and samples."""
         with self._lock:
             before = self._decoder.counts.good
-            arrivals = self._decoder.feed(data, moment)
-            for arrival in arrivals:
-                self._dropped += len(self._queue) == QUEUE_SAMPLES
-                self._queue.append(arrival)
-                if not isinstance(arrival.sample, mcu_protocol.Pulse):
-                    self._recent.append(moment.monotonic_s)
-            if self._decoder.answered:
-                self._next_command = 0.0
+            arrivals = self._decoder.decode(data, moment)
             lines = self._decoder.counts.good > before
+        if self._decoder.answered:
+            self._next_command = 0.0
         if arrivals:
-            self._enter(Phase.RECEIVING, f"receiving from {self._port}")
-            self._wake()
+            samples = [a for a in arrivals if not isinstance(a.sample, mcu_protocol.Pulse)]
+            self._admit(arrivals, [moment.monotonic_s] * len(samples), f"receiving from {self._port}")
         return lines, bool(arrivals)
 
     def _moved(self, device: serial.Serial) -> bool:
         """Whether the path now leads to another device than the open one; OSError if it leads nowhere."""
         return os.stat(self._port).st_rdev != os.fstat(device.fileno()).st_rdev
-
-    def _enter(self, phase: Phase, sentence: str) -> None:
-        with self._lock:
-            changed = (phase, sentence) != (self._phase, self._sentence)
-            self._phase, self._sentence = phase, sentence
-        if changed:
-            self._wake()
 
     def _explain(self, error: Exception, opened: bool) -> str:
         code = getattr(error, "errno", None)

@@ -1,31 +1,27 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Interface between the node and a sensor. A new sensor is a TiltSource in a module here, and a line in `parameters`."""
+"""Interface between the node and a sensor, and the link to a sensor that a thread reads.
 
+A new sensor is a TiltSource in a module here, and a line in `registry`.
+"""
+
+import threading
+from collections import deque
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import Enum
-from typing import Any, Protocol
+from typing import Any
 
 from rclpy.node import Node
 
-from starpos.messages.tilt import GAP, OUT_OF_RANGE, SATURATED, STUCK, TIME_UNKNOWN, Reading
+from starpos.messages.tilt import Reading
 from starpos_common.topics import Take
 from starpos_inclinometer.clock import HostClock, Moment, Step
 
-__all__ = [
-    "GAP",
-    "OUT_OF_RANGE",
-    "SATURATED",
-    "STUCK",
-    "TIME_UNKNOWN",
-    "Arrival",
-    "Counts",
-    "Health",
-    "Phase",
-    "Reading",
-]
-
-# for the sources
+# A device that came back is read again within a second.
+RETRY_S = 0.4
+# 20 s at the board's highest rate.
+QUEUE = 1024
+RATE_WINDOW_S = 5.0
 
 
 class Phase(Enum):
@@ -70,8 +66,10 @@ class Arrival:
 
     sample: Any
     moment: Moment
-    # The device's identity when it sent this.
+    # The device when it sent this: its identity, or itself.
     identity: Any = None
+    # Whether it was read soon after it was measured.
+    dated: bool = True
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -124,7 +122,88 @@ class Surroundings:
     replays: bool = False
 
 
-class TiltSource(Protocol):
+class Link:
+    """A device that a thread reads until `stop`, and opens again when it comes back.
+
+    clock: read at least once a second.
+    wake: called from the thread when there is something to fetch or the phase changed; it must be quick.
+    """
+
+    def __init__(self, clock: HostClock, wake: Callable[[], object], name: str) -> None:
+        self._clock, self._wake = clock, wake
+        self._queue: deque[Arrival] = deque(maxlen=QUEUE)
+        self._recent: deque[float] = deque(maxlen=QUEUE)
+        # Of all that both threads use.
+        self._lock = threading.Lock()
+        self._phase, self._sentence = Phase.ABSENT, "the device has not been opened yet"
+        self._connections = self._dropped = 0
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+
+    def start(self) -> None:
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Close the device and end the thread, soon."""
+        self._stop.set()
+        if self._thread.is_alive():
+            self._thread.join(timeout=5.0)
+
+    def fetch(self) -> list[Arrival]:
+        """Return what has arrived since the last call, in order."""
+        with self._lock:
+            arrivals = list(self._queue)
+            self._queue.clear()
+        return arrivals
+
+    def health(self) -> Health:
+        with self._lock:
+            horizon = self._clock.monotonic_s() - RATE_WINDOW_S
+            recent = [t for t in self._recent if t >= horizon]
+            span = recent[-1] - recent[0] if len(recent) > 1 else 0.0
+            return Health(
+                phase=self._phase,
+                sentence=self._sentence,
+                rate_hz=(len(recent) - 1) / span if span > 0 and self._phase is Phase.RECEIVING else 0.0,
+                counts=self._counts(),
+                step=self._clock.step,
+                values={"openings": self._connections, "unfetched samples": self._dropped},
+            )
+
+    def _counts(self) -> Counts:
+        raise NotImplementedError
+
+    # All that follows runs in the thread.
+
+    def _run(self) -> None:
+        while not self._stop.is_set():
+            self._serve()
+            self._clock.read()
+            self._stop.wait(RETRY_S)
+
+    def _serve(self) -> None:
+        """Open the device and read it until the link is stopped, or the device has gone; never raises."""
+        raise NotImplementedError
+
+    def _admit(self, arrivals: list[Arrival], measured_s: list[float], sentence: str) -> None:
+        """Queue arrivals; measured_s: the monotonic times of those that count for the rate."""
+        with self._lock:
+            for arrival in arrivals:
+                self._dropped += len(self._queue) == QUEUE
+                self._queue.append(arrival)
+            self._recent.extend(measured_s)
+        self._enter(Phase.RECEIVING, sentence)
+        self._wake()
+
+    def _enter(self, phase: Phase, sentence: str) -> None:
+        with self._lock:
+            changed = (phase, sentence) != (self._phase, self._sentence)
+            self._phase, self._sentence = phase, sentence
+        if changed:
+            self._wake()
+
+
+class TiltSource:
     """A source of tilts, made as SourceClass(host, values) from the node's parameters.
 
     Only the node's thread calls it.
@@ -133,14 +212,16 @@ class TiltSource(Protocol):
     # The port or topic of the device, for diagnostics.
     name: str
 
-    def __init__(self, host: Surroundings, values: Mapping[str, Any]) -> None: ...
+    def __init__(self, host: Surroundings, values: Mapping[str, Any]) -> None:
+        raise NotImplementedError
 
     @staticmethod
     def refusal(values: Mapping[str, Any]) -> str | None:
         """Say in a sentence why a source cannot be made of these parameters; None if it can."""
+        return None
 
     @property
-    def takes(self) -> Mapping[str, Take]:
+    def handlers(self) -> Mapping[str, Take]:
         """Functions that take the messages of topics, by relative name."""
         return {}
 
@@ -152,17 +233,42 @@ class TiltSource(Protocol):
 
     def restart(self) -> None:
         """Forget what came of topics: a replay begins."""
-        return None
 
     def configure(self, values: Mapping[str, Any]) -> None:
         """Apply the parameters that may change at run time."""
 
-    def take(self) -> list[Reading]:
+    def fetch(self) -> list[Reading]:
         """Return the readings since the last call, in order."""
+        raise NotImplementedError
 
-    def take_pulses(self) -> list[TimedPulse]:
+    def fetch_pulses(self) -> list[TimedPulse]:
         """Return the edges that the device has timed since the last call, in order; most devices time none."""
         return []
 
     def health(self) -> Health:
         """State of the source, for a person to read."""
+        raise NotImplementedError
+
+
+class LinkSource(TiltSource):
+    """A source whose device a `Link` reads."""
+
+    _link: Link
+
+    def start(self) -> None:
+        self._link.start()
+
+    def stop(self) -> None:
+        self._link.stop()
+
+    def health(self) -> Health:
+        health = self._link.health()
+        return replace(health, complaint=self._complaint(), values={**health.values, **self._values()})
+
+    def _complaint(self) -> str:
+        """What is wrong although samples come; '' for nothing."""
+        return ""
+
+    def _values(self) -> Mapping[str, object]:
+        """What diagnostics show besides the link."""
+        return {}

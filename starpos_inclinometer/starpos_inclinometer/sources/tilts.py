@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tilts from a sensor's angles or codes, their covariance and their faults.  Sources: data sheets SCA100T series (Murata
-8261800 rev. B2), AD7730/AD7730L (Analog Devices rev. A), SCL3300-D01 (Murata Doc. 4921 Rev. 2); PROTOCOL.md says what
-the board makes of its registers.
+"""Tilts from a sensor's angles or codes, their covariance and their faults.
+
+Sources: data sheets SCA100T series (Murata 8261800 rev. B2), AD7730/AD7730L (Analog Devices rev. A), SCL3300-D01
+(Murata Doc. 4921 Rev. 2); PROTOCOL.md says what the board makes of its registers.
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,9 +18,8 @@ from starpos.instrument.inclinometer import (
     SCA100T_SENSITIVITY_V_PER_G,
 )
 from starpos.instrument.tilt_log import NoiseTracker
-from starpos_inclinometer.clock import Moment
-from starpos_inclinometer.sources.mcu_protocol import Sample, SampleStatus
-from starpos_inclinometer.sources.source import GAP, OUT_OF_RANGE, SATURATED, STUCK, TIME_UNKNOWN, Reading
+from starpos.messages.tilt import GAP, OUT_OF_RANGE, SATURATED, STUCK, Reading
+from starpos_inclinometer.sources.mcu_protocol import FAULTS, Sample, SampleStatus
 
 # The body of the sensor warms no faster.
 SMOOTHING_S = 60.0
@@ -29,6 +29,13 @@ READING_STEP_C = 0.92
 AGEING_C_PER_S = 2.0 / 60
 # Without any reading the temperature may be anywhere from -40 to 125 deg C.
 UNKNOWN_STDDEV_C = 40.0
+# (xx, xy, yx, yy) of a sensor whose axes are S's.
+SQUARE_AXES = (1.0, 0.0, 0.0, 1.0)
+
+
+def noise_floor_rad(values: Mapping[str, Any]) -> float:
+    """Smallest noise of a reading (rad) by the parameter noise_stddev; 0 where it is unset."""
+    return 0.0 if math.isnan(values["noise_stddev"]) else math.radians(values["noise_stddev"])
 
 
 class Temperature:
@@ -38,7 +45,7 @@ class Temperature:
         self._value = math.nan
         self._read_s = self._now_s = 0.0
 
-    def add(self, time_s: float, celsius: float) -> None:
+    def observe(self, time_s: float, celsius: float) -> None:
         """Take a reading at `time_s` of a clock that does not step; NaN for a missing one."""
         elapsed = max(time_s - self._read_s, 0.0)
         self._now_s = time_s
@@ -63,74 +70,109 @@ class Temperature:
         return min(math.hypot(READING_STEP_C / math.sqrt(12), AGEING_C_PER_S * age_s), UNKNOWN_STDDEV_C)
 
 
-@dataclass(frozen=True, slots=True)
-class Angles:
-    """One reading: elevations of x, y and perhaps z, and the step of their digits, in rad."""
+class SensorTilts:
+    """Readings of one sensor, in order: their noise, which they show themselves, and their faults.
 
-    angles: tuple[float, ...]
-    step: float
-    # NaN where it is not known.
-    temperature_c: float
-    # Readings lost just before this one.
-    lost: int = 0
-    # True: it does not continue the readings before.
-    broken: bool = False
+    usual_noise_rad: noise of a reading until the readings show theirs.  range_rad: largest angle of x and y.
+    stuck: number of equal readings, on all axes, that shows a stuck sensor; 0: none.  stuck_axis: the same on one axis.
+    """
 
-
-class AngleTilts:
-    """Readings of one sensor of angles, in order."""
-
-    def __init__(self) -> None:
+    def __init__(
+        self,
+        usual_noise_rad: float = SCA100T_NOISE_RAD,
+        range_rad: float = math.pi / 2,
+        stuck: int = 0,
+        stuck_axis: int = 0,
+    ) -> None:
         self.noise = NoiseTracker()
-        # Noise of a reading until the readings show theirs, rad.
-        self.usual_noise = SCA100T_NOISE_RAD
-        self._floor = self._latency = 0.0
-        self._stuck_samples, self._range = 0, math.pi / 2
-        self._equal = 0
-        self._last: tuple[float, ...] = ()
-        self._sequence = -1
+        self.range_rad, self.stuck = range_rad, stuck
+        # Smallest noise of a reading, even if the readings show less.
+        self.noise_floor_rad = 0.0
+        # (xx, xy, yx, yy): from the sines of the sensor's x and y to those of S's.
+        self.cross_axis: Sequence[float] = SQUARE_AXES
+        self._usual_noise_rad, self._stuck_axis = usual_noise_rad, stuck_axis
+        self._codes: tuple[float, ...] = ()
+        self._equal: list[int] = []
 
-    def configure(self, values: Mapping[str, Any], *, stuck_samples: int, range_rad: float) -> None:
-        """Take the parameters, the number of equal readings that shows a stuck sensor (0: none), and its range."""
-        self._floor = 0.0 if math.isnan(values["noise_stddev"]) else math.radians(values["noise_stddev"])
-        self._latency = 0.0 if math.isnan(values["latency"]) else values["latency"]
-        self._stuck_samples, self._range = stuck_samples, range_rad
+    def reading(
+        self,
+        angles: tuple[float, ...],
+        steps: tuple[float, ...],
+        *,
+        time_s: float,
+        stamp_ns: int,
+        sequence: int,
+        temperature_c: float,
+        flags: int = 0,
+        codes: tuple[float, ...] | None = None,
+        shift: tuple[float, float] = (0.0, 0.0),
+    ) -> Reading:
+        """Make the reading of a sensor's own angles (elevations of x, y and perhaps z, rad) and their steps (rad).
 
-    def reading(self, measured: Angles, moment: Moment, late_s: float | None) -> Reading:
-        """Convert a reading that came at a moment, late by some seconds, or None if unknown."""
-        angles = measured.angles
-        flags = self._flags(measured) | (TIME_UNKNOWN if late_s is None else 0)
-        if flags & GAP:
-            self.noise.interrupt()
-        late = late_s or 0.0
-        if not flags & (OUT_OF_RANGE | STUCK):
-            self.noise.add(moment.monotonic_s - late, *angles)
-        sigmas = self.noise.sigma or (max(self.usual_noise, measured.step),) * len(angles)
-        variances = [max(s, self._floor) ** 2 + measured.step**2 / 12 for s in sigmas]
-        self._sequence = (self._sequence + 1 + measured.lost) & 0xFFFFFFFF
-        three = len(angles) > 2
-        return Reading(
-            stamp_ns=max(moment.host_ns - round((late + self._latency) * 1e9), 0),
-            x=angles[0],
-            y=angles[1],
-            covariance=(variances[0], 0.0, 0.0, variances[1]),
-            temperature_c=measured.temperature_c,
-            sequence=self._sequence,
-            flags=flags,
-            z=angles[2] if three else math.nan,
-            z_variance=variances[2] if three else math.nan,
-        )
-
-    def _flags(self, measured: Angles) -> int:
-        self._equal = self._equal + 1 if measured.angles == self._last else 1
-        self._last = measured.angles
-        flags = GAP if measured.lost or measured.broken else 0
-        if 0 < self._stuck_samples <= self._equal:
+        time_s: of a clock that does not step.  codes: what the sensor sent, if not its angles.
+        shift: change of S's x and y (rad) if the temperature is 1 sigma off.
+        """
+        x, y = self.turned(angles)
+        if self._is_stuck(angles if codes is None else codes):
             flags |= STUCK
         # For a sensor without z, beyond 90 deg is upside down.
-        if max(map(abs, measured.angles[:2])) > self._range:
+        if max(abs(x), abs(y)) > self.range_rad:
             flags |= OUT_OF_RANGE
-        return flags
+        if flags & GAP:
+            self.noise.interrupt()
+        if not flags & (OUT_OF_RANGE | STUCK | SATURATED):
+            self.noise.add(time_s, *angles)
+        sigmas = self.noise.sigma or [max(self._usual_noise_rad, step) for step in steps]
+        variances = [
+            max(s, self.noise_floor_rad) ** 2 + step**2 / 12 for s, step in zip(sigmas, steps, strict=True)
+        ]
+        xx, xy, yx, yy = self._slopes(angles, (x, y))
+        vx, vy, *vz = variances
+        dx, dy = shift
+        cxy = xx * yx * vx + xy * yy * vy + dx * dy
+        return Reading(
+            stamp_ns=stamp_ns,
+            x=x,
+            y=y,
+            covariance=(
+                xx * xx * vx + xy * xy * vy + dx * dx,
+                cxy,
+                cxy,
+                yx * yx * vx + yy * yy * vy + dy * dy,
+            ),
+            temperature_c=temperature_c,
+            sequence=sequence,
+            flags=flags,
+            z=angles[2] if vz else math.nan,
+            z_variance=vz[0] if vz else math.nan,
+        )
+
+    def turned(self, angles: Sequence[float]) -> tuple[float, float]:
+        """Elevations of S's x and y from the sensor's own, rad."""
+        if self.cross_axis == SQUARE_AXES:
+            return angles[0], angles[1]
+        xx, xy, yx, yy = self.cross_axis
+        sx, sy = math.sin(angles[0]), math.sin(angles[1])
+        return _asin(xx * sx + xy * sy), _asin(yx * sx + yy * sy)
+
+    def _slopes(
+        self, angles: Sequence[float], turned: tuple[float, float]
+    ) -> tuple[float, float, float, float]:
+        """Derivatives of S's x and y by the sensor's own, as `cross_axis` has them."""
+        if self.cross_axis == SQUARE_AXES:
+            return SQUARE_AXES
+        xx, xy, yx, yy = self.cross_axis
+        # An angle of 90 deg has no slope.
+        cx, cy, x, y = (max(math.cos(angle), 0.1) for angle in (*angles[:2], *turned))
+        return xx * cx / x, xy * cy / x, yx * cx / y, yy * cy / y
+
+    def _is_stuck(self, codes: tuple[float, ...]) -> bool:
+        before = (
+            zip(codes, self._codes, self._equal, strict=True) if self._codes else ((0, 1, 0) for _ in codes)
+        )
+        self._equal = [count + 1 if code == last else 1 for code, last, count in before]
+        self._codes = codes
+        return 0 < self.stuck <= min(self._equal) or 0 < self._stuck_axis <= max(self._equal)
 
 
 # Bipolar conversions of the AD7730 are offset binary: 0x000000 at minus full scale, 0x800000 at zero.
@@ -162,14 +204,10 @@ class Sca100tCalibration:
     sensitivity_volts_per_g: tuple[float, float] = (SCA100T_SENSITIVITY_V_PER_G, SCA100T_SENSITIVITY_V_PER_G)
     divider: float = DIVIDER
     reference_volts: float = ADC_NOMINAL_REFERENCE_V
-    # (xx, xy, yx, yy): matrix from the g of the sensor's axes to the g of the axes of S.
-    cross_axis: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 1.0)
     # With t = T - reference: offset + c1 t + c2 t^2 + c3 t^3 [V], sensitivity (1 + c1 t + c2 t^2 + c3 t^3), for x and y.
     temperature_reference_c: float = 25.0
     offset_per_c: tuple[tuple[float, float, float], ...] = ((0.0, 0.0, 0.0),) * 2
     sensitivity_per_c: tuple[tuple[float, float, float], ...] = ((0.0, 0.0, 0.0),) * 2
-    # Smallest noise of one sample, even if the samples show less.
-    noise_floor_rad: float = 0.0
 
     @property
     def volts_per_code(self) -> float:
@@ -186,11 +224,6 @@ class Sca100tCalibration:
         """Convert a code to the sensor's output voltage."""
         return self.reference_volts / 2 + (code - CODE_ZERO) * self.volts_per_code
 
-    def code(self, volts: float) -> int:
-        """Convert an output voltage to a code, limited to the range of the converter."""
-        code = CODE_ZERO + round((volts - self.reference_volts / 2) / self.volts_per_code)
-        return min(max(code, 0), CODE_MAX)
-
     def offset_and_sensitivity(self, axis: int, temperature_c: float) -> tuple[float, float]:
         """Offset (V) and sensitivity (V/g) of an axis at a temperature."""
         t = temperature_c - self.temperature_reference_c
@@ -205,114 +238,93 @@ class Sca100tCalibration:
         offset, sensitivity = self.offset_and_sensitivity(axis, temperature_c)
         return min(max((self.volts(code) - offset) / sensitivity, -1.0), 1.0)
 
-    def angles(self, gx: float, gy: float) -> tuple[float, float]:
-        """Elevation of S's axes above the horizon in rad, from the g of the sensor's axes."""
-        xx, xy, yx, yy = self.cross_axis
-        return _asin(xx * gx + xy * gy), _asin(yx * gx + yy * gy)
 
+class BoardSensor(SensorTilts):
+    """A sensor on a board of starpos, whose samples hold codes.
 
-@dataclass(frozen=True, slots=True)
-class Measured:
-    """A sample in units: x, y rad (always finite), covariance rad2 (xx, xy, yx, yy), deg C or NaN, Tilt.msg's flags."""
+    faults: bits of a sample's status under which its codes mean nothing.
+    """
 
-    x: float
-    y: float
-    covariance: tuple[float, float, float, float]
-    temperature_c: float
-    flags: int
+    faults: int = FAULTS
 
-
-def sca100t_celsius(counts: int) -> float:
-    """Convert the SCA100T's temperature counts to deg C."""
-    return (counts - SCA100T_ZERO_COUNTS) / SCA100T_COUNTS_PER_C
-
-
-def sca100t_counts(celsius: float) -> int:
-    """Convert deg C to temperature counts, limited to 8 bits."""
-    return min(max(round(SCA100T_ZERO_COUNTS + SCA100T_COUNTS_PER_C * celsius), 0), 255)
-
-
-class Sca100t:
-    """Converts the samples of one MCU to tilts; remembers the last codes, the temperature and the noise."""
-
-    def __init__(self, calibration: Sca100tCalibration = Sca100tCalibration()) -> None:
-        self.calibration = calibration
-        self.noise = NoiseTracker()
+    def __init__(self, *limits: Any) -> None:
+        super().__init__(*limits)
         self.temperature = Temperature()
-        self._last = (-1, -1)
-        self._run = [0, 0]
 
-    def measure(self, sample: Sample, time_s: float) -> Measured:
+    def measure(self, sample: Sample, time_s: float, stamp_ns: int = 0) -> Reading:
         """Convert a sample taken at `time_s` of a clock that does not step."""
-        flags = self._flags(sample)
-        measured = math.nan
-        if not sample.status & SampleStatus.NO_TEMPERATURE:
-            measured = sca100t_celsius(sample.temperature)
-        self.temperature.add(time_s, measured)
-        c, at = self.calibration, self.temperature.celsius(self.calibration.temperature_reference_c)
-        g = c.axis_g(0, sample.x, at), c.axis_g(1, sample.y, at)
-        x, y = c.angles(*g)
-        if max(abs(x), abs(y)) > SCA100T_RANGE_RAD:
-            flags |= OUT_OF_RANGE
-        if flags & GAP:
-            self.noise.interrupt()
-        if not flags & (OUT_OF_RANGE | STUCK | SATURATED):
-            self.noise.add(time_s, math.asin(g[0]), math.asin(g[1]))
-        return Measured(x, y, self._covariance(sample, g, (x, y), at), measured, flags)
+        celsius = self._celsius(sample.temperature)
+        if sample.status & SampleStatus.NO_TEMPERATURE:
+            celsius = math.nan
+        self.temperature.observe(time_s, celsius)
+        flags = GAP if sample.lost or sample.restarted or sample.resumed else 0
+        if sample.status & self.faults:
+            flags |= STUCK
+        angles, steps = self._angles(sample)
+        return self.reading(
+            angles,
+            steps,
+            time_s=time_s,
+            stamp_ns=stamp_ns,
+            sequence=sample.sequence,
+            temperature_c=celsius,
+            flags=flags | self._flags(sample),
+            codes=(sample.x, sample.y),
+            shift=self._shift(sample),
+        )
+
+    def _celsius(self, counts: int) -> float:
+        """Convert the temperature counts of a sample to deg C."""
+        raise NotImplementedError
+
+    def _angles(self, sample: Sample) -> tuple[tuple[float, float], tuple[float, float]]:
+        """Elevations of the sensor's own axes, and their steps, rad."""
+        raise NotImplementedError
 
     def _flags(self, sample: Sample) -> int:
-        codes = (sample.x, sample.y)
-        flags = GAP if sample.lost or sample.restarted or sample.resumed else 0
-        for axis in range(2):
-            self._run[axis] = self._run[axis] + 1 if codes[axis] == self._last[axis] else 1
-        self._last = codes
-        stuck = max(self._run) >= SCA100T_STUCK_SAMPLES or min(self._run) >= SCA100T_STUCK_PAIRS
-        if stuck or sample.status & (SampleStatus.NO_ANSWER | SampleStatus.MEANINGLESS):
-            flags |= STUCK
-        if any(code in (0, CODE_MAX) for code in codes):
-            flags |= SATURATED
-        return flags
+        """Flags of the sample that only this sensor has."""
+        raise NotImplementedError
 
-    def _covariance(
-        self, sample: Sample, g: tuple[float, float], angles: tuple[float, float], at: float
-    ) -> tuple[float, float, float, float]:
-        """Covariance from noise and quantisation of each axis, through the cross-axis matrix, and temperature error.
+    def _shift(self, sample: Sample) -> tuple[float, float]:
+        """Change of the tilt (rad) if the temperature is 1 sigma off."""
+        return 0.0, 0.0
 
-        at: the temperature, deg C.
-        """
+
+class Sca100t(BoardSensor):
+    """An SCA100T-D01 behind an AD7730."""
+
+    def __init__(self, calibration: Sca100tCalibration = Sca100tCalibration()) -> None:
+        super().__init__(SCA100T_NOISE_RAD, SCA100T_RANGE_RAD, SCA100T_STUCK_PAIRS, SCA100T_STUCK_SAMPLES)
+        self.calibration = calibration
+
+    def _celsius(self, counts: int) -> float:
+        return (counts - SCA100T_ZERO_COUNTS) / SCA100T_COUNTS_PER_C
+
+    def _angles(self, sample: Sample) -> tuple[tuple[float, float], tuple[float, float]]:
         c = self.calibration
-        noise = self.noise.sigma or (SCA100T_NOISE_RAD, SCA100T_NOISE_RAD)
-        step = [c.volts_per_code / c.sensitivity_volts_per_g[axis] for axis in range(2)]
-        # Variances of each axis in g^2; the noise of an angle is the noise of g over the cosine.
-        vx, vy = (
-            max(noise[i], c.noise_floor_rad) ** 2 * (1 - g[i] ** 2) + step[i] ** 2 / 12 for i in range(2)
+        x, y = self._angles_at(sample, self.temperature.celsius(c.temperature_reference_c))
+        # The step of the sine over its slope.
+        sx, sy = (
+            c.volts_per_code / c.sensitivity_volts_per_g[axis] / max(math.cos(angle), 0.1)
+            for axis, angle in enumerate((x, y))
         )
-        kx, ky = (1 / max(math.cos(angle), 0.1) for angle in angles)
-        xx, xy, yx, yy = c.cross_axis
-        cxx = kx * kx * (xx * xx * vx + xy * xy * vy)
-        cxy = kx * ky * (xx * yx * vx + xy * yy * vy)
-        cyy = ky * ky * (yx * yx * vx + yy * yy * vy)
-        if c.compensates:
-            dx, dy = self._temperature_error(sample, at)
-            cxx, cxy, cyy = cxx + dx * dx, cxy + dx * dy, cyy + dy * dy
-        return cxx, cxy, cxy, cyy
+        return (x, y), (sx, sy)
 
-    def _temperature_error(self, sample: Sample, at: float) -> tuple[float, float]:
-        """Change of the tilt (rad) if the temperature is 1 sigma off, to the side with the larger change."""
-        c, sigma = self.calibration, self.temperature.stddev_c
-        here, low, high = (
-            c.angles(c.axis_g(0, sample.x, t), c.axis_g(1, sample.y, t)) for t in (at, at - sigma, at + sigma)
-        )
+    def _angles_at(self, sample: Sample, celsius: float) -> tuple[float, float]:
+        c = self.calibration
+        return math.asin(c.axis_g(0, sample.x, celsius)), math.asin(c.axis_g(1, sample.y, celsius))
+
+    def _flags(self, sample: Sample) -> int:
+        return SATURATED if {sample.x, sample.y} & {0, CODE_MAX} else 0
+
+    def _shift(self, sample: Sample) -> tuple[float, float]:
+        if not self.calibration.compensates:
+            return 0.0, 0.0
+        at = self.temperature.celsius(self.calibration.temperature_reference_c)
+        sigma = self.temperature.stddev_c
+        here, low, high = (self.turned(self._angles_at(sample, t)) for t in (at, at - sigma, at + sigma))
+        # To the side with the larger change.
         return max(((x - here[0], y - here[1]) for x, y in (low, high)), key=lambda d: math.hypot(*d))
-
-
-def _cubic(coefficients: tuple[float, float, float], t: float) -> float:
-    c1, c2, c3 = coefficients
-    return t * (c1 + t * (c2 + t * c3))
-
-
-def _asin(g: float) -> float:
-    return math.asin(min(max(g, -1.0), 1.0))
 
 
 # 90 deg are 2^14 steps of the sensor, each 256 codes.
@@ -322,72 +334,31 @@ SCL3300_STEP_RAD = 256 * SCL3300_RAD_PER_CODE
 SCL3300_ZERO_COUNTS, SCL3300_STEP_C = 256, 16 / 18.9
 # The steps are about as large as the noise, so neighbours are often equal on one axis; this many on both are no chance.
 SCL3300_STUCK_PAIRS = 50
-SCL3300_FAULTS = SampleStatus.NO_ANSWER | SampleStatus.MEANINGLESS | SampleStatus.SELF_TEST
 
 
-@dataclass(frozen=True)
-class Scl3300Calibration:
-    """What the owner found out.
+class Scl3300(BoardSensor):
+    """An SCL3300-D01, which measures at any lean."""
 
-    cross_axis: matrix (xx, xy, yx, yy) from the sines of the sensor's angles to the sines of S's.
-    noise_floor_rad: smallest noise of one sample, even if the samples show less.
-    """
+    faults = FAULTS | SampleStatus.SELF_TEST
 
-    cross_axis: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 1.0)
-    noise_floor_rad: float = 0.0
+    def __init__(self) -> None:
+        super().__init__(sensors.SCL3300.noise_rad, math.pi / 2, SCL3300_STUCK_PAIRS)
 
+    def _celsius(self, counts: int) -> float:
+        return (counts + SCL3300_ZERO_COUNTS + 0.5) * SCL3300_STEP_C - 273
 
-def scl3300_celsius(counts: int) -> float:
-    """Convert the board's temperature counts to deg C."""
-    return (counts + SCL3300_ZERO_COUNTS + 0.5) * SCL3300_STEP_C - 273
-
-
-class Scl3300:
-    """Converts the samples of one board to tilts; remembers the last codes, the temperature and the noise."""
-
-    def __init__(self, calibration: Scl3300Calibration = Scl3300Calibration()) -> None:
-        self.calibration = calibration
-        self.noise = NoiseTracker()
-        self.temperature = Temperature()
-        self._last = (-1, -1)
-        self._equal = 0
-
-    def measure(self, sample: Sample, time_s: float) -> Measured:
-        """Convert a sample taken at `time_s` of a clock that does not step."""
-        flags = self._flags(sample)
-        measured = math.nan
-        if not sample.status & SampleStatus.NO_TEMPERATURE:
-            measured = scl3300_celsius(sample.temperature)
-        self.temperature.add(time_s, measured)
-        if flags & GAP:
-            self.noise.interrupt()
-        felt = [(code - CODE_ZERO) * SCL3300_RAD_PER_CODE for code in (sample.x, sample.y)]
-        if not flags & (OUT_OF_RANGE | STUCK):
-            self.noise.add(time_s, *felt)
-        sx, sy = map(math.sin, felt)
-        xx, xy, yx, yy = self.calibration.cross_axis
-        x, y = _scl3300_asin(xx * sx + xy * sy), _scl3300_asin(yx * sx + yy * sy)
-        sigmas = self.noise.sigma or (sensors.SCL3300.noise_rad,) * 2
-        floor = self.calibration.noise_floor_rad
-        vx, vy = (max(s, floor) ** 2 + SCL3300_STEP_RAD**2 / 12 for s in sigmas)
-        covariance = (
-            xx * xx * vx + xy * xy * vy,
-            xx * yx * vx + xy * yy * vy,
-            xx * yx * vx + xy * yy * vy,
-            yx * yx * vx + yy * yy * vy,
-        )
-        return Measured(x, y, covariance, measured, flags)
+    def _angles(self, sample: Sample) -> tuple[tuple[float, float], tuple[float, float]]:
+        x, y = ((code - CODE_ZERO) * SCL3300_RAD_PER_CODE for code in (sample.x, sample.y))
+        return (x, y), (SCL3300_STEP_RAD, SCL3300_STEP_RAD)
 
     def _flags(self, sample: Sample) -> int:
-        self._equal = self._equal + 1 if (sample.x, sample.y) == self._last else 1
-        self._last = (sample.x, sample.y)
-        flags = GAP if sample.lost or sample.restarted or sample.resumed else 0
-        if sample.status & SCL3300_FAULTS or self._equal >= SCL3300_STUCK_PAIRS:
-            flags |= STUCK
-        if sample.status & SampleStatus.UPSIDE_DOWN:
-            flags |= OUT_OF_RANGE
-        return flags
+        return OUT_OF_RANGE if sample.status & SampleStatus.UPSIDE_DOWN else 0
 
 
-def _scl3300_asin(sine: float) -> float:
+def _cubic(coefficients: tuple[float, float, float], t: float) -> float:
+    c1, c2, c3 = coefficients
+    return t * (c1 + t * (c2 + t * c3))
+
+
+def _asin(sine: float) -> float:
     return math.asin(min(max(sine, -1.0), 1.0))

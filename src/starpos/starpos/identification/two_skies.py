@@ -90,7 +90,7 @@ def _between_two(field: FrameStars, sky: Sky, found: Identification) -> bool:
     """Whether the residuals of neighbouring stars differ by more than one sky can explain."""
     stars = len(found.star)
     xy, error2 = field.xy[int(found.mirrored)][found.star], field.sigma[found.star] ** 2 + MIN_ERROR_PX**2
-    residual = xy - _pose(field, found).project(sky.directions(found.catalogue))
+    residual = xy - Pose.of(field, found).project(sky.directions(found.catalogue))
     u, v = ((xy - field.middle) / field.half.max()).T
     powers = np.stack([u**0, u, v, u * u, u * v, v * v, u**3, u * u * v, u * v * v, v**3], 1)
     terms = powers[:, : max([1, *(k for n, k in BENDS if stars >= n)])]
@@ -199,7 +199,7 @@ def _another_pose(
     field: FrameStars, mag: np.ndarray, left: np.ndarray, sky: Sky, found: Identification
 ) -> bool:
     """Whether the stars of the field that are left over (N,) fit another pose of the same camera."""
-    row, first = np.flatnonzero(left)[:MAX_STARS], _pose(field, found)
+    row, first = np.flatnonzero(left)[:MAX_STARS], Pose.of(field, found)
     while len(row) >= MIN_LEFT:
         rest = field.take(row).but(focal_px=first.focal_px)
         second = _same_camera(rest, sky, first, WORSE * found.residual_px + WORSE_PX)
@@ -245,7 +245,7 @@ def _new(
     share = _zero(mag[row], sky, second) - _zero(mag[found.star], sky, found)
     if abs(share) > MAX_FAINTER_MAG:
         return np.zeros(len(row), bool)
-    first, xy = _pose(field, found), field.xy[int(found.mirrored)]
+    first, xy = Pose.of(field, found), field.xy[int(found.mirrored)]
     away = np.linalg.norm(xy[row][:, None] - xy[found.star], axis=2).min(1)
     bend, their_bend = (
         np.linalg.norm(xy[star] - first.project(sky.directions(index)), axis=1)
@@ -257,10 +257,6 @@ def _new(
     alike = np.abs(mag[other] - mag[one] - share) < SAME_MAG
     new[here] |= alike & (np.linalg.norm(xy[one] - xy[other], axis=1) > DOUBLE_PX)
     return new
-
-
-def _pose(field: FrameStars, found: Identification) -> Pose:
-    return Pose(found.attitude, field.focal_px * found.focal_scale, found.mirrored)
 
 
 def _zero(mag: np.ndarray, sky: Sky, found: Identification) -> float:

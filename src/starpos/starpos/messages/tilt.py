@@ -254,6 +254,11 @@ class ForceAverager:
         self._messages: list[Felt] = []
         self._last_ns = 0
 
+    def restart(self) -> None:
+        """Forget the messages of an average that is not complete; the next one begins a new sequence."""
+        self.breaks += bool(self._messages)
+        self._messages = []
+
     def add(self, message: Felt) -> MeanForce | None:
         """Take a message; return the average that it completes, if that has enough messages."""
         last_ns, messages = self._last_ns, self._messages
@@ -310,6 +315,13 @@ class ImuTilts:
         self._scatter_alone = values["imu.variance"] == "scatter"
         self._floor = 0.0 if math.isnan(values["noise_stddev"]) else math.radians(values["noise_stddev"])
         self._latency_ns = 0 if math.isnan(values["latency"]) else round(values["latency"] * 1e9)
+
+    def restart(self) -> None:
+        """Forget the sensor: another one takes its place."""
+        self._noise.restart()
+        self._noisy = 0
+        self._gap = True
+        self.averager.restart()
 
     @property
     def noise(self) -> tuple[float, ...] | None:
