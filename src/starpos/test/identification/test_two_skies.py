@@ -177,7 +177,7 @@ def test_stars_that_an_unknown_lens_bends_out_of_place_are_no_second_sky(corner_
 
 @pytest.mark.parametrize("error_px", [1.5, 2.5])
 def test_centroids_that_err_by_more_than_they_claim_are_one_sky(error_px, catalogue, rng):
-    """As on photographs of telephones, which merge and sharpen several exposures."""
+    # as on photographs of telephones, which merge and sharpen several exposures
     for _ in range(FIELDS):
         light = sky_of(catalogue, random_attitude(rng))
         assert not warns(light.moved(light.xy + rng.normal(0, error_px, light.xy.shape)), catalogue, rng)
