@@ -18,6 +18,7 @@ from sensor_msgs.msg import CameraInfo, Image
 from sensor_msgs.srv import SetCameraInfo
 from std_msgs.msg import Header
 
+from starpos import system_clock
 from starpos.errors import InstrumentError, StarposError
 from starpos.files import path_of
 from starpos.frames.exposure import Shutter
@@ -26,7 +27,6 @@ from starpos.instrument.camera import Camera
 from starpos.instrument.instrument import focal_px_of
 from starpos.messages.camera import message_to_camera
 from starpos.parameters.table import parameters_of
-from starpos.session import system_clock
 from starpos_camera.sources.registry import SOURCES
 from starpos_camera.sources.source import CapturedFrame, CaptureSettings, FrameSource, NothingYet, SourceEnded
 from starpos_camera.sources.timing import OF_SYSTEM_CLOCK, ShutterTimes, in_one_time

@@ -75,12 +75,12 @@ class SolverNode(Node):
         self._transforms = StaticTransforms(self)
         session = self._session
         takes: dict[str, Take] = {
-            CAMERA_TOPIC: lambda m, _: self._publish(session.take_camera(m, self._now())),
-            "tilt": lambda m, info: self._publish(session.take_tilt(m, _sent(info), self._now())),
-            "stars": lambda m, info: self._publish(session.take_stars(m, self._now(), _sent(info))),
+            CAMERA_TOPIC: lambda m, _: self._publish(session.receive_camera(m, self._now())),
+            "tilt": lambda m, info: self._publish(session.receive_tilt(m, _sent(info), self._now())),
+            "stars": lambda m, info: self._publish(session.receive_stars(m, self._now(), _sent(info))),
         }
         if session.gnss is not None:
-            takes[GNSS_TOPIC] = lambda m, _: self._publish(session.take_gnss(m, self._now()))
+            takes[GNSS_TOPIC] = lambda m, _: self._publish(session.receive_gnss(m, self._now()))
         if time_is_simulated(self):
             self._replayed = Replayed(
                 self,
@@ -189,7 +189,8 @@ class SolverNode(Node):
         self._transforms.update(
             self._values["publish_tf"],
             self._values["frame_id"],
-            self._session.names,
+            self._session.instrument.frame_id,
+            self._session.tilts.frame_id,
             solver.instrument if solver else None,
         )
 

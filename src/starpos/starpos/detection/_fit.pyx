@@ -96,7 +96,7 @@ cdef struct Star:
 
 cdef struct Solution:
     # Of all unknowns, star after star: normal equations, then their scaled factor; the right side, the covariance, the last
-    # step. Sigma of each flux at known gains.
+    # step; the normal equations without the gains. Sigma of each flux at known gains.
     bint solved
     int unknowns
     double[LARGEST * LARGEST] normal
@@ -104,6 +104,7 @@ cdef struct Solution:
     double[LARGEST] right
     double[LARGEST] step
     double[LARGEST * LARGEST] covariance
+    double[36] known
     double[STARS] sigma
 
 
@@ -311,26 +312,6 @@ cdef bint _mark_outliers(const Stamp *s, const Star *star, Rules rules, Pixels *
     return same
 
 
-cdef void _sum_products(const Pixels *p, int first, int n, double *square, double *right) noexcept nogil:
-    """Sums over n pixels of the products (6, 6), lower half, of the stars' derivatives and values, and with the residuals (6,)."""
-    cdef const double *column[3 * STARS]
-    cdef double[9] sums
-    cdef int k, a, b
-    for k in range(p.stars):
-        column[3 * k], column[3 * k + 1] = p.of[k].by_x + first, p.of[k].by_y + first
-        column[3 * k + 2] = p.of[k].value + first
-        products(p.weight + first, column[3 * k], column[3 * k + 1], column[3 * k + 2], p.residual + first, n, sums)
-        a = 21 * k
-        square[a], square[a + 6], square[a + 7] = sums[0], sums[1], sums[2]
-        square[a + 12], square[a + 13], square[a + 14] = sums[3], sums[4], sums[5]
-        right[3 * k], right[3 * k + 1], right[3 * k + 2] = sums[6], sums[7], sums[8]
-    if p.stars > 1:
-        cross_products(p.weight + first, column + 3, column, n, sums)
-        for a in range(3):
-            for b in range(3):
-                square[6 * (3 + a) + b] = sums[3 * a + b]
-
-
 cdef inline double _by_gain(const Star *star, Rules rules, int phase) noexcept nogil:
     """What turns a pixel's value of the PSF into its derivative by the star's gain at its phase, over the frame's."""
     return star.flux * rules.gain[phase] / star.gain[phase]
@@ -341,47 +322,58 @@ cdef void _sum_up(const Star *star, Rules rules, const Pixels *p, Solution *to) 
 
     A pixel knows of each star the place, the flux and the gain of its own phase alone, which is held near the frame's.
     """
-    # of each unknown: what a column is multiplied by, which one, and the unknown's row
-    cdef double[4 * STARS] slope
-    cdef int[4 * STARS] column
-    cdef int[4 * STARS] row
-    cdef double[36] square
-    cdef double[3 * STARS] with_residual
-    cdef double *equation
-    cdef int n = to.unknowns, each = 4 if rules.own else 3, k, a, b, phase
+    cdef double[9] sums
+    cdef double[STARS][4] slope
+    cdef const double *column[STARS][3]
+    cdef double *own
+    cdef double *right
+    cdef double flux, by
+    cdef int n = to.unknowns, each = 4 if rules.own else 3, k, a, b, phase, first, some, gain
     memset(to.normal, 0, n * n * sizeof(double))
     memset(to.right, 0, n * sizeof(double))
     for phase in range(rules.phases):
-        _sum_products(p, p.first[phase], p.first[phase + 1] - p.first[phase], square, with_residual)
+        first, some, gain = p.first[phase], p.first[phase + 1] - p.first[phase], 3 + phase
         for k in range(p.stars):
-            for a in range(each):
-                column[k * each + a], row[k * each + a] = 3 * k + min(a, 2), k * rules.unknowns + a
-                slope[k * each + a] = star[k].flux if a < 2 else 1.0
+            # the star's block begins on the diagonal
+            own, right, flux = to.normal + k * rules.unknowns * (n + 1), to.right + k * rules.unknowns, star[k].flux
+            column[k][0], column[k][1], column[k][2] = p.of[k].by_x + first, p.of[k].by_y + first, p.of[k].value + first
+            products(p.weight + first, column[k][0], column[k][1], column[k][2], p.residual + first, some, sums)
+            own[0] += flux * flux * sums[0]
+            own[n] += flux * flux * sums[1]
+            own[n + 1] += flux * flux * sums[2]
+            own[2 * n] += flux * sums[3]
+            own[2 * n + 1] += flux * sums[4]
+            own[2 * n + 2] += sums[5]
+            right[0] += flux * sums[6]
+            right[1] += flux * sums[7]
+            right[2] += sums[8]
             if rules.own:
-                a = k * each + 3
-                slope[a], row[a] = _by_gain(&star[k], rules, phase), k * rules.unknowns + 3 + phase
-                to.normal[row[a] * n + row[a]], to.right[row[a]] = rules.held, -star[k].colour[phase] * rules.held
-        for a in range(p.stars * each):
-            equation = to.normal + row[a] * n
-            to.right[row[a]] += slope[a] * with_residual[column[a]]
-            for b in range(a + 1):
-                equation[row[b]] += slope[a] * slope[b] * square[6 * column[a] + column[b]]
+                by = _by_gain(&star[k], rules, phase)
+                own[gain * n], own[gain * n + 1], own[gain * n + 2] = by * flux * sums[3], by * flux * sums[4], by * sums[5]
+                own[gain * n + gain] = rules.held + by * by * sums[5]
+                right[gain] = by * sums[8] - star[k].colour[phase] * rules.held
+                slope[k][3] = by
+            slope[k][0], slope[k][1], slope[k][2] = flux, flux, 1.0
+        if p.stars > 1:
+            cross_products(p.weight + first, column[1], column[0], some, sums)
+            for a in range(each):
+                own = to.normal + (rules.unknowns + (a if a < 3 else gain)) * n
+                for b in range(each):
+                    own[b if b < 3 else gain] += slope[1][a] * slope[0][b] * sums[3 * min(a, 2) + min(b, 2)]
+    # without the gains
+    to.known[8] = to.normal[2 * n + 2]
+    for a in range(6 if p.stars > 1 else 0):
+        for b in range(a + 1):
+            to.known[6 * a + b] = to.normal[(a // 3 * rules.unknowns + a % 3) * n + b // 3 * rules.unknowns + b % 3]
 
 
-cdef void _set_sigmas(Rules rules, int stars, Solution *to) noexcept nogil:
+cdef void _set_sigmas(int stars, Solution *to) noexcept nogil:
     """Set each flux's sigma at known gains: of a single star at a known place, of two at places that are fitted with them."""
-    cdef double[36] known
     cdef double[36] inverse
-    cdef int a, b
     if stars == 1:
-        to.sigma[0] = 1 / sqrt(to.normal[2 * to.unknowns + 2])
+        to.sigma[0] = 1 / sqrt(to.known[8])
         return
-    for a in range(6):
-        for b in range(6):
-            known[6 * a + b] = to.normal[
-                (a // 3 * rules.unknowns + a % 3) * to.unknowns + b // 3 * rules.unknowns + b % 3
-            ]
-    invert(known, 6, inverse)
+    invert(to.known, 6, inverse)
     to.sigma[0], to.sigma[1] = sqrt(inverse[14]), sqrt(inverse[35])
 
 
@@ -436,7 +428,6 @@ cdef void _fit(
         # a hot pixel or a neighbour's light is brighter than noise and an imperfect PSF explain
         same = p.stars > 1 or (1 <= round_ < rounds - 1 and _mark_outliers(s, star, rules, p))
         _sum_up(star, rules, p, to)
-        _set_sigmas(rules, p.stars, to)
         to.solved = scaled_factor(to.normal, to.unknowns, to.scale)
         if not to.solved:
             for k in range(p.stars):
@@ -494,19 +485,22 @@ cdef double _set_images(
     """
     cdef int j, k, place, count = 0, area = s.size * s.size
     pixels[0] = 0.0
-    for k in range(p.stars if not solved or p.all < area else 0):
-        for j in range(area):
-            model[k * apart + j] = 0 if solved else NAN
     if not solved:
         for j in range(area):
             residual[j] = NAN
+            for k in range(p.stars):
+                model[k * apart + j] = NAN
         return NAN
-    memcpy(residual, s.signal, area * sizeof(float))
+    if p.all < area:
+        memcpy(residual, s.signal, area * sizeof(float))
     for j in range(p.all):
-        place = p.place[j]
-        residual[place] = <float>p.residual[j]
-        for k in range(p.stars):
-            model[k * apart + place] = <float>(star[k].flux * p.of[k].value[j])
+        residual[p.place[j]] = <float>p.residual[j]
+    for k in range(p.stars):
+        if p.all < area:
+            memset(model, 0, area * sizeof(float))
+        for j in range(p.all):
+            model[p.place[j]] = <float>(star[k].flux * p.of[k].value[j])
+        model += apart
     for j in range(p.count):
         place = p.place[j]
         used[place], outlier[place] = p.weight[j] > 0, p.outlier[place]
@@ -596,6 +590,7 @@ def fit_stamps(
                 star[j].x, star[j].y, star[j].flux = x[j, k], y[j, k], 0.0 if stars == 1 else least_flux[k]
             local_of(axes, series, k, &psf)
             _fit(&s, &psf, rules, rounds, least, whole, &p, star, &to)
+            _set_sigmas(stars, &to)
             fit[0, k] = _set_images(
                 &s, star, to.solved, &p, &model[0, k, 0], n * area, &residual[k, 0], &mark[0, k, 0], &mark[1, k, 0], &fit[1, k]
             )

@@ -89,8 +89,10 @@ class Fit(StarRows):
     leverage: np.ndarray
 
 
-# Columns that each of several stars in one stamp has; the others are the stamp's.
-OF_STAR = ("x", "y", "flux", "flux_sigma", "covariance", "gains", "model")
+# Columns of a Fit, and whether each of several stars in one stamp has its own; the others are the stamp's.
+COLUMNS = {
+    f.name: f.name in ("x", "y", "flux", "flux_sigma", "covariance", "gains", "model") for f in fields(Fit)
+}
 
 
 def fit_stars(
@@ -112,7 +114,8 @@ def fit_stars(
     phase nor the star's colour moves the position. The weights come from the model: the pixels' own noise would bias
     the fit.
     """
-    return _fit(stamps, psf, np.stack([x, y])[:, None], response, rounds, leverage, whole)[0]
+    first = np.ascontiguousarray(x)[None], np.ascontiguousarray(y)[None]
+    return _fit(stamps, psf, *first, response, rounds, leverage, whole)[0]
 
 
 def fit_pairs(
@@ -127,21 +130,21 @@ def fit_pairs(
 
     Returns two Fits, with models of the whole stamps, and chi2, residual and pixels of both together.
     """
-    return _fit(stamps, psf, places, response, PAIR_ROUNDS + 1, False, True, LEAST * flux, LEAST)
+    return _fit(stamps, psf, *places, response, PAIR_ROUNDS + 1, False, True, LEAST * flux, LEAST)
 
 
 def _fit(
-    stamps: Stamps, psf: FieldPsf, places: np.ndarray, response: Response, *settings: object
+    stamps: Stamps, psf: FieldPsf, x: np.ndarray, y: np.ndarray, response: Response, *settings: object
 ) -> list[Fit]:
-    local = psf.at(*places[:, 0])
+    """Fits of K stars to each of N stamps, with first places x, y (K, N) px."""
+    local = psf.at(x[0], y[0])
     columns = fit_stamps(
-        stamps.signal, stamps.noise, stamps.good, stamps.phase, stamps.x, stamps.y, *map(np.ascontiguousarray, places),
-        local.axes, local.series, response.rules, *settings,
+        stamps.signal, stamps.noise, stamps.good, stamps.phase, stamps.x, stamps.y, x, y, local.axes, local.series,
+        response.rules, *settings,
     )  # fmt: skip
-    named = dict(zip((f.name for f in fields(Fit)), columns, strict=True))
     return [
-        Fit(**{name: column[k] if name in OF_STAR else column for name, column in named.items()})
-        for k in range(places.shape[1])
+        Fit(**{name: c[k] if own else c for (name, own), c in zip(COLUMNS.items(), columns, strict=True)})
+        for k in range(len(x))
     ]
 
 

@@ -31,7 +31,7 @@ from starpos.session import reports
 from starpos.session.calibrating import Calibrating, Seen
 from starpos.session.camera_solver import CameraSolver
 from starpos.session.deflection import LiveDeflection
-from starpos.session.driver import Changes, Heard, Jobs, Log, Now, Sent
+from starpos.session.driver import Changes, Heard, Jobs, Log, Now, Sent, refusing
 from starpos.session.frames import Answered, Averaged, Output, Waiting, ground_of
 from starpos.session.gnss import GnssTeacher, SessionPlaces, solved_beside
 from starpos.session.gyro import Gyro
@@ -39,8 +39,7 @@ from starpos.session.pace import MAX_WAITING, Backlog, Pace
 from starpos.session.settings import Settings
 from starpos.session.solving import AT_ONCE_S, Search, attitude_seen
 from starpos.session.standing import ClockDoubt
-from starpos.session.tilts import TiltBuffer, TiltIntake
-from starpos.session.transforms import FrameNames, name_in
+from starpos.session.tilts import TiltBuffer
 from starpos.sky import catalogue
 
 NOTHING_TOLD = Sent()
@@ -78,8 +77,6 @@ class SolverSession:
         # messages that arrived meanwhile are taken first
         self.more = False
         self.tilts = TiltBuffer()
-        # of the frames of the messages taken
-        self.names = FrameNames()
         self.doubt = ClockDoubt()
         self.gyro = Gyro(heard)
         self.gnss = GnssTeacher(settings, jobs(), heard, log) if settings.values["gnss.use"] else None
@@ -93,7 +90,6 @@ class SolverSession:
         self._heard, self._log = heard, log
         self._arrived, self._arrived_stars = arrived, arrived_stars
         self._backlog = Backlog()
-        self._intake = TiltIntake(self.tilts, self.names, settings, heard)
         self._was_s: float | None = None
         self._ended = False
         # from the last fix
@@ -127,7 +123,7 @@ class SolverSession:
     @property
     def waits(self) -> bool:
         """Whether a frame or a tilt waits for its time."""
-        return bool(self._backlog) or self._intake.waits
+        return bool(self._backlog) or self.tilts.waits
 
     @property
     def busy(self) -> bool:
@@ -146,31 +142,28 @@ class SolverSession:
 
     # inputs ----------------------------------------------------------------------------------------------------------
 
-    def take_camera(self, message: Any, now: Now) -> list[Output]:
+    def receive_camera(self, message: Any, now: Now) -> list[Output]:
         """Take a CameraInfo.
 
         Another camera's counts from now on; in recorded data from its stamp on, since it may be read before frames that
         were taken before it.
         """
         made = self._begun(now)
-        try:
-            self.instrument.take(message, at_once=not now.played)
-        except StarposError as e:
-            if self.instrument.camera is None:
-                self.instrument.trouble = str(e)
-            self._heard.refuse("camera_info", str(e))
-            return made
-        self._heard.came("camera_info")
-        self.names.camera = name_in(message)
+        with refusing(self._heard, "camera_info"):
+            self.instrument.receive(message, at_once=not now.played)
         return made + self._work(now)
 
-    def take_tilt(self, message: Any, sent: Sent, now: Now) -> list[Output]:
+    def receive_tilt(self, message: Any, sent: Sent, now: Now) -> list[Output]:
         """Take a Tilt."""
         made = self._begun(now)
-        self._intake.take(message, sent, now)
+        self._receive_tilt(message, sent, now)
         return made + self._work(now)
 
-    def take_stars(self, message: Any, now: Now, sent: Sent = NOTHING_TOLD) -> list[Output]:
+    def _receive_tilt(self, message: Any, sent: Sent, now: Now) -> None:
+        with refusing(self._heard, "tilt"):
+            self.tilts.receive(message, sent, now, self._settings.tilt_stddev_rad)
+
+    def receive_stars(self, message: Any, now: Now, sent: Sent = NOTHING_TOLD) -> list[Output]:
         """Take a StarArray, and those that have come after it."""
         made = self._begun(now)
         made += self._add_stars(message, now, sent)
@@ -191,7 +184,7 @@ class SolverSession:
         self._wait_for(stars, message.header, now)
         return []
 
-    def take_detected(self, stars: Stars, header: Any, now: Now) -> list[Output]:
+    def receive_detected(self, stars: Stars, header: Any, now: Now) -> list[Output]:
         """Take stars as a StarArray with this header holds them."""
         made = self._begun(now)
         if self._takes(header, now, NOTHING_TOLD):
@@ -217,7 +210,7 @@ class SolverSession:
         # If the user sets clock_stddev, it replaces the error that the camera's host states.
         if not math.isnan(self._values["clock_stddev"]):
             stars = replace(stars, clock_stddev_s=0.0)
-        self.instrument.frame_came(stars.width, stars.height, at_once=not now.played)
+        self.instrument.note_frame_size(stars.width, stars.height, at_once=not now.played)
         if len(self._backlog) >= MAX_WAITING:
             self.pace.drop(now.waiting_s)
             self._heard.refuse("stars", f"a frame was dropped: {MAX_WAITING} wait for their tilts")
@@ -232,7 +225,7 @@ class SolverSession:
             return self.tilts.delay_s
         return max(self.tilts.delay_s, now.waiting_s - self._backlog.first.since_s)
 
-    def take_gnss(self, message: Any, now: Now) -> list[Output]:
+    def receive_gnss(self, message: Any, now: Now) -> list[Output]:
         """Take a sensor_msgs/NavSatFix of GNSS; nothing is done with it without gnss.use."""
         if self.gnss is not None:
             self.gnss.take(message, now)
@@ -267,7 +260,9 @@ class SolverSession:
             # The clock was set back: no tilt may be from the future.
             self.tilts.forget_after(now.unix_s)
         if now.unix_s > was_s:
-            self._intake.go_on(now)
+            for message in self.tilts.pop_early():
+                with refusing(self._heard, "tilt"):
+                    self.tilts.keep_in_time(message, now, self._settings.tilt_stddev_rad)
 
     def _work(self, now: Now) -> list[Output]:
         """Answer the first frames that have everything they need: of recorded ones all, live one at a time."""
@@ -280,14 +275,14 @@ class SolverSession:
                 return made
             # After a stall the frame's own tilts may be among them.
             for message, sent in self._arrived():
-                self._intake.take(message, sent, now)
+                self._receive_tilt(message, sent, now)
             made += self._solve(self._backlog.pop(now.waiting_s).dated(now), now)
         self._backlog.pause()
         return made
 
     def _first_ready(self, now: Now) -> bool:
         if self._backlog:
-            self.instrument.go_on_to(self._backlog.first.stars.mid_unix_s)
+            self.instrument.advance_to(self._backlog.first.stars.mid_unix_s)
         return bool(self._backlog) and self._ready(self._backlog.first, now)
 
     def _ready(self, frame: Waiting, now: Now) -> bool:
@@ -442,7 +437,6 @@ class SolverSession:
         """Forget tilts, frames and the place, but no calibration that was found."""
         self.tilts.clear()
         self._backlog.clear()
-        self._intake.clear()
         self.latest = self.answer = self._hint = None
         self.gyro.forget()
         if self.gnss is not None:

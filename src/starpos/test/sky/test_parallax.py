@@ -100,13 +100,13 @@ def test_a_file_from_before_parallaxes_has_those_of_its_near_stars(near, tmp_pat
 def test_an_unpacked_catalogue_from_before_parallaxes_is_still_one(near, tmp_path):
     from starpos.table_cache import _store
 
-    _store(near, tmp_path / "stars-1-old", module.PREFIX)
+    _store(near, tmp_path / "stars-1-old", "stars-1-")
     for name in NEWER:
         (tmp_path / "stars-1-old" / f"{name}.npy").unlink()
-    old = module.stored(tmp_path / "stars-1-old")
+    old = module.kept_catalogues().mapped(tmp_path / "stars-1-old")
     assert old.fingerprint == near.fingerprint and (old.parallax_tenths >= 200).all()
     (tmp_path / "stars-1-old" / "tyc.npy").unlink()
-    assert module.stored(tmp_path / "stars-1-old") is None
+    assert module.kept_catalogues().mapped(tmp_path / "stars-1-old") is None
 
 
 def test_motions_are_kept_to_a_hundredth(near):
