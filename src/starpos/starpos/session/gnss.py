@@ -20,7 +20,7 @@ from starpos.fix.solver import Solver
 from starpos.frames.frame import Stars
 from starpos.gnss import states
 from starpos.gnss.filter import what_would_tell_more
-from starpos.gnss.receiver import NEAREST_S, GnssPlace, GnssTrack, known_place, message_to_gnss
+from starpos.gnss.receiver import NEAREST_S, GnssTrack, message_to_gnss
 from starpos.gnss.solving import Watched, watched
 from starpos.gnss.states import Learned
 from starpos.gnss.watch import GnssStatus, GnssWatch
@@ -39,12 +39,12 @@ CONTRADICTION_SIGMAS = 5.0
 OLDEST_S = 5.0
 
 
-def contradiction(gnss: GnssPlace, ground: Geodetic, utc_unix_s: float, speed: float) -> tuple[float, str]:
+def contradiction(gnss: Place, ground: Geodetic, utc_unix_s: float, speed: float) -> tuple[float, str]:
     """How far GNSS's place lies from ours of a time, m, and a sentence where the two cannot both be right.
 
     speed: of the vehicle, m/s, which goes on between the two times.
     """
-    off = gnss.from_place_m(ground.latitude, ground.longitude)
+    off = gnss.offset_m(ground.latitude, ground.longitude)
     on_the_way = speed * (utc_unix_s - gnss.utc_unix_s)
     claim = ground.covariance[:2, :2] + gnss.covariance + np.eye(2) * on_the_way**2
     apart, sigmas = float(np.linalg.norm(off)), float(np.sqrt(off @ np.linalg.solve(claim, off)))
@@ -60,7 +60,7 @@ class GnssComparison:
     """Keeps the last place of GNSS; it never changes a fix."""
 
     def __init__(self) -> None:
-        self._place: GnssPlace | None = None
+        self._place: Place | None = None
 
     def take(self, message: Any) -> None:
         """Take a sensor_msgs/NavSatFix; one without a usable place is forgotten."""
@@ -97,7 +97,7 @@ class GnssTeacher:
         self.newest: Watched | None = None
         self._settings, self._values, self._jobs = settings, settings.values, jobs
         self._heard, self._log = heard, log
-        self._places: deque[GnssPlace] = deque(maxlen=KEPT)
+        self._places: deque[Place] = deque(maxlen=KEPT)
         self._watch: GnssWatch | None = None
         self._instrument: Instrument | None = None
         self._stored: Learned | None = settings.learned
@@ -166,7 +166,7 @@ class GnssTeacher:
             self._log.warning("another camera_info: what GNSS taught of the other camera is forgotten")
             self._watch = GnssWatch(self._instrument, self._settings.vertical)
 
-    def place_at(self, utc_unix_s: float) -> GnssPlace | None:
+    def place_at(self, utc_unix_s: float) -> Place | None:
         """GNSS's place at a time, None without one; GnssError if its places contradict each other."""
         return GnssTrack(list(self._places)).at(utc_unix_s)
 
@@ -174,7 +174,7 @@ class GnssTeacher:
         """Forget where GNSS had the instrument, not what it taught."""
         self._places.clear()
 
-    def _compared_with(self, stars: Stars) -> GnssPlace | None:
+    def _compared_with(self, stars: Stars) -> Place | None:
         if stars.mid_unix_s is None:
             return None
         try:
@@ -295,4 +295,4 @@ class SessionPlaces:
                 f"no GNSS place within {NEAREST_S:g} s of the frame: no heading at a known place: check gnss/fix and the "
                 "clocks, or set site.latitude and site.longitude"
             )
-        return known_place(gnss, self._settings.vertical)
+        return gnss.deflected(self._settings.vertical)

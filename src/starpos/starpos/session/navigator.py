@@ -21,7 +21,7 @@ from starpos.earth.vertical import Geodetic, Vertical, geodetic
 from starpos.errors import GnssError, StarposError, VoyageError
 from starpos.files import path_of
 from starpos.fix.attitude import Attitude
-from starpos.gnss.receiver import GnssPlace, GnssTrack, known_place, message_to_gnss
+from starpos.gnss.receiver import GnssTrack, message_to_gnss
 from starpos.instrument.instrument import Instrument
 from starpos.messages.stamp import stamp_to_unix
 from starpos.messages.stars import message_to_attitude
@@ -177,7 +177,7 @@ class NavigatorSession:
         # of the newest frame that the estimate is made of
         self._seen_s = -math.inf
         self._clock_stddev_s = 0.0
-        self._gnss: deque[GnssPlace] = deque(maxlen=GNSS_KEPT)
+        self._gnss: deque[Place] = deque(maxlen=GNSS_KEPT)
         # marks outcomes of jobs that began before as out of date
         self._voyage = object()
 
@@ -246,7 +246,7 @@ class NavigatorSession:
         if not self._values["gnss.use"]:
             return None
         gnss = GnssTrack(list(self._gnss)).at(utc_unix_s)
-        return None if gnss is None else known_place(gnss, self._settings.vertical)
+        return None if gnss is None else gnss.deflected(self._settings.vertical)
 
     def receive_velocity(self, message: Any, now: Now, name: str) -> list[Navigated]:
         """Take a nav_msgs/Odometry or a geometry_msgs/TwistWithCovarianceStamped, from the topic of that name."""
