@@ -105,7 +105,7 @@ def solution(header: Header, answer: Solution, ground: Geodetic | None) -> msg.S
     message.indices = [] if answer.star is None else answer.star.tolist()
     message.magnitudes = [] if answer.magnitudes is None else answer.magnitudes.tolist()
     message.identify_seconds, message.fix_seconds = answer.identify_s, answer.fix_s
-    a, fix = answer.attitude, answer.fix
+    a, fix = answer.pointing, answer.fix
     message.right_ascension, message.declination, message.roll = (
         (math.degrees(v) for v in (a.ra, a.dec, a.roll)) if a else (NAN,) * 3
     )

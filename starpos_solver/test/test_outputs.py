@@ -47,7 +47,7 @@ def fix_facing(azimuth_deg: float, latitude_deg: float = 40.0) -> Fix:
         refraction_arcsec=12.0,
         diurnal_aberration_arcsec=0.3,
         ut1_minus_utc_s=-0.05,
-        camera=Attitude(np.eye(3), np.eye(3) * 1e-6, CAMERA, ITRS),
+        camera=Attitude(np.eye(3), np.eye(3) * 1e-6, of=CAMERA, into=ITRS),
     )
 
 

@@ -112,7 +112,7 @@ class GnssDrive:
                 yield DriveFrame(
                     LevelSight(
                         utc_unix_s=1.7e9 + t,
-                        camera=Attitude(seen, np.eye(3) * STARS_RAD**2, CAMERA, ITRS),
+                        camera=Attitude(seen, np.eye(3) * STARS_RAD**2, of=CAMERA, into=ITRS),
                         tilt=tilt,
                         zenith_covariance=np.eye(3) * STARS_RAD**2,
                         latitude=latitude,

@@ -98,7 +98,7 @@ def budget_of(fix: Fix | Average, ground: Geodetic) -> dict:
 
 def json_about(s: Solution) -> dict:
     """The keys of --json about the stars of a frame."""
-    a, fitted = s.attitude, s.fix or s.at_place
+    a, fitted = s.pointing, s.fix or s.at_place
     return {
         "stars_detected": s.stars_detected,
         "stars_matched": len(s.names),
@@ -273,7 +273,7 @@ def put_mean(
         "stars_detected": sum(s.stars_detected for s in answers),
         "stars_matched": sum(len(s.names) for s in answers),
         "residual_arcsec": np.sqrt(np.mean([s.at_place.residual_arcsec**2 for s in answers if s.at_place])),
-        "log_odds": sum(s.attitude.log_odds for s in answers if s.attitude),
+        "log_odds": sum(s.pointing.log_odds for s in answers if s.pointing),
         "status": (Status.OK if mean else Status.POOR_FIT).value,
         "warnings": [],
         "iers_table_age_days": table_age_days(mean.utc_unix_s) if mean else None,

@@ -2,7 +2,7 @@
 """An attitude: a rotation from the axes of one frame into those of another, with its error."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -32,6 +32,7 @@ class Attitude:
 
     rotation: np.ndarray
     covariance: np.ndarray
+    _: KW_ONLY
     of: str
     into: str
     terms: "tuple[ErrorTerm, ...]" = ()
@@ -41,7 +42,7 @@ class Attitude:
         """The attitude in another frame, into whose axes `turn` (3, 3) takes those of `into`; without its budget."""
         bent = None if self.by_refraction is None else turn @ self.by_refraction
         return Attitude(
-            turn @ self.rotation, turn @ self.covariance @ turn.T, self.of, into, by_refraction=bent
+            turn @ self.rotation, turn @ self.covariance @ turn.T, of=self.of, into=into, by_refraction=bent
         )
 
     @property

@@ -141,7 +141,7 @@ class Sensitivity:
 
 def link_attitude(link_to_enu: np.ndarray, terms: tuple[ErrorTerm, ...]) -> Attitude:
     """The attitude of the base link in east, north, up, with its budget."""
-    return Attitude(link_to_enu, total_covariance(terms)[3:, 3:], LINK, ENU, terms)
+    return Attitude(link_to_enu, total_covariance(terms)[3:, 3:], of=LINK, into=ENU, terms=terms)
 
 
 def mount_term(name: str, link_to_enu: np.ndarray, stddev: float) -> tuple[ErrorTerm, ...]:

@@ -255,7 +255,7 @@ def pointing_fix(
         residual_px=np.zeros((0, 2)),
         residual_arcsec=float("nan"),
         jitter_px=0.0,
-        camera=Attitude(to_itrs @ to_frame, to_itrs @ own @ to_itrs.T, CAMERA, ITRS),
+        camera=Attitude(to_itrs @ to_frame, to_itrs @ own @ to_itrs.T, of=CAMERA, into=ITRS),
     )
 
 

@@ -66,7 +66,7 @@ def fitted_fields(
     error = seen.errors.rotation_covariance(seen.errors.centroids)
     return {
         "utc_unix_s": earth.utc_unix_s,
-        "camera": Attitude(a4.T @ g, a4.T @ error @ a4, CAMERA, ITRS),
+        "camera": Attitude(a4.T @ g, a4.T @ error @ a4, of=CAMERA, into=ITRS),
         "used": np.flatnonzero(fit.keep),
         "residual_px": seen.residual,
         "residual_arcsec": seen.residual_px * optics.scale_arcsec,

@@ -87,7 +87,7 @@ def fix_of(motion: Motion, k: int, covariance: np.ndarray, errors: TimeErrors) -
         covariance=to_heading @ place_and_turn @ to_heading.T + shared[:3, :3],
         velocity=enu @ motion.velocity[k],
         velocity_covariance=enu @ covariance[VELOCITY, VELOCITY] @ enu.T,
-        link=Attitude(attitude, place_and_turn[2:, 2:] + shared[3:, 3:], LINK, ENU),
+        link=Attitude(attitude, place_and_turn[2:, 2:] + shared[3:, 3:], of=LINK, into=ENU),
         gyro_bias=motion.gyro_bias[k],
         accel_bias=motion.accel_bias[k],
     )

@@ -320,4 +320,4 @@ def body_attitude(frame: PlacelessFrame, place: Place, vessel: Vessel) -> Attitu
     to_ellipsoid = place.axes @ a4.T
     turn = rotation.about_axis(2, -math.atan2(to_ellipsoid[0, 1], to_ellipsoid[1, 1]))
     covariance = g @ seen.covariance @ g.T + columns @ columns.T + np.eye(3) * vessel.mount_stddev**2
-    return Attitude(turn @ g @ vessel.camera_to_body.T, covariance, LINK, ENU)
+    return Attitude(turn @ g @ vessel.camera_to_body.T, covariance, of=LINK, into=ENU)

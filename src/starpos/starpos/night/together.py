@@ -59,7 +59,7 @@ class Solved:
     def of(cls, s: Solution, fix: Fix) -> "Solved":
         """The part of a solution with a fix."""
         light = replace(fix, used=np.zeros(0, int), residual_px=np.zeros((0, 2)))
-        log_odds = s.attitude.log_odds if s.attitude else float("nan")
+        log_odds = s.pointing.log_odds if s.pointing else float("nan")
         return cls(
             fix=light,
             extrapolated_days=s.extrapolated_days,

@@ -75,7 +75,7 @@ def fix_at(seconds: float, azimuth_deg=40.0, latitude_deg=40.0, noise_m=100.0, c
         refraction_arcsec=12.0,
         diurnal_aberration_arcsec=0.3,
         ut1_minus_utc_s=-0.05,
-        camera=Attitude(site.enu.T @ attitude, np.eye(3) * 1e-12, CAMERA, ITRS),
+        camera=Attitude(site.enu.T @ attitude, np.eye(3) * 1e-12, of=CAMERA, into=ITRS),
     )
 
 
