@@ -12,10 +12,11 @@ from std_msgs.msg import Header
 from starpos.earth.place import Place
 from starpos.earth.vertical import Deflection
 from starpos.fix.attitude import CAMERA, ITRS, Attitude, heading_of, heading_row
-from starpos.fix.budget import ErrorTerm, link_attitude
+from starpos.fix.budget import link_attitude
 from starpos.fix.fix import Fix
 from starpos.fix.heading import AttitudeAtPlace
 from starpos.fix.solution import Solution, Status
+from starpos.fix.terms import ErrorTerm
 from starpos.session.frames import ground_of
 from starpos_interfaces import msg
 from starpos_solver import outputs

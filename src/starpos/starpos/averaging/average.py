@@ -14,8 +14,8 @@ from starpos.averaging.poses import poses_of, slip_s
 from starpos.averaging.scatter import MAX_ROWS, Frames, Scatter, scatter_of
 from starpos.earth.ellipsoid import EARTH_RADIUS_M, zenith_of
 from starpos.errors import FixError
-from starpos.fix.budget import EACH_POSE, ErrorTerm
 from starpos.fix.fix import Fix, PlaceFix
+from starpos.fix.terms import EACH_POSE, ErrorTerm
 from starpos.frozen import at_once
 
 # sigma of a place in rad before anything is known of it

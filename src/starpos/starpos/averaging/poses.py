@@ -11,9 +11,10 @@ from starpos._numeric.roots import symmetric_root
 from starpos.earth.orientation import ROTATION_RAD_S
 from starpos.errors import FixError
 from starpos.fix.attitude import Attitude
-from starpos.fix.budget import ErrorTerm, link_attitude
+from starpos.fix.budget import link_attitude
 from starpos.fix.fix import Fix, angle_text
 from starpos.fix.heading import AttitudeAtPlace
+from starpos.fix.terms import ErrorTerm
 from starpos.units import ARCSEC
 
 # errors may be as large as this

@@ -21,10 +21,11 @@ from starpos.calibration.plumb_line import (
 )
 from starpos.earth.ellipsoid import EARTH_RADIUS_M, enu_axes
 from starpos.errors import FixError
-from starpos.fix.budget import ALWAYS, ErrorTerm, Sensitivity, local_north
+from starpos.fix.budget import Sensitivity, local_north
 from starpos.fix.fix import Fix
 from starpos.fix.solution import Solution, Status
 from starpos.fix.solver import Solver
+from starpos.fix.terms import ALWAYS, ErrorTerm
 from starpos.frames.frame import Stars
 from starpos.frames.tables import Pointing
 from starpos.identification import Identification

@@ -12,8 +12,8 @@ from starpos.averaging.poses import poses_of
 from starpos.averaging.scatter import Frames, Scatter, scatter_of
 from starpos.earth.ellipsoid import EARTH_RADIUS_M
 from starpos.errors import FixError
-from starpos.fix.budget import EACH_POSE
 from starpos.fix.fix import Fix
+from starpos.fix.terms import EACH_POSE
 from starpos.instrument.inclinometer import InclinometerErrors
 from starpos.instrument.instrument import UNKNOWN_ARCSEC
 from starpos.instrument.mounting import RESPONSE_COEFFICIENTS, Zeroed, response_columns, stated_variances

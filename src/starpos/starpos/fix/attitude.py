@@ -4,15 +4,15 @@
 import math
 from dataclasses import KW_ONLY, dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from starpos import rotation
+from starpos.fix.terms import ErrorTerm
 from starpos.frozen import at_once
 
 if TYPE_CHECKING:
-    from starpos.fix.budget import ErrorTerm
+    from starpos.fix.terms import ErrorTerm
 
 # Names of frames, as docs/frames_and_symbols.md has them.
 CAMERA, LINK, ITRS, GCRS, ENU = "camera", "link", "ITRS", "GCRS", "ENU"
@@ -35,7 +35,7 @@ class Attitude:
     _: KW_ONLY
     of: str
     into: str
-    terms: "tuple[ErrorTerm, ...]" = ()
+    terms: tuple[ErrorTerm, ...] = ()
     by_refraction: np.ndarray | None = None
 
     def then(self, turn: np.ndarray, into: str) -> "Attitude":

@@ -12,8 +12,9 @@ from starpos.earth.ellipsoid import EARTH_RADIUS_M
 from starpos.earth.orientation import ROTATION_RAD_S
 from starpos.earth.refraction import MIN_COS_ZENITH
 from starpos.errors import FixError, PlaceError
-from starpos.fix.budget import CALIBRATION, ErrorTerm
+from starpos.fix.budget import CALIBRATION
 from starpos.fix.fix import Fix, angle_text
+from starpos.fix.terms import ErrorTerm
 from starpos.frames.frame import SATURATED, Stars
 from starpos.identification import MIN_STARS
 from starpos.instrument.camera import Camera

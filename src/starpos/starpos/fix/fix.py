@@ -15,17 +15,10 @@ from starpos.earth.orientation import EarthState
 from starpos.earth.refraction import Atmosphere
 from starpos.earth.vertical import Geodetic, Vertical, geodetic
 from starpos.fix.attitude import CAMERA, ITRS, Attitude, heading_of
-from starpos.fix.budget import (
-    ErrorTerm,
-    Sensitivity,
-    error_terms,
-    link_attitude,
-    local_north,
-    mount_term,
-    total_covariance,
-)
+from starpos.fix.budget import Sensitivity, error_terms, link_attitude, local_north, mount_term
 from starpos.fix.sighting import FittedSighting, fitted_fields
 from starpos.fix.star_fit import MatchedStars, apparent, fit_stars
+from starpos.fix.terms import ErrorTerm, total_covariance
 from starpos.frames.exposure import GLOBAL_SHUTTER, Shutter
 from starpos.frames.tables import Pointing
 from starpos.frozen import at_once

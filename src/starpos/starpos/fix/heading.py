@@ -16,10 +16,11 @@ from starpos.earth.place import Place
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import FixError, PlaceError
 from starpos.fix.attitude import Attitude, heading_row
-from starpos.fix.budget import ALWAYS, ErrorTerm, link_attitude, mount_term
+from starpos.fix.budget import link_attitude, mount_term
 from starpos.fix.checks import check_visible
 from starpos.fix.sighting import FittedSighting, fitted_fields
 from starpos.fix.star_fit import MatchedStars, StarFit, apparent, fit_stars
+from starpos.fix.terms import ALWAYS, ErrorTerm
 from starpos.frames.exposure import GLOBAL_SHUTTER, Shutter
 from starpos.frozen import at_once
 from starpos.instrument.camera import Camera

@@ -15,7 +15,8 @@ from starpos.earth.refraction import Atmosphere, Refraction
 from starpos.errors import FixError
 from starpos.fix._adjustment import Adjustment
 from starpos.fix._scatter import distances2, expected_variance, sifted
-from starpos.fix.budget import ALWAYS, StarErrors
+from starpos.fix.budget import StarErrors
+from starpos.fix.terms import ALWAYS
 from starpos.frames.exposure import Shutter
 from starpos.frames.frame import Stars
 from starpos.frozen import at_once

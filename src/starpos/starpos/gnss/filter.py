@@ -10,9 +10,9 @@ from starpos import rotation
 from starpos.earth.ellipsoid import curvature_radii_m, enu_axes, place_of_zenith
 from starpos.earth.place import Place
 from starpos.earth.vertical import Vertical
-from starpos.fix.budget import Origin, total_covariance
 from starpos.fix.fix import Fix
 from starpos.fix.sighting import Sighting
+from starpos.fix.terms import Origin, total_covariance
 from starpos.frozen import at_once
 from starpos.gnss.receiver import gnss_place
 from starpos.gnss.states import Learned, aged, ageing, prior

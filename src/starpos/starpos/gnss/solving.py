@@ -10,10 +10,11 @@ from starpos._numeric.roots import symmetric_root
 from starpos.earth.ellipsoid import curvature_radii_m, enu_axes, meridian_turn
 from starpos.earth.place import Place
 from starpos.earth.vertical import Deflection, Geodetic, Vertical, geodetic
-from starpos.fix.budget import ALWAYS, ErrorTerm, Sensitivity, local_north, total_covariance
+from starpos.fix.budget import Sensitivity, local_north
 from starpos.fix.fix import Fix
 from starpos.fix.solution import Solution, Status
 from starpos.fix.solver import Solver
+from starpos.fix.terms import ALWAYS, ErrorTerm, total_covariance
 from starpos.frames.frame import Stars
 from starpos.gnss.filter import LEARNED_ORIGINS, LevelSight, zenith_rows
 from starpos.gnss.states import Learned

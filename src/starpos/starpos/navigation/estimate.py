@@ -10,7 +10,8 @@ from starpos.earth.ellipsoid import curvature_radii_m, enu_axes, meridian_turn
 from starpos.earth.gravity import geodetic_place
 from starpos.earth.orientation import earth_state
 from starpos.fix.attitude import ENU, LINK, Attitude, heading_of, heading_row
-from starpos.fix.budget import time_terms, total_covariance
+from starpos.fix.budget import time_terms
+from starpos.fix.terms import total_covariance
 from starpos.navigation.equations import (
     ACCEL_BIAS,
     BY_LAW,

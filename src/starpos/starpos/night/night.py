@@ -11,10 +11,10 @@ from starpos.averaging.average import Average
 from starpos.earth.ellipsoid import curvature_radii_m, enu_axes, zenith_of
 from starpos.earth.refraction import Atmosphere
 from starpos.earth.vertical import Geodetic, Vertical, geodetic
-from starpos.fix.budget import ErrorTerm
 from starpos.fix.fix import Fix, InDegrees
 from starpos.fix.heading import AttitudeAtPlace
 from starpos.fix.solution import FieldPointing, Solution, Status
+from starpos.fix.terms import ErrorTerm
 from starpos.frames.frame import Stars
 from starpos.night.remarks import Remark
 from starpos.night.together import WatchedNight

@@ -9,8 +9,8 @@ import numpy as np
 from starpos.averaging.average import MOVED_FIXES, Average, Averager
 from starpos.averaging.poses import CREEP_RAD, SLIP_SIGMAS, slip_s
 from starpos.earth.ellipsoid import EARTH_RADIUS_M, curvature_radii_m, enu_axes, zenith_of
-from starpos.fix.budget import Origin
 from starpos.fix.fix import Fix
+from starpos.fix.terms import Origin
 from starpos.session.driver import Diagnosis, Level
 from starpos.units import ARCSEC
 

@@ -11,7 +11,7 @@ from starpos.averaging.filter import UNIT, PlaceFilter, Plane
 from starpos.earth.ellipsoid import curvature_radii_m
 from starpos.earth.orientation import earth_state
 from starpos.errors import FixError
-from starpos.fix.budget import ALWAYS, ErrorTerm, correlation, total_covariance
+from starpos.fix.terms import ALWAYS, ErrorTerm, correlation, total_covariance
 from starpos.instrument.inclinometer import Tilt
 from starpos.units import ARCSEC
 from starpos_testing.skies.fields import UTC, SkyField, random_field

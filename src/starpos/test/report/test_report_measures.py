@@ -11,8 +11,8 @@ from starpos.earth.ellipsoid import curvature_radii_m
 from starpos.earth.orientation import earth_state
 from starpos.earth.refraction import Atmosphere
 from starpos.earth.vertical import Deflection
-from starpos.fix.budget import ALWAYS, ErrorTerm
 from starpos.fix.solution import FieldPointing, Status
+from starpos.fix.terms import ALWAYS, ErrorTerm
 from starpos.instrument.camera import EQUIDISTANT, Camera
 from starpos.instrument.instrument import Calibration, Instrument
 from starpos.night.night import Night, ReportedPlace, Shot, Truth

@@ -8,8 +8,8 @@ import numpy as np
 
 from starpos import rotation
 from starpos.fix.attitude import CAMERA, ITRS, Attitude, heading_of
-from starpos.fix.budget import ALWAYS, ErrorTerm
 from starpos.fix.fix import Fix
+from starpos.fix.terms import ALWAYS, ErrorTerm
 from starpos.frames.frame import Stars
 from starpos.instrument.inclinometer import Tilt
 from starpos.session.calibrating import Seen
