@@ -31,7 +31,7 @@ SQUARE_SIGMA = 5.0
 EXPLAINED_SIGMA = 3.0
 # Maximum temperature at which an inclinometer measures
 MAX_CELSIUS = 300.0
-# Temperatures that no sensor measured. 1 sigma of the difference of two at different dates: a warm room and a clear night.
+# Temperatures that no sensor measured: 1 sigma of the difference of two, as of a warm room and a clear night.
 # Its random walk, by a night's cooling; and of an instrument that has long stood outdoors, by some degrees in hours.
 UNMEASURED_JUMP_C = 14.0
 UNMEASURED_WALK_C_PER_SQRT_HOUR = UNMEASURED_JUMP_C / math.sqrt(6.0)
