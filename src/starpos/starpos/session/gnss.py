@@ -19,7 +19,7 @@ from starpos.fix.solver import Solver
 from starpos.frames.frame import Stars
 from starpos.gnss import states
 from starpos.gnss.filter import what_would_tell_more
-from starpos.gnss.receiver import NEAREST_S, GnssPlace, GnssTrack, known_place, message_to_gnss
+from starpos.gnss.receiver import NEAREST_S, GnssTrack, message_to_gnss
 from starpos.gnss.solving import Watched, watched
 from starpos.gnss.states import Learned
 from starpos.gnss.watch import GnssStatus, GnssWatch
@@ -42,12 +42,12 @@ KEPT_S = 300.0
 MAX_LATE_S = 30.0
 
 
-def contradiction(gnss: GnssPlace, ground: Geodetic, utc_unix_s: float, speed: float) -> tuple[float, str]:
+def contradiction(gnss: Place, ground: Geodetic, utc_unix_s: float, speed: float) -> tuple[float, str]:
     """How far GNSS's place lies from ours of a time, m, and a sentence where the two cannot both be right.
 
     speed: of the vehicle, m/s, which goes on between the two times.
     """
-    off = gnss.from_place_m(ground.latitude, ground.longitude)
+    off = gnss.offset_m(ground.latitude, ground.longitude)
     on_the_way = speed * (utc_unix_s - gnss.utc_unix_s)
     claim = ground.covariance[:2, :2] + gnss.covariance + np.eye(2) * on_the_way**2
     apart, sigmas = float(np.linalg.norm(off)), float(np.sqrt(off @ np.linalg.solve(claim, off)))
@@ -68,13 +68,13 @@ class RecentPlaces:
 
     def __init__(self, unstated_m: float = math.nan) -> None:
         self._unstated_m = unstated_m
-        self._places: list[GnssPlace] = []
+        self._places: list[Place] = []
 
     def __len__(self) -> int:
         return len(self._places)
 
     @property
-    def newest(self) -> GnssPlace | None:
+    def newest(self) -> Place | None:
         """The newest place; None without one."""
         return self._places[-1] if self._places else None
 
@@ -91,7 +91,7 @@ class RecentPlaces:
         if self._places[0].utc_unix_s < place.utc_unix_s - 2 * KEPT_S:
             del self._places[: self._first_since(place.utc_unix_s - KEPT_S)]
 
-    def at(self, utc_unix_s: float) -> GnssPlace | None:
+    def at(self, utc_unix_s: float) -> Place | None:
         """The place at a time, None without one near; GnssError if the places there contradict each other."""
         # with one more on either side, from which the speed is known
         first = max(self._first_since(utc_unix_s - NEAREST_S) - 1, 0)
@@ -199,7 +199,7 @@ class GnssTeacher:
             self._log.warning("another camera_info: what GNSS taught of the other camera is forgotten")
             self._watch = GnssWatch(self._instrument, self._settings.vertical)
 
-    def _compared_with(self, stars: Stars) -> GnssPlace | None:
+    def _compared_with(self, stars: Stars) -> Place | None:
         if stars.mid_unix_s is None:
             return None
         try:
@@ -313,4 +313,4 @@ class SessionPlaces:
                 f"no GNSS place within {NEAREST_S:g} s of the frame: no heading at a known place: check gnss/fix and the "
                 "clocks, or set site.latitude and site.longitude"
             )
-        return known_place(gnss, self._settings.vertical)
+        return gnss.deflected(self._settings.vertical)

@@ -19,7 +19,6 @@ from starpos.earth.place import Place
 from starpos.earth.vertical import Geodetic, Vertical, geodetic
 from starpos.errors import GnssError, StarposError, VoyageError
 from starpos.files import path_of
-from starpos.gnss.receiver import known_place
 from starpos.instrument.instrument import Instrument
 from starpos.messages.stamp import stamp_to_unix
 from starpos.messages.stars import message_to_attitude
@@ -242,7 +241,7 @@ class NavigatorSession:
         if not self._values["gnss.use"]:
             return None
         gnss = self._gnss.at(utc_unix_s)
-        return None if gnss is None else known_place(gnss, self._settings.vertical)
+        return None if gnss is None else gnss.deflected(self._settings.vertical)
 
     def receive_velocity(self, message: Any, now: Now, name: str) -> list[Navigated]:
         """Take a nav_msgs/Odometry or a geometry_msgs/TwistWithCovarianceStamped, from the topic of that name."""
