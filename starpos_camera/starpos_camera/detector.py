@@ -278,10 +278,10 @@ class DetectorNode(Node):
     def _on_imu(self, message: Imu) -> None:
         # in a replay the stars would depend on which readings came before a frame
         if not time_is_simulated(self):
-            self._tell_trails("imu/data", lambda trails: trails.take_imu(message))
+            self._tell_trails("imu/data", lambda trails: trails.receive_imu(message))
 
     def _on_camera(self, message: CameraInfo, info: Mapping[str, Any]) -> None:
-        self._tell_trails("camera_info", lambda trails: trails.take_camera(message))
+        self._tell_trails("camera_info", lambda trails: trails.receive_camera(message))
 
     def _tell_trails(self, name: str, tell: Callable[[Trails], None]) -> None:
         assert self._trails is not None

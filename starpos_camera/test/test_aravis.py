@@ -116,7 +116,7 @@ def test_frames_are_new_ones_and_exposure_and_gain_are_set(make, fake, monkeypat
     frame = source.capture(CaptureSettings(0.1, 5.0, 1.0)).frame
     assert frame.mid_unix_s >= begin
     assert frame.exposure_s == pytest.approx(0.1)
-    assert source._device._camera.get_gain() == 5.0
+    assert source._device.camera.get_gain() == 5.0
     monkeypatch.setattr(fake.Camera, "get_exposure_time", lambda _: 2e5)
     assert "it exposes for 0.2 s, not for 0.1 s" in source.capture(CaptureSettings(0.1, 5.0, 1.0)).remark
 

@@ -10,7 +10,7 @@ from sensor_msgs.msg import Image
 
 from starpos.frames.frame import Frame
 from starpos.messages.stamp import stamp_to_unix
-from starpos.session.system_clock import StepWatch
+from starpos.system_clock import StepWatch
 from starpos_camera.sources.source import CapturedFrame, CaptureError
 from starpos_camera.sources.timing import in_one_time
 from starpos_interfaces.msg import Capture

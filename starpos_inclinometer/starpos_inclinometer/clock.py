@@ -14,7 +14,7 @@ from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
-from starpos.session.system_clock import StepWatch
+from starpos.system_clock import StepWatch
 
 # If reading both clocks takes longer, they are read again.
 QUICK_S = 1e-3

@@ -75,12 +75,12 @@ class SolverNode(Node):
         self._transforms = StaticTransforms(self)
         session = self._session
         takes: dict[str, Take] = {
-            CAMERA_TOPIC: lambda m, _: self._publish(session.take_camera(m, self._now())),
-            "tilt": lambda m, info: self._publish(session.take_tilt(m, _sent(info), self._now())),
-            "stars": lambda m, info: self._publish(session.take_stars(m, self._now(), _sent(info))),
+            CAMERA_TOPIC: lambda m, _: self._publish(session.receive_camera(m, self._now())),
+            "tilt": lambda m, info: self._publish(session.receive_tilt(m, _sent(info), self._now())),
+            "stars": lambda m, info: self._publish(session.receive_stars(m, self._now(), _sent(info))),
         }
         if session.gnss is not None:
-            takes[GNSS_TOPIC] = lambda m, _: self._publish(session.take_gnss(m, self._now()))
+            takes[GNSS_TOPIC] = lambda m, _: self._publish(session.receive_gnss(m, self._now()))
         if time_is_simulated(self):
             self._replayed = Replayed(
                 self,
@@ -98,7 +98,7 @@ class SolverNode(Node):
             best_effort = ReliabilityPolicy.BEST_EFFORT
             subscription(self, Imu, IMU_TOPIC, self._on_imu, IMU_QUEUE, best_effort)
         self._gnss = GnssComparison()
-        take = self._gnss.take if session.gnss is None else self._taker(GNSS_TOPIC, takes)
+        take = self._compare_gnss if session.gnss is None else self._taker(GNSS_TOPIC, takes)
         # receivers' drivers publish in either way
         subscription(self, NavSatFix, GNSS_TOPIC, take, 10, ReliabilityPolicy.BEST_EFFORT)
         self.create_service(Solve, "~/solve", self._on_solve)
@@ -155,6 +155,9 @@ class SolverNode(Node):
 
         return on_message
 
+    def _compare_gnss(self, message: NavSatFix) -> None:
+        self._gnss.receive(message, self._now())
+
     def _on_imu(self, message: Imu) -> None:
         self._session.gyro.take(message, self._now())
 
@@ -189,7 +192,8 @@ class SolverNode(Node):
         self._transforms.update(
             self._values["publish_tf"],
             self._values["frame_id"],
-            self._session.names,
+            self._session.instrument.frame_id,
+            self._session.tilts.frame_id,
             solver.instrument if solver else None,
         )
 

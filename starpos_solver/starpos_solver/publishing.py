@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The topics and transforms that the solver and the navigator publish."""
+"""The topics that the solver publishes, and the transforms of both nodes."""
 
+from dataclasses import dataclass
 from functools import cached_property
 from importlib.util import find_spec
 
 import numpy as np
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import Point, Quaternion, TransformStamped, Vector3
+from geometry_msgs.msg import Quaternion, TransformStamped, Vector3
 from nav_msgs.msg import Odometry
 from rclpy.node import Node
 from rclpy.publisher import Publisher
@@ -14,14 +15,11 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import Imu, NavSatFix
 from std_msgs.msg import Header
 
+from starpos import rotation
 from starpos.earth.vertical import Geodetic
 from starpos.instrument.instrument import Instrument
-from starpos.navigation.estimate import VoyageFix
 from starpos.session.frames import Answered, Averaged, Output
-from starpos.session.navigator import Navigated, Position
-from starpos.session.navigator_parameters import NavigatorSettings
-from starpos.session.transforms import FrameNames, Transform, transforms_of
-from starpos_common.messages import attitude_to_message, unix_to_stamp
+from starpos_common.messages import attitude_to_message
 from starpos_common.topics import publisher
 from starpos_interfaces import msg
 from starpos_solver import outputs
@@ -33,6 +31,40 @@ STATIC_QOS = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 MOVING_QOS = QoSProfile(depth=100)
 
 
+@dataclass(frozen=True)
+class Transform:
+    """Rotation of a frame in another one; its position there is not measured.
+
+    quaternion  (x, y, z, w): takes vectors of the child into the parent
+    """
+
+    parent: str
+    child: str
+    quaternion: tuple[float, ...]
+
+
+def transforms_of(instrument: Instrument, link: str, camera: str, inclinometer: str) -> tuple[Transform, ...]:
+    """Make the transforms of an instrument whose frames have these names; a frame without a name is left out.
+
+    So is the inclinometer without a known A3, a missing inclinometer, and a frame that is in the tree already.
+    """
+    if not camera:
+        return ()
+    found = [_transform(link, camera, np.asarray(instrument.link_to_camera, float).T)]
+    if inclinometer and instrument.vertical is None and not instrument.calibration.unknown:
+        found.append(_transform(camera, inclinometer, instrument.calibration.a3.T))
+    names, tree = {link}, []
+    for transform in found:
+        if transform.child not in names:
+            names.add(transform.child)
+            tree.append(transform)
+    return tuple(tree)
+
+
+def _transform(parent: str, child: str, matrix: np.ndarray) -> Transform:
+    return Transform(parent, child, tuple(rotation.to_quaternion(matrix).tolist()))
+
+
 class StaticTransforms:
     """Publishes the transforms of an instrument."""
 
@@ -41,17 +73,17 @@ class StaticTransforms:
         self._publisher: Publisher | None = None
         self._published: tuple[Transform, ...] = ()
 
-    def update(self, wanted: bool, link: str, names: FrameNames, instrument: Instrument | None) -> None:
+    def update(
+        self, wanted: bool, link: str, camera: str, inclinometer: str, instrument: Instrument | None
+    ) -> None:
         """Publish the known transforms, if they differ from before; withdraw them if they are not wanted.
 
-        link: name of the base link.  names: of the others.  instrument: that in use, None before there is one.
+        link, camera, inclinometer: names of the frames.  instrument: in use, None before there is one.
         """
         if not wanted:
             self._close()
         elif self._possible:
-            self._publish(
-                transforms_of(instrument, link, names.camera, names.inclinometer) if instrument else ()
-            )
+            self._publish(transforms_of(instrument, link, camera, inclinometer) if instrument else ())
 
     @cached_property
     def _possible(self) -> bool:
@@ -157,13 +189,13 @@ class SolutionPublishers:
             self._fix_averaged.publish(self._nav_sat_fix(header, output.ground))
             return
         self._fix.publish(self._nav_sat_fix(header, output.ground))
-        fix, at_place, beside = output.solution.fix, output.solution.at_place, output.beside
+        fix, at_place = output.solution.fix, output.solution.at_place
         if at_place is not None:
             self._imu.publish(outputs.imu_at_place(header, at_place.true_north))
         elif fix is not None and output.ground is not None:
             self._imu.publish(outputs.imu(header, fix, output.ground))
-        if self._check is not None and beside is not None and beside.compared is not None:
-            self._check.publish(outputs.gnss_check(header, beside.compared))
+        if self._check is not None and output.compared is not None:
+            self._check.publish(outputs.gnss_check(header, output.compared))
         if output.attitude is not None:
             self._attitude.publish(attitude_to_message(output.attitude))
         self._solution.publish(self.solution(output))
@@ -180,55 +212,3 @@ class SolutionPublishers:
 
     def _nav_sat_fix(self, header: Header, ground: Geodetic | None) -> NavSatFix:
         return outputs.nav_sat_fix(header, ground, self._values["altitude"], self._values["altitude_stddev"])
-
-
-class NavigatorPublishers:
-    """Publishes what the session makes, with the present parameters."""
-
-    def __init__(self, node: Node, settings: NavigatorSettings) -> None:
-        self._values = settings.values
-        self._fix = publisher(node, NavSatFix, "navigator/fix", 10)
-        self._heading = publisher(node, Imu, "navigator/heading", 10)
-        self._odometry = publisher(node, Odometry, "navigator/odometry", 10)
-        self._transform = MovingTransform(node)
-        self.parameters_set()
-
-    def parameters_set(self) -> None:
-        """Create the topics that the parameters ask for."""
-        self._transform.open(self._values["publish_tf"])
-
-    def publish(self, output: Navigated) -> None:
-        """Publish one output; without support it is a NO_FIX alone, and at a known place a heading."""
-        frame = self._values["frame_id"]
-        header = Header(stamp=unix_to_stamp(output.utc_unix_s), frame_id=frame)
-        if output.at_place is not None:
-            self._heading.publish(outputs.imu_at_place(header, output.at_place))
-            return
-        altitude = self._values["altitude"], self._values["altitude_stddev"]
-        self._fix.publish(outputs.nav_sat_fix(header, output.ground, *altitude))
-        if output.fix is None or output.ground is None:
-            return
-        self._heading.publish(outputs.imu(header, output.fix, output.ground))
-        if output.position is None:
-            return
-        start = Header(stamp=header.stamp, frame_id=self._values["odometry_frame_id"])
-        message = odometry(start, frame, output.fix, output.ground, output.position)
-        self._odometry.publish(message)
-        self._transform.publish(message)
-
-
-def odometry(header: Header, child: str, fix: VoyageFix, ground: Geodetic, position: Position) -> Odometry:
-    """Make the Odometry: pose in the frame of the header, ENU; velocity along the axes of the child's."""
-    message = Odometry(header=header, child_frame_id=child)
-    message.pose.pose.position = Point(**dict(zip("xyz", position.enu.tolist(), strict=True)))
-    message.pose.pose.orientation, turn = outputs.attitude(fix, ground)
-    pose, twist = np.zeros((2, 6, 6))
-    pose[:3, :3], pose[3:, 3:] = position.covariance, turn
-    message.pose.covariance = pose.ravel()
-    velocity = fix.link_to_enu.T @ fix.velocity
-    message.twist.twist.linear = Vector3(**dict(zip("xyz", velocity.tolist(), strict=True)))
-    twist[:3, :3] = fix.link_to_enu.T @ fix.velocity_covariance @ fix.link_to_enu
-    # rates are the IMU's own
-    twist[3, 3] = -1.0
-    message.twist.covariance = twist.ravel()
-    return message

@@ -176,7 +176,7 @@ class Recorder:
         solver = settings.solver(message_to_camera(self.infos[-1]), None, load_catalogue())
         tilts = TiltBuffer()
         for tilt in self.tilts:
-            tilts.add(tilt, settings.tilt_stddev_rad)
+            tilts.keep(tilt, settings.tilt_stddev_rad)
         stars = replace(message_to_stars(self.stars[stamp]), mid_unix_s=mid_s)
         return solver.solve(stars, tilts.over(EXPOSURE_S)).fix
 

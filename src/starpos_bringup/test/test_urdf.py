@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from starpos.instrument import instrument_file
 from starpos.instrument.instrument import TOP_OF_FRAME, Calibration, Instrument
-from starpos.session.transforms import transforms_of
+from starpos_solver.publishing import transforms_of
 from starpos_testing.lacking import require
 
 URDF = Path(__file__).parent.parent / "urdf" / "starpos.urdf.xacro"

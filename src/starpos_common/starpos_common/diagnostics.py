@@ -13,7 +13,7 @@ from rclpy.clock import Clock, ROSClock
 from rclpy.clock_type import ClockType
 from rclpy.node import Node
 
-from starpos.session import system_clock
+from starpos import system_clock
 from starpos.session.driver import Diagnosis, Level
 
 __all__ = ["Diagnosis", "Diagnostics", "Level"]

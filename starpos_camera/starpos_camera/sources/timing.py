@@ -10,7 +10,7 @@ from datetime import datetime, timezone
 from typing import Any
 
 from starpos.messages.stamp import stamp_to_unix
-from starpos.session.system_clock import StepWatch
+from starpos.system_clock import StepWatch
 from starpos_camera.sources.source import CapturedFrame, CaptureError
 from starpos_common.shutter_pulses import Edge, Lag, ShutterPulse, ShutterPulses
 from starpos_interfaces.msg import Capture, Pulse

@@ -41,7 +41,7 @@ from starpos.instrument.tilt_log import TiltLog
 from starpos.night.reading import NO_CAMERA, First, Given, Reader
 from starpos.night.remarks import of_inclinometer
 from starpos.night.together import axis_of, circles_of
-from starpos.night.work import Identifying
+from starpos.night.work import Solving
 from starpos.sky import catalogue
 from starpos.sky.site import Site
 from starpos.units import ARCSEC
@@ -312,7 +312,8 @@ def run(args: argparse.Namespace) -> int:
     # an unusable instrument is refused before the work on all frames
     check_output(args, instrument)
     sights, unreadable = _sights(args.frames, read, replace(given_of(args, first), instrument=instrument))
-    solver, frames = of_one_camera(Solver(instrument, catalogue.load_catalogue()), sights)
+    solver, alike = of_one_camera(Solver(instrument, catalogue.load_catalogue()), sights)
+    frames = [(sight.stars, sight.found) for sight in alike]
     instrument = solver.instrument
     tilts = _tilts(args, instrument)
     try:
@@ -386,11 +387,11 @@ def _written(args: argparse.Namespace) -> Iterator[Written]:
 
 def _sights(paths: Sequence[str], read: Reader, given: Given) -> tuple[list[Sight], bool]:
     """The frames that can be read, identified by every way there is, and whether some cannot be read."""
-    progress, unreadable, work = console.ProgressBar(), False, Identifying(given)
+    progress, unreadable, work = console.ProgressBar(), False, Solving(given)
     sights: list[Sight] = []
     for k, path in enumerate(paths):
         try:
-            sight, _ = work(read(path))
+            sight = work(read(path))
             sights.append(sight)
             if sight.solution.remark:
                 console.complain("calibrate", sight.solution.remark)

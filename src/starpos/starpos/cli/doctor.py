@@ -204,7 +204,7 @@ def earth_rotation() -> Finding:
 
 def clock() -> Finding:
     """The kernel's state of this machine's clock."""
-    from starpos.session import system_clock
+    from starpos import system_clock
 
     state = system_clock.read()
     if state is None:

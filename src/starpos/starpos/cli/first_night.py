@@ -20,7 +20,7 @@ from starpos.instrument.tilt_table import read_tilt_csv
 from starpos.night.first_night import AROUND_S, FirstNight, Look, Stage
 from starpos.night.opening import exposures, frames_in
 from starpos.night.reading import About, Given, stars_of
-from starpos.night.work import Identifying
+from starpos.night.work import Solving
 from starpos.report import field
 from starpos.sky import catalogue
 from starpos.units import utc_text
@@ -113,7 +113,7 @@ def _watched(args: argparse.Namespace, folder: Path) -> tuple[FirstNight | None,
                 given = given_of(args, About(item.width, item.height, item.focal_px, item.origin_px))
                 air = options.atmosphere_of(args)
                 night = FirstNight(Solver(options.instrument_of(args, item), catalogue.load_catalogue(), air))
-            sight = Identifying(given)(item)[0]
+            sight = Solving(given)(item)
             look = night.add(sight, _tilts(folder, night, stars_of(item)))
             _tell(look, sight.stars)
             if night.step is None:

@@ -12,9 +12,10 @@ from starpos.cli.inputs import frames_among, given_of, is_untold, reader_of
 from starpos.errors import FrameError
 from starpos.fix.blind import SEARCH_S, BlindSolver
 from starpos.fix.solution import Solution, Status
+from starpos.frames.frame import Stars
 from starpos.instrument.camera import EQUIDISTANT
 from starpos.night.reading import First, Given
-from starpos.night.work import Fitting, Identifying, OnFile
+from starpos.night.work import OnFile, Solving
 from starpos.parallel.processes import Here
 from starpos.progress import quiet
 from starpos.sky.catalogue import load_catalogue
@@ -59,7 +60,7 @@ def define(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     args.frames = frames_among(args.frames)
     any_found, unreadable, number = False, False, len(args.frames)
-    lost: str | None = None
+    lost: Stars | None = None
     read, output = reader_of(args), Output(args, COLUMNS, HEAD)
     with inputs.workers_of(args, number) as workers:
         (about,) = workers.map([(First(read), tuple(args.frames))])
@@ -72,21 +73,20 @@ def run(args: argparse.Namespace) -> int:
         # without a frame that can be read, each one reports why it cannot
         # several at once would write over each other's progress
         progress = console.ProgressBar() if isinstance(workers, Here) else quiet
-        work = OnFile(read, Identifying(given, args.search_time, progress))
+        work = OnFile(read, Solving(given, search_s=args.search_time, progress=progress))
         answers = inputs.watched(workers.map((work, path) for path in args.frames), number)
         for path, answer in zip(args.frames, answers, strict=True):
             if isinstance(answer, FrameError):
                 unreadable, found, cpu_ms = True, Solution.unreadable(path, answer), 0.0
             else:
-                sight, cpu_ms = answer
-                found = sight.solution
+                found, cpu_ms = answer.solution, answer.cpu_ms
+                lost = answer.stars if lost is None and found.status is Status.NOT_IDENTIFIED else lost
             any_found |= found.ok
-            lost = path if lost is None and found.status is Status.NOT_IDENTIFIED else lost
             if not found.ok or found.remark:
                 console.complain("identify", found.remark or found.message)
             output.put(as_json(path, found) | {"cpu_ms": cpu_ms}, _line(path, found))
     if lost is not None and not any_found:
-        for remark in Fitting(given)(read(lost)):
+        for remark in Solving(given).fitting(lost):
             console.complain("identify", remark)
     return console.UNREADABLE if unreadable else 0 if any_found else 1
 

@@ -25,7 +25,7 @@ from starpos.navigation.sightings import IdentifiedFrame, sighting_of
 from starpos.navigation.vessel import LAWS, Vessel
 from starpos.navigation.voyage import Voyage, navigate
 from starpos.night.reading import First, Given, Reader
-from starpos.night.work import Identifying
+from starpos.night.work import Solving
 from starpos.sky import catalogue
 
 NO_ANSWER = 1
@@ -127,7 +127,7 @@ class Seeing:
 
     def __call__(self, path: str) -> FrameSeen:
         item = self.read(path)
-        sight, _ = Identifying(self.given)(item)
+        sight = Solving(self.given)(item)
         instrument = sight.instrument or self.given.of(item)
         assert instrument is not None
         eye, time_s = Solver(instrument, catalogue.load_catalogue()), item.mid_unix_s

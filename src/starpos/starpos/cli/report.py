@@ -15,7 +15,7 @@ from starpos.errors import FrameError, InstrumentError
 from starpos.night.night import Night
 from starpos.night.opening import exposures, frames_in
 from starpos.night.reading import First, Given, Reader
-from starpos.night.solving import Exposures, solved_night
+from starpos.night.solving import Exposures, How, solved_night
 from starpos.parameters.given import of_solver
 from starpos.sky import catalogue
 from starpos.units import utc_text
@@ -163,16 +163,14 @@ def _night(path: Path, args: argparse.Namespace) -> Night:
     """The Night of a folder or a bag; raises StarposError if there is nothing to work on."""
     from starpos.night import bag
 
-    turn_stddev_deg = options.turn_of(args) if args.self_calibrate else None
     found = _exposures(path, args)
     receiver = read_receiver(args.gnss, None, "report")
+    how = How(options.turn_of(args) if args.self_calibrate else None, receiver)
     if isinstance(found, Exposures):
-        return solved_night(found, turn_stddev_deg, console.ProgressBar(), receiver)
+        return solved_night(found, how, console.ProgressBar())
     if receiver is not None:
         raise FrameError(f"{path}: --gnss goes with a folder of frames, and this is a bag: leave it out")
-    return bag.night(
-        *found, options.atmosphere_of(args), vertical_of(args), turn_stddev_deg, console.ProgressBar()
-    )
+    return bag.night(*found, options.atmosphere_of(args), vertical_of(args), how, console.ProgressBar())
 
 
 def _exposures(path: Path, args: argparse.Namespace) -> "Exposures | tuple[Recorded, OfBag]":

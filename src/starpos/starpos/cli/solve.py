@@ -4,7 +4,7 @@
 import argparse
 import os
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -40,9 +40,8 @@ from starpos.cli.options import add_site, add_vertical, place_of, tell_unknown, 
 from starpos.cli.overwriting import Written, save_instrument
 from starpos.earth.place import Place
 from starpos.earth.vertical import Vertical
-from starpos.errors import FrameError, InstrumentError, StarposError, TiltError
-from starpos.fix.searching import of_one_camera
-from starpos.fix.solution import Solution, Status, status_of
+from starpos.errors import InstrumentError, StarposError, TiltError
+from starpos.fix.solution import Solution, status_of
 from starpos.fix.solver import Solver
 from starpos.frames.tables import Pointing, read_pointings
 from starpos.gnss import states
@@ -51,38 +50,25 @@ from starpos.gnss.solving import Watched
 from starpos.gnss.states import Learned
 from starpos.gnss.watch import GnssCheck
 from starpos.instrument import instrument_file
-from starpos.instrument.instrument import Instrument, with_frame_size
+from starpos.instrument.instrument import Instrument
 from starpos.instrument.tilt_log import NO_TILTS, Tilts
-from starpos.night.reading import NO_CAMERA, About, First, Given, Reader, stars_of
+from starpos.night.opening import work_of
+from starpos.night.reading import NO_CAMERA, About, First, Given
 from starpos.night.remarks import WORTH_SAVING_ARCSEC, Near, of_inclinometer
+from starpos.night.solving import How, NightAnswers, answers_of
 from starpos.night.together import (
+    FrameAnswer,
+    Gathered,
     Receiver,
-    Solved,
     TurnedNight,
     from_elevations,
     together,
     turned,
-    watched_night,
 )
-from starpos.night.work import Fitting, Identifying, OnFile, Solving
+from starpos.night.work import OnFile, Solving
 from starpos.report import field
 from starpos.sky import catalogue
 from starpos.units import utc_text
-
-
-@dataclass(frozen=True)
-class Plan:
-    """How to solve a night: the work on each frame, the instruments, and the solver of its first frame.
-
-    solver: None if no frame can be read; then each one reports why.
-    """
-
-    night: NightFolder
-    work: OnFile
-    given: Given
-    solver: Solver | None = None
-    tilts: Tilts = NO_TILTS
-
 
 NO_FIX = 1
 
@@ -91,58 +77,76 @@ def tell(
     args: argparse.Namespace,
     output: Output,
     night: NightFolder,
-    rows: Iterable,
+    answers: NightAnswers,
     vertical: Vertical,
-    given: Instrument | None = None,
     place: Place | None = None,
-) -> tuple[int, str]:
-    """Write (path, Solution or FrameError) of each frame, and their common result.
+    work: Solving | None = None,
+) -> int:
+    """Write the answer to each frame of a night, and what they come to together; returns the exit status.
 
-    given: the instrument whose A3 was used unchanged; None if A3 was found by turning.
     place: the known place, whose headings are then reported; None without one.
-    Returns the exit status, and a frame that was not identified if no frame has a fix, else ''.
+    work: on the frames, which may say which focal length fits those that were not identified.
     """
-    solved: list[Solved] = []
-    headings: list[Solution] = []
-    warnings: set[str] = set()
-    unreadable, lost = False, ""
-    for path, answer in rows:
-        if isinstance(answer, FrameError):
-            unreadable = True
-            answer = Solution.unreadable(path, answer)
-        warnings |= set(answer.warnings)
-        if answer.status is Status.NOT_IDENTIFIED:
-            lost = lost or path
-        if answer.fix:
-            solved.append(Solved.of(answer, answer.fix))
-        elif answer.at_place is None or not answer.ok:
-            console.complain("solve", answer.message)
-        if answer.remark:
-            console.complain("solve", answer.remark)
-        values = {"file": path} | json_of(answer.fix, vertical) | json_about(answer)
-        if place is None:
-            output.put(values, line_of(path, answer, args.self_calibrate))
-            continue
-        headings += [answer] if answer.at_place else []
-        told = fix_output.with_heading(values, answer.at_place, place)
-        output.put(told, fix_output.heading_line_of(path, answer))
-    near = near_of(args)
-    whole = together(solved, given, near)
-    mean, why = fix_output.mean_of(headings)
-    say(night, *([whole.why_not] if whole.why_not else ()), *whole.remarks, *why)
+    statuses = [] if answers.turned is None else [tell_turned(args, night, answers.turned)]
+    watched, gathered = answers.watched, Gathered()
+    if watched is not None:
+        say(night, *watched.remarks)
+        if args.learned is not None:
+            _save_learned(Path(args.learned), watched.learned)
+    for answer in answers.each:
+        gathered.gather(answer)
+        s = answer.solution
+        if s.fix is None and (s.at_place is None or not s.ok):
+            console.complain("solve", s.message)
+        if s.remark:
+            console.complain("solve", s.remark)
+        output.put(_json_of_answer(args, answer, vertical, place), _line_of_answer(args, answer, place))
+    solved, headings, near = gathered.solved, gathered.headings, near_of(args)
+    whole = together(solved, answers.given, near)
+    mean, why = (None, ()) if place is None else fix_output.mean_of(headings)
+    unnamed = () if watched is None or answers.instrument is None else of_inclinometer(answers.instrument)
+    not_averaged = [whole.why_not] if whole.why_not else []
+    say(night, *not_averaged, *(unnamed if solved else ()), *whole.remarks, *why)
     if solved:
         last = solved[-1].fix
         tell_unknown("solve", args, vertical.at(last.latitude, last.longitude))
         where = last if whole.average is None else whole.average
         about = {} if near is None else {"km_from_near": near.km_from(where.latitude, where.longitude)}
         if place is not None:
-            about |= fix_output.with_heading(json_of(whole.average, vertical), mean, place)
-        put_combined(output, night, whole.average, solved, warnings, vertical, about)
+            about |= with_heading(json_of(whole.average, vertical), mean, place)
+        put_combined(output, night, whole.average, solved, gathered.warnings, vertical, about)
     elif headings and place is not None:
         fix_output.put_mean(output, night, headings, mean, place, vertical)
-    found = headings if place is not None and not args.tilt else whole.average
-    status = console.UNREADABLE if unreadable else 0 if found else NO_FIX
-    return status, "" if solved or headings else lost
+    elif gathered.lost is not None and not headings and work is not None:
+        say(night, *work.fitting(gathered.lost))
+    # without tilts headings are all that was asked for
+    found = bool(headings) if place is not None and not args.tilt else whole.average is not None
+    found |= args.gnss is not None and args.tilt is None and bool(headings)
+    return max([*statuses, console.UNREADABLE if gathered.unreadable else 0 if found else NO_FIX])
+
+
+def _json_of_answer(
+    args: argparse.Namespace, answer: FrameAnswer, vertical: Vertical, place: Place | None
+) -> dict:
+    """The answer to a frame for --json; with --gnss, its heading is at GNSS's place, and it has the key `gnss`."""
+    s = answer.solution
+    if args.gnss is not None:
+        watched = answer.watched or Watched(solution=s)
+        return {"file": answer.name} | json_of_watched(watched) | json_about(s)
+    values = {"file": answer.name} | json_of(s.fix, vertical) | json_about(s)
+    return values if place is None else with_heading(values, s.at_place, place)
+
+
+def _line_of_answer(args: argparse.Namespace, answer: FrameAnswer, place: Place | None) -> str:
+    s, watched = answer.solution, answer.watched
+    if place is not None or s.at_place is not None:
+        line = fix_output.heading_line_of(answer.name, s)
+    else:
+        line = line_of(answer.name, s, args.self_calibrate)
+    if watched is None or watched.compared is None:
+        return line
+    check = watched.compared.check
+    return f"{line}; GNSS {check.status}: {check.sentence}"
 
 
 def check_save(args: argparse.Namespace, instrument: Instrument) -> None:
@@ -168,9 +172,6 @@ def say(night: NightFolder, *texts: object) -> None:
     """Print lines about a whole night on standard error."""
     for text in texts:
         console.complain("solve", text if night.folder is None else f"{night.folder}: {text}")
-
-
-_GNSS_NO_FIX = 1
 
 
 def add_gnss(parser: argparse.ArgumentParser) -> None:
@@ -213,61 +214,6 @@ def read_receiver(gnss: str | None, learned: str | None, command: str) -> Receiv
     return Receiver(track, before)
 
 
-def run_gnss(
-    args: argparse.Namespace,
-    output: Output,
-    plan: Plan,
-    rows: list,
-    receiver: Receiver,
-    vertical: Vertical,
-) -> int:
-    """Write the answers to (path, Identifying's answer or FrameError) of a night's frames; returns the exit status."""
-    sights = [answer[0] for _, answer in rows if not isinstance(answer, FrameError)]
-    answers: list[Watched] = []
-    if sights and plan.solver is not None:
-        solver, seen = of_one_camera(plan.solver, sights)
-        if solver.instrument.vertical is not None:
-            raise InstrumentError(
-                "--gnss teaches an inclinometer, and this camera is its own level: leave --gnss out"
-            )
-        tilts = None if plan.night.tilt is None else plan.tilts
-        night = watched_night(solver, seen, tilts, receiver, vertical)
-        answers = list(night.answers)
-        for remark in night.remarks:
-            console.complain("solve", remark)
-        if args.learned is not None:
-            _save_learned(Path(args.learned), night.learned)
-    solved, warnings, unreadable = [], set(), False
-    following = iter(answers)
-    for path, answer in rows:
-        if isinstance(answer, FrameError):
-            unreadable = True
-            told = Watched(solution=Solution.unreadable(path, answer))
-        else:
-            told = next(following)
-            # the frame was identified before this solver had its focal length: the remark is of that moment
-            if remark := answer[0].solution.remark:
-                console.complain("solve", remark)
-                told = replace(told, solution=replace(told.solution, remark=remark))
-        warnings |= set(told.solution.warnings)
-        if told.solution.fix:
-            solved.append(Solved.of(told.solution, told.solution.fix))
-        elif told.solution.at_place is None or not told.solution.ok:
-            console.complain("solve", told.solution.message)
-        output.put(
-            {"file": path} | json_of_watched(told) | json_about(told.solution), _line_of_watched(path, told)
-        )
-    whole = together(solved, None, near_of(args))
-    unnamed = of_inclinometer(plan.solver.instrument) if solved and plan.solver is not None else ()
-    for text in (*([whole.why_not] if whole.why_not else ()), *unnamed, *whole.remarks):
-        console.complain("solve", text)
-    if solved:
-        put_combined(output, plan.night, whole.average, solved, warnings, vertical)
-    # without tilts headings are all that was asked for
-    found = whole.average or (args.tilt is None and any(told.solution.at_place for told in answers))
-    return console.UNREADABLE if unreadable else 0 if found else _GNSS_NO_FIX
-
-
 def _save_learned(path: Path, learned: Learned | None) -> None:
     if learned is None or not learned.frames:
         console.complain("solve", f"{path} is not written: no frame with a GNSS place has taught anything")
@@ -294,17 +240,6 @@ def json_of_check(check: GnssCheck) -> dict:
     }
 
 
-def _line_of_watched(path: str, told: Watched) -> str:
-    if told.solution.at_place is None:
-        line = line_of(path, told.solution, False)
-    else:
-        line = fix_output.heading_line_of(path, told.solution)
-    if told.compared is None:
-        return line
-    check = told.compared.check
-    return f"{line}; GNSS {check.status}: {check.sentence}"
-
-
 # the status of a row that gives an elevation
 ELEVATION = "elevation alone"
 ELEVATIONS_HEAD = "row: the zenith distance of its direction; together these give the position"
@@ -319,7 +254,7 @@ def run_pointings(args: argparse.Namespace) -> int:
         raise InstrumentError("--pointings needs the tilts: give --tilt CSV")
     if args.jobs is not None or args.scheduler is not None:
         raise InstrumentError("--jobs and --scheduler are for frames: --pointings take only a moment")
-    solver, saving = _solver_of(args), 0
+    solver = _solver_of(args)
     check_save(args, solver.instrument)
     tilts = NO_TILTS if own_level else checked_tilts("solve", args.tilt, solver.instrument)
     whole = [p for p in pointings if p.has_roll]
@@ -327,15 +262,14 @@ def run_pointings(args: argparse.Namespace) -> int:
     if not whole:
         return _from_elevations(args, output, solver, tilts, pointings, vertical, near)
     night = NightFolder(tuple(p.source for p in pointings), args.tilt)
+    found, given = None, solver.instrument if not args.self_calibrate else None
+    solutions: Iterable[Solution] = (solver.solve_pointing(p, tilts) for p in pointings)
     if args.self_calibrate:
-        found = turned(solver, [(p, None) for p in whole], tilts, options.turn_of(args))
-        saving, solved = tell_turned(args, night, found), iter(found.solutions)
-        answers = [next(solved) if p.has_roll else solver.solve_pointing(p) for p in pointings]
-    else:
-        answers = [solver.solve_pointing(p, tilts) for p in pointings]
-    given = None if args.self_calibrate else solver.instrument
-    status, _ = tell(args, output, night, zip(night.frames, answers, strict=True), vertical, given)
-    return max(saving, status)
+        found = turned(solver, whole, tilts, options.turn_of(args))
+        solved = iter(found.solutions)
+        solutions = [next(solved) if p.has_roll else solver.solve_pointing(p) for p in pointings]
+    each = (FrameAnswer(p.source, s) for p, s in zip(pointings, solutions, strict=True))
+    return tell(args, output, night, NightAnswers(each, given=given, turned=found), vertical)
 
 
 def _solver_of(args: argparse.Namespace) -> Solver:
@@ -471,6 +405,11 @@ def _run(args: argparse.Namespace) -> int:
     near_of(args)
     own_level = options.has_own_level(args)
     receiver = read_receiver(args.gnss, args.learned, "solve")
+    if receiver is not None and own_level:
+        raise InstrumentError(
+            "--gnss teaches an inclinometer, and this camera is its own level: leave --gnss out"
+        )
+    how = How(options.turn_of(args) if args.self_calibrate else None, receiver)
     # the folder of a night has its tilts
     needs_no_tilt = own_level or (
         (place is not None or receiver is not None) and not any(map(os.path.isdir, args.frames))
@@ -480,36 +419,22 @@ def _run(args: argparse.Namespace) -> int:
         raise InstrumentError("--save writes the A3 of one night: give one")
     nights = [night for night in given if isinstance(night, NightFolder)]
     statuses = [_refused(why, given) for why in given if not isinstance(why, NightFolder)]
-    number = sum(len(night.frames) for night in nights)
-    with inputs.workers_of(args, number) as workers:
+    with inputs.workers_of(args, sum(len(night.frames) for night in nights)) as workers:
         plans = []
         abouts = workers.map((First(read), night.frames) for night in nights)
         for night, about in zip(nights, abouts, strict=True):
             try:
-                plans.append(_plan(args, night, about, read, own_level, place))
+                plans.append((night, _work(args, night, about, own_level, place)))
             except TiltError as error:
                 statuses.append(_refused(error, given))
-        calls = ((plan.work, path) for plan in plans for path in plan.night.frames)
+        calls = [(OnFile(read, how.work(work)), path) for night, work in plans for path in night.frames]
         # the lines of a turn come at its end, and show no progress
-        answers = inputs.watched(
-            workers.map(calls),
-            sum(len(p.night.frames) for p in plans),
-            silent=not (args.self_calibrate or args.gnss),
-        )
-        for plan in plans:
+        sights = inputs.watched(workers.map(calls), len(calls), silent=how.one_by_one)
+        for night, work in plans:
             # takes the answers of this night, and leaves the rest
-            rows: Iterable = zip(plan.night.frames, answers, strict=False)
-            if receiver is not None:
-                statuses.append(run_gnss(args, output, plan, list(rows), receiver, vertical))
-                continue
-            if args.self_calibrate:
-                rows, saving = _turned(args, plan, list(rows))
-                statuses.append(saving)
-            known = None if args.self_calibrate else plan.given.instrument
-            status, lost = tell(args, output, plan.night, rows, vertical, known, place)
-            statuses.append(status)
-            if lost:
-                say(plan.night, *Fitting(plan.given)(read(lost)))
+            rows = zip(night.frames, sights, strict=False)
+            answers = answers_of(rows, work, vertical, how, console.ProgressBar())
+            statuses.append(tell(args, output, night, answers, vertical, place, work))
     return max(statuses)
 
 
@@ -521,42 +446,19 @@ def _refused(why: StarposError, given: list) -> int:
     return console.UNREADABLE
 
 
-def _plan(
-    args: argparse.Namespace,
-    night: NightFolder,
-    about: About | None,
-    read: Reader,
-    own_level: bool,
-    place: Place | None,
-) -> Plan:
+def _work(
+    args: argparse.Namespace, night: NightFolder, about: About | None, own_level: bool, place: Place | None
+) -> Solving:
+    """The work on a night's frames, after complaints about what looks wrong; raises TiltError."""
+    air = options.atmosphere_of(args)
     # without a frame that can be read, each one reports why it cannot
     if about is None:
-        return Plan(night, OnFile(read, stars_of), Given(None))
-    instrument, doubt = with_frame_size(options.instrument_of(args, about), about)
-    if doubt:
-        console.complain("solve", doubt)
-    given, air = replace(given_of(args, about), instrument=instrument), options.atmosphere_of(args)
-    check_save(args, instrument)
-    tilts = NO_TILTS if night.tilt is None else checked_tilts("solve", night.tilt, instrument)
-    inputs.prepare("solve", instrument, about)
-    solver = Solver(instrument, catalogue.load_catalogue(), air, progress=console.ProgressBar())
-    levelled = own_level or night.tilt is not None
-    solving = Solving(given, air, tilts if levelled else None, place)
-    together = args.self_calibrate or args.gnss is not None
-    work = Identifying(given) if together else solving
-    return Plan(night, OnFile(read, work), given, solver, tilts)
-
-
-def _turned(args: argparse.Namespace, plan: Plan, rows: list) -> tuple[list, int]:
-    """(path, Solution or FrameError) of frames (path, Identifying's answer or FrameError), with their A3.
-
-    Returns the exit status of saving that A3 too.
-    """
-    sights = [answer[0] for _, answer in rows if not isinstance(answer, FrameError)]
-    if not sights or plan.solver is None:
-        return rows, 0
-    solver, seen = of_one_camera(plan.solver, sights)
-    found = turned(solver, seen, plan.tilts, options.turn_of(args))
-    solutions = iter(found.solutions)
-    answers = [(path, answer if isinstance(answer, FrameError) else next(solutions)) for path, answer in rows]
-    return answers, tell_turned(args, plan.night, found)
+        return Solving(Given(None), atmosphere=air)
+    tilt = None if night.tilt is None else Path(night.tilt)
+    work, remarks = work_of(given_of(args, about), about, tilt, air, place)
+    for remark in remarks:
+        console.complain("solve", remark)
+    assert work.instruments.instrument is not None
+    check_save(args, work.instruments.instrument)
+    inputs.prepare("solve", work.instruments.instrument, about)
+    return replace(work, tilts=NO_TILTS) if own_level else work

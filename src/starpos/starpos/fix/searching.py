@@ -79,11 +79,13 @@ class Sight:
     """A detection of a frame: its stars, and their solution.
 
     instrument: with the focal length that fits, if the frame header's does not; else None.
+    cpu_ms: CPU time of detection and search; NaN where it was not measured.
     """
 
     stars: Stars
     solution: Solution
     instrument: Instrument | None = None
+    cpu_ms: float = math.nan
 
     @property
     def found(self) -> Identification | None:
@@ -235,17 +237,19 @@ def answer_by_header(solver: Solver, question: Question, progress: Progress) -> 
     return replace(again, solution=replace(again.solution, remark=remark), instrument=fitting)
 
 
-def of_one_camera(
-    solver: Solver, sights: Sequence[Sight]
-) -> tuple[Solver, list[tuple[Stars, Identification | None]]]:
-    """A solver with the focal length of a night's frames, and each frame with its identification by this solver.
+def of_one_camera(solver: Solver, sights: Sequence[Sight]) -> tuple[Solver, list[Sight]]:
+    """A solver with the focal length of a night's frames, and each frame's sight by this solver.
 
     solver: with the header's focal length, which holds unless a frame was identified with another one.
     """
     other = next((s.instrument for s in sights if s.instrument is not None), None)
-    if other is not None:
-        solver = replace(solver, instrument=other)
-    return solver, [(s.stars, s.found if s.instrument is other else None) for s in sights]
+    if other is None:
+        return solver, list(sights)
+    by_other = replace(solver, instrument=other)
+    return by_other, [
+        s if s.instrument is other else identify_every_way(by_other, Question(item=s.stars, stars=s.stars))
+        for s in sights
+    ]
 
 
 def wrong_header(item: Frame | Stars, focal_px: float) -> str:

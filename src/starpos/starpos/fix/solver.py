@@ -161,16 +161,17 @@ class Solver:
         tilts: Tilts = NO_TILTS,
         hint: Hint | None = None,
         predicted: Priors = (),
-        known: Identification | None = None,
+        known: Identification | Hint | None = None,
     ) -> Solution:
         """The fix of one frame; a fault of the frame, the tilt or the time is a status and never an exception.
 
         tilts: not used for a camera that is its own level.
         predicted, hint: where to look, the latter of an earlier solution; a wrong one costs 0.5 ms and does no harm.
-        known: an identification of these stars, such as that of `identify`: then nothing is searched.
+        known: an identification of these stars, or a hint outside of which they are not to be searched.
         """
         if (rows := self._inside(stars)) is not None:
-            known = known and known.but(star=np.searchsorted(rows, known.star))
+            if isinstance(known, Identification):
+                known = known.but(star=np.searchsorted(rows, known.star))
             return self.solve(stars.select(rows), tilts, hint, predicted, known).among(stars, rows)
         try:
             state, tilt = self.levelled(stars, tilts)
@@ -182,6 +183,8 @@ class Solver:
             field = field_of(directions, mean_sigma(stars.covariance), camera, stars.window)
             if known is None:
                 found = identify_frame(field, sky, (*predicted, *(hint.priors(state, g[2]) if hint else ())))
+            elif isinstance(known, Hint):
+                found = identify_near(field, sky, known.priors(state, g[2]))
             else:
                 found = _refracted(known, field, sky, camera)
         except StarposError as e:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A night in a rosbag2: one instrument's messages, solved again if there are stars and tilts, else as recorded."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -27,7 +27,7 @@ from starpos.night.night import NO_TILT, Night, ReportedPlace, Shot, Truth, offs
 from starpos.night.opening import truth_in
 from starpos.night.reading import Instruments
 from starpos.night.remarks import Kind, Remark
-from starpos.night.solving import Exposures, solved_night
+from starpos.night.solving import ONE_BY_ONE, Exposures, How, Worked, solved_night
 from starpos.night.work import Solving
 from starpos.progress import Progress, quiet
 from starpos.recording.bag import BagReader
@@ -126,7 +126,7 @@ def each_frame(r: Recorded) -> Iterator[tuple[str, Stars | FrameError]]:
             if connection.msgtype == STARS:
                 yield named_stars(message)
             elif connection.msgtype == CAPTURE:
-                messages.take_capture(message)
+                messages.receive_capture(message)
             else:
                 yield named_image(connection.msgtype, message, messages)
 
@@ -319,14 +319,14 @@ def night(
     instruments: Instruments,
     atmosphere: Atmosphere,
     vertical: Vertical,
-    turn_stddev_deg: float | None = None,
+    how: How = ONE_BY_ONE,
     progress: Progress = quiet,
 ) -> Night:
-    """The night of a bag, by options as `solved_night` has them; raises StarposError if nothing in it can be used."""
+    """The night of a bag, solved as `solved_night` does; raises StarposError if nothing in it can be used."""
     r = recorded
     if r.star_count and (r.tilts or not r.solutions):
         try:
-            solved = solved_night(exposures(r, instruments, atmosphere, vertical), turn_stddev_deg, progress)
+            solved = solved_night(exposures(r, instruments, atmosphere, vertical), how, progress)
             return replace(solved, remarks=(*solved.remarks, *_against_recorded(solved, r)))
         except InstrumentError:
             if not r.solutions:
@@ -337,12 +337,17 @@ def night(
 def exposures(r: Recorded, instruments: Instruments, atmosphere: Atmosphere, vertical: Vertical) -> Exposures:
     """The stars of a bag, to be solved."""
     tilts: Tilts = r.tilts or NoTilts(f"{r.path}: no usable tilt in it: record the topic tilt too")
+
+    def each(work: Callable[[Frame | Stars], Any]) -> Worked:
+        for name, item in each_frame(r):
+            yield name, item if isinstance(item, FrameError) else work(item)
+
     return Exposures(
         name=r.name,
         origin=f"solved from stars and tilt of the bag {r.path.name}, namespace {r.namespace}",
         count=r.star_count,
-        each=lambda: each_frame(r),
-        work=Solving(instruments, atmosphere, tilts),
+        each=each,
+        work=Solving(instruments, atmosphere=atmosphere, tilts=tilts),
         vertical=vertical,
         truth=r.truth,
         remarks=r.remarks,

@@ -2,9 +2,11 @@
 """A night in a folder: frames or lists of stars, tilt.csv, maybe truth.json; `starpos.open_night` opens one."""
 
 import json
-from collections.abc import Iterator
+import os
+from collections.abc import Callable
 from dataclasses import KW_ONLY, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -14,18 +16,18 @@ from starpos.earth.vertical import Deflection, Vertical
 from starpos.errors import FrameError, TiltError
 from starpos.files import read_regular
 from starpos.frames.frame import Frame, Stars
-from starpos.frames.reading import FITS, read_frame
+from starpos.frames.reading import FITS
 from starpos.frames.tables import GNSS, SIMULATED, TILTS, TRUTH
 from starpos.instrument import instrument_file, sensors
 from starpos.instrument.inclinometer import SCA100T_NOISE_RAD
 from starpos.instrument.instrument import Calibration, Instrument
-from starpos.instrument.tilt_log import NoTilts, Tilts
-from starpos.instrument.tilt_table import read_tilt_csv
+from starpos.instrument.tilt_log import NoTilts
 from starpos.night.night import Night, Truth
-from starpos.night.reading import First, Given, Reader
-from starpos.night.remarks import of_tilts
-from starpos.night.solving import Exposures, solved_night
-from starpos.night.work import Solving
+from starpos.night.reading import About, First, Given, Reader, TiltFile
+from starpos.night.remarks import Remark, of_tilts
+from starpos.night.solving import Exposures, How, Worked, solved_night
+from starpos.night.work import OnFile, Solving
+from starpos.parallel.processes import Here
 from starpos.progress import Progress, quiet
 
 TRUTH_LIMIT = 1 << 26
@@ -45,35 +47,48 @@ def exposures(
 
     Raises FrameError if there are no frames, or truth.json cannot be used.
     """
-    frames = frames_in(folder)
-    first = First(Reader())(tuple(map(str, frames)))
-    instruments, remarks = (given, ()) if first is None else given.framed(first)
-    known = instruments.instrument
-    noise_rad = SCA100T_NOISE_RAD if known is None else known.inclinometer.noise_rad
-    tilts: Tilts | None
-    try:
-        tilts = log = read_tilt_csv(folder / TILTS, noise_rad)
-        remarks = (*of_tilts(log, TILTS), *remarks)
-    except TiltError as error:
-        tilts = None if place is not None and not (folder / TILTS).exists() else NoTilts(str(error))
+    frames, read = frames_in(folder), Reader()
+    first = First(read)(tuple(map(str, frames)))
+    work, remarks = Solving(given, atmosphere=atmosphere, places=place), tuple[Remark, ...]()
+    if first is not None:
+        try:
+            work, remarks = work_of(given, first, folder / TILTS, atmosphere, place)
+        except TiltError as error:
+            tilts = None if place is not None and not (folder / TILTS).exists() else NoTilts(str(error))
+            instruments, remarks = given.framed(first)
+            work = replace(work, instruments=instruments, tilts=tilts)
 
-    def each() -> Iterator[tuple[str, Frame | Stars | FrameError]]:
-        for path in frames:
-            try:
-                yield path.name, read_frame(path)
-            except FrameError as error:
-                yield path.name, error
+    def each(work: Callable[[Frame | Stars], Any]) -> Worked:
+        answers = Here().map((OnFile(read, work), str(path)) for path in frames)
+        return zip((path.name for path in frames), answers, strict=True)
 
     return Exposures(
         name=folder.name or str(folder),
         origin=f"solved from {len(frames)} {'lists of stars' if frames[0].suffix == '.csv' else 'frames'} and {TILTS}",
         count=len(frames),
         each=each,
-        work=Solving(instruments, atmosphere, tilts, place),
+        work=work,
         vertical=vertical,
         truth=truth_in(folder),
         remarks=remarks,
     )
+
+
+def work_of(
+    given: Given, first: About, tilts: Path | None, atmosphere: Atmosphere, place: Place | None = None
+) -> tuple[Solving, tuple[Remark, ...]]:
+    """The work on the frames of a night whose first one is known, and what looks wrong.
+
+    tilts: their table; None where none is needed.  Raises TiltError if it cannot be read.
+    """
+    instruments, remarks = given.framed(first)
+    if tilts is None:
+        return Solving(instruments, atmosphere=atmosphere, places=place), remarks
+    known = instruments.instrument
+    noise_rad = SCA100T_NOISE_RAD if known is None else known.inclinometer.noise_rad
+    table = TiltFile(os.path.abspath(tilts), noise_rad)
+    doubts = of_tilts(table.log, str(tilts))
+    return Solving(instruments, atmosphere=atmosphere, tilts=table, places=place), (*remarks, *doubts)
 
 
 def frames_in(folder: Path) -> list[Path]:
@@ -159,7 +174,7 @@ class NightOnDisk:
         instruments = Given(given, by_header=self.instrument is None)
         return solved_night(
             exposures(self.folder, instruments, self.atmosphere, self.vertical, self.place),
-            turn_stddev_deg if self_calibrate else None,
+            How(turn_stddev_deg if self_calibrate else None),
             progress,
         )
 

@@ -1,19 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Goes through a night: solves each frame, or all of them by turning, and makes a Night of the answers."""
+"""The one driver of a night, for command, library and report: it goes through the frames' sights, and answers each.
+
+Frames are solved one by one, or all together: by turning, or beside GNSS.
+"""
 
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import suppress
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from starpos.earth.ellipsoid import EARTH_RADIUS_M
 from starpos.earth.vertical import Vertical
-from starpos.errors import FrameError, StarposError
+from starpos.errors import FrameError
 from starpos.fix.budget import heading_of, local_north
 from starpos.fix.searching import Sight, of_one_camera
-from starpos.fix.solution import Solution, Status
-from starpos.fix.solver import Solver
 from starpos.frames.frame import Frame, Stars
 from starpos.identification.prior import Hint
 from starpos.instrument.inclinometer import level_of, up_of
@@ -22,167 +23,173 @@ from starpos.instrument.tilt_log import NO_TILTS
 from starpos.night.night import Night, ReportedPlace, Shot, Truth, why_none
 from starpos.night.remarks import Kind, Remark
 from starpos.night.together import (
+    FrameAnswer,
+    Gathered,
     Receiver,
-    Solved,
     TurnedNight,
     WatchedNight,
     together,
     turned,
     watched_night,
 )
-from starpos.night.work import Fitting, Identifying, Solving
+from starpos.night.work import Solving
 from starpos.progress import Progress, quiet
 from starpos.rotation import half_turns
 
 # if readings are further from their median than this, the camera was moved
 STILL_SIGMA = 8.0
 
+# the names of frames, and what a work made of each, or why it cannot be read
+Worked = Iterator[tuple[str, Any]]
+
 
 @dataclass(frozen=True, kw_only=True)
 class Exposures:
-    """The exposures of a night: each call of `each` goes through all `count` of them, by name, or why one has no stars.
+    """The exposures of a night, and what is asked of each.
 
+    each: goes through all `count` of them with a work.
     remarks: what looks wrong.
     """
 
     name: str
     origin: str
     count: int
-    each: Callable[[], Iterator[tuple[str, Frame | Stars | FrameError]]]
+    each: Callable[[Callable[[Frame | Stars], Any]], Worked]
     work: Solving
     vertical: Vertical
     truth: Truth | None = None
     remarks: tuple[Remark, ...] = ()
 
 
-# the name of a frame, its stars, None if it cannot be read, and its solution
-_Answer = tuple[str, Stars | None, Solution]
+@dataclass(frozen=True)
+class How:
+    """How a night is solved.
 
-
-def solved_night(
-    exposures: Exposures,
-    turn_stddev_deg: float | None = None,
-    progress: Progress = quiet,
-    receiver: Receiver | None = None,
-) -> Night:
-    """The night of these exposures; raises InstrumentError if there is no instrument for a frame.
-
-    turn_stddev_deg: to calibrate by turning, the sigma of A3's turn; None to use A3 as given.
+    turn_stddev_deg: to find A3 by turning, the sigma of its turn about the plumb line; None to use A3 as given.
     receiver: GNSS, which teaches the instrument; None without one.
     """
-    answers: Iterable[_Answer]
-    said: tuple[Remark, ...] = ()
+
+    turn_stddev_deg: float | None = None
+    receiver: Receiver | None = None
+
+    @property
+    def one_by_one(self) -> bool:
+        """Whether each frame is solved by itself."""
+        return self.turn_stddev_deg is None and self.receiver is None
+
+    def work(self, asked: Solving) -> Solving:
+        """The work on one frame: all that is asked, or only to identify it, where all are solved together."""
+        return asked if self.one_by_one else replace(asked, tilts=None, places=None)
+
+
+ONE_BY_ONE = How()
+
+
+@dataclass(frozen=True, eq=False)
+class NightAnswers:
+    """The answers of a night; each: one for each frame, in order, as soon as it is there.
+
+    instrument: on which they rest; None without a frame.
+    given: the instrument whose A3 was used unchanged; None where it was found, or taught by GNSS.
+    """
+
+    each: Iterable[FrameAnswer]
+    instrument: Instrument | None = None
+    given: Instrument | None = None
+    turned: TurnedNight | None = None
     watched: WatchedNight | None = None
-    if receiver is not None:
-        answers, watched, instrument = _beside(exposures, receiver, progress)
-        said = watched.remarks
-    elif turn_stddev_deg is None:
-        answers, instrument = _one_by_one(exposures, progress), exposures.work.instruments.instrument
-    else:
-        answers, said, instrument = _by_turning(exposures, turn_stddev_deg, progress)
-    shots, solved, of_frames = [], [], []
-    lost: Stars | None = None
-    for done, (name, stars, solution) in enumerate(answers, 1):
-        shots.append(Shot.of(name, solution, stars))
-        if solution.remark:
-            of_frames.append(Remark(Kind.FOCAL_LENGTH, solution.remark))
-        if solution.fix:
-            solved.append(Solved.of(solution, solution.fix))
-        elif solution.status is Status.NOT_IDENTIFIED:
-            lost = stars if lost is None else lost
+
+
+def answers_of(
+    sights: Iterable[tuple[str, Sight | FrameError]],
+    asked: Solving,
+    vertical: Vertical,
+    how: How = ONE_BY_ONE,
+    progress: Progress = quiet,
+) -> NightAnswers:
+    """Answer the frames of a night, by name; sights: what `how.work(asked)` gave of each."""
+    if how.one_by_one:
+        known = asked.instruments.instrument
+        return NightAnswers(_one_by_one(sights, asked), known, known)
+    rows = list(sights)
+    seen = [sight for _, sight in rows if isinstance(sight, Sight)]
+    if not seen:
+        return NightAnswers(_in_order(rows, ()))
+    solver = replace(asked.solver(seen[0].stars), progress=progress)
+    solver, alike = of_one_camera(solver, seen)
+    if how.receiver is not None:
+        watched = watched_night(solver, alike, asked.tilts, how.receiver, vertical)
+        answers = [
+            FrameAnswer("", a.solution, s.stars, a) for a, s in zip(watched.answers, alike, strict=True)
+        ]
+        return NightAnswers(_in_order(rows, answers), solver.instrument, watched=watched)
+    assert how.turn_stddev_deg is not None
+    found = turned(solver, alike, asked.tilts or NO_TILTS, how.turn_stddev_deg)
+    answers = [FrameAnswer("", a, s.stars) for a, s in zip(found.solutions, alike, strict=True)]
+    instrument = solver.instrument if found.calibrated is None else found.calibrated.instrument
+    return NightAnswers(_in_order(rows, answers), instrument, turned=found)
+
+
+def _one_by_one(sights: Iterable[tuple[str, Sight | FrameError]], asked: Solving) -> Iterator[FrameAnswer]:
+    """The answers as they come; a frame that was not identified is looked for where the last one looked."""
+    hint: Hint | None = None
+    for name, sight in sights:
+        if isinstance(sight, FrameError):
+            yield FrameAnswer.unreadable(name, sight)
+            continue
+        if hint is not None:
+            sight = asked.after(sight, hint)
+        hint = sight.solution.hint or hint
+        yield FrameAnswer(name, sight.solution, sight.stars)
+
+
+def _in_order(
+    rows: Iterable[tuple[str, Sight | FrameError]], answers: Iterable[FrameAnswer]
+) -> Iterator[FrameAnswer]:
+    """The answer to each frame; answers: to those that can be read, in order."""
+    following = iter(answers)
+    for name, sight in rows:
+        if isinstance(sight, FrameError):
+            yield FrameAnswer.unreadable(name, sight)
+            continue
+        answer = replace(next(following), name=name)
+        # a header's wrong focal length was noticed when the frame was identified
+        remark = answer.solution.remark or sight.solution.remark
+        yield replace(answer, solution=replace(answer.solution, remark=remark))
+
+
+def solved_night(exposures: Exposures, how: How = ONE_BY_ONE, progress: Progress = quiet) -> Night:
+    """The night of these exposures; raises InstrumentError if there is no instrument for a frame."""
+    work = replace(exposures.work, progress=progress)
+    answers = answers_of(exposures.each(how.work(work)), work, exposures.vertical, how, progress)
+    shots, of_frames, gathered = [], [], Gathered()
+    for done, answer in enumerate(answers.each, 1):
+        gathered.gather(answer)
+        shots.append(Shot.of(answer.name, answer.solution, answer.stars))
+        if answer.solution.remark:
+            of_frames.append(Remark(Kind.FOCAL_LENGTH, answer.solution.remark))
         progress(exposures.name[:20], done / exposures.count)
-    as_given = turn_stddev_deg is None and receiver is None
-    whole = together(solved, exposures.work.instruments.instrument if as_given else None)
-    fits = Fitting(exposures.work.instruments)(lost) if lost is not None and not solved else ()
+    whole = together(gathered.solved, answers.given)
+    said = [
+        remark for part in (answers.turned, answers.watched) if part is not None for remark in part.remarks
+    ]
+    if gathered.lost is not None and not gathered.solved:
+        of_frames += work.fitting(gathered.lost)
     night = Night(
         name=exposures.name,
         origin=exposures.origin,
         shots=shots,
         combined=None if whole.average is None else ReportedPlace.of(whole.average),
-        why_not=whole.why_not if solved else why_none(shots),
+        why_not=whole.why_not if gathered.solved else why_none(shots),
         vertical=exposures.vertical,
         atmosphere=exposures.work.atmosphere,
         truth=exposures.truth,
-        watched=watched,
-        remarks=(*exposures.remarks, *said, *of_frames, *fits, *whole.remarks),
+        watched=answers.watched,
+        remarks=(*exposures.remarks, *said, *of_frames, *whole.remarks),
     )
-    return replace(night, steady=_steady(night, instrument)) if night.combined and instrument else night
-
-
-def _one_by_one(exposures: Exposures, progress: Progress) -> Iterator[_Answer]:
-    """Solve each frame by itself."""
-    hint: Hint | None = None
-    prepared: set[tuple[int, int]] = set()
-    for name, item in exposures.each():
-        if isinstance(item, FrameError):
-            yield name, None, Solution.unreadable(name, item)
-            continue
-        size = item.width, item.height
-        # otherwise the time of the first frame would include the building of the triangles
-        if size not in prepared:
-            prepared.add(size)
-            # the frame itself reports an error
-            with suppress(StarposError):
-                replace(exposures.work.solver(item), progress=progress).prepare(*size)
-        sight = exposures.work.sight(item, hint)
-        hint = sight.solution.hint or hint
-        yield name, sight.stars, sight.solution
-
-
-def _by_turning(
-    exposures: Exposures, turn_stddev_deg: float, progress: Progress
-) -> tuple[list[_Answer], tuple[Remark, ...], Instrument | None]:
-    """Solve all frames together, with the A3 that they determine; returns that instrument too, None without a frame."""
-    rows, solver = _identified(exposures, progress)
-    found, instrument = TurnedNight(()), None
-    if solver is not None:
-        solver, sights = of_one_camera(solver, [s for _, s in rows if isinstance(s, Sight)])
-        found = turned(solver, sights, exposures.work.tilts or NO_TILTS, turn_stddev_deg)
-        instrument = solver.instrument if found.calibrated is None else found.calibrated.instrument
-    return _answers(rows, found.solutions), found.remarks, instrument
-
-
-def _beside(
-    exposures: Exposures, receiver: Receiver, progress: Progress
-) -> tuple[list[_Answer], WatchedNight, Instrument | None]:
-    """Solve the frames in the order of their times, each with what GNSS taught before it."""
-    rows, solver = _identified(exposures, progress)
-    night = WatchedNight((), receiver.learned, ())
-    if solver is not None:
-        solver, sights = of_one_camera(solver, [s for _, s in rows if isinstance(s, Sight)])
-        night = watched_night(solver, sights, exposures.work.tilts, receiver, exposures.vertical)
-    return (
-        _answers(rows, [told.solution for told in night.answers]),
-        night,
-        None if solver is None else solver.instrument,
-    )
-
-
-_Rows = list[tuple[str, Sight | FrameError]]
-
-
-def _identified(exposures: Exposures, progress: Progress) -> tuple[_Rows, Solver | None]:
-    """The sight of each frame, and the solver of the first that can be read, None without one."""
-    work, solver = exposures.work, None
-    rows: _Rows = []
-    for name, item in exposures.each():
-        if isinstance(item, FrameError):
-            rows.append((name, item))
-            continue
-        solver = solver or replace(work.solver(item), progress=progress)
-        rows.append((name, Identifying(work.instruments, progress=progress)(item)[0]))
-    return rows, solver
-
-
-def _answers(rows: _Rows, solutions: Iterable[Solution]) -> list[_Answer]:
-    """The answer to each frame; solutions: of those that can be read, in order."""
-    following = iter(solutions)
-    return [
-        (name, None, Solution.unreadable(name, s))
-        if isinstance(s, FrameError)
-        else (name, s.stars, next(following))
-        for name, s in rows
-    ]
+    if night.combined is None or answers.instrument is None:
+        return night
+    return replace(night, steady=_steady(night, answers.instrument))
 
 
 def _steady(night: Night, instrument: Instrument) -> np.ndarray | None:

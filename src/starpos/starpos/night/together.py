@@ -23,18 +23,17 @@ from starpos.averaging.average import Average, average
 from starpos.calibration.misalignment import Calibrated, turn
 from starpos.earth.orientation import EarthState
 from starpos.earth.vertical import Vertical
-from starpos.errors import FixError, GnssError, StarposError
+from starpos.errors import FixError, FrameError, GnssError, StarposError
 from starpos.fix.fix import IDEAL, Fix
-from starpos.fix.searching import Question, answer_frame
+from starpos.fix.searching import Sight
 from starpos.fix.solution import Solution, Status
-from starpos.fix.solver import Solver
+from starpos.fix.solver import Solver, placed
 from starpos.frames.frame import Stars
 from starpos.frames.tables import Pointing
-from starpos.gnss.receiver import GnssPlace, GnssTrack, known_place
+from starpos.gnss.receiver import GnssTrack
 from starpos.gnss.solving import Watched, watched
 from starpos.gnss.states import Learned
 from starpos.gnss.watch import GnssWatch
-from starpos.identification import Identification
 from starpos.instrument.inclinometer import Tilt
 from starpos.instrument.instrument import Calibration, Instrument
 from starpos.instrument.mounting import Mounting
@@ -69,6 +68,54 @@ class Solved:
             log_odds=log_odds,
             tilt=s.tilt,
         )
+
+
+@dataclass(frozen=True, eq=False)
+class FrameAnswer:
+    """The answer to a frame of a night.
+
+    stars: that gave it; None for a pointing, and for a file that cannot be read.
+    watched: beside GNSS; None without it.
+    """
+
+    name: str
+    solution: Solution
+    stars: Stars | None = None
+    watched: Watched | None = None
+    readable: bool = True
+
+    @classmethod
+    def unreadable(cls, name: str, error: FrameError) -> "FrameAnswer":
+        """The answer to a file that holds no frame."""
+        return cls(name, Solution.unreadable(name, error), readable=False)
+
+
+class Gathered:
+    """What is needed of a night's answers at its end, gathered one after another.
+
+    solved: those with a fix; headings: those with a heading at a known place; warnings: of all, each once.
+    lost: the stars of the first frame that was not identified; None without one.
+    unreadable: whether a file was.
+    """
+
+    def __init__(self) -> None:
+        self.solved: list[Solved] = []
+        self.headings: list[Solution] = []
+        self.warnings: set[str] = set()
+        self.lost: Stars | None = None
+        self.unreadable = False
+
+    def gather(self, answer: FrameAnswer) -> None:
+        """Keep what is needed of an answer."""
+        s = answer.solution
+        self.unreadable |= not answer.readable
+        self.warnings |= set(s.warnings)
+        if s.fix:
+            self.solved.append(Solved.of(s, s.fix))
+        if s.at_place:
+            self.headings.append(s)
+        if s.status is Status.NOT_IDENTIFIED and self.lost is None:
+            self.lost = answer.stars
 
 
 @dataclass(frozen=True)
@@ -130,25 +177,30 @@ class TurnedNight:
 
 
 def turned(
-    solver: Solver,
-    frames: Sequence[tuple[Stars | Pointing, Identification | None]],
-    tilts: Tilts,
-    turn_stddev_deg: float,
+    solver: Solver, frames: Sequence[Sight | Pointing], tilts: Tilts, turn_stddev_deg: float
 ) -> TurnedNight:
-    """Find A3 and the fixes of a night's frames, each with its identification so far.
+    """Find A3 and the fixes of a night's frames, which are identified already; one that was not keeps its solution.
 
     turn_stddev_deg: sigma of the turn of the solver's A3 about the plumb line.
     """
-    items = [frame for frame, _ in frames]
-    known = {k: found for k, (_, found) in enumerate(frames) if found is not None}
+
+    def all_of(solved: Iterable[Solution]) -> tuple[Solution, ...]:
+        following = iter(solved)
+        return tuple(
+            f.solution if isinstance(f, Sight) and f.found is None else next(following) for f in frames
+        )
+
+    used = [f for f in frames if isinstance(f, Pointing) or f.found is not None]
+    items = [f if isinstance(f, Pointing) else f.stars for f in used]
+    known = {k: f.found for k, f in enumerate(used) if isinstance(f, Sight) and f.found is not None}
     try:
         found = turn(solver, items, tilts, turn_stddev_deg, solver.progress, known)
     except FixError as error:
-        return TurnedNight(tuple(Solution.failed(item, Status.POOR_FIT, str(error)) for item in items))
+        return TurnedNight(all_of(Solution.failed(item, Status.POOR_FIT, str(error)) for item in items))
     said = tuple(remarks.of_turn(found))
     if any(s.fix is not None for s in found.solutions):
         said += remarks.of_inclinometer(solver.instrument)
-    return TurnedNight(found.solutions, found, said)
+    return TurnedNight(all_of(found.solutions), found, said)
 
 
 @dataclass(frozen=True)
@@ -259,35 +311,28 @@ class WatchedNight:
 
 
 def watched_night(
-    solver: Solver,
-    frames: Sequence[tuple[Stars, Identification | None]],
-    tilts: Tilts | None,
-    receiver: Receiver,
-    vertical: Vertical,
+    solver: Solver, sights: Sequence[Sight], tilts: Tilts | None, receiver: Receiver, vertical: Vertical
 ) -> WatchedNight:
-    """Solve a night's frames in the order of their times, each with its identification so far.
+    """Solve a night's frames, which are identified already, in the order of their times.
 
     tilts: None where headings alone are wanted.
     """
     watch = GnssWatch(solver.instrument, vertical, receiver.learned)
     said: Counter[str] = Counter()
-
-    def place_at(stars: Stars) -> GnssPlace | None:
-        if stars.mid_unix_s is None:
-            return None
-        try:
-            return receiver.track.at(stars.mid_unix_s)
-        except GnssError as error:
-            said[str(error)] += 1
-            return None
-
     answers: dict[int, Watched] = {}
-    for k in sorted(range(len(frames)), key=lambda k: frames[k][0].mid_unix_s or 0.0):
-        stars, found = frames[k]
-        gnss = place_at(stars)
-        place = None if gnss is None else known_place(gnss, vertical)
-        question = Question(item=stars, stars=stars, tilts=tilts, places=place, known=found)
-        rough = answer_frame(solver, question).solution
+    for k in sorted(range(len(sights)), key=lambda k: sights[k].stars.mid_unix_s or 0.0):
+        stars, rough, gnss = sights[k].stars, sights[k].solution, None
+        if stars.mid_unix_s is not None:
+            try:
+                gnss = receiver.track.at(stars.mid_unix_s)
+            except GnssError as error:
+                said[str(error)] += 1
+        if rough.found is not None and tilts is not None:
+            solved = solver.solve(stars, tilts, known=rough.found)
+            refused = replace(rough, status=solved.status, message=solved.message)
+            rough = refused if solved.found is None else solved
+        if gnss is not None:
+            rough = placed(solver, stars, rough, gnss.deflected(vertical))
         answers[k] = watched(solver, stars, rough, gnss, watch)
     remarks = tuple(Remark(Kind.GNSS, f"{number} frames: {why}") for why, number in said.items())
-    return WatchedNight(tuple(answers[k] for k in range(len(frames))), watch.learned, remarks)
+    return WatchedNight(tuple(answers[k] for k in range(len(sights))), watch.learned, remarks)

@@ -4,13 +4,13 @@
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
-from starpos.earth.place import Places
+from starpos.earth.place import Place, Places
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import InstrumentError, StarposError
-from starpos.fix.blind import SEARCH_S, BlindSolver
+from starpos.fix.blind import BlindSolver
 from starpos.fix.searching import (
     Question,
     Sight,
@@ -21,15 +21,15 @@ from starpos.fix.searching import (
     other_focal_length,
 )
 from starpos.fix.solution import Solution
-from starpos.fix.solver import Solver, check_explained
+from starpos.fix.solver import Solver, check_explained, placed
 from starpos.frames.frame import Frame, Stars
 from starpos.identification.prior import Hint
-from starpos.instrument.tilt_log import NO_TILTS, Tilts
+from starpos.instrument.tilt_log import Tilts
 from starpos.night.reading import Instruments, Reader, TiltFile, stars_of
 from starpos.night.remarks import Kind, Remark
 from starpos.progress import Progress, quiet
 from starpos.sky import catalogue
-from starpos.zenith.sighting import Mark, ZenithSighting, sighting
+from starpos.zenith.sighting import ZenithSighting, sighting
 
 if TYPE_CHECKING:
     from starpos.detection import Detection
@@ -62,70 +62,42 @@ def detected(item: Frame | Stars) -> tuple["Detection | Stars", float]:
 
 
 @dataclass(frozen=True)
-class Identifying:
-    """Identifies a frame by every way there is, at any scale if its focal length is unknown.
+class Solving:
+    """Answers a frame: its Sight, identified by every way there is, with its fix and its heading as far as asked for.
 
-    Gives its Sight, and the CPU time in ms.
-    search_s: CPU time after which the search at every scale ends.
-    progress: of that search.
+    tilts: for a fix; not used for a camera fixed to the ground; None if no fix is asked for.
+    places: where the instrument is known to be, for its heading there; None if unknown.
+    search_s: CPU time of the search at every scale for a frame of unknown focal length; None to refuse that frame.
+    progress: of building tables, and of the search at every scale.
     """
 
     instruments: Instruments
-    search_s: float = SEARCH_S
+    _: KW_ONLY
+    atmosphere: Atmosphere = field(default_factory=lambda: Atmosphere.measured(None, None))
+    tilts: Tilts | None = None
+    places: Places | None = None
+    search_s: float | None = None
     progress: Progress = quiet
 
-    def __call__(self, item: Frame | Stars) -> tuple[Sight, float]:
-        instrument, stars_known = self.instruments.of(item), catalogue.load_catalogue()
-        if instrument is None:
-            blind = BlindSolver(stars_known, self.progress, search_s=self.search_s)
+    def __call__(self, item: Frame | Stars) -> Sight:
+        """The sight of a frame; InstrumentError if its focal length is unknown, and must not be."""
+        if self.search_s is not None and self.instruments.of(item) is None:
+            blind = BlindSolver(catalogue.load_catalogue(), self.progress, search_s=self.search_s)
             blind.prepare()
             begin = time.process_time()
             sight = identify_blind_every_way(blind, item, stars_of(item))
         else:
-            solver = Solver(instrument, stars_known)
+            solver = self.solver(item)
             # the frame reports the error
             with suppress(StarposError):
                 solver.prepare(item.width, item.height, item.origin_px)
             begin = time.process_time()
-            sight = _answered(self, solver, Question(item=item, stars=stars_of(item)))
-        return sight, 1000 * (time.process_time() - begin)
-
-
-@dataclass(frozen=True)
-class Fitting:
-    """Says which focal length fits a frame that was not identified with the given one."""
-
-    instruments: Instruments
-
-    def __call__(self, item: Frame | Stars) -> tuple[Remark, ...]:
-        instrument = self.instruments.of(item)
-        # without its header's focal length a frame was searched already
-        if instrument is None or self.instruments.hinted:
-            return ()
-        solver = Solver(instrument, catalogue.load_catalogue())
-        focal_px = focal_px_that_fits(solver, stars_of(item))
-        return (
-            () if focal_px is None else (Remark(Kind.FOCAL_LENGTH, other_focal_length(item.place, focal_px)),)
-        )
-
-
-@dataclass(frozen=True)
-class Solving:
-    """Solves a frame, identified by every way there is: its Solution.
-
-    tilts: not used for a camera fixed to the ground; None if only headings are wanted.
-    places: where the instrument is known to be, for its heading there; None if unknown.
-    progress: of the search for a focal length.
-    """
-
-    instruments: Instruments
-    atmosphere: Atmosphere
-    tilts: Tilts | None = NO_TILTS
-    places: Places | None = None
-    progress: Progress = quiet
-
-    def __call__(self, item: Frame | Stars) -> Solution:
-        return self.sight(item).solution
+            question = Question(item=item, stars=stars_of(item), tilts=self.tilts, places=self.places)
+            if self.instruments.hinted:
+                sight = answer_by_header(solver, question, self.progress)
+            else:
+                sight = answer_frame(solver, question)
+        return replace(sight, cpu_ms=1000 * (time.process_time() - begin))
 
     def solver(self, item: Frame | Stars) -> Solver:
         """The solver of a frame; InstrumentError if its focal length is unknown."""
@@ -134,18 +106,30 @@ class Solving:
             raise InstrumentError(
                 f"{item.place}: its header has no focal length: give instrument=Instrument(focal_px)"
             )
-        return Solver(instrument, catalogue.load_catalogue(), self.atmosphere)
+        return Solver(instrument, catalogue.load_catalogue(), self.atmosphere, progress=self.progress)
 
-    def sight(self, item: Frame | Stars, hint: Hint | None = None) -> Sight:
-        """The solution of a frame, and the stars that gave it; hint: of the frame before."""
-        question = Question(item=item, stars=stars_of(item), tilts=self.tilts, places=self.places, hint=hint)
-        return _answered(self, self.solver(item), question)
+    def after(self, sight: Sight, hint: Hint) -> Sight:
+        """The sight of a frame that was not identified, if it looks where an earlier one did; else as it was."""
+        if self.tilts is None or not sight.solution.lost:
+            return sight
+        solver = self.solver(sight.stars)
+        answer = solver.solve(sight.stars, self.tilts, known=hint)
+        if answer.found is None:
+            return sight
+        if self.places is not None:
+            answer = placed(solver, sight.stars, answer, self.places)
+        return replace(sight, solution=answer)
 
-
-def _answered(work: Identifying | Solving, solver: Solver, question: Question) -> Sight:
-    if work.instruments.hinted:
-        return answer_by_header(solver, question, work.progress)
-    return answer_frame(solver, question)
+    def fitting(self, lost: Stars) -> tuple[Remark, ...]:
+        """Say which focal length fits a frame that was not identified with the given one."""
+        instrument = self.instruments.of(lost)
+        # without its header's focal length a frame was searched already
+        if instrument is None or self.instruments.hinted:
+            return ()
+        focal_px = focal_px_that_fits(self.solver(lost), lost)
+        if focal_px is None:
+            return ()
+        return (Remark(Kind.FOCAL_LENGTH, other_focal_length(lost.place, focal_px)),)
 
 
 @dataclass(frozen=True)
@@ -155,11 +139,11 @@ class ZenithSighted:
     instruments: Instruments
     atmosphere: Atmosphere
     tilts: Tilts
-    mark: Mark
+    mark: Place
 
     def __call__(self, item: Frame | Stars) -> ZenithSighting | Solution:
         """The sighting of a frame, identified by every way there is."""
-        sight, _ = Identifying(self.instruments)(item)
+        sight = Solving(self.instruments)(item)
         instrument = sight.instrument or self.instruments.of(item)
         if sight.found is None or instrument is None:
             return sight.solution

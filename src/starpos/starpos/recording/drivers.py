@@ -54,7 +54,7 @@ class DriverMessages:
         self._imu = ImuTilts(drivers.inclinometer)
         self._frames = self._tilts = 0
 
-    def take_capture(self, message: Any) -> None:
+    def receive_capture(self, message: Any) -> None:
         """Take a Capture."""
         self._exposures.take(message)
 

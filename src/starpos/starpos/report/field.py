@@ -29,7 +29,7 @@ from starpos.instrument import instrument_file
 from starpos.instrument.instrument import Instrument
 from starpos.instrument.tilt_log import TiltLog
 from starpos.night.night import Truth
-from starpos.night.reading import stars_of
+from starpos.night.reading import TiltFile, stars_of
 from starpos.night.solving import Exposures
 from starpos.progress import Progress, quiet
 from starpos.report.html import WriteError
@@ -48,15 +48,16 @@ def write(path: Path, exposures: Exposures, progress: Progress = quiet) -> int:
 
     Raises FrameError for a night without a usable frame or tilt, WriteError if the file cannot be written.
     """
-    if not isinstance(exposures.work.tilts, TiltLog):
+    tilts = exposures.work.tilts
+    log = tilts.log if isinstance(tilts, TiltFile) else tilts
+    if not isinstance(log, TiltLog):
         raise FrameError(f"{exposures.name}: no tilts: a field report needs the night's tilts")
     lists: dict[str, bytes] = {}
     instrument, unreadable = None, 0
     with tempfile.TemporaryDirectory() as folder:
-        for k, (_, item) in enumerate(exposures.each()):
+        for k, (_, stars) in enumerate(exposures.each(stars_of)):
             progress(exposures.name[:20], (k + 1) / exposures.count)
-            stars = None if isinstance(item, FrameError) else stars_of(item)
-            if stars is None or stars.mid_unix_s is None or not stars.exposure_s:
+            if isinstance(stars, FrameError) or stars.mid_unix_s is None or not stars.exposure_s:
                 unreadable += 1
                 continue
             instrument = _with_clock(instrument or exposures.work.instruments.of(stars), stars)
@@ -67,7 +68,7 @@ def write(path: Path, exposures: Exposures, progress: Progress = quiet) -> int:
             raise FrameError(f"{exposures.name}: no frame of it has stars, a time and a known focal length")
         instrument_file.write(Path(folder) / INSTRUMENT, instrument)
         lists[INSTRUMENT] = (Path(folder) / INSTRUMENT).read_bytes()
-    lists[TILTS] = _tilt_table(exposures.work.tilts).encode()
+    lists[TILTS] = _tilt_table(log).encode()
     lists[ABOUT] = json.dumps(_about(exposures, unreadable), indent=1).encode()
     if exposures.truth is not None:
         lists[TRUTH] = json.dumps(_truth(exposures.truth)).encode()

@@ -5,12 +5,12 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any
 
-from starpos.errors import InstrumentError
+from starpos.errors import InstrumentError, StarposError
 from starpos.fix.solver import Solver
 from starpos.instrument.camera import Camera
 from starpos.messages.camera import leaves_size_open, message_to_camera
 from starpos.messages.stamp import stamp_to_unix
-from starpos.session.driver import Jobs, Outcome
+from starpos.session.driver import Jobs, Outcome, name_in
 
 MAX_CHANGES = 1000
 
@@ -40,6 +40,8 @@ class CameraSolver:
         self._frame_px: tuple[int, int] | None = None
         # the last CameraInfo, if it states no size
         self._of_open_size: Any = None
+        # name of its frame; '' before the first CameraInfo
+        self.frame_id = ""
         # cameras that hold from a stamp on which no frame has reached yet
         self._changes: deque[tuple[float | None, Camera]] = deque(maxlen=MAX_CHANGES)
 
@@ -58,29 +60,34 @@ class CameraSolver:
             waiting = "the triangles of this field are being built"
         raise InstrumentError(self.trouble or waiting)
 
-    def take(self, message: Any, at_once: bool) -> None:
-        """Take a CameraInfo for the frames from its stamp on, or at once; the first one counts at once anyway.
+    def receive(self, message: Any, at_once: bool) -> None:
+        """Use a CameraInfo for the frames from its stamp on, or at once; the first one counts at once anyway.
 
         One that leaves the size open waits for a frame. InstrumentError if it cannot be used.
         """
         size = self._frame_px or (1, 1)
-        camera, open_size = message_to_camera(message, size=size), leaves_size_open(message)
-        self._of_open_size = message if open_size else None
+        try:
+            camera, open_size = message_to_camera(message, size=size), leaves_size_open(message)
+        except StarposError as e:
+            if self.camera is None:
+                self.trouble = str(e)
+            raise
+        self._of_open_size, self.frame_id = message if open_size else None, name_in(message)
         if self._frame_px is not None or not open_size:
-            self._take(camera, stamp_to_unix(message.header.stamp), at_once)
+            self._queue(camera, stamp_to_unix(message.header.stamp), at_once)
 
-    def know(self, camera: Camera) -> None:
-        """Take a camera that is known without a CameraInfo."""
-        self._take(camera, None, at_once=True)
+    def use_known(self, camera: Camera) -> None:
+        """Use a camera that is known without a CameraInfo."""
+        self._queue(camera, None, at_once=True)
 
-    def frame_came(self, width: int, height: int, at_once: bool) -> None:
+    def note_frame_size(self, width: int, height: int, at_once: bool) -> None:
         """Note the size of a frame, px: a CameraInfo that leaves its size open takes it."""
         if (width, height) != self._frame_px:
             self._frame_px = width, height
             if self._of_open_size is not None:
-                self.take(self._of_open_size, at_once)
+                self.receive(self._of_open_size, at_once)
 
-    def _take(self, camera: Camera, since_s: float | None, at_once: bool) -> None:
+    def _queue(self, camera: Camera, since_s: float | None, at_once: bool) -> None:
         if camera == (self._changes[-1][1] if self._changes else self.camera):
             return
         if at_once or self.camera is None:
@@ -88,7 +95,7 @@ class CameraSolver:
         else:
             self._changes.append((since_s, camera))
 
-    def go_on_to(self, mid_unix_s: float | None) -> None:
+    def advance_to(self, mid_unix_s: float | None) -> None:
         """Take the cameras into use that hold for a frame of that time."""
         while self._changes and not self.preparing:
             since_s, camera = self._changes[0]

@@ -3,12 +3,14 @@
 
 import math
 import traceback
-from collections.abc import Callable, Generator, Mapping
+from collections.abc import Callable, Generator, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Any, Protocol
 
 from starpos.errors import StarposError
+from starpos.parameters.table import FRAME_NAME
 
 # Times that differ by more are not of the same evening.
 ANOTHER_TIME_S = 3600.0
@@ -91,6 +93,17 @@ class Heard(Protocol):
     def came(self, name: str) -> object: ...
 
     def refuse(self, name: str, sentence: str) -> object: ...
+
+
+@contextmanager
+def refusing(heard: Heard, name: str) -> Iterator[None]:
+    """Refuse a message of a topic with the reason where the block raises a StarposError, else note that it came."""
+    try:
+        yield
+    except StarposError as error:
+        heard.refuse(name, str(error))
+    else:
+        heard.came(name)
 
 
 class Level(IntEnum):
@@ -196,3 +209,9 @@ class JobsInTurn:
             outcome = outcome_of(job, self._say)
             self._next = None
             promised.come(outcome)
+
+
+def name_in(message: Any) -> str:
+    """The frame of a message with a header; '' if it is not a valid name."""
+    name: str = message.header.frame_id
+    return name if FRAME_NAME.fits(name) else ""

@@ -92,11 +92,11 @@ class Trails:
         self._readings = GyroReadings()
         self._focal_px: float | None = None
 
-    def take_imu(self, message: Any) -> None:
+    def receive_imu(self, message: Any) -> None:
         """Take a sensor_msgs/Imu; VoyageError in a sentence if it cannot be used."""
         self._readings.take(message)
 
-    def take_camera(self, message: Any) -> None:
+    def receive_camera(self, message: Any) -> None:
         """Take a CameraInfo; InstrumentError in a sentence if it cannot be used."""
         # a size that it leaves open does not matter here
         self._focal_px = message_to_camera(message, size=(1, 1)).fx

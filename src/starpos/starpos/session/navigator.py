@@ -1,42 +1,120 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The navigator's decisions: when the newest part of a voyage is adjusted, how it is carried on, what is published.
-
-A state machine without a clock or a thread of its own, as session.py is for frames: its driver passes each message with
+"""The navigator's decisions: when the newest part of a voyage is adjusted, how it is carried on, what is published.  A
+state machine without a clock or a thread of its own, as session.py is for frames: its driver passes each message with
 its time of arrival; it returns what to publish.  The adjustment is a job; until its outcome comes the IMU carries the
 last one on.
 """
 
 import math
-from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from starpos.earth.ellipsoid import enu_axes
+from starpos.earth.geoid import Geoid
 from starpos.earth.gravity import geodetic_place
 from starpos.earth.place import Place
-from starpos.earth.vertical import Geodetic, geodetic
+from starpos.earth.vertical import Geodetic, Vertical, geodetic
 from starpos.errors import GnssError, StarposError, VoyageError
-from starpos.gnss.receiver import GnssPlace, GnssTrack, known_place, message_to_gnss
+from starpos.files import path_of
+from starpos.instrument.instrument import Instrument
 from starpos.messages.stamp import stamp_to_unix
 from starpos.messages.stars import message_to_attitude
 from starpos.navigation.equations import PLACE
 from starpos.navigation.estimate import Estimate, Observability, VoyageFix, observability
 from starpos.navigation.recent import BACK_S, LONGEST_GAP_S, Recent
+from starpos.navigation.records import ImuModel, read_imu_model
 from starpos.navigation.sightings import BodyAttitude, PlacelessFrame, attitude_at_place
-from starpos.navigation.vessel import PARKED
+from starpos.navigation.vessel import PARKED, Vessel, check_drift
 from starpos.navigation.voyage import MIN_FRAMES, Voyage
+from starpos.session import settings
 from starpos.session.driver import Diagnosis, Heard, Jobs, Level, Log, Now, Outcome
-from starpos.session.gnss import OLDEST_S, UNSTATED_M, contradiction
-from starpos.session.navigator_parameters import NavigatorSettings
+from starpos.session.gnss import OLDEST_S, UNSTATED_M, RecentPlaces, contradiction
 from starpos.session.reports import AHEAD_S
+
+# of a stated altitude: the vehicle goes up and down by more than its file says
+MIN_HEIGHT_STDDEV_M = 10.0
+ANY_INSTRUMENT = Instrument(1000.0, clock_stddev_s=settings.MIN_CLOCK_S)
+
+
+class NavigatorSettings:
+    """The parameters as `values` by name, and what is made from them and from their files.
+
+    A file is read once, when its parameter is checked.
+    """
+
+    def __init__(self, values: Mapping[str, Any]) -> None:
+        self.values = values
+        # the files in use, and the files of the last check
+        self._files: tuple[Instrument, ImuModel, Geoid | None] = ANY_INSTRUMENT, ImuModel(), None
+        self._read: tuple[Instrument, ImuModel, Geoid | None] = self._files
+
+    def check(self, values: Mapping[str, Any], names: frozenset[str]) -> str | None:
+        """Say in a sentence why values cannot be, such as with a broken file; None if they can.
+
+        names: of those that are set.
+        """
+        known, model, grid = self._files
+        try:
+            if "calibration_url" in names:
+                known = settings.known_instrument(values["calibration_url"]) or ANY_INSTRUMENT
+            if "imu_model" in names:
+                name = values["imu_model"]
+                model = read_imu_model(path_of(name)) if name else ImuModel()
+            if "deflection.geoid" in names:
+                grid = settings.geoid_file(values["deflection.geoid"])
+            settings.atmosphere_of(values)
+            settings.site_of(values, settings.vertical_of(values, grid))
+            check_drift(values["vehicle"], values["drift_stddev"], values["drift_change"])
+        except StarposError as e:
+            return str(e)
+        self._read = known, model, grid
+        return None
+
+    def adopt(self) -> None:
+        """Use the files that the last check has read."""
+        self._files = self._read
+
+    @property
+    def vertical(self) -> Vertical:
+        """The deflection of the vertical, or the geoid that gives it."""
+        return settings.vertical_of(self.values, self._files[2])
+
+    @property
+    def site(self) -> Place | None:
+        """The place that is known; None where none is set."""
+        return settings.site_of(self.values, self.vertical)
+
+    def vessel(self, clock_stddev_s: float) -> Vessel:
+        """Instrument and vehicle, of which the frames' clock states its error."""
+        values, (known, model, _) = self.values, self._files
+        clock = values["clock_stddev"]
+        height = values["altitude"]
+        stated = (
+            {}
+            if np.isnan(height)
+            else {
+                "height_m": height,
+                "height_stddev_m": max(values["altitude_stddev"], MIN_HEIGHT_STDDEV_M),
+            }
+        )
+        return Vessel(
+            vehicle=values["vehicle"] or None,
+            model=model,
+            camera_to_body=np.asarray(known.link_to_camera, float).T,
+            mount_stddev=float(np.radians(values["mount_stddev"])),
+            atmosphere=settings.atmosphere_of(values),
+            clock_stddev_s=max(known.clock_stddev_s, clock_stddev_s) if np.isnan(clock) else clock,
+            drift_stddev=values["drift_stddev"],
+            drift_change=values["drift_change"],
+            **stated,
+        )
+
 
 # minimum length of the window before it is adjusted, s, and minimum frames per second of the period
 SHORTEST_S, FRAMES_PER_S = 10.0, 30.0
-# fixes of GNSS that are kept: attitudes come later than they
-GNSS_KEPT = 100
 # 1 sigma beyond which a position counts as unknown, m an axis
 WIDE_M = 1000.0
 STARTING = "no frame with stars yet"
@@ -94,7 +172,7 @@ class NavigatorSession:
         # of the newest frame that the estimate is made of
         self._seen_s = -math.inf
         self._clock_stddev_s = 0.0
-        self._gnss: deque[GnssPlace] = deque(maxlen=GNSS_KEPT)
+        self._gnss = RecentPlaces(UNSTATED_M)
         # marks outcomes of jobs that began before as out of date
         self._voyage = object()
 
@@ -109,7 +187,7 @@ class NavigatorSession:
 
     # inputs ----------------------------------------------------------------------------------------------------------
 
-    def take_imu(self, message: Any, now: Now) -> list[Navigated]:
+    def receive_imu(self, message: Any, now: Now) -> list[Navigated]:
         """Take a sensor_msgs/Imu; returns an output where one is due."""
         w, f, stamp = message.angular_velocity, message.linear_acceleration, message.header.stamp
         row = (stamp.sec + stamp.nanosec * 1e-9, w.x, w.y, w.z, f.x, f.y, f.z)
@@ -131,7 +209,7 @@ class NavigatorSession:
         self._heard.came("imu/data")
         return self._tick(row[0]) if row[0] >= self._next_s else []
 
-    def take_attitude(self, message: Any, now: Now) -> list[Navigated]:
+    def receive_attitude(self, message: Any, now: Now) -> list[Navigated]:
         """Take a starpos_interfaces/Attitude."""
         try:
             attitude = message_to_attitude(message)
@@ -162,10 +240,10 @@ class NavigatorSession:
     def _by_gnss(self, utc_unix_s: float) -> Place | None:
         if not self._values["gnss.use"]:
             return None
-        gnss = GnssTrack(list(self._gnss)).at(utc_unix_s)
-        return None if gnss is None else known_place(gnss, self._settings.vertical)
+        gnss = self._gnss.at(utc_unix_s)
+        return None if gnss is None else gnss.deflected(self._settings.vertical)
 
-    def take_velocity(self, message: Any, now: Now, name: str) -> list[Navigated]:
+    def receive_velocity(self, message: Any, now: Now, name: str) -> list[Navigated]:
         """Take a nav_msgs/Odometry or a geometry_msgs/TwistWithCovarianceStamped, from the topic of that name."""
         v = message.twist.twist.linear
         variance = np.asarray(message.twist.covariance, float)[[0, 7, 14]]
@@ -186,12 +264,12 @@ class NavigatorSession:
         self._heard.came(name)
         return []
 
-    def take_gnss(self, message: Any, now: Now) -> list[Navigated]:
+    def receive_gnss(self, message: Any, now: Now) -> list[Navigated]:
         """Take a sensor_msgs/NavSatFix of satellites: it is compared, not fused."""
         try:
-            self._gnss.append(message_to_gnss(message, UNSTATED_M))
+            self._gnss.receive(message, now)
         except GnssError:
-            self._gnss.clear()
+            self._gnss.forget()
         self._heard.came("gnss/fix")
         return []
 
@@ -347,10 +425,11 @@ class NavigatorSession:
         if self._stars_missing:
             return Diagnosis(Level.WARN, self._why_old(since_s), values)
         faults = list(self._faults)
-        if self._gnss and abs(estimate.utc_unix_s - self._gnss[-1].utc_unix_s) < OLDEST_S:
+        gnss = self._gnss.newest
+        if gnss is not None and abs(estimate.utc_unix_s - gnss.utc_unix_s) < OLDEST_S:
             fix = estimate.fix
             moving = float(np.linalg.norm(fix.velocity))
-            apart_m, wrong = contradiction(self._gnss[-1], self._ground(fix), fix.utc_unix_s, moving)
+            apart_m, wrong = contradiction(gnss, self._ground(fix), fix.utc_unix_s, moving)
             values["GNSS from here (m)"] = apart_m
             faults += [wrong] if wrong else []
         said = [f"place to {known.sigma_m:.3g} m", *([known.missing] if known.missing else [])]

@@ -64,7 +64,7 @@ class Replay:
 
     def play_lists(self, camera: Camera, stars: Sequence[Stars], tilts: TiltLog) -> Iterator[Output]:
         """Yield what the solver publishes of lists of stars with times, and of tilts, each at its own time."""
-        self.session.instrument.know(camera)
+        self.session.instrument.use_known(camera)
         messages: list[tuple[float, Any]] = [
             (unix_s, _tilt_message(tilts, k)) for k, unix_s in enumerate(tilts.utc_unix_s.tolist())
         ]
@@ -75,9 +75,9 @@ class Replay:
             if isinstance(message, Stars):
                 self.frames += 1
                 stamp = PlainStamp.of_ns(round((message.mid_unix_s or 0.0) * 1e9))
-                yield from self.session.take_detected(message, PlainHeader(stamp, "camera"), now)
+                yield from self.session.receive_detected(message, PlainHeader(stamp, "camera"), now)
             else:
-                yield from self._take_tilt(message, now)
+                yield from self._receive_tilt(message, now)
             yield from self._settled(now)
         yield from self._ended(now)
 
@@ -85,10 +85,10 @@ class Replay:
         """Have the session take a message, or the stars or tilt made from it."""
         session = self.session
         if kind == TILT:
-            return self._take_tilt(message, now)
+            return self._receive_tilt(message, now)
         if kind == STARS:
             self.frames += 1
-            return session.take_stars(message, now)
+            return session.receive_stars(message, now)
         if kind in IMAGES:
             self.frames += 1
             try:
@@ -96,20 +96,20 @@ class Replay:
             except StarposError as error:
                 self._heard.refuse("image_raw", str(error))
                 return []
-            return session.take_detected(stars, header, now)
+            return session.receive_detected(stars, header, now)
         if kind == IMU:
             tilt = messages.tilt_of(message, now.unix_s or 0.0)
-            return [] if tilt is None else self._take_tilt(tilt, now)
+            return [] if tilt is None else self._receive_tilt(tilt, now)
         if kind == NAV_SAT_FIX:
-            return session.take_gnss(message, now)
+            return session.receive_gnss(message, now)
         if kind == CAPTURE:
-            messages.take_capture(message)
+            messages.receive_capture(message)
             return []
-        return session.take_camera(message, now)
+        return session.receive_camera(message, now)
 
-    def _take_tilt(self, message: Any, now: Now) -> list[Output]:
+    def _receive_tilt(self, message: Any, now: Now) -> list[Output]:
         self._tilts += 1
-        return self.session.take_tilt(message, Sent(self._tilts), now)
+        return self.session.receive_tilt(message, Sent(self._tilts), now)
 
     def _ended(self, now: Now) -> Iterator[Output]:
         yield from self.session.end(now)

@@ -1,5 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The tilts of a session: which are kept, who publishes them, and their average over an exposure."""
+"""The tilts of a session: which are kept, who publishes them, and their average over an exposure.
+
+Any ROS node may publish on `tilt`, and mixed readings of two inclinometers make confident wrong fixes: while two are
+heard, neither is used. A killed publisher stays in the graph for a while, so only received messages count. Publishers
+are distinguished by the frame of their messages and by DDS's message numbers, which grow with each message of one
+publisher.
+"""
 
 import math
 from collections import deque
@@ -8,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from starpos.errors import StarposError, TiltError, TiltRangeError
+from starpos.errors import TiltError, TiltRangeError
 from starpos.instrument.inclinometer import Tilt
 from starpos.instrument.tilt_log import (
     BRACKET_S,
@@ -22,16 +28,14 @@ from starpos.instrument.tilt_log import (
 from starpos.messages.stamp import stamp_to_unix
 from starpos.messages.tilt import OUT_OF_RANGE, SATURATED, STUCK, UNUSABLE, message_to_tilt
 from starpos.session import reports
-from starpos.session.driver import Heard, Now, Sent
-from starpos.session.settings import Settings
-from starpos.session.transforms import FrameNames, name_in
+from starpos.session.driver import Now, Sent, name_in
 
 # Number of samples from which the noise is measured.
 STEPS_KEPT = 2000
 
 
 class TiltSteps:
-    """Differences of neighbouring samples, in order of time: the newest CAPACITY of them."""
+    """Differences of neighbouring samples, in order of time: the newest STEPS_KEPT of them."""
 
     def __init__(self) -> None:
         self._number = self._axes = 0
@@ -41,7 +45,7 @@ class TiltSteps:
     def clear(self) -> None:
         self._number = 0
 
-    def note(self, before: Tilt, sample: Tilt) -> None:
+    def record(self, before: Tilt, sample: Tilt) -> None:
         """Take two successive samples, if they are neighbours in time."""
         apart_s = sample.utc_unix_s - before.utc_unix_s
         # a repeated sample adds nothing, and counting it would distort the noise
@@ -101,7 +105,7 @@ class TiltPublishers:
         self._voices: list[_Voice] = []
         self._speaking: list[_Voice] = []
 
-    def heard(self, frame_id: str, number: int | None, now_s: float) -> None:
+    def note(self, frame_id: str, number: int | None, now_s: float) -> None:
         """Note a message; number: its number among its publisher's messages, None where the middleware gives none."""
         mine = self._voice_of(frame_id, number, now_s) or _Voice(frame_id, number, now_s)
         mine.number, mine.heard_s, mine.period_s = number, now_s, abs(now_s - mine.heard_s)
@@ -153,6 +157,8 @@ NEAR_S = BRACKET_S
 ORDER_S = 1.0
 # Assumed time between samples if there are too few, and the share of it by which the next may come early.
 USUAL_PERIOD_S, JITTER = 0.1, 0.9
+# Tilts that wait for a clock.
+MAX_EARLY = 1000
 
 
 class TiltBuffer:
@@ -168,6 +174,10 @@ class TiltBuffer:
         self._late_s: deque[float] = deque(maxlen=USUAL)
         self._apart_s: deque[float] = deque(maxlen=USUAL)
         self._publishers = TiltPublishers()
+        # those ahead of a clock that may have been heard only after them
+        self._early: deque[Any] = deque(maxlen=MAX_EARLY)
+        # of the last message; '' before the first one
+        self.frame_id = ""
 
     def __len__(self) -> int:
         return len(self._good)
@@ -178,6 +188,7 @@ class TiltBuffer:
         self._steps.clear()
         self._late_s.clear()
         self._apart_s.clear()
+        self._early.clear()
         self._latest_unix_s = -np.inf
         self.forget_publishers()
 
@@ -185,18 +196,45 @@ class TiltBuffer:
         """Forget who has published, but no samples: whoever publishes next is alone at first."""
         self._publishers = TiltPublishers()
 
-    def heard(self, message: Any, number: int | None, now_s: float) -> None:
-        """Note who publishes, before `add`; number: its number among its publisher's messages, None without one.
+    @property
+    def waits(self) -> bool:
+        """Whether a tilt waits for its time."""
+        return bool(self._early)
 
-        TiltError while two publish: it is unknown which samples are the instrument's own, so none is kept.
+    def receive(self, message: Any, sent: Sent, now: Now, unknown_stddev_rad: float) -> None:
+        """Keep a Tilt, or have one of recorded data that is ahead of a clock heard late wait for `pop_early`.
+
+        TiltError if it is broken or of the future, and while two publish: it is unknown which samples are the
+        instrument's own, so none is kept.
         """
-        self._publishers.heard(message.header.frame_id, number, now_s)
+        if sent.unix_s is not None and not now.played:
+            # A process that stood still may read it only when its time has come.
+            now = replace(now, unix_s=sent.unix_s if now.unix_s is None else min(sent.unix_s, now.unix_s))
+        self._publishers.note(message.header.frame_id, sent.number, now.waiting_s)
         if several := self._publishers.several:
             self._good.clear()
             self._steps.clear()
             raise TiltError(several)
+        if now.played and now.ahead_s(stamp_to_unix(message.header.stamp)) > reports.AHEAD_S:
+            self._early.append(message)
+        else:
+            self.keep_in_time(message, now, unknown_stddev_rad)
 
-    def add(self, message: Any, unknown_stddev_rad: float) -> None:
+    def pop_early(self) -> list[Any]:
+        """The messages that waited for their time; none waits any more."""
+        early = list(self._early)
+        self._early.clear()
+        return early
+
+    def keep_in_time(self, message: Any, now: Now, unknown_stddev_rad: float) -> None:
+        """Keep a Tilt, unless it is of the future: the instrument may lean otherwise when its time comes."""
+        if (ahead_s := now.ahead_s(stamp_to_unix(message.header.stamp))) > reports.AHEAD_S:
+            raise TiltError(f"a tilt is stamped {ahead_s:.3g} s in the future: {reports.ONE_CLOCK}")
+        self.keep(message, unknown_stddev_rad)
+        self._late_s.append(max(-ahead_s, 0.0))
+        self.frame_id = name_in(message)
+
+    def keep(self, message: Any, unknown_stddev_rad: float) -> None:
         """Keep a sample; TiltError if the message is broken."""
         if message.flags & UNUSABLE:
             self._flagged.append((stamp_to_unix(message.header.stamp) or 0.0, message.flags))
@@ -204,7 +242,7 @@ class TiltBuffer:
         sample = message_to_tilt(message, unknown_stddev_rad)
         if self._good:
             before = self._good[-1][1]
-            self._steps.note(before, sample)
+            self._steps.record(before, sample)
             self._apart_s.append(abs(sample.utc_unix_s - before.utc_unix_s))
         self.forget_after(sample.utc_unix_s + ORDER_S)
         self._came += 1
@@ -218,10 +256,6 @@ class TiltBuffer:
             self._good = deque((s for s in self._good if s[1].utc_unix_s <= unix_s), maxlen=CAPACITY)
             # A night that is played again comes from here on: its steps count once, as when it was played first.
             self._steps.forget_after(unix_s - ORDER_S)
-
-    def came_late(self, late_s: float) -> None:
-        """Note how long after its time the last sample came."""
-        self._late_s.append(max(late_s, 0.0))
 
     @property
     def delay_s(self) -> float:
@@ -317,58 +351,3 @@ class _Over:
     def average(self, mid_unix_s: float, exposure_s: float, spread_s: float = 0.0) -> Tilt:
         """Average over the span about a time."""
         return self.buffer.average(mid_unix_s, self.span_s)
-
-
-MAX_EARLY = 1000
-
-
-class TiltIntake:
-    """Gives tilts to a buffer; names: of the frames of the messages taken."""
-
-    def __init__(self, tilts: TiltBuffer, names: FrameNames, settings: Settings, heard: Heard) -> None:
-        self._tilts, self._names, self._settings, self._heard = tilts, names, settings, heard
-        # those ahead of a clock that may have been heard only after them
-        self._early: deque[Any] = deque(maxlen=MAX_EARLY)
-
-    @property
-    def waits(self) -> bool:
-        """Whether a tilt waits for its time."""
-        return bool(self._early)
-
-    def clear(self) -> None:
-        self._early.clear()
-
-    def take(self, message: Any, sent: Sent, now: Now) -> None:
-        """Take a Tilt."""
-        stamp_s = stamp_to_unix(message.header.stamp)
-        if sent.unix_s is not None and not now.played:
-            # A process that stood still may read it only when its time has come.
-            now = replace(now, unix_s=min(sent.unix_s, sent.unix_s if now.unix_s is None else now.unix_s))
-        try:
-            self._tilts.heard(message, sent.number, now.waiting_s)
-            ahead_s = now.ahead_s(stamp_s)
-        except StarposError as e:
-            self._heard.refuse("tilt", str(e))
-            return
-        if now.played and ahead_s > reports.AHEAD_S:
-            self._early.append(message)
-        else:
-            self._add(message, now)
-
-    def go_on(self, now: Now) -> None:
-        """Look again at those that were ahead of the clock."""
-        early, self._early = self._early, deque(maxlen=MAX_EARLY)
-        for message in early:
-            self._add(message, now)
-
-    def _add(self, message: Any, now: Now) -> None:
-        """Keep a tilt, unless it is broken, or of the future: the instrument may lean otherwise when its time comes."""
-        try:
-            if (ahead_s := now.ahead_s(stamp_to_unix(message.header.stamp))) > reports.AHEAD_S:
-                raise TiltError(f"a tilt is stamped {ahead_s:.3g} s in the future: {reports.ONE_CLOCK}")
-            self._tilts.add(message, self._settings.tilt_stddev_rad)
-            self._tilts.came_late(-ahead_s)
-            self._heard.came("tilt")
-            self._names.inclinometer = name_in(message)
-        except StarposError as e:
-            self._heard.refuse("tilt", str(e))

@@ -6,10 +6,10 @@ import os
 
 import pytest
 
+from starpos import system_clock
 from starpos.cli import doctor
 from starpos.earth import orientation
-from starpos.session import system_clock
-from starpos.session.system_clock import SystemClock
+from starpos.system_clock import SystemClock
 from starpos.units import unix_of
 
 

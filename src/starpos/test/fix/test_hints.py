@@ -15,7 +15,7 @@ from starpos.frames.header import read_exposure
 from starpos.instrument.camera import EQUIDISTANT, PLUMB_BOB, Camera
 from starpos.instrument.instrument import Instrument
 from starpos.night.reading import Given
-from starpos.night.work import Identifying
+from starpos.night.work import Solving
 from starpos.progress import quiet
 from starpos.sky.catalogue import load_catalogue
 from starpos_testing.skies.cygnus import DEC_DEG, stars_of_cygnus
@@ -53,8 +53,8 @@ def seen(catalogue, rng):
 )
 def test_a_wrong_header_binds_nothing(seen, header, told):
     stars = seen(header)
-    work = Identifying(Given(None, by_header=True))
-    sight, _ = work(stars)
+    work = Solving(Given(None, by_header=True))
+    sight = work(stars)
     assert sight.solution.ok and np.degrees(sight.solution.attitude.dec) == pytest.approx(DEC_DEG, abs=1e-3)
     assert sight.instrument.focal_px == pytest.approx(FOCAL_PX, rel=0.03)
     assert re.fullmatch(
@@ -63,32 +63,33 @@ def test_a_wrong_header_binds_nothing(seen, header, told):
 
 
 def test_a_right_header_is_not_doubted(seen):
-    sight, _ = Identifying(Given(None, by_header=True))(seen(RIGHT))
+    sight = Solving(Given(None, by_header=True))(seen(RIGHT))
     assert sight.solution.ok and (sight.solution.remark, sight.instrument) == ("", None)
 
 
 def test_each_frame_has_its_own_header(seen):
     """The first frame's focal length differs from the others'."""
     given = Given(Instrument(1000.0 * 50 / PIXEL_UM), by_header=True)
-    sight, _ = Identifying(given)(seen(RIGHT))
+    sight = Solving(given)(seen(RIGHT))
     assert sight.solution.ok and sight.solution.remark == ""
 
 
 def test_a_focal_length_that_somebody_gave_is_no_hint(seen):
     """It holds, because a place rests on it: the frame is lost, and no other one is tried."""
-    sight, _ = Identifying(Given(Instrument(2 * FOCAL_PX)))(seen(RIGHT))
+    sight = Solving(Given(Instrument(2 * FOCAL_PX)))(seen(RIGHT))
     assert sight.solution.status is Status.NOT_IDENTIFIED
 
 
 def test_turning_takes_the_focal_length_that_fits(seen):
-    work = Identifying(Given(None, by_header=True))
-    wrong, right = work(seen(RIGHT | {"XPIXSZ": 3.2}))[0], work(seen(RIGHT))[0]
+    work = Solving(Given(None, by_header=True))
+    wrong, right = work(seen(RIGHT | {"XPIXSZ": 3.2})), work(seen(RIGHT))
     solver, frames = of_one_camera(_solver(187500.0), [wrong, right])
     assert solver.instrument.focal_px == pytest.approx(FOCAL_PX, rel=0.03)
     # what was identified by another focal length is identified anew
-    assert [found is None for _, found in frames] == [False, True]
+    assert frames[0] is wrong and frames[1] is not right
+    assert frames[1].found.star.tolist() == right.found.star.tolist()
     solver, frames = of_one_camera(_solver(FOCAL_PX), [right])
-    assert solver.instrument.focal_px == FOCAL_PX and frames[0][1] is right.found
+    assert solver.instrument.focal_px == FOCAL_PX and frames == [right]
 
 
 @pytest.fixture
@@ -120,9 +121,7 @@ def test_a_focal_length_near_the_headers_needs_no_search_at_every_scale(catalogu
         Camera.from_focal(1000, 700, 5000.0),
         read_exposure({"FOCALLEN": 34, "XPIXSZ": 6.4}, "frame.fits").facts,
     )
-    sight, _ = Identifying(Given(None, by_header=True))(
-        stars_of_cygnus(catalogue, rng, wide, 6.5, 0.05, **header)
-    )
+    sight = Solving(Given(None, by_header=True))(stars_of_cygnus(catalogue, rng, wide, 6.5, 0.05, **header))
     assert sight.solution.ok and "(34 mm" in sight.solution.remark and "32 mm" in sight.solution.remark
 
 

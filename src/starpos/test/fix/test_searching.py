@@ -75,7 +75,7 @@ def test_an_answer_by_stars_detected_otherwise_needs_more_evidence(frame, catalo
     good = Solver(Instrument(FOCAL_PX), catalogue).identify(stars, part=PART)
     lost = Solution.failed(stars, Status.NOT_IDENTIFIED, "lost")
     others = [replace(stars, source=str(k)) for k in range(4)]
-    monkeypatch.setattr(ways, "otherwise", lambda frame, window: iter(others))
+    monkeypatch.setattr(ways, "other_views", lambda frame, window: iter(others))
     weak = replace(good, attitude=replace(good.attitude, log_odds=searching.MIN_LOG_ODDS_OTHERWISE - 0.1))
     sight = identified(Answering(*4 * [lost], *4 * [weak], lost, good), frame, stars)
     assert sight.solution is good and sight.stars.source == "1"
@@ -101,7 +101,7 @@ def test_no_other_way_is_begun_when_the_time_is_over(frame):
 def test_no_way_is_tried_twice_on_the_same_stars(frame, tilts, monkeypatch):
     stars = no_stars(300, 200)
     others = [replace(stars, source=str(k)) for k in range(2)]
-    monkeypatch.setattr(ways, "otherwise", lambda frame, window: iter(others))
+    monkeypatch.setattr(ways, "other_views", lambda frame, window: iter(others))
     solver = Answering(*20 * [Solution.failed(stars, Status.NOT_IDENTIFIED, "lost")])
     assert not answer_frame(solver, Question(item=frame, stars=stars, tilts=tilts)).solution.ok
     assert len(solver.ways) == len(set(solver.ways)) == 12

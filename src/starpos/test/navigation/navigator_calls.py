@@ -10,8 +10,7 @@ from starpos import rotation
 from starpos.earth.orientation import earth_state
 from starpos.parameters.table import defaults_of
 from starpos.session.driver import JobsInTurn, Now
-from starpos.session.navigator import NavigatorSession
-from starpos.session.navigator_parameters import NavigatorSettings
+from starpos.session.navigator import NavigatorSession, NavigatorSettings
 
 # of an attitude behind its frame, as the solver takes it
 LATE_S = 0.5
@@ -99,7 +98,7 @@ class Navigator:
         """Pass (unix_s, take's name, arguments) in the order of time."""
         for unix_s, take, *arguments in sorted(events, key=lambda e: e[0]):
             now = Now(unix_s, unix_s)
-            take_it = getattr(self.session, f"take_{take}")
+            take_it = getattr(self.session, f"receive_{take}")
             self.outputs += take_it(arguments[0], now, *arguments[1:])
             if self.works:
                 self._jobs.work()

@@ -163,7 +163,7 @@ def test_a_gnss_elsewhere_is_told_and_not_followed(record, model, off_deg, said)
         position_covariance=np.diag([4.0, 4.0, 9.0]).ravel(),
         position_covariance_type=2,
     )
-    navigator.session.take_gnss(message, Now(at, at))
+    navigator.session.receive_gnss(message, Now(at, at))
     report = navigator.session.report()
     assert ("one of them is wrong" in report.message) is said
     assert report.values["GNSS from here (m)"] == pytest.approx(off_deg * 111_200, abs=1500)
@@ -185,7 +185,7 @@ NO_G = [0.0, 0.0, 9.8]
 )
 def test_a_reading_that_cannot_be_is_refused_with_a_sentence(message, said):
     navigator = Navigator()
-    assert navigator.session.take_imu(message, NOW) == []
+    assert navigator.session.receive_imu(message, NOW) == []
     ((name, sentence),) = navigator.told.refused
     assert name == "imu/data" and said in sentence
 
@@ -205,7 +205,7 @@ def test_a_reading_that_cannot_be_is_refused_with_a_sentence(message, said):
 def test_an_attitude_that_cannot_be_is_refused_with_a_sentence(record, change, said):
     navigator, message = Navigator(), attitude_message(record.frames[0])
     vars(message).update(change)
-    navigator.session.take_attitude(message, Now(None, 0.0))
+    navigator.session.receive_attitude(message, Now(None, 0.0))
     ((name, sentence),) = navigator.told.refused
     assert name == "attitude" and said in sentence
 
@@ -213,7 +213,7 @@ def test_an_attitude_that_cannot_be_is_refused_with_a_sentence(record, change, s
 def test_doubled_stamps_and_short_steps_back_are_left_out():
     navigator = Navigator()
     for unix_s in (1.7e9 - 1, 1.7e9 - 1, 1.7e9 - 1.2):
-        navigator.session.take_imu(imu_message(unix_s, [0, 0, 0], NO_G), NOW)
+        navigator.session.receive_imu(imu_message(unix_s, [0, 0, 0], NO_G), NOW)
     assert [sentence for _, sentence in navigator.told.refused] == [
         "an inertial reading is not later than the one before: it is left out"
     ] * 2
@@ -224,7 +224,7 @@ def test_a_clock_that_jumps_begins_a_new_voyage(record, model, jump_s):
     navigator = Navigator(imu_model=model).play([e for e in events_of(record) if e[0] < record.frames_s[20]])
     assert navigator.outputs[-1].fix is not None
     at = navigator.outputs[-1].utc_unix_s + jump_s
-    (output,) = navigator.session.take_imu(imu_message(at, [0, 0, 0], NO_G), Now(at, at))
+    (output,) = navigator.session.receive_imu(imu_message(at, [0, 0, 0], NO_G), Now(at, at))
     assert output.fix is None
     assert any("begun anew" in sentence for sentence in navigator.told.said)
 
@@ -234,7 +234,7 @@ def test_a_clock_that_jumps_begins_a_new_voyage(record, model, jump_s):
 )
 def test_a_velocity_that_cannot_be_is_refused_with_a_sentence(velocity, sigma, said):
     navigator = Navigator()
-    navigator.session.take_velocity(velocity_message(1.7e9, velocity, sigma), NOW, "odom")
+    navigator.session.receive_velocity(velocity_message(1.7e9, velocity, sigma), NOW, "odom")
     assert said in navigator.told.refused[0][1]
 
 

@@ -149,14 +149,14 @@ def told(scene, stars, tilt, **parameters):
         k=[camera.fx, 0.0, camera.cx, 0.0, camera.fy, camera.cy, 0.0, 0.0, 1.0], binning_x=0, binning_y=0,
         roi=SimpleNamespace(x_offset=0, y_offset=0, width=0, height=0),
     )  # fmt: skip
-    session.take_camera(info, now)
+    session.receive_camera(info, now)
     for each in jobs:
         each.work()
     message = SimpleNamespace(
         header=header(tilt.utc_unix_s), x=tilt.theta_x, y=tilt.theta_y, z=np.nan, z_variance=np.nan,
         covariance=tilt.covariance.ravel(), temperature=15.0, flags=0,
     )  # fmt: skip
-    session.take_tilt(message, Sent(1), now)
+    session.receive_tilt(message, Sent(1), now)
     seen = [
         SimpleNamespace(x=x, y=y, flux=flux, snr=snr, covariance=c.ravel(), flags=flag)
         for x, y, flux, snr, c, flag in zip(
@@ -167,7 +167,7 @@ def told(scene, stars, tilt, **parameters):
         header=header(START + EXPOSURE / 2), width=SIZE[0], height=SIZE[1], exposure=EXPOSURE, stamp_stddev=0.0,
         clock_stddev=0.0, shutter_known=True, readout=0.0, readout_stddev=0.0, stars=seen,
     )  # fmt: skip
-    answers = session.take_stars(array, now) + session.end(Now(START + 2.0, 1.5))
+    answers = session.receive_stars(array, now) + session.end(Now(START + 2.0, 1.5))
     return answers[0].solution
 
 

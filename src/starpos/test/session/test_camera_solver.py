@@ -17,7 +17,7 @@ def info(**changes):
     """A CameraInfo of that camera."""
     f, (cx, cy) = CAMERA.fx, CAMERA.centre_px
     about = {
-        "header": SimpleNamespace(stamp=SimpleNamespace(sec=1793642400, nanosec=0)),
+        "header": SimpleNamespace(frame_id="camera", stamp=SimpleNamespace(sec=1793642400, nanosec=0)),
         "width": CAMERA.width,
         "height": CAMERA.height,
         "k": [f, 0, cx, 0, f, cy, 0, 0, 1.0],
@@ -46,7 +46,7 @@ def taken(solver):
     """The CameraSolver that has taken a camera, and what it has said."""
     said, jobs = [], JobsInTurn(print)
     camera_solver = CameraSolver(lambda camera: solver, lambda: None, jobs, said.append, "camera/camera_info")
-    camera_solver.take(info(), at_once=True)
+    camera_solver.receive(info(), at_once=True)
     jobs.work()
     return camera_solver, said
 
@@ -71,15 +71,15 @@ def test_a_field_that_cannot_be_leaves_no_solver():
 def test_a_camera_of_no_size_has_that_of_the_frames():
     jobs = JobsInTurn(print)
     camera_solver = CameraSolver(lambda camera: Prepared(), lambda: None, jobs, print, "camera/camera_info")
-    camera_solver.take(info(width=0, height=0), at_once=True)
+    camera_solver.receive(info(width=0, height=0), at_once=True)
     assert camera_solver.camera is None
     with pytest.raises(InstrumentError, match="not calibrated"):
-        camera_solver.take(info(width=0, height=0, k=[0.0] * 9), at_once=True)
+        camera_solver.receive(info(width=0, height=0, k=[0.0] * 9), at_once=True)
     for size in ((1000, 700), (500, 300)):
-        camera_solver.frame_came(*size, at_once=True)
+        camera_solver.note_frame_size(*size, at_once=True)
         jobs.work()
         assert (camera_solver.camera.width, camera_solver.camera.height) == size
         assert camera_solver.camera.fx == CAMERA.fx and camera_solver.solver is not None
     # it counts for the frames that follow, too
-    camera_solver.take(info(width=0, height=0), at_once=True)
+    camera_solver.receive(info(width=0, height=0), at_once=True)
     assert camera_solver.camera.width == 500

@@ -71,8 +71,8 @@ class Told:
     def tell(self, kind, message, at_s, played=True, sent=NOTHING_TOLD):
         now = Now.in_data(at_s) if played else Now(at_s, at_s)
         if kind == TILT:
-            return self.session.take_tilt(message, sent, now)
-        return (self.session.take_stars if kind == STARS else self.session.take_camera)(message, now)
+            return self.session.receive_tilt(message, sent, now)
+        return (self.session.receive_stars if kind == STARS else self.session.receive_camera)(message, now)
 
     def at(self, at_s):
         return self.session.at(Now.in_data(at_s))
@@ -127,14 +127,14 @@ def test_frames_have_the_names_of_messages_that_are_taken(told, messages, begin_
     tilt, came_s = first(messages, TILT)
     names = "starpos_camera_optical_frame", "starpos_inclinometer_frame"
     told.tell(TILT, tilt, came_s)
-    assert (told.session.names.camera, told.session.names.inclinometer) == names
+    assert (told.session.instrument.frame_id, told.session.tilts.frame_id) == names
     broken = deepcopy(tilt)
     broken.x, broken.header.frame_id = float("nan"), "elsewhere"
     told.tell(TILT, broken, came_s)
     no_camera = deepcopy(first(messages, CAMERA_INFO)[0])
     no_camera.k[0], no_camera.header.frame_id = float("nan"), "elsewhere"
     told.tell(CAMERA_INFO, no_camera, came_s)
-    assert (told.session.names.camera, told.session.names.inclinometer) == names
+    assert (told.session.instrument.frame_id, told.session.tilts.frame_id) == names
 
 
 def test_a_frame_without_tilts_waits_by_the_clock_of_the_data(told, messages):
@@ -331,7 +331,7 @@ def test_half_a_site_is_refused():
 def test_the_place_of_a_heading_may_be_that_of_gnss(messages, begin_s):
     told = seen_at(messages, begin_s, "gnss.use:=true")
     stars, came_s = first(messages, STARS)
-    told.session.take_gnss(gnss_fix(stars), Now.in_data(came_s))
+    told.session.receive_gnss(gnss_fix(stars), Now.in_data(came_s))
     [answer] = told.tell(STARS, stars, came_s)
     at_place = answer.solution.at_place
     assert math.degrees(at_place.ellipsoid.heading) == pytest.approx(195.31952, abs=2e-3)
@@ -346,10 +346,10 @@ def test_the_place_of_a_heading_may_be_that_of_gnss(messages, begin_s):
 def test_gnss_without_a_fix_is_no_place(messages, begin_s):
     told = seen_at(messages, begin_s, "gnss.use:=true")
     stars, came_s = first(messages, STARS)
-    told.session.take_gnss(gnss_fix(stars, latitude=float("nan")), Now.in_data(came_s))
+    told.session.receive_gnss(gnss_fix(stars, latitude=float("nan")), Now.in_data(came_s))
     lost = gnss_fix(stars)
     lost.status = SimpleNamespace(status=-1)
-    told.session.take_gnss(lost, Now.in_data(came_s))
+    told.session.receive_gnss(lost, Now.in_data(came_s))
     [answer] = told.tell(STARS, stars, came_s)
     assert answer.solution.at_place is None
 
@@ -362,9 +362,44 @@ def test_without_gnss_use_messages_of_gnss_change_no_answer(messages, begin_s):
         for tilt, _ in tilts_of(messages, came_s + 5.0):
             told.tell(TILT, tilt, came_s)
         if given:
-            told.session.take_gnss(gnss_fix(stars, latitude=10.0), Now.in_data(came_s))
+            told.session.receive_gnss(gnss_fix(stars, latitude=10.0), Now.in_data(came_s))
         [answer, *_] = told.tell(STARS, stars, came_s)
-        assert answer.solution.ok and answer.beside is None
+        assert answer.solution.ok and answer.compared is None
         fix = answer.solution.fix
         answers.append((fix.latitude, fix.longitude, fix.covariance.tobytes(), answer.ground.latitude))
     assert answers[0] == answers[1] and told.session.gnss is None
+
+
+@pytest.mark.parametrize(
+    "part, named",
+    [
+        ("gyro.predicted", ""),
+        ("_search.solve", "the solver failed on this frame (RuntimeError: a defect)"),
+        ("doubt.judge", "the solver failed on this frame"),
+        ("gyro.learn_from", ""),
+        ("deflection.include", ""),
+        ("calibrating.include", ""),
+        ("gnss.solve", "what GNSS taught could not be used on this frame"),
+    ],
+)
+def test_a_defect_in_any_part_loses_only_what_that_part_makes(messages, monkeypatch, part, named):
+    """The parts are broken one after another, so that a part without a guard shows."""
+    told = Told(*(("gnss.use:=true",) if part.startswith("gnss") else ()))
+    owner, name = part.split(".") if "." in part else (None, part)
+    of = getattr(told.session, owner)
+    whole, broken = getattr(of, name), iter([True])
+
+    def breaks_once(*arguments, **named):
+        if next(broken, False):
+            raise RuntimeError("a defect")
+        return whole(*arguments, **named)
+
+    monkeypatch.setattr(of, name, breaks_once)
+    answers = []
+    for kind, message, at_s in messages:
+        answers += [a for a in told.tell(kind, message, at_s) if isinstance(a, Answered)]
+        answers += [a for a in told.work(at_s) if isinstance(a, Answered)]
+    first, *others = [a.solution for a in answers]
+    assert len(told.said.errors) == 1 and "RuntimeError: a defect" in told.said.errors[0]
+    assert named in first.message and first.ok == (not named)
+    assert others and all(a.found is not None for a in others)

@@ -9,8 +9,8 @@ import subprocess
 
 import pytest
 
-from starpos.session import system_clock
-from starpos.session.system_clock import StepWatch, SystemClock
+from starpos import system_clock
+from starpos.system_clock import StepWatch, SystemClock
 
 
 def test_the_kernels_word_is_what_the_system_tool_reads():

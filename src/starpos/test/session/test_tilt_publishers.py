@@ -10,7 +10,7 @@ def heard(messages) -> TiltPublishers:
     """After messages (frame, number, seconds)."""
     publishers = TiltPublishers()
     for message in messages:
-        publishers.heard(*message)
+        publishers.note(*message)
     return publishers
 
 
@@ -29,7 +29,7 @@ def test_two_publishers_are_seen_within_two_messages_of_each(frames, begin, ofte
     for k in range(3):
         for which, count in ((0, 1), (1, often)):
             for _ in range(count):
-                publishers.heard(frames[which], numbers[which], 0.1 * k)
+                publishers.note(frames[which], numbers[which], 0.1 * k)
                 numbers[which] += 1
                 told.append(bool(publishers.several))
     assert all(told[2 * (1 + often) :])

@@ -37,7 +37,7 @@ def sample(
 def buffer_of(messages) -> TiltBuffer:
     buffer = TiltBuffer()
     for message in messages:
-        buffer.add(message, NOISE)
+        buffer.keep(message, NOISE)
     return buffer
 
 
@@ -89,7 +89,7 @@ def test_a_cleared_buffer_measures_the_noise_as_a_new_one():
     buffer = buffer_of([*noisy, sample(60.0)])
     buffer.clear()
     for message in noisy:
-        buffer.add(message, NOISE)
+        buffer.keep(message, NOISE)
     assert np.array_equal(buffer.average(T0, 0.5).covariance, buffer_of(noisy).average(T0, 0.5).covariance)
 
 
@@ -105,7 +105,7 @@ def test_a_night_that_is_played_again_measures_the_same_noise():
     def played():
         for t, messages in zip(shots, night, strict=True):
             for message in messages:
-                buffer.add(message, NOISE)
+                buffer.keep(message, NOISE)
             yield buffer.average(T0 + t, 0.5).covariance
 
     first = list(played())
@@ -164,21 +164,21 @@ def test_broken_samples_are_refused_and_not_kept():
     impossible = sample(0.0, 60.0, 60.0)
     for broken in (sample(0.0, math.nan), sample(0.0, variance=-1.0), sample(-T0), impossible):
         with pytest.raises(TiltError):
-            buffer.add(broken, NOISE)
+            buffer.keep(broken, NOISE)
     assert len(buffer) == 0
 
 
 def test_complete_once_a_sample_of_the_exposures_end_is_here():
     buffer = buffer_of(sample(k / 10) for k in range(-5, 1))
     assert not buffer.complete(T0, 0.5)
-    buffer.add(sample(0.2), NOISE)
+    buffer.keep(sample(0.2), NOISE)
     assert buffer.complete(T0, 0.5)
 
 
 def test_the_sample_after_an_exposure_is_waited_for_where_the_last_one_in_it_leaves_its_end_open():
     buffer = buffer_of(sample(k - 0.2) for k in range(-3, 1))
     assert not buffer.complete(T0, 0.5)
-    buffer.add(sample(0.8, 5.0), NOISE)
+    buffer.keep(sample(0.8, 5.0), NOISE)
     assert buffer.complete(T0, 0.5)
     with pytest.raises(TiltError, match="uncovered"):
         buffer.average(T0, 0.5)

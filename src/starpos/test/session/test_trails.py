@@ -24,13 +24,13 @@ def told(monkeypatch):
     camera = type("Camera", (), {"fx": FOCAL_PX})
     monkeypatch.setattr(gyro_readings, "message_to_camera", lambda message, **_: camera)
     told = Trails("")
-    told.take_camera(None)
+    told.receive_camera(None)
     return told
 
 
 def turn(told, rate, begin_s=MID_S - 0.1, end_s=MID_S + 0.1):
     for t in np.arange(begin_s, end_s, 0.005):
-        told.take_imu(reading(t, rate))
+        told.receive_imu(reading(t, rate))
 
 
 @pytest.mark.parametrize(
@@ -82,7 +82,7 @@ def test_where_anything_lacks_there_is_none(told):
     assert told.told(replace(FRAME, exposure_s=None)).trail is None
     assert told.told(replace(FRAME, mid_unix_s=None)).trail is None
     with pytest.raises(VoyageError, match="NaN"):
-        told.take_imu(reading(MID_S + 1.0, (np.nan, 0.0, 0.0)))
+        told.receive_imu(reading(MID_S + 1.0, (np.nan, 0.0, 0.0)))
     unknown = Trails("")
     turn(unknown, (0.1, 0.0, 0.0))
     assert unknown.told(FRAME).trail is None

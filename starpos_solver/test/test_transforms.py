@@ -6,7 +6,8 @@ from types import SimpleNamespace
 import pytest
 
 from starpos.instrument.instrument import Calibration, Instrument
-from starpos.session.transforms import name_in, transforms_of
+from starpos.session.driver import name_in
+from starpos_solver.publishing import transforms_of
 
 INSTRUMENT = Instrument(1000.0, calibration=Calibration.of((0.4, -0.3, 35.0), (5.0,) * 3))
 
