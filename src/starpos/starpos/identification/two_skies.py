@@ -7,7 +7,8 @@ The second is another pose of the same camera: what is left over is identified a
 evidence. In both the second sky must be about as bright as the first: ghosts and glare are much fainter.
 
 Two skies a few pixels apart may be identified as one between them. Then the residuals of neighbouring stars differ by
-much more than their errors, and as much as the residuals of distant stars, which no lens does.
+much more than their errors, and as much as the residuals of distant stars, which no lens does; and each residual is
+one of two opposite ones, half of the offset, which centroids that err by more than they claim are not.
 """
 
 import math
@@ -52,6 +53,8 @@ STEEPEST_BEND = 0.2
 # Minimum difference of neighbours' residuals between two skies: in px; in their errors, times the first number plus the
 # second over the square root of the number of stars; and as a share of the difference of distant stars.
 MIXED_PX, MIXED, MIXED_BY_CHANCE, MIXED_EVERYWHERE = 1.2, 1.4, 2.0, 0.3
+# Maximum share of the residuals' mean square that two opposite offsets leave: 0.68 of normally distributed errors remain.
+MAX_LEFT_BY_OFFSETS = 0.35
 # With a smaller mean square of all residuals no two skies are mixed.
 MIN_MIXED_PX2 = MIXED_PX**2 * MIXED_EVERYWHERE
 # Minimum error of centroids (px), for errors that are not stated.
@@ -110,7 +113,20 @@ def _between_two(field: FrameStars, sky: Sky, found: Identification) -> bool:
         near2 > MIXED_PX**2
         and near2 > (MIXED + MIXED_BY_CHANCE / math.sqrt(stars)) ** 2 * expected2
         and near2 > MIXED_EVERYWHERE * far2
+        and _share_beyond_offsets(residual, terms[kept, :3]) < MAX_LEFT_BY_OFFSETS
     )
+
+
+def _share_beyond_offsets(residual: np.ndarray, plane: np.ndarray) -> float:
+    """Share of the mean square of residuals (N, 2) that an offset of either sign leaves.
+
+    plane (N, 1 or 3): 1 and the place on the frame, over which the offset may change, as where the camera was turned.
+    """
+    along = np.linalg.eigh(residual.T @ residual)[1][:, 1]
+    offset = np.where(residual @ along < 0, -1.0, 1.0)[:, None] * plane
+    left = residual - offset @ np.linalg.lstsq(offset, residual, rcond=None)[0]
+    free = 1 - offset.shape[1] / len(residual)
+    return float(np.square(left).sum() / (np.square(residual).sum() * free))
 
 
 def _every_star_twice(xy: np.ndarray, mag: np.ndarray, left: np.ndarray, size: np.ndarray) -> bool:

@@ -12,9 +12,10 @@ import numpy as np
 
 from starpos import rotation
 from starpos.earth.orientation import ROTATION_RAD_S
+from starpos.earth.place import Place
 from starpos.instrument.inclinometer import OUTDOORS_WALK_C_PER_SQRT_HOUR, InclinometerErrors
 from starpos.units import ARCSEC, HOUR_S
-from starpos.zenith.sighting import Mark, StarPlaces, ZenithSighting
+from starpos.zenith.sighting import StarPlaces, ZenithSighting
 
 TURNS_TRIED = 360
 
@@ -168,7 +169,7 @@ def errors_of(
     places: StarPlaces,
     faces: np.ndarray,
     inclinometer: InclinometerErrors,
-    mark: Mark,
+    mark: Place,
     since_unix_s: float,
 ) -> Errors:
     """The errors of a session; since_unix_s: time at which the tiltmeter's zero was found with A3, NaN: unknown."""
@@ -243,14 +244,16 @@ def _of_stars(lines: Lines, sightings: Sequence[ZenithSighting], places: StarPla
     ]
 
 
-def _of_time(lines: Lines, sightings: Sequence[ZenithSighting], mark: Mark) -> list[Source]:
+def _of_time(lines: Lines, sightings: Sequence[ZenithSighting], mark: Place) -> list[Source]:
     # in a second the sky turns about the pole
-    second = lines.by_sky @ (mark.enu[:, 2] * ROTATION_RAD_S)
+    second = lines.by_sky @ (mark.axes[:, 2] * ROTATION_RAD_S)
     clock = np.array([np.hypot(s.clock_stddev_s, s.stamp_stddev_s) for s in sightings])
     ut1 = np.array([s.orientation.ut1_sigma_s for s in sightings])
     pole = np.array([s.orientation.pole_sigma for s in sightings])
     return [
         Source.shared("clock", (second * clock[:, None])[..., None]),
         Source.shared("ut1", (second * np.hypot(ut1, DAILY_UT1_S)[:, None])[..., None]),
-        Source.shared("pole", lines.by_sky @ mark.enu[:, :2] * np.hypot(pole, DAILY_POLE_RAD)[:, None, None]),
+        Source.shared(
+            "pole", lines.by_sky @ mark.axes[:, :2] * np.hypot(pole, DAILY_POLE_RAD)[:, None, None]
+        ),
     ]

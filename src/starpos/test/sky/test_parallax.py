@@ -9,6 +9,7 @@ import pytest
 
 from starpos import rotation
 from starpos.earth.orientation import earth_state
+from starpos.earth.place import Place
 from starpos.earth.refraction import Atmosphere
 from starpos.fix.solver import Solver
 from starpos.frames.frame import Stars
@@ -19,7 +20,7 @@ from starpos.sky import catalogue as module
 from starpos.sky.catalogue import load_catalogue, pack, read, save
 from starpos.sky.site import Site
 from starpos.units import ARCSEC, DAY_S, MAS
-from starpos.zenith.sighting import Mark, sighting
+from starpos.zenith.sighting import sighting
 
 # HIP: J2000 place (deg), motions and parallax (mas) as SIMBAD has them: Hipparcos (van Leeuwen 2007), Gaia for Barnard's
 NEAREST = {
@@ -153,7 +154,7 @@ def _ground(site):
 
 ANSWERS = {
     "deflection": lambda solver, stars, found, tilt: (
-        sighting(solver, stars, found.found, Mark(*np.radians(PLACE), 0.0), tilt).enu_to_camera
+        sighting(solver, stars, found.found, Place.on_ellipsoid(*PLACE, height_m=0.0), tilt).enu_to_camera
     ),
     "fix": lambda solver, stars, found, tilt: solver.solve(stars, tilt).fix,
     "under way": lambda solver, stars, found, tilt: (
