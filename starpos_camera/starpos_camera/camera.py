@@ -22,7 +22,6 @@ from starpos import system_clock
 from starpos.errors import InstrumentError, StarposError
 from starpos.files import path_of
 from starpos.frames.exposure import Shutter
-from starpos.frames.frame import Frame
 from starpos.instrument import instrument_file
 from starpos.instrument.camera import Camera
 from starpos.instrument.instrument import focal_px_of
@@ -49,18 +48,13 @@ IMAGE_DEPTH = 2
 STAMP_SOURCES = ("unknown", "file", "driver", "command", "hardware", "simulated", "exif")
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Taken:
-    """A frame with its Capture, the intrinsics and the remark of its source, and how long it took.
+@dataclass(frozen=True, eq=False)
+class PreparedFrame:
+    """A frame ready to be published: its messages (image: None without subscribers), and how long it took."""
 
-    image: its message, None without subscribers.
-    """
-
-    frame: Frame
+    captured: CapturedFrame
     capture: Capture
     image: Image | None
-    camera: Camera | None
-    remark: str
     seconds: float
 
 
@@ -166,7 +160,7 @@ class CameraNode(Node):
     def _heard(self) -> bool:
         return self._images.get_subscription_count() > 0 or any(d.wanted for d in self._detectors)
 
-    def _prepare(self, settings: CaptureSettings) -> Taken:
+    def _prepare(self, settings: CaptureSettings) -> PreparedFrame:
         """Take a frame and make it ready to be published, in the worker's thread."""
         begin = time.monotonic()
         if time_is_simulated(self):
@@ -191,14 +185,8 @@ class CameraNode(Node):
         # A message is a copy of the frame, so it is made only for subscribers.
         heard = self._images.get_subscription_count()
         image = frame_to_message(frame, header.frame_id) if heard else None
-        return Taken(
-            frame=frame,
-            capture=capture,
-            image=image,
-            camera=exposure.camera,
-            remark=exposure.remark,
-            seconds=time.monotonic() - begin,
-        )
+        exposure = replace(exposure, frame=frame)
+        return PreparedFrame(exposure, capture, image, time.monotonic() - begin)
 
     def _capture(self, settings: CaptureSettings) -> CapturedFrame:
         if self._shutter is None:
@@ -227,18 +215,19 @@ class CameraNode(Node):
             else:
                 self._publish(result)
 
-    def _publish(self, taken: Taken) -> None:
-        frame, camera = taken.frame, self._intrinsics(taken)
-        info = camera_to_message(camera, taken.capture.header.frame_id)
-        info.header = taken.capture.header
-        self._captures.publish(taken.capture)
+    def _publish(self, prepared: PreparedFrame) -> None:
+        exposure, capture = prepared.captured, prepared.capture
+        frame, camera = exposure.frame, self._intrinsics(exposure)
+        info = camera_to_message(camera, capture.header.frame_id)
+        info.header = capture.header
+        self._captures.publish(capture)
         self._infos.publish(info)
-        if taken.image is not None:
-            self._images.publish(taken.image)
+        if prepared.image is not None:
+            self._images.publish(prepared.image)
         for detector in self._detectors:
-            detector.submit(frame, taken.capture.header)
+            detector.submit(frame, capture.header)
         self._frames += 1
-        self._last, self._last_took_s = taken.capture, taken.seconds
+        self._last, self._last_took_s = capture, prepared.seconds
         self._size = frame.width, frame.height
         if (camera.width, camera.height) != self._size:
             self._say(
@@ -246,16 +235,16 @@ class CameraNode(Node):
                 f"the calibration is of {camera.width} x {camera.height} px but the frames have {frame.width} x "
                 f"{frame.height} px: calibrate the camera as it is used.",
             )
-        elif taken.remark:
-            self._say(Level.WARN, taken.remark)
+        elif exposure.remark:
+            self._say(Level.WARN, exposure.remark)
         else:
             self._say(Level.OK, f"taking frames of {frame.width} x {frame.height} px.")
 
-    def _intrinsics(self, taken: Taken) -> Camera:
-        if known := self._calibration or taken.camera:
+    def _intrinsics(self, exposure: CapturedFrame) -> Camera:
+        if known := self._calibration or exposure.camera:
             return known
         focal_px = focal_px_of(self._values["focal_mm"], self._values["pixel_um"])
-        return Camera.from_focal(taken.frame.width, taken.frame.height, focal_px)
+        return Camera.from_focal(exposure.frame.width, exposure.frame.height, focal_px)
 
     def _say(self, level: Level, sentence: str) -> None:
         """Set the state; log it if it differs from the last logged one."""

@@ -93,7 +93,7 @@ def test_memory_stays_bounded_whatever_comes():
     parser = LineParser()
     for chunk in (b"$" * 10_000, b"$" + b"A" * 10_000, b"x" * 10_000, b"$T,"):
         assert parser.parse(chunk) == []
-        assert len(parser._splitter._rest) < mcu_protocol.MAX_LINE
+        assert len(parser._rest) < mcu_protocol.MAX_LINE
     assert [m.sequence for m in parser.parse(lines(1)[0])] == [0]
 
 

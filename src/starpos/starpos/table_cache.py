@@ -1,16 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tables of a star catalogue that are built once and kept in a cache on the disk, from which they are memory-mapped."""
 
+import hashlib
 import os
 import shutil
 import tempfile
+import threading
 import time
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import fields
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 
@@ -30,59 +32,107 @@ def cache_folder() -> Path:
         return Path(tempfile.gettempdir()) / f"starpos-{os.getuid()}"
 
 
-def load_or_build(
-    folder: Path, prefix: str, load: Callable[[], Table | None], build: Callable[[], Table], what: str
-) -> Table:
-    """The table that `load` maps from a folder of the cache; built and kept there if it is missing or broken.
+class KeptTables(Generic[Table]):
+    """Tables of one kind, dataclasses of arrays with a method `check`: in the cache, and the last few in memory too.
 
-    prefix: of the folder's name, KIND-FORMAT-; folders of other formats are removed.
-    what: name of the table in a warning if it cannot be kept; '' for a table that is quick to build, without a warning.
+    prefix        of the folders' names, KIND-FORMAT-; folders of other formats are removed
+    number_kinds  numpy's kinds of the columns' numbers
+    what          name of the table in a warning if it cannot be kept; '' for one that is quick to build
+    most          number of tables in memory
+    newer         makes the columns that folders of earlier versions lack, from the others
     """
-    if (stored := load()) is not None:
-        return stored
-    with _one_builder(folder.parent):
-        # another process may have been first
-        if (stored := load()) is not None:
+
+    def __init__(
+        self,
+        kind: type[Table],
+        prefix: str,
+        number_kinds: str,
+        what: str = "",
+        most: int = 1,
+        newer: Callable[[dict[str, np.ndarray]], dict[str, np.ndarray]] = lambda columns: {},
+    ) -> None:
+        self.kind, self.prefix, self.number_kinds = kind, prefix, number_kinds
+        self.what, self.most, self.newer = what, most, newer
+        self._lock = threading.Lock()
+        self._in_use: dict[Path, Table] = {}
+
+    def folder(self, name: str) -> Path:
+        """The folder of a table in the cache."""
+        return cache_folder() / f"{self.prefix}{name}"
+
+    def forget(self) -> None:
+        """Let go of the tables in memory."""
+        self._in_use.clear()
+
+    def stored(self, name: str, *of: Any) -> Table | None:
+        """The table of a name; None if it was not built, or is broken: `check(*of)` raises ValueError."""
+        folder = self.folder(name)
+        with self._lock:
+            if folder not in self._in_use and (found := self.mapped(folder, *of)) is not None:
+                self._keep(folder, found)
+            return self._in_use.get(folder)
+
+    def built(self, name: str, build: Callable[[], Table], *of: Any, anew: bool = False) -> Table:
+        """The table of a name; built and kept in the cache if it is missing or broken, or wanted anew."""
+        folder = self.folder(name)
+        with self._lock:
+            if anew or folder not in self._in_use:
+                self._in_use.pop(folder, None)
+                self._keep(folder, self._load_or_build(folder, build, of, anew))
+            return self._in_use[folder]
+
+    def _keep(self, folder: Path, table: Table) -> None:
+        while len(self._in_use) >= self.most:
+            self._in_use.pop(next(iter(self._in_use)))
+        self._in_use[folder] = table
+
+    def _load_or_build(self, folder: Path, build: Callable[[], Table], of: tuple, anew: bool) -> Table:
+        if not anew and (stored := self.mapped(folder, *of)) is not None:
             return stored
-        built = build()
+        with _one_builder(folder.parent):
+            # another process may have been first
+            if not anew and (stored := self.mapped(folder, *of)) is not None:
+                return stored
+            built = build()
+            try:
+                _store(built, folder, self.prefix)
+            except OSError as e:
+                if self.what:
+                    warnings.warn(
+                        f"{folder.parent}: {self.what} cannot be kept there ({e.strerror}), so that each start builds "
+                        "them again: make the folder writable or set XDG_CACHE_HOME",
+                        stacklevel=4,
+                    )
+                return built
+            # the mapped table takes its place in memory
+            del built
+        stored = self.mapped(folder, *of)
+        return build() if stored is None else stored
+
+    def mapped(self, folder: Path, *of: Any) -> Table | None:
+        """The table in a folder, memory-mapped; None if a column is missing, of another kind, or does not fit."""
+        names = [f.name for f in fields(self.kind)]  # type: ignore[arg-type]
         try:
-            _store(built, folder, prefix)
-        except OSError as e:
-            if what:
-                warnings.warn(
-                    f"{folder.parent}: {what} cannot be kept there ({e.strerror}), so that each start builds them again: "
-                    "make the folder writable or set XDG_CACHE_HOME",
-                    stacklevel=3,
-                )
-            return built
-        # the mapped table takes its place in memory
-        del built
-    return load() or build()
+            columns = {
+                name: np.asarray(np.load(path, mmap_mode="r", allow_pickle=False))
+                for name in names
+                if (path := folder / f"{name}.npy").exists()
+            }
+            if len(columns) < len(names):
+                columns = {**self.newer(columns), **columns}
+            ordered = {name: columns[name] for name in names}
+            if [c.dtype.kind for c in ordered.values()] != list(self.number_kinds):
+                return None
+            table: Any = self.kind(**ordered)
+            table.check(*of)
+        except (OSError, ValueError, EOFError, KeyError):
+            return None
+        return table  # type: ignore[no-any-return]
 
 
-def mapped(
-    kind: type,
-    folder: Path,
-    number_kinds: str,
-    newer: Callable[[dict[str, np.ndarray]], dict[str, np.ndarray]] = lambda columns: {},
-) -> Any | None:
-    """The table, a dataclass of arrays, memory-mapped; None if a column is missing or not of its kind of numbers.
-
-    newer: makes the columns that folders of earlier versions lack, from the others.
-    """
-    try:
-        columns = {
-            path.stem: np.asarray(np.load(path, mmap_mode="r", allow_pickle=False))
-            for f in fields(kind)
-            if (path := folder / f"{f.name}.npy").exists()
-        }
-        names = [f.name for f in fields(kind)]
-        if len(columns) < len(names):
-            columns = {**newer(columns), **columns}
-        ordered = {name: columns[name] for name in names}
-    except (OSError, ValueError, EOFError, KeyError):
-        return None
-    return kind(**ordered) if [c.dtype.kind for c in ordered.values()] == list(number_kinds) else None
+def digest_of(settings: object) -> str:
+    """A digest of settings, of which a table's name is made."""
+    return hashlib.sha256(repr(settings).encode()).hexdigest()[:16]
 
 
 def rising(start: np.ndarray, end: int) -> bool:

@@ -10,8 +10,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from starpos.earth.ellipsoid import curvature_radii_m, enu_axes
+from starpos.earth.place import Place
 from starpos.gnss.filter import LevelSight
-from starpos.gnss.receiver import GnssPlace
+from starpos.gnss.receiver import gnss_place
 from starpos.instrument.inclinometer import InclinometerErrors, Tilt
 from starpos.instrument.instrument import Calibration, Instrument
 from starpos.rotation import about_axis, from_vector
@@ -29,7 +30,7 @@ class DriveFrame:
     """A frame of a drive: the sighting, GNSS's place, and the true one (latitude, longitude in rad)."""
 
     sighting: LevelSight
-    gnss: GnssPlace
+    gnss: Place
     place: tuple[float, float]
 
 
@@ -117,11 +118,6 @@ class GnssDrive:
                         latitude=latitude,
                         longitude=longitude,
                     ),
-                    GnssPlace(
-                        utc_unix_s=1.7e9 + t,
-                        latitude=latitude + off[1],
-                        longitude=longitude + off[0],
-                        covariance=np.eye(2) * STATED_M**2,
-                    ),
+                    gnss_place(1.7e9 + t, latitude + off[1], longitude + off[0], np.eye(2) * STATED_M**2),
                     (latitude, longitude),
                 )

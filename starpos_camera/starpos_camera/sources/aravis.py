@@ -165,30 +165,30 @@ class AravisCamera:
 
     def __init__(self, values: Mapping) -> None:
         self._aravis = library()
-        self._camera = self._aravis.Camera.new(_found(self._aravis, values["aravis.device"]))
+        self.camera = self._aravis.Camera.new(_find_camera(self._aravis, values["aravis.device"]))
         self._exposure_s: float | None = None
         self._gain: float | None = None
         self._size = self._set_region(values["aravis.region_as_set"])
         self._pattern, self._bits = self._set_format(values["aravis.pixel_format"])
         self.shutter = self._shutter()
-        self._camera.set_acquisition_mode(self._aravis.AcquisitionMode.CONTINUOUS)
-        self._camera.set_trigger(values["aravis.trigger"])
-        self._stream = self._camera.create_stream(None, None)
+        self.camera.set_acquisition_mode(self._aravis.AcquisitionMode.CONTINUOUS)
+        self.camera.set_trigger(values["aravis.trigger"])
+        self._stream = self.camera.create_stream(None, None)
         if self._stream is None:
             raise CaptureError("it sends no frames; another program holds it.")
         for _ in range(BUFFERS):
-            self._stream.push_buffer(self._aravis.Buffer.new_allocate(self._camera.get_payload()))
-        self._camera.start_acquisition()
+            self._stream.push_buffer(self._aravis.Buffer.new_allocate(self.camera.get_payload()))
+        self.camera.start_acquisition()
 
     def release(self) -> None:
         """Stop and forget the camera, which may have gone."""
         with suppress(Exception):
-            self._camera.stop_acquisition()
-        self._stream = self._camera = None
+            self.camera.stop_acquisition()
+        self._stream = self.camera = None
 
     def set_exposure(self, wanted_s: float | None) -> tuple[float, str]:
         """Set the exposure if it was not set last; return the camera's own (s), and a remark if it is another one."""
-        camera = self._camera
+        camera = self.camera
         if wanted_s is not None and wanted_s != self._exposure_s:
             if camera.is_exposure_auto_available():
                 camera.set_exposure_time_auto(self._aravis.Auto.OFF)
@@ -203,7 +203,7 @@ class AravisCamera:
 
     def set_gain(self, wanted: float | None) -> str:
         """Set the gain if it was not set last; return a remark if the camera has another one."""
-        camera = self._camera
+        camera = self.camera
         if wanted is None:
             return ""
         if wanted != self._gain:
@@ -217,7 +217,7 @@ class AravisCamera:
         )
 
     def trigger(self) -> None:
-        self._camera.software_trigger()
+        self.camera.software_trigger()
 
     def drain(self) -> None:
         """Leave out the frames that came before."""
@@ -233,10 +233,6 @@ class AravisCamera:
             return self._read(buffer)
         finally:
             self._stream.push_buffer(buffer)
-
-    def clock_relation(self, now: Callable[[], float]) -> ClockRelation | None:
-        """Compare the camera's clock with `now` (Unix s); None if it cannot be read."""
-        return clock_relation(self._camera, now)
 
     def _read(self, buffer: Any) -> ArrivedFrame:
         if buffer.get_status() != self._aravis.BufferStatus.SUCCESS:
@@ -256,7 +252,7 @@ class AravisCamera:
 
     def _set_region(self, as_set: bool) -> tuple[int, int]:
         """Set the whole sensor, unless its present region is meant; return width and height (px)."""
-        camera = self._camera
+        camera = self.camera
         sensor = camera.get_sensor_size()
         if not as_set:
             if camera.is_binning_available():
@@ -274,25 +270,25 @@ class AravisCamera:
 
     def _set_format(self, wanted: str) -> tuple[str, int]:
         """Set the pixel format; return its pattern and bits."""
-        offered = self._camera.dup_available_pixel_formats_as_strings()
+        offered = self.camera.dup_available_pixel_formats_as_strings()
         if wanted and (wanted not in FORMATS or wanted not in offered):
             raise CaptureError(
                 f"aravis.pixel_format is {wanted}; it offers {' '.join(offered)}, and this source knows unpacked Mono "
                 "and Bayer formats."
             )
-        name = wanted or best_format(offered, self._camera.get_pixel_format_as_string())
-        self._camera.set_pixel_format_from_string(name)
+        name = wanted or best_format(offered, self.camera.get_pixel_format_as_string())
+        self.camera.set_pixel_format_from_string(name)
         return FORMATS[name]
 
     def _shutter(self) -> Shutter | None:
         """A global shutter where the camera says that it has one; else nothing is known."""
         name = "SensorShutterMode"
-        if self._camera.is_feature_available(name) and self._camera.get_string(name) == "Global":
+        if self.camera.is_feature_available(name) and self.camera.get_string(name) == "Global":
             return Shutter(0.0, 0.0)
         return None
 
 
-def _found(aravis: ModuleType, wanted: str) -> str:
+def _find_camera(aravis: ModuleType, wanted: str) -> str:
     """Name the camera to open; CaptureError if it is not there."""
     aravis.update_device_list()
     names = [aravis.get_device_id(i) for i in range(aravis.get_n_devices())]
@@ -406,7 +402,7 @@ class Aravis(DeviceSource[AravisCamera]):
             commanded_s=commanded_s if triggers else None,
             received_s=received_s,
             camera_s=buffer.camera_s,
-            relation=camera.clock_relation(self._now),
+            relation=clock_relation(camera.camera, self._now),
         )
         stamp = stamp_of_camera(times, self._values["aravis.timestamp"], self._values)
         frame = Frame(

@@ -15,7 +15,6 @@ V4L2 cameras and video files, through OpenCV.
 
 import math
 import os
-import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -32,6 +31,7 @@ from starpos_camera.sources.source import (
     CapturedFrame,
     CaptureError,
     CaptureSettings,
+    DeviceSource,
     FrameSource,
     SourceEnded,
 )
@@ -90,57 +90,52 @@ JPEG = ("MJPG", "JPEG")
 FORMATS = (*MONO, *LUMA, *PLANAR, *MOSAIC, *COLOUR, *JPEG)
 
 
-class V4l2Device:
+class V4l2(DeviceSource["VideoCapture"]):
     """Keeps the camera streaming; `capture` returns the first frame that was exposed after the call."""
 
     def __init__(self, path: str, values: Mapping, now: Callable[[], float]) -> None:
-        self.closing = False
-        self._path = path
-        self._values = values
-        self._now = now
-        self._capture: VideoCapture | None = None
+        super().__init__(values, now)
+        self.hardware_id = path
         self._format, self._size = "", (0, 0)
         # Exposure and gain that were set last.
         self._set: tuple[float | None, float | None] | None = None
         # Frames before this steady time have other settings.
         self._not_before_s = 0.0
 
-    def capture(self, settings: CaptureSettings) -> CapturedFrame:
-        try:
-            with quiet() as cv2:
-                if self._capture is None:
-                    self._capture = self._opened(cv2)
-                camera = self._capture
-                exposure_s, remark = self._settings(cv2, camera, settings)
-                mid_s, stddev_s, stamp = self._grab(cv2, camera, exposure_s)
-                period_s = _period_s(cv2, camera)
-                came, raw = camera.retrieve()
-                if not came:
-                    raise CaptureError("it gave no frame.")
-                pixels, pattern = self._pixels(cv2, raw)
-        except Exception as error:
-            self.close()
-            text = str(error) if isinstance(error, CaptureError) else f"{type(error).__name__}: {error}."
-            raise CaptureError(f"{self._path}: {' '.join(text.split())}") from error
+    def _expose(self, device: "VideoCapture", settings: CaptureSettings) -> CapturedFrame:
+        with quiet() as cv2:
+            exposure_s, remark = self._settings(cv2, device, settings)
+            mid_s, stddev_s, stamp = self._grab(cv2, device, exposure_s)
+            period_s = _period_s(cv2, device)
+            came, raw = device.retrieve()
+            if not came:
+                raise CaptureError("it gave no frame.")
+            pixels, pattern = self._pixels(cv2, raw)
         frame = Frame(
             pixels,
             pattern=pattern,
             mid_unix_s=mid_s,
             exposure_s=exposure_s,
-            source=self._path,
+            source=self.hardware_id,
             stamp_stddev_s=stddev_s,
             # from either end, and no longer than from one frame to the next
             shutter=Shutter(0.0, min(period_s, MAX_READOUT_S) / math.sqrt(3)),
         )
-        return CapturedFrame(frame, stamp, remark=remark and f"{self._path}: {remark}")
+        return CapturedFrame(frame, stamp, remark=remark and f"{self.hardware_id}: {remark}")
 
-    def close(self) -> None:
-        if self._capture is not None:
-            self._capture.release()
-        self._capture = None
+    def _close(self, device: "VideoCapture") -> None:
+        device.release()
+
+    def _explain(self, error: Exception) -> str:
+        text = str(error) if isinstance(error, CaptureError) else f"{type(error).__name__}: {error}."
+        return " ".join(text.split())
+
+    def _open(self) -> "VideoCapture":
+        with quiet() as cv2:
+            return self._opened(cv2)
 
     def _opened(self, cv2: ModuleType) -> "VideoCapture":
-        capture = cv2.VideoCapture(self._path, cv2.CAP_V4L2)
+        capture = cv2.VideoCapture(self.hardware_id, cv2.CAP_V4L2)
         if not capture.isOpened():
             raise CaptureError(
                 "it cannot be opened as a camera; it is unplugged, in use, or not yours (be in the group video)."
@@ -211,7 +206,7 @@ class V4l2Device:
         before_s: float | None = None
         apart_s: list[float] = []
         unstamped = 0
-        while time.monotonic() < end_s and not self.closing:
+        while time.monotonic() < end_s and not self._closing.is_set():
             if not capture.grab():
                 raise CaptureError("it gives no frame; check its plug.")
             steady_s, now_s = self._clocks()
@@ -231,7 +226,7 @@ class V4l2Device:
                 if at_s - latest_s >= asked_s and (stamped or unstamped > stale + 1):
                     return now_s - age_s - lag_s, stddev_s, Capture.HARDWARE if stamped else Capture.DRIVER
             before_s = at_s
-        if self.closing:
+        if self._closing.is_set():
             raise CaptureError("the node ends.")
         raise CaptureError(
             "it gives frames, but none that was exposed after it was asked for; its clock is wrong."
@@ -316,19 +311,16 @@ OPTIONS_IN = "OPENCV_FFMPEG_CAPTURE_OPTIONS"
 GREY_8, GREY_16 = 0x30303859, 0x10003159
 
 
-class Film:
+class Film(DeviceSource["VideoCapture"]):
     """Plays a file once. If its disk goes away and comes back, it goes on at the next frame."""
 
-    # Set by the source; a frame of a file takes no time, so nothing waits for it.
-    closing = False
-
-    def __init__(self, path: str, start: str) -> None:
-        self._path = path
-        started = read_utc(start)
+    def __init__(self, path: str, values: Mapping, now: Callable[[], float]) -> None:
+        super().__init__(values, now)
+        self.hardware_id = self._path = path
+        started = read_utc(values["video.start"])
         # Video.refusal has checked it.
         assert started is not None
         self._start_s, self._start_resolution_s = started
-        self._capture: VideoCapture | None = None
         self._grey = False
         self._period_s = 0.0
         self._taken = 0
@@ -339,15 +331,20 @@ class Film:
     def capture(self, settings: CaptureSettings) -> CapturedFrame:
         if self._ended:
             raise SourceEnded(self._ended)
-        if not Path(self._path).is_file():
-            self.close()
-            raise CaptureError(f"{self._path}: it is not there; correct video.device, or mount its disk.")
+        return super().capture(settings)
+
+    def _close(self, device: "VideoCapture") -> None:
+        device.release()
+
+    def _explain(self, error: Exception) -> None:
+        """Return None: errors of a file have its path already."""
+
+    def _expose(self, device: "VideoCapture", settings: CaptureSettings) -> CapturedFrame:
+        self._check_there()
         with quiet() as cv2:
-            if self._capture is None:
-                self._capture = self._opened(cv2)
-            came, pixels = self._capture.read()
-            at_s = self._capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
-            frames = self._capture.get(cv2.CAP_PROP_FRAME_COUNT)
+            came, pixels = device.read()
+            at_s = device.get(cv2.CAP_PROP_POS_MSEC) / 1000
+            frames = device.get(cv2.CAP_PROP_FRAME_COUNT)
         if not came:
             self._ended = f"all {self._taken} frames of {self._path} are played."
             if self._taken < frames:
@@ -372,10 +369,14 @@ class Film:
         frame = Frame(pixels, mid_unix_s=mid_s, source=self._path, stamp_stddev_s=stddev_s)
         return CapturedFrame(frame, Capture.FILE)
 
-    def close(self) -> None:
-        if self._capture is not None:
-            self._capture.release()
-        self._capture = None
+    def _check_there(self) -> None:
+        if not Path(self._path).is_file():
+            raise CaptureError(f"{self._path}: it is not there; correct video.device, or mount its disk.")
+
+    def _open(self) -> "VideoCapture":
+        self._check_there()
+        with quiet() as cv2:
+            return self._opened(cv2)
 
     def _opened(self, cv2: ModuleType) -> "VideoCapture":
         at, beginnings = BEGINNINGS[Path(self._path).suffix.lower()]
@@ -459,12 +460,7 @@ class Video(FrameSource):
         # Without a listener the first frames of a file would be played before the detector is ready.
         self.waits_for_listener = not is_camera(device)
         self.hardware_id = f"/dev/video{device}" if device.isdecimal() else str(Path(device).expanduser())
-        self._in_use = threading.Lock()
-        self._from: V4l2Device | Film = (
-            V4l2Device(self.hardware_id, values, now)
-            if is_camera(device)
-            else Film(self.hardware_id, values["video.start"])
-        )
+        self._from = (V4l2 if is_camera(device) else Film)(self.hardware_id, values, now)
 
     def lacking(self) -> str | None:
         if not Path(self.hardware_id).exists():
@@ -472,13 +468,13 @@ class Video(FrameSource):
         return None
 
     def capture(self, settings: CaptureSettings) -> CapturedFrame:
-        with self._in_use:
-            return self._from.capture(settings)
+        return self._from.capture(settings)
+
+    def update(self, values: Mapping) -> None:
+        self._from.update(values)
 
     def close(self) -> None:
-        self._from.closing = True
-        with self._in_use:
-            self._from.close()
+        self._from.close()
 
 
 def is_camera(device: str) -> bool:

@@ -164,63 +164,40 @@ def rate_command(rate_hz: int) -> bytes:
     return frame(b"R,%02X" % rate_hz)
 
 
-class LineSplitter:
-    """Collects framed lines from chunks of bytes; keeps at most one line; never raises, whatever comes."""
+class LineParser:
+    """Parses and counts the MCU's messages from chunks of bytes; keeps at most one line; never raises, whatever comes."""
 
     def __init__(self) -> None:
-        self.garbage_bytes = 0
+        self.good = self.crc_errors = self.malformed = self.garbage_bytes = 0
         self._rest = b""
 
-    def split(self, data: bytes) -> list[tuple[bytes, bool]]:
-        """Return the bodies of the lines that end in `data`, each with whether its checksum is right."""
+    def parse(self, data: bytes) -> list[Message]:
+        """Return the messages that `data` completes, in order; none with a wrong checksum or an impossible field."""
+        messages: list[Message] = []
         buffer = self._rest + data
-        lines = []
         end = 0
         for match in _LINE.finditer(buffer):
             self.garbage_bytes += match.start() - end
             end = match.end()
-            lines.append((match[1], checksum(match[1]) == int(match[2], 16)))
+            if checksum(match[1]) != int(match[2], 16):
+                self.crc_errors += 1
+            elif (message := _parse(match[1])) is None:
+                self.malformed += 1
+            else:
+                self.good += 1
+                messages.append(message)
         # A '$' can only be the first byte of a line, so bytes before the last '$' cannot become a line any more.
         start = buffer.rfind(b"$", end)
         if start < 0 or len(buffer) - start >= MAX_LINE:
             start = len(buffer)
         self.garbage_bytes += start - end
         self._rest = buffer[start:]
-        return lines
+        return messages
 
     def forget(self) -> None:
         """Drop a half-received line, because the next bytes come from another connection."""
         self.garbage_bytes += len(self._rest)
         self._rest = b""
-
-
-class LineParser:
-    """Parses and counts the MCU's messages from chunks of bytes."""
-
-    def __init__(self) -> None:
-        self.good = self.crc_errors = self.malformed = 0
-        self._splitter = LineSplitter()
-
-    @property
-    def garbage_bytes(self) -> int:
-        return self._splitter.garbage_bytes
-
-    def parse(self, data: bytes) -> list[Message]:
-        """Return the messages that `data` completes, in order; none with a wrong checksum or an impossible field."""
-        messages: list[Message] = []
-        for body, right in self._splitter.split(data):
-            if not right:
-                self.crc_errors += 1
-            elif (message := _parse(body)) is None:
-                self.malformed += 1
-            else:
-                self.good += 1
-                messages.append(message)
-        return messages
-
-    def forget(self) -> None:
-        """Drop a half-received line, because the next bytes come from another connection."""
-        self._splitter.forget()
 
 
 def _parse(body: bytes) -> Message | None:

@@ -13,6 +13,7 @@ from starpos.cli import console, inputs, options
 from starpos.cli.console import Output, add_formats
 from starpos.cli.inputs import checked_tilts, frames_among, given_of, reader_of
 from starpos.earth.orientation import earth_state
+from starpos.earth.place import Place
 from starpos.errors import FixError, FrameError, InstrumentError, TiltError
 from starpos.fix.solution import Solution
 from starpos.fix.solver import Solver
@@ -26,7 +27,7 @@ from starpos.units import ARCSEC, utc_text
 from starpos.zenith.adjustment import FaceQuality, Reduced, StarQuality, reduced
 from starpos.zenith.doubts import DeflectionSession, remarks
 from starpos.zenith.planning import Planner, Routine, SessionPlan, ZenithSky
-from starpos.zenith.sighting import Mark, ZenithSighting
+from starpos.zenith.sighting import ZenithSighting
 
 COLUMNS = ("file", "combined", "status", "utc", "face", "heading", "xi_arcsec", "eta_arcsec", "sigma_xi_arcsec",
            "sigma_eta_arcsec", "stars_matched", "residual_arcsec", "faces", "frames")  # fmt: skip
@@ -71,7 +72,7 @@ def frame_line(value: dict) -> str:
 
 
 def combined_json(
-    session: DeflectionSession, without: Reduced, mark: Mark, station: str, catalogue: Catalogue
+    session: DeflectionSession, without: Reduced, mark: Place, station: str, catalogue: Catalogue
 ) -> dict:
     """The session's value; station: name of the mark, '' for none.  catalogue: of which its stars are rows."""
     found = session.adjusted
@@ -242,7 +243,7 @@ def add_plan(parser: argparse.ArgumentParser) -> None:
     options.add_frame_size(plan)
 
 
-def run_plan(args: argparse.Namespace, mark: Mark) -> int:
+def run_plan(args: argparse.Namespace, mark: Place) -> int:
     """Print the plan; returns the exit status."""
     if args.frames or args.tilt is not None:
         raise InstrumentError("--plan is for a session that has no frames yet: leave out frames and --tilt")
@@ -368,7 +369,7 @@ class _Taken:
     catalogue: Catalogue
 
 
-def _of_files(args: argparse.Namespace, mark: Mark) -> _Taken | None:
+def _of_files(args: argparse.Namespace, mark: Place) -> _Taken | None:
     """The sightings of files; None where no frame can be read, which has been said."""
     if not args.frames or args.tilt is None:
         raise InstrumentError("give frames and --tilt CSV, or a bag, or --plan SIGMA")
@@ -403,7 +404,7 @@ def _is_bag(args: argparse.Namespace) -> bool:
     return bool(bag)
 
 
-def _of_bag(args: argparse.Namespace, mark: Mark) -> _Taken:
+def _of_bag(args: argparse.Namespace, mark: Place) -> _Taken:
     """The sightings of a bag's frames."""
     path = Path(args.frames[0])
     found, instruments = inputs.read_bag(path, args)
@@ -423,7 +424,7 @@ def _of_bag(args: argparse.Namespace, mark: Mark) -> _Taken:
     return _Taken(names, answers, instrument, catalogue)
 
 
-def _tell(args: argparse.Namespace, taken: _Taken, mark: Mark) -> int:
+def _tell(args: argparse.Namespace, taken: _Taken, mark: Place) -> int:
     """Adjust the session and print it; returns the exit status."""
     output = Output(args, COLUMNS, HEAD)
     for remark in of_inclinometer(taken.instrument):
@@ -454,13 +455,13 @@ def _tell(args: argparse.Namespace, taken: _Taken, mark: Mark) -> int:
     return console.UNREADABLE if any(isinstance(a, FrameError) for a in taken.answers) else 0
 
 
-def _mark_of(args: argparse.Namespace) -> Mark:
+def _mark_of(args: argparse.Namespace) -> Place:
     latitude, longitude, height_m = args.site
     if not (abs(latitude) <= 90 and abs(longitude) <= 360 and -1000 <= height_m <= 9000):
         raise InstrumentError(
             f"--site {latitude:g} {longitude:g} {height_m:g}: give latitude and longitude in deg and the height in m"
         )
-    return Mark(float(np.radians(latitude)), float(np.radians(longitude)), height_m)
+    return Place.on_ellipsoid(latitude, longitude, height_m=height_m)
 
 
 def _why(path: str, answer: Solution | FrameError) -> str:

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The pointing of a frame of unknown scale and lens."""
 
+import math
 import time
 from dataclasses import dataclass, replace
 
@@ -28,6 +29,8 @@ from starpos.instrument.camera import Camera
 from starpos.progress import CpuLimit, Progress, quiet
 from starpos.sky.catalogue import Catalogue
 
+# A lens whose frame's diagonal is a smaller multiple of its focal length is no fisheye: 1.4 for 26 mm on full format.
+MAX_FISHEYE_DIAGONAL = 2.2
 # CPU time, s, of the search for one frame.
 SEARCH_S = 20.0
 
@@ -91,7 +94,9 @@ class BlindSolver:
             return identify_blind(*about, self.stages, near_px, seen.window, limit, self.progress)
 
         ways = (by_pinhole, by_fisheye)
-        if seen.fisheye or disc_radius_px(xy, seen.width, seen.height) is not None:
+        # stars in a disc are of a fisheye, unless EXIF states a longer lens: a vignette or a roof may shape them, too
+        narrow = near_px is not None and near_px > math.hypot(seen.width, seen.height) / MAX_FISHEYE_DIAGONAL
+        if seen.fisheye or (not narrow and disc_radius_px(xy, seen.width, seen.height) is not None):
             ways = (by_fisheye, by_pinhole)
         return ways[0]() or ways[1]()
 

@@ -8,10 +8,11 @@ import numpy as np
 
 from starpos import rotation
 from starpos.earth.ellipsoid import curvature_radii_m, enu_axes, place_of_zenith
+from starpos.earth.place import Place
 from starpos.earth.vertical import Vertical
 from starpos.fix.budget import Origin, total_covariance
 from starpos.fix.fix import Fix
-from starpos.gnss.receiver import GnssPlace
+from starpos.gnss.receiver import gnss_place
 from starpos.gnss.states import Learned, aged, ageing, prior
 from starpos.instrument.inclinometer import Tilt
 from starpos.instrument.instrument import Instrument
@@ -84,7 +85,7 @@ class Innovation:
 
 def innovation(
     sighting: LevelSight,
-    gnss: GnssPlace,
+    gnss: Place,
     learned: Learned,
     vertical: Vertical,
     up_in_camera: np.ndarray | None = None,
@@ -116,10 +117,8 @@ def tilt_noise(sighting: LevelSight, learned: Learned) -> np.ndarray:
     return back @ sighting.tilt.noise @ back.T
 
 
-def place_of_stars(
-    sighting: LevelSight, learned: Learned, vertical: Vertical
-) -> tuple[float, float, np.ndarray]:
-    """Geodetic latitude, longitude (rad) by the stars alone, and its covariance (2, 2) of east, north, m2."""
+def place_of_stars(sighting: LevelSight, learned: Learned, vertical: Vertical) -> Place:
+    """The place by the stars alone, on the ellipsoid."""
     zenith = zenith_of_stars(sighting, learned)
     latitude, longitude = place_of_zenith(zenith)
     axes = enu_axes(latitude, longitude)
@@ -132,7 +131,7 @@ def place_of_stars(
     covariance = rows @ learned.covariance @ rows.T + noise
     radii = np.array(curvature_radii_m(latitude))
     latitude, longitude = place_of_zenith(rotation.normalised(axes[2] - east_north @ axes[:2]))
-    return latitude, longitude, covariance * np.outer(radii, radii)
+    return gnss_place(sighting.utc_unix_s, latitude, longitude, covariance * np.outer(radii, radii))
 
 
 # An A3 known so well, across the plumb line and about it, is linear: the squares of what is left are below 0.5 arcsec.
@@ -177,7 +176,7 @@ class GnssFrame:
     """
 
     sighting: LevelSight
-    gnss: GnssPlace
+    gnss: Place
     new_pose: bool
     up_in_camera: np.ndarray
 
@@ -216,7 +215,7 @@ def taught(learned: Learned, frame: GnssFrame, instrument: Instrument, vertical:
     """The state after a frame that comes later than all before."""
     gnss, sighting = frame.gnss, frame.sighting
     assert learned.place is not None
-    moved_m = float(np.linalg.norm(gnss.from_place_m(*learned.place))) if frame.new_pose else 0.0
+    moved_m = float(np.linalg.norm(gnss.offset_m(*learned.place))) if frame.new_pose else 0.0
     stddev = stddev_rad(vertical, gnss.latitude, gnss.longitude)
     passed = ageing(
         learned, instrument.inclinometer, sighting.tilt, sighting.utc_unix_s, moved_m, stddev, frame.new_pose

@@ -6,15 +6,12 @@ import io
 import math
 import re
 from collections import Counter
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from starpos.earth.ellipsoid import curvature_radii_m, enu_axes, zenith_of
-from starpos.earth.place import Place
-from starpos.earth.vertical import Vertical
+from starpos.earth.place import UNDEFLECTED, Place
 from starpos.errors import GnssError, one_line
 from starpos.files import read_regular
 from starpos.messages.stamp import stamp_to_unix
@@ -28,35 +25,23 @@ MAX_SIGMA_M = 10_000.0
 NULL_ISLAND_DEG = 1e-5
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class GnssPlace:
-    """Latitude and longitude on WGS 84 (rad), and the covariance (2, 2) of east and north, m2."""
-
-    utc_unix_s: float
-    latitude: float
-    longitude: float
-    covariance: np.ndarray
-
-    @property
-    def zenith(self) -> np.ndarray:
-        """Up (3,) in ITRS by the ellipsoid."""
-        return zenith_of(self.latitude, self.longitude)
-
-    @property
-    def axes(self) -> np.ndarray:
-        """East, north, up (3, 3) in ITRS by the ellipsoid."""
-        return enu_axes(self.latitude, self.longitude)
-
-    def from_place_m(self, latitude: float, longitude: float) -> np.ndarray:
-        """East, north (2,) in m from a geodetic place (rad) to this one."""
-        prime, meridian = curvature_radii_m(latitude)
-        east = half_turn(self.longitude - longitude) * prime * np.cos(latitude)
-        return np.array([east, (self.latitude - latitude) * meridian])
+def gnss_place(utc_unix_s: float, latitude: float, longitude: float, covariance: np.ndarray) -> Place:
+    """A receiver's place at a time: rad on WGS 84, and the covariance (2, 2) of east and north, m2."""
+    return Place(
+        latitude=latitude,
+        longitude=longitude,
+        plumb=(latitude, longitude),
+        covariance=covariance,
+        deflection=UNDEFLECTED,
+        plumb_stddev=0.0,
+        ellipsoid_stddev=0.0,
+        utc_unix_s=utc_unix_s,
+    )
 
 
 def checked(
     utc_unix_s: float, latitude_deg: float, longitude_deg: float, covariance: np.ndarray, status: float
-) -> GnssPlace:
+) -> Place:
     """The place of a receiver's output; GnssError that says why it gives none.
 
     covariance (2, 2): of east and north, m2.  status: as in NavSatStatus, below 0 without a fix.
@@ -79,15 +64,11 @@ def checked(
         raise GnssError("GNSS states no error of its place: have its driver fill in the covariance")
     if np.sqrt(np.trace(covariance)) > MAX_SIGMA_M:
         raise GnssError(f"GNSS states an error of over {MAX_SIGMA_M / 1000:g} km: it is left out")
-    return GnssPlace(
-        utc_unix_s=utc_unix_s,
-        latitude=float(np.radians(latitude_deg)),
-        longitude=half_turn(np.radians(longitude_deg)),
-        covariance=covariance,
-    )
+    longitude = half_turn(np.radians(longitude_deg))
+    return gnss_place(utc_unix_s, float(np.radians(latitude_deg)), longitude, covariance)
 
 
-def message_to_gnss(message: Any, unstated_m: float = math.nan) -> GnssPlace:
+def message_to_gnss(message: Any, unstated_m: float = math.nan) -> Place:
     """The place of a sensor_msgs/NavSatFix; GnssError that says why it has none.
 
     unstated_m: 1 sigma an axis of a fix that states no error; NaN: such a fix is refused.
@@ -112,12 +93,6 @@ def _names_other_datum(frame_id: str) -> bool:
     return any("".join(words[k:]) in OTHER_DATUMS for k in range(len(words)))
 
 
-def known_place(gnss: GnssPlace, vertical: Vertical) -> Place:
-    """A GNSS place as one that is known, with the deflection there."""
-    latitude, longitude = np.degrees([gnss.latitude, gnss.longitude]).tolist()
-    return Place.on_ellipsoid(latitude, longitude, vertical, gnss.covariance)
-
-
 # Maximum time between a GNSS place and a frame, s.
 NEAREST_S = 3.0
 # Maximum speed of a vehicle between two places, m/s, and tolerance beyond it, in sigma of both.
@@ -132,7 +107,7 @@ class GnssTrack:
     Two places of one moment that contradict each other give none: two receivers, or a spoofed one.
     """
 
-    def __init__(self, places: list[GnssPlace]) -> None:
+    def __init__(self, places: list[Place]) -> None:
         ordered = sorted(places, key=lambda p: p.utc_unix_s)
         self._places = _agreeing(ordered)
         self._times = np.array([p.utc_unix_s for p in self._places])
@@ -140,7 +115,7 @@ class GnssTrack:
     def __len__(self) -> int:
         return len(self._places)
 
-    def at(self, utc_unix_s: float) -> GnssPlace | None:
+    def at(self, utc_unix_s: float) -> Place | None:
         """The place at a time, between the two nearest to it; None without one near.
 
         GnssError if those contradict each other.
@@ -159,31 +134,27 @@ class GnssTrack:
         step_s = after.utc_unix_s - before.utc_unix_s
         return _between(before, after, (utc_unix_s - before.utc_unix_s) / step_s if step_s > SAME_S else 0.5)
 
-    def _carried(self, place: GnssPlace, utc_unix_s: float) -> GnssPlace:
+    def _carried(self, place: Place, utc_unix_s: float) -> Place:
         """A place carried to a time after the last one, or before the first, with the error of that way."""
         k = int(np.searchsorted(self._times, place.utc_unix_s))
         other = self._places[k - 1] if k else self._places[1] if len(self._places) > 1 else place
         span_s = max(abs(place.utc_unix_s - other.utc_unix_s), 1.0)
-        speed = float(np.linalg.norm(place.from_place_m(other.latitude, other.longitude))) / span_s
+        speed = float(np.linalg.norm(place.offset_m(other.latitude, other.longitude))) / span_s
         way_m = speed * (utc_unix_s - place.utc_unix_s)
-        return GnssPlace(
-            utc_unix_s=utc_unix_s,
-            latitude=place.latitude,
-            longitude=place.longitude,
-            covariance=place.covariance + np.eye(2) * way_m**2,
-        )
+        covariance = place.covariance + np.eye(2) * way_m**2
+        return gnss_place(utc_unix_s, place.latitude, place.longitude, covariance)
 
 
-def agree(a: GnssPlace, b: GnssPlace) -> bool:
+def agree(a: Place, b: Place) -> bool:
     """Whether a vehicle may have gone from one place to the other in the time between them."""
-    apart_m = float(np.linalg.norm(a.from_place_m(b.latitude, b.longitude)))
+    apart_m = float(np.linalg.norm(a.offset_m(b.latitude, b.longitude)))
     sigma_m = float(np.sqrt(np.linalg.eigvalsh(a.covariance + b.covariance)[-1]))
     return apart_m <= MAX_SPEED * abs(a.utc_unix_s - b.utc_unix_s) + SIGMAS * sigma_m
 
 
-def _agreeing(ordered: list[GnssPlace]) -> list[GnssPlace]:
+def _agreeing(ordered: list[Place]) -> list[Place]:
     """One place for each moment; none if a moment's places contradict each other."""
-    kept: list[GnssPlace] = []
+    kept: list[Place] = []
     start = 0
     for end in range(1, len(ordered) + 1):
         if end < len(ordered) and ordered[end].utc_unix_s - ordered[start].utc_unix_s <= SAME_S:
@@ -194,16 +165,15 @@ def _agreeing(ordered: list[GnssPlace]) -> list[GnssPlace]:
     return kept
 
 
-def _between(before: GnssPlace, after: GnssPlace, share: float) -> GnssPlace:
+def _between(before: Place, after: Place, share: float) -> Place:
     """The place at a share of the way, with the larger error of the two."""
-    latitude = before.latitude + share * (after.latitude - before.latitude)
-    turn = np.remainder(after.longitude - before.longitude + np.pi, 2 * np.pi) - np.pi
+    turn = half_turn(after.longitude - before.longitude)
     larger = max(before, after, key=lambda p: float(np.trace(p.covariance)))
-    return GnssPlace(
-        utc_unix_s=before.utc_unix_s + share * (after.utc_unix_s - before.utc_unix_s),
-        latitude=latitude,
-        longitude=before.longitude + share * float(turn),
-        covariance=larger.covariance,
+    return gnss_place(
+        before.utc_unix_s + share * (after.utc_unix_s - before.utc_unix_s),
+        before.latitude + share * (after.latitude - before.latitude),
+        before.longitude + share * turn,
+        larger.covariance,
     )
 
 
@@ -235,7 +205,7 @@ def read_gnss_csv(path: Path | str) -> tuple[GnssTrack, tuple[str, ...]]:
         raise GnssError(
             f"{path}: not a readable table of GNSS (it has no column {lacking[0]}, or two): {CURE}"
         )
-    places: list[GnssPlace] = []
+    places: list[Place] = []
     faults: Counter[str] = Counter()
     try:
         for row in reader:
@@ -253,7 +223,7 @@ def read_gnss_csv(path: Path | str) -> tuple[GnssTrack, tuple[str, ...]]:
     return track, tuple(f"{path}: {number} rows left out: {why}" for why, number in faults.most_common())
 
 
-def _place(row: dict[str, str]) -> GnssPlace:
+def _place(row: dict[str, str]) -> Place:
     t, latitude, longitude, east, north = (_number(row.get(name)) for name in NEEDED)
     status = _number(row.get("status", "0"))
     covariance = np.diag(np.square([east, north])) if min(east, north) > 0 else np.full((2, 2), np.nan)

@@ -8,6 +8,7 @@ import numpy as np
 from starpos import rotation
 from starpos._numeric.roots import symmetric_root
 from starpos.earth.ellipsoid import curvature_radii_m, enu_axes, meridian_turn
+from starpos.earth.place import Place
 from starpos.earth.vertical import Deflection, Geodetic, Vertical, geodetic
 from starpos.fix.budget import ALWAYS, ErrorTerm, Sensitivity, local_north, total_covariance
 from starpos.fix.fix import Fix
@@ -15,7 +16,6 @@ from starpos.fix.solution import Solution, Status
 from starpos.fix.solver import Solver
 from starpos.frames.frame import Stars
 from starpos.gnss.filter import LEARNED_ORIGINS, LevelSight, zenith_rows
-from starpos.gnss.receiver import GnssPlace
 from starpos.gnss.states import Learned
 from starpos.gnss.watch import GnssCheck, GnssStatus, GnssWatch
 from starpos.instrument.inclinometer import Tilt
@@ -33,7 +33,7 @@ NOTHING_LEARNED = (
 class Compared:
     """A GNSS place at a frame, and what the stars say of it; frames, poses: from which was learned what counts."""
 
-    place: GnssPlace
+    place: Place
     check: GnssCheck
     frames: int
     poses: int
@@ -54,9 +54,7 @@ class Watched:
     learned: Learned | None = None
 
 
-def watched(
-    solver: Solver, stars: Stars, rough: Solution, gnss: GnssPlace | None, watch: GnssWatch
-) -> Watched:
+def watched(solver: Solver, stars: Stars, rough: Solution, gnss: Place | None, watch: GnssWatch) -> Watched:
     """Solve a frame that is later than all before, and let the watch judge and learn.
 
     rough: its solution by the solver, whose A3 may be wrong, and its heading at GNSS's place.
@@ -94,7 +92,7 @@ def watched(
     return replace(answer, compared=Compared(gnss, check, frames, poses), learned=watch.learned)
 
 
-def _up(watch: GnssWatch, fix: Fix, tilt: Tilt, gnss: GnssPlace | None) -> np.ndarray | None:
+def _up(watch: GnssWatch, fix: Fix, tilt: Tilt, gnss: Place | None) -> np.ndarray | None:
     """Up (3,) in C: as learned if that gives a place, else by GNSS; None without either."""
     if watch.tells_place(LevelSight.of(fix, tilt)):
         return watch.up_in_camera(tilt)

@@ -10,6 +10,7 @@ import numpy as np
 
 from starpos.averaging.poses import slip_s
 from starpos.earth.ellipsoid import EARTH_RADIUS_M
+from starpos.earth.place import Place
 from starpos.earth.vertical import Vertical
 from starpos.gnss.filter import (
     GnssFrame,
@@ -23,7 +24,6 @@ from starpos.gnss.filter import (
     stddev_rad,
     updated,
 )
-from starpos.gnss.receiver import GnssPlace
 from starpos.gnss.states import Ageing, Learned, aged, ageing, at_temperature, prior
 from starpos.instrument.inclinometer import Tilt
 from starpos.instrument.instrument import Instrument
@@ -247,23 +247,21 @@ class GnssWatch:
     def _age(self, sighting: LevelSight) -> None:
         learned, tilt = self.learned, sighting.tilt
         assert learned is not None
-        latitude, longitude, covariance = place_of_stars(
-            sighting, at_temperature(learned, tilt), self.vertical
-        )
+        place = place_of_stars(sighting, at_temperature(learned, tilt), self.vertical)
         here, moved_m = learned.place, 0.0
         if here is None:
-            here = latitude, longitude
+            here = place.latitude, place.longitude
         elif self._new_pose:
-            way_m = float(np.linalg.norm(_apart_m(here, (latitude, longitude))))
-            if way_m > ELSEWHERE_SIGMA * math.sqrt(np.linalg.eigvalsh(covariance)[-1]):
-                moved_m, here = way_m, (latitude, longitude)
+            way_m = float(np.linalg.norm(place.offset_m(*here)))
+            if way_m > ELSEWHERE_SIGMA * math.sqrt(np.linalg.eigvalsh(place.covariance)[-1]):
+                moved_m, here = way_m, (place.latitude, place.longitude)
         passed = ageing(
             learned,
             self._instrument.inclinometer,
             tilt,
             sighting.utc_unix_s,
             moved_m,
-            stddev_rad(self.vertical, latitude, longitude),
+            stddev_rad(self.vertical, place.latitude, place.longitude),
             self._new_pose,
         )
         self.learned = replace(aged(learned, passed, tilt, sighting.utc_unix_s), place=here)
@@ -281,7 +279,8 @@ class GnssWatch:
         """Whether the stars give a place with what was learned before this frame."""
         if self.learned is None:
             return False
-        narrow, wide = np.linalg.eigvalsh(place_of_stars(sighting, self.learned, self.vertical)[2])
+        place = place_of_stars(sighting, self.learned, self.vertical)
+        narrow, wide = np.linalg.eigvalsh(place.covariance)
         if wide >= WIDEST_M**2:
             return False
         # a turn makes the place wide along an arc, and the bend leaves it across
@@ -297,7 +296,7 @@ class GnssWatch:
         turn2 = min(float(up @ self.learned.covariance[at.a3, at.a3] @ up), 2.0)
         return turn2 / 2 * leaned * EARTH_RADIUS_M
 
-    def judge(self, sighting: LevelSight, gnss: GnssPlace) -> GnssCheck:
+    def judge(self, sighting: LevelSight, gnss: Place) -> GnssCheck:
         """Compare a GNSS place with the stars'; where they disagree, take back what GNSS taught meanwhile."""
         if self.learned is None or not self.tells_place(sighting):
             return GnssCheck(GnssStatus.LEARNING)
@@ -350,20 +349,20 @@ class GnssWatch:
         elif utc_unix_s - self._onsets.since[0] >= BACK_S and self._onsets.frames[0] >= BACK_FRAMES:
             self.disagrees = False
 
-    def _check(self, status: GnssStatus, sighting: LevelSight, gnss: GnssPlace) -> GnssCheck:
+    def _check(self, status: GnssStatus, sighting: LevelSight, gnss: Place) -> GnssCheck:
         assert self.learned is not None
-        latitude, longitude, covariance = place_of_stars(sighting, self.learned, self.vertical)
-        apart = gnss.from_place_m(latitude, longitude)
+        place = place_of_stars(sighting, self.learned, self.vertical)
+        apart = gnss.offset_m(place.latitude, place.longitude)
         distance = float(np.linalg.norm(apart))
         way = apart / max(distance, 1e-9)
         return GnssCheck(
             status=status,
             distance_m=distance,
             bearing_deg=float(np.degrees(np.arctan2(*apart)) % 360),
-            sigma_m=math.sqrt(way @ (covariance + gnss.covariance) @ way),
+            sigma_m=math.sqrt(way @ (place.covariance + gnss.covariance) @ way),
         )
 
-    def learn(self, sighting: LevelSight, gnss: GnssPlace, check: GnssCheck) -> None:
+    def learn(self, sighting: LevelSight, gnss: Place, check: GnssCheck) -> None:
         """Learn from a frame if GNSS is believed, and its readings are new."""
         readings = frozenset(sighting.tilt.times)
         if check.status not in (GnssStatus.LEARNING, GnssStatus.AGREES) or readings & self._readings:
@@ -390,8 +389,3 @@ class GnssWatch:
         self._starting = not is_linear(self.learned, sighting.tilt)
         if not self._starting:
             self._held.clear()
-
-
-def _apart_m(a: tuple[float, float], b: tuple[float, float]) -> np.ndarray:
-    """East, north (2,) in m from a to b, places in rad."""
-    return GnssPlace(utc_unix_s=0.0, latitude=b[0], longitude=b[1], covariance=np.eye(2)).from_place_m(*a)

@@ -35,8 +35,8 @@ from starpos.identification.evidence import (
     verify_pose,
 )
 from starpos.identification.fisheye import outwards
-from starpos.identification.pose import Pose, Poses, stars_at
-from starpos.identification.quads import Matches, QuadCatalogue, QuadPoses, most_agreed
+from starpos.identification.pose import Pose, stars_at
+from starpos.identification.quads import QuadCatalogue, QuadPoses, matches
 from starpos.identification.search import SECOND_TRY, second_try, through
 from starpos.identification.sky import Sky
 from starpos.instrument.camera import EQUIDISTANT, Camera
@@ -153,16 +153,16 @@ def _poses(
 ) -> Iterator[tuple[Pose, np.ndarray]]:
     """Yield poses, those first on which most quads agree, and the distance (N,) px by which each star may be off."""
     half_diagonal_px = float(np.hypot(*field.half))
-    matches = []
+    alike = []
     for focal_px, step in focal_lengths(half_diagonal_px, *focal_range):
         if limit.reached:
             return
-        matches.append(Matches.of(field, quads, stars, error_px, focal_px, step))
-    found = QuadPoses.of(field, sky, Matches.together(matches), error_px, focal_range)
-    for k in most_agreed(found.poses, half_diagonal_px, MAX_JUDGED):
+        alike.append(matches(field, quads, stars, error_px, focal_px, step))
+    found = QuadPoses.of(field, sky, alike, error_px, focal_range)
+    for k in found.most_agreed(half_diagonal_px, MAX_JUDGED):
         if limit.reached:
             return
-        yield found.poses[k], found.radius_px(field, k, error_px)
+        yield found[k], found.radius_px(field, k, error_px)
 
 
 def focal_lengths(half_diagonal_px: float, shortest: float, longest: float) -> Iterator[tuple[float, float]]:
@@ -301,16 +301,16 @@ def identify_fisheye(
         for guess, row in _most_agreed(guesses):
             if limit.reached:
                 return best
-            pose, radius = guess.found.poses[row], guess.found.radius_px(guess.field, row, FISHEYE_ERROR_PX)
+            pose, radius = guess.found[row], guess.found.radius_px(guess.field, row, FISHEYE_ERROR_PX)
             found = verify_pose(guess.field, sky, pose, radius, prior, need)
             if found is None or (best is not None and found.log_odds <= best[1].log_odds):
                 continue
             whole = outwards(picture.seen_by(guess.focal_px, guess.lens), sky, guess.part, found)
-            if whole is not None and whole.borne_out:
-                return whole.camera, whole.found
+            if whole is not None and whole[2]:
+                return whole[:2]
             # off the middle, a wrong lens would turn the axis elsewhere
             if whole is not None and k == 0:
-                best = whole.camera, whole.found
+                best = whole[:2]
     return best
 
 
@@ -342,12 +342,12 @@ def _guesses(
             part, field = _part(picture, float(focal_px), lens, turn)
             if field is None or len(field) < MIN_STARS:
                 continue
-            matches = Matches.of(
+            alike = matches(
                 field, quads, min(stars, len(field)), FISHEYE_ERROR_PX, field.focal_px, FISHEYE_STEP
             )
             scales = field.focal_px * (1 - FISHEYE_STEP), field.focal_px * (1 + FISHEYE_STEP)
-            found = QuadPoses.of(field, sky, matches, FISHEYE_ERROR_PX, scales)
-            if len(found.poses):
+            found = QuadPoses.of(field, sky, [alike], FISHEYE_ERROR_PX, scales)
+            if len(found):
                 yield _Guess(float(focal_px), lens, part, field, found)
 
 
@@ -379,14 +379,8 @@ def _most_agreed(guesses: Sequence[_Guess]) -> Iterator[tuple[_Guess, int]]:
     """Yield guesses and rows of their poses, those with most votes of all guesses first."""
     if not guesses:
         return
-    poses = Poses(
-        *(
-            np.concatenate([getattr(g.found.poses, name) for g in guesses])
-            for name in ("attitude", "focal_px", "mirrored")
-        )
-    )
-    first = np.cumsum([0, *(len(g.found.poses) for g in guesses)])
+    first = np.cumsum([0, *(len(g.found) for g in guesses)])
     half_diagonal_px = float(np.hypot(*guesses[0].field.half))
-    for k in most_agreed(poses, half_diagonal_px, FISHEYE_JUDGED):
+    for k in QuadPoses.together([g.found for g in guesses]).most_agreed(half_diagonal_px, FISHEYE_JUDGED):
         owner = int(np.searchsorted(first, k, side="right")) - 1
         yield guesses[owner], k - int(first[owner])

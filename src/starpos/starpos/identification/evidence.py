@@ -155,6 +155,10 @@ class OnFrame:
         )
         return cls(*found)
 
+    def rows(self, which: np.ndarray) -> "OnFrame":
+        """The stars of a mask (S,)."""
+        return OnFrame(self.index[which], self.directions[which], self.blend_px[which])
+
 
 def judge(field: FrameStars, sky: Sky, prior: Prior, enough: float = MIN_LOG_ODDS) -> Judge:
     """What judges poses of a frame by a prior, for compiled code; enough: log-odds of an identification."""

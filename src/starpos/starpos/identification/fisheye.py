@@ -3,11 +3,6 @@
 
 A part of the field is taken as a pinhole would see it, first the middle, then others in case that is covered, and
 identified like any frame. Then all stars are matched, with the lens itself.
-
-Extend the identification of a part of a fisheye's frame to the whole of it, and find out its lens on the way.
-
-Stars near identified ones are matched first. Each ring of them improves the lens (focal length, axis and distortion),
-which then predicts the next ring.
 """
 
 import math
@@ -45,8 +40,18 @@ from starpos.units import SIGMA_PER_MAD
 WIDE_RAD = math.radians(25)
 # Half the sides of a part; how far off the axis the middles of the other parts lie, and in how many directions.
 HALF_RAD, OFF_RAD, AROUND = math.radians(30), math.radians(45), 4
-# Rounds of matching, steps of a fit, its numerical derivative (rad), and the step that ends it.
-ROUNDS, STEPS, STEP_RAD, SETTLED = 6, 8, 1e-6, 1e-10
+# Rounds of matching; step of a fit's numerical derivatives (rad, and shares).
+ROUNDS, STEP = 6, 1e-6
+# Most steps of a fit, and the step that ends it: of the pose alone, and with the lens.
+POSE_STEPS, LENS_STEPS = (8, 1e-10), (3, 1e-6)
+# Prior of an unknown lens, 1 sigma: the position of the axis in focal lengths (x, y), k1 and k2.
+LENS_PRIOR = np.array([0.08, 0.08, 0.06, 0.02])
+# Radius about the part's middle in which stars are matched first, its growth in each round, number of final rounds.
+FIRST_RAD, NEXT_RAD, LAST_ROUNDS = math.radians(32), math.radians(15), 2
+# Maximum distance of a star from its predicted place (focal lengths), in addition to the residuals' spread.
+GATE_RAD, MIN_LENS_SPREAD_PX = 0.004, 0.2
+# Stars beyond the part bear it out if chance makes as many pairs as seldom as this (logarithm).
+LOG_CHANCE_PAIRS = math.log(1e-6)
 # A coordinate where no star is.
 FAR_PX = -1e7
 # The rows of a mirrored frame run bottom-up.
@@ -187,28 +192,49 @@ class LensPose:
         u = w @ self.attitude.T
         return self.camera.project(u @ FLIP if self.mirrored else u)
 
-    def moved(self, turn: np.ndarray, scale: float) -> "LensPose":
-        """The pose turned by turn (3,) rad about C's axes, its focal length longer by the share `scale`."""
-        return replace(
-            self, camera=self.camera.scaled(1 + scale), attitude=rotation.from_vector(turn) @ self.attitude
-        )
+    def moved(self, step: np.ndarray) -> "LensPose":
+        """The pose turned about C's axes (rad), its focal length longer by a share, its lens moved in LENS_PRIOR's terms.
 
-    def fitted(self, xy: np.ndarray, w: np.ndarray, error_px: np.ndarray) -> "LensPose":
-        """Fit attitude and focal length to pixels xy (n, 2), with errors (n,) px, of directions w (n, 3)."""
-        pose = self
-        for _ in range(STEPS):
+        step (4,), or (8,) with the lens
+        """
+        c = self.camera.scaled(1 + step[3])
+        if len(step) > 4:
+            k1, k2, *rest = c.distortion
+            focal_px, lens = self.camera.fx, (k1 + step[6], k2 + step[7], *rest)
+            c = replace(c, cx=c.cx + focal_px * step[4], cy=c.cy + focal_px * step[5], distortion=lens)
+        return replace(self, camera=c, attitude=rotation.from_vector(step[:3]) @ self.attitude)
+
+    def fitted(
+        self, xy: np.ndarray, w: np.ndarray, error_px: np.ndarray, given: Camera | None = None
+    ) -> "LensPose":
+        """Fit attitude and focal length to pixels xy (n, 2), with errors (n,) px, of directions w (n, 3).
+
+        given: the lens is fitted too, to these and to LENS_PRIOR about this one's.
+        """
+        pose, terms, (steps, settled) = self, 4, POSE_STEPS
+        if given is not None:
+            terms, (steps, settled) = 4 + len(LENS_PRIOR), LENS_STEPS
+        for _ in range(steps):
             here = pose.project(w)
-            ahead = [pose.moved(turn, 0.0).project(w) for turn in np.eye(3) * STEP_RAD]
-            ahead.append(pose.moved(np.zeros(3), STEP_RAD).project(w))
-            slope = (np.stack(ahead, -1) - here[..., None]) / STEP_RAD
+            ahead = [pose.moved(step).project(w) for step in np.eye(terms) * STEP]
+            slope = (np.stack(ahead, -1) - here[..., None]) / STEP
             on = np.isfinite(slope).all((1, 2))
-            weight = 1 / error_px[on]
-            j = (slope[on] * weight[:, None, None]).reshape(-1, 4)
-            step = np.linalg.lstsq(j, ((xy - here)[on] * weight[:, None]).ravel(), rcond=None)[0]
-            pose = pose.moved(step[:3], float(step[3]))
-            if np.abs(step).max() < SETTLED:
+            design = (slope[on] / error_px[on, None, None]).reshape(-1, terms)
+            target = ((xy - here)[on] / error_px[on, None]).ravel()
+            if given is not None:
+                design = np.vstack([design, np.eye(terms)[4:] / LENS_PRIOR[:, None]])
+                target = np.append(target, pose.away_from(given) / LENS_PRIOR)
+            step = np.linalg.lstsq(design, target, rcond=None)[0]
+            pose = pose.moved(step)
+            if np.abs(step).max() < settled:
                 break
         return pose
+
+    def away_from(self, given: Camera) -> np.ndarray:
+        """How far (4,) its lens has still to go to a given one, in LENS_PRIOR's terms."""
+        c = self.camera
+        axis = (given.cx - c.cx) / c.fx, (given.cy - c.cy) / c.fx
+        return np.array([*axis, *np.subtract(given.distortion[:2], c.distortion[:2])])
 
     def identified(
         self, field: WideField, xy: np.ndarray, there: OnFrame, pair: np.ndarray, found: Identification
@@ -230,30 +256,56 @@ class LensPose:
         )
 
 
+@at_once
+@dataclass(frozen=True, kw_only=True)
+class _Start:
+    """A frame's N stars at xy (N, 2) px with errors (N,), and what a part of it says of them.
+
+    pose: of the whole frame.  star, index (M,): rows of the identified stars, and of the catalogue.
+    beyond (N,): which stars are not on the part.
+    """
+
+    xy: np.ndarray
+    sigma: np.ndarray
+    pose: LensPose
+    star: np.ndarray
+    index: np.ndarray
+    beyond: np.ndarray
+
+    @classmethod
+    def of(cls, field: WideField, part: Part, found: Identification) -> "_Start":
+        flip = FLIP if found.mirrored else np.eye(3)
+        attitude = flip @ part.turn.T @ flip @ found.attitude
+        # ignore stars that fall outside the picture once refraction is removed
+        xy = np.nan_to_num(field.camera.project(field.directions[:FAINTEST_FIT]), nan=FAR_PX)
+        row = part.row[found.star]
+        return cls(
+            xy=xy,
+            sigma=field.sigma_px[:FAINTEST_FIT],
+            pose=LensPose(field.camera.scaled(found.focal_scale), attitude, found.mirrored),
+            star=row[row < len(xy)],
+            index=found.catalogue[row < len(xy)],
+            beyond=~np.isin(np.arange(len(xy)), part.row),
+        )
+
+
 def everywhere(field: WideField, sky: Sky, part: Part, found: Identification) -> Identification | None:
-    """Extend the identification of a part to the whole frame.
+    """Extend the identification of a part to the whole frame of a known lens.
 
     None if the lens puts the identified stars in other places.
     """
-    flip = FLIP if found.mirrored else np.eye(3)
-    attitude = flip @ part.turn.T @ flip @ found.attitude
-    pose = LensPose(field.camera.scaled(found.focal_scale), attitude, found.mirrored)
-    # ignore stars that fall outside the picture once refraction is removed
-    xy = np.nan_to_num(field.camera.project(field.directions[:FAINTEST_FIT]), nan=FAR_PX)
-    sigma = field.sigma_px[:FAINTEST_FIT]
-    star, index = part.row[found.star], found.catalogue
-    star, index = star[star < len(xy)], index[star < len(xy)]
-    w, beyond = sky.directions(index), ~np.isin(np.arange(len(xy)), part.row)
+    s = _Start.of(field, part, found)
+    xy, sigma, pose, star, index = s.xy, s.sigma, s.pose, s.star, s.index
+    w = sky.directions(index)
     for _ in range(ROUNDS):
-        pose = pose.fitted(xy[star], w, np.hypot(sigma[star], error_px(xy[star] - pose.project(w))))
-        residual = xy[star] - pose.project(w)
-        there = stars_on(pose, sky, len(xy))
-        gate = _gate_px(residual, sigma)
+        pose = pose.fitted(xy[star], w, np.hypot(sigma[star], _error_px(xy[star] - pose.project(w))))
+        spread = _spread_px(xy[star] - pose.project(w))
+        there = _stars_on(pose, sky, len(xy))
+        gate = GATE_SIGMA * np.hypot(max(spread, MIN_SPREAD_PX), sigma) + GATE_PX
         # a lens that is not known well has other stars than its own in their places farther out
-        if spread_px(residual) > BENT_PX:
-            gate[beyond] = 0.0
-        predicted = pose.project(there.directions)
-        pair = mutual_nearest(xy, predicted, gate)
+        if spread > BENT_PX:
+            gate[s.beyond] = 0.0
+        pair = mutual_nearest(xy, pose.project(there.directions), gate)
         if len(pair[0]) < MIN_STARS:
             return None
         same = np.array_equal(pair[0], star) and np.array_equal(there.index[pair[1]], index)
@@ -263,18 +315,60 @@ def everywhere(field: WideField, sky: Sky, part: Part, found: Identification) ->
     return pose.identified(field, xy, there, np.stack(pair), found)
 
 
-def error_px(residual: np.ndarray) -> float:
+def outwards(
+    field: WideField, sky: Sky, part: Part, found: Identification
+) -> tuple[Camera, Identification, bool] | None:
+    """Extend the identification of a part to the whole frame, and find out its lens on the way.
+
+    Stars near identified ones are matched first. Each ring of them improves the lens (focal length, axis and distortion),
+    which then predicts the next ring.
+
+    Returns the camera fitted to its stars, the identification, and whether stars beyond the part bear it out; if they do
+    not, the first two are of the first ring.  None if the lens puts the stars of the part in other places.
+    """
+    s = _Start.of(field, part, found)
+    xy, sigma, pose, star, w = s.xy, s.sigma, s.pose, s.star, sky.directions(s.index)
+    middle = part.turn[2] * [1, -1, 1] if found.mirrored else part.turn[2]
+    inner = None
+    for k in range(math.ceil((math.pi - FIRST_RAD) / NEXT_RAD) + LAST_ROUNDS):
+        error = np.hypot(sigma[star], _error_px(xy[star] - pose.project(w)))
+        pose = pose.fitted(xy[star], w, error, field.camera)
+        spread = max(_spread_px(xy[star] - pose.project(w)), MIN_LENS_SPREAD_PX)
+        gate = GATE_SIGMA * np.hypot(spread, sigma) + GATE_RAD * pose.camera.fx
+        near = _stars_on(pose, sky, len(xy))
+        reach = math.cos(min(FIRST_RAD + k * NEXT_RAD, math.pi))
+        near = near.rows(near.directions @ pose.attitude.T @ middle > reach)
+        pair = np.stack(mutual_nearest(xy, pose.project(near.directions), gate))
+        if pair.shape[1] < MIN_STARS:
+            return None
+        star, w = pair[0], near.directions[pair[1]]
+        if inner is None:
+            inner = pose, near, pair
+    borne_out = _borne_out(int(s.beyond[star].sum()), xy[s.beyond], len(near.index), gate[s.beyond])
+    pose, near, pair = (pose, near, pair) if borne_out or inner is None else inner
+    whole = replace(field, camera=pose.camera)
+    return pose.camera, pose.identified(whole, xy, near, pair, found), borne_out
+
+
+def _borne_out(pairs: int, xy: np.ndarray, places: int, gate: np.ndarray) -> bool:
+    """Whether this number of pairs of stars xy (n, 2) and places, within gate (n,) px, is more than chance makes."""
+    if pairs == 0:
+        return False
+    area = float(np.prod(np.ptp(xy, axis=0))) * math.pi / 4
+    expected = places * float(np.square(gate).sum()) * math.pi / max(area, 1.0)
+    if not pairs > expected > 0:
+        return pairs > expected
+    # Chernoff's bound of the probability of as many
+    return pairs - expected - pairs * math.log(pairs / expected) < LOG_CHANCE_PAIRS
+
+
+def _error_px(residual: np.ndarray) -> float:
     """Extra error: where the lens is poorly known, it dominates, so all stars get the same weight."""
-    spread = spread_px(residual[np.isfinite(residual).all(1)])
+    spread = _spread_px(residual[np.isfinite(residual).all(1)])
     return spread if spread > BENT_PX else FLOOR_PX
 
 
-def _gate_px(residual: np.ndarray, sigma: np.ndarray) -> np.ndarray:
-    """Maximum distance (N,) px of a star from its place, from the residuals (M, 2) of the stars matched so far."""
-    return GATE_SIGMA * np.hypot(max(spread_px(residual), MIN_SPREAD_PX), sigma) + GATE_PX
-
-
-def spread_px(residual: np.ndarray) -> float:
+def _spread_px(residual: np.ndarray) -> float:
     """Standard deviation (px) that the median of residuals (M, 2) shows."""
     return SIGMA_PER_MAD * float(np.sort(np.abs(residual), axis=None)[residual.size // 2])
 
@@ -297,7 +391,7 @@ def _within(pixel: np.ndarray, camera: Camera, margin_px: float) -> np.ndarray:
         return np.asarray(((pixel > least) & (pixel < most)).all(1))
 
 
-def stars_on(pose: LensPose, sky: Sky, stars: int) -> OnFrame:
+def _stars_on(pose: LensPose, sky: Sky, stars: int) -> OnFrame:
     """The catalogue stars that this number of detections may be."""
     camera, catalogue = pose.camera, sky.catalogue
     axis = (FLIP[2] if pose.mirrored else np.array([0.0, 0.0, 1.0])) @ pose.attitude
@@ -329,132 +423,3 @@ def _resolved(
     np.add.at(drawn, brighter, apart * ratio / (1 + ratio))
     single[fainter] = False
     return single, drawn
-
-
-# Prior of an unknown lens, 1 sigma: the position of the axis in focal lengths (x, y), k1 and k2.
-LENS_PRIOR = np.array([0.08, 0.08, 0.06, 0.02])
-# Terms of a fit: rotations, logarithm of the focal length, and the terms of PRIOR. Size and number of its steps.
-LENS_TERMS, LENS_STEP, LENS_STEPS = 8, 1e-6, 3
-# Radius about the part's middle in which stars are matched first, its growth in each round, number of final rounds.
-FIRST_RAD, NEXT_RAD, LAST_ROUNDS = math.radians(32), math.radians(15), 2
-# Maximum distance of a star from its predicted place (focal lengths), in addition to the residuals' spread.
-GATE_RAD, MIN_LENS_SPREAD_PX = 0.004, 0.2
-# Stars beyond the part bear it out if chance makes as many pairs as seldom as this (logarithm).
-LOG_CHANCE_PAIRS = math.log(1e-6)
-
-
-@dataclass(frozen=True)
-class Outwards:
-    """A camera fitted to its stars, the identification of a frame, and whether stars beyond the part bear it out.
-
-    If they do not, the camera and the identification stay as the part gave them.
-    """
-
-    camera: Camera
-    found: Identification
-    borne_out: bool
-
-
-def outwards(field: WideField, sky: Sky, part: Part, found: Identification) -> Outwards | None:
-    """Extend the identification of a part; None if the lens does not have in their places the stars of the part."""
-    flip = FLIP if found.mirrored else np.eye(3)
-    attitude = flip @ part.turn.T @ flip @ found.attitude
-    pose = LensPose(field.camera.scaled(found.focal_scale), attitude, found.mirrored)
-    xy = np.nan_to_num(field.camera.project(field.directions[:FAINTEST_FIT]), nan=FAR_PX)
-    sigma, beyond = field.sigma_px[:FAINTEST_FIT], ~np.isin(np.arange(len(xy)), part.row)
-    star, index = part.row[found.star], found.catalogue
-    star, index = star[star < len(xy)], index[star < len(xy)]
-    w = sky.directions(index)
-    middle = part.turn[2] * [1, -1, 1] if found.mirrored else part.turn[2]
-    rounds = math.ceil((math.pi - FIRST_RAD) / NEXT_RAD) + LAST_ROUNDS
-    inner: Outwards | None = None
-    for k in range(rounds):
-        error = np.hypot(sigma[star], error_px(xy[star] - pose.project(w)))
-        pose = _fitted(pose, field.camera, xy[star], w, error)
-        spread = max(spread_px(xy[star] - pose.project(w)), MIN_LENS_SPREAD_PX)
-        gate = GATE_SIGMA * np.hypot(spread, sigma) + GATE_RAD * pose.camera.fx
-        near = stars_on(pose, sky, len(xy))
-        reach = math.cos(min(FIRST_RAD + k * NEXT_RAD, math.pi))
-        near = _rows_of(near, near.directions @ pose.attitude.T @ middle > reach)
-        pair = np.stack(mutual_nearest(xy, pose.project(near.directions), gate))
-        if pair.shape[1] < MIN_STARS:
-            return None
-        star, w = pair[0], near.directions[pair[1]]
-        if inner is None:
-            inner = _answer(field, pose, xy, near, pair, found, False)
-    if _borne_out(int(beyond[star].sum()), xy[beyond], len(near.index), gate[beyond]):
-        return _answer(field, pose, xy, near, pair, found, True)
-    return inner
-
-
-def _answer(
-    field: WideField,
-    pose: LensPose,
-    xy: np.ndarray,
-    there: OnFrame,
-    pair: np.ndarray,
-    found: Identification,
-    borne_out: bool,
-) -> Outwards:
-    whole = replace(field, camera=pose.camera)
-    return Outwards(pose.camera, pose.identified(whole, xy, there, pair, found), borne_out)
-
-
-def _rows_of(there: OnFrame, which: np.ndarray) -> OnFrame:
-    return OnFrame(there.index[which], there.directions[which], there.blend_px[which])
-
-
-def _borne_out(pairs: int, xy: np.ndarray, places: int, gate: np.ndarray) -> bool:
-    """Whether this number of pairs of stars xy (n, 2) and places, within gate (n,) px, is more than chance makes."""
-    if pairs == 0:
-        return False
-    area = float(np.prod(np.ptp(xy, axis=0))) * math.pi / 4
-    expected = places * float(np.square(gate).sum()) * math.pi / max(area, 1.0)
-    return pairs > expected and _log_tail(pairs, expected) < LOG_CHANCE_PAIRS
-
-
-def _log_tail(count: int, expected: float) -> float:
-    """Chernoff's bound of the logarithm of the probability of `count` or more events."""
-    return count - expected - count * math.log(count / expected) if expected > 0 else -math.inf
-
-
-def _fitted(pose: LensPose, given: Camera, xy: np.ndarray, w: np.ndarray, error: np.ndarray) -> LensPose:
-    """Fit pose and lens to pixels xy (n, 2), with errors (n,) px, of directions w (n, 3), and to PRIOR about `given`."""
-    for _ in range(LENS_STEPS):
-        here = pose.project(w)
-        ahead = [_moved(pose, step).project(w) for step in np.eye(LENS_TERMS) * LENS_STEP]
-        slope = (np.stack(ahead, -1) - here[..., None]) / LENS_STEP
-        on = np.isfinite(slope).all((1, 2))
-        j = (slope[on] / error[on, None, None]).reshape(-1, LENS_TERMS)
-        prior = np.hstack(
-            [np.zeros((len(LENS_PRIOR), LENS_TERMS - len(LENS_PRIOR))), np.diag(1 / LENS_PRIOR)]
-        )
-        target = np.append(
-            ((xy - here)[on] / error[on, None]).ravel(), _from_prior(pose.camera, given) / LENS_PRIOR
-        )
-        step = np.linalg.lstsq(np.vstack([j, prior]), target, rcond=None)[0]
-        pose = _moved(pose, step)
-        if np.abs(step).max() < LENS_STEP:
-            break
-    return pose
-
-
-def _from_prior(camera: Camera, given: Camera) -> np.ndarray:
-    """How far (4,) a camera has still to go to `given`, in the terms of PRIOR."""
-    axis = (given.cx - camera.cx) / camera.fx, (given.cy - camera.cy) / camera.fx
-    return np.array([*axis, *np.subtract(given.distortion[:2], camera.distortion[:2])])
-
-
-def _moved(pose: LensPose, step: np.ndarray) -> LensPose:
-    """The pose turned, its focal length longer, axis elsewhere and lens another by the terms (TERMS,) of a step."""
-    c = pose.camera
-    k1, k2, *rest = c.distortion
-    camera = replace(
-        c,
-        fx=c.fx * (1 + step[3]),
-        fy=c.fy * (1 + step[3]),
-        cx=c.cx + c.fx * step[4],
-        cy=c.cy + c.fx * step[5],
-        distortion=(k1 + step[6], k2 + step[7], *rest),
-    )
-    return replace(pose, camera=camera, attitude=rotation.from_vector(step[:3]) @ pose.attitude)

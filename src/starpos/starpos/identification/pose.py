@@ -7,6 +7,7 @@ import numpy as np
 
 from starpos import rotation
 from starpos.frozen import at_once
+from starpos.identification._found import Identification
 from starpos.identification._frame import FrameStars
 from starpos.identification._poses import fitted
 from starpos.instrument.camera import Camera
@@ -50,6 +51,11 @@ class Pose:
     focal_px: float
     mirrored: bool
 
+    @classmethod
+    def of(cls, field: FrameStars, found: Identification) -> "Pose":
+        """The pose that an identification of a frame gives."""
+        return cls(found.attitude, field.focal_px * found.focal_scale, found.mirrored)
+
     def project(self, w: np.ndarray) -> np.ndarray:
         """Pixels (N, 2) of directions w (N, 3); directions behind the camera become pixels far away."""
         u = w @ self.attitude.T
@@ -59,22 +65,6 @@ class Pose:
         """Fit attitude and focal length to pixels xy (N, 2), with errors sigma_px (N,), of directions w (N, 3)."""
         attitude, focal_px = fitted(xy, w, sigma_px, self.attitude, self.focal_px, STEPS, SMALL_STEP)
         return Pose(attitude, focal_px, self.mirrored)
-
-
-@at_once
-@dataclass(frozen=True)
-class Poses:
-    """K poses: attitude (K, 3, 3), focal_px (K,), mirrored (K,)."""
-
-    attitude: np.ndarray
-    focal_px: np.ndarray
-    mirrored: np.ndarray
-
-    def __getitem__(self, k: int) -> Pose:
-        return Pose(self.attitude[k], float(self.focal_px[k]), bool(self.mirrored[k]))
-
-    def __len__(self) -> int:
-        return len(self.focal_px)
 
 
 def directions(xy: np.ndarray, focal_px: np.ndarray) -> np.ndarray:

@@ -9,13 +9,10 @@ Keep the quads of a star catalogue: in memory, and next to the triangles on the 
 Poses of a frame from quads of its brightest stars that look like quads of the sky, those first that most agree on.
 """
 
-import hashlib
-import threading
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import combinations
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -25,12 +22,12 @@ from starpos.frozen import at_once
 from starpos.identification._circles import well_apart
 from starpos.identification._frame import FrameStars
 from starpos.identification._quads import near
-from starpos.identification.pose import MATCH_SIGMA, Poses, directions
+from starpos.identification.pose import MATCH_SIGMA, Pose, directions
 from starpos.identification.sky import Sky
 from starpos.identification.triangles import circle_count, spread_points
 from starpos.progress import Progress, quiet
 from starpos.sky.catalogue import Catalogue
-from starpos.table_cache import cache_folder, load_or_build, mapped, rising
+from starpos.table_cache import KeptTables, digest_of, rising
 
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
@@ -67,6 +64,19 @@ class QuadCatalogue:
     shape: np.ndarray
     log_size: np.ndarray
     bin_start: np.ndarray
+
+    def check(self, catalogue_stars: int) -> None:
+        """Raise ValueError for columns that do not match each other or the stars: compiled loops trust them."""
+        count = len(self.corners)
+        if not (
+            self.corners.shape == (count, 4)
+            and self.shape.shape == (count, 5)
+            and self.log_size.shape == (count,)
+            and self.bin_start.shape == (BINS**4 * SIZE_BINS + 1,)
+            and rising(self.bin_start, count)
+            and (count == 0 or 0 <= self.corners.min() <= self.corners.max() < catalogue_stars)
+        ):
+            raise ValueError("the quads are not sorted, or not of the catalogue's stars")
 
     def near(
         self, shape: np.ndarray, tolerance: np.ndarray, log_size: np.ndarray, log_tolerance: float
@@ -190,60 +200,34 @@ def _key(bins: np.ndarray) -> np.ndarray:
     return (((a * BINS + b) * BINS + c) * BINS + d) * SIZE_BINS
 
 
-# Cache folder; the number is the format version.
-PREFIX = "quads-1-"
-
-_lock = threading.Lock()
-_in_use: dict[str, QuadCatalogue] = {}
+# The number of the folder's name is the format version.
+KEPT = KeptTables(QuadCatalogue, "quads-1-", "iufi", "star quads")
 
 
 def is_built(catalogue: Catalogue) -> bool:
     """Whether `cached_quads` need not build."""
-    return _digest(catalogue) in _in_use or _folder(catalogue).is_dir()
+    return KEPT.folder(_name(catalogue)).is_dir()
 
 
 def cached_quads(catalogue: Catalogue, progress: Progress = quiet) -> QuadCatalogue:
     """The QuadCatalogue of a star catalogue, memory-mapped from the cache (180 MB); built, in about 20 s, if missing."""
-    digest = _digest(catalogue)
-    with _lock:
-        if digest not in _in_use:
-            _in_use.clear()
-            folder = _folder(catalogue)
-            _in_use[digest] = load_or_build(
-                folder,
-                PREFIX,
-                lambda: _map(folder, len(catalogue)),
-                lambda: build(catalogue, progress),
-                "star quads",
-            )
-        return _in_use[digest]
+    return KEPT.built(_name(catalogue), lambda: build(catalogue, progress), len(catalogue))
 
 
-def _digest(catalogue: Catalogue) -> str:
-    settings = repr((catalogue.fingerprint, LEVELS, SPACING, STARS_PER_CIRCLE, MIN_SIDE,
-                     SHORTEST, BINS, SIZE_BINS, SIZES_RAD))  # fmt: skip
-    return hashlib.sha256(settings.encode()).hexdigest()[:16]
-
-
-def _folder(catalogue: Catalogue) -> Path:
-    return cache_folder() / f"{PREFIX}{_digest(catalogue)}"
-
-
-def _map(folder: Path, catalogue_stars: int) -> QuadCatalogue | None:
-    """The stored quads; None if they are missing or their columns do not fit together."""
-    q = mapped(QuadCatalogue, folder, "iufi")
-    if q is None:
-        return None
-    count = len(q.corners)
-    fit = (
-        q.corners.shape == (count, 4)
-        and q.shape.shape == (count, 5)
-        and q.log_size.shape == (count,)
-        and q.bin_start.shape == (BINS**4 * SIZE_BINS + 1,)
-        and rising(q.bin_start, count)
-        and (count == 0 or 0 <= q.corners.min() <= q.corners.max() < catalogue_stars)
+def _name(catalogue: Catalogue) -> str:
+    return digest_of(
+        (
+            catalogue.fingerprint,
+            LEVELS,
+            SPACING,
+            STARS_PER_CIRCLE,
+            MIN_SIDE,
+            SHORTEST,
+            BINS,
+            SIZE_BINS,
+            SIZES_RAD,
+        )
     )
-    return q if fit else None
 
 
 # Sides of quads over the longest may be off by this besides the errors of the stars: lenses bend.
@@ -255,131 +239,122 @@ SAME_AXIS, SAME_FOCAL = 0.03, 0.03
 BEYOND = 0.1
 
 
-@at_once
-@dataclass(frozen=True)
-class Matches:
-    """K pairs of quads that look alike.
+# K pairs of quads that look alike: rows (K, 4) of the frame's stars, rows (K, 4) of the star catalogue, and the focal
+# lengths (K,) at which they do.
+Matches = tuple[np.ndarray, np.ndarray, np.ndarray]
 
-    star      (K, 4): rows of the frame's stars
-    corner    (K, 4): rows of the star catalogue
-    focal_px  (K,): the focal length at which they do
+
+def matches(
+    field: FrameStars, quads: QuadCatalogue, stars: int, error_px: float, focal_px: float, step: float
+) -> Matches:
+    """Quads of the frame's brightest stars, and similar quads of the sky at a focal length.
+
+    error_px: of the stars, besides their own.  step: the share by which the true focal length may differ.
     """
-
-    star: np.ndarray
-    corner: np.ndarray
-    focal_px: np.ndarray
-
-    @classmethod
-    def of(
-        cls,
-        field: FrameStars,
-        quads: QuadCatalogue,
-        stars: int,
-        error_px: float,
-        focal_px: float,
-        step: float,
-    ) -> "Matches":
-        """Quads of the frame's brightest stars, and similar quads of the sky at a focal length.
-
-        error_px: of the stars, besides their own.  step: the share by which the true focal length may differ.
-        """
-        four = _fours(stars)
-        v = directions(field.xy[:1, :stars], np.array([focal_px]))[0]
-        order, shape, size = shapes(v[four])
-        star = np.take_along_axis(four, order, 1)
-        error = QUAD_SIGMA * np.hypot(error_px, field.sigma[four].max(1)) / (focal_px * size)
-        # a lower limit than the catalogue's
-        use = np.flatnonzero((shape.min(1) > 0.8 * SHORTEST) & (error < 0.03))
-        # the best known first: the number of look-ups is limited
-        use = use[np.argsort(error[use], kind="stable")]
-        query, quad = quads.near(shape[use], error[use] + LENS, np.log(size[use]), step + 0.01)
-        return cls(star[use[query]], quads.corners[quad], np.full(len(query), focal_px))
-
-    @classmethod
-    def together(cls, parts: Iterable["Matches"]) -> "Matches":
-        """All matches of several parts, at least one."""
-        listed = list(parts)
-        return cls(
-            *(np.concatenate([getattr(m, name) for m in listed]) for name in ("star", "corner", "focal_px"))
-        )
+    four = _fours(stars)
+    v = directions(field.xy[:1, :stars], np.array([focal_px]))[0]
+    order, shape, size = shapes(v[four])
+    star = np.take_along_axis(four, order, 1)
+    error = QUAD_SIGMA * np.hypot(error_px, field.sigma[four].max(1)) / (focal_px * size)
+    # a lower limit than the catalogue's
+    use = np.flatnonzero((shape.min(1) > 0.8 * SHORTEST) & (error < 0.03))
+    # the best known first: the number of look-ups is limited
+    use = use[np.argsort(error[use], kind="stable")]
+    query, quad = quads.near(shape[use], error[use] + LENS, np.log(size[use]), step + 0.01)
+    return star[use[query]], quads.corners[quad], np.full(len(query), focal_px)
 
 
 @at_once
 @dataclass(frozen=True)
 class QuadPoses:
-    """K poses of a frame, and the quads of its stars (K, 4) from which they come."""
+    """K poses of a frame, as `Pose` has each, and the quads of its stars (K, 4) from which they come.
 
-    poses: Poses
+    attitude (K, 3, 3), focal_px (K,), mirrored (K,)
+    """
+
+    attitude: np.ndarray
+    focal_px: np.ndarray
+    mirrored: np.ndarray
     star: np.ndarray
 
     @classmethod
     def of(
-        cls, field: FrameStars, sky: Sky, m: Matches, error_px: float, focal_range: tuple[float, float]
+        cls,
+        field: FrameStars,
+        sky: Sky,
+        found: Sequence[Matches],
+        error_px: float,
+        focal_range: tuple[float, float],
     ) -> "QuadPoses":
         """The poses of matches by which their four stars are in their places, with focal lengths in a range."""
-        poses, off_px = _fitted(field, m, sky)
-        error = np.hypot(error_px, field.sigma[m.star].max(1)) if len(m.star) else np.zeros(0)
-        (low, high), focal = focal_range, poses.focal_px
+        star, corner, focal = map(np.concatenate, zip(*found, strict=True))
+        w = sky.directions(corner.ravel()).reshape(-1, 4, 3)
+        seen = directions(field.xy[0][star], focal)
+        mirrored = (_turn(seen[:, :3]) > 0) != (_turn(w[:, :3]) > 0)
+        xy = field.xy[mirrored.astype(int)[:, None], star]
+        wanted = _perimeter(w)
+        for _ in range(3):
+            focal = focal * _perimeter(directions(xy, focal)) / wanted
+        attitude = rotation.best_rotation(w, directions(xy, focal))
+        u = np.einsum("kij,knj->kni", attitude, w)
+        off = u[..., :2] * (focal[:, None, None] / np.maximum(u[..., 2:], 1e-6)) - xy
+        off_px = np.sqrt(np.square(off).sum(2).max(1))
+        error = np.hypot(error_px, field.sigma[star].max(1)) if len(star) else np.zeros(0)
+        low, high = focal_range
         good = (off_px < QUAD_SIGMA * error) & (focal > (1 - BEYOND) * low) & (focal < (1 + BEYOND) * high)
-        return cls(Poses(poses.attitude[good], focal[good], poses.mirrored[good]), m.star[good])
+        return cls(attitude[good], focal[good], mirrored[good], star[good])
+
+    @classmethod
+    def together(cls, parts: Sequence["QuadPoses"]) -> "QuadPoses":
+        """All poses of several parts, at least one."""
+        return cls(*map(np.concatenate, zip(*(vars(p).values() for p in parts), strict=True)))
+
+    def __getitem__(self, k: int) -> Pose:
+        return Pose(self.attitude[k], float(self.focal_px[k]), bool(self.mirrored[k]))
+
+    def __len__(self) -> int:
+        return len(self.focal_px)
 
     def radius_px(self, field: FrameStars, k: int, error_px: float) -> np.ndarray:
         """Distance (N,) px by which each star may be off by pose k: it grows with that from the quad's stars."""
-        xy = field.xy[int(self.poses.mirrored[k])]
+        xy = field.xy[int(self.mirrored[k])]
         of_quad = xy[self.star[k]]
         middle = of_quad.mean(0)
         size2 = max(float(np.square(of_quad - middle).sum() / 4), 1.0)
         away2 = np.square(xy - middle).sum(1)
         return MATCH_SIGMA * np.hypot(field.sigma, error_px) * np.sqrt(1 + away2 / size2)
 
+    def most_agreed(self, half_diagonal_px: float, most: int) -> list[int]:
+        """Rows of the poses with most votes, one of each group that agrees, up to a maximum number."""
+        from scipy.spatial import cKDTree
 
-def most_agreed(poses: Poses, half_diagonal_px: float, most: int) -> list[int]:
-    """Rows of the poses with most votes, one of each group that agrees, up to a maximum number."""
-    from scipy.spatial import cKDTree
-
-    if not len(poses):
-        return []
-    place = np.concatenate(
-        [
-            poses.attitude[:, 2] * (poses.focal_px / (SAME_AXIS * half_diagonal_px))[:, None],
-            np.log(poses.focal_px)[:, None] / SAME_FOCAL,
-            10.0 * poses.mirrored[:, None],
-        ],
-        axis=1,
-    )
-    tree = cKDTree(place)
-    votes = tree.query_ball_point(place, 1.0, return_length=True)
-    rows: list[int] = []
-    taken = np.zeros(len(place), bool)
-    for k in np.argsort(-votes, kind="stable").tolist():
-        if not taken[k]:
-            rows.append(k)
-            taken[tree.query_ball_point(place[k], 1.0)] = True
-            if len(rows) == most:
-                break
-    return rows
+        if not len(self):
+            return []
+        place = np.concatenate(
+            [
+                self.attitude[:, 2] * (self.focal_px / (SAME_AXIS * half_diagonal_px))[:, None],
+                np.log(self.focal_px)[:, None] / SAME_FOCAL,
+                10.0 * self.mirrored[:, None],
+            ],
+            axis=1,
+        )
+        tree = cKDTree(place)
+        votes = tree.query_ball_point(place, 1.0, return_length=True)
+        rows: list[int] = []
+        taken = np.zeros(len(place), bool)
+        for k in np.argsort(-votes, kind="stable").tolist():
+            if not taken[k]:
+                rows.append(k)
+                taken[tree.query_ball_point(place[k], 1.0)] = True
+                if len(rows) == most:
+                    break
+        return rows
 
 
 @lru_cache(maxsize=8)
 def _fours(n: int) -> np.ndarray:
     """All sets (F, 4) of four of 0..n-1."""
     return np.array(list(combinations(range(n), 4)), int).reshape(-1, 4)
-
-
-def _fitted(field: FrameStars, m: Matches, sky: Sky) -> tuple[Poses, np.ndarray]:
-    """The pose of each match, and the largest distance (K,) px of its four stars from their places."""
-    w = sky.directions(m.corner.ravel()).reshape(-1, 4, 3)
-    focal = m.focal_px.copy()
-    seen = directions(field.xy[0][m.star], focal)
-    mirrored = (_turn(seen[:, :3]) > 0) != (_turn(w[:, :3]) > 0)
-    xy = field.xy[mirrored.astype(int)[:, None], m.star]
-    wanted = _perimeter(w)
-    for _ in range(3):
-        focal = focal * _perimeter(directions(xy, focal)) / wanted
-    attitude = rotation.best_rotation(w, directions(xy, focal))
-    u = np.einsum("kij,knj->kni", attitude, w)
-    off = u[..., :2] * (focal[:, None, None] / np.maximum(u[..., 2:], 1e-6)) - xy
-    return Poses(attitude, focal, mirrored), np.sqrt(np.square(off).sum(2).max(1))
 
 
 def _turn(v: np.ndarray) -> np.ndarray:

@@ -161,21 +161,14 @@ def identify_frame(
 def identifications(
     field: FrameStars, sky: Sky, priors: Priors, enough: float = MIN_LOG_ODDS
 ) -> Iterator[Identification]:
-    """All of `near_or_lost`, then what `_crowded_or_uneven` yields."""
-    if len(field) < MIN_STARS:
-        return iter(())
-    return chain(
-        near_or_lost(field, sky, priors, STAGES, enough), _crowded_or_uneven(field, sky, priors, enough)
-    )
+    """Yield identifications of a frame in the order in which they are tried.
 
-
-def _crowded_or_uneven(
-    field: FrameStars, sky: Sky, priors: Priors, enough: float
-) -> Iterator[Identification]:
-    """Yield identifications of a frame whose brightest stars may nearly all be false, in any order.
-
-    Then the same for evenly spread stars, if the brightest are not spread evenly.
+    First all of `near_or_lost`, then those of a frame whose brightest stars may nearly all be false, in any order. Then
+    both for evenly spread stars, if the brightest are not spread evenly.
     """
+    if len(field) < MIN_STARS:
+        return
+    yield from near_or_lost(field, sky, priors, STAGES, enough)
     yield from _crowded(field, sky, priors, enough, CROWD_STARS)
     rows = second_try(field)
     # only one star is taken from a cell, which leaves less area for the others
@@ -229,8 +222,10 @@ def near_or_lost(
     crowded: only triangles that others support are looked at, but all of those.
     """
     if priors:
-        return _near_or_lost(field, sky, priors, stages, enough, crowded)
-    return _lost(field, sky, stages, 0.0, enough, crowded)
+        yield from _near(field, sky, priors, enough)
+    prior = anywhere(field.focal_px, LOG_HALF if priors else 0.0)
+    finder = _finder(sky.catalogue, sky.triangles)
+    yield from finder.lost(field, sky.years, sky.velocity, prior, enough, stages, crowded)
 
 
 def identify_near(field: FrameStars | fisheye.WideField, sky: Sky, priors: Priors) -> Identification | None:
@@ -243,30 +238,12 @@ def identify_near(field: FrameStars | fisheye.WideField, sky: Sky, priors: Prior
     return next(chain.from_iterable(tries), None)
 
 
-def _near_or_lost(
-    field: FrameStars, sky: Sky, priors: Priors, stages: Stages, enough: float, crowded: bool
-) -> Iterator[Identification]:
-    """Yield what is identified by the priors, which have half of the probability, then what is without them."""
-    yield from _near(field, sky, priors, enough)
-    yield from _lost(field, sky, stages, LOG_HALF, enough, crowded)
-
-
 def _near(field: FrameStars, sky: Sky, priors: Priors, enough: float) -> Iterator[Identification]:
     """Yield what is identified by the priors, which have half of the probability."""
     for prior in priors:
         for pose, radius_px, known in prior.attempts(field, sky, LOG_HALF - np.log(len(priors))):
             if found := verify_pose(field, sky, pose, radius_px, known, enough):
                 yield found
-
-
-def _lost(
-    field: FrameStars, sky: Sky, stages: Stages, log_share: float, enough: float, crowded: bool
-) -> Iterator[Identification]:
-    """What is identified lost in space, which has that share of the probability."""
-    prior = anywhere(field.focal_px, log_share)
-    return _finder(sky.catalogue, sky.triangles).lost(
-        field, sky.years, sky.velocity, prior, enough, stages, crowded
-    )
 
 
 @lru_cache(maxsize=4)
@@ -328,7 +305,7 @@ def second_look(
 
 def _log_ratio(field: FrameStars, sky: Sky, camera: Camera, found: Identification, look: Look) -> float:
     """The logarithm of the evidence for an identification by what was not detected."""
-    pose = Pose(found.attitude, field.focal_px * found.focal_scale, found.mirrored)
+    pose = Pose.of(field, found)
     due = OnFrame.of(field, sky, pose, TEST_STARS)
     xy, detected = pose.project(due.directions), field.xy[int(found.mirrored)]
     alone = np.linalg.norm(xy[:, None] - detected, axis=2).min(1) > DETECTED_PX

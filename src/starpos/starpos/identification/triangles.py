@@ -7,13 +7,10 @@ field's size gives its own brightest stars, so that every field of the instrumen
 Keep triangle catalogues: in memory, and in a cache on the disk from which they are memory-mapped.
 """
 
-import hashlib
 import math
-import threading
 from dataclasses import dataclass
 from functools import cached_property
 from math import comb
-from pathlib import Path
 
 import numpy as np
 
@@ -21,7 +18,7 @@ from starpos.identification._circles import binned, distinct, triples_of_circles
 from starpos.identification._triangles import TriangleTable
 from starpos.progress import Progress, quiet
 from starpos.sky.catalogue import CELLS, ZONES, Catalogue, cell_starts
-from starpos.table_cache import cache_folder, load_or_build, mapped, rising
+from starpos.table_cache import KeptTables, digest_of, rising
 
 # Shortest side over the longest allowed one: the errors of centroids blur the angles of smaller triangles.
 SHORTEST_SIDE = 0.03
@@ -219,9 +216,8 @@ def spread_points(n: int) -> np.ndarray:
     return np.stack([level * np.cos(angle), level * np.sin(angle), z], -1)
 
 
-# Cache folders; the number is the format version. Up to 10, tables of over 2 million stars may be wrong.
-PREFIX = "triangles-11-"
-MAX_IN_USE = 4
+# The number of the folder's name is the format version. Up to 10, tables of over 2 million stars may be wrong.
+KEPT = KeptTables(TriangleCatalogue, "triangles-11-", "iiiifibufi", "triangles", 4)
 
 
 def cached_triangles(
@@ -231,51 +227,7 @@ def cached_triangles(
 
     The field is rounded up to steps of 5 %, so that a refined focal length does not need a new one.
     """
-    half_diagonal = _rounded(half_diagonal_rad)
-    with _lock:
-        key = (catalogue.fingerprint, half_diagonal)
-        if key not in _in_use:
-            while len(_in_use) >= MAX_IN_USE:
-                _in_use.pop(next(iter(_in_use)))
-            _in_use[key] = _load_or_build(catalogue, half_diagonal, progress)
-        return _in_use[key]
-
-
-def _rounded(half_diagonal_rad: float) -> float:
-    return 1.05 ** math.ceil(math.log(half_diagonal_rad) / math.log(1.05))
-
-
-_lock = threading.Lock()
-_in_use: dict[tuple, TriangleCatalogue] = {}
-
-
-def _load_or_build(catalogue: Catalogue, half_diagonal: float, progress: Progress) -> TriangleCatalogue:
-    settings = (
-        catalogue.fingerprint,
-        half_diagonal,
-        affordable(half_diagonal),
-        POOL_PER_CIRCLE,
-        BEACONS,
-        SHORTEST_SIDE,
-    )
-    digest = hashlib.sha256(repr(settings).encode()).hexdigest()[:16]
-    folder = cache_folder() / f"{PREFIX}{np.degrees(2 * half_diagonal):.2f}deg-{digest}"
-    return load_or_build(
-        folder,
-        PREFIX,
-        lambda: _map(folder, len(catalogue)),
-        lambda: build(catalogue, half_diagonal, progress),
-        "triangles",
-    )
-
-
-def _map(folder: Path, catalogue_stars: int) -> TriangleCatalogue | None:
-    """The stored catalogue; None if it is missing or its columns do not fit together."""
-    t = mapped(TriangleCatalogue, folder, "iiiifibufi")
-    if t is None:
-        return None
-    try:
-        t.check(catalogue_stars)
-    except ValueError:
-        return None
-    return t
+    half = 1.05 ** math.ceil(math.log(half_diagonal_rad) / math.log(1.05))
+    settings = catalogue.fingerprint, half, affordable(half), POOL_PER_CIRCLE, BEACONS, SHORTEST_SIDE
+    name = f"{np.degrees(2 * half):.2f}deg-{digest_of(settings)}"
+    return KEPT.built(name, lambda: build(catalogue, half, progress), len(catalogue))

@@ -7,7 +7,8 @@ The second is another pose of the same camera: what is left over is identified a
 evidence. In both the second sky must be about as bright as the first: ghosts and glare are much fainter.
 
 Two skies a few pixels apart may be identified as one between them. Then the residuals of neighbouring stars differ by
-much more than their errors, and as much as the residuals of distant stars, which no lens does.
+much more than their errors, and as much as the residuals of distant stars, which no lens does; and each residual is
+one of two opposite ones, half of the offset, which centroids that err by more than they claim are not.
 """
 
 import math
@@ -52,6 +53,8 @@ STEEPEST_BEND = 0.2
 # Minimum difference of neighbours' residuals between two skies: in px; in their errors, times the first number plus the
 # second over the square root of the number of stars; and as a share of the difference of distant stars.
 MIXED_PX, MIXED, MIXED_BY_CHANCE, MIXED_EVERYWHERE = 1.2, 1.4, 2.0, 0.3
+# Maximum share of the residuals' mean square that two opposite offsets leave: 0.68 of normally distributed errors remain.
+MAX_LEFT_BY_OFFSETS = 0.35
 # With a smaller mean square of all residuals no two skies are mixed.
 MIN_MIXED_PX2 = MIXED_PX**2 * MIXED_EVERYWHERE
 # Minimum error of centroids (px), for errors that are not stated.
@@ -87,7 +90,7 @@ def _between_two(field: FrameStars, sky: Sky, found: Identification) -> bool:
     """Whether the residuals of neighbouring stars differ by more than one sky can explain."""
     stars = len(found.star)
     xy, error2 = field.xy[int(found.mirrored)][found.star], field.sigma[found.star] ** 2 + MIN_ERROR_PX**2
-    residual = xy - _pose(field, found).project(sky.directions(found.catalogue))
+    residual = xy - Pose.of(field, found).project(sky.directions(found.catalogue))
     u, v = ((xy - field.middle) / field.half.max()).T
     powers = np.stack([u**0, u, v, u * u, u * v, v * v, u**3, u * u * v, u * v * v, v**3], 1)
     terms = powers[:, : max([1, *(k for n, k in BENDS if stars >= n)])]
@@ -110,7 +113,20 @@ def _between_two(field: FrameStars, sky: Sky, found: Identification) -> bool:
         near2 > MIXED_PX**2
         and near2 > (MIXED + MIXED_BY_CHANCE / math.sqrt(stars)) ** 2 * expected2
         and near2 > MIXED_EVERYWHERE * far2
+        and _share_beyond_offsets(residual, terms[kept, :3]) < MAX_LEFT_BY_OFFSETS
     )
+
+
+def _share_beyond_offsets(residual: np.ndarray, plane: np.ndarray) -> float:
+    """Share of the mean square of residuals (N, 2) that an offset of either sign leaves.
+
+    plane (N, 1 or 3): 1 and the place on the frame, over which the offset may change, as where the camera was turned.
+    """
+    along = np.linalg.eigh(residual.T @ residual)[1][:, 1]
+    offset = np.where(residual @ along < 0, -1.0, 1.0)[:, None] * plane
+    left = residual - offset @ np.linalg.lstsq(offset, residual, rcond=None)[0]
+    free = 1 - offset.shape[1] / len(residual)
+    return float(np.square(left).sum() / (np.square(residual).sum() * free))
 
 
 def _every_star_twice(xy: np.ndarray, mag: np.ndarray, left: np.ndarray, size: np.ndarray) -> bool:
@@ -183,7 +199,7 @@ def _another_pose(
     field: FrameStars, mag: np.ndarray, left: np.ndarray, sky: Sky, found: Identification
 ) -> bool:
     """Whether the stars of the field that are left over (N,) fit another pose of the same camera."""
-    row, first = np.flatnonzero(left)[:MAX_STARS], _pose(field, found)
+    row, first = np.flatnonzero(left)[:MAX_STARS], Pose.of(field, found)
     while len(row) >= MIN_LEFT:
         rest = field.take(row).but(focal_px=first.focal_px)
         second = _same_camera(rest, sky, first, WORSE * found.residual_px + WORSE_PX)
@@ -229,7 +245,7 @@ def _new(
     share = _zero(mag[row], sky, second) - _zero(mag[found.star], sky, found)
     if abs(share) > MAX_FAINTER_MAG:
         return np.zeros(len(row), bool)
-    first, xy = _pose(field, found), field.xy[int(found.mirrored)]
+    first, xy = Pose.of(field, found), field.xy[int(found.mirrored)]
     away = np.linalg.norm(xy[row][:, None] - xy[found.star], axis=2).min(1)
     bend, their_bend = (
         np.linalg.norm(xy[star] - first.project(sky.directions(index)), axis=1)
@@ -241,10 +257,6 @@ def _new(
     alike = np.abs(mag[other] - mag[one] - share) < SAME_MAG
     new[here] |= alike & (np.linalg.norm(xy[one] - xy[other], axis=1) > DOUBLE_PX)
     return new
-
-
-def _pose(field: FrameStars, found: Identification) -> Pose:
-    return Pose(found.attitude, field.focal_px * found.focal_scale, found.mirrored)
 
 
 def _zero(mag: np.ndarray, sky: Sky, found: Identification) -> float:

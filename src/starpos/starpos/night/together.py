@@ -30,7 +30,7 @@ from starpos.fix.solution import Solution, Status
 from starpos.fix.solver import Solver, placed
 from starpos.frames.frame import Stars
 from starpos.frames.tables import Pointing
-from starpos.gnss.receiver import GnssTrack, known_place
+from starpos.gnss.receiver import GnssTrack
 from starpos.gnss.solving import Watched, watched
 from starpos.gnss.states import Learned
 from starpos.gnss.watch import GnssWatch
@@ -332,7 +332,7 @@ def watched_night(
             refused = replace(rough, status=solved.status, message=solved.message)
             rough = refused if solved.found is None else solved
         if gnss is not None:
-            rough = placed(solver, stars, rough, known_place(gnss, vertical))
+            rough = placed(solver, stars, rough, gnss.deflected(vertical))
         answers[k] = watched(solver, stars, rough, gnss, watch)
     remarks = tuple(Remark(Kind.GNSS, f"{number} frames: {why}") for why, number in said.items())
     return WatchedNight(tuple(answers[k] for k in range(len(sights))), watch.learned, remarks)

@@ -7,7 +7,7 @@ from contextlib import suppress
 from dataclasses import KW_ONLY, dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
-from starpos.earth.place import Places
+from starpos.earth.place import Place, Places
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import InstrumentError, StarposError
 from starpos.fix.blind import BlindSolver
@@ -29,7 +29,7 @@ from starpos.night.reading import Instruments, Reader, TiltFile, stars_of
 from starpos.night.remarks import Kind, Remark
 from starpos.progress import Progress, quiet
 from starpos.sky import catalogue
-from starpos.zenith.sighting import Mark, ZenithSighting, sighting
+from starpos.zenith.sighting import ZenithSighting, sighting
 
 if TYPE_CHECKING:
     from starpos.detection import Detection
@@ -139,7 +139,7 @@ class ZenithSighted:
     instruments: Instruments
     atmosphere: Atmosphere
     tilts: Tilts
-    mark: Mark
+    mark: Place
 
     def __call__(self, item: Frame | Stars) -> ZenithSighting | Solution:
         """The sighting of a frame, identified by every way there is."""

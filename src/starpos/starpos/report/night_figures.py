@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from starpos.earth.orientation import EarthState, earth_state
+from starpos.earth.place import Place
 from starpos.fix.solution import Attitude
-from starpos.gnss.receiver import GnssPlace
 from starpos.gnss.solving import Watched
 from starpos.gnss.watch import GnssStatus
 from starpos.instrument.camera import Camera
@@ -323,8 +323,8 @@ def _draw_map(axes: "Axes", timed: Sequence[Watched]) -> None:
     first = places[0] if places else grounds[0]
 
     def km(latitude: float, longitude: float) -> np.ndarray:
-        here = GnssPlace(utc_unix_s=0.0, latitude=latitude, longitude=longitude, covariance=np.eye(2))
-        return here.from_place_m(first.latitude, first.longitude) / 1000
+        here = Place.on_ellipsoid(*np.degrees([latitude, longitude]).tolist())
+        return here.offset_m(first.latitude, first.longitude) / 1000
 
     if grounds:
         stars = np.array([km(g.latitude, g.longitude) for g in grounds])

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from starpos.earth.place import Place
 from starpos.errors import StarposError
 from starpos.fix.solver import Solver
 from starpos.frames.frame import Stars
@@ -17,7 +18,7 @@ from starpos.session.settings import Settings
 from starpos.zenith.adjustment import Adjusted
 from starpos.zenith.doubts import DeflectionSession
 from starpos.zenith.session_file import NEW
-from starpos.zenith.sighting import Mark, ZenithSighting, sighting
+from starpos.zenith.sighting import ZenithSighting, sighting
 
 # An adjustment of more frames takes too long to keep up; the deflection is settled before.
 MOST = 500
@@ -65,15 +66,15 @@ class LiveDeflection:
         if names & OF_SESSION:
             self.forget()
 
-    def take(self, solver: Solver | None, stars: Stars, tilts: Tilts, found: Identification | None) -> None:
-        """Take an identified frame; one that gives no sighting is counted by its reason only."""
-        if solver is None or found is None or not self.measures or len(self._sightings) >= MOST:
+    def include(self, solver: Solver, stars: Stars, tilts: Tilts, found: Identification | None) -> None:
+        """Include an identified frame; one that gives no sighting is counted by its reason only."""
+        if found is None or not self.measures or len(self._sightings) >= MOST:
             return
         values = self._settings.values
-        mark = Mark(
-            math.radians(values["site.latitude"]), math.radians(values["site.longitude"]), values["altitude"]
-        )
         try:
+            mark = Place.on_ellipsoid(
+                values["site.latitude"], values["site.longitude"], height_m=values["altitude"]
+            )
             self._sightings.append(sighting(solver, stars, found, mark, tilts))
         except StarposError as error:
             self._left_out = str(error)
@@ -82,7 +83,7 @@ class LiveDeflection:
         if number >= LEAST and not self._jobs.busy and number - self._adjusted_of >= NEWS * number:
             self._adjust(solver, mark)
 
-    def _adjust(self, solver: Solver, mark: Mark) -> None:
+    def _adjust(self, solver: Solver, mark: Place) -> None:
         era, sightings = self._era, tuple(self._sightings)
         self._adjusted_of = len(sightings)
         # an A3 that was found by turning comes from these very frames

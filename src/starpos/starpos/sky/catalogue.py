@@ -32,7 +32,7 @@ from starpos.errors import CatalogueError
 from starpos.files import open_regular
 from starpos.rotation import normalised
 from starpos.sky._labels import Labels
-from starpos.table_cache import cache_folder, load_or_build, mapped, rising
+from starpos.table_cache import KeptTables, digest_of, rising
 from starpos.units import MAS, MAS_DEG
 
 # Zones of declination.
@@ -115,9 +115,6 @@ EPOCH_ZERO = 1900.0
 SMALLEST_MAS, SMALLEST_MAS_YEAR, CODE_STEP = 1.0, 0.1, 1.03
 # Parts of a mas/yr and of a mas in the columns that are finer.
 CENTI, TENTH = 0.01, 0.1
-# Names of the unpacked catalogue's folders in the cache, and kinds of numbers of its columns. The number stays as long as
-# older folders can be read: the deeper catalogue of a user without a network is there, too.
-PREFIX, KINDS = "stars-1-", "uiiiiuuuiiiiiu"
 COMMITTED = Path(__file__).with_name("data") / "tycho2.npz"
 
 Rows = np.ndarray | slice
@@ -413,6 +410,17 @@ def read(path: Path | str) -> Catalogue:
         ) from None
 
 
+def kept_catalogues(what: str = "") -> KeptTables[Catalogue]:
+    """Catalogues that are unpacked in the cache; what: as of `KeptTables`.
+
+    The number of the format stays as long as older folders can be read: the deeper catalogue of a user without a network
+    is there, too.
+    """
+    return KeptTables(
+        Catalogue, "stars-1-", "uiiiiuuuiiiiiu", what, newer=lambda columns: _newer(columns["tyc"])
+    )
+
+
 @lru_cache(maxsize=2)
 def load_catalogue(path: str | None = None) -> Catalogue:
     """The catalogue at `path`, else the file named by STARPOS_CATALOGUE, else the committed one; each is read once.
@@ -424,20 +432,8 @@ def load_catalogue(path: str | None = None) -> Catalogue:
     try:
         with zipfile.ZipFile(COMMITTED) as packed:
             columns = [(column.filename, column.CRC) for column in packed.infolist()]
-        key = repr((FORMAT, columns, zlib.crc32(PARALLAXES.read_bytes())))
+        key = (FORMAT, columns, zlib.crc32(PARALLAXES.read_bytes()))
     except (OSError, zipfile.BadZipFile):
         # raises the error of a broken file
         return read(COMMITTED)
-    folder = cache_folder() / f"{PREFIX}{hashlib.sha256(key.encode()).hexdigest()[:16]}"
-    return load_or_build(folder, PREFIX, lambda: stored(folder), lambda: read(COMMITTED), "")
-
-
-def stored(folder: Path) -> Catalogue | None:
-    """The catalogue in a folder of the cache; None if it is missing or its columns do not fit together."""
-    found: Catalogue | None = mapped(Catalogue, folder, KINDS, lambda columns: _newer(columns["tyc"]))
-    try:
-        if found is not None:
-            found.check()
-    except ValueError:
-        return None
-    return found
+    return kept_catalogues().built(digest_of(key), lambda: read(COMMITTED))

@@ -1,11 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How deep a catalogue a field needs, and a deeper one for small fields: all of Tycho-2, built once and kept in the
-cache.
-"""
+"""How deep a catalogue a field needs, and a deeper one for small fields: all of Tycho-2, built once and kept."""
 
 import math
 import os
-import threading
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -14,8 +11,7 @@ import numpy as np
 
 from starpos.instrument.camera import Camera
 from starpos.progress import Progress, quiet
-from starpos.sky.catalogue import CELLS, PREFIX, ZONES, Catalogue, stored
-from starpos.table_cache import cache_folder, load_or_build
+from starpos.sky.catalogue import CELLS, ZONES, Catalogue, kept_catalogues
 
 # Number of the catalogue's stars that should be on a frame, in all but this share of the sky.
 ENOUGH_ON_FRAME, SPARSE = 12, 0.1
@@ -100,9 +96,8 @@ ORIGINALS = "STARPOS_TYCHO2"
 ALL_MAG, TYCHO2_STARS = 20.0, 2_550_000
 # How to get the deeper catalogue.
 GET_IT = "type `starpos catalogue deepen --fetch` (121 MB, once)"
-
-_lock = threading.Lock()
-_in_use: dict[Path, Catalogue] = {}
+NAME = "tycho2"
+KEPT = kept_catalogues("stars of the deeper catalogue")
 
 
 def for_field(catalogue: Catalogue, camera: Camera, progress: Progress = quiet) -> Catalogue:
@@ -136,14 +131,7 @@ def too_thin(catalogue: Catalogue, camera: Camera) -> str:
 
 def kept() -> Catalogue | None:
     """The deeper catalogue, memory-mapped from the cache; None if it was not built."""
-    folder = _folder()
-    with _lock:
-        if folder not in _in_use:
-            if (found := stored(folder)) is None:
-                return None
-            _in_use.clear()
-            _in_use[folder] = found
-        return _in_use[folder]
+    return KEPT.stored(NAME)
 
 
 def build(originals: Path | str, progress: Progress = quiet, *, anew: bool = False) -> Catalogue:
@@ -153,17 +141,7 @@ def build(originals: Path | str, progress: Progress = quiet, *, anew: bool = Fal
     """
     from starpos.sky import tycho2
 
-    folder = _folder()
-    with _lock:
-        _in_use.clear()
-        _in_use[folder] = load_or_build(
-            folder,
-            PREFIX,
-            lambda: None if anew else stored(folder),
-            lambda: tycho2.build(originals, ALL_MAG, progress),
-            "stars of the deeper catalogue",
-        )
-        return _in_use[folder]
+    return KEPT.built(NAME, lambda: tycho2.build(originals, ALL_MAG, progress), anew=anew)
 
 
 def fetched(mirror: str | None = None, progress: Progress = quiet) -> Catalogue:
@@ -177,7 +155,3 @@ def fetched(mirror: str | None = None, progress: Progress = quiet) -> Catalogue:
     made = build(archive, progress, anew=True)
     archive.unlink(missing_ok=True)
     return made
-
-
-def _folder() -> Path:
-    return cache_folder() / f"{PREFIX}tycho2"

@@ -15,6 +15,7 @@ import numpy as np
 
 from starpos.earth.gravity import itrs_place, plumb_tide
 from starpos.earth.orientation import ROTATION_RAD_S
+from starpos.earth.place import Place
 from starpos.earth.refraction import Atmosphere
 from starpos.earth.vertical import plumb_curvature_arcsec_per_m
 from starpos.errors import FixError
@@ -22,7 +23,7 @@ from starpos.instrument.inclinometer import InclinometerErrors
 from starpos.instrument.instrument import Calibration, Instrument
 from starpos.units import ARCSEC
 from starpos.zenith.equations import Errors, LeanEstimate, Lines, errors_of, start_of
-from starpos.zenith.sighting import Mark, StarPlaces, ZenithSighting, faces_of, mean_headings
+from starpos.zenith.sighting import StarPlaces, ZenithSighting, faces_of, mean_headings
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -246,7 +247,7 @@ def adjusted(
     sightings: Sequence[ZenithSighting],
     instrument: Instrument,
     atmosphere: Atmosphere,
-    mark: Mark,
+    mark: Place,
     air: Air | None = None,
 ) -> Adjusted:
     """The deflection of a session; sightings: in order of time, at least three.
@@ -318,7 +319,7 @@ class _Session:
     prior: np.ndarray
     bending: float
     given: Calibration
-    mark: Mark
+    mark: Place
 
     def errors(self, lines: Lines, inclinometer: InclinometerErrors) -> Errors:
         since = self.given.utc_unix_s
@@ -482,7 +483,7 @@ def _fitted(lines: Lines, covariance: np.ndarray, prior: np.ndarray, offset: np.
     return _Fit(step=step, covariance=inverse, gain=gain, root=root, cost=cost, chi2=chi2)
 
 
-def _leftover(solved: _Solved, mark: Mark) -> Leftover:
+def _leftover(solved: _Solved, mark: Place) -> Leftover:
     # slow to import
     from scipy.linalg import cho_solve
 
@@ -492,7 +493,7 @@ def _leftover(solved: _Solved, mark: Mark) -> Leftover:
     design = inverse @ parameters
     return Leftover(
         by_lean=lines.by_lean,
-        by_second=lines.by_sky @ (mark.enu[:, 2] * ROTATION_RAD_S),
+        by_second=lines.by_sky @ (mark.axes[:, 2] * ROTATION_RAD_S),
         projector=inverse - design @ fit.covariance @ design.T,
         weighted=inverse @ (lines.off.reshape(-1) - parameters @ fit.step),
     )
@@ -560,7 +561,7 @@ class Reduced:
     geoid_arcsec: np.ndarray
 
 
-def reduced(found: Adjusted, sightings: Sequence[ZenithSighting], mark: Mark) -> Reduced:
+def reduced(found: Adjusted, sightings: Sequence[ZenithSighting], mark: Place) -> Reduced:
     """The reductions of a session.
 
     The mark's height above the ellipsoid stands for that above the geoid: 50 m between them are 0.009 arcsec at most.
@@ -570,7 +571,7 @@ def reduced(found: Adjusted, sightings: Sequence[ZenithSighting], mark: Mark) ->
     t = np.array([s.utc_unix_s for s in sightings])
     number = np.bincount(found.faces)
     middles = np.bincount(found.faces, t) / number
-    tides = np.array([plumb_tide(middle, place, mark.enu) for middle in middles.tolist()])
+    tides = np.array([plumb_tide(middle, place, mark.axes) for middle in middles.tolist()])
     east, north = number @ tides / number.sum() / ARCSEC
     tide = np.array([north, east])
     curvature = plumb_curvature_arcsec_per_m(mark.latitude) * mark.height_m

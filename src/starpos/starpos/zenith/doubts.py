@@ -8,13 +8,14 @@ import numpy as np
 
 from starpos.earth.ellipsoid import EARTH_RADIUS_M
 from starpos.earth.orientation import earth_motion
+from starpos.earth.place import Place
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import FixError
 from starpos.instrument.instrument import Instrument
 from starpos.sky.catalogue import load_catalogue
 from starpos.units import ARCSEC, utc_text
 from starpos.zenith.adjustment import Adjusted, FaceQuality, adjusted, check_round
-from starpos.zenith.sighting import Mark, ZenithSighting
+from starpos.zenith.sighting import ZenithSighting
 
 # On land 6 arcsec are usual, over 25 are found in high mountains only, over 120 nowhere.
 LARGE_ARCSEC, MAX_ARCSEC = 25.0, 120.0
@@ -204,7 +205,7 @@ class DeflectionSession:
 
     @classmethod
     def of(
-        cls, sightings: Sequence[ZenithSighting], instrument: Instrument, atmosphere: Atmosphere, mark: Mark
+        cls, sightings: Sequence[ZenithSighting], instrument: Instrument, atmosphere: Atmosphere, mark: Place
     ) -> "DeflectionSession":
         """Adjust the sightings; FixError, with a sentence, where they do not bear a deflection."""
         if not sightings:

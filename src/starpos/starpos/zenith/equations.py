@@ -12,9 +12,10 @@ import numpy as np
 
 from starpos import rotation
 from starpos.earth.orientation import ROTATION_RAD_S
-from starpos.instrument.inclinometer import InclinometerErrors
+from starpos.earth.place import Place
+from starpos.instrument.inclinometer import OUTDOORS_WALK_C_PER_SQRT_HOUR, InclinometerErrors
 from starpos.units import ARCSEC, HOUR_S
-from starpos.zenith.sighting import Mark, StarPlaces, ZenithSighting
+from starpos.zenith.sighting import StarPlaces, ZenithSighting
 
 TURNS_TRIED = 360
 
@@ -121,8 +122,6 @@ def start_of(sightings: Sequence[ZenithSighting]) -> LeanEstimate:
     return LeanEstimate(lean=np.array([xi, eta]), a3=tilted @ a3)
 
 
-# Unmeasured temperature of a tiltmeter: it follows a clear night's air, some degrees in a few hours.
-UNKNOWN_WALK_C_PER_SQRT_HOUR = 2.0
 # Daily and half-daily terms of UT1 and of the pole, which daily tables do not have. The values are the root mean square
 # of the ocean tides' terms (IERS Conventions (2010), tables 8.2 and 8.3: M2 alone is 0.33 mas of the pole, O1 0.02 ms of
 # UT1). They include the error of interpolating UT1 linearly across a day of its fortnightly tide (0.8 ms, table 8.1).
@@ -170,7 +169,7 @@ def errors_of(
     places: StarPlaces,
     faces: np.ndarray,
     inclinometer: InclinometerErrors,
-    mark: Mark,
+    mark: Place,
     since_unix_s: float,
 ) -> Errors:
     """The errors of a session; since_unix_s: time at which the tiltmeter's zero was found with A3, NaN: unknown."""
@@ -217,7 +216,7 @@ def _of_tilts(
             Source.shared("tilt temperature", axes * ((warm - warm.mean()) * per_c)[:, None, None])
         )
     else:
-        walk = hours * UNKNOWN_WALK_C_PER_SQRT_HOUR**2
+        walk = hours * OUTDOORS_WALK_C_PER_SQRT_HOUR**2
         sources.append(Source.varying("tilt temperature", walk, axes * per_c))
     return sources
 
@@ -245,14 +244,16 @@ def _of_stars(lines: Lines, sightings: Sequence[ZenithSighting], places: StarPla
     ]
 
 
-def _of_time(lines: Lines, sightings: Sequence[ZenithSighting], mark: Mark) -> list[Source]:
+def _of_time(lines: Lines, sightings: Sequence[ZenithSighting], mark: Place) -> list[Source]:
     # in a second the sky turns about the pole
-    second = lines.by_sky @ (mark.enu[:, 2] * ROTATION_RAD_S)
+    second = lines.by_sky @ (mark.axes[:, 2] * ROTATION_RAD_S)
     clock = np.array([np.hypot(s.clock_stddev_s, s.stamp_stddev_s) for s in sightings])
     ut1 = np.array([s.orientation.ut1_sigma_s for s in sightings])
     pole = np.array([s.orientation.pole_sigma for s in sightings])
     return [
         Source.shared("clock", (second * clock[:, None])[..., None]),
         Source.shared("ut1", (second * np.hypot(ut1, DAILY_UT1_S)[:, None])[..., None]),
-        Source.shared("pole", lines.by_sky @ mark.enu[:, :2] * np.hypot(pole, DAILY_POLE_RAD)[:, None, None]),
+        Source.shared(
+            "pole", lines.by_sky @ mark.axes[:, :2] * np.hypot(pole, DAILY_POLE_RAD)[:, None, None]
+        ),
     ]

@@ -11,6 +11,7 @@ import numpy as np
 
 from starpos import rotation
 from starpos.earth.orientation import ROTATION_RAD_S, EarthState
+from starpos.earth.place import Place
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import FixError
 from starpos.frames.exposure import UNKNOWN_SHUTTER
@@ -20,7 +21,7 @@ from starpos.instrument.instrument import Instrument
 from starpos.sky.catalogue import Catalogue
 from starpos.units import MAS_DEG
 from starpos.zenith.adjustment import AIR_SHARE, Air, adjusted
-from starpos.zenith.sighting import Mark, ZenithSighting
+from starpos.zenith.sighting import ZenithSighting
 
 # a round: a quarter turn from face to face
 FACES = 4
@@ -128,7 +129,7 @@ class Planner:
     instrument: Instrument
     camera: Camera
     atmosphere: Atmosphere
-    mark: Mark
+    mark: Place
     sky: ZenithSky
     routine: Routine
     motion_rad: float
@@ -209,7 +210,7 @@ class Planner:
         roll = sky.centroid_rad / sky.radius_rad
         rows = np.linspace(0, self.camera.height - 1, 9)
         late_s = (instrument.shutter or UNKNOWN_SHUTTER).errors_s(rows, self.camera.height).mean(0)
-        drift = -ROTATION_RAD_S * (attitude @ self.mark.enu[:, 2])
+        drift = -ROTATION_RAD_S * (attitude @ self.mark.axes[:, 2])
         return ZenithSighting(
             source="",
             utc_unix_s=utc_unix_s,

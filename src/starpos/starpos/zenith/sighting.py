@@ -7,8 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from starpos import rotation
-from starpos.earth.ellipsoid import ECCENTRICITY2, enu_axes
+from starpos.earth.ellipsoid import ECCENTRICITY2
 from starpos.earth.orientation import ROTATION_RAD_S, EarthOrientation, EarthState, later, station_velocity
+from starpos.earth.place import Place
 from starpos.earth.refraction import Refraction
 from starpos.errors import FixError, InstrumentError
 from starpos.fix._adjustment import Adjustment
@@ -26,20 +27,6 @@ from starpos.rotation import half_turns
 BENT_ALREADY = Refraction(0.0, 0.0)
 # step of the refraction for its derivative
 STRONGER = 0.01
-
-
-@dataclass(frozen=True)
-class Mark:
-    """The point above which the instrument stands: geodetic latitude, longitude (rad) and height (m) on WGS 84."""
-
-    latitude: float
-    longitude: float
-    height_m: float
-
-    @property
-    def enu(self) -> np.ndarray:
-        """Rotation (3, 3) of ITRS into east, north, up."""
-        return enu_axes(self.latitude, self.longitude)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -85,7 +72,9 @@ class ZenithSighting:
         return float(np.sqrt(np.mean(self.residual_arcsec**2)))
 
 
-def sighting(solver: Solver, stars: Stars, found: Identification, mark: Mark, tilts: Tilts) -> ZenithSighting:
+def sighting(
+    solver: Solver, stars: Stars, found: Identification, mark: Place, tilts: Tilts
+) -> ZenithSighting:
     """The sighting of a frame whose stars are identified.
 
     Refraction is counted from the ellipsoid's normal; `adjustment` accounts for the plumb line's deflection from it.
@@ -113,7 +102,7 @@ def sighting(solver: Solver, stars: Stars, found: Identification, mark: Mark, ti
     )
     shutter = solver.shutter(stars)
     itrs = _seen(matched, state, shutter, camera.height, mark)
-    enu = itrs @ mark.enu.T
+    enu = itrs @ mark.axes.T
     refraction = solver.atmosphere.refraction()
     problem = Adjustment(
         matched.xy,
@@ -139,14 +128,14 @@ def sighting(solver: Solver, stars: Stars, found: Identification, mark: Mark, ti
     rays = refraction.bend(enu)[kept] @ fit.a4.T
     # a star that is displaced moves on the frame as the camera's turn about its ray x displacement would move it
     across = np.array([rotation.cross_matrix(ray) for ray in rays])
-    icrs_to_camera = fit.a4 @ mark.enu @ state.gcrs_to_itrs
+    icrs_to_camera = fit.a4 @ mark.axes @ state.gcrs_to_itrs
     displaced_px = turns @ across @ icrs_to_camera * matched.place_sigma[kept, None, None]
     gain, white = errors.gain, np.linalg.inv(np.linalg.cholesky(centroids))
     shown = white @ displaced_px
     common = np.linalg.qr((white @ fit.slope[kept]).reshape(-1, 4))[0].reshape(-1, 2, 4)
     stronger = solver.atmosphere.refraction(1 + STRONGER).bend(enu)[kept] - refraction.bend(enu)[kept]
     bent_px = np.einsum("nij,njk,nk->ni", turns, across, stronger @ fit.a4.T)
-    pole = fit.a4 @ mark.enu[:, 2]
+    pole = fit.a4 @ mark.axes[:, 2]
     late_s = shutter.errors_s(matched.xy[kept, 1], camera.height)
     drift_px = turns @ (-ROTATION_RAD_S * pole)
     return ZenithSighting(
@@ -179,12 +168,12 @@ def centroids_of(residual: np.ndarray, stated: np.ndarray, placed_px: np.ndarray
     return stated + ISOTROPIC * expected_extra(residual, whole, share)
 
 
-def _seen(stars: MatchedStars, state: EarthState, shutter: Shutter, height: int, mark: Mark) -> np.ndarray:
+def _seen(stars: MatchedStars, state: EarthState, shutter: Shutter, height: int, mark: Place) -> np.ndarray:
     """Topocentric directions (N, 3) in ITRS, with the diurnal aberration, each when its row was exposed."""
     itrs = state.to_itrs(stars.places)
     if shutter.readout_s:
         itrs = later(itrs, shutter.later_s(stars.xy[:, 1], height))
-    return rotation.normalised(itrs + station_velocity(mark.enu[2]))
+    return rotation.normalised(itrs + station_velocity(mark.axes[2]))
 
 
 # within a face the heading stays: a turntable or a foot that settles moves it by less than this

@@ -78,4 +78,4 @@ def test_an_error_may_be_taken_for_one_that_is_not_stated():
 def test_metres_to_a_place_across_the_date_line():
     east = message_to_gnss(message(longitude=-179.999, latitude=0.5))
     here = message_to_gnss(message(longitude=179.999, latitude=0.5))
-    assert east.from_place_m(here.latitude, here.longitude) == pytest.approx([222.6, 0.0], abs=0.1)
+    assert east.offset_m(here.latitude, here.longitude) == pytest.approx([222.6, 0.0], abs=0.1)

@@ -8,7 +8,6 @@ import pytest
 
 from starpos.earth.vertical import Deflection
 from starpos.gnss.filter import place_of_stars, what_would_tell_more
-from starpos.gnss.receiver import GnssPlace
 from starpos.gnss.watch import GnssStatus, GnssWatch
 from starpos.instrument import sensors
 from starpos.instrument.inclinometer import InclinometerErrors
@@ -44,9 +43,8 @@ def driven(drive, seed, gnss_until_s=np.inf, gnss_again_s=np.inf, astray=lambda 
         check = watch.judge(sighting, moment.gnss) if t < gnss_until_s or t > gnss_again_s else None
         error = covariance = None
         if watch.tells_place(sighting):
-            latitude, longitude, covariance = place_of_stars(sighting, watch.learned, UNKNOWN)
-            here = GnssPlace(utc_unix_s=0.0, latitude=latitude, longitude=longitude, covariance=covariance)
-            error = here.from_place_m(*moment.place)
+            here = place_of_stars(sighting, watch.learned, UNKNOWN)
+            error, covariance = here.offset_m(*moment.place), here.covariance
         told.append(Told(t, check, error, covariance))
         if check is not None:
             watch.learn(sighting, moment.gnss, check)

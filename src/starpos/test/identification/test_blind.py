@@ -17,7 +17,7 @@ from starpos.frames.frame import Stars
 from starpos.frames.reading import read_frame
 from starpos.identification import Sky, blind, quads
 from starpos.identification.pose import stars_at
-from starpos.identification.quads import Matches
+from starpos.identification.quads import matches
 from starpos.identification.triangles import no_triangles
 from starpos.instrument.camera import Camera
 from starpos.instrument.instrument import Instrument
@@ -178,11 +178,11 @@ def test_at_any_scale_the_quads_of_a_frame_are_those_of_the_sky(catalogue, rng):
         tried += 1
         field = stars_at(camera, xy, np.full(4, 0.1))
         found = [
-            Matches.of(field, table, 4, 0.4, focal, step)
+            matches(field, table, 4, 0.4, focal, step)
             for focal, step in blind.focal_lengths(half_px, *span)
             if abs(np.log(focal / focal_px)) < 0.3
         ]
-        assert any((m.corner == table.corners[quad]).all(1).any() for m in found), focal_px
+        assert any((corner == table.corners[quad]).all(1).any() for _, corner, _ in found), focal_px
 
 
 def test_the_focal_lengths_that_are_tried_cover_all():
@@ -221,13 +221,13 @@ def test_a_shape_is_that_of_the_quad_turned_scaled_and_mirrored(rng):
 def test_a_damaged_cache_is_built_again(catalogue, tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setattr(quads, "LEVELS", ((19.4, 6), (29.0, 6)))
-    monkeypatch.setattr(quads, "_in_use", {})
+    quads.KEPT.forget()
     # a copy, because the file below it is damaged
     first = quads.cached_quads(catalogue).shape.copy()
     assert quads.is_built(catalogue) and len(first) > 100
     (folder,) = (tmp_path / "starpos").glob("quads-*")
     (folder / "shape.npy").write_bytes(b"no")
-    quads._in_use.clear()
+    quads.KEPT.forget()
     assert np.array_equal(quads.cached_quads(catalogue).shape, first)
     assert (folder / "shape.npy").stat().st_size > 100
 

@@ -24,7 +24,7 @@ def field(catalogue, rng):
 @pytest.fixture
 def not_lost(monkeypatch):
     """The search of the whole sky may not be called."""
-    monkeypatch.setattr(search, "_lost", lambda *_: pytest.fail("lost in space"))
+    monkeypatch.setattr(search, "_finder", lambda *_: pytest.fail("lost in space"))
 
 
 def turned(attitude, rng, angle_rad):
@@ -142,7 +142,7 @@ def test_the_next_frame_of_a_fix_is_not_lost(catalogue, rng, monkeypatch):
     scene = wide_scene()
     solver = solver_of(scene, catalogue)
     first = solver.solve(stars_of(scene, catalogue, rng), tilt_of(scene, rng))
-    monkeypatch.setattr(search, "_lost", lambda *_: pytest.fail("lost in space"))
+    monkeypatch.setattr(search, "_finder", lambda *_: pytest.fail("lost in space"))
     later = START + 2.5 * 3600
     moved = wide_scene(pointing_deg=(210.0, 78.0, 15.0))
     for now in (scene, moved):

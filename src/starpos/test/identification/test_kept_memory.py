@@ -81,4 +81,4 @@ def test_a_search_of_no_stage_or_of_too_many_is_refused(sky):
     stars = frame(np.zeros((2, 5, 2)), np.ones(5))
     for stages in ([], [(5, 0.3)] * 9):
         with pytest.raises(ValueError, match=f"^{len(stages)} stages"):
-            search.near_or_lost(stars, sky, (), stages)
+            next(search.near_or_lost(stars, sky, (), stages))

@@ -37,9 +37,9 @@ def places(table, catalogue):
 def own_cache(tmp_path, monkeypatch):
     """An empty cache and nothing remembered from it, before and after."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    triangles._in_use.clear()
+    triangles.KEPT.forget()
     yield tmp_path / "cache" / "starpos"
-    triangles._in_use.clear()
+    triangles.KEPT.forget()
 
 
 def angles(v):
@@ -183,7 +183,7 @@ def test_it_is_built_once_then_mapped(own_cache, catalogue, monkeypatch):
     table = triangles.cached_triangles(catalogue, BROAD, lambda what, done: built.append(done))
     assert built[-1] == pytest.approx(1)
     (folder,) = own_cache.iterdir()
-    triangles._in_use.clear()
+    triangles.KEPT.forget()
     monkeypatch.setattr(triangles, "build", lambda *_: pytest.fail("built again"))
     again = triangles.cached_triangles(catalogue, BROAD)
     np.testing.assert_array_equal(again.corners, table.corners)
@@ -196,15 +196,15 @@ def test_who_waited_for_another_process_that_built_does_not_build_again(own_cach
     triangles.cached_triangles(catalogue, BROAD)
     (folder,) = own_cache.iterdir()
     away = folder.rename(own_cache.parent / "away")
-    triangles._in_use.clear()
-    absent, built, load = threading.Event(), [], triangles._map
+    triangles.KEPT.forget()
+    absent, built, load = threading.Event(), [], triangles.KEPT.mapped
 
     def looked(*of):
         found = load(*of)
         absent.set()
         return found
 
-    monkeypatch.setattr(triangles, "_map", looked)
+    monkeypatch.setattr(triangles.KEPT, "mapped", looked)
     other = os.open(own_cache, os.O_RDONLY)
     fcntl.flock(other, fcntl.LOCK_EX)
     waiting = threading.Thread(
@@ -247,7 +247,7 @@ def test_a_broken_cache_is_built_anew(damage, own_cache, catalogue):
     (folder,) = own_cache.iterdir()
     column, harm = DAMAGE[damage]
     kept = {path.name: path.read_bytes() for path in folder.iterdir()}
-    triangles._in_use.clear()
+    triangles.KEPT.forget()
     path = folder / f"{column}.npy"
     # Otherwise the harm would reach what is still mapped.
     path.unlink()
@@ -270,7 +270,7 @@ def test_what_older_versions_left_in_the_cache_goes(own_cache, catalogue):
     (own_cache / "unfinished-now").mkdir()
     (own_cache / "somebody's").mkdir()
     triangles.cached_triangles(catalogue, BROAD)
-    left = sorted(p.name for p in own_cache.iterdir() if not p.name.startswith(triangles.PREFIX))
+    left = sorted(p.name for p in own_cache.iterdir() if not p.name.startswith(triangles.KEPT.prefix))
     assert left == ["somebody's", "unfinished-now"]
 
 

@@ -175,6 +175,14 @@ def test_stars_that_an_unknown_lens_bends_out_of_place_are_no_second_sky(corner_
         assert not warns(sky_of(catalogue, random_attitude(rng), 1.0, corner_px), catalogue, rng)
 
 
+@pytest.mark.parametrize("error_px", [1.5, 2.5])
+def test_centroids_that_err_by_more_than_they_claim_are_one_sky(error_px, catalogue, rng):
+    # as on photographs of telephones, which merge and sharpen several exposures
+    for _ in range(FIELDS):
+        light = sky_of(catalogue, random_attitude(rng))
+        assert not warns(light.moved(light.xy + rng.normal(0, error_px, light.xy.shape)), catalogue, rng)
+
+
 def exposed(light, rng, trail_px=(0.0, 0.0)) -> Stars:
     """The stars that the detector finds on a frame of these lights, trailed."""
     on = ((light.xy > 0) & (light.xy < np.array(SIZE))).all(1)

@@ -54,7 +54,7 @@ def test_a_field_with_too_few_stars_takes_the_deeper_catalogue_once_it_is_built(
     seen = []
     made = deeper.build(originals, lambda what, done: seen.append(done))
     assert len(made) >= 5000 and len(seen) == 21
-    deeper._in_use.clear()
+    deeper.KEPT.forget()
     kept = deeper.kept()
     assert kept.fingerprint == made.fingerprint
     assert deeper.for_field(bright, SMALL) is kept
@@ -67,7 +67,7 @@ def test_original_files_at_hand_are_built_when_a_field_needs_them_and_only_once(
 ):
     monkeypatch.setenv(deeper.ORIGINALS, str(originals))
     assert len(deeper.for_field(bright, SMALL)) >= 5000
-    deeper._in_use.clear()
+    deeper.KEPT.forget()
     monkeypatch.setenv(deeper.ORIGINALS, str(originals / "none"))
     assert len(deeper.for_field(bright, SMALL)) >= 5000
 
@@ -81,10 +81,18 @@ def test_original_files_that_are_none_are_named(bright, tmp_path, monkeypatch):
 def test_what_is_broken_in_the_cache_counts_as_not_built(originals, own_cache):
     deeper.build(originals)
     (folder,) = own_cache.glob("stars-*")
-    deeper._in_use.clear()
+    deeper.KEPT.forget()
     np.save(folder / "hip.npy", np.zeros(3, np.int32))
     assert deeper.kept() is None
     assert len(deeper.build(originals)) >= 5000 and deeper.kept() is not None
+
+
+@pytest.mark.parametrize("anew", [False, True])
+def test_it_is_built_once_a_call(originals, anew):
+    before = deeper.build(originals)
+    seen = []
+    made = deeper.build(originals, lambda what, done: seen.append(done), anew=anew)
+    assert len(seen) == 21 * anew and made.fingerprint == before.fingerprint
 
 
 def test_a_thin_field_says_what_it_holds_what_it_needs_and_what_to_type(catalogue):

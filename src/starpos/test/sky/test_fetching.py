@@ -82,9 +82,9 @@ def own_cache(archive, tmp_path, monkeypatch):
     monkeypatch.setattr(tycho2, "SHA256", hashlib.sha256(archive).hexdigest())
     monkeypatch.setattr(tycho2, "BYTES", len(archive))
     monkeypatch.setattr(tycho2, "CHUNK_BYTES", 1000)
-    deeper._in_use.clear()
+    deeper.KEPT.forget()
     yield tmp_path / "cache" / "starpos"
-    deeper._in_use.clear()
+    deeper.KEPT.forget()
 
 
 def test_one_command_brings_the_deeper_catalogue_and_leaves_nothing_else(
@@ -95,7 +95,7 @@ def test_one_command_brings_the_deeper_catalogue_and_leaves_nothing_else(
     status, _, said = run(capsys, "catalogue", "deepen", "--fetch")
     assert status == 0 and "small fields take them from now on" in said[-1]
     assert len(deeper.kept()) >= 200
-    assert [p.name for p in own_cache.iterdir()] == [f"{deeper.PREFIX}tycho2"]
+    assert [p.name for p in own_cache.iterdir()] == [f"{deeper.KEPT.prefix}tycho2"]
     assert there.asked == [(f"/debian/{tycho2.IN_MIRROR}", None)]
 
 

@@ -9,6 +9,7 @@ import pytest
 
 from starpos import rotation
 from starpos.earth.orientation import earth_state
+from starpos.earth.place import Place
 from starpos.earth.refraction import Atmosphere
 from starpos.fix.solver import Solver
 from starpos.frames.frame import Stars
@@ -19,7 +20,7 @@ from starpos.sky import catalogue as module
 from starpos.sky.catalogue import load_catalogue, pack, read, save
 from starpos.sky.site import Site
 from starpos.units import ARCSEC, DAY_S, MAS
-from starpos.zenith.sighting import Mark, sighting
+from starpos.zenith.sighting import sighting
 
 # HIP: J2000 place (deg), motions and parallax (mas) as SIMBAD has them: Hipparcos (van Leeuwen 2007), Gaia for Barnard's
 NEAREST = {
@@ -100,13 +101,13 @@ def test_a_file_from_before_parallaxes_has_those_of_its_near_stars(near, tmp_pat
 def test_an_unpacked_catalogue_from_before_parallaxes_is_still_one(near, tmp_path):
     from starpos.table_cache import _store
 
-    _store(near, tmp_path / "stars-1-old", module.PREFIX)
+    _store(near, tmp_path / "stars-1-old", "stars-1-")
     for name in NEWER:
         (tmp_path / "stars-1-old" / f"{name}.npy").unlink()
-    old = module.stored(tmp_path / "stars-1-old")
+    old = module.kept_catalogues().mapped(tmp_path / "stars-1-old")
     assert old.fingerprint == near.fingerprint and (old.parallax_tenths >= 200).all()
     (tmp_path / "stars-1-old" / "tyc.npy").unlink()
-    assert module.stored(tmp_path / "stars-1-old") is None
+    assert module.kept_catalogues().mapped(tmp_path / "stars-1-old") is None
 
 
 def test_motions_are_kept_to_a_hundredth(near):
@@ -153,7 +154,7 @@ def _ground(site):
 
 ANSWERS = {
     "deflection": lambda solver, stars, found, tilt: (
-        sighting(solver, stars, found.found, Mark(*np.radians(PLACE), 0.0), tilt).enu_to_camera
+        sighting(solver, stars, found.found, Place.on_ellipsoid(*PLACE, height_m=0.0), tilt).enu_to_camera
     ),
     "fix": lambda solver, stars, found, tilt: solver.solve(stars, tilt).fix,
     "under way": lambda solver, stars, found, tilt: (

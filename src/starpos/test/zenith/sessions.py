@@ -8,12 +8,13 @@ import numpy as np
 from starpos import rotation
 from starpos.earth.ellipsoid import enu_axes
 from starpos.earth.orientation import EarthOrientation
+from starpos.earth.place import Place
 from starpos.earth.refraction import Atmosphere
 from starpos.instrument.inclinometer import EXACT, Tilt
 from starpos.instrument.instrument import Instrument
 from starpos.units import ARCSEC
 from starpos.zenith.adjustment import adjusted
-from starpos.zenith.sighting import Mark, ZenithSighting
+from starpos.zenith.sighting import ZenithSighting
 
 NOISE_ARCSEC, DRIFT_ARCSEC, SCALE = 0.05, 0.05, 1e-3
 TILTMETER = replace(
@@ -21,7 +22,7 @@ TILTMETER = replace(
 )
 INSTRUMENT = Instrument(93750.0, inclinometer=TILTMETER, clock_stddev_s=0.001)
 VACUUM = Atmosphere(pressure_pa=0.0)
-MARK = Mark(np.radians(47.0), np.radians(8.0), 500.0)
+MARK = Place.on_ellipsoid(47.0, 8.0, height_m=500.0)
 BEGIN = 1.75e9
 ORIENTATION = EarthOrientation(
     ut1_minus_utc_s=0.0, ut1_sigma_s=1e-5, pole_x=0.0, pole_y=0.0, pole_sigma=1e-10
@@ -67,7 +68,7 @@ def drawn(
     """A session of frames 5 s apart in faces at these azimuths (deg), a minute from face to face; sizes in arcsec."""
     eta, xi = rng.normal(0, 10, 2)
     astronomic = MARK.latitude + xi * ARCSEC, MARK.longitude + eta * ARCSEC / np.cos(MARK.latitude)
-    up = MARK.enu @ enu_axes(*astronomic)[2]
+    up = MARK.axes @ enu_axes(*astronomic)[2]
     a3 = rotation.about_axis(2, np.radians(turn_deg)) @ rotation.from_vector([*rng.normal(0, 0.002, 2), 0.0])
     zero, scale = rng.normal(0, 60, 2) * ARCSEC, rng.normal(0, SCALE * worse.scale, 2)
     quiet = motion == 0 and air == 0
