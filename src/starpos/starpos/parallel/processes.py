@@ -174,7 +174,7 @@ class Processes:
 
 
 def workers(number: int) -> Workers:
-    """That many processes, or this one alone."""
+    """Processes of that number, or this one alone."""
     return Here() if number <= 1 else Processes(number)
 
 
