@@ -17,7 +17,7 @@ from starpos.fix.attitude import Attitude
 from starpos.fix.fix import Fix, InDegrees, length_text
 from starpos.fix.heading import AttitudeAtPlace
 from starpos.fix.solution import Solution, Status
-from starpos.night.together import Solved
+from starpos.night.together import Gathered
 from starpos.units import utc_text
 
 # numbers of an average that are printed
@@ -124,13 +124,13 @@ def put_combined(
     output: Output,
     night: NightFolder,
     all_together: Average | None,
-    solved: Sequence[Solved],
-    warnings: set[str],
+    gathered: Gathered,
     vertical: Vertical,
     about: dict | None = None,
 ) -> None:
     """Write the average of a night, or that it is missing; about: more keys of JSON."""
     name = {} if night.folder is None else {"night": night.folder}
+    solved = gathered.solved
     counts = dict.fromkeys(COUNTS) if all_together is None else {k: getattr(all_together, k) for k in COUNTS}
     of_stars = {
         "stars_detected": sum(s.stars_detected for s in solved),
@@ -138,7 +138,7 @@ def put_combined(
         "residual_arcsec": np.sqrt(np.mean([s.fix.residual_arcsec**2 for s in solved] or [np.nan])),
         "log_odds": sum(s.log_odds for s in solved) if solved else None,
         "status": (Status.OK if all_together else Status.POOR_FIT).value,
-        "warnings": sorted(warnings),
+        "warnings": sorted(gathered.warnings),
     }
     age_days = table_age_days(all_together.utc_unix_s) if all_together else None
     output.put(

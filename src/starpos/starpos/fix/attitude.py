@@ -11,9 +11,6 @@ from starpos import rotation
 from starpos.fix.terms import ErrorTerm
 from starpos.frozen import at_once
 
-if TYPE_CHECKING:
-    from starpos.fix.terms import ErrorTerm
-
 # Names of frames, as docs/frames_and_symbols.md has them.
 CAMERA, LINK, ITRS, GCRS, ENU = "camera", "link", "ITRS", "GCRS", "ENU"
 

@@ -20,8 +20,6 @@ from starpos.units import HOUR_S
 
 # Name of the term of the calibrated A3.
 CALIBRATION = "calibration"
-# 1 sigma of the difference of two unmeasured temperatures: a warm room and a clear night
-UNKNOWN_TEMPERATURE_C = 14.0
 
 
 @at_once
@@ -230,6 +228,7 @@ def _inclinometer_terms(
     """
     errors, term = mounting.inclinometer, partial(ErrorTerm, origin=Origin.INCLINOMETER)
     since_s = abs(utc_unix_s - mounting.calibrated_unix_s)
+    warmer_c = mounting.warmer_c(tilt)
     return (
         ErrorTerm("tilt", rows @ symmetric_root(tilt.noise), shared=tilt.times, origin=Origin.READINGS),
         term("tilt quantisation", rows * errors.undithered_rad(tilt), shared=errors.steps(tilt)),
@@ -244,19 +243,9 @@ def _inclinometer_terms(
         ),
         term(
             "tilt temperature",
-            rows * errors.temperature_rad_per_c * _warmer_c(tilt, mounting),
+            rows
+            * errors.temperature_rad_per_c
+            * (warmer_c if math.isfinite(warmer_c) else mounting.unmeasured_c),
             shared=ALWAYS,
         ),
     )
-
-
-def _warmer_c(tilt: Tilt, mounting: Mounting) -> float:
-    """The inclinometer's temperature minus the calibration's; if unknown, its expected 1 sigma.
-
-    If a calibration has neither a date nor a temperature, its stated error holds for all temperatures.
-    """
-    warmer = tilt.temperature_c - mounting.calibrated_temperature_c
-    if math.isfinite(warmer):
-        return warmer
-    dated = math.isfinite(mounting.calibrated_unix_s) or math.isfinite(mounting.calibrated_temperature_c)
-    return UNKNOWN_TEMPERATURE_C if dated else 0.0

@@ -99,7 +99,7 @@ def read(
         wanted = [c for c in chosen.connections if c.msgtype not in WITH_STARS]
         total = sum(c.msgcount for c in wanted) or 1
         for done, (connection, log_ns, message) in enumerate(bag.decoded(wanted), 1):
-            reading.take(connection.msgtype, message, log_ns * 1e-9)
+            reading.read_message(connection.msgtype, message, log_ns * 1e-9)
             if done % 500 == 0 or done == total:
                 progress(path.name[:20], done / total)
         return Recorded(
@@ -148,8 +148,8 @@ class _Reading:
         self._unusable = 0
         self._why_no_camera = ""
 
-    def take(self, kind: str, message: Any, log_s: float) -> None:
-        """Take in a message of a type; an impossible tilt or camera only leads to a remark."""
+    def read_message(self, kind: str, message: Any, log_s: float) -> None:
+        """Read a message of a type; an impossible tilt or camera only leads to a remark."""
         if kind == IMU:
             kind, message = TILT, self._messages.tilt_of(message, log_s)
             if message is None:

@@ -47,7 +47,7 @@ def own_cache(sky, tmp_path_factory):
         patch.setenv("XDG_CACHE_HOME", str(folder / "cache"))
         deeper.build(write_sky(folder / "originals", *sky))
         yield
-    deeper._in_use.clear()
+    deeper.KEPT.forget()
 
 
 def seen(sky, camera, rng):
