@@ -285,7 +285,7 @@ def looking(solver: Solver) -> montecarlo_fields.Answer:
     """A function that asks `solver` for the direction (3,) in ICRS of a frame's centre."""
 
     def answer(stars: Stars) -> np.ndarray | None:
-        a = solver.identify(stars).attitude
+        a = solver.identify(stars).pointing
         if a is None:
             return None
         return np.array([np.cos(a.dec) * np.cos(a.ra), np.cos(a.dec) * np.sin(a.ra), np.sin(a.dec)])

@@ -12,8 +12,8 @@ from starpos.earth.ellipsoid import curvature_radii_m
 from starpos.earth.refraction import Atmosphere
 from starpos.earth.vertical import Deflection, Vertical, geodetic
 from starpos.errors import FrameError, InstrumentError, StarposError, TiltError
-from starpos.fix.budget import ALWAYS, ErrorTerm
-from starpos.fix.solution import Attitude, Status
+from starpos.fix.solution import FieldPointing, Status
+from starpos.fix.terms import ALWAYS, ErrorTerm
 from starpos.frames.frame import Frame, Stars
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import Tilt
@@ -245,7 +245,7 @@ def shot_of(m: Any, cameras: dict[tuple[int, int], Camera]) -> Shot:
     looking = np.radians([m.right_ascension, m.declination, m.roll])
     if np.isfinite([*looking, m.focal_px]).all() and m.focal_px > 0:
         ra, dec, roll = looking.tolist()
-        pointing = Attitude(
+        pointing = FieldPointing(
             ra=ra,
             dec=dec,
             roll=roll,
