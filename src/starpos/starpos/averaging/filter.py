@@ -14,9 +14,8 @@ import numpy as np
 
 from starpos._numeric.roots import symmetric_root
 from starpos.earth.ellipsoid import curvature_radii_m, enu_axes, meridian_turn, place_of_zenith, zenith_of
-from starpos.fix.budget import EACH_POSE, ErrorTerm, correlation
 from starpos.fix.fix import Fix
-from starpos.frozen import at_once
+from starpos.fix.terms import EACH_POSE, ErrorTerm, correlation
 from starpos.rotation import full_turn, half_turn
 
 # of east, north in m and heading in rad: brings them to similar sizes
@@ -29,7 +28,6 @@ MAX_BENT = 0.2
 STEEPEST = 30.0
 
 
-@at_once
 @dataclass(frozen=True)
 class Plane:
     """The tangent plane at a fix, whose east and north are used for all fixes near it.
@@ -85,7 +83,6 @@ class Plane:
         return place_of_zenith(zenith)
 
 
-@at_once
 @dataclass(frozen=True, kw_only=True)
 class PlaceFilter:
     """State of the filter after the fixes so far.
