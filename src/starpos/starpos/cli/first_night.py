@@ -114,7 +114,7 @@ def _watched(args: argparse.Namespace, folder: Path) -> tuple[FirstNight | None,
                 air = options.atmosphere_of(args)
                 night = FirstNight(Solver(options.instrument_of(args, item), catalogue.load_catalogue(), air))
             sight = Solving(given)(item)
-            look = night.add(sight, _tilts(folder, night, stars_of(item)))
+            look = night.inspect(sight, _tilts(folder, night, stars_of(item)))
             _tell(look, sight.stars)
             if night.step is None:
                 return night, given

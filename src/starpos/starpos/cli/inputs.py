@@ -22,7 +22,7 @@ from starpos.instrument.instrument import Instrument
 from starpos.night.reading import About, Given, Reader, TiltFile
 from starpos.night.remarks import NEAR_KM, Near, of_tilts
 from starpos.parallel.cluster import Cluster
-from starpos.parallel.processes import Here, Processes, Workers, processors
+from starpos.parallel.processes import Workers, processors, workers
 from starpos.recording.drivers import Drivers
 from starpos.sky import catalogue
 
@@ -213,8 +213,7 @@ def workers_of(args: argparse.Namespace, frames: int) -> Workers:
                 "--scheduler names machines, --jobs processes of this one: give one of the two"
             )
         return Cluster(args.scheduler)
-    number = min(processors() if args.jobs == 0 else args.jobs or 1, frames)
-    return Here() if number <= 1 else Processes(number)
+    return workers(min(processors() if args.jobs == 0 else args.jobs or 1, frames))
 
 
 def watched(answers: Iterable, number: int, what: str = "frame", silent: bool = True) -> Iterator:

@@ -12,8 +12,8 @@ from starpos.earth.ellipsoid import curvature_radii_m
 from starpos.earth.refraction import Atmosphere
 from starpos.earth.vertical import Deflection, Vertical, geodetic
 from starpos.errors import FrameError, InstrumentError, StarposError, TiltError
-from starpos.fix.budget import ALWAYS, ErrorTerm
-from starpos.fix.solution import Attitude, Status
+from starpos.fix.solution import FieldPointing, Status
+from starpos.fix.terms import ALWAYS, ErrorTerm
 from starpos.frames.frame import Frame, Stars
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import Tilt
@@ -99,7 +99,7 @@ def read(
         wanted = [c for c in chosen.connections if c.msgtype not in WITH_STARS]
         total = sum(c.msgcount for c in wanted) or 1
         for done, (connection, log_ns, message) in enumerate(bag.decoded(wanted), 1):
-            reading.take(connection.msgtype, message, log_ns * 1e-9)
+            reading.read_message(connection.msgtype, message, log_ns * 1e-9)
             if done % 500 == 0 or done == total:
                 progress(path.name[:20], done / total)
         return Recorded(
@@ -148,8 +148,8 @@ class _Reading:
         self._unusable = 0
         self._why_no_camera = ""
 
-    def take(self, kind: str, message: Any, log_s: float) -> None:
-        """Take in a message of a type; an impossible tilt or camera only leads to a remark."""
+    def read_message(self, kind: str, message: Any, log_s: float) -> None:
+        """Read a message of a type; an impossible tilt or camera only leads to a remark."""
         if kind == IMU:
             kind, message = TILT, self._messages.tilt_of(message, log_s)
             if message is None:
@@ -246,7 +246,7 @@ def shot_of(m: Any, cameras: dict[tuple[int, int], Camera]) -> Shot:
     looking = np.radians([m.right_ascension, m.declination, m.roll])
     if np.isfinite([*looking, m.focal_px]).all() and m.focal_px > 0:
         ra, dec, roll = looking.tolist()
-        pointing = Attitude(
+        pointing = FieldPointing(
             ra=ra,
             dec=dec,
             roll=roll,

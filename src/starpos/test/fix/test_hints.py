@@ -9,7 +9,7 @@ import pytest
 
 from starpos.fix import searching
 from starpos.fix.searching import Question, Sight, answer_by_header, of_one_camera
-from starpos.fix.solution import Attitude, Solution, Status
+from starpos.fix.solution import FieldPointing, Solution, Status
 from starpos.fix.solver import Solver
 from starpos.frames.header import read_exposure
 from starpos.instrument.camera import EQUIDISTANT, PLUMB_BOB, Camera
@@ -55,7 +55,7 @@ def test_a_wrong_header_binds_nothing(seen, header, told):
     stars = seen(header)
     work = Solving(Given(None, by_header=True))
     sight = work(stars)
-    assert sight.solution.ok and np.degrees(sight.solution.attitude.dec) == pytest.approx(DEC_DEG, abs=1e-3)
+    assert sight.solution.ok and np.degrees(sight.solution.pointing.dec) == pytest.approx(DEC_DEG, abs=1e-3)
     assert sight.instrument.focal_px == pytest.approx(FOCAL_PX, rel=0.03)
     assert re.fullmatch(
         f"frame.fits: its header is wrong: it makes a focal length of {told}", sight.solution.remark
@@ -131,9 +131,9 @@ def test_a_scale_and_a_lens_that_then_identify_nothing_are_not_told(lost, monkey
 
     def blind(solver, *_):
         searched.append(solver.search_s)
-        a_fisheye = Attitude(ra=0.0, dec=0.0, roll=0.0, focal_px=900.0, residual_arcsec=1.0, log_odds=99.0,
+        a_fisheye = FieldPointing(ra=0.0, dec=0.0, roll=0.0, focal_px=900.0, residual_arcsec=1.0, log_odds=99.0,
                              mirrored=False, model=EQUIDISTANT)  # fmt: skip
-        return Sight(stars, Solution.of(stars, attitude=a_fisheye))
+        return Sight(stars, Solution.of(stars, pointing=a_fisheye))
 
     def identify(solver, question):
         tried.append((solver.instrument.focal_px, solver.instrument.model))
