@@ -37,7 +37,7 @@ from starpos.instrument.instrument import (
     Instrument,
 )
 from starpos.instrument.tilt_log import TiltLog
-from starpos.night.reading import NO_CAMERA, First, Given, Reader
+from starpos.night.reading import NO_CAMERA, First, Instruments, Reader
 from starpos.night.remarks import of_inclinometer
 from starpos.night.together import axis_of, circles_of
 from starpos.night.work import Solving
@@ -302,7 +302,7 @@ def run(args: argparse.Namespace) -> int:
     first = First(read)(tuple(args.frames))
     if first is None:
         # each frame says why it cannot be read
-        _sights(args.frames, read, Given(None))
+        _sights(args.frames, read, Instruments(None))
         return console.UNREADABLE
     # an error of the axis that all frames share becomes part of the A3 that is found
     given, _ = given_of(args, first).framed(first)
@@ -372,7 +372,7 @@ def _written(args: argparse.Namespace) -> Iterator[Written]:
         yield Written("--output", args.output, instrument_file.check_replaceable)
 
 
-def _sights(paths: Sequence[str], read: Reader, given: Given) -> tuple[list[Sight], bool]:
+def _sights(paths: Sequence[str], read: Reader, given: Instruments) -> tuple[list[Sight], bool]:
     """The frames that can be read, identified by every way there is, and whether some cannot be read."""
     progress, unreadable, work = console.ProgressBar(), False, Solving(given)
     sights: list[Sight] = []

@@ -14,7 +14,7 @@ from starpos.fix.blind import SEARCH_S, BlindSolver
 from starpos.fix.solution import Solution, Status
 from starpos.frames.frame import Stars
 from starpos.instrument.camera import EQUIDISTANT
-from starpos.night.reading import First, Given
+from starpos.night.reading import First, Instruments
 from starpos.night.work import OnFile, Solving
 from starpos.parallel.processes import Here
 from starpos.progress import quiet
@@ -64,7 +64,7 @@ def run(args: argparse.Namespace) -> int:
     read, output = reader_of(args), Output(args, COLUMNS, HEAD)
     with inputs.workers_of(args, number) as workers:
         (about,) = workers.map([(First(read), tuple(args.frames))])
-        given = Given(None, by_header=True)
+        given = Instruments(None, by_header=True)
         if about is not None and is_untold(args) and about.focal_px is None:
             BlindSolver(load_catalogue(), console.ProgressBar()).prepare()
         elif about is not None:

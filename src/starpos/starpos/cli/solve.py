@@ -53,7 +53,7 @@ from starpos.instrument import instrument_file
 from starpos.instrument.instrument import Instrument
 from starpos.instrument.tilt_log import NO_TILTS, Tilts
 from starpos.night.opening import work_of
-from starpos.night.reading import NO_CAMERA, About, First, Given
+from starpos.night.reading import NO_CAMERA, About, First, Instruments
 from starpos.night.remarks import WORTH_SAVING_ARCSEC, Near, of_inclinometer
 from starpos.night.solving import How, NightAnswers, answers_of
 from starpos.night.together import (
@@ -453,7 +453,7 @@ def _work(
     air = options.atmosphere_of(args)
     # without a frame that can be read, each one reports why it cannot
     if about is None:
-        return Solving(Given(None), atmosphere=air)
+        return Solving(Instruments(None), atmosphere=air)
     tilt = None if night.tilt is None else Path(night.tilt)
     work, remarks = work_of(given_of(args, about), about, tilt, air, place)
     for remark in remarks:

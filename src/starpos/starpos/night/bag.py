@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A night in a rosbag2: one instrument's messages, solved again if there are stars and tilts, else as recorded."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,6 @@ from starpos.fix.terms import ALWAYS, ErrorTerm
 from starpos.frames.frame import Frame, Stars
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import Tilt
-from starpos.instrument.instrument import Instrument
 from starpos.instrument.tilt_log import NoTilts, TiltLog, Tilts
 from starpos.messages.camera import message_to_camera
 from starpos.messages.stamp import stamp_to_unix
@@ -288,30 +287,6 @@ def deflection_of(m: Any) -> Deflection | None:
         return Deflection(m.xi, m.eta, float(np.sqrt(max(wider, 0.0)) / np.hypot(prime, meridian) / ARCSEC))
     except StarposError:
         return None
-
-
-@dataclass(frozen=True)
-class OfBag:
-    """The instrument of a bag's frames, with the bag's camera for their size.
-
-    any_size: whether frames of other sizes use the instrument unchanged.
-    """
-
-    instrument: Instrument
-    cameras: Mapping[tuple[int, int], Camera]
-    any_size: bool
-
-    @property
-    def hinted(self) -> bool:
-        """Whether only headers give the focal length: a bag has none."""
-        return False
-
-    def of(self, frame: Frame | Stars) -> Instrument | None:
-        """The instrument of a frame."""
-        camera = self.cameras.get((frame.width, frame.height))
-        if camera is None:
-            return self.instrument if self.any_size else None
-        return replace(self.instrument, camera=camera, focal_px=camera.fx)
 
 
 def night(

@@ -17,7 +17,7 @@ from starpos.fix.solver import Solver
 from starpos.gnss.receiver import GnssTrack
 from starpos.instrument.instrument import Calibration, Instrument
 from starpos.instrument.tilt_log import NO_TILTS, TiltsByTime
-from starpos.night.reading import Given
+from starpos.night.reading import Instruments
 from starpos.night.solving import ONE_BY_ONE, Exposures, How, answers_of, solved_night
 from starpos.night.together import Gathered, Receiver, together, turned
 from starpos.night.work import Solving
@@ -49,7 +49,7 @@ class Frames:
             turned, start = replace(self.scene, azimuth_deg=azimuth_deg), START + 60.0 * k
             self.stars.append(stars_of(turned, catalogue, rng, start))
             tilts[start + EXPOSURE / 2] = tilt_of(turned, rng, start)
-        self.work = Solving(Given(self.instrument), atmosphere=AIR, tilts=TiltsByTime(tilts))
+        self.work = Solving(Instruments(self.instrument), atmosphere=AIR, tilts=TiltsByTime(tilts))
 
     def sights(self, how=ONE_BY_ONE, items=None):
         """The sights of the frames, or of other items, by name."""
@@ -196,7 +196,7 @@ class _Standing:
 
 
 def test_turning_with_nothing_identified_keeps_each_sentence(still, points):
-    lost = Solving(Given(still.instrument))(points)
+    lost = Solving(Instruments(still.instrument))(points)
     solver = Solver(still.instrument, still.work.solver(points).catalogue)
     found = turned(solver, [lost, lost], still.work.tilts, 180.0)
     assert found.solutions == (lost.solution, lost.solution) and not found.worth_saving
@@ -236,7 +236,7 @@ def test_a_solved_night(still, points):
 def test_a_night_without_a_fix_says_which_focal_length_fits(catalogue, still):
     frames = Frames(catalogue, [40.0])
     wrong = replace(frames.instrument, focal_px=1.2 * FOCAL_PX)
-    frames.work = replace(frames.work, instruments=Given(wrong))
+    frames.work = replace(frames.work, instruments=Instruments(wrong))
     (said,) = [r for r in solved_night(frames.exposures()).remarks if r.kind.value == "focal length"]
     (focal_px,) = map(float, re.findall(r"a focal length of (\d+) px fits", said.text))
     assert focal_px == pytest.approx(FOCAL_PX, rel=1e-3)
@@ -245,10 +245,10 @@ def test_a_night_without_a_fix_says_which_focal_length_fits(catalogue, still):
 def test_without_a_focal_length_a_frame_is_refused_or_searched_at_every_scale(still, monkeypatch):
     stars = replace(still.stars[0], focal_px=None)
     with pytest.raises(InstrumentError, match="no focal length"):
-        Solving(Given(None))(stars)
+        Solving(Instruments(None))(stars)
     blind = Sight(stars, Solution.failed(stars, Status.NOT_IDENTIFIED, "searched"))
     monkeypatch.setattr("starpos.night.work.identify_blind_every_way", lambda *_: blind)
-    assert Solving(Given(None), search_s=1.0)(stars).solution is blind.solution
+    assert Solving(Instruments(None), search_s=1.0)(stars).solution is blind.solution
 
 
 @pytest.mark.parametrize("tilts", [None, NO_TILTS], ids=["none asked for", "missing"])
