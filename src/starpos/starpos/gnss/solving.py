@@ -52,7 +52,7 @@ def watched(solver: Solver, stars: Stars, rough: Solution, gnss: Place | None, w
     gnss: that place, None without one.
     """
     if rough.fix is None or rough.tilt is None:
-        compared = None if gnss is None else GnssCheck(GnssStatus.LEARNING, gnss)
+        compared = None if gnss is None else GnssCheck(status=GnssStatus.LEARNING, place=gnss)
         return Watched(solution=rough, compared=compared)
     tilt = rough.tilt
     watch.advance(LevelSight.of(rough.fix, tilt))

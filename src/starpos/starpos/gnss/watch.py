@@ -173,7 +173,7 @@ class GnssStatus(str, Enum):
         return self.value
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class GnssCheck:
     """What the guard says of a GNSS fix: a status, and how far it is from the stars' place.
 
@@ -312,7 +312,7 @@ class GnssWatch:
     def judge(self, sighting: LevelSight, gnss: Place) -> GnssCheck:
         """Compare a GNSS place with the stars'; where they disagree, take back what GNSS taught meanwhile."""
         if self.learned is None or not self.tells_place(sighting):
-            return GnssCheck(GnssStatus.LEARNING, gnss)
+            return GnssCheck(status=GnssStatus.LEARNING, place=gnss)
         seen = innovation(sighting, gnss, self.learned, self.vertical)
         single = chi2(self.learned, seen)
         if self._starting:

@@ -261,7 +261,7 @@ NO_PLACE, NO_VELOCITY, NO_TURN = 2e7, 1e3, 10.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class Prior:
+class VoyagePrior:
     """What is known before the voyage, 1 sigma: mount rad an axis, share of refraction, height m.
 
     log_scale, log_axes, lag_s: of the measured velocity (a share; rad an axis) and of the camera's stamps (s).
@@ -382,7 +382,7 @@ def law_residuals(motion: Motion, law: MotionLaw) -> Residuals:
     return Residuals(index=np.arange(count), rows=rows, covariance=covariance)
 
 
-def prior_rows(motion: Motion, model: ImuModel, prior: Prior, law: MotionLaw | None) -> np.ndarray:
+def prior_rows(motion: Motion, model: ImuModel, prior: VoyagePrior, law: MotionLaw | None) -> np.ndarray:
     """Whitened equations (P, n + m + 1) of the first node and the constants: what is known beforehand."""
     n = MEASURED if law is None else BY_LAW
     sigma, value = np.empty(n + CONSTANTS), np.zeros(n + CONSTANTS)

@@ -22,9 +22,9 @@ from starpos.navigation.equations import (
     Links,
     Motion,
     Odometry,
-    Prior,
     Residuals,
     StarAttitudes,
+    VoyagePrior,
     law_residuals,
     links_of,
     prior_rows,
@@ -92,7 +92,7 @@ class Adjustment:
             raise VoyageError("no velocity lies on the voyage: check that its clock and the camera's agree")
         self.law = self._law(vessel)
         self.unknowns = MEASURED if self.law is None else BY_LAW
-        self.prior = Prior(
+        self.prior = VoyagePrior(
             mount=vessel.mount_stddev,
             refraction=vessel.atmosphere.relative_sigma,
             height_m=vessel.height_m,
