@@ -22,6 +22,7 @@ from starpos.fix.checks import (
     unnamed_inclinometer,
 )
 from starpos.fix.fix import Fix, length_text
+from starpos.frozen import at_once
 from starpos.instrument.inclinometer import Tilt, level_of, up_of
 from starpos.instrument.instrument import Calibration, Instrument
 from starpos.instrument.mounting import Mounting
@@ -148,6 +149,7 @@ MISTAKES: tuple[tuple[str, Callable[[np.ndarray], np.ndarray]], ...] = (
 )
 
 
+@at_once
 @dataclass(frozen=True)
 class Levelled:
     """A frame's attitude by its stars, camera_to_itrs (3, 3), and its tilt."""
