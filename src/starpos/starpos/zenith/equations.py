@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The observation equations of a session: what a tiltmeter reads, from the attitudes, the deflection and A3, and its
-errors.  Up leans from the ellipsoid's normal by xi to the north and eta to the east, so in geodetic east, north, up
-it is along n = (eta, xi, 1).  The tiltmeter's axes X', Y' rise by asin(A3 C n) there, where C is the camera's
-attitude by the stars.
+"""The observation equations of a session: what a tiltmeter reads by attitudes, deflection and A3, and its errors.
+
+Up leans from the ellipsoid's normal by xi to the north and eta to the east, so in geodetic east, north, up it is along
+n = (eta, xi, 1).  The tiltmeter's axes X', Y' rise by asin(A3 C n) there, where C is the camera's attitude by the stars.
 """
 
 from collections.abc import Sequence
