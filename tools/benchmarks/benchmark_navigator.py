@@ -20,7 +20,7 @@ from table import Cost, Row
 
 from starpos.earth.orientation import earth_state
 from starpos.fix.camera_attitude import CameraAttitude
-from starpos.navigation.sightings import IdentifiedFrame
+from starpos.navigation.sightings import StarsUnderWay
 from starpos_common.messages import attitude_to_message, unix_to_stamp
 from starpos_interfaces.msg import Attitude
 from starpos_testing.graph.graph import Graph
@@ -109,7 +109,7 @@ def reading(unix_s: float, gyro: list[float], force: list[float]) -> Imu:
     return message
 
 
-def attitude(frame: IdentifiedFrame) -> Attitude:
+def attitude(frame: StarsUnderWay) -> Attitude:
     """Make the message of a frame, as the solver publishes it."""
     seen = frame.placeless()
     found = CameraAttitude(
@@ -117,8 +117,8 @@ def attitude(frame: IdentifiedFrame) -> Attitude:
         stamp_stddev_s=0.0,
         clock_stddev_s=1e-3,
         frame_id="camera",
-        camera_to_gcrs=earth_state(frame.utc_unix_s).gcrs_to_itrs.T @ seen.camera_to_itrs,
-        covariance=seen.covariance,
+        camera_to_gcrs=earth_state(frame.utc_unix_s).gcrs_to_itrs.T @ seen.rotation,
+        covariance=seen.covariance_about_own,
         stars=len(frame.xy),
         log_odds=50.0,
     )

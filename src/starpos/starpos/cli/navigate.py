@@ -21,7 +21,7 @@ from starpos.fix.solver import Solver
 from starpos.instrument.instrument import AxisDoubt, framed
 from starpos.navigation.estimate import VoyageFix
 from starpos.navigation.records import ImuModel, read_imu, read_imu_model, read_velocity
-from starpos.navigation.sightings import IdentifiedFrame, sighting_of
+from starpos.navigation.sightings import StarsUnderWay, sighting_of
 from starpos.navigation.vessel import LAWS, Vessel
 from starpos.navigation.voyage import Voyage, navigate
 from starpos.night.reading import First, Instruments, Reader
@@ -114,7 +114,7 @@ class FrameSeen:
     """A frame's time, its identified stars, or why it has none, or a remark."""
 
     utc_unix_s: float | None
-    sighting: IdentifiedFrame | None
+    sighting: StarsUnderWay | None
     message: str = ""
 
 

@@ -43,7 +43,7 @@ from starpos.navigation.evidence import (
 )
 from starpos.navigation.preintegration import Pieces, Sums, summed
 from starpos.navigation.records import ImuLog, VelocityLog
-from starpos.navigation.sightings import FrameUnderWay
+from starpos.navigation.sightings import SightingUnderWay
 from starpos.navigation.start import first_motion, nodes_of
 from starpos.navigation.vessel import MotionLaw, Vessel
 from starpos.progress import Progress, quiet
@@ -78,7 +78,7 @@ class Adjustment:
 
     def __init__(
         self,
-        frames: Sequence[FrameUnderWay],
+        frames: Sequence[SightingUnderWay],
         nodes: np.ndarray,
         pieces: Pieces,
         velocity: VelocityLog | None,
@@ -279,9 +279,9 @@ class Adjustment:
             raise VoyageError(f"the stars of {len(used)} frames agree: at least {MIN_FRAMES} are needed")
         return StarAttitudes(
             index=np.searchsorted(self.nodes, [frame.utc_unix_s for frame in used]),
-            camera_to_itrs=np.array([a.camera_to_itrs for a in found]),
-            covariance=np.array([a.covariance for a in found]),
-            by_refraction=np.array([a.by_refraction for a in found]),
+            camera_to_itrs=np.array([a.rotation for a in found]),
+            covariance=np.array([a.covariance_about_own for a in found]),
+            by_refraction=np.array([a.rotation.T @ a.by_refraction for a in found]),
             stamp_stddev_s=np.array([frame.stamp_stddev_s for frame in used]),
         )
 
@@ -371,7 +371,7 @@ class Voyage:
 
 
 def navigate(
-    frames: Sequence[FrameUnderWay],
+    frames: Sequence[SightingUnderWay],
     imu: ImuLog,
     velocity: VelocityLog | None,
     vessel: Vessel,
