@@ -67,7 +67,7 @@ class Averaging:
         place = self._averager.average
         return -math.inf if place is None else place.began_unix_s
 
-    def add(self, fix: Fix) -> News:
+    def include(self, fix: Fix) -> News:
         """Take a fix that is later than all before."""
         if self._pose is None or slip_s(fix, self._pose) != 0:
             self._pose = fix
@@ -153,7 +153,7 @@ class ClockDoubt:
         self._other: Fix | None = None
         self._other_agree = 0
 
-    def add(self, fix: Fix, stated_s: float) -> None:
+    def judge(self, fix: Fix, stated_s: float) -> None:
         """Take a fix; stated_s: standard deviation of its time, as its sender states it."""
         first = self._first
         slip = None if first is None else slip_s(fix, first, self._both(stated_s))
