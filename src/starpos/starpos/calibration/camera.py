@@ -23,6 +23,7 @@ from starpos.errors import CalibrationError, InstrumentError
 from starpos.fix.solver import ENOUGH_SOUND, high_enough
 from starpos.fix.star_fit import sound_matches
 from starpos.frames.frame import Stars
+from starpos.frozen import at_once
 from starpos.identification import Identification, PointingPrior, Sky, fisheye, identify_directions, triangles
 from starpos.identification.triangles import TriangleCatalogue
 from starpos.instrument.camera import EQUIDISTANT, Camera
@@ -41,6 +42,7 @@ MAX_SCATTER_PX = 1.5
 BORDER = 25
 
 
+@at_once
 @dataclass(frozen=True, kw_only=True)
 class Intrinsics:
     """A camera that was fitted to stars.
@@ -289,6 +291,7 @@ def calibrate_camera(
     return FromSky(fit, tuple(sightings))
 
 
+@at_once
 @dataclass(frozen=True)
 class _Frame:
     """The stars of a frame, and the sky of its date."""
