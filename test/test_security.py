@@ -62,7 +62,7 @@ READS_WHOLE = {
     "starpos/identification/paper.py": "of the package",
     "starpos/sky/catalogue.py": "of the package, and the checksum of its table of parallaxes",
     "starpos/report/coast.py": "of the package",
-    "starpos/report/field.py": "MAX_BYTES",
+    "starpos/night/field.py": "MAX_BYTES",
     "starpos/recording/bag.py": "installed messages; MAX_METADATA",
     "starpos/instrument/tilt_table.py": "MAX_CSV_BYTES",
     "starpos/navigation/records.py": "MAX_BYTES",
