@@ -98,7 +98,7 @@ class SolverNode(Node):
             best_effort = ReliabilityPolicy.BEST_EFFORT
             subscription(self, Imu, IMU_TOPIC, self._on_imu, IMU_QUEUE, best_effort)
         self._gnss = GnssComparison()
-        take = self._gnss.take if session.gnss is None else self._taker(GNSS_TOPIC, takes)
+        take = self._compare_gnss if session.gnss is None else self._taker(GNSS_TOPIC, takes)
         # receivers' drivers publish in either way
         subscription(self, NavSatFix, GNSS_TOPIC, take, 10, ReliabilityPolicy.BEST_EFFORT)
         self.create_service(Solve, "~/solve", self._on_solve)
@@ -154,6 +154,9 @@ class SolverNode(Node):
                 takes[name](message, info)
 
         return on_message
+
+    def _compare_gnss(self, message: NavSatFix) -> None:
+        self._gnss.receive(message, self._now())
 
     def _on_imu(self, message: Imu) -> None:
         self._session.gyro.take(message, self._now())

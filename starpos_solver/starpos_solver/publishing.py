@@ -189,13 +189,13 @@ class SolutionPublishers:
             self._fix_averaged.publish(self._nav_sat_fix(header, output.ground))
             return
         self._fix.publish(self._nav_sat_fix(header, output.ground))
-        fix, at_place, beside = output.solution.fix, output.solution.at_place, output.beside
+        fix, at_place = output.solution.fix, output.solution.at_place
         if at_place is not None:
             self._imu.publish(outputs.imu_at_place(header, at_place.true_north))
         elif fix is not None and output.ground is not None:
-            self._imu.publish(outputs.imu(header, fix, output.ground))
-        if self._check is not None and beside is not None and beside.compared is not None:
-            self._check.publish(outputs.gnss_check(header, beside.compared))
+            self._imu.publish(outputs.imu(header, fix.link, output.ground))
+        if self._check is not None and output.compared is not None:
+            self._check.publish(outputs.gnss_check(header, output.compared))
         if output.attitude is not None:
             self._attitude.publish(attitude_to_message(output.attitude))
         self._solution.publish(self.solution(output))

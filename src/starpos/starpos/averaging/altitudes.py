@@ -16,7 +16,8 @@ from starpos.earth.ellipsoid import curvature_radii_m
 from starpos.earth.orientation import EarthState, station_velocity
 from starpos.earth.refraction import MIN_COS_ZENITH, Atmosphere
 from starpos.errors import FixError
-from starpos.fix.budget import ALWAYS, EACH_POSE, ErrorTerm, tilt_terms, time_terms
+from starpos.fix.budget import tilt_terms, time_terms
+from starpos.fix.terms import ALWAYS, EACH_POSE, ErrorTerm
 from starpos.frames.tables import Pointing
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import Tilt

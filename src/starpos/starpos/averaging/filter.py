@@ -14,8 +14,8 @@ import numpy as np
 
 from starpos._numeric.roots import symmetric_root
 from starpos.earth.ellipsoid import curvature_radii_m, enu_axes, meridian_turn, place_of_zenith, zenith_of
-from starpos.fix.budget import EACH_POSE, ErrorTerm, correlation
 from starpos.fix.fix import Fix
+from starpos.fix.terms import EACH_POSE, ErrorTerm, correlation
 from starpos.rotation import full_turn, half_turn
 
 # of east, north in m and heading in rad: brings them to similar sizes

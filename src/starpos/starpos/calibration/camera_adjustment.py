@@ -36,7 +36,7 @@ STEP_RAD = 1e-6
 
 
 @dataclass(frozen=True, kw_only=True)
-class Sighting:
+class CameraSighting:
     """The identified stars of one frame.
 
     xy (N, 2) in px and covariance_px2 (N, 2, 2): as measured.
@@ -137,7 +137,7 @@ class CameraAdjustment:
 
     @classmethod
     def of(
-        cls, sightings: Sequence[Sighting], given: Camera, atmosphere: Atmosphere, free: Sequence[str]
+        cls, sightings: Sequence[CameraSighting], given: Camera, atmosphere: Atmosphere, free: Sequence[str]
     ) -> "CameraAdjustment":
         sightings = [s for s in sightings if len(s.xy)]
         counts = [len(s.xy) for s in sightings]

@@ -468,50 +468,45 @@ cdef int _alike(
     const float[:, :, ::1] noise, const float[:, :, ::1] model, const float[:, :, ::1] residual,
     const unsigned char[:, :, ::1] used, const float[:, :, ::1] leverage,
 ) except -1:
-    """Raise ValueError unless images of fits have the same shapes, and stamps the same size."""
+    """Raise ValueError unless images of fits have the shape of the stamps' noise."""
     for name, fits, height, width in (
         ("model", model.shape[0], model.shape[1], model.shape[2]),
         ("residual", residual.shape[0], residual.shape[1], residual.shape[2]),
         ("used", used.shape[0], used.shape[1], used.shape[2]),
         ("leverage", leverage.shape[0], leverage.shape[1], leverage.shape[2]),
     ):
-        if (fits, height, width) != (model.shape[0], noise.shape[1], noise.shape[2]):
-            raise ValueError(f"{name} has the shape {(fits, height, width)}: as the model, and stamps as of the noise")
+        if (fits, height, width) != (noise.shape[0], noise.shape[1], noise.shape[2]):
+            raise ValueError(f"{name} has the shape {(fits, height, width)}: it must be that of the noise")
     return 0
 
 
 def light_noise(
     const float[:, :, ::1] noise, const float[:, :, ::1] model, const float[:, :, ::1] residual,
-    const unsigned char[:, :, ::1] used, const float[:, :, ::1] leverage, const Py_ssize_t[::1] rows, double photon,
-    double misfit, double outlier,
+    const unsigned char[:, :, ::1] used, const float[:, :, ::1] leverage, double photon, double misfit, double outlier,
 ):
     """DN of a photon and misfit: a star's light s adds the variance photon s + (misfit s)^2 to that of the sky.
 
-    noise                            (M, S, S) of the sky, of the stars that teach
-    model, residual, used, leverage  (N, S, S) of a fit, in which these are `rows` (M,)
+    noise                            (N, S, S) of the sky
+    model, residual, used, leverage  (N, S, S) of a fit
     photon, misfit                   before
     outlier                          sigmas beyond which a residual teaches nothing
     """
-    cdef Py_ssize_t n = rows.shape[0], area = noise.shape[1] * noise.shape[2], room = n * area + LANES, k, j, row
+    cdef Py_ssize_t pixels = noise.shape[0] * noise.shape[1] * noise.shape[2], room = pixels + LANES, j
     cdef double misfit2
     cdef Light p
     _alike(noise, model, residual, used, leverage)
-    if noise.shape[0] != n or not within[Py_ssize_t](&rows[0], n, 0, model.shape[0] - 1):
-        raise ValueError(f"{n} rows of {model.shape[0]} fits for {noise.shape[0]} stars: one each is needed")
     p.noise2 = <double *>malloc(3 * room * sizeof(double))
     if p.noise2 == NULL:
         raise MemoryError
     p.count, p.light, p.square = 0, p.noise2 + room, p.noise2 + 2 * room
     with nogil:
-        for k in range(n if area else 0):
-            row = rows[k]
-            for j in range(area):
-                if (&used[row, 0, 0])[j]:
-                    p.noise2[p.count] = <double>(&noise[k, 0, 0])[j] * (&noise[k, 0, 0])[j]
-                    p.light[p.count] = max((&model[row, 0, 0])[j], 0.0)
-                    p.square[p.count] = <double>(&residual[row, 0, 0])[j] * (&residual[row, 0, 0])[j]
-                    p.square[p.count] /= max(1.0 - (&leverage[row, 0, 0])[j], CERTAIN)
-                    p.count += 1
+        for j in range(pixels):
+            if (&used[0, 0, 0])[j]:
+                p.noise2[p.count] = <double>(&noise[0, 0, 0])[j] * (&noise[0, 0, 0])[j]
+                p.light[p.count] = max((&model[0, 0, 0])[j], 0.0)
+                p.square[p.count] = <double>(&residual[0, 0, 0])[j] * (&residual[0, 0, 0])[j]
+                p.square[p.count] /= max(1.0 - (&leverage[0, 0, 0])[j], CERTAIN)
+                p.count += 1
         while p.count % LANES:
             p.noise2[p.count], p.light[p.count], p.square[p.count] = 1.0, 0.0, 0.0
             p.count += 1
@@ -531,8 +526,6 @@ def strangeness(
     cdef Py_ssize_t n = model.shape[0], area = noise.shape[1] * noise.shape[2], k, j
     cdef double light2, left, scatter, noise2
     _alike(noise, model, residual, used, leverage)
-    if noise.shape[0] != n:
-        raise ValueError(f"{noise.shape[0]} stars and {n} fits: one each is needed")
     out = np.empty((2, n))
     cdef double[:, ::1] found = out
     with nogil:
@@ -564,8 +557,6 @@ def phase_fluxes(
     cdef int p
     _alike(noise, signal, value, good, value)
     _alike(noise, signal, value, phase, value)
-    if noise.shape[0] != n:
-        raise ValueError(f"{noise.shape[0]} noises of {n} stars: one each is needed")
     fluxes, weights = np.zeros((2, n, phases))
     cdef double[:, ::1] flux = fluxes
     cdef double[:, ::1] information = weights
@@ -588,38 +579,35 @@ def phase_fluxes(
 
 def unit_light(
     const float[:, :, ::1] signal, const float[:, :, ::1] noise, const unsigned char[:, :, ::1] phase,
-    const float[:, :, ::1] model, const unsigned char[:, :, ::1] used, const Py_ssize_t[::1] rows, const double[::1] flux,
-    const double[:, ::1] gains, double dn_per_photon, double misfit2,
+    const float[:, :, ::1] model, const unsigned char[:, :, ::1] used, const double[::1] flux, const double[:, ::1] gains,
+    double dn_per_photon, double misfit2,
 ):
-    """The pixels (M, S, S) of stars that teach over their fluxes and gains, and the inverse variances; 0 if not used.
+    """The pixels (N, S, S) of stars over their fluxes and gains, and the inverse variances; 0 if not used.
 
-    signal, noise, phase  (M, S, S) of these stars
-    model, used           (N, S, S) of a fit, in which these are `rows` (M,), with flux (N,) and gains (N, P)
+    signal, noise, phase  (N, S, S) of the stars
+    model, used           (N, S, S) of a fit, with flux (N,) and gains (N, P)
     dn_per_photon         DN2 of variance for each DN of light, and
     misfit2               for its square
     """
-    cdef Py_ssize_t n = rows.shape[0], area = noise.shape[1] * noise.shape[2], k, j, row
+    cdef Py_ssize_t n = noise.shape[0], area = noise.shape[1] * noise.shape[2], k, j
     cdef float light, sky
     cdef double scale
     _alike(noise, model, model, used, model)
     _alike(noise, signal, signal, phase, signal)
-    if noise.shape[0] != n or not within[Py_ssize_t](&rows[0], n, 0, model.shape[0] - 1):
-        raise ValueError(f"{n} rows of {model.shape[0]} fits for {noise.shape[0]} stars: one each is needed")
-    if flux.shape[0] != model.shape[0] or gains.shape[0] != flux.shape[0]:
-        raise ValueError(f"{flux.shape[0]} fluxes and {gains.shape[0]} gains of {model.shape[0]} fits: one each is needed")
+    if flux.shape[0] != n or gains.shape[0] != n:
+        raise ValueError(f"{flux.shape[0]} fluxes and {gains.shape[0]} gains of {n} fits: one each is needed")
     if n and np.max(phase, initial=0) >= gains.shape[1]:
         raise ValueError(f"a pixel of phase {np.max(phase)}: there are {gains.shape[1]}")
     out = np.empty((2, n, noise.shape[1], noise.shape[2]), np.float32)
     cdef float[:, :, :, ::1] found = out
     with nogil:
         for k in range(n if area else 0):
-            row = rows[k]
             for j in range(area):
-                scale = flux[row] * gains[row, (&phase[k, 0, 0])[j]]
-                light, sky = max((&model[row, 0, 0])[j], <float>0), (&noise[k, 0, 0])[j]
+                scale = flux[k] * gains[k, (&phase[k, 0, 0])[j]]
+                light, sky = max((&model[k, 0, 0])[j], <float>0), (&noise[k, 0, 0])[j]
                 (&found[0, k, 0, 0])[j] = <float>((&signal[k, 0, 0])[j] / scale)
                 (&found[1, k, 0, 0])[j] = <float>(
-                    (&used[row, 0, 0])[j] * scale * scale / (sky * sky + (dn_per_photon + misfit2 * light) * light)
+                    (&used[k, 0, 0])[j] * scale * scale / (sky * sky + (dn_per_photon + misfit2 * light) * light)
                 )
     return out[0], out[1]
 

@@ -98,17 +98,7 @@ class Terms:
         return [self.orders.tolist().index(term) for term in ([2, 0], [1, 1], [0, 2])]
 
 
-def even_terms(psf: Psf, highest: int) -> Terms:
-    """Terms of even order, up to `highest` across the trail and, for a long star, up to twice that along it."""
-    return _even_terms(_lengthened(psf), highest)
-
-
-def all_terms(psf: Psf, highest: int, count: int) -> Terms:
-    """The even terms, then coma, then variations over the field if there are enough stars, `count`."""
-    return _all_terms(_lengthened(psf), highest, count >= PLACES)
-
-
-def _lengthened(psf: Psf) -> float:
+def elongation(psf: Psf) -> float:
     """How many times longer than wide a star is, from 1 to 2, in steps: the terms of each are made once."""
     across, along = (math.hypot(*axis) for axis in psf.axes[::-1].tolist())
     return round(STEPS * min(max(across / along, 1.0), 2.0)) / STEPS
@@ -120,7 +110,8 @@ def _rank(orders: np.ndarray, longer: float) -> np.ndarray:
 
 
 @lru_cache(maxsize=64)
-def _even_terms(longer: float, highest: int) -> Terms:
+def even_terms(longer: float, highest: int) -> Terms:
+    """Terms of even order, up to `highest` across the trail and, for a `longer` star, up to twice that along it."""
     grid = [(i, j) for i in range(2 * highest + 1) for j in range(highest + 1) if (i + j) % 2 == 0]
     orders = np.array(grid[1:], np.int32)
     orders = orders[_rank(orders, longer) <= highest]
@@ -130,8 +121,9 @@ def _even_terms(longer: float, highest: int) -> Terms:
 
 
 @lru_cache(maxsize=64)
-def _all_terms(longer: float, highest: int, varied: bool) -> Terms:
-    even = _even_terms(longer, highest)
+def all_terms(longer: float, highest: int, varied: bool) -> Terms:
+    """The even terms, then coma, then variations over the field, if asked for."""
+    even = even_terms(longer, highest)
     orders = np.concatenate([even.orders, COMA_ORDERS])
     first = np.arange(MONOMIALS if varied else 1) == 0
     steps = np.concatenate(
@@ -144,34 +136,24 @@ def _all_terms(longer: float, highest: int, varied: bool) -> Terms:
     return Terms(orders, np.array(everywhere + field), np.where(coma[:, None] | ~first, DEAR, WORTH))
 
 
-def refine(
-    psf: Psf,
-    x: np.ndarray,
-    y: np.ndarray,
-    left: np.ndarray,
-    top: np.ndarray,
-    brightness: np.ndarray,
-    weight: np.ndarray,
-    phase: np.ndarray,
-    phases: int,
-    terms: Terms,
-) -> Psf:
-    """The Psf whose series fits N stars best, by weighted linear least squares with free positions and gains.
+def refine(psf: Psf, stamps: Stamps, fit: Fit, response: Response, terms: Terms) -> Psf:
+    """The Psf whose series fits N fitted stars best, by weighted linear least squares with free positions and gains.
 
-    x, y        (N,) px: the stars' places
-    left, top   (N,) px: first column and row of a stamp, from the centre of the star
-    brightness  (N, S, S): the pixels over their stars' fluxes and gains
-    weight      (N, S, S): inverse variances of brightness; 0 for a pixel that is not used
-    phase       (N, S, S): the pixels' phases in the mosaic, counted from 0; phases: their number
-    terms       the terms that are tried; they are taken if they are worth their price
+    terms: those that are tried; they are taken if they are worth their price
     """
-    local = psf.at(x, y)
+    local = psf.at(fit.x, fit.y)
+    # 2 % of the model as extra noise: the brightest star must not be the only teacher
+    brightness, weight = unit_light(
+        stamps.signal, stamps.noise, stamps.phase, fit.model, fit.used, fit.flux, fit.gains, response.dn_per_photon,
+        response.misfit**2 + 0.02**2,
+    )  # fmt: skip
     normal, right = marginal_equations(
-        local.axes, local.series, left, top, brightness, weight, phase, phases, terms.orders
-    )
+        local.axes, local.series, *stamps.corner(fit.x, fit.y), brightness, weight, stamps.phase,
+        len(response.gain), terms.orders,
+    )  # fmt: skip
     count, places = terms.candidates.shape[1:]
-    field = psf.monomials(x, y)[:, :places]
-    each = (field[:, :, None] * field[:, None]).reshape(len(x), -1).T @ normal.reshape(len(x), -1)
+    field = psf.monomials(fit.x, fit.y)[:, :places]
+    each = (field[:, :, None] * field[:, None]).reshape(len(field), -1).T @ normal.reshape(len(field), -1)
     normal = each.reshape(places, places, count, count).transpose(2, 0, 3, 1).reshape(count * places, -1)
     right = (right.T @ field).ravel()
     candidates = terms.candidates.reshape(-1, len(right)).view(np.uint8)
@@ -282,19 +264,19 @@ def learn(
         strange, error = strangeness(stamps.noise, fit.model, fit.residual, fit.used, fit.leverage, DARKEST)
         # compared with the best 30 %, because most of the brightest may be pairs
         sound &= strange < 3 * max(0, quantile(strange[sound], 0.3)) + 3 * error + UNLIKE
-        stamps, x, y = stamps.select(sound), fit.x[sound], fit.y[sound]
-        response = respond(stamps, psf, x, y, fit, sound, response)
+        stamps, fit = stamps.select(sound), fit.select(sound)
+        x, y = fit.x, fit.y
+        response = respond(stamps, psf, fit, response)
         ring = round_ >= rounds
         if ring and (psf.fwhm_px < RING_FWHM or response.misfit < POOR):
             # the response has now been learnt with the final PSF
             break
         # odd terms only in the last round: the first stars still include pairs, which look like coma
-        terms = (
-            all_terms(psf, ORDER, len(x))
-            if round_ == rounds - 1
-            else even_terms(psf, RING_ORDER if ring else ORDER)
-        )
-        psf = _refined(stamps, psf, fit, sound, response, terms)
+        if round_ == rounds - 1:
+            terms = all_terms(elongation(psf), ORDER, len(x) >= PLACES)
+        else:
+            terms = even_terms(elongation(psf), RING_ORDER if ring else ORDER)
+        psf = refine(psf, stamps, fit, response, terms)
     return Lesson(psf, response, reach_of(psf), teachers)
 
 
@@ -432,16 +414,14 @@ def _isolated(x: np.ndarray, y: np.ndarray, height: np.ndarray) -> tuple[np.ndar
     return alone, high
 
 
-def respond(
-    stamps: Stamps, psf: FieldPsf, x: np.ndarray, y: np.ndarray, fit: Fit, sound: np.ndarray, before: Response
-) -> Response:
+def respond(stamps: Stamps, psf: FieldPsf, fit: Fit, before: Response) -> Response:
     """The Response of the fitted stars: gains of the phases, their scatter, and the noise that grows with light."""
     gain, spread = before.gain, before.colour_spread
     if len(gain) > 1:
-        gain, spread = _gains(stamps, psf.at(x, y).evaluate(*stamps.corner(x, y), stamps.size), before)
+        value = psf.at(fit.x, fit.y).evaluate(*stamps.corner(fit.x, fit.y), stamps.size)
+        gain, spread = _gains(stamps, value, before)
     photon, misfit = light_noise(
-        stamps.noise, fit.model, fit.residual, fit.used, fit.leverage, sound.nonzero()[0], before.dn_per_photon,
-        before.misfit, DEVIANT,
+        stamps.noise, fit.model, fit.residual, fit.used, fit.leverage, before.dn_per_photon, before.misfit, DEVIANT
     )  # fmt: skip
     return Response(gain, spread, photon, misfit)
 
@@ -457,18 +437,6 @@ def _gains(stamps: Stamps, value: np.ndarray, before: Response) -> tuple[np.ndar
     )  # fmt: skip
     gain, spread = typical_gains(own, information, DARKEST_MEAN, MIN_GAIN, OUTLYING_GAIN, GAIN_ROUNDS)
     return gain, float(np.clip(spread, *SPREADS))
-
-
-def _refined(stamps: Stamps, psf: Psf, fit: Fit, sound: np.ndarray, response: Response, terms: Terms) -> Psf:
-    """Refine the PSF once, by the sound stars of a fit, which are those in stamps."""
-    x, y = fit.x[sound], fit.y[sound]
-    # 2 % of the model as extra noise: the brightest star must not be the only teacher
-    brightness, weight = unit_light(
-        stamps.signal, stamps.noise, stamps.phase, fit.model, fit.used, sound.nonzero()[0], fit.flux, fit.gains,
-        response.dn_per_photon, response.misfit**2 + 0.02**2,
-    )  # fmt: skip
-    left, top = stamps.corner(x, y)
-    return refine(psf, x, y, left, top, brightness, weight, stamps.phase, len(response.gain), terms)
 
 
 # px; a shorter trail makes no star longer
@@ -526,7 +494,7 @@ def with_trail(
     psf, fit, response = tried[best_of], fits[1 + best_of], lesson.response
     sound = (fit.flux > BRIGHT * fit.flux_sigma) & np.isfinite(fit.covariance).all((1, 2))
     if sound.any():
-        response = respond(stamps.select(sound), psf, fit.x[sound], fit.y[sound], fit, sound, response)
+        response = respond(stamps.select(sound), psf, fit.select(sound), response)
     return replace(lesson, psf=psf, response=response, reach=reach_of(psf))
 
 

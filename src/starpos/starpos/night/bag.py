@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A night in a rosbag2: one instrument's messages, solved again if there are stars and tilts, else as recorded."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -12,12 +12,11 @@ from starpos.earth.ellipsoid import curvature_radii_m
 from starpos.earth.refraction import Atmosphere
 from starpos.earth.vertical import Deflection, Vertical, geodetic
 from starpos.errors import FrameError, InstrumentError, StarposError, TiltError
-from starpos.fix.budget import ALWAYS, ErrorTerm
-from starpos.fix.solution import Attitude, Status
+from starpos.fix.solution import FieldPointing, Status
+from starpos.fix.terms import ALWAYS, ErrorTerm
 from starpos.frames.frame import Frame, Stars
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import Tilt
-from starpos.instrument.instrument import Instrument
 from starpos.instrument.tilt_log import NoTilts, TiltLog, Tilts
 from starpos.messages.camera import message_to_camera
 from starpos.messages.stamp import stamp_to_unix
@@ -99,7 +98,7 @@ def read(
         wanted = [c for c in chosen.connections if c.msgtype not in WITH_STARS]
         total = sum(c.msgcount for c in wanted) or 1
         for done, (connection, log_ns, message) in enumerate(bag.decoded(wanted), 1):
-            reading.take(connection.msgtype, message, log_ns * 1e-9)
+            reading.read_message(connection.msgtype, message, log_ns * 1e-9)
             if done % 500 == 0 or done == total:
                 progress(path.name[:20], done / total)
         return Recorded(
@@ -148,8 +147,8 @@ class _Reading:
         self._unusable = 0
         self._why_no_camera = ""
 
-    def take(self, kind: str, message: Any, log_s: float) -> None:
-        """Take in a message of a type; an impossible tilt or camera only leads to a remark."""
+    def read_message(self, kind: str, message: Any, log_s: float) -> None:
+        """Read a message of a type; an impossible tilt or camera only leads to a remark."""
         if kind == IMU:
             kind, message = TILT, self._messages.tilt_of(message, log_s)
             if message is None:
@@ -246,7 +245,7 @@ def shot_of(m: Any, cameras: dict[tuple[int, int], Camera]) -> Shot:
     looking = np.radians([m.right_ascension, m.declination, m.roll])
     if np.isfinite([*looking, m.focal_px]).all() and m.focal_px > 0:
         ra, dec, roll = looking.tolist()
-        pointing = Attitude(
+        pointing = FieldPointing(
             ra=ra,
             dec=dec,
             roll=roll,
@@ -288,30 +287,6 @@ def deflection_of(m: Any) -> Deflection | None:
         return Deflection(m.xi, m.eta, float(np.sqrt(max(wider, 0.0)) / np.hypot(prime, meridian) / ARCSEC))
     except StarposError:
         return None
-
-
-@dataclass(frozen=True)
-class OfBag:
-    """The instrument of a bag's frames, with the bag's camera for their size.
-
-    any_size: whether frames of other sizes use the instrument unchanged.
-    """
-
-    instrument: Instrument
-    cameras: Mapping[tuple[int, int], Camera]
-    any_size: bool
-
-    @property
-    def hinted(self) -> bool:
-        """Whether only headers give the focal length: a bag has none."""
-        return False
-
-    def of(self, frame: Frame | Stars) -> Instrument | None:
-        """The instrument of a frame."""
-        camera = self.cameras.get((frame.width, frame.height))
-        if camera is None:
-            return self.instrument if self.any_size else None
-        return replace(self.instrument, camera=camera, focal_px=camera.fx)
 
 
 def night(

@@ -73,7 +73,7 @@ class Standing:
 
 
 class FirstNight:
-    """Takes the frames of a first night; `turned` is what the last step found.
+    """Inspects the frames of a first night; `turned` is what the last step found.
 
     solver: with A3 as far as it is known.
     """
@@ -99,8 +99,8 @@ class FirstNight:
         """The step that the next frame is for; None after the last."""
         return self._steps[0] if self._steps else None
 
-    def add(self, sight: Sight, log: TiltLog | str) -> Look:
-        """Take the next frame, identified, and the tilts so far, or a sentence on why they are missing."""
+    def inspect(self, sight: Sight, log: TiltLog | str) -> Look:
+        """Inspect the next frame, identified, with the tilts so far, or a sentence on why they are missing."""
         step = self._steps[0]
         looks: dict[Stage, Callable[[], Look]] = {
             Stage.FOCUS: lambda: self._focus(sight.stars),

@@ -11,10 +11,10 @@ from starpos.averaging.average import Average
 from starpos.earth.ellipsoid import curvature_radii_m, enu_axes, zenith_of
 from starpos.earth.refraction import Atmosphere
 from starpos.earth.vertical import Geodetic, Vertical, geodetic
-from starpos.fix.budget import ErrorTerm
 from starpos.fix.fix import Fix, InDegrees
 from starpos.fix.heading import AttitudeAtPlace
-from starpos.fix.solution import Attitude, Solution, Status
+from starpos.fix.solution import FieldPointing, Solution, Status
+from starpos.fix.terms import ErrorTerm
 from starpos.frames.frame import Stars
 from starpos.night.remarks import Remark
 from starpos.night.together import WatchedNight
@@ -94,7 +94,7 @@ class Shot:
     message: str
     utc_unix_s: float = float("nan")
     place: ReportedPlace | None = None
-    pointing: Attitude | None = None
+    pointing: FieldPointing | None = None
     size: tuple[int, int] | None = None
     xy: np.ndarray = field(default_factory=lambda: NO_STARS)
     residual_px: np.ndarray = field(default_factory=lambda: NO_STARS)
@@ -117,14 +117,14 @@ class Shot:
             status=s.status,
             message=s.message,
             utc_unix_s=float("nan") if s.utc_unix_s is None else s.utc_unix_s,
-            pointing=s.attitude,
+            pointing=s.pointing,
             size=None if stars is None else (stars.width, stars.height),
             stars_detected=s.stars_detected,
             stars_matched=len(s.names),
             tilt=(s.tilt.theta_x, s.tilt.theta_y) if s.tilt else NO_TILT,
             identify_s=s.identify_s,
             fix_s=s.fix_s,
-            residual_arcsec=s.attitude.residual_arcsec if s.attitude else float("nan"),
+            residual_arcsec=s.pointing.residual_arcsec if s.pointing else float("nan"),
             at_place=s.at_place,
             warnings=s.warnings,
         )
@@ -137,7 +137,7 @@ class Shot:
             place=ReportedPlace.of(s.fix),
             residual_px=-s.fix.residual_px,
             residual_arcsec=s.fix.residual_arcsec,
-            camera_to_itrs=s.fix.camera_to_itrs,
+            camera_to_itrs=s.fix.camera.rotation,
         )
 
     def __repr__(self) -> str:

@@ -24,7 +24,7 @@ from starpos.instrument.inclinometer import SCA100T_NOISE_RAD
 from starpos.instrument.instrument import Calibration, Instrument
 from starpos.instrument.tilt_log import NoTilts
 from starpos.night.night import Night, Truth
-from starpos.night.reading import About, First, Given, Reader, TiltFile
+from starpos.night.reading import About, First, Instruments, Reader, TiltFile
 from starpos.night.remarks import Remark, of_tilts
 from starpos.night.solving import Exposures, How, Worked, solved_night
 from starpos.night.together import Receiver
@@ -37,7 +37,7 @@ TRUTH_LIMIT = 1 << 26
 
 def exposures(
     folder: Path,
-    given: Given,
+    given: Instruments,
     atmosphere: Atmosphere,
     vertical: Vertical,
     place: Place | None = None,
@@ -77,7 +77,7 @@ def exposures(
 
 
 def work_of(
-    given: Given, first: About, tilts: Path | None, atmosphere: Atmosphere, place: Place | None = None
+    given: Instruments, first: About, tilts: Path | None, atmosphere: Atmosphere, place: Place | None = None
 ) -> tuple[Solving, tuple[Remark, ...]]:
     """The work on the frames of a night whose first one is known, and what looks wrong.
 
@@ -181,7 +181,7 @@ class NightOnDisk:
         if given is not None and self.inclinometer:
             model, errors = sensors.find(self.inclinometer)
             given = replace(given, inclinometer=errors, inclinometer_model=model)
-        instruments = Given(given, by_header=self.instrument is None)
+        instruments = Instruments(given, by_header=self.instrument is None)
         track = read_gnss_csv(gnss)[0] if isinstance(gnss, (str, Path)) else gnss
         return solved_night(
             exposures(self.folder, instruments, self.atmosphere, self.vertical, self.place),

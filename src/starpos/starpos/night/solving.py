@@ -13,7 +13,8 @@ import numpy as np
 from starpos.earth.ellipsoid import EARTH_RADIUS_M
 from starpos.earth.vertical import Vertical
 from starpos.errors import FrameError
-from starpos.fix.budget import heading_of, local_north
+from starpos.fix.attitude import heading_of
+from starpos.fix.budget import local_north
 from starpos.fix.searching import Sight, of_one_camera
 from starpos.frames.frame import Frame, Stars
 from starpos.identification.prior import Hint

@@ -59,7 +59,7 @@ class Solved:
     def of(cls, s: Solution, fix: Fix) -> "Solved":
         """The part of a solution with a fix."""
         light = replace(fix, used=np.zeros(0, int), residual_px=np.zeros((0, 2)))
-        log_odds = s.attitude.log_odds if s.attitude else float("nan")
+        log_odds = s.pointing.log_odds if s.pointing else float("nan")
         return cls(
             fix=light,
             extrapolated_days=s.extrapolated_days,
@@ -149,7 +149,7 @@ def together(solved: Sequence[Solved], given: Instrument | None, near: Near | No
         said += remarks.of_a3(given.calibration, place)
         if given.vertical is None and not given.calibration.unknown:
             mounting = given.mounting
-    frames = [Levelled(s.fix.camera_to_itrs, s.tilt) for s in solved if s.tilt is not None]
+    frames = [Levelled(s.fix.camera.rotation, s.tilt) for s in solved if s.tilt is not None]
     said += doubts(frames, place, mounting, near)
     return Together(whole, why_not, tuple(said))
 

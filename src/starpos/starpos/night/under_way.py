@@ -18,7 +18,7 @@ from starpos.navigation.sightings import IdentifiedFrame, sighting_of
 from starpos.navigation.vessel import Vessel
 from starpos.navigation.voyage import Voyage
 from starpos.navigation.voyage import navigate as place_under_way
-from starpos.night.reading import First, Given, Reader
+from starpos.night.reading import First, Instruments, Reader
 from starpos.night.work import Solving
 from starpos.progress import Progress, quiet
 from starpos.sky import catalogue
@@ -42,7 +42,7 @@ class IdentifyingVoyage:
     """Work on the file of a frame, for any process: a VoyageFrame."""
 
     read: Reader
-    given: Given
+    given: Instruments
 
     def __call__(self, path: str) -> VoyageFrame:
         item = self.read(path)
@@ -166,7 +166,7 @@ def navigate(
     vessel, _ = kept.vessel(
         whole, Atmosphere.measured(None, None) if atmosphere is None else atmosphere, axis
     )
-    work: Callable[[str], VoyageFrame] = IdentifyingVoyage(read, Given(whole))
+    work: Callable[[str], VoyageFrame] = IdentifyingVoyage(read, Instruments(whole))
     answers: list[VoyageFrame | FrameError] = []
     for path in paths:
         try:

@@ -30,7 +30,7 @@ from starpos.identification.prior import Hint
 from starpos.instrument import instrument_file
 from starpos.instrument.instrument import Instrument, with_frame_size
 from starpos.instrument.tilt_log import Tilts
-from starpos.night.reading import First, Given, Instruments, Reader, TiltFile, stars_of
+from starpos.night.reading import First, Instruments, Reader, TiltFile, stars_of
 from starpos.night.remarks import Kind, Remark
 from starpos.progress import Progress, quiet
 from starpos.sky import catalogue
@@ -99,7 +99,7 @@ class Solving:
                 solver.prepare(item.width, item.height, item.origin_px)
             begin = time.process_time()
             question = Question(item=item, stars=stars_of(item), tilts=self.tilts, places=self.places)
-            if self.instruments.hinted:
+            if self.instruments.by_header:
                 sight = answer_by_header(solver, question, self.progress)
             else:
                 sight = answer_frame(solver, question)
@@ -130,7 +130,7 @@ class Solving:
         """Say which focal length fits a frame that was not identified with the given one."""
         instrument = self.instruments.of(lost)
         # without its header's focal length a frame was searched already
-        if instrument is None or self.instruments.hinted:
+        if instrument is None or self.instruments.by_header:
             return ()
         focal_px = focal_px_that_fits(self.solver(lost), lost)
         if focal_px is None:
@@ -174,7 +174,7 @@ def identify(
     """
     item = read_frame(frame) if isinstance(frame, (str, Path)) else frame
     known = instrument_file.read(instrument) if isinstance(instrument, (str, Path)) else instrument
-    given = Given(known, by_header=known is None)
+    given = Instruments(known, by_header=known is None)
     return Solving(given, search_s=search_s, progress=progress)(item).solution
 
 
@@ -244,7 +244,7 @@ def deflection(
     framed, _ = with_frame_size(known, first)
     log = TiltFile(os.path.abspath(tilt), framed.inclinometer.noise_rad)
     mark = Place.on_ellipsoid(site[0], site[1], height_m=site[2])
-    work = OnFile(read, ZenithSighted(Given(framed), air, log, mark))
+    work = OnFile(read, ZenithSighted(Instruments(framed), air, log, mark))
     sightings = []
     for path in paths:
         with suppress(FrameError):

@@ -10,7 +10,7 @@ import numpy as np
 
 from starpos.earth.orientation import EarthState, earth_state
 from starpos.earth.place import Place
-from starpos.fix.solution import Attitude
+from starpos.fix.solution import FieldPointing
 from starpos.gnss.solving import Watched
 from starpos.gnss.watch import GnssStatus
 from starpos.instrument.camera import Camera
@@ -396,7 +396,7 @@ class View:
     """A frame whose pointing is known, with its size in px."""
 
     shot: Shot
-    pointing: Attitude
+    pointing: FieldPointing
     size: tuple[int, int]
 
     def directions(self, xy: np.ndarray) -> np.ndarray:
@@ -482,7 +482,7 @@ def polar(enu: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.arctan2(enu[:, 0], enu[:, 1]), np.degrees(np.arctan2(np.hypot(enu[:, 0], enu[:, 1]), enu[:, 2]))
 
 
-def _axes(a: Attitude) -> np.ndarray:
+def _axes(a: FieldPointing) -> np.ndarray:
     """Camera axes (3, 3) in ICRS: its rows are x (along columns), y (along rows) and z."""
     ca, sa, cd, sd = np.cos(a.ra), np.sin(a.ra), np.cos(a.dec), np.sin(a.dec)
     east, north = np.array([-sa, ca, 0.0]), np.array([-sd * ca, -sd * sa, cd])

@@ -4,7 +4,6 @@ are here because they must forget at the same events: an average holds for one i
 """
 
 import math
-import traceback
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -48,31 +47,6 @@ class Seen:
         return self.stars.mid_unix_s
 
 
-class RecentFrames:
-    """The newest frames with stars and a tilt."""
-
-    def __init__(self, most: int) -> None:
-        self._frames: deque[Seen] = deque(maxlen=most)
-
-    def __len__(self) -> int:
-        return len(self._frames)
-
-    def add(self, seen: Seen) -> None:
-        if len(seen.stars):
-            self._frames.append(seen)
-
-    def keep(self, most: int) -> None:
-        """Keep this number of frames from now on; the newest of the present ones stay."""
-        self._frames = deque(self._frames, maxlen=most)
-
-    def newest(self, count: int) -> list[Seen]:
-        """Return up to this number of the newest frames in the order they came."""
-        return list(self._frames)[max(0, len(self._frames) - count) :]
-
-    def clear(self) -> None:
-        self._frames.clear()
-
-
 @dataclass
 class _Pose:
     """A camera that has stood still on the Earth since `first`."""
@@ -82,7 +56,7 @@ class _Pose:
     frames: int = 0
     tilts: deque[Tilt] = field(default_factory=lambda: deque(maxlen=MAX_TILTS))
 
-    def add(self, seen: Seen) -> None:
+    def keep(self, seen: Seen) -> None:
         self.newest = seen
         self.frames += 1
         self.tilts.append(seen.tilt)
@@ -97,12 +71,12 @@ class PoseMemory:
     def __len__(self) -> int:
         return len(self._poses)
 
-    def add(self, seen: Seen, fix: Fix) -> bool:
-        """Add a frame; return whether a new calibration is worthwhile: a new pose, or one with twice as many frames."""
+    def keep(self, seen: Seen, fix: Fix) -> bool:
+        """Keep a frame; return whether a new calibration is worthwhile: a new pose, or one with twice as many frames."""
         if not self._poses or slip_s(fix, self._poses[-1].first) != 0:
             self._poses.append(_Pose(fix, seen))
         pose = self._poses[-1]
-        pose.add(seen)
+        pose.keep(seen)
         return pose.frames & (pose.frames - 1) == 0
 
     def frames(self) -> list[Seen]:
@@ -223,7 +197,7 @@ class Calibrating:
         self._log = log
         self._settings, self._solver, self._changed = settings, solver, changed
         self._values = settings.values
-        self._recent = RecentFrames(self._values["calibration_frames"])
+        self._recent: deque[Seen] = deque(maxlen=self._values["calibration_frames"])
         self._poses = PoseMemory()
         self._newest_unix_s = self._late_unix_s = -math.inf
         # Number of frames in a row that are older than the newest, each younger than the one before.
@@ -256,43 +230,37 @@ class Calibrating:
     @property
     def unknown(self) -> bool:
         """Whether A3 is not known, so that fixes carry its error."""
-        return not self._is_told and self._settings.instrument(self.found).calibration.unknown
+        return not self._is_found and self._settings.instrument(self.found).calibration.unknown
 
     @property
-    def _is_told(self) -> bool:
+    def _is_found(self) -> bool:
         """Whether A3 and its error come from frames."""
         return not math.isnan(self._plumb_arcsec)
 
     # events of the session ----------------------------------------------------------------------------------------------
 
-    def learn(self, seen: Seen, fix: Fix | None) -> Average | None:
-        """Take a frame and its fix; return the average if it includes this frame."""
-        try:
-            return self.average.place if self._take(seen, fix) else None
-        except Exception:
-            # Fix and heading go on without the average; data that cause a defect must not stay.
-            self._log.error(traceback.format_exc())
-            self.forget()
-            return None
+    def include(self, seen: Seen, fix: Fix | None) -> Average | None:
+        """Keep a frame, and average its fix; return the average if it includes this frame."""
+        return self.average.place if self._included(seen, fix) else None
 
-    def _take(self, seen: Seen, fix: Fix | None) -> bool:
-        """Take a frame; return whether the average includes it."""
+    def _included(self, seen: Seen, fix: Fix | None) -> bool:
         mid = seen.mid_unix_s
         if mid == self._newest_unix_s or self._came_late(mid):
             return False
         self._newest_unix_s = mid
-        self._recent.add(seen)
+        if len(seen.stars):
+            self._recent.append(seen)
         if fix is None:
             return False
-        news = self.average.add(fix)
+        news = self.average.include(fix)
         # While A3 is not known, turning looks like moving.
-        if self._is_told and news is News.MOVED:
+        if self._is_found and news is News.MOVED:
             self._era += 1
             self._poses.forget_before(self.average.began_unix_s)
-        if self._is_told and news is News.LEFT_OUT:
+        if self._is_found and news is News.LEFT_OUT:
             return False
-        told_more = self._poses.add(seen, fix)
-        if self._values["self_calibration"] and (told_more or self._again):
+        worthwhile = self._poses.keep(seen, fix)
+        if self._values["self_calibration"] and (worthwhile or self._again):
             self._turn_by_itself()
         return news is not News.LEFT_OUT
 
@@ -331,7 +299,7 @@ class Calibrating:
     def parameters_set(self, names: frozenset[str]) -> None:
         """Apply a change of these parameters."""
         if "calibration_frames" in names:
-            self._recent.keep(self._values["calibration_frames"])
+            self._recent = deque(self._recent, maxlen=self._values["calibration_frames"])
         if names & OF_AVERAGE:
             self.average.begin_anew()
         by_itself = "self_calibration" in names and self._values["self_calibration"]
@@ -374,7 +342,7 @@ class Calibrating:
             raise FixError(
                 f"{wanted} frames are more than are kept: give up to {most}, or raise calibration_frames"
             )
-        frames = self._recent.newest(wanted or most)
+        frames = list(self._recent)[-(wanted or most) :]
         if len(frames) < max(wanted, 1):
             asked = f" of {wanted}" if wanted else ""
             raise FixError(
@@ -433,7 +401,7 @@ class Calibrating:
             self._said = said
             if not said:
                 self._adopt_turned(outcome.value)
-            elif outcome.trouble and self._is_told:
+            elif outcome.trouble and self._is_found:
                 # The newest heading does not fit the others: the place has changed.
                 self._moved_on(self._newest_unix_s)
         if self._again:
@@ -460,7 +428,7 @@ class Calibrating:
 
         The zero of the inclinometer drifts, so the calibration in use gets worse with time.
         """
-        if self.found is None or not self._is_told:
+        if self.found is None or not self._is_found:
             return True
         now = calibrated.instrument.calibration.utc_unix_s
         hours = abs(now - self.found.utc_unix_s) / 3600
@@ -503,7 +471,7 @@ class Calibrating:
         values: dict[str, object] = {"frames kept": len(self._recent), "headings": len(self._poses)}
         values |= {"self-calibration": self._values["self_calibration"], "working": self._worker.busy}
         values |= {"last turn on the spot": self._said}
-        if self._is_told and self.found is not None:
+        if self._is_found and self.found is not None:
             values |= {"plumb line (arcsec)": self._plumb_arcsec, "found of frames": self.found.frames}
         if self.unknown:
             remedy = (self._said or TURN_IT) if self._values["self_calibration"] else CALIBRATE_IT

@@ -66,9 +66,9 @@ class LiveDeflection:
         if names & OF_SESSION:
             self.forget()
 
-    def take(self, solver: Solver | None, stars: Stars, tilts: Tilts, found: Identification | None) -> None:
-        """Take an identified frame; one that gives no sighting is counted by its reason only."""
-        if solver is None or found is None or not self.measures or len(self._sightings) >= MOST:
+    def include(self, solver: Solver, stars: Stars, tilts: Tilts, found: Identification | None) -> None:
+        """Include an identified frame; one that gives no sighting is counted by its reason only."""
+        if found is None or not self.measures or len(self._sightings) >= MOST:
             return
         values = self._settings.values
         try:

@@ -10,7 +10,7 @@ from starpos.fix.camera_attitude import CameraAttitude
 from starpos.fix.fix import Fix
 from starpos.fix.solution import Solution
 from starpos.frames.frame import Stars
-from starpos.gnss.solving import Watched
+from starpos.gnss.solving import Compared
 from starpos.session.driver import Now
 
 
@@ -20,7 +20,7 @@ class Answered:
 
     no_camera: no camera calibration has arrived.
     attitude: the camera's, by its stars; None if they do not determine it.
-    `beside`: with GNSS, what it taught and what the guard says of it; None without.
+    compared: the GNSS place at the frame, and what the guard says of it; None without one.
     """
 
     stamp: Any
@@ -28,7 +28,7 @@ class Answered:
     ground: Geodetic | None
     no_camera: bool
     attitude: CameraAttitude | None = None
-    beside: Watched | None = None
+    compared: Compared | None = None
 
 
 @dataclass(frozen=True)

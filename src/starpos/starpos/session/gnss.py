@@ -4,8 +4,7 @@ position is compared with the star fix and never fused with it, so that each can
 """
 
 import math
-import traceback
-from collections import deque
+from bisect import bisect_left
 from dataclasses import replace
 from typing import Any
 
@@ -15,7 +14,7 @@ from starpos.earth.place import Place
 from starpos.earth.vertical import Geodetic, Vertical
 from starpos.errors import GnssError, PlaceError, StarposError
 from starpos.files import path_of
-from starpos.fix.solution import Solution, Status
+from starpos.fix.solution import Solution
 from starpos.fix.solver import Solver
 from starpos.frames.frame import Stars
 from starpos.gnss import states
@@ -25,7 +24,7 @@ from starpos.gnss.solving import Watched, watched
 from starpos.gnss.states import Learned
 from starpos.gnss.watch import GnssStatus, GnssWatch
 from starpos.instrument.instrument import Instrument
-from starpos.session.driver import ANOTHER_TIME_S, Diagnosis, Heard, Jobs, Level, Log, Now
+from starpos.session.driver import ANOTHER_TIME_S, Diagnosis, Heard, Jobs, Level, Log, Now, refusing
 from starpos.session.frames import ground_of
 from starpos.session.reports import AHEAD_S, ONE_CLOCK
 from starpos.session.settings import Settings
@@ -37,6 +36,10 @@ UNSTATED_M = 30.0
 CONTRADICTION_SIGMAS = 5.0
 # maximum age of a GNSS place in a comparison, s
 OLDEST_S = 5.0
+# time for which places are kept: half of an exposure, and the waiting of its frame
+KEPT_S = 300.0
+# a fix that comes later than this after its stamp is of another clock, s
+MAX_LATE_S = 30.0
 
 
 def contradiction(gnss: Place, ground: Geodetic, utc_unix_s: float, speed: float) -> tuple[float, str]:
@@ -56,33 +59,81 @@ def contradiction(gnss: Place, ground: Geodetic, utc_unix_s: float, speed: float
     )
 
 
+class RecentPlaces:
+    """The places of GNSS of the last KEPT_S, whatever the receiver's rate.
+
+    A frame asks for the middle of its exposure only when that is over, is read, and has its tilts.
+    unstated_m: 1 sigma an axis of a place whose message states no error; NaN: it is refused.
+    """
+
+    def __init__(self, unstated_m: float = math.nan) -> None:
+        self._unstated_m = unstated_m
+        self._places: list[Place] = []
+
+    def __len__(self) -> int:
+        return len(self._places)
+
+    @property
+    def newest(self) -> Place | None:
+        """The newest place; None without one."""
+        return self._places[-1] if self._places else None
+
+    def receive(self, message: Any, now: Now) -> None:
+        """Keep the place of a sensor_msgs/NavSatFix; GnssError with the reason if it cannot be used."""
+        place = message_to_gnss(message, self._unstated_m)
+        ahead_s = now.ahead_s(place.utc_unix_s)
+        if ahead_s > AHEAD_S or -ANOTHER_TIME_S < ahead_s < -MAX_LATE_S:
+            side = "ahead of" if ahead_s > 0 else "behind"
+            raise GnssError(f"GNSS's stamps are {abs(ahead_s):.3g} s {side} this clock: {ONE_CLOCK}")
+        if self._places and place.utc_unix_s < self._places[-1].utc_unix_s:
+            raise GnssError("GNSS's stamps go back: check that one receiver publishes, not two")
+        self._places.append(place)
+        if self._places[0].utc_unix_s < place.utc_unix_s - 2 * KEPT_S:
+            del self._places[: self._first_since(place.utc_unix_s - KEPT_S)]
+
+    def at(self, utc_unix_s: float) -> Place | None:
+        """The place at a time, None without one near; GnssError if the places there contradict each other."""
+        # with one more on either side, from which the speed is known
+        first = max(self._first_since(utc_unix_s - NEAREST_S) - 1, 0)
+        return GnssTrack(self._places[first : self._first_since(utc_unix_s + NEAREST_S) + 1]).at(utc_unix_s)
+
+    def forget(self) -> None:
+        """Forget all places."""
+        self._places.clear()
+
+    def _first_since(self, utc_unix_s: float) -> int:
+        return bisect_left(self._places, utc_unix_s, key=lambda p: p.utc_unix_s)
+
+
 class GnssComparison:
-    """Keeps the last place of GNSS; it never changes a fix."""
+    """Compares the newest fix with GNSS's place of its time; it never changes a fix."""
 
     def __init__(self) -> None:
-        self._place: Place | None = None
+        self._places = RecentPlaces(UNSTATED_M)
 
-    def take(self, message: Any) -> None:
-        """Take a sensor_msgs/NavSatFix; one without a usable place is forgotten."""
+    def receive(self, message: Any, now: Now) -> None:
+        """Keep the place of a sensor_msgs/NavSatFix; after one without a usable place nothing is compared."""
         try:
-            self._place = message_to_gnss(message, UNSTATED_M)
+            self._places.receive(message, now)
         except GnssError:
-            self._place = None
+            self._places.forget()
 
     def remark(self, answer: Solution | None, vertical: Vertical) -> str:
         """Sentence with the distance, where both places cannot be right; '' otherwise."""
         fix = None if answer is None else answer.fix
-        if fix is None or self._place is None or abs(fix.utc_unix_s - self._place.utc_unix_s) > OLDEST_S:
+        if fix is None:
             return ""
-        _, wrong = contradiction(self._place, ground_of(fix, vertical), fix.utc_unix_s, 0.0)
+        try:
+            gnss = self._places.at(fix.utc_unix_s)
+        except GnssError:
+            gnss = None
+        if gnss is None:
+            return ""
+        _, wrong = contradiction(gnss, ground_of(fix, vertical), fix.utc_unix_s, 0.0)
         return f"{wrong}: check how frames are turned, A3 and the inclinometer's axes" if wrong else ""
 
 
 GNSS_TOPIC = "gnss/fix"
-# fixes that are kept: frames wait for their tilts meanwhile
-KEPT = 100
-# a fix that comes later than this after its stamp is of another clock, s
-MAX_LATE_S = 30.0
 # minimum interval between writings of what was learned, s
 SAVE_EVERY_S = 60.0
 
@@ -97,7 +148,7 @@ class GnssTeacher:
         self.newest: Watched | None = None
         self._settings, self._values, self._jobs = settings, settings.values, jobs
         self._heard, self._log = heard, log
-        self._places: deque[Place] = deque(maxlen=KEPT)
+        self.places = RecentPlaces()
         self._watch: GnssWatch | None = None
         self._instrument: Instrument | None = None
         self._stored: Learned | None = settings.learned
@@ -111,33 +162,15 @@ class GnssTeacher:
         """What is known of the instrument now."""
         return self._stored if self._watch is None else self._watch.learned
 
-    def take(self, message: Any, now: Now) -> None:
-        """Take a sensor_msgs/NavSatFix; one that cannot be used is refused with the reason."""
-        try:
-            place = message_to_gnss(message)
-            ahead_s = now.ahead_s(place.utc_unix_s)
-            if ahead_s > AHEAD_S or -ANOTHER_TIME_S < ahead_s < -MAX_LATE_S:
-                side = "ahead of" if ahead_s > 0 else "behind"
-                raise GnssError(f"GNSS's stamps are {abs(ahead_s):.3g} s {side} this clock: {ONE_CLOCK}")
-            if self._places and place.utc_unix_s < self._places[-1].utc_unix_s:
-                raise GnssError("GNSS's stamps go back: check that one receiver publishes, not two")
-        except GnssError as error:
-            self._heard.refuse(GNSS_TOPIC, str(error))
-            return
-        self._heard.came(GNSS_TOPIC)
-        self._places.append(place)
+    def receive(self, message: Any, now: Now) -> None:
+        """Keep the place of a sensor_msgs/NavSatFix; one that cannot be used is refused with the reason."""
+        with refusing(self._heard, GNSS_TOPIC):
+            self.places.receive(message, now)
 
-    def solved(self, solver: Solver, stars: Stars, rough: Solution, compared: bool = True) -> Watched:
+    def solve(self, solver: Solver, stars: Stars, rough: Solution, compared: bool = True) -> Watched:
         """Solve a frame with what GNSS taught before it; compared: with GNSS's place of its time too."""
         watch = self._watch_of(solver.instrument)
-        gnss = self._compared_with(stars) if compared else None
-        try:
-            answer = watched(solver, stars, rough, gnss, watch)
-        except Exception as e:
-            # A defect loses only this frame.
-            self._log.error(traceback.format_exc())
-            why = f"what GNSS taught could not be used on this frame ({type(e).__name__}: {e})"
-            answer = Watched(solution=Solution.failed(stars, Status.BAD_INPUT, why))
+        answer = watched(solver, stars, rough, self._compared_with(stars) if compared else None, watch)
         if self._settings.site is not None:
             # the heading there is better than any fix's
             answer = replace(answer, solution=replace(answer.solution, at_place=rough.at_place))
@@ -166,19 +199,11 @@ class GnssTeacher:
             self._log.warning("another camera_info: what GNSS taught of the other camera is forgotten")
             self._watch = GnssWatch(self._instrument, self._settings.vertical)
 
-    def place_at(self, utc_unix_s: float) -> Place | None:
-        """GNSS's place at a time, None without one; GnssError if its places contradict each other."""
-        return GnssTrack(list(self._places)).at(utc_unix_s)
-
-    def forget_places(self) -> None:
-        """Forget where GNSS had the instrument, not what it taught."""
-        self._places.clear()
-
     def _compared_with(self, stars: Stars) -> Place | None:
         if stars.mid_unix_s is None:
             return None
         try:
-            return self.place_at(stars.mid_unix_s)
+            return self.places.at(stars.mid_unix_s)
         except GnssError as error:
             self._heard.refuse(GNSS_TOPIC, str(error))
             return None
@@ -261,13 +286,6 @@ class GnssTeacher:
         }
 
 
-def solved_beside(
-    gnss: GnssTeacher | None, solver: Solver | None, stars: Stars, rough: Solution, compared: bool
-) -> Watched | None:
-    """Solve a frame as a teacher does; None without one, or without a solver."""
-    return gnss.solved(solver, stars, rough, compared) if gnss is not None and solver is not None else None
-
-
 class SessionPlaces:
     """The known place at each time, as `Places`.
 
@@ -287,7 +305,7 @@ class SessionPlaces:
         if (site := self._settings.site) is not None:
             return site
         try:
-            gnss = None if self._gnss is None else self._gnss.place_at(utc_unix_s)
+            gnss = None if self._gnss is None else self._gnss.places.at(utc_unix_s)
         except GnssError as error:
             raise PlaceError(f"no heading at a known place: {error}") from None
         if gnss is None:

@@ -77,7 +77,7 @@ class Gyro:
         useful = self._error(turned, mid_s) < turned.reach_rad(stars.width, stars.height)
         return (turned,) if useful else ()
 
-    def saw(self, stars: Stars, found: Identification, solver: Solver) -> None:
+    def learn_from(self, stars: Stars, found: Identification, solver: Solver) -> None:
         """Take an attitude from stars identified beyond doubt, and learn the bias from it."""
         mid_s, (camera, _, _) = stars.mid_unix_s, solver.view(stars.width, stars.height)
         if mid_s is None:

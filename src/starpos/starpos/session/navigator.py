@@ -6,7 +6,6 @@ last one on.
 """
 
 import math
-from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -20,7 +19,7 @@ from starpos.earth.place import Place
 from starpos.earth.vertical import Geodetic, Vertical, geodetic
 from starpos.errors import GnssError, StarposError, VoyageError
 from starpos.files import path_of
-from starpos.gnss.receiver import GnssTrack, message_to_gnss
+from starpos.fix.attitude import Attitude
 from starpos.instrument.instrument import Instrument
 from starpos.messages.stamp import stamp_to_unix
 from starpos.messages.stars import message_to_attitude
@@ -28,12 +27,12 @@ from starpos.navigation.equations import PLACE
 from starpos.navigation.estimate import Estimate, Observability, VoyageFix, observability
 from starpos.navigation.recent import BACK_S, LONGEST_GAP_S, Recent
 from starpos.navigation.records import ImuModel, read_imu_model
-from starpos.navigation.sightings import BodyAttitude, PlacelessFrame, attitude_at_place
+from starpos.navigation.sightings import PlacelessFrame, body_attitude
 from starpos.navigation.vessel import PARKED, Vessel, check_drift
 from starpos.navigation.voyage import MIN_FRAMES, Voyage
 from starpos.session import settings
 from starpos.session.driver import Diagnosis, Heard, Jobs, Level, Log, Now, Outcome
-from starpos.session.gnss import OLDEST_S, UNSTATED_M, contradiction
+from starpos.session.gnss import OLDEST_S, UNSTATED_M, RecentPlaces, contradiction
 from starpos.session.reports import AHEAD_S
 
 # of a stated altitude: the vehicle goes up and down by more than its file says
@@ -117,8 +116,6 @@ class NavigatorSettings:
 
 # minimum length of the window before it is adjusted, s, and minimum frames per second of the period
 SHORTEST_S, FRAMES_PER_S = 10.0, 30.0
-# fixes of GNSS that are kept: attitudes come later than they
-GNSS_KEPT = 100
 # 1 sigma beyond which a position counts as unknown, m an axis
 WIDE_M = 1000.0
 STARTING = "no frame with stars yet"
@@ -147,7 +144,7 @@ class Navigated:
     fix: VoyageFix | None = None
     ground: Geodetic | None = None
     position: Position | None = None
-    at_place: BodyAttitude | None = None
+    at_place: Attitude | None = None
 
 
 class NavigatorSession:
@@ -176,7 +173,7 @@ class NavigatorSession:
         # of the newest frame that the estimate is made of
         self._seen_s = -math.inf
         self._clock_stddev_s = 0.0
-        self._gnss: deque[Place] = deque(maxlen=GNSS_KEPT)
+        self._gnss = RecentPlaces(UNSTATED_M)
         # marks outcomes of jobs that began before as out of date
         self._voyage = object()
 
@@ -238,13 +235,13 @@ class NavigatorSession:
             return []
         if place is None:
             return []
-        found = attitude_at_place(frame, place, self._settings.vessel(self._clock_stddev_s))
+        found = body_attitude(frame, place, self._settings.vessel(self._clock_stddev_s))
         return [Navigated(utc_unix_s=frame.utc_unix_s, at_place=found)]
 
     def _by_gnss(self, utc_unix_s: float) -> Place | None:
         if not self._values["gnss.use"]:
             return None
-        gnss = GnssTrack(list(self._gnss)).at(utc_unix_s)
+        gnss = self._gnss.at(utc_unix_s)
         return None if gnss is None else gnss.deflected(self._settings.vertical)
 
     def receive_velocity(self, message: Any, now: Now, name: str) -> list[Navigated]:
@@ -271,9 +268,9 @@ class NavigatorSession:
     def receive_gnss(self, message: Any, now: Now) -> list[Navigated]:
         """Take a sensor_msgs/NavSatFix of satellites: it is compared, not fused."""
         try:
-            self._gnss.append(message_to_gnss(message, UNSTATED_M))
+            self._gnss.receive(message, now)
         except GnssError:
-            self._gnss.clear()
+            self._gnss.forget()
         self._heard.came("gnss/fix")
         return []
 
@@ -429,10 +426,11 @@ class NavigatorSession:
         if self._stars_missing:
             return Diagnosis(Level.WARN, self._why_old(since_s), values)
         faults = list(self._faults)
-        if self._gnss and abs(estimate.utc_unix_s - self._gnss[-1].utc_unix_s) < OLDEST_S:
+        gnss = self._gnss.newest
+        if gnss is not None and abs(estimate.utc_unix_s - gnss.utc_unix_s) < OLDEST_S:
             fix = estimate.fix
             moving = float(np.linalg.norm(fix.velocity))
-            apart_m, wrong = contradiction(self._gnss[-1], self._ground(fix), fix.utc_unix_s, moving)
+            apart_m, wrong = contradiction(gnss, self._ground(fix), fix.utc_unix_s, moving)
             values["GNSS from here (m)"] = apart_m
             faults += [wrong] if wrong else []
         said = [f"place to {known.sigma_m:.3g} m", *([known.missing] if known.missing else [])]

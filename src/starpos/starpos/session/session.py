@@ -10,10 +10,11 @@ import math
 import traceback
 from collections.abc import Callable, Iterable
 from dataclasses import replace
-from typing import Any
+from typing import Any, TypeVar
 
 from starpos.earth.orientation import earth_state
 from starpos.errors import InstrumentError, StarposError, TimeError
+from starpos.fix.camera_attitude import CameraAttitude
 from starpos.fix.checks import MODEL_BY_PARAMETERS, unnamed_inclinometer
 from starpos.fix.fix import Fix
 from starpos.fix.searching import Question
@@ -21,7 +22,6 @@ from starpos.fix.solution import Solution, Status
 from starpos.fix.solver import Solver
 from starpos.frames.frame import Stars
 from starpos.gnss.solving import Watched
-from starpos.identification import Identification
 from starpos.identification.prior import Hint
 from starpos.identification.search import Priors
 from starpos.instrument.camera import Camera
@@ -33,15 +33,16 @@ from starpos.session.camera_solver import CameraSolver
 from starpos.session.deflection import LiveDeflection
 from starpos.session.driver import Changes, Heard, Jobs, Log, Now, Sent, refusing
 from starpos.session.frames import Answered, Averaged, Output, Waiting, ground_of
-from starpos.session.gnss import GnssTeacher, SessionPlaces, solved_beside
+from starpos.session.gnss import GnssTeacher, SessionPlaces
 from starpos.session.gyro import Gyro
 from starpos.session.pace import MAX_WAITING, Backlog, Pace
 from starpos.session.settings import Settings
-from starpos.session.solving import AT_ONCE_S, Search, attitude_seen
+from starpos.session.solving import AT_ONCE_S, Search, attitude_beside
 from starpos.session.standing import ClockDoubt
 from starpos.session.tilts import TiltBuffer
 from starpos.sky import catalogue
 
+T = TypeVar("T")
 NOTHING_TOLD = Sent()
 J2000_UNIX_S = 946_728_000.0
 # A stamp further in the future than AHEAD_S and this many stated sigmas is wrong.
@@ -180,7 +181,8 @@ class SolverSession:
         except StarposError as e:
             number = len(message.stars)
             bad = Solution(Status.BAD_INPUT, str(e), source="stars", utc_unix_s=None, stars_detected=number)
-            return [self._answered(message.header.stamp, bad, now)]
+            self._note(bad, now)
+            return [self._output(message.header.stamp, bad)]
         self._wait_for(stars, message.header, now)
         return []
 
@@ -198,7 +200,7 @@ class SolverSession:
             self.pace.numbered(sent.number, now.waiting_s)
         if not self.pace.wants(stamp_to_unix(header.stamp), self._values["max_rate"]):
             return False
-        self._search.frame_came(now)
+        self._search.note_frame(now)
         if not now.played and not self._backlog.has_room(self._delay_s(now)):
             self.pace.drop(now.waiting_s)
             return False
@@ -228,7 +230,7 @@ class SolverSession:
     def receive_gnss(self, message: Any, now: Now) -> list[Output]:
         """Take a sensor_msgs/NavSatFix of GNSS; nothing is done with it without gnss.use."""
         if self.gnss is not None:
-            self.gnss.take(message, now)
+            self.gnss.receive(message, now)
         return self.at(now)
 
     def at(self, now: Now) -> list[Output]:
@@ -310,88 +312,102 @@ class SolverSession:
         return stars.exposure_s or self._values["tilt_window"]
 
     def _solve(self, frame: Waiting, now: Now) -> list[Output]:
-        predicted = self.gyro.predicted(frame.stars, self.instrument.solver)
+        predicted: Priors = self._guarded(
+            lambda: self.gyro.predicted(frame.stars, self.instrument.solver), lambda e: ()
+        )
         until_s = self._search.until_s(now, bool(self._backlog))
-        answer = self._answer_to(frame, self._hint, until_s, predicted)
-        if answer.ok and answer.fix is not None:
-            frame, answer = self._with_doubt(frame, answer, answer.fix)
+        question = self._question(frame, predicted=predicted, hint=self._hint, until_s=until_s)
+        answer = self._answer(frame, question)
+        if (fix := answer.fix) is not None and answer.ok:
+            frame, answer = self._guarded(
+                lambda: self._with_doubt(frame, answer, fix),
+                lambda e: (frame, _failed(frame, "the solver failed on this frame", e)),
+            )
         self.latest = frame
         # if a frame's time is in doubt, so is GNSS's place for it
-        beside = solved_beside(
-            self.gnss, self.instrument.solver, frame.stars, answer, compared=not frame.doubted
+        answered = self._taught(frame, answer, compared=not frame.doubted)
+        if now.played:
+            # by the clock of recorded data no time passes
+            answered = replace(answered, solution=replace(answered.solution, identify_s=0.0, fix_s=0.0))
+        self._note(answered.solution, now)
+        return [
+            replace(answered, attitude=self._attitude(frame, question, answered.solution)),
+            *self._learn(frame, answered.solution),
+        ]
+
+    def _guarded(self, work: Callable[[], T], instead: Callable[[Exception], T]) -> T:
+        """What `work` makes.  A defect in it is logged and loses only that: the session goes on with `instead`."""
+        try:
+            return work()
+        except Exception as e:
+            self._log.error(traceback.format_exc())
+            return instead(e)
+
+    def _question(self, frame: Waiting, **known: Any) -> Question:
+        """What is asked of a frame; known: further fields of a Question."""
+        # a node has no picture to look at, only the list
+        stars = frame.stars
+        places = self.places if self.places.known else None
+        return Question(
+            item=stars, stars=stars, tilts=self.tilts.over(self._span(stars)), places=places, **known
         )
-        answer = answer if beside is None else beside.solution
-        answered = self._answered(frame.header.stamp, answer, now, beside)
-        attitude = attitude_seen(
-            self.instrument.solver,
-            frame.stars,
-            answer,
-            frame.header.frame_id,
-            predicted,
-            until_s,
-            self.gyro,
-            self._log,
-        )
-        return [replace(answered, attitude=attitude), *self._learn(frame, answer)]
+
+    def _answer(self, frame: Waiting, question: Question) -> Solution:
+        def work() -> Solution:
+            solver = self.instrument.solver_now
+            if frame.ahead_s > reports.AHEAD_S + CLOCK_SIGMAS * solver.clock_stddev_s(frame.stars):
+                raise TimeError(
+                    f"the frame is stamped {frame.ahead_s:.3g} s in the future: {reports.ONE_CLOCK}"
+                )
+            return self._search.solve(solver, question)
+
+        try:
+            return self._guarded(work, lambda e: _failed(frame, "the solver failed on this frame", e))
+        except (InstrumentError, TimeError) as e:
+            return Solution.failed(frame.stars, Status.BAD_INPUT, str(e))
 
     def _with_doubt(self, frame: Waiting, answer: Solution, fix: Fix) -> tuple[Waiting, Solution]:
         """Add the error of its time that the stars of earlier frames show to a frame and its answer."""
         stated_s = math.hypot(
             self.instrument.solver_now.clock_stddev_s(frame.stars), frame.stars.stamp_stddev_s
         )
-        self.doubt.add(fix, stated_s)
+        self.doubt.judge(fix, stated_s)
         if self.doubt.seconds <= stated_s:
             return frame, answer
         frame = replace(frame, stars=replace(frame.stars, clock_stddev_s=self.doubt.seconds), doubted=True)
         if self.doubt.leans_otherwise:
             return frame, Solution.failed(frame.stars, Status.NO_TILT, reports.OTHER_TILTS)
-        return frame, self._answer_to(frame, answer.hint, AT_ONCE_S, known=answer.found)
+        known = self._question(frame, hint=answer.hint, until_s=AT_ONCE_S, known=answer.found)
+        return frame, self._answer(frame, known)
 
-    def _answer_to(
-        self,
-        frame: Waiting,
-        hint: Hint | None,
-        until_s: float,
-        predicted: Priors = (),
-        known: Identification | None = None,
-    ) -> Solution:
-        stars = frame.stars
-        try:
-            solver = self.instrument.solver_now
-            if frame.ahead_s > reports.AHEAD_S + CLOCK_SIGMAS * solver.clock_stddev_s(stars):
-                raise TimeError(
-                    f"the frame is stamped {frame.ahead_s:.3g} s in the future: {reports.ONE_CLOCK}"
-                )
-            tilts = self.tilts.over(self._span(stars))
-            places = self.places if self.places.known else None
-            # a node has no picture to look at, only the list
-            question = Question(
-                item=stars,
-                stars=stars,
-                tilts=tilts,
-                places=places,
-                predicted=predicted,
-                hint=hint,
-                until_s=until_s,
-                known=known,
-            )
-            return self._search.solved(solver, question)
-        except (InstrumentError, TimeError) as e:
-            return Solution.failed(stars, Status.BAD_INPUT, str(e))
-        except Exception as e:
-            # A defect loses only this frame; the session goes on.
-            self._log.error(traceback.format_exc())
-            return Solution.failed(
-                stars, Status.BAD_INPUT, f"the solver failed on this frame ({type(e).__name__}: {e})"
-            )
+    def _taught(self, frame: Waiting, answer: Solution, compared: bool) -> Answered:
+        """The answer to a frame, with gnss.use by what GNSS has taught; compared: with GNSS's place of its time too."""
+        stamp, solver, gnss = frame.header.stamp, self.instrument.solver, self.gnss
+        if gnss is None or solver is None:
+            return self._output(stamp, answer)
+        taught = self._guarded(
+            lambda: gnss.solve(solver, frame.stars, answer, compared),
+            lambda e: Watched(solution=_failed(frame, "what GNSS taught could not be used on this frame", e)),
+        )
+        made = self._output(stamp, taught.solution)
+        return replace(made, ground=taught.ground, compared=taught.compared)
+
+    def _attitude(self, frame: Waiting, question: Question, answer: Solution) -> CameraAttitude | None:
+        if (solver := self.instrument.solver) is None:
+            return None
+        question = replace(question, item=frame.stars, stars=frame.stars)
+        return self._guarded(
+            lambda: attitude_beside(solver, question, answer, frame.header.frame_id, self.gyro),
+            lambda e: None,
+        )
 
     def _learn(self, frame: Waiting, answer: Solution) -> list[Output]:
         """Give a frame to the calibration and the average, even one that a stale calibration refuses.
 
         A frame whose time is in doubt is left out.  Returns the average if it includes the frame.
         """
-        stars = frame.stars
-        if self.instrument.solver is None or stars.mid_unix_s is None or frame.doubted:
+        stars, solver = frame.stars, self.instrument.solver
+        if solver is None or stars.mid_unix_s is None or frame.doubted:
             return []
         if answer.status is Status.BAD_INPUT and frame.ahead_s > reports.AHEAD_S:
             return []
@@ -399,39 +415,36 @@ class SolverSession:
             tilt = answer.tilt or self.tilts.average(stars.mid_unix_s, self._span(stars))
         except StarposError:
             return []
-        self.deflection.take(self.instrument.solver, stars, tilt, answer.found)
-        place = self.calibrating.learn(Seen(stars, tilt, answer.found), answer.fix)
+        self._guarded(lambda: self.deflection.include(solver, stars, tilt, answer.found), lambda e: None)
+        place = self._guarded(
+            lambda: self.calibrating.include(Seen(stars, tilt, answer.found), answer.fix),
+            # data that cause a defect must not stay
+            lambda e: self.calibrating.forget(),
+        )
         if place is None:
             return []
         return [Averaged(frame.header.stamp, place, ground_of(place, self._settings.vertical))]
 
-    def _answered(self, stamp: Any, answer: Solution, now: Now, beside: Watched | None = None) -> Answered:
-        if now.played:
-            # by the clock of recorded data no time passes
-            answer = replace(answer, identify_s=0.0, fix_s=0.0)
+    def _note(self, answer: Solution, now: Now) -> None:
+        """Note the answer to the newest frame."""
         self.answer = answer
         self.pace.answered(answer.ok)
         self._hint = answer.hint or self._hint
         self._changes.say("fixes are coming" if answer.ok else answer.message, answer.ok, answer.status)
         if self.gnss is not None:
             self.gnss.save_if_due(now)
-        return self._output(stamp, answer, beside)
 
-    def _output(self, stamp: Any, answer: Solution, beside: Watched | None) -> Answered:
+    def _output(self, stamp: Any, answer: Solution) -> Answered:
         no_camera = self.instrument.solver is None and self.instrument.camera is None
         ground = None if answer.fix is None else ground_of(answer.fix, self._settings.vertical)
-        if beside is not None:
-            ground = beside.ground
-        return Answered(stamp=stamp, solution=answer, ground=ground, no_camera=no_camera, beside=beside)
+        return Answered(stamp=stamp, solution=answer, ground=ground, no_camera=no_camera)
 
     def solve_again(self) -> Answered | None:
         """Solve the newest frame with what is known now, identified anew whatever was found before; None without one."""
         if self.latest is None:
             return None
-        answer = self._answer_to(self.latest, None, self._search.until_s(None, False))
-        beside = solved_beside(self.gnss, self.instrument.solver, self.latest.stars, answer, compared=False)
-        answer = answer if beside is None else beside.solution
-        return self._output(self.latest.header.stamp, answer, beside)
+        question = self._question(self.latest, until_s=self._search.until_s(None, False))
+        return self._taught(self.latest, self._answer(self.latest, question), compared=False)
 
     def reset(self) -> None:
         """Forget tilts, frames and the place, but no calibration that was found."""
@@ -440,7 +453,11 @@ class SolverSession:
         self.latest = self.answer = self._hint = None
         self.gyro.forget()
         if self.gnss is not None:
-            self.gnss.forget_places()
+            self.gnss.places.forget()
         self.doubt.clear()
         self.calibrating.forget()
         self.deflection.forget()
+
+
+def _failed(frame: Waiting, what: str, error: Exception) -> Solution:
+    return Solution.failed(frame.stars, Status.BAD_INPUT, f"{what} ({type(error).__name__}: {error})")

@@ -3,7 +3,6 @@
 
 import math
 import time
-import traceback
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
@@ -23,9 +22,8 @@ from starpos.fix.solution import Solution, Status
 from starpos.fix.solver import Solver, focal_that_fits
 from starpos.frames.frame import Stars
 from starpos.identification import fisheye
-from starpos.identification.search import Priors
 from starpos.navigation.sightings import sighted
-from starpos.session.driver import Log, Now
+from starpos.session.driver import Now
 from starpos.session.gyro import Gyro
 
 # Share of the time between frames in which one may be searched.
@@ -48,7 +46,7 @@ class Search:
         # whether a frame of this camera was identified
         self._identified = False
 
-    def frame_came(self, now: Now) -> None:
+    def note_frame(self, now: Now) -> None:
         """Note that a frame has come."""
         self._interval_s, self._came_s = now.waiting_s - self._came_s, now.waiting_s
 
@@ -64,7 +62,7 @@ class Search:
             most_s = min(most_s, 0.0 if others_wait else MAX_OF_INTERVAL * self._interval_s)
         return time.monotonic() + most_s
 
-    def solved(self, solver: Solver, question: Question) -> Solution:
+    def solve(self, solver: Solver, question: Question) -> Solution:
         """Solve a list by `answer_frame`; while none is identified, say which focal length fits."""
         answer = answer_frame(solver, question).solution
         self._identified |= answer.found is not None
@@ -74,16 +72,6 @@ class Search:
         if focal_px is None:
             return answer
         return replace(answer, message=other_focal_length(question.stars.place, focal_px))
-
-
-def asked(
-    solver: Solver, stars: Stars, answer: Solution, predicted: Priors = (), until_s: float = NEVER_S
-) -> Solution:
-    """The solver's answer to a frame; if it stopped before identification, identify the stars now."""
-    if answer.found is None and answer.status in UNASKED:
-        question = Question(item=stars, stars=stars, predicted=predicted, until_s=until_s)
-        return identify_every_way(solver, question).solution
-    return answer
 
 
 def camera_attitude_of(
@@ -116,26 +104,16 @@ def camera_attitude_of(
     )
 
 
-def attitude_seen(
-    solver: Solver | None,
-    stars: Stars,
-    answer: Solution,
-    frame_id: str,
-    predicted: Priors,
-    until_s: float,
-    gyro: Gyro,
-    log: Log,
+def attitude_beside(
+    solver: Solver, question: Question, answer: Solution, frame_id: str, gyro: Gyro
 ) -> CameraAttitude | None:
-    """The attitude of an answered frame, also given to the gyro; None without a solver or identified stars."""
-    if solver is None:
-        return None
-    try:
-        answer = asked(solver, stars, answer, predicted, until_s)
-        attitude = camera_attitude_of(solver, stars, answer, frame_id)
-        if attitude is not None and answer.found is not None:
-            gyro.saw(stars, answer.found, solver)
-        return attitude
-    except Exception:
-        # A defect loses only this attitude.
-        log.error(traceback.format_exc())
-        return None
+    """The attitude of a frame that was asked about, also given to the gyro; None without identified stars.
+
+    Where the solver stopped before identification, the stars are identified now.
+    """
+    if answer.found is None and answer.status in UNASKED:
+        answer = identify_every_way(solver, replace(question, tilts=None, places=None)).solution
+    attitude = camera_attitude_of(solver, question.stars, answer, frame_id)
+    if attitude is not None and answer.found is not None:
+        gyro.learn_from(question.stars, answer.found, solver)
+    return attitude

@@ -11,8 +11,8 @@ from starpos.earth.ellipsoid import curvature_radii_m
 from starpos.earth.orientation import earth_state
 from starpos.earth.refraction import Atmosphere
 from starpos.earth.vertical import Deflection
-from starpos.fix.budget import ALWAYS, ErrorTerm
-from starpos.fix.solution import Attitude, Status
+from starpos.fix.solution import FieldPointing, Status
+from starpos.fix.terms import ALWAYS, ErrorTerm
 from starpos.instrument.camera import EQUIDISTANT, Camera
 from starpos.instrument.instrument import Calibration, Instrument
 from starpos.night.night import Night, ReportedPlace, Shot, Truth
@@ -174,7 +174,7 @@ def test_a_night_at_two_places_is_averaged_at_the_last_and_says_so(tmp_path):
 
 
 def test_a_fisheye_sees_to_the_horizon_on_the_map():
-    looking = Attitude(
+    looking = FieldPointing(
         ra=1.0,
         dec=0.5,
         roll=2.0,

@@ -15,7 +15,7 @@ from starpos.session.standing import Averaging, News
 def averaging_of(fixes) -> Averaging:
     made = Averaging()
     for fix in fixes:
-        made.add(fix)
+        made.include(fix)
     return made
 
 
@@ -34,16 +34,16 @@ def test_it_is_the_average_of_its_fixes():
 def test_a_fix_far_off_is_left_out_and_told():
     a = averaging_of(fix_at(10.0 * k) for k in range(5))
     before = a.place.latitude
-    assert a.add(north_of(fix_at(50.0), 5000.0)) is News.LEFT_OUT
+    assert a.include(north_of(fix_at(50.0), 5000.0)) is News.LEFT_OUT
     assert a.place.latitude == before
     assert a.report().level == Level.WARN and a.report().values["left out"] == 1
-    assert a.add(fix_at(60.0)) is News.USED
+    assert a.include(fix_at(60.0)) is News.USED
     assert a.report().level == Level.OK
 
 
 def moved_after(a: Averaging, seconds: float) -> list[News]:
     """Fixes of a turned camera, 11 km to the north."""
-    return [a.add(fix_at(seconds + 10.0 * k, 130.0, latitude_deg=40.1)) for k in range(4)]
+    return [a.include(fix_at(seconds + 10.0 * k, 130.0, latitude_deg=40.1)) for k in range(4)]
 
 
 def test_a_move_is_told_and_the_average_is_of_the_new_place():
@@ -52,7 +52,7 @@ def test_a_move_is_told_and_the_average_is_of_the_new_place():
     assert math.degrees(a.place.latitude) == pytest.approx(40.1, abs=1e-6)
     assert a.report().level == Level.WARN and a.report().values["moved"] == 1
     for k in range(20):
-        a.add(fix_at(200.0 + 10 * k, 130.0, latitude_deg=40.1))
+        a.include(fix_at(200.0 + 10 * k, 130.0, latitude_deg=40.1))
     assert a.report().level == Level.OK
 
 
@@ -67,7 +67,7 @@ def test_the_place_of_a_turn_stays_while_the_instrument_does():
     a = turned()
     place = a.place
     for k in range(50):
-        assert a.add(north_of(fix_at(100.0 + 10 * k, 10.0), 30.0)) is News.USED
+        assert a.include(north_of(fix_at(100.0 + 10 * k, 10.0), 30.0)) is News.USED
     assert a.place is place
     assert "turn on the spot" in a.report().message
 

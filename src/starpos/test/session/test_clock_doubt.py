@@ -21,13 +21,17 @@ def stamped(off_s: float, azimuth_deg=40.0, **at):
     fix = fix_at(0.0, azimuth_deg, **at)
     turn = rotation.about_axis(2, ROTATION_RAD_S * off_s)
     east, north, _ = turn @ zenith_of(fix.latitude, fix.longitude)
-    return replace(fix, camera_to_itrs=turn @ fix.camera_to_itrs, longitude=math.atan2(north, east))
+    return replace(
+        fix,
+        camera=replace(fix.camera, rotation=turn @ fix.camera.rotation),
+        longitude=math.atan2(north, east),
+    )
 
 
 def doubts_of(*fixes, stated_s=STATED_S) -> list[float]:
     doubt, seconds = ClockDoubt(), []
     for fix in fixes:
-        doubt.add(fix, stated_s)
+        doubt.judge(fix, stated_s)
         seconds.append(doubt.seconds)
     return seconds
 
@@ -63,7 +67,8 @@ def test_the_first_of_a_pose_alone_is_outvoted():
 
 def test_a_blurred_frame_is_not_what_others_are_held_against():
     # A quarter of a minute of time.
-    blurred = replace(stamped(0.0), camera_covariance=np.eye(3) * 4e-4**2)
+    sharp = stamped(0.0)
+    blurred = replace(sharp, camera=replace(sharp.camera, covariance=np.eye(3) * 4e-4**2))
     assert doubts_of(blurred, stamped(0.0), stamped(20.0)) == pytest.approx([0.0, 0.0, 20.0], rel=1e-6)
 
 
@@ -78,9 +83,9 @@ def test_at_a_pole_a_turn_on_the_spot_is_no_contradiction():
 def test_cleared_nothing_is_held_against_the_next():
     doubt = ClockDoubt()
     for off_s in (0.0, 0.0, 3.0):
-        doubt.add(stamped(off_s), STATED_S)
+        doubt.judge(stamped(off_s), STATED_S)
     doubt.clear()
-    doubt.add(stamped(3.0), STATED_S)
+    doubt.judge(stamped(3.0), STATED_S)
     assert doubt.seconds == 0.0
 
 
@@ -91,8 +96,8 @@ def test_cleared_nothing_is_held_against_the_next():
 def test_one_that_is_off_and_leans_otherwise_has_the_tilts_of_another_time(off_s, metres, otherwise):
     """A fix errs by 100 m; what comes right in time is the inclinometer's, and for the average to judge."""
     doubt = ClockDoubt()
-    doubt.add(stamped(0.0), STATED_S)
-    doubt.add(north_of(stamped(off_s), metres), STATED_S)
+    doubt.judge(stamped(0.0), STATED_S)
+    doubt.judge(north_of(stamped(off_s), metres), STATED_S)
     assert doubt.leans_otherwise is otherwise
-    doubt.add(stamped(0.0), STATED_S)
+    doubt.judge(stamped(0.0), STATED_S)
     assert not doubt.leans_otherwise

@@ -10,6 +10,7 @@ from fixes import T0, fix_at
 
 from starpos.earth.vertical import Deflection
 from starpos.fix.solution import Status
+from starpos.session.driver import Now
 from starpos.session.gnss import GnssComparison
 
 
@@ -33,6 +34,6 @@ def test_a_place_that_cannot_be_is_said_with_its_distance(latitude_deg, seconds,
     answer = SimpleNamespace(fix=fix, status=Status.OK)
     check = GnssComparison()
     assert check.remark(answer, Deflection()) == ""
-    check.take(gnss(latitude_deg, math.degrees(fix.longitude), seconds))
+    check.receive(gnss(latitude_deg, math.degrees(fix.longitude), seconds), Now(None, 0.0))
     remark = check.remark(answer, Deflection())
     assert bool(remark) == said and (not said or "1.78e+06 m" in remark)

@@ -8,7 +8,7 @@ import pytest
 
 from starpos.frames.frame import no_stars
 from starpos.session.driver import JobsInTurn, Now
-from starpos.session.gnss import GNSS_TOPIC, GnssTeacher
+from starpos.session.gnss import GNSS_TOPIC, KEPT_S, GnssTeacher, RecentPlaces
 from starpos.session.settings import Settings
 
 START_S = 1_790_000_000
@@ -53,8 +53,8 @@ def now(seconds=0.0):
 
 
 def test_a_fix_without_an_altitude_is_a_place(teacher):
-    teacher.take(fix(), now())
-    assert teacher.account.taken == 1 and teacher.place_at(START_S) is not None
+    teacher.receive(fix(), now())
+    assert teacher.account.taken == 1 and teacher.places.at(START_S) is not None
 
 
 @pytest.mark.parametrize(
@@ -71,23 +71,38 @@ def test_a_fix_without_an_altitude_is_a_place(teacher):
     ],
 )
 def test_what_tells_no_place_is_a_sentence_and_is_not_kept(teacher, message, said):
-    teacher.take(message, now())
+    teacher.receive(message, now())
     assert len(teacher.account.refused) == 1 and said in teacher.account.refused[0]
-    assert not teacher.account.taken and teacher.place_at(START_S) is None and teacher.learned is None
+    assert not teacher.account.taken and teacher.places.at(START_S) is None and teacher.learned is None
 
 
 def test_stamps_that_go_back_are_refused(teacher):
     for seconds in (0.0, 1.0, 0.5):
-        teacher.take(fix(seconds), now(1.0))
+        teacher.receive(fix(seconds), now(1.0))
     assert teacher.account.taken == 2 and "stamps go back" in teacher.account.refused[0]
+
+
+@pytest.mark.parametrize("rate_hz", [1, 5, 10, 20])
+@pytest.mark.parametrize("exposure_s", [2.0, 30.0, 120.0])
+def test_the_middle_of_an_exposure_has_its_place_whatever_the_receivers_rate(rate_hz, exposure_s):
+    """A fast receiver sends hundreds of fixes until a long exposure is over, read, and has its tilts."""
+    places, late_s = RecentPlaces(), exposure_s / 2 + 5.0
+    until = 1000.0
+    for k in range(round(until * rate_hz)):
+        seconds = k / rate_hz
+        places.receive(fix(seconds, latitude=47.0 + 1e-6 * seconds), now(seconds))
+    place = places.at(START_S + until - late_s)
+    assert math.degrees(place.latitude) == pytest.approx(47.0 + 1e-6 * (until - late_s), abs=1e-8)
+    assert places.at(START_S + 1.0) is None
+    assert len(places) <= 2 * KEPT_S * rate_hz + 1
 
 
 def test_two_receivers_on_one_topic_are_compared_with_nothing(teacher):
     for k in range(6):
-        teacher.take(fix(float(k), latitude=47.0 + NORTH_3_KM * (k % 2)), now(float(k)))
+        teacher.receive(fix(float(k), latitude=47.0 + NORTH_3_KM * (k % 2)), now(float(k)))
     stars = no_stars(100, 100, mid_unix_s=START_S + 2.5)
     rough = SimpleNamespace(fix=None, tilt=None, at_place=None, message="")
     solver = SimpleNamespace(instrument=Settings.of().instrument(None))
-    answer = teacher.solved(solver, stars, rough)
+    answer = teacher.solve(solver, stars, rough)
     assert answer.compared is None and "one receiver publishes, not two" in teacher.account.refused[-1]
     assert teacher.learned is None

@@ -72,7 +72,7 @@ def gyro(said, first, solver):
     """One that has seen the frame, after readings of a second."""
     gyro = Gyro(said)
     tell(gyro, MID_S - 1.0, MID_S)
-    gyro.saw(*first, solver)
+    gyro.learn_from(*first, solver)
     return gyro
 
 
@@ -103,7 +103,7 @@ def test_a_turn_to_the_left_by_the_sky_is_one_by_the_gyro(said, catalogue, rng):
     before, after = (wide_scene(pointing_deg=(azimuth_deg, 89.99, 0.0)) for azimuth_deg in (40.0, 36.0))
     solver, gyro = solver_of(before, catalogue), Gyro(said)
     stars = stars_of(before, catalogue, rng)
-    gyro.saw(stars, solver.identify(stars).found, solver)
+    gyro.learn_from(stars, solver.identify(stars).found, solver)
     tell(gyro, MID_S - 0.01, MID_S + 0.2, (0.0, 0.0, np.radians(20.0)))
     later = stars_of(after, catalogue, rng, START + 0.2)
     assert off_rad(gyro.predicted(later, solver)[0], solver.identify(later).found.attitude) < 1e-3
@@ -122,7 +122,7 @@ def test_a_gap_or_a_time_before_the_readings_gives_none(said, gyro, first, solve
     tell(gyro, MID_S + 0.25, MID_S + 0.4)
     assert not gyro.predicted(frame_at(first[0], 0.4), solver)
     late = Gyro(said)
-    late.saw(*first, solver)
+    late.learn_from(*first, solver)
     tell(late, MID_S + 0.2, MID_S + 0.4)
     assert not late.predicted(frame_at(first[0], 0.4), solver)
     assert not gyro.predicted(frame_at(first[0], -0.1), solver)
@@ -162,7 +162,7 @@ def test_a_clock_that_is_set_back_begins_anew(gyro, said, first, solver):
 def test_recorded_data_have_none(said, first, solver):
     gyro = Gyro(said)
     tell(gyro, MID_S - 1.0, MID_S + 0.4, now=Now.in_data(MID_S))
-    gyro.saw(*first, solver)
+    gyro.learn_from(*first, solver)
     assert not gyro.predicted(frame_at(first[0], 0.4), solver)
 
 
@@ -173,7 +173,7 @@ def test_an_old_attitude_is_of_no_use_until_the_bias_is_known(gyro, first, solve
     later = frame_at(stars, 1.0)
     assert not gyro.predicted(later, solver)
     seen = found.but(attitude=turned(found.attitude, solver, RATE, 1.0))
-    gyro.saw(later, seen, solver)
+    gyro.learn_from(later, seen, solver)
     (prior,) = gyro.predicted(frame_at(stars, 2.0), solver)
     assert off_rad(prior, turned(found.attitude, solver, RATE, 2.0)) < 3e-3 and not said
     tell(gyro, MID_S + 2.0, MID_S + 30.0)
@@ -192,9 +192,9 @@ def test_a_gyro_that_contradicts_the_stars_is_told(said, first, solver, kind):
     stars, found = first
     gyro = Gyro(said)
     tell(gyro, MID_S - 0.1, MID_S + 1.0, WRONG[kind](RATE))
-    gyro.saw(stars, found, solver)
+    gyro.learn_from(stars, found, solver)
     later = found.but(attitude=turned(found.attitude, solver, RATE, 1.0))
-    gyro.saw(frame_at(stars, 1.0), later, solver)
+    gyro.learn_from(frame_at(stars, 1.0), later, solver)
     assert ["off the stars" in sentence for sentence in said] == [True]
 
 
@@ -215,7 +215,7 @@ def test_few_stars_of_a_turning_camera_are_identified_with_the_gyro_and_not_with
         rate = np.array([0.0, 0.0, np.radians(10.0)]) + rng.normal(0, 0.005, 3)
         tell(gyro, start, start + 1.5, lambda t, rate=rate: rate + rng.normal(0, 0.002, 3))
         for stars in frames[:2]:
-            gyro.saw(stars, solver.identify(stars).found, solver)
+            gyro.learn_from(stars, solver.identify(stars).found, solver)
         truth, stars = solver.identify(frames[2]).found, few(frames[2], rng)
         lost += solver.identify(stars).found is not None
         answer = solver.identify(stars, gyro.predicted(stars, solver))
@@ -241,7 +241,7 @@ def test_a_wrong_gyro_costs_no_answer(said, first, solver, catalogue, rng, kind)
     stars, found = first
     gyro = Gyro(said)
     tell(gyro, MID_S - 0.1, MID_S + 0.1, WRONG[kind](RATE))
-    gyro.saw(stars, found, solver)
+    gyro.learn_from(stars, found, solver)
     later = frame_at(stars, 0.1)
     # the camera has stood
     wrong = gyro.predicted(later, solver)

@@ -6,39 +6,14 @@ import pytest
 from fixes import NOISE, T0, fix_at, seen_at, tilt_at
 
 from starpos.errors import TiltError
-from starpos.session.calibrating import MAX_POSES, MAX_TILTS, PoseMemory, RecentFrames, mean_tilt, tilts_of
-
-
-def test_days_of_frames_stay_bounded_and_the_newest_are_kept():
-    recent = RecentFrames(100)
-    for k in range(5000):
-        recent.add(seen_at(10.0 * k))
-    assert len(recent) == 100
-    assert [s.tilt.utc_unix_s - T0 for s in recent.newest(3)] == [49970.0, 49980.0, 49990.0]
-    assert len(recent.newest(1000)) == 100
-
-
-def test_frames_without_stars_are_not_kept():
-    recent = RecentFrames(10)
-    recent.add(seen_at(0.0, stars=0))
-    assert len(recent) == 0
-
-
-def test_fewer_are_kept_from_now_on():
-    recent = RecentFrames(10)
-    for k in range(10):
-        recent.add(seen_at(k))
-    recent.keep(4)
-    assert [s.tilt.utc_unix_s - T0 for s in recent.newest(10)] == [6, 7, 8, 9]
-    recent.add(seen_at(10))
-    assert len(recent) == 4
+from starpos.session.calibrating import MAX_POSES, MAX_TILTS, PoseMemory, mean_tilt, tilts_of
 
 
 def poses_of(*frames) -> PoseMemory:
     """Frames of (seconds, azimuth)."""
     poses = PoseMemory()
     for seconds, azimuth in frames:
-        poses.add(seen_at(seconds), fix_at(seconds, azimuth))
+        poses.keep(seen_at(seconds), fix_at(seconds, azimuth))
     return poses
 
 
@@ -62,9 +37,9 @@ def test_many_frames_of_one_pose_and_many_poses_stay_bounded():
 
 def test_it_is_worth_a_look_at_a_new_pose_and_each_time_its_frames_have_doubled():
     poses = PoseMemory()
-    worth = [poses.add(seen_at(k), fix_at(k)) for k in range(20)]
+    worth = [poses.keep(seen_at(k), fix_at(k)) for k in range(20)]
     assert [k + 1 for k, w in enumerate(worth) if w] == [1, 2, 4, 8, 16]
-    assert poses.add(seen_at(20), fix_at(20, 90.0))
+    assert poses.keep(seen_at(20), fix_at(20, 90.0))
 
 
 def test_one_bad_tilt_does_not_move_a_pose():
@@ -76,7 +51,7 @@ def test_two_tilts_that_contradict_each_other_make_no_pose():
     with pytest.raises(TiltError):
         mean_tilt([tilt_at(0), tilt_at(1, x_deg=1.5)])
     poses = poses_of((0.0, 90.0), (10.0, 40.0))
-    poses.add(seen_at(20.0, x_deg=1.5), fix_at(20.0))
+    poses.keep(seen_at(20.0, x_deg=1.5), fix_at(20.0))
     assert len(poses) == 2 and [s.stars.mid_unix_s - T0 for s in poses.frames()] == [0.0]
 
 

@@ -39,7 +39,7 @@ class Core:
         self.told, self.cost_s = Told("tilt_stddev:=0.0035", *parameters), cost_s
         self.session = self.told.session
         self.session._arrived, self.session._arrived_stars = lambda: self.come(TILT), lambda: self.come(STARS)
-        self.session._answer_to = lambda frame, *_: self.answer(frame)
+        self.session._answer = lambda frame, _: self.answer(frame)
         info, self.begin_s = first(messages, CAMERA_INFO)
         self.stars, self.tilt = first(messages, STARS)[0], first(messages, TILT)[0]
         self.stars.exposure = EXPOSURE_S

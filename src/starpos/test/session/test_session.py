@@ -336,7 +336,7 @@ def test_the_place_of_a_heading_may_be_that_of_gnss(messages, begin_s):
     at_place = answer.solution.at_place
     assert math.degrees(at_place.ellipsoid.heading) == pytest.approx(195.31952, abs=2e-3)
     # the deflection is not known, and GNSS has the place on the ellipsoid
-    assert at_place.ellipsoid.covariance[0, 0] < 0.3 * at_place.plumb.covariance[0, 0]
+    assert at_place.ellipsoid.angles_covariance[0, 0] < 0.3 * at_place.plumb.angles_covariance[0, 0]
     later = deepcopy(stars)
     later.header.stamp.sec += 30
     [answer] = told.tell(STARS, later, came_s + 30.0)
@@ -364,7 +364,42 @@ def test_without_gnss_use_messages_of_gnss_change_no_answer(messages, begin_s):
         if given:
             told.session.receive_gnss(gnss_fix(stars, latitude=10.0), Now.in_data(came_s))
         [answer, *_] = told.tell(STARS, stars, came_s)
-        assert answer.solution.ok and answer.beside is None
+        assert answer.solution.ok and answer.compared is None
         fix = answer.solution.fix
         answers.append((fix.latitude, fix.longitude, fix.covariance.tobytes(), answer.ground.latitude))
     assert answers[0] == answers[1] and told.session.gnss is None
+
+
+@pytest.mark.parametrize(
+    "part, named",
+    [
+        ("gyro.predicted", ""),
+        ("_search.solve", "the solver failed on this frame (RuntimeError: a defect)"),
+        ("doubt.judge", "the solver failed on this frame"),
+        ("gyro.learn_from", ""),
+        ("deflection.include", ""),
+        ("calibrating.include", ""),
+        ("gnss.solve", "what GNSS taught could not be used on this frame"),
+    ],
+)
+def test_a_defect_in_any_part_loses_only_what_that_part_makes(messages, monkeypatch, part, named):
+    """The parts are broken one after another, so that a part without a guard shows."""
+    told = Told(*(("gnss.use:=true",) if part.startswith("gnss") else ()))
+    owner, name = part.split(".") if "." in part else (None, part)
+    of = getattr(told.session, owner)
+    whole, broken = getattr(of, name), iter([True])
+
+    def breaks_once(*arguments, **named):
+        if next(broken, False):
+            raise RuntimeError("a defect")
+        return whole(*arguments, **named)
+
+    monkeypatch.setattr(of, name, breaks_once)
+    answers = []
+    for kind, message, at_s in messages:
+        answers += [a for a in told.tell(kind, message, at_s) if isinstance(a, Answered)]
+        answers += [a for a in told.work(at_s) if isinstance(a, Answered)]
+    first, *others = [a.solution for a in answers]
+    assert len(told.said.errors) == 1 and "RuntimeError: a defect" in told.said.errors[0]
+    assert named in first.message and first.ok == (not named)
+    assert others and all(a.found is not None for a in others)
