@@ -12,6 +12,7 @@ from starpos.earth.vertical import geodetic as geodetic
 from starpos.errors import StarposError as StarposError
 from starpos.fix.fix import Fix as Fix
 from starpos.fix.fix import InDegrees as InDegrees
+from starpos.fix.fix import PlaceFix as PlaceFix
 from starpos.fix.solution import Solution as Solution
 from starpos.fix.solution import Status as Status
 from starpos.fix.solver import Solver as Solver
@@ -29,7 +30,6 @@ from starpos.instrument.tilt_table import read_tilt_csv as read_tilt_csv
 from starpos.navigation.estimate import VoyageFix as VoyageFix
 from starpos.navigation.voyage import Voyage as Voyage
 from starpos.night.night import Night as Night
-from starpos.night.night import ReportedPlace as ReportedPlace
 from starpos.night.night import Shot as Shot
 from starpos.night.opening import NightOnDisk as NightOnDisk
 from starpos.night.opening import open_night as open_night

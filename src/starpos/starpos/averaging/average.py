@@ -26,6 +26,7 @@ MAX_REMEMBERED = 2 * MAX_ROWS
 NEWS = 0.3
 
 
+@at_once
 @dataclass(frozen=True, kw_only=True)
 class Remembered:
     """A fix, or the mean of some that follow each other in a pose.
@@ -89,6 +90,7 @@ def _sigma(terms: Sequence[ErrorTerm]) -> float:
     return float(np.sqrt(sum(np.trace(t.covariance[:2, :2]) for t in terms) / 2)) / EARTH_RADIUS_M
 
 
+@at_once
 @dataclass(frozen=True)
 class Claim:
     """The remembered parts of the fixes of a place, and the result when they were last looked at.

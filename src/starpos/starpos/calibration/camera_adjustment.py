@@ -14,7 +14,8 @@ import numpy as np
 from starpos import rotation
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import CalibrationError
-from starpos.fix.star_fit import distance2, judged
+from starpos.fix.star_fit import MatchedStars, distance2, judged
+from starpos.frozen import at_once
 from starpos.instrument.camera import COEFFICIENTS, EQUIDISTANT, PLUMB_BOB, RATIONAL, Camera
 
 # 1 sigma of the priors about the given camera: relative focal length, fx over fy, principal point (share of the longer
@@ -35,21 +36,17 @@ MAX_ROUNDS, MAX_STEPS, SETTLED = 8, 30, 1e-6
 STEP_RAD = 1e-6
 
 
+@at_once
 @dataclass(frozen=True, kw_only=True)
 class CameraSighting:
-    """The identified stars of one frame.
+    """The identified stars of one frame; their places are apparent directions, aberration included.
 
-    xy (N, 2) in px and covariance_px2 (N, 2, 2): as measured.
-    directions (N, 3): apparent directions, aberration included; direction_sigma (N,): sigma per axis in rad.
-    attitude (3, 3): takes `directions` into C, approximately.
+    attitude (3, 3): takes these directions into C, approximately.
     level (3, 3): takes C into the local level L; None if unknown.
     timed: whether the aberration is computed for the frame's date.
     """
 
-    xy: np.ndarray
-    covariance_px2: np.ndarray
-    directions: np.ndarray
-    direction_sigma: np.ndarray
+    stars: MatchedStars
     attitude: np.ndarray
     level: np.ndarray | None
     timed: bool
@@ -96,6 +93,7 @@ def unknowns(camera: Camera) -> tuple[str, ...]:
     return ("scale", "square", *parameters(camera)[2:], *OF_THE_AIR)
 
 
+@at_once
 @dataclass(frozen=True)
 class CameraEstimate:
     """The unknowns q (U,) and the attitudes (F, 3, 3) of the frames."""
@@ -104,6 +102,7 @@ class CameraEstimate:
     attitudes: np.ndarray
 
 
+@at_once
 @dataclass(frozen=True)
 class SettledCamera:
     """A finished fit: covariance (U, U) of q, mask `keep` (N,) of the stars, variance beyond their errors in px2."""
@@ -114,6 +113,7 @@ class SettledCamera:
     jitter2: float
 
 
+@at_once
 @dataclass(frozen=True, kw_only=True)
 class CameraAdjustment:
     """The least-squares problem: all N stars of all F frames, frame by frame.
@@ -139,9 +139,9 @@ class CameraAdjustment:
     def of(
         cls, sightings: Sequence[CameraSighting], given: Camera, atmosphere: Atmosphere, free: Sequence[str]
     ) -> "CameraAdjustment":
-        sightings = [s for s in sightings if len(s.xy)]
-        counts = [len(s.xy) for s in sightings]
-        direction2 = np.square(np.concatenate([s.direction_sigma for s in sightings]) * given.fx)
+        sightings = [s for s in sightings if len(s.stars.xy)]
+        counts = [len(s.stars.xy) for s in sightings]
+        direction2 = np.square(np.concatenate([s.stars.place_sigma for s in sightings]) * given.fx)
         untimed = any(not s.timed for s in sightings)
         shrink = np.hypot(UNLEVELLED[1] * atmosphere.refraction().a, UNTIMED * untimed)
         side = PRINCIPAL * max(given.width, given.height)
@@ -150,10 +150,10 @@ class CameraAdjustment:
         return cls(
             given=given,
             sigma=np.array([*camera, atmosphere.relative_sigma, shrink, shrink]),
-            xy=np.concatenate([s.xy for s in sightings]),
-            stated=np.concatenate([s.covariance_px2 for s in sightings])
+            xy=np.concatenate([s.stars.xy for s in sightings]),
+            stated=np.concatenate([s.stars.covariance_px2 for s in sightings])
             + np.eye(2) * direction2[:, None, None],
-            places=np.concatenate([s.directions for s in sightings]),
+            places=np.concatenate([s.stars.places for s in sightings]),
             frame=np.repeat(np.arange(len(counts)), counts),
             first=np.cumsum([0, *counts[:-1]]),
             start=np.stack([s.attitude for s in sightings]),

@@ -14,6 +14,7 @@ from starpos.earth.ellipsoid import EARTH_RADIUS_M
 from starpos.errors import FixError
 from starpos.fix.fix import Fix
 from starpos.fix.terms import EACH_POSE
+from starpos.frozen import at_once
 from starpos.instrument.inclinometer import InclinometerErrors
 from starpos.instrument.instrument import UNKNOWN_ARCSEC
 from starpos.instrument.mounting import RESPONSE_COEFFICIENTS, Zeroed, response_columns, stated_variances
@@ -25,6 +26,7 @@ KNOWN = 1e-9
 LEAN_SIGMA = 5.0
 
 
+@at_once
 @dataclass(frozen=True, kw_only=True)
 class Readings:
     """Attitudes and tilts of K frames.
@@ -141,6 +143,7 @@ MAX_STEPS, LONGEST_STEP = 60, 0.5
 SETTLED_CHI2 = 1e-10
 
 
+@at_once
 @dataclass(frozen=True)
 class Linear:
     """A fit about its answer: p holds A3's turns (3) about `turns`, the zenith's moves (2) along `across`, and the
@@ -157,6 +160,7 @@ class Linear:
     across: np.ndarray
 
 
+@at_once
 @dataclass(frozen=True, kw_only=True)
 class PlumbLine:
     """a3 (3, 3) with covariance (3, 3) in rad2 about S's axes, and the zenith (3,) in ITRS with its sigma in rad.
@@ -186,6 +190,7 @@ class PlumbLine:
         return float(np.sqrt(np.linalg.eigvalsh(across @ self.covariance @ across.T)[-1]))
 
 
+@at_once
 @dataclass(frozen=True)
 class PlumbLinePrior:
     """Prior knowledge of the fit: the zenith (3,) or None, its sigma, and the sigma of A3's turn, in rad."""
@@ -214,6 +219,7 @@ def symmetric(covariance: np.ndarray) -> np.ndarray:
     return (covariance + covariance.T) / 2
 
 
+@at_once
 @dataclass(frozen=True, kw_only=True)
 class _Model:
     """What all starts of a fit share, and what each begins with.
@@ -258,6 +264,7 @@ class _Model:
         )
 
 
+@at_once
 @dataclass(frozen=True, kw_only=True)
 class _State:
     """Where T fits stand: a3 (T, 3, 3), up (T, 3) of any length, p (T, n) as in Linear, start (T,): its number."""
@@ -271,6 +278,7 @@ class _State:
         return _State(a3=self.a3[rows], up=self.up[rows], p=self.p[rows], start=self.start[rows])
 
 
+@at_once
 @dataclass(frozen=True, kw_only=True)
 class _Slopes:
     """A linearisation at T states, and what it costs.

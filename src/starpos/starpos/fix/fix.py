@@ -109,6 +109,16 @@ class PlaceFix:
         return covariance
 
     @property
+    def own(self) -> np.ndarray:
+        """Covariance (3, 3) of the errors that are new in each frame, by which the frames differ from each other."""
+        return sum((t.covariance[:3, :3] for t in self.terms if not t.common), np.zeros((3, 3)))
+
+    @property
+    def sigma(self) -> np.ndarray:
+        """Standard deviations (3,) of east m, north m, heading rad."""
+        return np.sqrt(np.diag(self.covariance))
+
+    @property
     def in_degrees(self) -> InDegrees:
         """Place and heading in degrees."""
         return InDegrees.of(self.latitude, self.longitude, self.heading, self.covariance)

@@ -12,6 +12,7 @@ from starpos.earth.ellipsoid import curvature_radii_m
 from starpos.earth.refraction import Atmosphere
 from starpos.earth.vertical import Deflection, Vertical, geodetic
 from starpos.errors import FrameError, InstrumentError, StarposError, TiltError
+from starpos.fix.fix import PlaceFix
 from starpos.fix.solution import FieldPointing, Status
 from starpos.fix.terms import ALWAYS, ErrorTerm
 from starpos.frames.frame import Frame, Stars
@@ -22,7 +23,7 @@ from starpos.messages.camera import message_to_camera
 from starpos.messages.stamp import stamp_to_unix
 from starpos.messages.stars import message_to_stars
 from starpos.messages.tilt import UNUSABLE, message_to_tilt
-from starpos.night.night import NO_TILT, Night, ReportedPlace, Shot, Truth, offset_m, why_none
+from starpos.night.night import NO_TILT, Night, Shot, Truth, offset_m, why_none
 from starpos.night.opening import truth_in
 from starpos.night.reading import Instruments
 from starpos.night.remarks import Kind, Remark
@@ -191,6 +192,18 @@ class _Reading:
         return tuple(said)
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class RecordedPlace(PlaceFix):
+    """A place as messages have it; stated (3, 3): their covariance, of which their terms hold only the variances."""
+
+    stated: np.ndarray
+
+    @property
+    def covariance(self) -> np.ndarray:
+        """Covariance (3, 3) of east m, north m, heading rad."""
+        return self.stated
+
+
 # by the number in Solution.status
 STATUS = (Status.OK, Status.TOO_FEW_STARS, Status.NOT_IDENTIFIED, Status.NO_TILT, Status.TILT_OUT_OF_RANGE,
           Status.TIME_OUTSIDE_TABLES, Status.BAD_INPUT, Status.POOR_FIT)  # fmt: skip
@@ -232,12 +245,12 @@ def shot_of(m: Any, cameras: dict[tuple[int, int], Camera]) -> Shot:
             for t in m.budget
             if t.name != "deflection" and np.isfinite([t.east, t.north, t.heading]).all()
         )
-        place = ReportedPlace(
+        place = RecordedPlace(
             utc_unix_s=utc,
             latitude=float(angles[0]),
             longitude=float(angles[1]),
             heading=full_turn(heading),
-            covariance=covariance,
+            stated=covariance,
             terms=terms,
         )
     elif status is Status.OK:
@@ -364,7 +377,7 @@ def _as_recorded(r: Recorded, atmosphere: Atmosphere, vertical: Vertical) -> Nig
     )
 
 
-def _bound(places: list[ReportedPlace]) -> ReportedPlace:
+def _bound(places: list[PlaceFix]) -> RecordedPlace:
     """The plain mean of places, with the mean of their covariances: an upper bound, whatever their correlation is."""
     seen = np.array([[p.latitude, p.longitude, p.heading] for p in places])
     away = half_turns(seen - seen[0])
@@ -376,11 +389,11 @@ def _bound(places: list[ReportedPlace]) -> ReportedPlace:
         for k, t in enumerate(places[0].terms)
         if all([u.name for u in p.terms] == names for p in places)
     ]
-    return ReportedPlace(
+    return RecordedPlace(
         utc_unix_s=float(np.mean([p.utc_unix_s for p in places])),
         latitude=float(mean[0]),
         longitude=float(half_turns(mean[1])),
         heading=full_turn(mean[2]) if still else float("nan"),
-        covariance=np.mean([p.covariance for p in places], axis=0),
+        stated=np.mean([p.covariance for p in places], axis=0),
         terms=tuple(terms),
     )

@@ -16,6 +16,7 @@ from starpos.errors import StarposError
 from starpos.fix.searching import Sight, of_one_camera
 from starpos.fix.solver import Solver
 from starpos.frames.frame import SATURATED, Stars
+from starpos.frozen import at_once
 from starpos.instrument.inclinometer import up_of
 from starpos.instrument.instrument import Calibration, Instrument
 from starpos.instrument.tilt_log import TiltLog
@@ -63,6 +64,7 @@ class Look:
     todo: str
 
 
+@at_once
 @dataclass(frozen=True)
 class Standing:
     """An identified frame of a still instrument: its sight, up (3,) in S, and ITRS into C (3, 3)."""

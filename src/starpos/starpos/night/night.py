@@ -7,14 +7,12 @@ from html import escape
 
 import numpy as np
 
-from starpos.averaging.average import Average
 from starpos.earth.ellipsoid import curvature_radii_m, enu_axes, zenith_of
 from starpos.earth.refraction import Atmosphere
-from starpos.earth.vertical import Geodetic, Vertical, geodetic
-from starpos.fix.fix import Fix, InDegrees
+from starpos.earth.vertical import Vertical
+from starpos.fix.fix import InDegrees, PlaceFix
 from starpos.fix.heading import AttitudeAtPlace
 from starpos.fix.solution import FieldPointing, Solution, Status
-from starpos.fix.terms import ErrorTerm
 from starpos.frames.frame import Stars
 from starpos.night.remarks import Remark
 from starpos.night.together import WatchedNight
@@ -23,59 +21,6 @@ NO_TILT = (float("nan"), float("nan"))
 NO_STARS = np.zeros((0, 2))
 # maximum number of frames shown in a notebook
 SHOWN = 20
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class ReportedPlace:
-    """Astronomic latitude, longitude and heading (rad), with their errors.
-
-    heading: of the last pose; NaN without a common heading. poses: number of poses that the place comes from.
-    covariance (3, 3): of east m, north m, heading rad, the sum of the `terms`.
-    """
-
-    utc_unix_s: float
-    latitude: float
-    longitude: float
-    heading: float
-    covariance: np.ndarray
-    terms: tuple[ErrorTerm, ...]
-    poses: int = 1
-
-    @classmethod
-    def of(cls, fix: Fix | Average) -> "ReportedPlace":
-        """The place of a fix or an average."""
-        poses = fix.poses if isinstance(fix, Average) else 1
-        return cls(
-            utc_unix_s=fix.utc_unix_s,
-            latitude=fix.latitude,
-            longitude=fix.longitude,
-            heading=fix.heading,
-            covariance=fix.covariance,
-            terms=fix.terms,
-            poses=poses,
-        )
-
-    def __repr__(self) -> str:
-        return f"<{self.in_degrees} (astronomic)>"
-
-    @property
-    def own(self) -> np.ndarray:
-        """Covariance (3, 3) of the errors that are new in each frame, by which the frames differ from each other."""
-        return sum((t.covariance[:3, :3] for t in self.terms if not t.common), np.zeros((3, 3)))
-
-    @property
-    def sigma(self) -> np.ndarray:
-        """Standard deviations (3,) of east m, north m, heading rad."""
-        return np.sqrt(np.diag(self.covariance))
-
-    @property
-    def in_degrees(self) -> InDegrees:
-        """Place and heading in degrees."""
-        return InDegrees.of(self.latitude, self.longitude, self.heading, self.covariance)
-
-    def on_ground(self, vertical: Vertical) -> Geodetic:
-        """The geodetic place, with the deflection of the vertical removed."""
-        return geodetic(self.latitude, self.longitude, self.heading, self.covariance, vertical)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -93,7 +38,7 @@ class Shot:
     status: Status
     message: str
     utc_unix_s: float = float("nan")
-    place: ReportedPlace | None = None
+    place: PlaceFix | None = None
     pointing: FieldPointing | None = None
     size: tuple[int, int] | None = None
     xy: np.ndarray = field(default_factory=lambda: NO_STARS)
@@ -134,7 +79,7 @@ class Shot:
             return shot
         return replace(
             shot,
-            place=ReportedPlace.of(s.fix),
+            place=s.fix,
             residual_px=-s.fix.residual_px,
             residual_arcsec=s.fix.residual_arcsec,
             camera_to_itrs=s.fix.camera.rotation,
@@ -164,7 +109,7 @@ class Truth:
     simulated: bool = False
 
 
-def offset_m(place: ReportedPlace | Truth, latitude: float, longitude: float) -> tuple[float, float]:
+def offset_m(place: PlaceFix | Truth, latitude: float, longitude: float) -> tuple[float, float]:
     """East, north in m of a place from another (rad)."""
     across = enu_axes(latitude, longitude)[:2] @ zenith_of(place.latitude, place.longitude)
     east, north = across * curvature_radii_m(latitude)
@@ -186,7 +131,7 @@ class Night:
     name: str
     origin: str
     shots: Sequence[Shot]
-    combined: ReportedPlace | None
+    combined: PlaceFix | None
     why_not: str
     vertical: Vertical
     atmosphere: Atmosphere
@@ -214,7 +159,7 @@ class Night:
         return [(k, s) for k, s in enumerate(self.shots, 1) if s.place]
 
     @property
-    def places(self) -> list[ReportedPlace]:
+    def places(self) -> list[PlaceFix]:
         """The places of the frames with a fix."""
         return [s.place for s in self.shots if s.place]
 

@@ -10,11 +10,12 @@ import numpy as np
 
 from starpos.earth.orientation import EarthState, earth_state
 from starpos.earth.place import Place
+from starpos.fix.fix import PlaceFix
 from starpos.fix.solution import FieldPointing
 from starpos.gnss.solving import Watched
 from starpos.gnss.watch import GnssStatus
 from starpos.instrument.camera import Camera
-from starpos.night.night import Night, ReportedPlace, Shot
+from starpos.night.night import Night, Shot
 from starpos.report import measures
 from starpos.report.measures import Stability
 from starpos.report.style import BLUE, GREEN, GREY, ORANGE, PURPLE, RED, SKY, figures_of, number_axis, plain
@@ -176,7 +177,7 @@ def _short(value: float) -> str:
     return "0" if value == 0 else figures_of(value, 2) if value >= SMALLEST_SHOWN else f"< {SMALLEST_SHOWN:g}"
 
 
-def _shares(place: ReportedPlace, night: Night) -> dict[str, np.ndarray]:
+def _shares(place: PlaceFix, night: Night) -> dict[str, np.ndarray]:
     """1 sigma (3,) of each source: east m, north m, heading arcsec; the latter is NaN if there is no heading."""
     unit = np.array([1, 1, 1 / measures.ARCSEC])
     shares = {t.name: np.sqrt(np.diag(t.covariance)[:3]) * unit for t in place.terms}

@@ -12,12 +12,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from starpos import __version__
+from starpos.averaging.average import Average
 from starpos.calibration import residual_map
 from starpos.errors import TimeError
-from starpos.fix.fix import length_text
+from starpos.fix.fix import PlaceFix, length_text
 from starpos.gnss.solving import Watched
 from starpos.gnss.watch import GnssStatus
-from starpos.night.night import Night, ReportedPlace, Truth
+from starpos.night.night import Night, Truth
 from starpos.report import coast, measures, night_figures
 from starpos.report.html import document, figures, sexagesimal, table, wide_table
 from starpos.report.style import Picture, figures_of
@@ -234,13 +235,17 @@ def _place(night: Night) -> str:
     ground = c.on_ground(night.vertical)
     facing = "turned between the frames"
     if np.isfinite(c.heading):
-        last = "last " if c.poses > 1 else ""
+        last = "last " if _poses(c) > 1 else ""
         sigma_deg = np.degrees(np.sqrt(ground.covariance[2, 2]))
         facing = f"{last}heading {np.degrees(ground.heading):.4f} &plusmn; {sigma_deg:.4f}&deg;"
     where = f"{_degrees(ground.latitude)}, {_degrees(ground.longitude)}"
     link = f"geo:{np.degrees(ground.latitude):.6f},{np.degrees(ground.longitude):.6f}"
     errors = _errors(ground.covariance)
     return f'<p class="place"><a href="{link}">{where}</a> {errors} (WGS 84, as on maps), {facing}</p>'
+
+
+def _poses(place: PlaceFix) -> int:
+    return place.poses if isinstance(place, Average) else 1
 
 
 def _errors(covariance: np.ndarray) -> str:
@@ -269,7 +274,7 @@ def _summary(night: Night) -> str:
         )
         if np.isfinite(c.heading):
             text = f"{np.degrees(c.heading):.4f} &plusmn; {np.degrees(c.sigma[2]):.4f}&deg; from astronomic north"
-            last = f", of the last of {c.poses} poses" if c.poses > 1 else ""
+            last = f", of the last of {_poses(c)} poses" if _poses(c) > 1 else ""
             rows.append(
                 ("Heading", f"{text}, {np.degrees(ground.heading):.4f}&deg; from true north on WGS 84{last}")
             )
@@ -329,7 +334,7 @@ def _rows_on_fixes(night: Night) -> list[tuple[str, str]]:
     return rows
 
 
-def _error(place: ReportedPlace, truth: Truth) -> str:
+def _error(place: PlaceFix, truth: Truth) -> str:
     east, north = measures.offset_m(place, truth.latitude, truth.longitude)
     latitude, longitude = measures.error_arcsec(place, truth)
     return (
