@@ -16,8 +16,7 @@ from starpos.instrument.instrument import AxisDoubt, Instrument, framed
 from starpos.navigation.records import ImuModel, read_imu, read_imu_model, read_velocity
 from starpos.navigation.sightings import IdentifiedFrame, sighting_of
 from starpos.navigation.vessel import Vessel
-from starpos.navigation.voyage import Voyage
-from starpos.navigation.voyage import navigate as place_under_way
+from starpos.navigation.voyage import Voyage, adjust_voyage
 from starpos.night.reading import First, Instruments, Reader
 from starpos.night.work import Solving
 from starpos.progress import Progress, quiet
@@ -56,7 +55,7 @@ class IdentifyingVoyage:
             return VoyageFrame(time_s, None, str(error))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Records:
     """What a vehicle recorded besides frames: files, and the law by which its speed changes.
 
@@ -108,7 +107,7 @@ class Records:
         velocity = None if self.velocity is None else read_velocity(str(self.velocity))
         times = np.array([np.nan if f.utc_unix_s is None else f.utc_unix_s for f in frames])
         sightings = [f.sighting for f in frames if f.sighting is not None]
-        return place_under_way(sightings, imu, velocity, vessel, times, progress)
+        return adjust_voyage(sightings, imu, velocity, vessel, times, progress)
 
 
 def voyage_frames(
@@ -162,7 +161,7 @@ def navigate(
     if about is None:
         raise VoyageError(f"none of the {len(paths)} frames can be read: give star lists or frames")
     whole, axis = framed(known, about)
-    kept = Records(imu, **records)  # type: ignore[arg-type]
+    kept = Records(imu=imu, **records)  # type: ignore[arg-type]
     vessel, _ = kept.vessel(
         whole, Atmosphere.measured(None, None) if atmosphere is None else atmosphere, axis
     )
