@@ -145,7 +145,7 @@ def _line_of_answer(args: argparse.Namespace, answer: FrameAnswer, place: Place 
         line = line_of(answer.name, s, args.self_calibrate)
     if watched is None or watched.compared is None:
         return line
-    check = watched.compared.check
+    check = watched.compared
     return f"{line}; GNSS {check.status}: {check.sentence}"
 
 
@@ -227,7 +227,7 @@ def json_of_watched(told: Watched) -> dict:
     keys = dict.fromkeys(FIX_KEYS) if fix is None or ground is None else json_on_ground(fix, ground)
     if (at_place := told.solution.at_place) is not None:
         keys = with_heading(keys, at_place, at_place.place)
-    return keys | {"gnss": None if told.compared is None else json_of_check(told.compared.check)}
+    return keys | {"gnss": None if told.compared is None else json_of_check(told.compared)}
 
 
 def json_of_check(check: GnssCheck) -> dict:

@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The search: priors first, then lost in space, from few bright stars to more, from good centroids to poor ones.
 
-If too few stars are detected to decide, look in the frame itself for light where fainter stars should be.
-
-A pose that its stars make likely, but not likely enough, says where the catalogue's other stars are. Each of these places
-is compared with those around it, where a star is as likely to be if the pose is wrong. The evidence is the ratio of the
-probabilities of that comparison. So its mean is at most 1 if the pose is wrong, for any noise of the frame. It looks only
-where nothing was detected, so it multiplies with the evidence of the detections.
+If too few stars are detected to decide, a second look at the frame itself searches for light where fainter stars should
+be. A pose that its stars make likely, but not likely enough, says where the catalogue's other stars are. Each of these
+places is compared with those around it, where a star is as likely to be if the pose is wrong. The evidence is the ratio
+of the probabilities of that comparison. So its mean is at most 1 if the pose is wrong, for any noise of the frame. It
+looks only where nothing was detected, so it multiplies with the evidence of the detections.
 """
 
 import math
@@ -174,7 +173,7 @@ def identifications(
     # only one star is taken from a cell, which leaves less area for the others
     left_px2 = field.area_px2 - 4 * float(field.half.prod()) / 2
     if rows is not None and left_px2 > 0:
-        even, enough = field.take(rows).but(area_px2=left_px2), enough + SECOND_TRY
+        even, enough = field.of_rows(rows).but(area_px2=left_px2), enough + SECOND_TRY
         for found in chain(
             near_or_lost(even, sky, (), STAGES, enough), _crowded(even, sky, (), enough, CELLS**2 // 2)
         ):

@@ -433,7 +433,7 @@ class NoiseTracker:
         # Begin, number of samples, sums.
         self._block: list[float] | None = None
 
-    def add(self, time_s: float, *angles: float) -> None:
+    def add_sample(self, time_s: float, *angles: float) -> None:
         """Take a sample (rad, of two axes or three) at `time_s` of a clock that does not step."""
         block = self._block
         # With the factor, samples that come every 0.1 s are one block each.

@@ -34,8 +34,8 @@ class RecentReadings:
         self._open: list[tuple[float, ...]] = []
         self._blocks: deque[tuple[np.ndarray, ImuLog]] = deque()
 
-    def add(self, row: tuple[float, ...]) -> None:
-        """Take a reading; VoyageError in a sentence if it cannot be used."""
+    def append(self, row: tuple[float, ...]) -> None:
+        """Append a reading; VoyageError in a sentence if it cannot be used."""
         # sums, because they are NaN where one is
         if not (sum(map(abs, row[1:4])) < MAX_RATE and sum(map(abs, row[4:])) < MAX_FORCE):
             raise VoyageError(
