@@ -52,6 +52,7 @@ from starpos.gnss.watch import GnssCheck
 from starpos.instrument import instrument_file
 from starpos.instrument.instrument import Instrument
 from starpos.instrument.tilt_log import NO_TILTS, Tilts
+from starpos.night import field
 from starpos.night.opening import work_of
 from starpos.night.reading import NO_CAMERA, About, First, Instruments
 from starpos.night.remarks import WORTH_SAVING_ARCSEC, Near, of_inclinometer
@@ -66,7 +67,6 @@ from starpos.night.together import (
     turned,
 )
 from starpos.night.work import OnFile, Solving
-from starpos.report import field
 from starpos.sky import catalogue
 from starpos.units import utc_text
 
