@@ -11,7 +11,7 @@ from starpos.frames.frame import Stars
 from starpos.instrument.camera import Camera
 from starpos.instrument.tilt_log import TiltLog
 from starpos.messages.stamp import PlainHeader, PlainStamp
-from starpos.messages.tilt import Reading, TiltMessage
+from starpos.messages.tilt import Reading
 from starpos.recording.bag import BagReader
 from starpos.recording.drivers import IMAGES, DriverMessages, Drivers
 from starpos.recording.topics import CAPTURE, GNSS, IMU, INPUTS, NAV_SAT_FIX, STARS, TILT, instrument_in
@@ -124,7 +124,7 @@ class Replay:
             yield from self.session.at(now)
 
 
-def _tilt_message(log: TiltLog, k: int) -> TiltMessage:
+def _tilt_message(log: TiltLog, k: int) -> Reading:
     """The message of a reading."""
     z, variance_z = (math.nan if c is None else float(c[k]) for c in (log.theta_z, log.variance_z))
     return Reading(
@@ -137,4 +137,5 @@ def _tilt_message(log: TiltLog, k: int) -> TiltMessage:
         flags=0,
         z=z,
         z_variance=variance_z,
-    ).message("inclinometer")
+        frame_id="inclinometer",
+    )
