@@ -10,10 +10,9 @@ from datetime import datetime, timezone
 import numpy as np
 import pytest
 from alpaca_servers import HEIGHT, WIDTH, Liar, Simulator, free_port, image_bytes
-from attempts import SHORT, attempt, in_thread
+from attempts import SHORT, attempt, in_thread, made, values
 from sensor_msgs.msg import Image
 
-from starpos.parameters.table import defaults_of
 from starpos_camera.sources.alpaca import Alpaca
 from starpos_camera.sources.source import CaptureSettings
 from starpos_interfaces.msg import Capture
@@ -25,15 +24,8 @@ LONG = CaptureSettings(6.0, None, 7.0)
 EXPOSING = 2
 
 
-def values(address, **changes):
-    table = defaults_of("camera") | {"source": "alpaca", "alpaca.address": address}
-    return table | {name.replace("__", "."): value for name, value in changes.items()}
-
-
 def make(server, **changes):
-    given = values(server.address, **changes)
-    assert Alpaca.refusal(given, SHORT) is None
-    return Alpaca(given, time.time)
+    return made(values("alpaca", alpaca__address=server.address, **changes))
 
 
 def exposing(source, camera):
@@ -89,7 +81,7 @@ def test_exposure_and_gain_are_set_at_run_time_and_what_cannot_be_is_refused(sim
     assert "its gain is 7, though 6 was set" in exposure.remark
     assert "out of range" in attempt(source, CaptureSettings(0.1, 99.0, 5.0))
     assert "too long" in attempt(source, CaptureSettings(4000.0, None, 5000.0))
-    given = values(simulator.address)
+    given = values("alpaca", alpaca__address=simulator.address)
     assert "whole number" in Alpaca.refusal(given, CaptureSettings(0.1, 1.5, 5.0))
 
 
@@ -148,9 +140,9 @@ def test_a_server_killed_in_mid_exposure_and_back(tmp_path, record_property):
 
 def test_nobody_there_and_addresses_that_are_none():
     require("alpaca")
-    assert "no Alpaca server" in attempt(Alpaca(values(f"127.0.0.1:{free_port()}"), time.time))
+    assert "no Alpaca server" in attempt(made(values("alpaca", alpaca__address=f"127.0.0.1:{free_port()}")))
     for address in ("", "127.0.0.1", "http://127.0.0.1:1", "a@b:1", "::1:1", "host:0", "host:99999"):
-        assert "HOST:PORT" in Alpaca.refusal(values(address), SHORT)
+        assert "HOST:PORT" in Alpaca.refusal(values("alpaca", alpaca__address=address), SHORT)
 
 
 def test_close_ends_an_exposure(simulator):

@@ -11,15 +11,14 @@ import warnings
 from importlib.util import find_spec
 from pathlib import Path
 
+import attempts
 import numpy as np
 import pytest
-from attempts import attempt, in_thread
+from attempts import attempt, in_thread, made
 
-from starpos.parameters.table import defaults_of
 from starpos_camera.sources import aravis as source_module
 from starpos_camera.sources.aravis import (
     FORMATS,
-    Aravis,
     AravisCamera,
     ClockRelation,
     FrameTimes,
@@ -39,8 +38,7 @@ DEBIAN = Path("/usr/lib/python3/dist-packages/gi")
 
 
 def values(**changes):
-    table = defaults_of("camera") | {"source": "aravis"}
-    return table | {f"aravis.{name}": value for name, value in changes.items()}
+    return attempts.values("aravis", **{f"aravis.{name}": value for name, value in changes.items()})
 
 
 @pytest.fixture(scope="module")
@@ -72,16 +70,14 @@ def fake(tmp_path_factory):
 
 @pytest.fixture
 def make(fake):
-    made = []
+    sources = []
 
-    def one(**changes):
-        given = values(**{"region_as_set": True} | changes)
-        assert Aravis.refusal(given, SHORT) is None
-        made.append(Aravis(given, time.time))
-        return made[-1]
+    def make(**changes):
+        sources.append(made(values(**{"region_as_set": True} | changes), SHORT))
+        return sources[-1]
 
-    yield one
-    for source in made:
+    yield make
+    for source in sources:
         source.close()
 
 

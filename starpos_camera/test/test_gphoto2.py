@@ -10,10 +10,9 @@ from types import SimpleNamespace
 import cv2
 import numpy as np
 import pytest
-from attempts import SHORT, attempt, in_thread
+from attempts import SHORT, attempt, in_thread, made, values
 from sensor_msgs.msg import Image
 
-from starpos.parameters.table import defaults_of
 from starpos_camera.sources import gphoto2 as gphoto2_source
 from starpos_camera.sources.gphoto2 import RAW_ALONE, Gphoto2, named_off_s, nearest, seconds, sentence
 from starpos_camera.sources.source import CaptureError, CaptureSettings
@@ -68,19 +67,12 @@ def folder(tmp_path, monkeypatch):
     return Folder(tmp_path, monkeypatch)
 
 
-def values(**changes):
-    table = defaults_of("camera") | {"source": "gphoto2"}
-    return table | {name.replace("__", "."): value for name, value in changes.items()}
-
-
 @pytest.fixture
 def make(folder):
     sources = []
 
     def make(**changes):
-        given = values(**changes)
-        assert Gphoto2.refusal(given, SHORT) is None
-        sources.append(Gphoto2(given, time.time))
+        sources.append(made(values("gphoto2", **changes)))
         return sources[-1]
 
     yield make
@@ -270,7 +262,7 @@ def test_the_node_takes_frames_and_says_when_the_camera_is_gone(folder, start, l
 
 def test_what_is_refused_before_a_camera_is_looked_for():
     require("gphoto2")
-    assert "longer than `cadence`" in Gphoto2.refusal(values(), CaptureSettings(6.0, None, 5.0))
+    assert "longer than `cadence`" in Gphoto2.refusal(values("gphoto2"), CaptureSettings(6.0, None, 5.0))
 
 
 def test_a_camera_that_another_program_holds_is_said(folder):

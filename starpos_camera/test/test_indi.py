@@ -9,10 +9,9 @@ import time
 import numpy as np
 import pytest
 from astropy.io import fits
-from attempts import SHORT, in_thread
+from attempts import SHORT, in_thread, made, values
 from indi_servers import DEVICE, IndiServer, OtherClient, executable_liar
 
-from starpos.parameters.table import defaults_of
 from starpos_camera.sources import timing
 from starpos_camera.sources.indi import Indi
 from starpos_camera.sources.source import CaptureError, CaptureSettings
@@ -26,14 +25,7 @@ SIZE = (1024, 1280)
 
 
 def make(server, **changes):
-    values = defaults_of("camera") | {
-        "source": "indi",
-        "indi.port": server.port,
-        "indi.device": DEVICE,
-    }
-    values |= {name.replace("__", "."): value for name, value in changes.items()}
-    assert Indi.refusal(values, SHORT) is None
-    return Indi(values, time.time)
+    return made(values("indi", **{"indi__port": server.port, "indi__device": DEVICE} | changes))
 
 
 def sentence(source, settings=SHORT) -> str:
@@ -128,7 +120,7 @@ def test_what_another_client_has_set_does_not_stay(source, other):
     # All that was set before is there.
     assert server.run(heard)
     assert source.capture(SHORT).frame.pixels.shape == SIZE
-    source.update(defaults_of("camera") | {"indi.binning": 2})
+    source.update(values("indi", indi__binning=2))
     assert source.capture(SHORT).frame.pixels.shape == (SIZE[0] // 2, SIZE[1] // 2)
 
 
@@ -233,8 +225,7 @@ def test_a_frame_that_does_not_come_in_time_is_given_up(server, source, other):
 
 
 def test_a_camera_is_named_and_one_that_is_not_there_said(server):
-    values = defaults_of("camera")
-    assert "indi.device must name the camera" in Indi.refusal(values, SHORT)
+    assert "indi.device must name the camera" in Indi.refusal(values("indi"), SHORT)
     source = make(server, indi__device="Canon")
     assert f"the server has {DEVICE}: start the camera's driver" in sentence(source)
     source.close()

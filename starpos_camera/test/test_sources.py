@@ -1,14 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Frame sources by themselves."""
 
+import attempts
 import cv2
 import numpy as np
 import pytest
+from attempts import made
 
 from starpos.detection import detect
 from starpos.errors import FrameError
 from starpos.frames.exposure import UNKNOWN_LATENCY_S
-from starpos.parameters.table import defaults_of
 from starpos.simulation.scene import expose
 from starpos.sky.catalogue import load_catalogue
 from starpos_camera.sources.registry import SOURCES
@@ -21,26 +22,16 @@ NOW_S = 1793642400.0
 SETTINGS = CaptureSettings(None, None, 5.0)
 
 
-def values(**changes):
-    table = defaults_of("camera")
-    return table | {name.replace("__", "."): value for name, value in changes.items()}
+def values(source="files", **changes):
+    return attempts.values(source, **changes)
 
 
 def make(**changes):
-    v = values(**changes)
-    assert SOURCES[v["source"]].refusal(v, SETTINGS) is None
-    return SOURCES[v["source"]](v, lambda: NOW_S)
+    return made(values(**changes), SETTINGS, lambda: NOW_S)
 
 
 def play(source, count):
-    """What each of `count` calls gave: the file's name and its time, or the error."""
-    out = []
-    for _ in range(count):
-        try:
-            out.append(source.capture(SETTINGS))
-        except (FrameError, SourceEnded) as error:
-            out.append(error)
-    return out
+    return attempts.play(source, count, SETTINGS)
 
 
 def test_files_in_order_with_a_truncated_one_between(folder):

@@ -3,16 +3,16 @@
 
 import math
 import struct
-import time
 
+import attempts
 import cv2
 import numpy as np
 import pytest
+from attempts import made
 from sensor_msgs.msg import Image
 
 from starpos.errors import FrameError
-from starpos.parameters.table import defaults_of
-from starpos_camera.sources.source import CaptureError, CaptureSettings, SourceEnded
+from starpos_camera.sources.source import CaptureSettings, SourceEnded
 from starpos_camera.sources.video import Video
 from starpos_interfaces.msg import Capture
 
@@ -46,27 +46,15 @@ def film(tmp_path):
 
 
 def values(path, **changes):
-    table = defaults_of("camera") | {"source": "video", "video.device": str(path)}
-    return (
-        table | {"video.start": START} | {name.replace("__", "."): value for name, value in changes.items()}
-    )
+    return attempts.values("video", **{"video__device": str(path), "video__start": START} | changes)
 
 
 def make(path, **changes):
-    given = values(path, **changes)
-    assert Video.refusal(given, SETTINGS) is None
-    return Video(given, time.time)
+    return made(values(path, **changes), SETTINGS)
 
 
 def play(source, count):
-    """What each of `count` calls gave: an exposure, or its error."""
-    out = []
-    for _ in range(count):
-        try:
-            out.append(source.capture(SETTINGS))
-        except (FrameError, CaptureError, SourceEnded) as error:
-            out.append(error)
-    return out
+    return attempts.play(source, count, SETTINGS)
 
 
 def test_every_frame_as_it_was_written_at_the_time_of_its_place(film):

@@ -9,11 +9,12 @@ import time
 import tracemalloc
 from pathlib import Path
 
+import attempts
 import pytest
+from attempts import made
 from sensor_msgs.msg import Image
 
 from starpos.errors import FrameError, StarposError
-from starpos.parameters.table import defaults_of
 from starpos.simulation.scene import write_fits
 from starpos_camera.sources import files
 from starpos_camera.sources.files import IDLE_S, MAX_LOOKED_AT, PATIENCE, Files, WatchedFolder
@@ -251,14 +252,11 @@ def test_of_a_file_that_came_and_went_nothing_is_kept(watch):
 
 
 def values(path, **changes):
-    table = defaults_of("camera") | {"files.path": str(path), "files.watch": True}
-    return table | {name.replace("__", "."): value for name, value in changes.items()}
+    return attempts.values("files", files__path=str(path), files__watch=True, **changes)
 
 
 def make(path, **changes):
-    given = values(path, **changes)
-    assert Files.refusal(given, SETTINGS) is None
-    return Files(given, time.time)
+    return made(values(path, **changes), SETTINGS)
 
 
 def until_something(source):

@@ -54,7 +54,7 @@ class NavigatorPublishers:
         self._fix.publish(outputs.nav_sat_fix(header, output.ground, *altitude))
         if output.fix is None or output.ground is None:
             return
-        self._heading.publish(outputs.imu(header, output.fix, output.ground))
+        self._heading.publish(outputs.imu(header, output.fix.link, output.ground))
         if output.position is None:
             return
         start = Header(stamp=header.stamp, frame_id=self._values["odometry_frame_id"])
@@ -67,13 +67,13 @@ def odometry(header: Header, child: str, fix: VoyageFix, ground: Geodetic, posit
     """Make the Odometry: pose in the frame of the header, ENU; velocity along the axes of the child's."""
     message = Odometry(header=header, child_frame_id=child)
     message.pose.pose.position = Point(**dict(zip("xyz", position.enu.tolist(), strict=True)))
-    message.pose.pose.orientation, turn = outputs.attitude(fix, ground)
+    message.pose.pose.orientation, turn = outputs.attitude(fix.link, ground)
     pose, twist = np.zeros((2, 6, 6))
     pose[:3, :3], pose[3:, 3:] = position.covariance, turn
     message.pose.covariance = pose.ravel()
-    velocity = fix.link_to_enu.T @ fix.velocity
+    velocity = fix.link.rotation.T @ fix.velocity
     message.twist.twist.linear = Vector3(**dict(zip("xyz", velocity.tolist(), strict=True)))
-    twist[:3, :3] = fix.link_to_enu.T @ fix.velocity_covariance @ fix.link_to_enu
+    twist[:3, :3] = fix.link.rotation.T @ fix.velocity_covariance @ fix.link.rotation
     # rates are the IMU's own
     twist[3, 3] = -1.0
     message.twist.covariance = twist.ravel()

@@ -2,7 +2,6 @@
 """Messages of a solution: NavSatFix, Imu, Solution."""
 
 import math
-from typing import Protocol
 
 import numpy as np
 from geometry_msgs.msg import Quaternion
@@ -11,6 +10,7 @@ from std_msgs.msg import Header
 
 from starpos import rotation
 from starpos.earth.vertical import Geodetic
+from starpos.fix.attitude import Attitude
 from starpos.fix.fix import Fix
 from starpos.fix.heading import AttitudeAtPlace
 from starpos.fix.solution import Solution, Status
@@ -65,23 +65,13 @@ def nav_sat_fix(
     return message
 
 
-class Oriented(Protocol):
-    """A fix with an attitude: (3, 3) of the base link into east, north, up, its covariance (3, 3) about these."""
-
-    @property
-    def link_to_enu(self) -> np.ndarray: ...
-
-    @property
-    def attitude_covariance(self) -> np.ndarray: ...
-
-
-def attitude(fix: Oriented, ground: Geodetic) -> tuple[Quaternion, np.ndarray]:
+def attitude(link: Attitude, ground: Geodetic) -> tuple[Quaternion, np.ndarray]:
     """The attitude of the base link in true-north ENU, and its covariance (3, 3)."""
     # Azimuths grow clockwise.
     to_geodetic_north = rotation.about_axis(2, -ground.azimuth_turn)
-    covariance = to_geodetic_north @ fix.attitude_covariance @ to_geodetic_north.T
+    covariance = to_geodetic_north @ link.covariance @ to_geodetic_north.T
     covariance[2, 2] += ground.deflection_covariance[2, 2]
-    return _quaternion(to_geodetic_north @ fix.link_to_enu), covariance
+    return _quaternion(to_geodetic_north @ link.rotation), covariance
 
 
 def _quaternion(turn: np.ndarray) -> Quaternion:
@@ -89,14 +79,14 @@ def _quaternion(turn: np.ndarray) -> Quaternion:
     return Quaternion(x=x, y=y, z=z, w=w)
 
 
-def imu(header: Header, fix: Oriented, ground: Geodetic) -> Imu:
+def imu(header: Header, link: Attitude, ground: Geodetic) -> Imu:
     """Make the attitude of the base link in true-north ENU; rates and accelerations are not measured."""
-    return _imu(header, *attitude(fix, ground))
+    return _imu(header, *attitude(link, ground))
 
 
-def imu_at_place(header: Header, link: Oriented) -> Imu:
+def imu_at_place(header: Header, link: Attitude) -> Imu:
     """Make the same of an attitude that is in true-north ENU already."""
-    return _imu(header, _quaternion(link.link_to_enu), link.attitude_covariance)
+    return _imu(header, _quaternion(link.rotation), link.covariance)
 
 
 def _imu(header: Header, orientation: Quaternion, covariance: np.ndarray) -> Imu:
@@ -115,7 +105,7 @@ def solution(header: Header, answer: Solution, ground: Geodetic | None) -> msg.S
     message.indices = [] if answer.star is None else answer.star.tolist()
     message.magnitudes = [] if answer.magnitudes is None else answer.magnitudes.tolist()
     message.identify_seconds, message.fix_seconds = answer.identify_s, answer.fix_s
-    a, fix = answer.attitude, answer.fix
+    a, fix = answer.pointing, answer.fix
     message.right_ascension, message.declination, message.roll = (
         (math.degrees(v) for v in (a.ra, a.dec, a.roll)) if a else (NAN,) * 3
     )
@@ -192,7 +182,7 @@ def _add_heading(message: msg.Solution, at_place: AttitudeAtPlace) -> None:
 def _set_heading(message: msg.Solution, at_place: AttitudeAtPlace) -> None:
     link = at_place.true_north
     message.heading = math.degrees(link.heading)
-    message.heading_stddev = math.degrees(math.sqrt(link.covariance[0, 0]))
+    message.heading_stddev = math.degrees(math.sqrt(link.angles_covariance[0, 0]))
 
 
 def _add_corrections(message: msg.Solution, applied: Fix | AttitudeAtPlace) -> None:

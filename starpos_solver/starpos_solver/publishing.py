@@ -193,7 +193,7 @@ class SolutionPublishers:
         if at_place is not None:
             self._imu.publish(outputs.imu_at_place(header, at_place.true_north))
         elif fix is not None and output.ground is not None:
-            self._imu.publish(outputs.imu(header, fix, output.ground))
+            self._imu.publish(outputs.imu(header, fix.link, output.ground))
         if self._check is not None and output.compared is not None:
             self._check.publish(outputs.gnss_check(header, output.compared))
         if output.attitude is not None:

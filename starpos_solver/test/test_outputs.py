@@ -11,10 +11,12 @@ from std_msgs.msg import Header
 
 from starpos.earth.place import Place
 from starpos.earth.vertical import Deflection
-from starpos.fix.budget import ErrorTerm, heading_of, heading_row
+from starpos.fix.attitude import CAMERA, ITRS, Attitude, heading_of, heading_row
+from starpos.fix.budget import link_attitude
 from starpos.fix.fix import Fix
-from starpos.fix.heading import AttitudeAtPlace, LinkAttitude
+from starpos.fix.heading import AttitudeAtPlace
 from starpos.fix.solution import Solution, Status
+from starpos.fix.terms import ErrorTerm
 from starpos.session.frames import ground_of
 from starpos_interfaces import msg
 from starpos_solver import outputs
@@ -46,8 +48,7 @@ def fix_facing(azimuth_deg: float, latitude_deg: float = 40.0) -> Fix:
         refraction_arcsec=12.0,
         diurnal_aberration_arcsec=0.3,
         ut1_minus_utc_s=-0.05,
-        camera_to_itrs=np.eye(3),
-        camera_covariance=1e-6,
+        camera=Attitude(np.eye(3), np.eye(3) * 1e-6, of=CAMERA, into=ITRS),
     )
 
 
@@ -68,7 +69,7 @@ def answer_facing(azimuth_deg: float) -> Solution:
 @pytest.mark.parametrize(("azimuth", "yaw"), [(0, 90), (90, 0), (180, -90), (270, 180), (45, 45)])
 def test_yaw_is_counterclockwise_from_east(azimuth, yaw):
     answer = answer_facing(azimuth)
-    message = outputs.imu(Header(), answer.fix, ground_of(answer.fix, EXACT))
+    message = outputs.imu(Header(), answer.fix.link, ground_of(answer.fix, EXACT))
     assert (yaw_deg(message) - yaw + 180) % 360 - 180 == pytest.approx(0, abs=1e-9)
 
 
@@ -99,7 +100,7 @@ def test_what_is_suspicious_about_the_identification_is_named():
 
 def test_rates_and_accelerations_are_declared_unmeasured():
     answer = answer_facing(10.0)
-    message = outputs.imu(Header(), answer.fix, ground_of(answer.fix, EXACT))
+    message = outputs.imu(Header(), answer.fix.link, ground_of(answer.fix, EXACT))
     assert message.angular_velocity_covariance[0] == -1.0
     assert message.linear_acceleration_covariance[0] == -1.0
     assert np.all(np.linalg.eigvalsh(np.array(message.orientation_covariance).reshape(3, 3)) > 0)
@@ -137,8 +138,8 @@ def test_the_deflection_of_the_vertical_moves_and_widens_fix_and_heading():
     assert ground.covariance[0, 0] - plain.covariance[0, 0] == pytest.approx(
         (5 * arcsec * 6.387e6) ** 2, rel=1e-2
     )
-    turned = yaw_deg(outputs.imu(Header(), answer.fix, ground)) - yaw_deg(
-        outputs.imu(Header(), answer.fix, plain)
+    turned = yaw_deg(outputs.imu(Header(), answer.fix.link, ground)) - yaw_deg(
+        outputs.imu(Header(), answer.fix.link, plain)
     )
     # azimuth = A - eta tan(phi): a smaller azimuth is a larger yaw
     assert turned * 3600 == pytest.approx(-20.0 * math.tan(ground.latitude), rel=1e-3)
@@ -194,7 +195,7 @@ def at_place_facing(azimuth_deg: float, **places) -> AttitudeAtPlace:
     fix = fix_facing(azimuth_deg)
     heading = heading_row(fix.link_to_enu)
     term = ErrorTerm("centroids", np.vstack([np.zeros((2, 3)), heading, np.eye(3)]) * 1e-4)
-    link = LinkAttitude(link_to_enu=fix.link_to_enu, terms=(term,))
+    link = link_attitude(fix.link_to_enu, (term,))
     shared = {f.name: getattr(fix, f.name) for f in fields(AttitudeAtPlace) if hasattr(fix, f.name)}
     where = Place.on_ellipsoid(40.0, 57.0, EXACT)
     return AttitudeAtPlace(**shared, place=where, plumb=link, ellipsoid=link, true_north=link)

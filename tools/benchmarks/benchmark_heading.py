@@ -18,7 +18,7 @@ import numpy as np
 from starpos.earth.ellipsoid import curvature_radii_m, enu_axes
 from starpos.earth.place import Place
 from starpos.earth.vertical import UNKNOWN_STDDEV_ARCSEC, Deflection, geodetic
-from starpos.fix.budget import heading_of
+from starpos.fix.attitude import heading_of
 from starpos.fix.solver import Solver, placed
 from starpos.instrument.camera import Camera
 from starpos.rotation import half_turns
@@ -95,7 +95,7 @@ def headings(task: tuple[Case, np.random.SeedSequence]) -> np.ndarray | str:
     off = half_turns(
         np.array([a.heading - heading_of(t) for a, t in zip(found, (on_ground, link), strict=True)])
     )
-    return np.array([off, [np.sqrt(a.covariance[0, 0]) for a in found]]) / ARCSEC
+    return np.array([off, [np.sqrt(a.angles_covariance[0, 0]) for a in found]]) / ARCSEC
 
 
 def options(parser) -> None:

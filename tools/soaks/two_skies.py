@@ -81,8 +81,8 @@ def run(args) -> int:
         stars, camera, centres, kind = two_skies(catalogue, args.seed, number)
         s = Solver(Instrument(camera.fx), catalogue).identify(stars)
         verdict = "none"
-        if s.attitude is not None:
-            ra, dec = s.attitude.ra, s.attitude.dec
+        if s.pointing is not None:
+            ra, dec = s.pointing.ra, s.pointing.dec
             centre = np.array([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])
             # stars of both that coincide draw the pose of one towards the other
             allowed = max(NEAR_PX, NEAR_SIGMA * float(np.median(stars.sigma))) / camera.fx
@@ -91,7 +91,7 @@ def run(args) -> int:
             if verdict == "wrong":
                 away = min(np.linalg.norm(centre - c) for c in centres) * camera.fx
                 about = f"{len(s.names)} of {len(stars)} stars, {away:.1f} px off"
-                print(f"BAD {stars.source}: {about}, log-odds {s.attitude.log_odds:.0f}", flush=True)
+                print(f"BAD {stars.source}: {about}, log-odds {s.pointing.log_odds:.0f}", flush=True)
         tally.setdefault(kind, Counter())[verdict] += 1
         progress.at(number - args.first + 1, json.dumps(sum(tally.values(), Counter())))
     for kind, counts in sorted(tally.items()):

@@ -44,7 +44,7 @@ _HOMES = {
     "Night": "night.night",
     "NightOnDisk": "night.opening",
     "Place": "earth.place",
-    "ReportedPlace": "night.night",
+    "PlaceFix": "fix.fix",
     "Shot": "night.night",
     "Site": "sky.site",
     "Solution": "fix.solution",

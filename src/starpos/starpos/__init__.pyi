@@ -2,6 +2,7 @@
 from starpos.averaging.average import Average as Average
 from starpos.averaging.average import average as average
 from starpos.calibration.misalignment import calibrate_at as calibrate_at
+from starpos.calibration.misalignment import turn as turn
 from starpos.detection import Detection as Detection
 from starpos.detection import detect as detect
 from starpos.earth.place import Place as Place
@@ -10,10 +11,13 @@ from starpos.earth.vertical import Deflection as Deflection
 from starpos.earth.vertical import geodetic as geodetic
 from starpos.errors import StarposError as StarposError
 from starpos.fix.fix import Fix as Fix
+from starpos.fix.fix import InDegrees as InDegrees
+from starpos.fix.fix import PlaceFix as PlaceFix
 from starpos.fix.solution import Solution as Solution
 from starpos.fix.solution import Status as Status
 from starpos.fix.solver import Solver as Solver
 from starpos.frames.frame import Frame as Frame
+from starpos.frames.frame import Stars as Stars
 from starpos.frames.reading import read_frame as read_frame
 from starpos.instrument.camera import Camera as Camera
 from starpos.instrument.inclinometer import Tilt as Tilt
@@ -22,7 +26,6 @@ from starpos.instrument.instrument import Instrument as Instrument
 from starpos.instrument.tilt_log import TiltLog as TiltLog
 from starpos.instrument.tilt_table import read_tilt_csv as read_tilt_csv
 from starpos.night.night import Night as Night
-from starpos.night.night import ReportedPlace as ReportedPlace
 from starpos.night.night import Shot as Shot
 from starpos.night.opening import NightOnDisk as NightOnDisk
 from starpos.night.opening import open_night as open_night

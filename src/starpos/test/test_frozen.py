@@ -1,8 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Frozen dataclasses that set all fields at once are dataclasses like others."""
 
+import contextlib
+import importlib
+import importlib.util
 import inspect
-from dataclasses import KW_ONLY, FrozenInstanceError, dataclass, field, replace
+import pkgutil
+import sys
+from dataclasses import KW_ONLY, FrozenInstanceError, dataclass, field, fields, is_dataclass, replace
 
 import numpy as np
 import pytest
@@ -99,3 +104,46 @@ def test_what_holds_an_array_has_no_hash():
     with pytest.raises(TypeError, match="unhashable"):
         hash(Held("a", np.zeros(2)))
     assert hash(Quick(1, third=3.0)) == hash(Quick(1, third=3.0))
+
+
+PACKAGES = "starpos", "starpos_common", "starpos_camera", "starpos_inclinometer", "starpos_solver"
+
+
+def dataclasses_with_arrays() -> list[type]:
+    """All dataclasses of the product with a field that is an array, of modules that can be imported here."""
+    found = []
+    for name in PACKAGES:
+        if importlib.util.find_spec(name) is None:
+            continue
+        package = importlib.import_module(name)
+        for module in pkgutil.walk_packages(package.__path__, f"{name}."):
+            # what needs ROS, or a camera's library, is not everywhere
+            with contextlib.suppress(ImportError):
+                if not module.name.endswith("__main__"):
+                    importlib.import_module(module.name)
+        made = [m for n, m in sys.modules.items() if n.partition(".")[0] == name]
+        found += [
+            k for m in made for k in vars(m).values() if isinstance(k, type) and k.__module__ == m.__name__
+        ]
+    return [k for k in found if is_dataclass(k) and any("ndarray" in str(f.type) for f in fields(k))]
+
+
+def instance(cls: type, first: float) -> object:
+    """One that holds arrays, which begin with a number, where it has arrays."""
+    made = object.__new__(cls)
+    for f in fields(cls):
+        value = np.array([first, np.nan, 2.0]) if "ndarray" in str(f.type) else f.name
+        object.__setattr__(made, f.name, value)
+    return made
+
+
+def test_every_dataclass_with_an_array_compares_by_value_or_has_no_comparison():
+    every = dataclasses_with_arrays()
+    assert len(every) > 100
+    for cls in every:
+        one, other = instance(cls, 1.0), instance(cls, 1.0)
+        if cls.__eq__ is object.__eq__:
+            assert one != other and hash(one) == hash(one)
+            continue
+        assert one == other and one != instance(cls, 3.0), cls
+        assert cls.__hash__ is None, cls

@@ -11,6 +11,7 @@ import numpy as np
 
 from starpos.earth.ellipsoid import curvature_radii_m, enu_axes
 from starpos.earth.place import Place
+from starpos.fix.attitude import CAMERA, ITRS, Attitude
 from starpos.gnss.filter import LevelSight
 from starpos.gnss.receiver import gnss_place
 from starpos.instrument.inclinometer import InclinometerErrors, Tilt
@@ -111,8 +112,7 @@ class GnssDrive:
                 yield DriveFrame(
                     LevelSight(
                         utc_unix_s=1.7e9 + t,
-                        camera_to_itrs=seen,
-                        camera_covariance=np.eye(3) * STARS_RAD**2,
+                        camera=Attitude(seen, np.eye(3) * STARS_RAD**2, of=CAMERA, into=ITRS),
                         tilt=tilt,
                         zenith_covariance=np.eye(3) * STARS_RAD**2,
                         latitude=latitude,

@@ -16,8 +16,10 @@ from starpos.earth.ellipsoid import curvature_radii_m
 from starpos.earth.orientation import EarthState, station_velocity
 from starpos.earth.refraction import MIN_COS_ZENITH, Atmosphere
 from starpos.errors import FixError
-from starpos.fix.budget import ALWAYS, EACH_POSE, ErrorTerm, tilt_terms, time_terms
+from starpos.fix.budget import tilt_terms, time_terms
+from starpos.fix.terms import ALWAYS, EACH_POSE, ErrorTerm
 from starpos.frames.tables import Pointing
+from starpos.frozen import at_once
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import Tilt
 from starpos.instrument.instrument import UNKNOWN_ARCSEC, Calibration
@@ -46,6 +48,7 @@ WITHIN = 0.95
 CONTRADICT_SIGMA = 5.0
 
 
+@at_once
 @dataclass(frozen=True, kw_only=True)
 class Circle:
     """A circle of equal altitude.
@@ -125,6 +128,7 @@ def place_of_circles(circles: Sequence[Circle], near: tuple[float, float] | None
     return _average(part, _answer(part, near), len(circles))
 
 
+@at_once
 @dataclass(frozen=True)
 class Directions:
     """D directions: the circles of each, and by source the covariance (D, D) in rad2 of their mean zenith distances."""
@@ -224,6 +228,7 @@ def _mean_variance(terms: list[ErrorTerm]) -> float:
     return float(np.mean([v * len(k) for v, k in zip(each, keys, strict=True)])) / max(different, 1)
 
 
+@at_once
 @dataclass(frozen=True)
 class _Answer:
     """A zenith (3,), the gain (2, D) of the fit there and its chi-square."""
@@ -414,6 +419,7 @@ OF_A3 = "calibration"
 CirclesOf = Callable[[np.ndarray], Sequence[Circle]]
 
 
+@at_once
 @dataclass(frozen=True, kw_only=True)
 class FoundAxis:
     """A3 whose axis the elevations determined.
@@ -531,6 +537,7 @@ def _slope(circle: Circle, across: np.ndarray) -> np.ndarray:
     return -(across @ circle.up) / max(np.sin(circle.zenith_distance), 1e-9)
 
 
+@at_once
 @dataclass(frozen=True, kw_only=True)
 class _Normal:
     """The least-squares problem at an A3 (3, 3) and a zenith (3,): its unknowns are the axis, and perhaps the zenith."""

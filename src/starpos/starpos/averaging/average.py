@@ -14,8 +14,9 @@ from starpos.averaging.poses import poses_of, slip_s
 from starpos.averaging.scatter import MAX_ROWS, Frames, Scatter, scatter_of
 from starpos.earth.ellipsoid import EARTH_RADIUS_M, zenith_of
 from starpos.errors import FixError
-from starpos.fix.budget import EACH_POSE, ErrorTerm, total_covariance
-from starpos.fix.fix import Fix, InDegrees
+from starpos.fix.fix import Fix, PlaceFix
+from starpos.fix.terms import EACH_POSE, ErrorTerm
+from starpos.frozen import at_once
 
 # sigma of a place in rad before anything is known of it
 ANYWHERE_RAD = np.pi
@@ -25,6 +26,7 @@ MAX_REMEMBERED = 2 * MAX_ROWS
 NEWS = 0.3
 
 
+@at_once
 @dataclass(frozen=True, kw_only=True)
 class Remembered:
     """A fix, or the mean of some that follow each other in a pose.
@@ -62,8 +64,8 @@ class Remembered:
             utc_unix_s=f.utc_unix_s,
             pose=pose,
             fixes=1,
-            attitude=f.camera_to_itrs.T,
-            up=f.camera_to_itrs.T @ zenith_of(f.latitude, f.longitude),
+            attitude=f.camera.rotation.T,
+            up=f.camera.rotation.T @ zenith_of(f.latitude, f.longitude),
             place=plane.seen(f)[:2],
             to_rad=np.linalg.inv(turn @ f.levelling[:3]),
             shared=np.hstack(factors),
@@ -88,6 +90,7 @@ def _sigma(terms: Sequence[ErrorTerm]) -> float:
     return float(np.sqrt(sum(np.trace(t.covariance[:2, :2]) for t in terms) / 2)) / EARTH_RADIUS_M
 
 
+@at_once
 @dataclass(frozen=True)
 class Claim:
     """The remembered parts of the fixes of a place, and the result when they were last looked at.
@@ -186,9 +189,10 @@ MAX_OF_ALL = 2 / 3
 RIVAL_FIXES = 10
 
 
+@at_once
 @dataclass(frozen=True, kw_only=True)
-class Average:
-    """The averaged place, and the heading of the last pose (rad), with the budget of their errors.
+class Average(PlaceFix):
+    """The averaged place, and the heading of the last pose, with the budget of their errors.
 
     A pose lasts until somebody touches the camera.  The heading is NaN while no fix of the last pose has been accepted.
     frames, poses: number of accepted fixes and of their poses; left_out: number of fixes that were not accepted.
@@ -196,29 +200,11 @@ class Average:
     moved: number of earlier averages, of other places.
     """
 
-    utc_unix_s: float
-    latitude: float
-    longitude: float
-    heading: float
-    terms: tuple[ErrorTerm, ...]
     frames: int
     poses: int
     left_out: int
     began_unix_s: float
     moved: int
-
-    @property
-    def covariance(self) -> np.ndarray:
-        """Covariance (3, 3) of east m, north m, heading rad; its last row and column are NaN if the heading is."""
-        covariance = total_covariance(self.terms)[:3, :3]
-        if np.isnan(self.heading):
-            covariance[2] = covariance[:, 2] = np.nan
-        return covariance
-
-    @property
-    def in_degrees(self) -> InDegrees:
-        """Place and heading in degrees."""
-        return InDegrees.of(self.latitude, self.longitude, self.heading, self.covariance)
 
     def __repr__(self) -> str:
         return f"<Average of {self.frames} frames: {self.in_degrees}>"

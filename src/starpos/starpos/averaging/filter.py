@@ -14,8 +14,9 @@ import numpy as np
 
 from starpos._numeric.roots import symmetric_root
 from starpos.earth.ellipsoid import curvature_radii_m, enu_axes, meridian_turn, place_of_zenith, zenith_of
-from starpos.fix.budget import EACH_POSE, ErrorTerm, correlation
 from starpos.fix.fix import Fix
+from starpos.fix.terms import EACH_POSE, ErrorTerm, correlation
+from starpos.frozen import at_once
 from starpos.rotation import full_turn, half_turn
 
 # of east, north in m and heading in rad: brings them to similar sizes
@@ -28,6 +29,7 @@ MAX_BENT = 0.2
 STEEPEST = 30.0
 
 
+@at_once
 @dataclass(frozen=True)
 class Plane:
     """The tangent plane at a fix, whose east and north are used for all fixes near it.
@@ -83,6 +85,7 @@ class Plane:
         return place_of_zenith(zenith)
 
 
+@at_once
 @dataclass(frozen=True, kw_only=True)
 class PlaceFilter:
     """State of the filter after the fixes so far.

@@ -3,7 +3,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
@@ -11,9 +10,11 @@ from starpos import rotation
 from starpos._numeric.roots import symmetric_root
 from starpos.earth.orientation import ROTATION_RAD_S
 from starpos.errors import FixError
-from starpos.fix.budget import ErrorTerm
+from starpos.fix.attitude import Attitude
+from starpos.fix.budget import link_attitude
 from starpos.fix.fix import Fix, angle_text
-from starpos.fix.heading import AttitudeAtPlace, LinkAttitude
+from starpos.fix.heading import AttitudeAtPlace
+from starpos.fix.terms import ErrorTerm
 from starpos.units import ARCSEC
 
 # errors may be as large as this
@@ -26,32 +27,19 @@ HIGHEST_LATITUDE = np.radians(89.0)
 LARGE_TRACE = 2.9
 
 
-class Sighted(Protocol):
-    """Attitude of a camera against the Earth, as a Fix has it: a rotation (3, 3), its covariance (3, 3), a latitude."""
-
-    @property
-    def camera_to_itrs(self) -> np.ndarray: ...
-
-    @property
-    def camera_covariance(self) -> np.ndarray: ...
-
-    @property
-    def latitude(self) -> float: ...
-
-
-def slip_s(fix: Sighted, first: Sighted, stated_s: float = 0.0) -> float | None:
+def slip_s(fix: Fix, first: Fix, stated_s: float = 0.0) -> float | None:
     """Seconds by which the time stamps of two fixes contradict each other; None if the camera was touched in between.
 
     The result is 0 if the errors of both attitudes, the mount's creep and stated_s explain the difference.
     stated_s: 1 sigma of both stamps together.
     """
-    turned = fix.camera_to_itrs @ first.camera_to_itrs.T
+    turned = fix.camera.rotation @ first.camera.rotation.T
     angle = np.arctan2(turned[1, 0] - turned[0, 1], turned[0, 0] + turned[1, 1])
     about_axis = rotation.about_axis(2, angle)
     rest = turned @ about_axis.T
     if np.trace(rest) < LARGE_TRACE:
         return None
-    covariance = fix.camera_covariance + about_axis @ first.camera_covariance @ about_axis.T
+    covariance = fix.camera.covariance + about_axis @ first.camera.covariance @ about_axis.T
     weight = np.linalg.inv(covariance + np.eye(3) * (CREEP_RAD / SLIP_SIGMAS) ** 2)
     # choose the angle that leaves the least rest in sigma: the roll is known worse than the optical axis
     rest, variance = rotation.to_small_vector(rest), 1 / weight[2, 2]
@@ -84,18 +72,18 @@ class MeanAttitude:
 
     utc_unix_s: float
     frames: int
-    plumb: LinkAttitude
-    ellipsoid: LinkAttitude
+    plumb: Attitude
+    ellipsoid: Attitude
 
 
 def mean_attitude(attitudes: Sequence[AttitudeAtPlace]) -> MeanAttitude:
     """The mean of one or more frames; FixError if the camera turned between them."""
-    cameras = np.array([a.camera_to_itrs for a in attitudes])
+    cameras = np.array([a.camera.rotation for a in attitudes])
     axes = np.tile(np.eye(3), (len(cameras), 1))
     mean = rotation.best_rotation(axes, np.concatenate(cameras.swapaxes(1, 2)))
     for attitude, camera in zip(attitudes, cameras, strict=True):
         off = rotation.to_vector(camera @ mean.T)
-        if off @ np.linalg.solve(attitude.camera_covariance, off) > TURN_SIGMAS**2:
+        if off @ np.linalg.solve(attitude.camera.covariance, off) > TURN_SIGMAS**2:
             turned = angle_text(float(np.linalg.norm(off)))
             raise FixError(
                 f"the camera turned between the frames, by {turned} from their mean: each frame has its own heading"
@@ -108,13 +96,11 @@ def mean_attitude(attitudes: Sequence[AttitudeAtPlace]) -> MeanAttitude:
     )
 
 
-def _mean(links: Sequence[LinkAttitude]) -> LinkAttitude:
+def _mean(links: Sequence[Attitude]) -> Attitude:
     """The mean of attitudes whose budgets name the same sources in the same order."""
     axes = np.tile(np.eye(3), (len(links), 1))
-    mean = rotation.best_rotation(axes, np.concatenate([link.link_to_enu.T for link in links]))
-    return LinkAttitude(
-        link_to_enu=mean, terms=tuple(map(_mean_term, zip(*(k.terms for k in links), strict=True)))
-    )
+    mean = rotation.best_rotation(axes, np.concatenate([link.rotation.T for link in links]))
+    return link_attitude(mean, tuple(map(_mean_term, zip(*(k.terms for k in links), strict=True))))
 
 
 def _mean_term(terms: Sequence[ErrorTerm]) -> ErrorTerm:

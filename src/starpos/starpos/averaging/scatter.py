@@ -18,6 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from starpos.frozen import at_once
 from starpos.units import ARCSEC
 
 # sizes: from a share of a frame's own error to the most that any sensor has
@@ -46,6 +47,7 @@ MIN_FREE, MIN_FREE_CONTRADICTING, CONTRADICT_SIGMA = 2.5, 0.5, 4.0
 MAX_ROWS = 64
 
 
+@at_once
 @dataclass(frozen=True, kw_only=True)
 class Frames:
     """The data of K frames on n parameters that they share, all per axis of two.
@@ -83,6 +85,7 @@ class Frames:
         return weight / weight.sum(1)[:, None]
 
 
+@at_once
 @dataclass(frozen=True, kw_only=True)
 class Scatter:
     """The result of the frames, as means over all hypotheses.
@@ -105,6 +108,7 @@ class Scatter:
     stated: np.ndarray
 
 
+@at_once
 @dataclass(frozen=True)
 class _Kind:
     """An error of unit size: its covariance (B, B), and mean variances (3,) over poses, over frames, and as noise."""

@@ -10,7 +10,7 @@ from starpos.calibration.camera_adjustment import (
     STEP_RAD,
     CameraAdjustment,
     CameraEstimate,
-    Sighting,
+    CameraSighting,
     camera_values,
     parameters,
     settled_camera,
@@ -23,6 +23,7 @@ from starpos.errors import CalibrationError, InstrumentError
 from starpos.fix.solver import ENOUGH_SOUND, high_enough
 from starpos.fix.star_fit import sound_matches
 from starpos.frames.frame import Stars
+from starpos.frozen import at_once
 from starpos.identification import Identification, PointingPrior, Sky, fisheye, identify_directions, triangles
 from starpos.identification.triangles import TriangleCatalogue
 from starpos.instrument.camera import EQUIDISTANT, Camera
@@ -41,6 +42,7 @@ MAX_SCATTER_PX = 1.5
 BORDER = 25
 
 
+@at_once
 @dataclass(frozen=True, kw_only=True)
 class Intrinsics:
     """A camera that was fitted to stars.
@@ -118,7 +120,7 @@ def rms(residual: np.ndarray) -> float:
 
 
 def fit_camera(
-    sightings: Sequence[Sighting], given: Camera, atmosphere: Atmosphere, free: Sequence[str] = ()
+    sightings: Sequence[CameraSighting], given: Camera, atmosphere: Atmosphere, free: Sequence[str] = ()
 ) -> Intrinsics:
     """Fit a camera near the `given` one to all sightings; parameters that are not in `free` keep their values.
 
@@ -289,6 +291,7 @@ def calibrate_camera(
     return FromSky(fit, tuple(sightings))
 
 
+@at_once
 @dataclass(frozen=True)
 class _Frame:
     """The stars of a frame, and the sky of its date."""
@@ -309,7 +312,7 @@ class _Frame:
 
     def sighting(
         self, camera: Camera, atmosphere: Atmosphere, attitude: np.ndarray | None
-    ) -> Sighting | None:
+    ) -> CameraSighting | None:
         """The stars that are identified with this camera, first near a known attitude (3, 3); None if none are.
 
         Raises InstrumentError for a mirrored frame.
@@ -326,12 +329,14 @@ class _Frame:
             )
         return self._sighting(stars, seen, found, camera)
 
-    def _sighting(self, stars: Stars, seen: np.ndarray, found: Identification, camera: Camera) -> Sighting:
+    def _sighting(
+        self, stars: Stars, seen: np.ndarray, found: Identification, camera: Camera
+    ) -> CameraSighting:
         use = sound_matches(stars, found, ENOUGH_SOUND)
         if fisheye.is_wide(camera) and self.level is not None:
             use &= high_enough(seen[found.star] @ self.level[2])
         star, index = found.star[use], found.catalogue[use]
-        return Sighting(
+        return CameraSighting(
             xy=np.stack([stars.x, stars.y], -1)[star],
             covariance_px2=stars.covariance[star],
             directions=self.sky.directions(index),

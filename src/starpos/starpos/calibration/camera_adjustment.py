@@ -15,6 +15,7 @@ from starpos import rotation
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import CalibrationError
 from starpos.fix.star_fit import distance2, judged
+from starpos.frozen import at_once
 from starpos.instrument.camera import COEFFICIENTS, EQUIDISTANT, PLUMB_BOB, RATIONAL, Camera
 
 # 1 sigma of the priors about the given camera: relative focal length, fx over fy, principal point (share of the longer
@@ -35,8 +36,9 @@ MAX_ROUNDS, MAX_STEPS, SETTLED = 8, 30, 1e-6
 STEP_RAD = 1e-6
 
 
+@at_once
 @dataclass(frozen=True, kw_only=True)
-class Sighting:
+class CameraSighting:
     """The identified stars of one frame.
 
     xy (N, 2) in px and covariance_px2 (N, 2, 2): as measured.
@@ -96,6 +98,7 @@ def unknowns(camera: Camera) -> tuple[str, ...]:
     return ("scale", "square", *parameters(camera)[2:], *OF_THE_AIR)
 
 
+@at_once
 @dataclass(frozen=True)
 class CameraEstimate:
     """The unknowns q (U,) and the attitudes (F, 3, 3) of the frames."""
@@ -104,6 +107,7 @@ class CameraEstimate:
     attitudes: np.ndarray
 
 
+@at_once
 @dataclass(frozen=True)
 class SettledCamera:
     """A finished fit: covariance (U, U) of q, mask `keep` (N,) of the stars, variance beyond their errors in px2."""
@@ -114,6 +118,7 @@ class SettledCamera:
     jitter2: float
 
 
+@at_once
 @dataclass(frozen=True, kw_only=True)
 class CameraAdjustment:
     """The least-squares problem: all N stars of all F frames, frame by frame.
@@ -137,7 +142,7 @@ class CameraAdjustment:
 
     @classmethod
     def of(
-        cls, sightings: Sequence[Sighting], given: Camera, atmosphere: Atmosphere, free: Sequence[str]
+        cls, sightings: Sequence[CameraSighting], given: Camera, atmosphere: Atmosphere, free: Sequence[str]
     ) -> "CameraAdjustment":
         sightings = [s for s in sightings if len(s.xy)]
         counts = [len(s.xy) for s in sightings]

@@ -12,7 +12,6 @@ from starpos.averaging.poses import poses_of
 from starpos.averaging.scatter import Scatter
 from starpos.calibration.plumb_line import (
     MIN_POSES,
-    FixedFrame,
     PlumbLine,
     Readings,
     hang,
@@ -22,10 +21,11 @@ from starpos.calibration.plumb_line import (
 )
 from starpos.earth.ellipsoid import EARTH_RADIUS_M, enu_axes
 from starpos.errors import FixError
-from starpos.fix.budget import ALWAYS, ErrorTerm, Sensitivity, local_north
+from starpos.fix.budget import Sensitivity, local_north
 from starpos.fix.fix import Fix
 from starpos.fix.solution import Solution, Status
 from starpos.fix.solver import Solver
+from starpos.fix.terms import ALWAYS, ErrorTerm
 from starpos.frames.frame import Stars
 from starpos.frames.tables import Pointing
 from starpos.identification import Identification
@@ -125,7 +125,7 @@ def calibrate_at(
     found = calibrate(solver, frames, tilts, find, fewest=1, progress=progress, known=known)
     if not found.fixes:
         raise FixError(f"no frame has a fix to calibrate from: {found.solutions[0].message}")
-    if min(f.camera_to_itrs[:, 2] @ site.enu[2] for f in found.fixes) < 0:
+    if min(f.camera.rotation[:, 2] @ site.enu[2] for f in found.fixes) < 0:
         raise FixError(
             "from the place that was given the camera would look into the ground: check latitude and longitude, their "
             "order and signs, and the clock"
@@ -161,7 +161,7 @@ def calibrate(
                 solutions.append(solver.solve(frame, tilts, hint, known=known.get(n)))
             progress("calibrating", (k + (n + 1) / len(frames)) / SOLVING_ROUNDS)
         hints = [s.hint for s in solutions]
-        solved = [FixedFrame(s.fix, s.tilt) for s in solutions if s.fix and s.tilt]
+        solved = [s.fix for s in solutions if s.fix]
         if len(solved) < fewest:
             break
         a3 = solver.instrument.mounting.a3
@@ -198,7 +198,7 @@ class _Agreement:
 
     plumb: PlumbLine
     readings: Readings
-    sound: list[FixedFrame]
+    sound: list[Fix]
     scatter: Scatter
     left_out: dict[float, float]
 
@@ -206,7 +206,7 @@ class _Agreement:
         """The inclinometer's errors, with its noise and its poses' errors as these frames show them."""
         noise = stated.noise_rad
         if self._noisy:
-            samples = np.mean([s.tilt.samples for s in self.sound])
+            samples = np.mean([f.tilt.samples for f in self.sound])
             noise = float(np.hypot(noise, self.scatter.noise_sigma * np.sqrt(samples)))
         return replace(stated, pose_rad=self.scatter.pose_sigma, noise_rad=noise)
 
@@ -283,32 +283,29 @@ class _Agreement:
         return solution
 
 
-def _agreed(
-    find: FindPlumbLine, solved: list[FixedFrame], a3: np.ndarray, errors: InclinometerErrors
-) -> _Agreement:
+def _agreed(find: FindPlumbLine, solved: list[Fix], a3: np.ndarray, errors: InclinometerErrors) -> _Agreement:
     """The plumb line that `find` gives for the frames that agree with each other."""
     whole = Readings.of(solved, errors)
     rows, plumb = _agreeing(find, whole, solved, a3, errors)
     sound = [solved[k] for k in rows]
-    fixes = [s.fix for s in sound]
     # a fix with a bad tilt, hence a bad refraction, may have split the pose of the sound ones
-    readings = replace(whole.take(rows), pose=poses_of(fixes))
+    readings = replace(whole.take(rows), pose=poses_of(sound))
     _, scatter = settled(plumb, readings)
     # once more about the answer, with the errors that the poses show
     noisy = np.hypot(readings.sigma, scatter.noise_sigma)
-    again = find(replace(readings, pose_sigma=scatter.pose_sigma, sigma=noisy), a3, fixes)
+    again = find(replace(readings, pose_sigma=scatter.pose_sigma, sigma=noisy), a3, sound)
     plumb, scatter = settled(again, readings)
     left_out = {}
     if len(rows) < len(solved):
         # how far the others are off shows against the answer of these
         off = np.linalg.norm(_left(whole, plumb), axis=1)
         for k in np.setdiff1d(np.arange(len(solved)), rows):
-            left_out[solved[k].fix.utc_unix_s] = float(off[k])
+            left_out[solved[k].utc_unix_s] = float(off[k])
     return _Agreement(plumb, readings, sound, scatter, left_out)
 
 
 def _agreeing(
-    find: FindPlumbLine, whole: Readings, solved: list[FixedFrame], a3: np.ndarray, errors: InclinometerErrors
+    find: FindPlumbLine, whole: Readings, solved: list[Fix], a3: np.ndarray, errors: InclinometerErrors
 ) -> tuple[np.ndarray, PlumbLine]:
     """Indices of the frames that agree with most of the others, and the plumb line of these.
 
@@ -325,14 +322,14 @@ def _agreeing(
 def _kept(
     find: FindPlumbLine,
     whole: Readings,
-    solved: list[FixedFrame],
+    solved: list[Fix],
     a3: np.ndarray,
     errors: InclinometerErrors,
     rows: np.ndarray,
 ) -> tuple[np.ndarray, PlumbLine]:
     """The frames in `rows` without those that their plumb line shows to disagree, and the plumb line of the rest."""
     for _ in range(JUDGED):
-        plumb = find(whole.take(rows), a3, [solved[k].fix for k in rows])
+        plumb = find(whole.take(rows), a3, [solved[k] for k in rows])
         size = np.linalg.norm(plumb.left, axis=1)
         usual = np.hypot(whole.take(rows).sigma, max(typical(plumb.left, 5), errors.pose_rad))
         agree = size < OUTLIER_SIGMA * usual
@@ -352,7 +349,7 @@ def _calm(whole: Readings) -> np.ndarray:
     return np.flatnonzero(size < OUTLIER_SIGMA * np.maximum(whole.sigma, typical(off, 0)))
 
 
-def _unhidden(find: FindPlumbLine, whole: Readings, solved: list[FixedFrame], a3: np.ndarray) -> np.ndarray:
+def _unhidden(find: FindPlumbLine, whole: Readings, solved: list[Fix], a3: np.ndarray) -> np.ndarray:
     """Indices of the frames without outliers that pull the fit of all towards them, and so seem to agree with it.
 
     Each is judged against a fit of the frames that lie closest to it, as many as must agree (least trimmed squares).
@@ -366,7 +363,7 @@ def _unhidden(find: FindPlumbLine, whole: Readings, solved: list[FixedFrame], a3
     # the closest alone, until they are the same; then all that agree with them, until these are
     for closest in (True, False):
         for _ in range(JUDGED):
-            left = _left(whole, find(whole.take(rows), a3, [solved[k].fix for k in rows]))
+            left = _left(whole, find(whole.take(rows), a3, [solved[k] for k in rows]))
             usual = np.hypot(whole.sigma, max(typical(left[rows], 5), whole.pose_sigma))
             off = np.linalg.norm(left, axis=1) / usual
             before, rows = rows, np.sort(np.argsort(off, kind="stable")[:most])
@@ -419,7 +416,7 @@ def _dated(agreement: _Agreement, errors: InclinometerErrors) -> Calibration:
     return replace(
         _found(agreement, errors),
         covariance_arcsec2=tuple(map(tuple, (agreement.plumb.covariance / ARCSEC**2).tolist())),
-        utc_unix_s=float(np.mean([s.fix.utc_unix_s for s in sound])),
+        utc_unix_s=float(np.mean([f.utc_unix_s for f in sound])),
         frames=len(sound),
         valid_days=VALID_DAYS,
     )
@@ -446,9 +443,9 @@ def _found(agreement: _Agreement, errors: InclinometerErrors) -> Calibration:
     )
 
 
-def _mean_temperature_c(solved: list[FixedFrame]) -> float:
+def _mean_temperature_c(solved: list[Fix]) -> float:
     # an unknown temperature is NaN, which is not below MAX_C
-    known = [s.tilt.temperature_c for s in solved if abs(s.tilt.temperature_c) < MAX_C]
+    known = [f.tilt.temperature_c for f in solved if abs(f.tilt.temperature_c) < MAX_C]
     return float(np.mean(known)) if known else float("nan")
 
 
@@ -505,11 +502,11 @@ def calibrate_fixed(
             "the camera was touched between the frames, or their clock was set: give frames of a camera "
             "that nothing moved"
         )
-    attitudes = np.array([f.camera_to_itrs for f in fixes])
+    attitudes = np.array([f.camera.rotation for f in fixes])
     mean = rotation.best_rotation(
         np.tile(np.eye(3), (len(fixes), 1)), np.concatenate(attitudes.swapaxes(1, 2))
     )
-    covariance = np.mean([f.camera_covariance for f in fixes], axis=0) / ARCSEC**2
+    covariance = np.mean([f.camera.covariance for f in fixes], axis=0) / ARCSEC**2
     vertical = CameraVertical(*(tuple(map(tuple, m.tolist())) for m in (mean, covariance)))
     # a level that always reads zero has no response
     calibration = replace(found.instrument.calibration, response=(), response_covariance=())

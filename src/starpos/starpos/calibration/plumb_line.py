@@ -12,9 +12,10 @@ from starpos.averaging.poses import poses_of
 from starpos.averaging.scatter import Frames, Scatter, scatter_of
 from starpos.earth.ellipsoid import EARTH_RADIUS_M
 from starpos.errors import FixError
-from starpos.fix.budget import EACH_POSE
 from starpos.fix.fix import Fix
-from starpos.instrument.inclinometer import InclinometerErrors, Tilt
+from starpos.fix.terms import EACH_POSE
+from starpos.frozen import at_once
+from starpos.instrument.inclinometer import InclinometerErrors
 from starpos.instrument.instrument import UNKNOWN_ARCSEC
 from starpos.instrument.mounting import RESPONSE_COEFFICIENTS, Zeroed, response_columns, stated_variances
 from starpos.units import ARCSEC, MEDIAN_OF_CHI2
@@ -25,14 +26,7 @@ KNOWN = 1e-9
 LEAN_SIGMA = 5.0
 
 
-@dataclass(frozen=True)
-class FixedFrame:
-    """A frame's fix, and the tilt that it was made with."""
-
-    fix: Fix
-    tilt: Tilt
-
-
+@at_once
 @dataclass(frozen=True, kw_only=True)
 class Readings:
     """Attitudes and tilts of K frames.
@@ -55,21 +49,21 @@ class Readings:
     column_sigma: np.ndarray
 
     @classmethod
-    def of(cls, solved: Sequence[FixedFrame], errors: InclinometerErrors) -> "Readings":
+    def of(cls, fixes: Sequence[Fix], errors: InclinometerErrors) -> "Readings":
         """Readings of frames with a fix; FixError if some have two axes and some three."""
-        fixes = [s.fix for s in solved]
-        plumb = np.array([s.tilt.up for s in solved])
-        axes = {s.tilt.axes for s in solved}
+        tilts = [f.tilt for f in fixes if f.tilt is not None]
+        plumb = np.array([t.up for t in tilts])
+        axes = {t.axes for t in tilts}
         if len(axes) != 1:
             raise FixError("some tilts have two axes and some three: give the tilts of one inclinometer")
         mean = rotation.normalised(plumb.sum(0))
         zeroed = Zeroed.at(mean, min(axes))
-        response = np.array([response_columns(s.tilt.theta, s.tilt.up, zeroed) for s in solved])
-        walked = _wandering(solved, errors)
+        response = np.array([response_columns(t.theta, t.up, zeroed) for t in tilts])
+        walked = _wandering(fixes, errors)
         variances = stated_variances(errors, axes.pop())
         return cls(
             utc_unix_s=np.array([f.utc_unix_s for f in fixes]),
-            to_camera=np.array([f.camera_to_itrs.T for f in fixes]),
+            to_camera=np.array([f.camera.rotation.T for f in fixes]),
             plumb=plumb,
             heading=np.array([f.heading for f in fixes]),
             sigma=_own_sigma(fixes),
@@ -131,13 +125,13 @@ def _own_sigma(fixes: Sequence[Fix]) -> np.ndarray:
     return np.sqrt(variance) / EARTH_RADIUS_M
 
 
-def _wandering(solved: Sequence[FixedFrame], errors: InclinometerErrors) -> np.ndarray:
+def _wandering(fixes: Sequence[Fix], errors: InclinometerErrors) -> np.ndarray:
     """Change (K, 3, 2 axes) of up by drift and temperature of each axis, counted from the means of the frames."""
-    hours = np.array([s.fix.utc_unix_s for s in solved]) / 3600
-    warm = np.array([s.tilt.temperature_c for s in solved])
+    hours = np.array([f.utc_unix_s for f in fixes]) / 3600
+    warm = np.array([f.tilt.temperature_c for f in fixes])
     late = (hours - hours.mean()) / max(np.sqrt(np.ptp(hours)), 1e-9)
     warm = warm - np.mean(warm) if np.isfinite(warm).all() else np.zeros(len(warm))
-    slope = np.array([s.tilt.slope for s in solved])
+    slope = np.array([f.tilt.slope for f in fixes])
     known = late * errors.drift_rad_per_sqrt_hour, warm * errors.temperature_rad_per_c
     return np.concatenate([slope * off[:, None, None] for off in known], 2)
 
@@ -149,6 +143,7 @@ MAX_STEPS, LONGEST_STEP = 60, 0.5
 SETTLED_CHI2 = 1e-10
 
 
+@at_once
 @dataclass(frozen=True)
 class Linear:
     """A fit about its answer: p holds A3's turns (3) about `turns`, the zenith's moves (2) along `across`, and the
@@ -165,6 +160,7 @@ class Linear:
     across: np.ndarray
 
 
+@at_once
 @dataclass(frozen=True, kw_only=True)
 class PlumbLine:
     """a3 (3, 3) with covariance (3, 3) in rad2 about S's axes, and the zenith (3,) in ITRS with its sigma in rad.
@@ -194,6 +190,7 @@ class PlumbLine:
         return float(np.sqrt(np.linalg.eigvalsh(across @ self.covariance @ across.T)[-1]))
 
 
+@at_once
 @dataclass(frozen=True)
 class PlumbLinePrior:
     """Prior knowledge of the fit: the zenith (3,) or None, its sigma, and the sigma of A3's turn, in rad."""
@@ -222,6 +219,7 @@ def symmetric(covariance: np.ndarray) -> np.ndarray:
     return (covariance + covariance.T) / 2
 
 
+@at_once
 @dataclass(frozen=True, kw_only=True)
 class _Model:
     """What all starts of a fit share, and what each begins with.
@@ -266,6 +264,7 @@ class _Model:
         )
 
 
+@at_once
 @dataclass(frozen=True, kw_only=True)
 class _State:
     """Where T fits stand: a3 (T, 3, 3), up (T, 3) of any length, p (T, n) as in Linear, start (T,): its number."""
@@ -279,6 +278,7 @@ class _State:
         return _State(a3=self.a3[rows], up=self.up[rows], p=self.p[rows], start=self.start[rows])
 
 
+@at_once
 @dataclass(frozen=True, kw_only=True)
 class _Slopes:
     """A linearisation at T states, and what it costs.

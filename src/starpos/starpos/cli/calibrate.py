@@ -35,10 +35,9 @@ from starpos.instrument.instrument import (
     SAG_ARCSEC_PER_SQRT_HOUR,
     Calibration,
     Instrument,
-    with_frame_size,
 )
 from starpos.instrument.tilt_log import TiltLog
-from starpos.night.reading import NO_CAMERA, First, Given, Reader
+from starpos.night.reading import NO_CAMERA, First, Instruments, Reader
 from starpos.night.remarks import of_inclinometer
 from starpos.night.together import axis_of, circles_of
 from starpos.night.work import Solving
@@ -168,18 +167,10 @@ def run_site(
             console.complain("calibrate", f"left out: {solution.message}")
     if found.beyond:
         console.complain("calibrate", found.beyond)
-    calibration = found.instrument.calibration
-    if args.valid_days is not None:
-        calibration = replace(calibration, valid_days=args.valid_days)
-    found = replace(found, instrument=replace(found.instrument, calibration=calibration))
     about = _about_site(found, site)
     if args.misalignment is not None:
-        about += _against(instrument.calibration, calibration)
-    save_instrument("calibrate", args.output, found.instrument, about, camera_found=args.camera is not None)
-    if args.json:
-        console.print_json(_json_of_site(found, args.output))
-    else:
-        print(about, end="")
+        about += _against(instrument.calibration, found.instrument.calibration)
+    _save(args, found, about)
 
 
 def run_elevations(
@@ -195,8 +186,6 @@ def run_elevations(
     for remark in of_inclinometer(instrument):
         console.complain("calibrate", remark)
     calibration = found.calibration(instrument.calibration, options.turn_of(args))
-    if args.valid_days is not None:
-        calibration = replace(calibration, valid_days=args.valid_days)
     about = (
         f"A3 of {calibration.frames} elevations in {found.directions} directions at {site.latitude_deg:+.6f} "
         f"{site.longitude_deg:+.6f} (by gravity): "
@@ -204,10 +193,18 @@ def run_elevations(
         + f"the frame's centre in the inclinometer is known to {found.stddev_arcsec:.2f} arcsec; elevations "
         f"alone do not determine the turn about it, which does not matter for pointings without a roll\n"
     )
-    whole = replace(instrument, calibration=calibration)
-    save_instrument("calibrate", args.output, whole, about)
+    _save(args, Calibrated(replace(instrument, calibration=calibration), found.stddev_arcsec, ()), about)
+
+
+def _save(args: argparse.Namespace, found: Calibrated, about: str) -> None:
+    """Write what was found as -o and --valid-days ask, and print it."""
+    instrument = found.instrument
+    if args.valid_days is not None:
+        lasting = replace(instrument.calibration, valid_days=args.valid_days)
+        instrument = replace(instrument, calibration=lasting)
+    save_instrument("calibrate", args.output, instrument, about, camera_found=args.camera is not None)
     if args.json:
-        console.print_json(_json_of_site(Calibrated(whole, found.stddev_arcsec, ()), args.output))
+        console.print_json(_json_of_site(found, args.output))
     else:
         print(about, end="")
 
@@ -305,14 +302,15 @@ def run(args: argparse.Namespace) -> int:
     first = First(read)(tuple(args.frames))
     if first is None:
         # each frame says why it cannot be read
-        _sights(args.frames, read, Given(None))
+        _sights(args.frames, read, Instruments(None))
         return console.UNREADABLE
     # an error of the axis that all frames share becomes part of the A3 that is found
-    instrument, _ = with_frame_size(options.instrument_of(args, first), first)
+    given, _ = given_of(args, first).framed(first)
+    assert given.instrument is not None
     # an unusable instrument is refused before the work on all frames
-    check_output(args, instrument)
-    sights, unreadable = _sights(args.frames, read, replace(given_of(args, first), instrument=instrument))
-    solver, alike = of_one_camera(Solver(instrument, catalogue.load_catalogue()), sights)
+    check_output(args, given.instrument)
+    sights, unreadable = _sights(args.frames, read, given)
+    solver, alike = of_one_camera(Solver(given.instrument, catalogue.load_catalogue()), sights)
     frames = [(sight.stars, sight.found) for sight in alike]
     instrument = solver.instrument
     tilts = _tilts(args, instrument)
@@ -344,31 +342,20 @@ def _tilts(args: argparse.Namespace, instrument: Instrument) -> TiltLog | None:
 
 
 def _from_pointings(args: argparse.Namespace) -> int:
-    """Calibrate from the pointings of a plate solver; returns the exit status."""
+    """Calibrate from the pointings of a plate solver, or from elevations if none has a roll; returns the exit status."""
     pointings = read_pointings(args.pointings)
     whole = [p for p in pointings if p.has_roll]
-    if not whole and args.tilt is not None:
-        return _from_elevations(args, pointings)
-    if len(whole) < len(pointings):
+    elevations = pointings if not whole and args.tilt is not None else []
+    if len(whole) < len(pointings) and not elevations:
         console.complain("calibrate", f"{len(pointings) - len(whole)} pointings without a roll are left out")
     instrument = options.instrument_of(args, NO_CAMERA)
     check_output(args, instrument)
     tilts = _tilts(args, instrument)
     try:
-        run_site(args, whole, instrument, tilts)
-    except FixError as e:
-        console.complain("calibrate", e)
-        return NOTHING
-    return 0
-
-
-def _from_elevations(args: argparse.Namespace, pointings: Sequence[Pointing]) -> int:
-    """Calibrate from pointings without a roll, whose elevations determine A3's axis; returns the exit status."""
-    instrument = options.instrument_of(args, NO_CAMERA)
-    check_output(args, instrument)
-    tilts = checked_tilts("calibrate", args.tilt, instrument).log
-    try:
-        run_elevations(args, pointings, instrument, tilts)
+        if elevations and tilts is not None:
+            run_elevations(args, elevations, instrument, tilts)
+        else:
+            run_site(args, whole, instrument, tilts)
     except FixError as e:
         console.complain("calibrate", e)
         return NOTHING
@@ -385,7 +372,7 @@ def _written(args: argparse.Namespace) -> Iterator[Written]:
         yield Written("--output", args.output, instrument_file.check_replaceable)
 
 
-def _sights(paths: Sequence[str], read: Reader, given: Given) -> tuple[list[Sight], bool]:
+def _sights(paths: Sequence[str], read: Reader, given: Instruments) -> tuple[list[Sight], bool]:
     """The frames that can be read, identified by every way there is, and whether some cannot be read."""
     progress, unreadable, work = console.ProgressBar(), False, Solving(given)
     sights: list[Sight] = []

@@ -19,7 +19,7 @@ from starpos.instrument.tilt_log import BRACKET_S, TiltLog
 from starpos.instrument.tilt_table import read_tilt_csv
 from starpos.night.first_night import AROUND_S, FirstNight, Look, Stage
 from starpos.night.opening import exposures, frames_in
-from starpos.night.reading import About, Given, stars_of
+from starpos.night.reading import About, Instruments, stars_of
 from starpos.night.work import Solving
 from starpos.report import field
 from starpos.sky import catalogue
@@ -90,10 +90,10 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _watched(args: argparse.Namespace, folder: Path) -> tuple[FirstNight | None, Given]:
+def _watched(args: argparse.Namespace, folder: Path) -> tuple[FirstNight | None, Instruments]:
     """Take frames as they come, until the last step is done or none has come for long."""
     night: FirstNight | None = None
-    given = Given(None)
+    given = Instruments(None)
     seen: set[Path] = set()
     waited = time.monotonic()
     while True:
@@ -114,7 +114,7 @@ def _watched(args: argparse.Namespace, folder: Path) -> tuple[FirstNight | None,
                 air = options.atmosphere_of(args)
                 night = FirstNight(Solver(options.instrument_of(args, item), catalogue.load_catalogue(), air))
             sight = Solving(given)(item)
-            look = night.add(sight, _tilts(folder, night, stars_of(item)))
+            look = night.inspect(sight, _tilts(folder, night, stars_of(item)))
             _tell(look, sight.stars)
             if night.step is None:
                 return night, given

@@ -13,10 +13,11 @@ from starpos.earth.orientation import measured_until, table_age_days
 from starpos.earth.place import Place
 from starpos.earth.vertical import Geodetic, Vertical, geodetic
 from starpos.errors import FixError
+from starpos.fix.attitude import Attitude
 from starpos.fix.fix import Fix, InDegrees, length_text
-from starpos.fix.heading import AttitudeAtPlace, LinkAttitude
+from starpos.fix.heading import AttitudeAtPlace
 from starpos.fix.solution import Solution, Status
-from starpos.night.together import Solved
+from starpos.night.together import Gathered
 from starpos.units import utc_text
 
 # numbers of an average that are printed
@@ -97,7 +98,7 @@ def budget_of(fix: Fix | Average, ground: Geodetic) -> dict:
 
 def json_about(s: Solution) -> dict:
     """The keys of --json about the stars of a frame."""
-    a, fitted = s.attitude, s.fix or s.at_place
+    a, fitted = s.pointing, s.fix or s.at_place
     return {
         "stars_detected": s.stars_detected,
         "stars_matched": len(s.names),
@@ -123,13 +124,13 @@ def put_combined(
     output: Output,
     night: NightFolder,
     all_together: Average | None,
-    solved: Sequence[Solved],
-    warnings: set[str],
+    gathered: Gathered,
     vertical: Vertical,
     about: dict | None = None,
 ) -> None:
     """Write the average of a night, or that it is missing; about: more keys of JSON."""
     name = {} if night.folder is None else {"night": night.folder}
+    solved = gathered.solved
     counts = dict.fromkeys(COUNTS) if all_together is None else {k: getattr(all_together, k) for k in COUNTS}
     of_stars = {
         "stars_detected": sum(s.stars_detected for s in solved),
@@ -137,7 +138,7 @@ def put_combined(
         "residual_arcsec": np.sqrt(np.mean([s.fix.residual_arcsec**2 for s in solved] or [np.nan])),
         "log_odds": sum(s.log_odds for s in solved) if solved else None,
         "status": (Status.OK if all_together else Status.POOR_FIT).value,
-        "warnings": sorted(warnings),
+        "warnings": sorted(gathered.warnings),
     }
     age_days = table_age_days(all_together.utc_unix_s) if all_together else None
     output.put(
@@ -201,7 +202,9 @@ def with_heading(
         none = {k: _with_variance(values[k], np.nan) for k in COVARIANCES if values[k] is not None}
         return values | dict.fromkeys(HEADING_KEYS) | none
     plumb, ellipsoid = found.plumb, found.ellipsoid
-    covariance, covariance_geodetic = (np.degrees(np.degrees(a.covariance)) for a in (plumb, ellipsoid))
+    covariance, covariance_geodetic = (
+        np.degrees(np.degrees(a.angles_covariance)) for a in (plumb, ellipsoid)
+    )
     sigma = np.sqrt(np.diag(covariance))
     told = (
         np.degrees(plumb.heading),
@@ -242,7 +245,7 @@ def heading_text_of(found: AttitudeAtPlace | MeanAttitude) -> str:
     plumb, ellipsoid = found.plumb, found.ellipsoid
     angles = np.degrees([plumb.heading, ellipsoid.heading, plumb.pitch, plumb.roll])
     sigma = np.degrees(
-        np.sqrt([plumb.covariance[0, 0], ellipsoid.covariance[0, 0], *np.diag(plumb.covariance)[1:]])
+        np.sqrt([ellipsoid.angles_covariance[0, 0], *np.diag(plumb.angles_covariance)])[[1, 0, 2, 3]]
     )
     heading, on_ground, pitch, roll = (f"{a:.5f} +- {s:.5f}" for a, s in zip(angles, sigma, strict=True))
     return f"heading {heading} (WGS 84: {on_ground}) deg, pitch {pitch}, roll {roll}"
@@ -270,7 +273,7 @@ def put_mean(
         "stars_detected": sum(s.stars_detected for s in answers),
         "stars_matched": sum(len(s.names) for s in answers),
         "residual_arcsec": np.sqrt(np.mean([s.at_place.residual_arcsec**2 for s in answers if s.at_place])),
-        "log_odds": sum(s.attitude.log_odds for s in answers if s.attitude),
+        "log_odds": sum(s.pointing.log_odds for s in answers if s.pointing),
         "status": (Status.OK if mean else Status.POOR_FIT).value,
         "warnings": [],
         "iers_table_age_days": table_age_days(mean.utc_unix_s) if mean else None,
@@ -291,7 +294,7 @@ def _with_variance(covariance: np.ndarray | None, heading: float) -> np.ndarray:
     return whole
 
 
-def _heading_budget(of_fix: dict | None, plumb: LinkAttitude) -> dict:
+def _heading_budget(of_fix: dict | None, plumb: Attitude) -> dict:
     """1 sigma (3,) of each source: east m, north m of a fix, heading deg at the known place by the plumb line."""
     headings = {t.name: float(np.degrees(np.sqrt(t.covariance[2, 2]))) for t in plumb.terms}
     places = {} if of_fix is None else {name: list(row[:2]) for name, row in of_fix.items()}

@@ -14,7 +14,7 @@ from starpos.fix.blind import SEARCH_S, BlindSolver
 from starpos.fix.solution import Solution, Status
 from starpos.frames.frame import Stars
 from starpos.instrument.camera import EQUIDISTANT
-from starpos.night.reading import First, Given
+from starpos.night.reading import First, Instruments
 from starpos.night.work import OnFile, Solving
 from starpos.parallel.processes import Here
 from starpos.progress import quiet
@@ -64,7 +64,7 @@ def run(args: argparse.Namespace) -> int:
     read, output = reader_of(args), Output(args, COLUMNS, HEAD)
     with inputs.workers_of(args, number) as workers:
         (about,) = workers.map([(First(read), tuple(args.frames))])
-        given = Given(None, by_header=True)
+        given = Instruments(None, by_header=True)
         if about is not None and is_untold(args) and about.focal_px is None:
             BlindSolver(load_catalogue(), console.ProgressBar()).prepare()
         elif about is not None:
@@ -93,7 +93,7 @@ def run(args: argparse.Namespace) -> int:
 
 def as_json(path: str, s: Solution) -> dict:
     """The solution of a frame as JSON has it; angles in deg, None for missing values."""
-    a = s.attitude
+    a = s.pointing
     return {
         "file": path,
         "ra": np.degrees(a.ra) if a else None,
@@ -117,9 +117,9 @@ def as_json(path: str, s: Solution) -> dict:
 
 
 def _line(path: str, s: Solution) -> str:
-    if s.attitude is None:
+    if s.pointing is None:
         return f"{path}: {s.status.value}, {s.stars_detected} stars detected"
-    a = s.attitude
+    a = s.pointing
     digits = 1 - math.floor(math.log10(min(max(a.focal_stddev_px, 1e-3), 1.0)))
     return (
         f"{path}: RA {np.degrees(a.ra):.5f} Dec {np.degrees(a.dec):+.5f} top at {np.degrees(a.roll):.3f} deg, "

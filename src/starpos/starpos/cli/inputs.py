@@ -19,15 +19,15 @@ from starpos.frames.frame import no_stars
 from starpos.frames.tables import TILTS, TRUTH
 from starpos.instrument.camera import PLUMB_BOB
 from starpos.instrument.instrument import Instrument
-from starpos.night.reading import About, Given, Reader, TiltFile
+from starpos.night.reading import About, Instruments, Reader, TiltFile
 from starpos.night.remarks import NEAR_KM, Near, of_tilts
 from starpos.parallel.cluster import Cluster
-from starpos.parallel.processes import Here, Processes, Workers, processors
+from starpos.parallel.processes import Workers, processors, workers
 from starpos.recording.drivers import Drivers
 from starpos.sky import catalogue
 
 if TYPE_CHECKING:
-    from starpos.night.bag import OfBag, Recorded
+    from starpos.night.bag import Recorded
 
 
 def reader_of(args: argparse.Namespace) -> Reader:
@@ -35,12 +35,12 @@ def reader_of(args: argparse.Namespace) -> Reader:
     return Reader(options.clock_of(args), tuple(args.shutter_delay or (0.0, 0.0)))
 
 
-def given_of(args: argparse.Namespace, first: About | None) -> Given:
+def given_of(args: argparse.Namespace, first: About | None) -> Instruments:
     """The instrument of each frame; the focal length is from its header unless the options give one.
 
     Raises InstrumentError if the options do not fit together, or the first frame has no focal length either.
     """
-    return Given(
+    return Instruments(
         options.instrument_of(args, first), by_header=(args.instrument, args.focal_mm) == (None, None)
     )
 
@@ -164,7 +164,7 @@ def add_bag(parser: argparse.ArgumentParser) -> None:
     options.add_remaps(parser)
 
 
-def read_bag(path: Path, args: argparse.Namespace) -> "tuple[Recorded, OfBag]":
+def read_bag(path: Path, args: argparse.Namespace) -> "tuple[Recorded, Instruments]":
     """One instrument's part of a bag, and the instrument of its frames; raises StarposError."""
     if find_spec("rosbags") is None:
         raise FrameError(f"{path}: bags are read with rosbags, which is not here: {PIP}")
@@ -175,7 +175,7 @@ def read_bag(path: Path, args: argparse.Namespace) -> "tuple[Recorded, OfBag]":
     found = bag.read(path, args.namespace, any_camera.inclinometer.noise_rad, drivers, console.ProgressBar())
     told = (args.instrument, args.focal_mm) != (None, None)
     cameras = found.cameras if args.focal_mm is None else {}
-    return found, bag.OfBag(any_camera, cameras, any_size=told)
+    return found, Instruments(any_camera, cameras=cameras, any_size=told)
 
 
 MAX_JOBS = 1000
@@ -213,8 +213,7 @@ def workers_of(args: argparse.Namespace, frames: int) -> Workers:
                 "--scheduler names machines, --jobs processes of this one: give one of the two"
             )
         return Cluster(args.scheduler)
-    number = min(processors() if args.jobs == 0 else args.jobs or 1, frames)
-    return Here() if number <= 1 else Processes(number)
+    return workers(min(processors() if args.jobs == 0 else args.jobs or 1, frames))
 
 
 def watched(answers: Iterable, number: int, what: str = "frame", silent: bool = True) -> Iterator:

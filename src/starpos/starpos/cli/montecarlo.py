@@ -6,7 +6,6 @@ import json
 import os
 import sys
 from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from functools import lru_cache, partial
 from itertools import islice
 from pathlib import Path
@@ -21,6 +20,7 @@ from starpos.frames.frame import Stars
 from starpos.instrument.camera import Camera
 from starpos.instrument.instrument import Instrument
 from starpos.instrument.sensors import SCA100T_CALIBRATED
+from starpos.parallel.processes import workers
 from starpos.simulation import montecarlo_fields, montecarlo_nights
 from starpos.simulation.montecarlo_nights import NightOutcome
 from starpos.sky import catalogue, deeper
@@ -149,42 +149,35 @@ def _either(
     return montecarlo_nights.calibrated_night(rng, stars, errors, int(rng.integers(1, 9)))
 
 
-def _all(args: argparse.Namespace, night: Callable) -> list[NightOutcome]:
+def _all(args: argparse.Namespace, night: RandomNight) -> list[NightOutcome]:
     """Every night's outcome, independent of the number of processes."""
-    seeds, outcomes, bar = np.random.SeedSequence(args.seed).spawn(args.nights), {}, console.ProgressBar()
-    for k, outcome in _each(night, seeds, min(args.jobs, args.nights)):
-        outcomes[k] = outcome
+    seeds, outcomes, bar = np.random.SeedSequence(args.seed).spawn(args.nights), [], console.ProgressBar()
+    for k, outcome in enumerate(_each(night, seeds, args.jobs)):
+        outcomes.append(outcome)
         if outcome.trouble:
             console.complain("montecarlo", f"night {k}: {outcome.trouble}")
         bar("nights", len(outcomes) / args.nights)
-    ordered = [outcomes[k] for k in range(args.nights)]
-    if args.json:
-        for o in ordered:
-            sigma = np.sqrt(np.diag(o.covariance))
-            console.print_json(
-                {
-                    "kind": o.kind, "east_m": o.off[0], "north_m": o.off[1], "heading_deg": np.degrees(o.off[2]),
-                    "sigma_east_m": sigma[0], "sigma_north_m": sigma[1], "sigma_heading_deg": np.degrees(sigma[2]),
-                }
-            )  # fmt: skip
-    return ordered
+    for o in outcomes if args.json else ():
+        sigma = np.sqrt(np.diag(o.covariance))
+        console.print_json(
+            {
+                "kind": o.kind, "east_m": o.off[0], "north_m": o.off[1], "heading_deg": np.degrees(o.off[2]),
+                "sigma_east_m": sigma[0], "sigma_north_m": sigma[1], "sigma_heading_deg": np.degrees(sigma[2]),
+            }
+        )  # fmt: skip
+    return outcomes
 
 
-def _each(
-    night: RandomNight, seeds: list[np.random.SeedSequence], jobs: int
-) -> Iterator[tuple[int, NightOutcome]]:
-    """(number, outcome) of the night of each seed, in any order."""
-    if jobs == 1:
-        for k, seed in enumerate(seeds):
-            yield k, _one(night, seed)
-        return
-    # loaded before the processes start, so that they share it and build the triangles once
-    _stars()
-    with ProcessPoolExecutor(jobs) as pool:
-        yield 0, pool.submit(_one, night, seeds[0]).result()
-        waiting = {pool.submit(_one, night, seed): k for k, seed in enumerate(seeds[1:], 1)}
-        for done in as_completed(waiting):
-            yield waiting[done], done.result()
+def _each(night: RandomNight, seeds: list[np.random.SeedSequence], jobs: int) -> Iterator[NightOutcome]:
+    """The outcome of each seed's night; the first is worked here, so that the triangles are built once."""
+    first, *others = seeds
+    work = partial(_one, night)
+    yield work(first)
+    with workers(min(jobs, len(others))) as processes:
+        for outcome in processes.map((work, seed) for seed in others):
+            if isinstance(outcome, FrameError):
+                raise outcome
+            yield outcome
 
 
 def _one(night: RandomNight, seed: np.random.SeedSequence) -> NightOutcome:
@@ -292,7 +285,7 @@ def looking(solver: Solver) -> montecarlo_fields.Answer:
     """A function that asks `solver` for the direction (3,) in ICRS of a frame's centre."""
 
     def answer(stars: Stars) -> np.ndarray | None:
-        a = solver.identify(stars).attitude
+        a = solver.identify(stars).pointing
         if a is None:
             return None
         return np.array([np.cos(a.dec) * np.cos(a.ra), np.cos(a.dec) * np.sin(a.ra), np.sin(a.dec)])

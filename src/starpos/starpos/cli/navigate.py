@@ -24,7 +24,7 @@ from starpos.navigation.records import ImuModel, read_imu, read_imu_model, read_
 from starpos.navigation.sightings import IdentifiedFrame, sighting_of
 from starpos.navigation.vessel import LAWS, Vessel
 from starpos.navigation.voyage import Voyage, navigate
-from starpos.night.reading import First, Given, Reader
+from starpos.night.reading import First, Instruments, Reader
 from starpos.night.work import Solving
 from starpos.sky import catalogue
 
@@ -123,7 +123,7 @@ class Seeing:
     """Work of `navigate`: a FrameSeen."""
 
     read: Reader
-    given: Given
+    given: Instruments
 
     def __call__(self, path: str) -> FrameSeen:
         item = self.read(path)

@@ -34,7 +34,7 @@ from starpos.instrument.tilt_table import read_tilt_csv
 from starpos.night.opening import frames_in
 from starpos.night.reading import stars_of
 from starpos.night.remarks import of_a3, of_inclinometer
-from starpos.night.together import Solved, extrapolated
+from starpos.night.together import FrameAnswer, Gathered, extrapolated
 from starpos.recording.drivers import Drivers
 from starpos.recording.topics import NO_REMAPS, Remaps
 from starpos.report.field import INSTRUMENT, is_field, opened
@@ -192,18 +192,17 @@ def tell(
     """Write the solutions of a bag and the average of its place; returns the exit status."""
     for sentence in night.said:
         console.complain("replay", f"{bag}: {sentence}")
-    solved: list[Solved] = []
+    gathered = Gathered()
     for solution in night.solutions:
-        if solution.fix:
-            solved.append(Solved.of(solution, solution.fix))
-        else:
+        gathered.gather(FrameAnswer(bag, solution))
+        if not solution.fix:
             console.complain("replay", f"{bag}: {solution.message}")
         time = "a frame" if solution.utc_unix_s is None else utc_text(solution.utc_unix_s)
         output.put(
             {"file": bag} | json_of(solution.fix, vertical) | json_about(solution),
             line_of(f"{bag} {time}", solution, turning=False),
         )
-    whole = night.average
+    whole, solved = night.average, gathered.solved
     remarks = list(extrapolated(solved))
     if solved:
         remarks += of_inclinometer(night.instrument, MODEL_BY_PARAMETERS)
@@ -212,9 +211,8 @@ def tell(
     for remark in remarks:
         console.complain("replay", f"{bag}: {remark}")
     if solved:
-        warnings = {warning for s in night.solutions for warning in s.warnings}
         folder = NightFolder((), None, bag if len(args.bags) > 1 else None)
-        put_combined(output, folder, whole, solved, warnings, vertical)
+        put_combined(output, folder, whole, gathered, vertical)
     # a trouble names its bag
     console.complain("replay", night.trouble or f"{bag}: {night.summary}")
     return console.UNREADABLE if night.trouble else 0 if solved else NO_FIX

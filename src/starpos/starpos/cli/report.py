@@ -14,14 +14,14 @@ from starpos.cli.solve import read_receiver
 from starpos.errors import FrameError, InstrumentError
 from starpos.night.night import Night
 from starpos.night.opening import exposures, frames_in
-from starpos.night.reading import First, Given, Reader
+from starpos.night.reading import First, Instruments, Reader
 from starpos.night.solving import Exposures, How, solved_night
 from starpos.parameters.given import of_solver
 from starpos.sky import catalogue
 from starpos.units import utc_text
 
 if TYPE_CHECKING:
-    from starpos.night.bag import OfBag, Recorded
+    from starpos.night.bag import Recorded
 
 NO_FIX = 1
 # maximum number of nights with all figures; more nights get the table and the errors only
@@ -173,7 +173,7 @@ def _night(path: Path, args: argparse.Namespace) -> Night:
     return bag.night(*found, options.atmosphere_of(args), vertical_of(args), how, console.ProgressBar())
 
 
-def _exposures(path: Path, args: argparse.Namespace) -> "Exposures | tuple[Recorded, OfBag]":
+def _exposures(path: Path, args: argparse.Namespace) -> "Exposures | tuple[Recorded, Instruments]":
     """The exposures of a folder, or what a bag holds; raises StarposError if there is nothing to work on."""
     from starpos.night import bag
 
@@ -186,6 +186,6 @@ def _exposures(path: Path, args: argparse.Namespace) -> "Exposures | tuple[Recor
                 f"{path}: neither a folder of frames nor a rosbag2 (.mcap, .db3): give one of these"
             )
         about = First(Reader())(tuple(map(str, frames_in(path))))
-        given = Given(None) if about is None else given_of(args, about)
+        given = Instruments(None) if about is None else given_of(args, about)
         return exposures(path, given, air, vertical)
     return inputs.read_bag(path, args)

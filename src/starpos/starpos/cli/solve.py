@@ -53,7 +53,7 @@ from starpos.instrument import instrument_file
 from starpos.instrument.instrument import Instrument
 from starpos.instrument.tilt_log import NO_TILTS, Tilts
 from starpos.night.opening import work_of
-from starpos.night.reading import NO_CAMERA, About, First, Given
+from starpos.night.reading import NO_CAMERA, About, First, Instruments
 from starpos.night.remarks import WORTH_SAVING_ARCSEC, Near, of_inclinometer
 from starpos.night.solving import How, NightAnswers, answers_of
 from starpos.night.together import (
@@ -114,7 +114,7 @@ def tell(
         about = {} if near is None else {"km_from_near": near.km_from(where.latitude, where.longitude)}
         if place is not None:
             about |= with_heading(json_of(whole.average, vertical), mean, place)
-        put_combined(output, night, whole.average, solved, gathered.warnings, vertical, about)
+        put_combined(output, night, whole.average, gathered, vertical, about)
     elif headings and place is not None:
         fix_output.put_mean(output, night, headings, mean, place, vertical)
     elif gathered.lost is not None and not headings and work is not None:
@@ -310,7 +310,7 @@ def _from_elevations(
         tell_unknown("solve", args, vertical.at(place.latitude, place.longitude))
         about = {} if near is None else {"km_from_near": near.km_from(place.latitude, place.longitude)}
     if place is not None or whole.why_not:
-        put_combined(output, night, place, [], set(), vertical, about)
+        put_combined(output, night, place, Gathered(), vertical, about)
     return max(saving, 0 if place else NO_FIX)
 
 
@@ -453,7 +453,7 @@ def _work(
     air = options.atmosphere_of(args)
     # without a frame that can be read, each one reports why it cannot
     if about is None:
-        return Solving(Given(None), atmosphere=air)
+        return Solving(Instruments(None), atmosphere=air)
     tilt = None if night.tilt is None else Path(night.tilt)
     work, remarks = work_of(given_of(args, about), about, tilt, air, place)
     for remark in remarks:

@@ -28,7 +28,7 @@ class Places(Protocol):
 
 
 @at_once
-@dataclass(frozen=True, eq=False, kw_only=True)
+@dataclass(frozen=True, kw_only=True)
 class Place:
     """A place on the Earth; make it by `on_ellipsoid` or `by_gravity`.
 

@@ -2,84 +2,24 @@
 """The error budget of a fix: the effect of each source of error on place, heading and attitude."""
 
 import math
-from collections.abc import Iterable
-from dataclasses import KW_ONLY, dataclass
-from enum import Enum
+from dataclasses import dataclass
 from functools import cached_property, partial
 
 import numpy as np
 
-from starpos import rotation
 from starpos._numeric.roots import symmetric_root
 from starpos.earth.ellipsoid import curvature_radii_m, enu_axes, meridian_turn, place_of_zenith
 from starpos.earth.orientation import ROTATION_RAD_S, EarthState
 from starpos.fix._adjustment import gain_of, spread
+from starpos.fix.attitude import ENU, LINK, Attitude, heading_row
+from starpos.fix.terms import ALWAYS, EACH_POSE, ErrorTerm, Origin, total_covariance
 from starpos.frozen import at_once
 from starpos.instrument.inclinometer import Tilt
 from starpos.instrument.mounting import LocalLevel, Mounting
 from starpos.units import HOUR_S
 
-# Values of `ErrorTerm.shared`. The average of several fixes replaces EACH_POSE by the key of the pose, which a single fix
-# does not know.
-ALWAYS, EACH_POSE = ("always",), ("pose",)
 # Name of the term of the calibrated A3.
 CALIBRATION = "calibration"
-# 1 sigma of the difference of two unmeasured temperatures: a warm room and a clear night
-UNKNOWN_TEMPERATURE_C = 14.0
-
-
-class Origin(Enum):
-    """Origin of an error. What GNSS teaches (starpos.gnss) replaces the terms of A3 and INCLINOMETER."""
-
-    A3 = "the angle between camera and inclinometer"
-    INCLINOMETER = "errors of the inclinometer that last longer than one frame"
-    READINGS = "noise of the tilts of one frame"
-    OTHER = "stars, air, time, mount"
-
-
-@at_once
-@dataclass(frozen=True)
-class ErrorTerm:
-    """One source of error: its covariance is variance * factor @ factor.T.
-
-    factor (6, m): rows are east m, north m, heading rad, and the attitude's small rotation about east, north, up in rad.
-    shared: which frames have the same error.  None: each frame has a new one.  ALWAYS: all frames share it, as for a
-    calibration or a clock.  EACH_POSE: all frames share it until the instrument is touched.  Any other tuple: the keys of
-    the readings or stars of which the error is the mean; the errors of two frames have the `correlation` of their keys.
-    walk_s: growth of the variance per second, for an error that wanders.
-    constant_within_pose: the true factor stays the same until the camera is touched.  Factors of the frames of a pose
-    differ only by noise, so an average uses the first one's.
-    origin: what the error comes from.
-    """
-
-    name: str
-    factor: np.ndarray
-    _: KW_ONLY
-    shared: tuple | None = None
-    variance: float = 1.0
-    walk_s: float = 0.0
-    constant_within_pose: bool = False
-    origin: Origin = Origin.OTHER
-
-    @property
-    def covariance(self) -> np.ndarray:
-        """Covariance (6, 6) of the rows of `factor`."""
-        return self.variance * self.factor @ self.factor.T
-
-    @property
-    def common(self) -> bool:
-        """Whether the error is the same in all frames."""
-        return self.shared == ALWAYS
-
-
-def total_covariance(terms: Iterable[ErrorTerm]) -> np.ndarray:
-    """Sum of the covariances of independent terms, (6, 6) if their factors have six rows."""
-    return np.sum([t.covariance for t in terms], axis=0)
-
-
-def correlation(a: tuple, b: tuple) -> float:
-    """Correlation of the means of two sets of equally good readings that have the keys `a` and `b`."""
-    return len(set(a) & set(b)) / (len(a) * len(b)) ** 0.5 if a and b else 0.0
 
 
 @at_once
@@ -138,17 +78,9 @@ class Sensitivity:
         return cls(stars, level)
 
 
-def heading_of(link_to_enu: np.ndarray) -> float:
-    """Azimuth (rad, 0 to 2 pi) of the base link's x axis."""
-    return rotation.full_turn(np.arctan2(link_to_enu[0, 0], link_to_enu[1, 0]))
-
-
-def heading_row(link_to_enu: np.ndarray) -> np.ndarray:
-    """Change (3,) of the heading for small rotations of the attitude link_to_enu (3, 3) about east, north, up."""
-    east, north, up = link_to_enu[:, 0].tolist()
-    level = max(east * east + north * north, 1e-12)
-    # d azimuth = (north d_east - east d_north) / level, with d(forward) = spin x forward
-    return np.array([east * up / level, north * up / level, -1.0])
+def link_attitude(link_to_enu: np.ndarray, terms: tuple[ErrorTerm, ...]) -> Attitude:
+    """The attitude of the base link in east, north, up, with its budget."""
+    return Attitude(link_to_enu, total_covariance(terms)[3:, 3:], of=LINK, into=ENU, terms=terms)
 
 
 def mount_term(name: str, link_to_enu: np.ndarray, stddev: float) -> tuple[ErrorTerm, ...]:
@@ -296,6 +228,7 @@ def _inclinometer_terms(
     """
     errors, term = mounting.inclinometer, partial(ErrorTerm, origin=Origin.INCLINOMETER)
     since_s = abs(utc_unix_s - mounting.calibrated_unix_s)
+    warmer_c = mounting.warmer_c(tilt)
     return (
         ErrorTerm("tilt", rows @ symmetric_root(tilt.noise), shared=tilt.times, origin=Origin.READINGS),
         term("tilt quantisation", rows * errors.undithered_rad(tilt), shared=errors.steps(tilt)),
@@ -310,19 +243,9 @@ def _inclinometer_terms(
         ),
         term(
             "tilt temperature",
-            rows * errors.temperature_rad_per_c * _warmer_c(tilt, mounting),
+            rows
+            * errors.temperature_rad_per_c
+            * (warmer_c if math.isfinite(warmer_c) else mounting.unmeasured_c),
             shared=ALWAYS,
         ),
     )
-
-
-def _warmer_c(tilt: Tilt, mounting: Mounting) -> float:
-    """The inclinometer's temperature minus the calibration's; if unknown, its expected 1 sigma.
-
-    If a calibration has neither a date nor a temperature, its stated error holds for all temperatures.
-    """
-    warmer = tilt.temperature_c - mounting.calibrated_temperature_c
-    if math.isfinite(warmer):
-        return warmer
-    dated = math.isfinite(mounting.calibrated_unix_s) or math.isfinite(mounting.calibrated_temperature_c)
-    return UNKNOWN_TEMPERATURE_C if dated else 0.0

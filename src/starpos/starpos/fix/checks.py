@@ -12,8 +12,9 @@ from starpos.earth.ellipsoid import EARTH_RADIUS_M
 from starpos.earth.orientation import ROTATION_RAD_S
 from starpos.earth.refraction import MIN_COS_ZENITH
 from starpos.errors import FixError, PlaceError
-from starpos.fix.budget import CALIBRATION, ErrorTerm
+from starpos.fix.budget import CALIBRATION
 from starpos.fix.fix import Fix, angle_text
+from starpos.fix.terms import ErrorTerm
 from starpos.frames.frame import SATURATED, Stars
 from starpos.identification import MIN_STARS
 from starpos.instrument.camera import Camera
@@ -68,14 +69,14 @@ def check_unmoved(fix: Fix, instrument: Instrument, clock_stddev_s: float) -> No
     if vertical is None:
         return
     then = np.asarray(vertical.camera_to_itrs, float)
-    turned = fix.camera_to_itrs @ then.T
+    turned = fix.camera.rotation @ then.T
     since_s = abs(fix.utc_unix_s - instrument.calibration.utc_unix_s)
     sag2 = instrument.inclinometer.drift_rad_per_sqrt_hour**2 * since_s / HOUR_S
     # the air bends the whole field by about as much as it moves the zenith, then and now
     air2 = (
         sum(np.trace(t.covariance[:2, :2]) for t in fix.terms if t.name == "refraction") / EARTH_RADIUS_M**2
     )
-    covariance = fix.camera_covariance + np.asarray(vertical.covariance_arcsec2) * ARCSEC**2
+    covariance = fix.camera.covariance + np.asarray(vertical.covariance_arcsec2) * ARCSEC**2
     covariance = covariance + np.eye(3) * (sag2 + air2)
     covariance[2, 2] += 2 * (ROTATION_RAD_S * clock_stddev_s) ** 2
     angle = float(np.arccos(np.clip((np.trace(turned) - 1) / 2, -1, 1)))

@@ -5,23 +5,20 @@ covariance.
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from starpos import rotation
 from starpos._numeric.roots import symmetric_root
-from starpos.earth.orientation import EarthState, station_velocity
+from starpos.earth.orientation import EarthState
 from starpos.earth.refraction import Atmosphere
-from starpos.fix.budget import (
-    ErrorTerm,
-    Sensitivity,
-    error_terms,
-    heading_of,
-    local_north,
-    mount_term,
-    total_covariance,
-)
-from starpos.fix.star_fit import MatchedStars, SeenFrame, apparent, fit_stars
+from starpos.earth.vertical import Geodetic, Vertical, geodetic
+from starpos.fix.attitude import CAMERA, ITRS, Attitude, heading_of
+from starpos.fix.budget import Sensitivity, error_terms, link_attitude, local_north, mount_term
+from starpos.fix.sighting import FittedSighting, fitted_fields
+from starpos.fix.star_fit import MatchedStars, apparent, fit_stars
+from starpos.fix.terms import ErrorTerm, total_covariance
 from starpos.frames.exposure import GLOBAL_SHUTTER, Shutter
 from starpos.frames.tables import Pointing
 from starpos.frozen import at_once
@@ -91,38 +88,66 @@ class InDegrees:
 
 @at_once
 @dataclass(frozen=True, kw_only=True)
-class Fix(SeenFrame):
-    """Astronomic latitude, longitude and heading (rad) at one instant, with the error budget.
+class PlaceFix:
+    """Astronomic latitude, longitude and heading (rad) at one time, with the budget of their errors.
 
-    link_to_enu (3, 3): attitude of the base link.
-    levelling (6, 2): change of the rows of an ErrorTerm for errors, in rad, of up about two axes fixed to the
-    inclinometer.
+    The heading is NaN where none is known.
     """
 
+    utc_unix_s: float
     latitude: float
     longitude: float
     heading: float
-    link_to_enu: np.ndarray
     terms: tuple[ErrorTerm, ...]
-    levelling: np.ndarray
 
     @property
     def covariance(self) -> np.ndarray:
-        """Covariance (3, 3) of east m, north m, heading rad."""
-        return total_covariance(self.terms)[:3, :3]
+        """Covariance (3, 3) of east m, north m, heading rad; its last row and column are NaN if the heading is."""
+        covariance = total_covariance(self.terms)[:3, :3]
+        if math.isnan(self.heading):
+            covariance[2] = covariance[:, 2] = np.nan
+        return covariance
+
+    @property
+    def own(self) -> np.ndarray:
+        """Covariance (3, 3) of the errors that are new in each frame, by which the frames differ from each other."""
+        return sum((t.covariance[:3, :3] for t in self.terms if not t.common), np.zeros((3, 3)))
+
+    @property
+    def sigma(self) -> np.ndarray:
+        """Standard deviations (3,) of east m, north m, heading rad."""
+        return np.sqrt(np.diag(self.covariance))
 
     @property
     def in_degrees(self) -> InDegrees:
         """Place and heading in degrees."""
         return InDegrees.of(self.latitude, self.longitude, self.heading, self.covariance)
 
+    def on_ground(self, vertical: Vertical) -> Geodetic:
+        """The geodetic place, with the deflection of the vertical removed."""
+        return geodetic(self.latitude, self.longitude, self.heading, self.covariance, vertical)
+
+
+@at_once
+@dataclass(frozen=True, kw_only=True)
+class Fix(PlaceFix, FittedSighting):
+    """The place and attitude of the instrument, from one frame and its level.
+
+    link_to_enu (3, 3): attitude of the base link.
+    levelling (6, 2): change of the rows of an ErrorTerm for errors, in rad, of up about two axes fixed to the
+    inclinometer.
+    """
+
+    link_to_enu: np.ndarray
+    levelling: np.ndarray
+
     def __repr__(self) -> str:
         return f"<Fix: {self.in_degrees}>"
 
-    @property
-    def attitude_covariance(self) -> np.ndarray:
-        """Covariance (3, 3) in rad2 of the base link's orientation about east, north, up."""
-        return total_covariance(self.terms)[3:, 3:]
+    @cached_property
+    def link(self) -> Attitude:
+        """Attitude of the base link in east, north, up."""
+        return link_attitude(self.link_to_enu, self.terms)
 
 
 def solve_fix(
@@ -167,27 +192,17 @@ def solve_fix(
         ),
         *mount_term("mount", link_to_enu, mounting.link_stddev_rad),
     )
-    axis = g @ camera.centre_ray
-    bent = math.dist(axis, refraction.unbend(axis))
     return Fix(
-        utc_unix_s=earth.utc_unix_s,
+        **fitted_fields(seen, camera, g, fit.a4, refraction, earth),
+        clock_stddev_s=clock_stddev_s,
+        stamp_stddev_s=stamp_stddev_s,
+        tilt=tilt,
         latitude=place.latitude,
         longitude=place.longitude,
         heading=heading_of(link_to_enu),
         link_to_enu=link_to_enu,
         terms=terms,
         levelling=sensitivity.level @ (level.turns @ axes),
-        used=np.flatnonzero(fit.keep),
-        residual_px=seen.residual,
-        residual_arcsec=seen.residual_px * camera.scale_arcsec,
-        jitter_px=math.sqrt(fit.jitter2),
-        focal_scale=fit.scale,
-        zenith_distance=math.acos(min(max(axis[2], -1.0), 1.0)),
-        refraction_arcsec=bent / ARCSEC,
-        diurnal_aberration_arcsec=math.hypot(*station_velocity(fit.a4[2])) / ARCSEC,
-        ut1_minus_utc_s=earth.orientation.ut1_minus_utc_s,
-        camera_to_itrs=fit.a4.T @ g,
-        camera_covariance=fit.a4.T @ errors.rotation_covariance(errors.centroids) @ fit.a4,
     )
 
 
@@ -229,7 +244,7 @@ def pointing_fix(
         np.zeros(RING_STARS),
     )
     fix = solve_fix(stars, IDEAL, tilt, seen, atmosphere, earth, clock_stddev_s, pointing.stamp_stddev_s)
-    g, to_itrs = seen.level(tilt).camera, fix.camera_to_itrs
+    g, to_itrs = seen.level(tilt).camera, fix.camera.rotation
     # the centre's error turns the frame about two axes across its own, the roll's error about its own axis
     own = np.diag([pointing.sigma, pointing.sigma, pointing.sigma_roll]) ** 2
     sensitivity = Sensitivity.of(local_north(g @ to_itrs.T), fix.link_to_enu)
@@ -243,8 +258,7 @@ def pointing_fix(
         residual_px=np.zeros((0, 2)),
         residual_arcsec=float("nan"),
         jitter_px=0.0,
-        camera_to_itrs=to_itrs @ to_frame,
-        camera_covariance=to_itrs @ own @ to_itrs.T,
+        camera=Attitude(to_itrs @ to_frame, to_itrs @ own @ to_itrs.T, of=CAMERA, into=ITRS),
     )
 
 

@@ -5,25 +5,26 @@ reverse of the fix: there the level is known and A4, which holds the place, is f
 
 import math
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
 from starpos import rotation
 from starpos._numeric.roots import symmetric_root
 from starpos.earth.ellipsoid import meridian_turn
-from starpos.earth.orientation import ROTATION_RAD_S, EarthState, station_velocity
+from starpos.earth.orientation import ROTATION_RAD_S, EarthState
 from starpos.earth.place import Place
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import FixError, PlaceError
-from starpos.fix.budget import ALWAYS, ErrorTerm, heading_of, heading_row, mount_term, total_covariance
+from starpos.fix.attitude import Attitude, heading_row
+from starpos.fix.budget import link_attitude, mount_term
 from starpos.fix.checks import check_visible
-from starpos.fix.star_fit import MatchedStars, SeenFrame, StarFit, apparent, fit_stars
+from starpos.fix.sighting import FittedSighting, fitted_fields
+from starpos.fix.star_fit import MatchedStars, StarFit, apparent, fit_stars
+from starpos.fix.terms import ALWAYS, ErrorTerm
 from starpos.frames.exposure import GLOBAL_SHUTTER, Shutter
 from starpos.frozen import at_once
 from starpos.instrument.camera import Camera
 from starpos.instrument.mounting import Mounting
-from starpos.units import ARCSEC
 
 # the level settles to this, rad; refraction turns with it, and settles a thousand times faster, or ten times at 10 deg
 SETTLED_RAD, MAX_ROUNDS = 1e-9, 10
@@ -33,54 +34,7 @@ MIN_SHARE, REFRACTION_SIGMAS = 0.5, 5.0
 
 @at_once
 @dataclass(frozen=True, kw_only=True)
-class LinkAttitude:
-    """Attitude of the base link in east, north, up: link_to_enu (3, 3), and its error budget.
-
-    terms: as in a fix; the place is given, so its rows are 0.
-    """
-
-    link_to_enu: np.ndarray
-    terms: tuple[ErrorTerm, ...]
-
-    @property
-    def attitude_covariance(self) -> np.ndarray:
-        """Covariance (3, 3) in rad2 of the small rotation about east, north, up."""
-        return total_covariance(self.terms)[3:, 3:]
-
-    @property
-    def heading(self) -> float:
-        """Azimuth (rad, 0 to 2 pi) of the link's x axis, clockwise from north."""
-        return heading_of(self.link_to_enu)
-
-    @property
-    def pitch(self) -> float:
-        """Elevation (rad) of the link's x axis: positive with the nose up, unlike a turn about ROS's y axis."""
-        return math.asin(min(max(self.link_to_enu[2, 0], -1.0), 1.0))
-
-    @property
-    def roll(self) -> float:
-        """Turn (rad, -pi to pi) about the link's x axis: positive with the left side up."""
-        return math.atan2(self.link_to_enu[2, 1], self.link_to_enu[2, 2])
-
-    @cached_property
-    def covariance(self) -> np.ndarray:
-        """Covariance (3, 3) in rad2 of heading, pitch, roll; unbounded where x is vertical."""
-        return self._slope @ self.attitude_covariance @ self._slope.T
-
-    @property
-    def _slope(self) -> np.ndarray:
-        """Change (3, 3) of heading, pitch, roll for small rotations about east, north, up."""
-        east, north, _ = self.link_to_enu[:, 0].tolist()
-        level = max(math.hypot(east, north), 1e-6)
-        pitch = np.array([north, -east, 0.0]) / level
-        # about x itself by all of it, and up to the horizon by what the heading turns
-        roll = np.array([east, north, 0.0]) / level**2
-        return np.array([heading_row(self.link_to_enu), pitch, roll])
-
-
-@at_once
-@dataclass(frozen=True, kw_only=True)
-class AttitudeAtPlace(SeenFrame):
+class AttitudeAtPlace(FittedSighting):
     """Attitude of the instrument at a known place, by the stars alone.
 
     plumb: in east, north, up by the plumb line (astronomic).  ellipsoid: by WGS 84's normal (geodetic).
@@ -88,14 +42,14 @@ class AttitudeAtPlace(SeenFrame):
     """
 
     place: Place
-    plumb: LinkAttitude
-    ellipsoid: LinkAttitude
-    true_north: LinkAttitude
+    plumb: Attitude
+    ellipsoid: Attitude
+    true_north: Attitude
 
     @property
     def text(self) -> str:
         """The heading by the plumb line, in deg, with its error."""
-        sigma = math.degrees(math.sqrt(self.plumb.covariance[0, 0]))
+        sigma = math.degrees(math.sqrt(self.plumb.angles_covariance[0, 0]))
         return f"heading {math.degrees(self.plumb.heading):.5f} +- {sigma:.5f} deg at the known place"
 
     def __repr__(self) -> str:
@@ -136,20 +90,19 @@ def attitude_at_place(
     else:
         raise FixError("the stars lie too low for their refraction to be known: point the camera higher")
     _check_refraction(seen, atmosphere)
-    axis = g @ camera.centre_ray
     terms = _rotations(seen, atmosphere, earth, shutter, camera.height, clock_stddev_s, stamp_stddev_s, a4)
     link = g @ mounting.link_to_camera
     to_ellipsoid = place.axes @ a4.T
     turn = math.atan2(to_ellipsoid[0, 1], to_ellipsoid[1, 1])
     north = rotation.about_axis(2, -turn)
 
-    def attitude(link_to_enu: np.ndarray, level_stddev: float, north_stddev: float) -> LinkAttitude:
+    def attitude(link_to_enu: np.ndarray, level_stddev: float, north_stddev: float) -> Attitude:
         moved = _zenith_moved(place.plumb[0])
         errors = {**terms, "place": moved @ place.zenith_root}
         errors["deflection"] = moved * np.array([[level_stddev], [level_stddev], [north_stddev]])
-        return LinkAttitude(
-            link_to_enu=link_to_enu,
-            terms=(
+        return link_attitude(
+            link_to_enu,
+            (
                 *(_term(name, rotations, link_to_enu, seen) for name, rotations in errors.items()),
                 *mount_term("lens", link_to_enu, axis_stddev),
                 *mount_term("mount", link_to_enu, mounting.link_stddev_rad),
@@ -157,22 +110,13 @@ def attitude_at_place(
         )
 
     return AttitudeAtPlace(
-        utc_unix_s=earth.utc_unix_s,
+        **fitted_fields(seen, camera, g, a4, refraction, earth),
+        clock_stddev_s=clock_stddev_s,
+        stamp_stddev_s=stamp_stddev_s,
         place=place,
         plumb=attitude(link, place.plumb_stddev, place.plumb_stddev),
         ellipsoid=attitude(to_ellipsoid @ link, place.ellipsoid_stddev, place.ellipsoid_stddev),
         true_north=attitude(north @ link, place.plumb_stddev, place.ellipsoid_stddev),
-        used=np.flatnonzero(seen.fit.keep),
-        residual_px=seen.residual,
-        residual_arcsec=seen.residual_px * camera.scale_arcsec,
-        jitter_px=math.sqrt(seen.fit.jitter2),
-        focal_scale=seen.fit.scale,
-        zenith_distance=math.acos(min(max(axis[2], -1.0), 1.0)),
-        refraction_arcsec=math.dist(axis, refraction.unbend(axis)) / ARCSEC,
-        diurnal_aberration_arcsec=math.hypot(*station_velocity(a4[2])) / ARCSEC,
-        ut1_minus_utc_s=earth.orientation.ut1_minus_utc_s,
-        camera_to_itrs=a4.T @ g,
-        camera_covariance=a4.T @ seen.errors.rotation_covariance(seen.errors.centroids) @ a4,
     )
 
 

@@ -165,7 +165,7 @@ def focal_px_that_fits(solver: Solver, stars: Stars) -> float | None:
     found = focal_that_fits(solver, stars)
     if found is None and quads.is_built(solver.catalogue):
         answer = BlindSolver(solver.catalogue, stages=STAGES[:1], fisheye_stages=()).identify(stars)
-        found = None if answer.attitude is None else answer.attitude.focal_px
+        found = None if answer.pointing is None else answer.pointing.focal_px
     return found
 
 
@@ -197,7 +197,7 @@ def _another(
         return first
     for seen, enough in _seen(item, first.stars):
         for answer in ways(seen):
-            if answer.attitude is not None and answer.attitude.log_odds >= enough:
+            if answer.pointing is not None and answer.pointing.log_odds >= enough:
                 return Sight(seen, answer)
             if is_over():
                 return first
@@ -231,9 +231,9 @@ def answer_by_header(solver: Solver, question: Question, progress: Progress) -> 
     if fitting is None:
         return sight
     again = answer_frame(replace(solver, instrument=fitting), question)
-    if again.solution.attitude is None:
+    if again.solution.pointing is None:
         return sight
-    remark = wrong_header(item, again.solution.attitude.focal_px)
+    remark = wrong_header(item, again.solution.pointing.focal_px)
     return replace(again, solution=replace(again.solution, remark=remark), instrument=fitting)
 
 
@@ -285,5 +285,5 @@ def _fitting(solver: Solver, q: Question, progress: Progress) -> Instrument | No
         return replace(solver.instrument, focal_px=focal_px)
     blind = BlindSolver(solver.catalogue, progress, search_s=HINT_SEARCH_S)
     blind.prepare()
-    seen = identify_blind_every_way(blind, q.item, q.stars).solution.attitude
+    seen = identify_blind_every_way(blind, q.item, q.stars).solution.pointing
     return None if seen is None else replace(solver.instrument, focal_px=seen.focal_px, model=seen.model)

@@ -44,7 +44,7 @@ class Status(str, Enum):
 
 @at_once
 @dataclass(frozen=True, kw_only=True)
-class Attitude:
+class FieldPointing:
     """Pointing of the camera: ICRS place of the frame's centre pixel, and the position angle `roll` of its top (rad).
 
     model: of its lens.
@@ -88,7 +88,7 @@ class Solution:
     names: tuple[str, ...] = ()
     star: np.ndarray | None = None
     magnitudes: np.ndarray | None = None
-    attitude: Attitude | None = None
+    pointing: FieldPointing | None = None
     fix: Fix | None = None
     tilt: Tilt | None = None
     identify_s: float = 0.0
@@ -185,7 +185,7 @@ def solution_of(
         names=names,
         star=found.star,
         magnitudes=magnitudes,
-        attitude=attitude_of(found, sky, camera, found.spread_px(stars.x, stars.y)),
+        pointing=pointing_of(found, sky, camera, found.spread_px(stars.x, stars.y)),
         warnings=warnings,
         explained=explained,
         found=found,
@@ -211,7 +211,7 @@ def suspicions(
     return names, explained
 
 
-def attitude_of(found: Identification, sky: Sky, camera: Camera, spread_px: float) -> Attitude:
+def pointing_of(found: Identification, sky: Sky, camera: Camera, spread_px: float) -> FieldPointing:
     """Pointing of the frame's centre; of a mirrored frame, after it was turned the right way up.
 
     spread_px: of the identified stars on the frame, as `Identification.spread_px` has it.
@@ -228,7 +228,7 @@ def attitude_of(found: Identification, sky: Sky, camera: Camera, spread_px: floa
         if turned:
             centre, above = fisheye.FLIP @ centre, fisheye.FLIP @ above
     ra, dec, roll = found.pointing(centre, above, sky.velocity)
-    return Attitude(
+    return FieldPointing(
         ra=ra,
         dec=dec,
         roll=roll,

@@ -15,7 +15,8 @@ from starpos.earth.refraction import Atmosphere, Refraction
 from starpos.errors import FixError
 from starpos.fix._adjustment import Adjustment
 from starpos.fix._scatter import distances2, expected_variance, sifted
-from starpos.fix.budget import ALWAYS, StarErrors
+from starpos.fix.budget import StarErrors
+from starpos.fix.terms import ALWAYS
 from starpos.frames.exposure import Shutter
 from starpos.frames.frame import Stars
 from starpos.frozen import at_once
@@ -184,33 +185,6 @@ class MatchedStars:
             raise ValueError(f"arrays of identified stars differ in length or shape: {shapes}")
         if not np.isfinite(self.covariance_px2).all():
             raise FixError("the error of a star's place is not a finite number: leave that star out")
-
-
-@at_once
-@dataclass(frozen=True, kw_only=True)
-class SeenFrame:
-    """What a fit of a frame's stars comes to, whatever it was made for.
-
-    used (M,): rows of the given stars that were kept; residual_px (M, 2): their fitted places minus their seen places.
-    jitter_px: scatter of the stars beyond the centroids' own errors (seeing, optics).
-    focal_scale: factor on the given focal length.
-    zenith_distance: of the optical axis, rad.
-    camera_to_itrs (3, 3): attitude of the camera against the Earth by the stars alone; camera_covariance (3, 3) in rad2:
-    of its small rotation about the Earth's axes.
-    """
-
-    utc_unix_s: float
-    used: np.ndarray
-    residual_px: np.ndarray
-    residual_arcsec: float
-    jitter_px: float
-    focal_scale: float
-    zenith_distance: float
-    refraction_arcsec: float
-    diurnal_aberration_arcsec: float
-    ut1_minus_utc_s: float
-    camera_to_itrs: np.ndarray
-    camera_covariance: np.ndarray
 
 
 def sound_matches(stars: Stars, found: Identification, enough: int) -> np.ndarray:

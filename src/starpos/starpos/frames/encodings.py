@@ -13,10 +13,12 @@ import numpy as np
 from starpos.errors import FrameError
 from starpos.frames.frame import PATTERNS
 from starpos.frames.pictures import frame_pixels
+from starpos.frozen import at_once
 
 MOSAICS = tuple(filter(None, PATTERNS))
 
 
+@at_once
 @dataclass(frozen=True)
 class Encoding:
     """How pixels lie in a row.

@@ -10,8 +10,10 @@ from starpos import rotation
 from starpos.earth.ellipsoid import curvature_radii_m, enu_axes, place_of_zenith
 from starpos.earth.place import Place
 from starpos.earth.vertical import Vertical
-from starpos.fix.budget import Origin, total_covariance
 from starpos.fix.fix import Fix
+from starpos.fix.sighting import Sighting
+from starpos.fix.terms import Origin, total_covariance
+from starpos.frozen import at_once
 from starpos.gnss.receiver import gnss_place
 from starpos.gnss.states import Learned, aged, ageing, prior
 from starpos.instrument.inclinometer import Tilt
@@ -22,19 +24,15 @@ from starpos.units import ARCSEC
 LEARNED_ORIGINS = (Origin.A3, Origin.INCLINOMETER)
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class LevelSight:
-    """Attitude of the camera by the stars, camera_to_itrs (3, 3), and the tilt of a frame.
+@at_once
+@dataclass(frozen=True, kw_only=True)
+class LevelSight(Sighting):
+    """A sighting with a tilt, and a rough place.
 
-    camera_covariance (3, 3): as in a Fix.
     zenith_covariance (3, 3): of a zenith in ITRS by the errors of the stars, the air and the time, rad2.
     latitude, longitude (rad): of the fix, whose A3 may be wrong.
     """
 
-    utc_unix_s: float
-    camera_to_itrs: np.ndarray
-    camera_covariance: np.ndarray
-    tilt: Tilt
     zenith_covariance: np.ndarray
     latitude: float
     longitude: float
@@ -48,8 +46,7 @@ class LevelSight:
         covariance = total_covariance(stars)[:2, :2] / np.outer(radii, radii)
         return cls(
             utc_unix_s=fix.utc_unix_s,
-            camera_to_itrs=fix.camera_to_itrs,
-            camera_covariance=fix.camera_covariance,
+            camera=fix.camera,
             tilt=tilt,
             zenith_covariance=axes.T @ covariance @ axes,
             latitude=fix.latitude,
@@ -60,14 +57,14 @@ class LevelSight:
 def zenith_of_stars(sighting: LevelSight, learned: Learned) -> np.ndarray:
     """Up (3,) in ITRS by the plumb line, as camera and inclinometer have it with what was learned."""
     up_in_camera = learned.rotation.T @ learned.up(sighting.tilt)
-    return sighting.camera_to_itrs @ up_in_camera
+    return sighting.camera.rotation @ up_in_camera
 
 
 def zenith_rows(sighting: LevelSight, learned: Learned, up: np.ndarray) -> np.ndarray:
     """Derivatives (3, n) of `zenith_of_stars` by the states; up (3,): in S."""
     rows = learned.tilted(sighting.tilt)
     rows[:, learned.layout.a3] = rotation.cross_matrix(up)
-    return sighting.camera_to_itrs @ learned.rotation.T @ rows
+    return sighting.camera.rotation @ learned.rotation.T @ rows
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,7 +98,7 @@ def innovation(
     # along two directions at the place
     seen = axes[:2] @ (zenith_of_stars(sighting, learned) - expected)
     # the stars' plumb line has no noise of the tilts, by which an unknown turn of A3 would seem to be determined
-    up = learned.rotation @ (sighting.camera_to_itrs.T @ expected if up_in_camera is None else up_in_camera)
+    up = learned.rotation @ (sighting.camera.rotation.T @ expected if up_in_camera is None else up_in_camera)
     rows = -axes[:2] @ zenith_rows(sighting, learned, up)
     rows[:, at.constant] += np.eye(2)
     rows[:, at.field] += np.eye(2)
@@ -113,7 +110,7 @@ def innovation(
 
 def tilt_noise(sighting: LevelSight, learned: Learned) -> np.ndarray:
     """Covariance (3, 3) of the zenith in ITRS by the noise of the readings."""
-    back = sighting.camera_to_itrs @ learned.rotation.T @ sighting.tilt.slope
+    back = sighting.camera.rotation @ learned.rotation.T @ sighting.tilt.slope
     return back @ sighting.tilt.noise @ back.T
 
 
@@ -188,7 +185,7 @@ def begun(instrument: Instrument, frames: Sequence[GnssFrame], vertical: Vertica
     start = prior(instrument, first.sighting.tilt, stddev, first.sighting.utc_unix_s)
     stated, a3 = start.a3, start.a3
     if instrument.calibration.unknown:
-        in_camera = np.array([frame.sighting.camera_to_itrs.T @ frame.gnss.zenith for frame in frames])
+        in_camera = np.array([frame.sighting.camera.rotation.T @ frame.gnss.zenith for frame in frames])
         in_sensor = np.array([frame.sighting.tilt.up for frame in frames])
         stated = a3 = rotation.best_rotation(in_camera, in_sensor)
     at = start.layout

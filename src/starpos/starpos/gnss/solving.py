@@ -10,10 +10,11 @@ from starpos._numeric.roots import symmetric_root
 from starpos.earth.ellipsoid import curvature_radii_m, enu_axes, meridian_turn
 from starpos.earth.place import Place
 from starpos.earth.vertical import Deflection, Geodetic, Vertical, geodetic
-from starpos.fix.budget import ALWAYS, ErrorTerm, Sensitivity, local_north, total_covariance
+from starpos.fix.budget import Sensitivity, local_north
 from starpos.fix.fix import Fix
 from starpos.fix.solution import Solution, Status
 from starpos.fix.solver import Solver
+from starpos.fix.terms import ALWAYS, ErrorTerm, total_covariance
 from starpos.frames.frame import Stars
 from starpos.gnss.filter import LEARNED_ORIGINS, LevelSight, zenith_rows
 from starpos.gnss.states import Learned
@@ -100,7 +101,7 @@ def _up(watch: GnssWatch, fix: Fix, tilt: Tilt, gnss: Place | None) -> np.ndarra
         return None
     stated, axes = watch.vertical.at(gnss.latitude, gnss.longitude), gnss.axes
     lean = ARCSEC * (stated.eta_arcsec * axes[0] + stated.xi_arcsec * axes[1])
-    return fix.camera_to_itrs.T @ rotation.normalised(axes[2] + lean)
+    return fix.camera.rotation.T @ rotation.normalised(axes[2] + lean)
 
 
 def _levelled(solver: Solver, stars: Stars, answer: Solution, up_in_camera: np.ndarray | None) -> Solution:

@@ -16,11 +16,10 @@ from starpos import files, rotation
 from starpos.earth.ellipsoid import EARTH_RADIUS_M
 from starpos.earth.vertical import Vertical
 from starpos.errors import GnssError
-from starpos.fix.budget import UNKNOWN_TEMPERATURE_C
-from starpos.instrument.inclinometer import InclinometerErrors, Tilt
+from starpos.instrument.inclinometer import UNMEASURED_WALK_C_PER_SQRT_HOUR, InclinometerErrors, Tilt
 from starpos.instrument.instrument import Instrument
 from starpos.instrument.mounting import RESPONSE_COEFFICIENTS, Zeroed, response_columns, stated_variances
-from starpos.units import ARCSEC, HOUR_S
+from starpos.units import ARCSEC
 
 # Share of the deflection's variance that is the same everywhere the instrument goes; the rest is a field.
 CONSTANT_SHARE = 0.5
@@ -33,8 +32,6 @@ FIELD_LENGTH_M = 37_000.0
 GNSS_SLOW_RAD, GNSS_SLOW_S = 10.0 / EARTH_RADIUS_M, 300.0
 # 1 sigma about each axis of an unknown A3.
 NO_A3_RAD = 1.0
-# A night's cooling: the random walk of an unmeasured temperature.
-UNMEASURED_C_PER_SQRT_HOUR = 14.0 / np.sqrt(6.0)
 
 
 @dataclass(frozen=True)
@@ -191,11 +188,9 @@ def prior(instrument: Instrument, tilt: Tilt, deflection_stddev_rad: float, utc_
         np.eye(3) * NO_A3_RAD**2 if calibration.unknown else mounting.calibration_covariance
     ) + np.eye(3) * mounting.remounted_rad**2
     since_s = abs(utc_unix_s - calibration.utc_unix_s)
-    drift2 = errors.drift_rad_per_sqrt_hour**2 * (since_s if np.isfinite(since_s) else 0.0) / HOUR_S
-    warmer_c = tilt.temperature_c - calibration.temperature_c
-    dated = np.isfinite(since_s) or np.isfinite(calibration.temperature_c)
-    if dated and not np.isfinite(warmer_c):
-        drift2 += (errors.temperature_rad_per_c * UNKNOWN_TEMPERATURE_C) ** 2
+    drift2, warmer_c = errors.wander_variance(since_s), mounting.warmer_c(tilt)
+    if not np.isfinite(warmer_c):
+        drift2 += (errors.temperature_rad_per_c * mounting.unmeasured_c) ** 2
     state = np.zeros(at.size)
     if calibration.response and len(calibration.response) == RESPONSE_COEFFICIENTS[tilt.axes]:
         state[at.response] = calibration.response
@@ -206,7 +201,7 @@ def prior(instrument: Instrument, tilt: Tilt, deflection_stddev_rad: float, utc_
     for rows, value in (
         (at.zero, drift2),
         (at.temperature, errors.temperature_rad_per_c**2),
-        (at.pose, pose_variance(errors, tilt)),
+        (at.pose, errors.pose_variance(tilt)),
         (at.constant, CONSTANT_SHARE * deflection2),
         (at.field, (1 - CONSTANT_SHARE) * deflection2),
         (at.gnss, GNSS_SLOW_RAD**2),
@@ -222,11 +217,6 @@ def prior(instrument: Instrument, tilt: Tilt, deflection_stddev_rad: float, utc_
         covariance=variance,
         utc_unix_s=utc_unix_s,
     )
-
-
-def pose_variance(errors: InclinometerErrors, tilt: Tilt) -> float:
-    """Variance (rad2) of what is new at each pose: hysteresis, flexure, and the rounding that noise does not remove."""
-    return errors.pose_rad**2 + errors.undithered_rad(tilt) ** 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -258,17 +248,15 @@ def ageing(
     at = learned.layout
     share, variance = np.ones(at.size), np.zeros(at.size)
     seconds = abs(utc_unix_s - learned.utc_unix_s)
-    walk = errors.drift_rad_per_sqrt_hour**2
-    if not np.isfinite(tilt.temperature_c - learned.temperature_c):
-        walk += (errors.temperature_rad_per_c * UNMEASURED_C_PER_SQRT_HOUR) ** 2
-    variance[at.zero] = walk * seconds / HOUR_S
+    measured = np.isfinite(tilt.temperature_c - learned.temperature_c)
+    variance[at.zero] = errors.wander_variance(seconds, 0.0 if measured else UNMEASURED_WALK_C_PER_SQRT_HOUR)
     kept = np.exp(-moved_m / FIELD_LENGTH_M)
     share[at.field] = kept
     variance[at.field] = (1 - CONSTANT_SHARE) * deflection_stddev_rad**2 * (1 - kept**2)
     kept = np.exp(-seconds / GNSS_SLOW_S)
     share[at.gnss], variance[at.gnss] = kept, GNSS_SLOW_RAD**2 * (1 - kept**2)
     if new_pose:
-        share[at.pose], variance[at.pose] = 0.0, pose_variance(errors, tilt)
+        share[at.pose], variance[at.pose] = 0.0, errors.pose_variance(tilt)
     return Ageing(share, variance)
 
 

@@ -382,7 +382,7 @@ class GnssWatch:
         if self._of_pose >= FEW_OF_POSE:
             return
         first = self._of_pose == 0
-        up = sighting.camera_to_itrs.T @ gnss.zenith if first else self._held[-1].up_in_camera
+        up = sighting.camera.rotation.T @ gnss.zenith if first else self._held[-1].up_in_camera
         self._held.append(GnssFrame(sighting, gnss, first, up))
         self._of_pose += 1
         self.learned = begun(self._instrument, self._held, self.vertical)

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from starpos import rotation
 from starpos.errors import InstrumentError, TiltError, TiltRangeError
 from starpos.frozen import at_once
-from starpos.units import ARCSEC
+from starpos.units import ARCSEC, HOUR_S
 
 # The -D01 variant.
 SCA100T_RANGE_RAD = np.radians(30.0)
@@ -31,6 +31,11 @@ SQUARE_SIGMA = 5.0
 EXPLAINED_SIGMA = 3.0
 # Maximum temperature at which an inclinometer measures
 MAX_CELSIUS = 300.0
+# Temperatures that no sensor measured: 1 sigma of the difference of two, as of a warm room and a clear night.
+# Its random walk, by a night's cooling; and of an instrument that has long stood outdoors, by some degrees in hours.
+UNMEASURED_JUMP_C = 14.0
+UNMEASURED_WALK_C_PER_SQRT_HOUR = UNMEASURED_JUMP_C / math.sqrt(6.0)
+OUTDOORS_WALK_C_PER_SQRT_HOUR = 2.0
 # sine above which X' counts as vertical: then L's X is taken below Y' instead
 STEEP = 0.999
 
@@ -198,6 +203,15 @@ class InclinometerErrors:
             + self.cross**2 * cross
         )
         return float(squares.sum()) - 1, 2 * float(np.sqrt(variance))
+
+    def wander_variance(self, seconds: float, walk_c_per_sqrt_hour: float = 0.0) -> float:
+        """Variance (rad2) that the zero gains in a time (NaN: 0), also by an unmeasured temperature's random walk."""
+        walk2 = self.drift_rad_per_sqrt_hour**2 + (self.temperature_rad_per_c * walk_c_per_sqrt_hour) ** 2
+        return walk2 * seconds / HOUR_S if math.isfinite(seconds) else 0.0
+
+    def pose_variance(self, tilt: Tilt) -> float:
+        """Variance (rad2) of what is new at each pose: hysteresis, flexure, and the rounding that noise leaves."""
+        return self.pose_rad**2 + self.undithered_rad(tilt) ** 2
 
     def undithered_rad(self, tilt: Tilt) -> float:
         """Error (rad) that rounding leaves in the mean of many readings; noise larger than half a step removes it.

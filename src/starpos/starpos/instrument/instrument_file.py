@@ -116,21 +116,13 @@ INCLINOMETER = {
     "tilt_pose_arcsec": ("pose_rad", ARCSEC),
     "tilt_range_deg": ("range_rad", math.radians(1)),
 }
-CALIBRATED = (
-    "utc",
-    "temperature_c",
-    "tilt_deg",
-    "frames",
-    "valid_days",
-    "response",
-    "response_covariance",
-)
+CALIBRATED = "utc", "temperature_c", "tilt_deg", "frames", "valid_days", "response", "response_covariance"
+# keys that a calibration finds, of A3 or of a fixed camera's vertical; a file may have some of them
+STDDEV, COVARIANCE = "calibration_stddev_arcsec", "calibration_covariance_arcsec2"
+CALIBRATION_KEYS = "misalignment_deg", STDDEV, COVARIANCE, "calibrated", "vertical"
 KEYS = (
     "camera",
-    "misalignment_deg",
-    "calibration_stddev_arcsec",
-    "calibration_covariance_arcsec2",
-    "calibrated",
+    *CALIBRATION_KEYS[:4],
     "remounted_arcsec",
     "link_to_camera",
     "link_to_camera_stddev_arcsec",
@@ -140,9 +132,10 @@ KEYS = (
     "shutter",
     "vertical",
 )
-SIDES = ("width", "height")
-SHUTTER = ("readout_s", "readout_stddev_s")
-VERTICAL = ("camera_to_itrs", "covariance_arcsec2", "sag_arcsec_per_sqrt_hour")
+SIDES = "width", "height"
+INTRINSICS = "fx", "fy", "cx", "cy"
+SHUTTER = "readout_s", "readout_stddev_s"
+VERTICAL = "camera_to_itrs", "covariance_arcsec2", "sag_arcsec_per_sqrt_hour"
 
 
 def read(path: Path | str, needs_camera: bool = True) -> Instrument:
@@ -199,31 +192,18 @@ def write(path: Path | str, instrument: Instrument, comment: str = "") -> None:
 
 def content_of(instrument: Instrument) -> dict[str, Any]:
     """The keys and values of an instrument's file."""
-    c, camera = instrument.calibration, instrument.camera
-    content: dict[str, Any] = {
-        "starpos_instrument": FORMAT,
-        "camera": {"focal_px": float(instrument.focal_px)},
-    }
-    model = instrument.model if camera is None else camera.model
-    if camera is not None:
-        content["camera"] = {"width": camera.width, "height": camera.height}
-        content["camera"] |= {k: float(getattr(camera, k)) for k in ("fx", "fy", "cx", "cy")}
-        content["camera"]["distortion"] = [float(d) for d in camera.distortion]
-    elif instrument.frame_size is not None:
-        content["camera"] |= dict(zip(SIDES, instrument.frame_size, strict=True))
-    if model != PLUMB_BOB:
-        content["camera"]["model"] = model
+    c = instrument.calibration
+    content: dict[str, Any] = {"starpos_instrument": FORMAT, "camera": _camera_of(instrument)}
     content["misalignment_deg"] = [float(a) for a in c.misalignment_deg]
-    content["calibration_covariance_arcsec2"] = np.asarray(c.covariance_arcsec2, float).tolist()
+    content[COVARIANCE] = np.asarray(c.covariance_arcsec2, float).tolist()
     if c.remounted_arcsec:
         content["remounted_arcsec"] = float(c.remounted_arcsec)
     if not math.isnan(c.utc_unix_s):
         content["calibrated"] = {"utc": utc_text(c.utc_unix_s), "frames": int(c.frames)}
         content["calibrated"]["tilt_deg"] = [float(t) for t in c.tilt_deg]
-        if not math.isnan(c.temperature_c):
-            content["calibrated"]["temperature_c"] = float(c.temperature_c)
-        if math.isfinite(c.valid_days):
-            content["calibrated"]["valid_days"] = float(c.valid_days)
+        for key in ("temperature_c", "valid_days"):
+            if math.isfinite(getattr(c, key)):
+                content["calibrated"][key] = float(getattr(c, key))
         if c.response:
             content["calibrated"]["response"] = [float(r) for r in c.response]
             content["calibrated"]["response_covariance"] = np.asarray(c.response_covariance, float).tolist()
@@ -246,63 +226,75 @@ def content_of(instrument: Instrument) -> dict[str, Any]:
     return content
 
 
+def _camera_of(instrument: Instrument) -> dict[str, Any]:
+    """The keys and values of an instrument's camera."""
+    camera = instrument.camera
+    if camera is None:
+        sides = zip(SIDES, instrument.frame_size or (), strict=False)
+        content: dict[str, Any] = {"focal_px": float(instrument.focal_px), **dict(sides)}
+    else:
+        content = {"width": camera.width, "height": camera.height}
+        content |= {k: float(getattr(camera, k)) for k in INTRINSICS}
+        content["distortion"] = [float(d) for d in camera.distortion]
+    model = instrument.model if camera is None else camera.model
+    return content if model == PLUMB_BOB else content | {"model": model}
+
+
 def _from_mapping(content: dict, folder: Path, needs_camera: bool) -> Instrument:
     _refuse_others(content, KEYS)
+    optics: dict[str, Any] = {"focal_px": POINTED_FOCAL_PX}
     if "camera" in content or needs_camera:
-        camera, focal_px, model = _camera(content.get("camera"), folder)
-    else:
-        camera, focal_px, model = None, POINTED_FOCAL_PX, PLUMB_BOB
-    instrument = Instrument(focal_px, camera=camera, model=model, calibration=_calibration(content))
-    if camera is None and any(side in content.get("camera", ()) for side in SIDES):
-        instrument = replace(instrument, frame_size=_size(content["camera"]))
-    if "link_to_camera" in content:
-        link = _matrix(content["link_to_camera"], "link_to_camera")
-        instrument = replace(instrument, link_to_camera=link)
-    if "link_to_camera_stddev_arcsec" in content:
-        mount = _number(content, "link_to_camera_stddev_arcsec")
-        instrument = replace(instrument, mount_stddev_arcsec=mount)
+        optics = _camera(content.get("camera"), folder)
     given = {name: _error(content, key, unit) for key, (name, unit) in INCLINOMETER.items() if key in content}
     sensor, errors = _sensor(content, bool(given))
-    instrument = replace(instrument, inclinometer=replace(errors, **given), inclinometer_model=sensor)
+    more = {
+        name: read(content, key)
+        for key, (name, read) in {
+            "link_to_camera": ("link_to_camera", _matrix),
+            "link_to_camera_stddev_arcsec": ("mount_stddev_arcsec", _number),
+            "clock_stddev_s": ("clock_stddev_s", _number),
+            "shutter": ("shutter", _shutter),
+        }.items()
+        if key in content
+    }
+    instrument = Instrument(
+        **optics,
+        calibration=_calibration(content),
+        inclinometer=replace(errors, **given),
+        inclinometer_model=sensor,
+        **more,
+    )
     if "vertical" in content:
         if given or sensor:
             raise InstrumentError(
                 "vertical is of a camera without an inclinometer: leave out inclinometer and the tilt_ keys"
             )
-        instrument = _with_vertical(instrument, content["vertical"])
-    if "clock_stddev_s" in content:
-        instrument = replace(instrument, clock_stddev_s=_number(content, "clock_stddev_s"))
-    if "shutter" in content:
-        instrument = replace(instrument, shutter=_shutter(content["shutter"]))
+        instrument = _with_vertical(instrument, content)
     return instrument
 
 
-def _shutter(about: object) -> Shutter:
-    if not isinstance(about, dict):
-        raise InstrumentError(f"shutter is {_short(about)}: give {{{', '.join(SHUTTER)}}}")
-    _refuse_others(about, SHUTTER)
+def _shutter(content: dict, key: str) -> Shutter:
+    about = _mapping(content, key, SHUTTER)
     try:
         return Shutter(*(_number(about, key) for key in SHUTTER))
     except FrameError as e:
         raise InstrumentError(str(e)) from None
 
 
-def _with_vertical(instrument: Instrument, about: object) -> Instrument:
+def _with_vertical(instrument: Instrument, content: dict) -> Instrument:
     """The instrument of a camera that is fixed to the ground."""
-    if not isinstance(about, dict):
-        raise InstrumentError(f"vertical is {_short(about)}: give {{{', '.join(VERTICAL)}}}")
-    _refuse_others(about, VERTICAL)
+    about = _mapping(content, "vertical", VERTICAL)
     if math.isnan(instrument.calibration.utc_unix_s):
         raise InstrumentError("a vertical sags with time: say when it was found, calibrated: {utc: ...}")
     sag = _number(about, VERTICAL[2])
     if not 0 <= sag <= MAX_SAG_ARCSEC:
         raise InstrumentError(f"{VERTICAL[2]} is {sag:g}: give a number from 0 to {MAX_SAG_ARCSEC:g}")
-    vertical = CameraVertical(*(_matrix(about.get(key), key) for key in VERTICAL[:2]))
+    vertical = CameraVertical(*(_matrix(about, key) for key in VERTICAL[:2]))
     return replace(instrument, vertical=vertical, inclinometer=level_errors(sag))
 
 
-def _camera(camera: object, folder: Path) -> tuple[Camera | None, float, str]:
-    """Intrinsics (None if only the focal length is given), focal length (px), and lens of a camera without intrinsics."""
+def _camera(camera: object, folder: Path) -> dict[str, Any]:
+    """Arguments of an Instrument: its camera, or the focal length and the lens of a camera without intrinsics."""
     if not isinstance(camera, dict):
         raise InstrumentError(
             f"camera is {_short(camera)}: give {{focal_mm, pixel_um}} or {{width, height, fx, fy, cx, cy}}"
@@ -310,12 +302,6 @@ def _camera(camera: object, folder: Path) -> tuple[Camera | None, float, str]:
     model = camera.get("model", PLUMB_BOB)
     if model not in tuple(COEFFICIENTS):
         raise InstrumentError(f"the camera's model is {_short(model)}: give {' or '.join(COEFFICIENTS)}")
-    if "focal_mm" in camera:
-        _refuse_others(camera, ("focal_mm", "pixel_um", *SIDES, "model"))
-        return None, focal_px_of(_number(camera, "focal_mm"), _number(camera, "pixel_um")), model
-    if "focal_px" in camera:
-        _refuse_others(camera, ("focal_px", *SIDES, "model"))
-        return None, _number(camera, "focal_px"), model
     if "calibration" in camera:
         _refuse_others(camera, ("calibration",))
         if not isinstance(camera["calibration"], str):
@@ -323,20 +309,20 @@ def _camera(camera: object, folder: Path) -> tuple[Camera | None, float, str]:
                 f"the camera's calibration is {_short(camera['calibration'])}: give the name of a file"
             )
         full = read_camera(folder / camera["calibration"])
-        return full, full.fx, PLUMB_BOB
-    _refuse_others(camera, ("width", "height", "fx", "fy", "cx", "cy", "distortion", "model"))
+        return {"focal_px": full.fx, "camera": full}
+    if "focal_mm" in camera or "focal_px" in camera:
+        stated = ("focal_mm", "pixel_um") if "focal_mm" in camera else ("focal_px",)
+        _refuse_others(camera, (*stated, *SIDES, "model"))
+        numbers = [_number(camera, key) for key in stated]
+        focal_px = focal_px_of(*numbers) if "focal_mm" in camera else numbers[0]
+        size = _size(camera) if any(side in camera for side in SIDES) else None
+        return {"focal_px": focal_px, "model": model, "frame_size": size}
+    _refuse_others(camera, (*SIDES, *INTRINSICS, "distortion", "model"))
     width, height = _size(camera)
-    full = Camera(
-        width=width,
-        height=height,
-        fx=_number(camera, "fx"),
-        fy=_number(camera, "fy"),
-        cx=_number(camera, "cx"),
-        cy=_number(camera, "cy"),
-        distortion=_row(camera.get("distortion", []), "distortion"),
-        model=model,
-    )
-    return full, full.fx, PLUMB_BOB
+    numbers_by_key = {key: _number(camera, key) for key in INTRINSICS}
+    distortion = _row({"distortion": [], **camera}, "distortion")
+    full = Camera(width=width, height=height, distortion=distortion, model=model, **numbers_by_key)
+    return {"focal_px": full.fx, "camera": full}
 
 
 def _size(camera: dict) -> tuple[int, int]:
@@ -350,38 +336,30 @@ def _size(camera: dict) -> tuple[int, int]:
 
 
 def _calibration(content: dict) -> Calibration:
-    keys = ("calibration_stddev_arcsec", "calibration_covariance_arcsec2")
-    if all(key in content for key in keys):
-        raise InstrumentError(f"{keys[0]} and {keys[1]} say the same thing: give one of them")
-    angles = _row(content.get("misalignment_deg", [0.0] * 3), "misalignment_deg")
+    if STDDEV in content and COVARIANCE in content:
+        raise InstrumentError(f"{STDDEV} and {COVARIANCE} say the same thing: give one of them")
+    angles = _row({"misalignment_deg": [0.0] * 3, **content}, "misalignment_deg")
     calibration = Calibration(misalignment_deg=angles)
-    if keys[0] in content:
-        calibration = Calibration.of(angles, _row(content[keys[0]], keys[0]))
-    if keys[1] in content:
-        calibration = Calibration(
-            misalignment_deg=angles, covariance_arcsec2=_matrix(content[keys[1]], keys[1])
-        )
+    if STDDEV in content:
+        calibration = Calibration.of(angles, _row(content, STDDEV))
+    if COVARIANCE in content:
+        calibration = replace(calibration, covariance_arcsec2=_matrix(content, COVARIANCE))
     if "remounted_arcsec" in content:
         calibration = replace(calibration, remounted_arcsec=_number(content, "remounted_arcsec"))
-    about = content.get("calibrated")
-    if about is None:
+    if content.get("calibrated") is None:
         return calibration
-    if not isinstance(about, dict):
-        raise InstrumentError(f"calibrated is {_short(about)}: give {{{', '.join(CALIBRATED)}}}")
-    _refuse_others(about, CALIBRATED)
+    about = _mapping(content, "calibrated", CALIBRATED)
     try:
         utc = unix_of(str(about.get("utc")))
     except TimeError as e:
         raise InstrumentError(f"calibrated: {e}") from None
     more: dict[str, Any] = {k: _number(about, k) for k in ("temperature_c", "valid_days") if k in about}
-    if "tilt_deg" in about:
-        more["tilt_deg"] = _row(about["tilt_deg"], "tilt_deg")
+    more |= {k: _row(about, k) for k in ("tilt_deg", "response") if k in about}
     if "response" in about:
-        more["response"] = _row(about["response"], "response")
-        rows = about.get("response_covariance")
-        if not isinstance(rows, list):
-            raise InstrumentError(f"response_covariance is {_short(rows)}: give rows of numbers")
-        more["response_covariance"] = tuple(_row(row, "response_covariance") for row in rows)
+        rows = _list(about, "response_covariance", "rows of numbers")
+        more["response_covariance"] = tuple(
+            _row({"response_covariance": r}, "response_covariance") for r in rows
+        )
         if {len(row) for row in more["response_covariance"]} != {len(more["response"])}:
             raise InstrumentError(
                 "response_covariance has not as many rows and columns as response has numbers"
@@ -397,22 +375,22 @@ def _sensor(content: dict, stated: bool) -> tuple[str, InclinometerErrors]:
 
     A file that states some errors without a model describes a measured sensor: the other errors are a good sensor's.
     """
-    if "inclinometer" not in content and stated:
-        return "", InclinometerErrors()
-    about = content.get("inclinometer", {"model": ""})
+    if "inclinometer" not in content:
+        return ("", InclinometerErrors()) if stated else sensors.find("")
+    about = content["inclinometer"]
     if not isinstance(about, dict) or not isinstance(about.get("model"), str):
         raise InstrumentError(f"inclinometer is {_short(about)}: give {{model: NAME}}")
     _refuse_others(about, ("model",))
     return sensors.find(about["model"])
 
 
-def _matrix(rows: object, key: str) -> tuple:
-    if not isinstance(rows, list) or len(rows) != 3:
-        raise InstrumentError(f"{key} is {_short(rows)}: give three rows of three numbers")
-    matrix = tuple(_row(row, key) for row in rows)
-    if {len(row) for row in matrix} != {3}:
-        raise InstrumentError(f"{key} has a row of another length: give three rows of three numbers")
-    return matrix
+def _mapping(content: dict, key: str, known: tuple[str, ...]) -> dict:
+    """The mapping that a key has, of known keys."""
+    about = content.get(key)
+    if not isinstance(about, dict):
+        raise InstrumentError(f"{key} is {_short(about)}: give {{{', '.join(known)}}}")
+    _refuse_others(about, known)
+    return about
 
 
 def _refuse_others(mapping: dict, known: tuple[str, ...]) -> None:
@@ -433,6 +411,26 @@ def _number(mapping: dict, key: str) -> float:
         raise InstrumentError(f"{key} is {_short(mapping[key])}: give a number") from None
 
 
+def _list(mapping: dict, key: str, what: str) -> list:
+    if not isinstance(mapping.get(key), list):
+        raise InstrumentError(f"{key} is {_short(mapping.get(key))}: give {what}")
+    return mapping[key]  # type: ignore[no-any-return]
+
+
+def _row(mapping: dict, key: str) -> tuple[float, ...]:
+    return tuple(
+        _number({key: v}, key) for v in _list(mapping, key, "a list of numbers, like [0.0, 0.0, 0.0]")
+    )
+
+
+def _matrix(mapping: dict, key: str) -> tuple:
+    rows = _list(mapping, key, "three rows of three numbers")
+    matrix = tuple(_row({key: row}, key) for row in rows) if len(rows) == 3 else ()
+    if {len(row) for row in matrix} != {3}:
+        raise InstrumentError(f"{key} is {_short(rows)}: give three rows of three numbers")
+    return matrix
+
+
 def _error(mapping: dict, key: str, unit: float) -> float:
     """An error of the inclinometer, given in `unit`, in rad or as a share."""
     given = _number(mapping, key)
@@ -449,28 +447,12 @@ def _in_unit(value: float, unit: float) -> float:
     return next((number for number in short if number * unit == value), exact)
 
 
-def _row(numbers: list, key: str) -> tuple[float, ...]:
-    if not isinstance(numbers, list):
-        raise InstrumentError(f"{key} is {_short(numbers)}: give a list of numbers, like [0.0, 0.0, 0.0]")
-    return tuple(_number({key: v}, key) for v in numbers)
-
-
 def _short(value: object) -> str:
     """A value of a file, short enough for a sentence, however deep it is."""
     if isinstance(value, int) and abs(value) > 1e18:
         return "a number beyond any sense"
     text = "missing" if value is None else reprlib.repr(value)
     return text if len(text) < 60 else text[:57] + "..."
-
-
-# keys that a calibration finds, of A3 or of a fixed camera's vertical; a file may have some of them
-CALIBRATION_KEYS = (
-    "misalignment_deg",
-    "calibration_stddev_arcsec",
-    "calibration_covariance_arcsec2",
-    "calibrated",
-    "vertical",
-)
 
 
 def check_replaceable(path: Path) -> None:

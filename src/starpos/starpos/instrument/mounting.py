@@ -19,6 +19,7 @@ from starpos.errors import InstrumentError
 from starpos.frozen import at_once
 from starpos.instrument.inclinometer import (
     EXACT,
+    UNMEASURED_JUMP_C,
     InclinometerErrors,
     Tilt,
     level_of,
@@ -136,6 +137,19 @@ class Mounting:
     calibrated_tilt: tuple[float, ...] = (0.0, 0.0)
     response: tuple[float, ...] = ()
     response_covariance: tuple = ()
+
+    def warmer_c(self, tilt: Tilt) -> float:
+        """The inclinometer's temperature at a tilt minus the calibration's; NaN if one is unknown."""
+        return tilt.temperature_c - self.calibrated_temperature_c
+
+    @property
+    def unmeasured_c(self) -> float:
+        """1 sigma of `warmer_c` where it is unknown.
+
+        If a calibration has neither a date nor a temperature, its stated error holds for all temperatures: 0.
+        """
+        dated = np.isfinite([self.calibrated_unix_s, self.calibrated_temperature_c]).any()
+        return UNMEASURED_JUMP_C if dated else 0.0
 
     @cached_property
     def calibrated_up(self) -> np.ndarray:

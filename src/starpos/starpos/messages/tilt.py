@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from starpos.errors import TiltError
+from starpos.frozen import at_once
 from starpos.instrument.inclinometer import MAX_CELSIUS, SCA100T_NOISE_RAD, SQUARE, Tilt
 from starpos.instrument.tilt_log import NoiseTracker
 from starpos.messages.stamp import PlainHeader, PlainStamp, stamp_to_unix
@@ -166,6 +167,7 @@ def acceleration_of(message: Any) -> Acceleration:
     return Acceleration(stamp_ns, force, math.hypot(*rotation), variance)
 
 
+@at_once
 @dataclass(frozen=True)
 class MeanForce:
     """The messages of one span of time; forces is (N, 3), see `Acceleration`."""

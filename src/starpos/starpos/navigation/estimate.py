@@ -9,7 +9,9 @@ import numpy as np
 from starpos.earth.ellipsoid import curvature_radii_m, enu_axes, meridian_turn
 from starpos.earth.gravity import geodetic_place
 from starpos.earth.orientation import earth_state
-from starpos.fix.budget import heading_of, heading_row, time_terms, total_covariance
+from starpos.fix.attitude import ENU, LINK, Attitude, heading_of, heading_row
+from starpos.fix.budget import time_terms
+from starpos.fix.terms import total_covariance
 from starpos.navigation.equations import (
     ACCEL_BIAS,
     BY_LAW,
@@ -43,7 +45,7 @@ class VoyageFix:
     """Astronomic latitude, longitude and heading of the body's x (rad) at one time of a voyage.
 
     covariance (3, 3): east m, north m, heading rad.  velocity (3,): east, north, up, m/s; velocity_covariance (3, 3).
-    link_to_enu (3, 3): the body's axes, x forward, into east, north, up; attitude_covariance (3, 3): rad2, about these.
+    link: the body's axes, x forward, into east, north, up.
     gyro_bias, accel_bias (3,): rad/s, m/s2.
     """
 
@@ -54,8 +56,7 @@ class VoyageFix:
     covariance: np.ndarray
     velocity: np.ndarray
     velocity_covariance: np.ndarray
-    link_to_enu: np.ndarray
-    attitude_covariance: np.ndarray
+    link: Attitude
     gyro_bias: np.ndarray
     accel_bias: np.ndarray
 
@@ -87,8 +88,7 @@ def fix_of(motion: Motion, k: int, covariance: np.ndarray, errors: TimeErrors) -
         covariance=to_heading @ place_and_turn @ to_heading.T + shared[:3, :3],
         velocity=enu @ motion.velocity[k],
         velocity_covariance=enu @ covariance[VELOCITY, VELOCITY] @ enu.T,
-        link_to_enu=attitude,
-        attitude_covariance=place_and_turn[2:, 2:] + shared[3:, 3:],
+        link=Attitude(attitude, place_and_turn[2:, 2:] + shared[3:, 3:], of=LINK, into=ENU),
         gyro_bias=motion.gyro_bias[k],
         accel_bias=motion.accel_bias[k],
     )

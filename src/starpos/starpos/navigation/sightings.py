@@ -22,6 +22,7 @@ from starpos.earth.place import Place
 from starpos.earth.refraction import Atmosphere, Refraction
 from starpos.errors import FixError, FrameError, InstrumentError, TimeError
 from starpos.fix import solver
+from starpos.fix.attitude import ENU, LINK, Attitude
 from starpos.fix.camera_attitude import CameraAttitude
 from starpos.fix.solution import Solution
 from starpos.fix.star_fit import expected_extra, judged, share_free, sound_matches
@@ -297,20 +298,11 @@ class PlacelessFrame:
         )
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class BodyAttitude:
-    """The body's axes, x forward, in east, north, up: level by the plumb line, north by WGS 84.
+def body_attitude(frame: PlacelessFrame, place: Place, vessel: Vessel) -> Attitude:
+    """The body's axes, x forward, at a known place: level by the plumb line, north by WGS 84.
 
-    link_to_enu (3, 3); attitude_covariance (3, 3): rad2, of its small rotation about east, north, up.
+    The errors are of stars, air, time, place, deflection and mount.
     """
-
-    utc_unix_s: float
-    link_to_enu: np.ndarray
-    attitude_covariance: np.ndarray
-
-
-def attitude_at_place(frame: PlacelessFrame, place: Place, vessel: Vessel) -> BodyAttitude:
-    """The attitude of the body at a known place, with the errors of stars, air, time, place, deflection and mount."""
     a4, air = place.plumb_axes, vessel.atmosphere
     seen = frame.under(a4[2], air)
     g = a4 @ seen.camera_to_itrs
@@ -327,10 +319,5 @@ def attitude_at_place(frame: PlacelessFrame, place: Place, vessel: Vessel) -> Bo
     ])  # fmt: skip
     to_ellipsoid = place.axes @ a4.T
     turn = rotation.about_axis(2, -math.atan2(to_ellipsoid[0, 1], to_ellipsoid[1, 1]))
-    return BodyAttitude(
-        utc_unix_s=frame.utc_unix_s,
-        link_to_enu=turn @ g @ vessel.camera_to_body.T,
-        attitude_covariance=g @ seen.covariance @ g.T
-        + columns @ columns.T
-        + np.eye(3) * vessel.mount_stddev**2,
-    )
+    covariance = g @ seen.covariance @ g.T + columns @ columns.T + np.eye(3) * vessel.mount_stddev**2
+    return Attitude(turn @ g @ vessel.camera_to_body.T, covariance, of=LINK, into=ENU)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A night in a rosbag2: one instrument's messages, solved again if there are stars and tilts, else as recorded."""
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -12,18 +12,18 @@ from starpos.earth.ellipsoid import curvature_radii_m
 from starpos.earth.refraction import Atmosphere
 from starpos.earth.vertical import Deflection, Vertical, geodetic
 from starpos.errors import FrameError, InstrumentError, StarposError, TiltError
-from starpos.fix.budget import ALWAYS, ErrorTerm
-from starpos.fix.solution import Attitude, Status
+from starpos.fix.fix import PlaceFix
+from starpos.fix.solution import FieldPointing, Status
+from starpos.fix.terms import ALWAYS, ErrorTerm
 from starpos.frames.frame import Frame, Stars
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import Tilt
-from starpos.instrument.instrument import Instrument
 from starpos.instrument.tilt_log import NoTilts, TiltLog, Tilts
 from starpos.messages.camera import message_to_camera
 from starpos.messages.stamp import stamp_to_unix
 from starpos.messages.stars import message_to_stars
 from starpos.messages.tilt import UNUSABLE, message_to_tilt
-from starpos.night.night import NO_TILT, Night, ReportedPlace, Shot, Truth, offset_m, why_none
+from starpos.night.night import NO_TILT, Night, Shot, Truth, offset_m, why_none
 from starpos.night.opening import truth_in
 from starpos.night.reading import Instruments
 from starpos.night.remarks import Kind, Remark
@@ -99,7 +99,7 @@ def read(
         wanted = [c for c in chosen.connections if c.msgtype not in WITH_STARS]
         total = sum(c.msgcount for c in wanted) or 1
         for done, (connection, log_ns, message) in enumerate(bag.decoded(wanted), 1):
-            reading.take(connection.msgtype, message, log_ns * 1e-9)
+            reading.read_message(connection.msgtype, message, log_ns * 1e-9)
             if done % 500 == 0 or done == total:
                 progress(path.name[:20], done / total)
         return Recorded(
@@ -148,8 +148,8 @@ class _Reading:
         self._unusable = 0
         self._why_no_camera = ""
 
-    def take(self, kind: str, message: Any, log_s: float) -> None:
-        """Take in a message of a type; an impossible tilt or camera only leads to a remark."""
+    def read_message(self, kind: str, message: Any, log_s: float) -> None:
+        """Read a message of a type; an impossible tilt or camera only leads to a remark."""
         if kind == IMU:
             kind, message = TILT, self._messages.tilt_of(message, log_s)
             if message is None:
@@ -190,6 +190,18 @@ class _Reading:
         if self._why_no_camera and not self.cameras:
             said.append(Remark(Kind.RECORDED, f"{path.name}: {self._why_no_camera}"))
         return tuple(said)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class RecordedPlace(PlaceFix):
+    """A place as messages have it; stated (3, 3): their covariance, of which their terms hold only the variances."""
+
+    stated: np.ndarray
+
+    @property
+    def covariance(self) -> np.ndarray:
+        """Covariance (3, 3) of east m, north m, heading rad."""
+        return self.stated
 
 
 # by the number in Solution.status
@@ -233,12 +245,12 @@ def shot_of(m: Any, cameras: dict[tuple[int, int], Camera]) -> Shot:
             for t in m.budget
             if t.name != "deflection" and np.isfinite([t.east, t.north, t.heading]).all()
         )
-        place = ReportedPlace(
+        place = RecordedPlace(
             utc_unix_s=utc,
             latitude=float(angles[0]),
             longitude=float(angles[1]),
             heading=full_turn(heading),
-            covariance=covariance,
+            stated=covariance,
             terms=terms,
         )
     elif status is Status.OK:
@@ -246,7 +258,7 @@ def shot_of(m: Any, cameras: dict[tuple[int, int], Camera]) -> Shot:
     looking = np.radians([m.right_ascension, m.declination, m.roll])
     if np.isfinite([*looking, m.focal_px]).all() and m.focal_px > 0:
         ra, dec, roll = looking.tolist()
-        pointing = Attitude(
+        pointing = FieldPointing(
             ra=ra,
             dec=dec,
             roll=roll,
@@ -288,30 +300,6 @@ def deflection_of(m: Any) -> Deflection | None:
         return Deflection(m.xi, m.eta, float(np.sqrt(max(wider, 0.0)) / np.hypot(prime, meridian) / ARCSEC))
     except StarposError:
         return None
-
-
-@dataclass(frozen=True)
-class OfBag:
-    """The instrument of a bag's frames, with the bag's camera for their size.
-
-    any_size: whether frames of other sizes use the instrument unchanged.
-    """
-
-    instrument: Instrument
-    cameras: Mapping[tuple[int, int], Camera]
-    any_size: bool
-
-    @property
-    def hinted(self) -> bool:
-        """Whether only headers give the focal length: a bag has none."""
-        return False
-
-    def of(self, frame: Frame | Stars) -> Instrument | None:
-        """The instrument of a frame."""
-        camera = self.cameras.get((frame.width, frame.height))
-        if camera is None:
-            return self.instrument if self.any_size else None
-        return replace(self.instrument, camera=camera, focal_px=camera.fx)
 
 
 def night(
@@ -389,7 +377,7 @@ def _as_recorded(r: Recorded, atmosphere: Atmosphere, vertical: Vertical) -> Nig
     )
 
 
-def _bound(places: list[ReportedPlace]) -> ReportedPlace:
+def _bound(places: list[PlaceFix]) -> RecordedPlace:
     """The plain mean of places, with the mean of their covariances: an upper bound, whatever their correlation is."""
     seen = np.array([[p.latitude, p.longitude, p.heading] for p in places])
     away = half_turns(seen - seen[0])
@@ -401,11 +389,11 @@ def _bound(places: list[ReportedPlace]) -> ReportedPlace:
         for k, t in enumerate(places[0].terms)
         if all([u.name for u in p.terms] == names for p in places)
     ]
-    return ReportedPlace(
+    return RecordedPlace(
         utc_unix_s=float(np.mean([p.utc_unix_s for p in places])),
         latitude=float(mean[0]),
         longitude=float(half_turns(mean[1])),
         heading=full_turn(mean[2]) if still else float("nan"),
-        covariance=np.mean([p.covariance for p in places], axis=0),
+        stated=np.mean([p.covariance for p in places], axis=0),
         terms=tuple(terms),
     )

@@ -16,6 +16,7 @@ from starpos.errors import StarposError
 from starpos.fix.searching import Sight, of_one_camera
 from starpos.fix.solver import Solver
 from starpos.frames.frame import SATURATED, Stars
+from starpos.frozen import at_once
 from starpos.instrument.inclinometer import up_of
 from starpos.instrument.instrument import Calibration, Instrument
 from starpos.instrument.tilt_log import TiltLog
@@ -63,6 +64,7 @@ class Look:
     todo: str
 
 
+@at_once
 @dataclass(frozen=True)
 class Standing:
     """An identified frame of a still instrument: its sight, up (3,) in S, and ITRS into C (3, 3)."""
@@ -73,7 +75,7 @@ class Standing:
 
 
 class FirstNight:
-    """Takes the frames of a first night; `turned` is what the last step found.
+    """Inspects the frames of a first night; `turned` is what the last step found.
 
     solver: with A3 as far as it is known.
     """
@@ -99,8 +101,8 @@ class FirstNight:
         """The step that the next frame is for; None after the last."""
         return self._steps[0] if self._steps else None
 
-    def add(self, sight: Sight, log: TiltLog | str) -> Look:
-        """Take the next frame, identified, and the tilts so far, or a sentence on why they are missing."""
+    def inspect(self, sight: Sight, log: TiltLog | str) -> Look:
+        """Inspect the next frame, identified, with the tilts so far, or a sentence on why they are missing."""
         step = self._steps[0]
         looks: dict[Stage, Callable[[], Look]] = {
             Stage.FOCUS: lambda: self._focus(sight.stars),

@@ -7,14 +7,12 @@ from html import escape
 
 import numpy as np
 
-from starpos.averaging.average import Average
 from starpos.earth.ellipsoid import curvature_radii_m, enu_axes, zenith_of
 from starpos.earth.refraction import Atmosphere
-from starpos.earth.vertical import Geodetic, Vertical, geodetic
-from starpos.fix.budget import ErrorTerm
-from starpos.fix.fix import Fix, InDegrees
+from starpos.earth.vertical import Vertical
+from starpos.fix.fix import InDegrees, PlaceFix
 from starpos.fix.heading import AttitudeAtPlace
-from starpos.fix.solution import Attitude, Solution, Status
+from starpos.fix.solution import FieldPointing, Solution, Status
 from starpos.frames.frame import Stars
 from starpos.night.remarks import Remark
 from starpos.night.together import WatchedNight
@@ -23,59 +21,6 @@ NO_TILT = (float("nan"), float("nan"))
 NO_STARS = np.zeros((0, 2))
 # maximum number of frames shown in a notebook
 SHOWN = 20
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class ReportedPlace:
-    """Astronomic latitude, longitude and heading (rad), with their errors.
-
-    heading: of the last pose; NaN without a common heading. poses: number of poses that the place comes from.
-    covariance (3, 3): of east m, north m, heading rad, the sum of the `terms`.
-    """
-
-    utc_unix_s: float
-    latitude: float
-    longitude: float
-    heading: float
-    covariance: np.ndarray
-    terms: tuple[ErrorTerm, ...]
-    poses: int = 1
-
-    @classmethod
-    def of(cls, fix: Fix | Average) -> "ReportedPlace":
-        """The place of a fix or an average."""
-        poses = fix.poses if isinstance(fix, Average) else 1
-        return cls(
-            utc_unix_s=fix.utc_unix_s,
-            latitude=fix.latitude,
-            longitude=fix.longitude,
-            heading=fix.heading,
-            covariance=fix.covariance,
-            terms=fix.terms,
-            poses=poses,
-        )
-
-    def __repr__(self) -> str:
-        return f"<{self.in_degrees} (astronomic)>"
-
-    @property
-    def own(self) -> np.ndarray:
-        """Covariance (3, 3) of the errors that are new in each frame, by which the frames differ from each other."""
-        return sum((t.covariance[:3, :3] for t in self.terms if not t.common), np.zeros((3, 3)))
-
-    @property
-    def sigma(self) -> np.ndarray:
-        """Standard deviations (3,) of east m, north m, heading rad."""
-        return np.sqrt(np.diag(self.covariance))
-
-    @property
-    def in_degrees(self) -> InDegrees:
-        """Place and heading in degrees."""
-        return InDegrees.of(self.latitude, self.longitude, self.heading, self.covariance)
-
-    def on_ground(self, vertical: Vertical) -> Geodetic:
-        """The geodetic place, with the deflection of the vertical removed."""
-        return geodetic(self.latitude, self.longitude, self.heading, self.covariance, vertical)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -93,8 +38,8 @@ class Shot:
     status: Status
     message: str
     utc_unix_s: float = float("nan")
-    place: ReportedPlace | None = None
-    pointing: Attitude | None = None
+    place: PlaceFix | None = None
+    pointing: FieldPointing | None = None
     size: tuple[int, int] | None = None
     xy: np.ndarray = field(default_factory=lambda: NO_STARS)
     residual_px: np.ndarray = field(default_factory=lambda: NO_STARS)
@@ -117,14 +62,14 @@ class Shot:
             status=s.status,
             message=s.message,
             utc_unix_s=float("nan") if s.utc_unix_s is None else s.utc_unix_s,
-            pointing=s.attitude,
+            pointing=s.pointing,
             size=None if stars is None else (stars.width, stars.height),
             stars_detected=s.stars_detected,
             stars_matched=len(s.names),
             tilt=(s.tilt.theta_x, s.tilt.theta_y) if s.tilt else NO_TILT,
             identify_s=s.identify_s,
             fix_s=s.fix_s,
-            residual_arcsec=s.attitude.residual_arcsec if s.attitude else float("nan"),
+            residual_arcsec=s.pointing.residual_arcsec if s.pointing else float("nan"),
             at_place=s.at_place,
             warnings=s.warnings,
         )
@@ -134,10 +79,10 @@ class Shot:
             return shot
         return replace(
             shot,
-            place=ReportedPlace.of(s.fix),
+            place=s.fix,
             residual_px=-s.fix.residual_px,
             residual_arcsec=s.fix.residual_arcsec,
-            camera_to_itrs=s.fix.camera_to_itrs,
+            camera_to_itrs=s.fix.camera.rotation,
         )
 
     def __repr__(self) -> str:
@@ -164,7 +109,7 @@ class Truth:
     simulated: bool = False
 
 
-def offset_m(place: ReportedPlace | Truth, latitude: float, longitude: float) -> tuple[float, float]:
+def offset_m(place: PlaceFix | Truth, latitude: float, longitude: float) -> tuple[float, float]:
     """East, north in m of a place from another (rad)."""
     across = enu_axes(latitude, longitude)[:2] @ zenith_of(place.latitude, place.longitude)
     east, north = across * curvature_radii_m(latitude)
@@ -186,7 +131,7 @@ class Night:
     name: str
     origin: str
     shots: Sequence[Shot]
-    combined: ReportedPlace | None
+    combined: PlaceFix | None
     why_not: str
     vertical: Vertical
     atmosphere: Atmosphere
@@ -214,7 +159,7 @@ class Night:
         return [(k, s) for k, s in enumerate(self.shots, 1) if s.place]
 
     @property
-    def places(self) -> list[ReportedPlace]:
+    def places(self) -> list[PlaceFix]:
         """The places of the frames with a fix."""
         return [s.place for s in self.shots if s.place]
 

@@ -23,7 +23,7 @@ from starpos.instrument.inclinometer import SCA100T_NOISE_RAD
 from starpos.instrument.instrument import Calibration, Instrument
 from starpos.instrument.tilt_log import NoTilts
 from starpos.night.night import Night, Truth
-from starpos.night.reading import About, First, Given, Reader, TiltFile
+from starpos.night.reading import About, First, Instruments, Reader, TiltFile
 from starpos.night.remarks import Remark, of_tilts
 from starpos.night.solving import Exposures, How, Worked, solved_night
 from starpos.night.work import OnFile, Solving
@@ -35,7 +35,7 @@ TRUTH_LIMIT = 1 << 26
 
 def exposures(
     folder: Path,
-    given: Given,
+    given: Instruments,
     atmosphere: Atmosphere,
     vertical: Vertical,
     place: Place | None = None,
@@ -75,7 +75,7 @@ def exposures(
 
 
 def work_of(
-    given: Given, first: About, tilts: Path | None, atmosphere: Atmosphere, place: Place | None = None
+    given: Instruments, first: About, tilts: Path | None, atmosphere: Atmosphere, place: Place | None = None
 ) -> tuple[Solving, tuple[Remark, ...]]:
     """The work on the frames of a night whose first one is known, and what looks wrong.
 
@@ -171,7 +171,7 @@ class NightOnDisk:
         if given is not None and self.inclinometer:
             model, errors = sensors.find(self.inclinometer)
             given = replace(given, inclinometer=errors, inclinometer_model=model)
-        instruments = Given(given, by_header=self.instrument is None)
+        instruments = Instruments(given, by_header=self.instrument is None)
         return solved_night(
             exposures(self.folder, instruments, self.atmosphere, self.vertical, self.place),
             How(turn_stddev_deg if self_calibrate else None),

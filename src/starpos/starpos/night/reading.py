@@ -3,17 +3,18 @@
 
 import math
 import os
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Protocol
 
 from starpos.errors import FrameError
 from starpos.fix.fix import IDEAL
 from starpos.frames.exif import CameraClock
 from starpos.frames.frame import Frame, Stars
 from starpos.frames.reading import read_frame
+from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import Tilt
 from starpos.instrument.instrument import Instrument, with_frame_size
 from starpos.instrument.tilt_log import TiltLog
@@ -89,43 +90,35 @@ class First:
         return None
 
 
-class Instruments(Protocol):
-    """Finds the instrument for a frame of a night, with its camera; None if its focal length is unknown.
+@dataclass(frozen=True)
+class Instruments:
+    """The instrument of each frame of a night.
 
     instrument: with all frames' A3 and inclinometer; None if nothing is known.
+    by_header: whether each frame's own header has its focal length, if it states one.
+    cameras: of a bag, by (width, height) of their frames in px.
+    any_size: whether frames of other sizes than the cameras' are the instrument's too.
     """
-
-    @property
-    def instrument(self) -> Instrument | None: ...
-
-    def of(self, frame: Frame | Stars) -> Instrument | None: ...
-
-    @property
-    def hinted(self) -> bool:
-        """Whether only headers give the focal length."""
-
-
-@dataclass(frozen=True)
-class Given:
-    """One instrument for all frames; by_header: except for the focal length in a frame's own header."""
 
     instrument: Instrument | None
     by_header: bool = False
+    cameras: Mapping[tuple[int, int], Camera] = field(default_factory=dict)
+    any_size: bool = True
 
-    def framed(self, first: About) -> tuple["Given", tuple[Remark, ...]]:
+    def framed(self, first: About) -> tuple["Instruments", tuple[Remark, ...]]:
         """Instruments of a night with this first frame, and a remark if the optical axis of its frames is not known."""
         if self.instrument is None:
             return self, ()
         instrument, doubt = with_frame_size(self.instrument, first)
         return replace(self, instrument=instrument), of_axis(doubt)
 
-    @property
-    def hinted(self) -> bool:
-        """Whether only headers give the focal length."""
-        return self.by_header
-
     def of(self, frame: Frame | Stars) -> Instrument | None:
-        """The instrument of a frame."""
+        """The instrument of a frame; None if its focal length is unknown."""
+        camera = self.cameras.get((frame.width, frame.height))
+        if camera is not None and self.instrument is not None:
+            return replace(self.instrument, camera=camera, focal_px=camera.fx)
+        if not self.any_size:
+            return None
         if not self.by_header or frame.focal_px is None:
             return self.instrument
         if self.instrument is None:

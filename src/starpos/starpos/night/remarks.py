@@ -22,6 +22,7 @@ from starpos.fix.checks import (
     unnamed_inclinometer,
 )
 from starpos.fix.fix import Fix, length_text
+from starpos.frozen import at_once
 from starpos.instrument.inclinometer import Tilt, level_of, up_of
 from starpos.instrument.instrument import Calibration, Instrument
 from starpos.instrument.mounting import Mounting
@@ -138,6 +139,9 @@ APART_M, NEARER = 20_000.0, 20.0
 # clocks that are not on UTC are usually wrong by a multiple of this
 ZONE_H = 0.5
 
+# camera_to_itrs (3, 3) of a frame, and its tilt
+Leaning = tuple[np.ndarray, Tilt]
+
 # possible mistakes in tilts, and functions that give the corrected angles (N, 2), rad
 MISTAKES: tuple[tuple[str, Callable[[np.ndarray], np.ndarray]], ...] = (
     ("theta_x and theta_y exchanged", lambda theta: theta[:, ::-1]),
@@ -148,14 +152,7 @@ MISTAKES: tuple[tuple[str, Callable[[np.ndarray], np.ndarray]], ...] = (
 )
 
 
-@dataclass(frozen=True)
-class Levelled:
-    """A frame's attitude by its stars, camera_to_itrs (3, 3), and its tilt."""
-
-    camera_to_itrs: np.ndarray
-    tilt: Tilt
-
-
+@at_once
 @dataclass(frozen=True)
 class Near:
     """A place, in rad, at which the instrument is said to be within some km."""
@@ -170,12 +167,13 @@ class Near:
 
 
 def doubts(
-    frames: Sequence[Levelled], whole: Fix | Average, mounting: Mounting | None, near: Near | None
+    fixes: Sequence[Fix], whole: Fix | Average, mounting: Mounting | None, near: Near | None
 ) -> Iterator[Remark]:
     """Report places that mistaken tilts set apart, and a place far from `near`.
 
-    mounting: of the frames, None if A3 was not given: then it is not checked.
+    mounting: of the fixes' frames, None if A3 was not given: then it is not checked.
     """
+    frames: list[Leaning] = [(f.camera.rotation, f.tilt) for f in fixes if f.tilt is not None]
     if apart := _mistaken(mounting, frames):
         yield Remark(Kind.MISTAKEN, apart)
     if near is not None and (away := _far(near, whole, mounting, frames[-1:])):
@@ -188,7 +186,7 @@ def apart_m(a: tuple[float, float], b: tuple[float, float]) -> float:
     return EARTH_RADIUS_M * float(np.arctan2(np.linalg.norm(np.cross(up, other)), up @ other))
 
 
-def _far(near: Near, fix: Fix | Average, mounting: Mounting | None, frames: Sequence[Levelled]) -> str:
+def _far(near: Near, fix: Fix | Average, mounting: Mounting | None, frames: Sequence[Leaning]) -> str:
     """Say that a fix lies far from a place, and which mistake would explain it; '' if it does not."""
     km = near.km_from(fix.latitude, fix.longitude)
     sigma_m = float(np.sqrt(np.diag(fix.covariance)[:2].max()))
@@ -213,14 +211,14 @@ def _hours_ahead(near: Near, fix: Fix | Average) -> float:
     return hours if near.km_from(fix.latitude, turned) <= near.km else 0.0
 
 
-def _mistaken(mounting: Mounting | None, frames: Sequence[Levelled]) -> str:
+def _mistaken(mounting: Mounting | None, frames: Sequence[Leaning]) -> str:
     """Say which mistake has set the places of frames far apart; '' if none explains it.
 
     One heading alone never shows it: the same mistake then moves all places alike.
     """
     if mounting is None:
         return ""
-    spread_m = _spread_m([_place(f, f.tilt.theta, mounting) for f in frames])
+    spread_m = _spread_m([_place(camera, tilt.theta, mounting) for camera, tilt in frames])
     if spread_m < APART_M:
         return ""
     for name, places in _places(mounting, frames):
@@ -233,23 +231,28 @@ def _mistaken(mounting: Mounting | None, frames: Sequence[Levelled]) -> str:
 
 
 def _places(
-    mounting: Mounting | None, frames: Sequence[Levelled]
+    mounting: Mounting | None, frames: Sequence[Leaning]
 ) -> list[tuple[str, list[tuple[float, float]]]]:
     """The places of frames with two-axis tilts, by mistake."""
-    if mounting is None or not frames or any(f.tilt.axes != 2 for f in frames):
+    if mounting is None or not frames or any(tilt.axes != 2 for _, tilt in frames):
         return []
-    theta = np.array([f.tilt.theta for f in frames])
+    theta = np.array([tilt.theta for _, tilt in frames])
     found = []
     for name, corrected in MISTAKES:
         angles = corrected(theta)
         if np.abs(angles).max() < np.pi / 2:
-            found.append((name, [_place(f, one, mounting) for f, one in zip(frames, angles, strict=True)]))
+            found.append(
+                (
+                    name,
+                    [_place(camera, one, mounting) for (camera, _), one in zip(frames, angles, strict=True)],
+                )
+            )
     return found
 
 
-def _place(frame: Levelled, theta: np.ndarray, mounting: Mounting) -> tuple[float, float]:
+def _place(camera_to_itrs: np.ndarray, theta: np.ndarray, mounting: Mounting) -> tuple[float, float]:
     """Latitude, longitude (rad) of a frame with a tilt, without refraction."""
-    place = local_north(level_of(up_of(theta)) @ mounting.a3 @ frame.camera_to_itrs.T)
+    place = local_north(level_of(up_of(theta)) @ mounting.a3 @ camera_to_itrs.T)
     return place.latitude, place.longitude
 
 

@@ -13,14 +13,15 @@ import numpy as np
 from starpos.earth.ellipsoid import EARTH_RADIUS_M
 from starpos.earth.vertical import Vertical
 from starpos.errors import FrameError
-from starpos.fix.budget import heading_of, local_north
+from starpos.fix.attitude import heading_of
+from starpos.fix.budget import local_north
 from starpos.fix.searching import Sight, of_one_camera
 from starpos.frames.frame import Frame, Stars
 from starpos.identification.prior import Hint
 from starpos.instrument.inclinometer import level_of, up_of
 from starpos.instrument.instrument import Instrument
 from starpos.instrument.tilt_log import NO_TILTS
-from starpos.night.night import Night, ReportedPlace, Shot, Truth, why_none
+from starpos.night.night import Night, Shot, Truth, why_none
 from starpos.night.remarks import Kind, Remark
 from starpos.night.together import (
     FrameAnswer,
@@ -179,7 +180,7 @@ def solved_night(exposures: Exposures, how: How = ONE_BY_ONE, progress: Progress
         name=exposures.name,
         origin=exposures.origin,
         shots=shots,
-        combined=None if whole.average is None else ReportedPlace.of(whole.average),
+        combined=whole.average,
         why_not=whole.why_not if gathered.solved else why_none(shots),
         vertical=exposures.vertical,
         atmosphere=exposures.work.atmosphere,

@@ -39,7 +39,7 @@ from starpos.instrument.instrument import Calibration, Instrument
 from starpos.instrument.mounting import Mounting
 from starpos.instrument.tilt_log import Tilts
 from starpos.night import remarks
-from starpos.night.remarks import Kind, Levelled, Near, Remark, doubts, of_inclinometer
+from starpos.night.remarks import Kind, Near, Remark, doubts, of_inclinometer
 from starpos.sky.site import Site
 from starpos.units import ARCSEC
 
@@ -53,20 +53,18 @@ class Solved:
     stars_detected: int
     stars_matched: int
     log_odds: float
-    tilt: Tilt | None = None
 
     @classmethod
     def of(cls, s: Solution, fix: Fix) -> "Solved":
         """The part of a solution with a fix."""
         light = replace(fix, used=np.zeros(0, int), residual_px=np.zeros((0, 2)))
-        log_odds = s.attitude.log_odds if s.attitude else float("nan")
+        log_odds = s.pointing.log_odds if s.pointing else float("nan")
         return cls(
             fix=light,
             extrapolated_days=s.extrapolated_days,
             stars_detected=s.stars_detected,
             stars_matched=len(s.names),
             log_odds=log_odds,
-            tilt=s.tilt,
         )
 
 
@@ -149,8 +147,7 @@ def together(solved: Sequence[Solved], given: Instrument | None, near: Near | No
         said += remarks.of_a3(given.calibration, place)
         if given.vertical is None and not given.calibration.unknown:
             mounting = given.mounting
-    frames = [Levelled(s.fix.camera_to_itrs, s.tilt) for s in solved if s.tilt is not None]
-    said += doubts(frames, place, mounting, near)
+    said += doubts([s.fix for s in solved], place, mounting, near)
     return Together(whole, why_not, tuple(said))
 
 

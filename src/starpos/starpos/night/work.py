@@ -93,7 +93,7 @@ class Solving:
                 solver.prepare(item.width, item.height, item.origin_px)
             begin = time.process_time()
             question = Question(item=item, stars=stars_of(item), tilts=self.tilts, places=self.places)
-            if self.instruments.hinted:
+            if self.instruments.by_header:
                 sight = answer_by_header(solver, question, self.progress)
             else:
                 sight = answer_frame(solver, question)
@@ -124,7 +124,7 @@ class Solving:
         """Say which focal length fits a frame that was not identified with the given one."""
         instrument = self.instruments.of(lost)
         # without its header's focal length a frame was searched already
-        if instrument is None or self.instruments.hinted:
+        if instrument is None or self.instruments.by_header:
             return ()
         focal_px = focal_px_that_fits(self.solver(lost), lost)
         if focal_px is None:

@@ -1,6 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Do calls in this process, or in several processes of this machine.  concurrent.futures is not suitable: if one process
-dies, its whole pool breaks and does not say at which call, and its processes go on after their parent was killed.
+"""Do calls in this process, or in several processes of this machine.
+
+No kept library does the latter. If a process dies, the pools of concurrent.futures and loky break and do not say at
+which call; the processes of concurrent.futures go on after their parent was killed. Pebble names the call, but its pool
+breaks if processes die between two calls. And none of them does a call again alone, with all of the machine's memory.
 """
 
 import os
@@ -18,9 +21,20 @@ from typing import Any, Protocol
 from starpos.errors import FrameError, StarposError, one_line
 from starpos.parallel import BLAS_THREADS
 
+# Calls for each process whose answers may wait for an earlier one.
+AHEAD = 4
+# Maximum number of processes in a row that end before they are ready.
+MAX_STILLBORN = 3
+# Time for a process that no longer answers to end.
+DYING_S = 1.0
+# There is a process for each processor, so the libraries need no threads of their own.
+ONE_THREAD = dict.fromkeys((*BLAS_THREADS, "OPENCV_FOR_THREADS_NUM"), "1")
+
 Files = str | tuple[str, ...]
 # The work, which can be pickled, and the file or files it is done on.
 Call = tuple[Callable[[Any], Any], Files]
+# A call and its number.
+Task = tuple[int, Call]
 
 
 class Workers(Protocol):
@@ -85,20 +99,6 @@ class Here:
         return (answer_of(worked(*call)) for call in calls)
 
 
-# Calls for each process whose answers may wait for an earlier one.
-AHEAD = 4
-# Maximum number of processes in a row that end before they are ready.
-MAX_STILLBORN = 3
-# Time for a process that no longer answers to end.
-DYING_S = 1.0
-# There is a process for each processor, so the libraries need no threads of their own.
-ONE_THREAD = dict.fromkeys((*BLAS_THREADS, "OPENCV_FOR_THREADS_NUM"), "1")
-
-
-# A call and its number.
-Task = tuple[int, Call]
-
-
 class ProcessError(StarposError):
     """The processes do not start."""
 
@@ -132,9 +132,9 @@ class Processes:
         """See Workers."""
         board = _Board(calls, AHEAD * self._number)
         while True:
-            yield from board.answers()
+            yield from board.pop_answers()
             for k, worker in enumerate(self._workers):
-                if worker.task is None and (task := board.take()) is not None and not worker.give(task):
+                if worker.task is None and (task := board.next_task()) is not None and not worker.send(task):
                     self._replace(k, board, task)
             busy = [(k, w, w.task) for k, w in enumerate(self._workers) if w.task is not None]
             if not busy:
@@ -146,13 +146,13 @@ class Processes:
                 if worker.pipe not in ready:
                     continue
                 try:
-                    outcome = worker.hear()
+                    outcome = worker.receive()
                 except (EOFError, OSError):
                     self._replace(k, board, task)
                     continue
                 self._stillborn = 0
                 if outcome is not None:
-                    board.came(task, outcome)
+                    board.finish(task, outcome)
                     worker.task = None
 
     def _replace(self, k: int, board: "_Board", task: Task) -> None:
@@ -168,9 +168,14 @@ class Processes:
             raise ProcessError(f"the processes of --jobs do not start ({why}): use fewer, or --jobs 1")
         self._workers[k] = _Worker()
         if dead.begun:
-            board.died(task, why)
+            board.fail(task, why)
         else:
-            board.came_back(task)
+            board.put_back(task)
+
+
+def workers(number: int) -> Workers:
+    """Processes of that number, or this one alone."""
+    return Here() if number <= 1 else Processes(number)
 
 
 class _Board:
@@ -185,9 +190,9 @@ class _Board:
         # Calls that have ended a process.
         self._tried: set[int] = set()
         self._done: dict[int, bytes] = {}
-        self._given = self._told = 0
+        self._given = self._popped = 0
 
-    def take(self) -> Task | None:
+    def next_task(self) -> Task | None:
         """The next task; None if nothing is left, or if it must not run together with the tasks under way."""
         if self._under_way & self._tried or (self._again and self._under_way):
             return None
@@ -196,21 +201,21 @@ class _Board:
             task = self._again.popleft()
         elif self._untouched:
             task = self._untouched.popleft()
-        elif self._given - self._told < self._ahead and (task := next(self._coming, None)) is not None:
+        elif self._given - self._popped < self._ahead and (task := next(self._coming, None)) is not None:
             self._given += 1
         if task is not None:
             self._under_way.add(task[0])
         return task
 
-    def came(self, task: Task, outcome: bytes) -> None:
+    def finish(self, task: Task, outcome: bytes) -> None:
         self._under_way.discard(task[0])
         self._done[task[0]] = outcome
 
-    def came_back(self, task: Task) -> None:
+    def put_back(self, task: Task) -> None:
         self._under_way.discard(task[0])
         self._untouched.append(task)
 
-    def died(self, task: Task, why: str) -> None:
+    def fail(self, task: Task, why: str) -> None:
         number, (_, files) = task
         self._under_way.discard(number)
         if number not in self._tried:
@@ -220,16 +225,16 @@ class _Board:
         error = given_up(files, f"the process that worked it ended twice, the second time alone ({why})")
         self._done[number] = pickle.dumps(error)
 
-    def answers(self) -> Iterator:
-        while self._told in self._done:
-            outcome = self._done.pop(self._told)
-            self._told += 1
+    def pop_answers(self) -> Iterator:
+        while self._popped in self._done:
+            outcome = self._done.pop(self._popped)
+            self._popped += 1
             yield answer_of(outcome)
 
     @property
     def finished(self) -> bool:
         """Whether nothing is left to do; asked while no call is under way."""
-        return not self._again and self._told == self._given
+        return not self._again and self._popped == self._given
 
 
 class _Worker:
@@ -248,7 +253,7 @@ class _Worker:
         with theirs, _for_one_that_starts():
             self._process.start()
 
-    def give(self, task: Task) -> bool:
+    def send(self, task: Task) -> bool:
         """Send a task; False if the process has died."""
         self.task, self.begun = task, False
         try:
@@ -257,7 +262,7 @@ class _Worker:
             return False
         return True
 
-    def hear(self) -> bytes | None:
+    def receive(self) -> bytes | None:
         """Receive an answer; None for word that it runs, the first, or has begun. EOFError or OSError if it has died."""
         said, outcome = pickle.loads(self.pipe.recv_bytes())
         for text in said:

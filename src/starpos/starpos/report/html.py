@@ -7,7 +7,6 @@ import base64
 import tempfile
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from html import escape
 from pathlib import Path
 
@@ -16,6 +15,7 @@ import numpy as np
 from starpos import __version__
 from starpos.errors import StarposError
 from starpos.files import has_mark, write_whole
+from starpos.report.style import Picture
 
 STYLE = """
 :root { color-scheme: light dark; --ink: #1d2329; --soft: #5a646e; --paper: #fbfbf9; --card: #ffffff; --line: #dcdfe2;
@@ -42,16 +42,6 @@ figcaption { margin-top: .6rem; } details { margin: .6rem 0 1.2rem; } summary { 
   th, td { padding: .4rem .5rem; font-size: .92rem; } }
 @media print { img { filter: none; } .wide table { white-space: normal; font-size: .8rem; } }
 """
-
-
-@dataclass(frozen=True, eq=False)
-class Picture:
-    """A figure as PNG; name: of its file, without suffix; title, caption: plain text."""
-
-    name: str
-    title: str
-    caption: str
-    png: bytes
 
 
 def document(title: str, parts: Sequence[str]) -> str:

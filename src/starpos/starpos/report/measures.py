@@ -6,7 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from starpos.earth.ellipsoid import curvature_radii_m, place_of_zenith, zenith_of
-from starpos.night.night import Night, ReportedPlace, Truth, offset_m
+from starpos.fix.fix import PlaceFix
+from starpos.night.night import Night, Truth, offset_m
 from starpos.rotation import half_turns
 from starpos.units import ARCSEC, SIGMA_PER_MAD
 
@@ -99,12 +100,12 @@ def share_inside(night: Night, squared_distance: float) -> int:
     return int(np.sum(np.einsum("ni,nij,nj->n", apart, np.linalg.inv(own), apart) <= squared_distance))
 
 
-def error_arcsec(place: ReportedPlace, truth: Truth) -> np.ndarray:
+def error_arcsec(place: PlaceFix, truth: Truth) -> np.ndarray:
     """Latitude, longitude (2,) of a place minus the truth, in arcsec."""
     return half_turns(np.array([place.latitude - truth.latitude, place.longitude - truth.longitude])) / ARCSEC
 
 
-def sigma_arcsec(place: ReportedPlace) -> np.ndarray:
+def sigma_arcsec(place: PlaceFix) -> np.ndarray:
     """1 sigma of latitude and longitude (2,) in arcsec."""
     return _angles(place.covariance, place.latitude)[:2] / ARCSEC
 
@@ -114,7 +115,7 @@ def _from_mean(seen: np.ndarray) -> np.ndarray:
     return away - away.mean(0)
 
 
-def _own_sigma(place: ReportedPlace, without: str = "none") -> np.ndarray:
+def _own_sigma(place: PlaceFix, without: str = "none") -> np.ndarray:
     """Sigma (3,) of latitude, longitude, heading in rad by the errors that are new in each frame."""
     own = [t.covariance[:3, :3] for t in place.terms if not t.common and not t.name.startswith(without)]
     return _angles(sum(own, np.zeros((3, 3))), place.latitude)

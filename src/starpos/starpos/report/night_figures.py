@@ -10,11 +10,12 @@ import numpy as np
 
 from starpos.earth.orientation import EarthState, earth_state
 from starpos.earth.place import Place
-from starpos.fix.solution import Attitude
+from starpos.fix.fix import PlaceFix
+from starpos.fix.solution import FieldPointing
 from starpos.gnss.solving import Watched
 from starpos.gnss.watch import GnssStatus
 from starpos.instrument.camera import Camera
-from starpos.night.night import Night, ReportedPlace, Shot
+from starpos.night.night import Night, Shot
 from starpos.report import measures
 from starpos.report.measures import Stability
 from starpos.report.style import BLUE, GREEN, GREY, ORANGE, PURPLE, RED, SKY, figures_of, number_axis, plain
@@ -176,7 +177,7 @@ def _short(value: float) -> str:
     return "0" if value == 0 else figures_of(value, 2) if value >= SMALLEST_SHOWN else f"< {SMALLEST_SHOWN:g}"
 
 
-def _shares(place: ReportedPlace, night: Night) -> dict[str, np.ndarray]:
+def _shares(place: PlaceFix, night: Night) -> dict[str, np.ndarray]:
     """1 sigma (3,) of each source: east m, north m, heading arcsec; the latter is NaN if there is no heading."""
     unit = np.array([1, 1, 1 / measures.ARCSEC])
     shares = {t.name: np.sqrt(np.diag(t.covariance)[:3]) * unit for t in place.terms}
@@ -396,7 +397,7 @@ class View:
     """A frame whose pointing is known, with its size in px."""
 
     shot: Shot
-    pointing: Attitude
+    pointing: FieldPointing
     size: tuple[int, int]
 
     def directions(self, xy: np.ndarray) -> np.ndarray:
@@ -482,7 +483,7 @@ def polar(enu: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.arctan2(enu[:, 0], enu[:, 1]), np.degrees(np.arctan2(np.hypot(enu[:, 0], enu[:, 1]), enu[:, 2]))
 
 
-def _axes(a: Attitude) -> np.ndarray:
+def _axes(a: FieldPointing) -> np.ndarray:
     """Camera axes (3, 3) in ICRS: its rows are x (along columns), y (along rows) and z."""
     ca, sa, cd, sd = np.cos(a.ra), np.sin(a.ra), np.cos(a.dec), np.sin(a.dec)
     east, north = np.array([-sa, ca, 0.0]), np.array([-sd * ca, -sd * sa, cd])

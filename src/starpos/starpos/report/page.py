@@ -12,15 +12,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from starpos import __version__
+from starpos.averaging.average import Average
 from starpos.calibration import residual_map
 from starpos.errors import TimeError
-from starpos.fix.fix import length_text
+from starpos.fix.fix import PlaceFix, length_text
 from starpos.gnss.solving import Watched
 from starpos.gnss.watch import GnssStatus
-from starpos.night.night import Night, ReportedPlace, Truth
+from starpos.night.night import Night, Truth
 from starpos.report import coast, measures, night_figures
-from starpos.report.html import Picture, document, figures, sexagesimal, table, wide_table
-from starpos.report.style import figures_of, mark_simulated, new_figure, png_of
+from starpos.report.html import document, figures, sexagesimal, table, wide_table
+from starpos.report.style import Picture, figures_of
 from starpos.sky.catalogue import Catalogue
 from starpos.units import utc_text
 
@@ -28,79 +29,62 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
+# name, title, caption and height (in) of a figure, and what draws it
+_Figure = tuple[str, str, str, float, "Callable[[Figure], None]"]
+
+
 def pictures_of(night: Night, catalogue: Catalogue) -> Iterator[Picture]:
     """All figures that a night has data for; without a fix only the health of its frames."""
-    if night.fixed:
-        yield from _place_pictures(night)
-        if (over := night_figures.overlaid(night)) is not None:
-            yield _residuals(night, *over)
+    for row in _figures(night, catalogue):
         # the time of a recorded solution may lie outside the tables of the Earth's rotation
         with suppress(TimeError):
-            if night_figures.views(night):
-                yield _drawn(night.simulated, "sky", "Where the camera looked", _sky_caption(), 6.4,
-                         lambda f: night_figures.draw_sky(f, night, catalogue))  # fmt: skip
-    if night.shots:
-        if night.watched is not None and night_figures.compared_of(night.watched.answers):
-            answers = night.watched.answers
-            yield _drawn(night.simulated, "drive", "The drive beside GNSS", _drive_caption(answers), 8.6,
-                         lambda f: night_figures.draw_drive(f, answers))  # fmt: skip
-        yield _drawn(
-            night.simulated,
-            "health",
-            "Frame by frame",
-            HEALTH,
-            6.4,
-            lambda f: night_figures.draw_health(f, night),
-        )
+            yield Picture.drawn(*row, simulated=night.simulated)
 
 
 def nights_picture(nights: Sequence[tuple[int, Night]]) -> Picture:
     """The errors of numbered nights whose truth is known, at least one."""
     simulated = all(night.simulated for _, night in nights)
-    return _drawn(
-        simulated,
-        "nights",
-        "Error of the nights",
-        NIGHTS,
-        5.0,
-        lambda f: night_figures.draw_nights(f, nights),
-    )
+
+    def draw(figure: "Figure") -> None:
+        night_figures.draw_nights(figure, nights)
+
+    return Picture.drawn("nights", "Error of the nights", NIGHTS, 5.0, draw, simulated)
 
 
-def _place_pictures(night: Night) -> Iterator[Picture]:
+def _figures(night: Night, catalogue: Catalogue) -> Iterator[_Figure]:
+    draw = night_figures
+    if night.fixed:
+        yield from _place_figures(night)
+        if (over := draw.overlaid(night)) is not None:
+            yield _residuals(*over)
+        if draw.views(night):
+            title = "Where the camera looked"
+            yield "sky", title, _sky_caption(), 6.4, lambda f: draw.draw_sky(f, night, catalogue)
+    if not night.shots:
+        return
+    if night.watched is not None and draw.compared_of(night.watched.answers):
+        answers = night.watched.answers
+        title = "The drive beside GNSS"
+        yield "drive", title, _drive_caption(answers), 8.6, lambda f: draw.draw_drive(f, answers)
+    yield "health", "Frame by frame", HEALTH, 6.4, lambda f: draw.draw_health(f, night)
+
+
+def _place_figures(night: Night) -> Iterator[_Figure]:
+    draw = night_figures
     ground = (night.combined or night.places[0]).on_ground(night.vertical)
-    yield _drawn(night.simulated, "map", "Where on Earth", MAP, 6.6,
-                 lambda f: coast.draw_map(f, ground.latitude, ground.longitude))  # fmt: skip
+    yield "map", "Where on Earth", MAP, 6.6, lambda f: coast.draw_map(f, ground.latitude, ground.longitude)
     if night.steady is not None:
         s = measures.steadiness(night, night.steady)
-        yield _drawn(night.simulated, "stability", "Stability: one tilt for all frames",
-                     _stability_caption(s, STEADY), 6.8, lambda f: night_figures.draw_stability(f, s))  # fmt: skip
+        title = "Stability: one tilt for all frames"
+        yield "stability", title, _stability_caption(s, STEADY), 6.8, lambda f: draw.draw_stability(f, s)
     if len(night.fixed) > 1:
         each = measures.stability(night)
-        yield _drawn(night.simulated, "frames", "Each frame with its own tilt", _stability_caption(each, EACH), 6.8,
-                     lambda f: night_figures.draw_stability(f, each))  # fmt: skip
-    yield _drawn(night.simulated, "scatter", "Scatter of the fixes", _scatter_caption(night), 6.4,
-                 lambda f: night_figures.draw_scatter(f, night))  # fmt: skip
+        title = "Each frame with its own tilt"
+        yield "frames", title, _stability_caption(each, EACH), 6.8, lambda f: draw.draw_stability(f, each)
+    title = "Scatter of the fixes"
+    yield "scatter", title, _scatter_caption(night), 6.4, lambda f: draw.draw_scatter(f, night)
     if night.places[0].terms:
-        yield _drawn(
-            night.simulated,
-            "budget",
-            "Error budget",
-            BUDGET,
-            5.6,
-            lambda f: night_figures.draw_budget(f, night),
-        )
-
-
-def _drawn(
-    simulated: bool, name: str, title: str, caption: str, height_in: float, draw: "Callable[[Figure], None]"
-) -> Picture:
-    figure = new_figure(height_in)
-    draw(figure)
-    if simulated:
-        mark_simulated(figure)
-        caption = f"Simulated. {caption}"
-    return Picture(name, title, caption, png_of(figure))
+        yield "budget", "Error budget", BUDGET, 5.6, lambda f: draw.draw_budget(f, night)
 
 
 MAP = (
@@ -185,7 +169,7 @@ def _scatter_caption(night: Night) -> str:
     )
 
 
-def _residuals(night: Night, xy: np.ndarray, residual_px: np.ndarray, size: tuple[int, int]) -> Picture:
+def _residuals(xy: np.ndarray, residual_px: np.ndarray, size: tuple[int, int]) -> _Figure:
     rms = figures_of(np.sqrt(np.mean(residual_px**2)))
     text = f"{len(xy)} stars, root mean square {rms} px an axis. {RESIDUALS}"
     height = 0.9 + 6.4 * min(size[1] / size[0], 1.6)
@@ -195,7 +179,7 @@ def _residuals(night: Night, xy: np.ndarray, residual_px: np.ndarray, size: tupl
         figure.set_layout_engine("constrained", rect=(0, 0.06, 1, 0.94))
         residual_map.draw_residuals(figure.subplots(), xy, residual_px, *size)
 
-    return _drawn(night.simulated, "residuals", "Residuals over the frame", text, height, draw)
+    return "residuals", "Residuals over the frame", text, height, draw
 
 
 def _sky_caption() -> str:
@@ -251,13 +235,17 @@ def _place(night: Night) -> str:
     ground = c.on_ground(night.vertical)
     facing = "turned between the frames"
     if np.isfinite(c.heading):
-        last = "last " if c.poses > 1 else ""
+        last = "last " if _poses(c) > 1 else ""
         sigma_deg = np.degrees(np.sqrt(ground.covariance[2, 2]))
         facing = f"{last}heading {np.degrees(ground.heading):.4f} &plusmn; {sigma_deg:.4f}&deg;"
     where = f"{_degrees(ground.latitude)}, {_degrees(ground.longitude)}"
     link = f"geo:{np.degrees(ground.latitude):.6f},{np.degrees(ground.longitude):.6f}"
     errors = _errors(ground.covariance)
     return f'<p class="place"><a href="{link}">{where}</a> {errors} (WGS 84, as on maps), {facing}</p>'
+
+
+def _poses(place: PlaceFix) -> int:
+    return place.poses if isinstance(place, Average) else 1
 
 
 def _errors(covariance: np.ndarray) -> str:
@@ -286,7 +274,7 @@ def _summary(night: Night) -> str:
         )
         if np.isfinite(c.heading):
             text = f"{np.degrees(c.heading):.4f} &plusmn; {np.degrees(c.sigma[2]):.4f}&deg; from astronomic north"
-            last = f", of the last of {c.poses} poses" if c.poses > 1 else ""
+            last = f", of the last of {_poses(c)} poses" if _poses(c) > 1 else ""
             rows.append(
                 ("Heading", f"{text}, {np.degrees(ground.heading):.4f}&deg; from true north on WGS 84{last}")
             )
@@ -346,7 +334,7 @@ def _rows_on_fixes(night: Night) -> list[tuple[str, str]]:
     return rows
 
 
-def _error(place: ReportedPlace, truth: Truth) -> str:
+def _error(place: PlaceFix, truth: Truth) -> str:
     east, north = measures.offset_m(place, truth.latitude, truth.longitude)
     latitude, longitude = measures.error_arcsec(place, truth)
     return (

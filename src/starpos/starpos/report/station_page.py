@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Writes the stations of a zenith camera, with their figures, as one HTML page that a surveyor hands in."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from html import escape
 from typing import TYPE_CHECKING
@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from starpos import __version__
-from starpos.report.html import Picture, document, figures, sexagesimal, table, wide_table
-from starpos.report.style import BLUE, GREEN, GREY, ORANGE, PURPLE, RED, SKY, new_figure, plain, png_of
+from starpos.report.html import document, figures, sexagesimal, table, wide_table
+from starpos.report.style import BLUE, GREEN, GREY, ORANGE, PURPLE, RED, SKY, Picture, plain
 from starpos.units import utc_text
 from starpos.zenith.session_file import SessionResult
 from starpos.zenith.stations import AgainstGrid, Station
@@ -168,7 +168,7 @@ def station_page(
     title = f"Station {stations[0].name}" if len(stations) == 1 else f"{len(stations)} stations"
     parts, pictures = [f"<h1>Deflection of the vertical: {escape(title)}</h1>"], {}
     if len(stations) > 1:
-        shown = _drawn("map", "Map", MAP, 6.0, lambda f: draw_map(f, stations, compared))
+        shown = Picture.drawn("map", "Map", MAP, 6.0, lambda f: draw_map(f, stations, compared))
         pictures["map"] = shown
         parts += [_table_of_stations(stations, compared), figures([shown])]
     for k, (station, against) in enumerate(zip(stations, compared, strict=True), 1):
@@ -191,31 +191,16 @@ def station_page(
     return document(f"starpos: {title}", parts), pictures
 
 
-def _drawn(
-    name: str, title: str, caption: str, height_in: float, draw: "Callable[[Figure], None]"
-) -> Picture:
-    figure = new_figure(height_in)
-    draw(figure)
-    return Picture(name, title, caption, png_of(figure))
-
-
 def _pictures(station: Station) -> list[Picture]:
     """The figures of a station: of its sessions, and of their repeats."""
     made = []
     if len(station.sessions) > 1:
-        made.append(
-            _drawn(
-                "repeats",
-                f"{station.name}: repeats",
-                REPEATS,
-                5.0,
-                lambda f: draw_repeats(f, station),
-            )
-        )
+        title = f"{station.name}: repeats"
+        made.append(Picture.drawn("repeats", title, REPEATS, 5.0, lambda f: draw_repeats(f, station)))
     for k, session in enumerate(station.sessions, 1):
         of = f"{station.name}, session {k}" if len(station.sessions) > 1 else station.name
         made += [
-            _drawn(f"{name}{k}", f"{of}: {title}", caption, height_in, partial(draw, session=session))
+            Picture.drawn(f"{name}{k}", f"{of}: {title}", caption, height_in, partial(draw, session=session))
             for there, name, title, caption, height_in, draw in (
                 (session.frames, "frames", "frame by frame", FRAMES, 5.6, draw_frames),
                 (session.faces, "faces", "face by face", FACES, 4.2, draw_faces),

@@ -19,6 +19,7 @@ from starpos.earth.place import Place
 from starpos.earth.vertical import Geodetic, Vertical, geodetic
 from starpos.errors import GnssError, StarposError, VoyageError
 from starpos.files import path_of
+from starpos.fix.attitude import Attitude
 from starpos.instrument.instrument import Instrument
 from starpos.messages.stamp import stamp_to_unix
 from starpos.messages.stars import message_to_attitude
@@ -26,7 +27,7 @@ from starpos.navigation.equations import PLACE
 from starpos.navigation.estimate import Estimate, Observability, VoyageFix, observability
 from starpos.navigation.recent import BACK_S, LONGEST_GAP_S, Recent
 from starpos.navigation.records import ImuModel, read_imu_model
-from starpos.navigation.sightings import BodyAttitude, PlacelessFrame, attitude_at_place
+from starpos.navigation.sightings import PlacelessFrame, body_attitude
 from starpos.navigation.vessel import PARKED, Vessel, check_drift
 from starpos.navigation.voyage import MIN_FRAMES, Voyage
 from starpos.session import settings
@@ -143,7 +144,7 @@ class Navigated:
     fix: VoyageFix | None = None
     ground: Geodetic | None = None
     position: Position | None = None
-    at_place: BodyAttitude | None = None
+    at_place: Attitude | None = None
 
 
 class NavigatorSession:
@@ -234,7 +235,7 @@ class NavigatorSession:
             return []
         if place is None:
             return []
-        found = attitude_at_place(frame, place, self._settings.vessel(self._clock_stddev_s))
+        found = body_attitude(frame, place, self._settings.vessel(self._clock_stddev_s))
         return [Navigated(utc_unix_s=frame.utc_unix_s, at_place=found)]
 
     def _by_gnss(self, utc_unix_s: float) -> Place | None:

@@ -66,7 +66,7 @@ def of_solution(answer: Solution, counts: Mapping[str, int], remarks: str = "") 
 
 def _heading_stddev_arcsec(attitude: AttitudeAtPlace) -> float:
     """1 sigma of the heading that is published."""
-    return float(np.sqrt(attitude.true_north.covariance[0, 0]) / ARCSEC)
+    return float(np.sqrt(attitude.true_north.angles_covariance[0, 0]) / ARCSEC)
 
 
 def of_clock(clock_stddev_s: float, stamp_stddev_s: float, ahead_s: float, doubt_s: float) -> Diagnosis:

@@ -9,8 +9,8 @@ import numpy as np
 from starpos.averaging.average import MOVED_FIXES, Average, Averager
 from starpos.averaging.poses import CREEP_RAD, SLIP_SIGMAS, slip_s
 from starpos.earth.ellipsoid import EARTH_RADIUS_M, curvature_radii_m, enu_axes, zenith_of
-from starpos.fix.budget import Origin
 from starpos.fix.fix import Fix
+from starpos.fix.terms import Origin
 from starpos.session.driver import Diagnosis, Level
 from starpos.units import ARCSEC
 
@@ -187,11 +187,11 @@ class ClockDoubt:
 
 
 def _spread(fix: Fix) -> float:
-    return float(np.trace(fix.camera_covariance))
+    return float(np.trace(fix.camera.covariance))
 
 
 def _leans_otherwise(fix: Fix, first: Fix) -> bool:
     """Whether the verticals of two fixes of one pose, seen from the camera, differ by more than the tilts' errors."""
-    up, before = (f.camera_to_itrs.T @ zenith_of(f.latitude, f.longitude) for f in (fix, first))
+    up, before = (f.camera.rotation.T @ zenith_of(f.latitude, f.longitude) for f in (fix, first))
     own_m2 = sum(np.trace(t.covariance[:2, :2]) for f in (fix, first) for t in f.terms if not t.common)
     return bool(np.linalg.norm(up - before) > SLIP_SIGMAS * np.sqrt(own_m2) / EARTH_RADIUS_M + CREEP_RAD)

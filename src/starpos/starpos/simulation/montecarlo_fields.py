@@ -14,6 +14,7 @@ import numpy as np
 
 from starpos.errors import CatalogueError
 from starpos.frames.frame import Stars
+from starpos.frozen import at_once
 from starpos.instrument.camera import Camera
 from starpos.sky.catalogue import Catalogue
 from starpos.units import ARCSEC
@@ -63,6 +64,7 @@ def limit_for(camera: Camera, catalogue: Catalogue, stars: float) -> float:
     return round(float(np.partition(catalogue.vmag_centi, rank)[rank]) / 100, 2)
 
 
+@at_once
 @dataclass(frozen=True)
 class Field:
     """Stars of a frame at xy (N, 2) px, brightest first.

@@ -21,6 +21,7 @@ from starpos.earth.vertical import Deflection, geodetic
 from starpos.errors import StarposError
 from starpos.fix.solver import Solver
 from starpos.frames.frame import Stars
+from starpos.frozen import at_once
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import InclinometerErrors
 from starpos.instrument.instrument import Calibration, Instrument
@@ -49,6 +50,7 @@ def tiltmeter(noise_arcsec: float) -> InclinometerErrors:
     )
 
 
+@at_once
 @dataclass(frozen=True, kw_only=True)
 class NightWorld:
     """The truth of a night, and the instrument's knowledge of it.
@@ -67,6 +69,7 @@ class NightWorld:
     air: Atmosphere
 
 
+@at_once
 @dataclass(frozen=True, kw_only=True)
 class NightOutcome:
     """Errors of one night and the covariances stated for them.
@@ -99,7 +102,7 @@ class NightOutcome:
         return float(self.off[2] ** 2 / self.covariance[2, 2])
 
 
-@dataclass
+@dataclass(eq=False)
 class Zero:
     """The zero of an inclinometer as it wanders with time."""
 

@@ -20,6 +20,7 @@ from starpos.frames.frame import Frame, Stars
 from starpos.frames.header import focal_mm
 from starpos.frames.reading import FITS
 from starpos.frames.tables import SIMULATED, TILTS, TRUTH, write_star_list
+from starpos.frozen import at_once
 from starpos.instrument.camera import PLUMB_BOB, Camera
 from starpos.instrument.instrument import Calibration, Instrument
 from starpos.instrument.sensors import SCA100T_CALIBRATED
@@ -101,6 +102,7 @@ class Scene:
         return float(np.arcsin(up[0])), float(np.arcsin(up[1]))
 
 
+@at_once
 @dataclass(frozen=True)
 class Exposed:
     """Stars on a frame: pixels (n, 2) at start, middle and end of the exposure; electrons (n,); catalogue index (n,)."""

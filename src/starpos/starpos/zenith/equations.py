@@ -13,7 +13,7 @@ import numpy as np
 from starpos import rotation
 from starpos.earth.orientation import ROTATION_RAD_S
 from starpos.earth.place import Place
-from starpos.instrument.inclinometer import InclinometerErrors
+from starpos.instrument.inclinometer import OUTDOORS_WALK_C_PER_SQRT_HOUR, InclinometerErrors
 from starpos.units import ARCSEC, HOUR_S
 from starpos.zenith.sighting import StarPlaces, ZenithSighting
 
@@ -122,8 +122,6 @@ def start_of(sightings: Sequence[ZenithSighting]) -> LeanEstimate:
     return LeanEstimate(lean=np.array([xi, eta]), a3=tilted @ a3)
 
 
-# Unmeasured temperature of a tiltmeter: it follows a clear night's air, some degrees in a few hours.
-UNKNOWN_WALK_C_PER_SQRT_HOUR = 2.0
 # Daily and half-daily terms of UT1 and of the pole, which daily tables do not have. The values are the root mean square
 # of the ocean tides' terms (IERS Conventions (2010), tables 8.2 and 8.3: M2 alone is 0.33 mas of the pole, O1 0.02 ms of
 # UT1). They include the error of interpolating UT1 linearly across a day of its fortnightly tide (0.8 ms, table 8.1).
@@ -218,7 +216,7 @@ def _of_tilts(
             Source.shared("tilt temperature", axes * ((warm - warm.mean()) * per_c)[:, None, None])
         )
     else:
-        walk = hours * UNKNOWN_WALK_C_PER_SQRT_HOUR**2
+        walk = hours * OUTDOORS_WALK_C_PER_SQRT_HOUR**2
         sources.append(Source.varying("tilt temperature", walk, axes * per_c))
     return sources
 

@@ -11,7 +11,7 @@ from starpos.averaging.filter import UNIT, PlaceFilter, Plane
 from starpos.earth.ellipsoid import curvature_radii_m
 from starpos.earth.orientation import earth_state
 from starpos.errors import FixError
-from starpos.fix.budget import ALWAYS, ErrorTerm, correlation, total_covariance
+from starpos.fix.terms import ALWAYS, ErrorTerm, correlation, total_covariance
 from starpos.instrument.inclinometer import Tilt
 from starpos.units import ARCSEC
 from starpos_testing.skies.fields import UTC, SkyField, random_field
@@ -314,7 +314,9 @@ def slipped(f, seconds):
     """A fix whose frame was stamped late: the Earth turns under the camera, and the place runs east to west."""
     angle = 7.292115e-5 * seconds
     return replace(
-        f, longitude=f.longitude - angle, camera_to_itrs=rotation.about_axis(2, -angle) @ f.camera_to_itrs
+        f,
+        longitude=f.longitude - angle,
+        camera=replace(f.camera, rotation=rotation.about_axis(2, -angle) @ f.camera.rotation),
     )
 
 

@@ -74,8 +74,10 @@ def spoiled(f, rng):
             f, latitude=float(np.clip(f.latitude + off[0], -1.57, 1.57)), longitude=f.longitude + off[1]
         )
     angle = EARTH_RAD_S * rng.normal(0, 10 ** rng.uniform(0, 4))
-    turned = rotation.about_axis(2, -angle) @ f.camera_to_itrs
-    return replace(f, longitude=rotation.half_turn(f.longitude - angle), camera_to_itrs=turned)
+    turned = rotation.about_axis(2, -angle) @ f.camera.rotation
+    return replace(
+        f, longitude=rotation.half_turn(f.longitude - angle), camera=replace(f.camera, rotation=turned)
+    )
 
 
 def sigmas_off(a, place) -> float:

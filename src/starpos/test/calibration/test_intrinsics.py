@@ -8,7 +8,7 @@ import pytest
 
 from starpos import rotation
 from starpos.calibration.camera import check_sound, fewest_stars, fit_camera, rms
-from starpos.calibration.camera_adjustment import Sighting, parameters, unbent
+from starpos.calibration.camera_adjustment import CameraSighting, parameters, unbent
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import CalibrationError
 from starpos.instrument.camera import Camera
@@ -24,7 +24,7 @@ from starpos_testing.skies.lenses import (
 )
 
 
-def moved(sighting: Sighting, rows, by) -> Sighting:
+def moved(sighting: CameraSighting, rows, by) -> CameraSighting:
     xy = sighting.xy.copy()
     xy[rows] += by
     return replace(sighting, xy=xy)

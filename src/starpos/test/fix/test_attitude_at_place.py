@@ -70,7 +70,7 @@ def attitude_of(stars, where=None, air=AIR, clock_s=0.0, unix_s=NIGHT, **more):
 def test_attitude_is_that_of_the_chain_of_erfa(pointing):
     stars, link = ring(*pointing)
     found = attitude_of(stars)
-    off = rotation.to_vector(found.plumb.link_to_enu @ link.T)
+    off = rotation.to_vector(found.plumb.rotation @ link.T)
     assert np.abs(off).max() < 0.002 * ARCSEC
     assert found.focal_scale == pytest.approx(1, abs=1e-7)
 
@@ -121,11 +121,11 @@ def test_norths_by_the_plumb_line_and_the_ellipsoid_differ_by_laplaces_equation(
     laplace += (xi * math.sin(azimuth) - eta * math.cos(azimuth)) * math.tan(height)
     turned = (found.plumb.heading - found.ellipsoid.heading) / ARCSEC
     assert turned == pytest.approx(laplace, abs=0.002)
-    level = found.true_north.link_to_enu
+    level = found.true_north.rotation
     assert found.true_north.heading - found.plumb.heading == pytest.approx(
         -eta * ARCSEC * math.tan(math.radians(LATITUDE)), abs=0.002 * ARCSEC
     )
-    assert level[2] == pytest.approx(found.plumb.link_to_enu[2], abs=1e-12)
+    assert level[2] == pytest.approx(found.plumb.rotation[2], abs=1e-12)
 
 
 @pytest.mark.parametrize("geodetic", [False, True])
@@ -133,7 +133,7 @@ def test_the_deflections_error_is_in_the_heading_of_the_north_that_was_not_state
     stars, _ = ring(200.0, 85.0, 20.0)
     make = Place.on_ellipsoid if geodetic else Place.by_gravity
     found = attitude_of(stars, place(Deflection(0.0, 0.0, 6.0), make))
-    sigma = [math.sqrt(a.covariance[0, 0]) / ARCSEC for a in (found.plumb, found.ellipsoid)]
+    sigma = [math.sqrt(a.angles_covariance[0, 0]) / ARCSEC for a in (found.plumb, found.ellipsoid)]
     own, other = sigma[::-1] if geodetic else sigma
     assert own < 4
     assert math.sqrt(other**2 - own**2) == pytest.approx(6.0 * math.tan(math.radians(LATITUDE)), rel=0.05)
@@ -150,7 +150,7 @@ def angles(link):
 def test_a_late_clock_turns_the_attitude_by_its_term():
     stars, _ = ring(200.0, 55.0, 20.0)
     found, late = attitude_of(stars, clock_s=1.0), attitude_of(stars, unix_s=NIGHT + 1.0)
-    turned = rotation.to_vector(late.plumb.link_to_enu @ found.plumb.link_to_enu.T)
+    turned = rotation.to_vector(late.plumb.rotation @ found.plumb.rotation.T)
     assert np.linalg.norm(turned) / ARCSEC == pytest.approx(15.04, abs=0.02)
     assert budget(found)["clock"][3:, 3:] == pytest.approx(
         np.outer(turned, turned), abs=1e-3 * (15 * ARCSEC) ** 2
@@ -170,7 +170,7 @@ def test_a_wrong_place_turns_the_attitude_by_its_term():
     of_place = next(t for t in found.plumb.terms if t.name == "place")
     assert of_place.covariance[2, 2] == pytest.approx(moved[0] ** 2, rel=0.02)
     bare = attitude_of(stars)
-    wider = found.plumb.covariance - bare.plumb.covariance
+    wider = found.plumb.angles_covariance - bare.plumb.angles_covariance
     assert wider == pytest.approx(np.outer(moved, moved), abs=0.03 * np.abs(moved).max() ** 2)
 
 
@@ -180,7 +180,7 @@ def test_mount_and_lens_are_in_the_claim():
     found = attitude_at_place(
         stars, CAMERA, place(), mounting, AIR, earth_state(NIGHT), 0.0, axis_stddev=40 * ARCSEC
     )
-    assert np.sqrt(np.diag(found.plumb.covariance)) / ARCSEC == pytest.approx(50.0, rel=0.01)
+    assert np.sqrt(np.diag(found.plumb.angles_covariance)) / ARCSEC == pytest.approx(50.0, rel=0.01)
 
 
 def test_errors_of_stars_are_as_large_as_claimed(rng):
@@ -196,8 +196,8 @@ def test_errors_of_stars_are_as_large_as_claimed(rng):
             stars.place_sigma,
         )
         found = attitude_of(noisy)
-        off = rotation.to_vector(found.plumb.link_to_enu @ link.T)
-        nees.append(off @ np.linalg.solve(found.plumb.attitude_covariance, off))
+        off = rotation.to_vector(found.plumb.rotation @ link.T)
+        nees.append(off @ np.linalg.solve(found.plumb.covariance, off))
     # 3 sigma of the mean of 80
     assert 2.18 < np.mean(nees) < 3.82
 
@@ -239,7 +239,7 @@ def test_pitch_and_roll_have_the_signs_of_the_base_link():
     assert math.degrees(nose_up.pitch) == pytest.approx(10.0, abs=1e-5)
     assert math.degrees(nose_up.roll) == pytest.approx(0.0, abs=1e-5)
     leaning = attitude_of(ring(0.0, 80.0, 70.0)[0]).plumb
-    left_up = leaning.link_to_enu[2, 1]
+    left_up = leaning.rotation[2, 1]
     assert abs(left_up) > 0.1 and math.sin(leaning.roll) * math.cos(leaning.pitch) == pytest.approx(left_up)
 
 
@@ -252,8 +252,10 @@ class TestOfAFrame:
         answer = placed(solver, stars, solver.identify(stars), where)
         link = answer.at_place.plumb
         assert answer.ok and answer.fix is None and "heading" in answer.message
-        assert abs(rotation.half_turn(link.heading - scene.heading)) < 4 * math.sqrt(link.covariance[0, 0])
-        assert math.sqrt(link.covariance[0, 0]) < 3 * ARCSEC
+        assert abs(rotation.half_turn(link.heading - scene.heading)) < 4 * math.sqrt(
+            link.angles_covariance[0, 0]
+        )
+        assert math.sqrt(link.angles_covariance[0, 0]) < 3 * ARCSEC
 
     def test_with_a_tilt_the_place_stays_the_stars_own(self, night):
         scene, stars, tilt, solver = night

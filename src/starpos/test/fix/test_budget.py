@@ -8,8 +8,8 @@ import pytest
 
 from starpos import rotation
 from starpos.earth.orientation import earth_state
-from starpos.fix.budget import Origin
 from starpos.fix.fix import Mounting
+from starpos.fix.terms import Origin
 from starpos.instrument.inclinometer import EXACT, InclinometerErrors, Tilt
 from starpos.units import ARCSEC
 from starpos_testing.skies.fields import UTC, SkyField

@@ -66,7 +66,7 @@ def test_the_whole_sky_gives_a_place_within_its_claim(night):
     assert len(s.names) > 0.95 * high.sum()
     off = np.hypot(stars.x[s.star] - scene.camera.cx, stars.y[s.star] - scene.camera.cy)
     assert off.max() > 1.2 * FOCAL_PX
-    assert s.attitude.residual_arcsec < 0.1 * scene.camera.scale_arcsec
+    assert s.pointing.residual_arcsec < 0.1 * scene.camera.scale_arcsec
 
 
 def stars_above(scene, stars, altitude_rad):
@@ -148,15 +148,15 @@ def test_an_uncalibrated_lens_is_identified(night, catalogue):
     ideal = replace(scene.instrument, camera=None, model=EQUIDISTANT, focal_px=1.02 * FOCAL_PX)
     s = replace(solver_of(scene, catalogue), instrument=ideal).identify(stars)
     assert s.ok, s.message
-    true = replace(solver_of(scene, catalogue)).identify(stars).attitude
-    assert (s.attitude.ra, s.attitude.dec) == pytest.approx((true.ra, true.dec), abs=np.radians(0.3))
+    true = replace(solver_of(scene, catalogue)).identify(stars).pointing
+    assert (s.pointing.ra, s.pointing.dec) == pytest.approx((true.ra, true.dec), abs=np.radians(0.3))
 
 
 def test_a_mirrored_frame_is_said(night):
     scene, stars, tilt, solver = night
     flipped = replace(stars, y=2 * scene.camera.cy - stars.y)
     s = solver.identify(flipped)
-    assert s.ok and s.attitude.mirrored
+    assert s.ok and s.pointing.mirrored
     # what stands low is raised by refraction, of which `identify` knows nothing
     assert len(s.names) > 0.8 * len(stars)
     assert "mirrored" in solver.solve(flipped, tilt).message
@@ -181,7 +181,7 @@ def test_a_hint_of_the_frame_before_serves(night):
     first = solver.solve(stars, tilt)
     again = solver.solve(stars, tilt, first.hint)
     assert again.ok and again.names == first.names
-    assert again.attitude.log_odds > first.attitude.log_odds
+    assert again.pointing.log_odds > first.pointing.log_odds
 
 
 def test_under_way_a_fisheye_is_refused(night):

@@ -311,7 +311,7 @@ def test_errors_are_as_large_as_their_covariance_says(source, rng):
         spin = rotation.to_small_vector(
             fix.link_to_enu @ (field.attitude @ np.array(field.mounting().link_to_camera)).T
         )
-        attitude.append(np.sum(spin**2) / np.trace(fix.attitude_covariance))
+        attitude.append(np.sum(spin**2) / np.trace(fix.link.covariance))
     bound = 4 * np.sqrt(2 / tries)
     # With what they have in common.
     assert np.mean(together) / 3 == pytest.approx(1, abs=bound / np.sqrt(3))

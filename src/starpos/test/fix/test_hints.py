@@ -9,12 +9,12 @@ import pytest
 
 from starpos.fix import searching
 from starpos.fix.searching import Question, Sight, answer_by_header, of_one_camera
-from starpos.fix.solution import Attitude, Solution, Status
+from starpos.fix.solution import FieldPointing, Solution, Status
 from starpos.fix.solver import Solver
 from starpos.frames.header import read_exposure
 from starpos.instrument.camera import EQUIDISTANT, PLUMB_BOB, Camera
 from starpos.instrument.instrument import Instrument
-from starpos.night.reading import Given
+from starpos.night.reading import Instruments
 from starpos.night.work import Solving
 from starpos.progress import quiet
 from starpos.sky.catalogue import load_catalogue
@@ -53,9 +53,9 @@ def seen(catalogue, rng):
 )
 def test_a_wrong_header_binds_nothing(seen, header, told):
     stars = seen(header)
-    work = Solving(Given(None, by_header=True))
+    work = Solving(Instruments(None, by_header=True))
     sight = work(stars)
-    assert sight.solution.ok and np.degrees(sight.solution.attitude.dec) == pytest.approx(DEC_DEG, abs=1e-3)
+    assert sight.solution.ok and np.degrees(sight.solution.pointing.dec) == pytest.approx(DEC_DEG, abs=1e-3)
     assert sight.instrument.focal_px == pytest.approx(FOCAL_PX, rel=0.03)
     assert re.fullmatch(
         f"frame.fits: its header is wrong: it makes a focal length of {told}", sight.solution.remark
@@ -63,25 +63,25 @@ def test_a_wrong_header_binds_nothing(seen, header, told):
 
 
 def test_a_right_header_is_not_doubted(seen):
-    sight = Solving(Given(None, by_header=True))(seen(RIGHT))
+    sight = Solving(Instruments(None, by_header=True))(seen(RIGHT))
     assert sight.solution.ok and (sight.solution.remark, sight.instrument) == ("", None)
 
 
 def test_each_frame_has_its_own_header(seen):
     """The first frame's focal length differs from the others'."""
-    given = Given(Instrument(1000.0 * 50 / PIXEL_UM), by_header=True)
+    given = Instruments(Instrument(1000.0 * 50 / PIXEL_UM), by_header=True)
     sight = Solving(given)(seen(RIGHT))
     assert sight.solution.ok and sight.solution.remark == ""
 
 
 def test_a_focal_length_that_somebody_gave_is_no_hint(seen):
     """It holds, because a place rests on it: the frame is lost, and no other one is tried."""
-    sight = Solving(Given(Instrument(2 * FOCAL_PX)))(seen(RIGHT))
+    sight = Solving(Instruments(Instrument(2 * FOCAL_PX)))(seen(RIGHT))
     assert sight.solution.status is Status.NOT_IDENTIFIED
 
 
 def test_turning_takes_the_focal_length_that_fits(seen):
-    work = Solving(Given(None, by_header=True))
+    work = Solving(Instruments(None, by_header=True))
     wrong, right = work(seen(RIGHT | {"XPIXSZ": 3.2})), work(seen(RIGHT))
     solver, frames = of_one_camera(_solver(187500.0), [wrong, right])
     assert solver.instrument.focal_px == pytest.approx(FOCAL_PX, rel=0.03)
@@ -121,7 +121,9 @@ def test_a_focal_length_near_the_headers_needs_no_search_at_every_scale(catalogu
         Camera.from_focal(1000, 700, 5000.0),
         read_exposure({"FOCALLEN": 34, "XPIXSZ": 6.4}, "frame.fits").facts,
     )
-    sight = Solving(Given(None, by_header=True))(stars_of_cygnus(catalogue, rng, wide, 6.5, 0.05, **header))
+    sight = Solving(Instruments(None, by_header=True))(
+        stars_of_cygnus(catalogue, rng, wide, 6.5, 0.05, **header)
+    )
     assert sight.solution.ok and "(34 mm" in sight.solution.remark and "32 mm" in sight.solution.remark
 
 
@@ -131,9 +133,9 @@ def test_a_scale_and_a_lens_that_then_identify_nothing_are_not_told(lost, monkey
 
     def blind(solver, *_):
         searched.append(solver.search_s)
-        a_fisheye = Attitude(ra=0.0, dec=0.0, roll=0.0, focal_px=900.0, residual_arcsec=1.0, log_odds=99.0,
+        a_fisheye = FieldPointing(ra=0.0, dec=0.0, roll=0.0, focal_px=900.0, residual_arcsec=1.0, log_odds=99.0,
                              mirrored=False, model=EQUIDISTANT)  # fmt: skip
-        return Sight(stars, Solution.of(stars, attitude=a_fisheye))
+        return Sight(stars, Solution.of(stars, pointing=a_fisheye))
 
     def identify(solver, question):
         tried.append((solver.instrument.focal_px, solver.instrument.model))

@@ -34,13 +34,13 @@ def test_an_exact_pointing_gives_the_exact_place_and_heading(catalogue, rng):
     for a in answers:
         assert np.abs(night.off_m(a.fix)).max() < 2
     assert abs(half_turn(answers[-1].fix.heading - night.heading)) < 0.1 * ARCSEC
-    assert answers[0].stars_detected == 0 and answers[0].attitude is None
+    assert answers[0].stars_detected == 0 and answers[0].pointing is None
 
 
 def test_stars_and_the_pointing_of_the_same_frame_agree(catalogue, rng):
     scene = wide_scene(tilt_noise_deg=0.0, pointing_deg=(40.0, 80.0, 15.0))
     stars, tilt, solver = stars_of(scene, catalogue, rng), tilt_of(scene, rng), solver_of(scene, catalogue)
-    seen = solver.identify(stars).attitude
+    seen = solver.identify(stars).pointing
     p = Pointing(
         mid_unix_s=stars.mid_unix_s,
         exposure_s=0.5,

@@ -10,7 +10,8 @@ from starpos import rotation
 from starpos.earth.ellipsoid import EARTH_RADIUS_M, curvature_radii_m, enu_axes, meridian_turn, zenith_of
 from starpos.earth.orientation import earth_state
 from starpos.earth.vertical import Deflection, geodetic
-from starpos.fix.budget import Sensitivity, heading_of, local_north
+from starpos.fix.attitude import heading_of
+from starpos.fix.budget import Sensitivity, local_north
 from starpos.units import ARCSEC
 from starpos_testing.skies.fields import UTC, SkyField, random_field
 

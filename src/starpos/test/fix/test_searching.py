@@ -35,7 +35,7 @@ def test_a_part_of_a_frame_without_the_brightest_stars_around_it(catalogue, left
     stars, solver = left_half, Solver(Instrument(FOCAL_PX), catalogue)
     assert solver.identify(stars).status is Status.NOT_IDENTIFIED
     found = solver.identify(stars, part=PART)
-    assert found.ok and found.attitude.dec == pytest.approx(np.radians(DEC_DEG), abs=1e-4)
+    assert found.ok and found.pointing.dec == pytest.approx(np.radians(DEC_DEG), abs=1e-4)
     assert (
         identify_every_way(solver, Question(item=stars, stars=stars)).solution.star.tolist()
         == found.star.tolist()
@@ -76,7 +76,7 @@ def test_an_answer_by_stars_detected_otherwise_needs_more_evidence(frame, catalo
     lost = Solution.failed(stars, Status.NOT_IDENTIFIED, "lost")
     others = [replace(stars, source=str(k)) for k in range(4)]
     monkeypatch.setattr(ways, "other_views", lambda frame, window: iter(others))
-    weak = replace(good, attitude=replace(good.attitude, log_odds=searching.MIN_LOG_ODDS_OTHERWISE - 0.1))
+    weak = replace(good, pointing=replace(good.pointing, log_odds=searching.MIN_LOG_ODDS_OTHERWISE - 0.1))
     sight = identified(Answering(*4 * [lost], *4 * [weak], lost, good), frame, stars)
     assert sight.solution is good and sight.stars.source == "1"
     sight = identified(Answering(*4 * [lost], *12 * [weak]), frame, stars)
@@ -118,7 +118,7 @@ def test_what_another_way_has_identified_is_not_searched_again(frame):
     stars = no_stars(300, 200)
     found = SimpleNamespace(log_odds=99.0)
     lost = Solution.failed(stars, Status.NOT_IDENTIFIED, "lost")
-    seen = replace(lost, attitude=found, found=found)
+    seen = replace(lost, pointing=found, found=found)
     fixed = replace(lost, status=Status.OK, message="fix")
     solver = Answering(lost, lost, seen, fixed)
     assert answer_frame(solver, Question(item=frame, stars=stars, tilts=NO_TILTS)).solution.ok

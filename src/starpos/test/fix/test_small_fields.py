@@ -47,7 +47,7 @@ def own_cache(sky, tmp_path_factory):
         patch.setenv("XDG_CACHE_HOME", str(folder / "cache"))
         deeper.build(write_sky(folder / "originals", *sky))
         yield
-    deeper._in_use.clear()
+    deeper.KEPT.forget()
 
 
 def seen(sky, camera, rng):
@@ -80,7 +80,7 @@ def unit(ra, dec):
 
 
 def off_px(s, middle, camera):
-    return np.linalg.norm(unit(s.attitude.ra, s.attitude.dec) - middle) * camera.fx
+    return np.linalg.norm(unit(s.pointing.ra, s.pointing.dec) - middle) * camera.fx
 
 
 @pytest.mark.parametrize("focal_error", [0.0, 0.02, -0.02])
@@ -93,7 +93,7 @@ def test_a_field_that_the_catalogue_is_too_thin_for_is_found_with_the_deeper_one
         s = solver.identify(stars)
         if s.ok:
             assert off_px(s, middle, CAMERA) < 1.5
-            assert len(s.names) > 0.6 * len(stars) and s.attitude.focal_px == pytest.approx(
+            assert len(s.names) > 0.6 * len(stars) and s.pointing.focal_px == pytest.approx(
                 CAMERA.fx, rel=1e-3
             )
             found += 1

@@ -99,7 +99,7 @@ def test_pixels_that_are_not_square_and_a_lens_that_distorts(catalogue, rng):
     s = solver_of(scene, catalogue).solve(stars_of(scene, catalogue, rng), tilt_of(scene, rng))
     assert s.ok, s.message
     assert off_by_sigma(s.fix, scene)[0] < 4
-    assert s.attitude.residual_arcsec < 0.1 * camera.scale_arcsec
+    assert s.pointing.residual_arcsec < 0.1 * camera.scale_arcsec
 
 
 def test_the_tilt_is_asked_for_the_exposure(night):
@@ -121,7 +121,7 @@ def test_identify_gives_the_pointing_of_the_frames_centre(night, catalogue):
     scene, stars, _, solver = night
     s = solver.identify(stars)
     assert s.ok
-    a = s.attitude
+    a = s.pointing
     # where a star stands that is seen in the centre: refraction, diurnal aberration and, by ERFA, A1 taken off
     state, site = earth_state(stars.mid_unix_s), scene.site
     itrs = site.atmosphere.refraction().unbend(scene.attitude[:, 2]) @ site.enu - station_velocity(
@@ -135,8 +135,8 @@ def test_identify_gives_the_pointing_of_the_frames_centre(night, catalogue):
     state_free = solver.identify(replace(stars, mid_unix_s=None))
     assert state_free.ok
     # without a time neither aberration nor proper motion: 21 arcsec at most, and some
-    d_dec = abs(state_free.attitude.dec - a.dec) / ARCSEC
-    d_ra = abs(state_free.attitude.ra - a.ra) * np.cos(a.dec) / ARCSEC
+    d_dec = abs(state_free.pointing.dec - a.dec) / ARCSEC
+    d_ra = abs(state_free.pointing.ra - a.ra) * np.cos(a.dec) / ARCSEC
     assert 0.1 < np.hypot(d_ra, d_dec) < 23
 
 
@@ -146,7 +146,7 @@ def test_the_window_of_a_frame_counts_with_and_without_its_directions(night):
     shown = stars.select(np.flatnonzero(stars.x < width))
     windowed = replace(shown, window=(0, 0, width, stars.height))
     for ask in (solver.identify, lambda s: solver.solve(s, tilt)):
-        assert ask(windowed).attitude.log_odds > ask(shown).attitude.log_odds + 10
+        assert ask(windowed).pointing.log_odds > ask(shown).pointing.log_odds + 10
 
 
 def test_right_ascension_and_roll_are_in_a_full_turn(catalogue, rng):
@@ -158,7 +158,7 @@ def test_right_ascension_and_roll_are_in_a_full_turn(catalogue, rng):
         x, y = camera.project(catalogue.directions(index, 2000.0) @ attitude.T).T
         on = (x > 0) & (x < camera.width - 1) & (y > 0) & (y < camera.height - 1)
         listed = replace(random_stars(on.sum(), rng, mid_unix_s=None), x=x[on], y=y[on])
-        found = solver.identify(listed).attitude
+        found = solver.identify(listed).pointing
         assert found.ra == pytest.approx(np.arctan2(attitude[2, 1], attitude[2, 0]) % (2 * np.pi), abs=1e-4)
         assert 0 <= found.roll < 2 * np.pi
 
@@ -166,7 +166,7 @@ def test_right_ascension_and_roll_are_in_a_full_turn(catalogue, rng):
 def test_a_mirrored_frame_has_a_pointing_but_no_fix(night):
     _, stars, tilt, solver = night
     flipped = replace(stars, y=SIZE[1] - 1 - stars.y)
-    straight, mirrored = solver.identify(stars).attitude, solver.identify(flipped).attitude
+    straight, mirrored = solver.identify(stars).pointing, solver.identify(flipped).pointing
     assert mirrored.mirrored
     assert (mirrored.ra, mirrored.dec) == pytest.approx((straight.ra, straight.dec), abs=5 * ARCSEC)
     assert "mirrored" in refused(solver.solve(flipped, tilt), Status.BAD_INPUT)
@@ -262,7 +262,7 @@ def test_poor_fit(night, catalogue):
     demanding = Solver(Instrument(FOCAL_PX), catalogue, min_stars=1000)
     s = demanding.solve(stars, tilt)
     assert "min_stars is 1000" in refused(s, Status.POOR_FIT)
-    assert s.attitude is not None
+    assert s.pointing is not None
 
 
 def test_every_status_is_tested_here():

@@ -60,7 +60,7 @@ def seen(catalogue, field_deg, limit_mag, rng, scatter_mag=0.2):
 
 
 def looks(s, axis):
-    a = s.attitude
+    a = s.pointing
     return np.array([np.cos(a.dec) * np.cos(a.ra), np.cos(a.dec) * np.sin(a.ra), np.sin(a.dec)]) @ axis
 
 
@@ -72,7 +72,7 @@ def test_frames_of_any_scale_are_found(field_deg, limit_mag, solver, catalogue, 
         s = solver.identify(listed(xy))
         if s.ok:
             assert np.sqrt(2 - 2 * looks(s, axis)) < 1 / focal_px
-            assert s.attitude.focal_px == pytest.approx(focal_px, rel=2e-3)
+            assert s.pointing.focal_px == pytest.approx(focal_px, rel=2e-3)
             assert s.warnings == ()
             found += 1
     assert found >= 2
@@ -90,8 +90,8 @@ def test_a_focal_length_that_is_roughly_known_comes_first(off, solver, catalogue
         s = solver.identify(replace(listed(xy), rough_focal_px=off * focal_px))
         if free.ok:
             assert s.ok and looks(s, axis) > 1 - 1e-6
-            assert s.attitude.focal_px == pytest.approx(focal_px, rel=2e-3)
-            assert s.attitude.log_odds > free.attitude.log_odds
+            assert s.pointing.focal_px == pytest.approx(focal_px, rel=2e-3)
+            assert s.pointing.log_odds > free.pointing.log_odds
             assert all(longest < 1.5 * shortest for shortest, longest in tried)
 
 
@@ -99,7 +99,7 @@ def test_a_focal_length_that_is_roughly_known_comes_first(off, solver, catalogue
 def test_a_wrong_focal_length_of_exif_costs_time_only(off, solver, catalogue, rng):
     xy, axis, focal_px = seen(catalogue, 13.0, 7.5, rng)
     s = solver.identify(replace(listed(xy), rough_focal_px=off * focal_px))
-    assert s.ok and looks(s, axis) > 1 - 1e-6 and s.attitude.focal_px == pytest.approx(focal_px, rel=2e-3)
+    assert s.ok and looks(s, axis) > 1 - 1e-6 and s.pointing.focal_px == pytest.approx(focal_px, rel=2e-3)
 
 
 def test_a_telephone_s_widest_lens_is_found_where_exif_tells_it(solver, catalogue, rng):
@@ -113,7 +113,7 @@ def test_a_telephone_s_widest_lens_is_found_where_exif_tells_it(solver, catalogu
 def test_a_mirrored_frame_is_found_and_said(solver, catalogue, rng):
     xy, axis, _ = seen(catalogue, 8.0, 8.5, rng)
     s = solver.identify(listed(np.stack([xy[:, 0], HEIGHT - 1 - xy[:, 1]], 1)))
-    assert s.ok and s.attitude.mirrored and looks(s, axis) > 1 - 1e-6
+    assert s.ok and s.pointing.mirrored and looks(s, axis) > 1 - 1e-6
 
 
 def test_a_few_false_stars_brighter_than_all_others_do_not_matter(solver, catalogue, rng):
@@ -201,10 +201,10 @@ def test_a_poor_answer_near_the_focal_length_of_exif_does_not_bind(solver, catal
     many, axis, focal_px = seen(catalogue, 20.0, 7.0, rng)
     xy = np.concatenate([few[:8], many[:60]])
     alone = solver.identify(replace(listed(few[:8]), rough_focal_px=told_px))
-    assert alone.ok and alone.attitude.focal_px == pytest.approx(told_px, rel=3e-3)
+    assert alone.ok and alone.pointing.focal_px == pytest.approx(told_px, rel=3e-3)
     s = solver.identify(replace(listed(xy), rough_focal_px=told_px))
-    assert s.ok and looks(s, axis) > 1 - 1e-6 and s.attitude.focal_px == pytest.approx(focal_px, rel=3e-3)
-    assert s.attitude.log_odds > 2 * alone.attitude.log_odds
+    assert s.ok and looks(s, axis) > 1 - 1e-6 and s.pointing.focal_px == pytest.approx(focal_px, rel=3e-3)
+    assert s.pointing.log_odds > 2 * alone.pointing.log_odds
 
 
 def test_a_shape_is_that_of_the_quad_turned_scaled_and_mirrored(rng):

@@ -30,13 +30,13 @@ def solver(catalogue):
 
 
 def axis_of(s):
-    a = s.attitude
+    a = s.pointing
     return np.array([np.cos(a.dec) * np.cos(a.ra), np.cos(a.dec) * np.sin(a.ra), np.sin(a.dec)])
 
 
 def check(s, sky, off_deg=0.5):
     assert np.degrees(np.arccos(min(1.0, axis_of(s) @ sky.axis))) < off_deg
-    assert s.attitude.model == EQUIDISTANT and not s.attitude.mirrored
+    assert s.pointing.model == EQUIDISTANT and not s.pointing.mirrored
 
 
 @pytest.mark.parametrize("lens", LENSES)
@@ -54,7 +54,7 @@ def test_an_all_sky_frame_is_found_with_no_option_at_all(kinds, lens, solver, ca
     s = solver.identify(sky.stars)
     assert s.ok, s.message
     check(s, sky)
-    assert s.attitude.log_odds > 25
+    assert s.pointing.log_odds > 25
 
 
 @pytest.mark.parametrize(
@@ -84,9 +84,9 @@ def test_a_mirrored_frame_looks_where_the_other_does(solver, catalogue, rng):
     stars = sky.stars
     s, flipped = solver.identify(stars), solver.identify(replace(stars, y=sky.height - 1 - stars.y))
     check(s, sky)
-    assert flipped.ok and flipped.attitude.mirrored
+    assert flipped.ok and flipped.pointing.mirrored
     assert np.degrees(np.arccos(min(1.0, axis_of(flipped) @ axis_of(s)))) < 0.05
-    turned = np.degrees(flipped.attitude.roll - s.attitude.roll - np.pi) % 360
+    turned = np.degrees(flipped.pointing.roll - s.pointing.roll - np.pi) % 360
     assert min(turned, 360 - turned) < 0.2
 
 

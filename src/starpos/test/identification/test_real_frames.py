@@ -45,11 +45,11 @@ def test_all_are_identified_and_look_where_they_look(answers):
     for row, _, s, scale in solved(answers):
         assert s.ok, (row["file"], s.message)
         theirs = np.radians([float(row["ra_deg"]), float(row["dec_deg"])])
-        off = erfa.seps(s.attitude.ra, s.attitude.dec, *theirs)
+        off = erfa.seps(s.pointing.ra, s.pointing.dec, *theirs)
         assert np.degrees(off) * 3600 < max(20, scale), row["file"]
-        assert s.attitude.mirrored == (row["parity"] == "mirrored")
-        if not s.attitude.mirrored:
-            roll = (np.degrees(s.attitude.roll) - float(row["pa_up_deg"]) + 180) % 360 - 180
+        assert s.pointing.mirrored == (row["parity"] == "mirrored")
+        if not s.pointing.mirrored:
+            roll = (np.degrees(s.pointing.roll) - float(row["pa_up_deg"]) + 180) % 360 - 180
             assert abs(roll) < 0.5, row["file"]
 
 
@@ -61,8 +61,8 @@ def test_as_many_stars_as_astrometry_net_and_of_as_many_residuals_no_larger(answ
         assert len(s.names) >= n, row["file"]
         first = np.argsort(s.star)[:n]
         there = catalogue.directions([row_of[s.names[k]] for k in first], YEAR[row["set"]])
-        centre = erfa.s2c(s.attitude.ra, s.attitude.dec)
-        east = erfa.s2c(s.attitude.ra + np.pi / 2, 0.0)
+        centre = erfa.s2c(s.pointing.ra, s.pointing.dec)
+        east = erfa.s2c(s.pointing.ra + np.pi / 2, 0.0)
         plane = there @ np.stack([centre, east, np.cross(centre, east)], 1)
         design, seen = plane / plane[:, :1], np.stack([stars.x, stars.y], 1)[s.star[first]]
         residual = seen - design @ np.linalg.lstsq(design, seen, rcond=None)[0]
@@ -80,4 +80,4 @@ def test_nothing_is_invented_for_the_rest(answers):
             # the brighter a detection, the brighter its star
             magnitudes = s.magnitudes[np.argsort(s.star)]
             assert np.corrcoef(np.arange(len(magnitudes)), magnitudes)[0, 1] > 0.75, row["file"]
-            assert s.attitude.log_odds > np.log(1e9)
+            assert s.pointing.log_odds > np.log(1e9)

@@ -48,7 +48,7 @@ def answers(solver, catalogue, frames, rng, **more):
 
 
 def is_right(solution, attitude):
-    a = solution.attitude
+    a = solution.pointing
     axis = np.array([np.cos(a.dec) * np.cos(a.ra), np.cos(a.dec) * np.sin(a.ra), np.sin(a.dec)])
     return np.arccos(min(1.0, axis @ attitude[2])) < 6 / CAMERA.fx
 
@@ -58,7 +58,7 @@ def test_stars_too_faint_to_be_detected_decide(mirrored, solver, catalogue, rng)
     without = with_look = 0
     for attitude, first, second in answers(solver, catalogue, 25, rng, mirrored=mirrored):
         assert not second.ok or is_right(second, attitude)
-        assert not first.ok or second.attitude.log_odds == first.attitude.log_odds
+        assert not first.ok or second.pointing.log_odds == first.pointing.log_odds
         without, with_look = without + first.ok, with_look + second.ok
     assert with_look >= without + 3, (without, with_look)
 

@@ -219,7 +219,7 @@ def test_there_is_no_fix_from_two_skies_but_a_sentence(catalogue, rng):
     s = solver.solve(merged(stars, replace(moved, x=moved.x + 40.0)), tilt)
     assert s.status is Status.POOR_FIT and s.fix is None and s.hint is None
     assert s.warnings == (TWO_SKIES,) and "two skies in one frame" in s.message
-    assert s.attitude is not None
+    assert s.pointing is not None
     once = solver.solve(stars, tilt)
     assert once.ok and once.warnings == ()
 

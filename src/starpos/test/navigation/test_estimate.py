@@ -40,9 +40,7 @@ def test_readings_carry_place_and_attitude_on_within_the_claim(record, last):
     sigma = 15 * np.sqrt(np.trace(there.fix.velocity_covariance))
     assert np.linalg.norm(drift) < 3 * sigma
     turned = there.motion.attitude[0].T @ record.body_to_itrs[END + 15]
-    assert np.arccos(min(1.0, (np.trace(turned) - 1) / 2)) < 4 * np.sqrt(
-        np.trace(there.fix.attitude_covariance)
-    )
+    assert np.arccos(min(1.0, (np.trace(turned) - 1) / 2)) < 4 * np.sqrt(np.trace(there.fix.link.covariance))
 
 
 def test_the_way_does_not_depend_on_the_steps(record, last):
@@ -71,7 +69,7 @@ def test_noise_alone_widens_the_claim(record, last):
     sure = replace(last, covariance=np.zeros_like(last.covariance))
     there = sure.carried_on(record.imu, record.frames_s[END + 10])
     turn = last.model.gyroscope_noise_density * np.sqrt(10)
-    assert np.sqrt(np.diag(there.fix.attitude_covariance)[:2]) == pytest.approx([turn, turn], rel=0.05)
+    assert np.sqrt(np.diag(there.fix.link.covariance)[:2]) == pytest.approx([turn, turn], rel=0.05)
 
 
 def test_joined_readings_say_the_same():

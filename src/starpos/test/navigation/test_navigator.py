@@ -24,7 +24,7 @@ from starpos.earth.ellipsoid import enu_axes
 from starpos.earth.place import Place
 from starpos.earth.refraction import Atmosphere
 from starpos.earth.vertical import Deflection
-from starpos.navigation.sightings import PlacelessFrame, attitude_at_place
+from starpos.navigation.sightings import PlacelessFrame, body_attitude
 from starpos.navigation.vessel import Vessel
 from starpos.session.driver import Level, Now
 from starpos_testing.voyages import INDUSTRIAL, made
@@ -265,11 +265,11 @@ def test_at_a_known_place_there_is_a_heading_before_a_fix(record, known_by):
     nees = []
     for output, true in zip(navigator.outputs, record.heading, strict=True):
         seen = output.at_place
-        heading = np.arctan2(*seen.link_to_enu[:2, 0])
+        heading = np.arctan2(*seen.rotation[:2, 0])
         off_rad = np.remainder(heading - true + np.pi, 2 * np.pi) - np.pi
-        nees.append(off_rad**2 / seen.attitude_covariance[2, 2])
+        nees.append(off_rad**2 / seen.covariance[2, 2])
     # the mount's error is the same in all, 1 deg; all others are far below
-    assert np.mean(nees) < 9 and np.sqrt(seen.attitude_covariance[2, 2]) < np.radians(1.01)
+    assert np.mean(nees) < 9 and np.sqrt(seen.covariance[2, 2]) < np.radians(1.01)
     assert np.std([np.sqrt(x) for x in nees]) < 0.2
 
 
@@ -288,8 +288,8 @@ def test_a_heading_at_a_known_place_claims_what_it_errs_by_when_the_mount_is_kno
             camera_to_itrs=seen.camera_to_itrs,
             covariance=seen.covariance,
         )
-        found = attitude_at_place(placeless, place, there)
-        off = rotation.to_small_vector(found.link_to_enu @ (enu_axes(latitude, longitude) @ body_to_itrs).T)
-        nees.append(off @ np.linalg.solve(found.attitude_covariance, off))
+        found = body_attitude(placeless, place, there)
+        off = rotation.to_small_vector(found.rotation @ (enu_axes(latitude, longitude) @ body_to_itrs).T)
+        nees.append(off @ np.linalg.solve(found.covariance, off))
     # three degrees of freedom; 60 frames
     assert 2.0 < np.mean(nees) < 4.2

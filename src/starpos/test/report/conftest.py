@@ -7,7 +7,7 @@ def unpainted(monkeypatch):
     """Figures are made and not painted, which takes most of a report's time; for tests that look at its text."""
     from matplotlib.figure import Figure
 
-    from starpos.report import page
+    from starpos.report import style
 
-    blank = page.png_of(Figure(figsize=(0.1, 0.1)))
-    monkeypatch.setattr(page, "png_of", lambda figure: blank)
+    blank = style.png_of(Figure(figsize=(0.1, 0.1)))
+    monkeypatch.setattr(style, "png_of", lambda figure: blank)

@@ -11,11 +11,12 @@ from starpos.earth.ellipsoid import curvature_radii_m
 from starpos.earth.orientation import earth_state
 from starpos.earth.refraction import Atmosphere
 from starpos.earth.vertical import Deflection
-from starpos.fix.budget import ALWAYS, ErrorTerm
-from starpos.fix.solution import Attitude, Status
+from starpos.fix.fix import PlaceFix
+from starpos.fix.solution import FieldPointing, Status
+from starpos.fix.terms import ALWAYS, ErrorTerm
 from starpos.instrument.camera import EQUIDISTANT, Camera
 from starpos.instrument.instrument import Calibration, Instrument
-from starpos.night.night import Night, ReportedPlace, Shot, Truth
+from starpos.night.night import Night, Shot, Truth
 from starpos.report import measures, night_figures
 from starpos.sky.site import Site, camera_to_enu
 from starpos.units import ARCSEC
@@ -43,19 +44,17 @@ def night(latitudes, longitudes, headings, truth=None, own_m=100.0, common_m=50.
         ErrorTerm("tilt", np.vstack([own_m * scale, pad])),
         ErrorTerm("calibration", np.vstack([common_m * scale, pad]), shared=ALWAYS),
     )
-    covariance = scale * (own_m**2 + common_m**2)
     shots = [
         Shot(
             name=str(k),
             status=Status.OK,
             message="",
             utc_unix_s=1.8e9 + k,
-            place=ReportedPlace(
+            place=PlaceFix(
                 utc_unix_s=1.8e9 + k,
                 latitude=angles[0],
                 longitude=angles[1],
                 heading=angles[2],
-                covariance=covariance,
                 terms=terms,
             ),  # fmt: skip,
         )
@@ -174,7 +173,7 @@ def test_a_night_at_two_places_is_averaged_at_the_last_and_says_so(tmp_path):
 
 
 def test_a_fisheye_sees_to_the_horizon_on_the_map():
-    looking = Attitude(
+    looking = FieldPointing(
         ra=1.0,
         dec=0.5,
         roll=2.0,

@@ -7,8 +7,9 @@ from dataclasses import replace
 import numpy as np
 
 from starpos import rotation
-from starpos.fix.budget import ALWAYS, ErrorTerm, heading_of
+from starpos.fix.attitude import CAMERA, ITRS, Attitude, heading_of
 from starpos.fix.fix import Fix
+from starpos.fix.terms import ALWAYS, ErrorTerm
 from starpos.frames.frame import Stars
 from starpos.instrument.inclinometer import Tilt
 from starpos.session.calibrating import Seen
@@ -74,8 +75,7 @@ def fix_at(seconds: float, azimuth_deg=40.0, latitude_deg=40.0, noise_m=100.0, c
         refraction_arcsec=12.0,
         diurnal_aberration_arcsec=0.3,
         ut1_minus_utc_s=-0.05,
-        camera_to_itrs=site.enu.T @ attitude,
-        camera_covariance=np.eye(3) * 1e-12,
+        camera=Attitude(site.enu.T @ attitude, np.eye(3) * 1e-12, of=CAMERA, into=ITRS),
     )
 
 

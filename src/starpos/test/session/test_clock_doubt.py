@@ -21,7 +21,11 @@ def stamped(off_s: float, azimuth_deg=40.0, **at):
     fix = fix_at(0.0, azimuth_deg, **at)
     turn = rotation.about_axis(2, ROTATION_RAD_S * off_s)
     east, north, _ = turn @ zenith_of(fix.latitude, fix.longitude)
-    return replace(fix, camera_to_itrs=turn @ fix.camera_to_itrs, longitude=math.atan2(north, east))
+    return replace(
+        fix,
+        camera=replace(fix.camera, rotation=turn @ fix.camera.rotation),
+        longitude=math.atan2(north, east),
+    )
 
 
 def doubts_of(*fixes, stated_s=STATED_S) -> list[float]:
@@ -63,7 +67,8 @@ def test_the_first_of_a_pose_alone_is_outvoted():
 
 def test_a_blurred_frame_is_not_what_others_are_held_against():
     # A quarter of a minute of time.
-    blurred = replace(stamped(0.0), camera_covariance=np.eye(3) * 4e-4**2)
+    sharp = stamped(0.0)
+    blurred = replace(sharp, camera=replace(sharp.camera, covariance=np.eye(3) * 4e-4**2))
     assert doubts_of(blurred, stamped(0.0), stamped(20.0)) == pytest.approx([0.0, 0.0, 20.0], rel=1e-6)
 
 

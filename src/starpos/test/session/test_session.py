@@ -336,7 +336,7 @@ def test_the_place_of_a_heading_may_be_that_of_gnss(messages, begin_s):
     at_place = answer.solution.at_place
     assert math.degrees(at_place.ellipsoid.heading) == pytest.approx(195.31952, abs=2e-3)
     # the deflection is not known, and GNSS has the place on the ellipsoid
-    assert at_place.ellipsoid.covariance[0, 0] < 0.3 * at_place.plumb.covariance[0, 0]
+    assert at_place.ellipsoid.angles_covariance[0, 0] < 0.3 * at_place.plumb.angles_covariance[0, 0]
     later = deepcopy(stars)
     later.header.stamp.sec += 30
     [answer] = told.tell(STARS, later, came_s + 30.0)

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from starpos import rotation
-from starpos.calibration.camera_adjustment import Sighting
+from starpos.calibration.camera_adjustment import CameraSighting
 from starpos.earth.refraction import Atmosphere
 from starpos.instrument.camera import Camera
 from starpos.simulation.scene import Optics, detected, expose, scene_of
@@ -53,7 +53,7 @@ def random_camera(field, rng) -> Camera:
     )
 
 
-def sightings(camera, frames, stars, rng, sigma=0.05, level=None) -> list[Sighting]:
+def sightings(camera, frames, stars, rng, sigma=0.05, level=None) -> list[CameraSighting]:
     """Identified stars all over the frames of a camera in a vacuum, with attitudes 20 arcsec off."""
     made = []
     for _ in range(frames):
@@ -64,7 +64,7 @@ def sightings(camera, frames, stars, rng, sigma=0.05, level=None) -> list[Sighti
         covariance = np.eye(2)[None].repeat(stars, 0) * sigma**2
         off = rotation.from_vector(rng.normal(0, 1e-4, 3)) @ attitude
         made.append(
-            Sighting(
+            CameraSighting(
                 xy=measured,
                 covariance_px2=covariance,
                 directions=places,

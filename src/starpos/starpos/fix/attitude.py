@@ -1,0 +1,92 @@
+# SPDX-License-Identifier: Apache-2.0
+"""An attitude: a rotation from the axes of one frame into those of another, with its error."""
+
+import math
+from dataclasses import KW_ONLY, dataclass
+from functools import cached_property
+
+import numpy as np
+
+from starpos import rotation
+from starpos.fix.terms import ErrorTerm
+from starpos.frozen import at_once
+
+# Names of frames, as docs/frames_and_symbols.md has them.
+CAMERA, LINK, ITRS, GCRS, ENU = "camera", "link", "ITRS", "GCRS", "ENU"
+
+
+@at_once
+@dataclass(frozen=True)
+class Attitude:
+    """A rotation and its error.
+
+    rotation (3, 3): takes vectors along the axes of the frame `of` into those of the frame `into`.
+    covariance (3, 3): rad2, of its small rotation about the axes of `into`.
+    terms: the budget of which `covariance` is the sum; () without one.
+    by_refraction (3,): small rotation (rad) about the axes of `into` if refraction is stronger by its own size;
+    None where that was not asked.
+    """
+
+    rotation: np.ndarray
+    covariance: np.ndarray
+    _: KW_ONLY
+    of: str
+    into: str
+    terms: tuple[ErrorTerm, ...] = ()
+    by_refraction: np.ndarray | None = None
+
+    def then(self, turn: np.ndarray, into: str) -> "Attitude":
+        """The attitude in another frame, into whose axes `turn` (3, 3) takes those of `into`; without its budget."""
+        bent = None if self.by_refraction is None else turn @ self.by_refraction
+        return Attitude(
+            turn @ self.rotation, turn @ self.covariance @ turn.T, of=self.of, into=into, by_refraction=bent
+        )
+
+    @property
+    def covariance_about_own(self) -> np.ndarray:
+        """Covariance (3, 3) in rad2 of the small rotation about the axes of `of`."""
+        return self.rotation.T @ self.covariance @ self.rotation
+
+    @property
+    def heading(self) -> float:
+        """Azimuth (rad, 0 to 2 pi) of a link's x axis, clockwise from north."""
+        return heading_of(self.rotation)
+
+    @property
+    def pitch(self) -> float:
+        """Elevation (rad) of a link's x axis: positive with the nose up, unlike a turn about ROS's y axis."""
+        return math.asin(min(max(self.rotation[2, 0], -1.0), 1.0))
+
+    @property
+    def roll(self) -> float:
+        """Turn (rad, -pi to pi) about a link's x axis: positive with the left side up."""
+        return math.atan2(self.rotation[2, 1], self.rotation[2, 2])
+
+    @cached_property
+    def angles_covariance(self) -> np.ndarray:
+        """Covariance (3, 3) in rad2 of heading, pitch, roll; unbounded where x is vertical."""
+        slope = self._slope
+        return slope @ self.covariance @ slope.T
+
+    @property
+    def _slope(self) -> np.ndarray:
+        """Change (3, 3) of heading, pitch, roll for small rotations about east, north, up."""
+        east, north, _ = self.rotation[:, 0].tolist()
+        level = max(math.hypot(east, north), 1e-6)
+        pitch = np.array([north, -east, 0.0]) / level
+        # about x itself by all of it, and up to the horizon by what the heading turns
+        roll = np.array([east, north, 0.0]) / level**2
+        return np.array([heading_row(self.rotation), pitch, roll])
+
+
+def heading_of(link_to_enu: np.ndarray) -> float:
+    """Azimuth (rad, 0 to 2 pi) of the base link's x axis."""
+    return rotation.full_turn(np.arctan2(link_to_enu[0, 0], link_to_enu[1, 0]))
+
+
+def heading_row(link_to_enu: np.ndarray) -> np.ndarray:
+    """Change (3,) of the heading for small rotations of the attitude link_to_enu (3, 3) about east, north, up."""
+    east, north, up = link_to_enu[:, 0].tolist()
+    level = max(east * east + north * north, 1e-12)
+    # d azimuth = (north d_east - east d_north) / level, with d(forward) = spin x forward
+    return np.array([east * up / level, north * up / level, -1.0])
