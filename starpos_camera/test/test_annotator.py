@@ -46,6 +46,7 @@ class Inside:
 
     def close(self):
         self.executor.shutdown()
+        self.detector.close()
         self.detector.destroy_node()
         self.viewer.destroy_node()
         rclpy.shutdown(context=self.context)

@@ -103,6 +103,7 @@ def test_a_picture_that_takes_long_to_decode_leaves_the_executor_free(monkeypatc
     finally:
         go_on.set()
         executor.shutdown()
+        node.close()
         node.destroy_node()
         rclpy.shutdown(context=context)
     assert threading.current_thread() not in threads

@@ -34,6 +34,7 @@ def spin(bench):
     until.node = node
     yield until
     executor.shutdown()
+    node.close()
     node.destroy_node()
     rclpy.try_shutdown()
 

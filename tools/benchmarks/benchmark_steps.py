@@ -59,15 +59,10 @@ class Shot:
     def fix(self) -> Callable[[], Fix]:
         """The step from identified stars to their fix."""
         found, state = self.identify().found, earth_state(self.stars.mid_unix_s)
-        index = found.catalogue
-        matched = MatchedStars(
-            np.stack([self.stars.x, self.stars.y], -1)[found.star],
-            self.stars.covariance[found.star],
-            self.solver.catalogue.directions(index, state.year, state.observer_au),
-            self.solver.catalogue.sigma(index, state.year),
-            index,
-        )
         scene: Scene = self.scene
+        catalogue, every = self.solver.catalogue, np.ones(len(found.star), bool)
+        places = catalogue.directions(found.catalogue, state.year, state.observer_au)
+        matched = MatchedStars.of(self.stars, found, every, scene.camera, catalogue, state.year, places)
         return partial(
             solve_fix,
             matched,

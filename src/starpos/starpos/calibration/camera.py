@@ -21,7 +21,7 @@ from starpos.calibration.misalignment import NOTHING_KNOWN, Known
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import CalibrationError, InstrumentError
 from starpos.fix.solver import ENOUGH_SOUND, high_enough
-from starpos.fix.star_fit import sound_matches
+from starpos.fix.star_fit import MatchedStars, sound_matches
 from starpos.frames.frame import Stars
 from starpos.frozen import at_once
 from starpos.identification import Identification, PointingPrior, Sky, fisheye, identify_directions, triangles
@@ -128,7 +128,7 @@ def fit_camera(
     whether the fit is good.
     """
     free = free or parameters(given)
-    count, fewest = sum(len(s.xy) for s in sightings), fewest_stars(free)
+    count, fewest = sum(len(s.stars.xy) for s in sightings), fewest_stars(free)
     if count < fewest:
         raise CalibrationError(
             f"{count} identified stars are too few for a camera: give frames with {fewest} at least"
@@ -276,7 +276,7 @@ def calibrate_camera(
         fit = fit_camera(list(sightings.values()), given, atmosphere, free)
         check_invertible(fit.camera)
         camera, attitudes = fit.camera, dict(zip(sightings, fit.attitudes, strict=True))
-        count = sum(len(s.xy) for s in sightings.values())
+        count = sum(len(s.stars.xy) for s in sightings.values())
         if k >= len(FIRST_FREE) and abs(count - before) <= SETTLED_SHARE * count:
             break
         before = count
@@ -335,14 +335,9 @@ class _Frame:
         use = sound_matches(stars, found, ENOUGH_SOUND)
         if fisheye.is_wide(camera) and self.level is not None:
             use &= high_enough(seen[found.star] @ self.level[2])
-        star, index = found.star[use], found.catalogue[use]
+        sky, places = self.sky, self.sky.directions(found.catalogue[use])
         return CameraSighting(
-            xy=np.stack([stars.x, stars.y], -1)[star],
-            covariance_px2=stars.covariance[star],
-            directions=self.sky.directions(index),
-            direction_sigma=np.hypot(
-                self.sky.catalogue.sigma(index, self.sky.year), found.blend_px[use] / camera.fx
-            ),
+            stars=MatchedStars.of(stars, found, use, camera, sky.catalogue, sky.year, places),
             attitude=found.attitude,
             level=self.level,
             timed=self.stars.mid_unix_s is not None,

@@ -14,7 +14,7 @@ import numpy as np
 from starpos import rotation
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import CalibrationError
-from starpos.fix.star_fit import distance2, judged
+from starpos.fix.star_fit import MatchedStars, distance2, judged
 from starpos.frozen import at_once
 from starpos.instrument.camera import COEFFICIENTS, EQUIDISTANT, PLUMB_BOB, RATIONAL, Camera
 
@@ -39,19 +39,14 @@ STEP_RAD = 1e-6
 @at_once
 @dataclass(frozen=True, kw_only=True)
 class CameraSighting:
-    """The identified stars of one frame.
+    """The identified stars of one frame; their places are apparent directions, aberration included.
 
-    xy (N, 2) in px and covariance_px2 (N, 2, 2): as measured.
-    directions (N, 3): apparent directions, aberration included; direction_sigma (N,): sigma per axis in rad.
-    attitude (3, 3): takes `directions` into C, approximately.
+    attitude (3, 3): takes these directions into C, approximately.
     level (3, 3): takes C into the local level L; None if unknown.
     timed: whether the aberration is computed for the frame's date.
     """
 
-    xy: np.ndarray
-    covariance_px2: np.ndarray
-    directions: np.ndarray
-    direction_sigma: np.ndarray
+    stars: MatchedStars
     attitude: np.ndarray
     level: np.ndarray | None
     timed: bool
@@ -144,9 +139,9 @@ class CameraAdjustment:
     def of(
         cls, sightings: Sequence[CameraSighting], given: Camera, atmosphere: Atmosphere, free: Sequence[str]
     ) -> "CameraAdjustment":
-        sightings = [s for s in sightings if len(s.xy)]
-        counts = [len(s.xy) for s in sightings]
-        direction2 = np.square(np.concatenate([s.direction_sigma for s in sightings]) * given.fx)
+        sightings = [s for s in sightings if len(s.stars.xy)]
+        counts = [len(s.stars.xy) for s in sightings]
+        direction2 = np.square(np.concatenate([s.stars.place_sigma for s in sightings]) * given.fx)
         untimed = any(not s.timed for s in sightings)
         shrink = np.hypot(UNLEVELLED[1] * atmosphere.refraction().a, UNTIMED * untimed)
         side = PRINCIPAL * max(given.width, given.height)
@@ -155,10 +150,10 @@ class CameraAdjustment:
         return cls(
             given=given,
             sigma=np.array([*camera, atmosphere.relative_sigma, shrink, shrink]),
-            xy=np.concatenate([s.xy for s in sightings]),
-            stated=np.concatenate([s.covariance_px2 for s in sightings])
+            xy=np.concatenate([s.stars.xy for s in sightings]),
+            stated=np.concatenate([s.stars.covariance_px2 for s in sightings])
             + np.eye(2) * direction2[:, None, None],
-            places=np.concatenate([s.directions for s in sightings]),
+            places=np.concatenate([s.stars.places for s in sightings]),
             frame=np.repeat(np.arange(len(counts)), counts),
             first=np.cumsum([0, *counts[:-1]]),
             start=np.stack([s.attitude for s in sightings]),

@@ -8,7 +8,7 @@ px, P = 1, or 4 for the phases of a colour mosaic.
 
 from libc.math cimport ceil, sqrt
 from libc.stdlib cimport free, malloc
-from libc.string cimport memcpy
+from libc.string cimport memcpy, memset
 
 import numpy as np
 
@@ -130,21 +130,12 @@ def measure_rims(
 
 
 cdef wide_void _copy_row(const pixel_t *line, int n, const float *level, float *signal, int *highest) noexcept nogil:
-    """Take the light of n pixels above the sky, and the highest of them if it is higher than what is there."""
+    """Set the light of n pixels above the sky, and `highest` to the highest pixel if it is higher."""
     cdef int j, most = highest[0]
     for j in range(n):
         signal[j] = <float>line[j] - level[j]
         most = max(most, <int>line[j])
     highest[0] = most
-
-
-cdef wide_void _mark_row(const pixel_t *line, int n, int limit, unsigned char *good, unsigned char *full) noexcept nogil:
-    """Mark the pixels of a row that are saturated, and those that are not."""
-    cdef int j
-    for j in range(n):
-        full[j] = line[j] >= limit
-    for j in range(n):
-        good[j] = full[j] ^ 1
 
 
 def cut_stamps(
@@ -159,16 +150,16 @@ def cut_stamps(
     Returns signal, noise, good, full and phase, as `detection.stamps.Stamps` has them. A pixel beyond the frame is as
     the nearest one on it, but neither good nor full.
     """
-    cdef Py_ssize_t n = x.shape[0], height = plane.shape[0], width = plane.shape[1], k, i, j, row, place, odd
-    cdef int size = 2 * reach + 1, phases = level.shape[1], phase, highest = 0
+    cdef Py_ssize_t n = x.shape[0], height = plane.shape[0], width = plane.shape[1], k, i, j, row, column, odd
+    cdef int size = 2 * reach + 1, phases = level.shape[1], phase, highest
     cdef int limit = <int>ceil(saturation) if saturation < BEYOND else BEYOND
     cdef const pixel_t *line
-    cdef bint whole
+    cdef bint whole, on
     if not (y.shape[0] == level.shape[0] == noise.shape[0] == n and noise.shape[1] == phases and phases in (1, 4)):
         raise ValueError("a row, and a level and noise for each of 1 or 4 phases, are needed for each column of a star")
     if reach < 0 or not (height and width):
         raise ValueError(f"stamps of {size} px of a frame of {width} x {height} px: there is nothing to see")
-    skies, marks = np.empty((2, n, size, size), np.float32), np.empty((3, n, size, size), np.uint8)
+    skies, marks = np.empty((2, n, size, size), np.float32), np.zeros((3, n, size, size), np.uint8)
     cdef float[:, :, ::1] sky = skies.reshape(2, n, size * size)
     cdef unsigned char[:, :, ::1] mark = marks.reshape(3, n, size * size)
     # level and noise of the pixels of an even row and of an odd one, their phases, and pixels of a row that leaves the frame
@@ -183,7 +174,7 @@ def cut_stamps(
         raise MemoryError
     with nogil:
         for k in range(n):
-            whole = reach <= x[k] < width - reach
+            whole, highest = reach <= x[k] < width - reach, 0
             # peaks are in no order: the next one's rows are far away
             for i in range(size if k + 1 < n else 0):
                 fetch(&plane[inside(y[k + 1] - reach + i, height), inside(x[k + 1] - reach, width)])
@@ -193,7 +184,7 @@ def cut_stamps(
                     phase_of[i * size + j] = <unsigned char>phase
                     level_of[i * size + j], noise_of[i * size + j] = level[k, phase], noise[k, phase]
             for i in range(size):
-                row, place, odd = y[k] - reach + i, i * size, (y[k] - reach + i & 1) * size
+                row, odd = y[k] - reach + i, (y[k] - reach + i & 1) * size
                 line = &plane[inside(row, height), 0]
                 if whole:
                     line += x[k] - reach
@@ -201,13 +192,22 @@ def cut_stamps(
                     for j in range(size):
                         pixels[j] = line[inside(x[k] - reach + j, width)]
                     line = pixels
-                _copy_row(line, size, level_of + odd, &sky[0, k, place], &highest)
-                _mark_row(line, size, limit, &mark[0, k, place], &mark[1, k, place])
-                memcpy(&sky[1, k, place], noise_of + odd, size * sizeof(float))
-                memcpy(&mark[2, k, place], phase_of + odd, size)
-                for j in range(0 if whole and 0 <= row < height else size):
-                    if not (0 <= row < height and 0 <= x[k] - reach + j < width):
-                        mark[0, k, place + j] = mark[1, k, place + j] = False
+                _copy_row(line, size, level_of + odd, &sky[0, k, i * size], &highest)
+                if phases > 1:
+                    memcpy(&sky[1, k, i * size], noise_of + odd, size * sizeof(float))
+                    memcpy(&mark[2, k, i * size], phase_of + odd, size)
+            for j in range(size * size if phases == 1 else 0):
+                sky[1, k, j] = noise_of[0]
+            # most stars are on the frame and none of their pixels is saturated
+            if whole and reach <= y[k] < height - reach and highest < limit:
+                memset(&mark[0, k, 0], True, size * size)
+                continue
+            for i in range(size):
+                for j in range(size):
+                    row, column = y[k] - reach + i, x[k] - reach + j
+                    on = 0 <= row < height and 0 <= column < width
+                    mark[1, k, i * size + j] = on and plane[row, column] >= limit
+                    mark[0, k, i * size + j] = on and not plane[row, column] >= limit
     free(level_of)
     free(phase_of)
     free(pixels)

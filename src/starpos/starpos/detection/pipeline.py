@@ -19,7 +19,7 @@ from starpos.detection.learn import learn, with_trail
 from starpos.detection.saturated import find_discs, with_clipped, with_discs
 from starpos.detection.vet import measure, resolve
 from starpos.errors import FrameError
-from starpos.frames.exposure import Trail
+from starpos.frames.exposure import Exposure, Trail
 from starpos.frames.frame import BLENDED, COLUMNS, EDGE, ELONGATED, Frame, Stars, Window, no_stars
 
 # Pixels of stars that are fitted together, give or take half, on a small and on a large frame: about 2 and 6 MB.
@@ -116,16 +116,22 @@ class _Picture:
 
     plane     (h, w) of a frame, or of a reduced one; halvings: how often it may be reduced by two
     mosaic    whether its pixels are of several colours
-    about     what a frame's Stars know of it
+    exposure  of the frame
     trail     how stars move during the exposure; None if not stated
     """
 
     plane: np.ndarray
     mosaic: bool | None
     settings: DetectionSettings
-    about: dict[str, Any]
+    exposure: Exposure
     halvings: int
     trail: Trail | None
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """The fields of Stars that are not of stars."""
+        height, width = self.plane.shape
+        return {"width": width, "height": height} | self.exposure.facts
 
     def halved(self) -> tuple["_Picture", int]:
         """The picture of half the size, and the flux of 1 DN in it."""
@@ -138,7 +144,6 @@ class _Picture:
             plane=plane,
             mosaic=False,
             settings=settings,
-            about=self.about | {"width": plane.shape[1], "height": plane.shape[0]},
             halvings=self.halvings - 1,
             trail=None if self.trail is None else self.trail.halved(),
         )
@@ -147,7 +152,6 @@ class _Picture:
 
 def detect(frame: Frame, settings: DetectionSettings = DetectionSettings()) -> Detection:
     """Measure the stars of a Frame. Without stars the Detection is empty and fwhm_px NaN."""
-    about = {"width": frame.width, "height": frame.height} | frame.facts
     # OpenCV would take all processors for a little, and wait for them where others work
     cv2.setNumThreads(settings.threads)
     plane, mosaic = plane_of(frame)
@@ -155,7 +159,7 @@ def detect(frame: Frame, settings: DetectionSettings = DetectionSettings()) -> D
         plane=plane,
         mosaic=mosaic,
         settings=settings,
-        about=about,
+        exposure=frame,
         halvings=MAX_HALVINGS,
         trail=frame.trail,
     )
@@ -171,7 +175,7 @@ def _detect(picture: _Picture) -> Detection:
     reduced = _detect(smaller)
     if _clear(reduced.stars) <= _clear(found.stars):
         return found
-    width, height = picture.about["width"], picture.about["height"]
+    height, width = picture.plane.shape
     stars = enlarged(reduced.stars, 2, width, height, found.stars.window, gain)
     return replace(
         found, stars=stars, fwhm_px=2 * reduced.fwhm_px, chi2=reduced.chi2, left_out=reduced.left_out
@@ -201,16 +205,16 @@ def _clear(stars: Stars) -> int:
 
 
 def _detect_at_full_size(picture: _Picture) -> Detection:
-    plane, settings, about = picture.plane, picture.settings, picture.about
+    plane, settings = picture.plane, picture.settings
     if min(plane.shape) < 2:
-        return _starless(about, float(np.median(plane)), 0.0)
+        return _starless(picture, float(np.median(plane)), 0.0)
     sky = measure_sky(plane, settings.mesh_px, picture.mosaic)
     level, noise = sky.typical
     limit = max(PEAKS, 2 * settings.max_stars)
     peaks = find_peaks(sky, settings.threshold, limit, settings.threads)
     x, y, height = peaks.x, peaks.y, peaks.height
     if len(x) == 0:
-        return _starless(about, level, noise)
+        return _starless(picture, level, noise)
     saturation = _saturation(plane, x, y, settings)
     sky = replace(sky, correlation=peaks.correlation, saturation=saturation)
     streaks = find_streaks(sky, x, y)
@@ -233,7 +237,7 @@ def _detect_at_full_size(picture: _Picture) -> Detection:
         **{name: found[name] for name in COLUMNS},
         fwhm_px=fwhm_px,
         window=window_of(plane, int(peaks.highest.max()), level),
-        **about,
+        **picture.facts,
     )
     return Detection(
         stars=stars,
@@ -245,11 +249,10 @@ def _detect_at_full_size(picture: _Picture) -> Detection:
     )
 
 
-def _starless(about: dict[str, Any], level: float, noise: float) -> Detection:
+def _starless(picture: _Picture, level: float, noise: float) -> Detection:
     """The Detection of a frame without stars."""
-    return Detection(
-        stars=no_stars(**about), background=level, noise=noise, fwhm_px=float("nan"), chi2=np.zeros(0)
-    )
+    stars = no_stars(**picture.facts)
+    return Detection(stars=stars, background=level, noise=noise, fwhm_px=float("nan"), chi2=np.zeros(0))
 
 
 def _saturation(plane: np.ndarray, x: np.ndarray, y: np.ndarray, settings: DetectionSettings) -> float:

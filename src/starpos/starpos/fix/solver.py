@@ -299,14 +299,8 @@ class Solver:
         use = sound_matches(stars, found, max(self.min_stars, ENOUGH_SOUND))
         if fisheye.is_wide(camera):
             use &= high_enough(directions_of(camera, stars)[found.star] @ up)
-        star, index = found.star[use], found.catalogue[use]
-        return use, MatchedStars(
-            np.stack([stars.x, stars.y], -1)[star],
-            stars.covariance[star],
-            catalogue.directions(index, state.year, state.observer_au),
-            np.hypot(catalogue.sigma(index, state.year), found.blend_px[use] / camera.fx),
-            index,
-        )
+        places = catalogue.directions(found.catalogue[use], state.year, state.observer_au)
+        return use, MatchedStars.of(stars, found, use, camera, catalogue, state.year, places)
 
     def attitude_at(self, stars: Stars, found: Identification, place: Place) -> AttitudeAtPlace:
         """Heading, pitch and roll at a known place, from a frame's identified stars; needs no tilt.

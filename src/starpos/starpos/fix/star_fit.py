@@ -22,6 +22,7 @@ from starpos.frames.frame import Stars
 from starpos.frozen import at_once
 from starpos.identification import Identification
 from starpos.instrument.camera import Camera
+from starpos.sky.catalogue import Catalogue
 from starpos.units import MEDIAN_OF_CHI2
 
 MAX_ROUNDS = 6
@@ -30,6 +31,8 @@ MIN_STARS = 3
 SETTLED, MAX_STEPS = 1e-11, 20
 # the rounds end when the scatter changes by less than this share of itself, and of this minimum, px2
 SAME_SHARE, SAME_PX2 = 0.02, 1e-6
+# an air that bends nothing
+BENT_ALREADY = Refraction(0.0, 0.0).compiled
 # a covariance that is the same in all directions
 ISOTROPIC = np.eye(2)
 
@@ -186,6 +189,27 @@ class MatchedStars:
         if not np.isfinite(self.covariance_px2).all():
             raise FixError("the error of a star's place is not a finite number: leave that star out")
 
+    @classmethod
+    def of(
+        cls,
+        stars: Stars,
+        found: Identification,
+        use: np.ndarray,
+        camera: Camera,
+        catalogue: Catalogue,
+        year: float,
+        places: np.ndarray,
+    ) -> "MatchedStars":
+        """The identified stars of a frame that are in the mask use (M,); places (N, 3): their directions."""
+        star, index = found.star[use], found.catalogue[use]
+        return cls(
+            np.stack([stars.x, stars.y], -1)[star],
+            stars.covariance[star],
+            places,
+            np.hypot(catalogue.sigma(index, year), found.blend_px[use] / camera.fx),
+            index,
+        )
+
 
 def sound_matches(stars: Stars, found: Identification, enough: int) -> np.ndarray:
     """Mask (M,) of the matches to use: stars without a flag, or all if fewer than `enough` are without."""
@@ -264,10 +288,41 @@ def fit_stars(
             f"the identified stars lie {math.sqrt(fit.jitter2):.1f} px off the best attitude: check the camera's "
             "distortion"
         )
+    return _with_errors(problem, fit, stars.covariance_px2, catalogue_px2, stars.index)
+
+
+def seen_problem(xy: np.ndarray, camera: Camera, seen: np.ndarray) -> Adjustment:
+    """The problem of N stars at xy (N, 2) px whose light comes from the directions seen (N, 3) along any axes.
+
+    Nothing bends it on its way: A4 takes these axes into C.
+    """
+    intrinsics = camera.fx, camera.fy, camera.cx, camera.cy
+    return Adjustment(xy, seen, np.eye(3), camera.lens, intrinsics, BENT_ALREADY, 0.0, ECCENTRICITY2)
+
+
+def fit_seen(xy: np.ndarray, stated: np.ndarray, camera: Camera, seen: np.ndarray) -> StarFit:
+    """Fit the camera's attitude and the plate scale to stars as `seen_problem` has them; FixError as `fit_stars`.
+
+    stated (N, 2, 2): covariances of the places, px2, with those of the catalogue.
+    """
+    problem = seen_problem(xy, camera, seen)
+    fit = fitted(problem, camera.directions(*xy.T), stated)
+    return _with_errors(problem, fit, stated, np.zeros_like(stated), None)
+
+
+def _with_errors(
+    problem: Adjustment,
+    fit: Fitted,
+    centroids_px2: np.ndarray,
+    catalogue_px2: np.ndarray,
+    index: np.ndarray | None,
+) -> StarFit:
+    """The fit with the errors of its stars, whose scatter widens the errors of the centroids."""
     kept, residual = fit.kept, fit.residual[fit.kept]
+    stated = centroids_px2 + catalogue_px2
     claimed2 = expected_extra(residual, stated[kept], share_free(fit.keep))
-    centroids = stars.covariance_px2[kept] + ISOTROPIC * claimed2
-    same_stars = ALWAYS if stars.index is None else tuple(stars.index[kept][:MARKS].tolist())
+    centroids = centroids_px2[kept] + ISOTROPIC * claimed2
+    same_stars = ALWAYS if index is None else tuple(index[kept][:MARKS].tolist())
     errors = StarErrors.of(fit.slope[kept], centroids, catalogue_px2[kept], same_stars)
     if not np.isfinite(errors.gain).all() or not math.isfinite(claimed2):
         raise FixError(

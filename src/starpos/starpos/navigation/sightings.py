@@ -4,7 +4,8 @@ level is needed: only refraction and the diurnal aberration depend on the zenith
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
@@ -25,17 +26,20 @@ from starpos.fix import solver
 from starpos.fix.attitude import ENU, LINK, Attitude
 from starpos.fix.camera_attitude import CameraAttitude
 from starpos.fix.solution import Solution
-from starpos.fix.star_fit import expected_extra, judged, share_free, sound_matches
+from starpos.fix.star_fit import (
+    StarFit,
+    fit_seen,
+    seen_problem,
+    sound_matches,
+)
 from starpos.frames.frame import Stars
 from starpos.frames.reading import why_no_time
 from starpos.identification import Identification, fisheye
-from starpos.identification.pose import Pose
 from starpos.instrument.camera import Camera
 from starpos.navigation.vessel import Vessel
 from starpos.sky.catalogue import Catalogue
 from starpos.units import ARCSEC
 
-FEWEST, ROUNDS, STEPS = 4, 6, 3
 # of an attitude without refraction; 1 sigma
 ROUGH = 20 * ARCSEC
 STEP_REFRACTION = 0.01
@@ -79,23 +83,37 @@ class IdentifiedFrame:
 
     def under(self, zenith: np.ndarray, atmosphere: Atmosphere) -> "StarAttitude":
         """The attitude under a zenith (3,) in ITRS, with the plate scale, by the stars; FixError if they disagree."""
-        fit = _fit(self, _seen(self, zenith, atmosphere.refraction()))
+        seen = self._fitted(_seen(self, zenith, atmosphere.refraction()))
         stronger = _seen(self, zenith, atmosphere.refraction(1 + STEP_REFRACTION))
-        shift = (fit.pose.project(stronger) - fit.pixel)[fit.keep] / STEP_REFRACTION
+        fit = seen.fit
+        there = seen_problem(self.xy, self._optics, stronger).predict(fit.a4, fit.scale)
+        shift = (there - self.xy - fit.residual)[fit.kept] / STEP_REFRACTION
         return StarAttitude(
-            camera_to_itrs=fit.pose.attitude.T,
-            covariance=fit.covariance[:3, :3],
-            by_refraction=(fit.covariance @ np.einsum("nki,nk->i", fit.weighted, shift))[:3],
+            camera_to_itrs=fit.a4.T,
+            covariance=seen.errors.rotation_covariance(seen.errors.centroids),
+            # the camera turns the other way than the sky in it
+            by_refraction=-seen.errors.rotated(shift),
         )
 
     def placeless(self) -> "StarAttitude":
         """Fit attitude and plate scale where no zenith is known: refraction and diurnal aberration stay in it."""
-        fit = _fit(self, self.itrs)
+        seen = self._fitted(self.itrs)
         return StarAttitude(
-            camera_to_itrs=fit.pose.attitude.T,
-            covariance=fit.covariance[:3, :3],
+            camera_to_itrs=seen.fit.a4.T,
+            covariance=seen.errors.rotation_covariance(seen.errors.centroids),
             by_refraction=np.zeros(3),
         )
+
+    @cached_property
+    def _optics(self) -> Camera:
+        return Camera(width=1, height=1, fx=self.focal_px, fy=self.focal_px, cx=0.0, cy=0.0)
+
+    def _fitted(self, seen: np.ndarray) -> StarFit:
+        """The fit to the directions seen (N, 3); FixError if the stars disagree."""
+        try:
+            return fit_seen(self.xy, self.covariance_px2, self._optics, seen)
+        except FixError as error:
+            raise FixError(f"{self.source}: {error}: left out") from None
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -165,80 +183,11 @@ def sighted(
     )
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class _Fit:
-    """A pose that fits the N stars keep (N,): their pixels (N, 2) by it, and covariance (4, 4) of turns and scale.
-
-    weighted (M, 2, 4): the kept stars' derivatives over their errors.
-    """
-
-    pose: Pose
-    keep: np.ndarray
-    pixel: np.ndarray
-    covariance: np.ndarray
-    weighted: np.ndarray
-
-
-def _fit(sighting: IdentifiedFrame, seen: np.ndarray) -> _Fit:
-    keep, extra = np.ones(len(seen), bool), 0.0
-    v = np.column_stack([sighting.xy, np.full(len(seen), sighting.focal_px)])
-    pose = Pose(rotation.best_rotation(seen, rotation.normalised(v)), sighting.focal_px, False)
-    for _ in range(ROUNDS):
-        if keep.sum() < FEWEST:
-            raise FixError(
-                f"{sighting.source}: only {int(keep.sum())} of its {len(keep)} stars agree: left out"
-            )
-        before = keep
-        pose = _fitted(pose, sighting, seen, keep, extra)
-        residual = pose.project(seen) - sighting.xy
-        share = share_free(keep)
-        extra, keep = judged(residual, sighting.covariance_px2, keep, share)
-        if np.array_equal(keep, before):
-            break
-    pixel, slope = _slopes(pose, seen)
-    slope, covariance = slope[keep], sighting.covariance_px2[keep]
-    wide = covariance + np.eye(2) * expected_extra((pixel - sighting.xy)[keep], covariance, share)
-    weighted = np.linalg.solve(wide, slope)
-    return _Fit(
-        pose=pose,
-        keep=keep,
-        pixel=pixel,
-        covariance=np.linalg.inv(np.einsum("nki,nkj->ij", slope, weighted)),
-        weighted=weighted,
-    )
-
-
 def _seen(sighting: IdentifiedFrame, zenith: np.ndarray, refraction: Refraction) -> np.ndarray:
     """Directions (N, 3) along ITRS's axes in which the stars are seen under a zenith."""
     level = rotation.shortest_turn(zenith, np.array([0.0, 0.0, 1.0]))
     apparent = rotation.normalised(sighting.itrs + station_velocity(zenith))
     return refraction.bend(apparent @ level.T) @ level
-
-
-def _fitted(pose: Pose, sighting: IdentifiedFrame, seen: np.ndarray, keep: np.ndarray, extra: float) -> Pose:
-    covariance = sighting.covariance_px2[keep] + np.eye(2) * extra
-    for _ in range(STEPS):
-        pixel, slope = _slopes(pose, seen[keep])
-        weighted = np.linalg.solve(covariance, slope)
-        normal = np.einsum("nki,nkj->ij", slope, weighted)
-        step = np.linalg.solve(normal, np.einsum("nki,nk->i", weighted, sighting.xy[keep] - pixel))
-        turned = rotation.from_vector(step[:3]) @ pose.attitude
-        pose = replace(pose, attitude=turned, focal_px=float(pose.focal_px * (1 + step[3])))
-    return pose
-
-
-def _slopes(pose: Pose, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels (N, 2) of directions w (N, 3), and their derivatives (N, 2, 4).
-
-    The derivatives are by small rotations (rad) about C's axes and by the logarithm of the focal length.
-    """
-    u = w @ pose.attitude.T
-    x, y = (u[:, :2] / u[:, 2:]).T
-    slope = np.empty((len(w), 2, 4))
-    slope[:, 0, 0], slope[:, 0, 1], slope[:, 0, 2], slope[:, 0, 3] = -x * y, 1 + x * x, -y, x
-    slope[:, 1, 0], slope[:, 1, 1], slope[:, 1, 2], slope[:, 1, 3] = -1 - y * y, x * y, x, y
-    slope *= pose.focal_px
-    return slope[:, :, 3].copy(), slope
 
 
 # Refraction squeezes a frame more along the vertical than across. This turns the attitude across the axis if the middle

@@ -1,5 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Frames at a known site: attitude, errors and tilt of each, their faces, and the stars' places on which they agree."""
+"""Frames at a known site: attitude, errors and tilt of each, their faces, and the stars' places on which they agree.
+
+Stars stand in many frames, so a frame's stars show how far each is from its place in the others.  So their places are
+adjusted, as overlapping plates are (Eichhorn 1960, Astron. Nachr. 285, 233), with the catalogue's errors as what is known
+before; and their scatter shows how large the catalogue's errors are here, by maximum likelihood.  What is common to all
+stars of the session remains as uncertain as such errors leave it.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -7,15 +13,20 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from starpos import rotation
-from starpos.earth.ellipsoid import ECCENTRICITY2
 from starpos.earth.orientation import ROTATION_RAD_S, EarthOrientation, EarthState, later, station_velocity
 from starpos.earth.place import Place
-from starpos.earth.refraction import Refraction
 from starpos.errors import FixError, InstrumentError
-from starpos.fix._adjustment import Adjustment
 from starpos.fix.budget import StarErrors
 from starpos.fix.solver import ENOUGH_SOUND, Solver
-from starpos.fix.star_fit import ISOTROPIC, MatchedStars, expected_extra, fitted, share_free, sound_matches
+from starpos.fix.star_fit import (
+    ISOTROPIC,
+    MatchedStars,
+    expected_extra,
+    fitted,
+    seen_problem,
+    share_free,
+    sound_matches,
+)
 from starpos.frames.exposure import Shutter
 from starpos.frames.frame import Stars
 from starpos.identification import Identification
@@ -23,8 +34,6 @@ from starpos.instrument.inclinometer import Tilt
 from starpos.instrument.tilt_log import Tilts
 from starpos.rotation import half_turns
 
-# refraction is put on the stars, so nothing bends between them and the camera
-BENT_ALREADY = Refraction(0.0, 0.0)
 # step of the refraction for its derivative
 STRONGER = 0.01
 
@@ -91,29 +100,15 @@ def sighting(
     state, tilt = solver.levelled(stars, tilts)
     camera, catalogue, _ = solver.view(stars.width, stars.height, stars.origin_px)
     use = sound_matches(stars, found, max(solver.min_stars, ENOUGH_SOUND))
-    star, index = found.star[use], found.catalogue[use]
+    index = found.catalogue[use]
     camera = camera.scaled(found.focal_scale)
-    matched = MatchedStars(
-        np.stack([stars.x, stars.y], -1)[star],
-        stars.covariance[star],
-        catalogue.directions(index, state.year, state.observer_au),
-        np.hypot(catalogue.sigma(index, state.year), found.blend_px[use] / camera.fx),
-        index,
-    )
+    places = catalogue.directions(index, state.year, state.observer_au)
+    matched = MatchedStars.of(stars, found, use, camera, catalogue, state.year, places)
     shutter = solver.shutter(stars)
     itrs = _seen(matched, state, shutter, camera.height, mark)
     enu = itrs @ mark.axes.T
     refraction = solver.atmosphere.refraction()
-    problem = Adjustment(
-        matched.xy,
-        refraction.bend(enu),
-        np.eye(3),
-        camera.lens,
-        (camera.fx, camera.fy, camera.cx, camera.cy),
-        BENT_ALREADY.compiled,
-        0.0,
-        ECCENTRICITY2,
-    )
+    problem = seen_problem(matched.xy, camera, refraction.bend(enu))
     # the catalogue's errors do not weigh here: `places` adjusts them with all frames' stars
     fit = fitted(problem, camera.directions(*matched.xy.T), matched.covariance_px2)
     kept, residual = fit.kept, fit.residual[fit.kept]

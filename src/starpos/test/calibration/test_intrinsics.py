@@ -25,9 +25,13 @@ from starpos_testing.skies.lenses import (
 
 
 def moved(sighting: CameraSighting, rows, by) -> CameraSighting:
-    xy = sighting.xy.copy()
+    xy = sighting.stars.xy.copy()
     xy[rows] += by
-    return replace(sighting, xy=xy)
+    return with_stars(sighting, xy=xy)
+
+
+def with_stars(sighting: CameraSighting, **other) -> CameraSighting:
+    return replace(sighting, stars=replace(sighting.stars, **other))
 
 
 @pytest.mark.parametrize("field", FIELDS)
@@ -112,7 +116,7 @@ def test_wrong_matches_move_nothing(rng):
 def test_scatter_beyond_the_stated_errors_widens_the_claim(rng):
     true = random_camera(11, rng)
     frames = sightings(true, 10, 60, rng, sigma=0.2)
-    bold = [replace(s, covariance_px2=s.covariance_px2 / 16) for s in frames]
+    bold = [with_stars(s, covariance_px2=s.stars.covariance_px2 / 16) for s in frames]
     honest, fit = (fit_camera(f, ideal(11), VACUUM) for f in (frames, bold))
     assert fit.scatter_px == pytest.approx(np.sqrt(0.2**2 - 0.05**2), rel=0.1)
     np.testing.assert_allclose(fit.sigma, honest.sigma, rtol=0.15)
@@ -122,22 +126,22 @@ def test_stars_whose_places_are_poorly_known_count_less(rng):
     true = random_camera(11, rng)
     frames, sigma = [], np.repeat([1e-9, 0.5 / true.fx], 40)
     for s in sightings(true, 10, 80, rng):
-        off = s.directions + rng.normal(0, 1, (80, 3)) * sigma[:, None]
+        off = s.stars.places + rng.normal(0, 1, (80, 3)) * sigma[:, None]
         off /= np.linalg.norm(off, axis=1, keepdims=True)
-        frames.append(replace(s, directions=off, direction_sigma=sigma))
+        frames.append(with_stars(s, places=off, place_sigma=sigma))
     fit = fit_camera(frames, ideal(11), VACUUM)
     assert fit.scatter_px < 0.03
     assert fit.rejected < 5
     assert np.abs((fit.values - values(true)) / fit.sigma).max() < 4
-    good = [replace(s, **{name: getattr(s, name)[:40] for name in
-                          ("xy", "covariance_px2", "directions", "direction_sigma")}) for s in frames]  # fmt: skip
+    good = [with_stars(s, **{name: getattr(s.stars, name)[:40] for name in
+                             ("xy", "covariance_px2", "places", "place_sigma")}) for s in frames]  # fmt: skip
     assert (fit.sigma < 1.1 * fit_camera(good, ideal(11), VACUUM).sigma).all()
 
 
 def test_a_stars_whole_covariance_counts(rng):
     """Trailed stars: x errs ten times more than y, and fx ten times more than fy."""
     true = replace(ideal(11), fx=5100.0, fy=5110.0)
-    frames = [replace(s, xy=s.xy + np.stack([rng.normal(0, 0.5, 80), np.zeros(80)], -1),
+    frames = [with_stars(s, xy=s.stars.xy + np.stack([rng.normal(0, 0.5, 80), np.zeros(80)], -1),
                       covariance_px2=np.diag([0.5**2 + 0.05**2, 0.05**2])[None].repeat(80, 0))
               for s in sightings(true, 10, 80, rng)]  # fmt: skip
     fit = fit_camera(frames, ideal(11), VACUUM, ("fx", "fy"))
@@ -162,8 +166,8 @@ def bent(frames, air: Atmosphere, strength=1.0, lean=(20.0, 50.0)):
         level = rotation.about_axis(2, 2.0 * k) @ rotation.about_axis(
             0, np.radians(lean[0] + (lean[1] - lean[0]) * (k % 4) / 3)
         )
-        u = refraction.bend(s.directions @ s.attitude.T @ level.T) @ level
-        out.append(replace(s, xy=camera.project(u), level=level))
+        u = refraction.bend(s.stars.places @ s.attitude.T @ level.T) @ level
+        out.append(replace(with_stars(s, xy=camera.project(u)), level=level))
     return out
 
 
@@ -211,13 +215,13 @@ def test_without_levels_refraction_is_in_the_sigma(rng):
 def test_unbent_is_the_inverse_of_what_the_fit_does(rng):
     air = Atmosphere(pressure_pa=88000.0, temperature_c=12.0, humidity=0.3)
     (s,) = bent(clean(ideal(11), 1, 20, rng), air)
-    back = unbent(ideal(11).directions(*s.xy.T), s.level, air)
+    back = unbent(ideal(11).directions(*s.stars.xy.T), s.level, air)
     # The attitude is 20 arcsec off.
-    np.testing.assert_allclose(back, s.directions @ s.attitude.T, atol=2e-4)
+    np.testing.assert_allclose(back, s.stars.places @ s.attitude.T, atol=2e-4)
     assert np.linalg.norm(back, axis=1) == pytest.approx(1)
-    smaller = unbent(ideal(11).directions(*s.xy.T), None, air)
+    smaller = unbent(ideal(11).directions(*s.stars.xy.T), None, air)
     assert np.hypot(*smaller[:, :2].T) == pytest.approx(
-        np.hypot(*ideal(11).directions(*s.xy.T)[:, :2].T), rel=1e-3
+        np.hypot(*ideal(11).directions(*s.stars.xy.T)[:, :2].T), rel=1e-3
     )
     assert np.linalg.norm(smaller, axis=1) == pytest.approx(1)
 
@@ -232,14 +236,17 @@ def test_too_few_stars(rng):
 
 def test_stars_that_agree_on_nothing(rng):
     frames = [
-        moved(s, slice(None), rng.uniform(-200, 200, s.xy.shape)) for s in sightings(ideal(11), 5, 40, rng)
+        moved(s, slice(None), rng.uniform(-200, 200, s.stars.xy.shape))
+        for s in sightings(ideal(11), 5, 40, rng)
     ]
     with pytest.raises(CalibrationError):
         check_sound(fit_camera(frames, ideal(11), VACUUM), ideal(11))
 
 
 def test_stars_that_agree_on_too_little(rng):
-    frames = [moved(s, slice(None), rng.normal(0, 2.5, s.xy.shape)) for s in sightings(ideal(11), 5, 40, rng)]
+    frames = [
+        moved(s, slice(None), rng.normal(0, 2.5, s.stars.xy.shape)) for s in sightings(ideal(11), 5, 40, rng)
+    ]
     with pytest.raises(CalibrationError, match=r"lie 2\.\d px off the best camera"):
         check_sound(fit_camera(frames, ideal(11), VACUUM), ideal(11))
 
@@ -256,7 +263,7 @@ def test_a_distortion_that_folds_in_the_corners_none_has_seen(rng):
     true = replace(given, distortion=(k1_of(given, -0.45), 0.0, 0.0, 0.0, 0.0))
     frames = []
     for s in sightings(replace(true, width=400, height=280, cx=199.5, cy=139.5), 5, 60, rng):
-        frames.append(replace(s, xy=s.xy + np.array([300.0, 210.0])))
+        frames.append(with_stars(s, xy=s.stars.xy + np.array([300.0, 210.0])))
     fit = fit_camera(frames, given, VACUUM, ("fx", "fy", "k1"))
     with pytest.raises(CalibrationError):
         check_sound(fit, given)

@@ -9,6 +9,7 @@ from scipy.optimize import least_squares
 from starpos import rotation
 from starpos.calibration.camera_adjustment import CameraSighting
 from starpos.earth.refraction import Atmosphere
+from starpos.fix.star_fit import MatchedStars
 from starpos.instrument.camera import Camera
 from starpos.simulation.scene import Optics, detected, expose, scene_of
 from starpos_testing.skies.scenes import EXPOSURE, START
@@ -65,10 +66,7 @@ def sightings(camera, frames, stars, rng, sigma=0.05, level=None) -> list[Camera
         off = rotation.from_vector(rng.normal(0, 1e-4, 3)) @ attitude
         made.append(
             CameraSighting(
-                xy=measured,
-                covariance_px2=covariance,
-                directions=places,
-                direction_sigma=np.full(stars, 1e-10),
+                stars=MatchedStars(measured, covariance, places, np.full(stars, 1e-10)),
                 attitude=off,
                 level=level,
                 timed=True,
