@@ -19,7 +19,7 @@ def tracked(values, rate_hz, tracker=None, begin_s=0.0):
     """A tracker after (N, 2) samples."""
     tracker = tracker or NoiseTracker()
     for k, (x, y) in enumerate(values.tolist()):
-        tracker.add(begin_s + k / rate_hz, x, y)
+        tracker.add_sample(begin_s + k / rate_hz, x, y)
     return tracker
 
 
@@ -115,7 +115,7 @@ def test_few_samples_an_interruption_and_another_rate_tell_nothing():
     tracker.restart()
     for k, (x, y) in enumerate(white(200).tolist()):
         tracker.interrupt()
-        tracker.add(k / 10, x + k, y)
+        tracker.add_sample(k / 10, x + k, y)
     assert tracker.sigma is None
     # Each 5 s: what they differ by is drift.
     assert tracked(white(100), 0.2).sigma is None

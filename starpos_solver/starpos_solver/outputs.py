@@ -14,8 +14,7 @@ from starpos.fix.attitude import Attitude
 from starpos.fix.fix import Fix
 from starpos.fix.heading import AttitudeAtPlace
 from starpos.fix.solution import Solution, Status
-from starpos.gnss.solving import Compared
-from starpos.gnss.watch import GnssStatus
+from starpos.gnss.watch import GnssCheck, GnssStatus
 from starpos_common.messages import tilt_to_message
 from starpos_interfaces import msg
 
@@ -149,9 +148,8 @@ def solution(header: Header, answer: Solution, ground: Geodetic | None) -> msg.S
     return message
 
 
-def gnss_check(header: Header, compared: Compared) -> msg.GnssCheck:
+def gnss_check(header: Header, check: GnssCheck) -> msg.GnssCheck:
     """Make the message of the comparison of a GNSS place with the stars."""
-    check, place = compared.check, compared.place
     return msg.GnssCheck(
         header=header,
         status=GNSS_STATUS[check.status],
@@ -159,10 +157,10 @@ def gnss_check(header: Header, compared: Compared) -> msg.GnssCheck:
         distance=check.distance_m,
         bearing=check.bearing_deg,
         distance_stddev=check.sigma_m,
-        latitude=math.degrees(place.latitude),
-        longitude=math.degrees(place.longitude),
-        frames=compared.frames,
-        poses=compared.poses,
+        latitude=math.degrees(check.place.latitude),
+        longitude=math.degrees(check.place.longitude),
+        frames=check.frames,
+        poses=check.poses,
     )
 
 

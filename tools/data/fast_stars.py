@@ -65,7 +65,7 @@ def main() -> None:
     motion, apart = motion[row], apart / ARCSEC
     fast = (np.hypot(*motion.T) >= MIN_MAS_YEAR) & (apart < TOGETHER_ARCSEC)
     for k in np.flatnonzero(fast)[np.lexsort(tyc[fast].T[::-1])]:
-        print("    ({}, {}, {}): ({}, {}),".format(*tyc[k], *motion[k]))
+        print("{},{},{},{},{}".format(*tyc[k], *motion[k]))
     known = (apart < SAME_ARCSEC) & motion.any(1)
     print(f"{len(v)} stars without a motion, {known.sum()} in Hipparcos' list, {fast.sum()} fast")
     print("      V      stars   rms of one axis of the others' motions, mas/yr")

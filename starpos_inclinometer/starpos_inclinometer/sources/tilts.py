@@ -121,7 +121,7 @@ class SensorTilts:
         if flags & GAP:
             self.noise.interrupt()
         if not flags & (OUT_OF_RANGE | STUCK | SATURATED):
-            self.noise.add(time_s, *angles)
+            self.noise.add_sample(time_s, *angles)
         sigmas = self.noise.sigma or [max(self._usual_noise_rad, step) for step in steps]
         variances = [
             max(s, self.noise_floor_rad) ** 2 + step**2 / 12 for s, step in zip(sigmas, steps, strict=True)

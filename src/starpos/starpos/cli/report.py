@@ -120,10 +120,9 @@ def _stations(args: argparse.Namespace) -> int:
     from starpos.earth import geoid
     from starpos.report.html import PAGE, write_files
     from starpos.report.station_page import station_page
-    from starpos.zenith import session_file
-    from starpos.zenith.stations import against_grid, stations_of
+    from starpos.zenith.stations import against_grid, read_session, stations_of
 
-    stations = stations_of([session_file.read(path) for path in args.nights])
+    stations = stations_of([read_session(path) for path in args.nights])
     for station in stations:
         if station.doubt:
             console.complain("report", station.doubt)
@@ -144,8 +143,7 @@ def _now_text() -> str:
 
 def _pack(args: argparse.Namespace) -> int:
     """Write a field report of one night."""
-    from starpos.night import bag
-    from starpos.report import field
+    from starpos.night import bag, field
 
     if len(args.nights) > 1:
         raise FrameError("--field packs one night: give one")

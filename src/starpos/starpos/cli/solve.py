@@ -52,6 +52,7 @@ from starpos.gnss.watch import GnssCheck
 from starpos.instrument import instrument_file
 from starpos.instrument.instrument import Instrument
 from starpos.instrument.tilt_log import NO_TILTS, Tilts
+from starpos.night import field
 from starpos.night.opening import work_of
 from starpos.night.reading import NO_CAMERA, About, First, Instruments
 from starpos.night.remarks import WORTH_SAVING_ARCSEC, Near, of_inclinometer
@@ -66,7 +67,6 @@ from starpos.night.together import (
     turned,
 )
 from starpos.night.work import OnFile, Solving
-from starpos.report import field
 from starpos.sky import catalogue
 from starpos.units import utc_text
 
@@ -145,7 +145,7 @@ def _line_of_answer(args: argparse.Namespace, answer: FrameAnswer, place: Place 
         line = line_of(answer.name, s, args.self_calibrate)
     if watched is None or watched.compared is None:
         return line
-    check = watched.compared.check
+    check = watched.compared
     return f"{line}; GNSS {check.status}: {check.sentence}"
 
 
@@ -227,7 +227,7 @@ def json_of_watched(told: Watched) -> dict:
     keys = dict.fromkeys(FIX_KEYS) if fix is None or ground is None else json_on_ground(fix, ground)
     if (at_place := told.solution.at_place) is not None:
         keys = with_heading(keys, at_place, at_place.place)
-    return keys | {"gnss": None if told.compared is None else json_of_check(told.compared.check)}
+    return keys | {"gnss": None if told.compared is None else json_of_check(told.compared)}
 
 
 def json_of_check(check: GnssCheck) -> dict:

@@ -14,8 +14,7 @@ from starpos.earth import geoid
 from starpos.earth.geoid import Geoid
 from starpos.errors import StationError
 from starpos.units import utc_text
-from starpos.zenith import session_file
-from starpos.zenith.stations import GeoidStep, Station, against_grid, levelled, stations_of
+from starpos.zenith.stations import GeoidStep, Station, against_grid, levelled, read_session, stations_of
 
 
 def define(parser: argparse.ArgumentParser) -> None:
@@ -50,7 +49,7 @@ def define(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    stations = stations_of([session_file.read(path) for path in args.sessions])
+    stations = stations_of([read_session(path) for path in args.sessions])
     grid = None if args.geoid is None else geoid.read(args.geoid)
     for station in stations:
         if station.doubt:
@@ -90,9 +89,9 @@ def station_json(station: Station, grid: Geoid | None) -> dict:
     compared = None if grid is None else against_grid(station, grid)
     return {
         "station": station.name,
-        "latitude": np.degrees(station.latitude),
-        "longitude": np.degrees(station.longitude),
-        "height_m": station.height_m,
+        "latitude": np.degrees(station.place.latitude),
+        "longitude": np.degrees(station.place.longitude),
+        "height_m": station.place.height_m,
         "sessions": len(station.sessions),
         "frames": sum(s.frame_count for s in station.sessions),
         "first_utc": utc_text(min(s.utc_unix_s for s in station.sessions)),

@@ -1,11 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Read a GeoTIFF of one float band in geographic degrees: OpenCV decodes the pixels, this module reads their places.
+"""The deflection of the vertical from a grid of geoid undulations, with an error for what the grid cannot resolve.
 
+Grids are NOAA's GTX, NGS's .bin, and GeoTIFFs of one float band in geographic degrees, whose pixels OpenCV decodes.
 Sources: GeoTIFF 1.1 (OGC 19-008r4), and PROJ's specification of geodetic TIFF grids for two tags of GDAL.
-
-Grids of geoid undulations: NOAA's GTX, NGS's .bin and PROJ's GeoTIFF (its specification of geodetic TIFF grids).
-
-The deflection of the vertical from the slopes of a geoid grid, with an error for what the grid cannot resolve.
 """
 
 import math

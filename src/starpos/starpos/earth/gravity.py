@@ -1,10 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Normal gravity of WGS 84 as a vector in ITRS: attraction and centrifugal force, along the ellipsoid's normal.
+"""Normal gravity of WGS 84 as a vector in ITRS (attraction and centrifugal force), and the tide of the plumb line.
 
-Along the normal also above the ellipsoid: a place found by it is astronomic, that where the ellipsoid's normal is the
-plumb line.
-
-The tide of the plumb line: the pull of Moon and Sun on it, and the yielding of the solid Earth.
+Gravity is along the ellipsoid's normal, also above the ellipsoid: a place found by it is astronomic, that where the
+ellipsoid's normal is the plumb line.
 """
 
 import erfa

@@ -29,7 +29,8 @@ class Origin(Enum):
 class ErrorTerm:
     """One source of error: its covariance is variance * factor @ factor.T.
 
-    factor (6, m): rows are east m, north m, heading rad, and the attitude's small rotation about east, north, up in rad.
+    factor (r, m): its rows are what the owner of the budget asks for; of a fix, r = 6, they are east m, north m, heading
+    rad, and the attitude's small rotation about east, north, up in rad.
     shared: which frames have the same error.  None: each frame has a new one.  ALWAYS: all frames share it, as for a
     calibration or a clock.  EACH_POSE: all frames share it until the instrument is touched.  Any other tuple: the keys of
     the readings or stars of which the error is the mean; the errors of two frames have the `correlation` of their keys.
@@ -37,6 +38,8 @@ class ErrorTerm:
     constant_within_pose: the true factor stays the same until the camera is touched.  Factors of the frames of a pose
     differ only by noise, so an average uses the first one's.
     origin: what the error comes from.
+    kernel (N, N): covariance, in units of the factor's, from frame to frame of an error of N frames together, which
+    `of_frames` makes; then the factor has the rows of each frame in turn.
     """
 
     name: str
@@ -47,11 +50,21 @@ class ErrorTerm:
     walk_s: float = 0.0
     constant_within_pose: bool = False
     origin: Origin = Origin.OTHER
+    kernel: np.ndarray | None = None
+
+    @classmethod
+    def of_frames(cls, name: str, factors: np.ndarray, kernel: np.ndarray | None = None) -> "ErrorTerm":
+        """The error of N frames together, with factors (N, r, m); without a kernel they share it."""
+        return cls(name, factors.reshape(-1, factors.shape[2]), shared=ALWAYS, kernel=kernel)
 
     @property
     def covariance(self) -> np.ndarray:
-        """Covariance (6, 6) of the rows of `factor`."""
-        return self.variance * self.factor @ self.factor.T
+        """Covariance of the rows of `factor`, (6, 6) of a fix's."""
+        covariance = self.variance * self.factor @ self.factor.T
+        if self.kernel is None:
+            return covariance
+        rows = len(self.factor) // len(self.kernel)
+        return np.repeat(np.repeat(self.kernel, rows, 0), rows, 1) * covariance
 
     @property
     def common(self) -> bool:

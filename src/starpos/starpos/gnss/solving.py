@@ -30,16 +30,6 @@ NOTHING_LEARNED = (
 )
 
 
-@dataclass(frozen=True, eq=False)
-class Compared:
-    """A GNSS place at a frame, and what the stars say of it; frames, poses: from which was learned what counts."""
-
-    place: Place
-    check: GnssCheck
-    frames: int
-    poses: int
-
-
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Watched:
     """A frame's answer.
@@ -51,7 +41,7 @@ class Watched:
 
     solution: Solution
     ground: Geodetic | None = None
-    compared: Compared | None = None
+    compared: GnssCheck | None = None
     learned: Learned | None = None
 
 
@@ -62,7 +52,7 @@ def watched(solver: Solver, stars: Stars, rough: Solution, gnss: Place | None, w
     gnss: that place, None without one.
     """
     if rough.fix is None or rough.tilt is None:
-        compared = None if gnss is None else Compared(gnss, GnssCheck(GnssStatus.LEARNING), 0, 0)
+        compared = None if gnss is None else GnssCheck(status=GnssStatus.LEARNING, place=gnss)
         return Watched(solution=rough, compared=compared)
     tilt = rough.tilt
     watch.advance(LevelSight.of(rough.fix, tilt))
@@ -90,7 +80,7 @@ def watched(solver: Solver, stars: Stars, rough: Solution, gnss: Place | None, w
         return replace(answer, learned=watch.learned)
     watch.learn(sighting, gnss, check)
     frames, poses = (0, 0) if watch.learned is None else (watch.learned.frames, watch.learned.poses)
-    return replace(answer, compared=Compared(gnss, check, frames, poses), learned=watch.learned)
+    return replace(answer, compared=replace(check, frames=frames, poses=poses), learned=watch.learned)
 
 
 def _up(watch: GnssWatch, fix: Fix, tilt: Tilt, gnss: Place | None) -> np.ndarray | None:

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """What GNSS teaches of an instrument: A3, the errors of its inclinometer, the deflection of the vertical; all together.
-All are angles in rad, or shares. Their covariance is kept whole, because at first most of them cannot be separated:
-at one pose a turn of A3 looks like a zero, and at one heading like a deflection.
+
+All are angles in rad, or shares. Their covariance is kept whole, because at first most of them cannot be separated: at
+one pose a turn of A3 looks like a zero, and at one heading like a deflection.
 """
 
 import json

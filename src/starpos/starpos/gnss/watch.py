@@ -1,5 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a session knows of its instrument by GNSS, and whether it believes GNSS: frame by frame, in order of time."""
+"""What a session knows of its instrument by GNSS, and whether it believes GNSS: frame by frame, in order of time.
+
+A GNSS place that is spoofed or wrong, suddenly or slowly, is detected by copies of the filter: one is made every
+COPY_INTERVAL_S seconds, and kept for LONGEST_S. A copy has one more unknown, an error of GNSS that began when it was
+made, as a step or growing evenly. If GNSS is good, that error is 0 within its covariance, which includes all errors of
+the stars' place; a likelihood ratio decides (Willsky and Jones, IEEE Trans. Automatic Control 21(1), 1976, 108, from
+memory). So a slow drag shows although each of its frames agrees with the one before, and although the filter that learns
+has followed it.
+"""
 
 import math
 from collections import deque
@@ -78,9 +86,9 @@ class OnsetFilters:
 
     def recent(self, utc_unix_s: float) -> "OnsetFilters":
         """The filters that are not older than LONGEST_S."""
-        return self._take(utc_unix_s - self.since <= LONGEST_S)
+        return self._selected(utc_unix_s - self.since <= LONGEST_S)
 
-    def _take(self, which: np.ndarray) -> "OnsetFilters":
+    def _selected(self, which: np.ndarray) -> "OnsetFilters":
         before = tuple(b for b, kept in zip(self.before, which, strict=True) if kept)
         return OnsetFilters(
             before, self.since[which], self.frames[which], self.state[which], self.covariance[which]
@@ -165,18 +173,23 @@ class GnssStatus(str, Enum):
         return self.value
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class GnssCheck:
     """What the guard says of a GNSS fix: a status, and how far it is from the stars' place.
 
+    place: GNSS's.
     distance_m, bearing_deg: of the GNSS place from the stars' place.  sigma_m: 1 sigma of the distance.
     All three are NaN where the stars give no place yet.
+    frames, poses: from how many was learned what counts.
     """
 
     status: GnssStatus
+    place: Place
     distance_m: float = math.nan
     bearing_deg: float = math.nan
     sigma_m: float = math.nan
+    frames: int = 0
+    poses: int = 0
 
     @property
     def sentence(self) -> str:
@@ -299,7 +312,7 @@ class GnssWatch:
     def judge(self, sighting: LevelSight, gnss: Place) -> GnssCheck:
         """Compare a GNSS place with the stars'; where they disagree, take back what GNSS taught meanwhile."""
         if self.learned is None or not self.tells_place(sighting):
-            return GnssCheck(GnssStatus.LEARNING)
+            return GnssCheck(status=GnssStatus.LEARNING, place=gnss)
         seen = innovation(sighting, gnss, self.learned, self.vertical)
         single = chi2(self.learned, seen)
         if self._starting:
@@ -357,6 +370,7 @@ class GnssWatch:
         way = apart / max(distance, 1e-9)
         return GnssCheck(
             status=status,
+            place=gnss,
             distance_m=distance,
             bearing_deg=float(np.degrees(np.arctan2(*apart)) % 360),
             sigma_m=math.sqrt(way @ (place.covariance + gnss.covariance) @ way),

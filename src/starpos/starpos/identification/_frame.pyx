@@ -46,7 +46,7 @@ cdef class FrameStars:
     def half(self):
         return np.array([self.reach[0], self.reach[1]])
 
-    def take(self, row):
+    def of_rows(self, row):
         """The stars of these rows, in the same order."""
         return _hold(_shape_of(self), self.xy[:, row], self.sigma[row])
 

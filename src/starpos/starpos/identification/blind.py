@@ -1,16 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Identify a frame of which nothing is known, not even the scale: by quads of its brightest stars, at every scale.
+"""Identify a frame of which nothing is known, not even the scale or the lens: by quads of its brightest stars.
 
 Scales are tried in steps so small that a pinhole's projection shows in no shape. Quads of the frame that look like
 quads of the sky give poses. Those on which most agree are judged by the same evidence as any other, but every scale was
 possible before. Where the focal length is roughly known, scales near it come first, which is quick. An answer that is
 not sure is kept while the search goes on, in case there is a better one.
 
-Identify a fisheye's frame with unknown lens model and scale, from parts of the frame outwards.
-
-An assumed lens and focal length give directions to the stars in a part of the frame, and a pinhole that looks there
-would see them like any other frame. Quads of the brightest of them give poses of the part, which are judged by the
-same evidence as any other. Then the lens extends the answer to the whole frame.
+Of a fisheye, an assumed lens and focal length give directions to the stars in a part of the frame, and a pinhole that
+looks there would see them like any other frame. Quads of the brightest of them give poses of the part, which are judged
+by the same evidence as any other. Then the lens extends the answer to the whole frame.
 """
 
 import math
@@ -115,7 +113,7 @@ def identify_blind(
     for k, (t, (stars, error_px), (low, high)) in enumerate(work):
         progress("searching all scales", k / len(work))
         prior = any_scale(low, high, -math.log(len(spans)))
-        for pose, radius_px in _poses(frame.take(t.rows), sky, quads, (low, high), stars, error_px, limit):
+        for pose, radius_px in _poses(frame.of_rows(t.rows), sky, quads, (low, high), stars, error_px, limit):
             camera = Camera.from_focal(width, height, pose.focal_px)
             seen = through(stars_at(camera, xy[t.rows], sigma_px[t.rows]), camera, window)
             seen = seen.but(area_px2=t.share * seen.area_px2)

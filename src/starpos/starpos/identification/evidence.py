@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Evidence of a frame's stars that a pose is right, against chance.
+"""Evidence of a frame's stars that a pose is right, against chance; verification of a pose by it, and what that explains.
 
 By chance the detections are random points anywhere on the frame. If the pose is right, each detection, from the brightest
 down, is one of two things. It is a false star, with a probability that follows from the share of false ones before it (a
@@ -11,10 +11,6 @@ exceeds x in at most one of x frames of random points, at whatever detection one
 the pose was found. Here only the neighbourhood of one pose is counted, by Laplace's method. That is right to a small
 factor, but all other poses are left out, so the result is on the safe side: with random points it exceeds 1 in one frame
 of a hundred.
-
-Verify a pose by a frame's stars, and match all detections with all catalogue stars of the field.
-
-How much of a frame an identification explains: its bright detections, and the bright stars that should be there.
 """
 
 import math

@@ -2,11 +2,8 @@
 """Quads of bright stars of every size, by their shape: they determine the scale of an unknown frame.
 
 As in astrometry.net (Lang et al. 2010, AJ 139, 1782) four stars have a shape that does not depend on the scale, and
-hardly any other four have it too. Here the shape is the lengths of five sides over the length of the longest.
-
-Keep the quads of a star catalogue: in memory, and next to the triangles on the disk, memory-mapped.
-
-Poses of a frame from quads of its brightest stars that look like quads of the sky, those first that most agree on.
+hardly any other four have it too. Here the shape is the lengths of five sides over the length of the longest. Quads of a
+frame's brightest stars that look like quads of the sky give poses, those first that most agree on.
 """
 
 from collections.abc import Sequence

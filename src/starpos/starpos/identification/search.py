@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The search: priors first, then lost in space, from few bright stars to more, from good centroids to poor ones.
 
-If too few stars are detected to decide, look in the frame itself for light where fainter stars should be.
-
-A pose that its stars make likely, but not likely enough, says where the catalogue's other stars are. Each of these places
-is compared with those around it, where a star is as likely to be if the pose is wrong. The evidence is the ratio of the
-probabilities of that comparison. So its mean is at most 1 if the pose is wrong, for any noise of the frame. It looks only
-where nothing was detected, so it multiplies with the evidence of the detections.
+If too few stars are detected to decide, a second look at the frame itself searches for light where fainter stars should
+be. A pose that its stars make likely, but not likely enough, says where the catalogue's other stars are. Each of these
+places is compared with those around it, where a star is as likely to be if the pose is wrong. The evidence is the ratio
+of the probabilities of that comparison. So its mean is at most 1 if the pose is wrong, for any noise of the frame. It
+looks only where nothing was detected, so it multiplies with the evidence of the detections.
 """
 
 import math
@@ -161,20 +160,29 @@ def identify_frame(
 def identifications(
     field: FrameStars, sky: Sky, priors: Priors, enough: float = MIN_LOG_ODDS
 ) -> Iterator[Identification]:
-    """Yield identifications of a frame in the order in which they are tried.
+    """Identifications of a frame in the order in which they are tried.
 
     First all of `near_or_lost`, then those of a frame whose brightest stars may nearly all be false, in any order. Then
     both for evenly spread stars, if the brightest are not spread evenly.
     """
     if len(field) < MIN_STARS:
-        return
-    yield from near_or_lost(field, sky, priors, STAGES, enough)
+        return iter(())
+    # not one generator for all: to end one in the middle takes as long as a look at the sky's triangles
+    return chain(
+        near_or_lost(field, sky, priors, STAGES, enough), _crowded_or_uneven(field, sky, priors, enough)
+    )
+
+
+def _crowded_or_uneven(
+    field: FrameStars, sky: Sky, priors: Priors, enough: float
+) -> Iterator[Identification]:
+    """Yield what `identifications` does after `near_or_lost`."""
     yield from _crowded(field, sky, priors, enough, CROWD_STARS)
     rows = second_try(field)
     # only one star is taken from a cell, which leaves less area for the others
     left_px2 = field.area_px2 - 4 * float(field.half.prod()) / 2
     if rows is not None and left_px2 > 0:
-        even, enough = field.take(rows).but(area_px2=left_px2), enough + SECOND_TRY
+        even, enough = field.of_rows(rows).but(area_px2=left_px2), enough + SECOND_TRY
         for found in chain(
             near_or_lost(even, sky, (), STAGES, enough), _crowded(even, sky, (), enough, CELLS**2 // 2)
         ):
@@ -216,16 +224,15 @@ def near_or_lost(
     enough: float = MIN_LOG_ODDS,
     crowded: bool = False,
 ) -> Iterator[Identification]:
-    """Yield identifications with log-odds of `enough`: by the priors, then lost in space by `stages`.
+    """Identifications with log-odds of `enough`: by the priors, then lost in space by `stages`.
 
     The priors have half of the probability, if there are any.
     crowded: only triangles that others support are looked at, but all of those.
     """
-    if priors:
-        yield from _near(field, sky, priors, enough)
     prior = anywhere(field.focal_px, LOG_HALF if priors else 0.0)
     finder = _finder(sky.catalogue, sky.triangles)
-    yield from finder.lost(field, sky.years, sky.velocity, prior, enough, stages, crowded)
+    lost = finder.lost(field, sky.years, sky.velocity, prior, enough, stages, crowded)
+    return chain(_near(field, sky, priors, enough), lost) if priors else lost
 
 
 def identify_near(field: FrameStars | fisheye.WideField, sky: Sky, priors: Priors) -> Identification | None:

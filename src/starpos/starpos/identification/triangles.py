@@ -3,8 +3,6 @@
 
 Triangles are found by their angles, as in the paper, because these hardly depend on the focal length. Every circle of the
 field's size gives its own brightest stars, so that every field of the instrument has enough triangles.
-
-Keep triangle catalogues: in memory, and in a cache on the disk from which they are memory-mapped.
 """
 
 import math

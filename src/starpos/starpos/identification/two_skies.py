@@ -201,7 +201,7 @@ def _another_pose(
     """Whether the stars of the field that are left over (N,) fit another pose of the same camera."""
     row, first = np.flatnonzero(left)[:MAX_STARS], Pose.of(field, found)
     while len(row) >= MIN_LEFT:
-        rest = field.take(row).but(focal_px=first.focal_px)
+        rest = field.of_rows(row).but(focal_px=first.focal_px)
         second = _same_camera(rest, sky, first, WORSE * found.residual_px + WORSE_PX)
         if second is None:
             return False

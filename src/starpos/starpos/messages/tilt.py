@@ -373,7 +373,7 @@ class ImuTilts:
         if flags & GAP:
             self._noise.interrupt()
         if not flags & STUCK:
-            self._noise.add(average.mid_ns * 1e-9, x, y, z)
+            self._noise.add_sample(average.mid_ns * 1e-9, x, y, z)
         self._sequence += 1
         covariance = self._covariance(average) + step_rad**2 / 12 * np.eye(3)
         return Reading(

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The unknowns of a voyage, and their equations: from each node to the next, and of single nodes.  The mechanisation is
-strapdown, in ITRS: at each node inertial axes are laid along ITRS, in which the readings are summed; until the next
-one ITRS turns with the Earth. There is no latitude or longitude in it, so that poles and 180 deg are like other
-places.
+"""The unknowns of a voyage, and their equations: from each node to the next, and of single nodes.
+
+The mechanisation is strapdown, in ITRS: at each node inertial axes are laid along ITRS, in which the readings are summed;
+until the next one ITRS turns with the Earth. There is no latitude or longitude in it, so that poles and 180 deg are like
+other places.
 """
 
 from dataclasses import dataclass, replace
@@ -96,17 +97,8 @@ LOST_RATE, LOST_FORCE = 1.0, 5.0
 LOST_SHARE = 1e-3
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class NextNodes:
-    """Where K - 1 nodes' readings lead to at the next node: place, velocity (K - 1, 3) and attitude (K - 1, 3, 3)."""
-
-    place: np.ndarray
-    velocity: np.ndarray
-    attitude: np.ndarray
-
-
-def arrived(motion: Motion, sums: Sums, span_s: np.ndarray) -> NextNodes:
-    """Carry each node but the last on to the next."""
+def arrived(motion: Motion, sums: Sums, span_s: np.ndarray) -> Motion:
+    """The nodes after the first with place, velocity and attitude as the readings carry the ones before there."""
     dt = span_s[:, None]
     place, velocity, attitude = motion.place[:-1], motion.velocity[:-1], motion.attitude[:-1]
     speed, way = _turned(attitude, sums.speed), _turned(attitude, sums.way)
@@ -117,7 +109,8 @@ def arrived(motion: Motion, sums: Sums, span_s: np.ndarray) -> NextNodes:
     place = place + inertial * dt + way + (2 * begin + end) * dt**2 / 6
     inertial = inertial + speed + (begin + end) * dt / 2
     back = turned_back(span_s)
-    return NextNodes(
+    return replace(
+        motion.part(np.arange(1, len(motion))),
         place=_turned(back, place),
         velocity=_turned(back, inertial - np.cross(SPIN, place)),
         attitude=back @ attitude @ sums.turn,
@@ -199,7 +192,7 @@ def links_of(motion: Motion, sums: Sums, pieces: Pieces, model: ImuModel, law: M
 
 
 def _misclosure(motion: Motion, sums: Sums, span_s: np.ndarray, n: int) -> np.ndarray:
-    """What each node lacks (K - 1, n) against what arrives from the one before."""
+    """Misclosures (K - 1, n): where each node arrives from the one before, minus the node."""
     there = arrived(motion, sums, span_s)
     short = np.zeros((len(span_s), n))
     short[:, PLACE] = there.place - motion.place[1:]
@@ -268,7 +261,7 @@ NO_PLACE, NO_VELOCITY, NO_TURN = 2e7, 1e3, 10.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class Beforehand:
+class VoyagePrior:
     """What is known before the voyage, 1 sigma: mount rad an axis, share of refraction, height m.
 
     log_scale, log_axes, lag_s: of the measured velocity (a share; rad an axis) and of the camera's stamps (s).
@@ -298,12 +291,16 @@ class StarAttitudes:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Lacks:
+class Residuals:
     """Equations (F, 3, n + m + 1) of some nodes, index (F,), not whitened, and covariances (F, 3, 3) of their errors."""
 
     index: np.ndarray
     rows: np.ndarray
     covariance: np.ndarray
+
+    def part(self, keep: np.ndarray) -> "Residuals":
+        """Some of the equations, by a mask (F,)."""
+        return Residuals(index=self.index[keep], rows=self.rows[keep], covariance=self.covariance[keep])
 
     def whitened(self, count: int) -> np.ndarray:
         """Equations (count, 3, n + m + 1) of all nodes, with zeros at nodes without one."""
@@ -331,7 +328,7 @@ class Lacks:
 MIN_LEFT = 0.02
 
 
-def star_lacks(motion: Motion, stars: StarAttitudes, sums: Sums, pieces: Pieces, n: int) -> Lacks:
+def star_residuals(motion: Motion, stars: StarAttitudes, sums: Sums, pieces: Pieces, n: int) -> Residuals:
     """Equations of the frames with stars: the camera's attitude by the body's, the mount and the lag."""
     k = stars.index
     camera = motion.attitude[k] @ motion.camera_to_body
@@ -346,7 +343,7 @@ def star_lacks(motion: Motion, stars: StarAttitudes, sums: Sums, pieces: Pieces,
     constants[:, :, REFRACTION] = -stars.by_refraction[..., None]
     rows[:, :, -1] = stars.by_refraction * motion.refraction - rate * motion.lag_s - off
     smeared = rate[:, :, None] * rate[:, None, :] * (stars.stamp_stddev_s**2)[:, None, None]
-    return Lacks(index=k, rows=rows, covariance=stars.covariance + smeared)
+    return Residuals(index=k, rows=rows, covariance=stars.covariance + smeared)
 
 
 def _rates(sums: Sums, pieces: Pieces) -> np.ndarray:
@@ -357,32 +354,15 @@ def _rates(sums: Sums, pieces: Pieces) -> np.ndarray:
     return np.concatenate([rate, rate[-1:]])
 
 
-def velocity_lacks(motion: Motion, index: np.ndarray, missed: np.ndarray, sigma: np.ndarray, n: int) -> Lacks:
-    """Equations of nodes (F,) with velocities, missed (F, 3) by so much, measured less predicted, with 1 sigma (F,)."""
-    attitude = motion.attitude[index]
-    through = motion.velocity[index] - motion.drift[index]
-    forward = np.einsum("kji,kj->ki", attitude, through)
-    rows = np.zeros((len(index), 3, n + CONSTANTS + 1))
-    rows[:, :, VELOCITY] = attitude.transpose(0, 2, 1)
-    rows[:, :, TURN] = attitude.transpose(0, 2, 1) @ crosses(through)
-    if n == BY_LAW:
-        rows[:, :, DRIFT] = -attitude.transpose(0, 2, 1)
-    constants = rows[:, :, n:-1]
-    constants[:, :, LOG_SCALE] = forward[..., None]
-    constants[:, :, LOG_AXES] = -crosses(forward)
-    rows[:, :, -1] = missed
-    return Lacks(index=index, rows=rows, covariance=(sigma**2)[:, None, None] * np.eye(3))
-
-
-def standing_lacks(motion: Motion, index: np.ndarray, sigma: float, n: int) -> Lacks:
+def standing_residuals(motion: Motion, index: np.ndarray, sigma: float, n: int) -> Residuals:
     """Equations of nodes (F,) at which the vehicle stands, within sigma m/s."""
     rows = np.zeros((len(index), 3, n + CONSTANTS + 1))
     rows[:, :, VELOCITY] = np.eye(3)
     rows[:, :, -1] = -motion.velocity[index]
-    return Lacks(index=index, rows=rows, covariance=np.tile(sigma**2 * np.eye(3), (len(index), 1, 1)))
+    return Residuals(index=index, rows=rows, covariance=np.tile(sigma**2 * np.eye(3), (len(index), 1, 1)))
 
 
-def law_lacks(motion: Motion, law: MotionLaw) -> Lacks:
+def law_residuals(motion: Motion, law: MotionLaw) -> Residuals:
     """Equations of the nodes whose velocity is known only from the motion law: speed along the nose, drift, rest."""
     up, count = zenith_at(motion.place), len(motion)
     level = np.eye(3) - up[:, :, None] * up[:, None, :]
@@ -399,10 +379,10 @@ def law_lacks(motion: Motion, law: MotionLaw) -> Lacks:
     apart_s = float(np.median(np.diff(motion.utc_unix_s)))
     upward = up[:, :, None] * up[:, None, :]
     covariance = law.rest_at(apart_s) ** 2 * level + law.climb_at(apart_s) ** 2 * upward
-    return Lacks(index=np.arange(count), rows=rows, covariance=covariance)
+    return Residuals(index=np.arange(count), rows=rows, covariance=covariance)
 
 
-def first_rows(motion: Motion, model: ImuModel, known: Beforehand, law: MotionLaw | None) -> np.ndarray:
+def prior_rows(motion: Motion, model: ImuModel, prior: VoyagePrior, law: MotionLaw | None) -> np.ndarray:
     """Whitened equations (P, n + m + 1) of the first node and the constants: what is known beforehand."""
     n = MEASURED if law is None else BY_LAW
     sigma, value = np.empty(n + CONSTANTS), np.zeros(n + CONSTANTS)
@@ -420,21 +400,21 @@ def first_rows(motion: Motion, model: ImuModel, known: Beforehand, law: MotionLa
     matrix = np.where(np.eye(3, dtype=bool), model.scale_stddev, model.axes_stddev).ravel()
     nominal = Rotation.from_matrix(motion.nominal.T @ motion.camera_to_body).as_rotvec()
     for columns, spread, now in (
-        (MOUNT, known.mount, nominal),
+        (MOUNT, prior.mount, nominal),
         (GYRO_MATRIX, matrix, motion.gyro_matrix.ravel()),
         (ACCEL_MATRIX, matrix, motion.accel_matrix.ravel()),
-        (LOG_SCALE, known.log_scale, motion.log_scale),
-        (LOG_AXES, known.log_axes, motion.log_axes),
-        (LAG, known.lag_s, motion.lag_s),
-        (REFRACTION, max(known.refraction, 1e-6), motion.refraction),
+        (LOG_SCALE, prior.log_scale, motion.log_scale),
+        (LOG_AXES, prior.log_axes, motion.log_axes),
+        (LAG, prior.lag_s, motion.lag_s),
+        (REFRACTION, max(prior.refraction, 1e-6), motion.refraction),
     ):
         sigma[n:][columns], value[n:][columns] = spread, now
     rows = np.zeros((n + CONSTANTS + 1, n + CONSTANTS + 1))
     rows[np.arange(n + CONSTANTS), np.arange(n + CONSTANTS)] = 1 / sigma
     rows[:-1, -1] = -value / sigma
     _, _, height = geodetic_place(motion.place[0])
-    rows[-1, PLACE] = zenith_at(motion.place[0]) / known.height_stddev_m
-    rows[-1, -1] = (known.height_m - float(height)) / known.height_stddev_m
+    rows[-1, PLACE] = zenith_at(motion.place[0]) / prior.height_stddev_m
+    rows[-1, -1] = (prior.height_m - float(height)) / prior.height_stddev_m
     return rows
 
 
@@ -489,14 +469,28 @@ class Odometry:
         forward = np.einsum("kji,kj->ki", attitude, motion.velocity[k] + velocity - motion.drift[k])
         return self.velocity - (1 + motion.log_scale) * (forward + np.cross(motion.log_axes, forward))
 
-    def lacks(self, motion: Motion, missed: np.ndarray, keep: np.ndarray, vibration: float, n: int) -> Lacks:
-        """Equations of the nodes near velocities to keep (N,), of which missed (N, 3) are measured less predicted."""
+    def residuals(
+        self, motion: Motion, missed: np.ndarray, keep: np.ndarray, vibration: float, n: int
+    ) -> Residuals:
+        """Equations of the nodes near velocities to keep (N,); missed (N, 3): measured less predicted, m/s."""
         weight = keep / self.sigma**2
         total = np.bincount(self.node, weight, len(motion))
         index = np.flatnonzero(total)
         mean = np.stack([np.bincount(self.node, weight * part, len(motion)) for part in missed.T], -1)[index]
         sigma = np.hypot(1 / np.sqrt(total[index]), vibration)
-        return velocity_lacks(motion, index, mean / total[index, None], sigma, n)
+        attitude = motion.attitude[index]
+        through = motion.velocity[index] - motion.drift[index]
+        forward = np.einsum("kji,kj->ki", attitude, through)
+        rows = np.zeros((len(index), 3, n + CONSTANTS + 1))
+        rows[:, :, VELOCITY] = attitude.transpose(0, 2, 1)
+        rows[:, :, TURN] = attitude.transpose(0, 2, 1) @ crosses(through)
+        if n == BY_LAW:
+            rows[:, :, DRIFT] = -attitude.transpose(0, 2, 1)
+        constants = rows[:, :, n:-1]
+        constants[:, :, LOG_SCALE] = forward[..., None]
+        constants[:, :, LOG_AXES] = -crosses(forward)
+        rows[:, :, -1] = mean / total[index, None]
+        return Residuals(index=index, rows=rows, covariance=(sigma**2)[:, None, None] * np.eye(3))
 
     def sound(self, missed: np.ndarray) -> np.ndarray:
         """Mask (N,) of the velocities that do not lie beyond what most of them scatter, or should."""

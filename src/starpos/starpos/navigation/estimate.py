@@ -32,14 +32,6 @@ from starpos.navigation.start import nodes_of
 from starpos.navigation.vessel import MotionLaw
 
 
-@dataclass(frozen=True, kw_only=True)
-class TimeErrors:
-    """Errors of time that all fixes share, 1 sigma: of the clock against UTC, and of the frames' stamps; s."""
-
-    clock_s: float
-    stamp_s: float
-
-
 @dataclass(frozen=True, eq=False, kw_only=True)
 class VoyageFix:
     """Astronomic latitude, longitude and heading of the body's x (rad) at one time of a voyage.
@@ -61,8 +53,13 @@ class VoyageFix:
     accel_bias: np.ndarray
 
 
-def fix_of(motion: Motion, k: int, covariance: np.ndarray, errors: TimeErrors) -> VoyageFix:
-    """The fix at node k, of whose unknowns this is the covariance; the errors of time and Earth rotation are added."""
+def fix_of(
+    motion: Motion, k: int, covariance: np.ndarray, clock_stddev_s: float, stamp_stddev_s: float
+) -> VoyageFix:
+    """The fix at node k, of whose unknowns this is the covariance; the errors of time and Earth rotation are added.
+
+    clock_stddev_s, stamp_stddev_s: errors of time that all fixes share, of the clock and of the frames' stamps.
+    """
     latitude, longitude, _ = (float(x) for x in geodetic_place(motion.place[k]))
     enu, (prime, meridian) = enu_axes(latitude, longitude), curvature_radii_m(latitude)
     attitude = enu @ motion.attitude[k]
@@ -79,7 +76,7 @@ def fix_of(motion: Motion, k: int, covariance: np.ndarray, errors: TimeErrors) -
     to_heading[:2, :2] = np.eye(2)
     to_heading[2:, 2:] = heading_row(attitude)
     earth = earth_state(float(motion.utc_unix_s[k]))
-    shared = total_covariance(time_terms(latitude, earth, errors.clock_s, errors.stamp_s))
+    shared = total_covariance(time_terms(latitude, earth, clock_stddev_s, stamp_stddev_s))
     return VoyageFix(
         utc_unix_s=float(motion.utc_unix_s[k]),
         latitude=latitude,
@@ -104,13 +101,15 @@ class Estimate:
     """A motion of one node, and the covariance (n + m, n + m) of its unknowns with the constants.
 
     model: of the IMU, its noise as the voyage shows it.  law: whose unknowns the node has, if any.
+    clock_stddev_s, stamp_stddev_s: as in `fix_of`.
     """
 
     motion: Motion
     covariance: np.ndarray
     model: ImuModel
     law: MotionLaw | None
-    errors: TimeErrors
+    clock_stddev_s: float
+    stamp_stddev_s: float
 
     @property
     def utc_unix_s(self) -> float:
@@ -123,7 +122,7 @@ class Estimate:
 
     @property
     def fix(self) -> VoyageFix:
-        return fix_of(self.motion, 0, self.covariance, self.errors)
+        return fix_of(self.motion, 0, self.covariance, self.clock_stddev_s, self.stamp_stddev_s)
 
     def carried_on(self, imu: ImuLog, until_s: float) -> "Estimate":
         """The estimate at a time after its own, by the readings until then; what is missing of them widens it."""
@@ -149,10 +148,7 @@ class Estimate:
         there = arrived(both, sums, pieces.span_s)
         after = onward @ covariance @ onward.T
         after[:n, :n] += links.covariance[0]
-        moved = replace(
-            both.part(np.ones(1, int)), attitude=there.attitude, place=there.place, velocity=there.velocity
-        )
-        return moved, after
+        return there, after
 
 
 def _part(table: T, k: int) -> T:

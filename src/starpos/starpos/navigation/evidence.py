@@ -1,5 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a record itself shows of its assumptions: where the vehicle stands, and how well a law of motion holds."""
+"""What a record itself shows of its assumptions: where the vehicle stands, and how well a law of motion holds.
+
+No single sign distinguishes a standing vehicle from one that rolls evenly and straight.  So three signs must agree.
+Its attitude is constant within the errors of the stars, which no vehicle that rolls on real ground achieves.  Its
+readings are quieter than while it surely moves: a vehicle whose motion is not felt never counts as standing.  And the
+rest of the record, without that standstill, determines its velocity well enough, and it is 0.  If one of them cannot be
+0, all are rejected: it is unknown which of the contradicting ones are true.
+
+Of a law of motion, only the motion across the nose shows how much wind and gusts change from one minute to the next,
+since the speed along the nose is unknown.  A trend, steady from end to end of the record, looks like an error of the
+place, so it cannot be used.  Minutes reveal it as far as a wind is a random walk.  A slow swing, half a wave or two over
+the record, hides a trend of its own size.  Calm air may drift without either, so the record may widen how fast the drift
+changes, and never narrows it.
+"""
 
 from dataclasses import dataclass, replace
 
@@ -9,7 +22,7 @@ from scipy.spatial.transform import Rotation
 from starpos.earth.ellipsoid import enu_axes
 from starpos.earth.gravity import geodetic_place, zenith_at
 from starpos.navigation.chain import Smoothed
-from starpos.navigation.equations import Lacks, Motion, StarAttitudes
+from starpos.navigation.equations import Motion, Residuals, StarAttitudes
 from starpos.navigation.preintegration import Pieces
 from starpos.navigation.vessel import MotionLaw
 from starpos.units import ARCSEC
@@ -121,7 +134,7 @@ class ByTheRest:
         return bool((np.einsum("ji,ji->j", self.velocity, scaled) > ONE_IN_1000).any())
 
 
-def by_the_rest(trial: Lacks, sigma: float, solution: Smoothed) -> ByTheRest:
+def by_the_rest(trial: Residuals, sigma: float, solution: Smoothed) -> ByTheRest:
     """What each of the standstills would be without its own equation: trial has one of each, with which it was solved."""
     slope, short = trial.rows[..., :-1], trial.rows[..., -1]
     constants = np.tile(solution.constants, (len(short), 1))

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Sums of an IMU's readings between nodes, in the body's axes at the first node, with their derivatives.  They hold
-wherever the body is and however it moves (Forster et al. 2017, IEEE Trans. Robot. 33, 1), so that an adjustment need
-not go through the readings again for each place it tries; here they are for inertial axes, and so without the Earth.
+"""Sums of an IMU's readings between nodes, in the body's axes at the first node, with their derivatives.
+
+They hold wherever the body is and however it moves (Forster et al. 2017, IEEE Trans. Robot. 33, 1), so that an adjustment
+need not go through the readings again for each place it tries; here they are for inertial axes, and so without the Earth.
 """
 
 from dataclasses import dataclass

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Place, heading and velocity of a recorded voyage, from all its stars, inertial readings and velocities at once.  The
-equations are solved again and again until the place settles. Equations of a wrong place make a filter sure of it: of
-each round nothing is kept but the motion that it led to.
+"""Place, heading and velocity of a recorded voyage, from all its stars, inertial readings and velocities at once.
+
+The equations are solved again and again until the place settles. Equations of a wrong place make a filter sure of it:
+of each round nothing is kept but the motion that it led to.
 """
 
 from collections.abc import Sequence
@@ -18,19 +19,19 @@ from starpos.navigation.equations import (
     CONSTANTS,
     MEASURED,
     PLACE,
-    Beforehand,
-    Lacks,
     Links,
     Motion,
     Odometry,
+    Residuals,
     StarAttitudes,
-    first_rows,
-    law_lacks,
+    VoyagePrior,
+    law_residuals,
     links_of,
-    standing_lacks,
-    star_lacks,
+    prior_rows,
+    standing_residuals,
+    star_residuals,
 )
-from starpos.navigation.estimate import Estimate, TimeErrors, VoyageFix, fix_of
+from starpos.navigation.estimate import Estimate, VoyageFix, fix_of
 from starpos.navigation.evidence import (
     MIN_STANDSTILLS,
     NOWHERE,
@@ -91,7 +92,7 @@ class Adjustment:
             raise VoyageError("no velocity lies on the voyage: check that its clock and the camera's agree")
         self.law = self._law(vessel)
         self.unknowns = MEASURED if self.law is None else BY_LAW
-        self.known = Beforehand(
+        self.prior = VoyagePrior(
             mount=vessel.mount_stddev,
             refraction=vessel.atmosphere.relative_sigma,
             height_m=vessel.height_m,
@@ -209,7 +210,7 @@ class Adjustment:
         before = len(self.standing or NOWHERE)
         seeming = standstills(stars, self.pieces) if self.standing is None else self.standing
         if len(seeming):
-            trial = standing_lacks(motion, seeming.middle, TRIAL_SIGMA, self.unknowns)
+            trial = standing_residuals(motion, seeming.middle, TRIAL_SIGMA, self.unknowns)
             nodes = np.concatenate([chain.nodes[:, : -trial.rows.shape[1]], self._by_law(motion, trial)], 1)
             rest = by_the_rest(trial, TRIAL_SIGMA, smoothed(replace(chain, nodes=nodes)))
             self.contradicted |= rest.contradicted
@@ -294,14 +295,14 @@ class Adjustment:
             motion.gyro_matrix,
             motion.accel_matrix,
         )
-        parts = [self._sound(star_lacks(motion, stars, sums, self.pieces, n), before, "frames")]
+        parts = [self._sound(star_residuals(motion, stars, sums, self.pieces, n), before, "frames")]
         if self.odometry is not None:
             parts.append(self._sound(self._velocities(motion, sums, before), before, "velocities"))
         if self.vessel.parked:
-            parts.append(standing_lacks(motion, np.arange(count), STANDING_SIGMA, n))
+            parts.append(standing_residuals(motion, np.arange(count), STANDING_SIGMA, n))
         rows = [part.whitened(count) for part in parts]
         if self.law is not None and self.odometry is None:
-            stands = standing_lacks(motion, (self.standing or NOWHERE).nodes, STANDING_SIGMA, n)
+            stands = standing_residuals(motion, (self.standing or NOWHERE).nodes, STANDING_SIGMA, n)
             rows.append(self._by_law(motion, stands))
         links = links_of(motion, sums, self.pieces, self.model, self.law)
         # what shakes the accelerometer while it drives is not there where it stands
@@ -309,43 +310,43 @@ class Adjustment:
         less = at_rest2 - self.model.accelerometer_noise_density**2
         links = links.noisier(less * ~self._shaken, self.pieces)
         chain = Chain(
-            first=first_rows(motion, self.model, self.known, self.law),
+            first=prior_rows(motion, self.model, self.prior, self.law),
             nodes=np.concatenate(rows, 1),
             links=links.whitened(),
             constants=CONSTANTS,
         )
         return chain, links
 
-    def _by_law(self, motion: Motion, stands: Lacks) -> np.ndarray:
+    def _by_law(self, motion: Motion, stands: Residuals) -> np.ndarray:
         """Whitened equations (K, 3, n + m + 1) of the law of motion, replaced by the equations of standstills."""
         assert self.law is not None
-        rows = law_lacks(motion, self.law).whitened(len(motion))
+        rows = law_residuals(motion, self.law).whitened(len(motion))
         rows[stands.index] = stands.whitened(len(motion))[stands.index]
         return rows
 
-    def _velocities(self, motion: Motion, sums: Sums, before: Smoothed | None) -> Lacks:
+    def _velocities(self, motion: Motion, sums: Sums, before: Smoothed | None) -> Residuals:
         assert self.odometry is not None
         missed = self.odometry.missed(motion, sums, self.pieces)
         if before is not None:
             self.slipped = ~self.odometry.sound(missed)
-        return self.odometry.lacks(motion, missed, ~self.slipped, self.vibration, self.unknowns)
+        return self.odometry.residuals(motion, missed, ~self.slipped, self.vibration, self.unknowns)
 
-    def _sound(self, lacks: Lacks, before: Smoothed | None, kind: str) -> Lacks:
+    def _sound(self, residuals: Residuals, before: Smoothed | None, kind: str) -> Residuals:
         """Equations without outliers, with wider errors where most of them scatter by more than is stated.
 
         Where no solution is near, those that were left out stay so: leaving them out moves the solution, and judged
         from there they would look good again.
         """
         used = self.excess[kind]
-        if before is not None and len(lacks.index):
-            left_out = np.isin(lacks.index, self.wrong[kind])
-            stated = replace(lacks, covariance=lacks.covariance * used)
+        if before is not None and len(residuals.index):
+            left_out = np.isin(residuals.index, self.wrong[kind])
+            stated = replace(residuals, covariance=residuals.covariance * used)
             distance2 = stated.distance2(before.covariance, left_out)
             change = max(1 / used, float(np.median(distance2)) / MEDIAN_OF_CHI2)
-            self.wrong[kind] = lacks.index[distance2 > OUTLIER_CHI2 * change]
+            self.wrong[kind] = residuals.index[distance2 > OUTLIER_CHI2 * change]
             self.excess[kind] = used = used * change
-        keep = ~np.isin(lacks.index, self.wrong[kind])
-        return Lacks(index=lacks.index[keep], rows=lacks.rows[keep], covariance=lacks.covariance[keep] * used)
+        keep = ~np.isin(residuals.index, self.wrong[kind])
+        return replace(residuals, covariance=residuals.covariance * used).part(keep)
 
 
 MAX_APART_S = 1.5
@@ -369,7 +370,7 @@ class Voyage:
     last: Estimate
 
 
-def navigate(
+def adjust_voyage(
     frames: Sequence[FrameUnderWay],
     imu: ImuLog,
     velocity: VelocityLog | None,
@@ -395,10 +396,9 @@ def navigate(
     adjustment = Adjustment(within, nodes, Pieces.cut(imu, nodes), velocity, vessel, imu.vibration)
     motion, solution, rounds = adjustment.settle(progress)
     stamp_s = float(np.median([f.stamp_stddev_s for f in within]))
-    errors = TimeErrors(clock_s=vessel.clock_stddev_s, stamp_s=stamp_s)
     return Voyage(
         fixes=tuple(
-            fix_of(motion, k, solution.covariance[k], errors) if there else None
+            fix_of(motion, k, solution.covariance[k], vessel.clock_stddev_s, stamp_s) if there else None
             for k, there in zip(np.searchsorted(nodes, times), inside, strict=True)
         ),
         faults=(*imu.faults, *(() if velocity is None else velocity.faults), *adjustment.faults),
@@ -412,6 +412,7 @@ def navigate(
             covariance=solution.covariance[-1],
             model=adjustment.model,
             law=adjustment.law,
-            errors=errors,
+            clock_stddev_s=vessel.clock_stddev_s,
+            stamp_stddev_s=stamp_s,
         ),
     )

@@ -333,9 +333,7 @@ def _draw_map(axes: "Axes", timed: Sequence[Watched]) -> None:
         axes.errorbar(stars[:, 0], stars[:, 1], xerr=sigma[:, 0], yerr=sigma[:, 1], fmt="o", color=BLUE, ecolor=SKY,
                       ms=3, elinewidth=0.7, alpha=0.8, label="stars, 1 sigma")  # fmt: skip
     for status, colour in COLOURS.items():
-        which = [
-            a.compared.place for a in timed if a.compared is not None and a.compared.check.status == status
-        ]
+        which = [a.compared.place for a in timed if a.compared is not None and a.compared.status == status]
         if which:
             seen = np.array([km(p.latitude, p.longitude) for p in which])
             axes.plot(
@@ -357,9 +355,9 @@ def _draw_distance(axes: "Axes", hours: np.ndarray, timed: Sequence[Watched]) ->
     plain(axes)
     for status, colour in COLOURS.items():
         rows = [
-            (h, a.compared.check.distance_m, a.compared.check.sigma_m)
+            (h, a.compared.distance_m, a.compared.sigma_m)
             for h, a in zip(hours, timed, strict=True)
-            if a.compared is not None and a.compared.check.status == status
+            if a.compared is not None and a.compared.status == status
         ]
         if rows:
             h, distance, sigma = np.array(rows).T

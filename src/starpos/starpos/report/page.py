@@ -130,13 +130,11 @@ NIGHTS = (
 
 def _drive_caption(answers: Sequence[Watched]) -> str:
     compared = night_figures.compared_of(answers)
-    alarm = next(
-        (a for a in compared if a.compared and a.compared.check.status == GnssStatus.DISAGREES), None
-    )
+    alarm = next((a for a in compared if a.compared and a.compared.status == GnssStatus.DISAGREES), None)
     if alarm is None or alarm.compared is None:
         told = "No alarm: GNSS never disagreed."
     else:
-        told = f"Alarm at {utc_text(alarm.solution.utc_unix_s or 0.0)}: {alarm.compared.check.sentence}."
+        told = f"Alarm at {utc_text(alarm.solution.utc_unix_s or 0.0)}: {alarm.compared.sentence}."
     return f"{DRIVE} {told}"
 
 

@@ -12,8 +12,7 @@ from starpos import __version__
 from starpos.report.html import document, figures, sexagesimal, table, wide_table
 from starpos.report.style import BLUE, GREEN, GREY, ORANGE, PURPLE, RED, SKY, Picture, plain
 from starpos.units import utc_text
-from starpos.zenith.session_file import SessionResult
-from starpos.zenith.stations import AgainstGrid, Station
+from starpos.zenith.stations import AgainstGrid, SessionResult, Station
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -100,7 +99,7 @@ def draw_repeats(figure: "Figure", station: Station) -> None:
 def draw_map(figure: "Figure", stations: Sequence[Station], compared: Sequence[AgainstGrid | None]) -> None:
     """The stations with their deflections as arrows, and in another colour what they have more than a grid."""
     axes = figure.subplots()
-    places = np.degrees([[s.longitude, s.latitude] for s in stations])
+    places = np.degrees([[s.place.longitude, s.place.latitude] for s in stations])
     stretch = 1 / np.cos(np.radians(places[:, 1].mean()))
     axes.set_aspect(min(stretch, 20.0))
     middle, half = places.mean(0), max(np.ptp(places, axis=0).max(), 0.01) * 0.75
@@ -224,7 +223,7 @@ def _value(station: Station) -> str:
 
 
 def _summary(station: Station, against: AgainstGrid | None, grid_name: str) -> str:
-    c, (sigma_xi, sigma_eta) = station.covariance, station.sigma
+    place, c, (sigma_xi, sigma_eta) = station.place, station.covariance, station.sigma
     sessions = (
         "one session" if len(station.sessions) == 1 else f"the mean of {len(station.sessions)} sessions"
     )
@@ -232,8 +231,8 @@ def _summary(station: Station, against: AgainstGrid | None, grid_name: str) -> s
     rows = [
         (
             "Mark (WGS 84)",
-            f"{sexagesimal(station.latitude, 'NS', 4)}, {sexagesimal(station.longitude, 'EW', 4)}, ellipsoidal height "
-            f"{station.height_m:.3f} m",
+            f"{sexagesimal(place.latitude, 'NS', 4)}, {sexagesimal(place.longitude, 'EW', 4)}, ellipsoidal height "
+            f"{place.height_m:.3f} m",
         ),
         ("At the mark", f"{_pair(station.at_mark, station.sigma)}, {sessions}"),
         ("At the geoid", f"{_pair(station.at_geoid, station.sigma)}, by the normal plumb line"),
@@ -308,8 +307,8 @@ def _table_of_stations(stations: Sequence[Station], compared: Sequence[AgainstGr
         (xi, eta), (sigma_xi, sigma_eta) = s.at_mark, s.sigma
         row = [
             f'<a href="#station{k}">{escape(s.name)}</a>',
-            f"{np.degrees(s.latitude):.6f}&deg;, {np.degrees(s.longitude):.6f}&deg;",
-            f"{s.height_m:.1f} m",
+            f"{np.degrees(s.place.latitude):.6f}&deg;, {np.degrees(s.place.longitude):.6f}&deg;",
+            f"{s.place.height_m:.1f} m",
             f"{xi:+.3f} &plusmn; {sigma_xi:.3f}&Prime;",
             f"{eta:+.3f} &plusmn; {sigma_eta:.3f}&Prime;",
             f"{s.at_geoid[0]:+.3f}&Prime;, {s.at_geoid[1]:+.3f}&Prime;",

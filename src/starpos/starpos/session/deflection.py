@@ -17,8 +17,8 @@ from starpos.session.driver import Diagnosis, Jobs, Level
 from starpos.session.settings import Settings
 from starpos.zenith.adjustment import Adjusted
 from starpos.zenith.doubts import DeflectionSession
-from starpos.zenith.session_file import NEW
 from starpos.zenith.sighting import ZenithSighting, sighting
+from starpos.zenith.stations import NEW
 
 # An adjustment of more frames takes too long to keep up; the deflection is settled before.
 MOST = 500

@@ -10,7 +10,7 @@ from starpos.fix.camera_attitude import CameraAttitude
 from starpos.fix.fix import Fix
 from starpos.fix.solution import Solution
 from starpos.frames.frame import Stars
-from starpos.gnss.solving import Compared
+from starpos.gnss.watch import GnssCheck
 from starpos.session.driver import Now
 
 
@@ -28,7 +28,7 @@ class Answered:
     ground: Geodetic | None
     no_camera: bool
     attitude: CameraAttitude | None = None
-    compared: Compared | None = None
+    compared: GnssCheck | None = None
 
 
 @dataclass(frozen=True)

@@ -258,7 +258,7 @@ class GnssTeacher:
                 else "no GNSS place at the newest frame"
             )
             return Diagnosis(Level.WARN, f"{since}: the stars' place goes on with what was learned", values)
-        check = compared.check
+        check = compared
         values |= {
             "status": check.status.value,
             "distance (m)": check.distance_m,

@@ -203,7 +203,7 @@ class NavigatorSession:
                 )
             self._check_time(row[0], now, "an inertial reading")
             self._begin_anew(row[0])
-            self._recent.readings.add(row)
+            self._recent.readings.append(row)
         except StarposError as e:
             self._heard.refuse("imu/data", str(e))
             return []

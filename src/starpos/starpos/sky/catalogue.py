@@ -1,18 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Find the rows of a table that lie in a part of the sky, by cells of 1 deg of declination and 1 deg of right ascension.
-
-The table is in declination zones, each sorted by right ascension, so that the rows of a cell follow each other.
-
-Parallaxes of the near stars, which Tycho-2 does not have.
-
-They are Hipparcos' stars (ESA SP-1200, 1997) of MIN_MAS and more, and stars within 8 arcsec of one. The table is made by
-tools/data/near_stars.py from Stellarium's list, which has later values for some. Hipparcos' own err by 1 to 3 mas, of
-some pairs more.
-
-The star catalogue: a compact Tycho-2 in declination zones, with directions at any date and their errors.
+"""The star catalogue: a compact Tycho-2 in declination zones, with directions at any date and their errors.
 
 The committed file holds all stars with V < 11, which the instrument sees in half a second. Stars fainter than V = 9.5
-give half of the accuracy of the roll about the optical axis, and so of the position.
+give half of the accuracy of the roll about the optical axis, and so of the position. Zones are sorted by right ascension,
+so that the rows of a cell of the sky, 1 deg by 1 deg, follow each other.
 """
 
 import hashlib
@@ -72,16 +63,10 @@ def rows_near(cell_start: np.ndarray, centre: np.ndarray, radius_rad: float) -> 
     return np.concatenate([np.arange(cell_start[begin], cell_start[end]) for begin, end in runs])
 
 
-def ranges(first: np.ndarray, count: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The numbers first[i] .. first[i] + count[i] - 1 of all i, one after the other: arrays of i (M,) and number (M,)."""
-    owner = np.repeat(np.arange(len(count)), count)
-    before = np.cumsum(count) - count
-    return owner, np.arange(len(owner)) + (first - before)[owner]
-
-
-NEAR_MIN_MAS = 100.0
-# Columns tyc1, tyc2, tyc3, parallax_mas.
-PARALLAXES = Path(__file__).with_name("data") / "near_stars.csv"
+# Parallaxes of the near stars, which Tycho-2 does not have (columns tyc1, tyc2, tyc3, parallax_mas): of the stars of
+# Hipparcos (ESA SP-1200, 1997) of at least this, and of stars within 8 arcsec of one. tools/data/near_stars.py makes the
+# table of Stellarium's list, which has later values for some. Hipparcos' own err by 1 to 3 mas, of some pairs more.
+NEAR_MIN_MAS, PARALLAXES = 100.0, Path(__file__).with_name("data") / "near_stars.csv"
 
 
 def parallaxes_mas(tyc: np.ndarray) -> np.ndarray:

@@ -1,16 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Motions of the fast stars for which Tycho-2 has none.
+"""Build the compact catalogue from the original Tycho-2 files (CDS I/259), tyc2.dat.* and suppl_1.dat, and fetch them.
 
-Tycho-2 compares the satellite's places with places on old plates. Of bright stars, which the plates show as blots, and of
-fast ones, which were not found again, it has only the satellite's place (pflag X). Some of these move by
-arcminutes until today. Their motions here are from Hipparcos (ESA SP-1200, 1997); tools/data/fast_stars.py made the
-table, of all faster than MIN_MAS_YEAR and V < 9.
-
-Fetch Tycho-2's original files from a mirror of Debian: resumed where it broke off, checked before they are used.
-
-Build the compact catalogue from the original Tycho-2 files (CDS I/259): tyc2.dat.* and suppl_1.dat.
-
-Sources: Tycho-2, Hog et al. 2000, A&A 355, L27; byte positions from the catalogue's own ReadMe.
+Sources: Tycho-2, Hog et al. 2000, A&A 355, L27; byte positions from the catalogue's own ReadMe. The files come from a
+mirror of Debian: resumed where the connection broke off, checked before they are used.
 """
 
 import hashlib
@@ -33,35 +25,13 @@ from starpos.progress import Progress, quiet
 from starpos.sky.catalogue import EPOCH, Catalogue, pack, parallaxes_mas
 from starpos.table_cache import cache_folder
 
-MIN_MAS_YEAR = 400.0
-# Many are pairs, whose orbits Hipparcos saw for three years only.
-FAST_SIGMA_MAS_YEAR = 10.0
-# Tycho identifier: motion in right ascension times cos dec, and in declination, mas/yr.
-FAST = {
-    (52, 1686, 1): (1806.3, 1442.5), (583, 1456, 1): (432.1, -111.9), (590, 343, 1): (447.3, 181.4),
-    (728, 3142, 1): (373.0, -483.8), (834, 654, 1): (359.9, -770.1), (958, 1468, 1): (183.4, -418.7),
-    (958, 1468, 2): (183.4, -418.7), (1310, 2544, 1): (-79.8, -420.0), (1496, 2119, 1): (311.2, -1282.2),
-    (2582, 3158, 1): (-462.6, 345.1), (2582, 3158, 2): (-462.6, 345.1), (2822, 2210, 1): (-172.6, -381.0),
-    (2900, 2157, 1): (519.4, -664.8), (2986, 1978, 1): (-487.7, -219.3), (3014, 574, 1): (4003.7, -5813.0),
-    (3168, 2800, 1): (4155.1, 3258.9), (3246, 874, 1): (892.5, -136.5), (3246, 874, 2): (847.1, -152.0),
-    (3420, 2149, 1): (-441.1, -215.2), (3432, 1451, 1): (-947.1, -535.6), (3663, 2669, 1): (1087.1, -559.6),
-    (3664, 1985, 1): (523.4, -180.4), (3930, 1791, 1): (-1314.4, 1753.4), (3990, 2431, 1): (476.4, 50.0),
-    (4437, 1491, 1): (531.1, -351.6), (4715, 1106, 1): (-230.4, -768.7), (4949, 1120, 1): (-616.7, 60.7),
-    (4949, 1120, 2): (-616.7, 60.7), (4982, 1645, 1): (-25.8, -419.8), (5312, 2325, 1): (-2239.3, -3419.9),
-    (5521, 1366, 1): (142.0, -483.3), (5827, 1181, 1): (-477.1, -1180.2), (5827, 1181, 2): (-477.1, -1180.2),
-    (5855, 2292, 1): (-1721.8, 854.1), (5862, 1720, 1): (614.8, 202.3), (5930, 2197, 1): (-292.4, -368.4),
-    (6116, 1517, 1): (-1069.9, -1063.8), (6152, 754, 1): (221.9, -375.3), (6445, 990, 1): (371.5, 612.3),
-    (6820, 326, 1): (-473.7, -1143.9), (6820, 326, 2): (-473.7, -1143.9), (7370, 850, 1): (1149.2, -90.8),
-    (7370, 850, 2): (1149.2, -90.8), (7512, 1263, 1): (6767.3, 1326.7), (7966, 1201, 1): (-3259.0, -1147.0),
-    (8399, 2186, 1): (303.6, -364.3), (8431, 60, 1): (-29.8, -817.3), (8502, 1080, 1): (784.9, 396.1),
-    (8514, 2241, 1): (-45.5, 731.8), (8672, 855, 1): (-294.0, -323.9), (8690, 554, 1): (-454.5, -810.0),
-    (8791, 434, 1): (63.0, -1066.7), (8863, 1552, 1): (1336.1, 616.3), (8863, 1557, 1): (1331.1, 646.8),
-    (9027, 5712, 1): (-188.4, -401.9), (9111, 1423, 1): (81.1, 800.7), (9136, 1758, 1): (416.6, 76.0),
-    (9136, 1758, 2): (416.6, 76.0), (9333, 1274, 1): (461.3, -287.2), (9345, 214, 1): (141.1, -736.9),
-    (9354, 780, 1): (433.9, -58.0), (9386, 2614, 1): (312.0, 1050.2),
-}  # fmt: skip
-
-
+# Motions (in right ascension times cos dec) of the fast stars for which Tycho-2 has none: of all faster than this and
+# V < 9 (tools/data/fast_stars.py).  Tycho-2 compares the satellite's places with places on old plates: of bright stars,
+# which the plates show as blots, and of fast ones, which were not found again, it has only the satellite's place (pflag
+# X).  Some of these move by arcminutes until today.  Their motions are from Hipparcos (ESA SP-1200, 1997); many are
+# pairs, whose orbits it saw for three years only.
+FAST_STARS = Path(__file__).with_name("data") / "fast_stars.csv"
+MIN_MAS_YEAR, FAST_SIGMA_MAS_YEAR = 400.0, 10.0
 # The archive of Debian's source package tycho2 (2-4), and where a mirror has it.
 ARCHIVE = "tycho2_2.orig.tar.xz"
 IN_MIRROR = f"pool/main/t/tycho2/{ARCHIVE}"
@@ -209,7 +179,7 @@ def build(source: Path | str, limit_mag: float, progress: Progress = quiet) -> C
     """Build the catalogue of all stars with V < limit_mag from a folder of the originals, or Debian's tycho2_*.tar.xz.
 
     Every star has its own position error. It has the mean position and motion if Tycho-2 gives them; else (pflag X) the
-    observed place, and the motion of `fast_stars`, or an unknown one. A pair with pflag P becomes one star at its
+    observed place, and the motion of FAST_STARS, or an unknown one. A pair with pflag P becomes one star at its
     photocentre. The epoch of supplement 1 is 1991.25. CatalogueError if files are missing or damaged.
     """
     parts, seen = [], 0
@@ -288,16 +258,16 @@ def johnson_v(bt: np.ndarray, vt: np.ndarray) -> np.ndarray:
 
 
 def _motions(t: dict) -> dict[str, np.ndarray]:
-    """Proper motions and their errors, mas/yr; a motion that Tycho-2 does not have is taken from `FAST`, or 0."""
+    """Proper motions and their errors, mas/yr; a motion that Tycho-2 does not have is taken from FAST_STARS, or 0."""
     measured = np.isfinite(t["pm_ra"])
     motion = np.nan_to_num(np.stack([t["pm_ra"], t["pm_dec"]], -1))
     sigma = np.where(
         measured, np.nan_to_num(np.hypot(t["e_pm_ra"], t["e_pm_dec"])) / np.sqrt(2), UNMEASURED_MAS_YEAR
     )
+    fast = {tuple(row[:3]): row[3:] for row in np.loadtxt(FAST_STARS, delimiter=",", skiprows=1).tolist()}
     for k in np.flatnonzero(~measured):
-        fast = FAST.get((int(t["tyc1"][k]), int(t["tyc2"][k]), int(t["tyc3"][k])))
-        if fast is not None:
-            motion[k], sigma[k] = fast, FAST_SIGMA_MAS_YEAR
+        if (known := fast.get((t["tyc1"][k], t["tyc2"][k], t["tyc3"][k]))) is not None:
+            motion[k], sigma[k] = known, FAST_SIGMA_MAS_YEAR
     return {"pm_ra": motion[:, 0], "pm_dec": motion[:, 1], "sigma_pm": sigma}
 
 

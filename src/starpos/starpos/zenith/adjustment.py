@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The deflection of the vertical of one session, by generalised least squares of all its frames.  Unknown are xi, eta
-and A3 (its two tilts, which hold the tiltmeter's zero, and its turn).  All else is in the covariance of the readings.
-The session's residuals determine the size of image motion and anomalous refraction, by restricted maximum likelihood
-(Patterson and Thompson 1971, Biometrika 58, 545).  A session hardly shows an error that changes as slowly as the
-second, so anomalous refraction is at least AIR_SHARE times the image motion.  Where the residuals show that the
-tiltmeter's zero drifts more than its file states, or that its scale is off by more, they determine that size, too,
-and the errors grow by it.
+"""The deflection of the vertical of one session, by generalised least squares of all its frames.
+
+Unknown are xi, eta and A3 (its two tilts, which hold the tiltmeter's zero, and its turn).  All else is in the covariance
+of the readings.  The session's residuals determine the size of image motion and anomalous refraction, by restricted
+maximum likelihood (Patterson and Thompson 1971, Biometrika 58, 545).  A session hardly shows an error that changes as
+slowly as the second, so anomalous refraction is at least AIR_SHARE times the image motion.
+
+Where the residuals show that the tiltmeter's zero drifts more than its file states, or that its scale is off by more,
+they determine that size, too, and the errors grow by it.
 """
 
 from collections.abc import Sequence

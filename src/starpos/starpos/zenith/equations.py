@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The observation equations of a session: what a tiltmeter reads, from the attitudes, the deflection and A3, and its
-errors.  Up leans from the ellipsoid's normal by xi to the north and eta to the east, so in geodetic east, north, up
-it is along n = (eta, xi, 1).  The tiltmeter's axes X', Y' rise by asin(A3 C n) there, where C is the camera's
-attitude by the stars.
+"""The observation equations of a session: what a tiltmeter reads by attitudes, deflection and A3, and its errors.
+
+Up leans from the ellipsoid's normal by xi to the north and eta to the east, so in geodetic east, north, up it is along
+n = (eta, xi, 1).  The tiltmeter's axes X', Y' rise by asin(A3 C n) there, where C is the camera's attitude by the stars.
 """
 
 from collections.abc import Sequence
@@ -13,6 +13,7 @@ import numpy as np
 from starpos import rotation
 from starpos.earth.orientation import ROTATION_RAD_S
 from starpos.earth.place import Place
+from starpos.fix.terms import ErrorTerm
 from starpos.instrument.inclinometer import OUTDOORS_WALK_C_PER_SQRT_HOUR, InclinometerErrors
 from starpos.units import ARCSEC, HOUR_S
 from starpos.zenith.sighting import StarPlaces, ZenithSighting
@@ -130,37 +131,16 @@ DAILY_UT1_S, DAILY_POLE_RAD = 3e-5, 3e-4 * ARCSEC
 AIR_TAU_S = 1200.0
 
 
-@dataclass(frozen=True, eq=False)
-class Source:
-    """A source of error: covariance (2 N, 2 N) in rad2 of the angles of N frames, X' and Y' of each in turn."""
-
-    name: str
-    covariance: np.ndarray
-
-    @classmethod
-    def shared(cls, name: str, columns: np.ndarray) -> "Source":
-        """Independent errors of 1 sigma that all frames share: columns (N, 2, m)."""
-        flat = columns.reshape(-1, columns.shape[2])
-        return cls(name, flat @ flat.T)
-
-    @classmethod
-    def varying(cls, name: str, kernel: np.ndarray, legs: np.ndarray) -> "Source":
-        """Errors of legs (N, 2, m) whose covariance from frame to frame is kernel (N, N)."""
-        size = 2 * len(kernel)
-        flat = legs.reshape(size, -1)
-        return cls(name, np.repeat(np.repeat(kernel, 2, 0), 2, 1) * (flat @ flat.T))
-
-
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Errors:
-    """All errors of the readings: sources without the air, and the air's errors for 1 rad of each.
+    """All errors of the readings, X' and Y' (rad) of N frames: sources without the air, and the air's for 1 rad.
 
     motion: image motion, new in each frame.  air: anomalous refraction, that changes within AIR_TAU_S.
     """
 
-    sources: tuple[Source, ...]
-    motion: Source
-    air: Source
+    sources: tuple[ErrorTerm, ...]
+    motion: ErrorTerm
+    air: ErrorTerm
 
 
 def errors_of(
@@ -182,8 +162,8 @@ def errors_of(
             *_of_stars(lines, sightings, places),
             *_of_time(lines, sightings, mark),
         ),
-        motion=Source.varying("image motion", own, lines.by_lean),
-        air=Source.varying("anomalous refraction", np.exp(-apart_s / AIR_TAU_S), lines.by_lean),
+        motion=ErrorTerm.of_frames("image motion", lines.by_lean, own),
+        air=ErrorTerm.of_frames("anomalous refraction", lines.by_lean, np.exp(-apart_s / AIR_TAU_S)),
     )
 
 
@@ -192,7 +172,7 @@ def _of_tilts(
     faces: np.ndarray,
     inclinometer: InclinometerErrors,
     since_unix_s: float,
-) -> list[Source]:
+) -> list[ErrorTerm]:
     tilts = [s.tilt for s in sightings]
     theta, t = np.array([tilt.theta[:2] for tilt in tilts]), np.array([s.utc_unix_s for s in sightings])
     n, axes = len(t), np.broadcast_to(np.eye(2), (len(t), 2, 2))
@@ -202,22 +182,22 @@ def _of_tilts(
     same = _shared_readings(sightings)
     rounding = np.array([inclinometer.undithered_rad(tilt) for tilt in tilts])
     sources = [
-        Source.varying("tilt readings", same, noise),
-        Source.varying("tilt quantisation", np.eye(n), axes * rounding[:, None, None]),
-        Source.varying("tilt drift", hours, axes * inclinometer.drift_rad_per_sqrt_hour),
-        Source.shared("tilt scale", axes * theta[..., None] * inclinometer.scale),
-        Source.shared("tilt cross", theta[:, ::-1, None] * inclinometer.cross),
-        Source.varying("tilt face", faces[:, None] == faces, axes * inclinometer.pose_rad),
+        ErrorTerm.of_frames("tilt readings", noise, same),
+        ErrorTerm.of_frames("tilt quantisation", axes * rounding[:, None, None], np.eye(n)),
+        ErrorTerm.of_frames("tilt drift", axes * inclinometer.drift_rad_per_sqrt_hour, hours),
+        ErrorTerm.of_frames("tilt scale", axes * theta[..., None] * inclinometer.scale),
+        ErrorTerm.of_frames("tilt cross", theta[:, ::-1, None] * inclinometer.cross),
+        ErrorTerm.of_frames("tilt face", axes * inclinometer.pose_rad, faces[:, None] == faces),
     ]
     warm = np.array([tilt.temperature_c for tilt in tilts])
     per_c = inclinometer.temperature_rad_per_c
     if np.isfinite(warm).all():
         sources.append(
-            Source.shared("tilt temperature", axes * ((warm - warm.mean()) * per_c)[:, None, None])
+            ErrorTerm.of_frames("tilt temperature", axes * ((warm - warm.mean()) * per_c)[:, None, None])
         )
     else:
         walk = hours * OUTDOORS_WALK_C_PER_SQRT_HOUR**2
-        sources.append(Source.varying("tilt temperature", walk, axes * per_c))
+        sources.append(ErrorTerm.of_frames("tilt temperature", axes * per_c, walk))
     return sources
 
 
@@ -231,29 +211,29 @@ def _shared_readings(sightings: Sequence[ZenithSighting]) -> np.ndarray:
     return member @ member.T
 
 
-def _of_stars(lines: Lines, sightings: Sequence[ZenithSighting], places: StarPlaces) -> list[Source]:
+def _of_stars(lines: Lines, sightings: Sequence[ZenithSighting], places: StarPlaces) -> list[ErrorTerm]:
     n = len(sightings)
     roots = np.linalg.cholesky([s.centroids for s in sightings])
     bent = np.array([s.by_refraction for s in sightings])
     rows = np.array([s.by_rows for s in sightings])
     return [
-        Source.varying("centroids", np.eye(n), lines.by_camera @ roots),
-        Source.shared("catalogue", places.columns(lines.by_camera, sightings)),
-        Source.shared("refraction", lines.by_camera @ bent[..., None]),
-        Source.shared("shutter", lines.by_camera @ rows),
+        ErrorTerm.of_frames("centroids", lines.by_camera @ roots, np.eye(n)),
+        ErrorTerm.of_frames("catalogue", places.columns(lines.by_camera, sightings)),
+        ErrorTerm.of_frames("refraction", lines.by_camera @ bent[..., None]),
+        ErrorTerm.of_frames("shutter", lines.by_camera @ rows),
     ]
 
 
-def _of_time(lines: Lines, sightings: Sequence[ZenithSighting], mark: Place) -> list[Source]:
+def _of_time(lines: Lines, sightings: Sequence[ZenithSighting], mark: Place) -> list[ErrorTerm]:
     # in a second the sky turns about the pole
     second = lines.by_sky @ (mark.axes[:, 2] * ROTATION_RAD_S)
     clock = np.array([np.hypot(s.clock_stddev_s, s.stamp_stddev_s) for s in sightings])
     ut1 = np.array([s.orientation.ut1_sigma_s for s in sightings])
     pole = np.array([s.orientation.pole_sigma for s in sightings])
     return [
-        Source.shared("clock", (second * clock[:, None])[..., None]),
-        Source.shared("ut1", (second * np.hypot(ut1, DAILY_UT1_S)[:, None])[..., None]),
-        Source.shared(
+        ErrorTerm.of_frames("clock", (second * clock[:, None])[..., None]),
+        ErrorTerm.of_frames("ut1", (second * np.hypot(ut1, DAILY_UT1_S)[:, None])[..., None]),
+        ErrorTerm.of_frames(
             "pole", lines.by_sky @ mark.axes[:, :2] * np.hypot(pole, DAILY_POLE_RAD)[:, None, None]
         ),
     ]

@@ -1,5 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Frames at a known site: attitude, errors and tilt of each, their faces, and the stars' places on which they agree."""
+"""Frames at a known site: attitude, errors and tilt of each, their faces, and the stars' places on which they agree.
+
+Stars stand in many frames, so a frame's stars show how far each is from its place in the others.  So their places are
+adjusted, as overlapping plates are (Eichhorn 1960, Astron. Nachr. 285, 233), with the catalogue's errors as what is known
+before; and their scatter shows how large the catalogue's errors are here, by maximum likelihood.  What is common to all
+stars of the session remains as uncertain as such errors leave it.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -1,24 +1,206 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The sessions of one mark joined to a station, and stations levelled: how much the geoid rises between stations.  N_B -
-N_A = - integral of epsilon ds, with epsilon = xi cos(alpha) + eta sin(alpha) at the geoid, along the azimuth alpha
+"""Results of sessions read from files, joined to stations, and levelled: how much the geoid rises between stations.
+
+N_B - N_A = - integral of epsilon ds, with epsilon = xi cos(alpha) + eta sin(alpha) at the geoid, along the azimuth alpha
 (Hofmann-Wellenhof and Moritz, Physical Geodesy (2005), equation 5-116).  Between two stations epsilon is taken to be
-linear, so that the integral is the mean of both times the distance; how far it is not linear is in the error.  A
-geoid grid has the shape between the stations: with one, only what the stations have more than the grid is linear.
+linear, so that the integral is the mean of both times the distance; how far it is not linear is in the error.  A geoid
+grid has the shape between the stations: with one, only what the stations have more than the grid is linear.
 """
 
-from collections.abc import Sequence
+import json
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 
 from starpos.earth.ellipsoid import curvature_radii_m
 from starpos.earth.geoid import Geoid
+from starpos.earth.place import Place
 from starpos.earth.vertical import UNKNOWN_STDDEV_ARCSEC, Deflection
-from starpos.errors import StationError
+from starpos.errors import StarposError, StationError
+from starpos.files import read_regular
 from starpos.rotation import half_turns
-from starpos.units import ARCSEC
-from starpos.zenith.session_file import SessionResult
+from starpos.units import ARCSEC, unix_of
+
+MAX_BYTES = 50_000_000
+# of a correlation
+ROUNDING = 1e-6
+MADE_BY = "starpos deflection --json > session.json"
+# Errors that are new in each session.  All others are common to the sessions of an instrument, as far as anyone knows,
+# and no number of them averages these.
+NEW = frozenset(
+    {
+        "tilt readings",
+        "tilt quantisation",
+        "tilt drift",
+        "tilt temperature",
+        "tilt scale",
+        "tilt cross",
+        "tilt face",
+        "centroids",
+        "image motion",
+        "anomalous refraction",
+    }
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrameResult:
+    """The deflection of one frame alone, arcsec, with its 1 sigma; face: number of its face, from 1."""
+
+    utc_unix_s: float
+    face: int
+    xi: float
+    eta: float
+    sigma_xi: float
+    sigma_eta: float
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class FaceResult:
+    """A face against the others, arcsec: off, stddev (2,) of xi and eta."""
+
+    face: int
+    heading_deg: float
+    frames: int
+    off: np.ndarray
+    stddev: np.ndarray
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SessionResult:
+    """A session's deflection at a mark, arcsec: xi, eta.
+
+    station: name of the mark; '' for none.  place: of the mark, with its height.
+    seen (2,): as the plumb line stood.  tide (2,), curvature: what tide and normal plumb line added.
+    mark, geoid (2,): without the tide, at the mark and at the geoid.
+    covariance (2, 2), and common (2, 2): the part that the sessions of an instrument share.
+    terms: 1 sigma of xi and eta for each source of error.  stars: their number.
+    """
+
+    path: Path
+    station: str
+    place: Place
+    utc_unix_s: float
+    duration_s: float
+    seen: np.ndarray
+    tide: np.ndarray
+    curvature: float
+    mark: np.ndarray
+    geoid: np.ndarray
+    covariance: np.ndarray
+    common: np.ndarray
+    terms: tuple[tuple[str, float, float], ...]
+    motion_arcsec: float
+    stars: int
+    face_count: int
+    frame_count: int
+    frames: tuple[FrameResult, ...]
+    faces: tuple[FaceResult, ...]
+
+    @property
+    def new(self) -> np.ndarray:
+        """Covariance (2, 2) of what is new in this session."""
+        values, axes = np.linalg.eigh(self.covariance - self.common)
+        least = 1e-6 * np.trace(self.covariance)
+        return (axes * np.maximum(values, least)) @ axes.T
+
+
+def read_session(path: Path | str) -> SessionResult:
+    """Read a session's result; StationError says why a file is not one."""
+    path = Path(path)
+    try:
+        lines = [
+            json.loads(line) for line in read_regular(path, MAX_BYTES).decode().splitlines() if line.strip()
+        ]
+        whole = [line for line in lines if line.get("combined") is True and "xi_arcsec" in line]
+        if len(whole) != 1:
+            raise StationError(
+                f"{path}: {len(whole)} lines with a session's deflection in it, one is wanted: make it with `{MADE_BY}`"
+            )
+        return _session(
+            path, whole[0], [line for line in lines if line.get("status") == "ok" and "face" in line]
+        )
+    except OSError as e:
+        raise StationError(
+            f"{path}: cannot be read ({e.strerror or e}): give the output of `{MADE_BY}`"
+        ) from None
+    except StationError:
+        raise
+    except (ValueError, KeyError, TypeError, AttributeError, StarposError) as e:
+        said = f"no {e}" if isinstance(e, KeyError) else str(e)
+        raise StationError(f"{path}: no session's result ({said[:100]}): make it with `{MADE_BY}`") from None
+
+
+def _session(path: Path, value: Mapping, frames: list) -> SessionResult:
+    site, reduced = value["site"], value["reduced"]
+    covariance = _array(value["covariance_arcsec2"], (2, 2))
+    terms = tuple((str(name), float(xi), float(eta)) for name, (xi, eta) in value["errors"].items())
+    # sessions from before correlations were written have none
+    correlations = value.get("correlations", {})
+    common = np.zeros((2, 2))
+    for name, *sizes in terms:
+        r = 0.0 if name in NEW else float(correlations.get(name, 0.0))
+        if not abs(r) <= 1 + ROUNDING:
+            raise ValueError(f"correlations has {r} for {name}")
+        common += np.outer(sizes, sizes) * [[1.0, r], [r, 1.0]] * (name not in NEW)
+    if not (np.linalg.eigvalsh(covariance) > 0).all():
+        raise ValueError("covariance_arcsec2 is no covariance")
+    latitude, longitude, height_m = (float(site[k]) for k in ("latitude", "longitude", "height_m"))
+    if not (abs(latitude) <= 90 and abs(longitude) <= 360 and np.isfinite(height_m)):
+        raise ValueError("site is no place")
+    return SessionResult(
+        path=path,
+        station=str(value["station"]),
+        place=Place.on_ellipsoid(latitude, longitude, height_m=height_m),
+        utc_unix_s=unix_of(value["utc"]),
+        duration_s=float(value["duration_s"]),
+        seen=_array([value["xi_arcsec"], value["eta_arcsec"]], (2,)),
+        tide=_array(reduced["tide_arcsec"], (2,)),
+        curvature=float(reduced["curvature_arcsec"][0]),
+        mark=_array(reduced["mark_arcsec"], (2,)),
+        geoid=_array(reduced["geoid_arcsec"], (2,)),
+        covariance=covariance,
+        common=common,
+        terms=terms,
+        motion_arcsec=float(value["image_motion_arcsec"]),
+        stars=int(value["stars"]),
+        face_count=int(value["faces"]),
+        frame_count=int(value["frames"]),
+        frames=tuple(_frame(line) for line in frames),
+        faces=tuple(_face(line) for line in value["by_face"]),
+    )
+
+
+def _array(values: list, shape: tuple[int, ...]) -> np.ndarray:
+    array = np.array(values, float)
+    if array.shape != shape or not np.isfinite(array).all():
+        raise ValueError(f"{values} are not {shape} finite numbers")
+    return array
+
+
+def _frame(line: Mapping) -> FrameResult:
+    return FrameResult(
+        utc_unix_s=unix_of(line["utc"]),
+        face=int(line["face"]),
+        xi=float(line["xi_arcsec"]),
+        eta=float(line["eta_arcsec"]),
+        sigma_xi=float(line["sigma_xi_arcsec"]),
+        sigma_eta=float(line["sigma_eta_arcsec"]),
+    )
+
+
+def _face(line: Mapping) -> FaceResult:
+    return FaceResult(
+        face=int(line["face"]),
+        heading_deg=float(line["heading"]),
+        frames=int(line["frames"]),
+        off=np.array(line["off_arcsec"], float),
+        stddev=np.array(line["stddev_arcsec"], float),
+    )
+
 
 # Sessions so close to each other are of one mark: GNSS knows it to centimetres, and 1 m is 0.03 arcsec.
 SAME_MARK_M = 1.0
@@ -32,16 +214,14 @@ UNLIKELY = 1e-3
 class Station:
     """The deflection of a mark, tide free, of all its sessions: xi, eta in arcsec.
 
-    latitude, longitude (rad), height_m: on WGS 84.  at_mark, at_geoid (2,), covariance (2, 2).
+    place: with its height.  at_mark, at_geoid (2,), covariance (2, 2).
     common (2, 2): part of the covariance that all stations of the instrument share.
     off (K, 2): each session minus the station.  chi2, degrees: of these against what is new in each session.
     scaled: factor of the new errors, above 1 where the sessions scatter more than they state (Birge 1932).
     """
 
     name: str
-    latitude: float
-    longitude: float
-    height_m: float
+    place: Place
     sessions: tuple[SessionResult, ...]
     at_mark: np.ndarray
     at_geoid: np.ndarray
@@ -93,7 +273,7 @@ def stations_of(sessions: Sequence[SessionResult]) -> list[Station]:
 
 
 def _same(a: SessionResult, b: SessionResult) -> bool:
-    north, east = offset_m(a, b)
+    north, east = offset_m(a.place, b.place)
     apart = float(np.hypot(north, east))
     named = a.station and a.station == b.station
     if named and apart > SAME_MARK_M:
@@ -104,7 +284,7 @@ def _same(a: SessionResult, b: SessionResult) -> bool:
     return bool(named) or (apart < SAME_MARK_M and not (a.station and b.station))
 
 
-def offset_m(a: "SessionResult | Station", b: "SessionResult | Station") -> tuple[float, float]:
+def offset_m(a: Place, b: Place) -> tuple[float, float]:
     """How far b is to the north and to the east of a, m, by the radii at their middle latitude (Gauss)."""
     middle = (a.latitude + b.latitude) / 2
     prime, meridian = curvature_radii_m(middle)
@@ -128,12 +308,9 @@ def _station(sessions: list[SessionResult], number: str) -> Station:
     # errors that all share are not of independent sessions: they do not average
     values, axes = np.linalg.eigh(np.mean([s.common for s in sessions], 0) - common)
     common = common + (axes * np.maximum(values, 0.0)) @ axes.T
-    first = sessions[0]
     return Station(
         name=next((s.station for s in sessions if s.station), number),
-        latitude=first.latitude,
-        longitude=first.longitude,
-        height_m=first.height_m,
+        place=sessions[0].place,
         sessions=tuple(sessions),
         at_mark=at_mark,
         at_geoid=mean(np.array([s.geoid for s in sessions])),
@@ -159,7 +336,7 @@ def against_grid(station: Station, geoid: Geoid) -> AgainstGrid | None:
 
     Both are at the geoid: the station's by the normal plumb line, so that mountains remain in the difference.
     """
-    grid = geoid.at(station.latitude, station.longitude)
+    grid = geoid.at(station.place.latitude, station.place.longitude)
     if not grid.known:
         return None
     return AgainstGrid(
@@ -204,8 +381,8 @@ def levelled(line: Sequence[Station], geoid: Geoid | None) -> tuple[GeoidStep, .
     too long.
     """
     steps = [_Step.of(a, b, geoid) for a, b in pairwise(line)]
-    told = [_told([step]) for step in steps]
-    return (*told, _told(steps)) if len(steps) > 1 else tuple(told)
+    rises = [_joined([step]) for step in steps]
+    return (*rises, _joined(steps)) if len(steps) > 1 else tuple(rises)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -225,7 +402,7 @@ class _Step:
 
     @classmethod
     def of(cls, begin: Station, end: Station, geoid: Geoid | None) -> "_Step":
-        north, east = offset_m(begin, end)
+        north, east = offset_m(begin.place, end.place)
         distance = float(np.hypot(north, east))
         if distance > MAX_STEP_M:
             raise StationError(
@@ -238,14 +415,14 @@ class _Step:
         if geoid is None:
             rise, stddev, length = 0.0, UNKNOWN_STDDEV_ARCSEC, FIELD_LENGTH_M
         else:
-            grids = [geoid.at(s.latitude, s.longitude) for s in (begin, end)]
-            heights = [geoid.undulation_m(s.latitude, s.longitude) for s in (begin, end)]
+            grids = [geoid.at(s.latitude, s.longitude) for s in (begin.place, end.place)]
+            heights = [geoid.undulation_m(s.latitude, s.longitude) for s in (begin.place, end.place)]
             if not (np.isfinite(heights).all() and all(g.known for g in grids)):
                 raise StationError(f"{begin.name} to {end.name}: the geoid grid has no data at both of them")
             seen = seen - np.sum([[g.xi_arcsec, g.eta_arcsec] for g in grids], 0)
             rise = heights[1] - heights[0]
             # what the grid does not resolve changes within its spacing
-            stddev, length = max(g.stddev_arcsec for g in grids), geoid.node_m(begin.latitude)
+            stddev, length = max(g.stddev_arcsec for g in grids), geoid.node_m(begin.place.latitude)
         return cls(
             begin=begin,
             end=end,
@@ -257,7 +434,7 @@ class _Step:
         )
 
 
-def _told(steps: Sequence[_Step]) -> GeoidStep:
+def _joined(steps: Sequence[_Step]) -> GeoidStep:
     north, east = sum(s.north for s in steps), sum(s.east for s in steps)
     # a station between two steps counts in both; what all stations share, along the whole way
     slopes: dict[int, np.ndarray] = {}

@@ -61,7 +61,7 @@ def test_arrays_of_an_identification_that_do_not_fit_are_refused(wrong, sentence
 def test_the_stars_of_a_frame_are_what_was_given_and_a_copy():
     xy, sigma = np.arange(12.0).reshape(2, 3, 2), np.array([0.1, 0.2, 0.3])
     stars = frame(xy.copy(), sigma.copy())
-    taken = stars.take(np.array([2, 0]))
+    taken = stars.of_rows(np.array([2, 0]))
     assert len(stars) == 3
     assert len(taken) == 2
     assert np.array_equal(stars.xy, xy)

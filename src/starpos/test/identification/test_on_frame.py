@@ -79,7 +79,7 @@ def test_pixels_and_directions_make_the_same_field(rng, squeeze):
 def test_a_field_with_another_number_is_another_field(rng):
     camera = Camera.from_focal(900, 600, 2000.0)
     field = stars_at(camera, rng.uniform(0, [900, 600], (9, 2)), np.full(9, 0.1))
-    other = field.take(np.array([0, 3, 4])).but(tested=2, area_px2=7.0)
+    other = field.of_rows(np.array([0, 3, 4])).but(tested=2, area_px2=7.0)
     assert (len(field), field.tested, field.area_px2) == (9, 50, 900.0 * 600)
     assert (len(other), other.tested, other.area_px2, other.focal_px) == (3, 2, 7.0, 2000.0)
     assert (other.xy == field.xy[:, [0, 3, 4]]).all()

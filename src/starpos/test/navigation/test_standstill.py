@@ -10,7 +10,7 @@ from scipy.stats import chi2
 from voyage_calls import navigated, nees, sigma_m, vessel
 
 from starpos.navigation.chain import Chain, smoothed
-from starpos.navigation.equations import CONSTANTS, MEASURED, VELOCITY, Lacks, StarAttitudes
+from starpos.navigation.equations import CONSTANTS, MEASURED, VELOCITY, Residuals, StarAttitudes
 from starpos.navigation.evidence import NOWHERE, Standstills, by_the_rest, noise_density2, standstills
 from starpos.navigation.preintegration import Pieces
 from starpos.navigation.records import ImuLog
@@ -107,7 +107,7 @@ def test_what_the_rest_leads_to_is_a_solution_without_that_equation(rng):
     rows = np.zeros((3, 3, size))
     rows[:, :, VELOCITY] = np.eye(3)
     rows[:, :, -1] = rng.normal(0, 0.1, (3, 3))
-    trial = Lacks(index=index, rows=rows, covariance=np.tile(0.3**2 * np.eye(3), (3, 1, 1)))
+    trial = Residuals(index=index, rows=rows, covariance=np.tile(0.3**2 * np.eye(3), (3, 1, 1)))
     across = rng.normal(0, 0.1, (count - 1, n, 2 * n + CONSTANTS + 1))
     chain = Chain(
         first=np.column_stack([np.eye(size - 1), rng.normal(size=size - 1)]),

@@ -9,8 +9,7 @@ import pytest
 from starpos.earth.geoid import Geoid, Grid
 from starpos.errors import StationError
 from starpos.units import ARCSEC
-from starpos.zenith import session_file
-from starpos.zenith.stations import against_grid, between_m, levelled, stations_of
+from starpos.zenith.stations import against_grid, between_m, levelled, read_session, stations_of
 from starpos_testing.skies.deflections import COMMON_ARCSEC, NEW_ARCSEC, result
 
 # a geoid that is a sum of two waves, m by deg
@@ -41,11 +40,11 @@ def grid():
 def station(tmp_path, name, phi, lam, off=(0.0, 0.0)):
     xi, eta = slopes(phi, lam)
     path = result(tmp_path / f"{name}.json", phi, lam, xi + off[0], eta + off[1], station=name)
-    return session_file.read(path)
+    return read_session(path)
 
 
 def test_repeats_average_what_is_new_and_not_what_they_share(tmp_path):
-    sessions = [session_file.read(result(tmp_path / f"{k}.json", 47, 8, 2 + 0.05 * k, 1)) for k in (-1, 0, 1)]
+    sessions = [read_session(result(tmp_path / f"{k}.json", 47, 8, 2 + 0.05 * k, 1)) for k in (-1, 0, 1)]
     (found,) = stations_of(sessions)
     assert found.at_geoid == pytest.approx([2, 1]) and found.at_mark == pytest.approx([2.1, 1])
     assert found.sigma == pytest.approx([np.sqrt(NEW_ARCSEC**2 / 3 + COMMON_ARCSEC**2)] * 2, rel=1e-4)
@@ -54,9 +53,7 @@ def test_repeats_average_what_is_new_and_not_what_they_share(tmp_path):
 
 
 def test_repeats_that_contradict_each_other_are_told_and_widen_the_error(tmp_path):
-    sessions = [
-        session_file.read(result(tmp_path / f"{k}.json", 47, 8, 0.6 * k, 1, station="P")) for k in (0, 1)
-    ]
+    sessions = [read_session(result(tmp_path / f"{k}.json", 47, 8, 0.6 * k, 1, station="P")) for k in (0, 1)]
     (found,) = stations_of(sessions)
     assert "station P: its 2 sessions differ by 0.60" in found.doubt
     assert found.sigma[0] > 0.2
@@ -65,11 +62,11 @@ def test_repeats_that_contradict_each_other_are_told_and_widen_the_error(tmp_pat
 def test_marks_that_are_apart_are_stations_of_their_own(tmp_path):
     places = [(47.0, 8.0, ""), (47.0001, 8.0, ""), (47.0, 8.0, ""), (47.0, 8.000001, "P")]
     sessions = [
-        session_file.read(result(tmp_path / f"{k}.json", phi, lam, 0, 0, station=name))
+        read_session(result(tmp_path / f"{k}.json", phi, lam, 0, 0, station=name))
         for k, (phi, lam, name) in enumerate(places)
     ]
     assert [(s.name, len(s.sessions)) for s in stations_of(sessions)] == [("P", 3), ("2", 1)]
-    far = session_file.read(result(tmp_path / "far.json", 47.1, 8, 0, 0, station="P"))
+    far = read_session(result(tmp_path / "far.json", 47.1, 8, 0, 0, station="P"))
     with pytest.raises(StationError, match=r"station P, but their marks are 111\d\d.* m apart"):
         stations_of([sessions[3], far])
 
@@ -102,7 +99,7 @@ def test_what_stations_share_tilts_a_line_by_its_correlation(tmp_path):
     told = []
     for correlation in (-0.9, 0.0, 0.9):
         sessions = [
-            session_file.read(
+            read_session(
                 result(tmp_path / f"{name}{k}.json", *end, 2, 1, station=name, correlation=correlation)
             )
             for name, end in ends.items()
@@ -145,7 +142,7 @@ def test_files_that_are_no_session_are_a_sentence(broken, words, tmp_path):
     if broken is not None:
         path.write_text(broken)
     with pytest.raises(StationError, match=words):
-        session_file.read(path)
+        read_session(path)
 
 
 def test_a_covariance_that_is_none_is_refused(tmp_path):
@@ -154,4 +151,4 @@ def test_a_covariance_that_is_none_is_refused(tmp_path):
     lines[-1]["covariance_arcsec2"] = [[1.0, 2.0], [2.0, 1.0]]
     path.write_text("\n".join(map(json.dumps, lines)))
     with pytest.raises(StationError, match="is no covariance"):
-        session_file.read(path)
+        read_session(path)
