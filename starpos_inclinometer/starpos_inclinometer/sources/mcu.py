@@ -38,7 +38,7 @@ from starpos_inclinometer.sources.tilts import (
     Scl3300,
     noise_floor_rad,
 )
-from starpos_interfaces.msg import Pulse as PulseMessage
+from starpos_interfaces import msg
 
 # Error of a time through the serial line: an adapter's latency timer of 16 ms, evenly distributed.
 LINE_STDDEV_S = 0.016 / 12**0.5
@@ -60,7 +60,7 @@ class PulseTimes:
         self.dated = self.undated = 0
         # The state of the receiver's second, for a person to read.
         self.second = "no pulse yet"
-        self._queue: deque[PulseMessage] = deque(maxlen=QUEUE)
+        self._queue: deque[msg.Pulse] = deque(maxlen=QUEUE)
         self._sequences: dict[int, tuple[int, int]] = {}
         # (device s, UTC s) of the last two pulses that fit each other.
         self._seconds: deque[tuple[float, int]] = deque(maxlen=2)
@@ -69,7 +69,7 @@ class PulseTimes:
         """Forget the receiver's pulses, because the board's clock was reset."""
         self._seconds.clear()
 
-    def fetch(self) -> list[PulseMessage]:
+    def fetch(self) -> list[msg.Pulse]:
         """Return the edges that were dated since the last call, in order."""
         dated = list(self._queue)
         self._queue.clear()
@@ -89,7 +89,7 @@ class PulseTimes:
         utc_s = self._by_second(device_s)
         stamp_ns = host_ns if utc_s is None else utc_s[0] * 10**9 + round(utc_s[1] * 1e9)
         self.dated += 1
-        dated = PulseMessage(
+        dated = msg.Pulse(
             input=pulse.input,
             rising=pulse.rising,
             sequence=sequence,
@@ -360,7 +360,7 @@ class McuSource(LinkSource):
     def fetch(self) -> list[Reading]:
         return self._tilts.read(self._link.fetch())
 
-    def fetch_pulses(self) -> list[PulseMessage]:
+    def fetch_pulses(self) -> list[msg.Pulse]:
         return self._tilts.pulses.fetch()
 
     def _complaint(self) -> str:
