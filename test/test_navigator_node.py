@@ -18,7 +18,7 @@ from starpos.earth.orientation import earth_state
 from starpos.earth.refraction import Atmosphere
 from starpos.fix.camera_attitude import CameraAttitude
 from starpos.navigation.vessel import Vessel
-from starpos.navigation.voyage import navigate
+from starpos.navigation.voyage import adjust_voyage
 from starpos_common.messages import attitude_to_message, unix_to_stamp
 from starpos_interfaces.msg import Attitude
 from starpos_testing.graph.graph import stamp_of
@@ -164,7 +164,7 @@ def test_a_rovers_place_is_the_command_lines(graph, transforms, ears, record):
         atmosphere=Atmosphere(pressure_pa=0.0),
         clock_stddev_s=1e-4,
     )
-    said = navigate(record.frames, record.imu, record.velocity, vessel).fixes[-1]
+    said = adjust_voyage(record.frames, record.imu, record.velocity, vessel).fixes[-1]
     claim = np.reshape(fix.position_covariance, (3, 3))[:2, :2]
     sigma_m = np.sqrt(np.trace(claim) / 2)
     apart = off_m(fix, np.degrees(said.latitude), np.degrees(said.longitude))

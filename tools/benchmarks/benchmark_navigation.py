@@ -17,7 +17,7 @@ from table import Cost, Row
 from starpos.earth.refraction import Atmosphere
 from starpos.navigation.records import ImuModel, VelocityLog
 from starpos.navigation.vessel import LAWS, Vessel
-from starpos.navigation.voyage import Voyage, navigate
+from starpos.navigation.voyage import Voyage, adjust_voyage
 from starpos.units import ARCSEC
 from starpos_testing.halting import even, halting, idling, on_a_ferry, on_carriers
 from starpos_testing.voyages import (
@@ -74,7 +74,7 @@ def navigated(
         clock_stddev_s=1e-3,
         drift_change=drift_change,
     )
-    return navigate(record.frames, record.imu, velocity, vessel)
+    return adjust_voyage(record.frames, record.imu, velocity, vessel)
 
 
 def scores(record: MadeVoyage, voyage: Voyage) -> np.ndarray:

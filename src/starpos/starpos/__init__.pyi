@@ -19,19 +19,29 @@ from starpos.fix.solver import Solver as Solver
 from starpos.frames.frame import Frame as Frame
 from starpos.frames.frame import Stars as Stars
 from starpos.frames.reading import read_frame as read_frame
+from starpos.gnss.receiver import GnssTrack as GnssTrack
+from starpos.gnss.receiver import read_gnss_csv as read_gnss_csv
 from starpos.instrument.camera import Camera as Camera
 from starpos.instrument.inclinometer import Tilt as Tilt
 from starpos.instrument.instrument import Calibration as Calibration
 from starpos.instrument.instrument import Instrument as Instrument
 from starpos.instrument.tilt_log import TiltLog as TiltLog
 from starpos.instrument.tilt_table import read_tilt_csv as read_tilt_csv
+from starpos.navigation.estimate import VoyageFix as VoyageFix
+from starpos.navigation.voyage import Voyage as Voyage
 from starpos.night.night import Night as Night
 from starpos.night.night import Shot as Shot
 from starpos.night.opening import NightOnDisk as NightOnDisk
 from starpos.night.opening import open_night as open_night
+from starpos.night.under_way import navigate as navigate
+from starpos.night.work import deflection as deflection
+from starpos.night.work import identify as identify
+from starpos.session.replay import PlayedNight as PlayedNight
+from starpos.session.replay import replay as replay
 from starpos.sky.catalogue import Catalogue as Catalogue
 from starpos.sky.catalogue import load_catalogue as load_catalogue
 from starpos.sky.site import Site as Site
+from starpos.zenith.doubts import DeflectionSession as DeflectionSession
 
 __version__: str
 __all__: list[str]

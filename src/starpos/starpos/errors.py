@@ -49,6 +49,10 @@ class PlaceError(StarposError):
     """A known place is impossible, or the stars contradict it."""
 
 
+class WriteError(StarposError):
+    """A report or a picture cannot be written."""
+
+
 class BagError(StarposError):
     """A recording (rosbag2) cannot be read, or unpacks to more than it may."""
 

@@ -17,11 +17,11 @@ from starpos.frames.tables import TILTS
 from starpos.instrument import instrument_file
 from starpos.instrument.tilt_log import BRACKET_S, TiltLog
 from starpos.instrument.tilt_table import read_tilt_csv
+from starpos.night import field
 from starpos.night.first_night import AROUND_S, FirstNight, Look, Stage
 from starpos.night.opening import exposures, frames_in
 from starpos.night.reading import About, Instruments, stars_of
 from starpos.night.work import Solving
-from starpos.report import field
 from starpos.sky import catalogue
 from starpos.units import utc_text
 

@@ -3,8 +3,7 @@
 
 import argparse
 import math
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import replace
 
 import numpy as np
 
@@ -15,23 +14,23 @@ from starpos.cli.inputs import frames_among, given_of, reader_of
 from starpos.cli.options import add_vertical, tell_unknown, vertical_of
 from starpos.earth.orientation import earth_orientation
 from starpos.earth.vertical import Vertical, geodetic
-from starpos.errors import FixError, FrameError, InstrumentError, TimeError, VoyageError
+from starpos.errors import FixError, VoyageError
 from starpos.fix.fix import InDegrees
-from starpos.fix.solver import Solver
-from starpos.instrument.instrument import AxisDoubt, framed
+from starpos.instrument.instrument import framed
 from starpos.navigation.estimate import VoyageFix
-from starpos.navigation.records import ImuModel, read_imu, read_imu_model, read_velocity
-from starpos.navigation.sightings import IdentifiedFrame, sighting_of
-from starpos.navigation.vessel import LAWS, Vessel
-from starpos.navigation.voyage import Voyage, navigate
-from starpos.night.reading import First, Instruments, Reader
-from starpos.night.work import Solving
-from starpos.sky import catalogue
+from starpos.navigation.vessel import LAWS
+from starpos.navigation.voyage import Voyage
+from starpos.night.reading import First
+from starpos.night.under_way import (
+    MAX_MOUNT_DEG,
+    MOUNT_STDDEV_DEG,
+    IdentifyingVoyage,
+    Records,
+    VoyageFrame,
+    voyage_frames,
+)
 
 NO_ANSWER = 1
-MOUNT_STDDEV_DEG, MAX_MOUNT_DEG = 1.0, 20.0
-# of --altitude-m: the geoid, and hills on the way
-GIVEN_HEIGHT_STDDEV_M = 100.0
 OK, CARRIED, NO_READINGS, BAD_INPUT = "ok", "carried", "no inertial readings", "bad input"
 KEYS = ("utc_unix_s", "latitude", "longitude", "heading", "covariance", "velocity", "gyro_bias", "accel_bias",
         "latitude_geodetic", "longitude_geodetic", "covariance_geodetic", "xi_arcsec", "eta_arcsec",
@@ -109,34 +108,6 @@ def define(parser: argparse.ArgumentParser) -> None:
     parser.set_defaults(run=run)
 
 
-@dataclass(frozen=True)
-class FrameSeen:
-    """A frame's time, its identified stars, or why it has none, or a remark."""
-
-    utc_unix_s: float | None
-    sighting: IdentifiedFrame | None
-    message: str = ""
-
-
-@dataclass(frozen=True)
-class Seeing:
-    """Work of `navigate`: a FrameSeen."""
-
-    read: Reader
-    given: Instruments
-
-    def __call__(self, path: str) -> FrameSeen:
-        item = self.read(path)
-        sight = Solving(self.given)(item)
-        instrument = sight.instrument or self.given.of(item)
-        assert instrument is not None
-        eye, time_s = Solver(instrument, catalogue.load_catalogue()), item.mid_unix_s
-        try:
-            return FrameSeen(time_s, sighting_of(sight.stars, eye, sight.solution), sight.solution.remark)
-        except (FrameError, TimeError) as error:
-            return FrameSeen(time_s, None, str(error))
-
-
 def run(args: argparse.Namespace) -> int:
     args.frames = frames_among(args.frames, args.imu, args.velocity)
     if args.velocity is not None and not args.drift_stddev and not math.isnan(args.drift_change):
@@ -145,62 +116,45 @@ def run(args: argparse.Namespace) -> int:
             "air"
         )
     vertical, read, number = vertical_of(args), reader_of(args), len(args.frames)
-    imu = read_imu(args.imu)
-    model = ImuModel() if args.imu_model is None else read_imu_model(Path(args.imu_model))
-    velocity = None if args.velocity is None else read_velocity(args.velocity)
+    records = Records(
+        imu=args.imu,
+        imu_model=args.imu_model,
+        velocity=args.velocity,
+        vehicle=args.vehicle,
+        mount_stddev_deg=args.mount_stddev,
+        drift_stddev=args.drift_stddev,
+        drift_change=args.drift_change,
+        height_m=args.altitude_m,
+    )
     with inputs.workers_of(args, number) as workers:
         (about,) = workers.map([(First(read), tuple(args.frames))])
         if about is None:
             raise VoyageError(f"none of the {number} frames can be read: give star lists or frames")
-        instrument, doubt = framed(options.instrument_of(args, about), about)
-        mount_stddev = _mount_stddev(args, doubt)
+        instrument, axis = framed(options.instrument_of(args, about), about)
+        vessel, remark = records.vessel(instrument, options.atmosphere_of(args), axis)
+        if remark:
+            console.complain("navigate", remark)
         inputs.prepare("navigate", instrument, about)
-        work = Seeing(read, replace(given_of(args, about), instrument=instrument))
+        work = IdentifyingVoyage(read, replace(given_of(args, about), instrument=instrument))
         answers = inputs.watched(workers.map((work, path) for path in args.frames), number)
-        seen = [FrameSeen(None, None, str(a)) if isinstance(a, FrameError) else a for a in answers]
-    for frame in seen:
+        frames = voyage_frames(answers)
+    for frame in frames:
         if frame.message:
             console.complain("navigate", frame.message)
-    vessel = Vessel(
-        vehicle=args.vehicle,
-        model=model,
-        camera_to_body=np.asarray(instrument.link_to_camera, float).T,
-        mount_stddev=mount_stddev,
-        atmosphere=options.atmosphere_of(args),
-        clock_stddev_s=instrument.clock_stddev_s,
-        drift_stddev=args.drift_stddev,
-        drift_change=args.drift_change,
-    )
-    if args.altitude_m is not None:
-        vessel = replace(vessel, height_m=args.altitude_m, height_stddev_m=GIVEN_HEIGHT_STDDEV_M)
-    times = np.array([np.nan if s.utc_unix_s is None else s.utc_unix_s for s in seen])
-    sightings = [s.sighting for s in seen if s.sighting is not None]
     try:
-        voyage = navigate(sightings, imu, velocity, vessel, times, console.ProgressBar())
+        voyage = records.voyage(frames, vessel, console.ProgressBar())
     except FixError as error:
         console.complain("navigate", error)
         return NO_ANSWER
-    return tell(args, seen, voyage, vertical)
+    return tell(args, frames, voyage, vertical)
 
 
-def _mount_stddev(args: argparse.Namespace, doubt: AxisDoubt | None) -> float:
-    """1 sigma in rad of the mount, including an unknown optical axis; InstrumentError if it is too large."""
-    stddev = math.radians(args.mount_stddev)
-    if doubt is None:
-        return stddev
-    said, stddev = doubt.counted_as("the mount"), math.hypot(stddev, doubt.error_rad)
-    if math.degrees(stddev) > MAX_MOUNT_DEG:
-        raise InstrumentError(f"{said}; with a mount known no better, there is no position under way")
-    console.complain("navigate", said)
-    return stddev
-
-
-def tell(args: argparse.Namespace, seen: list[FrameSeen], voyage: Voyage, vertical: Vertical) -> int:
+def tell(args: argparse.Namespace, frames: list[VoyageFrame], voyage: Voyage, vertical: Vertical) -> int:
     """Write the answer for each frame; returns the exit status."""
     output = Output(args, COLUMNS, HEAD)
     for fault in voyage.faults:
         console.complain("navigate", fault)
-    for path, frame, fix in zip(args.frames, seen, voyage.fixes, strict=True):
+    for path, frame, fix in zip(args.frames, frames, voyage.fixes, strict=True):
         status = _status(frame, fix)
         output.put(
             {"file": path} | json_of(fix, vertical) | {"status": status},
@@ -215,10 +169,10 @@ def tell(args: argparse.Namespace, seen: list[FrameSeen], voyage: Voyage, vertic
     if beyond > 0:
         console.complain("navigate", f"the Earth's rotation is extrapolated {beyond:.0f} days beyond the IERS table: "
                         "upgrade astropy-iers-data")  # fmt: skip
-    return console.UNREADABLE if any(frame.utc_unix_s is None for frame in seen) else 0
+    return console.UNREADABLE if any(frame.utc_unix_s is None for frame in frames) else 0
 
 
-def _status(frame: FrameSeen, fix: VoyageFix | None) -> str:
+def _status(frame: VoyageFrame, fix: VoyageFix | None) -> str:
     if fix is None:
         return BAD_INPUT if frame.utc_unix_s is None else NO_READINGS
     return CARRIED if frame.sighting is None else OK

@@ -143,8 +143,7 @@ def _now_text() -> str:
 
 def _pack(args: argparse.Namespace) -> int:
     """Write a field report of one night."""
-    from starpos.night import bag
-    from starpos.report import field
+    from starpos.night import bag, field
 
     if len(args.nights) > 1:
         raise FrameError("--field packs one night: give one")

@@ -21,6 +21,7 @@ from starpos.fix.solution import Solution, Status
 from starpos.fix.solver import Solver, focal_that_fits, placed
 from starpos.frames.frame import Frame, Stars
 from starpos.frames.header import focal_mm
+from starpos.frozen import at_once
 from starpos.identification import Identification, blind, quads
 from starpos.identification.blind import STAGES
 from starpos.identification.prior import Hint
@@ -46,6 +47,7 @@ UNASKED = (Status.NO_TILT, Status.TILT_OUT_OF_RANGE)
 NEVER_S = math.inf
 
 
+@at_once
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Question:
     """A frame, what is asked of it, and what is known beforehand.
@@ -74,6 +76,7 @@ class Question:
         return time.monotonic() >= self.until_s
 
 
+@at_once
 @dataclass(frozen=True, eq=False)
 class Sight:
     """A detection of a frame: its stars, and their solution.
@@ -143,18 +146,19 @@ def _solved(solver: Solver, q: Question, tilts: Tilts) -> Sight:
 
 def _otherwise(solver: Solver, q: Question, first: Solution) -> Sight:
     """The sight of a frame by all ways but the search among its stars, which has given `first`."""
+    return _another(q.item, Sight(q.stars, first), lambda seen: _ways(solver, q, seen), lambda: q.is_late)
 
-    def ways(seen: Stars) -> Iterator[Solution]:
-        look = look_at(q.item, seen)
-        if seen is not q.stars:
-            yield solver.identify(seen, q.predicted)
-        if look is not None:
-            yield solver.look_again(seen, look, q.predicted)
-        yield solver.identify(seen, q.predicted, part=PART)
-        if look is not None:
-            yield solver.look_again(seen, look, q.predicted, part=PART)
 
-    return _another(q.item, Sight(q.stars, first), ways, lambda: q.is_late)
+def _ways(solver: Solver, q: Question, seen: Stars) -> Iterator[Solution]:
+    """Yield the answers to these stars of a frame, by one way after another; its own were searched already."""
+    look = look_at(q.item, seen)
+    if seen is not q.stars:
+        yield solver.identify(seen, q.predicted)
+    if look is not None:
+        yield solver.look_again(seen, look, q.predicted)
+    yield solver.identify(seen, q.predicted, part=PART)
+    if look is not None:
+        yield solver.look_again(seen, look, q.predicted, part=PART)
 
 
 def focal_px_that_fits(solver: Solver, stars: Stars) -> float | None:

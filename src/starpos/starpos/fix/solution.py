@@ -180,8 +180,13 @@ def solution_of(
     """
     warnings, explained = suspicions(stars, field, sky, found)
     names, magnitudes = sky.catalogue.labels(found.catalogue)
-    return Solution.of(
-        stars,
+    return Solution(
+        Status.OK,
+        "identified",
+        source=stars.source,
+        utc_unix_s=stars.mid_unix_s,
+        stars_detected=len(stars.x),
+        negative=stars.negative,
         names=names,
         star=found.star,
         magnitudes=magnitudes,

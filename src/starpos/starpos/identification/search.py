@@ -160,14 +160,23 @@ def identify_frame(
 def identifications(
     field: FrameStars, sky: Sky, priors: Priors, enough: float = MIN_LOG_ODDS
 ) -> Iterator[Identification]:
-    """Yield identifications of a frame in the order in which they are tried.
+    """Identifications of a frame in the order in which they are tried.
 
     First all of `near_or_lost`, then those of a frame whose brightest stars may nearly all be false, in any order. Then
     both for evenly spread stars, if the brightest are not spread evenly.
     """
     if len(field) < MIN_STARS:
-        return
-    yield from near_or_lost(field, sky, priors, STAGES, enough)
+        return iter(())
+    # not one generator for all: to end one in the middle takes as long as a look at the sky's triangles
+    return chain(
+        near_or_lost(field, sky, priors, STAGES, enough), _crowded_or_uneven(field, sky, priors, enough)
+    )
+
+
+def _crowded_or_uneven(
+    field: FrameStars, sky: Sky, priors: Priors, enough: float
+) -> Iterator[Identification]:
+    """Yield what `identifications` does after `near_or_lost`."""
     yield from _crowded(field, sky, priors, enough, CROWD_STARS)
     rows = second_try(field)
     # only one star is taken from a cell, which leaves less area for the others
@@ -215,16 +224,15 @@ def near_or_lost(
     enough: float = MIN_LOG_ODDS,
     crowded: bool = False,
 ) -> Iterator[Identification]:
-    """Yield identifications with log-odds of `enough`: by the priors, then lost in space by `stages`.
+    """Identifications with log-odds of `enough`: by the priors, then lost in space by `stages`.
 
     The priors have half of the probability, if there are any.
     crowded: only triangles that others support are looked at, but all of those.
     """
-    if priors:
-        yield from _near(field, sky, priors, enough)
     prior = anywhere(field.focal_px, LOG_HALF if priors else 0.0)
     finder = _finder(sky.catalogue, sky.triangles)
-    yield from finder.lost(field, sky.years, sky.velocity, prior, enough, stages, crowded)
+    lost = finder.lost(field, sky.years, sky.velocity, prior, enough, stages, crowded)
+    return chain(_near(field, sky, priors, enough), lost) if priors else lost
 
 
 def identify_near(field: FrameStars | fisheye.WideField, sky: Sky, priors: Priors) -> Identification | None:

@@ -13,7 +13,7 @@ from starpos.navigation.preintegration import thinned
 from starpos.navigation.records import FASTEST, GAP, MAX_SIGMA, MIN_SIGMA, ImuLog, VelocityLog
 from starpos.navigation.sightings import PlacelessFrame
 from starpos.navigation.vessel import Vessel
-from starpos.navigation.voyage import Voyage, navigate
+from starpos.navigation.voyage import Voyage, adjust_voyage
 
 # readings are joined to so long ones
 READING_S = 0.02
@@ -111,7 +111,7 @@ class RecentRecord:
         if self.velocity is not None:
             t, velocity, sigma = self.velocity[:, 0], self.velocity[:, 1:4], self.velocity[:, 4]
             log = VelocityLog(utc_unix_s=t, velocity=velocity, sigma=sigma)
-        return navigate(self.frames, imu, log, vessel)
+        return adjust_voyage(self.frames, imu, log, vessel)
 
 
 class Recent:

@@ -370,7 +370,7 @@ class Voyage:
     last: Estimate
 
 
-def navigate(
+def adjust_voyage(
     frames: Sequence[FrameUnderWay],
     imu: ImuLog,
     velocity: VelocityLog | None,

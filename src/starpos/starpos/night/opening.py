@@ -18,14 +18,16 @@ from starpos.files import read_regular
 from starpos.frames.frame import Frame, Stars
 from starpos.frames.reading import FITS
 from starpos.frames.tables import GNSS, SIMULATED, TILTS, TRUTH
+from starpos.gnss.receiver import GnssTrack, read_gnss_csv
 from starpos.instrument import instrument_file, sensors
 from starpos.instrument.inclinometer import SCA100T_NOISE_RAD
 from starpos.instrument.instrument import Calibration, Instrument
-from starpos.instrument.tilt_log import NoTilts
+from starpos.instrument.tilt_log import TiltsByTime
 from starpos.night.night import Night, Truth
 from starpos.night.reading import About, First, Instruments, Reader, TiltFile
 from starpos.night.remarks import Remark, of_tilts
 from starpos.night.solving import Exposures, How, Worked, solved_night
+from starpos.night.together import Receiver
 from starpos.night.work import OnFile, Solving
 from starpos.parallel.processes import Here
 from starpos.progress import Progress, quiet
@@ -54,7 +56,9 @@ def exposures(
         try:
             work, remarks = work_of(given, first, folder / TILTS, atmosphere, place)
         except TiltError as error:
-            tilts = None if place is not None and not (folder / TILTS).exists() else NoTilts(str(error))
+            tilts = (
+                None if place is not None and not (folder / TILTS).exists() else TiltsByTime(why=str(error))
+            )
             instruments, remarks = given.framed(first)
             work = replace(work, instruments=instruments, tilts=tilts)
 
@@ -154,12 +158,20 @@ class NightOnDisk:
         return f"<{self.folder}: {self.count} frames and {TILTS}, to be solved>"
 
     def solve(
-        self, self_calibrate: bool = False, turn_stddev_deg: float = 180.0, progress: Progress = quiet
+        self,
+        self_calibrate: bool = False,
+        turn_stddev_deg: float = 180.0,
+        progress: Progress = quiet,
+        *,
+        gnss: str | Path | GnssTrack | None = None,
     ) -> Night:
         """The place, and the fix of each frame; a frame's fault is its status.
 
         self_calibrate: find A3 too, from frames of one place at several headings; turn_stddev_deg: sigma of the given
-        A3's turn about the plumb line.  Raises StarposError where the folder or the instrument cannot be used.
+        A3's turn about the plumb line.  gnss: a receiver's places, or the path of their table: they teach the
+        instrument, and `Night.watched` compares them with the stars.
+
+        Raises StarposError where the folder or the instrument cannot be used.
         """
         given = self.instrument
         if given is None:
@@ -172,9 +184,10 @@ class NightOnDisk:
             model, errors = sensors.find(self.inclinometer)
             given = replace(given, inclinometer=errors, inclinometer_model=model)
         instruments = Instruments(given, by_header=self.instrument is None)
+        track = read_gnss_csv(gnss)[0] if isinstance(gnss, (str, Path)) else gnss
         return solved_night(
             exposures(self.folder, instruments, self.atmosphere, self.vertical, self.place),
-            How(turn_stddev_deg if self_calibrate else None),
+            How(turn_stddev_deg if self_calibrate else None, None if track is None else Receiver(track)),
             progress,
         )
 

@@ -1,16 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """The work on one frame, as small objects that can be sent to any process or machine, where `OnFile` calls them."""
 
+import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import KW_ONLY, dataclass, field, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from starpos.earth.place import Place, Places
 from starpos.earth.refraction import Atmosphere
-from starpos.errors import InstrumentError, StarposError
-from starpos.fix.blind import BlindSolver
+from starpos.errors import FrameError, InstrumentError, StarposError
+from starpos.fix.blind import SEARCH_S, BlindSolver
 from starpos.fix.searching import (
     Question,
     Sight,
@@ -23,12 +25,16 @@ from starpos.fix.searching import (
 from starpos.fix.solution import Solution
 from starpos.fix.solver import Solver, check_explained, placed
 from starpos.frames.frame import Frame, Stars
+from starpos.frames.reading import read_frame
 from starpos.identification.prior import Hint
+from starpos.instrument import instrument_file
+from starpos.instrument.instrument import Instrument, with_frame_size
 from starpos.instrument.tilt_log import Tilts
-from starpos.night.reading import Instruments, Reader, TiltFile, stars_of
+from starpos.night.reading import First, Instruments, Reader, TiltFile, stars_of
 from starpos.night.remarks import Kind, Remark
 from starpos.progress import Progress, quiet
 from starpos.sky import catalogue
+from starpos.zenith.doubts import DeflectionSession
 from starpos.zenith.sighting import ZenithSighting, sighting
 
 if TYPE_CHECKING:
@@ -132,6 +138,46 @@ class Solving:
         return (Remark(Kind.FOCAL_LENGTH, other_focal_length(lost.place, focal_px)),)
 
 
+def identify(
+    frame: str | Path | Frame | Stars,
+    instrument: Instrument | str | Path | None = None,
+    *,
+    search_s: float = SEARCH_S,
+    progress: Progress = quiet,
+) -> Solution:
+    """Where a frame looks, from its stars alone, lost in space.
+
+    Parameters
+    ----------
+    frame : path of a frame (FITS, TIFF, PNG, JPEG, HEIF, camera raw) or of a list of stars; or a Frame, or Stars
+    instrument : an Instrument, or the path of its file (YAML); None: the focal length is taken from the frame's header as
+        a hint, and without one all scales are searched
+    search_s : CPU time in s of the search at every scale
+    progress : is told how far long work is
+
+    Returns
+    -------
+    Solution
+        `attitude` has right ascension, declination and roll of the frame's centre in rad, `names` the stars; `ok` is
+        False where nothing was identified, and `message` says why
+
+    Raises
+    ------
+    FrameError
+        the file cannot be read
+
+    Examples
+    --------
+    >>> found = starpos.identify("night/stars_0000.csv")
+    >>> found.ok, len(found.names) > 10
+    (True, True)
+    """
+    item = read_frame(frame) if isinstance(frame, (str, Path)) else frame
+    known = instrument_file.read(instrument) if isinstance(instrument, (str, Path)) else instrument
+    given = Instruments(known, by_header=known is None)
+    return Solving(given, search_s=search_s, progress=progress)(item).solution
+
+
 @dataclass(frozen=True)
 class ZenithSighted:
     """Makes the ZenithSighting of a frame at a mark; a frame's fault is a Solution that gives the reason."""
@@ -153,3 +199,55 @@ class ZenithSighted:
             return sighting(solver, sight.stars, sight.found, self.mark, self.tilts)
         except StarposError as error:
             return Solution.refused(sight.stars, error)
+
+
+def deflection(
+    frames: Sequence[str | Path],
+    tilt: str | Path,
+    site: tuple[float, float, float],
+    instrument: Instrument | str | Path,
+    *,
+    atmosphere: Atmosphere | None = None,
+) -> DeflectionSession:
+    """The deflection of the vertical at a mark, from a zenith camera's frames and a tiltmeter's readings.
+
+    Parameters
+    ----------
+    frames : paths of frames or of lists of stars
+    tilt : path of the tiltmeter's CSV
+    site : latitude, longitude (deg) and height (m) of the mark on WGS 84
+    instrument : an Instrument, or the path of its file (YAML)
+    atmosphere : of refraction; None: not measured
+
+    Returns
+    -------
+    DeflectionSession
+        `adjusted` has xi_arcsec, eta_arcsec and covariance_arcsec2 (2, 2)
+
+    Raises
+    ------
+    FixError
+        the sightings do not bear a deflection
+
+    Examples
+    --------
+    >>> lists = sorted(Path("zenith").glob("stars_*.csv"))
+    >>> session = starpos.deflection(lists, "zenith/tilt.csv", (47.3, 8.5, 560.0), zenith)
+    >>> xi_arcsec, eta_arcsec = session.adjusted.xi_arcsec, session.adjusted.eta_arcsec
+    """
+    known = instrument_file.read(instrument) if isinstance(instrument, (str, Path)) else instrument
+    air = Atmosphere.measured(None, None) if atmosphere is None else atmosphere
+    read, paths = Reader(), tuple(map(str, frames))
+    first = First(read)(paths)
+    if first is None:
+        raise FrameError(f"none of the {len(paths)} frames can be read: give frames or lists of stars")
+    framed, _ = with_frame_size(known, first)
+    log = TiltFile(os.path.abspath(tilt), framed.inclinometer.noise_rad)
+    mark = Place.on_ellipsoid(site[0], site[1], height_m=site[2])
+    work = OnFile(read, ZenithSighted(Instruments(framed), air, log, mark))
+    sightings = []
+    for path in paths:
+        with suppress(FrameError):
+            answer = work(path)
+            sightings += [answer] if isinstance(answer, ZenithSighting) else []
+    return DeflectionSession.of(sightings, framed, air, mark)

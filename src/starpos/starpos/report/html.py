@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from starpos import __version__
-from starpos.errors import StarposError
+from starpos.errors import WriteError
 from starpos.files import has_mark, write_whole
 from starpos.report.style import Picture
 
@@ -94,10 +94,6 @@ def wide_table(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 PAGE = "index.html"
-
-
-class WriteError(StarposError):
-    """A report cannot be written."""
 
 
 def check_folder(folder: Path) -> None:

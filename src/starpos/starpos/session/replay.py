@@ -2,21 +2,44 @@
 """A recorded night through a session, as the nodes solve it when `replay` plays the bag to them."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from starpos.averaging.average import Average
+from starpos.earth.refraction import Atmosphere
 from starpos.errors import StarposError
+from starpos.fix.solution import Solution
 from starpos.frames.frame import Stars
+from starpos.frames.reading import read_frame
+from starpos.frames.tables import TILTS
+from starpos.instrument import instrument_file
 from starpos.instrument.camera import Camera
+from starpos.instrument.instrument import Instrument
 from starpos.instrument.tilt_log import TiltLog
+from starpos.instrument.tilt_table import read_tilt_csv
 from starpos.messages.stamp import PlainHeader, PlainStamp
 from starpos.messages.tilt import Reading, TiltMessage
+from starpos.night.field import INSTRUMENT, is_field, opened
+from starpos.night.opening import frames_in
+from starpos.night.reading import stars_of
 from starpos.recording.bag import BagReader
 from starpos.recording.drivers import IMAGES, DriverMessages, Drivers
-from starpos.recording.topics import CAPTURE, GNSS, IMU, INPUTS, NAV_SAT_FIX, STARS, TILT, instrument_in
+from starpos.recording.topics import (
+    CAPTURE,
+    GNSS,
+    IMU,
+    INPUTS,
+    NAV_SAT_FIX,
+    NO_REMAPS,
+    STARS,
+    TILT,
+    Remaps,
+    instrument_in,
+)
 from starpos.session.driver import Heard, JobsInTurn, Log, Now, Sent
-from starpos.session.frames import Output
+from starpos.session.frames import Answered, Averaged, Output
 from starpos.session.session import SolverSession
 from starpos.session.settings import Settings
 
@@ -138,3 +161,139 @@ def _tilt_message(log: TiltLog, k: int) -> TiltMessage:
         z=z,
         z_variance=variance_z,
     ).message("inclinometer")
+
+
+@dataclass(kw_only=True)
+class PlayedNight:
+    """The result of a bag: frames read, solutions, the average of its place, sentences; trouble: why it broke off."""
+
+    instrument: Instrument
+    frames: int = 0
+    solutions: list[Solution] = field(default_factory=list)
+    average: Average | None = None
+    said: list[str] = field(default_factory=list)
+    trouble: str = ""
+
+    @property
+    def summary(self) -> str:
+        """Numbers of frames, answers and fixes."""
+        fixes = sum(s.fix is not None for s in self.solutions)
+        return f"{self.frames} frames, {len(self.solutions)} answers, {fixes} fixes"
+
+
+class _Said:
+    """Keeps each sentence of a session once."""
+
+    def __init__(self, night: PlayedNight) -> None:
+        self._said = night.said
+
+    def came(self, name: str) -> None:
+        """A good message is not mentioned."""
+
+    def refuse(self, name: str, sentence: str) -> None:
+        self.error(sentence)
+
+    def info(self, message: str) -> None:
+        """Each fix has its own line."""
+
+    def warning(self, message: str) -> None:
+        """The frame's own line shows it."""
+
+    def error(self, message: str) -> None:
+        if message not in self._said:
+            self._said.append(message)
+
+
+@dataclass(frozen=True)
+class Playing:
+    """The work on one bag, for any process."""
+
+    params_file: Path | None
+    given: Sequence[str]
+    namespace: str | None
+    remaps: Remaps = NO_REMAPS
+
+    def __call__(self, bag: str) -> PlayedNight:
+        if is_field(bag):
+            with opened(bag) as (folder, air):
+                told = self.given or self.params_file is not None
+                given = self.given if told else _parameters_in(folder, air)
+                return self._played(lambda replay: _play_field(replay, folder), given)
+        return self._played(lambda replay: replay.play(Path(bag), self.namespace), self.given)
+
+    def _played(self, play: Callable[[Replay], Iterator[Output]], given: Sequence[str]) -> PlayedNight:
+        settings = Settings.of(self.params_file, given, self.namespace)
+        night = PlayedNight(instrument=settings.instrument(None))
+        said = _Said(night)
+        replay = Replay(
+            settings,
+            said,
+            said,
+            Drivers.of(self.params_file, self.given, self.namespace, self.remaps),
+        )
+        try:
+            for output in play(replay):
+                if isinstance(output, Answered):
+                    night.solutions.append(_light(output.solution))
+                elif isinstance(output, Averaged):
+                    night.average = output.place
+        except StarposError as error:
+            night.trouble = str(error)
+        night.frames = replay.frames
+        night.said[:0] = replay.remarks
+        return night
+
+
+def _light(solution: Solution) -> Solution:
+    """A solution without what only its solver needs."""
+    return replace(solution, hint=None)
+
+
+def _parameters_in(folder: Path, air: Atmosphere) -> list[str]:
+    """The solver's parameters, NAME:=VALUE, of an unpacked field report."""
+    measured = {"pressure": air.pressure_pa, "temperature": air.temperature_c, "humidity": air.humidity}
+    refraction = [f"refraction.{name}:={float(value)}" for name, value in measured.items()]
+    return [f"calibration_url:={folder / INSTRUMENT}", *refraction]
+
+
+def _play_field(replay: Replay, folder: Path) -> Iterator[Output]:
+    """What the session publishes of an unpacked field report."""
+    instrument = instrument_file.read(folder / INSTRUMENT)
+    stars = [stars_of(read_frame(path)) for path in frames_in(folder)]
+    tilts = read_tilt_csv(folder / TILTS, instrument.inclinometer.noise_rad)
+    return replay.play_lists(instrument.camera_for(stars[0].width, stars[0].height), stars, tilts)
+
+
+def replay(
+    bag: str | Path,
+    parameters: Sequence[str] = (),
+    params_file: str | Path | None = None,
+    namespace: str | None = None,
+) -> PlayedNight:
+    """The fixes of a recorded night, by the code of the node `solver`.
+
+    Parameters
+    ----------
+    bag : path of a rosbag2 with stars, tilts and camera_info, or with a robot's images and IMU; or of a field report
+    parameters : of the solver, as 'NAME:=VALUE'; with 'detector:' or 'inclinometer:' in front, of these
+    params_file : YAML of parameters, as the nodes take it
+    namespace : of the instrument, in a bag that holds several
+
+    Returns
+    -------
+    PlayedNight
+        `solutions` of the frames, `average` of their places (None without one), `said`: sentences; `trouble`: why it
+        broke off, '' if it did not
+
+    Raises
+    ------
+    StarposError
+        a parameter is not allowed
+
+    Examples
+    --------
+    >>> played = starpos.replay("night.zip")
+    >>> played.summary
+    '4 frames, 4 answers, 4 fixes'
+    """
+    return Playing(None if params_file is None else Path(params_file), tuple(parameters), namespace)(str(bag))

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from starpos.instrument import instrument_file
-from starpos.report import field
+from starpos.night import field
 from starpos_testing.skies.first_night import A3_DEG, Stand, arriving, usual
 
 BEGIN_S = 1.79e9

@@ -2,20 +2,19 @@
 """`starpos navigate` on a drive of 80 s: star lists under the catalogue's sky, an IMU's table, odometry."""
 
 import json
-from argparse import Namespace
 from dataclasses import asdict
 
 import numpy as np
 import pytest
 from cli_calls import AIR, WIDE, objects
 
-from starpos.cli.navigate import _mount_stddev
 from starpos.earth.orientation import earth_state
 from starpos.earth.refraction import Atmosphere
 from starpos.frames.frame import Stars
 from starpos.frames.tables import write_star_list
 from starpos.instrument.camera import Camera
-from starpos.instrument.instrument import AxisDoubt
+from starpos.instrument.instrument import AxisDoubt, Instrument
+from starpos.night.under_way import Records
 from starpos.sky.site import Site
 from starpos.units import utc_text
 from starpos_testing.command_line import run
@@ -178,10 +177,13 @@ def test_crops_of_a_sensor_of_which_nobody_says_the_size_are_refused_as_of_a_mou
     assert "size is not stated" in errors[0] and "an error of the mount" in errors[0]
 
 
-def test_an_axis_that_nobody_knows_widens_the_mount(capsys):
+def test_an_axis_that_nobody_knows_widens_the_mount():
     doubt = AxisDoubt("cut out", 300.0, np.radians(4))
-    assert _mount_stddev(Namespace(mount_stddev=3.0), doubt) == pytest.approx(np.radians(5))
-    assert "4 deg that count as an error of the mount" in capsys.readouterr().err
+    vessel, remark = Records(imu="imu.csv", mount_stddev_deg=3.0).vessel(
+        Instrument(1000.0), Atmosphere(), doubt
+    )
+    assert vessel.mount_stddev == pytest.approx(np.radians(5))
+    assert "4 deg that count as an error of the mount" in remark
 
 
 def test_a_wrong_header_keeps_no_frame_from_a_voyage(voyage, tmp_path, capsys):

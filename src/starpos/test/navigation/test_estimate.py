@@ -9,7 +9,7 @@ from voyage_calls import vessel
 
 from starpos.navigation.preintegration import Pieces, summed, thinned
 from starpos.navigation.records import ImuLog
-from starpos.navigation.voyage import navigate
+from starpos.navigation.voyage import adjust_voyage
 from starpos_testing.voyages import made
 
 END = 40
@@ -26,7 +26,7 @@ def last(record):
     log, until_s = record.velocity, record.frames_s[END]
     on = log.utc_unix_s <= until_s
     log = replace(log, utc_unix_s=log.utc_unix_s[on], velocity=log.velocity[on], sigma=log.sigma[on])
-    return navigate(record.frames[: END + 1], record.imu, log, vessel()).last
+    return adjust_voyage(record.frames[: END + 1], record.imu, log, vessel()).last
 
 
 def moved_m(record, estimate, k):

@@ -5,7 +5,7 @@ import numpy as np
 
 from starpos.earth.refraction import Atmosphere
 from starpos.navigation.vessel import Vessel
-from starpos.navigation.voyage import navigate
+from starpos.navigation.voyage import adjust_voyage
 from starpos_testing.voyages import CAMERA_TO_BODY, INDUSTRIAL
 
 EARTH_M = 6.37e6
@@ -54,4 +54,4 @@ def sigma_m(voyage):
 
 
 def navigated(made, vehicle="rover", velocity=True, **about):
-    return navigate(made.frames, made.imu, made.velocity if velocity else None, vessel(vehicle, **about))
+    return adjust_voyage(made.frames, made.imu, made.velocity if velocity else None, vessel(vehicle, **about))

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from starpos.cli import main
-from starpos.report import field
+from starpos.night import field
 
 OPTICS = (
     "--focal-mm",

@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from starpos.earth.refraction import Atmosphere
-from starpos.errors import FrameError
+from starpos.errors import FrameError, WriteError
 from starpos.files import read_regular, write_whole
 from starpos.frames.frame import Stars
 from starpos.frames.tables import SIMULATED, TILTS, TRUTH, write_star_list
@@ -32,7 +32,6 @@ from starpos.night.night import Truth
 from starpos.night.reading import TiltFile, stars_of
 from starpos.night.solving import Exposures
 from starpos.progress import Progress, quiet
-from starpos.report.html import WriteError
 from starpos.units import date_obs
 
 ABOUT, INSTRUMENT = "field.json", "instrument.yaml"
