@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The inclinometer: its readings, its transfer function, and A2, which takes its frame S into the local level L."""
+"""The inclinometer: its readings, its errors, and A2, which takes its frame S into the local level L."""
 
 import math
 from dataclasses import KW_ONLY, dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from starpos import rotation
 from starpos.errors import InstrumentError, TiltError, TiltRangeError
@@ -292,12 +291,3 @@ def levelling_of(a2: np.ndarray) -> np.ndarray:
     a2 (3, 3): S into L.
     """
     return np.array([a2[1], -a2[0], np.zeros(3)])
-
-
-def sca100t_volts(
-    angle: ArrayLike,
-    offset_v: float = SCA100T_OFFSET_V,
-    sensitivity_v_per_g: float = SCA100T_SENSITIVITY_V_PER_G,
-) -> np.ndarray:
-    """The SCA100T's output voltage at an angle in rad: offset + sensitivity sin(angle) (paper, section 3.1)."""
-    return offset_v + sensitivity_v_per_g * np.sin(angle)

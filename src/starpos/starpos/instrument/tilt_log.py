@@ -4,7 +4,7 @@
 import math
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import KW_ONLY, dataclass, replace
+from dataclasses import KW_ONLY, dataclass, field, replace
 from functools import cached_property
 from typing import Any, Protocol
 
@@ -376,28 +376,20 @@ class Tilts(Protocol):
 
 
 @dataclass(frozen=True)
-class NoTilts:
-    """No tilts, and the sentence that says why."""
+class TiltsByTime:
+    """The tilts of exposures, each known by their middle (Unix seconds); and why there is none for another one."""
 
+    tilts: Mapping[Any, Tilt] = field(default_factory=dict)
     why: str = "no tilt: give the inclinometer's"
 
     def average(self, mid_unix_s: float, exposure_s: float, spread_s: float = 0.0) -> Tilt:
-        """Raise TiltError."""
-        raise TiltError(self.why)
-
-
-NO_TILTS = NoTilts()
-
-
-@dataclass(frozen=True)
-class TiltsByTime:
-    """The tilts of exposures, each known by their middle (Unix seconds)."""
-
-    tilts: Mapping[Any, Tilt]
-
-    def average(self, mid_unix_s: float, exposure_s: float, spread_s: float = 0.0) -> Tilt:
-        """Give the tilt of the exposure with this middle."""
+        """Give the tilt of the exposure with this middle; TiltError without one."""
+        if mid_unix_s not in self.tilts:
+            raise TiltError(self.why)
         return self.tilts[mid_unix_s]
+
+
+NO_TILTS = TiltsByTime()
 
 
 # A sensor of 18 Hz has a memory of 9 ms, so means over this time are independent.

@@ -18,7 +18,7 @@ from starpos.fix.terms import ALWAYS, ErrorTerm
 from starpos.frames.frame import Frame, Stars
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import Tilt
-from starpos.instrument.tilt_log import NoTilts, TiltLog, Tilts
+from starpos.instrument.tilt_log import TiltLog, Tilts, TiltsByTime
 from starpos.messages.camera import message_to_camera
 from starpos.messages.stamp import stamp_to_unix
 from starpos.messages.stars import message_to_stars
@@ -324,7 +324,7 @@ def night(
 
 def exposures(r: Recorded, instruments: Instruments, atmosphere: Atmosphere, vertical: Vertical) -> Exposures:
     """The stars of a bag, to be solved."""
-    tilts: Tilts = r.tilts or NoTilts(f"{r.path}: no usable tilt in it: record the topic tilt too")
+    tilts: Tilts = r.tilts or TiltsByTime(why=f"{r.path}: no usable tilt in it: record the topic tilt too")
 
     def each(work: Callable[[Frame | Stars], Any]) -> Worked:
         for name, item in each_frame(r):

@@ -22,7 +22,7 @@ from starpos.gnss.receiver import GnssTrack, read_gnss_csv
 from starpos.instrument import instrument_file, sensors
 from starpos.instrument.inclinometer import SCA100T_NOISE_RAD
 from starpos.instrument.instrument import Calibration, Instrument
-from starpos.instrument.tilt_log import NoTilts
+from starpos.instrument.tilt_log import TiltsByTime
 from starpos.night.night import Night, Truth
 from starpos.night.reading import About, First, Instruments, Reader, TiltFile
 from starpos.night.remarks import Remark, of_tilts
@@ -56,7 +56,9 @@ def exposures(
         try:
             work, remarks = work_of(given, first, folder / TILTS, atmosphere, place)
         except TiltError as error:
-            tilts = None if place is not None and not (folder / TILTS).exists() else NoTilts(str(error))
+            tilts = (
+                None if place is not None and not (folder / TILTS).exists() else TiltsByTime(why=str(error))
+            )
             instruments, remarks = given.framed(first)
             work = replace(work, instruments=instruments, tilts=tilts)
 

@@ -11,7 +11,6 @@ from starpos.instrument.inclinometer import (
     Tilt,
     level_of,
     levelling_of,
-    sca100t_volts,
     up_of,
     up_slope,
 )
@@ -117,19 +116,6 @@ def test_axes_with_the_errors_of_their_sheet_do_not_contradict_each_other(rng):
         skew = np.eye(3) + errors.cross * rng.normal(size=(3, 3)) * (1 - np.eye(3))
         read = skew @ up * (1 + errors.scale * rng.normal(size=3)) + errors.pose_rad * rng.normal(size=3)
         errors.check_axes(three_axes(np.degrees(np.arcsin(np.clip(read, -1, 1)))))
-
-
-@pytest.mark.parametrize(
-    ("volts", "degrees"),
-    [(2.5, 0.0), (4.5, 30.0), (0.5, -30.0), (3.5, 14.47751), (2.5 + 4 * 6.1087e-5, 0.0035)],
-)
-def test_sca100t_by_hand(volts, degrees):
-    """SCA100T-D01 on 5 V: 2.5 V at zero, 4 V/g, asin((4.5 - 2.5) / 4) = 30 deg."""
-    assert sca100t_volts(degrees * DEG) == pytest.approx(volts, abs=1e-6)
-
-
-def test_sca100t_d02_by_hand():
-    assert sca100t_volts(30 * DEG, sensitivity_v_per_g=2.0) == pytest.approx(2.5 + 2 * 0.5)
 
 
 @pytest.mark.parametrize(
