@@ -9,9 +9,11 @@ from libc.string cimport memcmp, memcpy, memset
 import numpy as np
 
 from starpos._numeric.limits cimport unsigned_char, within
-from starpos.detection._equations cimport LARGEST, invert, invert_scaled, scaled_factor, solve_scaled
 from starpos.detection._psf cimport BLOCK, Local, blocks, evaluate, local_of, sound, values
-from starpos.detection._sums cimport any_bright, chi_square, copy_pixels, cross_products, products, sky_sums, squares, weigh
+from starpos.detection._sums cimport (
+    LARGEST, any_bright, chi_square, copy_pixels, cross_products, invert, invert_scaled, products, scaled_factor, sky_sums,
+    solve_scaled, squares, weigh,
+)
 
 cdef enum:
     STARS = 2

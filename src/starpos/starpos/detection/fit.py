@@ -181,7 +181,7 @@ def split_pairs(
 
     Each star's stamp is without the other's light. cut_at(x, y) gives the Stamps around pixels x, y (N,).
     """
-    light = _light(stamps, psf, alone)
+    light = _model_light(stamps, psf, alone)
     alone = replace(alone, model=light, residual=stamps.signal - light)
     first, second = fit_pairs(stamps, psf, _first_places(stamps, alone, psf), alone.flux, response)
     real = _are_real(stamps, alone, first, second, psf, response)
@@ -190,12 +190,12 @@ def split_pairs(
     both, first, second = stamps.select(real), first.select(real), second.select(real)
     x, y = (np.rint(v).astype(int) for v in (second.x, second.y))
     around = cut_at(x, y)
-    light = _light(around, psf, first)
+    light = _model_light(around, psf, first)
     noise = np.sqrt(response.variance(around.noise, light))
     around = replace(around, signal=around.signal - light, noise=noise)
     apart = fit_stars(around, psf, second.x, second.y, response, rounds=3)
     # if the whole companion lies on the first star's stamp, the fit of both together is the better one
-    whole = _away(both, second) < both.reach - 1
+    whole = _off_centre_px(both, second) < both.reach - 1
     better = {}
     for name in ("x", "y", "flux", "flux_sigma", "covariance", "gains", "chi2"):
         own = getattr(apart, name)
@@ -217,12 +217,14 @@ def _are_real(
     with np.errstate(invalid="ignore"):
         real = np.isfinite(first.chi2) & (apart > CLOSEST)
         for fit, beyond in ((first, -1), (second, 2)):
-            real &= (fit.flux > FAINTEST * fit.flux_sigma) & (_away(stamps, fit) < stamps.reach + beyond)
+            real &= (fit.flux > FAINTEST * fit.flux_sigma) & (
+                _off_centre_px(stamps, fit) < stamps.reach + beyond
+            )
         real &= before.sum((1, 2)) - first.chi2 * freedom > GAIN * np.maximum(first.chi2, 1)
         return real & (second.flux > DIMMEST * first.flux)
 
 
-def _away(stamps: Stamps, fit: Fit) -> np.ndarray:
+def _off_centre_px(stamps: Stamps, fit: Fit) -> np.ndarray:
     """How far stars (N,) are from the middles of their stamps, px along the farther axis."""
     return np.maximum(np.abs(fit.x - stamps.x), np.abs(fit.y - stamps.y))
 
@@ -235,7 +237,7 @@ def surprising(stamps: Stamps, fit: Fit) -> np.ndarray:
     return odd & (count_marked(stamps.full) == 0) & np.isfinite(fit.covariance).all((1, 2)) & (fit.flux > 0)
 
 
-def _light(stamps: Stamps, psf: FieldPsf, fit: Fit) -> np.ndarray:
+def _model_light(stamps: Stamps, psf: FieldPsf, fit: Fit) -> np.ndarray:
     """The light (N, S, S) float32, DN, of fitted stars on whole stamps."""
     light = psf.at(fit.x, fit.y).evaluate(*stamps.corner(fit.x, fit.y), stamps.size)
     return light * (gains_at(fit.gains, stamps.phase) * fit.flux.astype(np.float32)[:, None, None])

@@ -299,11 +299,11 @@ def _teachers(
     light, full = around.signal, around.full.any((1, 2))
     # the shapes of fainter stars are noise
     clearly_many = np.count_nonzero(height[bright] > BRIGHT) > ALIKE
-    bright, light = bright[~full], _those(light, ~full)
+    bright, light = bright[~full], _select_light(light, ~full)
     light, blur = grey(light, sky)
     if clearly_many and len(bright):
         alike = _most_alike(light)
-        bright, light = bright[alike], _those(light, alike)
+        bright, light = bright[alike], _select_light(light, alike)
     shape = frame_shape(light, blur) if len(bright) else None
     # a shape as wide as the stamps is the sky's
     if shape is not None and squared_widths(shape)[0, 0] > 0.9 * (SIGHT / 2) ** 2:
@@ -357,7 +357,7 @@ def _likeliest(stamps: Stamps, shape: np.ndarray | None, response: Response) -> 
     return choices[0 if learnt else best], learnt
 
 
-def _those(light: np.ndarray, which: np.ndarray) -> np.ndarray:
+def _select_light(light: np.ndarray, which: np.ndarray) -> np.ndarray:
     """The signals (N, S, S) that a mask (N,) selects; if it selects all, nothing is copied."""
     return light if which.all() else light[which]
 
@@ -481,10 +481,10 @@ def with_trail(
 
     fits = [fitted(lesson.psf), *map(fitted, tried)]
     for factor in FINER:
-        best = tried[int(np.argmin(_left(stamps, fits, lesson)[1:]))]
+        best = tried[int(np.argmin(_chi_squares(stamps, fits, lesson)[1:]))]
         finer = [trailed(best.sigma * f, trail, *size) for f in (factor, 1 / factor)]
         tried, fits = tried + finer, fits + [fitted(psf) for psf in finer]
-    left = _left(stamps, fits, lesson)
+    left = _chi_squares(stamps, fits, lesson)
     best_of = int(np.argmin(left[1:]))
     unknowns = OF_SHAPE + np.count_nonzero(lesson.psf.at(x[:1].astype(float), y[:1].astype(float)).series) - 1
     allowed = 0.0 if taught else WORTH * unknowns if lesson.teachers else -CLEAR
@@ -498,7 +498,7 @@ def with_trail(
     return replace(lesson, psf=psf, response=response, reach=reach_of(psf))
 
 
-def _left(stamps: Stamps, fits: list[Fit], lesson: Lesson) -> np.ndarray:
+def _chi_squares(stamps: Stamps, fits: list[Fit], lesson: Lesson) -> np.ndarray:
     """Chi-square that fits with different PSFs leave in the same stamps, by the noise of the first one's light."""
     noise2 = lesson.response.variance(stamps.noise, fits[0].model)
     left = np.array([(stamps.good * fit.residual**2 / noise2).sum((1, 2)) for fit in fits])

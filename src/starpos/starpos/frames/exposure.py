@@ -247,22 +247,22 @@ class DriverStamp:
     def missing_statement(self) -> str:
         """Sentence on what has to be stated for a smaller error; '' if nothing."""
         if self.kind == UNKNOWN_STAMP and math.isnan(self.stddev_s):
-            lacks = (
+            gap = (
                 f"nothing says which moment the frames' stamps are ({', '.join(STAMPS[1:])}): set the parameters stamp, "
                 "stamp_stddev and exposure"
             )
         elif self.kind in (START, END, ARRIVAL) and self.exposure_s is None:
-            lacks = (
+            gap = (
                 f"the stamps are of the {self.kind}, and nothing says how far the middle of the exposure is from it: "
                 "set the parameter exposure"
             )
         elif self.kind == ARRIVAL and math.isnan(self.stddev_s):
-            lacks = "the stamps are of the arrival, and nothing says how late that is: set the parameter stamp_stddev"
+            gap = "the stamps are of the arrival, and nothing says how late that is: set the parameter stamp_stddev"
         else:
             return ""
         stddev_s = self.middle_stddev_s
         metres = stddev_s * METRES_PER_S
-        return f"{lacks}. Until then the time is taken as {stddev_s:.2g} s off, {metres:.0f} m at the equator (1 sigma)."
+        return f"{gap}. Until then the time is taken as {stddev_s:.2g} s off, {metres:.0f} m at the equator (1 sigma)."
 
     def apply(self, stamped: Stamped) -> Stamped:
         """The exposure, whose mid_unix_s is the stamp, with its middle and the other facts."""
