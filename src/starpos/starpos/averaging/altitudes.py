@@ -12,8 +12,9 @@ import numpy as np
 from starpos import rotation
 from starpos._numeric.roots import symmetric_root
 from starpos.averaging.average import SCATTER, Average
-from starpos.earth.ellipsoid import curvature_radii_m
+from starpos.earth.ellipsoid import curvature_radii_m, enu_axes, place_of_zenith
 from starpos.earth.orientation import EarthState, station_velocity
+from starpos.earth.place import Place
 from starpos.earth.refraction import MIN_COS_ZENITH, Atmosphere
 from starpos.errors import FixError
 from starpos.fix.budget import tilt_terms, time_terms
@@ -24,7 +25,6 @@ from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import Tilt
 from starpos.instrument.instrument import UNKNOWN_ARCSEC, Calibration
 from starpos.instrument.mounting import Mounting, angles_at
-from starpos.sky.site import Site
 from starpos.units import ARCSEC, SIGMA_PER_MAD
 
 # so near the zenith a direction has hardly an elevation to speak of
@@ -398,7 +398,7 @@ def _degrees(zenith: np.ndarray) -> tuple[float, float]:
 
 def _enu(zenith: np.ndarray) -> np.ndarray:
     """East, north and up (3, 3) in ITRS at a zenith (3,)."""
-    return Site(*_degrees(zenith)).enu
+    return enu_axes(*place_of_zenith(zenith))
 
 
 AXIS_ROUNDS, SETTLED_CHI2, FIRST_DAMPING, LAST_DAMPING = 80, 1e-6, 1e-3, 1e9
@@ -474,8 +474,7 @@ def find_axis(
     circles_of: CirclesOf,
     given: Calibration,
     ray: np.ndarray,
-    site: Site | None = None,
-    site_stddev_rad: float = 0.0,
+    site: Place | None = None,
     near: tuple[float, float] | None = None,
 ) -> FoundAxis:
     """Fit A3's axis, and the zenith unless a site is given; `given` counts as well as it is known.
@@ -491,13 +490,13 @@ def find_axis(
             f"it takes {fewest} or more (frames of a camera that stands still are one)"
         )
     if site is not None:
-        zeniths = [site.enu[2]]
+        zeniths = [site.plumb_axes[2]]
     else:
         tried = sorted(starts(first), key=lambda z: float(np.median(np.abs(first.residual(z)[0]))))
         zeniths = [*_round(first), *tried[:TRIED]]
     found: list[tuple[float, FoundAxis]] = []
     for zenith in zeniths:
-        one = _fitted(circles_of, given, ray, zenith, None if site is None else site_stddev_rad)
+        one = _fitted(circles_of, given, ray, zenith, None if site is None else site.plumb_stddev)
         if one is not None:
             found.append(one)
     if not found:
