@@ -40,7 +40,7 @@ def nees(message, shot) -> float:
     """Squared error under the shot's sky in units of the claim: chi-squared of three degrees of freedom."""
     enu = enu_axes(*np.radians([LATITUDE_DEG, LONGITUDE_DEG]))
     seen = PlacelessFrame.of(message_to_attitude(message)).under(enu[2], AIR)
-    off = Rotation.from_matrix(seen.camera_to_itrs.T @ enu.T @ shot.scene.attitude).as_rotvec()
+    off = Rotation.from_matrix(seen.rotation.T @ enu.T @ shot.scene.attitude).as_rotvec()
     return float(off @ np.linalg.solve(seen.covariance, off))
 
 

@@ -107,8 +107,8 @@ def send_stars_and_wheels(ears, record):
             stamp_stddev_s=0.0,
             clock_stddev_s=1e-4,
             frame_id="camera",
-            camera_to_gcrs=state.gcrs_to_itrs.T @ seen.camera_to_itrs,
-            covariance=seen.covariance,
+            camera_to_gcrs=state.gcrs_to_itrs.T @ seen.rotation,
+            covariance=seen.covariance_about_own,
             stars=30,
             log_odds=50.0,
         )

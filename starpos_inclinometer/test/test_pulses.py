@@ -233,7 +233,7 @@ def test_a_night_of_frames_has_the_times_of_their_light_though_nobody_stated_the
                         sequence=t.sequence,
                         disciplined=t.disciplined,
                     )
-                    pairing.add(edge)
+                    pairing.record(edge)
         got = pairing.pair(commanded_s, exposure_s, commanded_s, host_ns * 1e-9)
         if isinstance(got, ShutterPulse):
             assert got.disciplined

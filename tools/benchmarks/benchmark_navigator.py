@@ -117,8 +117,8 @@ def attitude(frame: IdentifiedFrame) -> Attitude:
         stamp_stddev_s=0.0,
         clock_stddev_s=1e-3,
         frame_id="camera",
-        camera_to_gcrs=earth_state(frame.utc_unix_s).gcrs_to_itrs.T @ seen.camera_to_itrs,
-        covariance=seen.covariance,
+        camera_to_gcrs=earth_state(frame.utc_unix_s).gcrs_to_itrs.T @ seen.rotation,
+        covariance=seen.covariance_about_own,
         stars=len(frame.xy),
         log_odds=50.0,
     )

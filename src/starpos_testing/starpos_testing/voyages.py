@@ -11,7 +11,7 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from starpos.navigation.records import ImuLog, ImuModel, VelocityLog
-from starpos.navigation.sightings import IdentifiedFrame
+from starpos.navigation.sightings import IdentifiedFrame, roughly
 
 # Unix, in November 2026.
 BEGIN_S = 1.7937e9
@@ -307,5 +307,5 @@ def _frame(utc_unix_s, camera_to_itrs, place, rng, on):
         covariance_px2=np.tile(np.eye(2) * STAR_SIGMA_PX**2, (STARS, 1, 1)),
         itrs=apparent / np.linalg.norm(apparent, axis=1)[:, None],
         focal_px=FOCAL_PX,
-        camera_to_itrs=camera_to_itrs,
+        camera=roughly(camera_to_itrs),
     )

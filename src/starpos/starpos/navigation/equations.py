@@ -278,7 +278,7 @@ class VoyagePrior:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class StarAttitudes:
-    """Attitudes of the camera at F of the nodes: index (F,), camera_to_itrs (F, 3, 3), as `StarAttitude` has them.
+    """Attitudes of the camera at F of the nodes: index (F,), camera_to_itrs (F, 3, 3), C into ITRS.
 
     covariance (F, 3, 3), by_refraction (F, 3); stamp_stddev_s (F,).
     """

@@ -6,7 +6,6 @@ level is needed: only refraction and the diurnal aberration depend on the zenith
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol
 
 import numpy as np
 
@@ -23,8 +22,9 @@ from starpos.earth.place import Place
 from starpos.earth.refraction import Atmosphere, Refraction
 from starpos.errors import FixError, FrameError, InstrumentError, TimeError
 from starpos.fix import solver
-from starpos.fix.attitude import ENU, LINK, Attitude
+from starpos.fix.attitude import CAMERA, ENU, GCRS, ITRS, LINK, Attitude
 from starpos.fix.camera_attitude import CameraAttitude
+from starpos.fix.sighting import Sighting
 from starpos.fix.solution import Solution
 from starpos.fix.star_fit import (
     StarFit,
@@ -45,64 +45,45 @@ ROUGH = 20 * ARCSEC
 STEP_REFRACTION = 0.01
 
 
-class FrameUnderWay(Protocol):
-    """A frame under way: its time, and the attitude of the camera by its stars, roughly and under a zenith."""
+@dataclass(frozen=True, eq=False, kw_only=True)
+class FrameUnderWay(Sighting):
+    """A sighting whose attitude is computed again under each zenith that is tried."""
 
-    @property
-    def utc_unix_s(self) -> float: ...
+    def rough(self) -> Attitude:
+        """The attitude as it is without a place."""
+        return roughly(self.camera.rotation)
 
-    @property
-    def stamp_stddev_s(self) -> float: ...
-
-    def rough(self) -> "StarAttitude": ...
-
-    def under(self, zenith: np.ndarray, atmosphere: Atmosphere) -> "StarAttitude": ...
+    def under(self, zenith: np.ndarray, atmosphere: Atmosphere) -> Attitude:
+        """The attitude under a zenith (3,) in ITRS; FixError where it has none."""
+        raise NotImplementedError
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class IdentifiedFrame:
-    """N identified stars of a frame.
+class IdentifiedFrame(FrameUnderWay):
+    """N identified stars of a frame; `camera` is without refraction, good to ROUGH rad.
 
-    utc_unix_s, stamp_stddev_s: middle of the exposure, and the error of that stamp.
     xy (N, 2), covariance_px2 (N, 2, 2): px from the principal point of an ideal camera of focal length focal_px.
-    itrs (N, 3): geocentric apparent directions in ITRS.  camera_to_itrs (3, 3): without refraction, good to ROUGH rad.
+    itrs (N, 3): geocentric apparent directions in ITRS.
     """
 
-    utc_unix_s: float
-    stamp_stddev_s: float
-    source: str
     xy: np.ndarray
     covariance_px2: np.ndarray
     itrs: np.ndarray
     focal_px: float
-    camera_to_itrs: np.ndarray
 
-    def rough(self) -> "StarAttitude":
-        """The attitude as it was when the stars were identified."""
-        return roughly(self.camera_to_itrs)
-
-    def under(self, zenith: np.ndarray, atmosphere: Atmosphere) -> "StarAttitude":
+    def under(self, zenith: np.ndarray, atmosphere: Atmosphere) -> Attitude:
         """The attitude under a zenith (3,) in ITRS, with the plate scale, by the stars; FixError if they disagree."""
         seen = self._fitted(_seen(self, zenith, atmosphere.refraction()))
         stronger = _seen(self, zenith, atmosphere.refraction(1 + STEP_REFRACTION))
         fit = seen.fit
         there = seen_problem(self.xy, self._optics, stronger).predict(fit.a4, fit.scale)
         shift = (there - self.xy - fit.residual)[fit.kept] / STEP_REFRACTION
-        return StarAttitude(
-            camera_to_itrs=fit.a4.T,
-            covariance=seen.errors.rotation_covariance(seen.errors.centroids),
-            # the camera turns the other way than the sky in it
-            by_refraction=-seen.errors.rotated(shift),
-        )
+        # the camera turns the other way than the sky in it
+        return _camera_of(seen, -seen.errors.rotated(shift))
 
-    def placeless(self) -> "StarAttitude":
+    def placeless(self) -> Attitude:
         """Fit attitude and plate scale where no zenith is known: refraction and diurnal aberration stay in it."""
-        seen = self._fitted(self.itrs)
-        return StarAttitude(
-            camera_to_itrs=seen.fit.a4.T,
-            covariance=seen.errors.rotation_covariance(seen.errors.centroids),
-            by_refraction=np.zeros(3),
-        )
+        return _camera_of(self._fitted(self.itrs), np.zeros(3))
 
     @cached_property
     def _optics(self) -> Camera:
@@ -116,24 +97,22 @@ class IdentifiedFrame:
             raise FixError(f"{self.source}: {error}: left out") from None
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class StarAttitude:
-    """Attitude of the camera against the Earth: camera_to_itrs (3, 3).
-
-    covariance (3, 3): rad2, of its small rotation about the camera's axes.
-    by_refraction (3,): rotation, rad, by which the camera is turned further if refraction is stronger by its own size.
-    """
-
-    camera_to_itrs: np.ndarray
-    covariance: np.ndarray
-    by_refraction: np.ndarray
-
-
-def roughly(camera_to_itrs: np.ndarray) -> StarAttitude:
-    """An attitude (3, 3) that is good to ROUGH."""
-    return StarAttitude(
-        camera_to_itrs=camera_to_itrs, covariance=np.eye(3) * ROUGH**2, by_refraction=np.zeros(3)
+def _camera_of(seen: StarFit, by_refraction: np.ndarray) -> Attitude:
+    """The camera's attitude by a fit; by_refraction (3,): about C's axes."""
+    own = Attitude(
+        np.eye(3),
+        seen.errors.rotation_covariance(seen.errors.centroids),
+        of=CAMERA,
+        into=CAMERA,
+        by_refraction=by_refraction,
     )
+    return own.then(seen.fit.a4.T, ITRS)
+
+
+def roughly(camera_to_itrs: np.ndarray) -> Attitude:
+    """An attitude (3, 3) that is good to ROUGH."""
+    error = np.eye(3) * ROUGH**2
+    return Attitude(camera_to_itrs, error, of=CAMERA, into=ITRS, by_refraction=np.zeros(3))
 
 
 def sighting_of(stars: Stars, eye: solver.Solver, answer: Solution) -> IdentifiedFrame:
@@ -179,7 +158,7 @@ def sighted(
         + np.eye(2) * (catalogue_px**2)[:, None, None],
         itrs=state.to_itrs(catalogue.directions(index, state.year, state.observer_au)),
         focal_px=camera.fx * found.focal_scale,
-        camera_to_itrs=state.gcrs_to_itrs @ found.attitude.T,
+        camera=roughly(state.gcrs_to_itrs @ found.attitude.T),
     )
 
 
@@ -199,52 +178,42 @@ CIRCLE = np.array([[np.cos(a), np.sin(a)] for a in np.arange(8) * np.pi / 4])
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class PlacelessFrame:
-    """An attitude camera_to_itrs (3, 3) without refraction and diurnal aberration, as CameraAttitude has it."""
-
-    utc_unix_s: float
-    stamp_stddev_s: float
-    camera_to_itrs: np.ndarray
-    covariance: np.ndarray
+class PlacelessFrame(FrameUnderWay):
+    """An attitude without refraction and diurnal aberration, as CameraAttitude has it."""
 
     @classmethod
     def of(cls, attitude: CameraAttitude) -> "PlacelessFrame":
         """The frame of an attitude that has a time; TimeError outside the IERS tables."""
         assert attitude.utc_unix_s is not None
+        turn = attitude.camera_to_gcrs
+        among_stars = Attitude(turn, turn @ attitude.covariance @ turn.T, of=CAMERA, into=GCRS)
         return cls(
             utc_unix_s=attitude.utc_unix_s,
             stamp_stddev_s=attitude.stamp_stddev_s,
-            camera_to_itrs=earth_state(attitude.utc_unix_s).gcrs_to_itrs @ attitude.camera_to_gcrs,
-            covariance=attitude.covariance,
+            camera=among_stars.then(earth_state(attitude.utc_unix_s).gcrs_to_itrs, ITRS),
         )
 
-    def rough(self) -> StarAttitude:
-        """The attitude where nothing is known of the place."""
-        return roughly(self.camera_to_itrs)
-
-    def under(self, zenith: np.ndarray, atmosphere: Atmosphere) -> StarAttitude:
+    def under(self, zenith: np.ndarray, atmosphere: Atmosphere) -> Attitude:
         """The attitude under a zenith (3,) in ITRS, from where stars around the camera's axis would be seen there.
 
         The attitude's covariance gives the distance of the frame's own stars from it.  The fitted plate scale has
         absorbed the effect of refraction that is the same in all directions.  The covariance contains the rest, which
         depends on the directions in which the stars lie.
         """
-        across, about = np.diag(self.covariance)[:2].mean(), self.covariance[2, 2]
+        given, covariance = self.camera.rotation, self.camera.covariance_about_own
+        across, about = np.diag(covariance)[:2].mean(), covariance[2, 2]
         ring = np.column_stack([np.sqrt(across / about) * CIRCLE, np.ones(len(CIRCLE))])
-        true = rotation.normalised(ring) @ self.camera_to_itrs.T
+        true = rotation.normalised(ring) @ given.T
         apparent = rotation.normalised(true + station_velocity(zenith))
         level = rotation.shortest_turn(zenith, np.array([0.0, 0.0, 1.0]))
         seen = atmosphere.refraction().bend(apparent @ level.T) @ level
-        camera = rotation.best_rotation(true, seen) @ self.camera_to_itrs
+        camera = rotation.best_rotation(true, seen) @ given
         raised = rotation.to_small_vector(rotation.best_rotation(apparent, seen))
         height = max(float(seen.mean(0) @ zenith), LOWEST)
         squeezed = float(np.linalg.norm(raised)) * np.sqrt(1 - min(height, 1.0) ** 2) / height
         uneven = squeezed * np.array([OFF_AXIS, OFF_AXIS, SPREAD])
-        return StarAttitude(
-            camera_to_itrs=camera,
-            covariance=self.covariance + np.diag(uneven**2),
-            by_refraction=camera.T @ raised,
-        )
+        whole = covariance + np.diag(uneven**2)
+        return Attitude(camera, camera @ whole @ camera.T, of=CAMERA, into=ITRS, by_refraction=raised)
 
 
 def body_attitude(frame: PlacelessFrame, place: Place, vessel: Vessel) -> Attitude:
@@ -254,19 +223,19 @@ def body_attitude(frame: PlacelessFrame, place: Place, vessel: Vessel) -> Attitu
     """
     a4, air = place.plumb_axes, vessel.atmosphere
     seen = frame.under(a4[2], air)
-    g = a4 @ seen.camera_to_itrs
+    seen = seen.then(a4, ENU)
     late_s = [frame.stamp_stddev_s, vessel.clock_stddev_s, earth_orientation(frame.utc_unix_s).ut1_sigma_s]
     # a zenith further east, or north, turns level and north
     level = np.array([[0.0, 1.0], [-1.0, 0.0]])
     north = -meridian_turn(place.plumb[0]) * np.array([[1.0, 0.0]])
     deflection = np.vstack([level * place.plumb_stddev, north * place.ellipsoid_stddev])
     columns = np.column_stack([
-        g @ seen.by_refraction * air.relative_sigma,
+        seen.by_refraction * air.relative_sigma,
         a4[:, 2] * ROTATION_RAD_S * math.hypot(*late_s),
         np.vstack([level, north]) @ place.zenith_root,
         deflection,
     ])  # fmt: skip
     to_ellipsoid = place.axes @ a4.T
     turn = rotation.about_axis(2, -math.atan2(to_ellipsoid[0, 1], to_ellipsoid[1, 1]))
-    covariance = g @ seen.covariance @ g.T + columns @ columns.T + np.eye(3) * vessel.mount_stddev**2
-    return Attitude(turn @ g @ vessel.camera_to_body.T, covariance, of=LINK, into=ENU)
+    covariance = seen.covariance + columns @ columns.T + np.eye(3) * vessel.mount_stddev**2
+    return Attitude(turn @ seen.rotation @ vessel.camera_to_body.T, covariance, of=LINK, into=ENU)

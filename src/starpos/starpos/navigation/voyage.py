@@ -279,9 +279,9 @@ class Adjustment:
             raise VoyageError(f"the stars of {len(used)} frames agree: at least {MIN_FRAMES} are needed")
         return StarAttitudes(
             index=np.searchsorted(self.nodes, [frame.utc_unix_s for frame in used]),
-            camera_to_itrs=np.array([a.camera_to_itrs for a in found]),
-            covariance=np.array([a.covariance for a in found]),
-            by_refraction=np.array([a.by_refraction for a in found]),
+            camera_to_itrs=np.array([a.rotation for a in found]),
+            covariance=np.array([a.covariance_about_own for a in found]),
+            by_refraction=np.array([a.rotation.T @ a.by_refraction for a in found]),
             stamp_stddev_s=np.array([frame.stamp_stddev_s for frame in used]),
         )
 

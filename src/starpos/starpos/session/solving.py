@@ -97,8 +97,8 @@ def camera_attitude_of(
         stamp_stddev_s=stars.stamp_stddev_s,
         clock_stddev_s=solver.clock_stddev_s(stars),
         frame_id=frame_id,
-        camera_to_gcrs=state.gcrs_to_itrs.T @ seen.camera_to_itrs,
-        covariance=seen.covariance,
+        camera_to_gcrs=state.gcrs_to_itrs.T @ seen.rotation,
+        covariance=seen.covariance_about_own,
         stars=len(found.star),
         log_odds=found.log_odds,
     )

@@ -38,12 +38,12 @@ def imu_message(unix_s, gyro, force):
 
 def attitude_message(frame):
     seen = frame.placeless()
-    camera_to_gcrs = earth_state(frame.utc_unix_s).gcrs_to_itrs.T @ seen.camera_to_itrs
+    camera_to_gcrs = earth_state(frame.utc_unix_s).gcrs_to_itrs.T @ seen.rotation
     x, y, z, w = rotation.to_quaternion(camera_to_gcrs)
     return SimpleNamespace(
         header=header_of(frame.utc_unix_s),
         orientation=SimpleNamespace(x=x, y=y, z=z, w=w),
-        covariance=seen.covariance.ravel(),
+        covariance=seen.covariance_about_own.ravel(),
         stars_matched=len(frame.xy),
         log_odds=50.0,
         stamp_stddev=0.0,

@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 from voyage_calls import navigated, nees, sigma_m
 
 from starpos.errors import VoyageError
+from starpos.fix.attitude import ITRS
 from starpos.navigation.records import ImuLog, in_order
 from starpos_testing.voyages import made
 
@@ -111,7 +112,9 @@ def test_frames_identified_wrongly_are_left_out(record, degrees, wrong):
     )
     for k in wrong:
         frames[k] = replace(
-            frames[k], itrs=frames[k].itrs @ turn.T, camera_to_itrs=turn @ frames[k].camera_to_itrs
+            frames[k],
+            itrs=frames[k].itrs @ turn.T,
+            camera=frames[k].camera.then(turn, ITRS),
         )
     voyage = navigated(replace(record, frames=frames))
     assert voyage.left_out["frames"] == len(wrong) and nees(voyage, record) < 16

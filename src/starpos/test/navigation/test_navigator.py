@@ -285,8 +285,7 @@ def test_a_heading_at_a_known_place_claims_what_it_errs_by_when_the_mount_is_kno
         placeless = PlacelessFrame(
             utc_unix_s=frame.utc_unix_s,
             stamp_stddev_s=0.0,
-            camera_to_itrs=seen.camera_to_itrs,
-            covariance=seen.covariance,
+            camera=seen,
         )
         found = body_attitude(placeless, place, there)
         off = rotation.to_small_vector(found.rotation @ (enu_axes(latitude, longitude) @ body_to_itrs).T)

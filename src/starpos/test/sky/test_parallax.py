@@ -158,8 +158,7 @@ ANSWERS = {
     ),
     "fix": lambda solver, stars, found, tilt: solver.solve(stars, tilt).fix,
     "under way": lambda solver, stars, found, tilt: (
-        sighting_of(stars, solver, found).under(Site(*PLACE).enu[2], VACUUM).camera_to_itrs.T
-        @ Site(*PLACE).enu.T
+        sighting_of(stars, solver, found).under(Site(*PLACE).enu[2], VACUUM).rotation.T @ Site(*PLACE).enu.T
     ),
 }
 
