@@ -137,6 +137,7 @@ OUTVOTE_ONE = 10
 class ClockDoubt:
     """Judges the time of each fix; `seconds` is the error to assume for it, 0 if nothing contradicts its stamp.
 
+    It is unknown which of two contradicting stamps is wrong, so the contradiction is taken as the error of the clock.
     leans_otherwise: the camera stands as before, but the tilts differ, so the tilts are of another time.
     """
 
