@@ -88,7 +88,7 @@ class SensorTilts:
         self.range_rad, self.stuck = range_rad, stuck
         # Smallest noise of a reading, even if the readings show less.
         self.noise_floor_rad = 0.0
-        # (xx, xy, yx, yy): from the sines of the sensor's x and y to those of S's.
+        # (xx, xy, yx, yy): from the sines of the sensor's x and y to the sines of S's.
         self.cross_axis: Sequence[float] = SQUARE_AXES
         self._usual_noise_rad, self._stuck_axis = usual_noise_rad, stuck_axis
         self._axes = 0

@@ -124,7 +124,7 @@ def place_of_circles(circles: Sequence[Circle], near: tuple[float, float] | None
             f"determine a place: without a roll it takes three (frames of a camera that stands still are one)"
             + (", or two and --near LAT LON, because two circles meet in two places" if number == 2 else "")
         )
-    part = whole.take(_sound(whole))
+    part = whole.subset(_sound(whole))
     return _average(part, _answer(part, near), len(circles))
 
 
@@ -166,7 +166,7 @@ class Directions:
         """Whether A3 is known too badly for a linear error."""
         return any(g[0].terms[0].covariance[0, 0] > LINEAR_A3_RAD**2 for g in self.circles)
 
-    def take(self, rows: np.ndarray) -> "Directions":
+    def subset(self, rows: np.ndarray) -> "Directions":
         """Some of the directions."""
         return Directions(
             [self.circles[k] for k in rows], {n: c[np.ix_(rows, rows)] for n, c in self.sources.items()}
@@ -265,7 +265,7 @@ def _sound(whole: Directions) -> np.ndarray:
             return every
         if np.array_equal(agree, rows):
             break
-        rows, part = agree, whole.take(agree)
+        rows, part = agree, whole.subset(agree)
         found = _refined(part, np.linalg.inv(part.covariance), zenith)
         zenith = None if found is None else found.zenith
     return rows
@@ -406,8 +406,6 @@ AXIS_ROUNDS, SETTLED_CHI2, FIRST_DAMPING, LAST_DAMPING = 80, 1e-6, 1e-3, 1e9
 MIN_RAD = 1e-9
 # number of zeniths that are tried, the ones that fit best at first
 TRIED = 4
-# an answer is excluded if its fit is worse by this
-AXIS_EXCLUDED_SIGMA = 6.0
 # minimum number of directions that determine an axis, with the zenith known and unknown
 FEWEST, MIN_WITHOUT_SITE = 2, 4
 # how long A3 may be used
@@ -505,11 +503,11 @@ def find_axis(
         )
     found.sort(key=lambda f: f[0])
     best = found[0][1]
-    left = [f for chi2, f in found if chi2 - found[0][0] < AXIS_EXCLUDED_SIGMA**2 * (1 + best.scatter2)]
+    left = [f for chi2, f in found if chi2 - found[0][0] < EXCLUDED_SIGMA**2 * (1 + best.scatter2)]
     if near is not None:
         there = rotation.unit_vector(near[1], near[0])
         return max(left, key=lambda f: float(f.zenith @ there))
-    if max(np.linalg.norm(f.zenith - best.zenith) for f in left) > 2 * AXIS_EXCLUDED_SIGMA * _wide(best):
+    if max(np.linalg.norm(f.zenith - best.zenith) for f in left) > 2 * EXCLUDED_SIGMA * _wide(best):
         raise FixError(
             "the elevations leave two places and two A3: turn the camera to directions of other altitudes too, state A3 "
             "better, or say where it is with --near LAT LON"

@@ -287,7 +287,7 @@ def _agreed(find: FindPlumbLine, solved: list[Fix], a3: np.ndarray, errors: Incl
     rows, plumb = _agreeing(find, whole, solved, a3, errors)
     sound = [solved[k] for k in rows]
     # a fix with a bad tilt, hence a bad refraction, may have split the pose of the sound ones
-    readings = replace(whole.take(rows), pose=poses_of(sound))
+    readings = replace(whole.subset(rows), pose=poses_of(sound))
     _, scatter = settled(plumb, readings)
     # once more about the answer, with the errors that the poses show
     noisy = np.hypot(readings.sigma, scatter.noise_sigma)
@@ -327,9 +327,9 @@ def _kept(
 ) -> tuple[np.ndarray, PlumbLine]:
     """The frames in `rows` without those that their plumb line shows to disagree, and the plumb line of the rest."""
     for _ in range(JUDGED):
-        plumb = find(whole.take(rows), a3, [solved[k] for k in rows])
+        plumb = find(whole.subset(rows), a3, [solved[k] for k in rows])
         size = np.linalg.norm(plumb.left, axis=1)
-        usual = np.hypot(whole.take(rows).sigma, max(typical(plumb.left, 5), errors.pose_rad))
+        usual = np.hypot(whole.subset(rows).sigma, max(typical(plumb.left, 5), errors.pose_rad))
         agree = size < OUTLIER_SIGMA * usual
         if agree.all() or agree.sum() < (1 - MAX_OUTLIERS) * len(solved):
             break
@@ -361,7 +361,7 @@ def _unhidden(find: FindPlumbLine, whole: Readings, solved: list[Fix], a3: np.nd
     # the closest alone, until they are the same; then all that agree with them, until these are
     for closest in (True, False):
         for _ in range(JUDGED):
-            left = _left(whole, find(whole.take(rows), a3, [solved[k] for k in rows]))
+            left = _left(whole, find(whole.subset(rows), a3, [solved[k] for k in rows]))
             usual = np.hypot(whole.sigma, max(typical(left[rows], 5), whole.pose_sigma))
             off = np.linalg.norm(left, axis=1) / usual
             before, rows = rows, np.sort(np.argsort(off, kind="stable")[:most])
@@ -500,9 +500,7 @@ def calibrate_fixed(
             "that nothing moved"
         )
     attitudes = np.array([f.camera.rotation for f in fixes])
-    mean = rotation.best_rotation(
-        np.tile(np.eye(3), (len(fixes), 1)), np.concatenate(attitudes.swapaxes(1, 2))
-    )
+    mean = rotation.mean_rotation(attitudes)
     covariance = np.mean([f.camera.covariance for f in fixes], axis=0) / ARCSEC**2
     vertical = CameraVertical(*(tuple(map(tuple, m.tolist())) for m in (mean, covariance)))
     # a level that always reads zero has no response

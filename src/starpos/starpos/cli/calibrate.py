@@ -469,7 +469,9 @@ def _about(found: FromSky) -> str:
         f"{len(found.used)} frames, {len(fit.xy)} stars ({fit.rejected} left out): {fit.rms_px:.3f} px rms an axis, "
         f"of the given camera, its scale fitted, {rms(fit.before):.3f} px"
     ]
-    for name, value, sigma, told in zip(parameters(fit.camera), fit.values, fit.sigma, fit.told, strict=True):
+    for name, value, sigma, told in zip(
+        parameters(fit.camera), fit.values, fit.sigma, fit.determined, strict=True
+    ):
         digits = max(0, 1 - int(np.floor(np.log10(sigma))))
         by = "from the stars" if told else "from the prior"
         lines.append(f"  {name:<4} {value:>16.{digits}f} +- {sigma:<12.{digits}f} {by}")
@@ -513,7 +515,7 @@ def _json_of(found: FromSky, path: str) -> dict:
         "distortion": c.distortion,
         "sigma": dict(zip(parameters(c), fit.sigma, strict=True)),
         "covariance": fit.covariance,
-        "told": [name for name, told in zip(parameters(c), fit.told, strict=True) if told],
+        "told": [name for name, told in zip(parameters(c), fit.determined, strict=True) if told],
         "rms_px": fit.rms_px,
         "rms_before_px": rms(fit.before),
         "scatter_px": fit.scatter_px,

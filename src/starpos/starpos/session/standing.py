@@ -74,7 +74,7 @@ class Averaging:
             if self._turned is not None or _is_wide(fix):
                 self._averager = Averager()
         before = self._averager.average
-        self._averager.add(fix)
+        self._averager.include(fix)
         after = self._averager.average
         assert after is not None
         self._news = self._judged(before, after)
