@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from starpos.earth.ellipsoid import enu_axes
 from starpos.earth.refraction import Atmosphere
 from starpos.messages.stars import message_to_attitude
-from starpos.navigation.sightings import SightingUnderWay
+from starpos.navigation.sightings import PlacelessFrame
 from starpos_interfaces.msg import Attitude, Solution
 from starpos_testing.graph.graph import stamp_of
 from starpos_testing.graph.shots import (
@@ -39,9 +39,9 @@ def came(graph, attitudes, shot) -> Attitude:
 def nees(message, shot) -> float:
     """Squared error under the shot's sky in units of the claim: chi-squared of three degrees of freedom."""
     enu = enu_axes(*np.radians([LATITUDE_DEG, LONGITUDE_DEG]))
-    seen = SightingUnderWay.of(message_to_attitude(message)).under(enu[2], AIR)
+    seen = PlacelessFrame.of(message_to_attitude(message)).under(enu[2], AIR)
     off = Rotation.from_matrix(seen.rotation.T @ enu.T @ shot.scene.attitude).as_rotvec()
-    return float(off @ np.linalg.solve(seen.covariance_about_own, off))
+    return float(off @ np.linalg.solve(seen.covariance, off))
 
 
 def test_the_attitude_is_the_cameras_and_its_claim_holds(graph, attitudes):

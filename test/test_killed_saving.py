@@ -25,7 +25,7 @@ CALLS = 8
 KILLER = """
 import os, random, signal, sys, time
 from pathlib import Path
-from starpos.instrument import camera_file, instrument_file
+from starpos.instrument import instrument_file
 from starpos.instrument.camera import Camera
 from starpos.instrument.instrument import Instrument
 
@@ -35,7 +35,8 @@ cameras = [Camera.from_focal(100, 80, focal) for focal in (1000.0, 2000.0)]
 files = {
     "instrument.yaml": (lambda p, c: instrument_file.write(p, Instrument(c.fx, camera=c)),
                         lambda p: instrument_file.read(p).focal_px),
-    "camera.yaml": (lambda p, c: camera_file.write(p, c, "camera"), lambda p: camera_file.read(p).fx),
+    "camera.yaml": (lambda p, c: instrument_file.write_camera(p, c, "camera"),
+                    lambda p: instrument_file.read_camera(p).fx),
 }
 for name, (write, read) in files.items():
     path, found = folder / name, []

@@ -10,7 +10,9 @@ that are at hand (tools/setup/core); it builds the documents' site, looks throug
 which `test.py --docs` does alone: a warning is a failure.
 """
 
+import math
 import os
+import re
 import shlex
 import subprocess
 import sys
@@ -89,45 +91,14 @@ CORE = [
         "instrument/test_camera",
     )
 ]
-# `make quick`: the core, and rooms of starpos whose tests take a second each
-QUICK = {
-    "quick": [
-        *CORE,
-        *(f"src/starpos/test/{room}" for room in ("earth", "instrument", "messages", "recording")),
-    ]
-}
-# with the newest versions only: what waits for nodes or other processes, what takes long and is
-# in other tests too, and what draws many nights (montecarlo)
-NEWEST_ONLY = [
-    "starpos_inclinometer/test/test_faults.py",
-    "starpos_inclinometer/test/test_fuzz.py",
-    "starpos_inclinometer/test/test_node.py",
-    "starpos_inclinometer/test/test_noise.py",
-    *(
-        f"starpos_camera/test/test_{name}.py"
-        for name in ("annotator", "camera", "clock", "detector", "together", "v4l2")
-    ),
-    *(
-        f"src/starpos/test/{name}.py"
-        for name in (
-            "averaging/test_average",
-            "calibration/test_camera_from_sky",
-            "calibration/test_fisheye_from_sky",
-            "calibration/test_misalignment",
-            "cli/test_cli_jobs",
-            "detection/test_detection_sky",
-            "identification/test_blind",
-            "identification/test_blind_fisheye",
-            "identification/test_real_frames",
-            "navigation/test_bad_records",
-            "navigation/test_borne_out",
-            "navigation/test_standstill",
-            "report/test_report_bag",
-        )
-    ),
-    "src/starpos_bringup/test/test_driving_recipe.py",
-    "src/starpos_dashboard/test/test_dashboard_node.py",
-]
+# How long each file of tests takes, s; `test.py --record` writes it after a whole run. A file that is not in it is new.
+SECONDS = ROOT / "tools" / "test_seconds.txt"
+# `make quick` runs files up to the first of these, Ubuntu's versions those up to the second: what takes longer computes,
+# or waits for nodes, and what it asks of libraries is in other tests too.
+QUICK_S, UBUNTU_S = 0.5, 3.0
+QUICK_PARTS = 2
+# with the newest versions only, however quick
+NEWEST_ONLY = {"starpos_inclinometer/test/test_node.py", "src/starpos_dashboard/test/test_dashboard_node.py"}
 # programs that a bare machine has not: those that tools/setup/missing looks for
 COUNTERPARTS = {"avr-gcc", "indiserver", "indi_simulator_ccd", "ip", "xmllint", "chromium", "chromedriver"}
 PRINTING, MAKING = threading.Lock(), threading.Lock()
@@ -248,17 +219,48 @@ def folders() -> dict[str, str]:
     return {folder.parent.name: str(folder.relative_to(ROOT)) for folder in tests}
 
 
+@cache
+def seconds_of_files() -> dict[str, float]:
+    """How long each file of tests takes, s, as it was recorded last."""
+    rows = (line.rsplit(" ", 1) for line in SECONDS.read_text().splitlines() if not line.startswith("#"))
+    return {path: float(seconds) for path, seconds in rows}
+
+
+def files_in(folder: str, max_s: float = math.inf) -> list[str]:
+    """Files of tests in a folder that take no longer than max_s."""
+    paths = [str(path.relative_to(ROOT)) for path in sorted((ROOT / folder).glob("**/test_*.py"))]
+    return [path for path in paths if seconds_of_files().get(path, 0.0) <= max_s]
+
+
 def parts(
-    folders: dict[str, str], shares: dict[str, int], without: Collection[str] = ()
+    folders: dict[str, str],
+    shares: dict[str, int],
+    without: Collection[str] = (),
+    max_s: float = math.inf,
 ) -> dict[str, list[str]]:
     """Files of tests, by the name of their part; shares: in how many parts a folder's files run, 1 by default."""
     made = {}
     for name, folder in folders.items():
-        files = [str(path.relative_to(ROOT)) for path in sorted((ROOT / folder).glob("**/test_*.py"))]
-        files = [path for path in files if path not in without]
+        files = [path for path in files_in(folder, max_s) if path not in without]
         count = min(shares.get(name, 1), len(files))
-        made |= {f"{name} {k + 1}" if count > 1 else name: files[k::count] for k in range(count)}
+        lanes: list[list[str]] = [[] for _ in range(count)]
+        # the longest first, each to the part that has least to do
+        for path in sorted(files, key=lambda f: -seconds_of_files().get(f, 0.0)):
+            min(lanes, key=lambda lane: sum(seconds_of_files().get(f, 0.1) for f in lane)).append(path)
+        made |= {f"{name} {k + 1}" if count > 1 else name: sorted(lane) for k, lane in enumerate(lanes)}
     return made
+
+
+def record() -> None:
+    """Write how long each file of tests took, by the JUnit files of the last run with the newest versions."""
+    seconds: Counter = Counter()
+    for report in (ROOT / "log").glob("*.xml"):
+        if not re.search("ubuntu|core", report.stem):
+            for case in ElementTree.parse(report).getroot().iter("testcase"):
+                seconds[f"{case.get('classname', '').replace('.', '/')}.py"] += float(case.get("time", 0))
+    rows = [f"{path} {s:.1f}\n" for path, s in sorted(seconds.items()) if (ROOT / path).is_file()]
+    head = "# seconds that a file of tests takes; `python tools/test.py --record` writes it after make test\n"
+    SECONDS.write_text(head + "".join(rows))
 
 
 def newest(pytest_args: list[str]) -> Tests:
@@ -349,12 +351,10 @@ def others(pytest_args: list[str]) -> Tests:
 
 def ubuntus(pytest_args: list[str]) -> Tests:
     """Tests of all packages with Ubuntu's versions, and of what the Earth's rotation enters with Ubuntu's table of it."""
-    rotating = [
-        str(p.relative_to(ROOT)) for folder in ROTATING for p in sorted((ROOT / folder).glob("test_*.py"))
-    ]
+    rotating = [path for folder in ROTATING for path in files_in(folder, UBUNTU_S)]
     tests = {
         f"{UBUNTU}{name}": partial(older, files, f"{name.replace(' ', '-')}-ubuntu", pytest_args)
-        for name, files in parts(folders(), UBUNTU_PARTS, {*NEWEST_ONLY, *rotating}).items()
+        for name, files in parts(folders(), UBUNTU_PARTS, {*NEWEST_ONLY, *rotating}, UBUNTU_S).items()
     }
     table = partial(older, rotating, "table-ubuntu", pytest_args, before=["old_table"])
     return tests | {f"{UBUNTU}table": table, "versions": versions}
@@ -389,12 +389,17 @@ def all_of(tests: Tests) -> Outcome:
 
 
 def main(args: list[str]) -> int:
+    if args == ["--record"]:
+        record()
+        return 0
     which = {"--docs", "--lint", "--quick", "--ubuntu", "--both"} & set(args)
     pytest_args = [a for a in args if a not in which]
     tests = {} if which & {"--docs", "--lint", "--quick", "--ubuntu"} else newest(pytest_args)
     if "--quick" in which:
-        tests["fast linters"] = partial(lint, FAST_LINTERS)
-        tests |= {name: partial(pytest, files, name, pytest_args) for name, files in QUICK.items()}
+        tests["linters"] = partial(lint, FAST_LINTERS)
+        quick = [path for folder in folders().values() for path in files_in(folder, QUICK_S)]
+        for k in range(QUICK_PARTS):
+            tests[f"quick {k + 1}"] = partial(pytest, quick[k::QUICK_PARTS], f"quick-{k + 1}", pytest_args)
     if not which & {"--docs", "--quick", "--ubuntu"}:
         tests["linters"] = partial(lint, LINTERS)
     if which & {"--docs", "--both"}:

@@ -302,7 +302,7 @@ class DetectorNode(Node):
         self._settings = DetectionSettings.by_parameters(self._values)
 
     def _on_capture(self, message: Capture, info: Mapping[str, Any]) -> None:
-        self._exposures.take(message)
+        self._exposures.keep_capture(message)
         self._go_on()
 
     def _on_image(self, message: Image | CompressedImage, info: Mapping[str, Any]) -> None:
@@ -386,7 +386,7 @@ class DetectorNode(Node):
         frame = make()
         if self._trails is not None:
             with self._turning:
-                frame = self._trails.told(frame)
+                frame = self._trails.with_trail(frame)
         detection = detect(frame, self._settings)
         message = stars_to_message(detection.stars, header.frame_id)
         # The stamp must be the frame's to the nanosecond, because others match messages by it.

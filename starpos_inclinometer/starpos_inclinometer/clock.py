@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The host's clock and the monotonic clock read together: when bytes were read, and steps of the host's clock.
+"""When bytes were read, on the host's clock and the monotonic one at once, and when a device took its samples.
 
-Time of a sample from the MCU's milliseconds, free of the jitter of the serial line and of the scheduler.
-
-A line can come late but never early. So the lower envelope of (arrival - MCU time) over a window relates the two
-clocks, and whatever lies above it is delay. The envelope is a straight line with a slope, because the rates of the
-clocks differ. It is the edge of the lower hull at the middle of the window: the linear-programming fit of Moon, Skelly
-and Towsley (1999).
+The time of a sample comes from the device's milliseconds, free of the jitter of the serial line and of the scheduler. A
+line can come late but never early. So the lower envelope of (arrival - MCU time) over a window relates the two clocks,
+and whatever lies above it is delay. The envelope is a straight line with a slope, because the rates of the clocks
+differ. It is the edge of the lower hull at the middle of the window: the linear-programming fit of Moon, Skelly and
+Towsley (1999).
 """
 
 import time

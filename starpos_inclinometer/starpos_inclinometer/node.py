@@ -17,7 +17,7 @@ from starpos_common.replayed import Replayed
 from starpos_common.topics import Take, publisher
 from starpos_inclinometer.clock import HostClock, Step
 from starpos_inclinometer.sources.registry import SOURCES, refusal
-from starpos_inclinometer.sources.source import Counts, Health, Phase, Surroundings, TimedPulse
+from starpos_inclinometer.sources.source import Counts, Health, Phase, Surroundings
 from starpos_interfaces.msg import Pulse, Tilt
 
 # Above this share of corrupted or lost lines since the last report the link gets a warning.
@@ -160,7 +160,7 @@ class InclinometerNode(Node):
             if self._replayed is not None:
                 self._replayed.note(message.header.stamp)
         for pulse in self._source.fetch_pulses():
-            self._pulses.publish(_pulse_message(pulse))
+            self._pulses.publish(pulse)
         return urgent
 
     def _on_wake(self) -> None:
@@ -202,13 +202,3 @@ class InclinometerNode(Node):
         health = self._source.health()
         self._log(health)
         return self._reporter.report(health, time.monotonic())
-
-
-def _pulse_message(pulse: TimedPulse) -> Pulse:
-    message = Pulse()
-    message.header.stamp = Time(nanoseconds=max(pulse.stamp_ns, 0)).to_msg()
-    message.input, message.rising = pulse.input, pulse.rising
-    message.sequence, message.bounces = pulse.sequence, pulse.bounces
-    message.device_time = pulse.device_time_s
-    message.stamp_stddev, message.disciplined = pulse.stddev_s, pulse.disciplined
-    return message

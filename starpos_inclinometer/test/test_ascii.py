@@ -341,6 +341,13 @@ def test_a_third_axis_is_published_and_no_lean_is_too_far(meter):
     assert all(0 < r.z_variance < 1e-6 for r in got)
 
 
+def test_a_third_axis_that_comes_and_goes_ends_nothing(meter):
+    device = meter(lambda k: b"45.%02d,-40.00%s\n" % (k % 7, b"" if k % 50 > 40 else b",16.80"))
+    got, _ = readings(device.path, 150, **{"ascii.pattern": rf"{PLAIN}(?:,(?P<z>{NUMBER}))?"})
+    assert {math.isnan(r.z) for r in got} == {True, False}
+    assert all(math.isnan(r.z) == math.isnan(r.z_variance) for r in got)
+
+
 def test_upside_down_without_a_third_axis_is_out_of_range(meter):
     device = meter(lambda k: b"%d,2\n" % (170 + k % 3))
     got, _ = readings(device.path, 20)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from sensor_msgs.msg import Imu
 
-from starpos.messages.tilt import BadMessage, ForceAverager, MeanForce, felt
+from starpos.messages.tilt import BadMessage, ForceAverager, MeanForce, acceleration_of
 from starpos_interfaces.msg import Tilt
 from starpos_testing.nodes import Listener, Process, take_domain
 
@@ -35,7 +35,9 @@ def message(force, stamp_ns=BEGIN_NS, rotation=(0.0, 0.0, 0.0), variance=0.0):
 
 
 def average(forces, **options):
-    return MeanForce.of([felt(message(f, BEGIN_NS + k * PERIOD_NS, **options)) for k, f in enumerate(forces)])
+    return MeanForce.of(
+        [acceleration_of(message(f, BEGIN_NS + k * PERIOD_NS, **options)) for k, f in enumerate(forces)]
+    )
 
 
 @pytest.mark.parametrize("tilt", [(0, 0), (3, -11), (-29, 20), (50, -35)])
@@ -76,7 +78,7 @@ def test_stated_noise_counts_where_it_is_more_and_minus_one_is_none():
     assert np.diag(average(forces, variance=0.001**2).covariance())[:2] == pytest.approx(plain**2)
     none = message(forces[0])
     none.linear_acceleration_covariance[0] = -1.0
-    assert felt(none).variance == (0.0, 0.0, 0.0)
+    assert acceleration_of(none).variance == (0.0, 0.0, 0.0)
     still = average(np.tile(G * up(1, 2), (10, 1)), variance=0.1**2).covariance()
     assert np.sqrt(np.diag(still))[:2] == pytest.approx([0.1 / G / math.sqrt(10)] * 2, rel=0.01)
     assert np.linalg.eigvalsh(average(np.tile(G * up(1, 2), (10, 1))).covariance()).min() > 0
@@ -89,7 +91,7 @@ def test_not_at_rest():
     assert "deg/s" in average(forces, rotation=(0.0, 0.08, 0.08)).unrest(0.05, 0.1)
     no_gyroscope = message(forces[0], rotation=(9.0, 9.0, 9.0))
     no_gyroscope.angular_velocity_covariance[0] = -1.0
-    assert felt(no_gyroscope).rotation == 0.0
+    assert acceleration_of(no_gyroscope).rotation == 0.0
 
 
 @pytest.mark.parametrize(
@@ -105,11 +107,11 @@ def test_not_at_rest():
 )
 def test_messages_that_are_none(bad):
     with pytest.raises(BadMessage):
-        felt(bad)
+        acceleration_of(bad)
 
 
 def averaged(averager, stamps_ns):
-    got = [averager.add(felt(message((0, 0, G), BEGIN_NS + s))) for s in stamps_ns]
+    got = [averager.include(acceleration_of(message((0, 0, G), BEGIN_NS + s))) for s in stamps_ns]
     return [a for a in got if a]
 
 

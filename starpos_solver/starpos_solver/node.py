@@ -159,7 +159,7 @@ class SolverNode(Node):
         self._gnss.receive(message, self._now())
 
     def _on_imu(self, message: Imu) -> None:
-        self._session.gyro.take(message, self._now())
+        self._session.gyro.receive(message, self._now())
 
     def _note_dropped(self, name: str, info: Mapping[str, Any]) -> None:
         if time_is_simulated(self):

@@ -154,7 +154,7 @@ def given(errors: InclinometerErrors, catalogue: Catalogue, rng: np.random.Gener
     more, readings, _ = photograph(lower, zero, response, begin + 3600, CALIBRATED, rng)
     solver, known = Solver(world.told, catalogue, world.air), log_of(rows + readings, errors)
     try:
-        found = calibrate_at(solver, stars + more, known, world.site)
+        found = calibrate_at(solver, stars + more, known, world.site.place)
     except StarposError as e:
         return [lost(e)] * len(GIVEN)
     ready = replace(solver, instrument=found.instrument)

@@ -20,7 +20,7 @@ from table import Cost, Row
 
 from starpos.earth.orientation import earth_state
 from starpos.fix.camera_attitude import CameraAttitude
-from starpos.navigation.sightings import StarsUnderWay
+from starpos.navigation.sightings import IdentifiedFrame
 from starpos_common.messages import attitude_to_message, unix_to_stamp
 from starpos_interfaces.msg import Attitude
 from starpos_testing.graph.graph import Graph
@@ -109,7 +109,7 @@ def reading(unix_s: float, gyro: list[float], force: list[float]) -> Imu:
     return message
 
 
-def attitude(frame: StarsUnderWay) -> Attitude:
+def attitude(frame: IdentifiedFrame) -> Attitude:
     """Make the message of a frame, as the solver publishes it."""
     seen = frame.placeless()
     found = CameraAttitude(

@@ -81,6 +81,11 @@ def shortest_turn(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     )
 
 
+def mean_rotation(rotations: np.ndarray) -> np.ndarray:
+    """The rotation (3, 3) nearest to all of rotations (N, 3, 3), by least squares."""
+    return best_rotation(np.tile(np.eye(3), (len(rotations), 1)), np.concatenate(rotations.swapaxes(1, 2)))
+
+
 def to_small_vector(r: np.ndarray) -> np.ndarray:
     """The rotation vector (3,) of a rotation by much less than 1 rad."""
     return 0.5 * np.array([r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]])

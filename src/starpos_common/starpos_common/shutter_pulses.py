@@ -84,8 +84,8 @@ class ShutterPulses:
         # (lag, length) of frames that had one pulse only.
         self._seen: deque[tuple[float, float]] = deque(maxlen=KEPT)
 
-    def add(self, edge: Edge) -> None:
-        """Take an edge, in the order of their sequence."""
+    def record(self, edge: Edge) -> None:
+        """Record an edge, in the order of their sequence."""
         last, self._last = self._last, edge
         if last is not None and edge.sequence != last.sequence + 1:
             self._gaps.append((last.time_s, edge.time_s))

@@ -22,7 +22,7 @@ class Camera:
     def edge(self, time_s, rising, lost=False):
         if not lost:
             edge = Edge(time_s=time_s, stddev_s=2e-5, rising=rising, sequence=self.sequence, disciplined=True)
-            self.pulses.add(edge)
+            self.pulses.record(edge)
         self.sequence += 1
 
     def frame(self, commanded_s, faults=()):

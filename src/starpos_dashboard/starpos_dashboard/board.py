@@ -182,7 +182,7 @@ STATUSES = 256
 
 
 class Board:
-    """Takes messages and gives one JSON text, of bounded size. `changed`: a message came since the last `told`.
+    """Takes messages and gives one JSON text, of bounded size. `changed`: a message came since the last `as_json`.
 
     nodes: the nodes whose diagnostics are shown as lights, by their names in `namespace`, or whole ones; empty: all.
     """
@@ -274,7 +274,7 @@ class Board:
         else:
             self._heard[name] = self._clock(), told
 
-    def told(self, now_s: float, slow_s: float) -> str:
+    def as_json(self, now_s: float, slow_s: float) -> str:
         """Write everything as one line of JSON; each `age` [s] counts since it came, on the monotonic clock.
 
         now_s: the node's time (Unix).  slow_s: age at which the values that come with each frame are old.

@@ -137,7 +137,7 @@ class DashboardNode(Node):
         if pages and (more or self._board.changed or now - self._told_at >= HEARTBEAT_S):
             self._told_at = now
             unix_s = self.get_clock().now().nanoseconds * 1e-9
-            self._server.show(self._board.told(unix_s, self._values["stale_after"]), self._board.track)
+            self._server.show(self._board.as_json(unix_s, self._values["stale_after"]), self._board.track)
 
     def _follow_viewers(self) -> None:
         """Subscribe to the frames only while somebody looks, because the detector draws them for subscribers."""

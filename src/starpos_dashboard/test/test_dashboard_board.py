@@ -28,7 +28,7 @@ class Clock:
 
 
 def told(board: Board, now_s=1000.0, slow_s=15.0) -> dict:
-    return json.loads(board.told(now_s, slow_s))
+    return json.loads(board.as_json(now_s, slow_s))
 
 
 def test_a_fix_comes_with_its_covariance_and_where_it_was_before():
@@ -139,7 +139,7 @@ def test_lights_are_the_newest_of_their_name_and_bounded():
     assert len(told(b)["lights"]) == board.LIGHTS
     many = said.diagnostics(*((f"m{k}: T", 0, "z" * 999) for k in range(3000)))
     b.hear_diagnostics(many)
-    assert len(b.told(0.0, 15.0)) < board.LIGHTS * 600
+    assert len(b.as_json(0.0, 15.0)) < board.LIGHTS * 600
 
 
 def test_only_lights_of_the_nodes_asked_for():

@@ -11,7 +11,7 @@ from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
 from starpos.navigation.records import ImuLog, ImuModel, VelocityLog
-from starpos.navigation.sightings import StarsUnderWay, roughly
+from starpos.navigation.sightings import IdentifiedFrame, roughly
 
 # Unix, in November 2026.
 BEGIN_S = 1.7937e9
@@ -176,7 +176,7 @@ class MadeVoyage:
 
     imu: ImuLog
     velocity: VelocityLog
-    frames: list[StarsUnderWay]
+    frames: list[IdentifiedFrame]
     latitude: np.ndarray
     longitude: np.ndarray
     heading: np.ndarray
@@ -299,7 +299,7 @@ def _frame(utc_unix_s, camera_to_itrs, place, rng, on):
     # the diurnal aberration, to first order
     moving = SPIN * np.array([-place[1], place[0], 0.0]) / LIGHT_M_PER_S
     apparent = seen - (moving - (seen @ moving)[:, None] * seen)
-    return StarsUnderWay(
+    return IdentifiedFrame(
         utc_unix_s=utc_unix_s,
         stamp_stddev_s=0.0,
         source=f"frame {utc_unix_s:.1f}",

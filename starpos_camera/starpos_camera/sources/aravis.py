@@ -1,12 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Middle of an exposure from a GenICam camera's time of it, on its own clock.
-
-One GenICam camera through Aravis: its settings, its clock, and its buffers as pixels.
+"""GenICam cameras (GigE Vision, USB3 Vision) through Aravis 0.8 and its GObject introspection.
 
 Names of features follow GenICam's Standard Features Naming Convention and GigE Vision. Aravis's functions:
 https://aravisproject.github.io/docs/aravis-0.8/.
-
-GenICam cameras (GigE Vision, USB3 Vision) through Aravis 0.8 and its GObject introspection.
 """
 
 import math

@@ -51,7 +51,11 @@ class NewFile:
 
 
 class WatchedFolder:
-    """Finds the new files of a folder. Files that are there at the first look are not new.
+    """Finds the new files of a folder, each once, when it is complete; what is there at the first look is not new.
+
+    The folder is polled: network disks send no events. A look costs one stat of the folder and of each file that is being
+    written. The folder is listed only if it has changed, and listing takes at most a tenth of the time. For each file in
+    the folder 8 bytes are kept.
 
     If the folder itself comes later, all its files are new. A name counts once. If another folder takes its place (a
     disk is mounted again), only files newer than the newest one taken so far are new.

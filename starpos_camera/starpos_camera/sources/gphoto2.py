@@ -31,7 +31,10 @@ MAX_FILE_BYTES = 500_000_000
 
 
 class Gphoto2Camera:
-    """An open camera. Setting `closing` ends all waiting."""
+    """An open camera: its settings, its exposures, its files. Setting `closing` ends all waiting.
+
+    GPhoto2Error is raised if the camera fails, CaptureError if it does something else than was asked.
+    """
 
     def __init__(self, model: str, port: str, closing: threading.Event) -> None:
         """Open the one camera that fits; CaptureError if none fits, or several."""

@@ -155,7 +155,7 @@ class ShutterTimes:
             disciplined=message.disciplined,
         )
         with self._changed:
-            self._pulses.add(edge)
+            self._pulses.record(edge)
             self._last = edge
             self.heard += 1
             self._changed.notify_all()

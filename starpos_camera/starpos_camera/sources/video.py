@@ -1,16 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""OpenCV without its messages, for V4L2 cameras and video files.
+"""V4L2 cameras and video files, through OpenCV.
 
-A Video4Linux camera through OpenCV: the sensor's own pixels if the camera sends them, the kernel's time of each frame.
-
-OpenCV's V4L2 backend (tried: 4.6 and 5.0) gives the kernel's buffer time as CAP_PROP_POS_MSEC. With
-CAP_PROP_CONVERT_RGB at 0 it gives the buffer itself, in the shape of its format or as plain bytes. It waits at most 10 s
-for a frame. Exposure is V4L2_CID_EXPOSURE_ABSOLUTE, in 100 us, if the menu of auto exposure is at 1. OpenCV does not
-report that a buffer is short, but the kernel's uvcvideo drops such frames (its parameter nodrop is 0).
-
-Frames of a video file, each with the time of its place in the file.
-
-V4L2 cameras and video files, through OpenCV.
+Of a camera the sensor's own pixels are taken if it sends them, and the kernel's time of each frame. OpenCV's V4L2 backend
+(tried: 4.6 and 5.0) gives the kernel's buffer time as CAP_PROP_POS_MSEC. With CAP_PROP_CONVERT_RGB at 0 it gives the
+buffer itself, in the shape of its format or as plain bytes. It waits at most 10 s for a frame. Exposure is
+V4L2_CID_EXPOSURE_ABSOLUTE, in 100 us, if the menu of auto exposure is at 1. OpenCV does not report that a buffer is
+short, but the kernel's uvcvideo drops such frames (its parameter nodrop is 0).
 """
 
 import math

@@ -10,7 +10,7 @@ from typing import Any
 
 from starpos.instrument import sensors
 from starpos.instrument.tilt_log import noise_text
-from starpos.messages.tilt import GAP, TIME_UNKNOWN, Felt, ImuTilts, Reading
+from starpos.messages.tilt import GAP, TIME_UNKNOWN, Acceleration, ImuTilts, Reading
 from starpos_inclinometer.clock import Moment
 from starpos_inclinometer.sources.iio_device import (
     FAILED_READS,
@@ -153,8 +153,8 @@ class IioTilts:
         if device.kind != INCLINATION:
             if not arrival.dated:
                 return None
-            felt = Felt(moment.host_ns, device.force(raw), 0.0, (0.0, 0.0, 0.0))
-            return self.forces.add(felt, device.temperature_c(raw), device.step_rad)
+            force = Acceleration(moment.host_ns, device.force(raw), 0.0, (0.0, 0.0, 0.0))
+            return self.forces.include(force, device.temperature_c(raw), device.step_rad)
         try:
             angles = device.angles(raw)
         except ValueError:

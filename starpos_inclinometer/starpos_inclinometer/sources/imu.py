@@ -70,7 +70,7 @@ class ImuSource(TiltSource):
     def _hear(self, message: Imu, info: Mapping[str, Any]) -> None:
         self._heard_s = self._clock.read().monotonic_s
         before = self._tilts.unrest
-        reading = self._tilts.take(message, self._clock.now_ns())
+        reading = self._tilts.receive(message, self._clock.now_ns())
         if reading is not None:
             self._readings.append(reading)
             self._told_s = self._heard_s

@@ -12,6 +12,8 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
+from rclpy.time import Time
+
 from starpos.instrument.tilt_log import noise_text
 from starpos.messages.tilt import TIME_UNKNOWN, Reading
 from starpos_inclinometer.clock import ArrivalFilter, Moment
@@ -28,7 +30,7 @@ from starpos_inclinometer.sources.mcu_protocol import (
     mcu_follows,
 )
 from starpos_inclinometer.sources.serial_link import SerialLink, port_refusal
-from starpos_inclinometer.sources.source import Arrival, Counts, LinkSource, Surroundings, TimedPulse
+from starpos_inclinometer.sources.source import Arrival, Counts, LinkSource, Surroundings
 from starpos_inclinometer.sources.tilts import (
     BoardSensor,
     Sca100t,
@@ -36,6 +38,7 @@ from starpos_inclinometer.sources.tilts import (
     Scl3300,
     noise_floor_rad,
 )
+from starpos_interfaces import msg
 
 # Error of a time through the serial line: an adapter's latency timer of 16 ms, evenly distributed.
 LINE_STDDEV_S = 0.016 / 12**0.5
@@ -51,13 +54,13 @@ QUEUE = 256
 
 
 class PulseTimes:
-    """Dates the edges of one board."""
+    """Dates the edges of one board: their stamps are the host's time, or UTC by the receiver's second (disciplined)."""
 
     def __init__(self) -> None:
         self.dated = self.undated = 0
         # The state of the receiver's second, for a person to read.
         self.second = "no pulse yet"
-        self._queue: deque[TimedPulse] = deque(maxlen=QUEUE)
+        self._queue: deque[msg.Pulse] = deque(maxlen=QUEUE)
         self._sequences: dict[int, tuple[int, int]] = {}
         # (device s, UTC s) of the last two pulses that fit each other.
         self._seconds: deque[tuple[float, int]] = deque(maxlen=2)
@@ -66,7 +69,7 @@ class PulseTimes:
         """Forget the receiver's pulses, because the board's clock was reset."""
         self._seconds.clear()
 
-    def fetch(self) -> list[TimedPulse]:
+    def fetch(self) -> list[msg.Pulse]:
         """Return the edges that were dated since the last call, in order."""
         dated = list(self._queue)
         self._queue.clear()
@@ -84,19 +87,19 @@ class PulseTimes:
         if pulse.input == Input.PPS:
             self._follow(device_s, host_ns)
         utc_s = self._by_second(device_s)
+        stamp_ns = host_ns if utc_s is None else utc_s[0] * 10**9 + round(utc_s[1] * 1e9)
         self.dated += 1
-        self._queue.append(
-            TimedPulse(
-                input=pulse.input,
-                rising=pulse.rising,
-                sequence=sequence,
-                bounces=pulse.bounces,
-                device_time_s=device_s,
-                stamp_ns=host_ns if utc_s is None else utc_s[0] * 10**9 + round(utc_s[1] * 1e9),
-                stddev_s=LINE_STDDEV_S if utc_s is None else SECOND_STDDEV_S,
-                disciplined=utc_s is not None,
-            )
+        dated = msg.Pulse(
+            input=pulse.input,
+            rising=pulse.rising,
+            sequence=sequence,
+            bounces=pulse.bounces,
+            device_time=device_s,
+            stamp_stddev=LINE_STDDEV_S if utc_s is None else SECOND_STDDEV_S,
+            disciplined=utc_s is not None,
         )
+        dated.header.stamp = Time(nanoseconds=max(stamp_ns, 0)).to_msg()
+        self._queue.append(dated)
 
     def _continued(self, pulse: Pulse) -> int:
         """Number of the edge, counted on over wraps; after a reset of the board it jumps, as for lost edges."""
@@ -357,7 +360,7 @@ class McuSource(LinkSource):
     def fetch(self) -> list[Reading]:
         return self._tilts.read(self._link.fetch())
 
-    def fetch_pulses(self) -> list[TimedPulse]:
+    def fetch_pulses(self) -> list[msg.Pulse]:
         return self._tilts.pulses.fetch()
 
     def _complaint(self) -> str:

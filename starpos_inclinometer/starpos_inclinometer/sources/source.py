@@ -16,6 +16,7 @@ from rclpy.node import Node
 from starpos.messages.tilt import Reading
 from starpos_common.topics import Take
 from starpos_inclinometer.clock import HostClock, Moment, Step
+from starpos_interfaces.msg import Pulse
 
 # A device that came back is read again within a second.
 RETRY_S = 0.4
@@ -70,24 +71,6 @@ class Arrival:
     identity: Any = None
     # Whether it was read soon after it was measured.
     dated: bool = True
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class TimedPulse:
-    """An edge with its time, as it is published.
-
-    input: of starpos_interfaces/Pulse.  sequence: counted on over resets.  bounces: edges since the one before that have
-    no line.  stamp_ns: the host's time, or UTC by the receiver's second if `disciplined`.
-    """
-
-    input: int
-    rising: bool
-    sequence: int
-    bounces: int
-    device_time_s: float
-    stamp_ns: int
-    stddev_s: float
-    disciplined: bool
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -241,8 +224,8 @@ class TiltSource:
         """Return the readings since the last call, in order."""
         raise NotImplementedError
 
-    def fetch_pulses(self) -> list[TimedPulse]:
-        """Return the edges that the device has timed since the last call, in order; most devices time none."""
+    def fetch_pulses(self) -> list[Pulse]:
+        """Return the edges that the device has timed since the last call, with their times; most devices time none."""
         return []
 
     def health(self) -> Health:

@@ -39,7 +39,7 @@ def noise_floor_rad(values: Mapping[str, Any]) -> float:
 
 
 class Temperature:
-    """Smooths readings in steps of STEP_C; its error grows while readings are missing."""
+    """Smooths readings in steps of READING_STEP_C; its error grows while readings are missing."""
 
     def __init__(self) -> None:
         self._value = math.nan
@@ -88,9 +88,10 @@ class SensorTilts:
         self.range_rad, self.stuck = range_rad, stuck
         # Smallest noise of a reading, even if the readings show less.
         self.noise_floor_rad = 0.0
-        # (xx, xy, yx, yy): from the sines of the sensor's x and y to those of S's.
+        # (xx, xy, yx, yy): from the sines of the sensor's x and y to the sines of S's.
         self.cross_axis: Sequence[float] = SQUARE_AXES
         self._usual_noise_rad, self._stuck_axis = usual_noise_rad, stuck_axis
+        self._axes = 0
         self._codes: tuple[float, ...] = ()
         self._equal: list[int] = []
 
@@ -113,6 +114,10 @@ class SensorTilts:
         shift: change of S's x and y (rad) if the temperature is 1 sigma off.
         """
         x, y = self.turned(angles)
+        if len(angles) != self._axes:
+            # A device may leave out its third axis.
+            self._axes, self._codes = len(angles), ()
+            self.noise.restart()
         if self._is_stuck(angles if codes is None else codes):
             flags |= STUCK
         # For a sensor without z, beyond 90 deg is upside down.
@@ -167,10 +172,11 @@ class SensorTilts:
         return xx * cx / x, xy * cy / x, yx * cx / y, yy * cy / y
 
     def _is_stuck(self, codes: tuple[float, ...]) -> bool:
-        before = (
-            zip(codes, self._codes, self._equal, strict=True) if self._codes else ((0, 1, 0) for _ in codes)
-        )
-        self._equal = [count + 1 if code == last else 1 for code, last, count in before]
+        if not self._codes:
+            self._equal = [1] * len(codes)
+        else:
+            before = zip(codes, self._codes, self._equal, strict=True)
+            self._equal = [count + 1 if code == last else 1 for code, last, count in before]
         self._codes = codes
         return 0 < self.stuck <= min(self._equal) or 0 < self._stuck_axis <= max(self._equal)
 

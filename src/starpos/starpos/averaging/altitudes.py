@@ -12,8 +12,9 @@ import numpy as np
 from starpos import rotation
 from starpos._numeric.roots import symmetric_root
 from starpos.averaging.average import SCATTER, Average
-from starpos.earth.ellipsoid import curvature_radii_m
+from starpos.earth.ellipsoid import curvature_radii_m, enu_axes, place_of_zenith
 from starpos.earth.orientation import EarthState, station_velocity
+from starpos.earth.place import Place
 from starpos.earth.refraction import MIN_COS_ZENITH, Atmosphere
 from starpos.errors import FixError
 from starpos.fix.budget import tilt_terms, time_terms
@@ -24,7 +25,6 @@ from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import Tilt
 from starpos.instrument.instrument import UNKNOWN_ARCSEC, Calibration
 from starpos.instrument.mounting import Mounting, angles_at
-from starpos.sky.site import Site
 from starpos.units import ARCSEC, SIGMA_PER_MAD
 
 # so near the zenith a direction has hardly an elevation to speak of
@@ -124,7 +124,7 @@ def place_of_circles(circles: Sequence[Circle], near: tuple[float, float] | None
             f"determine a place: without a roll it takes three (frames of a camera that stands still are one)"
             + (", or two and --near LAT LON, because two circles meet in two places" if number == 2 else "")
         )
-    part = whole.take(_sound(whole))
+    part = whole.subset(_sound(whole))
     return _average(part, _answer(part, near), len(circles))
 
 
@@ -166,7 +166,7 @@ class Directions:
         """Whether A3 is known too badly for a linear error."""
         return any(g[0].terms[0].covariance[0, 0] > LINEAR_A3_RAD**2 for g in self.circles)
 
-    def take(self, rows: np.ndarray) -> "Directions":
+    def subset(self, rows: np.ndarray) -> "Directions":
         """Some of the directions."""
         return Directions(
             [self.circles[k] for k in rows], {n: c[np.ix_(rows, rows)] for n, c in self.sources.items()}
@@ -265,7 +265,7 @@ def _sound(whole: Directions) -> np.ndarray:
             return every
         if np.array_equal(agree, rows):
             break
-        rows, part = agree, whole.take(agree)
+        rows, part = agree, whole.subset(agree)
         found = _refined(part, np.linalg.inv(part.covariance), zenith)
         zenith = None if found is None else found.zenith
     return rows
@@ -398,7 +398,7 @@ def _degrees(zenith: np.ndarray) -> tuple[float, float]:
 
 def _enu(zenith: np.ndarray) -> np.ndarray:
     """East, north and up (3, 3) in ITRS at a zenith (3,)."""
-    return Site(*_degrees(zenith)).enu
+    return enu_axes(*place_of_zenith(zenith))
 
 
 AXIS_ROUNDS, SETTLED_CHI2, FIRST_DAMPING, LAST_DAMPING = 80, 1e-6, 1e-3, 1e9
@@ -406,8 +406,6 @@ AXIS_ROUNDS, SETTLED_CHI2, FIRST_DAMPING, LAST_DAMPING = 80, 1e-6, 1e-3, 1e9
 MIN_RAD = 1e-9
 # number of zeniths that are tried, the ones that fit best at first
 TRIED = 4
-# an answer is excluded if its fit is worse by this
-AXIS_EXCLUDED_SIGMA = 6.0
 # minimum number of directions that determine an axis, with the zenith known and unknown
 FEWEST, MIN_WITHOUT_SITE = 2, 4
 # how long A3 may be used
@@ -474,8 +472,7 @@ def find_axis(
     circles_of: CirclesOf,
     given: Calibration,
     ray: np.ndarray,
-    site: Site | None = None,
-    site_stddev_rad: float = 0.0,
+    site: Place | None = None,
     near: tuple[float, float] | None = None,
 ) -> FoundAxis:
     """Fit A3's axis, and the zenith unless a site is given; `given` counts as well as it is known.
@@ -491,13 +488,13 @@ def find_axis(
             f"it takes {fewest} or more (frames of a camera that stands still are one)"
         )
     if site is not None:
-        zeniths = [site.enu[2]]
+        zeniths = [site.plumb_axes[2]]
     else:
         tried = sorted(starts(first), key=lambda z: float(np.median(np.abs(first.residual(z)[0]))))
         zeniths = [*_round(first), *tried[:TRIED]]
     found: list[tuple[float, FoundAxis]] = []
     for zenith in zeniths:
-        one = _fitted(circles_of, given, ray, zenith, None if site is None else site_stddev_rad)
+        one = _fitted(circles_of, given, ray, zenith, None if site is None else site.plumb_stddev)
         if one is not None:
             found.append(one)
     if not found:
@@ -506,11 +503,11 @@ def find_axis(
         )
     found.sort(key=lambda f: f[0])
     best = found[0][1]
-    left = [f for chi2, f in found if chi2 - found[0][0] < AXIS_EXCLUDED_SIGMA**2 * (1 + best.scatter2)]
+    left = [f for chi2, f in found if chi2 - found[0][0] < EXCLUDED_SIGMA**2 * (1 + best.scatter2)]
     if near is not None:
         there = rotation.unit_vector(near[1], near[0])
         return max(left, key=lambda f: float(f.zenith @ there))
-    if max(np.linalg.norm(f.zenith - best.zenith) for f in left) > 2 * AXIS_EXCLUDED_SIGMA * _wide(best):
+    if max(np.linalg.norm(f.zenith - best.zenith) for f in left) > 2 * EXCLUDED_SIGMA * _wide(best):
         raise FixError(
             "the elevations leave two places and two A3: turn the camera to directions of other altitudes too, state A3 "
             "better, or say where it is with --near LAT LON"

@@ -66,7 +66,7 @@ class Remembered:
             fixes=1,
             attitude=f.camera.rotation.T,
             up=f.camera.rotation.T @ zenith_of(f.latitude, f.longitude),
-            place=plane.seen(f)[:2],
+            place=plane.coordinates(f)[:2],
             to_rad=np.linalg.inv(turn @ f.levelling[:3]),
             shared=np.hstack(factors),
             sigma=_sigma(own),
@@ -241,7 +241,7 @@ def average(fixes: Sequence[Fix]) -> Average:
 def _averaged(in_order: Sequence[Fix], frame_sigma: float) -> "Averager":
     averager = Averager(frame_sigma)
     for f in in_order:
-        averager.add(f)
+        averager.include(f)
     averager.look_again()
     return averager
 
@@ -311,14 +311,14 @@ class _Track:
 
     def begin(self, f: Fix) -> "_Track":
         """The track with its first fix, which nothing can contradict."""
-        return self._extended(f, self.place_filter.add(self._scattered(f), self.pose)[0])
+        return self._including(f, self.place_filter.updated(self._scattered(f), self.pose)[0])
 
-    def add(self, f: Fix) -> "_Track | None":
+    def with_fix(self, f: Fix) -> "_Track | None":
         """The track with one more fix; None if the fix lies too far off."""
-        extended, sigmas = self.place_filter.add(self._scattered(f), self.pose)
+        extended, sigmas = self.place_filter.updated(self._scattered(f), self.pose)
         if sigmas > GATE_SIGMA or not extended.straight_from(self.place_filter):
             return None
-        return self._extended(f, extended)
+        return self._including(f, extended)
 
     def terms(self, last: Fix) -> tuple[ErrorTerm, ...]:
         """The budget of the average, whose last fix is `last`.
@@ -332,7 +332,7 @@ class _Track:
         """The fix with the scatter of those before as one more error of its own."""
         return _with_scatter(f, self.claim.frame_sigma)
 
-    def _extended(self, f: Fix, extended: PlaceFilter) -> "_Track":
+    def _including(self, f: Fix, extended: PlaceFilter) -> "_Track":
         frames, poses = self.frames + 1, self.poses + (self.in_pose == 0)
         seen = Remembered.of(f, self.pose, poses, extended.plane)
         return replace(
@@ -351,7 +351,7 @@ def _with_scatter(f: Fix, sigma: float) -> Fix:
 
 
 class Averager:
-    """Averages fixes as they come in: `add` them in order of time and read `average`.  Its memory does not grow.
+    """Averages fixes as they come in: `include` them in order of time and read `average`.  Its memory does not grow.
 
     frame_sigma (rad): scatter of the fixes beyond their budgets, as far as it is known before the first.
     """
@@ -399,7 +399,7 @@ class Averager:
             track = self._track
             self._track = replace(track, claim=track.claim.looked_at(track.place_filter.east_north_m))
 
-    def add(self, f: Fix) -> None:
+    def include(self, f: Fix) -> None:
         """Take in one more fix, later than all before."""
         track = self._track
         if track is None:
@@ -409,8 +409,8 @@ class Averager:
         if slip is None:
             track = self._touch(track, f)
         self._last = f
-        extended = None if slip else track.add(f)
-        rival = self._rival.add(f) if self._rival else None
+        extended = None if slip else track.with_fix(f)
+        rival = self._rival.with_fix(f) if self._rival else None
         if extended is not None:
             self._track, self._disbelieved = extended, 0
             # a rival that this fix contradicts began with a wrong fix

@@ -57,7 +57,7 @@ class Plane:
         """East, north (2,) in m of a place (rad)."""
         return self.axes @ (zenith_of(latitude, longitude) - self.zenith) * self.radii
 
-    def seen(self, f: Fix) -> np.ndarray:
+    def coordinates(self, f: Fix) -> np.ndarray:
         """East, north, heading (3,) of a fix relative to the plane, in UNIT."""
         moved = self.across(f.latitude, f.longitude)
         heading = f.heading + self.convergence(f.latitude, f.longitude) - self.heading
@@ -140,7 +140,7 @@ class PlaceFilter:
         """The filter at an unknown place in the plane of a fix, with all that is known of the instrument's errors."""
         return replace(self.forget((True, True, True)), plane=Plane.at(f))
 
-    def add(self, f: Fix, pose: Fix) -> tuple["PlaceFilter", float]:
+    def updated(self, f: Fix, pose: Fix) -> tuple["PlaceFilter", float]:
         """The filter with one more fix, and by how many sigma the fix differed from what was expected.
 
         pose: the first fix since the camera was touched.  Raises ValueError if the fix has other error terms.
@@ -154,7 +154,7 @@ class PlaceFilter:
                 noise[k] = t.variance * factor @ factor.T
             else:
                 shared[:, now.columns[k]] = factor
-        seen, sigmas = self.plane.seen(f), 0.0
+        seen, sigmas = self.plane.coordinates(f), 0.0
         known, which = self.known, np.flatnonzero(self.known)
         # the state's new error is kept @ its old error + brought @ the fix's own error
         kept, brought = np.eye(len(now.state)), np.zeros((len(now.state), 3))

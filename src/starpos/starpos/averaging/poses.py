@@ -79,8 +79,7 @@ class MeanAttitude:
 def mean_attitude(attitudes: Sequence[AttitudeAtPlace]) -> MeanAttitude:
     """The mean of one or more frames; FixError if the camera turned between them."""
     cameras = np.array([a.camera.rotation for a in attitudes])
-    axes = np.tile(np.eye(3), (len(cameras), 1))
-    mean = rotation.best_rotation(axes, np.concatenate(cameras.swapaxes(1, 2)))
+    mean = rotation.mean_rotation(cameras)
     for attitude, camera in zip(attitudes, cameras, strict=True):
         off = rotation.to_vector(camera @ mean.T)
         if off @ np.linalg.solve(attitude.camera.covariance, off) > TURN_SIGMAS**2:
@@ -98,8 +97,7 @@ def mean_attitude(attitudes: Sequence[AttitudeAtPlace]) -> MeanAttitude:
 
 def _mean(links: Sequence[Attitude]) -> Attitude:
     """The mean of attitudes whose budgets name the same sources in the same order."""
-    axes = np.tile(np.eye(3), (len(links), 1))
-    mean = rotation.best_rotation(axes, np.concatenate([link.rotation.T for link in links]))
+    mean = rotation.mean_rotation(np.array([link.rotation for link in links]))
     return link_attitude(mean, tuple(map(_mean_term, zip(*(k.terms for k in links), strict=True))))
 
 

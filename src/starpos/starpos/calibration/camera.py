@@ -32,7 +32,7 @@ from starpos.sky import deeper
 from starpos.sky.catalogue import Catalogue
 
 # the sky determines a parameter if its sigma is below this share of the prior's
-TOLD = 0.5
+DETERMINED = 0.5
 # sigma; a parameter further off than this is not of the given camera
 BEYOND_PRIOR = 5.0
 # stars for each free parameter; with fewer, one wrong match in a corner can look like a lens
@@ -78,9 +78,9 @@ class Intrinsics:
         return np.sqrt(np.diag(self.covariance))
 
     @property
-    def told(self) -> np.ndarray:
+    def determined(self) -> np.ndarray:
         """Mask (P,) of those parameters that the sky determines; the others are held by their priors."""
-        return self.sigma < TOLD * self.prior_sigma
+        return self.sigma < DETERMINED * self.prior_sigma
 
     @property
     def rms_px(self) -> float:

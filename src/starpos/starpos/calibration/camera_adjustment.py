@@ -180,7 +180,7 @@ class CameraAdjustment:
         """The camera with the unknowns q (U,)."""
         return with_values(self.given, camera_values(self.given) + self.named_per_unit() @ q)
 
-    def seen(self, state: CameraEstimate) -> np.ndarray:
+    def light(self, state: CameraEstimate) -> np.ndarray:
         """Directions (N, 3) in C from which the light of the stars comes."""
         u = np.einsum("nij,nj->ni", state.attitudes[self.frame], self.places)
         strength, *shrink = (state.q * self.sigma)[-len(OF_THE_AIR) :]
@@ -196,7 +196,7 @@ class CameraAdjustment:
 
     def residual(self, state: CameraEstimate) -> np.ndarray:
         """Measured minus predicted places (N, 2) in px."""
-        return self.xy - self.camera(state.q).project(self.seen(state))
+        return self.xy - self.camera(state.q).project(self.light(state))
 
     def turned(self, state: CameraEstimate, turns: np.ndarray) -> CameraEstimate:
         """Each attitude turned by a small rotation (F, 3) about C's axes."""
@@ -205,7 +205,7 @@ class CameraAdjustment:
 
     def derivatives(self, state: CameraEstimate) -> tuple[np.ndarray, np.ndarray]:
         """Derivatives of the predicted pixels with respect to q (N, 2, U) and to a turn of their own frame (N, 2, 3)."""
-        seen, camera = self.seen(state), self.camera(state.q)
+        seen, camera = self.light(state), self.camera(state.q)
         here = camera.project(seen)
         of_q = np.zeros((len(here), 2, len(self.sigma)))
         of_camera = len(self.sigma) - len(OF_THE_AIR)
@@ -216,7 +216,7 @@ class CameraAdjustment:
             if k < of_camera:
                 of_q[..., k] = self.camera(q).project(seen) - here
             else:
-                of_q[..., k] = (camera.project(self.seen(replace(state, q=q))) - here) * 1e3
+                of_q[..., k] = (camera.project(self.light(replace(state, q=q))) - here) * 1e3
         of_turn = []
         # the light turns with the sky; the change of the refraction over a step is negligible
         for turn in np.eye(3) * STEP_RAD:

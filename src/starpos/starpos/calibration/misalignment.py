@@ -20,6 +20,7 @@ from starpos.calibration.plumb_line import (
     typical,
 )
 from starpos.earth.ellipsoid import EARTH_RADIUS_M, enu_axes
+from starpos.earth.place import Place
 from starpos.errors import FixError
 from starpos.fix.budget import Sensitivity, local_north
 from starpos.fix.fix import Fix
@@ -44,7 +45,6 @@ from starpos.instrument.instrument import (
 from starpos.instrument.mounting import angles_at, stated_variances
 from starpos.instrument.tilt_log import Tilts
 from starpos.progress import Progress, quiet
-from starpos.sky.site import Site
 from starpos.units import ARCSEC
 
 SOLVING_ROUNDS = 4
@@ -100,15 +100,13 @@ def calibrate_at(
     solver: Solver,
     frames: Sequence[Stars | Pointing],
     tilts: Tilts,
-    site: Site,
-    site_stddev_arcsec: float = 0.0,
+    site: Place,
     turn_stddev_deg: float = 180.0,
     progress: Progress = quiet,
     known: Known = NOTHING_KNOWN,
 ) -> Calibrated:
-    """A3 from one or more frames at a known astronomic place; the solver's A3 need not be near.
+    """A3 from one or more frames at a known place; the solver's A3 need not be near.
 
-    site_stddev_arcsec: sigma of the place.
     known: the stars of frames, by the frames' numbers, that only a longer search identifies than the solver's.
     turn_stddev_deg: sigma of the turn of the solver's A3 about the plumb line.  One lean of the instrument does not
     determine that turn, and only a fix at another lean needs it; the covariance shows it.
@@ -117,15 +115,15 @@ def calibrate_at(
 
     def find(readings: Readings, a3: np.ndarray, fixes: list[Fix]) -> PlumbLine:
         common = sum(np.trace(t.covariance[:2, :2]) / 2 for f in fixes for t in f.terms if t.name in OF_PLACE)
-        sigma = np.hypot(site_stddev_arcsec * ARCSEC, np.sqrt(common / len(fixes)) / EARTH_RADIUS_M)
-        return hang(readings, a3, site.enu[2], float(sigma), np.radians(turn_stddev_deg))
+        sigma = np.hypot(site.plumb_stddev, np.sqrt(common / len(fixes)) / EARTH_RADIUS_M)
+        return hang(readings, a3, site.plumb_axes[2], float(sigma), np.radians(turn_stddev_deg))
 
     if not frames:
         raise FixError("there is no frame to calibrate from: give at least one")
     found = calibrate(solver, frames, tilts, find, fewest=1, progress=progress, known=known)
     if not found.fixes:
         raise FixError(f"no frame has a fix to calibrate from: {found.solutions[0].message}")
-    if min(f.camera.rotation[:, 2] @ site.enu[2] for f in found.fixes) < 0:
+    if min(f.camera.rotation[:, 2] @ site.plumb_axes[2] for f in found.fixes) < 0:
         raise FixError(
             "from the place that was given the camera would look into the ground: check latitude and longitude, their "
             "order and signs, and the clock"
@@ -289,7 +287,7 @@ def _agreed(find: FindPlumbLine, solved: list[Fix], a3: np.ndarray, errors: Incl
     rows, plumb = _agreeing(find, whole, solved, a3, errors)
     sound = [solved[k] for k in rows]
     # a fix with a bad tilt, hence a bad refraction, may have split the pose of the sound ones
-    readings = replace(whole.take(rows), pose=poses_of(sound))
+    readings = replace(whole.subset(rows), pose=poses_of(sound))
     _, scatter = settled(plumb, readings)
     # once more about the answer, with the errors that the poses show
     noisy = np.hypot(readings.sigma, scatter.noise_sigma)
@@ -329,9 +327,9 @@ def _kept(
 ) -> tuple[np.ndarray, PlumbLine]:
     """The frames in `rows` without those that their plumb line shows to disagree, and the plumb line of the rest."""
     for _ in range(JUDGED):
-        plumb = find(whole.take(rows), a3, [solved[k] for k in rows])
+        plumb = find(whole.subset(rows), a3, [solved[k] for k in rows])
         size = np.linalg.norm(plumb.left, axis=1)
-        usual = np.hypot(whole.take(rows).sigma, max(typical(plumb.left, 5), errors.pose_rad))
+        usual = np.hypot(whole.subset(rows).sigma, max(typical(plumb.left, 5), errors.pose_rad))
         agree = size < OUTLIER_SIGMA * usual
         if agree.all() or agree.sum() < (1 - MAX_OUTLIERS) * len(solved):
             break
@@ -363,7 +361,7 @@ def _unhidden(find: FindPlumbLine, whole: Readings, solved: list[Fix], a3: np.nd
     # the closest alone, until they are the same; then all that agree with them, until these are
     for closest in (True, False):
         for _ in range(JUDGED):
-            left = _left(whole, find(whole.take(rows), a3, [solved[k] for k in rows]))
+            left = _left(whole, find(whole.subset(rows), a3, [solved[k] for k in rows]))
             usual = np.hypot(whole.sigma, max(typical(left[rows], 5), whole.pose_sigma))
             off = np.linalg.norm(left, axis=1) / usual
             before, rows = rows, np.sort(np.argsort(off, kind="stable")[:most])
@@ -479,8 +477,7 @@ TURN_DEG = 1e-3
 def calibrate_fixed(
     solver: Solver,
     frames: Sequence[Stars | Pointing],
-    site: Site,
-    site_stddev_arcsec: float = 0.0,
+    site: Place,
     sag_arcsec_per_sqrt_hour: float = SAG_ARCSEC_PER_SQRT_HOUR,
     progress: Progress = quiet,
     known: Known = NOTHING_KNOWN,
@@ -495,7 +492,7 @@ def calibrate_fixed(
         solver,
         instrument=replace(solver.instrument, inclinometer=level, inclinometer_model="", vertical=None),
     )
-    found = calibrate_at(bare, frames, OWN_LEVEL, site, site_stddev_arcsec, TURN_DEG, progress, known)
+    found = calibrate_at(bare, frames, OWN_LEVEL, site, TURN_DEG, progress, known)
     fixes = found.fixes
     if poses_of(fixes).any():
         raise FixError(
@@ -503,9 +500,7 @@ def calibrate_fixed(
             "that nothing moved"
         )
     attitudes = np.array([f.camera.rotation for f in fixes])
-    mean = rotation.best_rotation(
-        np.tile(np.eye(3), (len(fixes), 1)), np.concatenate(attitudes.swapaxes(1, 2))
-    )
+    mean = rotation.mean_rotation(attitudes)
     covariance = np.mean([f.camera.covariance for f in fixes], axis=0) / ARCSEC**2
     vertical = CameraVertical(*(tuple(map(tuple, m.tolist())) for m in (mean, covariance)))
     # a level that always reads zero has no response

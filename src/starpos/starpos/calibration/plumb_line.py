@@ -73,7 +73,7 @@ class Readings:
             column_sigma=np.concatenate([np.ones(walked.shape[2]), np.maximum(np.sqrt(variances), KNOWN)]),
         )
 
-    def take(self, rows: np.ndarray) -> "Readings":
+    def subset(self, rows: np.ndarray) -> "Readings":
         """The readings of the frames in `rows`."""
         per_frame = ("utc_unix_s", "to_camera", "plumb", "heading", "sigma", "columns")
         pose = np.unique(self.pose[rows], return_inverse=True)[1]
@@ -274,7 +274,7 @@ class _State:
     p: np.ndarray
     start: np.ndarray
 
-    def take(self, rows: np.ndarray) -> "_State":
+    def subset(self, rows: np.ndarray) -> "_State":
         return _State(a3=self.a3[rows], up=self.up[rows], p=self.p[rows], start=self.start[rows])
 
 
@@ -315,7 +315,7 @@ def fits(
         best[rows] = slopes.cost[better]
         answer.a3[rows], answer.up[rows], answer.p[rows] = now.a3[better], now.up[better], now.p[better]
         step, gain = _step(model, slopes, now.p)
-        now = _stepped(model, now, step).take(gain >= SETTLED_CHI2)
+        now = _stepped(model, now, step).subset(gain >= SETTLED_CHI2)
         if not len(now.start):
             break
     slopes = _slopes(model, answer)

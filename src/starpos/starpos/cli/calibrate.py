@@ -17,8 +17,8 @@ from starpos.cli.console import add_formats
 from starpos.cli.inputs import checked_tilts, frames_among, given_of, reader_of
 from starpos.cli.options import add_vertical, vertical_of
 from starpos.cli.overwriting import CAMERA_NAME, Written, save_instrument
+from starpos.earth.place import Place
 from starpos.earth.refraction import Atmosphere
-from starpos.earth.vertical import astronomic
 from starpos.errors import CalibrationError, FixError, FrameError, InstrumentError, StarposError
 from starpos.fix.checks import FIND_TURN, at_another_lean, may_turn
 from starpos.fix.searching import Sight, of_one_camera
@@ -42,7 +42,6 @@ from starpos.night.remarks import of_inclinometer
 from starpos.night.together import axis_of, circles_of
 from starpos.night.work import Solving
 from starpos.sky import catalogue
-from starpos.sky.site import Site
 from starpos.units import ARCSEC
 
 
@@ -149,17 +148,17 @@ def run_site(
     known: identifications of the frames so far.
     """
     solver = Solver(instrument, catalogue.load_catalogue(), options.atmosphere_of(args))
-    (site, stddev_arcsec), bar = _site(args), console.ProgressBar()
+    site, bar = _site(args), console.ProgressBar()
     if tilts is None:
         sag = SAG_ARCSEC_PER_SQRT_HOUR if args.sag is None else args.sag
-        found = calibrate_fixed(solver, frames, site, stddev_arcsec, sag, bar, known)
+        found = calibrate_fixed(solver, frames, site, sag, bar, known)
     elif instrument.vertical is not None:
         raise InstrumentError(
             f"{args.instrument} describes a camera fixed to the ground: give --fixed, or another instrument "
             f"file"
         )
     else:
-        found = calibrate_at(solver, frames, tilts, site, stddev_arcsec, options.turn_of(args), bar, known)
+        found = calibrate_at(solver, frames, tilts, site, options.turn_of(args), bar, known)
         for remark in of_inclinometer(instrument):
             console.complain("calibrate", remark)
     for solution in found.solutions:
@@ -181,14 +180,14 @@ def run_elevations(
     for row in circles_of(solver, pointings, tilts):
         if isinstance(row, StarposError):
             console.complain("calibrate", f"left out: {row}")
-    site, stddev_arcsec = _site(args)
-    found = axis_of(solver, pointings, tilts, site=site, site_stddev_arcsec=stddev_arcsec)
+    site = _site(args)
+    found = axis_of(solver, pointings, tilts, site=site)
     for remark in of_inclinometer(instrument):
         console.complain("calibrate", remark)
     calibration = found.calibration(instrument.calibration, options.turn_of(args))
     about = (
-        f"A3 of {calibration.frames} elevations in {found.directions} directions at {site.latitude_deg:+.6f} "
-        f"{site.longitude_deg:+.6f} (by gravity): "
+        f"A3 of {calibration.frames} elevations in {found.directions} directions at {_text_of(site)} "
+        "(by gravity): "
         "{:.5f} {:.5f} {:.5f} deg\n".format(*calibration.misalignment_deg)
         + f"the frame's centre in the inclinometer is known to {found.stddev_arcsec:.2f} arcsec; elevations "
         f"alone do not determine the turn about it, which does not matter for pointings without a roll\n"
@@ -209,26 +208,30 @@ def _save(args: argparse.Namespace, found: Calibrated, about: str) -> None:
         print(about, end="")
 
 
-def _site(args: argparse.Namespace) -> tuple[Site, float]:
-    """The astronomic place, and its sigma in arcsec."""
-    if not args.geodetic:
-        return Site(*args.site), 0.0
-    latitude, longitude = np.radians(args.site).tolist()
-    d = vertical_of(args).at(latitude, longitude)
-    return Site(*np.degrees(astronomic(latitude, longitude, d)).tolist()), d.stddev_arcsec
+def _site(args: argparse.Namespace) -> Place:
+    if args.geodetic:
+        return Place.on_ellipsoid(*args.site, vertical_of(args))
+    return Place.by_gravity(*args.site)
 
 
-def _about_site(found: Calibrated, site: Site) -> str:
+def _text_of(site: Place) -> str:
+    """Astronomic latitude and longitude in deg."""
+    latitude, longitude = np.degrees(site.plumb)
+    return f"{latitude:+.6f} {longitude:+.6f}"
+
+
+def _about_site(found: Calibrated, site: Place) -> str:
     c = found.instrument.calibration
     if found.instrument.vertical is not None:
         sag = found.instrument.inclinometer.drift_rad_per_sqrt_hour / ARCSEC
         return (
-            f"the vertical of a fixed camera of {c.frames} frames at {site.latitude_deg:+.6f} {site.longitude_deg:+.6f} "
+            f"the vertical of a fixed camera of {c.frames} frames at {_text_of(site)} "
             f"(by gravity), known to {found.plumb_stddev_arcsec:.2f} arcsec, and {sag:g} arcsec of sag in an hour\n"
         )
     lines = [
-        f"A3 of {c.frames} frames at {site.latitude_deg:+.6f} {site.longitude_deg:+.6f} (by gravity): "
-        "{:.5f} {:.5f} {:.5f} deg".format(*c.misalignment_deg),
+        f"A3 of {c.frames} frames at {_text_of(site)} (by gravity): {{:.5f}} {{:.5f}} {{:.5f}} deg".format(
+            *c.misalignment_deg
+        ),
         f"the plumb line in the camera is known to {found.plumb_stddev_arcsec:.2f} arcsec; "
         + at_another_lean(c),
     ]
@@ -466,7 +469,9 @@ def _about(found: FromSky) -> str:
         f"{len(found.used)} frames, {len(fit.xy)} stars ({fit.rejected} left out): {fit.rms_px:.3f} px rms an axis, "
         f"of the given camera, its scale fitted, {rms(fit.before):.3f} px"
     ]
-    for name, value, sigma, told in zip(parameters(fit.camera), fit.values, fit.sigma, fit.told, strict=True):
+    for name, value, sigma, told in zip(
+        parameters(fit.camera), fit.values, fit.sigma, fit.determined, strict=True
+    ):
         digits = max(0, 1 - int(np.floor(np.log10(sigma))))
         by = "from the stars" if told else "from the prior"
         lines.append(f"  {name:<4} {value:>16.{digits}f} +- {sigma:<12.{digits}f} {by}")
@@ -510,7 +515,7 @@ def _json_of(found: FromSky, path: str) -> dict:
         "distortion": c.distortion,
         "sigma": dict(zip(parameters(c), fit.sigma, strict=True)),
         "covariance": fit.covariance,
-        "told": [name for name, told in zip(parameters(c), fit.told, strict=True) if told],
+        "told": [name for name, told in zip(parameters(c), fit.determined, strict=True) if told],
         "rms_px": fit.rms_px,
         "rms_before_px": rms(fit.before),
         "scatter_px": fit.scatter_px,

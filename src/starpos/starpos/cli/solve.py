@@ -254,7 +254,9 @@ def run_pointings(args: argparse.Namespace) -> int:
         raise InstrumentError("--pointings needs the tilts: give --tilt CSV")
     if args.jobs is not None or args.scheduler is not None:
         raise InstrumentError("--jobs and --scheduler are for frames: --pointings take only a moment")
-    solver = _solver_of(args)
+    # pointings need no focal length
+    instrument = options.instrument_of(args, NO_CAMERA)
+    solver = Solver(instrument, catalogue.load_catalogue(), options.atmosphere_of(args))
     check_save(args, solver.instrument)
     tilts = NO_TILTS if own_level else checked_tilts("solve", args.tilt, solver.instrument)
     whole = [p for p in pointings if p.has_roll]
@@ -270,12 +272,6 @@ def run_pointings(args: argparse.Namespace) -> int:
         solutions = [next(solved) if p.has_roll else solver.solve_pointing(p) for p in pointings]
     each = (FrameAnswer(p.source, s) for p, s in zip(pointings, solutions, strict=True))
     return tell(args, output, night, NightAnswers(each, given=given, turned=found), vertical)
-
-
-def _solver_of(args: argparse.Namespace) -> Solver:
-    """The solver for pointings, which needs no focal length."""
-    instrument = options.instrument_of(args, NO_CAMERA)
-    return Solver(instrument, catalogue.load_catalogue(), options.atmosphere_of(args))
 
 
 def _from_elevations(
@@ -427,7 +423,8 @@ def _run(args: argparse.Namespace) -> int:
                 plans.append((night, _work(args, night, about, own_level, place)))
             except TiltError as error:
                 statuses.append(_refused(error, given))
-        calls = [(OnFile(read, how.work(work)), path) for night, work in plans for path in night.frames]
+        on_files = [OnFile(read, how.work(work)) for _, work in plans]
+        calls = [(f, path) for f, (night, _) in zip(on_files, plans, strict=True) for path in night.frames]
         # the lines of a turn come at its end, and show no progress
         sights = inputs.watched(workers.map(calls), len(calls), silent=how.one_by_one)
         for night, work in plans:

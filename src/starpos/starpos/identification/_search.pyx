@@ -261,6 +261,8 @@ cdef class Lost:
     cdef TriangleTable table
     cdef BrightTable bright
     cdef Limits limits
+    # the stages as they are given, and as numbers once the looks have failed
+    cdef object plan
     cdef int[MAX_STAGES] stars
     cdef double[MAX_STAGES] stage_px
     cdef int stages, stage, looks
@@ -274,14 +276,13 @@ cdef class Lost:
 
     cdef int _take(self, Judge judge, TriangleTable table, BrightTable bright, stages, bint crowded, Limits limits) except -1:
         """Take what a new one searches by."""
-        cdef int most = max(limits.most_looked_at, limits.most_supported) + 1, k
+        cdef int most = max(limits.most_looked_at, limits.most_supported) + 1
         self.judge, self.table, self.bright, self.limits = judge, table, bright, limits
         self.crowded, self.looks, self.stages = crowded, LOOKS if crowded else 0, len(stages)
         if not 0 < self.stages <= MAX_STAGES:
             raise ValueError(f"{self.stages} stages of a search: 1 to {MAX_STAGES} are possible")
-        for k in range(self.stages):
-            self.stars[k], self.stage_px[k] = stages[k]
-        self.error_px = self.stage_px[0]
+        self.plan = stages
+        _, self.error_px = stages[0]
         self.found = <Candidate *>malloc(most * (sizeof(Candidate) + sizeof(int)))
         self.radius = <double *>malloc((judge._deciding() + 1) * sizeof(double))
         if self.found == NULL or self.radius == NULL:
@@ -334,8 +335,12 @@ cdef class Lost:
         """Take the candidates of the next stage."""
         cdef FrameStars frame = self.judge.frame
         cdef Limits limits = self.limits
-        cdef double error_px = self.stage_px[self.stage]
-        cdef int k, done = 0, stars = min(self.stars[self.stage], frame.count)
+        cdef double error_px
+        cdef int k, done = 0, stars
+        if self.stage == 0:
+            for k in range(self.stages):
+                self.stars[k], self.stage_px[k] = self.plan[k]
+        error_px, stars = self.stage_px[self.stage], min(self.stars[self.stage], frame.count)
         if self.crowded:
             self.count = self.table.supported(
                 frame, stars, error_px, limits.most_looked_up, limits.most_in_crowd, limits.most_supported, self.found

@@ -229,10 +229,25 @@ def near_or_lost(
     The priors have half of the probability, if there are any.
     crowded: only triangles that others support are looked at, but all of those.
     """
-    prior = anywhere(field.focal_px, LOG_HALF if priors else 0.0)
-    finder = _finder(sky.catalogue, sky.triangles)
-    lost = finder.lost(field, sky.years, sky.velocity, prior, enough, stages, crowded)
-    return chain(_near(field, sky, priors, enough), lost) if priors else lost
+    if not priors:
+        return _lost(field, sky, 0.0, enough, stages, crowded)
+    return _near_or_lost(field, sky, priors, stages, enough, crowded)
+
+
+def _near_or_lost(
+    field: FrameStars, sky: Sky, priors: Priors, stages: Stages, enough: float, crowded: bool
+) -> Iterator[Identification]:
+    """Yield what the priors identify, and then, where that is asked for, what is identified without them."""
+    yield from _near(field, sky, priors, enough)
+    yield from _lost(field, sky, LOG_HALF, enough, stages, crowded)
+
+
+def _lost(
+    field: FrameStars, sky: Sky, log_share: float, enough: float, stages: Stages, crowded: bool
+) -> Iterator[Identification]:
+    """Identifications lost in space, which has that share of the probability."""
+    prior, finder = anywhere(field.focal_px, log_share), _finder(sky.catalogue, sky.triangles)
+    return finder.lost(field, sky.years, sky.velocity, prior, enough, stages, crowded)
 
 
 def identify_near(field: FrameStars | fisheye.WideField, sky: Sky, priors: Priors) -> Identification | None:

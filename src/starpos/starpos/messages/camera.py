@@ -129,8 +129,8 @@ class ExposureFacts:
         # facts for a frame whose Capture is lost; None: no Capture has ever come
         self._usual: _Facts | None = None
 
-    def take(self, message: Any) -> None:
-        """Take a Capture."""
+    def keep_capture(self, message: Any) -> None:
+        """Keep a Capture for its frame."""
         if len(self._captures) >= CAPTURES_KEPT:
             del self._captures[next(iter(self._captures))]
         self._captures[key_of(message.header)] = message

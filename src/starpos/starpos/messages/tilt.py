@@ -23,28 +23,13 @@ UNUSABLE = OUT_OF_RANGE | STUCK | SATURATED | TIME_UNKNOWN
 MAX_TILT_VARIANCE = 1.0
 
 
-@dataclass(frozen=True, kw_only=True)
-class TiltMessage:
-    """Fields of starpos_interfaces/Tilt."""
-
-    header: PlainHeader
-    x: float
-    y: float
-    covariance: tuple[float, ...]
-    temperature: float
-    sequence: int
-    flags: int
-    z: float
-    z_variance: float
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Reading:
-    """A tilt as it is published.
+    """A tilt as it is published: `message_to_tilt` takes it as it takes starpos_interfaces/Tilt.
 
     stamp_ns: the host's time.  x, y: rad, always finite.  covariance: rad2 (xx, xy, yx, yy).
     temperature_c: deg C, or NaN if it is not known.
-    z, z_variance: rad, rad2; NaN for a two-axis sensor.
+    z, z_variance: rad, rad2; NaN for a two-axis sensor.  frame_id: the inclinometer's frame.
     """
 
     stamp_ns: int
@@ -56,20 +41,17 @@ class Reading:
     flags: int
     z: float = math.nan
     z_variance: float = math.nan
+    frame_id: str = ""
 
-    def message(self, frame_id: str) -> TiltMessage:
-        """Make a message; frame_id: the inclinometer's frame."""
-        return TiltMessage(
-            header=PlainHeader(PlainStamp.of_ns(self.stamp_ns), frame_id),
-            x=self.x,
-            y=self.y,
-            covariance=self.covariance,
-            temperature=self.temperature_c,
-            sequence=self.sequence,
-            flags=self.flags,
-            z=self.z,
-            z_variance=self.z_variance,
-        )
+    @property
+    def header(self) -> PlainHeader:
+        """Stamp and frame."""
+        return PlainHeader(PlainStamp.of_ns(self.stamp_ns), self.frame_id)
+
+    @property
+    def temperature(self) -> float:
+        """The temperature, as the message names it."""
+        return self.temperature_c
 
 
 def message_to_tilt(message: Any, unknown_stddev_rad: float = SCA100T_NOISE_RAD) -> Tilt:
@@ -151,7 +133,7 @@ MAX_MESSAGES = 10_000
 
 
 @dataclass(frozen=True, slots=True)
-class Felt:
+class Acceleration:
     """Content of one message, at rest or not."""
 
     stamp_ns: int
@@ -167,7 +149,7 @@ class BadMessage(ValueError):
     """A message cannot be used; the text says why."""
 
 
-def felt(message: Any) -> Felt:
+def acceleration_of(message: Any) -> Acceleration:
     """Read a message; BadMessage if it has no stamp or holds NaN, infinity or a negative variance."""
     stamp_ns = message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec
     if stamp_ns <= 0:
@@ -182,13 +164,13 @@ def felt(message: Any) -> Felt:
         variance = (0.0, 0.0, 0.0)
     if not all(map(math.isfinite, (*force, *rotation, *variance))) or min(variance) < 0:
         raise BadMessage("holds NaN, infinity or a negative variance")
-    return Felt(stamp_ns, force, math.hypot(*rotation), variance)
+    return Acceleration(stamp_ns, force, math.hypot(*rotation), variance)
 
 
 @at_once
 @dataclass(frozen=True)
 class MeanForce:
-    """The messages of one span of time; forces is (N, 3), see `Felt`."""
+    """The messages of one span of time; forces is (N, 3), see `Acceleration`."""
 
     forces: np.ndarray
     mid_ns: int
@@ -198,7 +180,7 @@ class MeanForce:
     variance: np.ndarray
 
     @classmethod
-    def of(cls, messages: list[Felt]) -> "MeanForce":
+    def of(cls, messages: list[Acceleration]) -> "MeanForce":
         return cls(
             np.array([m.force for m in messages]),
             (messages[0].stamp_ns + messages[-1].stamp_ns) // 2,
@@ -253,7 +235,7 @@ class ForceAverager:
         self.duplicates = self.disordered = 0
         # How often the sequence of averages was interrupted.
         self.breaks = 0
-        self._messages: list[Felt] = []
+        self._messages: list[Acceleration] = []
         self._last_ns = 0
 
     def restart(self) -> None:
@@ -261,8 +243,8 @@ class ForceAverager:
         self.breaks += bool(self._messages)
         self._messages = []
 
-    def add(self, message: Felt) -> MeanForce | None:
-        """Take a message; return the average that it completes, if that has enough messages."""
+    def include(self, message: Acceleration) -> MeanForce | None:
+        """Include a message; return the average that it completes, if that has enough messages."""
         last_ns, messages = self._last_ns, self._messages
         if message.stamp_ns == last_ns:
             self.duplicates += 1
@@ -330,11 +312,11 @@ class ImuTilts:
         """White noise of a tilt by axis, rad, measured from the tilts; None: too few yet."""
         return self._noise.sigma
 
-    def take(self, message: Any, now_ns: int) -> Reading | None:
-        """Take a message; return the tilt that it completes.  now_ns: a stamp that is ahead of it is wrong."""
+    def receive(self, message: Any, now_ns: int) -> Reading | None:
+        """Average a message; return the tilt that it completes.  now_ns: a stamp that is ahead of it is wrong."""
         self.frame = message.header.frame_id
         try:
-            said = felt(message)
+            said = acceleration_of(message)
         except BadMessage:
             self.malformed += 1
             return None
@@ -345,20 +327,22 @@ class ImuTilts:
         self.age_s = (now_ns - said.stamp_ns) * 1e-9
         if self._scatter_alone:
             said = replace(said, variance=(0.0, 0.0, 0.0))
-        return self.add(said)
+        return self.include(said)
 
-    def add(self, said: Felt, temperature_c: float = math.nan, step_rad: float = 0.0) -> Reading | None:
-        """Take a reading of an accelerometer; return the tilt that it completes.
+    def include(
+        self, said: Acceleration, temperature_c: float = math.nan, step_rad: float = 0.0
+    ) -> Reading | None:
+        """Average a reading of an accelerometer; return the tilt that it completes.
 
         step_rad: the step of a reading, as a share of g; if it exceeds the noise, averaging does not remove the rounding.
         """
         breaks = self.averager.breaks
-        average = self.averager.add(said)
-        reading = None if average is None else self._told(average, temperature_c, step_rad)
+        average = self.averager.include(said)
+        reading = None if average is None else self._judged(average, temperature_c, step_rad)
         self._gap |= self.averager.breaks != breaks
         return reading
 
-    def _told(self, average: MeanForce, temperature_c: float, step_rad: float) -> Reading | None:
+    def _judged(self, average: MeanForce, temperature_c: float, step_rad: float) -> Reading | None:
         self.unrest = average.unrest(self._max_force_error, self._max_rotation)
         if self.unrest:
             self._sequence += 1

@@ -278,9 +278,9 @@ class VoyagePrior:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class StarAttitudes:
-    """Attitudes of the camera at F of the nodes: index (F,), camera_to_itrs (F, 3, 3).
+    """Attitudes of the camera at F of the nodes: index (F,), camera_to_itrs (F, 3, 3), C into ITRS.
 
-    covariance (F, 3, 3), by_refraction (F, 3): as `sightings.camera_attitude` has them.  stamp_stddev_s (F,).
+    covariance (F, 3, 3), by_refraction (F, 3); stamp_stddev_s (F,).
     """
 
     index: np.ndarray

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Frames under way: the attitude of the camera against the Earth by their stars, and the body's at a known place.
-
-No level is needed: only refraction and the diurnal aberration depend on the zenith, and hardly.
+"""Frames under way: the attitude of the camera against the Earth by their stars, and the body's at a known place.  No
+level is needed: only refraction and the diurnal aberration depend on the zenith, and hardly.
 """
 
 import math
@@ -23,7 +22,7 @@ from starpos.earth.place import Place
 from starpos.earth.refraction import Atmosphere, Refraction
 from starpos.errors import FixError, FrameError, InstrumentError, TimeError
 from starpos.fix import solver
-from starpos.fix.attitude import CAMERA, ENU, ITRS, LINK, Attitude
+from starpos.fix.attitude import CAMERA, ENU, GCRS, ITRS, LINK, Attitude
 from starpos.fix.camera_attitude import CameraAttitude
 from starpos.fix.sighting import Sighting
 from starpos.fix.solution import Solution
@@ -44,81 +43,24 @@ from starpos.units import ARCSEC
 # of an attitude without refraction; 1 sigma
 ROUGH = 20 * ARCSEC
 STEP_REFRACTION = 0.01
-NOT_BENT = np.zeros(3)
-# Refraction squeezes a frame more along the vertical than across. This turns the attitude across the axis if the middle
-# of the stars is off the axis (rad), and about it if stars spread farther one way than the other (share): 1 sigma.
-OFF_AXIS, SPREAD = 0.03, 0.25
-# sine of the lowest altitude that this is for
-LOWEST = 0.1
-CIRCLE = np.array([[np.cos(a), np.sin(a)] for a in np.arange(8) * np.pi / 4])
-
-
-def camera_attitude(
-    camera_to_itrs: np.ndarray, covariance: np.ndarray, by_refraction: np.ndarray = NOT_BENT
-) -> Attitude:
-    """Make the attitude camera_to_itrs (3, 3) of errors about the camera's axes: covariance (3, 3), rad2.
-
-    by_refraction (3,): rotation, rad, by which the camera is turned further if refraction is stronger by its own size.
-    """
-    return Attitude(
-        camera_to_itrs,
-        camera_to_itrs @ covariance @ camera_to_itrs.T,
-        of=CAMERA,
-        into=ITRS,
-        by_refraction=camera_to_itrs @ by_refraction,
-    )
-
-
-def roughly(camera_to_itrs: np.ndarray) -> Attitude:
-    """An attitude (3, 3) that is good to ROUGH."""
-    return camera_attitude(camera_to_itrs, np.eye(3) * ROUGH**2)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class SightingUnderWay(Sighting):
-    """A frame with only an attitude among the stars: `camera`, without refraction and diurnal aberration."""
-
-    @classmethod
-    def of(cls, attitude: CameraAttitude) -> "SightingUnderWay":
-        """The frame of an attitude that has a time; TimeError outside the IERS tables."""
-        assert attitude.utc_unix_s is not None
-        camera_to_itrs = earth_state(attitude.utc_unix_s).gcrs_to_itrs @ attitude.camera_to_gcrs
-        return cls(
-            utc_unix_s=attitude.utc_unix_s,
-            stamp_stddev_s=attitude.stamp_stddev_s,
-            clock_stddev_s=attitude.clock_stddev_s,
-            camera=camera_attitude(camera_to_itrs, attitude.covariance),
-        )
+class FrameUnderWay(Sighting):
+    """A sighting whose attitude is computed again under each zenith that is tried."""
 
     def rough(self) -> Attitude:
-        """The attitude where nothing is known of the place."""
+        """The attitude as it is without a place."""
         return roughly(self.camera.rotation)
 
     def under(self, zenith: np.ndarray, atmosphere: Atmosphere) -> Attitude:
-        """The attitude under a zenith (3,) in ITRS, from where stars around the camera's axis would be seen there.
-
-        The attitude's covariance gives the distance of the frame's own stars from it.  The fitted plate scale has
-        absorbed the effect of refraction that is the same in all directions.  The covariance contains the rest, which
-        depends on the directions in which the stars lie.
-        """
-        own, covariance = self.camera.rotation, self.camera.covariance_about_own
-        across, about = np.diag(covariance)[:2].mean(), covariance[2, 2]
-        ring = np.column_stack([np.sqrt(across / about) * CIRCLE, np.ones(len(CIRCLE))])
-        true = rotation.normalised(ring) @ own.T
-        apparent = rotation.normalised(true + station_velocity(zenith))
-        level = rotation.shortest_turn(zenith, np.array([0.0, 0.0, 1.0]))
-        seen = atmosphere.refraction().bend(apparent @ level.T) @ level
-        camera = rotation.best_rotation(true, seen) @ own
-        raised = rotation.to_small_vector(rotation.best_rotation(apparent, seen))
-        height = max(float(seen.mean(0) @ zenith), LOWEST)
-        squeezed = float(np.linalg.norm(raised)) * np.sqrt(1 - min(height, 1.0) ** 2) / height
-        uneven = squeezed * np.array([OFF_AXIS, OFF_AXIS, SPREAD])
-        return camera_attitude(camera, covariance + np.diag(uneven**2), camera.T @ raised)
+        """The attitude under a zenith (3,) in ITRS; FixError where it has none."""
+        raise NotImplementedError
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class StarsUnderWay(SightingUnderWay):
-    """A frame with N identified stars; camera: as they were identified, good to ROUGH rad.
+class IdentifiedFrame(FrameUnderWay):
+    """N identified stars of a frame; `camera` is without refraction, good to ROUGH rad.
 
     xy (N, 2), covariance_px2 (N, 2, 2): px from the principal point of an ideal camera of focal length focal_px.
     itrs (N, 3): geocentric apparent directions in ITRS.
@@ -131,17 +73,17 @@ class StarsUnderWay(SightingUnderWay):
 
     def under(self, zenith: np.ndarray, atmosphere: Atmosphere) -> Attitude:
         """The attitude under a zenith (3,) in ITRS, with the plate scale, by the stars; FixError if they disagree."""
-        seen = self._fitted(_directions(self, zenith, atmosphere.refraction()))
-        stronger = _directions(self, zenith, atmosphere.refraction(1 + STEP_REFRACTION))
+        seen = self._fitted(_seen(self, zenith, atmosphere.refraction()))
+        stronger = _seen(self, zenith, atmosphere.refraction(1 + STEP_REFRACTION))
         fit = seen.fit
         there = seen_problem(self.xy, self._optics, stronger).predict(fit.a4, fit.scale)
         shift = (there - self.xy - fit.residual)[fit.kept] / STEP_REFRACTION
         # the camera turns the other way than the sky in it
-        return _attitude_of(seen, -seen.errors.rotated(shift))
+        return _camera_of(seen, -seen.errors.rotated(shift))
 
     def placeless(self) -> Attitude:
         """Fit attitude and plate scale where no zenith is known: refraction and diurnal aberration stay in it."""
-        return _attitude_of(self._fitted(self.itrs), NOT_BENT)
+        return _camera_of(self._fitted(self.itrs), np.zeros(3))
 
     @cached_property
     def _optics(self) -> Camera:
@@ -155,13 +97,25 @@ class StarsUnderWay(SightingUnderWay):
             raise FixError(f"{self.source}: {error}: left out") from None
 
 
-def _attitude_of(seen: StarFit, by_refraction: np.ndarray) -> Attitude:
-    return camera_attitude(
-        seen.fit.a4.T, seen.errors.rotation_covariance(seen.errors.centroids), by_refraction
+def _camera_of(seen: StarFit, by_refraction: np.ndarray) -> Attitude:
+    """The camera's attitude by a fit; by_refraction (3,): about C's axes."""
+    own = Attitude(
+        np.eye(3),
+        seen.errors.rotation_covariance(seen.errors.centroids),
+        of=CAMERA,
+        into=CAMERA,
+        by_refraction=by_refraction,
     )
+    return own.then(seen.fit.a4.T, ITRS)
 
 
-def sighting_of(stars: Stars, eye: solver.Solver, answer: Solution) -> StarsUnderWay:
+def roughly(camera_to_itrs: np.ndarray) -> Attitude:
+    """An attitude (3, 3) that is good to ROUGH."""
+    error = np.eye(3) * ROUGH**2
+    return Attitude(camera_to_itrs, error, of=CAMERA, into=ITRS, by_refraction=np.zeros(3))
+
+
+def sighting_of(stars: Stars, eye: solver.Solver, answer: Solution) -> IdentifiedFrame:
     """The frame under way of stars that are identified; a StarposError says why it cannot be used.
 
     answer: of these stars, by the solver's camera.
@@ -182,12 +136,12 @@ def sighting_of(stars: Stars, eye: solver.Solver, answer: Solution) -> StarsUnde
         )
     if answer.found.mirrored:
         raise InstrumentError(f"{stars.place}: the frame is mirrored (its rows run bottom-up): flip it")
-    return under_way(stars, answer.found, (camera, catalogue), earth_state(mid_unix_s))
+    return sighted(stars, answer.found, (camera, catalogue), earth_state(mid_unix_s))
 
 
-def under_way(
+def sighted(
     stars: Stars, found: Identification, view: tuple[Camera, Catalogue], state: EarthState
-) -> StarsUnderWay:
+) -> IdentifiedFrame:
     """The identified stars of a frame; found.star are rows of stars, view the camera and the catalogue."""
     camera, catalogue = view
     use = sound_matches(stars, found, solver.ENOUGH_SOUND)
@@ -195,7 +149,7 @@ def under_way(
     directions = camera.directions(stars.x[star], stars.y[star])
     squeeze = np.array([1.0, camera.fx / camera.fy])
     catalogue_px = np.hypot(catalogue.sigma(index, state.year) * camera.fx, found.blend_px[use])
-    return StarsUnderWay(
+    return IdentifiedFrame(
         utc_unix_s=state.utc_unix_s,
         stamp_stddev_s=stars.stamp_stddev_s,
         source=stars.place,
@@ -208,33 +162,80 @@ def under_way(
     )
 
 
-def _directions(sighting: StarsUnderWay, zenith: np.ndarray, refraction: Refraction) -> np.ndarray:
+def _seen(sighting: IdentifiedFrame, zenith: np.ndarray, refraction: Refraction) -> np.ndarray:
     """Directions (N, 3) along ITRS's axes in which the stars are seen under a zenith."""
     level = rotation.shortest_turn(zenith, np.array([0.0, 0.0, 1.0]))
     apparent = rotation.normalised(sighting.itrs + station_velocity(zenith))
     return refraction.bend(apparent @ level.T) @ level
 
 
-def body_attitude(frame: SightingUnderWay, place: Place, vessel: Vessel) -> Attitude:
+# Refraction squeezes a frame more along the vertical than across. This turns the attitude across the axis if the middle
+# of the stars is off the axis (rad), and about it if stars spread farther one way than the other (share): 1 sigma.
+OFF_AXIS, SPREAD = 0.03, 0.25
+# sine of the lowest altitude that this is for
+LOWEST = 0.1
+CIRCLE = np.array([[np.cos(a), np.sin(a)] for a in np.arange(8) * np.pi / 4])
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PlacelessFrame(FrameUnderWay):
+    """An attitude without refraction and diurnal aberration, as CameraAttitude has it."""
+
+    @classmethod
+    def of(cls, attitude: CameraAttitude) -> "PlacelessFrame":
+        """The frame of an attitude that has a time; TimeError outside the IERS tables."""
+        assert attitude.utc_unix_s is not None
+        turn = attitude.camera_to_gcrs
+        among_stars = Attitude(turn, turn @ attitude.covariance @ turn.T, of=CAMERA, into=GCRS)
+        return cls(
+            utc_unix_s=attitude.utc_unix_s,
+            stamp_stddev_s=attitude.stamp_stddev_s,
+            camera=among_stars.then(earth_state(attitude.utc_unix_s).gcrs_to_itrs, ITRS),
+        )
+
+    def under(self, zenith: np.ndarray, atmosphere: Atmosphere) -> Attitude:
+        """The attitude under a zenith (3,) in ITRS, from where stars around the camera's axis would be seen there.
+
+        The attitude's covariance gives the distance of the frame's own stars from it.  The fitted plate scale has
+        absorbed the effect of refraction that is the same in all directions.  The covariance contains the rest, which
+        depends on the directions in which the stars lie.
+        """
+        given, covariance = self.camera.rotation, self.camera.covariance_about_own
+        across, about = np.diag(covariance)[:2].mean(), covariance[2, 2]
+        ring = np.column_stack([np.sqrt(across / about) * CIRCLE, np.ones(len(CIRCLE))])
+        true = rotation.normalised(ring) @ given.T
+        apparent = rotation.normalised(true + station_velocity(zenith))
+        level = rotation.shortest_turn(zenith, np.array([0.0, 0.0, 1.0]))
+        seen = atmosphere.refraction().bend(apparent @ level.T) @ level
+        camera = rotation.best_rotation(true, seen) @ given
+        raised = rotation.to_small_vector(rotation.best_rotation(apparent, seen))
+        height = max(float(seen.mean(0) @ zenith), LOWEST)
+        squeezed = float(np.linalg.norm(raised)) * np.sqrt(1 - min(height, 1.0) ** 2) / height
+        uneven = squeezed * np.array([OFF_AXIS, OFF_AXIS, SPREAD])
+        whole = covariance + np.diag(uneven**2)
+        return Attitude(camera, camera @ whole @ camera.T, of=CAMERA, into=ITRS, by_refraction=raised)
+
+
+def body_attitude(frame: PlacelessFrame, place: Place, vessel: Vessel) -> Attitude:
     """The body's axes, x forward, at a known place: level by the plumb line, north by WGS 84.
 
     The errors are of stars, air, time, place, deflection and mount.
     """
     a4, air = place.plumb_axes, vessel.atmosphere
     seen = frame.under(a4[2], air)
-    g = a4 @ seen.rotation
+    seen = seen.then(a4, ENU)
     late_s = [frame.stamp_stddev_s, vessel.clock_stddev_s, earth_orientation(frame.utc_unix_s).ut1_sigma_s]
     # a zenith further east, or north, turns level and north
     level = np.array([[0.0, 1.0], [-1.0, 0.0]])
     north = -meridian_turn(place.plumb[0]) * np.array([[1.0, 0.0]])
     deflection = np.vstack([level * place.plumb_stddev, north * place.ellipsoid_stddev])
     columns = np.column_stack([
-        a4 @ seen.by_refraction * air.relative_sigma,
+        seen.by_refraction * air.relative_sigma,
         a4[:, 2] * ROTATION_RAD_S * math.hypot(*late_s),
         np.vstack([level, north]) @ place.zenith_root,
         deflection,
     ])  # fmt: skip
     to_ellipsoid = place.axes @ a4.T
     turn = rotation.about_axis(2, -math.atan2(to_ellipsoid[0, 1], to_ellipsoid[1, 1]))
-    covariance = a4 @ seen.covariance @ a4.T + columns @ columns.T + np.eye(3) * vessel.mount_stddev**2
-    return Attitude(turn @ g @ vessel.camera_to_body.T, covariance, of=LINK, into=ENU)
+    covariance = seen.covariance + columns @ columns.T + np.eye(3) * vessel.mount_stddev**2
+    return Attitude(turn @ seen.rotation @ vessel.camera_to_body.T, covariance, of=LINK, into=ENU)

@@ -43,7 +43,7 @@ from starpos.navigation.evidence import (
 )
 from starpos.navigation.preintegration import Pieces, Sums, summed
 from starpos.navigation.records import ImuLog, VelocityLog
-from starpos.navigation.sightings import SightingUnderWay
+from starpos.navigation.sightings import FrameUnderWay
 from starpos.navigation.start import first_motion, nodes_of
 from starpos.navigation.vessel import MotionLaw, Vessel
 from starpos.progress import Progress, quiet
@@ -78,7 +78,7 @@ class Adjustment:
 
     def __init__(
         self,
-        frames: Sequence[SightingUnderWay],
+        frames: Sequence[FrameUnderWay],
         nodes: np.ndarray,
         pieces: Pieces,
         velocity: VelocityLog | None,
@@ -371,7 +371,7 @@ class Voyage:
 
 
 def adjust_voyage(
-    frames: Sequence[SightingUnderWay],
+    frames: Sequence[FrameUnderWay],
     imu: ImuLog,
     velocity: VelocityLog | None,
     vessel: Vessel,

@@ -22,6 +22,7 @@ from starpos.averaging.altitudes import (
 from starpos.averaging.average import Average, average
 from starpos.calibration.misalignment import Calibrated, turn
 from starpos.earth.orientation import EarthState
+from starpos.earth.place import Place
 from starpos.earth.vertical import Vertical
 from starpos.errors import FixError, FrameError, GnssError, StarposError
 from starpos.fix.fix import IDEAL, Fix
@@ -40,8 +41,6 @@ from starpos.instrument.mounting import Mounting
 from starpos.instrument.tilt_log import Tilts
 from starpos.night import remarks
 from starpos.night.remarks import Kind, Near, Remark, doubts, of_inclinometer
-from starpos.sky.site import Site
-from starpos.units import ARCSEC
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -249,8 +248,7 @@ def axis_of(
     pointings: Sequence[Pointing],
     tilts: Tilts,
     near: tuple[float, float] | None = None,
-    site: Site | None = None,
-    site_stddev_arcsec: float = 0.0,
+    site: Place | None = None,
 ) -> FoundAxis:
     """A3's axis from pointings at a site, or at an unknown place; FixError if they do not determine it."""
 
@@ -270,7 +268,7 @@ def axis_of(
 
     ray = (solver.instrument.camera or IDEAL).centre_ray
     given = solver.instrument.calibration
-    return find_axis(with_a3, given, ray, site, site_stddev_arcsec * ARCSEC, near)
+    return find_axis(with_a3, given, ray, site, near)
 
 
 def circles_of(solver: Solver, pointings: Sequence[Pointing], tilts: Tilts) -> list[Circle | StarposError]:

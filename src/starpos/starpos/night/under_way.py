@@ -14,7 +14,7 @@ from starpos.fix.solver import Solver
 from starpos.instrument import instrument_file
 from starpos.instrument.instrument import AxisDoubt, Instrument, framed
 from starpos.navigation.records import ImuModel, read_imu, read_imu_model, read_velocity
-from starpos.navigation.sightings import StarsUnderWay, sighting_of
+from starpos.navigation.sightings import IdentifiedFrame, sighting_of
 from starpos.navigation.vessel import Vessel
 from starpos.navigation.voyage import Voyage, adjust_voyage
 from starpos.night.reading import First, Instruments, Reader
@@ -32,7 +32,7 @@ class VoyageFrame:
     """A frame's time, its identified stars, or why it has none, or a remark."""
 
     utc_unix_s: float | None
-    sighting: StarsUnderWay | None
+    sighting: IdentifiedFrame | None
     message: str = ""
 
 

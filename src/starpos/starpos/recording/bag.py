@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reads a rosbag2 without ROS, by `rosbags`, within bounds; any fault of it is a BagError of one sentence."""
+"""Reads a rosbag2 without ROS, by `rosbags`, within bounds; any fault of it is a BagError of one sentence.
+
+A small file must not unpack to more than memory or disk can hold. rosbags (0.11) unpacks whatever a chunk, a message or a
+file holds, without a limit: its unpacking functions are replaced by bounded ones.
+"""
 
 import os
 import re

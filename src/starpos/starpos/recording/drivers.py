@@ -12,7 +12,7 @@ from starpos.errors import FrameError, StarposError
 from starpos.frames.frame import Stars
 from starpos.messages.camera import ExposureFacts, check_stamp, message_to_frame, message_to_picture
 from starpos.messages.stamp import PlainHeader, PlainStamp, stamp_to_unix
-from starpos.messages.tilt import ImuTilts, TiltMessage
+from starpos.messages.tilt import ImuTilts, Reading
 from starpos.parameters.given import values_of
 from starpos.recording.topics import IMAGE, NO_REMAPS, PICTURE, Remaps
 from starpos.units import utc_text
@@ -56,7 +56,7 @@ class DriverMessages:
 
     def receive_capture(self, message: Any) -> None:
         """Take a Capture."""
-        self._exposures.take(message)
+        self._exposures.keep_capture(message)
 
     def stars_of(self, kind: str, message: Any) -> tuple[Stars, PlainHeader]:
         """The stars of an image of this type and the header of their message; raises StarposError without any."""
@@ -71,13 +71,13 @@ class DriverMessages:
             detect(frame, DetectionSettings.by_parameters(self._drivers.detector)).stars, header
         ), header
 
-    def tilt_of(self, message: Any, now_s: float) -> TiltMessage | None:
+    def tilt_of(self, message: Any, now_s: float) -> Reading | None:
         """The tilt that an IMU's message completes; now_s: when it was recorded."""
-        reading = self._imu.take(message, round(now_s * 1e9))
+        reading = self._imu.receive(message, round(now_s * 1e9))
         if reading is None:
             return None
         self._tilts += 1
-        return reading.message(self._drivers.inclinometer["frame_id"])
+        return replace(reading, frame_id=self._drivers.inclinometer["frame_id"])
 
     def remarks(self) -> list[str]:
         """Sentences on missing parameters, and on accelerations that gave no tilt."""

@@ -13,6 +13,7 @@ import numpy as np
 from starpos.averaging.average import Average, Averager, average
 from starpos.averaging.poses import slip_s
 from starpos.calibration.misalignment import Calibrated, calibrate_at, turn
+from starpos.earth.place import Place
 from starpos.errors import FixError, InstrumentError, StarposError, TiltError
 from starpos.fix.checks import at_another_lean
 from starpos.fix.fix import Fix
@@ -25,7 +26,6 @@ from starpos.instrument.tilt_log import TiltLog, TiltsByTime
 from starpos.session.driver import Coming, Diagnosis, Jobs, Level, Log, Outcome
 from starpos.session.settings import Settings
 from starpos.session.standing import Averaging, News
-from starpos.sky.site import Site
 
 MAX_POSES = 36
 # The newest tilts of a pose.
@@ -349,7 +349,7 @@ class Calibrating:
                 f"only {len(frames)}{asked} frames with stars and a tilt have arrived: wait for more, or ask for fewer"
             )
         solver = self._solver()
-        site = Site(latitude, longitude, solver.atmosphere)
+        site = Place.by_gravity(latitude, longitude)
         turn_deg = self._values["calibration_turn_stddev"]
         stars, tilts, known = [f.stars for f in frames], tilts_of(frames), known_of(frames)
         return lambda: calibrate_at(solver, stars, tilts, site, turn_stddev_deg=turn_deg, known=known)

@@ -53,8 +53,8 @@ class Gyro:
         self._bias: np.ndarray = np.zeros(3)
         self._bias_stddev = WORST.gyroscope_bias_stddev
 
-    def take(self, message: Any, now: Now) -> None:
-        """Take a live sensor_msgs/Imu. Answers to recorded data must not depend on what was read before a frame."""
+    def receive(self, message: Any, now: Now) -> None:
+        """Keep a live sensor_msgs/Imu. Answers to recorded data must not depend on what was read before a frame."""
         if now.played:
             return
         if self._readings is None:
@@ -63,7 +63,7 @@ class Gyro:
 
             self._readings = GyroReadings()
         try:
-            self._readings.take(message)
+            self._readings.receive(message)
             self._heard.came(IMU_TOPIC)
         except VoyageError as e:
             self._heard.refuse(IMU_TOPIC, str(e))

@@ -31,8 +31,8 @@ class GyroReadings:
         self._recent = RecentReadings()
         self._block_s = -np.inf
 
-    def take(self, message: Any) -> None:
-        """Take a reading; VoyageError in a sentence if it cannot be used."""
+    def receive(self, message: Any) -> None:
+        """Keep a reading; VoyageError in a sentence if it cannot be used."""
         w, time_s = message.angular_velocity, stamp_to_unix(message.header.stamp)
         if message.angular_velocity_covariance[0] == -1:
             raise VoyageError(
@@ -45,7 +45,7 @@ class GyroReadings:
         if time_s < self._recent.last_s - BACK_S:
             # its clock was set
             self._recent = RecentReadings()
-        self._recent.add((time_s, w.x, w.y, w.z, 0.0, 0.0, 0.0))
+        self._recent.append((time_s, w.x, w.y, w.z, 0.0, 0.0, 0.0))
         if not 0 <= time_s - self._block_s < BLOCK_S:
             self._block_s = time_s
             self._recent.close()
@@ -94,14 +94,14 @@ class Trails:
 
     def receive_imu(self, message: Any) -> None:
         """Take a sensor_msgs/Imu; VoyageError in a sentence if it cannot be used."""
-        self._readings.take(message)
+        self._readings.receive(message)
 
     def receive_camera(self, message: Any) -> None:
         """Take a CameraInfo; InstrumentError in a sentence if it cannot be used."""
         # a size that it leaves open does not matter here
         self._focal_px = message_to_camera(message, size=(1, 1)).fx
 
-    def told(self, frame: Frame) -> Frame:
+    def with_trail(self, frame: Frame) -> Frame:
         """The frame with its trail; as it is where time, exposure, focal length or readings lack, or it turned far."""
         if self._focal_px is None or frame.mid_unix_s is None or not frame.exposure_s:
             return frame

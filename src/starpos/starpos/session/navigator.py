@@ -27,7 +27,7 @@ from starpos.navigation.equations import PLACE
 from starpos.navigation.estimate import Estimate, Observability, VoyageFix, observability
 from starpos.navigation.recent import BACK_S, LONGEST_GAP_S, Recent
 from starpos.navigation.records import ImuModel, read_imu_model
-from starpos.navigation.sightings import SightingUnderWay, body_attitude
+from starpos.navigation.sightings import PlacelessFrame, body_attitude
 from starpos.navigation.vessel import PARKED, Vessel, check_drift
 from starpos.navigation.voyage import MIN_FRAMES, Voyage
 from starpos.session import settings
@@ -215,7 +215,7 @@ class NavigatorSession:
         try:
             attitude = message_to_attitude(message)
             self._check_time(attitude.utc_unix_s, now, "an attitude")
-            frame = SightingUnderWay.of(attitude)
+            frame = PlacelessFrame.of(attitude)
             self._recent.add_frame(frame)
         except StarposError as e:
             self._heard.refuse("attitude", str(e))
@@ -224,7 +224,7 @@ class NavigatorSession:
         self._heard.came("attitude")
         return self._at_place(frame)
 
-    def _at_place(self, frame: SightingUnderWay) -> list[Navigated]:
+    def _at_place(self, frame: PlacelessFrame) -> list[Navigated]:
         """The heading at a known place, while there is no fix."""
         if self._estimate is not None and not self._stars_missing:
             return []

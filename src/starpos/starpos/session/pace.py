@@ -141,7 +141,7 @@ class Backlog:
         cost_s = statistics.median(self._costs_s) if self._costs_s else 0.0
         return len(self) * cost_s <= max(delay_s, MAX_LATE_S) + cost_s
 
-    def add(self, frame: Waiting) -> None:
+    def append(self, frame: Waiting) -> None:
         self._frames.append(frame)
 
     def keep_newest(self) -> int:

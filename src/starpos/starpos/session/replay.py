@@ -20,7 +20,7 @@ from starpos.instrument.instrument import Instrument
 from starpos.instrument.tilt_log import TiltLog
 from starpos.instrument.tilt_table import read_tilt_csv
 from starpos.messages.stamp import PlainHeader, PlainStamp
-from starpos.messages.tilt import Reading, TiltMessage
+from starpos.messages.tilt import Reading
 from starpos.night.field import INSTRUMENT, is_field, opened
 from starpos.night.opening import frames_in
 from starpos.night.reading import stars_of
@@ -147,7 +147,7 @@ class Replay:
             yield from self.session.at(now)
 
 
-def _tilt_message(log: TiltLog, k: int) -> TiltMessage:
+def _tilt_message(log: TiltLog, k: int) -> Reading:
     """The message of a reading."""
     z, variance_z = (math.nan if c is None else float(c[k]) for c in (log.theta_z, log.variance_z))
     return Reading(
@@ -160,7 +160,8 @@ def _tilt_message(log: TiltLog, k: int) -> TiltMessage:
         flags=0,
         z=z,
         z_variance=variance_z,
-    ).message("inclinometer")
+        frame_id="inclinometer",
+    )
 
 
 @dataclass(kw_only=True)

@@ -217,7 +217,7 @@ class SolverSession:
             self.pace.drop(now.waiting_s)
             self._heard.refuse("stars", f"a frame was dropped: {MAX_WAITING} wait for their tilts")
             return
-        self._backlog.add(Waiting(header, stars, now.waiting_s, now.ahead_s(stars.mid_unix_s)))
+        self._backlog.append(Waiting(header, stars, now.waiting_s, now.ahead_s(stars.mid_unix_s)))
         if self.instrument.preparing and not now.played:
             self.pace.dropped += self._backlog.keep_newest()
 

@@ -22,7 +22,7 @@ from starpos.fix.solution import Solution, Status
 from starpos.fix.solver import Solver, focal_that_fits
 from starpos.frames.frame import Stars
 from starpos.identification import fisheye
-from starpos.navigation.sightings import under_way
+from starpos.navigation.sightings import sighted
 from starpos.session.driver import Now
 from starpos.session.gyro import Gyro
 
@@ -89,7 +89,7 @@ def camera_attitude_of(
         if fisheye.is_wide(camera):
             return None
         state = earth_state(stars.mid_unix_s)
-        seen = under_way(stars, found, (camera, catalogue), state).placeless()
+        seen = sighted(stars, found, (camera, catalogue), state).placeless()
     except StarposError:
         return None
     return CameraAttitude(

@@ -74,7 +74,7 @@ class Averaging:
             if self._turned is not None or _is_wide(fix):
                 self._averager = Averager()
         before = self._averager.average
-        self._averager.add(fix)
+        self._averager.include(fix)
         after = self._averager.average
         assert after is not None
         self._news = self._judged(before, after)
@@ -137,6 +137,7 @@ OUTVOTE_ONE = 10
 class ClockDoubt:
     """Judges the time of each fix; `seconds` is the error to assume for it, 0 if nothing contradicts its stamp.
 
+    It is unknown which of two contradicting stamps is wrong, so the contradiction is taken as the error of the clock.
     leans_otherwise: the camera stands as before, but the tilts differ, so the tilts are of another time.
     """
 

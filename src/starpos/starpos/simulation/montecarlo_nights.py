@@ -291,7 +291,7 @@ def calibrated_night(
     shots, levels, heading = photograph(there, zero, later, [0.0], frames, rng)
 
     def answer() -> Average:
-        found = calibrate_at(solver, stars + more, tilts, world.site)
+        found = calibrate_at(solver, stars + more, tilts, world.site.place)
         ready = replace(solver, instrument=found.instrument)
         solutions = [ready.solve(s, levels) for s in shots]
         return average([s.fix for s in solutions if s.fix])

@@ -43,10 +43,12 @@ cdef class Labels:
                 raise IndexError(f"the star catalogue has no row {rows[k]}")
             fetch(&self.vmag[rows[k]])
             fetch(&self.hip[rows[k]])
-            fetch(&self.tyc[rows[k], 0])
+        for k in range(n):
+            mag[k] = self.vmag[rows[k]] * 0.01
+            if self.hip[rows[k]] == 0:
+                fetch(&self.tyc[rows[k], 0])
         for k in range(n):
             row = rows[k]
-            mag[k] = self.vmag[row] * 0.01
             if self.hip[row]:
                 at = _before(_written(self.hip[row], end), b"HIP ", 4)
             else:

@@ -8,6 +8,7 @@ import numpy as np
 from starpos import rotation
 from starpos.earth.ellipsoid import enu_axes
 from starpos.earth.orientation import EarthState, station_velocity
+from starpos.earth.place import Place
 from starpos.earth.refraction import Atmosphere
 from starpos.sky.catalogue import Catalogue
 
@@ -19,6 +20,11 @@ class Site:
     latitude_deg: float
     longitude_deg: float
     atmosphere: Atmosphere = field(default_factory=Atmosphere)
+
+    @property
+    def place(self) -> Place:
+        """The place without its air, by the plumb line."""
+        return Place.by_gravity(self.latitude_deg, self.longitude_deg)
 
     @property
     def enu(self) -> np.ndarray:

@@ -70,7 +70,7 @@ class ZenithSighting(Sighting):
         return self.camera.rotation.T
 
     def turned(self, turn: np.ndarray) -> "ZenithSighting":
-        """The same with a camera that is turned by a rotation (3, 3) of its axes C."""
+        """Turn the camera by a rotation (3, 3) of its axes C."""
         return replace(
             self, camera=site_attitude(turn @ self.enu_to_camera, self.camera.covariance_about_own)
         )

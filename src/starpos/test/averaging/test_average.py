@@ -184,7 +184,7 @@ def test_a_thousand_frames(rng):
 def dense(made):
     """Generalised least squares over all fixes at once: east, north, heading against the first, and their covariance."""
     plane, n = Plane.at(made[0]), len(made)
-    seen = np.array([plane.seen(f) * UNIT for f in made])
+    seen = np.array([plane.coordinates(f) * UNIT for f in made])
     whole = np.zeros((n, 3, n, 3))
     for k, term in enumerate(made[0].terms):
         # They are of one pose.
@@ -228,7 +228,7 @@ def test_the_recursion_is_generalised_least_squares_over_all(shared, rng):
     moved, covariance = dense(made)
     recursion = PlaceFilter.before(made[0])
     for f in made:
-        recursion, _ = recursion.add(f, made[0])
+        recursion, _ = recursion.updated(f, made[0])
     np.testing.assert_allclose(recursion.east_north_m, moved[:2], atol=1e-3)
     found = total_covariance(recursion.terms(made[-1].terms))
     np.testing.assert_allclose(found[:2, :2], covariance[:2, :2], rtol=1e-5)
@@ -242,7 +242,7 @@ def test_as_they_come_or_all_at_once(rng):
     made = in_order(fixes(SkyField(), rng, [40.0] * 5 + [90.0] * 5, calibration=10.0))
     averager = Averager()
     for f in made:
-        averager.add(f)
+        averager.include(f)
     a, b = average(made[::-1]), averager.average
     # at once, the first frames too are judged by the scatter of all
     assert (a.frames, a.poses) == (b.frames, b.poses) == (10, 2)
@@ -267,7 +267,7 @@ def test_frames_that_share_a_few_readings_are_believed_and_no_more_than_is_due(r
             )
             state = earth_state(now.utc)
             xy, places = now.places(state, rng)
-            averager.add(now.solve(xy + rng.normal(0, 0.05, xy.shape), places, state, tilt=tilt))
+            averager.include(now.solve(xy + rng.normal(0, 0.05, xy.shape), places, state, tilt=tilt))
         a = averager.average
         assert a.frames == 6
         off.append(sigmas_off(a, field) ** 2 / 2)
@@ -351,7 +351,7 @@ def test_a_robot_that_drove_on_begins_a_new_average(moved_to_m, needs, rng):
     there = replace(here, latitude=here.latitude - np.degrees(moved_to_m / 6.371e6), azimuth=90.0)
     averager = Averager()
     for f in in_order(fixes(here, rng, [40.0] * 30) + fixes(there, rng, [90.0] * needs)):
-        averager.add(f)
+        averager.include(f)
     a = averager.average
     assert a.moved == 1 and a.frames <= needs
     assert np.all(np.abs(moved_m(a, there)) < 4 * sigmas(a)[:2])
@@ -384,7 +384,7 @@ def test_a_clock_that_was_far_off_bends_no_average(rng):
         xy, places = now.places(earth_state(now.utc), rng)
         tilt = replace(now.tilt(np.eye(2) * (0.16 * ARCSEC) ** 2), utc_unix_s=now.utc + 60 * (not known))
         state = earth_state(tilt.utc_unix_s)
-        averager.add(now.solve(xy, places, state, tilt=tilt, clock_stddev_s=0.01 if known else 60.0))
+        averager.include(now.solve(xy, places, state, tilt=tilt, clock_stddev_s=0.01 if known else 60.0))
         worst = max(worst, sigmas_off(averager.average, field))
     assert worst < 4 and averager.average.covariance[0, 0] < 10**2
 
@@ -393,7 +393,7 @@ def test_memory_does_not_grow(rng):
     averager, two = Averager(), fixes(SkyField(), rng, [40.0] * 2)
     sizes = []
     for k in range(3 * MAX_REMEMBERED):
-        averager.add(read_at(replace(two[k % 2], utc_unix_s=UTC + k), UTC + k, UTC + k + 1))
+        averager.include(read_at(replace(two[k % 2], utc_unix_s=UTC + k), UTC + k, UTC + k + 1))
         sizes.append(len(pickle.dumps(vars(averager))))
     # once as much is remembered as ever
     settled = MAX_REMEMBERED + 10

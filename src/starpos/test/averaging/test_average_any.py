@@ -104,7 +104,7 @@ def run(made):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         for f in made.fixes:
-            averager.add(f)
+            averager.include(f)
             a = averager.average
             # No fix since the camera was touched is used.
             rows = 2 if np.isnan(a.heading) else 3
@@ -174,6 +174,6 @@ def test_its_memory_is_bounded(rng):
     averager, sizes = Averager(), []
     for n in range(10):
         for f in made.fixes:
-            averager.add(replace(f, utc_unix_s=f.utc_unix_s + 1e6 * n))
+            averager.include(replace(f, utc_unix_s=f.utc_unix_s + 1e6 * n))
         sizes.append(len(pickle.dumps(vars(averager))))
     assert max(sizes[4:]) <= max(sizes[:4]) + 200

@@ -94,7 +94,7 @@ def solver(one, instrument=None) -> Solver:
 
 
 def calibrated(one):
-    return calibrate_at(solver(one), one.pointings, one.tilt, one.site)
+    return calibrate_at(solver(one), one.pointings, one.tilt, one.site.place)
 
 
 def elsewhere(found, two):

@@ -51,7 +51,7 @@ def test_the_coefficients_are_found_within_what_is_claimed(lens, catalogue, rng)
     fit = found.fit
     assert found.used == tuple(range(2)) and fit.camera.model == EQUIDISTANT
     assert np.abs((fit.values - values(true)) / fit.sigma).max() < 4
-    assert fit.told.all()
+    assert fit.determined.all()
     assert rms(picture_errors(true, fit.camera)) < 0.03
     assert np.abs(picture_errors(true, fit.camera)).max() < max(0.05, 4 * fit.worst_sigma_px)
     assert fit.rms_px < 0.1

@@ -8,6 +8,7 @@ import pytest
 
 from starpos import rotation
 from starpos.calibration.misalignment import calibrate_fixed
+from starpos.earth.place import Place
 from starpos.errors import FixError, InstrumentError
 from starpos.fix.solution import Status
 from starpos.fix.solver import Solver
@@ -44,7 +45,7 @@ def solver(catalogue):
 
 def calibrated(solver, site, rng, attitude=None):
     frames = frames_of(site, pose() if attitude is None else attitude, BEGIN, rng)
-    found = calibrate_fixed(solver, frames, site, sag_arcsec_per_sqrt_hour=SAG_ARCSEC)
+    found = calibrate_fixed(solver, frames, site.place, sag_arcsec_per_sqrt_hour=SAG_ARCSEC)
     return replace(solver, instrument=found.instrument)
 
 
@@ -120,13 +121,13 @@ def test_a_clock_that_is_off_is_no_other_place(solver, site, rng):
 def test_a_camera_touched_between_its_frames_has_no_vertical(solver, site, rng):
     frames = [*frames_of(site, pose(), BEGIN, rng), *frames_of(site, pose(41.0), BEGIN + 100, rng)]
     with pytest.raises(FixError, match=r"touched between|do not agree|disagree"):
-        calibrate_fixed(solver, frames, site)
+        calibrate_fixed(solver, frames, site.place)
 
 
 def test_a_wrong_place_that_shows_is_refused(solver, site, rng):
     frames = frames_of(site, pose(), BEGIN, rng)
     with pytest.raises(FixError, match="into the ground"):
-        calibrate_fixed(solver, frames, Site(-site.latitude_deg, site.longitude_deg + 180))
+        calibrate_fixed(solver, frames, Place.by_gravity(-site.latitude_deg, site.longitude_deg + 180))
 
 
 def test_the_file_keeps_it(solver, site, rng, tmp_path):

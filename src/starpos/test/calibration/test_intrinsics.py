@@ -68,7 +68,7 @@ def test_over_many_cameras_the_errors_are_those_claimed(field, rng):
 def test_what_a_few_stars_of_a_narrow_field_cannot_tell_the_prior_holds(rng):
     given = ideal(3.4)
     fit = fit_camera(sightings(given, 1, 30, rng, sigma=0.3), given, VACUUM)
-    told = dict(zip(parameters(ideal(11)), fit.told, strict=True))
+    told = dict(zip(parameters(ideal(11)), fit.determined, strict=True))
     assert told["fx"] and told["fy"] and told["k1"]
     assert not any(told[name] for name in ("cx", "cy"))
     assert (fit.sigma <= fit.prior_sigma).all()
@@ -156,7 +156,7 @@ def test_only_what_is_free_is_fitted(rng):
     fit = fit_camera(sightings(true, 5, 60, rng), ideal(25), VACUUM, ("fx", "fy", "k1"))
     changed = fit.values != values(ideal(25))
     assert [name for name, c in zip(parameters(ideal(11)), changed, strict=True) if c] == ["fx", "fy", "k1"]
-    assert (fit.sigma > 0).tolist() == changed.tolist() == fit.told.tolist()
+    assert (fit.sigma > 0).tolist() == changed.tolist() == fit.determined.tolist()
 
 
 def bent(frames, air: Atmosphere, strength=1.0, lean=(20.0, 50.0)):

@@ -132,7 +132,7 @@ def refused(find):
 def test_calibrated_at_a_known_place_it_is_right_at_another(catalogue, nights):
     chi2, left_out = [], []
     for one, two in nights:
-        found = calibrate_at(one.solver(catalogue, unknown()), one.frames, one.tilts, one.scene.site)
+        found = calibrate_at(one.solver(catalogue, unknown()), one.frames, one.tilts, one.scene.site.place)
         assert len(found.fixes) >= DIRECTIONS - 1
         solver = two.solver(catalogue, found.instrument)
         fixes = [solver.solve(stars, two.tilts).fix for stars in two.frames]

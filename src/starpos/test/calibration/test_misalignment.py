@@ -9,6 +9,8 @@ import pytest
 from starpos.averaging.average import average
 from starpos.calibration.misalignment import VALID_DAYS, calibrate_at
 from starpos.earth.ellipsoid import curvature_radii_m
+from starpos.earth.place import Place
+from starpos.earth.vertical import Deflection
 from starpos.errors import FixError
 from starpos.fix.solution import Status
 from starpos.frames.frame import no_stars
@@ -23,7 +25,7 @@ NOISE_ARCSEC = 12.6
 
 
 def found_at(shot, catalogue, given=(0.0, 0.0, 0.0), **more):
-    return calibrate_at(shot.solver(catalogue, given), shot.frames, shot.tilt, shot.scene.site, **more)
+    return calibrate_at(shot.solver(catalogue, given), shot.frames, shot.tilt, shot.scene.site.place, **more)
 
 
 def stddev(calibration) -> np.ndarray:
@@ -179,10 +181,10 @@ def test_without_a_fix_there_is_no_calibration(catalogue, rng):
     shot = shots(catalogue, rng)
     solver = shot.solver(catalogue)
     with pytest.raises(FixError, match="there is no frame"):
-        calibrate_at(solver, [], shot.tilt, shot.scene.site)
+        calibrate_at(solver, [], shot.tilt, shot.scene.site.place)
     shot.frames = [no_stars(1000, 700, mid_unix_s=START, exposure_s=0.5)]
     with pytest.raises(FixError, match=r"no frame has a fix to calibrate from: .*0 stars detected"):
-        calibrate_at(solver, shot.frames, next(iter(shot.tilts.values())), shot.scene.site)
+        calibrate_at(solver, shot.frames, next(iter(shot.tilts.values())), shot.scene.site.place)
 
 
 def test_frames_without_a_fix_are_left_out(catalogue, rng):
@@ -197,7 +199,16 @@ def test_frames_without_a_fix_are_left_out(catalogue, rng):
 
 def test_a_site_that_is_not_known_well(catalogue, rng):
     shot = shots(catalogue, rng, [0.0] * 9)
-    sharp, blunt = (found_at(shot, catalogue, site_stddev_arcsec=s).plumb_stddev_arcsec for s in (0.0, 30.0))
+    site = shot.scene.site
+    sharp, blunt = (
+        calibrate_at(
+            shot.solver(catalogue),
+            shot.frames,
+            shot.tilt,
+            Place.on_ellipsoid(site.latitude_deg, site.longitude_deg, Deflection(0.0, 0.0, s)),
+        ).plumb_stddev_arcsec
+        for s in (0.0, 30.0)
+    )
     assert 0.9 < sharp / (NOISE_ARCSEC / 3) < WIDER
     assert blunt == pytest.approx(np.hypot(sharp, 30.0), rel=0.05)
 
@@ -206,7 +217,7 @@ def test_a_site_that_is_off_moves_a3_by_as_much(catalogue):
     """18.5 arcsec of latitude: the plumb line is that far off, and a fix lands on the site that was said."""
     shot = shots(catalogue, np.random.default_rng(5), [0.0] * 4, noise_deg=1e-5)
     site = replace(shot.scene.site, latitude_deg=shot.scene.site.latitude_deg + 18.5 / 3600)
-    found = calibrate_at(shot.solver(catalogue), shot.frames, shot.tilt, site)
+    found = calibrate_at(shot.solver(catalogue), shot.frames, shot.tilt, site.place)
     up = shot.scene.attitude[2]
     said = found.instrument.calibration.a3.T @ shot.true_a3 @ up
     assert np.degrees(np.arccos(said @ up)) * 3600 == pytest.approx(18.5, abs=0.3)
@@ -321,7 +332,7 @@ def test_an_old_calibration_does_not_stop_a_new_one(catalogue, rng):
     )
     solver = shot.solver(catalogue)
     solver = replace(solver, instrument=replace(solver.instrument, calibration=stale))
-    found = calibrate_at(solver, shot.frames, shot.tilt, shot.scene.site)
+    found = calibrate_at(solver, shot.frames, shot.tilt, shot.scene.site.place)
     assert found.instrument.calibration.utc_unix_s == shot.frames[0].mid_unix_s
 
 
@@ -338,6 +349,6 @@ def test_a_steadier_inclinometer_is_taken_at_its_word(catalogue):
     errors = replace(EXACT, noise_rad=np.radians(noise), quantum_rad=np.radians(noise) / 8)
     solver = shot.solver(catalogue)
     solver = replace(solver, instrument=replace(solver.instrument, inclinometer=errors, clock_stddev_s=0.0))
-    found = calibrate_at(solver, shot.frames, shot.tilt, shot.scene.site)
+    found = calibrate_at(solver, shot.frames, shot.tilt, shot.scene.site.place)
     assert found.plumb_stddev_arcsec < 0.3
     assert a3_error(shot, found.instrument.calibration)[1] < 25

@@ -36,7 +36,7 @@ def seen(facts, at_s):
 def test_an_exposure_that_changes_from_frame_to_frame_moves_the_middle_of_each():
     facts = ExposureFacts(START)
     for at_s, exposure in ((100, 0.2), (101, 0.5)):
-        facts.take(capture(at_s, exposure, UNKNOWN))
+        facts.keep_capture(capture(at_s, exposure, UNKNOWN))
         mid_ns, frame = seen(facts, at_s)
         assert mid_ns == at_s * S + exposure / 2 * S and frame.mid_unix_s == mid_ns / S
         assert (frame.exposure_s, frame.stamp_stddev_s) == (exposure, 0.002)
@@ -49,7 +49,7 @@ def test_an_exposure_that_changes_from_frame_to_frame_moves_the_middle_of_each()
 @pytest.mark.parametrize(("source", "stamp"), [(SIMULATED, "start"), (UNKNOWN, "")])
 def test_a_capture_that_knows_its_stamp_or_a_user_who_says_nothing_leaves_the_stamp_the_middle(source, stamp):
     facts = ExposureFacts(START | {"stamp": stamp})
-    facts.take(capture(100, 0.2, source))
+    facts.keep_capture(capture(100, 0.2, source))
     mid_ns, frame = seen(facts, 100)
     assert (mid_ns, frame.exposure_s) == (100 * S, 0.2)
 

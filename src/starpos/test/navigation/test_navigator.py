@@ -24,7 +24,7 @@ from starpos.earth.ellipsoid import enu_axes
 from starpos.earth.place import Place
 from starpos.earth.refraction import Atmosphere
 from starpos.earth.vertical import Deflection
-from starpos.navigation.sightings import SightingUnderWay, body_attitude
+from starpos.navigation.sightings import PlacelessFrame, body_attitude
 from starpos.navigation.vessel import Vessel
 from starpos.session.driver import Level, Now
 from starpos_testing.voyages import INDUSTRIAL, made
@@ -282,8 +282,9 @@ def test_a_heading_at_a_known_place_claims_what_it_errs_by_when_the_mount_is_kno
     for frame, (latitude, longitude, body_to_itrs) in zip(record.frames, truth, strict=True):
         place = Place.by_gravity(*np.degrees([latitude, longitude]), Deflection(0.0, 0.0, 0.0))
         seen = frame.placeless()
-        placeless = SightingUnderWay(
+        placeless = PlacelessFrame(
             utc_unix_s=frame.utc_unix_s,
+            stamp_stddev_s=0.0,
             camera=seen,
         )
         found = body_attitude(placeless, place, there)

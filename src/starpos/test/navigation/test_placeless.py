@@ -9,7 +9,7 @@ from starpos import rotation
 from starpos.earth.orientation import earth_state, station_velocity
 from starpos.earth.refraction import Atmosphere
 from starpos.fix.camera_attitude import CameraAttitude
-from starpos.navigation.sightings import SightingUnderWay, StarsUnderWay, roughly
+from starpos.navigation.sightings import IdentifiedFrame, PlacelessFrame, roughly
 from starpos.units import ARCSEC
 
 AIR = Atmosphere()
@@ -30,7 +30,7 @@ def frame_at(zenith_distance_deg, seed):
     seen = (
         AIR.refraction().bend(rotation.normalised(itrs + station_velocity(zenith)) @ level.T) @ level @ camera
     )
-    frame = StarsUnderWay(
+    frame = IdentifiedFrame(
         utc_unix_s=BEGIN_S,
         stamp_stddev_s=0.0,
         source="frame",
@@ -46,7 +46,7 @@ def frame_at(zenith_distance_deg, seed):
 def told(frame):
     """The frame as given by an attitude."""
     seen = frame.placeless()
-    return SightingUnderWay.of(
+    return PlacelessFrame.of(
         CameraAttitude(
             utc_unix_s=frame.utc_unix_s,
             stamp_stddev_s=0.0,
@@ -83,6 +83,7 @@ def test_it_is_the_attitude_by_the_stars_within_its_claim(zenith_distance_deg, l
 def test_stronger_air_turns_it_as_it_turns_the_stars():
     frame, zenith = frame_at(30.0, 1)
     seen = [f.under(zenith, AIR) for f in (frame, told(frame))]
+    # about the camera's own axes: about the optical axis a frame without stars knows less
     by_stars, by_attitude = (a.rotation.T @ a.by_refraction for a in seen)
     assert np.linalg.norm(by_stars) > 25 * ARCSEC
     assert np.linalg.norm((by_stars - by_attitude)[:2]) < 1 * ARCSEC

@@ -42,7 +42,7 @@ class Said(list):
 def tell(gyro, begin_s, end_s, rate=RATE, rate_hz=100, now=LIVE):
     """Readings of a time: of a steady rate (3,), or of one that is a function of the time."""
     for t in np.arange(begin_s + 1 / rate_hz, end_s + 0.5 / rate_hz, 1 / rate_hz):
-        gyro.take(reading(t, rate(t) if callable(rate) else rate), now)
+        gyro.receive(reading(t, rate(t) if callable(rate) else rate), now)
 
 
 @pytest.fixture(scope="module")
@@ -133,7 +133,7 @@ def test_clipped_readings_tell_no_turn(largest, is_told):
     readings = GyroReadings()
     for t in np.arange(0.01, 1.0, 0.01):
         rate = np.clip(5.0 * np.sin(8.0 * t), -largest, largest)
-        readings.take(reading(START + t, (0.0, 0.0, rate)))
+        readings.receive(reading(START + t, (0.0, 0.0, rate)))
     turn = readings.turn(START + 0.1, START + 0.9, 0.0, np.zeros(3))
     assert (turn is not None) == is_told
 
@@ -141,20 +141,20 @@ def test_clipped_readings_tell_no_turn(largest, is_told):
 @pytest.mark.parametrize("rate", [(np.nan, 0, 0), (0, np.inf, 0), (0, 0, 1e6)])
 def test_what_is_no_rate_is_told_and_left_out(gyro, said, first, solver, rate):
     tell(gyro, MID_S, MID_S + 0.2)
-    gyro.take(reading(MID_S + 0.205, rate), LIVE)
+    gyro.receive(reading(MID_S + 0.205, rate), LIVE)
     tell(gyro, MID_S + 0.2, MID_S + 0.4)
     assert ["NaN" in sentence for sentence in said] == [True]
     assert gyro.predicted(frame_at(first[0], 0.4), solver)
 
 
 def test_who_measures_no_rate_and_who_has_no_time_is_told(gyro, said):
-    gyro.take(reading(MID_S + 0.1, RATE, measured=False), LIVE)
-    gyro.take(reading(0.0, RATE), LIVE)
+    gyro.receive(reading(MID_S + 0.1, RATE, measured=False), LIVE)
+    gyro.receive(reading(0.0, RATE), LIVE)
     assert "measures no rates" in said[0] and "no time stamp" in said[1]
 
 
 def test_a_clock_that_is_set_back_begins_anew(gyro, said, first, solver):
-    gyro.take(reading(MID_S + 3600.0, RATE), LIVE)
+    gyro.receive(reading(MID_S + 3600.0, RATE), LIVE)
     tell(gyro, MID_S - 0.1, MID_S + 0.4)
     assert gyro.predicted(frame_at(first[0], 0.4), solver) and not said
 

@@ -46,7 +46,7 @@ def turn(told, rate, begin_s=MID_S - 0.1, end_s=MID_S + 0.1):
 )
 def test_stars_move_as_the_camera_turns(told, rate, way):
     turn(told, rate)
-    trail = told.told(FRAME).trail
+    trail = told.with_trail(FRAME).trail
     assert trail.middle_px == pytest.approx(np.multiply(way, 0.1 * EXPOSURE_S * FOCAL_PX), abs=0.02)
 
 
@@ -54,7 +54,7 @@ def test_stars_move_as_the_camera_turns(told, rate, way):
 def test_each_star_moves_along_its_own_trail(told, rate):
     """Against directions that the body's turn carries into the camera's axes, projected at both ends of the exposure."""
     turn(told, rate)
-    trail = told.told(FRAME).trail
+    trail = told.with_trail(FRAME).trail
     link, size = np.array(TOP_OF_FRAME), np.array([1936, 1216])
     ends = [Rotation.from_rotvec(np.array(rate) * t).as_matrix() for t in (-EXPOSURE_S / 2, EXPOSURE_S / 2)]
     for at in ([967.5, 607.5], [300.0, 200.0], [1900.0, 100.0], [5.0, 1210.0]):
@@ -70,22 +70,22 @@ def test_each_star_moves_along_its_own_trail(told, rate):
 def test_a_frame_whose_stars_cross_it_is_as_it_is(told, rate):
     """No node may stumble over turns of 90 deg and more, or over stars that leave it."""
     turn(told, rate)
-    assert told.told(FRAME).trail is None
+    assert told.with_trail(FRAME).trail is None
 
 
 def test_where_anything_lacks_there_is_none(told):
-    assert told.told(FRAME).trail is None
+    assert told.with_trail(FRAME).trail is None
     turn(told, (0.1, 0.0, 0.0), end_s=MID_S)
-    assert told.told(FRAME).trail is None
+    assert told.with_trail(FRAME).trail is None
     turn(told, (0.1, 0.0, 0.0), begin_s=MID_S)
-    assert told.told(FRAME).trail is not None
-    assert told.told(replace(FRAME, exposure_s=None)).trail is None
-    assert told.told(replace(FRAME, mid_unix_s=None)).trail is None
+    assert told.with_trail(FRAME).trail is not None
+    assert told.with_trail(replace(FRAME, exposure_s=None)).trail is None
+    assert told.with_trail(replace(FRAME, mid_unix_s=None)).trail is None
     with pytest.raises(VoyageError, match="NaN"):
         told.receive_imu(reading(MID_S + 1.0, (np.nan, 0.0, 0.0)))
     unknown = Trails("")
     turn(unknown, (0.1, 0.0, 0.0))
-    assert unknown.told(FRAME).trail is None
+    assert unknown.with_trail(FRAME).trail is None
 
 
 def test_a_broken_instrument_file_is_told(tmp_path):
