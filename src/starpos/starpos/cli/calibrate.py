@@ -439,6 +439,7 @@ def _levelled(
             if stars.mid_unix_s is None:
                 raise FrameError(f"no time of exposure: {why_no_time(stars)}")
             tilt = tilts.average(stars.mid_unix_s, stars.exposure_s or 0.0)
+            instrument.inclinometer.check_live(tilt)
             levels.append(level_of(tilt.up) @ instrument.mounting.a3)
             kept.append((stars, found))
         except StarposError as e:

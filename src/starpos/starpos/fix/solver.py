@@ -246,6 +246,7 @@ class Solver:
         spread_s = math.sqrt(12) * frame.stamp_stddev_s
         tilt = tilts.average(frame.mid_unix_s, frame.exposure_s or 0.0, spread_s)
         self.instrument.calibration.check_age(frame.mid_unix_s)
+        self.instrument.inclinometer.check_live(tilt)
         self.instrument.inclinometer.check_range(tilt)
         self.instrument.inclinometer.check_axes(tilt)
         return state, tilt

@@ -35,6 +35,8 @@ MAX_CELSIUS = 300.0
 UNMEASURED_JUMP_C = 14.0
 UNMEASURED_WALK_C_PER_SQRT_HOUR = UNMEASURED_JUMP_C / math.sqrt(6.0)
 OUTDOORS_WALK_C_PER_SQRT_HOUR = 2.0
+# a few readings may stand on larger steps than the sensor's by chance, up to this many times as large
+BY_CHANCE = 2.5
 # sine above which X' counts as vertical: then L's X is taken below Y' instead
 STEEP = 0.999
 
@@ -52,6 +54,8 @@ class Tilt:
     times             Unix times of the readings, if they are known
     theta_z           rad; NaN of a two-axis sensor, whose Z' points upwards
     variance_z        rad2 of theta_z; NaN: as for the other two
+    step_rad          step to which the readings are rounded, where it is larger than their noise; 0: finer;
+                      inf: they repeat to the last digit and show no step
 
     The sensor may lean in any way. TiltError if a value is not finite, or no direction of gravity gives these angles.
     """
@@ -66,6 +70,7 @@ class Tilt:
     times: tuple[float, ...] = ()
     theta_z: float = float("nan")
     variance_z: float = float("nan")
+    step_rad: float = 0.0
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "covariance", np.asarray(self.covariance, float))
@@ -178,6 +183,26 @@ class InclinometerErrors:
                 "model"
             )
 
+    def check_live(self, tilt: Tilt) -> None:
+        """Raise TiltError if the readings repeat to the last digit, though the sensor's noise is larger than its steps."""
+        if math.isinf(tilt.step_rad) and self.noise_rad > self.quantum_rad:
+            x, y = np.degrees(tilt.theta[:2])
+            raise TiltError(
+                f"the inclinometer repeats the same value ({x:.6g}, {y:.6g} deg) to the last digit, though its noise of "
+                f"{np.degrees(self.noise_rad):.2g} deg is larger than its steps: it does not measure: check its sensor "
+                "and converter, or state its step (tilt_quantum_deg) and noise if its readings are so coarse"
+            )
+
+    def coarser(self, tilt: Tilt) -> str:
+        """Say that a tilt's readings are rounded to steps that are larger than the sensor's; '' if they are not."""
+        if not self._rounded(tilt):
+            return ""
+        return (
+            f"the tilts come in steps of {np.degrees(tilt.step_rad):.2g} deg, coarser than the inclinometer's "
+            f"{np.degrees(self.quantum_rad):.2g} deg: the rounding is in the claimed errors: record more digits, or "
+            "state the step (tilt_quantum_deg)"
+        )
+
     def contradiction(self, tilt: Tilt) -> float:
         """Error of each axis' sine by which three axes contradict each other beyond the stated errors; 0 for two axes.
 
@@ -212,12 +237,20 @@ class InclinometerErrors:
         """Variance (rad2) of what is new at each pose: hysteresis, flexure, and the rounding that noise leaves."""
         return self.pose_rad**2 + self.undithered_rad(tilt) ** 2
 
+    def _rounded(self, tilt: Tilt) -> bool:
+        """Whether a tilt's readings are rounded to steps that the sensor's stated one does not explain."""
+        return BY_CHANCE * self.quantum_rad < tilt.step_rad < math.inf
+
     def undithered_rad(self, tilt: Tilt) -> float:
         """Error (rad) that rounding leaves in the mean of many readings; noise larger than half a step removes it.
 
         It is the first harmonic of a quantiser's mean error under Gaussian noise, after Widrow and Kollar,
-        "Quantization Noise", 2008.
+        "Quantization Noise", 2008. Of readings in coarser steps than the sensor's, the scatter is rounding too, and the
+        sensor's own noise counts.
         """
+        if self._rounded(tilt):
+            noise2 = (self.noise_rad / tilt.step_rad) ** 2
+            return float(tilt.step_rad / math.sqrt(12) * math.exp(-2 * math.pi**2 * noise2))
         if self.quantum_rad == 0:
             return 0.0
         noise2 = min(tilt.covariance[0, 0], tilt.covariance[1, 1]) * tilt.samples / self.quantum_rad**2
@@ -225,9 +258,10 @@ class InclinometerErrors:
 
     def steps(self, tilt: Tilt) -> tuple:
         """The quantiser's steps on which the readings stand; the error of rounding is the same while they stay."""
-        if self.quantum_rad == 0:
+        step = tilt.step_rad if self._rounded(tilt) else self.quantum_rad
+        if step == 0:
             return ()
-        return (tuple(np.round(tilt.theta / self.quantum_rad).astype(int).tolist()),)
+        return (tuple(np.round(tilt.theta / step).astype(int).tolist()),)
 
 
 EXACT = InclinometerErrors(

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Readings of an inclinometer: their noise, and the tilt of an exposure from a log of them."""
 
+import itertools
 import math
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
@@ -40,6 +41,15 @@ HALF, MIN_TIMES = 0.6, 5
 STUCK_READINGS, RARE = 10, 0.1
 # a sensor whose readings repeat this often is coarse, or quiet
 MOSTLY_STUCK = 2.0
+# Steps, deg, in which loggers round.
+ROUNDED_DEG = (1.0, 0.5, 0.25, 0.2, 0.1, 0.05, 0.025, 0.02, 0.01)
+# A value stands on a step if it is this near, in steps: chance brings it there once in 10^5.
+ON_STEP = 5e-6
+# Steps larger than this many sigma of noise leave an error of rounding. Readings whose noise removes it differ from their
+# neighbours by two steps or more in at least this share.
+COARSE_SIGMA, DITHERED = 2.0, 0.03
+# A quiet sensor goes from one step to the next: minimum number of such moves, and their median over the smallest.
+MIN_MOVES, ONE_STEP = 5, 2.5
 
 
 def white_noise(steps: np.ndarray) -> np.ndarray:
@@ -63,6 +73,43 @@ def noise_excess(steps: np.ndarray, stated_rad: float) -> float:
         return 1.0
     found = float(white_noise(steps).max() / stated_rad)
     return found if found > 1 + SIGNIFICANT / np.sqrt(len(steps)) else 1.0
+
+
+def coarse_step(theta: np.ndarray, moves: np.ndarray, repeats: np.ndarray, noise_rad: float) -> float:
+    """Step (rad) of readings that are rounded to steps larger than their noise; 0 if they are not.
+
+    It is inf for readings that repeat to the last digit where nothing shows that the sensor lives.
+
+    theta (N, 2): readings, rad.  moves (M, 2): differences of these and earlier ones from one to the next.
+    repeats (2,): whether an axis repeats its value in STUCK_READINGS or more.  noise_rad: stated.
+    """
+    size = np.abs(moves)
+    step = max(_rounding(theta), *(_step_of_moves(axis) for axis in size.T))
+    if step > COARSE_SIGMA * noise_rad:
+        if len(size) >= MIN_NEIGHBOURS and (size > 1.5 * step).mean() > DITHERED:
+            return 0.0
+        return math.inf if repeats.all() and not (moves.any() or np.ptp(theta, axis=0).any()) else step
+    for axis in size.T[repeats]:
+        moved = axis[axis > 0]
+        if len(moved) < MIN_MOVES or np.median(moved) > ONE_STEP * moved.min():
+            return math.inf
+    return 0.0
+
+
+def _step_of_moves(size: np.ndarray) -> float:
+    """The smallest difference of an axis from one reading to the next, if most are equal; size (M,): of all; else 0."""
+    moved = size[size > 0]
+    repeating = len(size) >= MIN_NEIGHBOURS and 0 < len(moved) <= len(size) / 2
+    return float(moved.min()) if repeating else 0.0
+
+
+def _rounding(theta: np.ndarray) -> float:
+    """The largest step (rad) of ROUNDED_DEG on which all readings (N, 2) in rad stand; 0 if on none, or all are 0."""
+    degrees = np.degrees(theta)
+    for step in ROUNDED_DEG if degrees.any() else ():
+        if (np.abs(np.remainder(degrees / step + 0.5, 1.0) - 0.5) < ON_STEP).all():
+            return math.radians(step)
+    return 0.0
 
 
 @at_once
@@ -144,11 +191,14 @@ class TiltLog:
     @cached_property
     def excess(self) -> float:
         """Noise of the readings, from the differences of neighbours in time, over the stated noise; 1 or more."""
+        return max(noise_excess(self._moves, float(np.sqrt(self.variance.mean()))), self.earlier_excess)
+
+    @cached_property
+    def _moves(self) -> np.ndarray:
+        """Differences (M, axes) of neighbours in time."""
         order = np.argsort(self.utc_unix_s, kind="stable")
         apart = np.diff(self.utc_unix_s[order])
-        near = (apart > 0) & (apart < NEIGHBOURS_S)
-        steps = np.diff(self.theta[order], axis=0)[near]
-        return max(noise_excess(steps, float(np.sqrt(self.variance.mean()))), self.earlier_excess)
+        return np.diff(self.theta[order], axis=0)[(apart > 0) & (apart < NEIGHBOURS_S)]
 
     def until(self, unix_s: float) -> "TiltLog":
         """The readings up to a time."""
@@ -169,6 +219,7 @@ class TiltLog:
 
         Two readings of the same time count once. A reading far from the others is left out; two that follow each other
         and agree are of a turn. If the readings scatter more than stated (wind, footsteps), the covariance is larger.
+        Its `step_rad` says whether they are rounded, or repeat without an end.
         TiltError if they do not cover the exposure, the instrument moved, or the sensor was stuck.
 
         spread_s: the full width within which the middle may lie, for a clock of whole seconds; then readings within it
@@ -180,7 +231,8 @@ class TiltLog:
                 f"the inclinometer repeats the same value in {STUCK_READINGS} readings or more, though its noise is "
                 "larger than its steps: check its converter's wiring"
             )
-        return self._mean(use)
+        repeats = tuple(self._repeats[use].any(0).tolist())
+        return replace(self._mean(use), step_rad=self._steps[repeats])
 
     def mean(self) -> Tilt:
         """The mean of all readings, of an instrument that is at rest between them too; TiltError if it moved."""
@@ -228,6 +280,23 @@ class TiltLog:
             for first, last in zip(begin, end, strict=True):
                 stuck[order[first : last + 1]] = True
         return stuck
+
+    @cached_property
+    def _steps(self) -> dict[tuple[bool, ...], float]:
+        """`coarse_step` of all readings, by whether X' and Y' repeat."""
+        noise, theta = float(np.sqrt(self.variance.mean())), self.theta[self._once, :2]
+        cases = list(itertools.product((False, True), repeat=2))
+        return {case: coarse_step(theta, self._moves[:, :2], np.array(case), noise) for case in cases}
+
+    @cached_property
+    def _repeats(self) -> np.ndarray:
+        """Mask (N, 2) of the values of X', Y' that stand in a row of STUCK_READINGS or more equal ones."""
+        repeats = np.zeros((len(self.utc_unix_s), 2), bool)
+        for axis, equal in enumerate((np.diff(self.theta[self._once, :2], axis=0) == 0).T):
+            begin, end = np.flatnonzero(np.diff(np.concatenate([[0], equal, [0]]))).reshape(-1, 2).T
+            for first, last in zip(begin, end, strict=True):
+                repeats[self._once[first : last + 1], axis] = last - first >= STUCK_READINGS - 1
+        return repeats
 
     def _mean(self, use: np.ndarray) -> Tilt:
         """The mean tilt of the readings `use` (indices, in order of time)."""

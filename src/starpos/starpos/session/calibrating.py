@@ -102,7 +102,7 @@ class PoseMemory:
 def mean_tilt(tilts: Sequence[Tilt]) -> Tilt:
     """Average the tilts of an instrument at rest without outliers; TiltError if the tilts contradict each other."""
     mean = TiltLog.of_readings(tilts).mean()
-    return replace(mean, samples=sum(t.samples for t in tilts))
+    return replace(mean, samples=sum(t.samples for t in tilts), step_rad=max(t.step_rad for t in tilts))
 
 
 def tilts_of(seen: Sequence[Seen]) -> TiltsByTime:

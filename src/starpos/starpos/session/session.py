@@ -413,6 +413,7 @@ class SolverSession:
             return []
         try:
             tilt = answer.tilt or self.tilts.average(stars.mid_unix_s, self._span(stars))
+            solver.instrument.inclinometer.check_live(tilt)
         except StarposError:
             return []
         self._guarded(lambda: self.deflection.include(solver, stars, tilt, answer.found), lambda e: None)

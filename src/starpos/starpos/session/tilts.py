@@ -7,6 +7,7 @@ are distinguished by the frame of their messages and by DDS's message numbers, w
 publisher.
 """
 
+import itertools
 import math
 from collections import deque
 from dataclasses import dataclass, replace
@@ -20,9 +21,11 @@ from starpos.instrument.tilt_log import (
     BRACKET_S,
     NEIGHBOURS_S,
     OPEN_END,
+    STUCK_READINGS,
     TOUCH_S,
     TiltLog,
     Tilts,
+    coarse_step,
     noise_excess,
 )
 from starpos.messages.stamp import stamp_to_unix
@@ -70,11 +73,18 @@ class TiltSteps:
 
     def excess(self, end_unix_s: float) -> float:
         """Measured noise over the stated one, 1 or more, by samples up to a time."""
-        rows = self._rows[max(self._number - STEPS_KEPT, 0) : self._number]
-        rows = rows[: np.searchsorted(rows[:, 0], end_unix_s, side="right")]
+        rows = self._until(end_unix_s)
         if not len(rows):
             return 1.0
         return noise_excess(rows[:, 2 : 2 + self._axes], float(np.sqrt(rows[:, 1].mean())))
+
+    def until(self, end_unix_s: float) -> np.ndarray:
+        """The differences (N, 2) of X', Y' of samples up to a time, rad."""
+        return self._until(end_unix_s)[:, 2:4]
+
+    def _until(self, end_unix_s: float) -> np.ndarray:
+        rows = self._rows[max(self._number - STEPS_KEPT, 0) : self._number]
+        return rows[: np.searchsorted(rows[:, 0], end_unix_s, side="right")]
 
 
 # time after which a single publisher is used again: a minimum, periods of the other if it sent seldom, a maximum
@@ -312,7 +322,18 @@ class TiltBuffer:
             near = near[max(inside[0] - 1, 0) : inside[-1] + 1 + open_end]
         # by samples up to the exposure's end: the number since then depends on chance
         excess = self._steps.excess(mid_unix_s + span_s / 2)
-        return TiltLog.of_readings(near, excess).average(mid_unix_s, span_s)
+        tilt = TiltLog.of_readings(near, excess).average(mid_unix_s, span_s)
+        return replace(tilt, step_rad=self._coarse_step(near))
+
+    def _coarse_step(self, used: list[Tilt]) -> float:
+        """`coarse_step` of the samples used, by these and those before."""
+        end = used[-1].utc_unix_s
+        until = (s for _, s in reversed(self._good) if s.utc_unix_s <= end)
+        before = [s.theta[:2] for s in itertools.islice(until, STUCK_READINGS)]
+        repeats = np.ptp(before, axis=0) == 0 if len(before) == STUCK_READINGS else np.zeros(2, bool)
+        noise = math.sqrt(np.mean([np.diag(s.covariance) for s in used]))
+        theta = np.array([s.theta[:2] for s in used])
+        return coarse_step(theta, self._steps.until(end), repeats, noise)
 
     def over(self, span_s: float) -> "Tilts":
         """These tilts for a frame, over a span in place of an exposure that may not be known."""
