@@ -35,7 +35,8 @@ def test_a_wheel_is_tested_by_what_is_there():
 
 def test_who_made_the_data_is_said():
     said = (REPOSITORY / "REUSE.toml").read_text()
-    for data in PACKAGE.glob("starpos/*/data"):
+    # rows of parameters are this project's own, and each file says so
+    for data in {*PACKAGE.glob("starpos/*/data")} - {PACKAGE / "starpos" / "parameters" / "data"}:
         assert f'"{data.relative_to(REPOSITORY).as_posix()}/**"' in said
 
 

@@ -45,7 +45,7 @@ class GyroReadings:
         if time_s < self._recent.last_s - BACK_S:
             # its clock was set
             self._recent = RecentReadings()
-        self._recent.add((time_s, w.x, w.y, w.z, 0.0, 0.0, 0.0))
+        self._recent.append((time_s, w.x, w.y, w.z, 0.0, 0.0, 0.0))
         if not 0 <= time_s - self._block_s < BLOCK_S:
             self._block_s = time_s
             self._recent.close()

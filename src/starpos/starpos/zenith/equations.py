@@ -213,7 +213,7 @@ def _shared_readings(sightings: Sequence[ZenithSighting]) -> np.ndarray:
 
 def _of_stars(lines: Lines, sightings: Sequence[ZenithSighting], places: StarPlaces) -> list[ErrorTerm]:
     n = len(sightings)
-    roots = np.linalg.cholesky([s.centroids for s in sightings])
+    roots = np.linalg.cholesky([s.camera.covariance_about_own for s in sightings])
     bent = np.array([s.by_refraction for s in sightings])
     rows = np.array([s.by_rows for s in sightings])
     return [

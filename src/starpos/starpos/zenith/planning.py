@@ -21,7 +21,7 @@ from starpos.instrument.instrument import Instrument
 from starpos.sky.catalogue import Catalogue
 from starpos.units import MAS_DEG
 from starpos.zenith.adjustment import AIR_SHARE, Air, adjusted
-from starpos.zenith.sighting import ZenithSighting
+from starpos.zenith.sighting import ZenithSighting, site_attitude
 
 # a round: a quarter turn from face to face
 FACES = 4
@@ -212,10 +212,10 @@ class Planner:
         late_s = (instrument.shutter or UNKNOWN_SHUTTER).errors_s(rows, self.camera.height).mean(0)
         drift = -ROTATION_RAD_S * (attitude @ self.mark.axes[:, 2])
         return ZenithSighting(
-            source="",
             utc_unix_s=utc_unix_s,
-            enu_to_camera=attitude,
-            centroids=np.diag([sky.centroid_rad, sky.centroid_rad, roll]) ** 2 / sky.stars,
+            camera=site_attitude(
+                attitude, np.diag([sky.centroid_rad, sky.centroid_rad, roll]) ** 2 / sky.stars
+            ),
             stars=stars,
             by_star=np.repeat(by_star[:, None], GROUPS, 1),
             star_weight=np.zeros((GROUPS, 3, 3)),
@@ -227,5 +227,4 @@ class Planner:
             tilt=Tilt(float(theta[0]), float(theta[1]), noise, utc_unix_s=utc_unix_s, samples=readings),
             orientation=self.state.orientation,
             clock_stddev_s=instrument.clock_stddev_s,
-            stamp_stddev_s=0.0,
         )

@@ -16,7 +16,9 @@ from starpos import rotation
 from starpos.earth.orientation import ROTATION_RAD_S, EarthOrientation, EarthState, later, station_velocity
 from starpos.earth.place import Place
 from starpos.errors import FixError, InstrumentError
+from starpos.fix.attitude import CAMERA, ENU, Attitude
 from starpos.fix.budget import StarErrors
+from starpos.fix.sighting import Sighting
 from starpos.fix.solver import ENOUGH_SOUND, Solver
 from starpos.fix.star_fit import (
     ISOTROPIC,
@@ -39,12 +41,11 @@ STRONGER = 0.01
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class ZenithSighting:
-    """The attitude of the camera at one frame, its tilt, and the errors of both.
+class ZenithSighting(Sighting):
+    """A sighting at a known site, with the effect of each error of its stars.
 
-    enu_to_camera (3, 3): geodetic east, north, up into C, by the stars.  All rotations below are small ones of the camera
-    about C's axes, rad.
-    centroids (3, 3): covariance of it by the stars' places on the frame.
+    camera: into geodetic east, north, up at the mark, with its errors by the stars' places on the frame alone.  All
+    rotations below are small ones of the camera about C's axes, rad.
     stars (N,): rows of the catalogue.  by_star (3, N, 3): rotation for 1 sigma of each star's place along ICRS's axes.
     star_weight (N, 3, 3), star_common (4, N, 3), star_pull (N, 3): normal equations of these displacements by this
     frame's stars alone: each star's own weight, less what attitude and scale take up, and the right side.
@@ -52,10 +53,7 @@ class ZenithSighting:
     residual_arcsec (N, 2): the stars' places by the fit minus those seen, along the frame's columns and rows.
     """
 
-    source: str
-    utc_unix_s: float
-    enu_to_camera: np.ndarray
-    centroids: np.ndarray
+    tilt: Tilt
     stars: np.ndarray
     by_star: np.ndarray
     star_weight: np.ndarray
@@ -64,10 +62,18 @@ class ZenithSighting:
     by_refraction: np.ndarray
     by_rows: np.ndarray
     residual_arcsec: np.ndarray
-    tilt: Tilt
     orientation: EarthOrientation
-    clock_stddev_s: float
-    stamp_stddev_s: float
+
+    @property
+    def enu_to_camera(self) -> np.ndarray:
+        """Rotation (3, 3) of geodetic east, north, up into C."""
+        return self.camera.rotation.T
+
+    def turned(self, turn: np.ndarray) -> "ZenithSighting":
+        """Turn the camera by a rotation (3, 3) of its axes C."""
+        return replace(
+            self, camera=site_attitude(turn @ self.enu_to_camera, self.camera.covariance_about_own)
+        )
 
     @property
     def heading(self) -> float:
@@ -79,6 +85,15 @@ class ZenithSighting:
     def residual_rms_arcsec(self) -> float:
         """Root mean square of the residuals a coordinate."""
         return float(np.sqrt(np.mean(self.residual_arcsec**2)))
+
+
+def site_attitude(enu_to_camera: np.ndarray, covariance: np.ndarray) -> Attitude:
+    """Make the camera's attitude at a site, by a rotation (3, 3) of east, north, up into C.
+
+    covariance (3, 3): rad2, of its small rotation about C's axes.
+    """
+    back = enu_to_camera.T
+    return Attitude(back, back @ covariance @ enu_to_camera, of=CAMERA, into=ENU)
 
 
 def sighting(
@@ -136,8 +151,7 @@ def sighting(
     return ZenithSighting(
         source=stars.source,
         utc_unix_s=state.utc_unix_s,
-        enu_to_camera=fit.a4,
-        centroids=errors.rotation_covariance(centroids),
+        camera=site_attitude(fit.a4, errors.rotation_covariance(centroids)),
         stars=index[kept],
         by_star=np.einsum("ing,ngj->inj", gain, displaced_px),
         star_weight=np.einsum("ngi,ngj->nij", shown, shown),
@@ -239,7 +253,7 @@ class StarPlaces:
     def applied(self, sightings: Sequence[ZenithSighting]) -> list[ZenithSighting]:
         """The sightings with the attitudes that the corrected places give."""
         return [
-            replace(s, enu_to_camera=rotation.from_vector(-self._turn(k, s)) @ s.enu_to_camera)
+            s.turned(rotation.from_vector(-self._turn(k, s)))
             for k, s in zip(self.rows, sightings, strict=True)
         ]
 

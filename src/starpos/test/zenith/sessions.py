@@ -14,7 +14,7 @@ from starpos.instrument.inclinometer import EXACT, Tilt
 from starpos.instrument.instrument import Instrument
 from starpos.units import ARCSEC
 from starpos.zenith.adjustment import adjusted
-from starpos.zenith.sighting import ZenithSighting
+from starpos.zenith.sighting import ZenithSighting, site_attitude
 
 NOISE_ARCSEC, DRIFT_ARCSEC, SCALE = 0.05, 0.05, 1e-3
 TILTMETER = replace(
@@ -97,8 +97,7 @@ def _sighting(number, utc_unix_s, attitude, theta):
     return ZenithSighting(
         source=f"{number}.csv",
         utc_unix_s=utc_unix_s,
-        enu_to_camera=attitude,
-        centroids=np.diag([0.01, 0.01, 1.0]) ** 2 * ARCSEC**2,
+        camera=site_attitude(attitude, np.diag([0.01, 0.01, 1.0]) ** 2 * ARCSEC**2),
         stars=np.array([7]),
         by_star=np.zeros((3, 1, 3)),
         star_weight=np.zeros((1, 3, 3)),
@@ -117,4 +116,4 @@ def _sighting(number, utc_unix_s, attitude, theta):
 def shifted(sighting, east_arcsec, north_arcsec):
     """The sighting of a frame whose stars stand that far aside."""
     turn = rotation.from_vector([-north_arcsec * ARCSEC, east_arcsec * ARCSEC, 0.0])
-    return replace(sighting, enu_to_camera=sighting.enu_to_camera @ turn)
+    return sighting.turned(sighting.enu_to_camera @ turn @ sighting.enu_to_camera.T)

@@ -101,8 +101,7 @@ def test_equations_that_do_not_settle_are_an_error_and_no_value(kind, seed):
 
 
 def scattered(rng, sighting):
-    turn = rotation.from_vector(rng.normal(0, 0.1, 3))
-    return replace(sighting, enu_to_camera=turn @ sighting.enu_to_camera)
+    return sighting.turned(rotation.from_vector(rng.normal(0, 0.1, 3)))
 
 
 def silent(sighting):

@@ -26,16 +26,15 @@ def passing(rng, frames, displaced):
         common, weight, pull = np.zeros((4, WIDE, 3)), np.zeros((WIDE, 3, 3)), np.zeros((WIDE, 3))
         common[0, :, 0], weight[:, 0, 0] = 1 / SEEN / np.sqrt(WIDE), 1 / SEEN**2
         pull[:, 0] = (seen - seen.mean()) / SEEN**2
-        attitude = rotation.from_vector([SIGMA * seen.mean(), 0.0, 0.0]) @ s.enu_to_camera
+        turn = rotation.from_vector([SIGMA * seen.mean(), 0.0, 0.0])
         sightings.append(
             replace(
-                s,
+                s.turned(turn),
                 stars=rows + 100,
                 by_star=by_star,
                 star_common=common,
                 star_weight=weight,
                 star_pull=pull,
-                enu_to_camera=attitude,
             )
         )
     return sightings

@@ -49,7 +49,7 @@ def test_the_leverage_of_a_star_is_what_its_displacement_does(rng):
     ]
     found = adjust(sightings)
     turn = rotation.from_vector([0.0, size / 10, 0.0])
-    other = adjust([replace(s, enu_to_camera=s.enu_to_camera @ turn) for s in sightings])
+    other = adjust([s.turned(s.enu_to_camera @ turn @ s.enu_to_camera.T) for s in sightings])
     assert found.stars.stars.tolist() == [7] and found.stars.frames.tolist() == [24]
     assert found.stars.leverage_arcsec[0] == pytest.approx([0.004, 0.004], rel=0.02)
     assert abs(other.eta_arcsec - found.eta_arcsec) == pytest.approx(0.004, rel=0.02)
