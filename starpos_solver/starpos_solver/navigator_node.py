@@ -13,10 +13,9 @@ from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
 from starpos.fix.attitude import Attitude
-from starpos.navigation.estimate import VoyageFix
 from starpos.parameters.table import parameters_of
 from starpos.session.driver import Now
-from starpos.session.navigator import Navigated, NavigatorSession, NavigatorSettings, Position
+from starpos.session.navigator import Navigated, NavigatorSession, NavigatorSettings
 from starpos_common.diagnostics import Diagnostics, time_is_simulated
 from starpos_common.messages import quaternion, unix_to_stamp
 from starpos_common.parameters import declare
@@ -56,24 +55,26 @@ class NavigatorPublishers:
             return
         link = outputs.true_north(output.fix.link, output.ground)
         self._heading.publish(outputs.imu(header, link))
-        if output.position is None:
+        if output.displacement is None:
             return
         start = Header(stamp=header.stamp, frame_id=self._values["odometry_frame_id"])
-        message = odometry(start, frame, output.fix, link, output.position)
+        message = odometry(start, frame, output, link)
         self._odometry.publish(message)
         self._transform.publish([transform_of(message)])
 
 
-def odometry(header: Header, child: str, fix: VoyageFix, link: Attitude, position: Position) -> Odometry:
+def odometry(header: Header, child: str, output: Navigated, link: Attitude) -> Odometry:
     """Make the Odometry: pose in the frame of the header, ENU; velocity along the axes of the child's.
 
     link: attitude of the base link in true-north ENU.
     """
+    fix, displacement = output.fix, output.displacement
+    assert fix is not None and displacement is not None
     message = Odometry(header=header, child_frame_id=child)
-    message.pose.pose.position = Point(**dict(zip("xyz", position.enu.tolist(), strict=True)))
+    message.pose.pose.position = Point(**dict(zip("xyz", displacement.tolist(), strict=True)))
     message.pose.pose.orientation = quaternion(link.rotation)
     pose, twist = np.zeros((2, 6, 6))
-    pose[:3, :3], pose[3:, 3:] = position.covariance, link.covariance
+    pose[:3, :3], pose[3:, 3:] = output.displacement_covariance, link.covariance
     message.pose.covariance = pose.ravel()
     velocity = fix.link.rotation.T @ fix.velocity
     message.twist.twist.linear = Vector3(**dict(zip("xyz", velocity.tolist(), strict=True)))
