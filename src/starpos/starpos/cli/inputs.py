@@ -53,7 +53,7 @@ def is_untold(args: argparse.Namespace) -> bool:
 def checked_tilts(command: str, path: str, instrument: Instrument) -> TiltFile:
     """The table of tilts, with a complaint where it looks like radians; raises TiltError as `read_tilt_csv` does."""
     file = TiltFile(path, instrument.inclinometer.noise_rad)
-    for remark in of_tilts(file.log, path):
+    for remark in of_tilts(file.log, path, instrument.inclinometer):
         console.complain(command, remark)
     return file
 

@@ -3,6 +3,7 @@
 A3.
 """
 
+import math
 from collections.abc import Iterable
 
 import numpy as np
@@ -54,6 +55,29 @@ def check_visible(sine: float) -> None:
 def _altitude_text(sine: float) -> str:
     altitude_deg = np.degrees(np.arcsin(max(sine, -1.0)))
     return f"{abs(altitude_deg):.1f} deg {'above' if altitude_deg > 0 else 'below'} the horizon"
+
+
+# A trail of which this much more than the stars' width (times it, and px) is missing; and the smallest width of a trail
+# across, px, for which the detector's FWHM is the geometric mean of length and width.
+TRAIL_WIDTHS, TRAIL_PX, ACROSS_PX = 3.0, 3.0, 0.8
+
+
+def check_exposure(stars: Stars, camera: Camera, directions: np.ndarray) -> None:
+    """Raise FixError if stars are points where those of a camera at rest would trail for the exposure's length.
+
+    directions (N, 3): of stars on the frame, GCRS.
+    """
+    if stars.fwhm_px is None or not stars.exposure_s:
+        return
+    across_pole = math.sqrt(1 - float(np.mean(directions[:, 2] ** 2)))
+    trail_px = ROTATION_RAD_S * stars.exposure_s * across_pole * camera.fx
+    if trail_px > max(TRAIL_WIDTHS * stars.fwhm_px + TRAIL_PX, stars.fwhm_px**2 / ACROSS_PX):
+        raise FixError(
+            f"{stars.place}: its stars are points of {stars.fwhm_px:.1f} px (FWHM), and an exposure of "
+            f"{stars.exposure_s:g} s of a camera at rest makes trails of {trail_px:.0f} px: its exposure time is wrong "
+            "(milliseconds?), or it was tracked, added or stacked: give single frames of a camera at rest with their own "
+            "times"
+        )
 
 
 # a camera at rest gets beyond it once in 900 frames

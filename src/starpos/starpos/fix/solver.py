@@ -14,7 +14,7 @@ from starpos.earth.orientation import EarthState, earth_state
 from starpos.earth.place import Place, Places
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import FieldError, FixError, InstrumentError, PlaceError, StarposError, TimeError
-from starpos.fix.checks import check_above_horizon, check_unmoved, why_unidentified
+from starpos.fix.checks import check_above_horizon, check_exposure, check_unmoved, why_unidentified
 from starpos.fix.fix import IDEAL, Fix, length_text, pointing_fix, solve_fix
 from starpos.fix.heading import AttitudeAtPlace, attitude_at_place
 from starpos.fix.solution import TWO_SKIES, UNEXPLAINED, Solution, Status, solution_of, status_of
@@ -301,6 +301,7 @@ class Solver:
         if fisheye.is_wide(camera):
             use &= high_enough(directions_of(camera, stars)[found.star] @ up)
         places = catalogue.directions(found.catalogue[use], state.year, state.observer_au)
+        check_exposure(stars, camera, places)
         return use, MatchedStars.of(stars, found, use, camera, catalogue, state.year, places)
 
     def attitude_at(self, stars: Stars, found: Identification, place: Place) -> AttitudeAtPlace:

@@ -184,7 +184,7 @@ class InclinometerErrors:
             )
 
     def check_live(self, tilt: Tilt) -> None:
-        """Raise TiltError if the readings repeat to the last digit, though the sensor's noise is larger than its steps."""
+        """Raise TiltError if readings repeat to the last digit, though the sensor's noise is larger than its steps."""
         if math.isinf(tilt.step_rad) and self.noise_rad > self.quantum_rad:
             x, y = np.degrees(tilt.theta[:2])
             raise TiltError(
@@ -193,12 +193,12 @@ class InclinometerErrors:
                 "and converter, or state its step (tilt_quantum_deg) and noise if its readings are so coarse"
             )
 
-    def coarser(self, tilt: Tilt) -> str:
-        """Say that a tilt's readings are rounded to steps that are larger than the sensor's; '' if they are not."""
-        if not self._rounded(tilt):
+    def coarser(self, step_rad: float) -> str:
+        """Say that readings are rounded to steps (`Tilt.step_rad`) larger than the sensor's; '' if they are not."""
+        if not self._is_rounded(step_rad):
             return ""
         return (
-            f"the tilts come in steps of {np.degrees(tilt.step_rad):.2g} deg, coarser than the inclinometer's "
+            f"the tilts come in steps of {np.degrees(step_rad):.2g} deg, coarser than the inclinometer's "
             f"{np.degrees(self.quantum_rad):.2g} deg: the rounding is in the claimed errors: record more digits, or "
             "state the step (tilt_quantum_deg)"
         )
@@ -237,9 +237,9 @@ class InclinometerErrors:
         """Variance (rad2) of what is new at each pose: hysteresis, flexure, and the rounding that noise leaves."""
         return self.pose_rad**2 + self.undithered_rad(tilt) ** 2
 
-    def _rounded(self, tilt: Tilt) -> bool:
-        """Whether a tilt's readings are rounded to steps that the sensor's stated one does not explain."""
-        return BY_CHANCE * self.quantum_rad < tilt.step_rad < math.inf
+    def _is_rounded(self, step_rad: float) -> bool:
+        """Whether readings are rounded to steps that the sensor's stated one does not explain."""
+        return BY_CHANCE * self.quantum_rad < step_rad < math.inf
 
     def undithered_rad(self, tilt: Tilt) -> float:
         """Error (rad) that rounding leaves in the mean of many readings; noise larger than half a step removes it.
@@ -248,7 +248,7 @@ class InclinometerErrors:
         "Quantization Noise", 2008. Of readings in coarser steps than the sensor's, the scatter is rounding too, and the
         sensor's own noise counts.
         """
-        if self._rounded(tilt):
+        if self._is_rounded(tilt.step_rad):
             noise2 = (self.noise_rad / tilt.step_rad) ** 2
             return float(tilt.step_rad / math.sqrt(12) * math.exp(-2 * math.pi**2 * noise2))
         if self.quantum_rad == 0:
@@ -258,7 +258,7 @@ class InclinometerErrors:
 
     def steps(self, tilt: Tilt) -> tuple:
         """The quantiser's steps on which the readings stand; the error of rounding is the same while they stay."""
-        step = tilt.step_rad if self._rounded(tilt) else self.quantum_rad
+        step = tilt.step_rad if self._is_rounded(tilt.step_rad) else self.quantum_rad
         if step == 0:
             return ()
         return (tuple(np.round(tilt.theta / step).astype(int).tolist()),)

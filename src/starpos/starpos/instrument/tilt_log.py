@@ -46,8 +46,8 @@ ROUNDED_DEG = (1.0, 0.5, 0.25, 0.2, 0.1, 0.05, 0.025, 0.02, 0.01)
 # A value stands on a step if it is this near, in steps: chance brings it there once in 10^5.
 ON_STEP = 5e-6
 # Steps larger than this many sigma of noise leave an error of rounding. Readings whose noise removes it differ from their
-# neighbours by two steps or more in at least this share.
-COARSE_SIGMA, DITHERED = 2.0, 0.03
+# neighbours by two steps or more in at least this share; a turn goes over more steps.
+COARSE_SIGMA, DITHERED, MOST_STEPS = 2.0, 0.03, 5.5
 # A quiet sensor goes from one step to the next: minimum number of such moves, and their median over the smallest.
 MIN_MOVES, ONE_STEP = 5, 2.5
 
@@ -84,9 +84,10 @@ def coarse_step(theta: np.ndarray, moves: np.ndarray, repeats: np.ndarray, noise
     repeats (2,): whether an axis repeats its value in STUCK_READINGS or more.  noise_rad: stated.
     """
     size = np.abs(moves)
-    step = max(_rounding(theta), *(_step_of_moves(axis) for axis in size.T))
+    step = _rounding(theta) or max(_step_of_moves(axis) for axis in size.T)
     if step > COARSE_SIGMA * noise_rad:
-        if len(size) >= MIN_NEIGHBOURS and (size > 1.5 * step).mean() > DITHERED:
+        several = (size > 1.5 * step) & (size < MOST_STEPS * step)
+        if len(size) >= MIN_NEIGHBOURS and several.mean() > DITHERED:
             return 0.0
         return math.inf if repeats.all() and not (moves.any() or np.ptp(theta, axis=0).any()) else step
     for axis in size.T[repeats]:
@@ -281,6 +282,11 @@ class TiltLog:
                 stuck[order[first : last + 1]] = True
         return stuck
 
+    @property
+    def step_rad(self) -> float:
+        """The step to which all readings are rounded, where it is larger than their noise; 0: finer."""
+        return self._steps[False, False]
+
     @cached_property
     def _steps(self) -> dict[tuple[bool, ...], float]:
         """`coarse_step` of all readings, by whether X' and Y' repeat."""
@@ -301,7 +307,8 @@ class TiltLog:
     def _mean(self, use: np.ndarray) -> Tilt:
         """The mean tilt of the readings `use` (indices, in order of time)."""
         theta = self.theta[use]
-        noise = self.excess * np.sqrt(self.variance[use].mean())
+        # rounded readings may go from one step to the next
+        noise = np.hypot(self.excess * np.sqrt(self.variance[use].mean()), self.step_rad / math.sqrt(12))
         from_middle = np.abs(theta - np.median(theta, axis=0))
         spread = np.maximum(noise, SIGMA_PER_MAD * np.median(from_middle, axis=0))
         sane = (from_middle <= OUTLIER_SIGMA * spread).all(1)

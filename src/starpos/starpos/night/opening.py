@@ -20,7 +20,6 @@ from starpos.frames.reading import FITS
 from starpos.frames.tables import GNSS, SIMULATED, TILTS, TRUTH
 from starpos.gnss.receiver import GnssTrack, read_gnss_csv
 from starpos.instrument import instrument_file, sensors
-from starpos.instrument.inclinometer import SCA100T_NOISE_RAD
 from starpos.instrument.instrument import Calibration, Instrument
 from starpos.instrument.tilt_log import TiltsByTime
 from starpos.night.night import Night, Truth
@@ -89,9 +88,9 @@ def work_of(
     if tilts is None:
         return Solving(instruments, atmosphere=atmosphere, places=place), remarks
     known = instruments.instrument
-    noise_rad = SCA100T_NOISE_RAD if known is None else known.inclinometer.noise_rad
-    table = TiltFile(os.path.abspath(tilts), noise_rad)
-    doubts = of_tilts(table.log, str(tilts))
+    errors = sensors.UNNAMED if known is None else known.inclinometer
+    table = TiltFile(os.path.abspath(tilts), errors.noise_rad)
+    doubts = of_tilts(table.log, str(tilts), errors)
     return Solving(instruments, atmosphere=atmosphere, tilts=table, places=place), (*remarks, *doubts)
 
 

@@ -23,7 +23,7 @@ from starpos.fix.checks import (
 )
 from starpos.fix.fix import Fix, length_text
 from starpos.frozen import at_once
-from starpos.instrument.inclinometer import Tilt, level_of, up_of
+from starpos.instrument.inclinometer import InclinometerErrors, Tilt, level_of, up_of
 from starpos.instrument.instrument import Calibration, Instrument
 from starpos.instrument.mounting import Mounting
 from starpos.instrument.tilt_log import TiltLog
@@ -65,10 +65,10 @@ class Remark:
         return self.text
 
 
-def of_tilts(log: TiltLog, path: str) -> tuple[Remark, ...]:
-    """Say that a table of tilts looks like radians."""
-    doubt = like_radians(log)
-    return (Remark(Kind.TILTS, f"{path}: {doubt}"),) if doubt else ()
+def of_tilts(log: TiltLog, path: str, inclinometer: InclinometerErrors) -> tuple[Remark, ...]:
+    """Say that a table of tilts looks like radians, or is rounded to steps coarser than the inclinometer's."""
+    doubts = (like_radians(log), inclinometer.coarser(log.step_rad))
+    return tuple(Remark(Kind.TILTS, f"{path}: {doubt}") for doubt in doubts if doubt)
 
 
 def of_inclinometer(instrument: Instrument, ways: str = MODEL_BY_OPTIONS) -> tuple[Remark, ...]:
