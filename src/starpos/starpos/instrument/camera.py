@@ -51,6 +51,22 @@ def stated_lens(model: str, d: Sequence[float], place: str) -> tuple[str, tuple[
     )
 
 
+# The axis of a whole frame is no further from its middle than this share of a side, on one of the two sides at least.
+OFF_MIDDLE = 0.24
+
+
+def check_axis(width: int, height: int, cx: float, cy: float, place: str) -> None:
+    """Raise InstrumentError if a whole frame's principal point lies near its corner, or outside, px; size 0: unknown."""
+    if not width or not height:
+        return
+    x, y = (cx + 0.5) / width - 0.5, (cy + 0.5) / height - 0.5
+    if max(abs(x), abs(y)) > 0.5 or min(abs(x), abs(y)) > OFF_MIDDLE:
+        raise InstrumentError(
+            f"{place}: the optical axis is at pixel ({cx:.1f}, {cy:.1f}) of a whole frame of {width} x {height} px, near "
+            "its corner or outside: the matrix seems to be of a part of the frame: give the whole sensor's, with its size"
+        )
+
+
 @lru_cache(maxsize=64)
 def _reach(d: tuple[float, ...]) -> float:
     """The angle off the axis, rad, out to which a fisheye has a picture; at most pi."""

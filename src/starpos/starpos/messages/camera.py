@@ -13,7 +13,7 @@ from starpos.frames.encodings import pixels_of
 from starpos.frames.exposure import UNKNOWN_STAMP, DriverStamp, Shutter
 from starpos.frames.frame import Frame
 from starpos.frames.pictures import picture_pixels
-from starpos.instrument.camera import Camera, stated_lens
+from starpos.instrument.camera import Camera, check_axis, stated_lens
 from starpos.messages.stamp import stamp_to_unix
 from starpos.messages.stars import message_to_shutter
 
@@ -40,6 +40,7 @@ def message_to_camera(
         raise InstrumentError(
             f"{source}: K is not [fx 0 cx, 0 fy cy, 0 0 1]; calibrate the camera without skew."
         )
+    check_axis(message.width, message.height, k[2], k[5], source)
     region, by_x, by_y = message.roi, max(1, message.binning_x), max(1, message.binning_y)
     width = _image_side(message.width, region.x_offset, region.width, by_x, source)
     height = _image_side(message.height, region.y_offset, region.height, by_y, source)

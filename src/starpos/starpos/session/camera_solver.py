@@ -42,8 +42,8 @@ class CameraSolver:
         self._of_open_size: Any = None
         # name of its frame; '' before the first CameraInfo
         self.frame_id = ""
-        # cameras that hold from a stamp on which no frame has reached yet
-        self._changes: deque[tuple[float | None, Camera]] = deque(maxlen=MAX_CHANGES)
+        # cameras, or why there is none, that hold from a stamp on which no frame has reached yet
+        self._changes: deque[tuple[float | None, Camera | str]] = deque(maxlen=MAX_CHANGES)
 
     @property
     def preparing(self) -> bool:
@@ -63,14 +63,15 @@ class CameraSolver:
     def receive(self, message: Any, at_once: bool) -> None:
         """Use a CameraInfo for the frames from its stamp on, or at once; the first one counts at once anyway.
 
-        One that leaves the size open waits for a frame. InstrumentError if it cannot be used.
+        One that leaves the size open waits for a frame. InstrumentError if it cannot be used; then the camera before is
+        no longer the one in use either.
         """
         size = self._frame_px or (1, 1)
         try:
             camera, open_size = message_to_camera(message, size=size), leaves_size_open(message)
         except StarposError as e:
-            if self.camera is None:
-                self.trouble = str(e)
+            self._of_open_size = None
+            self._queue(str(e), stamp_to_unix(message.header.stamp), at_once)
             raise
         self._of_open_size, self.frame_id = message if open_size else None, name_in(message)
         if self._frame_px is not None or not open_size:
@@ -87,11 +88,11 @@ class CameraSolver:
             if self._of_open_size is not None:
                 self.receive(self._of_open_size, at_once)
 
-    def _queue(self, camera: Camera, since_s: float | None, at_once: bool) -> None:
+    def _queue(self, camera: Camera | str, since_s: float | None, at_once: bool) -> None:
         if camera == (self._changes[-1][1] if self._changes else self.camera):
             return
         if at_once or self.camera is None:
-            self._use(camera)
+            self._begin(camera)
         else:
             self._changes.append((since_s, camera))
 
@@ -102,7 +103,7 @@ class CameraSolver:
             if since_s is not None and mid_unix_s is not None and since_s > mid_unix_s:
                 return
             self._changes.popleft()
-            self._use(camera)
+            self._begin(camera)
 
     def remake(self) -> None:
         """Make the solver again with the present parameters and calibration."""
@@ -112,6 +113,15 @@ class CameraSolver:
             self._prepare(self.camera)
         else:
             self.solver = self._make(self.camera)
+
+    def _begin(self, camera: Camera | str) -> None:
+        """Use a camera, or none, for the reason given."""
+        if isinstance(camera, Camera):
+            self._use(camera)
+            return
+        known, self.camera, self.solver, self.trouble = self.camera, None, None, camera
+        if known is not None:
+            self._changed()
 
     def _use(self, camera: Camera) -> None:
         self.camera, self.solver, self.trouble = camera, None, ""
@@ -129,7 +139,10 @@ class CameraSolver:
         self._jobs.run(work).add_done_callback(lambda f: self._prepared(camera, f.result()))
 
     def _prepared(self, camera: Camera, made: Outcome) -> None:
-        if self.camera is not None and camera != self.camera:
+        if self.camera is None:
+            # A camera_info was refused meanwhile.
+            return
+        if camera != self.camera:
             # Another camera_info has come meanwhile.
             self._prepare(self.camera)
             return

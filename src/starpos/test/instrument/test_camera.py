@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from starpos.errors import InstrumentError
-from starpos.instrument.camera import Camera
+from starpos.instrument.camera import Camera, check_axis
 
 SIZE = (5616, 3744)
 # A wide lens.
@@ -111,3 +111,23 @@ def test_a_camera_whose_lens_is_made_goes_to_other_processes(rng):
 def test_a_pixel_that_is_no_number_has_no_direction(camera):
     v = camera.directions([np.nan, 100.0], [50.0, 60.0])
     assert np.isnan(v[0]).any() and np.isfinite(v[1]).all()
+
+
+@pytest.mark.parametrize(("cx", "cy"), [(319.5, 239.5), (-400.0, 767.5), (1023.5, 1600.0), (1900.0, 1400.0)])
+def test_an_axis_at_the_corner_of_the_whole_frame_is_refused(cx, cy):
+    with pytest.raises(InstrumentError, match="optical axis is at pixel"):
+        check_axis(2048, 1536, cx, cy, "camera_info")
+
+
+@pytest.mark.parametrize(
+    ("width", "height", "cx", "cy"),
+    # the last two: a shifted lens, and a message without a size
+    [
+        (2048, 1536, 1023.5, 767.5),
+        (2048, 1536, 1100.0, 600.0),
+        (2048, 1536, 1023.5, 200.0),
+        (0, 0, 10.0, 10.0),
+    ],
+)
+def test_an_axis_in_the_frame_is_believed(width, height, cx, cy):
+    check_axis(width, height, cx, cy, "camera_info")

@@ -75,6 +75,7 @@ def test_a_camera_of_no_size_has_that_of_the_frames():
     assert camera_solver.camera is None
     with pytest.raises(InstrumentError, match="not calibrated"):
         camera_solver.receive(info(width=0, height=0, k=[0.0] * 9), at_once=True)
+    camera_solver.receive(info(width=0, height=0), at_once=True)
     for size in ((1000, 700), (500, 300)):
         camera_solver.note_frame_size(*size, at_once=True)
         jobs.work()
@@ -83,3 +84,43 @@ def test_a_camera_of_no_size_has_that_of_the_frames():
     # it counts for the frames that follow, too
     camera_solver.receive(info(width=0, height=0), at_once=True)
     assert camera_solver.camera.width == 500
+
+
+BROKEN = [0.0] * 9
+CROPPED = [CAMERA.fx, 0, 199.5, 0, CAMERA.fx, 149.5, 0, 0, 1.0]
+
+
+@pytest.mark.parametrize("matrix", [BROKEN, CROPPED])
+def test_after_a_refused_camera_info_no_older_one_stays_in_force(matrix):
+    camera_solver, _ = taken(Prepared())
+    with pytest.raises(InstrumentError) as refused:
+        camera_solver.receive(info(k=matrix), at_once=True)
+    assert camera_solver.solver is None and camera_solver.camera is None
+    with pytest.raises(InstrumentError, match="camera_info"):
+        _ = camera_solver.solver_now
+    assert camera_solver.trouble == str(refused.value)
+
+
+def test_a_good_camera_info_after_a_refused_one_is_used():
+    solver, jobs = Prepared(), JobsInTurn(print)
+    camera_solver = CameraSolver(lambda camera: solver, lambda: None, jobs, print, "camera/camera_info")
+    camera_solver.receive(info(), at_once=True)
+    with pytest.raises(InstrumentError):
+        camera_solver.receive(info(k=BROKEN), at_once=True)
+    # the first one's tables are ready only now
+    jobs.work()
+    assert camera_solver.solver is None
+    camera_solver.receive(info(), at_once=True)
+    jobs.work()
+    assert camera_solver.solver is solver and not camera_solver.trouble
+
+
+def test_a_refusal_in_recorded_data_counts_from_its_stamp_on():
+    camera_solver, _ = taken(Prepared())
+    later = SimpleNamespace(frame_id="camera", stamp=SimpleNamespace(sec=1793642500, nanosec=0))
+    with pytest.raises(InstrumentError):
+        camera_solver.receive(info(k=BROKEN, header=later), at_once=False)
+    camera_solver.advance_to(1793642450.0)
+    assert camera_solver.solver is not None
+    camera_solver.advance_to(1793642501.0)
+    assert camera_solver.solver is None and "not calibrated" in camera_solver.trouble

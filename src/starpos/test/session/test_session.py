@@ -185,6 +185,7 @@ def test_another_camera_counts_from_its_stamp_on_though_it_is_read_before(told, 
     info = deepcopy(first(messages, CAMERA_INFO)[0])
     info.header.stamp.sec += 5
     info.width, info.height = 1000, 700
+    info.k[2], info.k[5] = 499.5, 349.5
     told.tell(CAMERA_INFO, info, came_s)
     for tilt, _ in tilts_of(messages, came_s):
         told.tell(TILT, tilt, came_s)
@@ -199,7 +200,7 @@ def test_another_camera_counts_from_its_stamp_on_though_it_is_read_before(told, 
 
 def test_live_another_camera_counts_at_once(told, messages, begin_s):
     info = deepcopy(first(messages, CAMERA_INFO)[0])
-    info.width = 1000
+    info.width, info.k[2] = 1000, 499.5
     told.tell(CAMERA_INFO, info, begin_s, played=False)
     assert told.session.instrument.camera.width == 1000
 
