@@ -22,7 +22,7 @@ READOUT_S = 0.04
 def night(tmp_path_factory):
     """Two lists of stars of a rolling shutter, 60 deg up, and tilt.csv."""
     folder = tmp_path_factory.mktemp("rolling")
-    more = ("--altitude", "60", "--start", START, "--readout", str(READOUT_S), "--tilt-noise", "0.00001")
+    more = ("--altitude", "60", "--start", START, "--readout", str(READOUT_S), "--tilt-noise", "0.000003")
     assert main(["simulate", str(folder), "-n", "2", "--stars-only", *PLACE, *more]) == 0
     return folder
 
