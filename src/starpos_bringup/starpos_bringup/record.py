@@ -34,10 +34,9 @@ SAVED, BROKEN_OFF, REFUSED = 0, 1, 2
 
 def record() -> int:
     """Run the executable."""
-    from starpos_common.node_main import run
+    from starpos_common.node_main import own_arguments, run
 
-    k = sys.argv.index("--ros-args") if "--ros-args" in sys.argv else len(sys.argv)
-    options = _parser().parse_args(sys.argv[1:k])
+    options = _parser().parse_args(own_arguments(sys.argv[1:])[0])
     topics = TOPICS | (IMAGES if options.images else {})
     try:
         writer = BagWriter(options.bag)
@@ -73,15 +72,14 @@ def say(sentence: str) -> None:
 
 def folder() -> int:
     """Run the executable."""
-    from starpos_common.node_main import run
+    from starpos_common.node_main import own_arguments, run
 
-    k = sys.argv.index("--ros-args") if "--ros-args" in sys.argv else len(sys.argv)
     parser = argparse.ArgumentParser(
         prog="folder",
         description="Write the instrument's stars and tilts into a folder, new or there already, until Ctrl-C.",
     )
     parser.add_argument("folder", type=Path, metavar="NIGHT")
-    path = parser.parse_args(sys.argv[1:k]).folder
+    path = parser.parse_args(own_arguments(sys.argv[1:])[0]).folder
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
