@@ -51,7 +51,7 @@ class Readings:
     @classmethod
     def of(cls, fixes: Sequence[Fix], errors: InclinometerErrors) -> "Readings":
         """Readings of frames with a fix; FixError if some have two axes and some three."""
-        tilts = [f.tilt for f in fixes if f.tilt is not None]
+        tilts = [f.tilt for f in fixes]
         plumb = np.array([t.up for t in tilts])
         axes = {t.axes for t in tilts}
         if len(axes) != 1:

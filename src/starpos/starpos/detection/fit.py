@@ -254,5 +254,5 @@ def _first_places(stamps: Stamps, fit: Fit, psf: FieldPsf) -> np.ndarray:
         FIT_WIDTHS + 2,
         SMOOTHING,
     )
-    left, top = stamps.corner(0, 0)
+    left, top = stamps.x - stamps.reach, stamps.y - stamps.reach
     return np.array([[fit.x, left + column], [fit.y, top + row]])

@@ -233,8 +233,9 @@ def _detect_at_full_size(picture: _Picture) -> Detection:
     if fwhm_px < WIDE_FWHM:
         found = with_clipped(found, sky, x, y, fwhm_px)
     found = found[: settings.max_stars]
+    columns: dict[str, Any] = {name: found[name] for name in COLUMNS}
     stars = Stars(
-        **{name: found[name] for name in COLUMNS},
+        **columns,
         fwhm_px=fwhm_px,
         window=window_of(plane, int(peaks.highest.max()), level),
         **picture.facts,

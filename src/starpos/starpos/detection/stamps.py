@@ -32,6 +32,7 @@ HALF, QUARTER = 0.5, 0.25
 Each = TypeVar("Each", bound="StarRows")
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
 class StarRows:
     """A dataclass of arrays that have a row for each of N stars."""
 

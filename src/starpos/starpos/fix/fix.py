@@ -138,6 +138,7 @@ class Fix(PlaceFix, FittedSighting):
     inclinometer.
     """
 
+    tilt: Tilt
     link_to_enu: np.ndarray
     levelling: np.ndarray
 

@@ -80,7 +80,7 @@ ZONE = re.compile(
 LOCALLY = re.compile(r"\blocal\b", re.IGNORECASE)
 OPENING = re.compile(r"\b(start|begin|beginning|open(ing)?)\b", re.IGNORECASE)
 CENTRE = re.compile(r"\b(mid|middle|midpoint|cent(er|re))\b", re.IGNORECASE)
-CLOSING = re.compile(r"\b(end|ending|finish|stop|clos(e|ing)|frame grabbed)\b", re.IGNORECASE)
+CLOSING = re.compile(r"\b(end|ending|finish|stop|close|closing|frame grabbed)\b", re.IGNORECASE)
 CREATED = re.compile(r"\b(image created|file (created|written))\b", re.IGNORECASE)
 GPS = re.compile(r"\bgps\b", re.IGNORECASE)
 # Cards of the UTC of some moment of the exposure may be off by the time in which a header is written. Up to FOUND_S the
