@@ -185,7 +185,7 @@ def _detect(picture: _Picture) -> Detection:
 def enlarged(
     stars: Stars, times: int, width: int, height: int, window: Window | None, gain: float = 1.0
 ) -> Stars:
-    """The stars of a frame that was reduced so many times, on the original one, whose flux is `gain` times as large."""
+    """The stars of a frame that was reduced `times` times, on the original frame; gain: factor on their flux."""
     return replace(
         stars,
         x=times * stars.x + (times - 1) / 2,

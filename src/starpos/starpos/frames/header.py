@@ -75,7 +75,7 @@ UNITS_S = {"us": 1e-6, "ms": 1e-3, "msec": 1e-3, "s": 1.0, "sec": 1.0, "second":
 UNIVERSAL = re.compile(r"\b(utc?|gmt|universal)\b(?! *[+-] *\d)", re.IGNORECASE)
 OFFSET = re.compile(r"\b(?:utc?|gmt) *[+-] *0*[1-9]", re.IGNORECASE)
 ZONE = re.compile(
-    r"\b(CES?T|MES?Z|EES?T|WEST|BST|MSK|[ECMP][SD]T|AK[SD]T|HST|[JK]ST|A[ECW][SD]T|NZ[SD]T|IST|SAST|BRT|ART|CLS?T)\b"
+    r"\b(CES?T|MES?Z|EES?T|WEST|BST|MSK|[ECMP][SD]T|AK[SD]T|HST|[IJK]ST|A[ECW][SD]T|NZ[SD]T|SAST|BRT|ART|CLS?T)\b"
 )
 LOCALLY = re.compile(r"\blocal\b", re.IGNORECASE)
 OPENING = re.compile(r"\b(start|begin|beginning|open(ing)?)\b", re.IGNORECASE)

@@ -134,7 +134,7 @@ def navigate(
     imu : path of the IMU's CSV: utc_unix_s, gx, gy, gz (rad/s), ax, ay, az (m/s2)
     instrument : an Instrument, or the path of its file (YAML); its camera is mounted as link_to_camera says
     atmosphere : of refraction; None: not measured
-    progress : is told how far the work is
+    progress : receives the share of the work that is done
     **records : the other fields of `Records`: imu_model, velocity, vehicle, mount_stddev_deg, drift_stddev,
         drift_change, height_m
 

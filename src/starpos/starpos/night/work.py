@@ -153,7 +153,7 @@ def identify(
     instrument : an Instrument, or the path of its file (YAML); None: the focal length is taken from the frame's header as
         a hint, and without one all scales are searched
     search_s : CPU time in s of the search at every scale
-    progress : is told how far long work is
+    progress : receives the share of long work that is done
 
     Returns
     -------
