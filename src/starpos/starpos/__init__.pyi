@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 from starpos.averaging.average import Average as Average
 from starpos.averaging.average import average as average
+from starpos.calibration.camera import calibrate_camera as calibrate_camera
 from starpos.calibration.misalignment import calibrate_at as calibrate_at
 from starpos.calibration.misalignment import turn as turn
 from starpos.detection import Detection as Detection
@@ -25,6 +26,8 @@ from starpos.instrument.camera import Camera as Camera
 from starpos.instrument.inclinometer import Tilt as Tilt
 from starpos.instrument.instrument import Calibration as Calibration
 from starpos.instrument.instrument import Instrument as Instrument
+from starpos.instrument.instrument_file import read as read_instrument
+from starpos.instrument.instrument_file import write as write_instrument
 from starpos.instrument.tilt_log import TiltLog as TiltLog
 from starpos.instrument.tilt_table import read_tilt_csv as read_tilt_csv
 from starpos.navigation.estimate import VoyageFix as VoyageFix
@@ -38,6 +41,8 @@ from starpos.night.work import deflection as deflection
 from starpos.night.work import identify as identify
 from starpos.session.replay import PlayedNight as PlayedNight
 from starpos.session.replay import replay as replay
+from starpos.simulation.scene import scene_of as scene_of
+from starpos.simulation.scene import write_night as write_night
 from starpos.sky.catalogue import Catalogue as Catalogue
 from starpos.sky.catalogue import load_catalogue as load_catalogue
 from starpos.sky.site import Site as Site
