@@ -22,12 +22,11 @@ from starpos.frames.frame import Stars as Stars
 from starpos.frames.reading import read_frame as read_frame
 from starpos.gnss.receiver import GnssTrack as GnssTrack
 from starpos.gnss.receiver import read_gnss_csv as read_gnss_csv
+from starpos.instrument import instrument_file
 from starpos.instrument.camera import Camera as Camera
 from starpos.instrument.inclinometer import Tilt as Tilt
 from starpos.instrument.instrument import Calibration as Calibration
 from starpos.instrument.instrument import Instrument as Instrument
-from starpos.instrument.instrument_file import read as read_instrument
-from starpos.instrument.instrument_file import write as write_instrument
 from starpos.instrument.tilt_log import TiltLog as TiltLog
 from starpos.instrument.tilt_table import read_tilt_csv as read_tilt_csv
 from starpos.navigation.estimate import VoyageFix as VoyageFix
@@ -47,6 +46,9 @@ from starpos.sky.catalogue import Catalogue as Catalogue
 from starpos.sky.catalogue import load_catalogue as load_catalogue
 from starpos.sky.site import Site as Site
 from starpos.zenith.doubts import DeflectionSession as DeflectionSession
+
+read_instrument = instrument_file.read
+write_instrument = instrument_file.write
 
 __version__: str
 __all__: list[str]

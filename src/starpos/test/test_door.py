@@ -41,14 +41,14 @@ def test_what_is_no_public_name_is_an_attribute_error():
 
 
 def test_type_checkers_are_told_the_same():
-    told = [
-        n for n in ast.parse(SOURCE.with_suffix(".pyi").read_text()).body if isinstance(n, ast.ImportFrom)
-    ]
-    homes = {
-        a.asname: n.module.removeprefix("starpos.") + (f":{a.name}" if a.name != a.asname else "")
-        for n in told
-        for a in n.names
-    }
+    body = ast.parse(SOURCE.with_suffix(".pyi").read_text()).body
+    told = [n for n in body if isinstance(n, ast.ImportFrom)]
+    homes = {a.name: n.module.removeprefix("starpos.") for n in told for a in n.names if a.asname}
+    modules = {a.name: f"{n.module}.{a.name}" for n in told for a in n.names if not a.asname}
+    for n in body:
+        match n:
+            case ast.Assign([ast.Name(name)], ast.Attribute(ast.Name(module), there)):
+                homes[name] = f"{modules[module].removeprefix('starpos.')}:{there}"
     assert homes == starpos._HOMES
 
 

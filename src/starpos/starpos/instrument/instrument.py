@@ -15,7 +15,7 @@ from starpos.frames.exposure import Shutter
 from starpos.instrument.camera import PLUMB_BOB, Camera
 from starpos.instrument.inclinometer import EXACT, InclinometerErrors, Tilt
 from starpos.instrument.mounting import RESPONSE_COEFFICIENTS, Mounting
-from starpos.instrument.sensors import UNNAMED
+from starpos.instrument.sensors import unnamed
 from starpos.units import ARCSEC, DAY_S, utc_text
 
 # default sag: a camera on a pillar or a heavy tripod during a night
@@ -93,8 +93,6 @@ _ideal = lru_cache(maxsize=4)(Camera.from_focal)
 class Calibration:
     """A3, how well it is known, and when and how it was found; InstrumentError for impossible values.
 
-    response_covariance square, of these
-
     Attributes
     ----------
     misalignment_deg : (rx, ry, rz): A3 = R3(rz) R2(ry) R1(rx), active, C into S
@@ -107,6 +105,7 @@ class Calibration:
     frames : number of frames it was found from
     valid_days : how long it may be used
     response : coefficients of the inclinometer's response that were found with A3 (mounting.py), or ()
+    response_covariance : square, of these
 
     Examples
     --------
@@ -276,8 +275,6 @@ class Calibration:
 class Instrument:
     """The instrument of the paper, or another one; InstrumentError for impossible values.
 
-    mount_stddev_arcsec 1 sigma of link_to_camera about each axis; 0 for a link along the camera's own axes
-
     Attributes
     ----------
     focal_px : focal length, px
@@ -286,10 +283,11 @@ class Instrument:
         which A3 belongs; None: not stated, the axis is in the middle of any frame
     model : of the lens of that ideal camera: PLUMB_BOB, or EQUIDISTANT for a fisheye
     calibration : A3 and its errors
-    link_to_camera : (3, 3): base link into C
+    link_to_camera : (3, 3), base link into C
+    mount_stddev_arcsec : 1 sigma of link_to_camera about each axis; 0 for a link along the camera's own axes
     axis_stddev_rad : 1 sigma of the optical axis in frames that are an unknown part of a sensor
     inclinometer : its errors; unless stated, an SCA100T's as sold
-    inclinometer_model : name in sensors.PRESETS that these errors began with; '': none
+    inclinometer_model : name among sensors.presets() that these errors began with; '': none
     clock_stddev_s : standard deviation of the clock against UTC, s
     shutter : times of the camera's rows; None: as the source of the frames states them
     vertical : of a camera fixed to the ground, which is its own level; None: there is an inclinometer
@@ -311,7 +309,7 @@ class Instrument:
     link_to_camera: tuple = TOP_OF_FRAME
     mount_stddev_arcsec: float = 0.0
     axis_stddev_rad: float = 0.0
-    inclinometer: InclinometerErrors = UNNAMED
+    inclinometer: InclinometerErrors = field(default_factory=unnamed)
     inclinometer_model: str = ""
     clock_stddev_s: float = UNKNOWN_CLOCK_S
     shutter: Shutter | None = None

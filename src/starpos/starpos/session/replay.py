@@ -70,7 +70,7 @@ class Replay:
 
         Raises BagError if the bag cannot be read, FrameError if neither an instrument nor a robot's images are in it.
         """
-        now_ns, messages = 0, self._drivers.begin()
+        now_ns, messages = 0, DriverMessages(self._drivers)
         with BagReader(path, typed=True) as bag:
             topics = INPUTS if self.session.gnss is None else INPUTS | GNSS
             chosen = instrument_in(bag, path, namespace, topics, (STARS,), self._drivers.remaps)

@@ -92,7 +92,7 @@ def test_faults_are_told_and_a_frame_without_readings_has_no_answer(voyage, caps
     [
         ("time,gx\n1,2\n", "it has no column utc_unix_s"),
         ("utc_unix_s,gx,gy,gz,ax,ay,az\n", "has no rows"),
-        ("utc_unix_s,gx,gy,gz,ax,ay,az\n1,2,3,4,5,6,seven\n", "not a readable table of inertial readings"),
+        ("utc_unix_s,gx,gy,gz,ax,ay,az\n1,2,3,4,5,6,seven\n", "bad.csv:2: az is 'seven', which is no number"),
         ("utc_unix_s,gx,gy,gz,ax,ay,az\n1793700000,0,0,0,0,0,9.8\n", "at least 100 are needed"),
     ],
 )
