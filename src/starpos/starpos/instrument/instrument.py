@@ -103,17 +103,25 @@ _ideal = lru_cache(maxsize=4)(Camera.from_focal)
 class Calibration:
     """A3, how well it is known, and when and how it was found; InstrumentError for impossible values.
 
-    misalignment_deg    (rx, ry, rz): A3 = R3(rz) R2(ry) R1(rx), active, C into S
-    covariance_arcsec2  (3, 3) of A3 as a small rotation about S's axes, including the inclinometer's zero
-    remounted_arcsec    1 sigma about each axis of A3's turn since camera and inclinometer were taken apart and put
-                        together again; 0: they were not
-    utc_unix_s          when it was found; NaN: unknown
-    temperature_c       temperature of the inclinometer then; NaN: unknown
-    tilt_deg            its two or three angles then; an error of the scale grows with the distance from them
-    frames              number of frames it was found from
-    valid_days          how long it may be used
-    response            coefficients of the inclinometer's response that were found with A3 (mounting.py), or ()
-    response_covariance square, of these
+    Attributes
+    ----------
+    misalignment_deg : (rx, ry, rz): A3 = R3(rz) R2(ry) R1(rx), active, C into S
+    covariance_arcsec2 : (3, 3) of A3 as a small rotation about S's axes, including the inclinometer's zero
+    remounted_arcsec : 1 sigma about each axis of A3's turn since camera and inclinometer were taken apart and put
+        together again; 0: they were not
+    utc_unix_s : when it was found; NaN: unknown
+    temperature_c : temperature of the inclinometer then; NaN: unknown
+    tilt_deg : its two or three angles then; an error of the scale grows with the distance from them
+    frames : number of frames it was found from
+    valid_days : how long it may be used
+    response : coefficients of the inclinometer's response that were found with A3 (mounting.py), or ()
+    response_covariance : square, of these
+
+    Examples
+    --------
+    >>> known = starpos.Calibration.of((0.91, -0.48, 20.0), (5.0, 5.0, 5.0))  # deg, arcsec
+    >>> known.a3.shape
+    (3, 3)
     """
 
     misalignment_deg: tuple[float, ...] = (0.0, 0.0, 0.0)
@@ -271,20 +279,29 @@ class Calibration:
 class Instrument:
     """The instrument of the paper, or another one; InstrumentError for impossible values.
 
-    focal_px            focal length, px
-    camera              full intrinsics; None: an ideal camera
-    frame_size          (width, height) px of the whole frame of that ideal camera, in whose middle its axis lies, and to
-                        which A3 belongs; None: not stated, the axis is in the middle of any frame
-    model               of the lens of that ideal camera: PLUMB_BOB, or EQUIDISTANT for a fisheye
-    calibration         A3 and its errors
-    link_to_camera      (3, 3): base link into C
-    mount_stddev_arcsec 1 sigma of link_to_camera about each axis; 0 for a link along the camera's own axes
-    axis_stddev_rad     1 sigma of the optical axis in frames that are an unknown part of a sensor
-    inclinometer        its errors; unless stated, an SCA100T's as sold
-    inclinometer_model  name among sensors.presets() that these errors began with; '': none
-    clock_stddev_s      standard deviation of the clock against UTC, s
-    shutter             times of the camera's rows; None: as the source of the frames states them
-    vertical            of a camera fixed to the ground, which is its own level; None: there is an inclinometer
+    Attributes
+    ----------
+    focal_px : focal length, px
+    camera : full intrinsics; None: an ideal camera
+    frame_size : (width, height) px of the whole frame of that ideal camera, in whose middle its axis lies, and to
+        which A3 belongs; None: not stated, the axis is in the middle of any frame
+    model : of the lens of that ideal camera: PLUMB_BOB, or EQUIDISTANT for a fisheye
+    calibration : A3 and its errors
+    link_to_camera : (3, 3), base link into C
+    mount_stddev_arcsec : 1 sigma of link_to_camera about each axis; 0 for a link along the camera's own axes
+    axis_stddev_rad : 1 sigma of the optical axis in frames that are an unknown part of a sensor
+    inclinometer : its errors; unless stated, an SCA100T's as sold
+    inclinometer_model : name among sensors.presets() that these errors began with; '': none
+    clock_stddev_s : standard deviation of the clock against UTC, s
+    shutter : times of the camera's rows; None: as the source of the frames states them
+    vertical : of a camera fixed to the ground, which is its own level; None: there is an inclinometer
+
+    Examples
+    --------
+    >>> known = starpos.Calibration.of((0, 0, 0), (5, 5, 5))
+    >>> instrument = starpos.Instrument(4636.0, calibration=known)
+    >>> instrument.camera_for(1000, 700).fx
+    4636.0
     """
 
     focal_px: float
