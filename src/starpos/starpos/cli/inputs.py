@@ -45,8 +45,8 @@ def given_of(args: argparse.Namespace, first: About | None) -> Instruments:
     )
 
 
+def given_or_sought(args: argparse.Namespace, first: About) -> Instruments:
     """Instruments as by `given_of`; where nothing states the focal length, it is sought by the stars of each lens."""
-    """As `given_of`; but where nothing states the focal length, it is sought by the stars of each lens."""
     if first.focal_px is not None or not is_untold(args):
         return given_of(args, first)
     stand_in = replace(first, focal_px=float(max(first.width, first.height)))
