@@ -36,26 +36,36 @@ class CameraVertical:
     covariance_arcsec2: tuple
 
     def __post_init__(self) -> None:
-        turn, covariance = (np.asarray(m, float) for m in (self.camera_to_itrs, self.covariance_arcsec2))
-        rotation = (
-            np.isfinite(turn).all()
-            and turn.shape == (3, 3)
-            and np.abs(turn).max() < 2
-            and np.allclose(turn @ turn.T, np.eye(3), atol=1e-6)
-            and np.linalg.det(turn) > 0
+        _check_rotation(self.camera_to_itrs, "the vertical's camera_to_itrs")
+        _check_covariance(self.covariance_arcsec2, 3, "the vertical's covariance_arcsec2")
+
+
+def _check_rotation(given: object, name: str) -> None:
+    matrix = np.asarray(given, float)
+    sound = (
+        matrix.shape == (3, 3)
+        # squares must not overflow; false for NaN too
+        and np.abs(matrix).max() < 2
+        and np.allclose(matrix @ matrix.T, np.eye(3), atol=1e-6)
+        and np.linalg.det(matrix) > 0
+    )
+    if not sound:
+        raise InstrumentError(f"{name} must be a 3 x 3 rotation matrix")
+
+
+def _check_covariance(given: object, rows: int, name: str) -> None:
+    """Raise InstrumentError unless this is a covariance, to rounding."""
+    matrix = np.asarray(given, float)
+    sound = (
+        matrix.shape == (rows, rows)
+        and np.isfinite(matrix).all()
+        and np.allclose(matrix, matrix.T, rtol=1e-6)
+        and np.linalg.eigvalsh(matrix)[0] >= -1e-9 * max(np.trace(matrix), 1e-300)
+    )
+    if not sound:
+        raise InstrumentError(
+            f"{name} must be a symmetric {rows} x {rows} matrix without negative variances: correct it"
         )
-        if not rotation:
-            raise InstrumentError("the vertical's camera_to_itrs must be a 3 x 3 rotation matrix")
-        sound = (
-            covariance.shape == (3, 3)
-            and np.isfinite(covariance).all()
-            and np.allclose(covariance, covariance.T)
-            and np.linalg.eigvalsh(covariance)[0] >= 0
-        )
-        if not sound:
-            raise InstrumentError(
-                "the vertical's covariance_arcsec2 must be a symmetric 3 x 3 matrix without negative variances"
-            )
 
 
 def level_errors(sag_arcsec_per_sqrt_hour: float) -> InclinometerErrors:
@@ -155,10 +165,7 @@ class Calibration:
             raise InstrumentError(
                 f"the calibration's covariance is beyond any turn: give variances of at most {MAX_ARCSEC**2:g} arcsec2"
             )
-        if covariance.shape != (3, 3) or not np.allclose(covariance, covariance.T, rtol=1e-6):
-            raise InstrumentError("the calibration's covariance must be a symmetric 3 x 3 matrix, arcsec2")
-        if np.linalg.eigvalsh(covariance)[0] < -1e-9 * max(np.trace(covariance), 1e-300):
-            raise InstrumentError("the calibration's covariance has a negative variance: correct it")
+        _check_covariance(covariance, 3, "the calibration's covariance")
         self._check_response()
         if not 0 <= self.remounted_arcsec <= MAX_ARCSEC:
             raise InstrumentError(
@@ -191,14 +198,11 @@ class Calibration:
                 f"the calibration's response has {n} coefficients: give the 5 of two axes or the 9 of three, and a "
                 "covariance of as many rows and columns"
             )
-        sound = np.allclose(covariance, covariance.T) and np.linalg.eigvalsh(covariance)[
-            0
-        ] > -1e-9 * np.trace(covariance)
-        if max(abs(c) for c in self.response) > MAX_RESPONSE or not sound:
+        if max(abs(c) for c in self.response) > MAX_RESPONSE:
             raise InstrumentError(
-                f"the calibration's response is not valid: its coefficients must be at most "
-                f"{MAX_RESPONSE:g}, their covariance symmetric and without negative variances"
+                f"the calibration's response is not valid: its coefficients must be at most {MAX_RESPONSE:g}"
             )
+        _check_covariance(covariance, n, "the covariance of the calibration's response")
 
     @classmethod
     def of(
@@ -341,15 +345,7 @@ class Instrument:
                 f"the inclinometer's noise (tilt_noise_deg) is {np.degrees(self.inclinometer.noise_rad):g} deg: must be "
                 "positive (of one reading, SCA100T 0.0035)"
             )
-        link = np.asarray(self.link_to_camera, float)
-        if (
-            link.shape != (3, 3)
-            # Squares must not overflow.
-            or np.abs(link).max() > 2
-            or not np.allclose(link @ link.T, np.eye(3), atol=1e-6)
-            or np.linalg.det(link) < 0
-        ):
-            raise InstrumentError("link_to_camera must be a 3 x 3 rotation matrix")
+        _check_rotation(self.link_to_camera, "link_to_camera")
 
     @property
     def size(self) -> tuple[int, int] | None:
