@@ -48,7 +48,7 @@ def json_of(fix: Fix | Average | None, vertical: Vertical) -> dict:
     """The keys of --json that come from a fix; all None without a fix."""
     if fix is None:
         return dict.fromkeys(FIX_KEYS)
-    ground = geodetic(fix.latitude, fix.longitude, fix.heading, fix.covariance, vertical)
+    ground = fix.on_ground(vertical)
     return json_on_ground(fix, ground)
 
 
