@@ -16,7 +16,6 @@ from dataclasses import dataclass
 from functools import cached_property, lru_cache, partial
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -282,7 +281,7 @@ class NamedStars:
     def __hash__(self) -> int:
         return hash(self.labels[0])
 
-    def __reduce__(self) -> tuple[Any, ...]:
+    def __reduce__(self) -> tuple[object, ...]:
         return named_stars, self.labels
 
 
