@@ -10,21 +10,20 @@ if TYPE_CHECKING:
 
 def camera() -> int:
     """Run the node `camera`."""
-    from starpos_common.node_main import run
+    from starpos_common.node_main import run_executable
 
     def make_nodes() -> "Iterator[Node]":
         from starpos_camera.camera import CameraNode
 
         yield CameraNode()
 
-    return run(
-        make_nodes, help_text=lambda: _help("camera", "The frames of a camera, until Ctrl-C.", "camera")
-    )
+    about = "The frames of a camera, until Ctrl-C."
+    return run_executable("starpos_camera", "camera", about, make_nodes)
 
 
 def detector() -> int:
     """Run the node `detector`."""
-    from starpos_common.node_main import run
+    from starpos_common.node_main import run_executable
 
     def make_nodes() -> "Iterator[Node]":
         from starpos_camera.detector import DetectorNode
@@ -34,12 +33,12 @@ def detector() -> int:
         yield node
 
     about = "The stars of the frames on camera/image_raw, until Ctrl-C."
-    return run(make_nodes, help_text=lambda: _help("detector", about, "detector"))
+    return run_executable("starpos_camera", "detector", about, make_nodes)
 
 
 def camera_detector() -> int:
     """Run both nodes in one process: frames go from one to the other directly, not through the middleware."""
-    from starpos_common.node_main import run
+    from starpos_common.node_main import run_executable
 
     def make_nodes() -> "Iterator[Node]":
         from starpos_camera.camera import CameraNode
@@ -52,10 +51,4 @@ def camera_detector() -> int:
         yield camera
 
     about = "The frames of a camera and their stars, two nodes in one process, until Ctrl-C."
-    return run(make_nodes, help_text=lambda: _help("camera_detector", about, "camera", "detector"))
-
-
-def _help(executable: str, about: str, *nodes: str) -> str:
-    from starpos_common.parameters import node_help
-
-    return node_help("starpos_camera", executable, about, *nodes)
+    return run_executable("starpos_camera", "camera_detector", about, make_nodes, ("camera", "detector"))

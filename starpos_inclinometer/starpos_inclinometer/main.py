@@ -10,17 +10,12 @@ if TYPE_CHECKING:
 
 def inclinometer() -> int:
     """Run the node."""
-    from starpos_common.node_main import run
+    from starpos_common.node_main import run_executable
 
     def make_nodes() -> "Iterator[Node]":
         from starpos_inclinometer.node import InclinometerNode
 
         yield InclinometerNode()
 
-    def help_text() -> str:
-        from starpos_common.parameters import node_help
-
-        about = "The readings of an inclinometer, or of an IMU, on `tilt`, until Ctrl-C."
-        return node_help("starpos_inclinometer", "inclinometer", about, "inclinometer")
-
-    return run(make_nodes, help_text=help_text)
+    about = "The readings of an inclinometer, or of an IMU, on `tilt`, until Ctrl-C."
+    return run_executable("starpos_inclinometer", "inclinometer", about, make_nodes)

@@ -85,12 +85,14 @@ class SolverSettings(Settings):
         self, node: Node, camera: Callable[[], Camera | None], apply: Callable[[frozenset[str]], None]
     ) -> None:
         super().__init__({})
-        self._camera, self._apply = camera, apply
-        self.values = declare(node, parameters_of("solver"), apply=self._adopted, check=self._check)
+        self._apply = apply
+        self.values = declare(
+            node,
+            parameters_of("solver"),
+            apply=self._adopted,
+            check=lambda values, names: self.check(values, names, camera()),
+        )
         self.adopt()
-
-    def _check(self, values: Mapping, names: frozenset[str]) -> str | None:
-        return self.check(values, names, self._camera())
 
     def _adopted(self, names: frozenset[str]) -> None:
         self.adopt()

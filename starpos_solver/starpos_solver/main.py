@@ -10,39 +10,27 @@ if TYPE_CHECKING:
 
 def solver() -> int:
     """Run the node."""
-    from starpos_common.node_main import leave, run
+    from starpos_common.node_main import leave, run_executable
 
     def make_nodes() -> "Iterator[Node]":
         from starpos_solver.node import SolverNode
 
         yield SolverNode()
 
-    def help_text() -> str:
-        from starpos_common.parameters import node_help
-
-        about = "Stars and tilts in, position and heading out, until Ctrl-C."
-        return node_help("starpos_solver", "solver", about, "solver")
-
+    about = "Stars and tilts in, position and heading out, until Ctrl-C."
     # A thread may still build triangles.
-    return leave(run(make_nodes, help_text=help_text))
+    return leave(run_executable("starpos_solver", "solver", about, make_nodes))
 
 
 def navigator() -> int:
     """Run the node."""
-    from starpos_common.node_main import leave, run
+    from starpos_common.node_main import leave, run_executable
 
     def make_nodes() -> "Iterator[Node]":
         from starpos_solver.navigator_node import NavigatorNode
 
         yield NavigatorNode()
 
-    def help_text() -> str:
-        from starpos_common.parameters import node_help
-
-        about = (
-            "An IMU, attitudes and velocities in, position, heading and velocity under way out, until Ctrl-C."
-        )
-        return node_help("starpos_solver", "navigator", about, "navigator")
-
+    about = "An IMU, attitudes and velocities in, position, heading and velocity under way out, until Ctrl-C."
     # A thread may still adjust.
-    return leave(run(make_nodes, help_text=help_text))
+    return leave(run_executable("starpos_solver", "navigator", about, make_nodes))

@@ -12,20 +12,19 @@ from sensor_msgs.msg import Imu, NavSatFix
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
-from starpos.earth.vertical import Geodetic
-from starpos.navigation.estimate import VoyageFix
+from starpos.fix.attitude import Attitude
 from starpos.parameters.table import parameters_of
 from starpos.session.driver import Now
-from starpos.session.navigator import Navigated, NavigatorSession, NavigatorSettings, Position
+from starpos.session.navigator import Navigated, NavigatorSession, NavigatorSettings
 from starpos_common.diagnostics import Diagnostics, time_is_simulated
-from starpos_common.messages import unix_to_stamp
+from starpos_common.messages import quaternion, unix_to_stamp
 from starpos_common.parameters import declare
 from starpos_common.topics import publisher, subscription
 from starpos_common.worker import JobRunner
-from starpos_interfaces.msg import Attitude
+from starpos_interfaces import msg
 from starpos_solver import outputs
 from starpos_solver.driver import IMU_QUEUE, Inputs, NodeLog
-from starpos_solver.publishing import MovingTransform
+from starpos_solver.publishing import MOVING, MOVING_QOS, Transforms, transform_of
 
 
 class NavigatorPublishers:
@@ -36,7 +35,7 @@ class NavigatorPublishers:
         self._fix = publisher(node, NavSatFix, "navigator/fix", 10)
         self._heading = publisher(node, Imu, "navigator/heading", 10)
         self._odometry = publisher(node, Odometry, "navigator/odometry", 10)
-        self._transform = MovingTransform(node)
+        self._transform = Transforms(node, MOVING, MOVING_QOS)
         self.parameters_set()
 
     def parameters_set(self) -> None:
@@ -48,28 +47,34 @@ class NavigatorPublishers:
         frame = self._values["frame_id"]
         header = Header(stamp=unix_to_stamp(output.utc_unix_s), frame_id=frame)
         if output.at_place is not None:
-            self._heading.publish(outputs.imu_at_place(header, output.at_place))
+            self._heading.publish(outputs.imu(header, output.at_place))
             return
         altitude = self._values["altitude"], self._values["altitude_stddev"]
         self._fix.publish(outputs.nav_sat_fix(header, output.ground, *altitude))
         if output.fix is None or output.ground is None:
             return
-        self._heading.publish(outputs.imu(header, output.fix.link, output.ground))
-        if output.position is None:
+        link = outputs.true_north(output.fix.link, output.ground)
+        self._heading.publish(outputs.imu(header, link))
+        if output.displacement is None:
             return
         start = Header(stamp=header.stamp, frame_id=self._values["odometry_frame_id"])
-        message = odometry(start, frame, output.fix, output.ground, output.position)
+        message = odometry(start, frame, output, link)
         self._odometry.publish(message)
-        self._transform.publish(message)
+        self._transform.publish([transform_of(message)])
 
 
-def odometry(header: Header, child: str, fix: VoyageFix, ground: Geodetic, position: Position) -> Odometry:
-    """Make the Odometry: pose in the frame of the header, ENU; velocity along the axes of the child's."""
+def odometry(header: Header, child: str, output: Navigated, link: Attitude) -> Odometry:
+    """Make the Odometry: pose in the frame of the header, ENU; velocity along the axes of the child's.
+
+    link: attitude of the base link in true-north ENU.
+    """
+    fix, displacement = output.fix, output.displacement
+    assert fix is not None and displacement is not None
     message = Odometry(header=header, child_frame_id=child)
-    message.pose.pose.position = Point(**dict(zip("xyz", position.enu.tolist(), strict=True)))
-    message.pose.pose.orientation, turn = outputs.attitude(fix.link, ground)
+    message.pose.pose.position = Point(**dict(zip("xyz", displacement.tolist(), strict=True)))
+    message.pose.pose.orientation = quaternion(link.rotation)
     pose, twist = np.zeros((2, 6, 6))
-    pose[:3, :3], pose[3:, 3:] = position.covariance, turn
+    pose[:3, :3], pose[3:, 3:] = output.displacement_covariance, link.covariance
     message.pose.covariance = pose.ravel()
     velocity = fix.link.rotation.T @ fix.velocity
     message.twist.twist.linear = Vector3(**dict(zip("xyz", velocity.tolist(), strict=True)))
@@ -99,7 +104,7 @@ class NavigatorNode(Node):
         self._outputs = NavigatorPublishers(self, self._settings)
         session, best_effort = self._session, ReliabilityPolicy.BEST_EFFORT
         subscription(self, Imu, "imu/data", self._on_imu, IMU_QUEUE, best_effort)
-        subscription(self, Attitude, "attitude", self._on_attitude, 100)
+        subscription(self, msg.Attitude, "attitude", self._on_attitude, 100)
         for kind, name in ((Odometry, "odom"), (TwistWithCovarianceStamped, "twist")):
             subscription(
                 self,
@@ -134,7 +139,7 @@ class NavigatorNode(Node):
         for output in self._session.receive_imu(message, self._now()):
             self._outputs.publish(output)
 
-    def _on_attitude(self, message: Attitude) -> None:
+    def _on_attitude(self, message: msg.Attitude) -> None:
         for output in self._session.receive_attitude(message, self._now()):
             self._outputs.publish(output)
 

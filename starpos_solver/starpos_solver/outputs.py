@@ -2,38 +2,25 @@
 """Messages of a solution: NavSatFix, Imu, Solution."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
-from geometry_msgs.msg import Quaternion
 from sensor_msgs.msg import Imu, NavSatFix, NavSatStatus
 from std_msgs.msg import Header
 
 from starpos import rotation
 from starpos.earth.vertical import Geodetic
-from starpos.fix.attitude import Attitude
+from starpos.fix.attitude import ENU, Attitude
 from starpos.fix.fix import Fix
 from starpos.fix.heading import AttitudeAtPlace
 from starpos.fix.solution import Solution, Status
 from starpos.gnss.watch import GnssCheck, GnssStatus
-from starpos_common.messages import tilt_to_message
+from starpos_common.messages import quaternion, tilt_to_message
 from starpos_interfaces import msg
 
-STATUS = {
-    Status.OK: msg.Solution.OK,
-    Status.TOO_FEW_STARS: msg.Solution.TOO_FEW_STARS,
-    Status.NOT_IDENTIFIED: msg.Solution.NOT_IDENTIFIED,
-    Status.NO_TILT: msg.Solution.NO_TILT,
-    Status.TILT_OUT_OF_RANGE: msg.Solution.TILT_OUT_OF_RANGE,
-    Status.TIME_OUTSIDE_TABLES: msg.Solution.TIME_OUTSIDE_TABLES,
-    Status.BAD_INPUT: msg.Solution.BAD_INPUT,
-    Status.POOR_FIT: msg.Solution.POOR_FIT,
-}
-GNSS_STATUS = {
-    GnssStatus.LEARNING: msg.GnssCheck.LEARNING,
-    GnssStatus.AGREES: msg.GnssCheck.AGREES,
-    GnssStatus.DOUBTFUL: msg.GnssCheck.DOUBTFUL,
-    GnssStatus.DISAGREES: msg.GnssCheck.DISAGREES,
-}
+# the messages name their constants as the enums do
+STATUS = {status: getattr(msg.Solution, status.name) for status in Status}
+GNSS_STATUS = {status: getattr(msg.GnssCheck, status.name) for status in GnssStatus}
 # An entry of the error budget that concerns the geodetic position only.
 DEFLECTION = "deflection"
 # m2; with a NaN consumers would drop the whole matrix.
@@ -64,33 +51,20 @@ def nav_sat_fix(
     return message
 
 
-def attitude(link: Attitude, ground: Geodetic) -> tuple[Quaternion, np.ndarray]:
-    """The attitude of the base link in true-north ENU, and its covariance (3, 3)."""
+def true_north(link: Attitude, ground: Geodetic) -> Attitude:
+    """The attitude of the base link in true-north ENU; `link`: by astronomic north."""
     # Azimuths grow clockwise.
     to_geodetic_north = rotation.about_axis(2, -ground.azimuth_turn)
-    covariance = to_geodetic_north @ link.covariance @ to_geodetic_north.T
+    turned = link.then(to_geodetic_north, ENU)
+    covariance = turned.covariance.copy()
     covariance[2, 2] += ground.deflection_covariance[2, 2]
-    return _quaternion(to_geodetic_north @ link.rotation), covariance
+    return replace(turned, covariance=covariance)
 
 
-def _quaternion(turn: np.ndarray) -> Quaternion:
-    x, y, z, w = rotation.to_quaternion(turn).tolist()
-    return Quaternion(x=x, y=y, z=z, w=w)
-
-
-def imu(header: Header, link: Attitude, ground: Geodetic) -> Imu:
+def imu(header: Header, link: Attitude) -> Imu:
     """Make the attitude of the base link in true-north ENU; rates and accelerations are not measured."""
-    return _imu(header, *attitude(link, ground))
-
-
-def imu_at_place(header: Header, link: Attitude) -> Imu:
-    """Make the same of an attitude that is in true-north ENU already."""
-    return _imu(header, _quaternion(link.rotation), link.covariance)
-
-
-def _imu(header: Header, orientation: Quaternion, covariance: np.ndarray) -> Imu:
-    message = Imu(header=header, orientation=orientation)
-    message.orientation_covariance = covariance.ravel()
+    message = Imu(header=header, orientation=quaternion(link.rotation))
+    message.orientation_covariance = link.covariance.ravel()
     message.angular_velocity_covariance[0] = -1.0
     message.linear_acceleration_covariance[0] = -1.0
     return message

@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """The topics that the solver publishes, and the transforms of both nodes."""
 
-from dataclasses import dataclass
+from copy import deepcopy
 from functools import cached_property
 from importlib.util import find_spec
 
 import numpy as np
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import Quaternion, TransformStamped, Vector3
+from geometry_msgs.msg import TransformStamped, Vector3
 from nav_msgs.msg import Odometry
 from rclpy.node import Node
 from rclpy.publisher import Publisher
@@ -15,11 +15,10 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import Imu, NavSatFix
 from std_msgs.msg import Header
 
-from starpos import rotation
 from starpos.earth.vertical import Geodetic
 from starpos.instrument.instrument import Instrument
 from starpos.session.frames import Answered, Averaged, Output
-from starpos_common.messages import attitude_to_message
+from starpos_common.messages import attitude_to_message, quaternion
 from starpos_common.topics import publisher
 from starpos_interfaces import msg
 from starpos_solver import outputs
@@ -31,47 +30,77 @@ STATIC_QOS = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 MOVING_QOS = QoSProfile(depth=100)
 
 
-@dataclass(frozen=True)
-class Transform:
-    """Rotation of a frame in another one; its position there is not measured.
-
-    quaternion  (x, y, z, w): takes vectors of the child into the parent
-    """
-
-    parent: str
-    child: str
-    quaternion: tuple[float, ...]
-
-
-def transforms_of(instrument: Instrument, link: str, camera: str, inclinometer: str) -> tuple[Transform, ...]:
+def transforms_of(
+    instrument: Instrument, link: str, camera: str, inclinometer: str
+) -> list[TransformStamped]:
     """Make the transforms of an instrument whose frames have these names; a frame without a name is left out.
 
-    So is the inclinometer without a known A3, a missing inclinometer, and a frame that is in the tree already.
+    So is the inclinometer without a known A3, a missing inclinometer, and a frame that is in the tree already.  They are
+    without a stamp; positions are not measured.
     """
     if not camera:
-        return ()
+        return []
     found = [_transform(link, camera, np.asarray(instrument.link_to_camera, float).T)]
     if inclinometer and instrument.vertical is None and not instrument.calibration.unknown:
         found.append(_transform(camera, inclinometer, instrument.calibration.a3.T))
     names, tree = {link}, []
     for transform in found:
-        if transform.child not in names:
-            names.add(transform.child)
+        if transform.child_frame_id not in names:
+            names.add(transform.child_frame_id)
             tree.append(transform)
-    return tuple(tree)
+    return tree
 
 
-def _transform(parent: str, child: str, matrix: np.ndarray) -> Transform:
-    return Transform(parent, child, tuple(rotation.to_quaternion(matrix).tolist()))
+def _transform(parent: str, child: str, matrix: np.ndarray) -> TransformStamped:
+    message = TransformStamped(header=Header(frame_id=parent), child_frame_id=child)
+    message.transform.rotation = quaternion(matrix)
+    return message
 
 
-class StaticTransforms:
-    """Publishes the transforms of an instrument."""
+def transform_of(odometry: Odometry) -> TransformStamped:
+    """Make the transform that puts the child frame of an Odometry into the frame of its header."""
+    message, pose = TransformStamped(header=odometry.header), odometry.pose.pose
+    message.child_frame_id = odometry.child_frame_id
+    message.transform.translation = Vector3(x=pose.position.x, y=pose.position.y, z=pose.position.z)
+    message.transform.rotation = pose.orientation
+    return message
+
+
+class Transforms:
+    """Publishes transforms on a topic of tf while they are wanted, if tf's messages are installed."""
+
+    def __init__(self, node: Node, topic: str, qos: QoSProfile) -> None:
+        self._node, self._topic, self._qos = node, topic, qos
+        self._publisher: Publisher | None = None
+
+    def open(self, wanted: bool) -> None:
+        """Have the topic if it is wanted and possible; remove it if not, and with it what is latched."""
+        if not wanted and self._publisher is not None:
+            self._node.destroy_publisher(self._publisher)
+            self._publisher = None
+        elif wanted and self._publisher is None and self._possible:
+            from tf2_msgs.msg import TFMessage
+
+            self._publisher = self._node.create_publisher(TFMessage, self._topic, self._qos)
+
+    @cached_property
+    def _possible(self) -> bool:
+        return _can_be_told(self._node, self._topic)
+
+    def publish(self, transforms: list[TransformStamped]) -> None:
+        """Publish them if the topic is open."""
+        if self._publisher is not None:
+            from tf2_msgs.msg import TFMessage
+
+            self._publisher.publish(TFMessage(transforms=transforms))
+
+
+class StaticTransforms(Transforms):
+    """Publishes the transforms of an instrument as they change."""
 
     def __init__(self, node: Node) -> None:
-        self._node = node
-        self._publisher: Publisher | None = None
-        self._published: tuple[Transform, ...] = ()
+        super().__init__(node, STATIC, STATIC_QOS)
+        self._published: list[TransformStamped] = []
 
     def update(
         self, wanted: bool, link: str, camera: str, inclinometer: str, instrument: Instrument | None
@@ -80,72 +109,15 @@ class StaticTransforms:
 
         link, camera, inclinometer: names of the frames.  instrument: in use, None before there is one.
         """
-        if not wanted:
-            self._close()
-        elif self._possible:
-            self._publish(transforms_of(instrument, link, camera, inclinometer) if instrument else ())
-
-    @cached_property
-    def _possible(self) -> bool:
-        return _can_be_told(self._node, STATIC)
-
-    def _publish(self, transforms: tuple[Transform, ...]) -> None:
-        from tf2_msgs.msg import TFMessage
-
-        if self._publisher is None:
-            self._publisher = self._node.create_publisher(TFMessage, STATIC, STATIC_QOS)
-        if transforms != self._published:
-            self._published = transforms
-            self._publisher.publish(TFMessage(transforms=[self._message(t) for t in transforms]))
-
-    def _close(self) -> None:
-        if self._publisher is not None:
-            # and with it what is latched
-            self._node.destroy_publisher(self._publisher)
-            self._publisher, self._published = None, ()
-
-    def _message(self, transform: Transform) -> TransformStamped:
-        message = TransformStamped(child_frame_id=transform.child)
-        message.header.frame_id = transform.parent
-        message.header.stamp = self._node.get_clock().now().to_msg()
-        x, y, z, w = transform.quaternion
-        message.transform.rotation = Quaternion(x=x, y=y, z=z, w=w)
-        return message
-
-
-class MovingTransform:
-    """Publishes where the child frame of an Odometry is in the frame of its header."""
-
-    def __init__(self, node: Node) -> None:
-        self._node = node
-        self._publisher: Publisher | None = None
-
-    def open(self, wanted: bool) -> None:
-        """Have the topic if it is wanted and possible, before there is a pose; remove it if not."""
-        if not wanted:
-            if self._publisher is not None:
-                self._node.destroy_publisher(self._publisher)
-                self._publisher = None
-        elif self._publisher is None and self._possible:
-            from tf2_msgs.msg import TFMessage
-
-            self._publisher = self._node.create_publisher(TFMessage, MOVING, MOVING_QOS)
-
-    @cached_property
-    def _possible(self) -> bool:
-        return _can_be_told(self._node, MOVING)
-
-    def publish(self, odometry: Odometry) -> None:
-        """Publish a pose if the topic is open."""
-        if self._publisher is None:
-            return
-        from tf2_msgs.msg import TFMessage
-
-        pose = odometry.pose.pose
-        message = TransformStamped(header=odometry.header, child_frame_id=odometry.child_frame_id)
-        message.transform.translation = Vector3(x=pose.position.x, y=pose.position.y, z=pose.position.z)
-        message.transform.rotation = pose.orientation
-        self._publisher.publish(TFMessage(transforms=[message]))
+        self.open(wanted)
+        found: list[TransformStamped] = []
+        if instrument is not None and self._publisher is not None:
+            found = transforms_of(instrument, link, camera, inclinometer)
+        if found != self._published:
+            self._published, stamped = found, deepcopy(found)
+            for message in stamped:
+                message.header.stamp = self._node.get_clock().now().to_msg()
+            self.publish(stamped)
 
 
 def _can_be_told(node: Node, topic: str) -> bool:
@@ -191,9 +163,9 @@ class SolutionPublishers:
         self._fix.publish(self._nav_sat_fix(header, output.ground))
         fix, at_place = output.solution.fix, output.solution.at_place
         if at_place is not None:
-            self._imu.publish(outputs.imu_at_place(header, at_place.true_north))
+            self._imu.publish(outputs.imu(header, at_place.true_north))
         elif fix is not None and output.ground is not None:
-            self._imu.publish(outputs.imu(header, fix.link, output.ground))
+            self._imu.publish(outputs.imu(header, outputs.true_north(fix.link, output.ground)))
         if self._check is not None and output.compared is not None:
             self._check.publish(outputs.gnss_check(header, output.compared))
         if output.attitude is not None:

@@ -69,7 +69,7 @@ def answer_facing(azimuth_deg: float) -> Solution:
 @pytest.mark.parametrize(("azimuth", "yaw"), [(0, 90), (90, 0), (180, -90), (270, 180), (45, 45)])
 def test_yaw_is_counterclockwise_from_east(azimuth, yaw):
     answer = answer_facing(azimuth)
-    message = outputs.imu(Header(), answer.fix.link, ground_of(answer.fix, EXACT))
+    message = outputs.imu(Header(), outputs.true_north(answer.fix.link, ground_of(answer.fix, EXACT)))
     assert (yaw_deg(message) - yaw + 180) % 360 - 180 == pytest.approx(0, abs=1e-9)
 
 
@@ -100,7 +100,7 @@ def test_what_is_suspicious_about_the_identification_is_named():
 
 def test_rates_and_accelerations_are_declared_unmeasured():
     answer = answer_facing(10.0)
-    message = outputs.imu(Header(), answer.fix.link, ground_of(answer.fix, EXACT))
+    message = outputs.imu(Header(), outputs.true_north(answer.fix.link, ground_of(answer.fix, EXACT)))
     assert message.angular_velocity_covariance[0] == -1.0
     assert message.linear_acceleration_covariance[0] == -1.0
     assert np.all(np.linalg.eigvalsh(np.array(message.orientation_covariance).reshape(3, 3)) > 0)
@@ -138,8 +138,8 @@ def test_the_deflection_of_the_vertical_moves_and_widens_fix_and_heading():
     assert ground.covariance[0, 0] - plain.covariance[0, 0] == pytest.approx(
         (5 * arcsec * 6.387e6) ** 2, rel=1e-2
     )
-    turned = yaw_deg(outputs.imu(Header(), answer.fix.link, ground)) - yaw_deg(
-        outputs.imu(Header(), answer.fix.link, plain)
+    turned = yaw_deg(outputs.imu(Header(), outputs.true_north(answer.fix.link, ground))) - yaw_deg(
+        outputs.imu(Header(), outputs.true_north(answer.fix.link, plain))
     )
     # azimuth = A - eta tan(phi): a smaller azimuth is a larger yaw
     assert turned * 3600 == pytest.approx(-20.0 * math.tan(ground.latitude), rel=1e-3)
@@ -208,7 +208,7 @@ def test_a_heading_without_a_fix_is_an_attitude_and_a_solution_without_a_place()
     assert message.heading_stddev == pytest.approx(math.degrees(1e-4))
     assert [term.name for term in message.budget] == ["centroids"]
     assert math.isnan(message.budget[0].east) and message.refraction == 12.0
-    attitude = outputs.imu_at_place(Header(), answer.at_place.true_north)
+    attitude = outputs.imu(Header(), answer.at_place.true_north)
     assert yaw_deg(attitude) == pytest.approx(30.0)
     assert np.diag(np.reshape(attitude.orientation_covariance, (3, 3))) == pytest.approx([1e-8] * 3)
 

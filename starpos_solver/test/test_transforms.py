@@ -26,7 +26,7 @@ INSTRUMENT = Instrument(1000.0, calibration=Calibration.of((0.4, -0.3, 35.0), (5
 )
 def test_each_frame_is_once_in_the_tree(camera, inclinometer, tree):
     found = transforms_of(INSTRUMENT, "link", camera, inclinometer)
-    assert [(t.parent, t.child) for t in found] == tree
+    assert [(t.header.frame_id, t.child_frame_id) for t in found] == tree
 
 
 @pytest.mark.parametrize(

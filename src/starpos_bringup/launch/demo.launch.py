@@ -14,14 +14,11 @@ import shutil
 import tempfile
 
 import numpy as np
-from launch import LaunchDescription
-from launch.actions import ExecuteProcess, OpaqueFunction
-from launch.substitutions import LaunchConfiguration
-from launch_ros.actions import PushRosNamespace
+from launch.actions import ExecuteProcess
 from launch_ros.substitutions import ExecutableInPackage
 
-from starpos_bringup.launch_arguments import is_true, number
-from starpos_bringup.launching import COMMON_ARGUMENTS, Common, declared, given, process
+from starpos_bringup.launch_arguments import number
+from starpos_bringup.launching import COMMON_ARGUMENTS, Common, dashboard, described, process
 
 ARGUMENTS = (
     *COMMON_ARGUMENTS,
@@ -56,8 +53,7 @@ def tilt_deg(place: dict[str, float], roll_deg: float):
     return np.degrees(scene.tilt)
 
 
-def nodes(context):
-    told = given(context, ARGUMENTS)
+def nodes(told):
     place = {name: number(told, name, *bounds) for name, bounds in POINTING.items()}
     roll_deg = 15.0
     theta_x, theta_y = tilt_deg(place, roll_deg)
@@ -76,23 +72,15 @@ def nodes(context):
     }
     emulator = ExecutableInPackage("emulator", "starpos_testing")
     device = [emulator, "--link", link, "--tilt-x", f"{theta_x:.9f}", "--tilt-y", f"{theta_y:.9f}"]
-    processes = [
+    return [
         # The emulator is a device, not a node.
         ExecuteProcess(cmd=device, name="emulator", output="screen"),
         process("starpos_inclinometer", "inclinometer", common, {"inclinometer": {"port": link}}),
         process("starpos_camera", "camera_detector", common, {"camera": camera}),
         process("starpos_solver", "solver", common, {"solver": solver}),
+        *dashboard(told, common),
     ]
-    if is_true(told, "dashboard"):
-        processes.append(process("starpos_dashboard", "dashboard", common))
-    return processes
 
 
 def generate_launch_description():
-    return LaunchDescription(
-        [
-            *declared(ARGUMENTS),
-            PushRosNamespace(LaunchConfiguration("namespace")),
-            OpaqueFunction(function=nodes),
-        ]
-    )
+    return described(ARGUMENTS, nodes)

@@ -8,20 +8,24 @@ If a bag holds images and no stars, detector:=true finds the stars again.
 
 from pathlib import Path
 
-from launch import LaunchDescription
-from launch.actions import OpaqueFunction, Shutdown
-from launch.substitutions import LaunchConfiguration
-from launch_ros.actions import PushRosNamespace
+from launch.actions import Shutdown
 
 from starpos_bringup.launch_arguments import LaunchError, is_true, number
-from starpos_bringup.launching import COMMON_ARGUMENTS, Common, declared, given, process
+from starpos_bringup.launching import (
+    COMMON_ARGUMENTS,
+    DASHBOARD_ARGUMENT,
+    Common,
+    dashboard,
+    described,
+    process,
+)
 
 ARGUMENTS = (
     *COMMON_ARGUMENTS,
     ("bag", None, "the rosbag2: a folder, or one .mcap or .db3 file"),
     ("rate", "1", "times real time; 0: as fast as the solver answers, with the same result"),
     ("detector", "false", "true: stars from the bag's images instead of the bag's stars"),
-    ("dashboard", "false", "true: also the web page, at http://127.0.0.1:8042"),
+    DASHBOARD_ARGUMENT,
 )
 MAX_RATE = 1e6
 SIMULATED = {"**": {"use_sim_time": True}}
@@ -34,8 +38,7 @@ def over(event, context):
     return Shutdown(reason="the bag is played")
 
 
-def nodes(context):
-    told = given(context, ARGUMENTS)
+def nodes(told):
     rate = number(told, "rate", 0, MAX_RATE)
     bag = Path(told["bag"]).expanduser()
     if not bag.exists():
@@ -46,26 +49,13 @@ def nodes(context):
     if is_true(told, "detector"):
         processes.append(process("starpos_camera", "detector", common, SIMULATED))
         inputs = "images"
-    if is_true(told, "dashboard"):
-        processes.append(process("starpos_dashboard", "dashboard", common, SIMULATED))
     player = ["--rate", f"{rate:g}", "--inputs", inputs, "--", str(bag)]
-    processes.append(
-        process(
-            "starpos_bringup",
-            "replay",
-            common,
-            arguments=player,
-            on_exit=over,
-        )
-    )
-    return processes
+    return [
+        *processes,
+        *dashboard(told, common, SIMULATED),
+        process("starpos_bringup", "replay", common, arguments=player, on_exit=over),
+    ]
 
 
 def generate_launch_description():
-    return LaunchDescription(
-        [
-            *declared(ARGUMENTS),
-            PushRosNamespace(LaunchConfiguration("namespace")),
-            OpaqueFunction(function=nodes),
-        ]
-    )
+    return described(ARGUMENTS, nodes)

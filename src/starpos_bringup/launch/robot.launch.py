@@ -7,18 +7,22 @@
 config/existing_robot.yaml.
 """
 
-from launch import LaunchDescription
-from launch.actions import OpaqueFunction
-from launch.substitutions import LaunchConfiguration
-from launch_ros.actions import PushRosNamespace
-
-from starpos_bringup.launch_arguments import is_true
-from starpos_bringup.launching import COMMON_ARGUMENTS, Common, declared, given, process
+from starpos_bringup.launching import (
+    COMMON_ARGUMENTS,
+    DASHBOARD_ARGUMENT,
+    LIVE_ARGUMENTS,
+    Common,
+    clock_of,
+    dashboard,
+    described,
+    process,
+)
 
 ARGUMENTS = (
     ("image", None, "the camera's topic, sensor_msgs/Image, or the one whose /compressed is sent"),
     ("camera_info", None, "the topic of its intrinsics"),
     ("imu", None, "the IMU's topic, sensor_msgs/Imu with accelerations"),
+    *COMMON_ARGUMENTS,
     (
         "params_file",
         None,
@@ -29,36 +33,23 @@ ARGUMENTS = (
         "starpos",
         "of what the nodes publish: /NAMESPACE/fix, so that it is not mixed with a GNSS receiver's",
     ),
-    *(argument for argument in COMMON_ARGUMENTS if argument[0] not in ("params_file", "namespace")),
-    ("use_sim_time", "", "true: time from /clock, for a bag"),
-    ("dashboard", "false", "true: also the web page, at http://127.0.0.1:8042"),
-    ("respawn", "false", "true: a process that ends, for whatever reason, is started again 2 s later"),
+    *LIVE_ARGUMENTS,
+    DASHBOARD_ARGUMENT,
 )
 
 
-def nodes(context):
-    told = given(context, ARGUMENTS)
-    common = Common.of(told)
-    clock = {"use_sim_time": is_true(told, "use_sim_time")} if told["use_sim_time"] else {}
-    every = {"**": clock}
+def nodes(told):
+    common, every = Common.of(told), clock_of(told)
     camera_info, imu = {"camera/camera_info": told["camera_info"]}, {"imu/data": told["imu"]}
     frames = {"camera/image_raw": told["image"], **camera_info, **imu}
     source = every | {"inclinometer": {"source": "imu"}}
-    processes = [
+    return [
         process("starpos_camera", "detector", common, every, remaps=frames),
         process("starpos_inclinometer", "inclinometer", common, source, remaps=imu),
         process("starpos_solver", "solver", common, every, remaps=camera_info | imu),
+        *dashboard(told, common, every),
     ]
-    if is_true(told, "dashboard"):
-        processes.append(process("starpos_dashboard", "dashboard", common, every))
-    return processes
 
 
 def generate_launch_description():
-    return LaunchDescription(
-        [
-            *declared(ARGUMENTS),
-            PushRosNamespace(LaunchConfiguration("namespace")),
-            OpaqueFunction(function=nodes),
-        ]
-    )
+    return described(ARGUMENTS, nodes)

@@ -4,21 +4,22 @@
 import atexit
 import os
 import tempfile
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import yaml
-from launch.actions import DeclareLaunchArgument
+from launch import LaunchDescription
+from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
-from launch_ros.actions import Node
+from launch_ros.actions import Node, PushRosNamespace
 from launch_ros.substitutions import FindPackageShare
 
 from starpos_bringup.launch_arguments import LaunchError, is_true, names, one_of
 
 if TYPE_CHECKING:
-    from launch.launch_context import LaunchContext
+    from launch import LaunchDescriptionEntity
 
 Arguments = Iterable[tuple[str, Any, str]]
 LOG_LEVELS = ("debug", "info", "warn", "error", "fatal")
@@ -42,6 +43,12 @@ COMMON_ARGUMENTS = (
         "where the SROS2 enclaves are: each process has enclaves/EXECUTABLE, if security is enabled",
     ),
 )
+# of launch files for a live instrument
+LIVE_ARGUMENTS = (
+    ("use_sim_time", "", "true: time from /clock"),
+    ("respawn", "false", "true: a process that ends, for whatever reason, is started again 2 s later"),
+)
+DASHBOARD_ARGUMENT = ("dashboard", "false", "true: also the web page, at http://127.0.0.1:8042")
 RESPAWN_DELAY_S = 2.0
 # Topics of the solver whose names drivers of GNSS and IMUs have, too.
 OUTPUTS = ("fix", "fix_averaged", "heading/imu")
@@ -73,16 +80,36 @@ class Common:
         return cls(str(path), level, told["enclaves"].rstrip("/"), respawn, outputs)
 
 
-def declared(arguments: Arguments) -> list[DeclareLaunchArgument]:
-    """Convert arguments to launch's own."""
-    return [
-        DeclareLaunchArgument(name, default_value=value, description=text) for name, value, text in arguments
-    ]
+def described(
+    arguments: Arguments, entities: Callable[[Mapping[str, str]], "list[LaunchDescriptionEntity]"]
+) -> LaunchDescription:
+    """Describe a launch: `entities` makes what is started from the values of the arguments, in their namespace.
+
+    Of two arguments of one name the later holds.
+    """
+    known = {name: (value, text) for name, value, text in arguments}
+
+    def started(context: Any) -> "list[LaunchDescriptionEntity]":
+        return entities({name: LaunchConfiguration(name).perform(context) for name in known})
+
+    return LaunchDescription(
+        [
+            *(DeclareLaunchArgument(n, default_value=v, description=text) for n, (v, text) in known.items()),
+            PushRosNamespace(LaunchConfiguration("namespace")),
+            OpaqueFunction(function=started),
+        ]
+    )
 
 
-def given(context: "LaunchContext", arguments: Arguments) -> dict[str, str]:
-    """Read the values of the arguments, as text."""
-    return {name: LaunchConfiguration(name).perform(context) for name, _, _ in arguments}
+def clock_of(told: Mapping[str, str]) -> dict[str, dict[str, bool]]:
+    """The parameter use_sim_time of all nodes, where the argument states it."""
+    return {"**": {"use_sim_time": is_true(told, "use_sim_time")} if told["use_sim_time"] else {}}
+
+
+def dashboard(told: Mapping[str, str], common: Common, parameters: Mapping[str, Mapping] = {}) -> list[Node]:
+    """Make the process of the web page, if it is wanted."""
+    wanted = is_true(told, "dashboard")
+    return [process("starpos_dashboard", "dashboard", common, parameters)] if wanted else []
 
 
 # Package, executable and nodes of each process of an instrument; camera and detector are one.

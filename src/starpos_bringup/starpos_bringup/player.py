@@ -20,6 +20,7 @@ from rclpy.qos import DurabilityPolicy, QoSCompatibility, QoSProfile, qos_check_
 from rclpy.serialization import deserialize_message
 from rosgraph_msgs.msg import Clock
 
+from starpos.recording.topics import IMAGE, IMU, PICTURE, STARS
 from starpos_bringup.bag import Topic
 from starpos_common.replayed import DEPTH, PLAYED, TAKEN, WORD_S
 from starpos_interfaces.msg import Played, Taken
@@ -200,10 +201,8 @@ class Participants:
         return ""
 
 
-STARS = "starpos_interfaces/msg/StarArray"
-IMAGES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+IMAGES = (IMAGE, PICTURE)
 FRAMES = (STARS, *IMAGES)
-IMU = "sensor_msgs/msg/Imu"
 CLOCK_PERIOD_S = 0.025
 ACKNOWLEDGED_S = 3.0
 # Maximum number of messages on their way: queues hold some hundred.

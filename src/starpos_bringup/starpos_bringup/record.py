@@ -7,7 +7,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from starpos_bringup.bag import BagWriteError, BagWriter
+from starpos.errors import BagError
+from starpos_bringup.bag import BagWriter
 
 if TYPE_CHECKING:
     from starpos_bringup.recorder import FolderWriter, Recorder
@@ -34,14 +35,13 @@ SAVED, BROKEN_OFF, REFUSED = 0, 1, 2
 
 def record() -> int:
     """Run the executable."""
-    from starpos_common.node_main import run
+    from starpos_common.node_main import own_arguments, run
 
-    k = sys.argv.index("--ros-args") if "--ros-args" in sys.argv else len(sys.argv)
-    options = _parser().parse_args(sys.argv[1:k])
+    options = _parser().parse_args(own_arguments(sys.argv[1:])[0])
     topics = TOPICS | (IMAGES if options.images else {})
     try:
         writer = BagWriter(options.bag)
-    except BagWriteError as error:
+    except BagError as error:
         say(str(error))
         return REFUSED
     recorders: list[Recorder] = []
@@ -73,15 +73,14 @@ def say(sentence: str) -> None:
 
 def folder() -> int:
     """Run the executable."""
-    from starpos_common.node_main import run
+    from starpos_common.node_main import own_arguments, run
 
-    k = sys.argv.index("--ros-args") if "--ros-args" in sys.argv else len(sys.argv)
     parser = argparse.ArgumentParser(
         prog="folder",
         description="Write the instrument's stars and tilts into a folder, new or there already, until Ctrl-C.",
     )
     parser.add_argument("folder", type=Path, metavar="NIGHT")
-    path = parser.parse_args(sys.argv[1:k]).folder
+    path = parser.parse_args(own_arguments(sys.argv[1:])[0]).folder
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:

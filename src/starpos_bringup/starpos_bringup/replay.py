@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 from starpos.errors import BagError, FrameError, StarposError
 from starpos.recording.topics import DRIVER_INPUTS, RAW, Remaps
 from starpos_bringup.bag import Bag, Topic
-from starpos_common.node_main import stop_signals
+from starpos_common.node_main import own_arguments, stop_signals
 
 if TYPE_CHECKING:
     from starpos_bringup.player import Player
@@ -38,7 +38,7 @@ def replay() -> int:
 
 def main(arguments: list[str], stopped: list[int]) -> int:
     """Play to the end, or until a signal handler puts something into `stopped`; return the exit status."""
-    ours, ros = _split(arguments)
+    ours, ros = own_arguments(arguments)
     options = _parser().parse_args(ours)
     try:
         with Bag(options.bag) as bag:
@@ -53,12 +53,6 @@ def main(arguments: list[str], stopped: list[int]) -> int:
     except StarposError as error:
         _say(str(error))
         return REFUSED
-
-
-def _split(arguments: list[str]) -> tuple[list[str], list[str]]:
-    """Split the arguments into ours and rclpy's, which begin with `--ros-args`."""
-    k = arguments.index("--ros-args") if "--ros-args" in arguments else len(arguments)
-    return arguments[:k], arguments[k:]
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -54,7 +54,10 @@ def test_its_joints_are_turned_as_tf_static_says(link, angles_deg, tmp_path):
     made = joints(instrument=path, xyz="0.2 0 0.4", rpy="0 0 1.5")
     xyz, turned = made.pop(("base_link", "starpos_link"))
     assert xyz == "0.2 0 0.4" and np.allclose(turned.as_euler("xyz"), (0, 0, 1.5))
-    wanted = {(t.parent, t.child): t.quaternion for t in transforms_of(instrument, *NAMES)}
+    wanted = {
+        (t.header.frame_id, t.child_frame_id): [getattr(t.transform.rotation, axis) for axis in "xyzw"]
+        for t in transforms_of(instrument, *NAMES)
+    }
     assert set(made) == set(wanted)
     for ends, quaternion in wanted.items():
         assert (made[ends][1] * Rotation.from_quat(quaternion).inv()).magnitude() < 1e-7

@@ -88,12 +88,16 @@ def tilt_to_message(tilt: Tilt, frame_id: str, sequence: int = 0, flags: int = 0
     )
 
 
+def quaternion(turn: np.ndarray) -> Quaternion:
+    """Convert a rotation (3, 3)."""
+    return Quaternion(**dict(zip("xyzw", rotation.to_quaternion(turn).tolist(), strict=True)))
+
+
 def attitude_to_message(attitude: CameraAttitude) -> msg.Attitude:
     """Convert the attitude of a camera to starpos_interfaces/Attitude."""
-    x, y, z, w = rotation.to_quaternion(attitude.camera_to_gcrs).tolist()
     return msg.Attitude(
         header=Header(stamp=unix_to_stamp(attitude.utc_unix_s), frame_id=attitude.frame_id),
-        orientation=Quaternion(x=x, y=y, z=z, w=w),
+        orientation=quaternion(attitude.camera_to_gcrs),
         covariance=attitude.covariance.ravel(),
         stars_matched=attitude.stars,
         log_odds=float(attitude.log_odds),

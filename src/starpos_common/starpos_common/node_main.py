@@ -129,6 +129,32 @@ def run(
         return _run(make_nodes, args, stopped)
 
 
+def run_executable(
+    package: str,
+    executable: str,
+    about: str,
+    make_nodes: Callable[[], "Iterator[Node]"],
+    nodes: tuple[str, ...] = (),
+) -> int:
+    """Run the nodes of an executable as `run` does; `--help` says what it is and explains the nodes' parameters.
+
+    nodes: names in the table of parameters, if not the executable's own.
+    """
+
+    def help_text() -> str:
+        from starpos_common.parameters import node_help
+
+        return node_help(package, executable, about, *(nodes or (executable,)))
+
+    return run(make_nodes, help_text=help_text)
+
+
+def own_arguments(args: list[str]) -> tuple[list[str], list[str]]:
+    """Split a command line into the program's arguments and ROS's, which begin with `--ros-args`."""
+    k = args.index("--ros-args") if "--ros-args" in args else len(args)
+    return args[:k], args[k:]
+
+
 def _show(text: str) -> None:
     try:
         print(text, flush=True)
@@ -138,8 +164,7 @@ def _show(text: str) -> None:
 
 
 def _asks_for_help(args: list[str]) -> bool:
-    ours = args[: args.index("--ros-args")] if "--ros-args" in args else args
-    return not {"--help", "-h"}.isdisjoint(ours)
+    return not {"--help", "-h"}.isdisjoint(own_arguments(args)[0])
 
 
 def leave(status: int) -> int:

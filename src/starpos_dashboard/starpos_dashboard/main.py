@@ -10,19 +10,12 @@ if TYPE_CHECKING:
 
 def dashboard() -> int:
     """Run the node."""
-    from starpos_common.node_main import leave, run
-
-    return leave(run(make_nodes, help_text=help_text))
-
-
-def help_text() -> str:
-    """What `--help` says."""
-    from starpos_common.parameters import node_help
+    from starpos_common.node_main import leave, run_executable
 
     about = (
         "The instrument in a browser, at http://127.0.0.1:8042 unless parameters say otherwise, until Ctrl-C."
     )
-    return node_help("starpos_dashboard", "dashboard", about, "dashboard")
+    return leave(run_executable("starpos_dashboard", "dashboard", about, make_nodes))
 
 
 def make_nodes() -> "Iterator[Node]":

@@ -189,7 +189,7 @@ def add_instrument(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--inclinometer",
         metavar="MODEL",
-        help=f"take the inclinometer's errors from its data sheet: {', '.join(sensors.PRESETS)} "
+        help=f"take the inclinometer's errors from its data sheet: {', '.join(sensors.presets())} "
         "(else those of an SCA100T as sold: 7 km or more)",
     )
     parser.add_argument(

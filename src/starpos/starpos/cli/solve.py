@@ -15,7 +15,6 @@ from starpos.cli.console import Output, add_formats
 from starpos.cli.fix_output import (
     COLUMNS,
     CSV_HELP,
-    FIX_KEYS,
     HEAD,
     JSON_HELP,
     json_about,
@@ -223,8 +222,7 @@ def _save_learned(path: Path, learned: Learned | None) -> None:
 
 def json_of_watched(told: Watched) -> dict:
     """The keys of --json of a frame that come from its fix, or its heading at GNSS's place, and `gnss`."""
-    fix, ground = told.solution.fix, told.ground
-    keys = dict.fromkeys(FIX_KEYS) if fix is None or ground is None else json_on_ground(fix, ground)
+    keys = json_on_ground(told.solution.fix, told.ground)
     if (at_place := told.solution.at_place) is not None:
         keys = with_heading(keys, at_place, at_place.place)
     return keys | {"gnss": None if told.compared is None else json_of_check(told.compared)}

@@ -31,7 +31,13 @@ TWO_SKIES, UNEXPLAINED = "two_skies", "unexplained"
 
 
 class Status(str, Enum):
-    """Result of the work on one frame."""
+    """Result of the work on one frame.
+
+    Examples
+    --------
+    >>> starpos.identify("night/stars_0000.csv").status is starpos.Status.OK
+    True
+    """
 
     OK = "ok"
     TOO_FEW_STARS = "too few stars"
@@ -73,16 +79,24 @@ class FieldPointing:
 class Solution:
     """Solution of one frame: a status, a sentence, and the part of the answer that was found.
 
-    named, star (M,): the identified stars of the catalogue, and their rows in the input's stars.
-    identify_s, fix_s: seconds that the two steps took.
-    extrapolated_days: how far behind the end of the IERS table the frame's date lies; 0 within it.
-    warnings: sorted names of suspicions about an identification: TWO_SKIES, UNEXPLAINED. There is no fix then.
-    explained: how much of the frame the identification explains.
-    at_place: heading, pitch and roll at a known place; None if not asked for or not found.
-    found: the identification itself; its rows refer to the input's stars.
-    negative: whether the stars are dark on a bright sky.
-    hint: helps to identify the next frame.
-    remark: a warning on an identified frame; '' without one.
+    Attributes
+    ----------
+    named, star : (M,) the identified stars of the catalogue, and their rows in the input's stars
+    identify_s, fix_s : seconds that the two steps took
+    extrapolated_days : how far behind the end of the IERS table the frame's date lies; 0 within it
+    warnings : sorted names of suspicions about an identification: TWO_SKIES, UNEXPLAINED. There is no fix then.
+    explained : how much of the frame the identification explains
+    at_place : heading, pitch and roll at a known place; None if not asked for or not found
+    found : the identification itself; its rows refer to the input's stars
+    negative : whether the stars are dark on a bright sky
+    hint : helps to identify the next frame
+    remark : a warning on an identified frame; '' without one
+
+    Examples
+    --------
+    >>> solution = starpos.identify("night/stars_0000.csv")
+    >>> solution.ok, len(solution.names) == len(solution.star)
+    (True, True)
     """
 
     status: Status

@@ -94,6 +94,13 @@ class Solver:
     Other ways to identify a frame are in `starpos.fix.searching`.
 
     catalogue: or the deeper one in its stead, for a field that needs it.
+
+    Examples
+    --------
+    >>> solver = starpos.Solver(starpos.read_instrument("instrument.yaml"), starpos.load_catalogue())
+    >>> stars = starpos.read_frame("night/stars_0000.csv")
+    >>> solver.solve(stars, starpos.read_tilt_csv("night/tilt.csv")).fix
+    <Fix: +35.70... +51.4...>
     """
 
     instrument: Instrument

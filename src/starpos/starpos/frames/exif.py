@@ -66,8 +66,8 @@ class SensorGrid:
 
     made_px  sides (px) of the picture as the camera made it, the longer one first; 0: not stated
 
-    Rows and columns are the sensor's, however the camera was held, because EXIF's Orientation is not applied. Only
-    libheif turns portraits upright.
+    Rows and columns are the sensor's in every format, however the camera was held: what turns a picture for the eye
+    (EXIF's Orientation, the boxes irot and imir of HEIF) is not applied.
     """
 
     width: int

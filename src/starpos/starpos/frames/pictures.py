@@ -4,6 +4,7 @@
 import io
 import struct
 import zlib
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -21,7 +22,11 @@ SCAN = 0xDA
 # Samples of a decoded pixel by a PNG's type of colour: grey, colour, palette, grey with alpha, colour with alpha.
 PNG_SAMPLES = {0: 1, 2: 3, 3: 3, 4: 4, 6: 4}
 # Tags of TIFF 6.0.
-WIDTH, HEIGHT, BITS, SAMPLES = 256, 257, 258, 277
+WIDTH, HEIGHT, BITS, SAMPLES, ORIENTATION = 256, 257, 258, 277, 274
+# Byte orders of a TIFF by its beginning.
+TIFF_ORDERS = {b"II*\0": "<", b"MM\0*": ">"}
+# Letters of struct by type of a tag: BYTE, ASCII, SHORT, DOUBLE; of all others, LONG.
+TIFF_KINDS = {1: "B", 2: "B", 3: "H", 12: "d"}
 
 
 def picture_frame(data: bytes, place: str, clock: exif.CameraClock | None = None) -> Frame:
@@ -39,7 +44,7 @@ def picture_pixels(data: bytes, place: str) -> np.ndarray:
     if size is None:
         raise FrameError(f"{place}: this is not a whole PNG, TIFF, JPEG or BMP image; give one, or FITS.")
     check_pixels(*size, place)
-    pixels = decode_picture(_png_image(data) if data.startswith(PNG_START) else data)
+    pixels = decode_picture(_png_image(data) if data.startswith(PNG_START) else _not_turned_tiff(data))
     if pixels is None:
         raise FrameError(f"{place}: this is not a whole PNG, TIFF, JPEG or BMP image; take or copy it again.")
     return frame_pixels(pixels, place)
@@ -104,24 +109,40 @@ def _bmp_size(data: bytes) -> tuple[int, int, float] | None:
 
 def _tiff_size(data: bytes) -> tuple[int, int, float] | None:
     """Width, height and bytes of a pixel of a TIFF by its header; None if this is not one."""
-    order = {b"II*\0": "<", b"MM\0*": ">"}.get(data[:4])
+    order = TIFF_ORDERS.get(data[:4])
     if order is None:
         return None
     (at,) = struct.unpack_from(order + "I", data, 4)
-    tags, _ = _directory(data, at, order, (WIDTH, HEIGHT, BITS, SAMPLES), 1)
-    if not {WIDTH, HEIGHT} <= tags.keys():
+    tags, _ = tiff_directory(data, at, order, (WIDTH, HEIGHT, BITS, SAMPLES), 1)
+    if not {WIDTH, HEIGHT} <= tags.keys() or any(
+        isinstance(v, float) for values in tags.values() for v in values
+    ):
         return None
     # one sample of one bit, unless the file says more
     (width,), (height,), (bits,), (samples,) = (tags.get(tag, (1,)) for tag in (WIDTH, HEIGHT, BITS, SAMPLES))
     return width, height, samples * max(bits, 8) / 8
 
 
-def _directory(
+def _not_turned_tiff(data: bytes) -> bytes:
+    """A TIFF with the Orientation 1, by which a decoder leaves rows and columns as they are stored; others unchanged."""
+    order = TIFF_ORDERS.get(data[:4])
+    if order is None:
+        return data
+    (at,) = struct.unpack_from(order + "I", data, 4)
+    (count,) = struct.unpack_from(order + "H", data, at)
+    for entry in range(at + 2, at + 2 + 12 * count, 12):
+        tag, kind, n, value = struct.unpack_from(order + "HHIH", data, entry)
+        if (tag, kind, n) == (ORIENTATION, 3, 1) and value != 1:
+            data = data[: entry + 8] + struct.pack(order + "H", 1) + data[entry + 10 :]
+    return data
+
+
+def tiff_directory(
     data: bytes, at: int, order: str, wanted: tuple[int, ...], most: int
-) -> tuple[dict[int, tuple[int, ...]], int]:
+) -> tuple[dict[int, tuple], int]:
     """The first values, at most so many, of the wanted tags of a TIFF's directory, and the offset of the next one.
 
-    struct.error if it is not a directory. Values are SHORT or LONG.
+    struct.error if it is not a directory.  A text is its bytes.
     """
     (count,) = struct.unpack_from(order + "H", data, at)
     tags = {}
@@ -129,7 +150,7 @@ def _directory(
         tag, kind, n = struct.unpack_from(order + "HHI", data, entry)
         if tag not in wanted or not n:
             continue
-        letter, place = "H" if kind == 3 else "I", entry + 8
+        letter, place = TIFF_KINDS.get(kind, "I"), entry + 8
         if n * struct.calcsize(order + letter) > 4:
             (place,) = struct.unpack_from(order + "I", data, place)
         tags[tag] = struct.unpack_from(f"{order}{min(n, most)}{letter}", data, place)
@@ -181,7 +202,7 @@ def _png_image(data: bytes) -> bytes:
 def heif_frame(data: bytes, place: str, clock: exif.CameraClock | None = None) -> Frame:
     """Read the first picture of a HEIF file by the rules of `reading.read_frame`; FrameError if it is not one.
 
-    A picture taken in portrait format is turned upright.
+    Its rows and columns are the sensor's, as in a JPEG, however the camera was held.
     place says where the bytes came from, for messages; clock: of the camera, if it may be trusted.
     """
     try:
@@ -191,7 +212,9 @@ def heif_frame(data: bytes, place: str, clock: exif.CameraClock | None = None) -
             f"{place}: reading HEIF needs pillow-heif; run `pip install pillow-heif`, or save it as JPEG."
         ) from None
     try:
-        picture = pillow_heif.open_heif(io.BytesIO(data), convert_hdr_to_8bit=False, bgr_mode=True)
+        picture = pillow_heif.open_heif(
+            io.BytesIO(_not_turned_heif(data)), convert_hdr_to_8bit=False, bgr_mode=True
+        )
         # it is unpacked only after this
         width, height = picture.size
         check_pixels(width, height, 8.0 if ";16" in picture.mode else 4.0, place)
@@ -205,6 +228,40 @@ def heif_frame(data: bytes, place: str, clock: exif.CameraClock | None = None) -
         raise FrameError(f"{place}: this is not a whole HEIF picture ({one_line(e)}); copy it again.") from e
     pixels = frame_pixels(pixels, place)
     return Frame(pixels, **exif.read_exposure(tags, place, clock, pixels.shape).facts)
+
+
+# Boxes of a HEIF (ISO/IEC 23008-12) that turn a picture by quarters, and mirror it: each holds one byte.
+TURN, MIRROR = b"irot", b"imir"
+
+
+def _not_turned_heif(data: bytes) -> bytes:
+    """The file with turns of 0 in place of those by which a decoder would show the picture upright.
+
+    Without them the rows and columns are those that the camera encoded.
+    """
+    inside = [(0, len(data))]
+    for name, skip in ((b"meta", 4), (b"iprp", 0), (b"ipco", 0)):
+        inside = [
+            (begin + skip, end) for part in inside for kind, begin, end in _boxes(data, *part) if kind == name
+        ]
+    for part in inside:
+        for kind, begin, end in _boxes(data, *part):
+            if kind in (TURN, MIRROR) and end - begin == 1:
+                data = data[: begin - 4] + TURN + b"\0" + data[end:]
+    return data
+
+
+def _boxes(data: bytes, at: int, end: int) -> Iterator[tuple[bytes, int, int]]:
+    """Kind, begin and end of the content of each box between two offsets; it ends at a damaged one."""
+    while at + 8 <= end:
+        length, head = int.from_bytes(data[at : at + 4], "big"), 8
+        if length == 1:
+            length, head = int.from_bytes(data[at + 8 : at + 16], "big"), 16
+        following = end if length == 0 else at + length
+        if not at + head <= following <= end:
+            return
+        yield data[at + 4 : at + 8], at + head, following
+        at = following
 
 
 # Tags of TIFF 6.0: offsets and lengths of an image's strips, the same of its tiles, and the IFDs below this one.
@@ -273,8 +330,8 @@ def _end(data: bytes) -> int:
             continue
         seen.add(at)
         try:
-            tags, following = _directory(data, at, order, (*STRIPS, *TILES, BELOW), MAX_VALUES)
-        except struct.error:
+            tags, following = tiff_directory(data, at, order, (*STRIPS, *TILES, BELOW), MAX_VALUES)
+        except (struct.error, TypeError):
             continue
         waiting += [following, *tags.get(BELOW, ())]
         for offsets, lengths in (STRIPS, TILES):

@@ -95,7 +95,7 @@ def read(
     """
     with BagReader(path, typed=True) as bag:
         chosen = _instrument(bag, path, namespace, drivers)
-        reading = _Reading(tilt_noise_rad, drivers.begin())
+        reading = _Reading(tilt_noise_rad, DriverMessages(drivers))
         wanted = [c for c in chosen.connections if c.msgtype not in WITH_STARS]
         total = sum(c.msgcount for c in wanted) or 1
         for done, (connection, log_ns, message) in enumerate(bag.decoded(wanted), 1):
@@ -118,7 +118,7 @@ def read(
 
 def each_frame(r: Recorded) -> Iterator[tuple[str, Stars | FrameError]]:
     """A name for each frame, one at a time, and its stars, or why it has none."""
-    messages = r.drivers.begin()
+    messages = DriverMessages(r.drivers)
     with BagReader(r.path, typed=True) as bag:
         chosen = _instrument(bag, r.path, r.namespace, r.drivers)
         wanted = [c for c in chosen.connections if c.msgtype in (*WITH_STARS, CAPTURE)]

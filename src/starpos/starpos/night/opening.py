@@ -140,8 +140,17 @@ def truth_in(folder: Path) -> Truth | None:
 class NightOnDisk:
     """A folder of frames with tilt.csv, its instrument and air as far as known; `solve` solves it.
 
-    instrument: None if the frames' headers have the focal length.  calibration: A3 in place of the instrument's.
-    inclinometer: name of its model in place of the instrument's; '' for the instrument's.
+    Attributes
+    ----------
+    instrument : None if the frames' headers have the focal length
+    calibration : A3 in place of the instrument's
+    inclinometer : name of its model in place of the instrument's; '' for the instrument's
+
+    Examples
+    --------
+    >>> night = starpos.open_night("night", instrument="instrument.yaml")
+    >>> night.count, len(night.solve().shots)
+    (5, 5)
     """
 
     folder: Path
@@ -204,13 +213,32 @@ def open_night(
 ) -> NightOnDisk:
     """A night: a folder of FITS frames, or else of CSV lists of stars, with tilt.csv; not read yet.
 
-    instrument: or the path of its file (YAML); None if the frames' headers have the focal length.
-    calibration: A3 in place of the instrument's; without a known A3 the position error exceeds 1000 km, unless the night
-    is solved with self_calibrate=True. inclinometer: name of its model, in place of the instrument's; without a name or
-    stated errors it counts as an SCA100T as sold, 7 km or more.  atmosphere: None: not measured.
-    vertical: its deflection; None: not known.
-    place: where the instrument is known to be: each frame's `Shot.at_place` is its heading there, and tilt.csv may lack.
-    Raises StarposError if there is no frame, or the instrument's file cannot be used.
+    Parameters
+    ----------
+    folder : of the night
+    instrument : or the path of its file (YAML); None if the frames' headers have the focal length
+    calibration : A3 in place of the instrument's; without a known A3 the position error exceeds 1000 km, unless the night
+        is solved with self_calibrate=True
+    inclinometer : name of its model, in place of the instrument's; without a name or stated errors it counts as an
+        SCA100T as sold, 7 km or more
+    atmosphere : None: not measured
+    vertical : its deflection; None: not known
+    place : where the instrument is known to be: each frame's `Shot.at_place` is its heading there, and tilt.csv may lack
+
+    Returns
+    -------
+    NightOnDisk
+        its `solve` gives a Night
+
+    Raises
+    ------
+    StarposError
+        there is no frame, or the instrument's file cannot be used
+
+    Examples
+    --------
+    >>> starpos.open_night("night", instrument="instrument.yaml")
+    <night: 5 frames and tilt.csv, to be solved>
     """
     folder = Path(folder)
     if not folder.is_dir():

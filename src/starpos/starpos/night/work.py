@@ -153,7 +153,7 @@ def identify(
     instrument : an Instrument, or the path of its file (YAML); None: the focal length is taken from the frame's header as
         a hint, and without one all scales are searched
     search_s : CPU time in s of the search at every scale
-    progress : is told how far long work is
+    progress : is called with the share of long work that is done
 
     Returns
     -------
@@ -232,8 +232,9 @@ def deflection(
     Examples
     --------
     >>> lists = sorted(Path("zenith").glob("stars_*.csv"))
-    >>> session = starpos.deflection(lists, "zenith/tilt.csv", (47.3, 8.5, 560.0), zenith)
-    >>> xi_arcsec, eta_arcsec = session.adjusted.xi_arcsec, session.adjusted.eta_arcsec
+    >>> session = starpos.deflection(lists, "zenith/tilt.csv", (61.2, 24.5, 900.0), "zenith/instrument.yaml")
+    >>> round(session.adjusted.xi_arcsec), round(session.adjusted.eta_arcsec)
+    (30, -12)
     """
     known = instrument_file.read(instrument) if isinstance(instrument, (str, Path)) else instrument
     air = Atmosphere.measured(None, None) if atmosphere is None else atmosphere

@@ -148,7 +148,7 @@ def _newest_is_off(fixes: list[Fix]) -> bool:
     before = after = averager.average
     for fix in sorted(fixes, key=lambda f: f.utc_unix_s):
         before = after
-        averager.add(fix)
+        averager.include(fix)
         after = averager.average
     return before is not None and after is not None and after.left_out > before.left_out
 

@@ -8,16 +8,15 @@ last one on.
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
 from starpos.earth.ellipsoid import enu_axes
-from starpos.earth.geoid import Geoid
 from starpos.earth.gravity import geodetic_place
 from starpos.earth.place import Place
-from starpos.earth.vertical import Geodetic, Vertical, geodetic
-from starpos.errors import GnssError, StarposError, VoyageError
+from starpos.earth.vertical import Geodetic, geodetic
+from starpos.errors import GnssError, VoyageError
 from starpos.files import path_of
 from starpos.fix.attitude import Attitude
 from starpos.instrument.instrument import Instrument
@@ -30,67 +29,30 @@ from starpos.navigation.records import ImuModel, read_imu_model
 from starpos.navigation.sightings import PlacelessFrame, body_attitude
 from starpos.navigation.vessel import PARKED, Vessel, check_drift
 from starpos.navigation.voyage import MIN_FRAMES, Voyage
-from starpos.session import settings
-from starpos.session.driver import Diagnosis, Heard, Jobs, Level, Log, Now, Outcome
-from starpos.session.gnss import OLDEST_S, UNSTATED_M, RecentPlaces, contradiction
+from starpos.session.driver import Changes, Diagnosis, Heard, Jobs, Level, Log, Now, Outcome, refusing
+from starpos.session.gnss import OLDEST_S, ComparedPlaces, contradiction
 from starpos.session.reports import AHEAD_S
+from starpos.session.settings import MIN_CLOCK_S, NodeSettings, atmosphere_of
 
 # of a stated altitude: the vehicle goes up and down by more than its file says
 MIN_HEIGHT_STDDEV_M = 10.0
-ANY_INSTRUMENT = Instrument(1000.0, clock_stddev_s=settings.MIN_CLOCK_S)
+ANY_INSTRUMENT = Instrument(1000.0, clock_stddev_s=MIN_CLOCK_S)
 
 
-class NavigatorSettings:
-    """The parameters as `values` by name, and what is made from them and from their files.
+class NavigatorSettings(NodeSettings):
+    """The parameters of the navigator."""
 
-    A file is read once, when its parameter is checked.
-    """
+    readers: ClassVar[Mapping[str, Callable[[str], Any]]] = {
+        **NodeSettings.readers,
+        "imu_model": lambda name: read_imu_model(path_of(name)) if name else ImuModel(),
+    }
 
-    def __init__(self, values: Mapping[str, Any]) -> None:
-        self.values = values
-        # the files in use, and the files of the last check
-        self._files: tuple[Instrument, ImuModel, Geoid | None] = ANY_INSTRUMENT, ImuModel(), None
-        self._read: tuple[Instrument, ImuModel, Geoid | None] = self._files
-
-    def check(self, values: Mapping[str, Any], names: frozenset[str]) -> str | None:
-        """Say in a sentence why values cannot be, such as with a broken file; None if they can.
-
-        names: of those that are set.
-        """
-        known, model, grid = self._files
-        try:
-            if "calibration_url" in names:
-                known = settings.known_instrument(values["calibration_url"]) or ANY_INSTRUMENT
-            if "imu_model" in names:
-                name = values["imu_model"]
-                model = read_imu_model(path_of(name)) if name else ImuModel()
-            if "deflection.geoid" in names:
-                grid = settings.geoid_file(values["deflection.geoid"])
-            settings.atmosphere_of(values)
-            settings.site_of(values, settings.vertical_of(values, grid))
-            check_drift(values["vehicle"], values["drift_stddev"], values["drift_change"])
-        except StarposError as e:
-            return str(e)
-        self._read = known, model, grid
-        return None
-
-    def adopt(self) -> None:
-        """Use the files that the last check has read."""
-        self._files = self._read
-
-    @property
-    def vertical(self) -> Vertical:
-        """The deflection of the vertical, or the geoid that gives it."""
-        return settings.vertical_of(self.values, self._files[2])
-
-    @property
-    def site(self) -> Place | None:
-        """The place that is known; None where none is set."""
-        return settings.site_of(self.values, self.vertical)
+    def _refuse(self, values: Mapping[str, Any], files: Mapping[str, Any]) -> None:
+        check_drift(values["vehicle"], values["drift_stddev"], values["drift_change"])
 
     def vessel(self, clock_stddev_s: float) -> Vessel:
         """Instrument and vehicle, of which the frames' clock states its error."""
-        values, (known, model, _) = self.values, self._files
+        values, known = self.values, self._known or ANY_INSTRUMENT
         clock = values["clock_stddev"]
         height = values["altitude"]
         stated = (
@@ -103,10 +65,10 @@ class NavigatorSettings:
         )
         return Vessel(
             vehicle=values["vehicle"] or None,
-            model=model,
+            model=self._files["imu_model"],
             camera_to_body=np.asarray(known.link_to_camera, float).T,
             mount_stddev=float(np.radians(values["mount_stddev"])),
-            atmosphere=settings.atmosphere_of(values),
+            atmosphere=atmosphere_of(values),
             clock_stddev_s=max(known.clock_stddev_s, clock_stddev_s) if np.isnan(clock) else clock,
             drift_stddev=values["drift_stddev"],
             drift_change=values["drift_change"],
@@ -123,27 +85,19 @@ APART = "all frames with stars are stamped later than the IMU's readings: set th
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Position:
-    """Displacement (3,) in m east, north, up of the origin, along the axes there, and its covariance (3, 3).
-
-    The origin is the first place that is known to WIDE_M.
-    """
-
-    enu: np.ndarray
-    covariance: np.ndarray
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
 class Navigated:
     """An output at one time: a fix, the place on the ellipsoid, where it lies from the origin; None without support.
 
+    displacement (3,): m east, north, up of the first place that was known to WIDE_M, along the axes there; with its
+    covariance (3, 3).
     at_place: heading, pitch and roll at a known place, while there is no fix; None where no place is known.
     """
 
     utc_unix_s: float
     fix: VoyageFix | None = None
     ground: Geodetic | None = None
-    position: Position | None = None
+    displacement: np.ndarray | None = None
+    displacement_covariance: np.ndarray | None = None
     at_place: Attitude | None = None
 
 
@@ -158,7 +112,7 @@ class NavigatorSession:
         self._settings, self._values = settings, settings.values
         self._heard, self._log = heard, log
         self._jobs = jobs()
-        self._told = ""
+        self._changes = Changes(log)
         self.reset()
 
     def reset(self) -> None:
@@ -173,7 +127,7 @@ class NavigatorSession:
         # of the newest frame that the estimate is made of
         self._seen_s = -math.inf
         self._clock_stddev_s = 0.0
-        self._gnss = RecentPlaces(UNSTATED_M)
+        self._gnss = ComparedPlaces()
         # marks outcomes of jobs that began before as out of date
         self._voyage = object()
 
@@ -192,7 +146,8 @@ class NavigatorSession:
         """Take a sensor_msgs/Imu; returns an output where one is due."""
         w, f, stamp = message.angular_velocity, message.linear_acceleration, message.header.stamp
         row = (stamp.sec + stamp.nanosec * 1e-9, w.x, w.y, w.z, f.x, f.y, f.z)
-        try:
+        due = False
+        with refusing(self._heard, "imu/data"):
             if (
                 message.angular_velocity_covariance[0] == -1
                 or message.linear_acceleration_covariance[0] == -1
@@ -204,25 +159,20 @@ class NavigatorSession:
             self._check_time(row[0], now, "an inertial reading")
             self._begin_anew(row[0])
             self._recent.readings.append(row)
-        except StarposError as e:
-            self._heard.refuse("imu/data", str(e))
-            return []
-        self._heard.came("imu/data")
-        return self._tick(row[0]) if row[0] >= self._next_s else []
+            due = row[0] >= self._next_s
+        return self._tick(row[0]) if due else []
 
     def receive_attitude(self, message: Any, now: Now) -> list[Navigated]:
         """Take a starpos_interfaces/Attitude."""
-        try:
+        made: list[Navigated] = []
+        with refusing(self._heard, "attitude"):
             attitude = message_to_attitude(message)
             self._check_time(attitude.utc_unix_s, now, "an attitude")
             frame = PlacelessFrame.of(attitude)
             self._recent.add_frame(frame)
-        except StarposError as e:
-            self._heard.refuse("attitude", str(e))
-            return []
-        self._clock_stddev_s = attitude.clock_stddev_s
-        self._heard.came("attitude")
-        return self._at_place(frame)
+            self._clock_stddev_s = attitude.clock_stddev_s
+            made = self._at_place(frame)
+        return made
 
     def _at_place(self, frame: PlacelessFrame) -> list[Navigated]:
         """The heading at a known place, while there is no fix."""
@@ -248,7 +198,7 @@ class NavigatorSession:
         """Take a nav_msgs/Odometry or a geometry_msgs/TwistWithCovarianceStamped, from the topic of that name."""
         v = message.twist.twist.linear
         variance = np.asarray(message.twist.covariance, float)[[0, 7, 14]]
-        try:
+        with refusing(self._heard, name):
             time_s = stamp_to_unix(message.header.stamp)
             self._check_time(time_s, now, "a velocity")
             assert time_s is not None
@@ -259,18 +209,11 @@ class NavigatorSession:
             # an axis without a stated variance moves as little as the others, or is not measured
             sigma = math.sqrt(variance.max()) or self._values["velocity_stddev"]
             self._recent.add_velocity(time_s, (v.x, v.y, v.z), sigma)
-        except StarposError as e:
-            self._heard.refuse(name, str(e))
-            return []
-        self._heard.came(name)
         return []
 
     def receive_gnss(self, message: Any, now: Now) -> list[Navigated]:
         """Take a sensor_msgs/NavSatFix of satellites: it is compared, not fused."""
-        try:
-            self._gnss.receive(message, now)
-        except GnssError:
-            self._gnss.forget()
+        self._gnss.receive(message, now)
         self._heard.came("gnss/fix")
         return []
 
@@ -330,14 +273,14 @@ class NavigatorSession:
         self._trouble, self._faults = made.trouble, ()
         if made.trouble:
             self._estimate = self._known = None
-            self._tell(made.trouble)
+            self._changes.say(made.trouble, good=False)
             return
         found: Voyage = made.value
         self._faults = found.faults
         self._seen_s = found.last.utc_unix_s
         self._known = observability(found.last, self._is_measured)
         self._estimate = self._carried_on(found.last)
-        self._tell("")
+        self._changes.say("fixes are coming", good=True)
 
     def _carried_on(self, estimate: Estimate) -> Estimate:
         """An estimate at the last output's time."""
@@ -350,14 +293,6 @@ class NavigatorSession:
     def _is_measured(self) -> bool:
         return self._recent.velocities > 0 or self._values["vehicle"] == PARKED
 
-    def _tell(self, trouble: str) -> None:
-        if trouble != self._told:
-            self._told = trouble
-            if trouble:
-                self._log.warning(trouble)
-            else:
-                self._log.info("fixes are coming")
-
     # outputs ---------------------------------------------------------------------------------------------------------
 
     @property
@@ -369,30 +304,28 @@ class NavigatorSession:
         if estimate is None or self._stars_missing:
             return Navigated(utc_unix_s=time_s)
         self.counts["fixes"] += 1
-        fix = estimate.fix
+        ground, (displacement, covariance) = self._ground(estimate.fix), self._displacement(estimate)
         return Navigated(
             utc_unix_s=time_s,
-            fix=fix,
-            ground=self._ground(fix),
-            position=self._position(estimate),
+            fix=estimate.fix,
+            ground=ground,
+            displacement=displacement,
+            displacement_covariance=covariance,
         )
 
     def _ground(self, fix: VoyageFix) -> Geodetic:
         return geodetic(fix.latitude, fix.longitude, fix.heading, fix.covariance, self._settings.vertical)
 
-    def _position(self, estimate: Estimate) -> Position | None:
-        """Where an estimate lies from the first place that was known well enough; None before there is one."""
+    def _displacement(self, estimate: Estimate) -> tuple[np.ndarray, np.ndarray] | tuple[None, None]:
+        """Where an estimate lies from the first place that was known well enough, with covariance; None before it."""
         place = estimate.motion.place[0]
         if self._origin is None and self._known is not None and self._known.sigma_m < WIDE_M:
             self._origin = place
         if self._origin is None:
-            return None
+            return None, None
         latitude, longitude, _ = (float(x) for x in geodetic_place(self._origin))
         axes = enu_axes(latitude, longitude)
-        return Position(
-            enu=axes @ (place - self._origin),
-            covariance=axes @ estimate.covariance[PLACE, PLACE] @ axes.T,
-        )
+        return axes @ (place - self._origin), axes @ estimate.covariance[PLACE, PLACE] @ axes.T
 
     def _why_old(self, since_s: float) -> str:
         """Say why the newest frame that is adjusted is so old."""

@@ -2,10 +2,10 @@
 """The parameters of the solver, and the settings that follow from them and from the named files."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -140,6 +140,11 @@ def geoid_file(name: str) -> Geoid | None:
     return geoid.read(name) if name else None
 
 
+def learned_file(name: str) -> Learned | None:
+    """Read what gnss.learned names, None for ''; StarposError with the reason if it is broken."""
+    return states.read_learned(path_of(name)) if name else None
+
+
 def vertical_of(values: Mapping, known: Geoid | None) -> Vertical:
     """Return the Geoid (`known`, or None), or the deflection that the parameters give for the place.
 
@@ -164,21 +169,75 @@ def vertical_of(values: Mapping, known: Geoid | None) -> Vertical:
 ANY_CAMERA = Camera.from_focal(100, 100, 1000.0)
 
 
-class Settings:
-    """The parameters as `values` by name (settings.py), and the objects made from them and from their files.
+class NodeSettings:
+    """The parameters of a node as `values` by name (settings.py), and the objects made from them and from their files.
 
     A file is read once, when its parameter is checked, so the checked contents are used. A file that breaks or
     disappears later does not matter until the parameter is set again.
     """
 
+    # what reads the file of a parameter, which may be ''
+    readers: ClassVar[Mapping[str, Callable[[str], Any]]] = {
+        "calibration_url": known_instrument,
+        "deflection.geoid": geoid_file,
+    }
+
     def __init__(self, values: Mapping[str, Any]) -> None:
         self.values = values
-        self._known: Instrument | None = None
-        self._geoid: Geoid | None = None
-        # by the last check
-        self._read: tuple[Instrument | None, Geoid | None] = None, None
-        # what earlier sessions learned by GNSS; None without a file
-        self.learned: Learned | None = None
+        # contents by parameter: in use, and by the last check
+        self._files: dict[str, Any] = dict.fromkeys(self.readers)
+        self._read = self._files
+
+    def check(
+        self, values: Mapping[str, Any], names: frozenset[str], camera: Camera | None = None
+    ) -> str | None:
+        """Say in a sentence why values cannot be together, such as with a broken file; None if they can.
+
+        names: of those that are set.  camera: the one in use, None before there is one.
+        """
+        try:
+            read = {name: reader(values[name]) for name, reader in self.readers.items() if name in names}
+            files = self._files | read
+            self._refuse(values, files)
+            if camera is not None and "calibration_url" in read:
+                check_camera(read["calibration_url"], values["calibration_url"], camera)
+            atmosphere_of(values)
+            site_of(values, vertical_of(values, files["deflection.geoid"]))
+        except StarposError as e:
+            return str(e)
+        self._read = files
+        return None
+
+    def _refuse(self, values: Mapping[str, Any], files: Mapping[str, Any]) -> None:
+        """Raise a StarposError if values do not go together, or not with the contents of the files."""
+
+    def adopt(self) -> None:
+        """Use the files that the last check has read."""
+        self._files = self._read
+
+    @property
+    def _known(self) -> Instrument | None:
+        """The instrument of calibration_url."""
+        return self._files["calibration_url"]
+
+    @property
+    def vertical(self) -> Vertical:
+        """The deflection of the vertical, or the geoid that gives it."""
+        return vertical_of(self.values, self._files["deflection.geoid"])
+
+    @property
+    def site(self) -> Place | None:
+        """The place that is known; None where none is set."""
+        return site_of(self.values, self.vertical)
+
+
+class Settings(NodeSettings):
+    """The parameters of the solver."""
+
+    readers: ClassVar[Mapping[str, Callable[[str], Any]]] = {
+        **NodeSettings.readers,
+        "gnss.learned": learned_file,
+    }
 
     @classmethod
     def of(
@@ -186,52 +245,23 @@ class Settings:
     ) -> "Settings":
         """Read them from a parameter file and texts NAME:=VALUE, as the node does; errors as `values_of` raises them."""
         settings = cls(values_of("solver", file, given, namespace))
-        if trouble := settings.check(settings.values, frozenset(settings.values), None):
+        if trouble := settings.check(settings.values, frozenset(settings.values)):
             raise InstrumentError(trouble)
         settings.adopt()
         return settings
 
-    def check(self, values: Mapping, names: frozenset[str], camera: Camera | None) -> str | None:
-        """Say in a sentence why values make no instrument together, such as with a broken file; None if they do.
+    def _refuse(self, values: Mapping[str, Any], files: Mapping[str, Any]) -> None:
+        check_gnss(values, instrument_of(values, ANY_CAMERA, files["calibration_url"]))
+        check_deflection(values)
 
-        names: of those that are set.  camera: the one in use, None before there is one.
-        """
-        known, grid = self._known, self._geoid
-        try:
-            if "calibration_url" in names:
-                known = known_instrument(values["calibration_url"])
-                if camera is not None:
-                    check_camera(known, values["calibration_url"], camera)
-            if "deflection.geoid" in names:
-                grid = geoid_file(values["deflection.geoid"])
-            if "gnss.learned" in names and values["gnss.learned"]:
-                self.learned = states.read_learned(path_of(values["gnss.learned"]))
-            check_gnss(values, instrument_of(values, ANY_CAMERA, known))
-            atmosphere_of(values)
-            check_deflection(values)
-            site_of(values, vertical_of(values, grid))
-        except StarposError as e:
-            return str(e)
-        self._read = known, grid
-        return None
-
-    def adopt(self) -> None:
-        """Use the files that the last check has read."""
-        self._known, self._geoid = self._read
+    @property
+    def learned(self) -> Learned | None:
+        """What earlier sessions learned by GNSS; None without a file."""
+        return self._files["gnss.learned"]
 
     def saved(self, instrument: Instrument) -> None:
         """Note that the file of calibration_url holds this instrument now."""
-        self._known = instrument
-
-    @property
-    def vertical(self) -> Vertical:
-        """The deflection of the vertical, or the geoid that gives it."""
-        return vertical_of(self.values, self._geoid)
-
-    @property
-    def site(self) -> Place | None:
-        """The place that is known; None where none is set."""
-        return site_of(self.values, self.vertical)
+        self._files = self._files | {"calibration_url": instrument}
 
     @property
     def tilt_stddev_rad(self) -> float:

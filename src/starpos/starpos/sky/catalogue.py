@@ -110,17 +110,26 @@ Rows = np.ndarray | slice
 class Catalogue:
     """N stars sorted by declination zone, then right ascension; integers as stored, so that loading is quick.
 
-    ra_mas, dec_mas  (N,) ICRS at J2000.0, mas
-    pm_ra, pm_dec    (N,) mas/yr, pm_ra times cos(dec)
-    vmag_centi       (N,) V in 0.01 mag
-    sigma_code       (N,) code of the position's error at the mean epoch
-    pm_sigma_code    (N,) code of the proper motion's error
-    epoch_code       (N,) mean epoch, years after EPOCH_ZERO
-    tyc              (N, 3) Tycho identifier
-    hip              (N,) Hipparcos number, 0 for none
-    zone_start       (181,) first row of each zone of 1 deg of declination, and the end
-    pm_ra_centi, pm_dec_centi  (N,) what the motions are more than pm_ra and pm_dec, 0.01 mas/yr
-    parallax_tenths  (N,) parallax, 0.1 mas, 0 if unknown
+    Attributes
+    ----------
+    ra_mas, dec_mas : (N,) ICRS at J2000.0, mas
+    pm_ra, pm_dec : (N,) mas/yr, pm_ra times cos(dec)
+    vmag_centi : (N,) V in 0.01 mag
+    sigma_code : (N,) code of the position's error at the mean epoch
+    pm_sigma_code : (N,) code of the proper motion's error
+    epoch_code : (N,) mean epoch, years after EPOCH_ZERO
+    tyc : (N, 3) Tycho identifier
+    hip : (N,) Hipparcos number, 0 for none
+    zone_start : (181,) first row of each zone of 1 deg of declination, and the end
+    pm_ra_centi, pm_dec_centi : (N,) what the motions are more than pm_ra and pm_dec, 0.01 mas/yr
+    parallax_tenths : (N,) parallax, 0.1 mas, 0 if unknown
+
+    Examples
+    --------
+    >>> stars = starpos.load_catalogue()
+    >>> magnitudes = stars.vmag(np.arange(len(stars.hip)))
+    >>> 40 < sum((magnitudes < 2.0).tolist()) < 60
+    True
     """
 
     ra_mas: np.ndarray
@@ -457,6 +466,25 @@ def load_catalogue(path: str | None = None) -> Catalogue:
     """The catalogue at `path`, else the file named by STARPOS_CATALOGUE, else the committed one; each is read once.
 
     The committed one is kept unpacked in the cache, by its contents, and memory-mapped from there.
+
+    Parameters
+    ----------
+    path : of a catalogue's file; None: as above
+
+    Returns
+    -------
+    Catalogue
+        shared by all callers
+
+    Raises
+    ------
+    CatalogueError
+        the file is missing or broken
+
+    Examples
+    --------
+    >>> starpos.load_catalogue() is starpos.load_catalogue()
+    True
     """
     if named := path or os.environ.get("STARPOS_CATALOGUE"):
         return read(named)

@@ -158,7 +158,7 @@ REFUSED = {
     "nothing to work on": (("TILT",), "give either frames or --pointings CSV"),
     "both": (("x.fits", "WHOLE", "TILT"), "not both"),
     "no tilts": (("WHOLE",), "give --tilt CSV"),
-    "no such table": (("--pointings", "none.csv", "TILT"), "none.csv: no readable table"),
+    "no such table": (("--pointings", "none.csv", "TILT"), "none.csv: there is no such file"),
     "how near without where": (("WHOLE", "TILT", *A3, "--near-km", "20"), "--near-km is for --near"),
     "near nowhere": (("BARE", "TILT", "--near", "95", "2"), "give latitude and longitude in deg"),
     "processes": (("WHOLE", "TILT", "--jobs", "2"), "--jobs and --scheduler are for frames"),
