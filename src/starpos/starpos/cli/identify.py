@@ -61,6 +61,7 @@ def run(args: argparse.Namespace) -> int:
     args.frames = frames_among(args.frames)
     any_found, unreadable, number = False, False, len(args.frames)
     lost: Stars | None = None
+    complaints = console.FrameComplaints("identify")
     read, output = reader_of(args), Output(args, COLUMNS, HEAD)
     with inputs.workers_of(args, number) as workers:
         (about,) = workers.map([(First(read), tuple(args.frames))])
@@ -83,8 +84,9 @@ def run(args: argparse.Namespace) -> int:
                 lost = answer.stars if lost is None and found.status is Status.NOT_IDENTIFIED else lost
             any_found |= found.ok
             if not found.ok or found.remark:
-                console.complain("identify", found.remark or found.message)
+                complaints(path, found.remark or found.message)
             output.put(as_json(path, found) | {"cpu_ms": cpu_ms}, _line(path, found))
+    complaints.end()
     if lost is not None and not any_found:
         for remark in Solving(given).fitting(lost):
             console.complain("identify", remark)
