@@ -34,11 +34,30 @@ QUARTER = 0.3186
 
 
 def read_tilt_csv(path: Path | str, noise_rad: float = SCA100T_NOISE_RAD) -> TiltLog:
-    """Read a TiltLog from a CSV, one reading of a sensor a line; TiltError if it cannot be one.
+    """Read a TiltLog from a CSV, one reading of a sensor a line.
 
     Columns: utc_unix_s, theta_x_deg, theta_y_deg; theta_z_deg of a three-axis sensor; temperature_c, unknown (NaN) where
-    it is beyond MAX_CELSIUS; sigma_deg, 1 sigma of the white noise of that line's angles. Where no sigma is stated (no
-    column, an empty cell, or NaN) it is noise_rad. Other columns are ignored.
+    it is beyond MAX_CELSIUS; sigma_deg, 1 sigma of the white noise of that line's angles. Other columns are ignored.
+
+    Parameters
+    ----------
+    path : of the CSV
+    noise_rad : sigma where no sigma is stated (no column, an empty cell, or NaN)
+
+    Returns
+    -------
+    TiltLog
+        its readings
+
+    Raises
+    ------
+    TiltError
+        the file cannot be one
+
+    Examples
+    --------
+    >>> starpos.read_tilt_csv("night/tilt.csv").theta_x.shape
+    (25,)
     """
     path = Path(path)
     table = TILT_TABLE.read(path)
