@@ -18,7 +18,7 @@ from starpos.instrument.camera import Camera
 from starpos.session import reports
 from starpos.session.driver import Now, Sent
 from starpos.session.frames import Answered, Output
-from starpos.session.gnss import GNSS_TOPIC, GnssComparison
+from starpos.session.gnss import GNSS_TOPIC, ComparedPlaces
 from starpos.session.gyro import IMU_TOPIC
 from starpos.session.session import CAMERA_TOPIC, SolverSession
 from starpos_common.diagnostics import Diagnosis, Diagnostics, Level, time_is_simulated
@@ -97,7 +97,7 @@ class SolverNode(Node):
         if self._values["gyro"]:
             best_effort = ReliabilityPolicy.BEST_EFFORT
             subscription(self, Imu, IMU_TOPIC, self._on_imu, IMU_QUEUE, best_effort)
-        self._gnss = GnssComparison()
+        self._gnss = ComparedPlaces()
         take = self._compare_gnss if session.gnss is None else self._taker(GNSS_TOPIC, takes)
         # receivers' drivers publish in either way
         subscription(self, NavSatFix, GNSS_TOPIC, take, 10, ReliabilityPolicy.BEST_EFFORT)

@@ -107,10 +107,35 @@ def calibrate_at(
 ) -> Calibrated:
     """A3 from one or more frames at a known place; the solver's A3 need not be near.
 
-    known: the stars of frames, by the frames' numbers, that only a longer search identifies than the solver's.
-    turn_stddev_deg: sigma of the turn of the solver's A3 about the plumb line.  One lean of the instrument does not
-    determine that turn, and only a fix at another lean needs it; the covariance shows it.
-    Raises FixError if there is no fix or the frames do not agree.
+    Parameters
+    ----------
+    solver : of the instrument
+    frames : lists of stars, or pointings of another program
+    tilts : of their times
+    site : the known place
+    turn_stddev_deg : sigma of the turn of the solver's A3 about the plumb line. One lean of the instrument does not
+        determine that turn, and only a fix at another lean needs it; the covariance shows it.
+    progress : is called with the share of the work that is done
+    known : the stars of frames, by the frames' numbers, that only a longer search identifies than the solver's
+
+    Returns
+    -------
+    Calibrated
+        `instrument` with the new A3, and `solutions` of the frames
+
+    Raises
+    ------
+    FixError
+        there is no fix, or the frames do not agree
+
+    Examples
+    --------
+    >>> solver = starpos.Solver(starpos.Instrument(4635.9375), starpos.load_catalogue())
+    >>> stars = [starpos.read_frame(path) for path in sorted(Path("night").glob("stars_*.csv"))]
+    >>> tilts = starpos.read_tilt_csv("night/tilt.csv")
+    >>> found = starpos.calibrate_at(solver, stars, tilts, starpos.Place.by_gravity(35.7046, 51.4106))
+    >>> len(found.fixes)
+    5
     """
 
     def find(readings: Readings, a3: np.ndarray, fixes: list[Fix]) -> PlumbLine:
@@ -457,11 +482,36 @@ def turn(
 ) -> Calibrated:
     """A3, and fixes, from frames of one place at several headings; the solver's A3 need not be near.
 
-    known: the stars of frames, by the frames' numbers, that only a longer search identifies than the solver's.
-    turn_stddev_deg: sigma of the turn of the solver's A3 about the plumb line; it matters if the axis of the turn leans.
     The `average` of the fixes is the place; its covariance says how well the headings separate it from A3.  With fewer
     than two fixes A3 stays as it was.
-    Raises FixError if the instrument leans and the headings leave two places, or if the frames have no common zenith.
+
+    Parameters
+    ----------
+    solver : of the instrument
+    frames : lists of stars, or pointings of another program
+    tilts : of their times
+    turn_stddev_deg : sigma of the turn of the solver's A3 about the plumb line. It matters if the axis of the turn
+        leans.
+    progress : is called with the share of the work that is done
+    known : the stars of frames, by the frames' numbers, that only a longer search identifies than the solver's
+
+    Returns
+    -------
+    Calibrated
+        `instrument` with the new A3, and `solutions` of the frames
+
+    Raises
+    ------
+    FixError
+        the instrument leans and the headings leave two places, or the frames have no common zenith
+
+    Examples
+    --------
+    >>> solver = starpos.Solver(starpos.Instrument(4635.9375), starpos.load_catalogue())
+    >>> stars = [starpos.read_frame(path) for path in sorted(Path("turn").glob("stars_*.csv"))]
+    >>> tilts = starpos.read_tilt_csv("turn/tilt.csv")
+    >>> starpos.average(starpos.turn(solver, stars, tilts).fixes)
+    <Average of 8 frames: +35.7... +51.4... +- ...>
     """
 
     def find(readings: Readings, a3: np.ndarray, fixes: list[Fix]) -> PlumbLine:
