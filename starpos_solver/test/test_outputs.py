@@ -15,8 +15,9 @@ from starpos.fix.attitude import CAMERA, ITRS, Attitude, heading_of, heading_row
 from starpos.fix.budget import link_attitude
 from starpos.fix.fix import Fix
 from starpos.fix.heading import AttitudeAtPlace
-from starpos.fix.solution import Solution, Status
+from starpos.fix.solution import NO_STARS, Solution, Status
 from starpos.fix.terms import ErrorTerm
+from starpos.sky.catalogue import named_stars
 from starpos_interfaces import msg
 from starpos_solver import outputs
 from starpos_testing.headings import yaw_deg
@@ -58,9 +59,8 @@ def answer_facing(azimuth_deg: float) -> Solution:
         source="stars",
         utc_unix_s=1.8e9,
         stars_detected=5,
-        names=("a", "b", "c"),
+        named=named_stars(("a", "b", "c"), np.array([5.25, 7.5, 10.0])),
         star=np.array([0, 2, 4]),
-        magnitudes=np.array([5.25, 7.5, 10.0]),
         fix=fix_facing(azimuth_deg),
     )
 
@@ -149,9 +149,8 @@ def test_without_a_fix_every_number_that_is_missing_is_nan():
         answer_facing(10.0),
         status=Status.NOT_IDENTIFIED,
         fix=None,
-        names=(),
+        named=NO_STARS,
         star=None,
-        magnitudes=None,
         message="why",
     )
     message = outputs.solution(Header(), answer, None)
