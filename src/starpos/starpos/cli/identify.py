@@ -104,7 +104,7 @@ def as_json(path: str, s: Solution) -> dict:
         "focal_px": a.focal_px if a else None,
         "focal_stddev_px": a.focal_stddev_px if a else None,
         "stars_detected": s.stars_detected,
-        "stars_matched": len(s.names),
+        "stars_matched": len(s.named),
         "residual_arcsec": a.residual_arcsec if a else None,
         "log_odds": a.log_odds if a else None,
         "lens": a.model if a else None,
@@ -125,7 +125,7 @@ def _line(path: str, s: Solution) -> str:
     digits = 1 - math.floor(math.log10(min(max(a.focal_stddev_px, 1e-3), 1.0)))
     return (
         f"{path}: RA {np.degrees(a.ra):.5f} Dec {np.degrees(a.dec):+.5f} top at {np.degrees(a.roll):.3f} deg, "
-        f"{len(s.names)} of {s.stars_detected} stars, residual {a.residual_arcsec:.2f} arcsec, "
+        f"{len(s.named)} of {s.stars_detected} stars, residual {a.residual_arcsec:.2f} arcsec, "
         f"focal length {a.focal_px:.{digits}f} +- {a.focal_stddev_px:.{digits}f} px "
         f"({1 / a.focal_px / ARCSEC:.5g} arcsec/px), log-odds {a.log_odds:.0f}"
         + (", a fisheye" if a.model == EQUIDISTANT else "")
