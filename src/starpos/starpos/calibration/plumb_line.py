@@ -456,7 +456,7 @@ def level(readings: Readings, given: np.ndarray, turn_sigma: float = np.pi) -> P
         raise FixError(
             f"the instrument leans by {np.degrees(lean):.2f} deg from one heading to the other, and these "
             f"headings do not determine which way its inclinometer faces, or one heading's tilts are off: "
-            f"level it better, or add a frame "
+            f"leave out a frame whose tilt is wrong, level it better, or add a frame "
             "with one foot raised by as much or more"
         )
     if nearest.cost < best.cost + AS_GOOD:
