@@ -2,6 +2,7 @@
 """Options shared by several commands: frames, instrument, air, deflection, known place; the objects made from them."""
 
 import argparse
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -303,6 +304,20 @@ def number(low: float, high: float, kind: type[int] | type[float] = float) -> Ca
     return parse
 
 
+def degrees(text: str) -> float:
+    """An argparse type: degrees, or degrees, minutes and seconds as 47:06:00 and -33:52:10.4."""
+    parts = re.fullmatch(r"([+-]?)(\d{1,3}):([0-5]?\d)(?::([0-5]?\d(?:\.\d*)?))?", text.strip())
+    if parts is None:
+        try:
+            return float(text)
+        except ValueError:
+            raise argparse.ArgumentTypeError(
+                f"{text!r} is no angle: give deg, such as 47.1 or 47:06:00, south and west negative"
+            ) from None
+    value = int(parts[2]) + int(parts[3]) / 60 + float(parts[4] or 0) / 3600
+    return -value if parts[1] == "-" else value
+
+
 def atmosphere_of(args: argparse.Namespace) -> Atmosphere:
     """The air from the options, as far as they give it; `args.air`: from a field report."""
     if (stated := getattr(args, "air", None)) is not None:
@@ -438,7 +453,7 @@ def add_site(parser: argparse.ArgumentParser) -> None:
     """Add the options that `place_of` reads."""
     parser.add_argument(
         "--site",
-        type=float,
+        type=degrees,
         nargs="+",
         metavar=("LAT", "LON HEIGHT"),
         help="known position, deg (by gravity unless --geodetic), and optionally its height above the "

@@ -181,8 +181,6 @@ def _between(before: Place, after: Place, share: float) -> Place:
     )
 
 
-# what `starpos.recording` writes
-COLUMNS = ("utc_unix_s", "latitude", "longitude", "altitude_m", "sigma_east_m", "sigma_north_m", "status")
 # deg on WGS 84, for a month of 1 Hz; a receiver without a fix leaves cells empty
 GNSS_TABLE = TableForm(
     what="table of GNSS",

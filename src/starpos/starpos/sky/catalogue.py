@@ -11,8 +11,9 @@ import math
 import os
 import zipfile
 import zlib
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 from itertools import pairwise
 from pathlib import Path
 
@@ -236,6 +237,10 @@ class Catalogue:
         motion = SMALLEST_MAS_YEAR * CODE_STEP ** self.pm_sigma_code[index].astype(float) * years
         return np.hypot(SMALLEST_MAS * CODE_STEP ** self.sigma_code[index].astype(float), motion) * MAS
 
+    def named(self, index: np.ndarray) -> "NamedStars":
+        """The stars of the rows `index` (n,), whose names and V magnitudes are looked up when they are asked for."""
+        return NamedStars(len(index), partial(self.labels, index))
+
     def labels(self, index: np.ndarray) -> tuple[tuple[str, ...], np.ndarray]:
         """Names and V magnitudes (n,) of the rows `index` (n,)."""
         return self._labels.of(np.ascontiguousarray(index, np.intp))
@@ -251,6 +256,47 @@ class Catalogue:
             index = index[self.vmag_centi[index] < limit_mag * 100]
         index = index[self.directions(index) @ centre >= np.cos(radius_rad)]
         return index[np.argsort(self.vmag_centi[index], kind="stable")]
+
+
+class NamedStars:
+    """Names and V magnitudes of M stars, which are looked up when they are first asked for, compared or pickled."""
+
+    def __init__(self, number: int, look_up: Callable[[], tuple[tuple[str, ...], np.ndarray]]) -> None:
+        self._number, self._look_up = number, look_up
+
+    def __len__(self) -> int:
+        return self._number
+
+    @cached_property
+    def labels(self) -> tuple[tuple[str, ...], np.ndarray]:
+        """Names, and V magnitudes (M,)."""
+        return self._look_up()
+
+    def of_rows(self, row: np.ndarray) -> "NamedStars":
+        """The stars in these rows (n,)."""
+
+        def look_up() -> tuple[tuple[str, ...], np.ndarray]:
+            names, magnitudes = self.labels
+            return tuple(names[k] for k in row), magnitudes[row]
+
+        return NamedStars(len(row), look_up)
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, NamedStars):
+            return NotImplemented
+        (names, magnitudes), (others, theirs) = self.labels, other.labels
+        return names == others and np.array_equal(magnitudes, theirs, equal_nan=True)
+
+    def __hash__(self) -> int:
+        return hash(self.labels[0])
+
+    def __reduce__(self) -> tuple[object, ...]:
+        return named_stars, self.labels
+
+
+def named_stars(names: tuple[str, ...], magnitudes: np.ndarray) -> NamedStars:
+    """Stars of which names and V magnitudes (M,) are known."""
+    return NamedStars(len(names), lambda: (names, magnitudes))
 
 
 def pack(
