@@ -327,7 +327,7 @@ def define(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--site",
-        type=float,
+        type=options.degrees,
         nargs=3,
         required=True,
         metavar=("LAT", "LON", "HEIGHT"),

@@ -103,6 +103,12 @@ class GnssTrack:
     """GNSS places by time.
 
     Two places of one moment that contradict each other give none: two receivers, or a spoofed one.
+
+    Examples
+    --------
+    >>> track = starpos.GnssTrack([starpos.Place.on_ellipsoid(35.7, 51.4, utc_unix_s=1.8e9)])
+    >>> track.at(1.8e9 + 100) is None  # no place near that time
+    True
     """
 
     def __init__(self, places: list[Place]) -> None:
@@ -175,8 +181,6 @@ def _between(before: Place, after: Place, share: float) -> Place:
     )
 
 
-# what `starpos.recording` writes
-COLUMNS = ("utc_unix_s", "latitude", "longitude", "altitude_m", "sigma_east_m", "sigma_north_m", "status")
 # deg on WGS 84, for a month of 1 Hz; a receiver without a fix leaves cells empty
 GNSS_TABLE = TableForm(
     what="table of GNSS",
@@ -188,10 +192,30 @@ GNSS_TABLE = TableForm(
 
 
 def read_gnss_csv(path: Path | str) -> tuple[GnssTrack, tuple[str, ...]]:
-    """Read the fixes of a receiver, and a sentence for each kind of row that was left out; GnssError if it cannot be.
+    """Read the fixes of a receiver.
 
     Columns: utc_unix_s, latitude, longitude in deg on WGS 84, sigma_east_m, sigma_north_m; status as NavSatStatus's (0 if
     there is no such column).  Cells may be empty.  Rows may come in any order.
+
+    Parameters
+    ----------
+    path : of the CSV
+
+    Returns
+    -------
+    tuple of GnssTrack and tuple of str
+        the places by time, and a sentence for each kind of row that was left out
+
+    Raises
+    ------
+    GnssError
+        the file cannot be read or has no such columns
+
+    Examples
+    --------
+    >>> track, left_out = starpos.read_gnss_csv("gnss.csv")
+    >>> len(track), left_out
+    (3, ())
     """
     table = GNSS_TABLE.read(path)
     places: list[Place] = []

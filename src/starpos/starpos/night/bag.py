@@ -47,6 +47,8 @@ from starpos.rotation import full_turn, half_turns
 from starpos.units import ARCSEC, utc_text
 
 SUFFIXES = (".mcap", ".db3")
+# of ROS 1, which is refused with a sentence
+ROS1_SUFFIX = ".bag"
 TOPICS = INPUTS | {"solver/solution": SOLUTION}
 # types of messages that are a frame each
 WITH_STARS = (STARS, *IMAGES)
@@ -81,7 +83,7 @@ class Recorded:
 def is_bag(path: Path) -> bool:
     """Whether a path looks like a bag: a folder with metadata.yaml or a bag's files, or a file with a bag's suffix."""
     if path.is_file():
-        return path.suffix.lower() in SUFFIXES
+        return path.suffix.lower() in (*SUFFIXES, ROS1_SUFFIX)
     return (path / "metadata.yaml").is_file() or any(next(path.glob(f"*{s}"), None) for s in SUFFIXES)
 
 

@@ -25,7 +25,6 @@ from starpos.gnss.states import Learned
 from starpos.gnss.watch import GnssStatus, GnssWatch
 from starpos.instrument.instrument import Instrument
 from starpos.session.driver import ANOTHER_TIME_S, Diagnosis, Heard, Jobs, Level, Log, Now, refusing
-from starpos.session.frames import ground_of
 from starpos.session.reports import AHEAD_S, ONE_CLOCK
 from starpos.session.settings import Settings
 from starpos.units import ARCSEC, utc_text
@@ -110,7 +109,7 @@ class ComparedPlaces(RecentPlaces):
             gnss = self.at(fix.utc_unix_s)
         except GnssError:
             return ""
-        wrong = "" if gnss is None else contradiction(gnss, ground_of(fix, vertical), fix.utc_unix_s, 0.0)[1]
+        wrong = "" if gnss is None else contradiction(gnss, fix.on_ground(vertical), fix.utc_unix_s, 0.0)[1]
         return f"{wrong}: check how frames are turned, A3 and the inclinometer's axes" if wrong else ""
 
 

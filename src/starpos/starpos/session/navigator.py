@@ -304,7 +304,10 @@ class NavigatorSession:
         if estimate is None or self._stars_missing:
             return Navigated(utc_unix_s=time_s)
         self.counts["fixes"] += 1
-        ground, (displacement, covariance) = self._ground(estimate.fix), self._displacement(estimate)
+        ground, (displacement, covariance) = (
+            self._ground(estimate.fix),
+            self._displacement(estimate),
+        )
         return Navigated(
             utc_unix_s=time_s,
             fix=estimate.fix,
