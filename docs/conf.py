@@ -14,6 +14,8 @@ from starpos.cli import COMMANDS, parser_for
 ROOT = Path(__file__).resolve().parents[1]
 # lines of a docstring that tell of something by its name, in columns or after a colon
 COLUMNS, NAMED = re.compile(r"[\w, ]*\w(?: \([^)]*\))? {2,}\S"), re.compile(r"[\w, ]*\w(?: \([^)]*\))?: \S")
+# an entry of a section of numpydoc
+ENTRY = re.compile(r"\*{0,2}\w+(?:, \w+)* : \S")
 
 # as wide as a line of code on a page
 os.environ["COLUMNS"] = "84"
@@ -56,7 +58,7 @@ def about_names() -> str:
         is_class = isinstance(getattr(starpos, name), type)
         members = "   :members:\n" if is_class else ""
         kind = "autoclass" if is_class else "autofunction"
-        made.append(f"```{{eval-rst}}\n.. {kind}:: starpos.{home}.{name}\n{members}```\n")
+        made.append(f"```{{eval-rst}}\n.. {kind}:: starpos.{name}\n{members}```\n")
     return "\n".join(made)
 
 
@@ -103,8 +105,19 @@ def as_written(app: object, what: str, name: str, thing: object, options: object
     made = []
     for paragraph in "\n".join(lines).split("\n\n"):
         rows = paragraph.split("\n")
+        if len(rows) > 1 and rows[1] and set(rows[1]) == {"-"}:
+            made += [f".. rubric:: {rows[0]}", ""]
+            rows = rows[2:]
         plain = [re.sub(r"([\\*`_|])", r"\\\1", row).strip() for row in rows]
-        if any(COLUMNS.match(row) or row.startswith("    ") for row in rows):
+        if any(row.startswith(">>> ") for row in rows):
+            made += ["::", "", *(f"    {row}" for row in rows), ""]
+        elif any(ENTRY.match(row) for row in rows):
+            # a row that goes on is continued in its line block
+            made += [
+                f"  {p}" if row.startswith(" ") else f"| {p}" for row, p in zip(rows, plain, strict=True)
+            ]
+            made.append("")
+        elif any(COLUMNS.match(row) or row.startswith("    ") for row in rows):
             made += ["::", "", *(f"    {row}" for row in rows), ""]
         elif any(NAMED.match(row) for row in rows):
             made += [*(f"| {row}" for row in plain if row), ""]

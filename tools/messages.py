@@ -3,7 +3,7 @@
 
 import ast
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple
@@ -98,7 +98,8 @@ def shown(tree: ast.AST, errors: set[str], known: Mapping[str, str]) -> Iterator
     """Texts that are raised, reported or returned as a sentence."""
     for node in ast.walk(tree):
         match node:
-            case ast.Raise(ast.Call(ast.Name(name), arguments)) if name in errors:
+            # an error of the caller's class is called `error`
+            case ast.Raise(ast.Call(ast.Name(name) | ast.Attribute(_, name), arguments)) if name in errors:
                 for argument in arguments:
                     yield from texts(argument, known)
             case ast.Call(ast.Name(name) | ast.Attribute(_, name), arguments) if name in SHOWN:
@@ -109,10 +110,10 @@ def shown(tree: ast.AST, errors: set[str], known: Mapping[str, str]) -> Iterator
                 yield from (text for text in texts(value, known) if PARTS.match(text) and ". " not in text)
 
 
-def messages(folder: str, errors: set[str], shared: Mapping[str, str]) -> list[Message]:
-    """The messages of a folder's modules, each once, in alphabetical order; shared: constants of other modules."""
+def messages(trees: Iterable[ast.Module], errors: set[str], shared: Mapping[str, str]) -> list[Message]:
+    """The messages of modules, each once, in alphabetical order; shared: constants of other modules."""
     found = set()
-    for tree in modules(folder).values():
+    for tree in trees:
         for text in shown(tree, errors, {**shared, **dict(constants(tree))}):
             # the place, such as a file, comes first
             plain = re.sub(rf"^{GAP}: ", "", " ".join(text.split())).rstrip(".")
@@ -137,13 +138,16 @@ def cell(text: str) -> str:
 
 def page() -> str:
     """Markdown with a table for each room of the library and for each package of nodes."""
-    errors = error_names()
+    errors = error_names() | {"error"}
     shared = dict(pair for tree in modules(LIBRARY).values() for pair in constants(tree))
     rooms = [path.parent for path in sorted((ROOT / LIBRARY).glob("*/__init__.py"))]
     packages = [ROOT / node / Path(node).name for node in NODES]
     made = []
-    for folder in (*rooms, *packages):
-        if found := messages(str(folder.relative_to(ROOT)), errors, shared):
+    for folder in (ROOT / LIBRARY, *rooms, *packages):
+        trees = modules(str(folder.relative_to(ROOT)))
+        if folder == ROOT / LIBRARY:
+            trees = {path: tree for path, tree in trees.items() if path.parent == folder}
+        if found := messages(trees.values(), errors, shared):
             made += [f"\n## {folder.name}\n", about(folder / "__init__.py"), ""]
             made += ["| what happened | what it means, what to do |", "| --- | --- |"]
             made += [f"| {cell(message.happened)} | {cell(message.advice)} |" for message in found]

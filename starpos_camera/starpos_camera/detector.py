@@ -234,11 +234,7 @@ class DetectorNode(Node):
         self._look = self.create_timer(LOOK_S, self._go_on, clock=self._patience_clock, autostart=False)
 
         def taker(name: str) -> Take:
-            def on_message(message: Any, info: Mapping[str, Any]) -> None:
-                if self._replayed is None or not self._replayed.holds(name, message, info):
-                    takes[name](message, info)
-
-            return on_message
+            return takes[name] if self._replayed is None else self._replayed.in_turn(name, takes[name])
 
         captures = subscription(self, Capture, "camera/capture", taker("camera/capture"), CAPTURES_KEPT)
         self._captures_come = captures.get_publisher_count

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from sensor_msgs.msg import Imu
 
-from starpos.messages.tilt import BadMessage, ForceAverager, MeanForce, acceleration_of
+from starpos.errors import TiltError
+from starpos.messages.tilt import ForceAverager, MeanForce, acceleration_of
 from starpos_interfaces.msg import Tilt
 from starpos_testing.nodes import Listener, Process, take_domain
 
@@ -106,7 +107,7 @@ def test_not_at_rest():
     ],
 )
 def test_messages_that_are_none(bad):
-    with pytest.raises(BadMessage):
+    with pytest.raises(TiltError):
         acceleration_of(bad)
 
 

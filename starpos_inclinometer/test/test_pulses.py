@@ -125,7 +125,11 @@ def test_lines_of_edges_are_read_as_they_are_written():
     most = {"number": 255, "bounces": 3, "milliseconds": 0xFFFFFFFF, "microseconds": 999}
     sent = [Pulse(input=i, rising=r, **most) for i in (0, 1) for r in (False, True)]
     parser = LineParser()
-    assert parser.parse(b"".join(emulator.pulse_line(**asdict(p)) for p in sent)) == sent
+    lines = [
+        emulator.pulse_line(channel=p.input, **{k: v for k, v in asdict(p).items() if k != "input"})
+        for p in sent
+    ]
+    assert parser.parse(b"".join(lines)) == sent
     bad = [b"P,02,00,00,00000000,0000", b"P,00,00,00,00000000,03E8", b"P,0,00,00,00000000,0000"]
     assert parser.parse(b"".join(map(frame, bad))) == [] and parser.malformed == 3
 

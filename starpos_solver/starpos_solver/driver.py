@@ -9,8 +9,9 @@ from rclpy.node import Node
 
 from starpos.instrument.camera import Camera
 from starpos.parameters.table import parameters_of
+from starpos.session.driver import Now
 from starpos.session.settings import Settings
-from starpos_common.diagnostics import Diagnosis, Level, Troubles
+from starpos_common.diagnostics import Diagnosis, Level, Troubles, time_is_simulated
 from starpos_common.parameters import declare
 
 
@@ -72,6 +73,13 @@ class Inputs:
         if said:
             return Diagnosis(Level.WARN, "; ".join(said), values)
         return Diagnosis(Level.OK, "all inputs arrive", values)
+
+
+def now_of(node: Node) -> Now:
+    """The moment by the node's clock; the time that is waited is in real time, unless the clock is simulated."""
+    now_ns = node.get_clock().now().nanoseconds
+    unix_s = now_ns * 1e-9 if now_ns else None
+    return Now.in_data(unix_s) if time_is_simulated(node) else Now(unix_s, time.monotonic())
 
 
 class SolverSettings(Settings):

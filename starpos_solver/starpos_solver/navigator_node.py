@@ -4,8 +4,6 @@
 import numpy as np
 from geometry_msgs.msg import Point, TwistWithCovarianceStamped, Vector3
 from nav_msgs.msg import Odometry
-from rclpy.clock import Clock
-from rclpy.clock_type import ClockType
 from rclpy.node import Node
 from rclpy.qos import ReliabilityPolicy
 from sensor_msgs.msg import Imu, NavSatFix
@@ -14,16 +12,15 @@ from std_srvs.srv import Trigger
 
 from starpos.fix.attitude import Attitude
 from starpos.parameters.table import parameters_of
-from starpos.session.driver import Now
 from starpos.session.navigator import Navigated, NavigatorSession, NavigatorSettings
-from starpos_common.diagnostics import Diagnostics, time_is_simulated
+from starpos_common.diagnostics import Diagnostics
 from starpos_common.messages import quaternion, unix_to_stamp
 from starpos_common.parameters import declare
 from starpos_common.topics import publisher, subscription
 from starpos_common.worker import JobRunner
 from starpos_interfaces import msg
 from starpos_solver import outputs
-from starpos_solver.driver import IMU_QUEUE, Inputs, NodeLog
+from starpos_solver.driver import IMU_QUEUE, Inputs, NodeLog, now_of
 from starpos_solver.publishing import MOVING, MOVING_QOS, Transforms, transform_of
 
 
@@ -95,8 +92,6 @@ class NavigatorNode(Node):
             self, parameters_of("navigator"), apply=self._adopted, check=self._settings.check
         )
         self._settings.adopt()
-        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._played = time_is_simulated(self)
         self._inputs = Inputs(self, ("imu/data", "attitude"))
         self._session = NavigatorSession(
             self._settings, lambda: JobRunner(self), self._inputs, NodeLog(self.get_logger())
@@ -110,12 +105,12 @@ class NavigatorNode(Node):
                 self,
                 kind,
                 name,
-                lambda m, n=name: session.receive_velocity(m, self._now(), n),
+                lambda m, n=name: session.receive_velocity(m, now_of(self), n),
                 1000,
                 best_effort,
             )
         subscription(
-            self, NavSatFix, "gnss/fix", lambda m: session.receive_gnss(m, self._now()), 10, best_effort
+            self, NavSatFix, "gnss/fix", lambda m: session.receive_gnss(m, now_of(self)), 10, best_effort
         )
         self.create_service(Trigger, "~/reset", self._on_reset)
         self._diagnostics = Diagnostics(
@@ -130,17 +125,12 @@ class NavigatorNode(Node):
         self._outputs.parameters_set()
         self._session.parameters_set()
 
-    def _now(self) -> Now:
-        now_ns = self.get_clock().now().nanoseconds
-        unix_s = now_ns * 1e-9 if now_ns else None
-        return Now.in_data(unix_s) if self._played else Now(unix_s, self._steady.now().nanoseconds * 1e-9)
-
     def _on_imu(self, message: Imu) -> None:
-        for output in self._session.receive_imu(message, self._now()):
+        for output in self._session.receive_imu(message, now_of(self)):
             self._outputs.publish(output)
 
     def _on_attitude(self, message: msg.Attitude) -> None:
-        for output in self._session.receive_attitude(message, self._now()):
+        for output in self._session.receive_attitude(message, now_of(self)):
             self._outputs.publish(output)
 
     def _on_reset(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:

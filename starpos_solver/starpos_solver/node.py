@@ -18,7 +18,7 @@ from starpos.instrument.camera import Camera
 from starpos.session import reports
 from starpos.session.driver import Now, Sent
 from starpos.session.frames import Answered, Output
-from starpos.session.gnss import GNSS_TOPIC, GnssComparison
+from starpos.session.gnss import GNSS_TOPIC, ComparedPlaces
 from starpos.session.gyro import IMU_TOPIC
 from starpos.session.session import CAMERA_TOPIC, SolverSession
 from starpos_common.diagnostics import Diagnosis, Diagnostics, Level, time_is_simulated
@@ -28,7 +28,7 @@ from starpos_common.worker import JobRunner
 from starpos_interfaces import msg
 from starpos_interfaces.srv import Solve
 from starpos_solver.calibration_services import CalibrationServices
-from starpos_solver.driver import IMU_QUEUE, Inputs, NodeLog, SolverSettings
+from starpos_solver.driver import IMU_QUEUE, Inputs, NodeLog, SolverSettings, now_of
 from starpos_solver.publishing import SolutionPublishers, StaticTransforms
 
 POLL_S = 0.02
@@ -97,7 +97,7 @@ class SolverNode(Node):
         if self._values["gyro"]:
             best_effort = ReliabilityPolicy.BEST_EFFORT
             subscription(self, Imu, IMU_TOPIC, self._on_imu, IMU_QUEUE, best_effort)
-        self._gnss = GnssComparison()
+        self._gnss = ComparedPlaces()
         take = self._compare_gnss if session.gnss is None else self._taker(GNSS_TOPIC, takes)
         # receivers' drivers publish in either way
         subscription(self, NavSatFix, GNSS_TOPIC, take, 10, ReliabilityPolicy.BEST_EFFORT)
@@ -141,19 +141,17 @@ class SolverNode(Node):
     def _now(self) -> Now:
         if self._replayed is not None and self._replayed.playing:
             return Now.in_data(self._replayed.unix_s)
-        now_ns = self.get_clock().now().nanoseconds
-        unix_s = now_ns * 1e-9 if now_ns else None
-        if time_is_simulated(self):
-            return Now.in_data(unix_s)
-        return Now(unix_s, self._steady.now().nanoseconds * 1e-9)
+        return now_of(self)
 
     def _taker(self, name: str, takes: Mapping[str, Take]) -> Take:
-        def on_message(message: Any, info: Mapping[str, Any]) -> None:
-            if self._replayed is None or not self._replayed.holds(name, message, info):
-                self._note_dropped(name, info)
-                takes[name](message, info)
+        if self._replayed is None:
+            return takes[name]
 
-        return on_message
+        def take(message: Any, info: Mapping[str, Any]) -> None:
+            self._note_dropped(name, info)
+            takes[name](message, info)
+
+        return self._replayed.in_turn(name, take)
 
     def _compare_gnss(self, message: NavSatFix) -> None:
         self._gnss.receive(message, self._now())

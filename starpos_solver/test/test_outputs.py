@@ -15,9 +15,10 @@ from starpos.fix.attitude import CAMERA, ITRS, Attitude, heading_of, heading_row
 from starpos.fix.budget import link_attitude
 from starpos.fix.fix import Fix
 from starpos.fix.heading import AttitudeAtPlace
-from starpos.fix.solution import Solution, Status
+from starpos.fix.solution import NO_STARS, Solution, Status
 from starpos.fix.terms import ErrorTerm
-from starpos.session.frames import ground_of
+from starpos.instrument.inclinometer import Tilt
+from starpos.sky.catalogue import named_stars
 from starpos_interfaces import msg
 from starpos_solver import outputs
 from starpos_testing.headings import yaw_deg
@@ -33,6 +34,7 @@ def fix_facing(azimuth_deg: float, latitude_deg: float = 40.0) -> Fix:
     factor = np.diag([100.0, 50.0, 1e-4, 2e-4, 3e-4, 1e-4])
     return Fix(
         utc_unix_s=1.8e9,
+        tilt=Tilt(0.0, 0.0, np.eye(2) * 1e-10, utc_unix_s=1.8e9),
         latitude=math.radians(latitude_deg),
         longitude=1.0,
         heading=heading_of(link),
@@ -59,9 +61,8 @@ def answer_facing(azimuth_deg: float) -> Solution:
         source="stars",
         utc_unix_s=1.8e9,
         stars_detected=5,
-        names=("a", "b", "c"),
+        named=named_stars(("a", "b", "c"), np.array([5.25, 7.5, 10.0])),
         star=np.array([0, 2, 4]),
-        magnitudes=np.array([5.25, 7.5, 10.0]),
         fix=fix_facing(azimuth_deg),
     )
 
@@ -69,20 +70,20 @@ def answer_facing(azimuth_deg: float) -> Solution:
 @pytest.mark.parametrize(("azimuth", "yaw"), [(0, 90), (90, 0), (180, -90), (270, 180), (45, 45)])
 def test_yaw_is_counterclockwise_from_east(azimuth, yaw):
     answer = answer_facing(azimuth)
-    message = outputs.imu(Header(), outputs.true_north(answer.fix.link, ground_of(answer.fix, EXACT)))
+    message = outputs.imu(Header(), outputs.true_north(answer.fix.link, answer.fix.on_ground(EXACT)))
     assert (yaw_deg(message) - yaw + 180) % 360 - 180 == pytest.approx(0, abs=1e-9)
 
 
 def test_heading_north_is_not_taken_for_none():
     answer = answer_facing(0.0)
-    message = outputs.solution(Header(), answer, ground_of(answer.fix, EXACT))
+    message = outputs.solution(Header(), answer, answer.fix.on_ground(EXACT))
     assert message.heading == 0.0
     assert message.status == msg.Solution.OK
 
 
 def test_matched_stars_are_told_by_name_place_in_the_list_and_magnitude():
     answer = answer_facing(0.0)
-    message = outputs.solution(Header(), answer, ground_of(answer.fix, EXACT))
+    message = outputs.solution(Header(), answer, answer.fix.on_ground(EXACT))
     assert (message.stars_detected, message.stars_matched) == (5, 3)
     assert (message.ids, list(message.indices), list(message.magnitudes)) == (
         ["a", "b", "c"],
@@ -95,19 +96,19 @@ def test_what_is_suspicious_about_the_identification_is_named():
     answer = answer_facing(0.0)
     suspicious = replace(answer, status=Status.POOR_FIT, fix=None, warnings=("two_skies", "unexplained"))
     assert outputs.solution(Header(), suspicious, None).warnings == ["two_skies", "unexplained"]
-    assert outputs.solution(Header(), answer, ground_of(answer.fix, EXACT)).warnings == []
+    assert outputs.solution(Header(), answer, answer.fix.on_ground(EXACT)).warnings == []
 
 
 def test_rates_and_accelerations_are_declared_unmeasured():
     answer = answer_facing(10.0)
-    message = outputs.imu(Header(), outputs.true_north(answer.fix.link, ground_of(answer.fix, EXACT)))
+    message = outputs.imu(Header(), outputs.true_north(answer.fix.link, answer.fix.on_ground(EXACT)))
     assert message.angular_velocity_covariance[0] == -1.0
     assert message.linear_acceleration_covariance[0] == -1.0
     assert np.all(np.linalg.eigvalsh(np.array(message.orientation_covariance).reshape(3, 3)) > 0)
 
 
 def test_a_fix_has_a_known_covariance_of_east_and_north():
-    ground = ground_of(answer_facing(10.0).fix, EXACT)
+    ground = answer_facing(10.0).fix.on_ground(EXACT)
     message = outputs.nav_sat_fix(Header(), ground, 250.0, 10.0)
     assert message.status.status == NavSatStatus.STATUS_FIX
     assert message.position_covariance_type == NavSatFix.COVARIANCE_TYPE_KNOWN
@@ -115,7 +116,7 @@ def test_a_fix_has_a_known_covariance_of_east_and_north():
 
 
 def test_an_unset_altitude_stays_nan_and_its_variance_finite():
-    message = outputs.nav_sat_fix(Header(), ground_of(answer_facing(10.0).fix, EXACT), math.nan, 10.0)
+    message = outputs.nav_sat_fix(Header(), answer_facing(10.0).fix.on_ground(EXACT), math.nan, 10.0)
     assert math.isnan(message.altitude)
     assert np.isfinite(message.position_covariance).all()
 
@@ -129,7 +130,7 @@ def test_no_fix_is_nan_with_an_unknown_covariance():
 
 def test_the_deflection_of_the_vertical_moves_and_widens_fix_and_heading():
     answer, deflection = answer_facing(10.0), Deflection(10.0, -20.0, 5.0)
-    ground, plain = ground_of(answer.fix, deflection), ground_of(answer.fix, EXACT)
+    ground, plain = answer.fix.on_ground(deflection), answer.fix.on_ground(EXACT)
     arcsec = math.radians(1 / 3600)
     assert ground.latitude - plain.latitude == pytest.approx(-10 * arcsec, rel=1e-3)
     assert ground.longitude - plain.longitude == pytest.approx(
@@ -150,9 +151,8 @@ def test_without_a_fix_every_number_that_is_missing_is_nan():
         answer_facing(10.0),
         status=Status.NOT_IDENTIFIED,
         fix=None,
-        names=(),
+        named=NO_STARS,
         star=None,
-        magnitudes=None,
         message="why",
     )
     message = outputs.solution(Header(), answer, None)
@@ -180,7 +180,7 @@ def test_every_status_has_a_code_of_the_message():
 
 def test_the_budget_adds_up_and_the_deflection_to_the_geodetic_covariance():
     answer = answer_facing(30.0)
-    message = outputs.solution(Header(), answer, ground_of(answer.fix, Deflection(1.0, 2.0, 3.0)))
+    message = outputs.solution(Header(), answer, answer.fix.on_ground(Deflection(1.0, 2.0, 3.0)))
     *others, deflection = message.budget
     assert deflection.name == "deflection" and deflection.common
     variance = np.sum([[t.east**2, t.north**2, t.heading**2] for t in others], axis=0)
@@ -216,5 +216,5 @@ def test_a_heading_without_a_fix_is_an_attitude_and_a_solution_without_a_place()
 
 def test_beside_a_fix_the_heading_is_that_of_the_known_place():
     answer = replace(answer_facing(60.0), at_place=at_place_facing(61.0))
-    message = outputs.solution(Header(), answer, ground_of(answer.fix, EXACT))
+    message = outputs.solution(Header(), answer, answer.fix.on_ground(EXACT))
     assert message.heading == pytest.approx(61.0) and message.latitude == pytest.approx(40.0)

@@ -65,7 +65,7 @@ def test_the_model_of_the_inclinometer_is_its_noise_until_one_is_stated(make):
     node, settings, _ = make()
     assert math.degrees(settings.tilt_stddev_rad) == pytest.approx(0.0035)
     assert change(node, **{"inclinometer.model": "bmi088"}).successful
-    assert settings.tilt_stddev_rad == sensors.BMI088.noise_rad
+    assert settings.tilt_stddev_rad == sensors.presets()["bmi088"].noise_rad
     result = change(node, **{"inclinometer.model": "bmi"})
     assert not result.successful and "'bmi' is not known" in result.reason
     assert change(node, tilt_stddev=0.01).successful

@@ -45,9 +45,9 @@ from starpos.sky.catalogue import Catalogue, load_catalogue
 # GNSS time, PTP or a good NTP server
 CLOCK_S = 0.001
 SENSORS = {
-    "IMU at rest (Bosch BMI088, data sheet)": sensors.BMI088,
-    "SCA100T-D01 as sold (data sheet)": sensors.SCA100T,
-    "SCL3300, digital, as sold (data sheet)": sensors.SCL3300,
+    "IMU at rest (Bosch BMI088, data sheet)": sensors.presets()["bmi088"],
+    "SCA100T-D01 as sold (data sheet)": sensors.presets()["sca100t"],
+    "SCL3300, digital, as sold (data sheet)": sensors.presets()["scl3300"],
     "SCA100T, compensated and calibrated": SCA100T_CALIBRATED,
     "tiltmeter of 0.1 arcsec": tiltmeter(0.1),
 }

@@ -58,7 +58,7 @@ LONGER = Case(
     20.0,
 )
 LENSES = (PI, WIDE, LONGER, PAPERS)
-LEVELS = {"SCL3300 as sold": sensors.SCL3300, "tiltmeter of 0.1 arcsec": tiltmeter(0.1)}
+LEVELS = {"SCL3300 as sold": sensors.presets()["scl3300"], "tiltmeter of 0.1 arcsec": tiltmeter(0.1)}
 
 
 def night_of(task: tuple) -> tuple[Night, list[int], np.ndarray]:

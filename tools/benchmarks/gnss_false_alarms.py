@@ -21,12 +21,12 @@ from starpos_testing.gnss_drives import GnssDrive
 
 # drives to a sensor: a rover that stops, one that takes frames faster, a good sensor, and one with an error of each pose
 DRIVES = {
-    "sca100t_calibrated, a stop every 2 min": GnssDrive(errors=sensors.SCA100T_CALIBRATED),
+    "sca100t_calibrated, a stop every 2 min": GnssDrive(errors=sensors.presets()["sca100t_calibrated"]),
     "sca100t_calibrated, 30 frames a stop": GnssDrive(
-        errors=sensors.SCA100T_CALIBRATED, frames=30, cadence_s=1.0
+        errors=sensors.presets()["sca100t_calibrated"], frames=30, cadence_s=1.0
     ),
-    "nivel210": GnssDrive(errors=sensors.NIVEL210, lean_deg=0.03),
-    "scl3300": GnssDrive(errors=sensors.SCL3300),
+    "nivel210": GnssDrive(errors=sensors.presets()["nivel210"], lean_deg=0.03),
+    "scl3300": GnssDrive(errors=sensors.presets()["scl3300"]),
 }
 MOST = 1e-5
 

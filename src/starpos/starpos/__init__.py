@@ -28,7 +28,7 @@ from typing import Any
 
 __version__ = "0.1.0"
 
-# __init__.pyi says the same to editors and type checkers
+# name: module, and after a colon its name there; __init__.pyi says the same to editors and type checkers
 _HOMES = {
     "Atmosphere": "earth.refraction",
     "Average": "averaging.average",
@@ -61,6 +61,7 @@ _HOMES = {
     "VoyageFix": "navigation.estimate",
     "average": "averaging.average",
     "calibrate_at": "calibration.misalignment",
+    "calibrate_camera": "calibration.camera",
     "deflection": "night.work",
     "detect": "detection",
     "geodetic": "earth.vertical",
@@ -70,9 +71,13 @@ _HOMES = {
     "open_night": "night.opening",
     "read_frame": "frames.reading",
     "read_gnss_csv": "gnss.receiver",
+    "read_instrument": "instrument.instrument_file:read",
     "read_tilt_csv": "instrument.tilt_table",
     "replay": "session.replay",
+    "scene_of": "simulation.scene",
     "turn": "calibration.misalignment",
+    "write_instrument": "instrument.instrument_file:write",
+    "write_night": "simulation.scene",
 }
 __all__ = list(_HOMES)
 
@@ -81,7 +86,8 @@ def __getattr__(name: str) -> Any:
     """Import a public name at its first use (PEP 562)."""
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
+    home, _, there = _HOMES[name].partition(":")
+    value = getattr(import_module(f"{__name__}.{home}"), there or name)
     globals()[name] = value
     return value
 

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 from starpos.averaging.average import Average as Average
 from starpos.averaging.average import average as average
+from starpos.calibration.camera import calibrate_camera as calibrate_camera
 from starpos.calibration.misalignment import calibrate_at as calibrate_at
 from starpos.calibration.misalignment import turn as turn
 from starpos.detection import Detection as Detection
@@ -21,6 +22,7 @@ from starpos.frames.frame import Stars as Stars
 from starpos.frames.reading import read_frame as read_frame
 from starpos.gnss.receiver import GnssTrack as GnssTrack
 from starpos.gnss.receiver import read_gnss_csv as read_gnss_csv
+from starpos.instrument import instrument_file
 from starpos.instrument.camera import Camera as Camera
 from starpos.instrument.inclinometer import Tilt as Tilt
 from starpos.instrument.instrument import Calibration as Calibration
@@ -38,10 +40,15 @@ from starpos.night.work import deflection as deflection
 from starpos.night.work import identify as identify
 from starpos.session.replay import PlayedNight as PlayedNight
 from starpos.session.replay import replay as replay
+from starpos.simulation.scene import scene_of as scene_of
+from starpos.simulation.scene import write_night as write_night
 from starpos.sky.catalogue import Catalogue as Catalogue
 from starpos.sky.catalogue import load_catalogue as load_catalogue
 from starpos.sky.site import Site as Site
 from starpos.zenith.doubts import DeflectionSession as DeflectionSession
+
+read_instrument = instrument_file.read
+write_instrument = instrument_file.write
 
 __version__: str
 __all__: list[str]

@@ -6,7 +6,16 @@ LETTERS = 120
 
 
 class StarposError(Exception):
-    """The base of all errors that starpos raises on purpose."""
+    """The base of all errors that starpos raises on purpose.
+
+    Examples
+    --------
+    >>> try:
+    ...     starpos.open_night("nowhere")
+    ... except starpos.StarposError as error:
+    ...     print(error)
+    nowhere: there is no such folder: ...
+    """
 
 
 class FrameError(StarposError):

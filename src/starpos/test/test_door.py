@@ -3,14 +3,19 @@
 
 import ast
 import doctest
+import inspect
 import re
 import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import starpos
+from starpos.instrument.sensors import SCA100T_CALIBRATED
+from starpos_testing.skies.folders import write_drive, write_zenith_session
+from starpos_testing.voyages import made
 
 SOURCE = Path(starpos.__file__)
 README = SOURCE.resolve().parents[1] / "README.md"
@@ -36,10 +41,15 @@ def test_what_is_no_public_name_is_an_attribute_error():
 
 
 def test_type_checkers_are_told_the_same():
-    told = [
-        n for n in ast.parse(SOURCE.with_suffix(".pyi").read_text()).body if isinstance(n, ast.ImportFrom)
-    ]
-    assert {a.name: n.module.removeprefix("starpos.") for n in told for a in n.names} == starpos._HOMES
+    body = ast.parse(SOURCE.with_suffix(".pyi").read_text()).body
+    told = [n for n in body if isinstance(n, ast.ImportFrom)]
+    homes = {a.name: n.module.removeprefix("starpos.") for n in told for a in n.names if a.asname}
+    modules = {a.name: f"{n.module}.{a.name}" for n in told for a in n.names if not a.asname}
+    for n in body:
+        match n:
+            case ast.Assign([ast.Name(name)], ast.Attribute(ast.Name(module), there)):
+                homes[name] = f"{modules[module].removeprefix('starpos.')}:{there}"
+    assert homes == starpos._HOMES
 
 
 def test_the_door_itself_imports_nothing_heavy():
@@ -79,6 +89,44 @@ def test_the_doors_own_example_is_what_comes_of_it(night, monkeypatch):
     runner = doctest.DocTestRunner(optionflags=doctest.ELLIPSIS)
     runner.run(told, out=lines.append)
     assert told.examples and runner.failures == 0, "".join(lines)
+
+
+@pytest.fixture(scope="module")
+def workplace(tmp_path_factory, catalogue):
+    """A folder with all files that the examples of the public names read."""
+    from starpos.cli import main
+
+    folder = tmp_path_factory.mktemp("workplace")
+    simulated(folder / "night", "--stars-only", "-n", "5")
+    simulated(folder / "turn", "--stars-only", "-n", "8", "--turn", "45")
+    known = starpos.Calibration.of((0, 0, 0), (5, 5, 5))
+    instrument = starpos.Instrument(4635.9375, calibration=known, inclinometer=SCA100T_CALIBRATED)
+    starpos.write_instrument(folder / "instrument.yaml", instrument)
+    told = ["--field", str(folder / "night.zip"), "--instrument", str(folder / "instrument.yaml")]
+    assert main(["report", str(folder / "night"), *told]) == 0
+    for name in ("drive", "zenith"):
+        (folder / name).mkdir()
+    write_drive(folder / "drive", catalogue, made("rover", 40, 2, cadence_s=4.0))
+    write_zenith_session(folder / "zenith", catalogue)
+    rows = "".join(f"{1.8e9 + k},35.7046,51.4106,2.0,2.0\n" for k in range(3))
+    (folder / "gnss.csv").write_text("utc_unix_s,latitude,longitude,sigma_east_m,sigma_north_m\n" + rows)
+    return folder
+
+
+@pytest.mark.parametrize("name", starpos.__all__)
+def test_the_example_of_a_public_name_is_what_comes_of_it(name, workplace, monkeypatch):
+    monkeypatch.chdir(workplace)
+    thing = getattr(starpos, name)
+    text = inspect.getdoc(thing)
+    for title in () if inspect.isclass(thing) else ("Parameters", "Returns"):
+        assert f"\n{title}\n{'-' * len(title)}\n" in text
+    names = {"starpos": starpos, "np": np, "Path": Path}
+    example = doctest.DocTestParser().get_doctest(text, names, name, None, 0)
+    lines = []
+    runner = doctest.DocTestRunner(optionflags=doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE)
+    runner.run(example, out=lines.append)
+    assert "\nExamples\n--------\n" in text and example.examples
+    assert runner.failures == 0, "".join(lines)
 
 
 def test_what_a_night_is_made_of_has_public_names(night):

@@ -221,21 +221,17 @@ def _type_hash(name: str) -> str:
         return ""
 
 
-class BagWriteError(Exception):
-    """A bag cannot be written; the text is one sentence."""
-
-
 class BagWriter:
     """Writes messages unchanged, compressed; the folder is a bag once it is closed.
 
-    Raises BagWriteError if rosbags is not installed, or if the folder exists already or cannot be made.
+    Raises BagError if rosbags is not installed, or if the folder exists already or cannot be made.
     """
 
     def __init__(self, folder: Path) -> None:
         try:
             from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer, WriterError
         except ImportError:
-            raise BagWriteError("rosbags, which writes bags, is not installed: pip install rosbags") from None
+            raise BagError("rosbags, which writes bags, is not installed: pip install rosbags") from None
         self.folder, self.count = folder, 0
         self.store = installed_types()
         self._connections: dict[str, Connection] = {}
@@ -244,9 +240,9 @@ class BagWriter:
             self._writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
             self._writer.open()
         except WriterError:
-            raise BagWriteError(f"{folder}: there is something of that name: give another one") from None
+            raise BagError(f"{folder}: there is something of that name: give another one") from None
         except OSError as error:
-            raise BagWriteError(f"{folder}: no bag can be made there ({error.strerror})") from None
+            raise BagError(f"{folder}: no bag can be made there ({error.strerror})") from None
 
     def add_topic(self, topic: str, type_name: str, latched: bool = False) -> None:
         """Declare a topic before its first message; type_name as 'sensor_msgs/msg/Imu'."""
@@ -256,21 +252,21 @@ class BagWriter:
             )
 
     def write(self, topic: str, log_ns: int, data: bytes) -> None:
-        """Write a message's bytes; BagWriteError if the disk does not take it."""
+        """Write a message's bytes; BagError if the disk does not take it."""
         try:
             self._writer.write(self._connections[topic], log_ns, data)
         except OSError as error:
-            raise BagWriteError(
+            raise BagError(
                 f"{self.folder}: it cannot be written ({error.strerror}): the recording ends"
             ) from None
         self.count += 1
 
     def close(self) -> None:
-        """Finish the bag; BagWriteError if that fails."""
+        """Finish the bag; BagError if that fails."""
         try:
             self._writer.close()
         except OSError as error:
-            raise BagWriteError(
+            raise BagError(
                 f"{self.folder}: its end cannot be written ({error.strerror}): `mcap recover` gets back what is in it"
             ) from None
 

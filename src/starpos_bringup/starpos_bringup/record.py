@@ -7,7 +7,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from starpos_bringup.bag import BagWriteError, BagWriter
+from starpos.errors import BagError
+from starpos_bringup.bag import BagWriter
 
 if TYPE_CHECKING:
     from starpos_bringup.recorder import FolderWriter, Recorder
@@ -40,7 +41,7 @@ def record() -> int:
     topics = TOPICS | (IMAGES if options.images else {})
     try:
         writer = BagWriter(options.bag)
-    except BagWriteError as error:
+    except BagError as error:
         say(str(error))
         return REFUSED
     recorders: list[Recorder] = []

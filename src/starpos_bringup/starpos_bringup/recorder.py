@@ -15,13 +15,13 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.node import Node
 from sensor_msgs.msg import CameraInfo
 
-from starpos.errors import StarposError
+from starpos.errors import BagError, StarposError
 from starpos.frames.tables import TILTS, write_star_list
 from starpos.messages.camera import message_to_camera
 from starpos.messages.stars import message_to_stars
 from starpos.messages.tilt import UNUSABLE, message_to_tilt
 from starpos.units import date_obs
-from starpos_bringup.bag import BagWriteError, BagWriter
+from starpos_bringup.bag import BagWriter
 from starpos_common.diagnostics import Diagnosis, Diagnostics, Level
 from starpos_common.topics import subscription
 from starpos_interfaces.msg import StarArray, Tilt
@@ -60,7 +60,7 @@ class Recorder(Node):
         try:
             self._writer.close()
             self._say(f"{self._writer.folder}: {self._writer.count} messages")
-        except BagWriteError as error:
+        except BagError as error:
             self.trouble = str(error)
             self._say(self.trouble)
 
@@ -70,7 +70,7 @@ class Recorder(Node):
         try:
             self._writer.write(topic, self.get_clock().now().nanoseconds, data)
             self._counts[name] += 1
-        except BagWriteError as error:
+        except BagError as error:
             self.trouble = str(error)
             self._say(self.trouble)
             rclpy.shutdown()

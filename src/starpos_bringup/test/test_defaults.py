@@ -8,7 +8,7 @@ import pytest
 import yaml
 
 from starpos.frames.exposure import STAMPS
-from starpos.instrument.sensors import PRESETS
+from starpos.instrument.sensors import presets
 from starpos.navigation.vessel import LAWS
 from starpos.parameters.table import NODES, parameter_file, parameters_of
 from starpos_camera.sources.registry import SOURCES as CAMERAS
@@ -52,7 +52,7 @@ def test_the_choices_are_those_that_the_code_has(row, choices):
 
 
 def test_the_inclinometers_that_the_code_knows_are_named():
-    assert [name for name in PRESETS if name not in ROWS["solver: inclinometer.model"].description] == []
+    assert [name for name in presets() if name not in ROWS["solver: inclinometer.model"].description] == []
 
 
 def test_the_solver_keeps_the_names_that_users_files_have():

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a node says of its health: /diagnostics once a second, the state of its clock, troubles that repeat.
+
 /diagnostics follows diagnostic_updater's conventions (which PyPI's ROS does not carry).
 """
 

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The main function of every node: start, spin, and end cleanly whatever signal comes, whenever it comes.  Nothing heavy
-is imported before the signal handlers are in place, so that a signal during start-up also gives a clean exit. The
-module of an executable therefore imports its node inside `make_nodes`.
+"""The main function of every node: start, spin, and end cleanly whatever signal comes, whenever it comes.
+
+Nothing heavy is imported before the signal handlers are in place, so that a signal during start-up also gives a clean
+exit. The module of an executable therefore imports its node inside `make_nodes`.
 """
 
 import contextlib

@@ -95,6 +95,15 @@ class Replayed:
         self.go_on()
         return True
 
+    def in_turn(self, name: str, take: Take) -> Take:
+        """Make a topic's callback that calls `take` at once where no replay is under way."""
+
+        def on_message(message: Any, info: Mapping[str, Any]) -> None:
+            if not self.holds(name, message, info):
+                take(message, info)
+
+        return on_message
+
     def note(self, stamp: Time, fix: bool = False) -> None:
         """Note that something was made and published; fix: whether it is a fix."""
         self.made += 1

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Publishers and subscriptions: QoS that the user may override, a driver's reliability, lost messages, other publishers.
+
 The QoS of each topic is in the parameters `qos_overrides.TOPIC...`.
 """
 

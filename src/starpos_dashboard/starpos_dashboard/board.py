@@ -215,26 +215,19 @@ class Board:
 
     def hear_fix(self, message: NavSatFix) -> None:
         told = position(message)
-        self._keep("fix", told)
+        self.show("fix", told)
         if told["good"]:
-            self._keep("last_fix", told)
+            self.show("last_fix", told)
             self._count += 1
             self._track.append((self._count, told["latitude"], told["longitude"]))
 
-    def hear_average(self, message: NavSatFix) -> None:
-        self._keep("averaged", position(message))
-
-    def hear_heading(self, message: Imu) -> None:
-        self._keep("heading", heading(message))
-
-    def hear_tilt(self, message: Tilt) -> None:
-        self._keep("tilt", tilt(message))
-
-    def hear_solution(self, message: Solution) -> None:
-        self._keep("solution", solution(message))
-
-    def hear_gnss(self, message: GnssCheck) -> None:
-        self._keep("gnss", gnss(message))
+    def show(self, name: str, told: dict[str, Any] | None) -> None:
+        """Show what a message says, under a name; None: nothing any more."""
+        self.changed = True
+        if told is None:
+            self._heard.pop(name, None)
+        else:
+            self._heard[name] = self._clock(), told
 
     def hear_diagnostics(self, message: DiagnosticArray) -> None:
         """Keep the diagnostics of the nodes that have lights."""
@@ -252,7 +245,7 @@ class Board:
 
     def show_frame(self, number: int, stamp_s: float | None, trouble: str = "") -> None:
         """Note the number of a picture, or why it is missing."""
-        self._keep("frame", {"number": number, "stamp": stamp_s, "trouble": text(trouble)})
+        self.show("frame", {"number": number, "stamp": stamp_s, "trouble": text(trouble)})
 
     def hide_frame(self) -> None:
         """Forget the frame, because no page shows it and it would get old."""
@@ -266,13 +259,6 @@ class Board:
 
     def _seen(self, nodes: frozenset[str]) -> frozenset[str]:
         return frozenset(seen_from(self._namespace, n) if n[0] == "/" else n for n in nodes)
-
-    def _keep(self, name: str, told: dict[str, Any] | None) -> None:
-        self.changed = True
-        if told is None:
-            self._heard.pop(name, None)
-        else:
-            self._heard[name] = self._clock(), told
 
     def as_json(self, now_s: float, slow_s: float) -> str:
         """Write everything as one line of JSON; each `age` [s] counts since it came, on the monotonic clock.

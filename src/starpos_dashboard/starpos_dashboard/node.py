@@ -2,6 +2,8 @@
 """The node `dashboard`: a read-only web page that shows the running instrument."""
 
 import time
+from collections.abc import Callable
+from typing import Any
 
 import cv2
 import numpy as np
@@ -19,7 +21,7 @@ from starpos.parameters.table import parameters_of
 from starpos_common.diagnostics import Diagnosis, Diagnostics, Level
 from starpos_common.parameters import declare
 from starpos_common.topics import subscription
-from starpos_dashboard import server
+from starpos_dashboard import board, server
 from starpos_dashboard.board import Board
 from starpos_dashboard.server import DashboardServer, listen
 from starpos_interfaces.msg import GnssCheck, Solution, Tilt
@@ -49,6 +51,14 @@ def jpeg(message: Image, side: int) -> bytes:
     return data.tobytes()
 
 
+# type, topic, name for the page, and what reads it
+SHOWN: tuple[tuple[type, str, str, Callable[[Any], dict | None]], ...] = (
+    (NavSatFix, "fix_averaged", "averaged", board.position),
+    (Imu, "heading/imu", "heading", board.heading),
+    (Tilt, "tilt", "tilt", board.tilt),
+    (Solution, "solver/solution", "solution", board.solution),
+    (GnssCheck, "gnss/check", "gnss", board.gnss),
+)
 # Maximum interval between states sent to an open page, because ages grow even if no message comes.
 HEARTBEAT_S = 1.0
 
@@ -82,17 +92,12 @@ class DashboardNode(Node):
         self._announce(address)
 
     def _connect(self) -> None:
-        board = self._board
-        for kind, topic, hear in (
-            (NavSatFix, "fix", board.hear_fix),
-            (NavSatFix, "fix_averaged", board.hear_average),
-            (Imu, "heading/imu", board.hear_heading),
-            (Tilt, "tilt", board.hear_tilt),
-            (Solution, "solver/solution", board.hear_solution),
-            (GnssCheck, "gnss/check", board.hear_gnss),
-        ):
-            subscription(self, kind, topic, hear, 10)
-        self.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 50)
+        subscription(self, NavSatFix, "fix", self._board.hear_fix, 10)
+        for kind, topic, name, read in SHOWN:
+            subscription(
+                self, kind, topic, lambda m, name=name, read=read: self._board.show(name, read(m)), 10
+            )
+        self.create_subscription(DiagnosticArray, "/diagnostics", self._board.hear_diagnostics, 50)
         # Subscribe once now, so that a wrong qos_override is refused at the start.
         self.destroy_subscription(self._subscribe_frames())
         steady = Clock(clock_type=ClockType.STEADY_TIME)
@@ -118,9 +123,6 @@ class DashboardNode(Node):
         self._server.clients = self._values["clients"]
 
     # messages --------------------------------------------------------------------------------------------------------
-
-    def _on_diagnostics(self, message: DiagnosticArray) -> None:
-        self._board.hear_diagnostics(message)
 
     def _on_image(self, message: Image) -> None:
         self._image = message

@@ -15,7 +15,7 @@ import re
 import socket
 import threading
 import weakref
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
 from importlib import resources
@@ -302,29 +302,23 @@ class Reply(RequestHandler):
 
     async def deliver(self) -> bool:
         """Send what was written; False if the other side is gone, or takes too long and is closed."""
-        try:
-            await asyncio.wait_for(self.flush(), PATIENCE_S)
-            return True
-        except asyncio.TimeoutError:
-            self._cut()
-        except StreamClosedError:
-            pass
-        return False
+        return await self._sent(self.flush())
 
-    def _cut(self) -> None:
-        """Close the connection without waiting for the other side."""
-        if isinstance(self.request.connection, HTTP1Connection):
-            self.request.connection.stream.close()
+    async def _sent(self, sending: Awaitable[None]) -> bool:
+        with suppress(StreamClosedError):
+            try:
+                await asyncio.wait_for(sending, PATIENCE_S)
+                return True
+            except asyncio.TimeoutError:
+                # without waiting for the other side
+                if isinstance(self.request.connection, HTTP1Connection):
+                    self.request.connection.stream.close()
+        return False
 
     async def send(self, kind: str, content: bytes) -> None:
         """Send the whole reply; 304 if the browser has it already."""
         self.set_header("Content-Type", kind)
-        try:
-            await asyncio.wait_for(self.finish(content), PATIENCE_S)
-        except asyncio.TimeoutError:
-            self._cut()
-        except StreamClosedError:
-            pass
+        await self._sent(self.finish(content))
 
 
 class File(Reply):

@@ -85,17 +85,17 @@ def test_no_attitude_is_no_heading(broken):
     else:
         message.orientation_covariance[0] = -1.0
     b = Board(10, ALL)
-    b.hear_heading(said.imu())
-    b.hear_heading(message)
+    b.show("heading", board.heading(said.imu()))
+    b.show("heading", board.heading(message))
     assert "heading" not in told(b)
 
 
 def test_nan_everywhere_is_null_everywhere():
     b = Board(10, ALL)
-    b.hear_tilt(Tilt(x=NAN, y=INF, temperature=NAN, covariance=[NAN, NAN, NAN, INF]))
+    b.show("tilt", board.tilt(Tilt(x=NAN, y=INF, temperature=NAN, covariance=[NAN, NAN, NAN, INF])))
     message = said.solution()
     message.residual, message.budget[0].east, message.budget[1].heading = NAN, NAN, INF
-    b.hear_solution(message)
+    b.show("solution", board.solution(message))
     all_of_it = told(b)
     assert [all_of_it["tilt"][k] for k in ("x", "y", "temperature", "sigma_x", "sigma_y")] == [None] * 5
     assert all_of_it["solution"]["residual"] is None
@@ -200,7 +200,7 @@ def test_the_track_forgets_its_oldest_and_counts_on():
 def test_ages_are_told_on_a_clock_that_nobody_sets():
     clock = Clock()
     b = Board(10, ALL, clock)
-    b.hear_tilt(said.tilt())
+    b.show("tilt", board.tilt(said.tilt()))
     clock.now += 3.5
     assert told(b)["tilt"]["age"] == 3.5 and told(b)["old_after"] == {"slow": 15.0, "fast": 5.0}
 

@@ -68,10 +68,10 @@ def identity_line(
 
 
 def pulse_line(
-    *, input: int, rising: bool, number: int, bounces: int, milliseconds: int, microseconds: int
+    *, channel: int, rising: bool, number: int, bounces: int, milliseconds: int, microseconds: int
 ) -> bytes:
-    """Make a `$P` line; input: 0 shutter, 1 second."""
-    kind = input | (RISING if rising else 0)
+    """Make a `$P` line; channel: 0 shutter, 1 second."""
+    kind = channel | (RISING if rising else 0)
     return frame(b"P,%02X,%02X,%02X,%08X,%04X" % (kind, number, bounces, milliseconds, microseconds))
 
 

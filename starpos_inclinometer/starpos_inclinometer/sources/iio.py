@@ -178,7 +178,7 @@ class IioTilts:
             flags = GAP
             self.forces.restart()
         self.device = device
-        preset = sensors.PRESETS.get(device.model)
+        preset = sensors.presets().get(device.model)
         self.angles = SensorTilts(preset.noise_rad, preset.range_rad) if preset else SensorTilts()
         self.configure(self._values)
         return flags
@@ -228,4 +228,4 @@ class IioSource(LinkSource):
 def _preset(device: IioDevice | None) -> str:
     if device is None:
         return "unknown"
-    return device.model if device.model in sensors.PRESETS else f"none of that name ({device.model})"
+    return device.model if device.model in sensors.presets() else f"none of that name ({device.model})"

@@ -348,7 +348,7 @@ class Scl3300(BoardSensor):
     faults = FAULTS | SampleStatus.SELF_TEST
 
     def __init__(self) -> None:
-        super().__init__(sensors.SCL3300.noise_rad, math.pi / 2, SCL3300_STUCK_PAIRS)
+        super().__init__(sensors.presets()["scl3300"].noise_rad, math.pi / 2, SCL3300_STUCK_PAIRS)
 
     def _celsius(self, counts: int) -> float:
         return (counts + SCL3300_ZERO_COUNTS + 0.5) * SCL3300_STEP_C - 273

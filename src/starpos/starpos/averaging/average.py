@@ -195,9 +195,19 @@ class Average(PlaceFix):
     """The averaged place, and the heading of the last pose, with the budget of their errors.
 
     A pose lasts until somebody touches the camera.  The heading is NaN while no fix of the last pose has been accepted.
-    frames, poses: number of accepted fixes and of their poses; left_out: number of fixes that were not accepted.
-    began_unix_s: time of the first fix; utc_unix_s: mean of the times of all.
-    moved: number of earlier averages, of other places.
+
+    Attributes
+    ----------
+    frames, poses : number of accepted fixes and of their poses
+    left_out : number of fixes that were not accepted
+    began_unix_s : time of the first fix
+    utc_unix_s : mean of the times of all
+    moved : number of earlier averages, of other places
+
+    Examples
+    --------
+    >>> starpos.open_night("night", instrument="instrument.yaml").solve().combined.frames
+    5
     """
 
     frames: int
@@ -213,7 +223,25 @@ class Average(PlaceFix):
 def average(fixes: Sequence[Fix]) -> Average:
     """The average of fixes in any order, of the last place in time if there are several; a frame counts once.
 
-    Raises FixError if there is no fix, or if as many were left out as were used: it is then unknown which are right.
+    Parameters
+    ----------
+    fixes : of frames, each with its budget of errors
+
+    Returns
+    -------
+    Average
+        astronomic, in rad
+
+    Raises
+    ------
+    FixError
+        there is no fix, or as many were left out as were used: it is then unknown which are right
+
+    Examples
+    --------
+    >>> solutions = starpos.replay("night.zip").solutions
+    >>> starpos.average([solution.fix for solution in solutions]).frames
+    5
     """
     different = {(f.utc_unix_s, f.latitude, f.longitude): f for f in fixes}.values()
     in_order = sorted(different, key=lambda f: f.utc_unix_s)
@@ -405,7 +433,7 @@ class Averager:
         if track is None:
             self._track, self._last = _Track.before(f, self._begin_sigma).begin(f), f
             return
-        slip = slip_s(f, track.pose)
+        slip = slip_s(f.camera, track.pose.camera, f.latitude)
         if slip is None:
             track = self._touch(track, f)
         self._last = f

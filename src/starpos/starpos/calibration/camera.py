@@ -237,12 +237,39 @@ def calibrate_camera(
 ) -> FromSky:
     """One camera from frames of any attitudes.
 
-    levels: for each frame the rotation (3, 3) of C into the local level L, None if unknown.
-    given: a camera that is right to 3 % of the focal length and a few px of distortion; a fisheye to 5 px within 30 deg
-    of its axis.
-    known: the stars of frames, by the frames' numbers, that only a longer search identifies.
-    Frames that are not identified are left out.  Raises CalibrationError if no camera can be found, InstrumentError for
-    a mirrored frame, TimeError for an impossible time.
+    Parameters
+    ----------
+    frames : stars of frames of one size; those that are not identified are left out
+    levels : for each frame the rotation (3, 3) of C into the local level L, None if unknown
+    given : a camera that is right to 3 % of the focal length and a few px of distortion; a fisheye to 5 px within 30 deg
+        of its axis
+    catalogue : or the deeper one in its stead, for a field that needs it
+    atmosphere : of refraction
+    progress : is called with the share of the work that is done
+    known : the stars of frames, by the frames' numbers, that only a longer search identifies
+
+    Returns
+    -------
+    FromSky
+        `fit.camera`, and the indices of the frames that were used
+
+    Raises
+    ------
+    CalibrationError
+        no camera can be found
+    InstrumentError
+        a frame is mirrored
+    TimeError
+        a time is impossible
+
+    Examples
+    --------
+    >>> stars = [starpos.read_frame(path) for path in sorted(Path("turn").glob("stars_*.csv"))]
+    >>> given = starpos.Camera.from_focal(1000, 700, 4600.0)
+    >>> air, catalogue = starpos.Atmosphere(), starpos.load_catalogue()
+    >>> found = starpos.calibrate_camera(stars, [None] * len(stars), given, catalogue, air)
+    >>> abs(found.fit.camera.fx - 4635.9) < 5
+    True
     """
     for stars in frames:
         if (stars.width, stars.height) != (given.width, given.height):

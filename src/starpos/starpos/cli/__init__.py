@@ -5,13 +5,14 @@
 import argparse
 import io
 import os
+import re
 import sys
 import warnings
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from importlib import import_module
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from starpos import __version__
 from starpos.errors import StarposError
@@ -154,7 +155,11 @@ COMMANDS = {
 
 
 class CommandParser(argparse.ArgumentParser):
-    """A parser that prints one line for a bad call, as for any other error."""
+    """A parser that prints one line for a bad call, as for any other error; -33:52:10 is a number, not an option."""
+
+    def __init__(self, *args: Any, **about: Any) -> None:
+        super().__init__(*args, **about)
+        self._negative_number_matcher = re.compile(r"-\d[\d:]*(\.\d*)?$|-\.\d+$")
 
     def error(self, message: str) -> NoReturn:
         """Print the message and exit."""

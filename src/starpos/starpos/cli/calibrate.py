@@ -14,7 +14,7 @@ from starpos.calibration.camera_adjustment import UNLEVELLED, UNTIMED, parameter
 from starpos.calibration.misalignment import NOTHING_KNOWN, Calibrated, Known, calibrate_at, calibrate_fixed
 from starpos.cli import console, options, overwriting
 from starpos.cli.console import add_formats
-from starpos.cli.inputs import checked_tilts, frames_among, given_of, reader_of
+from starpos.cli.inputs import checked_tilts, frames_among, given_or_sought, reader_of
 from starpos.cli.options import add_vertical, vertical_of
 from starpos.cli.overwriting import CAMERA_NAME, Written, save_instrument
 from starpos.earth.place import Place
@@ -25,7 +25,7 @@ from starpos.fix.searching import Sight, of_one_camera
 from starpos.fix.solver import Solver
 from starpos.frames.frame import Stars
 from starpos.frames.reading import why_no_time
-from starpos.frames.tables import Pointing, read_pointings
+from starpos.frames.tables import TILTS, Pointing, read_pointings
 from starpos.identification import Identification
 from starpos.instrument import instrument_file
 from starpos.instrument.camera import Camera
@@ -37,6 +37,7 @@ from starpos.instrument.instrument import (
     Instrument,
 )
 from starpos.instrument.tilt_log import TiltLog
+from starpos.night.opening import frames_in
 from starpos.night.reading import NO_CAMERA, First, Instruments, Reader
 from starpos.night.remarks import of_inclinometer
 from starpos.night.together import axis_of, circles_of
@@ -48,7 +49,7 @@ from starpos.units import ARCSEC
 def define_site(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--site",
-        type=float,
+        type=options.degrees,
         nargs=2,
         metavar=("LAT", "LON"),
         help="find A3 at this place, deg, by gravity (as a fix has them); needs -o, and --tilt or --fixed",
@@ -210,7 +211,8 @@ def _save(args: argparse.Namespace, found: Calibrated, about: str) -> None:
 
 def _site(args: argparse.Namespace) -> Place:
     if args.geodetic:
-        return Place.on_ellipsoid(*args.site, vertical_of(args))
+        latitude_deg, longitude_deg = args.site
+        return Place.on_ellipsoid(latitude_deg, longitude_deg, vertical_of(args))
     return Place.by_gravity(*args.site)
 
 
@@ -293,6 +295,7 @@ def run(args: argparse.Namespace) -> int:
     if args.map is not None and args.camera is None:
         raise InstrumentError("--map draws the camera's residuals: give --camera OUT.yaml too")
     options.check_frames(args)
+    _open_night(args)
     if args.pointings is not None and args.camera is not None:
         raise InstrumentError("--pointings hold no stars: give frames for --camera")
     check_site(args)
@@ -308,14 +311,17 @@ def run(args: argparse.Namespace) -> int:
         _sights(args.frames, read, Instruments(None))
         return console.UNREADABLE
     # an error of the axis that all frames share becomes part of the A3 that is found
-    given, _ = given_of(args, first).framed(first)
+    given, _ = given_or_sought(args, first).framed(first)
     assert given.instrument is not None
     # an unusable instrument is refused before the work on all frames
-    check_output(args, given.instrument)
+    if not given.sought:
+        check_output(args, given.instrument)
     sights, unreadable = _sights(args.frames, read, given)
     solver, alike = of_one_camera(Solver(given.instrument, catalogue.load_catalogue()), sights)
     frames = [(sight.stars, sight.found) for sight in alike]
     instrument = solver.instrument
+    if given.sought:
+        check_output(args, instrument)
     tilts = _tilts(args, instrument)
     try:
         if args.camera is not None:
@@ -335,6 +341,19 @@ def run(args: argparse.Namespace) -> int:
         console.complain("calibrate", e)
         return console.UNREADABLE if unreadable else NOTHING
     return console.UNREADABLE if unreadable else 0
+
+
+def _open_night(args: argparse.Namespace) -> None:
+    """Put a folder's frames and its tilt.csv in the place of the folder; raises FrameError."""
+    folders = [path for path in args.frames if Path(path).is_dir()]
+    if not folders:
+        return
+    if len(args.frames) > 1:
+        raise FrameError(f"{folders[0]}: calibrate takes one night: give one folder, or frames")
+    args.frames = list(map(str, frames_in(Path(folders[0]))))
+    tilts = Path(folders[0]) / TILTS
+    if args.tilt is None and not args.fixed and tilts.is_file():
+        args.tilt = str(tilts)
 
 
 def _tilts(args: argparse.Namespace, instrument: Instrument) -> TiltLog | None:

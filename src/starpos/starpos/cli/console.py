@@ -46,6 +46,32 @@ def complain(command: str, error: object) -> None:
     print(f"starpos {command}: {error}", file=sys.stderr)
 
 
+class FrameComplaints:
+    """Complains about frames: a sentence that is true of several, but for their names, is printed once."""
+
+    def __init__(self, command: str) -> None:
+        self._command = command
+        self._frames: dict[str, list[str]] = {}
+
+    def __call__(self, name: str, error: object) -> None:
+        """Complain about a frame, unless the same was said about another."""
+        reason = str(error).replace(name, "")
+        alike = self._frames.setdefault(reason, [])
+        alike.append(name)
+        if len(alike) == 1:
+            complain(self._command, error)
+
+    def end(self) -> None:
+        """Say how many more frames each sentence is true of."""
+        for reason, (first, *others) in self._frames.items():
+            if others:
+                start = reason.lstrip(": ")[:60].rsplit(" ", 1)[0]
+                last = f", the last is {others[-1]}" if len(others) > 1 else ""
+                frames = "1 more frame" if len(others) == 1 else f"{len(others)} more frames"
+                complain(self._command, f"the same as of {first} ({start} ...) is true of {frames}{last}")
+        self._frames.clear()
+
+
 class ProgressBar:
     """Progress on standard error: a bar for work of more than BAR_AFTER_S, or occasional lines if it is not a terminal.
 
@@ -80,12 +106,15 @@ class ProgressBar:
             print(f"{what}: {100 * done:.0f} % done", file=sys.stderr, flush=True)
 
 
-def add_formats(parser: argparse.ArgumentParser, json_help: str, csv_help: str | None) -> None:
-    """Add --json and, with a help for it, --csv."""
+def add_formats(
+    parser: argparse.ArgumentParser, json_help: str, csv_help: str | None
+) -> "argparse._MutuallyExclusiveGroup":
+    """Add --json and, with a help for it, --csv; returns the group of formats, of which a call has one at most."""
     formats = parser.add_mutually_exclusive_group()
     formats.add_argument("--json", action="store_true", help=json_help)
     if csv_help is not None:
         formats.add_argument("--csv", action="store_true", help=csv_help)
+    return formats
 
 
 class Output:

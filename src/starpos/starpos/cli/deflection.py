@@ -327,7 +327,7 @@ def define(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--site",
-        type=float,
+        type=options.degrees,
         nargs=3,
         required=True,
         metavar=("LAT", "LON", "HEIGHT"),
@@ -421,6 +421,7 @@ def _of_bag(args: argparse.Namespace, mark: Place) -> _Taken:
         answers.append(item if isinstance(item, FrameError) else work(item))
         if isinstance(answers[-1], ZenithSighting) and (own := instruments.of(item)) is not None:
             _, catalogue, _ = Solver(own, load_catalogue()).view(item.width, item.height, item.origin_px)
+    assert instrument is not None
     return _Taken(names, answers, instrument, catalogue)
 
 

@@ -7,12 +7,11 @@ import time
 from pathlib import Path
 
 from starpos.cli import console, doctor, options, overwriting
-from starpos.cli.inputs import given_of
+from starpos.cli.inputs import given_of, reader_of
 from starpos.earth.vertical import Deflection
 from starpos.errors import FrameError, TiltError
 from starpos.fix.solver import Solver
 from starpos.frames.frame import Stars
-from starpos.frames.reading import read_frame
 from starpos.frames.tables import TILTS
 from starpos.instrument import instrument_file
 from starpos.instrument.tilt_log import BRACKET_S, TiltLog
@@ -38,7 +37,7 @@ def define(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "folder",
         metavar="FOLDER",
-        help=f"where frames (FITS, or CSV of stars) and {TILTS} arrive: of your own programs, or of `ros2 run "
+        help=f"where frames (FITS, CSV of stars, or pictures) and {TILTS} arrive: of your own programs, or of `ros2 run "
         "starpos_bringup folder FOLDER`",
     )
     parser.add_argument(
@@ -54,6 +53,7 @@ def define(parser: argparse.ArgumentParser) -> None:
         metavar="S",
         help="end when no frame has come for so long (600)",
     )
+    options.add_stamps(parser)
     options.add_instrument(parser)
     options.add_air(parser)
     parser.set_defaults(run=run)
@@ -84,7 +84,7 @@ def run(args: argparse.Namespace) -> int:
     )
     print(f"done: {args.save} is written -> starpos solve FRAMES --tilt {TILTS} --instrument {args.save}")
     if args.field is not None:
-        packed = exposures(folder, given, options.atmosphere_of(args), Deflection())
+        packed = exposures(folder, given, options.atmosphere_of(args), Deflection(), read=reader_of(args))
         count = field.write(Path(args.field), packed)
         print(f"done: {args.field} holds {count} frames -> attach it to an issue `It ran on hardware`")
     return 0
@@ -93,6 +93,7 @@ def run(args: argparse.Namespace) -> int:
 def _watched(args: argparse.Namespace, folder: Path) -> tuple[FirstNight | None, Instruments]:
     """Take frames as they come, until the last step is done or none has come for long."""
     night: FirstNight | None = None
+    read = reader_of(args)
     given = Instruments(None)
     seen: set[Path] = set()
     waited = time.monotonic()
@@ -100,7 +101,7 @@ def _watched(args: argparse.Namespace, folder: Path) -> tuple[FirstNight | None,
         new = [path for path in _frames(folder) if path not in seen]
         for path in new:
             try:
-                item = read_frame(path)
+                item = read(str(path))
             except FrameError as error:
                 if time.time() < path.stat().st_mtime + WRITTEN_S:
                     break

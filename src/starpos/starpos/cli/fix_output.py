@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The lines, JSON keys and CSV columns of fixes and of headings at a known place: of a frame, and of a night together."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -14,7 +15,7 @@ from starpos.earth.place import Place
 from starpos.earth.vertical import Geodetic, Vertical, geodetic
 from starpos.errors import FixError
 from starpos.fix.attitude import Attitude
-from starpos.fix.fix import Fix, InDegrees, length_text
+from starpos.fix.fix import Fix, InDegrees, PlaceFix, length_text
 from starpos.fix.heading import AttitudeAtPlace
 from starpos.fix.solution import Solution, Status
 from starpos.night.together import Gathered
@@ -39,46 +40,6 @@ JSON_HELP = (
 CSV_HELP = "a row of a CSV a frame, and one with combined=True for all; columns as the keys of --json"
 
 
-FIX_KEYS = ("utc", "latitude", "longitude", "heading", "latitude_geodetic", "longitude_geodetic", "sigma_east_m",
-            "sigma_north_m", "sigma_heading_deg", "covariance", "covariance_geodetic", "xi_arcsec", "eta_arcsec",
-            "deflection_stddev_arcsec", "budget")  # fmt: skip
-
-
-def json_of(fix: Fix | Average | None, vertical: Vertical) -> dict:
-    """The keys of --json that come from a fix; all None without a fix."""
-    if fix is None:
-        return dict.fromkeys(FIX_KEYS)
-    ground = geodetic(fix.latitude, fix.longitude, fix.heading, fix.covariance, vertical)
-    return json_on_ground(fix, ground)
-
-
-def json_on_ground(fix: Fix | Average, ground: Geodetic) -> dict:
-    """The keys of --json that come from a fix with its geodetic place."""
-    covariance = in_degrees(fix.covariance)
-    sigma = np.sqrt(np.diag(covariance))
-    values = (
-        utc_text(fix.utc_unix_s),
-        np.degrees(fix.latitude),
-        np.degrees(fix.longitude),
-        np.degrees(fix.heading),
-        np.degrees(ground.latitude),
-        np.degrees(ground.longitude),
-        *sigma,
-        covariance,
-        in_degrees(ground.covariance),
-        ground.deflection.xi_arcsec,
-        ground.deflection.eta_arcsec,
-        ground.deflection.stddev_arcsec,
-        budget_of(fix, ground),
-    )
-    return dict(zip(FIX_KEYS, values, strict=True))
-
-
-def counted(frames: int) -> str:
-    """A number of frames in words."""
-    return "1 frame" if frames == 1 else f"{frames} frames"
-
-
 def in_degrees(covariance: np.ndarray) -> np.ndarray:
     """A covariance (3, 3) of east m, north m, heading rad with the heading in deg instead."""
     unit = np.array([1.0, 1.0, np.degrees(1.0)])
@@ -94,6 +55,43 @@ def budget_of(fix: Fix | Average, ground: Geodetic) -> dict:
         np.degrees(1),
     ]
     return terms
+
+
+# the keys of --json that come from a fix and the same place on the ellipsoid
+FIX_KEYS: dict[str, Callable[[PlaceFix, Geodetic], Any]] = {
+    "utc": lambda fix, _: utc_text(fix.utc_unix_s),
+    "latitude": lambda fix, _: np.degrees(fix.latitude),
+    "longitude": lambda fix, _: np.degrees(fix.longitude),
+    "heading": lambda fix, _: np.degrees(fix.heading),
+    "latitude_geodetic": lambda _, ground: np.degrees(ground.latitude),
+    "longitude_geodetic": lambda _, ground: np.degrees(ground.longitude),
+    "sigma_east_m": lambda fix, _: np.sqrt(fix.covariance[0, 0]),
+    "sigma_north_m": lambda fix, _: np.sqrt(fix.covariance[1, 1]),
+    "sigma_heading_deg": lambda fix, _: np.sqrt(in_degrees(fix.covariance)[2, 2]),
+    "covariance": lambda fix, _: in_degrees(fix.covariance),
+    "covariance_geodetic": lambda _, ground: in_degrees(ground.covariance),
+    "xi_arcsec": lambda _, ground: ground.deflection.xi_arcsec,
+    "eta_arcsec": lambda _, ground: ground.deflection.eta_arcsec,
+    "deflection_stddev_arcsec": lambda _, ground: ground.deflection.stddev_arcsec,
+    "budget": budget_of,
+}
+
+
+def json_of(fix: PlaceFix | None, vertical: Vertical) -> dict:
+    """The keys of --json that come from a fix; all None without a fix."""
+    return json_on_ground(fix, None if fix is None else fix.on_ground(vertical))
+
+
+def json_on_ground(fix: PlaceFix | None, ground: Geodetic | None) -> dict:
+    """The keys of --json that come from a fix with its geodetic place; all None without one."""
+    if fix is None or ground is None:
+        return dict.fromkeys(FIX_KEYS)
+    return {key: value(fix, ground) for key, value in FIX_KEYS.items()}
+
+
+def counted(frames: int) -> str:
+    """A number of frames in words."""
+    return "1 frame" if frames == 1 else f"{frames} frames"
 
 
 def json_about(s: Solution) -> dict:
@@ -184,9 +182,27 @@ HEADING_HEAD = (
 # besides the columns of a fix
 HEADING_COLUMNS = (*COLUMNS, "pitch", "roll", "sigma_pitch_deg", "sigma_roll_deg", "heading_geodetic",
            "sigma_heading_geodetic_deg", "pitch_geodetic", "roll_geodetic")  # fmt: skip
-HEADING_KEYS = ("heading", "sigma_heading_deg", "pitch", "sigma_pitch_deg", "roll", "sigma_roll_deg",
-        "covariance_attitude", "heading_geodetic", "sigma_heading_geodetic_deg", "pitch_geodetic", "roll_geodetic",
-        "covariance_attitude_geodetic")  # fmt: skip
+# the keys of --json that come from a heading at a known place
+HEADING_KEYS: dict[str, Callable[[Attitude, Attitude], Any]] = {
+    "heading": lambda plumb, _: np.degrees(plumb.heading),
+    "sigma_heading_deg": lambda plumb, _: np.sqrt(_angles_deg2(plumb)[0, 0]),
+    "pitch": lambda plumb, _: np.degrees(plumb.pitch),
+    "sigma_pitch_deg": lambda plumb, _: np.sqrt(_angles_deg2(plumb)[1, 1]),
+    "roll": lambda plumb, _: np.degrees(plumb.roll),
+    "sigma_roll_deg": lambda plumb, _: np.sqrt(_angles_deg2(plumb)[2, 2]),
+    "covariance_attitude": lambda plumb, _: _angles_deg2(plumb),
+    "heading_geodetic": lambda _, ellipsoid: np.degrees(ellipsoid.heading),
+    "sigma_heading_geodetic_deg": lambda _, ellipsoid: np.sqrt(_angles_deg2(ellipsoid)[0, 0]),
+    "pitch_geodetic": lambda _, ellipsoid: np.degrees(ellipsoid.pitch),
+    "roll_geodetic": lambda _, ellipsoid: np.degrees(ellipsoid.roll),
+    "covariance_attitude_geodetic": lambda _, ellipsoid: _angles_deg2(ellipsoid),
+}
+
+
+def _angles_deg2(attitude: Attitude) -> np.ndarray:
+    """Covariance (3, 3) of heading, pitch, roll in deg2."""
+    return np.degrees(np.degrees(attitude.angles_covariance))
+
 
 COVARIANCES = ("covariance", "covariance_geodetic")
 
@@ -201,35 +217,19 @@ def with_heading(
     if found is None or place is None:
         none = {k: _with_variance(values[k], np.nan) for k in COVARIANCES if values[k] is not None}
         return values | dict.fromkeys(HEADING_KEYS) | none
-    plumb, ellipsoid = found.plumb, found.ellipsoid
-    covariance, covariance_geodetic = (
-        np.degrees(np.degrees(a.angles_covariance)) for a in (plumb, ellipsoid)
-    )
-    sigma = np.sqrt(np.diag(covariance))
-    told = (
-        np.degrees(plumb.heading),
-        sigma[0],
-        np.degrees(plumb.pitch),
-        sigma[1],
-        np.degrees(plumb.roll),
-        sigma[2],
-        covariance,
-        np.degrees(ellipsoid.heading),
-        np.sqrt(covariance_geodetic[0, 0]),
-        np.degrees(ellipsoid.pitch),
-        np.degrees(ellipsoid.roll),
-        covariance_geodetic,
-    )
+    told = {key: value(found.plumb, found.ellipsoid) for key, value in HEADING_KEYS.items()}
     whole = {
         "utc": utc_text(found.utc_unix_s),
         "xi_arcsec": place.deflection.xi_arcsec,
         "eta_arcsec": place.deflection.eta_arcsec,
         "deflection_stddev_arcsec": place.deflection.stddev_arcsec,
-        "covariance": _with_variance(values["covariance"], covariance[0, 0]),
-        "covariance_geodetic": _with_variance(values["covariance_geodetic"], covariance_geodetic[0, 0]),
-        "budget": _heading_budget(values["budget"], plumb),
+        "covariance": _with_variance(values["covariance"], told["covariance_attitude"][0, 0]),
+        "covariance_geodetic": _with_variance(
+            values["covariance_geodetic"], told["covariance_attitude_geodetic"][0, 0]
+        ),
+        "budget": _heading_budget(values["budget"], found.plumb),
     }
-    return values | whole | dict(zip(HEADING_KEYS, told, strict=True))
+    return values | whole | told
 
 
 def heading_line_of(path: str, s: Solution) -> str:

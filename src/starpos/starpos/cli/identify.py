@@ -61,6 +61,7 @@ def run(args: argparse.Namespace) -> int:
     args.frames = frames_among(args.frames)
     any_found, unreadable, number = False, False, len(args.frames)
     lost: Stars | None = None
+    complaints = console.FrameComplaints("identify")
     read, output = reader_of(args), Output(args, COLUMNS, HEAD)
     with inputs.workers_of(args, number) as workers:
         (about,) = workers.map([(First(read), tuple(args.frames))])
@@ -83,8 +84,9 @@ def run(args: argparse.Namespace) -> int:
                 lost = answer.stars if lost is None and found.status is Status.NOT_IDENTIFIED else lost
             any_found |= found.ok
             if not found.ok or found.remark:
-                console.complain("identify", found.remark or found.message)
+                complaints(path, found.remark or found.message)
             output.put(as_json(path, found) | {"cpu_ms": cpu_ms}, _line(path, found))
+    complaints.end()
     if lost is not None and not any_found:
         for remark in Solving(given).fitting(lost):
             console.complain("identify", remark)
@@ -102,7 +104,7 @@ def as_json(path: str, s: Solution) -> dict:
         "focal_px": a.focal_px if a else None,
         "focal_stddev_px": a.focal_stddev_px if a else None,
         "stars_detected": s.stars_detected,
-        "stars_matched": len(s.names),
+        "stars_matched": len(s.named),
         "residual_arcsec": a.residual_arcsec if a else None,
         "log_odds": a.log_odds if a else None,
         "lens": a.model if a else None,
@@ -123,7 +125,7 @@ def _line(path: str, s: Solution) -> str:
     digits = 1 - math.floor(math.log10(min(max(a.focal_stddev_px, 1e-3), 1.0)))
     return (
         f"{path}: RA {np.degrees(a.ra):.5f} Dec {np.degrees(a.dec):+.5f} top at {np.degrees(a.roll):.3f} deg, "
-        f"{len(s.names)} of {s.stars_detected} stars, residual {a.residual_arcsec:.2f} arcsec, "
+        f"{len(s.named)} of {s.stars_detected} stars, residual {a.residual_arcsec:.2f} arcsec, "
         f"focal length {a.focal_px:.{digits}f} +- {a.focal_stddev_px:.{digits}f} px "
         f"({1 / a.focal_px / ARCSEC:.5g} arcsec/px), log-odds {a.log_odds:.0f}"
         + (", a fisheye" if a.model == EQUIDISTANT else "")

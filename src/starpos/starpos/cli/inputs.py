@@ -7,7 +7,7 @@ import os
 import sys
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -45,6 +45,14 @@ def given_of(args: argparse.Namespace, first: About | None) -> Instruments:
     )
 
 
+def given_or_sought(args: argparse.Namespace, first: About) -> Instruments:
+    """Instruments as by `given_of`; where nothing states the focal length, it is sought by the stars of each lens."""
+    if first.focal_px is not None or not is_untold(args):
+        return given_of(args, first)
+    stand_in = replace(first, focal_px=float(max(first.width, first.height)))
+    return Instruments(options.instrument_of(args, stand_in), by_header=True, sought=True)
+
+
 def is_untold(args: argparse.Namespace) -> bool:
     """Whether the options say nothing of the camera."""
     return (args.instrument, args.focal_mm, args.pixel_um) == (None,) * 3 and args.lens == PLUMB_BOB
@@ -62,7 +70,7 @@ def add_near(parser: argparse.ArgumentParser) -> None:
     """Add the options that `near_of` reads."""
     parser.add_argument(
         "--near",
-        type=float,
+        type=options.degrees,
         nargs=2,
         metavar=("LAT", "LON"),
         help="approximate position of the instrument, deg: a fix far from it is reported with likely causes "
@@ -123,7 +131,7 @@ def nights_of(
 
     Else a night for each folder, or its error.
 
-    A folder's frames are its FITS files, or without FITS files its CSV files, in the order of their names.
+    A folder's frames are those of `opening.frames_in`, in the order of their names.
     Raises FrameError for a path that does not exist, TiltError for frames without a table.
     """
     if tilt is not None:

@@ -78,6 +78,7 @@ def run_nights(args: argparse.Namespace) -> int:
     off = np.array([o.off for o in solved]).reshape(-1, 3)
     # North, east m.
     error = np.abs(off[:, 1::-1]).mean(0) if solved else np.full(2, np.nan)
+    failed = int(not (len(solved) >= SOLVED * args.nights and np.all(error <= _target_m(args))))
     if args.json:
         console.print_json(
             {
@@ -86,7 +87,7 @@ def run_nights(args: argparse.Namespace) -> int:
                 "paper_arcsec": PAPER_ARCSEC,
             }
         )  # fmt: skip
-        return int(not (len(solved) >= SOLVED * args.nights and np.all(error <= _target_m(args))))
+        return failed
     print(
         f"{len(solved)} of {args.nights} nights, mean absolute error (the aim: {_target_m(args) / ARCSEC_M:.3g} arcsec):"
     )
@@ -96,7 +97,7 @@ def run_nights(args: argparse.Namespace) -> int:
         )
     heading = np.degrees(np.abs(off[:, 2]).mean()) * 3600 if solved else np.nan
     print(f"  {'heading':<10}{heading:7.3f} arcsec")
-    return int(not (len(solved) >= SOLVED * args.nights and np.all(error <= _target_m(args))))
+    return failed
 
 
 def run_honesty(args: argparse.Namespace) -> int:

@@ -3,17 +3,19 @@
 
 import argparse
 import math
+from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from starpos.cli import console, inputs, options
 from starpos.cli.console import Output, add_formats
-from starpos.cli.fix_output import HEAD, in_degrees
+from starpos.cli.fix_output import FIX_KEYS, HEAD
 from starpos.cli.inputs import frames_among, given_of, reader_of
 from starpos.cli.options import add_vertical, tell_unknown, vertical_of
 from starpos.earth.orientation import earth_orientation
-from starpos.earth.vertical import Vertical, geodetic
+from starpos.earth.vertical import Geodetic, Vertical, geodetic
 from starpos.errors import FixError, VoyageError
 from starpos.fix.fix import InDegrees
 from starpos.instrument.instrument import framed
@@ -32,9 +34,16 @@ from starpos.night.under_way import (
 
 NO_ANSWER = 1
 OK, CARRIED, NO_READINGS, BAD_INPUT = "ok", "carried", "no inertial readings", "bad input"
-KEYS = ("utc_unix_s", "latitude", "longitude", "heading", "covariance", "velocity", "gyro_bias", "accel_bias",
-        "latitude_geodetic", "longitude_geodetic", "covariance_geodetic", "xi_arcsec", "eta_arcsec",
-        "deflection_stddev_arcsec")  # fmt: skip
+# the keys of --json that come from a fix
+KEYS: dict[str, Callable[[VoyageFix, Geodetic], Any]] = {
+    "utc_unix_s": lambda fix, _: fix.utc_unix_s,
+    **{key: FIX_KEYS[key] for key in ("latitude", "longitude", "heading", "covariance")},
+    "velocity": lambda fix, _: fix.velocity,
+    "gyro_bias": lambda fix, _: fix.gyro_bias,
+    "accel_bias": lambda fix, _: fix.accel_bias,
+    **{key: FIX_KEYS[key] for key in ("latitude_geodetic", "longitude_geodetic", "covariance_geodetic")},
+    **{key: FIX_KEYS[key] for key in ("xi_arcsec", "eta_arcsec", "deflection_stddev_arcsec")},
+}
 JSON_HELP = (
     "one JSON object a frame: latitude, longitude and heading are astronomic, in deg, their ..._geodetic on WGS 84, "
     "covariance (3 x 3) is of east m, north m, heading deg; velocity is of east, north, up in m/s"
@@ -183,20 +192,7 @@ def json_of(fix: VoyageFix | None, vertical: Vertical) -> dict:
     if fix is None:
         return dict.fromkeys(KEYS)
     ground = geodetic(fix.latitude, fix.longitude, fix.heading, fix.covariance, vertical)
-    values = (
-        fix.utc_unix_s,
-        *np.degrees([fix.latitude, fix.longitude, fix.heading]).tolist(),
-        in_degrees(fix.covariance),
-        fix.velocity,
-        fix.gyro_bias,
-        fix.accel_bias,
-        *np.degrees([ground.latitude, ground.longitude]).tolist(),
-        in_degrees(ground.covariance),
-        ground.deflection.xi_arcsec,
-        ground.deflection.eta_arcsec,
-        ground.deflection.stddev_arcsec,
-    )
-    return dict(zip(KEYS, values, strict=True))
+    return {key: value(fix, ground) for key, value in KEYS.items()}
 
 
 def text_of(fix: VoyageFix) -> str:

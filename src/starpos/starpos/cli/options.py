@@ -2,6 +2,7 @@
 """Options shared by several commands: frames, instrument, air, deflection, known place; the objects made from them."""
 
 import argparse
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -189,7 +190,7 @@ def add_instrument(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--inclinometer",
         metavar="MODEL",
-        help=f"take the inclinometer's errors from its data sheet: {', '.join(sensors.PRESETS)} "
+        help=f"take the inclinometer's errors from its data sheet: {', '.join(sensors.presets())} "
         "(else those of an SCA100T as sold: 7 km or more)",
     )
     parser.add_argument(
@@ -301,6 +302,20 @@ def number(low: float, high: float, kind: type[int] | type[float] = float) -> Ca
     # the name that argparse prints
     parse.__name__ = kind.__name__
     return parse
+
+
+def degrees(text: str) -> float:
+    """An argparse type: degrees, or degrees, minutes and seconds as 47:06:00 and -33:52:10.4."""
+    parts = re.fullmatch(r"([+-]?)(\d{1,3}):([0-5]?\d)(?::([0-5]?\d(?:\.\d*)?))?", text.strip())
+    if parts is None:
+        try:
+            return float(text)
+        except ValueError:
+            raise argparse.ArgumentTypeError(
+                f"{text!r} is no angle: give deg, such as 47.1 or 47:06:00, south and west negative"
+            ) from None
+    value = int(parts[2]) + int(parts[3]) / 60 + float(parts[4] or 0) / 3600
+    return -value if parts[1] == "-" else value
 
 
 def atmosphere_of(args: argparse.Namespace) -> Atmosphere:
@@ -438,7 +453,7 @@ def add_site(parser: argparse.ArgumentParser) -> None:
     """Add the options that `place_of` reads."""
     parser.add_argument(
         "--site",
-        type=float,
+        type=degrees,
         nargs="+",
         metavar=("LAT", "LON HEIGHT"),
         help="known position, deg (by gravity unless --geodetic), and optionally its height above the "

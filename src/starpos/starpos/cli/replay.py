@@ -18,6 +18,7 @@ from starpos.cli.fix_output import (
 from starpos.cli.inputs import NightFolder
 from starpos.cli.solve import NO_FIX
 from starpos.earth.vertical import Vertical
+from starpos.errors import FrameError
 from starpos.fix.checks import BY_PARAMETERS, MODEL_BY_PARAMETERS
 from starpos.night.remarks import of_a3, of_inclinometer
 from starpos.night.together import FrameAnswer, Gathered, extrapolated
@@ -67,10 +68,13 @@ def tell(
     args: argparse.Namespace,
     output: Output,
     bag: str,
-    night: PlayedNight,
+    night: PlayedNight | FrameError,
     vertical: Vertical,
 ) -> int:
     """Write the solutions of a bag and the average of its place; returns the exit status."""
+    if isinstance(night, FrameError):
+        console.complain("replay", night)
+        return console.UNREADABLE
     for sentence in night.said:
         console.complain("replay", f"{bag}: {sentence}")
     gathered = Gathered()

@@ -8,13 +8,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from starpos.cli import console, inputs, options
-from starpos.cli.inputs import given_of
+from starpos.cli.inputs import given_of, given_or_sought, reader_of
 from starpos.cli.options import add_vertical, vertical_of
 from starpos.cli.solve import read_receiver
 from starpos.errors import FrameError, InstrumentError
 from starpos.night.night import Night
 from starpos.night.opening import exposures, frames_in
-from starpos.night.reading import First, Instruments, Reader
+from starpos.night.reading import First, Instruments
 from starpos.night.solving import Exposures, How, solved_night
 from starpos.parameters.given import of_solver
 from starpos.sky import catalogue
@@ -35,8 +35,8 @@ def define(parser: argparse.ArgumentParser) -> None:
         "nights",
         nargs="+",
         metavar="NIGHT",
-        help="a folder of frames (FITS, or CSV of stars) with tilt.csv and perhaps truth.json, or a rosbag2, of the "
-        "instrument or of a robot's own camera and IMU; or sessions of starpos deflection --json (.json)",
+        help="a folder of frames (FITS, CSV of stars, or pictures) with tilt.csv and perhaps truth.json, or a rosbag2, "
+        "of the instrument or of a robot's own camera and IMU; or sessions of starpos deflection --json (.json)",
     )
     parser.add_argument(
         "-o", "--out", default="starpos-report", metavar="FOLDER", help="index.html and PNGs (starpos-report)"
@@ -48,6 +48,7 @@ def define(parser: argparse.ArgumentParser) -> None:
         "one file that can be sent and `starpos solve` reads: no pictures, paths, names or serial numbers",
     )
     inputs.add_bag(parser)
+    options.add_stamps(parser)
     options.add_instrument(parser)
     options.add_air(parser)
     add_vertical(parser)
@@ -183,7 +184,10 @@ def _exposures(path: Path, args: argparse.Namespace) -> "Exposures | tuple[Recor
             raise FrameError(
                 f"{path}: neither a folder of frames nor a rosbag2 (.mcap, .db3): give one of these"
             )
-        about = First(Reader())(tuple(map(str, frames_in(path))))
-        given = Instruments(None) if about is None else given_of(args, about)
-        return exposures(path, given, air, vertical)
+        read = reader_of(args)
+        about = First(read)(tuple(map(str, frames_in(path))))
+        # a field report states the focal length
+        find = given_or_sought if args.field is None else given_of
+        given = Instruments(None) if about is None else find(args, about)
+        return exposures(path, given, air, vertical, read=read)
     return inputs.read_bag(path, args)

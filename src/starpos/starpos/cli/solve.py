@@ -15,7 +15,6 @@ from starpos.cli.console import Output, add_formats
 from starpos.cli.fix_output import (
     COLUMNS,
     CSV_HELP,
-    FIX_KEYS,
     HEAD,
     JSON_HELP,
     json_about,
@@ -30,7 +29,7 @@ from starpos.cli.inputs import (
     add_near,
     checked_tilts,
     frames_among,
-    given_of,
+    given_or_sought,
     is_untold,
     near_of,
     nights_of,
@@ -41,6 +40,7 @@ from starpos.cli.overwriting import Written, save_instrument
 from starpos.earth.place import Place
 from starpos.earth.vertical import Vertical
 from starpos.errors import InstrumentError, StarposError, TiltError
+from starpos.fix.blind import BlindSolver
 from starpos.fix.solution import Solution, status_of
 from starpos.fix.solver import Solver
 from starpos.frames.tables import Pointing, read_pointings
@@ -88,7 +88,7 @@ def tell(
     work: on the frames, which may say which focal length fits those that were not identified.
     """
     statuses = [] if answers.turned is None else [tell_turned(args, night, answers.turned)]
-    watched, gathered = answers.watched, Gathered()
+    watched, gathered, complaints = answers.watched, Gathered(), console.FrameComplaints("solve")
     if watched is not None:
         say(night, *watched.remarks)
         if args.learned is not None:
@@ -97,10 +97,11 @@ def tell(
         gathered.gather(answer)
         s = answer.solution
         if s.fix is None and (s.at_place is None or not s.ok):
-            console.complain("solve", s.message)
+            complaints(answer.name, s.message)
         if s.remark:
-            console.complain("solve", s.remark)
+            complaints(answer.name, s.remark)
         output.put(_json_of_answer(args, answer, vertical, place), _line_of_answer(args, answer, place))
+    complaints.end()
     solved, headings, near = gathered.solved, gathered.headings, near_of(args)
     whole = together(solved, answers.given, near)
     mean, why = (None, ()) if place is None else fix_output.mean_of(headings)
@@ -223,8 +224,7 @@ def _save_learned(path: Path, learned: Learned | None) -> None:
 
 def json_of_watched(told: Watched) -> dict:
     """The keys of --json of a frame that come from its fix, or its heading at GNSS's place, and `gnss`."""
-    fix, ground = told.solution.fix, told.ground
-    keys = dict.fromkeys(FIX_KEYS) if fix is None or ground is None else json_on_ground(fix, ground)
+    keys = json_on_ground(told.solution.fix, told.ground)
     if (at_place := told.solution.at_place) is not None:
         keys = with_heading(keys, at_place, at_place.place)
     return keys | {"gnss": None if told.compared is None else json_of_check(told.compared)}
@@ -452,10 +452,13 @@ def _work(
     if about is None:
         return Solving(Instruments(None), atmosphere=air)
     tilt = None if night.tilt is None else Path(night.tilt)
-    work, remarks = work_of(given_of(args, about), about, tilt, air, place)
+    work, remarks = work_of(given_or_sought(args, about), about, tilt, air, place)
     for remark in remarks:
         console.complain("solve", remark)
     assert work.instruments.instrument is not None
+    if work.instruments.sought:
+        BlindSolver(catalogue.load_catalogue(), console.ProgressBar()).prepare()
+        return work
     check_save(args, work.instruments.instrument)
     inputs.prepare("solve", work.instruments.instrument, about)
     return replace(work, tilts=NO_TILTS) if own_level else work

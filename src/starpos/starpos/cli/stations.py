@@ -2,14 +2,13 @@
 """`starpos stations`: a table of many sessions of `starpos deflection`: repeats, a geoid grid, levelling."""
 
 import argparse
-import csv
-import json
 import sys
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from starpos.cli import console
+from starpos.cli.console import Output, add_formats
 from starpos.earth import geoid
 from starpos.earth.geoid import Geoid
 from starpos.errors import StationError
@@ -37,13 +36,11 @@ def define(parser: argparse.ArgumentParser) -> None:
         help="print how much the geoid rises along these stations, two or more (astrogeodetic levelling); with --geoid "
         "by the grid's shape between them",
     )
-    formats = parser.add_mutually_exclusive_group()
-    formats.add_argument("--csv", action="store_true", help="a CSV, a row a station")
-    formats.add_argument(
-        "--geojson", action="store_true", help="GeoJSON (RFC 7946), a point a station, for any GIS"
+    formats = add_formats(
+        parser, "one JSON object a station, then one a step of --level", "a CSV, a row a station"
     )
     formats.add_argument(
-        "--json", action="store_true", help="one JSON object a station, then one a step of --level"
+        "--geojson", action="store_true", help="GeoJSON (RFC 7946), a point a station, for any GIS"
     )
     parser.set_defaults(run=run)
 
@@ -58,19 +55,17 @@ def run(args: argparse.Namespace) -> int:
     if grid is not None and (without := [v["station"] for v in values if v["grid_arcsec"] is None]):
         console.complain("stations", f"{args.geoid}: no data at {', '.join(without)}")
     steps = [] if args.level is None else levelled(_line(stations, args.level), grid)
-    if args.csv:
-        _print_csv(values)
-    elif args.geojson:
-        print(json.dumps(console.plain(_geojson(values))))
+    output = Output(args, tuple(flat(values[0])), "")
+    if args.geojson:
+        console.print_json(_geojson(values))
     else:
         for value in values:
-            console.print_json(value) if args.json else print(_station_line(value))
-    if args.csv or args.geojson:
-        for step in steps:
+            output.put(value, _station_line(value), [flat(value)])
+    for step in steps:
+        if args.csv or args.geojson:
             print(step_line(step), file=sys.stderr)
-    else:
-        for step in steps:
-            console.print_json(step_json(step)) if args.json else print(step_line(step))
+        else:
+            output.put(step_json(step), step_line(step))
     return 0
 
 
@@ -160,13 +155,6 @@ def flat(value: Mapping) -> dict:
         row |= {f"xi_{key}": xi, f"eta_{key}": eta}
     row |= {k: value[k] for k in ("sigma_xi_arcsec", "sigma_eta_arcsec")}
     return row
-
-
-def _print_csv(values: Sequence[Mapping]) -> None:
-    rows = [console.plain(flat(value)) for value in values]
-    writer = csv.DictWriter(sys.stdout, list(rows[0]), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
 
 
 def _geojson(values: Sequence[Mapping]) -> dict:

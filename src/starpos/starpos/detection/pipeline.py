@@ -93,8 +93,16 @@ class DetectionSettings:
 class Detection:
     """The stars of a frame, its background and noise (DN, medians over the frame) and FWHM (px).
 
-    chi2      (N,) of each star's fit, per degree of freedom: about 1 for a star that PSF and noise describe
-    left_out  how many peaks, the lowest, were not measured because there were too many
+    Attributes
+    ----------
+    chi2 : (N,) of each star's fit, per degree of freedom: about 1 for a star that PSF and noise describe
+    left_out : how many peaks, the lowest, were not measured because there were too many
+
+    Examples
+    --------
+    >>> frame = starpos.Frame(np.full((200, 300), 100, np.uint16))
+    >>> len(starpos.detect(frame).stars.x)
+    0
     """
 
     stars: Stars
@@ -151,7 +159,25 @@ class _Picture:
 
 
 def detect(frame: Frame, settings: DetectionSettings = DetectionSettings()) -> Detection:
-    """Measure the stars of a Frame. Without stars the Detection is empty and fwhm_px NaN."""
+    """Measure the stars of a Frame. Without stars the Detection is empty and fwhm_px NaN.
+
+    Parameters
+    ----------
+    frame : its pixels
+    settings : thresholds and limits
+
+    Returns
+    -------
+    Detection
+        `stars`, brightest first, with background, noise and FWHM
+
+    Examples
+    --------
+    >>> frame = starpos.Frame(np.random.default_rng(1).poisson(100, (200, 300)).astype(np.uint16))
+    >>> found = starpos.detect(frame)
+    >>> 95 < found.background < 105
+    True
+    """
     # OpenCV would take all processors for a little, and wait for them where others work
     cv2.setNumThreads(settings.threads)
     plane, mosaic = plane_of(frame)
@@ -185,7 +211,7 @@ def _detect(picture: _Picture) -> Detection:
 def enlarged(
     stars: Stars, times: int, width: int, height: int, window: Window | None, gain: float = 1.0
 ) -> Stars:
-    """The stars of a frame that was reduced so many times, on the original one, whose flux is `gain` times as large."""
+    """The stars of a frame that was reduced `times` times, on the original frame; gain: factor on their flux."""
     return replace(
         stars,
         x=times * stars.x + (times - 1) / 2,
@@ -233,8 +259,9 @@ def _detect_at_full_size(picture: _Picture) -> Detection:
     if fwhm_px < WIDE_FWHM:
         found = with_clipped(found, sky, x, y, fwhm_px)
     found = found[: settings.max_stars]
+    columns: dict[str, Any] = {name: found[name] for name in COLUMNS}
     stars = Stars(
-        **{name: found[name] for name in COLUMNS},
+        **columns,
         fwhm_px=fwhm_px,
         window=window_of(plane, int(peaks.highest.max()), level),
         **picture.facts,

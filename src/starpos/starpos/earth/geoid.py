@@ -19,22 +19,28 @@ from starpos.earth.ellipsoid import curvature_radii_m
 from starpos.earth.vertical import Deflection
 from starpos.errors import GeoidError
 from starpos.files import bytes_of, open_regular
-from starpos.frames.pictures import decode_picture
+from starpos.frames.pictures import (
+    BITS,
+    HEIGHT,
+    SAMPLES,
+    TIFF_ORDERS,
+    WIDTH,
+    decode_picture,
+    tiff_directory,
+)
 from starpos.units import ARCSEC
 
 if TYPE_CHECKING:
     from scipy.interpolate import RectBivariateSpline
 
-WIDTH, HEIGHT, BITS, SAMPLES = 256, 257, 258, 277
 PIXEL_SCALE, TIEPOINT, GEO_KEYS = 33550, 33922, 34735
 GDAL_METADATA, GDAL_NODATA = 42112, 42113
 # Two keys, and the value of each that is read.
 MODEL_TYPE, RASTER_TYPE, GEOGRAPHIC, PIXEL_IS_POINT = 1024, 1025, 2, 2
 # What a band of geoid undulations is called in GDAL's metadata.
 UNDULATION = "geoid_undulation"
-# The types of these tags: BYTE, ASCII, SHORT, LONG, DOUBLE.
-KINDS = {1: "B", 2: "s", 3: "H", 4: "I", 12: "d"}
-MAX_TAG_BYTES = 1 << 20
+TAGS = (WIDTH, HEIGHT, BITS, SAMPLES, PIXEL_SCALE, TIEPOINT, GEO_KEYS, GDAL_METADATA, GDAL_NODATA)
+MAX_VALUES = 1 << 20
 
 
 def read_geotiff(data: bytes, most_bytes: int) -> tuple[np.ndarray, float, float, float, float]:
@@ -67,37 +73,16 @@ def read_geotiff(data: bytes, most_bytes: int) -> tuple[np.ndarray, float, float
 
 def _tags(data: bytes) -> dict[int, tuple]:
     """The tags of the first directory that are needed here; GeoidError if the file ends too early."""
-    order = "<" if data[:2] == b"II" else ">"
+    order = TIFF_ORDERS[data[:4]]
     try:
         (start,) = struct.unpack_from(order + "I", data, 4)
-        (count,) = struct.unpack_from(order + "H", data, start)
-        entries = [struct.unpack_from(order + "HHI", data, start + 2 + 12 * i) for i in range(count)]
-        found = {}
-        for i, (tag, kind, n) in enumerate(entries):
-            if tag not in (
-                WIDTH,
-                HEIGHT,
-                BITS,
-                SAMPLES,
-                PIXEL_SCALE,
-                TIEPOINT,
-                GEO_KEYS,
-                GDAL_METADATA,
-                GDAL_NODATA,
-            ):
-                continue
-            size = struct.calcsize(KINDS.get(kind, "B")) * n
-            if kind not in KINDS or size > MAX_TAG_BYTES:
-                raise GeoidError(
-                    f"its tag {tag} is of {n} values of TIFF's type {kind}, which it should not be"
-                )
-            at = start + 10 + 12 * i
-            if size > 4:
-                (at,) = struct.unpack_from(order + "I", data, at)
-            found[tag] = struct.unpack_from(f"{order}{n}{KINDS[kind]}", data, at)
+        tags, _ = tiff_directory(data, start, order, TAGS, MAX_VALUES + 1)
     except struct.error:
         raise GeoidError("it ends before its tags do: copy it again") from None
-    return found
+    for tag, values in tags.items():
+        if len(values) > MAX_VALUES:
+            raise GeoidError(f"its tag {tag} has more than {MAX_VALUES} values")
+    return tags
 
 
 def _number(tags: dict, tag: int, default: int = 0) -> int:
@@ -106,8 +91,8 @@ def _number(tags: dict, tag: int, default: int = 0) -> int:
 
 
 def _text(tags: dict, tag: int) -> str:
-    (value,) = tags.get(tag, (b"",))
-    return value.decode("ascii", "replace").strip("\0 \n") if isinstance(value, bytes) else ""
+    text = "".join(chr(c) for c in tags.get(tag, ()) if isinstance(c, int) and c < 128)
+    return text.strip("\0 \n")
 
 
 def _corner(tags: dict, height: int) -> tuple[float, float, float, float]:
@@ -167,7 +152,6 @@ STEPS_DEG = (1e-4, 2.0)
 # Undulations are -107 to 86 m; a value beyond this limit means "no data".
 UNDULATION_LIMIT_M = 150.0
 PROJ_FOLDERS = ("/usr/share/proj", "/usr/local/share/proj")
-TIFF_MAGIC = (b"II*\0", b"MM\0*")
 BIGTIFF_MAGIC = (b"II+\0", b"MM\0+")
 
 
@@ -272,7 +256,7 @@ def read_grid(path: Path | str) -> Grid:
     try:
         with open_regular(path) as file:
             start = file.read(4)
-            if start in TIFF_MAGIC:
+            if start in TIFF_ORDERS:
                 return Grid(*read_geotiff(bytes_of(file, MAX_BYTES), MAX_BYTES))
             if start in BIGTIFF_MAGIC:
                 raise GeoidError(

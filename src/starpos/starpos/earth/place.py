@@ -32,13 +32,22 @@ class Places(Protocol):
 class Place:
     """A place on the Earth; make it by `on_ellipsoid` or `by_gravity`.
 
-    latitude, longitude: on WGS 84 (geodetic), rad.  plumb: (latitude, longitude) by the plumb line (astronomic), rad.
-    height_m: above the ellipsoid; NaN: not known.
-    covariance (2, 2): of the place itself, east and north, m2.
-    deflection: between the two zeniths.
-    plumb_stddev, ellipsoid_stddev: error in rad that the deflection leaves in a component of each zenith; the stated one
-    has none.
-    utc_unix_s: when it was there; NaN: it holds for any time.
+    Attributes
+    ----------
+    latitude, longitude : on WGS 84 (geodetic), rad
+    plumb : (latitude, longitude) by the plumb line (astronomic), rad
+    height_m : above the ellipsoid; NaN: not known
+    covariance : (2, 2) of the place itself, east and north, m2
+    deflection : between the two zeniths
+    plumb_stddev, ellipsoid_stddev : error in rad that the deflection leaves in a component of each zenith; the stated one
+        has none
+    utc_unix_s : when it was there; NaN: it holds for any time
+
+    Examples
+    --------
+    >>> place = starpos.Place.on_ellipsoid(35.7046, 51.4106, starpos.Deflection(10.0, 0.0, 1.0))
+    >>> print(round(np.degrees(place.plumb[0] - place.latitude) * 3600, 3))  # arcsec
+    10.0
     """
 
     latitude: float

@@ -23,7 +23,14 @@ MIN_COS_ZENITH = 0.05
 
 @dataclass(frozen=True, kw_only=True)
 class Atmosphere:
-    """The air at the instrument and how well it is known (1 sigma); InstrumentError for impossible values."""
+    """The air at the instrument and how well it is known (1 sigma); InstrumentError for impossible values.
+
+    Examples
+    --------
+    >>> air = starpos.Atmosphere(pressure_pa=88_000.0, temperature_c=12.0)
+    >>> bool(air.relative_sigma > 0)
+    True
+    """
 
     # Not reduced to sea level; 0: a vacuum.
     pressure_pa: float = STANDARD_PRESSURE_PA

@@ -40,10 +40,21 @@ class Vertical(Protocol):
 
 @dataclass(frozen=True)
 class Deflection:
-    """Components xi (north) and eta (east) in arcsec, with the 1 sigma of each; InstrumentError if not finite.
+    """Components of the deflection of the vertical; InstrumentError if not finite.
 
     North and east are at the place that the Deflection is asked for; close to a pole they change with every step.
-    curvature_arcsec: the part of xi that is the curvature of normal plumb lines, which a height alone gives.
+
+    Attributes
+    ----------
+    xi_arcsec, eta_arcsec : to the north and to the east
+    stddev_arcsec : 1 sigma of each
+    curvature_arcsec : the part of xi that is the curvature of normal plumb lines, which a height alone gives
+
+    Examples
+    --------
+    >>> slope = starpos.Deflection(xi_arcsec=3.0, eta_arcsec=-7.0, stddev_arcsec=0.5)
+    >>> starpos.open_night("night", vertical=slope)
+    <night: 5 frames and tilt.csv, to be solved>
     """
 
     xi_arcsec: float = 0.0
@@ -143,7 +154,24 @@ def geodetic(
 
     The zenith turns by the deflection, about axes of the astronomic place, and the axes turn with it. Far from the
     poles that is phi = Phi - xi, lambda = Lambda - eta / cos(phi), azimuth = A - eta tan(phi); it holds at a pole too.
-    covariance (3, 3): of east (m), north (m), heading (rad) at the astronomic place.
+
+    Parameters
+    ----------
+    latitude, longitude, heading : astronomic, rad; an unknown heading is NaN
+    covariance : (3, 3) of east (m), north (m), heading (rad) at the astronomic place
+    vertical : its deflection there is removed
+
+    Returns
+    -------
+    Geodetic
+        on WGS 84, in rad
+
+    Examples
+    --------
+    >>> slope = starpos.Deflection(xi_arcsec=10.0, eta_arcsec=0.0, stddev_arcsec=1.0)
+    >>> ground = starpos.geodetic(0.6, 0.9, 0.0, np.zeros((3, 3)), slope)
+    >>> print(round(np.degrees(0.6 - ground.latitude) * 3600, 3))  # arcsec
+    10.0
     """
     d = vertical.at(latitude, longitude)
     carried = _leaned(enu_axes(latitude, longitude), d, -1)

@@ -20,7 +20,7 @@ from starpos.frames.frame import SATURATED, Stars
 from starpos.identification import MIN_STARS
 from starpos.instrument.camera import Camera
 from starpos.instrument.instrument import Calibration, Instrument
-from starpos.instrument.sensors import UNNAMED
+from starpos.instrument.sensors import unnamed
 from starpos.sky import deeper
 from starpos.sky.catalogue import Catalogue
 from starpos.units import ARCSEC, HOUR_S, utc_text
@@ -218,11 +218,15 @@ def unknown_a3(
 
 def unnamed_inclinometer(instrument: Instrument, ways: str = MODEL_BY_OPTIONS) -> str:
     """Say that no inclinometer is stated, and which one is assumed; '' if one is stated."""
-    if instrument.vertical is not None or instrument.inclinometer_model or instrument.inclinometer != UNNAMED:
+    if (
+        instrument.vertical is not None
+        or instrument.inclinometer_model
+        or instrument.inclinometer != unnamed()
+    ):
         return ""
     return (
         "the inclinometer's model is not stated: the errors of an SCA100T as sold are assumed, "
-        f"{np.degrees(UNNAMED.pose_rad):.2f} deg, 7 km or more (1 sigma): {ways}"
+        f"{np.degrees(unnamed().pose_rad):.2f} deg, 7 km or more (1 sigma): {ways}"
     )
 
 

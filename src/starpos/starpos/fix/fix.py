@@ -46,7 +46,16 @@ def angle_text(rad: float) -> str:
 class InDegrees:
     """A place and a heading in degrees, with 1 sigma of each; a heading that is not known is NaN.
 
-    sigma_east_m, sigma_north_m: of the place.
+    Attributes
+    ----------
+    latitude, longitude, heading, sigma_heading : deg
+    sigma_east_m, sigma_north_m : of the place
+
+    Examples
+    --------
+    >>> answer = starpos.open_night("night", instrument="instrument.yaml").solve().wgs84
+    >>> round(answer.latitude, 1), round(answer.longitude, 1)
+    (35.7, 51.4)
     """
 
     latitude: float
@@ -92,6 +101,12 @@ class PlaceFix:
     """Astronomic latitude, longitude and heading (rad) at one time, with the budget of their errors.
 
     The heading is NaN where none is known.
+
+    Examples
+    --------
+    >>> fix = starpos.open_night("night", instrument="instrument.yaml").solve().combined
+    >>> fix.sigma.shape  # east m, north m, heading rad
+    (3,)
     """
 
     utc_unix_s: float
@@ -133,11 +148,20 @@ class PlaceFix:
 class Fix(PlaceFix, FittedSighting):
     """The place and attitude of the instrument, from one frame and its level.
 
-    link_to_enu (3, 3): attitude of the base link.
-    levelling (6, 2): change of the rows of an ErrorTerm for errors, in rad, of up about two axes fixed to the
-    inclinometer.
+    Attributes
+    ----------
+    link_to_enu : (3, 3), attitude of the base link
+    levelling : (6, 2), change of the rows of an ErrorTerm for errors, in rad, of up about two axes fixed to the
+        inclinometer
+
+    Examples
+    --------
+    >>> shots = starpos.open_night("night", instrument="instrument.yaml").solve().shots
+    >>> print(shots[0].place.in_degrees)
+    +35.70... +51.4...
     """
 
+    tilt: Tilt
     link_to_enu: np.ndarray
     levelling: np.ndarray
 

@@ -116,7 +116,9 @@ def answer_frame(solver: Solver, question: Question) -> Sight:
 
 def identify_every_way(solver: Solver, question: Question) -> Sight:
     """Identify a frame; its stars that identified it, or the given ones with the first answer if none did."""
-    return _otherwise(solver, question, solver.identify(question.stars, question.predicted))
+    first = Sight(question.stars, solver.identify(question.stars, question.predicted))
+    # most frames are: what all other ways need is not made for them
+    return _otherwise(solver, question, first) if first.solution.lost else first
 
 
 def identify_blind_every_way(solver: BlindSolver, item: Frame | Stars, stars: Stars) -> Sight:
@@ -137,16 +139,16 @@ def identify_blind_every_way(solver: BlindSolver, item: Frame | Stars, stars: St
 def _solved(solver: Solver, q: Question, tilts: Tilts) -> Sight:
     """The fix of a frame, whose stars are searched with refraction removed first."""
     answer = solver.solve(q.stars, tilts, q.hint, q.predicted, q.known)
-    sight = _otherwise(solver, q, answer)
+    sight = _otherwise(solver, q, Sight(q.stars, answer))
     if sight.solution is answer:
         return sight
     again = solver.solve(sight.stars, tilts, known=sight.found)
     return replace(sight, solution=replace(again, identify_s=answer.identify_s + again.identify_s))
 
 
-def _otherwise(solver: Solver, q: Question, first: Solution) -> Sight:
+def _otherwise(solver: Solver, q: Question, first: Sight) -> Sight:
     """The sight of a frame by all ways but the search among its stars, which has given `first`."""
-    return _another(q.item, Sight(q.stars, first), lambda seen: _ways(solver, q, seen), lambda: q.is_late)
+    return _another(q.item, first, lambda seen: _ways(solver, q, seen), lambda: q.is_late)
 
 
 def _ways(solver: Solver, q: Question, seen: Stars) -> Iterator[Solution]:

@@ -22,6 +22,7 @@ from starpos.identification.prior import Hint
 from starpos.identification.two_skies import two_skies
 from starpos.instrument.camera import PLUMB_BOB, Camera
 from starpos.instrument.inclinometer import Tilt
+from starpos.sky.catalogue import NamedStars, named_stars
 from starpos.units import ARCSEC
 
 # Names in `Solution.warnings`. TWO_SKIES: unidentified bright stars form a sky of their own. UNEXPLAINED: most bright
@@ -30,7 +31,13 @@ TWO_SKIES, UNEXPLAINED = "two_skies", "unexplained"
 
 
 class Status(str, Enum):
-    """Result of the work on one frame."""
+    """Result of the work on one frame.
+
+    Examples
+    --------
+    >>> starpos.identify("night/stars_0000.csv").status is starpos.Status.OK
+    True
+    """
 
     OK = "ok"
     TOO_FEW_STARS = "too few stars"
@@ -40,6 +47,11 @@ class Status(str, Enum):
     TIME_OUTSIDE_TABLES = "time outside tables"
     BAD_INPUT = "bad input"
     POOR_FIT = "poor fit"
+
+
+# Of a frame on which another search may succeed; and no identified stars.
+LOST = Status.NOT_IDENTIFIED, Status.TOO_FEW_STARS
+NO_STARS = named_stars((), np.zeros(0))
 
 
 @at_once
@@ -67,16 +79,24 @@ class FieldPointing:
 class Solution:
     """Solution of one frame: a status, a sentence, and the part of the answer that was found.
 
-    star, magnitudes (M,): row in the input's stars and V of the catalogue, for each of `names`.
-    identify_s, fix_s: seconds that the two steps took.
-    extrapolated_days: how far behind the end of the IERS table the frame's date lies; 0 within it.
-    warnings: sorted names of suspicions about an identification: TWO_SKIES, UNEXPLAINED. There is no fix then.
-    explained: how much of the frame the identification explains.
-    at_place: heading, pitch and roll at a known place; None if not asked for or not found.
-    found: the identification itself; its rows refer to the input's stars.
-    negative: whether the stars are dark on a bright sky.
-    hint: helps to identify the next frame.
-    remark: a warning on an identified frame; '' without one.
+    Attributes
+    ----------
+    named, star : (M,) the identified stars of the catalogue, and their rows in the input's stars
+    identify_s, fix_s : seconds that the two steps took
+    extrapolated_days : how far behind the end of the IERS table the frame's date lies; 0 within it
+    warnings : sorted names of suspicions about an identification: TWO_SKIES, UNEXPLAINED. There is no fix then.
+    explained : how much of the frame the identification explains
+    at_place : heading, pitch and roll at a known place; None if not asked for or not found
+    found : the identification itself; its rows refer to the input's stars
+    negative : whether the stars are dark on a bright sky
+    hint : helps to identify the next frame
+    remark : a warning on an identified frame; '' without one
+
+    Examples
+    --------
+    >>> solution = starpos.identify("night/stars_0000.csv")
+    >>> solution.ok, len(solution.names) == len(solution.star)
+    (True, True)
     """
 
     status: Status
@@ -85,9 +105,8 @@ class Solution:
     source: str
     utc_unix_s: float | None
     stars_detected: int
-    names: tuple[str, ...] = ()
+    named: NamedStars = NO_STARS
     star: np.ndarray | None = None
-    magnitudes: np.ndarray | None = None
     pointing: FieldPointing | None = None
     fix: Fix | None = None
     tilt: Tilt | None = None
@@ -141,12 +160,22 @@ class Solution:
 
     def __repr__(self) -> str:
         found = self.fix.in_degrees if self.fix else self.message
-        return f"<Solution {self.status.value}: {found}; {len(self.names)} of {self.stars_detected} stars>"
+        return f"<Solution {self.status.value}: {found}; {len(self.named)} of {self.stars_detected} stars>"
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the identified stars."""
+        return self.named.labels[0]
+
+    @property
+    def magnitudes(self) -> np.ndarray | None:
+        """V magnitudes (M,) of the identified stars by the catalogue; None where no star was identified."""
+        return None if self.star is None else self.named.labels[1]
 
     @property
     def lost(self) -> bool:
         """Whether nothing was identified, so that another search may succeed."""
-        return self.status in (Status.NOT_IDENTIFIED, Status.TOO_FEW_STARS)
+        return self.status in LOST
 
     @property
     def ok(self) -> bool:
@@ -179,7 +208,6 @@ def solution_of(
     begin_s: when their search began, by time.perf_counter.
     """
     warnings, explained = suspicions(stars, field, sky, found)
-    names, magnitudes = sky.catalogue.labels(found.catalogue)
     return Solution(
         Status.OK,
         "identified",
@@ -187,9 +215,8 @@ def solution_of(
         utc_unix_s=stars.mid_unix_s,
         stars_detected=len(stars.x),
         negative=stars.negative,
-        names=names,
+        named=sky.catalogue.named(found.catalogue),
         star=found.star,
-        magnitudes=magnitudes,
         pointing=pointing_of(found, sky, camera, found.spread_px(stars.x, stars.y)),
         warnings=warnings,
         explained=explained,

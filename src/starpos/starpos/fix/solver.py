@@ -94,6 +94,13 @@ class Solver:
     Other ways to identify a frame are in `starpos.fix.searching`.
 
     catalogue: or the deeper one in its stead, for a field that needs it.
+
+    Examples
+    --------
+    >>> solver = starpos.Solver(starpos.read_instrument("instrument.yaml"), starpos.load_catalogue())
+    >>> stars = starpos.read_frame("night/stars_0000.csv")
+    >>> solver.solve(stars, starpos.read_tilt_csv("night/tilt.csv")).fix
+    <Fix: +35.70... +51.4...>
     """
 
     instrument: Instrument
@@ -192,7 +199,6 @@ class Solver:
         if found is None:
             return replace(_unidentified(stars, camera, sky, begin), tilt=tilt)
         answer, done = solution_of(stars, field, sky, camera, found, begin), time.perf_counter()
-        assert answer.magnitudes is not None
         try:
             check_explained(answer)
             fix = self._fix(stars, found, camera, tilt, state, catalogue)
@@ -206,9 +212,8 @@ class Solver:
             fix_s=time.perf_counter() - done,
             extrapolated_days=state.orientation.extrapolated_days,
             hint=Hint.at(found, state, camera.fx * found.focal_scale, fix.latitude, fix.longitude),
-            names=tuple(answer.names[k] for k in fix.used),
+            named=answer.named.of_rows(fix.used),
             star=found.star[fix.used],
-            magnitudes=answer.magnitudes[fix.used],
         )
 
     def solve_pointing(self, pointing: Pointing, tilts: Tilts = NO_TILTS) -> Solution:

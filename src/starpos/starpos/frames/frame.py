@@ -33,11 +33,19 @@ PATTERNS = ("", "rggb", "bggr", "grbg", "gbrg")
 class Frame(Exposure):
     """The pixels of one exposure, row 0 on top.
 
-    pixels      (height, width) uint8 or uint16, grey or a colour mosaic; or (height, width, 3) uint8, BGR
-    pattern     the mosaic's colours in reading order: 'rggb', 'bggr', 'grbg', 'gbrg'; '' for none
-    trail       how its stars move during the exposure; None: unknown
-
     FrameError for other types, shapes, sizes or patterns.
+
+    Attributes
+    ----------
+    pixels : (height, width) uint8 or uint16, grey or a colour mosaic; or (height, width, 3) uint8, BGR
+    pattern : the mosaic's colours in reading order: 'rggb', 'bggr', 'grbg', 'gbrg'; '' for none
+    trail : how its stars move during the exposure; None: unknown
+
+    Examples
+    --------
+    >>> frame = starpos.Frame(np.zeros((700, 1000), np.uint16), mid_unix_s=1.8e9, exposure_s=0.5)
+    >>> frame.width, frame.height
+    (1000, 700)
     """
 
     pixels: np.ndarray
@@ -141,17 +149,25 @@ SYMMETRIC = 1e-6
 class Stars(Exposure):
     """N stars of a frame, brightest first; the centre of the top-left pixel is (0, 0).
 
-    x, y            (N,) px: column and row
-    flux            (N,) DN above the background, or any other unit: only order and ratios are used
-    snr             (N,) flux over its standard deviation
-    covariance      (N, 2, 2) px2 of (x, y)
-    flags           (N,) uint8, a sum of SATURATED, EDGE, ELONGATED, BLENDED
-    width, height   px, of the frame
-    fwhm_px         width of the star images, px; None: unknown
-    window          px, the part of the frame that holds a picture, if the rest is white; None: all of it
-    negative        whether they are dark on a bright sky, as on a plate
-
     Sequences are converted to arrays. FrameError if the columns do not fit together or hold impossible values.
+
+    Attributes
+    ----------
+    x, y : (N,) px: column and row
+    flux : (N,) DN above the background, or any other unit: only order and ratios are used
+    snr : (N,) flux over its standard deviation
+    covariance : (N, 2, 2) px2 of (x, y)
+    flags : (N,) uint8, a sum of SATURATED, EDGE, ELONGATED, BLENDED
+    width, height : px, of the frame
+    fwhm_px : width of the star images, px; None: unknown
+    window : px, the part of the frame that holds a picture, if the rest is white; None: all of it
+    negative : whether they are dark on a bright sky, as on a plate
+
+    Examples
+    --------
+    >>> stars = starpos.read_frame("night/stars_0000.csv")
+    >>> stars.x.shape == stars.flux.shape == (len(stars.snr),)
+    True
     """
 
     x: np.ndarray

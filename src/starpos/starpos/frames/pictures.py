@@ -25,6 +25,8 @@ PNG_SAMPLES = {0: 1, 2: 3, 3: 3, 4: 4, 6: 4}
 WIDTH, HEIGHT, BITS, SAMPLES, ORIENTATION = 256, 257, 258, 277, 274
 # Byte orders of a TIFF by its beginning.
 TIFF_ORDERS = {b"II*\0": "<", b"MM\0*": ">"}
+# Letters of struct by type of a tag: BYTE, ASCII, SHORT, DOUBLE; of all others, LONG.
+TIFF_KINDS = {1: "B", 2: "B", 3: "H", 12: "d"}
 
 
 def picture_frame(data: bytes, place: str, clock: exif.CameraClock | None = None) -> Frame:
@@ -111,8 +113,10 @@ def _tiff_size(data: bytes) -> tuple[int, int, float] | None:
     if order is None:
         return None
     (at,) = struct.unpack_from(order + "I", data, 4)
-    tags, _ = _directory(data, at, order, (WIDTH, HEIGHT, BITS, SAMPLES), 1)
-    if not {WIDTH, HEIGHT} <= tags.keys():
+    tags, _ = tiff_directory(data, at, order, (WIDTH, HEIGHT, BITS, SAMPLES), 1)
+    if not {WIDTH, HEIGHT} <= tags.keys() or any(
+        isinstance(v, float) for values in tags.values() for v in values
+    ):
         return None
     # one sample of one bit, unless the file says more
     (width,), (height,), (bits,), (samples,) = (tags.get(tag, (1,)) for tag in (WIDTH, HEIGHT, BITS, SAMPLES))
@@ -133,12 +137,12 @@ def _not_turned_tiff(data: bytes) -> bytes:
     return data
 
 
-def _directory(
+def tiff_directory(
     data: bytes, at: int, order: str, wanted: tuple[int, ...], most: int
-) -> tuple[dict[int, tuple[int, ...]], int]:
-    """The first values, at most so many, of the wanted tags of a TIFF's directory, and the offset of the next one.
+) -> tuple[dict[int, tuple], int]:
+    """The first values, at most `most`, of the wanted tags of a TIFF's directory, and the offset of the next directory.
 
-    struct.error if it is not a directory. Values are SHORT or LONG.
+    struct.error if it is not a directory.  A text is its bytes.
     """
     (count,) = struct.unpack_from(order + "H", data, at)
     tags = {}
@@ -146,7 +150,7 @@ def _directory(
         tag, kind, n = struct.unpack_from(order + "HHI", data, entry)
         if tag not in wanted or not n:
             continue
-        letter, place = "H" if kind == 3 else "I", entry + 8
+        letter, place = TIFF_KINDS.get(kind, "I"), entry + 8
         if n * struct.calcsize(order + letter) > 4:
             (place,) = struct.unpack_from(order + "I", data, place)
         tags[tag] = struct.unpack_from(f"{order}{min(n, most)}{letter}", data, place)
@@ -326,8 +330,8 @@ def _end(data: bytes) -> int:
             continue
         seen.add(at)
         try:
-            tags, following = _directory(data, at, order, (*STRIPS, *TILES, BELOW), MAX_VALUES)
-        except struct.error:
+            tags, following = tiff_directory(data, at, order, (*STRIPS, *TILES, BELOW), MAX_VALUES)
+        except (struct.error, TypeError):
             continue
         waiting += [following, *tags.get(BELOW, ())]
         for offsets, lengths in (STRIPS, TILES):

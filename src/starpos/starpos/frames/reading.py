@@ -27,8 +27,6 @@ RAW = (".cr2", ".cr3", ".nef", ".arw", ".dng", ".raf", ".orf", ".rw2", ".pef")
 def read_frame(path: Path | str, clock: CameraClock | None = None) -> Frame | Stars:
     """Read one exposure, or the star list of one; the file's suffix says which.
 
-    clock: of the camera that wrote the file, if it may be trusted.
-
     FITS (also .fz and .gz): DATE-OBS (or DATE-BEG, MJD-OBS, MJD-BEG) is the start of the exposure in UTC (or in
     TIMESYS), whose last digit is its error. EXPTIME or EXPOSURE is its length in s, where 0 is unknown; a DATE-AVG is
     its middle, a DATE-END its end. Where these contradict each other, or the frame is a stack (STACKCNT), there is no
@@ -50,8 +48,28 @@ def read_frame(path: Path | str, clock: CameraClock | None = None) -> Frame | St
     required, then columns x, y, flux and optionally sigma (px); without it sigma is 0.1 px. The SNR is 1 px / sigma, as
     for a star image whose standard deviation is 1 px.
 
-    Without a time or an exposure mid_unix_s is None, and untimed says why. FrameError for everything
-    that is not as described here.
+    Without a time or an exposure mid_unix_s is None, and untimed says why.
+
+    Parameters
+    ----------
+    path : of the file
+    clock : of the camera that wrote the file, if it may be trusted
+
+    Returns
+    -------
+    Frame or Stars
+        the latter for a list of stars
+
+    Raises
+    ------
+    FrameError
+        anything is not as described here
+
+    Examples
+    --------
+    >>> stars = starpos.read_frame("night/stars_0000.csv")
+    >>> stars.width, stars.height
+    (1000, 700)
     """
     path = Path(path)
     file_path, part = _part_of(path)

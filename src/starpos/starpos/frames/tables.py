@@ -1,21 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tables of a night on disk: star lists, a plate solver's pointings, and the names of files next to the frames."""
 
-import csv
+import io
 import json
 import math
-import reprlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
 
-from starpos.errors import FrameError, one_line
-from starpos.files import bytes_of, read_regular
+from starpos.errors import FrameError
+from starpos.files import bytes_of
 from starpos.frames.exposure import Exposure
 from starpos.frames.frame import Stars
 from starpos.frames.header import focal_mm, fwhm_px, read_exposure
+from starpos.tables import TableForm
 from starpos.units import ARCSEC
 
 # readings of the inclinometer; fixes of a GNSS receiver; true values of the night
@@ -26,6 +26,13 @@ SIMULATED = "simulated_files"
 MAX_CSV_BYTES = 20_000_000
 # Error of a centroid if its file gives no sigma.
 DEFAULT_SIGMA_PX = 0.1
+STAR_LIST = TableForm(
+    what="list of stars",
+    error=FrameError,
+    needed=("x", "y", "flux"),
+    optional=("sigma", "flags"),
+    limits={"sigma": (1e-6, 1e3)},
+)
 
 
 def read_star_list(file: BinaryIO, place: str) -> Stars:
@@ -48,27 +55,12 @@ def read_star_list(file: BinaryIO, place: str) -> Stars:
         raise FrameError(
             f"{place}: its first line does not give the frame's size; write it like {line}."
         ) from None
-    try:
-        rows = [row for row in csv.reader(rest.splitlines()) if row]
-    except csv.Error as e:
-        raise FrameError(f"{place}: this is not a CSV ({one_line(e)}); write one star a line.") from None
-    names = [name.strip().lower() for name in rows[0]] if rows else []
-    if not {"x", "y", "flux"} <= set(names):
-        raise FrameError(
-            f"{place}: its second line names the columns {reprlib.repr(names)}; it must name x, y, flux."
-        )
-    try:
-        table = np.array([[float(cell) for cell in row] for row in rows[1:]]).reshape(-1, len(names))
-        if len(table) != len(rows) - 1:
-            raise ValueError
-    except ValueError:
-        raise FrameError(f"{place}: a row is not {len(names)} numbers; write one star a line.") from None
-    column = dict(zip(names, table.T, strict=True))
-    sigma = column.get("sigma", np.full(len(table), DEFAULT_SIGMA_PX))
-    if not np.all((sigma > 0) & (sigma < 1e3)):
-        raise FrameError(
-            f"{place}: a star's sigma is not between 0 and 1000 px; correct or remove the column."
-        )
+    rest, counted_from, in_magnitudes = _as_ours(rest)
+    table = STAR_LIST.read_text(io.StringIO(rest), place, before=1)
+    column, sigma = dict(table.columns), table.column("sigma", DEFAULT_SIGMA_PX)
+    column["x"], column["y"] = column["x"] - counted_from, column["y"] - counted_from
+    if in_magnitudes:
+        column["flux"] = 10 ** (-0.4 * np.clip(column["flux"], -50, 50))
     order = np.argsort(-column["flux"], kind="stable")
     return Stars(
         x=column["x"][order],
@@ -76,12 +68,41 @@ def read_star_list(file: BinaryIO, place: str) -> Stars:
         flux=column["flux"][order],
         snr=1.0 / sigma[order],
         covariance=(sigma[order] ** 2)[:, None, None] * np.eye(2),
-        flags=column.get("flags", np.zeros(len(table)))[order],
+        flags=table.column("flags", 0.0)[order],
         width=width,
         height=height,
         fwhm_px=fwhm_px(header),
         **read_exposure(header, place).facts,
     )
+
+
+# Names that programs give to a star's place, and from where they count the first pixel's centre: SExtractor, IRAF's
+# daofind, photutils' DAOStarFinder. Names of their
+# fluxes, and of their magnitudes, where there is no flux.
+PLACES = {
+    ("x_image", "y_image"): 1.0,
+    ("xcenter", "ycenter"): 1.0,
+    ("xcentroid", "ycentroid"): 0.0,
+    ("x_centroid", "y_centroid"): 0.0,
+}
+FLUXES = ("flux", "flux_auto", "flux_best", "flux_iso", "flux_aper", "flux_psf")
+MAGNITUDES = ("mag", "mag_auto", "mag_best", "mag_iso", "mag_aper", "mag_psf")
+
+
+def _as_ours(rows: str) -> tuple[str, float, bool]:
+    """Rows of stars under our own names of columns.
+
+    Also what x and y of the first pixel's centre are in them, and whether their light is a magnitude.
+    """
+    names, line, rest = rows.partition("\n")
+    given = [name.strip('" \t\r').lower() for name in names.lstrip("# ").split(",")]
+    for place, counted_from in PLACES.items():
+        if set(place) <= set(given) and not {"x", "y"} & set(given):
+            light = next((name for name in (*FLUXES, *MAGNITUDES) if name in given), "flux")
+            ours = {**dict(zip(place, "xy", strict=True)), light: "flux"}
+            text = ",".join(ours.get(name, name) for name in given) + line + rest
+            return text, counted_from, light in MAGNITUDES
+    return rows, 0.0, False
 
 
 def write_star_list(path: Path | str, stars: Stars, start_utc: str, pixel_um: float = 1.0) -> None:
@@ -109,22 +130,25 @@ def write_star_list(path: Path | str, stars: Stars, start_utc: str, pixel_um: fl
     Path(path).write_text(f"# {json.dumps(header)}\nx,y,flux,sigma,flags\n{rows}")
 
 
-MAX_ROWS = 100_000
-NEEDED = ("utc_unix_s", "ra_deg", "dec_deg", "sigma_arcsec")
-ROLL = ("roll_deg", "sigma_roll_arcsec")
 # limits of a stated sigma: with an error of a degree a pointing is useless, an error of 0 is a mistake
 MIN_ARCSEC, MAX_ARCSEC = 1e-4, 3600.0
 MAX_ROLL_ARCSEC = 36_000.0
-# what each column may hold, in its own unit
-LIMITS = {
-    "utc_unix_s": (-1e11, 1e11),
-    "ra_deg": (-360.0, 360.0),
-    "dec_deg": (-90.0, 90.0),
-    "roll_deg": (-360.0, 360.0),
-    "sigma_arcsec": (MIN_ARCSEC, MAX_ARCSEC),
-    "sigma_roll_arcsec": (MIN_ARCSEC, MAX_ROLL_ARCSEC),
-    "exposure_s": (0.0, 3600.0),
-}
+POINTINGS = TableForm(
+    what="table of pointings",
+    error=FrameError,
+    needed=("utc_unix_s", "ra_deg", "dec_deg", "sigma_arcsec"),
+    optional=("roll_deg", "sigma_roll_arcsec", "exposure_s"),
+    limits={
+        "utc_unix_s": (-1e11, 1e11),
+        "ra_deg": (-360.0, 360.0),
+        "dec_deg": (-90.0, 90.0),
+        "roll_deg": (-360.0, 360.0),
+        "sigma_arcsec": (MIN_ARCSEC, MAX_ARCSEC),
+        "sigma_roll_arcsec": (MIN_ARCSEC, MAX_ROLL_ARCSEC),
+        "exposure_s": (0.0, 3600.0),
+    },
+    most_bytes=MAX_CSV_BYTES,
+)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -155,64 +179,25 @@ def read_pointings(path: Path | str) -> list[Pointing]:
     The columns of the roll may be empty or absent, exposure_s may be added; other columns are not read.
     `source` of a pointing: the table and the line.  FrameError says why a table cannot be used.
     """
-    try:
-        text = read_regular(path, MAX_CSV_BYTES).decode("utf-8-sig")
-    except OSError as e:
-        raise FrameError(f"{path}: no readable table of pointings ({e.strerror})") from None
-    except UnicodeDecodeError:
-        raise FrameError(f"{path}: this is not a text file; give a CSV of pointings") from None
-    try:
-        lines = csv.reader(text.splitlines())
-        rows = [(lines.line_num, row) for row in lines if any(cell.strip() for cell in row)]
-    except csv.Error as e:
-        raise FrameError(f"{path}: this is not a CSV ({one_line(e)}); write one pointing a line") from None
-    names = [name.strip().lower() for name in rows[0][1]] if rows else []
-    if names:
-        names[0] = names[0].lstrip("# ")
-    if not set(NEEDED) <= set(names) or len(set(names)) < len(names) or len(rows) < 2:
+    table = POINTINGS.read(path)
+    roll, sigma_roll = table.column("roll_deg"), table.column("sigma_roll_arcsec")
+    for line in table.lines[np.isnan(roll) != np.isnan(sigma_roll)][:1]:
         raise FrameError(
-            f"{path}: a table of pointings needs a first line with the names {', '.join(NEEDED)}, and may have "
-            f"{', '.join(ROLL)}, exposure_s, each once, and a row a frame"
+            f"{path}:{line}: roll_deg and sigma_roll_arcsec belong together; give both or neither"
         )
-    if len(rows) - 1 > MAX_ROWS:
-        raise FrameError(f"{path}: {len(rows) - 1} pointings, of which {MAX_ROWS} are read: split the table")
-    return [_pointing(f"{path}:{number}", dict(zip(names, row, strict=False)), len(row) == len(names))
-            for number, row in rows[1:]]  # fmt: skip
-
-
-def _pointing(source: str, row: dict[str, str], whole: bool) -> Pointing:
-    if not whole:
-        raise FrameError(
-            f"{source}: the row has not as many cells as there are columns; write one pointing a line"
+    sigma, sigma_roll = table.columns["sigma_arcsec"] * ARCSEC, sigma_roll * ARCSEC
+    ra, dec, roll = np.radians([table.columns["ra_deg"], table.columns["dec_deg"], roll])
+    exposure_s = table.column("exposure_s")
+    return [
+        Pointing(
+            mid_unix_s=float(utc_unix_s),
+            exposure_s=None if math.isnan(exposure_s[k]) else float(exposure_s[k]),
+            source=f"{path}:{table.lines[k]}",
+            ra=float(ra[k]),
+            dec=float(dec[k]),
+            sigma=float(sigma[k]),
+            roll=float(roll[k]),
+            sigma_roll=float(sigma_roll[k]),
         )
-    value = {name: _number(source, name, row[name]) for name in LIMITS if name in row}
-    if missing := next((name for name in NEEDED if math.isnan(value[name])), None):
-        raise FrameError(f"{source}: {missing} is empty; leave such a row out")
-    roll, sigma_roll = (value.get(name, math.nan) for name in ROLL)
-    if math.isnan(roll) != math.isnan(sigma_roll):
-        raise FrameError(f"{source}: roll_deg and sigma_roll_arcsec belong together; give both or neither")
-    exposure_s = value.get("exposure_s", math.nan)
-    return Pointing(
-        mid_unix_s=value["utc_unix_s"],
-        exposure_s=None if math.isnan(exposure_s) else exposure_s,
-        source=source,
-        ra=math.radians(value["ra_deg"]),
-        dec=math.radians(value["dec_deg"]),
-        sigma=value["sigma_arcsec"] * ARCSEC,
-        roll=math.radians(roll),
-        sigma_roll=sigma_roll * ARCSEC,
-    )
-
-
-def _number(source: str, name: str, cell: str) -> float:
-    """The number in a cell; NaN if it is empty."""
-    low, high = LIMITS[name]
-    try:
-        value = float(cell) if cell.strip() else math.nan
-        if cell.strip() and not low <= value <= high:
-            raise ValueError
-    except ValueError:
-        raise FrameError(
-            f"{source}: {name} is {one_line(repr(cell))}; give a number from {low:g} to {high:g}"
-        ) from None
-    return value
+        for k, utc_unix_s in enumerate(table.columns["utc_unix_s"])
+    ]

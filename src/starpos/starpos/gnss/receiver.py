@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """GNSS places of a receiver, by messages or a table: checked, and in the order of their time."""
 
-import csv
-import io
 import math
 import re
 from collections import Counter
@@ -12,10 +10,10 @@ from typing import Any
 import numpy as np
 
 from starpos.earth.place import UNDEFLECTED, Place
-from starpos.errors import GnssError, one_line
-from starpos.files import read_regular
+from starpos.errors import GnssError
 from starpos.messages.stamp import stamp_to_unix
 from starpos.rotation import half_turn
+from starpos.tables import TableForm
 
 # Names of datums that lie up to kilometres off NavSatFix's, WGS 84, as the last words of a frame_id.
 OTHER_DATUMS = ("nad27", "nad83", "ed50", "osgb", "osgb36", "gcj02", "bd09", "pz90", "tokyo", "sk42")
@@ -105,6 +103,12 @@ class GnssTrack:
     """GNSS places by time.
 
     Two places of one moment that contradict each other give none: two receivers, or a spoofed one.
+
+    Examples
+    --------
+    >>> track = starpos.GnssTrack([starpos.Place.on_ellipsoid(35.7, 51.4, utc_unix_s=1.8e9)])
+    >>> track.at(1.8e9 + 100) is None  # no place near that time
+    True
     """
 
     def __init__(self, places: list[Place]) -> None:
@@ -177,61 +181,55 @@ def _between(before: Place, after: Place, share: float) -> Place:
     )
 
 
-NEEDED = ("utc_unix_s", "latitude", "longitude", "sigma_east_m", "sigma_north_m")
-COLUMNS = ("utc_unix_s", "latitude", "longitude", "altitude_m", "sigma_east_m", "sigma_north_m", "status")
-# a month of 1 Hz
-MAX_BYTES = 300_000_000
-CURE = f"give a CSV with a line of names, {','.join(COLUMNS)}, and a row a fix, deg on WGS 84"
+# deg on WGS 84, for a month of 1 Hz; a receiver without a fix leaves cells empty
+GNSS_TABLE = TableForm(
+    what="table of GNSS",
+    error=GnssError,
+    needed=("utc_unix_s", "latitude", "longitude", "sigma_east_m", "sigma_north_m"),
+    optional=("status",),
+    broken_rows_are_nan=True,
+)
 
 
 def read_gnss_csv(path: Path | str) -> tuple[GnssTrack, tuple[str, ...]]:
-    """Read the fixes of a receiver, and a sentence for each kind of row that was left out; GnssError if it cannot be.
+    """Read the fixes of a receiver.
 
     Columns: utc_unix_s, latitude, longitude in deg on WGS 84, sigma_east_m, sigma_north_m; status as NavSatStatus's (0 if
     there is no such column).  Cells may be empty.  Rows may come in any order.
+
+    Parameters
+    ----------
+    path : of the CSV
+
+    Returns
+    -------
+    tuple of GnssTrack and tuple of str
+        the places by time, and a sentence for each kind of row that was left out
+
+    Raises
+    ------
+    GnssError
+        the file cannot be read or has no such columns
+
+    Examples
+    --------
+    >>> track, left_out = starpos.read_gnss_csv("gnss.csv")
+    >>> len(track), left_out
+    (3, ())
     """
-    try:
-        text = read_regular(path, MAX_BYTES).decode("utf-8-sig")
-    except FileNotFoundError:
-        raise GnssError(f"{path}: there is no such file: {CURE}") from None
-    except (OSError, UnicodeDecodeError) as e:
-        reason = getattr(e, "strerror", None) or one_line(e)
-        raise GnssError(f"{path}: not a readable table of GNSS ({reason}): {CURE}") from None
-    reader = csv.DictReader(io.StringIO(text), skipinitialspace=True)
-    names = [name.strip().lstrip("# ") for name in reader.fieldnames or ()]
-    reader.fieldnames = names
-    lacking = [name for name in NEEDED if names.count(name) != 1]
-    if lacking:
-        raise GnssError(
-            f"{path}: not a readable table of GNSS (it has no column {lacking[0]}, or two): {CURE}"
-        )
+    table = GNSS_TABLE.read(path)
     places: list[Place] = []
     faults: Counter[str] = Counter()
-    try:
-        for row in reader:
-            try:
-                places.append(_place(row))
-            except GnssError as error:
-                faults[str(error)] += 1
-    except csv.Error as e:
-        raise GnssError(f"{path}: not a readable table of GNSS ({one_line(e)}): {CURE}") from None
+    columns = (*(table.columns[name] for name in GNSS_TABLE.needed), table.column("status", 0.0))
+    for t, latitude, longitude, east, north, status in np.stack(columns, -1).tolist():
+        covariance = np.diag(np.square([east, north])) if min(east, north) > 0 else np.full((2, 2), np.nan)
+        try:
+            places.append(checked(t, latitude, longitude, covariance, status))
+        except GnssError as error:
+            faults[str(error)] += 1
     track = GnssTrack(places)
     if len(track) < len(places):
         faults["places of one moment contradict each other: give the fixes of one receiver"] += len(
             places
         ) - len(track)
     return track, tuple(f"{path}: {number} rows left out: {why}" for why, number in faults.most_common())
-
-
-def _place(row: dict[str, str]) -> Place:
-    t, latitude, longitude, east, north = (_number(row.get(name)) for name in NEEDED)
-    status = _number(row.get("status", "0"))
-    covariance = np.diag(np.square([east, north])) if min(east, north) > 0 else np.full((2, 2), np.nan)
-    return checked(t, latitude, longitude, covariance, status)
-
-
-def _number(cell: str | None) -> float:
-    try:
-        return float(cell or "nan")
-    except (TypeError, ValueError):
-        return math.nan

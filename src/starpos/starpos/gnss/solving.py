@@ -9,7 +9,7 @@ from starpos import rotation
 from starpos._numeric.roots import symmetric_root
 from starpos.earth.ellipsoid import curvature_radii_m, enu_axes, meridian_turn
 from starpos.earth.place import Place
-from starpos.earth.vertical import Deflection, Geodetic, Vertical, geodetic
+from starpos.earth.vertical import Deflection, Geodetic, Vertical
 from starpos.fix.budget import Sensitivity, local_north
 from starpos.fix.fix import Fix
 from starpos.fix.solution import Solution, Status
@@ -140,7 +140,7 @@ def _ground(fix: Fix, sighting: LevelSight, learned: Learned, vertical: Vertical
         eta_arcsec=float(deflection[0]),
         stddev_arcsec=learned.deflection_stddev_rad / ARCSEC,
     )
-    ground = geodetic(fix.latitude, fix.longitude, fix.heading, fix.covariance, applied)
+    ground = fix.on_ground(applied)
     prime, meridian = curvature_radii_m(ground.latitude)
     moved = -np.array([[prime, 0.0], [0.0, meridian], [meridian_turn(ground.latitude), 0.0]])
     rows = _zenith_moved(fix)[:3] @ _zenith_rows(fix, sighting, learned)

@@ -80,11 +80,19 @@ def _reach(d: tuple[float, ...]) -> float:
 class Camera:
     """Intrinsics of a camera, as in sensor_msgs/CameraInfo; InstrumentError for impossible values.
 
-    width, height  px of the frame
-    fx, fy         focal lengths, px
-    cx, cy         principal point, px
-    distortion     coefficients of the model, by the names in COEFFICIENTS; (): all 0
-    model          of the lens: PLUMB_BOB or RATIONAL, or EQUIDISTANT for a fisheye
+    Attributes
+    ----------
+    width, height : px of the frame
+    fx, fy : focal lengths, px
+    cx, cy : principal point, px
+    distortion : coefficients of the model, by the names in COEFFICIENTS; (): all 0
+    model : of the lens: PLUMB_BOB or RATIONAL, or EQUIDISTANT for a fisheye
+
+    Examples
+    --------
+    >>> camera = starpos.Camera.from_focal(1000, 700, 4636.0)
+    >>> round(float(camera.scale_arcsec), 1)  # arcsec per px
+    44.5
     """
 
     width: int

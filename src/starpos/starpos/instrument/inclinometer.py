@@ -46,18 +46,26 @@ STEEP = 0.999
 class Tilt:
     """Elevation of S's X', Y' and, of a three-axis sensor, Z' above the horizon, averaged over readings.
 
-    theta_x, theta_y  rad
-    covariance        (2, 2) rad2 of the average of these two
-    utc_unix_s        middle of the readings
-    samples           number of readings
-    temperature_c     NaN: unknown
-    times             Unix times of the readings, if they are known
-    theta_z           rad; NaN of a two-axis sensor, whose Z' points upwards
-    variance_z        rad2 of theta_z; NaN: as for the other two
-    step_rad          step to which the readings are rounded, where it is larger than their noise; 0: finer;
-                      inf: they repeat to the last digit and show no step
-
     The sensor may lean in any way. TiltError if a value is not finite, or no direction of gravity gives these angles.
+
+    Attributes
+    ----------
+    theta_x, theta_y : rad
+    covariance : (2, 2) rad2 of the average of these two
+    utc_unix_s : middle of the readings
+    samples : number of readings
+    temperature_c : NaN: unknown
+    times : Unix times of the readings, if they are known
+    theta_z : rad; NaN of a two-axis sensor, whose Z' points upwards
+    variance_z : rad2 of theta_z; NaN: as for the other two
+    step_rad : step to which the readings are rounded, where it is larger than their noise; 0: finer;
+        inf: they repeat to the last digit and show no step
+
+    Examples
+    --------
+    >>> tilt = starpos.Tilt(0.01, -0.02, np.eye(2) * 1e-10, utc_unix_s=1.8e9)
+    >>> tilt.up.round(3)  # direction of up in S
+    array([ 0.01, -0.02,  1.  ])
     """
 
     theta_x: float

@@ -15,7 +15,7 @@ from starpos.frames.exposure import Shutter
 from starpos.instrument.camera import PLUMB_BOB, Camera
 from starpos.instrument.inclinometer import EXACT, InclinometerErrors, Tilt
 from starpos.instrument.mounting import RESPONSE_COEFFICIENTS, Mounting
-from starpos.instrument.sensors import UNNAMED
+from starpos.instrument.sensors import unnamed
 from starpos.units import ARCSEC, DAY_S, utc_text
 
 # default sag: a camera on a pillar or a heavy tripod during a night
@@ -36,26 +36,36 @@ class CameraVertical:
     covariance_arcsec2: tuple
 
     def __post_init__(self) -> None:
-        turn, covariance = (np.asarray(m, float) for m in (self.camera_to_itrs, self.covariance_arcsec2))
-        rotation = (
-            np.isfinite(turn).all()
-            and turn.shape == (3, 3)
-            and np.abs(turn).max() < 2
-            and np.allclose(turn @ turn.T, np.eye(3), atol=1e-6)
-            and np.linalg.det(turn) > 0
+        _check_rotation(self.camera_to_itrs, "the vertical's camera_to_itrs")
+        _check_covariance(self.covariance_arcsec2, 3, "the vertical's covariance_arcsec2")
+
+
+def _check_rotation(given: object, name: str) -> None:
+    matrix = np.asarray(given, float)
+    sound = (
+        matrix.shape == (3, 3)
+        # squares must not overflow; false for NaN too
+        and np.abs(matrix).max() < 2
+        and np.allclose(matrix @ matrix.T, np.eye(3), atol=1e-6)
+        and np.linalg.det(matrix) > 0
+    )
+    if not sound:
+        raise InstrumentError(f"{name} must be a 3 x 3 rotation matrix")
+
+
+def _check_covariance(given: object, rows: int, name: str) -> None:
+    """Raise InstrumentError unless this is a covariance, to rounding."""
+    matrix = np.asarray(given, float)
+    sound = (
+        matrix.shape == (rows, rows)
+        and np.isfinite(matrix).all()
+        and np.allclose(matrix, matrix.T, rtol=1e-6)
+        and np.linalg.eigvalsh(matrix)[0] >= -1e-9 * max(np.trace(matrix), 1e-300)
+    )
+    if not sound:
+        raise InstrumentError(
+            f"{name} must be a symmetric {rows} x {rows} matrix without negative variances: correct it"
         )
-        if not rotation:
-            raise InstrumentError("the vertical's camera_to_itrs must be a 3 x 3 rotation matrix")
-        sound = (
-            covariance.shape == (3, 3)
-            and np.isfinite(covariance).all()
-            and np.allclose(covariance, covariance.T)
-            and np.linalg.eigvalsh(covariance)[0] >= 0
-        )
-        if not sound:
-            raise InstrumentError(
-                "the vertical's covariance_arcsec2 must be a symmetric 3 x 3 matrix without negative variances"
-            )
 
 
 def level_errors(sag_arcsec_per_sqrt_hour: float) -> InclinometerErrors:
@@ -93,17 +103,25 @@ _ideal = lru_cache(maxsize=4)(Camera.from_focal)
 class Calibration:
     """A3, how well it is known, and when and how it was found; InstrumentError for impossible values.
 
-    misalignment_deg    (rx, ry, rz): A3 = R3(rz) R2(ry) R1(rx), active, C into S
-    covariance_arcsec2  (3, 3) of A3 as a small rotation about S's axes, including the inclinometer's zero
-    remounted_arcsec    1 sigma about each axis of A3's turn since camera and inclinometer were taken apart and put
-                        together again; 0: they were not
-    utc_unix_s          when it was found; NaN: unknown
-    temperature_c       temperature of the inclinometer then; NaN: unknown
-    tilt_deg            its two or three angles then; an error of the scale grows with the distance from them
-    frames              number of frames it was found from
-    valid_days          how long it may be used
-    response            coefficients of the inclinometer's response that were found with A3 (mounting.py), or ()
-    response_covariance square, of these
+    Attributes
+    ----------
+    misalignment_deg : (rx, ry, rz): A3 = R3(rz) R2(ry) R1(rx), active, C into S
+    covariance_arcsec2 : (3, 3) of A3 as a small rotation about S's axes, including the inclinometer's zero
+    remounted_arcsec : 1 sigma about each axis of A3's turn since camera and inclinometer were taken apart and put
+        together again; 0: they were not
+    utc_unix_s : when it was found; NaN: unknown
+    temperature_c : temperature of the inclinometer then; NaN: unknown
+    tilt_deg : its two or three angles then; an error of the scale grows with the distance from them
+    frames : number of frames it was found from
+    valid_days : how long it may be used
+    response : coefficients of the inclinometer's response that were found with A3 (mounting.py), or ()
+    response_covariance : square, of these
+
+    Examples
+    --------
+    >>> known = starpos.Calibration.of((0.91, -0.48, 20.0), (5.0, 5.0, 5.0))  # deg, arcsec
+    >>> known.a3.shape
+    (3, 3)
     """
 
     misalignment_deg: tuple[float, ...] = (0.0, 0.0, 0.0)
@@ -147,10 +165,7 @@ class Calibration:
             raise InstrumentError(
                 f"the calibration's covariance is beyond any turn: give variances of at most {MAX_ARCSEC**2:g} arcsec2"
             )
-        if covariance.shape != (3, 3) or not np.allclose(covariance, covariance.T, rtol=1e-6):
-            raise InstrumentError("the calibration's covariance must be a symmetric 3 x 3 matrix, arcsec2")
-        if np.linalg.eigvalsh(covariance)[0] < -1e-9 * max(np.trace(covariance), 1e-300):
-            raise InstrumentError("the calibration's covariance has a negative variance: correct it")
+        _check_covariance(covariance, 3, "the calibration's covariance")
         self._check_response()
         if not 0 <= self.remounted_arcsec <= MAX_ARCSEC:
             raise InstrumentError(
@@ -183,14 +198,11 @@ class Calibration:
                 f"the calibration's response has {n} coefficients: give the 5 of two axes or the 9 of three, and a "
                 "covariance of as many rows and columns"
             )
-        sound = np.allclose(covariance, covariance.T) and np.linalg.eigvalsh(covariance)[
-            0
-        ] > -1e-9 * np.trace(covariance)
-        if max(abs(c) for c in self.response) > MAX_RESPONSE or not sound:
+        if max(abs(c) for c in self.response) > MAX_RESPONSE:
             raise InstrumentError(
-                f"the calibration's response is not valid: its coefficients must be at most "
-                f"{MAX_RESPONSE:g}, their covariance symmetric and without negative variances"
+                f"the calibration's response is not valid: its coefficients must be at most {MAX_RESPONSE:g}"
             )
+        _check_covariance(covariance, n, "the covariance of the calibration's response")
 
     @classmethod
     def of(
@@ -267,20 +279,29 @@ class Calibration:
 class Instrument:
     """The instrument of the paper, or another one; InstrumentError for impossible values.
 
-    focal_px            focal length, px
-    camera              full intrinsics; None: an ideal camera
-    frame_size          (width, height) px of the whole frame of that ideal camera, in whose middle its axis lies, and to
-                        which A3 belongs; None: not stated, the axis is in the middle of any frame
-    model               of the lens of that ideal camera: PLUMB_BOB, or EQUIDISTANT for a fisheye
-    calibration         A3 and its errors
-    link_to_camera      (3, 3): base link into C
-    mount_stddev_arcsec 1 sigma of link_to_camera about each axis; 0 for a link along the camera's own axes
-    axis_stddev_rad     1 sigma of the optical axis in frames that are an unknown part of a sensor
-    inclinometer        its errors; unless stated, an SCA100T's as sold
-    inclinometer_model  name in sensors.PRESETS that these errors began with; '': none
-    clock_stddev_s      standard deviation of the clock against UTC, s
-    shutter             times of the camera's rows; None: as the source of the frames states them
-    vertical            of a camera fixed to the ground, which is its own level; None: there is an inclinometer
+    Attributes
+    ----------
+    focal_px : focal length, px
+    camera : full intrinsics; None: an ideal camera
+    frame_size : (width, height) px of the whole frame of that ideal camera, in whose middle its axis lies, and to
+        which A3 belongs; None: not stated, the axis is in the middle of any frame
+    model : of the lens of that ideal camera: PLUMB_BOB, or EQUIDISTANT for a fisheye
+    calibration : A3 and its errors
+    link_to_camera : (3, 3), base link into C
+    mount_stddev_arcsec : 1 sigma of link_to_camera about each axis; 0 for a link along the camera's own axes
+    axis_stddev_rad : 1 sigma of the optical axis in frames that are an unknown part of a sensor
+    inclinometer : its errors; unless stated, an SCA100T's as sold
+    inclinometer_model : name among sensors.presets() that these errors began with; '': none
+    clock_stddev_s : standard deviation of the clock against UTC, s
+    shutter : times of the camera's rows; None: as the source of the frames states them
+    vertical : of a camera fixed to the ground, which is its own level; None: there is an inclinometer
+
+    Examples
+    --------
+    >>> known = starpos.Calibration.of((0, 0, 0), (5, 5, 5))
+    >>> instrument = starpos.Instrument(4636.0, calibration=known)
+    >>> instrument.camera_for(1000, 700).fx
+    4636.0
     """
 
     focal_px: float
@@ -292,7 +313,7 @@ class Instrument:
     link_to_camera: tuple = TOP_OF_FRAME
     mount_stddev_arcsec: float = 0.0
     axis_stddev_rad: float = 0.0
-    inclinometer: InclinometerErrors = UNNAMED
+    inclinometer: InclinometerErrors = field(default_factory=unnamed)
     inclinometer_model: str = ""
     clock_stddev_s: float = UNKNOWN_CLOCK_S
     shutter: Shutter | None = None
@@ -324,15 +345,7 @@ class Instrument:
                 f"the inclinometer's noise (tilt_noise_deg) is {np.degrees(self.inclinometer.noise_rad):g} deg: must be "
                 "positive (of one reading, SCA100T 0.0035)"
             )
-        link = np.asarray(self.link_to_camera, float)
-        if (
-            link.shape != (3, 3)
-            # Squares must not overflow.
-            or np.abs(link).max() > 2
-            or not np.allclose(link @ link.T, np.eye(3), atol=1e-6)
-            or np.linalg.det(link) < 0
-        ):
-            raise InstrumentError("link_to_camera must be a 3 x 3 rotation matrix")
+        _check_rotation(self.link_to_camera, "link_to_camera")
 
     @property
     def size(self) -> tuple[int, int] | None:

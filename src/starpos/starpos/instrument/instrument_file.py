@@ -168,7 +168,20 @@ def read(path: Path | str, needs_camera: bool = True) -> Instrument:
     vertical: {camera_to_itrs, covariance_arcsec2, sag_arcsec_per_sqrt_hour}
                                                          of a camera fixed to the ground, in place of tilt_...
 
-    needs_camera: whether a file without a camera is refused; pointings need none.
+    Parameters
+    ----------
+    path : of the file
+    needs_camera : whether a file without a camera is refused; pointings need none
+
+    Returns
+    -------
+    Instrument
+        as the file states it
+
+    Examples
+    --------
+    >>> starpos.read_instrument("instrument.yaml").calibration.misalignment_deg
+    (0.0, 0.0, 0.0)
     """
     path = Path(path)
     content = yaml_file.load(path, "instrument file")
@@ -183,9 +196,29 @@ def read(path: Path | str, needs_camera: bool = True) -> Instrument:
 
 
 def write(path: Path | str, instrument: Instrument, comment: str = "") -> None:
-    """Write a file that `read` turns into the same Instrument; InstrumentError if it cannot be written.
+    """Write a file that `read` turns into the same Instrument.
 
-    comment is text for people, written at the end of the file.
+    Parameters
+    ----------
+    path : of the file, which is replaced
+    instrument : what is written
+    comment : text for people, written at the end of the file
+
+    Returns
+    -------
+    None
+
+    Raises
+    ------
+    InstrumentError
+        the file cannot be written
+
+    Examples
+    --------
+    >>> instrument = starpos.Instrument(4635.9375)
+    >>> starpos.write_instrument("mine.yaml", instrument)
+    >>> starpos.read_instrument("mine.yaml") == instrument
+    True
     """
     yaml_file.save(Path(path), content_of(instrument), comment)
 
@@ -247,7 +280,7 @@ def _from_mapping(content: dict, folder: Path, needs_camera: bool) -> Instrument
         optics = _camera(content.get("camera"), folder)
     given = {name: _error(content, key, unit) for key, (name, unit) in INCLINOMETER.items() if key in content}
     sensor, errors = _sensor(content, bool(given))
-    more = {
+    more: dict[str, Any] = {
         name: read(content, key)
         for key, (name, read) in {
             "link_to_camera": ("link_to_camera", _matrix),

@@ -118,11 +118,21 @@ def _rounding(theta: np.ndarray) -> float:
 class TiltLog:
     """N readings of one sensor.
 
-    utc_unix_s (N,).  theta_x, theta_y (N,) in rad.  temperature_c (N,).
-    covariance (N, 2, 2) in rad2 of each reading's theta_x, theta_y.
-    theta_z (N,) in rad; None or NaN for a two-axis sensor.
-    variance_z (N,) in rad2; None or NaN: as for the other two.
-    earlier_excess  noise over the stated one that earlier readings showed, which are not in the log
+    Attributes
+    ----------
+    utc_unix_s, temperature_c : (N,)
+    theta_x, theta_y : (N,) rad
+    covariance : (N, 2, 2) rad2 of each reading's theta_x, theta_y
+    theta_z : (N,) rad; None or NaN for a two-axis sensor
+    variance_z : (N,) rad2; None or NaN: as for the other two
+    earlier_excess : noise over the stated one that earlier readings showed, which are not in the log
+
+    Examples
+    --------
+    >>> log = starpos.read_tilt_csv("night/tilt.csv")
+    >>> stars = starpos.read_frame("night/stars_0000.csv")
+    >>> log.average(stars.mid_unix_s, stars.exposure_s).samples
+    5
     """
 
     utc_unix_s: np.ndarray
@@ -453,7 +463,7 @@ class Tilts(Protocol):
 
 @dataclass(frozen=True)
 class TiltsByTime:
-    """The tilts of exposures, each known by their middle (Unix seconds); and why there is none for another one."""
+    """The tilts of exposures by their middles (Unix seconds); why: the reason why other exposures have no tilt."""
 
     tilts: Mapping[Any, Tilt] = field(default_factory=dict)
     why: str = "no tilt: give the inclinometer's"

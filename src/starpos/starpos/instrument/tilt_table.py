@@ -1,38 +1,27 @@
 # SPDX-License-Identifier: Apache-2.0
 """The table of tilt readings on disk, a CSV; and doubt whether its degrees are radians."""
 
-import difflib
-import io
 import itertools
-import os
-import re
-import warnings
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TextIO
 
 import numpy as np
 
 from starpos.errors import TiltError
-from starpos.files import open_regular
 from starpos.instrument.inclinometer import MAX_CELSIUS, SCA100T_NOISE_RAD, elevations
 from starpos.instrument.tilt_log import BRACKET_S, OUTLIER_SIGMA, TiltLog, white_noise
+from starpos.tables import TableForm
 
-# A week at 10 Hz.
-MAX_CSV_BYTES = 300_000_000
-NEEDED = ("utc_unix_s", "theta_x_deg", "theta_y_deg")
 ANGLES = ("theta_x_deg", "theta_y_deg", "theta_z_deg")
-OPTIONAL = ("theta_z_deg", "temperature_c", "sigma_deg")
-CURE = (
-    f"give a CSV with a line of names, {','.join(NEEDED)}[,{','.join(OPTIONAL)}], and readings: the elevations of "
-    "the sensor's axes"
+# the elevations of the sensor's axes, for a week at 10 Hz
+TILT_TABLE = TableForm(
+    what="table of tilts",
+    error=TiltError,
+    needed=("utc_unix_s", "theta_x_deg", "theta_y_deg"),
+    optional=("theta_z_deg", "temperature_c", "sigma_deg"),
+    # 1 sigma, up to which an angle still means anything
+    limits={"sigma_deg": (1e-9, 45.0)},
 )
-# an empty cell, other than a line's first
-EMPTY = re.compile(r",[ \t]*(?=[,\r\n]|\Z)")
-# similarity from which an unknown column's name may be meant for a known one
-ALIKE_NAME = 0.7
-# largest sigma at which an angle still means anything
-MAX_SIGMA_DEG = 45.0
 # Readings alternate if, of three in a row, the outer two are closer than two neighbours in more than this share. White
 # noise has a share of a half, and exceeds it by this many sigma less than once in 10^7 tables.
 ALTERNATING, ALTERNATING_SIGMA = 0.75, 6.0
@@ -45,48 +34,47 @@ QUARTER = 0.3186
 
 
 def read_tilt_csv(path: Path | str, noise_rad: float = SCA100T_NOISE_RAD) -> TiltLog:
-    """Read a TiltLog from a CSV, one reading of a sensor a line; TiltError if it cannot be one.
+    """Read a TiltLog from a CSV, one reading of a sensor a line.
 
     Columns: utc_unix_s, theta_x_deg, theta_y_deg; theta_z_deg of a three-axis sensor; temperature_c, unknown (NaN) where
-    it is beyond MAX_CELSIUS; sigma_deg, 1 sigma of the white noise of that line's angles. Where no sigma is stated (no
-    column, an empty cell, or NaN) it is noise_rad. Other columns are ignored.
+    it is beyond MAX_CELSIUS; sigma_deg, 1 sigma of the white noise of that line's angles. Other columns are ignored.
+
+    Parameters
+    ----------
+    path : of the CSV
+    noise_rad : sigma where no sigma is stated (no column, an empty cell, or NaN)
+
+    Returns
+    -------
+    TiltLog
+        its readings
+
+    Raises
+    ------
+    TiltError
+        the file cannot be one
+
+    Examples
+    --------
+    >>> starpos.read_tilt_csv("night/tilt.csv").theta_x.shape
+    (25,)
     """
     path = Path(path)
-    try:
-        with _opened(path) as f, warnings.catch_warnings():
-            # our own error says that a file is empty
-            warnings.simplefilter("ignore")
-            names = [name.strip() for name in f.readline().lstrip("# ").split(",")]
-            rows = np.loadtxt(io.StringIO(EMPTY.sub(",nan", f.read())), delimiter=",", ndmin=2)
-    except FileNotFoundError:
-        raise TiltError(f"{path}: there is no such file: {CURE}") from None
-    except (OSError, ValueError, UnicodeDecodeError) as e:
-        reason = getattr(e, "strerror", None) or _first_line(e)
-        raise TiltError(f"{path}: not a readable table of tilts ({reason}): {CURE}") from None
-    if not set(NEEDED) <= set(names) or rows.shape[0] == 0 or rows.shape[1] != len(set(names)):
+    table = TILT_TABLE.read(path)
+    column = table.columns
+    if not np.isfinite([column[name] for name in TILT_TABLE.needed]).all(0).any():
         raise TiltError(
-            f"{path}: a tilt table needs the columns {', '.join(NEEDED)} and at least one row: {CURE}"
+            f"{path}: none of its {len(table.lines)} readings is a number: check the inclinometer and what wrote them"
         )
-    for name in set(names) - {*NEEDED, *OPTIONAL}:
-        for meant in difflib.get_close_matches(name.lower(), OPTIONAL, 1, ALIKE_NAME):
-            raise TiltError(
-                f"{path}: its column {name} is not read: call it {meant} if it holds that, else give it "
-                f"another name"
-            )
-    column = dict(zip(names, rows.T, strict=True))
-    if not np.isfinite([column[name] for name in NEEDED]).all(0).any():
-        raise TiltError(
-            f"{path}: none of its {len(rows)} readings is a number: check the inclinometer and what wrote the table"
-        )
-    _check_one_sensor(path, column, rows)
+    _check_digits(path, column["utc_unix_s"])
+    _check_one_sensor(path, column)
     order = np.argsort(column["utc_unix_s"], kind="stable")
     order = order[np.isfinite(column["utc_unix_s"][order])]
-    unknown = np.full(len(rows), np.nan)
-    z = column.get("theta_z_deg", unknown)
+    z = table.column("theta_z_deg")
     axes = ["theta_x_deg", "theta_y_deg"] + ([] if np.isnan(z).all() else ["theta_z_deg"])
     theta = elevations(np.radians([column[axis][order] for axis in axes]).T).T
-    sigma = np.radians(_sigma_deg(path, column.get("sigma_deg", unknown)))[order]
-    celsius = column.get("temperature_c", unknown)[order]
+    sigma = np.radians(table.column("sigma_deg"))[order]
+    celsius = table.column("temperature_c")[order]
     return TiltLog.of(
         column["utc_unix_s"][order],
         theta[0],
@@ -97,34 +85,30 @@ def read_tilt_csv(path: Path | str, noise_rad: float = SCA100T_NOISE_RAD) -> Til
     )
 
 
-def _sigma_deg(path: Path, sigma: np.ndarray) -> np.ndarray:
-    """The stated sigmas (N,), in deg; TiltError if one cannot be."""
-    wrong = ~np.isnan(sigma) & ~((sigma > 0) & (sigma <= MAX_SIGMA_DEG))
-    if wrong.any():
+# Times of these steps, s, are rounded: float32 at today's times, and six digits as %g writes.
+ROUNDED_S, FEWEST_ROUNDED = (128.0, 10_000.0), 3
+
+
+def _check_digits(path: Path, t: np.ndarray) -> None:
+    """TiltError if times (N,) were written with too few digits, so that many of them are the same."""
+    t = t[np.isfinite(t)]
+    if len(t) < FEWEST_ROUNDED or len(np.unique(t)) == len(t):
+        return
+    if any((t % step == 0).all() for step in ROUNDED_S):
         raise TiltError(
-            f"{path}: a sigma_deg is {sigma[wrong][0]:g}: give 1 sigma of the angles in deg, above 0 and at most "
-            f"{MAX_SIGMA_DEG:g}, or nan where it is not known"
+            f"{path}: {len(t)} readings have {len(np.unique(t))} times, all whole multiples of over 100 s: they were "
+            "rounded by float32, or by %g: write utc_unix_s with its fractions of a second (%.3f, double precision)"
         )
-    return sigma
 
 
-def _opened(path: Path) -> TextIO:
-    """The open text of a table; OSError if it cannot be read, ValueError if it is too large."""
-    file = open_regular(path)
-    if os.fstat(file.fileno()).st_size > MAX_CSV_BYTES:
-        file.close()
-        raise ValueError(f"it is larger than {MAX_CSV_BYTES // 10**6} MB")
-    return io.TextIOWrapper(file, "utf-8-sig")
-
-
-def _check_one_sensor(path: Path, column: Mapping[str, np.ndarray], rows: np.ndarray) -> None:
+def _check_one_sensor(path: Path, column: Mapping[str, np.ndarray]) -> None:
     """TiltError if the rows seem to be readings of two sensors, one after the other or alternating.
 
     One after the other, the second sensor's times go back into times that the table already holds. A table may hold
     nights in any order, and repeat a part of itself.
     """
     finite = np.flatnonzero(np.isfinite(column["utc_unix_s"]))
-    _, first = np.unique(rows[finite], axis=0, return_index=True)
+    _, first = np.unique(np.stack(list(column.values()), -1)[finite], axis=0, return_index=True)
     once = finite[np.sort(first)]
     t = column["utc_unix_s"][once]
     runs = np.split(t, np.flatnonzero(np.diff(t) < 0) + 1)
@@ -179,10 +163,6 @@ def _leaps(t: np.ndarray, angle: np.ndarray) -> bool:
     if len(size) < max(MIN_LEAPS, LEAPING * len(step)):
         return False
     return bool(np.mean(np.abs(size - np.median(size)) <= alike[returns]) >= ONE_SIZE)
-
-
-def _first_line(error: Exception) -> str:
-    return (str(error).splitlines() or [type(error).__name__])[0]
 
 
 # The noise of readings in radians that are taken for degrees is 57.3 times too small. Number of differences that

@@ -3,14 +3,14 @@
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from starpos.errors import InstrumentError, TimeError
 from starpos.frames.encodings import pixels_of
-from starpos.frames.exposure import UNKNOWN_STAMP, DriverStamp, Shutter
+from starpos.frames.exposure import UNKNOWN_STAMP, DriverStamp
 from starpos.frames.frame import Frame
 from starpos.frames.pictures import picture_pixels
 from starpos.instrument.camera import Camera, check_axis, stated_lens
@@ -105,16 +105,6 @@ UNKNOWN_SOURCE = 0
 NANO = 10**9
 
 
-@dataclass(frozen=True)
-class _Facts:
-    """The exposure by a Capture; exposure_s: 0 if unknown."""
-
-    exposure_s: float
-    stamp_stddev_s: float
-    clock_stddev_s: float
-    shutter: Shutter | None
-
-
 class ExposureFacts:
     """Keeps Captures by their stamps, and adds their contents to their frames.
 
@@ -128,7 +118,7 @@ class ExposureFacts:
         # the oldest first
         self._captures: dict[tuple[int, int], Any] = {}
         # facts for a frame whose Capture is lost; None: no Capture has ever come
-        self._usual: _Facts | None = None
+        self._usual: dict[str, Any] | None = None
 
     def keep_capture(self, message: Any) -> None:
         """Keep a Capture for its frame."""
@@ -162,21 +152,16 @@ class ExposureFacts:
         self._exposures_come |= of_driver
         facts = None if of_driver else told or self._usual
         if facts is None:
-            driver = self._driver_stamp(told.exposure_s if told else 0.0)
+            driver = self._driver_stamp(told["exposure_s"] if told else 0.0)
             mid_ns = stamp_ns + round(driver.to_middle_s * 1e9)
             if mid_ns <= 0:
                 raise TimeError(
                     "image_raw: the middle of the exposure is before 1970; check the camera's clock."
                 )
             return mid_ns, driver.apply
-        known: dict[str, Any] = {
-            "exposure_s": facts.exposure_s or self._values["exposure"] or None,
-            "stamp_stddev_s": facts.stamp_stddev_s,
-            "clock_stddev_s": facts.clock_stddev_s,
-            "shutter": facts.shutter,
-        }
+        known = facts | {"exposure_s": facts["exposure_s"] or self._values["exposure"] or None}
         # the errors of a camera's times and its shutter are the same in all its frames; its exposure may differ
-        self._usual = replace(facts, exposure_s=0.0)
+        self._usual = facts | {"exposure_s": 0.0}
         return stamp_ns, lambda frame: replace(frame, **known)
 
     def _is_of_driver(self, capture: Any) -> bool:
@@ -190,10 +175,12 @@ class ExposureFacts:
         return DriverStamp(v["stamp"], v["stamp_stddev"], exposure_s or None, v["readout"])
 
 
-def _facts_of(capture: Any) -> _Facts:
+def _facts_of(capture: Any) -> dict[str, Any]:
+    """The fields of a Frame that a Capture gives; exposure_s: 0 if unknown."""
     told = (capture.exposure, capture.stamp_stddev, capture.clock_stddev)
     exposure, stamp, clock = (float(v) if math.isfinite(v) and v > 0 else 0.0 for v in told)
-    return _Facts(exposure, stamp, clock, message_to_shutter(capture))
+    errors = {"stamp_stddev_s": stamp, "clock_stddev_s": clock}
+    return {"exposure_s": exposure, **errors, "shutter": message_to_shutter(capture)}
 
 
 def key_of(header: Any) -> tuple[int, int]:

@@ -145,15 +145,11 @@ class Acceleration:
     variance: tuple[float, float, float]
 
 
-class BadMessage(ValueError):
-    """A message cannot be used; the text says why."""
-
-
 def acceleration_of(message: Any) -> Acceleration:
-    """Read a message; BadMessage if it has no stamp or holds NaN, infinity or a negative variance."""
+    """Read a message; TiltError if it has no stamp or holds NaN, infinity or a negative variance."""
     stamp_ns = message.header.stamp.sec * 1_000_000_000 + message.header.stamp.nanosec
     if stamp_ns <= 0:
-        raise BadMessage("has no stamp")
+        raise TiltError("has no stamp")
     a, w = message.linear_acceleration, message.angular_velocity
     force = (a.x, a.y, a.z)
     # A covariance that begins with -1 says that the quantity is not measured. The force is checked against g anyway.
@@ -163,7 +159,7 @@ def acceleration_of(message: Any) -> Acceleration:
     if stated[0] == -1:
         variance = (0.0, 0.0, 0.0)
     if not all(map(math.isfinite, (*force, *rotation, *variance))) or min(variance) < 0:
-        raise BadMessage("holds NaN, infinity or a negative variance")
+        raise TiltError("holds NaN, infinity or a negative variance")
     return Acceleration(stamp_ns, force, math.hypot(*rotation), variance)
 
 
@@ -317,7 +313,7 @@ class ImuTilts:
         self.frame = message.header.frame_id
         try:
             said = acceleration_of(message)
-        except BadMessage:
+        except TiltError:
             self.malformed += 1
             return None
         if said.stamp_ns > now_ns + FUTURE_S * 1e9:

@@ -36,9 +36,19 @@ from starpos.navigation.vessel import MotionLaw
 class VoyageFix:
     """Astronomic latitude, longitude and heading of the body's x (rad) at one time of a voyage.
 
-    covariance (3, 3): east m, north m, heading rad.  velocity (3,): east, north, up, m/s; velocity_covariance (3, 3).
-    link: the body's axes, x forward, into east, north, up.
-    gyro_bias, accel_bias (3,): rad/s, m/s2.
+    Attributes
+    ----------
+    covariance : (3, 3) of east m, north m, heading rad
+    velocity, velocity_covariance : (3,) east, north, up, m/s, and (3, 3)
+    link : the body's axes, x forward, into east, north, up
+    gyro_bias, accel_bias : (3,) rad/s, m/s2
+
+    Examples
+    --------
+    >>> lists = sorted(Path("drive").glob("stars_*.csv"))
+    >>> voyage = starpos.navigate(lists, "drive/imu.csv", starpos.Instrument(4635.9375), vehicle="rover")
+    >>> voyage.fixes[-1].velocity.shape
+    (3,)
     """
 
     utc_unix_s: float

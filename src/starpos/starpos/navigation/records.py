@@ -1,22 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """Records of a voyage: inertial readings and measured velocities, their tables on disk, and how good an IMU is."""
 
-import io
-import os
-import warnings
-from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
 
 from starpos.errors import InstrumentError, VoyageError, one_line
-from starpos.files import open_regular
 from starpos.instrument import yaml_file
+from starpos.tables import TableForm
 
 # a night of 400 Hz
 MAX_BYTES = 1_500_000_000
-TIME = "utc_unix_s"
 # Unix times of the years 1973 to 2100
 EARLIEST_S, LATEST_S = 9.4e7, 4.1e9
 
@@ -30,40 +25,19 @@ class Record:
     faults: tuple[str, ...]
 
 
-def read_record(path: Path | str, columns: Sequence[str], what: str) -> Record:
-    """Read the columns of a CSV whose first line names them, utc_unix_s first; VoyageError if it cannot be used.
+def _read_record(path: Path | str, form: TableForm) -> Record:
+    """Read the columns that a form needs, utc_unix_s first; VoyageError if they cannot be used."""
+    columns = form.read(path).columns
+    utc_unix_s, *values = (columns[name] for name in form.needed)
+    return in_order(utc_unix_s, np.stack(values, -1), f"{path}")
+
+
+def in_order(utc_unix_s: np.ndarray, values: np.ndarray, place: str) -> Record:
+    """Keep the rows that can be used; VoyageError if none can.
 
     Rows that are not all finite numbers are left out, and so are rows whose time does not come after all before them:
     of two readings with one stamp it is unknown which is right.
     """
-    cure = f"give a CSV with a line of names, {','.join((TIME, *columns))}, and a row a reading"
-    try:
-        with open_regular(path) as file:
-            if os.fstat(file.fileno()).st_size > MAX_BYTES:
-                raise ValueError(f"it is larger than {MAX_BYTES // 10**6} MB")
-            text = io.TextIOWrapper(file, "utf-8-sig")
-            names = [name.strip() for name in text.readline().lstrip("# ").split(",")]
-            lacking = [name for name in (TIME, *columns) if names.count(name) != 1]
-            if lacking:
-                raise ValueError(f"it has no column {lacking[0]}, or two")
-            with warnings.catch_warnings():
-                # our own error says that a table is empty
-                warnings.simplefilter("ignore")
-                rows = np.loadtxt(
-                    text, delimiter=",", ndmin=2, usecols=[names.index(name) for name in (TIME, *columns)]
-                )
-    except FileNotFoundError:
-        raise VoyageError(f"{path}: there is no such file: {cure}") from None
-    except (OSError, ValueError, UnicodeDecodeError) as e:
-        reason = getattr(e, "strerror", None) or one_line(e)
-        raise VoyageError(f"{path}: not a readable table of {what} ({reason}): {cure}") from None
-    if len(rows) == 0:
-        raise VoyageError(f"{path}: the table of {what} has no rows: {cure}")
-    return in_order(rows[:, 0], rows[:, 1:], f"{path}")
-
-
-def in_order(utc_unix_s: np.ndarray, values: np.ndarray, place: str) -> Record:
-    """Keep the rows that can be used, as `read_record` says; VoyageError if none can."""
     faults = []
     sound = np.isfinite(values).all(1) & np.isfinite(utc_unix_s)
     sound &= (utc_unix_s > EARLIEST_S) & (utc_unix_s < LATEST_S)
@@ -87,7 +61,12 @@ def _rows(wrong: np.ndarray) -> str:
     return f"{number} row is" if number == 1 else f"{number} rows are"
 
 
-IMU_COLUMNS = ("gx", "gy", "gz", "ax", "ay", "az")
+IMU_TABLE = TableForm(
+    what="table of inertial readings",
+    error=VoyageError,
+    needed=("utc_unix_s", "gx", "gy", "gz", "ax", "ay", "az"),
+    most_bytes=MAX_BYTES,
+)
 # a reading that comes later than this share of the usual time has one missing before it
 GAP = 1.5
 # number of readings in a row at a channel's greatest value that count as clipped
@@ -171,7 +150,7 @@ def clipped(values: np.ndarray) -> np.ndarray:
 
 def read_imu(path: Path | str) -> ImuLog:
     """Read a CSV of utc_unix_s, gx, gy, gz (rad/s), ax, ay, az (m/s2); VoyageError says why one cannot be used."""
-    record = read_record(path, IMU_COLUMNS, "inertial readings")
+    record = _read_record(path, IMU_TABLE)
     return ImuLog.of(record.utc_unix_s, record.values[:, :3], record.values[:, 3:], record.faults, f"{path}")
 
 
@@ -240,11 +219,17 @@ def read_imu_model(path: Path) -> ImuModel:
         raise InstrumentError(f"{path}: {error}") from None
 
 
-VELOCITY_COLUMNS = ("vx", "vy", "vz", "sigma")
-# below it a stated error is a mistake; above it nothing is measured
-MIN_SIGMA, MAX_SIGMA = 1e-6, 1000.0
 # In m/s.
 FASTEST = 1000.0
+# below it a stated error is a mistake; above it nothing is measured
+MIN_SIGMA, MAX_SIGMA = 1e-6, 1000.0
+VELOCITY_TABLE = TableForm(
+    what="table of velocities",
+    error=VoyageError,
+    needed=("utc_unix_s", "vx", "vy", "vz", "sigma"),
+    limits={"sigma": (MIN_SIGMA, MAX_SIGMA)},
+    most_bytes=MAX_BYTES,
+)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -259,12 +244,8 @@ class VelocityLog:
 
 def read_velocity(path: Path | str) -> VelocityLog:
     """Read a CSV of utc_unix_s, vx, vy, vz, sigma (m/s); VoyageError says why one cannot be used."""
-    record = read_record(path, VELOCITY_COLUMNS, "velocities")
+    record = _read_record(path, VELOCITY_TABLE)
     velocity, sigma = record.values[:, :3], record.values[:, 3]
-    if not ((sigma >= MIN_SIGMA) & (sigma <= MAX_SIGMA)).all():
-        raise VoyageError(
-            f"{path}: a sigma is not between {MIN_SIGMA:g} and {MAX_SIGMA:g} m/s: state 1 sigma of an axis"
-        )
     if np.abs(velocity).max() > FASTEST:
         raise VoyageError(f"{path}: a velocity is beyond {FASTEST:g} m/s: give m/s along the body's axes")
     return VelocityLog(utc_unix_s=record.utc_unix_s, velocity=velocity, sigma=sigma, faults=record.faults)

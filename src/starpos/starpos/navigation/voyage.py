@@ -356,8 +356,20 @@ MAX_APART_S = 1.5
 class Voyage:
     """Fixes at the times that were asked for, None where there is no answer.
 
-    faults: what is wrong with the record, in sentences.  excess, left_out: of frames and velocities, as `Adjustment` has
-    them.  rounds: of the adjustment; motion, solution: its last.  last: where it ends, to be carried on.
+    Attributes
+    ----------
+    faults : what is wrong with the record, in sentences
+    excess, left_out : of frames and velocities, as `Adjustment` has them
+    rounds : of the adjustment
+    motion, solution : of its last round
+    last : where it ends, to be carried on
+
+    Examples
+    --------
+    >>> lists = sorted(Path("drive").glob("stars_*.csv"))
+    >>> voyage = starpos.navigate(lists, "drive/imu.csv", starpos.Instrument(4635.9375), vehicle="rover")
+    >>> len(voyage.fixes) == len(lists)
+    True
     """
 
     fixes: tuple[VoyageFix | None, ...]

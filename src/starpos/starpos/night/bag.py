@@ -47,6 +47,8 @@ from starpos.rotation import full_turn, half_turns
 from starpos.units import ARCSEC, utc_text
 
 SUFFIXES = (".mcap", ".db3")
+# of ROS 1, which is refused with a sentence
+ROS1_SUFFIX = ".bag"
 TOPICS = INPUTS | {"solver/solution": SOLUTION}
 # types of messages that are a frame each
 WITH_STARS = (STARS, *IMAGES)
@@ -81,7 +83,7 @@ class Recorded:
 def is_bag(path: Path) -> bool:
     """Whether a path looks like a bag: a folder with metadata.yaml or a bag's files, or a file with a bag's suffix."""
     if path.is_file():
-        return path.suffix.lower() in SUFFIXES
+        return path.suffix.lower() in (*SUFFIXES, ROS1_SUFFIX)
     return (path / "metadata.yaml").is_file() or any(next(path.glob(f"*{s}"), None) for s in SUFFIXES)
 
 
@@ -95,7 +97,7 @@ def read(
     """
     with BagReader(path, typed=True) as bag:
         chosen = _instrument(bag, path, namespace, drivers)
-        reading = _Reading(tilt_noise_rad, drivers.begin())
+        reading = _Reading(tilt_noise_rad, DriverMessages(drivers))
         wanted = [c for c in chosen.connections if c.msgtype not in WITH_STARS]
         total = sum(c.msgcount for c in wanted) or 1
         for done, (connection, log_ns, message) in enumerate(bag.decoded(wanted), 1):
@@ -118,7 +120,7 @@ def read(
 
 def each_frame(r: Recorded) -> Iterator[tuple[str, Stars | FrameError]]:
     """A name for each frame, one at a time, and its stars, or why it has none."""
-    messages = r.drivers.begin()
+    messages = DriverMessages(r.drivers)
     with BagReader(r.path, typed=True) as bag:
         chosen = _instrument(bag, r.path, r.namespace, r.drivers)
         wanted = [c for c in chosen.connections if c.msgtype in (*WITH_STARS, CAPTURE)]

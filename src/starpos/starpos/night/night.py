@@ -27,11 +27,21 @@ SHOWN = 20
 class Shot:
     """One frame: its status, and the part of its answer that was found.
 
-    utc_unix_s: NaN if unknown.  size: of the frame in px.  tilt: in rad.
-    xy, residual_px (M, 2): seen places of the stars of its fix, and these minus the fitted ones.
-    camera_to_itrs (3, 3): attitude against the Earth by the stars alone.
-    at_place: heading, pitch and roll at a known place; None without one.
-    warnings: what is suspicious about its identification, as `Solution.warnings`.
+    Attributes
+    ----------
+    utc_unix_s : NaN if unknown
+    size : of the frame in px
+    tilt : rad
+    xy, residual_px : (M, 2), seen places of the stars of its fix, and these minus the fitted ones
+    camera_to_itrs : (3, 3), attitude against the Earth by the stars alone
+    at_place : heading, pitch and roll at a known place; None without one
+    warnings : what is suspicious about its identification, as `Solution.warnings`
+
+    Examples
+    --------
+    >>> shot = starpos.open_night("night", instrument="instrument.yaml").solve().shots[0]
+    >>> shot.name, shot.status.value
+    ('stars_0000.csv', 'ok')
     """
 
     name: str
@@ -120,12 +130,19 @@ def offset_m(place: PlaceFix | Truth, latitude: float, longitude: float) -> tupl
 class Night:
     """All frames of one place; printed, and in a notebook shown, in a few lines.
 
-    origin: a sentence that says where the fixes come from.
-    shots: one for each frame.
-    combined: the average, astronomic and in rad; None without one, and why_not says why.
-    wgs84: the same for a map, in deg.
-    steady (N, 3): latitude, longitude, heading (rad) of the fixes with one tilt for all; None if the camera moved.
-    watched: what GNSS taught and what its guard said, of each frame that can be read; None without GNSS.
+    Attributes
+    ----------
+    origin : a sentence that says where the fixes come from
+    shots : one for each frame
+    combined : the average, astronomic and in rad; None without one, and why_not says why
+    wgs84 : the same for a map, in deg
+    steady : (N, 3), latitude, longitude, heading (rad) of the fixes with one tilt for all; None if the camera moved
+    watched : what GNSS taught and what its guard said, of each frame that can be read; None without GNSS
+
+    Examples
+    --------
+    >>> starpos.open_night("night", instrument="instrument.yaml").solve()
+    <night: 5 of 5 frames fixed; +35.70... +51.4...>
     """
 
     name: str

@@ -3,7 +3,7 @@
 
 import json
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import KW_ONLY, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -14,9 +14,9 @@ from starpos.earth.place import Place
 from starpos.earth.refraction import Atmosphere
 from starpos.earth.vertical import Deflection, Vertical
 from starpos.errors import FrameError, TiltError
-from starpos.files import read_regular
+from starpos.files import open_regular, read_regular
 from starpos.frames.frame import Frame, Stars
-from starpos.frames.reading import FITS
+from starpos.frames.reading import FITS, HEIF, JPEG, PICTURE, RAW
 from starpos.frames.tables import GNSS, SIMULATED, TILTS, TRUTH
 from starpos.gnss.receiver import GnssTrack, read_gnss_csv
 from starpos.instrument import instrument_file, sensors
@@ -40,15 +40,18 @@ def exposures(
     atmosphere: Atmosphere,
     vertical: Vertical,
     place: Place | None = None,
+    read: Reader | None = None,
 ) -> Exposures:
     """The frames of a folder in the order of their names, to be solved.
+
+    read: with a camera's clock, for the times of pictures; None for files that state their time.
 
     place: a known place, where each frame has a heading. If tilt.csv is missing, only headings are computed there;
     without a known place each frame reports that it is missing.
 
     Raises FrameError if there are no frames, or truth.json cannot be used.
     """
-    frames, read = frames_in(folder), Reader()
+    frames, read = frames_in(folder), read or Reader()
     first = First(read)(tuple(map(str, frames)))
     work, remarks = Solving(given, atmosphere=atmosphere, places=place), tuple[Remark, ...]()
     if first is not None:
@@ -95,18 +98,45 @@ def work_of(
 
 
 def frames_in(folder: Path) -> list[Path]:
-    """Paths of the frames in a folder by name, at least one; raises FrameError without any."""
+    """Paths of the frames in a folder by name, at least one; raises FrameError without any.
+
+    FITS, or else lists of stars, or else pictures and raw files; a JPEG with the name of another file is its copy.
+    """
     try:
         files = sorted(p for p in folder.iterdir() if p.is_file())
     except OSError as e:
         raise FrameError(f"{folder}: the folder cannot be read ({e.strerror})") from None
     frames = [p for p in files if p.suffix.lower() in FITS]
-    frames = frames or [p for p in files if p.suffix.lower() == ".csv" and p.name not in (TILTS, GNSS)]
+    tables = [p for p in files if p.suffix.lower() == ".csv" and p.name not in (TILTS, GNSS)]
+    frames = frames or (tables if any(map(_is_star_list, tables)) else [])
+    # without a list of stars, other tables lie beside pictures
+    frames = frames or _pictures_among(files) or tables
     if not frames:
         raise FrameError(
-            f"{folder}: no frames in it: a night is a folder of FITS frames, or of CSV lists of stars, and {TILTS}"
+            f"{folder}: no frames in it: a night is a folder of frames (FITS, raw, HEIC, TIFF, PNG, JPEG, or CSV lists "
+            f"of stars) and {TILTS}"
         )
     return frames
+
+
+def _is_star_list(path: Path) -> bool:
+    """Whether a CSV begins as a list of stars does."""
+    try:
+        with open_regular(path) as file:
+            return file.read(16).lstrip(b"# ").startswith(b"{")
+    # its reader reports why
+    except OSError:
+        return True
+
+
+def _pictures_among(files: Sequence[Path]) -> list[Path]:
+    """Pictures and raw files by name, each name once: a JPEG beside another one is its copy."""
+    best: dict[str, Path] = {}
+    for suffixes in (RAW, PICTURE, HEIF, JPEG):
+        for path in files:
+            if path.suffix.lower() in suffixes:
+                best.setdefault(path.stem, path)
+    return sorted(best.values())
 
 
 def truth_in(folder: Path) -> Truth | None:
@@ -139,8 +169,17 @@ def truth_in(folder: Path) -> Truth | None:
 class NightOnDisk:
     """A folder of frames with tilt.csv, its instrument and air as far as known; `solve` solves it.
 
-    instrument: None if the frames' headers have the focal length.  calibration: A3 in place of the instrument's.
-    inclinometer: name of its model in place of the instrument's; '' for the instrument's.
+    Attributes
+    ----------
+    instrument : None if the frames' headers have the focal length
+    calibration : A3 in place of the instrument's
+    inclinometer : name of its model in place of the instrument's; '' for the instrument's
+
+    Examples
+    --------
+    >>> night = starpos.open_night("night", instrument="instrument.yaml")
+    >>> night.count, len(night.solve().shots)
+    (5, 5)
     """
 
     folder: Path
@@ -201,15 +240,34 @@ def open_night(
     vertical: Vertical | None = None,
     place: Place | None = None,
 ) -> NightOnDisk:
-    """A night: a folder of FITS frames, or else of CSV lists of stars, with tilt.csv; not read yet.
+    """A night: a folder of frames (FITS, or else CSV lists of stars, or else pictures), with tilt.csv; not read yet.
 
-    instrument: or the path of its file (YAML); None if the frames' headers have the focal length.
-    calibration: A3 in place of the instrument's; without a known A3 the position error exceeds 1000 km, unless the night
-    is solved with self_calibrate=True. inclinometer: name of its model, in place of the instrument's; without a name or
-    stated errors it counts as an SCA100T as sold, 7 km or more.  atmosphere: None: not measured.
-    vertical: its deflection; None: not known.
-    place: where the instrument is known to be: each frame's `Shot.at_place` is its heading there, and tilt.csv may lack.
-    Raises StarposError if there is no frame, or the instrument's file cannot be used.
+    Parameters
+    ----------
+    folder : of the night
+    instrument : or the path of its file (YAML); None if the frames' headers have the focal length
+    calibration : A3 in place of the instrument's; without a known A3 the position error exceeds 1000 km, unless the night
+        is solved with self_calibrate=True
+    inclinometer : name of its model, in place of the instrument's; without a name or stated errors it counts as an
+        SCA100T as sold, 7 km or more
+    atmosphere : None: not measured
+    vertical : its deflection; None: not known
+    place : where the instrument is known to be: each frame's `Shot.at_place` is its heading there, and tilt.csv may lack
+
+    Returns
+    -------
+    NightOnDisk
+        its `solve` gives a Night
+
+    Raises
+    ------
+    StarposError
+        there is no frame, or the instrument's file cannot be used
+
+    Examples
+    --------
+    >>> starpos.open_night("night", instrument="instrument.yaml")
+    <night: 5 frames and tilt.csv, to be solved>
     """
     folder = Path(folder)
     if not folder.is_dir():

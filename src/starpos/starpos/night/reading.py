@@ -98,12 +98,14 @@ class Instruments:
     by_header: whether each frame's own header has its focal length, if it states one.
     cameras: of a bag, by (width, height) of their frames in px.
     any_size: whether frames of other sizes than the cameras' are the instrument's too.
+    sought: whether nothing states the focal length, and that of `instrument` stands in until the stars give it.
     """
 
     instrument: Instrument | None
     by_header: bool = False
     cameras: Mapping[tuple[int, int], Camera] = field(default_factory=dict)
     any_size: bool = True
+    sought: bool = False
 
     def framed(self, first: About) -> tuple["Instruments", tuple[Remark, ...]]:
         """Instruments of a night with this first frame, and a remark if the optical axis of its frames is not known."""
@@ -117,7 +119,7 @@ class Instruments:
         camera = self.cameras.get((frame.width, frame.height))
         if camera is not None and self.instrument is not None:
             return replace(self.instrument, camera=camera, focal_px=camera.fx)
-        if not self.any_size:
+        if not self.any_size or (self.sought and frame.focal_px is None):
             return None
         if not self.by_header or frame.focal_px is None:
             return self.instrument

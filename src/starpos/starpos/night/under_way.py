@@ -134,7 +134,7 @@ def navigate(
     imu : path of the IMU's CSV: utc_unix_s, gx, gy, gz (rad/s), ax, ay, az (m/s2)
     instrument : an Instrument, or the path of its file (YAML); its camera is mounted as link_to_camera says
     atmosphere : of refraction; None: not measured
-    progress : is told how far the work is
+    progress : is called with the share of the work that is done
     **records : the other fields of `Records`: imu_model, velocity, vehicle, mount_stddev_deg, drift_stddev,
         drift_change, height_m
 
@@ -153,7 +153,10 @@ def navigate(
 
     Examples
     --------
-    >>> voyage = starpos.navigate(sorted(Path("drive").glob("stars_*.csv")), "drive/imu.csv", instrument, vehicle="rover")
+    >>> lists, camera = sorted(Path("drive").glob("stars_*.csv")), starpos.Instrument(4635.9375)
+    >>> voyage = starpos.navigate(lists, "drive/imu.csv", camera, vehicle="rover", imu_model="drive/imu.yaml")
+    >>> voyage.fixes[-1].covariance.shape  # east m, north m, heading rad
+    (3, 3)
     """
     paths, read = tuple(map(str, frames)), Reader()
     known = instrument_file.read(instrument) if isinstance(instrument, (str, Path)) else instrument

@@ -84,10 +84,15 @@ class Solving:
     places: Places | None = None
     search_s: float | None = None
     progress: Progress = quiet
+    # focal length in px by size and EXIF's focal length of frames that state none
+    _found_px: dict = field(default_factory=dict, compare=False)
 
     def __call__(self, item: Frame | Stars) -> Sight:
         """The sight of a frame; InstrumentError if its focal length is unknown, and must not be."""
-        if self.search_s is not None and self.instruments.of(item) is None:
+        if self.instruments.sought and item.focal_px is None:
+            begin = time.process_time()
+            sight = self._by_sought_focal_length(item)
+        elif self.search_s is not None and self.instruments.of(item) is None:
             blind = BlindSolver(catalogue.load_catalogue(), self.progress, search_s=self.search_s)
             blind.prepare()
             begin = time.process_time()
@@ -105,9 +110,39 @@ class Solving:
                 sight = answer_frame(solver, question)
         return replace(sight, cpu_ms=1000 * (time.process_time() - begin))
 
+    def _by_sought_focal_length(self, item: Frame | Stars) -> Sight:
+        """The answer with the focal length of an earlier frame of this lens, else with the one that the stars give."""
+        stars, lens = stars_of(item), (item.width, item.height, item.rough_focal_px)
+        question = Question(item=item, stars=stars, tilts=self.tilts, places=self.places)
+        if lens in self._found_px:
+            sight = self._answer_at(self._found_px[lens], question)
+            if sight.found is not None or not sight.solution.lost:
+                return sight
+        blind = BlindSolver(catalogue.load_catalogue(), self.progress, search_s=self.search_s or SEARCH_S)
+        found = identify_blind_every_way(blind, item, stars)
+        if found.solution.pointing is None:
+            return found
+        focal_px, model = found.solution.pointing.focal_px, found.solution.pointing.model
+        sight = self._answer_at((focal_px, model), question)
+        if sight.found is None:
+            return sight
+        self._found_px[lens] = focal_px, model
+        remark = f"{item.place}: no focal length is stated: its stars give {focal_px:.0f} px"
+        return replace(sight, solution=replace(sight.solution, remark=sight.solution.remark or remark))
+
+    def _answer_at(self, lens: tuple[float, str], question: Question) -> Sight:
+        """The answer with this focal length in px and model of a lens."""
+        known = self.instruments.instrument
+        assert known is not None
+        known = replace(known, focal_px=lens[0], model=lens[1])
+        solver = Solver(known, catalogue.load_catalogue(), self.atmosphere, progress=self.progress)
+        return replace(answer_frame(solver, question), instrument=known)
+
     def solver(self, item: Frame | Stars) -> Solver:
         """The solver of a frame; InstrumentError if its focal length is unknown."""
         instrument = self.instruments.of(item)
+        if self.instruments.sought:
+            instrument = instrument or self.instruments.instrument
         if instrument is None:
             raise InstrumentError(
                 f"{item.place}: its header has no focal length: give instrument=Instrument(focal_px)"
@@ -116,7 +151,7 @@ class Solving:
 
     def after(self, sight: Sight, hint: Hint) -> Sight:
         """The sight of a frame that was not identified, if it looks where an earlier one did; else as it was."""
-        if self.tilts is None or not sight.solution.lost:
+        if self.tilts is None or not sight.solution.lost or self.instruments.sought:
             return sight
         solver = self.solver(sight.stars)
         answer = solver.solve(sight.stars, self.tilts, known=hint)
@@ -153,7 +188,7 @@ def identify(
     instrument : an Instrument, or the path of its file (YAML); None: the focal length is taken from the frame's header as
         a hint, and without one all scales are searched
     search_s : CPU time in s of the search at every scale
-    progress : is told how far long work is
+    progress : is called with the share of long work that is done
 
     Returns
     -------
@@ -232,8 +267,9 @@ def deflection(
     Examples
     --------
     >>> lists = sorted(Path("zenith").glob("stars_*.csv"))
-    >>> session = starpos.deflection(lists, "zenith/tilt.csv", (47.3, 8.5, 560.0), zenith)
-    >>> xi_arcsec, eta_arcsec = session.adjusted.xi_arcsec, session.adjusted.eta_arcsec
+    >>> session = starpos.deflection(lists, "zenith/tilt.csv", (61.2, 24.5, 900.0), "zenith/instrument.yaml")
+    >>> round(session.adjusted.xi_arcsec), round(session.adjusted.eta_arcsec)
+    (30, -12)
     """
     known = instrument_file.read(instrument) if isinstance(instrument, (str, Path)) else instrument
     air = Atmosphere.measured(None, None) if atmosphere is None else atmosphere

@@ -32,6 +32,8 @@ MAX_AT_ONCE = 1 << 30
 MCAP = b"\x89MCAP0\r\n"
 # rosbag2's names of the supported storages, .mcap and .db3
 STORAGES = ("mcap", "sqlite3")
+# the first bytes of a bag of ROS 1
+ROS1 = b"#ROSBAG"
 # bytes that stay free in the folder for temporary files, when a packed file is unpacked there
 LEFT_ON_DISK = 1 << 30
 
@@ -47,6 +49,12 @@ def check_folder(path: Path) -> None:
             raise BagError(
                 f"{file.name} is no regular file but a pipe, a socket or a device: give a bag's files"
             )
+    if path.is_file() and _begins_with(path, ROS1):
+        whole = path.with_suffix("")
+        raise BagError(
+            f"this is a bag of ROS 1: run `rosbags-convert --src {path.name} --dst {whole.name}` (pip install rosbags), "
+            f"and give {whole.name}"
+        )
     for file in sorted(path.glob("*.mcap")) if path.is_dir() else [path]:
         if file.suffix == ".mcap" and _is_cut_off(file):
             raise BagError(
@@ -65,6 +73,11 @@ def check_folder(path: Path) -> None:
             f"the storage_identifier in its metadata.yaml is {storage[:40]!r}: write there {' or '.join(STORAGES)}, as "
             "its files are, or name the file itself"
         )
+
+
+def _begins_with(file: Path, head: bytes) -> bool:
+    with open_regular(file) as content:
+        return content.read(len(head)) == head
 
 
 def _is_cut_off(file: Path) -> bool:

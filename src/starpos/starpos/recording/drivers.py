@@ -40,13 +40,9 @@ class Drivers:
         detector, inclinometer = (values_of(n, file, given, namespace) for n in ("detector", "inclinometer"))
         return cls(detector, inclinometer, remaps)
 
-    def begin(self) -> "DriverMessages":
-        """A DriverMessages for one bag."""
-        return DriverMessages(self)
-
 
 class DriverMessages:
-    """Takes the messages of a robot's drivers one after another, as the nodes detector and inclinometer do."""
+    """Takes the messages of a robot's drivers in one bag one after another, as the nodes detector and inclinometer do."""
 
     def __init__(self, drivers: Drivers) -> None:
         self._drivers = drivers

@@ -5,9 +5,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from starpos.averaging.average import Average
-from starpos.earth.vertical import Geodetic, Vertical, geodetic
+from starpos.earth.vertical import Geodetic
 from starpos.fix.camera_attitude import CameraAttitude
-from starpos.fix.fix import Fix
 from starpos.fix.solution import Solution
 from starpos.frames.frame import Stars
 from starpos.gnss.watch import GnssCheck
@@ -63,8 +62,3 @@ class Waiting:
         if not now.played:
             return self
         return replace(self, ahead_s=min(now.ahead_s(self.stars.mid_unix_s), self.ahead_s))
-
-
-def ground_of(place: Fix | Average, vertical: Vertical) -> Geodetic:
-    """Convert a fix or an average to a geodetic position."""
-    return geodetic(place.latitude, place.longitude, place.heading, place.covariance, vertical)

@@ -25,7 +25,6 @@ from starpos.gnss.states import Learned
 from starpos.gnss.watch import GnssStatus, GnssWatch
 from starpos.instrument.instrument import Instrument
 from starpos.session.driver import ANOTHER_TIME_S, Diagnosis, Heard, Jobs, Level, Log, Now, refusing
-from starpos.session.frames import ground_of
 from starpos.session.reports import AHEAD_S, ONE_CLOCK
 from starpos.session.settings import Settings
 from starpos.units import ARCSEC, utc_text
@@ -40,23 +39,6 @@ OLDEST_S = 5.0
 KEPT_S = 300.0
 # a fix that comes later than this after its stamp is of another clock, s
 MAX_LATE_S = 30.0
-
-
-def contradiction(gnss: Place, ground: Geodetic, utc_unix_s: float, speed: float) -> tuple[float, str]:
-    """How far GNSS's place lies from ours of a time, m, and a sentence where the two cannot both be right.
-
-    speed: of the vehicle, m/s, which goes on between the two times.
-    """
-    off = gnss.offset_m(ground.latitude, ground.longitude)
-    on_the_way = speed * (utc_unix_s - gnss.utc_unix_s)
-    claim = ground.covariance[:2, :2] + gnss.covariance + np.eye(2) * on_the_way**2
-    apart, sigmas = float(np.linalg.norm(off)), float(np.sqrt(off @ np.linalg.solve(claim, off)))
-    if sigmas < CONTRADICTION_SIGMAS:
-        return apart, ""
-    return apart, (
-        f"GNSS has a place {apart:.3g} m from here, {sigmas:.2g} times their stated errors: one of them is "
-        f"wrong"
-    )
 
 
 class RecentPlaces:
@@ -105,18 +87,18 @@ class RecentPlaces:
         return bisect_left(self._places, utc_unix_s, key=lambda p: p.utc_unix_s)
 
 
-class GnssComparison:
-    """Compares the newest fix with GNSS's place of its time; it never changes a fix."""
+class ComparedPlaces(RecentPlaces):
+    """Places of GNSS that are compared with a fix of their time; they never change a fix."""
 
     def __init__(self) -> None:
-        self._places = RecentPlaces(UNSTATED_M)
+        super().__init__(UNSTATED_M)
 
     def receive(self, message: Any, now: Now) -> None:
         """Keep the place of a sensor_msgs/NavSatFix; after one without a usable place nothing is compared."""
         try:
-            self._places.receive(message, now)
+            super().receive(message, now)
         except GnssError:
-            self._places.forget()
+            self.forget()
 
     def remark(self, answer: Solution | None, vertical: Vertical) -> str:
         """Sentence with the distance, where both places cannot be right; '' otherwise."""
@@ -124,13 +106,27 @@ class GnssComparison:
         if fix is None:
             return ""
         try:
-            gnss = self._places.at(fix.utc_unix_s)
+            gnss = self.at(fix.utc_unix_s)
         except GnssError:
-            gnss = None
-        if gnss is None:
             return ""
-        _, wrong = contradiction(gnss, ground_of(fix, vertical), fix.utc_unix_s, 0.0)
+        wrong = "" if gnss is None else contradiction(gnss, fix.on_ground(vertical), fix.utc_unix_s, 0.0)[1]
         return f"{wrong}: check how frames are turned, A3 and the inclinometer's axes" if wrong else ""
+
+
+def contradiction(gnss: Place, ground: Geodetic, utc_unix_s: float, speed: float) -> tuple[float, str]:
+    """How far GNSS's place lies from ours of a time, m, and a sentence where the two cannot both be right.
+
+    speed: of the vehicle, m/s, which goes on between the two times.
+    """
+    off = gnss.offset_m(ground.latitude, ground.longitude)
+    on_the_way = speed * (utc_unix_s - gnss.utc_unix_s)
+    claim = ground.covariance[:2, :2] + gnss.covariance + np.eye(2) * on_the_way**2
+    apart, sigmas = float(np.linalg.norm(off)), float(np.sqrt(off @ np.linalg.solve(claim, off)))
+    if sigmas < CONTRADICTION_SIGMAS:
+        return apart, ""
+    return apart, (
+        f"GNSS has a place {apart:.3g} m from here, {sigmas:.2g} times their stated errors: one of them is wrong"
+    )
 
 
 GNSS_TOPIC = "gnss/fix"

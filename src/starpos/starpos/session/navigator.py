@@ -30,7 +30,7 @@ from starpos.navigation.sightings import PlacelessFrame, body_attitude
 from starpos.navigation.vessel import PARKED, Vessel, check_drift
 from starpos.navigation.voyage import MIN_FRAMES, Voyage
 from starpos.session.driver import Changes, Diagnosis, Heard, Jobs, Level, Log, Now, Outcome, refusing
-from starpos.session.gnss import OLDEST_S, UNSTATED_M, RecentPlaces, contradiction
+from starpos.session.gnss import OLDEST_S, ComparedPlaces, contradiction
 from starpos.session.reports import AHEAD_S
 from starpos.session.settings import MIN_CLOCK_S, NodeSettings, atmosphere_of
 
@@ -127,7 +127,7 @@ class NavigatorSession:
         # of the newest frame that the estimate is made of
         self._seen_s = -math.inf
         self._clock_stddev_s = 0.0
-        self._gnss = RecentPlaces(UNSTATED_M)
+        self._gnss = ComparedPlaces()
         # marks outcomes of jobs that began before as out of date
         self._voyage = object()
 
@@ -213,10 +213,7 @@ class NavigatorSession:
 
     def receive_gnss(self, message: Any, now: Now) -> list[Navigated]:
         """Take a sensor_msgs/NavSatFix of satellites: it is compared, not fused."""
-        try:
-            self._gnss.receive(message, now)
-        except GnssError:
-            self._gnss.forget()
+        self._gnss.receive(message, now)
         self._heard.came("gnss/fix")
         return []
 
@@ -307,7 +304,10 @@ class NavigatorSession:
         if estimate is None or self._stars_missing:
             return Navigated(utc_unix_s=time_s)
         self.counts["fixes"] += 1
-        ground, (displacement, covariance) = self._ground(estimate.fix), self._displacement(estimate)
+        ground, (displacement, covariance) = (
+            self._ground(estimate.fix),
+            self._displacement(estimate),
+        )
         return Navigated(
             utc_unix_s=time_s,
             fix=estimate.fix,

@@ -70,7 +70,7 @@ class Replay:
 
         Raises BagError if the bag cannot be read, FrameError if neither an instrument nor a robot's images are in it.
         """
-        now_ns, messages = 0, self._drivers.begin()
+        now_ns, messages = 0, DriverMessages(self._drivers)
         with BagReader(path, typed=True) as bag:
             topics = INPUTS if self.session.gnss is None else INPUTS | GNSS
             chosen = instrument_in(bag, path, namespace, topics, (STARS,), self._drivers.remaps)
@@ -166,7 +166,22 @@ def _tilt_message(log: TiltLog, k: int) -> Reading:
 
 @dataclass(kw_only=True)
 class PlayedNight:
-    """The result of a bag: frames read, solutions, the average of its place, sentences; trouble: why it broke off."""
+    """The result of a bag.
+
+    Attributes
+    ----------
+    frames : number of frames read
+    solutions : of these frames
+    average : of their places; None without one
+    said : sentences
+    trouble : why it broke off; '' if it did not
+
+    Examples
+    --------
+    >>> played = starpos.replay("night.zip")
+    >>> played.average.frames, played.trouble
+    (5, '')
+    """
 
     instrument: Instrument
     frames: int = 0
@@ -295,6 +310,6 @@ def replay(
     --------
     >>> played = starpos.replay("night.zip")
     >>> played.summary
-    '4 frames, 4 answers, 4 fixes'
+    '5 frames, 5 answers, 5 fixes'
     """
     return Playing(None if params_file is None else Path(params_file), tuple(parameters), namespace)(str(bag))

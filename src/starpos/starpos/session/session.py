@@ -32,7 +32,7 @@ from starpos.session.calibrating import Calibrating, Seen
 from starpos.session.camera_solver import CameraSolver
 from starpos.session.deflection import LiveDeflection
 from starpos.session.driver import Changes, Heard, Jobs, Log, Now, Sent, refusing
-from starpos.session.frames import Answered, Averaged, Output, Waiting, ground_of
+from starpos.session.frames import Answered, Averaged, Output, Waiting
 from starpos.session.gnss import GnssTeacher, SessionPlaces
 from starpos.session.gyro import Gyro
 from starpos.session.pace import MAX_WAITING, Backlog, Pace
@@ -424,7 +424,7 @@ class SolverSession:
         )
         if place is None:
             return []
-        return [Averaged(frame.header.stamp, place, ground_of(place, self._settings.vertical))]
+        return [Averaged(frame.header.stamp, place, place.on_ground(self._settings.vertical))]
 
     def _note(self, answer: Solution, now: Now) -> None:
         """Note the answer to the newest frame."""
@@ -437,7 +437,7 @@ class SolverSession:
 
     def _output(self, stamp: Any, answer: Solution) -> Answered:
         no_camera = self.instrument.solver is None and self.instrument.camera is None
-        ground = None if answer.fix is None else ground_of(answer.fix, self._settings.vertical)
+        ground = None if answer.fix is None else answer.fix.on_ground(self._settings.vertical)
         return Answered(stamp=stamp, solution=answer, ground=ground, no_camera=no_camera)
 
     def solve_again(self) -> Answered | None:

@@ -206,8 +206,11 @@ def photograph(
     turns_deg: Sequence[float],
     frames: int,
     rng: np.random.Generator,
-) -> tuple[list[Stars], TiltLog, float]:
-    """Frames at several headings, with a turn by hand in between; returns stars, tilts and the last heading (rad)."""
+) -> tuple[list[Stars], np.ndarray, float]:
+    """Frames at several headings, with a turn by hand in between; returns stars, readings and the last heading (rad).
+
+    readings (N, 4): Unix s, theta_x, theta_y in rad, deg C.
+    """
     stars: list[Stars] = []
     rows: list[tuple[float, ...]] = []
     now = begin
@@ -233,9 +236,11 @@ def photograph(
                 rows.append((moment, *read_tilt(shaky, 0.0, rng), 15.0 + warm))
             now += CADENCE_S
         now += TURN_S
-    unix_s, theta_x, theta_y, temperature_c = np.array(rows).T
-    log = TiltLog.of(unix_s, theta_x, theta_y, temperature_c, world.told.inclinometer.noise_rad)
-    return stars, log, scene.heading
+    return stars, np.array(rows), scene.heading
+
+
+def _tilt_log(world: NightWorld, readings: np.ndarray) -> TiltLog:
+    return TiltLog.of(*readings.T, noise_rad=world.told.inclinometer.noise_rad)
 
 
 def turned_night(
@@ -250,11 +255,11 @@ def turned_night(
     """A night of an instrument with unknown A3 that is turned on the spot."""
     world, begin = draw(rng, catalogue, errors, clock_stddev_s, camera)
     turns = [k * 360 / headings for k in range(headings)]
-    stars, tilts, heading = photograph(world, Zero(errors, rng, begin), begin, turns, frames, rng)
+    stars, readings, heading = photograph(world, Zero(errors, rng, begin), begin, turns, frames, rng)
     solver = Solver(world.told, catalogue, world.air)
 
     def answer() -> Average:
-        return average(turn(solver, stars, tilts).fixes)
+        return average(turn(solver, stars, _tilt_log(world, readings)).fixes)
 
     return _outcome("turned", answer, world.site, heading, rng)
 
@@ -270,17 +275,10 @@ def calibrated_night(
     """A night after a calibration: calibrated at a known place with two leans, days before at another place."""
     world, begin = draw(rng, catalogue, errors, clock_stddev_s, camera)
     zero = Zero(errors, rng, begin)
-    stars, tilts, _ = photograph(world, zero, begin, [0.0], frames, rng)
+    stars, before, _ = photograph(world, zero, begin, [0.0], frames, rng)
     lower = replace(world, scene=replace(world.scene, altitude_deg=world.scene.altitude_deg - 5))
-    more, readings, _ = photograph(lower, zero, begin + 3600, [0.0], frames, rng)
-    tilts = TiltLog(
-        *(
-            np.concatenate([getattr(log, n) for log in (tilts, readings)])
-            for n in ("utc_unix_s", "theta_x", "theta_y")
-        ),
-        temperature_c=np.concatenate([tilts.temperature_c, readings.temperature_c]),
-        covariance=np.concatenate([tilts.covariance, readings.covariance]),
-    )
+    more, after, _ = photograph(lower, zero, begin + 3600, [0.0], frames, rng)
+    tilts = _tilt_log(world, np.concatenate([before, after]))
     solver = Solver(world.told, catalogue, world.air)
     later = begin + DAY_S * rng.uniform(0.1, 20)
     there = at_place(world, rng, later)
@@ -288,11 +286,11 @@ def calibrated_night(
         there, scene=replace(there.scene, altitude_deg=there.scene.altitude_deg + rng.normal(0, 1.0))
     )
 
-    shots, levels, heading = photograph(there, zero, later, [0.0], frames, rng)
+    shots, readings, heading = photograph(there, zero, later, [0.0], frames, rng)
 
     def answer() -> Average:
         found = calibrate_at(solver, stars + more, tilts, world.site.place)
-        ready = replace(solver, instrument=found.instrument)
+        ready, levels = replace(solver, instrument=found.instrument), _tilt_log(there, readings)
         solutions = [ready.solve(s, levels) for s in shots]
         return average([s.fix for s in solutions if s.fix])
 

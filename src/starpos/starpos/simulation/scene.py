@@ -225,7 +225,31 @@ def scene_of(
     readout_s: float = 0.0,
     lens: str = PLUMB_BOB,
 ) -> Scene:
-    """The paper's instrument at a place; plain numbers for what is usually varied."""
+    """The paper's instrument at a place; plain numbers for what is usually varied.
+
+    Parameters
+    ----------
+    size : (width, height) of the frames, px
+    focal_px : focal length, px
+    latitude_deg, longitude_deg : of the place, astronomic
+    atmosphere : its air
+    pointing_deg : azimuth and altitude of the optical axis, and the camera's roll about it
+    misalignment_deg : A3's three angles
+    tilt_noise_deg, tilt_zero_deg : noise of the inclinometer's readings, and the error of its zero
+    readout_s : time from the row read first to the last
+    lens : its model
+
+    Returns
+    -------
+    Scene
+        what `write_night` simulates
+
+    Examples
+    --------
+    >>> scene = starpos.scene_of((1000, 700), 4635.9375, latitude_deg=52.0, longitude_deg=4.4)
+    >>> scene.site.latitude_deg
+    52.0
+    """
     azimuth_deg, altitude_deg, roll_deg = pointing_deg
     return Scene(
         camera=Camera.from_focal(size[0], size[1], focal_px, lens),
@@ -303,9 +327,35 @@ def write_night(
 ) -> None:
     """Write `frames` exposures of a scene that turns by turn_deg of azimuth from one to the next.
 
-    pixel_um: with the focal length in px it makes the headers' focal length in mm.
-    A simulated night that is in the folder is replaced. Raises FrameError if the folder holds frames or tilts that were
-    not simulated, or cannot be written.
+    Parameters
+    ----------
+    folder : of the night; a simulated night that is in it is replaced
+    scene : instrument, place and pointing of the first frame
+    catalogue : of the stars in the sky
+    start_utc : start of the first exposure, ISO 8601
+    frames, cadence_s, exposure_s : number of exposures, time from start to start, and length of each, s
+    turn_deg : turn of azimuth from frame to frame
+    stars_only : whether lists of stars (CSV) are written in place of frames (FITS)
+    rng : of all noise
+    progress : is called with the share of the work that is done
+    pixel_um : with the focal length in px it makes the headers' focal length in mm
+
+    Returns
+    -------
+    None
+
+    Raises
+    ------
+    FrameError
+        the folder holds frames or tilts that were not simulated, or cannot be written
+
+    Examples
+    --------
+    >>> scene, sky = starpos.scene_of((1000, 700), 4635.9375), starpos.load_catalogue()
+    >>> noise = np.random.default_rng(1)
+    >>> starpos.write_night("mine", scene, sky, "2026-11-02T18:00:00", 2, 5.0, 0.5, 0.0, True, noise)
+    >>> starpos.open_night("mine")
+    <mine: 2 frames and tilt.csv, to be solved>
     """
     begin = unix_of(start_utc)
     folder = Path(folder)

@@ -11,8 +11,9 @@ import math
 import os
 import zipfile
 import zlib
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 from itertools import pairwise
 from pathlib import Path
 
@@ -63,8 +64,8 @@ def rows_near(cell_start: np.ndarray, centre: np.ndarray, radius_rad: float) -> 
     return np.concatenate([np.arange(cell_start[begin], cell_start[end]) for begin, end in runs])
 
 
-# Parallaxes of the near stars, which Tycho-2 does not have (columns tyc1, tyc2, tyc3, parallax_mas): of the stars of
-# Hipparcos (ESA SP-1200, 1997) of at least this, and of stars within 8 arcsec of one. tools/data/near_stars.py makes the
+# Parallaxes of the near stars, which Tycho-2 does not have (columns tyc1, tyc2, tyc3, parallax_mas). These are stars of
+# Hipparcos (ESA SP-1200, 1997) of at least this, and stars within 8 arcsec of one. tools/data/near_stars.py makes the
 # table of Stellarium's list, which has later values for some. Hipparcos' own err by 1 to 3 mas, of some pairs more.
 NEAR_MIN_MAS, PARALLAXES = 100.0, Path(__file__).with_name("data") / "near_stars.csv"
 
@@ -109,17 +110,26 @@ Rows = np.ndarray | slice
 class Catalogue:
     """N stars sorted by declination zone, then right ascension; integers as stored, so that loading is quick.
 
-    ra_mas, dec_mas  (N,) ICRS at J2000.0, mas
-    pm_ra, pm_dec    (N,) mas/yr, pm_ra times cos(dec)
-    vmag_centi       (N,) V in 0.01 mag
-    sigma_code       (N,) code of the position's error at the mean epoch
-    pm_sigma_code    (N,) code of the proper motion's error
-    epoch_code       (N,) mean epoch, years after EPOCH_ZERO
-    tyc              (N, 3) Tycho identifier
-    hip              (N,) Hipparcos number, 0 for none
-    zone_start       (181,) first row of each zone of 1 deg of declination, and the end
-    pm_ra_centi, pm_dec_centi  (N,) what the motions are more than pm_ra and pm_dec, 0.01 mas/yr
-    parallax_tenths  (N,) parallax, 0.1 mas, 0 if unknown
+    Attributes
+    ----------
+    ra_mas, dec_mas : (N,) ICRS at J2000.0, mas
+    pm_ra, pm_dec : (N,) mas/yr, pm_ra times cos(dec)
+    vmag_centi : (N,) V in 0.01 mag
+    sigma_code : (N,) code of the position's error at the mean epoch
+    pm_sigma_code : (N,) code of the proper motion's error
+    epoch_code : (N,) mean epoch, years after EPOCH_ZERO
+    tyc : (N, 3) Tycho identifier
+    hip : (N,) Hipparcos number, 0 for none
+    zone_start : (181,) first row of each zone of 1 deg of declination, and the end
+    pm_ra_centi, pm_dec_centi : (N,) what the motions are more than pm_ra and pm_dec, 0.01 mas/yr
+    parallax_tenths : (N,) parallax, 0.1 mas, 0 if unknown
+
+    Examples
+    --------
+    >>> stars = starpos.load_catalogue()
+    >>> magnitudes = stars.vmag(np.arange(len(stars.hip)))
+    >>> 40 < sum((magnitudes < 2.0).tolist()) < 60
+    True
     """
 
     ra_mas: np.ndarray
@@ -227,6 +237,10 @@ class Catalogue:
         motion = SMALLEST_MAS_YEAR * CODE_STEP ** self.pm_sigma_code[index].astype(float) * years
         return np.hypot(SMALLEST_MAS * CODE_STEP ** self.sigma_code[index].astype(float), motion) * MAS
 
+    def named(self, index: np.ndarray) -> "NamedStars":
+        """The stars of the rows `index` (n,), whose names and V magnitudes are looked up when they are asked for."""
+        return NamedStars(len(index), partial(self.labels, index))
+
     def labels(self, index: np.ndarray) -> tuple[tuple[str, ...], np.ndarray]:
         """Names and V magnitudes (n,) of the rows `index` (n,)."""
         return self._labels.of(np.ascontiguousarray(index, np.intp))
@@ -242,6 +256,47 @@ class Catalogue:
             index = index[self.vmag_centi[index] < limit_mag * 100]
         index = index[self.directions(index) @ centre >= np.cos(radius_rad)]
         return index[np.argsort(self.vmag_centi[index], kind="stable")]
+
+
+class NamedStars:
+    """Names and V magnitudes of M stars, which are looked up when they are first asked for, compared or pickled."""
+
+    def __init__(self, number: int, look_up: Callable[[], tuple[tuple[str, ...], np.ndarray]]) -> None:
+        self._number, self._look_up = number, look_up
+
+    def __len__(self) -> int:
+        return self._number
+
+    @cached_property
+    def labels(self) -> tuple[tuple[str, ...], np.ndarray]:
+        """Names, and V magnitudes (M,)."""
+        return self._look_up()
+
+    def of_rows(self, row: np.ndarray) -> "NamedStars":
+        """The stars in these rows (n,)."""
+
+        def look_up() -> tuple[tuple[str, ...], np.ndarray]:
+            names, magnitudes = self.labels
+            return tuple(names[k] for k in row), magnitudes[row]
+
+        return NamedStars(len(row), look_up)
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, NamedStars):
+            return NotImplemented
+        (names, magnitudes), (others, theirs) = self.labels, other.labels
+        return names == others and np.array_equal(magnitudes, theirs, equal_nan=True)
+
+    def __hash__(self) -> int:
+        return hash(self.labels[0])
+
+    def __reduce__(self) -> tuple[object, ...]:
+        return named_stars, self.labels
+
+
+def named_stars(names: tuple[str, ...], magnitudes: np.ndarray) -> NamedStars:
+    """Stars of which names and V magnitudes (M,) are known."""
+    return NamedStars(len(names), lambda: (names, magnitudes))
 
 
 def pack(
@@ -411,6 +466,25 @@ def load_catalogue(path: str | None = None) -> Catalogue:
     """The catalogue at `path`, else the file named by STARPOS_CATALOGUE, else the committed one; each is read once.
 
     The committed one is kept unpacked in the cache, by its contents, and memory-mapped from there.
+
+    Parameters
+    ----------
+    path : of a catalogue's file; None: as above
+
+    Returns
+    -------
+    Catalogue
+        shared by all callers
+
+    Raises
+    ------
+    CatalogueError
+        the file is missing or broken
+
+    Examples
+    --------
+    >>> starpos.load_catalogue() is starpos.load_catalogue()
+    True
     """
     if named := path or os.environ.get("STARPOS_CATALOGUE"):
         return read(named)

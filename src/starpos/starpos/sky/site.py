@@ -15,7 +15,14 @@ from starpos.sky.catalogue import Catalogue
 
 @dataclass(frozen=True)
 class Site:
-    """A place, by its astronomic latitude and longitude in deg, and its air."""
+    """A place, by its astronomic latitude and longitude in deg, and its air.
+
+    Examples
+    --------
+    >>> site = starpos.Site(35.7046, 51.4106)
+    >>> site.enu.shape  # rows east, north, up in ITRS
+    (3, 3)
+    """
 
     latitude_deg: float
     longitude_deg: float

@@ -198,7 +198,15 @@ def _steps(found: Adjusted, columns: np.ndarray) -> tuple[np.ndarray, float, int
 
 @dataclass(frozen=True, eq=False)
 class DeflectionSession:
-    """A session: its sightings in order of time, and the deflection that they give."""
+    """A session: its sightings in order of time, and the deflection that they give.
+
+    Examples
+    --------
+    >>> lists = sorted(Path("zenith").glob("stars_*.csv"))
+    >>> session = starpos.deflection(lists, "zenith/tilt.csv", (61.2, 24.5, 900.0), "zenith/instrument.yaml")
+    >>> len(session.sightings)
+    8
+    """
 
     sightings: tuple[ZenithSighting, ...]
     adjusted: Adjusted

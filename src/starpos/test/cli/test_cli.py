@@ -229,7 +229,7 @@ BAD_CALLS = {
     "no frame": ("solve",),
     "no tilt": ("identify",),
     "half a focal length": ("identify", "STARS", "--focal-mm", "600"),
-    "no focal length": ("solve", "BARE", "--tilt", "TILT"),
+    "no focal length": ("navigate", "BARE", "--tilt", "TILT"),
     "a negative focal length": ("identify", "STARS", "--focal-mm=-600", "--pixel-um", "6"),
     "a focal length of nan": ("identify", "STARS", "--focal-mm", "nan", "--pixel-um", "6"),
     "a word for a number": ("identify", "STARS", "--focal-mm", "long", "--pixel-um", "6"),

@@ -161,7 +161,7 @@ def test_a_frame_without_a_tilt_and_one_that_is_none(skies, run, tmp_path):
 
 REFUSED = {
     "nothing": ((), 2, "give --camera OUT.yaml"),
-    "no focal length": (("--camera", "OUT"), 2, "no focal length"),
+    "half a focal length": (("--camera", "OUT", "--focal-mm", "40"), 2, "belong together"),
     "wrong focal length": (("--camera", "OUT", "--focal-mm", "40", "--pixel-um", "10"), 1, "no part of the sky matches"),
     "two instruments": (("--camera", "OUT", *OPTICS, "--instrument", "x.yaml"), 2, "give either"),
     "no such instrument": (("--camera", "OUT", "--instrument", "x.yaml"), 2, "x.yaml: not a readable"),

@@ -1,78 +1,35 @@
 # SPDX-License-Identifier: Apache-2.0
 """`starpos deflection`, on lists of the stars above a place whose plumb line differs from the ellipsoid's normal."""
 
-import json
 import re
 
 import numpy as np
 import pytest
 from cli_calls import objects
 
-from starpos import rotation
-from starpos.earth.orientation import earth_state
-from starpos.earth.refraction import Atmosphere
 from starpos.errors import InstrumentError
 from starpos.frames.reading import read_frame
-from starpos.instrument.camera import Camera
 from starpos.instrument.tilt_table import read_tilt_csv
 from starpos.session.driver import Level
 from starpos.session.replay import Replay
 from starpos.session.settings import Settings
-from starpos.sky.site import Site
-from starpos.units import ARCSEC, utc_text
-
-LATITUDE, LONGITUDE, HEIGHT_M = 61.2, 24.5, 900.0
-# large, so that refraction towards the plumb line, not the ellipsoid's normal, is 7 mas of it
-XI, ETA = 30.0, -12.0
-BEGIN = 1.75e9
-CAMERA = Camera.from_focal(1000, 700, 4636.0)
-INSTRUMENT = """starpos_instrument: 1
-camera: {focal_mm: 29.6704, pixel_um: 6.4}
-tilt_noise_deg: 1.0e-5
-tilt_quantum_deg: 1.0e-7
-tilt_drift_arcsec_per_sqrt_hour: 0.01
-tilt_temperature_arcsec_per_c: 0
-tilt_scale: 1.0e-4
-clock_stddev_s: 1.0e-4
-shutter: {readout_s: 0, readout_stddev_s: 0}
-"""
+from starpos_testing.skies.folders import (
+    ETA,
+    HEIGHT_M,
+    LATITUDE,
+    LONGITUDE,
+    XI,
+    ZENITH_CAMERA,
+    write_zenith_session,
+)
 
 
 @pytest.fixture(scope="module")
 def session(tmp_path_factory, catalogue):
     """Four faces of two star lists each, their tilts and the instrument's file."""
     folder = tmp_path_factory.mktemp("zenith")
-    rng = np.random.default_rng(5)
-    cosine = np.cos(np.radians(LATITUDE))
-    air = Atmosphere(pressure_pa=90_000.0, temperature_c=5.0, humidity=0.3)
-    # far from the poles: Phi = phi + xi, Lambda = lambda + eta / cos(phi)
-    site = Site(LATITUDE + XI / 3600, LONGITUDE + ETA / 3600 / cosine, air)
-    a3 = rotation.about_axis(2, np.radians(95.0)) @ rotation.from_vector([0.003, -0.004, 0.0])
-    rows = ["utc_unix_s,theta_x_deg,theta_y_deg"]
-    for k in range(8):
-        level = rotation.from_vector([*rng.normal(0, 20, 2) * ARCSEC, 0.0])
-        sensor = level @ rotation.about_axis(2, np.radians(90.0 * (k // 2) + 3))
-        at = BEGIN + 40.0 * k
-        # readings in units of 1e-7 deg, with a little noise
-        theta = np.degrees(np.arcsin(sensor[:2, 2])) + rng.normal(0, 3e-6, (5, 2))
-        rows += [f"{at - 0.2 + 0.1 * j:.3f},{x:.7f},{y:.7f}" for j, (x, y) in enumerate(theta)]
-        _list(folder / f"stars_{k}.csv", catalogue, site, at, a3.T @ sensor)
-    (folder / "tilt.csv").write_text("\n".join(rows) + "\n")
-    (folder / "instrument.yaml").write_text(INSTRUMENT)
+    write_zenith_session(folder, catalogue)
     return folder
-
-
-def _list(path, catalogue, site, at, axes):
-    """Write the stars that a camera with these axes (rows, in east, north, up) sees."""
-    state = earth_state(at)
-    index = site.overhead(catalogue, state, axes[2], CAMERA.half_diagonal_rad, 7.5)
-    xy = CAMERA.project(site.observed(catalogue, index, state) @ axes.T)
-    on = ((xy > 2) & (xy < [997, 697])).all(1)
-    flux = 10 ** (-0.4 * (catalogue.vmag(index) - 14))
-    head = {"DATE-OBS": utc_text(at - 0.25).rstrip("Z"), "EXPTIME": 0.5, "NAXIS1": 1000, "NAXIS2": 700}
-    stars = np.column_stack([xy, flux, np.full(len(flux), 0.01)])[on]
-    text = "\n".join(",".join(f"{v:.5f}" for v in star) for star in stars)
-    path.write_text(f"# {json.dumps(head)}\nx,y,flux,sigma\n{text}\n")
 
 
 def arguments(folder, latitude=LATITUDE, frames="stars_*.csv"):
@@ -116,7 +73,7 @@ def recorded(session, tmp_path_factory):
 
     path = tmp_path_factory.mktemp("recorded") / "bag"
     with NightBag(path) as bag:
-        bag.camera(CAMERA.fx, CAMERA.width, CAMERA.height)
+        bag.camera(ZENITH_CAMERA.fx, ZENITH_CAMERA.width, ZENITH_CAMERA.height)
         for name in sorted(session.glob("stars_*.csv")):
             bag.stars(read_frame(name))
         bag.tilts(read_tilt_csv(session / "tilt.csv"))

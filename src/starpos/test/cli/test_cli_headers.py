@@ -99,7 +99,8 @@ def test_a_frame_without_a_sound_time_has_no_fix_and_is_identified_all_the_same(
     paths = changed(lists, tmp_path, **cards)
     status, answer, errors = solve(paths, *KNOWN)
     assert (status, answer) == (1, None)
-    assert all(f"no time of exposure: {words}" in line or words in line for line in errors) and errors
+    # the same sentence is printed once, whatever the number of frames
+    assert 1 <= sum(words in line for line in errors) < len(paths)
     assert run("identify", paths[0], *WIDE, "--json")[0] == 0
 
 

@@ -8,62 +8,22 @@ import numpy as np
 import pytest
 from cli_calls import AIR, WIDE, objects
 
-from starpos.earth.orientation import earth_state
 from starpos.earth.refraction import Atmosphere
-from starpos.frames.frame import Stars
-from starpos.frames.tables import write_star_list
-from starpos.instrument.camera import Camera
 from starpos.instrument.instrument import AxisDoubt, Instrument
 from starpos.night.under_way import Records
-from starpos.sky.site import Site
-from starpos.units import utc_text
 from starpos_testing.command_line import run
+from starpos_testing.skies.folders import write_drive
 from starpos_testing.voyages import INDUSTRIAL, made
 
 KEYS = {"file", "utc_unix_s", "latitude", "longitude", "heading", "covariance", "velocity", "gyro_bias", "accel_bias",
         "status", "latitude_geodetic", "longitude_geodetic", "covariance_geodetic"}  # fmt: skip
-EXPOSURE_S, SIGMA_PX = 0.02, 0.1
-CAMERA = Camera.from_focal(1000, 700, 29670 / 6.4)
 
 
 @pytest.fixture(scope="module")
 def voyage(tmp_path_factory, catalogue):
     """The folder of a drive, and its truth."""
-    folder, record, rng = (
-        tmp_path_factory.mktemp("voyage"),
-        made("rover", 80, 2, cadence_s=2.0),
-        np.random.default_rng(1),
-    )
-    air = Atmosphere(pressure_pa=100_000.0, temperature_c=5.0)
-    for k, t in enumerate(record.frames_s):
-        state = earth_state(t)
-        site = Site(*np.degrees([record.latitude[k], record.longitude[k]]), air)
-        camera_to_enu = site.enu @ record.body_to_itrs[k] @ record.mount
-        index = site.overhead(catalogue, state, camera_to_enu[:, 2], CAMERA.half_diagonal_rad, 7.0)
-        xy = CAMERA.project(site.observed(catalogue, index, state) @ camera_to_enu)
-        xy = (xy + rng.normal(0, SIGMA_PX, xy.shape))[((xy > 0) & (xy < [999, 699])).all(1)]
-        stars = Stars(
-            x=xy[:, 0],
-            y=xy[:, 1],
-            flux=np.linspace(1000, 10, len(xy)),
-            snr=np.full(len(xy), 50.0),
-            covariance=np.tile(np.eye(2) * SIGMA_PX**2, (len(xy), 1, 1)),
-            flags=np.zeros(len(xy)),
-            width=1000,
-            height=700,
-            exposure_s=EXPOSURE_S,
-        )
-        write_star_list(folder / f"stars_{k:03d}.csv", stars, utc_text(t - EXPOSURE_S / 2).rstrip("Z"))
-    imu = np.column_stack([record.imu.utc_unix_s, record.imu.gyro, record.imu.force])
-    log = np.column_stack([record.velocity.utc_unix_s, record.velocity.velocity, record.velocity.sigma])
-    for name, columns, table in (
-        ("imu.csv", "utc_unix_s,gx,gy,gz,ax,ay,az", imu),
-        ("velocity.csv", "utc_unix_s,vx,vy,vz,sigma", log),
-    ):
-        np.savetxt(folder / name, table, fmt="%.9f", delimiter=",", header=columns, comments="")
-    (folder / "imu.yaml").write_text(
-        "".join(f"{name}: {value:.6e}\n" for name, value in asdict(INDUSTRIAL).items())
-    )
+    folder, record = tmp_path_factory.mktemp("voyage"), made("rover", 80, 2, cadence_s=2.0)
+    write_drive(folder, catalogue, record)
     return folder, record
 
 
@@ -132,7 +92,7 @@ def test_faults_are_told_and_a_frame_without_readings_has_no_answer(voyage, caps
     [
         ("time,gx\n1,2\n", "it has no column utc_unix_s"),
         ("utc_unix_s,gx,gy,gz,ax,ay,az\n", "has no rows"),
-        ("utc_unix_s,gx,gy,gz,ax,ay,az\n1,2,3,4,5,6,seven\n", "not a readable table of inertial readings"),
+        ("utc_unix_s,gx,gy,gz,ax,ay,az\n1,2,3,4,5,6,seven\n", "bad.csv:2: az is 'seven', which is no number"),
         ("utc_unix_s,gx,gy,gz,ax,ay,az\n1793700000,0,0,0,0,0,9.8\n", "at least 100 are needed"),
     ],
 )

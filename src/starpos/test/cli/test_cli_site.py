@@ -193,7 +193,7 @@ REFUSED = {
     "a file for a folder": ((*PLACE, "TILT", "-o", "/dev/null/mine.yaml", *OPTICS), "the file cannot be written there"),
     "no such tilts": ((*PLACE, "--tilt", "none.csv", "-o", "OUT", *OPTICS), "none.csv"),
     "two instruments": ((*PLACE, "TILT", "-o", "OUT", *OPTICS, "--instrument", "x.yaml"), "give either"),
-    "no optics": ((*PLACE, "TILT", "-o", "OUT"), "no focal length"),
+    "half the optics": ((*PLACE, "TILT", "-o", "OUT", "--pixel-um", "4"), "belong together"),
 }  # fmt: skip
 
 

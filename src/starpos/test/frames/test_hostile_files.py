@@ -26,7 +26,7 @@ def refused(path):
     with pytest.raises(FrameError) as raised:
         read_frame(path)
     text = str(raised.value)
-    assert text.startswith(f"{path}") and text.endswith(".") and "\n" not in text and len(text) < 600
+    assert text.startswith(f"{path}") and "\n" not in text and len(text) < 600
     return text
 
 

@@ -45,25 +45,25 @@ def test_other_tables_that_can_be_read(text, tmp_path):
 
 
 REFUSED = {
-    "nothing": ("", "needs a first line with the names"),
-    "no row": (FULL, "and a row a frame"),
-    "other names": ("utc,ra,dec,sigma\n1,2,3,4\n", "needs a first line"),
-    "a name twice": (FULL.strip() + ",ra_deg\n" + ROW.strip() + ",3\n", "each once"),
+    "nothing": ("", "no column utc_unix_s"),
+    "no row": (FULL, "has no rows"),
+    "other names": ("utc,ra,dec,sigma\n1,2,3,4\n", "no column utc_unix_s"),
+    "a name twice": (FULL.strip() + ",ra_deg\n" + ROW.strip() + ",3\n", "no column ra_deg, or two"),
     "a short row": (FULL + "1,2,3\n", "table.csv:2: the row has not as many cells"),
     "a long row": (FULL + ROW.strip() + ",7\n", "the row has not as many cells"),
-    "words": (FULL + ROW.replace("44.29", "north"), "dec_deg is 'north'; give a number from -90 to 90"),
-    "nan": (FULL + ROW.replace("13.83", "nan"), "ra_deg is 'nan'"),
-    "infinity": (FULL + ROW.replace("1793642400.25", "inf"), "utc_unix_s is 'inf'"),
-    "beyond the pole": (FULL + ROW.replace("44.29", "91"), "dec_deg is '91'"),
-    "no error": (FULL + ROW.replace("1.5", "0"), "sigma_arcsec is '0'"),
-    "a negative error": (FULL + ROW.replace(",20", ",-20"), "sigma_roll_arcsec is '-20'"),
+    "words": (FULL + ROW.replace("44.29", "north"), "table.csv:2: dec_deg is 'north', which is no number"),
+    "nan": (FULL + ROW.replace("13.83", "nan"), "ra_deg is empty: give a number from -360 to 360"),
+    "infinity": (FULL + ROW.replace("1793642400.25", "inf"), "utc_unix_s is inf"),
+    "beyond the pole": (FULL + ROW.replace("44.29", "91"), "dec_deg is 91"),
+    "no error": (FULL + ROW.replace("1.5", "0"), "sigma_arcsec is 0"),
+    "a negative error": (FULL + ROW.replace(",20", ",-20"), "sigma_roll_arcsec is -20"),
     "an error of degrees": (FULL + ROW.replace("1.5", "36000"), "from 0.0001 to 3600"),
     "half a roll": (FULL + ROW.replace("241.9", ""), "belong together"),
     "no time": (FULL + ROW.replace("1793642400.25", ""), "utc_unix_s is empty"),
     "a cell of megabytes": (FULL + ROW.replace("44.29", "4" * 1_000_000), "no"),
     "no text": (b"\xff\xfe\x00\x01", "not a text file"),
     "a NUL": (FULL.encode() + b"1,2,3,\x00,5,6\n", "roll_deg is"),
-    "too large": (b"1" * (MAX_CSV_BYTES + 1), "no readable table"),
+    "too large": (b"1" * (MAX_CSV_BYTES + 1), "not a readable table"),
 }  # fmt: skip
 
 
@@ -72,11 +72,11 @@ def test_a_table_that_is_none_is_refused_in_a_sentence(kind, tmp_path):
     text, words = REFUSED[kind]
     with pytest.raises(FrameError, match=words.replace("(", r"\(")) as refused:
         read_pointings(table(tmp_path, text))
-    assert len(str(refused.value)) < 400 and "\n" not in str(refused.value)
+    assert len(str(refused.value)) < 500 and "\n" not in str(refused.value)
 
 
 def test_what_is_no_file_is_refused_at_once(tmp_path):
     os.mkfifo(tmp_path / "pipe")
     for path in (tmp_path / "pipe", tmp_path, tmp_path / "none.csv", "/dev/zero", "a\0b"):
-        with pytest.raises(FrameError, match="no readable table of pointings"):
+        with pytest.raises(FrameError, match=r"no such file|not a readable table of pointings"):
             read_pointings(path)

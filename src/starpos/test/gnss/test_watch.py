@@ -197,7 +197,9 @@ def test_readings_that_two_frames_share_teach_once():
 
 @pytest.mark.parametrize("model", ["nivel210", "scl3300"])
 def test_an_error_of_each_pose_is_claimed_before_a3_is_known_too(model):
-    drive = GnssDrive(errors=sensors.PRESETS[model], lean_deg=0.03 if model == "nivel210" else 4.0, stops=12)
+    drive = GnssDrive(
+        errors=sensors.presets()[model], lean_deg=0.03 if model == "nivel210" else 4.0, stops=12
+    )
     told = [frame for seed in (1, 2) for frame in driven(drive, seed)[0] if frame.error_m is not None]
     assert np.mean([frame.nees for frame in told]) < 4
     assert all(frame.check.status != GnssStatus.DISAGREES for frame in told)
@@ -205,7 +207,7 @@ def test_an_error_of_each_pose_is_claimed_before_a3_is_known_too(model):
 
 def test_one_pose_tells_no_turn_of_a3_however_good_the_inclinometer():
     """GNSS's noise on a sensor of 1 arcsec once seemed to lean the camera: 16 false alarms in 75,000 frames."""
-    drive = GnssDrive(errors=sensors.NIVEL210, lean_deg=0.03, stops=1, frames=12)
+    drive = GnssDrive(errors=sensors.presets()["nivel210"], lean_deg=0.03, stops=1, frames=12)
     _, watch = driven(drive, 1)
     learned = watch.learned
     up, a3 = learned.calibrated_up, learned.covariance[learned.layout.a3, learned.layout.a3]

@@ -87,8 +87,8 @@ def three_axes(angles_deg):
     ("errors", "most", "sentence"),
     [
         (InclinometerErrors(), 0.062, "contradict each other: .* add up to {:.4f}, not to 1"),
-        (sensors.SCL3300, 0.094, "contradict each other: .* add up to {:.4f}, not to 1"),
-        (sensors.SCA100T, 0.1, "cannot hold together"),
+        (sensors.presets()["scl3300"], 0.094, "contradict each other: .* add up to {:.4f}, not to 1"),
+        (sensors.presets()["sca100t"], 0.1, "cannot hold together"),
     ],
 )
 def test_three_axes_that_contradict_each_other_are_refused(errors, most, sentence):
@@ -111,7 +111,7 @@ def test_three_axes_that_contradict_each_other_are_refused(errors, most, sentenc
 
 
 def test_axes_with_the_errors_of_their_sheet_do_not_contradict_each_other(rng):
-    errors = sensors.SCL3300
+    errors = sensors.presets()["scl3300"]
     for up in rotation.normalised(rng.normal(size=(2000, 3))):
         skew = np.eye(3) + errors.cross * rng.normal(size=(3, 3)) * (1 - np.eye(3))
         read = skew @ up * (1 + errors.scale * rng.normal(size=3)) + errors.pose_rad * rng.normal(size=3)

@@ -41,9 +41,9 @@ def reads(tmp_path):
     return of
 
 
-@pytest.mark.parametrize("name", sensors.PRESETS)
+@pytest.mark.parametrize("name", sensors.presets())
 def test_a_preset_is_of_its_class(name):
-    errors = sensors.PRESETS[name]
+    errors = sensors.presets()[name]
     least, most, reach = CLASS[name]
     assert least <= np.degrees(errors.noise_rad) <= most
     assert np.degrees(errors.range_rad) == pytest.approx(reach)
@@ -62,13 +62,13 @@ def test_the_sheets_rules_in_figures():
     assert sensors.limit(1.0) == pytest.approx(
         np.random.default_rng(1).uniform(-1, 1, 100_000).std(), rel=0.01
     )
-    assert np.degrees(sensors.SCL3300.pose_rad) == pytest.approx(0.019, abs=5e-4)
+    assert np.degrees(sensors.presets()["scl3300"].pose_rad) == pytest.approx(0.019, abs=5e-4)
 
 
 @pytest.mark.skipif(not DOCUMENT.exists(), reason="installed without the documents")
-@pytest.mark.parametrize("name", sensors.PRESETS)
+@pytest.mark.parametrize("name", sensors.presets())
 def test_the_document_has_the_figures_of_the_code(name):
-    e = sensors.PRESETS[name]
+    e = sensors.presets()[name]
     (row,) = re.findall(rf"^\| `{name}` \|(.*)\|$", DOCUMENT.read_text(), re.MULTILINE)
     told = [float(cell) for cell in row.split("|")]
     known = [
@@ -81,15 +81,15 @@ def test_the_document_has_the_figures_of_the_code(name):
     assert told == pytest.approx(known, rel=0.03)
 
 
-@pytest.mark.parametrize("name", sensors.PRESETS)
+@pytest.mark.parametrize("name", sensors.presets())
 def test_a_file_that_names_only_its_model_has_the_models_errors(name, reads):
     i = reads(f"inclinometer: {{model: {name.upper()}}}\n")
-    assert (i.inclinometer, i.inclinometer_model) == (sensors.PRESETS[name], name)
+    assert (i.inclinometer, i.inclinometer_model) == (sensors.presets()[name], name)
 
 
 def test_the_model_fills_what_the_file_leaves_out_and_nothing_else(reads):
     i = reads("inclinometer: {model: scl3300}\ntilt_pose_arcsec: 20\ntilt_scale: 0\nclock_stddev_s: 0.5\n")
-    assert i.inclinometer == replace(sensors.SCL3300, pose_rad=20 * ARCSEC, scale=0.0)
+    assert i.inclinometer == replace(sensors.presets()["scl3300"], pose_rad=20 * ARCSEC, scale=0.0)
     assert i == Instrument(
         93750.0, inclinometer=i.inclinometer, inclinometer_model="scl3300", clock_stddev_s=0.5
     )
@@ -101,7 +101,7 @@ def test_a_file_without_a_model_has_what_it_states_and_the_defaults(reads):
 
 
 def test_a_written_model_and_every_figure_is_read_again(tmp_path):
-    errors = replace(sensors.NIVEL210, pose_rad=7 * ARCSEC)
+    errors = replace(sensors.presets()["nivel210"], pose_rad=7 * ARCSEC)
     told = Instrument(5000.0, inclinometer=errors, inclinometer_model="nivel210")
     instrument_file.write(tmp_path / "i.yaml", told)
     text = (tmp_path / "i.yaml").read_text()
@@ -120,7 +120,7 @@ def test_a_written_model_and_every_figure_is_read_again(tmp_path):
     [
         (
             "inclinometer: {model: scl9900}",
-            f"'scl9900' is not known: the models are {', '.join(sensors.PRESETS)}",
+            f"'scl9900' is not known: the models are {', '.join(sensors.presets())}",
         ),
         ("inclinometer: scl3300", "give {model: NAME}"),
         ("inclinometer: {model: 3300}", "give {model: NAME}"),

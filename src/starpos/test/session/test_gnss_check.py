@@ -11,7 +11,7 @@ from fixes import T0, fix_at
 from starpos.earth.vertical import Deflection
 from starpos.fix.solution import Status
 from starpos.session.driver import Now
-from starpos.session.gnss import GnssComparison
+from starpos.session.gnss import ComparedPlaces
 
 
 def gnss(latitude_deg, longitude_deg, seconds=0.0):
@@ -32,7 +32,7 @@ def gnss(latitude_deg, longitude_deg, seconds=0.0):
 def test_a_place_that_cannot_be_is_said_with_its_distance(latitude_deg, seconds, said):
     fix = fix_at(0.0)
     answer = SimpleNamespace(fix=fix, status=Status.OK)
-    check = GnssComparison()
+    check = ComparedPlaces()
     assert check.remark(answer, Deflection()) == ""
     check.receive(gnss(latitude_deg, math.degrees(fix.longitude), seconds), Now(None, 0.0))
     remark = check.remark(answer, Deflection())

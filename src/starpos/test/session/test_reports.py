@@ -11,13 +11,13 @@ from starpos.fix.solution import Solution, Status
 from starpos.frames.exposure import GLOBAL_SHUTTER, UNKNOWN_SHUTTER, Shutter
 from starpos.frames.frame import no_stars
 from starpos.instrument.instrument import Calibration, Instrument
-from starpos.instrument.sensors import SCL3300
+from starpos.instrument.sensors import presets
 from starpos.session import reports
 from starpos.session.driver import Level
 from starpos_testing.skies.fields import SkyField
 
 TOLD = {"refraction.pressure": 95000.0, "refraction.temperature": 8.0}
-NAMED = Instrument(4000.0, inclinometer=SCL3300, inclinometer_model="scl3300")
+NAMED = Instrument(4000.0, inclinometer=presets()["scl3300"], inclinometer_model="scl3300")
 NOBODYS = replace(NAMED, calibration=Calibration.of((0.0, 0.0, 0.0), (5.0,) * 3))
 DATED = replace(NAMED, calibration=Calibration(utc_unix_s=1.79e9))
 

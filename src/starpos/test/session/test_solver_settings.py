@@ -45,8 +45,8 @@ def test_the_cameras_intrinsics_come_from_camera_info():
 
 def test_a_named_inclinometer_has_its_sheets_errors_unless_a_file_states_them():
     named = instrument_of(values(inclinometer__model="SCL3300"), CAMERA, None)
-    assert (named.inclinometer, named.inclinometer_model) == (sensors.SCL3300, "scl3300")
-    assert instrument_of(values(), CAMERA, None).inclinometer == sensors.UNNAMED
+    assert (named.inclinometer, named.inclinometer_model) == (sensors.presets()["scl3300"], "scl3300")
+    assert instrument_of(values(), CAMERA, None).inclinometer == sensors.unnamed()
     known = Instrument(1000.0, inclinometer=InclinometerErrors(scale=0.01))
     of_file = instrument_of(values(inclinometer__model="scl3300"), CAMERA, known)
     assert (of_file.inclinometer, of_file.inclinometer_model) == (known.inclinometer, "")

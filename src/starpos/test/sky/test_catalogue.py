@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 import os
+import pickle
 from dataclasses import fields
 
 import numpy as np
@@ -308,3 +309,14 @@ def test_it_is_read_once(monkeypatch):
     once = load_catalogue()
     monkeypatch.setattr(module, "read", lambda path: pytest.fail("read again"))
     assert load_catalogue() is once
+
+
+def test_named_stars_are_looked_up_late_and_sent_without_their_catalogue(catalogue):
+    index = np.argsort(catalogue.vmag_centi)[:5]
+    named = catalogue.named(index)
+    assert len(named) == 5 and "labels" not in vars(named)
+    sent = pickle.dumps(named)
+    assert len(sent) < 1000 and pickle.loads(sent) == named
+    some = named.of_rows(np.array([3, 1]))
+    assert some.labels[0] == catalogue.names(index[[3, 1]])
+    assert some != named and some == catalogue.named(index[[3, 1]])
