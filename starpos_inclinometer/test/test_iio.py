@@ -67,6 +67,13 @@ def test_offset_scale_and_range_are_the_channels_own(tmp_path):
     assert reading.flags == OUT_OF_RANGE and math.isnan(reading.z) and math.isnan(reading.temperature_c)
 
 
+@pytest.mark.parametrize("shared", ["scale", "in_scale", "in_incli_scale"])
+def test_a_scale_that_all_channels_share_is_the_channels(tmp_path, shared):
+    plug(tmp_path, name="some", in_incli_x_raw=100, in_incli_y_raw=-200, **{shared: 0.01})
+    device = find(tmp_path, "")
+    assert np.allclose(np.degrees(device.angles(device.read_raw())), [1.0, -2.0])
+
+
 def test_accelerations_are_averaged_and_g_is_not_taken_for_metres(tmp_path):
     adxl355(tmp_path)
     plug(tmp_path, 1, name="sca3300", in_accel_scale=0.00037, **{f"in_accel_{a}_raw": 1 for a in "xyz"})

@@ -17,6 +17,7 @@ from starpos.fix.fix import Fix
 from starpos.fix.heading import AttitudeAtPlace
 from starpos.fix.solution import NO_STARS, Solution, Status
 from starpos.fix.terms import ErrorTerm
+from starpos.instrument.inclinometer import Tilt
 from starpos.sky.catalogue import named_stars
 from starpos_interfaces import msg
 from starpos_solver import outputs
@@ -33,6 +34,7 @@ def fix_facing(azimuth_deg: float, latitude_deg: float = 40.0) -> Fix:
     factor = np.diag([100.0, 50.0, 1e-4, 2e-4, 3e-4, 1e-4])
     return Fix(
         utc_unix_s=1.8e9,
+        tilt=Tilt(0.0, 0.0, np.eye(2) * 1e-10, utc_unix_s=1.8e9),
         latitude=math.radians(latitude_deg),
         longitude=1.0,
         heading=heading_of(link),

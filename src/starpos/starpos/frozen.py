@@ -34,7 +34,7 @@ def at_once(cls: type[T]) -> type[T]:
     return cls
 
 
-def _equal(one: Any, other: object) -> bool:
+def _equal(one: Any, other: Any) -> bool:
     """Whether two dataclasses are of one class, and all their fields are alike."""
     if other.__class__ is not one.__class__:
         return NotImplemented

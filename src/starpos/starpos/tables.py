@@ -26,7 +26,7 @@ ALIKE_NAME = 0.7
 
 @dataclass(frozen=True, eq=False)
 class Table:
-    """The N rows of a table: its columns (N,) by name, and the line (N,) of each row in its file.
+    """The N rows of a table: its columns (N,) by name, and the rows' lines (N,) in the file.
 
     An empty cell is NaN. A column that is not needed is absent if the table has none.
     """
@@ -59,7 +59,7 @@ class TableForm:
 
     @property
     def cure(self) -> str:
-        """What to do about a table that cannot be used."""
+        """Advice on an unusable table."""
         more = f"[,{','.join(self.optional)}]" if self.optional else ""
         return f"give a CSV with a line of names, {','.join(self.needed)}{more}, and rows of numbers"
 

@@ -163,11 +163,12 @@ def _describe(folder: Path) -> IioDevice:
 
 
 def _channel(folder: Path, kind: str, axis: str) -> Channel | None:
-    """Find a channel whose values have a unit; without a scale it is unknown."""
+    """Find a channel whose values have a unit: its own, its kind's, or of all channels; without a scale it is unknown."""
     name = f"in_{kind}_{axis}"
     if not (folder / f"{name}_raw").exists():
         return None
-    scale, offset = (_first(folder, name, f"in_{kind}", what) for what in ("scale", "offset"))
+    shared = (f"in_{kind}_", "in_", "")
+    scale, offset = (_first(folder, name, what, *shared) for what in ("scale", "offset"))
     return None if not scale else Channel(name, scale, offset or 0.0)
 
 
@@ -175,7 +176,7 @@ def _temperature(folder: Path, model: str) -> Channel | None:
     for name in ("in_temp", "in_temp0"):
         if not (folder / f"{name}_raw").exists():
             continue
-        scale, offset = (_first(folder, name, "in_temp", what) for what in ("scale", "offset"))
+        scale, offset = (_first(folder, name, what, "in_temp_") for what in ("scale", "offset"))
         if scale:
             return Channel(name, scale, offset or 0.0)
         if model in SHEET_TEMPERATURES:
@@ -189,11 +190,11 @@ def _sampling(folder: Path, kind: str) -> Path | None:
     return next((folder / n for n in names if (folder / n).exists()), None)
 
 
-def _first(folder: Path, channel: str, kind: str, what: str) -> float | None:
-    """Read an attribute of the channel, or the one that all channels of its kind share; None where there is neither."""
-    for path in (folder / f"{channel}_{what}", folder / f"{kind}_{what}"):
-        if path.exists():
-            return _number(path)
+def _first(folder: Path, channel: str, what: str, *shared: str) -> float | None:
+    """Read an attribute of the channel, or the first that channels share, by how their names begin; None without any."""
+    for begin in (f"{channel}_", *shared):
+        if (folder / (begin + what)).exists():
+            return _number(folder / (begin + what))
     return None
 
 

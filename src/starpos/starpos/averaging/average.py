@@ -433,7 +433,7 @@ class Averager:
         if track is None:
             self._track, self._last = _Track.before(f, self._begin_sigma).begin(f), f
             return
-        slip = slip_s(f, track.pose)
+        slip = slip_s(f.camera, track.pose.camera, f.latitude)
         if slip is None:
             track = self._touch(track, f)
         self._last = f

@@ -27,19 +27,20 @@ HIGHEST_LATITUDE = np.radians(89.0)
 LARGE_TRACE = 2.9
 
 
-def slip_s(fix: Fix, first: Fix, stated_s: float = 0.0) -> float | None:
-    """Seconds by which the time stamps of two fixes contradict each other; None if the camera was touched in between.
+def slip_s(camera: Attitude, first: Attitude, latitude: float, stated_s: float = 0.0) -> float | None:
+    """Seconds by which the time stamps of two frames contradict each other; None if the camera was touched in between.
 
     The result is 0 if the errors of both attitudes, the mount's creep and stated_s explain the difference.
+    camera, first: attitudes of C against ITRS.  latitude: of the camera, rad.
     stated_s: 1 sigma of both stamps together.
     """
-    turned = fix.camera.rotation @ first.camera.rotation.T
+    turned = camera.rotation @ first.rotation.T
     angle = np.arctan2(turned[1, 0] - turned[0, 1], turned[0, 0] + turned[1, 1])
     about_axis = rotation.about_axis(2, angle)
     rest = turned @ about_axis.T
     if np.trace(rest) < LARGE_TRACE:
         return None
-    covariance = fix.camera.covariance + about_axis @ first.camera.covariance @ about_axis.T
+    covariance = camera.covariance + about_axis @ first.covariance @ about_axis.T
     weight = np.linalg.inv(covariance + np.eye(3) * (CREEP_RAD / SLIP_SIGMAS) ** 2)
     # choose the angle that leaves the least rest in sigma: the roll is known worse than the optical axis
     rest, variance = rotation.to_small_vector(rest), 1 / weight[2, 2]
@@ -49,14 +50,14 @@ def slip_s(fix: Fix, first: Fix, stated_s: float = 0.0) -> float | None:
         return None
     if abs(angle) <= SLIP_SIGMAS * np.sqrt(variance + (stated_s * ROTATION_RAD_S) ** 2):
         return 0.0
-    return None if abs(fix.latitude) > HIGHEST_LATITUDE else float(abs(angle) / ROTATION_RAD_S)
+    return None if abs(latitude) > HIGHEST_LATITUDE else float(abs(angle) / ROTATION_RAD_S)
 
 
 def poses_of(fixes: Sequence[Fix]) -> np.ndarray:
     """Number (K,) of the pose of each fix, from 0: a pose lasts until somebody touches the camera."""
     poses, pose, first = np.zeros(len(fixes), int), -1, None
     for k in np.argsort([f.utc_unix_s for f in fixes], kind="stable"):
-        if first is None or slip_s(fixes[k], first) is None:
+        if first is None or slip_s(fixes[k].camera, first.camera, fixes[k].latitude) is None:
             pose, first = pose + 1, fixes[k]
         poses[k] = pose
     return poses

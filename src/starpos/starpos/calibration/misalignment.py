@@ -19,7 +19,7 @@ from starpos.calibration.plumb_line import (
     settled,
     typical,
 )
-from starpos.earth.ellipsoid import EARTH_RADIUS_M, enu_axes
+from starpos.earth.ellipsoid import enu_axes
 from starpos.earth.place import Place
 from starpos.errors import FixError
 from starpos.fix.budget import Sensitivity, local_north
@@ -49,8 +49,6 @@ from starpos.units import ARCSEC
 
 SOLVING_ROUNDS = 4
 SETTLED_RAD = 0.02 * ARCSEC
-# terms that move the zenith, of all frames about alike
-OF_PLACE = ("refraction", "shutter", "clock", "time stamp", "ut1", "pole")
 VALID_DAYS = 365.0
 # factor on the sigma of A3's turn from the leans that the fixes use, because both come from the same tilts
 TURN_SIGMA = 3.0
@@ -69,8 +67,10 @@ MAX_SCATTER = 16.0
 # share by which a coefficient of the response must be known better, or worse, than stated to be worth keeping
 WORTH = 0.05
 
-# A3 and the zenith from readings, A3 as it is, and the fixes
-FindPlumbLine = Callable[[Readings, np.ndarray, list[Fix]], PlumbLine]
+# A3 and the zenith from readings and A3 as it is
+FindPlumbLine = Callable[[Readings, np.ndarray], PlumbLine]
+# the same from some of the readings
+FitOfRows = Callable[[np.ndarray], PlumbLine]
 # what is identified already, by the numbers of the frames
 Known = Mapping[int, Identification]
 NOTHING_KNOWN: Known = MappingProxyType({})
@@ -138,9 +138,8 @@ def calibrate_at(
     5
     """
 
-    def find(readings: Readings, a3: np.ndarray, fixes: list[Fix]) -> PlumbLine:
-        common = sum(np.trace(t.covariance[:2, :2]) / 2 for f in fixes for t in f.terms if t.name in OF_PLACE)
-        sigma = np.hypot(site.plumb_stddev, np.sqrt(common / len(fixes)) / EARTH_RADIUS_M)
+    def find(readings: Readings, a3: np.ndarray) -> PlumbLine:
+        sigma = np.hypot(site.plumb_stddev, np.sqrt(np.mean(readings.common2)))
         return hang(readings, a3, site.plumb_axes[2], float(sigma), np.radians(turn_stddev_deg))
 
     if not frames:
@@ -309,14 +308,14 @@ class _Agreement:
 def _agreed(find: FindPlumbLine, solved: list[Fix], a3: np.ndarray, errors: InclinometerErrors) -> _Agreement:
     """The plumb line that `find` gives for the frames that agree with each other."""
     whole = Readings.of(solved, errors)
-    rows, plumb = _agreeing(find, whole, solved, a3, errors)
+    rows, plumb = _agreeing(lambda rows: find(whole.subset(rows), a3), whole, errors.pose_rad)
     sound = [solved[k] for k in rows]
     # a fix with a bad tilt, hence a bad refraction, may have split the pose of the sound ones
     readings = replace(whole.subset(rows), pose=poses_of(sound))
     _, scatter = settled(plumb, readings)
     # once more about the answer, with the errors that the poses show
     noisy = np.hypot(readings.sigma, scatter.noise_sigma)
-    again = find(replace(readings, pose_sigma=scatter.pose_sigma, sigma=noisy), a3, sound)
+    again = find(replace(readings, pose_sigma=scatter.pose_sigma, sigma=noisy), a3)
     plumb, scatter = settled(again, readings)
     left_out = {}
     if len(rows) < len(solved):
@@ -327,36 +326,27 @@ def _agreed(find: FindPlumbLine, solved: list[Fix], a3: np.ndarray, errors: Incl
     return _Agreement(plumb, readings, sound, scatter, left_out)
 
 
-def _agreeing(
-    find: FindPlumbLine, whole: Readings, solved: list[Fix], a3: np.ndarray, errors: InclinometerErrors
-) -> tuple[np.ndarray, PlumbLine]:
+def _agreeing(fit: FitOfRows, whole: Readings, pose_rad: float) -> tuple[np.ndarray, PlumbLine]:
     """Indices of the frames that agree with most of the others, and the plumb line of these.
 
     Of few poses the robust fit may end between sound and bad tilts. A second one begins with the frames that agree with
     their own poses, and the fit from which half of the frames are less far counts.
     """
-    starts, calm = [_unhidden(find, whole, solved, a3)], _calm(whole)
-    if (1 - MAX_OUTLIERS) * len(solved) <= len(calm) < len(starts[0]):
+    starts, calm = [_unhidden(fit, whole)], _calm(whole)
+    if (1 - MAX_OUTLIERS) * len(whole.pose) <= len(calm) < len(starts[0]):
         starts.append(calm)
-    found = [_kept(find, whole, solved, a3, errors, rows) for rows in starts]
+    found = [_kept(fit, whole, pose_rad, rows) for rows in starts]
     return min(found, key=lambda f: typical(_left(whole, f[1]), 5))
 
 
-def _kept(
-    find: FindPlumbLine,
-    whole: Readings,
-    solved: list[Fix],
-    a3: np.ndarray,
-    errors: InclinometerErrors,
-    rows: np.ndarray,
-) -> tuple[np.ndarray, PlumbLine]:
+def _kept(fit: FitOfRows, whole: Readings, pose_rad: float, rows: np.ndarray) -> tuple[np.ndarray, PlumbLine]:
     """The frames in `rows` without those that their plumb line shows to disagree, and the plumb line of the rest."""
     for _ in range(JUDGED):
-        plumb = find(whole.subset(rows), a3, [solved[k] for k in rows])
+        plumb = fit(rows)
         size = np.linalg.norm(plumb.left, axis=1)
-        usual = np.hypot(whole.subset(rows).sigma, max(typical(plumb.left, 5), errors.pose_rad))
+        usual = np.hypot(whole.sigma[rows], max(typical(plumb.left, 5), pose_rad))
         agree = size < OUTLIER_SIGMA * usual
-        if agree.all() or agree.sum() < (1 - MAX_OUTLIERS) * len(solved):
+        if agree.all() or agree.sum() < (1 - MAX_OUTLIERS) * len(whole.pose):
             break
         rows = rows[agree]
     return rows, plumb
@@ -372,21 +362,20 @@ def _calm(whole: Readings) -> np.ndarray:
     return np.flatnonzero(size < OUTLIER_SIGMA * np.maximum(whole.sigma, typical(off, 0)))
 
 
-def _unhidden(find: FindPlumbLine, whole: Readings, solved: list[Fix], a3: np.ndarray) -> np.ndarray:
+def _unhidden(fit: FitOfRows, whole: Readings) -> np.ndarray:
     """Indices of the frames without outliers that pull the fit of all towards them, and so seem to agree with it.
 
     Each is judged against a fit of the frames that lie closest to it, as many as must agree (least trimmed squares).
     Few poses fit almost anything; then these are all.
     """
-    everyone: np.ndarray = np.arange(len(solved))
-    rows = everyone
-    most = int(np.ceil((1 - MAX_OUTLIERS) * len(solved)))
+    rows: np.ndarray = np.arange(len(whole.pose))
+    most = int(np.ceil((1 - MAX_OUTLIERS) * len(rows)))
     if len(np.unique(whole.pose)) < MANY_POSES:
-        return everyone
+        return rows
     # the closest alone, until they are the same; then all that agree with them, until these are
     for closest in (True, False):
         for _ in range(JUDGED):
-            left = _left(whole, find(whole.subset(rows), a3, [solved[k] for k in rows]))
+            left = _left(whole, fit(rows))
             usual = np.hypot(whole.sigma, max(typical(left[rows], 5), whole.pose_sigma))
             off = np.linalg.norm(left, axis=1) / usual
             before, rows = rows, np.sort(np.argsort(off, kind="stable")[:most])
@@ -514,7 +503,7 @@ def turn(
     <Average of 8 frames: +35.7... +51.4... +- ...>
     """
 
-    def find(readings: Readings, a3: np.ndarray, fixes: list[Fix]) -> PlumbLine:
+    def find(readings: Readings, a3: np.ndarray) -> PlumbLine:
         return level(readings, a3, np.radians(turn_stddev_deg))
 
     return calibrate(solver, frames, tilts, find, fewest=2, progress=progress, known=known)

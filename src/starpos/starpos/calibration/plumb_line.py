@@ -2,7 +2,7 @@
 """The plumb line in the camera: A3 from the attitudes of frames and their tilts, with a known or an unknown zenith."""
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,7 +13,7 @@ from starpos.averaging.scatter import Frames, Scatter, scatter_of
 from starpos.earth.ellipsoid import EARTH_RADIUS_M
 from starpos.errors import FixError
 from starpos.fix.fix import Fix
-from starpos.fix.terms import EACH_POSE
+from starpos.fix.terms import EACH_POSE, ErrorTerm
 from starpos.frozen import at_once
 from starpos.instrument.inclinometer import InclinometerErrors
 from starpos.instrument.instrument import UNKNOWN_ARCSEC
@@ -22,6 +22,8 @@ from starpos.units import ARCSEC, MEDIAN_OF_CHI2
 
 # sigma of a coefficient that is as good as known
 KNOWN = 1e-9
+# terms that move the zenith, of all frames about alike
+OF_PLACE = ("refraction", "shutter", "clock", "time stamp", "ut1", "pole")
 # minimum significance of a lean, which errors of the tilts do not reach
 LEAN_SIGMA = 5.0
 
@@ -33,6 +35,7 @@ class Readings:
 
     utc_unix_s (K,).  to_camera (K, 3, 3): ITRS into C.  plumb (K, 3): up in S as the inclinometer reads it.  heading
     (K,) in rad. sigma (K,) in rad: of the zenith from each frame alone.
+    common2 (K,) in rad2: variance of what moves the zenith of all frames about alike.
     pose (K,): number of each frame's pose, from 0.  pose_sigma (rad): of an error that is new at each pose.
     columns (K, 3, M): change of `plumb` for each of M errors of the inclinometer that frames share: its drift and its
     temperature in units of their sigma, then its response.  column_sigma (M,): 1 sigma of these.
@@ -43,6 +46,7 @@ class Readings:
     plumb: np.ndarray
     heading: np.ndarray
     sigma: np.ndarray
+    common2: np.ndarray
     pose: np.ndarray
     pose_sigma: float
     columns: np.ndarray
@@ -51,7 +55,7 @@ class Readings:
     @classmethod
     def of(cls, fixes: Sequence[Fix], errors: InclinometerErrors) -> "Readings":
         """Readings of frames with a fix; FixError if some have two axes and some three."""
-        tilts = [f.tilt for f in fixes if f.tilt is not None]
+        tilts = [f.tilt for f in fixes]
         plumb = np.array([t.up for t in tilts])
         axes = {t.axes for t in tilts}
         if len(axes) != 1:
@@ -67,6 +71,7 @@ class Readings:
             plumb=plumb,
             heading=np.array([f.heading for f in fixes]),
             sigma=_own_sigma(fixes),
+            common2=np.array([_variance(t for t in f.terms if t.name in OF_PLACE) for f in fixes]),
             pose=poses_of(fixes),
             pose_sigma=errors.pose_rad,
             columns=np.concatenate([walked, response], 2),
@@ -75,7 +80,7 @@ class Readings:
 
     def subset(self, rows: np.ndarray) -> "Readings":
         """The readings of the frames in `rows`."""
-        per_frame = ("utc_unix_s", "to_camera", "plumb", "heading", "sigma", "columns")
+        per_frame = ("utc_unix_s", "to_camera", "plumb", "heading", "sigma", "common2", "columns")
         pose = np.unique(self.pose[rows], return_inverse=True)[1]
         return replace(self, pose=pose, **{name: getattr(self, name)[rows] for name in per_frame})
 
@@ -105,6 +110,11 @@ class Readings:
         return {2 * axes + number: axes for axes, number in RESPONSE_COEFFICIENTS.items()}[
             self.columns.shape[2]
         ]
+
+
+def _variance(terms: Iterable[ErrorTerm]) -> float:
+    """Variance per axis in rad2 of the zenith, by terms of a fix."""
+    return float(sum(np.trace(t.covariance[:2, :2]) for t in terms)) / 2 / EARTH_RADIUS_M**2
 
 
 def _own_sigma(fixes: Sequence[Fix]) -> np.ndarray:
@@ -144,23 +154,6 @@ SETTLED_CHI2 = 1e-10
 
 
 @at_once
-@dataclass(frozen=True)
-class Linear:
-    """A fit about its answer: p holds A3's turns (3) about `turns`, the zenith's moves (2) along `across`, and the
-    columns.
-
-    residual (K, 2) in rad with p = 0 for the columns, design (K, 2, n): its derivatives.  prior_sigma (n,).
-    turns (3, 3): axes in S, two across the plumb line and it.  across (2, 3): axes in ITRS, across the zenith.
-    """
-
-    residual: np.ndarray
-    design: np.ndarray
-    prior_sigma: np.ndarray
-    turns: np.ndarray
-    across: np.ndarray
-
-
-@at_once
 @dataclass(frozen=True, kw_only=True)
 class PlumbLine:
     """a3 (3, 3) with covariance (3, 3) in rad2 about S's axes, and the zenith (3,) in ITRS with its sigma in rad.
@@ -168,7 +161,9 @@ class PlumbLine:
     cost: half the robust chi-square.  scatter: chi-square per degree of freedom, 1 for frames of one zenith.
     left (K, 2): what the fit leaves of each frame's reading, in rad across the plumb line.
     response (m,), response_covariance (m, m): of the inclinometer's response.
-    linear: the fit about its answer.
+    residual (K, 2) in rad, design (K, 2, n), prior_sigma (n,): the linear fit about the answer.  Its n parameters are
+    A3's turns (3) about `turns`, the zenith's moves (2) along `across`, and the columns, which are 0 in the residual.
+    turns (3, 3): axes in S, two across the plumb line and it.  across (2, 3): axes in ITRS, across the zenith.
     astray (rad): sigma by which the zenith may be off together with A3's turn about a leaning axis; no heading shows it.
     """
 
@@ -181,23 +176,17 @@ class PlumbLine:
     left: np.ndarray
     response: np.ndarray
     response_covariance: np.ndarray
-    linear: "Linear"
+    residual: np.ndarray
+    design: np.ndarray
+    prior_sigma: np.ndarray
+    turns: np.ndarray
+    across: np.ndarray
     astray: float = 0.0
 
     def stddev_across(self, plumb: np.ndarray) -> float:
         """Sigma in rad of the direction that A3 takes to `plumb` (3,), on the worse of two axes."""
         across = np.linalg.svd(plumb[None])[2][1:]
         return float(np.sqrt(np.linalg.eigvalsh(across @ self.covariance @ across.T)[-1]))
-
-
-@at_once
-@dataclass(frozen=True)
-class PlumbLinePrior:
-    """Prior knowledge of the fit: the zenith (3,) or None, its sigma, and the sigma of A3's turn, in rad."""
-
-    zenith: np.ndarray | None = None
-    zenith_sigma: float = np.inf
-    turn_sigma: float = np.pi
 
 
 def huber(off: np.ndarray) -> np.ndarray:
@@ -239,24 +228,30 @@ class _Model:
     seen_across: np.ndarray
 
     @classmethod
-    def of(cls, readings: Readings, starts: np.ndarray, known: PlumbLinePrior) -> "_Model":
+    def of(
+        cls,
+        readings: Readings,
+        starts: np.ndarray,
+        turn_sigma: float,
+        known: np.ndarray | None,
+        zenith_sigma: float,
+    ) -> "_Model":
         to_camera, mean = readings.to_camera, readings.mean_plumb
-        if known.zenith is None:
+        if known is None:
             zenith = np.einsum("kji,tlj,kl->ti", to_camera, starts, readings.plumb)
         else:
-            zenith = np.tile(known.zenith, (len(starts), 1))
+            zenith = np.tile(known, (len(starts), 1))
         zenith = rotation.normalised(zenith)
         across = np.linalg.svd(zenith[:, None])[2][:, 1:]
         turns = np.vstack([np.linalg.svd(mean[None])[2][1:], mean]).T
         loose = UNKNOWN_ARCSEC[0] * ARCSEC
-        zenith_sigma = min(known.zenith_sigma, np.pi)
         return cls(
             readings=readings,
             spread=readings.spread,
             turns=turns,
             columns=-np.einsum("kim,ij->kjm", readings.columns, turns[:, :2]),
             prior_sigma=np.array(
-                [loose, loose, known.turn_sigma, zenith_sigma, zenith_sigma, *readings.column_sigma]
+                [loose, loose, turn_sigma, zenith_sigma, zenith_sigma, *readings.column_sigma]
             ),
             zenith=zenith,
             across=across,
@@ -267,7 +262,7 @@ class _Model:
 @at_once
 @dataclass(frozen=True, kw_only=True)
 class _State:
-    """Where T fits stand: a3 (T, 3, 3), up (T, 3) of any length, p (T, n) as in Linear, start (T,): its number."""
+    """Where T fits stand: a3 (T, 3, 3), up (T, 3) of any length, p (T, n) as in PlumbLine, start (T,): its number."""
 
     a3: np.ndarray
     up: np.ndarray
@@ -293,15 +288,20 @@ class _Slopes:
 
 
 def fits(
-    readings: Readings, starts: np.ndarray, known: PlumbLinePrior, turned: np.ndarray | float = 0.0
+    readings: Readings,
+    starts: np.ndarray,
+    turn_sigma: float,
+    turned: np.ndarray | float = 0.0,
+    zenith: np.ndarray | None = None,
+    zenith_sigma: float = np.pi,
 ) -> list[PlumbLine]:
     """Fit A3, the zenith and the errors of the inclinometer by robust Gauss-Newton, from each of T starts.
 
-    starts (T, 3, 3): the given A3, turned by `turned` (T,) rad about the plumb line.  The residuals compare
-    the readings with the plumb line of the stars, whose error is small compared with theirs.  The prior of A3's tilts is
-    UNKNOWN_ARCSEC.
+    starts (T, 3, 3): the given A3, turned by `turned` (T,) rad about the plumb line; turn_sigma (rad): of that turn.
+    zenith (3,): None if nothing is known of it.  The residuals compare the readings with the plumb line of the stars,
+    whose error is small compared with theirs.  The prior of A3's tilts is UNKNOWN_ARCSEC.
     """
-    model = _Model.of(readings, starts, known)
+    model = _Model.of(readings, starts, turn_sigma, zenith, zenith_sigma)
     p = np.zeros((len(starts), len(model.prior_sigma)))
     p[:, 2] = turned
     now = _State(a3=starts, up=model.zenith, p=p, start=np.arange(len(starts)))
@@ -391,7 +391,11 @@ def _plumb_line(model: _Model, answer: _State, slopes: _Slopes, t: int) -> Plumb
         left=slopes.residual[t] + model.columns @ p[5:],
         response=p[response],
         response_covariance=symmetric(whole[response, response]),
-        linear=Linear(slopes.residual[t], slopes.slope[t], prior_sigma, turns, model.across[t]),
+        residual=slopes.residual[t],
+        design=slopes.slope[t],
+        prior_sigma=prior_sigma,
+        turns=turns,
+        across=model.across[t],
     )
 
 
@@ -430,19 +434,18 @@ def level(readings: Readings, given: np.ndarray, turn_sigma: float = np.pi) -> P
     """
     mean = readings.mean_plumb
     start = _axis_of_turn(readings, given)
-    known = PlumbLinePrior(turn_sigma=turn_sigma)
-    [nearest] = fits(readings, start[None], known)
+    [nearest] = fits(readings, start[None], turn_sigma)
     leans = _leans(readings)
     if nearest.scatter < FOUND_SCATTER and not leans:
         return nearest
     # the prior holds each answer near its own start
     starts = _turns(mean, start)[1] if turn_sigma > NARROW_TURN else start[None]
-    found = fits(readings, starts, known)
+    found = fits(readings, starts, turn_sigma)
     best = min(found, key=_cost)
     if best.scatter > USUAL_SCATTER:
         # whichever way the inclinometer faces, its poses scatter
         readings = replace(readings, pose_sigma=_pose_scatter(best, readings))
-        found = fits(readings, starts, known)
+        found = fits(readings, starts, turn_sigma)
         best, nearest, leans = min(found, key=_cost), found[0], _leans(readings)
     # a search that began half a turn away may have ended in a wrong minimum
     if not leans:
@@ -456,7 +459,7 @@ def level(readings: Readings, given: np.ndarray, turn_sigma: float = np.pi) -> P
         raise FixError(
             f"the instrument leans by {np.degrees(lean):.2f} deg from one heading to the other, and these "
             f"headings do not determine which way its inclinometer faces, or one heading's tilts are off: "
-            f"level it better, or add a frame "
+            f"leave out a frame whose tilt is wrong, level it better, or add a frame "
             "with one foot raised by as much or more"
         )
     if nearest.cost < best.cost + AS_GOOD:
@@ -476,9 +479,8 @@ def hang(
     mean = readings.mean_plumb
     up = np.einsum("kij,j->ki", readings.to_camera, zenith).sum(0)
     start = rotation.shortest_turn(given @ rotation.normalised(up), mean) @ given
-    known = PlumbLinePrior(zenith, max(zenith_sigma, 1e-12), turn_sigma)
     angles, starts = _turns(mean, start) if turn_sigma > NARROW_TURN else (np.zeros(1), start[None])
-    found = fits(readings, starts, known, angles)
+    found = fits(readings, starts, turn_sigma, angles, zenith, min(max(zenith_sigma, 1e-12), np.pi))
     best = min(found, key=_cost)
     if found[0].cost < best.cost + AS_GOOD:
         best = found[0]
@@ -504,13 +506,11 @@ def settled(plumb: PlumbLine, readings: Readings) -> tuple[PlumbLine, Scatter]:
 
     readings: of the frames of the fit.
     """
-    linear, prior_sigma = plumb.linear, plumb.linear.prior_sigma.copy()
+    prior_sigma = plumb.prior_sigma.copy()
     # the errors of the tilts would seem to show A3's turn, unless the instrument really leans from pose to pose
     leans = readings.lean(_pose_scatter(plumb, readings))
     if not leans:
         prior_sigma[2] = KNOWN
-    response = np.zeros(len(prior_sigma), bool)
-    response[5 + readings.response.start :] = readings.pose.max() + 1 >= MIN_POSES
     scatter = scatter_of(
         Frames(
             utc_unix_s=readings.utc_unix_s,
@@ -518,8 +518,8 @@ def settled(plumb: PlumbLine, readings: Readings) -> tuple[PlumbLine, Scatter]:
             attitude=readings.to_camera,
             # by the stars: the readings' own errors would seem to follow from the lean that they show
             up=readings.to_camera @ plumb.zenith,
-            residual=linear.residual,
-            design=linear.design,
+            residual=plumb.residual,
+            design=plumb.design,
             sigma=readings.sigma,
             pose_sigma=readings.pose_sigma,
             prior_sigma=prior_sigma,
@@ -531,15 +531,15 @@ def settled(plumb: PlumbLine, readings: Readings) -> tuple[PlumbLine, Scatter]:
     )
     moved, covariance, at = scatter.moved, scatter.covariance, 5 + readings.response.start
     if not leans:
-        covariance[2, 2] = linear.prior_sigma[2] ** 2
+        covariance[2, 2] = plumb.prior_sigma[2] ** 2
     # as in the fit, without the turn about the plumb line
     given_turn = covariance[3:5, 3:5] - np.outer(covariance[3:5, 2], covariance[3:5, 2]) / covariance[2, 2]
-    a3 = rotation.from_vector(linear.turns @ moved[:3]) @ plumb.a3
-    up = rotation.normalised(plumb.zenith + moved[3:5] @ linear.across)
+    a3 = rotation.from_vector(plumb.turns @ moved[:3]) @ plumb.a3
+    up = rotation.normalised(plumb.zenith + moved[3:5] @ plumb.across)
     answer = replace(
         plumb,
         a3=a3,
-        covariance=symmetric(linear.turns @ covariance[:3, :3] @ linear.turns.T),
+        covariance=symmetric(plumb.turns @ covariance[:3, :3] @ plumb.turns.T),
         zenith=up,
         zenith_sigma=float(np.sqrt(np.linalg.eigvalsh(given_turn)[-1])),
         response=moved[at:],

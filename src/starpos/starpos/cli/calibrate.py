@@ -211,7 +211,8 @@ def _save(args: argparse.Namespace, found: Calibrated, about: str) -> None:
 
 def _site(args: argparse.Namespace) -> Place:
     if args.geodetic:
-        return Place.on_ellipsoid(*args.site, vertical_of(args))
+        latitude_deg, longitude_deg = args.site
+        return Place.on_ellipsoid(latitude_deg, longitude_deg, vertical_of(args))
     return Place.by_gravity(*args.site)
 
 

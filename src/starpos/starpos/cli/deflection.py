@@ -421,6 +421,7 @@ def _of_bag(args: argparse.Namespace, mark: Place) -> _Taken:
         answers.append(item if isinstance(item, FrameError) else work(item))
         if isinstance(answers[-1], ZenithSighting) and (own := instruments.of(item)) is not None:
             _, catalogue, _ = Solver(own, load_catalogue()).view(item.width, item.height, item.origin_px)
+    assert instrument is not None
     return _Taken(names, answers, instrument, catalogue)
 
 

@@ -123,7 +123,7 @@ def fit_pairs(
 ) -> list[Fit]:
     """Fit a pair of stars to each of N stamps by Gauss-Newton on all their parameters.
 
-    The PSF is that of the first places.
+    The PSF is taken at the first places.
 
     places  (2, 2, N) px: first x, y of the stars and of their companions
     flux    (N,) DN: of the star alone
@@ -254,5 +254,5 @@ def _first_places(stamps: Stamps, fit: Fit, psf: FieldPsf) -> np.ndarray:
         FIT_WIDTHS + 2,
         SMOOTHING,
     )
-    left, top = stamps.corner(0, 0)
+    left, top = stamps.x - stamps.reach, stamps.y - stamps.reach
     return np.array([[fit.x, left + column], [fit.y, top + row]])

@@ -296,7 +296,7 @@ def _teachers(
     bright = next((c for c in choices if c.any()), choices[-1]).nonzero()[0]
     bright = bright[~are_dots(sky, x[bright], y[bright])][:TEACHERS]
     around = cut(sky, x[bright], y[bright], SIGHT)
-    light, full = around.signal, around.full.any((1, 2))
+    light, full = around.signal, np.any(around.full, axis=(1, 2))
     # the shapes of fainter stars are noise
     clearly_many = np.count_nonzero(height[bright] > BRIGHT) > ALIKE
     bright, light = bright[~full], _select_light(light, ~full)

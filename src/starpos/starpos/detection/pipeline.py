@@ -211,7 +211,7 @@ def _detect(picture: _Picture) -> Detection:
 def enlarged(
     stars: Stars, times: int, width: int, height: int, window: Window | None, gain: float = 1.0
 ) -> Stars:
-    """The stars of a frame that was reduced so many times, on the original one, whose flux is `gain` times as large."""
+    """The stars of a frame that was reduced `times` times, on the original frame; gain: factor on their flux."""
     return replace(
         stars,
         x=times * stars.x + (times - 1) / 2,
@@ -259,8 +259,9 @@ def _detect_at_full_size(picture: _Picture) -> Detection:
     if fwhm_px < WIDE_FWHM:
         found = with_clipped(found, sky, x, y, fwhm_px)
     found = found[: settings.max_stars]
+    columns: dict[str, Any] = {name: found[name] for name in COLUMNS}
     stars = Stars(
-        **{name: found[name] for name in COLUMNS},
+        **columns,
         fwhm_px=fwhm_px,
         window=window_of(plane, int(peaks.highest.max()), level),
         **picture.facts,

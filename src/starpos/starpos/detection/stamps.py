@@ -32,6 +32,7 @@ HALF, QUARTER = 0.5, 0.25
 Each = TypeVar("Each", bound="StarRows")
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
 class StarRows:
     """A dataclass of arrays that have a row for each of N stars."""
 
@@ -137,7 +138,7 @@ NARROWEST_WINDOW = 1.2
 # A star counts for the typical shape if its mean is so near the peak, px, and its windowed image wider than that, px2;
 # which is settled at a relative change of so little.
 NEAR, THINNEST, SETTLED = 1.5, 0.1, 1e-3
-# px. A centroid is not farther from the peak, after so many rounds.
+# Maximum distance of a centroid from the peak, px, and the number of rounds.
 FARTHEST, ROUNDS = 2.0, 3
 
 
@@ -175,7 +176,7 @@ def frame_shape(signal: np.ndarray, blur: float = 0.0, rounds: int = 12) -> np.n
 
 
 def relative_widths(seen: np.ndarray, shape: np.ndarray, window: np.ndarray) -> np.ndarray:
-    """The smaller and the larger squared width (N, 2) of images through windows, over those of stars of this shape.
+    """The smaller and the larger squared width (N, 2) of images through windows, over the widths of stars of this shape.
 
     Both are 1 for a star of that shape and near 0 for a hot pixel. Along a streak the larger reaches 2 if the window is
     the shape. NaN counts as 0.

@@ -92,8 +92,8 @@ def measure(
 
     def one_chunk(x: np.ndarray, y: np.ndarray) -> np.ndarray:
         stamps = cut_at(x, y)
-        begin = centroid(grey(stamps.signal, sky)[0], stamps.x, stamps.y, psf.shapes_at(x, y))
-        fit = fit_stars(stamps, psf, *begin, lesson.response)
+        first_x, first_y = centroid(grey(stamps.signal, sky)[0], stamps.x, stamps.y, psf.shapes_at(x, y))
+        fit = fit_stars(stamps, psf, first_x, first_y, lesson.response)
         strange = surprising(stamps, fit)
         rows = strange.nonzero()[0]
         if len(rows):

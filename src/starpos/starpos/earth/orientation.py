@@ -29,6 +29,11 @@ ROTATION_RAD_S = 7.292115e-5
 EQUATOR_M_PER_S = ROTATION_RAD_S * EQUATOR_RADIUS_M
 # a time of the first year since 1970 is one that counts from a start
 COUNTED_S = 366 * DAY_S
+# Days of 1990 to 2090 as astronomers count them: as seconds after 1970 they are of its first month.
+DATES = (
+    ("Julian date", "2440587.5", (2_447_892.5, 2_484_418.5)),
+    ("modified Julian date", "40587", (47_892.0, 84_418.0)),
+)
 # 1973-01-02: the first day of the IERS table.
 FIRST_MJD = 41684.0
 # Root mean square error of carrying UT1-UTC on along its last year's slope, over all days of 1973 to 2026, and of
@@ -135,6 +140,12 @@ def earth_orientation(utc_unix_s: float) -> EarthOrientation:
     """
     if not np.isfinite(utc_unix_s):
         raise TimeError("the time of the frame is not a finite number: check the clock that stamps it")
+    for name, first, days in DATES:
+        if days[0] <= utc_unix_s < days[1]:
+            raise TimeError(
+                f"a time of {utc_unix_s:.5f} s after 1970 looks like a {name}: give s since 1970, (it - {first}) x "
+                "86400; or it counts from a start, as time since boot, and stars need UTC"
+            )
     if 0 <= utc_unix_s < COUNTED_S:
         raise TimeError(
             f"a time of {utc_unix_s:.3f} s after 1970 is no date: it counts from a start, as simulated time (Gazebo's "

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""An attitude: a rotation from the axes of one frame into those of another, with its error."""
+"""An attitude: a rotation from the axes of one frame into the axes of another, with its error."""
 
 import math
 from dataclasses import KW_ONLY, dataclass
@@ -20,7 +20,7 @@ CAMERA, LINK, ITRS, GCRS, ENU = "camera", "link", "ITRS", "GCRS", "ENU"
 class Attitude:
     """A rotation and its error.
 
-    rotation (3, 3): takes vectors along the axes of the frame `of` into those of the frame `into`.
+    rotation (3, 3): takes components along the axes of the frame `of` to components along the axes of `into`.
     covariance (3, 3): rad2, of its small rotation about the axes of `into`.
     terms: the budget of which `covariance` is the sum; () without one.
     by_refraction (3,): small rotation (rad) about the axes of `into` if refraction is stronger by its own size;
@@ -36,7 +36,7 @@ class Attitude:
     by_refraction: np.ndarray | None = None
 
     def then(self, turn: np.ndarray, into: str) -> "Attitude":
-        """The attitude in another frame, into whose axes `turn` (3, 3) takes those of `into`; without its budget."""
+        """The attitude in another frame, without its budget; turn (3, 3): from the axes of `into` to the new ones."""
         bent = None if self.by_refraction is None else turn @ self.by_refraction
         return Attitude(
             turn @ self.rotation, turn @ self.covariance @ turn.T, of=self.of, into=into, by_refraction=bent

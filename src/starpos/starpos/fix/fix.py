@@ -161,6 +161,7 @@ class Fix(PlaceFix, FittedSighting):
     +35.70... +51.4...
     """
 
+    tilt: Tilt
     link_to_enu: np.ndarray
     levelling: np.ndarray
 

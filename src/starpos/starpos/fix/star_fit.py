@@ -303,7 +303,7 @@ def seen_problem(xy: np.ndarray, camera: Camera, seen: np.ndarray) -> Adjustment
 def fit_seen(xy: np.ndarray, stated: np.ndarray, camera: Camera, seen: np.ndarray) -> StarFit:
     """Fit the camera's attitude and the plate scale to stars as `seen_problem` has them; FixError as `fit_stars`.
 
-    stated (N, 2, 2): covariances of the places, px2, with those of the catalogue.
+    stated (N, 2, 2): covariances of the places, px2, with the catalogue's errors.
     """
     problem = seen_problem(xy, camera, seen)
     fit = fitted(problem, camera.directions(*xy.T), stated)

@@ -80,7 +80,7 @@ class SensorGrid:
 
     @property
     def scale(self) -> float:
-        """Pixels of the picture over those of the picture that the camera made, along a side; 1 if that is not stated."""
+        """Length of a side, px, over its length in the picture that the camera made; 1 if its size is not stated."""
         return max(self.width, self.height) / self.made_px[0] if self.made_px[0] else 1.0
 
     @property

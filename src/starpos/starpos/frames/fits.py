@@ -175,7 +175,9 @@ def _content(file: BinaryIO, image: _Image, place: str) -> tuple[dict[str, Any],
     check_pixels(shape[-1], shape[-2], planes * abs(int(hdu.header["BITPIX"])) / 8, place)
     if isinstance(hdu, fits.CompImageHDU):
         _check_tiles(file, image.number, place)
-    headers = (hdu.header,) if hdu.header.get("INHERIT") is False else (image.primary, hdu.header)
+    headers: tuple[Any, ...] = (
+        (hdu.header,) if hdu.header.get("INHERIT") is False else (image.primary, hdu.header)
+    )
     known = {key: header[key] for header in headers for key in KEYS if key in header}
     comments = {key: str(header.comments[key]) for header in headers for key in KEYS if key in header}
     values = np.asarray(hdu.data)

@@ -75,12 +75,12 @@ UNITS_S = {"us": 1e-6, "ms": 1e-3, "msec": 1e-3, "s": 1.0, "sec": 1.0, "second":
 UNIVERSAL = re.compile(r"\b(utc?|gmt|universal)\b(?! *[+-] *\d)", re.IGNORECASE)
 OFFSET = re.compile(r"\b(?:utc?|gmt) *[+-] *0*[1-9]", re.IGNORECASE)
 ZONE = re.compile(
-    r"\b(CES?T|MES?Z|EES?T|WEST|BST|MSK|[ECMP][SD]T|AK[SD]T|HST|[JK]ST|A[ECW][SD]T|NZ[SD]T|IST|SAST|BRT|ART|CLS?T)\b"
+    r"\b(CES?T|MES?Z|EES?T|WEST|BST|MSK|[ECMP][SD]T|AK[SD]T|HST|[IJK]ST|A[ECW][SD]T|NZ[SD]T|SAST|BRT|ART|CLS?T)\b"
 )
 LOCALLY = re.compile(r"\blocal\b", re.IGNORECASE)
 OPENING = re.compile(r"\b(start|begin|beginning|open(ing)?)\b", re.IGNORECASE)
 CENTRE = re.compile(r"\b(mid|middle|midpoint|cent(er|re))\b", re.IGNORECASE)
-CLOSING = re.compile(r"\b(end|ending|finish|stop|clos(e|ing)|frame grabbed)\b", re.IGNORECASE)
+CLOSING = re.compile(r"\b(end|ending|finish|stop|close|closing|frame grabbed)\b", re.IGNORECASE)
 CREATED = re.compile(r"\b(image created|file (created|written))\b", re.IGNORECASE)
 GPS = re.compile(r"\bgps\b", re.IGNORECASE)
 # Cards of the UTC of some moment of the exposure may be off by the time in which a header is written. Up to FOUND_S the

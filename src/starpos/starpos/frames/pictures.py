@@ -140,7 +140,7 @@ def _not_turned_tiff(data: bytes) -> bytes:
 def tiff_directory(
     data: bytes, at: int, order: str, wanted: tuple[int, ...], most: int
 ) -> tuple[dict[int, tuple], int]:
-    """The first values, at most so many, of the wanted tags of a TIFF's directory, and the offset of the next one.
+    """The first values, at most `most`, of the wanted tags of a TIFF's directory, and the offset of the next directory.
 
     struct.error if it is not a directory.  A text is its bytes.
     """

@@ -56,8 +56,12 @@ def read_star_list(file: BinaryIO, place: str) -> Stars:
         raise FrameError(
             f"{place}: its first line does not give the frame's size; write it like {line}."
         ) from None
+    rest, counted_from, in_magnitudes = _as_ours(rest)
     table = STAR_LIST.read_text(io.StringIO(rest), place, before=1)
-    column, sigma = table.columns, table.column("sigma", DEFAULT_SIGMA_PX)
+    column, sigma = dict(table.columns), table.column("sigma", DEFAULT_SIGMA_PX)
+    column["x"], column["y"] = column["x"] - counted_from, column["y"] - counted_from
+    if in_magnitudes:
+        column["flux"] = 10 ** (-0.4 * np.clip(column["flux"], -50, 50))
     order = np.argsort(-column["flux"], kind="stable")
     return Stars(
         x=column["x"][order],
@@ -71,6 +75,35 @@ def read_star_list(file: BinaryIO, place: str) -> Stars:
         fwhm_px=fwhm_px(header),
         **read_exposure(header, place).facts,
     )
+
+
+# Names that programs give to a star's place, and from where they count the first pixel's centre: SExtractor, IRAF's
+# daofind, photutils' DAOStarFinder. Names of their
+# fluxes, and of their magnitudes, where there is no flux.
+PLACES = {
+    ("x_image", "y_image"): 1.0,
+    ("xcenter", "ycenter"): 1.0,
+    ("xcentroid", "ycentroid"): 0.0,
+    ("x_centroid", "y_centroid"): 0.0,
+}
+FLUXES = ("flux", "flux_auto", "flux_best", "flux_iso", "flux_aper", "flux_psf")
+MAGNITUDES = ("mag", "mag_auto", "mag_best", "mag_iso", "mag_aper", "mag_psf")
+
+
+def _as_ours(rows: str) -> tuple[str, float, bool]:
+    """Rows of stars under our own names of columns.
+
+    Also what x and y of the first pixel's centre are in them, and whether their light is a magnitude.
+    """
+    names, line, rest = rows.partition("\n")
+    given = [name.strip('" \t\r').lower() for name in names.lstrip("# ").split(",")]
+    for place, counted_from in PLACES.items():
+        if set(place) <= set(given) and not {"x", "y"} & set(given):
+            light = next((name for name in (*FLUXES, *MAGNITUDES) if name in given), "flux")
+            ours = {**dict(zip(place, "xy", strict=True)), light: "flux"}
+            text = ",".join(ours.get(name, name) for name in given) + line + rest
+            return text, counted_from, light in MAGNITUDES
+    return rows, 0.0, False
 
 
 def write_star_list(path: Path | str, stars: Stars, start_utc: str, pixel_um: float = 1.0) -> None:

@@ -33,6 +33,7 @@ class LevelSight(Sighting):
     latitude, longitude (rad): of the fix, whose A3 may be wrong.
     """
 
+    tilt: Tilt
     zenith_covariance: np.ndarray
     latitude: float
     longitude: float

@@ -237,7 +237,9 @@ class GnssWatch:
     def advance(self, sighting: LevelSight) -> None:
         """Advance to the time of a frame, seen with any A3: only the attitude of its camera counts."""
         tilt = sighting.tilt
-        self._new_pose = self._pose is None or slip_s(sighting, self._pose) is None
+        self._new_pose = (
+            self._pose is None or slip_s(sighting.camera, self._pose.camera, sighting.latitude) is None
+        )
         if self._new_pose:
             self._pose, self._of_pose = sighting, 0
         if self.learned is not None and self.learned.axes != tilt.axes:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Evidence of a frame's stars that a pose is right, against chance; verification of a pose by it, and what that explains.
+"""Evidence of a frame's stars that a pose is right, against chance; poses verified by it, and the stars they explain.
 
 By chance the detections are random points anywhere on the frame. If the pose is right, each detection, from the brightest
 down, is one of two things. It is a false star, with a probability that follows from the share of false ones before it (a

@@ -162,7 +162,7 @@ def identifications(
 ) -> Iterator[Identification]:
     """Identifications of a frame in the order in which they are tried.
 
-    First all of `near_or_lost`, then those of a frame whose brightest stars may nearly all be false, in any order. Then
+    First all of `near_or_lost`, then, in any order, those for a crowd of false stars among the brightest. Then
     both for evenly spread stars, if the brightest are not spread evenly.
     """
     if len(field) < MIN_STARS:

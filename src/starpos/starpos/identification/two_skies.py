@@ -7,8 +7,8 @@ The second is another pose of the same camera: what is left over is identified a
 evidence. In both the second sky must be about as bright as the first: ghosts and glare are much fainter.
 
 Two skies a few pixels apart may be identified as one between them. Then the residuals of neighbouring stars differ by
-much more than their errors, and as much as the residuals of distant stars, which no lens does; and each residual is
-one of two opposite ones, half of the offset, which centroids that err by more than they claim are not.
+much more than their errors, and as much as the residuals of distant stars, which no lens does. And each
+residual is one of two opposite ones, half of the offset, which centroids that err by more than they claim are not.
 """
 
 import math

@@ -280,7 +280,7 @@ def _from_mapping(content: dict, folder: Path, needs_camera: bool) -> Instrument
         optics = _camera(content.get("camera"), folder)
     given = {name: _error(content, key, unit) for key, (name, unit) in INCLINOMETER.items() if key in content}
     sensor, errors = _sensor(content, bool(given))
-    more = {
+    more: dict[str, Any] = {
         name: read(content, key)
         for key, (name, read) in {
             "link_to_camera": ("link_to_camera", _matrix),

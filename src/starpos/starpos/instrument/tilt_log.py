@@ -387,7 +387,7 @@ class Tilts(Protocol):
 
 @dataclass(frozen=True)
 class TiltsByTime:
-    """The tilts of exposures, each known by their middle (Unix seconds); and why there is none for another one."""
+    """The tilts of exposures by their middles (Unix seconds); why: the reason why other exposures have no tilt."""
 
     tilts: Mapping[Any, Tilt] = field(default_factory=dict)
     why: str = "no tilt: give the inclinometer's"

@@ -66,6 +66,7 @@ def read_tilt_csv(path: Path | str, noise_rad: float = SCA100T_NOISE_RAD) -> Til
         raise TiltError(
             f"{path}: none of its {len(table.lines)} readings is a number: check the inclinometer and what wrote them"
         )
+    _check_digits(path, column["utc_unix_s"])
     _check_one_sensor(path, column)
     order = np.argsort(column["utc_unix_s"], kind="stable")
     order = order[np.isfinite(column["utc_unix_s"][order])]
@@ -82,6 +83,22 @@ def read_tilt_csv(path: Path | str, noise_rad: float = SCA100T_NOISE_RAD) -> Til
         np.where(np.isnan(sigma), noise_rad, sigma),
         theta_z=theta[2] if len(theta) == 3 else None,
     )
+
+
+# Times of these steps, s, are rounded: float32 at today's times, and six digits as %g writes.
+ROUNDED_S, FEWEST_ROUNDED = (128.0, 10_000.0), 3
+
+
+def _check_digits(path: Path, t: np.ndarray) -> None:
+    """TiltError if times (N,) were written with too few digits, so that many of them are the same."""
+    t = t[np.isfinite(t)]
+    if len(t) < FEWEST_ROUNDED or len(np.unique(t)) == len(t):
+        return
+    if any((t % step == 0).all() for step in ROUNDED_S):
+        raise TiltError(
+            f"{path}: {len(t)} readings have {len(np.unique(t))} times, all whole multiples of over 100 s: they were "
+            "rounded by float32, or by %g: write utc_unix_s with its fractions of a second (%.3f, double precision)"
+        )
 
 
 def _check_one_sensor(path: Path, column: Mapping[str, np.ndarray]) -> None:

@@ -224,6 +224,7 @@ def body_attitude(frame: PlacelessFrame, place: Place, vessel: Vessel) -> Attitu
     a4, air = place.plumb_axes, vessel.atmosphere
     seen = frame.under(a4[2], air)
     seen = seen.then(a4, ENU)
+    assert seen.by_refraction is not None
     late_s = [frame.stamp_stddev_s, vessel.clock_stddev_s, earth_orientation(frame.utc_unix_s).ut1_sigma_s]
     # a zenith further east, or north, turns level and north
     level = np.array([[0.0, 1.0], [-1.0, 0.0]])

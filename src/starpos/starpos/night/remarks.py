@@ -173,7 +173,7 @@ def doubts(
 
     mounting: of the fixes' frames, None if A3 was not given: then it is not checked.
     """
-    frames: list[Leaning] = [(f.camera.rotation, f.tilt) for f in fixes if f.tilt is not None]
+    frames: list[Leaning] = [(f.camera.rotation, f.tilt) for f in fixes]
     if apart := _mistaken(mounting, frames):
         yield Remark(Kind.MISTAKEN, apart)
     if near is not None and (away := _far(near, whole, mounting, frames[-1:])):

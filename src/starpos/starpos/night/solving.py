@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The one driver of a night, for command, library and report: it goes through the frames' sights, and answers each.
 
-Frames are solved one by one, or all together: by turning, or beside GNSS.
+Frames are solved one by one, or all together: by turning, or compared with GNSS.
 """
 
 from collections.abc import Callable, Iterable, Iterator

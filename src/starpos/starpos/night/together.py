@@ -72,7 +72,7 @@ class FrameAnswer:
     """The answer to a frame of a night.
 
     stars: that gave it; None for a pointing, and for a file that cannot be read.
-    watched: beside GNSS; None without it.
+    watched: compared with GNSS; None without it.
     """
 
     name: str

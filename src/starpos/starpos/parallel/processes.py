@@ -31,8 +31,8 @@ DYING_S = 1.0
 ONE_THREAD = dict.fromkeys((*BLAS_THREADS, "OPENCV_FOR_THREADS_NUM"), "1")
 
 Files = str | tuple[str, ...]
-# The work, which can be pickled, and the file or files it is done on.
-Call = tuple[Callable[[Any], Any], Files]
+# The work and its argument, which can be pickled: a file or files, on this machine also anything else.
+Call = tuple[Callable[[Any], Any], Any]
 # A call and its number.
 Task = tuple[int, Call]
 

@@ -73,7 +73,7 @@ class PoseMemory:
 
     def keep(self, seen: Seen, fix: Fix) -> bool:
         """Keep a frame; return whether a new calibration is worthwhile: a new pose, or one with twice as many frames."""
-        if not self._poses or slip_s(fix, self._poses[-1].first) != 0:
+        if not self._poses or slip_s(fix.camera, self._poses[-1].first.camera, fix.latitude) != 0:
             self._poses.append(_Pose(fix, seen))
         pose = self._poses[-1]
         pose.keep(seen)

@@ -69,7 +69,7 @@ class Averaging:
 
     def include(self, fix: Fix) -> News:
         """Take a fix that is later than all before."""
-        if self._pose is None or slip_s(fix, self._pose) != 0:
+        if self._pose is None or slip_s(fix.camera, self._pose.camera, fix.latitude) != 0:
             self._pose = fix
             if self._turned is not None or _is_wide(fix):
                 self._averager = Averager()
@@ -157,7 +157,7 @@ class ClockDoubt:
     def judge(self, fix: Fix, stated_s: float) -> None:
         """Take a fix; stated_s: standard deviation of its time, as its sender states it."""
         first = self._first
-        slip = None if first is None else slip_s(fix, first, self._both(stated_s))
+        slip = None if first is None else slip_s(fix.camera, first.camera, fix.latitude, self._both(stated_s))
         self.leans_otherwise = False
         if first is None or slip is None:
             # The camera was touched; its clock is as good or bad as just before.
@@ -170,7 +170,8 @@ class ClockDoubt:
                 self._first, self._first_stated_s = fix, stated_s
         else:
             self.leans_otherwise = _leans_otherwise(fix, first)
-            again = self._other is not None and slip_s(fix, self._other, self._both(stated_s)) == 0
+            other, both_s = self._other, self._both(stated_s)
+            again = other is not None and slip_s(fix.camera, other.camera, fix.latitude, both_s) == 0
             self._other_agree = self._other_agree + 1 if again else 1
             self._other = self._other if again else fix
             self.seconds = max(self._first_doubt_s, slip)

@@ -64,8 +64,8 @@ def rows_near(cell_start: np.ndarray, centre: np.ndarray, radius_rad: float) -> 
     return np.concatenate([np.arange(cell_start[begin], cell_start[end]) for begin, end in runs])
 
 
-# Parallaxes of the near stars, which Tycho-2 does not have (columns tyc1, tyc2, tyc3, parallax_mas): of the stars of
-# Hipparcos (ESA SP-1200, 1997) of at least this, and of stars within 8 arcsec of one. tools/data/near_stars.py makes the
+# Parallaxes of the near stars, which Tycho-2 does not have (columns tyc1, tyc2, tyc3, parallax_mas). These are stars of
+# Hipparcos (ESA SP-1200, 1997) of at least this, and stars within 8 arcsec of one. tools/data/near_stars.py makes the
 # table of Stellarium's list, which has later values for some. Hipparcos' own err by 1 to 3 mas, of some pairs more.
 NEAR_MIN_MAS, PARALLAXES = 100.0, Path(__file__).with_name("data") / "near_stars.csv"
 

@@ -42,7 +42,7 @@ STRONGER = 0.01
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ZenithSighting(Sighting):
-    """A sighting at a known site, with the effect of each error of its stars.
+    """A sighting at a known site, with the effects of its stars' errors.
 
     camera: into geodetic east, north, up at the mark, with its errors by the stars' places on the frame alone.  All
     rotations below are small ones of the camera about C's axes, rad.

@@ -66,6 +66,7 @@ def readings(rng, headings, noise=SCA100T, lean=0.0, wander=0.0, leans=None) -> 
         plumb=rows,
         heading=np.radians(headings),
         sigma=np.full(n, noise),
+        common2=np.zeros(n),
         pose=np.arange(n),
         pose_sigma=0.0,
         columns=shared,

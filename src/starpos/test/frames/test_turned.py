@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""However a camera was held, rows and columns are those of its sensor, in every format."""
+"""However a camera was held, every format gives the rows and columns of its sensor."""
 
 import io
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The driver of a night: frames solved one by one, by turning or beside GNSS; those that fail, and what is said."""
+"""The driver of a night: frames solved one by one, by turning or compared with GNSS; failures and remarks."""
 
 import re
 from dataclasses import replace

@@ -60,6 +60,7 @@ def fix_at(seconds: float, azimuth_deg=40.0, latitude_deg=40.0, noise_m=100.0, c
     terms = (ErrorTerm("tilt", np.diag(rows * noise_m)), ErrorTerm("calibration", slip, shared=ALWAYS))
     return Fix(
         utc_unix_s=T0 + seconds,
+        tilt=tilt_at(seconds),
         latitude=math.radians(latitude_deg),
         longitude=math.radians(10.0),
         heading=heading_of(link),
