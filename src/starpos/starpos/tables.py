@@ -55,6 +55,7 @@ class TableForm:
     limits: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     most_bytes: int = 300_000_000
     broken_rows_are_nan: bool = False
+    may_be_empty: bool = False
 
     @property
     def cure(self) -> str:
@@ -103,7 +104,7 @@ class TableForm:
             except ValueError as e:
                 raise self.error(f"{place}:{numbers[-1]}: {one_line(e)}: {self.cure}") from None
         rows = rows.reshape(-1, len(used))
-        if len(rows) == 0 and not self.broken_rows_are_nan:
+        if len(rows) == 0 and not self.may_be_empty:
             raise self.error(f"{place}: the {self.what} has no rows: {self.cure}")
         table = Table(dict(zip(used, rows.T, strict=True)), np.array(numbers))
         self._check_limits(table, place)

@@ -32,6 +32,7 @@ STAR_LIST = TableForm(
     needed=("x", "y", "flux"),
     optional=("sigma", "flags"),
     limits={"sigma": (1e-6, 1e3)},
+    may_be_empty=True,
 )
 
 

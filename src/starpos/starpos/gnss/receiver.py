@@ -188,6 +188,7 @@ GNSS_TABLE = TableForm(
     needed=("utc_unix_s", "latitude", "longitude", "sigma_east_m", "sigma_north_m"),
     optional=("status",),
     broken_rows_are_nan=True,
+    may_be_empty=True,
 )
 
 
