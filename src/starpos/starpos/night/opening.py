@@ -91,7 +91,7 @@ def work_of(
     if tilts is None:
         return Solving(instruments, atmosphere=atmosphere, places=place), remarks
     known = instruments.instrument
-    errors = sensors.UNNAMED if known is None else known.inclinometer
+    errors = sensors.unnamed() if known is None else known.inclinometer
     table = TiltFile(os.path.abspath(tilts), errors.noise_rad)
     doubts = of_tilts(table.log, str(tilts), errors)
     return Solving(instruments, atmosphere=atmosphere, tilts=table, places=place), (*remarks, *doubts)

@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 
 from starpos.errors import TiltError
+from starpos.instrument import sensors
 from starpos.instrument.inclinometer import InclinometerErrors
-from starpos.instrument.sensors import ADIS16209
 from starpos.instrument.tilt_log import TiltLog
 
 SENSOR = InclinometerErrors()
+ADIS16209 = sensors.find("adis16209")[1]
 COARSE = InclinometerErrors(quantum_rad=np.radians(0.1))
 
 
