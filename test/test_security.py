@@ -13,7 +13,7 @@ from starpos.frames.reading import read_frame
 from starpos.instrument import instrument_file
 from starpos.instrument.tilt_table import read_tilt_csv
 from starpos.messages.stars import MAX_STARS, message_to_stars
-from starpos.navigation.records import read_record
+from starpos.navigation.records import read_imu
 from starpos_interfaces.msg import Star, StarArray
 
 ROOT = Path(__file__).parents[1]
@@ -164,7 +164,7 @@ def test_the_search_covers_the_product_and_would_find(monkeypatch):
         ("frame.png", b"\x89PNG\r\n\x1a\n", 1 << 40, read_frame),
         ("frame.cr2", b"II*\0", 1 << 40, read_frame),
         ("tilt.csv", b"utc_unix_s,theta_x_deg,theta_y_deg\n", 1 << 40, read_tilt_csv),
-        ("imu.csv", b"utc_unix_s,wx\n", 1 << 40, lambda path: read_record(path, ["wx"], "readings")),
+        ("imu.csv", b"utc_unix_s,gx,gy,gz,ax,ay,az\n", 1 << 40, read_imu),
         ("instrument.yaml", b"starpos_instrument: 1\n", 1 << 40, instrument_file.read),
         ("camera.yaml", b"image_width: 1\n", 1 << 40, instrument_file.read_camera),
         ("geoid.tif", b"II*\0", 1 << 40, geoid.read_grid),

@@ -159,9 +159,9 @@ class PlumbLine:
     """a3 (3, 3) with covariance (3, 3) in rad2 about S's axes, and the zenith (3,) in ITRS with its sigma in rad.
 
     cost: half the robust chi-square.  scatter: chi-square per degree of freedom, 1 for frames of one zenith.
-    left (K, 2): what the fit leaves of each frame's reading, in rad across the plumb line.
-    response (m,), response_covariance (m, m): of the inclinometer's response.
-    residual (K, 2) in rad, design (K, 2, n), prior_sigma (n,): the linear fit about the answer.  Its n parameters are
+    left (K, 2): residual of each frame's reading, in rad across the plumb line.
+    response (m,), response_covariance (m, m): the inclinometer's.
+    residual (K, 2) rad, design (K, 2, n), prior_sigma (n,): linear fit about the answer.  Its n parameters are
     A3's turns (3) about `turns`, the zenith's moves (2) along `across`, and the columns, which are 0 in the residual.
     turns (3, 3): axes in S, two across the plumb line and it.  across (2, 3): axes in ITRS, across the zenith.
     astray (rad): sigma by which the zenith may be off together with A3's turn about a leaning axis; no heading shows it.

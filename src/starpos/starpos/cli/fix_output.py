@@ -58,7 +58,7 @@ def budget_of(fix: Fix | Average, ground: Geodetic) -> dict:
 
 
 # the keys of --json that come from a fix and the same place on the ellipsoid
-FIX_KEYS: dict[str, Callable[[PlaceFix, Geodetic], Any]] = {
+FIX_KEYS: dict[str, Callable[[Any, Geodetic], Any]] = {
     "utc": lambda fix, _: utc_text(fix.utc_unix_s),
     "latitude": lambda fix, _: np.degrees(fix.latitude),
     "longitude": lambda fix, _: np.degrees(fix.longitude),

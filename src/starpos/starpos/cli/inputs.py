@@ -131,7 +131,7 @@ def nights_of(
 
     Else a night for each folder, or its error.
 
-    A folder's frames are those of `opening.frames_in`, in the order of their names.
+    `opening.frames_in` finds a folder's frames, in the order of their names.
     Raises FrameError for a path that does not exist, TiltError for frames without a table.
     """
     if tilt is not None:

@@ -35,7 +35,7 @@ from starpos.night.under_way import (
 NO_ANSWER = 1
 OK, CARRIED, NO_READINGS, BAD_INPUT = "ok", "carried", "no inertial readings", "bad input"
 # the keys of --json that come from a fix
-KEYS: dict[str, Callable[[VoyageFix, Geodetic], Any]] = {
+KEYS: dict[str, Callable[[Any, Geodetic], Any]] = {
     "utc_unix_s": lambda fix, _: fix.utc_unix_s,
     **{key: FIX_KEYS[key] for key in ("latitude", "longitude", "heading", "covariance")},
     "velocity": lambda fix, _: fix.velocity,

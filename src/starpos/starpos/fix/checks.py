@@ -63,7 +63,7 @@ TRAIL_WIDTHS, TRAIL_PX, ACROSS_PX = 3.0, 3.0, 0.8
 
 
 def check_exposure(stars: Stars, camera: Camera, directions: np.ndarray) -> None:
-    """Raise FixError if stars are points where those of a camera at rest would trail for the exposure's length.
+    """Raise FixError if stars are points although the camera, at rest, would show trails of the exposure's length.
 
     directions (N, 3): of stars on the frame, GCRS.
     """

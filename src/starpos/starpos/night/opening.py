@@ -109,7 +109,7 @@ def frames_in(folder: Path) -> list[Path]:
     frames = [p for p in files if p.suffix.lower() in FITS]
     tables = [p for p in files if p.suffix.lower() == ".csv" and p.name not in (TILTS, GNSS)]
     frames = frames or (tables if any(map(_is_star_list, tables)) else [])
-    # without a list of stars, other tables lie beside pictures
+    # without a list of stars, tables among pictures are no frames
     frames = frames or _pictures_among(files) or tables
     if not frames:
         raise FrameError(
@@ -130,7 +130,7 @@ def _is_star_list(path: Path) -> bool:
 
 
 def _pictures_among(files: Sequence[Path]) -> list[Path]:
-    """Pictures and raw files by name, each name once: a JPEG beside another one is its copy."""
+    """Pictures and raw files by name, each name once: a JPEG with the name of another one is its copy."""
     best: dict[str, Path] = {}
     for suffixes in (RAW, PICTURE, HEIF, JPEG):
         for path in files:

@@ -98,7 +98,7 @@ class Instruments:
     by_header: whether each frame's own header has its focal length, if it states one.
     cameras: of a bag, by (width, height) of their frames in px.
     any_size: whether frames of other sizes than the cameras' are the instrument's too.
-    sought: whether nothing states the focal length, and that of `instrument` stands in until the stars give it.
+    sought: whether nothing states the focal length; until the stars give it, `instrument` has a stand-in.
     """
 
     instrument: Instrument | None

@@ -42,7 +42,7 @@ class CameraSolver:
         self._of_open_size: Any = None
         # name of its frame; '' before the first CameraInfo
         self.frame_id = ""
-        # cameras, or why there is none, that hold from a stamp on which no frame has reached yet
+        # cameras, or the reason for their lack, that hold from a stamp on which no frame has reached yet
         self._changes: deque[tuple[float | None, Camera | str]] = deque(maxlen=MAX_CHANGES)
 
     @property

@@ -240,7 +240,8 @@ def photograph(
 
 
 def _tilt_log(world: NightWorld, readings: np.ndarray) -> TiltLog:
-    return TiltLog.of(*readings.T, noise_rad=world.told.inclinometer.noise_rad)
+    utc_unix_s, theta_x, theta_y, temperature_c = readings.T
+    return TiltLog.of(utc_unix_s, theta_x, theta_y, temperature_c, world.told.inclinometer.noise_rad)
 
 
 def turned_night(
