@@ -16,6 +16,7 @@ from starpos.fix.fix import PlaceFix
 from starpos.fix.solution import FieldPointing, Status
 from starpos.fix.terms import ALWAYS, ErrorTerm
 from starpos.frames.frame import Frame, Stars
+from starpos.frozen import at_once
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import Tilt
 from starpos.instrument.tilt_log import TiltLog, Tilts, TiltsByTime
@@ -194,7 +195,8 @@ class _Reading:
         return tuple(said)
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@at_once
+@dataclass(frozen=True, kw_only=True)
 class RecordedPlace(PlaceFix):
     """A place as messages have it; stated (3, 3): their covariance, of which their terms hold only the variances."""
 
