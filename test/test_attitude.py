@@ -41,7 +41,8 @@ def nees(message, shot) -> float:
     enu = enu_axes(*np.radians([LATITUDE_DEG, LONGITUDE_DEG]))
     seen = PlacelessFrame.of(message_to_attitude(message)).under(enu[2], AIR)
     off = Rotation.from_matrix(seen.rotation.T @ enu.T @ shot.scene.attitude).as_rotvec()
-    return float(off @ np.linalg.solve(seen.covariance, off))
+    # `off` is about the axes of the camera
+    return float(off @ np.linalg.solve(seen.covariance_about_own, off))
 
 
 def test_the_attitude_is_the_cameras_and_its_claim_holds(graph, attitudes):

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The newest message of each kind as JSON for the page, in the units that people read, and when it came.  A number that
-is not finite becomes null. A text is shortened and loses characters that could rearrange the text of the page. An
-inconsistent message is shown as trouble, never as a value.
+"""The newest message of each kind as JSON for the page, in the units that people read, and when it came.
+
+A number that is not finite becomes null. A text is shortened and loses characters that could rearrange the text of the
+page. An inconsistent message is shown as trouble, never as a value.
 """
 
 import json

@@ -34,6 +34,7 @@ from starpos.fix.star_fit import (
 )
 from starpos.frames.frame import Stars
 from starpos.frames.reading import why_no_time
+from starpos.frozen import at_once
 from starpos.identification import Identification, fisheye
 from starpos.instrument.camera import Camera
 from starpos.navigation.vessel import Vessel
@@ -58,7 +59,8 @@ class FrameUnderWay(Sighting):
         raise NotImplementedError
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@at_once
+@dataclass(frozen=True, kw_only=True)
 class IdentifiedFrame(FrameUnderWay):
     """N identified stars of a frame; `camera` is without refraction, good to ROUGH rad.
 

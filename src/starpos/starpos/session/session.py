@@ -13,7 +13,7 @@ from dataclasses import replace
 from typing import Any, TypeVar
 
 from starpos.earth.orientation import earth_state
-from starpos.errors import InstrumentError, StarposError, TimeError
+from starpos.errors import InstrumentError, StarposError
 from starpos.fix.camera_attitude import CameraAttitude
 from starpos.fix.checks import MODEL_BY_PARAMETERS, unnamed_inclinometer
 from starpos.fix.fix import Fix
@@ -354,17 +354,16 @@ class SolverSession:
 
     def _answer(self, frame: Waiting, question: Question) -> Solution:
         def work() -> Solution:
-            solver = self.instrument.solver_now
+            try:
+                solver = self.instrument.solver_now
+            except InstrumentError as e:
+                return Solution.failed(frame.stars, Status.BAD_INPUT, str(e))
             if frame.ahead_s > reports.AHEAD_S + CLOCK_SIGMAS * solver.clock_stddev_s(frame.stars):
-                raise TimeError(
-                    f"the frame is stamped {frame.ahead_s:.3g} s in the future: {reports.ONE_CLOCK}"
-                )
+                ahead = f"the frame is stamped {frame.ahead_s:.3g} s in the future: {reports.ONE_CLOCK}"
+                return Solution.failed(frame.stars, Status.BAD_INPUT, ahead)
             return self._search.solve(solver, question)
 
-        try:
-            return self._guarded(work, lambda e: _failed(frame, "the solver failed on this frame", e))
-        except (InstrumentError, TimeError) as e:
-            return Solution.failed(frame.stars, Status.BAD_INPUT, str(e))
+        return self._guarded(work, lambda e: _failed(frame, "the solver failed on this frame", e))
 
     def _with_doubt(self, frame: Waiting, answer: Solution, fix: Fix) -> tuple[Waiting, Solution]:
         """Add the error of its time that the stars of earlier frames show to a frame and its answer."""

@@ -31,6 +31,7 @@ from starpos.fix.star_fit import (
 )
 from starpos.frames.exposure import Shutter
 from starpos.frames.frame import Stars
+from starpos.frozen import at_once
 from starpos.identification import Identification
 from starpos.instrument.inclinometer import Tilt
 from starpos.instrument.tilt_log import Tilts
@@ -40,7 +41,8 @@ from starpos.rotation import half_turns
 STRONGER = 0.01
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
+@at_once
+@dataclass(frozen=True, kw_only=True)
 class ZenithSighting(Sighting):
     """A sighting at a known site, with the effects of its stars' errors.
 
