@@ -125,7 +125,7 @@ def names(dependencies) -> set[str]:
 
 @pytest.mark.parametrize("folder", PYTHON, ids=lambda folder: folder.name)
 def test_the_manifest_names_what_the_code_imports_and_no_more(folder):
-    texts = [f.read_text() for f in folder.glob("launch/*.py")]
+    texts = [f.read_text() for part in ("launch", folder.name) for f in folder.glob(f"{part}/*launch*.py")]
     launched = {f.name for f in FOLDERS if any(f'"{f.name}"' in text for text in texts)}
     wanted = (keys_of(Code(folder).run, folder.name) | launched) - {folder.name}
     assert wanted == names(parse_package(folder).exec_depends) - RUN_BY_COMMAND

@@ -18,7 +18,7 @@ from starpos.units import ARCSEC
 
 
 @at_once
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Sighting:
     """What one frame says, whatever it sees.
 
