@@ -359,8 +359,11 @@ class SolverSession:
             except InstrumentError as e:
                 return Solution.failed(frame.stars, Status.BAD_INPUT, str(e))
             if frame.ahead_s > reports.AHEAD_S + CLOCK_SIGMAS * solver.clock_stddev_s(frame.stars):
-                ahead = f"the frame is stamped {frame.ahead_s:.3g} s in the future: {reports.ONE_CLOCK}"
-                return Solution.failed(frame.stars, Status.BAD_INPUT, ahead)
+                return Solution.failed(
+                    frame.stars,
+                    Status.BAD_INPUT,
+                    f"the frame is stamped {frame.ahead_s:.3g} s in the future: {reports.ONE_CLOCK}",
+                )
             return self._search.solve(solver, question)
 
         return self._guarded(work, lambda e: _failed(frame, "the solver failed on this frame", e))
