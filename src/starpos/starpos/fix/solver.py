@@ -325,7 +325,7 @@ class Solver:
         up = found.attitude @ state.gcrs_to_itrs.T @ place.plumb_axes[2]
         if low := set_stars(directions_of(camera, stars)[found.star] @ up):
             raise PlaceError(
-                f"from the given place {low}: check the hour, and latitude and longitude, their order and signs"
+                f"from the given place {low}: check latitude and longitude, their order and signs, and the hour"
             )
         use, matched = self._matched(stars, found, camera, up, state, catalogue)
         attitude = attitude_at_place(
