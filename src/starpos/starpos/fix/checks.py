@@ -52,6 +52,19 @@ def check_visible(sine: float) -> None:
         )
 
 
+# More identified stars than these below this altitude are no mistakes of the identification.
+FEW_SET, SET_DEG = 3, -1.0
+
+
+def set_stars(sines: np.ndarray) -> str:
+    """Say that identified stars lie under the horizon; '' if at most a few do.  sines (N,): of their altitudes."""
+    under = int((sines < math.sin(math.radians(SET_DEG))).sum())
+    if under <= FEW_SET:
+        return ""
+    lowest = _altitude_text(float(sines.min()))
+    return f"{under} of the {len(sines)} identified stars would be under the horizon, the lowest {lowest}"
+
+
 def _altitude_text(sine: float) -> str:
     altitude_deg = np.degrees(np.arcsin(max(sine, -1.0)))
     return f"{abs(altitude_deg):.1f} deg {'above' if altitude_deg > 0 else 'below'} the horizon"

@@ -14,7 +14,7 @@ from starpos.earth.orientation import EarthState, earth_state
 from starpos.earth.place import Place, Places
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import FieldError, FixError, InstrumentError, PlaceError, StarposError, TimeError
-from starpos.fix.checks import check_above_horizon, check_exposure, check_unmoved, why_unidentified
+from starpos.fix.checks import check_above_horizon, check_exposure, check_unmoved, set_stars, why_unidentified
 from starpos.fix.fix import IDEAL, Fix, length_text, pointing_fix, solve_fix
 from starpos.fix.heading import AttitudeAtPlace, attitude_at_place
 from starpos.fix.solution import TWO_SKIES, UNEXPLAINED, Solution, Status, solution_of, status_of
@@ -270,6 +270,10 @@ class Solver:
         if fisheye.is_wide(camera):
             sines = directions_of(camera, stars)[found.star] @ up
             check_above_horizon(float(sines.mean()), self.instrument.calibration)
+            if not self.instrument.calibration.unknown and (low := set_stars(sines)):
+                raise FixError(
+                    f"by the tilts and A3 {low}: check the signs and the order of the tilts' axes, and A3"
+                )
         fix = solve_fix(
             matched,
             camera.scaled(found.focal_scale),
@@ -319,6 +323,10 @@ class Solver:
         state = earth_state(stars.mid_unix_s)
         camera, catalogue, _ = self.view(stars.width, stars.height, stars.origin_px)
         up = found.attitude @ state.gcrs_to_itrs.T @ place.plumb_axes[2]
+        if low := set_stars(directions_of(camera, stars)[found.star] @ up):
+            raise PlaceError(
+                f"from the given place {low}: check latitude and longitude, their order and signs, and the hour"
+            )
         use, matched = self._matched(stars, found, camera, up, state, catalogue)
         attitude = attitude_at_place(
             matched,

@@ -243,7 +243,7 @@ class TiltLog:
                 "larger than its steps: check its converter's wiring"
             )
         repeats = tuple(self._repeats[use].any(0).tolist())
-        return replace(self._mean(use), step_rad=self._steps[repeats])
+        return replace(self._mean(use, self.step_rad), step_rad=self._steps[repeats])
 
     def mean(self) -> Tilt:
         """The mean of all readings, of an instrument that is at rest between them too; TiltError if it moved."""
@@ -314,11 +314,11 @@ class TiltLog:
                 repeats[self._once[first : last + 1], axis] = last - first >= STUCK_READINGS - 1
         return repeats
 
-    def _mean(self, use: np.ndarray) -> Tilt:
-        """The mean tilt of the readings `use` (indices, in order of time)."""
+    def _mean(self, use: np.ndarray, step_rad: float = 0.0) -> Tilt:
+        """The mean tilt of the readings `use` (indices, in order of time), rounded to a step."""
         theta = self.theta[use]
         # rounded readings may go from one step to the next
-        noise = np.hypot(self.excess * np.sqrt(self.variance[use].mean()), self.step_rad / math.sqrt(12))
+        noise = np.hypot(self.excess * np.sqrt(self.variance[use].mean()), step_rad / math.sqrt(12))
         from_middle = np.abs(theta - np.median(theta, axis=0))
         spread = np.maximum(noise, SIGMA_PER_MAD * np.median(from_middle, axis=0))
         sane = (from_middle <= OUTLIER_SIGMA * spread).all(1)

@@ -37,7 +37,7 @@ def lists(tmp_path_factory):
         *place,
         *AIR,
     ]
-    assert main([*command, "--tilt-noise", "0.00001"]) == 0
+    assert main([*command, "--tilt-noise", "0.000001"]) == 0
     return folder
 
 

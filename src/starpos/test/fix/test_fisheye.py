@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from solved_night import off_by_sigma
 
-from starpos.errors import InstrumentError
+from starpos.earth.place import Place
+from starpos.errors import InstrumentError, PlaceError
 from starpos.fix.solution import Status
 from starpos.fix.solver import focal_that_fits
 from starpos.identification import fisheye as wide
@@ -210,3 +211,22 @@ def test_parts_look_at_the_frame_where_they_say(catalogue):
     assert cached_triangles(catalogue, wide.field_rad(camera)).longest_allowed[0] == pytest.approx(
         1.37, rel=0.06
     )
+
+
+def place_of(scene, east_deg=0.0):
+    return Place.by_gravity(scene.site.latitude_deg, scene.site.longitude_deg + east_deg)
+
+
+@pytest.mark.parametrize(("late_s", "east_deg"), [(7200.0, 0.0), (-5400.0, 0.0), (0.0, -40.0)])
+def test_stars_under_the_horizon_refute_the_hour_and_the_place(night, late_s, east_deg):
+    scene, stars, _, solver = night
+    found = solver.identify(stars).found
+    wrong = replace(stars, mid_unix_s=stars.mid_unix_s + late_s)
+    with pytest.raises(PlaceError, match="would be under the horizon"):
+        solver.attitude_at(wrong, found, place_of(scene, east_deg))
+
+
+def test_all_stars_of_a_whole_sky_are_up_at_its_own_place(night):
+    scene, stars, _, solver = night
+    place = place_of(scene)
+    assert solver.attitude_at(stars, solver.identify(stars).found, place).place is place
