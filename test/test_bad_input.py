@@ -174,22 +174,24 @@ def test_a_tilt_beyond_the_range_of_the_sensors_model_is_refused(graph, solver):
 
 
 @pytest.mark.parametrize(
-    "change",
+    ("change", "status"),
     [
-        lambda m: setattr(m, "k", [0.0] * 9),
-        lambda m: setattr(m, "width", 0),
-        lambda m: setattr(m, "d", [NAN] * 5),
-        lambda m: setattr(m, "distortion_model", "equidistant"),
+        # a camera_info that states no size says nothing of the camera
+        (lambda m: setattr(m, "width", 0), Solution.OK),
+        (lambda m: setattr(m, "k", [0.0] * 9), Solution.BAD_INPUT),
+        (lambda m: setattr(m, "d", [NAN] * 5), Solution.BAD_INPUT),
+        (lambda m: setattr(m, "distortion_model", "equidistant"), Solution.BAD_INPUT),
     ],
 )
-def test_intrinsics_that_are_none_leave_the_good_ones(graph, solver, change):
+def test_intrinsics_that_are_refused_leave_no_older_ones_in_force(graph, solver, change, status):
     check_good(graph)
     shot = shoot()
     broken = deepcopy(shot.info)
     change(broken)
     shot.info = broken
     graph.send(shot)
-    assert graph.result(shot.stamp)[0].status == Solution.OK
+    assert graph.result(shot.stamp)[0].status == status
+    check_good(graph)
 
 
 @pytest.fixture(scope="module")
