@@ -178,9 +178,9 @@ def test_a_tilt_beyond_the_range_of_the_sensors_model_is_refused(graph, solver):
     [
         # a camera_info that states no size says nothing of the camera
         (lambda m: setattr(m, "width", 0), Solution.OK),
-        (lambda m: setattr(m, "k", [0.0] * 9), Solution.BAD_INPUT),
-        (lambda m: setattr(m, "d", [NAN] * 5), Solution.BAD_INPUT),
-        (lambda m: setattr(m, "distortion_model", "equidistant"), Solution.BAD_INPUT),
+        (lambda m: setattr(m, "k", [0.0] * 9), Solution.NO_CAMERA),
+        (lambda m: setattr(m, "d", [NAN] * 5), Solution.NO_CAMERA),
+        (lambda m: setattr(m, "distortion_model", "equidistant"), Solution.NO_CAMERA),
     ],
 )
 def test_intrinsics_that_are_refused_leave_no_older_ones_in_force(graph, solver, change, status):
