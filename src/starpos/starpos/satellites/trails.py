@@ -12,7 +12,7 @@ from starpos.rotation import normalised
 
 @at_once
 @dataclass(frozen=True, kw_only=True)
-class Trail:
+class SatelliteTrail:
     """One or two ends of a trail: directions against the catalogue places of the stars around, and their times.
 
     track: a number of the caller's own.  directions (E, 3): ICRS unit vectors, E 1 or 2.  The stars' aberration and
@@ -35,7 +35,7 @@ class Trail:
     file: str = ""
 
     @property
-    def ways(self) -> "Iterator[Trail]":
+    def ways(self) -> "Iterator[SatelliteTrail]":
         """The trail as it is, and where its way is unknown, also with the other times; the way of each is known."""
         yield replace(self, turned_utc_unix_s=None)
         if self.turned_utc_unix_s is not None:
