@@ -18,9 +18,9 @@ from starpos.calibration.camera_adjustment import (
     with_values,
 )
 from starpos.calibration.misalignment import NOTHING_KNOWN, Known
-from starpos.earth.refraction import Atmosphere
 from starpos.earth.orientation import earth_state
 from starpos.earth.place import Place
+from starpos.earth.refraction import Atmosphere
 from starpos.errors import CalibrationError, InstrumentError, TimeError
 from starpos.fix.checks import check_risen
 from starpos.fix.solver import ENOUGH_SOUND, high_enough

@@ -52,8 +52,8 @@ def define_site(parser: argparse.ArgumentParser) -> None:
         type=options.degrees,
         nargs=2,
         metavar=("LAT", "LON"),
-        help="find A3 at this place, deg, by gravity (as a fix has them), with -o, and --tilt or --fixed; with --camera alone "
-        "the place gives the level that tells refraction from distortion",
+        help="find A3 at this place, deg, by gravity (as a fix has them), with -o, and --tilt or --fixed; with --camera "
+        "and without --tilt the place gives the level that tells refraction from distortion",
     )
     parser.add_argument(
         "--fixed",

@@ -84,7 +84,7 @@ def test_a_wrong_hour_puts_stars_under_the_horizon(catalogue, rng):
     true = random_fisheye(LENSES["equisolid"], rng)
     (stars,), _ = nights(true, catalogue, rng, 1)
     late = replace(stars, mid_unix_s=stars.mid_unix_s + 6 * 3600)
-    with pytest.raises(PlaceError, match="under the horizon.*not local time"):
+    with pytest.raises(PlaceError, match=r"under the horizon.*not local time"):
         calibrate_camera([late], [None], IDEAL, catalogue, AIR, site=SITE)
     # of the ideal lens only the middle is identified, where no star has set
     solver = Solver(Instrument(IDEAL.fx, model=EQUIDISTANT), catalogue, AIR)
