@@ -106,6 +106,22 @@ COMMANDS = {
         ),
         "starpos report p1.json makes the station's page",
     ),
+    "altaz": Command(
+        "azimuth and altitude of any pixel of a frame at a known place, and pixels of directions",
+        (
+            "starpos altaz sky.jpg 812.5 604 --site 51.98 108.23 --instrument camera.yaml --overlay grid.png",
+            "starpos altaz sky.fits --points trail.csv --site 51.98 108.23 --instrument camera.yaml --csv > sky.csv",
+        ),
+        "starpos calibrate --camera --site finds the lens, which errors near the edge depend on",
+    ),
+    "mount": Command(
+        "the axis about which a mount turned between frames, against the pole; a horizontal circle's orientation",
+        (
+            "starpos mount a.fits b.fits c.fits --site 51.98 108.23",
+            "starpos mount *.jpg --site 51.98 108.23 --readings circle.csv",
+        ),
+        "move the mount by what it prints, and take three more frames",
+    ),
     "report": Command(
         "nights on one page: stability, scatter, residuals, sky, error budget",
         (

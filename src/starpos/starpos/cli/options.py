@@ -16,6 +16,7 @@ from starpos.earth.place import Place
 from starpos.earth.refraction import Atmosphere
 from starpos.earth.vertical import UNKNOWN_STDDEV_ARCSEC, AtHeight, Deflection, Vertical
 from starpos.errors import InstrumentError
+from starpos.fix.directions import OPTICAL_AXIS
 from starpos.frames.exif import UNTENDED_STDDEV_S, ZONES_H, CameraClock
 from starpos.frames.exposure import MAX_READOUT_S, UNKNOWN_SHUTTER, Shutter
 from starpos.instrument import instrument, instrument_file, sensors
@@ -473,12 +474,41 @@ def add_site(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_axis(parser: argparse.ArgumentParser) -> None:
+    """Add the option that `axes_of` reads."""
+    parser.add_argument(
+        "--axis",
+        nargs=4,
+        action="append",
+        default=[],
+        metavar=("NAME", "X", "Y", "Z"),
+        help="azimuth and altitude of another direction that is fixed to the camera than its optical axis, 0 0 1: x "
+        "along the rows to the right, y down the columns, z forward, of any length; may be repeated; needs --site",
+    )
+
+
+def axes_of(args: argparse.Namespace) -> dict[str, tuple[float, ...]]:
+    """Names and unit vectors in C of the optical axis and of those of --axis; raises InstrumentError."""
+    axes: dict[str, tuple[float, ...]] = {"optical axis": OPTICAL_AXIS}
+    for name, *xyz in args.axis:
+        try:
+            v = np.array(xyz, float)
+        except ValueError:
+            v = np.zeros(3)
+        if not (np.isfinite(v).all() and np.abs(v).max() > 0):
+            raise InstrumentError(f"--axis {name} {' '.join(xyz)}: give a name and three numbers, not all 0")
+        axes[name] = tuple((v / np.linalg.norm(v)).tolist())
+    return axes
+
+
 def place_of(args: argparse.Namespace, vertical: Vertical) -> Place | None:
     """The place of --site, None without it; InstrumentError for bad options, PlaceError for an impossible place.
 
     vertical: the deflection by the other options.
     """
     if args.site is None:
+        if getattr(args, "axis", None):
+            raise InstrumentError("--axis needs a known place: give --site LAT LON")
         if args.geodetic or args.site_stddev is not None:
             raise InstrumentError("--geodetic and --site-stddev are for --site: give it too")
         return None

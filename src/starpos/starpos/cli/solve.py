@@ -114,10 +114,10 @@ def tell(
         where = last if whole.average is None else whole.average
         about = {} if near is None else {"km_from_near": near.km_from(where.latitude, where.longitude)}
         if place is not None:
-            about |= with_heading(json_of(whole.average, vertical), mean, place)
+            about |= with_heading(json_of(whole.average, vertical), mean, place, options.axes_of(args))
         put_combined(output, night, whole.average, gathered, vertical, about)
     elif headings and place is not None:
-        fix_output.put_mean(output, night, headings, mean, place, vertical)
+        fix_output.put_mean(output, night, headings, mean, place, vertical, options.axes_of(args))
     elif gathered.lost is not None and not headings and work is not None:
         say(night, *work.fitting(gathered.lost))
     # without tilts headings are all that was asked for
@@ -135,13 +135,13 @@ def _json_of_answer(
         watched = answer.watched or Watched(solution=s)
         return {"file": answer.name} | json_of_watched(watched) | json_about(s)
     values = {"file": answer.name} | json_of(s.fix, vertical) | json_about(s)
-    return values if place is None else with_heading(values, s.at_place, place)
+    return values if place is None else with_heading(values, s.at_place, place, options.axes_of(args))
 
 
 def _line_of_answer(args: argparse.Namespace, answer: FrameAnswer, place: Place | None) -> str:
     s, watched = answer.solution, answer.watched
     if place is not None or s.at_place is not None:
-        line = fix_output.heading_line_of(answer.name, s)
+        line = fix_output.heading_line_of(answer.name, s, options.axes_of(args))
     else:
         line = line_of(answer.name, s, args.self_calibrate)
     if watched is None or watched.compared is None:
@@ -352,6 +352,7 @@ def define(parser: argparse.ArgumentParser) -> None:
     options.add_air(parser)
     add_vertical(parser)
     add_site(parser)
+    options.add_axis(parser)
     add_near(parser)
     options.add_self_calibration(parser)
     parser.add_argument(
