@@ -16,7 +16,7 @@ from starpos.earth.place import Place
 from starpos.earth.refraction import Atmosphere
 from starpos.earth.vertical import UNKNOWN_STDDEV_ARCSEC, AtHeight, Deflection, Vertical
 from starpos.errors import InstrumentError
-from starpos.frames.exif import UNTENDED_STDDEV_S, ZONES_H, CameraClock
+from starpos.frames.exif import NETWORK_STDDEV_S, UNTENDED_STDDEV_S, ZONES_H, CameraClock
 from starpos.frames.exposure import MAX_READOUT_S, UNKNOWN_SHUTTER, Shutter
 from starpos.instrument import instrument, instrument_file, sensors
 from starpos.instrument.camera import EQUIDISTANT, PLUMB_BOB, Camera
@@ -115,7 +115,8 @@ def add_stamps(parser: argparse.ArgumentParser) -> None:
         "--exif-clock-stddev",
         type=number(0, 86400),
         metavar="S",
-        help=f"how far that clock may be off ({UNTENDED_STDDEV_S:g}; 1 s is 464 m at the equator)",
+        help=f"how far that clock may be off ({UNTENDED_STDDEV_S:g}, a telephone's {NETWORK_STDDEV_S:g}; 1 s is 464 m at "
+        "the equator)",
     )
     parser.add_argument(
         "--shutter-delay",
@@ -145,9 +146,7 @@ def clock_of(args: argparse.Namespace) -> CameraClock | None:
         if stddev_s is not None:
             raise InstrumentError("--exif-clock-stddev is for --exif-utc-offset: give both")
         return None
-    return CameraClock(
-        None if offset_h == FILES_OWN else offset_h, UNTENDED_STDDEV_S if stddev_s is None else stddev_s
-    )
+    return CameraClock(None if offset_h == FILES_OWN else offset_h, stddev_s)
 
 
 def add_optics(parser: argparse.ArgumentParser) -> None:
