@@ -81,7 +81,9 @@ def add_options(parser: argparse.ArgumentParser, rows: Mapping[str, dict | None]
     """
     sets: dict[str, Any] = {}
     for names, row in _unfolded(rows):
-        about = {key: tuple(value) if isinstance(value, list) else value for key, value in row.items()}
+        about: dict[str, Any] = {
+            key: tuple(value) if isinstance(value, list) else value for key, value in row.items()
+        }
         place: argparse._ActionsContainer = parser
         if "under" in about:
             title = about.pop("under")
