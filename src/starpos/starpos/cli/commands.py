@@ -12,7 +12,7 @@ from types import ModuleType
 from typing import Any
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Command:
     """A command, or a kind of it: a row of commands.yaml, whose keys are these names.
 
