@@ -18,7 +18,7 @@ from starpos.cli.options import vertical_of
 from starpos.cli.overwriting import CAMERA_NAME, Written, save_instrument
 from starpos.earth.place import Place
 from starpos.earth.refraction import Atmosphere
-from starpos.errors import CalibrationError, FixError, FrameError, InstrumentError, StarposError
+from starpos.errors import CalibrationError, FixError, FrameError, InstrumentError, PlaceError, StarposError
 from starpos.fix.checks import FIND_TURN, at_another_lean, may_turn
 from starpos.fix.searching import Sight, of_one_camera
 from starpos.fix.solver import Solver
@@ -73,19 +73,23 @@ def check_site(args: argparse.Namespace) -> None:
             )
     elif args.sag is not None:
         raise InstrumentError("--sag is for a camera fixed to the ground: give --fixed too")
-    if args.output is None or (args.tilt is None and not args.fixed):
+    if not _camera_alone(args) and (args.output is None or (args.tilt is None and not args.fixed)):
         raise InstrumentError(
             "--site needs the tilts and a file to write: give --tilt CSV and -o INSTRUMENT.yaml (or --fixed in place of "
-            "--tilt)"
+            "--tilt), or --camera OUT.yaml alone"
         )
-    latitude, longitude = args.site
-    if not (abs(latitude) <= 90 and abs(longitude) <= 360):
-        raise InstrumentError(f"--site {latitude:g} {longitude:g}: give latitude and longitude in deg")
+    # one sentence for a place that cannot be
+    Place.by_gravity(*args.site)
+
+
+def _camera_alone(args: argparse.Namespace) -> bool:
+    """Whether the place only serves the camera: its level without tilts."""
+    return args.camera is not None and args.tilt is None and not args.fixed and args.output is None
 
 
 def check_output(args: argparse.Namespace, instrument: Instrument) -> None:
     """Raise InstrumentError if the file of -o exists and describes another instrument."""
-    if args.site is not None:
+    if args.output is not None:
         instrument_file.check_fits(
             Path(args.output), instrument, fixed=args.fixed, camera_found=args.camera is not None
         )
@@ -266,9 +270,9 @@ def run(args: argparse.Namespace) -> int:
                 for s, k in frames
             ]
             instrument = replace(instrument, camera=camera, focal_px=camera.fx)
-        if args.site is not None:
+        if args.output is not None:
             run_site(args, [s for s, _ in frames], instrument, tilts, _known(frames))
-    except (CalibrationError, FixError) as e:
+    except (CalibrationError, FixError, PlaceError) as e:
         console.complain("calibrate", e)
         return console.UNREADABLE if unreadable else NOTHING
     return console.UNREADABLE if unreadable else 0
@@ -361,10 +365,11 @@ def _camera(
     if tilts is not None:
         seen, levels = _levelled(seen, instrument, tilts)
     frames, bar = [stars for stars, _ in seen], console.ProgressBar()
-    found = calibrate_camera(frames, levels, given, catalogue.load_catalogue(), air, bar, _known(seen))
+    site = _site(args) if args.site is not None and tilts is None else None
+    found = calibrate_camera(frames, levels, given, catalogue.load_catalogue(), air, bar, _known(seen), site)
     for k in sorted(set(range(len(frames))) - set(found.used)):
         console.complain("calibrate", f"{frames[k].source}: no part of the sky matches it: it is left out")
-    if tilts is None:
+    if tilts is None and site is None:
         _tell_what_tilts_would(found.fit, air, frames)
     about = _about(found)
     whole = instrument.whole_of(found.fit.camera, frames[0].origin_px)
