@@ -152,8 +152,8 @@ def _canon(note: _Note) -> Gravity | None:
     return Gravity.of_level(-roll / 10, pitch / 10, 0.1)
 
 
-# What a note begins with; where its byte order stands, None: that of EXIF; where its directory begins; whether offsets
-# count from its beginning, or from that of EXIF; and what reads it.
+# What a note begins with; where its byte order stands, None: EXIF's order; where its directory begins; whether offsets
+# count from its own beginning, not from EXIF's; and what reads it.
 NOTES: tuple[tuple[bytes, int | None, int, bool, Callable[[_Note], Gravity | None]], ...] = (
     (b"Apple iOS\0", 12, 14, True, _apple),
     (b"OLYMPUS\0", 8, 12, True, _olympus),
