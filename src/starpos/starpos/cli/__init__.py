@@ -106,6 +106,14 @@ COMMANDS = {
         ),
         "starpos report p1.json makes the station's page",
     ),
+    "satellites": Command(
+        "a position from satellites among the stars and their orbits, without a level",
+        (
+            "starpos satellites sightings.csv --elements active.tle --height 30 --height-stddev 20",
+            "starpos satellites night.iod --elements elements --clock-stddev 0.5 --json",
+        ),
+        "docs/how-to/satellites.md has the method and where orbits are had",
+    ),
     "report": Command(
         "nights on one page: stability, scatter, residuals, sky, error budget",
         (
