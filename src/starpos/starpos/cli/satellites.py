@@ -6,8 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from starpos.cli import console, options
-from starpos.cli.console import Output, add_formats
+from starpos.cli import console
 from starpos.earth.gravity import itrs_place
 from starpos.errors import SatelliteError
 from starpos.satellites.adjustment import KnownBefore
@@ -18,60 +17,8 @@ from starpos.satellites.trails import SatelliteTrail
 
 # without a height stated: any inhabited one
 UNKNOWN_HEIGHT_M, UNKNOWN_HEIGHT_STDDEV_M = 500.0, 700.0
-HEIGHT_STDDEV_M, CLOCK_STDDEV_S = 50.0, 0.05
-# a trail may come from a clock that is off by so much
-MOST_CLOCK_S = 600.0
-# deg of a prior place in km
+HEIGHT_STDDEV_M = 50.0
 KM = 1000.0
-
-
-def define(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "sightings",
-        nargs="+",
-        metavar="FILE",
-        help="a CSV of track, utc, ra_deg, dec_deg, stddev_arcsec[, satellite, time_stddev_s], a row for each end of a "
-        "trail, or observers' reports in the IOD format (.iod, .txt)",
-    )
-    parser.add_argument(
-        "--elements",
-        nargs="+",
-        required=True,
-        metavar="FILE",
-        help="orbits: TLE, 3LE, OMM (JSON, XML, CSV), OEM or SP3, or a folder of them; of each satellite the newest "
-        "before the sightings",
-    )
-    parser.add_argument(
-        "--newer-elements", action="store_true", help="also use elements whose epoch is after the sightings"
-    )
-    parser.add_argument(
-        "--height",
-        type=options.number(-500, 20_000),
-        metavar="M",
-        help=f"height above the ellipsoid ({UNKNOWN_HEIGHT_M:g} with an error of {UNKNOWN_HEIGHT_STDDEV_M:g})",
-    )
-    parser.add_argument(
-        "--height-stddev",
-        type=options.number(0.1, 20_000),
-        metavar="M",
-        help=f"its error ({HEIGHT_STDDEV_M:g}); a large one lets the satellites determine the height",
-    )
-    parser.add_argument(
-        "--clock-stddev",
-        type=options.number(1e-6, MOST_CLOCK_S),
-        default=CLOCK_STDDEV_S,
-        metavar="S",
-        help="error of the clock that gave the times (%(default)g); a large one lets the satellites determine the time",
-    )
-    parser.add_argument(
-        "--near",
-        type=float,
-        nargs=3,
-        metavar=("LAT", "LON", "KM"),
-        help="a rough place, deg on the ellipsoid, and its error in each direction",
-    )
-    add_formats(parser, "one JSON object a trail, then one of the place", None)
-    parser.set_defaults(run=run, csv=False)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -98,13 +45,19 @@ def run(args: argparse.Namespace) -> int:
                 {"combined": True, "latitude_geodetic": None, "longitude_geodetic": None, "status": str(e)}
             )
         return 1
-    output = Output(args, (), "")
     for k, trail in enumerate(trails):
         value = trail_json(trail, fix, k)
-        output.put(value, trail_line(value))
+        _put(args, value, trail_line(value))
     value = fix_json(fix)
-    output.put(value, fix_line(value))
+    _put(args, value, fix_line(value))
     return 0
+
+
+def _put(args: argparse.Namespace, value: dict, line: str) -> None:
+    if args.json:
+        console.print_json(value)
+    else:
+        print(line)
 
 
 def _read(path: str) -> list[SatelliteTrail]:

@@ -10,7 +10,7 @@ from starpos.earth.ellipsoid import enu_axes
 from starpos.earth.gravity import geodetic_place
 from starpos.errors import SatelliteError
 from starpos.frozen import at_once
-from starpos.satellites.adjustment import Adjuster, PlaceAdjustment, KnownBefore
+from starpos.satellites.adjustment import Adjuster, KnownBefore, PlaceAdjustment
 from starpos.satellites.elements import Orbit
 from starpos.satellites.naming import FEWEST, Candidates, agreement, candidates, ways_of
 from starpos.satellites.trails import SatelliteTrail
