@@ -23,15 +23,15 @@ THRESHOLD = 7.0
 SHORTEST, LONGEST, CLIP = 8, 128, 4.0
 # Columns of which only the best line is looked at; maximum number of lines that are measured.
 TILE, MAX_FITS = 8, 40
-# Pixels of a frame whose stars have no known width (px, FWHM); half the width of the fitted band, in sigma of the PSF.
+# Width of stars (px, FWHM) where it is unknown; half the width of the fitted band, in sigma of the PSF.
 USUAL_FWHM, BAND = 2.5, 4.0
 # Shortest trail in sigma of the PSF: a shorter one is a star.
 SHORTEST_SIGMAS = 8.0
-# 1 sigma of the PSF's width beside the stars' (their images are trailed), and limit of its factor.
+# 1 sigma of the PSF's width over the stars' (their images are trailed), and limit of its factor.
 WIDTH_SHARE, WIDEST = 0.2, 1.7
 # 1 sigma of the sag of a trail by the lens: this times its length squared over the frame's diagonal.
 SAG = 0.05
-# Light of a knot over the strongest: less, and the object flashes, so that its ends are not the shutter's.
+# Light of a knot over the strongest: less, and the object flashes, so that its ends are not the exposure's.
 FAINTEST = 0.35
 # Maximum deviation (rms, share of the light) of a steady trail's light along it.
 UNSTEADY = 0.3
@@ -53,7 +53,7 @@ class FrameTrail:
     covariance  (4, 4) px2 of x, y of the first end and of the second
     snr         its light over the sky's noise
     cut         (2,) bool: whether the trail leaves the frame there, so that this is not its end
-    steady      whether its light is even enough for its ends to be those of the exposure
+    steady      whether its light is even enough for its ends to be the exposure's
     """
 
     ends: np.ndarray
@@ -212,7 +212,7 @@ def _blot(plane: np.ndarray, ends: np.ndarray, reach: float, value: float = 0.0)
 
 
 def _measured(light: np.ndarray, line: np.ndarray, sigma: float) -> FrameTrail | None:
-    """The trail of which a line with ends (2, 2), x and y px, is a part; None if that is none."""
+    """The trail of which a line with ends (2, 2), x and y px, is a part; None without a trail there."""
     for _ in range(3):
         grown = _grown(light, line, sigma)
         if grown is None:
