@@ -23,10 +23,10 @@ from starpos.satellites.trails import SatelliteTrail, turned
 from starpos.sky.catalogue import Catalogue
 from starpos.units import SIGMA_PER_MAD
 
-# Minimum number of stars for polynomials of order 1, 2 and 3; of a trail's nearest stars so many determine them, which
-# are so near.
+# Minimum number of stars for polynomials of order 1, 2 and 3; how many of the stars nearest to a trail determine them, at
+# most, and cosine of their greatest distance.
 STARS_OF_ORDER, MAX_STARS, COS_FARTHEST = (6, 20, 60), 600, math.cos(math.radians(25))
-# Residuals beyond so many standard deviations are left out.
+# Larger residuals, in standard deviations, are left out.
 OUTLIER = 4.0
 # Beyond this angle from the middle of the stars, only identified stars explain light.
 COS_WIDEST = math.cos(math.radians(40))
@@ -36,7 +36,7 @@ COS_WIDEST = math.cos(math.radians(40))
 class Plate:
     """Polynomials that take points (N, 2) to points (N, 2), fitted to pairs of them.
 
-    middle, scale: make the points about -1 to 1.  coefficients (T, 2).  covariance (T, T): of those of each coordinate.
+    middle, scale: make the points about -1 to 1.  coefficients (T, 2).  covariance (T, T): of the coefficients of either coordinate.
     """
 
     order: int
@@ -47,7 +47,7 @@ class Plate:
 
     @classmethod
     def fit(cls, points: np.ndarray, to: np.ndarray, sigma: np.ndarray) -> "Plate":
-        """The plate of pairs with errors sigma (N,), in units of `to`, beside one that all share and outliers."""
+        """The plate of pairs with errors sigma (N,), in units of `to`, which may be too small, and outliers."""
         order = sum(len(points) >= fewest for fewest in STARS_OF_ORDER)
         middle = points.mean(0)
         scale = max(float(np.abs(points - middle).max()), 1e-12)
@@ -197,5 +197,5 @@ def trails_of(frame: Frame, stars: Stars, solution: Solution, catalogue: Catalog
 
 
 def _later_s(stars: Stars, rows: np.ndarray) -> np.ndarray:
-    """Time (N,) from the middle of the first row's exposure to that of the rows (N,) px."""
+    """Time (N,) from the middle of the first row's exposure to the middle of the rows' (N,) px."""
     return (stars.shutter or UNKNOWN_SHUTTER).later_s(rows, stars.height)

@@ -55,7 +55,7 @@ class SatelliteTrail:
 def turned(directions: np.ndarray, seconds: np.ndarray) -> np.ndarray:
     """Directions (N, 3), GCRS, that stand still above the ground, as they are `seconds` (N,) later.
 
-    About the axis of GCRS: that of the date is 0.2 deg from it, 0.1 arcsec in 2 s.
+    They turn about the axis of GCRS. The Earth's is 0.2 deg from it, which is 0.1 arcsec in 2 s.
     """
     c, s = np.cos(ROTATION_RAD_S * seconds), np.sin(ROTATION_RAD_S * seconds)
     x, y, z = directions.T
