@@ -47,7 +47,7 @@ from starpos.gnss.solving import Watched
 from starpos.gnss.states import Learned
 from starpos.gnss.watch import GnssCheck
 from starpos.instrument import instrument_file
-from starpos.instrument.instrument import Instrument
+from starpos.instrument.instrument import ByGravity, Instrument
 from starpos.instrument.tilt_log import NO_TILTS, Tilts
 from starpos.night import field
 from starpos.night.opening import work_of
@@ -347,7 +347,7 @@ def _run(args: argparse.Namespace) -> int:
         overwriting.check(args, Written("--save", args.save, instrument_file.check_replaceable))
     if args.pointings is not None:
         return run_pointings(args)
-    vertical, read = vertical_of(args), reader_of(args)
+    vertical = vertical_of(args)
     place = place_of(args, vertical)
     output = Output(
         args, *((COLUMNS, HEAD) if place is None else (fix_output.HEADING_COLUMNS, fix_output.HEADING_HEAD))
@@ -368,13 +368,15 @@ def _run(args: argparse.Namespace) -> int:
     if args.save is not None and len(given) > 1:
         raise InstrumentError("--save writes the A3 of one night: give one")
     nights = [night for night in given if isinstance(night, NightFolder)]
+    by_gravity = not needs_no_tilt and any(night.tilt is None for night in nights)
+    read = reader_of(args, by_gravity)
     statuses = [_refused(why, given) for why in given if not isinstance(why, NightFolder)]
     with inputs.workers_of(args, sum(len(night.frames) for night in nights)) as workers:
         plans = []
-        abouts = workers.map((First(read), night.frames) for night in nights)
+        abouts = workers.map((First(read, by_gravity), night.frames) for night in nights)
         for night, about in zip(nights, abouts, strict=True):
             try:
-                plans.append((night, _work(args, night, about, own_level, place)))
+                plans.append((night, _work(args, night, about, own_level, place, by_gravity)))
             except TiltError as error:
                 statuses.append(_refused(error, given))
         on_files = [OnFile(read, how.work(work)) for _, work in plans]
@@ -398,14 +400,19 @@ def _refused(why: StarposError, given: list) -> int:
 
 
 def _work(
-    args: argparse.Namespace, night: NightFolder, about: About | None, own_level: bool, place: Place | None
+    args: argparse.Namespace,
+    night: NightFolder,
+    about: About | None,
+    own_level: bool,
+    place: Place | None,
+    by_gravity: bool,
 ) -> Solving:
     """The work on a night's frames, after complaints about what looks wrong; raises TiltError."""
     air = options.atmosphere_of(args)
     # without a frame that can be read, each one reports why it cannot
     if about is None:
         return Solving(Instruments(None), atmosphere=air)
-    tilt = None if night.tilt is None else Path(night.tilt)
+    tilt = Path(night.tilt) if night.tilt is not None else ByGravity() if by_gravity else None
     work, remarks = work_of(given_or_sought(args, about), about, tilt, air, place)
     for remark in remarks:
         console.complain("solve", remark)
