@@ -36,7 +36,8 @@ COS_WIDEST = math.cos(math.radians(40))
 class Plate:
     """Polynomials that take points (N, 2) to points (N, 2), fitted to pairs of them.
 
-    middle, scale: make the points about -1 to 1.  coefficients (T, 2).  covariance (T, T): of the coefficients of either coordinate.
+    middle, scale: make the points about -1 to 1.  coefficients (T, 2).
+    covariance (T, T): of the coefficients of either coordinate.
     """
 
     order: int
