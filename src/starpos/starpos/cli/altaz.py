@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from starpos.cli import console, inputs, options, overwriting
-from starpos.cli.console import Output, add_formats
+from starpos.cli.console import Output
 from starpos.cli.overwriting import Written
 from starpos.errors import FrameError, InstrumentError
 from starpos.fix.attitude import Attitude
@@ -26,40 +26,9 @@ COLUMNS = ("file", "utc", "x", "y", "azimuth", "altitude", "altitude_airless", "
 HEAD = (
     "pixel x, y: azimuth (deg, from north over east), altitude as seen and without air, 1 sigma across and up"
 )
-JSON_HELP = (
-    "one JSON object a point: x, y of the pixel, azimuth and altitude as seen, altitude_airless without refraction, "
-    "deg by the plumb line; errors are null beyond the outermost identified star, where the lens is not known"
-)
 POINTS = TableForm(what="table of pixels", error=FrameError, needed=("x", "y"))
-# error of a point on the frame per axis, px, unless stated
-POINT_PX = 0.5
 # an identified star at this share of a point's distance from the axis, or more, shows the lens there
 REACH = 0.95
-
-
-def define(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("frame", metavar="FRAME", help="a frame or a list of stars, as solve takes them")
-    parser.add_argument("pixels", type=float, nargs="*", metavar="X Y", help="pixels: column and row, from 0")
-    add_formats(parser, JSON_HELP, "a row of a CSV a point")
-    parser.add_argument("--points", metavar="CSV", help="more pixels: x, y")
-    parser.add_argument(
-        "--back",
-        type=options.degrees,
-        nargs="+",
-        default=[],
-        metavar="AZ ALT",
-        help="the other way: pixels of azimuths and altitudes, deg, as they are seen",
-    )
-    parser.add_argument(
-        "--stddev-px", type=options.number(0, 1000), default=POINT_PX, help=f"error of a pixel ({POINT_PX:g})"
-    )
-    parser.add_argument(
-        "--overlay",
-        metavar="PNG",
-        help="draw the frame with its grid of azimuths and altitudes, and the points",
-    )
-    inputs.add_camera_at_place(parser)
-    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -13,9 +13,8 @@ from starpos.calibration.camera import FromSky, Intrinsics, calibrate_camera, rm
 from starpos.calibration.camera_adjustment import UNLEVELLED, UNTIMED, parameters
 from starpos.calibration.misalignment import NOTHING_KNOWN, Calibrated, Known, calibrate_at, calibrate_fixed
 from starpos.cli import console, options, overwriting
-from starpos.cli.console import add_formats
 from starpos.cli.inputs import checked_tilts, frames_among, given_or_sought, reader_of
-from starpos.cli.options import add_vertical, vertical_of
+from starpos.cli.options import vertical_of
 from starpos.cli.overwriting import CAMERA_NAME, Written, save_instrument
 from starpos.earth.place import Place
 from starpos.earth.refraction import Atmosphere
@@ -31,7 +30,6 @@ from starpos.instrument import instrument_file
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import level_of, up_of
 from starpos.instrument.instrument import (
-    MAX_SAG_ARCSEC,
     SAG_ARCSEC_PER_SQRT_HOUR,
     Calibration,
     Instrument,
@@ -44,51 +42,6 @@ from starpos.night.together import axis_of, circles_of
 from starpos.night.work import Solving
 from starpos.sky import catalogue
 from starpos.units import ARCSEC
-
-
-def define_site(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--site",
-        type=options.degrees,
-        nargs=2,
-        metavar=("LAT", "LON"),
-        help="find A3 at this place, deg, by gravity (as a fix has them), with -o, and --tilt or --fixed; with --camera "
-        "and without --tilt the place gives the level that tells refraction from distortion",
-    )
-    parser.add_argument(
-        "--fixed",
-        action="store_true",
-        help="a camera fixed to the ground, without an inclinometer: its pose at --site serves as its "
-        "vertical, and `solve` with the file that -o writes needs no --tilt; it gives position and "
-        "heading as long as the stars show the camera in that pose; once the camera has moved, it says "
-        "so and gives no position",
-    )
-    parser.add_argument(
-        "--sag",
-        type=options.number(0, MAX_SAG_ARCSEC),
-        metavar="ARCSEC",
-        help="how far a --fixed camera sags in an hour, 1 sigma about each axis; it grows with the root of the time "
-        f"({SAG_ARCSEC_PER_SQRT_HOUR:g}, 300 m; after a week 13 times as much)",
-    )
-    parser.add_argument(
-        "--geodetic",
-        action="store_true",
-        help="--site is on WGS 84, as a map or a receiver gives it: the deflection of the vertical is added",
-    )
-    add_vertical(parser)
-    options.add_turn(parser)
-    parser.add_argument(
-        "-o",
-        "--output",
-        metavar="OUT",
-        help="write A3 into an instrument file (YAML); one that is there keeps its other keys",
-    )
-    parser.add_argument(
-        "--valid-days",
-        type=options.number(0.01, 1e5),
-        metavar="DAYS",
-        help="after which the calibration is refused (365)",
-    )
 
 
 def check_site(args: argparse.Namespace) -> None:
@@ -269,29 +222,6 @@ def _json_of_site(found: Calibrated, path: str) -> dict:
 NOTHING = 1
 # the stars of a frame, and their identification
 _Seen = tuple[Stars, Identification | None]
-
-
-def define(parser: argparse.ArgumentParser) -> None:
-    options.add_frames(parser, pointings=True)
-    add_formats(parser, "one JSON object for --camera and one for --site instead of text", None)
-    parser.add_argument(
-        "--camera",
-        metavar="OUT",
-        help="write the camera's calibration (CameraInfo YAML): focal lengths, principal point, distortion",
-    )
-    parser.add_argument(
-        "--map", metavar="PNG", help="draw the residuals of the given and of the fitted camera (--camera)"
-    )
-    options.add_stamps(parser)
-    options.add_instrument(parser)
-    parser.add_argument(
-        "--tilt",
-        metavar="CSV",
-        help="utc_unix_s, theta_x_deg, theta_y_deg[, theta_z_deg, temperature_c, sigma_deg]: refraction is undone",
-    )
-    options.add_air(parser)
-    define_site(parser)
-    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -10,31 +10,18 @@ from pathlib import Path
 import numpy as np
 
 from starpos.cli import console, inputs, options
-from starpos.cli.console import add_formats, print_json
+from starpos.cli.console import print_json
 from starpos.cli.options import place_of, vertical_of
 from starpos.earth.place import Place
 from starpos.errors import FixError, FrameError, InstrumentError
 from starpos.files import open_regular
 from starpos.fix.directions import CircleOrientation, circle_orientation, horizontal, mount_axis
 from starpos.fix.heading import AttitudeAtPlace
-from starpos.fix.terms import ALWAYS, total_covariance
+from starpos.fix.terms import total_covariance
 from starpos.units import ARCSEC
 
 NOTHING = 1
 READING = "azimuth_deg"
-
-
-def define(parser: argparse.ArgumentParser) -> None:
-    options.add_frames(parser)
-    add_formats(parser, "one JSON object instead of text; angles by the plumb line, deg", None)
-    parser.add_argument(
-        "--readings",
-        metavar="CSV",
-        help="readings of a horizontal circle: file (a frame's name), azimuth_deg; prints the azimuth of its zero mark",
-    )
-    options.add_axis(parser)
-    inputs.add_camera_at_place(parser)
-    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -112,7 +99,7 @@ def _circle(
 
 def _shared(seen: AttitudeAtPlace) -> float:
     """The error in rad of azimuths that all frames of a place share."""
-    terms = tuple(t for t in seen.optics.terms if t.shared == ALWAYS)
+    terms = tuple(t for t in seen.optics.terms if t.common)
     return math.sqrt(total_covariance(terms)[5, 5]) if terms else 0.0
 
 

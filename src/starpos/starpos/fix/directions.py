@@ -10,7 +10,7 @@ import numpy as np
 from starpos import rotation
 from starpos.errors import FixError
 from starpos.fix.attitude import Attitude
-from starpos.fix.terms import ALWAYS, ErrorTerm
+from starpos.fix.terms import ErrorTerm
 from starpos.frozen import at_once
 
 # of the camera C
@@ -125,7 +125,7 @@ def mount_axis(attitudes: Sequence[Attitude]) -> MountAxis:
         for a in attitudes:
             seen = a.rotation @ m
             slope = np.cross(seen, of_n)
-            own = _covariance(t for t in a.terms if t.shared != ALWAYS) if a.terms else a.covariance
+            own = _covariance(t for t in a.terms if not t.common) if a.terms else a.covariance
             weight = np.linalg.inv(slope @ own @ slope.T)
             design = np.hstack([np.eye(2), -of_n @ a.rotation @ of_m.T])
             off = of_n @ (seen - n)
@@ -143,7 +143,7 @@ def mount_axis(attitudes: Sequence[Attitude]) -> MountAxis:
     free = 2 * len(attitudes) - 4
     covariance = np.linalg.inv(left)[:2, :2] * (max(1.0, chi2 / free) if free else 1.0)
     slope = np.cross(n, _basis(n[None])[0])
-    shared = [_covariance(t for t in a.terms if t.shared == ALWAYS) for a in attitudes]
+    shared = [_covariance(t for t in a.terms if t.common) for a in attitudes]
     covariance = covariance + slope @ np.mean(shared, axis=0) @ slope.T
     sign = 1.0 if n[2] >= 0 else -1.0
     flip = np.diag([-1.0, 1.0]) if sign < 0 else np.eye(2)
