@@ -343,8 +343,9 @@ def define(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--tilt",
         metavar="CSV",
-        help="utc_unix_s, theta_x_deg, theta_y_deg[, theta_z_deg, temperature_c, sigma_deg]; not with nights: folders of "
-        "frames with tilt.csv, nor with the instrument file of a camera fixed to the ground; --site needs none",
+        help="utc_unix_s, theta_x_deg, theta_y_deg[, theta_z_deg, temperature_c, sigma_deg], or a telephone's log "
+        "(phyphox, Sensor Logger); not with nights: folders of frames with tilt.csv, nor with the instrument file of "
+        "a camera fixed to the ground; --site needs none",
     )
     add_gnss(parser)
     options.add_stamps(parser)
