@@ -35,6 +35,7 @@ FOREIGN = {
     "rawpy",
     "rosbags",
     "scipy",
+    "sgp4",
     "yaml",
 }
 # What compiled modules may import besides compiled modules of their own folder and of lower floor numbers.

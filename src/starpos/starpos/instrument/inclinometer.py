@@ -108,7 +108,7 @@ class Tilt:
 
     @property
     def reversed(self) -> "Tilt":
-        """The same with the other sign."""
+        """This tilt with the other sign."""
         return replace(self, theta_x=-self.theta_x, theta_y=-self.theta_y, theta_z=-self.theta_z)
 
     @property

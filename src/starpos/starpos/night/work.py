@@ -86,6 +86,12 @@ class Solving:
     progress: Progress = quiet
     # focal length in px by size and EXIF's focal length of frames that state none
     _found_px: dict = field(default_factory=dict, compare=False)
+    # the solver of the latest instrument: frames of one camera share what it has made for them
+    _latest: list[Solver] = field(default_factory=list, compare=False)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What a worker is given: it makes its own solver."""
+        return vars(self) | {"_latest": []}
 
     def __call__(self, item: Frame | Stars) -> Sight:
         """The sight of a frame; InstrumentError if its focal length is unknown, and must not be."""
@@ -147,7 +153,10 @@ class Solving:
             raise InstrumentError(
                 f"{item.place}: its header has no focal length: give instrument=Instrument(focal_px)"
             )
-        return Solver(instrument, catalogue.load_catalogue(), self.atmosphere, progress=self.progress)
+        if not self._latest or self._latest[0].instrument != instrument:
+            stars = catalogue.load_catalogue()
+            self._latest[:] = [Solver(instrument, stars, self.atmosphere, progress=self.progress)]
+        return self._latest[0]
 
     def after(self, sight: Sight, hint: Hint) -> Sight:
         """The sight of a frame that was not identified, if it looks where an earlier one did; else as it was."""

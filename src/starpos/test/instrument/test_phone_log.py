@@ -107,7 +107,7 @@ def test_phyphox_starts_when_its_meta_says_and_pauses(tmp_path, between):
 
 @pytest.mark.parametrize("sign", [1, -1])
 def test_a_lone_table_may_point_either_way(tmp_path, sign):
-    """As a table of the first versions, whose names have units."""
+    """Tables of the first versions have units in their names."""
     names = "time,seconds_elapsed,GRAVITY Z (m/s\u00b2),GRAVITY Y (m/s\u00b2),GRAVITY X (m/s\u00b2)"
     (tmp_path / "Gravity.csv").write_text(logger(sign).replace("time,seconds_elapsed,z,y,x", names))
     log = read_tilt_csv(tmp_path / "Gravity.csv")
@@ -118,7 +118,7 @@ def test_a_lone_table_may_point_either_way(tmp_path, sign):
 
 
 def lying(path):
-    """A zip whose table unpacks to 50 MB and says that it has 100 bytes, in both of its headers."""
+    """Zip a table of 50 MB so that both of its headers state 100 bytes."""
     zipped(path, Gravity="time,x,y,z\n" + "0" * 50_000_000)
     content = bytearray(path.read_bytes())
     size = struct.pack("<I", 50_000_011)
