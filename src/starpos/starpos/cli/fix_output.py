@@ -32,12 +32,6 @@ HEAD = (
 COLUMNS = ("file", "combined", "night", "status", "utc", "latitude", "longitude", "heading", "latitude_geodetic",
            "longitude_geodetic", "sigma_east_m", "sigma_north_m", "sigma_heading_deg", "stars_detected",
            "stars_matched", "residual_arcsec", "log_odds", "warnings", "frames")  # fmt: skip
-JSON_HELP = (
-    "one JSON object a frame, and one with combined: true for all: latitude, longitude and heading are astronomic, in "
-    "deg, their ..._geodetic on WGS 84, covariance (3 x 3) is of east m, north m, heading deg, budget 1 sigma of each "
-    "source; status is ok, or why there is no fix, which is null then"
-)
-CSV_HELP = "a row of a CSV a frame, and one with combined=True for all; columns as the keys of --json"
 
 
 def in_degrees(covariance: np.ndarray) -> np.ndarray:

@@ -66,25 +66,6 @@ def checked_tilts(command: str, path: str, instrument: Instrument) -> TiltFile:
     return file
 
 
-def add_near(parser: argparse.ArgumentParser) -> None:
-    """Add the options that `near_of` reads."""
-    parser.add_argument(
-        "--near",
-        type=options.degrees,
-        nargs=2,
-        metavar=("LAT", "LON"),
-        help="approximate position of the instrument, deg: a fix far from it is reported with likely causes "
-        "and never changed; for pointings without a roll it selects between two possible places",
-    )
-    parser.add_argument(
-        "--near-km",
-        type=float,
-        metavar="KM",
-        help=f"distance from --near within which the fix is expected ({NEAR_KM:g}; 4 sigma of the fix are "
-        f"added)",
-    )
-
-
 def near_of(args: argparse.Namespace) -> Near | None:
     """The place of --near; None without it.  Raises InstrumentError."""
     if args.near is None:
@@ -160,18 +141,6 @@ def _night(folder: str) -> NightFolder | FrameError:
 PIP = "pip install matplotlib rosbags"
 
 
-def add_bag(parser: argparse.ArgumentParser) -> None:
-    """Add the options that `read_bag` reads."""
-    parser.add_argument("--namespace", metavar="NAME", help="of the instrument, in a bag that holds several")
-    options.add_parameters(
-        parser,
-        "of detector and inclinometer, where stars and tilts are made of a robot's images and IMU; the "
-        "solver's parameters come from the other options",
-        "detector:stamp:=start",
-    )
-    options.add_remaps(parser)
-
-
 def read_bag(path: Path, args: argparse.Namespace) -> "tuple[Recorded, Instruments]":
     """One instrument's part of a bag, and the instrument of its frames; raises StarposError."""
     if find_spec("rosbags") is None:
@@ -184,33 +153,6 @@ def read_bag(path: Path, args: argparse.Namespace) -> "tuple[Recorded, Instrumen
     told = (args.instrument, args.focal_mm) != (None, None)
     cameras = found.cameras if args.focal_mm is None else {}
     return found, Instruments(any_camera, cameras=cameras, any_size=told)
-
-
-MAX_JOBS = 1000
-AUTO = "auto"
-
-
-def add_jobs(parser: argparse.ArgumentParser, what: str = "frames") -> None:
-    """Add the options that `workers_of` reads; what: the object of the work."""
-    parser.add_argument(
-        "-j",
-        "--jobs",
-        type=_jobs,
-        metavar="N|auto",
-        help=f"work {what} on this number of processes (1; auto or 0: one per processor)",
-    )
-    parser.add_argument(
-        "--scheduler",
-        metavar="ADDRESS",
-        help="work them on a dask.distributed cluster whose workers have this starpos and see the files",
-    )
-
-
-def _jobs(text: str) -> int:
-    try:
-        return 0 if text == AUTO else options.number(0, MAX_JOBS, int)(text)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} is neither a whole number nor {AUTO}") from None
 
 
 def workers_of(args: argparse.Namespace, frames: int) -> Workers:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from starpos.cli import console, inputs, options
 from starpos.cli.inputs import given_of, given_or_sought, reader_of
-from starpos.cli.options import add_vertical, vertical_of
+from starpos.cli.options import vertical_of
 from starpos.cli.solve import read_receiver
 from starpos.errors import FrameError, InstrumentError
 from starpos.night.night import Night
@@ -28,37 +28,6 @@ NO_FIX = 1
 ALL_FIGURES = 6
 # ending of a session's result
 SESSION = ".json"
-
-
-def define(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "nights",
-        nargs="+",
-        metavar="NIGHT",
-        help="a folder of frames (FITS, CSV of stars, or pictures) with tilt.csv and perhaps truth.json, or a rosbag2, "
-        "of the instrument or of a robot's own camera and IMU; or sessions of starpos deflection --json (.json)",
-    )
-    parser.add_argument(
-        "-o", "--out", default="starpos-report", metavar="FOLDER", help="index.html and PNGs (starpos-report)"
-    )
-    parser.add_argument(
-        "--field",
-        metavar="ZIP",
-        help="instead of a page, write one night's lists of stars, tilts, instrument, air, versions and truth.json into "
-        "one file that can be sent and `starpos solve` reads: no pictures, paths, names or serial numbers",
-    )
-    inputs.add_bag(parser)
-    options.add_stamps(parser)
-    options.add_instrument(parser)
-    options.add_air(parser)
-    add_vertical(parser)
-    options.add_self_calibration(parser)
-    parser.add_argument(
-        "--gnss",
-        metavar="CSV",
-        help="draw a drive beside GNSS, whose fixes teach the instrument: a table as `starpos solve --gnss` takes it",
-    )
-    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -11,12 +11,10 @@ import numpy as np
 
 from starpos.averaging.altitudes import FoundAxis
 from starpos.cli import console, fix_output, inputs, options, overwriting
-from starpos.cli.console import Output, add_formats
+from starpos.cli.console import Output
 from starpos.cli.fix_output import (
     COLUMNS,
-    CSV_HELP,
     HEAD,
-    JSON_HELP,
     json_about,
     json_of,
     json_on_ground,
@@ -26,7 +24,6 @@ from starpos.cli.fix_output import (
 )
 from starpos.cli.inputs import (
     NightFolder,
-    add_near,
     checked_tilts,
     frames_among,
     given_or_sought,
@@ -35,7 +32,7 @@ from starpos.cli.inputs import (
     nights_of,
     reader_of,
 )
-from starpos.cli.options import add_site, add_vertical, place_of, tell_unknown, vertical_of
+from starpos.cli.options import place_of, tell_unknown, vertical_of
 from starpos.cli.overwriting import Written, save_instrument
 from starpos.earth.place import Place
 from starpos.earth.vertical import Vertical
@@ -173,22 +170,6 @@ def say(night: NightFolder, *texts: object) -> None:
     """Print lines about a whole night on standard error."""
     for text in texts:
         console.complain("solve", text if night.folder is None else f"{night.folder}: {text}")
-
-
-def add_gnss(parser: argparse.ArgumentParser) -> None:
-    """Add the options that `check`, `read_receiver` and `run` take."""
-    parser.add_argument(
-        "--gnss",
-        metavar="CSV",
-        help="fixes of a GNSS receiver: utc_unix_s, latitude, longitude (deg, WGS 84), altitude_m, sigma_east_m, "
-        "sigma_north_m, status; they teach A3, the inclinometer's errors and the deflection while the stars agree with "
-        "them, and never enter the place of their own frame",
-    )
-    parser.add_argument(
-        "--learned",
-        metavar="FILE",
-        help="what --gnss taught: read at the beginning if the file is there, written at the end",
-    )
 
 
 def check_gnss(args: argparse.Namespace) -> None:
@@ -335,34 +316,6 @@ def _put_row(
     row = json_of(None, vertical) | utc | {"zenith_distance_deg": deg} | about_stars
     about = status if deg is None else f"{deg:.5f} deg from the zenith"
     output.put({"file": pointing.source} | row, f"{pointing.source}: {about}")
-
-
-def define(parser: argparse.ArgumentParser) -> None:
-    options.add_frames(parser, pointings=True)
-    add_formats(parser, JSON_HELP, CSV_HELP)
-    parser.add_argument(
-        "--tilt",
-        metavar="CSV",
-        help="utc_unix_s, theta_x_deg, theta_y_deg[, theta_z_deg, temperature_c, sigma_deg], or a telephone's log "
-        "(phyphox, Sensor Logger); not with nights: folders of frames with tilt.csv, nor with the instrument file of "
-        "a camera fixed to the ground; --site needs none",
-    )
-    add_gnss(parser)
-    options.add_stamps(parser)
-    options.add_instrument(parser)
-    options.add_air(parser)
-    add_vertical(parser)
-    add_site(parser)
-    add_near(parser)
-    options.add_self_calibration(parser)
-    parser.add_argument(
-        "--save",
-        metavar="OUT",
-        help="write the A3 of --self-calibrate into an instrument file (YAML); one that is there keeps its other keys; "
-        "exits with status 1 and writes nothing if the headings do not determine A3",
-    )
-    inputs.add_jobs(parser)
-    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:

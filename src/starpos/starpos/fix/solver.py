@@ -22,7 +22,14 @@ from starpos.errors import (
     TiltError,
     TimeError,
 )
-from starpos.fix.checks import check_above_horizon, check_exposure, check_unmoved, set_stars, why_unidentified
+from starpos.fix.checks import (
+    check_above_horizon,
+    check_exposure,
+    check_risen,
+    check_unmoved,
+    set_stars,
+    why_unidentified,
+)
 from starpos.fix.fix import IDEAL, Fix, length_text, pointing_fix, solve_fix
 from starpos.fix.heading import AttitudeAtPlace, attitude_at_place
 from starpos.fix.solution import TWO_SKIES, UNEXPLAINED, Solution, Status, solution_of, status_of
@@ -291,9 +298,10 @@ class Solver:
         up = self.instrument.mounting.level(tilt).camera[2]
         use, matched = self._matched(stars, found, camera, up, state, catalogue)
         if fisheye.is_wide(camera):
-            sines = directions_of(camera, stars)[found.star] @ up
+            detected = directions_of(camera, stars) @ up
+            sines = detected[found.star]
             check_above_horizon(float(sines.mean()), self.instrument.calibration)
-            if not self.instrument.calibration.unknown and (low := set_stars(sines)):
+            if not self.instrument.calibration.unknown and (low := set_stars(sines, detected)):
                 raise FixError(
                     f"by the tilts and A3 {low}: check the signs and the order of the tilts' axes, and A3"
                 )
@@ -344,12 +352,10 @@ class Solver:
         if stars.mid_unix_s is None:
             raise TimeError(f"{stars.place}: no time of exposure: {why_no_time(stars)}")
         state = earth_state(stars.mid_unix_s)
-        camera, catalogue, _ = self.view(stars.width, stars.height, stars.origin_px)
+        camera, catalogue, triangles = self.view(stars.width, stars.height, stars.origin_px)
         up = found.attitude @ state.gcrs_to_itrs.T @ place.plumb_axes[2]
-        if low := set_stars(directions_of(camera, stars)[found.star] @ up):
-            raise PlaceError(
-                f"from the given place {low}: check latitude and longitude, their order and signs, and the hour"
-            )
+        sky = Sky(catalogue, triangles, state.year, tuple(state.velocity))
+        check_risen(stars, found, camera, sky, up)
         use, matched = self._matched(stars, found, camera, up, state, catalogue)
         attitude = attitude_at_place(
             matched,

@@ -173,9 +173,9 @@ def test_valid_days_and_the_turn_that_is_known(known, run, tmp_path):
 REFUSED = {
     "no tilt": (("--site", "35", "51", "-o", "OUT", *OPTICS), "give --tilt CSV and -o"),
     "nowhere to write": (("--site", "35", "51", "TILT", *OPTICS), "give --tilt CSV and -o"),
-    "latitude": (("--site", "91", "51", "TILT", "-o", "OUT", *OPTICS), "--site 91 51: give latitude and longitude"),
-    "longitude": (("--site", "5", "361", "TILT", "-o", "OUT", *OPTICS), "give latitude and longitude in deg"),
-    "a place that is none": (("--site", "nan", "5", "TILT", "-o", "OUT", *OPTICS), "give latitude and longitude"),
+    "latitude": (("--site", "91", "51", "TILT", "-o", "OUT", *OPTICS), "no place is at latitude 91"),
+    "longitude": (("--site", "5", "361", "TILT", "-o", "OUT", *OPTICS), "no place is at"),
+    "a place that is none": (("--site", "nan", "5", "TILT", "-o", "OUT", *OPTICS), "no place is at"),
     "half a place": (("--site", "35", "TILT", "-o", "OUT", *OPTICS), "--site"),
     "-o without a site": (("-o", "OUT", "--camera", "CAMERA", "TILT", *OPTICS), "give --site LAT LON"),
     "geodetic without a site": (("--geodetic", "--camera", "CAMERA", "TILT", *OPTICS), "give --site LAT LON"),
