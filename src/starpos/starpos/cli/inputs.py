@@ -5,7 +5,7 @@ import argparse
 import math
 import os
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
@@ -15,7 +15,9 @@ from typing import TYPE_CHECKING
 from starpos.cli import console, options
 from starpos.errors import FrameError, InstrumentError, StarposError, TiltError
 from starpos.fix.solver import Solver
+from starpos.frames.exif import CameraClock
 from starpos.frames.frame import no_stars
+from starpos.frames.reading import HEIF, JPEG, RAW
 from starpos.frames.tables import TILTS, TRUTH
 from starpos.instrument.camera import PLUMB_BOB
 from starpos.instrument.instrument import Instrument
@@ -30,9 +32,13 @@ if TYPE_CHECKING:
     from starpos.night.bag import Recorded
 
 
-def reader_of(args: argparse.Namespace) -> Reader:
-    """The reader of frames with the clock and the delay of their shutter that the options give."""
-    return Reader(options.clock_of(args), tuple(args.shutter_delay or (0.0, 0.0)))
+def reader_of(args: argparse.Namespace, by_files: bool = False) -> Reader:
+    """The reader of frames with the clock and the delay of their shutter that the options give.
+
+    by_files: without a clock by the options, each file's own counts, as its EXIF states it.
+    """
+    clock = options.clock_of(args) or (CameraClock() if by_files else None)
+    return Reader(clock, tuple(args.shutter_delay or (0.0, 0.0)))
 
 
 def given_of(args: argparse.Namespace, first: About | None) -> Instruments:
@@ -85,7 +91,8 @@ def near_of(args: argparse.Namespace) -> Near | None:
 class NightFolder:
     """Frames with one table of tilts that make one fix together.
 
-    tilt: absolute path; None where none is needed.  folder: None if the frames were named one by one.
+    tilt: absolute path; None where none is needed, or photographs have their own.
+    folder: None if the frames were named one by one.
     """
 
     frames: tuple[str, ...]
@@ -108,7 +115,7 @@ def frames_among(given: list[str], *tables: str | None) -> list[str]:
 def nights_of(
     given: list[str], tilt: str | None, needs_no_tilt: bool = False
 ) -> list[NightFolder | FrameError]:
-    """One night from frames and a table, or without one for a camera fixed to the ground or at a known place.
+    """One night from frames and a table, or without one for photographs, a fixed camera, or a known place.
 
     Else a night for each folder, or its error.
 
@@ -121,6 +128,8 @@ def nights_of(
         return [NightFolder(tuple(given), None)]
     if missing := next((path for path in given if not os.path.exists(path)), None):
         raise FrameError(f"{missing}: there is no such file or folder")
+    if are_photographs(given):
+        return [NightFolder(tuple(given), None)]
     if single := next((path for path in given if not os.path.isdir(path)), None):
         raise TiltError(
             f"{single}: no tilts: give --tilt with frames, or nights alone: folders of frames, each with its tilt.csv"
@@ -135,7 +144,13 @@ def _night(folder: str) -> NightFolder | FrameError:
         frames = tuple(map(str, frames_in(Path(folder))))
     except FrameError as error:
         return error
-    return NightFolder(frames, os.path.abspath(os.path.join(folder, TILTS)), folder)
+    tilt = os.path.abspath(os.path.join(folder, TILTS))
+    return NightFolder(frames, None if are_photographs(frames) and not os.path.exists(tilt) else tilt, folder)
+
+
+def are_photographs(paths: Sequence[str]) -> bool:
+    """Whether all files are of the kinds in which a telephone's photographs, with gravity, come."""
+    return all(os.path.splitext(path)[1].lower() in JPEG + HEIF + RAW for path in paths)
 
 
 PIP = "pip install matplotlib rosbags"

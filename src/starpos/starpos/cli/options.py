@@ -13,7 +13,7 @@ from starpos.earth.place import Place
 from starpos.earth.refraction import Atmosphere
 from starpos.earth.vertical import UNKNOWN_STDDEV_ARCSEC, AtHeight, Deflection, Vertical
 from starpos.errors import InstrumentError
-from starpos.frames.exif import UNTENDED_STDDEV_S, CameraClock
+from starpos.frames.exif import CameraClock
 from starpos.frames.exposure import Shutter
 from starpos.instrument import instrument, instrument_file, sensors
 from starpos.instrument.camera import PLUMB_BOB, Camera
@@ -60,9 +60,7 @@ def clock_of(args: argparse.Namespace) -> CameraClock | None:
         if stddev_s is not None:
             raise InstrumentError("--exif-clock-stddev is for --exif-utc-offset: give both")
         return None
-    return CameraClock(
-        None if offset_h == FILES_OWN else offset_h, UNTENDED_STDDEV_S if stddev_s is None else stddev_s
-    )
+    return CameraClock(None if offset_h == FILES_OWN else offset_h, stddev_s)
 
 
 def turn_of(args: argparse.Namespace) -> float:

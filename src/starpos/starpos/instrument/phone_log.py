@@ -5,7 +5,7 @@ CSV or JSON).
 A telephone's x points to the right of its screen, y to its top, z out of it.  S has the axes of the pictures that its
 back camera stores, as iPhones hold them: columns along -y, rows along -x, so that A3 is about zero for that camera.
 phyphox writes the specific force, upward, on iOS too (its source: phyphox-ios, kG = -9.81).  Sensor Logger writes gravity
-downward on iOS unless its setting "Standardise Units & Frames" is on, and upward on Android (its documentation of coordinates).
+downward on iOS unless its setting "Standardise Units & Frames" is on, and upward on Android (its own documents).
 """
 
 import csv
