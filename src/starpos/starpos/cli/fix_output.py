@@ -97,6 +97,7 @@ def json_about(s: Solution) -> dict:
         "residual_arcsec": fitted.residual_arcsec if fitted else None,
         "log_odds": a.log_odds if a else None,
         "status": s.status.value,
+        "bodies": list(s.bodies),
         "warnings": list(s.warnings),
         "remark": s.remark or None,
     }
@@ -104,6 +105,8 @@ def json_about(s: Solution) -> dict:
 
 def line_of(path: str, s: Solution, turning: bool) -> str:
     """The line of a frame; turning: its place needs the other headings."""
+    if s.circle is not None:
+        return f"{path}: {s.message}"
     if s.fix is None:
         return f"{path}: {s.status.value}, {s.stars_detected} stars detected"
     # one frame of a turn does not determine A3, so the error of its own place would exceed 1000 km
@@ -231,7 +234,8 @@ def heading_line_of(path: str, s: Solution) -> str:
     if s.at_place is None:
         return f"{path}: {s.status.value}, {s.stars_detected} stars detected"
     where = "" if s.fix is None else f"{s.fix.in_degrees.where}, "
-    return f"{path}: {where}{heading_text_of(s.at_place)}, {len(s.names)} of {s.stars_detected} stars"
+    seen = f"by the {s.bodies[0]}" if s.bodies else f"{len(s.names)} of {s.stars_detected} stars"
+    return f"{path}: {where}{heading_text_of(s.at_place)}, {seen}"
 
 
 def heading_text_of(found: AttitudeAtPlace | MeanAttitude) -> str:

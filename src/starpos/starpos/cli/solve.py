@@ -93,22 +93,21 @@ def tell(
     for answer in answers.each:
         gathered.gather(answer)
         s = answer.solution
-        if s.fix is None and (s.at_place is None or not s.ok):
+        if s.fix is None and s.circle is None and (s.at_place is None or not s.ok):
             complaints(answer.name, s.message)
         if s.remark:
             complaints(answer.name, s.remark)
         output.put(_json_of_answer(args, answer, vertical, place), _line_of_answer(args, answer, place))
     complaints.end()
     solved, headings, near = gathered.solved, gathered.headings, near_of(args)
-    whole = together(solved, answers.given, near)
+    whole = together(gathered, answers.given, near)
     mean, why = (None, ()) if place is None else fix_output.mean_of(headings)
     unnamed = () if watched is None or answers.instrument is None else of_inclinometer(answers.instrument)
     not_averaged = [whole.why_not] if whole.why_not else []
     say(night, *not_averaged, *(unnamed if solved else ()), *whole.remarks, *why)
-    if solved:
-        last = solved[-1].fix
-        tell_unknown("solve", args, vertical.at(last.latitude, last.longitude))
-        where = last if whole.average is None else whole.average
+    where = whole.average or (solved[-1].fix if solved else None)
+    if where is not None:
+        tell_unknown("solve", args, vertical.at(where.latitude, where.longitude))
         about = {} if near is None else {"km_from_near": near.km_from(where.latitude, where.longitude)}
         if place is not None:
             about |= with_heading(json_of(whole.average, vertical), mean, place)
@@ -117,8 +116,9 @@ def tell(
         fix_output.put_mean(output, night, headings, mean, place, vertical)
     elif gathered.lost is not None and not headings and work is not None:
         say(night, *work.fitting(gathered.lost))
-    # without tilts headings are all that was asked for
-    found = bool(headings) if place is not None and not args.tilt else whole.average is not None
+    # without tilts headings are all that was asked for, and by day they are all there is
+    by_day = any(s.bodies for s in headings)
+    found = bool(headings) if place is not None and (by_day or not args.tilt) else whole.average is not None
     found |= args.gnss is not None and args.tilt is None and bool(headings)
     return max([*statuses, console.UNREADABLE if gathered.unreadable else 0 if found else NO_FIX])
 
@@ -132,6 +132,9 @@ def _json_of_answer(
         watched = answer.watched or Watched(solution=s)
         return {"file": answer.name} | json_of_watched(watched) | json_about(s)
     values = {"file": answer.name} | json_of(s.fix, vertical) | json_about(s)
+    if s.circle is not None:
+        values |= {"utc": utc_text(s.circle.utc_unix_s)}
+        values |= {"zenith_distance_deg": np.degrees(s.circle.zenith_distance)}
     return values if place is None else with_heading(values, s.at_place, place)
 
 
