@@ -28,7 +28,7 @@ from starpos.frames.tables import TILTS, Pointing, read_pointings
 from starpos.identification import Identification
 from starpos.instrument import instrument_file
 from starpos.instrument.camera import Camera
-from starpos.instrument.inclinometer import level_of, up_of
+from starpos.instrument.inclinometer import up_of
 from starpos.instrument.instrument import (
     SAG_ARCSEC_PER_SQRT_HOUR,
     Calibration,
@@ -376,7 +376,7 @@ def _levelled(
                 raise FrameError(f"no time of exposure: {why_no_time(stars)}")
             tilt = tilts.average(stars.mid_unix_s, stars.exposure_s or 0.0)
             instrument.inclinometer.check_live(tilt)
-            levels.append(level_of(tilt.up) @ instrument.mounting.a3)
+            levels.append(instrument.mounting.level(tilt).camera)
             kept.append((stars, found))
         except StarposError as e:
             console.complain("calibrate", f"{stars.source} is left out: {e}")

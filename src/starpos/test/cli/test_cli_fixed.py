@@ -82,8 +82,8 @@ def test_a_touch_in_the_night_costs_the_frames_after_it(instrument, first, tmp_p
 
 REFUSED = {
     "tilts too": (("--fixed", *SITE, "--tilt", "t.csv", "-o", "OUT"), "--fixed and --tilt do not go"),
-    "an A3 too": (("--fixed", *SITE, "--misalignment", 1, 2, 3, "-o", "OUT"), "--fixed and --misalignment do not go"),
-    "an inclinometer too": (("--fixed", *SITE, "--inclinometer", "scl3300", "-o", "OUT"), "--fixed and --inclinometer do not go"),
+    "an A3 too": (("--fixed", *SITE, "--misalignment", 1, 2, 3, "-o", "OUT"), "do not go together"),
+    "an inclinometer too": (("--fixed", *SITE, "--inclinometer", "scl3300", "-o", "OUT"), "do not go together"),
     "no site": (("--fixed", "-o", "OUT", "--camera", "OUT"), "--fixed is for --site"),
     "nowhere to write": (("--fixed", *SITE), "-o INSTRUMENT.yaml"),
     "sag alone": (("--sag", 3, *SITE, "--tilt", "t.csv", "-o", "OUT"), "--sag is for --fixed"),

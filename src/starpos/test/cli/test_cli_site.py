@@ -184,7 +184,7 @@ REFUSED = {
     "a deflection without a site": (("--xi", "3", "--camera", "CAMERA", *OPTICS), "give --site LAT LON"),
     "a deflection by gravity": ((*PLACE, "--eta", "0", "TILT", "-o", "OUT", *OPTICS), "say --geodetic, or"),
     "a geoid by gravity": ((*PLACE, "--geoid", "x.gtx", "TILT", "-o", "OUT", *OPTICS), "say --geodetic"),
-    "two deflections": ((*PLACE, "--geodetic", "--xi", "3", "--geoid", "x", "TILT", "-o", "OUT", *OPTICS), "--geoid and --xi do not go"),
+    "two deflections": ((*PLACE, "--geodetic", "--xi", "3", "--geoid", "x", "TILT", "-o", "OUT", *OPTICS), "--geoid and"),
     "no such geoid": ((*PLACE, "--geodetic", "--geoid", "none.gtx", "TILT", "-o", "OUT", *OPTICS), "none.gtx"),
     "a deflection that is none": ((*PLACE, "--geodetic", "--xi", "nan", "TILT", "-o", "OUT", *OPTICS), "finite"),
     "a turn of nothing": ((*PLACE, "--turn-stddev", "0", "TILT", "-o", "OUT", *OPTICS), "must lie between"),
