@@ -5,7 +5,7 @@ import argparse
 import math
 import os
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
@@ -19,7 +19,7 @@ from starpos.fix.searching import Sight
 from starpos.fix.solver import Solver
 from starpos.frames.exif import CameraClock
 from starpos.frames.frame import Frame, Stars, no_stars
-from starpos.frames.reading import HEIF, JPEG, RAW, why_no_time
+from starpos.frames.reading import are_photographs, why_no_time
 from starpos.frames.tables import TILTS, TRUTH
 from starpos.instrument.camera import PLUMB_BOB, Camera
 from starpos.instrument.instrument import Instrument
@@ -121,8 +121,6 @@ def checked_tilts(command: str, path: str, instrument: Instrument) -> TiltFile:
 def near_of(args: argparse.Namespace) -> Near | None:
     """The place of --near; None without it.  Raises InstrumentError."""
     if args.near is None:
-        if args.near_km is not None:
-            raise InstrumentError("--near-km is for --near: give both")
         return None
     latitude, longitude = args.near
     if not (abs(latitude) <= 90 and abs(longitude) <= 360):
@@ -194,11 +192,6 @@ def _night(folder: str) -> NightFolder | FrameError:
     return NightFolder(frames, None if are_photographs(frames) and not os.path.exists(tilt) else tilt, folder)
 
 
-def are_photographs(paths: Sequence[str]) -> bool:
-    """Whether all files are of the kinds in which a telephone's photographs, with gravity, come."""
-    return all(os.path.splitext(path)[1].lower() in JPEG + HEIF + RAW for path in paths)
-
-
 PIP = "pip install matplotlib rosbags"
 
 
@@ -219,10 +212,6 @@ def read_bag(path: Path, args: argparse.Namespace) -> "tuple[Recorded, Instrumen
 def workers_of(args: argparse.Namespace, frames: int) -> Workers:
     """The workers that the options ask for, with no more processes than frames; raises InstrumentError."""
     if args.scheduler is not None:
-        if args.jobs is not None:
-            raise InstrumentError(
-                "--scheduler names machines, --jobs processes of this one: give one of the two"
-            )
         return Cluster(args.scheduler)
     return workers(min(processors() if args.jobs == 0 else args.jobs or 1, frames))
 
