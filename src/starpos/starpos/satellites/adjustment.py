@@ -62,7 +62,7 @@ class _Block:
         return np.linalg.inv(self.total)
 
     def offset(self, step: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The satellite's offset (3,) after a step (6,) of what all share, and its covariance (3, 3) with the place held."""
+        """The satellite's offset (3,) after a step (6,) of all unknowns, and its covariance (3, 3) at that place."""
         gain = self.prior @ self.by_offset.T @ self.weight
         return gain @ (self.residual - self.by_place @ step), self.prior - gain @ self.by_offset @ self.prior
 
@@ -72,9 +72,10 @@ class _Block:
 class PlaceAdjustment:
     """A place (3,) in ITRS, m, with the clock, by named trails.
 
-    covariance (6, 6): of east, north, up (m), the clock (s), and what sightings by hand share; already widened by `scale` (variance).
+    covariance (6, 6): of east, north, up (m), the clock (s), and the errors that sightings by hand share; widened by
+    `scale`, a factor of variances.
     offset_m, offset_sigma_m (T, 3): each trail's satellite against its orbit: radial, along, across (left from above);
-    of a trail that is not used, by that trail alone.
+    NaN of a trail that is not used.
     used (T,); probability (T,): of so large a residual by chance.
     """
 
