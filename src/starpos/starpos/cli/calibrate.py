@@ -185,16 +185,11 @@ def run_elevations(
     found = axis_of(solver, pointings, tilts, site=site)
     for remark in (*of_left_out(found.left_out), *of_inclinometer(instrument)):
         console.complain("calibrate", remark)
-    if found.stddev_arcsec > WORTH_SAVING_ARCSEC:
-        scatter = np.sqrt(1 + found.scatter2)
-        why = "directions at other altitudes and azimuths are needed"
-        if scatter > SCATTERED:
-            why = (
-                f"they scatter by {scatter:.0f} times their stated errors: check the place, the clock, and the tilts' "
-                "axes, signs and units"
-            )
+    scatter = np.sqrt(1 + found.scatter2)
+    if scatter > SCATTERED and found.stddev_arcsec > WORTH_SAVING_ARCSEC:
         raise FixError(
-            f"A3 is not written: the elevations determine it to {found.stddev_arcsec:.0f} arcsec only, {why}"
+            f"A3 is not written: the elevations scatter by {scatter:.0f} times their stated errors, and determine it to "
+            f"{found.stddev_arcsec:.0f} arcsec only: check the place, the clock, and the tilts' axes, signs and units"
         )
     calibration = found.calibration(instrument.calibration, options.turn_of(args))
     about = (

@@ -244,7 +244,7 @@ def from_elevations(
     except FixError as error:
         together = Together(None, str(error))
     found = Elevations(tuple(circles), together, axis)
-    if axis is not None or not remarks.beyond_stated(together.average):
+    if self_calibrate or axis is not None or not remarks.beyond_stated(together.average):
         return found
     # residuals beyond the stated errors may be those of a wrong A3, which no scatter covers
     given = solver.instrument.calibration
