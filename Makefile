@@ -35,9 +35,13 @@ emulated: build
 	@tools/setup/counterparts
 	@. tools/env.sh && python tools/demo/emulated_instrument.py $(ARGS)
 
-# what tests run against comes while the build computes
+# what tests run against comes while the build computes; what other versions lack, tools/test.py brings and says
+bring_for_tests = tools/setup/counterparts
+ifneq (,$(findstring --both,$(ARGS)))
+bring_for_tests += ; { tools/setup/docs; tools/setup/ubuntu packages; tools/setup/core python3.10 packages; } >/dev/null 2>&1
+endif
 test: .underlay/stamp
-	@tools/setup/counterparts & status=0; $(MAKE) --no-print-directory build || status=$$?; wait; exit $$status
+	@{ $(bring_for_tests); } & status=0; $(MAKE) --no-print-directory build || status=$$?; wait; exit $$status
 	@. tools/env.sh && python tools/test.py $(ARGS)
 
 bench: build

@@ -26,6 +26,7 @@ KEYS = {
     "pytest": "python3-pytest",
     "scipy": "python3-scipy",
     "serial": "python3-serial",
+    "sgp4": "python3-sgp4",
     "tornado": "python3-tornado",
     "yaml": "python3-yaml",
 }

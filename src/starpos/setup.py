@@ -65,6 +65,7 @@ setup(
         "pyerfa>=2.0.1",
         "opencv-python-headless>=4.6",
         "PyYAML",
+        "sgp4>=2.15",
     ],
     extras_require={
         "picture": ["matplotlib"],

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """CPU time of blind searches that find nothing: lists of random points, and of points in the gaps of clouds.
 
-`python tools/benchmarks/benchmark_blind.py [FRAMES [SEED]]`. It prints median and worst, and is wrong if one is identified.
+`python tools/benchmarks/benchmark_blind.py [FRAMES [SEED]]`. It prints median and worst; none may be identified.
 """
 
 import sys

@@ -10,25 +10,21 @@ import numpy as np
 from starpos import rotation
 from starpos._numeric.roots import symmetric_root
 from starpos.averaging.average import SCATTER, Average
-from starpos.earth.ellipsoid import curvature_radii_m, enu_axes, place_of_zenith
-from starpos.earth.orientation import EarthState, station_velocity
-from starpos.earth.refraction import MIN_COS_ZENITH, Atmosphere
+from starpos.earth.ellipsoid import EQUATOR_RADIUS_M, curvature_radii_m, enu_axes, ground_m, place_of_zenith
+from starpos.earth.orientation import station_velocity
 from starpos.errors import FixError
-from starpos.fix.budget import tilt_terms, time_terms
+from starpos.fix.budget import time_terms
+from starpos.fix.circle import Circle
 from starpos.fix.terms import ALWAYS, EACH_POSE, ErrorTerm
-from starpos.frames.tables import Pointing
 from starpos.frozen import at_once
-from starpos.instrument.camera import Camera
-from starpos.instrument.inclinometer import Tilt
-from starpos.instrument.mounting import Mounting
 from starpos.units import ARCSEC, SIGMA_PER_MAD
 
-# so near the zenith a direction has hardly an elevation to speak of
-MIN_SINE = 0.01
 # with a worse A3 the circles are no longer what a linear error makes of them: its axis is fitted first
 LINEAR_A3_RAD = 360 * ARCSEC
 # maximum distance of frames that look in one direction, in rad and in sigma
 SAME_RAD, SAME_SIGMA = 60 * ARCSEC, 6.0
+# the same for the Sun's way over a camera at rest, which the air bends
+SAME_POSE_RAD = 300 * ARCSEC
 MAX_DIRECTIONS = 1000
 # number of directions that give the first places to try
 STARTS = 8
@@ -42,67 +38,6 @@ OUTLIER_SIGMA, MIN_JUDGED, MAX_OUTLIERS, JUDGED = 6.0, 6, 1 / 3, 6
 WITHIN = 0.95
 # three directions that contradict each other by more have errors of unknown size
 CONTRADICT_SIGMA = 5.0
-
-
-@at_once
-@dataclass(frozen=True, kw_only=True)
-class Circle:
-    """A circle of equal altitude.
-
-    itrs (3,): geocentric apparent direction of the frame's centre.  zenith_distance (rad): as it is without refraction.
-    sigma (rad): of the pointing, across the circle.  terms: errors of the zenith distance, with factors (1, m) in rad.
-    clock_stddev_s, stamp_stddev_s: as in a fix.
-    up (3,): in S, as the inclinometer shows it; axes: their number, 2 or 3.
-    """
-
-    utc_unix_s: float
-    itrs: np.ndarray
-    up: np.ndarray
-    axes: int
-    zenith_distance: float
-    sigma: float
-    terms: tuple[ErrorTerm, ...]
-    earth: EarthState
-    clock_stddev_s: float
-    stamp_stddev_s: float
-
-
-def circle_of(
-    pointing: Pointing,
-    camera: Camera,
-    tilt: Tilt,
-    mounting: Mounting,
-    atmosphere: Atmosphere,
-    earth: EarthState,
-    clock_stddev_s: float,
-) -> Circle:
-    """The circle of one frame; FixError if its direction does not determine an altitude."""
-    level = mounting.level(tilt)
-    seen = level.camera @ camera.centre_ray
-    sine = np.hypot(seen[0], seen[1])
-    if sine < MIN_SINE or seen[2] < MIN_COS_ZENITH:
-        raise FixError(
-            f"{pointing.place}: the camera looks {np.degrees(np.arctan2(sine, seen[2])):.1f} deg from the "
-            f"zenith; an elevation determines a place only between 0.6 and 87: lean it"
-        )
-    # up that errs by a small rotation of L lies nearer to the axis, or further
-    rows = np.array([[-seen[1], seen[0], 0.0]]) / sine
-    terms = tilt_terms(rows, level, tilt, mounting, earth.utc_unix_s)
-    true = atmosphere.refraction().unbend(seen)
-    z = float(np.arctan2(np.hypot(true[0], true[1]), true[2]))
-    bent = (z - np.arctan2(sine, seen[2])) * atmosphere.relative_sigma
-    return Circle(
-        utc_unix_s=earth.utc_unix_s,
-        itrs=earth.to_itrs(rotation.unit_vector([pointing.ra], [pointing.dec]))[0],
-        up=level.up,
-        axes=tilt.axes,
-        zenith_distance=z,
-        sigma=pointing.sigma,
-        terms=(*terms, ErrorTerm("refraction", np.array([[bent]]), shared=ALWAYS)),
-        earth=earth,
-        clock_stddev_s=clock_stddev_s,
-        stamp_stddev_s=pointing.stamp_stddev_s,
-    )
 
 
 def place_of_circles(circles: Sequence[Circle], near: tuple[float, float] | None = None) -> Average:
@@ -184,7 +119,8 @@ class Directions:
         every = [c for g in self.circles for c in g]
         if measured is None:
             measured = np.array([c.zenith_distance for c in every])
-        v = rotation.normalised(np.array([c.itrs for c in every]) + station_velocity(zenith))
+        nearer = np.array([c.parallax for c in every])[:, None] * ground_m(zenith) / EQUATOR_RADIUS_M
+        v = rotation.normalised(np.array([c.itrs for c in every]) - nearer + station_velocity(zenith))
         axes = _enu(zenith)
         local = v @ axes.T
         sine = np.hypot(local[:, 0], local[:, 1])
@@ -198,15 +134,31 @@ def _alike(a: Circle, b: Circle) -> bool:
     return bool(a.itrs @ b.itrs > 0 and angle < max(SAME_RAD, SAME_SIGMA * np.hypot(a.sigma, b.sigma)))
 
 
+def _poses(groups: list[list[Circle]]) -> np.ndarray:
+    """Number (D,) of each direction's pose: what moves over a camera at rest moves as far in it as on the Earth."""
+    seen = np.array([g[0].ray for g in groups]), np.array([g[0].itrs for g in groups])
+    in_camera, on_earth = (np.arctan2(*_apart(v[:-1], v[1:])) for v in seen)
+    return np.append(0, np.cumsum(np.abs(in_camera - on_earth) > SAME_POSE_RAD))
+
+
+def _apart(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Sines and cosines (N,) of the angles between unit vectors (N, 3)."""
+    return np.linalg.norm(np.cross(a, b), axis=-1), np.einsum("ni,ni->n", a, b)
+
+
 def _tilt_sources(groups: list[list[Circle]]) -> dict[str, np.ndarray]:
     """Covariance (D, D) in rad2 of the mean zenith distances of each direction, for each term of the circles."""
+    poses = _poses(groups)
     first = groups[0][0].utc_unix_s
     since = np.array([np.mean([c.utc_unix_s for c in g]) for g in groups]) - first
     sources: dict[str, np.ndarray] = {}
     for k, like in enumerate(groups[0][0].terms):
         terms = [[c.terms[k] for c in g] for g in groups]
-        if like.shared == ALWAYS:
+        if like.shared in (ALWAYS, EACH_POSE):
             mean = np.array([np.mean([t.factor[0] for t in ts], axis=0) for ts in terms])
+            if like.shared == EACH_POSE:
+                sources[like.name] = mean @ mean.T * like.variance * (poses[:, None] == poses)
+                continue
             # what wanders has gone on together until the earlier of two times
             variance = terms[0][0].variance + like.walk_s * np.minimum(since[:, None], since)
             sources[like.name] = mean @ mean.T * variance
@@ -220,8 +172,6 @@ def _mean_variance(terms: list[ErrorTerm]) -> float:
     each = np.array([t.covariance[0, 0] for t in terms])
     if terms[0].shared is None:
         return float(each.sum()) / len(terms) ** 2
-    if terms[0].shared == EACH_POSE:
-        return float(each.mean())
     keys = [t.shared or () for t in terms]
     different = len(set().union(*keys))
     return float(np.mean([v * len(k) for v, k in zip(each, keys, strict=True)])) / max(different, 1)

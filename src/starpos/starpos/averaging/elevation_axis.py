@@ -12,9 +12,7 @@ from starpos.averaging.altitudes import (
     EXCLUDED_SIGMA,
     MAX_OUTLIERS,
     MIN_JUDGED,
-    MIN_SINE,
     OUTLIER_SIGMA,
-    Circle,
     Directions,
     excess,
     starts,
@@ -23,6 +21,7 @@ from starpos.averaging.altitudes import (
 from starpos.earth.place import Place
 from starpos.earth.refraction import MIN_COS_ZENITH
 from starpos.errors import FixError
+from starpos.fix.circle import MIN_SINE, Circle
 from starpos.frozen import at_once
 from starpos.instrument.instrument import UNKNOWN_ARCSEC, Calibration
 from starpos.instrument.mounting import angles_at

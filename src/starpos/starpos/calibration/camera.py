@@ -18,11 +18,15 @@ from starpos.calibration.camera_adjustment import (
     with_values,
 )
 from starpos.calibration.misalignment import NOTHING_KNOWN, Known
+from starpos.earth.orientation import earth_state
+from starpos.earth.place import Place
 from starpos.earth.refraction import Atmosphere
-from starpos.errors import CalibrationError, InstrumentError
+from starpos.errors import CalibrationError, InstrumentError, TimeError
+from starpos.fix.checks import check_risen
 from starpos.fix.solver import ENOUGH_SOUND, high_enough
 from starpos.fix.star_fit import MatchedStars, sound_matches
 from starpos.frames.frame import Stars
+from starpos.frames.reading import why_no_time
 from starpos.frozen import at_once
 from starpos.identification import Identification, PointingPrior, Sky, fisheye, identify_directions, triangles
 from starpos.identification.triangles import TriangleCatalogue
@@ -234,6 +238,7 @@ def calibrate_camera(
     atmosphere: Atmosphere,
     progress: Progress = quiet,
     known: Known = NOTHING_KNOWN,
+    site: Place | None = None,
 ) -> FromSky:
     """One camera from frames of any attitudes.
 
@@ -247,6 +252,7 @@ def calibrate_camera(
     atmosphere : of refraction
     progress : is called with the share of the work that is done
     known : the stars of frames, by the frames' numbers, that only a longer search identifies
+    site : where the camera is: the stars then show its level, and `levels` are not needed
 
     Returns
     -------
@@ -257,6 +263,8 @@ def calibrate_camera(
     ------
     CalibrationError
         no camera can be found
+    PlaceError
+        stars would be under the horizon of the site
     InstrumentError
         a frame is mirrored
     TimeError
@@ -277,16 +285,20 @@ def calibrate_camera(
                 f"{stars.source}: the frame is {stars.width} x {stars.height} px but the first or the instrument has "
                 f"{given.width} x {given.height}: give frames of one size"
             )
-    if fisheye.is_wide(given) and any(level is None for level in levels):
+    if fisheye.is_wide(given) and site is None and any(level is None for level in levels):
         raise CalibrationError(
-            "without tilts refraction cannot be separated from a fisheye's distortion: give the --tilt of "
-            "its frames"
+            "without a level refraction cannot be separated from a fisheye's distortion: give the place with --site, or "
+            "the --tilt of its frames"
         )
     catalogue = deeper.for_field(catalogue, given, progress)
     table = triangles.cached_triangles(catalogue, fisheye.field_rad(given), progress)
     every = parameters(given)
-    skies = [_Frame.of(stars, level, catalogue, table) for stars, level in zip(frames, levels, strict=True)]
+    skies = [
+        _Frame.of(stars, level, catalogue, table, site) for stars, level in zip(frames, levels, strict=True)
+    ]
     camera, before = given, 0
+    for n, found in known.items():
+        skies[n].check_risen(frames[n], found, given)
     attitudes = {n: found.attitude for n, found in known.items() if not found.mirrored}
     for k, free in enumerate((*FIRST_FREE, *[every] * ROUNDS)):
         sightings = {}
@@ -302,7 +314,8 @@ def calibrate_camera(
             )
         fit = fit_camera(list(sightings.values()), given, atmosphere, free)
         check_invertible(fit.camera)
-        camera, attitudes = fit.camera, dict(zip(sightings, fit.attitudes, strict=True))
+        camera = fit.camera
+        attitudes = {n: skies[n].of_sky(a) for n, a in zip(sightings, fit.attitudes, strict=True)}
         count = sum(len(s.stars.xy) for s in sightings.values())
         if k >= len(FIRST_FREE) and abs(count - before) <= SETTLED_SHARE * count:
             break
@@ -321,11 +334,15 @@ def calibrate_camera(
 @at_once
 @dataclass(frozen=True)
 class _Frame:
-    """The stars of a frame, and the sky of its date."""
+    """The stars of a frame, and the sky of its date.
+
+    to_local (3, 3): the sky's directions into L at the known place; None without one.
+    """
 
     stars: Stars
     level: np.ndarray | None
     sky: Sky
+    to_local: np.ndarray | None
 
     @classmethod
     def of(
@@ -334,18 +351,39 @@ class _Frame:
         level: np.ndarray | None,
         catalogue: Catalogue,
         table: TriangleCatalogue,
+        site: Place | None,
     ) -> "_Frame":
-        return cls(stars.select(stars.on_frame), level, Sky.at(catalogue, table, stars.mid_unix_s))
+        local = None
+        if site is not None and level is None:
+            if stars.mid_unix_s is None:
+                raise TimeError(f"{stars.place}: no time of exposure: {why_no_time(stars)}")
+            local = site.plumb_axes @ earth_state(stars.mid_unix_s).gcrs_to_itrs
+        return cls(stars.select(stars.on_frame), level, Sky.at(catalogue, table, stars.mid_unix_s), local)
+
+    def of_sky(self, attitude: np.ndarray) -> np.ndarray:
+        """The attitude of a fit, as one of the sky's directions into C."""
+        return attitude if self.to_local is None else attitude @ self.to_local
+
+    def check_risen(self, stars: Stars, found: Identification, camera: Camera) -> None:
+        """Raise PlaceError if identified stars would be under the horizon of the known place."""
+        if self.to_local is not None:
+            check_risen(stars, found, camera, self.sky, found.attitude @ self.to_local[2])
+
+    def _level(self, attitude: np.ndarray | None) -> np.ndarray | None:
+        """C into L, by the tilts, or by the place and an attitude of the sky."""
+        if self.to_local is None or attitude is None:
+            return self.level
+        return self.to_local @ attitude.T
 
     def sighting(
         self, camera: Camera, atmosphere: Atmosphere, attitude: np.ndarray | None
     ) -> CameraSighting | None:
         """The stars that are identified with this camera, first near a known attitude (3, 3); None if none are.
 
-        Raises InstrumentError for a mirrored frame.
+        Raises InstrumentError for a mirrored frame, PlaceError where its stars would be under the horizon.
         """
         stars = self.stars.select(camera.sees(self.stars.x, self.stars.y))
-        seen = unbent(camera.directions(stars.x, stars.y), self.level, atmosphere)
+        seen = unbent(camera.directions(stars.x, stars.y), self._level(attitude), atmosphere)
         priors = () if attitude is None else (PointingPrior(attitude, camera.fx),)
         found = identify_directions(seen, stars.sigma, camera, self.sky, priors)
         if found is None:
@@ -354,18 +392,25 @@ class _Frame:
             raise InstrumentError(
                 f"{self.stars.source}: the frame is mirrored (its rows run bottom-up): flip it"
             )
+        # others were checked when they became known
+        if attitude is None:
+            self.check_risen(stars, found, camera)
         return self._sighting(stars, seen, found, camera)
 
     def _sighting(
         self, stars: Stars, seen: np.ndarray, found: Identification, camera: Camera
     ) -> CameraSighting:
         use = sound_matches(stars, found, ENOUGH_SOUND)
-        if fisheye.is_wide(camera) and self.level is not None:
-            use &= high_enough(seen[found.star] @ self.level[2])
-        sky, places = self.sky, self.sky.directions(found.catalogue[use])
+        level = self._level(found.attitude)
+        if level is not None and fisheye.is_wide(camera):
+            use &= high_enough(seen[found.star] @ level[2])
+        sky, places, attitude = self.sky, self.sky.directions(found.catalogue[use]), found.attitude
+        if self.to_local is not None:
+            places, attitude = places @ self.to_local.T, attitude @ self.to_local.T
         return CameraSighting(
             stars=MatchedStars.of(stars, found, use, camera, sky.catalogue, sky.year, places),
-            attitude=found.attitude,
+            attitude=attitude,
             level=self.level,
             timed=self.stars.mid_unix_s is not None,
+            upright=self.to_local is not None,
         )

@@ -43,6 +43,7 @@ class CameraSighting:
 
     attitude (3, 3): takes these directions into C, approximately.
     level (3, 3): takes C into the local level L; None if unknown.
+    upright: whether the directions are along L, as at a known place: then the attitude itself is the level.
     timed: whether the aberration is computed for the frame's date.
     """
 
@@ -50,6 +51,7 @@ class CameraSighting:
     attitude: np.ndarray
     level: np.ndarray | None
     timed: bool
+    upright: bool = False
 
 
 def unbent(seen: np.ndarray, level: np.ndarray | None, atmosphere: Atmosphere) -> np.ndarray:
@@ -122,6 +124,7 @@ class CameraAdjustment:
     xy (N, 2) px, stated (N, 2, 2) px2, places (N, 3): seen place, its covariance and direction of each star.
     frame (N,): the frame of each star; first (F,): the row where each frame begins.
     start (F, 3, 3): approximate attitudes.  level (F, 3, 3): C into L, 0 if unknown.
+    upright: whether all places are along L.
     """
 
     given: Camera
@@ -134,6 +137,7 @@ class CameraAdjustment:
     start: np.ndarray
     level: np.ndarray
     atmosphere: Atmosphere
+    upright: bool
 
     @classmethod
     def of(
@@ -159,6 +163,7 @@ class CameraAdjustment:
             start=np.stack([s.attitude for s in sightings]),
             level=np.stack([np.zeros((3, 3)) if s.level is None else s.level for s in sightings]),
             atmosphere=atmosphere,
+            upright=all(s.upright for s in sightings),
         )
 
     def with_free(self, name: str) -> "CameraAdjustment":
@@ -182,9 +187,12 @@ class CameraAdjustment:
 
     def light(self, state: CameraEstimate) -> np.ndarray:
         """Directions (N, 3) in C from which the light of the stars comes."""
-        u = np.einsum("nij,nj->ni", state.attitudes[self.frame], self.places)
         strength, *shrink = (state.q * self.sigma)[-len(OF_THE_AIR) :]
         model = self.atmosphere.refraction(1 + strength)
+        places = model.bend(self.places) if self.upright else self.places
+        u = np.einsum("nij,nj->ni", state.attitudes[self.frame], places)
+        if self.upright:
+            return u
         if self.levelled.all():
             g = self.level[self.frame]
             return np.einsum("nij,ni->nj", g, model.bend(np.einsum("nij,nj->ni", g, u)))

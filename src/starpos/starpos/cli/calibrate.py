@@ -13,13 +13,12 @@ from starpos.calibration.camera import FromSky, Intrinsics, calibrate_camera, rm
 from starpos.calibration.camera_adjustment import UNLEVELLED, UNTIMED, parameters
 from starpos.calibration.misalignment import NOTHING_KNOWN, Calibrated, Known, calibrate_at, calibrate_fixed
 from starpos.cli import console, options, overwriting
-from starpos.cli.console import add_formats
 from starpos.cli.inputs import checked_tilts, frames_among, given_or_sought, reader_of
-from starpos.cli.options import add_vertical, vertical_of
+from starpos.cli.options import vertical_of
 from starpos.cli.overwriting import CAMERA_NAME, Written, save_instrument
 from starpos.earth.place import Place
 from starpos.earth.refraction import Atmosphere
-from starpos.errors import CalibrationError, FixError, FrameError, InstrumentError, StarposError
+from starpos.errors import CalibrationError, FixError, FrameError, InstrumentError, PlaceError, StarposError
 from starpos.fix.checks import FIND_TURN, at_another_lean, may_turn
 from starpos.fix.searching import Sight, of_one_camera
 from starpos.fix.solver import Solver
@@ -29,9 +28,8 @@ from starpos.frames.tables import TILTS, Pointing, read_pointings
 from starpos.identification import Identification
 from starpos.instrument import instrument_file
 from starpos.instrument.camera import Camera
-from starpos.instrument.inclinometer import level_of, up_of
+from starpos.instrument.inclinometer import up_of
 from starpos.instrument.instrument import (
-    MAX_SAG_ARCSEC,
     SAG_ARCSEC_PER_SQRT_HOUR,
     Calibration,
     Instrument,
@@ -46,92 +44,35 @@ from starpos.sky import catalogue
 from starpos.units import ARCSEC
 
 
-def define_site(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--site",
-        type=options.degrees,
-        nargs=2,
-        metavar=("LAT", "LON"),
-        help="find A3 at this place, deg, by gravity (as a fix has them); needs -o, and --tilt or --fixed",
-    )
-    parser.add_argument(
-        "--fixed",
-        action="store_true",
-        help="a camera fixed to the ground, without an inclinometer: its pose at --site serves as its "
-        "vertical, and `solve` with the file that -o writes needs no --tilt; it gives position and "
-        "heading as long as the stars show the camera in that pose; once the camera has moved, it says "
-        "so and gives no position",
-    )
-    parser.add_argument(
-        "--sag",
-        type=options.number(0, MAX_SAG_ARCSEC),
-        metavar="ARCSEC",
-        help="how far a --fixed camera sags in an hour, 1 sigma about each axis; it grows with the root of the time "
-        f"({SAG_ARCSEC_PER_SQRT_HOUR:g}, 300 m; after a week 13 times as much)",
-    )
-    parser.add_argument(
-        "--geodetic",
-        action="store_true",
-        help="--site is on WGS 84, as a map or a receiver gives it: the deflection of the vertical is added",
-    )
-    add_vertical(parser)
-    options.add_turn(parser)
-    parser.add_argument(
-        "-o",
-        "--output",
-        metavar="OUT",
-        help="write A3 into an instrument file (YAML); one that is there keeps its other keys",
-    )
-    parser.add_argument(
-        "--valid-days",
-        type=options.number(0.01, 1e5),
-        metavar="DAYS",
-        help="after which the calibration is refused (365)",
-    )
-
-
 def check_site(args: argparse.Namespace) -> None:
     """Raise InstrumentError for options that do not fit together."""
     deflection = (args.xi, args.eta, args.deflection_stddev, args.geoid, args.altitude_m) != (None,) * 5
     if args.site is None:
-        if (
-            deflection
-            or args.geodetic
-            or args.fixed
-            or (args.output, args.valid_days, args.turn_stddev, args.sag) != (None,) * 4
-        ):
-            raise InstrumentError(
-                "-o, --fixed, --sag, --geodetic, --turn-stddev, --valid-days and the deflection are for a "
-                "calibration at a known place: give --site LAT LON"
-            )
+        if deflection:
+            raise InstrumentError("the deflection is for a calibration at a known place: give --site LAT LON")
         return
     if deflection and not args.geodetic:
         raise InstrumentError(
             "--xi, --eta, --deflection-stddev, --geoid and --altitude-m are of a place on WGS 84: say --geodetic, or "
             "leave them out"
         )
-    if args.fixed:
-        if (args.tilt, args.misalignment, args.turn_stddev, args.inclinometer) != (None,) * 4:
-            raise InstrumentError(
-                "--fixed is for a camera without an inclinometer: leave out --tilt, --misalignment, "
-                "--turn-stddev and "
-                "--inclinometer"
-            )
-    elif args.sag is not None:
-        raise InstrumentError("--sag is for a camera fixed to the ground: give --fixed too")
-    if args.output is None or (args.tilt is None and not args.fixed):
+    if not _camera_alone(args) and (args.output is None or (args.tilt is None and not args.fixed)):
         raise InstrumentError(
             "--site needs the tilts and a file to write: give --tilt CSV and -o INSTRUMENT.yaml (or --fixed in place of "
-            "--tilt)"
+            "--tilt), or --camera OUT.yaml alone"
         )
-    latitude, longitude = args.site
-    if not (abs(latitude) <= 90 and abs(longitude) <= 360):
-        raise InstrumentError(f"--site {latitude:g} {longitude:g}: give latitude and longitude in deg")
+    # one sentence for a place that cannot be
+    Place.by_gravity(*args.site)
+
+
+def _camera_alone(args: argparse.Namespace) -> bool:
+    """Whether the place only serves the camera: its level without tilts."""
+    return args.camera is not None and args.tilt is None and not args.fixed and args.output is None
 
 
 def check_output(args: argparse.Namespace, instrument: Instrument) -> None:
     """Raise InstrumentError if the file of -o exists and describes another instrument."""
-    if args.site is not None:
+    if args.output is not None:
         instrument_file.check_fits(
             Path(args.output), instrument, fixed=args.fixed, camera_found=args.camera is not None
         )
@@ -274,34 +215,9 @@ SCATTERED = 3.0
 _Seen = tuple[Stars, Identification | None]
 
 
-def define(parser: argparse.ArgumentParser) -> None:
-    options.add_frames(parser, pointings=True)
-    add_formats(parser, "one JSON object for --camera and one for --site instead of text", None)
-    parser.add_argument(
-        "--camera",
-        metavar="OUT",
-        help="write the camera's calibration (CameraInfo YAML): focal lengths, principal point, distortion",
-    )
-    parser.add_argument(
-        "--map", metavar="PNG", help="draw the residuals of the given and of the fitted camera (--camera)"
-    )
-    options.add_stamps(parser)
-    options.add_instrument(parser)
-    parser.add_argument(
-        "--tilt",
-        metavar="CSV",
-        help="utc_unix_s, theta_x_deg, theta_y_deg[, theta_z_deg, temperature_c, sigma_deg]: refraction is undone",
-    )
-    options.add_air(parser)
-    define_site(parser)
-    parser.set_defaults(run=run)
-
-
 def run(args: argparse.Namespace) -> int:
     if args.camera is None and args.site is None:
         raise InstrumentError("nothing to calibrate: give --camera OUT.yaml, --site LAT LON, or both")
-    if args.map is not None and args.camera is None:
-        raise InstrumentError("--map draws the camera's residuals: give --camera OUT.yaml too")
     options.check_frames(args)
     _open_night(args)
     if args.pointings is not None and args.camera is not None:
@@ -343,9 +259,9 @@ def run(args: argparse.Namespace) -> int:
                 for s, k in frames
             ]
             instrument = replace(instrument, camera=camera, focal_px=camera.fx)
-        if args.site is not None:
+        if args.output is not None:
             run_site(args, [s for s, _ in frames], instrument, tilts, _known(frames))
-    except (CalibrationError, FixError) as e:
+    except (CalibrationError, FixError, PlaceError) as e:
         console.complain("calibrate", e)
         return console.UNREADABLE if unreadable else NOTHING
     return console.UNREADABLE if unreadable else 0
@@ -438,10 +354,11 @@ def _camera(
     if tilts is not None:
         seen, levels = _levelled(seen, instrument, tilts)
     frames, bar = [stars for stars, _ in seen], console.ProgressBar()
-    found = calibrate_camera(frames, levels, given, catalogue.load_catalogue(), air, bar, _known(seen))
+    site = _site(args) if args.site is not None and tilts is None else None
+    found = calibrate_camera(frames, levels, given, catalogue.load_catalogue(), air, bar, _known(seen), site)
     for k in sorted(set(range(len(frames))) - set(found.used)):
         console.complain("calibrate", f"{frames[k].source}: no part of the sky matches it: it is left out")
-    if tilts is None:
+    if tilts is None and site is None:
         _tell_what_tilts_would(found.fit, air, frames)
     about = _about(found)
     whole = instrument.whole_of(found.fit.camera, frames[0].origin_px)
@@ -467,7 +384,7 @@ def _levelled(
                 raise FrameError(f"no time of exposure: {why_no_time(stars)}")
             tilt = tilts.average(stars.mid_unix_s, stars.exposure_s or 0.0)
             instrument.inclinometer.check_live(tilt)
-            levels.append(level_of(tilt.up) @ instrument.mounting.a3)
+            levels.append(instrument.mounting.level(tilt).camera)
             kept.append((stars, found))
         except StarposError as e:
             console.complain("calibrate", f"{stars.source} is left out: {e}")

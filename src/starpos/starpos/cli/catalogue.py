@@ -15,87 +15,10 @@ from starpos.instrument.camera import Camera
 from starpos.sky import catalogue, deeper
 from starpos.table_cache import cache_folder
 
-ORIGINALS = """The original Tycho-2 files are in Debian's and Ubuntu's source package tycho2:
-    apt-get source --download-only tycho2        (with a deb-src line in the apt sources)
-which brings tycho2_2.orig.tar.xz; give that archive, or a folder with tyc2.dat.00 .. 19 and suppl_1.dat."""
-
-GAIA = """A table of the Gaia archive has the columns ra, dec (deg), ra_error, dec_error, parallax (mas), pmra, pmdec,
-pmra_error, pmdec_error (mas/yr), ref_epoch (Julian year), phot_g_mean_mag, and perhaps ruwe; docs/how-to/gaia.md has
-the query. Stars keep their names and V; those that the table does not have keep Tycho-2's places and errors."""
-
 LIMIT_MAG = 11.0
 
-DEEPER = """The catalogue that comes with starpos goes to V = 11. Fields that hold too few of its stars take
-the deeper one (70 MB in the cache) by themselves. `starpos catalogue deepen --fetch` is all it needs; without
-a network, give it the original files. Where STARPOS_TYCHO2 names the original files, it
-is built as soon as a field needs it."""
 
-
-def define(parser: argparse.ArgumentParser) -> None:
-    kinds = parser.add_subparsers(dest="what", required=True, metavar="WHAT")
-    info = kinds.add_parser("info", help="stars, magnitudes and errors of the catalogue in use")
-    info.add_argument("path", nargs="?", metavar="FILE", help="another file than the one in use")
-    info.add_argument(
-        "--year", type=options.number(1900, 2200), default=2026.0, help="for the errors of places (2026)"
-    )
-    info.set_defaults(run=show)
-    build = kinds.add_parser(
-        "build",
-        help="make the compact file from Tycho-2's original files, or put the places of a Gaia extract into it",
-        epilog=f"{GAIA}\n\n{ORIGINALS}",
-    )
-    build.formatter_class = argparse.RawDescriptionHelpFormatter
-    build.add_argument(
-        "originals",
-        nargs="?",
-        metavar="ORIGINALS",
-        help="folder or archive of the original files; with --gaia alone the catalogue in use takes its places",
-    )
-    build.add_argument(
-        "--gaia", metavar="TABLE", help="table of stars from the Gaia archive (CSV, ECSV, FITS, VOTable)"
-    )
-    build.add_argument(
-        "--year",
-        type=options.number(1990, 2100),
-        help="Julian year at which Gaia's places are exact to 1 mas (this year)",
-    )
-    build.add_argument(
-        "--limit-mag",
-        type=options.number(0, 20),
-        metavar="V",
-        help="faintest V kept of the original files (11.0)",
-    )
-    build.add_argument(
-        "--out", default="tycho2.npz", metavar="FILE", help="STARPOS_CATALOGUE=FILE then uses it"
-    )
-    build.set_defaults(run=build_file)
-    deepen = kinds.add_parser(
-        "deepen",
-        help="keep all stars of Tycho-2's original files in the cache, for small fields",
-        epilog=f"{DEEPER}\n\n{ORIGINALS}",
-    )
-    deepen.formatter_class = argparse.RawDescriptionHelpFormatter
-    source = deepen.add_mutually_exclusive_group(required=True)
-    source.add_argument(
-        "--fetch",
-        nargs="?",
-        const="",
-        metavar="URL",
-        help="fetch the original files (121 MB): from Debian, from a mirror of it, or from the address of the file; "
-        "what has come before is resumed, and the checksum is verified",
-    )
-    source.add_argument(
-        "originals", nargs="?", metavar="ORIGINALS", help="folder or archive of the original files"
-    )
-    deepen.set_defaults(run=keep_deeper)
-    triangle = kinds.add_parser("triangles", help="the catalogue of triangles of a field; the paper's")
-    triangle.add_argument("--paper", action="store_true", help="count the paper's triangles again instead")
-    options.add_optics(triangle)
-    options.add_size(triangle)
-    triangle.set_defaults(run=show_triangles)
-
-
-def show(args: argparse.Namespace) -> int:
+def run_info(args: argparse.Namespace) -> int:
     """Print the stars, magnitudes and errors of a catalogue."""
     c = catalogue.load_catalogue(args.path)
     v = c.vmag()
@@ -120,16 +43,12 @@ def show(args: argparse.Namespace) -> int:
     return 0
 
 
-def build_file(args: argparse.Namespace) -> int:
+def run_build(args: argparse.Namespace) -> int:
     """Build a catalogue from the original files, or from Gaia's places; raises CatalogueError."""
     from starpos.sky import gaia, tycho2
 
     if args.originals is None and args.gaia is None:
         raise CatalogueError("catalogue build: give the original files of Tycho-2, or --gaia TABLE, or both")
-    if args.gaia is None and args.year is not None:
-        raise CatalogueError("--year is for --gaia: give both")
-    if args.originals is None and args.limit_mag is not None:
-        raise CatalogueError("--limit-mag is for the original files: give both")
     overwriting.check(args, Written("--out", args.out, overwriting.stars))
     extract = None if args.gaia is None else gaia.read(Path(args.gaia))
     if args.originals is None:
@@ -153,7 +72,7 @@ def build_file(args: argparse.Namespace) -> int:
     return 0
 
 
-def keep_deeper(args: argparse.Namespace) -> int:
+def run_deepen(args: argparse.Namespace) -> int:
     """Build the deeper catalogue from the original files, here or fetched, into the cache; raises CatalogueError."""
     bar = console.ProgressBar()
     if args.originals is None:
@@ -166,7 +85,7 @@ def keep_deeper(args: argparse.Namespace) -> int:
     return 0
 
 
-def show_triangles(args: argparse.Namespace) -> int:
+def run_triangles(args: argparse.Namespace) -> int:
     """Print the catalogue of triangles of a field, or the paper's."""
     return show_paper() if args.paper else show_field(options.camera_of(args))
 

@@ -106,17 +106,6 @@ class ProgressBar:
             print(f"{what}: {100 * done:.0f} % done", file=sys.stderr, flush=True)
 
 
-def add_formats(
-    parser: argparse.ArgumentParser, json_help: str, csv_help: str | None
-) -> "argparse._MutuallyExclusiveGroup":
-    """Add --json and, with a help for it, --csv; returns the group of formats, of which a call has one at most."""
-    formats = parser.add_mutually_exclusive_group()
-    formats.add_argument("--json", action="store_true", help=json_help)
-    if csv_help is not None:
-        formats.add_argument("--csv", action="store_true", help=csv_help)
-    return formats
-
-
 class Output:
     """Writes one answer after another; the first line describes them, except in JSON.
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from starpos.cli import console, inputs, options
-from starpos.cli.console import Output, add_formats
+from starpos.cli.console import Output
 from starpos.cli.inputs import checked_tilts, frames_among, given_of, reader_of
 from starpos.earth.orientation import earth_state
 from starpos.earth.place import Place
@@ -32,11 +32,6 @@ from starpos.zenith.sighting import ZenithSighting
 COLUMNS = ("file", "combined", "status", "utc", "face", "heading", "xi_arcsec", "eta_arcsec", "sigma_xi_arcsec",
            "sigma_eta_arcsec", "stars_matched", "residual_arcsec", "faces", "frames")  # fmt: skip
 HEAD = "file: face, heading of the frame's top (deg), xi and eta (arcsec) of the frame alone, with the session's A3"
-JSON_HELP = (
-    "one JSON object a frame, and one with combined: true: xi_arcsec, eta_arcsec at the mark as the plumb line stood, "
-    "covariance_arcsec2 (2 x 2), errors (1 sigma of xi, eta for each source) and correlations, reduced (without the "
-    "tide; at the geoid), by_face and by_star (residuals, leverage); starpos stations and starpos report read it"
-)
 # number of stars listed, largest leverage first
 STARS_LISTED = 50
 
@@ -181,68 +176,6 @@ def _star_text(star: dict, stars: int) -> str:
 NO_PLAN = 1
 
 
-def add_plan(parser: argparse.ArgumentParser) -> None:
-    """Add --plan and what it takes."""
-    plan = parser.add_argument_group("plan a session instead")
-    plan.add_argument(
-        "--plan",
-        type=options.number(0.001, 3),
-        metavar="SIGMA",
-        help="print the faces, frames and time for this error (arcsec) of xi and of eta; takes --site, --instrument, "
-        "the air, and no frames",
-    )
-    plan.add_argument(
-        "--motion",
-        type=options.number(0, 5),
-        default=0.4,
-        metavar="ARCSEC",
-        help="image motion of a frame (0.4; starpos deflection prints that of a session)",
-    )
-    plan.add_argument(
-        "--centroid",
-        type=options.number(0.001, 5),
-        default=0.1,
-        metavar="PX",
-        help="error of a star's centroid (0.1)",
-    )
-    plan.add_argument(
-        "--limit-mag",
-        type=options.number(2, 20),
-        default=9.5,
-        metavar="V",
-        help="faintest stars on a frame (9.5)",
-    )
-    plan.add_argument(
-        "--cadence",
-        type=options.number(0.01, 600),
-        default=5.0,
-        metavar="S",
-        help="from frame to frame (5)",
-    )
-    plan.add_argument(
-        "--turning",
-        type=options.number(0.01, 3600),
-        default=60.0,
-        metavar="S",
-        help="from the last frame of a face to the first of the next (60)",
-    )
-    plan.add_argument(
-        "--readings",
-        type=options.number(1, 10_000, int),
-        default=5,
-        metavar="N",
-        help="of the tiltmeter in a frame (5)",
-    )
-    plan.add_argument(
-        "--level",
-        type=options.number(0, 3600),
-        default=10.0,
-        metavar="ARCSEC",
-        help="how well each face is levelled (10)",
-    )
-    options.add_frame_size(plan)
-
-
 def run_plan(args: argparse.Namespace, mark: Place) -> int:
     """Print the plan; returns the exit status."""
     if args.frames or args.tilt is not None:
@@ -308,44 +241,6 @@ def _plan_text(value: dict) -> str:
 
 
 NO_DEFLECTION = 1
-
-
-def define(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "frames",
-        nargs="*",
-        metavar="FRAME",
-        help="FITS, TIFF, PNG, JPEG, HEIF, raw, or a CSV of centroids; or one rosbag2 with stars (or images) and tilts",
-    )
-    add_formats(
-        parser, JSON_HELP, "a row of a CSV a frame, and one with combined=True; columns as keys of --json"
-    )
-    parser.add_argument(
-        "--tilt",
-        metavar="CSV",
-        help="the tiltmeter's readings, as for starpos solve; not with a bag, which has them",
-    )
-    parser.add_argument(
-        "--site",
-        type=options.degrees,
-        nargs=3,
-        required=True,
-        metavar=("LAT", "LON", "HEIGHT"),
-        help="the mark on WGS 84: latitude, longitude (deg) and height (m); 1 m off is 0.03 arcsec of the deflection",
-    )
-    parser.add_argument(
-        "--station",
-        default="",
-        metavar="NAME",
-        help="name of the mark, for starpos stations and starpos report",
-    )
-    add_plan(parser)
-    inputs.add_bag(parser)
-    options.add_stamps(parser)
-    options.add_instrument(parser)
-    options.add_air(parser)
-    inputs.add_jobs(parser)
-    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:

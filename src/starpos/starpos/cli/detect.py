@@ -4,8 +4,8 @@
 import argparse
 from typing import TYPE_CHECKING
 
-from starpos.cli import console, inputs, options
-from starpos.cli.console import Output, add_formats
+from starpos.cli import console, inputs
+from starpos.cli.console import Output
 from starpos.cli.inputs import frames_among
 from starpos.errors import FrameError
 from starpos.frames.frame import Stars
@@ -17,16 +17,6 @@ if TYPE_CHECKING:
 
 # columns of --csv; the stars of --json have the same, without the file
 COLUMNS = ("file", "x", "y", "flux", "snr", "sigma_x", "sigma_y", "flags")
-JSON_HELP = (
-    "one JSON object a frame: stars, each [x, y, flux, snr, sigma_x, sigma_y, flags], cpu_ms and negative"
-)
-
-
-def define(parser: argparse.ArgumentParser) -> None:
-    options.add_frames(parser)
-    add_formats(parser, JSON_HELP, "a row of a CSV a star")
-    inputs.add_jobs(parser)
-    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -61,17 +61,6 @@ class Finding:
     cure: str = ""
 
 
-def define(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--live",
-        action="store_true",
-        help="for an instrument that runs on this machine: also count an unsynchronised clock, no serial "
-        "port and no camera as missing",
-    )
-    parser.add_argument("--json", action="store_true", help="one JSON object a check instead of lines")
-    parser.set_defaults(run=run)
-
-
 def run(args: argparse.Namespace) -> int:
     missing = False
     for name, check in CHECKS.items():

@@ -33,32 +33,6 @@ TILTS_S = 4.0
 AGAIN = "the same command goes on where it was"
 
 
-def define(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "folder",
-        metavar="FOLDER",
-        help=f"where frames (FITS, CSV of stars, or pictures) and {TILTS} arrive: of your own programs, or of `ros2 run "
-        "starpos_bringup folder FOLDER`",
-    )
-    parser.add_argument(
-        "--save", required=True, metavar="OUT", help="the instrument file (YAML) that is written at the end"
-    )
-    parser.add_argument(
-        "--field", metavar="ZIP", help="write the night's field report too, as `starpos report --field` does"
-    )
-    parser.add_argument(
-        "--patience",
-        type=options.number(0, 86_400),
-        default=600.0,
-        metavar="S",
-        help="end when no frame has come for so long (600)",
-    )
-    options.add_stamps(parser)
-    options.add_instrument(parser)
-    options.add_air(parser)
-    parser.set_defaults(run=run)
-
-
 def run(args: argparse.Namespace) -> int:
     overwriting.check(args, overwriting.Written("--save", args.save, instrument_file.check_replaceable))
     folder = Path(args.folder)

@@ -32,12 +32,6 @@ HEAD = (
 COLUMNS = ("file", "combined", "night", "status", "utc", "latitude", "longitude", "heading", "latitude_geodetic",
            "longitude_geodetic", "sigma_east_m", "sigma_north_m", "sigma_heading_deg", "stars_detected",
            "stars_matched", "residual_arcsec", "log_odds", "warnings", "frames")  # fmt: skip
-JSON_HELP = (
-    "one JSON object a frame, and one with combined: true for all: latitude, longitude and heading are astronomic, in "
-    "deg, their ..._geodetic on WGS 84, covariance (3 x 3) is of east m, north m, heading deg, budget 1 sigma of each "
-    "source; status is ok, or why there is no fix, which is null then"
-)
-CSV_HELP = "a row of a CSV a frame, and one with combined=True for all; columns as the keys of --json"
 
 
 def in_degrees(covariance: np.ndarray) -> np.ndarray:
@@ -103,6 +97,7 @@ def json_about(s: Solution) -> dict:
         "residual_arcsec": fitted.residual_arcsec if fitted else None,
         "log_odds": a.log_odds if a else None,
         "status": s.status.value,
+        "bodies": list(s.bodies),
         "warnings": list(s.warnings),
         "remark": s.remark or None,
     }
@@ -110,6 +105,8 @@ def json_about(s: Solution) -> dict:
 
 def line_of(path: str, s: Solution, turning: bool) -> str:
     """The line of a frame; turning: its place needs the other headings."""
+    if s.circle is not None:
+        return f"{path}: {s.message}"
     if s.fix is None:
         return f"{path}: {s.status.value}, {s.stars_detected} stars detected"
     # one frame of a turn does not determine A3, so the error of its own place would exceed 1000 km
@@ -237,7 +234,8 @@ def heading_line_of(path: str, s: Solution) -> str:
     if s.at_place is None:
         return f"{path}: {s.status.value}, {s.stars_detected} stars detected"
     where = "" if s.fix is None else f"{s.fix.in_degrees.where}, "
-    return f"{path}: {where}{heading_text_of(s.at_place)}, {len(s.names)} of {s.stars_detected} stars"
+    seen = f"by the {s.bodies[0]}" if s.bodies else f"{len(s.names)} of {s.stars_detected} stars"
+    return f"{path}: {where}{heading_text_of(s.at_place)}, {seen}"
 
 
 def heading_text_of(found: AttitudeAtPlace | MeanAttitude) -> str:

@@ -7,10 +7,10 @@ import math
 import numpy as np
 
 from starpos.cli import console, inputs, options
-from starpos.cli.console import Output, add_formats
+from starpos.cli.console import Output
 from starpos.cli.inputs import frames_among, given_of, is_untold, reader_of
 from starpos.errors import FrameError
-from starpos.fix.blind import SEARCH_S, BlindSolver
+from starpos.fix.blind import BlindSolver
 from starpos.fix.solution import Solution, Status
 from starpos.frames.frame import Stars
 from starpos.instrument.camera import EQUIDISTANT
@@ -24,37 +24,10 @@ from starpos.units import ARCSEC
 # of --csv
 COLUMNS = ("file", "status", "ra", "dec", "roll", "focal_px", "focal_stddev_px", "stars_detected", "stars_matched",
            "residual_arcsec", "log_odds", "lens", "mirrored", "negative", "warnings", "cpu_ms")  # fmt: skip
-JSON_HELP = (
-    "one JSON object a frame: ra, dec of the middle of the frame and roll, the position angle of its top, in deg (ICRS), "
-    "focal_px and its error focal_stddev_px, lens, residual_arcsec, log_odds of the answer against chance; status is ok, "
-    "or why these are null"
-)
 HEAD = (
     "file: right ascension and declination of the middle of the frame (deg, ICRS), direction of its top (deg, from north "
     "over east), stars identified of those detected"
 )
-
-
-def define(parser: argparse.ArgumentParser) -> None:
-    options.add_frames(parser)
-    add_formats(parser, JSON_HELP, "a row of a CSV a frame")
-    options.add_stamps(parser)
-    parser.add_argument(
-        "--instrument",
-        metavar="FILE",
-        help="instrument file (YAML) with the camera, instead of the next three options",
-    )
-    options.add_optics(parser)
-    options.add_lens(parser)
-    parser.add_argument(
-        "--search-time",
-        type=options.number(0.1, 86400),
-        default=SEARCH_S,
-        metavar="S",
-        help=f"CPU time of the search where neither scale nor lens is known ({SEARCH_S:g} s)",
-    )
-    inputs.add_jobs(parser)
-    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:

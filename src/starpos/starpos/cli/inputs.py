@@ -5,7 +5,7 @@ import argparse
 import math
 import os
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
@@ -15,7 +15,9 @@ from typing import TYPE_CHECKING
 from starpos.cli import console, options
 from starpos.errors import FrameError, InstrumentError, StarposError, TiltError
 from starpos.fix.solver import Solver
+from starpos.frames.exif import CameraClock
 from starpos.frames.frame import no_stars
+from starpos.frames.reading import HEIF, JPEG, RAW
 from starpos.frames.tables import TILTS, TRUTH
 from starpos.instrument.camera import PLUMB_BOB
 from starpos.instrument.instrument import Instrument
@@ -30,9 +32,13 @@ if TYPE_CHECKING:
     from starpos.night.bag import Recorded
 
 
-def reader_of(args: argparse.Namespace) -> Reader:
-    """The reader of frames with the clock and the delay of their shutter that the options give."""
-    return Reader(options.clock_of(args), tuple(args.shutter_delay or (0.0, 0.0)))
+def reader_of(args: argparse.Namespace, by_files: bool = False) -> Reader:
+    """The reader of frames with the clock and the delay of their shutter that the options give.
+
+    by_files: without a clock by the options, each file's own counts, as its EXIF states it.
+    """
+    clock = options.clock_of(args) or (CameraClock() if by_files else None)
+    return Reader(clock, tuple(args.shutter_delay or (0.0, 0.0)))
 
 
 def given_of(args: argparse.Namespace, first: About | None) -> Instruments:
@@ -66,30 +72,9 @@ def checked_tilts(command: str, path: str, instrument: Instrument) -> TiltFile:
     return file
 
 
-def add_near(parser: argparse.ArgumentParser) -> None:
-    """Add the options that `near_of` reads."""
-    parser.add_argument(
-        "--near",
-        type=options.degrees,
-        nargs=2,
-        metavar=("LAT", "LON"),
-        help="approximate position of the instrument, deg: a fix far from it is reported with likely causes "
-        "and never changed; for pointings without a roll it selects between two possible places",
-    )
-    parser.add_argument(
-        "--near-km",
-        type=float,
-        metavar="KM",
-        help=f"distance from --near within which the fix is expected ({NEAR_KM:g}; 4 sigma of the fix are "
-        f"added)",
-    )
-
-
 def near_of(args: argparse.Namespace) -> Near | None:
     """The place of --near; None without it.  Raises InstrumentError."""
     if args.near is None:
-        if args.near_km is not None:
-            raise InstrumentError("--near-km is for --near: give both")
         return None
     latitude, longitude = args.near
     if not (abs(latitude) <= 90 and abs(longitude) <= 360):
@@ -104,7 +89,8 @@ def near_of(args: argparse.Namespace) -> Near | None:
 class NightFolder:
     """Frames with one table of tilts that make one fix together.
 
-    tilt: absolute path; None where none is needed.  folder: None if the frames were named one by one.
+    tilt: absolute path; None where none is needed, or photographs have their own.
+    folder: None if the frames were named one by one.
     """
 
     frames: tuple[str, ...]
@@ -127,7 +113,7 @@ def frames_among(given: list[str], *tables: str | None) -> list[str]:
 def nights_of(
     given: list[str], tilt: str | None, needs_no_tilt: bool = False
 ) -> list[NightFolder | FrameError]:
-    """One night from frames and a table, or without one for a camera fixed to the ground or at a known place.
+    """One night from frames and a table, or without one for photographs, a fixed camera, or a known place.
 
     Else a night for each folder, or its error.
 
@@ -140,6 +126,8 @@ def nights_of(
         return [NightFolder(tuple(given), None)]
     if missing := next((path for path in given if not os.path.exists(path)), None):
         raise FrameError(f"{missing}: there is no such file or folder")
+    if are_photographs(given):
+        return [NightFolder(tuple(given), None)]
     if single := next((path for path in given if not os.path.isdir(path)), None):
         raise TiltError(
             f"{single}: no tilts: give --tilt with frames, or nights alone: folders of frames, each with its tilt.csv"
@@ -154,22 +142,16 @@ def _night(folder: str) -> NightFolder | FrameError:
         frames = tuple(map(str, frames_in(Path(folder))))
     except FrameError as error:
         return error
-    return NightFolder(frames, os.path.abspath(os.path.join(folder, TILTS)), folder)
+    tilt = os.path.abspath(os.path.join(folder, TILTS))
+    return NightFolder(frames, None if are_photographs(frames) and not os.path.exists(tilt) else tilt, folder)
+
+
+def are_photographs(paths: Sequence[str]) -> bool:
+    """Whether all files are of the kinds in which a telephone's photographs, with gravity, come."""
+    return all(os.path.splitext(path)[1].lower() in JPEG + HEIF + RAW for path in paths)
 
 
 PIP = "pip install matplotlib rosbags"
-
-
-def add_bag(parser: argparse.ArgumentParser) -> None:
-    """Add the options that `read_bag` reads."""
-    parser.add_argument("--namespace", metavar="NAME", help="of the instrument, in a bag that holds several")
-    options.add_parameters(
-        parser,
-        "of detector and inclinometer, where stars and tilts are made of a robot's images and IMU; the "
-        "solver's parameters come from the other options",
-        "detector:stamp:=start",
-    )
-    options.add_remaps(parser)
 
 
 def read_bag(path: Path, args: argparse.Namespace) -> "tuple[Recorded, Instruments]":
@@ -186,40 +168,9 @@ def read_bag(path: Path, args: argparse.Namespace) -> "tuple[Recorded, Instrumen
     return found, Instruments(any_camera, cameras=cameras, any_size=told)
 
 
-MAX_JOBS = 1000
-AUTO = "auto"
-
-
-def add_jobs(parser: argparse.ArgumentParser, what: str = "frames") -> None:
-    """Add the options that `workers_of` reads; what: the object of the work."""
-    parser.add_argument(
-        "-j",
-        "--jobs",
-        type=_jobs,
-        metavar="N|auto",
-        help=f"work {what} on this number of processes (1; auto or 0: one per processor)",
-    )
-    parser.add_argument(
-        "--scheduler",
-        metavar="ADDRESS",
-        help="work them on a dask.distributed cluster whose workers have this starpos and see the files",
-    )
-
-
-def _jobs(text: str) -> int:
-    try:
-        return 0 if text == AUTO else options.number(0, MAX_JOBS, int)(text)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} is neither a whole number nor {AUTO}") from None
-
-
 def workers_of(args: argparse.Namespace, frames: int) -> Workers:
     """The workers that the options ask for, with no more processes than frames; raises InstrumentError."""
     if args.scheduler is not None:
-        if args.jobs is not None:
-            raise InstrumentError(
-                "--scheduler names machines, --jobs processes of this one: give one of the two"
-            )
         return Cluster(args.scheduler)
     return workers(min(processors() if args.jobs == 0 else args.jobs or 1, frames))
 

@@ -3,7 +3,6 @@
 
 import argparse
 import json
-import os
 import sys
 from collections.abc import Callable, Iterator
 from functools import lru_cache, partial
@@ -20,7 +19,7 @@ from starpos.frames.frame import Stars
 from starpos.instrument.camera import Camera
 from starpos.instrument.instrument import Instrument
 from starpos.instrument.sensors import SCA100T_CALIBRATED
-from starpos.parallel.processes import workers
+from starpos.parallel.processes import processors, workers
 from starpos.simulation import montecarlo_fields, montecarlo_nights
 from starpos.simulation.montecarlo_nights import NightOutcome
 from starpos.sky import catalogue, deeper
@@ -38,38 +37,6 @@ SOLVED = 0.95
 TARGETS_ARCSEC = (1.0, 0.15)
 # relative deviation of the normalised error squared from its expectation
 ALLOWED = 0.10
-
-NIGHTS = """The paper's fifty nights: a new place, date, pointing, A3 and zero each night, 25 frames at each of four
-headings, A3 unknown, clock to 1 ms; mean absolute errors on the ground (longitude times the cosine of latitude)
-next to the paper's 30.2 and 49.0 arcsec (932 and 1510 m).  Exit status: 0; 1 where they are above the aim of 1 arcsec
-(0.15 with a tiltmeter of 0.1 arcsec, and in proportion)."""
-HONESTY = """Nights turned on the spot, and nights calibrated at one place and used days later at another, every source of
-error drawn at random: the errors squared over their claimed covariance should average 2 (position) and 1 (heading).
-Exit status: 0; 1 where they are off by more than 10 %, or one night in twenty has no answer."""
-
-
-def define_nights(experiments: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
-    """Add both to a parser's subparsers."""
-    for name, number, text, work in (
-        ("nights", 50, NIGHTS, run_nights),
-        ("honesty", 500, HONESTY, run_honesty),
-    ):
-        parser = experiments.add_parser(name, description=text, help=text.split(":")[0].lower())
-        parser.formatter_class = argparse.RawDescriptionHelpFormatter
-        whole = options.number(1, 1_000_000, int)
-        parser.add_argument("--nights", type=whole, default=number, metavar="N", help=f"how many ({number})")
-        parser.add_argument("--seed", type=options.number(0, 2**63, int), default=1, metavar="S", help="(1)")
-        parser.add_argument(
-            "--jobs", type=whole, default=os.cpu_count(), metavar="N", help="processes (one a processor)"
-        )
-        parser.add_argument(
-            "--tiltmeter",
-            type=options.number(1e-3, 1e3),
-            metavar="ARCSEC",
-            help="an inclinometer of this noise a reading instead of a compensated SCA100T's 12.6, and as steady",
-        )
-        parser.add_argument("--json", action="store_true", help="one JSON object a night, and one for all")
-        parser.set_defaults(run=work)
 
 
 def run_nights(args: argparse.Namespace) -> int:
@@ -169,12 +136,14 @@ def _all(args: argparse.Namespace, night: RandomNight) -> list[NightOutcome]:
     return outcomes
 
 
-def _each(night: RandomNight, seeds: list[np.random.SeedSequence], jobs: int) -> Iterator[NightOutcome]:
+def _each(
+    night: RandomNight, seeds: list[np.random.SeedSequence], jobs: int | None
+) -> Iterator[NightOutcome]:
     """The outcome of each seed's night; the first is worked here, so that the triangles are built once."""
     first, *others = seeds
     work = partial(_one, night)
     yield work(first)
-    with workers(min(jobs, len(others))) as processes:
+    with workers(min(jobs or processors(), len(others))) as processes:
         for outcome in processes.map((work, seed) for seed in others):
             if isinstance(outcome, FrameError):
                 raise outcome
@@ -196,67 +165,6 @@ PAPER_FEW = {5: "> 95", 6: "> 99", 7: "> 99.9"}
 PAPER_CAMERA = Camera.from_focal(5616, 3744, 93750.0)
 # limiting magnitude of the paper's fields, and their mean number of stars
 PAPER_LIMIT_MAG, PAPER_STARS = 9.0, 24.9
-
-EPILOG = """Realistic fields: brightness off by 0.3 mag, 5 % of the stars not detected, stars closer than 4 px one.
---ideal leaves all three out, as the paper does.  False stars are brighter than all others.  Fields of 5, 6, 7 stars are
-the brightest ones of random fields.  A right answer has the frame's centre within 20 arcsec, or a pixel.
-Exit status: 0; 1 where an answer was wrong or invented."""
-
-
-def define(parser: argparse.ArgumentParser) -> None:
-    parser.epilog, parser.formatter_class = EPILOG, argparse.RawDescriptionHelpFormatter
-    whole = options.number(0, 10_000_000, int)
-    parser.add_argument(
-        "--fields",
-        type=options.number(1, 10_000_000, int),
-        default=1000,
-        metavar="N",
-        help="of each kind (1000)",
-    )
-    parser.add_argument("--seed", type=whole, default=1, metavar="S", help="of the random numbers (1)")
-    parser.add_argument(
-        "--false",
-        type=options.number(0, 100, int),
-        nargs="*",
-        default=[0, 1, 2],
-        metavar="K",
-        help="false stars (0 1 2)",
-    )
-    parser.add_argument(
-        "--stars", type=options.number(1, 100, int), nargs="*", default=[5, 6, 7], metavar="K",
-        help="star counts of the fields reduced to their brightest stars (5 6 7)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--points",
-        type=whole,
-        metavar="N",
-        help="fields of random points, nothing to find (a fifth of --fields)",
-    )
-    options.add_optics(parser)
-    options.add_size(parser)
-    parser.add_argument(
-        "--limit-mag",
-        type=options.number(0, 20),
-        metavar="V",
-        help="faintest star (9; in fields of another size the limit that gives as many stars)",
-    )
-    parser.add_argument(
-        "--noise-px", type=options.number(0.001, 10), default=0.05, metavar="PX", help="centroids' (0.05)"
-    )
-    parser.add_argument("--ideal", action="store_true", help="the paper's conditions, see below")
-    parser.add_argument(
-        "--focal-error",
-        type=options.number(0, 3),
-        default=0.0,
-        metavar="PERCENT",
-        help="of the focal length, at most (0)",
-    )
-    parser.add_argument(
-        "--keep", metavar="FOLDER", help="write the fields that failed there, as CSV for `identify`"
-    )
-    parser.add_argument("--json", action="store_true", help="one JSON object a row")
-    parser.set_defaults(run=run)
-    define_nights(parser.add_subparsers(dest="experiment", metavar="[nights|honesty]"))
 
 
 def run(args: argparse.Namespace) -> int:

@@ -10,22 +10,19 @@ from typing import Any
 import numpy as np
 
 from starpos.cli import console, inputs, options
-from starpos.cli.console import Output, add_formats
+from starpos.cli.console import Output
 from starpos.cli.fix_output import FIX_KEYS, HEAD
 from starpos.cli.inputs import frames_among, given_of, reader_of
-from starpos.cli.options import add_vertical, tell_unknown, vertical_of
+from starpos.cli.options import tell_unknown, vertical_of
 from starpos.earth.orientation import earth_orientation
 from starpos.earth.vertical import Geodetic, Vertical, geodetic
 from starpos.errors import FixError, VoyageError
 from starpos.fix.fix import InDegrees
 from starpos.instrument.instrument import framed
 from starpos.navigation.estimate import VoyageFix
-from starpos.navigation.vessel import LAWS
 from starpos.navigation.voyage import Voyage
 from starpos.night.reading import First
 from starpos.night.under_way import (
-    MAX_MOUNT_DEG,
-    MOUNT_STDDEV_DEG,
     IdentifyingVoyage,
     Records,
     VoyageFrame,
@@ -44,77 +41,8 @@ KEYS: dict[str, Callable[[Any, Geodetic], Any]] = {
     **{key: FIX_KEYS[key] for key in ("latitude_geodetic", "longitude_geodetic", "covariance_geodetic")},
     **{key: FIX_KEYS[key] for key in ("xi_arcsec", "eta_arcsec", "deflection_stddev_arcsec")},
 }
-JSON_HELP = (
-    "one JSON object a frame: latitude, longitude and heading are astronomic, in deg, their ..._geodetic on WGS 84, "
-    "covariance (3 x 3) is of east m, north m, heading deg; velocity is of east, north, up in m/s"
-)
 # of --csv
 COLUMNS = ("file", "status", *(k for k in KEYS if not k.startswith("covariance")))
-
-
-def define(parser: argparse.ArgumentParser) -> None:
-    options.add_frames(parser)
-    add_formats(parser, JSON_HELP, "a row of a CSV a frame")
-    parser.add_argument(
-        "--imu",
-        required=True,
-        metavar="CSV",
-        help="utc_unix_s, gx, gy, gz (rad/s), ax, ay, az (m/s2): means over the time since the reading before, along the "
-        "body's axes, x forward, y left, z up",
-    )
-    parser.add_argument(
-        "--imu-model",
-        metavar="FILE",
-        help="kalibr's imu.yaml, also with gyroscope_bias_stddev (rad/s), accelerometer_bias_stddev (m/s2), scale_stddev "
-        "and axes_stddev (rad); without it a cheap IMU is assumed",
-    )
-    parser.add_argument(
-        "--velocity",
-        metavar="CSV",
-        help="utc_unix_s, vx, vy, vz, sigma (m/s): over ground, along the body's axes, from wheels or a log",
-    )
-    parser.add_argument(
-        "--vehicle",
-        choices=tuple(LAWS),
-        help="parked: it stands still; any other, without --velocity, sets the law by which its speed "
-        "changes, for a rover also standstills found in the record (default: anything that moves)",
-    )
-    parser.add_argument(
-        "--mount-stddev",
-        type=options.number(1e-4, MAX_MOUNT_DEG),
-        default=MOUNT_STDDEV_DEG,
-        metavar="DEG",
-        help="error of the camera's stated orientation on the vehicle, 1 sigma an axis: z up, the top of "
-        "the frame forward "
-        f"({MOUNT_STDDEV_DEG:g})",
-    )
-    parser.add_argument(
-        "--drift-stddev",
-        type=options.number(0, 50),
-        default=0.0,
-        metavar="M_PER_S",
-        help="where --velocity is not over ground but through water or air: 1 sigma of current or wind, an axis; half of "
-        "it may change in an hour (0)",
-    )
-    parser.add_argument(
-        "--drift-change",
-        type=options.number(0.01, 50),
-        default=math.nan,
-        metavar="M_PER_S",
-        help="what wind or current change in ten minutes, 1 sigma an axis, if you know it: the claimed "
-        "error follows from it. Unset, without --velocity: a ship's current 0.07, a drone's wind 0.3, "
-        "widened where the record shows more; with --velocity: a fifth of --drift-stddev",
-    )
-    options.add_stamps(parser)
-    parser.add_argument(
-        "--instrument", metavar="FILE", help="instrument file (YAML) instead of the next two options"
-    )
-    options.add_optics(parser)
-    options.add_clock(parser)
-    options.add_air(parser)
-    add_vertical(parser)
-    inputs.add_jobs(parser)
-    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -4,12 +4,10 @@
 import argparse
 
 from starpos.cli import console, inputs, options
-from starpos.cli.console import Output, add_formats
+from starpos.cli.console import Output
 from starpos.cli.fix_output import (
     COLUMNS,
-    CSV_HELP,
     HEAD,
-    JSON_HELP,
     json_about,
     json_of,
     line_of,
@@ -26,28 +24,6 @@ from starpos.recording.drivers import Drivers
 from starpos.session.replay import PlayedNight, Playing
 from starpos.session.settings import Settings
 from starpos.units import utc_text
-
-
-def define(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "bags",
-        nargs="+",
-        metavar="BAG",
-        help="a rosbag2 with stars, tilts and camera_info, or with a robot's images, camera_info and IMU: a folder or a "
-        "file; or a field report (ZIP)",
-    )
-    parser.add_argument(
-        "--namespace", metavar="NAME", help="of the instrument, in a bag, or a YAML, of several"
-    )
-    options.add_parameters(
-        parser,
-        "of the node solver; for a robot's images and IMU of detector and inclinometer, too",
-        "misalignment_stddev:=5.0 or detector:stamp:=start",
-    )
-    options.add_remaps(parser)
-    add_formats(parser, JSON_HELP, CSV_HELP)
-    inputs.add_jobs(parser, "bags")
-    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:

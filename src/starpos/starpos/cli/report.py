@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from starpos.cli import console, inputs, options
 from starpos.cli.inputs import given_of, given_or_sought, reader_of
-from starpos.cli.options import add_vertical, vertical_of
+from starpos.cli.options import vertical_of
 from starpos.cli.solve import read_receiver
 from starpos.errors import FrameError, InstrumentError
 from starpos.night.night import Night
@@ -30,45 +30,14 @@ ALL_FIGURES = 6
 SESSION = ".json"
 
 
-def define(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "nights",
-        nargs="+",
-        metavar="NIGHT",
-        help="a folder of frames (FITS, CSV of stars, or pictures) with tilt.csv and perhaps truth.json, or a rosbag2, "
-        "of the instrument or of a robot's own camera and IMU; or sessions of starpos deflection --json (.json)",
-    )
-    parser.add_argument(
-        "-o", "--out", default="starpos-report", metavar="FOLDER", help="index.html and PNGs (starpos-report)"
-    )
-    parser.add_argument(
-        "--field",
-        metavar="ZIP",
-        help="instead of a page, write one night's lists of stars, tilts, instrument, air, versions and truth.json into "
-        "one file that can be sent and `starpos solve` reads: no pictures, paths, names or serial numbers",
-    )
-    inputs.add_bag(parser)
-    options.add_stamps(parser)
-    options.add_instrument(parser)
-    options.add_air(parser)
-    add_vertical(parser)
-    options.add_self_calibration(parser)
-    parser.add_argument(
-        "--gnss",
-        metavar="CSV",
-        help="draw a drive beside GNSS, whose fixes teach the instrument: a table as `starpos solve --gnss` takes it",
-    )
-    parser.set_defaults(run=run)
-
-
 def run(args: argparse.Namespace) -> int:
-    options.check_self_calibration(args)
     if wrong := of_solver(args.param):
         raise InstrumentError(
             f"-p {wrong[0]}: a report has the solver's values from its other options, such as --misalignment; -p takes "
             "NODE:NAME:=VALUE of detector and inclinometer"
         )
-    _check_gnss(args)
+    if args.gnss is not None and len(args.nights) > 1:
+        raise InstrumentError("--gnss is of one night: give one")
     if args.field is not None:
         return _pack(args)
     if find_spec("matplotlib") is None:
@@ -99,13 +68,6 @@ def run(args: argparse.Namespace) -> int:
     write_files(Path(args.out), files | {PAGE: html.encode(errors="replace")})
     print(Path(args.out) / PAGE)
     return 0 if any(n.combined for n in nights) else NO_FIX
-
-
-def _check_gnss(args: argparse.Namespace) -> None:
-    if args.gnss is not None and (args.self_calibrate or args.field is not None or len(args.nights) > 1):
-        raise InstrumentError(
-            "--gnss is of one night, and goes with neither --self-calibrate nor --field: leave one out"
-        )
 
 
 def _are_sessions(paths: list[str]) -> bool:

@@ -11,12 +11,10 @@ import numpy as np
 
 from starpos.averaging.elevation_axis import FoundAxis
 from starpos.cli import console, fix_output, inputs, options, overwriting
-from starpos.cli.console import Output, add_formats
+from starpos.cli.console import Output
 from starpos.cli.fix_output import (
     COLUMNS,
-    CSV_HELP,
     HEAD,
-    JSON_HELP,
     json_about,
     json_of,
     json_on_ground,
@@ -26,7 +24,6 @@ from starpos.cli.fix_output import (
 )
 from starpos.cli.inputs import (
     NightFolder,
-    add_near,
     checked_tilts,
     frames_among,
     given_or_sought,
@@ -35,7 +32,7 @@ from starpos.cli.inputs import (
     nights_of,
     reader_of,
 )
-from starpos.cli.options import add_site, add_vertical, place_of, tell_unknown, vertical_of
+from starpos.cli.options import place_of, tell_unknown, vertical_of
 from starpos.cli.overwriting import Written, save_instrument
 from starpos.earth.place import Place
 from starpos.earth.vertical import Vertical
@@ -50,7 +47,7 @@ from starpos.gnss.solving import Watched
 from starpos.gnss.states import Learned
 from starpos.gnss.watch import GnssCheck
 from starpos.instrument import instrument_file
-from starpos.instrument.instrument import Instrument
+from starpos.instrument.instrument import ByGravity, Instrument
 from starpos.instrument.tilt_log import NO_TILTS, Tilts
 from starpos.night import field
 from starpos.night.opening import work_of
@@ -96,22 +93,21 @@ def tell(
     for answer in answers.each:
         gathered.gather(answer)
         s = answer.solution
-        if s.fix is None and (s.at_place is None or not s.ok):
+        if s.fix is None and s.circle is None and (s.at_place is None or not s.ok):
             complaints(answer.name, s.message)
         if s.remark:
             complaints(answer.name, s.remark)
         output.put(_json_of_answer(args, answer, vertical, place), _line_of_answer(args, answer, place))
     complaints.end()
     solved, headings, near = gathered.solved, gathered.headings, near_of(args)
-    whole = together(solved, answers.given, near)
+    whole = together(gathered, answers.given, near)
     mean, why = (None, ()) if place is None else fix_output.mean_of(headings)
     unnamed = () if watched is None or answers.instrument is None else of_inclinometer(answers.instrument)
     not_averaged = [whole.why_not] if whole.why_not else []
     say(night, *not_averaged, *(unnamed if solved else ()), *whole.remarks, *why)
-    if solved:
-        last = solved[-1].fix
-        tell_unknown("solve", args, vertical.at(last.latitude, last.longitude))
-        where = last if whole.average is None else whole.average
+    where = whole.average or (solved[-1].fix if solved else None)
+    if where is not None:
+        tell_unknown("solve", args, vertical.at(where.latitude, where.longitude))
         about = {} if near is None else {"km_from_near": near.km_from(where.latitude, where.longitude)}
         if place is not None:
             about |= with_heading(json_of(whole.average, vertical), mean, place)
@@ -120,8 +116,9 @@ def tell(
         fix_output.put_mean(output, night, headings, mean, place, vertical)
     elif gathered.lost is not None and not headings and work is not None:
         say(night, *work.fitting(gathered.lost))
-    # without tilts headings are all that was asked for
-    found = bool(headings) if place is not None and not args.tilt else whole.average is not None
+    # without tilts headings are all that was asked for, and by day they are all there is
+    by_day = any(s.bodies for s in headings)
+    found = bool(headings) if place is not None and (by_day or not args.tilt) else whole.average is not None
     found |= args.gnss is not None and args.tilt is None and bool(headings)
     return max([*statuses, console.UNREADABLE if gathered.unreadable else 0 if found else NO_FIX])
 
@@ -135,6 +132,9 @@ def _json_of_answer(
         watched = answer.watched or Watched(solution=s)
         return {"file": answer.name} | json_of_watched(watched) | json_about(s)
     values = {"file": answer.name} | json_of(s.fix, vertical) | json_about(s)
+    if s.circle is not None:
+        values |= {"utc": utc_text(s.circle.utc_unix_s)}
+        values |= {"zenith_distance_deg": np.degrees(s.circle.zenith_distance)}
     return values if place is None else with_heading(values, s.at_place, place)
 
 
@@ -173,35 +173,6 @@ def say(night: NightFolder, *texts: object) -> None:
     """Print lines about a whole night on standard error."""
     for text in texts:
         console.complain("solve", text if night.folder is None else f"{night.folder}: {text}")
-
-
-def add_gnss(parser: argparse.ArgumentParser) -> None:
-    """Add the options that `check`, `read_receiver` and `run` take."""
-    parser.add_argument(
-        "--gnss",
-        metavar="CSV",
-        help="fixes of a GNSS receiver: utc_unix_s, latitude, longitude (deg, WGS 84), altitude_m, sigma_east_m, "
-        "sigma_north_m, status; they teach A3, the inclinometer's errors and the deflection while the stars agree with "
-        "them, and never enter the place of their own frame",
-    )
-    parser.add_argument(
-        "--learned",
-        metavar="FILE",
-        help="what --gnss taught: read at the beginning if the file is there, written at the end",
-    )
-
-
-def check_gnss(args: argparse.Namespace) -> None:
-    """Raise InstrumentError if options do not go together."""
-    if args.gnss is None:
-        if args.learned is not None:
-            raise InstrumentError("--learned keeps what --gnss teaches: give both")
-        return
-    if args.self_calibrate or args.pointings is not None:
-        other = "--pointings" if args.pointings is not None else "--self-calibrate"
-        raise InstrumentError(f"--gnss and {other} do not go together: give one of the two")
-    if args.site is not None:
-        raise InstrumentError("--gnss and --site both say where the instrument is: give one of the two")
 
 
 def read_receiver(gnss: str | None, learned: str | None, command: str) -> Receiver | None:
@@ -252,8 +223,6 @@ def run_pointings(args: argparse.Namespace) -> int:
     own_level = options.has_own_level(args)
     if args.tilt is None and not own_level:
         raise InstrumentError("--pointings needs the tilts: give --tilt CSV")
-    if args.jobs is not None or args.scheduler is not None:
-        raise InstrumentError("--jobs and --scheduler are for frames: --pointings take only a moment")
     # pointings need no focal length
     instrument = options.instrument_of(args, NO_CAMERA)
     solver = Solver(instrument, catalogue.load_catalogue(), options.atmosphere_of(args))
@@ -337,33 +306,6 @@ def _put_row(
     output.put({"file": pointing.source} | row, f"{pointing.source}: {about}")
 
 
-def define(parser: argparse.ArgumentParser) -> None:
-    options.add_frames(parser, pointings=True)
-    add_formats(parser, JSON_HELP, CSV_HELP)
-    parser.add_argument(
-        "--tilt",
-        metavar="CSV",
-        help="utc_unix_s, theta_x_deg, theta_y_deg[, theta_z_deg, temperature_c, sigma_deg]; not with nights: folders of "
-        "frames with tilt.csv, nor with the instrument file of a camera fixed to the ground; --site needs none",
-    )
-    add_gnss(parser)
-    options.add_stamps(parser)
-    options.add_instrument(parser)
-    options.add_air(parser)
-    add_vertical(parser)
-    add_site(parser)
-    add_near(parser)
-    options.add_self_calibration(parser)
-    parser.add_argument(
-        "--save",
-        metavar="OUT",
-        help="write the A3 of --self-calibrate into an instrument file (YAML); one that is there keeps its other keys; "
-        "exits with status 1 and writes nothing if the headings do not determine A3",
-    )
-    inputs.add_jobs(parser)
-    parser.set_defaults(run=run)
-
-
 def run(args: argparse.Namespace) -> int:
     if len(args.frames) == 1 and field.is_field(args.frames[0]):
         return _of_field(args)
@@ -384,16 +326,12 @@ def _of_field(args: argparse.Namespace) -> int:
 
 
 def _run(args: argparse.Namespace) -> int:
-    options.check_self_calibration(args)
-    if args.save is not None and not args.self_calibrate:
-        raise InstrumentError("--save writes what --self-calibrate finds: give both")
     options.check_frames(args)
-    check_gnss(args)
     if args.save is not None:
         overwriting.check(args, Written("--save", args.save, instrument_file.check_replaceable))
     if args.pointings is not None:
         return run_pointings(args)
-    vertical, read = vertical_of(args), reader_of(args)
+    vertical = vertical_of(args)
     place = place_of(args, vertical)
     output = Output(
         args, *((COLUMNS, HEAD) if place is None else (fix_output.HEADING_COLUMNS, fix_output.HEADING_HEAD))
@@ -414,13 +352,15 @@ def _run(args: argparse.Namespace) -> int:
     if args.save is not None and len(given) > 1:
         raise InstrumentError("--save writes the A3 of one night: give one")
     nights = [night for night in given if isinstance(night, NightFolder)]
+    by_gravity = not needs_no_tilt and any(night.tilt is None for night in nights)
+    read = reader_of(args, by_gravity)
     statuses = [_refused(why, given) for why in given if not isinstance(why, NightFolder)]
     with inputs.workers_of(args, sum(len(night.frames) for night in nights)) as workers:
         plans = []
-        abouts = workers.map((First(read), night.frames) for night in nights)
+        abouts = workers.map((First(read, by_gravity), night.frames) for night in nights)
         for night, about in zip(nights, abouts, strict=True):
             try:
-                plans.append((night, _work(args, night, about, own_level, place)))
+                plans.append((night, _work(args, night, about, own_level, place, by_gravity)))
             except TiltError as error:
                 statuses.append(_refused(error, given))
         on_files = [OnFile(read, how.work(work)) for _, work in plans]
@@ -444,14 +384,19 @@ def _refused(why: StarposError, given: list) -> int:
 
 
 def _work(
-    args: argparse.Namespace, night: NightFolder, about: About | None, own_level: bool, place: Place | None
+    args: argparse.Namespace,
+    night: NightFolder,
+    about: About | None,
+    own_level: bool,
+    place: Place | None,
+    by_gravity: bool,
 ) -> Solving:
     """The work on a night's frames, after complaints about what looks wrong; raises TiltError."""
     air = options.atmosphere_of(args)
     # without a frame that can be read, each one reports why it cannot
     if about is None:
         return Solving(Instruments(None), atmosphere=air)
-    tilt = None if night.tilt is None else Path(night.tilt)
+    tilt = Path(night.tilt) if night.tilt is not None else ByGravity() if by_gravity else None
     work, remarks = work_of(given_or_sought(args, about), about, tilt, air, place)
     for remark in remarks:
         console.complain("solve", remark)

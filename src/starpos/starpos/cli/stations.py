@@ -8,41 +8,12 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from starpos.cli import console
-from starpos.cli.console import Output, add_formats
+from starpos.cli.console import Output
 from starpos.earth import geoid
 from starpos.earth.geoid import Geoid
 from starpos.errors import StationError
 from starpos.units import utc_text
 from starpos.zenith.stations import GeoidStep, Station, against_grid, levelled, read_session, stations_of
-
-
-def define(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "sessions",
-        nargs="+",
-        metavar="SESSION",
-        help="output of starpos deflection --json, a file per session; sessions of one --station, or of one "
-        "mark, form a station",
-    )
-    parser.add_argument(
-        "--geoid",
-        metavar="FILE",
-        help="compare with the deflections of a geoid grid (EGM96, EGM2008, a national one: GTX, NGS .bin, GeoTIFF)",
-    )
-    parser.add_argument(
-        "--level",
-        nargs="+",
-        metavar="STATION",
-        help="print how much the geoid rises along these stations, two or more (astrogeodetic levelling); with --geoid "
-        "by the grid's shape between them",
-    )
-    formats = add_formats(
-        parser, "one JSON object a station, then one a step of --level", "a CSV, a row a station"
-    )
-    formats.add_argument(
-        "--geojson", action="store_true", help="GeoJSON (RFC 7946), a point a station, for any GIS"
-    )
-    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -14,6 +14,7 @@ import numpy as np
 
 from starpos.detection._pixels import third_highest
 from starpos.detection.background import halved, measure_sky, plane_of, window_of
+from starpos.detection.discs import find_disc
 from starpos.detection.finding import find_peaks, find_streaks
 from starpos.detection.learn import learn, with_trail
 from starpos.detection.saturated import find_discs, with_clipped, with_discs
@@ -189,7 +190,8 @@ def detect(frame: Frame, settings: DetectionSettings = DetectionSettings()) -> D
         halvings=MAX_HALVINGS,
         trail=frame.trail,
     )
-    return _detect(picture)
+    found = _detect(picture)
+    return replace(found, stars=replace(found.stars, disc=find_disc(plane)))
 
 
 def _detect(picture: _Picture) -> Detection:
@@ -222,6 +224,7 @@ def enlarged(
         width=width,
         height=height,
         window=window,
+        disc=None,
     )
 
 

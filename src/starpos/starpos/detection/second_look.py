@@ -33,7 +33,7 @@ def detect_dark_too(frame: Frame) -> Detection:
     dark = detect(negative_of(frame))
     if len(dark.stars) < MIN_STARS:
         return found
-    return replace(dark, stars=replace(dark.stars, negative=True))
+    return replace(dark, stars=replace(dark.stars, negative=True, disc=found.stars.disc))
 
 
 # (how often the frame is reduced by two, whether what is wider than a star is taken away), in the order of their use

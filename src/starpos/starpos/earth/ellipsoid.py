@@ -20,6 +20,12 @@ def zenith_of(latitude: float, longitude: float) -> np.ndarray:
     return unit_vector(longitude, latitude)
 
 
+def ground_m(zenith: np.ndarray) -> np.ndarray:
+    """The place (3,) on the ellipsoid whose zenith is (3,) in ITRS, from the Earth's centre, m."""
+    prime = EQUATOR_RADIUS_M / math.sqrt(1 - ECCENTRICITY2 * zenith[2] ** 2)
+    return prime * np.array([zenith[0], zenith[1], (1 - ECCENTRICITY2) * zenith[2]])
+
+
 def place_of_zenith(zenith: np.ndarray) -> tuple[float, float]:
     """Latitude, longitude (rad) at which the unit vector (3,) in ITRS points up; the longitude at a pole is 0."""
     x, y, z = np.asarray(zenith, float).tolist()

@@ -19,15 +19,8 @@ from starpos.earth.ellipsoid import curvature_radii_m
 from starpos.earth.vertical import Deflection
 from starpos.errors import GeoidError
 from starpos.files import bytes_of, open_regular
-from starpos.frames.pictures import (
-    BITS,
-    HEIGHT,
-    SAMPLES,
-    TIFF_ORDERS,
-    WIDTH,
-    decode_picture,
-    tiff_directory,
-)
+from starpos.frames.pictures import BITS, HEIGHT, SAMPLES, WIDTH, decode_picture
+from starpos.frames.tiff import TIFF_ORDERS, tiff_directory
 from starpos.units import ARCSEC
 
 if TYPE_CHECKING:

@@ -17,7 +17,8 @@ from starpos.fix.budget import CALIBRATION
 from starpos.fix.fix import Fix, angle_text
 from starpos.fix.terms import ErrorTerm
 from starpos.frames.frame import SATURATED, Stars
-from starpos.identification import MIN_STARS
+from starpos.identification import MIN_STARS, Identification, Sky, fisheye
+from starpos.identification._frame import mean_sigma
 from starpos.instrument.camera import Camera
 from starpos.instrument.instrument import Calibration, Instrument
 from starpos.instrument.sensors import unnamed
@@ -52,17 +53,51 @@ def check_visible(sine: float) -> None:
         )
 
 
-# More identified stars than these below this altitude are no mistakes of the identification.
-FEW_SET, SET_DEG = 3, -1.0
+# More identified stars than these below this altitude, and than this share of all detections there, are no mistakes of
+# the identification: a lamp on the ground has a star in its place once in ten times at most
+FEW_SET, SET_SHARE, SET_DEG = 3, 0.3, -1.0
 
 
-def set_stars(sines: np.ndarray) -> str:
-    """Say that identified stars lie under the horizon; '' if at most a few do.  sines (N,): of their altitudes."""
-    under = int((sines < math.sin(math.radians(SET_DEG))).sum())
-    if under <= FEW_SET:
+def set_stars(sines: np.ndarray, detected: np.ndarray) -> str:
+    """Say that identified stars lie under the horizon; '' if at most a few do.
+
+    sines (N,): of their altitudes.  detected (D,): the same of all detections.
+    """
+    under = _under(sines)
+    if under <= max(FEW_SET, SET_SHARE * _under(detected)):
         return ""
     lowest = _altitude_text(float(sines.min()))
     return f"{under} of the {len(sines)} identified stars would be under the horizon, the lowest {lowest}"
+
+
+def _under(sines: np.ndarray) -> int:
+    return int(np.count_nonzero(sines < math.sin(math.radians(SET_DEG))))
+
+
+def check_risen(stars: Stars, found: Identification, camera: Camera, sky: Sky, up: np.ndarray) -> None:
+    """Raise PlaceError if a frame's identified stars would lie under the horizon of a known place.
+
+    up (3,): the zenith in C there.  Of a fisheye all stars count, as the lens puts them that they show: the one given may
+    fit the middle of the frame only.
+    """
+    every, star = camera.directions(stars.x, stars.y), found.star
+    if _under(every @ up) <= FEW_SET:
+        return
+    if fisheye.is_wide(camera) and not found.mirrored:
+        rows = np.flatnonzero(stars.on_frame & np.isfinite(every[:, 0]))
+        field = fisheye.WideField(every[rows], mean_sigma(stars.covariance[rows]), camera)
+        part = fisheye.part_of(field, sky, found.but(star=np.searchsorted(rows, star)))
+        whole = fisheye.outwards(field, sky, *part)
+        if whole is not None and whole[2]:
+            lens, better, _ = whole
+            every, star = lens.directions(stars.x, stars.y), rows[better.star]
+            up = better.attitude @ found.attitude.T @ up
+    sines = every @ up
+    if low := set_stars(sines[star], sines):
+        raise PlaceError(
+            f"from the given place {low}: check latitude and longitude, their order and signs, and the hour (UTC, not "
+            "local time)"
+        )
 
 
 def _altitude_text(sine: float) -> str:

@@ -4,7 +4,8 @@ reverse of the fix: there the level is known and A4, which holds the place, is f
 """
 
 import math
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -35,7 +36,7 @@ MIN_SHARE, REFRACTION_SIGMAS = 0.5, 5.0
 @at_once
 @dataclass(frozen=True, kw_only=True)
 class AttitudeAtPlace(FittedSighting):
-    """Attitude of the instrument at a known place, by the stars alone.
+    """Attitude of the instrument at a known place, by the stars alone, or by the Sun and the level.
 
     plumb: in east, north, up by the plumb line (astronomic).  ellipsoid: by WGS 84's normal (geodetic).
     true_north: level by the plumb line, north by the ellipsoid, as the fix's attitude in a graph of nodes.
@@ -90,34 +91,61 @@ def attitude_at_place(
     else:
         raise FixError("the stars lie too low for their refraction to be known: point the camera higher")
     _check_refraction(seen, atmosphere)
-    terms = _rotations(seen, atmosphere, earth, shutter, camera.height, clock_stddev_s, stamp_stddev_s, a4)
-    link = g @ mounting.link_to_camera
-    to_ellipsoid = place.axes @ a4.T
-    turn = math.atan2(to_ellipsoid[0, 1], to_ellipsoid[1, 1])
-    north = rotation.about_axis(2, -turn)
+    moved = zenith_moved(place.plumb[0])
+    terms = (
+        *_of_stars(seen, atmosphere, shutter, camera.height),
+        *sky_terms(earth, clock_stddev_s, stamp_stddev_s, a4),
+        ErrorTerm("place", moved @ place.zenith_root, shared=ALWAYS),
+    )
+    deflected = moved * place.plumb_stddev, moved * place.ellipsoid_stddev
+    return AttitudeAtPlace(
+        **fitted_fields(seen, camera, g, a4, refraction, earth),
+        **attitudes_at(place, g, mounting, terms, deflected, axis_stddev),
+        clock_stddev_s=clock_stddev_s,
+        stamp_stddev_s=stamp_stddev_s,
+        place=place,
+    )
 
-    def attitude(link_to_enu: np.ndarray, level_stddev: float, north_stddev: float) -> Attitude:
-        moved = _zenith_moved(place.plumb[0])
-        errors = {**terms, "place": moved @ place.zenith_root}
-        errors["deflection"] = moved * np.array([[level_stddev], [level_stddev], [north_stddev]])
+
+def attitudes_at(
+    place: Place,
+    g: np.ndarray,
+    mounting: Mounting,
+    terms: Iterable[ErrorTerm],
+    deflected: tuple[np.ndarray, np.ndarray],
+    axis_stddev: float = 0.0,
+) -> dict[str, Attitude]:
+    """The base link by the plumb line, by the ellipsoid, and level by the first with north by the second.
+
+    g (3, 3): C into east, north, up by the plumb line.  terms: their factors are rotations (3, m) about these.
+    deflected: rotations (3, m) by 1 sigma of the deflection, by the plumb line and by the ellipsoid.
+    """
+    link = g @ mounting.link_to_camera
+    to_ellipsoid = place.axes @ place.plumb_axes.T
+    north = rotation.about_axis(2, -math.atan2(to_ellipsoid[0, 1], to_ellipsoid[1, 1]))
+    plumb, ellipsoid = deflected
+
+    def attitude(link_to_enu: np.ndarray, deflection: np.ndarray) -> Attitude:
+        def whole(term: ErrorTerm) -> ErrorTerm:
+            turns = term.factor
+            rows = np.vstack([np.zeros((2, turns.shape[1])), heading_row(link_to_enu) @ turns, turns])
+            return replace(term, factor=rows)
+
         return link_attitude(
             link_to_enu,
             (
-                *(_term(name, rotations, link_to_enu, seen) for name, rotations in errors.items()),
+                *map(whole, terms),
+                whole(ErrorTerm("deflection", deflection, shared=ALWAYS)),
                 *mount_term("lens", link_to_enu, axis_stddev),
                 *mount_term("mount", link_to_enu, mounting.link_stddev_rad),
             ),
         )
 
-    return AttitudeAtPlace(
-        **fitted_fields(seen, camera, g, a4, refraction, earth),
-        clock_stddev_s=clock_stddev_s,
-        stamp_stddev_s=stamp_stddev_s,
-        place=place,
-        plumb=attitude(link, place.plumb_stddev, place.plumb_stddev),
-        ellipsoid=attitude(to_ellipsoid @ link, place.ellipsoid_stddev, place.ellipsoid_stddev),
-        true_north=attitude(north @ link, place.plumb_stddev, place.ellipsoid_stddev),
-    )
+    return {
+        "plumb": attitude(link, plumb),
+        "ellipsoid": attitude(to_ellipsoid @ link, ellipsoid),
+        "true_north": attitude(north @ link, np.vstack([plumb[:2], ellipsoid[2:]])),
+    }
 
 
 def _check_refraction(seen: StarFit, atmosphere: Atmosphere) -> None:
@@ -134,39 +162,40 @@ def _check_refraction(seen: StarFit, atmosphere: Atmosphere) -> None:
         )
 
 
-def _rotations(
-    seen: StarFit,
-    atmosphere: Atmosphere,
-    earth: EarthState,
-    shutter: Shutter,
-    height: int,
-    clock_stddev_s: float,
-    stamp_stddev_s: float,
-    a4: np.ndarray,
-) -> dict[str, np.ndarray]:
-    """Rotations (3, m) of the sky about east, north, up, rad, for 1 sigma of each source."""
-    errors, orientation = seen.errors, earth.orientation
-    pole = a4[:, 2]
+def _of_stars(seen: StarFit, atmosphere: Atmosphere, shutter: Shutter, height: int) -> tuple[ErrorTerm, ...]:
+    """Rotations (3, m) of the sky about east, north, up, rad, for 1 sigma of each source of a fit of stars."""
+    errors = seen.errors
+
+    def of(covariance: np.ndarray) -> np.ndarray:
+        return symmetric_root(errors.rotation_covariance(covariance))
+
+    return (
+        ErrorTerm("centroids", of(errors.centroids)),
+        ErrorTerm("catalogue", of(errors.catalogue), shared=errors.same_stars),
+        ErrorTerm("refraction", seen.bending(atmosphere)[:, None], shared=ALWAYS),
+        ErrorTerm("shutter", seen.rolling(shutter, height), shared=ALWAYS),
+    )
+
+
+def sky_terms(
+    earth: EarthState, clock_stddev_s: float, stamp_stddev_s: float, a4: np.ndarray
+) -> tuple[ErrorTerm, ...]:
+    """Rotations (3, m) of the sky about east, north, up, rad, for 1 sigma of each error of the Earth's rotation.
+
+    a4 (3, 3): ITRS into east, north, up.
+    """
+    orientation = earth.orientation
     # a second of time turns the sky about the pole; the pole itself errs about the two axes across
-    second = ROTATION_RAD_S * pole[:, None]
-    return {
-        "centroids": symmetric_root(errors.rotation_covariance(errors.centroids)),
-        "catalogue": symmetric_root(errors.rotation_covariance(errors.catalogue)),
-        "refraction": seen.bending(atmosphere)[:, None],
-        "shutter": seen.rolling(shutter, height),
+    second = ROTATION_RAD_S * a4[:, 2:]
+    rotations = {
         "clock": second * clock_stddev_s,
         "time stamp": second * stamp_stddev_s,
         "ut1": second * orientation.ut1_sigma_s,
         "pole": a4[:, :2] * orientation.pole_sigma,
     }
+    return tuple(ErrorTerm(name, turns, shared=ALWAYS) for name, turns in rotations.items())
 
 
-def _zenith_moved(latitude: float) -> np.ndarray:
+def zenith_moved(latitude: float) -> np.ndarray:
     """Rotation (3, 2) of an attitude in east, north, up, for a zenith that lies 1 rad further east, or north."""
     return np.array([[0.0, 1.0], [-1.0, 0.0], [-meridian_turn(latitude), 0.0]])
-
-
-def _term(name: str, rotations: np.ndarray, link_to_enu: np.ndarray, seen: StarFit) -> ErrorTerm:
-    factor = np.vstack([np.zeros((2, rotations.shape[1])), heading_row(link_to_enu) @ rotations, rotations])
-    shared = {"centroids": None, "catalogue": seen.errors.same_stars}.get(name, ALWAYS)
-    return ErrorTerm(name, factor, shared=shared)

@@ -19,6 +19,7 @@ from starpos.errors import FieldError, StarposError
 from starpos.fix.blind import BlindSolver
 from starpos.fix.solution import Solution, Status
 from starpos.fix.solver import Solver, focal_that_fits, placed
+from starpos.fix.sun import by_sun
 from starpos.frames.frame import Frame, Stars
 from starpos.frames.header import focal_mm
 from starpos.frozen import at_once
@@ -99,8 +100,26 @@ class Sight:
 def answer_frame(solver: Solver, question: Question) -> Sight:
     """The fix of a frame by its tilt, and its heading where the place is known; without both its identification.
 
-    It is identified by every way there is, each tried once on the same stars.
+    What it shows decides whether that is by stars or by the Sun: a disc with a limb, or a glow where no stars are found.
+    Its stars are identified by every way there is, each tried once on the same stars.
     """
+    q, disc = question, question.stars.disc
+    if disc is None or (q.tilts is None and q.places is None):
+        return _by_stars(solver, q)
+    if not disc.sharp:
+        # the Moon, or a lamp, among stars
+        found = solver.identify(q.stars, q.predicted)
+        if not found.lost:
+            return _by_stars(solver, replace(q, known=found.found))
+    by_day = Sight(q.stars, by_sun(solver, q.stars, disc, q.tilts, q.places))
+    if by_day.solution.ok:
+        return by_day
+    by_night = _by_stars(solver, q)
+    return by_day if by_night.solution.lost else by_night
+
+
+def _by_stars(solver: Solver, question: Question) -> Sight:
+    """The answer to a frame by its stars."""
     q = question
     sight = identify_every_way(solver, q) if q.tilts is None else _solved(solver, q, q.tilts)
     if q.places is None:

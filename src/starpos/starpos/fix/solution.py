@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from starpos.errors import FixError, PlaceError, StarposError, TiltError, TiltRangeError, TimeError
+from starpos.fix.circle import Circle
 from starpos.fix.fix import Fix
 from starpos.fix.heading import AttitudeAtPlace
 from starpos.frames.frame import Stars
@@ -91,6 +92,8 @@ class Solution:
     negative : whether the stars are dark on a bright sky
     hint : helps to identify the next frame
     remark : a warning on an identified frame; '' without one
+    bodies : names of the Sun, the Moon and planets that it rests on
+    circle : of equal altitude, by the Sun where no place is known; None without
 
     Examples
     --------
@@ -120,6 +123,8 @@ class Solution:
     found: Identification | None = None
     negative: bool = False
     remark: str = ""
+    bodies: tuple[str, ...] = ()
+    circle: Circle | None = None
 
     @classmethod
     def of(

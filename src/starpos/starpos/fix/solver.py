@@ -13,8 +13,23 @@ from starpos.earth.ellipsoid import curvature_radii_m
 from starpos.earth.orientation import EarthState, earth_state
 from starpos.earth.place import Place, Places
 from starpos.earth.refraction import Atmosphere
-from starpos.errors import FieldError, FixError, InstrumentError, PlaceError, StarposError, TimeError
-from starpos.fix.checks import check_above_horizon, check_exposure, check_unmoved, set_stars, why_unidentified
+from starpos.errors import (
+    FieldError,
+    FixError,
+    InstrumentError,
+    PlaceError,
+    StarposError,
+    TiltError,
+    TimeError,
+)
+from starpos.fix.checks import (
+    check_above_horizon,
+    check_exposure,
+    check_risen,
+    check_unmoved,
+    set_stars,
+    why_unidentified,
+)
 from starpos.fix.fix import IDEAL, Fix, length_text, pointing_fix, solve_fix
 from starpos.fix.heading import AttitudeAtPlace, attitude_at_place
 from starpos.fix.solution import TWO_SKIES, UNEXPLAINED, Solution, Status, solution_of, status_of
@@ -38,8 +53,8 @@ from starpos.identification.search import (
 )
 from starpos.identification.triangles import TriangleCatalogue, cached_triangles
 from starpos.instrument.camera import EQUIDISTANT, Camera
-from starpos.instrument.inclinometer import Tilt
-from starpos.instrument.instrument import OWN_LEVEL, Instrument
+from starpos.instrument.inclinometer import EITHER_WAY, Tilt
+from starpos.instrument.instrument import OWN_LEVEL, ByGravity, Instrument
 from starpos.instrument.tilt_log import NO_TILTS, Tilts
 from starpos.progress import Progress, quiet
 from starpos.sky import deeper
@@ -47,6 +62,9 @@ from starpos.sky.catalogue import Catalogue
 
 # A fisheye's lower stars are not used: no model describes refraction near the horizon.
 MIN_ALTITUDE_RAD = math.radians(10)
+
+# Sine of the altitude beyond which the stars of a frame determine the sign of up: A3 may be off by degrees.
+MIN_TOLD_SINE = math.sin(math.radians(6))
 
 
 def inside(stars: Stars, camera: Camera) -> np.ndarray | None:
@@ -247,14 +265,28 @@ class Solver:
         state = earth_state(frame.mid_unix_s)
         if self.instrument.vertical is not None:
             tilts = OWN_LEVEL
+        elif isinstance(tilts, ByGravity):
+            tilts = tilts.of(frame, self.instrument)
         # the width of a uniform distribution with this standard deviation, as rounding causes
         spread_s = math.sqrt(12) * frame.stamp_stddev_s
         tilt = tilts.average(frame.mid_unix_s, frame.exposure_s or 0.0, spread_s)
+        if tilt.either_way:
+            tilt = self._upright(tilt, frame)
         self.instrument.calibration.check_age(frame.mid_unix_s)
         self.instrument.inclinometer.check_live(tilt)
         self.instrument.inclinometer.check_range(tilt)
         self.instrument.inclinometer.check_axes(tilt)
         return state, tilt
+
+    def _upright(self, tilt: Tilt, frame: Stars | Pointing) -> Tilt:
+        """A tilt that may point up or down, by the frame's stars: they are seen, so they are above the horizon."""
+        seen = np.array([[0.0, 0.0, 1.0]])
+        if isinstance(frame, Stars) and len(frame.x):
+            seen = directions_of(self.view(frame.width, frame.height, frame.origin_px)[0], frame)
+        sine = float(seen.mean(0) @ self.instrument.mounting.a3.T @ tilt.up)
+        if self.instrument.calibration.unknown or abs(sine) < MIN_TOLD_SINE:
+            raise TiltError(EITHER_WAY)
+        return replace(tilt if sine > 0 else tilt.reversed, either_way=False)
 
     def _fix(
         self,
@@ -268,9 +300,10 @@ class Solver:
         up = self.instrument.mounting.level(tilt).camera[2]
         use, matched = self._matched(stars, found, camera, up, state, catalogue)
         if fisheye.is_wide(camera):
-            sines = directions_of(camera, stars)[found.star] @ up
+            detected = directions_of(camera, stars) @ up
+            sines = detected[found.star]
             check_above_horizon(float(sines.mean()), self.instrument.calibration)
-            if not self.instrument.calibration.unknown and (low := set_stars(sines)):
+            if not self.instrument.calibration.unknown and (low := set_stars(sines, detected)):
                 raise FixError(
                     f"by the tilts and A3 {low}: check the signs and the order of the tilts' axes, and A3"
                 )
@@ -321,12 +354,10 @@ class Solver:
         if stars.mid_unix_s is None:
             raise TimeError(f"{stars.place}: no time of exposure: {why_no_time(stars)}")
         state = earth_state(stars.mid_unix_s)
-        camera, catalogue, _ = self.view(stars.width, stars.height, stars.origin_px)
+        camera, catalogue, triangles = self.view(stars.width, stars.height, stars.origin_px)
         up = found.attitude @ state.gcrs_to_itrs.T @ place.plumb_axes[2]
-        if low := set_stars(directions_of(camera, stars)[found.star] @ up):
-            raise PlaceError(
-                f"from the given place {low}: check latitude and longitude, their order and signs, and the hour"
-            )
+        sky = Sky(catalogue, triangles, state.year, tuple(state.velocity))
+        check_risen(stars, found, camera, sky, up)
         use, matched = self._matched(stars, found, camera, up, state, catalogue)
         attitude = attitude_at_place(
             matched,

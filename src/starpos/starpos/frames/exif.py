@@ -18,9 +18,11 @@ from datetime import datetime, timezone
 
 from starpos.errors import FrameError, TimeError
 from starpos.frames.exposure import MAX_EXPOSURE_S, UNKNOWN_LATENCY_S, Exposure
+from starpos.frames.gravity import read_gravity
 
-# Canon and Nikon allow their clocks an error of a minute a month.
-UNTENDED_STDDEV_S = 60.0
+# Canon and Nikon allow their clocks an error of a minute a month. A telephone's is set by its network, a DJI's by GPS.
+UNTENDED_STDDEV_S, NETWORK_STDDEV_S = 60.0, 1.0
+NETWORKED = re.compile(r"apple|dji|google|samsung|xiaomi|huawei|oneplus|motorola|oppo|vivo", re.IGNORECASE)
 # UTC-12 to UTC+14 are in use.
 ZONES_H = 14.0
 # EXIF began then: a clock that shows an earlier year was never set.
@@ -45,18 +47,18 @@ class CameraClock:
     """A camera's own clock; TimeError if a value is out of its range.
 
     utc_offset_h  the time it shows minus UTC, hours, east positive; None: as each file says (OffsetTimeOriginal)
-    stddev_s      standard deviation of its error, which all frames share, s
+    stddev_s      standard deviation of its error, which all frames share, s; None: as the maker's clocks are set
     """
 
     utc_offset_h: float | None = None
-    stddev_s: float = UNTENDED_STDDEV_S
+    stddev_s: float | None = None
 
     def __post_init__(self) -> None:
         if self.utc_offset_h is not None and not abs(self.utc_offset_h) <= ZONES_H:
             raise TimeError(
                 f"a camera's clock {self.utc_offset_h:g} h from UTC is of no zone: give -{ZONES_H:g} to {ZONES_H:g} h"
             )
-        if not 0 <= self.stddev_s <= 86400:
+        if self.stddev_s is not None and not 0 <= self.stddev_s <= 86400:
             raise TimeError(f"a camera's clock is known to {self.stddev_s:g} s: give 0 to 86400 s")
 
 
@@ -166,6 +168,29 @@ class Exif:
         return any(FISHEYE.search(self.text(name)) for name in NAMES)
 
     @property
+    def gps_deg(self) -> tuple[float, float] | None:
+        """GPSLatitude and GPSLongitude, deg on WGS 84, north and east positive."""
+        place = []
+        for name, minus, most in (("Latitude", "S", 90), ("Longitude", "W", 180)):
+            try:
+                whole, minutes, seconds = (
+                    value.num / value.den for value in self.tags[f"GPS GPS{name}"].values
+                )
+            except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError):
+                return None
+            deg = whole + minutes / 60 + seconds / 3600
+            place.append(-deg if self.text(f"GPS GPS{name}Ref").upper() == minus else deg)
+            if not 0 <= deg <= most:
+                return None
+        return place[0], place[1]
+
+    @property
+    def clock_stddev_s(self) -> float:
+        """Standard deviation of a clock as this maker's are set, s."""
+        networked = NETWORKED.match(self.text("Image Make"))
+        return NETWORK_STDDEV_S if networked else UNTENDED_STDDEV_S
+
+    @property
     def gps_unix_s(self) -> float | None:
         """GPSDateStamp and GPSTimeStamp, UTC of the last fix, as a Unix time."""
         try:
@@ -207,7 +232,7 @@ class Exif:
         if offset_s is None:
             raise TimeError(
                 f"its EXIF has no zone (OffsetTimeOriginal is {zone!r}) and no time by GPS: say "
-                "by how many hours the camera's clock is before UTC"
+                "by how many hours the camera's clock is before UTC (--exif-utc-offset)"
             )
         if ahead_s is not None and abs(ahead_s - offset_s) > GPS_APART_S:
             raise TimeError(
@@ -235,8 +260,15 @@ def read_exposure(data: bytes, place: str, clock: CameraClock | None, shape: tup
         if clock is None:
             return Exposure(source=place)
         raise FrameError(f"{place}: reading EXIF needs exifread; run `pip install exifread`.") from None
+    try:
+        gravity, unlevelled = read_gravity(data, exif.width, exif.height), ""
+    except FrameError as e:
+        gravity, unlevelled = None, str(e)
     exposure = Exposure(
         source=place,
+        gravity=gravity,
+        unlevelled=unlevelled,
+        gps_deg=exif.gps_deg,
         exposure_s=exif.exposure_s,
         rough_focal_px=exif.rough_focal_px,
         fisheye=exif.is_fisheye,
@@ -255,5 +287,5 @@ def read_exposure(data: bytes, place: str, clock: CameraClock | None, shape: tup
         exposure,
         mid_unix_s=start_unix_s + exposure.exposure_s / 2,
         stamp_stddev_s=math.hypot(step_s / math.sqrt(12), UNKNOWN_LATENCY_S),
-        clock_stddev_s=clock.stddev_s,
+        clock_stddev_s=exif.clock_stddev_s if clock.stddev_s is None else clock.stddev_s,
     )

@@ -8,6 +8,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from starpos.errors import FrameError
+from starpos.frames.gravity import Gravity
 
 # 1 sigma of an unstated readout: evenly up to 50 ms, from the top or from the bottom
 UNKNOWN_READOUT_S = 0.03
@@ -127,6 +128,9 @@ class Exposure:
     clock_stddev_s  standard deviation of that clock against UTC, an error that all frames share; 0: unknown
     shutter         times of the rows; None: not stated
     untimed         why mid_unix_s is None, for messages; '': its file has no time
+    gravity         which way is up in it by its own file, as a telephone's photograph has it; None: not stated
+    unlevelled      why gravity is None, for messages
+    gps_deg         latitude and longitude by GPS in its file, WGS 84; compared with a fix, never used; None: not stated
 
     FrameError if a time, a standard deviation or the focal length is an impossible number.
     """
@@ -143,6 +147,9 @@ class Exposure:
     pixel_um: float | None = None
     origin_px: tuple[float, float] | None = None
     untimed: str = ""
+    gravity: Gravity | None = None
+    unlevelled: str = ""
+    gps_deg: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         place = self.place

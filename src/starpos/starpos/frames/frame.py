@@ -146,6 +146,21 @@ SYMMETRIC = 1e-6
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
+class Disc:
+    """A bright round thing far wider than a star on a frame: the Sun, or what looks like it.
+
+    x, y: its centre, px, with the covariance (2, 2) px2.  radius_px: of its limb, or of the glow that is saturated.
+    sharp: whether its limb was fitted; else it is a saturated glow.
+    """
+
+    x: float
+    y: float
+    covariance: np.ndarray
+    radius_px: float
+    sharp: bool
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Stars(Exposure):
     """N stars of a frame, brightest first; the centre of the top-left pixel is (0, 0).
 
@@ -162,6 +177,7 @@ class Stars(Exposure):
     fwhm_px : width of the star images, px; None: unknown
     window : px, the part of the frame that holds a picture, if the rest is white; None: all of it
     negative : whether they are dark on a bright sky, as on a plate
+    disc : what looks like the Sun on the frame; None without
 
     Examples
     --------
@@ -181,6 +197,7 @@ class Stars(Exposure):
     fwhm_px: float | None = None
     window: Window | None = None
     negative: bool = False
+    disc: Disc | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -12,9 +12,8 @@ import numpy as np
 from starpos.errors import FrameError, one_line
 from starpos.frames import exif
 from starpos.frames.frame import PATTERNS, Frame, check_pixels, to_unsigned
+from starpos.frames.tiff import JPEG_START, PNG_START, TIFF_ORDERS, tiff_directory
 
-PNG_START = b"\x89PNG\r\n\x1a\n"
-JPEG_START = b"\xff\xd8\xff"
 BMP_START = b"BM"
 # Segments of a JPEG that hold its size, and the one where its image begins.
 SIZED = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
@@ -23,10 +22,6 @@ SCAN = 0xDA
 PNG_SAMPLES = {0: 1, 2: 3, 3: 3, 4: 4, 6: 4}
 # Tags of TIFF 6.0.
 WIDTH, HEIGHT, BITS, SAMPLES, ORIENTATION = 256, 257, 258, 277, 274
-# Byte orders of a TIFF by its beginning.
-TIFF_ORDERS = {b"II*\0": "<", b"MM\0*": ">"}
-# Letters of struct by type of a tag: BYTE, ASCII, SHORT, DOUBLE; of all others, LONG.
-TIFF_KINDS = {1: "B", 2: "B", 3: "H", 12: "d"}
 
 
 def picture_frame(data: bytes, place: str, clock: exif.CameraClock | None = None) -> Frame:
@@ -135,27 +130,6 @@ def _not_turned_tiff(data: bytes) -> bytes:
         if (tag, kind, n) == (ORIENTATION, 3, 1) and value != 1:
             data = data[: entry + 8] + struct.pack(order + "H", 1) + data[entry + 10 :]
     return data
-
-
-def tiff_directory(
-    data: bytes, at: int, order: str, wanted: tuple[int, ...], most: int
-) -> tuple[dict[int, tuple], int]:
-    """The first values, at most `most`, of the wanted tags of a TIFF's directory, and the offset of the next directory.
-
-    struct.error if it is not a directory.  A text is its bytes.
-    """
-    (count,) = struct.unpack_from(order + "H", data, at)
-    tags = {}
-    for entry in range(at + 2, at + 2 + 12 * count, 12):
-        tag, kind, n = struct.unpack_from(order + "HHI", data, entry)
-        if tag not in wanted or not n:
-            continue
-        letter, place = TIFF_KINDS.get(kind, "I"), entry + 8
-        if n * struct.calcsize(order + letter) > 4:
-            (place,) = struct.unpack_from(order + "I", data, place)
-        tags[tag] = struct.unpack_from(f"{order}{min(n, most)}{letter}", data, place)
-    (following,) = struct.unpack_from(order + "I", data, at + 2 + 12 * count)
-    return tags, following
 
 
 def _jpeg_size(data: bytes) -> tuple[int, int, float] | None:

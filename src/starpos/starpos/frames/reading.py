@@ -13,8 +13,9 @@ from starpos.frames.exif import CameraClock
 from starpos.frames.exposure import Exposure
 from starpos.frames.fits import read_fits
 from starpos.frames.frame import MAX_BYTES, Frame, Stars
-from starpos.frames.pictures import JPEG_START, PNG_START, heif_frame, picture_frame, raw_frame
+from starpos.frames.pictures import heif_frame, picture_frame, raw_frame
 from starpos.frames.tables import read_star_list
+from starpos.frames.tiff import JPEG_START, PNG_START
 
 FITS = (".fits", ".fit", ".fts", ".fz", ".gz")
 PICTURE = (".png", ".tif", ".tiff", ".bmp")

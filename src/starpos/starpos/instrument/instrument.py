@@ -10,12 +10,12 @@ from typing import Protocol
 import numpy as np
 
 from starpos import rotation
-from starpos.errors import InstrumentError
-from starpos.frames.exposure import Shutter
+from starpos.errors import InstrumentError, TiltError
+from starpos.frames.exposure import Exposure, Shutter
 from starpos.instrument.camera import PLUMB_BOB, Camera
 from starpos.instrument.inclinometer import EXACT, InclinometerErrors, Tilt
 from starpos.instrument.mounting import RESPONSE_COEFFICIENTS, Mounting
-from starpos.instrument.sensors import unnamed
+from starpos.instrument.sensors import built_in_rad, find, is_built_in, unnamed
 from starpos.units import ARCSEC, DAY_S, utc_text
 
 # default sag: a camera on a pillar or a heavy tripod during a night
@@ -82,6 +82,45 @@ class OwnLevel:
 
 
 OWN_LEVEL = OwnLevel()
+NO_GRAVITY = (
+    "give it as the telephone wrote it (a screenshot, an edited or a sent copy has no gravity). Without gravity "
+    "there are still: starpos identify, its heading with --site, a log of the level as --tilt, or a plumb line"
+)
+
+
+@dataclass(frozen=True)
+class ByGravity:
+    """The tilts that photographs' own files state, as `starpos.instrument.tilt_log.Tilts`; S is then C."""
+
+    def of(self, frame: Exposure, instrument: "Instrument") -> Tilt:
+        """The tilt of a photograph, with three axes; TiltError if its file states no gravity, or by another level."""
+        gravity, model = frame.gravity, instrument.inclinometer_model
+        if gravity is None or frame.mid_unix_s is None:
+            raise self.missing(frame)
+        if gravity.model != model and is_built_in(model):
+            raise TiltError(
+                f"{frame.place}: its level is a {gravity.model}'s, the others' a {model}'s: solve them apart"
+            )
+        variance = instrument.inclinometer.noise_rad**2 + gravity.stddev_rad**2
+        theta_x, theta_y, theta_z = np.arcsin(np.clip(gravity.up, -1, 1)).tolist()
+        return Tilt(
+            theta_x,
+            theta_y,
+            np.eye(2) * variance,
+            theta_z=theta_z,
+            variance_z=variance,
+            utc_unix_s=frame.mid_unix_s,
+            # a copy of the photograph has the same error
+            times=(frame.mid_unix_s,),
+        )
+
+    def missing(self, frame: Exposure) -> TiltError:
+        """Why a photograph has no gravity, and what can be done."""
+        return TiltError(f"{frame.place}: {frame.unlevelled or 'its file states no gravity'}: {NO_GRAVITY}")
+
+    def average(self, mid_unix_s: float, exposure_s: float, spread_s: float = 0.0) -> Tilt:
+        """TiltError: gravity is a photograph's, whatever its time."""
+        raise TiltError(f"no gravity: {NO_GRAVITY}")
 
 
 # x of the base link is the top of the frame (-y of C), z the optical axis (docs/frames_and_symbols.md#frames)
@@ -346,6 +385,17 @@ class Instrument:
                 "positive (of one reading, SCA100T 0.0035)"
             )
         _check_rotation(self.link_to_camera, "link_to_camera")
+
+    def levelled_by(self, model: str) -> "Instrument":
+        """The instrument with a level of this model inside its camera, as far as A3 and the inclinometer are unknown."""
+        known = self
+        if self.calibration.unknown:
+            stddev = built_in_rad(model) / ARCSEC
+            known = replace(known, calibration=Calibration.of((0.0, 0.0, 0.0), (stddev,) * 3))
+        if not self.inclinometer_model and self.inclinometer == unnamed():
+            name, errors = find(model)
+            known = replace(known, inclinometer=errors, inclinometer_model=name)
+        return known
 
     @property
     def size(self) -> tuple[int, int] | None:

@@ -143,9 +143,10 @@ def read(path: Path | str, needs_camera: bool = True) -> Instrument:
 
     starpos_instrument: 1
     camera: {focal_mm, pixel_um}, {focal_px} or {width, height, fx, fy, cx, cy, distortion: [k1, k2, p1, p2, k3]}
-            or {calibration: camera.yaml}, a CameraInfo calibration file next to this one or at a full path; each of the
-            first three may have `model: equidistant`, of a fisheye, whose distortion is [k1, k2, k3, k4], and the first
-            two width and height: of the whole frame, in whose middle the optical axis is, and to which A3 belongs
+            or camera.yaml, or {calibration: camera.yaml}, a CameraInfo calibration file next to this one or at a full
+            path; each of the first three may have `model: equidistant`, of a fisheye, whose distortion is
+            [k1, k2, k3, k4], and the first two width and height: of the whole frame, in whose middle the optical axis is,
+            and to which A3 belongs
     misalignment_deg: [rx, ry, rz]                       without one of the next two it is not known: 10 deg
     calibration_stddev_arcsec: [x, y, z]                 about the inclinometer's axes, or as
     calibration_covariance_arcsec2: [[..], [..], [..]]
@@ -328,6 +329,8 @@ def _with_vertical(instrument: Instrument, content: dict) -> Instrument:
 
 def _camera(camera: object, folder: Path) -> dict[str, Any]:
     """Arguments of an Instrument: its camera, or the focal length and the lens of a camera without intrinsics."""
+    if isinstance(camera, str):
+        camera = {"calibration": camera}
     if not isinstance(camera, dict):
         raise InstrumentError(
             f"camera is {_short(camera)}: give {{focal_mm, pixel_um}} or {{width, height, fx, fy, cx, cy}}"

@@ -16,11 +16,12 @@ from starpos.earth.vertical import Deflection, Vertical
 from starpos.errors import FrameError, TiltError
 from starpos.files import open_regular, read_regular
 from starpos.frames.frame import Frame, Stars
+from starpos.frames.gravity import PHONE
 from starpos.frames.reading import FITS, HEIF, JPEG, PICTURE, RAW
 from starpos.frames.tables import GNSS, SIMULATED, TILTS, TRUTH
 from starpos.gnss.receiver import GnssTrack, read_gnss_csv
 from starpos.instrument import instrument_file, sensors
-from starpos.instrument.instrument import Calibration, Instrument
+from starpos.instrument.instrument import ByGravity, Calibration, Instrument
 from starpos.instrument.tilt_log import TiltsByTime
 from starpos.night.night import Night, Truth
 from starpos.night.reading import About, First, Instruments, Reader, TiltFile
@@ -81,12 +82,22 @@ def exposures(
 
 
 def work_of(
-    given: Instruments, first: About, tilts: Path | None, atmosphere: Atmosphere, place: Place | None = None
+    given: Instruments,
+    first: About,
+    tilts: Path | ByGravity | None,
+    atmosphere: Atmosphere,
+    place: Place | None = None,
 ) -> tuple[Solving, tuple[Remark, ...]]:
     """The work on the frames of a night whose first one is known, and what looks wrong.
 
-    tilts: their table; None where none is needed.  Raises TiltError if it cannot be read.
+    tilts: their table, or that photographs have their own; None where none is needed.  Raises TiltError if the table
+    cannot be read.
     """
+    if isinstance(tilts, ByGravity):
+        model = PHONE if first.gravity is None else first.gravity.model
+        known = None if given.instrument is None else given.instrument.levelled_by(model)
+        instruments, remarks = replace(given, instrument=known).framed(first)
+        return Solving(instruments, atmosphere=atmosphere, tilts=tilts, places=place), remarks
     instruments, remarks = given.framed(first)
     if tilts is None:
         return Solving(instruments, atmosphere=atmosphere, places=place), remarks

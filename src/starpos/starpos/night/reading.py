@@ -13,6 +13,7 @@ from starpos.errors import FrameError
 from starpos.fix.fix import IDEAL
 from starpos.frames.exif import CameraClock
 from starpos.frames.frame import Frame, Stars
+from starpos.frames.gravity import Gravity
 from starpos.frames.reading import read_frame
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import Tilt
@@ -63,12 +64,13 @@ def stars_of(item: Frame | Stars) -> Stars:
 
 @dataclass(frozen=True)
 class About:
-    """Frame size, focal length and place on the sensor in px, as the first frame of a night states them."""
+    """Frame size, focal length and place on the sensor in px, and gravity, as the first frame of a night states them."""
 
     width: int
     height: int
     focal_px: float | None
     origin_px: tuple[float, float] | None = None
+    gravity: Gravity | None = None
 
 
 # for pointings only the camera's axes count
@@ -77,17 +79,25 @@ NO_CAMERA = About(IDEAL.width, IDEAL.height, IDEAL.fx)
 
 @dataclass(frozen=True)
 class First:
-    """Finds the About of the first of several frames that can be read; None if none can."""
+    """Finds the About of the first of several frames that can be read; None if none can.
+
+    levelled: rather of the first one that has gravity.
+    """
 
     read: Reader
+    levelled: bool = False
 
     def __call__(self, paths: tuple[str, ...]) -> About | None:
+        first = None
         for path in paths:
             with suppress(FrameError):
                 item = self.read(path)
                 self.read.keep(path, item)
-                return About(item.width, item.height, item.focal_px, item.origin_px)
-        return None
+                about = About(item.width, item.height, item.focal_px, item.origin_px, item.gravity)
+                if not self.levelled or item.gravity is not None:
+                    return about
+                first = first or about
+        return first
 
 
 @dataclass(frozen=True)
@@ -109,7 +119,8 @@ class Instruments:
 
     def framed(self, first: About) -> tuple["Instruments", tuple[Remark, ...]]:
         """Instruments of a night with this first frame, and a remark if the optical axis of its frames is not known."""
-        if self.instrument is None:
+        # a lens that is sought may be another one in each frame
+        if self.instrument is None or self.sought:
             return self, ()
         instrument, doubt = with_frame_size(self.instrument, first)
         return replace(self, instrument=instrument), of_axis(doubt)

@@ -170,7 +170,7 @@ def solved_night(exposures: Exposures, how: How = ONE_BY_ONE, progress: Progress
         if answer.solution.remark:
             of_frames.append(Remark(Kind.FOCAL_LENGTH, answer.solution.remark))
         progress(exposures.name[:20], done / exposures.count)
-    whole = together(gathered.solved, answers.given)
+    whole = together(gathered, answers.given)
     said = [
         remark for part in (answers.turned, answers.watched) if part is not None for remark in part.remarks
     ]
@@ -181,7 +181,7 @@ def solved_night(exposures: Exposures, how: How = ONE_BY_ONE, progress: Progress
         origin=exposures.origin,
         shots=shots,
         combined=whole.average,
-        why_not=whole.why_not if gathered.solved else why_none(shots),
+        why_not=whole.why_not if gathered.solved or gathered.circles else why_none(shots),
         vertical=exposures.vertical,
         atmosphere=exposures.work.atmosphere,
         truth=exposures.truth,

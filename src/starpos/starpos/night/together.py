@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from starpos.averaging.altitudes import MIN_JUDGED, Circle, Directions, circle_of, place_of_circles
+from starpos.averaging.altitudes import MIN_JUDGED, Directions, place_of_circles
 from starpos.averaging.average import Average, average
 from starpos.averaging.elevation_axis import MIN_WITHOUT_SITE, FoundAxis, find_axis
 from starpos.calibration.misalignment import Calibrated, turn
@@ -18,6 +18,7 @@ from starpos.earth.orientation import EarthState
 from starpos.earth.place import Place
 from starpos.earth.vertical import Vertical
 from starpos.errors import FixError, FrameError, GnssError, StarposError
+from starpos.fix.circle import Circle, circle_of
 from starpos.fix.fix import IDEAL, Fix
 from starpos.fix.searching import Sight
 from starpos.fix.solution import Solution, Status
@@ -86,7 +87,8 @@ class FrameAnswer:
 class Gathered:
     """What is needed of a night's answers at its end, gathered one after another.
 
-    solved: those with a fix; headings: those with a heading at a known place; warnings: of all, each once.
+    solved: those with a fix; headings: those with a heading at a known place; circles: of those that saw the Sun, which
+    serve where nothing is solved; warnings: of all, each once.
     lost: the stars of the first frame that was not identified; None without one.
     unreadable: whether a file was.
     """
@@ -94,6 +96,7 @@ class Gathered:
     def __init__(self) -> None:
         self.solved: list[Solved] = []
         self.headings: list[Solution] = []
+        self.circles: list[Circle] = []
         self.warnings: set[str] = set()
         self.lost: Stars | None = None
         self.unreadable = False
@@ -107,6 +110,8 @@ class Gathered:
             self.solved.append(Solved.of(s, s.fix))
         if s.at_place:
             self.headings.append(s)
+        if s.circle is not None:
+            self.circles.append(s.circle)
         if s.status is Status.NOT_IDENTIFIED and self.lost is None:
             self.lost = answer.stars
 
@@ -120,14 +125,15 @@ class Together:
     remarks: tuple[Remark, ...] = ()
 
 
-def together(solved: Sequence[Solved], given: Instrument | None, near: Near | None = None) -> Together:
-    """Average the fixes of a night, and check them.
+def together(gathered: Gathered, given: Instrument | None, near: Near | None = None) -> Together:
+    """Average the fixes of a night, and check them; of a day, find where the Sun's circles meet.
 
     given: the instrument whose A3 was used unchanged; None if A3 was found by turning.
     near: where the instrument should be.
     """
+    solved = gathered.solved
     if not solved:
-        return Together()
+        return _by_day(gathered.circles, near) if gathered.circles else Together()
     whole, why_not = None, ""
     try:
         whole = average([s.fix for s in solved])
@@ -144,6 +150,20 @@ def together(solved: Sequence[Solved], given: Instrument | None, near: Near | No
             mounting = given.mounting
     said += doubts([s.fix for s in solved], place, mounting, near)
     return Together(whole, why_not, tuple(said))
+
+
+def _by_day(circles: Sequence[Circle], near: Near | None) -> Together:
+    """The place by the Sun's circles."""
+    try:
+        if Directions.of(sorted(circles, key=lambda c: c.utc_unix_s)).wide:
+            raise FixError(
+                "the Sun's elevations tell a place only where A3 is known to 6 arcmin: find it by night with starpos "
+                "calibrate --site"
+            )
+        place = place_of_circles(circles, None if near is None else (near.latitude, near.longitude))
+    except FixError as error:
+        return Together(None, str(error))
+    return Together(place, "", (*remarks.of_average(place), *doubts((), place, None, near)))
 
 
 def extrapolated(solved: Iterable[Solved]) -> tuple[Remark, ...]:

@@ -28,7 +28,7 @@ from starpos.frames.frame import Frame, Stars
 from starpos.frames.reading import read_frame
 from starpos.identification.prior import Hint
 from starpos.instrument import instrument_file
-from starpos.instrument.instrument import Instrument, with_frame_size
+from starpos.instrument.instrument import ByGravity, Instrument, with_frame_size
 from starpos.instrument.tilt_log import Tilts
 from starpos.night.reading import First, Instruments, Reader, TiltFile, stars_of
 from starpos.night.remarks import Kind, Remark
@@ -86,10 +86,19 @@ class Solving:
     progress: Progress = quiet
     # focal length in px by size and EXIF's focal length of frames that state none
     _found_px: dict = field(default_factory=dict, compare=False)
+    # the solver of the latest instrument: frames of one camera share what it has made for them
+    _latest: list[Solver] = field(default_factory=list, compare=False)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What a worker is given: it makes its own solver."""
+        return vars(self) | {"_latest": []}
 
     def __call__(self, item: Frame | Stars) -> Sight:
         """The sight of a frame; InstrumentError if its focal length is unknown, and must not be."""
-        if self.instruments.sought and item.focal_px is None:
+        if isinstance(self.tilts, ByGravity) and item.gravity is None:
+            begin, stars = time.process_time(), stars_of(item)
+            sight = Sight(stars, Solution.refused(stars, self.tilts.missing(item)))
+        elif self.instruments.sought and item.focal_px is None:
             begin = time.process_time()
             sight = self._by_sought_focal_length(item)
         elif self.search_s is not None and self.instruments.of(item) is None:
@@ -134,9 +143,11 @@ class Solving:
         """The answer with this focal length in px and model of a lens."""
         known = self.instruments.instrument
         assert known is not None
-        known = replace(known, focal_px=lens[0], model=lens[1])
+        known, doubt = with_frame_size(replace(known, focal_px=lens[0], model=lens[1]), question.stars)
         solver = Solver(known, catalogue.load_catalogue(), self.atmosphere, progress=self.progress)
-        return replace(answer_frame(solver, question), instrument=known)
+        sight = answer_frame(solver, question)
+        solution = replace(sight.solution, remark=sight.solution.remark or doubt)
+        return replace(sight, solution=solution, instrument=known)
 
     def solver(self, item: Frame | Stars) -> Solver:
         """The solver of a frame; InstrumentError if its focal length is unknown."""
@@ -147,7 +158,10 @@ class Solving:
             raise InstrumentError(
                 f"{item.place}: its header has no focal length: give instrument=Instrument(focal_px)"
             )
-        return Solver(instrument, catalogue.load_catalogue(), self.atmosphere, progress=self.progress)
+        if not self._latest or self._latest[0].instrument != instrument:
+            stars = catalogue.load_catalogue()
+            self._latest[:] = [Solver(instrument, stars, self.atmosphere, progress=self.progress)]
+        return self._latest[0]
 
     def after(self, sight: Sight, hint: Hint) -> Sight:
         """The sight of a frame that was not identified, if it looks where an earlier one did; else as it was."""

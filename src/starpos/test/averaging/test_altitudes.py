@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 from scipy.special import fdtri
 
-from starpos.averaging.altitudes import circle_of, f_quantile, place_of_circles
+from starpos.averaging.altitudes import f_quantile, place_of_circles
 from starpos.earth.orientation import earth_state
 from starpos.errors import FixError
+from starpos.fix.circle import circle_of
 from starpos.fix.fix import IDEAL
 from starpos.instrument.inclinometer import InclinometerErrors
 from starpos.units import ARCSEC

@@ -8,11 +8,17 @@ import pytest
 
 from starpos.calibration.camera import calibrate_camera, fit_camera, rms
 from starpos.calibration.camera_adjustment import parameters
-from starpos.errors import CalibrationError
+from starpos.earth.place import Place
+from starpos.errors import CalibrationError, PlaceError
+from starpos.fix.searching import Question, answer_frame
+from starpos.fix.solver import Solver
 from starpos.instrument.camera import EQUIDISTANT, Camera
+from starpos.instrument.instrument import Instrument
 from starpos_testing.skies.lenses import AIR, VACUUM, night, sightings, values
 
 IDEAL = Camera.from_focal(2000, 2000, 600.0, EQUIDISTANT)
+# where the simulated nights are
+SITE = Place.by_gravity(35.7046, 51.4106)
 # of a lens that is nearly equisolid, one that is nearly stereographic, one whose picture ends at 100 deg
 LENSES = {
     "equisolid": (-0.0417, 5e-4, 1e-5, -2e-6),
@@ -47,7 +53,10 @@ def picture_errors(true, fitted, most_deg=80):
 def test_the_coefficients_are_found_within_what_is_claimed(lens, catalogue, rng):
     true = random_fisheye(LENSES[lens], rng)
     lists, levels = nights(true, catalogue, rng)
-    found = calibrate_camera(lists, levels, IDEAL, catalogue, AIR)
+    # a known place serves as the level
+    by_place = lens == "stereographic"
+    known = {"levels": [None] * 2, "site": SITE} if by_place else {"levels": levels}
+    found = calibrate_camera(lists, given=IDEAL, catalogue=catalogue, atmosphere=AIR, **known)
     fit = found.fit
     assert found.used == tuple(range(2)) and fit.camera.model == EQUIDISTANT
     assert np.abs((fit.values - values(true)) / fit.sigma).max() < 4
@@ -71,10 +80,24 @@ def test_over_many_fisheyes_the_errors_are_those_claimed(rng):
     assert (z2.mean(0) < 2.2).all() and (z2.mean(0) > 0.3).all()
 
 
+def test_a_wrong_hour_puts_stars_under_the_horizon(catalogue, rng):
+    true = random_fisheye(LENSES["equisolid"], rng)
+    (stars,), _ = nights(true, catalogue, rng, 1)
+    late = replace(stars, mid_unix_s=stars.mid_unix_s + 6 * 3600)
+    with pytest.raises(PlaceError, match=r"under the horizon.*not local time"):
+        calibrate_camera([late], [None], IDEAL, catalogue, AIR, site=SITE)
+    # of the ideal lens only the middle is identified, where no star has set
+    solver = Solver(Instrument(IDEAL.fx, model=EQUIDISTANT), catalogue, AIR)
+    answer = answer_frame(solver, Question(item=late, stars=late, places=SITE)).solution
+    assert answer.at_place is None and "under the horizon" in answer.message
+    sound = answer_frame(solver, Question(item=stars, stars=stars, places=SITE)).solution
+    assert sound.at_place is not None
+
+
 def test_without_tilts_refraction_would_pass_for_the_lens(catalogue, rng):
     true = random_fisheye(LENSES["equisolid"], rng)
     lists, _ = nights(true, catalogue, rng, 1)
-    with pytest.raises(CalibrationError, match="--tilt"):
+    with pytest.raises(CalibrationError, match="--site, or the --tilt"):
         calibrate_camera(lists, [None], IDEAL, catalogue, AIR)
 
 

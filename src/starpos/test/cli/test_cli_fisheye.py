@@ -69,9 +69,22 @@ def test_its_camera_is_found_and_serves(skies, run, tmp_path):
     assert status == 0 and json.loads(out)["status"] == "ok"
 
 
+def test_its_place_serves_as_well(skies, run, tmp_path):
+    place = ("--site", PLACE["latitude"], PLACE["longitude"])
+    status, out, err = run(
+        "calibrate", *skies.glob("stars_*.csv"), *LENS, *AIR, *place, "--camera", tmp_path / "camera.yaml"
+    )
+    assert (status, err) == (0, []) and out.count("from the stars") == 8
+    (tmp_path / "mine.yaml").write_text("starpos_instrument: 1\ncamera: camera.yaml\n")
+    status, out, _ = run(
+        "solve", *skies.glob("stars_*.csv"), *place, "--instrument", tmp_path / "mine.yaml", "--json"
+    )
+    assert status == 0 and objects(out)[0]["heading"] is not None
+
+
 def test_without_its_tilts_it_is_not_calibrated(skies, run, tmp_path):
     status, _, err = run("calibrate", *skies.glob("stars_*.csv"), *LENS, "--camera", tmp_path / "camera.yaml")
-    assert status == 1 and "--tilt" in err[-1]
+    assert status == 1 and "--site, or the --tilt" in err[-1]
 
 
 def test_a_pinhole_is_told_to_be_none(skies, run):

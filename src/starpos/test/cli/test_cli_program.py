@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The program around its commands: help, start-up, what it says where a file or its reader is missing."""
 
+import argparse
 import os
 import shlex
 import subprocess
@@ -10,7 +11,17 @@ import pytest
 from cli_calls import WIDE
 
 from starpos import cli
-from starpos.cli import COMMANDS, console, inputs, parser_for
+from starpos.cli import console, inputs, parser_for
+from starpos.cli.commands import commands
+from starpos.fix import blind
+from starpos.frames import exif
+from starpos.frames.exposure import MAX_READOUT_S, UNKNOWN_SHUTTER
+from starpos.instrument import instrument, sensors
+from starpos.instrument.camera import EQUIDISTANT, PLUMB_BOB
+from starpos.navigation import vessel
+from starpos.night import under_way
+from starpos.night.remarks import NEAR_KM
+from starpos.recording import topics
 from starpos_testing.command_line import run
 from starpos_testing.lacking import require
 from starpos_testing.patience import WAIT_S
@@ -38,8 +49,8 @@ def test_a_catalogue_that_cannot_be_written(capsys, monkeypatch, catalogue, tmp_
 def test_help_and_version(capsys):
     status, out, errors = run(capsys, "--help")
     assert (status, errors) == (0, [])
-    assert all(name in out for name in COMMANDS)
-    for name in COMMANDS:
+    assert all(name in out for name in commands())
+    for name in commands():
         status, out, _ = run(capsys, name, "--help")
         assert status == 0
         assert f"starpos {name}" in out
@@ -49,7 +60,7 @@ def test_help_and_version(capsys):
 @pytest.mark.parametrize(
     ("words", "slow"),
     [
-        (["--help"], ["astropy", "cv2", "scipy", "numpy", "yaml", "argcomplete"]),
+        (["--help"], ["astropy", "cv2", "scipy", "numpy", "argcomplete"]),
         (["solve", "--help"], ["astropy", "cv2", "matplotlib"]),
     ],
 )
@@ -177,7 +188,7 @@ def test_frames_of_a_turn_whose_lines_wait_are_counted_on_standard_error(capsys,
     assert capsys.readouterr().err == "frame 1 of 2: 50 % done\nframe 2 of 2: 100 % done\n"
 
 
-EXAMPLES = [(name, example) for name, command in COMMANDS.items() for example in command.examples]
+EXAMPLES = [(name, example) for name, command in commands().items() for example in command.examples]
 
 
 @pytest.mark.parametrize(("name", "example"), EXAMPLES)
@@ -186,10 +197,66 @@ def test_every_example_in_help_is_a_call_that_is_understood(name, example, capsy
         program, *words = shlex.split(call)
         # of --help the parser itself makes the end
         if program and "--help" not in words:
-            assert program == "starpos" and words[0] in COMMANDS
+            assert program == "starpos" and words[0] in commands()
             assert parser_for(words).parse_args(words).run
     _, out, _ = run(capsys, name, "--help")
-    assert f"  {example}\n" in out and COMMANDS[name].next_step in out
+    assert f"  {example}\n" in out and commands()[name].next_step in out
+
+
+def option(command, name):
+    """The argparse action of an option."""
+    [choice] = (action for action in parser_for([command])._actions if isinstance(action.choices, dict))
+    return next(a for a in choice.choices[command]._actions if name in a.option_strings)
+
+
+@pytest.mark.parametrize(
+    ("command", "name", "attribute", "expected"),
+    [
+        ("navigate", "--mount-stddev", "default", under_way.MOUNT_STDDEV_DEG),
+        ("navigate", "--mount-stddev", "help", f"({under_way.MOUNT_STDDEV_DEG:g})"),
+        ("navigate", "--vehicle", "choices", tuple(vessel.LAWS)),
+        ("identify", "--search-time", "default", blind.SEARCH_S),
+        ("identify", "--search-time", "help", f"({blind.SEARCH_S:g} s)"),
+        ("solve", "--near-km", "help", f"({NEAR_KM:g};"),
+        ("solve", "--clock-stddev", "help", f"else {instrument.UNKNOWN_CLOCK_S:g};"),
+        (
+            "solve",
+            "--exif-clock-stddev",
+            "help",
+            f"({exif.UNTENDED_STDDEV_S:g}, a telephone's {exif.NETWORK_STDDEV_S:g};",
+        ),
+        ("solve", "--inclinometer", "help", ", ".join(sensors.presets())),
+        ("solve", "--lens", "choices", (PLUMB_BOB, EQUIDISTANT)),
+        (
+            "solve",
+            "--readout",
+            "help",
+            f"not known, {UNKNOWN_SHUTTER.readout_s:g} {UNKNOWN_SHUTTER.readout_stddev_s:g})",
+        ),
+        ("calibrate", "--sag", "help", f"({instrument.SAG_ARCSEC_PER_SQRT_HOUR:g}, 300 m"),
+        ("replay", "--remap", "help", ", ".join(topics.DRIVER_INPUTS)),
+    ],
+)
+def test_rows_of_options_state_the_numbers_that_the_code_uses(command, name, attribute, expected):
+    stated = getattr(option(command, name), attribute)
+    assert expected in stated if attribute == "help" else stated == expected
+
+
+@pytest.mark.parametrize(
+    ("command", "name", "most"),
+    [
+        ("navigate", "--mount-stddev", under_way.MAX_MOUNT_DEG),
+        ("calibrate", "--sag", instrument.MAX_SAG_ARCSEC),
+        ("solve", "--readout", MAX_READOUT_S),
+        ("simulate", "--readout", MAX_READOUT_S),
+        ("solve", "--exif-utc-offset", exif.ZONES_H),
+    ],
+)
+def test_rows_of_options_state_the_bounds_that_the_code_has(command, name, most):
+    read = option(command, name).type
+    assert read(str(most)) == most
+    with pytest.raises(argparse.ArgumentTypeError, match="must lie between"):
+        read(str(most * 1.001))
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from cli_calls import AIR, PLACE, WIDE, objects, without_focal_length
 
-from starpos.cli import options, replay
+from starpos.cli import replay
+from starpos.cli.commands import degrees
 from starpos.errors import FrameError
 from starpos.frames.reading import read_frame
 from starpos.night.opening import frames_in
@@ -108,13 +109,13 @@ def test_without_a_focal_length_the_stars_give_it(lists, run, tmp_path):
     [("47.1", 47.1), ("47:06:00", 47.1), ("-33:52:12", -33.87), ("11:18", 11.3), ("+5:00:36.0", 5.01)],
 )
 def test_degrees_may_have_minutes_and_seconds(text, deg):
-    assert options.degrees(text) == pytest.approx(deg)
+    assert degrees(text) == pytest.approx(deg)
 
 
 @pytest.mark.parametrize("text", ["47:66:00", "north", "4706.0N", "47:06:00:00"])
 def test_other_angles_are_told_how_to_write_them(text):
     with pytest.raises(argparse.ArgumentTypeError, match="47:06:00"):
-        options.degrees(text)
+        degrees(text)
 
 
 @needs("rosbags")

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A law of motion weighed by a record: what its means say of the wind, and the claims that follow."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
@@ -43,6 +45,7 @@ def test_likelihood_is_that_of_all_covariances_together(side, rng):
         assert likely - len(one) * np.log(2 * np.pi) / 2 == pytest.approx(by_definition)
 
 
+@cache
 def voyage_in(wind, seed):
     record = made("drone", 900, seed, rate_hz=25, cadence_s=3.0, more_wind=wind)
     return record, navigated(record, "drone", velocity=False)
@@ -68,16 +71,20 @@ def test_a_wind_that_changes_more_widens_the_claim_and_is_told():
 
 def test_a_steady_wind_is_not_believed_to_stay_so():
     """An unseen trend of 0.3 m/s in ten minutes remains possible; unseen gusts do not."""
-    _, voyage = voyage_in(None, 6)
+    _, voyage = voyage_in(None, 5)
     law = voyage.last.law
     assert law.drift_walk == pytest.approx(LAWS["drone"].drift_walk, rel=0.05)
     assert law.rest_stddev < 0.5 * LAWS["drone"].rest_stddev
 
 
+@cache
+def known_steady():
+    return navigated(voyage_in(None, 5)[0], "drone", velocity=False, drift_change=0.03)
+
+
 def test_a_wind_that_is_known_to_be_steady_narrows_the_claim():
-    record = made("drone", 900, 3, rate_hz=25, cadence_s=3.0)
-    usual = navigated(record, "drone", velocity=False)
-    known = navigated(record, "drone", velocity=False, drift_change=0.03)
+    record, usual = voyage_in(None, 5)
+    known = known_steady()
     assert sigma_m(known) < 0.4 * sigma_m(usual) and nees(known, record) < 16
 
 
@@ -85,8 +92,7 @@ def test_a_wind_that_is_wrongly_said_to_be_steady_widens_the_claim_all_the_same(
     record = made("drone", 900, 4, rate_hz=25, cadence_s=3.0, more_wind=walking_wind(0.05))
     wrong = navigated(record, "drone", velocity=False, drift_change=0.03)
     assert any("change" in fault for fault in wrong.faults)
-    assert sigma_m(wrong) > 5 * sigma_m(navigated(made("drone", 900, 4, rate_hz=25, cadence_s=3.0), "drone",
-                                                   velocity=False, drift_change=0.03))  # fmt: skip
+    assert sigma_m(wrong) > 5 * sigma_m(known_steady())
 
 
 @pytest.mark.parametrize("vehicle", ["rover", "parked"])

@@ -154,7 +154,7 @@ def test_turning_finds_a3_and_says_what_it_rests_on(turning):
     for answer in answers.each:
         gathered.gather(answer)
     assert len(gathered.solved) == len(HEADINGS_DEG)
-    assert turning.is_here(together(gathered.solved, None).average)
+    assert turning.is_here(together(gathered, None).average)
 
 
 def test_a_frame_that_no_way_identified_is_not_searched_again_while_turning(turning, points, monkeypatch):

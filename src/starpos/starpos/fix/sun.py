@@ -1,0 +1,310 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The attitude by the Sun, or the Moon, and the level: at a known place, whose ephemeris says where the body stands.
+
+Two directions make an attitude, the body's and the plumb line's. They contain the altitude twice: that tells the Sun
+from a lamp, and makes the attitude better than either. Without a place one frame gives a circle of equal altitude.
+"""
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from starpos import rotation
+from starpos._numeric.roots import symmetric_root
+from starpos.earth.orientation import EarthState, earth_state, station_velocity
+from starpos.earth.place import Place, Places
+from starpos.earth.refraction import MIN_COS_ZENITH
+from starpos.errors import FixError, InstrumentError, PlaceError, StarposError
+from starpos.fix.attitude import CAMERA, ITRS, Attitude
+from starpos.fix.budget import tilt_terms
+from starpos.fix.checks import MIN_DEG
+from starpos.fix.circle import MIN_SINE, circle_along
+from starpos.fix.heading import AttitudeAtPlace, attitudes_at, sky_terms, zenith_moved
+from starpos.fix.solution import Solution
+from starpos.fix.solver import Solver
+from starpos.fix.terms import ALWAYS, ErrorTerm, total_covariance
+from starpos.frames.frame import Disc, Stars
+from starpos.instrument.camera import Camera
+from starpos.instrument.inclinometer import Tilt
+from starpos.instrument.tilt_log import NO_TILTS, Tilts
+from starpos.sky.bodies import MOON, SUN, Body, body_at
+from starpos.units import ARCSEC
+
+# The focal length and the distortion err by this share of the way from the axis.
+LENS_SHARE = 1e-3
+# A limb is the body's if its radius is to this share, and px.  A glow is at most so wide, rad.
+SIZE_SHARE, SIZE_PX, WIDEST_GLOW = 0.06, 1.0, math.radians(10.0)
+# A body's altitude by the level differs from the ephemeris' by at most this; a glow may be a lamp as well.
+LIMB_SIGMAS, GLOW_SIGMAS = 5.3, 3.5
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """A disc as a direction: ray (3,) in C, its change (3, 2) by a px, and its radius, rad.
+
+    own (3, 2), lens (3, 1): its errors in rad, new in each frame and of the lens.
+    """
+
+    ray: np.ndarray
+    slope: np.ndarray
+    own: np.ndarray
+    lens: np.ndarray
+    radius: float
+
+    @classmethod
+    def of(cls, disc: Disc, camera: Camera, place: str) -> "_Seen":
+        x, y, r = disc.x, disc.y, disc.radius_px
+        rays = camera.directions(x + np.array([0, 1, 0, r, -r, 0, 0]), y + np.array([0, 0, 1, 0, 0, r, -r]))
+        ray = rays[0]
+        if not np.isfinite(rays).all():
+            raise FixError(f"{place}: the bright disc lies at the rim of the lens's picture: turn the camera")
+        slope = (rays[1:3] - ray).T
+        off_axis = np.array([x - camera.cx, y - camera.cy])
+        return cls(
+            ray,
+            slope,
+            slope @ symmetric_root(disc.covariance),
+            slope @ off_axis[:, None] * LENS_SHARE,
+            float(np.arccos(np.clip(rays[3:] @ ray, -1, 1)).mean()),
+        )
+
+
+def by_sun(solver: Solver, stars: Stars, disc: Disc, tilts: Tilts | None, places: Places | None) -> Solution:
+    """The attitude of a frame that shows the Sun or the Moon, or without a known place its circle of equal altitude.
+
+    A fault of the frame, the tilt, the time or the place is a status.
+    """
+    try:
+        if tilts is None and solver.instrument.vertical is None:
+            raise InstrumentError(
+                f"{stars.place}: one bright disc, as the Sun's, is a single direction: its heading takes the level: give "
+                "the tilts"
+            )
+        if solver.instrument.calibration.unknown:
+            raise InstrumentError(
+                f"{stars.place}: the Sun needs the misalignment of camera and inclinometer (A3): find it by night at a "
+                "known place, or state it"
+            )
+        state, tilt = solver.levelled(stars, tilts or NO_TILTS)
+        shutter = solver.shutter(stars)
+        late_s = float(shutter.later_s(np.array([disc.y]), stars.height)[0])
+        if late_s:
+            state = earth_state(state.utc_unix_s + late_s)
+        camera = solver.instrument.camera_for(stars.width, stars.height, stars.origin_px)
+        seen = _Seen.of(disc, camera, stars.place)
+        stamp_s = math.hypot(
+            stars.stamp_stddev_s, *shutter.errors_s(np.array([disc.y]), stars.height)[0].tolist()
+        )
+        if places is None:
+            return _on_circle(solver, stars, disc, seen, tilt, state, stamp_s)
+        place, wrong = places.at(state.utc_unix_s), None
+        for name in (SUN, MOON) if disc.sharp else (SUN,):
+            try:
+                body = body_at(name, state)
+                _check_size(disc, seen, body, camera, stars.place)
+                found = _attitude(solver, stars, disc, seen, body, tilt, state, place, stamp_s)
+            except PlaceError as error:
+                wrong = wrong or error
+                continue
+            return Solution.of(
+                stars,
+                found.text,
+                at_place=found,
+                tilt=tilt,
+                bodies=(name,),
+                extrapolated_days=state.orientation.extrapolated_days,
+            )
+        assert wrong is not None
+        raise wrong
+    except StarposError as error:
+        return Solution.refused(stars, error)
+
+
+def _check_size(disc: Disc, seen: _Seen, body: Body, camera: Camera, place: str) -> None:
+    """Raise PlaceError if a disc is not as wide as the body."""
+    if disc.sharp:
+        off = abs(seen.radius / body.radius - 1) > SIZE_SHARE + SIZE_PX / disc.radius_px
+    else:
+        off = not body.radius * (1 - SIZE_PX / disc.radius_px) < seen.radius < WIDEST_GLOW
+    if off:
+        raise PlaceError(
+            f"{place}: its bright disc is {math.degrees(2 * seen.radius):.2f} deg wide and the {body.name.title()} "
+            f"{math.degrees(2 * body.radius):.2f}: it is not the {body.name.title()}, or the focal length "
+            f"({camera.fx:.0f} px) is wrong"
+        )
+
+
+def _on_circle(
+    solver: Solver, stars: Stars, disc: Disc, seen: _Seen, tilt: Tilt, state: EarthState, stamp_s: float
+) -> Solution:
+    """The Sun's circle of equal altitude."""
+    body = body_at(SUN, state)
+    _check_size(
+        disc,
+        seen,
+        body,
+        solver.instrument.camera_for(stars.width, stars.height, stars.origin_px),
+        stars.place,
+    )
+    mounting = solver.instrument.mounting
+    up = mounting.level(tilt).camera[2]
+    across = (up - (up @ seen.ray) * seen.ray) / max(math.sqrt(1 - (up @ seen.ray) ** 2), MIN_SINE)
+    sigma = math.hypot(float(np.linalg.norm(across @ seen.own)), body.sigma)
+    circle = circle_along(
+        seen.ray,
+        body.itrs,
+        stars.place,
+        tilt,
+        mounting,
+        solver.atmosphere,
+        state,
+        sigma=sigma,
+        parallax=body.parallax,
+        clock_stddev_s=solver.clock_stddev_s(stars),
+        stamp_stddev_s=stamp_s,
+    )
+    lens = ErrorTerm("lens", (across @ seen.lens)[None], shared=ALWAYS)
+    circle = replace(circle, terms=(*circle.terms, lens))
+    text = f"the Sun {math.degrees(circle.zenith_distance):.4f} deg from the zenith"
+    return Solution.of(stars, text, circle=circle, tilt=tilt, bodies=(SUN,))
+
+
+@dataclass(frozen=True)
+class _Adjusted:
+    """An attitude by two directions, a body's and up, each in two components across it, of which one is superfluous.
+
+    g (3, 3): C into east, north, up.  by_body, by_up (3, 2): its rotation for an error of a component of each.
+    """
+
+    g: np.ndarray
+    by_body: np.ndarray
+    by_up: np.ndarray
+
+
+# change of up's components, towards east and north, by a small rotation
+OF_UP = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
+
+
+@dataclass(frozen=True)
+class _TwoDirections:
+    """A body seen where the level says it is, and where the ephemeris does; components are sideways and upwards.
+
+    g (3, 3): C into east, north, up by the level and the body's azimuth.
+    bent (3,): the body's direction as the ephemeris and the air have it, in east, north, up.
+    components (2, 3): unit vectors across it.  turned (2, 3): its components' change by a small rotation.
+    """
+
+    g: np.ndarray
+    bent: np.ndarray
+    components: np.ndarray
+    turned: np.ndarray
+
+    @classmethod
+    def of(cls, level: np.ndarray, ray: np.ndarray, bent: np.ndarray) -> "_TwoDirections | None":
+        """level (3, 3): C into L.  None in the zenith, where there is no azimuth."""
+        local, sine = level @ ray, math.hypot(bent[0], bent[1])
+        if min(sine, math.hypot(local[0], local[1])) < MIN_SINE:
+            return None
+        turn = math.atan2(bent[1], bent[0]) - math.atan2(local[1], local[0])
+        along = np.array([-bent[1], bent[0], 0.0]) / sine
+        components = np.stack([along, np.cross(bent, along)])
+        return cls(rotation.about_axis(2, turn) @ level, bent, components, np.cross(bent, components))
+
+    def adjusted(self, ray: np.ndarray, of_body: np.ndarray, of_up: np.ndarray) -> tuple[_Adjusted, float]:
+        """The attitude, and by how many sigma the altitudes differ; covariances (2, 2) of the components, rad2."""
+        off = self.components @ (self.bent - self.g @ ray)
+        # up that errs by a component moves the altitude
+        altitude = self.turned[1] @ OF_UP.T
+        sigma = math.sqrt(altitude @ of_up @ altitude + of_body[1, 1])
+        body, up = self.turned.T @ np.linalg.inv(of_body), OF_UP.T @ np.linalg.inv(of_up)
+        spread = np.linalg.inv(body @ self.turned + up @ OF_UP)
+        g = rotation.from_vector(spread @ body @ off) @ self.g
+        return _Adjusted(g, spread @ body, spread @ up), abs(float(off[1])) / sigma
+
+
+def _attitude(
+    solver: Solver,
+    stars: Stars,
+    disc: Disc,
+    seen: _Seen,
+    body: Body,
+    tilt: Tilt,
+    state: EarthState,
+    place: Place,
+    stamp_s: float,
+) -> AttitudeAtPlace:
+    """The attitude by the body's direction and the level; PlaceError if they contradict each other's altitude."""
+    a4, air, mounting, name = (
+        place.plumb_axes,
+        solver.atmosphere,
+        solver.instrument.mounting,
+        body.name.title(),
+    )
+    clock_s, level = solver.clock_stddev_s(stars), mounting.level(tilt)
+    true = a4 @ body.from_place(a4[2])
+    if true[2] < MIN_COS_ZENITH:
+        raise PlaceError(
+            f"{stars.place}: at this time and place the {name} is at an altitude of {_altitude_deg(true):.1f} deg, and a "
+            f"heading takes {MIN_DEG:.0f}: the frame shows something else, or the clock or the place is wrong"
+        )
+    bent = air.refraction().bend(true)
+    two = _TwoDirections.of(level.camera, seen.ray, bent)
+    if two is None:
+        raise FixError(f"{stars.place}: the {name} is in the zenith, where it tells no heading")
+    moved = zenith_moved(place.plumb[0])
+    sky = (
+        *sky_terms(state, clock_s, stamp_s, a4),
+        ErrorTerm("place", moved @ place.zenith_root, shared=ALWAYS),
+    )
+    of_body = (
+        ErrorTerm("disc", two.components @ two.g @ seen.own),
+        ErrorTerm("lens", two.components @ two.g @ seen.lens, shared=ALWAYS),
+        ErrorTerm("ephemeris", np.eye(2) * body.sigma, shared=ALWAYS),
+        ErrorTerm("refraction", two.components @ (bent - true)[:, None] * air.relative_sigma, shared=ALWAYS),
+        *(replace(t, factor=two.turned @ t.factor) for t in sky),
+    )
+    deflected = two.turned @ moved * place.plumb_stddev
+    of_up = tilt_terms(OF_UP @ two.g @ level.camera.T, level, tilt, mounting, state.utc_unix_s)
+    whole = total_covariance((*of_body, ErrorTerm("deflection", deflected)))
+    found, sigmas = two.adjusted(seen.ray, whole, total_covariance(of_up))
+    if sigmas > (LIMB_SIGMAS if disc.sharp else GLOW_SIGMAS):
+        raise PlaceError(
+            f"{stars.place}: by the level its bright disc is at an altitude of "
+            f"{_altitude_deg(level.camera @ seen.ray):.2f} deg, and the {name} at {_altitude_deg(bent):.2f}, "
+            f"{sigmas:.0f} times the stated errors away: it is not the {name}, or the clock, the place, the tilts or A3 "
+            "are wrong"
+        )
+    terms = (
+        *(replace(t, factor=found.by_body @ t.factor) for t in of_body),
+        *(replace(t, factor=found.by_up @ t.factor) for t in of_up),
+    )
+    plumb = found.by_body @ deflected
+    ellipsoid = plumb + moved * (place.ellipsoid_stddev - place.plumb_stddev)
+    own = total_covariance(t for t in terms if not t.common)
+    expected = found.g.T @ bent
+    slope = seen.slope
+    off_px = np.linalg.lstsq(slope, expected - seen.ray, rcond=None)[0]
+    return AttitudeAtPlace(
+        utc_unix_s=state.utc_unix_s,
+        camera=Attitude(a4.T @ found.g, a4.T @ own @ a4, of=CAMERA, into=ITRS),
+        stamp_stddev_s=stars.stamp_stddev_s,
+        clock_stddev_s=clock_s,
+        tilt=tilt,
+        used=np.zeros(0, int),
+        residual_px=off_px[None],
+        residual_arcsec=math.dist(expected, seen.ray) / ARCSEC,
+        jitter_px=0.0,
+        focal_scale=1.0,
+        zenith_distance=math.acos(min(max(bent[2], -1.0), 1.0)),
+        refraction_arcsec=math.dist(bent, true) / ARCSEC,
+        diurnal_aberration_arcsec=math.hypot(*station_velocity(a4[2])) / ARCSEC,
+        ut1_minus_utc_s=state.orientation.ut1_minus_utc_s,
+        place=place,
+        **attitudes_at(place, found.g, mounting, terms, (plumb, ellipsoid)),
+    )
+
+
+def _altitude_deg(direction: np.ndarray) -> float:
+    """Altitude of a direction (3,) whose third component points up."""
+    return math.degrees(math.asin(min(max(direction[2], -1.0), 1.0)))

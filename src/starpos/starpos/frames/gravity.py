@@ -1,0 +1,223 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which way is up in a picture, as the camera wrote it into its file: a telephone's accelerometer, a camera's level.
+
+The maker's note of EXIF has it, a directory as TIFF has them. Apple's tag 8 is gravity in g; Panasonic, Olympus, Pentax
+and Canon write roll and pitch, and DJI the angles of its gimbal, in XMP. ExifTool's public tables state their
+tags, steps and signs. Nikon's level is in an encrypted part and is not read.
+"""
+
+import math
+import re
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from starpos.errors import FrameError
+from starpos.frames.tiff import exif_block, tiff_directory
+
+# names of inclinometers (instrument/sensors.py)
+PHONE, CAMERA_LEVEL = "phone", "camera_level"
+MAKE, MODEL, ORIENTATION, SOFTWARE, BELOW, NOTE, LENS, RENDERED = (
+    271,
+    272,
+    274,
+    305,
+    34665,
+    37500,
+    42036,
+    41985,
+)
+# Length of gravity, g, of a telephone that is held still.
+MIN_G, MAX_G = 0.97, 1.03
+# Programs that crop, turn or bend pictures and keep the maker's note.
+EDITOR = re.compile(
+    r"photoshop|lightroom|gimp|snapseed|capture one|darktable|rawtherapee|picasa|imagemagick|affinity|luminar|hugin|ptgui"
+    r"|pixelmator|vsco|photos \d|picsart|on1|dxo",
+    re.IGNORECASE,
+)
+# CustomRendered of a panorama by Apple.
+PANORAMA = 6
+# Sides of any single exposure: beyond this it is stitched.
+LONGEST_SHAPE = 2.4
+# Direction in C of the edge of the picture that was up, by EXIF's Orientation. Beyond this share of gravity along the
+# picture the two have to agree.
+EDGES = {1: (0, -1), 3: (0, 1), 6: (-1, 0), 8: (1, 0)}
+CLEAR = 0.5
+GIMBAL = re.compile(rb"drone-dji:Gimbal(Pitch|Roll)Degree(?:=\"|>)\s*([-+]?\d+(?:\.\d+)?)")
+# XMP stands before the picture in a JPEG.
+XMP_BYTES = 1 << 18
+MOST_VALUES = 1 << 20
+
+
+@dataclass(frozen=True, eq=False)
+class Gravity:
+    """Up in a picture by its own file.
+
+    up          (3,): unit vector in C
+    stddev_rad  of it about each axis by the way it is written: its step, and what its frame leaves open
+    model       of the inclinometer that felt it, by its name in sensors.csv
+    """
+
+    up: np.ndarray
+    stddev_rad: float = 0.0
+    model: str = PHONE
+
+    @classmethod
+    def of_level(cls, roll_deg: float, pitch_deg: float, step_deg: float) -> "Gravity":
+        """From the camera's clockwise roll and its upward pitch, which are rounded to a step; FrameError if impossible.
+
+        No maker says whether roll is counted about the optical axis or is the lean of the camera's side: the difference
+        is in the error.
+        """
+        if abs(roll_deg) > 180 or abs(pitch_deg) > 90:
+            raise FrameError(f"its level's roll {roll_deg:g} and pitch {pitch_deg:g} deg are impossible")
+        roll, pitch = math.radians(roll_deg), math.radians(pitch_deg)
+        across = math.cos(pitch)
+        up = np.array([-math.sin(roll) * across, -math.cos(roll) * across, math.sin(pitch)])
+        step, open_ = math.radians(step_deg) / math.sqrt(12), math.sin(roll) * (1 - across) / math.sqrt(3)
+        return cls(up, math.hypot(step, open_), CAMERA_LEVEL)
+
+
+@dataclass(frozen=True)
+class _Note:
+    """A maker's note: bytes from which its offsets count, its byte order, and where its directory begins."""
+
+    data: bytes
+    order: str
+    at: int
+
+    def tags(self, *wanted: int) -> dict[int, tuple]:
+        """The values of tags; struct.error if the note is cut off."""
+        return tiff_directory(self.data, self.at, self.order, wanted, MOST_VALUES)[0]
+
+    def below(self, tag: int) -> "_Note | None":
+        """The directory that a tag holds, or points at."""
+        held = self.tags(tag).get(tag)
+        if held is None:
+            return None
+        return _Note(self.data, self.order, held[0] if len(held) == 1 else self.data.find(bytes(held)))
+
+
+def _signed(value: int, range_: int) -> int:
+    """A number that counts from 0 to a range, from minus half of it instead."""
+    return (value + range_ // 2) % range_ - range_ // 2
+
+
+def _apple(note: _Note) -> Gravity | None:
+    """Gravity of an iPhone, right, up the screen and out of it; columns of the picture are along -y, rows along -x."""
+    numbers = note.tags(8).get(8)
+    if numbers is None:
+        return None
+    if len(numbers) != 6 or 0 in numbers[1::2]:
+        raise FrameError("the gravity in its maker's note is damaged")
+    x, y, z = (a / b for a, b in zip(numbers[::2], numbers[1::2], strict=True))
+    length = math.sqrt(x * x + y * y + z * z)
+    if not MIN_G <= length <= MAX_G:
+        raise FrameError(f"its telephone felt {length:.2f} g, so it was not held still")
+    return Gravity(np.array([y, x, z]) / length)
+
+
+def _panasonic(note: _Note) -> Gravity | None:
+    tags = note.tags(0x90, 0x91)
+    if len(tags) < 2:
+        return None
+    return Gravity.of_level(_signed(tags[0x90][0], 1 << 16) / 10, -_signed(tags[0x91][0], 1 << 16) / 10, 0.1)
+
+
+def _olympus(note: _Note) -> Gravity | None:
+    below = note.below(0x2040)
+    tags = {} if below is None else below.tags(0x903, 0x904)
+    # the second number is 1 where the level is on
+    if len(tags) < 2 or any(value[1:] != (1,) for value in tags.values()):
+        return None
+    return Gravity.of_level(-tags[0x903][0] / 10, tags[0x904][0] / 10, 0.1)
+
+
+def _pentax(note: _Note) -> Gravity | None:
+    level = note.tags(0x22B).get(0x22B, ())
+    # the low bits: 1 and 9 of a camera held level or nearly so, for which alone the frame of the angles is known
+    if len(level) < 3 or level[0] & 15 not in (1, 9):
+        return None
+    roll, pitch = (_signed(value, 256) for value in level[1:3])
+    return Gravity.of_level(-roll / 2, -pitch / 2, 0.5)
+
+
+def _canon(note: _Note) -> Gravity | None:
+    level = note.tags(0x4059).get(0x4059, ())
+    if len(level) < 6:
+        return None
+    roll, pitch = (_signed(value, 3600) for value in level[4:6])
+    return Gravity.of_level(-roll / 10, pitch / 10, 0.1)
+
+
+# What a note begins with; where its byte order stands, None: EXIF's order; where its directory begins; whether offsets
+# count from its own beginning, not from EXIF's; and what reads it.
+NOTES: tuple[tuple[bytes, int | None, int, bool, Callable[[_Note], Gravity | None]], ...] = (
+    (b"Apple iOS\0", 12, 14, True, _apple),
+    (b"OLYMPUS\0", 8, 12, True, _olympus),
+    (b"OM SYSTEM\0", 12, 16, True, _olympus),
+    (b"PENTAX \0", 8, 10, True, _pentax),
+    (b"Panasonic\0", None, 12, False, _panasonic),
+)
+ORDERS = {b"II": "<", b"MM": ">"}
+
+
+def read_gravity(data: bytes, width: int, height: int) -> Gravity:
+    """Read which way is up in a picture of width x height px; FrameError says why its file does not say so.
+
+    data: of a JPEG, PNG or TIFF-like file, or the EXIF of a HEIF alone.
+    """
+    block = exif_block(data)
+    order = ORDERS.get(block[:2], "<")
+    try:
+        (at,) = struct.unpack_from(order + "I", block, 4)
+        first, _ = tiff_directory(block, at, order, (MAKE, MODEL, ORIENTATION, SOFTWARE, BELOW), 256)
+        tags, _ = tiff_directory(block, first[BELOW][0], order, (NOTE, LENS, RENDERED), MOST_VALUES)
+    except (struct.error, LookupError, TypeError):
+        first, tags = {}, {}
+    software = _text(first.get(SOFTWARE))
+    if EDITOR.search(software):
+        raise FrameError(f"it was edited by {software}, so its pixels may not lie as its level says")
+    try:
+        found = _by_gimbal(data) or _by_note(block, order, first, tags)
+    except (struct.error, TypeError, ValueError, IndexError):
+        raise FrameError("its maker's note is damaged or cut off") from None
+    if found is None:
+        raise FrameError("its file does not say which way is down")
+    if tags.get(RENDERED) == (PANORAMA,) or max(width, height) > LONGEST_SHAPE * min(width, height):
+        raise FrameError("it is a panorama, stitched of several exposures")
+    if "front" in _text(tags.get(LENS)):
+        raise FrameError("it is by the telephone's front camera, whose level is not known")
+    if found.model == PHONE and height > width:
+        raise FrameError("its pixels were turned by a program, and the gravity in its file was not")
+    edge = EDGES.get(first.get(ORIENTATION, (0,))[0])
+    if edge is not None and np.hypot(*found.up[:2]) > CLEAR and np.dot(edge, found.up[:2]) < 0:
+        raise FrameError("its Orientation contradicts its level: a program turned it")
+    return found
+
+
+def _text(value: tuple | None) -> str:
+    return bytes(value or ()).decode("ascii", "replace").strip("\0 ")
+
+
+def _by_gimbal(data: bytes) -> Gravity | None:
+    angles = {name: float(value) for name, value in GIMBAL.findall(data[:XMP_BYTES])}
+    return Gravity.of_level(angles[b"Roll"], angles[b"Pitch"], 0.1) if len(angles) == 2 else None
+
+
+def _by_note(block: bytes, order: str, first: dict, tags: dict) -> Gravity | None:
+    note = bytes(tags.get(NOTE, ()))
+    for start, order_at, directory, own, read in NOTES:
+        if note.startswith(start):
+            if order_at is not None:
+                order = ORDERS.get(note[order_at : order_at + 2], "")
+            if not order:
+                raise ValueError("no byte order")
+            return read(
+                _Note(note, order, directory) if own else _Note(block, order, block.find(note) + directory)
+            )
+    if note and _text(first.get(MAKE)).startswith("Canon"):
+        return _canon(_Note(block, order, block.find(note)))
+    return None
