@@ -24,7 +24,7 @@ BENT = 4e-9
 
 
 def pixel_of(axes, v, from_middle_s):
-    """Pixel of a direction at a time from the middle of its row's exposure; axes: the camera's at that of row 0."""
+    """Pixel of a direction at a time from the middle of its row's exposure; axes: of the camera at the middle of row 0."""
     y = 0.0
     for _ in range(4):
         seconds = abs(READOUT_S) * (1 - y / (HEIGHT - 1)) + from_middle_s
@@ -86,7 +86,7 @@ def test_one_way_of_a_trail_has_its_directions_and_the_times_of_its_rows(sky, ca
     assert np.sort(ways[0].utc_unix_s) == pytest.approx(np.sort(expected), abs=5e-3)
 
 
-@pytest.mark.parametrize(("unstated", "said"), [("exposure_s", "how long"), ("mid_unix_s", "no time")])
+@pytest.mark.parametrize(("unstated", "said"), [("exposure_s", "exposure time"), ("mid_unix_s", "no time")])
 def test_a_frame_without_time_or_exposure_is_refused(sky, catalogue, unstated, said):
     frame, stars, solution, *_ = sky
     with pytest.raises(FrameError, match=said):
