@@ -5,7 +5,7 @@ import argparse
 import math
 import os
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
@@ -18,7 +18,7 @@ from starpos.fix.blind import BlindSolver
 from starpos.fix.solver import Solver
 from starpos.frames.exif import CameraClock
 from starpos.frames.frame import no_stars
-from starpos.frames.reading import HEIF, JPEG, RAW
+from starpos.frames.reading import are_photographs
 from starpos.frames.tables import TILTS, TRUTH
 from starpos.instrument.camera import PLUMB_BOB
 from starpos.instrument.instrument import Instrument
@@ -169,11 +169,6 @@ def _night(folder: str) -> NightFolder | FrameError:
         return error
     tilt = os.path.abspath(os.path.join(folder, TILTS))
     return NightFolder(frames, None if are_photographs(frames) and not os.path.exists(tilt) else tilt, folder)
-
-
-def are_photographs(paths: Sequence[str]) -> bool:
-    """Whether all files are of the kinds in which a telephone's photographs, with gravity, come."""
-    return all(os.path.splitext(path)[1].lower() in JPEG + HEIF + RAW for path in paths)
 
 
 PIP = "pip install matplotlib rosbags"

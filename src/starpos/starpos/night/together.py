@@ -51,10 +51,11 @@ class Solved:
     stars_detected: int
     stars_matched: int
     log_odds: float
+    gps_deg: tuple[float, float] | None
 
     @classmethod
-    def of(cls, s: Solution, fix: Fix) -> "Solved":
-        """The part of a solution with a fix."""
+    def of(cls, s: Solution, fix: Fix, gps_deg: tuple[float, float] | None = None) -> "Solved":
+        """The part of a solution with a fix; gps_deg: as the Exposure of its stars has it."""
         light = replace(fix, used=np.zeros(0, int), residual_px=np.zeros((0, 2)))
         log_odds = s.pointing.log_odds if s.pointing else float("nan")
         return cls(
@@ -63,6 +64,7 @@ class Solved:
             stars_detected=s.stars_detected,
             stars_matched=len(s.names),
             log_odds=log_odds,
+            gps_deg=gps_deg,
         )
 
 
@@ -109,7 +111,7 @@ class Gathered:
         self.unreadable |= not answer.readable
         self.warnings |= set(s.warnings)
         if s.fix:
-            self.solved.append(Solved.of(s, s.fix))
+            self.solved.append(Solved.of(s, s.fix, None if answer.stars is None else answer.stars.gps_deg))
         if s.at_place:
             self.headings.append(s)
         if s.circle is not None:
@@ -150,6 +152,8 @@ def together(gathered: Gathered, given: Instrument | None, near: Near | None = N
         said += remarks.of_a3(given.calibration, place)
         if given.vertical is None and not given.calibration.unknown:
             mounting = given.mounting
+        said += [] if whole is None else remarks.of_table([s.fix for s in solved], whole, given)
+    said += remarks.of_marks(place, [s.gps_deg for s in solved if s.gps_deg is not None])
     said += doubts([s.fix for s in solved], place, mounting, near)
     return Together(whole, why_not, tuple(said))
 

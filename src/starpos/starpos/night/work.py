@@ -138,7 +138,10 @@ class Solving:
         if sight.found is None:
             return sight
         self._found_px[lens] = focal_px, model
-        remark = f"{item.place}: no focal length is stated: its stars give {focal_px:.0f} px"
+        told = "no focal length is stated"
+        if item.rough_focal_px is not None:
+            told = f"its EXIF gives a focal length of about {item.rough_focal_px:.0f} px"
+        remark = f"{item.place}: {told}: its stars give {focal_px:.0f} px"
         return replace(sight, solution=replace(sight.solution, remark=sight.solution.remark or remark))
 
     def _answer_at(self, lens: tuple[float, str], question: Question) -> Sight:
