@@ -24,7 +24,7 @@ BENT = 4e-9
 
 
 def pixel_of(axes, v, from_middle_s):
-    """Pixel of a direction at a time from the middle of its row's exposure; axes: of the camera at the middle of row 0."""
+    """Pixel of a direction at a time from the middle of its row's exposure; axes: of the camera for row 0."""
     y = 0.0
     for _ in range(4):
         seconds = abs(READOUT_S) * (1 - y / (HEIGHT - 1)) + from_middle_s
