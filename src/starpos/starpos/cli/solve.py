@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from starpos.averaging.altitudes import FoundAxis
+from starpos.averaging.elevation_axis import FoundAxis
 from starpos.cli import console, fix_output, inputs, options, overwriting
 from starpos.cli.console import Output
 from starpos.cli.fix_output import (

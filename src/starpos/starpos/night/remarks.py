@@ -2,12 +2,13 @@
 """Remarks on a night, each a kind and a sentence; among them doubts: mistaken tilts, a place far from the stated one."""
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 
 import numpy as np
 
-from starpos.averaging.average import Average
+from starpos.averaging.average import SCATTER, Average
+from starpos.averaging.elevation_axis import FoundAxis
 from starpos.calibration.misalignment import Calibrated
 from starpos.earth.ellipsoid import EARTH_RADIUS_M, zenith_of
 from starpos.earth.orientation import ROTATION_RAD_S
@@ -156,6 +157,42 @@ def of_average(whole: Average) -> Iterator[Remark]:
             Kind.LEFT_OUT,
             f"{whole.left_out} fixes lie further from the others than their errors allow: they are not in the average",
         )
+
+
+def beyond_stated(place: Average | None) -> bool:
+    """Whether the residuals of elevations are beyond their stated errors; they are if no place fits."""
+    if place is None:
+        return True
+    shares = [np.trace(t.covariance[:2, :2]) for t in place.terms if t.name == SCATTER]
+    return place.left_out > 0 or sum(shares) > np.trace(place.covariance[:2, :2]) / 2
+
+
+def of_left_out(elevations: int) -> Iterator[Remark]:
+    """Say that some elevations are not used."""
+    if elevations:
+        yield Remark(
+            Kind.LEFT_OUT,
+            f"{elevations} elevations contradict the others and are left out: their tilts or pointings are wrong",
+        )
+
+
+def of_elevations(place: Average) -> Iterator[Remark]:
+    """Say which elevations the place is not from, and that the others scatter."""
+    yield from of_left_out(place.left_out)
+    if beyond_stated(replace(place, left_out=0)):
+        yield Remark(
+            Kind.TILTS,
+            "the elevations scatter by more than the stated errors of tilts and A3: the claimed error includes it",
+        )
+
+
+def of_denied_a3(axis: FoundAxis, given: Calibration) -> Remark:
+    """Say that the elevations deny the A3 that was given."""
+    return Remark(
+        Kind.UNKNOWN_A3,
+        f"the elevations deny the A3 given, by {axis.sigma_from(given):.0f} sigma: the place is from the A3 that they "
+        "determine: calibrate again",
+    )
 
 
 def of_a3(calibration: Calibration, place: Fix | Average, ways: str = BY_OPTIONS) -> tuple[Remark, ...]:

@@ -10,14 +10,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from starpos.averaging.altitudes import (
-    MIN_WITHOUT_SITE,
-    Directions,
-    FoundAxis,
-    find_axis,
-    place_of_circles,
-)
+from starpos.averaging.altitudes import MIN_JUDGED, Directions, place_of_circles
 from starpos.averaging.average import Average, average
+from starpos.averaging.elevation_axis import MIN_WITHOUT_SITE, FoundAxis, find_axis
 from starpos.calibration.misalignment import Calibrated, turn
 from starpos.earth.orientation import EarthState
 from starpos.earth.place import Place
@@ -40,6 +35,9 @@ from starpos.instrument.mounting import Mounting
 from starpos.instrument.tilt_log import Tilts
 from starpos.night import remarks
 from starpos.night.remarks import Kind, Near, Remark, doubts, of_inclinometer
+
+# elevations that have A3's axis further from where it was given, in sigma of both, deny the given one
+DENIED_SIGMA = 6.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -259,10 +257,26 @@ def from_elevations(
             # A3's error is counted from the given A3, or from the one found if none was given
             sound = axis.about(axis.a3 if self_calibrate else solver.instrument.calibration.a3)
         place = place_of_circles(sound, there)
-        together = Together(place, "", (*of_inclinometer(solver.instrument), *doubts((), place, None, near)))
+        if axis is not None:
+            place = replace(place, left_out=place.left_out + axis.left_out)
+        said = (
+            *remarks.of_elevations(place),
+            *of_inclinometer(solver.instrument),
+            *doubts((), place, None, near),
+        )
+        together = Together(place, "", said)
     except FixError as error:
         together = Together(None, str(error))
-    return Elevations(tuple(circles), together, axis)
+    found = Elevations(tuple(circles), together, axis)
+    if self_calibrate or axis is not None or not remarks.beyond_stated(together.average):
+        return found
+    # residuals beyond the stated errors may be those of a wrong A3, which no scatter covers
+    given = solver.instrument.calibration
+    free = from_elevations(solver, pointings, tilts, near, self_calibrate=True)
+    if free.axis is None or free.axis.directions < MIN_JUDGED or free.axis.sigma_from(given) < DENIED_SIGMA:
+        return found
+    said = (remarks.of_denied_a3(free.axis, given), *free.together.remarks)
+    return replace(free, circles=tuple(circles), together=replace(free.together, remarks=said))
 
 
 def axis_of(
