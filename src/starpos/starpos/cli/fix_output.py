@@ -249,7 +249,6 @@ def json_of_axes(found: AttitudeAtPlace | MeanAttitude, axes: Axes) -> list[dict
         for name, row in zip(axes, np.degrees(columns).T.tolist(), strict=True)
     ]
 
-
     """Text of `json_of_axes` for people."""
     """The same for people."""
     return "".join(

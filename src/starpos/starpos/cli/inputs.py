@@ -5,7 +5,7 @@ import argparse
 import math
 import os
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
@@ -26,8 +26,10 @@ from starpos.instrument.instrument import Instrument
 from starpos.night.opening import work_of
 from starpos.night.reading import About, First, Instruments, Reader, TiltFile
 from starpos.night.remarks import NEAR_KM, Near, of_tilts
+from starpos.night.work import Solving
 from starpos.parallel.cluster import Cluster
-from starpos.parallel.processes import Workers, processors, workers
+from starpos.parallel.processes import Here, Workers, processors, workers
+from starpos.progress import quiet
 from starpos.recording.drivers import Drivers
 from starpos.sky import catalogue
 
@@ -108,6 +110,28 @@ def seen_at_place(command: str, args: argparse.Namespace) -> Iterator[tuple[Fram
 def why_no_time_of(item: Frame | Stars) -> str:
     """The sentence for a frame without a time."""
     return f"{item.place}: no time of exposure: {why_no_time(item)}"
+
+
+def identifying(
+    command: str,
+    args: argparse.Namespace,
+    frames: Sequence[str],
+    read: Reader,
+    workers: Workers,
+    search_s: float,
+) -> Solving:
+    """The work that identifies frames with the camera of the options, else of their headers, else of any scale."""
+    (about,) = workers.map([(First(read), tuple(frames))])
+    given = Instruments(None, by_header=True)
+    if about is not None and is_untold(args) and about.focal_px is None:
+        BlindSolver(catalogue.load_catalogue(), console.ProgressBar()).prepare()
+    elif about is not None:
+        given = given_of(args, about)
+        prepare(command, options.instrument_of(args, about), about)
+    # without a frame that can be read, each one reports why it cannot
+    # several at once would write over each other's progress
+    progress = console.ProgressBar() if isinstance(workers, Here) else quiet
+    return Solving(given, search_s=search_s, progress=progress)
 
 
 def checked_tilts(command: str, path: str, instrument: Instrument) -> TiltFile:
