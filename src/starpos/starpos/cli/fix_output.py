@@ -249,8 +249,9 @@ def json_of_axes(found: AttitudeAtPlace | MeanAttitude, axes: Axes) -> list[dict
         for name, row in zip(axes, np.degrees(columns).T.tolist(), strict=True)
     ]
 
+
+def axes_text(found: AttitudeAtPlace | MeanAttitude, axes: Axes) -> str:
     """Text of `json_of_axes` for people."""
-    """The same for people."""
     return "".join(
         f"; {a['name']} azimuth {a['azimuth']:.5f} +- {a['sigma_azimuth_deg']:.5f}, altitude {a['altitude']:.5f} +- "
         f"{a['sigma_altitude_deg']:.5f}"
