@@ -5,7 +5,7 @@ import argparse
 import math
 import os
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
@@ -17,7 +17,6 @@ from starpos.errors import FrameError, InstrumentError, StarposError, TiltError
 from starpos.fix.solver import Solver
 from starpos.frames.exif import CameraClock
 from starpos.frames.frame import no_stars
-from starpos.frames.reading import HEIF, JPEG, RAW
 from starpos.frames.tables import TILTS, TRUTH
 from starpos.instrument.camera import PLUMB_BOB
 from starpos.instrument.instrument import Instrument
@@ -122,6 +121,8 @@ def nights_of(
     `opening.frames_in` finds a folder's frames, in the order of their names.
     Raises FrameError for a path that does not exist, TiltError for frames without a table.
     """
+    from starpos.night.opening import are_photographs
+
     if tilt is not None:
         return [NightFolder(tuple(given), os.path.abspath(tilt))]
     if needs_no_tilt:
@@ -138,7 +139,7 @@ def nights_of(
 
 
 def _night(folder: str) -> NightFolder | FrameError:
-    from starpos.night.opening import frames_in
+    from starpos.night.opening import are_photographs, frames_in
 
     try:
         frames = tuple(map(str, frames_in(Path(folder))))
@@ -146,11 +147,6 @@ def _night(folder: str) -> NightFolder | FrameError:
         return error
     tilt = os.path.abspath(os.path.join(folder, TILTS))
     return NightFolder(frames, None if are_photographs(frames) and not os.path.exists(tilt) else tilt, folder)
-
-
-def are_photographs(paths: Sequence[str]) -> bool:
-    """Whether all files are of the kinds in which a telephone's photographs, with gravity, come."""
-    return all(os.path.splitext(path)[1].lower() in JPEG + HEIF + RAW for path in paths)
 
 
 PIP = "pip install matplotlib rosbags"

@@ -15,6 +15,7 @@ from starpos.earth.refraction import Atmosphere
 from starpos.earth.vertical import Deflection, Vertical
 from starpos.errors import FrameError, TiltError
 from starpos.files import open_regular, read_regular
+from starpos.frames.exif import CameraClock
 from starpos.frames.frame import Frame, Stars
 from starpos.frames.gravity import PHONE
 from starpos.frames.reading import FITS, HEIF, JPEG, PICTURE, RAW
@@ -42,8 +43,11 @@ def exposures(
     vertical: Vertical,
     place: Place | None = None,
     read: Reader | None = None,
+    frames: Sequence[Path] = (),
 ) -> Exposures:
     """The frames of a folder in the order of their names, to be solved.
+
+    frames: these of it; without any, all. Photographs without tilt.csv have their own gravity.
 
     read: with a camera's clock, for the times of pictures; None for files that state their time.
 
@@ -52,16 +56,18 @@ def exposures(
 
     Raises FrameError if there are no frames, or truth.json cannot be used.
     """
-    frames, read = frames_in(folder), read or Reader()
-    first = First(read)(tuple(map(str, frames)))
+    frames, read, table = frames or frames_in(folder), read or Reader(), folder / TILTS
+    by_gravity = place is None and are_photographs(frames) and not table.exists()
+    if by_gravity:
+        # a new one, which has not kept a frame without its time
+        read = Reader(read.clock or CameraClock(), read.delay_s)
+    first = First(read, by_gravity)(tuple(map(str, frames)))
     work, remarks = Solving(given, atmosphere=atmosphere, places=place), tuple[Remark, ...]()
     if first is not None:
         try:
-            work, remarks = work_of(given, first, folder / TILTS, atmosphere, place)
+            work, remarks = work_of(given, first, ByGravity() if by_gravity else table, atmosphere, place)
         except TiltError as error:
-            tilts = (
-                None if place is not None and not (folder / TILTS).exists() else TiltsByTime(why=str(error))
-            )
+            tilts = None if place is not None and not table.exists() else TiltsByTime(why=str(error))
             instruments, remarks = given.framed(first)
             work = replace(work, instruments=instruments, tilts=tilts)
 
@@ -69,9 +75,10 @@ def exposures(
         answers = Here().map((OnFile(read, work), str(path)) for path in frames)
         return zip((path.name for path in frames), answers, strict=True)
 
+    kind = "lists of stars" if frames[0].suffix == ".csv" else "frames"
     return Exposures(
-        name=folder.name or str(folder),
-        origin=f"solved from {len(frames)} {'lists of stars' if frames[0].suffix == '.csv' else 'frames'} and {TILTS}",
+        name=frames[0].name if len(frames) == 1 else folder.name or str(folder),
+        origin=f"solved from {len(frames)} {kind} and {'the gravity in them' if by_gravity else TILTS}",
         count=len(frames),
         each=each,
         work=work,
@@ -128,6 +135,11 @@ def frames_in(folder: Path) -> list[Path]:
             f"of stars) and {TILTS}"
         )
     return frames
+
+
+def are_photographs(paths: Sequence[str | Path]) -> bool:
+    """Whether all files are of the kinds in which a telephone's photographs, with gravity, come."""
+    return all(os.path.splitext(path)[1].lower() in JPEG + HEIF + RAW for path in paths)
 
 
 def _is_star_list(path: Path) -> bool:
