@@ -37,7 +37,7 @@ from starpos.instrument.instrument import (
 from starpos.instrument.tilt_log import TiltLog
 from starpos.night.opening import frames_in
 from starpos.night.reading import NO_CAMERA, First, Instruments, Reader
-from starpos.night.remarks import of_inclinometer
+from starpos.night.remarks import WORTH_SAVING_ARCSEC, of_inclinometer, of_left_out
 from starpos.night.together import axis_of, circles_of
 from starpos.night.work import Solving
 from starpos.sky import catalogue
@@ -48,31 +48,14 @@ def check_site(args: argparse.Namespace) -> None:
     """Raise InstrumentError for options that do not fit together."""
     deflection = (args.xi, args.eta, args.deflection_stddev, args.geoid, args.altitude_m) != (None,) * 5
     if args.site is None:
-        if (
-            deflection
-            or args.geodetic
-            or args.fixed
-            or (args.output, args.valid_days, args.turn_stddev, args.sag) != (None,) * 4
-        ):
-            raise InstrumentError(
-                "-o, --fixed, --sag, --geodetic, --turn-stddev, --valid-days and the deflection are for a "
-                "calibration at a known place: give --site LAT LON"
-            )
+        if deflection:
+            raise InstrumentError("the deflection is for a calibration at a known place: give --site LAT LON")
         return
     if deflection and not args.geodetic:
         raise InstrumentError(
             "--xi, --eta, --deflection-stddev, --geoid and --altitude-m are of a place on WGS 84: say --geodetic, or "
             "leave them out"
         )
-    if args.fixed:
-        if (args.tilt, args.misalignment, args.turn_stddev, args.inclinometer) != (None,) * 4:
-            raise InstrumentError(
-                "--fixed is for a camera without an inclinometer: leave out --tilt, --misalignment, "
-                "--turn-stddev and "
-                "--inclinometer"
-            )
-    elif args.sag is not None:
-        raise InstrumentError("--sag is for a camera fixed to the ground: give --fixed too")
     if not _camera_alone(args) and (args.output is None or (args.tilt is None and not args.fixed)):
         raise InstrumentError(
             "--site needs the tilts and a file to write: give --tilt CSV and -o INSTRUMENT.yaml (or --fixed in place of "
@@ -141,8 +124,14 @@ def run_elevations(
             console.complain("calibrate", f"left out: {row}")
     site = _site(args)
     found = axis_of(solver, pointings, tilts, site=site)
-    for remark in of_inclinometer(instrument):
+    for remark in (*of_left_out(found.left_out), *of_inclinometer(instrument)):
         console.complain("calibrate", remark)
+    scatter = np.sqrt(1 + found.scatter2)
+    if scatter > SCATTERED and found.stddev_arcsec > WORTH_SAVING_ARCSEC:
+        raise FixError(
+            f"A3 is not written: the elevations scatter by {scatter:.0f} times their stated errors, and determine it to "
+            f"{found.stddev_arcsec:.0f} arcsec only: check the place, the clock, and the tilts' axes, signs and units"
+        )
     calibration = found.calibration(instrument.calibration, options.turn_of(args))
     about = (
         f"A3 of {calibration.frames} elevations in {found.directions} directions at {_text_of(site)} "
@@ -220,6 +209,8 @@ def _json_of_site(found: Calibrated, path: str) -> dict:
 
 # Exit status.
 NOTHING = 1
+# elevations that scatter by more, in stated sigmas, contradict what is stated with them
+SCATTERED = 3.0
 # the stars of a frame, and their identification
 _Seen = tuple[Stars, Identification | None]
 
@@ -227,8 +218,6 @@ _Seen = tuple[Stars, Identification | None]
 def run(args: argparse.Namespace) -> int:
     if args.camera is None and args.site is None:
         raise InstrumentError("nothing to calibrate: give --camera OUT.yaml, --site LAT LON, or both")
-    if args.map is not None and args.camera is None:
-        raise InstrumentError("--map draws the camera's residuals: give --camera OUT.yaml too")
     options.check_frames(args)
     _open_night(args)
     if args.pointings is not None and args.camera is not None:

@@ -13,8 +13,9 @@ from starpos.cli.inputs import given_of, given_or_sought, reader_of
 from starpos.cli.options import vertical_of
 from starpos.cli.solve import read_receiver
 from starpos.errors import FrameError, InstrumentError
+from starpos.frames.reading import are_photographs
 from starpos.night.night import Night
-from starpos.night.opening import are_photographs, exposures, frames_in
+from starpos.night.opening import exposures, frames_in
 from starpos.night.reading import First, Instruments
 from starpos.night.solving import Exposures, How, solved_night
 from starpos.parameters.given import of_solver
@@ -34,13 +35,13 @@ SESSION = ".json"
 
 
 def run(args: argparse.Namespace) -> int:
-    options.check_self_calibration(args)
     if wrong := of_solver(args.param):
         raise InstrumentError(
             f"-p {wrong[0]}: a report has the solver's values from its other options, such as --misalignment; -p takes "
             "NODE:NAME:=VALUE of detector and inclinometer"
         )
-    _check_gnss(args)
+    if args.gnss is not None and len(args.nights) > 1:
+        raise InstrumentError("--gnss is of one night: give one")
     if args.field is not None:
         return _pack(args)
     if places_file.is_places(args.out):
@@ -104,13 +105,6 @@ def _write_places(args: argparse.Namespace) -> int:
     places_file.write(args.out, answers)
     print(args.out)
     return 0 if answers[-1]["utc"] else NO_FIX
-
-
-def _check_gnss(args: argparse.Namespace) -> None:
-    if args.gnss is not None and (args.self_calibrate or args.field is not None or len(args.nights) > 1):
-        raise InstrumentError(
-            "--gnss is of one night, and goes with neither --self-calibrate nor --field: leave one out"
-        )
 
 
 def _are_sessions(paths: list[str]) -> bool:

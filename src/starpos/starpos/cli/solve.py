@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from starpos.averaging.altitudes import FoundAxis
+from starpos.averaging.elevation_axis import FoundAxis
 from starpos.cli import console, fix_output, inputs, options, overwriting, places_file
 from starpos.cli.console import Output
 from starpos.cli.fix_output import (
@@ -110,10 +110,10 @@ def tell(
         tell_unknown("solve", args, vertical.at(where.latitude, where.longitude))
         about = {} if near is None else {"km_from_near": near.km_from(where.latitude, where.longitude)}
         if place is not None:
-            about |= with_heading(json_of(whole.average, vertical), mean, place)
+            about |= with_heading(json_of(whole.average, vertical), mean, place, options.axes_of(args))
         put_combined(output, night, whole.average, gathered, vertical, about)
     elif headings and place is not None:
-        fix_output.put_mean(output, night, headings, mean, place, vertical)
+        fix_output.put_mean(output, night, headings, mean, place, vertical, options.axes_of(args))
     elif gathered.lost is not None and not headings and work is not None:
         say(night, *work.fitting(gathered.lost))
     # without tilts headings are all that was asked for, and by day they are all there is
@@ -135,13 +135,13 @@ def _json_of_answer(
     if s.circle is not None:
         values |= {"utc": utc_text(s.circle.utc_unix_s)}
         values |= {"zenith_distance_deg": np.degrees(s.circle.zenith_distance)}
-    return values if place is None else with_heading(values, s.at_place, place)
+    return values if place is None else with_heading(values, s.at_place, place, options.axes_of(args))
 
 
 def _line_of_answer(args: argparse.Namespace, answer: FrameAnswer, place: Place | None) -> str:
     s, watched = answer.solution, answer.watched
     if place is not None or s.at_place is not None:
-        line = fix_output.heading_line_of(answer.name, s)
+        line = fix_output.heading_line_of(answer.name, s, options.axes_of(args))
     else:
         line = line_of(answer.name, s, args.self_calibrate)
     if watched is None or watched.compared is None:
@@ -173,19 +173,6 @@ def say(night: NightFolder, *texts: object) -> None:
     """Print lines about a whole night on standard error."""
     for text in texts:
         console.complain("solve", text if night.folder is None else f"{night.folder}: {text}")
-
-
-def check_gnss(args: argparse.Namespace) -> None:
-    """Raise InstrumentError if options do not go together."""
-    if args.gnss is None:
-        if args.learned is not None:
-            raise InstrumentError("--learned keeps what --gnss teaches: give both")
-        return
-    if args.self_calibrate or args.pointings is not None:
-        other = "--pointings" if args.pointings is not None else "--self-calibrate"
-        raise InstrumentError(f"--gnss and {other} do not go together: give one of the two")
-    if args.site is not None:
-        raise InstrumentError("--gnss and --site both say where the instrument is: give one of the two")
 
 
 def read_receiver(gnss: str | None, learned: str | None, command: str) -> Receiver | None:
@@ -236,8 +223,6 @@ def run_pointings(args: argparse.Namespace) -> int:
     own_level = options.has_own_level(args)
     if args.tilt is None and not own_level:
         raise InstrumentError("--pointings needs the tilts: give --tilt CSV")
-    if args.jobs is not None or args.scheduler is not None:
-        raise InstrumentError("--jobs and --scheduler are for frames: --pointings take only a moment")
     # pointings need no focal length
     instrument = options.instrument_of(args, NO_CAMERA)
     solver = Solver(instrument, catalogue.load_catalogue(), options.atmosphere_of(args))
@@ -341,11 +326,7 @@ def _of_field(args: argparse.Namespace) -> int:
 
 
 def _run(args: argparse.Namespace) -> int:
-    options.check_self_calibration(args)
-    if args.save is not None and not args.self_calibrate:
-        raise InstrumentError("--save writes what --self-calibrate finds: give both")
     options.check_frames(args)
-    check_gnss(args)
     if args.save is not None:
         overwriting.check(args, Written("--save", args.save, instrument_file.check_replaceable))
     if args.out is not None:

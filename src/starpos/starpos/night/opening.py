@@ -18,7 +18,7 @@ from starpos.files import open_regular, read_regular
 from starpos.frames.exif import CameraClock
 from starpos.frames.frame import Frame, Stars
 from starpos.frames.gravity import PHONE
-from starpos.frames.reading import FITS, HEIF, JPEG, PICTURE, RAW
+from starpos.frames.reading import FITS, HEIF, JPEG, PICTURE, RAW, are_photographs
 from starpos.frames.tables import GNSS, SIMULATED, TILTS, TRUTH
 from starpos.gnss.receiver import GnssTrack, read_gnss_csv
 from starpos.instrument import instrument_file, sensors
@@ -26,7 +26,7 @@ from starpos.instrument.instrument import ByGravity, Calibration, Instrument
 from starpos.instrument.tilt_log import TiltsByTime
 from starpos.night.night import Night, Truth
 from starpos.night.reading import About, First, Instruments, Reader, TiltFile
-from starpos.night.remarks import Remark, of_tilts
+from starpos.night.remarks import Remark, of_gravity, of_tilts
 from starpos.night.solving import Exposures, How, Worked, solved_night
 from starpos.night.together import Receiver
 from starpos.night.work import OnFile, Solving
@@ -56,20 +56,21 @@ def exposures(
 
     Raises FrameError if there are no frames, or truth.json cannot be used.
     """
-    frames, read, table = frames or frames_in(folder), read or Reader(), folder / TILTS
-    by_gravity = place is None and are_photographs(frames) and not table.exists()
-    if by_gravity:
-        # a new one, which has not kept a frame without its time
-        read = Reader(read.clock or CameraClock(), read.delay_s)
+    frames, read = frames or frames_in(folder), read or Reader()
+    tilts: Path | ByGravity = folder / TILTS
+    if place is None and not tilts.exists() and are_photographs(frames):
+        # a new reader, which has not kept a frame without its time
+        tilts, read = ByGravity(), Reader(read.clock or CameraClock(), read.delay_s)
+    by_gravity = isinstance(tilts, ByGravity)
     first = First(read, by_gravity)(tuple(map(str, frames)))
     work, remarks = Solving(given, atmosphere=atmosphere, places=place), tuple[Remark, ...]()
     if first is not None:
         try:
-            work, remarks = work_of(given, first, ByGravity() if by_gravity else table, atmosphere, place)
+            work, remarks = work_of(given, first, tilts, atmosphere, place)
         except TiltError as error:
-            tilts = None if place is not None and not table.exists() else TiltsByTime(why=str(error))
+            none = place is not None and not (folder / TILTS).exists()
             instruments, remarks = given.framed(first)
-            work = replace(work, instruments=instruments, tilts=tilts)
+            work = replace(work, instruments=instruments, tilts=None if none else TiltsByTime(why=str(error)))
 
     def each(work: Callable[[Frame | Stars], Any]) -> Worked:
         answers = Here().map((OnFile(read, work), str(path)) for path in frames)
@@ -78,7 +79,7 @@ def exposures(
     kind = "lists of stars" if frames[0].suffix == ".csv" else "frames"
     return Exposures(
         name=frames[0].name if len(frames) == 1 else folder.name or str(folder),
-        origin=f"solved from {len(frames)} {kind} and {'the gravity in them' if by_gravity else TILTS}",
+        origin=f"solved from {len(frames)} {kind} and {'the gravity in their files' if by_gravity else TILTS}",
         count=len(frames),
         each=each,
         work=work,
@@ -104,7 +105,8 @@ def work_of(
         model = PHONE if first.gravity is None else first.gravity.model
         known = None if given.instrument is None else given.instrument.levelled_by(model)
         instruments, remarks = replace(given, instrument=known).framed(first)
-        return Solving(instruments, atmosphere=atmosphere, tilts=tilts, places=place), remarks
+        own = () if known is None or first.gravity is None else of_gravity(known)
+        return Solving(instruments, atmosphere=atmosphere, tilts=tilts, places=place), (*own, *remarks)
     instruments, remarks = given.framed(first)
     if tilts is None:
         return Solving(instruments, atmosphere=atmosphere, places=place), remarks
@@ -135,11 +137,6 @@ def frames_in(folder: Path) -> list[Path]:
             f"of stars) and {TILTS}"
         )
     return frames
-
-
-def are_photographs(paths: Sequence[str | Path]) -> bool:
-    """Whether all files are of the kinds in which a telephone's photographs, with gravity, come."""
-    return all(os.path.splitext(path)[1].lower() in JPEG + HEIF + RAW for path in paths)
 
 
 def _is_star_list(path: Path) -> bool:
@@ -234,17 +231,19 @@ class NightOnDisk:
 
         Raises StarposError where the folder or the instrument cannot be used.
         """
-        given = self.instrument
+        given, sought = self.instrument, False
         if given is None:
             first = First(Reader())(tuple(map(str, frames_in(self.folder))))
             # each frame's own counts; without any, the frame says so
             given = None if first is None or first.focal_px is None else Instrument(first.focal_px)
+            if sought := first is not None and first.focal_px is None and first.gravity is not None:
+                given = Instrument(float(max(first.width, first.height)))
         if given is not None and self.calibration is not None:
             given = replace(given, calibration=self.calibration)
         if given is not None and self.inclinometer:
             model, errors = sensors.find(self.inclinometer)
             given = replace(given, inclinometer=errors, inclinometer_model=model)
-        instruments = Instruments(given, by_header=self.instrument is None)
+        instruments = Instruments(given, by_header=self.instrument is None, sought=sought)
         track = read_gnss_csv(gnss)[0] if isinstance(gnss, (str, Path)) else gnss
         return solved_night(
             exposures(self.folder, instruments, self.atmosphere, self.vertical, self.place),
