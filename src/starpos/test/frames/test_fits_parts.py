@@ -106,8 +106,11 @@ def test_a_part_that_claims_gigabytes_is_refused(tmp_path):
         read_frame(f"{tmp_path / 'a.fits'}[1]")
 
 
-@pytest.mark.parametrize(("name", "start"), [("FF_XX0001_20240618_011731_867_1054720.fits", None),
-                                             ("FF_XX0001_20240618_011731_867123_1054720.fits", "2024-06-18T02:00:00")])  # fmt: skip
+# the name has ms or us; the header's time counts before the name's
+FF = "FF_XX0001_20240618_011731_867_1054720.fits", "FF_XX0001_20240618_011731_867123_1054720.fits"
+
+
+@pytest.mark.parametrize(("name", "start"), [(FF[0], None), (FF[1], "2024-06-18T02:00:00")])
 def test_a_stack_of_a_meteor_camera_is_its_mean_and_one_exposure(tmp_path, name, start):
     primary = fits.PrimaryHDU()
     primary.header.update({"NFRAMES": 256, "FPS": 25.0, "CAMNO": "XX0001"})
