@@ -130,7 +130,7 @@ def _opened(path: Path) -> Iterator[BinaryIO]:
 def are_photographs(paths: Sequence[Path | str]) -> bool:
     """Whether files are of the kinds in which a telephone's photographs, with gravity, come.
 
-    What else lies beside them in its folder (screenshots, films) may be among them, but no FITS and no list of stars.
+    Other files of its folder (screenshots, films) may be among them, but no FITS and no list of stars.
     """
     kinds = {Path(path).suffix.lower() for path in paths}
     return bool(kinds & {*JPEG, *HEIF, *RAW}) and not kinds & {*FITS, ".csv"}

@@ -89,7 +89,7 @@ def photographs(sky, tmp_path_factory):
     folder = tmp_path_factory.mktemp("photographs")
     for k, (grey, mid_unix_s, up) in enumerate(sky):
         save(folder / f"IMG_{k}.{'heic' if k == 2 else 'jpg'}", grey, mid_unix_s, up)
-    # what a telephone keeps beside them
+    # a telephone keeps films in the same folder
     (folder / "IMG_2.mov").write_bytes(b"no picture")
     return folder
 
