@@ -7,7 +7,7 @@ catalogue.  The instrument knows only their sizes.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
