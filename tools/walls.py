@@ -73,6 +73,11 @@ class Module:
     def tree(self) -> ast.Module:
         return ast.parse(self.text)
 
+    @cached_property
+    def nodes(self) -> list[ast.AST]:
+        """All nodes of the tree, which many rules look through."""
+        return list(ast.walk(self.tree))
+
     @property
     def package(self) -> str:
         return self.name.partition(".")[0]
@@ -90,7 +95,7 @@ class Module:
 
     def docstrings(self) -> Iterator[tuple[int, str]]:
         """Each docstring, and the line of what it documents."""
-        for node in ast.walk(self.tree):
+        for node in self.nodes:
             if isinstance(node, DOCUMENTED) and (said := ast.get_docstring(node)):
                 yield getattr(node, "lineno", 1), said
 
@@ -99,7 +104,10 @@ class Module:
         yield from (node.name for node in self.tree.body if isinstance(node, ast.FunctionDef))
 
     def comments(self) -> Iterator[tuple[int, str, str]]:
-        """Comments, each with its line and the code next to it."""
+        """Comments next to code, each with its line and that code."""
+        # most files have none, and are not taken apart
+        if not re.search(r"(?m)^[ \t]*[^\s#].*#", self.text):
+            return
         for token in tokenize.generate_tokens(io.StringIO(self.text).readline):
             if token.type == tokenize.COMMENT:
                 yield token.start[0], token.line[: token.start[1]].strip(), token.string
@@ -189,7 +197,7 @@ def floors() -> dict[str, int]:
 
 def imports(module: Module) -> Iterator[tuple[ast.AST, str]]:
     """What it imports, and where."""
-    for node in ast.walk(module.tree):
+    for node in module.nodes:
         if isinstance(node, ast.Import):
             yield from ((node, alias.name) for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
@@ -250,7 +258,7 @@ def uncalled(sources: list[Module]) -> Iterator[str]:
 def aliases(sources: list[Module]) -> Iterator[str]:
     """Imports under another name: two things have one name."""
     for module in sources:
-        for node in ast.walk(module.tree):
+        for node in module.nodes:
             if isinstance(node, (ast.Import, ast.ImportFrom)):
                 for alias in node.names:
                     if alias.asname and (alias.name, alias.asname) not in USUAL:
@@ -263,7 +271,7 @@ def twins(sources: list[Module]) -> Iterator[str]:
     """Class names that stand for two things."""
     classes: dict[str, list[str]] = defaultdict(list)
     for module in sources:
-        for node in ast.walk(module.tree):
+        for node in module.nodes:
             if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
                 classes[node.name].append(module.at(node, node.name))
     for name, places in sorted(classes.items()):
@@ -299,7 +307,7 @@ def dataclass_call(node: ast.ClassDef) -> ast.expr | None:
 def keywords(sources: list[Module]) -> Iterator[str]:
     """Dataclasses of many fields that may be made by position."""
     for module in sources:
-        for node in ast.walk(module.tree):
+        for node in module.nodes:
             decorator = dataclass_call(node) if isinstance(node, ast.ClassDef) else None
             if decorator is None:
                 continue

@@ -74,6 +74,10 @@ class FixError(StarposError):
     """The stars do not support a fix."""
 
 
+class SatelliteError(StarposError):
+    """Orbits or sightings of satellites cannot be used, or do not give a place."""
+
+
 class StationError(StarposError):
     """The result of a zenith camera's session is missing or broken, or contradicts another one."""
 

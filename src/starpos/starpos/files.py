@@ -2,9 +2,13 @@
 """Files of others, read so that none of them can hang the program; files written whole or not at all; their URLs."""
 
 import errno
+import lzma
 import os
 import stat
 import tempfile
+import zipfile
+import zlib
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import BinaryIO
@@ -53,6 +57,31 @@ def read_regular(path: Path | str, most: int) -> bytes:
     """The content of a regular file; OSError as by `open_regular`, and if it has more than `most` bytes."""
     with open_regular(path) as file:
         return bytes_of(file, most)
+
+
+def unpacked(
+    path: Path | str, most_bytes: int, most_files: int, wanted: Callable[[str], bool] = lambda _: True
+) -> dict[str, bytes]:
+    """The files of a zip by their names there, those that are wanted by name; most_bytes bounds what they unpack to.
+
+    OSError as by `open_regular`; ValueError if it is no zip, or holds more.
+    """
+    with open_regular(path) as packed:
+        try:
+            with zipfile.ZipFile(packed) as file:
+                entries = [e for e in file.infolist() if not e.is_dir() and wanted(e.filename)]
+                if len(entries) > most_files or sum(e.file_size for e in entries) > most_bytes:
+                    raise ValueError("it unpacks to more than a night")
+                # an entry may be longer than it says: read no more than that
+                return {e.filename: _opened(file, e) for e in entries}
+        # encrypted, or of an unknown compression
+        except (RuntimeError, EOFError, zipfile.BadZipFile, zlib.error, lzma.LZMAError) as e:
+            raise ValueError(str(e) or "it is cut off") from None
+
+
+def _opened(file: zipfile.ZipFile, entry: zipfile.ZipInfo) -> bytes:
+    with file.open(entry) as content:
+        return content.read(entry.file_size)
 
 
 def write_whole(path: Path | str, content: bytes) -> None:

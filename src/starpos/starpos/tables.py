@@ -15,8 +15,9 @@ from pathlib import Path
 
 import numpy as np
 
-from starpos.errors import StarposError, one_line
+from starpos.errors import StarposError, TimeError, one_line
 from starpos.files import open_regular
+from starpos.units import unix_of
 
 # an empty cell, other than a line's first
 EMPTY = re.compile(r",[ \t]*(?=[,\r\n]|\Z)")
@@ -45,6 +46,7 @@ class TableForm:
 
     what    names the kind in messages      error   is raised, with one sentence, where a table cannot be used
     limits  of a column's cells, each inclusive; a needed column with limits has no empty cell
+    times   columns of ISO 8601 times, which become Unix seconds
     broken_rows_are_nan   otherwise a row that is not all numbers, or not as long as the line of names, is an error
     """
 
@@ -56,6 +58,7 @@ class TableForm:
     most_bytes: int = 300_000_000
     broken_rows_are_nan: bool = False
     may_be_empty: bool = False
+    times: tuple[str, ...] = ()
 
     @property
     def cure(self) -> str:
@@ -131,7 +134,9 @@ class TableForm:
                 row = next(csv.reader([line]))
                 if len(row) != width:
                     raise ValueError(f"the row has not as many cells as there are columns ({width})")
-                values = [_number(row[k], name) for name, k in used.items()]
+                values = [
+                    (_time if name in self.times else _number)(row[k], name) for name, k in used.items()
+                ]
             except (ValueError, csv.Error) as e:
                 if not self.broken_rows_are_nan:
                     raise ValueError(e) from None
@@ -173,3 +178,10 @@ def _number(cell: str, name: str) -> float:
         return float(cell) if cell.strip() else math.nan
     except ValueError:
         raise ValueError(f"{name} is {one_line(repr(cell))}, which is no number") from None
+
+
+def _time(cell: str, name: str) -> float:
+    try:
+        return unix_of(cell.strip()) if cell.strip() else math.nan
+    except TimeError as e:
+        raise ValueError(f"{name}: {e}") from None

@@ -14,6 +14,8 @@ DAY_S = 86400.0
 HOUR_S = 3600.0
 
 
+# m/s2; true within 0.3 % everywhere on the ground
+STANDARD_GRAVITY = 9.80665
 # a standard deviation by the median of absolute deviations
 SIGMA_PER_MAD = 1.4826
 # the median of chi-squared with two degrees of freedom

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from starpos.instrument.inclinometer import elevations
-from starpos.messages.tilt import STANDARD_GRAVITY
+from starpos.units import STANDARD_GRAVITY
 
 # What is looked for, the better first: a sensor that measures angles has calibrated and filtered them itself.
 INCLINATION, ACCELERATION = "incli", "accel"

@@ -14,7 +14,7 @@ from importlib import import_module
 from typing import Any, NoReturn
 
 from starpos import __version__
-from starpos.cli.commands import commands
+from starpos.cli.commands import check_call, commands
 from starpos.errors import StarposError
 from starpos.parallel import BLAS_THREADS
 
@@ -110,6 +110,7 @@ def main(argv: list[str] | None = None) -> int:
             # PYTHONWARNINGS may make errors of them
             if sys.warnoptions:
                 warnings.simplefilter("default")
+            check_call(args)
             status: int = args.run(args)
         # a reader that has gone must be noticed here, and not while the interpreter ends
         sys.stdout.flush()

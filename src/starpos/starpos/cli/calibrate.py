@@ -28,7 +28,7 @@ from starpos.frames.tables import TILTS, Pointing, read_pointings
 from starpos.identification import Identification
 from starpos.instrument import instrument_file
 from starpos.instrument.camera import Camera
-from starpos.instrument.inclinometer import level_of, up_of
+from starpos.instrument.inclinometer import up_of
 from starpos.instrument.instrument import (
     SAG_ARCSEC_PER_SQRT_HOUR,
     Calibration,
@@ -48,31 +48,14 @@ def check_site(args: argparse.Namespace) -> None:
     """Raise InstrumentError for options that do not fit together."""
     deflection = (args.xi, args.eta, args.deflection_stddev, args.geoid, args.altitude_m) != (None,) * 5
     if args.site is None:
-        if (
-            deflection
-            or args.geodetic
-            or args.fixed
-            or (args.output, args.valid_days, args.turn_stddev, args.sag) != (None,) * 4
-        ):
-            raise InstrumentError(
-                "-o, --fixed, --sag, --geodetic, --turn-stddev, --valid-days and the deflection are for a "
-                "calibration at a known place: give --site LAT LON"
-            )
+        if deflection:
+            raise InstrumentError("the deflection is for a calibration at a known place: give --site LAT LON")
         return
     if deflection and not args.geodetic:
         raise InstrumentError(
             "--xi, --eta, --deflection-stddev, --geoid and --altitude-m are of a place on WGS 84: say --geodetic, or "
             "leave them out"
         )
-    if args.fixed:
-        if (args.tilt, args.misalignment, args.turn_stddev, args.inclinometer) != (None,) * 4:
-            raise InstrumentError(
-                "--fixed is for a camera without an inclinometer: leave out --tilt, --misalignment, "
-                "--turn-stddev and "
-                "--inclinometer"
-            )
-    elif args.sag is not None:
-        raise InstrumentError("--sag is for a camera fixed to the ground: give --fixed too")
     if not _camera_alone(args) and (args.output is None or (args.tilt is None and not args.fixed)):
         raise InstrumentError(
             "--site needs the tilts and a file to write: give --tilt CSV and -o INSTRUMENT.yaml (or --fixed in place of "
@@ -227,8 +210,6 @@ _Seen = tuple[Stars, Identification | None]
 def run(args: argparse.Namespace) -> int:
     if args.camera is None and args.site is None:
         raise InstrumentError("nothing to calibrate: give --camera OUT.yaml, --site LAT LON, or both")
-    if args.map is not None and args.camera is None:
-        raise InstrumentError("--map draws the camera's residuals: give --camera OUT.yaml too")
     options.check_frames(args)
     _open_night(args)
     if args.pointings is not None and args.camera is not None:
@@ -395,7 +376,7 @@ def _levelled(
                 raise FrameError(f"no time of exposure: {why_no_time(stars)}")
             tilt = tilts.average(stars.mid_unix_s, stars.exposure_s or 0.0)
             instrument.inclinometer.check_live(tilt)
-            levels.append(level_of(tilt.up) @ instrument.mounting.a3)
+            levels.append(instrument.mounting.level(tilt).camera)
             kept.append((stars, found))
         except StarposError as e:
             console.complain("calibrate", f"{stars.source} is left out: {e}")

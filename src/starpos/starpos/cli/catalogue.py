@@ -49,10 +49,6 @@ def run_build(args: argparse.Namespace) -> int:
 
     if args.originals is None and args.gaia is None:
         raise CatalogueError("catalogue build: give the original files of Tycho-2, or --gaia TABLE, or both")
-    if args.gaia is None and args.year is not None:
-        raise CatalogueError("--year is for --gaia: give both")
-    if args.originals is None and args.limit_mag is not None:
-        raise CatalogueError("--limit-mag is for the original files: give both")
     overwriting.check(args, Written("--out", args.out, overwriting.stars))
     extract = None if args.gaia is None else gaia.read(Path(args.gaia))
     if args.originals is None:

@@ -11,6 +11,12 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from starpos.errors import StarposError
+
+
+class CallError(StarposError):
+    """The options of a call do not go together."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class Command:
@@ -63,6 +69,13 @@ def _rows_of(file: str) -> dict[str, Any]:
     return rows
 
 
+def check_call(args: argparse.Namespace) -> None:
+    """Raise CallError if the options of a call do not go together."""
+    command = commands()[args.command]
+    kind = getattr(args, "kind", None)
+    check_options(command.options if kind is None else command.kinds[kind]["options"], args)
+
+
 def commands() -> dict[str, Command]:
     """The commands by their names, in the order of --help."""
     return {name: Command(**row) for name, row in _rows_of("commands.yaml").items()}
@@ -78,12 +91,15 @@ def add_options(parser: argparse.ArgumentParser, rows: Mapping[str, dict | None]
     words   words that may stand for a number, with the value of each
     one_of  name of the set of options of which a call may give one, or has to if one is required
     under   title in --help
+    needs, apart   for `check_options`
     """
     sets: dict[str, Any] = {}
     for names, row in _unfolded(rows):
         about: dict[str, Any] = {
             key: tuple(value) if isinstance(value, list) else value for key, value in row.items()
         }
+        about.pop("needs", None)
+        about.pop("apart", None)
         place: argparse._ActionsContainer = parser
         if "under" in about:
             title = about.pop("under")
@@ -100,6 +116,25 @@ def add_options(parser: argparse.ArgumentParser, rows: Mapping[str, dict | None]
             allowed = {key: about.pop(key) for key in ("minimum", "maximum", "words") if key in about}
             about["type"] = OTHERS.get(kind) or number(NUMBERS[kind], **allowed)
         place.add_argument(*names.split(), **about)
+
+
+def check_options(rows: Mapping[str, dict | None], args: argparse.Namespace) -> None:
+    """Raise CallError for an option without the one that it `needs`, or with one from which it stays `apart`."""
+    known = {names.split()[-1]: row for names, row in _unfolded(rows)}
+
+    def given(name: str) -> bool:
+        row = known[name]
+        default = {"flag": False, "several": []}.get(row.get("kind", ""), row.get("default"))
+        return getattr(args, name.lstrip("-").replace("-", "_")) not in (default, [])
+
+    for name, row in known.items():
+        if not given(name):
+            continue
+        if "needs" in row and not given(row["needs"]):
+            raise CallError(f"{name} is for {row['needs']}: give both")
+        for other in row.get("apart", ()):
+            if other in known and given(other):
+                raise CallError(f"{name} and {other} do not go together: give one of the two")
 
 
 def _unfolded(rows: Mapping[str, dict | None]) -> Iterator[tuple[str, dict]]:

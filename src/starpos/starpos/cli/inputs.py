@@ -75,8 +75,6 @@ def checked_tilts(command: str, path: str, instrument: Instrument) -> TiltFile:
 def near_of(args: argparse.Namespace) -> Near | None:
     """The place of --near; None without it.  Raises InstrumentError."""
     if args.near is None:
-        if args.near_km is not None:
-            raise InstrumentError("--near-km is for --near: give both")
         return None
     latitude, longitude = args.near
     if not (abs(latitude) <= 90 and abs(longitude) <= 360):
@@ -173,10 +171,6 @@ def read_bag(path: Path, args: argparse.Namespace) -> "tuple[Recorded, Instrumen
 def workers_of(args: argparse.Namespace, frames: int) -> Workers:
     """The workers that the options ask for, with no more processes than frames; raises InstrumentError."""
     if args.scheduler is not None:
-        if args.jobs is not None:
-            raise InstrumentError(
-                "--scheduler names machines, --jobs processes of this one: give one of the two"
-            )
         return Cluster(args.scheduler)
     return workers(min(processors() if args.jobs == 0 else args.jobs or 1, frames))
 

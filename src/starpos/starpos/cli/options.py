@@ -29,10 +29,6 @@ def check_frames(args: argparse.Namespace) -> None:
     """Raise InstrumentError unless there are either frames or --pointings."""
     if bool(args.frames) == (args.pointings is not None):
         raise InstrumentError("give either frames or --pointings CSV" + (", not both" if args.frames else ""))
-    if args.pointings is not None and (args.shutter_delay, args.readout) != (None, None):
-        raise InstrumentError(
-            "--shutter-delay and --readout are for frames: the times in --pointings are when the sky was seen"
-        )
 
 
 def has_own_level(args: argparse.Namespace) -> bool:
@@ -57,8 +53,6 @@ def clock_of(args: argparse.Namespace) -> CameraClock | None:
     """The clock that wrote the times in EXIF; None if the options do not give it.  Raises InstrumentError."""
     offset_h, stddev_s = args.exif_utc_offset, args.exif_clock_stddev
     if offset_h is None:
-        if stddev_s is not None:
-            raise InstrumentError("--exif-clock-stddev is for --exif-utc-offset: give both")
         return None
     return CameraClock(None if offset_h == FILES_OWN else offset_h, stddev_s)
 
@@ -66,12 +60,6 @@ def clock_of(args: argparse.Namespace) -> CameraClock | None:
 def turn_of(args: argparse.Namespace) -> float:
     """Sigma in deg of A3's turn about the plumb line, from --turn-stddev."""
     return 180.0 if args.turn_stddev is None else args.turn_stddev
-
-
-def check_self_calibration(args: argparse.Namespace) -> None:
-    """Raise InstrumentError for a --turn-stddev that would be ignored."""
-    if args.turn_stddev is not None and not args.self_calibrate:
-        raise InstrumentError("--turn-stddev is for --self-calibrate: give both")
 
 
 def camera_of(args: argparse.Namespace) -> Camera:
@@ -99,8 +87,6 @@ def instrument_of(args: argparse.Namespace, first: "HasFocalLength | None") -> i
     model = getattr(args, "inclinometer", None)
     lens = getattr(args, "lens", PLUMB_BOB)
     flat = (args.focal_mm, args.pixel_um, misalignment, stddev, model) != (None,) * 5 or lens != PLUMB_BOB
-    if stddev is not None and misalignment is None:
-        raise InstrumentError("--misalignment-stddev is the error of --misalignment: give both")
     if path is not None:
         if flat:
             raise InstrumentError(
@@ -157,11 +143,6 @@ def vertical_of(args: argparse.Namespace) -> Vertical:
     """
     by_hand = args.xi, args.eta, args.deflection_stddev
     if args.geoid is not None:
-        if by_hand != (None, None, None):
-            raise InstrumentError(
-                "--geoid gives the deflection and its error: give either --geoid or --xi, --eta and "
-                "--deflection-stddev"
-            )
         return _at_height(geoid.read(args.geoid), args)
     if by_hand == (None, None, None):
         return _at_height(Deflection(), args)
@@ -196,20 +177,12 @@ def place_of(args: argparse.Namespace, vertical: Vertical) -> Place | None:
     vertical: the deflection by the other options.
     """
     if args.site is None:
-        if args.geodetic or args.site_stddev is not None:
-            raise InstrumentError("--geodetic and --site-stddev are for --site: give it too")
         return None
     if len(args.site) not in (2, 3):
         raise InstrumentError(
             f"--site has {len(args.site)} numbers: give latitude, longitude and optionally the height in m, "
             f"after the frames"
         )
-    if args.self_calibrate:
-        raise InstrumentError(
-            "--self-calibrate is for an unknown place: leave out --site, or find A3 by starpos calibrate --site"
-        )
-    if args.pointings is not None:
-        raise InstrumentError("--site is for frames, and --pointings has none: leave out one of them")
     if len(args.site) == 3 and isinstance(vertical, AtHeight):
         if args.altitude_m is not None:
             raise InstrumentError("--site has a height, and --altitude-m another: give one")

@@ -31,13 +31,13 @@ SESSION = ".json"
 
 
 def run(args: argparse.Namespace) -> int:
-    options.check_self_calibration(args)
     if wrong := of_solver(args.param):
         raise InstrumentError(
             f"-p {wrong[0]}: a report has the solver's values from its other options, such as --misalignment; -p takes "
             "NODE:NAME:=VALUE of detector and inclinometer"
         )
-    _check_gnss(args)
+    if args.gnss is not None and len(args.nights) > 1:
+        raise InstrumentError("--gnss is of one night: give one")
     if args.field is not None:
         return _pack(args)
     if find_spec("matplotlib") is None:
@@ -68,13 +68,6 @@ def run(args: argparse.Namespace) -> int:
     write_files(Path(args.out), files | {PAGE: html.encode(errors="replace")})
     print(Path(args.out) / PAGE)
     return 0 if any(n.combined for n in nights) else NO_FIX
-
-
-def _check_gnss(args: argparse.Namespace) -> None:
-    if args.gnss is not None and (args.self_calibrate or args.field is not None or len(args.nights) > 1):
-        raise InstrumentError(
-            "--gnss is of one night, and goes with neither --self-calibrate nor --field: leave one out"
-        )
 
 
 def _are_sessions(paths: list[str]) -> bool:

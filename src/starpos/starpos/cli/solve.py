@@ -175,19 +175,6 @@ def say(night: NightFolder, *texts: object) -> None:
         console.complain("solve", text if night.folder is None else f"{night.folder}: {text}")
 
 
-def check_gnss(args: argparse.Namespace) -> None:
-    """Raise InstrumentError if options do not go together."""
-    if args.gnss is None:
-        if args.learned is not None:
-            raise InstrumentError("--learned keeps what --gnss teaches: give both")
-        return
-    if args.self_calibrate or args.pointings is not None:
-        other = "--pointings" if args.pointings is not None else "--self-calibrate"
-        raise InstrumentError(f"--gnss and {other} do not go together: give one of the two")
-    if args.site is not None:
-        raise InstrumentError("--gnss and --site both say where the instrument is: give one of the two")
-
-
 def read_receiver(gnss: str | None, learned: str | None, command: str) -> Receiver | None:
     """Read the tables of --gnss and --learned; None without the first.  Raises StarposError."""
     if gnss is None:
@@ -236,8 +223,6 @@ def run_pointings(args: argparse.Namespace) -> int:
     own_level = options.has_own_level(args)
     if args.tilt is None and not own_level:
         raise InstrumentError("--pointings needs the tilts: give --tilt CSV")
-    if args.jobs is not None or args.scheduler is not None:
-        raise InstrumentError("--jobs and --scheduler are for frames: --pointings take only a moment")
     # pointings need no focal length
     instrument = options.instrument_of(args, NO_CAMERA)
     solver = Solver(instrument, catalogue.load_catalogue(), options.atmosphere_of(args))
@@ -341,11 +326,7 @@ def _of_field(args: argparse.Namespace) -> int:
 
 
 def _run(args: argparse.Namespace) -> int:
-    options.check_self_calibration(args)
-    if args.save is not None and not args.self_calibrate:
-        raise InstrumentError("--save writes what --self-calibrate finds: give both")
     options.check_frames(args)
-    check_gnss(args)
     if args.save is not None:
         overwriting.check(args, Written("--save", args.save, instrument_file.check_replaceable))
     if args.pointings is not None:

@@ -107,7 +107,7 @@ def earth_state(utc_unix_s: float, orientation: EarthOrientation | None = None) 
     """
     orientation = orientation or earth_orientation(utc_unix_s)
     # computed in seconds, because ERFA's UTC stretches a day that ends in a leap second, and Unix time does not
-    tt = UNIX_EPOCH_JD, (utc_unix_s + _tai_minus_utc(utc_unix_s) + TT_MINUS_TAI_S) / DAY_S
+    tt = UNIX_EPOCH_JD, (utc_unix_s + tai_minus_utc(utc_unix_s) + TT_MINUS_TAI_S) / DAY_S
     ut1 = UNIX_EPOCH_JD, (utc_unix_s + orientation.ut1_minus_utc_s) / DAY_S
     # TT serves as TDB: they differ by 2 ms
     astrom, _ = erfa.apci13(*tt)
@@ -160,7 +160,7 @@ def earth_orientation(utc_unix_s: float) -> EarthOrientation:
             f"{utc_text(utc_unix_s)} lies outside the IERS tables (1973 to {_year(table.mjd[-1]):.1f}, and three years "
             "of extrapolation): check the frame's clock, or upgrade astropy-iers-data"
         )
-    leap = _tai_minus_utc(utc_unix_s)
+    leap = tai_minus_utc(utc_unix_s)
     if beyond > 0:
         ut1_minus_tai = table.ut1_minus_tai[-1] + beyond * table.slope
         sigma = np.hypot(table.ut1_sigma[-1], np.interp(beyond, EXTRAPOLATION_DAYS, EXTRAPOLATION_SIGMA_S))
@@ -253,7 +253,7 @@ def _table() -> _Table:
     )
 
 
-def _tai_minus_utc(utc_unix_s: float) -> float:
+def tai_minus_utc(utc_unix_s: float) -> float:
     """TAI - UTC (s) of the day; beyond the table's end its last value."""
     table = _table()
     day = int(utc_unix_s // DAY_S + UNIX_EPOCH_JD - 2400000.5 - table.mjd[0])

@@ -13,7 +13,15 @@ from starpos.earth.ellipsoid import curvature_radii_m
 from starpos.earth.orientation import EarthState, earth_state
 from starpos.earth.place import Place, Places
 from starpos.earth.refraction import Atmosphere
-from starpos.errors import FieldError, FixError, InstrumentError, PlaceError, StarposError, TimeError
+from starpos.errors import (
+    FieldError,
+    FixError,
+    InstrumentError,
+    PlaceError,
+    StarposError,
+    TiltError,
+    TimeError,
+)
 from starpos.fix.checks import (
     check_above_horizon,
     check_exposure,
@@ -45,7 +53,7 @@ from starpos.identification.search import (
 )
 from starpos.identification.triangles import TriangleCatalogue, cached_triangles
 from starpos.instrument.camera import EQUIDISTANT, Camera
-from starpos.instrument.inclinometer import Tilt
+from starpos.instrument.inclinometer import EITHER_WAY, Tilt
 from starpos.instrument.instrument import OWN_LEVEL, ByGravity, Instrument
 from starpos.instrument.tilt_log import NO_TILTS, Tilts
 from starpos.progress import Progress, quiet
@@ -54,6 +62,9 @@ from starpos.sky.catalogue import Catalogue
 
 # A fisheye's lower stars are not used: no model describes refraction near the horizon.
 MIN_ALTITUDE_RAD = math.radians(10)
+
+# Sine of the altitude beyond which the stars of a frame determine the sign of up: A3 may be off by degrees.
+MIN_TOLD_SINE = math.sin(math.radians(6))
 
 
 def inside(stars: Stars, camera: Camera) -> np.ndarray | None:
@@ -259,11 +270,23 @@ class Solver:
         # the width of a uniform distribution with this standard deviation, as rounding causes
         spread_s = math.sqrt(12) * frame.stamp_stddev_s
         tilt = tilts.average(frame.mid_unix_s, frame.exposure_s or 0.0, spread_s)
+        if tilt.either_way:
+            tilt = self._upright(tilt, frame)
         self.instrument.calibration.check_age(frame.mid_unix_s)
         self.instrument.inclinometer.check_live(tilt)
         self.instrument.inclinometer.check_range(tilt)
         self.instrument.inclinometer.check_axes(tilt)
         return state, tilt
+
+    def _upright(self, tilt: Tilt, frame: Stars | Pointing) -> Tilt:
+        """A tilt that may point up or down, by the frame's stars: they are seen, so they are above the horizon."""
+        seen = np.array([[0.0, 0.0, 1.0]])
+        if isinstance(frame, Stars) and len(frame.x):
+            seen = directions_of(self.view(frame.width, frame.height, frame.origin_px)[0], frame)
+        sine = float(seen.mean(0) @ self.instrument.mounting.a3.T @ tilt.up)
+        if self.instrument.calibration.unknown or abs(sine) < MIN_TOLD_SINE:
+            raise TiltError(EITHER_WAY)
+        return replace(tilt if sine > 0 else tilt.reversed, either_way=False)
 
     def _fix(
         self,

@@ -2,7 +2,7 @@
 """The inclinometer: its readings, its errors, and A2, which takes its frame S into the local level L."""
 
 import math
-from dataclasses import KW_ONLY, dataclass
+from dataclasses import KW_ONLY, dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -37,6 +37,11 @@ UNMEASURED_WALK_C_PER_SQRT_HOUR = UNMEASURED_JUMP_C / math.sqrt(6.0)
 OUTDOORS_WALK_C_PER_SQRT_HOUR = 2.0
 # a few readings may stand on larger steps than the sensor's by chance, up to this many times as large
 BY_CHANCE = 2.5
+# said of a telephone's log without its description, where the stars do not show it either
+EITHER_WAY = (
+    "the telephone's log does not say whether its readings point up or down: give the app's whole zip, with its "
+    "Metadata.csv, or state A3 (--misalignment) and point the camera well above the horizon"
+)
 # sine above which X' counts as vertical: then L's X is taken below Y' instead
 STEEP = 0.999
 
@@ -60,6 +65,7 @@ class Tilt:
     variance_z : rad2 of theta_z; NaN: as for the other two
     step_rad : step to which the readings are rounded, where it is larger than their noise; 0: finer;
         inf: they repeat to the last digit and show no step
+    either_way : whether the signs may all be wrong, because it is unknown if the readings point up or down
 
     Examples
     --------
@@ -79,6 +85,7 @@ class Tilt:
     theta_z: float = float("nan")
     variance_z: float = float("nan")
     step_rad: float = 0.0
+    either_way: bool = False
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "covariance", np.asarray(self.covariance, float))
@@ -98,6 +105,11 @@ class Tilt:
     def average(self, mid_unix_s: float, exposure_s: float, spread_s: float = 0.0) -> "Tilt":
         """Return itself: a single tilt serves any exposure, as `starpos.instrument.tilt_log.Tilts`."""
         return self
+
+    @property
+    def reversed(self) -> "Tilt":
+        """This tilt with the other sign."""
+        return replace(self, theta_x=-self.theta_x, theta_y=-self.theta_y, theta_z=-self.theta_z)
 
     @property
     def axes(self) -> int:

@@ -15,9 +15,10 @@ import numpy as np
 
 from starpos import rotation
 from starpos._numeric.roots import symmetric_root
-from starpos.errors import InstrumentError
+from starpos.errors import InstrumentError, TiltError
 from starpos.frozen import at_once
 from starpos.instrument.inclinometer import (
+    EITHER_WAY,
     EXACT,
     UNMEASURED_JUMP_C,
     InclinometerErrors,
@@ -164,8 +165,12 @@ class Mounting:
     def level(self, tilt: Tilt) -> LocalLevel:
         """The level at a tilt; InstrumentError if the response is of a sensor with another number of axes.
 
+        TiltError if it may point up or down.
+
         Zeros that were not calibrated are assumed to err by the contradiction of the axes.
         """
+        if tilt.either_way:
+            raise TiltError(EITHER_WAY)
         zeroed = self._zeroed[tilt.axes]
         if self.response:
             columns = response_columns(tilt.theta, tilt.up, zeroed)

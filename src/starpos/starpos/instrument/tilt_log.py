@@ -126,6 +126,7 @@ class TiltLog:
     theta_z : (N,) rad; None or NaN for a two-axis sensor
     variance_z : (N,) rad2; None or NaN: as for the other two
     earlier_excess : noise over the stated one that earlier readings showed, which are not in the log
+    either_way : as of a `Tilt`
 
     Examples
     --------
@@ -144,6 +145,7 @@ class TiltLog:
     theta_z: np.ndarray | None = None
     variance_z: np.ndarray | None = None
     earlier_excess: float = 1.0
+    either_way: bool = False
 
     @classmethod
     def of(
@@ -355,6 +357,7 @@ class TiltLog:
             samples=n,
             temperature_c=_mean_known(self.temperature_c[use]),
             times=tuple(self.utc_unix_s[use].tolist()),
+            either_way=self.either_way,
         )
 
     def _edges(self, use: np.ndarray) -> Iterator[tuple[int, int]]:

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from starpos.errors import TiltError
+from starpos.instrument import phone_log
 from starpos.instrument.inclinometer import MAX_CELSIUS, SCA100T_NOISE_RAD, elevations
 from starpos.instrument.tilt_log import BRACKET_S, OUTLIER_SIGMA, TiltLog, white_noise
 from starpos.tables import TableForm
@@ -34,7 +35,7 @@ QUARTER = 0.3186
 
 
 def read_tilt_csv(path: Path | str, noise_rad: float = SCA100T_NOISE_RAD) -> TiltLog:
-    """Read a TiltLog from a CSV, one reading of a sensor a line.
+    """Read a TiltLog from a CSV, one reading of a sensor a line; or from a telephone's log (`phone_log`).
 
     Columns: utc_unix_s, theta_x_deg, theta_y_deg; theta_z_deg of a three-axis sensor; temperature_c, unknown (NaN) where
     it is beyond MAX_CELSIUS; sigma_deg, 1 sigma of the white noise of that line's angles. Other columns are ignored.
@@ -60,6 +61,9 @@ def read_tilt_csv(path: Path | str, noise_rad: float = SCA100T_NOISE_RAD) -> Til
     (25,)
     """
     path = Path(path)
+    if (log := phone_log.read(path, noise_rad)) is not None:
+        _check_digits(path, log.utc_unix_s)
+        return log
     table = TILT_TABLE.read(path)
     column = table.columns
     if not np.isfinite([column[name] for name in TILT_TABLE.needed]).all(0).any():

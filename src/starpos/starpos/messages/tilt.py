@@ -15,6 +15,7 @@ from starpos.frozen import at_once
 from starpos.instrument.inclinometer import MAX_CELSIUS, SCA100T_NOISE_RAD, SQUARE, Tilt
 from starpos.instrument.tilt_log import NoiseTracker
 from starpos.messages.stamp import PlainHeader, PlainStamp, stamp_to_unix
+from starpos.units import STANDARD_GRAVITY
 
 # bits of Tilt.flags, as starpos_interfaces defines them
 OUT_OF_RANGE, STUCK, SATURATED, GAP, TIME_UNKNOWN = 1, 2, 4, 8, 16
@@ -114,8 +115,6 @@ def _third_axis(message: Any) -> tuple[float, float]:
     return z, variance or math.nan
 
 
-# m/s2; true within 0.3 % everywhere on the ground
-STANDARD_GRAVITY = 9.80665
 # Minimum number of messages in an average: fewer show no scatter.
 MIN_MESSAGES = 3
 # Share of the time of an average that its messages must cover.

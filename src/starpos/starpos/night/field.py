@@ -10,7 +10,6 @@ import json
 import platform
 import tempfile
 import zipfile
-import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -22,10 +21,11 @@ import numpy as np
 
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import FrameError, WriteError
-from starpos.files import read_regular, write_whole
+from starpos.files import unpacked, write_whole
 from starpos.frames.frame import Stars
 from starpos.frames.tables import SIMULATED, TILTS, TRUTH, write_star_list
 from starpos.instrument import instrument_file
+from starpos.instrument.inclinometer import EITHER_WAY
 from starpos.instrument.instrument import Instrument
 from starpos.instrument.tilt_log import TiltLog
 from starpos.night.night import Truth
@@ -49,6 +49,8 @@ def write(path: Path, exposures: Exposures, progress: Progress = quiet) -> int:
     """
     tilts = exposures.work.tilts
     log = tilts.log if isinstance(tilts, TiltFile) else tilts
+    if isinstance(log, TiltLog) and log.either_way:
+        raise FrameError(f"{exposures.name}: {EITHER_WAY}")
     if not isinstance(log, TiltLog):
         raise FrameError(f"{exposures.name}: no tilts: a field report needs the night's tilts")
     lists: dict[str, bytes] = {}
@@ -98,27 +100,15 @@ def opened(path: Path | str) -> Iterator[tuple[Path, Atmosphere]]:
         folder = Path(base) / Path(path).stem
         folder.mkdir()
         try:
-            with zipfile.ZipFile(io.BytesIO(read_regular(path, MAX_BYTES))) as file:
-                entries = file.infolist()
-                if len(entries) > MAX_FILES or sum(e.file_size for e in entries) > MAX_BYTES:
-                    raise ValueError("it unpacks to more than a night")
-                for entry in entries:
-                    if not _ours(entry.filename):
-                        raise ValueError(f"it holds {entry.filename[:40]!r}")
-                    (folder / entry.filename).write_bytes(file.read(entry))
+            for name, content in unpacked(path, MAX_BYTES, MAX_FILES).items():
+                if not _ours(name):
+                    raise ValueError(f"it holds {name[:40]!r}")
+                (folder / name).write_bytes(content)
             about = json.loads((folder / ABOUT).read_text())
             if about["starpos_field"] != FORMAT:
                 raise ValueError(f"its format is {about['starpos_field']!r}, and this starpos reads {FORMAT}")
             air = Atmosphere(**about["air"])
-        except (
-            OSError,
-            ValueError,
-            KeyError,
-            TypeError,
-            RuntimeError,
-            zipfile.BadZipFile,
-            zlib.error,
-        ) as error:
+        except (OSError, ValueError, KeyError, TypeError) as error:
             why = getattr(error, "strerror", None) or error
             raise FrameError(f"{path}: not a field report of starpos ({why})") from None
         yield folder, air

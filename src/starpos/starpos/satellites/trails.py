@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from starpos.earth.orientation import ROTATION_RAD_S
 from starpos.frozen import at_once
 from starpos.rotation import normalised
 
@@ -20,7 +21,7 @@ class SatelliteTrail:
     covariance (E, 2, 2): rad2 along the directions of growing right ascension and growing declination.
     utc_unix_s (E,): time of each end; the first end is at the opening of the shutter.
     turned_utc_unix_s (E,): the ends' times if the satellite flew the other way; None: the way is known. (With a rolling
-    shutter each end has the time of its own row.)
+    shutter each end has the time of its own row.) The camera then stands on the ground, and `directions` turn with it.
     time_stddev_s: error of the trail's own time, of a stop watch; the clock's, shared by all, is not in it.
     satellite: catalogue number that the observer states, or None.  file: frame that it was seen on, or "".
     """
@@ -39,7 +40,9 @@ class SatelliteTrail:
         """The trail as it is, and where its way is unknown, also with the other times; the way of each is known."""
         yield replace(self, turned_utc_unix_s=None)
         if self.turned_utc_unix_s is not None:
-            yield replace(self, utc_unix_s=self.turned_utc_unix_s, turned_utc_unix_s=None)
+            times = self.turned_utc_unix_s
+            directions = turned(self.directions, times - self.utc_unix_s)
+            yield replace(self, directions=directions, utc_unix_s=times, turned_utc_unix_s=None)
 
     @property
     def axes(self) -> np.ndarray:
@@ -47,3 +50,13 @@ class SatelliteTrail:
         x, y, z = self.directions.T
         east = normalised(np.stack([-y, x, np.zeros_like(z)], -1))
         return np.stack([east, np.cross(self.directions, east)], 1)
+
+
+def turned(directions: np.ndarray, seconds: np.ndarray) -> np.ndarray:
+    """Directions (N, 3), GCRS, that stand still above the ground, as they are `seconds` (N,) later.
+
+    They turn about the axis of GCRS. The Earth's is 0.2 deg from it, which is 0.1 arcsec in 2 s.
+    """
+    c, s = np.cos(ROTATION_RAD_S * seconds), np.sin(ROTATION_RAD_S * seconds)
+    x, y, z = directions.T
+    return np.stack([c * x - s * y, s * x + c * y, z], -1)

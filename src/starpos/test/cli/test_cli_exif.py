@@ -80,7 +80,7 @@ def test_files_that_do_not_say_their_zone_have_no_time_where_they_should_say_it(
     [
         (("--exif-clock-stddev", "3"), "--exif-utc-offset: give both"),
         (("--exif-utc-offset", "15"), "between -14 and 14"),
-        (("--exif-utc-offset", "local"), "invalid float"),
+        (("--exif-utc-offset", "local"), "neither a number nor file"),
         (("--exif-utc-offset", "nan"), "between -14 and 14"),
     ],
 )

@@ -81,12 +81,12 @@ def test_a_touch_in_the_night_costs_the_frames_after_it(instrument, first, tmp_p
 
 
 REFUSED = {
-    "tilts too": (("--fixed", *SITE, "--tilt", "t.csv", "-o", "OUT"), "leave out --tilt"),
-    "an A3 too": (("--fixed", *SITE, "--misalignment", 1, 2, 3, "-o", "OUT"), "leave out --tilt, --misalignment"),
-    "an inclinometer too": (("--fixed", *SITE, "--inclinometer", "scl3300", "-o", "OUT"), "leave out --tilt"),
-    "no site": (("--fixed", "-o", "OUT", "--camera", "OUT"), "give --site LAT LON"),
+    "tilts too": (("--fixed", *SITE, "--tilt", "t.csv", "-o", "OUT"), "--fixed and --tilt do not go"),
+    "an A3 too": (("--fixed", *SITE, "--misalignment", 1, 2, 3, "-o", "OUT"), "do not go together"),
+    "an inclinometer too": (("--fixed", *SITE, "--inclinometer", "scl3300", "-o", "OUT"), "do not go together"),
+    "no site": (("--fixed", "-o", "OUT", "--camera", "OUT"), "--fixed is for --site"),
     "nowhere to write": (("--fixed", *SITE), "-o INSTRUMENT.yaml"),
-    "sag alone": (("--sag", 3, *SITE, "--tilt", "t.csv", "-o", "OUT"), "give --fixed too"),
+    "sag alone": (("--sag", 3, *SITE, "--tilt", "t.csv", "-o", "OUT"), "--sag is for --fixed"),
     "a negative sag": (("--fixed", *SITE, "--sag", -1, "-o", "OUT"), "must lie between 0 and 3600"),
 }  # fmt: skip
 

@@ -89,7 +89,7 @@ def test_a_site_that_the_tilts_contradict_gives_no_heading(solve, lists):
         (("47.3",), "--site has 1 numbers"),
         (("47.3", "-122.8", "10", "20"), "--site has 4 numbers"),
         (("47.3", "-122.8", "10", "--altitude-m", "20"), "--site has a height"),
-        (("47.3", "-122.8", "--self-calibrate"), "leave out --site"),
+        (("47.3", "-122.8", "--self-calibrate"), "--site and --self-calibrate do not go"),
     ],
 )
 def test_a_site_that_cannot_be_is_refused_in_a_sentence(solve, site, said):
@@ -101,7 +101,7 @@ def test_a_site_that_cannot_be_is_refused_in_a_sentence(solve, site, said):
 def test_what_belongs_to_a_site_is_refused_without_one(solve):
     for option in (("--geodetic",), ("--site-stddev", "3")):
         status, _, errors = solve(*WIDE, *option)
-        assert status == 2 and "are for --site" in errors[0]
+        assert status == 2 and "is for --site" in errors[0]
 
 
 def test_the_table_and_the_lines_have_headings(solve, truth):

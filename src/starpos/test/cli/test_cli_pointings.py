@@ -161,7 +161,7 @@ REFUSED = {
     "no such table": (("--pointings", "none.csv", "TILT"), "none.csv: there is no such file"),
     "how near without where": (("WHOLE", "TILT", *A3, "--near-km", "20"), "--near-km is for --near"),
     "near nowhere": (("BARE", "TILT", "--near", "95", "2"), "give latitude and longitude in deg"),
-    "processes": (("WHOLE", "TILT", "--jobs", "2"), "--jobs and --scheduler are for frames"),
+    "processes": (("WHOLE", "TILT", "--jobs", "2"), "--jobs and --pointings do not go together"),
 }  # fmt: skip
 
 

@@ -219,7 +219,12 @@ def option(command, name):
         ("identify", "--search-time", "help", f"({blind.SEARCH_S:g} s)"),
         ("solve", "--near-km", "help", f"({NEAR_KM:g};"),
         ("solve", "--clock-stddev", "help", f"else {instrument.UNKNOWN_CLOCK_S:g};"),
-        ("solve", "--exif-clock-stddev", "help", f"({exif.UNTENDED_STDDEV_S:g};"),
+        (
+            "solve",
+            "--exif-clock-stddev",
+            "help",
+            f"({exif.UNTENDED_STDDEV_S:g}, a telephone's {exif.NETWORK_STDDEV_S:g};",
+        ),
         ("solve", "--inclinometer", "help", ", ".join(sensors.presets())),
         ("solve", "--lens", "choices", (PLUMB_BOB, EQUIDISTANT)),
         (

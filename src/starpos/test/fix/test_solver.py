@@ -213,6 +213,20 @@ def test_a_focal_length_that_is_none(night, catalogue):
         )
 
 
+@pytest.mark.parametrize("sign", [1, -1])
+def test_stars_tell_which_way_a_level_without_a_sign_points(night, sign):
+    """Where A3 is unknown, or the camera looks along the horizon by it, they do not."""
+    _, stars, tilt, solver = night
+    x, y, z = sign * np.arcsin(tilt.up)
+    unsigned = Tilt(x, y, tilt.covariance, utc_unix_s=tilt.utc_unix_s, theta_z=z, either_way=True)
+    fix, told = solver.solve(stars, tilt).fix, solver.solve(stars, unsigned).fix
+    assert [told.latitude, told.longitude] == pytest.approx([fix.latitude, fix.longitude], abs=1e-8)
+    lying = float(np.degrees(np.arctan2(tilt.up[2], tilt.up[1])))
+    for lost in (Calibration(), replace(solver.instrument.calibration, misalignment_deg=(lying, 0.0, 0.0))):
+        unable = replace(solver, instrument=replace(solver.instrument, calibration=lost))
+        assert "up or down" in refused(unable.solve(stars, unsigned), Status.NO_TILT)
+
+
 def test_no_tilt(night):
     _, stars, _, solver = night
     far = TiltLog.of(np.array([START - 100]), np.zeros(1), np.zeros(1), np.zeros(1))

@@ -1,0 +1,144 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`starpos satellites`: a place from satellites among the stars, without a level."""
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+
+from starpos.cli import console
+from starpos.earth.gravity import itrs_place
+from starpos.errors import SatelliteError
+from starpos.satellites.adjustment import KnownBefore
+from starpos.satellites.elements import chosen, read_orbits
+from starpos.satellites.locating import SatelliteFix, locate
+from starpos.satellites.sightings import read_iod, read_sightings
+from starpos.satellites.trails import SatelliteTrail
+
+# without a height stated: any inhabited one
+UNKNOWN_HEIGHT_M, UNKNOWN_HEIGHT_STDDEV_M = 500.0, 700.0
+HEIGHT_STDDEV_M = 50.0
+KM = 1000.0
+
+
+def run(args: argparse.Namespace) -> int:
+    trails: list[SatelliteTrail] = []
+    for path in args.sightings:
+        more = _read(path)
+        trails += more
+    orbits = []
+    for path in args.elements:
+        found, about = read_orbits(path)
+        orbits += found
+        for sentence in about:
+            console.complain("satellites", sentence)
+    middle = float(np.median(np.concatenate([t.utc_unix_s for t in trails])))
+    usable, about = chosen(orbits, middle, newer=args.newer_elements)
+    for sentence in about:
+        console.complain("satellites", sentence)
+    try:
+        fix = locate(trails, usable, _prior(args))
+    except SatelliteError as e:
+        console.complain("satellites", e)
+        if args.json:
+            console.print_json(
+                {"combined": True, "latitude_geodetic": None, "longitude_geodetic": None, "status": str(e)}
+            )
+        return 1
+    for k, trail in enumerate(trails):
+        value = trail_json(trail, fix, k)
+        _put(args, value, trail_line(value))
+    value = fix_json(fix)
+    _put(args, value, fix_line(value))
+    return 0
+
+
+def _put(args: argparse.Namespace, value: dict, line: str) -> None:
+    if args.json:
+        console.print_json(value)
+    else:
+        print(line)
+
+
+def _read(path: str) -> list[SatelliteTrail]:
+    if Path(path).suffix.lower() == ".csv":
+        return read_sightings(path)
+    trails, about = read_iod(path)
+    for sentence in about:
+        console.complain("satellites", sentence)
+    return trails
+
+
+def _prior(args: argparse.Namespace) -> KnownBefore:
+    unknown = args.height is None
+    height = UNKNOWN_HEIGHT_M if unknown else args.height
+    stddev = args.height_stddev or (UNKNOWN_HEIGHT_STDDEV_M if unknown else HEIGHT_STDDEV_M)
+    if args.near is None:
+        return KnownBefore(height, stddev, args.clock_stddev)
+    latitude, longitude, km = args.near
+    if not (abs(latitude) <= 90 and abs(longitude) <= 360 and 0 < km < 20_000):
+        raise SatelliteError("--near takes a latitude, a longitude (deg) and an error in km")
+    place = itrs_place(*np.radians([latitude, longitude]), height)
+    return KnownBefore(height, stddev, args.clock_stddev, place, (km * KM) ** 2 * np.eye(2))
+
+
+def trail_json(trail: SatelliteTrail, fix: SatelliteFix, k: int) -> dict:
+    """A trail for --json."""
+    orbit, row = fix.named[k], fix.adjusted[k]
+    used = bool(row >= 0 and fix.adjustment.used[row])
+    value = {
+        "track": trail.track,
+        "satellite": None if orbit is None else orbit.number,
+        "name": None if orbit is None else orbit.name,
+        "used": used,
+        "age_days": None if orbit is None else orbit.age_days(float(trail.utc_unix_s[0])),
+        "along_km": fix.adjustment.offset_m[row, 1] / KM if used else None,
+        "across_km": fix.adjustment.offset_m[row, 2] / KM if used else None,
+        "probability": fix.adjustment.probability[row] if used else None,
+    }
+    return value | ({"file": trail.file} if trail.file else {})
+
+
+def trail_line(value: dict) -> str:
+    """Return the same for people."""
+    if value["satellite"] is None:
+        return f"trail {value['track']}: no satellite of the orbits"
+    head = f"trail {value['track']}: satellite {value['satellite']} {value['name']}".rstrip()
+    if not value["used"]:
+        return f"{head}, elements of {value['age_days']:+.1f} days: does not fit, not used"
+    return (
+        f"{head}, elements of {value['age_days']:+.1f} days: {value['along_km']:+.2f} km along, "
+        f"{value['across_km']:+.2f} km across"
+    )
+
+
+def fix_json(fix: SatelliteFix) -> dict:
+    """The place for --json."""
+    a = fix.adjustment
+    return {
+        "combined": True,
+        "latitude_geodetic": np.degrees(fix.latitude),
+        "longitude_geodetic": np.degrees(fix.longitude),
+        "height_m": fix.height_m,
+        "covariance": fix.covariance,
+        "clock_offset_s": fix.clock_s,
+        "clock_stddev_s": fix.clock_stddev_s,
+        "satellites": fix.satellites,
+        "trails_used": int(a.used.sum()),
+        "chi2": a.chi2,
+        "degrees": a.degrees,
+        "status": "ok"
+        if a.scale == 1
+        else f"ok; the residuals are larger than stated, the covariance is {a.scale:.1f} times",
+    }
+
+
+def fix_line(value: dict) -> str:
+    """Return the same for people."""
+    east, north, up = np.sqrt(np.diag(value["covariance"]))
+    return (
+        f"place {value['latitude_geodetic']:.5f} {value['longitude_geodetic']:.5f} (WGS 84), {value['height_m']:.0f} m; "
+        f"+- {east:.0f} m east, {north:.0f} m north, {up:.0f} m up; clock {value['clock_offset_s']:+.3f} s +- "
+        f"{value['clock_stddev_s']:.3f}; {value['trails_used']} trails of {value['satellites']} satellites, chi-square "
+        f"{value['chi2']:.1f} of {value['degrees']}: {value['status']}"
+    )

@@ -1,0 +1,413 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Orbits of satellites from files: mean elements (TLE, 3LE; OMM in JSON, XML, CSV), and ephemerides (OEM, SP3).
+
+Mean elements are for SGP4 with the constants of WGS 72 alone (Hoots and Roehrich 1980, Spacetrack Report 3; Vallado et
+al. 2006, AIAA 2006-6753), by the package sgp4; OMM and OEM are CCSDS 502.0-B, SP3 is the IGS's (Hilla 2016).
+"""
+
+import csv
+import io
+import json
+import math
+import xml.etree.ElementTree as ET
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import erfa
+import numpy as np
+from numpy.polynomial import polynomial
+
+from starpos.earth.orientation import TT_MINUS_TAI_S, EarthState, earth_state, tai_minus_utc
+from starpos.errors import SatelliteError, StarposError, one_line
+from starpos.files import read_regular
+from starpos.units import DAY_S, UNIX_EPOCH_JD, unix_of, utc_text
+
+MOST_BYTES = 300_000_000
+# of the epochs of sgp4init: 1949-12-31, as a Julian date
+SGP4_EPOCH_JD = 2433281.5
+GPS_MINUS_TAI_S = -19.0
+# states of an ephemeris that one polynomial passes through
+POINTS = 9
+
+
+class OrbitErrors(NamedTuple):
+    """Prior errors (1 sigma) of a class of orbits, m, at once and per day: along the motion, and across and radially."""
+
+    what: str
+    along_m: float
+    along_m_per_day: float
+    across_m: float
+    across_m_per_day: float
+    max_age_days: float
+
+    def sigma(self, age_days: np.ndarray) -> np.ndarray:
+        """Standard deviations (..., 3) in m: radial, along, across."""
+        days = np.abs(age_days)
+        across = self.across_m + self.across_m_per_day * days
+        return np.stack([across, self.along_m + self.along_m_per_day * days, across], -1)
+
+
+# Flohrer, Krag and Klinkrad (2008, AMOS) compare elements with measured orbits: 0.1 to 0.5 km across, 0.3 to 2 km along
+# in low orbits. Drag makes the error along the motion grow (Levit and Marshall 2011, Adv. Space Res. 47, 1107); who
+# manoeuvres by electric thrust leaves the elements faster.
+PASSIVE = OrbitErrors("passive", 100.0, 250.0, 150.0, 50.0, 30.0)
+MANOEUVRING = OrbitErrors("that manoeuvre", 0.0, 4000.0, 150.0, 50.0, 14.0)
+GEOSTATIONARY = OrbitErrors("geostationary", 500.0, 1000.0, 500.0, 200.0, 30.0)
+UNNAMED = OrbitErrors("without a name", 100.0, 500.0, 150.0, 100.0, 30.0)
+OPERATORS = OrbitErrors("of an operator's ephemeris", 30.0, 300.0, 30.0, 30.0, 8.0)
+PRECISE = OrbitErrors("of a precise ephemeris", 1.0, 0.0, 1.0, 0.0, math.inf)
+# names of constellations and stations that keep their orbits by thrust
+THRUST = (
+    "STARLINK",
+    "ONEWEB",
+    "KUIPER",
+    "QIANFAN",
+    "HULIANWANG",
+    "IRIDIUM",
+    "ISS (",
+    "CSS (",
+    "TIANGONG",
+    "GLOBALSTAR",
+)
+GEOSTATIONARY_PER_DAY = 0.9, 1.1
+
+
+@dataclass(frozen=True, eq=False)
+class Ephemeris:
+    """States at times (N,), Unix s: positions (N, 3), m, GCRS."""
+
+    utc_unix_s: np.ndarray
+    places: np.ndarray
+
+    def at(self, utc_unix_s: float) -> tuple[np.ndarray, np.ndarray]:
+        """Position and velocity (3,) in m and m/s by Lagrange's polynomial; NaN outside its times."""
+        t = self.utc_unix_s
+        if not t[0] <= utc_unix_s <= t[-1]:
+            return np.full(3, np.nan), np.full(3, np.nan)
+        first = np.searchsorted(t, utc_unix_s) - POINTS // 2
+        first = min(max(int(first), 0), max(len(t) - POINTS, 0))
+        span = slice(first, first + POINTS)
+        step = t[first + 1] - t[first]
+        x = (t[span] - utc_unix_s) / step
+        c = polynomial.polyfit(x, self.places[span], len(x) - 1)
+        return c[0], c[1] / step
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Orbit:
+    """One satellite's orbit: SGP4's record, or an ephemeris.
+
+    number: of the catalogue.  epoch_unix_s: of the elements, or the first state of an ephemeris.
+    """
+
+    number: int
+    name: str
+    epoch_unix_s: float
+    errors: OrbitErrors
+    record: Any = None
+    ephemeris: Ephemeris | None = None
+
+    def age_days(self, utc_unix_s: float) -> float:
+        """Time since the epoch."""
+        return (utc_unix_s - self.epoch_unix_s) / DAY_S
+
+
+def read_orbits(path: Path | str) -> tuple[list[Orbit], list[str]]:
+    """All orbits of a file, or of each file in a folder, and a sentence about what could not be read; SatelliteError."""
+    if Path(path).is_dir():
+        files = sorted(p for p in Path(path).iterdir() if p.is_file() and not p.name.startswith("."))
+        orbits: list[Orbit] = []
+        said: list[str] = []
+        for file in files:
+            try:
+                more, about = read_orbits(file)
+            except SatelliteError as e:
+                more, about = [], [str(e)]
+            orbits += more
+            said += about
+        if not orbits:
+            raise SatelliteError(f"{path}: no file in it has orbits of satellites: {CURE}")
+        return orbits, said
+    try:
+        text = read_regular(path, MOST_BYTES).decode("utf-8-sig")
+    except (OSError, UnicodeDecodeError) as e:
+        reason = getattr(e, "strerror", None) or "it is no text"
+        raise SatelliteError(f"{path}: no readable orbits ({reason}): {CURE}") from None
+    bad: list[str] = []
+    found = []
+    try:
+        for orbit in _orbits(text):
+            if isinstance(orbit, Orbit):
+                found.append(orbit)
+            else:
+                bad.append(orbit)
+    except (ValueError, ET.ParseError, csv.Error, StarposError) as e:
+        raise SatelliteError(f"{path}: no readable orbits ({one_line(e)}): {CURE}") from None
+    if not found:
+        raise SatelliteError(f"{path}: it has no orbits of satellites{f' ({bad[0]})' if bad else ''}: {CURE}")
+    left = "1 is left out" if len(bad) == 1 else f"{len(bad)} are left out"
+    return found, [f"{path}: of {len(found) + len(bad)} orbits {left} ({bad[0]})"] if bad else []
+
+
+CURE = "give TLE, OMM (JSON, XML or CSV), OEM or SP3"
+
+
+def _orbits(text: str) -> Iterator[Orbit | str]:
+    """The orbits of a text, or for each one that is broken what is wrong with it."""
+    start = text.lstrip()[:4000]
+    if start.startswith(("{", "[")):
+        rows = json.loads(text)
+        yield from _from_omm(rows if isinstance(rows, list) else [rows])
+    elif start.startswith("<"):
+        yield from _from_omm(_xml_rows(ET.fromstring(text)))
+    elif start.startswith("CCSDS_OEM_VERS"):
+        yield from _from_oem(text)
+    elif start[:2] in ("#a", "#b", "#c", "#d"):
+        yield from _from_sp3(text)
+    elif "NORAD_CAT_ID" in start.partition("\n")[0]:
+        yield from _from_omm(csv.DictReader(io.StringIO(text)))
+    else:
+        yield from _from_lines(text)
+
+
+def _class_of(name: str, per_day: float) -> OrbitErrors:
+    if GEOSTATIONARY_PER_DAY[0] < per_day < GEOSTATIONARY_PER_DAY[1]:
+        return GEOSTATIONARY
+    if name.upper().startswith(THRUST):
+        return MANOEUVRING
+    return PASSIVE if name else UNNAMED
+
+
+def _of_record(number: int, name: str, record: Any) -> Orbit | str:
+    from sgp4.api import SGP4_ERRORS
+
+    if record.error:
+        return f"satellite {number}: {SGP4_ERRORS[record.error]}"
+    epoch = (record.jdsatepoch - UNIX_EPOCH_JD + record.jdsatepochF) * DAY_S
+    per_day = record.no_kozai * 1440 / (2 * math.pi)
+    if not (math.isfinite(epoch) and 0 < per_day < 20):
+        return f"satellite {number}: its mean motion is {per_day:g} a day"
+    return Orbit(number=number, name=name, epoch_unix_s=epoch, errors=_class_of(name, per_day), record=record)
+
+
+def _from_lines(text: str) -> Iterator[Orbit | str]:
+    """Two lines a satellite, with or without a line of its name before (Spacetrack Report 3; Kelso 1998)."""
+    from sgp4.api import Satrec
+
+    lines = [line.rstrip() for line in text.splitlines()]
+    before = ""
+    number = 0
+    while number < len(lines):
+        line = lines[number]
+        number += 1
+        if not line.startswith("1 ") or len(line) < 60:
+            before = line.removeprefix("0 ").strip()
+            continue
+        second = lines[number] if number < len(lines) else ""
+        if not second.startswith("2 ") or second[2:7] != line[2:7]:
+            yield f"line {number}: no second line of the same satellite follows"
+            continue
+        number += 1
+        wrong = [n for n, text_ in ((number - 1, line), (number, second)) if not _sums(text_)]
+        if wrong:
+            yield f"line {wrong[0]}: its check sum is wrong"
+        else:
+            try:
+                record = Satrec.twoline2rv(line, second)
+                yield _of_record(record.satnum, before, record)
+            except ValueError as e:
+                yield f"line {number}: {one_line(e)}"
+        before = ""
+
+
+def _sums(line: str) -> bool:
+    """Whether the last digit of a line is the sum of all digits before, a minus counting 1."""
+    body, last = line[:68], line[68:69]
+    return last.isdigit() and int(last) == sum(int(c) if c.isdigit() else c == "-" for c in body) % 10
+
+
+def _xml_rows(root: ET.Element) -> Iterator[dict]:
+    """The fields of each OMM in an NDM or a single one."""
+    for segment in root.iter():
+        if segment.tag.rpartition("}")[2] == "segment":
+            yield {e.tag.rpartition("}")[2]: e.text for e in segment.iter()}
+
+
+def _from_omm(rows: Iterable[Any]) -> Iterator[Orbit | str]:
+    for k, row in enumerate(rows, 1):
+        try:
+            yield _from_fields(row)
+        except (KeyError, TypeError, ValueError, AttributeError, OverflowError, StarposError) as e:
+            lacking = "no " if isinstance(e, KeyError) else ""
+            yield f"message {k}: {lacking}{one_line(e)}"
+
+
+def _from_fields(row: Mapping[str, Any]) -> Orbit | str:
+    from sgp4.api import WGS72, Satrec
+
+    if (theory := row.get("MEAN_ELEMENT_THEORY") or "SGP4") not in ("SGP4", "SGP/SGP4"):
+        return f"satellite {row['NORAD_CAT_ID']}: its elements are for {theory}, not for SGP4"
+    number = int(row["NORAD_CAT_ID"])
+    epoch = unix_of(str(row["EPOCH"]).strip())
+    angles = ("ARG_OF_PERICENTER", "INCLINATION", "MEAN_ANOMALY", "RA_OF_ASC_NODE")
+    perigee, inclination, anomaly, node = (math.radians(float(row[name])) for name in angles)
+    values = (
+        float(row["BSTAR"]),
+        # SGP4 makes no use of the derivatives of the mean motion
+        0.0,
+        0.0,
+        float(row["ECCENTRICITY"]),
+        perigee,
+        inclination,
+        anomaly,
+        float(row["MEAN_MOTION"]) * 2 * math.pi / 1440,
+        node,
+    )
+    if not all(map(math.isfinite, values)):
+        return f"satellite {number}: an element is not finite"
+    record = Satrec()
+    # a number of six digits has no place in the record
+    record.sgp4init(WGS72, "i", 0, epoch / DAY_S + UNIX_EPOCH_JD - SGP4_EPOCH_JD, *values)
+    return _of_record(number, str(row.get("OBJECT_NAME") or "").strip(), record)
+
+
+def _of_states(
+    number: int, name: str, errors: OrbitErrors, rows: list[tuple[float, np.ndarray]]
+) -> Orbit | str:
+    """An ephemeris of times and places in GCRS."""
+    rows.sort(key=lambda row: row[0])
+    times = np.array([row[0] for row in rows])
+    places = np.array([row[1] for row in rows])
+    if len(rows) < POINTS or not (np.isfinite(places).all() and (np.diff(times) > 0).all()):
+        return f"{name or number}: an ephemeris needs {POINTS} states at different times"
+    ephemeris = Ephemeris(times, places)
+    return Orbit(number=number, name=name, epoch_unix_s=times[0], errors=errors, ephemeris=ephemeris)
+
+
+def _from_oem(text: str) -> Iterator[Orbit | str]:
+    """Segments of an OEM in GCRF, EME2000, ICRF, ITRF or TEME, and UTC, TAI, TT or GPS (CCSDS 502.0-B)."""
+    about: dict[str, str] = {}
+    rows: list[tuple[float, np.ndarray]] = []
+    skipped = False
+    for line in [*text.splitlines(), "META_START"]:
+        key, equals, value = (part.strip() for part in line.partition("="))
+        if key == "META_START":
+            if rows:
+                yield _of_states(_number_of(about), about.get("OBJECT_NAME", ""), OPERATORS, rows)
+            about, rows = {}, []
+        elif key.startswith("COVARIANCE_ST"):
+            skipped = key == "COVARIANCE_START"
+        elif equals:
+            about[key] = value
+        elif not skipped and len(cells := line.split()) >= 7 and cells[0][:1].isdigit():
+            utc = _utc(unix_of(cells[0][:26]), about.get("TIME_SYSTEM", "UTC"))
+            place = np.array([float(cell) for cell in cells[1:4]]) * 1e3
+            rows.append((utc, place @ _to_gcrs(about.get("REF_FRAME", ""), utc).T))
+
+
+def _number_of(about: Mapping[str, str]) -> int:
+    """The catalogue number, where the object's id is one; otherwise a negative number of the id's own."""
+    text = about.get("OBJECT_ID", "")
+    return int(text) if text.isdigit() else -sum(ord(c) << 8 * (k % 3) for k, c in enumerate(text))
+
+
+def _utc(unix_s: float, system: str) -> float:
+    """UTC of a time of another scale, all as Unix seconds; ValueError for an unknown scale."""
+    if system == "UTC":
+        return unix_s
+    ahead = {"TAI": 0.0, "TT": TT_MINUS_TAI_S, "GPS": GPS_MINUS_TAI_S}
+    if system not in ahead:
+        raise ValueError(f"its times are {system}: UTC, TAI, TT and GPS are read")
+    tai = unix_s - ahead[system]
+    return tai - tai_minus_utc(tai - tai_minus_utc(tai))
+
+
+def _to_gcrs(frame: str, utc_unix_s: float) -> np.ndarray:
+    """Rotation (3, 3) of a reference frame into GCRS; ValueError for an unknown frame."""
+    if frame in ("GCRF", "ICRF", "EME2000", "J2000"):
+        # the bias of EME2000, 0.02 arcsec, is 0.7 m in a low orbit
+        return np.eye(3)
+    if frame.startswith(("ITRF", "IGS", "WGS")):
+        return earth_state(utc_unix_s).gcrs_to_itrs.T
+    if frame == "TEME":
+        return teme_to_gcrs(earth_state(utc_unix_s))
+    raise ValueError(f"its reference frame is {frame or 'not stated'}: GCRF, EME2000, ITRF and TEME are read")
+
+
+def teme_to_gcrs(state: EarthState) -> np.ndarray:
+    """Rotation (3, 3) of TEME, the axes of SGP4, into GCRS.
+
+    TEME turns into the Earth's by the mean sidereal time of 1982 (Vallado et al. 2006, AIAA 2006-6753, appendix C).
+    """
+    ut1 = UNIX_EPOCH_JD, (state.utc_unix_s + state.orientation.ut1_minus_utc_s) / DAY_S
+    back = erfa.rz(erfa.gmst82(*ut1) - erfa.era00(*ut1), np.eye(3))
+    return np.asarray(state.astrom["bpn"]).reshape(3, 3).T @ back
+
+
+def _from_sp3(text: str) -> Iterator[Orbit | str]:
+    """The satellites of an SP3 file: places in the Earth's frame, km, by GPS time or UTC."""
+    rows: dict[str, list[tuple[float, np.ndarray]]] = {}
+    system, utc, turn = "GPS", math.nan, np.eye(3)
+    for line in text.splitlines():
+        if line.startswith("%c") and (stated := line[9:12].strip()) not in ("ccc", ""):
+            system = stated
+        elif line.startswith("* "):
+            year, month, day, hour, minute, second = line[1:].split()
+            stamp = f"{int(year):04d}-{int(month):02d}-{int(day):02d}T{int(hour):02d}:{int(minute):02d}:00"
+            utc = _utc(unix_of(stamp) + float(second), system)
+            turn = _to_gcrs("ITRF", utc)
+        elif line.startswith("P") and len(line) >= 46:
+            place = np.array([float(line[k : k + 14]) for k in (4, 18, 32)]) * 1e3
+            # zeros stand for a place that is not known
+            if place.any():
+                rows.setdefault(line[1:4], []).append((utc, place @ turn.T))
+    for k, (name, states) in enumerate(rows.items(), 1):
+        yield _of_states(-k, name, PRECISE, states)
+
+
+def chosen(
+    orbits: Iterable[Orbit], utc_unix_s: float, *, newer: bool = False
+) -> tuple[list[Orbit], list[str]]:
+    """Each satellite's newest usable orbit at a time, and sentences about those left out; SatelliteError if none is left.
+
+    newer: also elements whose epoch is after that time.
+    """
+    best: dict[int, Orbit] = {}
+    left_out = {"newer": set[int](), "older": set[int]()}
+    last_epoch = -math.inf
+    for orbit in orbits:
+        age = orbit.age_days(utc_unix_s)
+        if orbit.ephemeris is not None:
+            if not orbit.ephemeris.utc_unix_s[0] <= utc_unix_s <= orbit.ephemeris.utc_unix_s[-1]:
+                left_out["older"].add(orbit.number)
+                continue
+        elif abs(age) > orbit.errors.max_age_days:
+            left_out["older"].add(orbit.number)
+            last_epoch = max(last_epoch, orbit.epoch_unix_s)
+            continue
+        elif age < 0 and not newer:
+            left_out["newer"].add(orbit.number)
+            continue
+        held = best.get(orbit.number)
+        if held is None or (orbit.errors.sigma(age)[1], abs(age)) < (
+            held.errors.sigma(held.age_days(utc_unix_s))[1],
+            abs(held.age_days(utc_unix_s)),
+        ):
+            best[orbit.number] = orbit
+    newer_only, older_only = (len(left_out[key] - set(best)) for key in ("newer", "older"))
+    said = []
+    if newer_only:
+        said.append(
+            f"the elements of {newer_only} satellites are newer than {utc_text(utc_unix_s)}: they are used with "
+            "--newer-elements alone"
+        )
+    if older_only:
+        said.append(
+            f"the orbits of {older_only} satellites do not reach {utc_text(utc_unix_s)}, or are older than their class "
+            f"allows ({PASSIVE.max_age_days:.0f} days, {MANOEUVRING.max_age_days:.0f} for those that manoeuvre)"
+        )
+    if not best:
+        raise SatelliteError(f"{'; '.join(said) or 'there are no orbits'}: get elements of that day")
+    return list(best.values()), said

@@ -1,0 +1,150 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A place from trails and orbits: names, adjustment, and names again by the place, until both stay."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from starpos.earth.ellipsoid import enu_axes
+from starpos.earth.gravity import geodetic_place
+from starpos.errors import SatelliteError
+from starpos.frozen import at_once
+from starpos.satellites.adjustment import Adjuster, KnownBefore, PlaceAdjustment
+from starpos.satellites.elements import Orbit
+from starpos.satellites.naming import FEWEST, Candidates, agreement, candidates, ways_of
+from starpos.satellites.trails import SatelliteTrail
+
+# chi-squared of a candidate's place on the ground, from which its trail is looked at
+NEAR = 40.0
+# probability of a named trail's residuals by chance
+UNLIKELY = 1e-4
+# by how much (log) a satellite has to fit a trail better than any other
+AHEAD = 4.6
+ROUNDS = 4
+# m by which all claims are rounded up: light in the air, SGP4's text
+FLOOR_M = 2.0
+
+
+@at_once
+@dataclass(frozen=True, kw_only=True)
+class SatelliteFix:
+    """A place from satellites.
+
+    latitude, longitude (rad), height_m: on WGS 84.  covariance (3, 3): east, north, up, m2.
+    named: for each trail its orbit, or None.  adjusted: row of each trail in the adjustment, or -1.
+    """
+
+    latitude: float
+    longitude: float
+    height_m: float
+    covariance: np.ndarray
+    clock_s: float
+    clock_stddev_s: float
+    named: tuple[Orbit | None, ...]
+    adjusted: np.ndarray
+    adjustment: PlaceAdjustment
+
+    @property
+    def satellites(self) -> int:
+        """Number of different satellites that the place stands on."""
+        rows = [
+            orbit
+            for orbit, k in zip(self.named, self.adjusted, strict=True)
+            if k >= 0 and self.adjustment.used[k]
+        ]
+        return len({orbit.number for orbit in rows if orbit is not None})
+
+
+def locate(trails: Sequence[SatelliteTrail], orbits: Sequence[Orbit], prior: KnownBefore) -> SatelliteFix:
+    """Name the trails and adjust the place; SatelliteError where they do not give one."""
+    if len(trails) < FEWEST:
+        raise SatelliteError(f"there are {len(trails)} trails: a place takes {FEWEST} or more")
+    found = candidates(trails, orbits, prior.height_m, prior.height_stddev_m, prior.clock_stddev_s)
+    if prior.place is None:
+        agreed = agreement(found, orbits)
+        place, rows, covariance = agreed.place, agreed.members, None
+    else:
+        place, rows, covariance = prior.place, np.zeros(0, int), prior.covariance
+    clock_s, seen_before = 0.0, []
+    answer: PlaceAdjustment | None = None
+    for _ in range(ROUNDS):
+        if covariance is not None:
+            rows = _named(trails, orbits, found, place, clock_s, covariance, prior)
+        if rows.tolist() in seen_before:
+            break
+        seen_before.append(rows.tolist())
+        if len(rows) < FEWEST:
+            raise SatelliteError(
+                f"of {len(trails)} trails {len(rows)} fit a satellite at one place: a place takes {FEWEST}: give orbits "
+                "of that day, or more trails"
+            )
+        adjuster = Adjuster(ways_of(trails, found, rows), [orbits[k] for k in found.orbit[rows]], prior)
+        answer = adjuster.solve(place, clock_s)
+        place, clock_s = answer.place, answer.clock_s
+        covariance = answer.covariance
+    assert answer is not None
+    return _fix(trails, orbits, found, np.array(seen_before[-1], int), answer)
+
+
+def _named(
+    trails: Sequence[SatelliteTrail],
+    orbits: Sequence[Orbit],
+    found: Candidates,
+    place: np.ndarray,
+    clock_s: float,
+    covariance: np.ndarray,
+    prior: KnownBefore,
+) -> np.ndarray:
+    """Rows of the candidates that fit their trails at a place, one a trail, where no other fits nearly as well."""
+    latitude, longitude, _ = geodetic_place(place)
+    plane = enu_axes(float(latitude), float(longitude))[:2]
+    off = (found.places - place) @ plane.T
+    spread = plane @ found.covariance @ plane.T + covariance[:2, :2]
+    near = np.flatnonzero(np.einsum("ki,kij,kj->k", off, np.linalg.inv(spread), off) < NEAR)
+    if not len(near):
+        return near
+    # each candidate as a satellite of its own, so that none pulls another
+    own = [replace(orbits[k], number=n) for n, k in enumerate(found.orbit[near])]
+    adjuster = Adjuster(ways_of(trails, found, near), own, prior)
+    density, probability = adjuster.fits(place, clock_s, covariance)
+    stated = np.array([trails[k].satellite is not None for k in found.trail[near]])
+    chosen = []
+    for trail in np.unique(found.trail[near]):
+        mine = np.flatnonzero((found.trail[near] == trail) & ((probability > UNLIKELY) | stated))
+        mine = mine[np.argsort(-density[mine])]
+        if len(mine) and (len(mine) == 1 or density[mine[0]] > density[mine[1]] + AHEAD):
+            chosen.append(near[mine[0]])
+    return np.array(chosen, int)
+
+
+def _fix(
+    trails: Sequence[SatelliteTrail],
+    orbits: Sequence[Orbit],
+    found: Candidates,
+    rows: np.ndarray,
+    answer: PlaceAdjustment,
+) -> SatelliteFix:
+    used = answer.used
+    satellites = {orbits[found.orbit[k]].number for k, fits in zip(rows, used, strict=True) if fits}
+    if used.sum() < FEWEST or len(satellites) < 2:
+        raise SatelliteError(
+            f"only {used.sum()} trails of {len(satellites)} satellites agree: a place takes {FEWEST} of two or more"
+        )
+    latitude, longitude, height = geodetic_place(answer.place)
+    adjusted = np.full(len(trails), -1)
+    named: list[Orbit | None] = [None] * len(trails)
+    for k, row in enumerate(rows):
+        adjusted[found.trail[row]] = k
+        named[found.trail[row]] = orbits[found.orbit[row]]
+    return SatelliteFix(
+        latitude=float(latitude),
+        longitude=float(longitude),
+        height_m=float(height),
+        covariance=answer.covariance[:3, :3] + FLOOR_M**2 * np.eye(3),
+        clock_s=answer.clock_s,
+        clock_stddev_s=float(np.sqrt(answer.covariance[3, 3])),
+        named=tuple(named),
+        adjusted=adjusted,
+        adjustment=answer,
+    )
