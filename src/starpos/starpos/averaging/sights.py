@@ -43,8 +43,8 @@ NUMBERS = {
 }
 CURE = f"give a CSV with a line of names, {','.join(NEEDED)}[,limb,{','.join(list(NUMBERS)[1:])}]"
 MAX_BYTES, MAX_SIGHTS = 5_000_000, 5_000
-# Dip of the sea's horizon at a height of 1 m, with the air's usual bending; what its bending errs by, and a stated index
-# error, both alike in all sights; share of a vessel's way that its course and speed err by.
+# Dip of the sea's horizon at a height of 1 m, with the air's usual bending. Errors of that bending and of a stated index
+# error are alike in all sights. A vessel's way errs by a share of it.
 DIP, DIP_STDDEV, INDEX_STDDEV, WAY_SHARE = 1.76 * ARCMIN, 0.5 * ARCMIN, 0.2 * ARCMIN, 0.05
 KNOT = 1852 / 3600
 WAY_ROUNDS = 4

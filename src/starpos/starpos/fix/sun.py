@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The attitude by the Sun, or the Moon, and the level: at a known place, whose ephemeris says where the body stands.
 
-Two directions make an attitude, the body's and the plumb line's. They contain the altitude twice: so a lamp is seen not to
-be the Sun, and the attitude is better than by either. Without a place one frame gives a circle of equal altitude.
+Two directions make an attitude, the body's and the plumb line's. They contain the altitude twice: that excludes a
+lamp, and makes the attitude better than by either. Without a place one frame gives a circle of equal altitude.
 """
 
 import math
