@@ -23,61 +23,20 @@ Inside, angles are in rad, times Unix seconds in UTC.
 The names below are the public ones. Each is imported when it is first asked for, so that `import starpos` takes no time.
 """
 
+import re
 from importlib import import_module
 from typing import Any
 
 __version__ = "0.1.0"
 
-# name: module, and after a colon its name there; __init__.pyi says the same to editors and type checkers
-_HOMES = {
-    "Atmosphere": "earth.refraction",
-    "Average": "averaging.average",
-    "Calibration": "instrument.instrument",
-    "Camera": "instrument.camera",
-    "Catalogue": "sky.catalogue",
-    "Deflection": "earth.vertical",
-    "DeflectionSession": "zenith.doubts",
-    "Detection": "detection",
-    "Fix": "fix.fix",
-    "Frame": "frames.frame",
-    "GnssTrack": "gnss.receiver",
-    "InDegrees": "fix.fix",
-    "Instrument": "instrument.instrument",
-    "Night": "night.night",
-    "NightOnDisk": "night.opening",
-    "Place": "earth.place",
-    "PlaceFix": "fix.fix",
-    "PlayedNight": "session.replay",
-    "Shot": "night.night",
-    "Site": "sky.site",
-    "Solution": "fix.solution",
-    "Solver": "fix.solver",
-    "StarposError": "errors",
-    "Stars": "frames.frame",
-    "Status": "fix.solution",
-    "Tilt": "instrument.inclinometer",
-    "TiltLog": "instrument.tilt_log",
-    "Voyage": "navigation.voyage",
-    "VoyageFix": "navigation.estimate",
-    "average": "averaging.average",
-    "calibrate_at": "calibration.misalignment",
-    "calibrate_camera": "calibration.camera",
-    "deflection": "night.work",
-    "detect": "detection",
-    "geodetic": "earth.vertical",
-    "identify": "night.work",
-    "load_catalogue": "sky.catalogue",
-    "navigate": "night.under_way",
-    "open_night": "night.opening",
-    "read_frame": "frames.reading",
-    "read_gnss_csv": "gnss.receiver",
-    "read_instrument": "instrument.instrument_file:read",
-    "read_tilt_csv": "instrument.tilt_table",
-    "replay": "session.replay",
-    "scene_of": "simulation.scene",
-    "turn": "calibration.misalignment",
-    "write_instrument": "instrument.instrument_file:write",
-    "write_night": "simulation.scene",
+# __init__.pyi says to editors and type checkers where the public names are, and here
+with open(f"{__file__.rpartition('.')[0]}.pyi", encoding="utf-8") as _stub:
+    _stated = _stub.read()
+# name: module, and after a colon its name there
+_HOMES = {name: home for home, name in re.findall(r"^from starpos\.(\S+) import (\w+) as ", _stated, re.M)}
+_HOMES |= {
+    name: f"{home}:{there}"
+    for name, home, there in re.findall(r"^(\w+) = starpos\.(\S+)\.(\w+)$", _stated, re.M)
 }
 __all__ = list(_HOMES)
 

@@ -1,4 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
+import starpos.instrument.instrument_file
 from starpos.averaging.average import Average as Average
 from starpos.averaging.average import average as average
 from starpos.calibration.camera import calibrate_camera as calibrate_camera
@@ -22,7 +23,6 @@ from starpos.frames.frame import Stars as Stars
 from starpos.frames.reading import read_frame as read_frame
 from starpos.gnss.receiver import GnssTrack as GnssTrack
 from starpos.gnss.receiver import read_gnss_csv as read_gnss_csv
-from starpos.instrument import instrument_file
 from starpos.instrument.camera import Camera as Camera
 from starpos.instrument.inclinometer import Tilt as Tilt
 from starpos.instrument.instrument import Calibration as Calibration
@@ -47,8 +47,8 @@ from starpos.sky.catalogue import load_catalogue as load_catalogue
 from starpos.sky.site import Site as Site
 from starpos.zenith.doubts import DeflectionSession as DeflectionSession
 
-read_instrument = instrument_file.read
-write_instrument = instrument_file.write
+read_instrument = starpos.instrument.instrument_file.read
+write_instrument = starpos.instrument.instrument_file.write
 
 __version__: str
 __all__: list[str]

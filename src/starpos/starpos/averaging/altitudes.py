@@ -1,10 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The place, and the camera's axis in the inclinometer, from elevations alone: of frames whose centre is known but not
-their roll.
-"""
+"""The place from elevations alone: of frames whose centre is known but not their roll."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
@@ -14,14 +12,11 @@ from starpos._numeric.roots import symmetric_root
 from starpos.averaging.average import SCATTER, Average
 from starpos.earth.ellipsoid import EQUATOR_RADIUS_M, curvature_radii_m, enu_axes, ground_m, place_of_zenith
 from starpos.earth.orientation import station_velocity
-from starpos.earth.place import Place
 from starpos.errors import FixError
 from starpos.fix.budget import time_terms
 from starpos.fix.circle import Circle
 from starpos.fix.terms import ALWAYS, EACH_POSE, ErrorTerm
 from starpos.frozen import at_once
-from starpos.instrument.instrument import UNKNOWN_ARCSEC, Calibration
-from starpos.instrument.mounting import angles_at
 from starpos.units import ARCSEC, SIGMA_PER_MAD
 
 # with a worse A3 the circles are no longer what a linear error makes of them: its axis is fitted first
@@ -108,26 +103,29 @@ class Directions:
             [self.circles[k] for k in rows], {n: c[np.ix_(rows, rows)] for n, c in self.sources.items()}
         )
 
-    def residual(self, zenith: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def mean(self, values: np.ndarray) -> np.ndarray:
+        """Mean (D, ...) over the circles of each direction of values (N, ...)."""
+        number = [len(g) for g in self.circles]
+        starts = np.cumsum([0, *number[:-1]])
+        return (np.add.reduceat(values, starts).T / number).T
+
+    def residual(
+        self, zenith: np.ndarray, measured: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Mean zenith distances minus those measured (D,) at a zenith (3,), and their derivatives (D, 2).
 
-        They are by the zenith's steps east and north, in rad.
+        They are by the zenith's steps east and north, in rad.  measured (N,): in place of the circles' own.
         """
-        rows = np.repeat(np.arange(len(self.circles)), [len(g) for g in self.circles])
         every = [c for g in self.circles for c in g]
+        if measured is None:
+            measured = np.array([c.zenith_distance for c in every])
         nearer = np.array([c.parallax for c in every])[:, None] * ground_m(zenith) / EQUATOR_RADIUS_M
         v = rotation.normalised(np.array([c.itrs for c in every]) - nearer + station_velocity(zenith))
         axes = _enu(zenith)
         local = v @ axes.T
         sine = np.hypot(local[:, 0], local[:, 1])
-        off = np.arctan2(sine, local[:, 2]) - [c.zenith_distance for c in every]
         slope = -local[:, :2] / np.maximum(sine, 1e-12)[:, None]
-        number = np.bincount(rows)
-
-        def mean(values: np.ndarray) -> np.ndarray:
-            return np.bincount(rows, values) / number
-
-        return mean(off), np.stack([mean(slope[:, 0]), mean(slope[:, 1])], -1)
+        return self.mean(np.arctan2(sine, local[:, 2]) - measured), self.mean(slope)
 
 
 def _alike(a: Circle, b: Circle) -> bool:
@@ -210,8 +208,7 @@ def _sound(whole: Directions) -> np.ndarray:
         if zenith is None:
             return every
         off = size(zenith)
-        usual = SIGMA_PER_MAD * (1 + 5 / (number - 2)) * float(np.median(off))
-        agree = np.flatnonzero(off < OUTLIER_SIGMA * max(usual, 1.0))
+        agree = np.flatnonzero(off < OUTLIER_SIGMA * max(usual_sigma(off, number - 2), 1.0))
         if len(agree) <= number // 2:
             return every
         if np.array_equal(agree, rows):
@@ -222,13 +219,20 @@ def _sound(whole: Directions) -> np.ndarray:
     return rows
 
 
+def usual_sigma(off: np.ndarray, free: int) -> float:
+    """Sigma by the median of residuals, of which a fit that is robust leaves as many as `free` other than 0."""
+    return SIGMA_PER_MAD * (1 + 5 / free) * float(np.median(np.sort(off)[-free:]))
+
+
 def _answer(part: Directions, near: tuple[float, float] | None) -> _Answer:
     """The one place that fits; FixError if no place fits, or two do."""
     weight = np.linalg.inv(part.covariance)
     found: list[_Answer] = []
     for start in starts(part):
         one = _refined(part, weight, start)
-        if one is not None and all(np.linalg.norm(one.zenith - f.zenith) > ALIKE for f in found):
+        if one is None or any(c.itrs @ one.zenith < 0 for g in part.circles for c in g):
+            continue
+        if all(np.linalg.norm(one.zenith - f.zenith) > ALIKE for f in found):
             found.append(one)
     if not found:
         raise FixError(
@@ -350,247 +354,3 @@ def _degrees(zenith: np.ndarray) -> tuple[float, float]:
 def _enu(zenith: np.ndarray) -> np.ndarray:
     """East, north and up (3, 3) in ITRS at a zenith (3,)."""
     return enu_axes(*place_of_zenith(zenith))
-
-
-AXIS_ROUNDS, SETTLED_CHI2, FIRST_DAMPING, LAST_DAMPING = 80, 1e-6, 1e-3, 1e9
-# an axis that is known better than this (rad) is known
-MIN_RAD = 1e-9
-# number of zeniths that are tried, the ones that fit best at first
-TRIED = 4
-# minimum number of directions that determine an axis, with the zenith known and unknown
-FEWEST, MIN_WITHOUT_SITE = 2, 4
-# how long A3 may be used
-VALID_DAYS = 365.0
-# the term of the circles that holds A3's error, which is fitted here
-OF_A3 = "calibration"
-
-# the circles of all frames with an A3 (3, 3)
-CirclesOf = Callable[[np.ndarray], Sequence[Circle]]
-
-
-@at_once
-@dataclass(frozen=True, kw_only=True)
-class FoundAxis:
-    """A3 whose axis the elevations determined.
-
-    a3 (3, 3).  ray (3,): the frame's centre in C.  zenith (3,) in ITRS.
-    covariance (2, 2) in rad2: of the axis along `across` (2, 3) in S, with the scatter of the directions.
-    scatter2: variance beyond the stated, as a share of it.  directions, frames: numbers.
-    """
-
-    a3: np.ndarray
-    ray: np.ndarray
-    zenith: np.ndarray
-    across: np.ndarray
-    covariance: np.ndarray
-    scatter2: float
-    directions: int
-    circles: Sequence[Circle]
-
-    @property
-    def stddev_arcsec(self) -> float:
-        """Sigma of the axis on the worse of two axes."""
-        return float(np.sqrt(np.linalg.eigvalsh(self.covariance)[-1]) / ARCSEC)
-
-    def calibration(self, given: Calibration, turn_stddev_deg: float) -> Calibration:
-        """The calibration, whose turn about the axis is as `given`, to turn_stddev_deg."""
-        axis = self.a3 @ self.ray
-        turns = np.cross(axis, self.across)
-        turn = min(np.radians(turn_stddev_deg), UNKNOWN_ARCSEC[2] * ARCSEC)
-        covariance = turns.T @ self.covariance @ turns + turn**2 * np.outer(axis, axis)
-        up = rotation.normalised(np.sum([c.up for c in self.circles], axis=0))
-        return replace(
-            given.turned_to(self.a3),
-            covariance_arcsec2=tuple(map(tuple, (covariance / ARCSEC**2).tolist())),
-            utc_unix_s=float(np.mean([c.utc_unix_s for c in self.circles])),
-            tilt_deg=tuple(np.degrees(angles_at(up, self.circles[0].axes)).tolist()),
-            frames=len(self.circles),
-            valid_days=VALID_DAYS,
-            response=(),
-            response_covariance=(),
-        )
-
-    def about(self, a3: np.ndarray) -> list[Circle]:
-        """The circles with the zenith distances of another A3 (3, 3), as far as they are linear in its error here."""
-        moved = self.across @ a3 @ self.ray
-        return [
-            replace(c, zenith_distance=c.zenith_distance + float(_slope(c, self.across) @ moved))
-            for c in self.circles
-        ]
-
-
-def find_axis(
-    circles_of: CirclesOf,
-    given: Calibration,
-    ray: np.ndarray,
-    site: Place | None = None,
-    near: tuple[float, float] | None = None,
-) -> FoundAxis:
-    """Fit A3's axis, and the zenith unless a site is given; `given` counts as well as it is known.
-
-    ray (3,): the frame's centre in C.  near: latitude, longitude (rad) that selects one of two answers.
-    Raises FixError if the directions are too few, or leave two answers.
-    """
-    first = Directions.of(sorted(circles_of(given.a3), key=lambda c: c.utc_unix_s))
-    number, fewest = len(first.circles), MIN_WITHOUT_SITE if site is None else FEWEST
-    if number < fewest:
-        raise FixError(
-            f"elevations in {number} {'direction' if number == 1 else 'directions'} do not determine A3: without a roll "
-            f"it takes {fewest} or more (frames of a camera that stands still are one)"
-        )
-    if site is not None:
-        zeniths = [site.plumb_axes[2]]
-    else:
-        tried = sorted(starts(first), key=lambda z: float(np.median(np.abs(first.residual(z)[0]))))
-        zeniths = [*_round(first), *tried[:TRIED]]
-    found: list[tuple[float, FoundAxis]] = []
-    for zenith in zeniths:
-        one = _fitted(circles_of, given, ray, zenith, None if site is None else site.plumb_stddev)
-        if one is not None:
-            found.append(one)
-    if not found:
-        raise FixError(
-            "the elevations do not determine A3: check the tilts, the clock and that nothing was moved"
-        )
-    found.sort(key=lambda f: f[0])
-    best = found[0][1]
-    left = [f for chi2, f in found if chi2 - found[0][0] < EXCLUDED_SIGMA**2 * (1 + best.scatter2)]
-    if near is not None:
-        there = rotation.unit_vector(near[1], near[0])
-        return max(left, key=lambda f: float(f.zenith @ there))
-    if max(np.linalg.norm(f.zenith - best.zenith) for f in left) > 2 * EXCLUDED_SIGMA * _wide(best):
-        raise FixError(
-            "the elevations leave two places and two A3: turn the camera to directions of other altitudes too, state A3 "
-            "better, or say where it is with --near LAT LON"
-        )
-    return best
-
-
-def _wide(found: FoundAxis) -> float:
-    """How far (rad) a zenith may be from another that is the same answer."""
-    return float(max(np.sqrt(np.linalg.eigvalsh(found.covariance)[-1]), 1e-6))
-
-
-def _round(part: Directions) -> list[np.ndarray]:
-    """Zeniths (3,) about which all directions lie on a circle, as they do where the sensor leans alike in all."""
-    axes = np.array([group[0].itrs for group in part.circles])
-    if len(axes) < 3:
-        return []
-    normal = np.linalg.svd(axes - axes.mean(0))[2][-1]
-    return [normal, -normal]
-
-
-def _slope(circle: Circle, across: np.ndarray) -> np.ndarray:
-    """Change (2,) of a circle's measured zenith distance by a move of the axis along `across` (2, 3) in S."""
-    return -(across @ circle.up) / max(np.sin(circle.zenith_distance), 1e-9)
-
-
-@at_once
-@dataclass(frozen=True, kw_only=True)
-class _Normal:
-    """The least-squares problem at an A3 (3, 3) and a zenith (3,): its unknowns are the axis, and perhaps the zenith."""
-
-    a3: np.ndarray
-    zenith: np.ndarray
-    across: np.ndarray
-    matrix: np.ndarray
-    pull: np.ndarray
-    prior: np.ndarray
-    chi2: float
-    part: Directions
-    circles: Sequence[Circle]
-
-
-def _fitted(
-    circles_of: CirclesOf,
-    given: Calibration,
-    ray: np.ndarray,
-    zenith: np.ndarray,
-    zenith_sigma: float | None,
-) -> tuple[float, FoundAxis] | None:
-    """The answer near a zenith, by Levenberg and Marquardt's method, with its chi-square; None if it does not converge.
-
-    Axis and zenith together lie in a narrow, bent valley where the sensor leans about alike in all directions.
-    """
-    damping, now = FIRST_DAMPING, _normal(circles_of, given, ray, given.a3, zenith, zenith_sigma)
-    if now is None:
-        return None
-    for _ in range(AXIS_ROUNDS):
-        damped = now.matrix + damping * np.diag(np.diag(now.matrix))
-        step = -np.linalg.solve(damped, now.pull)
-        moved = rotation.normalised(now.a3 @ ray + step[:2] @ now.across)
-        a3 = rotation.shortest_turn(now.a3 @ ray, moved) @ now.a3
-        there = now.zenith
-        if zenith_sigma is None:
-            there = rotation.normalised(there + step[2:] @ now.part.east_north(there))
-        tried = _normal(circles_of, given, ray, a3, there, zenith_sigma)
-        if tried is None or tried.chi2 > now.chi2:
-            damping *= 10
-            if damping > LAST_DAMPING:
-                break
-            continue
-        gain, now, damping = now.chi2 - tried.chi2, tried, damping / 10
-        if gain < SETTLED_CHI2:
-            break
-    spread = np.linalg.inv(now.matrix)
-    told = len(spread) - float(np.trace(now.prior @ spread[:2, :2]))
-    number = len(now.part.circles)
-    scatter2 = excess(now.chi2, int(number - np.floor(told + 1e-6)))
-    answer = FoundAxis(
-        a3=now.a3,
-        ray=ray,
-        zenith=now.zenith,
-        across=now.across,
-        covariance=spread[:2, :2] * (1 + scatter2),
-        scatter2=scatter2,
-        directions=number,
-        circles=now.circles,
-    )
-    return now.chi2, answer
-
-
-def _normal(
-    circles_of: CirclesOf,
-    given: Calibration,
-    ray: np.ndarray,
-    a3: np.ndarray,
-    zenith: np.ndarray,
-    zenith_sigma: float | None,
-) -> _Normal | None:
-    """Linearise at an A3 and a zenith; None for an axis that some frames cannot have.
-
-    zenith_sigma: None if the zenith is unknown.
-    """
-    circles = sorted(circles_of(a3), key=lambda c: c.utc_unix_s)
-    if len(circles) < len(circles_of(given.a3)):
-        return None
-    part, axis = Directions.of(circles), a3 @ ray
-    left, of_zenith = part.residual(zenith)
-    across = np.linalg.svd(axis[None])[2][1:]
-    of_axis = -np.array([np.mean([_slope(c, across) for c in g], axis=0) for g in part.circles])
-    stated = np.sum([c for name, c in part.sources.items() if name != OF_A3], axis=0)
-    slope = of_axis
-    if zenith_sigma is None:
-        slope = np.hstack([of_axis, of_zenith])
-    else:
-        stated = stated + zenith_sigma**2 * of_zenith @ of_zenith.T
-    # how far the axis is from where it was given, in units of what is known of it
-    turns = np.cross(axis, across)
-    about = np.asarray(given.covariance_arcsec2, float) * ARCSEC**2
-    prior = np.linalg.inv(turns @ about @ turns.T + MIN_RAD**2 * np.eye(2))
-    off = across @ (axis - given.a3 @ ray)
-    weighted = np.linalg.solve(stated, np.column_stack([left, slope]))
-    matrix, pull = slope.T @ weighted[:, 1:], slope.T @ weighted[:, 0]
-    matrix[:2, :2] += prior
-    pull[:2] += prior @ off
-    return _Normal(
-        a3=a3,
-        zenith=zenith,
-        across=across,
-        matrix=matrix,
-        pull=pull,
-        prior=prior,
-        chi2=float(left @ weighted[:, 0] + off @ prior @ off),
-        part=part,
-        circles=circles,
-    )

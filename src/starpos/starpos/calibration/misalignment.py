@@ -82,7 +82,8 @@ class Calibrated:
 
     plumb_stddev_arcsec: sigma of the plumb line in the camera, on the worse of two axes.
     beyond: a sentence on how much the frames scatter beyond the stated errors, and what to state; '' if they do not.
-    The budgets of the fixes take A3 as unknown, because the calibration was made from the same frames.
+    The budgets of the fixes take A3 as unknown, because the calibration was made from the same frames; of a level inside
+    the camera, as known as such a level is.
     """
 
     instrument: Instrument
@@ -168,7 +169,8 @@ def calibrate(
 
     Raises FixError if the frames do not agree.
     """
-    unknown = Calibration.of(solver.instrument.calibration.misalignment_deg)
+    given, inside = solver.instrument.calibration, solver.instrument.has_level_inside
+    unknown = given if inside else Calibration.of(given.misalignment_deg)
     errors = solver.instrument.inclinometer
     solver = _with(solver, unknown, errors)
     solutions: list[Solution] = []
@@ -188,7 +190,8 @@ def calibrate(
             break
         a3 = solver.instrument.mounting.a3
         agreement = _agreed(find, solved, a3, errors)
-        solver = _with(solver, _unknown(agreement, errors), agreement.errors(errors))
+        now = replace(_found(agreement, errors), covariance_arcsec2=given.covariance_arcsec2)
+        solver = _with(solver, now if inside else _unknown(agreement, errors), agreement.errors(errors))
         # a turn about the plumb line changes no fix
         if k and np.linalg.norm(agreement.plumb.a3[2] - a3[2]) < SETTLED_RAD:
             break
@@ -502,6 +505,9 @@ def turn(
     >>> starpos.average(starpos.turn(solver, stars, tilts).fixes)
     <Average of 8 frames: +35.7... +51.4... +- ...>
     """
+
+    if solver.instrument.has_level_inside:
+        turn_stddev_deg = min(turn_stddev_deg, solver.instrument.calibration.turn_stddev_deg)
 
     def find(readings: Readings, a3: np.ndarray) -> PlumbLine:
         return level(readings, a3, np.radians(turn_stddev_deg))

@@ -37,7 +37,7 @@ from starpos.instrument.instrument import (
 from starpos.instrument.tilt_log import TiltLog
 from starpos.night.opening import frames_in
 from starpos.night.reading import NO_CAMERA, First, Instruments, Reader
-from starpos.night.remarks import of_inclinometer
+from starpos.night.remarks import WORTH_SAVING_ARCSEC, of_inclinometer, of_left_out
 from starpos.night.together import axis_of, circles_of
 from starpos.night.work import Solving
 from starpos.sky import catalogue
@@ -124,8 +124,14 @@ def run_elevations(
             console.complain("calibrate", f"left out: {row}")
     site = _site(args)
     found = axis_of(solver, pointings, tilts, site=site)
-    for remark in of_inclinometer(instrument):
+    for remark in (*of_left_out(found.left_out), *of_inclinometer(instrument)):
         console.complain("calibrate", remark)
+    scatter = np.sqrt(1 + found.scatter2)
+    if scatter > SCATTERED and found.stddev_arcsec > WORTH_SAVING_ARCSEC:
+        raise FixError(
+            f"A3 is not written: the elevations scatter by {scatter:.0f} times their stated errors, and determine it to "
+            f"{found.stddev_arcsec:.0f} arcsec only: check the place, the clock, and the tilts' axes, signs and units"
+        )
     calibration = found.calibration(instrument.calibration, options.turn_of(args))
     about = (
         f"A3 of {calibration.frames} elevations in {found.directions} directions at {_text_of(site)} "
@@ -203,6 +209,8 @@ def _json_of_site(found: Calibrated, path: str) -> dict:
 
 # Exit status.
 NOTHING = 1
+# elevations that scatter by more, in stated sigmas, contradict what is stated with them
+SCATTERED = 3.0
 # the stars of a frame, and their identification
 _Seen = tuple[Stars, Identification | None]
 

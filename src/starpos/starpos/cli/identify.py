@@ -6,19 +6,14 @@ import math
 
 import numpy as np
 
-from starpos.cli import console, inputs, options
+from starpos.cli import console, inputs
 from starpos.cli.console import Output
-from starpos.cli.inputs import frames_among, given_of, is_untold, reader_of
+from starpos.cli.inputs import frames_among, reader_of
 from starpos.errors import FrameError
-from starpos.fix.blind import BlindSolver
 from starpos.fix.solution import Solution, Status
 from starpos.frames.frame import Stars
 from starpos.instrument.camera import EQUIDISTANT
-from starpos.night.reading import First, Instruments
-from starpos.night.work import OnFile, Solving
-from starpos.parallel.processes import Here
-from starpos.progress import quiet
-from starpos.sky.catalogue import load_catalogue
+from starpos.night.work import OnFile
 from starpos.units import ARCSEC
 
 # of --csv
@@ -37,17 +32,8 @@ def run(args: argparse.Namespace) -> int:
     complaints = console.FrameComplaints("identify")
     read, output = reader_of(args), Output(args, COLUMNS, HEAD)
     with inputs.workers_of(args, number) as workers:
-        (about,) = workers.map([(First(read), tuple(args.frames))])
-        given = Instruments(None, by_header=True)
-        if about is not None and is_untold(args) and about.focal_px is None:
-            BlindSolver(load_catalogue(), console.ProgressBar()).prepare()
-        elif about is not None:
-            given = given_of(args, about)
-            inputs.prepare("identify", options.instrument_of(args, about), about)
-        # without a frame that can be read, each one reports why it cannot
-        # several at once would write over each other's progress
-        progress = console.ProgressBar() if isinstance(workers, Here) else quiet
-        work = OnFile(read, Solving(given, search_s=args.search_time, progress=progress))
+        solving = inputs.identifying("identify", args, args.frames, read, workers, args.search_time)
+        work = OnFile(read, solving)
         answers = inputs.watched(workers.map((work, path) for path in args.frames), number)
         for path, answer in zip(args.frames, answers, strict=True):
             if isinstance(answer, FrameError):
@@ -61,7 +47,7 @@ def run(args: argparse.Namespace) -> int:
             output.put(as_json(path, found) | {"cpu_ms": cpu_ms}, _line(path, found))
     complaints.end()
     if lost is not None and not any_found:
-        for remark in Solving(given).fitting(lost):
+        for remark in solving.fitting(lost):
             console.complain("identify", remark)
     return console.UNREADABLE if unreadable else 0 if any_found else 1
 

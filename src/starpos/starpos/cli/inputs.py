@@ -14,17 +14,22 @@ from typing import TYPE_CHECKING
 
 from starpos.cli import console, options
 from starpos.errors import FrameError, InstrumentError, StarposError, TiltError
+from starpos.fix.blind import BlindSolver
+from starpos.fix.searching import Sight
 from starpos.fix.solver import Solver
 from starpos.frames.exif import CameraClock
-from starpos.frames.frame import no_stars
-from starpos.frames.reading import HEIF, JPEG, RAW
+from starpos.frames.frame import Frame, Stars, no_stars
+from starpos.frames.reading import are_photographs, why_no_time
 from starpos.frames.tables import TILTS, TRUTH
-from starpos.instrument.camera import PLUMB_BOB
+from starpos.instrument.camera import PLUMB_BOB, Camera
 from starpos.instrument.instrument import Instrument
-from starpos.night.reading import About, Instruments, Reader, TiltFile
+from starpos.night.opening import work_of
+from starpos.night.reading import About, First, Instruments, Reader, TiltFile
 from starpos.night.remarks import NEAR_KM, Near, of_tilts
+from starpos.night.work import Solving
 from starpos.parallel.cluster import Cluster
-from starpos.parallel.processes import Workers, processors, workers
+from starpos.parallel.processes import Here, Workers, processors, workers
+from starpos.progress import quiet
 from starpos.recording.drivers import Drivers
 from starpos.sky import catalogue
 
@@ -62,6 +67,71 @@ def given_or_sought(args: argparse.Namespace, first: About) -> Instruments:
 def is_untold(args: argparse.Namespace) -> bool:
     """Whether the options say nothing of the camera."""
     return (args.instrument, args.focal_mm, args.pixel_um) == (None,) * 3 and args.lens == PLUMB_BOB
+
+
+def seen_at_place(command: str, args: argparse.Namespace) -> Iterator[tuple[Frame | Stars, Sight, Camera]]:
+    """Frames with their attitudes at --site, and the camera with the focal length that their stars show.
+
+    Frames without one are complained about.  Raises InstrumentError without --site, and StarposError as `solve` does.
+    """
+    place = options.place_of(args, options.vertical_of(args))
+    if place is None:
+        raise InstrumentError(f"{command} needs the place of the camera: give --site LAT LON")
+    read = reader_of(args)
+    about = First(read)(tuple(args.frames))
+    if about is None:
+        # says why
+        read(args.frames[0])
+    assert about is not None
+    work, remarks = work_of(given_or_sought(args, about), about, None, options.atmosphere_of(args), place)
+    for remark in remarks:
+        console.complain(command, remark)
+    if work.instruments.sought:
+        BlindSolver(catalogue.load_catalogue(), console.ProgressBar()).prepare()
+    for path in args.frames:
+        try:
+            item = read(path)
+        except FrameError as e:
+            console.complain(command, e)
+            continue
+        sight = work(item)
+        answer = sight.solution
+        if answer.at_place is None or answer.found is None:
+            console.complain(
+                command, answer.message if answer.found is None or item.mid_unix_s else why_no_time_of(item)
+            )
+            continue
+        instrument = sight.instrument or work.instruments.of(item)
+        assert instrument is not None
+        camera = instrument.camera_for(item.width, item.height, item.origin_px)
+        yield item, sight, camera.scaled(answer.found.focal_scale * answer.at_place.focal_scale)
+
+
+def why_no_time_of(item: Frame | Stars) -> str:
+    """The sentence for a frame without a time."""
+    return f"{item.place}: no time of exposure: {why_no_time(item)}"
+
+
+def identifying(
+    command: str,
+    args: argparse.Namespace,
+    frames: Sequence[str],
+    read: Reader,
+    workers: Workers,
+    search_s: float,
+) -> Solving:
+    """The work that identifies frames with the camera of the options, else of their headers, else of any scale."""
+    (about,) = workers.map([(First(read), tuple(frames))])
+    given = Instruments(None, by_header=True)
+    if about is not None and is_untold(args) and about.focal_px is None:
+        BlindSolver(catalogue.load_catalogue(), console.ProgressBar()).prepare()
+    elif about is not None:
+        given = given_of(args, about)
+        prepare(command, options.instrument_of(args, about), about)
+    # without a frame that can be read, each one reports why it cannot
+    # several at once would write over each other's progress
+    progress = console.ProgressBar() if isinstance(workers, Here) else quiet
+    return Solving(given, search_s=search_s, progress=progress)
 
 
 def checked_tilts(command: str, path: str, instrument: Instrument) -> TiltFile:
@@ -144,11 +214,6 @@ def _night(folder: str) -> NightFolder | FrameError:
         return error
     tilt = os.path.abspath(os.path.join(folder, TILTS))
     return NightFolder(frames, None if are_photographs(frames) and not os.path.exists(tilt) else tilt, folder)
-
-
-def are_photographs(paths: Sequence[str]) -> bool:
-    """Whether all files are of the kinds in which a telephone's photographs, with gravity, come."""
-    return all(os.path.splitext(path)[1].lower() in JPEG + HEIF + RAW for path in paths)
 
 
 PIP = "pip install matplotlib rosbags"

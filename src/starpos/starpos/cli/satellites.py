@@ -2,13 +2,17 @@
 """`starpos satellites`: a place from satellites among the stars, without a level."""
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from starpos.cli import console
+from starpos.cli import console, inputs
 from starpos.earth.gravity import itrs_place
-from starpos.errors import SatelliteError
+from starpos.errors import FrameError, SatelliteError
+from starpos.fix.blind import SEARCH_S
+from starpos.fix.solution import Solution
+from starpos.night.work import OnFile, TrailSighted
 from starpos.satellites.adjustment import KnownBefore
 from starpos.satellites.elements import chosen, read_orbits
 from starpos.satellites.locating import SatelliteFix, locate
@@ -19,13 +23,20 @@ from starpos.satellites.trails import SatelliteTrail
 UNKNOWN_HEIGHT_M, UNKNOWN_HEIGHT_STDDEV_M = 500.0, 700.0
 HEIGHT_STDDEV_M = 50.0
 KM = 1000.0
+# other files are frames
+TABLES = ".csv", ".iod", ".txt"
 
 
 def run(args: argparse.Namespace) -> int:
     trails: list[SatelliteTrail] = []
+    frames = [path for path in args.sightings if Path(path).suffix.lower() not in TABLES]
     for path in args.sightings:
-        more = _read(path)
-        trails += more
+        trails += [] if path in frames else _read(path)
+    if frames:
+        trails += _on_frames(args, frames, 1 + max((trail.track for trail in trails), default=-1))
+    if not trails:
+        console.complain("satellites", f"none of the {len(frames)} frames has a trail with both ends")
+        return 1
     orbits = []
     for path in args.elements:
         found, about = read_orbits(path)
@@ -66,6 +77,25 @@ def _read(path: str) -> list[SatelliteTrail]:
     trails, about = read_iod(path)
     for sentence in about:
         console.complain("satellites", sentence)
+    return trails
+
+
+def _on_frames(args: argparse.Namespace, frames: list[str], first: int) -> list[SatelliteTrail]:
+    """The trails on frames, numbered from `first` on; complains of frames without."""
+    trails: list[SatelliteTrail] = []
+    complaints, read = console.FrameComplaints("satellites"), inputs.reader_of(args)
+    with inputs.workers_of(args, len(frames)) as workers:
+        solving = inputs.identifying("satellites", args, frames, read, workers, SEARCH_S)
+        work = OnFile(read, TrailSighted(solving))
+        answers = inputs.watched(workers.map((work, path) for path in frames), len(frames))
+        for path, found in zip(frames, answers, strict=True):
+            if isinstance(found, FrameError):
+                complaints(path, str(found))
+            elif isinstance(found, Solution):
+                complaints(path, found.message)
+            else:
+                trails += [replace(t, track=first + len(trails) + k, file=path) for k, t in enumerate(found)]
+    complaints.end()
     return trails
 
 

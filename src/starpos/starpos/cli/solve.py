@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from starpos.averaging.altitudes import FoundAxis
+from starpos.averaging.elevation_axis import FoundAxis
 from starpos.cli import console, fix_output, inputs, options, overwriting, sights
 from starpos.cli.console import Output
 from starpos.cli.fix_output import (
@@ -112,10 +112,10 @@ def tell(
         tell_unknown("solve", args, vertical.at(where.latitude, where.longitude))
         about = {} if near is None else {"km_from_near": near.km_from(where.latitude, where.longitude)}
         if place is not None:
-            about |= with_heading(json_of(whole.average, vertical), mean, place)
+            about |= with_heading(json_of(whole.average, vertical), mean, place, options.axes_of(args))
         put_combined(output, night, whole.average, gathered, vertical, about)
     elif headings and place is not None:
-        fix_output.put_mean(output, night, headings, mean, place, vertical)
+        fix_output.put_mean(output, night, headings, mean, place, vertical, options.axes_of(args))
     elif gathered.lost is not None and not headings and work is not None:
         say(night, *work.fitting(gathered.lost))
     # without tilts headings are all that was asked for, and by day they are all there is
@@ -137,13 +137,13 @@ def _json_of_answer(
     if s.circle is not None:
         values |= {"utc": utc_text(s.circle.utc_unix_s)}
         values |= {"zenith_distance_deg": np.degrees(s.circle.zenith_distance)}
-    return values if place is None else with_heading(values, s.at_place, place)
+    return values if place is None else with_heading(values, s.at_place, place, options.axes_of(args))
 
 
 def _line_of_answer(args: argparse.Namespace, answer: FrameAnswer, place: Place | None) -> str:
     s, watched = answer.solution, answer.watched
     if place is not None or s.at_place is not None:
-        line = fix_output.heading_line_of(answer.name, s)
+        line = fix_output.heading_line_of(answer.name, s, options.axes_of(args))
     else:
         line = line_of(answer.name, s, args.self_calibrate)
     if watched is None or watched.compared is None:

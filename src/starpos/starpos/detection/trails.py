@@ -39,6 +39,8 @@ UNSTEADY = 0.3
 UNEVEN, MAX_KNOTS = 3.0, 12
 # Over their noise: pixels farther from the model are a star's.
 OUTLIER = 5.0
+# Maximum share of the frame that is left out for its stars, the brightest first.
+MOST_HIDDEN = 0.15
 # A star hides at most so much of a trail to either side of its end, px.
 HIDDEN_PX = 30
 # px, 1 sigma: what the model of an image does not describe.
@@ -123,11 +125,11 @@ def _light_of(sky: SkyPlane, x: np.ndarray, y: np.ndarray, flux: np.ndarray, sig
     # out to where a Gaussian, half as wide again as the stars' for its wings, is lost in the noise
     peak = flux / (2 * np.pi * sigma**2 * max(sky.typical[1], 1e-9))
     radius = 1.5 * sigma * np.sqrt(2 * np.log(np.maximum(2 * peak, 2.0)))
-    seen = (
-        (peak > 1.0)
-        & (np.abs(2 * x - width) < width + 2 * radius)
-        & (np.abs(2 * y - height) < height + 2 * radius)
-    )
+    on = (np.abs(2 * x - width) < width + 2 * radius) & (np.abs(2 * y - height) < height + 2 * radius)
+    order = np.argsort(-flux * on)
+    few = np.cumsum((np.pi * radius**2 * on)[order]) < MOST_HIDDEN * light.size
+    seen = np.zeros(len(x), bool)
+    seen[order[few]] = (on & (peak > 1.0))[order[few]]
     reach = np.ceil(radius).astype(int)
     for r in np.unique(reach[seen]):
         dy, dx = np.nonzero(np.hypot(*np.mgrid[-r : r + 1, -r : r + 1]) <= r)

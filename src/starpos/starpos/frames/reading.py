@@ -2,7 +2,7 @@
 """Read frames from files: FITS, TIFF, PNG, JPEG, BMP, HEIF, camera raw; and stars from a CSV of centroids."""
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO
@@ -125,6 +125,11 @@ def _opened(path: Path) -> Iterator[BinaryIO]:
         if size > MAX_BYTES:
             raise FrameError(f"{path}: it has over {MAX_BYTES // 10**6} MB, too many for a frame.")
         yield file
+
+
+def are_photographs(paths: Sequence[Path | str]) -> bool:
+    """Whether all files are of the kinds in which a telephone's photographs, with gravity, come."""
+    return all(Path(path).suffix.lower() in JPEG + HEIF + RAW for path in paths)
 
 
 def decode_frame(data: bytes, source: str) -> Frame:

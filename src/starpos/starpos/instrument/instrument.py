@@ -386,6 +386,11 @@ class Instrument:
             )
         _check_rotation(self.link_to_camera, "link_to_camera")
 
+    @property
+    def has_level_inside(self) -> bool:
+        """Whether the inclinometer is a camera's own, whose axes are near the camera's."""
+        return is_built_in(self.inclinometer_model) and not self.calibration.unknown
+
     def levelled_by(self, model: str) -> "Instrument":
         """The instrument with a level of this model inside its camera, as far as A3 and the inclinometer are unknown."""
         known = self

@@ -90,7 +90,8 @@ def read_tilt_csv(path: Path | str, noise_rad: float = SCA100T_NOISE_RAD) -> Til
 
 
 # Times of these steps, s, are rounded: float32 at today's times, and six digits as %g writes.
-ROUNDED_S, FEWEST_ROUNDED = (128.0, 10_000.0), 3
+# FEWEST_STUCK times that are all the same were cut off elsewhere.
+ROUNDED_S, FEWEST_ROUNDED, FEWEST_STUCK = (128.0, 10_000.0), 3, 10
 
 
 def _check_digits(path: Path, t: np.ndarray) -> None:
@@ -98,10 +99,11 @@ def _check_digits(path: Path, t: np.ndarray) -> None:
     t = t[np.isfinite(t)]
     if len(t) < FEWEST_ROUNDED or len(np.unique(t)) == len(t):
         return
-    if any((t % step == 0).all() for step in ROUNDED_S):
+    stuck = len(t) >= FEWEST_STUCK and len(np.unique(t)) == 1
+    if stuck or any((t % step == 0).all() for step in ROUNDED_S):
         raise TiltError(
-            f"{path}: {len(t)} readings have {len(np.unique(t))} times, all whole multiples of over 100 s: they were "
-            "rounded by float32, or by %g: write utc_unix_s with its fractions of a second (%.3f, double precision)"
+            f"{path}: {len(t)} readings have only {len(np.unique(t))} different times: they were rounded, as by float32 "
+            "or %g: write utc_unix_s with its fractions of a second (%.3f, double precision)"
         )
 
 

@@ -15,9 +15,10 @@ from starpos.earth.refraction import Atmosphere
 from starpos.earth.vertical import Deflection, Vertical
 from starpos.errors import FrameError, TiltError
 from starpos.files import open_regular, read_regular
+from starpos.frames.exif import CameraClock
 from starpos.frames.frame import Frame, Stars
 from starpos.frames.gravity import PHONE
-from starpos.frames.reading import FITS, HEIF, JPEG, PICTURE, RAW
+from starpos.frames.reading import FITS, HEIF, JPEG, PICTURE, RAW, are_photographs
 from starpos.frames.tables import GNSS, SIMULATED, TILTS, TRUTH
 from starpos.gnss.receiver import GnssTrack, read_gnss_csv
 from starpos.instrument import instrument_file, sensors
@@ -25,7 +26,7 @@ from starpos.instrument.instrument import ByGravity, Calibration, Instrument
 from starpos.instrument.tilt_log import TiltsByTime
 from starpos.night.night import Night, Truth
 from starpos.night.reading import About, First, Instruments, Reader, TiltFile
-from starpos.night.remarks import Remark, of_tilts
+from starpos.night.remarks import Remark, of_gravity, of_tilts
 from starpos.night.solving import Exposures, How, Worked, solved_night
 from starpos.night.together import Receiver
 from starpos.night.work import OnFile, Solving
@@ -53,11 +54,15 @@ def exposures(
     Raises FrameError if there are no frames, or truth.json cannot be used.
     """
     frames, read = frames_in(folder), read or Reader()
-    first = First(read)(tuple(map(str, frames)))
+    tilts: Path | ByGravity = folder / TILTS
+    if place is None and not tilts.exists() and are_photographs(frames):
+        tilts, read = ByGravity(), replace(read, clock=read.clock or CameraClock())
+    by_gravity = isinstance(tilts, ByGravity)
+    first = First(read, by_gravity)(tuple(map(str, frames)))
     work, remarks = Solving(given, atmosphere=atmosphere, places=place), tuple[Remark, ...]()
     if first is not None:
         try:
-            work, remarks = work_of(given, first, folder / TILTS, atmosphere, place)
+            work, remarks = work_of(given, first, tilts, atmosphere, place)
         except TiltError as error:
             tilts = (
                 None if place is not None and not (folder / TILTS).exists() else TiltsByTime(why=str(error))
@@ -71,7 +76,8 @@ def exposures(
 
     return Exposures(
         name=folder.name or str(folder),
-        origin=f"solved from {len(frames)} {'lists of stars' if frames[0].suffix == '.csv' else 'frames'} and {TILTS}",
+        origin=f"solved from {len(frames)} {'lists of stars' if frames[0].suffix == '.csv' else 'frames'} and "
+        f"{'the gravity in their files' if by_gravity else TILTS}",
         count=len(frames),
         each=each,
         work=work,
@@ -97,7 +103,8 @@ def work_of(
         model = PHONE if first.gravity is None else first.gravity.model
         known = None if given.instrument is None else given.instrument.levelled_by(model)
         instruments, remarks = replace(given, instrument=known).framed(first)
-        return Solving(instruments, atmosphere=atmosphere, tilts=tilts, places=place), remarks
+        own = () if known is None or first.gravity is None else of_gravity(known)
+        return Solving(instruments, atmosphere=atmosphere, tilts=tilts, places=place), (*own, *remarks)
     instruments, remarks = given.framed(first)
     if tilts is None:
         return Solving(instruments, atmosphere=atmosphere, places=place), remarks
@@ -222,17 +229,19 @@ class NightOnDisk:
 
         Raises StarposError where the folder or the instrument cannot be used.
         """
-        given = self.instrument
+        given, sought = self.instrument, False
         if given is None:
             first = First(Reader())(tuple(map(str, frames_in(self.folder))))
             # each frame's own counts; without any, the frame says so
             given = None if first is None or first.focal_px is None else Instrument(first.focal_px)
+            if sought := first is not None and first.focal_px is None and first.gravity is not None:
+                given = Instrument(float(max(first.width, first.height)))
         if given is not None and self.calibration is not None:
             given = replace(given, calibration=self.calibration)
         if given is not None and self.inclinometer:
             model, errors = sensors.find(self.inclinometer)
             given = replace(given, inclinometer=errors, inclinometer_model=model)
-        instruments = Instruments(given, by_header=self.instrument is None)
+        instruments = Instruments(given, by_header=self.instrument is None, sought=sought)
         track = read_gnss_csv(gnss)[0] if isinstance(gnss, (str, Path)) else gnss
         return solved_night(
             exposures(self.folder, instruments, self.atmosphere, self.vertical, self.place),

@@ -2,12 +2,13 @@
 """Remarks on a night, each a kind and a sentence; among them doubts: mistaken tilts, a place far from the stated one."""
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 
 import numpy as np
 
-from starpos.averaging.average import Average
+from starpos.averaging.average import SCATTER, Average
+from starpos.averaging.elevation_axis import FoundAxis
 from starpos.calibration.misalignment import Calibrated
 from starpos.earth.ellipsoid import EARTH_RADIUS_M, zenith_of
 from starpos.earth.orientation import ROTATION_RAD_S
@@ -22,6 +23,8 @@ from starpos.fix.checks import (
     unnamed_inclinometer,
 )
 from starpos.fix.fix import Fix, length_text
+from starpos.fix.terms import Origin, total_covariance
+from starpos.frames.gravity import PHONE
 from starpos.frozen import at_once
 from starpos.instrument.inclinometer import InclinometerErrors, Tilt, level_of, up_of
 from starpos.instrument.instrument import Calibration, Instrument
@@ -31,6 +34,10 @@ from starpos.instrument.tilt_table import like_radians
 from starpos.rotation import half_turn
 from starpos.units import HOUR_S, utc_text
 
+# sigma of two coordinates together, beyond which a place is once in 100
+CLAIMED_SIGMAS = 3.03
+# of a camera that lay on a table: its lean's change, and the largest gap between its headings, rad
+TABLE_COSINE, TABLE_GAP_RAD = float(np.cos(np.radians(5.0))), np.radians(190.0)
 # with a larger error of A3 (arcsec) the headings hardly determine it
 WORTH_SAVING_ARCSEC = 600.0
 
@@ -77,6 +84,49 @@ def of_inclinometer(instrument: Instrument, ways: str = MODEL_BY_OPTIONS) -> tup
     return (Remark(Kind.INCLINOMETER, sentence),) if sentence else ()
 
 
+def of_gravity(instrument: Instrument) -> tuple[Remark, ...]:
+    """Say what a place by photographs alone rests on; instrument: with their level."""
+    if not instrument.has_level_inside:
+        return ()
+    level = "felt by the telephone" if instrument.inclinometer_model == PHONE else "by the camera's level"
+    sentence = (
+        f"the level is the gravity in the files, {level}; time, zone and lens are the files' too; their GPS is only "
+        "compared"
+    )
+    return (Remark(Kind.RECORDED, sentence),)
+
+
+def of_marks(place: Fix | Average, marks_deg: Sequence[tuple[float, float]]) -> tuple[Remark, ...]:
+    """Compare a place with the first of those that GPS wrote into the frames' files, deg on WGS 84."""
+    if not marks_deg:
+        return ()
+    mark = Near(*np.radians(marks_deg[0]).tolist())
+    off = np.array([half_turn(place.longitude - mark.longitude), place.latitude - mark.latitude])
+    off *= EARTH_RADIUS_M * np.array([np.cos(mark.latitude), 1.0])
+    sigmas = float(np.sqrt(off @ np.linalg.solve(place.covariance[:2, :2], off)))
+    claim = "within the claim" if sigmas < CLAIMED_SIGMAS else f"{sigmas:.1f} sigma, beyond the claim"
+    km = mark.km_from(place.latitude, place.longitude)
+    return (Remark(Kind.FAR, f"the place is {km:.0f} km from the GPS place in the file, {claim}"),)
+
+
+def of_table(fixes: Sequence[Fix], whole: Average, given: Instrument) -> tuple[Remark, ...]:
+    """Say what --self-calibrate would give for a telephone that was turned on a table."""
+    ups = np.array([f.tilt.up for f in fixes])
+    middle = ups.mean(0) / np.linalg.norm(ups.mean(0))
+    turns = np.sort([f.heading for f in fixes])
+    gap = np.diff(turns, append=turns[0] + 2 * np.pi).max()
+    known = given.calibration.frames > 0 or not given.has_level_inside
+    if known or (ups @ middle).min() < TABLE_COSINE or gap > TABLE_GAP_RAD:
+        return ()
+    left = total_covariance(t for t in whole.terms if t.origin is not Origin.A3)
+    km = float(np.sqrt(np.diag(left)[:2].max())) / 1000
+    sentence = (
+        "the camera was turned where it lay: --self-calibrate finds the error of its level, for a place to about "
+        f"{km:.1f} km, and with --save OUT later photographs have it"
+    )
+    return (Remark(Kind.NOT_CALIBRATED, sentence),)
+
+
 def of_axis(doubt: str) -> tuple[Remark, ...]:
     """Say that the optical axis of a night's frames is not known; doubt: the sentence, '' if it is known."""
     return (Remark(Kind.AXIS, doubt),) if doubt else ()
@@ -107,6 +157,42 @@ def of_average(whole: Average) -> Iterator[Remark]:
             Kind.LEFT_OUT,
             f"{whole.left_out} fixes lie further from the others than their errors allow: they are not in the average",
         )
+
+
+def beyond_stated(place: Average | None) -> bool:
+    """Whether the residuals of elevations are beyond their stated errors; they are if no place fits."""
+    if place is None:
+        return True
+    shares = [np.trace(t.covariance[:2, :2]) for t in place.terms if t.name == SCATTER]
+    return place.left_out > 0 or sum(shares) > np.trace(place.covariance[:2, :2]) / 2
+
+
+def of_left_out(elevations: int) -> Iterator[Remark]:
+    """Say that some elevations are not used."""
+    if elevations:
+        yield Remark(
+            Kind.LEFT_OUT,
+            f"{elevations} elevations contradict the others and are left out: their tilts or pointings are wrong",
+        )
+
+
+def of_elevations(place: Average) -> Iterator[Remark]:
+    """Say which elevations the place is not from, and that the others scatter."""
+    yield from of_left_out(place.left_out)
+    if beyond_stated(replace(place, left_out=0)):
+        yield Remark(
+            Kind.TILTS,
+            "the elevations scatter by more than the stated errors of tilts and A3: the claimed error includes it",
+        )
+
+
+def of_denied_a3(axis: FoundAxis, given: Calibration) -> Remark:
+    """Say that the elevations deny the A3 that was given."""
+    return Remark(
+        Kind.UNKNOWN_A3,
+        f"the elevations deny the A3 given, by {axis.sigma_from(given):.0f} sigma: the place is from the A3 that they "
+        "determine: calibrate again",
+    )
 
 
 def of_a3(calibration: Calibration, place: Fix | Average, ways: str = BY_OPTIONS) -> tuple[Remark, ...]:

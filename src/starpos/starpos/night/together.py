@@ -10,14 +10,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from starpos.averaging.altitudes import (
-    MIN_WITHOUT_SITE,
-    Directions,
-    FoundAxis,
-    find_axis,
-    place_of_circles,
-)
+from starpos.averaging.altitudes import MIN_JUDGED, Directions, place_of_circles
 from starpos.averaging.average import Average, average
+from starpos.averaging.elevation_axis import MIN_WITHOUT_SITE, FoundAxis, find_axis
 from starpos.calibration.misalignment import Calibrated, turn
 from starpos.earth.orientation import EarthState
 from starpos.earth.place import Place
@@ -41,6 +36,9 @@ from starpos.instrument.tilt_log import Tilts
 from starpos.night import remarks
 from starpos.night.remarks import Kind, Near, Remark, doubts, of_inclinometer
 
+# elevations that have A3's axis further from where it was given, in sigma of both, deny the given one
+DENIED_SIGMA = 6.0
+
 
 @dataclass(frozen=True, kw_only=True)
 class Solved:
@@ -51,10 +49,11 @@ class Solved:
     stars_detected: int
     stars_matched: int
     log_odds: float
+    gps_deg: tuple[float, float] | None
 
     @classmethod
-    def of(cls, s: Solution, fix: Fix) -> "Solved":
-        """The part of a solution with a fix."""
+    def of(cls, s: Solution, fix: Fix, gps_deg: tuple[float, float] | None = None) -> "Solved":
+        """The part of a solution with a fix; gps_deg: as the Exposure of its stars has it."""
         light = replace(fix, used=np.zeros(0, int), residual_px=np.zeros((0, 2)))
         log_odds = s.pointing.log_odds if s.pointing else float("nan")
         return cls(
@@ -63,6 +62,7 @@ class Solved:
             stars_detected=s.stars_detected,
             stars_matched=len(s.names),
             log_odds=log_odds,
+            gps_deg=gps_deg,
         )
 
 
@@ -109,7 +109,7 @@ class Gathered:
         self.unreadable |= not answer.readable
         self.warnings |= set(s.warnings)
         if s.fix:
-            self.solved.append(Solved.of(s, s.fix))
+            self.solved.append(Solved.of(s, s.fix, None if answer.stars is None else answer.stars.gps_deg))
         if s.at_place:
             self.headings.append(s)
         if s.circle is not None:
@@ -150,6 +150,8 @@ def together(gathered: Gathered, given: Instrument | None, near: Near | None = N
         said += remarks.of_a3(given.calibration, place)
         if given.vertical is None and not given.calibration.unknown:
             mounting = given.mounting
+        said += [] if whole is None else remarks.of_table([s.fix for s in solved], whole, given)
+    said += remarks.of_marks(place, [s.gps_deg for s in solved if s.gps_deg is not None])
     said += doubts([s.fix for s in solved], place, mounting, near)
     return Together(whole, why_not, tuple(said))
 
@@ -255,10 +257,26 @@ def from_elevations(
             # A3's error is counted from the given A3, or from the one found if none was given
             sound = axis.about(axis.a3 if self_calibrate else solver.instrument.calibration.a3)
         place = place_of_circles(sound, there)
-        together = Together(place, "", (*of_inclinometer(solver.instrument), *doubts((), place, None, near)))
+        if axis is not None:
+            place = replace(place, left_out=place.left_out + axis.left_out)
+        said = (
+            *remarks.of_elevations(place),
+            *of_inclinometer(solver.instrument),
+            *doubts((), place, None, near),
+        )
+        together = Together(place, "", said)
     except FixError as error:
         together = Together(None, str(error))
-    return Elevations(tuple(circles), together, axis)
+    found = Elevations(tuple(circles), together, axis)
+    if self_calibrate or axis is not None or not remarks.beyond_stated(together.average):
+        return found
+    # residuals beyond the stated errors may be those of a wrong A3, which no scatter covers
+    given = solver.instrument.calibration
+    free = from_elevations(solver, pointings, tilts, near, self_calibrate=True)
+    if free.axis is None or free.axis.directions < MIN_JUDGED or free.axis.sigma_from(given) < DENIED_SIGMA:
+        return found
+    said = (remarks.of_denied_a3(free.axis, given), *free.together.remarks)
+    return replace(free, circles=tuple(circles), together=replace(free.together, remarks=said))
 
 
 def axis_of(

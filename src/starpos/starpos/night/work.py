@@ -33,6 +33,8 @@ from starpos.instrument.tilt_log import Tilts
 from starpos.night.reading import First, Instruments, Reader, TiltFile, stars_of
 from starpos.night.remarks import Kind, Remark
 from starpos.progress import Progress, quiet
+from starpos.satellites.frames import trails_of
+from starpos.satellites.trails import SatelliteTrail
 from starpos.sky import catalogue
 from starpos.zenith.doubts import DeflectionSession
 from starpos.zenith.sighting import ZenithSighting, sighting
@@ -136,7 +138,10 @@ class Solving:
         if sight.found is None:
             return sight
         self._found_px[lens] = focal_px, model
-        remark = f"{item.place}: no focal length is stated: its stars give {focal_px:.0f} px"
+        told = "no focal length is stated"
+        if item.rough_focal_px is not None:
+            told = f"its EXIF gives a focal length of about {item.rough_focal_px:.0f} px"
+        remark = f"{item.place}: {told}: its stars give {focal_px:.0f} px"
         return replace(sight, solution=replace(sight.solution, remark=sight.solution.remark or remark))
 
     def _answer_at(self, lens: tuple[float, str], question: Question) -> Sight:
@@ -248,6 +253,25 @@ class ZenithSighted:
             return sighting(solver, sight.stars, sight.found, self.mark, self.tilts)
         except StarposError as error:
             return Solution.refused(sight.stars, error)
+
+
+@dataclass(frozen=True)
+class TrailSighted:
+    """Finds the trails of satellites on a frame; a frame's fault is a Solution that gives the reason."""
+
+    solving: Solving
+
+    def __call__(self, item: Frame | Stars) -> list[SatelliteTrail] | Solution:
+        """The trails on a frame, identified by every way there is; FrameError for a list of stars."""
+        if isinstance(item, Stars):
+            raise FrameError(f"{item.place}: a list of stars shows no trails: give the frame")
+        sight = self.solving(item)
+        known = sight.instrument or self.solving.instruments.of(item)
+        stars = sight.stars if known is None else replace(sight.stars, shutter=known.shutter or item.shutter)
+        try:
+            return trails_of(item, stars, sight.solution, catalogue.load_catalogue())
+        except StarposError as error:
+            return Solution.refused(stars, error)
 
 
 def deflection(

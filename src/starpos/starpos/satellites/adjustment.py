@@ -24,6 +24,9 @@ STEPS = 6
 STILL_M = 0.05
 # a trail or satellite is left out where chance makes it so unlikely
 REFUSED = 1e-4
+# Share of the stated error of sightings by hand that all of a night have in common: charts and setting circles are off
+# alike all night.
+SHARED_BY_HAND = 0.15
 # the scatter widens the covariance where chance makes it so unlikely
 SCATTER = 0.01
 
@@ -43,7 +46,7 @@ class _Block:
     """The equations of one satellite's trails.
 
     trails (n,).  of_row (m,): which trail each row is of.  residual (m,) against the orbit without its offset; by_place
-    (m, 4); by_offset (m, 3); prior (3, 3); total (m, m): the covariance with the offset's.
+    (m, 6): by what all share; by_offset (m, 3); prior (3, 3); total (m, m): the covariance with the offset's.
     """
 
     trails: np.ndarray
@@ -59,7 +62,7 @@ class _Block:
         return np.linalg.inv(self.total)
 
     def offset(self, step: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The satellite's offset (3,) after a step (4,) of the place, and its covariance (3, 3) with the place held."""
+        """The satellite's offset (3,) after a step (6,) of all unknowns, and its covariance (3, 3) at that place."""
         gain = self.prior @ self.by_offset.T @ self.weight
         return gain @ (self.residual - self.by_place @ step), self.prior - gain @ self.by_offset @ self.prior
 
@@ -69,9 +72,10 @@ class _Block:
 class PlaceAdjustment:
     """A place (3,) in ITRS, m, with the clock, by named trails.
 
-    covariance (4, 4): of east, north, up (m) and the clock (s), already widened by `scale` (variance).
+    covariance (6, 6): of east, north, up (m), the clock (s), and the errors that sightings by hand share; widened by
+    `scale`, a factor of variances.
     offset_m, offset_sigma_m (T, 3): each trail's satellite against its orbit: radial, along, across (left from above);
-    of a trail that is not used, by that trail alone.
+    NaN of a trail that is not used.
     used (T,); probability (T,): of so large a residual by chance.
     """
 
@@ -101,6 +105,9 @@ class Adjuster:
         self.directions = np.concatenate([t.directions for t in trails])
         self.axes = np.concatenate([t.axes for t in trails])
         self.covariance = np.concatenate([t.covariance for t in trails])
+        # rad; an end alone is a sighting by hand
+        alone = np.repeat(np.array(ends) == 1, ends)
+        self.by_hand = np.sqrt(np.trace(self.covariance, axis1=1, axis2=2) / 2) * alone
         self.time_stddev = np.array([t.time_stddev_s for t in trails])
         self.moments = Moments.at(self.utc)
         self.sigma = np.array(
@@ -110,8 +117,9 @@ class Adjuster:
     def equations(
         self, place: np.ndarray, clock_s: float, offsets: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Residuals (E, 2), derivatives by place and clock (E, 2, 4) and by the offsets (E, 2, 3).
+        """Residuals (E, 2), derivatives by what all share (E, 2, 6) and by the offsets (E, 2, 3).
 
+        All share east, north, up, the clock, and two directions in units of the errors of sightings by hand.
         offsets (T, 3): of each trail's satellite, m.
         """
         o = offsets[self.trail]
@@ -130,7 +138,8 @@ class Adjuster:
         by_place = -np.einsum("eki,eji,lj->ekl", across, earth.gcrs_to_itrs, enu)
         by_clock = np.einsum("eki,ei->ek", across, v - moving)
         by_offset = np.einsum("eki,eli->ekl", across, ways)
-        return residual, np.concatenate([by_place, by_clock[..., None]], -1), by_offset
+        by_hand = self.by_hand[:, None, None] * np.eye(2)
+        return residual, np.concatenate([by_place, by_clock[..., None], by_hand], -1), by_offset
 
     @staticmethod
     def _enu(place: np.ndarray) -> np.ndarray:
@@ -193,7 +202,7 @@ class Adjuster:
     def fits(
         self, place: np.ndarray, clock_s: float, covariance: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Log density (T,) of each trail at a place known by a covariance (4, 4), and its probability by chance."""
+        """Log density (T,) of each trail at a place known by a covariance (6, 6), and its probability by chance."""
         none = np.zeros((len(self.time_stddev), 3))
         density, probability = np.full((2, len(none)), -np.inf)
         for block in self._blocks(self.equations(place, clock_s, none), none, np.ones(len(none), bool)):
@@ -206,14 +215,15 @@ class Adjuster:
     def _known_before(
         self, place: np.ndarray, clock_s: float, enu: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, float, int]:
-        """Normal equations (4, 4), right side (4,) and chi-squared of what is known before, and how much that is."""
+        """Normal equations (6, 6), right side (6,) and chi-squared of what is known before, and how much that is."""
         prior = self.prior
-        normal = np.diag([0.0, 0.0, prior.height_stddev_m**-2, prior.clock_stddev_s**-2])
-        off = np.array([0.0, 0.0, prior.height_m - geodetic_place(place)[2], -clock_s])
+        shared = SHARED_BY_HAND**-2
+        normal = np.diag([0.0, 0.0, prior.height_stddev_m**-2, prior.clock_stddev_s**-2, shared, shared])
+        off = np.array([0.0, 0.0, prior.height_m - geodetic_place(place)[2], -clock_s, 0.0, 0.0])
         if prior.place is not None and prior.covariance is not None:
             normal[:2, :2] = np.linalg.inv(prior.covariance)
             off[:2] = enu[:2] @ (prior.place - place)
-        return normal, normal @ off, float(off @ normal @ off), 2 if prior.place is None else 4
+        return normal, normal @ off, float(off @ normal @ off), 4 if prior.place is None else 6
 
     def _blocks(
         self, equations: tuple[np.ndarray, np.ndarray, np.ndarray], offsets: np.ndarray, used: np.ndarray
@@ -238,7 +248,7 @@ class Adjuster:
                     trails=trails,
                     of_row=of_row,
                     residual=residual[ends].ravel() + rows @ offsets[trails[0]],
-                    by_place=by_place[ends].reshape(-1, 4),
+                    by_place=by_place[ends].reshape(-1, 6),
                     by_offset=rows,
                     prior=prior,
                     total=total + rows @ prior @ rows.T,

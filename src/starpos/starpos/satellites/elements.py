@@ -42,20 +42,20 @@ class OrbitErrors(NamedTuple):
     across_m_per_day: float
     max_age_days: float
 
-    def sigma(self, age_days: np.ndarray) -> np.ndarray:
-        """Standard deviations (..., 3) in m: radial, along, across."""
-        days = np.abs(age_days)
+    def sigma(self, age_days: float) -> np.ndarray:
+        """Standard deviations (3,) in m: radial, along, across."""
+        days = abs(age_days)
         across = self.across_m + self.across_m_per_day * days
-        return np.stack([across, self.along_m + self.along_m_per_day * days, across], -1)
+        return np.array([across, self.along_m + self.along_m_per_day * days, across])
 
 
 # Flohrer, Krag and Klinkrad (2008, AMOS) compare elements with measured orbits: 0.1 to 0.5 km across, 0.3 to 2 km along
 # in low orbits. Drag makes the error along the motion grow (Levit and Marshall 2011, Adv. Space Res. 47, 1107); who
-# manoeuvres by electric thrust leaves the elements faster.
+# manoeuvres by electric thrust leaves the elements faster. One without a name may do either.
 PASSIVE = OrbitErrors("passive", 100.0, 250.0, 150.0, 50.0, 30.0)
 MANOEUVRING = OrbitErrors("that manoeuvre", 0.0, 4000.0, 150.0, 50.0, 14.0)
 GEOSTATIONARY = OrbitErrors("geostationary", 500.0, 1000.0, 500.0, 200.0, 30.0)
-UNNAMED = OrbitErrors("without a name", 100.0, 500.0, 150.0, 100.0, 30.0)
+UNNAMED = OrbitErrors("without a name", 200.0, 1000.0, 300.0, 150.0, 30.0)
 OPERATORS = OrbitErrors("of an operator's ephemeris", 30.0, 300.0, 30.0, 30.0, 8.0)
 PRECISE = OrbitErrors("of a precise ephemeris", 1.0, 0.0, 1.0, 0.0, math.inf)
 # names of constellations and stations that keep their orbits by thrust

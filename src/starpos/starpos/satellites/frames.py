@@ -105,8 +105,8 @@ class FrameSky:
             )
         if not stars.exposure_s:
             raise FrameError(
-                f"{stars.place}: nobody states how long it was exposed, so when its trails begin and end is unknown: "
-                "give EXPTIME in its header"
+                f"{stars.place}: its exposure time is not stated, and a trail's ends are its beginning and its end: give "
+                "EXPTIME in its header"
             )
         order = np.argsort(found.star)
         seen, rows = stars.select(found.star[order]), found.catalogue[order]

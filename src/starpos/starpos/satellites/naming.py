@@ -64,8 +64,16 @@ class _Sky:
         self._ephemerides = [(k, o.ephemeris) for k, o in enumerate(orbits) if o.ephemeris is not None]
         self._of_elements = np.array([k for k, o in enumerate(orbits) if o.ephemeris is None], int)
         self._records = SatrecArray([o.record for o in orbits if o.ephemeris is None])
-        self._count = len(orbits)
+        self.count = len(orbits)
+        self._epochs = np.array([o.epoch_unix_s for o in orbits])
+        at_once = np.array([o.errors.sigma(0.0) for o in orbits])
+        self._errors = at_once, np.array([o.errors.sigma(1.0) for o in orbits]) - at_once
         self._nodes: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+
+    def sigma(self, rows: np.ndarray, utc_unix_s: float) -> np.ndarray:
+        """Prior errors (K, 3) of some orbits, m: radial, along, across."""
+        at_once, per_day = self._errors[0][rows], self._errors[1][rows]
+        return at_once + per_day * np.abs(utc_unix_s - self._epochs[rows, None]) / DAY_S
 
     def at(self, utc_unix_s: float, which: np.ndarray | slice = slice(None)) -> tuple[np.ndarray, np.ndarray]:
         """Positions and velocities (S, 3), ITRS, m and m/s; NaN where there is no satellite."""
@@ -83,7 +91,7 @@ class _Sky:
 
     def _computed(self, utc_unix_s: float) -> tuple[np.ndarray, np.ndarray]:
         moment = Moments.at(np.array([utc_unix_s]))
-        r, v = np.full((2, self._count, 3), np.nan)
+        r, v = np.full((2, self.count, 3), np.nan)
         if len(self._of_elements):
             whole, part = divmod(utc_unix_s / DAY_S, 1.0)
             error, places, speeds = self._records.sgp4(np.array([UNIX_EPOCH_JD + whole]), np.array([part]))
@@ -118,9 +126,7 @@ def candidates(
             continue
         only = np.array([row_of[trail.satellite]]) if named else slice(None)
         for way, one in enumerate(trail.ways):
-            index, places, covariance = _of_trail(
-                one, sky, only, orbits, height_m, height_stddev_m, clock_stddev_s
-            )
+            index, places, covariance = _of_trail(one, sky, only, height_m, height_stddev_m, clock_stddev_s)
             found.append((k, way, index, places, covariance))
     counts = [len(index) for _, _, index, _, _ in found]
     return Candidates(
@@ -136,7 +142,6 @@ def _of_trail(
     trail: SatelliteTrail,
     sky: _Sky,
     only: np.ndarray | slice,
-    orbits: Sequence[Orbit],
     height_m: float,
     height_stddev_m: float,
     clock_stddev_s: float,
@@ -147,7 +152,7 @@ def _of_trail(
     directions = np.einsum("eij,ej->ei", moments.gcrs_to_itrs, geometric)
     d = directions[0]
     r, v = sky.at(trail.utc_unix_s[0], only)
-    rows = np.arange(len(orbits))[only]
+    rows = np.arange(sky.count)[only]
     # the ellipsoid at that height, stretched to a sphere
     radius = EQUATOR_RADIUS_M + height_m
     stretch = np.array([1.0, 1.0, radius / (EQUATOR_RADIUS_M * math.sqrt(1 - ECCENTRICITY2) + height_m)])
@@ -163,8 +168,7 @@ def _of_trail(
     good = (distance > 0) & (sine > LOWEST)
     hit, distance, places, up, sine = (x[good] for x in (hit, distance, places, up, sine))
     r, v, rows = r[hit], v[hit] + np.cross(SPIN, r[hit]), rows[hit]
-    ages = np.array([orbits[k].age_days(trail.utc_unix_s[0]) for k in rows])
-    sigma = np.array([orbits[k].errors.sigma(age) for k, age in zip(rows, ages, strict=True)]).reshape(-1, 3)
+    sigma = sky.sigma(rows, trail.utc_unix_s[0])
     sigma[:, 1] = np.hypot(
         sigma[:, 1], np.linalg.norm(v, axis=1) * math.hypot(clock_stddev_s, trail.time_stddev_s)
     )

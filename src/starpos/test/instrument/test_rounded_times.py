@@ -17,7 +17,9 @@ def table(path, times):
     return path
 
 
-@pytest.mark.parametrize("rounded", [lambda t: f"{t:g}", lambda t: f"{float(np.float32(t)):.3f}"])
+@pytest.mark.parametrize(
+    "rounded", [lambda t: f"{t:g}", lambda t: f"{float(np.float32(t)):.3f}", lambda t: "1793642400.5"]
+)
 def test_rounded_times_are_named(tmp_path, rounded):
     with pytest.raises(TiltError, match="double precision"):
         read_tilt_csv(table(tmp_path / "tilt.csv", [rounded(t) for t in T]))

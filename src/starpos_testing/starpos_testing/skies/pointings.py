@@ -102,8 +102,12 @@ def pointed_night(
     a3_sigma_arcsec: float = 5.0,
     noise: float = 1.0,
     errors: InclinometerErrors = SENSOR,
+    spread_deg: float = 0.3,
 ) -> PointedNight:
-    """A night at a random place, with errors as large as stated; noise: of the readings, in units of the stated."""
+    """A night at a random place, with errors as large as stated; noise: of the readings, in units of the stated.
+
+    spread_deg: standard deviation of the altitudes.
+    """
     site = Site(rng.uniform(-65, 65), rng.uniform(-180, 180), AIR)
     begin, altitude = 1.79e9 + rng.uniform(0, 2e7), rng.uniform(68, 80)
     told = Calibration.of((0.0, 0.0, 0.0), (a3_sigma_arcsec,) * 3)
@@ -111,7 +115,7 @@ def pointed_night(
     pointings: list[Pointing] = []
     tilts: list[Tilt] = []
     for d, azimuth in enumerate(azimuths_deg):
-        attitude = camera_to_enu(azimuth + rng.uniform(-5, 5), altitude + rng.normal(0, 0.3), 15.0)
+        attitude = camera_to_enu(azimuth + rng.uniform(-5, 5), altitude + rng.normal(0, spread_deg), 15.0)
         theta = np.arcsin((TRUE_A3 @ attitude[2])[:2])
         for k in range(frames):
             now = begin + 60.0 * d + 10.0 * k
