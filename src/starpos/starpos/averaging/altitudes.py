@@ -33,8 +33,8 @@ ROUNDS, SETTLED = 30, 1e-12
 ALIKE = 1e-7
 # an answer is excluded if its fit is worse by this
 EXCLUDED_SIGMA = 6.0
-# outliers: their distance, minimum number of directions, maximum number of rounds
-OUTLIER_SIGMA, MIN_JUDGED, JUDGED = 6.0, 6, 6
+# outliers: their distance, minimum number of directions, maximum share left out where A3 is fitted too, number of rounds
+OUTLIER_SIGMA, MIN_JUDGED, MAX_OUTLIERS, JUDGED = 6.0, 6, 1 / 3, 6
 WITHIN = 0.95
 # three directions that contradict each other by more have errors of unknown size
 CONTRADICT_SIGMA = 5.0

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from starpos.averaging.elevation_axis import FoundAxis
-from starpos.cli import console, fix_output, inputs, options, overwriting, sights
+from starpos.cli import console, fix_output, inputs, options, overwriting, places_file, sights
 from starpos.cli.console import Output
 from starpos.cli.fix_output import (
     COLUMNS,
@@ -313,6 +313,12 @@ def _run(args: argparse.Namespace) -> int:
     options.check_frames(args)
     if args.save is not None:
         overwriting.check(args, Written("--save", args.save, instrument_file.check_replaceable))
+    if args.out is not None:
+        if not places_file.is_places(args.out):
+            raise InstrumentError(
+                f"-o {args.out}: give a name that ends in {' or '.join(places_file.SUFFIXES)}"
+            )
+        overwriting.check(args, Written("-o", args.out, places_file.check_ours))
     if args.pointings is not None:
         return run_pointings(args)
     vertical = vertical_of(args)
@@ -356,6 +362,8 @@ def _run(args: argparse.Namespace) -> int:
             rows = zip(night.frames, sights, strict=False)
             answers = answers_of(rows, work, vertical, how, console.ProgressBar())
             statuses.append(tell(args, output, night, answers, vertical, place, work))
+    if args.out is not None:
+        places_file.write(args.out, output.answers)
     return max(statuses)
 
 
