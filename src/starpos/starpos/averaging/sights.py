@@ -51,7 +51,7 @@ WAY_ROUNDS = 4
 
 
 @dataclass(frozen=True, kw_only=True)
-class Sight:
+class SextantSight:
     """One altitude as it was read, rad; limb: 1 for the lower, -1 for the upper, 0 for the centre.
 
     height_of_eye_m: above the sea whose horizon is used; NaN without.  artificial: whether the altitude is twice the
@@ -79,7 +79,7 @@ class Sight:
         return read - (0.0 if math.isnan(self.height_of_eye_m) else DIP * math.sqrt(self.height_of_eye_m))
 
 
-def read_sights(path: Path | str) -> list[Sight]:
+def read_sights(path: Path | str) -> list[SextantSight]:
     """The sights of a CSV in order of time; FrameError where it cannot be used."""
     try:
         with open_regular(path) as file:
@@ -102,7 +102,7 @@ def read_sights(path: Path | str) -> list[Sight]:
     return sorted(sights, key=lambda s: s.utc_unix_s)
 
 
-def _sight(row: dict, where: str) -> Sight:
+def _sight(row: dict, where: str) -> SextantSight:
     """The sight of a row; FrameError names the cell that cannot be used."""
     cells = {name: (row.get(name) or "").strip() for name in (*NUMBERS, "body", "limb", "utc")}
     values = {}
@@ -121,7 +121,7 @@ def _sight(row: dict, where: str) -> Sight:
         utc_unix_s = unix_of(cells["utc"])
     except StarposError as error:
         raise FrameError(f"{where}: {error}") from None
-    return Sight(
+    return SextantSight(
         source=where,
         body=" ".join(cells["body"].lower().split()),
         limb=LIMBS[cells["limb"].lower()],
@@ -137,7 +137,7 @@ def _sight(row: dict, where: str) -> Sight:
 
 
 def circle_of_sight(
-    sight: Sight, catalogue: Catalogue, atmosphere: Atmosphere, clock_stddev_s: float
+    sight: SextantSight, catalogue: Catalogue, atmosphere: Atmosphere, clock_stddev_s: float
 ) -> Circle:
     """The circle of equal altitude of a sight; StarposError if its body or its altitude cannot be."""
     state, apparent = earth_state(sight.utc_unix_s), sight.apparent
@@ -183,7 +183,7 @@ def circle_of_sight(
 
 
 def place_of_sights(
-    sights: Sequence[Sight], circles: Sequence[Circle], near: tuple[float, float] | None = None
+    sights: Sequence[SextantSight], circles: Sequence[Circle], near: tuple[float, float] | None = None
 ) -> Average:
     """The place at the last sight; FixError as `place_of_circles`, whose `near` it takes.
 
@@ -197,7 +197,7 @@ def place_of_sights(
     return place
 
 
-def _advanced(sights: Sequence[Sight], circles: Sequence[Circle], place: Average) -> list[Circle]:
+def _advanced(sights: Sequence[SextantSight], circles: Sequence[Circle], place: Average) -> list[Circle]:
     """The circles moved by the way from each sight to the last one, which ended at about this place."""
     turn, far, zenith = np.eye(3), 0.0, zenith_of(place.latitude, place.longitude)
     moved = [circles[-1]]
@@ -214,7 +214,7 @@ def _advanced(sights: Sequence[Sight], circles: Sequence[Circle], place: Average
     return moved[::-1]
 
 
-def _star_row(sight: Sight, catalogue: Catalogue) -> np.ndarray:
+def _star_row(sight: SextantSight, catalogue: Catalogue) -> np.ndarray:
     """Row (1,) of a star in the catalogue, by its name or its Hipparcos number."""
     name = sight.body.removeprefix("hip").strip()
     hip = int(name) if name.isdecimal() and len(name) < 7 else _star_names().get(sight.body, 0)
