@@ -112,6 +112,17 @@ def test_many_sightings_of_one_satellite_are_no_independent_ones(tmp_path, sky):
     assert nine[0, 0] > 0.8 * one[0, 0]
 
 
+def test_a_rough_place_makes_two_trails_enough(tmp_path, sky):
+    records, _, orbits = sky
+    trails, numbers, _ = trails_of(tmp_path, records, count=2)
+    near = itrs_place(*np.radians([PLACE[0] + 0.3, PLACE[1] - 0.3]), PLACE[2])
+    fix = locate(trails, orbits, PRIOR._replace(place=near, covariance=50e3**2 * np.eye(2)))
+    assert [orbit.number for orbit in fix.named] == numbers
+    off = off_m(fix)
+    assert np.hypot(*off) < 3000
+    assert off @ np.linalg.solve(fix.covariance[:2, :2], off) < 12
+
+
 def test_refusals(tmp_path, sky):
     records, path, orbits = sky
     trails, numbers, _ = trails_of(tmp_path, records, count=3)
