@@ -96,15 +96,18 @@ class Output:
     """Writes one answer after another; the first line describes them, except in JSON.
 
     columns: keys of the answers that are columns of the CSV.  head: the first line for people.
+    answers: all that were written.
     """
 
     def __init__(self, args: argparse.Namespace, columns: Sequence[str], head: str) -> None:
         self._json, self._head = args.json, head
         self._rows = csv.DictWriter(sys.stdout, columns, extrasaction="ignore", lineterminator="\n")
         self._csv, self._begun = args.csv, False
+        self.answers: list[dict] = []
 
     def put(self, value: dict, line: str, rows: Sequence[dict] | None = None) -> None:
         """Write an answer; line: the same for people, of one or more lines, or none; rows: if it is not one of a CSV."""
+        self.answers.append(value)
         if self._json:
             print_json(value)
         elif self._csv:

@@ -128,8 +128,12 @@ def _opened(path: Path) -> Iterator[BinaryIO]:
 
 
 def are_photographs(paths: Sequence[Path | str]) -> bool:
-    """Whether all files are of the kinds in which a telephone's photographs, with gravity, come."""
-    return all(Path(path).suffix.lower() in JPEG + HEIF + RAW for path in paths)
+    """Whether files are of the kinds in which a telephone's photographs, with gravity, come.
+
+    Other files of its folder (screenshots, films) may be among them, but no FITS and no list of stars.
+    """
+    kinds = {Path(path).suffix.lower() for path in paths}
+    return bool(kinds & {*JPEG, *HEIF, *RAW}) and not kinds & {*FITS, ".csv"}
 
 
 def decode_frame(data: bytes, source: str) -> Frame:
