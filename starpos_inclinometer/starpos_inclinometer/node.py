@@ -11,11 +11,12 @@ from rclpy.time import Time
 
 from starpos.messages.tilt import OUT_OF_RANGE, SATURATED, STUCK, Reading
 from starpos.parameters.table import parameters_of
+from starpos.session.driver import Changes
 from starpos_common.diagnostics import Diagnosis, Diagnostics, Level, time_is_simulated
 from starpos_common.parameters import declare
 from starpos_common.replayed import Replayed
 from starpos_common.topics import Take, publisher
-from starpos_inclinometer.clock import HostClock, Step
+from starpos_inclinometer.clock import HostClock
 from starpos_inclinometer.sources.registry import SOURCES, refusal
 from starpos_inclinometer.sources.source import Counts, Health, Phase, Surroundings
 from starpos_interfaces.msg import Pulse, Tilt
@@ -106,8 +107,7 @@ class InclinometerNode(Node):
         )
         self._publisher = publisher(self, Tilt, "tilt", 100)
         self._pulses = publisher(self, Pulse, "pulses", 100)
-        self._logged: tuple[Phase, str] | None = None
-        self._logged_step: Step | None = None
+        self._phases, self._steps = Changes(self.get_logger()), Changes(self.get_logger())
         self._reporter = Reporter()
         self._wake = self.create_guard_condition(self._on_wake)
         self._replayed: Replayed | None = None
@@ -185,18 +185,9 @@ class InclinometerNode(Node):
 
     def _log(self, health: Health) -> bool:
         """Log a line for each change; return whether there was one."""
-        step, changed = health.step, (health.phase, health.sentence) != self._logged
-        self._logged = (health.phase, health.sentence)
-        # rclpy ties a severity to the line it is called from, so each has its own.
-        if changed and health.phase is Phase.RECEIVING:
-            self.get_logger().info(health.sentence)
-        elif changed:
-            self.get_logger().warning(health.sentence)
-        if step is None or step == self._logged_step:
-            return changed
-        self._logged_step = step
-        self.get_logger().warning(step_sentence(step.seconds))
-        return True
+        good, step = health.phase is Phase.RECEIVING, health.step
+        changed = self._phases.say(health.sentence, good, (health.phase, health.sentence))
+        return (step is not None and self._steps.say(step_sentence(step.seconds), False, step)) or changed
 
     def _report(self) -> Diagnosis:
         health = self._source.health()

@@ -10,7 +10,7 @@ import numpy as np
 
 from starpos.frames.frame import MAX_PIXELS, Frame
 from starpos_camera.sources.source import CapturedFrame, CaptureError, CaptureSettings, DeviceSource, missing
-from starpos_camera.sources.timing import CLOCK_TOLERANCE_S, clock_stddev_of, stamp_of
+from starpos_camera.sources.timing import check_exposed, clock_stddev_of, stamp_of
 
 if TYPE_CHECKING:
     from alpaca.camera import Camera
@@ -86,25 +86,13 @@ class Alpaca(DeviceSource["Camera"]):
         self._wait(camera, wanted_s)
         ready_s = self._now()
         exposure_s = _optional(camera, "LastExposureDuration", wanted_s)
-        if not 0 < exposure_s <= ready_s - commanded_s + CLOCK_TOLERANCE_S:
-            raise CaptureError(
-                f"it says that it has exposed for {exposure_s:g} s, when {wanted_s:g} s were asked."
-            )
+        check_exposed(exposure_s, wanted_s, commanded_s, ready_s)
         pixels = camera.rqs.picture(f"{camera.base_url}/imagearray", *self._size)
         told = _optional(camera, "LastExposureStartTime", "")
         clock_s = clock_stddev_of("alpaca", self._address.rpartition(":")[0], self._values)
         stamp = stamp_of(told, clock_s, exposure_s, commanded_s, ready_s, self._values)
-        frame = Frame(
-            _unsigned(pixels),
-            pattern=self._pattern,
-            mid_unix_s=stamp.mid_s,
-            exposure_s=exposure_s,
-            source=self.hardware_id,
-            stamp_stddev_s=stamp.stddev_s,
-            clock_stddev_s=stamp.clock_stddev_s,
-        )
-        remark = f"{self.hardware_id}: {stamp.remark}." if stamp.remark else remark
-        return CapturedFrame(frame, stamp.source, remark=remark)
+        frame = Frame(_unsigned(pixels), pattern=self._pattern, exposure_s=exposure_s)
+        return stamp.captured(frame, self.hardware_id, remark)
 
     def _explain(self, error: Exception) -> str:
         # alpyca, requests and urllib3 have many exceptions, and an absurd reply causes others.
@@ -128,7 +116,7 @@ class Alpaca(DeviceSource["Camera"]):
             camera.Gain = int(gain)
             self._gain = gain
         has = camera.Gain
-        return "" if has == gain else f"{self.hardware_id}: its gain is {has}, though {gain:g} was set."
+        return "" if has == gain else f"its gain is {has}, though {gain:g} was set."
 
     def _wait(self, camera: "Camera", exposure_s: float) -> None:
         """Wait until the picture is there."""

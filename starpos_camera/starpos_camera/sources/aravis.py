@@ -401,17 +401,8 @@ class Aravis(DeviceSource[AravisCamera]):
             relation=clock_relation(camera.camera, self._now),
         )
         stamp = stamp_of_camera(times, self._values["aravis.timestamp"], self._values)
-        frame = Frame(
-            buffer.pixels,
-            pattern=buffer.pattern,
-            mid_unix_s=stamp.mid_s,
-            exposure_s=exposure_s,
-            source=self.hardware_id,
-            stamp_stddev_s=stamp.stddev_s,
-            shutter=camera.shutter,
-        )
-        remark = remark or stamp.remark
-        return CapturedFrame(frame, stamp.source, remark=remark and f"{self.hardware_id}: {remark}.")
+        frame = Frame(buffer.pixels, pattern=buffer.pattern, exposure_s=exposure_s, shutter=camera.shutter)
+        return stamp.captured(frame, self.hardware_id, remark and f"{remark}.")
 
     def _wait(self, camera: AravisCamera, asked_s: float, exposure_s: float) -> Any:
         """Wait for a frame that was exposed after `asked_s` (Unix time of the system)."""

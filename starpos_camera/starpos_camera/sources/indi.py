@@ -17,7 +17,7 @@ from starpos.errors import one_line
 from starpos.frames.fits import decode_fits
 from starpos.frames.frame import MAX_PIXELS
 from starpos_camera.sources.source import CapturedFrame, CaptureError, CaptureSettings, DeviceSource, missing
-from starpos_camera.sources.timing import CLOCK_TOLERANCE_S, clock_stddev_of, stamp_of
+from starpos_camera.sources.timing import check_exposed, clock_stddev_of, stamp_of
 
 if TYPE_CHECKING:
     from indipyclient import IPyClient
@@ -449,23 +449,11 @@ class Indi(DeviceSource[IndiServer]):
         if frame.untimed:
             raise CaptureError(f"the header of its frame cannot be used: {frame.untimed}.")
         exposure_s = frame.exposure_s or wanted_s
-        if exposure_s > ready_s - commanded_s + CLOCK_TOLERANCE_S:
-            raise CaptureError(
-                f"it says that it has exposed for {exposure_s:g} s, when {wanted_s:g} s were asked."
-            )
+        check_exposed(exposure_s, wanted_s, commanded_s, ready_s)
         told = str(header.get("DATE-OBS", ""))
         clock_s = clock_stddev_of("indi", self._host, self._values)
         stamp = stamp_of(told, clock_s, exposure_s, commanded_s, ready_s, self._values)
-        frame = replace(
-            frame,
-            mid_unix_s=stamp.mid_s,
-            exposure_s=exposure_s,
-            source=self.hardware_id,
-            stamp_stddev_s=stamp.stddev_s,
-            clock_stddev_s=stamp.clock_stddev_s,
-        )
-        remark = f"{self.hardware_id}: {stamp.remark}." if stamp.remark else ""
-        return CapturedFrame(frame, stamp.source, remark=remark)
+        return stamp.captured(replace(frame, exposure_s=exposure_s), self.hardware_id)
 
 
 def _unpacked(blob: Blob) -> bytes:

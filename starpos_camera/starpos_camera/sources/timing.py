@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from datetime import datetime, timezone
 from typing import Any
 
+from starpos.frames.frame import Frame
 from starpos.messages.stamp import stamp_to_unix
 from starpos.system_clock import StepWatch
 from starpos_camera.sources.source import CapturedFrame, CaptureError
@@ -41,6 +42,26 @@ class Stamp:
     source: int
     clock_stddev_s: float = 0.0
     remark: str = ""
+
+    def captured(self, frame: Frame, hardware_id: str, remark: str = "") -> CapturedFrame:
+        """A frame of a camera with this stamp; remark: without the camera's name, less urgent than the stamp's own."""
+        stamped = replace(
+            frame,
+            mid_unix_s=self.mid_s,
+            source=hardware_id,
+            stamp_stddev_s=self.stddev_s,
+            clock_stddev_s=self.clock_stddev_s,
+        )
+        said = f"{self.remark}." if self.remark else remark
+        return CapturedFrame(stamped, self.source, remark=said and f"{hardware_id}: {said}")
+
+
+def check_exposed(exposure_s: float, wanted_s: float, commanded_s: float, ready_s: float) -> None:
+    """Raise CaptureError if a camera reports an exposure that does not fit between command and frame."""
+    if not 0 < exposure_s <= ready_s - commanded_s + CLOCK_TOLERANCE_S:
+        raise CaptureError(
+            f"it says that it has exposed for {exposure_s:g} s, when {wanted_s:g} s were asked."
+        )
 
 
 def stamp_of(

@@ -151,7 +151,7 @@ def find_axis(
 
 
 def _axes(circles_of: CirclesOf, given: Calibration, ray: np.ndarray, site: Place | None) -> list[FoundAxis]:
-    """The answers, the one that fits best first; FixError if there is none."""
+    """The answers, the one that fits best first; FixError without any."""
     if site is not None:
         zeniths = [site.plumb_axes[2]]
     else:
@@ -316,7 +316,7 @@ def _fitted(
     a3, frames, now = given.a3, 0, None
     for _ in range(RELINEARISED):
         circles = sorted(circles_of(a3), key=lambda c: c.utc_unix_s)
-        # an axis that some frames cannot have is none
+        # some frames cannot have that axis
         if len(circles) < frames:
             return None
         frames, before = len(circles), a3

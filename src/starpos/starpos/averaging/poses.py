@@ -69,12 +69,13 @@ TURN_SIGMAS = 5.5
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class MeanAttitude:
-    """Mean attitude of `frames` frames, by the plumb line and by the ellipsoid, at their mean time."""
+    """Mean attitude of `frames` frames, by the plumb line and by the ellipsoid, at their mean time; `optics` of C."""
 
     utc_unix_s: float
     frames: int
     plumb: Attitude
     ellipsoid: Attitude
+    optics: Attitude
 
 
 def mean_attitude(attitudes: Sequence[AttitudeAtPlace]) -> MeanAttitude:
@@ -93,6 +94,7 @@ def mean_attitude(attitudes: Sequence[AttitudeAtPlace]) -> MeanAttitude:
         frames=len(attitudes),
         plumb=_mean([a.plumb for a in attitudes]),
         ellipsoid=_mean([a.ellipsoid for a in attitudes]),
+        optics=_mean([a.optics for a in attitudes]),
     )
 
 

@@ -13,7 +13,7 @@ from starpos.calibration.camera import FromSky, Intrinsics, calibrate_camera, rm
 from starpos.calibration.camera_adjustment import UNLEVELLED, UNTIMED, parameters
 from starpos.calibration.misalignment import NOTHING_KNOWN, Calibrated, Known, calibrate_at, calibrate_fixed
 from starpos.cli import console, options, overwriting
-from starpos.cli.inputs import checked_tilts, frames_among, given_or_sought, reader_of
+from starpos.cli.inputs import checked_tilts, frames_among, given_or_sought, reader_of, stated_site
 from starpos.cli.options import vertical_of
 from starpos.cli.overwriting import CAMERA_NAME, Written, save_instrument
 from starpos.earth.place import Place
@@ -217,7 +217,10 @@ _Seen = tuple[Stars, Identification | None]
 
 def run(args: argparse.Namespace) -> int:
     if args.camera is None and args.site is None:
-        raise InstrumentError("nothing to calibrate: give --camera OUT.yaml, --site LAT LON, or both")
+        raise InstrumentError(
+            "nothing to calibrate: give --camera OUT.yaml, --site LAT LON, or both"
+            + stated_site(args.frames or ())
+        )
     options.check_frames(args)
     _open_night(args)
     if args.pointings is not None and args.camera is not None:

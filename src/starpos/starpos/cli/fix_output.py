@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The lines, JSON keys and CSV columns of fixes and of headings at a known place: of a frame, and of a night together."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -15,6 +15,7 @@ from starpos.earth.place import Place
 from starpos.earth.vertical import Geodetic, Vertical, geodetic
 from starpos.errors import FixError
 from starpos.fix.attitude import Attitude
+from starpos.fix.directions import OPTICAL_AXIS, horizontal
 from starpos.fix.fix import Fix, InDegrees, PlaceFix, length_text
 from starpos.fix.heading import AttitudeAtPlace
 from starpos.fix.solution import Solution, Status
@@ -115,6 +116,29 @@ def line_of(path: str, s: Solution, turning: bool) -> str:
     return f"{path}: {where}{stars}"
 
 
+# the status of a row that gives an elevation
+ELEVATION = "elevation alone"
+ELEVATIONS_HEAD = "row: the zenith distance of its direction; together these give the position"
+
+
+def put_elevation(
+    output: Output,
+    source: str,
+    utc_unix_s: float | None,
+    zenith_distance: float | None,
+    vertical: Vertical,
+    status: str = ELEVATION,
+) -> None:
+    """Write a row that gives a zenith distance (rad) alone, or None with the status that says why."""
+    deg = None if zenith_distance is None else np.degrees(zenith_distance)
+    utc = {} if utc_unix_s is None else {"utc": utc_text(utc_unix_s)}
+    none = dict.fromkeys(("residual_arcsec", "log_odds"))
+    about_stars = {"stars_detected": 0, "stars_matched": 0} | none | {"status": status, "warnings": []}
+    row = json_of(None, vertical) | utc | {"zenith_distance_deg": deg} | about_stars
+    about = status if deg is None else f"{deg:.5f} deg from the zenith"
+    output.put({"file": source} | row, f"{source}: {about}")
+
+
 def put_combined(
     output: Output,
     night: NightFolder,
@@ -204,8 +228,16 @@ def _angles_deg2(attitude: Attitude) -> np.ndarray:
 COVARIANCES = ("covariance", "covariance_geodetic")
 
 
+# names and directions in C, which a camera's axes are
+Axes = Mapping[str, Sequence[float]]
+OPTICS: Axes = {"optical axis": OPTICAL_AXIS}
+
+
 def with_heading(
-    values: dict, found: AttitudeAtPlace | MeanAttitude | None, place: Place | None = None
+    values: dict,
+    found: AttitudeAtPlace | MeanAttitude | None,
+    place: Place | None = None,
+    axes: Axes = OPTICS,
 ) -> dict:
     """The keys of a fix and of the heading at a known place; keys without a value are None.
 
@@ -213,7 +245,7 @@ def with_heading(
     """
     if found is None or place is None:
         none = {k: _with_variance(values[k], np.nan) for k in COVARIANCES if values[k] is not None}
-        return values | dict.fromkeys(HEADING_KEYS) | none
+        return values | dict.fromkeys((*HEADING_KEYS, "axes")) | none
     told = {key: value(found.plumb, found.ellipsoid) for key, value in HEADING_KEYS.items()}
     whole = {
         "utc": utc_text(found.utc_unix_s),
@@ -225,17 +257,38 @@ def with_heading(
             values["covariance_geodetic"], told["covariance_attitude_geodetic"][0, 0]
         ),
         "budget": _heading_budget(values["budget"], found.plumb),
+        "axes": json_of_axes(found, axes),
     }
     return values | whole | told
 
 
-def heading_line_of(path: str, s: Solution) -> str:
+def json_of_axes(found: AttitudeAtPlace | MeanAttitude, axes: Axes) -> list[dict]:
+    """Where directions that are fixed to the camera point, by the plumb line, as they are seen."""
+    seen = horizontal(found.optics, np.array(list(axes.values()), float))
+    columns = (seen.azimuth, seen.altitude, seen.sigma_azimuth, seen.sigma_altitude)
+    keys = "azimuth", "altitude", "sigma_azimuth_deg", "sigma_altitude_deg"
+    return [
+        {"name": name, **dict(zip(keys, row, strict=True))}
+        for name, row in zip(axes, np.degrees(columns).T.tolist(), strict=True)
+    ]
+
+
+def axes_text(found: AttitudeAtPlace | MeanAttitude, axes: Axes) -> str:
+    """Text of `json_of_axes` for people."""
+    return "".join(
+        f"; {a['name']} azimuth {a['azimuth']:.5f} +- {a['sigma_azimuth_deg']:.5f}, altitude {a['altitude']:.5f} +- "
+        f"{a['sigma_altitude_deg']:.5f}"
+        for a in json_of_axes(found, axes)
+    )
+
+
+def heading_line_of(path: str, s: Solution, axes: Axes = OPTICS) -> str:
     """The line of a frame."""
     if s.at_place is None:
         return f"{path}: {s.status.value}, {s.stars_detected} stars detected"
     where = "" if s.fix is None else f"{s.fix.in_degrees.where}, "
     seen = f"by the {s.bodies[0]}" if s.bodies else f"{len(s.names)} of {s.stars_detected} stars"
-    return f"{path}: {where}{heading_text_of(s.at_place)}, {seen}"
+    return f"{path}: {where}{heading_text_of(s.at_place)}{axes_text(s.at_place, axes)}, {seen}"
 
 
 def heading_text_of(found: AttitudeAtPlace | MeanAttitude) -> str:
@@ -265,6 +318,7 @@ def put_mean(
     mean: MeanAttitude | None,
     place: Place,
     vertical: Vertical,
+    axes: Axes,
 ) -> None:
     """Write the mean attitude of frames without a place of their own."""
     about = {
@@ -279,8 +333,12 @@ def put_mean(
     name = {} if night.folder is None else {"night": night.folder}
     values = {"combined": True} | name | dict.fromkeys(COUNTS) | json_of(None, vertical)
     values |= {"frames": mean.frames} if mean else {}
-    text = "" if mean is None else f"{counted(mean.frames)} together: {heading_text_of(mean)}"
-    output.put(with_heading(values, mean, place) | about, text)
+    text = (
+        ""
+        if mean is None
+        else f"{counted(mean.frames)} together: {heading_text_of(mean)}{axes_text(mean, axes)}"
+    )
+    output.put(with_heading(values, mean, place, axes) | about, text)
 
 
 def _with_variance(covariance: np.ndarray | None, heading: float) -> np.ndarray:

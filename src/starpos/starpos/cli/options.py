@@ -13,6 +13,7 @@ from starpos.earth.place import Place
 from starpos.earth.refraction import Atmosphere
 from starpos.earth.vertical import UNKNOWN_STDDEV_ARCSEC, AtHeight, Deflection, Vertical
 from starpos.errors import InstrumentError
+from starpos.fix.directions import OPTICAL_AXIS
 from starpos.frames.exif import CameraClock
 from starpos.frames.exposure import Shutter
 from starpos.instrument import instrument, instrument_file, sensors
@@ -169,6 +170,20 @@ def tell_unknown(command: str, args: argparse.Namespace, deflection: Deflection)
             command,
             f"{args.geoid}: no data around this place; the deflection is unknown, {stddev:.2g} arcsec",
         )
+
+
+def axes_of(args: argparse.Namespace) -> dict[str, tuple[float, ...]]:
+    """Names and unit vectors in C of the optical axis and of those of --axis; raises InstrumentError."""
+    axes: dict[str, tuple[float, ...]] = {"optical axis": OPTICAL_AXIS}
+    for name, *xyz in args.axis:
+        try:
+            v = np.array(xyz, float)
+        except ValueError:
+            v = np.zeros(3)
+        if not (np.isfinite(v).all() and np.abs(v).max() > 0):
+            raise InstrumentError(f"--axis {name} {' '.join(xyz)}: give a name and three numbers, not all 0")
+        axes[name] = tuple((v / np.linalg.norm(v)).tolist())
+    return axes
 
 
 def place_of(args: argparse.Namespace, vertical: Vertical) -> Place | None:

@@ -7,11 +7,13 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from starpos.cli import console, inputs, options
+from starpos.cli import console, inputs, options, overwriting, places_file
+from starpos.cli.fix_output import json_of
 from starpos.cli.inputs import given_of, given_or_sought, reader_of
 from starpos.cli.options import vertical_of
 from starpos.cli.solve import read_receiver
 from starpos.errors import FrameError, InstrumentError
+from starpos.frames.reading import are_photographs
 from starpos.night.night import Night
 from starpos.night.opening import exposures, frames_in
 from starpos.night.reading import First, Instruments
@@ -26,6 +28,8 @@ if TYPE_CHECKING:
 NO_FIX = 1
 # maximum number of nights with all figures; more nights get the table and the errors only
 ALL_FIGURES = 6
+# endings of a page in one file
+PAGES = (".html", ".htm")
 # ending of a session's result
 SESSION = ".json"
 
@@ -40,23 +44,28 @@ def run(args: argparse.Namespace) -> int:
         raise InstrumentError("--gnss is of one night: give one")
     if args.field is not None:
         return _pack(args)
+    if places_file.is_places(args.out):
+        return _write_places(args)
     if find_spec("matplotlib") is None:
         raise InstrumentError(f"a report is drawn with matplotlib, which is not here: {inputs.PIP}")
     from starpos.report.html import PAGE, check_folder, write_files
     from starpos.report.page import nights_picture, page, pictures_of
+    from starpos.report.photograph import named_photograph
 
-    check_folder(Path(args.out))
+    out = Path(args.out)
+    folder, index = (out.parent, out.name) if out.suffix.lower() in PAGES else (out, PAGE)
+    check_folder(folder, index)
     if _are_sessions(args.nights):
         return _stations(args)
-    nights = [_night(Path(path), args) for path in args.nights]
-    for night in nights:
-        for sentence in (*night.remarks, *([night.why_not] if night.why_not else [])):
-            console.complain("report", f"{night.name}: {sentence}")
+    groups = _groups(args.nights)
+    nights = _nights(groups, args)
     bar, each = console.ProgressBar(), []
-    for k, night in enumerate(nights):
+    for k, (night, paths) in enumerate(zip(nights, groups, strict=True)):
         each.append(
             list(pictures_of(night, catalogue.load_catalogue())) if len(nights) <= ALL_FIGURES else []
         )
+        if are_photographs(paths) and (named := named_photograph(night, {p.name: p for p in paths})):
+            each[-1].insert(1, named)
         bar("figures", (k + 1) / len(nights))
     known = [(k, n) for k, n in enumerate(nights, 1) if n.truth and n.combined]
     overall = [nights_picture(known)] if len(nights) > 1 and known else []
@@ -65,9 +74,37 @@ def run(args: argparse.Namespace) -> int:
     for k, pictures in enumerate(each, 1):
         prefix = f"night{k}-" if len(nights) > 1 else ""
         files |= {f"{prefix}{p.name}.png": p.png for p in pictures}
-    write_files(Path(args.out), files | {PAGE: html.encode(errors="replace")})
-    print(Path(args.out) / PAGE)
+    # the page has its pictures
+    write_files(folder, ({} if folder != out else files) | {index: html.encode(errors="replace")})
+    print(folder / index)
     return 0 if any(n.combined for n in nights) else NO_FIX
+
+
+def _groups(names: list[str]) -> list[list[Path]]:
+    """The paths of each night: a folder or a bag, or photographs named one by one."""
+    paths = [Path(name) for name in names]
+    return [paths] if are_photographs(paths) and all(p.is_file() for p in paths) else [[p] for p in paths]
+
+
+def _nights(groups: list[list[Path]], args: argparse.Namespace) -> list[Night]:
+    """The nights, after complaints about what is wrong with them."""
+    nights = [_night(paths, args) for paths in groups]
+    for night in nights:
+        for sentence in (*night.remarks, *([night.why_not] if night.why_not else [])):
+            console.complain("report", f"{night.name}: {sentence}")
+    return nights
+
+
+def _write_places(args: argparse.Namespace) -> int:
+    """Write the places of nights for maps, without a page."""
+    overwriting.check(args, overwriting.Written("-o", args.out, places_file.check_ours))
+    answers: list[dict] = []
+    for night in _nights(_groups(args.nights), args):
+        answers += [{"file": s.name} | json_of(s.place, night.vertical) for _, s in night.fixed]
+        answers.append({"combined": True, "night": night.name} | json_of(night.combined, night.vertical))
+    places_file.write(args.out, answers)
+    print(args.out)
+    return 0 if answers[-1]["utc"] else NO_FIX
 
 
 def _are_sessions(paths: list[str]) -> bool:
@@ -112,7 +149,7 @@ def _pack(args: argparse.Namespace) -> int:
         raise FrameError("--field packs one night: give one")
     if not args.field.lower().endswith(field.SUFFIX):
         raise FrameError(f"--field {args.field}: give it a name that ends in {field.SUFFIX}")
-    found = _exposures(Path(args.nights[0]), args)
+    found = _exposures([Path(args.nights[0])], args)
     if not isinstance(found, Exposures):
         found = bag.exposures(*found, options.atmosphere_of(args), vertical_of(args))
     count = field.write(Path(args.field), found, console.ProgressBar())
@@ -120,36 +157,37 @@ def _pack(args: argparse.Namespace) -> int:
     return 0
 
 
-def _night(path: Path, args: argparse.Namespace) -> Night:
-    """The Night of a folder or a bag; raises StarposError if there is nothing to work on."""
+def _night(paths: list[Path], args: argparse.Namespace) -> Night:
+    """The Night of a folder, a bag or photographs; raises StarposError if there is nothing to work on."""
     from starpos.night import bag
 
-    found = _exposures(path, args)
+    found = _exposures(paths, args)
     receiver = read_receiver(args.gnss, None, "report")
     how = How(options.turn_of(args) if args.self_calibrate else None, receiver)
     if isinstance(found, Exposures):
         return solved_night(found, how, console.ProgressBar())
     if receiver is not None:
-        raise FrameError(f"{path}: --gnss goes with a folder of frames, and this is a bag: leave it out")
+        raise FrameError(f"{paths[0]}: --gnss goes with a folder of frames, and this is a bag: leave it out")
     return bag.night(*found, options.atmosphere_of(args), vertical_of(args), how, console.ProgressBar())
 
 
-def _exposures(path: Path, args: argparse.Namespace) -> "Exposures | tuple[Recorded, Instruments]":
-    """The exposures of a folder, or what a bag holds; raises StarposError if there is nothing to work on."""
+def _exposures(paths: list[Path], args: argparse.Namespace) -> "Exposures | tuple[Recorded, Instruments]":
+    """The exposures of a folder or of photographs, or what a bag holds; raises StarposError without any."""
     from starpos.night import bag
 
-    air, vertical = options.atmosphere_of(args), vertical_of(args)
+    air, vertical, path = options.atmosphere_of(args), vertical_of(args), paths[0]
     if not path.exists():
         raise FrameError(f"{path}: there is no such night: give a folder, or a rosbag2")
     if not bag.is_bag(path):
-        if path.is_file():
+        frames = paths if path.is_file() else []
+        if frames and not are_photographs(frames):
             raise FrameError(
-                f"{path}: neither a folder of frames nor a rosbag2 (.mcap, .db3): give one of these"
+                f"{path}: neither a folder of frames nor a rosbag2 (.mcap, .db3), nor a photograph: give one of these"
             )
-        read = reader_of(args)
-        about = First(read)(tuple(map(str, frames_in(path))))
+        read, folder = reader_of(args), path.parent if frames else path
+        about = First(read)(tuple(map(str, frames or frames_in(path))))
         # a field report states the focal length
         find = given_or_sought if args.field is None else given_of
         given = Instruments(None) if about is None else find(args, about)
-        return exposures(path, given, air, vertical, read=read)
+        return exposures(folder, given, air, vertical, read=read, frames=frames)
     return inputs.read_bag(path, args)

@@ -2,6 +2,7 @@
 """`starpos satellites`: a place from satellites among the stars, without a level."""
 
 import argparse
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -43,8 +44,8 @@ def run(args: argparse.Namespace) -> int:
         orbits += found
         for sentence in about:
             console.complain("satellites", sentence)
-    middle = float(np.median(np.concatenate([t.utc_unix_s for t in trails])))
-    usable, about = chosen(orbits, middle, newer=args.newer_elements)
+    begin = float(min(t.utc_unix_s.min() for t in trails))
+    usable, about = chosen(orbits, begin, newer=args.newer_elements)
     for sentence in about:
         console.complain("satellites", sentence)
     try:
@@ -108,7 +109,7 @@ def _prior(args: argparse.Namespace) -> KnownBefore:
     latitude, longitude, km = args.near
     if not (abs(latitude) <= 90 and abs(longitude) <= 360 and 0 < km < 20_000):
         raise SatelliteError("--near takes a latitude, a longitude (deg) and an error in km")
-    place = itrs_place(*np.radians([latitude, longitude]), height)
+    place = itrs_place(math.radians(latitude), math.radians(longitude), height)
     return KnownBefore(height, stddev, args.clock_stddev, place, (km * KM) ** 2 * np.eye(2))
 
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from starpos.cli import console
 from starpos.cli.console import Output
+from starpos.cli.places_file import feature_collection
 from starpos.earth import geoid
 from starpos.earth.geoid import Geoid
 from starpos.errors import StationError
@@ -129,16 +130,7 @@ def flat(value: Mapping) -> dict:
 
 
 def _geojson(values: Sequence[Mapping]) -> dict:
-    """A FeatureCollection of RFC 7946: longitude, latitude in deg and height in m on WGS 84."""
-    features = []
-    for value in values:
-        row = flat(value)
-        place = [row.pop("longitude"), row.pop("latitude"), row.pop("height_m")]
-        features.append(
-            {
-                "type": "Feature",
-                "geometry": {"type": "Point", "coordinates": place},
-                "properties": {k: v for k, v in row.items() if v is not None},
-            }
-        )
-    return {"type": "FeatureCollection", "features": features}
+    """A FeatureCollection of longitude, latitude in deg and height in m on WGS 84."""
+    rows = [flat(value) for value in values]
+    places = [[row.pop(name) for name in ("longitude", "latitude", "height_m")] for row in rows]
+    return feature_collection(("Point", place, row) for place, row in zip(places, rows, strict=True))

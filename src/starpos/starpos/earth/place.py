@@ -2,7 +2,7 @@
 """A place on the Earth: up and north there, by the plumb line and by the ellipsoid, and how well it is known."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -113,16 +113,12 @@ class Place:
         if vertical is UNDEFLECTED:
             return self
         d = vertical.at(self.latitude, self.longitude)
-        return Place(
-            latitude=self.latitude,
-            longitude=self.longitude,
+        return replace(
+            self,
             plumb=astronomic(self.latitude, self.longitude, d),
-            covariance=self.covariance,
             deflection=d,
             plumb_stddev=d.stddev_arcsec * ARCSEC,
             ellipsoid_stddev=0.0,
-            height_m=self.height_m,
-            utc_unix_s=self.utc_unix_s,
         )
 
     def at(self, utc_unix_s: float) -> "Place":

@@ -16,12 +16,12 @@ from starpos.earth.orientation import ROTATION_RAD_S, EarthState
 from starpos.earth.place import Place
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import FixError, PlaceError
-from starpos.fix.attitude import Attitude, heading_row
+from starpos.fix.attitude import CAMERA, ENU, Attitude, heading_row
 from starpos.fix.budget import link_attitude, mount_term
 from starpos.fix.checks import check_visible
 from starpos.fix.sighting import FittedSighting, fitted_fields
 from starpos.fix.star_fit import MatchedStars, StarFit, apparent, fit_stars
-from starpos.fix.terms import ALWAYS, ErrorTerm
+from starpos.fix.terms import ALWAYS, ErrorTerm, total_covariance
 from starpos.frames.exposure import GLOBAL_SHUTTER, Shutter
 from starpos.frozen import at_once
 from starpos.instrument.camera import Camera
@@ -46,6 +46,14 @@ class AttitudeAtPlace(FittedSighting):
     plumb: Attitude
     ellipsoid: Attitude
     true_north: Attitude
+
+    @property
+    def optics(self) -> Attitude:
+        """The camera C in east, north, up by the plumb line; the base link's mounting has no part in it."""
+        terms = tuple(t for t in self.plumb.terms if t.name != "mount")
+        covariance = total_covariance(terms)[3:, 3:]
+        seen = self.place.plumb_axes @ self.camera.rotation
+        return Attitude(seen, covariance, of=CAMERA, into=ENU, terms=terms)
 
     @property
     def text(self) -> str:

@@ -5,6 +5,7 @@ import gzip
 import io
 import itertools
 import math
+import re
 import warnings
 import zlib
 from collections.abc import Iterable, Mapping
@@ -58,6 +59,8 @@ def _read(file: BinaryIO, place: str, part: str) -> tuple[Frame, dict[str, Any]]
             with fits.open(plain, memmap=False, lazy_load_hdus=True) as hdus:
                 image = _image(hdus, place, part)
                 header, comments, values = _content(plain, image, place)
+                if _is_meteor_stack(image.primary):
+                    header = _of_meteor_stack(header, image.primary, place)
     except FrameError:
         raise
     # damaged bytes make astropy, zlib and CFITSIO raise any kind of exception
@@ -65,7 +68,7 @@ def _read(file: BinaryIO, place: str, part: str) -> tuple[Frame, dict[str, Any]]
         raise FrameError(
             f"{place}: this is not a whole FITS image ({one_line(e)}); take or copy it again."
         ) from e
-    if image.others:
+    if image.others and not _is_meteor_stack(image.primary):
         warnings.warn(
             f"{place}: its HDU {image.number} is taken, of {1 + len(image.others)} images; to take another name it, "
             f"like '{place}[{image.others[0]}]'",
@@ -99,6 +102,30 @@ def _check_unpacked(size: int, place: str) -> None:
         raise FrameError(f"{place}: it unpacks to over {MAX_BYTES // 10**6} MB, too many for a frame.")
 
 
+# A stack of video frames as the Global Meteor Network's RMS writes it (FF files): maximum, its frame, mean and scatter of
+# each pixel. Its mean shows the stars; the number of frames over their rate is the exposure.
+STACK_KEYS, MEAN_OF_STACK = ("NFRAMES", "FPS", "CAMNO"), "AVEPIXEL"
+# the start of the first frame, UTC, is in its header, or in its name
+STACK_NAME = re.compile(
+    r"FF_\w+?_(\d{4})(\d\d)(\d\d)_(\d\d)(\d\d)(\d\d)_(\d{3}|\d{6})_\d+\.fits?\b", re.ASCII
+)
+
+
+def _is_meteor_stack(primary: Mapping) -> bool:
+    return all(key in primary for key in STACK_KEYS)
+
+
+def _of_meteor_stack(header: Mapping, primary: Mapping, place: str) -> dict[str, Any]:
+    """The header of a stack of video frames as that of one exposure, as far as its times can be read."""
+    made = {key: value for key, value in header.items() if key != "NFRAMES"}
+    with suppress(TypeError, ValueError, ZeroDivisionError):
+        made.setdefault("EXPTIME", float(primary["NFRAMES"]) / float(primary["FPS"]))
+    if "DATE-OBS" not in made and (named := STACK_NAME.search(place)):
+        year, month, day, hour, minute, second, part = named.groups()
+        made["DATE-OBS"] = f"{year}-{month}-{day}T{hour}:{minute}:{second}.{part}"
+    return made
+
+
 @dataclass(frozen=True)
 class _Image:
     """The HDU of a frame, its number, the primary header, and the numbers of other images that might be meant."""
@@ -120,6 +147,8 @@ def _image(hdus: Iterable, place: str, part: str) -> _Image:
                 return _Image(hdu, number, primary, ())
         names = ", ".join(f"{n} {hdu.name}".strip() for n, hdu in enumerate(parts) if _axes(hdu))
         raise FrameError(f"{place}: there is no such HDU; its images are {one_line(names) or 'none'}.")
+    if _is_meteor_stack(primary):
+        return _image(parts, place, MEAN_OF_STACK)
     images = [number for number, hdu in enumerate(parts) if _axes(hdu)]
     if not images:
         raise FrameError(f"{place}: there is no image in this FITS file; give one that holds a frame.")

@@ -4,6 +4,7 @@
 import io
 import json
 import math
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
@@ -90,17 +91,36 @@ FLUXES = ("flux", "flux_auto", "flux_best", "flux_iso", "flux_aper", "flux_psf")
 MAGNITUDES = ("mag", "mag_auto", "mag_best", "mag_iso", "mag_aper", "mag_psf")
 
 
+# A line of the head that SExtractor writes as ASCII_HEAD: a column's number, its name, what it is.
+HEAD_LINE = re.compile(r"# +(\d+) +(\w+)", re.ASCII)
+
+
+def _of_ascii_head(rows: str) -> str:
+    """Rows with SExtractor's ASCII_HEAD as CSV; others as they are."""
+    head = HEAD_LINE.match(rows)
+    if head is None:
+        return rows
+    lines = rows.splitlines()
+    named = {int(m[1]): m[2] for m in map(HEAD_LINE.match, lines) if m}
+    cells = [line.split() for line in lines if line and not line.startswith("#")]
+    # an array has one name and several columns
+    names = [named.get(k + 1, f"column_{k + 1}") for k in range(max(map(len, cells), default=max(named)))]
+    return "\n".join(map(",".join, [names, *cells])) + "\n"
+
+
 def _as_ours(rows: str) -> tuple[str, float, bool]:
     """Rows of stars under our own names of columns.
 
     Also what x and y of the first pixel's centre are in them, and whether their light is a magnitude.
     """
+    rows = _of_ascii_head(rows)
     names, line, rest = rows.partition("\n")
     given = [name.strip('" \t\r').lower() for name in names.lstrip("# ").split(",")]
     for place, counted_from in PLACES.items():
         if set(place) <= set(given) and not {"x", "y"} & set(given):
             light = next((name for name in (*FLUXES, *MAGNITUDES) if name in given), "flux")
-            ours = {**dict(zip(place, "xy", strict=True)), light: "flux"}
+            # their flags have other meanings
+            ours = {**dict(zip(place, "xy", strict=True)), light: "flux", "flags": "their_flags"}
             text = ",".join(ours.get(name, name) for name in given) + line + rest
             return text, counted_from, light in MAGNITUDES
     return rows, 0.0, False

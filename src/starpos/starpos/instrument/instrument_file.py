@@ -13,7 +13,7 @@ import numpy as np
 from starpos.errors import FrameError, InstrumentError, TimeError
 from starpos.frames.exposure import Shutter
 from starpos.instrument import sensors, yaml_file
-from starpos.instrument.camera import COEFFICIENTS, PLUMB_BOB, Camera, stated_lens
+from starpos.instrument.camera import COEFFICIENTS, PLUMB_BOB, Camera, check_axis, stated_lens
 from starpos.instrument.inclinometer import InclinometerErrors
 from starpos.instrument.instrument import (
     MAX_SAG_ARCSEC,
@@ -50,6 +50,7 @@ def read_camera(path: Path) -> Camera:
         raise InstrumentError(
             f"{path}: camera_matrix is not [fx 0 cx, 0 fy cy, 0 0 1]; calibrate without skew."
         )
+    check_axis(width, height, k[2], k[5], str(path))
     try:
         return Camera(
             width=width, height=height, fx=k[0], fy=k[4], cx=k[2], cy=k[5], distortion=d, model=model
@@ -358,6 +359,7 @@ def _camera(camera: object, folder: Path) -> dict[str, Any]:
     numbers_by_key = {key: _number(camera, key) for key in INTRINSICS}
     distortion = _row({"distortion": [], **camera}, "distortion")
     full = Camera(width=width, height=height, distortion=distortion, model=model, **numbers_by_key)
+    check_axis(width, height, full.cx, full.cy, "camera")
     return {"focal_px": full.fx, "camera": full}
 
 

@@ -33,6 +33,7 @@ class Shot:
     size : of the frame in px
     tilt : rad
     xy, residual_px : (M, 2), seen places of the stars of its fix, and these minus the fitted ones
+    magnitudes, names : (M,) of them
     camera_to_itrs : (3, 3), attitude against the Earth by the stars alone
     at_place : heading, pitch and roll at a known place; None without one
     warnings : what is suspicious about its identification, as `Solution.warnings`
@@ -54,6 +55,7 @@ class Shot:
     xy: np.ndarray = field(default_factory=lambda: NO_STARS)
     residual_px: np.ndarray = field(default_factory=lambda: NO_STARS)
     magnitudes: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    names: tuple[str, ...] = ()
     stars_detected: int = 0
     stars_matched: int = 0
     residual_arcsec: float = float("nan")
@@ -84,7 +86,9 @@ class Shot:
             warnings=s.warnings,
         )
         if stars is not None and s.star is not None and s.magnitudes is not None:
-            shot = replace(shot, xy=np.stack([stars.x, stars.y], -1)[s.star], magnitudes=s.magnitudes)
+            shot = replace(
+                shot, xy=np.stack([stars.x, stars.y], -1)[s.star], magnitudes=s.magnitudes, names=s.names
+            )
         if s.fix is None:
             return shot
         return replace(

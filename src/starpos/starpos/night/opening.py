@@ -43,8 +43,11 @@ def exposures(
     vertical: Vertical,
     place: Place | None = None,
     read: Reader | None = None,
+    frames: Sequence[Path] = (),
 ) -> Exposures:
     """The frames of a folder in the order of their names, to be solved.
+
+    frames: these of it; without any, all. Photographs without tilt.csv have their own gravity.
 
     read: with a camera's clock, for the times of pictures; None for files that state their time.
 
@@ -53,10 +56,11 @@ def exposures(
 
     Raises FrameError if there are no frames, or truth.json cannot be used.
     """
-    frames, read = frames_in(folder), read or Reader()
+    frames, read = frames or frames_in(folder), read or Reader()
     tilts: Path | ByGravity = folder / TILTS
     if place is None and not tilts.exists() and are_photographs(frames):
-        tilts, read = ByGravity(), replace(read, clock=read.clock or CameraClock())
+        # a new reader, which has not kept a frame without its time
+        tilts, read = ByGravity(), Reader(read.clock or CameraClock(), read.delay_s)
     by_gravity = isinstance(tilts, ByGravity)
     first = First(read, by_gravity)(tuple(map(str, frames)))
     work, remarks = Solving(given, atmosphere=atmosphere, places=place), tuple[Remark, ...]()
@@ -64,20 +68,18 @@ def exposures(
         try:
             work, remarks = work_of(given, first, tilts, atmosphere, place)
         except TiltError as error:
-            tilts = (
-                None if place is not None and not (folder / TILTS).exists() else TiltsByTime(why=str(error))
-            )
+            none = place is not None and not (folder / TILTS).exists()
             instruments, remarks = given.framed(first)
-            work = replace(work, instruments=instruments, tilts=tilts)
+            work = replace(work, instruments=instruments, tilts=None if none else TiltsByTime(why=str(error)))
 
     def each(work: Callable[[Frame | Stars], Any]) -> Worked:
         answers = Here().map((OnFile(read, work), str(path)) for path in frames)
         return zip((path.name for path in frames), answers, strict=True)
 
+    kind = "lists of stars" if frames[0].suffix == ".csv" else "frames"
     return Exposures(
-        name=folder.name or str(folder),
-        origin=f"solved from {len(frames)} {'lists of stars' if frames[0].suffix == '.csv' else 'frames'} and "
-        f"{'the gravity in their files' if by_gravity else TILTS}",
+        name=frames[0].name if len(frames) == 1 else folder.name or str(folder),
+        origin=f"solved from {len(frames)} {kind} and {'the gravity in their files' if by_gravity else TILTS}",
         count=len(frames),
         each=each,
         work=work,

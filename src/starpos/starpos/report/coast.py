@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from starpos.earth.ellipsoid import EARTH_RADIUS_M
 from starpos.report.style import BLUE, GREY, ORANGE
 
 if TYPE_CHECKING:
@@ -20,6 +21,10 @@ if TYPE_CHECKING:
 COAST_FILE = Path(__file__).with_name("data") / "land-110m.json"
 # radius of the lens, and steps of the graticule on the globe and in the lens, in degrees
 LENS, STEPS = 10, (30, 5)
+# sizes of the place's mark there, points
+MARKERS = (8.0, 2.5)
+# radius of an ellipse that holds a place with 95 %, in sigma
+SIGMAS_95 = 2.4477
 
 
 def coast_lines() -> list[np.ndarray]:
@@ -29,25 +34,34 @@ def coast_lines() -> list[np.ndarray]:
     return [np.cumsum(arc, axis=0) * grid["scale"] + grid["translate"] for arc in topology["arcs"]]
 
 
-def draw_map(figure: "Figure", latitude: float, longitude: float) -> None:
-    """Draw the Earth from above a place in rad, north on top, and a lens with the lands around."""
+def draw_map(
+    figure: "Figure", latitude: float, longitude: float, covariance: np.ndarray | None = None
+) -> None:
+    """Draw the Earth from above a place in rad, north on top, and a lens with the lands around.
+
+    covariance: (2, 2) of east and north in m, for the lens to show the ellipse that holds the place with 95 %.
+    """
     globe = figure.subplots()
     lens = globe.inset_axes((0.64, 0.0, 0.36, 0.36))
     coast = _joined(coast_lines())
-    for axes, reach, step in zip((globe, lens), (90, LENS), STEPS, strict=True):
-        _draw_disc(axes, np.sin(np.radians(reach)), *(
+    for axes, reach, step, size in zip((globe, lens), (90, LENS), STEPS, MARKERS, strict=True):
+        _draw_disc(axes, np.sin(np.radians(reach)), size, *(
             _seen_from(latitude, longitude, lines) for lines in (_graticule(step), coast)
         ))  # fmt: skip
+    if covariance is not None:
+        around = np.linspace(0, 2 * np.pi, 73)
+        root = SIGMAS_95 * np.linalg.cholesky(covariance) / EARTH_RADIUS_M
+        lens.plot(*(root @ [np.cos(around), np.sin(around)]), color=ORANGE, lw=1.2)
 
 
-def _draw_disc(axes: "Axes", radius: float, graticule: np.ndarray, coast: np.ndarray) -> None:
+def _draw_disc(axes: "Axes", radius: float, size: float, graticule: np.ndarray, coast: np.ndarray) -> None:
     from matplotlib.patches import Circle
 
     rim = axes.add_patch(Circle((0, 0), radius, fc="#eef4f8", ec=GREY, lw=1.0))
     for lines, colour, width in ((graticule, "#c3cdd4", 0.6), (coast, BLUE, 1.0)):
         (line,) = axes.plot(*lines.T, color=colour, lw=width)
         line.set_clip_path(rim)
-    axes.plot(0, 0, "o", color=ORANGE, ms=8, mec="black", mew=0.8)
+    axes.plot(0, 0, "o", color=ORANGE, ms=size, mec="black", mew=size / 10)
     limits = (-1.01 * radius, 1.01 * radius)
     axes.set(xlim=limits, ylim=limits, aspect="equal")
     axes.set_axis_off()

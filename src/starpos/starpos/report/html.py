@@ -96,7 +96,7 @@ def wide_table(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 PAGE = "index.html"
 
 
-def check_folder(folder: Path) -> None:
+def check_folder(folder: Path, page: str = PAGE) -> None:
     """Raise WriteError, before a night is worked on, where its report could not be written; leaves nothing behind."""
     made: list[Path] = []
     try:
@@ -104,7 +104,7 @@ def check_folder(folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
             pass
-        _check_ours(folder / PAGE)
+        _check_ours(folder / page)
     except (OSError, ValueError) as error:
         raise _refused(folder, error) from None
     finally:

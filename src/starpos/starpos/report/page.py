@@ -72,7 +72,8 @@ def _figures(night: Night, catalogue: Catalogue) -> Iterator[_Figure]:
 def _place_figures(night: Night) -> Iterator[_Figure]:
     draw = night_figures
     ground = (night.combined or night.places[0]).on_ground(night.vertical)
-    yield "map", "Where on Earth", MAP, 6.6, lambda f: coast.draw_map(f, ground.latitude, ground.longitude)
+    where = ground.latitude, ground.longitude, ground.covariance[:2, :2]
+    yield "map", "Where on Earth", MAP, 6.6, lambda f: coast.draw_map(f, *where)
     if night.steady is not None:
         s = measures.steadiness(night, night.steady)
         title = "Stability: one tilt for all frames"
@@ -88,7 +89,8 @@ def _place_figures(night: Night) -> Iterator[_Figure]:
 
 
 MAP = (
-    "The place in the middle, north on top, a line every 30 degrees; the lens shows 1100 km around it, a line every 5. "
+    "The place in the middle, north on top, a line every 30 degrees; the lens shows 1100 km around it, a line every 5, "
+    "and the ellipse that holds the place with 95 %. "
     "Coast lines: Natural Earth 1:110m, public domain; small islands are left out. Suspicious: another country."
 )
 STEADY = (
@@ -214,9 +216,10 @@ def page(
             parts.append(f'<h2 id="night{number}">{number}. {escape(night.name)}</h2>')
         parts += [_place(night), _simulated(night), _summary(night), figures(pictures)]
     parts.append(
-        f"<footer><p>Made by starpos {escape(__version__)} on {escape(made_utc)}. Positions are astronomic unless "
-        "said otherwise; errors are 1 sigma. The paper is Izadmehr &amp; Khakian Ghomi, &ldquo;Design and construction "
-        "of a high resolution, portable and low-cost positioner by a star tracking system&rdquo;.</p></footer>"
+        f"<footer><p>Made by starpos {escape(__version__)} on {escape(made_utc)}, on this machine: nothing left it, and "
+        "the page loads nothing. Positions are astronomic unless said otherwise; errors are 1 sigma. The paper is "
+        "Izadmehr &amp; Khakian Ghomi, &ldquo;Design and construction of a high resolution, portable and low-cost "
+        "positioner by a star tracking system&rdquo;.</p></footer>"
     )
     return document(title, parts)
 

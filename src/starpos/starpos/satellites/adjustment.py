@@ -98,7 +98,7 @@ class Adjuster:
         ends = [len(t.directions) for t in trails]
         self.prior = prior
         self.trail = np.repeat(np.arange(len(trails)), ends)
-        self.orbits = [orbits[k] for k in self.trail]
+        self.orbits = [orbits[k] for k in self.trail.tolist()]
         numbers = [o.number for o in orbits]
         _, self.satellite = np.unique(numbers, return_inverse=True)
         self.utc = np.concatenate([t.utc_unix_s for t in trails])

@@ -86,8 +86,8 @@ class Ephemeris:
         t = self.utc_unix_s
         if not t[0] <= utc_unix_s <= t[-1]:
             return np.full(3, np.nan), np.full(3, np.nan)
-        first = np.searchsorted(t, utc_unix_s) - POINTS // 2
-        first = min(max(int(first), 0), max(len(t) - POINTS, 0))
+        first = int(np.searchsorted(t, utc_unix_s)) - POINTS // 2
+        first = min(max(first, 0), max(len(t) - POINTS, 0))
         span = slice(first, first + POINTS)
         step = t[first + 1] - t[first]
         x = (t[span] - utc_unix_s) / step

@@ -58,14 +58,16 @@ class SatelliteFix:
 
 def locate(trails: Sequence[SatelliteTrail], orbits: Sequence[Orbit], prior: KnownBefore) -> SatelliteFix:
     """Name the trails and adjust the place; SatelliteError where they do not give one."""
-    if len(trails) < FEWEST:
-        raise SatelliteError(f"there are {len(trails)} trails: a place takes {FEWEST} or more")
+    fewest = FEWEST if prior.place is None else FEWEST - 1
+    if len(trails) < fewest:
+        raise SatelliteError(f"there are {len(trails)} trails: a place takes {fewest} or more")
     found = candidates(trails, orbits, prior.height_m, prior.height_stddev_m, prior.clock_stddev_s)
-    if prior.place is None:
-        agreed = agreement(found, orbits)
-        place, rows, covariance = agreed.place, agreed.members, None
-    else:
-        place, rows, covariance = prior.place, np.zeros(0, int), prior.covariance
+    known = found
+    if prior.place is not None and prior.covariance is not None:
+        known = found.near(prior.place, prior.covariance[0, 0] * np.eye(3))
+    agreed = agreement(known, orbits)
+    place, rows = agreed.place, agreed.members[agreed.members < len(found.trail)]
+    covariance = None
     clock_s, seen_before = 0.0, []
     answer: PlaceAdjustment | None = None
     for _ in range(ROUNDS):
@@ -74,9 +76,9 @@ def locate(trails: Sequence[SatelliteTrail], orbits: Sequence[Orbit], prior: Kno
         if rows.tolist() in seen_before:
             break
         seen_before.append(rows.tolist())
-        if len(rows) < FEWEST:
+        if len(rows) < fewest:
             raise SatelliteError(
-                f"of {len(trails)} trails {len(rows)} fit a satellite at one place: a place takes {FEWEST}: give orbits "
+                f"of {len(trails)} trails {len(rows)} fit a satellite at one place: a place takes {fewest}: give orbits "
                 "of that day, or more trails"
             )
         adjuster = Adjuster(ways_of(trails, found, rows), [orbits[k] for k in found.orbit[rows]], prior)
@@ -84,7 +86,7 @@ def locate(trails: Sequence[SatelliteTrail], orbits: Sequence[Orbit], prior: Kno
         place, clock_s = answer.place, answer.clock_s
         covariance = answer.covariance
     assert answer is not None
-    return _fix(trails, orbits, found, np.array(seen_before[-1], int), answer)
+    return _fix(trails, orbits, found, np.array(seen_before[-1], int), answer, fewest)
 
 
 def _named(
@@ -124,12 +126,13 @@ def _fix(
     found: Candidates,
     rows: np.ndarray,
     answer: PlaceAdjustment,
+    fewest: int,
 ) -> SatelliteFix:
     used = answer.used
     satellites = {orbits[found.orbit[k]].number for k, fits in zip(rows, used, strict=True) if fits}
-    if used.sum() < FEWEST or len(satellites) < 2:
+    if used.sum() < fewest or len(satellites) < 2:
         raise SatelliteError(
-            f"only {used.sum()} trails of {len(satellites)} satellites agree: a place takes {FEWEST} of two or more"
+            f"only {used.sum()} trails of {len(satellites)} satellites agree: a place takes {fewest} of two or more"
         )
     latitude, longitude, height = geodetic_place(answer.place)
     adjusted = np.full(len(trails), -1)

@@ -54,6 +54,16 @@ class Candidates:
     places: np.ndarray
     covariance: np.ndarray
 
+    def near(self, place: np.ndarray, covariance: np.ndarray) -> "Candidates":
+        """These, and a rough place that is known, as if a trail more had given it."""
+        return Candidates(
+            trail=np.append(self.trail, self.trail.max(initial=0) + 1),
+            way=np.append(self.way, 0),
+            orbit=np.append(self.orbit, -1),
+            places=np.concatenate([self.places, place[None]]),
+            covariance=np.concatenate([self.covariance, covariance[None]]),
+        )
+
 
 class _Sky:
     """All orbits between two computed times, in axes that turn with the Earth."""
@@ -121,10 +131,12 @@ def candidates(
     found: list[tuple[int, int, np.ndarray, np.ndarray, np.ndarray]] = []
     for k in order:
         trail = trails[k]
-        named = trail.satellite is not None
-        if (named and trail.satellite not in row_of) or (not named and len(trail.directions) < 2):
+        if trail.satellite in row_of:
+            only: np.ndarray | slice = np.array([row_of[trail.satellite]])
+        elif trail.satellite is None and len(trail.directions) > 1:
+            only = slice(None)
+        else:
             continue
-        only = np.array([row_of[trail.satellite]]) if named else slice(None)
         for way, one in enumerate(trail.ways):
             index, places, covariance = _of_trail(one, sky, only, height_m, height_stddev_m, clock_stddev_s)
             found.append((k, way, index, places, covariance))

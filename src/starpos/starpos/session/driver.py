@@ -75,16 +75,17 @@ class Changes:
         self._log = log
         self._logged: object = None
 
-    def say(self, sentence: str, good: bool, state: object = None) -> None:
-        """Log a sentence, unless its state (or it itself) was logged last."""
+    def say(self, sentence: str, good: bool, state: object = None) -> bool:
+        """Log a sentence, unless its state (or it itself) was logged last; returns whether it was new."""
         state = state or sentence
         if state == self._logged:
-            return
+            return False
         self._logged = state
         if good:
             self._log.info(sentence)
         else:
             self._log.warning(sentence)
+        return True
 
 
 class Heard(Protocol):

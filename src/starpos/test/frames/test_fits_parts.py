@@ -104,3 +104,22 @@ def test_a_part_that_claims_gigabytes_is_refused(tmp_path):
     (tmp_path / "a.fits").write_bytes(data)
     with pytest.raises(FrameError, match="claims"):
         read_frame(f"{tmp_path / 'a.fits'}[1]")
+
+
+# the name has ms or us; the header's time counts before the name's
+FF = "FF_XX0001_20240618_011731_867_1054720.fits", "FF_XX0001_20240618_011731_867123_1054720.fits"
+
+
+@pytest.mark.parametrize(("name", "start"), [(FF[0], None), (FF[1], "2024-06-18T02:00:00")])
+def test_a_stack_of_a_meteor_camera_is_its_mean_and_one_exposure(tmp_path, name, start):
+    primary = fits.PrimaryHDU()
+    primary.header.update({"NFRAMES": 256, "FPS": 25.0, "CAMNO": "XX0001"})
+    if start:
+        primary.header["DATE-OBS"] = start
+    names = "MAXPIXEL", "MAXFRAME", "AVEPIXEL", "STDPIXEL"
+    images = [fits.ImageHDU(np.full((72, 128), k, np.uint8), name=n) for k, n in enumerate(names)]
+    fits.HDUList([primary, *images]).writeto(tmp_path / name)
+    frame = read_frame(tmp_path / name)
+    assert frame.exposure_s == 10.24 and (frame.pixels == 2).all()
+    # 2024-06-18T01:17:31.867 or 02:00:00 (date -u -d ... +%s), and half of the exposure
+    assert frame.mid_unix_s == pytest.approx((1718676000 if start else 1718673451.867) + 5.12, abs=1e-3)

@@ -4,6 +4,7 @@
 import numpy as np
 import pytest
 
+from starpos.cli.inputs import stated_site
 from starpos.errors import FrameError
 from starpos.frames.reading import read_frame
 
@@ -47,3 +48,37 @@ def test_a_list_without_light_is_refused(tmp_path):
     path.write_text(f"{HEAD}X_IMAGE,Y_IMAGE\n10,20\n")
     with pytest.raises(FrameError, match="flux"):
         read_frame(path)
+
+
+ASCII_HEAD = """#   1 NUMBER                 Running object number
+#   2 FLUX_APER              Flux vector within fixed circular aperture(s)  [count]
+#   4 X_IMAGE                Object position along x                        [pixel]
+#   5 Y_IMAGE                Object position along y                        [pixel]
+#   6 MAG_AUTO               Kron-like elliptical aperture magnitude        [mag]
+#   7 FLAGS                  Extraction flags
+         1   10.0   12.0   11.5   21.25   -2.5    0
+         2  100.0  120.0   31.0   41.00   -5.0    4
+"""
+
+
+def test_a_list_with_sextractors_own_head_is_read_below_the_frames_size(tmp_path):
+    path = tmp_path / "a.csv"
+    path.write_text(HEAD + ASCII_HEAD)
+    stars = read_frame(path)
+    assert stars.x.tolist() == [30, 10.5] and stars.y.tolist() == [40, 20.25]
+    assert stars.flags.tolist() == [0, 0]
+    path.write_text(ASCII_HEAD)
+    with pytest.raises(FrameError, match="first line does not give the frame's size"):
+        read_frame(path)
+
+
+def test_a_site_of_the_header_is_said_where_one_is_wanted(tmp_path):
+    path = tmp_path / "a.csv"
+    path.write_text(
+        '# {"NAXIS1": 100, "NAXIS2": 80, "SITELAT": "+47 06", "SITELONG": -11.3}\nx,y,flux\n1,2,3\n'
+    )
+    assert stated_site([str(path)]).endswith(
+        "SITELAT +47 06 and SITELONG -11.3: if that is right, give it (east is positive)"
+    )
+    path.write_text(f"{HEAD}x,y,flux\n1,2,3\n")
+    assert stated_site([str(path)]) == stated_site(["none.csv"]) == stated_site([]) == ""

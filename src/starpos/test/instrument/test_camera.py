@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 from starpos.errors import InstrumentError
+from starpos.instrument import instrument_file
 from starpos.instrument.camera import Camera, check_axis
+from starpos.instrument.instrument_file import read_camera, write_camera
 
 SIZE = (5616, 3744)
 # A wide lens.
@@ -114,9 +116,17 @@ def test_a_pixel_that_is_no_number_has_no_direction(camera):
 
 
 @pytest.mark.parametrize(("cx", "cy"), [(319.5, 239.5), (-400.0, 767.5), (1023.5, 1600.0), (1900.0, 1400.0)])
-def test_an_axis_at_the_corner_of_the_whole_frame_is_refused(cx, cy):
+def test_an_axis_at_the_corner_of_the_whole_frame_is_refused(tmp_path, cx, cy):
     with pytest.raises(InstrumentError, match="optical axis is at pixel"):
         check_axis(2048, 1536, cx, cy, "camera_info")
+    camera = f"{{width: 2048, height: 1536, fx: 900, fy: 900, cx: {cx}, cy: {cy}}}"
+    (tmp_path / "instrument.yaml").write_text(f"starpos_instrument: 1\ncamera: {camera}\n")
+    write_camera(
+        tmp_path / "camera.yaml", Camera(width=2048, height=1536, fx=900.0, fy=900.0, cx=cx, cy=cy), "any"
+    )
+    for read, name in ((instrument_file.read, "instrument.yaml"), (read_camera, "camera.yaml")):
+        with pytest.raises(InstrumentError, match="optical axis is at pixel"):
+            read(tmp_path / name)
 
 
 @pytest.mark.parametrize(

@@ -148,7 +148,7 @@ def test_a_link_stays_one_when_a_calibration_is_written_through_it(tmp_path):
     path = tmp_path / "camera.yaml"
     path.symlink_to("store/cam1.yaml")
     instrument_file.write_camera(path, CAMERA, "camera")
-    other = Camera(width=1234, height=567, fx=1e3, fy=1e3, cx=1.0, cy=2.0)
+    other = Camera(width=1234, height=567, fx=1e3, fy=1e3, cx=611.0, cy=282.0)
     instrument_file.write_camera(path, other, "camera")
     assert path.is_symlink() and instrument_file.read_camera(tmp_path / "store" / "cam1.yaml") == other
     assert [p.name for p in (tmp_path / "store").iterdir()] == ["cam1.yaml"]
@@ -171,7 +171,7 @@ def test_what_is_no_calibration_at_all(tmp_path, content):
 
 def test_a_reader_never_sees_half_a_file(tmp_path):
     path = tmp_path / "camera.yaml"
-    other = Camera(width=1234, height=567, fx=1e3, fy=1e3, cx=1.0, cy=2.0)
+    other = Camera(width=1234, height=567, fx=1e3, fy=1e3, cx=611.0, cy=282.0)
     instrument_file.write_camera(path, CAMERA, "camera")
 
     def write():

@@ -288,13 +288,14 @@ def random_instrument(rng, full: bool) -> Instrument:
         valid_days=float(rng.choice([np.inf, rng.uniform(0.1, 1e4)])),
     )
     focal = float(rng.uniform(1e3, 1e5))
+    width, height = (int(n) for n in rng.integers(100, 9000, 2))
     camera = Camera(
-        width=int(rng.integers(100, 9000)),
-        height=int(rng.integers(100, 9000)),
+        width=width,
+        height=height,
         fx=focal,
         fy=focal * 1.001,
-        cx=rng.uniform(50, 4000),
-        cy=rng.uniform(50, 4000),
+        cx=width * rng.uniform(0.3, 0.7),
+        cy=height * rng.uniform(0.3, 0.7),
         distortion=tuple(rng.normal(0, 0.1, 5).tolist()),
     )
     names = [f.name for f in fields(InclinometerErrors)]

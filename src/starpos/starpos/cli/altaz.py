@@ -1,0 +1,159 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`starpos altaz`: azimuth and altitude of pixels at a known place, pixels of directions, and the grid drawn."""
+
+import argparse
+import itertools
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from starpos.cli import console, inputs, options, overwriting
+from starpos.cli.console import Output
+from starpos.cli.overwriting import Written
+from starpos.errors import FrameError, InstrumentError
+from starpos.fix.attitude import Attitude
+from starpos.fix.directions import horizontal, towards
+from starpos.fix.searching import Sight
+from starpos.frames.frame import Frame
+from starpos.instrument.camera import Camera
+from starpos.tables import TableForm
+from starpos.units import utc_text
+
+NOTHING = 1
+COLUMNS = ("file", "utc", "x", "y", "azimuth", "altitude", "altitude_airless", "sigma_across_arcsec",
+           "sigma_altitude_arcsec")  # fmt: skip
+HEAD = (
+    "pixel x, y: azimuth (deg, from north over east), altitude as seen and without air, 1 sigma across and up"
+)
+POINTS = TableForm(what="table of pixels", error=FrameError, needed=("x", "y"))
+# an identified star at this share of a point's distance from the axis, or more, shows the lens there
+REACH = 0.95
+
+
+def run(args: argparse.Namespace) -> int:
+    for name, values in (("X Y", args.pixels), ("--back AZ ALT", args.back)):
+        if len(values) % 2:
+            raise InstrumentError(f"{name}: {len(values)} numbers are no pairs: give two for each point")
+    if args.overlay is not None:
+        overwriting.check(args, Written("--overlay", args.overlay, overwriting.picture))
+    args.frames, pixels = [args.frame], np.reshape(args.pixels, (-1, 2))
+    if args.points is not None:
+        table = POINTS.read(args.points)
+        pixels = np.vstack([pixels, np.stack([table.columns["x"], table.columns["y"]], -1)])
+    answers = list(inputs.seen_at_place("altaz", args))
+    if not answers:
+        return NOTHING
+    seen = _Seen(*answers[0])
+    back = np.radians(np.reshape(args.back, (-1, 2)))
+    backs = seen.pixels(back)
+    for (az, alt), xy in zip(np.degrees(back).tolist(), backs.tolist(), strict=True):
+        if not np.isfinite(xy).all():
+            console.complain("altaz", f"azimuth {az:g}, altitude {alt:g} deg is not on the frame")
+    points = np.vstack([pixels, backs[np.isfinite(backs).all(1)]])
+    _put(args, seen, points)
+    if args.overlay is not None:
+        _draw(args.overlay, seen, points)
+    return 0
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """A frame whose attitude at a known place is known, and its camera with the focal length that its stars show."""
+
+    item: object
+    sight: Sight
+    camera: Camera
+
+    @property
+    def optics(self) -> Attitude:
+        return self.sight.solution.at_place.optics
+
+    def pixels(self, directions: np.ndarray) -> np.ndarray:
+        """Pixels (N, 2) of azimuths and altitudes (N, 2) in rad; NaN for those that are not on the frame."""
+        xy = self.camera.project(towards(*directions.T) @ self.optics.rotation)
+        with np.errstate(invalid="ignore"):
+            on = ((xy > -0.5) & (xy < np.array([self.camera.width, self.camera.height]) - 0.5)).all(1)
+        return np.where(on[:, None], xy, np.nan)
+
+    def shown(self, rays: np.ndarray) -> np.ndarray:
+        """Whether identified stars lie as far off the axis as rays (N, 3) in C."""
+        stars, found, used = self.sight.stars, self.sight.found, self.sight.solution.at_place.used
+        row = found.star[used]
+        least = self.camera.directions(stars.x[row], stars.y[row])[:, 2].min()
+        return REACH * np.arccos(np.clip(rays[:, 2], -1, 1)) <= np.arccos(np.clip(least, -1, 1))
+
+
+def _put(args: argparse.Namespace, seen: _Seen, points: np.ndarray) -> None:
+    """Print the azimuth and altitude of pixels (N, 2)."""
+    output, found = Output(args, COLUMNS, HEAD), seen.sight.solution.at_place
+    rays = seen.camera.directions(*points.T)
+    sigma = np.hypot(args.stddev_px, found.jitter_px) / seen.camera.fx
+    at = horizontal(seen.optics, rays, sigma)
+    airless = options.atmosphere_of(args).refraction().unbend(rays @ seen.optics.rotation.T)
+    errors = np.degrees(np.sqrt(np.diagonal(at.covariance, axis1=1, axis2=2))) * 3600
+    errors[~seen.shown(rays)] = np.nan
+    if np.isnan(errors).any():
+        console.complain(
+            "altaz",
+            f"{int(np.isnan(errors[:, 0]).sum())} points lie further out than any identified star, where the lens is not "
+            "known: calibrate it with starpos calibrate --camera --site",
+        )
+    columns = (
+        points[:, 0],
+        points[:, 1],
+        *np.degrees([at.azimuth, at.altitude, np.arcsin(airless[:, 2])]),
+        *errors.T,
+    )
+    for row in np.transpose(columns).tolist():
+        x, y, azimuth, altitude, without, across, up = row
+        values = dict(zip(COLUMNS, (args.frame, utc_text(found.utc_unix_s), *row), strict=True))
+        output.put(
+            values,
+            f"{x:.2f} {y:.2f}: {azimuth:.4f} {altitude:.4f} ({without:.4f}) +- {across:.0f} {up:.0f} arcsec",
+        )
+
+
+# the grid: circles of altitude, azimuths, and the step along each, deg
+ALTITUDES, AZIMUTHS, ALONG = (0, 15, 30, 45, 60, 75), range(0, 360, 30), 0.5
+NAMES = {0: "N", 90: "E", 180: "S", 270: "W"}
+
+
+def _draw(path: str, seen: _Seen, points: np.ndarray) -> None:
+    """Draw the frame with stars, the grid and the points."""
+    import cv2
+
+    from starpos.frames.annotate import Identified, annotate, shrink
+
+    frame, stars, solution = seen.item, seen.sight.stars, seen.sight.solution
+    if not isinstance(frame, Frame):
+        raise InstrumentError(
+            f"{path}: a list of stars has no picture to draw on: give a frame for --overlay"
+        )
+    picture = annotate(
+        frame, stars, Identified(star=solution.star, names=solution.names, magnitudes=solution.magnitudes)
+    )
+    n = shrink(frame)
+
+    def line(azimuth: np.ndarray, altitude: np.ndarray) -> np.ndarray:
+        return (seen.pixels(np.radians(np.stack(np.broadcast_arrays(azimuth, altitude), -1))) + 0.5) / n - 0.5
+
+    grid = [line(np.arange(0, 360 + ALONG, ALONG), np.float64(a)) for a in ALTITUDES]
+    grid += [line(np.float64(a), np.arange(0, 90, ALONG)) for a in AZIMUTHS]
+    for xy in grid:
+        for begin, end in itertools.pairwise(xy):
+            if np.isfinite([begin, end]).all():
+                cv2.line(
+                    picture, tuple(map(round, begin)), tuple(map(round, end)), (120, 120, 40), 1, cv2.LINE_AA
+                )
+    for azimuth in AZIMUTHS:
+        (xy,) = line(np.array([azimuth]), np.array([5.0]))
+        if np.isfinite(xy).all():
+            text = NAMES.get(azimuth, str(azimuth))
+            cv2.putText(picture, text, tuple(map(round, xy)), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (0, 220, 255), 1)
+    for x, y in (points + 0.5) / n - 0.5:
+        cv2.drawMarker(picture, (round(x), round(y)), (60, 60, 255), cv2.MARKER_CROSS, 15)
+    if not cv2.imwrite(str(Path(path)), picture):
+        raise InstrumentError(
+            f"{path}: the picture cannot be written there: give a PNG in a folder that is there"
+        )
