@@ -33,7 +33,7 @@ ROUNDS, SETTLED = 30, 1e-12
 ALIKE = 1e-7
 # an answer is excluded if its fit is worse by this
 EXCLUDED_SIGMA = 6.0
-# outliers: their distance, minimum number of directions, maximum share left out, maximum number of rounds
+# outliers: their distance, minimum number of directions, maximum share left out where A3 is fitted too, number of rounds
 OUTLIER_SIGMA, MIN_JUDGED, MAX_OUTLIERS, JUDGED = 6.0, 6, 1 / 3, 6
 WITHIN = 0.95
 # three directions that contradict each other by more have errors of unknown size
@@ -209,7 +209,7 @@ def _sound(whole: Directions) -> np.ndarray:
             return every
         off = size(zenith)
         agree = np.flatnonzero(off < OUTLIER_SIGMA * max(usual_sigma(off, number - 2), 1.0))
-        if len(agree) < (1 - MAX_OUTLIERS) * number:
+        if len(agree) <= number // 2:
             return every
         if np.array_equal(agree, rows):
             break

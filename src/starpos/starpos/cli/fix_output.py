@@ -116,6 +116,29 @@ def line_of(path: str, s: Solution, turning: bool) -> str:
     return f"{path}: {where}{stars}"
 
 
+# the status of a row that gives an elevation
+ELEVATION = "elevation alone"
+ELEVATIONS_HEAD = "row: the zenith distance of its direction; together these give the position"
+
+
+def put_elevation(
+    output: Output,
+    source: str,
+    utc_unix_s: float | None,
+    zenith_distance: float | None,
+    vertical: Vertical,
+    status: str = ELEVATION,
+) -> None:
+    """Write a row that gives a zenith distance (rad) alone, or None with the status that says why."""
+    deg = None if zenith_distance is None else np.degrees(zenith_distance)
+    utc = {} if utc_unix_s is None else {"utc": utc_text(utc_unix_s)}
+    none = dict.fromkeys(("residual_arcsec", "log_odds"))
+    about_stars = {"stars_detected": 0, "stars_matched": 0} | none | {"status": status, "warnings": []}
+    row = json_of(None, vertical) | utc | {"zenith_distance_deg": deg} | about_stars
+    about = status if deg is None else f"{deg:.5f} deg from the zenith"
+    output.put({"file": source} | row, f"{source}: {about}")
+
+
 def put_combined(
     output: Output,
     night: NightFolder,

@@ -10,16 +10,18 @@ from pathlib import Path
 import numpy as np
 
 from starpos.averaging.elevation_axis import FoundAxis
-from starpos.cli import console, fix_output, inputs, options, overwriting, places_file
+from starpos.cli import console, fix_output, inputs, options, overwriting, places_file, sights
 from starpos.cli.console import Output
 from starpos.cli.fix_output import (
     COLUMNS,
+    ELEVATIONS_HEAD,
     HEAD,
     json_about,
     json_of,
     json_on_ground,
     line_of,
     put_combined,
+    put_elevation,
     with_heading,
 )
 from starpos.cli.inputs import (
@@ -211,11 +213,6 @@ def json_of_check(check: GnssCheck) -> dict:
     }
 
 
-# the status of a row that gives an elevation
-ELEVATION = "elevation alone"
-ELEVATIONS_HEAD = "row: the zenith distance of its direction; together these give the position"
-
-
 def run_pointings(args: argparse.Namespace) -> int:
     """Solve the table of --pointings; returns the exit status."""
     near = near_of(args)
@@ -257,9 +254,10 @@ def _from_elevations(
     for p, circle in zip(pointings, found.circles, strict=True):
         if isinstance(circle, StarposError):
             console.complain("solve", circle)
-            _put_row(output, p, None, status_of(p, circle).value, vertical)
+            status = status_of(p, circle).value
+            put_elevation(output, p.source, p.mid_unix_s, None, vertical, status)
         else:
-            _put_row(output, p, circle.zenith_distance, ELEVATION, vertical)
+            put_elevation(output, p.source, p.mid_unix_s, circle.zenith_distance, vertical)
     whole, night = found.together, NightFolder((), args.tilt)
     saving = 0
     if found.axis is not None:
@@ -290,23 +288,9 @@ def _save_axis(args: argparse.Namespace, solver: Solver, axis: FoundAxis | None)
     return 0
 
 
-def _put_row(
-    output: Output,
-    pointing: Pointing,
-    zenith_distance: float | None,
-    status: str,
-    vertical: Vertical,
-) -> None:
-    deg = None if zenith_distance is None else np.degrees(zenith_distance)
-    utc = {} if pointing.mid_unix_s is None else {"utc": utc_text(pointing.mid_unix_s)}
-    none = dict.fromkeys(("residual_arcsec", "log_odds"))
-    about_stars = {"stars_detected": 0, "stars_matched": 0} | none | {"status": status, "warnings": []}
-    row = json_of(None, vertical) | utc | {"zenith_distance_deg": deg} | about_stars
-    about = status if deg is None else f"{deg:.5f} deg from the zenith"
-    output.put({"file": pointing.source} | row, f"{pointing.source}: {about}")
-
-
 def run(args: argparse.Namespace) -> int:
+    if args.sights is not None:
+        return sights.run(args)
     if len(args.frames) == 1 and field.is_field(args.frames[0]):
         return _of_field(args)
     return _run(args)
@@ -372,7 +356,7 @@ def _run(args: argparse.Namespace) -> int:
         on_files = [OnFile(read, how.work(work)) for _, work in plans]
         calls = [(f, path) for f, (night, _) in zip(on_files, plans, strict=True) for path in night.frames]
         # the lines of a turn come at its end, and show no progress
-        sights = inputs.watched(workers.map(calls), len(calls), silent=how.one_by_one)
+        sights = inputs.watched(workers.map(calls), len(calls), lines=how.one_by_one)
         for night, work in plans:
             # takes the answers of this night, and leaves the rest
             rows = zip(night.frames, sights, strict=False)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The Sun on a frame: a disc whose limb is fitted, as behind a filter, or the middle of a saturated glow.
 
-Whether it is the Sun, or a lamp, only its altitude and size can tell: `starpos.fix.sun` decides.
+Its altitude and size decide whether it is the Sun or a lamp: `starpos.fix.sun` compares them.
 """
 
 import cv2

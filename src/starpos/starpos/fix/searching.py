@@ -100,7 +100,7 @@ class Sight:
 def answer_frame(solver: Solver, question: Question) -> Sight:
     """The fix of a frame by its tilt, and its heading where the place is known; without both its identification.
 
-    What it shows decides whether that is by stars or by the Sun: a disc with a limb, or a glow where no stars are found.
+    A disc with a limb is tried as the Sun first; a glow only where no stars are found.
     Its stars are identified by every way there is, each tried once on the same stars.
     """
     q, disc = question, question.stars.disc

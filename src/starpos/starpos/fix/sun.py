@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The attitude by the Sun, or the Moon, and the level: at a known place, whose ephemeris says where the body stands.
 
-Two directions make an attitude, the body's and the plumb line's. They contain the altitude twice: that tells the Sun
-from a lamp, and makes the attitude better than either. Without a place one frame gives a circle of equal altitude.
+Two directions make an attitude, the body's and the plumb line's. They contain the altitude twice: that excludes a
+lamp, and makes the attitude better than by either. Without a place one frame gives a circle of equal altitude.
 """
 
 import math
@@ -251,7 +251,7 @@ def _attitude(
     bent = air.refraction().bend(true)
     two = _TwoDirections.of(level.camera, seen.ray, bent)
     if two is None:
-        raise FixError(f"{stars.place}: the {name} is in the zenith, where it tells no heading")
+        raise FixError(f"{stars.place}: the {name} is in the zenith, where it gives no heading")
     moved = zenith_moved(place.plumb[0])
     sky = (
         *sky_terms(state, clock_s, stamp_s, a4),

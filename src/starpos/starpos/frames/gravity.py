@@ -41,6 +41,8 @@ EDITOR = re.compile(
 PANORAMA = 6
 # Sides of any single exposure: beyond this it is stitched.
 LONGEST_SHAPE = 2.4
+# A telephone's pictures have sides that this divides; cut-outs have any.
+WHOLE = 4
 # Direction in C of the edge of the picture that was up, by EXIF's Orientation. Beyond this share of gravity along the
 # picture the two have to agree.
 EDGES = {1: (0, -1), 3: (0, 1), 6: (-1, 0), 8: (1, 0)}
@@ -190,8 +192,10 @@ def read_gravity(data: bytes, width: int, height: int) -> Gravity:
         raise FrameError("it is a panorama, stitched of several exposures")
     if "front" in _text(tags.get(LENS)):
         raise FrameError("it is by the telephone's front camera, whose level is not known")
-    if found.model == PHONE and height > width:
-        raise FrameError("its pixels were turned by a program, and the gravity in its file was not")
+    if found.model == PHONE and (height > width or width % WHOLE or height % WHOLE):
+        raise FrameError(
+            "its pixels were turned or cut out by a program, and the gravity in its file was not"
+        )
     edge = EDGES.get(first.get(ORIENTATION, (0,))[0])
     if edge is not None and np.hypot(*found.up[:2]) > CLEAR and np.dot(edge, found.up[:2]) < 0:
         raise FrameError("its Orientation contradicts its level: a program turned it")

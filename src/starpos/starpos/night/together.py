@@ -161,8 +161,8 @@ def _by_day(circles: Sequence[Circle], near: Near | None) -> Together:
     try:
         if Directions.of(sorted(circles, key=lambda c: c.utc_unix_s)).wide:
             raise FixError(
-                "the Sun's elevations tell a place only where A3 is known to 6 arcmin: find it by night with starpos "
-                "calibrate --site"
+                "the Sun's elevations determine a place only where A3 is known to 6 arcmin: find it by night with "
+                "starpos calibrate --site"
             )
         place = place_of_circles(circles, None if near is None else (near.latitude, near.longitude))
     except FixError as error:

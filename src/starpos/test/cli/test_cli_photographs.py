@@ -14,7 +14,7 @@ from starpos.frames.reading import read_frame
 from starpos.instrument.inclinometer import up_of
 from starpos_testing.lacking import needs
 
-pytestmark = [needs("PIL"), needs("exifread")]
+pytestmark = [needs("PIL"), needs("pillow_heif"), needs("exifread")]
 ZONE = timezone(timedelta(hours=-8))
 # of 4636 px across 1000 x 700 px
 FILM_MM = 164
@@ -27,6 +27,7 @@ def note(up):
 
 
 def save(path, grey, mid_unix_s, up, **left_out):
+    import pillow_heif
     from PIL import Image
     from PIL.TiffImagePlugin import IFDRational
 
@@ -44,6 +45,7 @@ def save(path, grey, mid_unix_s, up, **left_out):
     exif[0x8825] = {1: "N", 2: (47.0, 24.0, 0.0), 3: "W", 4: (122.0, 48.0, 0.0)}
     # Pillow writes the note as numbers, cameras as bytes
     data = exif.tobytes().replace(b"\x92\x7c\x00\x01", b"\x92\x7c\x00\x07")
+    pillow_heif.register_heif_opener()
     Image.fromarray(np.dstack([grey] * 3)).save(path, quality=95, exif=data)
 
 
@@ -86,7 +88,9 @@ def sky(tmp_path_factory):
 def photographs(sky, tmp_path_factory):
     folder = tmp_path_factory.mktemp("photographs")
     for k, (grey, mid_unix_s, up) in enumerate(sky):
-        save(folder / f"IMG_{k}.jpg", grey, mid_unix_s, up)
+        save(folder / f"IMG_{k}.{'heic' if k == 2 else 'jpg'}", grey, mid_unix_s, up)
+    # a telephone keeps films in the same folder
+    (folder / "IMG_2.mov").write_bytes(b"no picture")
     return folder
 
 
@@ -96,7 +100,7 @@ def km_off(answer):
 
 
 def test_photographs_alone_give_a_place(photographs, run):
-    status, out, said = run("solve", *sorted(photographs.glob("*.jpg")), "--json")
+    status, out, said = run("solve", *sorted(photographs.glob("*[gc]")), "--json")
     *each, whole = objects(out)
     assert status == 0 and [a["status"] for a in each] == ["ok"] * 3
     # its level is wrong by 0.35 deg in each axis, and the three headings show that
@@ -137,6 +141,18 @@ def test_a_photograph_that_lacks_something_is_left_out_with_a_sentence(
     poor, good, whole = objects(out)
     assert status == 0 and poor["latitude"] is None and good["status"] == "ok" and whole["frames"] == 1
     assert any("poor.jpg" in line and why in line for line in said)
+
+
+def test_a_cut_out_of_a_photograph_is_refused(sky, tmp_path, run):
+    grey, mid_unix_s, up = sky[1]
+    save(tmp_path / "cut.jpg", grey[100:660, 100:900], mid_unix_s, up)
+    status, _, said = run("solve", tmp_path / "cut.jpg")
+    assert status == 1 and any("cut.jpg" in line and "a part of a photograph" in line for line in said)
+
+
+def test_a_film_among_photographs_leaves_them_their_place(photographs, run):
+    _, out, said = run("solve", photographs / "IMG_0.jpg", photographs / "IMG_2.mov", "--json")
+    assert objects(out)[-1]["frames"] == 1 and any("IMG_2.mov: the suffix" in line for line in said)
 
 
 def test_a_folder_of_photographs_is_a_night(photographs):
