@@ -341,9 +341,9 @@ def test_only_the_inputs_are_played_whatever_their_namespace_and_not_what_was_ma
 
 def test_bad_calls(run):
     for words, said in (
-        ((str(NIGHT), "--rate", "-1"), "-1 is not a number of at least 0"),
-        ((str(NIGHT), "--rate", "nan"), "nan is not a number of at least 0"),
-        ((str(NIGHT), "--rate", "abc"), "abc is not a number of at least 0"),
+        ((str(NIGHT), "--rate", "-1"), "-1 must lie between 0 and"),
+        ((str(NIGHT), "--rate", "nan"), "nan must lie between 0 and"),
+        ((str(NIGHT), "--rate", "abc"), "invalid float value: 'abc'"),
         ((str(NIGHT), "--topics", "/nothing"), "no topic /nothing"),
         ((), "BAG"),
         ((str(NIGHT), "--inputs", "moon"), "--inputs"),

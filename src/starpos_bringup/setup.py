@@ -13,6 +13,7 @@ setup(
     maintainer_email="maintainers@starpos.invalid",
     license="Apache-2.0",
     packages=find_packages(include=[package, f"{package}.*"]),
+    package_data={package: ["data/*.yaml"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{package}"]),
         (f"share/{package}", ["package.xml"]),

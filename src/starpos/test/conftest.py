@@ -24,16 +24,6 @@ def triangle_cache(tmp_path_factory):
         yield
 
 
-@pytest.fixture(scope="session", autouse=True)
-def no_lines_of_progress():
-    """Progress of slow work has no lines here: tests count the lines of what is wrong."""
-    from starpos.cli import console
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(console, "LINE_EVERY_S", float("inf"))
-        yield
-
-
 @pytest.fixture(scope="session")
 def catalogue():
     from starpos.sky import catalogue

@@ -4,9 +4,9 @@
 import argparse
 import sys
 from collections.abc import Iterator
-from pathlib import Path
 from typing import TYPE_CHECKING
 
+from starpos.cli.commands import Command, rows_of
 from starpos.errors import BagError
 from starpos_bringup.bag import BagWriter
 
@@ -37,7 +37,7 @@ def record() -> int:
     """Run the executable."""
     from starpos_common.node_main import own_arguments, run
 
-    options = _parser().parse_args(own_arguments(sys.argv[1:])[0])
+    options = parser_of("record").parse_args(own_arguments(sys.argv[1:])[0])
     topics = TOPICS | (IMAGES if options.images else {})
     try:
         writer = BagWriter(options.bag)
@@ -56,15 +56,10 @@ def record() -> int:
     return status or (BROKEN_OFF if any(r.trouble for r in recorders) else SAVED)
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="record",
-        description="Record what the instrument publishes and what it is made of, until Ctrl-C.",
-        epilog="Exit status: 0 saved, 1 broken off (a full disk), 2 a bad call.",
-    )
-    parser.add_argument("bag", type=Path, metavar="BAG", help="a folder to make")
-    parser.add_argument("--images", action="store_true", help="the frames too: 16 MB each of 21 megapixels")
-    return parser
+def parser_of(executable: str) -> argparse.ArgumentParser:
+    """The parser of an executable of this package, from its row."""
+    row = rows_of("executables.yaml", __package__)[executable]
+    return Command(**row).define(argparse.ArgumentParser(prog=executable))
 
 
 def say(sentence: str) -> None:
@@ -75,12 +70,7 @@ def folder() -> int:
     """Run the executable."""
     from starpos_common.node_main import own_arguments, run
 
-    parser = argparse.ArgumentParser(
-        prog="folder",
-        description="Write the instrument's stars and tilts into a folder, new or there already, until Ctrl-C.",
-    )
-    parser.add_argument("folder", type=Path, metavar="NIGHT")
-    path = parser.parse_args(own_arguments(sys.argv[1:])[0]).folder
+    path = parser_of("folder").parse_args(own_arguments(sys.argv[1:])[0]).folder
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:

@@ -6,15 +6,14 @@ play` cannot.
 """
 
 import argparse
-import math
 import sys
 import time
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from starpos.errors import BagError, FrameError, StarposError
-from starpos.recording.topics import DRIVER_INPUTS, RAW, Remaps
+from starpos.recording.topics import RAW, Remaps
 from starpos_bringup.bag import Bag, Topic
+from starpos_bringup.record import parser_of
 from starpos_common.node_main import own_arguments, stop_signals
 
 if TYPE_CHECKING:
@@ -39,7 +38,7 @@ def replay() -> int:
 def main(arguments: list[str], stopped: list[int]) -> int:
     """Play to the end, or until a signal handler puts something into `stopped`; return the exit status."""
     ours, ros = own_arguments(arguments)
-    options = _parser().parse_args(ours)
+    options = parser_of("replay").parse_args(ours)
     try:
         with Bag(options.bag) as bag:
             remaps = Remaps.of(options.remap)
@@ -53,64 +52,6 @@ def main(arguments: list[str], stopped: list[int]) -> int:
     except StarposError as error:
         _say(str(error))
         return REFUSED
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="replay",
-        description="Play a rosbag2 into the running graph, with /clock from the time it was recorded at: start the "
-        "nodes with -p use_sim_time:=true.",
-        epilog="Exit status: 0 played, 1 cut short, or frames of which none was answered, 2 a bad call or a bag that "
-        "cannot be read.",
-    )
-    parser.add_argument("bag", type=Path, metavar="BAG", help="its folder, or one .mcap or .db3 file")
-    parser.add_argument(
-        "--rate",
-        type=_rate,
-        default=1.0,
-        metavar="R",
-        help="times real time (1), or as fast as it is solved where that is slower; 0: as fast as it is solved. The "
-        "fixes are the same at any rate",
-    )
-    some = parser.add_mutually_exclusive_group()
-    some.add_argument("--topics", nargs="+", metavar="TOPIC", help="only these (all)")
-    some.add_argument(
-        "--inputs",
-        choices=tuple(INPUTS),
-        help="only the inputs of the solver (stars), or of detector, solver and, where no tilts are, "
-        "inclinometer (images), in any namespace or from a robot's own drivers; their recorded outputs "
-        "are left out",
-    )
-    parser.add_argument(
-        "--remap",
-        action="append",
-        default=[],
-        metavar="NAME:=TOPIC",
-        help=f"with --inputs images: the bag's topic to use as one of {', '.join(DRIVER_INPUTS)}; without "
-        f"it the "
-        "one with this name, or the only one of its type. It is played under its own name: remap the nodes, or the "
-        "player (--ros-args -r)",
-    )
-    parser.add_argument(
-        "--loop", action="store_true", help="play again and again; the time begins anew as well"
-    )
-    parser.add_argument(
-        "--wait",
-        type=_rate,
-        metavar="S",
-        help="longest wait for subscribers (3; with --inputs 30, for the solver too)",
-    )
-    return parser
-
-
-def _rate(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not (math.isfinite(value) and value >= 0):
-        raise argparse.ArgumentTypeError(f"{text} is not a number of at least 0")
-    return value
 
 
 def _say(sentence: str) -> None:

@@ -13,7 +13,10 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from starpos.errors import BagError
 from starpos.recording import bag as bounds
+from starpos.recording.topics import DRIVER_INPUTS
 from starpos_bringup.bag import Bag, BagWriter
+from starpos_bringup.record import parser_of
+from starpos_bringup.replay import INPUTS, WAIT_FOR_INPUTS_S, WAIT_S
 from starpos_testing.skies.bags import NightBag
 
 KIND = "std_msgs/msg/UInt8MultiArray"
@@ -177,3 +180,11 @@ def test_a_broken_tilt_of_the_first_release_is_left_to_the_player(tmp_path):
     with Bag(tmp_path / "night") as bag:
         *_, (_, _, data) = sorted(bag.messages(bag.topics(None, left_out=pytest.fail)), key=lambda m: -m[1])
         assert data == b"\0\1\0\0short"
+
+
+def test_the_row_of_replay_names_the_inputs_that_the_code_has():
+    help_ = " ".join(parser_of("replay").format_help().split())
+    assert all(name in help_ for name in DRIVER_INPUTS)
+    assert (
+        f"{{{','.join(INPUTS)}}}" in help_ and f"({WAIT_S:g}; with --inputs {WAIT_FOR_INPUTS_S:g}," in help_
+    )

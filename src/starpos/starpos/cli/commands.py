@@ -38,8 +38,13 @@ class Command:
     options: Mapping[str, dict | None] = field(default_factory=dict)
     kinds: Mapping[str, dict] = field(default_factory=dict)
 
-    def define(self, parser: argparse.ArgumentParser, module: ModuleType, run: str = "run") -> None:
-        """Add its options; run: the function of the module that it calls, for a kind with _KIND behind the name."""
+    def define(
+        self, parser: argparse.ArgumentParser, module: ModuleType | None = None, run: str = "run"
+    ) -> argparse.ArgumentParser:
+        """Add its options, and return the parser.
+
+        run: the function of the module that it calls, for a kind with _KIND behind the name.
+        """
         parser.formatter_class = argparse.RawDescriptionHelpFormatter
         parser.description = self.description or f"{self.text[0].upper()}{self.text[1:]}."
         examples = "".join(f"  {example}\n" for example in self.examples)
@@ -57,15 +62,17 @@ class Command:
                 kind.define(kinds.add_parser(name, help=kind.text), module, f"{run}_{name}")
         if hasattr(module, run):
             parser.set_defaults(run=getattr(module, run))
+        return parser
 
 
 @cache
-def _rows_of(file: str) -> dict[str, Any]:
+def rows_of(file: str, package: str = "starpos.cli") -> dict[str, Any]:
+    """The rows of a file in a package's folder data."""
     import yaml
 
     # PyYAML's parser in C takes a tenth of the time; a build without it is rare
     loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-    rows: dict[str, Any] = yaml.load(resources.files(__package__).joinpath("data", file).read_bytes(), loader)
+    rows: dict[str, Any] = yaml.load(resources.files(package).joinpath("data", file).read_bytes(), loader)
     return rows
 
 
@@ -78,7 +85,7 @@ def check_call(args: argparse.Namespace) -> None:
 
 def commands() -> dict[str, Command]:
     """The commands by their names, in the order of --help."""
-    return {name: Command(**row) for name, row in _rows_of("commands.yaml").items()}
+    return {name: Command(**row) for name, row in rows_of("commands.yaml").items()}
 
 
 def add_options(parser: argparse.ArgumentParser, rows: Mapping[str, dict | None]) -> None:
@@ -140,7 +147,7 @@ def check_options(rows: Mapping[str, dict | None], args: argparse.Namespace) -> 
 def _unfolded(rows: Mapping[str, dict | None]) -> Iterator[tuple[str, dict]]:
     for names, row in rows.items():
         if row is None:
-            yield from _unfolded(_rows_of("options.yaml")[names])
+            yield from _unfolded(rows_of("options.yaml")[names])
         else:
             yield names, row
 

@@ -14,8 +14,6 @@ import numpy as np
 
 # Exit status.
 UNREADABLE = 2
-# s between lines of progress
-LINE_EVERY_S = 5.0
 # s of work that needs no bar
 BAR_AFTER_S = 0.5
 
@@ -73,21 +71,15 @@ class FrameComplaints:
 
 
 class ProgressBar:
-    """Progress on standard error: a bar for work of more than BAR_AFTER_S, or occasional lines if it is not a terminal.
+    """Progress on standard error, if it is a terminal: a bar for work of more than BAR_AFTER_S."""
 
-    terminal_only: no such lines, for work whose results show how far it is.
-    """
-
-    def __init__(self, *, terminal_only: bool = False) -> None:
-        self.begin = self.said = time.monotonic()
+    def __init__(self) -> None:
+        self.begin = time.monotonic()
         self.shown = False
-        self._terminal_only = terminal_only
 
     def __call__(self, what: str, done: float) -> None:
-        if not sys.stderr.isatty():
-            self._say(what, done)
-            return
-        if time.monotonic() - self.begin < BAR_AFTER_S and not self.shown:
+        soon = time.monotonic() - self.begin < BAR_AFTER_S and not self.shown
+        if soon or not sys.stderr.isatty():
             return
         self.shown = True
         filled = int(30 * min(done, 1.0))
@@ -98,12 +90,6 @@ class ProgressBar:
             file=sys.stderr,
             flush=True,
         )
-
-    def _say(self, what: str, done: float) -> None:
-        now = time.monotonic()
-        if not self._terminal_only and now - self.said > LINE_EVERY_S:
-            self.said = now
-            print(f"{what}: {100 * done:.0f} % done", file=sys.stderr, flush=True)
 
 
 class Output:

@@ -283,9 +283,7 @@ def _of_files(args: argparse.Namespace, mark: Place) -> _Taken | None:
         tilts = checked_tilts("deflection", os.path.abspath(args.tilt), instrument)
         inputs.prepare("deflection", instrument, about)
         work = OnFile(read, ZenithSighted(given, options.atmosphere_of(args), tilts, mark))
-        answers = list(
-            inputs.watched(workers.map((work, path) for path in frames), len(frames), silent=False)
-        )
+        answers = list(inputs.watched(workers.map((work, path) for path in frames), len(frames), lines=False))
     _, catalogue, _ = Solver(instrument, load_catalogue()).view(about.width, about.height, about.origin_px)
     return _Taken(frames, answers, instrument, catalogue)
 
@@ -311,7 +309,7 @@ def _of_bag(args: argparse.Namespace, mark: Place) -> _Taken:
         raise FrameError(f"{path}: no stars and no images in it: record the topic stars too")
     work = ZenithSighted(instruments, options.atmosphere_of(args), found.tilts, mark)
     names, answers, instrument, catalogue = [], [], instruments.instrument, load_catalogue()
-    for name, item in inputs.watched(each_frame(found), found.star_count, silent=False):
+    for name, item in inputs.watched(each_frame(found), found.star_count, lines=False):
         names.append(name)
         answers.append(item if isinstance(item, FrameError) else work(item))
         if isinstance(answers[-1], ZenithSighting) and (own := instruments.of(item)) is not None:

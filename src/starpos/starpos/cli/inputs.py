@@ -13,13 +13,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from starpos.cli import console, options
+from starpos.earth.place import Place
 from starpos.errors import FrameError, InstrumentError, StarposError, TiltError
 from starpos.fix.blind import BlindSolver
 from starpos.fix.searching import Sight
 from starpos.fix.solver import Solver
 from starpos.frames.exif import CameraClock
 from starpos.frames.frame import Frame, Stars, no_stars
-from starpos.frames.reading import are_photographs, why_no_time
+from starpos.frames.reading import are_photographs, read_frame, why_no_time
 from starpos.frames.tables import TILTS, TRUTH
 from starpos.instrument.camera import PLUMB_BOB, Camera
 from starpos.instrument.instrument import Instrument
@@ -72,11 +73,18 @@ def is_untold(args: argparse.Namespace) -> bool:
 def seen_at_place(command: str, args: argparse.Namespace) -> Iterator[tuple[Frame | Stars, Sight, Camera]]:
     """Frames with their attitudes at --site, and the camera with the focal length that their stars show.
 
-    Frames without one are complained about.  Raises InstrumentError without --site, and StarposError as `solve` does.
+    Raises InstrumentError without --site, and StarposError as `solve` does.
     """
     place = options.place_of(args, options.vertical_of(args))
     if place is None:
         raise InstrumentError(f"{command} needs the place of the camera: give --site LAT LON")
+    return seen_at(command, args, place)
+
+
+def seen_at(
+    command: str, args: argparse.Namespace, place: Place
+) -> Iterator[tuple[Frame | Stars, Sight, Camera]]:
+    """Frames with their attitudes at a place, as `seen_at_place` has them; frames without one are complained about."""
     read = reader_of(args)
     about = First(read)(tuple(args.frames))
     if about is None:
@@ -200,9 +208,18 @@ def nights_of(
         return [NightFolder(tuple(given), None)]
     if single := next((path for path in given if not os.path.isdir(path)), None):
         raise TiltError(
-            f"{single}: no tilts: give --tilt with frames, or nights alone: folders of frames, each with its tilt.csv"
+            f"{single}: no tilts: give --tilt with frames, or nights alone: folders of frames, each with its tilt.csv; "
+            f"or --site LAT LON, for the heading at a known place{stated_site([single])}"
         )
     return [_night(folder) for folder in given]
+
+
+def stated_site(frames: Sequence[str]) -> str:
+    """The end of a sentence that asks for --site: what the first frame's header says of it; '' if it says nothing."""
+    with suppress(StarposError, OSError, IndexError):
+        if said := read_frame(frames[0]).site_cards:
+            return f"; {frames[0]} has {said}: if that is right, give it (east is positive)"
+    return ""
 
 
 def _night(folder: str) -> NightFolder | FrameError:
@@ -240,14 +257,11 @@ def workers_of(args: argparse.Namespace, frames: int) -> Workers:
     return workers(min(processors() if args.jobs == 0 else args.jobs or 1, frames))
 
 
-def watched(answers: Iterable, number: int, what: str = "frame", silent: bool = True) -> Iterator:
-    """The answers unchanged, with a progress bar unless standard output shows them on the same terminal.
-
-    silent: whether, without a terminal, the answers are lines that show the progress.
-    """
-    bar = console.ProgressBar(terminal_only=silent)
+def watched(answers: Iterable, number: int, what: str = "frame", lines: bool = True) -> Iterator:
+    """The answers unchanged, with a progress bar unless their lines on standard output show it on the same terminal."""
+    bar = console.ProgressBar()
     for k, answer in enumerate(answers, 1):
-        if not (silent and sys.stdout.isatty()):
+        if not (lines and sys.stdout.isatty()):
             bar(f"{what} {k} of {number}", k / number)
         yield answer
 

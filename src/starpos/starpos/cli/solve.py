@@ -356,7 +356,7 @@ def _run(args: argparse.Namespace) -> int:
         on_files = [OnFile(read, how.work(work)) for _, work in plans]
         calls = [(f, path) for f, (night, _) in zip(on_files, plans, strict=True) for path in night.frames]
         # the lines of a turn come at its end, and show no progress
-        sights = inputs.watched(workers.map(calls), len(calls), silent=how.one_by_one)
+        sights = inputs.watched(workers.map(calls), len(calls), lines=how.one_by_one)
         for night, work in plans:
             # takes the answers of this night, and leaves the rest
             rows = zip(night.frames, sights, strict=False)

@@ -287,6 +287,8 @@ def _read_plain(file: BinaryIO) -> tuple[np.ndarray, float, float, float, float]
     head = file.read(GTX_HEADER.size + struct.calcsize(NGS_KIND))
     if len(head) < GTX_HEADER.size:
         raise GeoidError("it is shorter than a header")
+    if head.startswith(b"P5"):
+        raise GeoidError("it is a PGM, as GeographicLib has them: give the same geoid as a GTX or GeoTIFF")
     order, start = _ngs_order(head, size), len(head)
     if not order:
         order, start = ">", GTX_HEADER.size

@@ -82,6 +82,26 @@ class Frame(Exposure):
         return self.pixels.shape[0]
 
 
+# number of pixels that are looked at; smallest noise of high bytes; number of low ones that show something
+LOOKED_AT, NOISY, SEVERAL = 1 << 18, 4, 8
+
+
+def in_order(frame: Frame) -> Frame:
+    """The frame; FrameError if the bytes of its pixels are in the wrong order: then the low ones alone make a picture."""
+    if frame.pixels.dtype != np.uint16:
+        return frame
+    some = frame.pixels[:: -(-frame.pixels.size // LOOKED_AT)]
+    high, low = (some >> 8).astype(int), (some & 255).astype(int)
+    # in a mosaic, every second pixel has the same colour
+    noise = [np.median(np.abs(v[:, 2:] - v[:, :-2])) if v.shape[1] > 2 else 0 for v in (high, low)]
+    if noise[0] >= NOISY and noise[1] <= 1 and len(np.unique(low)) > SEVERAL:
+        raise FrameError(
+            f"{frame.place}: the two bytes of its pixels are in the wrong order, because only the low ones make a "
+            "picture; write them in the other order (big-endian in FITS)."
+        )
+    return frame
+
+
 def to_unsigned(values: np.ndarray, place: str) -> np.ndarray:
     """Convert real values (h, w) to uint8 or uint16 by the rule of `reading.read_frame`; FrameError for other values."""
     if values.dtype.kind not in "uif":

@@ -107,8 +107,11 @@ LTM = ("LTM1_1", "LTM2_2")
 PLATE_SCALES = ("SCALE", "PIXSCALE", "SECPIX1")
 # minimum of a focal length, a pixel or a scale that counts as stated
 LEAST = 1e-9
+# latitude and longitude of a site, deg: programs differ in the sign of the longitude
+SITES = (("SITELAT", "SITELONG"), ("LAT-OBS", "LONG-OBS"), ("OBSGEO-B", "OBSGEO-L"))
 KEYS = (
     *TIME_KEYS,
+    *(key for keys in SITES for key in keys),
     *(key for keys, _ in CROPS for key in keys),
     *LTM,
     *PLATE_SCALES,
@@ -133,7 +136,16 @@ def read_exposure(header: Mapping, place: str, comments: Mapping[str, str] = NO_
         pixel_um=_positive(header, "XPIXSZ"),
         shutter=shutter(header, place),
         origin_px=origin_px(header),
+        site_cards=site_cards(header),
     )
+
+
+def site_cards(header: Mapping) -> str:
+    """The cards with which a header states a site, for messages; '' without any."""
+    for keys in SITES:
+        if all(header.get(key) not in (None, "") for key in keys):
+            return " and ".join(f"{key} {one_line(header[key])}" for key in keys)
+    return ""
 
 
 def origin_px(header: Mapping) -> tuple[float, float] | None:

@@ -12,7 +12,7 @@ from starpos.files import bytes_of, open_regular
 from starpos.frames.exif import CameraClock
 from starpos.frames.exposure import Exposure
 from starpos.frames.fits import read_fits
-from starpos.frames.frame import MAX_BYTES, Frame, Stars
+from starpos.frames.frame import MAX_BYTES, Frame, Stars, in_order
 from starpos.frames.pictures import heif_frame, picture_frame, raw_frame
 from starpos.frames.tables import read_star_list
 from starpos.frames.tiff import JPEG_START, PNG_START
@@ -93,12 +93,12 @@ def _part_of(path: Path) -> tuple[Path, str]:
 def _read(file: BinaryIO, place: str, suffix: str, part: str, clock: CameraClock | None) -> Frame | Stars:
     """Read an open file as files with this suffix are read."""
     if suffix in FITS:
-        return read_fits(file, place, part)
+        return in_order(read_fits(file, place, part))
     if suffix == ".csv":
         return read_star_list(file, place)
     for suffixes, decode in ((PICTURE + JPEG, picture_frame), (HEIF, heif_frame), (RAW, raw_frame)):
         if suffix in suffixes:
-            return decode(bytes_of(file, MAX_BYTES), place, clock)
+            return in_order(decode(bytes_of(file, MAX_BYTES), place, clock))
     known = " ".join(FITS + PICTURE + JPEG + HEIF + RAW + (".csv",))
     raise FrameError(f"{place}: the suffix {suffix!r} is not one of a frame; use one of {known}.")
 

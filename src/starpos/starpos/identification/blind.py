@@ -12,9 +12,10 @@ by the same evidence as any other. Then the lens extends the answer to the whole
 """
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
+from typing import TypeVar
 
 import numpy as np
 
@@ -34,7 +35,7 @@ from starpos.identification.evidence import (
 )
 from starpos.identification.fisheye import outwards
 from starpos.identification.pose import Pose, stars_at
-from starpos.identification.quads import QuadCatalogue, QuadPoses, matches
+from starpos.identification.quads import Matches, QuadCatalogue, QuadPoses, matches
 from starpos.identification.search import SECOND_TRY, second_try, through
 from starpos.identification.sky import Sky
 from starpos.instrument.camera import EQUIDISTANT, Camera
@@ -53,6 +54,9 @@ LARGEST_STEP, BENT = 0.1, 0.003
 MAX_JUDGED = 40
 # Log-odds of an answer that ends the search though most bright detections are not its stars.
 SURE = 6 * MIN_LOG_ODDS
+# of a search at once
+THREADS = 2
+Item, Result = TypeVar("Item"), TypeVar("Result")
 
 
 @at_once
@@ -151,16 +155,29 @@ def _poses(
 ) -> Iterator[tuple[Pose, np.ndarray]]:
     """Yield poses, those first on which most quads agree, and the distance (N,) px by which each star may be off."""
     half_diagonal_px = float(np.hypot(*field.half))
-    alike = []
-    for focal_px, step in focal_lengths(half_diagonal_px, *focal_range):
-        if limit.reached:
-            return
-        alike.append(matches(field, quads, stars, error_px, focal_px, step))
+
+    def alike_at(scale: tuple[float, float]) -> Matches | None:
+        return None if limit.reached else matches(field, quads, stars, error_px, *scale)
+
+    alike = [
+        found for found in _side_by_side(alike_at, focal_lengths(half_diagonal_px, *focal_range)) if found
+    ]
+    if limit.reached:
+        return
     found = QuadPoses.of(field, sky, alike, error_px, focal_range)
     for k in found.most_agreed(half_diagonal_px, MAX_JUDGED):
         if limit.reached:
             return
         yield found[k], found.radius_px(field, k, error_px)
+
+
+def _side_by_side(work: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
+    """The results of some work on items, in their order; compiled loops and numpy's run side by side."""
+    # slow to import, and seldom needed
+    from concurrent.futures import ThreadPoolExecutor
+
+    with ThreadPoolExecutor(THREADS) as threads:
+        return list(threads.map(work, items))
 
 
 def focal_lengths(half_diagonal_px: float, shortest: float, longest: float) -> Iterator[tuple[float, float]]:
@@ -295,7 +312,7 @@ def identify_fisheye(
     best: tuple[Camera, Identification] | None = None
     for done, (stars, k) in enumerate(work):
         progress("searching fisheyes", done / len(work))
-        guesses = list(_guesses(picture, spans, _TURNS[k], stars, sky, quads, limit))
+        guesses = _guesses(picture, spans, _TURNS[k], stars, sky, quads, limit)
         for guess, row in _most_agreed(guesses):
             if limit.reached:
                 return best
@@ -329,24 +346,29 @@ def _guesses(
     sky: Sky,
     quads: QuadCatalogue,
     limit: CpuLimit,
-) -> Iterator[_Guess]:
-    """Yield what each lens and focal length makes of a part of the picture."""
-    for lens, (shortest, longest) in zip(LENSES, spans, strict=True):
+) -> list[_Guess]:
+    """What each lens and focal length makes of a part of the picture."""
+
+    def guess(what: tuple[tuple[float, ...], float]) -> _Guess | None:
+        lens, focal_px = what
+        if limit.reached:
+            return None
+        part, field = _part(picture, focal_px, lens, turn)
+        if field is None or len(field) < MIN_STARS:
+            return None
+        alike = matches(field, quads, min(stars, len(field)), FISHEYE_ERROR_PX, field.focal_px, FISHEYE_STEP)
+        scales = field.focal_px * (1 - FISHEYE_STEP), field.focal_px * (1 + FISHEYE_STEP)
+        found = QuadPoses.of(field, sky, [alike], FISHEYE_ERROR_PX, scales)
+        return _Guess(focal_px, lens, part, field, found) if len(found) else None
+
+    scales = [
+        (lens, float(focal_px))
+        for lens, (shortest, longest) in zip(LENSES, spans, strict=True)
         for focal_px in np.geomspace(
             shortest, longest, math.ceil(math.log(longest / shortest) / (2 * FISHEYE_STEP)) + 1
-        ):
-            if limit.reached:
-                return
-            part, field = _part(picture, float(focal_px), lens, turn)
-            if field is None or len(field) < MIN_STARS:
-                continue
-            alike = matches(
-                field, quads, min(stars, len(field)), FISHEYE_ERROR_PX, field.focal_px, FISHEYE_STEP
-            )
-            scales = field.focal_px * (1 - FISHEYE_STEP), field.focal_px * (1 + FISHEYE_STEP)
-            found = QuadPoses.of(field, sky, [alike], FISHEYE_ERROR_PX, scales)
-            if len(found):
-                yield _Guess(float(focal_px), lens, part, field, found)
+        )
+    ]
+    return [found for found in _side_by_side(guess, scales) if found]
 
 
 def _part(

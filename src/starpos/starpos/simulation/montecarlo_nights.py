@@ -79,10 +79,10 @@ class NightOutcome:
     """
 
     kind: str
-    off: np.ndarray = field(default_factory=lambda: np.full(3, np.nan))
-    covariance: np.ndarray = field(default_factory=lambda: np.full((3, 3), np.nan))
-    off_ground: np.ndarray = field(default_factory=lambda: np.full(3, np.nan))
-    covariance_ground: np.ndarray = field(default_factory=lambda: np.full((3, 3), np.nan))
+    off: np.ndarray
+    covariance: np.ndarray
+    off_ground: np.ndarray
+    covariance_ground: np.ndarray
     trouble: str = ""
 
     @property
@@ -305,7 +305,15 @@ def _outcome(
     try:
         a = answer()
     except StarposError as e:
-        return NightOutcome(kind=kind, trouble=str(e))
+        nothing, no_covariance = np.full(3, np.nan), np.full((3, 3), np.nan)
+        return NightOutcome(
+            kind=kind,
+            off=nothing,
+            covariance=no_covariance,
+            off_ground=nothing,
+            covariance_ground=no_covariance,
+            trouble=str(e),
+        )
     unknown = Deflection()
     xi, eta = rng.normal(0, unknown.stddev_arcsec, 2)
     phi, lam = np.radians([site.latitude_deg, site.longitude_deg])

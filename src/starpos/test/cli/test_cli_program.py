@@ -108,7 +108,7 @@ def starpos(*args, **environment):
         timeout=300,
         check=False,
     )
-    return done.returncode, [line for line in done.stderr.splitlines() if not line.endswith("% done")]
+    return done.returncode, done.stderr.splitlines()
 
 
 def test_a_cache_that_cannot_be_written_is_one_line_for_all_frames(lists, tmp_path):
@@ -175,17 +175,12 @@ def test_warnings_that_the_environment_makes_errors_are_lines(tmp_path):
     assert "Traceback" not in done.stderr
 
 
-def test_progress_is_told_where_no_terminal_is(capsys, monkeypatch):
-    monkeypatch.setattr(console, "LINE_EVERY_S", -1.0)
-    console.ProgressBar()("star triangles", 0.25)
-    console.ProgressBar(terminal_only=True)("frame 1 of 4", 0.25)
-    assert capsys.readouterr().err == "star triangles: 25 % done\n"
-
-
-def test_frames_of_a_turn_whose_lines_wait_are_counted_on_standard_error(capsys, monkeypatch):
-    monkeypatch.setattr(console, "LINE_EVERY_S", -1.0)
-    assert list(inputs.watched("ab", 2, silent=False)) == ["a", "b"]
-    assert capsys.readouterr().err == "frame 1 of 2: 50 % done\nframe 2 of 2: 100 % done\n"
+@pytest.mark.parametrize("terminal", [True, False])
+def test_progress_of_frames_whose_lines_wait_is_shown_on_a_terminal_alone(capsys, monkeypatch, terminal):
+    monkeypatch.setattr(console, "BAR_AFTER_S", -1.0)
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: terminal)
+    assert list(inputs.watched("ab", 2, lines=False)) == ["a", "b"]
+    assert ("frame 2 of 2" in capsys.readouterr().err) is terminal
 
 
 EXAMPLES = [(name, example) for name, command in commands().items() for example in command.examples]

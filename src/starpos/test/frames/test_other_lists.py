@@ -4,6 +4,7 @@
 import numpy as np
 import pytest
 
+from starpos.cli.inputs import stated_site
 from starpos.errors import FrameError
 from starpos.frames.reading import read_frame
 
@@ -69,3 +70,15 @@ def test_a_list_with_sextractors_own_head_is_read_below_the_frames_size(tmp_path
     path.write_text(ASCII_HEAD)
     with pytest.raises(FrameError, match="first line does not give the frame's size"):
         read_frame(path)
+
+
+def test_a_site_of_the_header_is_said_where_one_is_wanted(tmp_path):
+    path = tmp_path / "a.csv"
+    path.write_text(
+        '# {"NAXIS1": 100, "NAXIS2": 80, "SITELAT": "+47 06", "SITELONG": -11.3}\nx,y,flux\n1,2,3\n'
+    )
+    assert stated_site([str(path)]).endswith(
+        "SITELAT +47 06 and SITELONG -11.3: if that is right, give it (east is positive)"
+    )
+    path.write_text(f"{HEAD}x,y,flux\n1,2,3\n")
+    assert stated_site([str(path)]) == stated_site(["none.csv"]) == stated_site([]) == ""
