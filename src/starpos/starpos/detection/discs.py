@@ -31,7 +31,8 @@ ALIKE_PX, FLOOR_PX, FLOOR_SHARE = 3.0, 0.03, 0.001
 HIDDEN, SMALL, ROUNDS = 0.012, 1.5, 6
 # A glow: shares of its height at which its middle is measured, the first of what is saturated; what share of it is.
 HEIGHTS, SATURATED_SHARE = (0.97, 0.8, 0.65), 0.15
-# Maximum size of a second bright group, in that of the glow. Squared ratio of its axes, share of an ellipse's area, and how far the middles may differ, in its radius.
+# Maximum size of a second bright group, as a share of the glow's. Squared ratio of its axes, share of an ellipse's area,
+# and how far the middles may differ, in its radius.
 ALONE, LONGEST, FULLEST, CONCENTRIC = 0.6, 1.8, 0.85, 0.2
 # The middle of a glow is known to this share of its radius: flare and blooming pull it.
 OFF_CENTRE = 0.03
