@@ -34,7 +34,6 @@ from starpos.instrument.tilt_log import Tilts
 from starpos.night.reading import First, Instruments, Reader, TiltFile, stars_of
 from starpos.night.remarks import Kind, Remark
 from starpos.progress import Progress, quiet
-from starpos.satellites.frames import trails_of
 from starpos.satellites.trails import SatelliteTrail
 from starpos.sky import catalogue
 from starpos.zenith.doubts import DeflectionSession
@@ -287,6 +286,8 @@ class TrailSighted:
 
     def __call__(self, item: Frame | Stars) -> list[SatelliteTrail] | Solution:
         """The trails on a frame, identified by every way there is; FrameError for a list of stars."""
+        from starpos.satellites.frames import trails_of
+
         if isinstance(item, Stars):
             raise FrameError(f"{item.place}: a list of stars shows no trails: give the frame")
         sight = self.solving(item)
