@@ -331,6 +331,36 @@ def calibrate_camera(
     return FromSky(fit, tuple(sightings))
 
 
+# Rounds in which one frame's stars are identified again with the lens found so far, and the significance of a k1 to use.
+LENS_ROUNDS, LENS_SIGMA = 3, 3.0
+
+
+def lens_of_frame(
+    stars: Stars, found: Identification, given: Camera, catalogue: Catalogue, atmosphere: Atmosphere
+) -> Camera:
+    """A camera with the focal lengths and k1 that one frame's stars show; the given one if they do not show a k1.
+
+    found: of these stars.  given: an ideal camera of about the right focal length.
+    """
+    catalogue = deeper.for_field(catalogue, given)
+    table = triangles.cached_triangles(catalogue, fisheye.field_rad(given))
+    frame = _Frame.of(stars, None, catalogue, table, None)
+    camera, attitude, free = given, found.attitude, FIRST_FREE[0]
+    try:
+        for _ in range(LENS_ROUNDS):
+            sighting = frame.sighting(camera, atmosphere, attitude)
+            if sighting is None:
+                return given
+            fit = fit_camera([sighting], given, atmosphere, free)
+            check_invertible(fit.camera)
+            camera, attitude = fit.camera, fit.attitudes[0]
+    except (CalibrationError, InstrumentError):
+        return given
+    k1 = parameters(given).index("k1")
+    shown = fit.determined[k1] and abs(fit.values[k1]) > LENS_SIGMA * fit.sigma[k1]
+    return camera if shown else given
+
+
 @at_once
 @dataclass(frozen=True)
 class _Frame:

@@ -3,6 +3,7 @@
 
 import argparse
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -12,7 +13,7 @@ import numpy as np
 from starpos.calibration.camera import FromSky, Intrinsics, calibrate_camera, rms
 from starpos.calibration.camera_adjustment import UNLEVELLED, UNTIMED, parameters
 from starpos.calibration.misalignment import NOTHING_KNOWN, Calibrated, Known, calibrate_at, calibrate_fixed
-from starpos.cli import console, options, overwriting
+from starpos.cli import console, inputs, options, overwriting, watch_output
 from starpos.cli.inputs import checked_tilts, frames_among, given_or_sought, reader_of, stated_site
 from starpos.cli.options import vertical_of
 from starpos.cli.overwriting import CAMERA_NAME, Written, save_instrument
@@ -39,6 +40,7 @@ from starpos.night.opening import frames_in
 from starpos.night.reading import NO_CAMERA, First, Instruments, Reader
 from starpos.night.remarks import WORTH_SAVING_ARCSEC, of_inclinometer, of_left_out
 from starpos.night.together import axis_of, circles_of
+from starpos.night.watching import kept, night_poses
 from starpos.night.work import Solving
 from starpos.sky import catalogue
 from starpos.units import ARCSEC
@@ -216,6 +218,8 @@ _Seen = tuple[Stars, Identification | None]
 
 
 def run(args: argparse.Namespace) -> int:
+    if args.watch is not None:
+        return _watch(args)
     if args.camera is None and args.site is None:
         raise InstrumentError(
             "nothing to calibrate: give --camera OUT.yaml, --site LAT LON, or both"
@@ -268,6 +272,41 @@ def run(args: argparse.Namespace) -> int:
         console.complain("calibrate", e)
         return console.UNREADABLE if unreadable else NOTHING
     return console.UNREADABLE if unreadable else 0
+
+
+def _watch(args: argparse.Namespace) -> int:
+    """Print how a fixed camera kept its pose, night by night; returns the exit status."""
+    if args.frames:
+        raise FrameError("--watch names the folder of the nights: leave out the frames")
+    folder = Path(args.watch)
+    try:
+        folders = [folder, *sorted(p for p in folder.iterdir() if p.is_dir())]
+    except OSError as e:
+        raise FrameError(f"{folder}: the folder cannot be read ({e.strerror})") from None
+    args.frames = []
+    for each in folders:
+        # a folder of folders has no frames of its own
+        with suppress(FrameError):
+            args.frames += map(str, frames_in(each))
+    if not args.frames:
+        raise FrameError(f"{folder}: no frames in it, nor in its folders")
+    if args.page is not None:
+        overwriting.check(args, Written("--page", args.page, watch_output.check_page))
+    site = _site(args)
+    seen = inputs.seen_at("calibrate", args, site)
+    answers = [(sight.solution, camera.fx) for _, sight, camera in seen]
+    nights = kept(night_poses(answers, site.longitude))
+    for night in nights:
+        values = watch_output.values_of(night)
+        if args.json:
+            console.print_json(values)
+        else:
+            print(watch_output.line_of(values))
+        if night.alarm:
+            console.complain("calibrate", watch_output.alarm_of(night))
+    if args.page is not None:
+        watch_output.write_page(Path(args.page), nights)
+    return NOTHING if not nights or any(n.alarm for n in nights) else 0
 
 
 def _open_night(args: argparse.Namespace) -> None:

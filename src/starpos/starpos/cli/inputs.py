@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from starpos.cli import console, options
+from starpos.earth.place import Place
 from starpos.errors import FrameError, InstrumentError, StarposError, TiltError
 from starpos.fix.blind import BlindSolver
 from starpos.fix.searching import Sight
@@ -72,11 +73,18 @@ def is_untold(args: argparse.Namespace) -> bool:
 def seen_at_place(command: str, args: argparse.Namespace) -> Iterator[tuple[Frame | Stars, Sight, Camera]]:
     """Frames with their attitudes at --site, and the camera with the focal length that their stars show.
 
-    Frames without one are complained about.  Raises InstrumentError without --site, and StarposError as `solve` does.
+    Raises InstrumentError without --site, and StarposError as `solve` does.
     """
     place = options.place_of(args, options.vertical_of(args))
     if place is None:
         raise InstrumentError(f"{command} needs the place of the camera: give --site LAT LON")
+    return seen_at(command, args, place)
+
+
+def seen_at(
+    command: str, args: argparse.Namespace, place: Place
+) -> Iterator[tuple[Frame | Stars, Sight, Camera]]:
+    """Frames with their attitudes at a place, as `seen_at_place` has them; frames without one are complained about."""
     read = reader_of(args)
     about = First(read)(tuple(args.frames))
     if about is None:

@@ -180,7 +180,7 @@ def _exposures(paths: list[Path], args: argparse.Namespace) -> "Exposures | tupl
         raise FrameError(f"{path}: there is no such night: give a folder, or a rosbag2")
     if not bag.is_bag(path):
         frames = paths if path.is_file() else []
-        if not are_photographs(frames):
+        if frames and not are_photographs(frames):
             raise FrameError(
                 f"{path}: neither a folder of frames nor a rosbag2 (.mcap, .db3), nor a photograph: give one of these"
             )

@@ -5,6 +5,7 @@ Sums along lines of all directions and of lengths 8, 16, 32, ... cells find them
 transform, as Nir et al. (2018, AJ 156, 229) use it for streaks. A fit of an evenly moving point measures them.
 """
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -21,8 +22,8 @@ from starpos.frames.frame import Frame, Stars
 THRESHOLD = 7.0
 # Cells along the shortest and the longest sum; maximum light of a cell over its noise, so that a star is no line.
 SHORTEST, LONGEST, CLIP = 8, 128, 4.0
-# Columns of which only the best line is looked at; maximum number of lines that are measured.
-TILE, MAX_FITS = 8, 40
+# Columns of which only the best line is looked at; maximum number of lines that turn out to be no trails.
+TILE, MAX_FAILED = 8, 8
 # Width of stars (px, FWHM) where it is unknown; half the width of the fitted band, in sigma of the PSF.
 USUAL_FWHM, BAND = 2.5, 4.0
 # Shortest trail in sigma of the PSF: a shorter one is a star.
@@ -39,8 +40,12 @@ UNSTEADY = 0.3
 UNEVEN, MAX_KNOTS = 3.0, 12
 # Over their noise: pixels farther from the model are a star's.
 OUTLIER = 5.0
+# Median of a column or row, over its noise times the square root of its pixels, from which it differs from the others.
+STRIPE = 5.0
 # Maximum share of the frame that is left out for its stars, the brightest first.
 MOST_HIDDEN = 0.15
+# Steps of the slopes (px; of a logarithm); maximum number of steps of a fit.
+STEPS, MAX_STEPS = (0.01, 0.01, 0.01, 0.01, 0.01, 0.01), 40
 # A star hides at most so much of a trail to either side of its end, px.
 HIDDEN_PX = 30
 # px, 1 sigma: what the model of an image does not describe.
@@ -86,12 +91,15 @@ def find_trails(
     found: list[FrameTrail] = []
     bin_px = max(1, round(2 * sigma))
     cells = _cells_of(light, bin_px)
-    for tries, line in enumerate(_lines(cells)):
-        if tries == MAX_FITS:
-            break
+    failed = 0
+    for line in _lines(cells):
         _blot(cells, line, 1.5)
         trail = _measured(light, (line + 0.5) * bin_px - 0.5, sigma)
-        if trail is not None:
+        if trail is None:
+            failed += 1
+            if failed == MAX_FAILED:
+                break
+        else:
             found.append(trail)
             _blot(cells, (trail.ends + 0.5) / bin_px - 0.5, 2 * BAND * sigma / bin_px)
             _blot(light, trail.ends, BAND * sigma, np.nan)
@@ -121,6 +129,10 @@ def _light_of(sky: SkyPlane, x: np.ndarray, y: np.ndarray, flux: np.ndarray, sig
             for mesh in (sky.level[phase], sky.noise[phase])
         )
         light[part] = (light[part] - level) / noise
+    # columns and rows of the sensor that differ a little are no trails
+    for axis, some in ((0, light[::4]), (1, light[:, ::4])):
+        middle = np.median(some, axis=axis, keepdims=True)
+        light -= np.where(np.abs(middle) > STRIPE / math.sqrt(some.shape[axis]), middle, 0)
     hidden = sky.plane == np.iinfo(sky.plane.dtype).max
     # out to where a Gaussian, half as wide again as the stars' for its wings, is lost in the noise
     peak = flux / (2 * np.pi * sigma**2 * max(sky.typical[1], 1e-9))
@@ -309,11 +321,21 @@ class _Band:
             model = self.image(q[:6], knots) @ q[7:] + q[6]
             return np.concatenate([(self.value - model) / noise, [q[4] / WIDTH_SHARE, q[5] / self.sag]])
 
+        def slopes(q: np.ndarray) -> np.ndarray:
+            jac = np.zeros((len(self.value) + 2, len(q)))
+            base = self.image(q[:6], knots)
+            for k, step in enumerate(STEPS):
+                there = q[:6] + step * (np.arange(6) == k)
+                jac[:-2, k] = (self.image(there, knots) - base) @ q[7:] / -step
+            jac[:-2, 6], jac[:-2, 7:] = -1.0, -base
+            jac[:-2] /= noise[:, None]
+            jac[-2, 4], jac[-1, 5] = 1 / WIDTH_SHARE, 1 / self.sag
+            return jac
+
         for _ in range(3):
             light = np.linalg.lstsq(self.image(p, knots), self.value, rcond=None)[0]
-            best = optimize.least_squares(
-                residuals, np.concatenate([p, [0.0], light]), method="lm", max_nfev=500
-            )
+            start = np.concatenate([p, [0.0], light])
+            best = optimize.least_squares(residuals, start, slopes, method="lm", max_nfev=MAX_STEPS)
             p, model = best.x[:6], self.image(best.x[:6], knots) @ best.x[7:]
             # the light's photons: what the residuals have beyond the sky's noise grows with it
             rest, known = self.value - model - best.x[6], np.isfinite(noise)
@@ -364,7 +386,8 @@ def _fitted(light: np.ndarray, line: np.ndarray, sigma: float) -> FrameTrail | N
         rough, _ = band.unevenness(model, best)
     first, last, left, right, wide, _ = best[:6]
     snr = float(band.value @ model / np.sqrt(max(model @ model, 1e-9)))
-    if not (snr > THRESHOLD and last - first > SHORTEST_SIGMAS * sigma and abs(wide) < np.log(WIDEST)):
+    inside = -reach < first < last - SHORTEST_SIGMAS * sigma < length + reach - SHORTEST_SIGMAS * sigma
+    if not (snr > THRESHOLD and inside and abs(wide) < np.log(WIDEST)):
         return None
     ends = line[0] + np.array([[first, left], [last, right]]) @ turn
     order, both = [0, 2, 1, 3], np.kron(np.eye(2), turn.T)

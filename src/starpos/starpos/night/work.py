@@ -9,6 +9,7 @@ from dataclasses import KW_ONLY, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from starpos.calibration.camera import lens_of_frame
 from starpos.earth.place import Place, Places
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import FrameError, InstrumentError, StarposError
@@ -33,7 +34,6 @@ from starpos.instrument.tilt_log import Tilts
 from starpos.night.reading import First, Instruments, Reader, TiltFile, stars_of
 from starpos.night.remarks import Kind, Remark
 from starpos.progress import Progress, quiet
-from starpos.satellites.frames import trails_of
 from starpos.satellites.trails import SatelliteTrail
 from starpos.sky import catalogue
 from starpos.zenith.doubts import DeflectionSession
@@ -161,6 +161,19 @@ class Solving:
         known, doubt = with_frame_size(replace(known, focal_px=lens[0], model=lens[1]), question.stars)
         solver = Solver(known, catalogue.load_catalogue(), self.atmosphere, progress=self.progress)
         sight = answer_frame(solver, question)
+        if (
+            question.item.gravity is not None
+            and sight.found is not None
+            and known.camera is None
+            and not doubt
+        ):
+            # the lens of a telephone bends the field's corners by up to 100 px
+            camera, _, _ = solver.view(sight.stars.width, sight.stars.height)
+            bent = lens_of_frame(sight.stars, sight.found, camera, solver.catalogue, self.atmosphere)
+            if bent is not camera:
+                known = replace(known, camera=bent, focal_px=bent.fx)
+                again = answer_frame(replace(solver, instrument=known), question)
+                sight = sight if again.found is None else again
         solution = replace(sight.solution, remark=sight.solution.remark or doubt)
         return replace(sight, solution=solution, instrument=known)
 
@@ -273,6 +286,8 @@ class TrailSighted:
 
     def __call__(self, item: Frame | Stars) -> list[SatelliteTrail] | Solution:
         """The trails on a frame, identified by every way there is; FrameError for a list of stars."""
+        from starpos.satellites.frames import trails_of
+
         if isinstance(item, Stars):
             raise FrameError(f"{item.place}: a list of stars shows no trails: give the frame")
         sight = self.solving(item)

@@ -7,13 +7,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from starpos.calibration.camera import calibrate_camera, rms
+from starpos.calibration.camera import calibrate_camera, lens_of_frame, rms
 from starpos.detection import detect
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import CalibrationError, InstrumentError
+from starpos.fix.solver import Solver
 from starpos.frames.frame import SATURATED, Stars, no_stars
 from starpos.frames.reading import read_frame
 from starpos.instrument.camera import Camera
+from starpos.instrument.instrument import Instrument
 from starpos_testing.skies.lenses import (
     AIR,
     FIELDS,
@@ -89,6 +91,22 @@ def test_wide_lenses_from_one_frame_of_few_stars_are_true_or_refused(catalogue, 
         assert np.abs((fit.values - values(true)) / fit.sigma).max() < 5
         assert np.abs(prediction_errors(true, fit.camera)).max() < 6 * fit.worst_sigma_px
     assert solved > 3
+
+
+def test_the_lens_that_one_frames_stars_show_is_nearer_than_a_pinhole(catalogue, rng):
+    given, nearer = ideal(25), 0
+    solver = Solver(Instrument(given.fx), catalogue)
+    for corner in np.repeat([0.0, -0.03, 0.03], 4):
+        true = replace(given, distortion=(k1_of(given, corner), 0.0, 0.0, 0.0, 0.0))
+        (stars,), _ = night(true, 1, catalogue, rng, 6.3)
+        found = solver.identify(stars).found
+        if found is None:
+            continue
+        lens = lens_of_frame(stars, found, given, catalogue, AIR)
+        off, before = (np.abs(prediction_errors(true, camera)).max() for camera in (lens, given))
+        assert off < max(before / 5, 0.2)
+        nearer += corner != 0
+    assert nearer > 3
 
 
 def test_images_that_are_unsound_are_left_out_where_there_are_others(wide, catalogue, rng):

@@ -94,3 +94,17 @@ def test_a_horizontal_circle(run, lists, truth, tmp_path):
     table.write_text("file,azimuth_deg\nother.fits,7\n")
     status, _, err = run("mount", *frames, *WIDE, *SITE, "--readings", table)
     assert status == 1 and "check the names" in err[-1]
+
+
+def test_a_camera_that_turns_is_no_camera_that_stands_still(run, lists, tmp_path):
+    page = tmp_path / "history.html"
+    status, said, err = run("calibrate", "--watch", lists, *WIDE, *AIR, *SITE, "--page", page, "--json")
+    nights = objects(said)
+    assert status == 1 and [n["alarm"] for n in nights] == [False, True, True]
+    assert nights[1]["moved_arcsec"] == pytest.approx(40 * 3600, rel=1e-3) and "has moved" in err[0]
+    assert page.read_text().count("<tr>") == 3
+    page.write_text("mine")
+    status, _, err = run("calibrate", "--watch", lists, *WIDE, *SITE, "--page", page)
+    assert status == 2 and "not a page" in err[-1]
+    status, _, err = run("calibrate", "--watch", tmp_path / "none", *WIDE, *SITE)
+    assert status == 2 and "cannot be read" in err[-1]

@@ -1,0 +1,97 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How a camera that stands still has kept its pose: a line and a JSON object a night, and a page of the history."""
+
+from collections.abc import Sequence
+from html import escape
+from pathlib import Path
+
+from starpos.errors import InstrumentError
+from starpos.night.watching import ALARM_SIGMAS, Kept
+from starpos.units import ARCSEC, utc_text
+
+# key: heading of its column on the page, and format
+COLUMNS = {
+    "night": ("night", "{}"),
+    "utc": ("mean time", "{}"),
+    "frames": ("frames", "{}"),
+    "stars": ("stars", "{}"),
+    "moved_arcsec": ("moved, arcsec", "{:.1f}"),
+    "sigma_arcsec": ("1 sigma", "{:.1f}"),
+    "focal_px": ("focal length, px", "{:.3f}"),
+    "limit_mag": ("limit, V", "{:.1f}"),
+    "alarm": ("", "{}"),
+}
+TITLE = "A camera that stands still"
+# of the page's picture, px
+WIDTH, HEIGHT = 800, 120
+
+
+def values_of(night: Kept) -> dict:
+    """A night for --json."""
+    pose = night.pose
+    return {
+        "night": pose.day,
+        "utc": utc_text(pose.utc_unix_s),
+        "frames": pose.frames,
+        "stars": pose.stars,
+        "moved_arcsec": night.moved_arcsec,
+        "sigma_arcsec": night.sigma_arcsec,
+        "turned_arcsec": (night.turned / ARCSEC).tolist(),
+        "focal_px": pose.focal_px,
+        "limit_mag": pose.limit_mag,
+        "alarm": night.alarm,
+    }
+
+
+def line_of(values: dict) -> str:
+    """Text of a night for people."""
+    return (
+        "{night}: {frames} frames, {stars} stars, moved by {moved_arcsec:.1f} +- {sigma_arcsec:.1f} arcsec, focal length "
+        "{focal_px:.3f} px, limit V {limit_mag:.1f}".format(**values)
+    )
+
+
+def alarm_of(night: Kept) -> str:
+    """Say that a camera has moved."""
+    return (
+        f"{night.pose.day}: the camera has moved by {night.moved_arcsec:.0f} arcsec against the {night.nights} nights "
+        "before: later nights are compared with this one; calibrate it again"
+    )
+
+
+def check_page(path: Path) -> None:
+    """Raise InstrumentError if a file that is there is no such page."""
+    if path.exists() and TITLE.encode() not in path.read_bytes()[:200]:
+        raise InstrumentError(f"{path}: it is not a page of --watch: give another name, or remove it")
+
+
+def write_page(path: Path, nights: Sequence[Kept]) -> None:
+    """Write the history as a page; raises InstrumentError if it cannot be written."""
+    rows = [values_of(n) for n in nights]
+    most = max([1.0, *(r["moved_arcsec"] for r in rows)])
+    step = WIDTH / max(len(rows), 1)
+    bars = "".join(
+        f'<rect x="{k * step:.1f}" y="{HEIGHT * (1 - r["moved_arcsec"] / most):.1f}" width="{step * 0.8:.1f}" '
+        f'height="{HEIGHT * r["moved_arcsec"] / most:.1f}" fill="{"crimson" if r["alarm"] else "steelblue"}"/>'
+        for k, r in enumerate(rows)
+    )
+    head = "".join(f"<th>{name}</th>" for name, _ in COLUMNS.values())
+    body = "".join(
+        "<tr>"
+        + "".join(
+            f"<td>{escape(('moved' if r[k] else '') if k == 'alarm' else form.format(r[k]))}</td>"
+            for k, (_, form) in COLUMNS.items()
+        )
+        + "</tr>"
+        for r in rows
+    )
+    page = (
+        '<!DOCTYPE html><html lang="en"><meta charset="utf-8">'
+        f"<title>{TITLE}</title><h1>{TITLE}</h1><p>{len(rows)} nights. Bars: how far each pose is from the mean of those "
+        f"before, up to {most:.0f} arcsec; red where it is more than {ALARM_SIGMAS:g} sigma.</p>"
+        f'<svg width="{WIDTH}" height="{HEIGHT}">{bars}</svg><table>{head}{body}</table></html>'
+    )
+    try:
+        path.write_text(page, encoding="utf-8")
+    except OSError as e:
+        raise InstrumentError(f"{path}: the page cannot be written there ({e.strerror})") from None
