@@ -40,7 +40,7 @@ def test_a_bag_of_ros_1_names_the_converter_and_what_it_makes_is_read(ros1, monk
     monkeypatch.setattr(
         sys, "argv", ["rosbags-convert", "--src", str(ros1), "--dst", str(ros1.with_suffix(""))]
     )
-    with pytest.raises(SystemExit, match="^0$"):
+    with pytest.raises(SystemExit, match=r"^0$"):
         main()
     with BagReader(ros1.with_suffix(""), typed=True) as bag:
         ((_, _, message),) = bag.decoded(bag.connections)
