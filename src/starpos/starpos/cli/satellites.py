@@ -36,8 +36,9 @@ def run(args: argparse.Namespace) -> int:
     if frames:
         trails += _on_frames(args, frames, 1 + max((trail.track for trail in trails), default=-1))
     if not trails:
-        console.complain("satellites", f"none of the {len(frames)} frames has a trail with both ends")
-        return 1
+        return _refused(
+            args, f"none of {len(frames)} frames shows a trail with both of its ends: give more frames"
+        )
     orbits = []
     for path in args.elements:
         found, about = read_orbits(path)
@@ -51,18 +52,22 @@ def run(args: argparse.Namespace) -> int:
     try:
         fix = locate(trails, usable, _prior(args))
     except SatelliteError as e:
-        console.complain("satellites", e)
-        if args.json:
-            console.print_json(
-                {"combined": True, "latitude_geodetic": None, "longitude_geodetic": None, "status": str(e)}
-            )
-        return 1
+        return _refused(args, str(e))
     for k, trail in enumerate(trails):
         value = trail_json(trail, fix, k)
         _put(args, value, trail_line(value))
     value = fix_json(fix)
     _put(args, value, fix_line(value))
     return 0
+
+
+def _refused(args: argparse.Namespace, why: str) -> int:
+    console.complain("satellites", why)
+    if args.json:
+        console.print_json(
+            {"combined": True, "latitude_geodetic": None, "longitude_geodetic": None, "status": why}
+        )
+    return 1
 
 
 def _put(args: argparse.Namespace, value: dict, line: str) -> None:

@@ -187,12 +187,11 @@ def _of_trail(
     measured = math.sqrt(np.trace(trail.covariance[0]) / 2)
     if len(directions) > 1:
         r1, _ = sky.at(trail.utc_unix_s[1], rows)
-        motion = directions[1] - d
+        motion, worse = directions[1] - d, math.sqrt(np.trace(trail.covariance, axis1=1, axis2=2).max() / 2)
         other = normalised(r1 - places) - d
         share = RATE_SHARE + RATE_TURN * sigma[:, 1] / EQUATOR_RADIUS_M
         near = (
-            np.linalg.norm(other - motion, axis=1)
-            < share * np.linalg.norm(motion) + ENOUGH_SIGMA * 2 * measured
+            np.linalg.norm(other - motion, axis=1) < share * np.linalg.norm(motion) + ENOUGH_SIGMA * 2 * worse
         )
         r, v, rows, distance, places, up, sine, sigma = (
             x[near] for x in (r, v, rows, distance, places, up, sine, sigma)

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Directions of a trail on a drawn frame, of a camera that stands on the ground while its rows are read one by one."""
 
+import json
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -8,6 +9,7 @@ import erfa
 import numpy as np
 import pytest
 
+from starpos.cli import main
 from starpos.detection import detect
 from starpos.errors import FixError, FrameError
 from starpos.frames.exposure import Shutter
@@ -97,3 +99,13 @@ def test_points_of_a_camera_that_follows_the_stars_are_refused(sky, catalogue):
     frame, stars, solution, *_ = sky
     with pytest.raises(FixError, match="tracked"):
         trails_of(frame, replace(stars, exposure_s=300.0), solution, catalogue)
+
+
+def test_frames_without_a_trail_give_no_place(tmp_path, capsys):
+    """Exit status 1, a sentence of the frame and one of the place."""
+    frame = tmp_path / "dark.fits"
+    frame.write_bytes(b"no picture")
+    assert main(["satellites", str(frame), "--elements", str(tmp_path), "--json"]) == 1
+    told = capsys.readouterr()
+    assert json.loads(told.out)["latitude_geodetic"] is None
+    assert "dark.fits" in told.err and "none of 1 frames" in told.err
