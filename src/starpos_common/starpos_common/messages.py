@@ -2,6 +2,7 @@
 """Conversion of starpos' types to messages; `starpos.messages` converts back."""
 
 import array
+import math
 import sys
 from typing import Any
 
@@ -15,7 +16,7 @@ from starpos import rotation
 from starpos.errors import TimeError
 from starpos.fix.camera_attitude import CameraAttitude
 from starpos.frames.exposure import Shutter
-from starpos.frames.frame import Frame, Stars
+from starpos.frames.frame import DISC, SATURATED, Disc, Frame, Stars
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import Tilt
 from starpos_interfaces import msg
@@ -39,7 +40,7 @@ def unix_to_stamp(unix_s: float | None) -> Time:
 
 
 def stars_to_message(stars: Stars, frame_id: str) -> msg.StarArray:
-    """Convert stars to a StarArray."""
+    """Convert stars to a StarArray; what looks like the Sun comes first, as a star with the flag DISC."""
     covariance = stars.covariance.reshape(-1, 4)
     columns = zip(
         stars.x.tolist(),
@@ -57,8 +58,24 @@ def stars_to_message(stars: Stars, frame_id: str) -> msg.StarArray:
         exposure=float(stars.exposure_s or 0.0),
         stamp_stddev=float(stars.stamp_stddev_s),
         clock_stddev=float(stars.clock_stddev_s),
-        stars=[msg.Star(x=x, y=y, flux=f, snr=s, covariance=c, flags=g) for x, y, f, s, c, g in columns],
+        stars=[
+            *([] if stars.disc is None else [_disc_to_message(stars.disc)]),
+            *(msg.Star(x=x, y=y, flux=f, snr=s, covariance=c, flags=g) for x, y, f, s, c, g in columns),
+        ],
         **shutter_fields(stars.shutter),
+    )
+
+
+def _disc_to_message(disc: Disc) -> msg.Star:
+    area = math.pi * disc.radius_px**2
+    sigma = math.sqrt(float(np.trace(disc.covariance)) / 2)
+    return msg.Star(
+        x=float(disc.x),
+        y=float(disc.y),
+        flux=area,
+        snr=disc.radius_px / sigma,
+        covariance=disc.covariance.ravel(),
+        flags=DISC if disc.sharp else DISC | SATURATED,
     )
 
 

@@ -13,7 +13,7 @@ from sensor_msgs.msg import CameraInfo, Image
 
 from starpos.errors import FrameError, InstrumentError, TiltError, TimeError
 from starpos.frames.exposure import GLOBAL_SHUTTER, Shutter
-from starpos.frames.frame import EDGE, Frame, Stars, no_stars
+from starpos.frames.frame import EDGE, Disc, Frame, Stars, no_stars
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import Tilt
 from starpos.messages import tilt as tilts
@@ -99,6 +99,26 @@ def test_the_shutter_of_stars_round_trips(heard, shutter):
     message = heard(messages.stars_to_message(replace(stars(), shutter=shutter), "c"))
     assert message_to_stars(message).shutter == shutter
     assert message.shutter_known == (shutter is not None)
+
+
+@pytest.mark.parametrize("sharp", [True, False])
+def test_what_looks_like_the_sun_round_trips_beside_the_stars(heard, sharp):
+    error = np.array([[0.04, 0.01], [0.01, 0.09]])
+    disc = Disc(x=120.5, y=33.25, covariance=error, radius_px=17.0, sharp=sharp)
+    got = message_to_stars(heard(messages.stars_to_message(replace(stars(), disc=disc), "c")))
+    assert len(got) == len(stars())
+    assert (got.disc.x, got.disc.y, got.disc.sharp) == (120.5, 33.25, sharp)
+    assert got.disc.radius_px == pytest.approx(17.0, rel=1e-6)
+    assert np.array_equal(got.disc.covariance, error)
+
+
+@pytest.mark.parametrize(("field", "value"), [("flux", -1.0), ("x", math.nan), ("covariance", [0.0] * 4)])
+def test_a_disc_that_cannot_be_is_refused(heard, field, value):
+    disc = Disc(x=1.0, y=2.0, covariance=np.eye(2), radius_px=9.0, sharp=True)
+    message = messages.stars_to_message(replace(stars(), disc=disc), "c")
+    setattr(message.stars[0], field, value)
+    with pytest.raises(FrameError, match="disc"):
+        message_to_stars(heard(message))
 
 
 def test_a_shutter_that_cannot_be_is_refused(heard):

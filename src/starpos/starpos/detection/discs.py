@@ -31,8 +31,9 @@ ALIKE_PX, FLOOR_PX, FLOOR_SHARE = 3.0, 0.03, 0.001
 HIDDEN, SMALL, ROUNDS = 0.012, 1.5, 6
 # A glow: shares of its height at which its middle is measured, the first of what is saturated; what share of it is.
 HEIGHTS, SATURATED_SHARE = (0.97, 0.8, 0.65), 0.15
-# Squared ratio of its axes, share of an ellipse's area, and how far the middles may differ, in its radius.
-LONGEST, FULLEST, CONCENTRIC = 1.8, 0.85, 0.2
+# Maximum size of a second bright group, as a share of the glow's. Squared ratio of its axes, share of an ellipse's area,
+# and how far the middles may differ, in its radius.
+ALONE, LONGEST, FULLEST, CONCENTRIC = 0.6, 1.8, 0.85, 0.2
 # The middle of a glow is known to this share of its radius: flare and blooming pull it.
 OFF_CENTRE = 0.03
 
@@ -60,11 +61,13 @@ def find_disc(plane: np.ndarray) -> Disc | None:
     for left, top_row, width, rows in map(cv2.boundingRect, outlines):
         middle = np.array([left + (width - 1) / 2, top_row + (rows - 1) / 2])
         groups.append((middle * step, (max(width, rows) + 2) * step))
-    for fit in (_limb, _glow):
-        for middle, extent in groups:
-            if (disc := fit(plane, middle, float(extent), dark, height)) is not None:
-                return disc
-    return None
+    for middle, extent in groups:
+        if (disc := _limb(plane, middle, float(extent), dark, height)) is not None:
+            return disc
+    # of two lights as large nothing says which is the Sun
+    if not groups or (len(groups) > 1 and groups[1][1] > ALONE * groups[0][1]):
+        return None
+    return _glow(plane, groups[0][0], float(groups[0][1]), dark, height)
 
 
 def _limb(plane: np.ndarray, middle: np.ndarray, extent: float, dark: float, height: float) -> Disc | None:

@@ -109,7 +109,7 @@ def by_sun(solver: Solver, stars: Stars, disc: Disc, tilts: Tilts | None, places
                 continue
             return Solution.of(
                 stars,
-                found.text,
+                f"{found.text}, by the {name.title()}",
                 at_place=found,
                 tilt=tilt,
                 bodies=(name,),

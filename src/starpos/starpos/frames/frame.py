@@ -154,6 +154,8 @@ EDGE = 2
 ELONGATED = 4
 BLENDED = 8
 UNSOUND = SATURATED | EDGE | ELONGATED | BLENDED
+# In messages: not a star but a Disc, whose flux is its area, px2; SATURATED with it: a glow.
+DISC = 16
 # Left, top, right, bottom: the first column and row, and the first beyond.
 Window = tuple[int, int, int, int]
 COLUMNS = ("x", "y", "flux", "snr", "covariance", "flags")

@@ -9,7 +9,7 @@ from starpos import rotation
 from starpos.errors import FrameError
 from starpos.fix.camera_attitude import CameraAttitude
 from starpos.frames.exposure import Shutter
-from starpos.frames.frame import Stars
+from starpos.frames.frame import DISC, SATURATED, Disc, Stars
 from starpos.messages.stamp import stamp_to_unix
 
 # a detector publishes no more
@@ -18,9 +18,12 @@ MAX_STARS = 100_000
 
 def message_to_stars(message: Any, source: str = "stars") -> Stars:
     """Stars from a StarArray; raises FrameError if sizes, values, order or covariances cannot be right."""
-    rows = message.stars
-    if len(rows) > MAX_STARS:
-        raise FrameError(f"{source}: {len(rows)} stars are more than {MAX_STARS}: send the brightest.")
+    if len(message.stars) > MAX_STARS:
+        raise FrameError(
+            f"{source}: {len(message.stars)} stars are more than {MAX_STARS}: send the brightest."
+        )
+    rows = [s for s in message.stars if not s.flags & DISC]
+    disc = next((_message_to_disc(s, source) for s in message.stars if s.flags & DISC), None)
     return Stars(
         x=np.array([s.x for s in rows]),
         y=np.array([s.y for s in rows]),
@@ -37,6 +40,26 @@ def message_to_stars(message: Any, source: str = "stars") -> Stars:
         # older bags do not have it
         clock_stddev_s=getattr(message, "clock_stddev", 0.0),
         shutter=message_to_shutter(message),
+        disc=disc,
+    )
+
+
+def _message_to_disc(star: Any, source: str) -> Disc:
+    """The disc that a star with the flag DISC stands for; FrameError if a value is impossible."""
+    covariance = np.array(star.covariance, float).reshape(2, 2)
+    if not (
+        np.isfinite([star.x, star.y, star.flux, *covariance.flat]).all()
+        and star.flux > 0
+        and np.allclose(covariance, covariance.T)
+        and np.linalg.eigvalsh(covariance)[0] > 0
+    ):
+        raise FrameError(f"{source}: the disc's place, area or covariance is impossible: measure it again.")
+    return Disc(
+        x=star.x,
+        y=star.y,
+        covariance=covariance,
+        radius_px=float(np.sqrt(star.flux / np.pi)),
+        sharp=not star.flags & SATURATED,
     )
 
 

@@ -12,6 +12,7 @@ from starpos.earth.orientation import earth_state
 from starpos.earth.place import Place
 from starpos.earth.refraction import Atmosphere
 from starpos.earth.vertical import Deflection
+from starpos.fix.searching import Question, answer_frame
 from starpos.fix.solution import Solution, Status
 from starpos.fix.solver import Solver
 from starpos.fix.sun import by_sun
@@ -138,6 +139,16 @@ def test_what_is_not_the_sun_gives_no_heading() -> None:
 def test_a_glow_that_is_a_degree_off_is_a_lamp() -> None:
     lamp = View(AZIMUTH, ALTITUDE - 1.0).answer(WHEN, HERE, solver_of(), sharp=False, radius=60.0)
     assert lamp.at_place is None
+
+
+def test_a_frame_is_answered_by_what_it_shows() -> None:
+    view = View(AZIMUTH, ALTITUDE)
+    disc = Disc(x=view.xy[0], y=view.xy[1], covariance=np.eye(2) * 0.04, radius_px=19.7, sharp=True)
+    stars = replace(no_stars(*SIZE, mid_unix_s=unix_of(WHEN), exposure_s=0.0), disc=disc)
+    tilt = Tilt(*np.arcsin(view.up[:2]), np.eye(2) * 1e-10, utc_unix_s=unix_of(WHEN))
+    sight = answer_frame(solver_of(), Question(item=stars, stars=stars, tilts=tilt, places=HERE))
+    assert sight.solution.ok
+    assert sight.solution.bodies == ("sun",)
 
 
 def test_without_the_level_or_a3_it_says_so() -> None:
