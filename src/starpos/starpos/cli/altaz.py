@@ -80,7 +80,7 @@ class _Seen:
         xy = self.camera.project(towards(*directions.T) @ self.optics.rotation)
         with np.errstate(invalid="ignore"):
             on = ((xy > -0.5) & (xy < np.array([self.camera.width, self.camera.height]) - 0.5)).all(1)
-        return np.where(on[:, None], xy, np.nan)
+        return np.where(np.asarray(on)[:, None], xy, np.nan)
 
     def shown(self, rays: np.ndarray) -> np.ndarray:
         """Whether identified stars lie as far off the axis as rays (N, 3) in C."""
@@ -137,16 +137,16 @@ def _draw(path: str, seen: _Seen, points: np.ndarray) -> None:
         raise InstrumentError(
             f"{path}: a list of stars has no picture to draw on: give a frame for --overlay"
         )
-    picture = annotate(
-        frame, stars, Identified(star=solution.star, names=solution.names, magnitudes=solution.magnitudes)
-    )
+    star, magnitudes = (np.zeros(0) if v is None else v for v in (solution.star, solution.magnitudes))
+    named = Identified(star=star.astype(int).tolist(), names=solution.names, magnitudes=magnitudes.tolist())
+    picture = annotate(frame, stars, named)
     n = shrink(frame)
 
     def line(azimuth: np.ndarray, altitude: np.ndarray) -> np.ndarray:
         return (seen.pixels(np.radians(np.stack(np.broadcast_arrays(azimuth, altitude), -1))) + 0.5) / n - 0.5
 
-    grid = [line(np.arange(0, 360 + ALONG, ALONG), np.float64(a)) for a in ALTITUDES]
-    grid += [line(np.float64(a), np.arange(0, 90, ALONG)) for a in AZIMUTHS]
+    grid = [line(np.arange(0, 360 + ALONG, ALONG), np.array([float(a)])) for a in ALTITUDES]
+    grid += [line(np.array([float(a)]), np.arange(0, 90, ALONG)) for a in AZIMUTHS]
     for xy in grid:
         for begin, end in itertools.pairwise(xy):
             if np.isfinite([begin, end]).all():

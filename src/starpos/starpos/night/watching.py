@@ -47,7 +47,7 @@ class NightPose:
 
     @property
     def own(self) -> np.ndarray:
-        """Covariance (3, 3) in rad2 of the errors that other nights do not share, those of the clock among them."""
+        """Covariance (3, 3) in rad2 of the errors that other nights do not share, the clock's among them."""
         terms = [t for t in self.optics.terms if not t.common or t.name in OF_THE_CLOCK]
         return total_covariance(terms)[3:, 3:]
 
