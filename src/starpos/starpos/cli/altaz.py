@@ -14,8 +14,9 @@ from starpos.cli.overwriting import Written
 from starpos.errors import FrameError, InstrumentError
 from starpos.fix.attitude import Attitude
 from starpos.fix.directions import horizontal, towards
+from starpos.fix.heading import AttitudeAtPlace
 from starpos.fix.searching import Sight
-from starpos.frames.frame import Frame
+from starpos.frames.frame import Frame, Stars
 from starpos.instrument.camera import Camera
 from starpos.tables import TableForm
 from starpos.units import utc_text
@@ -61,13 +62,18 @@ def run(args: argparse.Namespace) -> int:
 class _Seen:
     """A frame whose attitude at a known place is known, and its camera with the focal length that its stars show."""
 
-    item: object
+    item: Frame | Stars
     sight: Sight
     camera: Camera
 
     @property
+    def at_place(self) -> AttitudeAtPlace:
+        assert self.sight.solution.at_place is not None
+        return self.sight.solution.at_place
+
+    @property
     def optics(self) -> Attitude:
-        return self.sight.solution.at_place.optics
+        return self.at_place.optics
 
     def pixels(self, directions: np.ndarray) -> np.ndarray:
         """Pixels (N, 2) of azimuths and altitudes (N, 2) in rad; NaN for those that are not on the frame."""
@@ -78,7 +84,8 @@ class _Seen:
 
     def shown(self, rays: np.ndarray) -> np.ndarray:
         """Whether identified stars lie as far off the axis as rays (N, 3) in C."""
-        stars, found, used = self.sight.stars, self.sight.found, self.sight.solution.at_place.used
+        stars, found, used = self.sight.stars, self.sight.found, self.at_place.used
+        assert found is not None
         row = found.star[used]
         least = self.camera.directions(stars.x[row], stars.y[row])[:, 2].min()
         return REACH * np.arccos(np.clip(rays[:, 2], -1, 1)) <= np.arccos(np.clip(least, -1, 1))
@@ -86,7 +93,7 @@ class _Seen:
 
 def _put(args: argparse.Namespace, seen: _Seen, points: np.ndarray) -> None:
     """Print the azimuth and altitude of pixels (N, 2)."""
-    output, found = Output(args, COLUMNS, HEAD), seen.sight.solution.at_place
+    output, found = Output(args, COLUMNS, HEAD), seen.at_place
     rays = seen.camera.directions(*points.T)
     sigma = np.hypot(args.stddev_px, found.jitter_px) / seen.camera.fx
     at = horizontal(seen.optics, rays, sigma)

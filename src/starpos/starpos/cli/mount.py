@@ -29,8 +29,12 @@ def run(args: argparse.Namespace) -> int:
     readings = None if args.readings is None else _readings(args.readings)
     # what --site cannot be is said before the work
     place = place_of(args, vertical_of(args))
+    if place is None:
+        raise InstrumentError("mount needs the place of the camera: give --site LAT LON")
     seen = [
-        (sight.stars.source, sight.solution.at_place) for _, sight, _ in inputs.seen_at_place("mount", args)
+        (sight.stars.source, at)
+        for _, sight, _ in inputs.seen_at_place("mount", args)
+        if (at := sight.solution.at_place) is not None
     ]
     try:
         if readings is None:

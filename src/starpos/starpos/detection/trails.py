@@ -177,7 +177,7 @@ def _lines(cells: np.ndarray) -> Iterator[np.ndarray]:
     ends, score = np.concatenate(lines), np.concatenate(scores)
     for k in np.argsort(-score):
         steps = round(np.abs(ends[k, 1] - ends[k, 0]).max()) + 1
-        x, y = np.rint(np.linspace(*ends[k], steps)).astype(int).T
+        x, y = np.rint(np.linspace(ends[k, 0], ends[k, 1], steps)).astype(int).T
         if cells[y, x].sum() > 0.7 * THRESHOLD * np.sqrt(steps):
             yield ends[k]
 
@@ -191,10 +191,10 @@ def _sums(cells: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     while rows < LONGEST and rows < height:
         upper, lower = sums[::2], sums[1::2]
         sums = np.repeat(upper, 2, axis=1)
-        for aside in range(2 * rows):
-            shift = (aside + 1) // 2
+        for step in range(2 * rows):
+            shift = (step + 1) // 2
             if shift < width:
-                sums[:, aside, : width - shift] += lower[:, aside // 2, shift:]
+                sums[:, step, : width - shift] += lower[:, step // 2, shift:]
         rows *= 2
         if rows < SHORTEST:
             continue
@@ -357,7 +357,7 @@ class _Band:
             return 0.0, 0.0
         power = power[kept]
         share = np.bincount(piece[on], (self.value * model)[on], pieces)[kept] / power - 1
-        return float(np.sqrt(max(np.mean(share**2 - 1 / power), 0.0))), float(np.mean(share**2 * power))
+        return math.sqrt(max(float(np.mean(share**2 - 1 / power)), 0.0)), float(np.mean(share**2 * power))
 
 
 def _fitted(light: np.ndarray, line: np.ndarray, sigma: float) -> FrameTrail | None:

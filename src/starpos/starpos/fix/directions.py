@@ -23,7 +23,7 @@ class Horizontal:
     """N directions as they are seen, refraction included.
 
     azimuth (N,): rad, 0 to 2 pi, from north over east.  altitude (N,): rad.
-    covariance (N, 2, 2): rad2, of their errors across (cos altitude times that of the azimuth) and up.
+    covariance (N, 2, 2): rad2, of their errors across (cos altitude times the azimuth's error) and up.
     """
 
     azimuth: np.ndarray

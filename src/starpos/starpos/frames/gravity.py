@@ -203,7 +203,10 @@ def read_gravity(data: bytes, width: int, height: int) -> Gravity:
 
 
 def _text(value: tuple | None) -> str:
-    return bytes(value or ()).decode("ascii", "replace").strip("\0 ")
+    """The text of a tag; empty where it is missing or of another type."""
+    if value is None or not all(isinstance(x, int) and 0 <= x < 256 for x in value):
+        return ""
+    return bytes(value).decode("ascii", "replace").strip("\0 ")
 
 
 def _by_gimbal(data: bytes) -> Gravity | None:

@@ -58,7 +58,7 @@ def exposures(
     """
     frames, read = frames or frames_in(folder), read or Reader()
     tilts: Path | ByGravity = folder / TILTS
-    if place is None and not tilts.exists() and are_photographs(frames):
+    if place is None and not (folder / TILTS).exists() and are_photographs(frames):
         # a new reader, which has not kept a frame without its time
         tilts, read = ByGravity(), Reader(read.clock or CameraClock(), read.delay_s)
     by_gravity = isinstance(tilts, ByGravity)

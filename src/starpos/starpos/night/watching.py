@@ -11,6 +11,7 @@ from starpos import rotation
 from starpos.averaging.poses import mean_attitude
 from starpos.errors import FixError
 from starpos.fix.attitude import Attitude
+from starpos.fix.heading import AttitudeAtPlace
 from starpos.fix.solution import Solution
 from starpos.fix.terms import total_covariance
 from starpos.units import ARCSEC, DAY_S, HOUR_S
@@ -31,7 +32,7 @@ OF_THE_CLOCK = "clock", "time stamp"
 class NightPose:
     """What the frames of a night, or of the part of one in which the camera stood still, say together.
 
-    day: its date, that of its evening by local mean time.  stars: number of identified ones.
+    day: the date of its evening by local mean time.  stars: number of identified ones.
     optics: C in east, north, up.  focal_px: mean of the frames, on the axis.
     limit_mag: V of the faintest stars; NaN where it is not known.
     """
@@ -53,7 +54,7 @@ class NightPose:
 
 @dataclass(frozen=True, kw_only=True)
 class Kept:
-    """A night's pose against those before it since the last knock.
+    """A night's pose against the poses before it since the last knock.
 
     nights: number of them; 0 for the first.  turned (3,), sigma (3,): rotation about east, north, up since their mean and
     its errors, rad.
@@ -86,10 +87,10 @@ def night_poses(answers: Iterable[tuple[Solution, float]], longitude: float) -> 
     longitude: of the place, rad; it says when a night begins.
     """
     late_s = np.degrees(longitude) / MEAN_HOUR_DEG * HOUR_S - DAY_S / 2
-    seen = sorted(answers, key=lambda a: a[0].at_place.utc_unix_s)
+    seen = sorted(answers, key=lambda a: _at(a[0]).utc_unix_s)
     groups: list[tuple[str, list[tuple[Solution, float]]]] = []
     for answer in seen:
-        evening = datetime.fromtimestamp(answer[0].at_place.utc_unix_s + late_s, timezone.utc)
+        evening = datetime.fromtimestamp(_at(answer[0]).utc_unix_s + late_s, timezone.utc)
         day = evening.strftime("%Y-%m-%d")
         if groups and groups[-1][0] == day and _stands([*groups[-1][1], answer]):
             groups[-1][1].append(answer)
@@ -98,17 +99,22 @@ def night_poses(answers: Iterable[tuple[Solution, float]], longitude: float) -> 
     return tuple(_pose(day, group) for day, group in groups)
 
 
+def _at(answer: Solution) -> AttitudeAtPlace:
+    assert answer.at_place is not None
+    return answer.at_place
+
+
 def _stands(answers: Sequence[tuple[Solution, float]]) -> bool:
     """Whether a camera stood still between frames."""
     try:
-        mean_attitude([s.at_place for s, _ in answers])
+        mean_attitude([_at(s) for s, _ in answers])
     except FixError:
         return False
     return True
 
 
 def _pose(day: str, answers: Sequence[tuple[Solution, float]]) -> NightPose:
-    mean = mean_attitude([s.at_place for s, _ in answers])
+    mean = mean_attitude([_at(s) for s, _ in answers])
     magnitudes = np.concatenate([np.asarray(s.magnitudes, float) for s, _ in answers])
     known = magnitudes[np.isfinite(magnitudes)]
     return NightPose(

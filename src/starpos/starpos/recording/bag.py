@@ -238,8 +238,10 @@ class BagReader:
             with ExitStack() as stack:
                 self._reader: Reader | AnyReader
                 if self._typed:
-                    decoder = AnyReader([self.path], default_typestore=installed_types())
+                    installed = installed_types()
+                    decoder = AnyReader([self.path], default_typestore=installed)
                     self._reader, self._types = decoder, stack.enter_context(decoder).typestore
+                    _spell(self._types, installed)
                     readers = decoder.readers
                 else:
                     self._reader = stack.enter_context(Reader(self.path))
@@ -294,6 +296,17 @@ class BagReader:
         if isinstance(error, BagError):
             return BagError(f"{self.path}: {error}")
         return BagError(f"{self.path}: not a readable bag ({type(error).__name__}: {one_line(error)})")
+
+
+def _spell(types: "Typestore", installed: "Typestore") -> None:
+    """Give fields the names that ROS 2 has: a bag that was converted from ROS 1 calls them D, K, R, P."""
+
+    def fields(store: "Typestore", name: str) -> list[tuple]:
+        return [(field.lower(), kind) for field, kind in store.fielddefs[name][1]]
+
+    for name in types.fielddefs.keys() & installed.fielddefs.keys():
+        if fields(types, name) == fields(installed, name):
+            types.fielddefs[name], types.types[name] = installed.fielddefs[name], installed.types[name]
 
 
 def installed_types() -> "Typestore":

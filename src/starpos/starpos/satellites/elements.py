@@ -363,8 +363,8 @@ def _from_sp3(text: str) -> Iterator[Orbit | str]:
             # zeros stand for a place that is not known
             if place.any():
                 rows.setdefault(line[1:4], []).append((utc, place @ turn.T))
-    for k, (name, states) in enumerate(rows.items(), 1):
-        yield _of_states(-k, name, PRECISE, states)
+    for name, states in rows.items():
+        yield _of_states(_number_of({"OBJECT_ID": name}), name, PRECISE, states)
 
 
 def chosen(

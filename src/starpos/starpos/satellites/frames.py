@@ -174,7 +174,8 @@ def trails_of(frame: Frame, stars: Stars, solution: Solution, catalogue: Catalog
     A trail that leaves the frame, or that flashes, does not. FrameError without a time, an exposure or enough stars.
     """
     sky = FrameSky.of(stars, solution, catalogue)
-    exposure_s, trails = stars.exposure_s or 0.0, []
+    exposure_s = stars.exposure_s or 0.0
+    trails: list[SatelliteTrail] = []
     for seen in find_trails(frame, stars, *sky.explained(catalogue)):
         if seen.cut.any() or not seen.steady:
             continue

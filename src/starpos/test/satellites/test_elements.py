@@ -97,3 +97,22 @@ def test_an_operators_ephemeris(tmp_path):
     assert r[0] == pytest.approx(
         radius * 1e3 * np.array([np.cos(rate * after), np.sin(rate * after), 0]), abs=0.5
     )
+
+
+def test_precise_ephemerides_are_in_the_earths_axes(tmp_path):
+    rate, radius = 2 * np.pi / 43200 - 7.292115e-5, 26560.0
+    lines = ["#dP2020  9 13 12  0  0.00000000      20 ORBIT IGS14 FIT  IGS", "%c M  cc GPS ccc cccc"]
+    for k in range(20):
+        turn = rate * 900 * k
+        lines.append(f"*  2020  9 13 {12 + k // 4:2d} {k % 4 * 15:2d}  0.00000000")
+        lines.append(
+            f"PG01{radius * np.cos(turn):14.6f}{radius * np.sin(turn):14.6f}{0.0:14.6f} 999999.999999"
+        )
+        # a satellite without a place
+        lines.append(f"PG02{0.0:14.6f}{0.0:14.6f}{0.0:14.6f} 999999.999999")
+    (tmp_path / "a.sp3").write_text("\n".join(lines))
+    (orbit,), _ = read_orbits(tmp_path / "a.sp3")
+    moment = Moments.at(np.array([1599998400.0 - 18 + 7000]))
+    r, _ = states([orbit], moment, np.zeros(1))
+    expected = radius * 1e3 * np.array([np.cos(rate * 7000), np.sin(rate * 7000), 0])
+    assert moment.gcrs_to_itrs[0] @ r[0] == pytest.approx(expected, abs=0.1)
