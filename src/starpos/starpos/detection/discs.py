@@ -34,6 +34,8 @@ HEIGHTS, SATURATED_SHARE = (0.97, 0.8, 0.65), 0.15
 # Maximum size of a second bright group, as a share of the glow's. Squared ratio of its axes, share of an ellipse's area,
 # and how far the middles may differ, in its radius.
 ALONE, LONGEST, FULLEST, CONCENTRIC = 0.6, 1.8, 0.85, 0.2
+# A glow falls off: it is wider at its lowest height by this factor than at its highest, as a bright window is not.
+HALO = 1.08
 # The middle of a glow is known to this share of its radius: flare and blooming pull it.
 OFF_CENTRE = 0.03
 
@@ -141,10 +143,8 @@ def _circle(plane: np.ndarray, points: np.ndarray, extent: float, dark: float) -
         return None
     away, step = max(WITHIN_PX, WITHIN * radius), max(0.5, radius / 100)
     unit = apart / np.linalg.norm(apart, axis=1)[:, None]
-    inside, outside = (
-        _sampled(plane, *(circle[:2] + r * unit).T[:, :, None], step)[:, 0] - dark
-        for r in (radius - away, radius + away)
-    )
+    rims = (circle[:2] + r * unit for r in (radius - away, radius + away))
+    inside, outside = (_sampled(plane, rim[:, :1], rim[:, 1:], step)[:, 0] - dark for rim in rims)
     if (outside < FALLEN * inside).mean() < MOST:
         return None
     # points along the limb are as independent as they are far apart
@@ -160,13 +160,12 @@ def _circle(plane: np.ndarray, points: np.ndarray, extent: float, dark: float) -
 def _sampled(plane: np.ndarray, x: np.ndarray, y: np.ndarray, step: float) -> np.ndarray:
     """The light at places x, y (n, m) px, smoothed over a step; NaN outside of the plane."""
     left, top = max(int(x.min()) - 8, 0), max(int(y.min()) - 8, 0)
-    part = plane[top : max(int(y.max()) + 9, 0), left : max(int(x.max()) + 9, 0)].astype(np.float32)
-    if not part.size:
+    raw = plane[top : max(int(y.max()) + 9, 0), left : max(int(x.max()) + 9, 0)].astype(np.float32)
+    if not raw.size:
         return np.full(x.shape, np.nan)
-    part = cv2.GaussianBlur(part, (0, 0), max(0.7, step))
-    light = cv2.remap(
-        part, (x - left).astype(np.float32), (y - top).astype(np.float32), cv2.INTER_LINEAR
-    ).astype(float)
+    part = cv2.GaussianBlur(raw, (0, 0), max(0.7, step))
+    places = (x - left).astype(np.float32), (y - top).astype(np.float32)
+    light = np.asarray(cv2.remap(part, *places, cv2.INTER_LINEAR), float)
     rows, columns = plane.shape
     light[(x < 1) | (y < 1) | (x > columns - 2) | (y > rows - 2)] = np.nan
     return light
@@ -201,6 +200,8 @@ def _glow(plane: np.ndarray, middle: np.ndarray, extent: float, dark: float, hei
         found.append((left + columns.mean(), top + rows.mean(), np.sqrt(area / np.pi)))
     x, y, radii = np.array(found).T
     radius = float(radii[0])
+    if radii[-1] < HALO * radius:
+        return None
     off = np.hypot(x - x[0], y - y[0])
     if (
         radius < LEAST_PX

@@ -6,6 +6,7 @@ reverse of the fix: there the level is known and A4, which holds the place, is f
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -122,7 +123,7 @@ def attitudes_at(
     terms: Iterable[ErrorTerm],
     deflected: tuple[np.ndarray, np.ndarray],
     axis_stddev: float = 0.0,
-) -> dict[str, Attitude]:
+) -> dict[str, Any]:
     """The base link by the plumb line, by the ellipsoid, and level by the first with north by the second.
 
     g (3, 3): C into east, north, up by the plumb line.  terms: their factors are rotations (3, m) about these.

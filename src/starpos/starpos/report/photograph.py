@@ -61,5 +61,5 @@ def _drawn(frame: Frame, xy: np.ndarray, shot: Shot) -> np.ndarray:
         mid_unix_s=shot.utc_unix_s if np.isfinite(shot.utc_unix_s) else None,
     )
     return annotate(
-        frame, stars, Identified(range(n), [shot.names[k] for k in order], shot.magnitudes[order])
+        frame, stars, Identified(range(n), [shot.names[k] for k in order], shot.magnitudes[order].tolist())
     )

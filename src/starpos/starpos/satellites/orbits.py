@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from starpos.earth.gravity import SPIN, geodetic_place
-from starpos.earth.orientation import ROTATION_RAD_S, SPEED_OF_LIGHT, earth_state, later
+from starpos.earth.orientation import SPEED_OF_LIGHT, earth_state, later
 from starpos.earth.refraction import MIN_COS_ZENITH, STANDARD_PRESSURE_PA, Atmosphere
 from starpos.frozen import at_once
 from starpos.rotation import normalised, unit_vector
@@ -47,15 +47,6 @@ class Moments:
         )
         gcrs_to_itrs, teme, velocity = (column[index.ravel()] for column in columns)
         return cls(utc_unix_s=utc_unix_s, gcrs_to_itrs=gcrs_to_itrs, teme_to_gcrs=teme, velocity=velocity)
-
-    def of(self, which: np.ndarray) -> "Moments":
-        """Some of the times."""
-        return Moments(
-            utc_unix_s=self.utc_unix_s[which],
-            gcrs_to_itrs=self.gcrs_to_itrs[which],
-            teme_to_gcrs=self.teme_to_gcrs[which],
-            velocity=self.velocity[which],
-        )
 
     def site(self, place: np.ndarray, seconds: float) -> tuple[np.ndarray, np.ndarray]:
         """GCRS positions and velocities (E, 3) of a place (3,) in ITRS, m, that many seconds after the times."""
@@ -113,8 +104,3 @@ def along_axes(r: np.ndarray, v: np.ndarray) -> np.ndarray:
     radial = normalised(r)
     across = normalised(np.cross(r, v))
     return np.stack([radial, np.cross(across, radial), across], 1)
-
-
-def rotating(v: np.ndarray, r: np.ndarray) -> np.ndarray:
-    """Velocities (..., 3) relative to axes that turn with the Earth."""
-    return v - ROTATION_RAD_S * np.stack([-r[..., 1], r[..., 0], np.zeros_like(r[..., 2])], -1)

@@ -75,7 +75,7 @@ def body_at(name: str, state: EarthState) -> Body:
         radius, sigma_arcsec = SUN_RADIUS_ARCSEC * ARCSEC / distance_au, SUN_ARCSEC
     else:
         _, heliocentric_arcsec, radius_arcsec = PLANETS[name]
-        from_sun_au = np.linalg.norm(seen + observer - _barycentric_au(SUN, days - delay))
+        from_sun_au = float(np.linalg.norm(seen + observer - _barycentric_au(SUN, days - delay)))
         radius = radius_arcsec * ARCSEC / distance_au
         sigma_arcsec = heliocentric_arcsec * from_sun_au / distance_au
     return Body(name, apparent @ state.gcrs_to_itrs.T, distance_m, radius, float(sigma_arcsec * ARCSEC))

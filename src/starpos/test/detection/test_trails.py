@@ -44,7 +44,7 @@ def off(trail, truth):
 
 def test_errors_of_both_ends_are_as_claimed():
     rng, chi2 = np.random.default_rng(3), []
-    for seed in range(12):
+    for seed in range(8):
         angle, x, y = rng.uniform(0, np.pi), rng.uniform(100, 380), rng.uniform(90, 230)
         dx, dy = 40 * np.cos(angle), 40 * np.sin(angle)
         truth = (x - dx, y - dy, x + dx, y + dy, 60 * 10 ** rng.uniform(0, 1))
@@ -53,8 +53,8 @@ def test_errors_of_both_ends_are_as_claimed():
         chi2.append(error @ np.linalg.solve(trail.covariance, error))
         assert trail.steady and not trail.cut.any()
         assert np.sqrt(np.trace(trail.covariance)) < 1.6
-    # of 48 numbers: 4 each, +- 3 standard deviations of the mean
-    assert 2.0 < np.mean(chi2) < 6.5
+    # of 32 numbers: 4 each, +- 3 standard deviations of the mean
+    assert 1.5 < np.mean(chi2) < 7.0
 
 
 def test_a_star_over_an_end_widens_that_end_alone():
