@@ -158,7 +158,8 @@ def _axes(circles_of: CirclesOf, given: Calibration, ray: np.ndarray, site: Plac
         first = Directions.of(sorted(circles_of(given.a3), key=lambda c: c.utc_unix_s))
         tried = sorted(starts(first), key=lambda z: float(np.median(np.abs(first.residual(z)[0]))))
         zeniths = [*_round(first), *tried[:TRIED]]
-    found = [_fitted(circles_of, given, ray, zenith, site and site.plumb_stddev) for zenith in zeniths]
+    sigma = None if site is None else site.plumb_stddev
+    found = [_fitted(circles_of, given, ray, zenith, sigma) for zenith in zeniths]
     if not any(found):
         raise FixError(
             "the elevations do not determine A3: check the tilts, the clock and that nothing was moved"
@@ -313,7 +314,7 @@ def _fitted(
     zenith_sigma: float | None,
 ) -> FoundAxis | None:
     """The answer near a zenith; None if it does not converge."""
-    a3, frames, now = given.a3, 0, None
+    a3, frames = given.a3, 0
     for _ in range(RELINEARISED):
         circles = sorted(circles_of(a3), key=lambda c: c.utc_unix_s)
         # some frames cannot have that axis

@@ -173,7 +173,7 @@ def tell_unknown(command: str, args: argparse.Namespace, deflection: Deflection)
 
 
 def axes_of(args: argparse.Namespace) -> dict[str, tuple[float, ...]]:
-    """Names and unit vectors in C of the optical axis and of those of --axis; raises InstrumentError."""
+    """Names and unit vectors in C of the optical axis and of each --axis; raises InstrumentError."""
     axes: dict[str, tuple[float, ...]] = {"optical axis": OPTICAL_AXIS}
     for name, *xyz in args.axis:
         try:

@@ -116,7 +116,7 @@ def _is_meteor_stack(primary: Mapping) -> bool:
 
 
 def _of_meteor_stack(header: Mapping, primary: Mapping, place: str) -> dict[str, Any]:
-    """The header of a stack of video frames as that of one exposure, as far as its times can be read."""
+    """The header of a stack of video frames as the header of one exposure, as far as its times can be read."""
     made = {key: value for key, value in header.items() if key != "NFRAMES"}
     with suppress(TypeError, ValueError, ZeroDivisionError):
         made.setdefault("EXPTIME", float(primary["NFRAMES"]) / float(primary["FPS"]))

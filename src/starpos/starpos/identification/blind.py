@@ -56,7 +56,8 @@ MAX_JUDGED = 40
 SURE = 6 * MIN_LOG_ODDS
 # of a search at once
 THREADS = 2
-Item, Result = TypeVar("Item"), TypeVar("Result")
+Item = TypeVar("Item")
+Result = TypeVar("Result")
 
 
 @at_once

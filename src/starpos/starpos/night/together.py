@@ -270,7 +270,7 @@ def from_elevations(
     found = Elevations(tuple(circles), together, axis)
     if self_calibrate or axis is not None or not remarks.beyond_stated(together.average):
         return found
-    # residuals beyond the stated errors may be those of a wrong A3, which no scatter covers
+    # residuals beyond the stated errors may come from a wrong A3, which no scatter covers
     given = solver.instrument.calibration
     free = from_elevations(solver, pointings, tilts, near, self_calibrate=True)
     if free.axis is None or free.axis.directions < MIN_JUDGED or free.axis.sigma_from(given) < DENIED_SIGMA:

@@ -29,7 +29,7 @@ class CameraSolver:
         make: Callable[[Camera], Solver],
         changed: Callable[[], None],
         jobs: Jobs,
-        say: Callable[[str], None],
+        say: Callable[[str], object],
         topic: str,
     ) -> None:
         self.camera: Camera | None = None
