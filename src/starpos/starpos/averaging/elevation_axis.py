@@ -314,7 +314,7 @@ def _fitted(
     zenith_sigma: float | None,
 ) -> FoundAxis | None:
     """The answer near a zenith; None if it does not converge."""
-    a3, frames = given.a3, 0
+    a3, frames, now = given.a3, 0, None
     for _ in range(RELINEARISED):
         circles = sorted(circles_of(a3), key=lambda c: c.utc_unix_s)
         # some frames cannot have that axis
@@ -328,6 +328,7 @@ def _fitted(
         a3, zenith = now.a3, now.zenith
         if np.linalg.norm((a3 - before) @ ray) < SAME_AXIS_RAD:
             break
+    assert now is not None
     spread = np.linalg.inv(now.matrix)
     told = len(spread) - float(np.trace(now.prior @ spread[:2, :2]))
     number = len(problem.part.circles)
