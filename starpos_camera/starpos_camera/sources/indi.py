@@ -77,9 +77,9 @@ class IndiServer:
                 concurrent.futures.wait([future], BEAT_S)
         except RuntimeError:
             # The loop has ended.
-            watched.close()
             future = None
         if future is None or not future.done() or future.cancelled():
+            watched.close()
             work.close()
             raise CaptureError("the connection to the INDI server was closed; the frame is given up.")
         return future.result()
@@ -94,6 +94,9 @@ class IndiServer:
             leaving.close()
             return
         self._thread.join(2 * LEAVE_S)
+        # a loop that ended meanwhile has not begun it
+        if not self._thread.is_alive():
+            leaving.close()
 
     @property
     def connected(self) -> bool:
