@@ -234,9 +234,13 @@ def is_module(package: str, names: str) -> bool:
         del parts[0]
     # What a package offers it may have from elsewhere.
     if place.is_dir():
-        home = re.search(rf'"{parts[0]}": "([\w.]+)"', (place / "__init__.py").read_text()) if parts else None
+        stub = place / "__init__.pyi"
+        offered = (place / "__init__.py").read_text() + (stub.read_text() if stub.is_file() else "")
+        home = (
+            re.search(rf"(?m)^from {place.name}\.([\w.]+) import {parts[0]} as", offered) if parts else None
+        )
         if home and len(parts) > 1:
             return is_module(package, f".{home[1]}.{'.'.join(parts)}")
-        return all(re.search(rf"\b{part}\b", (place / "__init__.py").read_text()) for part in parts)
+        return all(re.search(rf"\b{part}\b", offered) for part in parts)
     made = r"(?m)^ *(?:(?:def|class) {0}\b|{0}:|[\w, ]*\b{0}\b[\w, ]*(?::[^=\n]+)?=)"
     return all(re.search(made.format(part), place.read_text()) for part in parts)

@@ -56,6 +56,9 @@ ALLOWED = {
     },
     # of the package's own files
     "starpos/parameters/table.py": {"yaml.load", "yaml.SafeLoader"},
+    "starpos/cli/commands.py": {"yaml.load", "yaml.SafeLoader"},
+    # of MOST_BYTES, without declarations
+    "starpos/satellites/elements.py": {"xml"},
 }
 # Who reads a file whole, or a table, and what bounds it: a limit, or that it came with the package.
 READS_WHOLE = {
@@ -71,6 +74,10 @@ READS_WHOLE = {
     "starpos/frames/tables.py": "MAX_CSV_BYTES",
     "starpos/sky/tycho2.py": "of the package",
     "starpos/parameters/table.py": "of the package",
+    "starpos/cli/commands.py": "of the package",
+    "starpos/cli/demo.py": "what it has written",
+    "starpos/averaging/sights.py": "of the package",
+    "starpos/instrument/phone_log.py": "texts that are unpacked within a limit",
     "starpos_bringup/bag.py": "installed messages",
     "starpos_dashboard/server.py": "of the package",
     "starpos_inclinometer/sources/iio_device.py": "an attribute of the kernel is a page at most",

@@ -61,8 +61,11 @@ def alarm_of(night: Kept) -> str:
 
 def check_page(path: Path) -> None:
     """Raise InstrumentError if a file that is there is no such page."""
-    if path.exists() and TITLE.encode() not in path.read_bytes()[:200]:
-        raise InstrumentError(f"{path}: it is not a page of --watch: give another name, or remove it")
+    if not path.exists():
+        return
+    with path.open("rb") as page:
+        if TITLE.encode() not in page.read(200):
+            raise InstrumentError(f"{path}: it is not a page of --watch: give another name, or remove it")
 
 
 def write_page(path: Path, nights: Sequence[Kept]) -> None:

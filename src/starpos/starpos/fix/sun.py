@@ -39,7 +39,7 @@ SIZE_SHARE, SIZE_PX, WIDEST_GLOW = 0.06, 1.0, math.radians(10.0)
 LIMB_SIGMAS, GLOW_SIGMAS = 5.3, 3.5
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Seen:
     """A disc as a direction: ray (3,) in C, its change (3, 2) by a px, and its radius, rad.
 
@@ -170,7 +170,7 @@ def _on_circle(
     return Solution.of(stars, text, circle=circle, tilt=tilt, bodies=(SUN,))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _Adjusted:
     """An attitude by two directions, a body's and up, each in two components across it, of which one is superfluous.
 
@@ -186,7 +186,7 @@ class _Adjusted:
 OF_UP = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class _TwoDirections:
     """A body seen where the level says it is, and where the ephemeris does; components are sideways and upwards.
 

@@ -52,7 +52,7 @@ class NightPose:
         return total_covariance(terms)[3:, 3:]
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Kept:
     """A night's pose against the poses before it since the last knock.
 

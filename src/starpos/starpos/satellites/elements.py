@@ -161,6 +161,9 @@ def _orbits(text: str) -> Iterator[Orbit | str]:
         rows = json.loads(text)
         yield from _from_omm(rows if isinstance(rows, list) else [rows])
     elif start.startswith("<"):
+        # an entity may unfold to more than memory holds
+        if "<!DOCTYPE" in text or "<!ENTITY" in text:
+            raise ValueError("its XML declares a type or entities")
         yield from _from_omm(_xml_rows(ET.fromstring(text)))
     elif start.startswith("CCSDS_OEM_VERS"):
         yield from _from_oem(text)

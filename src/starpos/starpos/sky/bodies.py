@@ -13,6 +13,7 @@ import numpy as np
 from starpos import rotation
 from starpos.earth.ellipsoid import EQUATOR_RADIUS_M, ground_m
 from starpos.earth.orientation import EarthState, station_velocity
+from starpos.frozen import at_once
 from starpos.units import ARCSEC
 
 SUN, MOON = "sun", "moon"
@@ -34,6 +35,7 @@ LIGHT_DAYS_PER_AU = erfa.AULT / erfa.DAYSEC
 LIGHT_ROUNDS = 3
 
 
+@at_once
 @dataclass(frozen=True)
 class Body:
     """A body as it is seen from the Earth's centre at one time.

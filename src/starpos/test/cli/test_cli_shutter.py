@@ -94,4 +94,4 @@ def test_a_shutter_that_opens_late_moves_the_place_west_and_its_error_is_in_the_
 def test_a_shutter_is_no_matter_of_pointings(tmp_path, capsys):
     for option in ("--readout", "--shutter-delay"):
         assert main(["solve", "--pointings", str(tmp_path / "p.csv"), option, "0.1", "0"]) == 2
-        assert "for frames" in capsys.readouterr().err
+        assert "do not go together" in capsys.readouterr().err

@@ -47,7 +47,7 @@ def test_a_folder_of_pictures_without_a_focal_length_is_a_night(pictures, run):
     assert status == 0 and together["frames"] == 2
     assert abs(together["latitude"] - PLACE["latitude"]) * 111e3 < 4 * together["sigma_north_m"]
     # said of one of the two frames
-    assert sum("no focal length is stated: its stars give" in line for line in errors) == 1
+    assert sum("its stars give" in line for line in errors) == 1
 
 
 @pytest.mark.parametrize("command", [("solve",), ("report", "-o", "OUT"), ("calibrate", "--camera", "OUT")])
