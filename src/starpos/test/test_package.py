@@ -35,8 +35,8 @@ def test_a_wheel_is_tested_by_what_is_there():
 
 def test_who_made_the_data_is_said():
     said = (REPOSITORY / "REUSE.toml").read_text()
-    # rows of parameters and of data sheets are this project's own, and each file says so
-    own = {PACKAGE / "starpos" / room / "data" for room in ("instrument", "parameters")}
+    # rows of commands, parameters and data sheets are this project's own, and each file says so
+    own = {PACKAGE / "starpos" / room / "data" for room in ("cli", "instrument", "parameters")}
     for data in {*PACKAGE.glob("starpos/*/data")} - own:
         assert f'"{data.relative_to(REPOSITORY).as_posix()}/**"' in said
 
