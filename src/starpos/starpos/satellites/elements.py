@@ -186,8 +186,10 @@ def _class_of(name: str, per_day: float) -> OrbitErrors:
 def _of_record(number: int, name: str, record: Any) -> Orbit | str:
     from sgp4.api import SGP4_ERRORS
 
-    if record.error:
-        return f"satellite {number}: {SGP4_ERRORS[record.error]}"
+    # old versions leave `record.error` undefined before the first state
+    error, _, _ = record.sgp4(record.jdsatepoch, record.jdsatepochF)
+    if error:
+        return f"satellite {number}: {SGP4_ERRORS[error]}"
     epoch = (record.jdsatepoch - UNIX_EPOCH_JD + record.jdsatepochF) * DAY_S
     per_day = record.no_kozai * 1440 / (2 * math.pi)
     if not (math.isfinite(epoch) and 0 < per_day < 20):
