@@ -29,7 +29,7 @@ FIELDS = [(1.2, 11.0), (2.0, 11.0), (5.0, 9.5), (13.0, 7.5), (30.0, 6.0), (55.0,
 
 @pytest.fixture(scope="module")
 def solver(catalogue):
-    """With time enough on a busy machine, where a second of CPU does less."""
+    """The search has time enough on a busy machine, where a second of CPU does less."""
     return BlindSolver(catalogue, search_s=40.0)
 
 
