@@ -4,6 +4,7 @@ level is needed: only refraction and the diurnal aberration depend on the zenith
 """
 
 import math
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -47,16 +48,16 @@ STEP_REFRACTION = 0.01
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class FrameUnderWay(Sighting):
+class FrameUnderWay(Sighting, ABC):
     """A sighting whose attitude is computed again under each zenith that is tried."""
 
     def rough(self) -> Attitude:
         """The attitude as it is without a place."""
         return roughly(self.camera.rotation)
 
+    @abstractmethod
     def under(self, zenith: np.ndarray, atmosphere: Atmosphere) -> Attitude:
         """The attitude under a zenith (3,) in ITRS; FixError where it has none."""
-        raise NotImplementedError
 
 
 @at_once
