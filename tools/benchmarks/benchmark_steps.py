@@ -23,6 +23,7 @@ from table import Cost, Row, by_turns, spent_ms
 
 from starpos.averaging.average import average
 from starpos.cli import main as starpos
+from starpos.cli.demo import KNOWN
 from starpos.earth.orientation import earth_state
 from starpos.earth.refraction import Atmosphere
 from starpos.fix.fix import Fix, solve_fix
@@ -164,18 +165,8 @@ def night(folder: Path) -> tuple[str, ...]:
     optics = ("--focal-mm", "600", "--pixel-um", "6.4")
     starpos(["simulate", str(folder / "night"), "-n", "1", "--stars-only", *optics])
     [stars] = (folder / "night").glob("stars_*.csv")
-    mounting = (
-        "--misalignment",
-        "0",
-        "0",
-        "0",
-        "--misalignment-stddev",
-        "5",
-        "--inclinometer",
-        "sca100t_calibrated",
-    )
     tilt = ("--tilt", str(folder / "night" / "tilt.csv"))
-    return ("solve", str(stars), *tilt, *optics, *mounting, "--json")
+    return ("solve", str(stars), *tilt, *optics, *KNOWN, "--json")
 
 
 def starts(options) -> Iterator[Row]:
