@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The driver of a night: frames solved one by one, by turning or compared with GNSS; failures and remarks."""
 
+import pickle
 import re
 from dataclasses import replace
 
@@ -266,3 +267,11 @@ def test_an_unknown_a3_is_no_calibration_worth_saving(still):
     solver = Solver(unknown, still.work.solver(still.stars[0]).catalogue, AIR)
     sights = [searching.answer_frame(solver, searching.Question(item=s, stars=s)) for s in still.stars]
     assert not turned(solver, sights, still.work.tilts, 180.0).worth_saving
+
+
+def test_a_worker_is_not_sent_the_solver_and_its_catalogue(catalogue, rng):
+    stars = random_stars(9, rng)
+    work = Solving(Instruments(Instrument(FOCAL_PX)))
+    before = len(pickle.dumps(work))
+    assert work.solver(stars) is work.solver(stars)
+    assert len(pickle.dumps(work)) == before

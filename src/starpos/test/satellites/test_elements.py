@@ -70,6 +70,19 @@ def test_a_broken_line_costs_its_satellite_alone(tmp_path):
     assert "3 are left out" in sentence
 
 
+def test_an_orbit_inside_the_earth_costs_its_satellite_alone(tmp_path):
+    rows = [FIELDS | {"MEAN_MOTION": 17.9, "ECCENTRICITY": 0.2, "NORAD_CAT_ID": 7}, FIELDS]
+    (tmp_path / "a.json").write_text(json.dumps(rows))
+    (orbit,), (sentence,) = read_orbits(tmp_path / "a.json")
+    assert orbit.number == 123456 and "satellite 7: " in sentence
+
+
+def test_xml_that_declares_entities_is_not_unfolded(tmp_path):
+    (tmp_path / "a.xml").write_text(f'<!DOCTYPE x [<!ENTITY a "aaaa">]>{xml(FIELDS)}')
+    with pytest.raises(SatelliteError, match="declares a type or entities"):
+        read_orbits(tmp_path / "a.xml")
+
+
 @pytest.mark.parametrize("text", ["", "hello\nworld\n", "[1, 2", "<ndm>", "{}", "CCSDS_OEM_VERS = 2.0\n"])
 def test_a_file_without_orbits_is_refused(tmp_path, text):
     (tmp_path / "x").write_text(text)
