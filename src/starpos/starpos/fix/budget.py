@@ -83,6 +83,16 @@ def link_attitude(link_to_enu: np.ndarray, terms: tuple[ErrorTerm, ...]) -> Atti
     return Attitude(link_to_enu, total_covariance(terms)[3:, 3:], of=LINK, into=ENU, terms=terms)
 
 
+def lens_term(stars: np.ndarray, camera: np.ndarray, mounting: Mounting) -> tuple[ErrorTerm, ...]:
+    """The error of directions in C by an unknown lens, new at each pose; empty if there is none.
+
+    stars (r, 3): an ErrorTerm's rows for a small rotation of the sky about L's axes.  camera (3, 3): C into L.
+    """
+    if not mounting.lens_stddev_rad:
+        return ()
+    return (ErrorTerm("lens", stars @ camera[:, :2] * mounting.lens_stddev_rad, shared=EACH_POSE),)
+
+
 def mount_term(name: str, link_to_enu: np.ndarray, stddev: float) -> tuple[ErrorTerm, ...]:
     """The error of the base link against the sky that the camera sees, stddev rad about each axis; empty if that is 0."""
     if not stddev:
@@ -158,6 +168,7 @@ def error_terms(
         *tilt_terms(sensitivity.level, level, tilt, mounting, earth.utc_unix_s),
         ErrorTerm("refraction", (sensitivity.stars @ refraction_rotation)[:, None], shared=ALWAYS),
         ErrorTerm("shutter", sensitivity.stars @ shutter_rotation, shared=ALWAYS, constant_within_pose=True),
+        *lens_term(sensitivity.stars, level.camera, mounting),
         *time_terms(latitude, earth, clock_stddev_s, stamp_stddev_s),
     )
 

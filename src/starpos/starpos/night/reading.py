@@ -64,13 +64,14 @@ def stars_of(item: Frame | Stars) -> Stars:
 
 @dataclass(frozen=True)
 class About:
-    """Frame size, focal length and place on the sensor in px, and gravity, as the first frame of a night states them."""
+    """Frame size, focal length, place on the sensor in px, gravity and upper edge, as a first frame states them."""
 
     width: int
     height: int
     focal_px: float | None
     origin_px: tuple[float, float] | None = None
     gravity: Gravity | None = None
+    upper_edge: tuple[int, int] | None = None
 
 
 # for pointings only the camera's axes count
@@ -93,7 +94,9 @@ class First:
             with suppress(FrameError):
                 item = self.read(path)
                 self.read.keep(path, item)
-                about = About(item.width, item.height, item.focal_px, item.origin_px, item.gravity)
+                about = About(
+                    item.width, item.height, item.focal_px, item.origin_px, item.gravity, item.upper_edge
+                )
                 if not self.levelled or item.gravity is not None:
                     return about
                 first = first or about
