@@ -15,7 +15,7 @@ from catkin_pkg.package_version import get_forthcoming_label, rename_section
 ROOT = Path(__file__).parents[1]
 FOLDERS = sorted(p.parent for folder in (ROOT, ROOT / "src") for p in folder.glob("*/package.xml"))
 PYTHON = [f for f in FOLDERS if (f / "setup.py").is_file()]
-# rosdep's, of modules that are no ROS package.
+# Keys of modules that are no ROS package, each in rosdep's list (rosdep/python.yaml of ros/rosdistro).
 KEYS = {
     "astropy": "python3-astropy",
     "astropy_iers_data": "python3-astropy",
@@ -26,7 +26,6 @@ KEYS = {
     "pytest": "python3-pytest",
     "scipy": "python3-scipy",
     "serial": "python3-serial",
-    "sgp4": "python3-sgp4",
     "tornado": "python3-tornado",
     "yaml": "python3-yaml",
 }
@@ -34,7 +33,7 @@ KEYS = {
 # module of ours that cannot do without is one of them
 OPTIONAL = {
     "PIL", "alpaca", "alpaca_simulators", "argcomplete", "dask", "distributed", "exifread", "fastjsonschema",
-    "gi", "gphoto2", "indipyclient", "lz4", "pillow_heif", "rawpy", "requests", "rosbags", "selenium",
+    "gi", "gphoto2", "indipyclient", "lz4", "pillow_heif", "rawpy", "requests", "rosbags", "selenium", "sgp4",
     "starpos_camera.sources.alpaca_http", "starpos_testing.skies.bags", "starpos_testing.skies.robots", "urllib3",
 }  # fmt: skip
 # Modules next to the tests.
