@@ -64,7 +64,6 @@ ALLOWED = {
 READS_WHOLE = {
     "starpos/earth/orientation.py": "the table of the Earth's rotation that astropy brings",
     "starpos/parallel/cluster.py": "our own source",
-    "starpos/identification/paper.py": "of the package",
     "starpos/sky/catalogue.py": "of the package, and the checksum of its table of parallaxes",
     "starpos/report/coast.py": "of the package",
     "starpos/night/field.py": "MAX_BYTES",
