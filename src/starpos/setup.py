@@ -72,7 +72,6 @@ setup(
         "raw": ["rawpy", "exifread>=3"],
         "heif": ["pillow-heif", "exifread>=3"],
         "report": ["matplotlib", "rosbags>=0.11"],
-        "cluster": ["distributed"],
         "completion": ["argcomplete"],
         "test": ["pytest"],
     },
