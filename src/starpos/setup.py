@@ -41,7 +41,7 @@ class BuildCompiled(build_ext):
         super().build_extensions()
 
 
-# What colcon needs stands here, because it builds with links next to this file alone. All else that is said of the package
+# What colcon needs stands here, because it builds with links to this file alone. All else that is said of the package
 # is in pyproject.toml.
 setup(
     name=package,
