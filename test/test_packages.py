@@ -32,7 +32,7 @@ KEYS = {
 # Only PyPI has them, or brings them with these, or apt for one Python (gi), and the code says so where one is absent; a
 # module of ours that cannot do without is one of them
 OPTIONAL = {
-    "PIL", "alpaca", "alpaca_simulators", "argcomplete", "dask", "distributed", "exifread", "fastjsonschema",
+    "PIL", "alpaca", "alpaca_simulators", "argcomplete", "exifread", "fastjsonschema",
     "gi", "gphoto2", "indipyclient", "lz4", "pillow_heif", "rawpy", "requests", "rosbags", "selenium", "sgp4",
     "starpos_camera.sources.alpaca_http", "starpos_testing.skies.bags", "starpos_testing.skies.robots", "urllib3",
 }  # fmt: skip
@@ -90,7 +90,9 @@ def test_setup_py_says_what_the_manifest_says(folder):
 @pytest.mark.parametrize("folder", FOLDERS, ids=lambda folder: folder.name)
 def test_the_address_of_a_manifest_receives_no_mail(folder):
     """ROS wants one; the issue tracker is where people write, and a made-up address would lose what they send."""
-    assert {m.email.partition("@")[2] for m in parse_package(folder).maintainers} == {"users.noreply.github.com"}
+    assert {m.email.partition("@")[2] for m in parse_package(folder).maintainers} == {
+        "users.noreply.github.com"
+    }
 
 
 def imports(tree: ast.AST) -> Iterator[tuple[str, bool]]:

@@ -33,7 +33,6 @@ OPTIONAL = {
     "exifread": ("exifread", "times and lenses of photographs"),
     "sgp4": ("sgp4", "starpos satellites"),
     "pillow_heif": ("pillow-heif", "HEIF pictures of phones"),
-    "distributed": ("distributed", "--scheduler"),
     "argcomplete": ("argcomplete", "completion of commands and options by the Tab key"),
 }
 # OpenCV is one package of several
