@@ -62,7 +62,6 @@ ALLOWED = {
 # Who reads a file whole, or a table, and what bounds it: a limit, or that it came with the package.
 READS_WHOLE = {
     "starpos/earth/orientation.py": "the table of the Earth's rotation that astropy brings",
-    "starpos/identification/paper.py": "of the package",
     "starpos/sky/catalogue.py": "of the package, and the checksum of its table of parallaxes",
     "starpos/report/coast.py": "of the package",
     "starpos/night/field.py": "MAX_BYTES",
