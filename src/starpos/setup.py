@@ -21,7 +21,9 @@ COMPILED = [
         depends=[*SHARED, "setup.py"],
         # else the loader takes the oldest exp, which is slow
         libraries=[] if WINDOWS else ["m"],
-        extra_compile_args=["/O2", "/clang:-fno-math-errno"] if WINDOWS else ["-O3", "-g0", "-fno-math-errno"],
+        extra_compile_args=["/O2", "/clang:-fno-math-errno"]
+        if WINDOWS
+        else ["-O3", "-g0", "-fno-math-errno"],
     )
     for source in [*sorted(glob("starpos/*/*.pyx")), *(["starpos/_numeric/_views.c"] if VIEWS else [])]
 ]
