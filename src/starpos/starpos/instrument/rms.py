@@ -351,7 +351,7 @@ def _angles(v: np.ndarray) -> tuple[float, float]:
 
 
 def _seen_pointing(reference: np.ndarray, jd: float, latitude: float, longitude: float) -> np.ndarray:
-    """Right ascension, declination, position angle (3,) with which RMS works at the time of a platepar that has `reference`."""
+    """The right ascension, declination, position angle (3,) with which RMS works, for `reference` in a platepar."""
     ra, dec, angle = reference
     before = _refracted(rotation.unit_vector(ra, dec)[None], jd, latitude, longitude)[0]
     turn = _precession(jd, J2000_JD)
@@ -368,7 +368,7 @@ def _seen_pointing(reference: np.ndarray, jd: float, latitude: float, longitude:
 
 
 def _reference(seen: np.ndarray, jd: float, latitude: float, longitude: float) -> np.ndarray:
-    """What a platepar has to hold (3,) so that RMS works with the right ascension, declination and position angle `seen`."""
+    """The right ascension, declination, position angle (3,) of a platepar with which RMS works with `seen`."""
     found = seen.copy()
     for _ in range(ROUNDS):
         off = rotation.half_turns(seen - _seen_pointing(found, jd, latitude, longitude))
