@@ -29,7 +29,7 @@ UTC, LATITUDE, LONGITUDE = 1.72e9, 0.8, 0.3
 
 
 def seen_with(camera, altitude_deg):
-    """What pixels of a camera that looks to azimuth 200 deg show under RMS's own sky, above 20 deg of altitude."""
+    """Pixels of a camera facing azimuth 200 deg, and the places that they show above 20 deg under RMS's own sky."""
     xy = np.stack(
         np.meshgrid(np.linspace(100, camera.width - 100, 12), np.linspace(60, camera.height - 60, 12)), -1
     )
