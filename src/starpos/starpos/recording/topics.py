@@ -157,12 +157,14 @@ class _Topics:
         return topic
 
 
-STARS, SOLUTION = (f"{PACKAGE}/msg/{name}" for name in ("StarArray", "Solution"))
+STARS, SOLUTION, TRAILS = (f"{PACKAGE}/msg/{name}" for name in ("StarArray", "Solution", "TrailArray"))
 # types by the relative names of the solver's inputs
 NAV_SAT_FIX = "sensor_msgs/msg/NavSatFix"
 INPUTS = {"stars": STARS, "tilt": TILT, "camera/camera_info": CAMERA_INFO}
 # further inputs, with gnss.use
 GNSS = {"gnss/fix": NAV_SAT_FIX}
+# further inputs, with satellites.elements
+SATELLITES = {"trails": TRAILS}
 
 
 @dataclass(frozen=True)
