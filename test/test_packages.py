@@ -33,7 +33,7 @@ KEYS = {
 # Only PyPI has them, or brings them with these, or apt for one Python (gi), and the code says so where one is absent; a
 # module of ours that cannot do without is one of them
 OPTIONAL = {
-    "PIL", "alpaca", "alpaca_simulators", "argcomplete", "dask", "distributed", "exifread", "fastjsonschema",
+    "PIL", "alpaca", "alpaca_simulators", "argcomplete", "exifread", "fastjsonschema",
     "gi", "gphoto2", "indipyclient", "lz4", "pillow_heif", "rawpy", "requests", "rosbags", "selenium",
     "starpos_camera.sources.alpaca_http", "starpos_testing.skies.bags", "starpos_testing.skies.robots", "urllib3",
 }  # fmt: skip

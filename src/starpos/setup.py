@@ -10,7 +10,7 @@ from setuptools.command.build_ext import build_ext
 package = "starpos"
 # the code of views of arrays, which Cython from 3.1 on need not put into each module: that halves the time of a build
 VIEWS = f"{package}._numeric._views" if tuple(map(int, version("cython").split(".")[:2])) >= (3, 1) else None
-# a compiled module is a .pyx beside the Python that calls it; what several of them share is in .pxd
+# a compiled module is a .pyx next to the Python that calls it; what several of them share is in .pxd
 SHARED = sorted(glob("starpos/*/*.pxd"))
 COMPILED = [
     Extension(
@@ -41,7 +41,7 @@ class BuildCompiled(build_ext):
         super().build_extensions()
 
 
-# What colcon needs stands here, because it builds with links beside this file alone. All else that is said of the package
+# What colcon needs stands here, because it builds with links to this file alone. All else that is said of the package
 # is in pyproject.toml.
 setup(
     name=package,
@@ -72,7 +72,6 @@ setup(
         "raw": ["rawpy", "exifread>=3"],
         "heif": ["pillow-heif", "exifread>=3"],
         "report": ["matplotlib", "rosbags>=0.11"],
-        "cluster": ["distributed"],
         "completion": ["argcomplete"],
         "test": ["pytest"],
     },

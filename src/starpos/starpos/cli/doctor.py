@@ -32,7 +32,6 @@ OPTIONAL = {
     "rawpy": ("rawpy", "raw files of cameras"),
     "exifread": ("exifread", "times of raw and HEIF files"),
     "pillow_heif": ("pillow-heif", "HEIF pictures of phones"),
-    "distributed": ("distributed", "--scheduler"),
     "argcomplete": ("argcomplete", "completion of commands and options by the Tab key"),
 }
 # OpenCV is one package of several

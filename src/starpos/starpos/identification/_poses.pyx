@@ -99,21 +99,6 @@ cdef void _fit_alone(
     _fit(xy, w, sigma, star, near, n, steps, small_step, attitude, focal)
 
 
-def fitted(
-    const double[:, ::1] xy, const double[:, ::1] w, const double[::1] sigma_px, attitude, double focal_px, int steps,
-    double small_step,
-):
-    """Fit attitude (3, 3) and focal length to pixels xy (N, 2), with errors sigma_px (N,), of directions w (N, 3)."""
-    cdef int n = xy.shape[0]
-    both = np.arange(n)
-    out = np.array(attitude, float)
-    cdef Py_ssize_t[::1] rows = both
-    cdef double[:, ::1] turned_to = out
-    if n > 0:
-        _fit(&xy[0, 0], &w[0, 0], &sigma_px[0], &rows[0], &rows[0], n, steps, small_step, &turned_to[0, 0], &focal_px)
-    return out, focal_px
-
-
 cdef class Chances:
     """What `weighed` reckons with.
 
