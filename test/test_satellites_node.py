@@ -68,7 +68,7 @@ class Dusk:
         on = np.flatnonzero(ahead & ((pixels > 20) & (pixels < size - 20)).all((1, 2)))
         trails = [
             FrameTrail(
-                # which end is first is not told
+                # which end is first is unknown
                 ends=(pixels[k] + self.rng.normal(0, SIGMA_PX, (2, 2)))[:: self.rng.choice([-1, 1])],
                 covariance=SIGMA_PX**2 * np.eye(4),
                 snr=50.0,
@@ -126,7 +126,7 @@ def test_dusk_gives_a_place_without_a_level_and_then_calibrates_it(dusk, graph):
     assert is_right(off_m(last), last.position_covariance) and 10 < sigma[0] < 300
     assert abs(last.altitude) < 4 * sigma[2] < 100
     assert "satellites, chi-square" in graph.state("solver: Satellites", "place").message
-    # the level, which nobody calibrated, has learned from the place
+    # the uncalibrated level has learned from the place
     assert solutions[0][1].status != Solution.OK
     shot, solution = solutions[-1]
     assert solution.status == Solution.OK and "learned" in [term.name for term in solution.budget]

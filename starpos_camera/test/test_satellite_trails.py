@@ -50,7 +50,7 @@ def test_trails_of_a_frame_that_the_solver_has_identified(listener, start, cross
     assert trail.steady and not trail.cut.any()
     got = trail.ends[np.argsort(trail.ends[:, 0])]
     assert got == pytest.approx(ENDS, abs=0.5)
-    # of a frame without identified stars there are none: the next frame's come, and not these
+    # a frame without identified stars gives no message; the next one does
     lost = come(False).header
     count = len(heard)
     listener.wait(lambda: come(True) and len(heard) > count)

@@ -162,7 +162,7 @@ class StoredOrbits:
         self._files = self._seen()
 
     def read(self) -> list[Orbit]:
-        """The orbits as they are now; where they cannot be read any more, those of before, and `trouble` says why."""
+        """The orbits as they are now; if they became unreadable, the earlier ones, and `trouble` says why."""
         try:
             if (files := self._seen()) != self._files:
                 self._orbits, said = read_orbits(self._path)

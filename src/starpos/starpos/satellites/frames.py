@@ -85,7 +85,7 @@ def _terms(xy: np.ndarray, order: int) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class FrameTrails:
-    """The trails of a frame that tell of a place, with tracks from 0, and a sentence on those left out; '': none."""
+    """The usable trails of a frame, with tracks from 0, and a sentence on those left out; '': none."""
 
     trails: tuple[SatelliteTrail, ...]
     left_out: str = ""
@@ -187,8 +187,8 @@ class FrameSky:
     def sighted(self, stars: Stars, found: Sequence[FrameTrail]) -> FrameTrails:
         """Trails found on the frame of these stars, as seen from the ground, with the time of each end's row.
 
-        Of a trail that leaves the frame one end counts. One that is cut at both, or whose light is uneven, tells
-        nothing. FrameError with too few stars around a trail.
+        Of a trail that leaves the frame one end counts. One that is cut at both, or whose light is uneven, is left
+        out. FrameError with too few stars around a trail.
         """
         trails: list[SatelliteTrail] = []
         for seen in found:

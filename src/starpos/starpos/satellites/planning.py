@@ -21,14 +21,14 @@ HOUR_S = 3600.0
 DARK = math.sin(math.radians(-6))
 # The Earth's shadow is a cylinder as wide as the Earth with the air that lets no light through, m.
 SHADOW_M = 6_400_000.0
-# Directions that a camera may look to: this far from the zenith, in so many azimuths, and straight up.
+# Directions that a camera may look to: straight up, and at these distances from the zenith in 8 azimuths.
 LEANS, AZIMUTHS = np.radians([30.0, 50.0]), 8
 
 
 @at_once
 @dataclass(frozen=True, kw_only=True)
 class HourOfSatellites:
-    """What passes in the dark part of an hour that begins at utc_unix_s.
+    """Satellites that pass in the dark part of an hour; it begins at utc_unix_s.
 
     sun_deg (2,): the Sun's height at the beginning and the end of that part.
     lit_from_km: height of the lowest orbit that is in sunlight straight up, when the Sun is highest.
@@ -77,7 +77,7 @@ def nights_hours(
 
 
 def _leaning() -> Iterator[np.ndarray]:
-    """Directions (3,) in ENU that a camera may look to, beside the zenith."""
+    """Directions (3,) in ENU that a camera may look to, except the zenith."""
     for lean in LEANS:
         for k in range(AZIMUTHS):
             yield unit_vector(math.pi / 2 - 2 * math.pi * k / AZIMUTHS, math.pi / 2 - lean)

@@ -41,7 +41,7 @@ class SatelliteTrail:
 
     @property
     def moves(self) -> bool:
-        """Whether it tells a motion."""
+        """Whether its motion is known, at least in direction."""
         return len(self.directions) > 1 or self.towards is not None
 
     @property

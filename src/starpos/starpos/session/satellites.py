@@ -26,15 +26,15 @@ from starpos.sky import catalogue
 
 # frames whose stars wait for their trails, or trails for their stars
 KEPT = 32
-# The place's error is the same in all frames. So this many frames teach by it, each as if the place's variance were as
-# many times as large: together they tell what one place tells.
+# The place's error is the same in all frames. So 40 frames teach by it, each as if the place's variance were 40 times as
+# large: together they have the information of one place.
 TEACHES = 40
 Frame = tuple[Any, Stars, Solution, list[FrameTrail]]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Located:
-    """What a job found: the trails that count, the place or why there is none, and sentences on what is left out."""
+    """Result of a job: the trails that count, the place or why it is missing, and a sentence on what is left out."""
 
     stamp: Any
     trails: tuple[SatelliteTrail, ...]

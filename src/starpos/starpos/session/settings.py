@@ -147,7 +147,7 @@ def learned_file(name: str) -> Learned | None:
 
 
 def stored_orbits(name: str) -> StoredOrbits | None:
-    """The orbits that satellites.elements names, None for ''; SatelliteError with the reason if there are none."""
+    """The orbits that satellites.elements names, None for ''; SatelliteError with the reason if it has no orbits."""
     return StoredOrbits(path_of(name)) if name else None
 
 
