@@ -40,7 +40,7 @@ MOST_JSON_BYTES = 300_000_000
 
 
 @dataclass
-class Seen:
+class SeenTrails:
     """What the files of a call show: trails, and the frames that were identified, by their names."""
 
     trails: list[SatelliteTrail] = field(default_factory=list)
@@ -52,7 +52,7 @@ def run(args: argparse.Namespace) -> int:
         return plan(args)
     if not args.sightings or not args.elements:
         raise SatelliteError("give frames or sightings and --elements, or --plan LAT LON")
-    seen = Seen()
+    seen = SeenTrails()
     frames = [path for path in args.sightings if Path(path).suffix.lower() not in TABLES]
     for path in args.sightings:
         seen.trails += [] if path in frames else _read(path)
@@ -113,7 +113,7 @@ def _read(path: str) -> list[SatelliteTrail]:
     return trails
 
 
-def _look(args: argparse.Namespace, frames: list[str], seen: Seen) -> None:
+def _look(args: argparse.Namespace, frames: list[str], seen: SeenTrails) -> None:
     """Add the frames and their trails, numbered on; complains of frames without, and of trails that are left out."""
     number = 1 + max((trail.track for trail in seen.trails), default=-1)
     complaints, read = console.FrameComplaints("satellites"), inputs.reader_of(args)

@@ -65,7 +65,7 @@ class Candidates:
         )
 
 
-class Sky:
+class OrbitsAbove:
     """All orbits between two computed times, in axes that turn with the Earth."""
 
     def __init__(self, orbits: Sequence[Orbit]) -> None:
@@ -125,7 +125,7 @@ def candidates(
 
     A trail with one end and no name has no motion, and no candidates.
     """
-    sky = Sky(orbits)
+    sky = OrbitsAbove(orbits)
     row_of = {orbit.number: k for k, orbit in enumerate(orbits)}
     order = sorted(range(len(trails)), key=lambda k: trails[k].utc_unix_s[0])
     found: list[tuple[int, int, np.ndarray, np.ndarray, np.ndarray]] = []
@@ -152,7 +152,7 @@ def candidates(
 
 def _of_trail(
     trail: SatelliteTrail,
-    sky: Sky,
+    sky: OrbitsAbove,
     only: np.ndarray | slice,
     height_m: float,
     height_stddev_m: float,

@@ -13,7 +13,7 @@ from starpos.earth.orientation import EarthState, earth_state
 from starpos.frozen import at_once
 from starpos.rotation import normalised, unit_vector
 from starpos.satellites.elements import Orbit
-from starpos.satellites.naming import STEP_S, Sky
+from starpos.satellites.naming import STEP_S, OrbitsAbove
 from starpos.sky.bodies import SUN, body_at
 
 HOUR_S = 3600.0
@@ -63,7 +63,7 @@ def nights_hours(
     latitude, longitude = math.radians(latitude_deg), math.radians(longitude_deg)
     enu, site = enu_axes(latitude, longitude), itrs_place(latitude, longitude, 0.0)
     pointings = np.array([[0.0, 0.0, 1.0], *_leaning()])
-    sky = Sky(orbits) if orbits else None
+    sky = OrbitsAbove(orbits) if orbits else None
     steps = math.ceil(begin_unix_s / STEP_S) + np.arange(round(24 * HOUR_S / STEP_S))
     hours: dict[int, list[_Moment]] = {}
     for t in (steps * STEP_S).tolist():
@@ -96,7 +96,7 @@ class _Moment:
         cls,
         state: EarthState,
         sun: np.ndarray,
-        sky: Sky | None,
+        sky: OrbitsAbove | None,
         site: np.ndarray,
         enu: np.ndarray,
         least: float,
