@@ -254,8 +254,10 @@ def plan(args: argparse.Namespace) -> int:
     if args.size is not None:
         camera = options.camera_of(args) if args.instrument is None else None
         focal_px = options.instrument_of(args, None).focal_px if camera is None else camera.fx
-        lens = tuple(2 * math.degrees(math.atan(side / 2 / focal_px)) for side in args.size)
-    hours = nights_hours(*args.plan, begin, orbits, least_deg=args.min_altitude, lens_deg=lens)
+        width, height = (2 * math.degrees(math.atan(side / 2 / focal_px)) for side in args.size)
+        lens = width, height
+    latitude, longitude = args.plan
+    hours = nights_hours(latitude, longitude, begin, orbits, least_deg=args.min_altitude, lens_deg=lens)
     if not hours:
         console.complain(
             "satellites", "the Sun does not sink 6 deg below the horizon there in these 24 hours"
