@@ -80,7 +80,7 @@ class Replay:
             topics = INPUTS if self.session.gnss is None else INPUTS | GNSS
             if self.session.satellites is not None:
                 topics = topics | SATELLITES
-            chosen = instrument_in(bag, path, namespace, topics, (STARS,), self._drivers.remaps)
+            chosen = instrument_in(bag, path, namespace, topics, self._drivers.remaps)
             if chosen.made:
                 self.remarks.append(chosen.made)
             for connection, log_ns, message in bag.decoded(chosen.connections):
