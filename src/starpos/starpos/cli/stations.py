@@ -43,7 +43,7 @@ def station_json(station: Station, grid: Geoid | None) -> dict:
         "longitude": np.degrees(station.place.longitude),
         "height_m": station.place.height_m,
         "sessions": len(station.sessions),
-        "frames": sum(s.frame_count for s in station.sessions),
+        "frames": sum(s.frames for s in station.sessions),
         "first_utc": utc_text(min(s.utc_unix_s for s in station.sessions)),
         "last_utc": utc_text(max(s.utc_unix_s for s in station.sessions)),
         "mark_arcsec": station.at_mark,

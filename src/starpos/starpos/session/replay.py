@@ -73,7 +73,7 @@ class Replay:
         now_ns, messages = 0, DriverMessages(self._drivers)
         with BagReader(path, typed=True) as bag:
             topics = INPUTS if self.session.gnss is None else INPUTS | GNSS
-            chosen = instrument_in(bag, path, namespace, topics, (STARS,), self._drivers.remaps)
+            chosen = instrument_in(bag, path, namespace, topics, self._drivers.remaps)
             if chosen.made:
                 self.remarks.append(chosen.made)
             for connection, log_ns, message in bag.decoded(chosen.connections):

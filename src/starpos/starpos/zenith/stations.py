@@ -37,59 +37,24 @@ NEW = frozenset(
 )
 
 
-@dataclass(frozen=True, kw_only=True)
-class FrameResult:
-    """The deflection of one frame alone, arcsec, with its 1 sigma; face: number of its face, from 1."""
-
-    utc_unix_s: float
-    face: int
-    xi: float
-    eta: float
-    sigma_xi: float
-    sigma_eta: float
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class FaceResult:
-    """A face against the others, arcsec: off, stddev (2,) of xi and eta."""
-
-    face: int
-    heading_deg: float
-    frames: int
-    off: np.ndarray
-    stddev: np.ndarray
-
-
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SessionResult:
     """A session's deflection at a mark, arcsec: xi, eta.
 
     station: name of the mark; '' for none.  place: of the mark, with its height.
-    seen (2,): as the plumb line stood.  tide (2,), curvature: what tide and normal plumb line added.
     mark, geoid (2,): without the tide, at the mark and at the geoid.
     covariance (2, 2), and common (2, 2): the part that the sessions of an instrument share.
-    terms: 1 sigma of xi and eta for each source of error.  stars: their number.
     """
 
     path: Path
     station: str
     place: Place
     utc_unix_s: float
-    duration_s: float
-    seen: np.ndarray
-    tide: np.ndarray
-    curvature: float
     mark: np.ndarray
     geoid: np.ndarray
     covariance: np.ndarray
     common: np.ndarray
-    terms: tuple[tuple[str, float, float], ...]
-    motion_arcsec: float
-    stars: int
-    face_count: int
-    frame_count: int
-    frames: tuple[FrameResult, ...]
-    faces: tuple[FaceResult, ...]
+    frames: int
 
     @property
     def new(self) -> np.ndarray:
@@ -111,9 +76,7 @@ def read_session(path: Path | str) -> SessionResult:
             raise StationError(
                 f"{path}: {len(whole)} lines with a session's deflection in it, one is wanted: make it with `{MADE_BY}`"
             )
-        return _session(
-            path, whole[0], [line for line in lines if line.get("status") == "ok" and "face" in line]
-        )
+        return _session(path, whole[0])
     except OSError as e:
         raise StationError(
             f"{path}: cannot be read ({e.strerror or e}): give the output of `{MADE_BY}`"
@@ -125,7 +88,7 @@ def read_session(path: Path | str) -> SessionResult:
         raise StationError(f"{path}: no session's result ({said[:100]}): make it with `{MADE_BY}`") from None
 
 
-def _session(path: Path, value: Mapping, frames: list) -> SessionResult:
+def _session(path: Path, value: Mapping) -> SessionResult:
     site, reduced = value["site"], value["reduced"]
     covariance = _array(value["covariance_arcsec2"], (2, 2))
     terms = tuple((str(name), float(xi), float(eta)) for name, (xi, eta) in value["errors"].items())
@@ -147,21 +110,11 @@ def _session(path: Path, value: Mapping, frames: list) -> SessionResult:
         station=str(value["station"]),
         place=Place.on_ellipsoid(latitude, longitude, height_m=height_m),
         utc_unix_s=unix_of(value["utc"]),
-        duration_s=float(value["duration_s"]),
-        seen=_array([value["xi_arcsec"], value["eta_arcsec"]], (2,)),
-        tide=_array(reduced["tide_arcsec"], (2,)),
-        curvature=float(reduced["curvature_arcsec"][0]),
         mark=_array(reduced["mark_arcsec"], (2,)),
         geoid=_array(reduced["geoid_arcsec"], (2,)),
         covariance=covariance,
         common=common,
-        terms=terms,
-        motion_arcsec=float(value["image_motion_arcsec"]),
-        stars=int(value["stars"]),
-        face_count=int(value["faces"]),
-        frame_count=int(value["frames"]),
-        frames=tuple(_frame(line) for line in frames),
-        faces=tuple(_face(line) for line in value["by_face"]),
+        frames=int(value["frames"]),
     )
 
 
@@ -170,27 +123,6 @@ def _array(values: list, shape: tuple[int, ...]) -> np.ndarray:
     if array.shape != shape or not np.isfinite(array).all():
         raise ValueError(f"{values} are not {shape} finite numbers")
     return array
-
-
-def _frame(line: Mapping) -> FrameResult:
-    return FrameResult(
-        utc_unix_s=unix_of(line["utc"]),
-        face=int(line["face"]),
-        xi=float(line["xi_arcsec"]),
-        eta=float(line["eta_arcsec"]),
-        sigma_xi=float(line["sigma_xi_arcsec"]),
-        sigma_eta=float(line["sigma_eta_arcsec"]),
-    )
-
-
-def _face(line: Mapping) -> FaceResult:
-    return FaceResult(
-        face=int(line["face"]),
-        heading_deg=float(line["heading"]),
-        frames=int(line["frames"]),
-        off=np.array(line["off_arcsec"], float),
-        stddev=np.array(line["stddev_arcsec"], float),
-    )
 
 
 # Sessions so close to each other are of one mark: GNSS knows it to centimetres, and 1 m is 0.03 arcsec.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`starpos stations` and `starpos report` on sessions' results: tables, GeoJSON, and a page to hand in."""
+"""`starpos stations`: tables and GeoJSON."""
 
 import csv
 import io
@@ -10,7 +10,6 @@ import pytest
 from cli_calls import objects
 
 from starpos_testing.skies.deflections import result
-from starpos_testing.skies.reports import Page, assert_drawn
 
 # 2 km to the north-east, arcsec at the geoid
 PLACES = {"P1": (47.0, 8.0, 3.0, -1.0), "P2": (47.0128, 8.0186, 3.4, -1.2)}
@@ -59,19 +58,3 @@ def test_what_cannot_be_is_a_sentence(run, sessions, tmp_path):
     (tmp_path / "none.json").write_text("{}")
     status, _, err = run("stations", tmp_path / "none.json")
     assert status == 2 and "starpos deflection --json" in err[0]
-
-
-def test_a_page_of_the_stations_that_can_be_handed_in(run, sessions, tmp_path):
-    pytest.importorskip("matplotlib")
-    out = tmp_path / "page"
-    status, said, _ = run("report", *sessions, "--geoid", tmp_path / "geoid.gtx", "-o", out)
-    assert status == 0 and said.strip().endswith("index.html")
-    page = Page(out / "index.html")
-    assert "Station P1" in page.text and "Station P2" in page.text
-    assert "ξ +3.12" in page.text.replace("&xi;", "ξ") and "tide free" in page.text
-    assert "of 2 sessions" in page.text and "minus the grid" in page.text
-    assert "Map" in page.pictures and "P1: repeats" in page.pictures
-    for png in page.pictures.values():
-        assert_drawn(png)
-    status, _, err = run("report", sessions[0], tmp_path, "-o", out)
-    assert status == 2 and "either nights or sessions" in err[0]
