@@ -145,6 +145,8 @@ def read_orbits(path: Path | str) -> tuple[list[Orbit], list[str]]:
                 bad.append(orbit)
     except (ValueError, ET.ParseError, csv.Error, StarposError) as e:
         raise SatelliteError(f"{path}: no readable orbits ({one_line(e)}): {CURE}") from None
+    except ImportError:
+        raise SatelliteError("orbits need the package sgp4: pip install sgp4") from None
     if not found:
         raise SatelliteError(f"{path}: it has no orbits of satellites{f' ({bad[0]})' if bad else ''}: {CURE}")
     left = "1 is left out" if len(bad) == 1 else f"{len(bad)} are left out"
