@@ -30,8 +30,7 @@ from starpos.frames.frame import Stars
 from starpos.frames.reading import why_no_time
 from starpos.frames.tables import TILTS, Pointing, read_pointings
 from starpos.identification import Identification
-from starpos.instrument import instrument_file
-from starpos.instrument import rms as rms_files
+from starpos.instrument import instrument_file, platepar
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import up_of
 from starpos.instrument.instrument import (
@@ -442,7 +441,7 @@ def _write_platepar(
         )
     times = [frames[k].mid_unix_s or 0.0 for k in found.used]
     seen = seen_by(camera, mean, site, air, times[len(times) // 2])
-    plate, worst = rms_files.platepar_of(camera, seen)
+    plate, worst = platepar.platepar_of(camera, seen)
     try:
         write_whole(path, (json.dumps(plate, indent=4, sort_keys=True) + "\n").encode())
     except OSError as e:

@@ -16,7 +16,7 @@ from starpos.errors import InstrumentError
 from starpos.fix.directions import OPTICAL_AXIS
 from starpos.frames.exif import CameraClock
 from starpos.frames.exposure import Shutter
-from starpos.instrument import instrument, instrument_file, rms, sensors
+from starpos.instrument import instrument, instrument_file, platepar, sensors
 from starpos.instrument.camera import PLUMB_BOB, Camera
 from starpos.recording import topics
 
@@ -50,12 +50,12 @@ def has_own_level(args: argparse.Namespace) -> bool:
 def fill_site(args: argparse.Namespace) -> None:
     """Take the place that a file of RMS given as --instrument states, on WGS 84; --site and --tilt come first."""
     if (
-        not rms.is_rms(args.instrument)
+        not platepar.is_rms(args.instrument)
         or getattr(args, "site", ()) is not None
         or getattr(args, "tilt", None)
     ):
         return
-    station = rms.read(args.instrument)
+    station = platepar.read(args.instrument)
     args.site, args.geodetic = [station.latitude_deg, station.longitude_deg], True
 
 

@@ -32,7 +32,7 @@ ROUNDS, SETTLED = 50, 1e-10
 
 
 @dataclass(frozen=True)
-class Station:
+class RmsCamera:
     """What a file of RMS says of a camera: its lens, and its place on WGS 84 in deg (height above the sea in m)."""
 
     instrument: Instrument
@@ -46,7 +46,7 @@ def is_rms(path: Path | str) -> bool:
     return Path(path).suffix == ".cal" or Path(path).name.endswith(".config")
 
 
-def read(path: Path | str) -> Station:
+def read(path: Path | str) -> RmsCamera:
     """Read a platepar (JSON), or a `.config`; InstrumentError says why a file cannot be used."""
     path = Path(path)
     try:
@@ -62,7 +62,7 @@ def read(path: Path | str) -> Station:
         ) from None
 
 
-def _of_config(text: str) -> Station:
+def _of_config(text: str) -> RmsCamera:
     parser = configparser.ConfigParser(inline_comment_prefixes=("#", ";"), interpolation=None, strict=False)
     parser.read_string(text)
     place, capture = parser["System"], parser["Capture"]
@@ -71,7 +71,7 @@ def _of_config(text: str) -> Station:
     return _station(camera, *(float(place[k]) for k in ("latitude", "longitude", "elevation")))
 
 
-def _of_platepar(plate: Mapping[str, Any]) -> Station:
+def _of_platepar(plate: Mapping[str, Any]) -> RmsCamera:
     xy = _grid(int(plate["X_res"]), int(plate["Y_res"]))
     aspect, off = _undistorted(plate, xy)
     theta = np.radians(np.hypot(*off.T) / float(plate["F_scale"]))
@@ -92,10 +92,10 @@ def _of_platepar(plate: Mapping[str, Any]) -> Station:
     return _station(camera, *(float(plate[k]) for k in ("lat", "lon", "elev")))
 
 
-def _station(camera: Camera, latitude_deg: float, longitude_deg: float, height_m: float) -> Station:
+def _station(camera: Camera, latitude_deg: float, longitude_deg: float, height_m: float) -> RmsCamera:
     if not (abs(latitude_deg) <= 90 and abs(longitude_deg) <= 180 and np.isfinite(height_m)):
         raise InstrumentError(f"its place {latitude_deg:g} {longitude_deg:g} cannot be")
-    return Station(Instrument(camera.fx, camera=camera), latitude_deg, longitude_deg, height_m)
+    return RmsCamera(Instrument(camera.fx, camera=camera), latitude_deg, longitude_deg, height_m)
 
 
 def _grid(width: int, height: int) -> np.ndarray:
@@ -165,7 +165,7 @@ def _undistorted(plate: Mapping[str, Any], xy: np.ndarray) -> tuple[float, np.nd
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Seen:
+class SkyPixels:
     """What pixels of a camera at a place show at a time.
 
     xy (N, 2) in px, icrs (N, 3): where, without aberration and refraction, the light at each pixel comes from.
@@ -180,7 +180,7 @@ class Seen:
     height_m: float
 
 
-def platepar_of(camera: Camera, seen: Seen, station: str = "XX0001") -> tuple[dict[str, Any], float]:
+def platepar_of(camera: Camera, seen: SkyPixels, station: str = "XX0001") -> tuple[dict[str, Any], float]:
     """The content of a platepar, and by how many px at most RMS then sees a direction elsewhere than the camera.
 
     Its photometry is not calibrated: RMS's defaults.  InstrumentError for a camera that looks at a celestial pole.

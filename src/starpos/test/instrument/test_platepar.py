@@ -9,7 +9,7 @@ import pytest
 
 from starpos import rotation
 from starpos.errors import InstrumentError
-from starpos.instrument import instrument_file, rms
+from starpos.instrument import instrument_file, platepar
 from starpos.instrument.camera import EQUIDISTANT, Camera
 
 FISHEYE = Camera(
@@ -44,7 +44,7 @@ def seen_with(camera, altitude_deg):
     )
     high = local[:, 2] > sin(radians(20))
     places = [true_of(*v) for v in local[high]]
-    return rms.Seen(
+    return platepar.SkyPixels(
         xy=xy[high],
         icrs=np.array(places),
         utc_unix_s=UTC,
@@ -124,11 +124,11 @@ def pixel_of(plate, centre, place):
 @pytest.mark.parametrize(("camera", "altitude", "near"), [(FISHEYE, 80, 0.01), (NARROW, 45, 0.02)])
 def test_rms_sees_each_star_where_the_camera_does(camera, altitude, near, tmp_path):
     seen = seen_with(camera, altitude)
-    plate, worst = rms.platepar_of(camera, seen)
+    plate, worst = platepar.platepar_of(camera, seen)
     plate = json.loads(json.dumps(plate))
     pointing = np.radians([plate[k] for k in ("RA_d", "dec_d", "pos_angle_ref")])
     # the one formula that is not simple in angles is compared with RMS's own values below
-    centre = rms._seen_pointing(pointing, JD, LATITUDE, LONGITUDE)
+    centre = platepar._seen_pointing(pointing, JD, LATITUDE, LONGITUDE)
     off = [
         np.hypot(*np.subtract(pixel_of(plate, centre, v), xy))
         for v, xy in zip(seen.icrs, seen.xy, strict=True)
@@ -143,7 +143,9 @@ def test_rms_sees_each_star_where_the_camera_does(camera, altitude, near, tmp_pa
 
 def test_a_pointing_is_turned_as_rms_turns_it():
     # cyTrue..., eqRefractionTrueToApparent and equatorialCoordAndRotPrecession of RMS f441ef15, compiled
-    got = rms._seen_pointing(np.radians([120.0, 35.0, 50.0]), 2460500.3, np.radians(45.5), np.radians(14.25))
+    got = platepar._seen_pointing(
+        np.radians([120.0, 35.0, 50.0]), 2460500.3, np.radians(45.5), np.radians(14.25)
+    )
     np.testing.assert_allclose(np.degrees(got), RMS_POINTING, rtol=0, atol=1e-9)
 
 
@@ -154,7 +156,7 @@ def test_all_types_of_distortion_are_understood():
     # angles from the centre in deg by RMS's cyXYToRADec of f441ef15, compiled, of pixels (100, 80) and (1000, 500)
     for kind, (x, y, flags, angles) in RMS_ANGLES.items():
         plate = PLATE | flags | {"distortion_type": kind, "x_poly_fwd": x, "y_poly_fwd": y}
-        _, off = rms._undistorted(plate, np.array([[100.0, 80.0], [1000.0, 500.0]]))
+        _, off = platepar._undistorted(plate, np.array([[100.0, 80.0], [1000.0, 500.0]]))
         np.testing.assert_allclose(np.hypot(*off.T) / plate["F_scale"], angles, rtol=0, atol=1e-9)
 
 
@@ -193,7 +195,7 @@ def test_config_has_the_field_and_the_place(tmp_path):
         "[System]\nlatitude: 45.5 ; WGS84 +N\nlongitude: -14.25\nelevation: 300\n"
         "[Capture]\nwidth: 1280\nheight: 720\nfps: 25.0\nfov_w: 88\nfov_h: 45\n"
     )
-    station = rms.read(path)
+    station = platepar.read(path)
     assert (station.latitude_deg, station.longitude_deg, station.height_m) == (45.5, -14.25, 300)
     assert station.instrument.camera.fx == pytest.approx(1280 / radians(88))
 
@@ -213,4 +215,4 @@ def test_other_files_are_refused_with_a_sentence(text, tmp_path):
     for name in ("a.cal", "b.config"):
         (tmp_path / name).write_text(text)
         with pytest.raises(InstrumentError, match=r"not a platepar|its "):
-            rms.read(tmp_path / name)
+            platepar.read(tmp_path / name)
