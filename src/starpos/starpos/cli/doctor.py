@@ -30,7 +30,8 @@ OPTIONAL = {
     "matplotlib": ("matplotlib", "starpos report, calibrate --map"),
     "rosbags": ("rosbags", "recorded nights: report, replay"),
     "rawpy": ("rawpy", "raw files of cameras"),
-    "exifread": ("exifread", "times of raw and HEIF files"),
+    "exifread": ("exifread", "times and lenses of photographs"),
+    "sgp4": ("sgp4", "starpos satellites"),
     "pillow_heif": ("pillow-heif", "HEIF pictures of phones"),
     "argcomplete": ("argcomplete", "completion of commands and options by the Tab key"),
 }

@@ -27,6 +27,8 @@ AHEAD = 4
 MAX_STILLBORN = 3
 # Time for a process that no longer answers to end.
 DYING_S = 1.0
+# Exit status of a process that SIGKILL ended; Windows has no signals.
+KILLED_STATUS = -getattr(signal, "SIGKILL", 1 << 16)
 # There is a process for each processor, so the libraries need no threads of their own.
 ONE_THREAD = dict.fromkeys((*BLAS_THREADS, "OPENCV_FOR_THREADS_NUM"), "1")
 
@@ -268,7 +270,7 @@ class _Worker:
         self._process.join()
         code = self._process.exitcode
         self._process.close()
-        if code == -signal.SIGKILL:
+        if code == KILLED_STATUS:
             return "killed, perhaps for lack of memory: try fewer --jobs"
         if code is not None and code < 0:
             return signal.strsignal(-code) or f"signal {-code}"
@@ -279,17 +281,20 @@ class _Worker:
 def _for_one_that_starts() -> Iterator[None]:
     """Set what a new process inherits: one thread for each library, and SIGINT blocked.
 
-    A terminal sends Ctrl-C to all processes; only the parent is to react.
+    A terminal sends Ctrl-C to all processes; only the parent is to react.  Windows has no masks of signals.
     """
     before = dict(os.environ)
     os.environ.update({name: one for name, one in ONE_THREAD.items() if name not in before})
-    # otherwise it starts with the first process, and unblocks SIGINT for it
-    resource_tracker.ensure_running()
-    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    masks = hasattr(signal, "pthread_sigmask")
+    if masks:
+        # otherwise it starts with the first process, and unblocks SIGINT for it
+        resource_tracker.ensure_running()
+        mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
     finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        if masks:
+            signal.pthread_sigmask(signal.SIG_SETMASK, mask)
         for name in ONE_THREAD.keys() - before.keys():
             del os.environ[name]
 
