@@ -54,7 +54,8 @@ def run(args: argparse.Namespace) -> int:
         for f in json.loads(places.read_text(encoding="utf-8"))["features"]
         if f["properties"].get("combined")
     )
-    off_m = apart_m(*(np.radians(at) for at in ((found["latitude"], found["longitude"]), place_deg)))
+    (north, east), (true_north, true_east) = np.radians([[found["latitude"], found["longitude"]], place_deg])
+    off_m = apart_m((north, east), (true_north, true_east))
     off = f"{off_m:.0f} m" if off_m < 10e3 else f"{off_m / 1000:.0f} km"
     print(f"\nthe place that was hidden: {place_deg[0]:+.6f} {place_deg[1]:+.6f}, {off} from the one found")
     return 0
