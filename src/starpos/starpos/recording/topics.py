@@ -157,12 +157,14 @@ class _Topics:
         return topic
 
 
-STARS = f"{PACKAGE}/msg/StarArray"
+STARS, TRAILS = (f"{PACKAGE}/msg/{name}" for name in ("StarArray", "TrailArray"))
 # types by the relative names of the solver's inputs
 NAV_SAT_FIX = "sensor_msgs/msg/NavSatFix"
 INPUTS = {"stars": STARS, "tilt": TILT, "camera/camera_info": CAMERA_INFO}
 # further inputs, with gnss.use
 GNSS = {"gnss/fix": NAV_SAT_FIX}
+# further inputs, with satellites.elements
+SATELLITES = {"trails": TRAILS}
 
 
 @dataclass(frozen=True)
