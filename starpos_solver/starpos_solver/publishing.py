@@ -144,12 +144,6 @@ class SolutionPublishers:
         self._check = publisher(node, msg.GnssCheck, "gnss/check", 10) if self._values["gnss.use"] else None
 
     @property
-    def publishers(self) -> tuple[Publisher, ...]:
-        """The publishers of all topics, the solution's first."""
-        check = () if self._check is None else (self._check,)
-        return self._solution, self._fix, self._fix_averaged, self._imu, self._attitude, *check
-
-    @property
     def shared(self) -> tuple[Publisher, ...]:
         """The publishers of topics whose names other drivers have, too."""
         return self._fix, self._imu
