@@ -227,7 +227,12 @@ class Player:
             self._unanswered.append(self._now_ns or 0)
 
     def _keep_back(self, log_ns: int) -> None:
-        """Wait until the frames of long before a time are answered."""
+        """Go on no faster than real time while a frame is not answered, and no further than AHEAD_S beyond it.
+
+        Nodes wait for what others make, such as tilts of accelerations, by this clock.
+        """
+        if self._unanswered and self._now_ns is not None:
+            self._spin(min((log_ns - self._now_ns) * 1e-9, AHEAD_S), lambda: not self._unanswered)
         before_ns = log_ns - int(AHEAD_S * 1e9)
         if self._unanswered and self._unanswered[0] < before_ns:
             done = self._await(lambda: not self._unanswered or self._unanswered[0] >= before_ns)
@@ -235,10 +240,13 @@ class Player:
                 self._unanswered.clear()
 
     def _await(self, done: Callable[[], bool]) -> bool:
-        """Wait for nodes that follow; False if they do not in PATIENCE_S, which is said and counted."""
+        """Wait for nodes that follow, without time going on; False if they do not in PATIENCE_S, which is said."""
         if self._in_vain >= MAX_IN_VAIN:
             return False
-        if self._spin(PATIENCE_S, done) or self._stopped:
+        waits_s = time.monotonic()
+        came = self._spin(PATIENCE_S, done)
+        self._begin_s += time.monotonic() - waits_s
+        if came or self._stopped:
             return True
         self._in_vain += 1
         self._say(f"a frame was not answered in {PATIENCE_S:.0f} s: it goes on without the answer")
