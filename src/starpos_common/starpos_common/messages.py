@@ -4,6 +4,7 @@
 import array
 import math
 import sys
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -16,9 +17,10 @@ from starpos import rotation
 from starpos.errors import TimeError
 from starpos.fix.camera_attitude import CameraAttitude
 from starpos.frames.exposure import Shutter
-from starpos.frames.frame import DISC, SATURATED, Disc, Frame, Stars
+from starpos.frames.frame import DISC, SATURATED, Disc, Frame, FrameTrail, Stars
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import Tilt
+from starpos.messages.stars import FIRST_CUT, SECOND_CUT, UNSTEADY
 from starpos_interfaces import msg
 
 HOST_IS_BIG_ENDIAN = sys.byteorder == "big"
@@ -63,6 +65,22 @@ def stars_to_message(stars: Stars, frame_id: str) -> msg.StarArray:
             *(msg.Star(x=x, y=y, flux=f, snr=s, covariance=c, flags=g) for x, y, f, s, c, g in columns),
         ],
         **shutter_fields(stars.shutter),
+    )
+
+
+def trails_to_message(trails: Iterable[FrameTrail], header: Header) -> msg.TrailArray:
+    """Convert the trails of a frame to a TrailArray."""
+    return msg.TrailArray(
+        header=header,
+        trails=[
+            msg.Trail(
+                ends=t.ends.ravel(),
+                covariance=t.covariance.ravel(),
+                snr=t.snr,
+                flags=int(t.cut @ (FIRST_CUT, SECOND_CUT)) + (0 if t.steady else UNSTEADY),
+            )
+            for t in trails
+        ],
     )
 
 

@@ -29,46 +29,6 @@ from starpos.zenith.sighting import StarPlaces, ZenithSighting, faces_of, mean_h
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class StarQuality:
-    """The S stars of a session.
-
-    stars (S,): rows of the catalogue.  frames (S,): number of frames that each is in.
-    mean_arcsec (S, 2): mean of its residuals, where the frame's stars have it minus where it is seen, east and north.
-    rms_arcsec (S,): root mean square of its residuals a coordinate.
-    leverage_arcsec (S, 2): largest change of xi and of eta by 1 sigma of its place in the catalogue.
-    """
-
-    stars: np.ndarray
-    frames: np.ndarray
-    mean_arcsec: np.ndarray
-    rms_arcsec: np.ndarray
-    leverage_arcsec: np.ndarray
-
-    @classmethod
-    def of(
-        cls, sightings: Sequence[ZenithSighting], places: StarPlaces, lines: Lines, gain: np.ndarray
-    ) -> "StarQuality":
-        """Collect the residuals of each star; gain (2, 2 N): xi, eta in arcsec by the readings in rad."""
-        number = len(places.correction)
-        frames, mean, square = np.zeros(number), np.zeros((number, 2)), np.zeros(number)
-        lever = np.zeros((2, number, 3))
-        for k, (rows, s) in enumerate(zip(places.rows, sightings, strict=True)):
-            seen = s.residual_arcsec @ s.enu_to_camera[:2, :2]
-            frames[rows] += 1
-            mean[rows] += seen
-            square[rows] += (seen**2).mean(1)
-            turn = gain[:, 2 * k : 2 * k + 2] @ lines.by_camera[k]
-            lever[:, rows] += np.einsum("xi,inj->xnj", turn, s.by_star)
-        return cls(
-            stars=places.stars,
-            frames=frames.astype(int),
-            mean_arcsec=mean / frames[:, None],
-            rms_arcsec=np.sqrt(square / frames),
-            leverage_arcsec=np.linalg.norm(lever, axis=2).T,
-        )
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
 class FaceQuality:
     """A face against all others.
 
@@ -173,9 +133,10 @@ class Air:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Adjusted:
+class DeflectionSession:
     """The deflection of a session at the mark, arcsec, with its errors.
 
+    sightings (N,): in order of time.
     covariance_arcsec2 (2, 2): of xi, eta, the sum over sources of error, by_source (2, 2).
     a3 (3, 3): C into S, with the tiltmeter's zero.  turn_stddev_rad: of its turn about the plumb line.
     faces (N,): number of each frame's face.  frame_arcsec (N, 2): xi, eta of each frame minus the session's.
@@ -185,9 +146,17 @@ class Adjusted:
     as_stated: the session with the errors of the tiltmeter's file, where the residuals show larger ones.  same_air:
     likewise, with the air of this adjustment.  gain: twice the log of the likelihood minus the one of same_air.
     chi2_per_degree: of the residuals; 1 where the stated errors and the air's explain them.
-    face_quality: each face against the others.  stars: the residuals and the leverage of each star.
+    face_quality: each face against the others.  stars (S,): rows of the catalogue.
+
+    Examples
+    --------
+    >>> lists = sorted(Path("zenith").glob("stars_*.csv"))
+    >>> session = starpos.deflection(lists, "zenith/tilt.csv", (61.2, 24.5, 900.0), "zenith/instrument.yaml")
+    >>> len(session.sightings)
+    8
     """
 
+    sightings: tuple[ZenithSighting, ...]
     xi_arcsec: float
     eta_arcsec: float
     covariance_arcsec2: np.ndarray
@@ -201,12 +170,17 @@ class Adjusted:
     catalogue_factor: float
     chi2_per_degree: float
     face_quality: tuple[FaceQuality, ...]
-    stars: StarQuality
+    stars: np.ndarray
     leftover: Leftover
     inclinometer: InclinometerErrors
-    as_stated: "Adjusted | None" = None
-    same_air: "Adjusted | None" = None
+    as_stated: "DeflectionSession | None" = None
+    same_air: "DeflectionSession | None" = None
     gain: float = 0.0
+
+    @property
+    def mid_unix_s(self) -> float:
+        """Mean time of its frames, UTC."""
+        return sum(s.utc_unix_s for s in self.sightings) / len(self.sightings)
 
     @property
     def sigma_arcsec(self) -> np.ndarray:
@@ -250,11 +224,8 @@ def adjusted(
     instrument: Instrument,
     atmosphere: Atmosphere,
     mark: Place,
-    air: Air | None = None,
-) -> Adjusted:
-    """The deflection of a session; sightings: in order of time, at least three.
-
-    air: its size where it is known, as for a session that is only planned; else the residuals determine it.
+) -> DeflectionSession:
+    """The deflection of a session; sightings: at least three, in any order.
 
     Raises FixError where there are fewer, at the poles, or where the equations have no solution or do not settle.
     """
@@ -262,19 +233,21 @@ def adjusted(
         raise FixError(f"{len(sightings)} frames make no session: at least 3, in several faces, are needed")
     if np.cos(mark.latitude) < MIN_COSINE:
         raise FixError("the mark is within 6 km of a pole, where eta has no direction")
-    places = StarPlaces.of(sightings)
-    sightings = places.applied(sightings)
+    in_time = tuple(sorted(sightings, key=lambda s: s.utc_unix_s))
+    places = StarPlaces.of(in_time)
+    placed = places.applied(in_time)
     session = _Session(
-        sightings=sightings,
+        seen=in_time,
+        sightings=placed,
         places=places,
-        faces=faces_of(sightings),
+        faces=faces_of(placed),
         prior=_prior_of(instrument),
         bending=atmosphere.refraction().a,
         given=instrument.calibration,
         mark=mark,
     )
     try:
-        return _whole_session(session, instrument.inclinometer, air)
+        return _whole_session(session, instrument.inclinometer)
     except np.linalg.LinAlgError as error:
         raise FixError(
             f"the session's equations have no solution ({error}): turn the instrument to several faces, and state the "
@@ -282,10 +255,10 @@ def adjusted(
         ) from None
 
 
-def _whole_session(session: "_Session", inclinometer: InclinometerErrors, air: Air | None) -> Adjusted:
+def _whole_session(session: "_Session", inclinometer: InclinometerErrors) -> DeflectionSession:
     """The session with the errors of the tiltmeter as stated, or larger ones where the residuals show them."""
-    stated = session.solved(inclinometer, air)
-    if air is not None or (shown := session.shown(stated)) is None:
+    stated = session.solved(inclinometer, None)
+    if (shown := session.shown(stated)) is None:
         return _adjusted(session, stated)
     larger, size = shown
     # under one air: what is wrong with the tiltmeter had seemed to be the air's
@@ -313,8 +286,9 @@ class _Solved:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _Session:
-    """What is given: sightings with the stars' places that they adjusted, and what is known before."""
+    """What is given: sightings, as seen and with the stars' places that they adjusted, and what is known before."""
 
+    seen: tuple[ZenithSighting, ...]
     sightings: Sequence[ZenithSighting]
     places: StarPlaces
     faces: np.ndarray
@@ -501,7 +475,7 @@ def _leftover(solved: _Solved, mark: Place) -> Leftover:
     )
 
 
-def _adjusted(session: _Session, solved: _Solved) -> Adjusted:
+def _adjusted(session: _Session, solved: _Solved) -> DeflectionSession:
     sightings, faces, places, mark = session.sightings, session.faces, session.places, session.mark
     estimate, lines, errors, fit, air = solved.estimate, solved.lines, solved.errors, solved.fit, solved.air
     scaled = (
@@ -528,7 +502,8 @@ def _adjusted(session: _Session, solved: _Solved) -> Adjusted:
     up = estimate.a3 @ [east, north, 1.0]
     xi_eta = estimate.deflection(mark.latitude) / ARCSEC
     leftover = _leftover(solved, mark)
-    return Adjusted(
+    return DeflectionSession(
+        sightings=session.seen,
         xi_arcsec=float(xi_eta[0]),
         eta_arcsec=float(xi_eta[1]),
         covariance_arcsec2=whole,
@@ -542,7 +517,7 @@ def _adjusted(session: _Session, solved: _Solved) -> Adjusted:
         catalogue_factor=places.factor,
         chi2_per_degree=fit.chi2 / max(left.size - 5, 1),
         face_quality=face_qualities(leftover, sightings, faces),
-        stars=StarQuality.of(sightings, places, lines, gain),
+        stars=places.stars,
         leftover=leftover,
         inclinometer=solved.inclinometer,
     )
@@ -563,14 +538,14 @@ class Reduced:
     geoid_arcsec: np.ndarray
 
 
-def reduced(found: Adjusted, sightings: Sequence[ZenithSighting], mark: Place) -> Reduced:
+def reduced(found: DeflectionSession, mark: Place) -> Reduced:
     """The reductions of a session.
 
     The mark's height above the ellipsoid stands for that above the geoid: 50 m between them are 0.009 arcsec at most.
     What mountains add to the curvature no formula of the latitude has.
     """
     place = itrs_place(mark.latitude, mark.longitude, mark.height_m)
-    t = np.array([s.utc_unix_s for s in sightings])
+    t = np.array([s.utc_unix_s for s in found.sightings])
     number = np.bincount(found.faces)
     middles = np.bincount(found.faces, t) / number
     tides = np.array([plumb_tide(middle, place, mark.axes) for middle in middles.tolist()])
