@@ -109,7 +109,7 @@ def test_stored_orbits_are_read_again_when_they_change(tmp_path):
     assert [o.number for o in stored.read()] == [5, 123456] and not stored.trouble
     (tmp_path / "a.tle").unlink()
     (tmp_path / "b.json").write_text("broken")
-    # those of before, and why
+    # the earlier ones, and why
     assert [o.number for o in stored.read()] == [5, 123456]
     assert "no file in it has orbits" in stored.trouble
     with pytest.raises(SatelliteError, match="no file in it"):
