@@ -324,7 +324,7 @@ def _frames_below(folder: Path) -> list[str]:
 
 
 def _open_night(args: argparse.Namespace) -> None:
-    """Put a folder's frames, and those of its nights, and its tilt.csv in the place of the folder; raises FrameError."""
+    """Put the frames of a folder, or of the nights in it, and its tilt.csv in its place; raises FrameError."""
     folders = [path for path in args.frames if Path(path).is_dir()]
     if not folders:
         return

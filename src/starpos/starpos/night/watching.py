@@ -19,8 +19,8 @@ from starpos.frames.frame import Frame, Stars
 from starpos.instrument.camera import EQUIDISTANT, Camera
 from starpos.units import ARCSEC, DAY_S, HOUR_S
 
-# how far a camera that nobody touches may wander from night to night, 1 sigma per axis: from the stiffest mount to a post
-# in the Sun, each size as probable as any other until the nights have shown it
+# how far an untouched camera may wander from night to night, 1 sigma per axis: from the stiffest mount to a post in the
+# Sun, each size as probable as any other until the nights have shown it
 WANDERS_RAD = np.geomspace(0.3, 20, 25) * ARCSEC
 # a camera that stands still leaves its own scatter by more in this share of the nights
 ALARM_CHANCE = 1e-6
