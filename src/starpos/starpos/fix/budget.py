@@ -103,7 +103,7 @@ def link_attitude(link_to_enu: np.ndarray, terms: tuple[ErrorTerm, ...]) -> Atti
 
 
 def lens_term(sky: np.ndarray, camera: np.ndarray, mounting: Mounting) -> tuple[ErrorTerm, ...]:
-    """The error of directions in C by an unknown lens, new at each pose; empty if there is none.
+    """The error of directions in C by an unknown lens, new at each pose; empty for a known one.
 
     sky (r, 3): an ErrorTerm's rows for a small rotation of the sky about L's axes.  camera (3, 3): C into L.
     """
