@@ -51,7 +51,7 @@ from starpos.gnss.states import Learned
 from starpos.gnss.watch import GnssCheck
 from starpos.instrument import instrument_file
 from starpos.instrument.instrument import ByGravity, Instrument
-from starpos.instrument.phone_log import is_log as is_phone_log
+from starpos.instrument.phone_log import is_phone_log
 from starpos.instrument.tilt_log import NO_TILTS, Tilts
 from starpos.night import field
 from starpos.night.opening import work_of

@@ -42,7 +42,7 @@ HEAD, ZIP = 4096, b"PK\x03\x04"
 CURE = "give the app's zip as it exports it, of gravity or of the acceleration with gravity"
 
 
-def is_log(path: Path) -> bool:
+def is_phone_log(path: Path) -> bool:
     """Whether a file looks like a telephone's log."""
     head = _head(path)
     return head.startswith((ZIP, b"[")) or _is_header(head.decode("utf-8-sig", "replace").partition("\n")[0])
@@ -62,7 +62,7 @@ def read(path: Path, noise_rad: float) -> TiltLog | None:
 
     noise_rad: 1 sigma of the white noise of a reading.
     """
-    if not is_log(path):
+    if not is_phone_log(path):
         return None
     head = _head(path)
     try:

@@ -23,7 +23,7 @@ from starpos.frames.tables import GNSS, SIMULATED, TILTS, TRUTH
 from starpos.gnss.receiver import GnssTrack, read_gnss_csv
 from starpos.instrument import instrument_file, sensors
 from starpos.instrument.instrument import ByGravity, Calibration, Instrument
-from starpos.instrument.phone_log import is_log as is_phone_log
+from starpos.instrument.phone_log import is_phone_log
 from starpos.instrument.tilt_log import Tilts, TiltsByTime
 from starpos.night.night import Night, Truth
 from starpos.night.reading import About, First, Instruments, Reader, TiltFile

@@ -5,7 +5,7 @@ import math
 import os
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import KW_ONLY, dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -68,6 +68,7 @@ class About:
 
     width: int
     height: int
+    _: KW_ONLY
     focal_px: float | None
     origin_px: tuple[float, float] | None = None
     gravity: Gravity | None = None
@@ -75,7 +76,7 @@ class About:
 
 
 # for pointings only the camera's axes count
-NO_CAMERA = About(IDEAL.width, IDEAL.height, IDEAL.fx)
+NO_CAMERA = About(IDEAL.width, IDEAL.height, focal_px=IDEAL.fx)
 
 
 @dataclass(frozen=True)
@@ -95,7 +96,12 @@ class First:
                 item = self.read(path)
                 self.read.keep(path, item)
                 about = About(
-                    item.width, item.height, item.focal_px, item.origin_px, item.gravity, item.upper_edge
+                    item.width,
+                    item.height,
+                    focal_px=item.focal_px,
+                    origin_px=item.origin_px,
+                    gravity=item.gravity,
+                    upper_edge=item.upper_edge,
                 )
                 if not self.levelled or item.gravity is not None:
                     return about
