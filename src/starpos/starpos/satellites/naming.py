@@ -23,7 +23,7 @@ from starpos.units import DAY_S, UNIX_EPOCH_JD
 
 # s between computed states; Hermite's cubic is within 6 m in low orbits
 STEP_S = 120.0
-# m by which a satellite's distance along a direction, or that of its horizon, changes in half a step, generously
+# Maximum change (m) of a satellite's distance along a direction, or of its horizon's distance, in half a step.
 MOST_WAY_M = 1.5e6
 # a motion may differ by this share, and by this of its distance from the elements over the Earth's radius
 RATE_SHARE, RATE_TURN = 0.01, 4.0
