@@ -181,7 +181,7 @@ def test_a_name_has_the_time_where_no_exif_has_one(tmp_path):
         frame = read_frame(write(tmp_path / name, jpeg(start=None, exposure=None)), TEHRAN)
         assert frame.mid_unix_s == SHOWN_S - 3.5 * 3600 and frame.stamp_stddev_s >= 15
         assert read_frame(tmp_path / name).mid_unix_s is None
-    # the zone is not in the name, and neither is a time in a number or in a day that is none
+    # the zone is not in the name; a longer number, a month 13 and a day alone are no times
     assert read_frame(tmp_path / name, CameraClock()).mid_unix_s is None
     for name in ("120261102180000.jpg", "20261332_180000.jpg", "20261102.jpg"):
         assert read_frame(write(tmp_path / name, jpeg(start=None)), TEHRAN).mid_unix_s is None
