@@ -20,6 +20,7 @@ from starpos.fix.attitude import CAMERA, ITRS, Attitude
 from starpos.fix.budget import tilt_terms
 from starpos.fix.checks import MIN_DEG
 from starpos.fix.circle import MIN_SINE, circle_along
+from starpos.fix.glows import Glow
 from starpos.fix.heading import AttitudeAtPlace, attitudes_at, sky_terms, zenith_moved
 from starpos.fix.solution import Solution
 from starpos.fix.solver import Solver
@@ -75,6 +76,7 @@ def by_sun(solver: Solver, stars: Stars, disc: Disc, tilts: Tilts | None, places
 
     A fault of the frame, the tilt, the time or the place is a status.
     """
+    glow = None
     try:
         if tilts is None and solver.instrument.vertical is None:
             raise InstrumentError(
@@ -96,8 +98,11 @@ def by_sun(solver: Solver, stars: Stars, disc: Disc, tilts: Tilts | None, places
         stamp_s = math.hypot(
             stars.stamp_stddev_s, *shutter.errors_s(np.array([disc.y]), stars.height)[0].tolist()
         )
+        if not disc.sharp:
+            sigma = float(np.linalg.norm(seen.own)) / math.sqrt(2)
+            glow = Glow(state.utc_unix_s, seen.ray, body_at(SUN, state).itrs, sigma)
         if places is None:
-            return _on_circle(solver, stars, disc, seen, tilt, state, stamp_s)
+            return replace(_on_circle(solver, stars, disc, seen, tilt, state, stamp_s), glow=glow)
         place, wrong = places.at(state.utc_unix_s), None
         for name in (SUN, MOON) if disc.sharp else (SUN,):
             try:
@@ -113,12 +118,13 @@ def by_sun(solver: Solver, stars: Stars, disc: Disc, tilts: Tilts | None, places
                 at_place=found,
                 tilt=tilt,
                 bodies=(name,),
+                glow=glow,
                 extrapolated_days=state.orientation.extrapolated_days,
             )
         assert wrong is not None
         raise wrong
     except StarposError as error:
-        return Solution.refused(stars, error)
+        return replace(Solution.refused(stars, error), glow=glow)
 
 
 def _check_size(disc: Disc, seen: _Seen, body: Body, camera: Camera, place: str) -> None:
