@@ -14,7 +14,6 @@ setup(
     install_requires=["setuptools", "numpy", "pyyaml"],
     zip_safe=True,
     maintainer="starpos maintainers",
-    maintainer_email="maintainers@starpos.invalid",
     description="The starpos camera: frames from cameras, video, files or a simulated sky, and the stars in them.",
     license="Apache-2.0",
     extras_require={"test": ["pytest"]},

@@ -14,7 +14,6 @@ setup(
     install_requires=["setuptools", "numpy", "pyserial"],
     zip_safe=True,
     maintainer="starpos maintainers",
-    maintainer_email="maintainers@starpos.invalid",
     description="The starpos inclinometer: serial protocol, driver and node.",
     license="Apache-2.0",
     extras_require={"test": ["pytest"]},

@@ -8,7 +8,6 @@ setup(
     version="0.1.0",
     description="Stars and tilt in, position and heading out",
     maintainer="starpos maintainers",
-    maintainer_email="maintainers@starpos.invalid",
     license="Apache-2.0",
     packages=find_packages(include=[package, f"{package}.*"]),
     data_files=[

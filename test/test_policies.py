@@ -12,6 +12,7 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Image
 
 from starpos_testing.patience import WAIT_S
+from starpos_testing.skies import orbits
 
 NIGHT = Path(__file__).parent / "data" / "night"
 POLICY = Path(__file__).parents[1] / "src" / "starpos_bringup" / "sros2" / "policies.xml"
@@ -118,10 +119,12 @@ def hold(graph, *enclaves: str, without: frozenset = frozenset()):
 @pytest.mark.usefixtures("tf2")
 def test_the_policy_holds_for_the_nodes_apart(graph, secured, tmp_path):
     sim = "use_sim_time:=true"
-    secured("starpos_solver", "solver", sim, "gyro:=true")
+    (tmp_path / "active.tle").write_text(orbits.drawn(3, 1, time.time() - 3600)[1])
+    elements = f"satellites.elements:={tmp_path / 'active.tle'}"
+    secured("starpos_solver", "solver", sim, "gyro:=true", elements)
     secured("starpos_solver", "navigator", sim, "publish_tf:=true")
     secured("starpos_camera", "camera", sim, *SKY)
-    secured("starpos_camera", "detector", sim, "gyro:=true", "day_exposure:=true")
+    secured("starpos_camera", "detector", sim, "gyro:=true", "trails:=true", "day_exposure:=true")
     secured("starpos_inclinometer", "inclinometer", sim, "source:=imu")
     secured("starpos_bringup", "record", arguments=(str(tmp_path / "bag"), "--images"))
     secured("starpos_bringup", "folder", arguments=(str(tmp_path / "night"),))
@@ -135,16 +138,16 @@ def test_the_policy_holds_for_the_nodes_apart(graph, secured, tmp_path):
 
 def test_the_policy_holds_for_camera_and_detector_in_one_process(graph, secured):
     graph.hear(Image, "detector/image_annotated")
-    secured(
-        "starpos_camera", "camera_detector", "use_sim_time:=true", "gyro:=true", "day_exposure:=true", *SKY
-    )
+    all_of_it = "gyro:=true", "trails:=true", "day_exposure:=true"
+    secured("starpos_camera", "camera_detector", "use_sim_time:=true", *all_of_it, *SKY)
     hold(graph, "/starpos/camera_detector")
 
 
 def test_the_policy_holds_for_a_replay(graph, secured):
     secured("starpos_bringup", "replay", arguments=(str(NIGHT), "--rate", "0", "--wait", "30"))
-    # The kept night has no GNSS.
-    hold(graph, "/starpos/replay", without=frozenset({("/replay", "publish", "/gnss/fix")}))
+    # The kept night has no GNSS and no trails.
+    without = frozenset({("/replay", "publish", f"/{name}") for name in ("gnss/fix", "trails")})
+    hold(graph, "/starpos/replay", without=without)
 
 
 def test_every_executable_has_an_enclave():

@@ -41,9 +41,8 @@ FORBIDDEN_ATTRIBUTES = {
 }
 YAML = {"safe_load", "safe_dump", "YAMLError", "YAMLObject", "SafeDumper"}
 ALLOWED = {
-    # between the processes of one command; a cluster runs what its scheduler sends, by its nature (README)
+    # between the processes of one command
     "starpos/parallel/processes.py": {"pickle"},
-    "starpos/parallel/cluster.py": {"pickle"},
     # as dataclasses does: of the names of this program's own fields
     "starpos/frozen.py": {"exec"},
     # a SafeLoader that refuses aliases too; a scan makes pieces of text, no objects
@@ -63,8 +62,6 @@ ALLOWED = {
 # Who reads a file whole, or a table, and what bounds it: a limit, or that it came with the package.
 READS_WHOLE = {
     "starpos/earth/orientation.py": "the table of the Earth's rotation that astropy brings",
-    "starpos/parallel/cluster.py": "our own source",
-    "starpos/identification/paper.py": "of the package",
     "starpos/sky/catalogue.py": "of the package, and the checksum of its table of parallaxes",
     "starpos/report/coast.py": "of the package",
     "starpos/night/field.py": "MAX_BYTES",

@@ -169,7 +169,6 @@ def test_what_is_allowed_is_no_breach(walls):
         "starpos.fix.new": "import numpy as np\nfrom starpos.identification import Sky\nimport yaml\nimport json",
         "starpos_solver.new": "from starpos.fix.solver import Solver\nfrom starpos_interfaces.msg import Tilt",
         "starpos.rotation": "from starpos.units import ARCSEC",
-        "starpos.parallel.cluster": "import starpos",
         "starpos.cli.new": "from starpos import __version__, rotation",
         "starpos_bringup.new": "import starpos\nimport tf2_ros",
     }

@@ -25,7 +25,6 @@ FOREIGN = {
     "astropy",
     "astropy_iers_data",
     "cv2",
-    "distributed",
     "erfa",
     "exifread",
     "lz4",
@@ -41,8 +40,6 @@ FOREIGN = {
 # What compiled modules may import besides compiled modules of their own folder and of lower floor numbers.
 OF_CYTHON = {"cpython", "libc", "numpy"}
 IMPORTED = re.compile(r"\bfrom\s+([\w.]+)\s+c?import\b|\bc?import\s+(.+)")
-# Modules that may import the package `starpos` itself: they ask for its file and its version.
-MAY_IMPORT_STARPOS = {"starpos.parallel.cluster"}
 # names that the whole field writes in this way
 USUAL = {("numpy", "np"), ("xml.etree.ElementTree", "ET"), ("matplotlib.pyplot", "plt")}
 DOCUMENTED = ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef
@@ -213,7 +210,7 @@ def outside(sources: list[Module]) -> Iterator[str]:
                 yield module.at(
                     node, f"starpos imports {package}, which is ROS, or not yet in FOREIGN of walls.py"
                 )
-            elif package != "starpos" or rest == "__version__" or module.name in MAY_IMPORT_STARPOS:
+            elif package != "starpos" or rest == "__version__":
                 continue
             elif rest.partition(".")[0] not in floors():
                 yield module.at(

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 import os
+import sys
 from glob import glob
 from importlib.metadata import version
 from pathlib import Path
@@ -8,9 +9,10 @@ from setuptools import Extension, find_packages, setup
 from setuptools.command.build_ext import build_ext
 
 package = "starpos"
+WINDOWS = sys.platform == "win32"
 # the code of views of arrays, which Cython from 3.1 on need not put into each module: that halves the time of a build
 VIEWS = f"{package}._numeric._views" if tuple(map(int, version("cython").split(".")[:2])) >= (3, 1) else None
-# a compiled module is a .pyx beside the Python that calls it; what several of them share is in .pxd
+# a compiled module is a .pyx next to the Python that calls it; what several of them share is in .pxd
 SHARED = sorted(glob("starpos/*/*.pxd"))
 COMPILED = [
     Extension(
@@ -18,8 +20,10 @@ COMPILED = [
         [source],
         depends=[*SHARED, "setup.py"],
         # else the loader takes the oldest exp, which is slow
-        libraries=["m"],
-        extra_compile_args=["-O3", "-g0", "-fno-math-errno"],
+        libraries=[] if WINDOWS else ["m"],
+        extra_compile_args=["/O2", "/clang:-fno-math-errno"]
+        if WINDOWS
+        else ["-O3", "-g0", "-fno-math-errno"],
     )
     for source in [*sorted(glob("starpos/*/*.pyx")), *(["starpos/_numeric/_views.c"] if VIEWS else [])]
 ]
@@ -38,10 +42,14 @@ class BuildCompiled(build_ext):
         for extension in self.extensions:
             extension.sources = sources[extension.name]
         self.parallel = at_once
+        if self.compiler.compiler_type == "msvc":
+            # Microsoft's own compiler has no vectors of C; LLVM's takes its options (the runners of GitHub have it)
+            self.compiler.initialize()
+            self.compiler.cc = "clang-cl.exe"
         super().build_extensions()
 
 
-# What colcon needs stands here, because it builds with links beside this file alone. All else that is said of the package
+# What colcon needs stands here, because it builds with links to this file alone. All else that is said of the package
 # is in pyproject.toml.
 setup(
     name=package,
@@ -66,13 +74,13 @@ setup(
         "opencv-python-headless>=4.6",
         "PyYAML",
         "sgp4>=2.15",
+        "exifread>=3",
     ],
     extras_require={
         "picture": ["matplotlib"],
-        "raw": ["rawpy", "exifread>=3"],
-        "heif": ["pillow-heif", "exifread>=3"],
+        "raw": ["rawpy"],
+        "heif": ["pillow-heif"],
         "report": ["matplotlib", "rosbags>=0.11"],
-        "cluster": ["distributed"],
         "completion": ["argcomplete"],
         "test": ["pytest"],
     },

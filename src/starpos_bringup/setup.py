@@ -10,7 +10,6 @@ setup(
     version="0.1.0",
     description="Launch files, default parameters, recording and playing of the whole instrument",
     maintainer="starpos maintainers",
-    maintainer_email="maintainers@starpos.invalid",
     license="Apache-2.0",
     packages=find_packages(include=[package, f"{package}.*"]),
     package_data={package: ["data/*.yaml"]},

@@ -15,7 +15,6 @@ setup(
     install_requires=["setuptools"],
     zip_safe=True,
     maintainer="starpos maintainers",
-    maintainer_email="maintainers@starpos.invalid",
     description="What every starpos node shares.",
     license="Apache-2.0",
     extras_require={"test": ["pytest"]},

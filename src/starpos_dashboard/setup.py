@@ -8,7 +8,6 @@ setup(
     version="0.1.0",
     description="One page in a browser that shows what the instrument says",
     maintainer="starpos maintainers",
-    maintainer_email="maintainers@starpos.invalid",
     license="Apache-2.0 AND ISC AND MIT",
     packages=find_packages(include=[package, f"{package}.*"]),
     package_data={package: ["assets/*", "assets/vendor/*"]},

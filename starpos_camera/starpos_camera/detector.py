@@ -35,7 +35,7 @@ from starpos.messages.stamp import stamp_to_unix
 from starpos.parameters.table import parameters_of
 from starpos.session.gyro_readings import Trails
 from starpos.session.pace import MAX_LATE_S, Pace
-from starpos_camera.annotator import Annotator
+from starpos_camera.after_solution import Annotator, TrailFinder
 from starpos_common.diagnostics import Diagnosis, Diagnostics, Level, Troubles, time_is_simulated
 from starpos_common.messages import encoding_of, stars_to_message
 from starpos_common.parameters import declare
@@ -250,6 +250,7 @@ class DetectorNode(Node):
         self._captures_come: Callable[[], int] = lambda: 0
         self._annotator = Annotator(self)
         self._day = DayExposure(self) if self._values["day_exposure"] else None
+        self._trail_finder = TrailFinder(self) if self._values["trails"] else None
         self._trails: Trails | None = None
         # Held while the trails are used: the executor gives them readings, the worker's thread asks for a frame's.
         self._turning = threading.Lock()
@@ -289,6 +290,8 @@ class DetectorNode(Node):
     def close(self) -> None:
         self._worker.stop()
         self._annotator.stop()
+        if self._trail_finder is not None:
+            self._trail_finder.stop()
 
     @property
     def wanted(self) -> bool:
@@ -444,7 +447,11 @@ class DetectorNode(Node):
                     self._say_size(result.frame)
                     if self._day is not None:
                         self._day.judge(result.frame, result.detection.stars.disc)
-                    self._annotator.offer(result.frame, result.detection.stars, result.message.header)
+                    subject = result.frame, result.detection.stars, result.message.header
+                    self._annotator.offer(*subject)
+                    # in a replay the solver would have to wait for them
+                    if self._trail_finder is not None and not (self._replayed and self._replayed.playing):
+                        self._trail_finder.offer(*subject)
                 self._last = replace(result, frame=None)
             elif isinstance(result, StarposError):
                 self._complain(str(result))

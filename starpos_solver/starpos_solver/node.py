@@ -48,10 +48,11 @@ class SolverNode(Node):
         self._values = self._settings.values
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         gyro = (IMU_TOPIC,) * self._values["gyro"]
-        gnss = (GNSS_TOPIC,) * self._values["gnss.use"]
+        orbits = self._settings.orbits is not None
+        trails, gnss = ("trails",) * orbits, (GNSS_TOPIC,) * (self._values["gnss.use"] and not orbits)
         # at a known place a heading needs no tilt
         tilt = ("tilt",) * (self._settings.site is None and not gnss)
-        self._inputs = Inputs(self, ("camera_info", "stars", *tilt, *gyro, *gnss))
+        self._inputs = Inputs(self, ("camera_info", "stars", *trails, *tilt, *gyro, *gnss))
         self._dropped = Dropped(self, PLAY_SLOWER)
         self._replayed: Replayed | None = None
         self._session = SolverSession(
@@ -81,6 +82,8 @@ class SolverNode(Node):
         }
         if session.gnss is not None:
             takes[GNSS_TOPIC] = lambda m, _: self._publish(session.receive_gnss(m, self._now()))
+        if session.satellites is not None:
+            takes["trails"] = lambda m, _: self._publish(session.receive_trails(m, self._now()))
         if time_is_simulated(self):
             self._replayed = Replayed(
                 self,
@@ -93,6 +96,8 @@ class SolverNode(Node):
         subscription_from_any(self, CameraInfo, CAMERA_TOPIC, self._taker(CAMERA_TOPIC, takes), 10)
         self._tilts = subscription(self, msg.Tilt, "tilt", self._taker("tilt", takes), TILT_QUEUE)
         self._stars = subscription(self, msg.StarArray, "stars", self._taker("stars", takes), STARS_QUEUE)
+        if session.satellites is not None:
+            subscription(self, msg.TrailArray, "trails", self._taker("trails", takes), 10)
         self._again = self.create_guard_condition(self._go_on)
         if self._values["gyro"]:
             best_effort = ReliabilityPolicy.BEST_EFFORT
@@ -121,6 +126,8 @@ class SolverNode(Node):
         }
         if session.gnss is not None:
             tasks["GNSS"] = session.gnss.report
+        if session.satellites is not None:
+            tasks["Satellites"] = session.satellites.report
         if session.deflection.measures:
             tasks["Deflection"] = session.deflection.report
         self._diagnostics = Diagnostics(self, tasks, self._values["frame_id"])

@@ -3,6 +3,7 @@
 
 import math
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from sensor_msgs.msg import Imu, NavSatFix, NavSatStatus
@@ -18,6 +19,9 @@ from starpos.gnss.watch import GnssCheck, GnssStatus
 from starpos_common.messages import quaternion, tilt_to_message
 from starpos_interfaces import msg
 
+if TYPE_CHECKING:
+    from starpos.satellites.locating import SatelliteFix
+
 # the messages name their constants as the enums do
 STATUS = {status: getattr(msg.Solution, status.name) for status in Status}
 GNSS_STATUS = {status: getattr(msg.GnssCheck, status.name) for status in GnssStatus}
@@ -32,20 +36,35 @@ def nav_sat_fix(
     header: Header, ground: Geodetic | None, altitude: float, altitude_stddev: float
 ) -> NavSatFix:
     """Make a NavSatFix on WGS 84; without a position NO_FIX with NaN, so that consumers see the instrument at work."""
-    message = NavSatFix(header=header)
-    # No satellites.
-    message.status.service = 0
     if ground is None:
+        return _nav_sat_fix(header, None, NAN, np.zeros((3, 3)))
+    covariance = np.zeros((3, 3))
+    covariance[:2, :2] = ground.covariance[:2, :2]
+    covariance[2, 2] = UNKNOWN_ALTITUDE_VARIANCE if math.isnan(altitude) else altitude_stddev**2
+    return _nav_sat_fix(header, ground, altitude, covariance)
+
+
+def fix_by_satellites(header: Header, fix: "SatelliteFix | None") -> NavSatFix:
+    """Make a NavSatFix on WGS 84 with its height, of satellites among the stars; without a place NO_FIX with NaN."""
+    if fix is None:
+        return _nav_sat_fix(header, None, NAN, np.zeros((3, 3)))
+    return _nav_sat_fix(header, fix, fix.height_m, fix.covariance)
+
+
+def _nav_sat_fix(
+    header: Header, place: "Geodetic | SatelliteFix | None", altitude: float, covariance: np.ndarray
+) -> NavSatFix:
+    message = NavSatFix(header=header)
+    # no navigation satellites
+    message.status.service = 0
+    if place is None:
         message.status.status = NavSatStatus.STATUS_NO_FIX
         message.latitude = message.longitude = message.altitude = NAN
         message.position_covariance_type = NavSatFix.COVARIANCE_TYPE_UNKNOWN
         return message
     message.status.status = NavSatStatus.STATUS_FIX
-    message.latitude, message.longitude = math.degrees(ground.latitude), math.degrees(ground.longitude)
+    message.latitude, message.longitude = math.degrees(place.latitude), math.degrees(place.longitude)
     message.altitude = altitude
-    covariance = np.zeros((3, 3))
-    covariance[:2, :2] = ground.covariance[:2, :2]
-    covariance[2, 2] = UNKNOWN_ALTITUDE_VARIANCE if math.isnan(altitude) else altitude_stddev**2
     message.position_covariance = covariance.ravel()
     message.position_covariance_type = NavSatFix.COVARIANCE_TYPE_KNOWN
     return message

@@ -17,7 +17,7 @@ from std_msgs.msg import Header
 
 from starpos.earth.vertical import Geodetic
 from starpos.instrument.instrument import Instrument
-from starpos.session.frames import Answered, Averaged, Output
+from starpos.session.frames import Answered, Averaged, BySatellites, Output
 from starpos_common.messages import attitude_to_message, quaternion
 from starpos_common.topics import publisher
 from starpos_interfaces import msg
@@ -141,13 +141,15 @@ class SolutionPublishers:
         self._imu = publisher(node, Imu, "heading/imu", 10)
         self._attitude = publisher(node, msg.Attitude, "attitude", 10)
         self._solution = publisher(node, msg.Solution, "solver/solution", 10)
+        orbits = settings.orbits is not None
+        self._by_satellites = publisher(node, NavSatFix, "satellites/fix", 10) if orbits else None
         self._check = publisher(node, msg.GnssCheck, "gnss/check", 10) if self._values["gnss.use"] else None
 
     @property
     def publishers(self) -> tuple[Publisher, ...]:
         """The publishers of all topics, the solution's first."""
-        check = () if self._check is None else (self._check,)
-        return self._solution, self._fix, self._fix_averaged, self._imu, self._attitude, *check
+        more = [p for p in (self._by_satellites, self._check) if p is not None]
+        return self._solution, self._fix, self._fix_averaged, self._imu, self._attitude, *more
 
     @property
     def shared(self) -> tuple[Publisher, ...]:
@@ -159,6 +161,10 @@ class SolutionPublishers:
         header = self._header(output.stamp)
         if isinstance(output, Averaged):
             self._fix_averaged.publish(self._nav_sat_fix(header, output.ground))
+            return
+        if isinstance(output, BySatellites):
+            if self._by_satellites is not None:
+                self._by_satellites.publish(outputs.fix_by_satellites(header, output.fix))
             return
         self._fix.publish(self._nav_sat_fix(header, output.ground))
         fix, at_place = output.solution.fix, output.solution.at_place

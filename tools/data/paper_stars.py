@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Differences of the paper's star list from the plain cut V < 7 with a HIP number in the committed catalogue.
 
-`paper_stars.py ORIGINALS > src/starpos/starpos/identification/data/paper_stars.csv` (a folder with tyc2.dat.00 .. 19).
+`paper_stars.py ORIGINALS > src/starpos/test/identification/paper_stars.csv` (a folder with tyc2.dat.00 .. 19).
 The paper's list is rows of Tycho-2's main table: without supplement 1, both components of a pair, V not rounded to
 0.01 mag.
 """
@@ -13,9 +13,10 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
-from starpos.identification.paper import LIMIT_MAG, plain_cut
 from starpos.sky import catalogue
 from starpos.sky.tycho2 import johnson_v
+
+LIMIT_MAG = 7.0
 
 
 def paper_rows(folder: Path):
@@ -39,7 +40,8 @@ tree = cKDTree(stars.directions(bright))
 rows = list(paper_rows(Path(sys.argv[1])))
 ra, dec = np.radians([r[1:] for r in rows]).T
 _, nearest = tree.query(np.stack([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)], -1))
-wanted, plain = Counter(bright[nearest].tolist()), set(plain_cut(stars).tolist())
+plain_cut = (stars.vmag_centi < 100 * LIMIT_MAG) & (stars.hip > 0)
+wanted, plain = Counter(bright[nearest].tolist()), set(np.flatnonzero(plain_cut).tolist())
 print(
     f"# {Path(__file__).name}: how often the paper's {len(rows)} stars hold these, where that is not the plain cut"
 )

@@ -13,11 +13,14 @@ from contextlib import suppress
 from pathlib import Path
 from typing import BinaryIO
 from urllib.parse import unquote, urlsplit
+from urllib.request import url2pathname
 
 from starpos.errors import InstrumentError
 
 # Linux opens no longer path.
 LONGEST_PATH = 4096
+# no wait for the other end of a pipe, and no terminal becomes ours; Windows has neither among its files
+AT_ONCE = getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_NOCTTY", 0)
 # every page and picture that starpos makes has this mark in its first HEAD bytes
 MARK, HEAD = b"starpos", 400
 
@@ -30,7 +33,7 @@ def open_regular(path: Path | str) -> BinaryIO:
     try:
         _check_regular(os.stat(path))
         # the caller closes it
-        file = open(path, "rb", opener=_open_at_once)  # noqa: SIM115
+        file = open(path, "rb", opener=lambda name, flags: os.open(name, flags | AT_ONCE))  # noqa: SIM115
     # the name contains a NUL
     except ValueError:
         raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT)) from None
@@ -108,11 +111,13 @@ def write_whole(path: Path | str, content: bytes) -> None:
     except BaseException:
         Path(temporary).unlink(missing_ok=True)
         raise
-    folder = os.open(target.parent, os.O_RDONLY)
-    try:
-        os.fsync(folder)
-    finally:
-        os.close(folder)
+    # Windows opens no folder, and keeps names by itself
+    with suppress(PermissionError):
+        folder = os.open(target.parent, os.O_RDONLY)
+        try:
+            os.fsync(folder)
+        finally:
+            os.close(folder)
 
 
 def has_mark(path: Path | str) -> bool:
@@ -132,10 +137,11 @@ def path_of(url: str) -> Path:
         )
     try:
         parts = urlsplit(url)
-        if not parts.scheme:
+        # one letter is a drive of Windows
+        if len(parts.scheme) < 2:
             return Path(url).expanduser()
         if parts.scheme == "file" and parts.netloc in ("", "localhost") and parts.path:
-            return Path(unquote(parts.path))
+            return Path(url2pathname(parts.path))
         if parts.scheme == "package" and parts.netloc and parts.path:
             return _share_of(parts.netloc) / unquote(parts.path).lstrip("/")
     except (ValueError, RuntimeError):
@@ -152,11 +158,6 @@ def _share_of(package: str) -> Path:
     raise InstrumentError(
         f"package://{package}: no such package is installed: enter the workspace that has it"
     )
-
-
-def _open_at_once(path: str, flags: int) -> int:
-    """Open without waiting for the other end of a pipe, and without a terminal becoming ours."""
-    return os.open(path, flags | os.O_NONBLOCK | os.O_NOCTTY)
 
 
 def _check_regular(status: os.stat_result) -> None:

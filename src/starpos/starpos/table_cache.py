@@ -27,9 +27,9 @@ def cache_folder() -> Path:
     given = os.environ.get("XDG_CACHE_HOME")
     try:
         return Path(given or Path.home() / ".cache") / "starpos"
-    # a user without a home, as in some containers
+    # a user without a home, as in some containers; Windows numbers no users
     except RuntimeError:
-        return Path(tempfile.gettempdir()) / f"starpos-{os.getuid()}"
+        return Path(tempfile.gettempdir()) / f"starpos-{getattr(os, 'getuid', lambda: 'user')()}"
 
 
 class KeptTables(Generic[Table]):

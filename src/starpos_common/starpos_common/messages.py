@@ -4,6 +4,7 @@
 import array
 import math
 import sys
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -16,9 +17,10 @@ from starpos import rotation
 from starpos.errors import TimeError
 from starpos.fix.camera_attitude import CameraAttitude
 from starpos.frames.exposure import Shutter
-from starpos.frames.frame import DISC, SATURATED, Disc, Frame, Stars
+from starpos.frames.frame import DISC, SATURATED, Disc, Frame, FrameTrail, Stars
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import Tilt
+from starpos.messages.stars import FIRST_CUT, SECOND_CUT, UNSTEADY
 from starpos_interfaces import msg
 
 HOST_IS_BIG_ENDIAN = sys.byteorder == "big"
@@ -64,6 +66,22 @@ def stars_to_message(stars: Stars, frame_id: str) -> msg.StarArray:
             *([] if stars.disc is None else [_disc_to_message(stars.disc)]),
         ],
         **shutter_fields(stars.shutter),
+    )
+
+
+def trails_to_message(trails: Iterable[FrameTrail], header: Header) -> msg.TrailArray:
+    """Convert the trails of a frame to a TrailArray."""
+    return msg.TrailArray(
+        header=header,
+        trails=[
+            msg.Trail(
+                ends=t.ends.ravel(),
+                covariance=t.covariance.ravel(),
+                snr=t.snr,
+                flags=int(t.cut @ (FIRST_CUT, SECOND_CUT)) + (0 if t.steady else UNSTEADY),
+            )
+            for t in trails
+        ],
     )
 
 

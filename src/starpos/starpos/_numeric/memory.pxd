@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 # cython: boundscheck=False, wraparound=False, cdivision=True, initializedcheck=False
-# Where arrays keep their numbers, for the other modules here.
+# Where arrays keep their numbers, and memory to work in, for the other modules here.
 
 from cpython.buffer cimport PyBUF_SIMPLE, PyBuffer_Release, PyObject_GetBuffer
+from cpython.bytearray cimport PyByteArray_AS_STRING, PyByteArray_FromStringAndSize
 
 
 cdef inline void *numbers_of(array, Py_ssize_t size) except NULL:
@@ -16,3 +17,13 @@ cdef inline void *numbers_of(array, Py_ssize_t size) except NULL:
     if held.len != size:
         raise ValueError(f"an array of {held.len} bytes where {size} were expected")
     return held.buf
+
+
+cdef inline bytearray room_for(Py_ssize_t size):
+    """So many bytes to work in, without values; Python frees them when nobody holds them any more."""
+    return PyByteArray_FromStringAndSize(NULL, size)
+
+
+cdef inline void *start_of(bytearray room) noexcept:
+    """The first byte."""
+    return PyByteArray_AS_STRING(room)

@@ -86,42 +86,12 @@ def run_deepen(args: argparse.Namespace) -> int:
 
 
 def run_triangles(args: argparse.Namespace) -> int:
-    """Print the catalogue of triangles of a field, or the paper's."""
-    return show_paper() if args.paper else show_field(options.camera_of(args))
-
-
-def show_paper() -> int:
-    """Count the paper's triangles again and print them next to its own numbers."""
-    from starpos.identification import paper
-
-    c = catalogue.load_catalogue()
-    row = paper.stars(c)
-    count = paper.count_triangles(c.directions(row), np.radians(paper.LONGEST_SIDE_DEG))
-    print(f"Tycho-2's main table, V < {paper.LIMIT_MAG:g} with a HIP number: {len(row)} stars")
-    print(f"triangles with every side below {paper.LONGEST_SIDE_DEG:g} deg: {count}")
-    for whose, number in (
-        ("printed by the paper", paper.PRINTED_TRIANGLES),
-        ("from the original files", paper.TRIANGLES),
-    ):
-        print(f"    {number} {whose}: {100 * (count / number - 1):+.2f} %")
-    print("angles of its triangle, rad:  here      +-        paper     difference")
-    for name, here, sigma, printed in zip(
-        paper.CORNERS, *paper.angles_of_printed(c), paper.ANGLES, strict=True
-    ):
-        print(f"    at {name:12s}       {here:9.6f}  {sigma:.6f}  {printed:9.6f}  {here - printed:+.1e}")
-    print(
-        "    (+- is Tycho-2's: of component A's motion it knows only that of the pair; the paper rounds to 0.000005)"
-    )
-    return 0
-
-
-def show_field(camera: Camera) -> int:
-    """Print the catalogue of triangles for a camera."""
+    """Print the catalogue of triangles of a field."""
     from starpos.fix.solver import Solver
     from starpos.identification import triangles
     from starpos.instrument.instrument import Instrument
 
-    progress = console.ProgressBar()
+    camera, progress = options.camera_of(args), console.ProgressBar()
     Solver(Instrument(camera.fx), catalogue.load_catalogue(), progress=progress).prepare(
         camera.width, camera.height
     )

@@ -3,7 +3,6 @@
 
 import argparse
 import os
-import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -12,28 +11,22 @@ import numpy as np
 from starpos.cli import console, inputs, options
 from starpos.cli.console import Output
 from starpos.cli.inputs import checked_tilts, frames_among, given_of, reader_of
-from starpos.earth.orientation import earth_state
 from starpos.earth.place import Place
 from starpos.errors import FixError, FrameError, InstrumentError, TiltError
 from starpos.fix.solution import Solution
-from starpos.fix.solver import Solver
 from starpos.instrument.instrument import Instrument, with_frame_size
 from starpos.night.bag import each_frame, is_bag
 from starpos.night.reading import First
 from starpos.night.remarks import of_inclinometer
 from starpos.night.work import OnFile, ZenithSighted
-from starpos.sky.catalogue import Catalogue, load_catalogue
 from starpos.units import ARCSEC, utc_text
-from starpos.zenith.adjustment import FaceQuality, Reduced, StarQuality, reduced
+from starpos.zenith.adjustment import FaceQuality, Reduced, reduced
 from starpos.zenith.doubts import DeflectionSession, remarks
-from starpos.zenith.planning import Planner, Routine, SessionPlan, ZenithSky
 from starpos.zenith.sighting import ZenithSighting
 
 COLUMNS = ("file", "combined", "status", "utc", "face", "heading", "xi_arcsec", "eta_arcsec", "sigma_xi_arcsec",
            "sigma_eta_arcsec", "stars_matched", "residual_arcsec", "faces", "frames")  # fmt: skip
 HEAD = "file: face, heading of the frame's top (deg), xi and eta (arcsec) of the frame alone, with the session's A3"
-# number of stars listed, largest leverage first
-STARS_LISTED = 50
 
 
 def frame_json(path: str, session: DeflectionSession, k: int) -> dict:
@@ -66,10 +59,8 @@ def frame_line(value: dict) -> str:
     )
 
 
-def combined_json(
-    session: DeflectionSession, without: Reduced, mark: Place, station: str, catalogue: Catalogue
-) -> dict:
-    """The session's value; station: name of the mark, '' for none.  catalogue: of which its stars are rows."""
+def combined_json(session: DeflectionSession, without: Reduced, mark: Place, station: str) -> dict:
+    """The session's value; station: name of the mark, '' for none."""
     found = session.adjusted
     sigma_xi, sigma_eta = found.sigma_arcsec
     return {
@@ -104,8 +95,7 @@ def combined_json(
             "geoid_arcsec": without.geoid_arcsec,
         },
         "by_face": [_face_json(face) for face in found.face_quality],
-        "stars": len(found.stars.stars),
-        "by_star": _stars_json(found.stars, catalogue),
+        "stars": len(found.stars),
     }
 
 
@@ -118,23 +108,6 @@ def _face_json(face: FaceQuality) -> dict:
         "stddev_arcsec": face.stddev_arcsec,
         "chi2": face.chi2,
     }
-
-
-def _stars_json(stars: StarQuality, catalogue: Catalogue) -> list[dict]:
-    """The stars with the largest leverage, in order of it."""
-    first = np.argsort(-np.hypot(*stars.leverage_arcsec.T), kind="stable")[:STARS_LISTED]
-    names, magnitudes = catalogue.labels(stars.stars[first])
-    return [
-        {
-            "star": name,
-            "vmag": vmag,
-            "frames": stars.frames[k],
-            "mean_arcsec": stars.mean_arcsec[k],
-            "rms_arcsec": stars.rms_arcsec[k],
-            "leverage_arcsec": stars.leverage_arcsec[k],
-        }
-        for name, vmag, k in zip(names, magnitudes.tolist(), first.tolist(), strict=True)
-    ]
 
 
 def combined_text(session: DeflectionSession, value: dict) -> str:
@@ -152,7 +125,6 @@ def combined_text(session: DeflectionSession, value: dict) -> str:
             f"image motion {value['image_motion_arcsec']:.2f} a frame, anomalous refraction "
             f"{value['anomalous_refraction_arcsec']:.3f}; largest errors (xi, eta): {sizes}",
             *(_face_text(face) for face in value["by_face"]),
-            *(_star_text(star, value["stars"]) for star in value["by_star"][:1]),
         )
     )
 
@@ -165,109 +137,28 @@ def _face_text(face: dict) -> str:
     )
 
 
-def _star_text(star: dict, stars: int) -> str:
-    xi, eta = star["leverage_arcsec"]
-    return (
-        f"of {stars} stars {star['star']} (V {star['vmag']:.1f}, {star['frames']} frames) counts most: 1 sigma of its "
-        f"catalogue place would move xi by {xi:.4f}, eta by {eta:.4f}, if the session did not correct it"
-    )
-
-
-NO_PLAN = 1
-
-
-def run_plan(args: argparse.Namespace, mark: Place) -> int:
-    """Print the plan; returns the exit status."""
-    if args.frames or args.tilt is not None:
-        raise InstrumentError("--plan is for a session that has no frames yet: leave out frames and --tilt")
-    instrument = options.instrument_of(args, None)
-    camera = instrument.camera or instrument.camera_for(*(instrument.size or args.size))
-    state = earth_state(time.time())
-    sky = ZenithSky.of(load_catalogue(), camera, mark.latitude, args.limit_mag, args.centroid, state.year)
-    planner = Planner(
-        instrument=instrument,
-        camera=camera,
-        atmosphere=options.atmosphere_of(args),
-        mark=mark,
-        sky=sky,
-        routine=Routine(
-            frame_s=args.cadence,
-            turning_s=args.turning,
-            readings=args.readings,
-            level_rad=args.level * ARCSEC,
-        ),
-        motion_rad=args.motion * ARCSEC,
-        state=state,
-    )
-    try:
-        plan = planner.quickest(args.plan)
-    except FixError as error:
-        console.complain("deflection", error)
-        return NO_PLAN
-    value = _plan_json(plan, sky)
-    if args.json:
-        console.print_json(value)
-    else:
-        print(_plan_text(value))
-    return 0
-
-
-def _plan_json(plan: SessionPlan, sky: ZenithSky) -> dict:
-    sigma_xi, sigma_eta = plan.sigma_arcsec
-    return {
-        "plan": True,
-        "rounds": plan.rounds,
-        "faces": plan.faces,
-        "frames_a_face": plan.frames,
-        "frames": plan.faces * plan.frames,
-        "duration_s": plan.duration_s,
-        "sigma_xi_arcsec": sigma_xi,
-        "sigma_eta_arcsec": sigma_eta,
-        "stars_a_frame": sky.stars,
-        "errors": {name: [xi, eta] for name, xi, eta in plan.terms},
-    }
-
-
-def _plan_text(value: dict) -> str:
-    largest = sorted(value["errors"].items(), key=lambda item: -max(item[1]))[:4]
-    sizes = ", ".join(f"{name} {xi:.3f} {eta:.3f}" for name, (xi, eta) in largest)
-    return (
-        f"{value['faces']} faces (a quarter turn from one to the next, {value['rounds']} "
-        f"{'round' if value['rounds'] == 1 else 'rounds'}) of {value['frames_a_face']} frames, "
-        f"{value['duration_s'] / 60:.0f} min: xi +- {value['sigma_xi_arcsec']:.3f}, eta +- "
-        f"{value['sigma_eta_arcsec']:.3f} arcsec, {value['stars_a_frame']:.0f} stars a frame\n"
-        f"largest errors (xi, eta): {sizes}"
-    )
-
-
 NO_DEFLECTION = 1
 
 
 def run(args: argparse.Namespace) -> int:
     mark = _mark_of(args)
-    if args.plan is not None:
-        return run_plan(args, mark)
     taken = _of_bag(args, mark) if _is_bag(args) else _of_files(args, mark)
     return console.UNREADABLE if taken is None else _tell(args, taken, mark)
 
 
 @dataclass(frozen=True, eq=False)
 class _Taken:
-    """A session's frames: their names, and their sightings or the errors.
-
-    catalogue: of which the sightings' stars are rows.
-    """
+    """A session's frames: their names, and their sightings or the errors."""
 
     names: list[str]
     answers: list[ZenithSighting | Solution | FrameError]
     instrument: Instrument
-    catalogue: Catalogue
 
 
 def _of_files(args: argparse.Namespace, mark: Place) -> _Taken | None:
     """The sightings of files; None where no frame can be read, which has been said."""
     if not args.frames or args.tilt is None:
-        raise InstrumentError("give frames and --tilt CSV, or a bag, or --plan SIGMA")
+        raise InstrumentError("give frames and --tilt CSV, or a bag")
     read = reader_of(args)
     frames = frames_among(args.frames, args.tilt)
     with inputs.workers_of(args, len(frames)) as workers:
@@ -284,8 +175,7 @@ def _of_files(args: argparse.Namespace, mark: Place) -> _Taken | None:
         inputs.prepare("deflection", instrument, about)
         work = OnFile(read, ZenithSighted(given, options.atmosphere_of(args), tilts, mark))
         answers = list(inputs.watched(workers.map((work, path) for path in frames), len(frames), lines=False))
-    _, catalogue, _ = Solver(instrument, load_catalogue()).view(about.width, about.height, about.origin_px)
-    return _Taken(frames, answers, instrument, catalogue)
+    return _Taken(frames, answers, instrument)
 
 
 def _is_bag(args: argparse.Namespace) -> bool:
@@ -308,14 +198,12 @@ def _of_bag(args: argparse.Namespace, mark: Place) -> _Taken:
     if not found.star_count:
         raise FrameError(f"{path}: no stars and no images in it: record the topic stars too")
     work = ZenithSighted(instruments, options.atmosphere_of(args), found.tilts, mark)
-    names, answers, instrument, catalogue = [], [], instruments.instrument, load_catalogue()
+    names, answers = [], []
     for name, item in inputs.watched(each_frame(found), found.star_count, lines=False):
         names.append(name)
         answers.append(item if isinstance(item, FrameError) else work(item))
-        if isinstance(answers[-1], ZenithSighting) and (own := instruments.of(item)) is not None:
-            _, catalogue, _ = Solver(own, load_catalogue()).view(item.width, item.height, item.origin_px)
-    assert instrument is not None
-    return _Taken(names, answers, instrument, catalogue)
+    assert instruments.instrument is not None
+    return _Taken(names, answers, instruments.instrument)
 
 
 def _tell(args: argparse.Namespace, taken: _Taken, mark: Place) -> int:
@@ -344,7 +232,7 @@ def _tell(args: argparse.Namespace, taken: _Taken, mark: Place) -> int:
         else:
             output.put({"file": name, "status": "left out", "message": _why(name, answer)}, "")
     without = reduced(session.adjusted, session.sightings, mark)
-    whole = combined_json(session, without, mark, args.station, taken.catalogue)
+    whole = combined_json(session, without, mark, args.station)
     output.put(whole, combined_text(session, whole))
     return console.UNREADABLE if any(isinstance(a, FrameError) for a in taken.answers) else 0
 

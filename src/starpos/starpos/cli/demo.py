@@ -53,7 +53,9 @@ def run(args: argparse.Namespace) -> int:
             return status
     truth = truth_in(Path(night))
     (found,) = (
-        f for f in json.loads(Path(places).read_text())["features"] if f["properties"].get("combined")
+        f
+        for f in json.loads(Path(places).read_text(encoding="utf-8"))["features"]
+        if f["properties"].get("combined")
     )
     at = np.radians([found["properties"][name] for name in ("latitude", "longitude")])
     assert truth is not None

@@ -30,9 +30,9 @@ OPTIONAL = {
     "matplotlib": ("matplotlib", "starpos report, calibrate --map"),
     "rosbags": ("rosbags", "recorded nights: report, replay"),
     "rawpy": ("rawpy", "raw files of cameras"),
-    "exifread": ("exifread", "times of raw and HEIF files"),
+    "exifread": ("exifread", "times and lenses of photographs"),
+    "sgp4": ("sgp4", "starpos satellites"),
     "pillow_heif": ("pillow-heif", "HEIF pictures of phones"),
-    "distributed": ("distributed", "--scheduler"),
     "argcomplete": ("argcomplete", "completion of commands and options by the Tab key"),
 }
 # OpenCV is one package of several

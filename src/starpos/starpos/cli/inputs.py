@@ -28,7 +28,6 @@ from starpos.night.opening import work_of
 from starpos.night.reading import About, First, Instruments, Reader, TiltFile
 from starpos.night.remarks import NEAR_KM, Near, of_tilts
 from starpos.night.work import Solving
-from starpos.parallel.cluster import Cluster
 from starpos.parallel.processes import Here, Workers, processors, workers
 from starpos.progress import quiet
 from starpos.recording.drivers import Drivers
@@ -251,9 +250,7 @@ def read_bag(path: Path, args: argparse.Namespace) -> "tuple[Recorded, Instrumen
 
 
 def workers_of(args: argparse.Namespace, frames: int) -> Workers:
-    """The workers that the options ask for, with no more processes than frames; raises InstrumentError."""
-    if args.scheduler is not None:
-        return Cluster(args.scheduler)
+    """The workers that the options ask for, with no more processes than frames."""
     return workers(min(processors() if args.jobs == 0 else args.jobs or 1, frames))
 
 

@@ -273,7 +273,7 @@ def _keep(tally: montecarlo_fields.Tally, conditions: montecarlo_fields.Conditio
             lines = ["# " + json.dumps(head | {"VERDICT": verdict, "CENTRE": truth}), "x,y,flux"]
             s = given.stars(conditions)
             lines += [f"{x:.5f},{y:.5f},{flux:.6g}" for x, y, flux in zip(s.x, s.y, s.flux, strict=True)]
-            (folder / f"{given.name.replace(' ', '_')}.csv").write_text("\n".join(lines) + "\n")
+            (folder / f"{given.name.replace(' ', '_')}.csv").write_text("\n".join(lines) + "\n", "utf-8")
             print(f"{given.name}: {verdict}, {len(given)} stars", file=sys.stderr)
     except OSError as e:
         raise FrameError(f"{folder}: cannot be written ({e.strerror}): give another --keep") from None

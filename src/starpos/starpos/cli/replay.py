@@ -74,6 +74,11 @@ def tell(
     if solved:
         folder = NightFolder((), None, bag if len(args.bags) > 1 else None)
         put_combined(output, folder, whole, gathered, vertical)
+    if (by_satellites := night.by_satellites) is not None:
+        from starpos.cli.satellites import fix_json
+
+        value = {"file": bag, "by_satellites": True} | fix_json(by_satellites)
+        output.put(value, f"by satellites: {by_satellites.text}", rows=())
     # a trouble names its bag
     console.complain("replay", night.trouble or f"{bag}: {night.summary}")
     return console.UNREADABLE if night.trouble else 0 if solved else NO_FIX

@@ -5,7 +5,6 @@ import argparse
 import time
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from starpos.cli import console, inputs, options, overwriting, places_file
 from starpos.cli.fix_output import json_of
@@ -22,16 +21,11 @@ from starpos.parameters.given import of_solver
 from starpos.sky import catalogue
 from starpos.units import utc_text
 
-if TYPE_CHECKING:
-    from starpos.night.bag import Recorded
-
 NO_FIX = 1
 # maximum number of nights with all figures; more nights get the table and the errors only
 ALL_FIGURES = 6
 # endings of a page in one file
 PAGES = (".html", ".htm")
-# ending of a session's result
-SESSION = ".json"
 
 
 def run(args: argparse.Namespace) -> int:
@@ -55,8 +49,6 @@ def run(args: argparse.Namespace) -> int:
     out = Path(args.out)
     folder, index = (out.parent, out.name) if out.suffix.lower() in PAGES else (out, PAGE)
     check_folder(folder, index)
-    if _are_sessions(args.nights):
-        return _stations(args)
     groups = _groups(args.nights)
     nights = _nights(groups, args)
     bar, each = console.ProgressBar(), []
@@ -107,87 +99,49 @@ def _write_places(args: argparse.Namespace) -> int:
     return 0 if answers[-1]["utc"] else NO_FIX
 
 
-def _are_sessions(paths: list[str]) -> bool:
-    """Whether the results of deflection sessions are given; raises FrameError for these and nights together."""
-    results = [path for path in paths if path.lower().endswith(SESSION)]
-    if results and len(results) < len(paths):
-        raise FrameError(f"{results[0]}: give either nights or sessions of starpos deflection, not both")
-    return bool(results)
-
-
-def _stations(args: argparse.Namespace) -> int:
-    """Write the page of a zenith camera's stations."""
-    from starpos.earth import geoid
-    from starpos.report.html import PAGE, write_files
-    from starpos.report.station_page import station_page
-    from starpos.zenith.stations import against_grid, read_session, stations_of
-
-    stations = stations_of([read_session(path) for path in args.nights])
-    for station in stations:
-        if station.doubt:
-            console.complain("report", station.doubt)
-    grid = None if args.geoid is None else geoid.read(args.geoid)
-    compared = [None if grid is None else against_grid(station, grid) for station in stations]
-    html, pictures = station_page(
-        stations, compared, "" if args.geoid is None else Path(args.geoid).name, _now_text()
-    )
-    files = {f"{name}.png": picture.png for name, picture in pictures.items()}
-    write_files(Path(args.out), files | {PAGE: html.encode(errors="replace")})
-    print(Path(args.out) / PAGE)
-    return 0
-
-
 def _now_text() -> str:
     return utc_text(time.time())[:16].replace("T", " ") + " UTC"
 
 
 def _pack(args: argparse.Namespace) -> int:
     """Write a field report of one night."""
-    from starpos.night import bag, field
+    from starpos.night import field
 
     if len(args.nights) > 1:
         raise FrameError("--field packs one night: give one")
     if not args.field.lower().endswith(field.SUFFIX):
         raise FrameError(f"--field {args.field}: give it a name that ends in {field.SUFFIX}")
-    found = _exposures([Path(args.nights[0])], args)
-    if not isinstance(found, Exposures):
-        found = bag.exposures(*found, options.atmosphere_of(args), vertical_of(args))
-    count = field.write(Path(args.field), found, console.ProgressBar())
+    count = field.write(Path(args.field), _exposures([Path(args.nights[0])], args), console.ProgressBar())
     print(f"{args.field}: {count} frames")
     return 0
 
 
 def _night(paths: list[Path], args: argparse.Namespace) -> Night:
     """The Night of a folder, a bag or photographs; raises StarposError if there is nothing to work on."""
-    from starpos.night import bag
-
-    found = _exposures(paths, args)
     receiver = read_receiver(args.gnss, None, "report")
     how = How(options.turn_of(args) if args.self_calibrate else None, receiver)
-    if isinstance(found, Exposures):
-        return solved_night(found, how, console.ProgressBar())
-    if receiver is not None:
-        raise FrameError(f"{paths[0]}: --gnss goes with a folder of frames, and this is a bag: leave it out")
-    return bag.night(*found, options.atmosphere_of(args), vertical_of(args), how, console.ProgressBar())
+    return solved_night(_exposures(paths, args), how, console.ProgressBar())
 
 
-def _exposures(paths: list[Path], args: argparse.Namespace) -> "Exposures | tuple[Recorded, Instruments]":
-    """The exposures of a folder or of photographs, or what a bag holds; raises StarposError without any."""
+def _exposures(paths: list[Path], args: argparse.Namespace) -> Exposures:
+    """The exposures of a folder, of photographs or of a bag; raises StarposError without any."""
     from starpos.night import bag
 
     air, vertical, path = options.atmosphere_of(args), vertical_of(args), paths[0]
     if not path.exists():
         raise FrameError(f"{path}: there is no such night: give a folder, or a rosbag2")
-    if not bag.is_bag(path):
-        frames = paths if path.is_file() else []
-        if frames and not are_photographs(frames):
-            raise FrameError(
-                f"{path}: neither a folder of frames nor a rosbag2 (.mcap, .db3), nor a photograph: give one of these"
-            )
-        read, folder = reader_of(args), path.parent if frames else path
-        about = First(read)(tuple(map(str, frames or frames_in(path))))
-        # a field report states the focal length
-        find = given_or_sought if args.field is None else given_of
-        given = Instruments(None) if about is None else find(args, about)
-        return exposures(folder, given, air, vertical, read=read, frames=frames)
-    return inputs.read_bag(path, args)
+    if bag.is_bag(path):
+        if args.gnss is not None:
+            raise FrameError(f"{path}: --gnss goes with a folder of frames, and this is a bag: leave it out")
+        return bag.exposures(*inputs.read_bag(path, args), air, vertical)
+    frames = paths if path.is_file() else []
+    if frames and not are_photographs(frames):
+        raise FrameError(
+            f"{path}: neither a folder of frames nor a rosbag2 (.mcap, .db3), nor a photograph: give one of these"
+        )
+    read, folder = reader_of(args), path.parent if frames else path
+    about = First(read)(tuple(map(str, frames or frames_in(path))))
+    # a field report states the focal length
+    find = given_or_sought if args.field is None else given_of
+    given = Instruments(None) if about is None else find(args, about)
+    return exposures(folder, given, air, vertical, read=read, frames=frames)

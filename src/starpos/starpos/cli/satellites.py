@@ -1,63 +1,80 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`starpos satellites`: a place from satellites among the stars, without a level."""
+"""`starpos satellites`: a place from satellites among the stars, without a level, and which hour shows most of them."""
 
 import argparse
+import json
 import math
-from dataclasses import replace
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
-from starpos.cli import console, inputs
+from starpos.cli import console, inputs, options
 from starpos.earth.gravity import itrs_place
-from starpos.errors import FrameError, SatelliteError
+from starpos.earth.vertical import Deflection
+from starpos.errors import FrameError, SatelliteError, StarposError
+from starpos.files import read_regular
 from starpos.fix.blind import SEARCH_S
+from starpos.fix.searching import Sight
 from starpos.fix.solution import Solution
+from starpos.fix.solver import Solver
+from starpos.gnss.receiver import gnss_place, read_gnss_csv
 from starpos.night.work import OnFile, TrailSighted
 from starpos.satellites.adjustment import KnownBefore
-from starpos.satellites.elements import chosen, read_orbits
+from starpos.satellites.elements import Orbit, chosen, read_orbits
 from starpos.satellites.locating import SatelliteFix, locate
+from starpos.satellites.planning import HourOfSatellites, nights_hours
 from starpos.satellites.sightings import read_iod, read_sightings
 from starpos.satellites.trails import SatelliteTrail
+from starpos.sky import catalogue
+from starpos.units import unix_of, utc_text
 
-# without a height stated: any inhabited one
-UNKNOWN_HEIGHT_M, UNKNOWN_HEIGHT_STDDEV_M = 500.0, 700.0
+# of a height that is stated without an error
 HEIGHT_STDDEV_M = 50.0
 KM = 1000.0
 # other files are frames
 TABLES = ".csv", ".iod", ".txt"
+MOST_JSON_BYTES = 300_000_000
+
+
+@dataclass
+class SeenTrails:
+    """What the files of a call show: trails, and the frames that were identified, by their names."""
+
+    trails: list[SatelliteTrail] = field(default_factory=list)
+    frames: dict[str, Sight] = field(default_factory=dict)
 
 
 def run(args: argparse.Namespace) -> int:
-    trails: list[SatelliteTrail] = []
+    if args.plan is not None:
+        return plan(args)
+    if not args.sightings or not args.elements:
+        raise SatelliteError("give frames or sightings and --elements, or --plan LAT LON")
+    seen = SeenTrails()
     frames = [path for path in args.sightings if Path(path).suffix.lower() not in TABLES]
     for path in args.sightings:
-        trails += [] if path in frames else _read(path)
+        seen.trails += [] if path in frames else _read(path)
     if frames:
-        trails += _on_frames(args, frames, 1 + max((trail.track for trail in trails), default=-1))
+        _look(args, frames, seen)
+    trails = seen.trails
     if not trails:
-        return _refused(
-            args, f"none of {len(frames)} frames shows a trail with both of its ends: give more frames"
-        )
-    orbits = []
-    for path in args.elements:
-        found, about = read_orbits(path)
-        orbits += found
-        for sentence in about:
-            console.complain("satellites", sentence)
+        return _refused(args, f"none of {len(frames)} frames shows an end of a trail: give more frames")
     begin = float(min(t.utc_unix_s.min() for t in trails))
-    usable, about = chosen(orbits, begin, newer=args.newer_elements)
+    usable, about = chosen(_orbits(args.elements), begin, newer=args.newer_elements)
     for sentence in about:
         console.complain("satellites", sentence)
     try:
-        fix = locate(trails, usable, _prior(args))
+        fix = locate(trails, usable, _prior(args, begin))
     except SatelliteError as e:
         return _refused(args, str(e))
     for k, trail in enumerate(trails):
         value = trail_json(trail, fix, k)
         _put(args, value, trail_line(value))
-    value = fix_json(fix)
-    _put(args, value, fix_line(value))
+    headings = [h for name, sight in seen.frames.items() if (h := heading_json(name, sight, fix)) is not None]
+    lines = [f"{h['file']}: heading {h['heading']:.4f} +- {h['sigma_heading_deg']:.4f} deg" for h in headings]
+    _put(args, {"combined": True} | fix_json(fix) | {"frames": headings}, "\n".join([*lines, fix.text]))
     return 0
 
 
@@ -77,6 +94,16 @@ def _put(args: argparse.Namespace, value: dict, line: str) -> None:
         print(line)
 
 
+def _orbits(paths: Sequence[str]) -> list[Orbit]:
+    orbits = []
+    for path in paths:
+        found, about = read_orbits(path)
+        orbits += found
+        for sentence in about:
+            console.complain("satellites", sentence)
+    return orbits
+
+
 def _read(path: str) -> list[SatelliteTrail]:
     if Path(path).suffix.lower() == ".csv":
         return read_sightings(path)
@@ -86,36 +113,70 @@ def _read(path: str) -> list[SatelliteTrail]:
     return trails
 
 
-def _on_frames(args: argparse.Namespace, frames: list[str], first: int) -> list[SatelliteTrail]:
-    """The trails on frames, numbered from `first` on; complains of frames without."""
-    trails: list[SatelliteTrail] = []
+def _look(args: argparse.Namespace, frames: list[str], seen: SeenTrails) -> None:
+    """Add the frames and their trails, numbered on; complains of frames without, and of trails that are left out."""
+    number = 1 + max((trail.track for trail in seen.trails), default=-1)
     complaints, read = console.FrameComplaints("satellites"), inputs.reader_of(args)
     with inputs.workers_of(args, len(frames)) as workers:
         solving = inputs.identifying("satellites", args, frames, read, workers, SEARCH_S)
         work = OnFile(read, TrailSighted(solving))
         answers = inputs.watched(workers.map((work, path) for path in frames), len(frames))
-        for path, found in zip(frames, answers, strict=True):
-            if isinstance(found, FrameError):
-                complaints(path, str(found))
-            elif isinstance(found, Solution):
-                complaints(path, found.message)
+        for path, answer in zip(frames, answers, strict=True):
+            if isinstance(answer, FrameError):
+                complaints(path, str(answer))
+            elif isinstance(answer, Solution):
+                complaints(path, answer.message)
             else:
-                trails += [replace(t, track=first + len(trails) + k, file=path) for k, t in enumerate(found)]
+                seen.frames[path], found = answer
+                if found.left_out:
+                    complaints(path, found.left_out)
+                seen.trails += [replace(t, track=number + k, file=path) for k, t in enumerate(found.trails)]
+                number += len(found.trails)
     complaints.end()
-    return trails
 
 
-def _prior(args: argparse.Namespace) -> KnownBefore:
-    unknown = args.height is None
-    height = UNKNOWN_HEIGHT_M if unknown else args.height
-    stddev = args.height_stddev or (UNKNOWN_HEIGHT_STDDEV_M if unknown else HEIGHT_STDDEV_M)
-    if args.near is None:
-        return KnownBefore(height, stddev, args.clock_stddev)
-    latitude, longitude, km = args.near
-    if not (abs(latitude) <= 90 and abs(longitude) <= 360 and 0 < km < 20_000):
-        raise SatelliteError("--near takes a latitude, a longitude (deg) and an error in km")
-    place = itrs_place(math.radians(latitude), math.radians(longitude), height)
-    return KnownBefore(height, stddev, args.clock_stddev, place, (km * KM) ** 2 * np.eye(2))
+def _prior(args: argparse.Namespace, utc_unix_s: float) -> KnownBefore:
+    height = math.nan if args.height is None else args.height
+    prior = KnownBefore.at_height(height, HEIGHT_STDDEV_M, args.clock_stddev)
+    if args.height_stddev is not None:
+        prior = prior._replace(height_stddev_m=args.height_stddev)
+    if args.near is not None:
+        latitude, longitude, km = args.near
+        covariance = (km * KM) ** 2 * np.eye(2)
+        if not (abs(latitude) <= 90 and abs(longitude) <= 360 and 0 < km < 20_000):
+            raise SatelliteError("--near takes a latitude, a longitude (deg) and an error in km")
+    elif args.join is not None:
+        latitude, longitude, covariance = _joined(args.join, utc_unix_s)
+    else:
+        return prior
+    place = itrs_place(math.radians(latitude), math.radians(longitude), prior.height_m)
+    return prior._replace(place=place, covariance=covariance)
+
+
+def _joined(path: str, utc_unix_s: float) -> tuple[float, float, np.ndarray]:
+    """Latitude, longitude (deg) and covariance (2, 2) of a place: of what `starpos solve --json` printed, or of GNSS."""
+    if Path(path).suffix.lower() == ".csv":
+        track, faults = read_gnss_csv(path)
+        for sentence in faults:
+            console.complain("satellites", sentence)
+        if (place := track.at(utc_unix_s)) is None:
+            raise SatelliteError(f"{path}: no GNSS place at {utc_text(utc_unix_s)}, of the first trail")
+        return math.degrees(place.latitude), math.degrees(place.longitude), place.covariance
+    try:
+        text = read_regular(path, MOST_JSON_BYTES).decode()
+        rows = [json.loads(line) for line in text.splitlines() if line.startswith("{")]
+        row = next(
+            row for row in reversed(rows) if row.get("combined") and row.get("latitude_geodetic") is not None
+        )
+        covariance = np.array(row["covariance_geodetic"], float)[:2, :2]
+        latitude, longitude = float(row["latitude_geodetic"]), float(row["longitude_geodetic"])
+    except (OSError, ValueError, KeyError, StopIteration, TypeError, IndexError):
+        raise SatelliteError(
+            f"{path}: no place in it: give what `starpos solve --json` printed, or a receiver's CSV as solve --gnss"
+        ) from None
+    if not (np.isfinite(covariance).all() and np.linalg.eigvalsh(covariance)[0] > 0):
+        raise SatelliteError(f"{path}: the covariance of its place is impossible")
+    return latitude, longitude, covariance
 
 
 def trail_json(trail: SatelliteTrail, fix: SatelliteFix, k: int) -> dict:
@@ -140,19 +201,31 @@ def trail_line(value: dict) -> str:
     if value["satellite"] is None:
         return f"trail {value['track']}: no satellite of the orbits"
     head = f"trail {value['track']}: satellite {value['satellite']} {value['name']}".rstrip()
+    head += f", elements of {value['age_days']:+.1f} days"
     if not value["used"]:
-        return f"{head}, elements of {value['age_days']:+.1f} days: does not fit, not used"
-    return (
-        f"{head}, elements of {value['age_days']:+.1f} days: {value['along_km']:+.2f} km along, "
-        f"{value['across_km']:+.2f} km across"
-    )
+        return f"{head}: does not fit, not used"
+    return f"{head}: {value['along_km']:+.2f} km along, {value['across_km']:+.2f} km across"
+
+
+def heading_json(name: str, sight: Sight, fix: SatelliteFix) -> dict | None:
+    """Where a frame's camera looks from that place, from geodetic north; None where that is not known."""
+    if sight.instrument is None or sight.found is None or sight.stars.mid_unix_s is None:
+        return None
+    place = gnss_place(sight.stars.mid_unix_s, fix.latitude, fix.longitude, fix.covariance[:2, :2])
+    solver = Solver(sight.instrument, catalogue.load_catalogue())
+    try:
+        link = solver.attitude_at(sight.stars, sight.found, place.deflected(Deflection())).ellipsoid
+    except StarposError as e:
+        console.complain("satellites", f"{name}: no heading: {e}")
+        return None
+    sigma = np.degrees(np.sqrt(link.angles_covariance[0, 0]))
+    return {"file": name, "heading": np.degrees(link.heading), "sigma_heading_deg": sigma}
 
 
 def fix_json(fix: SatelliteFix) -> dict:
     """The place for --json."""
     a = fix.adjustment
     return {
-        "combined": True,
         "latitude_geodetic": np.degrees(fix.latitude),
         "longitude_geodetic": np.degrees(fix.longitude),
         "height_m": fix.height_m,
@@ -169,12 +242,56 @@ def fix_json(fix: SatelliteFix) -> dict:
     }
 
 
-def fix_line(value: dict) -> str:
+def plan(args: argparse.Namespace) -> int:
+    """Print the dark hours of the coming 24, and which of them shows most."""
+    begin = time.time() if args.at is None else unix_of(args.at)
+    orbits: list[Orbit] = []
+    if args.elements:
+        orbits, about = chosen(_orbits(args.elements), begin, newer=args.newer_elements)
+        for sentence in about:
+            console.complain("satellites", sentence)
+    lens = None
+    if args.size is not None:
+        camera = options.camera_of(args) if args.instrument is None else None
+        focal_px = options.instrument_of(args, None).focal_px if camera is None else camera.fx
+        width, height = (2 * math.degrees(math.atan(side / 2 / focal_px)) for side in args.size)
+        lens = width, height
+    latitude, longitude = args.plan
+    hours = nights_hours(latitude, longitude, begin, orbits, least_deg=args.min_altitude, lens_deg=lens)
+    if not hours:
+        console.complain(
+            "satellites", "the Sun does not sink 6 deg below the horizon there in these 24 hours"
+        )
+        return 1
+    most = max(hours, key=lambda h: h.at_once if lens is None else h.in_lens)
+    for hour in hours:
+        best = bool(orbits) and hour is most
+        _put(
+            args, plan_json(hour, lens is not None) | {"best": best}, plan_line(hour, lens is not None, best)
+        )
+    return 0
+
+
+def plan_json(hour: HourOfSatellites, lens: bool) -> dict:
+    """An hour for --json."""
+    return {
+        "utc": utc_text(hour.utc_unix_s),
+        "sun_deg": hour.sun_deg,
+        "lit_from_km": hour.lit_from_km,
+        "satellites": hour.numbers,
+        "at_once": hour.at_once,
+        "in_lens": hour.in_lens if lens else None,
+        "azimuth": hour.towards[0] if lens else None,
+        "altitude": hour.towards[1] if lens else None,
+    }
+
+
+def plan_line(hour: HourOfSatellites, lens: bool, best: bool) -> str:
     """Return the same for people."""
-    east, north, up = np.sqrt(np.diag(value["covariance"]))
-    return (
-        f"place {value['latitude_geodetic']:.5f} {value['longitude_geodetic']:.5f} (WGS 84), {value['height_m']:.0f} m; "
-        f"+- {east:.0f} m east, {north:.0f} m north, {up:.0f} m up; clock {value['clock_offset_s']:+.3f} s +- "
-        f"{value['clock_stddev_s']:.3f}; {value['trails_used']} trails of {value['satellites']} satellites, chi-square "
-        f"{value['chi2']:.1f} of {value['degrees']}: {value['status']}"
+    line = (
+        f"{utc_text(hour.utc_unix_s)} Sun {hour.sun_deg[0]:.0f} to {hour.sun_deg[1]:.0f} deg, overhead in sunlight from "
+        f"{hour.lit_from_km:.0f} km: {len(hour.numbers)} satellites, {hour.at_once:.1f} at a time"
     )
+    if lens:
+        line += f", {hour.in_lens:.2f} in the lens at azimuth {hour.towards[0]:.0f} altitude {hour.towards[1]:.0f}"
+    return f"{line}, the best hour" if best else line

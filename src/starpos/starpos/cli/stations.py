@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`starpos stations`: a table of many sessions of `starpos deflection`: repeats, a geoid grid, levelling."""
+"""`starpos stations`: a table of many sessions of `starpos deflection`: repeats, and a geoid grid."""
 
 import argparse
-import sys
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -12,9 +11,8 @@ from starpos.cli.console import Output
 from starpos.cli.places_file import feature_collection
 from starpos.earth import geoid
 from starpos.earth.geoid import Geoid
-from starpos.errors import StationError
 from starpos.units import utc_text
-from starpos.zenith.stations import GeoidStep, Station, against_grid, levelled, read_session, stations_of
+from starpos.zenith.stations import Station, against_grid, read_session, stations_of
 
 
 def run(args: argparse.Namespace) -> int:
@@ -26,28 +24,13 @@ def run(args: argparse.Namespace) -> int:
     values = [station_json(station, grid) for station in stations]
     if grid is not None and (without := [v["station"] for v in values if v["grid_arcsec"] is None]):
         console.complain("stations", f"{args.geoid}: no data at {', '.join(without)}")
-    steps = [] if args.level is None else levelled(_line(stations, args.level), grid)
     output = Output(args, tuple(flat(values[0])), "")
     if args.geojson:
         console.print_json(_geojson(values))
     else:
         for value in values:
             output.put(value, _station_line(value), [flat(value)])
-    for step in steps:
-        if args.csv or args.geojson:
-            print(step_line(step), file=sys.stderr)
-        else:
-            output.put(step_json(step), step_line(step))
     return 0
-
-
-def _line(stations: Sequence[Station], names: Sequence[str]) -> list[Station]:
-    found = {station.name: station for station in stations}
-    if len(names) < 2:
-        raise StationError("--level takes two stations or more")
-    if missing := [name for name in names if name not in found]:
-        raise StationError(f"--level {missing[0]}: the stations are {', '.join(found)}")
-    return [found[name] for name in names]
 
 
 def station_json(station: Station, grid: Geoid | None) -> dict:
@@ -60,7 +43,7 @@ def station_json(station: Station, grid: Geoid | None) -> dict:
         "longitude": np.degrees(station.place.longitude),
         "height_m": station.place.height_m,
         "sessions": len(station.sessions),
-        "frames": sum(s.frame_count for s in station.sessions),
+        "frames": sum(s.frames for s in station.sessions),
         "first_utc": utc_text(min(s.utc_unix_s for s in station.sessions)),
         "last_utc": utc_text(max(s.utc_unix_s for s in station.sessions)),
         "mark_arcsec": station.at_mark,
@@ -76,29 +59,6 @@ def station_json(station: Station, grid: Geoid | None) -> dict:
         "minus_grid_arcsec": None if compared is None else compared.off,
         "minus_grid_sigma_arcsec": None if compared is None else compared.stddev,
     }
-
-
-def step_json(step: GeoidStep) -> dict:
-    """A step of --level for --json."""
-    return {
-        "from": step.begin.name,
-        "to": step.end.name,
-        "distance_m": step.distance_m,
-        "azimuth": np.degrees(step.azimuth),
-        "rise_m": step.rise_m,
-        "sigma_m": step.stddev_m,
-        "sigma_deflections_m": step.measured_m,
-        "sigma_between_m": step.between_m,
-    }
-
-
-def step_line(step: GeoidStep) -> str:
-    """Return the same for people."""
-    return (
-        f"geoid {step.begin.name} to {step.end.name}: {step.rise_m:+.4f} m +- {step.stddev_m:.4f} (deflections "
-        f"{step.measured_m:.4f}, between the stations {step.between_m:.4f}), {step.distance_m / 1000:.3f} km at "
-        f"{np.degrees(step.azimuth):.1f} deg"
-    )
 
 
 def _station_line(value: Mapping) -> str:

@@ -3,12 +3,12 @@
 """Weighted least-squares fit of one star, or of two together, to each stamp: places, fluxes and gains, by Gauss-Newton."""
 
 from libc.math cimport NAN, isfinite, sqrt
-from libc.stdlib cimport free, malloc
 from libc.string cimport memcmp, memcpy, memset
 
 import numpy as np
 
 from starpos._numeric.limits cimport unsigned_char, within
+from starpos._numeric.memory cimport room_for, start_of
 from starpos.detection._psf cimport BLOCK, Local, blocks, evaluate, local_of, sound, values
 from starpos.detection._sums cimport (
     LARGEST, any_bright, chi_square, copy_pixels, cross_products, invert, invert_scaled, products, scaled_factor, sky_sums,
@@ -121,16 +121,13 @@ cdef struct Stamp:
     const unsigned char *phase
 
 
-cdef int _begin(Pixels *p, int stars, int size) except -1:
-    """Take memory for the pixels of a stamp, and for whole blocks of them."""
+cdef bytearray _begin(Pixels *p, int stars, int size):
+    """The memory of the pixels of a stamp, in whole blocks."""
     # the last step of a block may begin anywhere
     cdef int area = size * size, room = (blocks(area) + 1) * BLOCK, rows = 2 * stars * size, k
-    cdef double *columns = <double *>malloc(COLUMNS * room * sizeof(double))
-    p.place = <int *>malloc((room + 2 * rows) * sizeof(int) + area)
-    if columns == NULL or p.place == NULL:
-        free(columns)
-        free(p.place)
-        raise MemoryError
+    memory = room_for(COLUMNS * room * sizeof(double) + (room + 2 * rows) * sizeof(int) + area)
+    cdef double *columns = <double *>start_of(memory)
+    p.place = <int *>(columns + COLUMNS * room)
     p.bound, p.wanted = p.place + room, p.place + room + rows
     p.outlier = <unsigned char *>(p.place + room + 2 * rows)
     p.stars, p.count, p.all = stars, 0, 0
@@ -140,7 +137,7 @@ cdef int _begin(Pixels *p, int stars, int size) except -1:
         columns += 5 * room
         p.of[k].dx, p.of[k].dy, p.of[k].value = columns, columns + room, columns + 2 * room
         p.of[k].by_x, p.of[k].by_y = columns + 3 * room, columns + 4 * room
-    return 0
+    return memory
 
 
 cdef inline void _rows_within(const double *axes, double left, double top, int size, int apart, double widths2, int *bound) noexcept nogil:
@@ -581,7 +578,7 @@ def fit_stamps(
     cdef float[:, :, ::1] leverage = leverages_
     cdef unsigned char[:, :, ::1] mark = marks_.reshape(2, n, area)
     cdef double[:, ::1] fit = fits_
-    _begin(&p, stars, size)
+    memory = _begin(&p, stars, size)
     s.size = size
     with nogil:
         for k in range(n):
@@ -609,8 +606,6 @@ def fit_stamps(
                         covariance[j, k, a, b] = to.covariance[at]
                 for a in range(rules.phases):
                     gains[j, k, a] = star[j].gain[a]
-    free(p.signal)
-    free(p.place)
     at_x, at_y, flux, sigma = columns_
     used, outlier = marks_.view(bool)
     chi2, pixels = fits_

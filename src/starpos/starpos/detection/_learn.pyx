@@ -6,13 +6,13 @@ The noise is that which grows with a star's light, from what fits leave.
 """
 
 from libc.math cimport INFINITY, fabs, hypot, isnan, sqrt
-from libc.stdlib cimport calloc, free, malloc
 from libc.string cimport memset
 
 import numpy as np
 
 from starpos._numeric.algebra cimport factored, middle, solved
 from starpos._numeric.limits cimport unsigned_char, within
+from starpos._numeric.memory cimport room_for, start_of
 from starpos._numeric.wide cimport eights, fused_void, lanes, sum_of
 from starpos.detection._psf cimport BLOCK, MONOMIALS, ORDERS, Local, blocks, evaluate, local_of, scaled, sound, terms_at
 
@@ -176,12 +176,10 @@ def marginal_equations(
     out, right_ = np.empty((n, count, count)), np.empty((n, count))
     cdef double[:, :, ::1] normals = out
     cdef double[:, ::1] rights = right_
-    cdef double *normal = <double *>malloc(each * (each + 1) * sizeof(double))
-    pixels.design = <float *>calloc((each + ABREAST) * ROOM, sizeof(float))
-    if normal == NULL or pixels.design == NULL:
-        free(normal)
-        free(pixels.design)
-        raise MemoryError
+    equations, designs = room_for(each * (each + 1) * sizeof(double)), np.zeros((each + ABREAST, ROOM), np.float32)
+    cdef double *normal = <double *>start_of(equations)
+    cdef float[:, ::1] design = designs
+    pixels.design = &design[0, 0]
     with nogil:
         for k in range(n):
             local_of(axes, series, k, &psf)
@@ -201,8 +199,6 @@ def marginal_equations(
             if pixels.count:
                 _add_pixels(&pixels, &psf, orders, highest, phases, normal, normal + each * each)
             _eliminate(normal, normal + each * each, count, phases + 2, normals[k], rights[k])
-    free(normal)
-    free(pixels.design)
     return out, right_
 
 
@@ -249,13 +245,10 @@ def choose_terms(
     out, taken_ = np.zeros(most), np.zeros(most, np.uint8)
     cdef double[::1] found = out
     cdef unsigned char[::1] taken = taken_
-    cdef double *upper = <double *>malloc(max(most * (most + 1), 1) * sizeof(double))
-    cdef int *index = <int *>malloc(max(most, 1) * sizeof(int))
-    if upper == NULL or index == NULL:
-        free(upper)
-        free(index)
-        raise MemoryError
+    room = room_for(most * (most + 1) * sizeof(double) + most * sizeof(int))
+    cdef double *upper = <double *>start_of(room)
     cdef double *solution = upper + most * most
+    cdef int *index = <int *>(solution + most)
     with nogil:
         for c in range(candidates.shape[0]):
             n = 0
@@ -277,8 +270,6 @@ def choose_terms(
                 found[:] = 0.0
                 for i in range(n):
                     found[index[i]], taken[index[i]] = solution[i], True
-    free(upper)
-    free(index)
     return out
 
 
@@ -345,9 +336,8 @@ def fit_field_robustly(const double[:, ::1] field, const double[:, ::1] own, con
     out = np.empty((MONOMIALS, values))
     cdef double[:, ::1] fitted = out
     # weights of the rows that are kept, how far each is off, and that to be sorted
-    cdef double *kept = <double *>malloc(3 * n * sizeof(double))
-    if kept == NULL:
-        raise MemoryError
+    room = room_for(3 * n * sizeof(double))
+    cdef double *kept = <double *>start_of(room)
     cdef double *off = kept + n
     with nogil:
         for k in range(n):
@@ -383,7 +373,6 @@ def fit_field_robustly(const double[:, ::1] field, const double[:, ::1] own, con
                     one -= field[k, i] * fitted[i, v]
                 before += kept[k] * (own[k, v] - mean) ** 2
                 after += kept[k] * one * one
-    free(kept)
     return (out, before, after, count) if count >= least else None
 
 
@@ -495,9 +484,8 @@ def light_noise(
     cdef double misfit2
     cdef Light p
     _alike(noise, model, residual, used, leverage)
-    p.noise2 = <double *>malloc(3 * room * sizeof(double))
-    if p.noise2 == NULL:
-        raise MemoryError
+    columns = room_for(3 * room * sizeof(double))
+    p.noise2 = <double *>start_of(columns)
     p.count, p.light, p.square = 0, p.noise2 + room, p.noise2 + 2 * room
     with nogil:
         for j in range(pixels):
@@ -511,7 +499,6 @@ def light_noise(
             p.noise2[p.count], p.light[p.count], p.square[p.count] = 1.0, 0.0, 0.0
             p.count += 1
         photon, misfit2 = _fit_noise(&p, photon, misfit * misfit, outlier * outlier)
-    free(p.noise2)
     return photon, sqrt(misfit2)
 
 
@@ -629,13 +616,11 @@ def typical_gains(
     gain_ = np.empty(phases)
     cdef double[::1] gain = gain_
     # of each phase the gains of all stars, their variances, their weights; and some to be sorted
-    cdef double *room = <double *>malloc((3 * phases + 1) * n * sizeof(double))
-    if room == NULL:
-        raise MemoryError
-    cdef double *ratio = room
-    cdef double *error2 = room + phases * n
-    cdef double *weight = room + 2 * phases * n
-    cdef double *sorted_ = room + 3 * phases * n
+    room = room_for((3 * phases + 1) * n * sizeof(double))
+    cdef double *ratio = <double *>start_of(room)
+    cdef double *error2 = ratio + phases * n
+    cdef double *weight = error2 + phases * n
+    cdef double *sorted_ = weight + phases * n
     with nogil:
         for k in range(n):
             mean = 0.0
@@ -668,5 +653,4 @@ def typical_gains(
                     off = ratio[k] / gain[p] - 1
                     of_spread += weight[k] * (off * off - error2[k])
             spread2 = max(0.0, of_spread / max(all_, 1e-12))
-    free(room)
     return gain_, sqrt(spread2)

@@ -6,13 +6,13 @@ The latter are closed forms of what takes a library longer to begin than to do.
 """
 
 from libc.math cimport INFINITY, NAN, exp, fabs, isfinite, isnan, rint, sqrt
-from libc.stdlib cimport free, malloc
 from libc.string cimport memcpy, memset
 
 import numpy as np
 
 cimport starpos._numeric.wide
 from starpos._numeric.algebra cimport middle
+from starpos._numeric.memory cimport room_for, start_of
 from starpos.detection._shapes cimport Shape, clipped_to, inverse, put_shape, shape_before, shape_of, sides, with_sides
 
 cdef extern from *:
@@ -109,13 +109,12 @@ cdef struct Image:
     int stride
 
 
-cdef int _allocate(Image *image, int size) except -1:
-    """Take memory for an image (size, size)."""
+cdef bytearray _allocate(Image *image, int size):
+    """The memory of an image (size, size)."""
     image.size, image.stride = size, (size + LANES - 1) // LANES * LANES
-    image.light = <float *>malloc(max(size * image.stride, 1) * sizeof(float))
-    if image.light == NULL:
-        raise MemoryError
-    return 0
+    room = room_for(size * image.stride * sizeof(float))
+    image.light = <float *>start_of(room)
+    return room
 
 
 cdef void _load(Image *image, const float *signal) noexcept nogil:
@@ -187,7 +186,7 @@ def window_moments(
     cdef double[::1] mass = masses
     cdef double[:, ::1] mean = means
     cdef double[:, :, ::1] shape = shapes
-    _allocate(&image, signal.shape[1])
+    room = _allocate(&image, signal.shape[1])
     with nogil:
         for k in range(n):
             _load(&image, &signal[k, 0, 0])
@@ -195,7 +194,6 @@ def window_moments(
             mass[k], mean[k, 0], mean[k, 1] = found[0], found[1], found[2]
             shape[k, 0, 0], shape[k, 1, 1] = found[3], found[5]
             shape[k, 0, 1] = shape[k, 1, 0] = found[4]
-    free(image.light)
     return masses, means, shapes
 
 
@@ -219,14 +217,13 @@ def centroids(
         raise ValueError(f"{window.shape[0]} windows and {gain.shape[0]} gains: as many are needed")
     out = np.empty((n, 2))
     cdef double[:, ::1] places = out
-    _allocate(&image, signal.shape[1])
+    room = _allocate(&image, signal.shape[1])
     with nogil:
         for k in range(n):
             w = k if window.shape[0] > 1 else 0
             _load(&image, &signal[k, 0, 0])
             begin[0], begin[1] = column[k], row[k]
             _centre(&image, &window[w, 0, 0], &gain[w, 0, 0], begin, rounds, farthest, &places[k, 0])
-    free(image.light)
     return np.ascontiguousarray(out.T)
 
 
@@ -289,7 +286,7 @@ def own_shapes(
     cdef double[:, ::1] width = widths
     low = high = first
     begin[0] = begin[1] = half
-    _allocate(&image, signal.shape[1])
+    room = _allocate(&image, signal.shape[1])
     with nogil:
         for k in range(n):
             _load(&image, &signal[k, 0, 0])
@@ -309,7 +306,6 @@ def own_shapes(
                 own = with_sides(own, low, high)
             width[k, 0], width[k, 1] = low, high
             put_shape(shape, k, own)
-    free(image.light)
     return out, widths
 
 
@@ -334,21 +330,19 @@ def typical_shape(
     cdef double *found
     if signal.shape[1] != signal.shape[2]:
         raise ValueError(f"images of {signal.shape[2]} x {signal.shape[1]} px: they must be square")
-    _allocate(&image, signal.shape[1])
+    room = _allocate(&image, signal.shape[1])
     # of each image its place and moments; of the images that count each of three moments
-    cdef double *room = <double *>malloc(max(11 * n, 1) * sizeof(double))
-    if room == NULL:
-        free(image.light)
-        raise MemoryError
-    cdef double *seen = room + 8 * n
+    of_images = room_for(11 * n * sizeof(double))
+    cdef double *places = <double *>start_of(of_images)
+    cdef double *seen = places + 8 * n
     with nogil:
         for k in range(n):
-            room[8 * k] = room[8 * k + 1] = half
+            places[8 * k] = places[8 * k + 1] = half
         for round_ in range(rounds):
             count = 0
             _set_window(through, window)
             for k in range(n):
-                found = room + 8 * k
+                found = places + 8 * k
                 _load(&image, &signal[k, 0, 0])
                 _moments(&image, window, -found[0], -found[1], found + 2)
                 if not (fabs(found[3]) < farthest and fabs(found[4]) < farthest):
@@ -369,15 +363,13 @@ def typical_shape(
             )
             _set_gain(own, of_window, gain)
             for k in range(n):
-                found = room + 8 * k
+                found = places + 8 * k
                 for j in range(2 if found[2] > 0 else 0):
                     found[j] += max(-1.0, min(gain[2 * j] * found[3] + gain[2 * j + 1] * found[4], 1.0))
             change = max(max(fabs(own.xx - before.xx), fabs(own.xy - before.xy)), fabs(own.yy - before.yy))
             through = clipped_to(own, narrowest_window, INFINITY, 1.0)
             if change < enough * max(own.xx, own.yy):
                 break
-    free(room)
-    free(image.light)
     return None if isnan(own.xx) else np.array([[own.xx, own.xy], [own.xy, own.yy]])
 
 

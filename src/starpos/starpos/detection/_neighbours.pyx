@@ -2,8 +2,6 @@
 # cython: language_level=3, boundscheck=False, wraparound=False, cdivision=True, initializedcheck=False
 """Which of many points are near each other."""
 
-from libc.stdlib cimport free, malloc, realloc
-
 import numpy as np
 
 from starpos._numeric.limits cimport within
@@ -14,39 +12,36 @@ def near_pairs(const double[::1] x, const double[::1] y, double reach):
 
     The points are sorted by y, so that each meets only those of a strip below it. What is not a number is near nothing.
     """
-    cdef Py_ssize_t n = x.shape[0], count = 0, room = 4 * n + 16, i, j, k, m
-    cdef double dx, dy
-    if y.shape[0] != n:
-        raise ValueError(f"{n} columns and {y.shape[0]} rows of points: as many are needed")
+    if y.shape[0] != x.shape[0]:
+        raise ValueError(f"{x.shape[0]} columns and {y.shape[0]} rows of points: as many are needed")
     cdef const Py_ssize_t[::1] order = np.argsort(y)
-    cdef Py_ssize_t *pair = <Py_ssize_t *>malloc(2 * room * sizeof(Py_ssize_t))
-    cdef Py_ssize_t *more
-    if pair == NULL:
-        raise MemoryError
-    try:
-        for i in range(n):
-            k = order[i]
-            for j in range(i + 1, n):
-                m = order[j]
-                dx, dy = x[m] - x[k], y[m] - y[k]
-                if not dy <= reach:
-                    break
-                if not dx * dx + dy * dy <= reach * reach:
-                    continue
-                if count == room:
-                    room *= 2
-                    more = <Py_ssize_t *>realloc(pair, 2 * room * sizeof(Py_ssize_t))
-                    if more == NULL:
-                        raise MemoryError
-                    pair = more
-                pair[2 * count], pair[2 * count + 1] = min(k, m), max(k, m)
-                count += 1
-        out = np.empty((count, 2), np.intp)
-        if count:
-            out[:] = <Py_ssize_t[:count, :2]>pair
-        return out
-    finally:
-        free(pair)
+    cdef Py_ssize_t[:, ::1] pairs = None
+    out = np.empty((_pairs(x, y, reach, order, pairs), 2), np.intp)
+    pairs = out
+    _pairs(x, y, reach, order, pairs)
+    return out
+
+
+cdef Py_ssize_t _pairs(
+    const double[::1] x, const double[::1] y, double reach, const Py_ssize_t[::1] order, Py_ssize_t[:, ::1] pairs
+) noexcept:
+    """Write the pairs, unless they are None; how many there are."""
+    cdef Py_ssize_t n = x.shape[0], count = 0, i, j, k, m
+    cdef bint written = pairs is not None
+    cdef double dx, dy
+    for i in range(n):
+        k = order[i]
+        for j in range(i + 1, n):
+            m = order[j]
+            dx, dy = x[m] - x[k], y[m] - y[k]
+            if not dy <= reach:
+                break
+            if not dx * dx + dy * dy <= reach * reach:
+                continue
+            if written:
+                pairs[count, 0], pairs[count, 1] = min(k, m), max(k, m)
+            count += 1
+    return count
 
 
 def group_points(const Py_ssize_t[:, ::1] pairs, Py_ssize_t n):

@@ -3,11 +3,12 @@
 """Peaks of a smoothed frame, in one pass over its 8- or 16-bit pixels: a few rows at a time, which stay in the cache."""
 
 from libc.math cimport INFINITY, fabs
-from libc.stdlib cimport free, malloc, realloc
+from libc.stdlib cimport free, realloc
 from libc.string cimport memset
 
 import numpy as np
 
+from starpos._numeric.memory cimport room_for, start_of
 from starpos._numeric.wide cimport fused_void, wide_void
 
 ctypedef unsigned char unsigned_char
@@ -76,8 +77,8 @@ cdef struct Window:
     float *least
 
 
-cdef int _allocate(Smoother *s, Py_ssize_t width, const float[::1] weight) except -1:
-    """Take memory for smoothing rows."""
+cdef bytearray _allocate(Smoother *s, Py_ssize_t width, const float[::1] weight):
+    """The memory of smoothing rows."""
     cdef int k
     cdef double share = 0.0
     s.reach = weight.shape[0] - 1
@@ -86,9 +87,8 @@ cdef int _allocate(Smoother *s, Py_ssize_t width, const float[::1] weight) excep
     s.padded = max(3, (s.reach + 2) // 3 * 3)
     s.stride, s.slots, s.last, s.end = width + 2 * s.padded, 2 * s.reach + 1, 0, 0
     s.highest = NULL
-    s.plain = <float *>malloc((s.slots * width + s.padded + 1) * sizeof(float))
-    if s.plain == NULL:
-        raise MemoryError
+    room = room_for((s.slots * width + s.padded + 1) * sizeof(float))
+    s.plain = <float *>start_of(room)
     s.weight, s.over = s.plain + s.slots * width, 1.0
     for k in range(s.padded, -1, -1):
         s.weight[k] = weight[k] if k <= s.reach else 0.0
@@ -96,7 +96,7 @@ cdef int _allocate(Smoother *s, Py_ssize_t width, const float[::1] weight) excep
         share = 2 * s.weight[k] - share if k else share
         s.over = s.over if share >= 0 else INFINITY
     s.over = s.over * (1 + fabs(s.weight[0] - share)) * (1 + ROUNDING)
-    return 0
+    return room
 
 
 def smooth_rows(const pixel_t[:, ::1] plane, const float[::1] weight, const Py_ssize_t[::1] rows, int step):
@@ -112,11 +112,9 @@ def smooth_rows(const pixel_t[:, ::1] plane, const float[::1] weight, const Py_s
         raise ValueError(f"rows and steps of {step} px beyond the {width} x {plane.shape[0]} px of the frame")
     out = np.empty((rows.shape[0], (width + step - 1) // step), np.float32)
     cdef float[:, ::1] smooth = out
-    _allocate(&s, width, weight)
-    cdef float *across = <float *>malloc((s.stride + width) * sizeof(float))
-    if across == NULL:
-        free(s.plain)
-        raise MemoryError
+    of_smoother = _allocate(&s, width, weight)
+    room = room_for((s.stride + width) * sizeof(float))
+    cdef float *across = <float *>start_of(room)
     cdef float *whole = across + s.stride
     with nogil:
         for k in range(rows.shape[0]):
@@ -124,8 +122,6 @@ def smooth_rows(const pixel_t[:, ::1] plane, const float[::1] weight, const Py_s
             _smooth_along(&s, across + s.padded, width, whole)
             for x in range(smooth.shape[1]):
                 smooth[k, x] = whole[x * step]
-    free(s.plain)
-    free(across)
     return out
 
 
@@ -152,18 +148,17 @@ def find_maxima(
         raise ValueError(f"limits of {limit.shape[0]} strips of {strip} rows, in {limit.shape[1]} cells, for rows {first} to {last}")
     w.kept, w.width, w.blocks = 2 * flat + 1, width, (width + BLOCK - 1) // BLOCK
     g.each, g.count, g.room, g.last = NULL, 0, 0, -3
-    _allocate(&s, width, weight)
+    of_smoother = _allocate(&s, width, weight)
     s.highest = &highest[0]
-    w.across = <float *>malloc((w.kept * (s.stride + width) + width + w.blocks) * sizeof(float))
-    w.known = <unsigned char *>malloc(w.kept * w.blocks)
-    cdef int *marks = <int *>malloc(2 * (width + 2) * sizeof(int))
+    room = room_for((w.kept * (s.stride + width) + width + w.blocks) * sizeof(float) + 2 * (width + 2) * sizeof(int) + w.kept * w.blocks)
+    w.across = <float *>start_of(room)
+    w.smooth = w.across + w.kept * s.stride
+    w.limit = w.smooth + w.kept * width
+    w.least = w.limit + width
+    cdef int *marks = <int *>(w.least + w.blocks)
+    w.known = <unsigned char *>(marks + 2 * (width + 2))
+    g.here, g.above = marks, marks + width + 2
     try:
-        if w.across == NULL or w.known == NULL or marks == NULL:
-            raise MemoryError
-        w.smooth = w.across + w.kept * s.stride
-        w.limit = w.smooth + w.kept * width
-        w.least = w.limit + width
-        g.here, g.above = marks, marks + width + 2
         with nogil:
             memset(marks, 0xFF, 2 * (width + 2) * sizeof(int))
             for row in range(first, last):
@@ -176,10 +171,6 @@ def find_maxima(
                 _find_in_row(&s, &w, height, row, flat, &g)
         return *_columns(&g), highest_[first:last]
     finally:
-        free(w.across)
-        free(w.known)
-        free(marks)
-        free(s.plain)
         free(g.each)
 
 

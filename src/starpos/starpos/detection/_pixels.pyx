@@ -7,13 +7,13 @@ px, P = 1, or 4 for the phases of a colour mosaic.
 """
 
 from libc.math cimport ceil, sqrt
-from libc.stdlib cimport free, malloc
 from libc.string cimport memcpy, memset
 
 import numpy as np
 
 from starpos._numeric.algebra cimport fetch, level_and_scatter
 from starpos._numeric.limits cimport inside, within
+from starpos._numeric.memory cimport room_for, start_of
 from starpos._numeric.wide cimport wide_void
 
 cdef enum:
@@ -102,9 +102,8 @@ def measure_rims(
         raise ValueError(f"squares of {reach} px have no edge: give 1 or more")
     out = np.empty((2, n))
     cdef double[:, ::1] found = out
-    cdef double *score = <double *>malloc(4 * side * sizeof(double))
-    if score == NULL:
-        raise MemoryError
+    room = room_for(4 * side * sizeof(double))
+    cdef double *score = <double *>start_of(room)
     with nogil:
         for k in range(n):
             if k + 1 < n:
@@ -125,7 +124,6 @@ def measure_rims(
                 score[j] = <double>(<float>plane[row, column] - level[k, phase]) / noise[k, phase]
             sky, spread = level_and_scatter(score, 4 * side, per_mad, uneven)
             found[0, k], found[1, k] = sky if sky > raised else 0.0, spread
-    free(score)
     return out[0], out[1]
 
 
@@ -163,15 +161,11 @@ def cut_stamps(
     cdef float[:, :, ::1] sky = skies.reshape(2, n, size * size)
     cdef unsigned char[:, :, ::1] mark = marks.reshape(3, n, size * size)
     # level and noise of the pixels of an even row and of an odd one, their phases, and pixels of a row that leaves the frame
-    cdef float *level_of = <float *>malloc(4 * size * sizeof(float))
+    room = room_for(4 * size * sizeof(float) + size * sizeof(pixel_t) + 2 * size)
+    cdef float *level_of = <float *>start_of(room)
     cdef float *noise_of = level_of + 2 * size
-    cdef unsigned char *phase_of = <unsigned char *>malloc(2 * size)
-    cdef pixel_t *pixels = <pixel_t *>malloc(size * sizeof(pixel_t))
-    if level_of == NULL or phase_of == NULL or pixels == NULL:
-        free(level_of)
-        free(phase_of)
-        free(pixels)
-        raise MemoryError
+    cdef pixel_t *pixels = <pixel_t *>(noise_of + 2 * size)
+    cdef unsigned char *phase_of = <unsigned char *>(pixels + size)
     with nogil:
         for k in range(n):
             whole, highest = reach <= x[k] < width - reach, 0
@@ -208,9 +202,6 @@ def cut_stamps(
                     on = 0 <= row < height and 0 <= column < width
                     mark[1, k, i * size + j] = on and plane[row, column] >= limit
                     mark[0, k, i * size + j] = on and not plane[row, column] >= limit
-    free(level_of)
-    free(phase_of)
-    free(pixels)
     good, white = marks[:2].view(bool)
     return skies[0], skies[1], good, white, marks[2]
 
@@ -226,9 +217,8 @@ def smooth_mosaic(const float[:, :, ::1] signal):
     if not columns:
         return out
     cdef float[:, :, ::1] smooth = out
-    cdef float *line = <float *>malloc((columns + 2) * sizeof(float))
-    if line == NULL:
-        raise MemoryError
+    room = room_for((columns + 2) * sizeof(float))
+    cdef float *line = <float *>start_of(room)
     with nogil:
         for k in range(n):
             for i in range(rows):
@@ -239,7 +229,6 @@ def smooth_mosaic(const float[:, :, ::1] signal):
                 line[0], line[columns + 1] = line[1], line[columns]
                 for j in range(columns):
                     to[j] = <float>0.5 * line[j + 1] + <float>0.25 * (line[j] + line[j + 2])
-    free(line)
     return out
 
 

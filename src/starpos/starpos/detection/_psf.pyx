@@ -3,10 +3,10 @@
 """The PSF of stars: at places of the field, over which it may vary, and at pixels: a Gauss-Hermite series (`detection.psf`)."""
 
 from libc.math cimport M_PI, fabs, isnan, sqrt
-from libc.stdlib cimport free, malloc
 
 import numpy as np
 
+from starpos._numeric.memory cimport room_for, start_of
 from starpos._numeric.wide cimport fused_void
 from starpos.detection._shapes cimport Shape, clipped_to
 
@@ -182,9 +182,8 @@ def evaluated(
     out = np.empty((stars, size, size), np.float32)
     cdef float[:, ::1] image = out.reshape(stars, area)
     cdef int room = blocks(area) * BLOCK
-    cdef double *dx = <double *>malloc(3 * room * sizeof(double))
-    if dx == NULL:
-        raise MemoryError
+    columns = room_for(3 * room * sizeof(double))
+    cdef double *dx = <double *>start_of(columns)
     cdef double *dy = dx + room
     cdef double *value = dx + 2 * room
     with nogil:
@@ -198,7 +197,6 @@ def evaluated(
             values(&psf, dx, dy, area, value)
             for n in range(area):
                 image[k, n] = <float>value[n]
-    free(dx)
     return out
 
 

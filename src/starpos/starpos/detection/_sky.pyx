@@ -4,12 +4,12 @@
 
 from libc.limits cimport UINT_MAX
 from libc.math cimport NAN, fabs, isnan, nextafter, sqrt
-from libc.stdlib cimport free, malloc
 
 import numpy as np
 
 from starpos._numeric.algebra cimport middle
 from starpos._numeric.limits cimport within
+from starpos._numeric.memory cimport room_for, start_of
 from starpos._numeric.wide cimport wide_void
 
 ctypedef fused pixel_t:
@@ -27,9 +27,8 @@ def median(const double[::1] values):
     """The median of values (n,), as np.median has it; NaN of none, or if one is NaN."""
     cdef int n = values.shape[0], k
     cdef double found = NAN
-    cdef double *copy = <double *>malloc(max(n, 1) * sizeof(double))
-    if copy == NULL:
-        raise MemoryError
+    room = room_for(n * sizeof(double))
+    cdef double *copy = <double *>start_of(room)
     for k in range(n):
         copy[k] = values[k]
         if isnan(copy[k]):
@@ -37,7 +36,6 @@ def median(const double[::1] values):
     else:
         if n:
             found = middle(copy, n)
-    free(copy)
     return found
 
 
@@ -188,9 +186,8 @@ def sample_sky(
     found, tops = np.empty((2, 4, down, across)), np.empty((2, 4, down, across), np.int32)
     cdef double[:, :, :, ::1] sky = found
     cdef int[:, :, :, ::1] highest = tops
-    cdef unsigned short *value = <unsigned short *>malloc(5 * n * sizeof(unsigned short))
-    if value == NULL:
-        raise MemoryError
+    room = room_for(5 * n * sizeof(unsigned short))
+    cdef unsigned short *value = <unsigned short *>start_of(room)
     cdef unsigned short *own
     with nogil:
         for i in range(down):
@@ -204,7 +201,6 @@ def sample_sky(
                     _clipped(own, n, &clip, value + 4 * n, &sky[0, phase, i, j], &sky[1, phase, i, j])
                     _highest(own, n, top)
                     highest[0, phase, i, j], highest[1, phase, i, j] = top[0], top[1]
-    free(value)
     return found[0], found[1], tops[0], tops[1]
 
 
@@ -318,11 +314,9 @@ def even_out(const double[:, :, ::1] mesh, const double[::1] steep, bint level):
         raise ValueError(f"{steep.shape[0]} limits for {mesh.shape[0]} meshes of {rows} x {columns} cells: one each is needed")
     out = np.empty((mesh.shape[0], rows + 2, columns + 2))
     cdef double[:, :, ::1] even = out
-    cdef double *room = <double *>malloc(2 * (rows + 2 * AROUND) * stride * sizeof(double))
-    if room == NULL:
-        raise MemoryError
+    room = room_for(2 * (rows + 2 * AROUND) * stride * sizeof(double))
     # the first cells of the mesh and of its medians
-    cdef double *own = room + AROUND * stride + AROUND
+    cdef double *own = <double *>start_of(room) + AROUND * stride + AROUND
     cdef double *typical = own + (rows + 2 * AROUND) * stride
     cdef double *at
     with nogil:
@@ -340,7 +334,6 @@ def even_out(const double[:, :, ::1] mesh, const double[::1] steep, bint level):
                     mean = (_down(at - 1, stride) + _down(at, stride) + _down(at + 1, stride)) / 3
                     even[p, i + 1, j + 1] = mean if fabs(mean - at[0]) < steep[p] else at[0]
             _around(&even[p, 1, 1], rows, columns, columns + 2, 1, level)
-    free(room)
     return out
 
 
@@ -374,9 +367,8 @@ def scores(
     out = np.empty((tall, wide), np.float32)
     cdef float[:, ::1] score = out
     # level and noise of each phase along a row
-    cdef double *along = <double *>malloc(2 * phases * cells * sizeof(double))
-    if along == NULL:
-        raise MemoryError
+    room = room_for(2 * phases * cells * sizeof(double))
+    cdef double *along = <double *>start_of(room)
     cdef double *own
     with nogil:
         for i in range(tall):
@@ -396,5 +388,4 @@ def scores(
                     noise2 += one * one
                 one = one if phases == 1 else sqrt(noise2 / phases)
                 score[i, j] = (value[i, j] - <float>(sky / phases)) / <float>one
-    free(along)
     return out

@@ -3,11 +3,11 @@
 """What the pixels of stamps say of their stars: the sky at their rims, spikes, other light, and whether one pixel is all."""
 
 from libc.math cimport log, sqrt
-from libc.stdlib cimport free, malloc
 
 import numpy as np
 
 from starpos._numeric.algebra cimport level_and_scatter, middle
+from starpos._numeric.memory cimport room_for, start_of
 
 cdef struct Rim:
     # Of a stamp: the pixels at its edges, over their noise, and their noise; whether this is the same in all.
@@ -55,9 +55,8 @@ def correct_sky(float[:, :, ::1] signal, float[:, :, ::1] noise, double per_mad,
     cdef float up, wider
     cdef Rim rim
     _check_shape(signal.shape, noise.shape)
-    rim.score = <double *>malloc(2 * area * sizeof(double))
-    if rim.score == NULL:
-        raise MemoryError
+    room = room_for(2 * area * sizeof(double))
+    rim.score = <double *>start_of(room)
     rim.noise = rim.score + area
     with nogil:
         for k in range(n):
@@ -70,7 +69,6 @@ def correct_sky(float[:, :, ::1] signal, float[:, :, ::1] noise, double per_mad,
                 for j in range(area):
                     (&signal[k, 0, 0])[j] -= up * (&noise[k, 0, 0])[j]
                     (&noise[k, 0, 0])[j] *= wider
-    free(rim.score)
 
 
 def replace_spikes(
@@ -98,9 +96,8 @@ def replace_spikes(
         raise ValueError(f"{sharpest.shape[0]} sharpest and {gain.shape[0]} gains for {n} stars: one each, and of each phase")
     out = np.zeros((n, size, size), np.uint8)
     cdef unsigned char[:, :, ::1] spike = out
-    cdef float *mean = <float *>malloc(size * size * sizeof(float))
-    if mean == NULL:
-        raise MemoryError
+    room = room_for(size * size * sizeof(float))
+    cdef float *mean = <float *>start_of(room)
     with nogil:
         for k in range(n):
             own, sky, part, count = &signal[k, 0, 0], &noise[k, 0, 0], &phase[k, 0, 0], 0
@@ -118,7 +115,6 @@ def replace_spikes(
             for place in range(size * size if count else 0):
                 if (&spike[k, 0, 0])[place]:
                     own[place], (&good[k, 0, 0])[place] = mean[place], False
-    free(mean)
     return out.view(bool)
 
 
@@ -305,9 +301,8 @@ def brightest_left(
         raise ValueError(f"a smoothing that reaches {reach} px in stamps of {size} px")
     out = np.zeros((2, n), np.intp)
     cdef Py_ssize_t[:, ::1] place = out
-    cdef double *plain = <double *>malloc(2 * size * size * sizeof(double))
-    if plain == NULL:
-        raise MemoryError
+    room = room_for(2 * size * size * sizeof(double))
+    cdef double *plain = <double *>start_of(room)
     cdef double *across = plain + size * size
     with nogil:
         for k in range(n):
@@ -336,7 +331,6 @@ def brightest_left(
                         )
                     if value > most:
                         most, place[0, k], place[1, k] = value, row, column
-    free(plain)
     return out[0], out[1]
 
 

@@ -16,7 +16,7 @@ from scipy import ndimage, optimize, special
 from starpos.detection.background import SkyPlane, measure_sky, plane_of
 from starpos.detection.pipeline import DetectionSettings
 from starpos.detection.second_look import FWHM_PER_SIGMA, negative_of
-from starpos.frames.frame import Frame, Stars
+from starpos.frames.frame import Frame, FrameTrail, Stars
 
 # Sums along lines, and the whole light of a trail, exceed their noise by this factor: 1e7 lines are tried.
 THRESHOLD = 7.0
@@ -50,28 +50,6 @@ STEPS, MAX_STEPS = (0.01, 0.01, 0.01, 0.01, 0.01, 0.01), 40
 HIDDEN_PX = 30
 # px, 1 sigma: what the model of an image does not describe.
 MODEL_PX = 0.02
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class FrameTrail:
-    """A straight trail on a frame.
-
-    ends        (2, 2) px: x, y of both; which came first is not known
-    covariance  (4, 4) px2 of x, y of the first end and of the second
-    snr         its light over the sky's noise
-    cut         (2,) bool: whether the trail leaves the frame there, so that this is not its end
-    steady      whether its light is even enough for its ends to be the exposure's
-    """
-
-    ends: np.ndarray
-    covariance: np.ndarray
-    snr: float
-    cut: np.ndarray
-    steady: bool
-
-    @property
-    def length_px(self) -> float:
-        return float(np.hypot(*(self.ends[1] - self.ends[0])))
 
 
 def find_trails(

@@ -365,15 +365,6 @@ class Geoid:
             return Deflection()
         return Deflection(xi, eta, stddev)
 
-    def undulation_m(self, latitude: float, longitude: float) -> float:
-        """Height (m) of the geoid above WGS 84 at a place in rad; NaN without data."""
-        spline, row, column, _, _ = self._spline(float(np.degrees(latitude)), float(np.degrees(longitude)))
-        return math.nan if spline is None else float(spline(row, column).item())
-
-    def node_m(self, latitude: float) -> float:
-        """Distance (m) between nodes to the north at a latitude in rad."""
-        return self._spacing_m(float(np.degrees(latitude)))[0]
-
     def _slopes(self, phi: float, lam: float) -> tuple[float, float]:
         """Components xi and eta in arcsec; NaN without data."""
         spline, row, column, north_m, east_m = self._spline(phi, lam)

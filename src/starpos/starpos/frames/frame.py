@@ -168,6 +168,28 @@ SYMMETRIC = 1e-6
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
+class FrameTrail:
+    """A straight trail on a frame.
+
+    ends        (2, 2) px: x, y of both; which came first is not known
+    covariance  (4, 4) px2 of x, y of the first end and of the second
+    snr         its light over the sky's noise
+    cut         (2,) bool: whether the trail leaves the frame there, so that this is not its end
+    steady      whether its light is even enough for its ends to be the exposure's
+    """
+
+    ends: np.ndarray
+    covariance: np.ndarray
+    snr: float
+    cut: np.ndarray
+    steady: bool
+
+    @property
+    def length_px(self) -> float:
+        return float(np.hypot(*(self.ends[1] - self.ends[0])))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Disc:
     """A bright round thing far wider than a star on a frame: the Sun, or what looks like it.
 

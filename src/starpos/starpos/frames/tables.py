@@ -148,7 +148,7 @@ def write_star_list(path: Path | str, stars: Stars, start_utc: str, pixel_um: fl
         f"{x:.5f},{y:.5f},{f:.2f},{s:.5f},{flags}\n"
         for x, y, f, s, flags in zip(stars.x, stars.y, stars.flux, sigma, stars.flags, strict=True)
     )
-    Path(path).write_text(f"# {json.dumps(header)}\nx,y,flux,sigma,flags\n{rows}")
+    Path(path).write_text(f"# {json.dumps(header)}\nx,y,flux,sigma,flags\n{rows}", encoding="utf-8")
 
 
 # limits of a stated sigma: with an error of a degree a pointing is useless, an error of 0 is a mistake

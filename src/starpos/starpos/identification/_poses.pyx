@@ -3,11 +3,11 @@
 """Poses of a camera among the stars: fitted to stars that are matched meanwhile, and weighed against chance."""
 
 from libc.math cimport M_PI, exp, fabs, log, sqrt
-from libc.stdlib cimport free, malloc
 
 import numpy as np
 
 from starpos._numeric.algebra cimport best_rotation, factored, length, median, solved, turn_by, turned
+from starpos._numeric.memory cimport room_for, start_of
 from starpos.identification._frame cimport FrameStars, direction_of, pixel_of, pixels_of
 from starpos.identification._matching cimport Matching, match, order
 from starpos.identification._sky cimport Visible
@@ -97,21 +97,6 @@ cdef void _fit_alone(
                 b[3 * i + j] += v[i] * w[3 * near[k] + j]
     best_rotation(b, attitude)
     _fit(xy, w, sigma, star, near, n, steps, small_step, attitude, focal)
-
-
-def fitted(
-    const double[:, ::1] xy, const double[:, ::1] w, const double[::1] sigma_px, attitude, double focal_px, int steps,
-    double small_step,
-):
-    """Fit attitude (3, 3) and focal length to pixels xy (N, 2), with errors sigma_px (N,), of directions w (N, 3)."""
-    cdef int n = xy.shape[0]
-    both = np.arange(n)
-    out = np.array(attitude, float)
-    cdef Py_ssize_t[::1] rows = both
-    cdef double[:, ::1] turned_to = out
-    if n > 0:
-        _fit(&xy[0, 0], &w[0, 0], &sigma_px[0], &rows[0], &rows[0], n, steps, small_step, &turned_to[0, 0], &focal_px)
-    return out, focal_px
 
 
 cdef class Chances:
@@ -273,15 +258,12 @@ cdef double weighed(
     cdef double[8] slope
     cdef double[2] pixel
     cdef double[3] u
-    cdef double *chance = <double *>malloc((n + 2 * many) * sizeof(double))
+    room = room_for((n + 2 * many) * sizeof(double) + n * sizeof(int))
+    cdef double *chance = <double *>start_of(room)
     cdef double *apart2 = chance + n
     cdef double *gain = apart2 + many
     # the row of the match of each detection; or none, or one that says nothing
-    cdef int *hit = <int *>malloc((n + 1) * sizeof(int))
-    if chance == NULL or hit == NULL:
-        free(chance)
-        free(hit)
-        raise MemoryError
+    cdef int *hit = <int *>(gain + many)
     with nogil:
         for i in range(16):
             normal[i] = 0.0
@@ -328,6 +310,4 @@ cdef double weighed(
                 information[5 * i] += 2 * M_PI / (width[i] * width[i])
             volume = 0.5 * (4 * log(2 * M_PI) - factored(information, 4))
             best = max(best, most + volume + chances.log_shares[e])
-    free(chance)
-    free(hit)
     return best

@@ -8,7 +8,7 @@ from libc.string cimport memcpy
 
 import numpy as np
 
-from starpos._numeric.memory cimport numbers_of
+from starpos._numeric.memory cimport numbers_of, room_for, start_of
 from starpos.identification._found cimport Identification, hold
 from starpos.identification._frame cimport FrameStars, on_frame, pixels_of
 from starpos.identification._matching cimport Matching, begin
@@ -272,6 +272,7 @@ cdef class Lost:
     cdef Candidate *found
     cdef int *order
     cdef double *radius
+    cdef bytearray room
     cdef int count, at
 
     cdef int _take(self, Judge judge, TriangleTable table, BrightTable bright, stages, bint crowded, Limits limits) except -1:
@@ -283,16 +284,11 @@ cdef class Lost:
             raise ValueError(f"{self.stages} stages of a search: 1 to {MAX_STAGES} are possible")
         self.plan = stages
         _, self.error_px = stages[0]
-        self.found = <Candidate *>malloc(most * (sizeof(Candidate) + sizeof(int)))
-        self.radius = <double *>malloc((judge._deciding() + 1) * sizeof(double))
-        if self.found == NULL or self.radius == NULL:
-            raise MemoryError
-        self.order = <int *>(self.found + most)
+        self.room = room_for(most * (sizeof(Candidate) + sizeof(int)) + judge._deciding() * sizeof(double))
+        self.found = <Candidate *>start_of(self.room)
+        self.radius = <double *>(self.found + most)
+        self.order = <int *>(self.radius + judge._deciding())
         return 0
-
-    def __dealloc__(self):
-        free(self.found)
-        free(self.radius)
 
     def __iter__(self):
         return self
@@ -370,29 +366,25 @@ cdef class Lost:
         """Keep of the candidates behind the first, which mostly is right, those that are worth a fit, best first."""
         cdef double[9] attitude
         cdef double focal, worth
-        cdef double *kept = <double *>malloc((self.count + 1) * sizeof(double))
+        room = room_for(self.count * sizeof(double))
+        cdef double *kept = <double *>start_of(room)
         cdef int k, j, end = 1
         self.ranked = True
-        try:
-            if kept == NULL:
-                raise MemoryError
-            for k in range(1, self.count):
-                self._pose(&self.found[k], attitude, &focal)
-                worth = self.bright.worth(
-                    self.judge.frame, &self.found[k], &self.judge.date, attitude, focal, self.judge._deciding(), self.radius,
-                    self.limits.most_stars, self.limits.match_sigma, self.limits.log_false,
-                )
-                if not worth > self.limits.worth_a_fit:
-                    continue
-                j = end
-                while j > 1 and worth > kept[j - 1]:
-                    kept[j], self.order[j] = kept[j - 1], self.order[j - 1]
-                    j -= 1
-                kept[j], self.order[j] = worth, k
-                end += 1
-            self.count = end
-        finally:
-            free(kept)
+        for k in range(1, self.count):
+            self._pose(&self.found[k], attitude, &focal)
+            worth = self.bright.worth(
+                self.judge.frame, &self.found[k], &self.judge.date, attitude, focal, self.judge._deciding(), self.radius,
+                self.limits.most_stars, self.limits.match_sigma, self.limits.log_false,
+            )
+            if not worth > self.limits.worth_a_fit:
+                continue
+            j = end
+            while j > 1 and worth > kept[j - 1]:
+                kept[j], self.order[j] = kept[j - 1], self.order[j - 1]
+                j -= 1
+            kept[j], self.order[j] = worth, k
+            end += 1
+        self.count = end
         return 0
 
 

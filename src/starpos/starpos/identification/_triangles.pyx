@@ -4,11 +4,13 @@
 
 from libc.limits cimport INT_MAX
 from libc.math cimport M_PI, asin, atan2, fabs, sqrt
-from libc.stdlib cimport abs, calloc, free, malloc, realloc
+from libc.stdlib cimport abs, free, malloc, realloc
+from libc.string cimport memset
 
 import numpy as np
 
 from starpos._numeric.algebra cimport fetch, length
+from starpos._numeric.memory cimport room_for, start_of
 from starpos.identification._frame cimport FrameStars, direction_of
 
 cdef enum:
@@ -52,14 +54,10 @@ cdef class TriangleTable:
     ):
         """The candidates of `best` as arrays: star (K, 3), corner (K, 3) and mirrored (K,)."""
         cdef int k, count
-        cdef Candidate *found = <Candidate *>malloc((most + 1) * sizeof(Candidate))
-        try:
-            if found == NULL:
-                raise MemoryError
-            count = self.best(frame, first, last, error_px, most_expected, most, loose, found)
-            rows = [(list(found[k].star[:3]), found[k].corner, found[k].mirrored) for k in range(count)]
-        finally:
-            free(found)
+        room = room_for(most * sizeof(Candidate))
+        cdef Candidate *found = <Candidate *>start_of(room)
+        count = self.best(frame, first, last, error_px, most_expected, most, loose, found)
+        rows = [(list(found[k].star[:3]), found[k].corner, found[k].mirrored) for k in range(count)]
         star, corner, mirrored = zip(*rows) if rows else ((), (), ())
         return np.array(star, int).reshape(-1, 3), np.array(corner, int).reshape(-1, 3), np.array(mirrored, bool)
 
@@ -340,11 +338,14 @@ cdef inline void _sides(const Candidate *c, key_t *side) noexcept nogil:
         side[i] = (mixed[i] + mixed[(i + 1) % 3] + 2 * <key_t>c.mirrored) | 1
 
 
-cdef void _drop_lonely(Search *s, unsigned char *marks) noexcept nogil:
+cdef int _drop_lonely(Search *s) except -1:
     """Drop most of the candidates that share no side: mark each side in a small table, as seen once or more often."""
     cdef key_t[3] side
     cdef int k, i, kept = 0
     cdef unsigned char *mark
+    room = room_for(1 << LOG_MARKS)
+    cdef unsigned char *marks = <unsigned char *>start_of(room)
+    memset(marks, 0, 1 << LOG_MARKS)
     for k in range(s.count):
         _sides(&s.found[k], side)
         for i in range(3):
@@ -358,6 +359,7 @@ cdef void _drop_lonely(Search *s, unsigned char *marks) noexcept nogil:
                 kept += 1
                 break
     s.count = kept
+    return 0
 
 
 cdef struct Slot:
@@ -373,36 +375,32 @@ cdef int _support(Search *s) except -1:
     cdef key_t *side
     while slots < 4 * count:
         slots *= 2
-    cdef Slot *table = <Slot *>calloc(slots, sizeof(Slot))
+    room = room_for(slots * sizeof(Slot) + 3 * count * sizeof(key_t))
+    cdef Slot *table = <Slot *>start_of(room)
     # the sides of each candidate, and later the slots of these
-    cdef key_t *sides = <key_t *>malloc(3 * (count + 1) * sizeof(key_t))
-    try:
-        if table == NULL or sides == NULL:
-            raise MemoryError
-        for k in range(s.count + SLOTS_AHEAD):
-            if k < s.count:
-                _sides(&s.found[k], sides + 3 * k)
-                for i in range(3):
-                    fetch(&table[(sides[3 * k + i] >> 20) & (slots - 1)])
-            if k < SLOTS_AHEAD:
-                continue
-            side = sides + 3 * (k - SLOTS_AHEAD)
+    cdef key_t *sides = <key_t *>(table + slots)
+    memset(table, 0, slots * sizeof(Slot))
+    for k in range(s.count + SLOTS_AHEAD):
+        if k < s.count:
+            _sides(&s.found[k], sides + 3 * k)
             for i in range(3):
-                slot = (side[i] >> 20) & (slots - 1)
-                while table[slot].side != 0 and table[slot].side != side[i]:
-                    slot = (slot + 1) & (slots - 1)
-                table[slot].side = side[i]
-                table[slot].count += 1
-                side[i] = slot
-        for k in range(s.count):
-            others = -3
-            for i in range(3):
-                fetch(&table[sides[3 * min(k + SLOTS_AHEAD, s.count - 1) + i]])
-                others += <int>table[sides[3 * k + i]].count
-            s.found[k].support = others
-    finally:
-        free(table)
-        free(sides)
+                fetch(&table[(sides[3 * k + i] >> 20) & (slots - 1)])
+        if k < SLOTS_AHEAD:
+            continue
+        side = sides + 3 * (k - SLOTS_AHEAD)
+        for i in range(3):
+            slot = (side[i] >> 20) & (slots - 1)
+            while table[slot].side != 0 and table[slot].side != side[i]:
+                slot = (slot + 1) & (slots - 1)
+            table[slot].side = side[i]
+            table[slot].count += 1
+            side[i] = slot
+    for k in range(s.count):
+        others = -3
+        for i in range(3):
+            fetch(&table[sides[3 * min(k + SLOTS_AHEAD, s.count - 1) + i]])
+            others += <int>table[sides[3 * k + i]].count
+        s.found[k].support = others
     return 0
 
 
@@ -410,34 +408,25 @@ cdef int _best(Search *s, int most, int least_support, bint by_size, Candidate *
     """Write the `most` candidates with most support, equal ones by their size or in their order; how many."""
     cdef int k, j, kept = 0
     cdef Candidate *c
-    cdef int *order = <int *>malloc((most + 1) * sizeof(int))
-    cdef unsigned char *marks = NULL
-    try:
-        if order == NULL:
-            raise MemoryError
-        if least_support > 0 and s.count > MANY:
-            marks = <unsigned char *>calloc(1 << LOG_MARKS, 1)
-            if marks == NULL:
-                raise MemoryError
-            _drop_lonely(s, marks)
-        _support(s)
-        for k in range(s.count):
-            c = &s.found[k]
-            if c.support < least_support:
-                continue
-            j = kept
-            while j > 0 and _precedes(c, &s.found[order[j - 1]], by_size):
-                order[j] = order[j - 1]
-                j -= 1
-            if j < most:
-                order[j] = k
-                kept = min(kept + 1, most)
-        for k in range(kept):
-            out[k] = s.found[order[k]]
-        return kept
-    finally:
-        free(order)
-        free(marks)
+    room = room_for((most + 1) * sizeof(int))
+    cdef int *order = <int *>start_of(room)
+    if least_support > 0 and s.count > MANY:
+        _drop_lonely(s)
+    _support(s)
+    for k in range(s.count):
+        c = &s.found[k]
+        if c.support < least_support:
+            continue
+        j = kept
+        while j > 0 and _precedes(c, &s.found[order[j - 1]], by_size):
+            order[j] = order[j - 1]
+            j -= 1
+        if j < most:
+            order[j] = k
+            kept = min(kept + 1, most)
+    for k in range(kept):
+        out[k] = s.found[order[k]]
+    return kept
 
 
 cdef inline bint _precedes(const Candidate *one, const Candidate *other, bint by_size) noexcept nogil:

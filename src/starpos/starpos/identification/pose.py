@@ -9,7 +9,6 @@ from starpos import rotation
 from starpos.frozen import at_once
 from starpos.identification._found import Identification
 from starpos.identification._frame import FrameStars
-from starpos.identification._poses import fitted
 from starpos.instrument.camera import Camera
 
 # Most steps of a fit; a step below this (rad) is the last one.
@@ -60,11 +59,6 @@ class Pose:
         """Pixels (N, 2) of directions w (N, 3); directions behind the camera become pixels far away."""
         u = w @ self.attitude.T
         return u[:, :2] * (self.focal_px / np.maximum(u[:, 2:], 1e-6))
-
-    def fitted(self, xy: np.ndarray, w: np.ndarray, sigma_px: np.ndarray) -> "Pose":
-        """Fit attitude and focal length to pixels xy (N, 2), with errors sigma_px (N,), of directions w (N, 3)."""
-        attitude, focal_px = fitted(xy, w, sigma_px, self.attitude, self.focal_px, STEPS, SMALL_STEP)
-        return Pose(attitude, focal_px, self.mirrored)
 
 
 def directions(xy: np.ndarray, focal_px: np.ndarray) -> np.ndarray:

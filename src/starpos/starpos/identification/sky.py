@@ -58,10 +58,6 @@ class Sky:
         """Unit vectors (n, 3) of the catalogue's rows `index` (n,)."""
         return self.stars.directions(np.asarray(index, np.intp), self.years, self.velocity)
 
-    def bright(self, row: np.ndarray) -> np.ndarray:
-        """Unit vectors (n, 3) of the triangle catalogue's rows `row` (n,)."""
-        return self.directions(self.triangles.star[row])
-
 
 @lru_cache(maxsize=4)
 def _undated(catalogue: Catalogue, triangles: TriangleCatalogue) -> Sky:

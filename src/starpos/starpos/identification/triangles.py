@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Spherical triangles, their angles (the paper's section 2.1.1), and the catalogue of triangles that is searched.
+"""The catalogue of triangles of stars that is searched.
 
 Triangles are found by their angles, as in the paper, because these hardly depend on the focal length. Every circle of the
 field's size gives its own brightest stars, so that every field of the instrument has enough triangles.
@@ -40,27 +40,6 @@ CIRCLES = ((0.6, 0.7, 7), (0.8, 0.7, 8), (1.0, 0.7, 9))
 # circles. Beyond MAX_TRIANGLES fewer stars are taken of the smallest circles, down to MIN_TAKEN, and one less beyond
 # twice as many triangles: the table of a field of 0.3 deg has 600 MB.
 ENOUGH_TRIANGLES, MAX_TRIANGLES, MIN_TAKEN = 9_000_000, 16_000_000, 5
-
-
-def sides(v1: np.ndarray, v2: np.ndarray) -> np.ndarray:
-    """Angular separation in rad of unit vectors (..., 3): in the form that keeps small ones exact."""
-    apart = v1 - v2
-    return 2 * np.arcsin(np.minimum(1.0, 0.5 * np.sqrt(np.einsum("...i,...i->...", apart, apart))))
-
-
-def opposite_sides(v: np.ndarray) -> np.ndarray:
-    """The sides (..., 3) in rad opposite the corners v (..., 3, 3) of spherical triangles."""
-    return sides(v[..., [1, 0, 0], :], v[..., [2, 2, 1], :])
-
-
-def angles(side: np.ndarray) -> np.ndarray:
-    """The angles (..., 3) in rad of spherical triangles with sides (..., 3), each opposite its angle.
-
-    Equation 4 by the half-angle formula, tan(A/2)^2 = sin(s-b) sin(s-c) / (sin s sin(s-a)): exact for small triangles.
-    """
-    s = side.sum(-1, keepdims=True) / 2
-    rest = np.sin(np.maximum(s - side, 0.0))
-    return 2 * np.arctan2(np.sqrt(rest[..., [1, 0, 0]] * rest[..., [2, 2, 1]]), np.sqrt(np.sin(s) * rest))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

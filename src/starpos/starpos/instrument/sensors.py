@@ -54,7 +54,7 @@ BUILT_IN = "built_in_rad"
 @lru_cache(maxsize=1)
 def _rows() -> Mapping[str, Mapping[str, float]]:
     """The figures of each model, by their fields."""
-    text = resources.files(__package__).joinpath("data", "sensors.csv").read_text()
+    text = resources.files(__package__).joinpath("data", "sensors.csv").read_text("utf-8")
     rows = csv.DictReader(line for line in text.splitlines() if not line.startswith("#"))
     models = groupby(rows, lambda r: r["model"])
     return MappingProxyType({model: {r["field"]: _sigma(r) for r in of_model} for model, of_model in models})

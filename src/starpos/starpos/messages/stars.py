@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Stars and the shutter that they were seen through, from a StarArray, and a camera's attitude, from an Attitude."""
+"""Stars and their shutter from a StarArray, trails from a TrailArray, a camera's attitude from an Attitude."""
 
 from typing import Any
 
@@ -9,7 +9,7 @@ from starpos import rotation
 from starpos.errors import FrameError
 from starpos.fix.camera_attitude import CameraAttitude
 from starpos.frames.exposure import Shutter
-from starpos.frames.frame import DISC, SATURATED, Disc, Stars
+from starpos.frames.frame import DISC, SATURATED, Disc, FrameTrail, Stars
 from starpos.messages.stamp import stamp_to_unix
 
 # a detector publishes no more
@@ -69,6 +69,39 @@ def message_to_shutter(message: Any) -> Shutter | None:
     if not getattr(message, "shutter_known", False):
         return None
     return Shutter(message.readout, message.readout_stddev)
+
+
+MAX_TRAILS = 1000
+# flags of a Trail
+FIRST_CUT, SECOND_CUT, UNSTEADY = 1, 2, 4
+
+
+def message_to_trails(message: Any) -> list[FrameTrail]:
+    """Trails from a TrailArray; raises FrameError if ends or covariances cannot be right."""
+    if len(message.trails) > MAX_TRAILS:
+        raise FrameError(
+            f"trails: {len(message.trails)} trails are more than {MAX_TRAILS}: send the brightest."
+        )
+    trails = []
+    for t in message.trails:
+        ends, covariance = np.array(t.ends, float), np.array(t.covariance, float).reshape(4, 4)
+        if not (
+            np.isfinite([*ends, *covariance.flat]).all()
+            and (ends[:2] != ends[2:]).any()
+            and np.allclose(covariance, covariance.T)
+            and np.linalg.eigvalsh(covariance)[0] > 0
+        ):
+            raise FrameError("trails: ends or covariance of a trail are impossible: measure it again.")
+        trails.append(
+            FrameTrail(
+                ends=ends.reshape(2, 2),
+                covariance=covariance,
+                snr=float(t.snr),
+                cut=np.array([bool(t.flags & FIRST_CUT), bool(t.flags & SECOND_CUT)]),
+                steady=not t.flags & UNSTEADY,
+            )
+        )
+    return trails
 
 
 # of an attitude's quaternion, and the most that its covariance may say, rad2

@@ -104,7 +104,7 @@ def opened(path: Path | str) -> Iterator[tuple[Path, Atmosphere]]:
                 if not _ours(name):
                     raise ValueError(f"it holds {name[:40]!r}")
                 (folder / name).write_bytes(content)
-            about = json.loads((folder / ABOUT).read_text())
+            about = json.loads((folder / ABOUT).read_text("utf-8"))
             if about["starpos_field"] != FORMAT:
                 raise ValueError(f"its format is {about['starpos_field']!r}, and this starpos reads {FORMAT}")
             air = Atmosphere(**about["air"])

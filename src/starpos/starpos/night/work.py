@@ -34,13 +34,13 @@ from starpos.instrument.tilt_log import Tilts
 from starpos.night.reading import First, Instruments, Reader, TiltFile, stars_of
 from starpos.night.remarks import Kind, Remark
 from starpos.progress import Progress, quiet
-from starpos.satellites.trails import SatelliteTrail
 from starpos.sky import catalogue
 from starpos.zenith.doubts import DeflectionSession
 from starpos.zenith.sighting import ZenithSighting, sighting
 
 if TYPE_CHECKING:
     from starpos.detection import Detection
+    from starpos.satellites.frames import FrameTrails
 
 # Share by which a photograph's focal length may differ from its EXIF's, rounded to 1 mm of a 35 mm film's: 4 % of 13 mm.
 CUT_OUT = 0.06
@@ -284,8 +284,8 @@ class TrailSighted:
 
     solving: Solving
 
-    def __call__(self, item: Frame | Stars) -> list[SatelliteTrail] | Solution:
-        """The trails on a frame, identified by every way there is; FrameError for a list of stars."""
+    def __call__(self, item: Frame | Stars) -> "tuple[Sight, FrameTrails] | Solution":
+        """A frame that is identified by every way there is, and its trails; FrameError for a list of stars."""
         from starpos.satellites.frames import trails_of
 
         if isinstance(item, Stars):
@@ -294,7 +294,8 @@ class TrailSighted:
         known = sight.instrument or self.solving.instruments.of(item)
         stars = sight.stars if known is None else replace(sight.stars, shutter=known.shutter or item.shutter)
         try:
-            return trails_of(item, stars, sight.solution, catalogue.load_catalogue())
+            found = trails_of(item, stars, sight.solution, catalogue.load_catalogue())
+            return replace(sight, stars=stars, instrument=known), found
         except StarposError as error:
             return Solution.refused(stars, error)
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Do the same work on many frames: in this process, in several processes, or on a dask.distributed cluster.
+"""Do the same work on many frames: in this process, or in several processes.
 
-All three take calls, one for each frame (a function and the file or files it works on), and return the answers in the
-order of the calls.
+Both take calls, one for each frame (a function and the file or files it works on), and return the answers in the order of
+the calls.
 """
 
 # Variables that set the number of threads when a BLAS is loaded. With two threads OpenBLAS (at least numpy 1.26's)

@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from multiprocessing import get_context, resource_tracker
 from multiprocessing.connection import Connection, wait
-from typing import Any, Protocol
+from typing import Any
 
 from starpos.errors import FrameError, StarposError, one_line
 from starpos.parallel import BLAS_THREADS
@@ -27,28 +27,16 @@ AHEAD = 4
 MAX_STILLBORN = 3
 # Time for a process that no longer answers to end.
 DYING_S = 1.0
+# Exit status of a process that SIGKILL ended; Windows has no signals.
+KILLED_STATUS = -getattr(signal, "SIGKILL", 1 << 16)
 # There is a process for each processor, so the libraries need no threads of their own.
 ONE_THREAD = dict.fromkeys((*BLAS_THREADS, "OPENCV_FOR_THREADS_NUM"), "1")
 
 Files = str | tuple[str, ...]
-# The work and its argument, which can be pickled: a file or files, on this machine also anything else.
+# The work and its argument, which can be pickled: a file or files, or anything else.
 Call = tuple[Callable[[Any], Any], Any]
 # A call and its number.
 Task = tuple[int, Call]
-
-
-class Workers(Protocol):
-    """A place where calls are done; a context manager that leaves nothing running."""
-
-    def __enter__(self) -> "Workers": ...
-
-    def __exit__(self, *_: object) -> None: ...
-
-    def map(self, calls: Iterable[Call]) -> Iterator:
-        """Yield the answers in the order of the calls, each as soon as all before it are there.
-
-        A FrameError is an answer; any other StarposError of the work is raised.
-        """
 
 
 def worked(work: Callable, files: Files) -> bytes:
@@ -73,16 +61,11 @@ def worked(work: Callable, files: Files) -> bytes:
 
 def answer_of(outcome: bytes) -> Any:
     """Unpickle what `worked` returned; a StarposError that is not a FrameError is raised."""
-    # from this program's own processes, or from a cluster that the user trusts to run code
+    # from this program's own processes
     answer = pickle.loads(outcome)
     if isinstance(answer, StarposError) and not isinstance(answer, FrameError):
         raise answer
     return answer
-
-
-def given_up(files: Files, why: str) -> FrameError:
-    """The answer for a frame whose work ends the process that does it."""
-    return FrameError(f"{files}: given up: {why}")
 
 
 class Here:
@@ -95,7 +78,10 @@ class Here:
         pass
 
     def map(self, calls: Iterable[Call]) -> Iterator:
-        """See Workers."""
+        """Yield the answers in the order of the calls, each as soon as all before it are there.
+
+        A FrameError is an answer; any other StarposError of the work is raised.
+        """
         return (answer_of(worked(*call)) for call in calls)
 
 
@@ -129,7 +115,7 @@ class Processes:
             worker.end()
 
     def map(self, calls: Iterable[Call]) -> Iterator:
-        """See Workers."""
+        """Yield the answers as `Here.map` does."""
         board = _Board(calls, AHEAD * self._number)
         while True:
             yield from board.pop_answers()
@@ -171,6 +157,10 @@ class Processes:
             board.fail(task, why)
         else:
             board.put_back(task)
+
+
+# Where calls are done: a context manager that leaves nothing running.
+Workers = Here | Processes
 
 
 def workers(number: int) -> Workers:
@@ -222,7 +212,9 @@ class _Board:
             self._tried.add(number)
             self._again.append(task)
             return
-        error = given_up(files, f"the process that worked it ended twice, the second time alone ({why})")
+        error = FrameError(
+            f"{files}: given up: the process that worked it ended twice, the second time alone ({why})"
+        )
         self._done[number] = pickle.dumps(error)
 
     def pop_answers(self) -> Iterator:
@@ -278,7 +270,7 @@ class _Worker:
         self._process.join()
         code = self._process.exitcode
         self._process.close()
-        if code == -signal.SIGKILL:
+        if code == KILLED_STATUS:
             return "killed, perhaps for lack of memory: try fewer --jobs"
         if code is not None and code < 0:
             return signal.strsignal(-code) or f"signal {-code}"
@@ -289,17 +281,20 @@ class _Worker:
 def _for_one_that_starts() -> Iterator[None]:
     """Set what a new process inherits: one thread for each library, and SIGINT blocked.
 
-    A terminal sends Ctrl-C to all processes; only the parent is to react.
+    A terminal sends Ctrl-C to all processes; only the parent is to react.  Windows has no masks of signals.
     """
     before = dict(os.environ)
     os.environ.update({name: one for name, one in ONE_THREAD.items() if name not in before})
-    # otherwise it starts with the first process, and unblocks SIGINT for it
-    resource_tracker.ensure_running()
-    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    masks = hasattr(signal, "pthread_sigmask")
+    if masks:
+        # otherwise it starts with the first process, and unblocks SIGINT for it
+        resource_tracker.ensure_running()
+        mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
     finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        if masks:
+            signal.pthread_sigmask(signal.SIG_SETMASK, mask)
         for name in ONE_THREAD.keys() - before.keys():
             del os.environ[name]
 

@@ -318,6 +318,6 @@ def installed_types() -> "Typestore":
         texts = sorted((Path(prefix) / "share" / PACKAGE / "msg").glob("*.msg")) if prefix else []
         if texts:
             for text in texts:
-                store.register(get_types_from_msg(text.read_text(), f"{PACKAGE}/msg/{text.stem}"))
+                store.register(get_types_from_msg(text.read_text("utf-8"), f"{PACKAGE}/msg/{text.stem}"))
             break
     return store

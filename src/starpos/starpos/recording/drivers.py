@@ -8,14 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from starpos.errors import FrameError, StarposError
 from starpos.frames.frame import Stars
 from starpos.messages.camera import ExposureFacts, check_stamp, message_to_frame, message_to_picture
 from starpos.messages.stamp import PlainHeader, PlainStamp, stamp_to_unix
 from starpos.messages.tilt import ImuTilts, Reading
 from starpos.parameters.given import values_of
 from starpos.recording.topics import IMAGE, NO_REMAPS, PICTURE, Remaps
-from starpos.units import utc_text
 
 IMAGES = (IMAGE, PICTURE)
 
@@ -102,13 +100,3 @@ def _as_sent(stars: Stars, header: PlainHeader) -> Stars:
         window=None,
         negative=False,
     )
-
-
-def named_image(kind: str, message: Any, messages: DriverMessages) -> tuple[str, Stars | FrameError]:
-    """A name for an image, and its stars, or the error."""
-    stamp_s = stamp_to_unix(message.header.stamp)
-    name = "image " + ("of unknown time" if stamp_s is None else utc_text(stamp_s))
-    try:
-        return name, replace(messages.stars_of(kind, message)[0], source=name)
-    except StarposError as error:
-        return name, FrameError(f"{name}: {error}")

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The topics of one instrument in a bag, or of a robot's own camera and IMU."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol, TypeVar
@@ -157,12 +157,14 @@ class _Topics:
         return topic
 
 
-STARS, SOLUTION = (f"{PACKAGE}/msg/{name}" for name in ("StarArray", "Solution"))
+STARS, TRAILS = (f"{PACKAGE}/msg/{name}" for name in ("StarArray", "TrailArray"))
 # types by the relative names of the solver's inputs
 NAV_SAT_FIX = "sensor_msgs/msg/NavSatFix"
 INPUTS = {"stars": STARS, "tilt": TILT, "camera/camera_info": CAMERA_INFO}
 # further inputs, with gnss.use
 GNSS = {"gnss/fix": NAV_SAT_FIX}
+# further inputs, with satellites.elements
+SATELLITES = {"trails": TRAILS}
 
 
 @dataclass(frozen=True)
@@ -179,12 +181,11 @@ def instrument_in(
     path: Path,
     namespace: str | None,
     topics: Mapping[str, str],
-    needed: Collection[str],
     remaps: Remaps = NO_REMAPS,
 ) -> Chosen:
     """Find namespace and connections of an instrument, or of a robot's own drivers without an instrument.
 
-    topics: types by relative names. needed: types of which at least one must have a message.
+    topics: types by relative names.
     remaps: images that the user names take precedence over star lists, named accelerations over tilts. FrameError if
     there is no instrument, or if there are several and `namespace` is None.
     """
@@ -193,15 +194,14 @@ def instrument_in(
         for suffix, kind in topics.items():
             if c.msgtype == kind and c.topic.endswith(f"/{suffix}"):
                 found.setdefault(c.topic.removesuffix(suffix).rstrip("/") or "/", []).append(c)
-    able = sorted(n for n, cs in found.items() if any(c.msgtype in needed and c.msgcount for c in cs))
+    able = sorted(n for n, cs in found.items() if any(c.msgtype == STARS and c.msgcount for c in cs))
     if not able or RAW in remaps.topics:
         drivers = driver_topics(bag.connections, remaps, namespace, path)
         if drivers:
             return _of_drivers(bag, drivers, namespace)
-        names = " nor ".join(name for name, kind in topics.items() if kind in needed)
         raise FrameError(
-            f"{path}: {'neither ' if len(needed) > 1 else 'no '}{names} in it, and no images: record stars, tilt and "
-            "camera/camera_info, or the images and the IMU of a robot"
+            f"{path}: no stars in it, and no images: record stars, tilt and camera/camera_info, or the images and the "
+            "IMU of a robot"
         )
     wanted = "/" + namespace.strip("/") if namespace is not None else able[0]
     if able == ["/"] and wanted != "/":

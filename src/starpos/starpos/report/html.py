@@ -70,14 +70,13 @@ def figures(pictures: Sequence[Picture]) -> str:
     return f'<div class="figures">\n{cards}\n</div>'
 
 
-def sexagesimal(angle: float, sides: str, decimals: int = 2) -> str:
-    """An angle in rad as degrees, minutes and seconds with decimals; sides: letters of its signs, such as NS."""
-    unit = 10**decimals
-    seconds, parts = divmod(round(abs(float(np.degrees(angle))) * 3600 * unit), unit)
+def sexagesimal(angle: float, sides: str) -> str:
+    """An angle in rad as degrees, minutes and seconds to 0.01; sides: letters of its signs, such as NS."""
+    seconds, parts = divmod(round(abs(float(np.degrees(angle))) * 3600 * 100), 100)
     minutes, seconds = divmod(seconds, 60)
     degrees, minutes = divmod(minutes, 60)
     side = sides[0] if angle >= 0 else sides[1]
-    return f"{degrees}&deg; {minutes:02d}&prime; {seconds:02d}.{parts:0{decimals}d}&Prime; {side}"
+    return f"{degrees}&deg; {minutes:02d}&prime; {seconds:02d}.{parts:02d}&Prime; {side}"
 
 
 def table(rows: Sequence[tuple[str, str]]) -> str:

@@ -5,12 +5,13 @@ Errors of elements stay the same all night, so all sightings of a satellite shar
 and one radially. Each has a prior by its class and age, and is eliminated from the normal equations of the place.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy import stats
+from scipy import special
 
 from starpos.earth.ellipsoid import enu_axes
 from starpos.earth.gravity import geodetic_place
@@ -31,6 +32,10 @@ SHARED_BY_HAND = 0.15
 SCATTER = 0.01
 
 
+# of any inhabited place, with its error
+UNKNOWN_HEIGHT_M = 500.0, 700.0
+
+
 class KnownBefore(NamedTuple):
     """What is known before: height and clock (1 sigma), and a place (3,) in ITRS with a covariance (2, 2), or None."""
 
@@ -39,6 +44,13 @@ class KnownBefore(NamedTuple):
     clock_stddev_s: float
     place: np.ndarray | None = None
     covariance: np.ndarray | None = None
+
+    @classmethod
+    def at_height(cls, height_m: float, stddev_m: float, clock_stddev_s: float) -> "KnownBefore":
+        """A height, NaN where it is unknown: then any inhabited one."""
+        if math.isnan(height_m):
+            height_m, stddev_m = UNKNOWN_HEIGHT_M
+        return cls(height_m, stddev_m, clock_stddev_s)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -105,8 +117,8 @@ class Adjuster:
         self.directions = np.concatenate([t.directions for t in trails])
         self.axes = np.concatenate([t.axes for t in trails])
         self.covariance = np.concatenate([t.covariance for t in trails])
-        # rad; an end alone is a sighting by hand
-        alone = np.repeat(np.array(ends) == 1, ends)
+        # rad
+        alone = np.repeat([not t.moves for t in trails], ends)
         self.by_hand = np.sqrt(np.trace(self.covariance, axis1=1, axis2=2) / 2) * alone
         self.time_stddev = np.array([t.time_stddev_s for t in trails])
         self.moments = Moments.at(self.utc)
@@ -178,7 +190,7 @@ class Adjuster:
                 break
         degrees = sum(len(block.residual) for block in blocks) + known - len(step)
         chi2 = max(chi2 - float(step @ right), 0.0)
-        scale = max(chi2 / degrees, 1.0) if degrees > 0 and stats.chi2.sf(chi2, degrees) < SCATTER else 1.0
+        scale = max(chi2 / degrees, 1.0) if degrees > 0 and special.chdtrc(degrees, chi2) < SCATTER else 1.0
         sigma, probability = np.full((len(used), 3), np.nan), np.full(len(used), np.nan)
         for block in blocks:
             sigma[block.trails] = np.sqrt(np.diag(block.offset(step)[1]))
@@ -209,7 +221,7 @@ class Adjuster:
             total = block.total + block.by_place @ covariance @ block.by_place.T
             chi2 = float(block.residual @ np.linalg.solve(total, block.residual))
             density[block.trails] = -0.5 * (chi2 + np.linalg.slogdet(total)[1])
-            probability[block.trails] = stats.chi2.sf(chi2, len(total))
+            probability[block.trails] = special.chdtrc(len(total), chi2)
         return density, probability
 
     def _known_before(
@@ -263,7 +275,7 @@ class Adjuster:
         weighted = (weight @ (block.residual - block.by_place @ step))[rows]
         left = weight - weight @ block.by_place @ covariance @ block.by_place.T @ weight
         statistic = weighted @ np.linalg.pinv(left[np.ix_(rows, rows)], hermitian=True) @ weighted
-        return float(stats.chi2.sf(statistic, int(rows.sum())))
+        return float(special.chdtrc(int(rows.sum()), statistic))
 
     def _worst(
         self, used: np.ndarray, blocks: list[_Block], step: np.ndarray, covariance: np.ndarray

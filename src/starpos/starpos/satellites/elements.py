@@ -145,10 +145,38 @@ def read_orbits(path: Path | str) -> tuple[list[Orbit], list[str]]:
                 bad.append(orbit)
     except (ValueError, ET.ParseError, csv.Error, StarposError) as e:
         raise SatelliteError(f"{path}: no readable orbits ({one_line(e)}): {CURE}") from None
+    except ImportError:
+        raise SatelliteError("orbits need the package sgp4: pip install sgp4") from None
     if not found:
         raise SatelliteError(f"{path}: it has no orbits of satellites{f' ({bad[0]})' if bad else ''}: {CURE}")
     left = "1 is left out" if len(bad) == 1 else f"{len(bad)} are left out"
     return found, [f"{path}: of {len(found) + len(bad)} orbits {left} ({bad[0]})"] if bad else []
+
+
+class StoredOrbits:
+    """The orbits of a file or folder, read again when it changes; SatelliteError where it has none at the beginning."""
+
+    def __init__(self, path: Path | str) -> None:
+        self._path = Path(path)
+        self._files: list[tuple[str, int, int]] = []
+        self.trouble = ""
+        self._orbits, _ = read_orbits(self._path)
+        self._files = self._seen()
+
+    def read(self) -> list[Orbit]:
+        """The orbits as they are now; if they became unreadable, the earlier ones, and `trouble` says why."""
+        try:
+            if (files := self._seen()) != self._files:
+                self._orbits, said = read_orbits(self._path)
+                self._files, self.trouble = files, " ".join(said)
+        except (OSError, SatelliteError) as error:
+            self.trouble = str(error)
+        return self._orbits
+
+    def _seen(self) -> list[tuple[str, int, int]]:
+        """Name, time of writing and size of each file."""
+        files = sorted(self._path.iterdir()) if self._path.is_dir() else [self._path]
+        return [(f.name, (state := f.stat()).st_mtime_ns, state.st_size) for f in files]
 
 
 CURE = "give TLE, OMM (JSON, XML or CSV), OEM or SP3"

@@ -6,17 +6,17 @@ aberration as these stars have them, so neither a place nor a calibration is nee
 """
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from starpos.detection.trails import FrameTrail, find_trails
 from starpos.earth.orientation import earth_motion
 from starpos.errors import FrameError
 from starpos.fix.checks import check_exposure
 from starpos.fix.solution import Solution
 from starpos.frames.exposure import UNKNOWN_SHUTTER
-from starpos.frames.frame import Frame, Stars
+from starpos.frames.frame import Frame, FrameTrail, Stars
 from starpos.instrument.camera import Camera
 from starpos.rotation import normalised
 from starpos.satellites.trails import SatelliteTrail, turned
@@ -26,6 +26,8 @@ from starpos.units import SIGMA_PER_MAD
 # Minimum number of stars for polynomials of order 1, 2 and 3; how many of the stars nearest to a trail determine them, at
 # most, and cosine of their greatest distance.
 STARS_OF_ORDER, MAX_STARS, COS_FARTHEST = (6, 20, 60), 600, math.cos(math.radians(25))
+# How far from a trail's end a star may be taken for its end, in widths of stars; their width (px) where it is unknown.
+REACH_FWHM, USUAL_FWHM = 2.0, 2.5
 # Larger residuals, in standard deviations, are left out.
 OUTLIER = 4.0
 # Beyond this angle from the middle of the stars, only identified stars explain light.
@@ -82,6 +84,14 @@ def _terms(xy: np.ndarray, order: int) -> np.ndarray:
 
 
 @dataclass(frozen=True, eq=False)
+class FrameTrails:
+    """The usable trails of a frame, with tracks from 0, and a sentence on those left out; '': none."""
+
+    trails: tuple[SatelliteTrail, ...]
+    left_out: str = ""
+
+
+@dataclass(frozen=True, eq=False)
 class FrameSky:
     """The identified stars of a frame.
 
@@ -128,6 +138,21 @@ class FrameSky:
         zero = np.median(np.log10(stars.flux) + 0.4 * self.magnitudes)
         return x, y, 10 ** (zero - 0.4 * catalogue.vmag(rows))
 
+    def doubted(self, found: Sequence[FrameTrail], catalogue: Catalogue) -> list[FrameTrail]:
+        """Trails found with the identified stars alone: wider along the way where another star may be what ends there."""
+        x, y, _ = self.explained(catalogue)
+        pixels = np.stack([x, y], 1)
+        reach = REACH_FWHM * (self.stars.fwhm_px or USUAL_FWHM)
+        known = np.hypot(*(pixels[:, None] - np.stack([self.stars.x, self.stars.y], 1)).T).min(0) < reach
+        trails = []
+        for trail in found:
+            covariance, way = trail.covariance.copy(), normalised(trail.ends[1] - trail.ends[0])
+            for k, end in enumerate(trail.ends):
+                if (np.hypot(*(pixels[~known] - end).T) < reach).any():
+                    covariance[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] += reach**2 / 3 * np.outer(way, way)
+            trails.append(replace(trail, covariance=covariance))
+        return trails
+
     def ends(self, trail: FrameTrail) -> tuple[np.ndarray, np.ndarray]:
         """Directions (2, 3) of a trail's ends as the stars' `directions` have it, and covariances (2, 2, 2) rad2.
 
@@ -159,6 +184,47 @@ class FrameSky:
         shared = plate.variance(trail.ends)[:, None, None] * np.eye(2)
         return directions, turn @ own @ turn.transpose(0, 2, 1) + shared
 
+    def sighted(self, stars: Stars, found: Sequence[FrameTrail]) -> FrameTrails:
+        """Trails found on the frame of these stars, as seen from the ground, with the time of each end's row.
+
+        Of a trail that leaves the frame one end counts. One that is cut at both, or whose light is uneven, is left
+        out. FrameError with too few stars around a trail.
+        """
+        trails: list[SatelliteTrail] = []
+        for seen in found:
+            if seen.cut.all() or not seen.steady:
+                continue
+            directions, covariance = self.ends(seen)
+            rows = seen.ends[:, 1]
+            middle_s = _later_s(stars, rows)
+            half_s = np.array([-1.0, 1.0]) * (stars.exposure_s or 0.0) / 2
+            towards = None
+            if seen.cut.any():
+                kept = np.flatnonzero(~seen.cut)
+                towards = turned(directions[seen.cut], middle_s[kept] - abs(half_s[:1]))[0]
+                directions, covariance, rows, middle_s = (
+                    x[kept] for x in (directions, covariance, rows, middle_s)
+                )
+                half_s = -abs(half_s[:1])
+            row_error_s = (stars.shutter or UNKNOWN_SHUTTER).errors_s(rows, stars.height).mean(0)
+            trails.append(
+                SatelliteTrail(
+                    track=len(trails),
+                    directions=turned(directions, middle_s + half_s),
+                    covariance=covariance,
+                    utc_unix_s=(stars.mid_unix_s or 0.0) + middle_s + half_s,
+                    turned_utc_unix_s=(stars.mid_unix_s or 0.0) + middle_s - half_s,
+                    towards=towards,
+                    time_stddev_s=float(np.hypot(stars.stamp_stddev_s, np.hypot(*row_error_s))),
+                    file=stars.source,
+                )
+            )
+        uneven = sum(not seen.steady for seen in found)
+        cut = len(found) - len(trails) - uneven
+        why = [f"{cut} leave the frame at both ends"] * (cut > 0) + [f"{uneven} flash or fade"] * (uneven > 0)
+        left_out = f"{stars.place}: of {len(found)} trails {' and '.join(why)}: left out" if why else ""
+        return FrameTrails(tuple(trails), left_out)
+
 
 def tangent_axes(v: np.ndarray) -> np.ndarray:
     """Unit vectors (3, 3): towards growing right ascension and growing declination at a direction v (3,), and v's."""
@@ -168,34 +234,12 @@ def tangent_axes(v: np.ndarray) -> np.ndarray:
     return np.stack([east, np.cross(out, east), out])
 
 
-def trails_of(frame: Frame, stars: Stars, solution: Solution, catalogue: Catalogue) -> list[SatelliteTrail]:
-    """The trails on a frame whose stars were identified, with tracks from 0, that show both ends of their exposure.
+def trails_of(frame: Frame, stars: Stars, solution: Solution, catalogue: Catalogue) -> FrameTrails:
+    """The trails on a frame whose stars were identified. FrameError without a time, an exposure or enough stars."""
+    from starpos.detection.trails import find_trails
 
-    A trail that leaves the frame, or that flashes, does not. FrameError without a time, an exposure or enough stars.
-    """
     sky = FrameSky.of(stars, solution, catalogue)
-    exposure_s = stars.exposure_s or 0.0
-    trails: list[SatelliteTrail] = []
-    for seen in find_trails(frame, stars, *sky.explained(catalogue)):
-        if seen.cut.any() or not seen.steady:
-            continue
-        directions, covariance = sky.ends(seen)
-        rows = seen.ends[:, 1]
-        middle_s = _later_s(stars, rows)
-        half_s = np.array([-exposure_s, exposure_s]) / 2
-        row_error_s = (stars.shutter or UNKNOWN_SHUTTER).errors_s(rows, stars.height).mean(0)
-        trails.append(
-            SatelliteTrail(
-                track=len(trails),
-                directions=turned(directions, middle_s + half_s),
-                covariance=covariance,
-                utc_unix_s=(stars.mid_unix_s or 0.0) + middle_s + half_s,
-                turned_utc_unix_s=(stars.mid_unix_s or 0.0) + middle_s - half_s,
-                time_stddev_s=float(np.hypot(stars.stamp_stddev_s, np.hypot(*row_error_s))),
-                file=stars.source,
-            )
-        )
-    return trails
+    return sky.sighted(stars, find_trails(frame, stars, *sky.explained(catalogue)))
 
 
 def _later_s(stars: Stars, rows: np.ndarray) -> np.ndarray:

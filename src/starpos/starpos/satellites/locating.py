@@ -46,6 +46,18 @@ class SatelliteFix:
     adjustment: PlaceAdjustment
 
     @property
+    def text(self) -> str:
+        """The place on WGS 84 with its errors, the clock, and on how much it stands."""
+        a, (east, north, up) = self.adjustment, np.sqrt(np.diag(self.covariance))
+        widened = f", the covariance widened {a.scale:.1f} times" if a.scale > 1 else ""
+        return (
+            f"place {np.degrees(self.latitude):.5f} {np.degrees(self.longitude):.5f} (WGS 84), {self.height_m:.0f} m; +- "
+            f"{east:.0f} m east, {north:.0f} m north, {up:.0f} m up; clock {self.clock_s:+.3f} s +- "
+            f"{self.clock_stddev_s:.3f}; {a.used.sum()} trails of {self.satellites} satellites, chi-square "
+            f"{a.chi2:.1f} of {a.degrees}{widened}"
+        )
+
+    @property
     def satellites(self) -> int:
         """Number of different satellites that the place stands on."""
         rows = [
@@ -64,7 +76,8 @@ def locate(trails: Sequence[SatelliteTrail], orbits: Sequence[Orbit], prior: Kno
     found = candidates(trails, orbits, prior.height_m, prior.height_stddev_m, prior.clock_stddev_s)
     known = found
     if prior.place is not None and prior.covariance is not None:
-        known = found.near(prior.place, prior.covariance[0, 0] * np.eye(3))
+        east_north = _plane(prior.place)
+        known = found.near(prior.place, east_north.T @ prior.covariance @ east_north)
     agreed = agreement(known, orbits)
     place, rows = agreed.place, agreed.members[agreed.members < len(found.trail)]
     covariance = None
@@ -89,6 +102,12 @@ def locate(trails: Sequence[SatelliteTrail], orbits: Sequence[Orbit], prior: Kno
     return _fix(trails, orbits, found, np.array(seen_before[-1], int), answer, fewest)
 
 
+def _plane(place: np.ndarray) -> np.ndarray:
+    """East and north (2, 3) at a place (3,) in ITRS."""
+    latitude, longitude, _ = geodetic_place(place)
+    return enu_axes(float(latitude), float(longitude))[:2]
+
+
 def _named(
     trails: Sequence[SatelliteTrail],
     orbits: Sequence[Orbit],
@@ -99,8 +118,7 @@ def _named(
     prior: KnownBefore,
 ) -> np.ndarray:
     """Rows of the candidates that fit their trails at a place, one a trail, where no other fits nearly as well."""
-    latitude, longitude, _ = geodetic_place(place)
-    plane = enu_axes(float(latitude), float(longitude))[:2]
+    plane = _plane(place)
     off = (found.places - place) @ plane.T
     spread = plane @ found.covariance @ plane.T + covariance[:2, :2]
     near = np.flatnonzero(np.einsum("ki,kij,kj->k", off, np.linalg.inv(spread), off) < NEAR)

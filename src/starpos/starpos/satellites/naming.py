@@ -55,7 +55,7 @@ class Candidates:
     covariance: np.ndarray
 
     def near(self, place: np.ndarray, covariance: np.ndarray) -> "Candidates":
-        """These, and a rough place that is known, as if a trail more had given it."""
+        """These, and a place (3,) in ITRS that is known, as if a trail more had given it; covariance (3, 3): of it."""
         return Candidates(
             trail=np.append(self.trail, self.trail.max(initial=0) + 1),
             way=np.append(self.way, 0),
@@ -65,7 +65,7 @@ class Candidates:
         )
 
 
-class _Sky:
+class OrbitsAbove:
     """All orbits between two computed times, in axes that turn with the Earth."""
 
     def __init__(self, orbits: Sequence[Orbit]) -> None:
@@ -125,7 +125,7 @@ def candidates(
 
     A trail with one end and no name has no motion, and no candidates.
     """
-    sky = _Sky(orbits)
+    sky = OrbitsAbove(orbits)
     row_of = {orbit.number: k for k, orbit in enumerate(orbits)}
     order = sorted(range(len(trails)), key=lambda k: trails[k].utc_unix_s[0])
     found: list[tuple[int, int, np.ndarray, np.ndarray, np.ndarray]] = []
@@ -133,7 +133,7 @@ def candidates(
         trail = trails[k]
         if trail.satellite in row_of:
             only: np.ndarray | slice = np.array([row_of[trail.satellite]])
-        elif trail.satellite is None and len(trail.directions) > 1:
+        elif trail.satellite is None and trail.moves:
             only = slice(None)
         else:
             continue
@@ -152,7 +152,7 @@ def candidates(
 
 def _of_trail(
     trail: SatelliteTrail,
-    sky: _Sky,
+    sky: OrbitsAbove,
     only: np.ndarray | slice,
     height_m: float,
     height_stddev_m: float,
@@ -185,14 +185,21 @@ def _of_trail(
         sigma[:, 1], np.linalg.norm(v, axis=1) * math.hypot(clock_stddev_s, trail.time_stddev_s)
     )
     measured = math.sqrt(np.trace(trail.covariance[0]) / 2)
-    if len(directions) > 1:
-        r1, _ = sky.at(trail.utc_unix_s[1], rows)
-        motion, worse = directions[1] - d, math.sqrt(np.trace(trail.covariance, axis1=1, axis2=2).max() / 2)
+    until = trail.unseen_utc_unix_s if trail.towards is not None else trail.utc_unix_s[-1]
+    if until is not None and until != trail.utc_unix_s[0]:
+        r1, _ = sky.at(until, rows)
+        worse = math.sqrt(np.trace(trail.covariance, axis1=1, axis2=2).max() / 2)
         other = normalised(r1 - places) - d
         share = RATE_SHARE + RATE_TURN * sigma[:, 1] / EQUATOR_RADIUS_M
-        near = (
-            np.linalg.norm(other - motion, axis=1) < share * np.linalg.norm(motion) + ENOUGH_SIGMA * 2 * worse
-        )
+        if trail.towards is None:
+            motion = directions[-1] - d
+            off = np.linalg.norm(other - motion, axis=1)
+        else:
+            # it goes on beyond the edge of the frame, by no one knows how much
+            motion = moments.gcrs_to_itrs[0] @ normalised(trail.towards + moments.velocity[0]) - d
+            reached = np.maximum(other @ motion / (motion @ motion), 1.0)
+            off = np.linalg.norm(other / reached[:, None] - motion, axis=1)
+        near = off < share * np.linalg.norm(motion) + ENOUGH_SIGMA * 2 * worse
         r, v, rows, distance, places, up, sine, sigma = (
             x[near] for x in (r, v, rows, distance, places, up, sine, sigma)
         )

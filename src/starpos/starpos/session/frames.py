@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A frame in a session: while it waits, and its answer."""
+"""A frame in a session: while it waits, its answer, and what the last ones come to together."""
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from starpos.averaging.average import Average
 from starpos.earth.vertical import Geodetic
@@ -11,6 +11,9 @@ from starpos.fix.solution import Solution
 from starpos.frames.frame import Stars
 from starpos.gnss.watch import GnssCheck
 from starpos.session.driver import Now
+
+if TYPE_CHECKING:
+    from starpos.satellites.locating import SatelliteFix
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,7 +42,15 @@ class Averaged:
     ground: Geodetic
 
 
-Output = Answered | Averaged
+@dataclass(frozen=True)
+class BySatellites:
+    """The place by the satellites on the last frames, None where they give none; with the stamp of the newest."""
+
+    stamp: Any
+    fix: "SatelliteFix | None"
+
+
+Output = Answered | Averaged | BySatellites
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ position is compared with the star fix and never fused with it, so that each can
 import math
 from bisect import bisect_left
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -28,6 +28,9 @@ from starpos.session.driver import ANOTHER_TIME_S, Diagnosis, Heard, Jobs, Level
 from starpos.session.reports import AHEAD_S, ONE_CLOCK
 from starpos.session.settings import Settings
 from starpos.units import ARCSEC, utc_text
+
+if TYPE_CHECKING:
+    from starpos.session.satellites import LiveSatellites
 
 # 1 sigma of a fix that states no error, m an axis
 UNSTATED_M = 30.0
@@ -137,14 +140,21 @@ SAVE_EVERY_S = 60.0
 class GnssTeacher:
     """Keeps the newest fixes of GNSS, and what they have taught of the instrument in use.
 
-    jobs: writes the file.
+    jobs: writes the file.  satellites: their place teaches where GNSS has none.
     """
 
-    def __init__(self, settings: Settings, jobs: Jobs, heard: Heard, log: Log) -> None:
+    def __init__(
+        self,
+        settings: Settings,
+        jobs: Jobs,
+        heard: Heard,
+        log: Log,
+        satellites: "LiveSatellites | None" = None,
+    ) -> None:
         self.newest: Watched | None = None
         self._settings, self._values, self._jobs = settings, settings.values, jobs
         self._heard, self._log = heard, log
-        self.places = RecentPlaces()
+        self.places, self._satellites = RecentPlaces(), satellites
         self._watch: GnssWatch | None = None
         self._instrument: Instrument | None = None
         self._stored: Learned | None = settings.learned
@@ -199,10 +209,13 @@ class GnssTeacher:
         if stars.mid_unix_s is None:
             return None
         try:
-            return self.places.at(stars.mid_unix_s)
+            place = self.places.at(stars.mid_unix_s)
         except GnssError as error:
             self._heard.refuse(GNSS_TOPIC, str(error))
             return None
+        if place is None and self._satellites is not None:
+            return self._satellites.teaching(stars.mid_unix_s)
+        return place
 
     # the file --------------------------------------------------------------------------------------------------------
 
@@ -285,16 +298,19 @@ class GnssTeacher:
 class SessionPlaces:
     """The known place at each time, as `Places`.
 
-    gnss: None without gnss.use.
+    gnss: None without gnss.use.  satellites: None without satellites.elements.
     """
 
-    def __init__(self, settings: Settings, gnss: GnssTeacher | None) -> None:
-        self._settings, self._gnss = settings, gnss
+    def __init__(
+        self, settings: Settings, gnss: GnssTeacher | None, satellites: "LiveSatellites | None" = None
+    ) -> None:
+        self._settings, self._gnss, self._satellites = settings, gnss, satellites
 
     @property
     def known(self) -> bool:
         """Whether a source of the place is set."""
-        return self._settings.site is not None or self._gnss is not None
+        located = self._satellites is not None and self._satellites.located
+        return self._settings.site is not None or self._gnss is not None or located
 
     def at(self, utc_unix_s: float) -> Place:
         """The place at a time; raises PlaceError where it is not known."""
@@ -304,6 +320,8 @@ class SessionPlaces:
             gnss = None if self._gnss is None else self._gnss.places.at(utc_unix_s)
         except GnssError as error:
             raise PlaceError(f"no heading at a known place: {error}") from None
+        if gnss is None and self._satellites is not None:
+            gnss = self._satellites.at(utc_unix_s)
         if gnss is None:
             raise PlaceError(
                 f"no GNSS place within {NEAREST_S:g} s of the frame: no heading at a known place: check gnss/fix and the "

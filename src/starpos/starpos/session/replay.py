@@ -5,7 +5,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from starpos.averaging.average import Average
 from starpos.earth.refraction import Atmosphere
@@ -33,8 +33,10 @@ from starpos.recording.topics import (
     INPUTS,
     NAV_SAT_FIX,
     NO_REMAPS,
+    SATELLITES,
     STARS,
     TILT,
+    TRAILS,
     Remaps,
     instrument_in,
 )
@@ -42,6 +44,9 @@ from starpos.session.driver import Heard, JobsInTurn, Log, Now, Sent
 from starpos.session.frames import Answered, Averaged, Output
 from starpos.session.session import SolverSession
 from starpos.session.settings import Settings
+
+if TYPE_CHECKING:
+    from starpos.satellites.locating import SatelliteFix
 
 
 class Replay:
@@ -73,7 +78,9 @@ class Replay:
         now_ns, messages = 0, DriverMessages(self._drivers)
         with BagReader(path, typed=True) as bag:
             topics = INPUTS if self.session.gnss is None else INPUTS | GNSS
-            chosen = instrument_in(bag, path, namespace, topics, (STARS,), self._drivers.remaps)
+            if self.session.satellites is not None:
+                topics = topics | SATELLITES
+            chosen = instrument_in(bag, path, namespace, topics, self._drivers.remaps)
             if chosen.made:
                 self.remarks.append(chosen.made)
             for connection, log_ns, message in bag.decoded(chosen.connections):
@@ -123,6 +130,8 @@ class Replay:
         if kind == IMU:
             tilt = messages.tilt_of(message, now.unix_s or 0.0)
             return [] if tilt is None else self._receive_tilt(tilt, now)
+        if kind == TRAILS:
+            return session.receive_trails(message, now)
         if kind == NAV_SAT_FIX:
             return session.receive_gnss(message, now)
         if kind == CAPTURE:
@@ -173,6 +182,7 @@ class PlayedNight:
     frames : number of frames read
     solutions : of these frames
     average : of their places; None without one
+    by_satellites : the last place by satellites; None without one
     said : sentences
     trouble : why it broke off; '' if it did not
 
@@ -187,6 +197,7 @@ class PlayedNight:
     frames: int = 0
     solutions: list[Solution] = field(default_factory=list)
     average: Average | None = None
+    by_satellites: "SatelliteFix | None" = None
     said: list[str] = field(default_factory=list)
     trouble: str = ""
 
@@ -253,6 +264,8 @@ class Playing:
                     night.solutions.append(_light(output.solution))
                 elif isinstance(output, Averaged):
                     night.average = output.place
+                else:
+                    night.by_satellites = output.fix or night.by_satellites
         except StarposError as error:
             night.trouble = str(error)
         night.frames = replay.frames

@@ -10,7 +10,7 @@ import math
 import traceback
 from collections.abc import Callable, Iterable
 from dataclasses import replace
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from starpos.earth.orientation import earth_state
 from starpos.errors import InstrumentError, StarposError
@@ -42,6 +42,9 @@ from starpos.session.solving import AT_ONCE_S, Search, attitude_beside
 from starpos.session.standing import ClockDoubt
 from starpos.session.tilts import TiltBuffer
 from starpos.sky import catalogue
+
+if TYPE_CHECKING:
+    from starpos.session.satellites import LiveSatellites
 
 T = TypeVar("T")
 NOTHING_TOLD = Sent()
@@ -81,8 +84,15 @@ class SolverSession:
         self.tilts = TiltBuffer()
         self.doubt = ClockDoubt()
         self.gyro = Gyro(heard)
-        self.gnss = GnssTeacher(settings, jobs(), heard, log) if settings.values["gnss.use"] else None
-        self.places = SessionPlaces(settings, self.gnss)
+        self.satellites: LiveSatellites | None = None
+        if settings.orbits is not None:
+            from starpos.session import satellites
+
+            self.satellites = satellites.LiveSatellites(settings, settings.orbits, jobs(), heard)
+        self.gnss: GnssTeacher | None = None
+        if settings.values["gnss.use"]:
+            self.gnss = GnssTeacher(settings, jobs(), heard, log, self.satellites)
+        self.places = SessionPlaces(settings, self.gnss, self.satellites)
         self.deflection = LiveDeflection(settings, jobs())
         self._search = Search(settings.values)
         self._glows = Glows()
@@ -122,6 +132,8 @@ class SolverSession:
         if self.gnss is not None:
             self.gnss.other_camera()
         self.calibrating.camera_changed()
+        if self.satellites is not None:
+            self.satellites.forget()
         self.deflection.forget()
 
     @property
@@ -132,7 +144,8 @@ class SolverSession:
     @property
     def busy(self) -> bool:
         """Whether a job runs: what comes meanwhile may be answered with its outcome, or without."""
-        return self.instrument.preparing or self.calibrating.busy or self.deflection.busy
+        located = self.satellites is not None and self.satellites.busy
+        return located or self.instrument.preparing or self.calibrating.busy or self.deflection.busy
 
     # parameters ------------------------------------------------------------------------------------------------------
 
@@ -236,6 +249,13 @@ class SolverSession:
             self.gnss.receive(message, now)
         return self.at(now)
 
+    def receive_trails(self, message: Any, now: Now) -> list[Output]:
+        """Take a TrailArray; nothing is done with it without satellites.elements."""
+        made = self._begun(now)
+        if self.satellites is not None:
+            self.satellites.receive(message)
+        return made + self._work(now)
+
     def at(self, now: Now) -> list[Output]:
         """Go on to a time."""
         self._advance(now)
@@ -271,7 +291,7 @@ class SolverSession:
 
     def _work(self, now: Now) -> list[Output]:
         """Answer the first frames that have everything they need: of recorded ones all, live one at a time."""
-        made: list[Output] = []
+        made = [] if self.satellites is None else self.satellites.fetch()
         self.more = False
         # In recorded data a job is done when it was begun, however long it takes.
         while not (now.played and self.busy) and self._first_ready(now):
@@ -333,6 +353,8 @@ class SolverSession:
             # by the clock of recorded data no time passes
             answered = replace(answered, solution=replace(answered.solution, identify_s=0.0, fix_s=0.0))
         self._note(answered.solution, now)
+        if self.satellites is not None and not frame.doubted:
+            self.satellites.note(frame.header.stamp, frame.stars, answered.solution)
         return [
             replace(answered, attitude=self._attitude(frame, question, answered.solution)),
             *self._learn(frame, answered.solution),
@@ -460,6 +482,8 @@ class SolverSession:
         self.gyro.forget()
         if self.gnss is not None:
             self.gnss.places.forget()
+        if self.satellites is not None:
+            self.satellites.forget()
         self.doubt.clear()
         self.calibrating.forget()
         self.deflection.forget()

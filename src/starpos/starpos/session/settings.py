@@ -23,6 +23,7 @@ from starpos.instrument import instrument_file, sensors
 from starpos.instrument.camera import Camera
 from starpos.instrument.instrument import Calibration, Instrument
 from starpos.parameters.given import values_of
+from starpos.satellites.elements import StoredOrbits
 from starpos.sky.catalogue import Catalogue
 
 NAN = math.nan
@@ -145,6 +146,11 @@ def learned_file(name: str) -> Learned | None:
     return states.read_learned(path_of(name)) if name else None
 
 
+def stored_orbits(name: str) -> StoredOrbits | None:
+    """The orbits that satellites.elements names, None for ''; SatelliteError with the reason if it has no orbits."""
+    return StoredOrbits(path_of(name)) if name else None
+
+
 def vertical_of(values: Mapping, known: Geoid | None) -> Vertical:
     """Return the Geoid (`known`, or None), or the deflection that the parameters give for the place.
 
@@ -237,6 +243,7 @@ class Settings(NodeSettings):
     readers: ClassVar[Mapping[str, Callable[[str], Any]]] = {
         **NodeSettings.readers,
         "gnss.learned": learned_file,
+        "satellites.elements": stored_orbits,
     }
 
     @classmethod
@@ -258,6 +265,11 @@ class Settings(NodeSettings):
     def learned(self) -> Learned | None:
         """What earlier sessions learned by GNSS; None without a file."""
         return self._files["gnss.learned"]
+
+    @property
+    def orbits(self) -> StoredOrbits | None:
+        """The orbits of satellites; None without satellites.elements."""
+        return self._files["satellites.elements"]
 
     def saved(self, instrument: Instrument) -> None:
         """Note that the file of calibration_url holds this instrument now."""

@@ -382,10 +382,10 @@ def write_night(
                           "heading_deg": float(np.degrees(now.heading)), "stars": len(stars.electrons)})  # fmt: skip
             progress("frames", (k + 1) / frames)
         rows = "".join("{:.6f},{:.7f},{:.7f},{:.2f}\n".format(*row) for row in tilts)
-        (folder / TILTS).write_text("utc_unix_s,theta_x_deg,theta_y_deg,temperature_c\n" + rows)
+        (folder / TILTS).write_text("utc_unix_s,theta_x_deg,theta_y_deg,temperature_c\n" + rows, "utf-8")
         place = {"latitude_deg": scene.site.latitude_deg, "longitude_deg": scene.site.longitude_deg}
         made = {SIMULATED: {name: _digest(folder / name) for name in (*names, TILTS)}}
-        (folder / TRUTH).write_text(json.dumps(place | {"frames": truth} | made, indent=1))
+        (folder / TRUTH).write_text(json.dumps(place | {"frames": truth} | made, indent=1), "utf-8")
     except OSError as e:
         raise FrameError(f"{folder}: the night cannot be written there ({e.strerror})") from None
 

@@ -29,46 +29,6 @@ from starpos.zenith.sighting import StarPlaces, ZenithSighting, faces_of, mean_h
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class StarQuality:
-    """The S stars of a session.
-
-    stars (S,): rows of the catalogue.  frames (S,): number of frames that each is in.
-    mean_arcsec (S, 2): mean of its residuals, where the frame's stars have it minus where it is seen, east and north.
-    rms_arcsec (S,): root mean square of its residuals a coordinate.
-    leverage_arcsec (S, 2): largest change of xi and of eta by 1 sigma of its place in the catalogue.
-    """
-
-    stars: np.ndarray
-    frames: np.ndarray
-    mean_arcsec: np.ndarray
-    rms_arcsec: np.ndarray
-    leverage_arcsec: np.ndarray
-
-    @classmethod
-    def of(
-        cls, sightings: Sequence[ZenithSighting], places: StarPlaces, lines: Lines, gain: np.ndarray
-    ) -> "StarQuality":
-        """Collect the residuals of each star; gain (2, 2 N): xi, eta in arcsec by the readings in rad."""
-        number = len(places.correction)
-        frames, mean, square = np.zeros(number), np.zeros((number, 2)), np.zeros(number)
-        lever = np.zeros((2, number, 3))
-        for k, (rows, s) in enumerate(zip(places.rows, sightings, strict=True)):
-            seen = s.residual_arcsec @ s.enu_to_camera[:2, :2]
-            frames[rows] += 1
-            mean[rows] += seen
-            square[rows] += (seen**2).mean(1)
-            turn = gain[:, 2 * k : 2 * k + 2] @ lines.by_camera[k]
-            lever[:, rows] += np.einsum("xi,inj->xnj", turn, s.by_star)
-        return cls(
-            stars=places.stars,
-            frames=frames.astype(int),
-            mean_arcsec=mean / frames[:, None],
-            rms_arcsec=np.sqrt(square / frames),
-            leverage_arcsec=np.linalg.norm(lever, axis=2).T,
-        )
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
 class FaceQuality:
     """A face against all others.
 
@@ -185,7 +145,7 @@ class Adjusted:
     as_stated: the session with the errors of the tiltmeter's file, where the residuals show larger ones.  same_air:
     likewise, with the air of this adjustment.  gain: twice the log of the likelihood minus the one of same_air.
     chi2_per_degree: of the residuals; 1 where the stated errors and the air's explain them.
-    face_quality: each face against the others.  stars: the residuals and the leverage of each star.
+    face_quality: each face against the others.  stars (S,): rows of the catalogue.
     """
 
     xi_arcsec: float
@@ -201,7 +161,7 @@ class Adjusted:
     catalogue_factor: float
     chi2_per_degree: float
     face_quality: tuple[FaceQuality, ...]
-    stars: StarQuality
+    stars: np.ndarray
     leftover: Leftover
     inclinometer: InclinometerErrors
     as_stated: "Adjusted | None" = None
@@ -250,11 +210,8 @@ def adjusted(
     instrument: Instrument,
     atmosphere: Atmosphere,
     mark: Place,
-    air: Air | None = None,
 ) -> Adjusted:
     """The deflection of a session; sightings: in order of time, at least three.
-
-    air: its size where it is known, as for a session that is only planned; else the residuals determine it.
 
     Raises FixError where there are fewer, at the poles, or where the equations have no solution or do not settle.
     """
@@ -274,7 +231,7 @@ def adjusted(
         mark=mark,
     )
     try:
-        return _whole_session(session, instrument.inclinometer, air)
+        return _whole_session(session, instrument.inclinometer)
     except np.linalg.LinAlgError as error:
         raise FixError(
             f"the session's equations have no solution ({error}): turn the instrument to several faces, and state the "
@@ -282,10 +239,10 @@ def adjusted(
         ) from None
 
 
-def _whole_session(session: "_Session", inclinometer: InclinometerErrors, air: Air | None) -> Adjusted:
+def _whole_session(session: "_Session", inclinometer: InclinometerErrors) -> Adjusted:
     """The session with the errors of the tiltmeter as stated, or larger ones where the residuals show them."""
-    stated = session.solved(inclinometer, air)
-    if air is not None or (shown := session.shown(stated)) is None:
+    stated = session.solved(inclinometer, None)
+    if (shown := session.shown(stated)) is None:
         return _adjusted(session, stated)
     larger, size = shown
     # under one air: what is wrong with the tiltmeter had seemed to be the air's
@@ -542,7 +499,7 @@ def _adjusted(session: _Session, solved: _Solved) -> Adjusted:
         catalogue_factor=places.factor,
         chi2_per_degree=fit.chi2 / max(left.size - 5, 1),
         face_quality=face_qualities(leftover, sightings, faces),
-        stars=StarQuality.of(sightings, places, lines, gain),
+        stars=places.stars,
         leftover=leftover,
         inclinometer=solved.inclinometer,
     )

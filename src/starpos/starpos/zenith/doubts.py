@@ -135,7 +135,7 @@ def _worse(found: Adjusted) -> list[str]:
 def _zones_arcsec(found: Adjusted, sightings: Sequence[ZenithSighting]) -> float:
     """Zonal errors of the catalogue at the session's date, at most; 0 for a catalogue like Gaia's."""
     year, _ = earth_motion(sightings[0].utc_unix_s)
-    sigma = float(np.median(load_catalogue().sigma(found.stars.stars, year))) / ARCSEC
+    sigma = float(np.median(load_catalogue().sigma(found.stars, year))) / ARCSEC
     if sigma < LIKE_GAIA_ARCSEC:
         return 0.0
     return ZONES_ARCSEC + ZONES_ARCSEC_PER_YEAR * abs(year - ZONES_EPOCH)

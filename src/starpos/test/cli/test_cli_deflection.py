@@ -53,16 +53,13 @@ def test_the_deflection_of_four_faces(run, session):
     assert sum(v[0] ** 2 for v in whole["errors"].values()) == pytest.approx(sigma**2, rel=1e-6)
 
 
-def test_each_face_and_star_has_its_residuals(run, session):
+def test_each_face_has_its_residuals(run, session):
     _, out, _ = run(*arguments(session), "--json", "--station", "Pillar 1")
     whole = objects(out)[-1]
     assert whole["station"] == "Pillar 1" and whole["site"]["height_m"] == HEIGHT_M
     assert [face["frames"] for face in whole["by_face"]] == [2] * 4
     assert all(face["chi2"] < 20 for face in whole["by_face"])
-    lever = [np.hypot(*star["leverage_arcsec"]) for star in whole["by_star"]]
-    assert lever == sorted(lever, reverse=True) and lever[0] > 0
-    assert whole["stars"] >= len(lever) and all(1 <= star["frames"] <= 8 for star in whole["by_star"])
-    assert whole["by_star"][0]["star"].startswith(("HIP ", "TYC "))
+    assert whole["stars"] > 8
 
 
 @pytest.fixture(scope="module")
@@ -138,21 +135,6 @@ def test_live_a_session_that_lacks_something_says_what(session, recorded):
     )
     with pytest.raises(InstrumentError, match=r"set site\.latitude"):
         Settings.of(None, ["deflection.wanted:=0.1"])
-
-
-def test_a_plan_needs_no_frames(run, session):
-    site = ("--site", LATITUDE, LONGITUDE, HEIGHT_M, "--instrument", session / "instrument.yaml")
-    status, out, _ = run(
-        "deflection", "--plan", 0.5, *site, "--size", 1000, 700, "--limit-mag", 7.5, "--json"
-    )
-    (plan,) = objects(out)
-    assert (
-        status == 0 and plan["faces"] == 4 and max(plan["sigma_xi_arcsec"], plan["sigma_eta_arcsec"]) <= 0.5
-    )
-    status, out, _ = run("deflection", "--plan", 0.5, *site, "--size", 1000, 700, "--limit-mag", 7.5)
-    assert status == 0 and "4 faces" in out and "largest errors" in out
-    status, _, err = run("deflection", *site)
-    assert status == 2 and "--plan SIGMA" in err[0]
 
 
 def test_its_lines_for_people_and_its_table(run, session):

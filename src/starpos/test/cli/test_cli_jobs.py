@@ -20,7 +20,6 @@ from archives import frames, run, solve
 from cli_calls import KNOWN, WIDE
 
 from starpos.cli.console import BAR_AFTER_S
-from starpos_testing.lacking import require
 from starpos_testing.patience import WAIT_S
 
 
@@ -121,16 +120,12 @@ BAD_CALLS = {
     "fewer processes than none": ("--jobs", "-1"),
     "more processes than sense": ("--jobs", "100000"),
     "a word for a number": ("--jobs", "many"),
-    "both": ("--jobs", "2", "--scheduler", "tcp://127.0.0.1:1"),
-    "an address that is none": ("--scheduler", "mars"),
 }
 
 
 @pytest.mark.parametrize("kind", BAD_CALLS)
 @pytest.mark.parametrize("command", ["solve", "identify", "detect"])
 def test_a_bad_call_is_exit_2_and_one_line(kind, command, archive, capfd):
-    if kind == "an address that is none":
-        require("distributed")
     given = ["--tilt", str(archive / "turned" / "tilt.csv")] if command == "solve" else []
     status, out, err = run(capfd, [command, *frames(archive / "turned"), *given, *BAD_CALLS[kind]])
     assert (status, out, len(err.splitlines())) == (2, "", 1)
@@ -154,13 +149,6 @@ def test_frames_without_tilts_and_save_of_several_nights_are_refused(archive, tm
     status, _, err = run(capfd, ["solve", *nights, *KNOWN, *save])
     assert (status, len(err.splitlines())) == (2, 1)
     assert "one night" in err
-
-
-def test_without_distributed_the_line_to_install_it_is_told(archive, capfd, monkeypatch):
-    monkeypatch.setitem(sys.modules, "distributed", None)
-    status, _, err = run(capfd, ["detect", *frames(archive / "turned"), "--scheduler", "tcp://127.0.0.1:1"])
-    assert (status, len(err.splitlines())) == (2, 1)
-    assert "pip install distributed" in err
 
 
 @contextmanager

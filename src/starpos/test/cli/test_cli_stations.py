@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`starpos stations` and `starpos report` on sessions' results: tables, GeoJSON, and a page to hand in."""
+"""`starpos stations`: tables and GeoJSON."""
 
 import csv
 import io
@@ -10,7 +10,6 @@ import pytest
 from cli_calls import objects
 
 from starpos_testing.skies.deflections import result
-from starpos_testing.skies.reports import Page, assert_drawn
 
 # 2 km to the north-east, arcsec at the geoid
 PLACES = {"P1": (47.0, 8.0, 3.0, -1.0), "P2": (47.0128, 8.0186, 3.4, -1.2)}
@@ -29,21 +28,18 @@ def sessions(tmp_path):
     return paths
 
 
-def test_a_table_of_stations_with_a_grid_and_levelling(run, sessions, tmp_path):
+def test_a_table_of_stations_with_a_grid(run, sessions, tmp_path):
     grid = ("--geoid", tmp_path / "geoid.gtx")
-    status, out, err = run("stations", *sessions, *grid, "--level", "P1", "P2", "--json")
-    first, second, step = objects(out)
+    status, out, err = run("stations", *sessions, *grid, "--json")
+    first, second = objects(out)
     assert (
         status == 0 and not err and (first["station"], first["sessions"], second["sessions"]) == ("P1", 2, 1)
     )
     assert first["geoid_arcsec"] == pytest.approx([3.025, -1.015])
     assert first["grid_arcsec"] == pytest.approx([3.0, 0.0], abs=0.01)
     assert first["minus_grid_arcsec"] == pytest.approx([0.025, -1.015], abs=0.01)
-    # minus the mean of 3.2 cos and -1.1 sin of the azimuth, 1 arcsec is 4.848e-6
-    north, east = 0.0128 * 111_177, 0.0186 * 76_030
-    assert step["rise_m"] == pytest.approx(-4.848e-6 * (3.2125 * north - 1.1075 * east), rel=2e-3)
-    status, out, _ = run("stations", *sessions, *grid, "--level", "P1", "P2")
-    assert status == 0 and "P1: 47.000000 8.000000" in out and "geoid P1 to P2: -0.01" in out
+    status, out, _ = run("stations", *sessions, *grid)
+    assert status == 0 and "P1: 47.000000 8.000000" in out
 
 
 def test_tables_for_other_programs(run, sessions):
@@ -59,24 +55,6 @@ def test_tables_for_other_programs(run, sessions):
 
 
 def test_what_cannot_be_is_a_sentence(run, sessions, tmp_path):
-    status, _, err = run("stations", *sessions, "--level", "P1", "P9")
-    assert status == 2 and "the stations are P1, P2" in err[0]
     (tmp_path / "none.json").write_text("{}")
     status, _, err = run("stations", tmp_path / "none.json")
     assert status == 2 and "starpos deflection --json" in err[0]
-
-
-def test_a_page_of_the_stations_that_can_be_handed_in(run, sessions, tmp_path):
-    pytest.importorskip("matplotlib")
-    out = tmp_path / "page"
-    status, said, _ = run("report", *sessions, "--geoid", tmp_path / "geoid.gtx", "-o", out)
-    assert status == 0 and said.strip().endswith("index.html")
-    page = Page(out / "index.html")
-    assert "Station P1" in page.text and "Station P2" in page.text
-    assert "ξ +3.12" in page.text.replace("&xi;", "ξ") and "tide free" in page.text
-    assert "of 2 sessions" in page.text and "minus the grid" in page.text
-    assert "Map" in page.pictures and "P1: repeats" in page.pictures
-    for png in page.pictures.values():
-        assert_drawn(png)
-    status, _, err = run("report", sessions[0], tmp_path, "-o", out)
-    assert status == 2 and "either nights or sessions" in err[0]

@@ -5,9 +5,10 @@ from itertools import combinations
 
 import numpy as np
 import pytest
+from paper_triangles import opposite_sides
 
 from starpos.identification._circles import binned, distinct, triples_of_circles
-from starpos.identification.triangles import BINS, opposite_sides
+from starpos.identification.triangles import BINS
 
 RADIUS, MOST = 0.02, 7
 # 64 bits hold (a n + b) n + c up to 2,097,151 stars

@@ -3,6 +3,7 @@
 
 import numpy as np
 import pytest
+from scipy.optimize import least_squares
 from test_identification import seen, sky_for
 
 from starpos import rotation
@@ -63,7 +64,12 @@ def scene(rng, stars=12):
     xy = rng.uniform([-150, -112], [150, 112], (stars, 2))
     w = directions(xy[None], np.array([made.focal_px]))[0] @ made.attitude
     xy = xy + rng.normal(0, SIGMA_PX, xy.shape)
-    return made.fitted(xy, w, np.full(stars, SIGMA_PX)), w, xy
+
+    def turned(step):
+        return Pose(rotation.from_vector(step[:3]) @ made.attitude, 2000.0 * np.exp(step[3]), False)
+
+    best = least_squares(lambda step: (turned(step).project(w) - xy).ravel(), np.zeros(4), x_scale=1e-4).x
+    return turned(best), w, xy
 
 
 def evidence(pose, w, xy, star=None, rank=None, prior=None):

@@ -8,6 +8,7 @@ from itertools import combinations
 
 import numpy as np
 import pytest
+from paper_triangles import angles, opposite_sides, sides
 from scipy.spatial.transform import Rotation
 
 from starpos.identification import triangles
@@ -42,10 +43,6 @@ def own_cache(tmp_path, monkeypatch):
     triangles.KEPT.forget()
 
 
-def angles(v):
-    return triangles.angles(triangles.opposite_sides(v))
-
-
 def unit(ra_deg, dec_deg):
     ra, dec = np.radians([ra_deg, dec_deg])
     return np.array([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])
@@ -53,16 +50,16 @@ def unit(ra_deg, dec_deg):
 
 def test_an_octant_has_three_right_angles():
     x, y, z = np.eye(3)
-    assert angles(np.stack([x, y, z])) == pytest.approx([np.pi / 2] * 3, abs=1e-15)
-    assert triangles.sides(x, y) == pytest.approx(np.pi / 2)
+    assert angles(opposite_sides(np.stack([x, y, z]))) == pytest.approx([np.pi / 2] * 3, abs=1e-15)
+    assert sides(x, y) == pytest.approx(np.pi / 2)
 
 
 def test_angles_by_the_law_of_cosines_and_the_excess(rng):
     """Equation 4 as the paper prints it; the sum exceeds pi by the area (Girard; L'Huilier by the triple product)."""
     v = rng.normal(size=(500, 3, 3))
     v /= np.linalg.norm(v, axis=2, keepdims=True)
-    found = angles(v)
-    a, b, c = (triangles.sides(v[:, i], v[:, j]) for i, j in ((1, 2), (0, 2), (0, 1)))
+    found = angles(opposite_sides(v))
+    a, b, c = (sides(v[:, i], v[:, j]) for i, j in ((1, 2), (0, 2), (0, 1)))
     at_first = np.arccos((np.cos(a) - np.cos(b) * np.cos(c)) / (np.sin(b) * np.sin(c)))
     np.testing.assert_allclose(found[:, 0], at_first, atol=1e-7)
     product = np.abs(np.einsum("ni,ni->n", v[:, 0], np.cross(v[:, 1], v[:, 2])))
@@ -75,26 +72,28 @@ def test_small_triangles_keep_their_digits():
     s = np.radians(1 / 3600)
     v = np.array([[0, 0, 1.0], [3 * s, 0, 1], [0, 4 * s, 1]])
     v /= np.linalg.norm(v, axis=1, keepdims=True)
-    assert angles(np.stack(v)) == pytest.approx([np.pi / 2, np.arctan(4 / 3), np.arctan(3 / 4)], abs=1e-9)
+    assert angles(opposite_sides(np.stack(v))) == pytest.approx(
+        [np.pi / 2, np.arctan(4 / 3), np.arctan(3 / 4)], abs=1e-9
+    )
 
 
 def test_degenerate_triangles_give_numbers():
     x, y, _ = np.eye(3)
     for v in ((x, x, x), (x, x, y), (x, y, (x + y) / 2**0.5)):
-        assert np.isfinite(angles(np.stack(v))).all()
+        assert np.isfinite(angles(opposite_sides(np.stack(v)))).all()
 
 
 def shapes(table, places):
     """Largest angle, smallest angle, longest side (n, 3) from the catalogue's own places."""
-    side = triangles.opposite_sides(places[table.corners])
-    angle = triangles.angles(side)
+    side = opposite_sides(places[table.corners])
+    angle = angles(side)
     return np.stack([angle.max(1), angle.min(1), side.max(1)], -1)
 
 
 def queries(v, error_rad):
     """What is asked for three stars v (3, 3): their order, and shape and tolerance (3,) of each; the plain form."""
-    side = triangles.opposite_sides(v)
-    angle = triangles.angles(side)
+    side = opposite_sides(v)
+    angle = angles(side)
     order = np.argsort(-angle)
     (a, b, c), angle, error = side[order], angle[order], triangles.TRIANGLE_SIGMA * error_rad
     largest = error * np.sqrt(1 / b**2 + 1 / c**2 + (a / (b * c)) ** 2)
@@ -141,13 +140,13 @@ def unit_sum(v):
 def test_triangles_are_those_of_their_corners(table, places, rng):
     pick = rng.integers(0, len(table.corners), 2000)
     v = places[table.corners[pick]]
-    found = angles(v)
+    found = angles(opposite_sides(v))
     # The largest's corner first, the smallest's last.
     assert np.all(np.diff(found, axis=1) <= 1e-12)
     turn = np.einsum("ni,ni->n", np.cross(v[:, 0], v[:, 1]), v[:, 2])
     np.testing.assert_array_equal(table.counter_clockwise[pick], turn < 0)
     longest = (table.shape[pick, 2] + 0.5) * (table.longest_allowed[0] / triangles.CODES)
-    np.testing.assert_allclose(longest, triangles.opposite_sides(v).max(1), atol=1e-5)
+    np.testing.assert_allclose(longest, opposite_sides(v).max(1), atol=1e-5)
     assert longest.max() < 2 * WIDE * 1.05
 
 

@@ -14,31 +14,16 @@ from astropy.coordinates import (
 )
 from astropy.time import Time
 
+from starpos_testing.skies import orbits
+
 C = 299792.458
 NIGHT = 1.6e9
 AGE_DAYS = 1.0
 
 
 def drawn(count: int, seed: int, names: str = "OBJECT"):
-    """Records of sgp4 in low circular orbits, elements of a day before NIGHT, as text of three lines each."""
-    from sgp4.api import WGS72, Satrec
-    from sgp4.exporter import export_tle
-
-    rng = np.random.default_rng(seed)
-    records, text = [], ""
-    for k in range(count):
-        s = Satrec()
-        epoch = NIGHT / 86400 + 2440587.5 - 2433281.5 - AGE_DAYS
-        inclination, perigee, anomaly, node = np.radians([rng.uniform(50, 98), *rng.uniform(0, 360, 3)])
-        rate = rng.uniform(14, 15.2) * 2 * np.pi / 1440
-        s.sgp4init(
-            WGS72, "i", 40001 + k, epoch, 1e-5, 0.0, 0.0, 1e-3, perigee, inclination, anomaly, rate, node
-        )
-        s.classification, s.intldesg, s.ephtype, s.elnum, s.revnum = "U", "10001A", 0, 1, 1
-        lines = export_tle(s)
-        text += f"{names} {40001 + k}\n{lines[0]}\n{lines[1]}\n"
-        records.append(Satrec.twoline2rv(*lines))
-    return records, text
+    """Records of sgp4 in low orbits, elements of AGE_DAYS before NIGHT, and their text."""
+    return orbits.drawn(count, seed, NIGHT - AGE_DAYS * 86400, names)
 
 
 @cache

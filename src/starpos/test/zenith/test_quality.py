@@ -1,14 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The quality of a session's faces and stars: a face that is off is named with its size, a star's leverage is true."""
+"""The quality of a session's faces: one that is off is named with its size."""
 
-from dataclasses import replace
-
-import numpy as np
 import pytest
 from sessions import INSTRUMENT, MARK, SCALE, VACUUM, drawn, shifted
 
-from starpos import rotation
-from starpos.units import ARCSEC
 from starpos.zenith.adjustment import adjusted
 from starpos.zenith.doubts import DeflectionSession, remarks
 
@@ -38,18 +33,3 @@ def test_a_face_that_is_somewhat_off_is_named_beside_the_value(rng):
         and told[0].startswith("face 3 (top of the frame at")
         and "look at its frames" in told[0]
     )
-
-
-def test_the_leverage_of_a_star_is_what_its_displacement_does(rng):
-    size = 0.04 * ARCSEC
-    # one star of ten: displaced to the east and north, it turns the attitude by a tenth
-    about = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]]) * size / 10
-    sightings = [
-        replace(s, by_star=(s.enu_to_camera @ about)[:, None]) for s in drawn(rng, frames=3).sightings
-    ]
-    found = adjust(sightings)
-    turn = rotation.from_vector([0.0, size / 10, 0.0])
-    other = adjust([s.turned(s.enu_to_camera @ turn @ s.enu_to_camera.T) for s in sightings])
-    assert found.stars.stars.tolist() == [7] and found.stars.frames.tolist() == [24]
-    assert found.stars.leverage_arcsec[0] == pytest.approx([0.004, 0.004], rel=0.02)
-    assert abs(other.eta_arcsec - found.eta_arcsec) == pytest.approx(0.004, rel=0.02)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Stations of many sessions: repeats average what is new in them only, levelling follows a geoid that is known."""
+"""Stations of many sessions: repeats average what is new in them only."""
 
 import json
 
@@ -9,7 +9,7 @@ import pytest
 from starpos.earth.geoid import Geoid, Grid
 from starpos.errors import StationError
 from starpos.units import ARCSEC
-from starpos.zenith.stations import against_grid, between_m, levelled, read_session, stations_of
+from starpos.zenith.stations import against_grid, read_session, stations_of
 from starpos_testing.skies.deflections import COMMON_ARCSEC, NEW_ARCSEC, result
 
 # a geoid that is a sum of two waves, m by deg
@@ -78,54 +78,11 @@ def test_a_grid_of_the_truth_leaves_no_difference(tmp_path, grid):
     assert against_grid(stations_of([station(tmp_path, "B", 30.0, 8.0)])[0], grid) is None
 
 
-def test_levelling_climbs_the_geoid_it_stands_on(tmp_path, grid):
-    ends = [(47.0, 8.0), (47.02, 8.03), (47.05, 8.05)]
-    line = stations_of([station(tmp_path, f"S{k}", *end) for k, end in enumerate(ends)])
-    for geoid, most in ((None, 3.0), (grid, 0.3)):
-        first, _, whole = levelled(line, geoid)
-        for step, (a, b) in ((first, (0, 1)), (whole, (0, 2))):
-            truth = height(*ends[b]) - height(*ends[a])
-            assert abs(step.rise_m - truth) < max(most * step.between_m, 2e-5)
-        assert whole.begin is line[0] and whole.end is line[2]
-        # an error of 0.06 arcsec that is new at each end, and one of 0.03 that both share
-        new, common = NEW_ARCSEC * ARCSEC, COMMON_ARCSEC * ARCSEC
-        expected = first.distance_m * np.hypot(new / np.sqrt(2), common)
-        assert first.measured_m == pytest.approx(expected, rel=0.01)
-        assert first.distance_m == pytest.approx(np.hypot(0.02 * 111177, 0.03 * 76000), rel=2e-3)
-
-
-def test_what_stations_share_tilts_a_line_by_its_correlation(tmp_path):
-    ends = {"A": (47.0, 8.0), "B": (47.02, 8.03)}
-    told = []
-    for correlation in (-0.9, 0.0, 0.9):
-        sessions = [
-            read_session(
-                result(tmp_path / f"{name}{k}.json", *end, 2, 1, station=name, correlation=correlation)
-            )
-            for name, end in ends.items()
-            for k in range(50)
-        ]
-        line = stations_of(sessions)
-        for found in line:
-            assert found.covariance[0, 1] == pytest.approx(correlation * COMMON_ARCSEC**2, abs=1e-9)
-        told.append(levelled(line, None)[0])
-    # to the north-east: errors of xi and eta add if they are of one sign, and fifty sessions average all else
-    azimuth, shared = told[1].azimuth, COMMON_ARCSEC * ARCSEC * told[1].distance_m
-    new = NEW_ARCSEC * ARCSEC * told[1].distance_m / np.sqrt(2 * 50)
-    for step, correlation in zip(told, (-0.9, 0.0, 0.9), strict=True):
-        expected = np.hypot(shared * np.sqrt(1 + correlation * np.sin(2 * azimuth)), new)
-        assert step.measured_m == pytest.approx(expected, rel=0.01)
-
-
-def test_what_lies_between_stations_is_in_the_error(rng):
-    """Random fields of the stated covariance, integrated."""
-    at = np.linspace(0, 12_000.0, 241)
-    far = np.abs(at[:, None] - at) / 8000
-    root = np.linalg.cholesky((1 + far) * np.exp(-far) + np.eye(241) * 1e-9)
-    fields = 6.0 * ARCSEC * root @ rng.normal(size=(241, 2000))
-    errors = (fields[1:] + fields[:-1]).sum(0) * 25.0
-    errors = errors - 6000 * (fields[0] + fields[-1])
-    assert errors.std() == pytest.approx(between_m(12_000.0, 6.0, 8000.0), rel=0.06)
+@pytest.mark.parametrize("correlation", [-0.9, 0.0, 0.9])
+def test_what_sessions_share_keeps_its_correlation(tmp_path, correlation):
+    paths = [result(tmp_path / f"{k}.json", 47, 8, 2, 1, correlation=correlation) for k in range(9)]
+    (found,) = stations_of([read_session(path) for path in paths])
+    assert found.covariance[0, 1] == pytest.approx(correlation * COMMON_ARCSEC**2, abs=1e-9)
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ FILES = {
   <name>tf2_msgs</name>
   <version>0.36.0</version>
   <description>The message of tf2, for tests.</description>
-  <maintainer email="maintainers@starpos.invalid">starpos maintainers</maintainer>
+  <maintainer email="starpos@users.noreply.github.com">starpos maintainers</maintainer>
   <license>BSD-3-Clause</license>
   <buildtool_depend>rosidl_default_generators</buildtool_depend>
   <depend>geometry_msgs</depend>

@@ -108,35 +108,6 @@ class NightBag:
         for at, x, y, warm in zip(log.utc_unix_s, log.theta_x, log.theta_y, log.temperature_c, strict=True):
             self.write("tilt", self.message("Tilt", at, x=x, y=y, temperature=warm), at)
 
-    def solution(self, unix_s, solved):
-        """Write a Solution from an object of `starpos solve --json`."""
-        terms = [
-            self.message("ErrorTerm", name=name, east=e, north=n, heading=h, common=name != "tilt")
-            for name, (e, n, h) in solved["budget"].items()
-            if "geodetic" not in name
-        ]
-        given = {k: solved[k] for k in ("latitude", "longitude", "latitude_geodetic", "longitude_geodetic")}
-        given |= {"xi": solved["xi_arcsec"], "eta": solved["eta_arcsec"]}
-        turned = solved["eta_arcsec"] / 3600 * np.tan(np.radians(solved["latitude_geodetic"]))
-        # Geodetic, as the node's.
-        given["heading"] = solved["heading"] - turned
-        given |= {k: np.ravel(solved[k]).astype(float) for k in ("covariance", "covariance_geodetic")}
-        given |= {k: solved[k] for k in ("stars_detected", "stars_matched", "log_odds")}
-        made = self.message("Solution", unix_s, budget=terms, residual=solved["residual_arcsec"], **given)
-        self.write("solver/solution", made, unix_s)
-
-    def failure(self, unix_s, status, text, **more):
-        """Write a Solution without a fix."""
-        nothing = np.full(9, np.nan)
-        about = {
-            "status": status,
-            "status_text": text,
-            "covariance": nothing,
-            "covariance_geodetic": nothing,
-        } | more
-        nan = dict.fromkeys(("latitude", "longitude", "heading", "right_ascension", "residual"), float("nan"))
-        self.write("solver/solution", self.message("Solution", unix_s, **about, **nan), unix_s)
-
     def _blank(self, kind):
         _, fields = self.store.fielddefs[kind]
         return self.store.types[kind](**{name: self._empty(definition) for name, definition in fields})
