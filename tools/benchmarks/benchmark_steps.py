@@ -29,6 +29,7 @@ from starpos.earth.refraction import Atmosphere
 from starpos.fix.fix import Fix, solve_fix
 from starpos.fix.solver import Solver
 from starpos.fix.star_fit import MatchedStars
+from starpos.frames.exposure import GLOBAL_SHUTTER
 from starpos.frames.frame import Frame, Stars
 from starpos.identification import triangles
 from starpos.instrument.inclinometer import Tilt
@@ -64,16 +65,12 @@ class Shot:
         catalogue, every = self.solver.catalogue, np.ones(len(found.star), bool)
         places = catalogue.directions(found.catalogue, state.year, state.observer_au)
         matched = MatchedStars.of(self.stars, found, every, scene.camera, catalogue, state.year, places)
-        return partial(
-            solve_fix,
-            matched,
-            scene.camera,
-            self.tilt,
-            scene.instrument.mounting,
-            scene.site.atmosphere,
-            state,
-            CLOCK_S,
+        about = replace(
+            self.solver.circumstances(self.stars, scene.camera, state),
+            clock_stddev_s=CLOCK_S,
+            shutter=GLOBAL_SHUTTER,
         )
+        return partial(solve_fix, matched, self.tilt, about)
 
 
 def with_astropy(shot: Shot) -> Callable[[], object]:

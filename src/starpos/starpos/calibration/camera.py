@@ -31,6 +31,7 @@ from starpos.frozen import at_once
 from starpos.identification import Identification, PointingPrior, Sky, fisheye, identify_directions, triangles
 from starpos.identification.triangles import TriangleCatalogue
 from starpos.instrument.camera import EQUIDISTANT, Camera
+from starpos.instrument.platepar import SkyPixels
 from starpos.progress import Progress, quiet
 from starpos.sky import deeper
 from starpos.sky.catalogue import Catalogue
@@ -329,6 +330,29 @@ def calibrate_camera(
     check_sound(fit, given)
     progress("camera", 1.0)
     return FromSky(fit, tuple(sightings))
+
+
+# stars lower than this do not show where a platepar's pixels look
+SEEN_ABOVE_RAD = np.radians(10)
+
+
+def seen_by(
+    camera: Camera, attitude: np.ndarray, site: Place, atmosphere: Atmosphere, utc_unix_s: float
+) -> SkyPixels:
+    """What pixels all over a fixed camera's frame show; attitude (3, 3): east, north, up at the site into C."""
+    xy = _grid(camera, BORDER)
+    xy = xy[camera.sees(*xy.T)]
+    local = camera.directions(*xy.T) @ attitude
+    high = local[:, 2] > np.sin(SEEN_ABOVE_RAD)
+    state = earth_state(utc_unix_s)
+    return SkyPixels(
+        xy=xy[high],
+        icrs=state.of_itrs(atmosphere.refraction().unbend(local[high]) @ site.plumb_axes),
+        utc_unix_s=utc_unix_s,
+        latitude=site.latitude,
+        longitude=site.longitude,
+        height_m=0.0 if np.isnan(site.height_m) else site.height_m,
+    )
 
 
 # Rounds in which one frame's stars are identified again with the lens found so far, and the significance of a k1 to use.

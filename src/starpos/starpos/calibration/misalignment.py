@@ -22,7 +22,7 @@ from starpos.calibration.plumb_line import (
 from starpos.earth.ellipsoid import enu_axes
 from starpos.earth.place import Place
 from starpos.errors import FixError
-from starpos.fix.budget import Sensitivity, local_north
+from starpos.fix.budget import level_rows, local_north
 from starpos.fix.fix import Fix
 from starpos.fix.solution import Solution, Status
 from starpos.fix.solver import Solver
@@ -414,7 +414,7 @@ def _unknown(agreement: _Agreement, errors: InclinometerErrors) -> Calibration:
 def _with_zenith_error(fix: Fix, astray: float) -> Fix:
     """The fix with an error of the zenith (rad) that is the same for all frames, at any heading."""
     # with east, north, up for L
-    level = Sensitivity.of(local_north(enu_axes(fix.latitude, fix.longitude)), fix.link_to_enu).level
+    level = level_rows(local_north(enu_axes(fix.latitude, fix.longitude)), fix.link_to_enu)
     term = ErrorTerm("turn", level[:, :2] * astray, shared=ALWAYS)
     return replace(fix, terms=(*fix.terms, term))
 

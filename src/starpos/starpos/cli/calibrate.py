@@ -2,6 +2,7 @@
 """`starpos calibrate`: the camera and A3 from stars, written to files that the other commands read."""
 
 import argparse
+import json
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -10,7 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from starpos.calibration.camera import FromSky, Intrinsics, calibrate_camera, rms
+from starpos import rotation
+from starpos.calibration.camera import FromSky, Intrinsics, calibrate_camera, rms, seen_by
 from starpos.calibration.camera_adjustment import UNLEVELLED, UNTIMED, parameters
 from starpos.calibration.misalignment import NOTHING_KNOWN, Calibrated, Known, calibrate_at, calibrate_fixed
 from starpos.cli import console, inputs, options, overwriting, watch_output
@@ -20,6 +22,7 @@ from starpos.cli.overwriting import CAMERA_NAME, Written, save_instrument
 from starpos.earth.place import Place
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import CalibrationError, FixError, FrameError, InstrumentError, PlaceError, StarposError
+from starpos.files import write_whole
 from starpos.fix.checks import FIND_TURN, at_another_lean, may_turn
 from starpos.fix.searching import Sight, of_one_camera
 from starpos.fix.solver import Solver
@@ -27,7 +30,7 @@ from starpos.frames.frame import Stars
 from starpos.frames.reading import why_no_time
 from starpos.frames.tables import TILTS, Pointing, read_pointings
 from starpos.identification import Identification
-from starpos.instrument import instrument_file
+from starpos.instrument import instrument_file, platepar
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import up_of
 from starpos.instrument.instrument import (
@@ -356,6 +359,8 @@ def _written(args: argparse.Namespace) -> Iterator[Written]:
         yield Written("--camera", args.camera, overwriting.camera)
     if args.map is not None:
         yield Written("--map", args.map, overwriting.picture)
+    if args.platepar is not None:
+        yield Written("--platepar", args.platepar, overwriting.never)
     if args.output is not None:
         yield Written("--output", args.output, instrument_file.check_replaceable)
 
@@ -407,11 +412,44 @@ def _camera(
     instrument_file.write_camera(Path(args.camera), whole, CAMERA_NAME, about + _covariance_text(found.fit))
     if args.map is not None:
         _draw(args.map, found)
+    if args.platepar is not None:
+        _write_platepar(args.platepar, found, frames, site, air)
     if args.json:
         console.print_json(_json_of(found, args.camera))
     else:
         print(about, end="")
     return whole
+
+
+# frames of one platepar may lie apart by this, px
+STILL_PX = 3.0
+
+
+def _write_platepar(
+    path: str, found: FromSky, frames: Sequence[Stars], site: Place | None, air: Atmosphere
+) -> None:
+    """Write the camera and the mean pose of its frames for RMS; InstrumentError if they have none."""
+    if site is None:
+        raise InstrumentError("--platepar needs the place of the camera: give --site LAT LON, without --tilt")
+    fit, camera = found.fit, found.fit.camera
+    mean = rotation.mean_rotation(fit.attitudes)
+    apart = max(np.linalg.norm(rotation.to_vector(a @ mean.T)) for a in fit.attitudes) * camera.fx
+    if apart > STILL_PX:
+        raise InstrumentError(
+            f"--platepar is of a camera that stands still, and in these frames it moved by {apart:.0f} px: give frames "
+            "of one pose"
+        )
+    times = [frames[k].mid_unix_s or 0.0 for k in found.used]
+    seen = seen_by(camera, mean, site, air, times[len(times) // 2])
+    plate, worst = platepar.platepar_of(camera, seen)
+    try:
+        write_whole(path, (json.dumps(plate, indent=4, sort_keys=True) + "\n").encode())
+    except OSError as e:
+        raise InstrumentError(f"{path}: the platepar cannot be written there ({e.strerror})") from None
+    console.complain(
+        "calibrate",
+        f"{path}: RMS sees stars within {worst:.2f} px of this camera; the platepar has no photometry",
+    )
 
 
 def _levelled(

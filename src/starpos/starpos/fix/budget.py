@@ -10,10 +10,13 @@ import numpy as np
 from starpos._numeric.roots import symmetric_root
 from starpos.earth.ellipsoid import curvature_radii_m, enu_axes, meridian_turn, place_of_zenith
 from starpos.earth.orientation import ROTATION_RAD_S, EarthState
+from starpos.earth.refraction import Atmosphere
 from starpos.fix._adjustment import gain_of, spread
 from starpos.fix.attitude import ENU, LINK, Attitude, heading_row
 from starpos.fix.terms import ALWAYS, EACH_POSE, ErrorTerm, Origin, total_covariance
+from starpos.frames.exposure import GLOBAL_SHUTTER, Shutter
 from starpos.frozen import at_once
+from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import Tilt
 from starpos.instrument.mounting import LocalLevel, Mounting
 from starpos.units import HOUR_S
@@ -48,34 +51,50 @@ def local_north(a4: np.ndarray) -> LocalNorth:
 
 
 @at_once
-@dataclass(frozen=True)
-class Sensitivity:
-    """Change of the rows of an ErrorTerm for small rotations about L's axes, (6, 3) each.
+@dataclass(frozen=True, kw_only=True)
+class Circumstances:
+    """How a frame was taken: all that its fix takes besides what the frame and its level show.
 
-    stars: for a rotation of the sky against L, which changes A4 only.
-    level: for a rotation of L against sky and instrument, which changes A4 and the attitude together.
+    mounting: of the camera, the level and the base link.  earth: when the row was exposed that is read first.
+    clock_stddev_s, stamp_stddev_s: of the clock, and of the frame's time stamp by that clock.
+    shutter: when each row was exposed.
+    axis_stddev: error of the camera's optical axis, rad.
     """
 
-    stars: np.ndarray
-    level: np.ndarray
+    camera: Camera
+    mounting: Mounting
+    atmosphere: Atmosphere
+    earth: EarthState
+    clock_stddev_s: float
+    stamp_stddev_s: float = 0.0
+    shutter: Shutter = GLOBAL_SHUTTER
+    axis_stddev: float = 0.0
 
-    @classmethod
-    def of(cls, place: LocalNorth, link_to_enu: np.ndarray) -> "Sensitivity":
-        """Sensitivity at a place with the attitude link_to_enu (3, 3)."""
-        prime, meridian = curvature_radii_m(place.latitude)
-        east, north = place.east, place.north
-        stars = np.zeros((6, 3))
-        # a rotation by (dx, dy) moves the zenith among the stars by (-dy, dx)
-        stars[0, 0], stars[0, 1] = prime * east[1], -prime * east[0]
-        stars[1, 0], stars[1, 1] = meridian * north[1], -meridian * north[0]
-        # when the pole moves, north turns in L, and the attitude turns the other way against north
-        stars[5] = meridian_turn(place.latitude) * north
-        stars[5, 2] -= 1.0
-        level = stars.copy()
-        level[3:] += place.local_to_enu
-        to_heading = heading_row(link_to_enu)
-        stars[2], level[2] = to_heading @ stars[3:], to_heading @ level[3:]
-        return cls(stars, level)
+
+def sky_rows(place: LocalNorth) -> np.ndarray:
+    """Change (6, 3) of the rows of an ErrorTerm for small rotations of the sky about L's axes, which change A4 only."""
+    prime, meridian = curvature_radii_m(place.latitude)
+    east, north = place.east, place.north
+    rows = np.zeros((6, 3))
+    # a rotation by (dx, dy) moves the zenith among the stars by (-dy, dx)
+    rows[0, 0], rows[0, 1] = prime * east[1], -prime * east[0]
+    rows[1, 0], rows[1, 1] = meridian * north[1], -meridian * north[0]
+    # when the pole moves, north turns in L, and the attitude turns the other way against north
+    rows[5] = meridian_turn(place.latitude) * north
+    rows[5, 2] -= 1.0
+    rows[2] = -rows[5]
+    return rows
+
+
+def level_rows(place: LocalNorth, link_to_enu: np.ndarray) -> np.ndarray:
+    """Change (6, 3) of the rows of an ErrorTerm for small rotations of L against sky and instrument.
+
+    They change A4 and the attitude link_to_enu (3, 3) together.
+    """
+    rows = sky_rows(place)
+    rows[3:] += place.local_to_enu
+    rows[2] = heading_row(link_to_enu) @ rows[3:]
+    return rows
 
 
 def link_attitude(link_to_enu: np.ndarray, terms: tuple[ErrorTerm, ...]) -> Attitude:
@@ -128,40 +147,6 @@ class StarErrors:
         return spread(self.gain, np.ascontiguousarray(covariance))
 
 
-def error_terms(
-    *,
-    sensitivity: Sensitivity,
-    stars: StarErrors,
-    level: LocalLevel,
-    tilt: Tilt,
-    mounting: Mounting,
-    refraction_rotation: np.ndarray,
-    shutter_rotation: np.ndarray,
-    latitude: float,
-    earth: EarthState,
-    clock_stddev_s: float,
-    stamp_stddev_s: float,
-) -> tuple[ErrorTerm, ...]:
-    """The terms of a fix's budget, without the base link's (`mount_term`) and the deflection of the vertical.
-
-    refraction_rotation (3,): rotation of A4 in rad for 1 sigma of the refraction.
-    shutter_rotation (3, 2): rotation of A4 in rad for 1 sigma of each of the two errors of the rows' times.
-    clock_stddev_s, stamp_stddev_s: of the clock, and of the frame's time stamp by that clock.
-    """
-
-    def of_stars(covariance: np.ndarray) -> np.ndarray:
-        return sensitivity.stars @ symmetric_root(stars.rotation_covariance(covariance))
-
-    return (
-        ErrorTerm("centroids", of_stars(stars.centroids)),
-        ErrorTerm("catalogue", of_stars(stars.catalogue), shared=stars.same_stars),
-        *tilt_terms(sensitivity.level, level, tilt, mounting, earth.utc_unix_s),
-        ErrorTerm("refraction", (sensitivity.stars @ refraction_rotation)[:, None], shared=ALWAYS),
-        ErrorTerm("shutter", sensitivity.stars @ shutter_rotation, shared=ALWAYS, constant_within_pose=True),
-        *time_terms(latitude, earth, clock_stddev_s, stamp_stddev_s),
-    )
-
-
 def tilt_terms(
     rows: np.ndarray, level: LocalLevel, tilt: Tilt, mounting: Mounting, utc_unix_s: float
 ) -> tuple[ErrorTerm, ...]:
@@ -187,22 +172,31 @@ def tilt_terms(
     )
 
 
+def sky_terms(
+    rows: np.ndarray, earth: EarthState, clock_stddev_s: float, stamp_stddev_s: float, a4: np.ndarray
+) -> tuple[ErrorTerm, ...]:
+    """The terms of the Earth's rotation, which are the same for all directions.
+
+    rows (n, 3): the factors' rows for a small rotation of the sky about the axes into which a4 (3, 3) takes ITRS.
+    """
+    # a second of time turns the sky about the pole; the pole itself errs about the two axes across
+    second = ROTATION_RAD_S * (rows @ a4[:, 2:])
+    orientation = earth.orientation
+    return (
+        ErrorTerm("clock", second * clock_stddev_s, shared=ALWAYS),
+        # a constant lag does not average away and cannot be excluded
+        ErrorTerm("time stamp", second * stamp_stddev_s, shared=ALWAYS),
+        ErrorTerm("ut1", second * orientation.ut1_sigma_s, shared=ALWAYS),
+        ErrorTerm("pole", rows @ a4[:, :2] * orientation.pole_sigma, shared=ALWAYS),
+    )
+
+
 def time_terms(
     latitude: float, earth: EarthState, clock_stddev_s: float, stamp_stddev_s: float
 ) -> tuple[ErrorTerm, ...]:
-    """The sources of error of the Earth's rotation, which are the same for all directions."""
-    (prime, meridian), north_turns = curvature_radii_m(latitude), meridian_turn(latitude)
-    # the Earth's turn moves the place along its parallel, and north with it; another pole is another north
-    second_of_time, pole = np.zeros((6, 1)), np.zeros((6, 2))
-    second_of_time[0, 0] = prime * math.cos(latitude) * ROTATION_RAD_S
-    pole[[0, 2, 5], 0], pole[1, 1] = (prime, north_turns, -north_turns), meridian
-    return (
-        ErrorTerm("clock", second_of_time * clock_stddev_s, shared=ALWAYS),
-        # a constant lag does not average away and cannot be excluded
-        ErrorTerm("time stamp", second_of_time * stamp_stddev_s, shared=ALWAYS),
-        ErrorTerm("ut1", second_of_time * earth.orientation.ut1_sigma_s, shared=ALWAYS),
-        ErrorTerm("pole", pole * earth.orientation.pole_sigma, shared=ALWAYS),
-    )
+    """The terms of the Earth's rotation of any fix at a latitude."""
+    axes = enu_axes(latitude, 0.0)
+    return sky_terms(sky_rows(local_north(axes)), earth, clock_stddev_s, stamp_stddev_s, axes)
 
 
 def _turn_error(level: LocalLevel, mounting: Mounting) -> np.ndarray:

@@ -132,7 +132,7 @@ def check_exposure(stars: Stars, camera: Camera, directions: np.ndarray) -> None
 UNMOVED_SIGMAS = 4.0
 
 
-def check_unmoved(fix: Fix, instrument: Instrument, clock_stddev_s: float) -> None:
+def check_unmoved(fix: Fix, instrument: Instrument) -> None:
     """Raise FixError if a camera with a vertical of its own has turned against the Earth since its calibration.
 
     A camera that was moved looks like one at another place, but not like the same camera at the same place.
@@ -150,7 +150,7 @@ def check_unmoved(fix: Fix, instrument: Instrument, clock_stddev_s: float) -> No
     )
     covariance = fix.camera.covariance + np.asarray(vertical.covariance_arcsec2) * ARCSEC**2
     covariance = covariance + np.eye(3) * (sag2 + air2)
-    covariance[2, 2] += 2 * (ROTATION_RAD_S * clock_stddev_s) ** 2
+    covariance[2, 2] += 2 * (ROTATION_RAD_S * fix.clock_stddev_s) ** 2
     angle = float(np.arccos(np.clip((np.trace(turned) - 1) / 2, -1, 1)))
     small = rotation.to_small_vector(turned)
     if angle < 0.5 and small @ np.linalg.solve(covariance, small) <= UNMOVED_SIGMAS**2:

@@ -8,15 +8,13 @@ import numpy as np
 
 from starpos import rotation
 from starpos.earth.orientation import EarthState
-from starpos.earth.refraction import MIN_COS_ZENITH, Atmosphere
+from starpos.earth.refraction import MIN_COS_ZENITH
 from starpos.errors import FixError
-from starpos.fix.budget import tilt_terms
+from starpos.fix.budget import Circumstances, tilt_terms
 from starpos.fix.terms import ALWAYS, ErrorTerm
 from starpos.frames.tables import Pointing
 from starpos.frozen import at_once
-from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import Tilt
-from starpos.instrument.mounting import Mounting
 
 # so near the zenith a direction has hardly an elevation to speak of
 MIN_SINE = 0.01
@@ -49,44 +47,20 @@ class Circle:
     parallax: float = 0.0
 
 
-def circle_of(
-    pointing: Pointing,
-    camera: Camera,
-    tilt: Tilt,
-    mounting: Mounting,
-    atmosphere: Atmosphere,
-    earth: EarthState,
-    clock_stddev_s: float,
-) -> Circle:
+def circle_of(pointing: Pointing, tilt: Tilt, about: Circumstances) -> Circle:
     """The circle of one frame's centre; FixError if its direction does not determine an altitude."""
-    return circle_along(
-        camera.centre_ray,
-        earth.to_itrs(rotation.unit_vector([pointing.ra], [pointing.dec]))[0],
-        pointing.place,
-        tilt,
-        mounting,
-        atmosphere,
-        earth,
-        sigma=pointing.sigma,
-        clock_stddev_s=clock_stddev_s,
-        stamp_stddev_s=pointing.stamp_stddev_s,
-    )
+    itrs = about.earth.to_itrs(rotation.unit_vector([pointing.ra], [pointing.dec]))[0]
+    return circle_along(about.camera.centre_ray, itrs, pointing.place, tilt, about, sigma=pointing.sigma)
 
 
 def circle_along(
-    ray: np.ndarray,
-    itrs: np.ndarray,
-    place: str,
-    tilt: Tilt,
-    mounting: Mounting,
-    atmosphere: Atmosphere,
-    earth: EarthState,
-    **known: Any,
+    ray: np.ndarray, itrs: np.ndarray, place: str, tilt: Tilt, about: Circumstances, **known: Any
 ) -> Circle:
     """The circle of what is seen along a ray (3,) in C and stands at itrs (3,); known: further fields of the Circle.
 
     place: the frame's name, for messages.
     """
+    mounting, atmosphere, earth = about.mounting, about.atmosphere, about.earth
     level = mounting.level(tilt)
     seen = level.camera @ ray
     sine = np.hypot(seen[0], seen[1])
@@ -110,5 +84,7 @@ def circle_along(
         zenith_distance=z,
         terms=(*terms, ErrorTerm("refraction", np.array([[bent]]), shared=ALWAYS)),
         earth=earth,
+        clock_stddev_s=about.clock_stddev_s,
+        stamp_stddev_s=about.stamp_stddev_s,
         **known,
     )

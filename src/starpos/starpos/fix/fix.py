@@ -11,20 +11,25 @@ import numpy as np
 
 from starpos import rotation
 from starpos._numeric.roots import symmetric_root
-from starpos.earth.orientation import EarthState
-from starpos.earth.refraction import Atmosphere
 from starpos.earth.vertical import Geodetic, Vertical, geodetic
 from starpos.fix.attitude import CAMERA, ITRS, Attitude, heading_of
-from starpos.fix.budget import Sensitivity, error_terms, link_attitude, local_north, mount_term
+from starpos.fix.budget import (
+    Circumstances,
+    level_rows,
+    link_attitude,
+    local_north,
+    mount_term,
+    sky_rows,
+    sky_terms,
+    tilt_terms,
+)
 from starpos.fix.sighting import FittedSighting, fitted_fields
 from starpos.fix.star_fit import MatchedStars, apparent, fit_stars
 from starpos.fix.terms import ErrorTerm, total_covariance
-from starpos.frames.exposure import GLOBAL_SHUTTER, Shutter
 from starpos.frames.tables import Pointing
 from starpos.frozen import at_once
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import Tilt
-from starpos.instrument.mounting import Mounting
 from starpos.units import ARCSEC
 
 # lengths from here on are given in km
@@ -174,59 +179,36 @@ class Fix(PlaceFix, FittedSighting):
         return link_attitude(self.link_to_enu, self.terms)
 
 
-def solve_fix(
-    stars: MatchedStars,
-    camera: Camera,
-    tilt: Tilt,
-    mounting: Mounting,
-    atmosphere: Atmosphere,
-    earth: EarthState,
-    clock_stddev_s: float,
-    stamp_stddev_s: float = 0.0,
-    shutter: Shutter = GLOBAL_SHUTTER,
-) -> Fix:
-    """The fix of one frame from identified stars.
-
-    clock_stddev_s, stamp_stddev_s: of the clock, and of the frame's time stamp by that clock.
-    shutter: when each row was exposed; `earth` is of the row that is read first.
-    Raises FixError if the stars are too few or do not agree.
-    """
-    level, refraction = mounting.level(tilt), atmosphere.refraction()
+def solve_fix(stars: MatchedStars, tilt: Tilt, about: Circumstances) -> Fix:
+    """The fix of one frame from identified stars; FixError if the stars are too few or do not agree."""
+    mounting, refraction = about.mounting, about.atmosphere.refraction()
+    level = mounting.level(tilt)
     g = level.camera
-    seen = fit_stars(stars, camera, g, refraction, apparent(stars, earth, shutter, camera.height))
-    fit, errors = seen.fit, seen.errors
-    place = local_north(fit.a4)
+    seen = fit_stars(stars, about.camera, g, refraction, apparent(stars, about))
+    a4 = seen.fit.a4
+    place = local_north(a4)
     link_to_enu = place.local_to_enu @ g @ mounting.link_to_camera
-    sensitivity = Sensitivity.of(place, link_to_enu)
+    of_sky, of_level = sky_rows(place), level_rows(place, link_to_enu)
     # the two axes go with the inclinometer, however it leans
     axes = rotation.shortest_turn(np.array([0.0, 0.0, 1.0]), level.up)[:, :2]
+    centroids, catalogue, *of_air = seen.terms(of_sky, about)
     terms = (
-        *error_terms(
-            sensitivity=sensitivity,
-            stars=errors,
-            level=level,
-            tilt=tilt,
-            mounting=mounting,
-            refraction_rotation=seen.bending(atmosphere),
-            shutter_rotation=seen.rolling(shutter, camera.height),
-            latitude=place.latitude,
-            earth=earth,
-            clock_stddev_s=clock_stddev_s,
-            stamp_stddev_s=stamp_stddev_s,
-        ),
+        centroids,
+        catalogue,
+        *tilt_terms(of_level, level, tilt, mounting, about.earth.utc_unix_s),
+        *of_air,
+        *sky_terms(of_sky, about.earth, about.clock_stddev_s, about.stamp_stddev_s, a4),
         *mount_term("mount", link_to_enu, mounting.link_stddev_rad),
     )
     return Fix(
-        **fitted_fields(seen, camera, g, fit.a4, refraction, earth),
-        clock_stddev_s=clock_stddev_s,
-        stamp_stddev_s=stamp_stddev_s,
+        **fitted_fields(seen, about, g, a4),
         tilt=tilt,
         latitude=place.latitude,
         longitude=place.longitude,
         heading=heading_of(link_to_enu),
         link_to_enu=link_to_enu,
         terms=terms,
-        levelling=sensitivity.level @ (level.turns @ axes),
+        levelling=of_level @ (level.turns @ axes),
     )
 
 
@@ -245,17 +227,10 @@ def frame_axes(camera: Camera) -> np.ndarray:
     return np.stack([np.cross(axis, up), -up, axis])
 
 
-def pointing_fix(
-    pointing: Pointing,
-    camera: Camera,
-    tilt: Tilt,
-    mounting: Mounting,
-    atmosphere: Atmosphere,
-    earth: EarthState,
-    clock_stddev_s: float,
-) -> Fix:
+def pointing_fix(pointing: Pointing, tilt: Tilt, about: Circumstances) -> Fix:
     """The fix of a frame whose pointing and roll are known; FixError if it cannot be."""
-    to_frame = frame_axes(camera)
+    mounting = about.mounting
+    to_frame = frame_axes(about.camera)
     seen = replace(mounting, a3=mounting.a3 @ to_frame.T, link_to_camera=to_frame @ mounting.link_to_camera)
     angle = 2 * np.pi * np.arange(RING_STARS) / RING_STARS
     xy = np.array(IDEAL.centre_px) + RING_PX * np.stack([np.cos(angle), np.sin(angle)], -1)
@@ -267,15 +242,15 @@ def pointing_fix(
         IDEAL.directions(*xy.T) @ _frame_to_icrs(pointing).T,
         np.zeros(RING_STARS),
     )
-    fix = solve_fix(stars, IDEAL, tilt, seen, atmosphere, earth, clock_stddev_s, pointing.stamp_stddev_s)
+    fix = solve_fix(stars, tilt, replace(about, camera=IDEAL, mounting=seen))
     g, to_itrs = seen.level(tilt).camera, fix.camera.rotation
     # the centre's error turns the frame about two axes across its own, the roll's error about its own axis
     own = np.diag([pointing.sigma, pointing.sigma, pointing.sigma_roll]) ** 2
-    sensitivity = Sensitivity.of(local_north(g @ to_itrs.T), fix.link_to_enu)
+    rows = sky_rows(local_north(g @ to_itrs.T))
     return replace(
         fix,
         terms=(
-            ErrorTerm("pointing", sensitivity.stars @ symmetric_root(g @ own @ g.T)),
+            ErrorTerm("pointing", rows @ symmetric_root(g @ own @ g.T)),
             *(t for t in fix.terms if t.name not in OF_STARS),
         ),
         used=np.zeros(0, int),

@@ -11,21 +11,17 @@ from typing import Any
 import numpy as np
 
 from starpos import rotation
-from starpos._numeric.roots import symmetric_root
 from starpos.earth.ellipsoid import meridian_turn
-from starpos.earth.orientation import ROTATION_RAD_S, EarthState
 from starpos.earth.place import Place
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import FixError, PlaceError
 from starpos.fix.attitude import CAMERA, ENU, Attitude, heading_row
-from starpos.fix.budget import link_attitude, mount_term
+from starpos.fix.budget import Circumstances, link_attitude, mount_term, sky_terms
 from starpos.fix.checks import check_visible
 from starpos.fix.sighting import FittedSighting, fitted_fields
 from starpos.fix.star_fit import MatchedStars, StarFit, apparent, fit_stars
 from starpos.fix.terms import ALWAYS, ErrorTerm, total_covariance
-from starpos.frames.exposure import GLOBAL_SHUTTER, Shutter
 from starpos.frozen import at_once
-from starpos.instrument.camera import Camera
 from starpos.instrument.mounting import Mounting
 
 # the level settles to this, rad; refraction turns with it, and settles a thousand times faster, or ten times at 10 deg
@@ -66,26 +62,14 @@ class AttitudeAtPlace(FittedSighting):
         return f"<AttitudeAtPlace: {self.text}>"
 
 
-def attitude_at_place(
-    stars: MatchedStars,
-    camera: Camera,
-    place: Place,
-    mounting: Mounting,
-    atmosphere: Atmosphere,
-    earth: EarthState,
-    clock_stddev_s: float,
-    stamp_stddev_s: float = 0.0,
-    shutter: Shutter = GLOBAL_SHUTTER,
-    axis_stddev: float = 0.0,
-) -> AttitudeAtPlace:
+def attitude_at_place(stars: MatchedStars, place: Place, about: Circumstances) -> AttitudeAtPlace:
     """Heading, pitch and roll of the base link from identified stars at a known place.
 
-    mounting: only its base link on the camera is used.
-    axis_stddev: error in rad of the camera's optical axis.
-    clock_stddev_s, stamp_stddev_s, shutter: as `solve_fix` has them.
+    about: of its mounting only the base link on the camera is used.
     Raises FixError if the stars are too few or do not agree, PlaceError if they are below the horizon of this place.
     """
-    itrs, refraction = apparent(stars, earth, shutter, camera.height), atmosphere.refraction()
+    camera, atmosphere = about.camera, about.atmosphere
+    itrs, refraction = apparent(stars, about), atmosphere.refraction()
     a4 = place.plumb_axes
     rays = camera.directions(*stars.xy.T)
     g = a4 @ rotation.best_rotation(rays, itrs)
@@ -102,16 +86,14 @@ def attitude_at_place(
     _check_refraction(seen, atmosphere)
     moved = zenith_moved(place.plumb[0])
     terms = (
-        *_of_stars(seen, atmosphere, shutter, camera.height),
-        *sky_terms(earth, clock_stddev_s, stamp_stddev_s, a4),
+        *seen.terms(np.eye(3), about),
+        *sky_terms(np.eye(3), about.earth, about.clock_stddev_s, about.stamp_stddev_s, a4),
         ErrorTerm("place", moved @ place.zenith_root, shared=ALWAYS),
     )
     deflected = moved * place.plumb_stddev, moved * place.ellipsoid_stddev
     return AttitudeAtPlace(
-        **fitted_fields(seen, camera, g, a4, refraction, earth),
-        **attitudes_at(place, g, mounting, terms, deflected, axis_stddev),
-        clock_stddev_s=clock_stddev_s,
-        stamp_stddev_s=stamp_stddev_s,
+        **fitted_fields(seen, about, g, a4),
+        **attitudes_at(place, g, about.mounting, terms, deflected, about.axis_stddev),
         place=place,
     )
 
@@ -169,40 +151,6 @@ def _check_refraction(seen: StarFit, atmosphere: Atmosphere) -> None:
             f"from the given place the air would bend this field more than the stars show ({share:.2f} +- {sigma:.2f} of "
             "it): check latitude and longitude, their order and signs, the clock, and the camera's fx and fy"
         )
-
-
-def _of_stars(seen: StarFit, atmosphere: Atmosphere, shutter: Shutter, height: int) -> tuple[ErrorTerm, ...]:
-    """Rotations (3, m) of the sky about east, north, up, rad, for 1 sigma of each source of a fit of stars."""
-    errors = seen.errors
-
-    def of(covariance: np.ndarray) -> np.ndarray:
-        return symmetric_root(errors.rotation_covariance(covariance))
-
-    return (
-        ErrorTerm("centroids", of(errors.centroids)),
-        ErrorTerm("catalogue", of(errors.catalogue), shared=errors.same_stars),
-        ErrorTerm("refraction", seen.bending(atmosphere)[:, None], shared=ALWAYS),
-        ErrorTerm("shutter", seen.rolling(shutter, height), shared=ALWAYS),
-    )
-
-
-def sky_terms(
-    earth: EarthState, clock_stddev_s: float, stamp_stddev_s: float, a4: np.ndarray
-) -> tuple[ErrorTerm, ...]:
-    """Rotations (3, m) of the sky about east, north, up, rad, for 1 sigma of each error of the Earth's rotation.
-
-    a4 (3, 3): ITRS into east, north, up.
-    """
-    orientation = earth.orientation
-    # a second of time turns the sky about the pole; the pole itself errs about the two axes across
-    second = ROTATION_RAD_S * a4[:, 2:]
-    rotations = {
-        "clock": second * clock_stddev_s,
-        "time stamp": second * stamp_stddev_s,
-        "ut1": second * orientation.ut1_sigma_s,
-        "pole": a4[:, :2] * orientation.pole_sigma,
-    }
-    return tuple(ErrorTerm(name, turns, shared=ALWAYS) for name, turns in rotations.items())
 
 
 def zenith_moved(latitude: float) -> np.ndarray:

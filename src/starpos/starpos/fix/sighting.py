@@ -7,12 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from starpos.earth.orientation import EarthState, station_velocity
-from starpos.earth.refraction import Refraction
+from starpos.earth.orientation import station_velocity
 from starpos.fix.attitude import CAMERA, ITRS, Attitude
+from starpos.fix.budget import Circumstances
 from starpos.fix.star_fit import StarFit
 from starpos.frozen import at_once
-from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import Tilt
 from starpos.units import ARCSEC
 
@@ -58,22 +57,22 @@ class FittedSighting(Sighting):
     ut1_minus_utc_s: float
 
 
-def fitted_fields(
-    seen: StarFit, optics: Camera, g: np.ndarray, a4: np.ndarray, refraction: Refraction, earth: EarthState
-) -> dict[str, Any]:
+def fitted_fields(seen: StarFit, about: Circumstances, g: np.ndarray, a4: np.ndarray) -> dict[str, Any]:
     """The fields of a FittedSighting that a fit gives; g (3, 3): C into L, a4 (3, 3): ITRS into L."""
-    fit, axis = seen.fit, g @ optics.centre_ray
+    fit, earth, axis = seen.fit, about.earth, g @ about.camera.centre_ray
     error = seen.errors.rotation_covariance(seen.errors.centroids)
     return {
         "utc_unix_s": earth.utc_unix_s,
+        "clock_stddev_s": about.clock_stddev_s,
+        "stamp_stddev_s": about.stamp_stddev_s,
         "camera": Attitude(a4.T @ g, a4.T @ error @ a4, of=CAMERA, into=ITRS),
         "used": np.flatnonzero(fit.keep),
         "residual_px": seen.residual,
-        "residual_arcsec": seen.residual_px * optics.scale_arcsec,
+        "residual_arcsec": seen.residual_px * about.camera.scale_arcsec,
         "jitter_px": math.sqrt(fit.jitter2),
         "focal_scale": fit.scale,
         "zenith_distance": math.acos(min(max(axis[2], -1.0), 1.0)),
-        "refraction_arcsec": math.dist(axis, refraction.unbend(axis)) / ARCSEC,
+        "refraction_arcsec": math.dist(axis, about.atmosphere.refraction().unbend(axis)) / ARCSEC,
         "diurnal_aberration_arcsec": math.hypot(*station_velocity(a4[2])) / ARCSEC,
         "ut1_minus_utc_s": earth.orientation.ut1_minus_utc_s,
     }

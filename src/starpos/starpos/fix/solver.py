@@ -22,6 +22,7 @@ from starpos.errors import (
     TiltError,
     TimeError,
 )
+from starpos.fix.budget import Circumstances
 from starpos.fix.checks import (
     check_above_horizon,
     check_exposure,
@@ -34,7 +35,7 @@ from starpos.fix.fix import IDEAL, Fix, length_text, pointing_fix, solve_fix
 from starpos.fix.heading import AttitudeAtPlace, attitude_at_place
 from starpos.fix.solution import TWO_SKIES, UNEXPLAINED, Solution, Status, solution_of, status_of
 from starpos.fix.star_fit import MatchedStars, sound_matches
-from starpos.frames.exposure import UNKNOWN_SHUTTER, Shutter
+from starpos.frames.exposure import GLOBAL_SHUTTER, UNKNOWN_SHUTTER, Shutter
 from starpos.frames.frame import EDGE_PX, Stars
 from starpos.frames.reading import why_no_time
 from starpos.frames.tables import Pointing
@@ -241,12 +242,10 @@ class Solver:
             if not pointing.has_roll:
                 raise FixError(f"{pointing.place}: no roll: one elevation gives no fix, several together do")
             state, tilt = self.levelled(pointing, tilts)
-            camera, clock_s = self.instrument.camera or IDEAL, self.clock_stddev_s(pointing)
-            fix = pointing_fix(
-                pointing, camera, tilt, self.instrument.mounting, self.atmosphere, state, clock_s
-            )
+            camera = self.instrument.camera or IDEAL
+            fix = pointing_fix(pointing, tilt, self.circumstances(pointing, camera, state))
             check_above_horizon(math.cos(fix.zenith_distance), self.instrument.calibration)
-            check_unmoved(fix, self.instrument, clock_s)
+            check_unmoved(fix, self.instrument)
         except StarposError as e:
             return Solution.refused(pointing, e)
         return Solution.of(
@@ -307,20 +306,10 @@ class Solver:
                 raise FixError(
                     f"by the tilts and A3 {low}: check the signs and the order of the tilts' axes, and A3"
                 )
-        fix = solve_fix(
-            matched,
-            camera.scaled(found.focal_scale),
-            tilt,
-            self.instrument.mounting,
-            self.atmosphere,
-            state,
-            self.clock_stddev_s(stars),
-            stars.stamp_stddev_s,
-            self.shutter(stars),
-        )
+        fix = solve_fix(matched, tilt, self.circumstances(stars, camera.scaled(found.focal_scale), state))
         if not fisheye.is_wide(camera):
             check_above_horizon(math.cos(fix.zenith_distance), self.instrument.calibration)
-        check_unmoved(fix, self.instrument, self.clock_stddev_s(stars))
+        check_unmoved(fix, self.instrument)
         return replace(fix, used=np.flatnonzero(use)[fix.used])
 
     def _matched(
@@ -359,19 +348,23 @@ class Solver:
         sky = Sky(catalogue, triangles, state.year, tuple(state.velocity))
         check_risen(stars, found, camera, sky, up)
         use, matched = self._matched(stars, found, camera, up, state, catalogue)
-        attitude = attitude_at_place(
-            matched,
-            camera.scaled(found.focal_scale),
-            place,
-            self.instrument.mounting,
-            self.atmosphere,
-            state,
-            self.clock_stddev_s(stars),
-            stars.stamp_stddev_s,
-            self.shutter(stars),
-            self.instrument.axis_stddev_rad,
-        )
+        about = self.circumstances(stars, camera.scaled(found.focal_scale), state)
+        attitude = attitude_at_place(matched, place, about)
         return replace(attitude, used=np.flatnonzero(use)[attitude.used])
+
+    def circumstances(self, frame: Stars | Pointing, camera: Camera, earth: EarthState) -> Circumstances:
+        """How a frame was taken, by a camera in its pixels, at a state of the Earth."""
+        return Circumstances(
+            camera=camera,
+            mounting=self.instrument.mounting,
+            atmosphere=self.atmosphere,
+            earth=earth,
+            clock_stddev_s=self.clock_stddev_s(frame),
+            stamp_stddev_s=frame.stamp_stddev_s,
+            # a pointing is of one time
+            shutter=self.shutter(frame) if isinstance(frame, Stars) else GLOBAL_SHUTTER,
+            axis_stddev=self.instrument.axis_stddev_rad,
+        )
 
     def clock_stddev_s(self, stars: Stars | Pointing) -> float:
         """Standard deviation of the clock that stamped the stars: its host's own, but at least the instrument's."""

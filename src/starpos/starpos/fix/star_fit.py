@@ -9,14 +9,15 @@ from functools import cached_property
 
 import numpy as np
 
+from starpos._numeric.roots import symmetric_root
 from starpos.earth.ellipsoid import ECCENTRICITY2
-from starpos.earth.orientation import EQUATOR_M_PER_S, ROTATION_RAD_S, SPEED_OF_LIGHT, EarthState, later
+from starpos.earth.orientation import EQUATOR_M_PER_S, ROTATION_RAD_S, SPEED_OF_LIGHT, later
 from starpos.earth.refraction import Atmosphere, Refraction
 from starpos.errors import FixError
 from starpos.fix._adjustment import Adjustment
 from starpos.fix._scatter import distances2, expected_variance, sifted
-from starpos.fix.budget import StarErrors
-from starpos.fix.terms import ALWAYS
+from starpos.fix.budget import Circumstances, StarErrors
+from starpos.fix.terms import ALWAYS, ErrorTerm
 from starpos.frames.exposure import Shutter
 from starpos.frames.frame import Stars
 from starpos.frozen import at_once
@@ -235,9 +236,21 @@ class StarFit:
         """Root mean square residual of a coordinate."""
         return math.sqrt(np.vdot(self.residual, self.residual) / self.residual.size)
 
-    def bending(self, atmosphere: Atmosphere) -> np.ndarray:
-        """Rotation (3,) of A4 in rad for 1 sigma of the refraction."""
-        return self.errors.rotated(self._bent(atmosphere) * (atmosphere.relative_sigma / STEP_REFRACTION))
+    def terms(self, rows: np.ndarray, about: Circumstances) -> tuple[ErrorTerm, ...]:
+        """The terms of the stars, the air and the shutter; rows (n, 3): the factors' rows for a small rotation of A4."""
+        errors, air = self.errors, about.atmosphere
+
+        def of_stars(covariance: np.ndarray) -> np.ndarray:
+            return rows @ symmetric_root(errors.rotation_covariance(covariance))
+
+        bent = errors.rotated(self._bent(air) * (air.relative_sigma / STEP_REFRACTION))
+        rolling = rows @ self._rolling(about.shutter, about.camera.height)
+        return (
+            ErrorTerm("centroids", of_stars(errors.centroids)),
+            ErrorTerm("catalogue", of_stars(errors.catalogue), shared=errors.same_stars),
+            ErrorTerm("refraction", (rows @ bent)[:, None], shared=ALWAYS),
+            ErrorTerm("shutter", rolling, shared=ALWAYS, constant_within_pose=True),
+        )
 
     def refraction_seen(self, atmosphere: Atmosphere) -> tuple[float, float]:
         """Share of the refraction that the field shows, relative to the air at the fitted zenith, and its 1 sigma.
@@ -261,7 +274,7 @@ class StarFit:
         moved = self.problem.predict(fit.a4, fit.scale, stronger) - self.problem.xy - fit.residual
         return moved[fit.kept]
 
-    def rolling(self, shutter: Shutter, height: int) -> np.ndarray:
+    def _rolling(self, shutter: Shutter, height: int) -> np.ndarray:
         """Rotation (3, 2) of A4 in rad for 1 sigma of the two errors of the rows' times."""
         fit = self.fit
         if not shutter.readout_stddev_s:
@@ -332,7 +345,7 @@ def _with_errors(
     return StarFit(problem=problem, fit=fit, errors=errors, residual=residual)
 
 
-def apparent(stars: MatchedStars, earth: EarthState, shutter: Shutter, height: int) -> np.ndarray:
+def apparent(stars: MatchedStars, about: Circumstances) -> np.ndarray:
     """Geocentric apparent directions (N, 3) of the stars in ITRS, each when its row was exposed."""
-    itrs = earth.to_itrs(stars.places)
-    return later(itrs, shutter.later_s(stars.xy[:, 1], height)) if shutter.readout_s else itrs
+    itrs, shutter = about.earth.to_itrs(stars.places), about.shutter
+    return later(itrs, shutter.later_s(stars.xy[:, 1], about.camera.height)) if shutter.readout_s else itrs

@@ -17,11 +17,11 @@ from starpos.earth.place import Place, Places
 from starpos.earth.refraction import MIN_COS_ZENITH
 from starpos.errors import FixError, InstrumentError, PlaceError, StarposError
 from starpos.fix.attitude import CAMERA, ITRS, Attitude
-from starpos.fix.budget import tilt_terms
+from starpos.fix.budget import sky_terms, tilt_terms
 from starpos.fix.checks import MIN_DEG
 from starpos.fix.circle import MIN_SINE, circle_along
 from starpos.fix.glows import Glow
-from starpos.fix.heading import AttitudeAtPlace, attitudes_at, sky_terms, zenith_moved
+from starpos.fix.heading import AttitudeAtPlace, attitudes_at, zenith_moved
 from starpos.fix.solution import Solution
 from starpos.fix.solver import Solver
 from starpos.fix.terms import ALWAYS, ErrorTerm, total_covariance
@@ -146,30 +146,13 @@ def _on_circle(
 ) -> Solution:
     """The Sun's circle of equal altitude."""
     body = body_at(SUN, state)
-    _check_size(
-        disc,
-        seen,
-        body,
-        solver.instrument.camera_for(stars.width, stars.height, stars.origin_px),
-        stars.place,
-    )
-    mounting = solver.instrument.mounting
-    up = mounting.level(tilt).camera[2]
+    camera = solver.instrument.camera_for(stars.width, stars.height, stars.origin_px)
+    _check_size(disc, seen, body, camera, stars.place)
+    up = solver.instrument.mounting.level(tilt).camera[2]
     across = (up - (up @ seen.ray) * seen.ray) / max(math.sqrt(1 - (up @ seen.ray) ** 2), MIN_SINE)
     sigma = math.hypot(float(np.linalg.norm(across @ seen.own)), body.sigma)
-    circle = circle_along(
-        seen.ray,
-        body.itrs,
-        stars.place,
-        tilt,
-        mounting,
-        solver.atmosphere,
-        state,
-        sigma=sigma,
-        parallax=body.parallax,
-        clock_stddev_s=solver.clock_stddev_s(stars),
-        stamp_stddev_s=stamp_s,
-    )
+    about = replace(solver.circumstances(stars, camera, state), stamp_stddev_s=stamp_s)
+    circle = circle_along(seen.ray, body.itrs, stars.place, tilt, about, sigma=sigma, parallax=body.parallax)
     lens = ErrorTerm("lens", (across @ seen.lens)[None], shared=ALWAYS)
     circle = replace(circle, terms=(*circle.terms, lens))
     text = f"the Sun {math.degrees(circle.zenith_distance):.4f} deg from the zenith"
@@ -259,16 +242,13 @@ def _attitude(
     if two is None:
         raise FixError(f"{stars.place}: the {name} is in the zenith, where it gives no heading")
     moved = zenith_moved(place.plumb[0])
-    sky = (
-        *sky_terms(state, clock_s, stamp_s, a4),
-        ErrorTerm("place", moved @ place.zenith_root, shared=ALWAYS),
-    )
     of_body = (
         ErrorTerm("disc", two.components @ two.g @ seen.own),
         ErrorTerm("lens", two.components @ two.g @ seen.lens, shared=ALWAYS),
         ErrorTerm("ephemeris", np.eye(2) * body.sigma, shared=ALWAYS),
         ErrorTerm("refraction", two.components @ (bent - true)[:, None] * air.relative_sigma, shared=ALWAYS),
-        *(replace(t, factor=two.turned @ t.factor) for t in sky),
+        *sky_terms(two.turned, state, clock_s, stamp_s, a4),
+        ErrorTerm("place", two.turned @ moved @ place.zenith_root, shared=ALWAYS),
     )
     deflected = two.turned @ moved * place.plumb_stddev
     of_up = tilt_terms(OF_UP @ two.g @ level.camera.T, level, tilt, mounting, state.utc_unix_s)

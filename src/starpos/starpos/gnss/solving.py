@@ -10,7 +10,7 @@ from starpos._numeric.roots import symmetric_root
 from starpos.earth.ellipsoid import curvature_radii_m, enu_axes, meridian_turn
 from starpos.earth.place import Place
 from starpos.earth.vertical import Deflection, Geodetic, Vertical
-from starpos.fix.budget import Sensitivity, local_north
+from starpos.fix.budget import level_rows, local_north
 from starpos.fix.fix import Fix
 from starpos.fix.solution import Solution, Status
 from starpos.fix.solver import Solver
@@ -108,7 +108,7 @@ def _levelled(solver: Solver, stars: Stars, answer: Solution, up_in_camera: np.n
 def _zenith_moved(fix: Fix) -> np.ndarray:
     """Change (6, 2) of the rows of an ErrorTerm for a zenith of the level that lies 1 rad further east, or north."""
     # with east, north, up for L
-    level = Sensitivity.of(local_north(enu_axes(fix.latitude, fix.longitude)), fix.link_to_enu).level
+    level = level_rows(local_north(enu_axes(fix.latitude, fix.longitude)), fix.link_to_enu)
     return np.stack([-level[:, 1], level[:, 0]], 1)
 
 

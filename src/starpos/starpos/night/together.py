@@ -14,7 +14,6 @@ from starpos.averaging.altitudes import MIN_JUDGED, Directions, place_of_circles
 from starpos.averaging.average import Average, average
 from starpos.averaging.elevation_axis import MIN_WITHOUT_SITE, FoundAxis, find_axis
 from starpos.calibration.misalignment import Calibrated, turn
-from starpos.earth.orientation import EarthState
 from starpos.earth.place import Place
 from starpos.earth.vertical import Vertical
 from starpos.errors import FixError, FrameError, GnssError, StarposError
@@ -29,9 +28,7 @@ from starpos.gnss.receiver import GnssTrack
 from starpos.gnss.solving import Watched, watched
 from starpos.gnss.states import Learned
 from starpos.gnss.watch import GnssWatch
-from starpos.instrument.inclinometer import Tilt
 from starpos.instrument.instrument import Calibration, Instrument
-from starpos.instrument.mounting import Mounting
 from starpos.instrument.tilt_log import Tilts
 from starpos.night import remarks
 from starpos.night.remarks import Kind, Near, Remark, doubts, of_inclinometer
@@ -294,34 +291,32 @@ def axis_of(
         with suppress(StarposError):
             levelled.append((pointing, *solver.levelled(pointing, tilts)))
 
+    camera = solver.instrument.camera or IDEAL
+
     def with_a3(a3: np.ndarray) -> list[Circle]:
         mounting = replace(solver.instrument.mounting, a3=a3)
         circles = []
         for pointing, state, tilt in levelled:
+            about = replace(solver.circumstances(pointing, camera, state), mounting=mounting)
             with suppress(FixError):
-                circles.append(_circle(solver, pointing, tilt, mounting, state))
+                circles.append(circle_of(pointing, tilt, about))
         return circles
 
-    ray = (solver.instrument.camera or IDEAL).centre_ray
     given = solver.instrument.calibration
-    return find_axis(with_a3, given, ray, site, near)
+    return find_axis(with_a3, given, camera.centre_ray, site, near)
 
 
 def circles_of(solver: Solver, pointings: Sequence[Pointing], tilts: Tilts) -> list[Circle | StarposError]:
     """Each pointing's circle, or the error."""
     circles: list[Circle | StarposError] = []
+    camera = solver.instrument.camera or IDEAL
     for pointing in pointings:
         try:
             state, tilt = solver.levelled(pointing, tilts)
-            circles.append(_circle(solver, pointing, tilt, solver.instrument.mounting, state))
+            circles.append(circle_of(pointing, tilt, solver.circumstances(pointing, camera, state)))
         except StarposError as error:
             circles.append(error)
     return circles
-
-
-def _circle(solver: Solver, pointing: Pointing, tilt: Tilt, mounting: Mounting, state: EarthState) -> Circle:
-    camera, clock_s = solver.instrument.camera or IDEAL, solver.clock_stddev_s(pointing)
-    return circle_of(pointing, camera, tilt, mounting, solver.atmosphere, state, clock_s)
 
 
 @dataclass(frozen=True)

@@ -35,7 +35,8 @@ from starpos.night.reading import First, Instruments, Reader, TiltFile, stars_of
 from starpos.night.remarks import Kind, Remark
 from starpos.progress import Progress, quiet
 from starpos.sky import catalogue
-from starpos.zenith.doubts import DeflectionSession
+from starpos.zenith.adjustment import DeflectionSession
+from starpos.zenith.doubts import checked_session
 from starpos.zenith.sighting import ZenithSighting, sighting
 
 if TYPE_CHECKING:
@@ -321,7 +322,7 @@ def deflection(
     Returns
     -------
     DeflectionSession
-        `adjusted` has xi_arcsec, eta_arcsec and covariance_arcsec2 (2, 2)
+        with xi_arcsec, eta_arcsec and covariance_arcsec2 (2, 2)
 
     Raises
     ------
@@ -332,7 +333,7 @@ def deflection(
     --------
     >>> lists = sorted(Path("zenith").glob("stars_*.csv"))
     >>> session = starpos.deflection(lists, "zenith/tilt.csv", (61.2, 24.5, 900.0), "zenith/instrument.yaml")
-    >>> round(session.adjusted.xi_arcsec), round(session.adjusted.eta_arcsec)
+    >>> round(session.xi_arcsec), round(session.eta_arcsec)
     (30, -12)
     """
     known = instrument_file.read(instrument) if isinstance(instrument, (str, Path)) else instrument
@@ -350,4 +351,4 @@ def deflection(
         with suppress(FrameError):
             answer = work(path)
             sightings += [answer] if isinstance(answer, ZenithSighting) else []
-    return DeflectionSession.of(sightings, framed, air, mark)
+    return checked_session(sightings, framed, air, mark)

@@ -12,6 +12,7 @@ from starpos.earth.orientation import earth_state
 from starpos.errors import FixError
 from starpos.fix.circle import circle_of
 from starpos.fix.fix import IDEAL
+from starpos.fix.solver import Solver
 from starpos.instrument.inclinometer import InclinometerErrors
 from starpos.units import ARCSEC
 from starpos_testing.skies.pointings import pointed_night, without_roll
@@ -22,9 +23,9 @@ THREE = (0.0, 120.0, 240.0)
 
 
 def circles(night, **instrument):
-    mounting = replace(night.instrument, **instrument).mounting
+    solver = Solver(replace(night.instrument, clock_stddev_s=0.01, **instrument), (), AIR)
     return [
-        circle_of(without_roll(p), IDEAL, t, mounting, AIR, earth_state(p.mid_unix_s), 0.01)
+        circle_of(without_roll(p), t, solver.circumstances(p, IDEAL, earth_state(p.mid_unix_s)))
         for p, t in zip(night.pointings, night.tilts, strict=True)
     ]
 

@@ -14,6 +14,7 @@ from starpos.earth.place import Place
 from starpos.earth.refraction import Atmosphere
 from starpos.earth.vertical import Deflection
 from starpos.errors import PlaceError
+from starpos.fix.budget import Circumstances
 from starpos.fix.heading import attitude_at_place
 from starpos.fix.solver import placed
 from starpos.fix.star_fit import MatchedStars
@@ -60,8 +61,10 @@ def place(deflection=EXACT, make=Place.by_gravity, **more):
 
 
 def attitude_of(stars, where=None, air=AIR, clock_s=0.0, unix_s=NIGHT, **more):
-    where = where or place()
-    return attitude_at_place(stars, CAMERA, where, MOUNTING, air, earth_state(unix_s), clock_s, **more)
+    about = Circumstances(
+        camera=CAMERA, mounting=MOUNTING, atmosphere=air, earth=earth_state(unix_s), clock_stddev_s=clock_s
+    )
+    return attitude_at_place(stars, where or place(), replace(about, **more))
 
 
 @pytest.mark.parametrize(
@@ -177,9 +180,7 @@ def test_a_wrong_place_turns_the_attitude_by_its_term():
 def test_mount_and_lens_are_in_the_claim():
     stars, _ = ring(200.0, 88.0, 20.0)
     mounting = Instrument(CAMERA.fx, mount_stddev_arcsec=30.0).mounting
-    found = attitude_at_place(
-        stars, CAMERA, place(), mounting, AIR, earth_state(NIGHT), 0.0, axis_stddev=40 * ARCSEC
-    )
+    found = attitude_of(stars, mounting=mounting, axis_stddev=40 * ARCSEC)
     assert np.sqrt(np.diag(found.plumb.angles_covariance)) / ARCSEC == pytest.approx(50.0, rel=0.01)
 
 

@@ -8,9 +8,9 @@ import pytest
 
 from starpos import rotation
 from starpos.earth.orientation import earth_state
-from starpos.fix.fix import Mounting
 from starpos.fix.terms import Origin
 from starpos.instrument.inclinometer import EXACT, InclinometerErrors, Tilt
+from starpos.instrument.mounting import Mounting
 from starpos.units import ARCSEC
 from starpos_testing.skies.fields import UTC, SkyField
 

@@ -11,7 +11,7 @@ from starpos.earth.ellipsoid import EARTH_RADIUS_M, curvature_radii_m, enu_axes,
 from starpos.earth.orientation import earth_state
 from starpos.earth.vertical import Deflection, geodetic
 from starpos.fix.attitude import heading_of
-from starpos.fix.budget import Sensitivity, local_north
+from starpos.fix.budget import level_rows, local_north
 from starpos.units import ARCSEC
 from starpos_testing.skies.fields import UTC, SkyField, random_field
 
@@ -82,7 +82,7 @@ def test_heading_and_attitude_change_with_the_place_as_a_fixed_camera_shows(lati
     """A level that is off by a small angle is another place, from which the camera's attitude is another."""
     phi, step = np.radians(latitude), 1e-6
     axes, link = enu_axes(phi, 0.7), rotation.from_vector(rng.normal(size=3))
-    level = Sensitivity.of(local_north(axes), link).level
+    level = level_rows(local_north(axes), link)
     for k in range(3):
         turn = rotation.from_vector(np.eye(3)[k] * step)
         place = local_north(turn @ axes)

@@ -6,7 +6,7 @@ import pytest
 from sessions import AS_STATED, INSTRUMENT, MARK, SCALE, VACUUM, Worse, drawn
 
 from starpos.errors import FixError
-from starpos.zenith.doubts import DeflectionSession, remarks
+from starpos.zenith.doubts import checked_session, remarks
 
 SESSIONS = 30
 NOISE, DRIFT, LOOSE = Worse(noise=3), Worse(drift=5), Worse(scale=10)
@@ -19,15 +19,14 @@ def adjusted(worse, motion, number=SESSIONS):
         rng = np.random.default_rng([seed, 35])
         session = drawn(rng, frames=8, motion=motion, air=motion / 8, worse=worse)
         try:
-            found = DeflectionSession.of(session.sightings, INSTRUMENT, VACUUM, MARK)
+            a = checked_session(session.sightings, INSTRUMENT, VACUUM, MARK)
         except FixError as e:
             refused.append(str(e))
             continue
-        a = found.adjusted
         error = np.array([a.xi_arcsec - session.xi, a.eta_arcsec - session.eta])
         nees.append(error @ np.linalg.solve(a.covariance_arcsec2, error))
         claimed.append(np.trace(a.covariance_arcsec2) / 2)
-        said = remarks(a, found.sightings, len(session.sightings), SCALE)
+        said = remarks(a, len(session.sightings), SCALE)
         told.append(next((line for line in said if "the tiltmeter shows" in line), ""))
     return np.array(nees), np.array(claimed), told, refused
 

@@ -9,11 +9,13 @@ import numpy as np
 from starpos import rotation
 from starpos.earth.orientation import EarthState, earth_state, station_velocity
 from starpos.earth.refraction import Atmosphere
-from starpos.fix.fix import Fix, Mounting, solve_fix
+from starpos.fix.budget import Circumstances
+from starpos.fix.fix import Fix, solve_fix
 from starpos.fix.star_fit import MatchedStars
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import Tilt
 from starpos.instrument.instrument import TOP_OF_FRAME
+from starpos.instrument.mounting import Mounting
 from starpos.sky.site import Site, camera_to_enu
 from starpos.units import ARCSEC
 
@@ -91,15 +93,15 @@ class SkyField:
         n = len(xy)
         covariance = given.pop("covariance_px2", np.eye(2)[None].repeat(n, 0) * 0.05**2)
         stars = MatchedStars(xy, covariance, places, given.pop("place_sigma", np.full(n, 1e-9)))
-        parts: dict[str, Any] = {
-            "camera": self.camera,
-            "tilt": self.tilt(),
-            "mounting": self.mounting(),
-            "atmosphere": self.air,
-            "earth": state or earth_state(self.utc),
-            "clock_stddev_s": 0.0,
-        }
-        return solve_fix(stars, **parts | given)
+        tilt = given.pop("tilt", None) or self.tilt()
+        about = Circumstances(
+            camera=self.camera,
+            mounting=self.mounting(),
+            atmosphere=self.air,
+            earth=state or earth_state(self.utc),
+            clock_stddev_s=0.0,
+        )
+        return solve_fix(stars, tilt, replace(about, **given))
 
 
 def random_field(rng, **fixed) -> SkyField:
