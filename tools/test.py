@@ -392,6 +392,8 @@ def main(args: list[str]) -> int:
     if args == ["--record"]:
         record()
         return 0
+    # hundreds of processes start here, each of which would compile all modules anew
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
     which = {"--docs", "--lint", "--quick", "--ubuntu", "--both"} & set(args)
     pytest_args = [a for a in args if a not in which]
     tests = {} if which & {"--docs", "--lint", "--quick", "--ubuntu"} else newest(pytest_args)
