@@ -14,9 +14,9 @@ STEP, SHORTEST_S = 8.0, 1e-5
 
 
 def next_exposure_s(frame: Frame, disc: Disc | None, longest_s: float) -> float | None:
-    """The exposure in s that suits what a frame shows; None to leave it, or where the frame does not tell its own.
+    """The exposure in s that suits what a frame shows; None to leave it, or if the frame does not state its own.
 
-    disc: what looks like the Sun on it.  longest_s: that of the night, which is not exceeded.
+    disc: what looks like the Sun on it.  longest_s: the night's exposure, which is not exceeded.
     """
     if not frame.exposure_s:
         return None

@@ -12,7 +12,7 @@ from starpos.frozen import at_once
 
 # The Sun has moved on from this many sigma of two glows; what has moved by less than this share of its way stands still.
 MOVED_SIGMAS, STILL = 8.0, 0.5
-# Glows that later ones are compared with: as far apart in time as this (s), so many.
+# Minimum interval (s) between the glows that later ones are compared with, and their maximum number.
 APART_S, KEPT = 60.0, 60
 
 
