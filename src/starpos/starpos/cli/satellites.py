@@ -65,8 +65,9 @@ def run(args: argparse.Namespace) -> int:
     usable, about = chosen(_orbits(args.elements), begin, newer=args.newer_elements)
     for sentence in about:
         console.complain("satellites", sentence)
+    prior = _prior(args, begin)
     try:
-        fix = locate(trails, usable, _prior(args, begin))
+        fix = locate(trails, usable, prior)
     except SatelliteError as e:
         return _refused(args, str(e))
     for k, trail in enumerate(trails):
