@@ -59,6 +59,7 @@ from starpos.instrument.instrument import OWN_LEVEL, ByGravity, Instrument
 from starpos.instrument.tilt_log import NO_TILTS, Tilts
 from starpos.progress import Progress, quiet
 from starpos.sky import deeper
+from starpos.sky.bodies import ERFA, Ephemeris
 from starpos.sky.catalogue import Catalogue
 
 # A fisheye's lower stars are not used: no model describes refraction near the horizon.
@@ -113,6 +114,7 @@ class Solver:
     Other ways to identify a frame are in `starpos.fix.searching`.
 
     catalogue: or the deeper one in its stead, for a field that needs it.
+    ephemeris: of the Sun, the Moon and planets.
 
     Examples
     --------
@@ -127,6 +129,7 @@ class Solver:
     atmosphere: Atmosphere = field(default_factory=lambda: Atmosphere.measured(None, None))
     min_stars: int = 5
     progress: Progress = quiet
+    ephemeris: Ephemeris = ERFA
 
     def prepare(self, width: int, height: int, origin_px: tuple[float, float] | None = None) -> str:
         """Load the tables for frames of this size in px, or build them; raises StarposError.

@@ -100,13 +100,13 @@ def by_sun(solver: Solver, stars: Stars, disc: Disc, tilts: Tilts | None, places
         )
         if not disc.sharp:
             sigma = float(np.linalg.norm(seen.own)) / math.sqrt(2)
-            glow = Glow(state.utc_unix_s, seen.ray, body_at(SUN, state).itrs, sigma)
+            glow = Glow(state.utc_unix_s, seen.ray, body_at(SUN, state, solver.ephemeris).itrs, sigma)
         if places is None:
             return replace(_on_circle(solver, stars, disc, seen, tilt, state, stamp_s), glow=glow)
         place, wrong = places.at(state.utc_unix_s), None
         for name in (SUN, MOON) if disc.sharp else (SUN,):
             try:
-                body = body_at(name, state)
+                body = body_at(name, state, solver.ephemeris)
                 _check_size(disc, seen, body, camera, stars.place)
                 found = _attitude(solver, stars, disc, seen, body, tilt, state, place, stamp_s)
             except PlaceError as error:
@@ -145,7 +145,7 @@ def _on_circle(
     solver: Solver, stars: Stars, disc: Disc, seen: _Seen, tilt: Tilt, state: EarthState, stamp_s: float
 ) -> Solution:
     """The Sun's circle of equal altitude."""
-    body = body_at(SUN, state)
+    body = body_at(SUN, state, solver.ephemeris)
     camera = solver.instrument.camera_for(stars.width, stars.height, stars.origin_px)
     _check_size(disc, seen, body, camera, stars.place)
     up = solver.instrument.mounting.level(tilt).camera[2]
