@@ -26,7 +26,7 @@ from starpos.files import write_whole
 from starpos.fix.checks import FIND_TURN, at_another_lean, may_turn
 from starpos.fix.searching import Sight, of_one_camera
 from starpos.fix.solver import Solver
-from starpos.frames.frame import Stars
+from starpos.frames.frame import Frame, Stars
 from starpos.frames.reading import why_no_time
 from starpos.frames.tables import TILTS, Pointing, read_pointings
 from starpos.identification import Identification
@@ -43,7 +43,7 @@ from starpos.night.opening import frames_in
 from starpos.night.reading import NO_CAMERA, First, Instruments, Reader
 from starpos.night.remarks import WORTH_SAVING_ARCSEC, of_inclinometer, of_left_out
 from starpos.night.together import axis_of, circles_of
-from starpos.night.watching import kept, night_poses
+from starpos.night.watching import Answer, kept, night_poses, sky_mag
 from starpos.night.work import Solving
 from starpos.sky import catalogue
 from starpos.units import ARCSEC
@@ -281,23 +281,18 @@ def _watch(args: argparse.Namespace) -> int:
     """Print how a fixed camera kept its pose, night by night; returns the exit status."""
     if args.frames:
         raise FrameError("--watch names the folder of the nights: leave out the frames")
-    folder = Path(args.watch)
-    try:
-        folders = [folder, *sorted(p for p in folder.iterdir() if p.is_dir())]
-    except OSError as e:
-        raise FrameError(f"{folder}: the folder cannot be read ({e.strerror})") from None
-    args.frames = []
-    for each in folders:
-        # a folder of folders has no frames of its own
-        with suppress(FrameError):
-            args.frames += map(str, frames_in(each))
-    if not args.frames:
-        raise FrameError(f"{folder}: no frames in it, nor in its folders")
+    args.frames = _frames_below(Path(args.watch))
     if args.page is not None:
         overwriting.check(args, Written("--page", args.page, watch_output.check_page))
     site = _site(args)
-    seen = inputs.seen_at("calibrate", args, site)
-    answers = [(sight.solution, camera.fx) for _, sight, camera in seen]
+    answers = [
+        Answer(
+            solution=sight.solution,
+            focal_px=camera.fx,
+            sky_mag=sky_mag(item, sight.stars, sight.solution, camera) if isinstance(item, Frame) else np.nan,
+        )
+        for item, sight, camera in inputs.seen_at("calibrate", args, site)
+    ]
     nights = kept(night_poses(answers, site.longitude))
     for night in nights:
         values = watch_output.values_of(night)
@@ -312,14 +307,32 @@ def _watch(args: argparse.Namespace) -> int:
     return NOTHING if not nights or any(n.alarm for n in nights) else 0
 
 
+def _frames_below(folder: Path) -> list[str]:
+    """The frames of a folder, or of the nights that are folders in it; raises FrameError."""
+    try:
+        folders = [folder, *sorted(p for p in folder.iterdir() if p.is_dir())]
+    except OSError as e:
+        raise FrameError(f"{folder}: the folder cannot be read ({e.strerror})") from None
+    found: list[str] = []
+    for each in folders:
+        # a folder of folders has no frames of its own
+        with suppress(FrameError):
+            found += map(str, frames_in(each))
+    if not found:
+        raise FrameError(f"{folder}: no frames in it, nor in its folders")
+    return found
+
+
 def _open_night(args: argparse.Namespace) -> None:
-    """Put a folder's frames and its tilt.csv in the place of the folder; raises FrameError."""
+    """Put the frames of a folder, or of the nights in it, and its tilt.csv in its place; raises FrameError."""
     folders = [path for path in args.frames if Path(path).is_dir()]
     if not folders:
         return
     if len(args.frames) > 1:
-        raise FrameError(f"{folders[0]}: calibrate takes one night: give one folder, or frames")
-    args.frames = list(map(str, frames_in(Path(folders[0]))))
+        raise FrameError(
+            f"{folders[0]}: calibrate takes one night, or a folder of nights: give one folder, or frames"
+        )
+    args.frames = _frames_below(Path(folders[0]))
     tilts = Path(folders[0]) / TILTS
     if args.tilt is None and not args.fixed and tilts.is_file():
         args.tilt = str(tilts)
