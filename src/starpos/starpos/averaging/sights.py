@@ -24,7 +24,7 @@ from starpos.errors import FixError, FrameError, StarposError
 from starpos.files import bytes_of, open_regular
 from starpos.fix.circle import Circle
 from starpos.fix.terms import ALWAYS, ErrorTerm
-from starpos.sky.bodies import BODIES, ERFA, Ephemeris, body_at
+from starpos.sky.bodies import BODIES, ERFA, SolarSystem, body_at
 from starpos.sky.catalogue import Catalogue
 from starpos.units import unix_of
 
@@ -141,7 +141,7 @@ def circle_of_sight(
     catalogue: Catalogue,
     atmosphere: Atmosphere,
     clock_stddev_s: float,
-    ephemeris: Ephemeris = ERFA,
+    ephemeris: SolarSystem = ERFA,
 ) -> Circle:
     """The circle of equal altitude of a sight; StarposError if its body or its altitude cannot be."""
     state, apparent = earth_state(sight.utc_unix_s), sight.apparent

@@ -37,7 +37,9 @@ LENS_SHARE = 1e-3
 # A limb is the body's if its radius is to this share, and px.  A glow is at most so wide, rad.
 SIZE_SHARE, SIZE_PX, WIDEST_GLOW = 0.06, 1.0, math.radians(10.0)
 # A body's altitude by the level differs from the ephemeris' by at most this; a glow may be a lamp as well.
-LIMB_SIGMAS, GLOW_SIGMAS = 5.3, 3.5
+LIMB_SIGMAS, GLOW_SIGMAS = 5.3, 3.0
+# a lens in which the Sun's radius is larger, px, shows its limb: there a glow is a lamp or a cloud
+RESOLVED_PX = 6.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,6 +131,11 @@ def by_sun(solver: Solver, stars: Stars, disc: Disc, tilts: Tilts | None, places
 
 def _check_size(disc: Disc, seen: _Seen, body: Body, camera: Camera, place: str) -> None:
     """Raise PlaceError if a disc is not as wide as the body."""
+    if not disc.sharp and body.radius * disc.radius_px > RESOLVED_PX * seen.radius:
+        raise PlaceError(
+            f"{place}: a bright spot without a limb, in a lens that shows the Sun's: it is a lamp or a cloud, or the Sun "
+            "without a filter, behind which alone such a lens may look at it"
+        )
     if disc.sharp:
         off = abs(seen.radius / body.radius - 1) > SIZE_SHARE + SIZE_PX / disc.radius_px
     else:

@@ -35,7 +35,7 @@ from starpos.night.reading import First, Instruments, Reader, TiltFile, stars_of
 from starpos.night.remarks import Kind, Remark
 from starpos.progress import Progress, quiet
 from starpos.sky import catalogue
-from starpos.sky.bodies import ERFA, Ephemeris
+from starpos.sky.bodies import ERFA, SolarSystem
 from starpos.zenith.adjustment import DeflectionSession
 from starpos.zenith.doubts import checked_session
 from starpos.zenith.sighting import ZenithSighting, sighting
@@ -87,7 +87,7 @@ class Solving:
     instruments: Instruments
     _: KW_ONLY
     atmosphere: Atmosphere = field(default_factory=lambda: Atmosphere.measured(None, None))
-    ephemeris: Ephemeris = ERFA
+    ephemeris: SolarSystem = ERFA
     tilts: Tilts | None = None
     places: Places | None = None
     search_s: float | None = None

@@ -68,7 +68,7 @@ class Body:
         return rotation.normalised(from_there + station_velocity(zenith))
 
 
-class Ephemeris(Protocol):
+class SolarSystem(Protocol):
     """Barycentric places of the bodies and of the Earth, (3,) au along the axes of ICRS; days: of TT after J2000."""
 
     def body_au(self, name: str, days: float) -> np.ndarray: ...
@@ -121,7 +121,7 @@ HOW_TO_READ = "install jplephem (pip install 'starpos[ephemeris]')"
 
 
 @dataclass(frozen=True)
-class Kernel:
+class JplKernel:
     """A JPL ephemeris in SPICE's format (SPK, .bsp); InstrumentError if it cannot be read, or lacks a body."""
 
     path: str
@@ -148,7 +148,7 @@ class Kernel:
             raise InstrumentError(f"{self.path}: it lacks {', '.join(lacking)}: give a file like de440s.bsp")
 
     def __reduce__(self) -> tuple:
-        return Kernel, (self.path,)
+        return JplKernel, (self.path,)
 
     def body_au(self, name: str, days: float) -> np.ndarray:
         return self._place_au(NAIF[name], days)
@@ -172,7 +172,7 @@ class Kernel:
         return place_km * (1000 / erfa.DAU)
 
 
-def body_at(name: str, state: EarthState, ephemeris: Ephemeris = ERFA) -> Body:
+def body_at(name: str, state: EarthState, ephemeris: SolarSystem = ERFA) -> Body:
     """The body of one of the names in BODIES at the state's time."""
     days, delay = (state.year - 2000.0) * erfa.DJY, 0.0
     observer = ephemeris.earth_au(days)

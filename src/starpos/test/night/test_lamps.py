@@ -42,7 +42,7 @@ SOLVER = Solver(INSTRUMENT, load_catalogue(), AIR)
 
 
 def answers(seconds, lamp: bool):
-    """Those to frames of an upright fisheye at rest, around noon, when the Sun keeps its altitude."""
+    """Make the answers to frames of an upright fisheye at rest, around noon, when the Sun keeps its altitude."""
     tilt, made = Tilt(0.0, 0.0, np.eye(2) * 1e-10, utc_unix_s=NOON), []
     for s in seconds:
         seen_s = NOON + (seconds[0] if lamp else s)

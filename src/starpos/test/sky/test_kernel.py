@@ -14,7 +14,7 @@ from jplephem.daf import DAF
 
 from starpos.earth.orientation import earth_state
 from starpos.errors import InstrumentError, TimeError
-from starpos.sky.bodies import EARTH, ERFA, MOON, NAIF, Kernel, body_at
+from starpos.sky.bodies import EARTH, ERFA, MOON, NAIF, JplKernel, body_at
 from starpos.units import unix_of
 
 WHEN = unix_of("2025-06-01T09:00:00")
@@ -48,7 +48,7 @@ def write_kernel(path, days=DAYS, without=()):
 
 
 def test_bodies_stand_where_the_kernel_has_them(tmp_path):
-    kernel, state = Kernel(str(write_kernel(tmp_path / "drawn.bsp"))), earth_state(WHEN)
+    kernel, state = JplKernel(str(write_kernel(tmp_path / "drawn.bsp"))), earth_state(WHEN)
     for name in NAIF:
         by_kernel, by_erfa = body_at(name, state, kernel), body_at(name, state)
         # at rest for the time of the light
@@ -64,10 +64,10 @@ def test_what_is_no_kernel_is_refused_in_a_sentence(tmp_path):
     broken = tmp_path / "broken.bsp"
     broken.write_bytes(b"no ephemeris" * 500)
     with pytest.raises(InstrumentError, match="no ephemeris in SPICE's format"):
-        Kernel(str(broken))
+        JplKernel(str(broken))
     with pytest.raises(InstrumentError, match="No such file"):
-        Kernel(str(tmp_path / "none.bsp"))
+        JplKernel(str(tmp_path / "none.bsp"))
     with pytest.raises(InstrumentError, match="it lacks venus, the Earth"):
-        Kernel(str(write_kernel(tmp_path / "less.bsp", without=(NAIF["venus"], EARTH))))
+        JplKernel(str(write_kernel(tmp_path / "less.bsp", without=(NAIF["venus"], EARTH))))
     with pytest.raises(TimeError, match="does not hold this date"):
-        body_at(MOON, earth_state(WHEN + 40 * 86400), Kernel(str(write_kernel(tmp_path / "old.bsp"))))
+        body_at(MOON, earth_state(WHEN + 40 * 86400), JplKernel(str(write_kernel(tmp_path / "old.bsp"))))
