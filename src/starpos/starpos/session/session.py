@@ -266,10 +266,6 @@ class SolverSession:
         self._advance(now)
         return self._work(now) if now.played else []
 
-    def begin(self) -> None:
-        """Note that recorded messages begin: an earlier publisher of tilts was another player, no second inclinometer."""
-        self.tilts.forget_publishers()
-
     def end(self, now: Now) -> list[Output]:
         """Answer the frames that wait, because nothing comes any more; again after a job."""
         self._advance(now)
@@ -282,8 +278,9 @@ class SolverSession:
         if was_s is None or now.unix_s is None:
             return
         if now.unix_s < was_s - STEP_S:
-            # The clock was set back: no tilt may be from the future.
+            # The clock was set back: no tilt may be from the future, and another player is no second inclinometer.
             self.tilts.forget_after(now.unix_s)
+            self.tilts.forget_publishers()
         if now.unix_s > was_s:
             for message in self.tilts.pop_early():
                 with refusing(self._heard, "tilt"):
