@@ -345,7 +345,7 @@ def _run(args: argparse.Namespace) -> int:
     by_gravity = not needs_no_tilt and any(night.tilt is None for night in nights)
     read = reader_of(args, by_gravity)
     statuses = [_refused(why, given) for why in given if not isinstance(why, NightFolder)]
-    with inputs.workers_of(args, sum(len(night.frames) for night in nights)) as workers:
+    with inputs.workers_of(args, [path for night in nights for path in night.frames]) as workers:
         plans = []
         abouts = workers.map((First(read, by_gravity), night.frames) for night in nights)
         for night, about in zip(nights, abouts, strict=True):
