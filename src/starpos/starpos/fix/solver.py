@@ -262,13 +262,16 @@ class Solver:
         state = earth_state(frame.mid_unix_s)
         if self.instrument.vertical is not None:
             tilts = OWN_LEVEL
-        elif isinstance(tilts, ByGravity):
-            tilts = tilts.of(frame, self.instrument)
+        own = tilts if isinstance(tilts, ByGravity) else None
+        if own is not None:
+            tilts = own.of(frame, self.instrument)
         # the width of a uniform distribution with this standard deviation, as rounding causes
         spread_s = math.sqrt(12) * frame.stamp_stddev_s
         tilt = tilts.average(frame.mid_unix_s, frame.exposure_s or 0.0, spread_s)
         if tilt.either_way:
             tilt = self._upright(tilt, frame)
+        if own is not None:
+            own.check_held(frame, tilt)
         self.instrument.calibration.check_age(frame.mid_unix_s)
         self.instrument.inclinometer.check_live(tilt)
         self.instrument.inclinometer.check_range(tilt)
@@ -361,7 +364,7 @@ class Solver:
             stamp_stddev_s=frame.stamp_stddev_s,
             # a pointing is of one time
             shutter=self.shutter(frame) if isinstance(frame, Stars) else GLOBAL_SHUTTER,
-            axis_stddev=self.instrument.axis_stddev_rad,
+            axis_stddev=math.hypot(self.instrument.axis_stddev_rad, self.instrument.lens_stddev_rad),
         )
 
     def clock_stddev_s(self, stars: Stars | Pointing) -> float:
