@@ -248,7 +248,7 @@ def _numbers(stored: np.ndarray, found: re.Match[str]) -> np.ndarray:
     bits = np.uint64(int(found[3]))
     values = stored >> np.uint64(int(found[5] or 0)) & np.uint64((1 << int(bits)) - 1)
     half = np.uint64(1) << bits - np.uint64(1)
-    # two's complement of any number of bits as that of 64
+    # two's complement, extended from any number of bits to 64
     return ((values ^ half) - half).view(np.int64) if found[2] == "s" else values
 
 
