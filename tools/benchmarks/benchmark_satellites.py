@@ -111,7 +111,7 @@ def cost(options: argparse.Namespace) -> int:
 
 def ages(options: argparse.Namespace) -> int:
     print(
-        "| age (days) | error (m a component, rms) | claim (m, median) | beyond 4 sigma | trails named (%) | refused |"
+        "| age (days) | error (m a component, rms) | claim (m, rms) | beyond 4 sigma | trails named (%) | refused |"
     )
     print("| --- | --- | --- | --- | --- | --- |")
     for age in AGES:
@@ -134,10 +134,9 @@ def ages(options: argparse.Namespace) -> int:
             claims.append(math.sqrt(np.trace(fix.covariance[:2, :2]) / 2))
             far += bool(off @ np.linalg.solve(fix.covariance[:2, :2], off) > 16)
             named.append(np.mean([orbit is not None for orbit in fix.named]))
-        rms = math.sqrt(np.mean(np.square(errors))) if errors else math.nan
+        rms, claim = (math.sqrt(np.mean(np.square(x))) if x else math.nan for x in (errors, claims))
         print(
-            f"| {age:g} | {rms:.0f} | {np.median(claims or [math.nan]):.0f} | {far} | "
-            f"{100 * np.mean(named or [0]):.0f} | {refused} |",
+            f"| {age:g} | {rms:.0f} | {claim:.0f} | {far} | {100 * np.mean(named or [0]):.0f} | {refused} |",
             flush=True,
         )
     return 0

@@ -284,8 +284,13 @@ class SolverSession:
                     self.tilts.keep_in_time(message, now, self._settings.tilt_stddev_rad)
 
     def _work(self, now: Now) -> list[Output]:
+        """Answer what can be answered, and have the trails of these frames looked at."""
+        made = self._answers(now)
+        return made if self.satellites is None else made + self.satellites.fetch()
+
+    def _answers(self, now: Now) -> list[Output]:
         """Answer the first frames that have everything they need: of recorded ones all, live one at a time."""
-        made = [] if self.satellites is None else self.satellites.fetch()
+        made: list[Output] = []
         self.more = False
         # In recorded data a job is done when it was begun, however long it takes.
         while not (now.played and self.busy) and self._first_ready(now):

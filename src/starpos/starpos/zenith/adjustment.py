@@ -138,7 +138,7 @@ class DeflectionSession:
 
     sightings (N,): in order of time.
     covariance_arcsec2 (2, 2): of xi, eta, the sum over sources of error, by_source (2, 2).
-    a3 (3, 3): C into S, with the tiltmeter's zero.  turn_stddev_rad: of its turn about the plumb line.
+    a3 (3, 3): C into S, with the tiltmeter's zero.
     faces (N,): number of each frame's face.  frame_arcsec (N, 2): xi, eta of each frame minus the session's.
     frame_stddev_arcsec (N, 2): what these should scatter by.
     catalogue_factor: size of the catalogue's errors over what it states, by the session's own stars.
@@ -162,7 +162,6 @@ class DeflectionSession:
     covariance_arcsec2: np.ndarray
     by_source: dict[str, np.ndarray]
     a3: np.ndarray
-    turn_stddev_rad: float
     faces: np.ndarray
     frame_arcsec: np.ndarray
     frame_stddev_arcsec: np.ndarray
@@ -498,8 +497,6 @@ def _adjusted(session: _Session, solved: _Solved) -> DeflectionSession:
     n = len(sightings)
     own = own.reshape(n, 2, n, 2)[np.arange(n), :, np.arange(n)]
     per_frame = np.einsum("nab,nbc,ndc->nad", back, own, back)
-    north, east = estimate.lean
-    up = estimate.a3 @ [east, north, 1.0]
     xi_eta = estimate.deflection(mark.latitude) / ARCSEC
     leftover = _leftover(solved, mark)
     return DeflectionSession(
@@ -509,7 +506,6 @@ def _adjusted(session: _Session, solved: _Solved) -> DeflectionSession:
         covariance_arcsec2=whole,
         by_source=by_source,
         a3=estimate.a3,
-        turn_stddev_rad=float(np.sqrt(up @ fit.covariance[2:, 2:] @ up)),
         faces=faces,
         frame_arcsec=np.einsum("nab,nb->na", back, left) / ARCSEC,
         frame_stddev_arcsec=np.sqrt(np.diagonal(per_frame, axis1=1, axis2=2)) / ARCSEC,
