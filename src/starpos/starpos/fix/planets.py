@@ -12,7 +12,7 @@ from starpos.sky.bodies import body_at
 
 # of a planet from its predicted place: px, and sigma of the ephemeris
 NEAR_PX, NEAR_SIGMAS = 6.0, 3.0
-# Those that are among the brightest lights of any frame: so many detections of it are looked at.
+# Planets that outshine most stars, and the number of a frame's brightest detections that are looked at.
 BRIGHTEST = 12
 BRIGHT = "mercury", "venus", "mars", "jupiter", "saturn"
 
