@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from starpos.session.driver import JobsInTurn, Level
-from starpos.session.satellites import TEACHES, Located, LiveSatellites
+from starpos.session.satellites import TEACHES, LiveSatellites, Located
 from starpos.session.settings import Settings
 from starpos_testing.skies import orbits
 
