@@ -118,7 +118,7 @@ def _look(args: argparse.Namespace, frames: list[str], seen: SeenTrails) -> None
     """Add the frames and their trails, numbered on; complains of frames without, and of trails that are left out."""
     number = 1 + max((trail.track for trail in seen.trails), default=-1)
     complaints, read = console.FrameComplaints("satellites"), inputs.reader_of(args)
-    with inputs.workers_of(args, len(frames)) as workers:
+    with inputs.workers_of(args, frames) as workers:
         solving = inputs.identifying("satellites", args, frames, read, workers, SEARCH_S)
         work = OnFile(read, TrailSighted(solving))
         answers = inputs.watched(workers.map((work, path) for path in frames), len(frames))

@@ -12,6 +12,7 @@ import numpy as np
 from starpos.errors import FixError, PlaceError, StarposError, TiltError, TiltRangeError, TimeError
 from starpos.fix.circle import Circle
 from starpos.fix.fix import Fix
+from starpos.fix.glows import Glow, Glows
 from starpos.fix.heading import AttitudeAtPlace
 from starpos.frames.frame import Stars
 from starpos.frames.tables import Pointing
@@ -24,7 +25,7 @@ from starpos.identification.two_skies import two_skies
 from starpos.instrument.camera import PLUMB_BOB, Camera
 from starpos.instrument.inclinometer import Tilt
 from starpos.sky.catalogue import NamedStars, named_stars
-from starpos.units import ARCSEC
+from starpos.units import ARCSEC, utc_text
 
 # Names in `Solution.warnings`. TWO_SKIES: unidentified bright stars form a sky of their own. UNEXPLAINED: most bright
 # detections are not identified, and bright stars that should be there are missing.
@@ -94,6 +95,7 @@ class Solution:
     remark : a warning on an identified frame; '' without one
     bodies : names of the Sun, the Moon and planets that it rests on
     circle : of equal altitude, by the Sun where no place is known; None without
+    glow : the saturated spot that was taken for the Sun, or was not; None without
 
     Examples
     --------
@@ -125,6 +127,7 @@ class Solution:
     remark: str = ""
     bodies: tuple[str, ...] = ()
     circle: Circle | None = None
+    glow: Glow | None = None
 
     @classmethod
     def of(
@@ -156,6 +159,22 @@ class Solution:
     def unreadable(cls, source: str, error: StarposError) -> "Solution":
         """A solution of a file that holds no frame."""
         return cls(Status.BAD_INPUT, str(error), source=source, utc_unix_s=None, stars_detected=0)
+
+    def beside(self, glows: Glows) -> "Solution":
+        """The solution after the glows before it: refused if its own is a lamp's, which stands still."""
+        if self.glow is None or (since := glows.still_since(self.glow)) is None:
+            return self
+        return self.as_lamp(since)
+
+    def as_lamp(self, since_unix_s: float) -> "Solution":
+        """The solution of a frame whose glow has stood still since then, or until then, while the Sun moved on."""
+        if self.status is not Status.OK or not self.bodies:
+            return self
+        message = (
+            f"{self.source}: its bright spot stands where it stood at {utc_text(since_unix_s)}, and the Sun has moved on "
+            "in between: it is a lamp or a reflection, or the camera follows the Sun"
+        )
+        return replace(self, status=Status.POOR_FIT, message=message, at_place=None, circle=None, bodies=())
 
     def among(self, stars: Stars, rows: np.ndarray) -> "Solution":
         """The solution of `stars` that is found by the stars in `rows` (n,) alone."""

@@ -19,11 +19,11 @@ from datetime import datetime, timezone
 
 from starpos.errors import FrameError, TimeError
 from starpos.frames.exposure import MAX_EXPOSURE_S, UNKNOWN_LATENCY_S, Exposure
-from starpos.frames.gravity import read_gravity
+from starpos.frames.gravity import TELEPHONES, read_gravity, read_upper_edge
 
 # Canon and Nikon allow their clocks an error of a minute a month. A telephone's is set by its network, a DJI's by GPS.
 UNTENDED_STDDEV_S, NETWORK_STDDEV_S = 60.0, 1.0
-NETWORKED = re.compile(r"apple|dji|google|samsung|xiaomi|huawei|oneplus|motorola|oppo|vivo", re.IGNORECASE)
+NETWORKED = re.compile(f"dji|{TELEPHONES.pattern}", re.IGNORECASE)
 # UTC-12 to UTC+14 are in use.
 ZONES_H = 14.0
 # EXIF began then: a clock that shows an earlier year was never set.
@@ -284,6 +284,7 @@ def read_exposure(data: bytes, place: str, clock: CameraClock | None, shape: tup
         source=place,
         gravity=gravity,
         unlevelled=unlevelled,
+        upper_edge=read_upper_edge(data, exif.width, exif.height),
         gps_deg=exif.gps_deg,
         exposure_s=exif.exposure_s,
         rough_focal_px=exif.rough_focal_px,

@@ -2,6 +2,9 @@
 """The command: a place that joins, what a night shows, and calls that are refused."""
 
 import json
+from functools import lru_cache
+from importlib.util import find_spec
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -30,7 +33,19 @@ def told(capsys, *words):
     """Exit status, JSON objects, and complaints of a call."""
     status = main([*map(str, words), "--json"])
     out, err = capsys.readouterr()
-    return status, [json.loads(line) for line in out.splitlines()], err
+    answers = [json.loads(line) for line in out.splitlines()]
+    for answer in answers if find_spec("fastjsonschema") else ():
+        promised()(answer)
+    return status, answers, err
+
+
+@lru_cache(maxsize=1)
+def promised():
+    """A validator that refuses any object outside the schema."""
+    import fastjsonschema
+
+    schema = Path(__file__).resolve().parents[4] / "docs" / "reference" / "starpos.schema.json"
+    return fastjsonschema.compile(json.loads(schema.read_text()))
 
 
 def call(folder, name, *more):
