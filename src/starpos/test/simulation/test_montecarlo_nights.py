@@ -34,10 +34,10 @@ def outcomes(catalogue):
 @pytest.mark.montecarlo
 @pytest.mark.parametrize("kind", KINDS)
 def test_claims_are_true(kind, outcomes):
-    """The normalised errors squared of 12 nights scatter by 0.6 about their 2: 4.3 is four sigma up.
+    """The normalised errors squared of 8 nights scatter by 0.7 about their 2: 4.8 is four sigma up.
 
-    These twelve come to 2.2 calibrated and 1.7 turned; without the drift of the days it is 58. Without the noise of the
-    tilts no night is solved at all, and errors claimed twice as large as they are would leave 0.5.
+    These eight come to 2.5 calibrated and 1.7 turned; of twelve without the drift of the days it was 58. Without the
+    noise of the tilts no night is solved at all, and errors claimed twice as large as they are would leave 0.5.
     """
     assert [o.trouble for o in outcomes[kind]] == [""] * 8
     assert {o.kind for o in outcomes[kind]} == {kind}
