@@ -14,6 +14,7 @@ from starpos.fix.circle import Circle
 from starpos.fix.fix import Fix
 from starpos.fix.glows import Glow, Glows
 from starpos.fix.heading import AttitudeAtPlace
+from starpos.fix.planets import planets_among
 from starpos.frames.frame import Stars
 from starpos.frames.tables import Pointing
 from starpos.frozen import at_once
@@ -93,6 +94,7 @@ class Solution:
     negative : whether the stars are dark on a bright sky
     hint : helps to identify the next frame
     remark : a warning on an identified frame; '' without one
+    planets : names of those among the stars, and their rows there
     bodies : names of the Sun, the Moon and planets that it rests on
     circle : of equal altitude, by the Sun where no place is known; None without
     glow : the saturated spot that was taken for the Sun, or was not; None without
@@ -125,6 +127,7 @@ class Solution:
     found: Identification | None = None
     negative: bool = False
     remark: str = ""
+    planets: tuple[tuple[str, int], ...] = ()
     bodies: tuple[str, ...] = ()
     circle: Circle | None = None
     glow: Glow | None = None
@@ -180,7 +183,8 @@ class Solution:
         """The solution of `stars` that is found by the stars in `rows` (n,) alone."""
         star = None if self.star is None else rows[self.star]
         found = self.found and self.found.but(star=rows[self.found.star])
-        return replace(self, star=star, found=found, stars_detected=len(stars))
+        planets = tuple((name, int(rows[row])) for name, row in self.planets)
+        return replace(self, star=star, found=found, planets=planets, stars_detected=len(stars))
 
     def __repr__(self) -> str:
         found = self.fix.in_degrees if self.fix else self.message
@@ -231,7 +235,8 @@ def solution_of(
     field: the stars as they were searched.
     begin_s: when their search began, by time.perf_counter.
     """
-    warnings, explained = suspicions(stars, field, sky, found)
+    planets = planets_among(stars, found, camera)
+    warnings, explained = suspicions(stars, field, sky, found, tuple(row for _, row in planets))
     return Solution(
         Status.OK,
         "identified",
@@ -244,23 +249,31 @@ def solution_of(
         pointing=pointing_of(found, sky, camera, found.spread_px(stars.x, stars.y)),
         warnings=warnings,
         explained=explained,
+        planets=planets,
         found=found,
         identify_s=time.perf_counter() - begin_s,
     )
 
 
 def suspicions(
-    stars: Stars, field: FrameStars | fisheye.WideField, sky: Sky, found: Identification
+    stars: Stars,
+    field: FrameStars | fisheye.WideField,
+    sky: Sky,
+    found: Identification,
+    planets: tuple[int, ...] = (),
 ) -> tuple[tuple[str, ...], Explained]:
     """Sorted names of suspicions about the stars' identification, and how much it explains.
 
-    For a fisheye, the part with most identified stars is judged.
+    For a fisheye, the part with most identified stars is judged.  planets: rows of the stars that are no false ones.
     """
-    flux = stars.flux
+    flux, rows = stars.flux, None
     if isinstance(field, fisheye.WideField):
         part, found = fisheye.part_of(field, sky, found)
-        field, flux = part.field, flux[part.row]
+        field, flux, rows = part.field, flux[part.row], part.row
     explained = explained_by(found, field)
+    if planets:
+        bright = np.arange(explained.bright) if rows is None else rows[: explained.bright]
+        explained = replace(explained, bright=explained.bright - int(np.isin(bright, planets).sum()))
     names = (TWO_SKIES,) * two_skies(field, flux, sky, found, explained) + (UNEXPLAINED,) * (
         not explained.enough
     )
