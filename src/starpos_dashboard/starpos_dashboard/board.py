@@ -185,7 +185,7 @@ SUN_WAY_S, SUN_STEP_S = 12 * 3600, 1200
 
 @lru_cache(maxsize=1)
 def sun_way(latitude_deg: float, longitude_deg: float, unix_s: float) -> list[list[float]] | None:
-    """Azimuth and altitude [deg] of the Sun half a day before a time to half a day after; None without tables of the date."""
+    """Azimuth and altitude [deg] of the Sun from half a day before a time to half a day after; None without tables."""
     place = Place.on_ellipsoid(latitude_deg, longitude_deg)
     way = []
     try:
