@@ -28,7 +28,7 @@ from starpos.fix.star_fit import MatchedStars, sound_matches
 from starpos.frames.frame import Stars
 from starpos.frames.reading import why_no_time
 from starpos.frozen import at_once
-from starpos.identification import Identification, PointingPrior, Sky, fisheye, identify_directions, triangles
+from starpos.identification import Identification, PointingPrior, Sky, field_of, fisheye, identify, triangles
 from starpos.identification.triangles import TriangleCatalogue
 from starpos.instrument.camera import EQUIDISTANT, Camera
 from starpos.instrument.platepar import SkyPixels
@@ -461,7 +461,7 @@ class _Frame:
         stars = self.stars.select(camera.sees(self.stars.x, self.stars.y))
         seen = unbent(camera.directions(stars.x, stars.y), self._level(attitude), atmosphere)
         priors = () if attitude is None else (PointingPrior(attitude, camera.fx),)
-        found = identify_directions(seen, stars.sigma, camera, self.sky, priors)
+        found = identify(field_of(seen, stars.sigma, camera), self.sky, priors)
         if found is None:
             return None
         if found.mirrored:

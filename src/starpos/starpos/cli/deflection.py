@@ -160,7 +160,7 @@ def _of_files(args: argparse.Namespace, mark: Place) -> _Taken | None:
         raise InstrumentError("give frames and --tilt CSV, or a bag")
     read = reader_of(args)
     frames = frames_among(args.frames, args.tilt)
-    with inputs.workers_of(args, len(frames)) as workers:
+    with inputs.workers_of(args, frames) as workers:
         (about,) = workers.map([(First(read), tuple(frames))])
         if about is None:
             # says why

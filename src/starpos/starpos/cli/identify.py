@@ -31,7 +31,7 @@ def run(args: argparse.Namespace) -> int:
     lost: Stars | None = None
     complaints = console.FrameComplaints("identify")
     read, output = reader_of(args), Output(args, COLUMNS, HEAD)
-    with inputs.workers_of(args, number) as workers:
+    with inputs.workers_of(args, args.frames) as workers:
         solving = inputs.identifying("identify", args, args.frames, read, workers, args.search_time)
         work = OnFile(read, solving)
         answers = inputs.watched(workers.map((work, path) for path in args.frames), number)
@@ -69,6 +69,7 @@ def as_json(path: str, s: Solution) -> dict:
         "lens": a.model if a else None,
         "mirrored": a.mirrored if a else None,
         "negative": s.negative,
+        "planets": dict(s.planets),
         "status": s.status.value,
         "warnings": list(s.warnings),
         "bright_explained": [s.explained.explained, s.explained.bright] if s.explained else None,
@@ -90,5 +91,6 @@ def _line(path: str, s: Solution) -> str:
         + (", a fisheye" if a.model == EQUIDISTANT else "")
         + (", mirrored" if a.mirrored else "")
         + (", a negative" if s.negative else "")
+        + "".join(f", {name.title()}" for name, _ in s.planets)
         + "".join(f", {name}" for name in s.warnings)
     )

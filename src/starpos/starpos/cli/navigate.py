@@ -62,7 +62,7 @@ def run(args: argparse.Namespace) -> int:
         drift_change=args.drift_change,
         height_m=args.altitude_m,
     )
-    with inputs.workers_of(args, number) as workers:
+    with inputs.workers_of(args, args.frames) as workers:
         (about,) = workers.map([(First(read), tuple(args.frames))])
         if about is None:
             raise VoyageError(f"none of the {number} frames can be read: give star lists or frames")

@@ -13,6 +13,7 @@ import numpy as np
 
 from starpos.cli import console, inputs, options
 from starpos.earth.gravity import itrs_place
+from starpos.earth.refraction import Atmosphere
 from starpos.earth.vertical import Deflection
 from starpos.errors import FrameError, SatelliteError, StarposError
 from starpos.files import read_regular
@@ -118,7 +119,7 @@ def _look(args: argparse.Namespace, frames: list[str], seen: SeenTrails) -> None
     """Add the frames and their trails, numbered on; complains of frames without, and of trails that are left out."""
     number = 1 + max((trail.track for trail in seen.trails), default=-1)
     complaints, read = console.FrameComplaints("satellites"), inputs.reader_of(args)
-    with inputs.workers_of(args, len(frames)) as workers:
+    with inputs.workers_of(args, frames) as workers:
         solving = inputs.identifying("satellites", args, frames, read, workers, SEARCH_S)
         work = OnFile(read, TrailSighted(solving))
         answers = inputs.watched(workers.map((work, path) for path in frames), len(frames))
@@ -213,7 +214,7 @@ def heading_json(name: str, sight: Sight, fix: SatelliteFix) -> dict | None:
     if sight.instrument is None or sight.found is None or sight.stars.mid_unix_s is None:
         return None
     place = gnss_place(sight.stars.mid_unix_s, fix.latitude, fix.longitude, fix.covariance[:2, :2])
-    solver = Solver(sight.instrument, catalogue.load_catalogue())
+    solver = Solver(sight.instrument, catalogue.load_catalogue(), Atmosphere.measured(None, None))
     try:
         link = solver.attitude_at(sight.stars, sight.found, place.deflected(Deflection())).ellipsoid
     except StarposError as e:

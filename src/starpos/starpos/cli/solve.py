@@ -348,7 +348,7 @@ def _run(args: argparse.Namespace) -> int:
     by_log = args.tilt is not None and is_phone_log(Path(args.tilt)) and are_photographs(args.frames)
     read = reader_of(args, by_gravity or by_log)
     statuses = [_refused(why, given) for why in given if not isinstance(why, NightFolder)]
-    with inputs.workers_of(args, sum(len(night.frames) for night in nights)) as workers:
+    with inputs.workers_of(args, [path for night in nights for path in night.frames]) as workers:
         plans = []
         abouts = workers.map((First(read, by_gravity), night.frames) for night in nights)
         for night, about in zip(nights, abouts, strict=True):
@@ -393,6 +393,7 @@ def _work(
         return Solving(Instruments(None), atmosphere=air)
     tilt = Path(night.tilt) if night.tilt is not None else ByGravity() if by_gravity else None
     work, remarks = work_of(given_or_sought(args, about), about, tilt, air, place)
+    work = replace(work, ephemeris=options.ephemeris_of(args))
     for remark in remarks:
         console.complain("solve", remark)
     assert work.instruments.instrument is not None

@@ -4,7 +4,7 @@
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import KW_ONLY, dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -39,15 +39,13 @@ from starpos.frames.exposure import GLOBAL_SHUTTER, UNKNOWN_SHUTTER, Shutter
 from starpos.frames.frame import EDGE_PX, Stars
 from starpos.frames.reading import why_no_time
 from starpos.frames.tables import Pointing
-from starpos.identification import MIN_STARS, Identification, PointingPrior, Sky, fisheye, identify_directions
+from starpos.identification import MIN_STARS, Identification, PointingPrior, Sky, field_of, fisheye, identify
 from starpos.identification._frame import FrameStars, all_within, ideal_frame, mean_sigma, unit_vectors
 from starpos.identification.pose import MIN_SIGMA_PX, TEST_STARS
 from starpos.identification.prior import Hint
 from starpos.identification.search import (
     Look,
     Priors,
-    field_of,
-    identify_frame,
     identify_near,
     second_look,
     through,
@@ -59,6 +57,7 @@ from starpos.instrument.instrument import OWN_LEVEL, ByGravity, Instrument
 from starpos.instrument.tilt_log import NO_TILTS, Tilts
 from starpos.progress import Progress, quiet
 from starpos.sky import deeper
+from starpos.sky.bodies import ERFA, SolarSystem
 from starpos.sky.catalogue import Catalogue
 
 # A fisheye's lower stars are not used: no model describes refraction near the horizon.
@@ -84,7 +83,7 @@ def directions_of(camera: Camera, stars: Stars) -> np.ndarray:
 
 
 def as_seen(camera: Camera, stars: Stars) -> FrameStars | None:
-    """The stars as `identify_frame` takes them, refracted; None unless all lie on the frame of an ideal camera.
+    """The stars as `identify` takes them, refracted; None unless all lie on the frame of an ideal camera.
 
     For such a camera this is quicker than by their directions.
     """
@@ -113,6 +112,7 @@ class Solver:
     Other ways to identify a frame are in `starpos.fix.searching`.
 
     catalogue: or the deeper one in its stead, for a field that needs it.
+    ephemeris: of the Sun, the Moon and planets.
 
     Examples
     --------
@@ -125,8 +125,10 @@ class Solver:
     instrument: Instrument
     catalogue: Catalogue
     atmosphere: Atmosphere = field(default_factory=lambda: Atmosphere.measured(None, None))
+    _: KW_ONLY
     min_stars: int = 5
     progress: Progress = quiet
+    ephemeris: SolarSystem = ERFA
 
     def prepare(self, width: int, height: int, origin_px: tuple[float, float] | None = None) -> str:
         """Load the tables for frames of this size in px, or build them; raises StarposError.
@@ -143,7 +145,7 @@ class Solver:
         Stars without a time have J2000 places.
         part: of the frame in which its stars lie, as a share of its size: triangles that are looked up are no larger.
         """
-        return self._identified(stars, part, lambda field, sky, _: identify_frame(field, sky, predicted))
+        return self._identified(stars, part, lambda field, sky, _: identify(field, sky, predicted))
 
     def look_again(self, stars: Stars, look: Look, predicted: Priors = (), part: float = 1.0) -> Solution:
         """Identify stars that alone are too few, by what their frame shows where others should be.
@@ -208,7 +210,7 @@ class Solver:
             sky = Sky(catalogue, triangles, state.year, tuple(state.velocity))
             field = field_of(directions, mean_sigma(stars.covariance), camera, stars.window)
             if known is None:
-                found = identify_frame(field, sky, (*predicted, *(hint.priors(state, g[2]) if hint else ())))
+                found = identify(field, sky, (*predicted, *(hint.priors(state, g[2]) if hint else ())))
             elif isinstance(known, Hint):
                 found = identify_near(field, sky, known.priors(state, g[2]))
             else:
@@ -521,7 +523,8 @@ def focal_that_fits(solver: Solver, stars: Stars, until_s: float = math.inf) -> 
                 break
             camera = given.scaled(FOCAL_STEP**k)
             seen = on.select(camera.sees(on.x, on.y).nonzero()[0])
-            found = identify_directions(camera.directions(seen.x, seen.y), seen.sigma, camera, sky)
+            field = field_of(camera.directions(seen.x, seen.y), seen.sigma, camera)
+            found = identify(field, sky)
             if found is not None:
                 return camera.fx * found.focal_scale
     except StarposError:
