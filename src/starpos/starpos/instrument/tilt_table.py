@@ -116,8 +116,8 @@ def _check_degrees(path: Path, column: Mapping[str, np.ndarray]) -> None:
         angles = angles[np.isfinite(angles)]
         if len(angles) and (beyond := float(np.median(np.abs(angles)))) > FULL_TURN_DEG:
             raise TiltError(
-                f"{path}: {name} is beyond a full turn ({beyond:g}): degrees and minutes (ddmm.mm), or another unit: give "
-                "degrees with a decimal point"
+                f"{path}: {name} is beyond a full turn ({beyond:g}): degrees and minutes (ddmm.mm), or another unit: "
+                "give degrees with a decimal point"
             )
 
 
