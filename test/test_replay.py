@@ -271,7 +271,7 @@ def test_what_is_no_bag_is_refused_in_a_sentence(capsys, tmp_path, make):
 
 
 def refused(capsys, *arguments) -> str:
-    """What the player says to arguments that it does not take; in this process."""
+    """The sentence with which the player refuses arguments, in this process."""
     try:
         status = replay.main([str(a) for a in arguments], [])
     except SystemExit as end:
