@@ -377,7 +377,7 @@ class DetectorNode(Node):
                     subject = result.frame, result.detection.stars, result.message.header
                     self._annotator.offer(*subject)
                     # in a replay the solver would have to wait for them
-                    if self._trail_finder is not None and not (self._replayed and self._replayed.playing):
+                    if self._trail_finder is not None and not time_is_simulated(self):
                         self._trail_finder.offer(*subject)
                 self._last = replace(result, frame=None)
             elif isinstance(result, StarposError):
