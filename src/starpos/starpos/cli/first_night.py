@@ -89,8 +89,10 @@ def _watched(args: argparse.Namespace, folder: Path) -> tuple[FirstNight | None,
                 air = options.atmosphere_of(args)
                 night = FirstNight(Solver(options.instrument_of(args, item), catalogue.load_catalogue(), air))
             sight = Solving(given)(item)
+            step = night.step
+            assert step is not None
             look = night.inspect(sight, _tilts(folder, night, stars_of(item)))
-            _tell(look, sight.stars)
+            _tell(step, look, sight.stars)
             if night.step is None:
                 return night, given
         if time.monotonic() - waited > args.patience:
@@ -121,14 +123,14 @@ def _tilts(folder: Path, night: FirstNight, stars: Stars) -> TiltLog | str:
         time.sleep(POLL_S)
 
 
-def _tell(look: Look, stars: Stars) -> None:
+def _tell(step: Stage, look: Look, stars: Stars) -> None:
     """Print what a step found, and after the level the clock."""
     at = utc_text(stars.mid_unix_s)[11:19] if stars.mid_unix_s else "--:--:--"
     mark = "ok" if look.done else ".."
-    print(f"{at} {mark} {look.step.value:<9}{look.found}\n{'':12}-> {look.todo}", flush=True)
+    print(f"{at} {mark} {step.value:<9}{look.found}\n{'':12}-> {look.todo}", flush=True)
     if look.done and sys.stdout.isatty():
         print("\a", end="", flush=True)
-    if look.done and look.step is Stage.LEVEL:
+    if look.done and step is Stage.LEVEL:
         finding = doctor.clock()
         mark = "ok" if finding.state is doctor.State.OK else "!!"
         cure = f"\n{'':12}-> {finding.cure}" if finding.cure else ""

@@ -13,7 +13,6 @@ from starpos.cli.fix_output import (
     line_of,
     put_combined,
 )
-from starpos.cli.inputs import NightFolder
 from starpos.cli.solve import NO_FIX
 from starpos.earth.vertical import Vertical
 from starpos.errors import FrameError
@@ -72,8 +71,7 @@ def tell(
     for remark in remarks:
         console.complain("replay", f"{bag}: {remark}")
     if solved:
-        folder = NightFolder((), None, bag if len(args.bags) > 1 else None)
-        put_combined(output, folder, whole, gathered, vertical)
+        put_combined(output, bag if len(args.bags) > 1 else None, whole, gathered, vertical)
     if (by_satellites := night.by_satellites) is not None:
         from starpos.cli.satellites import fix_json
 

@@ -75,7 +75,7 @@ NO_FIX = 1
 def tell(
     args: argparse.Namespace,
     output: Output,
-    night: NightFolder,
+    folder: str | None,
     answers: NightAnswers,
     vertical: Vertical,
     place: Place | None = None,
@@ -83,13 +83,14 @@ def tell(
 ) -> int:
     """Write the answer to each frame of a night, and what they come to together; returns the exit status.
 
+    folder: of the night; None where it is not named.
     place: the known place, whose headings are then reported; None without one.
     work: on the frames, which may say which focal length fits those that were not identified.
     """
-    statuses = [] if answers.turned is None else [tell_turned(args, night, answers.turned)]
+    statuses = [] if answers.turned is None else [tell_turned(args, folder, answers.turned)]
     watched, gathered, complaints = answers.watched, Gathered(), console.FrameComplaints("solve")
     if watched is not None:
-        say(night, *watched.remarks)
+        say(folder, *watched.remarks)
         if args.learned is not None:
             _save_learned(Path(args.learned), watched.learned)
     for answer in answers.each:
@@ -101,23 +102,22 @@ def tell(
             complaints(answer.name, s.remark)
         output.put(_json_of_answer(args, answer, vertical, place), _line_of_answer(args, answer, place))
     complaints.end()
-    solved, headings, near = gathered.solved, gathered.headings, near_of(args)
+    fixes, headings, near = gathered.fixes, gathered.headings, near_of(args)
     whole = together(gathered, answers.given, near)
     mean, why = (None, ()) if place is None else fix_output.mean_of(headings)
     unnamed = () if watched is None or answers.instrument is None else of_inclinometer(answers.instrument)
     not_averaged = [whole.why_not] if whole.why_not else []
-    say(night, *not_averaged, *(unnamed if solved else ()), *whole.remarks, *why)
-    where = whole.average or (solved[-1].fix if solved else None)
+    say(folder, *not_averaged, *(unnamed if fixes else ()), *whole.remarks, *why)
+    where, about = whole.average or (fixes[-1] if fixes else None), {}
     if where is not None:
         tell_unknown("solve", args, vertical.at(where.latitude, where.longitude))
         about = {} if near is None else {"km_from_near": near.km_from(where.latitude, where.longitude)}
-        if place is not None:
-            about |= with_heading(json_of(whole.average, vertical), mean, place, options.axes_of(args))
-        put_combined(output, night, whole.average, gathered, vertical, about)
-    elif headings and place is not None:
-        fix_output.put_mean(output, night, headings, mean, place, vertical, options.axes_of(args))
+    if place is not None:
+        about |= with_heading(json_of(whole.average, vertical), mean, place, options.axes_of(args))
+    if where is not None or (headings and place is not None):
+        put_combined(output, folder, whole.average, gathered, vertical, about, mean)
     elif gathered.lost is not None and not headings and work is not None:
-        say(night, *work.fitting(gathered.lost))
+        say(folder, *work.fitting(gathered.lost))
     # without tilts headings are all that was asked for, and by day they are all there is
     by_day = any(s.bodies for s in headings)
     found = bool(headings) if place is not None and (by_day or not args.tilt) else whole.average is not None
@@ -158,23 +158,23 @@ def check_save(args: argparse.Namespace, instrument: Instrument) -> None:
         instrument_file.check_fits(Path(args.save), instrument)
 
 
-def tell_turned(args: argparse.Namespace, night: NightFolder, turned: TurnedNight) -> int:
+def tell_turned(args: argparse.Namespace, folder: str | None, turned: TurnedNight) -> int:
     """Say what was found by turning, and write A3 as --save asks; NO_FIX if it is asked for and not written."""
     if turned.calibrated is None or not turned.worth_saving:
-        say(night, *turned.remarks, *([] if args.save is None else [f"{args.save} is not written"]))
+        say(folder, *turned.remarks, *([] if args.save is None else [f"{args.save} is not written"]))
         return 0 if args.save is None else NO_FIX
     if args.save is not None:
         about = f"A3 by turning on the spot, {turned.remarks[0]}"
         save_instrument("solve", args.save, turned.calibrated.instrument, about)
     kept = "--save OUT keeps A3 and its errors" if args.save is None else f"{args.save} is written"
-    say(night, *turned.remarks, kept)
+    say(folder, *turned.remarks, kept)
     return 0
 
 
-def say(night: NightFolder, *texts: object) -> None:
+def say(folder: str | None, *texts: object) -> None:
     """Print lines about a whole night on standard error."""
     for text in texts:
-        console.complain("solve", text if night.folder is None else f"{night.folder}: {text}")
+        console.complain("solve", text if folder is None else f"{folder}: {text}")
 
 
 def read_receiver(gnss: str | None, learned: str | None, command: str) -> Receiver | None:
@@ -229,7 +229,6 @@ def run_pointings(args: argparse.Namespace) -> int:
     output = Output(args, COLUMNS, HEAD if whole else ELEVATIONS_HEAD)
     if not whole:
         return _from_elevations(args, output, solver, tilts, pointings, vertical, near)
-    night = NightFolder(tuple(p.source for p in pointings), args.tilt)
     found, given = None, solver.instrument if not args.self_calibrate else None
     solutions: Iterable[Solution] = (solver.solve_pointing(p, tilts) for p in pointings)
     if args.self_calibrate:
@@ -237,7 +236,7 @@ def run_pointings(args: argparse.Namespace) -> int:
         solved = iter(found.solutions)
         solutions = [next(solved) if p.has_roll else solver.solve_pointing(p) for p in pointings]
     each = (FrameAnswer(p.source, s) for p, s in zip(pointings, solutions, strict=True))
-    return tell(args, output, night, NightAnswers(each, given=given, turned=found), vertical)
+    return tell(args, output, None, NightAnswers(each, given=given, turned=found), vertical)
 
 
 def _from_elevations(
@@ -258,22 +257,21 @@ def _from_elevations(
             put_elevation(output, p.source, p.mid_unix_s, None, vertical, status)
         else:
             put_elevation(output, p.source, p.mid_unix_s, circle.zenith_distance, vertical)
-    whole, night = found.together, NightFolder((), args.tilt)
-    saving = 0
+    whole, saving = found.together, 0
     if found.axis is not None:
         say(
-            night,
+            None,
             f"A3 from the elevations: the frame's centre in the inclinometer to {found.axis.stddev_arcsec:.0f} arcsec",
         )
     if args.save is not None:
         saving = _save_axis(args, solver, found.axis)
-    say(night, *([whole.why_not] if whole.why_not else ()), *whole.remarks)
+    say(None, *([whole.why_not] if whole.why_not else ()), *whole.remarks)
     place, about = whole.average, {}
     if place is not None:
         tell_unknown("solve", args, vertical.at(place.latitude, place.longitude))
         about = {} if near is None else {"km_from_near": near.km_from(place.latitude, place.longitude)}
     if place is not None or whole.why_not:
-        put_combined(output, night, place, Gathered(), vertical, about)
+        put_combined(output, None, place, Gathered(), vertical, about)
     return max(saving, 0 if place else NO_FIX)
 
 
@@ -361,7 +359,7 @@ def _run(args: argparse.Namespace) -> int:
             # takes the answers of this night, and leaves the rest
             rows = zip(night.frames, sights, strict=False)
             answers = answers_of(rows, work, vertical, how, console.ProgressBar())
-            statuses.append(tell(args, output, night, answers, vertical, place, work))
+            statuses.append(tell(args, output, night.folder, answers, vertical, place, work))
     if args.out is not None:
         places_file.write(args.out, output.answers)
     return max(statuses)

@@ -213,13 +213,8 @@ def solution_of(
     begin_s: when their search began, by time.perf_counter.
     """
     warnings, explained = suspicions(stars, field, sky, found)
-    return Solution(
-        Status.OK,
-        "identified",
-        source=stars.source,
-        utc_unix_s=stars.mid_unix_s,
-        stars_detected=len(stars.x),
-        negative=stars.negative,
+    return Solution.of(
+        stars,
         named=sky.catalogue.named(found.catalogue),
         star=found.star,
         pointing=pointing_of(found, sky, camera, found.spread_px(stars.x, stars.y)),
