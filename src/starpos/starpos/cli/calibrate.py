@@ -13,7 +13,7 @@ import numpy as np
 from starpos.calibration.camera import FromSky, Intrinsics, calibrate_camera, rms
 from starpos.calibration.camera_adjustment import UNLEVELLED, UNTIMED, parameters
 from starpos.calibration.misalignment import NOTHING_KNOWN, Calibrated, Known, calibrate_at, calibrate_fixed
-from starpos.cli import console, inputs, options, overwriting, watch_output
+from starpos.cli import console, inputs, options, overwriting, places_file, watch_output
 from starpos.cli.inputs import checked_tilts, frames_among, given_or_sought, reader_of, stated_site
 from starpos.cli.options import vertical_of
 from starpos.cli.overwriting import CAMERA_NAME, Written, save_instrument
@@ -291,7 +291,7 @@ def _watch(args: argparse.Namespace) -> int:
     if not args.frames:
         raise FrameError(f"{folder}: no frames in it, nor in its folders")
     if args.page is not None:
-        overwriting.check(args, Written("--page", args.page, watch_output.check_page))
+        overwriting.check(args, Written("--page", args.page, places_file.check_ours))
     site = _site(args)
     seen = inputs.seen_at("calibrate", args, site)
     answers = [(sight.solution, camera.fx) for _, sight, camera in seen]

@@ -137,9 +137,6 @@ def _face_text(face: dict) -> str:
     )
 
 
-NO_DEFLECTION = 1
-
-
 def run(args: argparse.Namespace) -> int:
     mark = _mark_of(args)
     taken = _of_bag(args, mark) if _is_bag(args) else _of_files(args, mark)
@@ -220,7 +217,7 @@ def _tell(args: argparse.Namespace, taken: _Taken, mark: Place) -> int:
         session = DeflectionSession.of(sightings, taken.instrument, options.atmosphere_of(args), mark)
     except FixError as error:
         console.complain("deflection", error)
-        return NO_DEFLECTION
+        return console.NOTHING
     scale = taken.instrument.inclinometer.scale
     for said in remarks(session.adjusted, session.sightings, len(rows), scale):
         console.complain("deflection", said)

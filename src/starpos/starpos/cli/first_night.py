@@ -24,7 +24,6 @@ from starpos.night.work import Solving
 from starpos.sky import catalogue
 from starpos.units import utc_text
 
-NOT_YET = 1
 POLL_S = 0.5
 # A file that cannot be read may still be written for so long.
 WRITTEN_S = 10.0
@@ -46,13 +45,13 @@ def run(args: argparse.Namespace) -> int:
         night, given = _watched(args, folder)
     except KeyboardInterrupt:
         console.complain("first-night", f"stopped: {AGAIN}")
-        return NOT_YET
+        return console.NOTHING
     found = None if night is None else night.turned
     if found is None or found.calibrated is None:
         console.complain(
             "first-night", f"no frame has come for {args.patience:g} s, and A3 is not known yet: {AGAIN}"
         )
-        return NOT_YET
+        return console.NOTHING
     overwriting.save_instrument(
         "first-night", args.save, found.calibrated.instrument, "A3 by the first night"
     )

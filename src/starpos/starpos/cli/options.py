@@ -19,12 +19,6 @@ from starpos.frames.frame import Frame, Stars
 from starpos.instrument import instrument, instrument_file, sensors
 from starpos.instrument.camera import PLUMB_BOB, Camera
 from starpos.night.reading import About
-from starpos.recording import topics
-
-
-def remaps_of(args: argparse.Namespace) -> topics.Remaps:
-    """The topics of --remap; raises FrameError."""
-    return topics.Remaps.of(args.remap)
 
 
 def check_frames(args: argparse.Namespace) -> None:

@@ -15,8 +15,6 @@ from starpos.night.remarks import doubts, of_average
 from starpos.night.together import Gathered
 from starpos.sky.catalogue import load_catalogue
 
-NO_PLACE = 1
-
 
 def run(args: argparse.Namespace) -> int:
     """Solve the table of --sights; returns the exit status."""
@@ -37,7 +35,7 @@ def run(args: argparse.Namespace) -> int:
         circles.append(circle)
         put_elevation(output, sight.source, sight.utc_unix_s, circle.zenith_distance, vertical)
     if not circles:
-        return NO_PLACE
+        return console.NOTHING
     place, about = None, {}
     try:
         place = place_of_sights(used, circles, None if near is None else (near.latitude, near.longitude))
@@ -48,4 +46,4 @@ def run(args: argparse.Namespace) -> int:
             console.complain("solve", remark)
         about = {} if near is None else {"km_from_near": near.km_from(place.latitude, place.longitude)}
     put_combined(output, None, place, Gathered(), vertical, about)
-    return NO_PLACE if place is None else 0
+    return console.NOTHING if place is None else 0

@@ -47,7 +47,6 @@ from starpos.gnss import states
 from starpos.gnss.receiver import read_gnss_csv
 from starpos.gnss.solving import Watched
 from starpos.gnss.states import Learned
-from starpos.gnss.watch import GnssCheck
 from starpos.instrument import instrument_file
 from starpos.instrument.instrument import ByGravity, Instrument
 from starpos.instrument.tilt_log import NO_TILTS, Tilts
@@ -68,8 +67,6 @@ from starpos.night.together import (
 from starpos.night.work import OnFile, Solving
 from starpos.sky import catalogue
 from starpos.units import utc_text
-
-NO_FIX = 1
 
 
 def tell(
@@ -122,7 +119,7 @@ def tell(
     by_day = any(s.bodies for s in headings)
     found = bool(headings) if place is not None and (by_day or not args.tilt) else whole.average is not None
     found |= args.gnss is not None and args.tilt is None and bool(headings)
-    return max([*statuses, console.UNREADABLE if gathered.unreadable else 0 if found else NO_FIX])
+    return max([*statuses, console.UNREADABLE if gathered.unreadable else 0 if found else console.NOTHING])
 
 
 def _json_of_answer(
@@ -159,10 +156,10 @@ def check_save(args: argparse.Namespace, instrument: Instrument) -> None:
 
 
 def tell_turned(args: argparse.Namespace, folder: str | None, turned: TurnedNight) -> int:
-    """Say what was found by turning, and write A3 as --save asks; NO_FIX if it is asked for and not written."""
+    """Say what was found by turning, and write A3 as --save asks; NOTHING if it is asked for and not written."""
     if turned.calibrated is None or not turned.worth_saving:
         say(folder, *turned.remarks, *([] if args.save is None else [f"{args.save} is not written"]))
-        return 0 if args.save is None else NO_FIX
+        return 0 if args.save is None else console.NOTHING
     if args.save is not None:
         about = f"A3 by turning on the spot, {turned.remarks[0]}"
         save_instrument("solve", args.save, turned.calibrated.instrument, about)
@@ -197,20 +194,11 @@ def _save_learned(path: Path, learned: Learned | None) -> None:
 
 def json_of_watched(told: Watched) -> dict:
     """The keys of --json of a frame that come from its fix, or its heading at GNSS's place, and `gnss`."""
-    keys = json_on_ground(told.solution.fix, told.ground)
+    keys, check = json_on_ground(told.solution.fix, told.ground), told.compared
     if (at_place := told.solution.at_place) is not None:
         keys = with_heading(keys, at_place, at_place.place)
-    return keys | {"gnss": None if told.compared is None else json_of_check(told.compared)}
-
-
-def json_of_check(check: GnssCheck) -> dict:
-    """The key `gnss` of --json."""
-    return {
-        "status": check.status.value,
-        "distance_m": check.distance_m,
-        "bearing_deg": check.bearing_deg,
-        "sigma_m": check.sigma_m,
-    }
+    about = ("status", "distance_m", "bearing_deg", "sigma_m")
+    return keys | {"gnss": None if check is None else {name: getattr(check, name) for name in about}}
 
 
 def run_pointings(args: argparse.Namespace) -> int:
@@ -272,14 +260,14 @@ def _from_elevations(
         about = {} if near is None else {"km_from_near": near.km_from(place.latitude, place.longitude)}
     if place is not None or whole.why_not:
         put_combined(output, None, place, Gathered(), vertical, about)
-    return max(saving, 0 if place else NO_FIX)
+    return max(saving, 0 if place else console.NOTHING)
 
 
 def _save_axis(args: argparse.Namespace, solver: Solver, axis: FoundAxis | None) -> int:
-    """Write the A3 that the elevations determined, as --save asks; NO_FIX if they did not."""
+    """Write the A3 that the elevations determined, as --save asks; console.NOTHING if they did not."""
     if axis is None or axis.stddev_arcsec > WORTH_SAVING_ARCSEC:
         console.complain("solve", f"{args.save} is not written: the elevations hardly determine A3")
-        return NO_FIX
+        return console.NOTHING
     calibration = axis.calibration(solver.instrument.calibration, options.turn_of(args))
     about = f"A3 of elevations alone: the frame's centre to {axis.stddev_arcsec:.2f} arcsec"
     save_instrument("solve", args.save, replace(solver.instrument, calibration=calibration), about)

@@ -273,7 +273,7 @@ class FirstNight:
             self._solver.instrument.inclinometer.noise_rad,
         )
         self.turned = turned(solver, frames, log, TURN_STDDEV_DEG)
-        said = f"{found}; {'; '.join(map(str, self.turned.remarks))}"
+        said = f"{found}; {'; '.join(self.turned.remarks)}"
         if not self.turned.worth_saving:
             return Look(False, said, "turn on, to other headings")
         return Look(True, said, "A3 is known")

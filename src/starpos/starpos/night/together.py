@@ -31,7 +31,7 @@ from starpos.gnss.watch import GnssWatch
 from starpos.instrument.instrument import Calibration, Instrument
 from starpos.instrument.tilt_log import Tilts
 from starpos.night import remarks
-from starpos.night.remarks import Kind, Near, Remark, doubts, of_inclinometer
+from starpos.night.remarks import Near, Remark, doubts, of_inclinometer
 
 # elevations that have A3's axis further from where it was given, in sigma of both, deny the given one
 DENIED_SIGMA = 6.0
@@ -346,5 +346,5 @@ def watched_night(
         if gnss is not None:
             rough = placed(solver, stars, rough, gnss.deflected(vertical))
         answers[k] = watched(solver, stars, rough, gnss, watch)
-    remarks = tuple(Remark(Kind.GNSS, f"{number} frames: {why}") for why, number in said.items())
+    remarks = tuple(Remark(f"{number} frames: {why}") for why, number in said.items())
     return WatchedNight(tuple(answers[k] for k in range(len(sights))), watch.learned, remarks)

@@ -106,7 +106,7 @@ class Processes:
 
     def __init__(self, number: int) -> None:
         self._number, self._stillborn = number, 0
-        self._ended, self._why_none = False, ""
+        self._ended, self._how_ended = False, ""
         # None: there will be no more
         self._idle: SimpleQueue[_Worker | None] = SimpleQueue()
         self._workers: list[_Worker] = []
@@ -175,14 +175,16 @@ class Processes:
                 self._stillborn += not worker.ready
             how = worker.end(DYING_S)
             if self._stillborn > MAX_STILLBORN:
-                self._why_none = f"the processes of --jobs do not start ({how}): use fewer, or --jobs 1"
+                self._how_ended = how
                 break
             self._start()
             if worker.begun:
                 return how
         # all other threads end, too
         self._idle.put(None)
-        raise ProcessError(self._why_none)
+        raise ProcessError(
+            f"the processes of --jobs do not start ({self._how_ended}): use fewer, or --jobs 1"
+        )
 
 
 # Where calls are done: a context manager that leaves nothing running.

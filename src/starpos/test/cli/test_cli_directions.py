@@ -105,6 +105,6 @@ def test_a_camera_that_turns_is_no_camera_that_stands_still(run, lists, tmp_path
     assert page.read_text().count("<tr>") == 3
     page.write_text("mine")
     status, _, err = run("calibrate", "--watch", lists, *WIDE, *SITE, "--page", page)
-    assert status == 2 and "not a page" in err[-1]
+    assert status == 2 and "not of starpos" in err[-1]
     status, _, err = run("calibrate", "--watch", tmp_path / "none", *WIDE, *SITE)
     assert status == 2 and "cannot be read" in err[-1]
