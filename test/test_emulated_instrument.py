@@ -15,7 +15,7 @@ from starpos_testing.lacking import lacks
 from starpos_testing.patience import WAIT_S
 
 TOOL = Path(__file__).parent.parent / "tools" / "demo" / "emulated_instrument.py"
-FRAMES = 10
+FRAMES = 8
 
 
 @pytest.mark.timeout(5 * WAIT_S)

@@ -2,9 +2,9 @@
 """Every executable ends cleanly on SIGTERM and on the two SIGINTs that launch sends, in the middle of its work."""
 
 import signal
+from itertools import cycle
 
-import pytest
-
+WAYS = ((signal.SIGINT, signal.SIGINT), (signal.SIGTERM,))
 CAMERA = (
     "source:=simulated",
     "focal_mm:=14.8",
@@ -14,8 +14,8 @@ CAMERA = (
 )
 
 
-@pytest.mark.parametrize("signals", [(signal.SIGINT, signal.SIGINT), (signal.SIGTERM,)])
-def test_all_at_work_end_with_status_0(graph, run, tmp_path, signals):
+def test_all_at_work_end_with_status_0(graph, run, tmp_path):
+    """All have one main function, whose every signal test_node_main.py sends: each gets one kind of them here."""
     port = tmp_path / "port"
     emulator = run("starpos_testing", "emulator", arguments=("--link", str(port), "--tilt-x", "3"))
     graph.wait(port.exists, "for the emulated port")
@@ -30,7 +30,7 @@ def test_all_at_work_end_with_status_0(graph, run, tmp_path, signals):
     graph.diagnostics.clear()
     names = {"camera: Capture", "detector: Stars", "inclinometer: Link", "solver: Solution", "solver: Inputs"}
     graph.wait(lambda: names <= set(graph.diagnostics), "for everybody's diagnostics")
-    for process in (*processes, emulator):
+    for process, signals in zip((*processes, emulator), cycle(WAYS)):
         process.signal(*signals)
     for process in (*processes, emulator):
         assert process.wait() == 0, f"{process.name}: {process.output}"

@@ -5,6 +5,7 @@ import ast
 import re
 import sys
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -109,6 +110,7 @@ def is_any(module: str, names: set[str]) -> bool:
     return any(f"{module}.".startswith(f"{name}.") for name in names)
 
 
+@cache
 class Code:
     """A package's Python files and what they import; {dotted name: {imported: at the top}}."""
 

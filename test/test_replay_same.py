@@ -3,8 +3,6 @@
 
 import math
 import signal
-import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -21,11 +19,9 @@ from starpos_bringup.bag import Bag
 from starpos_common.messages import attitude_to_message, unix_to_stamp
 from starpos_interfaces.msg import Attitude, Tilt
 from starpos_testing.graph.graph import stamp_of
-from starpos_testing.patience import WAIT_S
 from starpos_testing.skies.bags import part_of
 
 NIGHT = Path(__file__).parent / "data" / "night"
-SOAK = Path(__file__).parent.parent / "tools" / "soaks" / "soak.py"
 KNOWN = ("refraction.pressure:=66000.0", "refraction.temperature:=-4.0", "refraction.humidity:=0.4",
          "misalignment:=[0.31, -0.22, 0.53]", "misalignment_stddev:=0.1",
          "inclinometer.model:=sca100t_calibrated")  # fmt: skip
@@ -187,11 +183,3 @@ def test_what_such_a_player_loses_is_named(graph, run):
     graph.wait(lost, "for the warning")
     assert "messages were dropped on the way: play it slower" in solver.output
     assert "messages came before this node listened: start it first" in solver.output
-
-
-@pytest.mark.timeout(5 * WAIT_S)
-def test_two_busy_runs_are_the_same_to_the_last_byte():
-    command = [sys.executable, str(SOAK), "bag", "--runs", "2", "--busy", "3", "--rates", "0", "--processes", "4",
-               "--lanes", "2", "--inputs", "images"]  # fmt: skip
-    done = subprocess.run(command, capture_output=True, text=True, timeout=5 * WAIT_S, check=False)
-    assert done.returncode == 0 and "2 runs, 1 different outcomes" in done.stdout, done.stdout + done.stderr

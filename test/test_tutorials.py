@@ -17,8 +17,8 @@ from starpos_testing.command_line import run
 
 # frames are written as lists of their stars, which is quick and gives the same answers to some metres
 LISTS = ("--stars-only", "--focal-mm", "600", "--pixel-um", "6.4")
-# photos that are identified with no option and a painted report have tests of their own
-ELSEWHERE = re.compile("starpos (?:identify photo|report|doctor)")
+# photos that are identified with no option, a painted report and the demo have tests of their own
+ELSEWHERE = re.compile("starpos (?:identify photo|report|doctor|demo)")
 
 
 def typed(page, folder, monkeypatch, capsys) -> dict[str, str]:

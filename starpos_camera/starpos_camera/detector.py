@@ -38,7 +38,6 @@ from starpos_camera.after_solution import Annotator, TrailFinder
 from starpos_common.diagnostics import Diagnosis, Diagnostics, Level, Troubles, time_is_simulated
 from starpos_common.messages import encoding_of, stars_to_message
 from starpos_common.parameters import declare
-from starpos_common.replayed import Replayed
 from starpos_common.topics import MatchedSubscription, Take, publisher, subscription, subscription_from_any
 from starpos_common.worker import Worker
 from starpos_interfaces.msg import Capture, StarArray
@@ -72,18 +71,13 @@ class FrameTopics:
         # stamp of the last frame of each topic
         self._stamps: dict[type, tuple[int, int]] = {}
 
-    @property
-    def takes(self) -> dict[str, Take]:
-        """What takes the messages of each topic."""
-        return {RAW: self._pass_raw, self.compressed_topic: self._pass_compressed}
-
-    def listen(self, taker: Callable[[str], Take], both: bool) -> None:
-        """Subscribe; taker gives the callback of a topic, which calls the one in `takes` when a message has its turn.
+    def listen(self, both: bool) -> None:
+        """Subscribe.
 
         both: hear both topics from the start, as in a replay, where which of them sends shows only message by message.
         """
-        self._taker, self._both = taker, both
-        self._raw = MatchedSubscription(self._node, Image, RAW, taker(RAW), IMAGE_DEPTH)
+        self._both = both
+        self._raw = MatchedSubscription(self._node, Image, RAW, self._pass_raw, IMAGE_DEPTH)
         self._look()
         self._timer = self._node.create_timer(
             PUBLISHERS_LOOK_S, self._look, clock=Clock(clock_type=ClockType.STEADY_TIME)
@@ -126,7 +120,7 @@ class FrameTopics:
         if wanted and self._compressed is None:
             topic = self.compressed_topic
             self._compressed = MatchedSubscription(
-                self._node, CompressedImage, topic, self._taker(topic), IMAGE_DEPTH
+                self._node, CompressedImage, topic, self._pass_compressed, IMAGE_DEPTH
             )
         elif not wanted and self._compressed is not None:
             self._compressed.destroy()
@@ -188,13 +182,12 @@ class DetectorNode(Node):
         self._values = declare(self, parameters_of("detector"), apply=self._apply)
         self._settings = DetectionSettings.by_parameters(self._values)
         self._exposures = ExposureFacts(self._values)
-        # images until their Captures come, oldest first, and how long they wait for them, s of the clock below
+        # images until their Captures come, oldest first, and how long they wait for them, monotonic s
         self._held: deque[tuple[Image | CompressedImage, float]] = deque()
         self._frames = self._bad = 0
         self._pace = Pace()
         # Type and sequence number of the last image; None: the middleware gives none.
         self._sequence: tuple[type, int | None] = (Image, None)
-        self._replayed: Replayed | None = None
         self._troubles = Troubles(self)
         # What was wrong with a frame since the last report.
         self._complaint = ""
@@ -225,25 +218,11 @@ class DetectorNode(Node):
 
     def listen(self) -> None:
         """Take the frames of `camera/image_raw`. A camera in the same process calls `submit` instead."""
-        takes: dict[str, Take] = {"camera/capture": self._on_capture, **self._topics.takes}
-        self._patience_clock = Clock(clock_type=ClockType.STEADY_TIME)
-        if time_is_simulated(self):
-            self._patience_clock = self.get_clock()
-            self._replayed = Replayed(
-                self, takes, [self._publisher], busy=lambda: not self._worker.idle, begin=self._forget
-            )
-        self._look = self.create_timer(LOOK_S, self._go_on, clock=self._patience_clock, autostart=False)
-
-        def taker(name: str) -> Take:
-            return takes[name] if self._replayed is None else self._replayed.in_turn(name, takes[name])
-
-        captures = subscription(self, Capture, "camera/capture", taker("camera/capture"), CAPTURES_KEPT)
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._look = self.create_timer(LOOK_S, self._go_on, clock=steady, autostart=False)
+        captures = subscription(self, Capture, "camera/capture", self._on_capture, CAPTURES_KEPT)
         self._captures_come = captures.get_publisher_count
-        self._topics.listen(taker, both=self._replayed is not None)
-
-    def _forget(self) -> None:
-        """Forget all Captures: a replay begins."""
-        self._exposures = ExposureFacts(self._values)
+        self._topics.listen(both=time_is_simulated(self))
 
     def close(self) -> None:
         self._worker.stop()
@@ -300,7 +279,7 @@ class DetectorNode(Node):
     def _apply(self, names: frozenset[str]) -> None:
         self._settings = DetectionSettings.by_parameters(self._values)
 
-    def _on_capture(self, message: Capture, info: Mapping[str, Any]) -> None:
+    def _on_capture(self, message: Capture) -> None:
         self._exposures.keep_capture(message)
         self._go_on()
 
@@ -319,14 +298,8 @@ class DetectorNode(Node):
         # At the first image the sender's Captures may not have been discovered yet.
         if first:
             patience_s = max(patience_s, DISCOVERY_S)
-        if self._replayed is not None and self._replayed.playing:
-            # It was played before its image, or is not in the bag.
-            patience_s = 0.0
-        self._held.append((message, self._now_s() + patience_s))
+        self._held.append((message, time.monotonic() + patience_s))
         self._go_on()
-
-    def _now_s(self) -> float:
-        return self._patience_clock.now().nanoseconds * 1e-9
 
     def _go_on(self) -> None:
         """Submit the oldest frame if its Capture has come, or will not come; of too many the oldest is dropped."""
@@ -357,7 +330,7 @@ class DetectorNode(Node):
             return False
         # a sender's Captures come in order: if a later frame's is here, its own is lost
         come = any(self._exposures.has(image.header) for image, _ in itertools.islice(self._held, k, None))
-        return come or len(self._held) > MAX_HELD or self._now_s() >= self._held[k][1]
+        return come or len(self._held) > MAX_HELD or time.monotonic() >= self._held[k][1]
 
     def _offer_image(self, message: Image | CompressedImage) -> None:
         """Submit an image, with the known facts of its exposure."""
@@ -398,8 +371,6 @@ class DetectorNode(Node):
             if isinstance(result, DetectedFrame):
                 self._publisher.publish(result.message)
                 self._frames += 1
-                if self._replayed is not None:
-                    self._replayed.note(result.message.header.stamp)
                 self._troubles.right("frames")
                 if result.frame is not None:
                     self._say_size(result.frame)
@@ -416,8 +387,6 @@ class DetectorNode(Node):
                 kind = type(result).__name__
                 self._complain(f"a frame was given up ({kind}: {result}); keep it and report this.")
         self._go_on()
-        if self._replayed is not None:
-            self._replayed.go_on()
 
     def _say_size(self, frame: Frame) -> None:
         size = f"{frame.width} x {frame.height} px, {encoding_of(frame)}"

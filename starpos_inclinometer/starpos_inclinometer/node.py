@@ -3,9 +3,9 @@
 
 import time
 from collections import Counter
-from collections.abc import Mapping
-from typing import Any
 
+from rclpy.clock import JumpThreshold
+from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.time import Time
 
@@ -14,8 +14,7 @@ from starpos.parameters.table import parameters_of
 from starpos.session.driver import Changes
 from starpos_common.diagnostics import Diagnosis, Diagnostics, Level, time_is_simulated
 from starpos_common.parameters import declare
-from starpos_common.replayed import Replayed
-from starpos_common.topics import Take, publisher
+from starpos_common.topics import publisher
 from starpos_inclinometer.clock import HostClock
 from starpos_inclinometer.sources.registry import SOURCES, refusal
 from starpos_inclinometer.sources.source import Counts, Health, Phase, Surroundings
@@ -24,6 +23,8 @@ from starpos_interfaces.msg import Pulse, Tilt
 # Above this share of corrupted or lost lines since the last report the link gets a warning.
 BAD_SHARE = 0.05
 STEP_SHOWN_S = 30.0
+# The time of a replay goes back where it begins again.
+BEGUN_ANEW = JumpThreshold(min_forward=None, min_backward=Duration(seconds=-1))
 FLAGS = {"stuck": STUCK, "saturated": SATURATED, "out of range": OUT_OF_RANGE}
 
 
@@ -110,39 +111,16 @@ class InclinometerNode(Node):
         self._phases, self._steps = Changes(self.get_logger()), Changes(self.get_logger())
         self._reporter = Reporter()
         self._wake = self.create_guard_condition(self._on_wake)
-        self._replayed: Replayed | None = None
-        self.host_clock = HostClock(self._now_ns, lambda: time_is_simulated(self))
-        host = Surroundings(self, self.host_clock, self._wake.trigger, self._in_turn, time_is_simulated(self))
+        self.host_clock = HostClock(
+            lambda: self.get_clock().now().nanoseconds, lambda: time_is_simulated(self)
+        )
+        host = Surroundings(self, self.host_clock, self._wake.trigger, time_is_simulated(self))
         self._source = SOURCES[self._values["source"]](host, self._values)
-        if host.replays and self._source.handlers:
-            takes = {name: self._at_once(take) for name, take in self._source.handlers.items()}
-            self._replayed = Replayed(
-                self, takes, [self._publisher], busy=lambda: False, begin=self._source.restart
-            )
+        self._begun = self.get_clock().create_jump_callback(
+            BEGUN_ANEW, post_callback=lambda _: self._source.restart()
+        )
         self._diagnostics = Diagnostics(self, {"Link": self._report}, self._source.name)
         self._source.start()
-
-    def _now_ns(self) -> int:
-        replayed = self._replayed
-        if replayed is not None and replayed.playing:
-            return round((replayed.unix_s or 0.0) * 1e9)
-        return self.get_clock().now().nanoseconds
-
-    def _in_turn(self, name: str, take: Take) -> Take:
-        def on_message(message: Any, info: Mapping[str, Any]) -> None:
-            if self._replayed is None or not self._replayed.holds(name, message, info):
-                take(message, info)
-
-        return on_message
-
-    def _at_once(self, take: Take) -> Take:
-        """Take a message of a replay, and publish what is made of it before the next one has its turn."""
-
-        def on_turn(message: Any, info: Mapping[str, Any]) -> None:
-            take(message, info)
-            self._publish_readings()
-
-        return on_turn
 
     def close(self) -> None:
         self._source.stop()
@@ -154,11 +132,8 @@ class InclinometerNode(Node):
         """Publish what the source has; return whether one has a flag that was not reported yet."""
         urgent = False
         for reading in self._source.fetch():
-            message = self._message(reading)
-            self._publisher.publish(message)
+            self._publisher.publish(self._message(reading))
             urgent |= self._reporter.count(reading.flags)
-            if self._replayed is not None:
-                self._replayed.note(message.header.stamp)
         for pulse in self._source.fetch_pulses():
             self._pulses.publish(pulse)
         return urgent

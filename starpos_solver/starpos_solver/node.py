@@ -16,13 +16,12 @@ from std_srvs.srv import Trigger
 
 from starpos.instrument.camera import Camera
 from starpos.session import reports
-from starpos.session.driver import Now, Sent
-from starpos.session.frames import Answered, Output
+from starpos.session.driver import Sent
+from starpos.session.frames import Output
 from starpos.session.gnss import GNSS_TOPIC, ComparedPlaces
 from starpos.session.gyro import IMU_TOPIC
 from starpos.session.session import CAMERA_TOPIC, SolverSession
 from starpos_common.diagnostics import Diagnosis, Diagnostics, Level, time_is_simulated
-from starpos_common.replayed import Replayed
 from starpos_common.topics import Dropped, Take, other_publishers, subscription, subscription_from_any
 from starpos_common.worker import JobRunner
 from starpos_interfaces import msg
@@ -54,7 +53,6 @@ class SolverNode(Node):
         tilt = ("tilt",) * (self._settings.site is None and not gnss)
         self._inputs = Inputs(self, ("camera_info", "stars", *trails, *tilt, *gyro, *gnss))
         self._dropped = Dropped(self, PLAY_SLOWER)
-        self._replayed: Replayed | None = None
         self._session = SolverSession(
             self._settings,
             lambda: JobRunner(self, self._go_on),
@@ -76,23 +74,14 @@ class SolverNode(Node):
         self._transforms = StaticTransforms(self)
         session = self._session
         takes: dict[str, Take] = {
-            CAMERA_TOPIC: lambda m, _: self._publish(session.receive_camera(m, self._now())),
-            "tilt": lambda m, info: self._publish(session.receive_tilt(m, _sent(info), self._now())),
-            "stars": lambda m, info: self._publish(session.receive_stars(m, self._now(), _sent(info))),
+            CAMERA_TOPIC: lambda m, _: self._publish(session.receive_camera(m, now_of(self))),
+            "tilt": lambda m, info: self._publish(session.receive_tilt(m, _sent(info), now_of(self))),
+            "stars": lambda m, info: self._publish(session.receive_stars(m, now_of(self), _sent(info))),
         }
         if session.gnss is not None:
-            takes[GNSS_TOPIC] = lambda m, _: self._publish(session.receive_gnss(m, self._now()))
+            takes[GNSS_TOPIC] = lambda m, _: self._publish(session.receive_gnss(m, now_of(self)))
         if session.satellites is not None:
-            takes["trails"] = lambda m, _: self._publish(session.receive_trails(m, self._now()))
-        if time_is_simulated(self):
-            self._replayed = Replayed(
-                self,
-                takes,
-                self._outputs.publishers,
-                busy=lambda: session.busy,
-                begin=session.begin,
-                end=lambda: self._publish(session.end(self._now())),
-            )
+            takes["trails"] = lambda m, _: self._publish(session.receive_trails(m, now_of(self)))
         subscription_from_any(self, CameraInfo, CAMERA_TOPIC, self._taker(CAMERA_TOPIC, takes), 10)
         self._tilts = subscription(self, msg.Tilt, "tilt", self._taker("tilt", takes), TILT_QUEUE)
         self._stars = subscription(self, msg.StarArray, "stars", self._taker("stars", takes), STARS_QUEUE)
@@ -145,38 +134,28 @@ class SolverNode(Node):
 
     # inputs ----------------------------------------------------------------------------------------------------------
 
-    def _now(self) -> Now:
-        if self._replayed is not None and self._replayed.playing:
-            return Now.in_data(self._replayed.unix_s)
-        return now_of(self)
-
     def _taker(self, name: str, takes: Mapping[str, Take]) -> Take:
-        if self._replayed is None:
-            return takes[name]
-
         def take(message: Any, info: Mapping[str, Any]) -> None:
             self._note_dropped(name, info)
             takes[name](message, info)
 
-        return self._replayed.in_turn(name, take)
+        return take
 
     def _compare_gnss(self, message: NavSatFix) -> None:
-        self._gnss.receive(message, self._now())
+        self._gnss.receive(message, now_of(self))
 
     def _on_imu(self, message: Imu) -> None:
-        self._session.gyro.receive(message, self._now())
+        self._session.gyro.receive(message, now_of(self))
 
     def _note_dropped(self, name: str, info: Mapping[str, Any]) -> None:
         if time_is_simulated(self):
             self._dropped.came(name, info)
 
     def _arrived(self, ear: Subscription, name: str, most: int) -> Iterator[tuple[Any, Sent]]:
-        """Read what has arrived but waits for the executor; in a replay it waits for its turn.
+        """Read what has arrived but waits for the executor.
 
         name: relative one of the topic.  most: messages that may wait.
         """
-        if self._replayed is not None and self._replayed.playing:
-            return
         with ear.handle:
             for _ in range(most):
                 taken = ear.handle.take_message(ear.msg_type, False)
@@ -187,9 +166,7 @@ class SolverNode(Node):
 
     def _go_on(self) -> None:
         """Go on with the frames that wait, because time has passed or a job is done."""
-        self._publish(self._session.at(self._now()))
-        if self._replayed is not None:
-            self._replayed.go_on()
+        self._publish(self._session.at(now_of(self)))
         self._update_transforms()
 
     def _update_transforms(self) -> None:
@@ -205,8 +182,6 @@ class SolverNode(Node):
     def _publish(self, outputs: list[Output]) -> None:
         for output in outputs:
             self._outputs.publish(output)
-            if self._replayed is not None and isinstance(output, Answered):
-                self._replayed.note(output.stamp, output.solution.ok)
         if outputs:
             self._update_transforms()
         if self._session.more:

@@ -146,12 +146,6 @@ class SolutionPublishers:
         self._check = publisher(node, msg.GnssCheck, "gnss/check", 10) if self._values["gnss.use"] else None
 
     @property
-    def publishers(self) -> tuple[Publisher, ...]:
-        """The publishers of all topics, the solution's first."""
-        more = [p for p in (self._by_satellites, self._check) if p is not None]
-        return self._solution, self._fix, self._fix_averaged, self._imu, self._attitude, *more
-
-    @property
     def shared(self) -> tuple[Publisher, ...]:
         """The publishers of topics whose names other drivers have, too."""
         return self._fix, self._imu

@@ -45,7 +45,7 @@ from starpos.simulation.scene import write_night as write_night
 from starpos.sky.catalogue import Catalogue as Catalogue
 from starpos.sky.catalogue import load_catalogue as load_catalogue
 from starpos.sky.site import Site as Site
-from starpos.zenith.doubts import DeflectionSession as DeflectionSession
+from starpos.zenith.adjustment import DeflectionSession as DeflectionSession
 
 read_instrument = starpos.instrument.instrument_file.read
 write_instrument = starpos.instrument.instrument_file.write

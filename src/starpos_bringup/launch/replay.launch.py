@@ -23,7 +23,7 @@ from starpos_bringup.launching import (
 ARGUMENTS = (
     *COMMON_ARGUMENTS,
     ("bag", None, "the rosbag2: a folder, or one .mcap or .db3 file"),
-    ("rate", "1", "times real time; 0: as fast as the solver answers, with the same result"),
+    ("rate", "1", "times real time; 0: as fast as the solver answers"),
     ("detector", "false", "true: stars from the bag's images instead of the bag's stars"),
     DASHBOARD_ARGUMENT,
 )

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """`ros2 run starpos_bringup replay BAG`: play a rosbag2 into the running graph, byte for byte, with its time on /clock.
 
-For machines without `ros2 bag play`, and to play as fast as the solver answers with the same result, which `ros2 bag
-play` cannot.
+For machines without `ros2 bag play`, and to play as fast as the solver answers, which `ros2 bag play` cannot.
 """
 
 import argparse
@@ -108,12 +107,11 @@ def _rounds(
         if not options.loop or status or player.count == before:
             break
     broken = f", {player.broken} broken ones left out" if player.broken else ""
-    answers, fixes = player.answers
     _say(
         f"{player.count} messages in {time.monotonic() - begin:.1f} s{broken}: {player.frames} frames, "
-        f"{answers} answers, {fixes} fixes"
+        f"{player.answers} answers, {player.fixes} fixes"
     )
     if stopped:
         return status
-    unanswered = player.frames > 0 and not answers
+    unanswered = player.frames > 0 and not player.answers
     return CUT_SHORT if unanswered or player.lost or not player.count else status

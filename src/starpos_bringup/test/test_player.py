@@ -1,20 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a player warns of before it begins, and which of its messages it counts as frames."""
+"""Which of its messages a player counts as frames, what it warns of, and how far it runs ahead of those who follow."""
 
 import pytest
 import rclpy
-from builtin_interfaces.msg import Time
 from rclpy.serialization import serialize_message
-from sensor_msgs.msg import Image, Imu
-from std_msgs.msg import String
+from sensor_msgs.msg import Image
 
+from starpos_bringup import player as module
 from starpos_bringup.bag import Topic
-from starpos_bringup.player import FRAMES, IMU, Player
-from starpos_interfaces.msg import StarArray, Taken
+from starpos_bringup.player import FRAMES, Player
+from starpos_interfaces.msg import Solution, StarArray
 from starpos_testing.nodes import take_domain
 
 IMAGES = "/camera/image_raw"
 STARS, IMAGE = FRAMES[:2]
+S = 10**9
 
 
 def topic(name, kind, type_name):
@@ -22,9 +22,6 @@ def topic(name, kind, type_name):
 
 
 TOPICS = {"/stars": topic("/stars", StarArray, STARS), IMAGES: topic(IMAGES, Image, IMAGE)}
-DETECTOR = Taken(node="/detector", takes=["/camera/capture", IMAGES], makes=["/stars"])
-STRING = "std_msgs/msg/String"
-SOLVER = Taken(node="/solver", takes=["/stars"], makes=["/solver/solution", "/fix"])
 
 
 @pytest.fixture
@@ -38,7 +35,7 @@ def context():
 
 @pytest.fixture
 def node(context):
-    """A node of that context, whose publishers the graph shows at once."""
+    """A node of that context, whose publishers and subscriptions the graph shows at once."""
     node = rclpy.create_node("another", context=context)
     yield node
     node.destroy_node()
@@ -46,16 +43,15 @@ def node(context):
 
 @pytest.fixture
 def player_of(context):
-    """Makes a player of topics, with nodes that take part and at once take everything; and the list of its sentences."""
+    """Makes a player of topics, which has begun; and the list of its sentences."""
     players = []
 
-    def player_of(topics, *nodes):
+    def player_of(*names):
         said = []
-        player = Player(topics, 0.0, [], (context, context), said.append)
+        player = Player([TOPICS[name] for name in names], 0.0, [], (context, context), said.append)
         players.append(player)
-        for words in nodes:
-            player._participants._on_taken(words)
-        player._taken = lambda: None
+        player.wait(0.0, for_solver=False)
+        player.start_round()
         return player, said
 
     yield player_of
@@ -63,86 +59,72 @@ def player_of(context):
         player.close()
 
 
-def doubled(player, said):
-    player._say_doubled()
-    return said
+@pytest.fixture(autouse=True)
+def hasty(monkeypatch):
+    monkeypatch.setattr(module, "SETTLED_S", 0.0)
+    monkeypatch.setattr(module, "FOUND_S", 0.1)
+    monkeypatch.setattr(module, "PATIENCE_S", 0.1)
+    monkeypatch.setattr(module, "AHEAD_S", 0.1)
 
 
-def publishing(node, *names):
-    for name in names:
-        node.create_publisher(String if name == "/fix" else StarArray, name, 1)
+def play(player, name, at_s):
+    player.play(TOPICS[name], at_s * S, bytes(serialize_message(TOPICS[name].kind())))
 
 
-def test_stars_that_are_played_and_made_of_played_images_again_are_named(player_of, node):
-    publishing(node, "/stars")
-    [said] = doubled(*player_of(TOPICS.values(), DETECTOR, SOLVER))
-    assert said.startswith("/stars is in the bag, and is made again of what is played") and "--inputs" in said
-
-
-def test_a_detector_without_images_is_no_second_publisher(player_of, node):
-    publishing(node, "/stars")
-    assert doubled(*player_of([TOPICS["/stars"]], DETECTOR, SOLVER)) == []
-
-
-def test_another_publisher_is_named_beside_a_detector_too(player_of, node):
-    publishing(node, "/stars", "/stars")
-    [said] = doubled(*player_of([TOPICS["/stars"]], DETECTOR, SOLVER))
-    assert said.startswith("/stars is published by another node too")
-
-
-def test_fixes_that_are_played_beside_images_are_made_again_of_the_stars_in_them(player_of, node):
-    publishing(node, "/fix")
-    topics = [TOPICS[IMAGES], topic("/fix", String, STRING)]
-    [said] = doubled(*player_of(topics, DETECTOR, SOLVER))
-    assert said.startswith("/fix is in the bag, and is made again")
+def test_what_is_published_by_another_node_too_is_named(player_of, node):
+    node.create_publisher(StarArray, "/stars", 1)
+    node.create_subscription(StarArray, "/stars", print, 1)
+    _, said = player_of("/stars")
+    assert "of the bag, another node publishes /stars" in said[-1] and "--inputs" in said[-1]
 
 
 @pytest.mark.parametrize(
-    ("nodes", "frames"),
-    [((), 2), ((SOLVER,), 1), ((DETECTOR,), 2), ((DETECTOR, SOLVER), 2)],
-    ids=["nobody", "solver", "detector", "both"],
+    ("heard", "frames"),
+    [((), 2), (("/stars",), 1), ((IMAGES,), 2), (("/stars", IMAGES), 2)],
+    ids=["nothing", "stars", "images", "both"],
 )
-def test_images_that_nobody_takes_are_no_frames_where_somebody_takes_stars(player_of, nodes, frames):
-    player, _ = player_of(TOPICS.values(), *nodes)
-    player._participants.begin()
-    player._first_ns = None
-    for played in TOPICS.values():
-        player.play(played, 1, bytes(serialize_message(played.kind())))
+def test_images_that_nobody_takes_are_no_frames_where_somebody_takes_stars(player_of, node, heard, frames):
+    for name in heard:
+        node.create_subscription(TOPICS[name].kind, name, print, 1)
+    player, said = player_of(*TOPICS)
+    for name in TOPICS:
+        play(player, name, 1)
     assert (player.count, player.frames) == (2, frames)
+    assert any("no node subscribes" in words for words in said) == (not heard)
 
 
-def test_a_tilt_has_its_turn_right_after_the_acceleration_that_completes_it(player_of):
-    inclinometer = Taken(node="/inclinometer", takes=["/imu/data"], makes=["/tilt"])
-    solver = Taken(node="/solver", takes=["/stars", "/tilt"], makes=["/solver/solution"])
-    player, _ = player_of([topic("/imu/data", Imu, IMU)], inclinometer, solver)
-    participants = player._participants
-    participants.begin()
-    player._first_ns = None
-    told, tell = [], participants.tell
+def test_it_waits_for_the_answer_to_a_frame_of_long_before(player_of, node, monkeypatch):
+    monkeypatch.setattr(module, "PATIENCE_S", 10.0)
+    monkeypatch.setattr(module, "AHEAD_S", 1.0)
+    solutions = node.create_publisher(Solution, "/solver/solution", 10)
+    came = []
+    node.create_subscription(StarArray, "/stars", came.append, 10)
+    player, said = player_of("/stars")
+    play(player, "/stars", 1)
+    play(player, "/stars", 2)
+    assert (player.answers, list(player._unanswered)) == (0, [S, 2 * S])
+    solutions.publish(Solution(status=Solution.OK))
+    play(player, "/stars", 3)
+    assert (player.answers, player.fixes, list(player._unanswered)) == (1, 1, [2 * S, 3 * S])
+    assert not player.lost and said == []
 
-    def note(kind, now_ns, name, stamp, *, answer):
-        told.append((name, stamp.sec, answer))
-        tell(kind, now_ns, name, stamp, answer=answer)
 
-    participants.tell = note
+def test_an_answer_that_never_comes_is_named_and_no_longer_waited_for(player_of, node):
+    node.create_publisher(Solution, "/solver/solution", 10)
+    node.create_subscription(StarArray, "/stars", print, 10)
+    player, said = player_of("/stars")
+    for k in range(4):
+        play(player, "/stars", 100 * k + 1)
+    player.end_round()
+    assert player.lost and len(said) == module.MAX_IN_VAIN and "was not answered" in said[0]
 
-    def taken():
-        """What the inclinometer says when the message has its turn: the second one completes a tilt."""
-        made = [Time(sec=7)] if told[-1][1] == 2 else []
-        now = {"replay": participants._replay, "index": participants._index}
-        heard = Taken(node="/inclinometer", takes=["/imu/data"], makes=["/tilt"], stamps=made, **now)
-        participants._on_taken(heard)
 
-    player._taken = taken
-    for k in (1, 2, 3):
-        message = Imu()
-        message.header.stamp.sec = k
-        player.play(topic("/imu/data", Imu, IMU), k * 10**9, bytes(serialize_message(message)))
-    assert told == [
-        ("/imu/data", 1, True),
-        ("/imu/data", 2, True),
-        ("/tilt", 7, False),
-        ("/imu/data", 3, True),
-    ]
-    # and the solver, which takes no accelerations, was not waited for
-    assert not player.lost
+def test_the_next_image_waits_until_a_detector_has_searched_the_last(player_of, node):
+    made = node.create_publisher(StarArray, "/stars", 10)
+    node.create_subscription(Image, IMAGES, print, 10)
+    player, said = player_of(IMAGES)
+    made.publish(StarArray())
+    play(player, IMAGES, 1)
+    assert not player.lost and len(said) == 1
+    play(player, IMAGES, 2)
+    assert player.lost and "was not answered" in said[-1]

@@ -13,7 +13,7 @@ from sensor_msgs.msg import Imu
 
 from starpos.instrument.tilt_log import noise_text
 from starpos.messages.tilt import MIN_MESSAGES, ImuTilts, Reading
-from starpos_common.topics import MatchedSubscription, Take, subscription
+from starpos_common.topics import MatchedSubscription, subscription
 from starpos_inclinometer.sources.source import Counts, Health, Phase, Surroundings, TiltSource
 
 TOPIC = "imu/data"
@@ -41,19 +41,14 @@ class ImuSource(TiltSource):
         self._readings: deque[Reading] = deque(maxlen=QUEUE)
         self._recent: deque[float] = deque(maxlen=QUEUE)
         self._heard_s = self._told_s = -math.inf
-        hear = host.in_turn(TOPIC, self._hear)
         if host.replays:
             # of a replay none may be lost; a simulator may offer best effort only
-            matched = MatchedSubscription(host.node, Imu, TOPIC, hear, DEPTH)
+            matched = MatchedSubscription(host.node, Imu, TOPIC, self._hear, DEPTH)
             host.node.create_timer(LOOK_S, matched.look, clock=Clock(clock_type=ClockType.STEADY_TIME))
             self._topic = matched.topic
         else:
             best_effort = ReliabilityPolicy.BEST_EFFORT
-            self._topic = subscription(host.node, Imu, TOPIC, hear, DEPTH, best_effort).topic_name
-
-    @property
-    def handlers(self) -> Mapping[str, Take]:
-        return {TOPIC: self._hear}
+            self._topic = subscription(host.node, Imu, TOPIC, self._hear, DEPTH, best_effort).topic_name
 
     def restart(self) -> None:
         self._tilts = ImuTilts(self._values)
@@ -67,7 +62,7 @@ class ImuSource(TiltSource):
         self._readings.clear()
         return readings
 
-    def _hear(self, message: Imu, info: Mapping[str, Any]) -> None:
+    def _hear(self, message: Imu) -> None:
         self._heard_s = self._clock.read().monotonic_s
         before = self._tilts.unrest
         reading = self._tilts.receive(message, self._clock.now_ns())

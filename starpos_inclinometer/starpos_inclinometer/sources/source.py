@@ -14,7 +14,6 @@ from typing import Any
 from rclpy.node import Node
 
 from starpos.messages.tilt import Reading
-from starpos_common.topics import Take
 from starpos_inclinometer.clock import HostClock, Moment, Step
 from starpos_interfaces.msg import Pulse
 
@@ -93,15 +92,12 @@ class Health:
 class Surroundings:
     """What a node gives its source: itself, for topics; the host's clock; `wake`, which any thread may call.
 
-    in_turn: makes a topic's callback, from its relative name and the function that takes its messages: in a replay each
-    has its turn.
     replays: whether the node's time is simulated.
     """
 
     node: Node
     clock: HostClock
     wake: Callable[[], object]
-    in_turn: Callable[[str, Take], Take] = lambda name, take: take
     replays: bool = False
 
 
@@ -202,11 +198,6 @@ class TiltSource:
     def refusal(values: Mapping[str, Any]) -> str | None:
         """Say in a sentence why a source cannot be made of these parameters; None if it can."""
         return None
-
-    @property
-    def handlers(self) -> Mapping[str, Take]:
-        """Functions that take the messages of topics, by relative name."""
-        return {}
 
     def start(self) -> None:
         """Begin to listen."""

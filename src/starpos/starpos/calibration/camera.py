@@ -28,9 +28,10 @@ from starpos.fix.star_fit import MatchedStars, sound_matches
 from starpos.frames.frame import Stars
 from starpos.frames.reading import why_no_time
 from starpos.frozen import at_once
-from starpos.identification import Identification, PointingPrior, Sky, fisheye, identify_directions, triangles
+from starpos.identification import Identification, PointingPrior, Sky, field_of, fisheye, identify, triangles
 from starpos.identification.triangles import TriangleCatalogue
 from starpos.instrument.camera import EQUIDISTANT, Camera
+from starpos.instrument.platepar import SkyPixels
 from starpos.progress import Progress, quiet
 from starpos.sky import deeper
 from starpos.sky.catalogue import Catalogue
@@ -331,34 +332,79 @@ def calibrate_camera(
     return FromSky(fit, tuple(sightings))
 
 
+# stars lower than this do not show where a platepar's pixels look
+SEEN_ABOVE_RAD = np.radians(10)
+
+
+def seen_by(
+    camera: Camera, attitude: np.ndarray, site: Place, atmosphere: Atmosphere, utc_unix_s: float
+) -> SkyPixels:
+    """What pixels all over a fixed camera's frame show; attitude (3, 3): east, north, up at the site into C."""
+    xy = _grid(camera, BORDER)
+    xy = xy[camera.sees(*xy.T)]
+    local = camera.directions(*xy.T) @ attitude
+    high = local[:, 2] > np.sin(SEEN_ABOVE_RAD)
+    state = earth_state(utc_unix_s)
+    return SkyPixels(
+        xy=xy[high],
+        icrs=state.of_itrs(atmosphere.refraction().unbend(local[high]) @ site.plumb_axes),
+        utc_unix_s=utc_unix_s,
+        latitude=site.latitude,
+        longitude=site.longitude,
+        height_m=0.0 if np.isnan(site.height_m) else site.height_m,
+    )
+
+
 # Rounds in which one frame's stars are identified again with the lens found so far, and the significance of a k1 to use.
 LENS_ROUNDS, LENS_SIGMA = 3, 3.0
 
 
 def lens_of_frame(
     stars: Stars, found: Identification, given: Camera, catalogue: Catalogue, atmosphere: Atmosphere
-) -> Camera:
-    """A camera with the focal lengths and k1 that one frame's stars show; the given one if they do not show a k1.
+) -> tuple[Camera, float]:
+    """A camera with what one frame's stars show of its lens; the given one if they do not show a k1.
 
     found: of these stars.  given: an ideal camera of about the right focal length.
+
+    Returns the camera, and the error of directions in C (rad, 1 sigma about each axis across the optical axis) by what
+    the stars leave open of the lens. The place of the optical axis is no part of it: its error is one of A3's.
     """
     catalogue = deeper.for_field(catalogue, given)
     table = triangles.cached_triangles(catalogue, fisheye.field_rad(given))
     frame = _Frame.of(stars, None, catalogue, table, None)
-    camera, attitude, free = given, found.attitude, FIRST_FREE[0]
+    k1, off_axis = parameters(given).index("k1"), [p for p in parameters(given) if p not in ("cx", "cy")]
+    camera, attitude, scatter2 = given, found.attitude, found.mean_square_px2
     try:
-        for _ in range(LENS_ROUNDS):
+        for free in (*[FIRST_FREE[0]] * LENS_ROUNDS, off_axis):
             sighting = frame.sighting(camera, atmosphere, attitude)
             if sighting is None:
-                return given
+                break
             fit = fit_camera([sighting], given, atmosphere, free)
             check_invertible(fit.camera)
-            camera, attitude = fit.camera, fit.attitudes[0]
+            if not (fit.determined[k1] and abs(fit.values[k1]) > LENS_SIGMA * fit.sigma[k1]):
+                camera, attitude = given, found.attitude
+                break
+            camera, attitude, scatter2 = fit.camera, fit.attitudes[0], fit.scatter_px**2
+    # what was found with fewer terms holds
     except (CalibrationError, InstrumentError):
-        return given
-    k1 = parameters(given).index("k1")
-    shown = fit.determined[k1] and abs(fit.values[k1]) > LENS_SIGMA * fit.sigma[k1]
-    return camera if shown else given
+        pass
+    sighting = frame.sighting(camera, atmosphere, attitude)
+    return camera, 0.0 if sighting is None else _turned_by_lens(
+        sighting, camera, atmosphere, scatter2, off_axis
+    )
+
+
+def _turned_by_lens(
+    sighting: CameraSighting, camera: Camera, atmosphere: Atmosphere, scatter_px2: float, free: Sequence[str]
+) -> float:
+    """How far (rad, 1 sigma) the terms of a lens that a frame's stars do not show may turn its directions."""
+    problem = CameraAdjustment.of([sighting], camera, atmosphere, free)
+    start = CameraEstimate(np.zeros(len(problem.sigma)), problem.start)
+    errors = problem.stated + np.eye(2) * scatter_px2
+    step, _, covariance = problem.step(start, errors, np.ones(len(errors), bool))
+    bent, turned = (_derivatives(camera, problem.xy, of) for of in (parameters(camera), ()))
+    turns = np.linalg.lstsq(turned, bent, rcond=None)[0][:2] @ problem.named_per_unit()
+    return float(np.sqrt(np.trace(turns @ (covariance + np.outer(step, step)) @ turns.T) / 2))
 
 
 @at_once
@@ -415,7 +461,7 @@ class _Frame:
         stars = self.stars.select(camera.sees(self.stars.x, self.stars.y))
         seen = unbent(camera.directions(stars.x, stars.y), self._level(attitude), atmosphere)
         priors = () if attitude is None else (PointingPrior(attitude, camera.fx),)
-        found = identify_directions(seen, stars.sigma, camera, self.sky, priors)
+        found = identify(field_of(seen, stars.sigma, camera), self.sky, priors)
         if found is None:
             return None
         if found.mirrored:

@@ -110,6 +110,9 @@ def main(argv: list[str] | None = None) -> int:
             # PYTHONWARNINGS may make errors of them
             if sys.warnoptions:
                 warnings.simplefilter("default")
+            # not for each command: it loads what reads instruments
+            if getattr(args, "instrument", None) is not None:
+                import_module("starpos.cli.options").fill_site(args)
             check_call(args)
             status: int = args.run(args)
         # a reader that has gone must be noticed here, and not while the interpreter ends

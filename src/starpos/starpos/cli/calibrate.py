@@ -2,6 +2,7 @@
 """`starpos calibrate`: the camera and A3 from stars, written to files that the other commands read."""
 
 import argparse
+import json
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -10,7 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from starpos.calibration.camera import FromSky, Intrinsics, calibrate_camera, rms
+from starpos import rotation
+from starpos.calibration.camera import FromSky, Intrinsics, calibrate_camera, rms, seen_by
 from starpos.calibration.camera_adjustment import UNLEVELLED, UNTIMED, parameters
 from starpos.calibration.misalignment import NOTHING_KNOWN, Calibrated, Known, calibrate_at, calibrate_fixed
 from starpos.cli import console, inputs, options, overwriting, places_file, watch_output
@@ -20,14 +22,15 @@ from starpos.cli.overwriting import CAMERA_NAME, Written, save_instrument
 from starpos.earth.place import Place
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import CalibrationError, FixError, FrameError, InstrumentError, PlaceError, StarposError
+from starpos.files import write_whole
 from starpos.fix.checks import FIND_TURN, at_another_lean, may_turn
 from starpos.fix.searching import Sight, of_one_camera
 from starpos.fix.solver import Solver
-from starpos.frames.frame import Stars
+from starpos.frames.frame import Frame, Stars
 from starpos.frames.reading import why_no_time
 from starpos.frames.tables import TILTS, Pointing, read_pointings
 from starpos.identification import Identification
-from starpos.instrument import instrument_file
+from starpos.instrument import instrument_file, platepar
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import up_of
 from starpos.instrument.instrument import (
@@ -40,7 +43,7 @@ from starpos.night.opening import frames_in
 from starpos.night.reading import NO_CAMERA, First, Instruments, Reader
 from starpos.night.remarks import WORTH_SAVING_ARCSEC, of_inclinometer, of_left_out
 from starpos.night.together import axis_of, circles_of
-from starpos.night.watching import kept, night_poses
+from starpos.night.watching import Answer, kept, night_poses, sky_mag
 from starpos.night.work import Solving
 from starpos.sky import catalogue
 from starpos.units import ARCSEC
@@ -278,23 +281,18 @@ def _watch(args: argparse.Namespace) -> int:
     """Print how a fixed camera kept its pose, night by night; returns the exit status."""
     if args.frames:
         raise FrameError("--watch names the folder of the nights: leave out the frames")
-    folder = Path(args.watch)
-    try:
-        folders = [folder, *sorted(p for p in folder.iterdir() if p.is_dir())]
-    except OSError as e:
-        raise FrameError(f"{folder}: the folder cannot be read ({e.strerror})") from None
-    args.frames = []
-    for each in folders:
-        # a folder of folders has no frames of its own
-        with suppress(FrameError):
-            args.frames += map(str, frames_in(each))
-    if not args.frames:
-        raise FrameError(f"{folder}: no frames in it, nor in its folders")
+    args.frames = _frames_below(Path(args.watch))
     if args.page is not None:
         overwriting.check(args, Written("--page", args.page, places_file.check_ours))
     site = _site(args)
-    seen = inputs.seen_at("calibrate", args, site)
-    answers = [(sight.solution, camera.fx) for _, sight, camera in seen]
+    answers = [
+        Answer(
+            solution=sight.solution,
+            focal_px=camera.fx,
+            sky_mag=sky_mag(item, sight.stars, sight.solution, camera) if isinstance(item, Frame) else np.nan,
+        )
+        for item, sight, camera in inputs.seen_at("calibrate", args, site)
+    ]
     nights = kept(night_poses(answers, site.longitude))
     for night in nights:
         values = watch_output.values_of(night)
@@ -309,14 +307,32 @@ def _watch(args: argparse.Namespace) -> int:
     return NOTHING if not nights or any(n.alarm for n in nights) else 0
 
 
+def _frames_below(folder: Path) -> list[str]:
+    """The frames of a folder, or of the nights that are folders in it; raises FrameError."""
+    try:
+        folders = [folder, *sorted(p for p in folder.iterdir() if p.is_dir())]
+    except OSError as e:
+        raise FrameError(f"{folder}: the folder cannot be read ({e.strerror})") from None
+    found: list[str] = []
+    for each in folders:
+        # a folder of folders has no frames of its own
+        with suppress(FrameError):
+            found += map(str, frames_in(each))
+    if not found:
+        raise FrameError(f"{folder}: no frames in it, nor in its folders")
+    return found
+
+
 def _open_night(args: argparse.Namespace) -> None:
-    """Put a folder's frames and its tilt.csv in the place of the folder; raises FrameError."""
+    """Put the frames of a folder, or of the nights in it, and its tilt.csv in its place; raises FrameError."""
     folders = [path for path in args.frames if Path(path).is_dir()]
     if not folders:
         return
     if len(args.frames) > 1:
-        raise FrameError(f"{folders[0]}: calibrate takes one night: give one folder, or frames")
-    args.frames = list(map(str, frames_in(Path(folders[0]))))
+        raise FrameError(
+            f"{folders[0]}: calibrate takes one night, or a folder of nights: give one folder, or frames"
+        )
+    args.frames = _frames_below(Path(folders[0]))
     tilts = Path(folders[0]) / TILTS
     if args.tilt is None and not args.fixed and tilts.is_file():
         args.tilt = str(tilts)
@@ -356,6 +372,8 @@ def _written(args: argparse.Namespace) -> Iterator[Written]:
         yield Written("--camera", args.camera, overwriting.camera)
     if args.map is not None:
         yield Written("--map", args.map, overwriting.picture)
+    if args.platepar is not None:
+        yield Written("--platepar", args.platepar, overwriting.never)
     if args.output is not None:
         yield Written("--output", args.output, instrument_file.check_replaceable)
 
@@ -407,11 +425,44 @@ def _camera(
     instrument_file.write_camera(Path(args.camera), whole, CAMERA_NAME, about + _covariance_text(found.fit))
     if args.map is not None:
         _draw(args.map, found)
+    if args.platepar is not None:
+        _write_platepar(args.platepar, found, frames, site, air)
     if args.json:
         console.print_json(_json_of(found, args.camera))
     else:
         print(about, end="")
     return whole
+
+
+# frames of one platepar may lie apart by this, px
+STILL_PX = 3.0
+
+
+def _write_platepar(
+    path: str, found: FromSky, frames: Sequence[Stars], site: Place | None, air: Atmosphere
+) -> None:
+    """Write the camera and the mean pose of its frames for RMS; InstrumentError if they have none."""
+    if site is None:
+        raise InstrumentError("--platepar needs the place of the camera: give --site LAT LON, without --tilt")
+    fit, camera = found.fit, found.fit.camera
+    mean = rotation.mean_rotation(fit.attitudes)
+    apart = max(np.linalg.norm(rotation.to_vector(a @ mean.T)) for a in fit.attitudes) * camera.fx
+    if apart > STILL_PX:
+        raise InstrumentError(
+            f"--platepar is of a camera that stands still, and in these frames it moved by {apart:.0f} px: give frames "
+            "of one pose"
+        )
+    times = [frames[k].mid_unix_s or 0.0 for k in found.used]
+    seen = seen_by(camera, mean, site, air, times[len(times) // 2])
+    plate, worst = platepar.platepar_of(camera, seen)
+    try:
+        write_whole(path, (json.dumps(plate, indent=4, sort_keys=True) + "\n").encode())
+    except OSError as e:
+        raise InstrumentError(f"{path}: the platepar cannot be written there ({e.strerror})") from None
+    console.complain(
+        "calibrate",
+        f"{path}: RMS sees stars within {worst:.2f} px of this camera; the platepar has no photometry",
+    )
 
 
 def _levelled(

@@ -20,8 +20,8 @@ from starpos.night.reading import First
 from starpos.night.remarks import of_inclinometer
 from starpos.night.work import OnFile, ZenithSighted
 from starpos.units import ARCSEC, utc_text
-from starpos.zenith.adjustment import FaceQuality, Reduced, reduced
-from starpos.zenith.doubts import DeflectionSession, remarks
+from starpos.zenith.adjustment import DeflectionSession, FaceQuality, Reduced, reduced
+from starpos.zenith.doubts import checked_session, remarks
 from starpos.zenith.sighting import ZenithSighting
 
 COLUMNS = ("file", "combined", "status", "utc", "face", "heading", "xi_arcsec", "eta_arcsec", "sigma_xi_arcsec",
@@ -29,9 +29,9 @@ COLUMNS = ("file", "combined", "status", "utc", "face", "heading", "xi_arcsec", 
 HEAD = "file: face, heading of the frame's top (deg), xi and eta (arcsec) of the frame alone, with the session's A3"
 
 
-def frame_json(path: str, session: DeflectionSession, k: int) -> dict:
+def frame_json(path: str, found: DeflectionSession, k: int) -> dict:
     """Frame k of a session, with the deflection that it alone has."""
-    s, found = session.sightings[k], session.adjusted
+    s = found.sightings[k]
     xi, eta = found.frame_arcsec[k] + [found.xi_arcsec, found.eta_arcsec]
     sigma_xi, sigma_eta = found.frame_stddev_arcsec[k]
     return {
@@ -59,9 +59,8 @@ def frame_line(value: dict) -> str:
     )
 
 
-def combined_json(session: DeflectionSession, without: Reduced, mark: Place, station: str) -> dict:
+def combined_json(found: DeflectionSession, without: Reduced, mark: Place, station: str) -> dict:
     """The session's value; station: name of the mark, '' for none."""
-    found = session.adjusted
     sigma_xi, sigma_eta = found.sigma_arcsec
     return {
         "combined": True,
@@ -72,15 +71,15 @@ def combined_json(session: DeflectionSession, without: Reduced, mark: Place, sta
             "longitude": np.degrees(mark.longitude),
             "height_m": mark.height_m,
         },
-        "utc": utc_text(session.mid_unix_s),
-        "duration_s": session.sightings[-1].utc_unix_s - session.sightings[0].utc_unix_s,
+        "utc": utc_text(found.mid_unix_s),
+        "duration_s": found.sightings[-1].utc_unix_s - found.sightings[0].utc_unix_s,
         "xi_arcsec": found.xi_arcsec,
         "eta_arcsec": found.eta_arcsec,
         "sigma_xi_arcsec": sigma_xi,
         "sigma_eta_arcsec": sigma_eta,
         "covariance_arcsec2": found.covariance_arcsec2,
         "faces": int(found.faces.max()) + 1,
-        "frames": len(session.sightings),
+        "frames": len(found.sightings),
         "errors": {name: [xi, eta] for name, xi, eta in found.terms},
         "correlations": found.correlations,
         "image_motion_arcsec": found.air.motion / ARCSEC,
@@ -110,9 +109,9 @@ def _face_json(face: FaceQuality) -> dict:
     }
 
 
-def combined_text(session: DeflectionSession, value: dict) -> str:
+def combined_text(found: DeflectionSession, value: dict) -> str:
     """The session's value in a few lines for people."""
-    found, without = session.adjusted, value["reduced"]
+    without = value["reduced"]
     parts = sorted(found.terms, key=lambda term: -np.hypot(*term[1:]))[:5]
     sizes = ", ".join(f"{name} {xi:.3f} {eta:.3f}" for name, xi, eta in parts)
     mark, geoid = without["mark_arcsec"], without["geoid_arcsec"]
@@ -158,7 +157,7 @@ def _of_files(args: argparse.Namespace, mark: Place) -> _Taken | None:
         raise InstrumentError("give frames and --tilt CSV, or a bag")
     read = reader_of(args)
     frames = frames_among(args.frames, args.tilt)
-    with inputs.workers_of(args, len(frames)) as workers:
+    with inputs.workers_of(args, frames) as workers:
         (about,) = workers.map([(First(read), tuple(frames))])
         if about is None:
             # says why
@@ -214,12 +213,12 @@ def _tell(args: argparse.Namespace, taken: _Taken, mark: Place) -> int:
             console.complain("deflection", _why(name, answer))
     sightings = [answer for answer in taken.answers if isinstance(answer, ZenithSighting)]
     try:
-        session = DeflectionSession.of(sightings, taken.instrument, options.atmosphere_of(args), mark)
+        session = checked_session(sightings, taken.instrument, options.atmosphere_of(args), mark)
     except FixError as error:
         console.complain("deflection", error)
         return console.NOTHING
     scale = taken.instrument.inclinometer.scale
-    for said in remarks(session.adjusted, session.sightings, len(rows), scale):
+    for said in remarks(session, len(rows), scale):
         console.complain("deflection", said)
     at = {id(s): k for k, s in enumerate(session.sightings)}
     for name, answer in rows:
@@ -228,7 +227,7 @@ def _tell(args: argparse.Namespace, taken: _Taken, mark: Place) -> int:
             output.put(value, frame_line(value))
         else:
             output.put({"file": name, "status": "left out", "message": _why(name, answer)}, "")
-    without = reduced(session.adjusted, session.sightings, mark)
+    without = reduced(session, mark)
     whole = combined_json(session, without, mark, args.station)
     output.put(whole, combined_text(session, whole))
     return console.UNREADABLE if any(isinstance(a, FrameError) for a in taken.answers) else 0

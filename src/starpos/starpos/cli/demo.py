@@ -10,8 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from starpos.cli import console, inputs, main
-from starpos.night.opening import truth_in
 from starpos.night.remarks import apart_m
+from starpos.simulation.photographs import telephone_at, write_photographs
+from starpos.sky.catalogue import load_catalogue
 from starpos.units import DAY_S, utc_text
 
 # the Sun is at least 20 deg below the horizon at their midnights
@@ -32,37 +33,65 @@ KNOWN = (
 
 def run(args: argparse.Namespace) -> int:
     folder = Path(args.out)
-    night, places = f"{folder / 'night'}", f"{folder / 'place.geojson'}"
     rng = np.random.default_rng(args.seed)
-    latitude, longitude = rng.uniform(-MAX_LATITUDE_DEG, MAX_LATITUDE_DEG), rng.uniform(-180, 180)
-    place = ("--latitude", f"{latitude}", "--longitude", f"{longitude}", "--start", _midnight(longitude))
+    place_deg = rng.uniform(-MAX_LATITUDE_DEG, MAX_LATITUDE_DEG), rng.uniform(-180, 180)
+    try:
+        call = (_photographs if args.photo else _night)(folder, place_deg, rng)
+    except _Failed as e:
+        return e.status
+    places = folder / "place.geojson"
+    calls = [("solve", *call, "-o", f"{places}")]
+    if find_spec("matplotlib") is None:
+        console.complain("demo", f"without a page, which is drawn with matplotlib: {inputs.PIP}")
+    else:
+        calls.append(("report", *call, "-o", f"{folder / 'page.html'}"))
+    for command in calls:
+        print(f"\n$ starpos {' '.join(command)}", flush=True)
+        if status := main(list(command)):
+            return status
+    (found,) = (
+        f["properties"]
+        for f in json.loads(places.read_text(encoding="utf-8"))["features"]
+        if f["properties"].get("combined")
+    )
+    (north, east), (true_north, true_east) = np.radians([[found["latitude"], found["longitude"]], place_deg])
+    off_m = apart_m((north, east), (true_north, true_east))
+    off = f"{off_m:.0f} m" if off_m < 10e3 else f"{off_m / 1000:.0f} km"
+    print(f"\nthe place that was hidden: {place_deg[0]:+.6f} {place_deg[1]:+.6f}, {off} from the one found")
+    return 0
+
+
+class _Failed(Exception):
+    """A command of the demo ended with this exit status."""
+
+    def __init__(self, status: int):
+        super().__init__(status)
+        self.status = status
+
+
+def _night(folder: Path, place_deg: tuple[float, float], rng: np.random.Generator) -> tuple[str, ...]:
+    """Draw a night of frames and tilts; the arguments that solve it."""
+    night = f"{folder / 'night'}"
+    latitude, longitude = map(str, place_deg)
+    place = ("--latitude", latitude, "--longitude", longitude, "--start", _midnight(place_deg[1]))
     print(
         f"$ starpos simulate {night} {' '.join(DRAWN)}    # at a place that is not printed, at midnight",
         flush=True,
     )
     if status := main(["simulate", night, *DRAWN, *place]):
-        return status
-    calls = [("solve", night, *KNOWN, "-o", places)]
-    if find_spec("matplotlib") is None:
-        console.complain("demo", f"without a page, which is drawn with matplotlib: {inputs.PIP}")
-    else:
-        calls.append(("report", night, *KNOWN, "-o", f"{folder / 'page.html'}"))
-    for call in calls:
-        print(f"\n$ starpos {' '.join(call)}", flush=True)
-        if status := main(list(call)):
-            return status
-    truth = truth_in(Path(night))
-    (found,) = (
-        f
-        for f in json.loads(Path(places).read_text(encoding="utf-8"))["features"]
-        if f["properties"].get("combined")
+        raise _Failed(status)
+    return night, *KNOWN
+
+
+def _photographs(folder: Path, place_deg: tuple[float, float], rng: np.random.Generator) -> tuple[str, ...]:
+    """Draw photographs of a telephone; their paths are all that solves them."""
+    print("drawing photographs of a telephone at a place that is not printed, at midnight", flush=True)
+    scene = telephone_at(*place_deg, azimuth_deg=rng.uniform(0, 360))
+    start = _midnight(place_deg[1])
+    written = write_photographs(
+        folder / "photographs", scene, load_catalogue(), start, rng, console.ProgressBar()
     )
-    at = np.radians([found["properties"][name] for name in ("latitude", "longitude")])
-    assert truth is not None
-    off_m = apart_m((at[0], at[1]), (truth.latitude, truth.longitude))
-    where = np.degrees([truth.latitude, truth.longitude])
-    print(f"\nthe place that was hidden: {where[0]:+.6f} {where[1]:+.6f}, {off_m:.0f} m from the one found")
-    return 0
+    return tuple(map(str, written))
 
 
 def _midnight(longitude_deg: float) -> str:

@@ -23,7 +23,7 @@ def run(args: argparse.Namespace) -> int:
     output = Output(args, COLUMNS, "")
     args.frames = frames_among(args.frames)
     status, work, number = 0, OnFile(Reader(), detected), len(args.frames)
-    with inputs.workers_of(args, number) as workers:
+    with inputs.workers_of(args, args.frames) as workers:
         answers = inputs.watched(workers.map((work, path) for path in args.frames), number)
         for path, answer in zip(args.frames, answers, strict=True):
             if isinstance(answer, FrameError):

@@ -84,7 +84,9 @@ def _watched(args: argparse.Namespace, folder: Path) -> tuple[FirstNight | None,
             seen.add(path)
             waited = time.monotonic()
             if night is None:
-                given = given_of(args, About(item.width, item.height, item.focal_px, item.origin_px))
+                given = given_of(
+                    args, About(item.width, item.height, focal_px=item.focal_px, origin_px=item.origin_px)
+                )
                 air = options.atmosphere_of(args)
                 night = FirstNight(Solver(options.instrument_of(args, item), catalogue.load_catalogue(), air))
             sight = Solving(given)(item)

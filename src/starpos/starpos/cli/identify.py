@@ -31,7 +31,7 @@ def run(args: argparse.Namespace) -> int:
     lost: Stars | None = None
     complaints = console.FrameComplaints("identify")
     read, output = reader_of(args), Output(args, COLUMNS, HEAD)
-    with inputs.workers_of(args, number) as workers:
+    with inputs.workers_of(args, args.frames) as workers:
         solving = inputs.identifying("identify", args, args.frames, read, workers, args.search_time)
         work = OnFile(read, solving)
         answers = inputs.watched(workers.map((work, path) for path in args.frames), number)

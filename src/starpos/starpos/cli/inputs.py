@@ -28,7 +28,7 @@ from starpos.night.opening import work_of
 from starpos.night.reading import About, First, Instruments, Reader, TiltFile
 from starpos.night.remarks import NEAR_KM, Near, of_tilts
 from starpos.night.work import Solving
-from starpos.parallel.processes import Here, Workers, processors, workers
+from starpos.parallel.processes import Here, Workers, memory_bytes, processors, workers
 from starpos.progress import quiet
 from starpos.recording.drivers import Drivers
 from starpos.recording.topics import Remaps
@@ -245,9 +245,17 @@ def read_bag(path: Path, args: argparse.Namespace) -> "tuple[Recorded, Instrumen
     return found, Instruments(any_camera, cameras=cameras, any_size=told)
 
 
-def workers_of(args: argparse.Namespace, frames: int) -> Workers:
-    """The workers that the options ask for, with no more processes than frames."""
-    return workers(min(processors() if args.jobs == 0 else args.jobs or 1, frames))
+# Frames of a picture's size that are worth the start of a process, which takes a second of CPU time; and its memory.
+FRAMES_A_PROCESS, PICTURE_BYTES, PROCESS_BYTES = 8, 1_000_000, 1 << 30
+
+
+def workers_of(args: argparse.Namespace, paths: Sequence[str]) -> Workers:
+    """The workers that --jobs asks for, no more than files; by default as many as pay and have memory."""
+    most = len(paths)
+    if args.jobs is None:
+        pictures = sum(os.path.isfile(path) and os.path.getsize(path) > PICTURE_BYTES for path in paths)
+        most = min(pictures // FRAMES_A_PROCESS, memory_bytes() // PROCESS_BYTES)
+    return workers(min(args.jobs or processors(), most))
 
 
 def watched(answers: Iterable, number: int, what: str = "frame", lines: bool = True) -> Iterator:

@@ -15,9 +15,8 @@ from starpos.cli.fix_output import FIX_KEYS, HEAD
 from starpos.cli.inputs import frames_among, given_of, reader_of
 from starpos.cli.options import tell_unknown, vertical_of
 from starpos.earth.orientation import earth_orientation
-from starpos.earth.vertical import Geodetic, Vertical, geodetic
+from starpos.earth.vertical import Geodetic, Vertical
 from starpos.errors import FixError, VoyageError
-from starpos.fix.fix import InDegrees
 from starpos.instrument.instrument import framed
 from starpos.navigation.estimate import VoyageFix
 from starpos.navigation.voyage import Voyage
@@ -62,7 +61,7 @@ def run(args: argparse.Namespace) -> int:
         drift_change=args.drift_change,
         height_m=args.altitude_m,
     )
-    with inputs.workers_of(args, number) as workers:
+    with inputs.workers_of(args, args.frames) as workers:
         (about,) = workers.map([(First(read), tuple(args.frames))])
         if about is None:
             raise VoyageError(f"none of the {number} frames can be read: give star lists or frames")
@@ -118,11 +117,10 @@ def json_of(fix: VoyageFix | None, vertical: Vertical) -> dict:
     """The keys of --json that come from a fix; all None without a fix."""
     if fix is None:
         return dict.fromkeys(KEYS)
-    ground = geodetic(fix.latitude, fix.longitude, fix.heading, fix.covariance, vertical)
+    ground = fix.on_ground(vertical)
     return {key: value(fix, ground) for key, value in KEYS.items()}
 
 
 def text_of(fix: VoyageFix) -> str:
     """The line of a fix for people."""
-    place = InDegrees.of(fix.latitude, fix.longitude, fix.heading, fix.covariance)
-    return f"{place}, {np.hypot(*fix.velocity[:2]):.2f} m/s"
+    return f"{fix.in_degrees}, {np.hypot(*fix.velocity[:2]):.2f} m/s"

@@ -16,7 +16,7 @@ from starpos.fix.directions import OPTICAL_AXIS
 from starpos.frames.exif import CameraClock
 from starpos.frames.exposure import Shutter
 from starpos.frames.frame import Frame, Stars
-from starpos.instrument import instrument, instrument_file, sensors
+from starpos.instrument import instrument, instrument_file, platepar, sensors
 from starpos.instrument.camera import PLUMB_BOB, Camera
 from starpos.night.reading import About
 
@@ -40,6 +40,18 @@ def has_own_level(args: argparse.Namespace) -> bool:
             "and --self-calibrate, or give another instrument file"
         )
     return True
+
+
+def fill_site(args: argparse.Namespace) -> None:
+    """Take the place that a file of RMS given as --instrument states, on WGS 84; --site and --tilt come first."""
+    if (
+        not platepar.is_rms(args.instrument)
+        or getattr(args, "site", ()) is not None
+        or getattr(args, "tilt", None)
+    ):
+        return
+    station = platepar.read(args.instrument)
+    args.site, args.geodetic = [station.latitude_deg, station.longitude_deg], True
 
 
 FILES_OWN = "file"

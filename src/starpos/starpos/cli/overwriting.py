@@ -78,6 +78,11 @@ def camera(path: Path) -> None:
         raise _there(path, "starpos calibrate did not write it in this form")
 
 
+def never(path: Path) -> None:
+    """The check of a file that holds other programs' work too: it is never replaced."""
+    raise InstrumentError(f"{path}: it is there already, and may hold more than starpos writes")
+
+
 def picture(path: Path) -> None:
     """The check of a picture: a PNG names the program that made it."""
     if not (path.is_file() and path.suffix.lower() == ".png" and files.has_mark(path)):

@@ -31,7 +31,7 @@ def run(args: argparse.Namespace) -> int:
     # a wrong parameter is reported once, not for each bag
     Drivers.of(args.params_file, args.param, args.namespace)
     work = Playing(args.params_file, tuple(args.param), args.namespace, Remaps.of(args.remap))
-    with inputs.workers_of(args, len(args.bags)) as workers:
+    with inputs.workers_of(args, args.bags) as workers:
         answers = inputs.watched(workers.map((work, bag) for bag in args.bags), len(args.bags), "bag")
         return max(
             tell(args, output, bag, night, settings.vertical)

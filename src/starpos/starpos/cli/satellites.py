@@ -65,8 +65,9 @@ def run(args: argparse.Namespace) -> int:
     usable, about = chosen(_orbits(args.elements), begin, newer=args.newer_elements)
     for sentence in about:
         console.complain("satellites", sentence)
+    prior = _prior(args, begin)
     try:
-        fix = locate(trails, usable, _prior(args, begin))
+        fix = locate(trails, usable, prior)
     except SatelliteError as e:
         return _refused(args, str(e))
     for k, trail in enumerate(trails):
@@ -117,7 +118,7 @@ def _look(args: argparse.Namespace, frames: list[str], seen: SeenTrails) -> None
     """Add the frames and their trails, numbered on; complains of frames without, and of trails that are left out."""
     number = 1 + max((trail.track for trail in seen.trails), default=-1)
     complaints, read = console.FrameComplaints("satellites"), inputs.reader_of(args)
-    with inputs.workers_of(args, len(frames)) as workers:
+    with inputs.workers_of(args, frames) as workers:
         solving = inputs.identifying("satellites", args, frames, read, workers, SEARCH_S)
         work = OnFile(read, TrailSighted(solving))
         answers = inputs.watched(workers.map((work, path) for path in frames), len(frames))

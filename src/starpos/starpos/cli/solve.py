@@ -42,6 +42,7 @@ from starpos.errors import InstrumentError, StarposError, TiltError
 from starpos.fix.blind import BlindSolver
 from starpos.fix.solution import Solution, status_of
 from starpos.fix.solver import Solver
+from starpos.frames.reading import are_photographs
 from starpos.frames.tables import Pointing, read_pointings
 from starpos.gnss import states
 from starpos.gnss.receiver import read_gnss_csv
@@ -49,6 +50,7 @@ from starpos.gnss.solving import Watched
 from starpos.gnss.states import Learned
 from starpos.instrument import instrument_file
 from starpos.instrument.instrument import ByGravity, Instrument
+from starpos.instrument.phone_log import is_phone_log
 from starpos.instrument.tilt_log import NO_TILTS, Tilts
 from starpos.night import field
 from starpos.night.opening import work_of
@@ -329,9 +331,10 @@ def _run(args: argparse.Namespace) -> int:
         raise InstrumentError("--save writes the A3 of one night: give one")
     nights = [night for night in given if isinstance(night, NightFolder)]
     by_gravity = not needs_no_tilt and any(night.tilt is None for night in nights)
-    read = reader_of(args, by_gravity)
+    by_log = args.tilt is not None and is_phone_log(Path(args.tilt)) and are_photographs(args.frames)
+    read = reader_of(args, by_gravity or by_log)
     statuses = [_refused(why, given) for why in given if not isinstance(why, NightFolder)]
-    with inputs.workers_of(args, sum(len(night.frames) for night in nights)) as workers:
+    with inputs.workers_of(args, [path for night in nights for path in night.frames]) as workers:
         plans = []
         abouts = workers.map((First(read, by_gravity), night.frames) for night in nights)
         for night, about in zip(nights, abouts, strict=True):

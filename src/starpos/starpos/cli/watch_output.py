@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """How a camera that stands still has kept its pose: a line and a JSON object a night, and a page of the history."""
 
+import math
 from collections.abc import Sequence
 from html import escape
 from pathlib import Path
 
 from starpos.errors import InstrumentError
 from starpos.files import write_whole
-from starpos.night.watching import ALARM_SIGMAS, Kept
+from starpos.night.watching import Kept
 from starpos.report.html import document, wide_table
 from starpos.units import ARCSEC, utc_text
 
@@ -21,6 +22,7 @@ COLUMNS = {
     "sigma_arcsec": ("1 sigma", "{:.1f}"),
     "focal_px": ("focal length, px", "{:.3f}"),
     "limit_mag": ("limit, V", "{:.1f}"),
+    "sky_mag": ("sky, V per square arcsec", "{:.2f}"),
     "alarm": ("", "{}"),
 }
 TITLE = "A camera that stands still"
@@ -41,16 +43,18 @@ def values_of(night: Kept) -> dict:
         "turned_arcsec": (night.turned / ARCSEC).tolist(),
         "focal_px": pose.focal_px,
         "limit_mag": pose.limit_mag,
+        "sky_mag": pose.sky_mag,
         "alarm": night.alarm,
     }
 
 
 def line_of(values: dict) -> str:
     """Text of a night for people."""
+    sky = "" if math.isnan(values["sky_mag"]) else ", sky V {sky_mag:.2f} per square arcsec"
     return (
         "{night}: {frames} frames, {stars} stars, moved by {moved_arcsec:.1f} +- {sigma_arcsec:.1f} arcsec, focal length "
-        "{focal_px:.3f} px, limit V {limit_mag:.1f}".format(**values)
-    )
+        "{focal_px:.3f} px, limit V {limit_mag:.1f}" + sky
+    ).format(**values)
 
 
 def alarm_of(night: Kept) -> str:
@@ -80,7 +84,7 @@ def write_page(path: Path, nights: Sequence[Kept]) -> None:
     ]
     about = (
         f"{len(rows)} nights. Bars: how far each pose is from the mean of those before, up to {most:.0f} arcsec; red "
-        f"where it is more than {ALARM_SIGMAS:g} sigma."
+        "where it has moved."
     )
     parts = (
         f"<h1>{TITLE}</h1><p>{about}</p>",

@@ -7,7 +7,7 @@ from libc.string cimport memcmp, memcpy, memset
 
 import numpy as np
 
-from starpos._numeric.limits cimport unsigned_char, within
+from starpos._numeric.limits cimport check_stamps, unsigned_char, within
 from starpos._numeric.memory cimport room_for, start_of
 from starpos.detection._psf cimport BLOCK, Local, blocks, evaluate, local_of, sound, values
 from starpos.detection._sums cimport (
@@ -515,14 +515,7 @@ cdef int _check_stamps(
     """Raise ValueError unless shapes and phases of stamps (N, S, S) are what a fit reads."""
     cdef Py_ssize_t n = signal.shape[0], size = signal.shape[1], k, row, column
     cdef bint alternate = True
-    for name, shape in (
-        ("signal", (n, size, signal.shape[2])),
-        ("noise", (noise.shape[0], noise.shape[1], noise.shape[2])),
-        ("good", (good.shape[0], good.shape[1], good.shape[2])),
-        ("phase", (phase.shape[0], phase.shape[1], phase.shape[2])),
-    ):
-        if shape != (n, size, size):
-            raise ValueError(f"{name} has the shape {shape}; {(n, size, size)} is needed")
+    check_stamps(signal.shape, 3, [&noise.shape[0], &good.shape[0], &phase.shape[0]])
     if not within[unsigned_char](&phase[0, 0, 0], n * size * size, 0, rules.phases - 1):
         raise ValueError(f"a pixel of phase {np.max(phase)}: there are {rules.phases}")
     # each pixel has the phase of the next but one in its row

@@ -11,7 +11,7 @@ from libc.string cimport memset
 import numpy as np
 
 from starpos._numeric.algebra cimport factored, middle, solved
-from starpos._numeric.limits cimport unsigned_char, within
+from starpos._numeric.limits cimport check_stamps, unsigned_char, within
 from starpos._numeric.memory cimport room_for, start_of
 from starpos._numeric.wide cimport eights, fused_void, lanes, sum_of
 from starpos.detection._psf cimport BLOCK, MONOMIALS, ORDERS, Local, blocks, evaluate, local_of, scaled, sound, terms_at
@@ -158,14 +158,8 @@ def marginal_equations(
     cdef Pixels pixels
     cdef Local psf
     sound(axes, series, n)
-    for images, rows, columns in (
-        (brightness.shape[0], brightness.shape[1], brightness.shape[2]),
-        (weight.shape[0], weight.shape[1], weight.shape[2]),
-        (phase.shape[0], phase.shape[1], phase.shape[2]),
-    ):
-        if (images, rows, columns) != (n, size, size):
-            raise ValueError(f"pixels {(images, rows, columns)}: {(n, size, size)} are needed")
-    if top.shape[0] != n or orders.shape[1] != 2 or phases not in (1, 4):
+    check_stamps(brightness.shape, 2, [&weight.shape[0], &phase.shape[0]])
+    if not (n == brightness.shape[0] == top.shape[0]) or orders.shape[1] != 2 or phases not in (1, 4):
         raise ValueError(f"{top.shape[0]} rows, {phases} phases, orders of {orders.shape[1]} numbers: {n} rows, 1 or 4, 2")
     if not within[unsigned_char](&phase[0, 0, 0], phase.shape[0] * phase.shape[1] * phase.shape[2], 0, phases - 1):
         raise ValueError(f"a pixel of phase {np.max(phase)}: there are {phases}")
@@ -453,22 +447,6 @@ cdef (double, double) _fit_noise(const Light *p, double photon, double misfit2, 
     return photon + sqrt(2 / max(sums[0], 1e-12)), misfit2
 
 
-cdef int _alike(
-    const float[:, :, ::1] noise, const float[:, :, ::1] model, const float[:, :, ::1] residual,
-    const unsigned char[:, :, ::1] used, const float[:, :, ::1] leverage,
-) except -1:
-    """Raise ValueError unless images of fits have the shape of the stamps' noise."""
-    for name, fits, height, width in (
-        ("model", model.shape[0], model.shape[1], model.shape[2]),
-        ("residual", residual.shape[0], residual.shape[1], residual.shape[2]),
-        ("used", used.shape[0], used.shape[1], used.shape[2]),
-        ("leverage", leverage.shape[0], leverage.shape[1], leverage.shape[2]),
-    ):
-        if (fits, height, width) != (noise.shape[0], noise.shape[1], noise.shape[2]):
-            raise ValueError(f"{name} has the shape {(fits, height, width)}: it must be that of the noise")
-    return 0
-
-
 def light_noise(
     const float[:, :, ::1] noise, const float[:, :, ::1] model, const float[:, :, ::1] residual,
     const unsigned char[:, :, ::1] used, const float[:, :, ::1] leverage, double photon, double misfit, double outlier,
@@ -483,7 +461,7 @@ def light_noise(
     cdef Py_ssize_t pixels = noise.shape[0] * noise.shape[1] * noise.shape[2], room = pixels + LANES, j
     cdef double misfit2
     cdef Light p
-    _alike(noise, model, residual, used, leverage)
+    check_stamps(noise.shape, 4, [&model.shape[0], &residual.shape[0], &used.shape[0], &leverage.shape[0]])
     columns = room_for(3 * room * sizeof(double))
     p.noise2 = <double *>start_of(columns)
     p.count, p.light, p.square = 0, p.noise2 + room, p.noise2 + 2 * room
@@ -512,7 +490,7 @@ def strangeness(
     """
     cdef Py_ssize_t n = model.shape[0], area = noise.shape[1] * noise.shape[2], k, j
     cdef double light2, left, scatter, noise2
-    _alike(noise, model, residual, used, leverage)
+    check_stamps(noise.shape, 4, [&model.shape[0], &residual.shape[0], &used.shape[0], &leverage.shape[0]])
     out = np.empty((2, n))
     cdef double[:, ::1] found = out
     with nogil:
@@ -542,8 +520,7 @@ def phase_fluxes(
     cdef Py_ssize_t n = signal.shape[0], area = signal.shape[1] * signal.shape[2], k, j
     cdef double light, weight, misfit2 = misfit * misfit
     cdef int p
-    _alike(noise, signal, value, good, value)
-    _alike(noise, signal, value, phase, value)
+    check_stamps(noise.shape, 4, [&signal.shape[0], &value.shape[0], &good.shape[0], &phase.shape[0]])
     fluxes, weights = np.zeros((2, n, phases))
     cdef double[:, ::1] flux = fluxes
     cdef double[:, ::1] information = weights
@@ -579,8 +556,7 @@ def unit_light(
     cdef Py_ssize_t n = noise.shape[0], area = noise.shape[1] * noise.shape[2], k, j
     cdef float light, sky
     cdef double scale
-    _alike(noise, model, model, used, model)
-    _alike(noise, signal, signal, phase, signal)
+    check_stamps(noise.shape, 4, [&model.shape[0], &used.shape[0], &signal.shape[0], &phase.shape[0]])
     if flux.shape[0] != n or gains.shape[0] != n:
         raise ValueError(f"{flux.shape[0]} fluxes and {gains.shape[0]} gains of {n} fits: one each is needed")
     if n and np.max(phase, initial=0) >= gains.shape[1]:

@@ -7,6 +7,7 @@ from libc.math cimport log, sqrt
 import numpy as np
 
 from starpos._numeric.algebra cimport level_and_scatter, middle
+from starpos._numeric.limits cimport check_stamps
 from starpos._numeric.memory cimport room_for, start_of
 
 cdef struct Rim:
@@ -54,7 +55,7 @@ def correct_sky(float[:, :, ::1] signal, float[:, :, ::1] noise, double per_mad,
     cdef double sky, spread, light
     cdef float up, wider
     cdef Rim rim
-    _check_shape(signal.shape, noise.shape)
+    check_stamps(signal.shape, 1, [&noise.shape[0]])
     room = room_for(2 * area * sizeof(double))
     rim.score = <double *>start_of(room)
     rim.noise = rim.score + area
@@ -89,9 +90,7 @@ def replace_spikes(
     cdef float *own
     cdef const float *sky
     cdef const unsigned char *part
-    _check_shape(signal.shape, noise.shape)
-    _check_shape(signal.shape, good.shape)
-    _check_shape(signal.shape, phase.shape)
+    check_stamps(signal.shape, 3, [&noise.shape[0], &good.shape[0], &phase.shape[0]])
     if sharpest.shape[0] != n or (n and np.max(phase) >= gain.shape[0]):
         raise ValueError(f"{sharpest.shape[0]} sharpest and {gain.shape[0]} gains for {n} stars: one each, and of each phase")
     out = np.zeros((n, size, size), np.uint8)
@@ -128,15 +127,6 @@ cdef float _beside(const float *signal, const unsigned char *phase, const float 
     return total * <float>0.25
 
 
-cdef int _check_shape(const Py_ssize_t *stamps, const Py_ssize_t *other) except -1:
-    """Raise ValueError unless other pixels have the shape of stamps, which are squares."""
-    if stamps[1] != stamps[2] or not stamps[1] or not (other[0] == stamps[0] and other[1] == other[2] == stamps[1]):
-        raise ValueError(
-            f"pixels {(other[0], other[1], other[2])} of stamps {(stamps[0], stamps[1], stamps[2])}: as many are needed"
-        )
-    return 0
-
-
 def restore_model(
     float[:, :, ::1] signal, const float[:, :, ::1] noise, const unsigned char[:, :, ::1] spike,
     const float[:, :, ::1] model, const unsigned char[:, :, ::1] outlier, int speck, float loud,
@@ -150,10 +140,7 @@ def restore_model(
     cdef float least
     cdef float *own
     cdef const float *sky
-    _check_shape(signal.shape, noise.shape)
-    _check_shape(signal.shape, spike.shape)
-    _check_shape(signal.shape, model.shape)
-    _check_shape(signal.shape, outlier.shape)
+    check_stamps(signal.shape, 4, [&noise.shape[0], &spike.shape[0], &model.shape[0], &outlier.shape[0]])
     with nogil:
         for k in range(n):
             own, sky, outliers, least = &signal[k, 0, 0], &noise[k, 0, 0], 0, noise[k, 0, 0]
@@ -183,14 +170,10 @@ def describe_stars(
     cdef Py_ssize_t n = signal.shape[0], k, a
     cdef int size = signal.shape[1], row, column, place
     cdef double dx, dy, u, v, distance2, score, matched, foreign, near2 = core * core, far2 = wider * wider
-    _check_shape(signal.shape, noise.shape)
-    _check_shape(signal.shape, good.shape)
-    _check_shape(signal.shape, full.shape)
-    _check_shape(signal.shape, spike.shape)
-    _check_shape(signal.shape, residual.shape)
-    _check_shape(signal.shape, model.shape)
-    _check_shape(signal.shape, used.shape)
-    _check_shape(signal.shape, outlier.shape)
+    check_stamps(signal.shape, 8, [
+        &noise.shape[0], &good.shape[0], &full.shape[0], &spike.shape[0], &residual.shape[0], &model.shape[0],
+        &used.shape[0], &outlier.shape[0]
+    ])
     if left.shape[0] != n or top.shape[0] != n or axes.shape[0] not in (1, n) or axes.shape[1] != 2 or axes.shape[2] != 2:
         raise ValueError(f"{left.shape[0]} places and {axes.shape[0]} axes for {n} stars: one each is needed")
     sums_, marks_ = np.empty((2, n)), np.zeros((2, n), np.uint8)
@@ -235,11 +218,7 @@ def compare_with_pixel(
     cdef Py_ssize_t n = signal.shape[0], k
     cdef int size = signal.shape[1], middle_ = size // 2, row, column, count, white
     cdef double score, most, one, star, light, sky2, variance
-    _check_shape(signal.shape, noise.shape)
-    _check_shape(signal.shape, good.shape)
-    _check_shape(signal.shape, full.shape)
-    _check_shape(signal.shape, residual.shape)
-    _check_shape(signal.shape, model.shape)
+    check_stamps(signal.shape, 5, [&noise.shape[0], &good.shape[0], &full.shape[0], &residual.shape[0], &model.shape[0]])
     if not 0 <= half <= middle_:
         raise ValueError(f"{half} px around the middle of stamps of {size} px: they have no such pixels")
     sums_, counts_ = np.empty((2, n)), np.empty((2, n), np.int64)
@@ -294,7 +273,7 @@ def brightest_left(
     cdef Py_ssize_t n = residual.shape[0], k, a
     cdef int size = residual.shape[1], reach = weight.shape[0] - 1, row, column, j
     cdef double dx, dy, u, v, value, most
-    _check_shape(residual.shape, good.shape)
+    check_stamps(residual.shape, 1, [&good.shape[0]])
     if left.shape[0] != n or top.shape[0] != n or axes.shape[0] not in (1, n) or axes.shape[1] != 2 or axes.shape[2] != 2:
         raise ValueError(f"{left.shape[0]} places and {axes.shape[0]} axes for {n} stars: one each is needed")
     if not 0 <= reach < size:

@@ -98,6 +98,14 @@ class EarthState:
         deflected = erfa.ldsun(v, astrom["eh"], astrom["em"])
         return erfa.ab(deflected, astrom["v"], astrom["em"], astrom["bm1"]) @ self.gcrs_to_itrs.T
 
+    def of_itrs(self, v: np.ndarray) -> np.ndarray:
+        """Turn geocentric apparent directions (N, 3) in ITRS back into ICRS ones (N, 3); the inverse of `to_itrs`."""
+        found = start = v @ self.gcrs_to_itrs
+        # each round leaves 1e-4 of the error
+        for _ in range(3):
+            found = found + start - self.to_itrs(found) @ self.gcrs_to_itrs
+        return found / np.linalg.norm(found, axis=-1, keepdims=True)
+
 
 def earth_state(utc_unix_s: float, orientation: EarthOrientation | None = None) -> EarthState:
     """EarthState at UTC seconds since 1970; TimeError if the Earth orientation of that time is unknown.

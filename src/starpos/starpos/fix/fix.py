@@ -15,6 +15,7 @@ from starpos.earth.vertical import Geodetic, Vertical, geodetic
 from starpos.fix.attitude import CAMERA, ITRS, Attitude, heading_of
 from starpos.fix.budget import (
     Circumstances,
+    lens_term,
     level_rows,
     link_attitude,
     local_north,
@@ -202,6 +203,7 @@ def solve_fix(stars: MatchedStars, tilt: Tilt, about: Circumstances) -> Fix:
         catalogue,
         *tilt_terms(of_level, level, tilt, mounting, about.earth.utc_unix_s),
         *of_air,
+        *lens_term(of_sky, g, mounting),
         *sky_terms(of_sky, about.earth, about.clock_stddev_s, about.stamp_stddev_s, a4),
         *mount_term("mount", link_to_enu, mounting.link_stddev_rad),
     )

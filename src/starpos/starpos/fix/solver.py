@@ -39,15 +39,13 @@ from starpos.frames.exposure import GLOBAL_SHUTTER, UNKNOWN_SHUTTER, Shutter
 from starpos.frames.frame import EDGE_PX, Stars
 from starpos.frames.reading import why_no_time
 from starpos.frames.tables import Pointing
-from starpos.identification import MIN_STARS, Identification, PointingPrior, Sky, fisheye, identify_directions
+from starpos.identification import MIN_STARS, Identification, PointingPrior, Sky, field_of, fisheye, identify
 from starpos.identification._frame import FrameStars, all_within, ideal_frame, mean_sigma, unit_vectors
 from starpos.identification.pose import MIN_SIGMA_PX, TEST_STARS
 from starpos.identification.prior import Hint
 from starpos.identification.search import (
     Look,
     Priors,
-    field_of,
-    identify_frame,
     identify_near,
     second_look,
     through,
@@ -84,7 +82,7 @@ def directions_of(camera: Camera, stars: Stars) -> np.ndarray:
 
 
 def as_seen(camera: Camera, stars: Stars) -> FrameStars | None:
-    """The stars as `identify_frame` takes them, refracted; None unless all lie on the frame of an ideal camera.
+    """The stars as `identify` takes them, refracted; None unless all lie on the frame of an ideal camera.
 
     For such a camera this is quicker than by their directions.
     """
@@ -143,7 +141,7 @@ class Solver:
         Stars without a time have J2000 places.
         part: of the frame in which its stars lie, as a share of its size: triangles that are looked up are no larger.
         """
-        return self._identified(stars, part, lambda field, sky, _: identify_frame(field, sky, predicted))
+        return self._identified(stars, part, lambda field, sky, _: identify(field, sky, predicted))
 
     def look_again(self, stars: Stars, look: Look, predicted: Priors = (), part: float = 1.0) -> Solution:
         """Identify stars that alone are too few, by what their frame shows where others should be.
@@ -208,7 +206,7 @@ class Solver:
             sky = Sky(catalogue, triangles, state.year, tuple(state.velocity))
             field = field_of(directions, mean_sigma(stars.covariance), camera, stars.window)
             if known is None:
-                found = identify_frame(field, sky, (*predicted, *(hint.priors(state, g[2]) if hint else ())))
+                found = identify(field, sky, (*predicted, *(hint.priors(state, g[2]) if hint else ())))
             elif isinstance(known, Hint):
                 found = identify_near(field, sky, known.priors(state, g[2]))
             else:
@@ -264,13 +262,16 @@ class Solver:
         state = earth_state(frame.mid_unix_s)
         if self.instrument.vertical is not None:
             tilts = OWN_LEVEL
-        elif isinstance(tilts, ByGravity):
-            tilts = tilts.of(frame, self.instrument)
+        own = tilts if isinstance(tilts, ByGravity) else None
+        if own is not None:
+            tilts = own.of(frame, self.instrument)
         # the width of a uniform distribution with this standard deviation, as rounding causes
         spread_s = math.sqrt(12) * frame.stamp_stddev_s
         tilt = tilts.average(frame.mid_unix_s, frame.exposure_s or 0.0, spread_s)
         if tilt.either_way:
             tilt = self._upright(tilt, frame)
+        if own is not None:
+            own.check_held(frame, tilt)
         self.instrument.calibration.check_age(frame.mid_unix_s)
         self.instrument.inclinometer.check_live(tilt)
         self.instrument.inclinometer.check_range(tilt)
@@ -363,7 +364,7 @@ class Solver:
             stamp_stddev_s=frame.stamp_stddev_s,
             # a pointing is of one time
             shutter=self.shutter(frame) if isinstance(frame, Stars) else GLOBAL_SHUTTER,
-            axis_stddev=self.instrument.axis_stddev_rad,
+            axis_stddev=math.hypot(self.instrument.axis_stddev_rad, self.instrument.lens_stddev_rad),
         )
 
     def clock_stddev_s(self, stars: Stars | Pointing) -> float:
@@ -518,7 +519,8 @@ def focal_that_fits(solver: Solver, stars: Stars, until_s: float = math.inf) -> 
                 break
             camera = given.scaled(FOCAL_STEP**k)
             seen = on.select(camera.sees(on.x, on.y).nonzero()[0])
-            found = identify_directions(camera.directions(seen.x, seen.y), seen.sigma, camera, sky)
+            field = field_of(camera.directions(seen.x, seen.y), seen.sigma, camera)
+            found = identify(field, sky)
             if found is not None:
                 return camera.fx * found.focal_scale
     except StarposError:

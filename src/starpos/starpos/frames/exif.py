@@ -13,16 +13,17 @@ import logging
 import math
 import re
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import datetime, timezone
 
 from starpos.errors import FrameError, TimeError
 from starpos.frames.exposure import MAX_EXPOSURE_S, UNKNOWN_LATENCY_S, Exposure
-from starpos.frames.gravity import read_gravity
+from starpos.frames.gravity import TELEPHONES, read_gravity, read_upper_edge
 
 # Canon and Nikon allow their clocks an error of a minute a month. A telephone's is set by its network, a DJI's by GPS.
 UNTENDED_STDDEV_S, NETWORK_STDDEV_S = 60.0, 1.0
-NETWORKED = re.compile(r"apple|dji|google|samsung|xiaomi|huawei|oneplus|motorola|oppo|vivo", re.IGNORECASE)
+NETWORKED = re.compile(f"dji|{TELEPHONES.pattern}", re.IGNORECASE)
 # UTC-12 to UTC+14 are in use.
 ZONES_H = 14.0
 # EXIF began then: a clock that shows an earlier year was never set.
@@ -97,6 +98,14 @@ class SensorGrid:
         )
 
 
+# a date and time in the name of a file, as all-sky cameras have them: image-20260930224951.jpg, 2019-07-29T204726.tiff;
+# it may be of the start or the end of an exposure of up to a minute
+NAMED_TIME = re.compile(
+    r"(?<!\d)(20\d\d)-?([01]\d)-?([0-3]\d)[T_ -]?([0-2]\d)[:-]?([0-5]\d)[:-]?([0-5]\d)(?!\d)[^/]*$", re.ASCII
+)
+NAMED_STDDEV_S = 20.0
+
+
 @dataclass(frozen=True, eq=False)
 class Exif:
     """What the EXIF of a picture of width x height px states; None for what it does not, or what is impossible.
@@ -121,10 +130,10 @@ class Exif:
         except Exception:
             return cls({}, width, height)
 
-    def number(self, name: str) -> float | None:
+    def number(self, name: str, group: str = "EXIF") -> float | None:
         """The positive number that is a tag's first value."""
         try:
-            value = self.tags[f"EXIF {name}"].values[0]
+            value = self.tags[f"{group} {name}"].values[0]
             number = value.num / value.den if hasattr(value, "den") else float(value)
         except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError):
             return None
@@ -143,8 +152,8 @@ class Exif:
 
     @property
     def exposure_s(self) -> float | None:
-        """ExposureTime in s."""
-        seconds = self.number("ExposureTime")
+        """ExposureTime in s; some programs write it among the tags of the image."""
+        seconds = self.number("ExposureTime") or self.number("ExposureTime", "Image")
         return seconds if seconds is not None and seconds <= MAX_EXPOSURE_S else None
 
     @property
@@ -191,8 +200,15 @@ class Exif:
         return NETWORK_STDDEV_S if networked else UNTENDED_STDDEV_S
 
     @property
+    def is_stamped_late(self) -> bool:
+        """Whether a program wrote it that stamps the end of the exposure, in local time, as GPS's time too."""
+        return self.text("Image Software") == "indi-allsky"
+
+    @property
     def gps_unix_s(self) -> float | None:
         """GPSDateStamp and GPSTimeStamp, UTC of the last fix, as a Unix time."""
+        if self.is_stamped_late:
+            return None
         try:
             day = datetime.strptime(str(self.tags["GPS GPSDate"].values).strip("\0 "), "%Y:%m:%d")
             hours, minutes, seconds = (
@@ -251,8 +267,8 @@ def read_exposure(data: bytes, place: str, clock: CameraClock | None, shape: tup
     """Read the Exposure that the EXIF of a picture or raw file states; shape: of the pixels, rows first.
 
     origin_px is NaN if the picture is a crop. Only with a clock there is a time, or `untimed`: DateTimeOriginal and
-    SubSecTimeOriginal are the start of the exposure, rounded down; when the shutter opened is known less well. FrameError
-    if exifread is missing where a clock asks for it.
+    SubSecTimeOriginal are the start of the exposure, rounded down; when the shutter opened is known less well. Without
+    them the name of the file may have a time. FrameError if exifread is missing where a clock asks for it.
     """
     try:
         exif = Exif.of(data, shape[1], shape[0])
@@ -268,6 +284,7 @@ def read_exposure(data: bytes, place: str, clock: CameraClock | None, shape: tup
         source=place,
         gravity=gravity,
         unlevelled=unlevelled,
+        upper_edge=read_upper_edge(data, exif.width, exif.height),
         gps_deg=exif.gps_deg,
         exposure_s=exif.exposure_s,
         rough_focal_px=exif.rough_focal_px,
@@ -276,6 +293,16 @@ def read_exposure(data: bytes, place: str, clock: CameraClock | None, shape: tup
     )
     if clock is None:
         return exposure
+    offset_h, named = clock.utc_offset_h, NAMED_TIME.search(place)
+    if offset_h is not None and "EXIF DateTimeOriginal" not in exif.tags and named is not None:
+        with suppress(ValueError):
+            shown = datetime(*map(int, named.groups()), tzinfo=timezone.utc)
+            return replace(
+                exposure,
+                mid_unix_s=shown.timestamp() - 3600 * offset_h + (exposure.exposure_s or 0.0) / 2,
+                stamp_stddev_s=NAMED_STDDEV_S,
+                clock_stddev_s=UNTENDED_STDDEV_S if clock.stddev_s is None else clock.stddev_s,
+            )
     if exposure.exposure_s is None or "EXIF DateTimeOriginal" not in exif.tags:
         missing = "ExposureTime" if exposure.exposure_s is None else "DateTimeOriginal"
         return replace(exposure, untimed=f"its EXIF has no {missing}: give the file as the camera wrote it")
@@ -283,9 +310,10 @@ def read_exposure(data: bytes, place: str, clock: CameraClock | None, shape: tup
         start_unix_s, step_s = exif.start(clock)
     except TimeError as e:
         return replace(exposure, untimed=str(e))
+    late_s = exposure.exposure_s if exif.is_stamped_late else 0.0
     return replace(
         exposure,
-        mid_unix_s=start_unix_s + exposure.exposure_s / 2,
+        mid_unix_s=start_unix_s + exposure.exposure_s / 2 - late_s,
         stamp_stddev_s=math.hypot(step_s / math.sqrt(12), UNKNOWN_LATENCY_S),
         clock_stddev_s=exif.clock_stddev_s if clock.stddev_s is None else clock.stddev_s,
     )

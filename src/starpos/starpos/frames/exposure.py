@@ -130,6 +130,7 @@ class Exposure:
     untimed         why mid_unix_s is None, for messages; '': its file has no time
     gravity         which way is up in it by its own file, as a telephone's photograph has it; None: not stated
     unlevelled      why gravity is None, for messages
+    upper_edge      direction in C of the edge that was up, (0, 0) if unknown, of a telephone's picture; None: of others
     site_cards      the cards of its header that state a site, for messages; never used for a place; '': none
     gps_deg         latitude and longitude by GPS in its file, WGS 84; compared with a fix, never used; None: not stated
 
@@ -150,6 +151,7 @@ class Exposure:
     untimed: str = ""
     gravity: Gravity | None = None
     unlevelled: str = ""
+    upper_edge: tuple[int, int] | None = None
     gps_deg: tuple[float, float] | None = None
     site_cards: str = ""
 

@@ -29,6 +29,7 @@ MAKE, MODEL, ORIENTATION, SOFTWARE, BELOW, NOTE, LENS, RENDERED = (
     42036,
     41985,
 )
+TELEPHONES = re.compile(r"apple|google|samsung|xiaomi|huawei|oneplus|motorola|oppo|vivo", re.IGNORECASE)
 # Length of gravity, g, of a telephone that is held still.
 MIN_G, MAX_G = 0.97, 1.03
 # Programs that crop, turn or bend pictures and keep the maker's note.
@@ -166,38 +167,86 @@ NOTES: tuple[tuple[bytes, int | None, int, bool, Callable[[_Note], Gravity | Non
 ORDERS = {b"II": "<", b"MM": ">"}
 
 
+@dataclass(frozen=True)
+class _Facts:
+    """What the EXIF of a file has: its block, byte order, the tags of its first directory, and of the one below."""
+
+    block: bytes
+    order: str
+    first: dict
+    tags: dict
+
+    @classmethod
+    def of(cls, data: bytes) -> "_Facts":
+        block = exif_block(data)
+        order = ORDERS.get(block[:2], "<")
+        try:
+            (at,) = struct.unpack_from(order + "I", block, 4)
+            first, _ = tiff_directory(block, at, order, (MAKE, MODEL, ORIENTATION, SOFTWARE, BELOW), 256)
+            tags, _ = tiff_directory(block, first[BELOW][0], order, (NOTE, LENS, RENDERED), MOST_VALUES)
+        except (struct.error, LookupError, TypeError):
+            first, tags = {}, {}
+        return cls(block, order, first, tags)
+
+    def check_unedited(self) -> None:
+        """Raise FrameError for the work of a program that may have moved the pixels."""
+        software = _text(self.first.get(SOFTWARE))
+        if EDITOR.search(software):
+            raise FrameError(f"it was edited by {software}, so its pixels may not lie as its level says")
+
+    def check_grid(self, width: int, height: int, by_phone: bool) -> None:
+        """Raise FrameError unless the pixels lie as the back camera's sensor gave them."""
+        if self.tags.get(RENDERED) == (PANORAMA,) or max(width, height) > LONGEST_SHAPE * min(width, height):
+            raise FrameError("it is a panorama, stitched of several exposures")
+        if "front" in _text(self.tags.get(LENS)):
+            raise FrameError("it is by the telephone's front camera, whose level is not known")
+        if by_phone and (height > width or width % WHOLE or height % WHOLE):
+            raise FrameError(
+                "its pixels were turned or cut out by a program, and the gravity in its file was not"
+            )
+
+    @property
+    def upper_edge(self) -> tuple[int, int]:
+        """Direction in C of the edge of the picture that was up, by its Orientation; 0, 0 if it is not stated."""
+        return EDGES.get(self.first.get(ORIENTATION, (0,))[0], (0, 0))
+
+
+def read_upper_edge(data: bytes, width: int, height: int) -> tuple[int, int] | None:
+    """Which edge was up, as `upper_edge`, in a telephone's picture of width x height px, in the sensor's grid.
+
+    None for other cameras, and for pictures whose pixels were moved.
+    """
+    facts = _Facts.of(data)
+    if not TELEPHONES.match(_text(facts.first.get(MAKE))):
+        return None
+    try:
+        facts.check_unedited()
+        facts.check_grid(width, height, by_phone=True)
+    except FrameError:
+        return None
+    return facts.upper_edge
+
+
+def contradicts(edge: tuple[int, int], up: np.ndarray) -> bool:
+    """Whether the edge that is said to be up was down, by up (3,) in C."""
+    return bool(np.hypot(*up[:2]) > CLEAR and np.dot(edge, up[:2]) < 0)
+
+
 def read_gravity(data: bytes, width: int, height: int) -> Gravity:
     """Read which way is up in a picture of width x height px; FrameError says why its file does not say so.
 
     data: of a JPEG, PNG or TIFF-like file, or the EXIF of a HEIF alone.
     """
-    block = exif_block(data)
-    order = ORDERS.get(block[:2], "<")
+    facts = _Facts.of(data)
+    facts.check_unedited()
     try:
-        (at,) = struct.unpack_from(order + "I", block, 4)
-        first, _ = tiff_directory(block, at, order, (MAKE, MODEL, ORIENTATION, SOFTWARE, BELOW), 256)
-        tags, _ = tiff_directory(block, first[BELOW][0], order, (NOTE, LENS, RENDERED), MOST_VALUES)
-    except (struct.error, LookupError, TypeError):
-        first, tags = {}, {}
-    software = _text(first.get(SOFTWARE))
-    if EDITOR.search(software):
-        raise FrameError(f"it was edited by {software}, so its pixels may not lie as its level says")
-    try:
-        found = _by_gimbal(data) or _by_note(block, order, first, tags)
+        found = _by_gimbal(data) or _by_note(facts.block, facts.order, facts.first, facts.tags)
     except (struct.error, TypeError, ValueError, IndexError):
         raise FrameError("its maker's note is damaged or cut off") from None
     if found is None:
         raise FrameError("its file does not say which way is down")
-    if tags.get(RENDERED) == (PANORAMA,) or max(width, height) > LONGEST_SHAPE * min(width, height):
-        raise FrameError("it is a panorama, stitched of several exposures")
-    if "front" in _text(tags.get(LENS)):
-        raise FrameError("it is by the telephone's front camera, whose level is not known")
-    if found.model == PHONE and (height > width or width % WHOLE or height % WHOLE):
-        raise FrameError(
-            "its pixels were turned or cut out by a program, and the gravity in its file was not"
-        )
-    edge = EDGES.get(first.get(ORIENTATION, (0,))[0])
-    if edge is not None and np.hypot(*found.up[:2]) > CLEAR and np.dot(edge, found.up[:2]) < 0:
+    facts.check_grid(width, height, found.model == PHONE)
+    if contradicts(facts.upper_edge, found.up):
         raise FrameError("its Orientation contradicts its level: a program turned it")
     return found
 

@@ -8,7 +8,7 @@ accepted by its probability, never by a number of stars. Then the fainter stars 
 
 from starpos.identification.evidence import Identification
 from starpos.identification.prior import PlumbPrior, PointingPrior
-from starpos.identification.search import MIN_STARS, identify, identify_directions
+from starpos.identification.search import MIN_STARS, field_of, identify
 from starpos.identification.sky import Sky
 
 __all__ = [
@@ -17,6 +17,6 @@ __all__ = [
     "PlumbPrior",
     "PointingPrior",
     "Sky",
+    "field_of",
     "identify",
-    "identify_directions",
 ]

@@ -12,9 +12,9 @@ by the same evidence as any other. Then the lens extends the answer to the whole
 """
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import product
+from itertools import chain, product
 from typing import TypeVar
 
 import numpy as np
@@ -54,8 +54,8 @@ LARGEST_STEP, BENT = 0.1, 0.003
 MAX_JUDGED = 40
 # Log-odds of an answer that ends the search though most bright detections are not its stars.
 SURE = 6 * MIN_LOG_ODDS
-# of a search at once
-THREADS = 2
+# Threads of a search; how many focal lengths are tried between two looks at the time.
+THREADS, AT_ONCE = 2, 8
 Item = TypeVar("Item")
 Result = TypeVar("Result")
 
@@ -157,12 +157,10 @@ def _poses(
     """Yield poses, those first on which most quads agree, and the distance (N,) px by which each star may be off."""
     half_diagonal_px = float(np.hypot(*field.half))
 
-    def alike_at(scale: tuple[float, float]) -> Matches | None:
-        return None if limit.reached else matches(field, quads, stars, error_px, *scale)
+    def alike_at(scale: tuple[float, float]) -> Matches:
+        return matches(field, quads, stars, error_px, *scale)
 
-    alike = [
-        found for found in _side_by_side(alike_at, focal_lengths(half_diagonal_px, *focal_range)) if found
-    ]
+    alike = _side_by_side(alike_at, list(focal_lengths(half_diagonal_px, *focal_range)), limit)
     if limit.reached:
         return
     found = QuadPoses.of(field, sky, alike, error_px, focal_range)
@@ -172,13 +170,19 @@ def _poses(
         yield found[k], found.radius_px(field, k, error_px)
 
 
-def _side_by_side(work: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
-    """The results of some work on items, in their order; compiled loops and numpy's run side by side."""
+def _side_by_side(work: Callable[[Item], Result], items: Sequence[Item], limit: CpuLimit) -> list[Result]:
+    """The results of some work on items, in their order, of all if the limit is not reached.
+
+    Compiled loops and numpy's run side by side.
+    """
     # slow to import, and seldom needed
     from concurrent.futures import ThreadPoolExecutor
 
+    def some(first: int) -> list[Result]:
+        return [] if limit.reached else [work(item) for item in items[first : first + AT_ONCE]]
+
     with ThreadPoolExecutor(THREADS) as threads:
-        return list(threads.map(work, items))
+        return list(chain.from_iterable(threads.map(some, range(0, len(items), AT_ONCE))))
 
 
 def focal_lengths(half_diagonal_px: float, shortest: float, longest: float) -> Iterator[tuple[float, float]]:
@@ -267,15 +271,14 @@ class _Picture:
         return fisheye.WideField(camera.directions(*self.xy.T), self.sigma_px, camera)
 
 
+@at_once
 @dataclass(frozen=True)
-class _Guess:
-    """A supposed lens, a part of the frame as it sees it, the stars of that part, and poses of it."""
+class _Part:
+    """A part of a frame, `whole` as a supposed lens sees it, and its stars, as if the picture had RADIUS_PX."""
 
-    focal_px: float
-    lens: tuple[float, ...]
+    whole: fisheye.WideField
     part: fisheye.Part
     field: FrameStars
-    found: QuadPoses
 
 
 def identify_fisheye(
@@ -303,25 +306,35 @@ def identify_fisheye(
     radius_px = disc_px or math.hypot(width, height) / 2
     picture = _Picture(xy, sigma_px, width, height, radius_px)
     spans = [_focal_range(lens, radius_px, near_px) for lens in LENSES]
+    wholes = [
+        picture.seen_by(focal_px, lens)
+        for lens, (shortest, longest) in zip(LENSES, spans, strict=True)
+        for focal_px in np.geomspace(
+            shortest, longest, math.ceil(math.log(longest / shortest) / (2 * FISHEYE_STEP)) + 1
+        ).tolist()
+    ]
     prior = any_scale(
         0.95 * min(low for low, _ in spans) * RADIUS_PX / radius_px,
         1.05 * max(high for _, high in spans) * RADIUS_PX / radius_px,
     )
     # the evidence that a frame needs, raised for the number of parts and lenses tried
     need = fisheye.enough(len(_TURNS) * len(LENSES)) + SECOND_TRY
+    parts: list[list[_Part]] = []
     work = [(stars, k) for stars in stages for k in range(len(_TURNS))]
     best: tuple[Camera, Identification] | None = None
     for done, (stars, k) in enumerate(work):
         progress("searching fisheyes", done / len(work))
-        guesses = _guesses(picture, spans, _TURNS[k], stars, sky, quads, limit)
-        for guess, row in _most_agreed(guesses):
+        if k == len(parts):
+            parts.append(_parts(picture, wholes, _TURNS[k], limit))
+        guesses = _guesses(parts[k], stars, sky, quads, limit)
+        for guess, poses, row in _most_agreed(guesses):
             if limit.reached:
                 return best
-            pose, radius = guess.found[row], guess.found.radius_px(guess.field, row, FISHEYE_ERROR_PX)
+            pose, radius = poses[row], poses.radius_px(guess.field, row, FISHEYE_ERROR_PX)
             found = verify_pose(guess.field, sky, pose, radius, prior, need)
             if found is None or (best is not None and found.log_odds <= best[1].log_odds):
                 continue
-            whole = outwards(picture.seen_by(guess.focal_px, guess.lens), sky, guess.part, found)
+            whole = outwards(guess.whole, sky, guess.part, found)
             if whole is not None and whole[2]:
                 return whole[:2]
             # off the middle, a wrong lens would turn the axis elsewhere
@@ -339,51 +352,38 @@ def _focal_range(lens: tuple[float, ...], radius_px: float, near_px: float | Non
     return max(low, near_px / ROUGHLY), min(high, near_px * ROUGHLY)
 
 
-def _guesses(
-    picture: _Picture,
-    spans: Sequence[tuple[float, float]],
-    turn: np.ndarray,
-    stars: int,
-    sky: Sky,
-    quads: QuadCatalogue,
-    limit: CpuLimit,
-) -> list[_Guess]:
-    """What each lens and focal length makes of a part of the picture."""
+def _parts(
+    picture: _Picture, wholes: Sequence[fisheye.WideField], turn: np.ndarray, limit: CpuLimit
+) -> list[_Part]:
+    """A part of the picture as each lens sees it, where enough of it shows sky and stars."""
+    shrink = picture.radius_px / RADIUS_PX
+    width, height = (round(size / shrink) for size in (picture.width, picture.height))
 
-    def guess(what: tuple[tuple[float, ...], float]) -> _Guess | None:
-        lens, focal_px = what
-        if limit.reached:
+    def part_of(whole: fisheye.WideField) -> _Part | None:
+        pinhole = fisheye.pinhole_of(Camera.from_focal(width, height, whole.camera.fx / shrink, EQUIDISTANT))
+        share = _share_seen(picture, whole.camera, pinhole, turn)
+        if share < MIN_SEEN:
             return None
-        part, field = _part(picture, focal_px, lens, turn)
-        if field is None or len(field) < MIN_STARS:
-            return None
+        part = fisheye.part_at(replace(whole, sigma_px=whole.sigma_px / shrink), pinhole, turn)
+        field = part.field.but(area_px2=share * part.field.area_px2)
+        return _Part(whole, part, field) if len(field) >= MIN_STARS else None
+
+    return [part for part in _side_by_side(part_of, wholes, limit) if part is not None]
+
+
+def _guesses(
+    parts: Sequence[_Part], stars: int, sky: Sky, quads: QuadCatalogue, limit: CpuLimit
+) -> list[tuple[_Part, QuadPoses]]:
+    """The poses that the brightest stars of each part give, where there are any."""
+
+    def poses_of(part: _Part) -> QuadPoses:
+        field = part.field
         alike = matches(field, quads, min(stars, len(field)), FISHEYE_ERROR_PX, field.focal_px, FISHEYE_STEP)
         scales = field.focal_px * (1 - FISHEYE_STEP), field.focal_px * (1 + FISHEYE_STEP)
-        found = QuadPoses.of(field, sky, [alike], FISHEYE_ERROR_PX, scales)
-        return _Guess(focal_px, lens, part, field, found) if len(found) else None
+        return QuadPoses.of(field, sky, [alike], FISHEYE_ERROR_PX, scales)
 
-    scales = [
-        (lens, float(focal_px))
-        for lens, (shortest, longest) in zip(LENSES, spans, strict=True)
-        for focal_px in np.geomspace(
-            shortest, longest, math.ceil(math.log(longest / shortest) / (2 * FISHEYE_STEP)) + 1
-        )
-    ]
-    return [found for found in _side_by_side(guess, scales) if found]
-
-
-def _part(
-    picture: _Picture, focal_px: float, lens: tuple[float, ...], turn: np.ndarray
-) -> tuple[fisheye.Part, FrameStars | None]:
-    """A part of the picture and its stars, as if the picture had RADIUS_PX; None where too little of it shows sky."""
-    seen, shrink = picture.seen_by(focal_px, lens), picture.radius_px / RADIUS_PX
-    width, height = (round(size / shrink) for size in (picture.width, picture.height))
-    pinhole = fisheye.pinhole_of(Camera.from_focal(width, height, focal_px / shrink, EQUIDISTANT))
-    part = fisheye.part_at(replace(seen, sigma_px=seen.sigma_px / shrink), pinhole, turn)
-    share = _share_seen(picture, seen.camera, pinhole, turn)
-    if share < MIN_SEEN:
-        return part, None
-    return part, part.field.but(area_px2=share * part.field.area_px2)
+    found = _side_by_side(poses_of, parts, limit)
+    return [(part, poses) for part, poses in zip(parts, found, strict=False) if len(poses)]
 
 
 def _share_seen(picture: _Picture, camera: Camera, pinhole: Camera, turn: np.ndarray) -> float:
@@ -396,12 +396,14 @@ def _share_seen(picture: _Picture, camera: Camera, pinhole: Camera, turn: np.nda
     return float(on.mean())
 
 
-def _most_agreed(guesses: Sequence[_Guess]) -> Iterator[tuple[_Guess, int]]:
-    """Yield guesses and rows of their poses, those with most votes of all guesses first."""
+def _most_agreed(guesses: Sequence[tuple[_Part, QuadPoses]]) -> Iterator[tuple[_Part, QuadPoses, int]]:
+    """Yield parts, their poses and a row of these, those with most votes of all parts first."""
     if not guesses:
         return
-    first = np.cumsum([0, *(len(g.found) for g in guesses)])
-    half_diagonal_px = float(np.hypot(*guesses[0].field.half))
-    for k in QuadPoses.together([g.found for g in guesses]).most_agreed(half_diagonal_px, FISHEYE_JUDGED):
+    first = np.cumsum([0, *(len(poses) for _, poses in guesses)])
+    half_diagonal_px = float(np.hypot(*guesses[0][0].field.half))
+    for k in QuadPoses.together([poses for _, poses in guesses]).most_agreed(
+        half_diagonal_px, FISHEYE_JUDGED
+    ):
         owner = int(np.searchsorted(first, k, side="right")) - 1
-        yield guesses[owner], k - int(first[owner])
+        yield *guesses[owner], k - int(first[owner])

@@ -156,20 +156,6 @@ class OnFrame:
         return OnFrame(self.index[which], self.directions[which], self.blend_px[which])
 
 
-def judge(field: FrameStars, sky: Sky, prior: Prior, enough: float = MIN_LOG_ODDS) -> Judge:
-    """What judges poses of a frame by a prior, for compiled code; enough: log-odds of an identification."""
-    return Judge(
-        field,
-        sky.stars,
-        sky.years,
-        sky.velocity,
-        prior,
-        enough,
-        RULES,
-        CHANCES,
-    )
-
-
 def verify_pose(
     field: FrameStars,
     sky: Sky,
@@ -182,8 +168,8 @@ def verify_pose(
 
     None unless the evidence is beyond doubt: log-odds of `enough`.
     """
-    judged = judge(field, sky, prior, enough)
-    return judged.identified(near_pose.attitude, near_pose.focal_px, near_pose.mirrored, radius_px)
+    judge = Judge(field, sky.stars, sky.years, sky.velocity, prior, enough, RULES, CHANCES)
+    return judge.identified(near_pose.attitude, near_pose.focal_px, near_pose.mirrored, radius_px)
 
 
 # Minimum number of catalogue stars looked for, if the frame has as many.

@@ -44,6 +44,8 @@ SIZES_RAD = np.log(0.004), np.log(1.2)
 MAX_ALIKE = 2000
 # Which pairs of a quad's stars its sides are: AB is the longest.
 SIDES = np.array(list(combinations(range(4), 2)))
+SIDE_OF = np.zeros((4, 4), int)
+SIDE_OF[SIDES[:, 0], SIDES[:, 1]] = SIDE_OF[SIDES[:, 1], SIDES[:, 0]] = range(6)
 
 
 @at_once
@@ -99,26 +101,32 @@ class QuadCatalogue:
         return query, quad
 
 
-def shapes(v: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Order (M, 4), shape (M, 5) and size (M,) of quads of unit vectors v (M, 4, 3).
+def chords(v: np.ndarray) -> np.ndarray:
+    """The six sides (M, 6) of quads of unit vectors v (M, 4, 3), in the order of SIDES."""
+    return np.linalg.norm(v[:, SIDES[:, 0]] - v[:, SIDES[:, 1]], axis=2)
+
+
+def shapes(side: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Order (M, 4), shape (M, 5) and size (M,) of quads of sides (M, 6), as `chords` has them.
 
     A and B are the farthest from each other, A the one nearer to the other two, C nearer to A than D. Sizes and sides are
     chords.
     """
-    side = np.linalg.norm(v[:, SIDES[:, 0]] - v[:, SIDES[:, 1]], axis=2)
-    length = np.zeros((len(v), 4, 4))
-    length[:, SIDES[:, 0], SIDES[:, 1]] = length[:, SIDES[:, 1], SIDES[:, 0]] = side
     longest = side.argmax(1)
-    each = np.arange(len(v))
+    each = np.arange(len(side))
+
+    def between(i: np.ndarray, j: np.ndarray) -> np.ndarray:
+        return side[each, SIDE_OF[i, j]]
+
     a, b = SIDES[longest].T
     # the opposite side joins the other two: the pairs are in such an order
     c, d = SIDES[5 - longest].T
-    swap = length[each, a, c] + length[each, a, d] > length[each, b, c] + length[each, b, d]
+    swap = between(a, c) + between(a, d) > between(b, c) + between(b, d)
     a, b = np.where(swap, b, a), np.where(swap, a, b)
-    swap = length[each, a, c] > length[each, a, d]
+    swap = between(a, c) > between(a, d)
     c, d = np.where(swap, d, c), np.where(swap, c, d)
-    size = side.max(1)
-    ratio = [length[each, i, j] / size for i, j in ((a, c), (a, d), (b, c), (b, d), (c, d))]
+    size = side[each, longest]
+    ratio = [between(i, j) / size for i, j in ((a, c), (a, d), (b, c), (b, d), (c, d))]
     return np.stack([a, b, c, d], 1), np.stack(ratio, 1), size
 
 
@@ -162,7 +170,7 @@ def _quads(
     rows = _distinct(np.concatenate(found))
     corners, shape, log_size = [], [], []
     for block in np.array_split(rows, len(rows) // 200_000 + 1):
-        order, ratio, size = shapes(v[block])
+        order, ratio, size = shapes(chords(v[block]))
         good = (size > MIN_SIDE * radius) & (ratio.min(1) > SHORTEST)
         corners.append(pool[np.take_along_axis(block, order, 1)[good]].astype(np.int32))
         shape.append(ratio[good].astype(np.float32))
@@ -250,15 +258,18 @@ def matches(
     """
     four = _fours(stars)
     v = directions(field.xy[:1, :stars], np.array([focal_px]))[0]
-    order, shape, size = shapes(v[four])
-    star = np.take_along_axis(four, order, 1)
+    apart = np.linalg.norm(v[:, None] - v, axis=2)
+    side = apart[four[:, SIDES[:, 0]], four[:, SIDES[:, 1]]]
+    size = side.max(1)
     error = QUAD_SIGMA * np.hypot(error_px, field.sigma[four].max(1)) / (focal_px * size)
     # a lower limit than the catalogue's
-    use = np.flatnonzero((shape.min(1) > 0.8 * SHORTEST) & (error < 0.03))
+    use = np.flatnonzero((side.min(1) > 0.8 * SHORTEST * size) & (error < 0.03))
     # the best known first: the number of look-ups is limited
     use = use[np.argsort(error[use], kind="stable")]
-    query, quad = quads.near(shape[use], error[use] + LENS, np.log(size[use]), step + 0.01)
-    return star[use[query]], quads.corners[quad], np.full(len(query), focal_px)
+    order, shape, size = shapes(side[use])
+    query, quad = quads.near(shape, error[use] + LENS, np.log(size), step + 0.01)
+    star = np.take_along_axis(four[use[query]], order[query], 1)
+    return star, quads.corners[quad], np.full(len(query), focal_px)
 
 
 @at_once
@@ -289,9 +300,9 @@ class QuadPoses:
         seen = directions(field.xy[0][star], focal)
         mirrored = (_turn(seen[:, :3]) > 0) != (_turn(w[:, :3]) > 0)
         xy = field.xy[mirrored.astype(int)[:, None], star]
-        wanted = _perimeter(w)
+        wanted = chords(w).sum(1)
         for _ in range(3):
-            focal = focal * _perimeter(directions(xy, focal)) / wanted
+            focal = focal * chords(directions(xy, focal)).sum(1) / wanted
         attitude = rotation.best_rotation(w, directions(xy, focal))
         u = np.einsum("kij,knj->kni", attitude, w)
         off = u[..., :2] * (focal[:, None, None] / np.maximum(u[..., 2:], 1e-6)) - xy
@@ -357,8 +368,3 @@ def _fours(n: int) -> np.ndarray:
 def _turn(v: np.ndarray) -> np.ndarray:
     """Determinants (K,) of triangles (K, 3, 3): their signs are their orientations."""
     return np.einsum("ki,ki->k", v[:, 0], np.cross(v[:, 1], v[:, 2]))
-
-
-def _perimeter(v: np.ndarray) -> np.ndarray:
-    """Sum (K,) of all chords of quads (K, 4, 3)."""
-    return np.linalg.norm(v[:, SIDES[:, 0]] - v[:, SIDES[:, 1]], axis=2).sum(1)

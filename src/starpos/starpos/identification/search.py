@@ -30,7 +30,7 @@ from starpos.identification.evidence import (
     anywhere,
     verify_pose,
 )
-from starpos.identification.pose import CROWD_STARS, MATCH_SIGMA, MIN_SIGMA_PX, TEST_STARS, Pose, stars_at
+from starpos.identification.pose import CROWD_STARS, MATCH_SIGMA, MIN_SIGMA_PX, TEST_STARS, Pose
 from starpos.identification.prior import PlumbPrior, PointingPrior
 from starpos.identification.sky import Sky
 from starpos.identification.triangles import TriangleCatalogue
@@ -66,39 +66,10 @@ Priors = Sequence[PointingPrior | PlumbPrior]
 Stages = Sequence[tuple[int, float]]
 
 
-def identify(
-    xy: np.ndarray,
-    sigma_px: np.ndarray,
-    camera: Camera,
-    sky: Sky,
-    priors: Sequence[PointingPrior | PlumbPrior] = (),
-) -> Identification | None:
-    """Identify stars at pixels xy (N, 2), brightest first, of an ideal camera (distortion and refraction removed).
-
-    sigma_px  (N,): their errors along one axis
-    camera    its focal length may be off by SCALE_TOLERANCE
-    priors    where to look first
-
-    None if no part of the sky fits beyond doubt. ValueError if a pixel or an error is not a finite number.
-    """
-    return identify_frame(stars_at(camera, xy, sigma_px), sky, priors)
-
-
-def identify_directions(
-    directions: np.ndarray,
-    sigma_px: np.ndarray,
-    camera: Camera,
-    sky: Sky,
-    priors: Sequence[PointingPrior | PlumbPrior] = (),
-) -> Identification | None:
-    """Identify stars as `identify` does, from unit vectors (N, 3) in C, with refraction removed, of any camera."""
-    return identify_frame(field_of(directions, sigma_px, camera), sky, priors)
-
-
 def field_of(
     directions: np.ndarray, sigma_px: np.ndarray, camera: Camera, window: Window | None = None
 ) -> FrameStars | fisheye.WideField:
-    """The stars in directions (N, 3) in C, errors (N,) px, as `identify_frame` takes them from this camera.
+    """The stars in directions (N, 3) in C, errors (N,) px, as `identify` takes them from this camera.
 
     window: the part of the frame that shows something, as `Stars` has it.
     """
@@ -148,12 +119,13 @@ def frame_stars(directions: np.ndarray, sigma_px: np.ndarray, camera: Camera) ->
     )
 
 
-def identify_frame(
-    field: FrameStars | fisheye.WideField, sky: Sky, priors: Priors = ()
-) -> Identification | None:
-    """Identify stars as `identify` does, from the stars of a pinhole camera or of a fisheye."""
+def identify(field: FrameStars | fisheye.WideField, sky: Sky, priors: Priors = ()) -> Identification | None:
+    """Identify the stars of a frame, refraction removed; the focal length may be off by SCALE_TOLERANCE.
+
+    priors: where to look first.  None if no part of the sky fits beyond doubt.
+    """
     if isinstance(field, fisheye.WideField):
-        return _by_parts(field, sky, priors, identify_frame)
+        return _by_parts(field, sky, priors, identify)
     return next(identifications(field, sky, priors), None)
 
 
@@ -309,7 +281,7 @@ def second_look(
 ) -> Identification | None:
     """Identify a frame whose stars are too few, by the light at the places of others.
 
-    field, priors  as `identify_frame` takes them; the field is in the camera's pixels, without refraction
+    field, priors  as `identify` takes them; the field is in the camera's pixels, without refraction
     """
     seen: set[tuple[bytes, bytes]] = set()
     for found in near_or_lost(field, sky, priors, STAGES, MIN_LOG_ODDS_TO_LOOK):

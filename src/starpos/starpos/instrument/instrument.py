@@ -12,10 +12,12 @@ import numpy as np
 from starpos import rotation
 from starpos.errors import InstrumentError, TiltError
 from starpos.frames.exposure import Exposure, Shutter
+from starpos.frames.gravity import contradicts
 from starpos.instrument.camera import PLUMB_BOB, Camera
 from starpos.instrument.inclinometer import EXACT, InclinometerErrors, Tilt
 from starpos.instrument.mounting import RESPONSE_COEFFICIENTS, Mounting
 from starpos.instrument.sensors import built_in_rad, find, is_built_in, unnamed
+from starpos.instrument.tilt_log import Tilts
 from starpos.units import ARCSEC, DAY_S, utc_text
 
 # default sag: a camera on a pillar or a heavy tripod during a night
@@ -90,13 +92,25 @@ NO_GRAVITY = (
 
 @dataclass(frozen=True)
 class ByGravity:
-    """The tilts that photographs' own files state, as `starpos.instrument.tilt_log.Tilts`; S is then C."""
+    """The tilts of a telephone's photographs, as `starpos.instrument.tilt_log.Tilts`; S is then C.
 
-    def of(self, frame: Exposure, instrument: "Instrument") -> Tilt:
-        """The tilt of a photograph, with three axes; TiltError if its file states no gravity, or by another level."""
+    log: of the telephone that took them, in S; None: their own files state gravity.
+    """
+
+    log: Tilts | None = None
+
+    def has(self, frame: Exposure) -> bool:
+        """Whether a photograph can have a tilt."""
+        return (frame.gravity if self.log is None else frame.upper_edge) is not None
+
+    def of(self, frame: Exposure, instrument: "Instrument") -> Tilts:
+        """The tilts of a photograph, of three axes; TiltError if its file states no gravity, or by another level."""
         gravity, model = frame.gravity, instrument.inclinometer_model
-        if gravity is None or frame.mid_unix_s is None:
+        if not self.has(frame) or frame.mid_unix_s is None:
             raise self.missing(frame)
+        if self.log is not None:
+            return self.log
+        assert gravity is not None
         if gravity.model != model and is_built_in(model):
             raise TiltError(
                 f"{frame.place}: its level is a {gravity.model}'s, the others' a {model}'s: solve them apart"
@@ -114,8 +128,21 @@ class ByGravity:
             times=(frame.mid_unix_s,),
         )
 
+    def check_held(self, frame: Exposure, tilt: Tilt) -> None:
+        """Raise TiltError if a photograph's Orientation contradicts a tilt of the log."""
+        if self.log is not None and frame.upper_edge is not None and contradicts(frame.upper_edge, tilt.up):
+            raise TiltError(
+                f"{frame.place}: its Orientation says that another edge was up than the telephone's log does: it is "
+                "the log of another telephone or time, or this one's sensor lies otherwise: state it with --misalignment"
+            )
+
     def missing(self, frame: Exposure) -> TiltError:
         """Why a photograph has no gravity, and what can be done."""
+        if self.log is not None:
+            return TiltError(
+                f"{frame.place}: it is no telephone's picture as the sensor gave it, so its place in the log's axes is "
+                "unknown: give the file as the telephone wrote it, or --misalignment"
+            )
         return TiltError(f"{frame.place}: {frame.unlevelled or 'its file states no gravity'}: {NO_GRAVITY}")
 
     def average(self, mid_unix_s: float, exposure_s: float, spread_s: float = 0.0) -> Tilt:
@@ -329,6 +356,7 @@ class Instrument:
     link_to_camera : (3, 3), base link into C
     mount_stddev_arcsec : 1 sigma of link_to_camera about each axis; 0 for a link along the camera's own axes
     axis_stddev_rad : 1 sigma of the optical axis in frames that are an unknown part of a sensor
+    lens_stddev_rad : 1 sigma of directions in C, about each axis across the optical one, by what is unknown of the lens
     inclinometer : its errors; unless stated, an SCA100T's as sold
     inclinometer_model : name among sensors.presets() that these errors began with; '': none
     clock_stddev_s : standard deviation of the clock against UTC, s
@@ -352,6 +380,7 @@ class Instrument:
     link_to_camera: tuple = TOP_OF_FRAME
     mount_stddev_arcsec: float = 0.0
     axis_stddev_rad: float = 0.0
+    lens_stddev_rad: float = 0.0
     inclinometer: InclinometerErrors = field(default_factory=unnamed)
     inclinometer_model: str = ""
     clock_stddev_s: float = UNKNOWN_CLOCK_S
@@ -442,6 +471,7 @@ class Instrument:
             a3=c.a3,
             link_to_camera=np.asarray(self.link_to_camera, float),
             link_stddev_rad=self.mount_stddev_arcsec * ARCSEC,
+            lens_stddev_rad=self.lens_stddev_rad,
             calibration_covariance=np.asarray(c.covariance_arcsec2, float) * ARCSEC**2,
             remounted_rad=c.remounted_arcsec * ARCSEC,
             inclinometer=self.inclinometer,

@@ -12,7 +12,7 @@ import numpy as np
 
 from starpos.errors import FrameError, InstrumentError, TimeError
 from starpos.frames.exposure import Shutter
-from starpos.instrument import sensors, yaml_file
+from starpos.instrument import platepar, sensors, yaml_file
 from starpos.instrument.camera import COEFFICIENTS, PLUMB_BOB, Camera, check_axis, stated_lens
 from starpos.instrument.inclinometer import InclinometerErrors
 from starpos.instrument.instrument import (
@@ -140,7 +140,9 @@ VERTICAL = "camera_to_itrs", "covariance_arcsec2", "sag_arcsec_per_sqrt_hour"
 
 
 def read(path: Path | str, needs_camera: bool = True) -> Instrument:
-    """Read an Instrument from its YAML file; InstrumentError says why a file cannot be used. The format:
+    """Read an Instrument from its YAML file; InstrumentError says why a file cannot be used.
+
+    Of RMS's platepar and `.config` it is the camera alone (platepar.py). The format of others:
 
     starpos_instrument: 1
     camera: {focal_mm, pixel_um}, {focal_px} or {width, height, fx, fy, cx, cy, distortion: [k1, k2, p1, p2, k3]}
@@ -186,6 +188,8 @@ def read(path: Path | str, needs_camera: bool = True) -> Instrument:
     (0.0, 0.0, 0.0)
     """
     path = Path(path)
+    if platepar.is_rms(path):
+        return platepar.read(path).instrument
     content = yaml_file.load(path, "instrument file")
     if not isinstance(content, dict) or content.pop("starpos_instrument", None) != FORMAT:
         raise InstrumentError(

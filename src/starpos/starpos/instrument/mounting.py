@@ -115,6 +115,7 @@ class Mounting:
     a3                        (3, 3): camera C into inclinometer S
     link_to_camera            (3, 3): base link into C
     link_stddev_rad           1 sigma of link_to_camera about each axis
+    lens_stddev_rad           1 sigma of directions in C, about each axis across the optical one, by an unknown lens
     calibration_covariance    (3, 3) rad2 of A3 as a small rotation about S's axes; it includes the inclinometer's zero,
                               because only their sum matters
     remounted_rad             1 sigma about each axis of a turn of A3 since the calibration
@@ -131,6 +132,7 @@ class Mounting:
     link_to_camera: np.ndarray
     calibration_covariance: np.ndarray
     link_stddev_rad: float = 0.0
+    lens_stddev_rad: float = 0.0
     remounted_rad: float = 0.0
     inclinometer: InclinometerErrors = EXACT
     calibrated_unix_s: float = float("nan")

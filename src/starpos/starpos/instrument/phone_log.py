@@ -38,8 +38,23 @@ TIME = re.compile(r"time|.* \(s\)")
 AT_REST, GRAVITY = 0.03, 0.1
 # nanoseconds since 1970 are more, seconds since the start are fewer
 NANOSECONDS = 1e15
-HEAD = 4096
+HEAD, ZIP = 4096, b"PK\x03\x04"
 CURE = "give the app's zip as it exports it, of gravity or of the acceleration with gravity"
+
+
+def is_phone_log(path: Path) -> bool:
+    """Whether a file looks like a telephone's log."""
+    head = _head(path)
+    return head.startswith((ZIP, b"[")) or _is_header(head.decode("utf-8-sig", "replace").partition("\n")[0])
+
+
+def _head(path: Path) -> bytes:
+    """The beginning of a file, without white space; empty if it cannot be read."""
+    try:
+        with open_regular(path) as file:
+            return file.read(HEAD).lstrip(b"\xef\xbb\xbf \r\n")
+    except OSError:
+        return b""
 
 
 def read(path: Path, noise_rad: float) -> TiltLog | None:
@@ -47,18 +62,14 @@ def read(path: Path, noise_rad: float) -> TiltLog | None:
 
     noise_rad: 1 sigma of the white noise of a reading.
     """
-    try:
-        with open_regular(path) as file:
-            head = file.read(HEAD)
-    except OSError:
+    if not is_phone_log(path):
         return None
+    head = _head(path)
     try:
-        if head.startswith(b"PK\x03\x04"):
+        if head.startswith(ZIP):
             return _log(path, _texts(unpacked(path, FORM.most_bytes, MAX_FILES, _is_wanted)), noise_rad)
-        if head.lstrip(b"\xef\xbb\xbf \r\n").startswith(b"["):
+        if head.startswith(b"["):
             return _log(path, _tables_of_json(read_regular(path, FORM.most_bytes)), noise_rad)
-        if not _is_header(head.decode("utf-8-sig", "replace").partition("\n")[0]):
-            return None
         beside = [path, path.parent / START, path.parent / "Metadata.csv"]
         found = {p: read_regular(p, FORM.most_bytes) for p in beside if p is path or p.is_file()}
         return _log(path, _texts({f"{p.relative_to(path.parent)}": found[p] for p in found}), noise_rad)

@@ -15,7 +15,7 @@ from starpos.earth.gravity import SPIN, geodetic_place, gravity, gravity_gradien
 from starpos.earth.orientation import ROTATION_RAD_S
 from starpos.navigation.preintegration import ERRORS, Pieces, Sums
 from starpos.navigation.records import ImuModel, VelocityLog
-from starpos.navigation.vessel import MotionLaw
+from starpos.navigation.vessel import MotionLaw, Vessel
 from starpos.units import SIGMA_PER_MAD
 
 # Columns of a node: place m and velocity m/s in ITRS, attitude as a small rotation about ITRS's axes in rad, biases of
@@ -256,24 +256,10 @@ def _turned(axes: np.ndarray, v: np.ndarray) -> np.ndarray:
 
 # number of readings whose mean is the rate at a frame
 RATE_READINGS = 5
-# nothing is known of it before: place m, velocity m/s, attitude rad
+# 1 sigma of the first node, of which nothing is known: place m, velocity m/s, attitude rad; of the measured velocity's
+# scale (a share) and axes (rad an axis), and of the lag of the camera's stamps, s
 NO_PLACE, NO_VELOCITY, NO_TURN = 2e7, 1e3, 10.0
-
-
-@dataclass(frozen=True, kw_only=True)
-class VoyagePrior:
-    """What is known before the voyage, 1 sigma: mount rad an axis, share of refraction, height m.
-
-    log_scale, log_axes, lag_s: of the measured velocity (a share; rad an axis) and of the camera's stamps (s).
-    """
-
-    mount: float
-    refraction: float
-    height_m: float
-    height_stddev_m: float
-    log_scale: float = 0.01
-    log_axes: float = 0.005
-    lag_s: float = 0.005
+SCALE_STDDEV, AXES_STDDEV, LAG_STDDEV_S = 0.01, 0.005, 0.005
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -382,7 +368,7 @@ def law_residuals(motion: Motion, law: MotionLaw) -> Residuals:
     return Residuals(index=np.arange(count), rows=rows, covariance=covariance)
 
 
-def prior_rows(motion: Motion, model: ImuModel, prior: VoyagePrior, law: MotionLaw | None) -> np.ndarray:
+def prior_rows(motion: Motion, model: ImuModel, vessel: Vessel, law: MotionLaw | None) -> np.ndarray:
     """Whitened equations (P, n + m + 1) of the first node and the constants: what is known beforehand."""
     n = MEASURED if law is None else BY_LAW
     sigma, value = np.empty(n + CONSTANTS), np.zeros(n + CONSTANTS)
@@ -400,21 +386,21 @@ def prior_rows(motion: Motion, model: ImuModel, prior: VoyagePrior, law: MotionL
     matrix = np.where(np.eye(3, dtype=bool), model.scale_stddev, model.axes_stddev).ravel()
     nominal = Rotation.from_matrix(motion.nominal.T @ motion.camera_to_body).as_rotvec()
     for columns, spread, now in (
-        (MOUNT, prior.mount, nominal),
+        (MOUNT, vessel.mount_stddev, nominal),
         (GYRO_MATRIX, matrix, motion.gyro_matrix.ravel()),
         (ACCEL_MATRIX, matrix, motion.accel_matrix.ravel()),
-        (LOG_SCALE, prior.log_scale, motion.log_scale),
-        (LOG_AXES, prior.log_axes, motion.log_axes),
-        (LAG, prior.lag_s, motion.lag_s),
-        (REFRACTION, max(prior.refraction, 1e-6), motion.refraction),
+        (LOG_SCALE, SCALE_STDDEV, motion.log_scale),
+        (LOG_AXES, AXES_STDDEV, motion.log_axes),
+        (LAG, LAG_STDDEV_S, motion.lag_s),
+        (REFRACTION, max(vessel.atmosphere.relative_sigma, 1e-6), motion.refraction),
     ):
         sigma[n:][columns], value[n:][columns] = spread, now
     rows = np.zeros((n + CONSTANTS + 1, n + CONSTANTS + 1))
     rows[np.arange(n + CONSTANTS), np.arange(n + CONSTANTS)] = 1 / sigma
     rows[:-1, -1] = -value / sigma
     _, _, height = geodetic_place(motion.place[0])
-    rows[-1, PLACE] = zenith_at(motion.place[0]) / prior.height_stddev_m
-    rows[-1, -1] = (prior.height_m - float(height)) / prior.height_stddev_m
+    rows[-1, PLACE] = zenith_at(motion.place[0]) / vessel.height_stddev_m
+    rows[-1, -1] = (vessel.height_m - float(height)) / vessel.height_stddev_m
     return rows
 
 

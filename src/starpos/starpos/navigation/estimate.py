@@ -6,12 +6,15 @@ from typing import TypeVar
 
 import numpy as np
 
+from starpos._numeric.roots import symmetric_root
 from starpos.earth.ellipsoid import curvature_radii_m, enu_axes, meridian_turn
 from starpos.earth.gravity import geodetic_place
 from starpos.earth.orientation import earth_state
 from starpos.fix.attitude import ENU, LINK, Attitude, heading_of, heading_row
 from starpos.fix.budget import time_terms
-from starpos.fix.terms import total_covariance
+from starpos.fix.fix import PlaceFix
+from starpos.fix.terms import ErrorTerm, total_covariance
+from starpos.frozen import at_once
 from starpos.navigation.equations import (
     ACCEL_BIAS,
     BY_LAW,
@@ -32,13 +35,13 @@ from starpos.navigation.start import nodes_of
 from starpos.navigation.vessel import MotionLaw
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class VoyageFix:
+@at_once
+@dataclass(frozen=True, kw_only=True)
+class VoyageFix(PlaceFix):
     """Astronomic latitude, longitude and heading of the body's x (rad) at one time of a voyage.
 
     Attributes
     ----------
-    covariance : (3, 3) of east m, north m, heading rad
     velocity, velocity_covariance : (3,) east, north, up, m/s, and (3, 3)
     link : the body's axes, x forward, into east, north, up
     gyro_bias, accel_bias : (3,) rad/s, m/s2
@@ -51,11 +54,6 @@ class VoyageFix:
     (3,)
     """
 
-    utc_unix_s: float
-    latitude: float
-    longitude: float
-    heading: float
-    covariance: np.ndarray
     velocity: np.ndarray
     velocity_covariance: np.ndarray
     link: Attitude
@@ -75,27 +73,25 @@ def fix_of(
     attitude = enu @ motion.attitude[k]
     # turns of east, north, up about themselves for a metre to the east and to the north
     carried = np.array([[0, -1 / meridian], [1 / prime, 0], [meridian_turn(latitude) / prime, 0]])
-    # east m, north m, and the small rotation of the attitude about east, north, up
-    slope = np.zeros((5, 6))
+    # rows of an ErrorTerm, by place and attitude in ITRS
+    slope = np.zeros((6, 6))
     slope[:2, :3] = enu[:2]
-    slope[2:, :3] = -carried @ enu[:2]
-    slope[2:, 3:] = enu
+    slope[3:, :3] = -carried @ enu[:2]
+    slope[3:, 3:] = enu
+    slope[2] = heading_row(attitude) @ slope[3:]
     columns = np.r_[PLACE, TURN]
-    place_and_turn = slope @ covariance[np.ix_(columns, columns)] @ slope.T
-    to_heading = np.zeros((3, 5))
-    to_heading[:2, :2] = np.eye(2)
-    to_heading[2:, 2:] = heading_row(attitude)
+    own = ErrorTerm("adjustment", slope @ symmetric_root(covariance[np.ix_(columns, columns)]))
     earth = earth_state(float(motion.utc_unix_s[k]))
-    shared = total_covariance(time_terms(latitude, earth, clock_stddev_s, stamp_stddev_s))
+    terms = own, *time_terms(latitude, earth, clock_stddev_s, stamp_stddev_s)
     return VoyageFix(
         utc_unix_s=float(motion.utc_unix_s[k]),
         latitude=latitude,
         longitude=longitude,
         heading=heading_of(attitude),
-        covariance=to_heading @ place_and_turn @ to_heading.T + shared[:3, :3],
+        terms=terms,
         velocity=enu @ motion.velocity[k],
         velocity_covariance=enu @ covariance[VELOCITY, VELOCITY] @ enu.T,
-        link=Attitude(attitude, place_and_turn[2:, 2:] + shared[3:, 3:], of=LINK, into=ENU),
+        link=Attitude(attitude, total_covariance(terms)[3:, 3:], of=LINK, into=ENU),
         gyro_bias=motion.gyro_bias[k],
         accel_bias=motion.accel_bias[k],
     )

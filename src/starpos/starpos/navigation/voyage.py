@@ -24,7 +24,6 @@ from starpos.navigation.equations import (
     Odometry,
     Residuals,
     StarAttitudes,
-    VoyagePrior,
     law_residuals,
     links_of,
     prior_rows,
@@ -92,12 +91,6 @@ class Adjustment:
             raise VoyageError("no velocity lies on the voyage: check that its clock and the camera's agree")
         self.law = self._law(vessel)
         self.unknowns = MEASURED if self.law is None else BY_LAW
-        self.prior = VoyagePrior(
-            mount=vessel.mount_stddev,
-            refraction=vessel.atmosphere.relative_sigma,
-            height_m=vessel.height_m,
-            height_stddev_m=vessel.height_stddev_m,
-        )
         self.model = vessel.model
         self.excess = {"frames": 1.0, "velocities": 1.0, "forces": 1.0, "forces at rest": 1.0}
         # how many times as much wind or current change as their law says
@@ -310,7 +303,7 @@ class Adjustment:
         less = at_rest2 - self.model.accelerometer_noise_density**2
         links = links.noisier(less * ~self._shaken, self.pieces)
         chain = Chain(
-            first=prior_rows(motion, self.model, self.prior, self.law),
+            first=prior_rows(motion, self.model, self.vessel, self.law),
             nodes=np.concatenate(rows, 1),
             links=links.whitened(),
             constants=CONSTANTS,

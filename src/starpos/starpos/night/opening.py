@@ -23,7 +23,8 @@ from starpos.frames.tables import GNSS, SIMULATED, TILTS, TRUTH
 from starpos.gnss.receiver import GnssTrack, read_gnss_csv
 from starpos.instrument import instrument_file, sensors
 from starpos.instrument.instrument import ByGravity, Calibration, Instrument
-from starpos.instrument.tilt_log import TiltsByTime
+from starpos.instrument.phone_log import is_phone_log
+from starpos.instrument.tilt_log import Tilts, TiltsByTime
 from starpos.night.night import Night, Truth
 from starpos.night.reading import About, First, Instruments, Reader, TiltFile
 from starpos.night.remarks import Remark, of_gravity, of_tilts
@@ -101,20 +102,24 @@ def work_of(
     tilts: their table, or that photographs have their own; None where none is needed.  Raises TiltError if the table
     cannot be read.
     """
-    if isinstance(tilts, ByGravity):
-        model = PHONE if first.gravity is None else first.gravity.model
-        known = None if given.instrument is None else given.instrument.levelled_by(model)
-        instruments, remarks = replace(given, instrument=known).framed(first)
-        own = () if known is None or first.gravity is None else of_gravity(known)
-        return Solving(instruments, atmosphere=atmosphere, tilts=tilts, places=place), (*own, *remarks)
-    instruments, remarks = given.framed(first)
-    if tilts is None:
-        return Solving(instruments, atmosphere=atmosphere, places=place), remarks
-    known = instruments.instrument
-    errors = sensors.unnamed() if known is None else known.inclinometer
-    table = TiltFile(os.path.abspath(tilts), errors.noise_rad)
-    doubts = of_tilts(table.log, str(tilts), errors)
-    return Solving(instruments, atmosphere=atmosphere, tilts=table, places=place), (*remarks, *doubts)
+    known, own = given.instrument, tuple[Remark, ...]()
+    by_log = isinstance(tilts, Path) and is_phone_log(tilts) and first.upper_edge is not None
+    # a telephone's log has its camera's axes, unless another A3 is stated
+    by_log = by_log and (known is None or known.calibration.unknown)
+    if by_log or isinstance(tilts, ByGravity):
+        model = PHONE if by_log or first.gravity is None else first.gravity.model
+        known = None if known is None else known.levelled_by(model)
+        if known is not None and (by_log or first.gravity is not None):
+            own = of_gravity(known, by_log)
+    instruments, remarks = replace(given, instrument=known).framed(first)
+    level: Tilts | None = None if isinstance(tilts, Path) else tilts
+    if isinstance(tilts, Path):
+        known = instruments.instrument
+        errors = sensors.unnamed() if known is None else known.inclinometer
+        table = TiltFile(os.path.abspath(tilts), errors.noise_rad)
+        own = (*own, *of_tilts(table.log, str(tilts), errors))
+        level = ByGravity(table) if by_log else table
+    return Solving(instruments, atmosphere=atmosphere, tilts=level, places=place), (*own, *remarks)
 
 
 def frames_in(folder: Path) -> list[Path]:

@@ -5,7 +5,7 @@ import math
 import os
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import KW_ONLY, dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -64,17 +64,19 @@ def stars_of(item: Frame | Stars) -> Stars:
 
 @dataclass(frozen=True)
 class About:
-    """Frame size, focal length and place on the sensor in px, and gravity, as the first frame of a night states them."""
+    """Frame size, focal length, place on the sensor in px, gravity and upper edge, as a first frame states them."""
 
     width: int
     height: int
+    _: KW_ONLY
     focal_px: float | None
     origin_px: tuple[float, float] | None = None
     gravity: Gravity | None = None
+    upper_edge: tuple[int, int] | None = None
 
 
 # for pointings only the camera's axes count
-NO_CAMERA = About(IDEAL.width, IDEAL.height, IDEAL.fx)
+NO_CAMERA = About(IDEAL.width, IDEAL.height, focal_px=IDEAL.fx)
 
 
 @dataclass(frozen=True)
@@ -93,7 +95,14 @@ class First:
             with suppress(FrameError):
                 item = self.read(path)
                 self.read.keep(path, item)
-                about = About(item.width, item.height, item.focal_px, item.origin_px, item.gravity)
+                about = About(
+                    item.width,
+                    item.height,
+                    focal_px=item.focal_px,
+                    origin_px=item.origin_px,
+                    gravity=item.gravity,
+                    upper_edge=item.upper_edge,
+                )
                 if not self.levelled or item.gravity is not None:
                     return about
                 first = first or about

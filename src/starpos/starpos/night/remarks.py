@@ -57,15 +57,13 @@ def of_inclinometer(instrument: Instrument, ways: str = MODEL_BY_OPTIONS) -> tup
     return (Remark(sentence),) if sentence else ()
 
 
-def of_gravity(instrument: Instrument) -> tuple[Remark, ...]:
-    """Say what a place by photographs alone rests on; instrument: with their level."""
+def of_gravity(instrument: Instrument, by_log: bool = False) -> tuple[Remark, ...]:
+    """Say what a place by photographs rests on; instrument: with their level.  by_log: a telephone's log is it."""
     if not instrument.has_level_inside:
         return ()
     level = "felt by the telephone" if instrument.inclinometer_model == PHONE else "by the camera's level"
-    sentence = (
-        f"the level is the gravity in the files, {level}; time, zone and lens are the files' too; their GPS is only "
-        "compared"
-    )
+    where = "the telephone's log, as the camera's own" if by_log else f"the gravity in the files, {level}"
+    sentence = f"the level is {where}; time, zone and lens are the files', and their GPS is only compared"
     return (Remark(sentence),)
 
 

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The poses of a camera that stands still, night by night: whether it has moved, and by how much."""
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timezone
@@ -14,13 +15,18 @@ from starpos.fix.attitude import Attitude
 from starpos.fix.heading import AttitudeAtPlace
 from starpos.fix.solution import Solution
 from starpos.fix.terms import total_covariance
+from starpos.frames.frame import Frame, Stars
+from starpos.instrument.camera import EQUIDISTANT, Camera
 from starpos.units import ARCSEC, DAY_S, HOUR_S
 
-# how far the poses of two nights may differ without a knock until they have shown it themselves, 1 sigma per axis, and
-# for how many nights that counts
-WANDER_RAD, WANDER_NIGHTS = 15 * ARCSEC, 2
-# a camera that stands still leaves its own scatter by more once in 1e6 nights
-ALARM_SIGMAS = 5.5
+# how far an untouched camera may wander from night to night, 1 sigma per axis: from the stiffest mount to a post in the
+# Sun, each size as probable as any other until the nights have shown it
+WANDERS_RAD = np.geomspace(0.3, 20, 25) * ARCSEC
+# a camera that stands still leaves its own scatter by more in this share of the nights
+ALARM_CHANCE = 1e-6
+# the sky is measured within SKY_RAD of the axis, the black level beyond DARK_RAD, on each SPARSE-th pixel of each
+# SPARSE-th row, by this many pixels and stars at least
+SKY_RAD, DARK_RAD, SPARSE, FEWEST = np.radians(30), np.radians(105), 4, 30
 # the magnitude that this share of a night's identified stars is brighter than
 LIMIT_PERCENTILE = 95
 MEAN_HOUR_DEG = 15.0
@@ -34,7 +40,7 @@ class NightPose:
 
     day: the date of its evening by local mean time.  stars: number of identified ones.
     optics: C in east, north, up.  focal_px: mean of the frames, on the axis.
-    limit_mag: V of the faintest stars; NaN where it is not known.
+    limit_mag: V of the faintest stars; sky_mag: V of the sky per square arcsec; NaN where they are not known.
     """
 
     day: str
@@ -44,6 +50,7 @@ class NightPose:
     optics: Attitude
     focal_px: float
     limit_mag: float
+    sky_mag: float
 
     @property
     def own(self) -> np.ndarray:
@@ -80,17 +87,46 @@ class Kept:
         return float(np.linalg.norm(along * self.sigma) / ARCSEC)
 
 
-def night_poses(answers: Iterable[tuple[Solution, float]], longitude: float) -> tuple[NightPose, ...]:
+@dataclass(frozen=True, kw_only=True)
+class Answer:
+    """A frame's solution with an attitude at a known place, its camera's focal length in px, and its sky_mag."""
+
+    solution: Solution
+    focal_px: float
+    sky_mag: float = np.nan
+
+
+def sky_mag(frame: Frame, stars: Stars, answer: Solution, camera: Camera) -> float:
+    """V of the sky around the optical axis per square arcsec, by the identified stars of a fisheye's frame; else NaN.
+
+    The pixels that the lens does not reach are the black level.  A picture of 8 bit has no level that is proportional to
+    light.
+    """
+    if camera.model != EQUIDISTANT or frame.pixels.dtype != np.uint16 or answer.star is None:
+        return np.nan
+    y, x = np.mgrid[0 : frame.height : SPARSE, 0 : frame.width : SPARSE]
+    off = np.hypot((x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy)
+    levels = frame.pixels[::SPARSE, ::SPARSE].astype(float)
+    dark, sky = levels[off > DARK_RAD], levels[off < SKY_RAD]
+    row, v = np.asarray(answer.star, int), np.asarray(answer.magnitudes, float)
+    good = np.isfinite(v) & (stars.flags[row] == 0)
+    if len(dark) < FEWEST or len(sky) < FEWEST or good.sum() < FEWEST:
+        return np.nan
+    light = np.median(sky) - np.median(dark)
+    zero = np.median(v[good] + 2.5 * np.log10(stars.flux[row[good]]))
+    return float(zero - 2.5 * np.log10(light / camera.scale_arcsec**2)) if light > 0 else np.nan
+
+
+def night_poses(answers: Iterable[Answer], longitude: float) -> tuple[NightPose, ...]:
     """Poses of a camera in the order of their times, one or more a night.
 
-    answers: of frames with an attitude at a known place, each with its camera's focal length in px.
     longitude: of the place, rad; it says when a night begins.
     """
     late_s = np.degrees(longitude) / MEAN_HOUR_DEG * HOUR_S - DAY_S / 2
-    seen = sorted(answers, key=lambda a: _at(a[0]).utc_unix_s)
-    groups: list[tuple[str, list[tuple[Solution, float]]]] = []
+    seen = sorted(answers, key=lambda a: _at(a).utc_unix_s)
+    groups: list[tuple[str, list[Answer]]] = []
     for answer in seen:
-        evening = datetime.fromtimestamp(_at(answer[0]).utc_unix_s + late_s, timezone.utc)
+        evening = datetime.fromtimestamp(_at(answer).utc_unix_s + late_s, timezone.utc)
         day = evening.strftime("%Y-%m-%d")
         if groups and groups[-1][0] == day and _stands([*groups[-1][1], answer]):
             groups[-1][1].append(answer)
@@ -99,53 +135,59 @@ def night_poses(answers: Iterable[tuple[Solution, float]], longitude: float) -> 
     return tuple(_pose(day, group) for day, group in groups)
 
 
-def _at(answer: Solution) -> AttitudeAtPlace:
-    assert answer.at_place is not None
-    return answer.at_place
+def _at(answer: Answer) -> AttitudeAtPlace:
+    assert answer.solution.at_place is not None
+    return answer.solution.at_place
 
 
-def _stands(answers: Sequence[tuple[Solution, float]]) -> bool:
+def _stands(answers: Sequence[Answer]) -> bool:
     """Whether a camera stood still between frames."""
     try:
-        mean_attitude([_at(s) for s, _ in answers])
+        mean_attitude([_at(a) for a in answers])
     except FixError:
         return False
     return True
 
 
-def _pose(day: str, answers: Sequence[tuple[Solution, float]]) -> NightPose:
-    mean = mean_attitude([_at(s) for s, _ in answers])
-    magnitudes = np.concatenate([np.asarray(s.magnitudes, float) for s, _ in answers])
+def _pose(day: str, answers: Sequence[Answer]) -> NightPose:
+    mean = mean_attitude([_at(a) for a in answers])
+    magnitudes = np.concatenate([np.asarray(a.solution.magnitudes, float) for a in answers])
     known = magnitudes[np.isfinite(magnitudes)]
+    sky = np.array([a.sky_mag for a in answers if np.isfinite(a.sky_mag)])
     return NightPose(
         day=day,
         utc_unix_s=mean.utc_unix_s,
         frames=len(answers),
-        stars=sum(len(s.names) for s, _ in answers),
+        stars=sum(len(a.solution.names) for a in answers),
         optics=mean.optics,
-        focal_px=float(np.mean([f for _, f in answers])),
+        focal_px=float(np.mean([a.focal_px for a in answers])),
         limit_mag=float(np.percentile(known, LIMIT_PERCENTILE)) if len(known) else np.nan,
+        sky_mag=float(np.median(sky)) if len(sky) else np.nan,
     )
 
 
 def kept(poses: Iterable[NightPose]) -> tuple[Kept, ...]:
     """Each pose against the mean of those before it; after an alarm it is against those since.
 
-    The scatter that is allowed for is the one that the nights have shown so far, with WANDER_RAD in the beginning.
+    The sizes of the wander from night to night are weighed by what the nights have shown of them so far.
     """
     before: list[NightPose] = []
-    offs: list[float] = []
+    log_weight = np.zeros(len(WANDERS_RAD))
     found = []
     for pose in poses:
         turned, covariance, alarm = np.zeros(3), pose.own, False
         if before:
             mean = rotation.mean_rotation(np.array([p.optics.rotation for p in before]))
             turned = rotation.to_vector(pose.optics.rotation @ mean.T)
-            # what the nights have shown contains the errors of their frames
-            shown2 = (WANDER_NIGHTS * WANDER_RAD**2 + sum(offs)) / (WANDER_NIGHTS + len(offs))
-            wander2 = max(shown2 - float(np.trace(pose.own)) / 3, 0.0)
-            covariance = (pose.own + np.eye(3) * wander2) * (1 + 1 / len(before))
-            alarm = bool(turned @ np.linalg.solve(covariance, turned) > ALARM_SIGMAS**2)
+            more = 1 + 1 / len(before)
+            each = (pose.own + np.eye(3) * WANDERS_RAD[:, None, None] ** 2) * more
+            chi2 = (
+                turned @ np.linalg.solve(each, np.broadcast_to(turned, (len(each), 3))[..., None])[..., 0].T
+            )
+            weight = np.exp(log_weight - log_weight.max())
+            weight /= weight.sum()
+            covariance = np.tensordot(weight, each, 1)
+            alarm = bool(weight @ [_chance(x) for x in chi2] < ALARM_CHANCE)
         found.append(
             Kept(
                 pose=pose,
@@ -158,6 +200,11 @@ def kept(poses: Iterable[NightPose]) -> tuple[Kept, ...]:
         if alarm:
             before = []
         elif before:
-            offs.append(float(np.mean(turned**2)))
+            log_weight -= (chi2 + np.linalg.slogdet(each)[1]) / 2
         before.append(pose)
     return tuple(found)
+
+
+def _chance(chi2: float) -> float:
+    """Probability that three normal numbers have a larger sum of squares."""
+    return math.erfc(math.sqrt(chi2 / 2)) + math.sqrt(2 * chi2 / math.pi) * math.exp(-chi2 / 2)

@@ -35,7 +35,8 @@ from starpos.night.reading import First, Instruments, Reader, TiltFile, stars_of
 from starpos.night.remarks import Remark
 from starpos.progress import Progress, quiet
 from starpos.sky import catalogue
-from starpos.zenith.doubts import DeflectionSession
+from starpos.zenith.adjustment import DeflectionSession
+from starpos.zenith.doubts import checked_session
 from starpos.zenith.sighting import ZenithSighting, sighting
 
 if TYPE_CHECKING:
@@ -57,6 +58,7 @@ class OnFile:
     def files(self) -> tuple[str, ...]:
         """Files that it reads besides the frame."""
         tilts = getattr(self.work, "tilts", None)
+        tilts = tilts.log if isinstance(tilts, ByGravity) else tilts
         return (tilts.path,) if isinstance(tilts, TiltFile) else ()
 
     def __call__(self, path: str) -> Any:
@@ -100,7 +102,7 @@ class Solving:
 
     def __call__(self, item: Frame | Stars) -> Sight:
         """The sight of a frame; InstrumentError if its focal length is unknown, and must not be."""
-        if isinstance(self.tilts, ByGravity) and item.gravity is None:
+        if isinstance(self.tilts, ByGravity) and not self.tilts.has(item):
             begin, stars = time.process_time(), stars_of(item)
             sight = Sight(stars, Solution.refused(stars, self.tilts.missing(item)))
         elif self.instruments.sought and item.focal_px is None:
@@ -138,7 +140,7 @@ class Solving:
             return found
         focal_px, model = found.solution.pointing.focal_px, found.solution.pointing.model
         rough_px = item.rough_focal_px or focal_px
-        if item.gravity is not None and abs(focal_px / rough_px - 1) > CUT_OUT:
+        if self._by_phone(item) and abs(focal_px / rough_px - 1) > CUT_OUT:
             cut = FrameError(
                 f"{item.place}: its stars give a focal length of {focal_px:.0f} px, its EXIF {rough_px:.0f} px: it is a "
                 "part of a photograph, whose optical axis is unknown: give the whole one"
@@ -154,6 +156,10 @@ class Solving:
         remark = f"{item.place}: {told}: its stars give {focal_px:.0f} px"
         return replace(sight, solution=replace(sight.solution, remark=sight.solution.remark or remark))
 
+    def _by_phone(self, item: Frame | Stars) -> bool:
+        """Whether the level is in the camera that took a photograph."""
+        return item.gravity is not None or (isinstance(self.tilts, ByGravity) and self.tilts.has(item))
+
     def _answer_at(self, lens: tuple[float, str], question: Question) -> Sight:
         """The answer with this focal length in px and model of a lens."""
         known = self.instruments.instrument
@@ -161,19 +167,17 @@ class Solving:
         known, doubt = with_frame_size(replace(known, focal_px=lens[0], model=lens[1]), question.stars)
         solver = Solver(known, catalogue.load_catalogue(), self.atmosphere, progress=self.progress)
         sight = answer_frame(solver, question)
-        if (
-            question.item.gravity is not None
-            and sight.found is not None
-            and known.camera is None
-            and not doubt
-        ):
+        if self._by_phone(question.item) and sight.found is not None and known.camera is None and not doubt:
             # the lens of a telephone bends the field's corners by up to 100 px
             camera, _, _ = solver.view(sight.stars.width, sight.stars.height)
-            bent = lens_of_frame(sight.stars, sight.found, camera, solver.catalogue, self.atmosphere)
-            if bent is not camera:
-                known = replace(known, camera=bent, focal_px=bent.fx)
-                again = answer_frame(replace(solver, instrument=known), question)
-                sight = sight if again.found is None else again
+            bent, left_rad = lens_of_frame(
+                sight.stars, sight.found, camera, solver.catalogue, self.atmosphere
+            )
+            known = replace(known, camera=bent, focal_px=bent.fx, lens_stddev_rad=left_rad)
+            if bent is camera:
+                question = replace(question, stars=sight.stars, known=sight.found)
+            again = answer_frame(replace(solver, instrument=known), question)
+            sight = sight if again.found is None else again
         solution = replace(sight.solution, remark=sight.solution.remark or doubt)
         return replace(sight, solution=solution, instrument=known)
 
@@ -321,7 +325,7 @@ def deflection(
     Returns
     -------
     DeflectionSession
-        `adjusted` has xi_arcsec, eta_arcsec and covariance_arcsec2 (2, 2)
+        with xi_arcsec, eta_arcsec and covariance_arcsec2 (2, 2)
 
     Raises
     ------
@@ -332,7 +336,7 @@ def deflection(
     --------
     >>> lists = sorted(Path("zenith").glob("stars_*.csv"))
     >>> session = starpos.deflection(lists, "zenith/tilt.csv", (61.2, 24.5, 900.0), "zenith/instrument.yaml")
-    >>> round(session.adjusted.xi_arcsec), round(session.adjusted.eta_arcsec)
+    >>> round(session.xi_arcsec), round(session.eta_arcsec)
     (30, -12)
     """
     known = instrument_file.read(instrument) if isinstance(instrument, (str, Path)) else instrument
@@ -350,4 +354,4 @@ def deflection(
         with suppress(FrameError):
             answer = work(path)
             sightings += [answer] if isinstance(answer, ZenithSighting) else []
-    return DeflectionSession.of(sightings, framed, air, mark)
+    return checked_session(sightings, framed, air, mark)

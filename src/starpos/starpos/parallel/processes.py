@@ -9,6 +9,7 @@ breaks if processes die between two calls. And none of them does a call again al
 import os
 import pickle
 import signal
+import sys
 import traceback
 import warnings
 from collections import deque
@@ -95,6 +96,15 @@ class ProcessError(StarposError):
 def processors() -> int:
     """Number of processors that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def memory_bytes() -> int:
+    """Memory of this machine; where the system does not say it, enough for a process each."""
+    try:
+        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    # Windows has no sysconf
+    except (AttributeError, ValueError, OSError):
+        return sys.maxsize
 
 
 class Processes:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Orbits of satellites from files: mean elements (TLE, 3LE; OMM in JSON, XML, CSV), and ephemerides (OEM, SP3).
+"""Orbits of satellites from files: mean elements (TLE, 3LE; OMM in JSON, XML, CSV, KVN), and ephemerides (OEM, SP3).
 
 Mean elements are for SGP4 with the constants of WGS 72 alone (Hoots and Roehrich 1980, Spacetrack Report 3; Vallado et
 al. 2006, AIAA 2006-6753), by the package sgp4; OMM and OEM are CCSDS 502.0-B, SP3 is the IGS's (Hilla 2016).
@@ -9,6 +9,7 @@ import csv
 import io
 import json
 import math
+import re
 import xml.etree.ElementTree as ET
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
@@ -28,6 +29,8 @@ MOST_BYTES = 300_000_000
 # of the epochs of sgp4init: 1949-12-31, as a Julian date
 SGP4_EPOCH_JD = 2433281.5
 GPS_MINUS_TAI_S = -19.0
+# type of ephemeris of elements for another theory
+XP = 4
 # states of an ephemeris that one polynomial passes through
 POINTS = 9
 
@@ -179,7 +182,7 @@ class StoredOrbits:
         return [(f.name, (state := f.stat()).st_mtime_ns, state.st_size) for f in files]
 
 
-CURE = "give TLE, OMM (JSON, XML or CSV), OEM or SP3"
+CURE = "give TLE, OMM (JSON, XML, CSV or KVN), OEM or SP3"
 
 
 def _orbits(text: str) -> Iterator[Orbit | str]:
@@ -192,7 +195,19 @@ def _orbits(text: str) -> Iterator[Orbit | str]:
         # an entity may unfold to more than memory holds
         if "<!DOCTYPE" in text or "<!ENTITY" in text:
             raise ValueError("its XML declares a type or entities")
-        yield from _from_omm(_xml_rows(ET.fromstring(text)))
+        root = ET.fromstring(text)
+        if any(e.tag.rpartition("}")[2] == "stateVector" for e in root.iter()):
+            raise ValueError("an OEM in XML: give it as text (KVN)")
+        yield from _from_omm(_xml_rows(root))
+    elif start.startswith("CCSDS_OMM_VERS"):
+        parts = (part.splitlines() for part in text.split("CCSDS_OMM_VERS")[1:])
+        yield from _from_omm(
+            {
+                key.strip(): value.split("[")[0].strip()
+                for key, _, value in (line.partition("=") for line in part)
+            }
+            for part in parts
+        )
     elif start.startswith("CCSDS_OEM_VERS"):
         yield from _from_oem(text)
     elif start[:2] in ("#a", "#b", "#c", "#d"):
@@ -249,7 +264,10 @@ def _from_lines(text: str) -> Iterator[Orbit | str]:
         else:
             try:
                 record = Satrec.twoline2rv(line, second)
-                yield _of_record(record.satnum, before, record)
+                if record.ephtype == XP:
+                    yield f"line {number - 1}: its elements are for SGP4-XP, not for SGP4"
+                else:
+                    yield _of_record(record.satnum, before, record)
             except ValueError as e:
                 yield f"line {number}: {one_line(e)}"
         before = ""
@@ -283,7 +301,9 @@ def _from_fields(row: Mapping[str, Any]) -> Orbit | str:
     if (theory := row.get("MEAN_ELEMENT_THEORY") or "SGP4") not in ("SGP4", "SGP/SGP4"):
         return f"satellite {row['NORAD_CAT_ID']}: its elements are for {theory}, not for SGP4"
     number = int(row["NORAD_CAT_ID"])
-    epoch = unix_of(str(row["EPOCH"]).strip())
+    if str(row.get("EPHEMERIS_TYPE") or 0).strip() == str(XP):
+        return f"satellite {number}: its elements are for SGP4-XP, not for SGP4"
+    epoch = _time(str(row["EPOCH"]).strip())
     angles = ("ARG_OF_PERICENTER", "INCLINATION", "MEAN_ANOMALY", "RA_OF_ASC_NODE")
     perigee, inclination, anomaly, node = (math.radians(float(row[name])) for name in angles)
     values = (
@@ -335,7 +355,9 @@ def _from_oem(text: str) -> Iterator[Orbit | str]:
         elif equals:
             about[key] = value
         elif not skipped and len(cells := line.split()) >= 7 and cells[0][:1].isdigit():
-            utc = _utc(unix_of(cells[0][:26]), about.get("TIME_SYSTEM", "UTC"))
+            if about.get("CENTER_NAME", "EARTH").upper() != "EARTH":
+                raise ValueError(f"it is about {about['CENTER_NAME']}, not about the Earth")
+            utc = _utc(_time(cells[0]), about.get("TIME_SYSTEM", "UTC"))
             place = np.array([float(cell) for cell in cells[1:4]]) * 1e3
             rows.append((utc, place @ _to_gcrs(about.get("REF_FRAME", ""), utc).T))
 
@@ -344,6 +366,14 @@ def _number_of(about: Mapping[str, str]) -> int:
     """The catalogue number, where the object's id is one; otherwise a negative number of the id's own."""
     text = about.get("OBJECT_ID", "")
     return int(text) if text.isdigit() else -sum(ord(c) << 8 * (k % 3) for k, c in enumerate(text))
+
+
+def _time(text: str) -> float:
+    """Unix seconds of a time of CCSDS, whose date may be year and day of the year."""
+    text = text.rstrip("Z")[:26]
+    if found := re.match(r"(\d{4})-(\d{3})T", text):
+        return unix_of(f"{found[1]}-01-01{text[8:]}") + (int(found[2]) - 1) * DAY_S
+    return unix_of(text)
 
 
 def _utc(unix_s: float, system: str) -> float:

@@ -22,6 +22,8 @@ UNLIKELY = 1e-4
 # by how much (log) a satellite has to fit a trail better than any other
 AHEAD = 4.6
 ROUNDS = 4
+# Share of the named trails that has to fit within the stated errors.
+FITTING = 0.5
 # m by which all claims are rounded up: light in the air, SGP4's text
 FLOOR_M = 2.0
 
@@ -148,6 +150,11 @@ def _fix(
 ) -> SatelliteFix:
     used = answer.used
     satellites = {orbits[found.orbit[k]].number for k, fits in zip(rows, used, strict=True) if fits}
+    if used.sum() < FITTING * len(used):
+        raise SatelliteError(
+            f"of {len(used)} trails with a satellite only {used.sum()} fit one place within the stated errors: check the "
+            "times, the exposures and the errors of the sightings"
+        )
     if used.sum() < fewest or len(satellites) < 2:
         raise SatelliteError(
             f"only {used.sum()} trails of {len(satellites)} satellites agree: a place takes {fewest} of two or more"

@@ -23,6 +23,8 @@ from starpos.units import DAY_S, UNIX_EPOCH_JD
 
 # s between computed states; Hermite's cubic is within 6 m in low orbits
 STEP_S = 120.0
+# Maximum change (m) of a satellite's distance along a direction, or of its horizon's distance, in half a step.
+MOST_WAY_M = 1.5e6
 # a motion may differ by this share, and by this of its distance from the elements over the Earth's radius
 RATE_SHARE, RATE_TURN = 0.01, 4.0
 ENOUGH_SIGMA = 5.0
@@ -85,19 +87,31 @@ class OrbitsAbove:
         at_once, per_day = self._errors[0][rows], self._errors[1][rows]
         return at_once + per_day * np.abs(utc_unix_s - self._epochs[rows, None]) / DAY_S
 
+    def toward(self, direction: np.ndarray, utc_unix_s: float) -> np.ndarray:
+        """Rows (K,) of the orbits that may stand in a direction (3,) in ITRS from the ground, and some more."""
+        first = self._computed_from(utc_unix_s)
+        r, _ = self._nodes[first + round(utc_unix_s / STEP_S - first)]
+        beyond = np.sqrt(np.maximum(np.einsum("ki,ki->k", r, r) - EQUATOR_RADIUS_M**2, 0.0))
+        return np.flatnonzero(r @ direction > beyond - MOST_WAY_M)
+
     def at(self, utc_unix_s: float, which: np.ndarray | slice = slice(None)) -> tuple[np.ndarray, np.ndarray]:
         """Positions and velocities (S, 3), ITRS, m and m/s; NaN where there is no satellite."""
-        first = math.floor(utc_unix_s / STEP_S)
-        self._nodes = {k: self._nodes[k] for k in (first, first + 1) if k in self._nodes}
-        for k in (first, first + 1):
-            if k not in self._nodes:
-                self._nodes[k] = self._computed(k * STEP_S)
+        first = self._computed_from(utc_unix_s)
         (r0, v0), (r1, v1) = ((r[which], v[which]) for r, v in (self._nodes[first], self._nodes[first + 1]))
         x, h = utc_unix_s / STEP_S - first, STEP_S
         y = 1 - x
         place = (1 + 2 * x) * y**2 * r0 + (3 - 2 * x) * x**2 * r1 + h * x * y * (y * v0 - x * v1)
         speed = 6 * x * y / h * (r1 - r0) + (1 - 4 * x + 3 * x**2) * v0 + (3 * x**2 - 2 * x) * v1
         return place, speed
+
+    def _computed_from(self, utc_unix_s: float) -> int:
+        """Have the states at the computed times around a time; returns the number of the one before."""
+        first = math.floor(utc_unix_s / STEP_S)
+        self._nodes = {k: self._nodes[k] for k in (first, first + 1) if k in self._nodes}
+        for k in (first, first + 1):
+            if k not in self._nodes:
+                self._nodes[k] = self._computed(k * STEP_S)
+        return first
 
     def _computed(self, utc_unix_s: float) -> tuple[np.ndarray, np.ndarray]:
         moment = Moments.at(np.array([utc_unix_s]))
@@ -132,9 +146,9 @@ def candidates(
     for k in order:
         trail = trails[k]
         if trail.satellite in row_of:
-            only: np.ndarray | slice = np.array([row_of[trail.satellite]])
+            only: np.ndarray | None = np.array([row_of[trail.satellite]])
         elif trail.satellite is None and trail.moves:
-            only = slice(None)
+            only = None
         else:
             continue
         for way, one in enumerate(trail.ways):
@@ -153,7 +167,7 @@ def candidates(
 def _of_trail(
     trail: SatelliteTrail,
     sky: OrbitsAbove,
-    only: np.ndarray | slice,
+    only: np.ndarray | None,
     height_m: float,
     height_stddev_m: float,
     clock_stddev_s: float,
@@ -163,8 +177,8 @@ def _of_trail(
     geometric = normalised(trail.directions + moments.velocity)
     directions = np.einsum("eij,ej->ei", moments.gcrs_to_itrs, geometric)
     d = directions[0]
-    r, v = sky.at(trail.utc_unix_s[0], only)
-    rows = np.arange(sky.count)[only]
+    rows = sky.toward(d, trail.utc_unix_s[0]) if only is None else only
+    r, v = sky.at(trail.utc_unix_s[0], rows)
     # the ellipsoid at that height, stretched to a sphere
     radius = EQUATOR_RADIUS_M + height_m
     stretch = np.array([1.0, 1.0, radius / (EQUATOR_RADIUS_M * math.sqrt(1 - ECCENTRICITY2) + height_m)])

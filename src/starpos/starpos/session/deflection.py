@@ -15,8 +15,8 @@ from starpos.instrument.tilt_log import Tilts
 from starpos.session.calibrating import OF_AVERAGE
 from starpos.session.driver import Diagnosis, Jobs, Level
 from starpos.session.settings import Settings
-from starpos.zenith.adjustment import Adjusted
-from starpos.zenith.doubts import DeflectionSession
+from starpos.zenith.adjustment import DeflectionSession
+from starpos.zenith.doubts import checked_session
 from starpos.zenith.sighting import ZenithSighting, sighting
 from starpos.zenith.stations import NEW
 
@@ -88,7 +88,7 @@ class LiveDeflection:
         self._adjusted_of = len(sightings)
         # an A3 that was found by turning comes from these very frames
         instrument, air = self._settings.instrument(None), solver.atmosphere
-        coming = self._jobs.run(lambda: DeflectionSession.of(sightings, instrument, air, mark))
+        coming = self._jobs.run(lambda: checked_session(sightings, instrument, air, mark))
 
         def done(result: object) -> None:
             outcome = coming.result()
@@ -103,18 +103,16 @@ class LiveDeflection:
             waiting = f"{len(self._sightings)} frames so far"
             said = self._trouble or self._left_out or "point the camera at the zenith"
             return Diagnosis(Level.WARN, f"{waiting}: {said}", {"frames": len(self._sightings)})
-        found, wanted = self._found.adjusted, self.wanted_arcsec
+        found, wanted = self._found, self.wanted_arcsec
         sigma = float(found.sigma_arcsec.max())
         faces = int(found.faces.max()) + 1
         enough = sigma <= wanted and not self._trouble
         xi, eta = found.sigma_arcsec.tolist()
         text = (
             f"xi {found.xi_arcsec:+.3f} +- {xi:.3f}, eta {found.eta_arcsec:+.3f} +- {eta:.3f} arcsec, {faces} faces, "
-            f"{len(self._found.sightings)} frames"
+            f"{len(found.sightings)} frames"
         )
-        more = self._trouble or (
-            "enough" if enough else f"not enough: {_lacking(self._found, faces, wanted)}"
-        )
+        more = self._trouble or ("enough" if enough else f"not enough: {_lacking(found, faces, wanted)}")
         if len(self._sightings) >= MOST and not enough:
             more = f"{MOST} frames are the most: finish, and call solver/reset"
         values = {
@@ -124,29 +122,28 @@ class LiveDeflection:
             "sigma eta arcsec": eta,
             "wanted arcsec": wanted,
             "faces": faces,
-            "frames": len(self._found.sightings),
+            "frames": len(found.sightings),
             "enough": enough,
         }
         return Diagnosis(Level.OK if enough else Level.WARN, f"{more}; {text}", values)
 
 
-def _lacking(session: DeflectionSession, faces: int, wanted_arcsec: float) -> str:
+def _lacking(found: DeflectionSession, faces: int, wanted_arcsec: float) -> str:
     """Advice on reaching the wanted error in a session."""
     if faces < QUARTER:
         return f"turn by a quarter, to face {faces + 1}"
-    found = session.adjusted
     averages = _variance(found, [t for t in found.terms if t[0] in NEW])
     stays = [t for t in found.terms if t[0] not in NEW]
     left = wanted_arcsec**2 - _variance(found, stays)
     if left <= 0:
         name, *sizes = max(stays, key=lambda term: max(term[1:]))
         return f"more frames do not help, {name} alone leaves {max(sizes):.3f}"
-    passed_s = session.sightings[-1].utc_unix_s - session.sightings[0].utc_unix_s
+    passed_s = found.sightings[-1].utc_unix_s - found.sightings[0].utc_unix_s
     minutes = max(passed_s * (averages / left - 1) / 60, 1.0)
     return f"about {minutes:.0f} min more, turning on"
 
 
-def _variance(found: Adjusted, terms: Sequence[tuple[str, float, float]]) -> float:
+def _variance(found: DeflectionSession, terms: Sequence[tuple[str, float, float]]) -> float:
     """Sum of the squares of terms, arcsec2, of the component that errs most."""
     worst = int(np.argmax(found.sigma_arcsec))
     return float(sum(sizes[worst] ** 2 for _, *sizes in terms))

@@ -176,7 +176,7 @@ class GnssTeacher:
     def solve(self, solver: Solver, stars: Stars, rough: Solution, compared: bool = True) -> Watched:
         """Solve a frame with what GNSS taught before it; compared: with GNSS's place of its time too."""
         watch = self._watch_of(solver.instrument)
-        answer = watched(solver, stars, rough, self._compared_with(stars) if compared else None, watch)
+        answer = watched(solver, stars, rough, self._compared_with(stars, rough) if compared else None, watch)
         if self._settings.site is not None:
             # the heading there is better than any fix's
             answer = replace(answer, solution=replace(answer.solution, at_place=rough.at_place))
@@ -205,7 +205,7 @@ class GnssTeacher:
             self._log.warning("another camera_info: what GNSS taught of the other camera is forgotten")
             self._watch = GnssWatch(self._instrument, self._settings.vertical)
 
-    def _compared_with(self, stars: Stars) -> Place | None:
+    def _compared_with(self, stars: Stars, rough: Solution) -> Place | None:
         if stars.mid_unix_s is None:
             return None
         try:
@@ -213,7 +213,7 @@ class GnssTeacher:
         except GnssError as error:
             self._heard.refuse(GNSS_TOPIC, str(error))
             return None
-        if place is None and self._satellites is not None:
+        if place is None and self._satellites is not None and rough.fix is not None:
             return self._satellites.teaching(stars.mid_unix_s)
         return place
 

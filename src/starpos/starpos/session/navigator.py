@@ -15,7 +15,7 @@ import numpy as np
 from starpos.earth.ellipsoid import enu_axes
 from starpos.earth.gravity import geodetic_place
 from starpos.earth.place import Place
-from starpos.earth.vertical import Geodetic, geodetic
+from starpos.earth.vertical import Geodetic
 from starpos.errors import GnssError, VoyageError
 from starpos.files import path_of
 from starpos.fix.attitude import Attitude
@@ -305,7 +305,7 @@ class NavigatorSession:
             return Navigated(utc_unix_s=time_s)
         self.counts["fixes"] += 1
         ground, (displacement, covariance) = (
-            self._ground(estimate.fix),
+            estimate.fix.on_ground(self._settings.vertical),
             self._displacement(estimate),
         )
         return Navigated(
@@ -315,9 +315,6 @@ class NavigatorSession:
             displacement=displacement,
             displacement_covariance=covariance,
         )
-
-    def _ground(self, fix: VoyageFix) -> Geodetic:
-        return geodetic(fix.latitude, fix.longitude, fix.heading, fix.covariance, self._settings.vertical)
 
     def _displacement(self, estimate: Estimate) -> tuple[np.ndarray, np.ndarray] | tuple[None, None]:
         """Where an estimate lies from the first place that was known well enough, with covariance; None before it."""
@@ -366,7 +363,9 @@ class NavigatorSession:
         if gnss is not None and abs(estimate.utc_unix_s - gnss.utc_unix_s) < OLDEST_S:
             fix = estimate.fix
             moving = float(np.linalg.norm(fix.velocity))
-            apart_m, wrong = contradiction(gnss, self._ground(fix), fix.utc_unix_s, moving)
+            apart_m, wrong = contradiction(
+                gnss, fix.on_ground(self._settings.vertical), fix.utc_unix_s, moving
+            )
             values["GNSS from here (m)"] = apart_m
             faults += [wrong] if wrong else []
         said = [f"place to {known.sigma_m:.3g} m", *([known.missing] if known.missing else [])]

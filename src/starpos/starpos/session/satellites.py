@@ -119,17 +119,14 @@ class LiveSatellites:
         def done(_: object) -> None:
             outcome = coming.result()
             if era == self._era:
-                self._take(
-                    outcome.value
-                    or replace(self._newest or Located(stamp=None, trails=()), why=outcome.trouble)
-                )
+                # a defect loses these frames' trails
+                self._take(outcome.value or Located(stamp=frames[-1][0], trails=trails, why=outcome.trouble))
 
         coming.add_done_callback(done)
 
     def _take(self, found: Located) -> None:
         self._newest, self._trails = found, found.trails
-        if found.stamp is not None:
-            self._made.append(BySatellites(found.stamp, found.fix))
+        self._made.append(BySatellites(found.stamp, found.fix))
         if found.fix is not None:
             utc_unix_s = float(found.trails[-1].utc_unix_s[0])
             fix = found.fix

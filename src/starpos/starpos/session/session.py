@@ -263,10 +263,6 @@ class SolverSession:
         self._advance(now)
         return self._work(now) if now.played else []
 
-    def begin(self) -> None:
-        """Note that recorded messages begin: an earlier publisher of tilts was another player, no second inclinometer."""
-        self.tilts.forget_publishers()
-
     def end(self, now: Now) -> list[Output]:
         """Answer the frames that wait, because nothing comes any more; again after a job."""
         self._advance(now)
@@ -279,16 +275,22 @@ class SolverSession:
         if was_s is None or now.unix_s is None:
             return
         if now.unix_s < was_s - STEP_S:
-            # The clock was set back: no tilt may be from the future.
+            # The clock was set back: no tilt may be from the future, and another player is no second inclinometer.
             self.tilts.forget_after(now.unix_s)
+            self.tilts.forget_publishers()
         if now.unix_s > was_s:
             for message in self.tilts.pop_early():
                 with refusing(self._heard, "tilt"):
                     self.tilts.keep_in_time(message, now, self._settings.tilt_stddev_rad)
 
     def _work(self, now: Now) -> list[Output]:
+        """Answer what can be answered, and have the trails of these frames looked at."""
+        made = self._answers(now)
+        return made if self.satellites is None else made + self.satellites.fetch()
+
+    def _answers(self, now: Now) -> list[Output]:
         """Answer the first frames that have everything they need: of recorded ones all, live one at a time."""
-        made = [] if self.satellites is None else self.satellites.fetch()
+        made: list[Output] = []
         self.more = False
         # In recorded data a job is done when it was begun, however long it takes.
         while not (now.played and self.busy) and self._first_ready(now):

@@ -133,11 +133,12 @@ class Air:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Adjusted:
+class DeflectionSession:
     """The deflection of a session at the mark, arcsec, with its errors.
 
+    sightings (N,): in order of time.
     covariance_arcsec2 (2, 2): of xi, eta, the sum over sources of error, by_source (2, 2).
-    a3 (3, 3): C into S, with the tiltmeter's zero.  turn_stddev_rad: of its turn about the plumb line.
+    a3 (3, 3): C into S, with the tiltmeter's zero.
     faces (N,): number of each frame's face.  frame_arcsec (N, 2): xi, eta of each frame minus the session's.
     frame_stddev_arcsec (N, 2): what these should scatter by.
     catalogue_factor: size of the catalogue's errors over what it states, by the session's own stars.
@@ -146,14 +147,21 @@ class Adjusted:
     likewise, with the air of this adjustment.  gain: twice the log of the likelihood minus the one of same_air.
     chi2_per_degree: of the residuals; 1 where the stated errors and the air's explain them.
     face_quality: each face against the others.  stars (S,): rows of the catalogue.
+
+    Examples
+    --------
+    >>> lists = sorted(Path("zenith").glob("stars_*.csv"))
+    >>> session = starpos.deflection(lists, "zenith/tilt.csv", (61.2, 24.5, 900.0), "zenith/instrument.yaml")
+    >>> len(session.sightings)
+    8
     """
 
+    sightings: tuple[ZenithSighting, ...]
     xi_arcsec: float
     eta_arcsec: float
     covariance_arcsec2: np.ndarray
     by_source: dict[str, np.ndarray]
     a3: np.ndarray
-    turn_stddev_rad: float
     faces: np.ndarray
     frame_arcsec: np.ndarray
     frame_stddev_arcsec: np.ndarray
@@ -164,9 +172,14 @@ class Adjusted:
     stars: np.ndarray
     leftover: Leftover
     inclinometer: InclinometerErrors
-    as_stated: "Adjusted | None" = None
-    same_air: "Adjusted | None" = None
+    as_stated: "DeflectionSession | None" = None
+    same_air: "DeflectionSession | None" = None
     gain: float = 0.0
+
+    @property
+    def mid_unix_s(self) -> float:
+        """Mean time of its frames, UTC."""
+        return sum(s.utc_unix_s for s in self.sightings) / len(self.sightings)
 
     @property
     def sigma_arcsec(self) -> np.ndarray:
@@ -210,8 +223,8 @@ def adjusted(
     instrument: Instrument,
     atmosphere: Atmosphere,
     mark: Place,
-) -> Adjusted:
-    """The deflection of a session; sightings: in order of time, at least three.
+) -> DeflectionSession:
+    """The deflection of a session; sightings: at least three, in any order.
 
     Raises FixError where there are fewer, at the poles, or where the equations have no solution or do not settle.
     """
@@ -219,12 +232,14 @@ def adjusted(
         raise FixError(f"{len(sightings)} frames make no session: at least 3, in several faces, are needed")
     if np.cos(mark.latitude) < MIN_COSINE:
         raise FixError("the mark is within 6 km of a pole, where eta has no direction")
-    places = StarPlaces.of(sightings)
-    sightings = places.applied(sightings)
+    in_time = tuple(sorted(sightings, key=lambda s: s.utc_unix_s))
+    places = StarPlaces.of(in_time)
+    placed = places.applied(in_time)
     session = _Session(
-        sightings=sightings,
+        seen=in_time,
+        sightings=placed,
         places=places,
-        faces=faces_of(sightings),
+        faces=faces_of(placed),
         prior=_prior_of(instrument),
         bending=atmosphere.refraction().a,
         given=instrument.calibration,
@@ -239,7 +254,7 @@ def adjusted(
         ) from None
 
 
-def _whole_session(session: "_Session", inclinometer: InclinometerErrors) -> Adjusted:
+def _whole_session(session: "_Session", inclinometer: InclinometerErrors) -> DeflectionSession:
     """The session with the errors of the tiltmeter as stated, or larger ones where the residuals show them."""
     stated = session.solved(inclinometer, None)
     if (shown := session.shown(stated)) is None:
@@ -270,8 +285,9 @@ class _Solved:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _Session:
-    """What is given: sightings with the stars' places that they adjusted, and what is known before."""
+    """What is given: sightings, as seen and with the stars' places that they adjusted, and what is known before."""
 
+    seen: tuple[ZenithSighting, ...]
     sightings: Sequence[ZenithSighting]
     places: StarPlaces
     faces: np.ndarray
@@ -458,7 +474,7 @@ def _leftover(solved: _Solved, mark: Place) -> Leftover:
     )
 
 
-def _adjusted(session: _Session, solved: _Solved) -> Adjusted:
+def _adjusted(session: _Session, solved: _Solved) -> DeflectionSession:
     sightings, faces, places, mark = session.sightings, session.faces, session.places, session.mark
     estimate, lines, errors, fit, air = solved.estimate, solved.lines, solved.errors, solved.fit, solved.air
     scaled = (
@@ -481,17 +497,15 @@ def _adjusted(session: _Session, solved: _Solved) -> Adjusted:
     n = len(sightings)
     own = own.reshape(n, 2, n, 2)[np.arange(n), :, np.arange(n)]
     per_frame = np.einsum("nab,nbc,ndc->nad", back, own, back)
-    north, east = estimate.lean
-    up = estimate.a3 @ [east, north, 1.0]
     xi_eta = estimate.deflection(mark.latitude) / ARCSEC
     leftover = _leftover(solved, mark)
-    return Adjusted(
+    return DeflectionSession(
+        sightings=session.seen,
         xi_arcsec=float(xi_eta[0]),
         eta_arcsec=float(xi_eta[1]),
         covariance_arcsec2=whole,
         by_source=by_source,
         a3=estimate.a3,
-        turn_stddev_rad=float(np.sqrt(up @ fit.covariance[2:, 2:] @ up)),
         faces=faces,
         frame_arcsec=np.einsum("nab,nb->na", back, left) / ARCSEC,
         frame_stddev_arcsec=np.sqrt(np.diagonal(per_frame, axis1=1, axis2=2)) / ARCSEC,
@@ -520,14 +534,14 @@ class Reduced:
     geoid_arcsec: np.ndarray
 
 
-def reduced(found: Adjusted, sightings: Sequence[ZenithSighting], mark: Place) -> Reduced:
+def reduced(found: DeflectionSession, mark: Place) -> Reduced:
     """The reductions of a session.
 
     The mark's height above the ellipsoid stands for that above the geoid: 50 m between them are 0.009 arcsec at most.
     What mountains add to the curvature no formula of the latitude has.
     """
     place = itrs_place(mark.latitude, mark.longitude, mark.height_m)
-    t = np.array([s.utc_unix_s for s in sightings])
+    t = np.array([s.utc_unix_s for s in found.sightings])
     number = np.bincount(found.faces)
     middles = np.bincount(found.faces, t) / number
     tides = np.array([plumb_tide(middle, place, mark.axes) for middle in middles.tolist()])

@@ -2,7 +2,6 @@
 """A zenith session: its deflection, and what speaks against it: faces that do not come round, a jump of clock or zero."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -14,7 +13,7 @@ from starpos.errors import FixError
 from starpos.instrument.instrument import Instrument
 from starpos.sky.catalogue import load_catalogue
 from starpos.units import ARCSEC, utc_text
-from starpos.zenith.adjustment import Adjusted, FaceQuality, adjusted, check_round
+from starpos.zenith.adjustment import DeflectionSession, FaceQuality, adjusted, check_round
 from starpos.zenith.sighting import ZenithSighting
 
 # On land 6 arcsec are usual, over 25 are found in high mountains only, over 120 nowhere.
@@ -36,12 +35,15 @@ ZONES_ARCSEC, ZONES_ARCSEC_PER_YEAR, ZONES_EPOCH, LIKE_GAIA_ARCSEC = 0.001, 0.00
 UNLEVEL_SIGMA = 3.0
 
 
-def check_session(found: Adjusted, sightings: Sequence[ZenithSighting]) -> None:
-    """Raise FixError, with a sentence, where the readings do not bear a deflection."""
-    check_round(found.covariance_arcsec2, sightings, found.faces)
+def checked_session(
+    sightings: Sequence[ZenithSighting], instrument: Instrument, atmosphere: Atmosphere, mark: Place
+) -> DeflectionSession:
+    """The deflection of a session; FixError, with a sentence, where the sightings do not bear one."""
+    found = adjusted(sightings, instrument, atmosphere, mark)
+    check_round(found.covariance_arcsec2, found.sightings, found.faces)
     for fit in (found.as_stated, found):
-        chi2, sentence = (0.0, "") if fit is None else _doubt(fit, sightings)
-        if chi2 > DOUBTED_CHI2 and not (fit is found.as_stated and _no_jump(found, sightings)):
+        chi2, sentence = (0.0, "") if fit is None else _doubt(fit)
+        if chi2 > DOUBTED_CHI2 and not (fit is found.as_stated and _no_jump(found)):
             raise FixError(sentence)
     size = float(np.hypot(found.xi_arcsec, found.eta_arcsec))
     if size > MAX_ARCSEC:
@@ -49,9 +51,10 @@ def check_session(found: Adjusted, sightings: Sequence[ZenithSighting]) -> None:
             f"the deflection would be {size:.0f} arcsec, as on no place of the Earth: the site is "
             f"{_off(found)}, or the clock is wrong"
         )
+    return found
 
 
-def remarks(found: Adjusted, sightings: Sequence[ZenithSighting], frames: int, scale: float) -> list[str]:
+def remarks(found: DeflectionSession, frames: int, scale: float) -> list[str]:
     """Sentences on possible faults of a deflection.
 
     frames: number that was given.  scale: stated error of the tiltmeter's scale.
@@ -75,15 +78,15 @@ def remarks(found: Adjusted, sightings: Sequence[ZenithSighting], frames: int, s
         said.append(f"{_face_off(quality)} (1 sigma {xi:.2f}, {eta:.2f}): look at its frames")
     if not unlike and found.gain > WORSE_GAIN:
         said += _worse(found)
-    zones = _zones_arcsec(found, sightings)
+    zones = _zones_arcsec(found)
     if found.sigma_arcsec.min() < zones:
         said.append(
             f"zonal errors of Tycho-2, up to {zones:.3f} arcsec here, are not in the covariance: all sessions under "
             "these stars share them: use Gaia's places (starpos catalogue build --gaia)"
         )
-    if frames > len(sightings):
-        said.append(f"{frames - len(sightings)} of {frames} frames are left out")
-    lean = max(np.ptp([s.tilt.theta[k] for s in sightings]) for k in (0, 1)) / ARCSEC
+    if frames > len(found.sightings):
+        said.append(f"{frames - len(found.sightings)} of {frames} frames are left out")
+    lean = max(np.ptp([s.tilt.theta[k] for s in found.sightings]) for k in (0, 1)) / ARCSEC
     if scale * lean > UNLEVEL_SIGMA * found.sigma_arcsec.max():
         said.append(
             f"the tiltmeter's angles differ by up to {lean:.0f} arcsec from face to face, of which its scale, known to "
@@ -93,17 +96,17 @@ def remarks(found: Adjusted, sightings: Sequence[ZenithSighting], frames: int, s
     return said
 
 
-def _doubt(fit: Adjusted, sightings: Sequence[ZenithSighting]) -> tuple[float, str]:
+def _doubt(fit: DeflectionSession) -> tuple[float, str]:
     """Chi-square of what speaks most against an adjustment, and the sentence about it."""
-    return max((_clock(fit, sightings), _zero(fit, sightings), _face(fit)), key=lambda doubt: doubt[0])
+    return max((_clock(fit), _zero(fit), _face(fit)), key=lambda doubt: doubt[0])
 
 
-def _no_jump(found: Adjusted, sightings: Sequence[ZenithSighting]) -> bool:
+def _no_jump(found: DeflectionSession) -> bool:
     """Whether a tiltmeter that is worse than stated explains the residuals better than one jump or one face does."""
-    return found.same_air is not None and _doubt(found.same_air, sightings)[0] < found.gain
+    return found.same_air is not None and _doubt(found.same_air)[0] < found.gain
 
 
-def _unlike(found: Adjusted) -> list[FaceQuality]:
+def _unlike(found: DeflectionSession) -> list[FaceQuality]:
     """The faces that are unlike the others."""
     if found.as_stated is None or found.same_air is None:
         return [face for face in found.face_quality if face.chi2 > UNLIKE_CHI2]
@@ -112,7 +115,7 @@ def _unlike(found: Adjusted) -> list[FaceQuality]:
     return [face for face, here in both if face.chi2 > UNLIKE_CHI2 and here.chi2 > found.gain]
 
 
-def _worse(found: Adjusted) -> list[str]:
+def _worse(found: DeflectionSession) -> list[str]:
     """Errors of the tiltmeter that the residuals show larger than its file states them."""
     if found.as_stated is None:
         return []
@@ -132,16 +135,16 @@ def _worse(found: Adjusted) -> list[str]:
     ]
 
 
-def _zones_arcsec(found: Adjusted, sightings: Sequence[ZenithSighting]) -> float:
+def _zones_arcsec(found: DeflectionSession) -> float:
     """Zonal errors of the catalogue at the session's date, at most; 0 for a catalogue like Gaia's."""
-    year, _ = earth_motion(sightings[0].utc_unix_s)
+    year, _ = earth_motion(found.sightings[0].utc_unix_s)
     sigma = float(np.median(load_catalogue().sigma(found.stars, year))) / ARCSEC
     if sigma < LIKE_GAIA_ARCSEC:
         return 0.0
     return ZONES_ARCSEC + ZONES_ARCSEC_PER_YEAR * abs(year - ZONES_EPOCH)
 
 
-def _off(found: Adjusted) -> str:
+def _off(found: DeflectionSession) -> str:
     """How far the site would be off."""
     north, east = np.array([found.xi_arcsec, found.eta_arcsec]) * ARCSEC * EARTH_RADIUS_M
     return (
@@ -150,28 +153,28 @@ def _off(found: Adjusted) -> str:
     )
 
 
-def _clock(found: Adjusted, sightings: Sequence[ZenithSighting]) -> tuple[float, str]:
+def _clock(found: DeflectionSession) -> tuple[float, str]:
     """Chi-square of the likeliest jump of the clock, and the sentence about it."""
     step, chi2, at = _steps(found, found.leftover.by_second[..., None])
-    when = utc_text(sightings[at].utc_unix_s)
+    when = utc_text(found.sightings[at].utc_unix_s)
     return chi2, (
         f"the clock that stamps the frames seems to have jumped by {step[0]:+.3f} s before {when}: use the frames "
         "before or after, or repeat the session with a disciplined clock"
     )
 
 
-def _zero(found: Adjusted, sightings: Sequence[ZenithSighting]) -> tuple[float, str]:
+def _zero(found: DeflectionSession) -> tuple[float, str]:
     """Chi-square of the likeliest jump of the tiltmeter's zero, and the sentence about it."""
-    step, chi2, at = _steps(found, np.broadcast_to(np.eye(2), (len(sightings), 2, 2)))
+    step, chi2, at = _steps(found, np.broadcast_to(np.eye(2), (len(found.sightings), 2, 2)))
     x, y = step / ARCSEC
     # two parameters where the clock has one
     return chi2 - 2, (
         f"the tiltmeter's zero seems to have jumped by {x:+.2f}, {y:+.2f} arcsec before "
-        f"{utc_text(sightings[at].utc_unix_s)}: use the frames before or after, or repeat the session"
+        f"{utc_text(found.sightings[at].utc_unix_s)}: use the frames before or after, or repeat the session"
     )
 
 
-def _face(found: Adjusted) -> tuple[float, str]:
+def _face(found: DeflectionSession) -> tuple[float, str]:
     """Chi-square of the face that goes least with the others, and the sentence about it."""
     if not found.face_quality:
         return 0.0, ""
@@ -187,43 +190,10 @@ def _face_off(face: FaceQuality) -> str:
     )
 
 
-def _steps(found: Adjusted, columns: np.ndarray) -> tuple[np.ndarray, float, int]:
+def _steps(found: DeflectionSession, columns: np.ndarray) -> tuple[np.ndarray, float, int]:
     """The likeliest jump (m,) along columns (N, 2, m), its chi-square, and the frame from which on it holds."""
     late = np.arange(len(columns))
     every = [found.leftover.tested(columns * (late >= k)[:, None, None]) for k in late[1:]]
     at = int(np.argmax([chi2 for _, _, chi2 in every]))
     step, _, chi2 = every[at]
     return step, chi2, at + 1
-
-
-@dataclass(frozen=True, eq=False)
-class DeflectionSession:
-    """A session: its sightings in order of time, and the deflection that they give.
-
-    Examples
-    --------
-    >>> lists = sorted(Path("zenith").glob("stars_*.csv"))
-    >>> session = starpos.deflection(lists, "zenith/tilt.csv", (61.2, 24.5, 900.0), "zenith/instrument.yaml")
-    >>> len(session.sightings)
-    8
-    """
-
-    sightings: tuple[ZenithSighting, ...]
-    adjusted: Adjusted
-
-    @classmethod
-    def of(
-        cls, sightings: Sequence[ZenithSighting], instrument: Instrument, atmosphere: Atmosphere, mark: Place
-    ) -> "DeflectionSession":
-        """Adjust the sightings; FixError, with a sentence, where they do not bear a deflection."""
-        if not sightings:
-            raise FixError("no frame with stars and a tilt: there is no deflection")
-        in_time = tuple(sorted(sightings, key=lambda s: s.utc_unix_s))
-        found = adjusted(in_time, instrument, atmosphere, mark)
-        check_session(found, in_time)
-        return cls(in_time, found)
-
-    @property
-    def mid_unix_s(self) -> float:
-        """Mean time of its frames, UTC."""
-        return sum(s.utc_unix_s for s in self.sightings) / len(self.sightings)

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from starpos import rotation
 from starpos.calibration.camera import calibrate_camera, lens_of_frame, rms
 from starpos.detection import detect
 from starpos.earth.refraction import Atmosphere
@@ -102,11 +103,28 @@ def test_the_lens_that_one_frames_stars_show_is_nearer_than_a_pinhole(catalogue,
         found = solver.identify(stars).found
         if found is None:
             continue
-        lens = lens_of_frame(stars, found, given, catalogue, AIR)
+        lens, _ = lens_of_frame(stars, found, given, catalogue, AIR)
         off, before = (np.abs(prediction_errors(true, camera)).max() for camera in (lens, given))
         assert off < max(before / 5, 0.2)
         nearer += corner != 0
     assert nearer > 3
+
+
+def test_what_one_frames_stars_leave_open_of_the_lens_turns_it_as_claimed(catalogue, rng):
+    """Decentred lenses, which a frame hardly shows; without those terms the claim would be ten times too small."""
+    given, sigmas = ideal(25), []
+    solver = Solver(Instrument(given.fx), catalogue)
+    corner = np.hypot(given.width, given.height) / 2 / given.fx
+    for _ in range(12):
+        p1, p2 = rng.normal(0, 0.003 / (3 * corner), 2)
+        true = replace(given, distortion=(k1_of(given, 0.02), 0.0, p1, p2, 0.0))
+        (stars,), _ = night(true, 1, catalogue, rng, 6.3)
+        if (found := solver.identify(stars).found) is not None:
+            lens, left_rad = lens_of_frame(stars, found, given, catalogue, AIR)
+            seen, right = (camera.directions(stars.x, stars.y) for camera in (lens, true))
+            turn = rotation.to_small_vector(rotation.best_rotation(seen, right))
+            sigmas.extend(turn[:2] / left_rad)
+    assert len(sigmas) > 12 and 0.4 < np.sqrt(np.mean(np.square(sigmas))) < 1.6
 
 
 def test_images_that_are_unsound_are_left_out_where_there_are_others(wide, catalogue, rng):

@@ -102,3 +102,27 @@ def test_a_lens_goes_with_a_focal_length_and_not_with_an_instrument_file(skies, 
     assert status == 2 and "either it or the options" in err[-1]
     status, _, err = run("identify", frame, "--lens", "equidistant")
     assert status == 2 and "no focal length" in err[-1]
+
+
+def test_a_platepar_of_rms_is_written_and_serves_as_lens_and_place(skies, run, tmp_path):
+    first, second = sorted(skies.glob("stars_*.csv"))
+    site, plate = ("--site", PLACE["latitude"], PLACE["longitude"]), tmp_path / "platepar_cmn2010.cal"
+    given = (*LENS, *AIR, "--camera", tmp_path / "camera.yaml")
+    status, _, err = run("calibrate", first, *given, *site, "--platepar", plate)
+    assert status == 0 and "RMS sees stars within 0.0" in err[-1]
+    content = json.loads(plate.read_text())
+    assert (
+        content["lat"] == pytest.approx(PLACE["latitude"])
+        and len(content["x_poly_rev"]) == content["poly_length"]
+    )
+    status, out, _ = run("solve", second, "--instrument", plate, *AIR, "--json")
+    _, told, _ = run("solve", second, *LENS, *site, "--geodetic", *AIR, "--json")
+    assert status == 0
+    assert objects(out)[0]["heading"] == pytest.approx(objects(told)[0]["heading"], abs=0.02)
+    for calls, why in (
+        ((first, *given, *site, "--platepar", plate), "already"),
+        ((first, second, *given, *site, "--platepar", tmp_path / "b.cal"), "stands still"),
+        ((first, *given, "--tilt", skies / "tilt.csv", "--platepar", tmp_path / "b.cal"), "needs the place"),
+    ):
+        status, _, err = run("calibrate", *calls)
+        assert status == 2 and why in err[-1] and not (tmp_path / "b.cal").exists()

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """--jobs, and nights in folders: the same answers, byte by byte, whoever works them and whatever happens on the way."""
 
+import argparse
 import gzip
 import json
 import os
@@ -19,6 +20,7 @@ import pytest
 from archives import frames, run, solve
 from cli_calls import KNOWN, WIDE
 
+from starpos.cli import inputs
 from starpos.cli.console import BAR_AFTER_S
 from starpos_testing.patience import WAIT_S
 
@@ -259,3 +261,27 @@ def test_a_terminal_is_shown_how_far_it_is(archive):
                 open_ends.remove(answers)
     os.close(ours)
     os.close(theirs)
+
+
+@pytest.mark.parametrize(
+    ("jobs", "pictures", "lists", "gigabytes", "processes"),
+    [
+        (None, 15, 100, 8, 1),
+        (None, 17, 0, 8, 2),
+        (None, 200, 0, 8, 6),
+        (None, 200, 0, 2, 2),
+        (None, 200, 0, 0.5, 1),
+        (1, 200, 0, 8, 1),
+        (0, 3, 2, 0.5, 5),
+    ],
+)
+def test_pictures_that_pay_have_processes(tmp_path, monkeypatch, jobs, pictures, lists, gigabytes, processes):
+    large, small = tmp_path / "large.jpg", tmp_path / "small.csv"
+    small.touch()
+    with open(large, "wb") as file:
+        file.truncate(2_000_000)
+    monkeypatch.setattr(inputs, "processors", lambda: 6)
+    monkeypatch.setattr(inputs, "memory_bytes", lambda: int(gigabytes * 2**30))
+    monkeypatch.setattr(inputs, "workers", lambda number: max(number, 1))
+    paths = [str(large)] * pictures + [str(small)] * lists
+    assert inputs.workers_of(argparse.Namespace(jobs=jobs), paths) == processes

@@ -143,6 +143,41 @@ def test_a_photograph_that_lacks_something_is_left_out_with_a_sentence(
     assert any("poor.jpg" in line and why in line for line in said)
 
 
+def log_of(path, sky, sign=-1.0):
+    """Sensor Logger's Gravity.csv of the telephone that took the pictures; sign: -1 as on iOS, downward."""
+    rows = ["time,seconds_elapsed,z,y,x"]
+    for k, (_, mid_unix_s, up) in enumerate(sky):
+        x, y, z = -sign * 9.81 * np.array([-up[1], -up[0], -up[2]])
+        # a hand shakes the last digits
+        rows += [
+            f"{round((mid_unix_s + t) * 1e9)},{t},{z + 1e-4 * n},{y},{x + 3e-4 * (n % 3) + 1e-4 * k}"
+            for n, t in enumerate(np.arange(-1, 1, 0.05))
+        ]
+    path.write_text("\n".join(rows) + "\n")
+
+
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_a_log_beside_photographs_without_gravity_is_all_that_is_typed(sky, tmp_path, run, sign):
+    for k, (grey, mid_unix_s, up) in enumerate(sky):
+        save(tmp_path / f"IMG_{k}.jpg", grey, mid_unix_s, up, tags={0x927C})
+    log_of(tmp_path / "Gravity.csv", sky, sign)
+    pictures = sorted(tmp_path.glob("*.jpg"))
+    status, out, said = run("solve", *pictures, "--tilt", tmp_path / "Gravity.csv", "--json")
+    whole = objects(out)[-1]
+    assert status == 0 and whole["sigma_north_m"] < 20e3 and km_off(whole) < 5
+    assert any("the level is the telephone's log" in line for line in said)
+
+
+def test_a_log_that_the_orientation_contradicts_is_refused(sky, tmp_path, run):
+    """A sensor that lies the other way, as of some Androids; its camera leans, so that an edge is clearly up."""
+    grey, mid_unix_s, _ = sky[0]
+    up = np.array([-0.7, 0.0, 0.714])
+    save(tmp_path / "IMG.jpg", grey, mid_unix_s, up, tags={0x927C})
+    log_of(tmp_path / "Gravity.csv", [(grey, mid_unix_s, up * [-1, -1, 1])])
+    status, _, said = run("solve", tmp_path / "IMG.jpg", "--tilt", tmp_path / "Gravity.csv")
+    assert status == 1 and any("another edge was up than the telephone's log" in line for line in said)
+
+
 def test_a_cut_out_of_a_photograph_is_refused(sky, tmp_path, run):
     grey, mid_unix_s, up = sky[1]
     save(tmp_path / "cut.jpg", grey[100:660, 100:900], mid_unix_s, up)

@@ -84,18 +84,12 @@ def test_a_parameter_of_another_node_that_is_none_is_refused(bag, replay):
         assert status == 2 and said in err
 
 
-def test_a_report_draws_it(bag, tmp_path, capsys):
+@pytest.mark.usefixtures("unpainted")
+def test_a_report_tells_of_it(bag, tmp_path, capsys):
     pytest.importorskip("matplotlib")
-    words = [
-        "report",
-        str(bag),
-        "-o",
-        str(tmp_path / "out"),
-        "--inclinometer",
-        "sca100t_calibrated",
-        "--misalignment",
-    ]
-    words += ["0", "0", "0", "--misalignment-stddev", "0.01", "--pressure-hpa", "950", "--temperature-c", "8"]
+    words = ["report", str(bag), "-o", str(tmp_path / "out"), "--inclinometer", "sca100t_calibrated"]
+    words += ["--misalignment", "0", "0", "0", "--misalignment-stddev", "0.01"]
+    words += ["--pressure-hpa", "950", "--temperature-c", "8"]
     more = [word for p in STAMPS for word in ("-p", p)]
     assert main([*words, "--humidity", "0.5", *more]) == 0
     assert "stars from /cam0/image_raw" in capsys.readouterr().err

@@ -62,9 +62,9 @@ def test_without_light_there_is_hardly_a_photon(rng):
 
 def test_images_of_other_shapes_are_refused(rng):
     given = fits(rng, 0.4, 0.0, 10)
-    with pytest.raises(ValueError, match="model"):
+    with pytest.raises(ValueError, match="as many"):
         light_noise(given[0][1:], *given[1:], 0.0, 0.0, 5.0)
-    with pytest.raises(ValueError, match="leverage"):
+    with pytest.raises(ValueError, match="as many"):
         light_noise(*given[:4], np.zeros((N, 0, 0), np.float32), 0.0, 0.0, 5.0)
 
 
@@ -79,7 +79,7 @@ def test_strangeness_is_that_of_plain_sums(rng):
     np.testing.assert_allclose(
         found, (left / light2, np.sqrt(2 * (noise2**2).sum((1, 2))) / light2), rtol=1e-7
     )
-    with pytest.raises(ValueError, match="model"):
+    with pytest.raises(ValueError, match="as many"):
         strangeness(noise[1:], model, residual, used, leverage, 1e-9)
 
 

@@ -32,7 +32,7 @@ def jpeg(**exif):
     return raws.with_exif(data, **exif)
 
 
-def picture_tiff(**exif):
+def picture_tiff(image=None, **exif):
     tags = {
         0x100: (raws.LONG, [8]),
         0x101: (raws.LONG, [4]),
@@ -42,6 +42,7 @@ def picture_tiff(**exif):
         0x115: (raws.SHORT, [1]),
         0x116: (raws.LONG, [4]),
         0x117: (raws.LONG, [32]),
+        **(image or {}),
     }
     return raws.tiff(tags, raws.exif_tags(**exif), pixels=bytes(range(32)))
 
@@ -172,6 +173,28 @@ def test_without_a_start_or_an_exposure_there_is_no_time_and_it_is_said_which_la
     frame = read_frame(write(tmp_path / "a.jpg", jpeg(**exif)), TEHRAN)
     assert frame.mid_unix_s is None
     assert ("ExposureTime" if "exposure" in exif else "DateTimeOriginal") in why_no_time(frame)
+
+
+@needs_exifread
+def test_a_name_has_the_time_where_no_exif_has_one(tmp_path):
+    for name in ("image-20261102180000.jpg", "ccd1_20261102_180000.jpg", "2026-11-02T180000_Alt40.jpg"):
+        frame = read_frame(write(tmp_path / name, jpeg(start=None, exposure=None)), TEHRAN)
+        assert frame.mid_unix_s == SHOWN_S - 3.5 * 3600 and frame.stamp_stddev_s >= 15
+        assert read_frame(tmp_path / name).mid_unix_s is None
+    # the zone is not in the name; a longer number, a month 13 and a day alone are no times
+    assert read_frame(tmp_path / name, CameraClock()).mid_unix_s is None
+    for name in ("120261102180000.jpg", "20261332_180000.jpg", "20261102.jpg"):
+        assert read_frame(write(tmp_path / name, jpeg(start=None)), TEHRAN).mid_unix_s is None
+
+
+@needs_exifread
+def test_indi_allsky_stamps_the_end_in_local_time_as_gps_time_too(tmp_path):
+    image = {0x131: (raws.ASCII, "indi-allsky"), 0x829A: (raws.RATIONAL, (30, 1))}
+    gps = ("2026:11:02", (18, 0, 0))
+    path = write(tmp_path / "a.tif", picture_tiff(image, exposure=None, gps=gps))
+    frame = read_frame(path, TEHRAN)
+    assert frame.exposure_s == 30 and frame.mid_unix_s == pytest.approx(SHOWN_S - 3.5 * 3600 + 0.5 - 15)
+    assert "no zone" in why_no_time(read_frame(path, CameraClock()))
 
 
 @needs_exifread

@@ -3,6 +3,8 @@
 
 import numpy as np
 
+from starpos.identification import identify
+from starpos.identification.pose import stars_at
 from starpos.instrument.camera import Camera
 
 # the paper's field, pixels binned by four
@@ -20,3 +22,8 @@ def stars_on(sky, attitude, rng):
 
 def under(crowd, xy, rng):
     return np.concatenate([rng.uniform(0, [CAMERA.width - 1, CAMERA.height - 1], (crowd, 2)), xy])
+
+
+def identified(xy, sigma_px, camera, sky, priors=()):
+    """What stars at pixels xy (N, 2), brightest first, of an ideal camera are identified as."""
+    return identify(stars_at(camera, xy, sigma_px), sky, priors)

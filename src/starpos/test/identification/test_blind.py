@@ -211,10 +211,10 @@ def test_a_poor_answer_near_the_focal_length_of_exif_does_not_bind(solver, catal
 def test_a_shape_is_that_of_the_quad_turned_scaled_and_mirrored(rng):
     flat = rng.normal(size=(50, 4, 2)) * 0.001
     v = rotation.normalised(np.concatenate([flat, np.ones((50, 4, 1))], 2))
-    order, shape, size = quads.shapes(v)
+    order, shape, size = quads.shapes(quads.chords(v))
     shuffled = rng.permutation(4)
     w = rotation.normalised(np.concatenate([2 * flat[:, shuffled] * [-1, 1], np.ones((50, 4, 1))], 2))
-    again, shape2, size2 = quads.shapes(w @ rotation.from_vector([0.3, -0.2, 1.0]))
+    again, shape2, size2 = quads.shapes(quads.chords(w @ rotation.from_vector([0.3, -0.2, 1.0])))
     assert np.allclose(shape, shape2, atol=1e-4) and np.allclose(2 * size, size2, rtol=1e-4)
     assert np.array_equal(shuffled[again], order)
 

@@ -3,11 +3,12 @@
 
 import numpy as np
 import pytest
+from crowds import identified
 from scipy.optimize import least_squares
 from test_identification import seen, sky_for
 
 from starpos import rotation
-from starpos.identification import PlumbPrior, PointingPrior, identify, search
+from starpos.identification import PlumbPrior, PointingPrior, search
 from starpos.identification import evidence as full
 from starpos.identification._poses import log_ratio
 from starpos.identification.evidence import CHANCES, DOUBLE_PX, LOG_SHARES, WIDTH, Prior, anywhere
@@ -146,17 +147,17 @@ def test_the_priors_share_half_of_the_probability(catalogue, rng, monkeypatch):
     expected = Pose(attitude, SMALL.fx, False)
     tried = {}
 
-    def judge(field, sky, prior, enough):
-        tried[id(prior)] = prior
-        return judged(field, sky, prior, enough)
+    def judge(*known):
+        tried[id(known[4])] = known[4]
+        return judged(*known)
 
     def anywhere(focal_px, log_share):
         prior = lost(focal_px, log_share)
         tried[id(prior)] = prior
         return prior
 
-    judged, lost = full.judge, search.anywhere
-    monkeypatch.setattr(full, "judge", judge)
+    judged, lost = full.Judge, search.anywhere
+    monkeypatch.setattr(full, "Judge", judge)
     monkeypatch.setattr(search, "anywhere", anywhere)
     assert not list(search.near_or_lost(field, sky, priors, search.STAGES))
     *led, unled = (np.exp(prior.log_density(expected)) * prior.width.prod() for prior in tried.values())
@@ -214,18 +215,18 @@ def test_errors_of_nothing_are_no_certainty(catalogue, rng):
     sky = sky_for(catalogue, SMALL)
     for sigma_px in (0.0, 1e-200):
         for _ in range(5):
-            assert identify(rng.uniform(0, [299, 224], (20, 2)), np.full(20, sigma_px), SMALL, sky) is None
+            assert identified(rng.uniform(0, [299, 224], (20, 2)), np.full(20, sigma_px), SMALL, sky) is None
         xy, _ = seen(sky, SMALL, random_attitude(rng), 8.0, rng, sigma=0.02)
-        assert identify(xy, np.full(len(xy), sigma_px), SMALL, sky) is not None
+        assert identified(xy, np.full(len(xy), sigma_px), SMALL, sky) is not None
 
 
 def test_what_is_no_number_is_not_accepted(catalogue, rng, monkeypatch):
     sky = sky_for(catalogue, SMALL)
     xy, _ = seen(sky, SMALL, random_attitude(rng), 8.0, rng, sigma=0.02)
     sigma_px = np.full(len(xy), 0.02)
-    assert identify(xy, sigma_px, SMALL, sky) is not None
+    assert identified(xy, sigma_px, SMALL, sky) is not None
     monkeypatch.setattr(search, "anywhere", lambda *_: Prior(lambda pose: np.nan, WIDTH))
-    assert identify(xy, sigma_px, SMALL, sky) is None
+    assert identified(xy, sigma_px, SMALL, sky) is None
 
 
 def test_what_lies_beyond_the_frame_does_not_make_chance_rarer(rng):
@@ -255,7 +256,7 @@ def test_four_stars_are_mostly_enough_and_with_a_false_one_often(catalogue):
             drawn = draw(catalogue, conditions, 3, number)
             assert len(drawn) == 4
             xy = drawn.with_false(false, camera).xy
-            if found := identify(xy, np.full(len(xy), 0.05), camera, sky):
+            if found := identified(xy, np.full(len(xy), 0.05), camera, sky):
                 centre = camera.directions(*camera.centre_px) @ found.attitude
                 assert np.linalg.norm(centre - drawn.centre) < conditions.tolerance_rad
                 right += 1

@@ -5,12 +5,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from crowds import CAMERA, SIGMA_PX, stars_on, under
+from crowds import CAMERA, SIGMA_PX, identified, stars_on, under
 
 from starpos.fix.solution import TWO_SKIES, UNEXPLAINED, Status
 from starpos.fix.solver import Solver
 from starpos.frames.frame import Stars
-from starpos.identification import identify
 from starpos.identification.evidence import Explained, explained_by
 from starpos.identification.pose import stars_at
 from starpos.instrument.instrument import Instrument
@@ -27,7 +26,7 @@ def field(sky, rng):
 
 def explained(xy, sky):
     sigma = np.full(len(xy), SIGMA_PX)
-    return explained_by(identify(xy, sigma, CAMERA, sky), stars_at(CAMERA, xy, sigma))
+    return explained_by(identified(xy, sigma, CAMERA, sky), stars_at(CAMERA, xy, sigma))
 
 
 def test_a_clear_frame_is_explained_and_all_its_stars_are_there(field, sky):

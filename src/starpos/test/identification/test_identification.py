@@ -5,9 +5,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from crowds import identified
 
 from starpos.errors import InstrumentError
-from starpos.identification import Sky, identify, identify_directions, search, triangles
+from starpos.identification import Sky, field_of, identify, search, triangles
 from starpos.instrument.camera import Camera
 from starpos_testing.skies.scenes import FOCAL_PX, SIZE, random_attitude, random_stars
 
@@ -56,7 +57,7 @@ def test_fields_are_found_with_false_stars_brighter_than_all_others(size, false_
         xy, index = seen(sky, camera, attitude, limit, rng)
         xy = np.concatenate([rng.uniform(0, [camera.width - 1, camera.height - 1], (false_stars, 2)), xy])
         index = np.concatenate([np.full(false_stars, -1), index])
-        answer = identify(xy, np.full(len(xy), 0.05), camera, sky)
+        answer = identified(xy, np.full(len(xy), 0.05), camera, sky)
         if answer is not None:
             found += 1
             check(answer, attitude, index, camera, sky)
@@ -72,7 +73,7 @@ def test_stars_missing_from_the_frame(catalogue, rng):
     for _ in range(6):
         attitude = random_attitude(rng)
         xy, index = seen(sky, camera, attitude, limit, rng, sigma=0.2, missing=0.1)
-        check(identify(xy, np.full(len(xy), 0.2), camera, sky), attitude, index, camera, sky)
+        check(identified(xy, np.full(len(xy), 0.2), camera, sky), attitude, index, camera, sky)
 
 
 @pytest.mark.parametrize("factor", [0.97, 1.03])
@@ -82,7 +83,7 @@ def test_a_focal_length_three_percent_off(factor, catalogue, rng):
     for _ in range(4):
         attitude = random_attitude(rng)
         xy, index = seen(sky, camera.scaled(factor), attitude, limit, rng)
-        answer = identify(xy, np.full(len(xy), 0.05), camera, sky)
+        answer = identified(xy, np.full(len(xy), 0.05), camera, sky)
         check(answer, attitude, index, camera, sky)
         assert answer.focal_scale == pytest.approx(factor, rel=1e-3)
 
@@ -98,7 +99,7 @@ def test_a_lens_whose_distortion_nobody_knows(corner_px, catalogue, rng):
         off = xy - camera.centre_px
         r2 = np.sum(off**2, 1, keepdims=True) / np.sum(half**2)
         distorted = camera.centre_px + off * (1 + corner_px * r2 / np.hypot(*half))
-        answer = identify(distorted, np.full(len(xy), 0.05), camera, sky)
+        answer = identified(distorted, np.full(len(xy), 0.05), camera, sky)
         if answer is not None:
             found += 1
             check(answer, attitude, index, camera, sky, tolerance_px=2.0)
@@ -110,7 +111,7 @@ def test_a_focal_length_a_third_off_is_not_found(catalogue, rng):
     sky = sky_for(catalogue, camera)
     for _ in range(2):
         xy, _ = seen(sky, camera.scaled(1.33), random_attitude(rng), limit, rng)
-        assert identify(xy, np.full(len(xy), 0.05), camera, sky) is None
+        assert identified(xy, np.full(len(xy), 0.05), camera, sky) is None
 
 
 def test_a_mirrored_frame_is_found_and_said(catalogue, rng):
@@ -118,7 +119,7 @@ def test_a_mirrored_frame_is_found_and_said(catalogue, rng):
     sky = sky_for(catalogue, camera)
     attitude = random_attitude(rng)
     xy, index = seen(sky, camera, attitude, limit, rng)
-    answer = identify(xy * [1, -1] + [0, camera.height - 1], np.full(len(xy), 0.05), camera, sky)
+    answer = identified(xy * [1, -1] + [0, camera.height - 1], np.full(len(xy), 0.05), camera, sky)
     assert answer.mirrored
     check(answer, attitude, index, camera, sky)
 
@@ -129,7 +130,7 @@ def test_random_points_are_nothing(catalogue, rng):
     for n in (4, 6, 12, 30, 200):
         for _ in range(2):
             s = random_stars(n, rng)
-            assert identify(np.stack([s.x, s.y], 1), np.full(n, 0.05), camera, sky) is None
+            assert identified(np.stack([s.x, s.y], 1), np.full(n, 0.05), camera, sky) is None
 
 
 def test_a_star_seen_double_does_not_speak_for_itself(catalogue, rng):
@@ -139,7 +140,7 @@ def test_a_star_seen_double_does_not_speak_for_itself(catalogue, rng):
         for _ in range(8):
             xy = np.repeat(rng.uniform(0, [999, 699], (12, 2)), 2, 0)
             xy += rng.normal(0, apart_px, xy.shape)
-            assert identify(xy, np.full(24, 0.05), camera, sky_for(catalogue, camera)) is None
+            assert identified(xy, np.full(24, 0.05), camera, sky_for(catalogue, camera)) is None
 
 
 def test_brightness_out_of_order_by_more_than_expected(catalogue, rng):
@@ -149,7 +150,7 @@ def test_brightness_out_of_order_by_more_than_expected(catalogue, rng):
         attitude = random_attitude(rng)
         xy, index = seen(sky, camera, attitude, limit, rng)
         order = np.argsort(np.arange(len(xy)) + rng.exponential(4.0, len(xy)) * (rng.random(len(xy)) < 0.3))
-        answer = identify(xy[order], np.full(len(xy), 0.05), camera, sky)
+        answer = identified(xy[order], np.full(len(xy), 0.05), camera, sky)
         if answer is not None:
             found += 1
             check(answer, attitude, index[order], camera, sky)
@@ -159,7 +160,9 @@ def test_brightness_out_of_order_by_more_than_expected(catalogue, rng):
 @pytest.mark.parametrize("n", [0, 1, 2, 3])
 def test_too_few(n, catalogue, rng):
     camera, _ = FIELDS["15 deg"]
-    assert identify(rng.uniform(0, 600, (n, 2)), np.full(n, 0.05), camera, sky_for(catalogue, camera)) is None
+    assert (
+        identified(rng.uniform(0, 600, (n, 2)), np.full(n, 0.05), camera, sky_for(catalogue, camera)) is None
+    )
 
 
 def test_aberration_of_the_date(catalogue, rng):
@@ -168,7 +171,7 @@ def test_aberration_of_the_date(catalogue, rng):
     sky = sky_for(catalogue, camera, year=2026.8, velocity=(6e-5, -7e-5, -3e-5))
     attitude = random_attitude(rng)
     xy, index = seen(sky, camera, attitude, limit, rng)
-    check(identify(xy, np.full(len(xy), 0.05), camera, sky), attitude, index, camera, sky)
+    check(identified(xy, np.full(len(xy), 0.05), camera, sky), attitude, index, camera, sky)
     # to first order in the velocity, across the direction
     straight, velocity = sky.catalogue.directions(np.array([5]), 2026.8)[0], np.array(sky.velocity)
     moved = sky.directions(np.array([5]))[0] - straight
@@ -182,12 +185,12 @@ def test_what_is_no_number_is_refused(value, catalogue, rng):
     for broken in (xy, sigma):
         kept, broken[3] = broken[3].copy(), value
         with pytest.raises(ValueError, match="finite"):
-            identify(xy, sigma, camera, sky)
+            identified(xy, sigma, camera, sky)
         broken[3] = kept
     v = camera.directions(*xy.T)
     v[3] = value
     with pytest.raises(ValueError, match="finite"), np.errstate(invalid="ignore"):
-        identify_directions(v, sigma, camera, sky)
+        identify(field_of(v, sigma, camera), sky)
 
 
 DEGENERATE = {
@@ -206,7 +209,7 @@ DEGENERATE = {
 def test_degenerate_lists_raise_nothing(kind, catalogue, rng):
     camera, _ = FIELDS["15 deg"]
     xy = DEGENERATE[kind](rng)
-    answer = identify(xy, np.full(len(xy), 0.05), camera, sky_for(catalogue, camera))
+    answer = identified(xy, np.full(len(xy), 0.05), camera, sky_for(catalogue, camera))
     assert answer is None
 
 
@@ -222,7 +225,7 @@ def test_coarse_centroids_are_searched_with_their_own_error(catalogue, rng):
         # The loose stages, made for lenses that distort, would help out.
         with pytest.MonkeyPatch.context() as only:
             only.setattr(search, "STAGES", tight)
-            answer = identify(xy, np.full(len(xy), error_px), camera, sky)
+            answer = identified(xy, np.full(len(xy), error_px), camera, sky)
         if answer is not None:
             assert np.arccos(np.clip(answer.attitude[2] @ attitude[2], -1, 1)) < 2 / camera.fx
             found += 1
@@ -242,8 +245,8 @@ def test_stars_of_a_hidden_part_are_not_missed(window, mirrored, catalogue, rng)
         xy[:, 1] = camera.height - 1 - xy[:, 1]
     shown = ((xy >= window[:2]) & (xy < window[2:])).all(1)
     v, sigma = camera.directions(*xy[shown].T), np.full(shown.sum(), 0.05)
-    part = search.identify_frame(search.field_of(v, sigma, camera, window), sky)
-    whole = search.identify_frame(search.field_of(v, sigma, camera), sky)
+    part = identify(field_of(v, sigma, camera, window), sky)
+    whole = identify(field_of(v, sigma, camera), sky)
     check(part, attitude, index[shown], camera, sky)
     assert part.mirrored == mirrored
     # of the brightest stars that should be there, nearly all are

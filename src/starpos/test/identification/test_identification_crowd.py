@@ -5,15 +5,15 @@ import time
 
 import numpy as np
 import pytest
-from crowds import CAMERA, SIGMA_PX, stars_on, under
+from crowds import CAMERA, SIGMA_PX, identified, stars_on, under
 
-from starpos.identification import PointingPrior, identify
+from starpos.identification import PointingPrior
 from starpos.rotation import about_axis
 from starpos_testing.skies.scenes import random_attitude
 
 
 def found_in(xy, sky, priors=()):
-    return identify(xy, np.full(len(xy), SIGMA_PX), CAMERA, sky, priors)
+    return identified(xy, np.full(len(xy), SIGMA_PX), CAMERA, sky, priors)
 
 
 def assert_looks(found, attitude):

@@ -3,10 +3,11 @@
 
 import numpy as np
 import pytest
+from crowds import identified
 from test_identification import FIELDS, check, seen, sky_for
 
 from starpos import rotation
-from starpos.identification import PlumbPrior, PointingPrior, identify, search
+from starpos.identification import PlumbPrior, PointingPrior, search
 from starpos.units import ARCSEC
 from starpos_testing.skies.scenes import START, random_attitude, solver_of, stars_of, tilt_of, wide_scene
 
@@ -35,7 +36,7 @@ def turned(attitude, rng, angle_rad):
 def test_a_camera_that_stands_is_not_lost(field, not_lost):
     sky, camera, attitude, xy, sigma, index = field
     check(
-        identify(xy, sigma, camera, sky, [PointingPrior(attitude, camera.fx)]), attitude, index, camera, sky
+        identified(xy, sigma, camera, sky, [PointingPrior(attitude, camera.fx)]), attitude, index, camera, sky
     )
 
 
@@ -43,7 +44,7 @@ def test_one_that_was_knocked_is_not_lost(field, rng, not_lost):
     sky, camera, attitude, xy, sigma, index = field
     for arcmin in (3, 10, 20):
         prior = PointingPrior(turned(attitude, rng, arcmin * 60 * ARCSEC), camera.fx)
-        check(identify(xy, sigma, camera, sky, [prior]), attitude, index, camera, sky)
+        check(identified(xy, sigma, camera, sky, [prior]), attitude, index, camera, sky)
 
 
 def test_one_that_was_turned_about_the_plumb_line_is_not_lost(field, rng, not_lost):
@@ -51,13 +52,13 @@ def test_one_that_was_turned_about_the_plumb_line_is_not_lost(field, rng, not_lo
     for zenith_distance in (0.2, 0.7, 1.4):
         zenith = turned(attitude, rng, zenith_distance)[2]
         prior = PlumbPrior(zenith, turned(np.eye(3), rng, 60 * ARCSEC) @ attitude @ zenith, 90 * ARCSEC)
-        check(identify(xy, sigma, camera, sky, [prior]), attitude, index, camera, sky)
+        check(identified(xy, sigma, camera, sky, [prior]), attitude, index, camera, sky)
 
 
 def test_a_prior_gives_the_same_answer_as_none(field):
     sky, camera, attitude, xy, sigma, _ = field
     lost, led = (
-        identify(xy, sigma, camera, sky, priors) for priors in ([], [PointingPrior(attitude, camera.fx)])
+        identified(xy, sigma, camera, sky, priors) for priors in ([], [PointingPrior(attitude, camera.fx)])
     )
     np.testing.assert_array_equal(lost.star, led.star)
     np.testing.assert_array_equal(lost.catalogue, led.catalogue)
@@ -91,7 +92,7 @@ def test_a_wrong_prior_falls_back_to_the_whole_sky(field, rng, kind):
         "another zenith": PlumbPrior(random_attitude(rng)[2], np.array([0.0, 0.6, 0.8]), 90 * ARCSEC),
         "no star there": PlumbPrior(random_attitude(rng)[2], np.array([0.0, 0.0, 1.0]), 1e-9),
     }[kind]
-    check(identify(xy, sigma, camera, sky, [wrong, wrong]), attitude, index, camera, sky)
+    check(identified(xy, sigma, camera, sky, [wrong, wrong]), attitude, index, camera, sky)
 
 
 def test_what_is_no_rotation_is_no_prior():
@@ -120,8 +121,8 @@ def test_what_is_no_zenith_is_no_prior():
 def test_with_a_prior_four_stars_are_enough(field):
     sky, camera, attitude, xy, sigma, index = field
     few = [0, 5, 9, 14]
-    assert identify(xy[few], sigma[few], camera, sky) is None
-    answer = identify(xy[few], sigma[few], camera, sky, [PointingPrior(attitude, camera.fx)])
+    assert identified(xy[few], sigma[few], camera, sky) is None
+    answer = identified(xy[few], sigma[few], camera, sky, [PointingPrior(attitude, camera.fx)])
     check(answer, attitude, index[few], camera, sky)
 
 
@@ -134,7 +135,7 @@ def test_random_points_stay_nothing_whatever_the_prior_says(field, rng):
     for n in (4, 5, 6, 8, 15, 40):
         for _ in range(5):
             xy = rng.uniform(0, [camera.width - 1, camera.height - 1], (n, 2))
-            assert identify(xy, np.full(n, 0.05), camera, sky, priors) is None
+            assert identified(xy, np.full(n, 0.05), camera, sky, priors) is None
 
 
 def test_the_next_frame_of_a_fix_is_not_lost(catalogue, rng, monkeypatch):

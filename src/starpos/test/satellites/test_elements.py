@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from starpos.errors import SatelliteError
-from starpos.satellites.elements import MANOEUVRING, PASSIVE, read_orbits
+from starpos.satellites.elements import MANOEUVRING, PASSIVE, StoredOrbits, read_orbits
 from starpos.satellites.orbits import Moments, states
 
 FIRST = "1 00005U 58002B   00179.78495062  .00000023  00000-0  28098-4 0  4753"
@@ -37,6 +37,11 @@ FORMS = {
     "three.tle": f"0 VANGUARD 1\r\n{FIRST}\r\n{SECOND}\r\n",
     "one.json": json.dumps([FIELDS]),
     "one.xml": xml(FIELDS),
+    # the day of the year, and a unit, as CCSDS 502.0-B allows
+    "one.kvn": "CCSDS_OMM_VERS = 3.0\n"
+    + "".join(f"{key} = {value}\n" for key, value in FIELDS.items())
+    .replace("2000-06-27T", "2000-179T")
+    .replace("10.82419157", "10.82419157 [rev/day]"),
     "one.csv": ",".join(FIELDS) + "\n" + ",".join(map(str, FIELDS.values())) + "\n",
 }
 
@@ -75,6 +80,40 @@ def test_an_orbit_inside_the_earth_costs_its_satellite_alone(tmp_path):
     (tmp_path / "a.json").write_text(json.dumps(rows))
     (orbit,), (sentence,) = read_orbits(tmp_path / "a.json")
     assert orbit.number == 123456 and "satellite 7: " in sentence
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (json.dumps([FIELDS | {"EPHEMERIS_TYPE": 4}]), "SGP4-XP"),
+        (f"{FIRST[:62]}4{FIRST[63:68]}7\n{SECOND}\n", "SGP4-XP"),
+        ("<oem><stateVector/></oem>", "give it as text"),
+        (
+            "CCSDS_OEM_VERS = 2.0\nMETA_START\nCENTER_NAME = MARS BARYCENTER\nREF_FRAME = EME2000\nMETA_STOP\n"
+            "1996-353T12:00:00.331 2789.619 -280.045 -1746.755 4.73372 -2.49586 -1.04195\n",
+            "about MARS BARYCENTER",
+        ),
+    ],
+)
+def test_orbits_that_would_be_misread_are_refused(tmp_path, text, said):
+    (tmp_path / "x").write_text(text)
+    with pytest.raises(SatelliteError, match=said):
+        read_orbits(tmp_path / "x")
+
+
+def test_stored_orbits_are_read_again_when_they_change(tmp_path):
+    (tmp_path / "a.tle").write_text(FORMS["two.tle"])
+    stored = StoredOrbits(tmp_path)
+    assert [o.number for o in stored.read()] == [5]
+    (tmp_path / "b.json").write_text(FORMS["one.json"])
+    assert [o.number for o in stored.read()] == [5, 123456] and not stored.trouble
+    (tmp_path / "a.tle").unlink()
+    (tmp_path / "b.json").write_text("broken")
+    # the earlier ones, and why
+    assert [o.number for o in stored.read()] == [5, 123456]
+    assert "no file in it has orbits" in stored.trouble
+    with pytest.raises(SatelliteError, match="no file in it"):
+        StoredOrbits(tmp_path)
 
 
 def test_xml_that_declares_entities_is_not_unfolded(tmp_path):

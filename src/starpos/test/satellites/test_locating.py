@@ -9,6 +9,7 @@ import skies
 
 from starpos.earth.gravity import itrs_place
 from starpos.errors import SatelliteError
+from starpos.rotation import normalised
 from starpos.satellites.adjustment import Adjuster, KnownBefore
 from starpos.satellites.elements import chosen, read_orbits
 from starpos.satellites.locating import locate
@@ -120,6 +121,66 @@ def test_a_rough_place_makes_two_trails_enough(tmp_path, sky):
     assert [orbit.number for orbit in fix.named] == numbers
     off = off_m(fix)
     assert np.hypot(*off) < 3000
+    assert off @ np.linalg.solve(fix.covariance[:2, :2], off) < 12
+
+
+def test_trails_of_two_places_are_refused(tmp_path, sky):
+    records, _, orbits = sky
+    trails, numbers, _ = trails_of(tmp_path, records, count=5)
+    rest = [r for r in records if r.satnum not in numbers]
+    elsewhere, others = skies.table(rest, (44.0, 13.0, 900.0), np.random.default_rng(2), count=5)
+    assert not set(others) & set(numbers)
+    (tmp_path / "other.csv").write_text(elsewhere)
+    with pytest.raises(SatelliteError, match=r"two places, 5\d\d km apart"):
+        locate([*trails, *read_sightings(tmp_path / "other.csv")], orbits, PRIOR)
+
+
+def test_one_satellite_is_no_place_and_scatter_that_no_error_explains_is_refused(tmp_path, sky):
+    records, _, orbits = sky
+    trails, numbers, _ = trails_of(tmp_path, records, count=12)
+    near = itrs_place(*np.radians(PLACE[:2]), PLACE[2])
+    known = PRIOR._replace(place=near, covariance=50e3**2 * np.eye(2))
+    again = [replace(trails[0], track=k) for k in range(3)]
+    with pytest.raises(SatelliteError, match="of two or more"):
+        locate(again, orbits, known._replace(clock_stddev_s=1.0))
+    # errors of 5 times the stated ones: neither an outlier nor an orbit explains them
+    off = np.random.default_rng(4).normal(0, 15 / 206265, (len(trails), 2, 3))
+    noisy = [
+        replace(t, track=k, directions=normalised(t.directions + d), satellite=n)
+        for k, (t, d, n) in enumerate(zip(trails, off, numbers, strict=True))
+    ]
+    with pytest.raises(SatelliteError, match="fit one place within the stated errors"):
+        locate(noisy, orbits, PRIOR)
+
+
+def test_a_trail_that_leaves_the_frame_counts_by_its_other_end(tmp_path, sky):
+    """Half of the trails end at the frame's edge, after a third of the exposure, or before its last two thirds."""
+    records, _, orbits = sky
+    trails, numbers, _ = trails_of(tmp_path, records, count=10)
+    seen = []
+    for k, trail in enumerate(trails):
+        opening, closing = trail.utc_unix_s
+        first, last = trail.directions
+        if k % 2:
+            seen.append(replace(trail, turned_utc_unix_s=trail.utc_unix_s[::-1]))
+            continue
+        # as the ground sees it, at the opening
+        last_there = turned(last[None], np.array([opening - closing]))[0]
+        edge = normalised(first + (last_there - first) * (1 / 3 if k % 4 else 2 / 3))
+        kept = first if k % 4 else last_there
+        seen.append(
+            replace(
+                trail,
+                directions=kept[None],
+                covariance=trail.covariance[:1],
+                utc_unix_s=np.array([opening]),
+                turned_utc_unix_s=np.array([closing]),
+                towards=edge,
+            )
+        )
+    fix = locate(seen, orbits, PRIOR)
+    assert [orbit.number for orbit in fix.named] == numbers
+    off = off_m(fix)
     assert off @ np.linalg.solve(fix.covariance[:2, :2], off) < 12
 
 

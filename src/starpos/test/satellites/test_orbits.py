@@ -61,6 +61,29 @@ def test_light_time_and_the_aberration_that_only_stars_have(one):
     assert np.linalg.norm(direction(orbit, np.zeros((1, 3)))[0] - theirs) * distance > 10
 
 
+def test_the_observer_turns_by_ut1_and_stands_above_the_ellipsoid():
+    """Against the angle of Capitaine et al. (2000) by UT1, and the ellipsoid's closed formula, not the geoid."""
+    moments, place = Moments.at(np.array([skies.NIGHT])), itrs_place(*np.radians(PLACE[:2]), PLACE[2])
+    latitude, e2, a = np.radians(PLACE[0]), 0.00669437999014, 6378137.0
+    prime = a / np.sqrt(1 - e2 * np.sin(latitude) ** 2)
+    assert np.hypot(*place[:2]) == pytest.approx((prime + PLACE[2]) * np.cos(latitude), abs=1e-3)
+    assert place[2] == pytest.approx((prime * (1 - e2) + PLACE[2]) * np.sin(latitude), abs=1e-3)
+    days = skies.NIGHT / 86400 + 2440587.5 - 2451545.0
+    t = Time(skies.NIGHT, format="unix", scale="utc")
+
+    def turned(seconds):
+        """Place in GCRS by that time of the Earth's rotation, the pole and precession by ERFA."""
+        turn = 2 * np.pi * (0.7790572732640 + 1.00273781191135448 * (days + seconds / 86400))
+        c, s = np.cos(turn), np.sin(turn)
+        to_intermediate = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+        return erfa.c2i06a(t.tt.jd1, t.tt.jd2).T @ to_intermediate @ place
+
+    site, _ = moments.site(place, 0.0)
+    # 10 m of polar motion are left out above
+    assert np.linalg.norm(turned(t.delta_ut1_utc) - site[0]) < 20
+    assert np.linalg.norm(turned(0.0) - site[0]) > 50
+
+
 def test_a_published_position_by_the_constants_of_wgs_72(tmp_path):
     # Vallado et al. 2006, AIAA 2006-6753: satellite 5 at its epoch
     (tmp_path / "5.tle").write_text(

@@ -167,7 +167,6 @@ def test_the_end_answers_what_waits(told, messages):
 
 def test_who_plays_a_night_again_after_one_that_was_broken_off_is_no_second_inclinometer(told, messages):
     for tilts in (tilts_of(messages, float("inf"))[:30], tilts_of(messages, float("inf"))[5:20]):
-        told.session.begin()
         # another process, whose numbers begin anew
         for number, (tilt, came_s) in enumerate(tilts, 1):
             told.tell(TILT, tilt, came_s, sent=Sent(number))

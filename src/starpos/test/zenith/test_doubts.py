@@ -5,21 +5,21 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from sessions import INSTRUMENT, MARK, SCALE, VACUUM, Drawn, drawn, shifted
+from sessions import INSTRUMENT, MARK, SCALE, VACUUM, drawn, shifted
 
 from starpos.errors import FixError
 from starpos.units import ARCSEC
 from starpos.zenith import doubts
-from starpos.zenith.doubts import DeflectionSession, remarks
+from starpos.zenith.doubts import checked_session, remarks
 
 
 def session(sightings):
-    return DeflectionSession.of(sightings, INSTRUMENT, VACUUM, MARK)
+    return checked_session(sightings, INSTRUMENT, VACUUM, MARK)
 
 
 def said(sightings, frames=None):
     found = session(sightings)
-    return " ".join(remarks(found.adjusted, found.sightings, frames or len(sightings), SCALE))
+    return " ".join(remarks(found, frames or len(sightings), SCALE))
 
 
 def test_a_sound_session_has_no_remarks(rng):
@@ -89,8 +89,8 @@ class LikeGaia:
 
 
 def test_no_sighting_is_no_deflection():
-    with pytest.raises(FixError, match="no frame"):
-        session(Drawn([], 0.0, 0.0).sightings)
+    with pytest.raises(FixError, match="0 frames make no session"):
+        session([])
 
 
 def _tilted(sighting, arcsec):

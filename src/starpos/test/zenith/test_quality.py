@@ -5,7 +5,7 @@ import pytest
 from sessions import INSTRUMENT, MARK, SCALE, VACUUM, drawn, shifted
 
 from starpos.zenith.adjustment import adjusted
-from starpos.zenith.doubts import DeflectionSession, remarks
+from starpos.zenith.doubts import checked_session, remarks
 
 
 def adjust(sightings):
@@ -26,8 +26,7 @@ def test_each_face_has_its_distance_from_the_others_and_an_error_that_explains_i
 def test_a_face_that_is_somewhat_off_is_named_beside_the_value(rng):
     sightings = drawn(rng).sightings
     off = [shifted(s, 0.95 * (12 <= k < 18), -0.95 * (12 <= k < 18)) for k, s in enumerate(sightings)]
-    session = DeflectionSession.of(off, INSTRUMENT, VACUUM, MARK)
-    told = remarks(session.adjusted, session.sightings, len(sightings), SCALE)
+    told = remarks(checked_session(off, INSTRUMENT, VACUUM, MARK), len(sightings), SCALE)
     assert (
         len(told) == 1
         and told[0].startswith("face 3 (top of the frame at")
