@@ -17,7 +17,7 @@ from starpos_testing.skies import orbits
 NIGHT = Path(__file__).parent / "data" / "night"
 POLICY = Path(__file__).parents[1] / "src" / "starpos_bringup" / "sros2" / "policies.xml"
 SKY = ("source:=simulated", "focal_mm:=14.8", "simulated.width:=640", "simulated.height:=427", "cadence:=0.5")
-RULES = {("topics", "publish"), ("topics", "subscribe"), ("services", "reply")}
+RULES = {("topics", "publish"), ("topics", "subscribe"), ("services", "reply"), ("services", "request")}
 
 
 def full_name(name: str, namespace: str, node: str) -> str:
@@ -35,7 +35,7 @@ def only(element, tag: str, *attributes: str):
 
 
 def allowed() -> dict[str, set]:
-    """(node, publish | subscribe | reply, name) by enclave."""
+    """(node, publish | subscribe | reply | request, name) by enclave."""
     # sros2 stumbles over comments in there
     parser = ElementTree.XMLParser(target=ElementTree.TreeBuilder(insert_comments=True))
     policy = only(ElementTree.parse(POLICY, parser).getroot(), "policy", "version")
@@ -63,7 +63,7 @@ def allowed() -> dict[str, set]:
 
 
 def done(graph) -> dict[str, set]:
-    """Topics and services of the running nodes that have an enclave; none of them calls a service."""
+    """Topics and services of the running nodes that have an enclave."""
     found, ask = {}, graph.node
     for node, namespace, enclave in ask.get_node_names_and_namespaces_with_enclaves():
         if enclave == "/":
@@ -124,7 +124,7 @@ def test_the_policy_holds_for_the_nodes_apart(graph, secured, tmp_path):
     secured("starpos_solver", "solver", sim, "gyro:=true", elements)
     secured("starpos_solver", "navigator", sim, "publish_tf:=true")
     secured("starpos_camera", "camera", sim, *SKY)
-    secured("starpos_camera", "detector", sim, "gyro:=true", "trails:=true")
+    secured("starpos_camera", "detector", sim, "gyro:=true", "trails:=true", "day_exposure:=true")
     secured("starpos_inclinometer", "inclinometer", sim, "source:=imu")
     secured("starpos_bringup", "record", arguments=(str(tmp_path / "bag"), "--images"))
     secured("starpos_bringup", "folder", arguments=(str(tmp_path / "night"),))
@@ -138,7 +138,8 @@ def test_the_policy_holds_for_the_nodes_apart(graph, secured, tmp_path):
 
 def test_the_policy_holds_for_camera_and_detector_in_one_process(graph, secured):
     graph.hear(Image, "detector/image_annotated")
-    secured("starpos_camera", "camera_detector", "use_sim_time:=true", "gyro:=true", "trails:=true", *SKY)
+    all_of_it = "gyro:=true", "trails:=true", "day_exposure:=true"
+    secured("starpos_camera", "camera_detector", "use_sim_time:=true", *all_of_it, *SKY)
     hold(graph, "/starpos/camera_detector")
 
 

@@ -2,12 +2,14 @@
 """The running graph and the command line on the same simulated night: topics on the one side, files on the other."""
 
 import csv
+import io
 import json
 import math
-import subprocess
+from contextlib import redirect_stdout
 
 import pytest
 
+from starpos.cli import main
 from starpos.instrument.inclinometer import Tilt
 from starpos_common.messages import tilt_to_message
 from starpos_interfaces import msg
@@ -23,7 +25,9 @@ CLOCK_S = 0.01
 
 
 def starpos(*words) -> str:
-    return subprocess.run(["starpos", *map(str, words)], check=True, capture_output=True, text=True).stdout
+    with redirect_stdout(io.StringIO()) as out:
+        assert main([*map(str, words)]) == 0
+    return out.getvalue()
 
 
 @pytest.fixture(scope="module")

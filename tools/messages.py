@@ -42,7 +42,13 @@ class Message(NamedTuple):
 def modules(folder: str) -> dict[Path, ast.Module]:
     """The modules of a folder; compiled ones raise no errors of their own."""
     paths = sorted((ROOT / folder).rglob("*.py"))
-    return {path: ast.parse(path.read_text(encoding="utf-8")) for path in paths if "test" not in path.parts}
+    return {path: parsed(path) for path in paths if "test" not in path.parts}
+
+
+@cache
+def parsed(path: Path) -> ast.Module:
+    """A file's tree."""
+    return ast.parse(path.read_text(encoding="utf-8"))
 
 
 def error_names() -> set[str]:
@@ -127,7 +133,7 @@ def messages(trees: Iterable[ast.Module], errors: set[str], shared: Mapping[str,
 
 def about(package: Path) -> str:
     """First sentence of a package's docstring."""
-    text = ast.get_docstring(ast.parse(package.read_text(encoding="utf-8"))) or ""
+    text = ast.get_docstring(parsed(package)) or ""
     return " ".join(text.split("\n\n")[0].split())
 
 

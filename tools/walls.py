@@ -27,6 +27,7 @@ FOREIGN = {
     "cv2",
     "erfa",
     "exifread",
+    "jplephem",
     "lz4",
     "matplotlib",
     "numpy",

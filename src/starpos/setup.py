@@ -81,6 +81,7 @@ setup(
         "raw": ["rawpy"],
         "heif": ["pillow-heif"],
         "report": ["matplotlib", "rosbags>=0.11"],
+        "ephemeris": ["jplephem>=2.19"],
         "completion": ["argcomplete"],
         "test": ["pytest"],
     },

@@ -20,8 +20,9 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Imu
 from std_msgs.msg import Header
 
 from starpos.detection import Detection, DetectionSettings, detect
+from starpos.detection.exposing import next_exposure_s
 from starpos.errors import StarposError
-from starpos.frames.frame import Frame
+from starpos.frames.frame import Disc, Frame
 from starpos.messages.camera import (
     CAPTURES_KEPT,
     ExposureFacts,
@@ -41,6 +42,7 @@ from starpos_common.parameters import declare
 from starpos_common.topics import MatchedSubscription, Take, publisher, subscription, subscription_from_any
 from starpos_common.worker import Worker
 from starpos_interfaces.msg import Capture, StarArray
+from starpos_interfaces.srv import SetCapture
 
 RAW, COMPRESSED = "camera/image_raw", "camera/image_raw/compressed"
 # Only the newest frame is kept; each more would take another 42 MB.
@@ -158,6 +160,8 @@ DISCOVERY_S = 0.5
 # Maximum number of waiting frames, of 42 MB each.
 MAX_HELD = 3
 LOOK_S = 0.1
+# Share by which a camera's exposure may differ from the one asked for, and how many frames may be of the one before.
+AS_ASKED, FRAMES_ON_THEIR_WAY = 0.1, 3
 # Silence is reported after this time, and after three times the interval between the last two frames.
 MIN_SILENCE_S = 5.0
 
@@ -171,6 +175,43 @@ class DetectedFrame:
     detection: Detection
     cpu_ms: float
     seconds: float
+
+
+class DayExposure:
+    """Asks a camera for the exposure that day or night takes, and for the night's own again."""
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self._client = node.create_client(SetCapture, "camera/set_capture")
+        # the exposure of the night, and the one that was asked for and has not come
+        self._longest_s = 0.0
+        self._asked_s: float | None = None
+        self._patience = 0
+
+    def judge(self, frame: Frame, disc: Disc | None) -> None:
+        """Ask for another exposure if this frame needs one; a frame whose exposure somebody changed sets the night's."""
+        now_s, asked_s = frame.exposure_s or 0.0, self._asked_s
+        if asked_s is not None and not math.isclose(now_s, asked_s, rel_tol=AS_ASKED):
+            # frames that were on their way, or a camera that does not follow
+            self._patience -= 1
+            if self._patience > 0:
+                return
+        if asked_s is None or now_s > self._longest_s:
+            self._longest_s = now_s
+        wanted_s = next_exposure_s(frame, disc, self._longest_s)
+        if wanted_s is None or not self._client.service_is_ready():
+            return
+        self._asked_s, self._patience = wanted_s, FRAMES_ON_THEIR_WAY
+        self._node.get_logger().info(f"the camera is asked for an exposure of {wanted_s:.3g} s.")
+        coming = self._client.call_async(
+            SetCapture.Request(exposure=wanted_s, gain=math.nan, cadence=math.nan)
+        )
+        coming.add_done_callback(self._answered)
+
+    def _answered(self, coming: Any) -> None:
+        answer = coming.result()
+        if answer is not None and not answer.success:
+            self._node.get_logger().warning(f"the camera refused another exposure: {answer.message}")
 
 
 class DetectorNode(Node):
@@ -201,6 +242,7 @@ class DetectorNode(Node):
         self._topics = FrameTopics(self, self._on_image)
         self._captures_come: Callable[[], int] = lambda: 0
         self._annotator = Annotator(self)
+        self._day = DayExposure(self) if self._values["day_exposure"] else None
         self._trail_finder = TrailFinder(self) if self._values["trails"] else None
         self._trails: Trails | None = None
         # Held while the trails are used: the executor gives them readings, the worker's thread asks for a frame's.
@@ -374,10 +416,11 @@ class DetectorNode(Node):
                 self._troubles.right("frames")
                 if result.frame is not None:
                     self._say_size(result.frame)
+                    if self._day is not None:
+                        self._day.judge(result.frame, result.detection.stars.disc)
                     subject = result.frame, result.detection.stars, result.message.header
                     self._annotator.offer(*subject)
-                    # in a replay the solver would have to wait for them
-                    if self._trail_finder is not None and not (self._replayed and self._replayed.playing):
+                    if self._trail_finder is not None:
                         self._trail_finder.offer(*subject)
                 self._last = replace(result, frame=None)
             elif isinstance(result, StarposError):
@@ -411,7 +454,9 @@ class DetectorNode(Node):
         complaint, self._complaint = self._complaint, ""
         last = self._last
         if last and last.message.stars:
-            sentence = f"{len(last.message.stars)} stars in {last.seconds:.2f} s."
+            sun = last.detection.stars.disc
+            day = "" if sun is None else f"{'a disc' if sun.sharp else 'a glow'} as the Sun's, "
+            sentence = f"{day}{len(last.detection.stars)} stars in {last.seconds:.2f} s."
         if last and last.detection.left_out:
             level = Level.WARN
             sentence += f" {last.detection.left_out} fainter peaks are left out: too many for stars, check the exposure."
@@ -441,7 +486,8 @@ class DetectorNode(Node):
         }
         if last:
             values |= {
-                "stars": len(last.message.stars),
+                "stars": len(last.detection.stars),
+                "disc": last.detection.stars.disc is not None,
                 "left out": last.detection.left_out,
                 "background (DN)": last.detection.background,
                 "noise (DN)": last.detection.noise,

@@ -4,26 +4,20 @@
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
+from starpos_common.node_main import run_executable
+
 if TYPE_CHECKING:
     from rclpy.node import Node
 
 
 def camera() -> int:
     """Run the node `camera`."""
-    from starpos_common.node_main import run_executable
-
-    def make_nodes() -> "Iterator[Node]":
-        from starpos_camera.camera import CameraNode
-
-        yield CameraNode()
-
     about = "The frames of a camera, until Ctrl-C."
-    return run_executable("starpos_camera", "camera", about, make_nodes)
+    return run_executable("starpos_camera", "camera", about, "camera:CameraNode")
 
 
 def detector() -> int:
     """Run the node `detector`."""
-    from starpos_common.node_main import run_executable
 
     def make_nodes() -> "Iterator[Node]":
         from starpos_camera.detector import DetectorNode
@@ -38,7 +32,6 @@ def detector() -> int:
 
 def camera_detector() -> int:
     """Run both nodes in one process: frames go from one to the other directly, not through the middleware."""
-    from starpos_common.node_main import run_executable
 
     def make_nodes() -> "Iterator[Node]":
         from starpos_camera.camera import CameraNode

@@ -13,9 +13,11 @@ from sensor_msgs.msg import Image
 from starpos.detection import detect
 from starpos.frames.frame import Frame
 from starpos.messages.stars import message_to_stars
+from starpos_camera.detector import DetectorNode
 from starpos_common.messages import frame_to_message
 from starpos_interfaces.msg import Capture, StarArray
-from starpos_testing.nodes import Listener, Process
+from starpos_interfaces.srv import SetCapture
+from starpos_testing.nodes import Listener, Process, refusal
 
 OK, WARN = 0, 1
 
@@ -163,10 +165,8 @@ def test_newest_frame_wins_and_the_others_are_counted(feed, frame):
 
 
 @pytest.mark.parametrize("parameter", ["threshold:=2", "min_snr:=.nan"])
-def test_bad_parameters_end_with_one_line(start, parameter):
-    status, out = start("detector", parameter).end()
-    assert status == 1
-    assert parameter.split(":")[0] in out and len(out.splitlines()) == 1
+def test_bad_parameters_are_refused(parameter):
+    assert parameter.split(":")[0] in refusal(DetectorNode, parameter)
 
 
 # After the tests that start a detector of their own: there may be one at a time.
@@ -299,3 +299,23 @@ def test_parameters_apply_at_run_time(standing, frame):
     for name, value in (("saturation", -1.0), ("max_stars", 0), ("exposure", -1.0)):
         refusal = standing.listener.set("detector", **{name: value})
         assert not refusal.successful and name in refusal.reason
+
+
+def test_by_day_the_camera_is_asked_for_a_shorter_exposure_and_by_night_for_its_own(listener, start):
+    asked = []
+
+    def answer(request, response):
+        asked.append(request.exposure)
+        response.success = True
+        return response
+
+    service = listener.node.create_service(SetCapture, "camera/set_capture", answer)
+    feed = Feed(listener, start, "day_exposure:=true")
+    white, dark = Frame(np.full((200, 300), 255, np.uint8)), Frame(np.full((200, 300), 3, np.uint8))
+    feed.wait_for(feed.send(white, exposure=0.8))
+    # the service may not have been discovered at the first frames
+    listener.wait(lambda: asked or feed.wait_for(feed.send(white, exposure=0.8)))
+    feed.wait_for(feed.send(dark, exposure=asked[0]))
+    listener.wait(lambda: len(asked) > 1)
+    assert asked == pytest.approx([0.1, 0.8])
+    listener.node.destroy_service(service)

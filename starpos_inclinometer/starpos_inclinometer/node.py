@@ -114,7 +114,7 @@ class InclinometerNode(Node):
         self.host_clock = HostClock(
             lambda: self.get_clock().now().nanoseconds, lambda: time_is_simulated(self)
         )
-        host = Surroundings(self, self.host_clock, self._wake.trigger, time_is_simulated(self))
+        host = Surroundings(self, self.host_clock, self._wake.trigger)
         self._source = SOURCES[self._values["source"]](host, self._values)
         self._begun = self.get_clock().create_jump_callback(
             BEGUN_ANEW, post_callback=lambda _: self._source.restart()

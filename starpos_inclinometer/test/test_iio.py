@@ -18,7 +18,6 @@ from starpos_inclinometer.sources.iio_device import (
     Buffer,
     DeviceError,
     ScanLayout,
-    element,
     find,
     set_sampling_frequency,
 )
@@ -159,20 +158,20 @@ def test_the_sampling_frequency_is_set_or_its_choices_are_told(tmp_path):
     ],
 )
 def test_elements_of_a_scan(text, data, number):
-    assert element("in", 0, text).number(data) == number
+    assert ScanLayout({"in": text}).numbers(data)["in"].tolist() == [number]
 
 
 def test_the_layout_is_the_one_of_the_kernels_document():
     """Four channels of 16, 32, 32 and 64 bits begin at 0, 4, 8 and 16; the first and last alone at 0 and 8."""
     kinds = ["be:u16/16>>0", "be:u32/32>>0", "be:u32/32>>0", "be:u64/64>>0"]
-    elements = [element(str(i), i, kind) for i, kind in enumerate(kinds)]
+    types = {str(i): kind for i, kind in enumerate(kinds)}
     scan = b"".join([b"\0\1\xff\xff", b"\0\0\0\2", b"\0\0\0\3", b"\xff" * 4, b"\0" * 7 + b"\4"])
-    whole = ScanLayout(elements[::-1])
-    assert (whole.size, whole.numbers(scan)) == (24, {"0": 1, "1": 2, "2": 3, "3": 4})
-    two = ScanLayout([elements[0], elements[3]])
-    assert (two.size, two.numbers(scan[:4] + b"\xff" * 4 + scan[16:])) == (16, {"0": 1, "3": 4})
+    whole, two = ScanLayout(types), ScanLayout({name: types[name] for name in "03"})
+    assert (whole.dtype.itemsize, two.dtype.itemsize) == (24, 16)
+    assert [v.tolist() for v in whole.numbers(2 * scan).values()] == [[1, 1], [2, 2], [3, 3], [4, 4]]
+    assert [v.tolist() for v in two.numbers(scan[:4] + b"\xff" * 4 + scan[16:]).values()] == [[1], [4]]
     with pytest.raises(DeviceError, match="a format that is not known"):
-        element("in", 0, "le:f32/32X2>>0")
+        ScanLayout({"in": "le:f32/32X2>>0"})
 
 
 def test_buffered_scans_have_the_kernels_stamps_and_the_device_is_set_up_for_them(tmp_path):

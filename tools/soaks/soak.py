@@ -14,7 +14,7 @@ import runner
 SOAKS = Path(__file__).resolve().parent
 FAULTS = SOAKS.parent / "faults"
 
-NAMES = "day", "camera", "inclinometer", "two_skies", "voyage", "ends"
+NAMES = "day", "no_sun", "camera", "inclinometer", "two_skies", "voyage", "ends"
 KINDS = {name: SOAKS / f"{name}.py" for name in NAMES}
 KINDS |= {"faults": FAULTS / "fault_soak.py", "stalls": FAULTS / "stall_soak.py"}
 

@@ -23,7 +23,7 @@ PLAYED, CUT_SHORT, REFUSED = 0, 1, 2
 # The topic that must be there, and others.
 INPUTS = {
     "stars": ("stars", ("camera/camera_info", "tilt", "gnss/fix", "trails")),
-    "images": (RAW, ("camera/camera_info", "camera/capture", "tilt", "gnss/fix", "trails")),
+    "images": (RAW, ("camera/camera_info", "camera/capture", "tilt", "gnss/fix")),
 }
 WAIT_S, WAIT_FOR_INPUTS_S = 3.0, 30.0
 

@@ -42,7 +42,7 @@ def unix_to_stamp(unix_s: float | None) -> Time:
 
 
 def stars_to_message(stars: Stars, frame_id: str) -> msg.StarArray:
-    """Convert stars to a StarArray; what looks like the Sun comes first, as a star with the flag DISC."""
+    """Convert stars to a StarArray; what looks like the Sun comes last, as a star with the flag DISC."""
     covariance = stars.covariance.reshape(-1, 4)
     columns = zip(
         stars.x.tolist(),
@@ -61,8 +61,9 @@ def stars_to_message(stars: Stars, frame_id: str) -> msg.StarArray:
         stamp_stddev=float(stars.stamp_stddev_s),
         clock_stddev=float(stars.clock_stddev_s),
         stars=[
-            *([] if stars.disc is None else [_disc_to_message(stars.disc)]),
             *(msg.Star(x=x, y=y, flux=f, snr=s, covariance=c, flags=g) for x, y, f, s, c, g in columns),
+            # so that the others are counted as in the frame's own list
+            *([] if stars.disc is None else [_disc_to_message(stars.disc)]),
         ],
         **shutter_fields(stars.shutter),
     )

@@ -2,7 +2,7 @@
 """The main function of every node: start, spin, and end cleanly whatever signal comes, whenever it comes.
 
 Nothing heavy is imported before the signal handlers are in place, so that a signal during start-up also gives a clean
-exit. The module of an executable therefore imports its node inside `make_nodes`.
+exit. The module of an executable therefore imports its nodes inside `make_nodes`, or names the one that it has.
 """
 
 import contextlib
@@ -12,6 +12,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
@@ -134,20 +135,25 @@ def run_executable(
     package: str,
     executable: str,
     about: str,
-    make_nodes: Callable[[], "Iterator[Node]"],
+    make_nodes: Callable[[], "Iterator[Node]"] | str,
     nodes: tuple[str, ...] = (),
 ) -> int:
     """Run the nodes of an executable as `run` does; `--help` says what it is and explains the nodes' parameters.
 
+    make_nodes: as of `run`, or MODULE:CLASS of its only node, in its package.
     nodes: names in the table of parameters, if not the executable's own.
     """
+
+    def only_node() -> "Iterator[Node]":
+        module, _, name = str(make_nodes).partition(":")
+        yield getattr(import_module(f"{package}.{module}"), name)()
 
     def help_text() -> str:
         from starpos_common.parameters import node_help
 
         return node_help(package, executable, about, *(nodes or (executable,)))
 
-    return run(make_nodes, help_text=help_text)
+    return run(only_node if isinstance(make_nodes, str) else make_nodes, help_text=help_text)
 
 
 def own_arguments(args: list[str]) -> tuple[list[str], list[str]]:

@@ -56,13 +56,6 @@ class ShutterPulse:
 
 
 @dataclass(frozen=True, slots=True)
-class Unpaired:
-    """Why a frame has no pulse, in a sentence."""
-
-    reason: str
-
-
-@dataclass(frozen=True, slots=True)
 class Lag:
     """Lag of the camera from the command, or a driver's begin: median and standard deviation of `frames`."""
 
@@ -108,10 +101,8 @@ class ShutterPulses:
             )
         self._forget(edge.time_s - REMEMBERED_S)
 
-    def pair(
-        self, told_s: float, exposure_s: float, since_s: float, until_s: float
-    ) -> ShutterPulse | Unpaired:
-        """Find the pulse of a frame.
+    def pair(self, told_s: float, exposure_s: float, since_s: float, until_s: float) -> ShutterPulse | str:
+        """Find the pulse of a frame, or say in a sentence why it has none.
 
         told_s: its begin by the command, or as a driver reported it.  since_s, until_s: when it was commanded and had
         arrived: no other frame of this camera was exposed between them. All in Unix s.
@@ -128,21 +119,20 @@ class ShutterPulses:
             if p.begin_s <= until_s
         ]
         if any(a <= until_s for a, _ in takewhile(lambda gap: gap[1] >= begin_s, reversed(self._gaps))):
-            return Unpaired("edges of the shutter were lost near it")
+            return "edges of the shutter were lost near it"
         if not near:
-            return Unpaired("no pulse of the shutter came between the command and the frame")
+            return "no pulse of the shutter came between the command and the frame"
         if len(near) > 1:
-            return Unpaired(f"{len(near)} pulses of the shutter came between the command and the frame")
+            return f"{len(near)} pulses of the shutter came between the command and the frame"
         (pulse,) = near
         if pulse.begin_s > end_s:
-            return Unpaired("the pulse of the shutter came too late for the exposure to end in time")
+            return "the pulse of the shutter came too late for the exposure to end in time"
         lag_s = pulse.begin_s - told_s
         usual = self._agreeing()
         self._seen.append((lag_s, pulse.length_s))
         if not usual:
-            return Unpaired(f"fewer than {LEARNED} frames agree on the camera's lag yet")
-        reason = _doubt(lag_s, pulse.length_s, usual)
-        return Unpaired(reason) if reason else pulse
+            return f"fewer than {LEARNED} frames agree on the camera's lag yet"
+        return _doubt(lag_s, pulse.length_s, usual) or pulse
 
     @property
     def lag(self) -> Lag | None:

@@ -13,13 +13,13 @@ from sensor_msgs.msg import CameraInfo, Image
 
 from starpos.errors import FrameError, InstrumentError, TiltError, TimeError
 from starpos.frames.exposure import GLOBAL_SHUTTER, Shutter
-from starpos.frames.frame import EDGE, Disc, Frame, Stars, no_stars
+from starpos.frames.frame import EDGE, Disc, Frame, FrameTrail, Stars, no_stars
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import Tilt
 from starpos.messages import tilt as tilts
 from starpos.messages.camera import message_to_camera, message_to_frame
 from starpos.messages.stamp import stamp_to_unix
-from starpos.messages.stars import message_to_stars
+from starpos.messages.stars import message_to_stars, message_to_trails
 from starpos.messages.tilt import message_to_tilt
 from starpos_common import messages
 from starpos_interfaces import msg
@@ -99,6 +99,24 @@ def test_the_shutter_of_stars_round_trips(heard, shutter):
     message = heard(messages.stars_to_message(replace(stars(), shutter=shutter), "c"))
     assert message_to_stars(message).shutter == shutter
     assert message.shutter_known == (shutter is not None)
+
+
+@pytest.mark.parametrize("cut", [(False, False), (True, False), (False, True)])
+def test_trails_round_trip(heard, cut):
+    root = RNG.normal(0, 1, (4, 4))
+    sent = FrameTrail(
+        ends=RNG.uniform(0, 100, (2, 2)),
+        covariance=root @ root.T,
+        snr=25.0,
+        cut=np.array(cut),
+        steady=not cut[0],
+    )
+    header = messages.stars_to_message(stars(), "c").header
+    message = heard(messages.trails_to_message([sent], header))
+    (got,) = message_to_trails(message)
+    assert message.header.stamp.sec == header.stamp.sec and np.array_equal(got.ends, sent.ends)
+    assert np.array_equal(got.covariance, sent.covariance)
+    assert (got.cut.tolist(), got.steady, got.snr) == (list(cut), sent.steady, 25.0)
 
 
 @pytest.mark.parametrize("sharp", [True, False])

@@ -4,14 +4,14 @@
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
+from starpos_common.node_main import leave, run_executable
+
 if TYPE_CHECKING:
     from rclpy.node import Node
 
 
 def dashboard() -> int:
     """Run the node."""
-    from starpos_common.node_main import leave, run_executable
-
     about = (
         "The instrument in a browser, at http://127.0.0.1:8042 unless parameters say otherwise, until Ctrl-C."
     )

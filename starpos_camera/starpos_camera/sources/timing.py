@@ -207,8 +207,8 @@ class ShutterTimes:
                 clock_stddev_s=clock_s,
             )
             return replace(exposure, frame=known, stamp_source=Capture.HARDWARE)
-        self.unpaired = found.reason
-        remark = exposure.remark or f"a frame has no time of its shutter: {found.reason}."
+        self.unpaired = found
+        remark = exposure.remark or f"a frame has no time of its shutter: {found}."
         if self._lag is None or self._lag.frames < ENOUGH_FOR_LAG:
             return replace(exposure, remark=remark)
         known = replace(

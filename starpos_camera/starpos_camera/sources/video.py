@@ -11,23 +11,22 @@ short, but the kernel's uvcvideo drops such frames (its parameter nodrop is 0).
 import math
 import os
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from starpos.errors import FrameError
 from starpos.frames.exposure import MAX_READOUT_S, Shutter
 from starpos.frames.frame import MAX_PIXELS, Frame
+from starpos.frames.pictures import quiet_opencv
 from starpos_camera.sources.source import (
     CapturedFrame,
     CaptureError,
     CaptureSettings,
     DeviceSource,
-    FrameSource,
     SourceEnded,
 )
 from starpos_camera.sources.timing import read_utc
@@ -35,20 +34,6 @@ from starpos_interfaces.msg import Capture
 
 if TYPE_CHECKING:
     from cv2 import VideoCapture
-
-
-@contextmanager
-def quiet() -> Iterator[ModuleType]:
-    """Import cv2 and keep it from printing meanwhile: our own sentences report the errors."""
-    import cv2
-
-    # OpenCV 4.6 has the function at the top level.
-    log: Any = getattr(cv2.utils, "logging", cv2)
-    level = log.setLogLevel(0)
-    try:
-        yield cv2
-    finally:
-        log.setLogLevel(level)
 
 
 EXPOSURE_UNIT_S = 1e-4
@@ -85,12 +70,72 @@ JPEG = ("MJPG", "JPEG")
 FORMATS = (*MONO, *LUMA, *PLANAR, *MOSAIC, *COLOUR, *JPEG)
 
 
-class V4l2(DeviceSource["VideoCapture"]):
+class Video(DeviceSource["VideoCapture"]):
+    """A live V4L2 camera, or the frames of a video file, one after the other: making a Video makes the one it is."""
+
+    def __new__(cls, values: Mapping, now: Callable[[], float]) -> "Video":
+        return super().__new__(V4l2 if is_camera(values["video.device"]) else Film)
+
+    @staticmethod
+    def refusal(values: Mapping, settings: CaptureSettings) -> str | None:
+        device = values["video.device"]
+        if not device or "://" in device:
+            return (
+                f"video.device must be a V4L2 camera or a video file of this machine, not {device!r}: streams of a "
+                "network do not state when a frame was taken."
+            )
+        if is_camera(device):
+            if values["video.format"] and values["video.format"].ljust(4) not in FORMATS:
+                known = ", ".join(f.strip() for f in FORMATS)
+                return f"video.format must be one of {known}, not {values['video.format']!r}."
+            if bool(values["video.width"]) != bool(values["video.height"]):
+                return "video.width and video.height must be given together."
+            return None
+        if Path(device).suffix.lower() not in SUFFIXES:
+            return (
+                f"video.device must be below /dev, or a video file ({', '.join(SUFFIXES)}), not {device!r}."
+            )
+        if read_utc(values["video.start"]) is None:
+            return (
+                "a video file does not state when it was taken: set video.start to the UTC of its first frame, as "
+                "2026-11-02T18:00:00.00."
+            )
+        if settings.exposure_s is not None or settings.gain:
+            return "a video file has its own exposure and gain: leave `exposure` and `gain` unset."
+        return None
+
+    def __init__(self, values: Mapping, now: Callable[[], float]) -> None:
+        super().__init__(values, now)
+        device = values["video.device"]
+        self.hardware_id = f"/dev/video{device}" if device.isdecimal() else str(Path(device).expanduser())
+
+    def lacking(self) -> str | None:
+        if not Path(self.hardware_id).exists():
+            return f"{self.hardware_id}: it is not there; plug it in, or correct video.device."
+        return None
+
+    def _open(self) -> "VideoCapture":
+        with quiet_opencv() as cv2:
+            return self._opened(cv2)
+
+    def _opened(self, cv2: ModuleType) -> "VideoCapture":
+        """Open the camera or the file; CaptureError if it is not there."""
+        raise NotImplementedError
+
+    def _close(self, device: "VideoCapture") -> None:
+        device.release()
+
+
+def is_camera(device: str) -> bool:
+    """Whether a device is a camera; otherwise it is a file."""
+    return device.isdecimal() or device.startswith("/dev/")
+
+
+class V4l2(Video):
     """Keeps the camera streaming; `capture` returns the first frame that was exposed after the call."""
 
-    def __init__(self, path: str, values: Mapping, now: Callable[[], float]) -> None:
+    def __init__(self, values: Mapping, now: Callable[[], float]) -> None:
         super().__init__(values, now)
-        self.hardware_id = path
         self._format, self._size = "", (0, 0)
         # Exposure and gain that were set last.
         self._set: tuple[float | None, float | None] | None = None
@@ -98,7 +143,7 @@ class V4l2(DeviceSource["VideoCapture"]):
         self._not_before_s = 0.0
 
     def _expose(self, device: "VideoCapture", settings: CaptureSettings) -> CapturedFrame:
-        with quiet() as cv2:
+        with quiet_opencv() as cv2:
             exposure_s, remark = self._settings(cv2, device, settings)
             mid_s, stddev_s, stamp = self._grab(cv2, device, exposure_s)
             period_s = _period_s(cv2, device)
@@ -118,16 +163,9 @@ class V4l2(DeviceSource["VideoCapture"]):
         )
         return CapturedFrame(frame, stamp, remark=remark and f"{self.hardware_id}: {remark}")
 
-    def _close(self, device: "VideoCapture") -> None:
-        device.release()
-
     def _explain(self, error: Exception) -> str:
         text = str(error) if isinstance(error, CaptureError) else f"{type(error).__name__}: {error}."
         return " ".join(text.split())
-
-    def _open(self) -> "VideoCapture":
-        with quiet() as cv2:
-            return self._opened(cv2)
 
     def _opened(self, cv2: ModuleType) -> "VideoCapture":
         capture = cv2.VideoCapture(self.hardware_id, cv2.CAP_V4L2)
@@ -306,12 +344,15 @@ OPTIONS_IN = "OPENCV_FFMPEG_CAPTURE_OPTIONS"
 GREY_8, GREY_16 = 0x30303859, 0x10003159
 
 
-class Film(DeviceSource["VideoCapture"]):
+class Film(Video):
     """Plays a file once. If its disk goes away and comes back, it goes on at the next frame."""
 
-    def __init__(self, path: str, values: Mapping, now: Callable[[], float]) -> None:
+    # Without a listener the first frames would be played before the detector is ready.
+    waits_for_listener = True
+
+    def __init__(self, values: Mapping, now: Callable[[], float]) -> None:
         super().__init__(values, now)
-        self.hardware_id = self._path = path
+        self._path = self.hardware_id
         started = read_utc(values["video.start"])
         # Video.refusal has checked it.
         assert started is not None
@@ -328,15 +369,12 @@ class Film(DeviceSource["VideoCapture"]):
             raise SourceEnded(self._ended)
         return super().capture(settings)
 
-    def _close(self, device: "VideoCapture") -> None:
-        device.release()
-
     def _explain(self, error: Exception) -> None:
         """Return None: errors of a file have its path already."""
 
     def _expose(self, device: "VideoCapture", settings: CaptureSettings) -> CapturedFrame:
         self._check_there()
-        with quiet() as cv2:
+        with quiet_opencv() as cv2:
             came, pixels = device.read()
             at_s = device.get(cv2.CAP_PROP_POS_MSEC) / 1000
             frames = device.get(cv2.CAP_PROP_FRAME_COUNT)
@@ -368,12 +406,8 @@ class Film(DeviceSource["VideoCapture"]):
         if not Path(self._path).is_file():
             raise CaptureError(f"{self._path}: it is not there; correct video.device, or mount its disk.")
 
-    def _open(self) -> "VideoCapture":
-        self._check_there()
-        with quiet() as cv2:
-            return self._opened(cv2)
-
     def _opened(self, cv2: ModuleType) -> "VideoCapture":
+        self._check_there()
         at, beginnings = BEGINNINGS[Path(self._path).suffix.lower()]
         try:
             with open(self._path, "rb") as file:
@@ -416,62 +450,3 @@ class Film(DeviceSource["VideoCapture"]):
         for _ in range(self._taken):
             capture.grab()
         return capture
-
-
-class Video(FrameSource):
-    """A live V4L2 camera, or the frames of a video file, one after the other."""
-
-    @staticmethod
-    def refusal(values: Mapping, settings: CaptureSettings) -> str | None:
-        device = values["video.device"]
-        if not device or "://" in device:
-            return (
-                f"video.device must be a V4L2 camera or a video file of this machine, not {device!r}: streams of a "
-                "network do not state when a frame was taken."
-            )
-        if is_camera(device):
-            if values["video.format"] and values["video.format"].ljust(4) not in FORMATS:
-                known = ", ".join(f.strip() for f in FORMATS)
-                return f"video.format must be one of {known}, not {values['video.format']!r}."
-            if bool(values["video.width"]) != bool(values["video.height"]):
-                return "video.width and video.height must be given together."
-            return None
-        if Path(device).suffix.lower() not in SUFFIXES:
-            return (
-                f"video.device must be below /dev, or a video file ({', '.join(SUFFIXES)}), not {device!r}."
-            )
-        if read_utc(values["video.start"]) is None:
-            return (
-                "a video file does not state when it was taken: set video.start to the UTC of its first frame, as "
-                "2026-11-02T18:00:00.00."
-            )
-        if settings.exposure_s is not None or settings.gain:
-            return "a video file has its own exposure and gain: leave `exposure` and `gain` unset."
-        return None
-
-    def __init__(self, values: Mapping, now: Callable[[], float]) -> None:
-        super().__init__(values, now)
-        device = values["video.device"]
-        # Without a listener the first frames of a file would be played before the detector is ready.
-        self.waits_for_listener = not is_camera(device)
-        self.hardware_id = f"/dev/video{device}" if device.isdecimal() else str(Path(device).expanduser())
-        self._from = (V4l2 if is_camera(device) else Film)(self.hardware_id, values, now)
-
-    def lacking(self) -> str | None:
-        if not Path(self.hardware_id).exists():
-            return f"{self.hardware_id}: it is not there; plug it in, or correct video.device."
-        return None
-
-    def capture(self, settings: CaptureSettings) -> CapturedFrame:
-        return self._from.capture(settings)
-
-    def update(self, values: Mapping) -> None:
-        self._from.update(values)
-
-    def close(self) -> None:
-        self._from.close()
-
-
-def is_camera(device: str) -> bool:
-    """Whether a device is a camera; otherwise it is a file."""
-    return device.isdecimal() or device.startswith("/dev/")

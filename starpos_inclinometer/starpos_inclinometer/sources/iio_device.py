@@ -11,6 +11,7 @@ import math
 import os
 import re
 import select
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -216,61 +217,39 @@ STAMP = "in_timestamp"
 # Scans that the kernel keeps while this process is busy: 1 s at 100 Hz.
 BUFFER_LENGTH = 128
 READ_BYTES = 65536
-_ELEMENT_TYPE = re.compile(r"(be|le):([su])(\d+)/(\d+)(?:>>(\d+))?")
-
-
-@dataclass(frozen=True, kw_only=True)
-class Element:
-    """One number of a scan: its place in the order, and how its bytes become a number."""
-
-    name: str
-    index: int
-    little_endian: bool
-    signed: bool
-    bits: int
-    size: int
-    shift: int
-
-    def number(self, data: bytes) -> int:
-        value = int.from_bytes(data, "little" if self.little_endian else "big") >> self.shift
-        value &= (1 << self.bits) - 1
-        return value - (1 << self.bits) if self.signed and value >> (self.bits - 1) else value
-
-
-def element(name: str, index: int, text: str) -> Element:
-    """Read the text of a `_type` attribute, such as le:s12/16>>4; DeviceError for another form."""
-    match = _ELEMENT_TYPE.fullmatch(text.strip())
-    if match is None or int(match[4]) % 8:
-        raise DeviceError(
-            f"{name} is stored as {text.strip()!r}, a format that is not known: unset `iio.trigger`."
-        )
-    order, sign, bits, storage, shift = match.groups()
-    return Element(
-        name=name,
-        index=index,
-        little_endian=order == "le",
-        signed=sign == "s",
-        bits=int(bits),
-        size=int(storage) // 8,
-        shift=int(shift or 0),
-    )
+_ELEMENT_TYPE = re.compile(r"(be|le):([su])(\d+)/(8|16|32|64)(?:>>(\d+))?")
 
 
 class ScanLayout:
-    """Where each element of a scan lies: in the order of their indices, each aligned to its own size."""
+    """Where each element of a scan lies, each aligned to its own size, and how its bytes become a number.
 
-    def __init__(self, elements: list[Element]) -> None:
-        self._at: dict[str, tuple[int, Element]] = {}
-        end = 0
-        for e in sorted(elements, key=lambda e: e.index):
-            begin = -(-end // e.size) * e.size
-            self._at[e.name] = (begin, e)
-            end = begin + e.size
-        largest = max(e.size for e in elements)
-        self.size = -(-end // largest) * largest
+    types: the texts of the elements' `_type` attributes, such as le:s12/16>>4, in the order of their indices; DeviceError
+    for another form.
+    """
 
-    def numbers(self, scan: bytes) -> dict[str, int]:
-        return {name: e.number(scan[at : at + e.size]) for name, (at, e) in self._at.items()}
+    def __init__(self, types: Mapping[str, str]) -> None:
+        self._found: dict[str, re.Match[str]] = {}
+        for name, text in types.items():
+            if (found := _ELEMENT_TYPE.fullmatch(text.strip())) is None:
+                raise DeviceError(
+                    f"{name} is stored as {text.strip()!r}, a format that is not known: unset `iio.trigger`."
+                )
+            self._found[name] = found
+        stored = [(n, f"{'<' if m[1] == 'le' else '>'}u{int(m[4]) // 8}") for n, m in self._found.items()]
+        self.dtype = np.dtype(stored, align=True)
+
+    def numbers(self, data: bytes) -> dict[str, np.ndarray]:
+        """The numbers (N,) of each element in the bytes of N whole scans."""
+        scans = np.frombuffer(data, self.dtype)
+        return {name: _numbers(scans[name].astype(np.uint64), m) for name, m in self._found.items()}
+
+
+def _numbers(stored: np.ndarray, found: re.Match[str]) -> np.ndarray:
+    bits = np.uint64(int(found[3]))
+    values = stored >> np.uint64(int(found[5] or 0)) & np.uint64((1 << int(bits)) - 1)
+    half = np.uint64(1) << bits - np.uint64(1)
+    # two's complement, extended from any number of bits to 64
+    return ((values ^ half) - half).view(np.int64) if found[2] == "s" else values
 
 
 @dataclass(frozen=True, slots=True)
@@ -304,7 +283,8 @@ class Buffer:
             self._write("current_timestamp_clock", CLOCK)
             for path in elements.glob("*_en"):
                 path.write_text("1" if path.name.removesuffix("_en") in names else "0")
-            self._layout = ScanLayout([self._element(elements, name) for name in names])
+            names.sort(key=lambda name: int((elements / f"{name}_index").read_text()))
+            self._layout = ScanLayout({name: (elements / f"{name}_type").read_text() for name in names})
             self._write("buffer/length", str(BUFFER_LENGTH))
             self._write("buffer/enable", "1")
             self._file = os.open(nodes / self._folder.name, os.O_RDONLY | os.O_NONBLOCK)
@@ -324,10 +304,12 @@ class Buffer:
         if not data:
             raise OSError(f"{self._folder} sends no more")
         data = self._rest + data
-        size = self._layout.size
-        whole = len(data) // size * size
+        whole = len(data) - len(data) % self._layout.dtype.itemsize
         self._rest = data[whole:]
-        return [self._scan(data[at : at + size]) for at in range(0, whole, size)]
+        numbers = self._layout.numbers(data[:whole])
+        rows = zip(*(numbers[c.name].tolist() for c in self._channels), strict=True)
+        times_s = (numbers[STAMP] * 1e-9).tolist()
+        return [Scan(tuple(map(float, row)), time_s) for row, time_s in zip(rows, times_s, strict=True)]
 
     def close(self) -> None:
         os.close(self._file)
@@ -339,13 +321,5 @@ class Buffer:
         with contextlib.suppress(OSError):
             self._write("buffer/enable", "0")
 
-    def _scan(self, data: bytes) -> Scan:
-        numbers = self._layout.numbers(data)
-        return Scan(tuple(float(numbers[c.name]) for c in self._channels), numbers[STAMP] * 1e-9)
-
     def _write(self, attribute: str, text: str) -> None:
         (self._folder / attribute).write_text(f"{text}\n")
-
-    def _element(self, elements: Path, name: str) -> Element:
-        index = int((elements / f"{name}_index").read_text())
-        return element(name, index, (elements / f"{name}_type").read_text())

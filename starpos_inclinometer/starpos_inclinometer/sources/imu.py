@@ -13,6 +13,7 @@ from sensor_msgs.msg import Imu
 
 from starpos.instrument.tilt_log import noise_text
 from starpos.messages.tilt import MIN_MESSAGES, ImuTilts, Reading
+from starpos_common.diagnostics import time_is_simulated
 from starpos_common.topics import MatchedSubscription, subscription
 from starpos_inclinometer.sources.source import Counts, Health, Phase, Surroundings, TiltSource
 
@@ -41,7 +42,7 @@ class ImuSource(TiltSource):
         self._readings: deque[Reading] = deque(maxlen=QUEUE)
         self._recent: deque[float] = deque(maxlen=QUEUE)
         self._heard_s = self._told_s = -math.inf
-        if host.replays:
+        if time_is_simulated(host.node):
             # of a replay none may be lost; a simulator may offer best effort only
             matched = MatchedSubscription(host.node, Imu, TOPIC, self._hear, DEPTH)
             host.node.create_timer(LOOK_S, matched.look, clock=Clock(clock_type=ClockType.STEADY_TIME))

@@ -90,15 +90,11 @@ class Health:
 
 @dataclass(frozen=True)
 class Surroundings:
-    """What a node gives its source: itself, for topics; the host's clock; `wake`, which any thread may call.
-
-    replays: whether the node's time is simulated.
-    """
+    """What a node gives its source: itself, for topics; the host's clock; `wake`, which any thread may call."""
 
     node: Node
     clock: HostClock
     wake: Callable[[], object]
-    replays: bool = False
 
 
 class Link:

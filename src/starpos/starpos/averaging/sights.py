@@ -24,7 +24,7 @@ from starpos.errors import FixError, FrameError, StarposError
 from starpos.files import bytes_of, open_regular
 from starpos.fix.circle import Circle
 from starpos.fix.terms import ALWAYS, ErrorTerm
-from starpos.sky.bodies import BODIES, body_at
+from starpos.sky.bodies import BODIES, ERFA, SolarSystem, body_at
 from starpos.sky.catalogue import Catalogue
 from starpos.units import unix_of
 
@@ -137,7 +137,11 @@ def _sight(row: dict, where: str) -> SextantSight:
 
 
 def circle_of_sight(
-    sight: SextantSight, catalogue: Catalogue, atmosphere: Atmosphere, clock_stddev_s: float
+    sight: SextantSight,
+    catalogue: Catalogue,
+    atmosphere: Atmosphere,
+    clock_stddev_s: float,
+    ephemeris: SolarSystem = ERFA,
 ) -> Circle:
     """The circle of equal altitude of a sight; StarposError if its body or its altitude cannot be."""
     state, apparent = earth_state(sight.utc_unix_s), sight.apparent
@@ -148,7 +152,7 @@ def circle_of_sight(
         )
     radius = parallax = 0.0
     if sight.body in BODIES:
-        body = body_at(sight.body, state)
+        body = body_at(sight.body, state, ephemeris)
         itrs, sigma, parallax = body.itrs, math.hypot(sight.sigma, body.sigma), body.parallax
         # nearer than from the Earth's centre, by the altitude
         radius = body.radius * (1 + parallax * math.sin(apparent))

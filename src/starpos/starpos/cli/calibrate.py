@@ -39,6 +39,7 @@ from starpos.instrument.instrument import (
     Instrument,
 )
 from starpos.instrument.tilt_log import TiltLog
+from starpos.night import horizon
 from starpos.night.opening import frames_in
 from starpos.night.reading import NO_CAMERA, First, Instruments, Reader
 from starpos.night.remarks import WORTH_SAVING_ARCSEC, of_inclinometer, of_left_out
@@ -284,15 +285,15 @@ def _watch(args: argparse.Namespace) -> int:
     args.frames = _frames_below(Path(args.watch))
     if args.page is not None:
         overwriting.check(args, Written("--page", args.page, places_file.check_ours))
+    if args.horizon is not None:
+        overwriting.check(args, Written("--horizon", args.horizon, overwriting.never))
     site = _site(args)
-    answers = [
-        Answer(
-            solution=sight.solution,
-            focal_px=camera.fx,
-            sky_mag=sky_mag(item, sight.stars, sight.solution, camera) if isinstance(item, Frame) else np.nan,
-        )
-        for item, sight, camera in inputs.seen_at("calibrate", args, site)
-    ]
+    answers, stars = [], []
+    for item, sight, camera in inputs.seen_at("calibrate", args, site):
+        sky = sky_mag(item, sight.stars, sight.solution, camera) if isinstance(item, Frame) else np.nan
+        answers.append(Answer(solution=sight.solution, focal_px=camera.fx, sky_mag=sky))
+        if args.horizon is not None:
+            stars.append(horizon.expected(sight, camera, catalogue.load_catalogue()))
     nights = kept(night_poses(answers, site.longitude))
     for night in nights:
         values = watch_output.values_of(night)
@@ -304,6 +305,11 @@ def _watch(args: argparse.Namespace) -> int:
             console.complain("calibrate", watch_output.alarm_of(night))
     if args.page is not None:
         watch_output.write_page(Path(args.page), nights)
+    if stars:
+        try:
+            horizon.write(Path(args.horizon), horizon.horizon(stars))
+        except OSError as e:
+            raise InstrumentError(f"{args.horizon}: it cannot be written there ({e.strerror})") from None
     return NOTHING if not nights or any(n.alarm for n in nights) else 0
 
 

@@ -84,9 +84,8 @@ def _watched(args: argparse.Namespace, folder: Path) -> tuple[FirstNight | None,
             seen.add(path)
             waited = time.monotonic()
             if night is None:
-                given = given_of(
-                    args, About(item.width, item.height, focal_px=item.focal_px, origin_px=item.origin_px)
-                )
+                about = About(item.width, item.height, focal_px=item.focal_px, origin_px=item.origin_px)
+                given = given_of(args, about)
                 air = options.atmosphere_of(args)
                 night = FirstNight(Solver(options.instrument_of(args, item), catalogue.load_catalogue(), air))
             sight = Solving(given)(item)

@@ -69,6 +69,7 @@ def as_json(path: str, s: Solution) -> dict:
         "lens": a.model if a else None,
         "mirrored": a.mirrored if a else None,
         "negative": s.negative,
+        "planets": dict(s.planets),
         "status": s.status.value,
         "warnings": list(s.warnings),
         "bright_explained": [s.explained.explained, s.explained.bright] if s.explained else None,
@@ -90,5 +91,6 @@ def _line(path: str, s: Solution) -> str:
         + (", a fisheye" if a.model == EQUIDISTANT else "")
         + (", mirrored" if a.mirrored else "")
         + (", a negative" if s.negative else "")
+        + "".join(f", {name.title()}" for name, _ in s.planets)
         + "".join(f", {name}" for name in s.warnings)
     )

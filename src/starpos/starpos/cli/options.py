@@ -19,6 +19,7 @@ from starpos.frames.frame import Frame, Stars
 from starpos.instrument import instrument, instrument_file, platepar, sensors
 from starpos.instrument.camera import PLUMB_BOB, Camera
 from starpos.night.reading import About
+from starpos.sky.bodies import ERFA, JplKernel, SolarSystem
 
 
 def check_frames(args: argparse.Namespace) -> None:
@@ -74,6 +75,11 @@ def camera_of(args: argparse.Namespace) -> Camera:
     """An ideal camera from --focal-mm, --pixel-um and --size."""
     width, height = args.size
     return Camera.from_focal(width, height, instrument.focal_px_of(args.focal_mm, args.pixel_um))
+
+
+def ephemeris_of(args: argparse.Namespace) -> SolarSystem:
+    """The kernel of --ephemeris, or ERFA's series; InstrumentError if it cannot be read."""
+    return ERFA if args.ephemeris is None else JplKernel(args.ephemeris)
 
 
 def atmosphere_of(args: argparse.Namespace) -> Atmosphere:

@@ -13,6 +13,7 @@ import numpy as np
 
 from starpos.cli import console, inputs, options
 from starpos.earth.gravity import itrs_place
+from starpos.earth.refraction import Atmosphere
 from starpos.earth.vertical import Deflection
 from starpos.errors import FrameError, SatelliteError, StarposError
 from starpos.files import read_regular
@@ -213,7 +214,7 @@ def heading_json(name: str, sight: Sight, fix: SatelliteFix) -> dict | None:
     if sight.instrument is None or sight.found is None or sight.stars.mid_unix_s is None:
         return None
     place = gnss_place(sight.stars.mid_unix_s, fix.latitude, fix.longitude, fix.covariance[:2, :2])
-    solver = Solver(sight.instrument, catalogue.load_catalogue())
+    solver = Solver(sight.instrument, catalogue.load_catalogue(), Atmosphere.measured(None, None))
     try:
         link = solver.attitude_at(sight.stars, sight.found, place.deflected(Deflection())).ellipsoid
     except StarposError as e:

@@ -23,10 +23,11 @@ def run(args: argparse.Namespace) -> int:
     sights, near, vertical = read_sights(args.sights), near_of(args), options.vertical_of(args)
     clock_s = UNKNOWN_CLOCK_S if args.clock_stddev is None else args.clock_stddev
     catalogue, air = load_catalogue(), options.atmosphere_of(args)
+    ephemeris = options.ephemeris_of(args)
     output, used, circles = Output(args, COLUMNS, ELEVATIONS_HEAD), [], []
     for sight in sights:
         try:
-            circle = circle_of_sight(sight, catalogue, air, clock_s)
+            circle = circle_of_sight(sight, catalogue, air, clock_s, ephemeris)
         except StarposError as error:
             console.complain("solve", error)
             put_elevation(output, sight.source, sight.utc_unix_s, None, vertical, Status.BAD_INPUT.value)

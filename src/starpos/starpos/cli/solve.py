@@ -379,6 +379,7 @@ def _work(
         return Solving(Instruments(None), atmosphere=air)
     tilt = Path(night.tilt) if night.tilt is not None else ByGravity() if by_gravity else None
     work, remarks = work_of(given_or_sought(args, about), about, tilt, air, place)
+    work = replace(work, ephemeris=options.ephemeris_of(args))
     for remark in remarks:
         console.complain("solve", remark)
     assert work.instruments.instrument is not None

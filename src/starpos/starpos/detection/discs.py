@@ -30,7 +30,7 @@ ALIKE_PX, FLOOR_PX, FLOOR_SHARE = 3.0, 0.03, 0.001
 # that a cloud pulls the circle of a small disc by, whose limb is hardly rounder than the cloud's edge.
 HIDDEN, SMALL, ROUNDS = 0.012, 1.5, 6
 # A glow: shares of its height at which its middle is measured, the first of what is saturated; what share of it is.
-HEIGHTS, SATURATED_SHARE = (0.97, 0.8, 0.65), 0.15
+HEIGHTS, SATURATED_SHARE = (0.97, 0.8, 0.65), 0.45
 # Maximum size of a second bright group, as a share of the glow's. Squared ratio of its axes, share of an ellipse's area,
 # and how far the middles may differ, in its radius.
 ALONE, LONGEST, FULLEST, CONCENTRIC = 0.6, 1.8, 0.85, 0.2

@@ -12,7 +12,9 @@ import numpy as np
 from starpos.errors import FixError, PlaceError, StarposError, TiltError, TiltRangeError, TimeError
 from starpos.fix.circle import Circle
 from starpos.fix.fix import Fix
+from starpos.fix.glows import Glow, Glows
 from starpos.fix.heading import AttitudeAtPlace
+from starpos.fix.planets import planets_among
 from starpos.frames.frame import Stars
 from starpos.frames.tables import Pointing
 from starpos.frozen import at_once
@@ -24,7 +26,7 @@ from starpos.identification.two_skies import two_skies
 from starpos.instrument.camera import PLUMB_BOB, Camera
 from starpos.instrument.inclinometer import Tilt
 from starpos.sky.catalogue import NamedStars, named_stars
-from starpos.units import ARCSEC
+from starpos.units import ARCSEC, utc_text
 
 # Names in `Solution.warnings`. TWO_SKIES: unidentified bright stars form a sky of their own. UNEXPLAINED: most bright
 # detections are not identified, and bright stars that should be there are missing.
@@ -92,8 +94,10 @@ class Solution:
     negative : whether the stars are dark on a bright sky
     hint : helps to identify the next frame
     remark : a warning on an identified frame; '' without one
+    planets : names of those among the stars, and their rows there
     bodies : names of the Sun, the Moon and planets that it rests on
     circle : of equal altitude, by the Sun where no place is known; None without
+    glow : the saturated spot that was taken for the Sun, or was not; None without
 
     Examples
     --------
@@ -123,8 +127,10 @@ class Solution:
     found: Identification | None = None
     negative: bool = False
     remark: str = ""
+    planets: tuple[tuple[str, int], ...] = ()
     bodies: tuple[str, ...] = ()
     circle: Circle | None = None
+    glow: Glow | None = None
 
     @classmethod
     def of(
@@ -157,11 +163,28 @@ class Solution:
         """A solution of a file that holds no frame."""
         return cls(Status.BAD_INPUT, str(error), source=source, utc_unix_s=None, stars_detected=0)
 
+    def beside(self, glows: Glows) -> "Solution":
+        """The solution after the glows before it: refused if its own is a lamp's, which stands still."""
+        if self.glow is None or (since := glows.still_since(self.glow)) is None:
+            return self
+        return self.as_lamp(since)
+
+    def as_lamp(self, since_unix_s: float) -> "Solution":
+        """The solution of a frame whose glow has stood still since then, or until then, while the Sun moved on."""
+        if self.status is not Status.OK or not self.bodies:
+            return self
+        message = (
+            f"{self.source}: its bright spot stands where it stood at {utc_text(since_unix_s)}, and the Sun has moved on "
+            "in between: it is a lamp or a reflection, or the camera follows the Sun"
+        )
+        return replace(self, status=Status.POOR_FIT, message=message, at_place=None, circle=None, bodies=())
+
     def among(self, stars: Stars, rows: np.ndarray) -> "Solution":
         """The solution of `stars` that is found by the stars in `rows` (n,) alone."""
         star = None if self.star is None else rows[self.star]
         found = self.found and self.found.but(star=rows[self.found.star])
-        return replace(self, star=star, found=found, stars_detected=len(stars))
+        planets = tuple((name, int(rows[row])) for name, row in self.planets)
+        return replace(self, star=star, found=found, planets=planets, stars_detected=len(stars))
 
     def __repr__(self) -> str:
         found = self.fix.in_degrees if self.fix else self.message
@@ -212,7 +235,8 @@ def solution_of(
     field: the stars as they were searched.
     begin_s: when their search began, by time.perf_counter.
     """
-    warnings, explained = suspicions(stars, field, sky, found)
+    planets = planets_among(stars, found, camera)
+    warnings, explained = suspicions(stars, field, sky, found, tuple(row for _, row in planets))
     return Solution.of(
         stars,
         named=sky.catalogue.named(found.catalogue),
@@ -220,23 +244,31 @@ def solution_of(
         pointing=pointing_of(found, sky, camera, found.spread_px(stars.x, stars.y)),
         warnings=warnings,
         explained=explained,
+        planets=planets,
         found=found,
         identify_s=time.perf_counter() - begin_s,
     )
 
 
 def suspicions(
-    stars: Stars, field: FrameStars | fisheye.WideField, sky: Sky, found: Identification
+    stars: Stars,
+    field: FrameStars | fisheye.WideField,
+    sky: Sky,
+    found: Identification,
+    planets: tuple[int, ...] = (),
 ) -> tuple[tuple[str, ...], Explained]:
     """Sorted names of suspicions about the stars' identification, and how much it explains.
 
-    For a fisheye, the part with most identified stars is judged.
+    For a fisheye, the part with most identified stars is judged.  planets: rows of the stars that are no false ones.
     """
-    flux = stars.flux
+    flux, rows = stars.flux, None
     if isinstance(field, fisheye.WideField):
         part, found = fisheye.part_of(field, sky, found)
-        field, flux = part.field, flux[part.row]
+        field, flux, rows = part.field, flux[part.row], part.row
     explained = explained_by(found, field)
+    if planets:
+        bright = np.arange(explained.bright) if rows is None else rows[: explained.bright]
+        explained = replace(explained, bright=explained.bright - int(np.isin(bright, planets).sum()))
     names = (TWO_SKIES,) * two_skies(field, flux, sky, found, explained) + (UNEXPLAINED,) * (
         not explained.enough
     )

@@ -4,7 +4,7 @@
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import KW_ONLY, dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -57,6 +57,7 @@ from starpos.instrument.instrument import OWN_LEVEL, ByGravity, Instrument
 from starpos.instrument.tilt_log import NO_TILTS, Tilts
 from starpos.progress import Progress, quiet
 from starpos.sky import deeper
+from starpos.sky.bodies import ERFA, SolarSystem
 from starpos.sky.catalogue import Catalogue
 
 # A fisheye's lower stars are not used: no model describes refraction near the horizon.
@@ -111,6 +112,7 @@ class Solver:
     Other ways to identify a frame are in `starpos.fix.searching`.
 
     catalogue: or the deeper one in its stead, for a field that needs it.
+    ephemeris: of the Sun, the Moon and planets.
 
     Examples
     --------
@@ -123,8 +125,10 @@ class Solver:
     instrument: Instrument
     catalogue: Catalogue
     atmosphere: Atmosphere = field(default_factory=lambda: Atmosphere.measured(None, None))
+    _: KW_ONLY
     min_stars: int = 5
     progress: Progress = quiet
+    ephemeris: SolarSystem = ERFA
 
     def prepare(self, width: int, height: int, origin_px: tuple[float, float] | None = None) -> str:
         """Load the tables for frames of this size in px, or build them; raises StarposError.

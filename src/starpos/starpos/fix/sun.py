@@ -20,6 +20,7 @@ from starpos.fix.attitude import CAMERA, ITRS, Attitude
 from starpos.fix.budget import sky_terms, tilt_terms
 from starpos.fix.checks import MIN_DEG
 from starpos.fix.circle import MIN_SINE, circle_along
+from starpos.fix.glows import Glow
 from starpos.fix.heading import AttitudeAtPlace, attitudes_at, zenith_moved
 from starpos.fix.solution import Solution
 from starpos.fix.solver import Solver
@@ -36,7 +37,9 @@ LENS_SHARE = 1e-3
 # A limb is the body's if its radius is to this share, and px.  A glow is at most so wide, rad.
 SIZE_SHARE, SIZE_PX, WIDEST_GLOW = 0.06, 1.0, math.radians(10.0)
 # A body's altitude by the level differs from the ephemeris' by at most this; a glow may be a lamp as well.
-LIMB_SIGMAS, GLOW_SIGMAS = 5.3, 3.5
+LIMB_SIGMAS, GLOW_SIGMAS = 5.3, 3.0
+# a lens in which the Sun's radius is larger, px, shows its limb: there a glow is a lamp or a cloud
+RESOLVED_PX = 6.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,6 +78,7 @@ def by_sun(solver: Solver, stars: Stars, disc: Disc, tilts: Tilts | None, places
 
     A fault of the frame, the tilt, the time or the place is a status.
     """
+    glow = None
     try:
         if tilts is None and solver.instrument.vertical is None:
             raise InstrumentError(
@@ -96,12 +100,15 @@ def by_sun(solver: Solver, stars: Stars, disc: Disc, tilts: Tilts | None, places
         stamp_s = math.hypot(
             stars.stamp_stddev_s, *shutter.errors_s(np.array([disc.y]), stars.height)[0].tolist()
         )
+        if not disc.sharp:
+            sigma = float(np.linalg.norm(seen.own)) / math.sqrt(2)
+            glow = Glow(state.utc_unix_s, seen.ray, body_at(SUN, state, solver.ephemeris).itrs, sigma)
         if places is None:
-            return _on_circle(solver, stars, disc, seen, tilt, state, stamp_s)
+            return replace(_on_circle(solver, stars, disc, seen, tilt, state, stamp_s), glow=glow)
         place, wrong = places.at(state.utc_unix_s), None
         for name in (SUN, MOON) if disc.sharp else (SUN,):
             try:
-                body = body_at(name, state)
+                body = body_at(name, state, solver.ephemeris)
                 _check_size(disc, seen, body, camera, stars.place)
                 found = _attitude(solver, stars, disc, seen, body, tilt, state, place, stamp_s)
             except PlaceError as error:
@@ -113,16 +120,22 @@ def by_sun(solver: Solver, stars: Stars, disc: Disc, tilts: Tilts | None, places
                 at_place=found,
                 tilt=tilt,
                 bodies=(name,),
+                glow=glow,
                 extrapolated_days=state.orientation.extrapolated_days,
             )
         assert wrong is not None
         raise wrong
     except StarposError as error:
-        return Solution.refused(stars, error)
+        return replace(Solution.refused(stars, error), glow=glow)
 
 
 def _check_size(disc: Disc, seen: _Seen, body: Body, camera: Camera, place: str) -> None:
     """Raise PlaceError if a disc is not as wide as the body."""
+    if not disc.sharp and body.radius * disc.radius_px > RESOLVED_PX * seen.radius:
+        raise PlaceError(
+            f"{place}: a bright spot without a limb, in a lens that shows the Sun's: it is a lamp or a cloud, or the Sun "
+            "without a filter, behind which alone such a lens may look at it"
+        )
     if disc.sharp:
         off = abs(seen.radius / body.radius - 1) > SIZE_SHARE + SIZE_PX / disc.radius_px
     else:
@@ -139,7 +152,7 @@ def _on_circle(
     solver: Solver, stars: Stars, disc: Disc, seen: _Seen, tilt: Tilt, state: EarthState, stamp_s: float
 ) -> Solution:
     """The Sun's circle of equal altitude."""
-    body = body_at(SUN, state)
+    body = body_at(SUN, state, solver.ephemeris)
     camera = solver.instrument.camera_for(stars.width, stars.height, stars.origin_px)
     _check_size(disc, seen, body, camera, stars.place)
     up = solver.instrument.mounting.level(tilt).camera[2]

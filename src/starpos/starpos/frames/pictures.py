@@ -5,7 +5,10 @@ import io
 import struct
 import zlib
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
+from types import ModuleType
+from typing import Any
 
 import numpy as np
 
@@ -62,15 +65,23 @@ def frame_pixels(pixels: np.ndarray, place: str) -> np.ndarray:
 
 def decode_picture(data: bytes) -> np.ndarray | None:
     """The pixels of a PNG, TIFF or JPEG as they are, None if they cannot be decoded; nothing is printed."""
+    with quiet_opencv() as cv2:
+        try:
+            return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+        except cv2.error:
+            return None
+
+
+@contextmanager
+def quiet_opencv() -> Iterator[ModuleType]:
+    """Import cv2 and keep it from printing meanwhile: our own sentences report the errors."""
     import cv2
 
     # OpenCV 4.6 has setLogLevel at the top
-    log = getattr(cv2.utils, "logging", cv2)
+    log: Any = getattr(cv2.utils, "logging", cv2)
     level = log.setLogLevel(0)
     try:
-        return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    except cv2.error:
-        return None
+        yield cv2
     finally:
         log.setLogLevel(level)
 

@@ -5,7 +5,7 @@ import itertools
 import math
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import KW_ONLY, dataclass, field, replace
+from dataclasses import KW_ONLY, dataclass, field, fields, replace
 from functools import cached_property
 from typing import Any, Protocol
 
@@ -171,16 +171,9 @@ class TiltLog:
     @classmethod
     def of_readings(cls, readings: Sequence[Tilt], earlier_excess: float = 1.0) -> "TiltLog":
         """Make a log of readings, each with its own covariance."""
-        return cls(
-            np.array([r.utc_unix_s for r in readings]),
-            np.array([r.theta_x for r in readings]),
-            np.array([r.theta_y for r in readings]),
-            temperature_c=np.array([r.temperature_c for r in readings]),
-            covariance=np.array([r.covariance for r in readings]),
-            theta_z=np.array([r.theta_z for r in readings]),
-            variance_z=np.array([r.variance_z for r in readings]),
-            earlier_excess=earlier_excess,
-        )
+        names = [f.name for f in fields(cls) if "ndarray" in str(f.type)]
+        columns = {name: np.array([getattr(r, name) for r in readings]) for name in names}
+        return cls(**columns, earlier_excess=earlier_excess)
 
     def __repr__(self) -> str:
         return f"<{len(self.utc_unix_s)} readings of an inclinometer>"
@@ -216,16 +209,8 @@ class TiltLog:
     def until(self, unix_s: float) -> "TiltLog":
         """The readings up to a time."""
         rows = self.utc_unix_s <= unix_s
-        return replace(
-            self,
-            utc_unix_s=self.utc_unix_s[rows],
-            theta_x=self.theta_x[rows],
-            theta_y=self.theta_y[rows],
-            temperature_c=self.temperature_c[rows],
-            covariance=self.covariance[rows],
-            theta_z=None if self.theta_z is None else self.theta_z[rows],
-            variance_z=None if self.variance_z is None else self.variance_z[rows],
-        )
+        columns = {f.name: getattr(self, f.name) for f in fields(self)}
+        return replace(self, **{name: c[rows] for name, c in columns.items() if isinstance(c, np.ndarray)})
 
     def average(self, mid_unix_s: float, exposure_s: float, spread_s: float = 0.0) -> Tilt:
         """The mean tilt over an exposure, from the readings in it or, for a short one, from two that bracket it closely.
@@ -275,8 +260,7 @@ class TiltLog:
         order = self._once
         steps = np.diff(self.theta[order], axis=0)
         equal = (steps == 0).all(1)
-        # rows of equal steps [begin, end)
-        begin, end = np.flatnonzero(np.diff(np.concatenate([[0], equal, [0]]))).reshape(-1, 2).T
+        begin, end = _runs(equal)
         rows = end - begin >= STUCK_READINGS - 1
         begin, end = begin[rows], end[rows]
         # all but these, of an instrument at rest
@@ -311,8 +295,7 @@ class TiltLog:
         """Mask (N, 2) of the values of X', Y' that stand in a row of STUCK_READINGS or more equal ones."""
         repeats = np.zeros((len(self.utc_unix_s), 2), bool)
         for axis, equal in enumerate((np.diff(self.theta[self._once, :2], axis=0) == 0).T):
-            begin, end = np.flatnonzero(np.diff(np.concatenate([[0], equal, [0]]))).reshape(-1, 2).T
-            for first, last in zip(begin, end, strict=True):
+            for first, last in zip(*_runs(equal), strict=True):
                 repeats[self._once[first : last + 1], axis] = last - first >= STUCK_READINGS - 1
         return repeats
 
@@ -443,6 +426,11 @@ class TiltLog:
         """Whether two readings are of one lean within their noise."""
         variance = (self.variance[a] + self.variance[b]) * self.excess**2
         return bool(((self.theta[a] - self.theta[b]) ** 2 <= AGREE_SIGMA**2 * variance).all())
+
+
+def _runs(mask: np.ndarray) -> np.ndarray:
+    """Begin and end (2, R) of the runs in which a mask (N,) holds; each ends before its end."""
+    return np.flatnonzero(np.diff(np.concatenate([[0], mask, [0]]))).reshape(-1, 2).T
 
 
 def _mean_known(celsius: np.ndarray) -> float:

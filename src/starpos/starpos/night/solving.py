@@ -15,6 +15,7 @@ from starpos.earth.vertical import Vertical
 from starpos.errors import FrameError
 from starpos.fix.attitude import heading_of
 from starpos.fix.budget import local_north
+from starpos.fix.glows import Glow
 from starpos.fix.searching import Sight, of_one_camera
 from starpos.frames.frame import Frame, Stars
 from starpos.identification.prior import Hint
@@ -111,7 +112,7 @@ def answers_of(
     """Answer the frames of a night, by name; sights: what `how.work(asked)` gave of each."""
     if how.one_by_one:
         known = asked.instruments.instrument
-        return NightAnswers(_one_by_one(sights, asked), known, known)
+        return NightAnswers(_without_lamps(_one_by_one(sights, asked)), known, known)
     rows = list(sights)
     seen = [sight for _, sight in rows if isinstance(sight, Sight)]
     if not seen:
@@ -142,6 +143,34 @@ def _one_by_one(sights: Iterable[tuple[str, Sight | FrameError]], asked: Solving
             sight = asked.after(sight, hint)
         hint = sight.solution.hint or hint
         yield FrameAnswer(name, sight.solution, sight.stars)
+
+
+def _without_lamps(answers: Iterable[FrameAnswer]) -> Iterator[FrameAnswer]:
+    """The answers, of which one by a glow is held back until a later glow shows that it moves with the Sun.
+
+    A glow that stands still meanwhile is a lamp's, and those before it too.
+    """
+    held: list[FrameAnswer] = []
+    lamp: Glow | None = None
+    for answer in answers:
+        glow = answer.solution.glow
+        if glow is None:
+            held.append(answer)
+        else:
+            first = lamp or next((a.solution.glow for a in held if a.solution.glow is not None), None)
+            still = None if first is None else first.stood_still(glow)
+            if still and first is not None:
+                lamp = first
+                answer = replace(answer, solution=answer.solution.as_lamp(first.utc_unix_s))
+                held = [replace(a, solution=a.solution.as_lamp(glow.utc_unix_s)) for a in held]
+            elif still is False:
+                yield from held
+                held, lamp = [], None
+            held.append(answer)
+        if lamp is not None or all(a.solution.glow is None for a in held):
+            yield from held
+            held = []
+    yield from held
 
 
 def _in_order(

@@ -35,6 +35,7 @@ from starpos.night.reading import First, Instruments, Reader, TiltFile, stars_of
 from starpos.night.remarks import Remark
 from starpos.progress import Progress, quiet
 from starpos.sky import catalogue
+from starpos.sky.bodies import ERFA, SolarSystem
 from starpos.zenith.adjustment import DeflectionSession
 from starpos.zenith.doubts import checked_session
 from starpos.zenith.sighting import ZenithSighting, sighting
@@ -87,6 +88,7 @@ class Solving:
     instruments: Instruments
     _: KW_ONLY
     atmosphere: Atmosphere = field(default_factory=lambda: Atmosphere.measured(None, None))
+    ephemeris: SolarSystem = ERFA
     tilts: Tilts | None = None
     places: Places | None = None
     search_s: float | None = None
@@ -192,7 +194,10 @@ class Solving:
             )
         if not self._latest or self._latest[0].instrument != instrument:
             stars = catalogue.load_catalogue()
-            self._latest[:] = [Solver(instrument, stars, self.atmosphere, progress=self.progress)]
+            solver = Solver(
+                instrument, stars, self.atmosphere, progress=self.progress, ephemeris=self.ephemeris
+            )
+            self._latest[:] = [solver]
         return self._latest[0]
 
     def after(self, sight: Sight, hint: Hint) -> Sight:

@@ -13,11 +13,10 @@ from typing import NamedTuple
 import numpy as np
 from scipy import special
 
-from starpos.earth.ellipsoid import enu_axes
 from starpos.earth.gravity import geodetic_place
 from starpos.frozen import at_once
 from starpos.satellites.elements import Orbit
-from starpos.satellites.orbits import Moments, along_axes, raised, seen, states
+from starpos.satellites.orbits import Moments, along_axes, enu_at, raised, seen, states
 from starpos.satellites.trails import SatelliteTrail
 
 STEPS = 6
@@ -135,7 +134,7 @@ class Adjuster:
         offsets (T, 3): of each trail's satellite, m.
         """
         o = offsets[self.trail]
-        earth, enu = self.moments, self._enu(place)
+        earth, enu = self.moments, enu_at(place)
         _, v = states(self.orbits, earth, np.full(len(o), clock_s))
         # an offset along the orbit is a delay
         r, v = states(self.orbits, earth, clock_s + o[:, 1] / np.linalg.norm(v, axis=1))
@@ -153,11 +152,6 @@ class Adjuster:
         by_hand = self.by_hand[:, None, None] * np.eye(2)
         return residual, np.concatenate([by_place, by_clock[..., None], by_hand], -1), by_offset
 
-    @staticmethod
-    def _enu(place: np.ndarray) -> np.ndarray:
-        latitude, longitude, _ = geodetic_place(place)
-        return enu_axes(float(latitude), float(longitude))
-
     def solve(self, start: np.ndarray, clock_s: float = 0.0, *, refuse: bool = True) -> PlaceAdjustment:
         """Adjust from a place (3,) in ITRS near the truth; refuse: leave out what does not fit."""
         used = np.ones(len(self.time_stddev), bool)
@@ -173,7 +167,7 @@ class Adjuster:
     ) -> tuple[PlaceAdjustment, list[_Block], np.ndarray]:
         offsets = np.zeros((len(used), 3))
         for _ in range(STEPS):
-            enu = self._enu(place)
+            enu = enu_at(place)
             normal, right, chi2, known = self._known_before(place, clock_s, enu)
             blocks = self._blocks(self.equations(place, clock_s, offsets), offsets, used)
             for block in blocks:

@@ -19,7 +19,7 @@ from starpos.frames.exposure import UNKNOWN_SHUTTER
 from starpos.frames.frame import Frame, FrameTrail, Stars
 from starpos.instrument.camera import Camera
 from starpos.rotation import normalised
-from starpos.satellites.trails import SatelliteTrail, turned
+from starpos.satellites.trails import SatelliteTrail, tangent_axes, turned
 from starpos.sky.catalogue import Catalogue
 from starpos.units import SIGMA_PER_MAD
 
@@ -224,14 +224,6 @@ class FrameSky:
         why = [f"{cut} leave the frame at both ends"] * (cut > 0) + [f"{uneven} flash or fade"] * (uneven > 0)
         left_out = f"{stars.place}: of {len(found)} trails {' and '.join(why)}: left out" if why else ""
         return FrameTrails(tuple(trails), left_out)
-
-
-def tangent_axes(v: np.ndarray) -> np.ndarray:
-    """Unit vectors (3, 3): towards growing right ascension and growing declination at a direction v (3,), and v's."""
-    out = v / np.linalg.norm(v)
-    east = np.array([-out[1], out[0], 0.0])
-    east = east / max(float(np.hypot(out[0], out[1])), 1e-300)
-    return np.stack([east, np.cross(out, east), out])
 
 
 def trails_of(frame: Frame, stars: Stars, solution: Solution, catalogue: Catalogue) -> FrameTrails:

@@ -6,13 +6,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from starpos.earth.ellipsoid import enu_axes
 from starpos.earth.gravity import geodetic_place
 from starpos.errors import SatelliteError
 from starpos.frozen import at_once
 from starpos.satellites.adjustment import Adjuster, KnownBefore, PlaceAdjustment
 from starpos.satellites.elements import Orbit
 from starpos.satellites.naming import FEWEST, Candidates, agreement, candidates, ways_of
+from starpos.satellites.orbits import enu_at
 from starpos.satellites.trails import SatelliteTrail
 
 # chi-squared of a candidate's place on the ground, from which its trail is looked at
@@ -78,7 +78,7 @@ def locate(trails: Sequence[SatelliteTrail], orbits: Sequence[Orbit], prior: Kno
     found = candidates(trails, orbits, prior.height_m, prior.height_stddev_m, prior.clock_stddev_s)
     known = found
     if prior.place is not None and prior.covariance is not None:
-        east_north = _plane(prior.place)
+        east_north = enu_at(prior.place)[:2]
         known = found.near(prior.place, east_north.T @ prior.covariance @ east_north)
     agreed = agreement(known, orbits)
     place, rows = agreed.place, agreed.members[agreed.members < len(found.trail)]
@@ -104,12 +104,6 @@ def locate(trails: Sequence[SatelliteTrail], orbits: Sequence[Orbit], prior: Kno
     return _fix(trails, orbits, found, np.array(seen_before[-1], int), answer, fewest)
 
 
-def _plane(place: np.ndarray) -> np.ndarray:
-    """East and north (2, 3) at a place (3,) in ITRS."""
-    latitude, longitude, _ = geodetic_place(place)
-    return enu_axes(float(latitude), float(longitude))[:2]
-
-
 def _named(
     trails: Sequence[SatelliteTrail],
     orbits: Sequence[Orbit],
@@ -120,7 +114,7 @@ def _named(
     prior: KnownBefore,
 ) -> np.ndarray:
     """Rows of the candidates that fit their trails at a place, one a trail, where no other fits nearly as well."""
-    plane = _plane(place)
+    plane = enu_at(place)[:2]
     off = (found.places - place) @ plane.T
     spread = plane @ found.covariance @ plane.T + covariance[:2, :2]
     near = np.flatnonzero(np.einsum("ki,kij,kj->k", off, np.linalg.inv(spread), off) < NEAR)

@@ -11,13 +11,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from starpos.earth.ellipsoid import ECCENTRICITY2, EQUATOR_RADIUS_M, enu_axes
-from starpos.earth.gravity import SPIN, geodetic_place
+from starpos.earth.ellipsoid import ECCENTRICITY2, EQUATOR_RADIUS_M
+from starpos.earth.gravity import SPIN
 from starpos.errors import SatelliteError
 from starpos.frozen import at_once
 from starpos.rotation import normalised
 from starpos.satellites.elements import Orbit
-from starpos.satellites.orbits import Moments, along_axes
+from starpos.satellites.orbits import Moments, along_axes, enu_at
 from starpos.satellites.trails import SatelliteTrail
 from starpos.units import DAY_S, UNIX_EPOCH_JD
 
@@ -278,8 +278,7 @@ def agreement(found: Candidates, orbits: Sequence[Orbit]) -> Agreement:
 def _fused(found: Candidates, chance: np.ndarray, start: int, steps: int) -> Agreement:
     """The agreement about one candidate's place; each step takes the mean of all that agree."""
     place = found.places[start]
-    latitude, longitude, _ = geodetic_place(place)
-    plane = enu_axes(float(latitude), float(longitude))[:2]
+    plane = enu_at(place)[:2]
     points = (found.places - place) @ plane.T
     covariance = plane @ found.covariance @ plane.T
     mean, own = points[start], covariance[start]

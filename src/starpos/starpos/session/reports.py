@@ -33,6 +33,7 @@ def of_solution(answer: Solution, counts: Mapping[str, int], remarks: str = "") 
     """Report the solution of the newest frame; remarks: sentences on what is wrong around it."""
     values: dict[str, object] = {**counts, "status": answer.status.value}
     values |= {
+        "source": ", ".join(answer.bodies) or "stars",
         "stars detected": answer.stars_detected,
         "stars matched": len(answer.names),
         "identify (s)": answer.identify_s,
@@ -57,7 +58,7 @@ def of_solution(answer: Solution, counts: Mapping[str, int], remarks: str = "") 
         return Diagnosis(
             Level.WARN, said if answer.ok or answer.remark else f"{answer.message}; {said}", values
         )
-    if answer.fix is None and attitude is not None:
+    if answer.fix is None and attitude is not None and not answer.bodies:
         sigma_arcsec = _heading_stddev_arcsec(attitude)
         told = f"heading at the known place, +- {sigma_arcsec:.2g} arcsec; no position: {answer.message}"
         return Diagnosis(Level.OK, told, values)

@@ -17,6 +17,7 @@ from starpos.errors import InstrumentError, StarposError
 from starpos.fix.attitude import CameraAttitude
 from starpos.fix.checks import MODEL_BY_PARAMETERS, unnamed_inclinometer
 from starpos.fix.fix import Fix
+from starpos.fix.glows import Glows
 from starpos.fix.searching import Question
 from starpos.fix.solution import Solution, Status
 from starpos.fix.solver import Solver
@@ -94,6 +95,7 @@ class SolverSession:
         self.places = SessionPlaces(settings, self.gnss, self.satellites)
         self.deflection = LiveDeflection(settings, jobs())
         self._search = Search(settings.values)
+        self._glows = Glows()
         self._settings, self._values = settings, settings.values
         self._catalogue = catalogue.load_catalogue()
         # This reads the tables of the Earth's rotation, so that the first frame is not slow.
@@ -125,6 +127,7 @@ class SolverSession:
     def _other_camera(self) -> None:
         self._hint = None
         self._search.other_camera()
+        self._glows = Glows()
         self.gyro.forget()
         if self.gnss is not None:
             self.gnss.other_camera()
@@ -388,7 +391,7 @@ class SolverSession:
                     Status.BAD_INPUT,
                     f"the frame is stamped {frame.ahead_s:.3g} s in the future: {reports.ONE_CLOCK}",
                 )
-            return self._search.solve(solver, question)
+            return self._search.solve(solver, question).beside(self._glows)
 
         return self._guarded(work, lambda e: _failed(frame, "the solver failed on this frame", e))
 

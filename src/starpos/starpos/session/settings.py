@@ -289,5 +289,5 @@ class Settings(NodeSettings):
             instrument_of(self.values, camera, self._known, found),
             catalogue,
             atmosphere_of(self.values),
-            self.values["min_stars"],
+            min_stars=self.values["min_stars"],
         )

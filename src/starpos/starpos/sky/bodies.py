@@ -1,11 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where the Sun, the Moon and the planets stand, by ERFA: apparent directions from the Earth's centre, and from a place.
+"""Where the Sun, the Moon and the planets stand: apparent directions from the Earth's centre, and from a place.
 
-Errors as ERFA states them. Of the Sun, by eraEpv00, they are 0.01 arcsec. Of the Moon, by eraMoon98, 3 arcsec rms, 10 at
-most. Of the planets, by eraPlan94, they are the largest differences from DE200 over 1800 to 2050.
+By ERFA, or by a kernel of JPL's that the user gives (de440s.bsp), which `jplephem` reads. Errors as ERFA states them: of
+the Sun, by eraEpv00, they are 0.01 arcsec; of the Moon, by eraMoon98, 3 arcsec rms, 10 at most; of the planets, by
+eraPlan94, the largest differences from DE200 over 1800 to 2050.
 """
 
-from dataclasses import dataclass
+import io
+import struct
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import Any, Protocol
 
 import erfa
 import numpy as np
@@ -13,6 +18,8 @@ import numpy as np
 from starpos import rotation
 from starpos.earth.ellipsoid import EQUATOR_RADIUS_M, ground_m
 from starpos.earth.orientation import EarthState, station_velocity
+from starpos.errors import InstrumentError, TimeError
+from starpos.files import bytes_of, open_regular
 from starpos.frozen import at_once
 from starpos.units import ARCSEC
 
@@ -61,32 +68,125 @@ class Body:
         return rotation.normalised(from_there + station_velocity(zenith))
 
 
-def body_at(name: str, state: EarthState) -> Body:
+class SolarSystem(Protocol):
+    """Barycentric places of the bodies and of the Earth, (3,) au along the axes of ICRS; days: of TT after J2000."""
+
+    def body_au(self, name: str, days: float) -> np.ndarray: ...
+
+    def earth_au(self, days: float) -> np.ndarray: ...
+
+    def error_arcsec(self, name: str, from_sun_au: float, distance_au: float) -> float:
+        """1 sigma of the direction along an axis, for a body so far from the Sun and from the Earth."""
+        ...
+
+
+class ErfaEphemeris:
+    """ERFA's own series: eraEpv00, eraMoon98, eraPlan94."""
+
+    def body_au(self, name: str, days: float) -> np.ndarray:
+        heliocentric, barycentric = erfa.epv00(erfa.DJ00, days)
+        if name == MOON:
+            return barycentric["p"] + erfa.moon98(erfa.DJ00, days)["p"]
+        sun = barycentric["p"] - heliocentric["p"]
+        return sun if name == SUN else sun + erfa.plan94(erfa.DJ00, days, PLANETS[name][0])["p"]
+
+    def earth_au(self, days: float) -> np.ndarray:
+        return erfa.epv00(erfa.DJ00, days)[1]["p"]
+
+    def error_arcsec(self, name: str, from_sun_au: float, distance_au: float) -> float:
+        if name in PLANETS:
+            return PLANETS[name][1] * from_sun_au / distance_au
+        return MOON_ARCSEC if name == MOON else SUN_ARCSEC
+
+
+ERFA = ErfaEphemeris()
+# NAIF's numbers; of the outer planets the barycentres with their moons, from which they are off by less than 0.1 arcsec
+NAIF = MappingProxyType(
+    {
+        SUN: 10,
+        MOON: 301,
+        "mercury": 199,
+        "venus": 299,
+        "mars": 4,
+        "jupiter": 5,
+        "saturn": 6,
+        "uranus": 7,
+        "neptune": 8,
+    }
+)
+EARTH, BARYCENTRE, KERNEL_ARCSEC = 399, 0, 0.1
+# de440.bsp, the largest one that is usual, has 120 MB
+MAX_BYTES = 200_000_000
+HOW_TO_READ = "install jplephem (pip install 'starpos[ephemeris]')"
+
+
+@dataclass(frozen=True)
+class JplKernel:
+    """A JPL ephemeris in SPICE's format (SPK, .bsp); InstrumentError if it cannot be read, or lacks a body."""
+
+    path: str
+    _segments: dict[int, list[Any]] = field(default_factory=dict, compare=False, repr=False)
+
+    def __post_init__(self) -> None:
+        try:
+            from jplephem.daf import DAF
+            from jplephem.spk import SPK
+        except ImportError:
+            raise InstrumentError(f"{self.path}: to read an ephemeris, {HOW_TO_READ}") from None
+        try:
+            with open_regular(self.path) as file:
+                kernel = SPK(DAF(io.BytesIO(bytes_of(file, MAX_BYTES))))
+        except (OSError, ValueError, IndexError, TypeError, KeyError, struct.error) as error:
+            raise InstrumentError(
+                f"{self.path}: this is no ephemeris in SPICE's format ({error}): give a file like de440s.bsp"
+            ) from None
+        for segment in kernel.segments:
+            self._segments.setdefault(segment.target, []).append(segment)
+        if lacking := [
+            n for n, number in {**NAIF, "the Earth": EARTH}.items() if number not in self._segments
+        ]:
+            raise InstrumentError(f"{self.path}: it lacks {', '.join(lacking)}: give a file like de440s.bsp")
+
+    def __reduce__(self) -> tuple:
+        return JplKernel, (self.path,)
+
+    def body_au(self, name: str, days: float) -> np.ndarray:
+        return self._place_au(NAIF[name], days)
+
+    def earth_au(self, days: float) -> np.ndarray:
+        return self._place_au(EARTH, days)
+
+    def error_arcsec(self, name: str, from_sun_au: float, distance_au: float) -> float:
+        return SUN_ARCSEC if name in (SUN, MOON) else KERNEL_ARCSEC
+
+    def _place_au(self, target: int, days: float) -> np.ndarray:
+        place_km = np.zeros(3)
+        while target != BARYCENTRE:
+            for segment in self._segments.get(target, ()):
+                if segment.start_jd <= erfa.DJ00 + days <= segment.end_jd:
+                    break
+            else:
+                raise TimeError(f"{self.path}: the ephemeris does not hold this date: give one that does")
+            place_km = place_km + segment.compute(erfa.DJ00, days)[:3]
+            target = segment.center
+        return place_km * (1000 / erfa.DAU)
+
+
+def body_at(name: str, state: EarthState, ephemeris: SolarSystem = ERFA) -> Body:
     """The body of one of the names in BODIES at the state's time."""
-    days, observer, delay = (state.year - 2000.0) * erfa.DJY, state.observer_au, 0.0
+    days, delay = (state.year - 2000.0) * erfa.DJY, 0.0
+    observer = ephemeris.earth_au(days)
     for _ in range(LIGHT_ROUNDS):
-        seen = _barycentric_au(name, days - delay) - observer
+        seen = ephemeris.body_au(name, days - delay) - observer
         distance_au = float(np.linalg.norm(seen))
         delay = distance_au * LIGHT_DAYS_PER_AU
     astrom = state.astrom
     apparent = erfa.ab(seen / distance_au, astrom["v"], astrom["em"], astrom["bm1"])
     distance_m = distance_au * erfa.DAU
+    from_sun_au = float(np.linalg.norm(seen + observer - ephemeris.body_au(SUN, days - delay)))
     if name == MOON:
-        radius, sigma_arcsec = float(np.arcsin(MOON_RADIUS_M / distance_m)), MOON_ARCSEC
-    elif name == SUN:
-        radius, sigma_arcsec = SUN_RADIUS_ARCSEC * ARCSEC / distance_au, SUN_ARCSEC
+        radius = float(np.arcsin(MOON_RADIUS_M / distance_m))
     else:
-        _, heliocentric_arcsec, radius_arcsec = PLANETS[name]
-        from_sun_au = float(np.linalg.norm(seen + observer - _barycentric_au(SUN, days - delay)))
-        radius = radius_arcsec * ARCSEC / distance_au
-        sigma_arcsec = heliocentric_arcsec * from_sun_au / distance_au
-    return Body(name, apparent @ state.gcrs_to_itrs.T, distance_m, radius, float(sigma_arcsec * ARCSEC))
-
-
-def _barycentric_au(name: str, days: float) -> np.ndarray:
-    """Barycentric place (3,), au, along the axes of ICRS; days: of TT after J2000."""
-    heliocentric, barycentric = erfa.epv00(erfa.DJ00, days)
-    if name == MOON:
-        return barycentric["p"] + erfa.moon98(erfa.DJ00, days)["p"]
-    sun = barycentric["p"] - heliocentric["p"]
-    return sun if name == SUN else sun + erfa.plan94(erfa.DJ00, days, PLANETS[name][0])["p"]
+        radius = (SUN_RADIUS_ARCSEC if name == SUN else PLANETS[name][2]) * ARCSEC / distance_au
+    sigma = ephemeris.error_arcsec(name, from_sun_au, distance_au) * ARCSEC
+    return Body(name, apparent @ state.gcrs_to_itrs.T, distance_m, radius, sigma)

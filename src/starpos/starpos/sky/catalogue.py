@@ -103,6 +103,18 @@ SMALLEST_MAS, SMALLEST_MAS_YEAR, CODE_STEP = 1.0, 0.1, 1.03
 CENTI, TENTH = 0.01, 0.1
 COMMITTED = Path(__file__).with_name("data") / "tycho2.npz"
 
+# The columns of one number a star that the compact file holds as they are, and their types.
+PLAIN: dict[str, type[np.integer]] = {
+    "pm_ra": np.int16,
+    "pm_dec": np.int16,
+    "vmag_centi": np.int16,
+    "sigma_code": np.uint8,
+    "pm_sigma_code": np.uint8,
+    "epoch_code": np.uint8,
+    "pm_ra_centi": np.int8,
+    "pm_dec_centi": np.int8,
+    "parallax_tenths": np.uint16,
+}
 Rows = np.ndarray | slice
 
 
@@ -164,19 +176,9 @@ class Catalogue:
     def check(self) -> None:
         """Raise ValueError for columns of different length or impossible places: the compiled loops trust both."""
         n = len(self)
-        columns = (
-            self.dec_mas,
-            self.pm_ra,
-            self.pm_dec,
-            self.vmag_centi,
-            self.sigma_code,
-            self.pm_sigma_code,
-            self.pm_ra_centi,
-            self.pm_dec_centi,
-            self.parallax_tenths,
-        )
+        columns = (self.dec_mas, self.hip, *(getattr(self, name) for name in PLAIN))
         if (
-            any(column.shape != (n,) for column in (self.ra_mas, *columns, self.epoch_code, self.hip))
+            any(column.shape != (n,) for column in columns)
             or self.tyc.shape != (n, 3)
             or self.zone_start.shape != (ZONES + 1,)
             or not rising(self.zone_start, n)
@@ -323,6 +325,18 @@ def pack(
     zone = np.clip(dec_mas // 3_600_000 + 90, 0, ZONES - 1)
     order = np.lexsort((ra_mas, zone))
 
+    plain = {
+        "pm_ra": whole[0],
+        "pm_dec": whole[1],
+        "pm_ra_centi": finer[0],
+        "pm_dec_centi": finer[1],
+        "parallax_tenths": np.broadcast_to(np.asarray(parallax_mas) / TENTH, order.shape),
+        "vmag_centi": np.asarray(vmag) * 100,
+        "sigma_code": _code(sigma_mas, SMALLEST_MAS),
+        "pm_sigma_code": _code(sigma_pm, SMALLEST_MAS_YEAR),
+        "epoch_code": np.asarray(epoch) - EPOCH_ZERO,
+    }
+
     def column(values: ArrayLike, dtype: type[np.integer]) -> np.ndarray:
         limits = np.iinfo(dtype)
         return np.clip(np.round(np.asarray(values)), limits.min, limits.max).astype(dtype)[order]
@@ -330,15 +344,7 @@ def pack(
     return Catalogue(
         ra_mas=ra_mas[order],
         dec_mas=dec_mas[order],
-        pm_ra=column(whole[0], np.int16),
-        pm_dec=column(whole[1], np.int16),
-        pm_ra_centi=column(finer[0], np.int8),
-        pm_dec_centi=column(finer[1], np.int8),
-        parallax_tenths=column(np.broadcast_to(np.asarray(parallax_mas) / TENTH, order.shape), np.uint16),
-        vmag_centi=column(np.asarray(vmag) * 100, np.int16),
-        sigma_code=column(_code(sigma_mas, SMALLEST_MAS), np.uint8),
-        pm_sigma_code=column(_code(sigma_pm, SMALLEST_MAS_YEAR), np.uint8),
-        epoch_code=column(np.asarray(epoch) - EPOCH_ZERO, np.uint8),
+        **{name: column(values, PLAIN[name]) for name, values in plain.items()},
         tyc=np.asarray(tyc, np.int16)[order],
         hip=np.asarray(hip, np.int32)[order],
         zone_start=np.searchsorted(zone[order], np.arange(ZONES + 1)),
@@ -365,31 +371,25 @@ def save(catalogue: Catalogue, path: Path | str) -> None:
             zone_count=np.diff(c.zone_start).astype(np.int32),
             ra_step=_split(step),
             dec_within=_split(within),
-            pm_ra=_split(c.pm_ra),
-            pm_dec=_split(c.pm_dec),
-            vmag_centi=_split(c.vmag_centi),
-            sigma_code=c.sigma_code,
-            pm_sigma_code=c.pm_sigma_code,
-            epoch_code=c.epoch_code,
             tyc1=_split(np.diff(c.tyc[:, 0], prepend=0).astype(np.int16)),
             tyc2=_split(c.tyc[:, 1]),
             tyc3=c.tyc[:, 2].astype(np.uint8),
             hip_step=_split(np.diff(named, prepend=0).astype(np.uint16)),
             hip=_split(c.hip[named]),
-            pm_ra_centi=c.pm_ra_centi,
-            pm_dec_centi=c.pm_dec_centi,
-            parallax_tenths=_split(c.parallax_tenths),
+            **{name: _split(getattr(c, name)) for name in PLAIN},
         )
 
 
 def _split(column: np.ndarray) -> np.ndarray:
-    """Byte planes (bytes, N) of a column (N,): the high bytes repeat, so they compress well."""
+    """Byte planes (bytes, N) of a column (N,), whose high bytes repeat, so that they compress well; bytes as they are."""
+    if column.itemsize == 1:
+        return column
     return np.ascontiguousarray(np.ascontiguousarray(column).view(np.uint8).reshape(len(column), -1).T)
 
 
 def _join(planes: np.ndarray, dtype: type[np.integer]) -> np.ndarray:
     """The column (N,) of byte planes; the inverse of `_split`."""
-    return np.ascontiguousarray(planes.T).view(dtype)[:, 0]
+    return np.ascontiguousarray(np.atleast_2d(planes).T).view(dtype)[:, 0]
 
 
 def _newer(tyc: np.ndarray) -> dict[str, np.ndarray]:
@@ -415,27 +415,14 @@ def read(path: Path | str) -> Catalogue:
             hip[np.cumsum(_join(f["hip_step"], np.uint16), dtype=np.int64)] = _join(f["hip"], np.int32)
             tyc1 = np.cumsum(_join(f["tyc1"], np.int16), dtype=np.int16)
             tyc = np.stack([tyc1, _join(f["tyc2"], np.int16), f["tyc3"].astype(np.int16)], -1)
+            plain = _newer(tyc) | {name: _join(f[name], dtype) for name, dtype in PLAIN.items() if name in f}
             found = Catalogue(
                 ra_mas=np.cumsum(_join(f["ra_step"], np.uint32), dtype=np.uint32),
                 dec_mas=_join(f["dec_within"], np.uint32).astype(np.int32) + (zone - 90) * 3_600_000,
-                pm_ra=_join(f["pm_ra"], np.int16),
-                pm_dec=_join(f["pm_dec"], np.int16),
-                vmag_centi=_join(f["vmag_centi"], np.int16),
-                sigma_code=f["sigma_code"],
-                pm_sigma_code=f["pm_sigma_code"],
-                epoch_code=f["epoch_code"],
                 tyc=tyc,
                 hip=hip,
                 zone_start=zone_start,
-                **(
-                    {
-                        "pm_ra_centi": f["pm_ra_centi"],
-                        "pm_dec_centi": f["pm_dec_centi"],
-                        "parallax_tenths": _join(f["parallax_tenths"], np.uint16),
-                    }
-                    if "parallax_tenths" in f
-                    else _newer(tyc)
-                ),
+                **plain,
             )
             found.check()
             return found

@@ -24,7 +24,7 @@ from starpos.errors import FixError
 from starpos.instrument.inclinometer import InclinometerErrors
 from starpos.instrument.instrument import Calibration, Instrument
 from starpos.units import ARCSEC
-from starpos.zenith.equations import Errors, LeanEstimate, Lines, errors_of, start_of
+from starpos.zenith.equations import ANOMALOUS, MOTION, LeanEstimate, Lines, errors_of, start_of
 from starpos.zenith.sighting import StarPlaces, ZenithSighting, faces_of, mean_headings
 
 
@@ -276,7 +276,7 @@ class _Solved:
 
     estimate: LeanEstimate
     lines: Lines
-    errors: Errors
+    errors: dict[str, np.ndarray]
     fit: _Fit
     air: Air
     offset: np.ndarray
@@ -296,7 +296,7 @@ class _Session:
     given: Calibration
     mark: Place
 
-    def errors(self, lines: Lines, inclinometer: InclinometerErrors) -> Errors:
+    def errors(self, lines: Lines, inclinometer: InclinometerErrors) -> dict[str, np.ndarray]:
         since = self.given.utc_unix_s
         return errors_of(lines, self.sightings, self.places, self.faces, inclinometer, self.mark, since)
 
@@ -341,10 +341,10 @@ class _Session:
         given, lines = stated.inclinometer, stated.lines
         leftover, units, base = _leftover(stated, self.mark), {}, _stated(stated.errors)
         for field, source, _ in SHOWN:
-            unit = _of_source(self.errors(lines, _larger(given, {field: 1.0})), source)
+            unit = self.errors(lines, _larger(given, {field: 1.0}))[source]
             if leftover.excess(unit) > SHOWN_SIGMA:
                 units[field] = unit
-                base = base - _of_source(stated.errors, source)
+                base = base - stated.errors[source]
         if not units:
             return None
 
@@ -388,14 +388,9 @@ def _larger(given: InclinometerErrors, factors: dict[str, float]) -> Inclinomete
     return replace(given, **{n: min(max(getattr(given, n), least[n]) * f, 1.0) for n, f in factors.items()})
 
 
-def _of_source(errors: Errors, source: str) -> np.ndarray:
-    """Covariance (2 N, 2 N) of a source of error."""
-    return next(s.covariance for s in errors.sources if s.name == source)
-
-
-def _stated(errors: Errors) -> np.ndarray:
+def _stated(errors: dict[str, np.ndarray]) -> np.ndarray:
     """Covariance (2 N, 2 N) of the readings without the air's."""
-    return np.sum([s.covariance for s in errors.sources], axis=0)
+    return np.sum([c for name, c in errors.items() if name not in (MOTION, ANOMALOUS)], axis=0)
 
 
 def _sigma(covariance: np.ndarray) -> np.ndarray:
@@ -412,12 +407,14 @@ def _prior_of(instrument: Instrument) -> np.ndarray:
     return weights
 
 
-def _whole(stated: np.ndarray, errors: Errors, air: Air) -> np.ndarray:
+def _whole(stated: np.ndarray, errors: dict[str, np.ndarray], air: Air) -> np.ndarray:
     """Covariance (2 N, 2 N) of the readings."""
-    return stated + air.motion**2 * errors.motion.covariance + air.anomalous**2 * errors.air.covariance
+    return stated + air.motion**2 * errors[MOTION] + air.anomalous**2 * errors[ANOMALOUS]
 
 
-def _air_of(lines: Lines, stated: np.ndarray, errors: Errors, prior: np.ndarray, offset: np.ndarray) -> Air:
+def _air_of(
+    lines: Lines, stated: np.ndarray, errors: dict[str, np.ndarray], prior: np.ndarray, offset: np.ndarray
+) -> Air:
     """Sizes of image motion and anomalous refraction, as the residuals make them likeliest."""
     # slow to import
     from scipy.optimize import minimize
@@ -477,13 +474,10 @@ def _leftover(solved: _Solved, mark: Place) -> Leftover:
 def _adjusted(session: _Session, solved: _Solved) -> DeflectionSession:
     sightings, faces, places, mark = session.sightings, session.faces, session.places, session.mark
     estimate, lines, errors, fit, air = solved.estimate, solved.lines, solved.errors, solved.fit, solved.air
-    scaled = (
-        (errors.motion.name, air.motion**2 * errors.motion.covariance),
-        (errors.air.name, air.anomalous**2 * errors.air.covariance),
-    )
-    sources = [(s.name, s.covariance) for s in errors.sources] + list(scaled)
+    size2 = {MOTION: air.motion**2, ANOMALOUS: air.anomalous**2}
+    sources = {name: size2.get(name, 1.0) * covariance for name, covariance in errors.items()}
     gain = fit.gain[:2] / ARCSEC
-    by_source = {name: gain @ covariance @ gain.T for name, covariance in sources}
+    by_source = {name: gain @ covariance @ gain.T for name, covariance in sources.items()}
     whole = fit.covariance[:2, :2] / ARCSEC**2
     values, axes = np.linalg.eigh(whole - np.sum(list(by_source.values()), 0))
     by_source = {name: term for name, term in by_source.items() if term.any()}
@@ -491,9 +485,7 @@ def _adjusted(session: _Session, solved: _Solved) -> DeflectionSession:
     by_source["A3 as given"] = (axes * np.maximum(values, 0.0)) @ axes.T
     left = (lines.off.reshape(-1) - lines.by_parameters.reshape(-1, 5) @ fit.step).reshape(-1, 2)
     back = np.linalg.inv(lines.by_lean)
-    own = np.array([c for name, c in sources if name in ("tilt readings", "centroids", "image motion")]).sum(
-        0
-    )
+    own = sources["tilt readings"] + sources["centroids"] + sources[MOTION]
     n = len(sightings)
     own = own.reshape(n, 2, n, 2)[np.arange(n), :, np.arange(n)]
     per_frame = np.einsum("nab,nbc,ndc->nad", back, own, back)

@@ -131,16 +131,8 @@ DAILY_UT1_S, DAILY_POLE_RAD = 3e-5, 3e-4 * ARCSEC
 AIR_TAU_S = 1200.0
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class Errors:
-    """All errors of the readings, X' and Y' (rad) of N frames: sources without the air, and the air's for 1 rad.
-
-    motion: image motion, new in each frame.  air: anomalous refraction, that changes within AIR_TAU_S.
-    """
-
-    sources: tuple[ErrorTerm, ...]
-    motion: ErrorTerm
-    air: ErrorTerm
+# errors of the air: new in each frame, and changing within AIR_TAU_S
+MOTION, ANOMALOUS = "image motion", "anomalous refraction"
 
 
 def errors_of(
@@ -151,20 +143,22 @@ def errors_of(
     inclinometer: InclinometerErrors,
     mark: Place,
     since_unix_s: float,
-) -> Errors:
-    """The errors of a session; since_unix_s: time at which the tiltmeter's zero was found with A3, NaN: unknown."""
+) -> dict[str, np.ndarray]:
+    """Covariances (2 N, 2 N) in rad2, by source, of the readings X', Y' of N frames; of the air, for errors of 1 rad.
+
+    since_unix_s: time at which the tiltmeter's zero was found with A3, NaN: unknown.
+    """
     t = np.array([s.utc_unix_s for s in sightings])
     own = np.eye(len(t))
     apart_s = np.abs(t[:, None] - t)
-    return Errors(
-        sources=(
-            *_of_tilts(sightings, faces, inclinometer, since_unix_s),
-            *_of_stars(lines, sightings, places),
-            *_of_time(lines, sightings, mark),
-        ),
-        motion=ErrorTerm.of_frames("image motion", lines.by_lean, own),
-        air=ErrorTerm.of_frames("anomalous refraction", lines.by_lean, np.exp(-apart_s / AIR_TAU_S)),
+    terms = (
+        *_of_tilts(sightings, faces, inclinometer, since_unix_s),
+        *_of_stars(lines, sightings, places),
+        *_of_time(lines, sightings, mark),
+        ErrorTerm.of_frames(MOTION, lines.by_lean, own),
+        ErrorTerm.of_frames(ANOMALOUS, lines.by_lean, np.exp(-apart_s / AIR_TAU_S)),
     )
+    return {t.name: t.covariance for t in terms}
 
 
 def _of_tilts(

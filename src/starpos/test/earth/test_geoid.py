@@ -10,7 +10,7 @@ import pytest
 
 from starpos.earth import geoid
 from starpos.earth.ellipsoid import curvature_radii_m
-from starpos.earth.geoid import find, read_grid
+from starpos.earth.geoid import find
 from starpos.earth.vertical import UNKNOWN_STDDEV_ARCSEC, Deflection, geodetic
 from starpos.errors import GeoidError
 from starpos.units import ARCSEC
@@ -267,7 +267,7 @@ def test_a_grid_of_ngs_says_what_the_gtx_says_in_either_byte_order(tmp_path, ord
     plain = gtx(tmp_path / "a.gtx", heights, south, west, 0.1)
     header = struct.pack(order + "4d3i", south, west, 0.1, 0.1, *heights.shape, 1)
     (tmp_path / "a.bin").write_bytes(header + heights.astype(order + "f4").tobytes())
-    told, expected = read_grid(tmp_path / "a.bin"), read_grid(plain)
+    told, expected = geoid.read(tmp_path / "a.bin"), geoid.read(plain)
     assert np.array_equal(told.values, expected.values)
     assert (told.south, told.west, told.step_longitude) == (south, west, 0.1)
 
@@ -442,4 +442,4 @@ def test_it_answers_everywhere(egm96):
 @pytest.mark.parametrize("name", ["x" * 100_000, "a\0b", "a/" + "x" * 300])
 def test_a_name_that_no_file_can_have_is_refused_as_one_that_is_not_there(name):
     with pytest.raises(GeoidError):
-        read_grid(name)
+        geoid.read(name)

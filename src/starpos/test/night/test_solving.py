@@ -161,7 +161,7 @@ def test_turning_finds_a3_and_says_what_it_rests_on(turning):
 def test_a_frame_that_no_way_identified_is_not_searched_again_while_turning(turning, points, monkeypatch):
     how = How(180.0)
     sights = [*turning.sights(how), *turning.sights(how, [points])]
-    monkeypatch.setattr("starpos.fix.solver.identify_frame", None)
+    monkeypatch.setattr("starpos.fix.solver.identify", None)
     answers = list(answers_of(sights, turning.work, Deflection(), how).each)
     assert [a.solution.ok for a in answers] == [True] * len(HEADINGS_DEG) + [False]
     assert (
@@ -174,7 +174,7 @@ def test_beside_gnss_nothing_that_is_identified_or_lost_is_searched_again(still,
     place = Place.on_ellipsoid(site.latitude_deg, site.longitude_deg, Deflection(0.0, 0.0, 0.0))
     how = How(receiver=Receiver(_Standing(place)))
     sights = [*still.sights(how), *still.sights(how, [points])]
-    monkeypatch.setattr("starpos.fix.solver.identify_frame", None)
+    monkeypatch.setattr("starpos.fix.solver.identify", None)
     answers = answers_of(sights, still.work, Deflection(), how)
     rows = list(answers.each)
     assert answers.watched.answers[0] is rows[0].watched and rows[-1].solution.lost

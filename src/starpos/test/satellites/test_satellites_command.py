@@ -2,6 +2,9 @@
 """The command: a place that joins, what a night shows, and calls that are refused."""
 
 import json
+from functools import lru_cache
+from importlib.util import find_spec
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,6 +14,9 @@ from astropy.coordinates import AltAz, EarthLocation, get_sun
 from astropy.time import Time
 
 from starpos.cli import main
+from starpos.simulation.scene import expose, render, scene_of, write_fits
+from starpos.sky.catalogue import load_catalogue
+from starpos.units import unix_of
 
 PLACE = 47.0, 8.0, 900.0
 
@@ -30,7 +36,19 @@ def told(capsys, *words):
     """Exit status, JSON objects, and complaints of a call."""
     status = main([*map(str, words), "--json"])
     out, err = capsys.readouterr()
-    return status, [json.loads(line) for line in out.splitlines()], err
+    answers = [json.loads(line) for line in out.splitlines()]
+    for answer in answers if find_spec("fastjsonschema") else ():
+        promised()(answer)
+    return status, answers, err
+
+
+@lru_cache(maxsize=1)
+def promised():
+    """A validator that refuses any object outside the schema."""
+    import fastjsonschema
+
+    schema = Path(__file__).resolve().parents[4] / "docs" / "reference" / "starpos.schema.json"
+    return fastjsonschema.compile(json.loads(schema.read_text()))
 
 
 def call(folder, name, *more):
@@ -65,6 +83,20 @@ def test_a_place_by_the_level_joins_by_its_covariance(night, tmp_path, capsys):
     assert status == 0 and answers[-1]["satellites"] == 2
     status, answers, _ = told(capsys, *call(folder, "two.csv", "--join", tmp_path / "gnss.csv"))
     assert answers[-1]["latitude_geodetic"] == pytest.approx(47.0, abs=2e-4)
+
+
+def test_a_frame_has_its_heading_at_that_place(night, tmp_path, capsys):
+    folder, _, _ = night
+    scene = scene_of((640, 480), 7812.5, *PLACE[:2], pointing_deg=(130.0, 60.0, 20.0))
+    rng, begin = np.random.default_rng(3), "2020-09-13T19:00:00"
+    light = expose(scene, load_catalogue(), unix_of(begin), 0.5, rng)
+    write_fits(tmp_path / "a.fits", render(scene, light, unix_of(begin), 0.5, rng), begin)
+    command, *words = call(folder, "all.csv", "--focal-mm", 50, "--pixel-um", 6.4)
+    status, (*trails, place), _ = told(capsys, command, tmp_path / "a.fits", *words)
+    assert status == 0 and len(trails) == 8
+    (frame,) = place["frames"]
+    off = (frame["heading"] - np.degrees(scene.heading) + 180) % 360 - 180
+    assert abs(off) < 4 * frame["sigma_heading_deg"] < 0.02
 
 
 @pytest.mark.parametrize(

@@ -24,8 +24,8 @@ KINDS = {
 
 @pytest.fixture(scope="module")
 def outcomes(catalogue):
-    """Twelve nights of each kind."""
-    seeds = np.random.SeedSequence(4).spawn(12)
+    """Eight nights of each kind."""
+    seeds = np.random.SeedSequence(4).spawn(8)
     return {
         kind: [night(np.random.default_rng(s), catalogue) for s in seeds] for kind, night in KINDS.items()
     }
@@ -34,16 +34,16 @@ def outcomes(catalogue):
 @pytest.mark.montecarlo
 @pytest.mark.parametrize("kind", KINDS)
 def test_claims_are_true(kind, outcomes):
-    """The normalised errors squared of 12 nights scatter by 0.6 about their 2: 4.3 is four sigma up.
+    """The normalised errors squared of 8 nights scatter by 0.7 about their 2: 4.8 is four sigma up.
 
-    These twelve come to 2.2 calibrated and 1.7 turned; without the drift of the days it is 58. Without the noise of the
-    tilts no night is solved at all, and errors claimed twice as large as they are would leave 0.5.
+    These eight come to 2.5 calibrated and 1.7 turned; of twelve without the drift of the days it was 58. Without the
+    noise of the tilts no night is solved at all, and errors claimed twice as large as they are would leave 0.5.
     """
-    assert [o.trouble for o in outcomes[kind]] == [""] * 12
+    assert [o.trouble for o in outcomes[kind]] == [""] * 8
     assert {o.kind for o in outcomes[kind]} == {kind}
     for name in ("position_nees", "ground_nees"):
-        assert 0.6 < np.mean([getattr(o, name) for o in outcomes[kind]]) < 4.3
-    assert 0.2 < np.mean([o.heading_nees for o in outcomes[kind]]) < 1 + 4 * np.sqrt(2 / 12)
+        assert 0.6 < np.mean([getattr(o, name) for o in outcomes[kind]]) < 4.8
+    assert 0.2 < np.mean([o.heading_nees for o in outcomes[kind]]) < 1 + 4 * np.sqrt(2 / 8)
 
 
 @pytest.mark.montecarlo

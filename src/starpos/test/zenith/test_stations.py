@@ -6,7 +6,7 @@ import json
 import numpy as np
 import pytest
 
-from starpos.earth.geoid import Geoid, Grid
+from starpos.earth.geoid import Geoid
 from starpos.errors import StationError
 from starpos.units import ARCSEC
 from starpos.zenith.stations import against_grid, read_session, stations_of
@@ -34,7 +34,7 @@ def slopes(phi, lam):
 @pytest.fixture
 def grid():
     phi, lam = np.meshgrid(np.arange(46, 48, 0.05), np.arange(7, 9, 0.05), indexing="ij")
-    return Geoid(Grid(height(phi, lam).astype(np.float32), 46.0, 7.0, 0.05, 0.05))
+    return Geoid(height(phi, lam).astype(np.float32), 46.0, 7.0, 0.05, 0.05)
 
 
 def station(tmp_path, name, phi, lam, off=(0.0, 0.0)):

@@ -1,0 +1,157 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A day and the night after it at a known place, by one camera: the Sun until it sets, then the stars; no restart."""
+
+import math
+
+import numpy as np
+import pytest
+from rclpy.serialization import serialize_message
+
+from starpos.earth.orientation import earth_state
+from starpos.fix.solution import Status
+from starpos.frames.frame import Frame
+from starpos.session.frames import Answered
+from starpos.session.replay import Replay
+from starpos.session.settings import Settings
+from starpos.simulation.scene import Scene, scene_of
+from starpos.sky.bodies import SUN, body_at
+from starpos_bringup.bag import BagWriter
+from starpos_common.messages import frame_to_message
+from starpos_interfaces.msg import Capture, Solution
+from starpos_testing.graph.shots import (
+    FRAME,
+    LATITUDE_DEG,
+    LONGITUDE_DEG,
+    NOISE_DEG,
+    SMALL,
+    SimulatedShot,
+    focal_of,
+    photograph_of,
+    scene_at,
+)
+from starpos_testing.headings import yaw_deg
+from starpos_testing.skies.bags import typestore
+from starpos_testing.skies.suns import disc_frame
+
+# 2024-11-03, UTC: the Sun sinks from 37 deg to 4, stands 5 deg below the horizon, and is 10 and 20 deg below it
+DAY = 1730664000.0 + 3600 * np.array([0.0, 1.0, 2.0, 2.4])
+DUSK = 1730664000.0 + 3600 * np.array([3.05])
+NIGHT = 1730664000.0 + 3600 * np.array([3.5, 4.0])
+LEAN_DEG, MOUNTED_ARCSEC = -30.0, 20.0
+SOLVER = (
+    "refraction.pressure:=95000.0",
+    "refraction.temperature:=8.0",
+    "refraction.humidity:=0.5",
+    f"misalignment:=[{LEAN_DEG}, 0.0, 0.0]",
+    f"misalignment_stddev:={MOUNTED_ARCSEC / 3600}",
+    "inclinometer.model:=sca100t_calibrated",
+    f"site.latitude:={LATITUDE_DEG}",
+    f"site.longitude:={LONGITUDE_DEG}",
+)
+
+
+def scene_towards(azimuth_deg: float, altitude_deg: float) -> Scene:
+    return scene_of(
+        SMALL,
+        focal_of(SMALL),
+        LATITUDE_DEG,
+        LONGITUDE_DEG,
+        scene_at().site.atmosphere,
+        pointing_deg=(azimuth_deg, altitude_deg, 15.0),
+        misalignment_deg=(LEAN_DEG, 0.0, 0.0),
+        tilt_noise_deg=NOISE_DEG,
+    )
+
+
+def photographs() -> list[tuple[SimulatedShot, object, Capture]]:
+    """Each exposure's messages, in order of time."""
+    made = []
+    place = scene_at().site.place
+    for k, start in enumerate((*DAY, *DUSK, *NIGHT)):
+        rng = np.random.default_rng(k)
+        true = place.axes @ body_at(SUN, earth_state(start + 0.25)).from_place(place.zenith)
+        sun = scene_at().site.atmosphere.refraction().bend(true)
+        azimuth, altitude = np.degrees([np.arctan2(sun[0], sun[1]), np.arcsin(sun[2])])
+        scene = scene_towards(azimuth + 0.4, altitude - 0.3) if start in DAY else scene_towards(70.0, 40.0)
+        shot, image, capture = photograph_of(scene, start, rng)
+        if start not in NIGHT:
+            x, y = scene.camera.project(sun @ scene.attitude) if start in DAY else (-5000.0, 0.0)
+            radius = scene.camera.fx * body_at(SUN, earth_state(start)).radius
+            frame = Frame(
+                disc_frame(x, y, radius, SMALL[::-1], seed=k), mid_unix_s=start + 0.25, exposure_s=0.5
+            )
+            image = frame_to_message(frame, FRAME)
+        made.append((shot, image, capture))
+    return made
+
+
+@pytest.fixture(scope="module")
+def frames():
+    return photographs()
+
+
+def is_right(shot: SimulatedShot, heading_deg: float, sigma_deg: float) -> bool:
+    return abs(shot.heading_error_deg(heading_deg)) < 4 * sigma_deg
+
+
+def test_nodes_give_headings_by_day_and_by_night(graph, run, tmp_path, frames):
+    run("starpos_solver", "solver", *SOLVER)
+    graph.wait_for_solver()
+    run("starpos_camera", "detector")
+    graph.wait_for_detector(lambda: frames[0])
+    said = []
+    for shot, image, capture in frames:
+        graph.send(shot, image, capture)
+        answer, _, imu = graph.result(shot.stamp)
+        if shot.stamp == frames[0][0].stamp:
+            state = graph.state("solver: Solution", "by the Sun")
+            assert ("source", "sun") in [(v.key, v.value) for v in state.values]
+        said.append("the Sun" if "by the Sun" in answer.status_text else answer.stars_matched)
+        if shot.stamp == frames[len(DAY)][0].stamp:
+            assert answer.status != Solution.OK
+            assert math.isnan(answer.heading)
+            assert imu is None
+            continue
+        assert answer.status == Solution.OK
+        assert is_right(shot, answer.heading, answer.heading_stddev)
+        assert abs((yaw_deg(imu) - (90 - answer.heading) + 180) % 360 - 180) < 0.02
+        assert answer.heading_stddev < 0.05
+    assert said[: len(DAY)] == ["the Sun"] * len(DAY)
+    assert min(said[len(DAY) + 1 :]) >= 4
+
+
+class Quiet:
+    """A log and driver that take anything from a session."""
+
+    def __getattr__(self, name):
+        return lambda *_: None
+
+
+def test_a_bag_of_a_day_and_a_night_is_replayed_without_a_gap(tmp_path, frames):
+    store, bag = typestore(), BagWriter(tmp_path / "bag")
+    for shot, image, capture in frames:
+        end_s = shot.stamp[0] + 1.0
+        rows = [("/camera/camera_info", shot.info), *(("/tilt", t) for t in shot.tilts)]
+        for k, (topic, message) in enumerate(
+            (*rows, ("/camera/capture", capture), ("/camera/image_raw", image))
+        ):
+            kind = "/".join((type(message).__module__.split(".")[0], "msg", type(message).__name__))
+            bag.add_topic(topic, kind)
+            data = store.serialize_cdr(store.deserialize_cdr(serialize_message(message), kind), kind)
+            bag.write(topic, round((end_s + 0.01 * k) * 1e9), bytes(data))
+    bag.close()
+    answers = [
+        made.solution
+        for made in Replay(Settings.of(None, SOLVER), Quiet(), Quiet()).play(tmp_path / "bag")
+        if isinstance(made, Answered)
+    ]
+    assert [s.bodies for s in answers] == [("sun",)] * len(DAY) + [()] * (len(DUSK) + len(NIGHT))
+    for (shot, *_), answer in zip(frames, answers, strict=True):
+        if answer.status is Status.OK:
+            north = answer.at_place.true_north
+            heading_deg, sigma = (
+                math.degrees(north.heading),
+                math.degrees(north.angles_covariance[0, 0] ** 0.5),
+            )
+            assert is_right(shot, heading_deg, sigma)
+    assert [s.ok for s in answers] == [True] * len(DAY) + [False] + [True] * len(NIGHT)
