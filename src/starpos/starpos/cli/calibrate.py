@@ -274,6 +274,9 @@ def run(args: argparse.Namespace) -> int:
             run_site(args, [s for s, _ in frames], instrument, tilts, _known(frames))
     except (CalibrationError, FixError, PlaceError) as e:
         console.complain("calibrate", e)
+        if not _known(frames):
+            for remark in Solving(replace(given, instrument=instrument)).fitting(frames[0][0]):
+                console.complain("calibrate", remark)
         return console.UNREADABLE if unreadable else NOTHING
     return console.UNREADABLE if unreadable else 0
 

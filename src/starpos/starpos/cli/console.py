@@ -57,7 +57,7 @@ class FrameComplaints:
         alike = self._frames.setdefault(reason, [])
         alike.append(name)
         if len(alike) == 1:
-            complain(self._command, error)
+            complain(self._command, error if name in str(error) else f"{name}: {error}")
 
     def end(self) -> None:
         """Say how many more frames each sentence is true of."""

@@ -141,7 +141,7 @@ class _Topics:
         return topic
 
 
-STARS, TRAILS = (f"{PACKAGE}/msg/{name}" for name in ("StarArray", "TrailArray"))
+STARS, TRAILS, SOLUTION = (f"{PACKAGE}/msg/{name}" for name in ("StarArray", "TrailArray", "Solution"))
 # types by the relative names of the solver's inputs
 NAV_SAT_FIX = "sensor_msgs/msg/NavSatFix"
 INPUTS = {"stars": STARS, "tilt": TILT, "camera/camera_info": CAMERA_INFO}
