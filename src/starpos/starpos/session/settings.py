@@ -167,7 +167,7 @@ class NodeSettings:
     disappears later does not matter until the parameter is set again.
     """
 
-    # what reads the file of a parameter that names one
+    # a reader of files for a parameter that names one
     readers: ClassVar[Mapping[str, Callable[[str], Any]]] = {
         "calibration_url": known_instrument,
         "deflection.geoid": geoid.read,
