@@ -10,13 +10,18 @@ import math
 import time
 from collections import deque
 from collections.abc import Callable
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from sensor_msgs.msg import Imu, NavSatFix, NavSatStatus
 
+from starpos.earth.orientation import earth_state
+from starpos.earth.place import Place
+from starpos.errors import StarposError
 from starpos.messages.stamp import stamp_to_unix
+from starpos.sky.bodies import SUN, body_at
 from starpos_interfaces.msg import GnssCheck, Solution, Tilt
 
 # Maximum length of a text from outside.
@@ -174,6 +179,26 @@ def silence(node: str) -> dict:
     return {"name": name, "level": STALE, "sentence": "nothing heard yet"}
 
 
+# Seconds before and after now for which the Sun's way is shown, and its interval.
+SUN_WAY_S, SUN_STEP_S = 12 * 3600, 1200
+
+
+@lru_cache(maxsize=1)
+def sun_way(latitude_deg: float, longitude_deg: float, unix_s: float) -> list[list[float]] | None:
+    """Azimuth and altitude [deg] of the Sun from half a day before a time to half a day after; None without tables."""
+    place = Place.on_ellipsoid(latitude_deg, longitude_deg)
+    way = []
+    try:
+        for at_s in np.arange(unix_s - SUN_WAY_S, unix_s + SUN_WAY_S + 1, SUN_STEP_S).tolist():
+            east, north, up = place.plumb_axes @ body_at(SUN, earth_state(at_s)).from_place(
+                place.plumb_axes[2]
+            )
+            way.append([math.degrees(math.atan2(east, north)) % 360, math.degrees(math.asin(up))])
+    except StarposError:
+        return None
+    return way
+
+
 # Age at which messages of 1 Hz or faster are old.
 FAST_S = 5.0
 # Diagnostics kept.
@@ -261,6 +286,16 @@ class Board:
     def _seen(self, nodes: frozenset[str]) -> frozenset[str]:
         return frozenset(seen_from(self._namespace, n) if n[0] == "/" else n for n in nodes)
 
+    def _sun(self, now_s: float) -> list[list[float]] | None:
+        """The Sun's way at the newest place, of the stars or of GNSS; None without one."""
+        for name in ("last_fix", "gnss"):
+            told = self._heard.get(name, (0.0, {}))[1]
+            if told.get("latitude") is not None:
+                # to a tenth of a degree, so that it is worked out seldom
+                place = (round(told["latitude"], 1), round(told["longitude"], 1))
+                return sun_way(*place, now_s // SUN_STEP_S * SUN_STEP_S)
+        return None
+
     def as_json(self, now_s: float, slow_s: float) -> str:
         """Write everything as one line of JSON; each `age` [s] counts since it came, on the monotonic clock.
 
@@ -274,6 +309,7 @@ class Board:
         lights = [{**light, "age": now - since} for since, light in self._lights.values()]
         silent = self._nodes - {_node_of(name) for name in self._lights}
         lights += [{**silence(node), "age": now - self._since} for node in silent]
+        told["sun"] = self._sun(now_s)
         told["lights"] = sorted(lights, key=lambda light: light["name"])
         told["now"] = now_s
         told["old_after"] = {"slow": slow_s, "fast": min(FAST_S, slow_s)}

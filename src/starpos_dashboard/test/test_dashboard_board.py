@@ -222,3 +222,23 @@ def test_a_broken_frame_is_one_sentence(field, value):
     with pytest.raises(FrameError) as error:
         jpeg(message, 800)
     assert "\n" not in str(error.value) and len(str(error.value)) < 200
+
+
+def test_the_suns_way_is_that_of_the_place_and_the_day():
+    b = Board(10, ALL)
+    # 2025-06-01T09:00:00
+    when = 1748768400.0
+    assert told(b, when)["sun"] is None
+    b.hear_fix(said.fix(48.0, 11.0, (4.0, 0.0, 4.0)))
+    way = told(b, when)["sun"]
+    assert len(way) == 73
+    # astropy's AltAz of the Sun there, without refraction
+    assert way[36] == pytest.approx([122.26, 52.83], abs=0.1)
+    assert min(altitude for _, altitude in way) < -15
+    assert told(b, 9e9)["sun"] is None
+
+
+def test_at_a_gnss_place_the_sun_is_shown_too():
+    b = Board(10, ALL)
+    b.show("gnss", board.gnss(said.gnss()))
+    assert len(told(b, 1748768400.0)["sun"]) == 73

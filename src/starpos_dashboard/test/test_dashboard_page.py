@@ -299,3 +299,12 @@ def test_a_page_one_too_many_says_so(page, listener):
         page.driver.close()
         page.driver.switch_to.window(first)
         assert listener.set("dashboard", clients=8).successful
+
+
+def test_the_sun_is_on_the_compass_where_it_stands_and_will_be(page):
+    def drawn():
+        return page.run(
+            "return ['.sun-way.past', '.sun-way.coming'].map((q) => document.querySelector(q).getAttribute('d').length)"
+        )
+
+    page.until(lambda: min(drawn()) > 20 or max(drawn()) > 200)

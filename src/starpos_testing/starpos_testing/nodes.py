@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from functools import cache
 from pathlib import Path
@@ -14,9 +15,14 @@ import rclpy
 from ament_index_python.packages import PackageNotFoundError, get_package_share_directory
 from diagnostic_msgs.msg import DiagnosticArray
 from rcl_interfaces.srv import SetParametersAtomically
+from rclpy._rclpy_pybind11 import RCLError
+from rclpy.exceptions import ParameterException
 from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
 from rclpy.parameter import Parameter
+from rclpy.signals import SignalHandlerOptions
 
+from starpos.errors import StarposError
 from starpos_testing.domain import own_domain
 from starpos_testing.patience import WAIT_S
 
@@ -31,6 +37,19 @@ def take_domain() -> None:
     with suppress(PackageNotFoundError):
         profile = Path(get_package_share_directory("starpos_bringup"), "config", "quick_start.xml")
         os.environ["FASTRTPS_DEFAULT_PROFILES_FILE"] = str(profile)
+
+
+def refusal(make: Callable[[], Node], *parameters: str) -> str:
+    """The sentence with which a node refuses parameters NAME:=VALUE; in this process, as another one takes a second."""
+    given = [word for p in parameters for word in ("-p", p)]
+    rclpy.init(args=["--ros-args", *given], signal_handler_options=SignalHandlerOptions.NO)
+    try:
+        make().destroy_node()
+    except (StarposError, ParameterException, RCLError) as error:
+        return str(error)
+    finally:
+        rclpy.try_shutdown()
+    raise AssertionError(f"taken: {parameters}")
 
 
 class Listener:

@@ -3,14 +3,18 @@
 
 import argparse
 import itertools
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from starpos import rotation
 from starpos.cli import console, inputs, options, overwriting
+from starpos.cli.commands import rows_of
 from starpos.cli.console import Output
 from starpos.cli.overwriting import Written
+from starpos.earth.orientation import earth_state
 from starpos.errors import FrameError, InstrumentError
 from starpos.fix.attitude import Attitude
 from starpos.fix.directions import horizontal, towards
@@ -18,10 +22,10 @@ from starpos.fix.heading import AttitudeAtPlace
 from starpos.fix.searching import Sight
 from starpos.frames.frame import Frame, Stars
 from starpos.instrument.camera import Camera
+from starpos.night import horizon
 from starpos.tables import TableForm
 from starpos.units import utc_text
 
-NOTHING = 1
 COLUMNS = ("file", "utc", "x", "y", "azimuth", "altitude", "altitude_airless", "sigma_across_arcsec",
            "sigma_altitude_arcsec")  # fmt: skip
 HEAD = (
@@ -38,13 +42,14 @@ def run(args: argparse.Namespace) -> int:
             raise InstrumentError(f"{name}: {len(values)} numbers are no pairs: give two for each point")
     if args.overlay is not None:
         overwriting.check(args, Written("--overlay", args.overlay, overwriting.picture))
+    ground = None if args.horizon is None else horizon.read(args.horizon)
     args.frames, pixels = [args.frame], np.reshape(args.pixels, (-1, 2))
     if args.points is not None:
         table = POINTS.read(args.points)
         pixels = np.vstack([pixels, np.stack([table.columns["x"], table.columns["y"]], -1)])
     answers = list(inputs.seen_at_place("altaz", args))
     if not answers:
-        return NOTHING
+        return console.NOTHING
     seen = _Seen(*answers[0])
     back = np.radians(np.reshape(args.back, (-1, 2)))
     backs = seen.pixels(back)
@@ -54,7 +59,7 @@ def run(args: argparse.Namespace) -> int:
     points = np.vstack([pixels, backs[np.isfinite(backs).all(1)]])
     _put(args, seen, points)
     if args.overlay is not None:
-        _draw(args.overlay, seen, points)
+        _draw(args.overlay, seen, points, ground)
     return 0
 
 
@@ -124,10 +129,39 @@ def _put(args: argparse.Namespace, seen: _Seen, points: np.ndarray) -> None:
 # the grid: circles of altitude, azimuths, and the step along each, deg
 ALTITUDES, AZIMUTHS, ALONG = (0, 15, 30, 45, 60, 75), range(0, 360, 30), 0.5
 NAMES = {0: "N", 90: "E", 180: "S", 270: "W"}
+# blue, green, red
+GRID, FIGURES = (120, 120, 40), (150, 90, 150)
 
 
-def _draw(path: str, seen: _Seen, points: np.ndarray) -> None:
-    """Draw the frame with stars, the grid and the points."""
+def _figures(seen: _Seen) -> Iterator[np.ndarray]:
+    """Azimuths and altitudes (N, 2) in deg along the lines of the constellations, above the horizon."""
+    at = seen.at_place
+    state, to_local = earth_state(at.utc_unix_s), at.place.plumb_axes
+    for lines in rows_of("figures.yaml").values():
+        for each in lines:
+            stars = rotation.unit_vector(*np.radians(np.reshape(each, (-1, 2))).T)
+            v = state.to_itrs(stars) @ to_local.T
+            # a line is straight in the sky, and bent by the lens
+            share = np.linspace(0, 1, 12)[:, None]
+            for begin, end in itertools.pairwise(v):
+                between = rotation.normalised(begin * (1 - share) + end * share)
+                azimuth, altitude = np.arctan2(between[:, 0], between[:, 1]), np.arcsin(between[:, 2])
+                if altitude.min() > 0:
+                    yield np.degrees(np.stack([azimuth, altitude], -1))
+
+
+def _shade(picture: np.ndarray, seen: _Seen, n: int, ground: np.ndarray) -> None:
+    """Darken the part of a picture (h, w, 3) below a horizon (N, 2) in deg."""
+    y, x = np.mgrid[: picture.shape[0], : picture.shape[1]]
+    xy = (np.stack([x.ravel(), y.ravel()], -1) + 0.5) * n - 0.5
+    v = seen.camera.directions(*xy.T) @ seen.optics.rotation.T
+    edge = np.interp(np.degrees(np.arctan2(v[:, 0], v[:, 1])), ground[:, 0], ground[:, 1], period=360)
+    below = (np.degrees(np.arcsin(np.clip(v[:, 2], -1, 1))) < edge).reshape(picture.shape[:2])
+    picture[below] = picture[below] // 3
+
+
+def _draw(path: str, seen: _Seen, points: np.ndarray, ground: np.ndarray | None) -> None:
+    """Draw the frame with stars, the grid, constellations and the points, the ground (N, 2) in deg darkened."""
     import cv2
 
     from starpos.frames.annotate import Identified, annotate, shrink
@@ -142,19 +176,22 @@ def _draw(path: str, seen: _Seen, points: np.ndarray) -> None:
     picture = annotate(frame, stars, named)
     n = shrink(frame)
 
-    def line(azimuth: np.ndarray, altitude: np.ndarray) -> np.ndarray:
-        return (seen.pixels(np.radians(np.stack(np.broadcast_arrays(azimuth, altitude), -1))) + 0.5) / n - 0.5
+    def line(directions: np.ndarray) -> np.ndarray:
+        """Points (N, 2) of the picture where azimuths and altitudes (N, 2) in deg are."""
+        return (seen.pixels(np.radians(directions)) + 0.5) / n - 0.5
 
-    grid = [line(np.arange(0, 360 + ALONG, ALONG), np.array([float(a)])) for a in ALTITUDES]
-    grid += [line(np.array([float(a)]), np.arange(0, 90, ALONG)) for a in AZIMUTHS]
-    for xy in grid:
-        for begin, end in itertools.pairwise(xy):
+    if ground is not None:
+        _shade(picture[: seen.camera.height // n], seen, n, ground)
+    round_, up = np.arange(0, 360 + ALONG, ALONG), np.arange(0, 90, ALONG)
+    grid = [(np.stack([round_, np.full_like(round_, a)], -1), GRID) for a in ALTITUDES]
+    grid += [(np.stack([np.full_like(up, a), up], -1), GRID) for a in AZIMUTHS]
+    grid += [(each, FIGURES) for each in _figures(seen)]
+    for directions, colour in grid:
+        for begin, end in itertools.pairwise(line(directions)):
             if np.isfinite([begin, end]).all():
-                cv2.line(
-                    picture, tuple(map(round, begin)), tuple(map(round, end)), (120, 120, 40), 1, cv2.LINE_AA
-                )
+                cv2.line(picture, tuple(map(round, begin)), tuple(map(round, end)), colour, 1, cv2.LINE_AA)
     for azimuth in AZIMUTHS:
-        (xy,) = line(np.array([azimuth]), np.array([5.0]))
+        (xy,) = line(np.array([[azimuth, 5.0]]))
         if np.isfinite(xy).all():
             text = NAMES.get(azimuth, str(azimuth))
             cv2.putText(picture, text, tuple(map(round, xy)), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (0, 220, 255), 1)

@@ -15,7 +15,7 @@ from starpos import rotation
 from starpos.calibration.camera import FromSky, Intrinsics, calibrate_camera, rms, seen_by
 from starpos.calibration.camera_adjustment import UNLEVELLED, UNTIMED, parameters
 from starpos.calibration.misalignment import NOTHING_KNOWN, Calibrated, Known, calibrate_at, calibrate_fixed
-from starpos.cli import console, inputs, options, overwriting, watch_output
+from starpos.cli import console, inputs, options, overwriting, places_file, watch_output
 from starpos.cli.inputs import checked_tilts, frames_among, given_or_sought, reader_of, stated_site
 from starpos.cli.options import vertical_of
 from starpos.cli.overwriting import CAMERA_NAME, Written, save_instrument
@@ -39,6 +39,7 @@ from starpos.instrument.instrument import (
     Instrument,
 )
 from starpos.instrument.tilt_log import TiltLog
+from starpos.night import horizon
 from starpos.night.opening import frames_in
 from starpos.night.reading import NO_CAMERA, First, Instruments, Reader
 from starpos.night.remarks import WORTH_SAVING_ARCSEC, of_inclinometer, of_left_out
@@ -273,6 +274,9 @@ def run(args: argparse.Namespace) -> int:
             run_site(args, [s for s, _ in frames], instrument, tilts, _known(frames))
     except (CalibrationError, FixError, PlaceError) as e:
         console.complain("calibrate", e)
+        if not _known(frames):
+            for remark in Solving(replace(given, instrument=instrument)).fitting(frames[0][0]):
+                console.complain("calibrate", remark)
         return console.UNREADABLE if unreadable else NOTHING
     return console.UNREADABLE if unreadable else 0
 
@@ -283,16 +287,16 @@ def _watch(args: argparse.Namespace) -> int:
         raise FrameError("--watch names the folder of the nights: leave out the frames")
     args.frames = _frames_below(Path(args.watch))
     if args.page is not None:
-        overwriting.check(args, Written("--page", args.page, watch_output.check_page))
+        overwriting.check(args, Written("--page", args.page, places_file.check_ours))
+    if args.horizon is not None:
+        overwriting.check(args, Written("--horizon", args.horizon, overwriting.never))
     site = _site(args)
-    answers = [
-        Answer(
-            solution=sight.solution,
-            focal_px=camera.fx,
-            sky_mag=sky_mag(item, sight.stars, sight.solution, camera) if isinstance(item, Frame) else np.nan,
-        )
-        for item, sight, camera in inputs.seen_at("calibrate", args, site)
-    ]
+    answers, stars = [], []
+    for item, sight, camera in inputs.seen_at("calibrate", args, site):
+        sky = sky_mag(item, sight.stars, sight.solution, camera) if isinstance(item, Frame) else np.nan
+        answers.append(Answer(solution=sight.solution, focal_px=camera.fx, sky_mag=sky))
+        if args.horizon is not None:
+            stars.append(horizon.expected(sight, camera, catalogue.load_catalogue()))
     nights = kept(night_poses(answers, site.longitude))
     for night in nights:
         values = watch_output.values_of(night)
@@ -304,6 +308,11 @@ def _watch(args: argparse.Namespace) -> int:
             console.complain("calibrate", watch_output.alarm_of(night))
     if args.page is not None:
         watch_output.write_page(Path(args.page), nights)
+    if stars:
+        try:
+            horizon.write(Path(args.horizon), horizon.horizon(stars))
+        except OSError as e:
+            raise InstrumentError(f"{args.horizon}: it cannot be written there ({e.strerror})") from None
     return NOTHING if not nights or any(n.alarm for n in nights) else 0
 
 

@@ -4,6 +4,7 @@
 import csv
 import json
 
+import cv2
 import numpy as np
 import pytest
 from cli_calls import AIR, PLACE, WIDE, objects
@@ -64,8 +65,20 @@ def test_pixels_and_back(run, lists, tmp_path):
 
 def test_a_grid_is_drawn(run, night, tmp_path):
     frame, picture = sorted(night.glob("frame_*.fits"))[0], tmp_path / "grid.png"
-    status, _, _ = run("altaz", frame, "100", "200", *WIDE, *AIR, *SITE, "--overlay", picture)
-    assert status == 0 and picture.read_bytes().startswith(b"\x89PNG")
+    table = tmp_path / "horizon.csv"
+    table.write_text("azimuth_deg,altitude_deg\n0,89\n180,89\n")
+    whole = cv2.IMREAD_GRAYSCALE
+    assert run("altaz", frame, "100", "200", *WIDE, *AIR, *SITE, "--overlay", picture)[0] == 0
+    bright = cv2.imread(str(picture), whole).mean()
+    picture = tmp_path / "ground.png"
+    ground = ("--overlay", picture, "--horizon", table)
+    assert run("altaz", frame, "100", "200", *WIDE, *AIR, *SITE, *ground)[0] == 0
+    # all that the camera sees lies below this horizon
+    assert cv2.imread(str(picture), whole).mean() < 0.6 * bright
+    table.write_text("azimuth_deg,altitude_deg\n")
+    picture.unlink()
+    status, _, err = run("altaz", frame, "1", "2", *WIDE, *SITE, *ground)
+    assert status == 2 and "horizon.csv" in err[-1]
 
 
 def test_the_axis_of_a_mount(run, lists):
@@ -97,14 +110,16 @@ def test_a_horizontal_circle(run, lists, truth, tmp_path):
 
 
 def test_a_camera_that_turns_is_no_camera_that_stands_still(run, lists, tmp_path):
-    page = tmp_path / "history.html"
-    status, said, err = run("calibrate", "--watch", lists, *WIDE, *AIR, *SITE, "--page", page, "--json")
+    page, ground = tmp_path / "history.html", tmp_path / "horizon.csv"
+    written = ("--page", page, "--horizon", ground)
+    status, said, err = run("calibrate", "--watch", lists, *WIDE, *AIR, *SITE, *written, "--json")
+    assert ground.read_text().startswith("azimuth_deg,altitude_deg\n")
     nights = objects(said)
     assert status == 1 and [n["alarm"] for n in nights] == [False, True, True]
     assert nights[1]["moved_arcsec"] == pytest.approx(40 * 3600, rel=1e-3) and "has moved" in err[0]
-    assert page.read_text().count("<tr>") == 3
+    assert page.read_text().count("<tr>") == 1 + 3
     page.write_text("mine")
     status, _, err = run("calibrate", "--watch", lists, *WIDE, *SITE, "--page", page)
-    assert status == 2 and "not a page" in err[-1]
+    assert status == 2 and "not of starpos" in err[-1]
     status, _, err = run("calibrate", "--watch", tmp_path / "none", *WIDE, *SITE)
     assert status == 2 and "cannot be read" in err[-1]

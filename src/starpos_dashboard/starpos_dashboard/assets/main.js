@@ -162,6 +162,7 @@ function showHeading() {
   const old = Boolean(heading) && (isOld(heading) || !link.alive);
   dress("heading-card", "heading-age", !heading ? "missing" : old ? "old" : "", heading ? badge(heading, old) : "none");
   compass.show(heading);
+  compass.showSun(state.sun);
   say("heading", text.azimuth(heading?.azimuth, heading?.sigma));
   say("heading-sigma", heading ? ` ± ${text.angle(heading.sigma)}` : "");
   say("heading-frame", heading ? `of ${heading.frame}` : "");
