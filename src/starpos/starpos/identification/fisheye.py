@@ -261,8 +261,8 @@ def _start(
 ) -> tuple[np.ndarray, np.ndarray, LensPose, np.ndarray, np.ndarray, np.ndarray]:
     """What a part of a frame says of all its stars.
 
-    Returns the pixels (N, 2) of the frame's stars and their errors (N,), the pose of the whole frame, the rows of the
-    identified stars (M,) and those in the catalogue (M,), and which stars (N,) are not on the part.
+    Returns the pixels (N, 2) of the frame's stars, their errors (N,), and the pose of the whole frame. Then, of the
+    identified stars, the rows (M,) and those in the catalogue (M,), and which stars (N,) are not on the part.
     """
     flip = FLIP if found.mirrored else np.eye(3)
     attitude = flip @ part.turn.T @ flip @ found.attitude
