@@ -15,7 +15,7 @@ from starpos import rotation
 from starpos.calibration.camera import FromSky, Intrinsics, calibrate_camera, rms, seen_by
 from starpos.calibration.camera_adjustment import UNLEVELLED, UNTIMED, parameters
 from starpos.calibration.misalignment import NOTHING_KNOWN, Calibrated, Known, calibrate_at, calibrate_fixed
-from starpos.cli import console, inputs, options, overwriting, watch_output
+from starpos.cli import console, inputs, options, overwriting, places_file, watch_output
 from starpos.cli.inputs import checked_tilts, frames_among, given_or_sought, reader_of, stated_site
 from starpos.cli.options import vertical_of
 from starpos.cli.overwriting import CAMERA_NAME, Written, save_instrument
@@ -287,7 +287,7 @@ def _watch(args: argparse.Namespace) -> int:
         raise FrameError("--watch names the folder of the nights: leave out the frames")
     args.frames = _frames_below(Path(args.watch))
     if args.page is not None:
-        overwriting.check(args, Written("--page", args.page, watch_output.check_page))
+        overwriting.check(args, Written("--page", args.page, places_file.check_ours))
     if args.horizon is not None:
         overwriting.check(args, Written("--horizon", args.horizon, overwriting.never))
     site = _site(args)

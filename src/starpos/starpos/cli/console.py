@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-# Exit status.
-UNREADABLE = 2
+# Exit status: no answer; input that cannot be read.
+NOTHING, UNREADABLE = 1, 2
 # s of work that needs no bar
 BAR_AFTER_S = 0.5
 
