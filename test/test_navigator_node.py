@@ -16,7 +16,7 @@ from std_srvs.srv import Trigger
 
 from starpos.earth.orientation import earth_state
 from starpos.earth.refraction import Atmosphere
-from starpos.fix.camera_attitude import CameraAttitude
+from starpos.fix.attitude import CameraAttitude
 from starpos.navigation.vessel import Vessel
 from starpos.navigation.voyage import adjust_voyage
 from starpos_common.messages import attitude_to_message, unix_to_stamp

@@ -3,6 +3,7 @@
 
 import resource
 import signal
+import sys
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from rclpy.qos import ReliabilityPolicy
 from rclpy.serialization import deserialize_message, serialize_message
 from rosbags.rosbag2 import Reader
 
+from starpos_bringup.record import REFUSED, record
 from starpos_interfaces.msg import Solution
 from starpos_testing.graph.shots import SOLVER, photograph, shoot
 
@@ -147,14 +149,12 @@ def test_the_recorder_hears_a_publisher_of_best_effort_where_it_is_told(graph, r
     graph.wait(lambda: reliability("/stars") == {ReliabilityPolicy.RELIABLE})
 
 
-def test_nothing_is_overwritten_and_nothing_made_in_a_place_that_is_none(run, tmp_path):
+def test_nothing_is_overwritten_and_nothing_made_in_a_place_that_is_none(tmp_path, monkeypatch, capsys):
     (tmp_path / "bag").mkdir()
+    (tmp_path / "file").touch()
     for place, words in (
         (tmp_path / "bag", "something of that name"),
         (tmp_path / "file" / "x", "no bag can be made"),
     ):
-        (tmp_path / "file").touch()
-        process = run("starpos_bringup", "record", arguments=(str(place),))
-        assert process.wait() == 2 and words in process.output and "Traceback" not in process.output, (
-            process.output
-        )
+        monkeypatch.setattr(sys, "argv", ["record", str(place)])
+        assert record() == REFUSED and words in capsys.readouterr().err

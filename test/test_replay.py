@@ -18,6 +18,7 @@ from rosgraph_msgs.msg import Clock
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
+from starpos_bringup import replay
 from starpos_bringup.bag import offered_qos
 from starpos_interfaces.msg import Solution, StarArray
 from starpos_testing.graph.graph import stamp_of
@@ -37,10 +38,10 @@ def truth():
 
 # Before there is an instrument.
 def test_a_replay_that_nobody_hears_says_so(graph, run):
-    replay = run("starpos_bringup", "replay", arguments=(str(NIGHT), "--rate", "0", "--wait", "0.2"))
-    assert replay.wait() == 1
-    assert "13 frames, 0 answers, 0 fixes" in replay.output, replay.output
-    assert "no node subscribes to" in replay.output and "/stars" in replay.output, replay.output
+    player = run("starpos_bringup", "replay", arguments=(str(NIGHT), "--rate", "0", "--wait", "0.2"))
+    assert player.wait() == 1
+    assert "13 frames, 0 answers, 0 fixes" in player.output, player.output
+    assert "no node subscribes to" in player.output and "/stars" in player.output, player.output
 
 
 def test_a_replay_that_only_strangers_hear_says_so(graph, run):
@@ -48,14 +49,14 @@ def test_a_replay_that_only_strangers_hear_says_so(graph, run):
         graph.node.create_subscription(kind, name, lambda message: None, 10)
         for kind, name in ((StarArray, "/stars"), (Clock, "/clock"))
     ]
-    replay = run(
+    player = run(
         "starpos_bringup",
         "replay",
         arguments=(str(NIGHT), "--topics", "/stars", "--rate", "0", "--wait", str(WAIT_S)),
     )
-    assert replay.wait() == 1, replay.output
-    assert "10 frames, 0 answers, 0 fixes" in replay.output
-    assert "no solver publishes solutions" in replay.output
+    assert player.wait() == 1, player.output
+    assert "10 frames, 0 answers, 0 fixes" in player.output
+    assert "no solver publishes solutions" in player.output
     for subscription in heard:
         graph.node.destroy_subscription(subscription)
 
@@ -74,12 +75,12 @@ def play(graph, run, truth):
     """The bag as fast as it is taken: (solution, imu) of each frame, by stamp."""
     assert graph.call(Trigger, "solver/reset", Trigger.Request()).success
     graph.solutions.clear(), graph.imus.clear()
-    replay = run("starpos_bringup", "replay", arguments=(str(NIGHT), "--rate", "0"))
+    player = run("starpos_bringup", "replay", arguments=(str(NIGHT), "--rate", "0"))
     count = len(truth["frames"])
-    assert replay.wait() == 0, replay.output
-    assert f"{count} frames, {count} answers, {count} fixes" in replay.output, replay.output
-    assert "of the bag, another node publishes /" in replay.output, replay.output
-    graph.wait(lambda: len(graph.solutions) == len(graph.imus) == count, f"for all; {replay.output}")
+    assert player.wait() == 0, player.output
+    assert f"{count} frames, {count} answers, {count} fixes" in player.output, player.output
+    assert "of the bag, another node publishes /" in player.output, player.output
+    graph.wait(lambda: len(graph.solutions) == len(graph.imus) == count, f"for all; {player.output}")
     return {s: (graph.solutions[s][0], graph.imus[s][0]) for s in sorted(graph.solutions)}
 
 
@@ -160,7 +161,7 @@ STRING = "std_msgs/msg/String"
 def test_latched_topics_reach_latecomers_and_a_signal_ends_it(graph, run, tmp_path, plugin):
     messages = [(S, "/words", STRING, text("early")), (1000 * S, "/words", STRING, text("late"))]
     bag = write_bag(tmp_path / "bag", messages, plugin)
-    replay = run("starpos_bringup", "replay", arguments=(str(bag), "--wait", "0"))
+    player = run("starpos_bringup", "replay", arguments=(str(bag), "--wait", "0"))
     graph.wait(lambda: graph.node.count_publishers("/words"))
     clock = graph.hear(Clock, "/clock")
     # It is past its first message.
@@ -170,18 +171,18 @@ def test_latched_topics_reach_latecomers_and_a_signal_ends_it(graph, run, tmp_pa
     heard = graph.hear(String, "/words", LATCHED)
     graph.wait(lambda: heard)
     assert heard[0].data == "early"
-    replay.signal(signal.SIGINT, signal.SIGINT)
-    assert replay.wait() == 0 and "Traceback" not in replay.output, replay.output
+    player.signal(signal.SIGINT, signal.SIGINT)
+    assert player.wait() == 0 and "Traceback" not in player.output, player.output
 
 
 def test_a_single_file_and_chosen_topics(graph, run, tmp_path):
     messages = [(S + k, f"/words{k % 2}", STRING, text(str(k))) for k in range(8)]
     bag = write_bag(tmp_path / "bag", messages)
     heard = [graph.hear(String, f"/words{k}", LATCHED) for k in range(2)]
-    replay = run(
+    player = run(
         "starpos_bringup", "replay", arguments=(str(bag / "bag.mcap"), "--topics", "/words1", "--rate", "0")
     )
-    assert replay.wait() == 0, replay.output
+    assert player.wait() == 0, player.output
     graph.wait(lambda: len(heard[1]) == 4)
     assert [m.data for m in heard[1]] == ["1", "3", "5", "7"] and not heard[0]
 
@@ -199,13 +200,13 @@ def test_what_a_bag_may_not_bring(graph, run, tmp_path):
     ]
     bag = write_bag(tmp_path / "bag", messages)
     heard, clock = graph.hear(String, "/words", LATCHED), graph.hear(Clock, "/clock")
-    replay = run("starpos_bringup", "replay", arguments=(str(bag), "--rate", "0"))
-    assert replay.wait() == 0, replay.output
+    player = run("starpos_bringup", "replay", arguments=(str(bag), "--rate", "0"))
+    assert player.wait() == 0, player.output
     graph.wait(lambda: heard)
     assert [m.data for m in heard] == ["good"]
     assert all(m.clock.sec for m in clock)
     for words in ("'os/msg/Path' is not installed", "'not a name' is left out", "2 broken ones left out"):
-        assert words in replay.output, replay.output
+        assert words in player.output, player.output
 
 
 def changed(tmp_path, change) -> Path:
@@ -262,14 +263,21 @@ def a_broken_database(tmp_path):
     "make",
     [no_folder, empty_folder, a_picture, truncated, garbage, bad_metadata, another_version_of_a_type, a_broken_database],
 )  # fmt: skip
-def test_what_is_no_bag_is_refused_in_a_sentence(domain, run, tmp_path, make):
+def test_what_is_no_bag_is_refused_in_a_sentence(capsys, tmp_path, make):
     bag, words = make(tmp_path)
-    replay = run("starpos_bringup", "replay", arguments=(str(bag),))
-    assert replay.wait() == 2
-    assert words in replay.output and str(tmp_path) in replay.output
-    assert "Traceback" not in replay.output and all(
-        x.startswith("replay:") for x in replay.output.splitlines()
-    )
+    said = refused(capsys, bag)
+    assert words in said and str(tmp_path) in said
+    assert all(line.startswith("replay:") for line in said.splitlines())
+
+
+def refused(capsys, *arguments) -> str:
+    """The sentence with which the player refuses arguments, in this process."""
+    try:
+        status = replay.main([str(a) for a in arguments], [])
+    except SystemExit as end:
+        status = end.code
+    assert status == replay.REFUSED
+    return capsys.readouterr().err
 
 
 def test_only_the_inputs_are_played_whatever_their_namespace_and_not_what_was_made_of_them(
@@ -281,36 +289,36 @@ def test_only_the_inputs_are_played_whatever_their_namespace_and_not_what_was_ma
     for inputs, played in (("stars", names[:2]), ("images", (names[1], names[3]))):
         for said in heard.values():
             said.clear()
-        replay = run(
+        player = run(
             "starpos_bringup",
             "replay",
             arguments=(str(bag), "--rate", "0", "--inputs", inputs, "--wait", "10"),
         )
-        assert replay.wait() == 0, replay.output
+        assert player.wait() == 0, player.output
         graph.wait(lambda names=played: all(heard[name] for name in names))
         assert {name for name, said in heard.items() if said} == set(played)
 
 
-def test_bad_calls(run):
-    for words, said in (
-        ((str(NIGHT), "--rate", "-1"), "-1 must lie between 0 and"),
-        ((str(NIGHT), "--rate", "nan"), "nan must lie between 0 and"),
-        ((str(NIGHT), "--rate", "abc"), "invalid float value: 'abc'"),
-        ((str(NIGHT), "--topics", "/nothing"), "no topic /nothing"),
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ((NIGHT, "--rate", "-1"), "-1 must lie between 0 and"),
+        ((NIGHT, "--rate", "nan"), "nan must lie between 0 and"),
+        ((NIGHT, "--rate", "abc"), "invalid float value: 'abc'"),
+        ((NIGHT, "--topics", "/nothing"), "no topic /nothing"),
         ((), "BAG"),
-        ((str(NIGHT), "--inputs", "moon"), "--inputs"),
-        ((str(NIGHT), "--inputs", "stars", "--topics", "/stars"), "not allowed with"),
-        ((str(NIGHT), "--ros-args", "-p"), "replay: "),
-    ):
-        replay = run("starpos_bringup", "replay", arguments=words)
-        assert replay.wait() == 2 and said in replay.output and "Traceback" not in replay.output, (
-            replay.output
-        )
+        ((NIGHT, "--inputs", "moon"), "--inputs"),
+        ((NIGHT, "--inputs", "stars", "--topics", "/stars"), "not allowed with"),
+        ((NIGHT, "--ros-args", "-p"), "replay: "),
+    ],
+)
+def test_bad_calls(capsys, arguments, said):
+    assert said in refused(capsys, *arguments)
 
 
 def test_without_rosbags(run, tmp_path, monkeypatch):
     (tmp_path / "rosbags.py").write_text("raise ImportError\n")
     monkeypatch.setenv("PYTHONPATH", f"{tmp_path}{os.pathsep}{os.environ.get('PYTHONPATH', '')}")
-    replay = run("starpos_bringup", "replay", arguments=(str(NIGHT),))
-    assert replay.wait() == 2
-    assert replay.output == "replay: rosbags, which reads bags, is not installed: pip install rosbags\n"
+    player = run("starpos_bringup", "replay", arguments=(str(NIGHT),))
+    assert player.wait() == 2
+    assert player.output == "replay: rosbags, which reads bags, is not installed: pip install rosbags\n"

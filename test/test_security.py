@@ -173,8 +173,8 @@ def test_the_search_covers_the_product_and_would_find(monkeypatch):
         ("imu.csv", b"utc_unix_s,gx,gy,gz,ax,ay,az\n", 1 << 40, read_imu),
         ("instrument.yaml", b"starpos_instrument: 1\n", 1 << 40, instrument_file.read),
         ("camera.yaml", b"image_width: 1\n", 1 << 40, instrument_file.read_camera),
-        ("geoid.tif", b"II*\0", 1 << 40, geoid.read_grid),
-        ("geoid.gtx", b"\x40" * 40, 1 << 40, geoid.read_grid),
+        ("geoid.tif", b"II*\0", 1 << 40, geoid.read),
+        ("geoid.gtx", b"\x40" * 40, 1 << 40, geoid.read),
     ],
 )
 def test_a_file_of_a_terabyte_is_refused_unread(tmp_path, name, head, size, read):

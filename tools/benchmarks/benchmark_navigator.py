@@ -19,7 +19,7 @@ from std_msgs.msg import Header
 from table import Cost, Row
 
 from starpos.earth.orientation import earth_state
-from starpos.fix.camera_attitude import CameraAttitude
+from starpos.fix.attitude import CameraAttitude
 from starpos.navigation.sightings import IdentifiedFrame
 from starpos_common.messages import attitude_to_message, unix_to_stamp
 from starpos_interfaces.msg import Attitude

@@ -15,7 +15,7 @@ from std_msgs.msg import Header
 
 from starpos import rotation
 from starpos.errors import TimeError
-from starpos.fix.camera_attitude import CameraAttitude
+from starpos.fix.attitude import CameraAttitude
 from starpos.frames.exposure import Shutter
 from starpos.frames.frame import DISC, SATURATED, Disc, Frame, FrameTrail, Stars
 from starpos.instrument.camera import Camera

@@ -26,7 +26,6 @@ from starpos.night import horizon
 from starpos.tables import TableForm
 from starpos.units import utc_text
 
-NOTHING = 1
 COLUMNS = ("file", "utc", "x", "y", "azimuth", "altitude", "altitude_airless", "sigma_across_arcsec",
            "sigma_altitude_arcsec")  # fmt: skip
 HEAD = (
@@ -50,7 +49,7 @@ def run(args: argparse.Namespace) -> int:
         pixels = np.vstack([pixels, np.stack([table.columns["x"], table.columns["y"]], -1)])
     answers = list(inputs.seen_at_place("altaz", args))
     if not answers:
-        return NOTHING
+        return console.NOTHING
     seen = _Seen(*answers[0])
     back = np.radians(np.reshape(args.back, (-1, 2)))
     backs = seen.pixels(back)

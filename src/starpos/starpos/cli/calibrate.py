@@ -15,7 +15,7 @@ from starpos import rotation
 from starpos.calibration.camera import FromSky, Intrinsics, calibrate_camera, rms, seen_by
 from starpos.calibration.camera_adjustment import UNLEVELLED, UNTIMED, parameters
 from starpos.calibration.misalignment import NOTHING_KNOWN, Calibrated, Known, calibrate_at, calibrate_fixed
-from starpos.cli import console, inputs, options, overwriting, watch_output
+from starpos.cli import console, inputs, options, overwriting, places_file, watch_output
 from starpos.cli.inputs import checked_tilts, frames_among, given_or_sought, reader_of, stated_site
 from starpos.cli.options import vertical_of
 from starpos.cli.overwriting import CAMERA_NAME, Written, save_instrument
@@ -274,6 +274,9 @@ def run(args: argparse.Namespace) -> int:
             run_site(args, [s for s, _ in frames], instrument, tilts, _known(frames))
     except (CalibrationError, FixError, PlaceError) as e:
         console.complain("calibrate", e)
+        if not _known(frames):
+            for remark in Solving(replace(given, instrument=instrument)).fitting(frames[0][0]):
+                console.complain("calibrate", remark)
         return console.UNREADABLE if unreadable else NOTHING
     return console.UNREADABLE if unreadable else 0
 
@@ -284,7 +287,7 @@ def _watch(args: argparse.Namespace) -> int:
         raise FrameError("--watch names the folder of the nights: leave out the frames")
     args.frames = _frames_below(Path(args.watch))
     if args.page is not None:
-        overwriting.check(args, Written("--page", args.page, watch_output.check_page))
+        overwriting.check(args, Written("--page", args.page, places_file.check_ours))
     if args.horizon is not None:
         overwriting.check(args, Written("--horizon", args.horizon, overwriting.never))
     site = _site(args)

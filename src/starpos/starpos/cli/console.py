@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-# Exit status.
-UNREADABLE = 2
+# Exit status: no answer; input that cannot be read.
+NOTHING, UNREADABLE = 1, 2
 # s of work that needs no bar
 BAR_AFTER_S = 0.5
 
@@ -57,7 +57,7 @@ class FrameComplaints:
         alike = self._frames.setdefault(reason, [])
         alike.append(name)
         if len(alike) == 1:
-            complain(self._command, error)
+            complain(self._command, error if name in str(error) else f"{name}: {error}")
 
     def end(self) -> None:
         """Say how many more frames each sentence is true of."""

@@ -136,9 +136,6 @@ def _face_text(face: dict) -> str:
     )
 
 
-NO_DEFLECTION = 1
-
-
 def run(args: argparse.Namespace) -> int:
     mark = _mark_of(args)
     taken = _of_bag(args, mark) if _is_bag(args) else _of_files(args, mark)
@@ -219,7 +216,7 @@ def _tell(args: argparse.Namespace, taken: _Taken, mark: Place) -> int:
         session = checked_session(sightings, taken.instrument, options.atmosphere_of(args), mark)
     except FixError as error:
         console.complain("deflection", error)
-        return NO_DEFLECTION
+        return console.NOTHING
     scale = taken.instrument.inclinometer.scale
     for said in remarks(session, len(rows), scale):
         console.complain("deflection", said)

@@ -18,10 +18,10 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from starpos import __version__
+from starpos.cli import console
 from starpos.errors import StarposError, one_line
 from starpos.units import DAY_S
 
-SOMETHING_MISSING = 1
 # modules that everything needs, with the names of their packages
 NEEDED = {"numpy": "numpy", "scipy": "scipy", "erfa": "pyerfa", "astropy": "astropy", "astropy_iers_data":
           "astropy-iers-data", "cv2": "opencv-python-headless", "yaml": "PyYAML"}  # fmt: skip
@@ -70,7 +70,7 @@ def run(args: argparse.Namespace) -> int:
         missing |= finding.state is State.MISSING
         said = json.dumps({"check": name} | asdict(finding)) if args.json else _lines(name, finding)
         print(said, flush=True)
-    return SOMETHING_MISSING if missing else 0
+    return console.NOTHING if missing else 0
 
 
 def _lines(name: str, finding: Finding) -> str:

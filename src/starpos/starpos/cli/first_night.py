@@ -24,7 +24,6 @@ from starpos.night.work import Solving
 from starpos.sky import catalogue
 from starpos.units import utc_text
 
-NOT_YET = 1
 POLL_S = 0.5
 # A file that cannot be read may still be written for so long.
 WRITTEN_S = 10.0
@@ -46,13 +45,13 @@ def run(args: argparse.Namespace) -> int:
         night, given = _watched(args, folder)
     except KeyboardInterrupt:
         console.complain("first-night", f"stopped: {AGAIN}")
-        return NOT_YET
+        return console.NOTHING
     found = None if night is None else night.turned
     if found is None or found.calibrated is None:
         console.complain(
             "first-night", f"no frame has come for {args.patience:g} s, and A3 is not known yet: {AGAIN}"
         )
-        return NOT_YET
+        return console.NOTHING
     overwriting.save_instrument(
         "first-night", args.save, found.calibrated.instrument, "A3 by the first night"
     )
@@ -85,12 +84,15 @@ def _watched(args: argparse.Namespace, folder: Path) -> tuple[FirstNight | None,
             seen.add(path)
             waited = time.monotonic()
             if night is None:
-                given = given_of(args, About(item.width, item.height, item.focal_px, item.origin_px))
+                about = About(item.width, item.height, focal_px=item.focal_px, origin_px=item.origin_px)
+                given = given_of(args, about)
                 air = options.atmosphere_of(args)
                 night = FirstNight(Solver(options.instrument_of(args, item), catalogue.load_catalogue(), air))
             sight = Solving(given)(item)
+            step = night.step
+            assert step is not None
             look = night.inspect(sight, _tilts(folder, night, stars_of(item)))
-            _tell(look, sight.stars)
+            _tell(step, look, sight.stars)
             if night.step is None:
                 return night, given
         if time.monotonic() - waited > args.patience:
@@ -121,14 +123,14 @@ def _tilts(folder: Path, night: FirstNight, stars: Stars) -> TiltLog | str:
         time.sleep(POLL_S)
 
 
-def _tell(look: Look, stars: Stars) -> None:
+def _tell(step: Stage, look: Look, stars: Stars) -> None:
     """Print what a step found, and after the level the clock."""
     at = utc_text(stars.mid_unix_s)[11:19] if stars.mid_unix_s else "--:--:--"
     mark = "ok" if look.done else ".."
-    print(f"{at} {mark} {look.step.value:<9}{look.found}\n{'':12}-> {look.todo}", flush=True)
+    print(f"{at} {mark} {step.value:<9}{look.found}\n{'':12}-> {look.todo}", flush=True)
     if look.done and sys.stdout.isatty():
         print("\a", end="", flush=True)
-    if look.done and look.step is Stage.LEVEL:
+    if look.done and step is Stage.LEVEL:
         finding = doctor.clock()
         mark = "ok" if finding.state is doctor.State.OK else "!!"
         cure = f"\n{'':12}-> {finding.cure}" if finding.cure else ""

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The lines, JSON keys and CSV columns of fixes and of headings at a known place: of a frame, and of a night together."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -9,14 +9,13 @@ import numpy as np
 from starpos.averaging.average import Average
 from starpos.averaging.poses import MeanAttitude, mean_attitude
 from starpos.cli.console import Output
-from starpos.cli.inputs import NightFolder
 from starpos.earth.orientation import measured_until, table_age_days
 from starpos.earth.place import Place
 from starpos.earth.vertical import Geodetic, Vertical, geodetic
 from starpos.errors import FixError
 from starpos.fix.attitude import Attitude
 from starpos.fix.directions import OPTICAL_AXIS, horizontal
-from starpos.fix.fix import Fix, InDegrees, PlaceFix, length_text
+from starpos.fix.fix import InDegrees, PlaceFix, length_text
 from starpos.fix.heading import AttitudeAtPlace
 from starpos.fix.solution import Solution, Status
 from starpos.night.together import Gathered
@@ -41,15 +40,9 @@ def in_degrees(covariance: np.ndarray) -> np.ndarray:
     return covariance * np.outer(unit, unit)
 
 
-def budget_of(fix: Fix | Average, ground: Geodetic) -> dict:
-    """1 sigma (3,) of each source: east m, north m, heading deg; the deflection acts on the geodetic place only."""
-    terms = {t.name: np.sqrt(np.diag(t.covariance)[:3]) * [1, 1, np.degrees(1)] for t in fix.terms}
-    terms["deflection (geodetic only)"] = np.sqrt(np.diag(ground.deflection_covariance)) * [
-        1,
-        1,
-        np.degrees(1),
-    ]
-    return terms
+def budget_of(fix: PlaceFix, ground: Geodetic) -> dict:
+    """1 sigma (3,) of each source, as `PlaceFix.budget` has it, with the heading in deg."""
+    return {name: root * [1, 1, np.degrees(1)] for name, root in fix.budget(ground).items()}
 
 
 # the keys of --json that come from a fix and the same place on the ellipsoid
@@ -141,46 +134,51 @@ def put_elevation(
 
 def put_combined(
     output: Output,
-    night: NightFolder,
-    all_together: Average | None,
+    folder: str | None,
+    average: Average | None,
     gathered: Gathered,
     vertical: Vertical,
     about: dict | None = None,
+    mean: MeanAttitude | None = None,
 ) -> None:
-    """Write the average of a night, or that it is missing; about: more keys of JSON."""
-    name = {} if night.folder is None else {"night": night.folder}
-    solved = gathered.solved
-    counts = dict.fromkeys(COUNTS) if all_together is None else {k: getattr(all_together, k) for k in COUNTS}
+    """Write the average of a night, or that it is missing; about: more keys of JSON.
+
+    folder: of the night; None where it is not named.
+    mean: attitude at a known place, which is the answer where no frame has a fix.
+    """
+    rows = gathered.solved or gathered.headings
+    whole = average if gathered.solved or mean is None else mean
+    fitted = [f.residual_arcsec for s in rows if (f := s.fix or s.at_place) is not None]
     of_stars = {
-        "stars_detected": sum(s.stars_detected for s in solved),
-        "stars_matched": sum(s.stars_matched for s in solved),
-        "residual_arcsec": np.sqrt(np.mean([s.fix.residual_arcsec**2 for s in solved] or [np.nan])),
-        "log_odds": sum(s.log_odds for s in solved) if solved else None,
-        "status": (Status.OK if all_together else Status.POOR_FIT).value,
+        "stars_detected": sum(s.stars_detected for s in rows),
+        "stars_matched": sum(len(s.named) for s in rows),
+        "residual_arcsec": np.sqrt(np.mean(np.square(fitted or [np.nan]))),
+        "log_odds": sum(np.nan if s.pointing is None else s.pointing.log_odds for s in rows)
+        if rows
+        else None,
+        "status": (Status.OK if whole else Status.POOR_FIT).value,
         "warnings": sorted(gathered.warnings),
+        "iers_table_age_days": table_age_days(whole.utc_unix_s) if whole else None,
     }
-    age_days = table_age_days(all_together.utc_unix_s) if all_together else None
-    output.put(
-        {"combined": True}
-        | name
-        | counts
-        | json_of(all_together, vertical)
-        | of_stars
-        | {"iers_table_age_days": age_days}
-        | (about or {}),
-        "" if all_together is None else _lines_of(night, all_together, vertical),
-    )
+    values = {"combined": True} | ({} if folder is None else {"night": folder})
+    values |= {name: getattr(whole, name, None) for name in COUNTS} | json_of(average, vertical)
+    line = ""
+    if average is not None:
+        line = _lines_of(folder, average, vertical)
+    elif whole is not None and mean is not None:
+        line = f"{counted(mean.frames)} together: {heading_text_of(mean)}{axes_text((about or {})['axes'])}"
+    output.put(values | of_stars | (about or {}), line)
 
 
-def _lines_of(night: NightFolder, together: Average, vertical: Vertical) -> str:
+def _lines_of(folder: str | None, together: Average, vertical: Vertical) -> str:
     """The lines of an average: its place, the place on WGS 84, the sources of error, the IERS table."""
     ground = geodetic(together.latitude, together.longitude, 0.0, together.covariance, vertical)
     turned = f" (the last of {together.poses} poses)" if together.poses > 1 else ""
-    folder = "" if night.folder is None else f"{night.folder}: "
+    night = "" if folder is None else f"{folder}: "
     on_ground = InDegrees.of(ground.latitude, ground.longitude, 0.0, ground.covariance)
     frames = counted(together.frames) + ("" if together.frames == 1 else " together")
     lines = [
-        f"{folder}{frames}: {together.in_degrees}{turned} (astronomic)",
+        f"{night}{frames}: {together.in_degrees}{turned} (astronomic)",
         f"geodetic, WGS 84: {on_ground.where} (the deflection of the vertical included)",
         "where the error comes from, 1 sigma of each source in the place and the heading:",
     ]
@@ -273,12 +271,12 @@ def json_of_axes(found: AttitudeAtPlace | MeanAttitude, axes: Axes) -> list[dict
     ]
 
 
-def axes_text(found: AttitudeAtPlace | MeanAttitude, axes: Axes) -> str:
-    """Text of `json_of_axes` for people."""
+def axes_text(axes: Iterable[Mapping]) -> str:
+    """Text of what `json_of_axes` gives."""
     return "".join(
         f"; {a['name']} azimuth {a['azimuth']:.5f} +- {a['sigma_azimuth_deg']:.5f}, altitude {a['altitude']:.5f} +- "
         f"{a['sigma_altitude_deg']:.5f}"
-        for a in json_of_axes(found, axes)
+        for a in axes
     )
 
 
@@ -288,7 +286,7 @@ def heading_line_of(path: str, s: Solution, axes: Axes = OPTICS) -> str:
         return f"{path}: {s.status.value}, {s.stars_detected} stars detected"
     where = "" if s.fix is None else f"{s.fix.in_degrees.where}, "
     seen = f"by the {s.bodies[0]}" if s.bodies else f"{len(s.names)} of {s.stars_detected} stars"
-    return f"{path}: {where}{heading_text_of(s.at_place)}{axes_text(s.at_place, axes)}, {seen}"
+    return f"{path}: {where}{heading_text_of(s.at_place)}{axes_text(json_of_axes(s.at_place, axes))}, {seen}"
 
 
 def heading_text_of(found: AttitudeAtPlace | MeanAttitude) -> str:
@@ -309,36 +307,6 @@ def mean_of(answers: Sequence[Solution]) -> tuple[MeanAttitude | None, tuple[str
         return (mean_attitude(attitudes) if attitudes else None), ()
     except FixError as error:
         return None, (str(error),)
-
-
-def put_mean(
-    output: Output,
-    night: NightFolder,
-    answers: Sequence[Solution],
-    mean: MeanAttitude | None,
-    place: Place,
-    vertical: Vertical,
-    axes: Axes,
-) -> None:
-    """Write the mean attitude of frames without a place of their own."""
-    about = {
-        "stars_detected": sum(s.stars_detected for s in answers),
-        "stars_matched": sum(len(s.names) for s in answers),
-        "residual_arcsec": np.sqrt(np.mean([s.at_place.residual_arcsec**2 for s in answers if s.at_place])),
-        "log_odds": sum(s.pointing.log_odds for s in answers if s.pointing),
-        "status": (Status.OK if mean else Status.POOR_FIT).value,
-        "warnings": [],
-        "iers_table_age_days": table_age_days(mean.utc_unix_s) if mean else None,
-    }
-    name = {} if night.folder is None else {"night": night.folder}
-    values = {"combined": True} | name | dict.fromkeys(COUNTS) | json_of(None, vertical)
-    values |= {"frames": mean.frames} if mean else {}
-    text = (
-        ""
-        if mean is None
-        else f"{counted(mean.frames)} together: {heading_text_of(mean)}{axes_text(mean, axes)}"
-    )
-    output.put(with_heading(values, mean, place, axes) | about, text)
 
 
 def _with_variance(covariance: np.ndarray | None, heading: float) -> np.ndarray:

@@ -31,6 +31,7 @@ from starpos.night.work import Solving
 from starpos.parallel.processes import Here, Workers, memory_bytes, processors, workers
 from starpos.progress import quiet
 from starpos.recording.drivers import Drivers
+from starpos.recording.topics import Remaps
 from starpos.sky import catalogue
 
 if TYPE_CHECKING:
@@ -104,19 +105,14 @@ def seen_at(
         sight = work(item)
         answer = sight.solution
         if answer.at_place is None or answer.found is None:
-            console.complain(
-                command, answer.message if answer.found is None or item.mid_unix_s else why_no_time_of(item)
-            )
+            timed = answer.found is None or item.mid_unix_s
+            no_time = f"{item.place}: no time of exposure: {why_no_time(item)}"
+            console.complain(command, answer.message if timed else no_time)
             continue
         instrument = sight.instrument or work.instruments.of(item)
         assert instrument is not None
         camera = instrument.camera_for(item.width, item.height, item.origin_px)
         yield item, sight, camera.scaled(answer.found.focal_scale * answer.at_place.focal_scale)
-
-
-def why_no_time_of(item: Frame | Stars) -> str:
-    """The sentence for a frame without a time."""
-    return f"{item.place}: no time of exposure: {why_no_time(item)}"
 
 
 def identifying(
@@ -242,7 +238,7 @@ def read_bag(path: Path, args: argparse.Namespace) -> "tuple[Recorded, Instrumen
     from starpos.night import bag
 
     any_camera = options.instrument_of(args, no_stars(100, 100, focal_px=1000.0))
-    drivers = Drivers.of(args.params_file, args.param, args.namespace, options.remaps_of(args))
+    drivers = Drivers.of(args.params_file, args.param, args.namespace, Remaps.of(args.remap))
     found = bag.read(path, args.namespace, any_camera.inclinometer.noise_rad, drivers, console.ProgressBar())
     told = (args.instrument, args.focal_mm) != (None, None)
     cameras = found.cameras if args.focal_mm is None else {}

@@ -20,7 +20,6 @@ from starpos.fix.heading import AttitudeAtPlace
 from starpos.fix.terms import total_covariance
 from starpos.units import ARCSEC
 
-NOTHING = 1
 READING = "azimuth_deg"
 
 
@@ -42,7 +41,7 @@ def run(args: argparse.Namespace) -> int:
         return _circle(args, seen, readings, axes[list(axes)[-1]])
     except FixError as e:
         console.complain("mount", e)
-        return NOTHING
+        return console.NOTHING
 
 
 def _axis(args: argparse.Namespace, place: Place, seen: Sequence[AttitudeAtPlace]) -> int:

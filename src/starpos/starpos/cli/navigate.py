@@ -28,7 +28,6 @@ from starpos.night.under_way import (
     voyage_frames,
 )
 
-NO_ANSWER = 1
 OK, CARRIED, NO_READINGS, BAD_INPUT = "ok", "carried", "no inertial readings", "bad input"
 # the keys of --json that come from a fix
 KEYS: dict[str, Callable[[Any, Geodetic], Any]] = {
@@ -81,7 +80,7 @@ def run(args: argparse.Namespace) -> int:
         voyage = records.voyage(frames, vessel, console.ProgressBar())
     except FixError as error:
         console.complain("navigate", error)
-        return NO_ANSWER
+        return console.NOTHING
     return tell(args, frames, voyage, vertical)
 
 
@@ -98,7 +97,7 @@ def tell(args: argparse.Namespace, frames: list[VoyageFrame], voyage: Voyage, ve
         )
     fixes = [fix for fix in voyage.fixes if fix is not None]
     if not fixes:
-        return NO_ANSWER
+        return console.NOTHING
     last = fixes[-1]
     tell_unknown("navigate", args, vertical.at(last.latitude, last.longitude))
     beyond = earth_orientation(last.utc_unix_s).extrapolated_days

@@ -3,7 +3,6 @@
 
 import argparse
 from dataclasses import replace
-from typing import Protocol
 
 import numpy as np
 
@@ -16,15 +15,11 @@ from starpos.errors import InstrumentError
 from starpos.fix.directions import OPTICAL_AXIS
 from starpos.frames.exif import CameraClock
 from starpos.frames.exposure import Shutter
+from starpos.frames.frame import Frame, Stars
 from starpos.instrument import instrument, instrument_file, platepar, sensors
 from starpos.instrument.camera import PLUMB_BOB, Camera
-from starpos.recording import topics
+from starpos.night.reading import About
 from starpos.sky.bodies import ERFA, JplKernel, SolarSystem
-
-
-def remaps_of(args: argparse.Namespace) -> topics.Remaps:
-    """The topics of --remap; raises FrameError."""
-    return topics.Remaps.of(args.remap)
 
 
 def check_frames(args: argparse.Namespace) -> None:
@@ -95,7 +90,7 @@ def atmosphere_of(args: argparse.Namespace) -> Atmosphere:
     return Atmosphere.measured(pressure_pa, args.temperature_c, args.humidity, args.wavelength_um)
 
 
-def instrument_of(args: argparse.Namespace, first: "HasFocalLength | None") -> instrument.Instrument:
+def instrument_of(args: argparse.Namespace, first: About | Frame | Stars | None) -> instrument.Instrument:
     """The instrument from --instrument, or from --focal-mm and --pixel-um, or from the first frame's header.
 
     Raises InstrumentError if the options do not fit together or there is no focal length.
@@ -141,14 +136,6 @@ def _with_times(known: instrument.Instrument, args: argparse.Namespace) -> instr
     if stddev is not None:
         known = replace(known, clock_stddev_s=stddev)
     return known if readout is None else replace(known, shutter=Shutter(*readout))
-
-
-class HasFocalLength(Protocol):
-    """A frame, or its header's facts."""
-
-    @property
-    def focal_px(self) -> float | None:
-        """Focal length in px from the frame's header; None without one."""
 
 
 # sigma of a deflection that is given by hand without one

@@ -3,7 +3,7 @@
 
 import argparse
 
-from starpos.cli import console, inputs, options
+from starpos.cli import console, inputs
 from starpos.cli.console import Output
 from starpos.cli.fix_output import (
     COLUMNS,
@@ -13,14 +13,13 @@ from starpos.cli.fix_output import (
     line_of,
     put_combined,
 )
-from starpos.cli.inputs import NightFolder
-from starpos.cli.solve import NO_FIX
 from starpos.earth.vertical import Vertical
 from starpos.errors import FrameError
 from starpos.fix.checks import BY_PARAMETERS, MODEL_BY_PARAMETERS
 from starpos.night.remarks import of_a3, of_inclinometer
 from starpos.night.together import FrameAnswer, Gathered, extrapolated
 from starpos.recording.drivers import Drivers
+from starpos.recording.topics import Remaps
 from starpos.session.replay import PlayedNight, Playing
 from starpos.session.settings import Settings
 from starpos.units import utc_text
@@ -31,7 +30,7 @@ def run(args: argparse.Namespace) -> int:
     output = Output(args, COLUMNS, HEAD)
     # a wrong parameter is reported once, not for each bag
     Drivers.of(args.params_file, args.param, args.namespace)
-    work = Playing(args.params_file, tuple(args.param), args.namespace, options.remaps_of(args))
+    work = Playing(args.params_file, tuple(args.param), args.namespace, Remaps.of(args.remap))
     with inputs.workers_of(args, args.bags) as workers:
         answers = inputs.watched(workers.map((work, bag) for bag in args.bags), len(args.bags), "bag")
         return max(
@@ -72,8 +71,7 @@ def tell(
     for remark in remarks:
         console.complain("replay", f"{bag}: {remark}")
     if solved:
-        folder = NightFolder((), None, bag if len(args.bags) > 1 else None)
-        put_combined(output, folder, whole, gathered, vertical)
+        put_combined(output, bag if len(args.bags) > 1 else None, whole, gathered, vertical)
     if (by_satellites := night.by_satellites) is not None:
         from starpos.cli.satellites import fix_json
 
@@ -81,4 +79,4 @@ def tell(
         output.put(value, f"by satellites: {by_satellites.text}", rows=())
     # a trouble names its bag
     console.complain("replay", night.trouble or f"{bag}: {night.summary}")
-    return console.UNREADABLE if night.trouble else 0 if solved else NO_FIX
+    return console.UNREADABLE if night.trouble else 0 if solved else console.NOTHING

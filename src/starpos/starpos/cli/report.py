@@ -21,7 +21,6 @@ from starpos.parameters.given import of_solver
 from starpos.sky import catalogue
 from starpos.units import utc_text
 
-NO_FIX = 1
 # maximum number of nights with all figures; more nights get the table and the errors only
 ALL_FIGURES = 6
 # endings of a page in one file
@@ -69,7 +68,7 @@ def run(args: argparse.Namespace) -> int:
     # the page has its pictures
     write_files(folder, ({} if folder != out else files) | {index: html.encode(errors="replace")})
     print(folder / index)
-    return 0 if any(n.combined for n in nights) else NO_FIX
+    return 0 if any(n.combined for n in nights) else console.NOTHING
 
 
 def _groups(names: list[str]) -> list[list[Path]]:
@@ -96,7 +95,7 @@ def _write_places(args: argparse.Namespace) -> int:
         answers.append({"combined": True, "night": night.name} | json_of(night.combined, night.vertical))
     places_file.write(args.out, answers)
     print(args.out)
-    return 0 if answers[-1]["utc"] else NO_FIX
+    return 0 if answers[-1]["utc"] else console.NOTHING
 
 
 def _now_text() -> str:

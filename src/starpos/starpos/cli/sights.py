@@ -7,15 +7,13 @@ from starpos.averaging.sights import circle_of_sight, place_of_sights, read_sigh
 from starpos.cli import console, options
 from starpos.cli.console import Output
 from starpos.cli.fix_output import COLUMNS, ELEVATIONS_HEAD, put_combined, put_elevation
-from starpos.cli.inputs import NightFolder, near_of
+from starpos.cli.inputs import near_of
 from starpos.errors import InstrumentError, StarposError
 from starpos.fix.solution import Status
 from starpos.instrument.instrument import UNKNOWN_CLOCK_S
 from starpos.night.remarks import doubts, of_average
 from starpos.night.together import Gathered
 from starpos.sky.catalogue import load_catalogue
-
-NO_PLACE = 1
 
 
 def run(args: argparse.Namespace) -> int:
@@ -38,7 +36,7 @@ def run(args: argparse.Namespace) -> int:
         circles.append(circle)
         put_elevation(output, sight.source, sight.utc_unix_s, circle.zenith_distance, vertical)
     if not circles:
-        return NO_PLACE
+        return console.NOTHING
     place, about = None, {}
     try:
         place = place_of_sights(used, circles, None if near is None else (near.latitude, near.longitude))
@@ -48,5 +46,5 @@ def run(args: argparse.Namespace) -> int:
         for remark in (*of_average(place), *doubts((), place, None, near)):
             console.complain("solve", remark)
         about = {} if near is None else {"km_from_near": near.km_from(place.latitude, place.longitude)}
-    put_combined(output, NightFolder((), None), place, Gathered(), vertical, about)
-    return NO_PLACE if place is None else 0
+    put_combined(output, None, place, Gathered(), vertical, about)
+    return console.NOTHING if place is None else 0

@@ -48,7 +48,6 @@ from starpos.gnss import states
 from starpos.gnss.receiver import read_gnss_csv
 from starpos.gnss.solving import Watched
 from starpos.gnss.states import Learned
-from starpos.gnss.watch import GnssCheck
 from starpos.instrument import instrument_file
 from starpos.instrument.instrument import ByGravity, Instrument
 from starpos.instrument.phone_log import is_phone_log
@@ -71,13 +70,11 @@ from starpos.night.work import OnFile, Solving
 from starpos.sky import catalogue
 from starpos.units import utc_text
 
-NO_FIX = 1
-
 
 def tell(
     args: argparse.Namespace,
     output: Output,
-    night: NightFolder,
+    folder: str | None,
     answers: NightAnswers,
     vertical: Vertical,
     place: Place | None = None,
@@ -85,13 +82,14 @@ def tell(
 ) -> int:
     """Write the answer to each frame of a night, and what they come to together; returns the exit status.
 
+    folder: of the night; None where it is not named.
     place: the known place, whose headings are then reported; None without one.
     work: on the frames, which may say which focal length fits those that were not identified.
     """
-    statuses = [] if answers.turned is None else [tell_turned(args, night, answers.turned)]
+    statuses = [] if answers.turned is None else [tell_turned(args, folder, answers.turned)]
     watched, gathered, complaints = answers.watched, Gathered(), console.FrameComplaints("solve")
     if watched is not None:
-        say(night, *watched.remarks)
+        say(folder, *watched.remarks)
         if args.learned is not None:
             _save_learned(Path(args.learned), watched.learned)
     for answer in answers.each:
@@ -103,28 +101,27 @@ def tell(
             complaints(answer.name, s.remark)
         output.put(_json_of_answer(args, answer, vertical, place), _line_of_answer(args, answer, place))
     complaints.end()
-    solved, headings, near = gathered.solved, gathered.headings, near_of(args)
+    fixes, headings, near = gathered.fixes, gathered.headings, near_of(args)
     whole = together(gathered, answers.given, near)
     mean, why = (None, ()) if place is None else fix_output.mean_of(headings)
     unnamed = () if watched is None or answers.instrument is None else of_inclinometer(answers.instrument)
     not_averaged = [whole.why_not] if whole.why_not else []
-    say(night, *not_averaged, *(unnamed if solved else ()), *whole.remarks, *why)
-    where = whole.average or (solved[-1].fix if solved else None)
+    say(folder, *not_averaged, *(unnamed if fixes else ()), *whole.remarks, *why)
+    where, about = whole.average or (fixes[-1] if fixes else None), {}
     if where is not None:
         tell_unknown("solve", args, vertical.at(where.latitude, where.longitude))
         about = {} if near is None else {"km_from_near": near.km_from(where.latitude, where.longitude)}
-        if place is not None:
-            about |= with_heading(json_of(whole.average, vertical), mean, place, options.axes_of(args))
-        put_combined(output, night, whole.average, gathered, vertical, about)
-    elif headings and place is not None:
-        fix_output.put_mean(output, night, headings, mean, place, vertical, options.axes_of(args))
+    if place is not None:
+        about |= with_heading(json_of(whole.average, vertical), mean, place, options.axes_of(args))
+    if where is not None or (headings and place is not None):
+        put_combined(output, folder, whole.average, gathered, vertical, about, mean)
     elif gathered.lost is not None and not headings and work is not None:
-        say(night, *work.fitting(gathered.lost))
+        say(folder, *work.fitting(gathered.lost))
     # without tilts headings are all that was asked for, and by day they are all there is
     by_day = any(s.bodies for s in headings)
     found = bool(headings) if place is not None and (by_day or not args.tilt) else whole.average is not None
     found |= args.gnss is not None and args.tilt is None and bool(headings)
-    return max([*statuses, console.UNREADABLE if gathered.unreadable else 0 if found else NO_FIX])
+    return max([*statuses, console.UNREADABLE if gathered.unreadable else 0 if found else console.NOTHING])
 
 
 def _json_of_answer(
@@ -160,23 +157,23 @@ def check_save(args: argparse.Namespace, instrument: Instrument) -> None:
         instrument_file.check_fits(Path(args.save), instrument)
 
 
-def tell_turned(args: argparse.Namespace, night: NightFolder, turned: TurnedNight) -> int:
-    """Say what was found by turning, and write A3 as --save asks; NO_FIX if it is asked for and not written."""
+def tell_turned(args: argparse.Namespace, folder: str | None, turned: TurnedNight) -> int:
+    """Say what was found by turning, and write A3 as --save asks; NOTHING if it is asked for and not written."""
     if turned.calibrated is None or not turned.worth_saving:
-        say(night, *turned.remarks, *([] if args.save is None else [f"{args.save} is not written"]))
-        return 0 if args.save is None else NO_FIX
+        say(folder, *turned.remarks, *([] if args.save is None else [f"{args.save} is not written"]))
+        return 0 if args.save is None else console.NOTHING
     if args.save is not None:
         about = f"A3 by turning on the spot, {turned.remarks[0]}"
         save_instrument("solve", args.save, turned.calibrated.instrument, about)
     kept = "--save OUT keeps A3 and its errors" if args.save is None else f"{args.save} is written"
-    say(night, *turned.remarks, kept)
+    say(folder, *turned.remarks, kept)
     return 0
 
 
-def say(night: NightFolder, *texts: object) -> None:
+def say(folder: str | None, *texts: object) -> None:
     """Print lines about a whole night on standard error."""
     for text in texts:
-        console.complain("solve", text if night.folder is None else f"{night.folder}: {text}")
+        console.complain("solve", text if folder is None else f"{folder}: {text}")
 
 
 def read_receiver(gnss: str | None, learned: str | None, command: str) -> Receiver | None:
@@ -199,20 +196,11 @@ def _save_learned(path: Path, learned: Learned | None) -> None:
 
 def json_of_watched(told: Watched) -> dict:
     """The keys of --json of a frame that come from its fix, or its heading at GNSS's place, and `gnss`."""
-    keys = json_on_ground(told.solution.fix, told.ground)
+    keys, check = json_on_ground(told.solution.fix, told.ground), told.compared
     if (at_place := told.solution.at_place) is not None:
         keys = with_heading(keys, at_place, at_place.place)
-    return keys | {"gnss": None if told.compared is None else json_of_check(told.compared)}
-
-
-def json_of_check(check: GnssCheck) -> dict:
-    """The key `gnss` of --json."""
-    return {
-        "status": check.status.value,
-        "distance_m": check.distance_m,
-        "bearing_deg": check.bearing_deg,
-        "sigma_m": check.sigma_m,
-    }
+    about = ("status", "distance_m", "bearing_deg", "sigma_m")
+    return keys | {"gnss": None if check is None else {name: getattr(check, name) for name in about}}
 
 
 def run_pointings(args: argparse.Namespace) -> int:
@@ -231,7 +219,6 @@ def run_pointings(args: argparse.Namespace) -> int:
     output = Output(args, COLUMNS, HEAD if whole else ELEVATIONS_HEAD)
     if not whole:
         return _from_elevations(args, output, solver, tilts, pointings, vertical, near)
-    night = NightFolder(tuple(p.source for p in pointings), args.tilt)
     found, given = None, solver.instrument if not args.self_calibrate else None
     solutions: Iterable[Solution] = (solver.solve_pointing(p, tilts) for p in pointings)
     if args.self_calibrate:
@@ -239,7 +226,7 @@ def run_pointings(args: argparse.Namespace) -> int:
         solved = iter(found.solutions)
         solutions = [next(solved) if p.has_roll else solver.solve_pointing(p) for p in pointings]
     each = (FrameAnswer(p.source, s) for p, s in zip(pointings, solutions, strict=True))
-    return tell(args, output, night, NightAnswers(each, given=given, turned=found), vertical)
+    return tell(args, output, None, NightAnswers(each, given=given, turned=found), vertical)
 
 
 def _from_elevations(
@@ -260,30 +247,29 @@ def _from_elevations(
             put_elevation(output, p.source, p.mid_unix_s, None, vertical, status)
         else:
             put_elevation(output, p.source, p.mid_unix_s, circle.zenith_distance, vertical)
-    whole, night = found.together, NightFolder((), args.tilt)
-    saving = 0
+    whole, saving = found.together, 0
     if found.axis is not None:
         say(
-            night,
+            None,
             f"A3 from the elevations: the frame's centre in the inclinometer to {found.axis.stddev_arcsec:.0f} arcsec",
         )
     if args.save is not None:
         saving = _save_axis(args, solver, found.axis)
-    say(night, *([whole.why_not] if whole.why_not else ()), *whole.remarks)
+    say(None, *([whole.why_not] if whole.why_not else ()), *whole.remarks)
     place, about = whole.average, {}
     if place is not None:
         tell_unknown("solve", args, vertical.at(place.latitude, place.longitude))
         about = {} if near is None else {"km_from_near": near.km_from(place.latitude, place.longitude)}
     if place is not None or whole.why_not:
-        put_combined(output, night, place, Gathered(), vertical, about)
-    return max(saving, 0 if place else NO_FIX)
+        put_combined(output, None, place, Gathered(), vertical, about)
+    return max(saving, 0 if place else console.NOTHING)
 
 
 def _save_axis(args: argparse.Namespace, solver: Solver, axis: FoundAxis | None) -> int:
-    """Write the A3 that the elevations determined, as --save asks; NO_FIX if they did not."""
+    """Write the A3 that the elevations determined, as --save asks; console.NOTHING if they did not."""
     if axis is None or axis.stddev_arcsec > WORTH_SAVING_ARCSEC:
         console.complain("solve", f"{args.save} is not written: the elevations hardly determine A3")
-        return NO_FIX
+        return console.NOTHING
     calibration = axis.calibration(solver.instrument.calibration, options.turn_of(args))
     about = f"A3 of elevations alone: the frame's centre to {axis.stddev_arcsec:.2f} arcsec"
     save_instrument("solve", args.save, replace(solver.instrument, calibration=calibration), about)
@@ -364,7 +350,7 @@ def _run(args: argparse.Namespace) -> int:
             # takes the answers of this night, and leaves the rest
             rows = zip(night.frames, sights, strict=False)
             answers = answers_of(rows, work, vertical, how, console.ProgressBar())
-            statuses.append(tell(args, output, night, answers, vertical, place, work))
+            statuses.append(tell(args, output, night.folder, answers, vertical, place, work))
     if args.out is not None:
         places_file.write(args.out, output.answers)
     return max(statuses)

@@ -7,7 +7,9 @@ from html import escape
 from pathlib import Path
 
 from starpos.errors import InstrumentError
+from starpos.files import write_whole
 from starpos.night.watching import Kept
+from starpos.report.html import document, wide_table
 from starpos.units import ARCSEC, utc_text
 
 # key: heading of its column on the page, and format
@@ -63,15 +65,6 @@ def alarm_of(night: Kept) -> str:
     )
 
 
-def check_page(path: Path) -> None:
-    """Raise InstrumentError if a file that is there is no such page."""
-    if not path.exists():
-        return
-    with path.open("rb") as page:
-        if TITLE.encode() not in page.read(200):
-            raise InstrumentError(f"{path}: it is not a page of --watch: give another name, or remove it")
-
-
 def write_page(path: Path, nights: Sequence[Kept]) -> None:
     """Write the history as a page; raises InstrumentError if it cannot be written."""
     rows = [values_of(n) for n in nights]
@@ -82,23 +75,23 @@ def write_page(path: Path, nights: Sequence[Kept]) -> None:
         f'height="{HEIGHT * r["moved_arcsec"] / most:.1f}" fill="{"crimson" if r["alarm"] else "steelblue"}"/>'
         for k, r in enumerate(rows)
     )
-    head = "".join(f"<th>{name}</th>" for name, _ in COLUMNS.values())
-    body = "".join(
-        "<tr>"
-        + "".join(
-            f"<td>{escape(('moved' if r[k] else '') if k == 'alarm' else form.format(r[k]))}</td>"
+    cells = [
+        [
+            escape(("moved" if r[k] else "") if k == "alarm" else form.format(r[k]))
             for k, (_, form) in COLUMNS.items()
-        )
-        + "</tr>"
+        ]
         for r in rows
+    ]
+    about = (
+        f"{len(rows)} nights. Bars: how far each pose is from the mean of those before, up to {most:.0f} arcsec; red "
+        "where it has moved."
     )
-    page = (
-        '<!DOCTYPE html><html lang="en"><meta charset="utf-8">'
-        f"<title>{TITLE}</title><h1>{TITLE}</h1><p>{len(rows)} nights. Bars: how far each pose is from the mean of those "
-        f"before, up to {most:.0f} arcsec; red where it has moved.</p>"
-        f'<svg width="{WIDTH}" height="{HEIGHT}">{bars}</svg><table>{head}{body}</table></html>'
+    parts = (
+        f"<h1>{TITLE}</h1><p>{about}</p>",
+        f'<svg width="{WIDTH}" height="{HEIGHT}">{bars}</svg>',
+        wide_table([name for name, _ in COLUMNS.values()], cells),
     )
     try:
-        path.write_text(page, encoding="utf-8")
+        write_whole(path, document(TITLE, parts).encode())
     except OSError as e:
         raise InstrumentError(f"{path}: the page cannot be written there ({e.strerror})") from None

@@ -144,6 +144,11 @@ class PlaceFix:
         """Place and heading in degrees."""
         return InDegrees.of(self.latitude, self.longitude, self.heading, self.covariance)
 
+    def budget(self, ground: Geodetic) -> dict[str, np.ndarray]:
+        """1 sigma (3,) of each source: east m, north m, heading rad; the deflection's acts on the geodetic place only."""
+        roots = {t.name: np.sqrt(np.diag(t.covariance)[:3]) for t in self.terms}
+        return roots | {"deflection (geodetic only)": np.sqrt(np.diag(ground.deflection_covariance))}
+
     def on_ground(self, vertical: Vertical) -> Geodetic:
         """The geodetic place, with the deflection of the vertical removed."""
         return geodetic(self.latitude, self.longitude, self.heading, self.covariance, vertical)

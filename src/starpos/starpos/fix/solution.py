@@ -237,13 +237,8 @@ def solution_of(
     """
     planets = planets_among(stars, found, camera)
     warnings, explained = suspicions(stars, field, sky, found, tuple(row for _, row in planets))
-    return Solution(
-        Status.OK,
-        "identified",
-        source=stars.source,
-        utc_unix_s=stars.mid_unix_s,
-        stars_detected=len(stars.x),
-        negative=stars.negative,
+    return Solution.of(
+        stars,
         named=sky.catalogue.named(found.catalogue),
         star=found.star,
         pointing=pointing_of(found, sky, camera, found.spread_px(stars.x, stars.y)),

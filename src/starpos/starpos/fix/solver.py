@@ -105,6 +105,16 @@ ENOUGH_SOUND = 8
 SMALLEST_FIELD_DEG, LARGEST_FIELD_DEG = 0.3, 100.0
 
 
+# A fisheye of which only the focal length is known misplaces stars by about this, outwards: it cancels where they lie all
+# around, and not where a mask leaves one side.
+NOMINAL_LENS_RAD = 0.002
+
+
+def _one_sided(off: np.ndarray) -> float:
+    """How far places (N, 2), relative to the axis, lie on one side of it: from 0 to 1."""
+    return float(np.hypot(*off.mean(0)) / max(np.hypot(*off.T).mean(), 1e-9))
+
+
 @dataclass(frozen=True)
 class Solver:
     """Solver for one instrument in its surroundings: `solve` makes a fix, `identify` a pointing alone, by one search.
@@ -354,6 +364,9 @@ class Solver:
         check_risen(stars, found, camera, sky, up)
         use, matched = self._matched(stars, found, camera, up, state, catalogue)
         about = self.circumstances(stars, camera.scaled(found.focal_scale), state)
+        if fisheye.is_wide(camera) and not any(camera.distortion):
+            lens = NOMINAL_LENS_RAD * _one_sided(matched.xy - [camera.cx, camera.cy])
+            about = replace(about, axis_stddev=math.hypot(about.axis_stddev, lens))
         attitude = attitude_at_place(matched, place, about)
         return replace(attitude, used=np.flatnonzero(use)[attitude.used])
 

@@ -296,7 +296,9 @@ def read_exposure(data: bytes, place: str, clock: CameraClock | None, shape: tup
     offset_h, named = clock.utc_offset_h, NAMED_TIME.search(place)
     if offset_h is not None and "EXIF DateTimeOriginal" not in exif.tags and named is not None:
         with suppress(ValueError):
-            shown = datetime(*map(int, named.groups()), tzinfo=timezone.utc)
+            shown = datetime.strptime(" ".join(named.groups()), "%Y %m %d %H %M %S").replace(
+                tzinfo=timezone.utc
+            )
             return replace(
                 exposure,
                 mid_unix_s=shown.timestamp() - 3600 * offset_h + (exposure.exposure_s or 0.0) / 2,

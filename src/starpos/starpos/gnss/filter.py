@@ -72,13 +72,12 @@ def zenith_rows(sighting: LevelSight, learned: Learned, up: np.ndarray) -> np.nd
 class Innovation:
     """What a frame with a GNSS place says of the states: value (2,) = rows (2, n) @ (true - state) + noise (2, 2).
 
-    offset (2, 2): change of `value` for an error of the GNSS place, east and north as angles at the Earth's centre.
+    An error of the GNSS place, east and north as an angle at the Earth's centre, makes `value` smaller by as much.
     """
 
     value: np.ndarray
     rows: np.ndarray
     noise: np.ndarray
-    offset: np.ndarray
 
 
 def innovation(
@@ -106,7 +105,7 @@ def innovation(
     rows[:, at.gnss] -= np.eye(2)
     radii = np.array(curvature_radii_m(gnss.latitude))
     noise = axes[:2] @ (sighting.zenith_covariance + tilt_noise(sighting, learned)) @ axes[:2].T
-    return Innovation(seen, rows, noise + gnss.covariance / np.outer(radii, radii), -np.eye(2))
+    return Innovation(seen, rows, noise + gnss.covariance / np.outer(radii, radii))
 
 
 def tilt_noise(sighting: LevelSight, learned: Learned) -> np.ndarray:

@@ -119,16 +119,13 @@ def _zenith_rows(fix: Fix, sighting: LevelSight, learned: Learned) -> np.ndarray
     )
 
 
-def _kept_terms(fix: Fix) -> tuple[ErrorTerm, ...]:
-    return tuple(t for t in fix.terms if t.origin not in LEARNED_ORIGINS)
-
-
 def _budgeted(fix: Fix, sighting: LevelSight, learned: Learned) -> Fix:
     """The fix with the error of the learned states in place of the errors of A3 and the inclinometer."""
     rows = _zenith_rows(fix, sighting, learned)
     root = symmetric_root(rows @ learned.covariance @ rows.T)
     term = ErrorTerm(LEARNED_TERM, _zenith_moved(fix) @ root, shared=ALWAYS)
-    return replace(fix, terms=(*_kept_terms(fix), term))
+    kept = (t for t in fix.terms if t.origin not in LEARNED_ORIGINS)
+    return replace(fix, terms=(*kept, term))
 
 
 def _ground(fix: Fix, sighting: LevelSight, learned: Learned, vertical: Vertical) -> Geodetic:

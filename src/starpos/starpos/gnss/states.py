@@ -8,8 +8,9 @@ one pose a turn of A3 looks like a zero, and at one heading like a deflection.
 import json
 import math
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -35,66 +36,37 @@ GNSS_SLOW_RAD, GNSS_SLOW_S = 10.0 / EARTH_RADIUS_M, 300.0
 NO_A3_RAD = 1.0
 
 
-@dataclass(frozen=True)
-class Layout:
-    """Where each state stands, for a sensor of two or three axes."""
+class Layout(NamedTuple):
+    """Where each state stands.
 
-    axes: int
+    a3: a small rotation of A3 about S's axes.  zero: each axis' zero, which wanders.
+    response: the coefficients of `instrument.response`.  temperature: change of each zero per C.
+    pose: error of each axis that is new at each pose.
+    constant: deflection, east and north, that is the same everywhere, beyond the `Vertical`'s.
+    field: deflection, east and north, of this place, beyond the constant.
+    gnss: slow error of GNSS, east and north, as angles at the Earth's centre.
+    """
 
-    @cached_property
-    def _ends(self) -> list[int]:
-        widths = (3, self.axes, RESPONSE_COEFFICIENTS[self.axes], self.axes, self.axes, 2, 2, 2)
-        return np.cumsum((0, *widths)).tolist()
-
-    def _slice(self, k: int) -> slice:
-        return slice(self._ends[k], self._ends[k + 1])
-
-    @property
-    def a3(self) -> slice:
-        """A small rotation of A3 about S's axes."""
-        return self._slice(0)
-
-    @property
-    def zero(self) -> slice:
-        """Each axis' zero, which wanders."""
-        return self._slice(1)
-
-    @property
-    def response(self) -> slice:
-        """The coefficients of `instrument.response`."""
-        return self._slice(2)
-
-    @property
-    def temperature(self) -> slice:
-        """Change of each zero per C."""
-        return self._slice(3)
-
-    @property
-    def pose(self) -> slice:
-        """Error of each axis that is new at each pose."""
-        return self._slice(4)
-
-    @property
-    def constant(self) -> slice:
-        """Deflection, east and north, that is the same everywhere, beyond the `Vertical`'s."""
-        return self._slice(5)
-
-    @property
-    def field(self) -> slice:
-        """Deflection, east and north, of this place, beyond the constant."""
-        return self._slice(6)
-
-    @property
-    def gnss(self) -> slice:
-        """Slow error of GNSS, east and north, as angles at the Earth's centre."""
-        return self._slice(7)
+    a3: slice
+    zero: slice
+    response: slice
+    temperature: slice
+    pose: slice
+    constant: slice
+    field: slice
+    gnss: slice
 
     @property
     def size(self) -> int:
-        return self._ends[-1]
+        """Number of states."""
+        return self.gnss.stop
 
 
-layout_of = lru_cache(maxsize=2)(Layout)
+@lru_cache(maxsize=2)
+def layout_of(axes: int) -> Layout:
+    """The states of a sensor of two or three axes."""
+    ends = np.cumsum((0, 3, axes, RESPONSE_COEFFICIENTS[axes], axes, axes, 2, 2, 2)).tolist()
+    return Layout(*map(slice, ends, ends[1:]))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -285,28 +257,17 @@ MAX_BYTES = 200_000
 # a covariance may miss being positive by this share of its trace of correlations, by rounding
 ROUNDING = 1e-9
 CURE = "delete it to learn anew, or give another file"
+# keys of the file that are not the names of the fields
+IN_FILE = {"place": "place_rad"}
 
 
 def save_learned(path: Path, learned: Learned) -> None:
     """Write what was learned; GnssError if the file cannot be written."""
-    unknown = math.isnan(learned.temperature_c)
-    content = {
-        KEY: VERSION,
-        "axes": learned.axes,
-        "utc_unix_s": learned.utc_unix_s,
-        "since_unix_s": None if math.isnan(learned.since_unix_s) else learned.since_unix_s,
-        "frames": learned.frames,
-        "poses": learned.poses,
-        "place_rad": learned.place,
-        "temperature_c": None if unknown else learned.temperature_c,
-        "warmer_c": learned.warmer_c,
-        "calibrated_up": learned.calibrated_up.tolist(),
-        "a3": learned.a3.tolist(),
-        "state": learned.state.tolist(),
-        "covariance": learned.covariance.tolist(),
-    }
+    content = {KEY: VERSION} | {IN_FILE.get(k, k): v for k, v in vars(learned).items()}
+    for name in ("since_unix_s", "temperature_c"):
+        content[name] = None if math.isnan(content[name]) else content[name]
     try:
-        files.write_whole(path, (json.dumps(content) + "\n").encode())
+        files.write_whole(path, (json.dumps(content, default=np.ndarray.tolist) + "\n").encode())
     # ValueError: the name contains a NUL
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error

@@ -86,9 +86,7 @@ class OnsetFilters:
 
     def recent(self, utc_unix_s: float) -> "OnsetFilters":
         """The filters that are not older than LONGEST_S."""
-        return self._selected(utc_unix_s - self.since <= LONGEST_S)
-
-    def _selected(self, which: np.ndarray) -> "OnsetFilters":
+        which = utc_unix_s - self.since <= LONGEST_S
         before = tuple(b for b, kept in zip(self.before, which, strict=True) if kept)
         return OnsetFilters(
             before, self.since[which], self.frames[which], self.state[which], self.covariance[which]
@@ -104,8 +102,8 @@ class OnsetFilters:
         n, grown = len(about), (utc_unix_s - self.since) / UNIT_S
         rows = np.empty((len(self.since), 2, n + OFFSETS))
         rows[:, :, :n] = seen.rows
-        rows[:, :, n : n + 2] = seen.offset
-        rows[:, :, n + 2 :] = seen.offset * grown[:, None, None]
+        rows[:, :, n : n + 2] = -np.eye(2)
+        rows[:, :, n + 2 :] = -np.eye(2) * grown[:, None, None]
         left = np.concatenate([about - self.state[:, :n], -self.state[:, n:]], 1)
         value = seen.value + np.einsum("wij,wj->wi", rows, left)
         across = self.covariance @ rows.swapaxes(1, 2)

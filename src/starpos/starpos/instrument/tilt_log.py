@@ -172,7 +172,7 @@ class TiltLog:
     def of_readings(cls, readings: Sequence[Tilt], earlier_excess: float = 1.0) -> "TiltLog":
         """Make a log of readings, each with its own covariance."""
         names = [f.name for f in fields(cls) if "ndarray" in str(f.type)]
-        columns = {name: np.array([getattr(r, name) for r in readings]) for name in names}
+        columns: dict[str, Any] = {name: np.array([getattr(r, name) for r in readings]) for name in names}
         return cls(**columns, earlier_excess=earlier_excess)
 
     def __repr__(self) -> str:
@@ -209,8 +209,9 @@ class TiltLog:
     def until(self, unix_s: float) -> "TiltLog":
         """The readings up to a time."""
         rows = self.utc_unix_s <= unix_s
-        columns = {f.name: getattr(self, f.name) for f in fields(self)}
-        return replace(self, **{name: c[rows] for name, c in columns.items() if isinstance(c, np.ndarray)})
+        columns = ((f.name, getattr(self, f.name)) for f in fields(self))
+        kept: dict[str, Any] = {name: c[rows] for name, c in columns if isinstance(c, np.ndarray)}
+        return replace(self, **kept)
 
     def average(self, mid_unix_s: float, exposure_s: float, spread_s: float = 0.0) -> Tilt:
         """The mean tilt over an exposure, from the readings in it or, for a short one, from two that bracket it closely.

@@ -71,6 +71,7 @@ def read_tilt_csv(path: Path | str, noise_rad: float = SCA100T_NOISE_RAD) -> Til
             f"{path}: none of its {len(table.lines)} readings is a number: check the inclinometer and what wrote them"
         )
     _check_digits(path, column["utc_unix_s"])
+    _check_degrees(path, column)
     _check_one_sensor(path, column)
     order = np.argsort(column["utc_unix_s"], kind="stable")
     order = order[np.isfinite(column["utc_unix_s"][order])]
@@ -89,6 +90,7 @@ def read_tilt_csv(path: Path | str, noise_rad: float = SCA100T_NOISE_RAD) -> Til
     )
 
 
+FULL_TURN_DEG = 360.0
 # Times of these steps, s, are rounded: float32 at today's times, and six digits as %g writes.
 # FEWEST_STUCK times that are all the same were cut off elsewhere.
 ROUNDED_S, FEWEST_ROUNDED, FEWEST_STUCK = (128.0, 10_000.0), 3, 10
@@ -105,6 +107,18 @@ def _check_digits(path: Path, t: np.ndarray) -> None:
             f"{path}: {len(t)} readings have only {len(np.unique(t))} different times: they were rounded, as by float32 "
             "or %g: write utc_unix_s with its fractions of a second (%.3f, double precision)"
         )
+
+
+def _check_degrees(path: Path, column: Mapping[str, np.ndarray]) -> None:
+    """TiltError if most angles of an axis are beyond a full turn."""
+    for name in ANGLES:
+        angles = column.get(name, np.zeros(0))
+        angles = angles[np.isfinite(angles)]
+        if len(angles) and (beyond := float(np.median(np.abs(angles)))) > FULL_TURN_DEG:
+            raise TiltError(
+                f"{path}: {name} is beyond a full turn ({beyond:g}): degrees and minutes (ddmm.mm), or another unit: "
+                "give degrees with a decimal point"
+            )
 
 
 def _check_one_sensor(path: Path, column: Mapping[str, np.ndarray]) -> None:

@@ -7,7 +7,7 @@ import numpy as np
 
 from starpos import rotation
 from starpos.errors import FrameError
-from starpos.fix.camera_attitude import CameraAttitude
+from starpos.fix.attitude import CameraAttitude
 from starpos.frames.exposure import Shutter
 from starpos.frames.frame import DISC, SATURATED, Disc, FrameTrail, Stars
 from starpos.messages.stamp import stamp_to_unix

@@ -23,8 +23,7 @@ from starpos.earth.place import Place
 from starpos.earth.refraction import Atmosphere, Refraction
 from starpos.errors import FixError, FrameError, InstrumentError, TimeError
 from starpos.fix import solver
-from starpos.fix.attitude import CAMERA, ENU, GCRS, ITRS, LINK, Attitude
-from starpos.fix.camera_attitude import CameraAttitude
+from starpos.fix.attitude import CAMERA, ENU, GCRS, ITRS, LINK, Attitude, CameraAttitude
 from starpos.fix.sighting import Sighting
 from starpos.fix.solution import Solution
 from starpos.fix.star_fit import (

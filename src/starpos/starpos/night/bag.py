@@ -20,7 +20,7 @@ from starpos.messages.tilt import UNUSABLE, message_to_tilt
 from starpos.night.night import Truth
 from starpos.night.opening import truth_in
 from starpos.night.reading import Instruments
-from starpos.night.remarks import Kind, Remark
+from starpos.night.remarks import Remark
 from starpos.night.solving import Exposures, Worked
 from starpos.night.work import Solving
 from starpos.progress import Progress
@@ -162,13 +162,13 @@ class _Reading:
 
     def remarks(self, path: Path, made: str) -> tuple[Remark, ...]:
         """Remarks on left-out messages, and on how a robot's own messages were used."""
-        said = [Remark(Kind.RECORDED, f"{path.name}: {made}")] if made else []
-        said += [Remark(Kind.TILTS, sentence) for sentence in self._messages.remarks()]
+        said = [Remark(f"{path.name}: {made}")] if made else []
+        said += [Remark(sentence) for sentence in self._messages.remarks()]
         if self._unusable:
             sentence = f"{self._unusable} tilts of the bag were left out: flagged, out of range or broken"
-            said.append(Remark(Kind.TILTS, sentence))
+            said.append(Remark(sentence))
         if self._why_no_camera and not self.cameras:
-            said.append(Remark(Kind.RECORDED, f"{path.name}: {self._why_no_camera}"))
+            said.append(Remark(f"{path.name}: {self._why_no_camera}"))
         return tuple(said)
 
 

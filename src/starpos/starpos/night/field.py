@@ -149,7 +149,6 @@ def _about(exposures: Exposures, unreadable: int) -> dict:
         "versions": {"python": platform.python_version(), "machine": platform.machine()} | dict(_versions()),
         "air": vars(exposures.work.atmosphere),
         "frames_left_out": unreadable,
-        "remarks": [remark.kind.value for remark in exposures.remarks],
     }
 
 

@@ -58,7 +58,6 @@ class Stage(Enum):
 class Look:
     """What a step found at a frame; todo: what to do next."""
 
-    step: Stage
     done: bool
     found: str
     todo: str
@@ -103,7 +102,6 @@ class FirstNight:
 
     def inspect(self, sight: Sight, log: TiltLog | str) -> Look:
         """Inspect the next frame, identified, with the tilts so far, or a sentence on why they are missing."""
-        step = self._steps[0]
         looks: dict[Stage, Callable[[], Look]] = {
             Stage.FOCUS: lambda: self._focus(sight.stars),
             Stage.EXPOSURE: lambda: self._exposure(sight),
@@ -111,7 +109,7 @@ class FirstNight:
             Stage.HORIZON: lambda: self._with_pose(sight, log, self._horizon),
             Stage.TURN: lambda: self._with_pose(sight, log, self._turn),
         }
-        look = looks[step]()
+        look = looks[self._steps[0]]()
         if look.done:
             self._steps.pop(0)
         return look
@@ -119,21 +117,19 @@ class FirstNight:
     def _focus(self, stars: Stars) -> Look:
         width = stars.fwhm_px
         if width is None or not width > 0:
-            return Look(Stage.FOCUS, False, "no width of stars", "check cap, clouds and exposure")
+            return Look(False, "no width of stars", "check cap, clouds and exposure")
         self._widths.append(width)
         best = min(self._widths)
         bar = "#" * round(BAR * best / width)
         found = f"FWHM {width:4.1f} px [{bar:<{BAR}}] best {best:.1f}"
         last = self._widths[-SHARP_FRAMES:]
         if len(last) == SHARP_FRAMES and max(last) <= min(AS_SHARP * best, WIDEST_PX):
-            return Look(Stage.FOCUS, True, found, "leave the focus as it is and fix it with tape")
+            return Look(True, found, "leave the focus as it is and fix it with tape")
         if width > AS_SHARP * best:
-            return Look(Stage.FOCUS, False, found, "turn the ring back: it was sharper")
+            return Look(False, found, "turn the ring back: it was sharper")
         if width > WIDEST_PX:
-            return Look(
-                Stage.FOCUS, False, found, f"turn the focus ring a little, until it is under {WIDEST_PX:g} px"
-            )
-        return Look(Stage.FOCUS, False, found, "hands off for some frames")
+            return Look(False, found, f"turn the focus ring a little, until it is under {WIDEST_PX:g} px")
+        return Look(False, found, "hands off for some frames")
 
     def _exposure(self, sight: Sight) -> Look:
         stars = sight.stars
@@ -147,28 +143,21 @@ class FirstNight:
         if stars.fwhm_px is not None and stars.fwhm_px < NARROWEST_PX:
             found += f", FWHM {stars.fwhm_px:.1f} px: too sharp for its pixels"
         if saturated > MAX_SATURATED:
-            return Look(Stage.EXPOSURE, False, found, "halve the exposure, or the gain")
+            return Look(False, found, "halve the exposure, or the gain")
         if len(stars) < MIN_STARS:
-            return Look(Stage.EXPOSURE, False, found, "double the exposure, or the gain")
+            return Look(False, found, "double the exposure, or the gain")
         if sight.found is None:
-            return Look(Stage.EXPOSURE, False, found, sight.solution.message)
-        return Look(
-            Stage.EXPOSURE,
-            True,
-            f"{found}, {len(sight.found.star)} identified",
-            "keep exposure and gain",
-        )
+            return Look(False, found, sight.solution.message)
+        return Look(True, f"{found}, {len(sight.found.star)} identified", "keep exposure and gain")
 
     def _level(self, stars: Stars, log: TiltLog | str) -> Look:
         if isinstance(log, str):
-            return Look(Stage.LEVEL, False, log, "connect the inclinometer")
+            return Look(False, log, "connect the inclinometer")
         end = log.utc_unix_s[-1]
         late_s = (stars.mid_unix_s or 0.0) - end
         near = log.utc_unix_s > end - LEVEL_S
         if late_s > LEVEL_S or np.ptp(log.utc_unix_s[near]) < 0.8 * LEVEL_S:
-            return Look(
-                Stage.LEVEL, False, f"no tilts over {LEVEL_S:.0f} s yet", "leave the instrument alone"
-            )
+            return Look(False, f"no tilts over {LEVEL_S:.0f} s yet", "leave the instrument alone")
         angles = np.degrees([log.theta_x[near], log.theta_y[near]]) * 3600
         minutes = (log.utc_unix_s[near] - end) / 60
         drift = np.polyfit(minutes, angles.T, 1)[0]
@@ -176,24 +165,21 @@ class FirstNight:
         stated = np.degrees(self._solver.instrument.inclinometer.noise_rad) * 3600
         found = f"noise {noise:.1f} arcsec (stated {stated:.1f}), drift {drift[0]:+.0f}, {drift[1]:+.0f} arcsec/min"
         if not _still(log, end - LEVEL_S, end):
-            return Look(
-                Stage.LEVEL, False, found, "wait until nothing moves: a firm ground, no wind, no hands"
-            )
-        return Look(Stage.LEVEL, True, found, "the level is still")
+            return Look(False, found, "wait until nothing moves: a firm ground, no wind, no hands")
+        return Look(True, found, "the level is still")
 
     def _with_pose(self, sight: Sight, log: TiltLog | str, look: Callable[[Standing], Look]) -> Look:
-        step = self._steps[0]
         if isinstance(log, str):
-            return Look(step, False, log, "connect the inclinometer")
+            return Look(False, log, "connect the inclinometer")
         mid = sight.stars.mid_unix_s
         if sight.found is None or mid is None:
-            return Look(step, False, sight.solution.message, "wait for stars")
+            return Look(False, sight.solution.message, "wait for stars")
         try:
             tilt = log.average(mid, sight.stars.exposure_s or 0.0)
         except StarposError as error:
-            return Look(step, False, str(error), "wait for tilts")
+            return Look(False, str(error), "wait for tilts")
         if not _still(log, mid - AROUND_S, mid + AROUND_S):
-            return Look(step, False, "it moves", "hands off until it is still")
+            return Look(False, "it moves", "hands off until it is still")
         camera = sight.found.attitude @ earth_state(mid).gcrs_to_itrs.T
         return look(Standing(sight, up_of(tilt.theta), camera))
 
@@ -222,8 +208,8 @@ class FirstNight:
         found += f", the stars differ by {misfit:.0%}"
         if len(leans) > 1 and self._turn_of(base, leans, mirrored=True)[1] <= OFF_SHARE:
             todo = "one of X' and Y' has the wrong sign, or they are swapped: correct it, and begin anew"
-            return Look(Stage.HORIZON, False, f"{found}: the level is mirrored", todo)
-        return Look(Stage.HORIZON, False, found, "camera and level do not move together: look what is loose")
+            return Look(False, f"{found}: the level is mirrored", todo)
+        return Look(False, found, "camera and level do not move together: look what is loose")
 
     def _turn_of(self, base: Standing, leans: Sequence[Standing], mirrored: bool) -> tuple[float, float]:
         """Turn of A3 about Z' (rad) with which the stars lean as the level does, and the misfit as a share of the lean.
@@ -255,16 +241,11 @@ class FirstNight:
             found += f"A3's rz is {now_deg:.0f} deg, not {rz:.0f}"
         else:
             found += f"A3's signs are right, its rz is {now_deg:.0f} deg"
-        return Look(
-            Stage.HORIZON,
-            True,
-            found,
-            "set the foot back; then turn the whole instrument on the spot by 90 deg",
-        )
+        return Look(True, found, "set the foot back; then turn the whole instrument on the spot by 90 deg")
 
     def _lean(self, found: str) -> Look:
         foot = "only another foot, a quarter around," if self._leans else "one foot"
-        return Look(Stage.HORIZON, False, found, f"raise {foot} by 1 to 5 deg, and wait")
+        return Look(False, found, f"raise {foot} by 1 to 5 deg, and wait")
 
     def _turn(self, pose: Standing) -> Look:
         near = [k for k, heading in enumerate(self._headings) if _angle_deg(heading[0], pose) < APART_DEG]
@@ -276,9 +257,9 @@ class FirstNight:
         number, many = number + 1, len(self._headings[number])
         found = f"heading {number} of {HEADINGS}: frame {many}"
         if many < FRAMES_EACH:
-            return Look(Stage.TURN, False, found, "hands off")
+            return Look(False, found, "hands off")
         if sum(len(h) >= FRAMES_EACH for h in self._headings) < HEADINGS:
-            return Look(Stage.TURN, False, found, "turn by 90 deg on the spot, always the same way")
+            return Look(False, found, "turn by 90 deg on the spot, always the same way")
         return self._calibrated(found)
 
     def _calibrated(self, found: str) -> Look:
@@ -292,10 +273,10 @@ class FirstNight:
             self._solver.instrument.inclinometer.noise_rad,
         )
         self.turned = turned(solver, frames, log, TURN_STDDEV_DEG)
-        said = f"{found}; {'; '.join(map(str, self.turned.remarks))}"
+        said = f"{found}; {'; '.join(self.turned.remarks)}"
         if not self.turned.worth_saving:
-            return Look(Stage.TURN, False, said, "turn on, to other headings")
-        return Look(Stage.TURN, True, said, "A3 is known")
+            return Look(False, said, "turn on, to other headings")
+        return Look(True, said, "A3 is known")
 
 
 def _angle_deg(one: Standing, other: Standing) -> float:

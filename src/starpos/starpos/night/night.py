@@ -201,5 +201,5 @@ class Night:
         head = ("frame", "status", "place (astronomic) and 1 sigma", "")
         table = "".join(f"<tr>{''.join(f'<td>{escape(cell)}</td>' for cell in row)}</tr>" for row in rows)
         titles = "".join(f"<th>{title}</th>" for title in head)
-        said = "".join(f"<p>{escape(remark.text)}</p>" for remark in self.remarks)
+        said = "".join(f"<p>{escape(remark)}</p>" for remark in self.remarks)
         return f"<p><b>{escape(repr(self)[1:-1])}</b></p><table><tr>{titles}</tr>{table}</table>{said}"

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Remarks on a night, each a kind and a sentence; among them doubts: mistaken tilts, a place far from the stated one."""
+"""Remarks on a night, each a sentence; among them doubts: mistaken tilts, a place far from the stated one."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from enum import Enum
 
 import numpy as np
 
@@ -42,46 +41,20 @@ TABLE_COSINE, TABLE_GAP_RAD = float(np.cos(np.radians(5.0))), np.radians(190.0)
 WORTH_SAVING_ARCSEC = 600.0
 
 
-class Kind(str, Enum):
-    """What a remark is about."""
-
-    TILTS = "tilts"
-    INCLINOMETER = "inclinometer"
-    FOCAL_LENGTH = "focal length"
-    AXIS = "optical axis"
-    EARTH_ROTATION = "earth rotation"
-    LEFT_OUT = "left out"
-    MOVED = "moved"
-    CALIBRATED = "calibrated"
-    NOT_CALIBRATED = "not calibrated"
-    UNKNOWN_A3 = "unknown A3"
-    MISTAKEN = "mistaken"
-    FAR = "far"
-    RECORDED = "recorded"
-    GNSS = "gnss"
-
-
-@dataclass(frozen=True)
-class Remark:
+class Remark(str):
     """A sentence about a night, which begins with a small letter and ends without a full stop."""
-
-    kind: Kind
-    text: str
-
-    def __str__(self) -> str:
-        return self.text
 
 
 def of_tilts(log: TiltLog, path: str, inclinometer: InclinometerErrors) -> tuple[Remark, ...]:
     """Say that a table of tilts looks like radians, or is rounded to steps coarser than the inclinometer's."""
     doubts = (like_radians(log), inclinometer.coarser(log.step_rad))
-    return tuple(Remark(Kind.TILTS, f"{path}: {doubt}") for doubt in doubts if doubt)
+    return tuple(Remark(f"{path}: {doubt}") for doubt in doubts if doubt)
 
 
 def of_inclinometer(instrument: Instrument, ways: str = MODEL_BY_OPTIONS) -> tuple[Remark, ...]:
     """Say that the inclinometer's model is not stated; ways: what to do then."""
     sentence = unnamed_inclinometer(instrument, ways)
-    return (Remark(Kind.INCLINOMETER, sentence),) if sentence else ()
+    return (Remark(sentence),) if sentence else ()
 
 
 def of_gravity(instrument: Instrument, by_log: bool = False) -> tuple[Remark, ...]:
@@ -91,7 +64,7 @@ def of_gravity(instrument: Instrument, by_log: bool = False) -> tuple[Remark, ..
     level = "felt by the telephone" if instrument.inclinometer_model == PHONE else "by the camera's level"
     where = "the telephone's log, as the camera's own" if by_log else f"the gravity in the files, {level}"
     sentence = f"the level is {where}; time, zone and lens are the files', and their GPS is only compared"
-    return (Remark(Kind.RECORDED, sentence),)
+    return (Remark(sentence),)
 
 
 def of_marks(place: Fix | Average, marks_deg: Sequence[tuple[float, float]]) -> tuple[Remark, ...]:
@@ -104,7 +77,7 @@ def of_marks(place: Fix | Average, marks_deg: Sequence[tuple[float, float]]) -> 
     sigmas = float(np.sqrt(off @ np.linalg.solve(place.covariance[:2, :2], off)))
     claim = "within the claim" if sigmas < CLAIMED_SIGMAS else f"{sigmas:.1f} sigma, beyond the claim"
     km = mark.km_from(place.latitude, place.longitude)
-    return (Remark(Kind.FAR, f"the place is {km:.0f} km from the GPS place in the file, {claim}"),)
+    return (Remark(f"the place is {km:.0f} km from the GPS place in the file, {claim}"),)
 
 
 def of_table(fixes: Sequence[Fix], whole: Average, given: Instrument) -> tuple[Remark, ...]:
@@ -122,12 +95,12 @@ def of_table(fixes: Sequence[Fix], whole: Average, given: Instrument) -> tuple[R
         "the camera was turned where it lay: --self-calibrate finds the error of its level, for a place to about "
         f"{km:.1f} km, and with --save OUT later photographs have it"
     )
-    return (Remark(Kind.NOT_CALIBRATED, sentence),)
+    return (Remark(sentence),)
 
 
 def of_axis(doubt: str) -> tuple[Remark, ...]:
     """Say that the optical axis of a night's frames is not known; doubt: the sentence, '' if it is known."""
-    return (Remark(Kind.AXIS, doubt),) if doubt else ()
+    return (Remark(doubt),) if doubt else ()
 
 
 def of_extrapolation(fix: Fix, days: float) -> tuple[Remark, ...]:
@@ -139,7 +112,7 @@ def of_extrapolation(fix: Fix, days: float) -> tuple[Remark, ...]:
         f"the Earth's rotation is extrapolated {days:.0f} days beyond the IERS table, "
         f"{np.sqrt(ut1.covariance[0, 0]):.0f} m east (1 sigma, in the budget): upgrade astropy-iers-data"
     )
-    return (Remark(Kind.EARTH_ROTATION, sentence),)
+    return (Remark(sentence),)
 
 
 def of_average(whole: Average) -> Iterator[Remark]:
@@ -147,13 +120,11 @@ def of_average(whole: Average) -> Iterator[Remark]:
     if whole.moved:
         begin = utc_text(whole.began_unix_s)
         yield Remark(
-            Kind.MOVED,
-            f"the instrument was moved: the average is of its last place, {whole.frames} frames since {begin}",
+            f"the instrument was moved: the average is of its last place, {whole.frames} frames since {begin}"
         )
     if whole.left_out:
         yield Remark(
-            Kind.LEFT_OUT,
-            f"{whole.left_out} fixes lie further from the others than their errors allow: they are not in the average",
+            f"{whole.left_out} fixes lie further from the others than their errors allow: they are not in the average"
         )
 
 
@@ -169,8 +140,7 @@ def of_left_out(elevations: int) -> Iterator[Remark]:
     """Say that some elevations are not used."""
     if elevations:
         yield Remark(
-            Kind.LEFT_OUT,
-            f"{elevations} elevations contradict the others and are left out: their tilts or pointings are wrong",
+            f"{elevations} elevations contradict the others and are left out: their tilts or pointings are wrong"
         )
 
 
@@ -179,40 +149,36 @@ def of_elevations(place: Average) -> Iterator[Remark]:
     yield from of_left_out(place.left_out)
     if beyond_stated(replace(place, left_out=0)):
         yield Remark(
-            Kind.TILTS,
-            "the elevations scatter by more than the stated errors of tilts and A3: the claimed error includes it",
+            "the elevations scatter by more than the stated errors of tilts and A3: the claimed error includes it"
         )
 
 
 def of_denied_a3(axis: FoundAxis, given: Calibration) -> Remark:
     """Say that the elevations deny the A3 that was given."""
     return Remark(
-        Kind.UNKNOWN_A3,
         f"the elevations deny the A3 given, by {axis.sigma_from(given):.0f} sigma: the place is from the A3 that they "
-        "determine: calibrate again",
+        "determine: calibrate again"
     )
 
 
 def of_a3(calibration: Calibration, place: Fix | Average, ways: str = BY_OPTIONS) -> tuple[Remark, ...]:
     """Say that A3's error makes the position error large; ways: what to do then."""
     sentence = unknown_a3(calibration, place.covariance, place.terms, ways)
-    return (Remark(Kind.UNKNOWN_A3, sentence),) if sentence else ()
+    return (Remark(sentence),) if sentence else ()
 
 
 def of_turn(turned: Calibrated) -> Iterator[Remark]:
     """Say how well A3 was found by turning."""
     error = f"the plumb line in the camera is known to {turned.plumb_stddev_arcsec:.2f} arcsec"
     if turned.plumb_stddev_arcsec > WORTH_SAVING_ARCSEC:
-        yield Remark(
-            Kind.NOT_CALIBRATED, f"not calibrated: the headings hardly determine A3, {error}: turn it further"
-        )
+        yield Remark(f"not calibrated: the headings hardly determine A3, {error}: turn it further")
         return
     found = turned.instrument.calibration
-    yield Remark(Kind.CALIBRATED, f"calibrated: {error}; {at_another_lean(found)}")
+    yield Remark(f"calibrated: {error}; {at_another_lean(found)}")
     if may_turn(found):
-        yield Remark(Kind.CALIBRATED, f"to use A3 at another lean, {FIND_TURN}")
+        yield Remark(f"to use A3 at another lean, {FIND_TURN}")
     if turned.beyond:
-        yield Remark(Kind.INCLINOMETER, turned.beyond)
+        yield Remark(turned.beyond)
 
 
 NEAR_KM = 50.0
@@ -259,9 +225,9 @@ def doubts(
     """
     frames: list[Leaning] = [(f.camera.rotation, f.tilt) for f in fixes]
     if apart := _mistaken(mounting, frames):
-        yield Remark(Kind.MISTAKEN, apart)
+        yield Remark(apart)
     if near is not None and (away := _far(near, whole, mounting, frames[-1:])):
-        yield Remark(Kind.FAR, away)
+        yield Remark(away)
 
 
 def apart_m(a: tuple[float, float], b: tuple[float, float]) -> float:

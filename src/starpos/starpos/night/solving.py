@@ -23,7 +23,7 @@ from starpos.instrument.inclinometer import level_of, up_of
 from starpos.instrument.instrument import Instrument
 from starpos.instrument.tilt_log import NO_TILTS
 from starpos.night.night import Night, Shot, Truth, why_none
-from starpos.night.remarks import Kind, Remark
+from starpos.night.remarks import Remark
 from starpos.night.together import (
     FrameAnswer,
     Gathered,
@@ -197,7 +197,7 @@ def solved_night(exposures: Exposures, how: How = ONE_BY_ONE, progress: Progress
         gathered.gather(answer)
         shots.append(Shot.of(answer.name, answer.solution, answer.stars))
         if answer.solution.remark:
-            of_frames.append(Remark(Kind.FOCAL_LENGTH, answer.solution.remark))
+            of_frames.append(Remark(answer.solution.remark))
         progress(exposures.name[:20], done / exposures.count)
     whole = together(gathered, answers.given)
     said = [

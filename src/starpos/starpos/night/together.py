@@ -31,36 +31,10 @@ from starpos.gnss.watch import GnssWatch
 from starpos.instrument.instrument import Calibration, Instrument
 from starpos.instrument.tilt_log import Tilts
 from starpos.night import remarks
-from starpos.night.remarks import Kind, Near, Remark, doubts, of_inclinometer
+from starpos.night.remarks import Near, Remark, doubts, of_inclinometer
 
 # elevations that have A3's axis further from where it was given, in sigma of both, deny the given one
 DENIED_SIGMA = 6.0
-
-
-@dataclass(frozen=True, kw_only=True)
-class Solved:
-    """The part of a Solution that is needed until the end of a night."""
-
-    fix: Fix
-    extrapolated_days: float
-    stars_detected: int
-    stars_matched: int
-    log_odds: float
-    gps_deg: tuple[float, float] | None
-
-    @classmethod
-    def of(cls, s: Solution, fix: Fix, gps_deg: tuple[float, float] | None = None) -> "Solved":
-        """The part of a solution with a fix; gps_deg: as the Exposure of its stars has it."""
-        light = replace(fix, used=np.zeros(0, int), residual_px=np.zeros((0, 2)))
-        log_odds = s.pointing.log_odds if s.pointing else float("nan")
-        return cls(
-            fix=light,
-            extrapolated_days=s.extrapolated_days,
-            stars_detected=s.stars_detected,
-            stars_matched=len(s.names),
-            log_odds=log_odds,
-            gps_deg=gps_deg,
-        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,14 +60,16 @@ class FrameAnswer:
 class Gathered:
     """What is needed of a night's answers at its end, gathered one after another.
 
-    solved: those with a fix; headings: those with a heading at a known place; circles: of those that saw the Sun, which
-    serve where nothing is solved; warnings: of all, each once.
+    solved: those with a fix, without the details of each star; headings: those with a heading at a known place;
+    circles: of those that saw the Sun, which serve where nothing is solved; warnings: of all, each once.
+    marks_deg: the places that GPS wrote into the files of those with a fix.
     lost: the stars of the first frame that was not identified; None without one.
     unreadable: whether a file was.
     """
 
     def __init__(self) -> None:
-        self.solved: list[Solved] = []
+        self.solved: list[Solution] = []
+        self.marks_deg: list[tuple[float, float]] = []
         self.headings: list[Solution] = []
         self.circles: list[Circle] = []
         self.warnings: set[str] = set()
@@ -106,13 +82,21 @@ class Gathered:
         self.unreadable |= not answer.readable
         self.warnings |= set(s.warnings)
         if s.fix:
-            self.solved.append(Solved.of(s, s.fix, None if answer.stars is None else answer.stars.gps_deg))
+            light = replace(s.fix, used=np.zeros(0, int), residual_px=np.zeros((0, 2)))
+            self.solved.append(replace(s, fix=light, star=None, found=None, hint=None, at_place=None))
+            if answer.stars is not None and answer.stars.gps_deg is not None:
+                self.marks_deg.append(answer.stars.gps_deg)
         if s.at_place:
             self.headings.append(s)
         if s.circle is not None:
             self.circles.append(s.circle)
         if s.status is Status.NOT_IDENTIFIED and self.lost is None:
             self.lost = answer.stars
+
+    @property
+    def fixes(self) -> list[Fix]:
+        """The fixes of those with one."""
+        return [s.fix for s in self.solved if s.fix is not None]
 
 
 @dataclass(frozen=True)
@@ -130,16 +114,16 @@ def together(gathered: Gathered, given: Instrument | None, near: Near | None = N
     given: the instrument whose A3 was used unchanged; None if A3 was found by turning.
     near: where the instrument should be.
     """
-    solved = gathered.solved
-    if not solved:
+    fixes = gathered.fixes
+    if not fixes:
         return _by_day(gathered.circles, near) if gathered.circles else Together()
     whole, why_not = None, ""
     try:
-        whole = average([s.fix for s in solved])
+        whole = average(fixes)
     except FixError as error:
         why_not = str(error)
-    place = solved[-1].fix if whole is None else whole
-    said = list(extrapolated(solved))
+    place = fixes[-1] if whole is None else whole
+    said = list(extrapolated(gathered.solved))
     said += [] if whole is None else remarks.of_average(whole)
     mounting = None
     if given is not None:
@@ -147,9 +131,9 @@ def together(gathered: Gathered, given: Instrument | None, near: Near | None = N
         said += remarks.of_a3(given.calibration, place)
         if given.vertical is None and not given.calibration.unknown:
             mounting = given.mounting
-        said += [] if whole is None else remarks.of_table([s.fix for s in solved], whole, given)
-    said += remarks.of_marks(place, [s.gps_deg for s in solved if s.gps_deg is not None])
-    said += doubts([s.fix for s in solved], place, mounting, near)
+        said += [] if whole is None else remarks.of_table(fixes, whole, given)
+    said += remarks.of_marks(place, gathered.marks_deg)
+    said += doubts(fixes, place, mounting, near)
     return Together(whole, why_not, tuple(said))
 
 
@@ -167,10 +151,12 @@ def _by_day(circles: Sequence[Circle], near: Near | None) -> Together:
     return Together(place, "", (*remarks.of_average(place), *doubts((), place, None, near)))
 
 
-def extrapolated(solved: Iterable[Solved]) -> tuple[Remark, ...]:
+def extrapolated(solved: Iterable[Solution]) -> tuple[Remark, ...]:
     """Say of the worst fix that it lies beyond the IERS table, if one does."""
     worst = max(solved, key=lambda s: s.extrapolated_days, default=None)
-    return () if worst is None else remarks.of_extrapolation(worst.fix, worst.extrapolated_days)
+    if worst is None or worst.fix is None:
+        return ()
+    return remarks.of_extrapolation(worst.fix, worst.extrapolated_days)
 
 
 @dataclass(frozen=True)
@@ -360,5 +346,5 @@ def watched_night(
         if gnss is not None:
             rough = placed(solver, stars, rough, gnss.deflected(vertical))
         answers[k] = watched(solver, stars, rough, gnss, watch)
-    remarks = tuple(Remark(Kind.GNSS, f"{number} frames: {why}") for why, number in said.items())
+    remarks = tuple(Remark(f"{number} frames: {why}") for why, number in said.items())
     return WatchedNight(tuple(answers[k] for k in range(len(sights))), watch.learned, remarks)

@@ -32,7 +32,7 @@ from starpos.instrument import instrument_file
 from starpos.instrument.instrument import ByGravity, Instrument, with_frame_size
 from starpos.instrument.tilt_log import Tilts
 from starpos.night.reading import First, Instruments, Reader, TiltFile, stars_of
-from starpos.night.remarks import Kind, Remark
+from starpos.night.remarks import Remark
 from starpos.progress import Progress, quiet
 from starpos.sky import catalogue
 from starpos.sky.bodies import ERFA, SolarSystem
@@ -221,7 +221,7 @@ class Solving:
         focal_px = focal_px_that_fits(self.solver(lost), lost)
         if focal_px is None:
             return ()
-        return (Remark(Kind.FOCAL_LENGTH, other_focal_length(lost.place, focal_px)),)
+        return (Remark(other_focal_length(lost.place, focal_px)),)
 
 
 def identify(

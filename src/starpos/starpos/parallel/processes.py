@@ -13,10 +13,13 @@ import sys
 import traceback
 import warnings
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager, suppress
 from multiprocessing import get_context, resource_tracker
-from multiprocessing.connection import Connection, wait
+from multiprocessing.connection import Connection
+from queue import SimpleQueue
+from threading import Lock
 from typing import Any
 
 from starpos.errors import FrameError, StarposError, one_line
@@ -36,8 +39,8 @@ ONE_THREAD = dict.fromkeys((*BLAS_THREADS, "OPENCV_FOR_THREADS_NUM"), "1")
 Files = str | tuple[str, ...]
 # The work and its argument, which can be pickled: a file or files, or anything else.
 Call = tuple[Callable[[Any], Any], Any]
-# A call and its number.
-Task = tuple[int, Call]
+# The warnings that the work gave, and its pickled answer.
+_Said = tuple[Sequence[str], bytes]
 
 
 def worked(work: Callable, files: Files) -> bytes:
@@ -105,7 +108,7 @@ def memory_bytes() -> int:
 
 
 class Processes:
-    """A number of processes, started on entering and ended on leaving.
+    """A number of processes, started on entering and ended on leaving; a thread for each waits for its answers.
 
     A process that dies is replaced. Its call is done again while no other is, so that it has all of the machine's memory;
     if its process dies again, it is given up.
@@ -113,60 +116,85 @@ class Processes:
 
     def __init__(self, number: int) -> None:
         self._number, self._stillborn = number, 0
+        self._ended, self._how_ended = False, ""
+        # None: there will be no more
+        self._idle: SimpleQueue[_Worker | None] = SimpleQueue()
         self._workers: list[_Worker] = []
+        self._starting = Lock()
 
     def __enter__(self) -> "Processes":
         for _ in range(self._number):
-            self._workers.append(_Worker())
+            self._start()
+        self._threads = ThreadPoolExecutor(self._number)
         return self
 
     def __exit__(self, *_: object) -> None:
+        self._ended = True
+        self._idle.put(None)
+        with self._starting:
+            for worker in self._workers:
+                worker.kill()
+        self._threads.shutdown(cancel_futures=True)
         for worker in self._workers:
             worker.end()
 
+    def _start(self) -> None:
+        with self._starting:
+            worker = _Worker()
+            self._workers.append(worker)
+        self._idle.put(worker)
+
     def map(self, calls: Iterable[Call]) -> Iterator:
         """Yield the answers as `Here.map` does."""
-        board = _Board(calls, AHEAD * self._number)
+        coming = iter(calls)
+        under_way: deque[tuple[Call, Future[_Said | str]]] = deque()
         while True:
-            yield from board.pop_answers()
-            for k, worker in enumerate(self._workers):
-                if worker.task is None and (task := board.next_task()) is not None and not worker.send(task):
-                    self._replace(k, board, task)
-            busy = [(k, w, w.task) for k, w in enumerate(self._workers) if w.task is not None]
-            if not busy:
-                if board.finished:
-                    return
+            while len(under_way) < AHEAD * self._number and (call := next(coming, None)) is not None:
+                under_way.append((call, self._threads.submit(self._done, call)))
+            if not under_way:
+                return
+            call, future = under_way.popleft()
+            outcome = future.result()
+            if isinstance(outcome, str):
+                wait(f for _, f in under_way)
+                outcome = self._done(call)
+            if isinstance(outcome, str):
+                how = f"the process that worked it ended twice, the second time alone ({outcome})"
+                yield FrameError(f"{call[1]}: given up: {how}")
                 continue
-            ready = wait([worker.pipe for _, worker, _ in busy])
-            for k, worker, task in busy:
-                if worker.pipe not in ready:
-                    continue
-                try:
-                    outcome = worker.receive()
-                except (EOFError, OSError):
-                    self._replace(k, board, task)
-                    continue
-                self._stillborn = 0
-                if outcome is not None:
-                    board.finish(task, outcome)
-                    worker.task = None
+            said, answer = outcome
+            for text in said:
+                warnings.warn(text, stacklevel=2)
+            yield answer_of(answer)
 
-    def _replace(self, k: int, board: "_Board", task: Task) -> None:
-        """Start a process in place of one that has died, and put its task back on the board.
+    def _done(self, call: Call) -> "_Said | str":
+        """What a process makes of a call, or in words how the one ended that had begun it.
 
-        A task that it had not begun did not end it: something else did, between two calls.
+        A process that ends before it has begun the call is replaced: something else ended it, between two calls.
         """
-        dead = self._workers[k]
-        why = dead.end(DYING_S)
-        self._stillborn += not dead.ready
-        if self._stillborn > MAX_STILLBORN:
-            del self._workers[k]
-            raise ProcessError(f"the processes of --jobs do not start ({why}): use fewer, or --jobs 1")
-        self._workers[k] = _Worker()
-        if dead.begun:
-            board.fail(task, why)
-        else:
-            board.put_back(task)
+        while (worker := self._idle.get()) is not None:
+            outcome = worker.work(call)
+            if outcome is not None:
+                self._stillborn = 0
+                self._idle.put(worker)
+                return outcome
+            if self._ended:
+                break
+            with self._starting:
+                self._workers.remove(worker)
+                self._stillborn += not worker.ready
+            how = worker.end(DYING_S)
+            if self._stillborn > MAX_STILLBORN:
+                self._how_ended = how
+                break
+            self._start()
+            if worker.begun:
+                return how
+        # all other threads end, too
+        self._idle.put(None)
+        raise ProcessError(
+            f"the processes of --jobs do not start ({self._how_ended}): use fewer, or --jobs 1"
+        )
 
 
 # Where calls are done: a context manager that leaves nothing running.
@@ -178,109 +206,47 @@ def workers(number: int) -> Workers:
     return Here() if number <= 1 else Processes(number)
 
 
-class _Board:
-    """The calls that are still to do, and the answers in their order."""
-
-    def __init__(self, calls: Iterable[Call], ahead: int) -> None:
-        self._coming, self._ahead = enumerate(calls), ahead
-        self._under_way: set[int] = set()
-        self._again: deque[Task] = deque()
-        # Calls that were given to a process which was dead already.
-        self._untouched: deque[Task] = deque()
-        # Calls that have ended a process.
-        self._tried: set[int] = set()
-        self._done: dict[int, bytes] = {}
-        self._given = self._popped = 0
-
-    def next_task(self) -> Task | None:
-        """The next task; None if nothing is left, or if it must not run together with the tasks under way."""
-        if self._under_way & self._tried or (self._again and self._under_way):
-            return None
-        task: Task | None = None
-        if self._again:
-            task = self._again.popleft()
-        elif self._untouched:
-            task = self._untouched.popleft()
-        elif self._given - self._popped < self._ahead and (task := next(self._coming, None)) is not None:
-            self._given += 1
-        if task is not None:
-            self._under_way.add(task[0])
-        return task
-
-    def finish(self, task: Task, outcome: bytes) -> None:
-        self._under_way.discard(task[0])
-        self._done[task[0]] = outcome
-
-    def put_back(self, task: Task) -> None:
-        self._under_way.discard(task[0])
-        self._untouched.append(task)
-
-    def fail(self, task: Task, why: str) -> None:
-        number, (_, files) = task
-        self._under_way.discard(number)
-        if number not in self._tried:
-            self._tried.add(number)
-            self._again.append(task)
-            return
-        error = FrameError(
-            f"{files}: given up: the process that worked it ended twice, the second time alone ({why})"
-        )
-        self._done[number] = pickle.dumps(error)
-
-    def pop_answers(self) -> Iterator:
-        while self._popped in self._done:
-            outcome = self._done.pop(self._popped)
-            self._popped += 1
-            yield answer_of(outcome)
-
-    @property
-    def finished(self) -> bool:
-        """Whether nothing is left to do; asked while no call is under way."""
-        return not self._again and self._popped == self._given
-
-
 class _Worker:
     """A process.
 
-    task   given and not answered yet
-    begun  whether it has begun that one
-    ready  whether it has started to work at all
+    begun: whether it has begun the call that it was given last.  ready: whether it has started to work at all.
     """
 
     def __init__(self) -> None:
         self.pipe, theirs = get_context("spawn").Pipe()
-        self.task: Task | None = None
         self.begun = self.ready = False
         self._process = get_context("spawn").Process(target=_serve, args=(theirs,), daemon=True)
         with theirs, _for_one_that_starts():
             self._process.start()
 
-    def send(self, task: Task) -> bool:
-        """Send a task; False if the process has died."""
-        self.task, self.begun = task, False
+    def work(self, call: Call) -> _Said | None:
+        """What the process says of a call; None if it has died."""
+        self.begun = False
+        message = pickle.dumps(call)
         try:
-            self.pipe.send_bytes(pickle.dumps(task[1]))
-        except OSError:
-            return False
-        return True
+            self.pipe.send_bytes(message)
+            while True:
+                said, outcome = pickle.loads(self.pipe.recv_bytes())
+                if outcome is not None:
+                    return said, outcome
+                # its first word is that it runs, each other one that it has begun
+                self.begun, self.ready = self.ready, True
+        except (EOFError, OSError):
+            return None
 
-    def receive(self) -> bytes | None:
-        """Receive an answer; None for word that it runs, the first, or has begun. EOFError or OSError if it has died."""
-        said, outcome = pickle.loads(self.pipe.recv_bytes())
-        for text in said:
-            warnings.warn(text, stacklevel=2)
-        self.begun, self.ready = self.ready, True
-        return outcome
+    def kill(self) -> None:
+        """Kill the process, which wakes the thread that waits for it."""
+        self._process.kill()
 
     def end(self, within_s: float = 0.0) -> str:
         """End the process, killing it after within_s, and return in words how it ended."""
-        self.pipe.close()
         self._process.join(within_s)
         self._process.kill()
         self._process.join()
+        self.pipe.close()
         code = self._process.exitcode
         self._process.close()
-        if code == KILLED_STATUS:
+        if code == -signal.SIGKILL:
             return "killed, perhaps for lack of memory: try fewer --jobs"
         if code is not None and code < 0:
             return signal.strsignal(-code) or f"signal {-code}"

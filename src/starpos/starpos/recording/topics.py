@@ -4,7 +4,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol, TypeVar
+from typing import TYPE_CHECKING
 
 from starpos.errors import FrameError
 from starpos.recording.bag import PACKAGE, BagReader
@@ -25,22 +25,6 @@ DRIVER_INPUTS = {
     IMU_DATA: (IMU,),
 }
 MADE_OF = {IMAGE: "stars", PICTURE: "stars", IMU: "tilts"}
-
-
-class Connected(Protocol):
-    """A topic of a bag: rosbags' Connection."""
-
-    @property
-    def topic(self) -> str: ...
-
-    @property
-    def msgtype(self) -> str: ...
-
-    @property
-    def msgcount(self) -> int: ...
-
-
-C = TypeVar("C", bound=Connected)
 
 
 @dataclass(frozen=True)
@@ -70,7 +54,7 @@ NO_REMAPS = Remaps({})
 
 
 def driver_topics(
-    connections: Sequence[C],
+    connections: "Sequence[Connection]",
     remaps: Remaps = NO_REMAPS,
     namespace: str | None = None,
     place: Path | str = "the bag",
@@ -96,13 +80,13 @@ def driver_topics(
     return found
 
 
-def named_topics(connections: Sequence[Connected], remaps: Remaps, place: Path | str) -> dict[str, str]:
+def named_topics(connections: "Sequence[Connection]", remaps: Remaps, place: Path | str) -> dict[str, str]:
     """The topics that the user names, by the inputs they serve as; raises FrameError as `driver_topics` does."""
     bag = _Topics(connections, remaps, None, f"{place}")
     return {name: topic for name in remaps.topics if (topic := bag.of(name, ""))}
 
 
-def sentence_on_use(found: Mapping[str, str], connections: Sequence[Connected]) -> str:
+def sentence_on_use(found: Mapping[str, str], connections: "Sequence[Connection]") -> str:
     """Sentence on the use of the topics that were found."""
     kinds = {c.topic: c.msgtype for c in connections}
     made = [f"{MADE_OF[kinds[t]]} from {t}" for t in found.values() if kinds[t] in MADE_OF]
@@ -114,7 +98,7 @@ def sentence_on_use(found: Mapping[str, str], connections: Sequence[Connected]) 
 class _Topics:
     """The topics of a bag that have messages."""
 
-    connections: Sequence[Connected]
+    connections: "Sequence[Connection]"
     remaps: Remaps
     namespace: str | None
     place: str
@@ -157,7 +141,7 @@ class _Topics:
         return topic
 
 
-STARS, TRAILS = (f"{PACKAGE}/msg/{name}" for name in ("StarArray", "TrailArray"))
+STARS, TRAILS, SOLUTION = (f"{PACKAGE}/msg/{name}" for name in ("StarArray", "TrailArray", "Solution"))
 # types by the relative names of the solver's inputs
 NAV_SAT_FIX = "sensor_msgs/msg/NavSatFix"
 INPUTS = {"stars": STARS, "tilt": TILT, "camera/camera_info": CAMERA_INFO}

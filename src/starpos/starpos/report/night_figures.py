@@ -33,7 +33,6 @@ MANY = 150
 FAR_M = 10_000.0
 # In m or arcsec.
 SMALLEST_SHOWN = 1e-3
-DEFLECTION = "deflection (geodetic only)"
 
 
 def draw_stability(figure: "Figure", s: Stability) -> None:
@@ -179,11 +178,9 @@ def _short(value: float) -> str:
 
 def _shares(place: PlaceFix, night: Night) -> dict[str, np.ndarray]:
     """1 sigma (3,) of each source: east m, north m, heading arcsec; the latter is NaN if there is no heading."""
-    unit = np.array([1, 1, 1 / measures.ARCSEC])
-    shares = {t.name: np.sqrt(np.diag(t.covariance)[:3]) * unit for t in place.terms}
-    deflection = place.on_ground(night.vertical).deflection_covariance
+    roots = place.budget(place.on_ground(night.vertical))
+    shares = {name: root * [1, 1, 1 / ARCSEC] for name, root in roots.items()}
     shares = {name: share for name, share in shares.items() if share.max() >= SMALLEST_SHOWN}
-    shares[DEFLECTION] = np.sqrt(np.diag(deflection)) * unit
     if np.isnan(place.heading):
         shares = {name: np.array([*share[:2], np.nan]) for name, share in shares.items()}
     return shares

@@ -299,7 +299,7 @@ def _summary(night: Night) -> str:
     if used:
         rows += _rows_on_fixes(night)
     rows.append(("Source", escape(night.origin)))
-    rows += [("Note", escape(remark.text)) for remark in night.remarks]
+    rows += [("Note", escape(remark)) for remark in night.remarks]
     return f"{table(rows)}\n{_names(night)}"
 
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from starpos.averaging.average import Average
 from starpos.earth.vertical import Geodetic
-from starpos.fix.camera_attitude import CameraAttitude
+from starpos.fix.attitude import CameraAttitude
 from starpos.fix.solution import Solution
 from starpos.frames.frame import Stars
 from starpos.gnss.watch import GnssCheck

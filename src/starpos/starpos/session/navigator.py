@@ -44,7 +44,7 @@ class NavigatorSettings(NodeSettings):
 
     readers: ClassVar[Mapping[str, Callable[[str], Any]]] = {
         **NodeSettings.readers,
-        "imu_model": lambda name: read_imu_model(path_of(name)) if name else ImuModel(),
+        "imu_model": lambda name: read_imu_model(path_of(name)),
     }
 
     def _refuse(self, values: Mapping[str, Any], files: Mapping[str, Any]) -> None:
@@ -65,7 +65,7 @@ class NavigatorSettings(NodeSettings):
         )
         return Vessel(
             vehicle=values["vehicle"] or None,
-            model=self._files["imu_model"],
+            model=self._files["imu_model"] or ImuModel(),
             camera_to_body=np.asarray(known.link_to_camera, float).T,
             mount_stddev=float(np.radians(values["mount_stddev"])),
             atmosphere=atmosphere_of(values),

@@ -261,7 +261,8 @@ class Playing:
         try:
             for output in play(replay):
                 if isinstance(output, Answered):
-                    night.solutions.append(_light(output.solution))
+                    # without what only its solver needs
+                    night.solutions.append(replace(output.solution, hint=None))
                 elif isinstance(output, Averaged):
                     night.average = output.place
                 else:
@@ -271,11 +272,6 @@ class Playing:
         night.frames = replay.frames
         night.said[:0] = replay.remarks
         return night
-
-
-def _light(solution: Solution) -> Solution:
-    """A solution without what only its solver needs."""
-    return replace(solution, hint=None)
 
 
 def _parameters_in(folder: Path, air: Atmosphere) -> list[str]:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from starpos.earth.orientation import earth_state
 from starpos.errors import InstrumentError, StarposError
-from starpos.fix.camera_attitude import CameraAttitude
+from starpos.fix.attitude import CameraAttitude
 from starpos.fix.checks import MODEL_BY_PARAMETERS, unnamed_inclinometer
 from starpos.fix.fix import Fix
 from starpos.fix.glows import Glows

@@ -136,21 +136,6 @@ def check_deflection(values: Mapping) -> None:
         )
 
 
-def geoid_file(name: str) -> Geoid | None:
-    """Read the Geoid that deflection.geoid names, None for ''; GeoidError with the reason if it is broken."""
-    return geoid.read(name) if name else None
-
-
-def learned_file(name: str) -> Learned | None:
-    """Read what gnss.learned names, None for ''; StarposError with the reason if it is broken."""
-    return states.read_learned(path_of(name)) if name else None
-
-
-def stored_orbits(name: str) -> StoredOrbits | None:
-    """The orbits that satellites.elements names, None for ''; SatelliteError with the reason if it has no orbits."""
-    return StoredOrbits(path_of(name)) if name else None
-
-
 def vertical_of(values: Mapping, known: Geoid | None) -> Vertical:
     """Return the Geoid (`known`, or None), or the deflection that the parameters give for the place.
 
@@ -182,10 +167,10 @@ class NodeSettings:
     disappears later does not matter until the parameter is set again.
     """
 
-    # what reads the file of a parameter, which may be ''
+    # a reader of files for a parameter that names one
     readers: ClassVar[Mapping[str, Callable[[str], Any]]] = {
         "calibration_url": known_instrument,
-        "deflection.geoid": geoid_file,
+        "deflection.geoid": geoid.read,
     }
 
     def __init__(self, values: Mapping[str, Any]) -> None:
@@ -202,7 +187,11 @@ class NodeSettings:
         names: of those that are set.  camera: the one in use, None before there is one.
         """
         try:
-            read = {name: reader(values[name]) for name, reader in self.readers.items() if name in names}
+            read = {
+                name: reader(values[name]) if values[name] else None
+                for name, reader in self.readers.items()
+                if name in names
+            }
             files = self._files | read
             self._refuse(values, files)
             if camera is not None and "calibration_url" in read:
@@ -242,8 +231,8 @@ class Settings(NodeSettings):
 
     readers: ClassVar[Mapping[str, Callable[[str], Any]]] = {
         **NodeSettings.readers,
-        "gnss.learned": learned_file,
-        "satellites.elements": stored_orbits,
+        "gnss.learned": lambda name: states.read_learned(path_of(name)),
+        "satellites.elements": lambda name: StoredOrbits(path_of(name)),
     }
 
     @classmethod

@@ -9,7 +9,7 @@ from typing import Any
 
 from starpos.earth.orientation import earth_state
 from starpos.errors import StarposError
-from starpos.fix.camera_attitude import CameraAttitude
+from starpos.fix.attitude import CameraAttitude
 from starpos.fix.searching import (
     NEVER_S,
     UNASKED,

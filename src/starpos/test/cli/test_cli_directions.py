@@ -117,9 +117,9 @@ def test_a_camera_that_turns_is_no_camera_that_stands_still(run, lists, tmp_path
     nights = objects(said)
     assert status == 1 and [n["alarm"] for n in nights] == [False, True, True]
     assert nights[1]["moved_arcsec"] == pytest.approx(40 * 3600, rel=1e-3) and "has moved" in err[0]
-    assert page.read_text().count("<tr>") == 3
+    assert page.read_text().count("<tr>") == 1 + 3
     page.write_text("mine")
     status, _, err = run("calibrate", "--watch", lists, *WIDE, *SITE, "--page", page)
-    assert status == 2 and "not a page" in err[-1]
+    assert status == 2 and "not of starpos" in err[-1]
     status, _, err = run("calibrate", "--watch", tmp_path / "none", *WIDE, *SITE)
     assert status == 2 and "cannot be read" in err[-1]

@@ -75,7 +75,7 @@ def test_tilts_that_look_like_radians_are_told(night, tmp_path, capsys):
     _, _, errors = run(capsys, "solve", tmp_path, *KNOWN)
     (line,) = errors
     assert "the tilts look like radians" in line and "write them in deg" in line
-    assert any("look like radians" in remark.text for remark in open_night(tmp_path).solve().remarks)
+    assert any("look like radians" in remark for remark in open_night(tmp_path).solve().remarks)
 
 
 def test_what_a_glob_takes_in_beside_the_frames_is_left_out(lists, tmp_path, capsys):

@@ -4,6 +4,7 @@
 import struct
 from datetime import datetime, timedelta, timezone
 
+import cv2
 import numpy as np
 import pytest
 from cli_calls import PLACE, WIDE, objects
@@ -26,7 +27,7 @@ def note(up):
     return b"Apple iOS\0\0\1MM" + struct.pack(">HHHIII", 1, 8, 10, 3, 32, 0) + values
 
 
-def save(path, grey, mid_unix_s, up, **left_out):
+def save(path, grey, mid_unix_s, up, film_mm=FILM_MM, **left_out):
     import pillow_heif
     from PIL import Image
     from PIL.TiffImagePlugin import IFDRational
@@ -37,7 +38,7 @@ def save(path, grey, mid_unix_s, up, **left_out):
         0x9003: begin.strftime("%Y:%m:%d %H:%M:%S"),
         0x9291: f"{begin.microsecond // 1000:03d}",
     }
-    below |= {0x9011: "-08:00", 0xA405: FILM_MM} | ({} if up is None else {0x927C: note(up)})
+    below |= {0x9011: "-08:00", 0xA405: film_mm} | ({} if up is None else {0x927C: note(up)})
     exif = Image.Exif()
     exif[0x010F], exif[0x0110], exif[0x0112] = "Apple", "iPhone 12 Pro", 6
     exif[0x8769] = {tag: value for tag, value in below.items() if tag not in left_out.get("tags", ())}
@@ -141,6 +142,20 @@ def test_a_photograph_that_lacks_something_is_left_out_with_a_sentence(
     poor, good, whole = objects(out)
     assert status == 0 and poor["latitude"] is None and good["status"] == "ok" and whole["frames"] == 1
     assert any("poor.jpg" in line and why in line for line in said)
+
+
+def test_photographs_by_several_lenses_are_each_solved_by_its_own(sky, photographs, tmp_path, run):
+    """A longer lens shows the middle of the first picture, twice as large; pixels grow about the frame's centre."""
+    grey, mid_unix_s, up = sky[0]
+    middle = cv2.resize(grey[175:525, 250:750], (1000, 700), interpolation=cv2.INTER_CUBIC)
+    save(tmp_path / "IMG_9.jpg", middle, mid_unix_s, up, film_mm=2 * FILM_MM)
+    status, out, said = run("solve", tmp_path / "IMG_9.jpg", photographs / "IMG_0.jpg", "--json")
+    tele, wide, whole = objects(out)
+    assert status == 0 and tele["status"] == wide["status"] == "ok" and whole["frames"] == 2
+    assert abs(tele["latitude"] - wide["latitude"]) < 0.002 and km_off(whole) < 1
+    for name, px in (("IMG_9", 9272), ("IMG_0", 4636)):
+        (line,) = (line for line in said if name in line and "its stars give" in line)
+        assert float(line.split()[-2]) == pytest.approx(px, rel=3e-3)
 
 
 def log_of(path, sky, sign=-1.0):

@@ -8,6 +8,9 @@ import pytest
 
 from starpos.errors import FrameError
 from starpos.frames.gravity import read_gravity
+from starpos.frames.reading import read_frame
+from starpos_testing.lacking import needs
+from starpos_testing.skies import raws
 
 BYTES, SHORT, LONG, SIGNED, RATIONAL = 7, 3, 4, 8, 10
 
@@ -71,6 +74,14 @@ def test_a_name_of_another_type_does_no_harm():
     assert up(exif(apple((0, 0, 1.0)), below={42036: (LONG, 1, struct.pack("<I", 300))})) == pytest.approx(
         [0, 0, 1]
     )
+
+
+@needs("rawpy")
+@needs("exifread")
+@pytest.mark.parametrize("order", "<>")
+def test_a_dng_has_it_as_the_telephone_wrote_it(tmp_path, order):
+    (tmp_path / "IMG.DNG").write_bytes(raws.dng(raws.mosaic(), order=order, note=apple((-1.0, 0, 0))))
+    assert read_frame(tmp_path / "IMG.DNG").gravity.up == pytest.approx([0, -1, 0])
 
 
 def panasonic(roll, pitch):

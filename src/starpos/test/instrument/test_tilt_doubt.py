@@ -4,8 +4,9 @@
 import numpy as np
 import pytest
 
+from starpos.errors import TiltError
 from starpos.instrument.tilt_log import TiltLog
-from starpos.instrument.tilt_table import like_radians
+from starpos.instrument.tilt_table import like_radians, read_tilt_csv
 
 NOISE = np.radians(0.0035)
 
@@ -46,3 +47,16 @@ def test_radians_are_seen_of_one_reading_a_frame():
 )
 def test_degrees_are_left_in_peace(sound):
     assert like_radians(sound) == ""
+
+
+@pytest.mark.parametrize(("theta_y", "refused"), [(-1135.3, True), (-11.588, False), (348.412, False)])
+def test_degrees_and_minutes_are_named_and_a_full_turn_is_not(tmp_path, theta_y, refused):
+    """-11 deg 35.3 arcmin as ddmm.mm, in degrees, and counted from 0 to 360."""
+    rows = "".join(f"{1.79e9 + k},{3.08 + 1e-3 * (k % 3)},{theta_y + 1e-3 * (k % 2)}\n" for k in range(30))
+    (tmp_path / "tilt.csv").write_text("utc_unix_s,theta_x_deg,theta_y_deg\n" + rows)
+    if refused:
+        with pytest.raises(TiltError, match=r"beyond a full turn \(1135.*ddmm.mm"):
+            read_tilt_csv(tmp_path / "tilt.csv")
+    else:
+        log = read_tilt_csv(tmp_path / "tilt.csv")
+        assert np.degrees(log.theta_y) == pytest.approx(-11.588, abs=2e-3)

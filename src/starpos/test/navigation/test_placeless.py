@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from starpos import rotation
 from starpos.earth.orientation import earth_state, station_velocity
 from starpos.earth.refraction import Atmosphere
-from starpos.fix.camera_attitude import CameraAttitude
+from starpos.fix.attitude import CameraAttitude
 from starpos.navigation.sightings import IdentifiedFrame, PlacelessFrame, roughly
 from starpos.units import ARCSEC
 

@@ -219,7 +219,7 @@ def test_what_a_night_comes_to_is_gathered(still, points):
     assert kept.unreadable and kept.lost is points and len(kept.solved) == 3
     assert not kept.headings and not kept.warnings
     # only what an average takes is kept
-    assert not len(kept.solved[0].fix.used) and kept.solved[0].stars_matched > 20
+    assert not len(kept.solved[0].fix.used) and len(kept.solved[0].names) > 20
 
 
 def test_a_solved_night(still, points):
@@ -238,8 +238,8 @@ def test_a_night_without_a_fix_says_which_focal_length_fits(catalogue, still):
     frames = Frames(catalogue, [40.0])
     wrong = replace(frames.instrument, focal_px=1.2 * FOCAL_PX)
     frames.work = replace(frames.work, instruments=Instruments(wrong))
-    (said,) = [r for r in solved_night(frames.exposures()).remarks if r.kind.value == "focal length"]
-    (focal_px,) = map(float, re.findall(r"a focal length of (\d+) px fits", said.text))
+    said = " ".join(solved_night(frames.exposures()).remarks)
+    (focal_px,) = map(float, re.findall(r"a focal length of (\d+) px fits", said))
     assert focal_px == pytest.approx(FOCAL_PX, rel=1e-3)
 
 

@@ -169,7 +169,7 @@ def test_a_night_at_two_places_is_averaged_at_the_last_and_says_so(tmp_path):
         path.rename(first / f"then_{path.name}")
     n = work(first)
     assert np.degrees(n.combined.latitude) == pytest.approx(47.9, abs=0.02)
-    assert any("was moved" in remark.text and "2026-11-02T19:00:00" in remark.text for remark in n.remarks)
+    assert any("was moved" in remark and "2026-11-02T19:00:00" in remark for remark in n.remarks)
 
 
 def test_a_fisheye_sees_to_the_horizon_on_the_map():

@@ -7,6 +7,7 @@ import struct
 import numpy as np
 import pytest
 
+from starpos.earth import geoid
 from starpos.errors import GeoidError, InstrumentError
 from starpos.instrument import sensors
 from starpos.instrument.camera import Camera
@@ -16,7 +17,6 @@ from starpos.parameters.table import defaults_of, parameters_of
 from starpos.session.settings import (
     atmosphere_of,
     check_camera,
-    geoid_file,
     instrument_of,
     known_instrument,
     vertical_of,
@@ -121,16 +121,16 @@ def test_a_deflection_is_given_by_hand_or_by_a_geoid(tmp_path):
     # 1 m a degree to the north.
     heights = np.broadcast_to(np.arange(30)[:, None], (30, 40))
     path.write_bytes(struct.pack(">4d2i", 30, 40, 1, 1, *heights.shape) + heights.astype(">f4").tobytes())
-    grid = geoid_file(str(path))
+    grid = geoid.read(str(path))
     there = vertical_of(values(), grid).at(math.radians(45), math.radians(60))
     higher = vertical_of(values(altitude=3000.0), grid).at(math.radians(45), math.radians(60))
     assert higher.xi_arcsec - there.xi_arcsec == pytest.approx(3 * 0.171, abs=0.01)
     assert there.xi_arcsec == pytest.approx(-1 / 111132 / math.radians(1 / 3600), rel=1e-3)
     with pytest.raises(GeoidError, match=r"deflection\.xi"):
         vertical_of(values(deflection__xi=3.0), grid)
-    assert vertical_of(values(deflection__eta=3.0), geoid_file("")).eta_arcsec == 3.0
+    assert vertical_of(values(deflection__eta=3.0), None).eta_arcsec == 3.0
 
 
 def test_a_broken_geoid_is_refused_with_its_path(tmp_path):
     with pytest.raises(GeoidError, match=r"missing\.gtx"):
-        geoid_file(str(tmp_path / "missing.gtx"))
+        geoid.read(str(tmp_path / "missing.gtx"))

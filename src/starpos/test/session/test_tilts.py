@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 from starpos.errors import TiltError, TiltRangeError
+from starpos.instrument import sensors
+from starpos.instrument.inclinometer import InclinometerErrors
 from starpos.messages.tilt import OUT_OF_RANGE, SATURATED, STUCK
 from starpos.session.tilts import CAPACITY, TiltBuffer
 
@@ -187,3 +189,59 @@ def test_the_sample_after_an_exposure_is_waited_for_where_the_last_one_in_it_lea
 def test_days_of_samples_stay_bounded():
     buffer = buffer_of(sample(k / 10) for k in range(CAPACITY + 500))
     assert len(buffer) == CAPACITY
+
+
+BMI088, ADIS16209 = (sensors.find(model)[1] for model in ("bmi088", "adis16209"))
+LEVEL = InclinometerErrors()
+
+
+def judged(readings, errors, period_s=0.1):
+    """The tilt of an exposure at T0 that an inclinometer of these errors gives; readings (N, 2) deg until 0.5 s later."""
+    last = len(readings) - 1 - round(0.5 / period_s)
+    variance = errors.noise_rad**2
+    messages = (sample((k - last) * period_s, *xy, variance=variance) for k, xy in enumerate(readings))
+    tilt = buffer_of(messages).average(T0, 0.5)
+    errors.check_live(tilt)
+    return tilt
+
+
+def at_rest(rng, number, noise_deg):
+    return np.array([3.1234, -11.7777]) + rng.normal(0, noise_deg, (number, 2))
+
+
+@pytest.mark.parametrize(
+    "kind", ["zeros", "from the start", "since a while", "one axis", "to a degree", "to 0.1 deg"]
+)
+def test_a_topic_whose_level_does_not_measure_gives_no_tilt(kind, rng):
+    live = at_rest(rng, 300, 0.0035)
+    lies = {
+        "zeros": np.zeros((60, 2)),
+        "from the start": np.full((60, 2), -4.51234),
+        "since a while": np.concatenate([live[:200], np.tile(live[200], (100, 1))]),
+        "one axis": np.stack([np.full(300, 3.1224), live[:, 1]], 1),
+        "to a degree": np.round(live),
+        "to 0.1 deg": np.round(live, 1),
+    }
+    with pytest.raises(TiltError, match="repeats the same value"):
+        judged(lies[kind], LEVEL)
+
+
+@pytest.mark.parametrize(
+    ("errors", "step_deg", "noise_deg", "period_s"),
+    [
+        (LEVEL, 0.0005, 0.0035, 0.1),
+        # a rover that is parked by night: nothing shakes its IMU but the IMU's own noise
+        (BMI088, 0.00525, 0.043, 0.01),
+        (BMI088, 0.0001, 0.0005, 0.01),
+        (ADIS16209, 0.025, 0.02, 0.1),
+    ],
+)
+def test_a_topic_of_a_level_at_rest_is_believed(errors, step_deg, noise_deg, period_s, rng):
+    tilt = judged(np.round(at_rest(rng, 600, noise_deg) / step_deg) * step_deg, errors, period_s)
+    assert tilt.step_rad == 0 and np.degrees(tilt.theta) == pytest.approx([3.1234, -11.7777], abs=0.03)
+
+
+def test_a_topic_of_an_old_level_whose_coarse_steps_are_stated_costs_them(rng):
+    old = InclinometerErrors(quantum_rad=math.radians(0.1))
+    tilt = judged(np.round(at_rest(rng, 300, 0.0035), 1), old)
+    assert np.degrees(old.undithered_rad(tilt)) == pytest.approx(0.1 / math.sqrt(12), rel=0.05)

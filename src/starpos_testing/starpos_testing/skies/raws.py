@@ -27,13 +27,16 @@ def exif_tags(
     size=None,
     gps=None,
     lens=None,
+    note=None,
 ):
     """The tags of an Exif IFD, with the GPS IFD's under 0x8825; None leaves one out.
 
     gps: UTC by GPS, a day like '2026:11:02' and whole hours, minutes and seconds.
     film_mm, focal (ratio of mm), plane (ratio of px per unit), unit, size (px) are of the focal length; lens: its name.
+    note: bytes of the maker's note.
     """
     tags = {
+        0x927C: None if note is None else (BYTE, note),
         0xA434: None if lens is None else (ASCII, lens),
         0x920A: None if focal is None else (RATIONAL, focal),
         0xA002: None if size is None else (LONG, [size[0]]),
