@@ -254,11 +254,12 @@ def plan(args: argparse.Namespace) -> int:
             console.complain("satellites", sentence)
     lens = None
     if args.size is not None:
-        camera = options.camera_of(args) if args.instrument is None else None
-        focal_px = options.instrument_of(args, None).focal_px if camera is None else camera.fx
+        focal_px = options.instrument_of(args, None).focal_px
         width, height = (2 * math.degrees(math.atan(side / 2 / focal_px)) for side in args.size)
         lens = width, height
     latitude, longitude = args.plan
+    if not (abs(latitude) <= 90 and abs(longitude) <= 360):
+        raise SatelliteError(f"--plan {latitude:g} {longitude:g}: give latitude and longitude in deg")
     hours = nights_hours(latitude, longitude, begin, orbits, least_deg=args.min_altitude, lens_deg=lens)
     if not hours:
         console.complain(

@@ -103,6 +103,8 @@ def test_a_frame_has_its_heading_at_that_place(night, tmp_path, capsys):
     ("words", "said"),
     [
         (["satellites"], "give frames or sightings and --elements"),
+        (["satellites", "--plan", "95", "0"], "give latitude and longitude"),
+        (["satellites", "--plan", "47", "8", "--size", "100", "100"], "no focal length"),
         (
             [
                 "satellites",
