@@ -35,13 +35,16 @@ emulated: build
 	@tools/setup/counterparts
 	@. tools/env.sh && python tools/demo/emulated_instrument.py $(ARGS)
 
-# what tests run against comes while the build computes; what other versions lack, tools/test.py brings and says
-bring_for_tests = tools/setup/counterparts
+# what tests run against comes while the build computes; of what other versions need, too, which nobody waits for here: tools/test.py
+# looks for the whole of it, brings what lacks, and says so
 ifneq (,$(findstring --both,$(ARGS)))
-bring_for_tests += ; { tools/setup/docs; tools/setup/ubuntu packages; tools/setup/core python3.10 packages; } >/dev/null 2>&1
+bring_versions = tools/setup/docs; tools/setup/ubuntu packages; tools/setup/core python3.10 packages; tools/setup/core python3.13 packages
+else
+bring_versions = true
 endif
 test: .underlay/stamp
-	@{ $(bring_for_tests); } & status=0; $(MAKE) --no-print-directory build || status=$$?; wait; exit $$status
+	@{ $(bring_versions); } >/dev/null 2>&1 & tools/setup/counterparts & bringing=$$!; status=0; \
+	$(MAKE) --no-print-directory build || status=$$?; wait $$bringing || true; exit $$status
 	@. tools/env.sh && python tools/test.py $(ARGS)
 
 bench: build

@@ -24,8 +24,10 @@ TOPIC = "detector/image_annotated"
 
 def has(picture, star, colour) -> bool:
     """Whether a circle of this colour is around a star of a frame that is shown as it is."""
-    rows, columns = np.nonzero(np.abs(picture.astype(int) - colour).max(2) < 40)
-    away = np.hypot(columns - star.x, rows - star.y)
+    left, top = (max(round(v) - 11, 0) for v in (star.x, star.y))
+    around = picture[top : top + 23, left : left + 23].astype(int)
+    rows, columns = np.nonzero(np.abs(around - colour).max(2) < 40)
+    away = np.hypot(left + columns - star.x, top + rows - star.y)
     return np.count_nonzero((away > 4) & (away < 10)) > 8
 
 

@@ -256,37 +256,23 @@ class LensPose:
         )
 
 
-@at_once
-@dataclass(frozen=True, kw_only=True)
-class _Start:
-    """A frame's N stars at xy (N, 2) px with errors (N,), and what a part of it says of them.
+def _start(
+    field: WideField, part: Part, found: Identification
+) -> tuple[np.ndarray, np.ndarray, LensPose, np.ndarray, np.ndarray, np.ndarray]:
+    """What a part of a frame says of all its stars.
 
-    pose: of the whole frame.  star, index (M,): rows of the identified stars, and of the catalogue.
-    beyond (N,): which stars are not on the part.
+    Returns the pixels (N, 2) of the frame's stars, their errors (N,), and the pose of the whole frame. Then, of the
+    identified stars, the rows (M,) and those in the catalogue (M,), and which stars (N,) are not on the part.
     """
-
-    xy: np.ndarray
-    sigma: np.ndarray
-    pose: LensPose
-    star: np.ndarray
-    index: np.ndarray
-    beyond: np.ndarray
-
-    @classmethod
-    def of(cls, field: WideField, part: Part, found: Identification) -> "_Start":
-        flip = FLIP if found.mirrored else np.eye(3)
-        attitude = flip @ part.turn.T @ flip @ found.attitude
-        # ignore stars that fall outside the picture once refraction is removed
-        xy = np.nan_to_num(field.camera.project(field.directions[:FAINTEST_FIT]), nan=FAR_PX)
-        row = part.row[found.star]
-        return cls(
-            xy=xy,
-            sigma=field.sigma_px[:FAINTEST_FIT],
-            pose=LensPose(field.camera.scaled(found.focal_scale), attitude, found.mirrored),
-            star=row[row < len(xy)],
-            index=found.catalogue[row < len(xy)],
-            beyond=~np.isin(np.arange(len(xy)), part.row),
-        )
+    flip = FLIP if found.mirrored else np.eye(3)
+    attitude = flip @ part.turn.T @ flip @ found.attitude
+    # ignore stars that fall outside the picture once refraction is removed
+    xy = np.nan_to_num(field.camera.project(field.directions[:FAINTEST_FIT]), nan=FAR_PX)
+    pose = LensPose(field.camera.scaled(found.focal_scale), attitude, found.mirrored)
+    row = part.row[found.star]
+    use = row < len(xy)
+    beyond = ~np.isin(np.arange(len(xy)), part.row)
+    return xy, field.sigma_px[:FAINTEST_FIT], pose, row[use], found.catalogue[use], beyond
 
 
 def everywhere(field: WideField, sky: Sky, part: Part, found: Identification) -> Identification | None:
@@ -294,8 +280,7 @@ def everywhere(field: WideField, sky: Sky, part: Part, found: Identification) ->
 
     None if the lens puts the identified stars in other places.
     """
-    s = _Start.of(field, part, found)
-    xy, sigma, pose, star, index = s.xy, s.sigma, s.pose, s.star, s.index
+    xy, sigma, pose, star, index, beyond = _start(field, part, found)
     w = sky.directions(index)
     for _ in range(ROUNDS):
         pose = pose.fitted(xy[star], w, np.hypot(sigma[star], _error_px(xy[star] - pose.project(w))))
@@ -304,7 +289,7 @@ def everywhere(field: WideField, sky: Sky, part: Part, found: Identification) ->
         gate = GATE_SIGMA * np.hypot(max(spread, MIN_SPREAD_PX), sigma) + GATE_PX
         # a lens that is not known well has other stars than its own in their places farther out
         if spread > BENT_PX:
-            gate[s.beyond] = 0.0
+            gate[beyond] = 0.0
         pair = mutual_nearest(xy, pose.project(there.directions), gate)
         if len(pair[0]) < MIN_STARS:
             return None
@@ -326,8 +311,8 @@ def outwards(
     Returns the camera fitted to its stars, the identification, and whether stars beyond the part bear it out; if they do
     not, the first two are of the first ring.  None if the lens puts the stars of the part in other places.
     """
-    s = _Start.of(field, part, found)
-    xy, sigma, pose, star, w = s.xy, s.sigma, s.pose, s.star, sky.directions(s.index)
+    xy, sigma, pose, star, index, beyond = _start(field, part, found)
+    w = sky.directions(index)
     middle = part.turn[2] * [1, -1, 1] if found.mirrored else part.turn[2]
     inner = None
     for k in range(math.ceil((math.pi - FIRST_RAD) / NEXT_RAD) + LAST_ROUNDS):
@@ -344,7 +329,7 @@ def outwards(
         star, w = pair[0], near.directions[pair[1]]
         if inner is None:
             inner = pose, near, pair
-    borne_out = _borne_out(int(s.beyond[star].sum()), xy[s.beyond], len(near.index), gate[s.beyond])
+    borne_out = _borne_out(int(beyond[star].sum()), xy[beyond], len(near.index), gate[beyond])
     pose, near, pair = (pose, near, pair) if borne_out or inner is None else inner
     whole = replace(field, camera=pose.camera)
     return pose.camera, pose.identified(whole, xy, near, pair, found), borne_out
