@@ -15,7 +15,7 @@ import messages
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "src" / "starpos"))
 
-from starpos.parameters.table import NODES, parameter_file, parameters_of, yaml_value  # noqa: E402
+from starpos.parameters.table import NODES, parameters_of, yaml_value  # noqa: E402
 
 INTERFACES = ROOT / "starpos_interfaces"
 PARAMETERS = ROOT / "src" / "starpos_bringup" / "config" / "starpos.yaml"
@@ -32,6 +32,19 @@ def about_parameters() -> str:
             value = yaml_value(p.default)
             made.append(f"| `{p.name}` | {said} Default: `{'unset' if value == '.nan' else value}`. |")
     return "\n".join(made) + "\n"
+
+
+def parameter_file() -> str:
+    """ROS's parameter file of all nodes: every parameter at its default, below its meaning, unit and constraint."""
+    # REUSE-IgnoreStart
+    lines = ["# SPDX-License-Identifier: Apache-2.0"]
+    # REUSE-IgnoreEnd
+    lines.append("# All parameters at their defaults; keep what you change. Written by tools/reference.py.")
+    for node in NODES:
+        lines += ["", f"/**/{node}:", "  ros__parameters:"]
+        for p in parameters_of(node):
+            lines += [f"    # {p.description}", f"    # {p.rule}", f"    {p.name}: {yaml_value(p.default)}"]
+    return "\n".join(lines) + "\n"
 
 
 def about_messages() -> str:

@@ -13,7 +13,7 @@ from iio_tree import adxl355, node, plug, scan, scl3300
 from starpos.messages.tilt import GAP, OUT_OF_RANGE, STUCK, TIME_UNKNOWN
 from starpos.parameters.table import defaults_of
 from starpos_inclinometer.clock import HostClock, Moment
-from starpos_inclinometer.sources.iio import IioLink, IioTilts
+from starpos_inclinometer.sources.iio import IioLink, IioSource
 from starpos_inclinometer.sources.iio_device import (
     Buffer,
     DeviceError,
@@ -27,6 +27,10 @@ from starpos_testing.patience import WAIT_S
 DEFAULTS = defaults_of("inclinometer")
 
 
+def source_of(values):
+    return IioSource(Surroundings(None, HostClock(), lambda: None), values)
+
+
 def arrivals(device, raws, period_s=0.01, dated=True):
     for k, raw in enumerate(raws):
         moment = Moment(100 + k * period_s, round(1.7e18 + k * period_s * 1e9))
@@ -37,7 +41,7 @@ def test_an_scl3300_is_read_by_its_angles_with_its_presets_noise_and_temperature
     scl3300(tmp_path)
     device = find(tmp_path, "")
     assert (device.model, device.kind, len(device.channels)) == ("scl3300", "incli", 3)
-    tilts = IioTilts(DEFAULTS)
+    tilts = source_of(DEFAULTS)
     (arrival,) = arrivals(device, [device.read_raw()])
     reading = tilts.read(arrival)
     assert np.degrees([reading.x, reading.y, reading.z]) == pytest.approx([3.0, -1.5, 86.6], abs=0.003)
@@ -60,7 +64,7 @@ def test_offset_scale_and_range_are_the_channels_own(tmp_path):
     )
     device = find(tmp_path, "adis16209")
     (arrival,) = arrivals(device, [device.read_raw()])
-    reading = IioTilts(DEFAULTS).read(arrival)
+    reading = source_of(DEFAULTS).read(arrival)
     assert np.degrees([reading.x, reading.y]) == pytest.approx([2.5, -35.0])
     # its sheet's figures hold to 30 deg
     assert reading.flags == OUT_OF_RANGE and math.isnan(reading.z) and math.isnan(reading.temperature_c)
@@ -80,7 +84,7 @@ def test_accelerations_are_averaged_and_g_is_not_taken_for_metres(tmp_path):
     up = np.array([math.sin(math.radians(-3)), math.sin(math.radians(6)), 0])
     up[2] = math.sqrt(1 - up @ up)
     for name, one_g, noise in (("adxl355", 256417, 1e-4), ("sca3300", 2703, 4e-4)):
-        device, tilts = find(tmp_path, name), IioTilts(DEFAULTS)
+        device, tilts = find(tmp_path, name), source_of(DEFAULTS)
         raw = rng.normal(up * one_g, one_g * noise, (60, 3)).round()
         temperature = [[1885.0]] * 60 if device.temperature else [[]] * 60
         raw = [(*r, *t) for r, t in zip(raw, temperature, strict=True)]
@@ -94,7 +98,7 @@ def test_accelerations_are_averaged_and_g_is_not_taken_for_metres(tmp_path):
 
 def test_a_driving_accelerometer_gives_no_tilt(tmp_path):
     adxl355(tmp_path)
-    device, tilts = find(tmp_path, ""), IioTilts(DEFAULTS)
+    device, tilts = find(tmp_path, ""), source_of(DEFAULTS)
     raw = [(30_000 * k, 0, 256417, 1885) for k in range(20)] * 3
     assert [r for a in arrivals(device, raw) if (r := tilts.read(a))] == []
     assert "m/s2" in tilts.forces.unrest
@@ -102,7 +106,7 @@ def test_a_driving_accelerometer_gives_no_tilt(tmp_path):
 
 def test_equal_readings_are_a_stuck_device_and_another_device_is_a_gap(tmp_path):
     scl3300(tmp_path)
-    device, tilts = find(tmp_path, ""), IioTilts(DEFAULTS | {"iio.stuck_samples": 5})
+    device, tilts = find(tmp_path, ""), source_of(DEFAULTS | {"iio.stuck_samples": 5})
     flags = [tilts.read(a).flags for a in arrivals(device, [device.read_raw()] * 6)]
     assert flags == [0] * 4 + [STUCK] * 2
     again = find(tmp_path, "")
@@ -187,9 +191,9 @@ def test_buffered_scans_have_the_kernels_stamps_and_the_device_is_set_up_for_the
     data = scan(-13421, 26828, 254288, 1885, 5_000_000_123) + scan(1, -1, 0, 1886, 5_008_000_123)
     # the second comes in two pieces
     os.write(writer, data[:30])
-    assert [(s.raw, s.time_s) for s in buffer.read(1.0)] == [((-13421, 26828, 254288, 1885), 5.000000123)]
+    assert buffer.read(1.0) == [((-13421, 26828, 254288, 1885), 5.000000123)]
     os.write(writer, data[30:])
-    assert [s.raw for s in buffer.read(1.0)] == [(1, -1, 0, 1886)]
+    assert [raw for raw, _ in buffer.read(1.0)] == [(1, -1, 0, 1886)]
     assert buffer.read(0.0) == []
     os.close(writer)
     with pytest.raises(OSError, match="sends no more"):
@@ -227,7 +231,7 @@ def test_another_device_has_its_own_noise(tmp_path, second):
     rng = np.random.default_rng(2)
     scl3300(tmp_path)
     values = DEFAULTS | {"iio.device": ""}
-    first, tilts = find(tmp_path, "scl3300"), IioTilts(values)
+    first, tilts = find(tmp_path, "scl3300"), source_of(values)
     for a in arrivals(first, [(*rng.normal(0, 15, 3).round(), 5540.0) for _ in range(300)], 0.02):
         tilts.read(a)
     assert np.degrees(tilts.angles.noise.sigma[0]) > 0.05
@@ -242,7 +246,7 @@ def test_another_device_has_its_own_noise(tmp_path, second):
     raw = [device.read_raw()] * 60
     got = [r for a in arrivals(device, raw, 0.01) if (r := tilts.read(a))]
     assert got[0].flags & GAP
-    fresh = IioTilts(values)
+    fresh = source_of(values)
     alone = [r for a in arrivals(device, raw, 0.01) if (r := fresh.read(a))]
     assert got[0].covariance == pytest.approx(alone[0].covariance)
 

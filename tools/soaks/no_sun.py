@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Frames by day without the Sun: clouds, lamps, walls, trees, windows. None may have a heading, and no disc a limb.
+"""Frames by day without the Sun: clouds, lamps, walls, globes, trees, panes. None may have a heading.
 
 Each is of a scene that is drawn anew, by a camera of 25 mm without a filter or a fisheye, whose level and place are
-known while the Sun stands 15 to 70 deg high. A scene is seen several times within a quarter of an hour by a camera at
-rest, or turned each time: `--each`. Exit status 1 where a frame has a heading. Needs no ROS.
+known while the Sun stands 15 to 70 deg high. A lamp may be as high as the Sun, to the errors of level and glow: such a
+frame is counted as `as_high`. Its camera at rest then takes another one a quarter of an hour later. If that has a
+heading too, it is a fault. Exit status 1 where there was one. Needs no ROS.
 """
 
 import json
@@ -19,6 +20,7 @@ from starpos.detection.discs import find_disc
 from starpos.earth.orientation import earth_state
 from starpos.earth.place import Place
 from starpos.earth.refraction import Atmosphere
+from starpos.fix.glows import Glows
 from starpos.fix.solver import Solver
 from starpos.fix.sun import by_sun
 from starpos.frames.frame import no_stars
@@ -182,11 +184,15 @@ def run(args) -> int:
         counts["scenes"] += 1
         if disc is not None:
             counts["limb" if disc.sharp else "glow"] += 1
-            stars = replace(no_stars(*shape[::-1], mid_unix_s=when, exposure_s=0.0), disc=disc)
-            answer = by_sun(solvers[kind], stars, disc, tilt, place)
-            if answer.at_place is not None:
-                counts["headings"] += 1
-                print(f"HEADING seed {args.seed} scene {number} {scene.__name__} {shape}: {disc}", flush=True)
+            glows = Glows()
+            for late_s, count in ((0.0, "as_high"), (SECONDS, "headings")):
+                stars = replace(no_stars(*shape[::-1], mid_unix_s=when + late_s, exposure_s=0.0), disc=disc)
+                now = replace(tilt, utc_unix_s=when + late_s)
+                answer = by_sun(solvers[kind], stars, disc, now, place).beside(glows)
+                if answer.at_place is None:
+                    break
+                counts[count] += 1
+                print(f"{count} seed {args.seed} scene {number} {scene.__name__} {shape}", flush=True)
         progress.at(number - args.first + 1, json.dumps(sum(tally.values(), Counter())))
     for name, counts in sorted(tally.items()):
         print(f"{name:24s}", json.dumps(dict(counts)))

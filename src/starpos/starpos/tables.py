@@ -12,6 +12,7 @@ from array import array
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -90,22 +91,25 @@ class TableForm:
         used = {name: names.index(name) for name in (*self.needed, *self.optional) if name in names}
         start = text.tell()
         numbers = array("I")
-        try:
-            with warnings.catch_warnings():
-                # our own error says that a table is empty
-                warnings.simplefilter("ignore")
-                lines = _filled(_rows(text, numbers, before + 2), len(names))
-                rows = np.loadtxt(lines, delimiter=",", usecols=list(used.values()))
-        except UnicodeDecodeError:
-            raise
-        except ValueError:
+        # quickest first: numbers alone; with empty cells, comments or texts in other columns; anything
+        if (rows := _plain(text, len(names))) is not None:
+            rows = rows[:, list(used.values())]
+            numbers.extend(range(before + 2, before + 2 + len(rows)))
+        else:
             text.seek(start)
-            del numbers[:]
-            cells = self._cells(_rows(text, numbers, before + 2), used, len(names))
             try:
-                rows = np.fromiter(cells, float)
-            except ValueError as e:
-                raise self.error(f"{place}:{numbers[-1]}: {one_line(e)}: {self.cure}") from None
+                lines = _filled(_rows(text, numbers, before + 2), len(names))
+                rows = _loaded(lines, usecols=list(used.values()))
+            except UnicodeDecodeError:
+                raise
+            except ValueError:
+                text.seek(start)
+                del numbers[:]
+                cells = self._cells(_rows(text, numbers, before + 2), used, len(names))
+                try:
+                    rows = np.fromiter(cells, float)
+                except ValueError as e:
+                    raise self.error(f"{place}:{numbers[-1]}: {one_line(e)}: {self.cure}") from None
         rows = rows.reshape(-1, len(used))
         if len(rows) == 0 and not self.may_be_empty:
             raise self.error(f"{place}: the {self.what} has no rows: {self.cure}")
@@ -155,6 +159,24 @@ class TableForm:
                 raise self.error(
                     f"{place}:{table.lines[k]}: {name} is {said}: give a number from {low:g} to {high:g}"
                 )
+
+
+def _plain(text: io.TextIOBase, width: int) -> np.ndarray | None:
+    """The cells (N, width) of the rest of a text, if each of its lines is a row of numbers; else None."""
+    start = text.tell()
+    try:
+        rows = _loaded(text, comments=None, ndmin=2)
+    except ValueError:
+        return None
+    text.seek(start)
+    return rows if rows.shape == (sum(1 for _ in text), width) else None
+
+
+def _loaded(lines: Iterable[str], **how: Any) -> np.ndarray:
+    with warnings.catch_warnings():
+        # our own error says that a table is empty
+        warnings.simplefilter("ignore")
+        return np.loadtxt(lines, delimiter=",", **how)
 
 
 def _rows(text: Iterable[str], numbers: array, first: int) -> Iterator[str]:

@@ -125,7 +125,9 @@ class MatchedSubscription:
     Where the user's qos_overrides say best effort, it stays so.
     """
 
-    def __init__(self, node: Node, kind: type, topic: str, callback: Take, depth: int) -> None:
+    def __init__(
+        self, node: Node, kind: type, topic: str, callback: Callable[..., object], depth: int
+    ) -> None:
         self._node, self._kind = node, kind
         # rclpy's types know callbacks of one argument only
         self._callback: Callable[..., Any] = callback

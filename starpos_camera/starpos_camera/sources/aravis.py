@@ -30,28 +30,20 @@ TOLERANCE_S = 5e-3
 
 
 @dataclass(frozen=True)
-class ClockRelation:
-    """Host's clock minus camera's clock (s), and its standard deviation."""
-
-    offset_s: float
-    stddev_s: float
-
-
-@dataclass(frozen=True)
 class FrameTimes:
     """What is known of the time of one frame; all but camera_s in Unix seconds of the node's clock.
 
     commanded_s  time just before the software trigger; None: a line has triggered
     received_s   arrival of the frame's first or last data
     camera_s     the frame's time on the camera's clock; None: not reported
-    relation     None: the camera does not let its clock be read
+    relation     host's clock minus camera's clock and its standard deviation, s; None: the camera's cannot be read
     """
 
     exposure_s: float
     commanded_s: float | None
     received_s: float
     camera_s: float | None
-    relation: ClockRelation | None
+    relation: tuple[float, float] | None
 
 
 def stamp_of_camera(times: FrameTimes, moment: str, values: Mapping) -> Stamp:
@@ -101,8 +93,8 @@ def _on_host_clock(times: FrameTimes) -> tuple[float, float]:
     """
     assert times.camera_s is not None
     if times.relation is not None:
-        stddev_s = math.hypot(times.relation.stddev_s, TIMESTAMP_STDDEV_S)
-        return times.camera_s + times.relation.offset_s, stddev_s
+        offset_s, stddev_s = times.relation
+        return times.camera_s + offset_s, math.hypot(stddev_s, TIMESTAMP_STDDEV_S)
     if times.commanded_s is None or not times.commanded_s <= times.camera_s <= times.received_s + TOLERANCE_S:
         return math.nan, math.nan
     slack_s = max(0.0, times.received_s - times.commanded_s - times.exposure_s)
@@ -325,8 +317,8 @@ def pixels_of(data: bytes, size: tuple[int, int], bits: int) -> np.ndarray:
     return pixels.astype(kind.newbyteorder("="), copy=False)
 
 
-def clock_relation(camera: Any, now: Callable[[], float]) -> ClockRelation | None:
-    """Hold a camera's clock and read it between two readings of `now`; None if it has no such feature."""
+def clock_relation(camera: Any, now: Callable[[], float]) -> tuple[float, float] | None:
+    """Host's clock minus camera's and its error (s), by holding it between readings of `now`; None if it cannot be."""
     known = (c for c in CLOCKS if camera.is_feature_available(c[0]) and camera.is_feature_available(c[1]))
     latch, value, frequency = next(known, ("", "", ""))
     if not latch:
@@ -334,16 +326,15 @@ def clock_relation(camera: Any, now: Callable[[], float]) -> ClockRelation | Non
     ticks_a_second = float(camera.get_integer(frequency)) if frequency else 1e9
     if not ticks_a_second > 0:
         return None
-    quickest: tuple[float, float] | None = None
+    readings = []
     for _ in range(CLOCK_READINGS):
         before_s = now()
         camera.execute_command(latch)
         took_s = now() - before_s
         camera_s = camera.get_integer(value) / ticks_a_second
-        if quickest is None or took_s < quickest[0]:
-            quickest = took_s, before_s + took_s / 2 - camera_s
-    assert quickest is not None
-    return ClockRelation(quickest[1], quickest[0] / math.sqrt(12))
+        readings.append((took_s, before_s + took_s / 2 - camera_s))
+    took_s, offset_s = min(readings)
+    return offset_s, took_s / math.sqrt(12)
 
 
 # A frame has to be here so long after its exposure.

@@ -39,7 +39,6 @@ ANGLES_RAD = {
 # An accelerometer measures the sine of the tilt.
 SINES = {"g": 1.0, "mg": 1e-3, "percent_g": 1e-2}
 UNITS = (*ANGLES_RAD, *SINES)
-NUMBER = r"[-+]?\d+\.?\d*"
 MAX_REQUEST = 256
 _END = re.compile(rb"[\r\n]+")
 

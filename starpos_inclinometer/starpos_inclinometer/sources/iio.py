@@ -105,12 +105,11 @@ class IioLink(Link):
                         raise OSError(errno.ENODEV, "it is gone")
                     continue
                 good_s = now.monotonic_s
-                moments = [
-                    Moment(s.time_s, now.host_ns - round((now.monotonic_s - s.time_s) * 1e9)) for s in scans
+                arrivals = [
+                    Arrival(raw, Moment(at_s, now.host_ns - round((now.monotonic_s - at_s) * 1e9)), device)
+                    for raw, at_s in scans
                 ]
-                self._queue_readings(
-                    device, [Arrival(s.raw, m, device) for s, m in zip(scans, moments, strict=True)]
-                )
+                self._queue_readings(device, arrivals)
         finally:
             buffer.close()
 
@@ -127,22 +126,37 @@ class IioLink(Link):
         self._admit(arrivals, times_s, f"receiving from {device.model} ({device.folder.name})")
 
 
-class IioTilts:
-    """Converts raw values of a device to readings."""
+class IioSource(LinkSource):
+    """An inclinometer or accelerometer of Linux's Industrial I/O."""
 
-    def __init__(self, values: Mapping[str, Any]) -> None:
+    _link: IioLink
+
+    def __init__(self, host: Surroundings, values: Mapping[str, Any]) -> None:
+        self.name = values["iio.device"].strip() or values["iio.root"]
+        self._link = IioLink(host, values)
         self.angles, self.forces = SensorTilts(), ImuTilts(values)
         self.unusable = 0
         self.device: IioDevice | None = None
         self._sequence = -1
         self.configure(values)
 
+    @staticmethod
+    def refusal(values: Mapping[str, Any]) -> str | None:
+        if values["iio.root"].strip():
+            return None
+        return "parameter iio.root must name the folder of the devices, such as /sys/bus/iio/devices; it is empty."
+
     def configure(self, values: Mapping[str, Any]) -> None:
-        self._values = values
+        self._parameters = values
+        self._link.rate_hz = values["rate"]
         self.angles.stuck = values["iio.stuck_samples"]
         self.angles.noise_floor_rad = noise_floor_rad(values)
         self._latency_s = 0.0 if math.isnan(values["latency"]) else values["latency"]
         self.forces.configure(values)
+
+    def fetch(self) -> list[Reading]:
+        read = (self.read(arrival) for arrival in self._link.fetch())
+        return [reading for reading in read if reading is not None]
 
     def read(self, arrival: Arrival) -> Reading | None:
         """Convert one reading; None while accelerations are being averaged, or if it gives no tilt."""
@@ -180,48 +194,24 @@ class IioTilts:
         self.device = device
         preset = sensors.presets().get(device.model)
         self.angles = SensorTilts(preset.noise_rad, preset.range_rad) if preset else SensorTilts()
-        self.configure(self._values)
+        self.configure(self._parameters)
         return flags
 
-
-class IioSource(LinkSource):
-    """An inclinometer or accelerometer of Linux's Industrial I/O."""
-
-    _link: IioLink
-
-    def __init__(self, host: Surroundings, values: Mapping[str, Any]) -> None:
-        self.name = values["iio.device"].strip() or values["iio.root"]
-        self._link, self._tilts = IioLink(host, values), IioTilts(values)
-
-    @staticmethod
-    def refusal(values: Mapping[str, Any]) -> str | None:
-        if values["iio.root"].strip():
-            return None
-        return "parameter iio.root must name the folder of the devices, such as /sys/bus/iio/devices; it is empty."
-
-    def configure(self, values: Mapping[str, Any]) -> None:
-        self._link.rate_hz = values["rate"]
-        self._tilts.configure(values)
-
-    def fetch(self) -> list[Reading]:
-        read = (self._tilts.read(arrival) for arrival in self._link.fetch())
-        return [reading for reading in read if reading is not None]
-
     def health(self) -> Health:
-        health, unrest = super().health(), self._tilts.forces.unrest
+        health, unrest = super().health(), self.forces.unrest
         if health.phase is not Phase.RECEIVING or not unrest:
             return health
         sentence = f"the accelerometer is not at rest: {unrest}; tilts come when it is."
         return replace(health, phase=Phase.MOVING, sentence=sentence)
 
     def _values(self) -> Mapping[str, object]:
-        tilts, device = self._tilts, self._tilts.device
+        device = self.device
         return {
             "driver": device.model if device else "unknown",
             "the solver's inclinometer.model": _preset(device),
             "sampling frequency (Hz)": device.sampling_hz if device else math.nan,
-            "unusable readings": tilts.unusable,
-            "noise by axis (arcsec)": noise_text(tilts.angles.noise.sigma or tilts.forces.noise),
+            "unusable readings": self.unusable,
+            "noise by axis (arcsec)": noise_text(self.angles.noise.sigma or self.forces.noise),
         }
 
 

@@ -252,14 +252,6 @@ def _numbers(stored: np.ndarray, found: re.Match[str]) -> np.ndarray:
     return ((values ^ half) - half).view(np.int64) if found[2] == "s" else values
 
 
-@dataclass(frozen=True, slots=True)
-class Scan:
-    """Raw values as `IioDevice.read_raw` gives them, and when the kernel took them (monotonic s)."""
-
-    raw: tuple[float, ...]
-    time_s: float
-
-
 class Buffer:
     """The buffer of a device, paced by a trigger; closed it is switched off again.
 
@@ -295,8 +287,11 @@ class Buffer:
                 f"`iio.trigger` ({trigger}) and the right to write there; it is retried."
             ) from None
 
-    def read(self, timeout_s: float) -> list[Scan]:
-        """Return the whole scans that have come, after waiting for the first one; OSError when the device went away."""
+    def read(self, timeout_s: float) -> list[tuple[tuple[float, ...], float]]:
+        """Return the whole scans that have come, after waiting for the first one; OSError when the device went away.
+
+        A scan: raw values as `IioDevice.read_raw` gives them, and when the kernel took them (monotonic s).
+        """
         ready, _, _ = select.select([self._file], [], [], timeout_s)
         if not ready:
             return []
@@ -309,7 +304,7 @@ class Buffer:
         numbers = self._layout.numbers(data[:whole])
         rows = zip(*(numbers[c.name].tolist() for c in self._channels), strict=True)
         times_s = (numbers[STAMP] * 1e-9).tolist()
-        return [Scan(tuple(map(float, row)), time_s) for row, time_s in zip(rows, times_s, strict=True)]
+        return [(tuple(map(float, row)), time_s) for row, time_s in zip(rows, times_s, strict=True)]
 
     def close(self) -> None:
         os.close(self._file)

@@ -10,13 +10,21 @@ import numpy as np
 from starpos import rotation
 from starpos._numeric.roots import symmetric_root
 from starpos.averaging.average import SCATTER, Average
-from starpos.earth.ellipsoid import EQUATOR_RADIUS_M, curvature_radii_m, enu_axes, ground_m, place_of_zenith
+from starpos.earth.ellipsoid import (
+    EQUATOR_RADIUS_M,
+    curvature_radii_m,
+    enu_axes,
+    ground_m,
+    place_of_zenith,
+    zenith_of,
+)
 from starpos.earth.orientation import station_velocity
 from starpos.errors import FixError
 from starpos.fix.budget import time_terms
 from starpos.fix.circle import Circle
 from starpos.fix.terms import ALWAYS, EACH_POSE, ErrorTerm
 from starpos.frozen import at_once
+from starpos.sky.bodies import MOON, SUN
 from starpos.units import ARCSEC, SIGMA_PER_MAD
 
 # with a worse A3 the circles are no longer what a linear error makes of them: its axis is fitted first
@@ -36,6 +44,8 @@ EXCLUDED_SIGMA = 6.0
 # outliers: their distance, minimum number of directions, maximum share left out where A3 is fitted too, number of rounds
 OUTLIER_SIGMA, MIN_JUDGED, MAX_OUTLIERS, JUDGED = 6.0, 6, 1 / 3, 6
 WITHIN = 0.95
+# 1 sigma of --near where it chooses between the Sun and the Moon
+NEAR_RAD = 500 / 6371
 # three directions that contradict each other by more have errors of unknown size
 CONTRADICT_SIGMA = 5.0
 
@@ -57,6 +67,41 @@ def place_of_circles(circles: Sequence[Circle], near: tuple[float, float] | None
         )
     part = whole.subset(_sound(whole))
     return _average(part, _answer(part, near), len(circles))
+
+
+def place_of_discs(circles: Sequence[Circle], near: tuple[float, float] | None = None) -> tuple[Average, str]:
+    """The place by discs that may all be the Sun's or all the Moon's, and the name of the body whose circles meet.
+
+    As `place_of_circles`.  Raises FixError where both bodies' do: they move by half a degree an hour against each other.
+    """
+    found, why = [], None
+    for name, choice in ((SUN, circles), (MOON, [c.instead for c in circles if c.instead is not None])):
+        if len(choice) == len(circles):
+            try:
+                place = place_of_circles(choice, near)
+            except FixError as error:
+                why = why or error
+                continue
+            found.append((_misfit(choice, place, near), place, name))
+    if not found:
+        assert why is not None
+        raise why
+    found.sort(key=lambda f: f[0])
+    if len(found) > 1 and found[1][0] - found[0][0] < EXCLUDED_SIGMA**2:
+        raise FixError(
+            "the discs may be the Sun's or the Moon's, whose circles meet both: go on for some hours, or say where you "
+            "are with --near LAT LON"
+        )
+    return found[0][1:]
+
+
+def _misfit(circles: Sequence[Circle], place: Average, near: tuple[float, float] | None) -> float:
+    """Sum of the squared residuals of circles at a place, in sigma, outliers' cut off, and of its way from near."""
+    whole = Directions.of(sorted(circles, key=lambda c: c.utc_unix_s))
+    zenith = zenith_of(place.latitude, place.longitude)
+    off2 = whole.residual(zenith)[0] ** 2 / np.diag(whole.covariance)
+    away = 0.0 if near is None else np.arccos(np.clip(zenith @ zenith_of(*near), -1, 1)) / NEAR_RAD
+    return float(np.minimum(off2, OUTLIER_SIGMA**2).sum() + away**2)
 
 
 @at_once

@@ -30,12 +30,14 @@ ALIKE_PX, FLOOR_PX, FLOOR_SHARE = 3.0, 0.03, 0.001
 # that a cloud pulls the circle of a small disc by, whose limb is hardly rounder than the cloud's edge.
 HIDDEN, SMALL, ROUNDS = 0.012, 1.5, 6
 # A glow: shares of its height at which its middle is measured, the first of what is saturated; what share of it is.
-HEIGHTS, SATURATED_SHARE = (0.97, 0.8, 0.65), 0.45
+HEIGHTS, SATURATED_SHARE = (0.97, 0.9, 0.8), 0.3
 # Maximum size of a second bright group, as a share of the glow's. Squared ratio of its axes, share of an ellipse's area,
 # and how far the middles may differ, in its radius.
-ALONE, LONGEST, FULLEST, CONCENTRIC = 0.6, 1.8, 0.85, 0.2
+ALONE, LONGEST, FULLEST, CONCENTRIC = 0.6, 1.8, 0.85, 0.3
 # A glow falls off: it is wider at its lowest height by this factor than at its highest, as a bright window is not.
-HALO = 1.08
+HALO = 1.05
+# Minimum height of a glow above the sky around it, as a share of its brightness.
+GLOW_CONTRAST = 0.06
 # The middle of a glow is known to this share of its radius: flare and blooming pull it.
 OFF_CENTRE = 0.03
 
@@ -53,23 +55,37 @@ def find_disc(plane: np.ndarray) -> Disc | None:
     height = top - dark
     if height < max(CONTRAST * top, CLEAR * noise):
         return None
-    bright = (small > plane.dtype.type(dark + 0.5 * height)).view(np.uint8)
+    groups = _groups(small, dark + 0.5 * height, step)
+    for middle, extent in groups:
+        if (disc := _limb(plane, middle, extent, dark, height)) is not None:
+            return disc
+    if (glow := _alone(plane, groups, dark, height)) is not None:
+        return glow
+    # in a bright sky the Sun's glow is no group of its own, but what is saturated is
+    return _alone(plane, _groups(small, dark + HEIGHTS[0] * height, step), dark, height)
+
+
+def _groups(small: np.ndarray, level: float, step: int) -> list[tuple[np.ndarray, float]]:
+    """Middles (2,) px and extents, px, of the largest groups of pixels above a level, of a plane reduced by a step."""
+    bright = (small > small.dtype.type(level)).view(np.uint8)
     # what stars leave is nothing
     outlines, _ = cv2.findContours(
         cv2.erode(bright, np.ones((3, 3), np.uint8)), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE
     )
-    outlines = sorted(outlines, key=len, reverse=True)[:TRIED]
     groups = []
-    for left, top_row, width, rows in map(cv2.boundingRect, outlines):
+    for left, top_row, width, rows in map(cv2.boundingRect, sorted(outlines, key=len, reverse=True)[:TRIED]):
         middle = np.array([left + (width - 1) / 2, top_row + (rows - 1) / 2])
-        groups.append((middle * step, (max(width, rows) + 2) * step))
-    for middle, extent in groups:
-        if (disc := _limb(plane, middle, float(extent), dark, height)) is not None:
-            return disc
-    # of two lights as large nothing says which is the Sun
+        groups.append((middle * step, float((max(width, rows) + 2) * step)))
+    return groups
+
+
+def _alone(
+    plane: np.ndarray, groups: list[tuple[np.ndarray, float]], dark: float, height: float
+) -> Disc | None:
+    """The glow of the largest group; None if another is as large: nothing says which is the Sun."""
     if not groups or (len(groups) > 1 and groups[1][1] > ALONE * groups[0][1]):
         return None
-    return _glow(plane, groups[0][0], float(groups[0][1]), dark, height)
+    return _glow(plane, *groups[0], dark, height)
 
 
 def _limb(plane: np.ndarray, middle: np.ndarray, extent: float, dark: float, height: float) -> Disc | None:
@@ -177,7 +193,7 @@ def _glow(plane: np.ndarray, middle: np.ndarray, extent: float, dark: float, hei
     part = plane[top : int(middle[1] + 2 * extent) + 1, left : int(middle[0] + 2 * extent) + 1]
     rim = np.concatenate([part[0], part[-1], part[:, 0], part[:, -1]])
     floor, peak = float(np.median(rim)), dark + height
-    if peak - floor < CONTRAST * peak:
+    if peak - floor < GLOW_CONTRAST * peak:
         return None
     found = []
     for share in HEIGHTS:

@@ -30,6 +30,7 @@ class Circle:
     zenith_distance (rad): as it is without refraction.
     sigma (rad): of the direction, across the circle.  terms: errors of the zenith distance, with factors (1, m) in rad.
     clock_stddev_s, stamp_stddev_s: as in a fix.
+    instead: the same disc as the Moon's, which it may be as well; None where it cannot be.
     up (3,): in S, as the inclinometer shows it; axes: their number, 2 or 3.
     """
 
@@ -45,6 +46,7 @@ class Circle:
     clock_stddev_s: float
     stamp_stddev_s: float
     parallax: float = 0.0
+    instead: "Circle | None" = None
 
 
 def circle_of(pointing: Pointing, tilt: Tilt, about: Circumstances) -> Circle:

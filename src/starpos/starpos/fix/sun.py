@@ -6,6 +6,7 @@ lamp, and makes the attitude better than by either. Without a place one frame gi
 """
 
 import math
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,7 +20,7 @@ from starpos.errors import FixError, InstrumentError, PlaceError, StarposError
 from starpos.fix.attitude import CAMERA, ITRS, Attitude
 from starpos.fix.budget import sky_terms, tilt_terms
 from starpos.fix.checks import MIN_DEG
-from starpos.fix.circle import MIN_SINE, circle_along
+from starpos.fix.circle import MIN_SINE, Circle, circle_along
 from starpos.fix.glows import Glow
 from starpos.fix.heading import AttitudeAtPlace, attitudes_at, zenith_moved
 from starpos.fix.solution import Solution
@@ -151,18 +152,28 @@ def _check_size(disc: Disc, seen: _Seen, body: Body, camera: Camera, place: str)
 def _on_circle(
     solver: Solver, stars: Stars, disc: Disc, seen: _Seen, tilt: Tilt, state: EarthState, stamp_s: float
 ) -> Solution:
-    """The Sun's circle of equal altitude."""
-    body = body_at(SUN, state, solver.ephemeris)
+    """The Sun's circle of equal altitude, with the Moon's in its stead; a glow is not the Moon's."""
     camera = solver.instrument.camera_for(stars.width, stars.height, stars.origin_px)
-    _check_size(disc, seen, body, camera, stars.place)
     up = solver.instrument.mounting.level(tilt).camera[2]
     across = (up - (up @ seen.ray) * seen.ray) / max(math.sqrt(1 - (up @ seen.ray) ** 2), MIN_SINE)
-    sigma = math.hypot(float(np.linalg.norm(across @ seen.own)), body.sigma)
-    about = replace(solver.circumstances(stars, camera, state), stamp_stddev_s=stamp_s)
-    circle = circle_along(seen.ray, body.itrs, stars.place, tilt, about, sigma=sigma, parallax=body.parallax)
     lens = ErrorTerm("lens", (across @ seen.lens)[None], shared=ALWAYS)
-    circle = replace(circle, terms=(*circle.terms, lens))
-    text = f"the Sun {math.degrees(circle.zenith_distance):.4f} deg from the zenith"
+    about = replace(solver.circumstances(stars, camera, state), stamp_stddev_s=stamp_s)
+
+    def circle_of(name: str) -> Circle:
+        body = body_at(name, state, solver.ephemeris)
+        _check_size(disc, seen, body, camera, stars.place)
+        sigma = math.hypot(float(np.linalg.norm(across @ seen.own)), body.sigma)
+        circle = circle_along(
+            seen.ray, body.itrs, stars.place, tilt, about, sigma=sigma, parallax=body.parallax
+        )
+        return replace(circle, terms=(*circle.terms, lens))
+
+    circle = circle_of(SUN)
+    if disc.sharp:
+        with suppress(PlaceError):
+            circle = replace(circle, instead=circle_of(MOON))
+    name = "the Sun" if circle.instead is None else "the Sun, or the Moon,"
+    text = f"{name} {math.degrees(circle.zenith_distance):.4f} deg from the zenith"
     return Solution.of(stars, text, circle=circle, tilt=tilt, bodies=(SUN,))
 
 

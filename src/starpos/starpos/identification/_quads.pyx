@@ -7,8 +7,6 @@ from libc.string cimport memcpy
 
 import numpy as np
 
-from starpos._numeric.algebra cimport fetch
-
 cdef enum:
     # Sides of a shape, and those of them that have bins.
     ALL_SIDES = 5
@@ -76,70 +74,41 @@ cdef void _copy(int[:, ::1] pairs, const Found *found) noexcept:
         memcpy(&pairs[0, 0], found.pair, 2 * found.count * sizeof(int))
 
 
-cdef struct Looked:
-    # What is looked up for a query: the bounds of its sides, the bins that these reach, and those of its size.
-    double[ALL_SIDES] least, greatest
-    int[BINNED] low, high
-    int first, last
-
-
 cdef bint _near(
     const int *bin_start, const unsigned short[:, ::1] shape, const float[::1] log_size, const double[:, ::1] wanted,
     const double[::1] tolerance, const double[::1] wanted_size, double size_tolerance, int codes, int bins,
     int size_bins, double smallest, double largest, Py_ssize_t most, Found *found,
 ) noexcept nogil:
     """Fill in `found`; False where memory ends."""
-    cdef Py_ssize_t q, n = len(wanted)
-    cdef double per_bin = size_bins / (largest - smallest)
-    cdef Looked[2] looked
-    cdef Looked *here
+    cdef Py_ssize_t q
+    cdef int[BINNED] low, high
+    cdef double[ALL_SIDES] least, greatest
+    cdef int a, b, c, d, i, k, first, last
     cdef Py_ssize_t run
-    cdef int a, b, c, d, k
-    # the quads of the next query come from memory while those of one are compared
-    for q in range(n + 1):
-        if q < n:
-            here = &looked[q & 1]
-            _look(here, wanted, q, tolerance[q], codes, bins)
-            here.first = _bin((wanted_size[q] - size_tolerance - smallest) * per_bin / size_bins, size_bins)
-            here.last = _bin((wanted_size[q] + size_tolerance - smallest) * per_bin / size_bins, size_bins)
-            for a in range(here.low[0], here.high[0] + 1):
-                for b in range(here.low[1], here.high[1] + 1):
-                    for c in range(here.low[2], here.high[2] + 1):
-                        for d in range(here.low[3], here.high[3] + 1):
-                            run = <Py_ssize_t>(((a * bins + b) * bins + c) * bins + d) * size_bins
-                            k = bin_start[run + here.first]
-                            if k < bin_start[run + here.last + 1]:
-                                fetch(&shape[k, 0])
-        if q == 0:
-            continue
-        here = &looked[(q - 1) & 1]
-        for a in range(here.low[0], here.high[0] + 1):
-            for b in range(here.low[1], here.high[1] + 1):
-                for c in range(here.low[2], here.high[2] + 1):
-                    for d in range(here.low[3], here.high[3] + 1):
+    cdef double per_bin = size_bins / (largest - smallest)
+    for q in range(len(wanted)):
+        for i in range(ALL_SIDES):
+            least[i], greatest[i] = (wanted[q, i] - tolerance[q]) * codes, (wanted[q, i] + tolerance[q]) * codes
+        for i in range(BINNED):
+            low[i], high[i] = _bin(least[i] / codes, bins), _bin(greatest[i] / codes, bins)
+        first = _bin((wanted_size[q] - size_tolerance - smallest) * per_bin / size_bins, size_bins)
+        last = _bin((wanted_size[q] + size_tolerance - smallest) * per_bin / size_bins, size_bins)
+        for a in range(low[0], high[0] + 1):
+            for b in range(low[1], high[1] + 1):
+                for c in range(low[2], high[2] + 1):
+                    for d in range(low[3], high[3] + 1):
                         run = <Py_ssize_t>(((a * bins + b) * bins + c) * bins + d) * size_bins
-                        for k in range(bin_start[run + here.first], bin_start[run + here.last + 1]):
-                            if _alike(&shape[k, 0], here.least, here.greatest) and (
-                                -size_tolerance <= log_size[k] - wanted_size[q - 1] <= size_tolerance
+                        for k in range(bin_start[run + first], bin_start[run + last + 1]):
+                            if _alike(&shape[k, 0], least, greatest) and (
+                                -size_tolerance <= log_size[k] - wanted_size[q] <= size_tolerance
                             ):
                                 if found.count == most:
                                     return True
                                 if not _room_for_one(found):
                                     return False
-                                found.pair[2 * found.count], found.pair[2 * found.count + 1] = <int>(q - 1), k
+                                found.pair[2 * found.count], found.pair[2 * found.count + 1] = <int>q, k
                                 found.count += 1
     return True
-
-
-cdef inline void _look(
-    Looked *query, const double[:, ::1] wanted, Py_ssize_t q, double tolerance, int codes, int bins
-) noexcept nogil:
-    """Set the bounds and bins of a query's sides."""
-    cdef int i
-    for i in range(ALL_SIDES):
-        query.least[i], query.greatest[i] = (wanted[q, i] - tolerance) * codes, (wanted[q, i] + tolerance) * codes
-    for i in range(BINNED):
-        query.low[i], query.high[i] = _bin(query.least[i] / codes, bins), _bin(query.greatest[i] / codes, bins)
 
 
 cdef inline bint _alike(const unsigned short *shape, const double *least, const double *greatest) noexcept nogil:

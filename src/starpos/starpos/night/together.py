@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from starpos.averaging.altitudes import MIN_JUDGED, Directions, place_of_circles
+from starpos.averaging.altitudes import MIN_JUDGED, Directions, place_of_circles, place_of_discs
 from starpos.averaging.average import Average, average
 from starpos.averaging.elevation_axis import MIN_WITHOUT_SITE, FoundAxis, find_axis
 from starpos.calibration.misalignment import Calibrated, turn
@@ -138,14 +138,14 @@ def together(gathered: Gathered, given: Instrument | None, near: Near | None = N
 
 
 def _by_day(circles: Sequence[Circle], near: Near | None) -> Together:
-    """The place by the Sun's circles."""
+    """The place by the circles of the Sun, or of the Moon."""
     try:
         if Directions.of(sorted(circles, key=lambda c: c.utc_unix_s)).wide:
             raise FixError(
                 "the Sun's elevations determine a place only where A3 is known to 6 arcmin: find it by night with "
                 "starpos calibrate --site"
             )
-        place = place_of_circles(circles, None if near is None else (near.latitude, near.longitude))
+        place, _ = place_of_discs(circles, None if near is None else (near.latitude, near.longitude))
     except FixError as error:
         return Together(None, str(error))
     return Together(place, "", (*remarks.of_average(place), *doubts((), place, None, near)))

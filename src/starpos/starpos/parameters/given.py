@@ -8,7 +8,7 @@ from typing import Any
 
 from starpos.errors import InstrumentError
 from starpos.instrument import yaml_file
-from starpos.parameters.table import parameters_of
+from starpos.parameters.table import defaults_of, parameters_of
 
 # the nodes whose work is done without ROS; a text without a node is the first one's
 NODES = ("solver", "detector", "inclinometer")
@@ -26,7 +26,7 @@ def values_of(
     Raises ParameterError if a value is not allowed, InstrumentError if something cannot be read, or is no parameter.
     """
     known = {p.name: p for p in parameters_of(node)}
-    values: dict[str, Any] = {p.name: p.default for p in known.values()}
+    values = defaults_of(node)
     stated = [] if file is None else list(_in_file(file, node, namespace))
     stated += [(name, value) for whose, name, value in map(_assigned, given) if whose == node]
     for name, value in stated:

@@ -3,7 +3,7 @@
 
 import math
 import reprlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import KW_ONLY, dataclass
 from functools import cache
 from importlib import resources
@@ -179,24 +179,6 @@ def _parameter(name: str, row: Any) -> Parameter:
     if "form" in made:
         made["form"] = FORMS[made["form"]]
     return Parameter(name, **made | {"choices": tuple(made.get("choices", ()))})
-
-
-def parameter_file() -> str:
-    """ROS's parameter file of all nodes: every parameter at its default, below its meaning, unit and constraint."""
-    # REUSE-IgnoreStart
-    lines = ["# SPDX-License-Identifier: Apache-2.0"]
-    # REUSE-IgnoreEnd
-    lines.append("# All parameters at their defaults; keep what you change. Written by tools/reference.py.")
-    for node in NODES:
-        lines += ["", f"/**/{node}:", "  ros__parameters:"]
-        lines += [line for p in parameters_of(node) for line in _lines(p)]
-    return "\n".join(lines) + "\n"
-
-
-def _lines(p: Parameter) -> Iterator[str]:
-    yield f"    # {p.description}"
-    yield f"    # {p.rule}"
-    yield f"    {p.name}: {yaml_value(p.default)}"
 
 
 def yaml_value(value: Any) -> str:

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from functools import cached_property, lru_cache, partial
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -364,6 +365,7 @@ def save(catalogue: Catalogue, path: Path | str) -> None:
         np.uint32
     )
     named = np.flatnonzero(c.hip)
+    plain: dict[str, Any] = {name: _split(getattr(c, name)) for name in PLAIN}
     with open(path, "wb") as f:
         np.savez_compressed(
             f,
@@ -376,7 +378,7 @@ def save(catalogue: Catalogue, path: Path | str) -> None:
             tyc3=c.tyc[:, 2].astype(np.uint8),
             hip_step=_split(np.diff(named, prepend=0).astype(np.uint16)),
             hip=_split(c.hip[named]),
-            **{name: _split(getattr(c, name)) for name in PLAIN},
+            **plain,
         )
 
 

@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 
 from starpos import rotation
-from starpos.averaging.altitudes import place_of_circles
+from starpos.averaging.altitudes import place_of_circles, place_of_discs
 from starpos.earth.orientation import earth_state
 from starpos.earth.place import Place
 from starpos.earth.refraction import Atmosphere
 from starpos.earth.vertical import Deflection
+from starpos.errors import FixError
 from starpos.fix.searching import Question, answer_frame
 from starpos.fix.solution import Solution, Status
 from starpos.fix.solver import Solver
@@ -164,6 +165,44 @@ def sun_at(hours: float, latitude: float, longitude: float) -> tuple[str, float,
         place.axes @ body_at("sun", earth_state(unix_of(utc))).from_place(place.zenith)
     )
     return utc, np.degrees(np.arctan2(seen[0], seen[1])), np.degrees(np.arcsin(seen[2]))
+
+
+def circles_of(name: str, hours, rng) -> list:
+    """Circles of equal altitude of a body that a level of good poses sees, turned each time."""
+    solver, made = solver_of(1.0), []
+    for hour in hours:
+        when = unix_of("2025-06-05T00:00:00") + 3600 * hour
+        body = body_at(name, earth_state(when))
+        seen = AIR.refraction().bend(HERE.axes @ body.from_place(HERE.zenith))
+        azimuth, altitude = np.degrees([np.arctan2(seen[0], seen[1]), np.arcsin(seen[2])])
+        view = View(azimuth, altitude, rng.uniform(-4, 4, 2), rng.uniform(-50, 50))
+        utc = np.datetime_as_string(np.datetime64(round(when), "s"))
+        radius = (
+            body.radius * 4266 * (1 + np.sin(np.radians(altitude)) * (body.parallax if name == "moon" else 0))
+        )
+        made.append(view.answer(utc, None, solver, tilted=rng.normal(0, POSE, 2), radius=radius).circle)
+    return made
+
+
+@pytest.mark.parametrize(
+    ("name", "hours"), [("sun", np.arange(7, 12, 0.5)), ("moon", np.arange(16, 21, 0.5))]
+)
+def test_discs_of_an_unknown_place_are_the_bodys_whose_circles_meet(name, hours) -> None:
+    circles = circles_of(name, hours, np.random.default_rng(2))
+    place, found = place_of_discs(circles)
+    assert found == name
+    off = HERE.offset_m(place.latitude, place.longitude)
+    assert off @ np.linalg.solve(place.covariance[:2, :2], off) < 12
+    near, chosen = place_of_discs(circles[:5:2], (HERE.plumb[0] + 0.02, HERE.plumb[1] - 0.03))
+    assert chosen == name
+    assert np.linalg.norm(HERE.offset_m(near.latitude, near.longitude)) < 60_000
+
+
+def test_discs_that_both_bodies_explain_give_no_place() -> None:
+    rng = np.random.default_rng(2)
+    circles = [replace(c, instead=c) for c in circles_of("sun", np.arange(7, 12, 0.5), rng)]
+    with pytest.raises(FixError, match="the Sun's or the Moon's"):
+        place_of_discs(circles)
 
 
 def test_many_suns_of_a_turned_level_give_a_place_and_of_one_at_rest_one_as_bad_as_its_pose() -> None:
