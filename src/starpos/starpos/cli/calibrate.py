@@ -552,22 +552,15 @@ def _json_of(found: FromSky, path: str) -> dict:
     c = fit.camera
     return {
         "camera": path,
-        "width": c.width,
-        "height": c.height,
-        "fx": c.fx,
-        "fy": c.fy,
-        "cx": c.cx,
-        "cy": c.cy,
-        "model": c.model,
-        "distortion": c.distortion,
+        **{
+            name: getattr(c, name)
+            for name in ("width", "height", "fx", "fy", "cx", "cy", "model", "distortion")
+        },
         "sigma": dict(zip(parameters(c), fit.sigma, strict=True)),
         "covariance": fit.covariance,
         "told": [name for name, told in zip(parameters(c), fit.determined, strict=True) if told],
-        "rms_px": fit.rms_px,
         "rms_before_px": rms(fit.before),
-        "scatter_px": fit.scatter_px,
-        "worst_sigma_px": fit.worst_sigma_px,
+        **{name: getattr(fit, name) for name in ("rms_px", "scatter_px", "worst_sigma_px", "rejected")},
         "stars": len(fit.xy),
-        "rejected": fit.rejected,
         "frames": len(found.used),
     }

@@ -3,7 +3,7 @@
 
 import numpy as np
 
-from starpos.earth.orientation import EarthState, earth_state
+from starpos.earth.orientation import earth_state
 from starpos.errors import StarposError
 from starpos.frames.frame import Stars
 from starpos.identification import Identification
@@ -25,27 +25,19 @@ def planets_among(stars: Stars, found: Identification, camera: Camera) -> tuple[
     others = np.array([row for row in range(min(len(stars), BRIGHTEST)) if row not in known])
     if not len(others):
         return ()
+    seen = camera.scaled(found.focal_scale)
     try:
         state = earth_state(stars.mid_unix_s)
+        rays = seen.directions(stars.x[others], stars.y[others])
     except StarposError:
         return ()
-    seen = camera.scaled(found.focal_scale)
-    xy = np.stack([stars.x, stars.y], 1)[others]
+    # rays are compared, not pixels: distortion's formula has no place for a planet far outside the frame
+    sky = rays @ found.attitude @ state.gcrs_to_itrs.T
     named = []
     for name in BRIGHT:
         body = body_at(name, state)
-        expected = _pixel(body.itrs, state, found, seen)
-        off = np.hypot(*(xy - expected).T)
+        off = np.linalg.norm(sky - body.itrs, axis=1)
         near = int(np.argmin(off))
-        if off[near] < NEAR_PX + (NEAR_SIGMAS * body.sigma + body.radius) * seen.fx:
+        if off[near] < NEAR_PX / seen.fx + NEAR_SIGMAS * body.sigma + body.radius:
             named.append((name, int(others[near])))
     return tuple(named)
-
-
-def _pixel(itrs: np.ndarray, state: EarthState, found: Identification, camera: Camera) -> np.ndarray:
-    """Place (2,) px of an apparent direction (3,) in ITRS; far away if it is not in front of the camera."""
-    ray = found.attitude @ (itrs @ state.gcrs_to_itrs)
-    xy = camera.project(ray[None])[0]
-    # what lies behind the camera has an image in formulas only
-    ahead = np.isfinite(xy).all() and camera.directions(xy[:1], xy[1:])[0] @ ray > 0.999
-    return xy if ahead else np.full(2, np.inf)

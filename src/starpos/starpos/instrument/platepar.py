@@ -218,12 +218,9 @@ def platepar_of(camera: Camera, seen: SkyPixels, station: str = "XX0001") -> tup
         "auto_recalibrated": False,
     }
     plate |= dict(zip(("RA_d", "dec_d", "pos_angle_ref"), np.degrees(pointing).tolist(), strict=True))
-    local = _local(rotation.unit_vector(*pointing[:2])[None] @ _precession(J2000_JD, jd).T, jd, *site)
-    (azimuth,), (altitude,) = np.arctan2(local[:, 0], local[:, 1]), np.arcsin(local[:, 2])
-    plate |= {
-        "az_centre": float(np.degrees(azimuth) % 360),
-        "alt_centre": float(np.degrees(_raised(altitude))),
-    }
+    east, north, up = _horizon(jd, *site) @ _precession(J2000_JD, jd) @ rotation.unit_vector(*pointing[:2])
+    plate["az_centre"] = float(np.degrees(np.arctan2(east, north)) % 360)
+    plate["alt_centre"] = float(np.degrees(_raised(np.arcsin(up))))
     off = _distorted(plate, apparent @ to_sky) - seen.xy
     return plate, float(np.hypot(*off.T).max())
 
@@ -322,11 +319,6 @@ def _horizon(jd: float, latitude: float, longitude: float) -> np.ndarray:
     up = rotation.unit_vector(time, latitude)
     east = np.array([-np.sin(time), np.cos(time), 0.0])
     return np.stack([east, np.cross(up, east), up])
-
-
-def _local(v: np.ndarray, jd: float, latitude: float, longitude: float) -> np.ndarray:
-    """Directions (N, 3) of date along east, north, up."""
-    return v @ _horizon(jd, latitude, longitude).T
 
 
 def _raised(altitude: np.ndarray) -> np.ndarray:
