@@ -30,7 +30,7 @@ from starpos_testing.graph.shots import (
     scene_at,
 )
 from starpos_testing.headings import yaw_deg
-from starpos_testing.skies.bags import typestore
+from starpos_testing.skies.bags import Quiet, typestore
 from starpos_testing.skies.suns import disc_frame
 
 # 2024-11-03, UTC: the Sun sinks from 37 deg to 4, stands 5 deg below the horizon, and is 10 and 20 deg below it
@@ -118,13 +118,6 @@ def test_nodes_give_headings_by_day_and_by_night(graph, run, tmp_path, frames):
         assert answer.heading_stddev < 0.05
     assert said[: len(DAY)] == ["the Sun"] * len(DAY)
     assert min(said[len(DAY) + 1 :]) >= 4
-
-
-class Quiet:
-    """A log and driver that take anything from a session."""
-
-    def __getattr__(self, name):
-        return lambda *_: None
 
 
 def test_a_bag_of_a_day_and_a_night_is_replayed_without_a_gap(tmp_path, frames):

@@ -19,7 +19,7 @@ from starpos_bringup.bag import Bag
 from starpos_common.messages import attitude_to_message, unix_to_stamp
 from starpos_interfaces.msg import Attitude, Tilt
 from starpos_testing.graph.graph import stamp_of
-from starpos_testing.skies.bags import part_of
+from starpos_testing.skies.bags import Quiet, part_of
 
 NIGHT = Path(__file__).parent / "data" / "night"
 KNOWN = ("refraction.pressure:=66000.0", "refraction.temperature:=-4.0", "refraction.humidity:=0.4",
@@ -32,13 +32,6 @@ CLOCK_S = 0.025
 @pytest.fixture(scope="module")
 def bag(tmp_path_factory):
     return part_of(NIGHT, tmp_path_factory.mktemp("bag") / "bag", 0.0, 10.0)
-
-
-class Quiet:
-    """A log and driver that take anything from a session."""
-
-    def __getattr__(self, name):
-        return lambda *_: None
 
 
 @pytest.fixture(scope="module")

@@ -12,16 +12,10 @@ from starpos.recording.drivers import Drivers
 from starpos.session.replay import Replay
 from starpos.session.settings import Settings
 from starpos_testing.skies import robots
+from starpos_testing.skies.bags import Quiet
 
 PARAMETERS = Path(__file__).parents[1] / "src" / "starpos_bringup" / "config" / "existing_robot.yaml"
 TOPICS = ("-r", "camera/image_raw:=/cam0/image_raw", "-r", "camera/camera_info:=/cam0/camera_info")
-
-
-class Quiet:
-    """A log and driver that take anything from a session."""
-
-    def __getattr__(self, name):
-        return lambda *_: None
 
 
 @pytest.fixture(scope="module")

@@ -355,8 +355,10 @@ class SolverSession:
             # by the clock of recorded data no time passes
             answered = replace(answered, solution=replace(answered.solution, identify_s=0.0, fix_s=0.0))
         self._note(answered.solution, now)
-        if self.satellites is not None and not frame.doubted:
-            self.satellites.note(frame.header.stamp, frame.stars, answered.solution)
+        if (satellites := self.satellites) is not None and not frame.doubted:
+            self._guarded(
+                lambda: satellites.note(frame.header.stamp, frame.stars, answered.solution), lambda e: None
+            )
         return [
             replace(answered, attitude=self._attitude(frame, question, answered.solution)),
             *self._learn(frame, answered.solution),

@@ -49,6 +49,13 @@ def knowing(truth: dict) -> list[str]:
     return [f"{name}:={value}" for name, value in values.items()]
 
 
+class Quiet:
+    """A log and driver that take anything from a session."""
+
+    def __getattr__(self, name):
+        return lambda *_: None
+
+
 class NightBag:
     """Writes a bag, by default MCAP, with its topics in `namespace`."""
 
