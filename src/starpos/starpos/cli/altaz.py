@@ -3,9 +3,10 @@
 
 import argparse
 import itertools
+import struct
+import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
@@ -16,6 +17,7 @@ from starpos.cli.console import Output
 from starpos.cli.overwriting import Written
 from starpos.earth.orientation import earth_state
 from starpos.errors import FrameError, InstrumentError
+from starpos.files import write_whole
 from starpos.fix.attitude import Attitude
 from starpos.fix.directions import horizontal, towards
 from starpos.fix.heading import AttitudeAtPlace
@@ -129,6 +131,8 @@ def _put(args: argparse.Namespace, seen: _Seen, points: np.ndarray) -> None:
 # the grid: circles of altitude, azimuths, and the step along each, deg
 ALTITUDES, AZIMUTHS, ALONG = (0, 15, 30, 45, 60, 75), range(0, 360, 30), 0.5
 NAMES = {0: "N", 90: "E", 180: "S", 270: "W"}
+# bytes of a PNG up to the end of its first chunk
+PNG_HEADER = 33
 # blue, green, red
 GRID, FIGURES = (120, 120, 40), (150, 90, 150)
 
@@ -197,7 +201,11 @@ def _draw(path: str, seen: _Seen, points: np.ndarray, ground: np.ndarray | None)
             cv2.putText(picture, text, tuple(map(round, xy)), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (0, 220, 255), 1)
     for x, y in (points + 0.5) / n - 0.5:
         cv2.drawMarker(picture, (round(x), round(y)), (60, 60, 255), cv2.MARKER_CROSS, 15)
-    if not cv2.imwrite(str(Path(path)), picture):
-        raise InstrumentError(
-            f"{path}: the picture cannot be written there: give a PNG in a folder that is there"
-        )
+    png = cv2.imencode(".png", picture)[1].tobytes()
+    # after the header: who made it, so that the next call may replace it
+    text = b"tEXtSoftware\0starpos"
+    made_by = struct.pack(">I", len(text) - 4) + text + struct.pack(">I", zlib.crc32(text))
+    try:
+        write_whole(path, png[:PNG_HEADER] + made_by + png[PNG_HEADER:])
+    except OSError as e:
+        raise InstrumentError(f"{path}: the picture cannot be written there ({e.strerror})") from None

@@ -70,13 +70,11 @@ def test_a_grid_is_drawn(run, night, tmp_path):
     whole = cv2.IMREAD_GRAYSCALE
     assert run("altaz", frame, "100", "200", *WIDE, *AIR, *SITE, "--overlay", picture)[0] == 0
     bright = cv2.imread(str(picture), whole).mean()
-    picture = tmp_path / "ground.png"
     ground = ("--overlay", picture, "--horizon", table)
     assert run("altaz", frame, "100", "200", *WIDE, *AIR, *SITE, *ground)[0] == 0
     # all that the camera sees lies below this horizon
     assert cv2.imread(str(picture), whole).mean() < 0.6 * bright
     table.write_text("azimuth_deg,altitude_deg\n")
-    picture.unlink()
     status, _, err = run("altaz", frame, "1", "2", *WIDE, *SITE, *ground)
     assert status == 2 and "horizon.csv" in err[-1]
 
