@@ -4,6 +4,7 @@
 import json
 
 import numpy as np
+import pytest
 from astropy.io import fits
 
 from starpos.cli import main
@@ -53,3 +54,13 @@ def test_a_frame_of_the_sun_alone_gives_its_zenith_distance_and_no_place(tmp_pat
     assert status == 1
     assert abs(frame["zenith_distance_deg"] - (90 - ALTITUDE)) < 0.1
     assert "do not determine a place" in said
+
+
+def test_what_is_no_ephemeris_is_a_bad_call(tmp_path, capsys):
+    pytest.importorskip("jplephem")
+    (tmp_path / "de.bsp").write_text("nothing")
+    status, frames, said = solved(
+        tmp_path, capsys, "--site", "48", "11", "0", "--ephemeris", str(tmp_path / "de.bsp")
+    )
+    assert (status, frames) == (2, [])
+    assert "de.bsp: this is no ephemeris in SPICE's format" in said
