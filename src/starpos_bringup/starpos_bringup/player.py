@@ -27,6 +27,8 @@ CLOCK_PERIOD_S = 0.025
 ACKNOWLEDGED_S = 3.0
 # How far the bag's time goes on beyond a frame that is not answered: solver and detector wait for later messages.
 AHEAD_S = 5.0
+# A clock set back makes nodes forget; they hear of it in this time, before the first message of a round.
+BEGUN_S = 0.5
 # How long an answer is waited for, and how often that may be in vain.
 PATIENCE_S, MAX_IN_VAIN = 30.0, 2
 # At rate 0 listeners get this time after each burst to empty their queues, which hold some hundred messages.
@@ -271,13 +273,16 @@ class Player:
         """Go on to a time; it is published unless the clock was published within some seconds before."""
         if self._now_ns is not None and now_ns <= self._now_ns:
             return
-        self._now_ns = now_ns
+        begins, self._now_ns = self._now_ns is None, now_ns
         if now_ns - self._ticked_ns < least_s * 1e9:
             return
         self._ticked_ns = now_ns
         message = Clock()
         message.clock.sec, message.clock.nanosec = divmod(now_ns, 10**9)
         self._clock.publish(message)
+        if begins:
+            self._spin(BEGUN_S)
+            self._begin_s += BEGUN_S
 
     def _spin(self, seconds: float, until: Callable[[], bool] = lambda: False) -> bool:
         end = time.monotonic() + seconds

@@ -65,6 +65,7 @@ def hasty(monkeypatch):
     monkeypatch.setattr(module, "FOUND_S", 0.1)
     monkeypatch.setattr(module, "PATIENCE_S", 0.1)
     monkeypatch.setattr(module, "AHEAD_S", 0.1)
+    monkeypatch.setattr(module, "BEGUN_S", 0.0)
 
 
 def play(player, name, at_s):
