@@ -203,8 +203,8 @@ def _draw(path: str, seen: _Seen, points: np.ndarray, ground: np.ndarray | None)
         cv2.drawMarker(picture, (round(x), round(y)), (60, 60, 255), cv2.MARKER_CROSS, 15)
     png = cv2.imencode(".png", picture)[1].tobytes()
     # after the header: who made it, so that the next call may replace it
-    text = b"tEXtSoftware\0starpos"
-    made_by = struct.pack(">I", len(text) - 4) + text + struct.pack(">I", zlib.crc32(text))
+    chunk = b"tEXtSoftware\0starpos"
+    made_by = struct.pack(">I", len(chunk) - 4) + chunk + struct.pack(">I", zlib.crc32(chunk))
     try:
         write_whole(path, png[:PNG_HEADER] + made_by + png[PNG_HEADER:])
     except OSError as e:
