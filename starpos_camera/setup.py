@@ -5,7 +5,7 @@ package = "starpos_camera"
 
 setup(
     name=package,
-    version="0.1.0",
+    version="0.4.0",
     packages=find_packages(exclude=["test"]),
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{package}"]),

@@ -5,7 +5,7 @@ package = "starpos_solver"
 
 setup(
     name=package,
-    version="0.1.0",
+    version="0.4.0",
     description="Stars and tilt in, position and heading out",
     maintainer="starpos maintainers",
     license="Apache-2.0",

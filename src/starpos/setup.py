@@ -53,7 +53,7 @@ class BuildCompiled(build_ext):
 # is in pyproject.toml.
 setup(
     name=package,
-    version="0.1.0",
+    version="0.4.0",
     license="Apache-2.0 AND BSD-2-Clause AND ISC AND LicenseRef-Natural-Earth",
     license_files=["LICENSES/*"],
     python_requires=">=3.10",

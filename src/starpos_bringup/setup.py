@@ -7,7 +7,7 @@ package = "starpos_bringup"
 
 setup(
     name=package,
-    version="0.1.0",
+    version="0.4.0",
     description="Launch files, default parameters, recording and playing of the whole instrument",
     maintainer="starpos maintainers",
     license="Apache-2.0",

@@ -5,7 +5,7 @@ package = "starpos_common"
 
 setup(
     name=package,
-    version="0.1.0",
+    version="0.4.0",
     packages=[package],
     package_data={package: ["flake8.ini"]},
     data_files=[

@@ -5,7 +5,7 @@ package = "starpos_dashboard"
 
 setup(
     name=package,
-    version="0.1.0",
+    version="0.4.0",
     description="One page in a browser that shows what the instrument says",
     maintainer="starpos maintainers",
     license="Apache-2.0 AND ISC AND MIT",

@@ -5,7 +5,7 @@ package = "starpos_testing"
 
 setup(
     name=package,
-    version="0.1.0",
+    version="0.4.0",
     description="Helpers of the tests",
     maintainer="starpos maintainers",
     license="Apache-2.0",

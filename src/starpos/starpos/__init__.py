@@ -27,7 +27,7 @@ import re
 from importlib import import_module
 from typing import Any
 
-__version__ = "0.1.0"
+__version__ = "0.4.0"
 
 # __init__.pyi says to editors and type checkers where the public names are, and here
 with open(f"{__file__.rpartition('.')[0]}.pyi", encoding="utf-8") as _stub:

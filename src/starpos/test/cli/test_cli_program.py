@@ -54,7 +54,7 @@ def test_help_and_version(capsys):
         status, out, _ = run(capsys, name, "--help")
         assert status == 0
         assert f"starpos {name}" in out
-    assert run(capsys, "--version")[:2] == (0, "starpos 0.1.0\n")
+    assert run(capsys, "--version")[:2] == (0, "starpos 0.4.0\n")
 
 
 @pytest.mark.parametrize(
