@@ -69,7 +69,7 @@ def test_a_changelog_can_be_released_by_catkin_prepare_release(folder):
     """`catkin_prepare_release` renames `Forthcoming`; bloom reads the changes of each version; a change is one line."""
     package = parse_package(folder)
     log = get_changelog_from_path(str(folder), package.name)
-    released = list(log.foreach_version())
+    released = list(log.foreach_version(reverse=True))
     assert released[0][0] == package.version and all(changes for *_, changes in released)
     title, label = f"Changelog for package {package.name}", get_forthcoming_label(log.rst)
     next_release = rename_section(log.rst, label, "9.9.9 (2100-01-01)") if label else log.rst
