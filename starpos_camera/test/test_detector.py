@@ -312,9 +312,9 @@ def test_by_day_the_camera_is_asked_for_a_shorter_exposure_and_by_night_for_its_
     service = listener.node.create_service(SetCapture, "camera/set_capture", answer)
     feed = Feed(listener, start, "day_exposure:=true")
     white, dark = Frame(np.full((200, 300), 255, np.uint8)), Frame(np.full((200, 300), 3, np.uint8))
-    feed.wait_for(feed.send(white, exposure=0.8))
     # the service may not have been discovered at the first frames
-    listener.wait(lambda: asked or feed.wait_for(feed.send(white, exposure=0.8)))
+    while not asked:
+        feed.wait_for(feed.send(white, exposure=0.8))
     feed.wait_for(feed.send(dark, exposure=asked[0]))
     listener.wait(lambda: len(asked) > 1)
     assert asked == pytest.approx([0.1, 0.8])

@@ -134,7 +134,7 @@ def test_what_looks_like_the_sun_round_trips_beside_the_stars(heard, sharp):
 def test_a_disc_that_cannot_be_is_refused(heard, field, value):
     disc = Disc(x=1.0, y=2.0, covariance=np.eye(2), radius_px=9.0, sharp=True)
     message = messages.stars_to_message(replace(stars(), disc=disc), "c")
-    setattr(message.stars[0], field, value)
+    setattr(message.stars[-1], field, value)
     with pytest.raises(FrameError, match="disc"):
         message_to_stars(heard(message))
 

@@ -239,7 +239,7 @@ class ScanLayout:
         self.dtype = np.dtype(stored, align=True)
 
     def numbers(self, data: bytes) -> dict[str, np.ndarray]:
-        """The numbers (N,) of each element in the bytes of N whole scans."""
+        """Decode the bytes of N whole scans: each element as N numbers."""
         scans = np.frombuffer(data, self.dtype)
         return {name: _numbers(scans[name].astype(np.uint64), m) for name, m in self._found.items()}
 
