@@ -130,11 +130,13 @@ def _put(args: argparse.Namespace, seen: _Seen, points: np.ndarray) -> None:
 
 # the grid: circles of altitude, azimuths, and the step along each, deg
 ALTITUDES, AZIMUTHS, ALONG = (0, 15, 30, 45, 60, 75), range(0, 360, 30), 0.5
+# a label's least distance from the frame's edge; the lowest that an azimuth's stands (deg); an altitude's from the azimuth's line (deg)
+LABEL_PX, LOWEST, OFF_THE_LINES = 20, 5, 3
 NAMES = {0: "N", 90: "E", 180: "S", 270: "W"}
 # bytes of a PNG up to the end of its first chunk
 PNG_HEADER = 33
 # blue, green, red
-GRID, FIGURES = (120, 120, 40), (150, 90, 150)
+GRID, FIGURES, LABELS = (120, 120, 40), (150, 90, 150), (0, 220, 255)
 
 
 def _figures(seen: _Seen) -> Iterator[np.ndarray]:
@@ -194,11 +196,17 @@ def _draw(path: str, seen: _Seen, points: np.ndarray, ground: np.ndarray | None)
         for begin, end in itertools.pairwise(line(directions)):
             if np.isfinite([begin, end]).all():
                 cv2.line(picture, tuple(map(round, begin)), tuple(map(round, end)), colour, 1, cv2.LINE_AA)
-    for azimuth in AZIMUTHS:
-        (xy,) = line(np.array([[azimuth, 5.0]]))
-        if np.isfinite(xy).all():
-            text = NAMES.get(azimuth, str(azimuth))
-            cv2.putText(picture, text, tuple(map(round, xy)), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (0, 220, 255), 1)
+    # azimuths where they enter the frame from below, altitudes along the first azimuth that shows them
+    rising = ([(azimuth, h) for h in range(LOWEST, 90)] for azimuth in AZIMUTHS)
+    labels = [(NAMES.get(azimuth, str(azimuth)), way) for azimuth, way in zip(AZIMUTHS, rising, strict=True)]
+    labels += [(f"{h} deg", [(azimuth + OFF_THE_LINES, h) for azimuth in AZIMUTHS]) for h in ALTITUDES]
+    room = np.array([LABEL_PX, LABEL_PX]), np.array(picture.shape[1::-1]) - [2 * LABEL_PX, 2 * LABEL_PX]
+    for text, way in labels:
+        xy = line(np.array(way, float))
+        inside = np.flatnonzero(((xy > room[0]) & (xy < room[1])).all(1))
+        if inside.size:
+            at = tuple(map(round, xy[inside[0]]))
+            cv2.putText(picture, text, at, cv2.FONT_HERSHEY_SIMPLEX, 0.5, LABELS, 1, cv2.LINE_AA)
     for x, y in (points + 0.5) / n - 0.5:
         cv2.drawMarker(picture, (round(x), round(y)), (60, 60, 255), cv2.MARKER_CROSS, 15)
     png = cv2.imencode(".png", picture)[1].tobytes()

@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 from cli_calls import AIR, PLACE, WIDE, objects
 
+from starpos.cli import altaz
+
 SITE = ("--site", str(PLACE["latitude"]), str(PLACE["longitude"]))
 CLOCK = ("--clock-stddev", "0.001")
 
@@ -70,6 +72,8 @@ def test_a_grid_is_drawn(run, night, tmp_path):
     whole = cv2.IMREAD_GRAYSCALE
     assert run("altaz", frame, "100", "200", *WIDE, *AIR, *SITE, "--overlay", picture)[0] == 0
     bright = cv2.imread(str(picture), whole).mean()
+    # a field of 12 deg that looks 12 deg off the zenith shows neither the horizon nor 5 deg above it, but has its labels
+    assert (np.abs(cv2.imread(str(picture)).astype(int) - altaz.LABELS).max(2) < 30).sum() > 50
     ground = ("--overlay", picture, "--horizon", table)
     assert run("altaz", frame, "100", "200", *WIDE, *AIR, *SITE, *ground)[0] == 0
     # all that the camera sees lies below this horizon
