@@ -33,6 +33,8 @@ MAX_STILLBORN = 3
 DYING_S = 1.0
 # Exit status of a process that SIGKILL ended; Windows has no signals.
 KILLED_STATUS = -getattr(signal, "SIGKILL", 1 << 16)
+# Exit status of a process that SIGKILL ended; Windows has no signals.
+KILLED_STATUS = -getattr(signal, "SIGKILL", 1 << 16)
 # There is a process for each processor, so the libraries need no threads of their own.
 ONE_THREAD = dict.fromkeys((*BLAS_THREADS, "OPENCV_FOR_THREADS_NUM"), "1")
 
@@ -246,7 +248,7 @@ class _Worker:
         self.pipe.close()
         code = self._process.exitcode
         self._process.close()
-        if code == -signal.SIGKILL:
+        if code == KILLED_STATUS:
             return "killed, perhaps for lack of memory: try fewer --jobs"
         if code is not None and code < 0:
             return signal.strsignal(-code) or f"signal {-code}"
