@@ -33,8 +33,6 @@ MAX_STILLBORN = 3
 DYING_S = 1.0
 # Exit status of a process that SIGKILL ended; Windows has no signals.
 KILLED_STATUS = -getattr(signal, "SIGKILL", 1 << 16)
-# Exit status of a process that SIGKILL ended; Windows has no signals.
-KILLED_STATUS = -getattr(signal, "SIGKILL", 1 << 16)
 # There is a process for each processor, so the libraries need no threads of their own.
 ONE_THREAD = dict.fromkeys((*BLAS_THREADS, "OPENCV_FOR_THREADS_NUM"), "1")
 
