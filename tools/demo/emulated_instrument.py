@@ -193,12 +193,16 @@ def mid_of(message) -> float:
 
 
 def by_known_times(recorder: Recorder, solutions: list, off_s: np.ndarray, place: Place) -> np.ndarray:
-    """How far (m east, north) the mean place of frames is from theirs with known times."""
+    """How far (m east, north) the mean place of frames is from theirs with known times.
+
+    A busy machine may lose the stars of a frame on their way to the recorder: such a frame is in neither mean.
+    """
+    heard = [(s, late_s) for s, late_s in zip(solutions, off_s, strict=True) if stamp_of(s) in recorder.stars]
     errors = []
-    for solution, late_s in zip(solutions, off_s, strict=True):
+    for solution, late_s in heard:
         fix = recorder.solved(stamp_of(solution), mid_of(solution) - late_s, place)
         errors.append(error_m(np.degrees(fix.latitude), np.degrees(fix.longitude), place))
-    return np.mean([error_m(s.latitude, s.longitude, place) for s in solutions], 0) - np.mean(errors, 0)
+    return np.mean([error_m(s.latitude, s.longitude, place) for s, _ in heard], 0) - np.mean(errors, 0)
 
 
 def main() -> int:
