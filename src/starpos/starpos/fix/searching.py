@@ -100,17 +100,15 @@ class Sight:
 def answer_frame(solver: Solver, question: Question) -> Sight:
     """The fix of a frame by its tilt, and its heading where the place is known; without both its identification.
 
-    A disc with a limb is tried as the Sun first; a glow only where no stars are found.
+    A disc counts only where no stars are found: else it is the Moon, a lamp, or no disc at all.
     Its stars are identified by every way there is, each tried once on the same stars.
     """
     q, disc = question, question.stars.disc
     if disc is None or (q.tilts is None and q.places is None):
         return _by_stars(solver, q)
-    if not disc.sharp:
-        # the Moon, or a lamp, among stars
-        found = solver.identify(q.stars, q.predicted)
-        if not found.lost:
-            return _by_stars(solver, replace(q, known=found.found))
+    found = solver.identify(q.stars, q.predicted)
+    if not found.lost:
+        return _by_stars(solver, replace(q, known=found.found))
     by_day = Sight(q.stars, by_sun(solver, q.stars, disc, q.tilts, q.places))
     if by_day.solution.ok:
         return by_day

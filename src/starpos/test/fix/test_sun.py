@@ -152,6 +152,17 @@ def test_a_frame_is_answered_by_what_it_shows() -> None:
     assert sight.solution.bodies == ("sun",)
 
 
+@pytest.mark.parametrize("sharp", [True, False])
+def test_a_disc_as_wide_as_the_sun_among_stars_is_not_the_sun(night, sharp) -> None:
+    scene, stars, tilt, solver = night
+    radius_px = scene.camera.fx * np.radians(0.266)
+    disc = Disc(x=300.0, y=200.0, covariance=np.eye(2) * 0.04, radius_px=radius_px, sharp=sharp)
+    stars = replace(stars, disc=disc)
+    solution = answer_frame(solver, Question(item=stars, stars=stars, tilts=tilt)).solution
+    assert solution.found is not None and solution.bodies != ("sun",)
+    assert np.isfinite(solution.fix.latitude)
+
+
 def test_without_the_level_or_a3_it_says_so() -> None:
     unknown = Solver(Instrument(4266.0), load_catalogue(), AIR)
     assert "A3" in View(AZIMUTH, ALTITUDE).answer(WHEN, HERE, unknown).message
