@@ -130,8 +130,8 @@ def _put(args: argparse.Namespace, seen: _Seen, points: np.ndarray) -> None:
 
 # the grid: circles of altitude, azimuths, and the step along each, deg
 ALTITUDES, AZIMUTHS, ALONG = (0, 15, 30, 45, 60, 75), range(0, 360, 30), 0.5
-# a label's least distance from the frame's edge; the lowest altitude at which an azimuth's stands, deg; how far an altitude's
-# stands from the line of the azimuth, deg
+# a label's least distance from the frame's edge; the lowest altitude at which an azimuth's stands, deg; how far an
+# altitude's stands from the line of the azimuth, deg
 LABEL_PX, LOWEST, OFF_THE_LINES = 20, 5, 3
 NAMES = {0: "N", 90: "E", 180: "S", 270: "W"}
 # bytes of a PNG up to the end of its first chunk
