@@ -16,7 +16,8 @@ from starpos.errors import InstrumentError, WriteError
 from starpos.files import has_mark, write_whole
 from starpos.report.coast import SIGMAS_95
 
-SUFFIXES = GEOJSON, GPX = ".geojson", ".gpx"
+GPX = ".gpx"
+SUFFIXES = (".geojson", GPX)
 CREATOR = f"starpos {__version__}"
 # corners of an ellipse
 CORNERS = 72

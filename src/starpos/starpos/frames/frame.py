@@ -184,10 +184,6 @@ class FrameTrail:
     cut: np.ndarray
     steady: bool
 
-    @property
-    def length_px(self) -> float:
-        return float(np.hypot(*(self.ends[1] - self.ends[0])))
-
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Disc:
