@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 
 from starpos.cli import console, options, overwriting
-from starpos.cli.overwriting import Written
 from starpos.errors import CatalogueError
 from starpos.instrument.camera import Camera
 from starpos.sky import catalogue, deeper
@@ -49,7 +48,7 @@ def run_build(args: argparse.Namespace) -> int:
 
     if args.originals is None and args.gaia is None:
         raise CatalogueError("catalogue build: give the original files of Tycho-2, or --gaia TABLE, or both")
-    overwriting.check(args, Written("--out", args.out, overwriting.stars))
+    overwriting.check(args, overwriting.Written("--out", args.out, overwriting.stars))
     extract = None if args.gaia is None else gaia.read(Path(args.gaia))
     if args.originals is None:
         made = catalogue.load_catalogue()
