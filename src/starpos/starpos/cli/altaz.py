@@ -15,7 +15,7 @@ from starpos.cli import console, inputs, options, overwriting
 from starpos.cli.commands import rows_of
 from starpos.earth.orientation import earth_state
 from starpos.errors import FrameError, InstrumentError
-from starpos.files import write_whole
+from starpos.files import save
 from starpos.fix.attitude import Attitude
 from starpos.fix.directions import horizontal, towards
 from starpos.fix.heading import AttitudeAtPlace
@@ -211,7 +211,4 @@ def _draw(path: str, seen: _Seen, points: np.ndarray, ground: np.ndarray | None)
     # after the header: who made it, so that the next call may replace it
     chunk = b"tEXtSoftware\0starpos"
     made_by = struct.pack(">I", len(chunk) - 4) + chunk + struct.pack(">I", zlib.crc32(chunk))
-    try:
-        write_whole(path, png[:PNG_HEADER] + made_by + png[PNG_HEADER:])
-    except OSError as e:
-        raise InstrumentError(f"{path}: the picture cannot be written there ({e.strerror})") from None
+    save(path, png[:PNG_HEADER] + made_by + png[PNG_HEADER:], "the picture")

@@ -22,7 +22,7 @@ from starpos.cli.overwriting import CAMERA_NAME, Written, save_instrument
 from starpos.earth.place import Place
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import CalibrationError, FixError, FrameError, InstrumentError, PlaceError, StarposError
-from starpos.files import write_whole
+from starpos.files import save
 from starpos.fix.checks import FIND_TURN, at_another_lean, may_turn
 from starpos.fix.searching import Sight, of_one_camera
 from starpos.fix.solver import Solver
@@ -303,10 +303,7 @@ def _watch(args: argparse.Namespace) -> int:
     if args.page is not None:
         watch_output.write_page(Path(args.page), nights)
     if stars:
-        try:
-            horizon.write(Path(args.horizon), horizon.horizon(stars))
-        except OSError as e:
-            raise InstrumentError(f"{args.horizon}: it cannot be written there ({e.strerror})") from None
+        horizon.write(Path(args.horizon), horizon.horizon(stars))
     return NOTHING if not nights or any(n.alarm for n in nights) else 0
 
 
@@ -457,10 +454,7 @@ def _write_platepar(
     times = [frames[k].mid_unix_s or 0.0 for k in found.used]
     seen = seen_by(camera, mean, site, air, times[len(times) // 2])
     plate, worst = platepar.platepar_of(camera, seen)
-    try:
-        write_whole(path, (json.dumps(plate, indent=4, sort_keys=True) + "\n").encode())
-    except OSError as e:
-        raise InstrumentError(f"{path}: the platepar cannot be written there ({e.strerror})") from None
+    save(path, (json.dumps(plate, indent=4, sort_keys=True) + "\n").encode(), "the platepar")
     console.complain(
         f"{path}: RMS sees stars within {worst:.2f} px of this camera; the platepar has no photometry",
     )
