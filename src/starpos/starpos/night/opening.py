@@ -113,6 +113,8 @@ def work_of(
             own = of_gravity(known, by_log)
     instruments, remarks = replace(given, instrument=known).framed(first)
     level: Tilts | None = None if isinstance(tilts, Path) else tilts
+    if isinstance(tilts, ByGravity) and first.gravity is not None:
+        level = replace(tilts, camera=first.gravity.camera)
     if isinstance(tilts, Path):
         known = instruments.instrument
         errors = sensors.unnamed() if known is None else known.inclinometer
