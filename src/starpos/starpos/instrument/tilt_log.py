@@ -245,8 +245,9 @@ class TiltLog:
     def average(self, mid_unix_s: float, exposure_s: float, spread_s: float = 0.0) -> Tilt:
         """The mean tilt over an exposure, from the readings in it or, for a short one, from two that bracket it closely.
 
-        Two readings of the same time count once, and so does one that is published several times. A reading far from the others is left out; two that follow each other
-        and agree are of a turn. If the readings scatter more than stated (wind, footsteps), the covariance is larger.
+        Two readings of the same time count once, and so does one that is published several times. A reading far from
+        the others is left out; two that follow each other and agree are of a turn. If the readings scatter more than
+        stated (wind, footsteps), the covariance is larger.
         Its `step_rad` says whether they are rounded, or repeat without an end.
         TiltError if they do not cover the exposure, the instrument moved, or the sensor was stuck.
 
@@ -299,7 +300,7 @@ class TiltLog:
         return self._first(self._once)
 
     def _first(self, use: np.ndarray) -> np.ndarray:
-        """Those of `use`, in order of time, that are not copies of another one there."""
+        """The readings of `use`, in order of time, without the copies of another one there."""
         return use[np.unique(self._number[use], return_index=True)[1]]
 
     @cached_property
