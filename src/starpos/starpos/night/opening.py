@@ -79,7 +79,7 @@ def exposures(
 
     kind = "lists of stars" if frames[0].suffix == ".csv" else "frames"
     return Exposures(
-        name=frames[0].name if len(frames) == 1 else folder.name or str(folder),
+        name=frames[0].name if len(frames) == 1 else folder.resolve().name or str(folder),
         origin=f"solved from {len(frames)} {kind} and {'the gravity in their files' if by_gravity else TILTS}",
         count=len(frames),
         each=each,

@@ -91,9 +91,7 @@ def of_marks(place: Fix | Average, marks_deg: Sequence[tuple[float, float]]) -> 
 def of_copies(fixes: Sequence[Fix]) -> tuple[Remark, ...]:
     """Say that some photographs are of the same moment as others."""
     copies = len(fixes) - len({f.utc_unix_s for f in fixes})
-    return (
-        (Remark(f"{copies} of the photographs are copies of others, and count once"),) if copies else ()
-    )
+    return (Remark(f"{copies} of the photographs are copies of others, and count once"),) if copies else ()
 
 
 def of_table(fixes: Sequence[Fix], whole: Average, given: Instrument) -> tuple[Remark, ...]:

@@ -148,9 +148,7 @@ def test_a_photograph_that_lacks_something_is_left_out_with_a_sentence(
     assert any("poor.jpg" in line and why in line for line in said)
 
 
-def test_a_copy_counts_once_and_another_telephone_has_a_level_of_its_own(
-    sky, photographs, tmp_path, run
-):
+def test_a_copy_counts_once_and_another_telephone_has_a_level_of_its_own(sky, photographs, tmp_path, run):
     for name, model in (("copy.jpg", "iPhone 12 Pro"), ("other.jpg", "iPhone SE")):
         save(tmp_path / name, *sky[int(name == "other.jpg")], model=model)
     first, copy, other = photographs / "IMG_0.jpg", tmp_path / "copy.jpg", tmp_path / "other.jpg"
