@@ -66,7 +66,8 @@ class TiltSteps:
         rows = self._until(end_unix_s)
         if not len(rows):
             return 1.0
-        return tilt_log.noise_excess(rows[:, 2 : 2 + self._axes], float(np.sqrt(rows[:, 1].mean())))
+        steps = tilt_log.without_copies(rows[:, 2 : 2 + self._axes])
+        return tilt_log.noise_excess(steps, float(np.sqrt(rows[:, 1].mean())))
 
     def until(self, end_unix_s: float) -> np.ndarray:
         """The differences (N, 2) of X', Y' of samples up to a time, rad."""
@@ -313,19 +314,25 @@ class TiltBuffer:
             open_end = mid_unix_s + span_s / 2 - near[inside[-1]].utc_unix_s > tilt_log.OPEN_END * span_s
             near = near[max(inside[0] - 1, 0) : inside[-1] + 1 + open_end]
         # by samples up to the exposure's end: the number since then depends on chance
-        excess = self._steps.excess(mid_unix_s + span_s / 2)
-        tilt = tilt_log.TiltLog.of_readings(near, excess).average(mid_unix_s, span_s)
+        end = mid_unix_s + span_s / 2
+        earlier = {
+            "earlier_excess": self._steps.excess(end),
+            "earlier_copies": tilt_log.copies(self._steps.until(end)),
+        }
+        tilt = tilt_log.TiltLog.of_readings(near, **earlier).average(mid_unix_s, span_s)
         return replace(tilt, step_rad=self._coarse_step(near))
 
     def _coarse_step(self, used: list[Tilt]) -> float:
         """`coarse_step` of the samples used, by these and those before."""
         end = used[-1].utc_unix_s
+        moves = self._steps.until(end)
+        most = tilt_log.STUCK_READINGS * tilt_log.copies(moves)
         until = (s for _, s in reversed(self._good) if s.utc_unix_s <= end)
-        before = [s.theta[:2] for s in itertools.islice(until, tilt_log.STUCK_READINGS)]
-        repeats = np.ptp(before, axis=0) == 0 if len(before) == tilt_log.STUCK_READINGS else np.zeros(2, bool)
+        before = [s.theta[:2] for s in itertools.islice(until, most)]
+        repeats = np.ptp(before, axis=0) == 0 if len(before) == most else np.zeros(2, bool)
         noise = math.sqrt(np.mean([np.diag(s.covariance) for s in used]))
         theta = np.array([s.theta[:2] for s in used])
-        return tilt_log.coarse_step(theta, self._steps.until(end), repeats, noise)
+        return tilt_log.coarse_step(theta, tilt_log.without_copies(moves), repeats, noise)
 
     def over(self, span_s: float) -> "tilt_log.Tilts":
         """These tilts for a frame, over a span in place of an exposure that may not be known."""
