@@ -13,7 +13,6 @@ from contextlib import suppress
 from pathlib import Path
 from typing import BinaryIO
 from urllib.parse import unquote, urlsplit
-from urllib.request import url2pathname
 
 from starpos.errors import InstrumentError
 
@@ -141,6 +140,9 @@ def path_of(url: str) -> Path:
         if len(parts.scheme) < 2:
             return Path(url).expanduser()
         if parts.scheme == "file" and parts.netloc in ("", "localhost") and parts.path:
+            # brings HTTP and TLS along, for which no command should wait that names a file by its path
+            from urllib.request import url2pathname
+
             return Path(url2pathname(parts.path))
         if parts.scheme == "package" and parts.netloc and parts.path:
             return _share_of(parts.netloc) / unquote(parts.path).lstrip("/")

@@ -171,7 +171,7 @@ def run(args: argparse.Namespace) -> int:
     if args.keep is not None:
         overwriting.check(args, Written("--keep", args.keep, overwriting.failed_fields))
     camera = options.camera_of(args)
-    stars = deeper.for_field(catalogue.load_catalogue(), camera, console.ProgressBar())
+    stars = deeper.for_field(catalogue.load_catalogue(), camera)
     conditions = _conditions(args, stars, camera)
     solver = Solver(Instrument(camera.fx), stars, progress=console.ProgressBar())
     solver.prepare(camera.width, camera.height)

@@ -17,7 +17,7 @@ from starpos.instrument.instrument import Instrument
 from starpos.sky import catalogue
 
 # options that name files to be read
-INPUTS = ("frames", "tilt", "pointings", "sights", "imu", "geoid", "originals", "gaia")
+INPUTS = ("frames", "tilt", "pointings", "sights", "imu", "geoid", "gaia")
 # the name in the camera's file, which the camera node uses
 CAMERA_NAME = "camera"
 # 'a.fits[2]' is an image in the file a.fits

@@ -429,7 +429,7 @@ def read(path: Path | str) -> Catalogue:
             found.check()
             return found
     except FileNotFoundError:
-        raise CatalogueError(f"{path}: no catalogue there: run `starpos catalogue build --help`") from None
+        raise CatalogueError(f"{path}: no catalogue there: run `starpos catalogue --help`") from None
     except CatalogueError:
         raise
     # a damaged zip file raises many kinds of exception
