@@ -128,7 +128,7 @@ def _exposures(paths: list[Path], args: argparse.Namespace) -> Exposures:
 
     air, vertical, path = options.atmosphere_of(args), vertical_of(args), paths[0]
     if not path.exists():
-        raise FrameError(f"{path}: there is no such night: give a folder, or a rosbag2")
+        raise FrameError(f"{path}: there is no such night: give a folder, a rosbag2, or photographs")
     if bag.is_bag(path):
         if args.gnss is not None:
             raise FrameError(f"{path}: --gnss goes with a folder of frames, and this is a bag: leave it out")

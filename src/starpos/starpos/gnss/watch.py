@@ -20,12 +20,13 @@ from starpos.averaging.poses import slip_s
 from starpos.earth.ellipsoid import EARTH_RADIUS_M
 from starpos.earth.place import Place
 from starpos.earth.vertical import Vertical
+from starpos.fix.fix import Fix
 from starpos.gnss.filter import (
     GnssFrame,
     Innovation,
-    LevelSight,
     begun,
     chi2,
+    corrected,
     innovation,
     is_linear,
     place_of_stars,
@@ -106,17 +107,8 @@ class OnsetFilters:
         rows[:, :, n + 2 :] = -np.eye(2) * grown[:, None, None]
         left = np.concatenate([about - self.state[:, :n], -self.state[:, n:]], 1)
         value = seen.value + np.einsum("wij,wj->wi", rows, left)
-        across = self.covariance @ rows.swapaxes(1, 2)
-        spread = rows @ across + seen.noise
-        gain = np.linalg.solve(spread, across.swapaxes(1, 2)).swapaxes(1, 2)
-        kept = np.eye(n + OFFSETS) - gain @ rows
-        covariance = kept @ self.covariance @ kept.swapaxes(1, 2) + gain @ seen.noise @ gain.swapaxes(1, 2)
-        return replace(
-            self,
-            state=self.state + np.einsum("wij,wj->wi", gain, value),
-            covariance=(covariance + covariance.swapaxes(1, 2)) / 2,
-            frames=self.frames + 1,
-        )
+        state, covariance = corrected(self.state, self.covariance, rows, seen.noise, value)
+        return replace(self, state=state, covariance=covariance, frames=self.frames + 1)
 
     def evidence(self, utc_unix_s: float) -> np.ndarray:
         """Evidence of each filter (W,) that GNSS is wrong: the larger chi-square (2 dof) of step and growth."""
@@ -220,7 +212,7 @@ class GnssWatch:
         self._starting = learned is None
         self._held: deque[GnssFrame] = deque(maxlen=MAX_HELD)
         self._of_pose = 0
-        self._pose: LevelSight | None = None
+        self._pose: Fix | None = None
         self._new_pose = True
         self._readings: frozenset[float] = frozenset()
         # the readings of a frame that would have been an alarm, before A3 was known
@@ -232,7 +224,7 @@ class GnssWatch:
         """Whether A3 is still too uncertain for the linear filter."""
         return self._starting
 
-    def advance(self, sighting: LevelSight) -> None:
+    def advance(self, sighting: Fix) -> None:
         """Advance to the time of a frame, seen with any A3: only the attitude of its camera counts."""
         tilt = sighting.tilt
         self._new_pose = (
@@ -257,7 +249,7 @@ class GnssWatch:
         self._suspicious = None
         self._onsets = OnsetFilters.empty(0)
 
-    def _age(self, sighting: LevelSight) -> None:
+    def _age(self, sighting: Fix) -> None:
         learned, tilt = self.learned, sighting.tilt
         assert learned is not None
         place = place_of_stars(sighting, at_temperature(learned, tilt), self.vertical)
@@ -288,7 +280,7 @@ class GnssWatch:
         """Up (3,) in C at a tilt by what was learned; None if nothing is known."""
         return None if self.learned is None else self.learned.rotation.T @ self.learned.up(tilt)
 
-    def tells_place(self, sighting: LevelSight) -> bool:
+    def tells_place(self, sighting: Fix) -> bool:
         """Whether the stars give a place with what was learned before this frame."""
         if self.learned is None:
             return False
@@ -309,7 +301,7 @@ class GnssWatch:
         turn2 = min(float(up @ self.learned.covariance[at.a3, at.a3] @ up), 2.0)
         return turn2 / 2 * leaned * EARTH_RADIUS_M
 
-    def judge(self, sighting: LevelSight, gnss: Place) -> GnssCheck:
+    def judge(self, sighting: Fix, gnss: Place) -> GnssCheck:
         """Compare a GNSS place with the stars'; where they disagree, take back what GNSS taught meanwhile."""
         if self.learned is None or not self.tells_place(sighting):
             return GnssCheck(status=GnssStatus.LEARNING, place=gnss)
@@ -344,7 +336,7 @@ class GnssWatch:
             self._suspicious = readings
         return GnssStatus.DISAGREES if again else GnssStatus.DOUBTFUL
 
-    def _take_back(self, onset: int, sighting: LevelSight) -> None:
+    def _take_back(self, onset: int, sighting: Fix) -> None:
         """Return to the state one copy before the likeliest onset of the error."""
         self.disagrees = True
         self.learned = self._onsets.before[max(onset - 1, 0)]
@@ -362,7 +354,7 @@ class GnssWatch:
         elif utc_unix_s - self._onsets.since[0] >= BACK_S and self._onsets.frames[0] >= BACK_FRAMES:
             self.disagrees = False
 
-    def _check(self, status: GnssStatus, sighting: LevelSight, gnss: Place) -> GnssCheck:
+    def _check(self, status: GnssStatus, sighting: Fix, gnss: Place) -> GnssCheck:
         assert self.learned is not None
         place = place_of_stars(sighting, self.learned, self.vertical)
         apart = gnss.offset_m(place.latitude, place.longitude)
@@ -376,7 +368,7 @@ class GnssWatch:
             sigma_m=math.sqrt(way @ (place.covariance + gnss.covariance) @ way),
         )
 
-    def learn(self, sighting: LevelSight, gnss: Place, check: GnssCheck) -> None:
+    def learn(self, sighting: Fix, gnss: Place, check: GnssCheck) -> None:
         """Learn from a frame if GNSS is believed, and its readings are new."""
         readings = frozenset(sighting.tilt.times)
         if check.status not in (GnssStatus.LEARNING, GnssStatus.AGREES) or readings & self._readings:

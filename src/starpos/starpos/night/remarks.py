@@ -75,9 +75,23 @@ def of_marks(place: Fix | Average, marks_deg: Sequence[tuple[float, float]]) -> 
     off = np.array([half_turn(place.longitude - mark.longitude), place.latitude - mark.latitude])
     off *= EARTH_RADIUS_M * np.array([np.cos(mark.latitude), 1.0])
     sigmas = float(np.sqrt(off @ np.linalg.solve(place.covariance[:2, :2], off)))
-    claim = "within the claim" if sigmas < CLAIMED_SIGMAS else f"{sigmas:.1f} sigma, beyond the claim"
     km = mark.km_from(place.latitude, place.longitude)
-    return (Remark(f"the place is {km:.0f} km from the GPS place in the file, {claim}"),)
+    told = f"the place is {km:.0f} km from the GPS place in the file"
+    if sigmas < CLAIMED_SIGMAS:
+        return (Remark(f"{told}, within the claim"),)
+    within_km = CLAIMED_SIGMAS * float(np.sqrt(np.diag(place.covariance)[:2].max())) / 1000
+    if ahead_h := _hours_ahead(replace(mark, km=within_km), place):
+        side = "ahead of" if ahead_h > 0 else "behind"
+        why = f"as of a clock {abs(ahead_h):g} h {side} the zone in the file: state its own with --exif-utc-offset"
+    else:
+        why = "the telephone moved while it exposed, or its GPS place is an older one"
+    return (Remark(f"{told}, {sigmas:.1f} sigma, beyond the claim: {why}"),)
+
+
+def of_copies(fixes: Sequence[Fix]) -> tuple[Remark, ...]:
+    """Say that some photographs are of the same moment as others."""
+    copies = len(fixes) - len({f.utc_unix_s for f in fixes})
+    return (Remark(f"{copies} of the photographs are copies of others, and count once"),) if copies else ()
 
 
 def of_table(fixes: Sequence[Fix], whole: Average, given: Instrument) -> tuple[Remark, ...]:

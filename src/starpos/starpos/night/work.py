@@ -145,7 +145,7 @@ class Solving:
         if self._by_phone(item) and abs(focal_px / rough_px - 1) > CUT_OUT:
             cut = FrameError(
                 f"{item.place}: its stars give a focal length of {focal_px:.0f} px, its EXIF {rough_px:.0f} px: it is a "
-                "part of a photograph, whose optical axis is unknown: give the whole one"
+                "part of a photograph, whose optical axis is unknown, or its EXIF is wrong: give the whole one"
             )
             return Sight(found.stars, Solution.refused(found.stars, cut))
         sight = self._answer_at((focal_px, model), question)

@@ -26,7 +26,9 @@ from starpos.instrument.tilt_log import (
     TiltLog,
     Tilts,
     coarse_step,
+    copies,
     noise_excess,
+    without_copies,
 )
 from starpos.messages.stamp import stamp_to_unix
 from starpos.messages.tilt import OUT_OF_RANGE, SATURATED, STUCK, UNUSABLE, message_to_tilt
@@ -76,7 +78,8 @@ class TiltSteps:
         rows = self._until(end_unix_s)
         if not len(rows):
             return 1.0
-        return noise_excess(rows[:, 2 : 2 + self._axes], float(np.sqrt(rows[:, 1].mean())))
+        steps = without_copies(rows[:, 2 : 2 + self._axes])
+        return noise_excess(steps, float(np.sqrt(rows[:, 1].mean())))
 
     def until(self, end_unix_s: float) -> np.ndarray:
         """The differences (N, 2) of X', Y' of samples up to a time, rad."""
@@ -321,19 +324,25 @@ class TiltBuffer:
             open_end = mid_unix_s + span_s / 2 - near[inside[-1]].utc_unix_s > OPEN_END * span_s
             near = near[max(inside[0] - 1, 0) : inside[-1] + 1 + open_end]
         # by samples up to the exposure's end: the number since then depends on chance
-        excess = self._steps.excess(mid_unix_s + span_s / 2)
-        tilt = TiltLog.of_readings(near, excess).average(mid_unix_s, span_s)
+        end = mid_unix_s + span_s / 2
+        earlier = {
+            "earlier_excess": self._steps.excess(end),
+            "earlier_copies": copies(self._steps.until(end)),
+        }
+        tilt = TiltLog.of_readings(near, **earlier).average(mid_unix_s, span_s)
         return replace(tilt, step_rad=self._coarse_step(near))
 
     def _coarse_step(self, used: list[Tilt]) -> float:
         """`coarse_step` of the samples used, by these and those before."""
         end = used[-1].utc_unix_s
+        moves = self._steps.until(end)
+        most = STUCK_READINGS * copies(moves)
         until = (s for _, s in reversed(self._good) if s.utc_unix_s <= end)
-        before = [s.theta[:2] for s in itertools.islice(until, STUCK_READINGS)]
-        repeats = np.ptp(before, axis=0) == 0 if len(before) == STUCK_READINGS else np.zeros(2, bool)
+        before = [s.theta[:2] for s in itertools.islice(until, most)]
+        repeats = np.ptp(before, axis=0) == 0 if len(before) == most else np.zeros(2, bool)
         noise = math.sqrt(np.mean([np.diag(s.covariance) for s in used]))
         theta = np.array([s.theta[:2] for s in used])
-        return coarse_step(theta, self._steps.until(end), repeats, noise)
+        return coarse_step(theta, without_copies(moves), repeats, noise)
 
     def over(self, span_s: float) -> "Tilts":
         """These tilts for a frame, over a span in place of an exposure that may not be known."""
