@@ -22,6 +22,7 @@ from starpos.instrument.camera import Camera
 from starpos.instrument.instrument import Calibration, Instrument
 from starpos.parameters.given import values_of
 from starpos.satellites.elements import StoredOrbits
+from starpos.sky.bodies import ERFA, JplKernel
 from starpos.sky.catalogue import Catalogue
 
 NAN = math.nan
@@ -231,6 +232,7 @@ class Settings(NodeSettings):
         **NodeSettings.readers,
         "gnss.learned": lambda name: states.read_learned(path_of(name)),
         "satellites.elements": lambda name: StoredOrbits(path_of(name)),
+        "ephemeris": lambda name: JplKernel(str(path_of(name))),
     }
 
     @classmethod
@@ -288,4 +290,5 @@ class Settings(NodeSettings):
             catalogue,
             atmosphere_of(self.values),
             min_stars=self.values["min_stars"],
+            ephemeris=self._files["ephemeris"] or ERFA,
         )

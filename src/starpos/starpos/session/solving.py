@@ -13,11 +13,13 @@ from starpos.fix import searching
 from starpos.fix.attitude import CameraAttitude
 from starpos.fix.solution import Solution, Status
 from starpos.fix.solver import Solver, focal_that_fits
+from starpos.fix.sun import sun_alone
 from starpos.frames.frame import Stars
 from starpos.identification import fisheye
 from starpos.navigation.sightings import sighted
 from starpos.session.driver import Now
 from starpos.session.gyro import Gyro
+from starpos.sky.bodies import SUN
 
 # Share of the time between frames in which one may be searched.
 MAX_OF_INTERVAL = 0.5
@@ -100,10 +102,14 @@ def camera_attitude_of(
 def attitude_beside(
     solver: Solver, question: searching.Question, answer: Solution, frame_id: str, gyro: Gyro
 ) -> CameraAttitude | None:
-    """The attitude of a frame that was asked about, also given to the gyro; None without identified stars.
+    """The attitude of a frame that was asked about, also given to the gyro; None without identified stars or the Sun.
 
-    Where the solver stopped before identification, the stars are identified now.
+    Where the solver stopped before identification, the stars are identified now.  The Sun's limb counts without a heading
+    too: under way the level does not show where up is.  A glow, which may be a lamp's, counts with one alone.
     """
+    disc = question.stars.disc
+    if disc is not None and answer.found is None and (disc.sharp or answer.ok):
+        return sun_alone(solver, question.stars, disc, frame_id) if answer.bodies in ((), (SUN,)) else None
     if answer.found is None and answer.status in searching.UNASKED:
         answer = searching.identify_every_way(solver, replace(question, tilts=None, places=None)).solution
     attitude = camera_attitude_of(solver, question.stars, answer, frame_id)
