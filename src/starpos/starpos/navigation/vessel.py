@@ -2,7 +2,7 @@
 """What is known of instrument and vehicle before a voyage, with the laws of motion where nothing measures the speed."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from starpos.errors import VoyageError
 from starpos.navigation.records import ImuModel
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class MotionLaw:
     """Velocity of a vehicle over ground as a speed along its nose, a drift, and a rest; m/s, 1 sigma.
 
@@ -38,8 +38,13 @@ class MotionLaw:
         return max(1.0, 2 * self.rest_s / apart_s) ** 0.5
 
 
+def _law(*row: float) -> MotionLaw:
+    """The law with the fields of a row, in their order."""
+    return MotionLaw(**{f.name: value for f, value in zip(fields(MotionLaw), row, strict=True)})
+
+
 LAWS = {
-    name: MotionLaw(*row)
+    name: _law(*row)
     for name, row in {
         # a path at a walk, that turns and stops as it likes
         "rover": (2.0, 0.3, 0.01, 1e-4, 0.1, 0.2, 3.0),
@@ -51,7 +56,7 @@ LAWS = {
     }.items()
 }
 # default: any vehicle on land, at sea or in the air
-ANYTHING = MotionLaw(100.0, 1.0, 30.0, 0.3, 5.0, 3.0, 10.0)
+ANYTHING = _law(100.0, 1.0, 30.0, 0.3, 5.0, 3.0, 10.0)
 # what is said of a drift is how much it changes in so long
 CHANGE_S = 600.0
 # of a drift such a share changes in an hour
@@ -95,7 +100,7 @@ class Vessel:
     def carried(self) -> MotionLaw:
         """How the drift changes where velocities are measured against water or air."""
         walk = DRIFT_CHANGE * self.drift_stddev / DRIFT_CHANGE_S**0.5
-        return self._drifting(MotionLaw(1e-3, 1e-6, self.drift_stddev, walk, 1e-3, 1e-3, 1.0))
+        return self._drifting(_law(1e-3, 1e-6, self.drift_stddev, walk, 1e-3, 1e-3, 1.0))
 
     def _drifting(self, law: MotionLaw) -> MotionLaw:
         """The law with the drift's stated change, as it walks at random."""
