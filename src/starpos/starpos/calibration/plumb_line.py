@@ -18,7 +18,7 @@ from starpos.fix.terms import EACH_POSE, ErrorTerm
 from starpos.frozen import at_once
 from starpos.instrument.inclinometer import InclinometerErrors
 from starpos.instrument.instrument import UNKNOWN_ARCSEC
-from starpos.instrument.mounting import RESPONSE_COEFFICIENTS, Zeroed, response_columns, stated_variances
+from starpos.instrument.mounting import RESPONSE_COEFFICIENTS, response_columns, stated_variances
 from starpos.units import ARCSEC, MEDIAN_OF_CHI2
 
 # sigma of a coefficient that is as good as known
@@ -62,8 +62,7 @@ class Readings:
         if len(axes) != 1:
             raise FixError("some tilts have two axes and some three: give the tilts of one inclinometer")
         mean = rotation.normalised(plumb.sum(0))
-        zeroed = Zeroed.at(mean, min(axes))
-        response = np.array([response_columns(t.theta, t.up, zeroed) for t in tilts])
+        response = np.array([response_columns(t.theta, t.up, mean) for t in tilts])
         walked = _wandering(fixes, errors)
         variances = stated_variances(errors, axes.pop())
         return cls(

@@ -21,7 +21,7 @@ from starpos.errors import GnssError
 from starpos.fix.fix import Fix
 from starpos.instrument.inclinometer import UNMEASURED_WALK_C_PER_SQRT_HOUR, Tilt
 from starpos.instrument.instrument import Instrument
-from starpos.instrument.mounting import RESPONSE_COEFFICIENTS, Zeroed, response_columns, stated_variances
+from starpos.instrument.mounting import RESPONSE_COEFFICIENTS, response_columns, stated_variances
 from starpos.units import ARCSEC
 
 # Share of the deflection's variance that is the same everywhere the instrument goes; the rest is a field.
@@ -122,8 +122,7 @@ class Learned:
 
     def columns(self, tilt: Tilt) -> tuple[np.ndarray, np.ndarray]:
         """Change of up in S for the response's coefficients (3, m), and for errors of the angles (3, axes)."""
-        zeroed = _zeroed(tuple(self.calibrated_up.tolist()), self.axes)
-        return response_columns(tilt.theta, tilt.up, zeroed), tilt.slope
+        return response_columns(tilt.theta, tilt.up, self.calibrated_up), tilt.slope
 
     def up(self, tilt: Tilt) -> np.ndarray:
         """Up (3,) in S at a tilt, without the errors that are known."""
@@ -146,11 +145,6 @@ class Learned:
         stated, at = vertical.at(latitude, longitude), self.layout
         known = np.array([stated.eta_arcsec, stated.xi_arcsec]) * ARCSEC
         return known + self.state[at.constant] + self.state[at.field]
-
-
-@lru_cache(maxsize=4)
-def _zeroed(up: tuple[float, ...], axes: int) -> Zeroed:
-    return Zeroed.at(np.array(up), axes)
 
 
 def prior(instrument: Instrument, tilt: Tilt, deflection_stddev_rad: float, utc_unix_s: float) -> Learned:
