@@ -69,7 +69,6 @@ READS_WHOLE = {
     "starpos/instrument/sensors.py": "of the package",
     "starpos/tables.py": "most_bytes of each form",
     "starpos/frames/tables.py": "MAX_CSV_BYTES",
-    "starpos/sky/tycho2.py": "of the package",
     "starpos/parameters/table.py": "of the package",
     "starpos/cli/commands.py": "of the package",
     "starpos/cli/demo.py": "what it has written",

@@ -291,7 +291,7 @@ def calibrate_camera(
             "without a level refraction cannot be separated from a fisheye's distortion: give the place with --site, or "
             "the --tilt of its frames"
         )
-    catalogue = deeper.for_field(catalogue, given, progress)
+    catalogue = deeper.for_field(catalogue, given)
     table = triangles.cached_triangles(catalogue, fisheye.field_rad(given), progress)
     every = parameters(given)
     skies = [

@@ -424,7 +424,7 @@ class Solver:
                 f"from {SMALLEST_FIELD_DEG:g} to {LARGEST_FIELD_DEG:g} deg: check focal length and pixel size, and "
                 "whether the lens is a fisheye (equidistant)"
             )
-        return camera, deeper.for_field(self.catalogue, camera, self.progress)
+        return camera, deeper.for_field(self.catalogue, camera)
 
     def triangles_of(
         self, width: int, height: int, part: float, origin_px: tuple[float, float] | None = None

@@ -95,9 +95,11 @@ class ByGravity:
     """The tilts of a telephone's photographs, as `starpos.instrument.tilt_log.Tilts`; S is then C.
 
     log: of the telephone that took them, in S; None: their own files state gravity.
+    camera: that took them; '': any.
     """
 
     log: Tilts | None = None
+    camera: str = ""
 
     def has(self, frame: Exposure) -> bool:
         """Whether a photograph can have a tilt."""
@@ -114,6 +116,11 @@ class ByGravity:
         if gravity.model != model and is_built_in(model):
             raise TiltError(
                 f"{frame.place}: its level is a {gravity.model}'s, the others' a {model}'s: solve them apart"
+            )
+        if self.camera and gravity.camera != self.camera:
+            raise TiltError(
+                f"{frame.place}: it is by another camera ({gravity.camera}) than the first ({self.camera}), whose level "
+                "errs otherwise: solve them apart"
             )
         variance = instrument.inclinometer.noise_rad**2 + gravity.stddev_rad**2
         theta_x, theta_y, theta_z = np.arcsin(np.clip(gravity.up, -1, 1)).tolist()
