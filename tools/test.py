@@ -59,7 +59,7 @@ LANES = 6
 PARTS = {"graph": 6, "starpos": 8, "starpos_camera": 3, "starpos_inclinometer": 2}
 # with Ubuntu's versions less is run
 UBUNTU_PARTS = {"starpos": 3}
-# for several at once: a thread without a processor of its own makes the others wait for it, and OpenBLAS's compute while they wait
+# for several at once: a thread without a processor of its own makes the others wait for it; OpenBLAS's compute meanwhile
 ONE_THREAD = {"OMP_NUM_THREADS": "1", "OPENCV_FOR_THREADS_NUM": "1"}
 # what is no test of pytest's
 CHECKS = ("linters", "documents", "versions")
