@@ -70,7 +70,10 @@ def test_over_all_of_them_too():
 def test_what_the_file_understates_is_named_and_nothing_else():
     as_stated, drift, loose = (adjusted(worse, 0.05)[2] for worse in (AS_STATED, DRIFT, LOOSE))
     assert sum(map(bool, as_stated)) <= 1
-    assert sum("a tilt_scale of 0.0" in line and "its file states 0.001" in line for line in loose) > SESSIONS / 2
+    assert (
+        sum("a tilt_scale of 0.0" in line and "its file states 0.001" in line for line in loose)
+        > SESSIONS / 2
+    )
     # air hides it in most
     assert any("tilt_drift_arcsec_per_sqrt_hour" in line and "its file states 0.05" in line for line in drift)
 
