@@ -231,7 +231,10 @@ class SolverNode(Node):
             )
             return Diagnosis(Level.WARN, session.instrument.trouble or waiting, session.pace.counts)
         remarks = session.pace.complaint, self._gnss.remark(session.answer, self._settings.vertical)
-        return reports.of_solution(session.answer, session.pace.counts, "; ".join(filter(None, remarks)))
+        known = {} if (site := self._settings.site) is None else reports.of_site(site)
+        return reports.of_solution(
+            session.answer, session.pace.counts | known, "; ".join(filter(None, remarks))
+        )
 
     def _report_outputs(self) -> Diagnosis:
         if others := other_publishers(self, self._outputs.shared):

@@ -15,11 +15,9 @@ from starpos import rotation
 from starpos._numeric.roots import symmetric_root
 from starpos.earth.orientation import EarthState, earth_state, station_velocity
 from starpos.earth.place import Place, Places
-from starpos.earth.refraction import MIN_COS_ZENITH
 from starpos.errors import FixError, InstrumentError, PlaceError, StarposError
-from starpos.fix.attitude import CAMERA, ITRS, Attitude
+from starpos.fix.attitude import ANY_TURN, CAMERA, ITRS, Attitude, CameraAttitude
 from starpos.fix.budget import sky_terms, tilt_terms
-from starpos.fix.checks import MIN_DEG
 from starpos.fix.circle import MIN_SINE, Circle, circle_along
 from starpos.fix.glows import Glow
 from starpos.fix.heading import AttitudeAtPlace, attitudes_at, zenith_moved
@@ -39,6 +37,8 @@ LENS_SHARE = 1e-3
 SIZE_SHARE, SIZE_PX, WIDEST_GLOW = 0.06, 1.0, math.radians(10.0)
 # A body's altitude by the level differs from the ephemeris' by at most this; a glow may be a lamp as well.
 LIMB_SIGMAS, GLOW_SIGMAS = 5.3, 3.0
+# of the lowest true altitude, -0.2 deg: there the disc stands on the horizon
+LOWEST_SINE = -0.0035
 # a lens in which the Sun's radius is larger, px, shows its limb: there a glow is a lamp or a cloud
 RESOLVED_PX = 6.0
 
@@ -74,6 +74,50 @@ class _Seen:
         )
 
 
+def sun_alone(solver: Solver, stars: Stars, disc: Disc, frame_id: str) -> CameraAttitude | None:
+    """The attitude of a frame that shows the Sun, but for the turn about it; None for a disc of another size."""
+    if stars.mid_unix_s is None:
+        return None
+    try:
+        state, camera, seen, stamp_s = _looked_at(solver, stars, disc, earth_state(stars.mid_unix_s))
+        body = body_at(SUN, state, solver.ephemeris)
+        _check_size(disc, seen, body, camera, stars.place)
+    except StarposError:
+        return None
+    if seen.ray[2] <= 0:
+        return None
+    own = np.column_stack([seen.own, seen.lens, np.eye(3) * body.sigma])
+    turns = np.cross(seen.ray, own.T)
+    return CameraAttitude(
+        utc_unix_s=state.utc_unix_s,
+        stamp_stddev_s=stamp_s,
+        clock_stddev_s=solver.clock_stddev_s(stars),
+        frame_id=frame_id,
+        camera_to_gcrs=rotation.shortest_turn(seen.ray, state.gcrs_to_itrs.T @ body.itrs),
+        covariance=turns.T @ turns + ANY_TURN * np.outer(seen.ray, seen.ray),
+        stars=0,
+        log_odds=0.0,
+    )
+
+
+def _looked_at(
+    solver: Solver, stars: Stars, disc: Disc, state: EarthState
+) -> tuple[EarthState, Camera, _Seen, float]:
+    """The state at the disc's row, the camera, the disc as a direction, and the error of its time, s."""
+    shutter = solver.shutter(stars)
+    row = np.array([disc.y])
+    if late_s := float(shutter.later_s(row, stars.height)[0]):
+        state = earth_state(state.utc_unix_s + late_s)
+    camera = solver.instrument.camera_for(stars.width, stars.height, stars.origin_px)
+    seen = _Seen.of(disc, camera, stars.place)
+    return (
+        state,
+        camera,
+        seen,
+        math.hypot(stars.stamp_stddev_s, *shutter.errors_s(row, stars.height)[0].tolist()),
+    )
+
+
 def by_sun(solver: Solver, stars: Stars, disc: Disc, tilts: Tilts | None, places: Places | None) -> Solution:
     """The attitude of a frame that shows the Sun or the Moon, or without a known place its circle of equal altitude.
 
@@ -92,15 +136,7 @@ def by_sun(solver: Solver, stars: Stars, disc: Disc, tilts: Tilts | None, places
                 "known place, or state it"
             )
         state, tilt = solver.levelled(stars, tilts or NO_TILTS)
-        shutter = solver.shutter(stars)
-        late_s = float(shutter.later_s(np.array([disc.y]), stars.height)[0])
-        if late_s:
-            state = earth_state(state.utc_unix_s + late_s)
-        camera = solver.instrument.camera_for(stars.width, stars.height, stars.origin_px)
-        seen = _Seen.of(disc, camera, stars.place)
-        stamp_s = math.hypot(
-            stars.stamp_stddev_s, *shutter.errors_s(np.array([disc.y]), stars.height)[0].tolist()
-        )
+        state, camera, seen, stamp_s = _looked_at(solver, stars, disc, state)
         if not disc.sharp:
             sigma = float(np.linalg.norm(seen.own)) / math.sqrt(2)
             glow = Glow(state.utc_unix_s, seen.ray, body_at(SUN, state, solver.ephemeris).itrs, sigma)
@@ -250,12 +286,13 @@ def _attitude(
     )
     clock_s, level = solver.clock_stddev_s(stars), mounting.level(tilt)
     true = a4 @ body.from_place(a4[2])
-    if true[2] < MIN_COS_ZENITH:
+    if true[2] < LOWEST_SINE:
         raise PlaceError(
             f"{stars.place}: at this time and place the {name} is at an altitude of {_altitude_deg(true):.1f} deg, and a "
-            f"heading takes {MIN_DEG:.0f}: the frame shows something else, or the clock or the place is wrong"
+            "heading takes the whole disc above the horizon: the frame shows something else, or the clock or the place "
+            "is wrong"
         )
-    bent = air.refraction().bend(true)
+    bent, raised = air.raised(true)
     two = _TwoDirections.of(level.camera, seen.ray, bent)
     if two is None:
         raise FixError(f"{stars.place}: the {name} is in the zenith, where it gives no heading")
@@ -264,7 +301,7 @@ def _attitude(
         ErrorTerm("disc", two.components @ two.g @ seen.own),
         ErrorTerm("lens", two.components @ two.g @ seen.lens, shared=ALWAYS),
         ErrorTerm("ephemeris", np.eye(2) * body.sigma, shared=ALWAYS),
-        ErrorTerm("refraction", two.components @ (bent - true)[:, None] * air.relative_sigma, shared=ALWAYS),
+        ErrorTerm("refraction", np.array([[0.0], [raised]]), shared=ALWAYS),
         *sky_terms(two.turned, state, clock_s, stamp_s, a4),
         ErrorTerm("place", two.turned @ moved @ place.zenith_root, shared=ALWAYS),
     )

@@ -7,7 +7,7 @@ import numpy as np
 
 from starpos import rotation
 from starpos.errors import FrameError
-from starpos.fix.attitude import CameraAttitude
+from starpos.fix.attitude import UNKNOWN_TURN, CameraAttitude
 from starpos.frames.exposure import Shutter
 from starpos.frames.frame import DISC, SATURATED, Disc, FrameTrail, Stars
 from starpos.messages.stamp import stamp_to_unix
@@ -104,7 +104,7 @@ def message_to_trails(message: Any) -> list[FrameTrail]:
     return trails
 
 
-# of an attitude's quaternion, and the most that its covariance may say, rad2
+# of an attitude's quaternion, and the most that its covariance may say, rad2, but about the Sun seen alone
 OFF_UNIT, MAX_ATTITUDE_VARIANCE = 1e-3, 0.01
 
 
@@ -127,10 +127,12 @@ def message_to_attitude(message: Any, source: str = "attitude") -> CameraAttitud
         raise FrameError(
             f"{source}: the covariance or an error of its time is not a finite number of at least 0."
         )
+    variances = np.linalg.eigvalsh(covariance)
+    known = variances[:2] if variances[2] > UNKNOWN_TURN else variances
     if not (
-        np.allclose(covariance, covariance.T, rtol=1e-6, atol=0)
-        and np.linalg.eigvalsh(covariance)[0] > 0
-        and covariance.trace() < MAX_ATTITUDE_VARIANCE
+        np.allclose(covariance, covariance.T, rtol=1e-6, atol=1e-9 * variances[2])
+        and variances[0] > 0
+        and known.sum() < MAX_ATTITUDE_VARIANCE
     ):
         raise FrameError(f"{source}: the covariance is not symmetric, positive and below 0.01 rad2.")
     return CameraAttitude(

@@ -38,6 +38,7 @@ from starpos.frozen import at_once
 from starpos.identification import Identification, fisheye
 from starpos.instrument.camera import Camera
 from starpos.navigation.vessel import Vessel
+from starpos.sky.bodies import SUN, Body, body_at
 from starpos.sky.catalogue import Catalogue
 from starpos.units import ARCSEC
 
@@ -218,6 +219,79 @@ class PlacelessFrame(FrameUnderWay):
         return Attitude(camera, camera @ whole @ camera.T, of=CAMERA, into=ITRS, by_refraction=raised)
 
 
+# how far a direction that is said to be the Sun's may be from it, rad
+SUN_NEAR = math.radians(0.05)
+# cosine of the altitude above which errors of the Sun's direction count no more in the heading
+HIGHEST_COSINE = 0.05
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SunFrame(FrameUnderWay):
+    """The Sun seen from a known place: one direction, about which gravity determines the camera's turn.
+
+    ray (3,): in C.  body: the Sun.  place: where it is seen from.
+    """
+
+    ray: np.ndarray
+    body: Body
+    place: Place
+
+    @classmethod
+    def of(cls, seen: CameraAttitude, place: Place) -> "SunFrame":
+        """The frame of an attitude that has a time and a ray; FrameError for another direction than the Sun's."""
+        assert seen.utc_unix_s is not None and seen.ray is not None
+        state = earth_state(seen.utc_unix_s)
+        body, turn = body_at(SUN, state), state.gcrs_to_itrs @ seen.camera_to_gcrs
+        if np.linalg.norm(turn @ seen.ray - body.itrs) > SUN_NEAR:
+            raise FrameError("an attitude about one direction, which is not the Sun's: left out")
+        return cls(
+            utc_unix_s=seen.utc_unix_s,
+            stamp_stddev_s=seen.stamp_stddev_s,
+            camera=Attitude(
+                turn, turn @ seen.covariance @ turn.T, of=CAMERA, into=ITRS, by_refraction=np.zeros(3)
+            ),
+            ray=seen.ray,
+            body=body,
+            place=place,
+        )
+
+    def rough(self) -> Attitude:
+        return self.camera
+
+    def under(self, zenith: np.ndarray, atmosphere: Atmosphere) -> Attitude:
+        """The attitude under a zenith (3,) in ITRS, turned anyhow about the Sun."""
+        true = self.body.from_place(zenith)
+        level = rotation.shortest_turn(zenith, np.array([0.0, 0.0, 1.0]))
+        bent, raised = atmosphere.raised(level @ true)
+        seen = bent @ level
+        turn = rotation.shortest_turn(self.camera.rotation @ self.ray, seen) @ self.camera.rotation
+        layers = raised**2 - (math.dist(seen, true) * atmosphere.relative_sigma) ** 2
+        across = rotation.normalised(np.cross(zenith, seen))
+        covariance = turn @ self.camera.covariance_about_own @ turn.T + layers * np.outer(across, across)
+        return Attitude(turn, covariance, of=CAMERA, into=ITRS, by_refraction=np.cross(true, seen))
+
+    def heading_by(self, link: Attitude) -> Attitude:
+        """The body's attitude at the known place: level by the plumb line, north by WGS 84.
+
+        link: along astronomic east, north, up, by an adjustment that takes errors for new in each frame.  Errors of
+        the lens, the place and the plumb line are not: they are added once more as they are in one frame.
+        """
+        sine = float(self.body.itrs @ self.place.plumb_axes[2])
+        across = np.linalg.eigvalsh(self.camera.covariance)[1]
+        root = self.place.zenith_root
+        common = across + self.place.plumb_stddev**2 + float(np.linalg.eigvalsh(root @ root.T)[1])
+        common /= max(1 - sine**2, HIGHEST_COSINE**2)
+        return Attitude(
+            _to_north(self.place) @ link.rotation, link.covariance + common * np.eye(3), of=LINK, into=ENU
+        )
+
+
+def _to_north(place: Place) -> np.ndarray:
+    """Rotation (3, 3) about up from the plumb line's north to WGS 84's."""
+    to_ellipsoid = place.axes @ place.plumb_axes.T
+    return rotation.about_axis(2, -math.atan2(to_ellipsoid[0, 1], to_ellipsoid[1, 1]))
+
+
 def body_attitude(frame: PlacelessFrame, place: Place, vessel: Vessel) -> Attitude:
     """The body's axes, x forward, at a known place: level by the plumb line, north by WGS 84.
 
@@ -238,7 +312,5 @@ def body_attitude(frame: PlacelessFrame, place: Place, vessel: Vessel) -> Attitu
         np.vstack([level, north]) @ place.zenith_root,
         deflection,
     ])  # fmt: skip
-    to_ellipsoid = place.axes @ a4.T
-    turn = rotation.about_axis(2, -math.atan2(to_ellipsoid[0, 1], to_ellipsoid[1, 1]))
     covariance = seen.covariance + columns @ columns.T + np.eye(3) * vessel.mount_stddev**2
-    return Attitude(turn @ seen.rotation @ vessel.camera_to_body.T, covariance, of=LINK, into=ENU)
+    return Attitude(_to_north(place) @ seen.rotation @ vessel.camera_to_body.T, covariance, of=LINK, into=ENU)
