@@ -46,7 +46,7 @@ CHUNK = 1 << 20
 METADATA = struct.Struct("<4i7i")
 # The types of the standard that pixels may have.
 SENT_AS = {1: "<i2", 2: "<i4", 6: "u1", 8: "<u2", 9: "<u4"}
-# The standard wants a number of the program and of each of its calls.
+# The standard wants a number of the program, and one of each call.
 CLIENT = 1
 
 
