@@ -92,7 +92,7 @@ def test_a_node_that_goes_and_comes_back(graph, instrument, record_property, nam
 
 
 def test_all_at_work_end_with_status_0(graph, instrument):
-    """By the two SIGINTs that launch sends, or by SIGTERM; the last of this file."""
+    """End each by the two SIGINTs that launch sends, or by SIGTERM: the last of this file."""
     running, _ = instrument
     wait_for_fix(graph, time.time())
     emulator = next(p for p in graph.processes if p.name == "emulator")
