@@ -266,12 +266,8 @@ def save_learned(path: Path, learned: Learned) -> None:
     content = {KEY: VERSION} | {IN_FILE.get(k, k): v for k, v in vars(learned).items()}
     for name in ("since_unix_s", "temperature_c"):
         content[name] = None if math.isnan(content[name]) else content[name]
-    try:
-        files.write_whole(path, (json.dumps(content, default=np.ndarray.tolist) + "\n").encode())
-    # ValueError: the name contains a NUL
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise GnssError(f"{path}: what was learned cannot be written there ({reason})") from None
+    text = json.dumps(content, default=np.ndarray.tolist) + "\n"
+    files.save(path, text.encode(), "what was learned", GnssError)
 
 
 def read_learned(path: Path) -> Learned | None:
