@@ -34,6 +34,7 @@ def station_json(station: Station, grid: geoid.Geoid | None) -> dict:
     """A station for --json; its keys with a grid are None without one, or where that has no data."""
     sigma_xi, sigma_eta = station.sigma
     compared = None if grid is None else against_grid(station, grid)
+    of_grid, off, stddev = compared or (None, None, None)
     return {
         "station": station.name,
         "latitude": np.degrees(station.place.latitude),
@@ -52,9 +53,9 @@ def station_json(station: Station, grid: geoid.Geoid | None) -> dict:
         "chi2": station.chi2,
         "degrees": station.degrees,
         "probability": station.probability,
-        "grid_arcsec": None if compared is None else [compared.grid.xi_arcsec, compared.grid.eta_arcsec],
-        "minus_grid_arcsec": None if compared is None else compared.off,
-        "minus_grid_sigma_arcsec": None if compared is None else compared.stddev,
+        "grid_arcsec": of_grid and [of_grid.xi_arcsec, of_grid.eta_arcsec],
+        "minus_grid_arcsec": off,
+        "minus_grid_sigma_arcsec": stddev,
     }
 
 
