@@ -4,6 +4,7 @@
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from operator import attrgetter
 
 import numpy as np
 
@@ -17,7 +18,7 @@ from starpos.fix.terms import EACH_POSE, ErrorTerm
 from starpos.frozen import at_once
 from starpos.instrument.inclinometer import InclinometerErrors
 from starpos.instrument.instrument import UNKNOWN_ARCSEC
-from starpos.instrument.mounting import RESPONSE_COEFFICIENTS, Zeroed, response_columns, stated_variances
+from starpos.instrument.mounting import RESPONSE_COEFFICIENTS, response_columns, stated_variances
 from starpos.units import ARCSEC, MEDIAN_OF_CHI2
 
 # sigma of a coefficient that is as good as known
@@ -61,8 +62,7 @@ class Readings:
         if len(axes) != 1:
             raise FixError("some tilts have two axes and some three: give the tilts of one inclinometer")
         mean = rotation.normalised(plumb.sum(0))
-        zeroed = Zeroed.at(mean, min(axes))
-        response = np.array([response_columns(t.theta, t.up, zeroed) for t in tilts])
+        response = np.array([response_columns(t.theta, t.up, mean) for t in tilts])
         walked = _wandering(fixes, errors)
         variances = stated_variances(errors, axes.pop())
         return cls(
@@ -441,12 +441,12 @@ def level(readings: Readings, given: np.ndarray, turn_sigma: float = np.pi) -> P
     # the prior holds each answer near its own start
     starts = _turns(mean, start)[1] if turn_sigma > NARROW_TURN else start[None]
     found = fits(readings, starts, turn_sigma)
-    best = min(found, key=_cost)
+    best = min(found, key=attrgetter("cost"))
     if best.scatter > USUAL_SCATTER:
         # whichever way the inclinometer faces, its poses scatter
         readings = replace(readings, pose_sigma=_pose_scatter(best, readings))
         found = fits(readings, starts, turn_sigma)
-        best, nearest, leans = min(found, key=_cost), found[0], _leans(readings)
+        best, nearest, leans = min(found, key=attrgetter("cost")), found[0], _leans(readings)
     # a search that began half a turn away may have ended in a wrong minimum
     if not leans:
         return best if best.cost < nearest.cost - AS_GOOD else nearest
@@ -481,7 +481,7 @@ def hang(
     start = rotation.shortest_turn(given @ rotation.normalised(up), mean) @ given
     angles, starts = _turns(mean, start) if turn_sigma > NARROW_TURN else (np.zeros(1), start[None])
     found = fits(readings, starts, turn_sigma, angles, zenith, min(max(zenith_sigma, 1e-12), np.pi))
-    best = min(found, key=_cost)
+    best = min(found, key=attrgetter("cost"))
     if found[0].cost < best.cost + AS_GOOD:
         best = found[0]
     return best
@@ -546,10 +546,6 @@ def settled(plumb: PlumbLine, readings: Readings) -> tuple[PlumbLine, Scatter]:
         response_covariance=symmetric(covariance[at:, at:]),
     )
     return answer, scatter
-
-
-def _cost(plumb: PlumbLine) -> float:
-    return plumb.cost
 
 
 def _turns(axis: np.ndarray, start: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

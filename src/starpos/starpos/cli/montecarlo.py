@@ -123,7 +123,7 @@ def _all(args: argparse.Namespace, night: RandomNight) -> list[NightOutcome]:
     for k, outcome in enumerate(_each(night, seeds, args.jobs)):
         outcomes.append(outcome)
         if outcome.trouble:
-            console.complain("montecarlo", f"night {k}: {outcome.trouble}")
+            console.complain(f"night {k}: {outcome.trouble}")
         bar("nights", len(outcomes) / args.nights)
     for o in outcomes if args.json else ():
         sigma = np.sqrt(np.diag(o.covariance))

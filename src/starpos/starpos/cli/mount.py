@@ -10,8 +10,6 @@ from pathlib import Path
 import numpy as np
 
 from starpos.cli import console, inputs, options
-from starpos.cli.console import print_json
-from starpos.cli.options import place_of, vertical_of
 from starpos.earth.place import Place
 from starpos.errors import FixError, FrameError, InstrumentError
 from starpos.files import open_regular
@@ -26,13 +24,10 @@ READING = "azimuth_deg"
 def run(args: argparse.Namespace) -> int:
     axes = options.axes_of(args)
     readings = None if args.readings is None else _readings(args.readings)
-    # what --site cannot be is said before the work
-    place = place_of(args, vertical_of(args))
-    if place is None:
-        raise InstrumentError("mount needs the place of the camera: give --site LAT LON")
+    place = options.camera_place_of(args)
     seen = [
         (sight.stars.source, at)
-        for _, sight, _ in inputs.seen_at_place("mount", args)
+        for _, sight, _ in inputs.seen_at(args, place)
         if (at := sight.solution.at_place) is not None
     ]
     try:
@@ -40,7 +35,7 @@ def run(args: argparse.Namespace) -> int:
             return _axis(args, place, [a for _, a in seen])
         return _circle(args, seen, readings, axes[list(axes)[-1]])
     except FixError as e:
-        console.complain("mount", e)
+        console.complain(e)
         return console.NOTHING
 
 
@@ -62,7 +57,7 @@ def _axis(args: argparse.Namespace, place: Place, seen: Sequence[AttitudeAtPlace
         "axis_in_camera": found.in_camera.tolist(),
     }
     if args.json:
-        print_json(values)
+        console.print_json(values)
         return 0
     side = ("right", "left")[int(right < 0)], ("above", "below")[int(above < 0)]
     print(
@@ -73,7 +68,7 @@ def _axis(args: argparse.Namespace, place: Place, seen: Sequence[AttitudeAtPlace
         f"{abs(above) * 3600:.0f} arcsec {side[1]} it"
     )
     if len(seen) < 3:
-        console.complain("mount", "two frames do not show whether it is one axis: give three")
+        console.complain("two frames do not show whether it is one axis: give three")
     return 0
 
 
@@ -86,7 +81,7 @@ def _circle(
     """Print the orientation of a horizontal circle."""
     there = [(path, a, readings[Path(path).name]) for path, a in seen if Path(path).name in readings]
     for path in {Path(p).name for p, _ in seen} - set(readings):
-        console.complain("mount", f"{path}: {args.readings} has no reading of it: it is left out")
+        console.complain(f"{path}: {args.readings} has no reading of it: it is left out")
     if not there:
         raise FixError(
             f"no frame with a heading has a reading in {args.readings}: check the names in its column file"
@@ -109,7 +104,7 @@ def _shared(seen: AttitudeAtPlace) -> float:
 def _print_circle(args: argparse.Namespace, found: CircleOrientation, names: Sequence[str]) -> None:
     zero, sigma, rest = math.degrees(found.zero), found.sigma / ARCSEC, (found.rest / ARCSEC).tolist()
     if args.json:
-        print_json(
+        console.print_json(
             {
                 "frames": len(rest),
                 "zero": zero,

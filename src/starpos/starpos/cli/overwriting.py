@@ -111,14 +111,11 @@ def failed_fields(folder: Path) -> None:
             raise _there(path, "starpos montecarlo did not write it")
 
 
-def save_instrument(
-    command: str, name: str, found: Instrument, about: str, *, camera_found: bool = False
-) -> None:
+def save_instrument(name: str, found: Instrument, about: str, *, camera_found: bool = False) -> None:
     """Write A3 into an instrument file, new or there already; raises InstrumentError."""
     instrument_file.update(Path(name), found, about, camera_found=camera_found)
     if arcsec := instrument_file.read(name, needs_camera=False).calibration.remounted_arcsec:
         console.complain(
-            command,
             f"{name} keeps remounted_arcsec: {arcsec:g}: A3 is new, so take it out unless you remount again",
         )
 

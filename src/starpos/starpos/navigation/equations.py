@@ -397,7 +397,7 @@ def law_residuals(motion: Motion, law: MotionLaw) -> Residuals:
     rows[:, :, -1] = nose * motion.speed[:, None] + drift - motion.velocity
     apart_s = float(np.median(np.diff(motion.utc_unix_s)))
     upward = up[:, :, None] * up[:, None, :]
-    covariance = law.rest_at(apart_s) ** 2 * level + law.climb_at(apart_s) ** 2 * upward
+    covariance = law.longer(apart_s) ** 2 * (law.rest_stddev**2 * level + law.climb_stddev**2 * upward)
     return Residuals(index=np.arange(count), rows=rows, covariance=covariance)
 
 
