@@ -26,7 +26,9 @@ from starpos.instrument import sensors
 from starpos.instrument.inclinometer import InclinometerErrors
 from starpos.instrument.tilt_log import TiltLog
 from starpos.rotation import half_turn
-from starpos.simulation.montecarlo_nights import (
+from starpos.simulation.scene import detected, expose, read_tilt
+from starpos.sky.catalogue import Catalogue, load_catalogue
+from starpos_testing.skies.random_nights import (
     CAMERA,
     EXPOSURE_S,
     LEAN_DEG,
@@ -39,8 +41,6 @@ from starpos.simulation.montecarlo_nights import (
     draw,
     tiltmeter,
 )
-from starpos.simulation.scene import detected, expose, read_tilt
-from starpos.sky.catalogue import Catalogue, load_catalogue
 
 # GNSS time, PTP or a good NTP server
 CLOCK_S = 0.001

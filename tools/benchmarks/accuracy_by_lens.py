@@ -34,10 +34,10 @@ from starpos.fix.solver import Solver
 from starpos.instrument import sensors
 from starpos.instrument.camera import Camera
 from starpos.rotation import half_turns
-from starpos.simulation.montecarlo_nights import Zero, draw, tiltmeter
 from starpos.simulation.scene import Optics
 from starpos.sky.catalogue import load_catalogue
 from starpos.units import ARCSEC
+from starpos_testing.skies.random_nights import Zero, draw, tiltmeter
 
 PAPERS, WIDE, _ = CASES
 # f/1.4, pixels of 1.55 um binned 2 x 2; half of the light of the 25 mm lens's monochrome camera for the same aperture;

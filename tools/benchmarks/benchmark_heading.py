@@ -22,10 +22,10 @@ from starpos.fix.attitude import heading_of
 from starpos.fix.solver import Solver, placed
 from starpos.instrument.camera import Camera
 from starpos.rotation import half_turns
-from starpos.simulation.montecarlo_nights import CAMERA, SCA100T_CALIBRATED, draw
 from starpos.simulation.scene import Optics, detected, expose
 from starpos.sky.catalogue import load_catalogue
 from starpos.units import ARCSEC
+from starpos_testing.skies.random_nights import CAMERA, SCA100T_CALIBRATED, draw
 
 CLOCK_S, PLACE_M, ALTITUDE_DEG = 0.001, 2.0, 70.0
 # of errors squared over claims

@@ -7,8 +7,6 @@ import numpy as np
 import pytest
 from cli_calls import KNOWN, SCHEMA, WIDE, objects, promised, solve
 
-from starpos.simulation import montecarlo_nights
-from starpos.simulation.montecarlo_nights import NightOutcome
 from starpos_testing.command_line import run
 from starpos_testing.lacking import require
 
@@ -44,27 +42,6 @@ def test_rows_of_montecarlo_are_as_promised(capsys):
     few = ("--size", 1000, 700, "--fields", 2, "--points", 2, "--false", 0, "--stars")
     fields, points = objects(run(capsys, "montecarlo", "--json", *WIDE, *few)[1])
     assert (fields["fields"], points["row"]) == (2, "random points")
-
-
-@pytest.mark.parametrize(("experiment", "lines"), [("nights", 1), ("honesty", 3)])
-@pytest.mark.parametrize("trouble", ["", "no stars"])
-def test_nights_of_montecarlo_are_as_promised(experiment, lines, trouble, monkeypatch, capsys):
-    def night(*_, **__):
-        off, covariance = np.full(3, np.nan if trouble else 1.0), np.eye(3)
-        return NightOutcome(
-            kind="turned",
-            off=off,
-            covariance=covariance,
-            off_ground=off,
-            covariance_ground=covariance,
-            trouble=trouble,
-        )
-
-    monkeypatch.setattr(montecarlo_nights, "turned_night", night)
-    monkeypatch.setattr(montecarlo_nights, "calibrated_night", night)
-    told = objects(run(capsys, "montecarlo", experiment, "--json", "--nights", 3, "--jobs", 1)[1])
-    assert [line.get("kind") for line in told] == ["turned"] * 3 + [None] * lines
-    assert told[3]["solved"] == (0 if trouble else 3)
 
 
 @pytest.mark.parametrize("change", [{"latitude": "52 N"}, {"height": 52.0}, {"status": "fine"}])

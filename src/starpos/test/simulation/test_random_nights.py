@@ -1,24 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whole nights at random: drawn as they should be, repeatable, their claims true; and the commands that count them."""
+"""Whole nights at random: drawn as they should be, repeatable, their claims true."""
 
-import json
 from functools import partial
 
 import numpy as np
 import pytest
 
-from starpos.cli import main
 from starpos.instrument.camera import Camera
 from starpos.instrument.inclinometer import InclinometerErrors
 from starpos.instrument.sensors import SCA100T_CALIBRATED
-from starpos.simulation import montecarlo_nights
+from starpos_testing.skies import random_nights
 from starpos_testing.skies.scenes import FOCAL_PX, SIZE
 
 # 15 deg, whose triangles build fast.
 CAMERA = Camera.from_focal(*SIZE, FOCAL_PX)
 KINDS = {
-    "turned": partial(montecarlo_nights.turned_night, headings=4, frames=1, camera=CAMERA),
-    "calibrated": partial(montecarlo_nights.calibrated_night, frames=1, camera=CAMERA),
+    "turned": partial(random_nights.turned_night, headings=4, frames=1, camera=CAMERA),
+    "calibrated": partial(random_nights.calibrated_night, frames=1, camera=CAMERA),
 }
 
 
@@ -67,7 +65,7 @@ def test_a_seed_is_a_night(kind, catalogue, outcomes):
 
 def test_a_quiet_inclinometer_makes_a_better_night(catalogue):
     noisy, quiet = (KINDS["turned"](np.random.default_rng(3), catalogue, errors=e)
-                    for e in (montecarlo_nights.tiltmeter(60.0), montecarlo_nights.tiltmeter(0.5)))  # fmt: skip
+                    for e in (random_nights.tiltmeter(60.0), random_nights.tiltmeter(0.5)))  # fmt: skip
     sigma = [np.sqrt(np.trace(o.covariance[:2, :2]) / 2) for o in (noisy, quiet)]
     assert sigma[0] > 10 * sigma[1]
     assert quiet.position_nees < 16
@@ -76,8 +74,8 @@ def test_a_quiet_inclinometer_makes_a_better_night(catalogue):
 def test_nothing_told_is_what_was_drawn(catalogue):
     """Else the nights would flatter: A3, zero, scale, air and stars all differ from the stated ones."""
     rng = np.random.default_rng(1)
-    world, begin = montecarlo_nights.draw(rng, catalogue, SCA100T_CALIBRATED, 0.01, CAMERA)
-    assert montecarlo_nights.FIRST_UNIX_S < begin < montecarlo_nights.LAST_UNIX_S
+    world, begin = random_nights.draw(rng, catalogue, SCA100T_CALIBRATED, 0.01, CAMERA)
+    assert random_nights.FIRST_UNIX_S < begin < random_nights.LAST_UNIX_S
     assert world.told.calibration.misalignment_deg == (0.0, 0.0, 0.0)
     assert np.abs(world.scene.instrument.calibration.misalignment_deg).max() > 0.1
     assert np.abs(world.scene.tilt_errors.zero).min() > 0
@@ -98,7 +96,7 @@ def test_nothing_told_is_what_was_drawn(catalogue):
 def test_a_zero_wanders_by_the_root_of_time():
     walked = []
     for seed in range(300):
-        zero = montecarlo_nights.Zero(InclinometerErrors(), np.random.default_rng(seed), 1000.0)
+        zero = random_nights.Zero(InclinometerErrors(), np.random.default_rng(seed), 1000.0)
         for hour in (1, 3, 9):
             off = zero.at(1000.0 + 3600 * hour)
         walked.append(off)
@@ -108,60 +106,8 @@ def test_a_zero_wanders_by_the_root_of_time():
 
 
 def test_a_night_that_cannot_be_worked_says_why(catalogue):
-    o = montecarlo_nights.turned_night(np.random.default_rng(0), catalogue, headings=2, frames=1,
+    o = random_nights.turned_night(np.random.default_rng(0), catalogue, headings=2, frames=1,
                             camera=Camera.from_focal(8, 8, FOCAL_PX))  # fmt: skip
     assert o.trouble
     assert "\n" not in o.trouble
     assert np.isnan(o.off).all() and np.isnan(o.covariance).all()
-
-
-@pytest.fixture
-def run(capsys):
-    def of(*args):
-        capsys.readouterr()
-        try:
-            status = main(["montecarlo", *map(str, args)])
-        except SystemExit as e:
-            status = e.code
-        said = capsys.readouterr()
-        return status, said.out, said.err.splitlines()
-
-    return of
-
-
-def test_the_papers_nights(run, monkeypatch):
-    """They have 4 frames a heading, where the paper has 25."""
-    monkeypatch.setattr(montecarlo_nights, "turned_night", partial(montecarlo_nights.turned_night, frames=4))
-    status, said, errors = run("nights", "--nights", 2, "--seed", 5, "--tiltmeter", 1, "--json", "--jobs", 1)
-    assert (status, errors) == (0, [])
-    *each, all_of_them = [json.loads(line) for line in said.splitlines()]
-    assert [n["kind"] for n in each] == ["turned"] * 2
-    assert all_of_them["solved"] == all_of_them["nights"] == 2
-    for axis in ("north", "east"):
-        assert all_of_them[f"mean_abs_{axis}_m"] == pytest.approx(
-            np.mean([abs(n[f"{axis}_m"]) for n in each])
-        )
-        assert max(abs(n[f"{axis}_m"]) / n[f"sigma_{axis}_m"] for n in each) < 5
-    assert all_of_them["mean_abs_latitude_arcsec"] == pytest.approx(all_of_them["mean_abs_north_m"] / 30.87)
-
-
-@pytest.mark.montecarlo
-def test_whether_claims_are_honest(run):
-    args = ("honesty", "--nights", 2, "--seed", 2)
-    status, said, errors = run(*args, "--jobs", 1, "--json")
-    *each, whole, turned, calibrated = [json.loads(line) for line in said.splitlines()]
-    assert len(each) == whole["nights"] == turned["nights"] + calibrated["nights"] == 2
-    assert [r["row"] for r in (whole, turned, calibrated)] == ["all", "turned", "calibrated"]
-    assert errors == []
-    off = [abs(whole[k] / n - 1) for k, n in (("position_nees", 2), ("ground_nees", 2), ("heading_nees", 1))]
-    assert status == int(max(off) >= 0.1)
-    # However many work on it.
-    assert run(*args, "--jobs", 2, "--json") == (status, said, [])
-
-
-@pytest.mark.parametrize(
-    "bad", [("--nights", 0), ("--jobs", 0), ("--tiltmeter", 0), ("--tiltmeter", "nan"), ("--seed", -1)]
-)
-def test_bad_calls(bad, run):
-    status, said, errors = run("nights", *bad)
-    assert (status, said, len(errors)) == (2, "", 1)
