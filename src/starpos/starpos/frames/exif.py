@@ -111,7 +111,7 @@ class Exif:
         return value.replace("\0", " ").strip() if isinstance(value, str) else ""
 
     def sexagesimal(self, name: str) -> float:
-        """A GPS tag of degrees or hours, minutes and seconds as one number; NaN for what is none."""
+        """A GPS tag of degrees or hours, minutes and seconds as one number; NaN without one."""
         try:
             whole, minutes, seconds = (value.num / value.den for value in self.tags[f"GPS GPS{name}"].values)
         except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError):
