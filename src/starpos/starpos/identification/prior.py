@@ -158,9 +158,11 @@ class PlumbPrior:
         return Prior(density, np.append(np.full(3, np.cbrt(rotations)), 2 * SCALE_TOLERANCE))
 
 
-# Half of the headers' pointings are right to USUALLY_RAD; those beyond AIMED_RAD are not looked for. Numbers of a frame's
-# brightest stars of which two, and all of which, show a pose; of the catalogue's for each area of a frame, and in all;
-# the stars of fields that reach beyond WIDEST_AIMED_RAD from their middle do not lie in a plane.
+# Half of the headers' focal lengths are right to this share, half of their pointings to USUALLY_RAD; those beyond AIMED_RAD
+# are not looked for. Numbers of a frame's brightest stars of which two, and all of which, show a pose; of the
+# catalogue's for each area of a frame, and in all; the stars of fields that reach beyond WIDEST_AIMED_RAD from their
+# middle do not lie in a plane.
+USUAL_SCALE = 0.01
 USUALLY_RAD, AIMED_RAD, WIDEST_AIMED_RAD = np.radians([0.3, 1.0, 4.0]).tolist()
 AIMED_PAIRS, AIMED_STARS, CATALOGUE_STARS, MOST_STARS = 8, 40, 10, 120
 
@@ -244,7 +246,8 @@ class AimPrior:
             if off > AIMED_RAD or scale > SCALE_TOLERANCE:
                 return -math.inf
             parity = math.log(MIRRORED if pose.mirrored else 1 - MIRRORED)
-            return float(log_density + parity - 2 * np.log1p((off / USUALLY_RAD) ** 2))
+            usual = math.log(0.5 + 0.5 * (scale < USUAL_SCALE) * SCALE_TOLERANCE / USUAL_SCALE)
+            return float(log_density + parity + usual - 2 * np.log1p((off / USUALLY_RAD) ** 2))
 
         return Prior(density, np.append(np.full(3, np.cbrt(rotations)), 2 * SCALE_TOLERANCE))
 
