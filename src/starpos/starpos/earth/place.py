@@ -54,9 +54,9 @@ class Place:
     longitude: float
     plumb: tuple[float, float]
     covariance: np.ndarray
-    deflection: Deflection
-    plumb_stddev: float
-    ellipsoid_stddev: float
+    deflection: Deflection = UNDEFLECTED
+    plumb_stddev: float = 0.0
+    ellipsoid_stddev: float = 0.0
     height_m: float = math.nan
     utc_unix_s: float = math.nan
 
@@ -80,9 +80,6 @@ class Place:
             longitude=longitude,
             plumb=(latitude, longitude),
             covariance=np.asarray(covariance, float),
-            deflection=UNDEFLECTED,
-            plumb_stddev=0.0,
-            ellipsoid_stddev=0.0,
             height_m=height_m,
             utc_unix_s=utc_unix_s,
         ).deflected(vertical)
@@ -104,7 +101,6 @@ class Place:
             plumb=plumb,
             covariance=np.asarray(covariance, float),
             deflection=ground.deflection,
-            plumb_stddev=0.0,
             ellipsoid_stddev=ground.deflection.stddev_arcsec * ARCSEC,
         )
 

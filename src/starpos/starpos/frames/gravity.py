@@ -10,7 +10,7 @@ import math
 import re
 import struct
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -61,11 +61,13 @@ class Gravity:
     up          (3,): unit vector in C
     stddev_rad  of it about each axis by the way it is written: its step, and what its frame leaves open
     model       of the inclinometer that felt it, by its name in sensors.csv
+    camera      make and model of the camera that it is in
     """
 
     up: np.ndarray
     stddev_rad: float = 0.0
     model: str = PHONE
+    camera: str = ""
 
     @classmethod
     def of_level(cls, roll_deg: float, pitch_deg: float, step_deg: float) -> "Gravity":
@@ -318,7 +320,7 @@ def read_gravity(data: bytes, width: int, height: int) -> Gravity:
     facts.check_grid(width, height, found.model == PHONE)
     if contradicts(facts.upper_edge, found.up):
         raise FrameError("its Orientation contradicts its level: a program turned it")
-    return found
+    return replace(found, camera=" ".join(_text(facts.first.get(tag)) for tag in (MAKE, MODEL)).strip())
 
 
 def _text(value: tuple | None) -> str:

@@ -75,15 +75,8 @@ def level_errors(sag_arcsec_per_sqrt_hour: float) -> InclinometerErrors:
     return replace(EXACT, noise_rad=NO_NOISE, drift_rad_per_sqrt_hour=sag_arcsec_per_sqrt_hour * ARCSEC)
 
 
-class OwnLevel:
-    """The tilts of that level, as `starpos.instrument.tilt_log.Tilts`: always zero."""
-
-    def average(self, mid_unix_s: float, exposure_s: float, spread_s: float = 0.0) -> Tilt:
-        """Zero, read at the middle of the exposure."""
-        return Tilt(0.0, 0.0, np.eye(2) * NO_NOISE**2, utc_unix_s=mid_unix_s)
-
-
-OWN_LEVEL = OwnLevel()
+# the reading of that level
+OWN_LEVEL = Tilt(0.0, 0.0, np.eye(2) * NO_NOISE**2, utc_unix_s=0.0)
 NO_GRAVITY = (
     "give it as the telephone wrote it (a screenshot, an edited or a sent copy has no gravity). Without gravity "
     "there are still: starpos identify, its heading with --site, a log of the level as --tilt, or a plumb line"
@@ -95,9 +88,11 @@ class ByGravity:
     """The tilts of a telephone's photographs, as `starpos.instrument.tilt_log.Tilts`; S is then C.
 
     log: of the telephone that took them, in S; None: their own files state gravity.
+    camera: that took them; '': any.
     """
 
     log: Tilts | None = None
+    camera: str = ""
 
     def has(self, frame: Exposure) -> bool:
         """Whether a photograph can have a tilt."""
@@ -114,6 +109,11 @@ class ByGravity:
         if gravity.model != model and is_built_in(model):
             raise TiltError(
                 f"{frame.place}: its level is a {gravity.model}'s, the others' a {model}'s: solve them apart"
+            )
+        if self.camera and gravity.camera != self.camera:
+            raise TiltError(
+                f"{frame.place}: it is by another camera ({gravity.camera}) than the first ({self.camera}), whose level "
+                "errs otherwise: solve them apart"
             )
         variance = instrument.inclinometer.noise_rad**2 + gravity.stddev_rad**2
         theta_x, theta_y, theta_z = np.arcsin(np.clip(gravity.up, -1, 1)).tolist()

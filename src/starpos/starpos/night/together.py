@@ -132,6 +132,7 @@ def together(gathered: Gathered, given: Instrument | None, near: Near | None = N
         if given.vertical is None and not given.calibration.unknown:
             mounting = given.mounting
         said += [] if whole is None else remarks.of_table(fixes, whole, given)
+        said += remarks.of_copies(fixes) if given.has_level_inside else ()
     said += remarks.of_marks(place, gathered.marks_deg)
     said += doubts(fixes, place, mounting, near)
     return Together(whole, why_not, tuple(said))

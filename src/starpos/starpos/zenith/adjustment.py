@@ -81,22 +81,23 @@ def face_qualities(
 
     Empty for fewer than three faces: of two it is unknown which is wrong.
     """
-    headings = np.degrees(mean_headings(sightings, faces)).tolist()
-    return tuple(_quality(leftover, k, h, faces == k) for k, h in enumerate(headings) if len(headings) > 2)
-
-
-def _quality(leftover: Leftover, number: int, heading_deg: float, member: np.ndarray) -> FaceQuality:
-    step, normal, chi2 = leftover.tested(leftover.by_lean * member[:, None, None])
-    known = np.linalg.cond(normal) < 1e9
-    stddev = np.sqrt(np.diag(np.linalg.inv(normal))) if known else np.full(2, np.nan)
-    return FaceQuality(
-        number=number,
-        heading_deg=heading_deg,
-        frames=int(member.sum()),
-        off_arcsec=step / ARCSEC,
-        stddev_arcsec=stddev / ARCSEC,
-        chi2=chi2,
-    )
+    headings, qualities = np.degrees(mean_headings(sightings, faces)).tolist(), []
+    for number, heading_deg in enumerate(headings if len(headings) > 2 else ()):
+        member = faces == number
+        step, normal, chi2 = leftover.tested(leftover.by_lean * member[:, None, None])
+        known = np.linalg.cond(normal) < 1e9
+        stddev = np.sqrt(np.diag(np.linalg.inv(normal))) if known else np.full(2, np.nan)
+        qualities.append(
+            FaceQuality(
+                number=number,
+                heading_deg=heading_deg,
+                frames=int(member.sum()),
+                off_arcsec=step / ARCSEC,
+                stddev_arcsec=stddev / ARCSEC,
+                chi2=chi2,
+            )
+        )
+    return tuple(qualities)
 
 
 STEPS = 8
