@@ -158,10 +158,10 @@ class PlumbPrior:
         return Prior(density, np.append(np.full(3, np.cbrt(rotations)), 2 * SCALE_TOLERANCE))
 
 
-# Half of the headers' focal lengths are right to this share, half of their pointings to USUALLY_RAD; those beyond AIMED_RAD
-# are not looked for. Numbers of a frame's brightest stars of which two, and all of which, show a pose; of the
-# catalogue's for each area of a frame, and in all; the stars of fields that reach beyond WIDEST_AIMED_RAD from their
-# middle do not lie in a plane.
+# Half of the headers' focal lengths are right to this share, half of their pointings to USUALLY_RAD; none is looked for
+# beyond AIMED_RAD. Numbers of a frame's brightest stars of which two, and all of which, show a pose; of the catalogue's
+# for each area of a frame, and in all; the stars of fields that reach beyond WIDEST_AIMED_RAD from their middle do not
+# lie in a plane.
 USUAL_SCALE = 0.01
 USUALLY_RAD, AIMED_RAD, WIDEST_AIMED_RAD = np.radians([0.3, 1.0, 4.0]).tolist()
 AIMED_PAIRS, AIMED_STARS, CATALOGUE_STARS, MOST_STARS = 8, 40, 10, 120
