@@ -158,7 +158,7 @@ def aim_deg(header: Mapping) -> tuple[float, float] | None:
 
 
 def _sexagesimal(value: Any) -> tuple[float, bool] | None:
-    """A number, and whether it was written in three parts; None if it is none."""
+    """A number, and whether it was written in three parts; None for any other text."""
     parts = re.split(r"[: hdms]+", str(value).strip(" hdms"))
     try:
         sizes = [abs(float(part)) for part in parts]

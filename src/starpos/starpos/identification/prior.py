@@ -159,9 +159,9 @@ class PlumbPrior:
 
 
 # Half of the headers' focal lengths are right to this share, half of their pointings to USUALLY_RAD; none is looked for
-# beyond AIMED_RAD. Numbers of a frame's brightest stars of which two, and all of which, show a pose; of the catalogue's
-# for each area of a frame, and in all; the stars of fields that reach beyond WIDEST_AIMED_RAD from their middle do not
-# lie in a plane.
+# beyond AIMED_RAD. The stars of fields that reach beyond WIDEST_AIMED_RAD from their middle do not lie in a plane.
+# Numbers of brightest stars: of a frame, whose pairs show poses and whose places judge them; of the catalogue, for each
+# area of a frame and in all.
 USUAL_SCALE = 0.01
 USUALLY_RAD, AIMED_RAD, WIDEST_AIMED_RAD = np.radians([0.3, 1.0, 4.0]).tolist()
 AIMED_PAIRS, AIMED_STARS, CATALOGUE_STARS, MOST_STARS = 8, 40, 10, 120
@@ -213,7 +213,7 @@ class AimPrior:
         shift = seen[one][:, None] - turn * plane[first]
         off = np.abs(shift - field.middle @ [1, 1j]) / field.focal_px
         turn, shift = (v[alike & (off < AIMED_RAD)] for v in (turn, shift))
-        # cells of the frame in which a star is seen, or beside one
+        # cells of the frame in which a star is seen, and the next ones
         low = field.middle - field.half - 2 * AGREE_PX
         size = (2 * field.half / AGREE_PX).astype(int) + 5
         cells = np.zeros(size, bool)
