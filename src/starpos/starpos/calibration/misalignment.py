@@ -210,7 +210,7 @@ def calibrate(
     return Calibrated(instrument, error, tuple(solutions), agreement.beyond)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class _Agreement:
     """The plumb line of the frames that agree, and how well they do.
 
@@ -312,7 +312,9 @@ def _agreed(find: FindPlumbLine, solved: list[Fix], a3: np.ndarray, errors: Incl
         off = np.linalg.norm(_left(whole, plumb), axis=1)
         for k in np.setdiff1d(np.arange(len(solved)), rows):
             left_out[solved[k].utc_unix_s] = float(off[k])
-    return _Agreement(plumb, readings, sound, scatter, left_out, errors)
+    return _Agreement(
+        plumb=plumb, readings=readings, sound=sound, scatter=scatter, left_out=left_out, stated=errors
+    )
 
 
 def _agreeing(fit: FitOfRows, whole: Readings, pose_rad: float) -> tuple[np.ndarray, PlumbLine]:
