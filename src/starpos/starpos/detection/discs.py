@@ -12,8 +12,9 @@ from starpos.frames.frame import Disc
 # Frames are searched at steps of their shorter side over this, px, or of 2. Minimum radius, px, and number of bright
 # groups that are tried.
 COARSE, LEAST_PX, TRIED = 800, 4.0, 4
-# The dark part of a frame is at this percentile; a disc is higher by this share of the brightest, and that many sigma.
-DARK, CONTRAST, CLEAR = 20.0, 0.3, 20.0
+# The dark part of a frame is at this percentile of some rows and columns; a disc is higher by this share of the brightest,
+# and that many sigma.
+SOME, DARK, CONTRAST, CLEAR = 80, 20.0, 0.3, 20.0
 # Directions from a bright group's middle, in each of which its edge is looked for.
 RAYS = 360
 # Minimum slope of an edge, as a share of the disc's height a px, and of the steepest of its direction.
@@ -47,31 +48,29 @@ def find_disc(plane: np.ndarray) -> Disc | None:
     step = max(2, min(plane.shape) // COARSE)
     if min(plane.shape) < 16 * step:
         return None
-    # without single hot pixels
-    small = cv2.medianBlur(np.ascontiguousarray(plane[::step, ::step]), 3)
-    some = small[::4, ::4].astype(float)
-    dark, top = float(np.percentile(some, DARK)), float(small.max())
+    # what is narrower than three of these pixels, as stars and hot pixels are, leaves nothing
+    wide = cv2.erode(np.ascontiguousarray(plane[::step, ::step]), np.ones((3, 3), np.uint8))
+    every = max(1, min(wide.shape) // SOME)
+    some = wide[::every, ::every].astype(float)
+    dark, top = float(np.percentile(some, DARK)), float(wide.max())
     noise = float(np.median(np.abs(np.diff(some, axis=1)))) + 1.0
     height = top - dark
     if height < max(CONTRAST * top, CLEAR * noise):
         return None
-    groups = _groups(small, dark + 0.5 * height, step)
+    groups = _groups(wide, dark + 0.5 * height, step)
     for middle, extent in groups:
         if (disc := _limb(plane, middle, extent, dark, height)) is not None:
             return disc
     if (glow := _alone(plane, groups, dark, height)) is not None:
         return glow
     # in a bright sky the Sun's glow is no group of its own, but what is saturated is
-    return _alone(plane, _groups(small, dark + HEIGHTS[0] * height, step), dark, height)
+    return _alone(plane, _groups(wide, dark + HEIGHTS[0] * height, step), dark, height)
 
 
-def _groups(small: np.ndarray, level: float, step: int) -> list[tuple[np.ndarray, float]]:
+def _groups(wide: np.ndarray, level: float, step: int) -> list[tuple[np.ndarray, float]]:
     """Middles (2,) px and extents, px, of the largest groups of pixels above a level, of a plane reduced by a step."""
-    bright = (small > small.dtype.type(level)).view(np.uint8)
-    # what stars leave is nothing
-    outlines, _ = cv2.findContours(
-        cv2.erode(bright, np.ones((3, 3), np.uint8)), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE
-    )
+    bright = (wide > wide.dtype.type(level)).view(np.uint8)
+    outlines, _ = cv2.findContours(bright, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     groups = []
     for left, top_row, width, rows in map(cv2.boundingRect, sorted(outlines, key=len, reverse=True)[:TRIED]):
         middle = np.array([left + (width - 1) / 2, top_row + (rows - 1) / 2])

@@ -10,8 +10,9 @@ import numpy as np
 from starpos import rotation
 from starpos.frozen import at_once
 
-# The Sun has moved on from this many sigma of two glows; what has moved by less than this share of its way stands still.
-MOVED_SIGMAS, STILL = 8.0, 0.5
+# The Sun has moved on from this many sigma of two glows; what has moved by less than the second number stands still. No share
+# of the Sun's way: over hours that is half the frame, and a camera that is turned may have the Sun again in any place of it.
+MOVED_SIGMAS, STILL_SIGMAS = 8.0, 4.0
 # Minimum interval (s) between the glows that later ones are compared with, and their maximum number.
 APART_S, KEPT = 60.0, 60
 
@@ -32,9 +33,8 @@ class Glow:
     def stood_still(self, later: "Glow") -> bool | None:
         """Whether the spot has kept its place in the camera while the Sun moved; None as long as that is too little."""
         went, moved = _angle(self.itrs, later.itrs), _angle(self.ray, later.ray)
-        if went < MOVED_SIGMAS * math.hypot(self.sigma, later.sigma):
-            return None
-        return moved < STILL * went
+        sigma = math.hypot(self.sigma, later.sigma)
+        return None if went < MOVED_SIGMAS * sigma else moved < STILL_SIGMAS * sigma
 
 
 def _angle(a: np.ndarray, b: np.ndarray) -> float:
