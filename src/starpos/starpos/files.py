@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import BinaryIO
 from urllib.parse import unquote, urlsplit
 
-from starpos.errors import InstrumentError
+from starpos.errors import InstrumentError, StarposError, WriteError
 
 # Linux opens no longer path.
 LONGEST_PATH = 4096
@@ -117,6 +117,18 @@ def write_whole(path: Path | str, content: bytes) -> None:
             os.fsync(folder)
         finally:
             os.close(folder)
+
+
+def save(
+    path: Path | str, content: bytes, what: str = "the file", error: type[StarposError] = WriteError
+) -> None:
+    """Write a file as `write_whole` does; an error of one sentence, with the reason, if that is impossible."""
+    try:
+        write_whole(path, content)
+    # ValueError: the name contains a NUL
+    except (OSError, ValueError) as e:
+        reason = getattr(e, "strerror", None) or e
+        raise error(f"{path}: {what} cannot be written there ({reason})") from None
 
 
 def has_mark(path: Path | str) -> bool:

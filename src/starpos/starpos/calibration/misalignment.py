@@ -33,7 +33,6 @@ from starpos.identification import Identification
 from starpos.identification.prior import Hint
 from starpos.instrument.inclinometer import InclinometerErrors, up_of
 from starpos.instrument.instrument import (
-    MAX_C,
     OWN_LEVEL,
     SAG_ARCSEC_PER_SQRT_HOUR,
     UNKNOWN_ARCSEC,
@@ -43,7 +42,7 @@ from starpos.instrument.instrument import (
     level_errors,
 )
 from starpos.instrument.mounting import angles_at, stated_variances
-from starpos.instrument.tilt_log import Tilts
+from starpos.instrument.tilt_log import Tilts, mean_known
 from starpos.progress import Progress, quiet
 from starpos.units import ARCSEC
 
@@ -441,7 +440,7 @@ def _found(agreement: _Agreement, errors: InclinometerErrors) -> Calibration:
     """The A3 that was found, at the mean temperature and tilt of the frames, with the response if the poses show it."""
     plumb, axes = agreement.plumb, agreement.sound[0].tilt.axes
     found = Calibration(
-        temperature_c=_mean_temperature_c(agreement.sound),
+        temperature_c=mean_known(np.array([f.tilt.temperature_c for f in agreement.sound])),
         tilt_deg=tuple(np.degrees(angles_at(agreement.readings.mean_plumb, axes)).tolist()),
     ).turned_to(plumb.a3)
     stated = np.diag(stated_variances(errors, axes))
@@ -456,12 +455,6 @@ def _found(agreement: _Agreement, errors: InclinometerErrors) -> Calibration:
         response=tuple(plumb.response.tolist()),
         response_covariance=tuple(map(tuple, plumb.response_covariance.tolist())),
     )
-
-
-def _mean_temperature_c(solved: list[Fix]) -> float:
-    # an unknown temperature is NaN, which is not below MAX_C
-    known = [f.tilt.temperature_c for f in solved if abs(f.tilt.temperature_c) < MAX_C]
-    return float(np.mean(known)) if known else float("nan")
 
 
 def turn(

@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 
 from starpos.cli import console, options, overwriting
-from starpos.cli.overwriting import Written
 from starpos.errors import CatalogueError
 from starpos.instrument.camera import Camera
 from starpos.sky import catalogue, deeper
@@ -45,7 +44,7 @@ def run_build(args: argparse.Namespace) -> int:
     """Put the places of a Gaia extract into the catalogue in use; raises CatalogueError."""
     from starpos.sky import gaia
 
-    overwriting.check(args, Written("--out", args.out, overwriting.stars))
+    overwriting.check(args, out=overwriting.stars)
     year = float(time.gmtime().tm_year) if args.year is None else args.year
     made, number = gaia.with_gaia(catalogue.load_catalogue(), gaia.read(Path(args.gaia)), year)
     try:

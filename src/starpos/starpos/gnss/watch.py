@@ -33,7 +33,7 @@ from starpos.gnss.filter import (
     stddev_rad,
     updated,
 )
-from starpos.gnss.states import Ageing, Learned, aged, ageing, at_temperature, prior
+from starpos.gnss.states import Ageing, Learned, aged, at_temperature, prior
 from starpos.instrument.inclinometer import Tilt
 from starpos.instrument.instrument import Instrument
 
@@ -201,6 +201,8 @@ class GnssWatch:
 
     Call `advance` for each frame; where there is a GNSS place, then `judge` and `learn`.
     learned: None before the first frame.
+    is_learning: whether A3 is too uncertain for the linear filter. Until it is not, each frame solves anew for all frames
+    held.
     """
 
     def __init__(self, instrument: Instrument, vertical: Vertical, learned: Learned | None = None) -> None:
@@ -208,8 +210,7 @@ class GnssWatch:
         self.disagrees = False
         self.vertical = vertical
         self._instrument = instrument
-        # Whether A3 is too uncertain for the linear filter. Until it is not, each frame solves anew for all frames held.
-        self._starting = learned is None
+        self.is_learning = learned is None
         self._held: deque[GnssFrame] = deque(maxlen=MAX_HELD)
         self._of_pose = 0
         self._pose: Fix | None = None
@@ -218,11 +219,6 @@ class GnssWatch:
         # the readings of a frame that would have been an alarm, before A3 was known
         self._suspicious: frozenset[float] | None = None
         self._onsets = OnsetFilters.empty(0)
-
-    @property
-    def is_learning(self) -> bool:
-        """Whether A3 is still too uncertain for the linear filter."""
-        return self._starting
 
     def advance(self, sighting: Fix) -> None:
         """Advance to the time of a frame, seen with any A3: only the attitude of its camera counts."""
@@ -240,11 +236,11 @@ class GnssWatch:
                 return
             stddev = stddev_rad(self.vertical, sighting.latitude, sighting.longitude)
             self.learned = prior(self._instrument, tilt, stddev, sighting.utc_unix_s)
-            self._starting = not is_linear(self.learned, tilt)
+            self.is_learning = not is_linear(self.learned, tilt)
         self._age(sighting)
 
     def _forget(self) -> None:
-        self.learned, self._starting, self.disagrees = None, True, False
+        self.learned, self.is_learning, self.disagrees = None, True, False
         self._held.clear()
         self._suspicious = None
         self._onsets = OnsetFilters.empty(0)
@@ -260,16 +256,11 @@ class GnssWatch:
             way_m = float(np.linalg.norm(place.offset_m(*here)))
             if way_m > ELSEWHERE_SIGMA * math.sqrt(np.linalg.eigvalsh(place.covariance)[-1]):
                 moved_m, here = way_m, (place.latitude, place.longitude)
-        passed = ageing(
-            learned,
-            self._instrument.inclinometer,
-            tilt,
-            sighting.utc_unix_s,
-            moved_m,
-            stddev_rad(self.vertical, place.latitude, place.longitude),
-            self._new_pose,
+        at = place.latitude, place.longitude
+        learned, passed = aged(
+            learned, self._instrument, self.vertical, sighting, at, moved_m, self._new_pose
         )
-        self.learned = replace(aged(learned, passed, tilt, sighting.utc_unix_s), place=here)
+        self.learned = replace(learned, place=here)
         if len(self._onsets.since):
             self._onsets = self._onsets.aged(passed)
             # the one that may bring GNSS back has to last for all of its frames, however far they are apart
@@ -307,7 +298,7 @@ class GnssWatch:
             return GnssCheck(status=GnssStatus.LEARNING, place=gnss)
         seen = innovation(sighting, gnss, self.learned, self.vertical)
         single = chi2(self.learned, seen)
-        if self._starting:
+        if self.is_learning:
             return self._check(self._while_starting(single, sighting.tilt), sighting, gnss)
         onsets = self._onsets if len(self._onsets.since) else OnsetFilters.empty(len(self.learned.state))
         # While GNSS is not believed there is one filter. If GNSS was away for long, it was dropped for its age.
@@ -374,7 +365,7 @@ class GnssWatch:
         if check.status not in (GnssStatus.LEARNING, GnssStatus.AGREES) or readings & self._readings:
             return
         self._readings = readings
-        if not self._starting:
+        if not self.is_learning:
             assert self.learned is not None
             seen = innovation(sighting, gnss, self.learned, self.vertical)
             first = not math.isfinite(self.learned.since_unix_s)
@@ -392,6 +383,6 @@ class GnssWatch:
         self._held.append(GnssFrame(sighting, gnss, first, up))
         self._of_pose += 1
         self.learned = begun(self._instrument, self._held, self.vertical)
-        self._starting = not is_linear(self.learned, sighting.tilt)
-        if not self._starting:
+        self.is_learning = not is_linear(self.learned, sighting.tilt)
+        if not self.is_learning:
             self._held.clear()

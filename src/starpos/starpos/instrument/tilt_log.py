@@ -398,7 +398,7 @@ class TiltLog:
             variance_z=float(variance[2]) / n if third else np.nan,
             utc_unix_s=float(self.utc_unix_s[use].mean()),
             samples=n,
-            temperature_c=_mean_known(self.temperature_c[use]),
+            temperature_c=mean_known(self.temperature_c[use]),
             times=tuple(self.utc_unix_s[use].tolist()),
             either_way=self.either_way,
         )
@@ -493,7 +493,7 @@ def _runs(mask: np.ndarray) -> np.ndarray:
     return np.flatnonzero(np.diff(np.concatenate([[0], mask, [0]]))).reshape(-1, 2).T
 
 
-def _mean_known(celsius: np.ndarray) -> float:
+def mean_known(celsius: np.ndarray) -> float:
     """Mean of the temperatures (N,) that are known; NaN without one."""
     known = celsius[np.isfinite(celsius)]
     return float(known.mean()) if len(known) else np.nan

@@ -11,16 +11,8 @@ from starpos.averaging.elevation_axis import FoundAxis
 from starpos.calibration.misalignment import Calibrated
 from starpos.earth.ellipsoid import EARTH_RADIUS_M, zenith_of
 from starpos.earth.orientation import ROTATION_RAD_S
+from starpos.fix import checks
 from starpos.fix.budget import local_north
-from starpos.fix.checks import (
-    BY_OPTIONS,
-    FIND_TURN,
-    MODEL_BY_OPTIONS,
-    at_another_lean,
-    may_turn,
-    unknown_a3,
-    unnamed_inclinometer,
-)
 from starpos.fix.fix import Fix, length_text
 from starpos.fix.terms import Origin, total_covariance
 from starpos.frames.gravity import PHONE
@@ -51,9 +43,9 @@ def of_tilts(log: TiltLog, path: str, inclinometer: InclinometerErrors) -> tuple
     return tuple(Remark(f"{path}: {doubt}") for doubt in doubts if doubt)
 
 
-def of_inclinometer(instrument: Instrument, ways: str = MODEL_BY_OPTIONS) -> tuple[Remark, ...]:
+def of_inclinometer(instrument: Instrument, ways: str = checks.MODEL_BY_OPTIONS) -> tuple[Remark, ...]:
     """Say that the inclinometer's model is not stated; ways: what to do then."""
-    sentence = unnamed_inclinometer(instrument, ways)
+    sentence = checks.unnamed_inclinometer(instrument, ways)
     return (Remark(sentence),) if sentence else ()
 
 
@@ -104,10 +96,10 @@ def of_table(fixes: Sequence[Fix], whole: Average, given: Instrument) -> tuple[R
     if known or (ups @ middle).min() < TABLE_COSINE or gap > TABLE_GAP_RAD:
         return ()
     left = total_covariance(t for t in whole.terms if t.origin is not Origin.A3)
-    km = float(np.sqrt(np.diag(left)[:2].max())) / 1000
+    km, now_km = (float(np.sqrt(np.diag(c)[:2].max())) / 1000 for c in (left, whole.covariance))
     sentence = (
         "the camera was turned where it lay: --self-calibrate finds the error of its level, for a place to about "
-        f"{km:.1f} km, and with --save OUT later photographs have it"
+        f"{km:.1f} km ({now_km:.1f} km without it), and with --save OUT later photographs have it"
     )
     return (Remark(sentence),)
 
@@ -175,9 +167,11 @@ def of_denied_a3(axis: FoundAxis, given: Calibration) -> Remark:
     )
 
 
-def of_a3(calibration: Calibration, place: Fix | Average, ways: str = BY_OPTIONS) -> tuple[Remark, ...]:
+def of_a3(
+    calibration: Calibration, place: Fix | Average, ways: str = checks.BY_OPTIONS
+) -> tuple[Remark, ...]:
     """Say that A3's error makes the position error large; ways: what to do then."""
-    sentence = unknown_a3(calibration, place.covariance, place.terms, ways)
+    sentence = checks.unknown_a3(calibration, place.covariance, place.terms, ways)
     return (Remark(sentence),) if sentence else ()
 
 
@@ -188,9 +182,9 @@ def of_turn(turned: Calibrated) -> Iterator[Remark]:
         yield Remark(f"not calibrated: the headings hardly determine A3, {error}: turn it further")
         return
     found = turned.instrument.calibration
-    yield Remark(f"calibrated: {error}; {at_another_lean(found)}")
-    if may_turn(found):
-        yield Remark(f"to use A3 at another lean, {FIND_TURN}")
+    yield Remark(f"calibrated: {error}; {checks.at_another_lean(found)}")
+    if checks.may_turn(found):
+        yield Remark(f"to use A3 at another lean, {checks.FIND_TURN}")
     if turned.beyond:
         yield Remark(turned.beyond)
 
