@@ -10,7 +10,7 @@ from starpos.fix.checks import BY_PARAMETERS, MODEL_BY_PARAMETERS
 from starpos.night.remarks import of_a3, of_inclinometer
 from starpos.night.together import FrameAnswer, Gathered, extrapolated
 from starpos.recording.drivers import Drivers
-from starpos.recording.topics import Remaps
+from starpos.recording.topics import remaps_of
 from starpos.session.replay import PlayedNight, Playing
 from starpos.session.settings import Settings
 from starpos.units import utc_text
@@ -21,7 +21,7 @@ def run(args: argparse.Namespace) -> int:
     output = console.Output(args, fix_output.COLUMNS, fix_output.HEAD)
     # a wrong parameter is reported once, not for each bag
     Drivers.of(args.params_file, args.param, args.namespace)
-    work = Playing(args.params_file, tuple(args.param), args.namespace, Remaps.of(args.remap))
+    work = Playing(args.params_file, tuple(args.param), args.namespace, remaps_of(args.remap))
     with inputs.workers_of(args, args.bags) as workers:
         answers = inputs.watched(workers.map((work, bag) for bag in args.bags), len(args.bags), "bag")
         return max(

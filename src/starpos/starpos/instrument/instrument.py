@@ -75,15 +75,8 @@ def level_errors(sag_arcsec_per_sqrt_hour: float) -> InclinometerErrors:
     return replace(EXACT, noise_rad=NO_NOISE, drift_rad_per_sqrt_hour=sag_arcsec_per_sqrt_hour * ARCSEC)
 
 
-class OwnLevel:
-    """The tilts of that level, as `starpos.instrument.tilt_log.Tilts`: always zero."""
-
-    def average(self, mid_unix_s: float, exposure_s: float, spread_s: float = 0.0) -> Tilt:
-        """Zero, read at the middle of the exposure."""
-        return Tilt(0.0, 0.0, np.eye(2) * NO_NOISE**2, utc_unix_s=mid_unix_s)
-
-
-OWN_LEVEL = OwnLevel()
+# the reading of that level
+OWN_LEVEL = Tilt(0.0, 0.0, np.eye(2) * NO_NOISE**2, utc_unix_s=0.0)
 NO_GRAVITY = (
     "give it as the telephone wrote it (a screenshot, an edited or a sent copy has no gravity). Without gravity "
     "there are still: starpos identify, its heading with --site, a log of the level as --tilt, or a plumb line"

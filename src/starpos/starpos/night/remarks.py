@@ -96,10 +96,10 @@ def of_table(fixes: Sequence[Fix], whole: Average, given: Instrument) -> tuple[R
     if known or (ups @ middle).min() < TABLE_COSINE or gap > TABLE_GAP_RAD:
         return ()
     left = total_covariance(t for t in whole.terms if t.origin is not Origin.A3)
-    km = float(np.sqrt(np.diag(left)[:2].max())) / 1000
+    km, now_km = (float(np.sqrt(np.diag(c)[:2].max())) / 1000 for c in (left, whole.covariance))
     sentence = (
         "the camera was turned where it lay: --self-calibrate finds the error of its level, for a place to about "
-        f"{km:.1f} km, and with --save OUT later photographs have it"
+        f"{km:.1f} km ({now_km:.1f} km without it), and with --save OUT later photographs have it"
     )
     return (Remark(sentence),)
 
