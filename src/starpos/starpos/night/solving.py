@@ -148,7 +148,7 @@ def _one_by_one(sights: Iterable[tuple[str, Sight | FrameError]], asked: Solving
 def _without_lamps(answers: Iterable[FrameAnswer]) -> Iterator[FrameAnswer]:
     """The answers, of which one by a glow is held back until a later glow shows that it moves with the Sun.
 
-    A glow that stands still meanwhile is a lamp's, and those before it too.  One that is not seen to move gives no answer.
+    A glow that stands still meanwhile is a lamp's, and those before it too.  One that is not seen to move has no answer.
     """
     held: list[FrameAnswer] = []
     lamp: Glow | None = None
