@@ -55,8 +55,8 @@ def answers(seconds, lamp: bool):
     return made
 
 
-def test_a_lamp_is_refused_once_the_sun_has_moved_on_and_the_sun_never():
-    for lamp, wanted in ((True, [True, True, False, False]), (False, [True] * 4)):
+def test_a_glow_counts_once_it_has_moved_as_the_sun_and_a_lamp_never():
+    for lamp, wanted in ((True, [False] * 4), (False, [False, False, True, True])):
         glows = Glows()
         assert [s.beside(glows).ok for _, s in answers([0, 30, 500, 600], lamp)] == wanted
 
@@ -70,3 +70,10 @@ def test_all_frames_of_a_lamp_are_refused_where_they_are_solved_together(lamp):
     assert [a.solution.ok for a in told] == [not lamp] * 4
     if lamp:
         assert all("lamp" in a.solution.message and a.solution.at_place is None for a in told)
+
+
+def test_a_glow_that_nothing_proves_has_no_heading():
+    sights = [(f"{k}", Sight(stars, s)) for k, (stars, s) in enumerate(answers([0, 30], lamp=False))]
+    told = list(answers_of(sights, Solving(Instruments(INSTRUMENT), atmosphere=AIR), Deflection()).each)
+    assert [a.solution.ok for a in told] == [False, False]
+    assert all("some minutes later" in a.solution.message for a in told)
