@@ -14,7 +14,7 @@ from starpos.frames.frame import Disc
 # Frames are searched at steps of their shorter side over this, px, or of 2. Minimum radius, px, and number of bright
 # groups that are tried.
 COARSE, LEAST_PX, TRIED = 800, 4.0, 4
-# The dark part of a frame is at this percentile of some rows and columns; a disc is higher by this share of the brightest,
+# The dark part of a frame is at this percentile of some rows and columns; a disc is higher by this share of the top,
 # and that many sigma.
 SOME, DARK, CONTRAST, CLEAR = 80, 20.0, 0.3, 20.0
 # Directions from a bright group's middle, in each of which its edge is looked for.
