@@ -152,9 +152,7 @@ def by_sun(solver: Solver, stars: Stars, disc: Disc, tilts: Tilts | None, places
             if disc.other is not None:
                 with suppress(PlaceError):
                     fix = _two_body_fix(solver, stars, looked(BOTH), tilt, state, stamp_s)
-                    return Solution.of(
-                        stars, f"fix by {_named(BOTH)}", fix=fix, tilt=tilt, bodies=BOTH, glow=glow
-                    )
+                    return Solution.of(stars, f"fix by {_named(BOTH)}", fix=fix, tilt=tilt, bodies=BOTH)
             return replace(_on_circle(solver, stars, disc, seen, tilt, state, stamp_s), glow=glow)
         place, wrong = places.at(state.utc_unix_s), []
         found: dict[tuple[str, ...], AttitudeAtPlace] = {}
@@ -177,7 +175,7 @@ def by_sun(solver: Solver, stars: Stars, disc: Disc, tilts: Tilts | None, places
             at_place=attitude,
             tilt=tilt,
             bodies=names,
-            glow=glow,
+            glow=None if names == BOTH else glow,
             extrapolated_days=state.orientation.extrapolated_days,
         )
     except StarposError as error:
