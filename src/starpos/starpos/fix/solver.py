@@ -102,7 +102,7 @@ def high_enough(sines: np.ndarray) -> np.ndarray:
 _Search = Callable[[FrameStars | fisheye.WideField, Sky, Camera], Identification | None]
 
 ENOUGH_SOUND = 8
-SMALLEST_FIELD_DEG, LARGEST_FIELD_DEG = 0.3, 100.0
+SMALLEST_FIELD_DEG, LARGEST_FIELD_DEG = 0.3, 115.0
 
 
 # A fisheye of which only the focal length is known misplaces stars by about this, outwards: it cancels where they lie all
