@@ -3,7 +3,7 @@
 
 import argparse
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 from importlib.util import find_spec
@@ -18,7 +18,7 @@ from starpos.calibration.misalignment import NOTHING_KNOWN, Calibrated, Known, c
 from starpos.cli import console, inputs, options, overwriting, places_file, watch_output
 from starpos.cli.inputs import checked_tilts, frames_among, given_or_sought, reader_of, stated_site
 from starpos.cli.options import vertical_of
-from starpos.cli.overwriting import CAMERA_NAME, Written, save_instrument
+from starpos.cli.overwriting import CAMERA_NAME, save_instrument
 from starpos.earth.place import Place
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import CalibrationError, FixError, FrameError, InstrumentError, PlaceError, StarposError
@@ -153,10 +153,7 @@ def _save(args: argparse.Namespace, found: Calibrated, about: str) -> None:
         lasting = replace(instrument.calibration, valid_days=args.valid_days)
         instrument = replace(instrument, calibration=lasting)
     save_instrument(args.output, instrument, about, camera_found=args.camera is not None)
-    if args.json:
-        console.print_json(_json_of_site(found, args.output))
-    else:
-        print(about, end="")
+    console.tell(args, _json_of_site(found, args.output), about.rstrip())
 
 
 def _site(args: argparse.Namespace) -> Place:
@@ -231,7 +228,13 @@ def run(args: argparse.Namespace) -> int:
     if args.pointings is not None and args.camera is not None:
         raise InstrumentError("--pointings hold no stars: give frames for --camera")
     check_site(args)
-    overwriting.check(args, *_written(args))
+    overwriting.check(
+        args,
+        camera=overwriting.camera,
+        map=overwriting.picture,
+        platepar=overwriting.never,
+        output=instrument_file.check_replaceable,
+    )
     if args.map is not None and find_spec("matplotlib") is None:
         raise InstrumentError("--map draws with matplotlib, which is not here: pip install matplotlib")
     if args.pointings is not None:
@@ -280,10 +283,7 @@ def _watch(args: argparse.Namespace) -> int:
     if args.frames:
         raise FrameError("--watch names the folder of the nights: leave out the frames")
     args.frames = _frames_below(Path(args.watch))
-    if args.page is not None:
-        overwriting.check(args, Written("--page", args.page, places_file.check_ours))
-    if args.horizon is not None:
-        overwriting.check(args, Written("--horizon", args.horizon, overwriting.never))
+    overwriting.check(args, page=places_file.check_ours, horizon=overwriting.never)
     site = _site(args)
     answers, stars = [], []
     for item, sight, camera in inputs.seen_at(args, site):
@@ -294,10 +294,7 @@ def _watch(args: argparse.Namespace) -> int:
     nights = kept(night_poses(answers, site.longitude))
     for night in nights:
         values = watch_output.values_of(night)
-        if args.json:
-            console.print_json(values)
-        else:
-            print(watch_output.line_of(values))
+        console.tell(args, values, watch_output.line_of(values))
         if night.alarm:
             console.complain(watch_output.alarm_of(night))
     if args.page is not None:
@@ -366,18 +363,6 @@ def _from_pointings(args: argparse.Namespace) -> int:
     return 0
 
 
-def _written(args: argparse.Namespace) -> Iterator[Written]:
-    """The files that the options name to be written."""
-    if args.camera is not None:
-        yield Written("--camera", args.camera, overwriting.camera)
-    if args.map is not None:
-        yield Written("--map", args.map, overwriting.picture)
-    if args.platepar is not None:
-        yield Written("--platepar", args.platepar, overwriting.never)
-    if args.output is not None:
-        yield Written("--output", args.output, instrument_file.check_replaceable)
-
-
 def _sights(paths: Sequence[str], read: Reader, given: Instruments) -> tuple[list[Sight], bool]:
     """The frames that can be read, identified by every way there is, and whether some cannot be read."""
     progress, unreadable, work = console.ProgressBar(), False, Solving(given)
@@ -426,10 +411,7 @@ def _camera(
         _draw(args.map, found)
     if args.platepar is not None:
         _write_platepar(args.platepar, found, frames, site, air)
-    if args.json:
-        console.print_json(_json_of(found, args.camera))
-    else:
-        print(about, end="")
+    console.tell(args, _json_of(found, args.camera), about.rstrip())
     return whole
 
 

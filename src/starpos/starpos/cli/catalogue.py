@@ -44,7 +44,7 @@ def run_build(args: argparse.Namespace) -> int:
     """Put the places of a Gaia extract into the catalogue in use; raises CatalogueError."""
     from starpos.sky import gaia
 
-    overwriting.check(args, overwriting.Written("--out", args.out, overwriting.stars))
+    overwriting.check(args, out=overwriting.stars)
     year = float(time.gmtime().tm_year) if args.year is None else args.year
     made, number = gaia.with_gaia(catalogue.load_catalogue(), gaia.read(Path(args.gaia)), year)
     try:

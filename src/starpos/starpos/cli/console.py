@@ -25,6 +25,14 @@ def print_json(value: dict) -> None:
     print(json.dumps(plain(value)), flush=True)
 
 
+def tell(args: argparse.Namespace, value: dict, line: str) -> None:
+    """Print an answer: as an object where --json asks for it, else the same for people."""
+    if args.json:
+        print_json(value)
+    else:
+        print(line, flush=True)
+
+
 def plain(value: Any) -> Any:
     """The value of types that json knows, without NaN and infinity."""
     if isinstance(value, dict):

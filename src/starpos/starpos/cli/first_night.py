@@ -33,7 +33,7 @@ AGAIN = "the same command goes on where it was"
 
 
 def run(args: argparse.Namespace) -> int:
-    overwriting.check(args, overwriting.Written("--save", args.save, instrument_file.check_replaceable))
+    overwriting.check(args, save=instrument_file.check_replaceable)
     folder = Path(args.folder)
     if not folder.is_dir():
         raise FrameError(

@@ -31,7 +31,7 @@ from starpos.night.work import Solving
 from starpos.parallel.processes import Here, Workers, memory_bytes, processors, workers
 from starpos.progress import quiet
 from starpos.recording.drivers import Drivers
-from starpos.recording.topics import Remaps
+from starpos.recording.topics import remaps_of
 from starpos.sky import catalogue
 
 if TYPE_CHECKING:
@@ -126,7 +126,7 @@ def identifying(
 
 
 def checked_tilts(path: str, instrument: Instrument) -> TiltFile:
-    """The table of tilts, with a complaint where it looks like radians; raises TiltError as `read_tilt_csv` does."""
+    """The table of tilts, with a complaint where its steps are coarse; raises TiltError, also for radians."""
     file = TiltFile(path, instrument.inclinometer.noise_rad)
     console.complain(*of_tilts(file.log, path, instrument.inclinometer))
     return file
@@ -225,7 +225,7 @@ def read_bag(path: Path, args: argparse.Namespace) -> "tuple[Recorded, Instrumen
     from starpos.night import bag
 
     any_camera = options.instrument_of(args, no_stars(100, 100, focal_px=1000.0))
-    drivers = Drivers.of(args.params_file, args.param, args.namespace, Remaps.of(args.remap))
+    drivers = Drivers.of(args.params_file, args.param, args.namespace, remaps_of(args.remap))
     found = bag.read(path, args.namespace, any_camera.inclinometer.noise_rad, drivers, console.ProgressBar())
     told = (args.instrument, args.focal_mm) != (None, None)
     cameras = found.cameras if args.focal_mm is None else {}

@@ -12,7 +12,6 @@ from pathlib import Path
 import numpy as np
 
 from starpos.cli import console, options, overwriting
-from starpos.cli.overwriting import Written
 from starpos.errors import FrameError
 from starpos.fix.solver import Solver
 from starpos.frames.frame import Stars
@@ -168,8 +167,7 @@ PAPER_LIMIT_MAG, PAPER_STARS = 9.0, 24.9
 
 
 def run(args: argparse.Namespace) -> int:
-    if args.keep is not None:
-        overwriting.check(args, Written("--keep", args.keep, overwriting.failed_fields))
+    overwriting.check(args, keep=overwriting.failed_fields)
     camera = options.camera_of(args)
     stars = deeper.for_field(catalogue.load_catalogue(), camera)
     conditions = _conditions(args, stars, camera)

@@ -56,16 +56,15 @@ def _axis(args: argparse.Namespace, place: Place, seen: Sequence[AttitudeAtPlace
         "rest_arcsec": (found.rest / ARCSEC).tolist(),
         "axis_in_camera": found.in_camera.tolist(),
     }
-    if args.json:
-        console.print_json(values)
-        return 0
     side = ("right", "left")[int(right < 0)], ("above", "below")[int(above < 0)]
-    print(
+    console.tell(
+        args,
+        values,
         f"the axis of {len(seen)} frames: azimuth {values['azimuth']:.5f}, altitude {values['altitude']:.5f} deg, "
         f"+- {sigma[0] * 3600:.1f} arcsec across, {sigma[1] * 3600:.1f} up; frames are off it by at most "
         f"{found.rest.max() / ARCSEC:.1f} arcsec\n"
         f"it points {abs(right) * 3600:.0f} arcsec {side[0]} of the celestial pole (facing it) and "
-        f"{abs(above) * 3600:.0f} arcsec {side[1]} it"
+        f"{abs(above) * 3600:.0f} arcsec {side[1]} it",
     )
     if len(seen) < 3:
         console.complain("two frames do not show whether it is one axis: give three")
@@ -103,23 +102,19 @@ def _shared(seen: AttitudeAtPlace) -> float:
 
 def _print_circle(args: argparse.Namespace, found: CircleOrientation, names: Sequence[str]) -> None:
     zero, sigma, rest = math.degrees(found.zero), found.sigma / ARCSEC, (found.rest / ARCSEC).tolist()
-    if args.json:
-        console.print_json(
-            {
-                "frames": len(rest),
-                "zero": zero,
-                "sigma_arcsec": sigma,
-                "sense": found.sense,
-                "rest_arcsec": rest,
-            }
-        )
-        return
-    for name, off in zip(names, rest, strict=True):
-        print(f"{name}: {off:+.1f} arcsec")
+    values = {
+        "frames": len(rest),
+        "zero": zero,
+        "sigma_arcsec": sigma,
+        "sense": found.sense,
+        "rest_arcsec": rest,
+    }
+    lines = [f"{name}: {off:+.1f} arcsec" for name, off in zip(names, rest, strict=True)]
     turns = "clockwise" if found.sense > 0 else "anticlockwise"
-    print(
+    lines.append(
         f"the circle counts {turns} from azimuth {zero:.5f} +- {sigma / 3600:.5f} deg, of {len(rest)} readings"
     )
+    console.tell(args, values, "\n".join(lines))
 
 
 def _readings(path: str) -> dict[str, float]:

@@ -6,7 +6,6 @@ import json
 import os
 import re
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 from starpos import files
@@ -25,36 +24,28 @@ HDU = re.compile(r"\[[^]]*\]$")
 MAX_LIST_BYTES = 1_000_000
 
 
-@dataclass(frozen=True)
-class Written:
-    """A file that an option names to be written.
-
-    check: raises InstrumentError, without advice, unless the existing file of that name may be replaced.
-    """
-
-    option: str
-    name: str
-    check: Callable[[Path], None]
-
-
-def check(args: argparse.Namespace, *written: Written) -> None:
-    """Raise InstrumentError unless each of these files may be written.
+def check(args: argparse.Namespace, **kinds: Callable[[Path], None]) -> None:
+    """Raise InstrumentError unless the files may be written that options name; an option that is not given names none.
 
     An existing file may be replaced if it is of the kind that the command writes. An input may not, and no two outputs
     may be one file. The file of --instrument may: it keeps everything that was not found anew.
+
+    kinds: by option, what raises InstrumentError, without advice, unless an existing file may be replaced.
     """
     read, names = set(_inputs(args)), set()
-    for output in written:
-        path, real = Path(output.name), os.path.realpath(output.name)
-        instead = f"give another {output.option}"
+    for option, check_kind in kinds.items():
+        if (name := getattr(args, option)) is None:
+            continue
+        path, real = Path(name), os.path.realpath(name)
+        instead = f"give another --{option}"
         if real in read:
-            raise InstrumentError(f"{path}: {output.option} would replace what is read: {instead}")
+            raise InstrumentError(f"{path}: --{option} would replace what is read: {instead}")
         if real in names:
             raise InstrumentError(f"{path}: two options would write it: {instead}")
         names.add(real)
         try:
             if path.exists():
-                output.check(path)
+                check_kind(path)
         except InstrumentError as e:
             raise InstrumentError(f"{e}: move it away, or {instead}") from None
         # ValueError: the name contains a NUL

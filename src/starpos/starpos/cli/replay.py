@@ -7,10 +7,10 @@ from starpos.cli import console, fix_output, inputs
 from starpos.earth.vertical import Vertical
 from starpos.errors import FrameError
 from starpos.fix.checks import BY_PARAMETERS, MODEL_BY_PARAMETERS
-from starpos.night.remarks import of_a3, of_inclinometer
-from starpos.night.together import FrameAnswer, Gathered, extrapolated
+from starpos.night.remarks import of_a3, of_extrapolation, of_inclinometer
+from starpos.night.together import FrameAnswer, Gathered
 from starpos.recording.drivers import Drivers
-from starpos.recording.topics import Remaps
+from starpos.recording.topics import remaps_of
 from starpos.session.replay import PlayedNight, Playing
 from starpos.session.settings import Settings
 from starpos.units import utc_text
@@ -21,7 +21,7 @@ def run(args: argparse.Namespace) -> int:
     output = console.Output(args, fix_output.COLUMNS, fix_output.HEAD)
     # a wrong parameter is reported once, not for each bag
     Drivers.of(args.params_file, args.param, args.namespace)
-    work = Playing(args.params_file, tuple(args.param), args.namespace, Remaps.of(args.remap))
+    work = Playing(args.params_file, tuple(args.param), args.namespace, remaps_of(args.remap))
     with inputs.workers_of(args, args.bags) as workers:
         answers = inputs.watched(workers.map((work, bag) for bag in args.bags), len(args.bags), "bag")
         return max(
@@ -54,7 +54,7 @@ def tell(
             fix_output.line_of(f"{bag} {time}", solution, turning=False),
         )
     whole, solved = night.average, gathered.solved
-    remarks = list(extrapolated(solved))
+    remarks = list(of_extrapolation(solved))
     if solved:
         remarks += of_inclinometer(night.instrument, MODEL_BY_PARAMETERS)
     if whole:

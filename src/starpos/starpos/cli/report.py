@@ -86,7 +86,7 @@ def _nights(groups: list[list[Path]], args: argparse.Namespace) -> list[Night]:
 
 def _write_places(args: argparse.Namespace) -> int:
     """Write the places of nights for maps, without a page."""
-    overwriting.check(args, overwriting.Written("-o", args.out, places_file.check_ours))
+    overwriting.check(args, out=places_file.check_ours)
     answers: list[dict] = []
     for night in _nights(_groups(args.nights), args):
         answers += [{"file": s.name} | json_of(s.place, night.vertical) for _, s in night.fixed]

@@ -72,10 +72,12 @@ def run(args: argparse.Namespace) -> int:
         return _refused(args, str(e))
     for k, trail in enumerate(trails):
         value = trail_json(trail, fix, k)
-        _put(args, value, trail_line(value))
+        console.tell(args, value, trail_line(value))
     headings = [h for name, sight in seen.frames.items() if (h := heading_json(name, sight, fix)) is not None]
     lines = [f"{h['file']}: heading {h['heading']:.4f} +- {h['sigma_heading_deg']:.4f} deg" for h in headings]
-    _put(args, {"combined": True} | fix_json(fix) | {"frames": headings}, "\n".join([*lines, fix.text]))
+    console.tell(
+        args, {"combined": True} | fix_json(fix) | {"frames": headings}, "\n".join([*lines, fix.text])
+    )
     return 0
 
 
@@ -86,13 +88,6 @@ def _refused(args: argparse.Namespace, why: str) -> int:
             {"combined": True, "latitude_geodetic": None, "longitude_geodetic": None, "status": why}
         )
     return 1
-
-
-def _put(args: argparse.Namespace, value: dict, line: str) -> None:
-    if args.json:
-        console.print_json(value)
-    else:
-        print(line)
 
 
 def _orbits(paths: Sequence[str]) -> list[Orbit]:
@@ -262,7 +257,7 @@ def plan(args: argparse.Namespace) -> int:
     most = max(hours, key=lambda h: h.at_once if lens is None else h.in_lens)
     for hour in hours:
         best = bool(orbits) and hour is most
-        _put(
+        console.tell(
             args, plan_json(hour, lens is not None) | {"best": best}, plan_line(hour, lens is not None, best)
         )
     return 0

@@ -278,14 +278,9 @@ def _of_field(args: argparse.Namespace) -> int:
 
 def _run(args: argparse.Namespace) -> int:
     options.check_frames(args)
-    if args.save is not None:
-        overwriting.check(args, overwriting.Written("--save", args.save, instrument_file.check_replaceable))
-    if args.out is not None:
-        if not places_file.is_places(args.out):
-            raise InstrumentError(
-                f"-o {args.out}: give a name that ends in {' or '.join(places_file.SUFFIXES)}"
-            )
-        overwriting.check(args, overwriting.Written("-o", args.out, places_file.check_ours))
+    if args.out is not None and not places_file.is_places(args.out):
+        raise InstrumentError(f"-o {args.out}: give a name that ends in {' or '.join(places_file.SUFFIXES)}")
+    overwriting.check(args, save=instrument_file.check_replaceable, out=places_file.check_ours)
     if args.pointings is not None:
         return run_pointings(args)
     vertical = options.vertical_of(args)

@@ -13,7 +13,7 @@ from starpos.earth.vertical import Vertical
 from starpos.fix.fix import Fix
 from starpos.fix.terms import Origin
 from starpos.gnss.receiver import gnss_place
-from starpos.gnss.states import Learned, aged, ageing, prior
+from starpos.gnss.states import Learned, aged, prior
 from starpos.instrument.inclinometer import Tilt
 from starpos.instrument.instrument import Instrument
 from starpos.units import ARCSEC
@@ -183,13 +183,10 @@ def taught(learned: Learned, frame: GnssFrame, instrument: Instrument, vertical:
     gnss, sighting = frame.gnss, frame.sighting
     assert learned.place is not None
     moved_m = float(np.linalg.norm(gnss.offset_m(*learned.place))) if frame.new_pose else 0.0
-    stddev = stddev_rad(vertical, gnss.latitude, gnss.longitude)
-    passed = ageing(
-        learned, instrument.inclinometer, sighting.tilt, sighting.utc_unix_s, moved_m, stddev, frame.new_pose
-    )
-    learned = aged(learned, passed, sighting.tilt, sighting.utc_unix_s)
+    here = gnss.latitude, gnss.longitude
+    learned, _ = aged(learned, instrument, vertical, sighting, here, moved_m, frame.new_pose)
     if frame.new_pose:
-        learned = replace(learned, place=(gnss.latitude, gnss.longitude), poses=learned.poses + 1)
+        learned = replace(learned, place=here, poses=learned.poses + 1)
     # about A3 as it was taken: its turn by a few frames would mislead
     about = np.zeros(learned.layout.size)
     # one up for all frames of a pose: GNSS's noise, as large as a good inclinometer's, would seem to lean the camera

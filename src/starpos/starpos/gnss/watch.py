@@ -33,7 +33,7 @@ from starpos.gnss.filter import (
     stddev_rad,
     updated,
 )
-from starpos.gnss.states import Ageing, Learned, aged, ageing, at_temperature, prior
+from starpos.gnss.states import Ageing, Learned, aged, at_temperature, prior
 from starpos.instrument.inclinometer import Tilt
 from starpos.instrument.instrument import Instrument
 
@@ -256,16 +256,11 @@ class GnssWatch:
             way_m = float(np.linalg.norm(place.offset_m(*here)))
             if way_m > ELSEWHERE_SIGMA * math.sqrt(np.linalg.eigvalsh(place.covariance)[-1]):
                 moved_m, here = way_m, (place.latitude, place.longitude)
-        passed = ageing(
-            learned,
-            self._instrument.inclinometer,
-            tilt,
-            sighting.utc_unix_s,
-            moved_m,
-            stddev_rad(self.vertical, place.latitude, place.longitude),
-            self._new_pose,
+        at = place.latitude, place.longitude
+        learned, passed = aged(
+            learned, self._instrument, self.vertical, sighting, at, moved_m, self._new_pose
         )
-        self.learned = replace(aged(learned, passed, tilt, sighting.utc_unix_s), place=here)
+        self.learned = replace(learned, place=here)
         if len(self._onsets.since):
             self._onsets = self._onsets.aged(passed)
             # the one that may bring GNSS back has to last for all of its frames, however far they are apart

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Stars and their shutter from a StarArray, trails from a TrailArray, a camera's attitude from an Attitude."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -23,7 +24,9 @@ def message_to_stars(message: Any, source: str = "stars") -> Stars:
             f"{source}: {len(message.stars)} stars are more than {MAX_STARS}: send the brightest."
         )
     rows = [s for s in message.stars if not s.flags & DISC]
-    disc = next((_message_to_disc(s, source) for s in message.stars if s.flags & DISC), None)
+    disc = None
+    for s in reversed([s for s in message.stars if s.flags & DISC][:DISCS]):
+        disc = replace(_message_to_disc(s, source), other=disc)
     return Stars(
         x=np.array([s.x for s in rows]),
         y=np.array([s.y for s in rows]),
@@ -104,6 +107,8 @@ def message_to_trails(message: Any) -> list[FrameTrail]:
     return trails
 
 
+# Of the discs of a frame two count.
+DISCS = 2
 # of an attitude's quaternion, and the most that its covariance may say, rad2, but about the Sun seen alone
 OFF_UNIT, MAX_ATTITUDE_VARIANCE = 1e-3, 0.01
 

@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-from starpos.earth.orientation import earth_state
 from starpos.errors import StarposError
 from starpos.fix import searching
 from starpos.fix.attitude import CameraAttitude
@@ -15,8 +14,7 @@ from starpos.fix.solution import Solution, Status
 from starpos.fix.solver import Solver, focal_that_fits
 from starpos.fix.sun import sun_alone
 from starpos.frames.frame import Stars
-from starpos.identification import fisheye
-from starpos.navigation.sightings import sighted
+from starpos.navigation.sightings import sighting_of
 from starpos.session.driver import Now
 from starpos.session.gyro import Gyro
 from starpos.sky.bodies import SUN
@@ -77,22 +75,19 @@ def camera_attitude_of(
     An identification in doubt, a fisheye and a mirrored frame give no attitude.
     """
     found = answer.found
-    if found is None or answer.warnings or found.mirrored or stars.mid_unix_s is None:
-        return None
     try:
-        camera, catalogue, _ = solver.view(stars.width, stars.height, stars.origin_px)
-        if fisheye.is_wide(camera):
-            return None
-        state = earth_state(stars.mid_unix_s)
-        seen = sighted(stars, found, (camera, catalogue), state).placeless()
+        frame = sighting_of(stars, solver, answer)
+        seen = frame.placeless()
     except StarposError:
         return None
+    assert found is not None
+    gcrs_to_itrs = frame.camera.rotation @ found.attitude
     return CameraAttitude(
-        utc_unix_s=stars.mid_unix_s,
+        utc_unix_s=frame.utc_unix_s,
         stamp_stddev_s=stars.stamp_stddev_s,
         clock_stddev_s=solver.clock_stddev_s(stars),
         frame_id=frame_id,
-        camera_to_gcrs=state.gcrs_to_itrs.T @ seen.rotation,
+        camera_to_gcrs=gcrs_to_itrs.T @ seen.rotation,
         covariance=seen.covariance_about_own,
         stars=len(found.star),
         log_odds=found.log_odds,

@@ -114,7 +114,8 @@ def test_photographs_alone_give_a_place(photographs, run):
     assert whole["budget"]["clock"][0] == pytest.approx(464 * np.cos(np.radians(47.3)), rel=0.01)
     text = "\n".join(said)
     assert "gravity in the files" in text and "11 km from the GPS place in the file, within the claim" in text
-    assert "--self-calibrate finds the error of its level" in text
+    assert "--self-calibrate finds the error of its level, for a place to about 5." in text
+    assert "km without it)" in text
 
 
 def test_turning_finds_the_error_of_the_level(sky, tmp_path, run):

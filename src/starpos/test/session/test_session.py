@@ -88,7 +88,7 @@ class Told:
 def messages():
     """(type, message, time it was recorded at) of the night."""
     with BagReader(NIGHT, typed=True) as bag:
-        chosen = instrument_in(bag, NIGHT, None, INPUTS)
+        chosen = instrument_in(bag, None, INPUTS)
         decoded = bag.decoded(chosen.connections)
         return [(c.msgtype, message, log_ns * 1e-9) for c, log_ns, message in decoded]
 
