@@ -66,7 +66,7 @@ def test_a_missing_catalogue_ends_the_node_with_one_line(graph, run, tmp_path, m
     process = run("starpos_solver", "solver", *SOLVER)
     assert process.wait() == 1
     (line,) = process.output.splitlines()
-    assert f"{none}: no catalogue there: run `starpos catalogue build" in line
+    assert f"{none}: no catalogue there: run `starpos catalogue --help`" in line
 
 
 def with_star(index=0, **values):

@@ -33,8 +33,8 @@ from starpos_testing.headings import yaw_deg
 from starpos_testing.skies.bags import Quiet, typestore
 from starpos_testing.skies.suns import disc_frame
 
-# 2024-11-03, UTC: the Sun sinks from 37 deg to 4, stands 5 deg below the horizon, and is 10 and 20 deg below it
-DAY = 1730664000.0 + 3600 * np.array([0.0, 1.0, 2.0, 2.4])
+# 2024-11-03, UTC: the Sun sinks from 37 deg to 1, stands 5 deg below the horizon, and is 10 and 20 deg below it
+DAY = 1730664000.0 + 3600 * np.array([0.0, 1.0, 2.0, 2.4, 2.64])
 DUSK = 1730664000.0 + 3600 * np.array([3.05])
 NIGHT = 1730664000.0 + 3600 * np.array([3.5, 4.0])
 LEAN_DEG, MOUNTED_ARCSEC = -30.0, 20.0
@@ -63,6 +63,18 @@ def scene_towards(azimuth_deg: float, altitude_deg: float) -> Scene:
     )
 
 
+def risen(true: np.ndarray) -> np.ndarray:
+    """The direction (3,) as it is seen; near the horizon as almanacs have it (Bennett 1982), in the air of the place."""
+    if true[2] > 0.06:
+        return scene_at().site.atmosphere.refraction().bend(true)
+    altitude = np.degrees(np.arcsin(true[2]))
+    seen = altitude
+    for _ in range(20):
+        seen = altitude + 1 / np.tan(np.radians(seen + 7.31 / (seen + 4.4))) / 60 * 950 / 1010 * 283 / 281
+    level = true[:2] / np.hypot(*true[:2]) * np.cos(np.radians(seen))
+    return np.array([*level, np.sin(np.radians(seen))])
+
+
 def photographs() -> list[tuple[SimulatedShot, object, Capture]]:
     """Each exposure's messages, in order of time."""
     made = []
@@ -70,7 +82,7 @@ def photographs() -> list[tuple[SimulatedShot, object, Capture]]:
     for k, start in enumerate((*DAY, *DUSK, *NIGHT)):
         rng = np.random.default_rng(k)
         true = place.axes @ body_at(SUN, earth_state(start + 0.25)).from_place(place.zenith)
-        sun = scene_at().site.atmosphere.refraction().bend(true)
+        sun = risen(true)
         azimuth, altitude = np.degrees([np.arctan2(sun[0], sun[1]), np.arcsin(sun[2])])
         scene = scene_towards(azimuth + 0.4, altitude - 0.3) if start in DAY else scene_towards(70.0, 40.0)
         shot, image, capture = photograph_of(scene, start, rng)

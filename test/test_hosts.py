@@ -126,15 +126,10 @@ def test_a_link_that_loses_a_fifth_of_the_packets_costs_time_but_no_fix_is_wrong
             assert abs(off_m) < 5 * solution.covariance[4] ** 0.5
 
 
-@pytest.mark.parametrize("peers", [True, False])
-def test_a_network_without_multicast_takes_static_peers(tmp_path, peers):
-    static = {"ROS_STATIC_PEERS": ";".join(hosts.Cable.ADDRESSES)} if peers else {}
-    with two_hosts(**static) as instrument:
+def test_a_network_without_multicast_takes_static_peers(tmp_path):
+    with two_hosts(ROS_STATIC_PEERS=";".join(hosts.Cable.ADDRESSES)) as instrument:
         instrument.cable.multicast = False
         start(instrument, tmp_path, SMALL, cadence_s=1.0)
-        if peers:
-            instrument.wait(lambda: len(instrument.ear.fixed) > 1)
-            return
-        # they call each other in vain
-        instrument.wait(lambda: min(instrument.cable.refused) > 20)
-        assert not instrument.ear.solutions and instrument.cable.bytes < 10_000
+        instrument.wait(lambda: len(instrument.ear.fixed) > 1)
+        # either side has called, and the cable carried no call: without the peers they would not have met
+        assert min(instrument.cable.refused) > 0

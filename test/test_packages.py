@@ -34,8 +34,8 @@ KEYS = {
 # module of ours that cannot do without is one of them
 OPTIONAL = {
     "PIL", "alpaca", "alpaca_simulators", "argcomplete", "exifread", "fastjsonschema",
-    "gi", "gphoto2", "indipyclient", "jplephem", "lz4", "pillow_heif", "rawpy", "requests", "rosbags", "selenium", "sgp4",
-    "starpos_camera.sources.alpaca_http", "starpos_testing.skies.bags", "starpos_testing.skies.robots", "urllib3",
+    "gi", "gphoto2", "jplephem", "lz4", "pillow_heif", "rawpy", "rosbags", "selenium", "sgp4",
+    "starpos_testing.skies.bags", "starpos_testing.skies.robots",
 }  # fmt: skip
 # Modules next to the tests.
 HELPERS = {path.stem for folder in PYTHON for path in folder.glob("test/**/*.py")}

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Each node ended or killed at work and started again: the others go on, and the fix is back, and right."""
+"""Each node ended or killed at work and started again: the others go on, and the fix is back, and right. Then all end."""
 
 import math
 import signal
 import time
+from itertools import cycle
 
 import pytest
 
@@ -88,3 +89,16 @@ def test_a_node_that_goes_and_comes_back(graph, instrument, record_property, nam
     record_property("fault", f"{name}: {'SIGTERM' if number == signal.SIGTERM else 'kill -9'}, started again")
     record_property("result", f"the others go on; a right fix {seconds:.1f} s later")
     print(f"{name} {number.name}: a fix again after {seconds:.2f} s")
+
+
+def test_all_at_work_end_with_status_0(graph, instrument):
+    """End each by the two SIGINTs that launch sends, or by SIGTERM: the last of this file."""
+    running, _ = instrument
+    wait_for_fix(graph, time.time())
+    emulator = next(p for p in graph.processes if p.name == "emulator")
+    ending = (*running.values(), emulator)
+    for process, signals in zip(ending, cycle(((signal.SIGINT, signal.SIGINT), (signal.SIGTERM,)))):
+        process.signal(*signals)
+    for process in ending:
+        assert process.wait() == 0, f"{process.name}: {process.output}"
+        assert "Traceback" not in process.output, process.output

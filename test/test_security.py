@@ -58,6 +58,8 @@ ALLOWED = {
     "starpos/cli/commands.py": {"yaml.load", "yaml.SafeLoader"},
     # of MOST_BYTES, without declarations
     "starpos/satellites/elements.py": {"xml"},
+    # elements of ELEMENT_MAX, within a root of ours, where XML has no declarations
+    "starpos_camera/sources/indi.py": {"xml"},
 }
 # Who reads a file whole, or a table, and what bounds it: a limit, or that it came with the package.
 READS_WHOLE = {
@@ -69,7 +71,6 @@ READS_WHOLE = {
     "starpos/instrument/sensors.py": "of the package",
     "starpos/tables.py": "most_bytes of each form",
     "starpos/frames/tables.py": "MAX_CSV_BYTES",
-    "starpos/sky/tycho2.py": "of the package",
     "starpos/parameters/table.py": "of the package",
     "starpos/cli/commands.py": "of the package",
     "starpos/cli/demo.py": "what it has written",

@@ -16,7 +16,6 @@ from sensor_msgs.msg import Image
 from starpos_camera.sources.alpaca import Alpaca
 from starpos_camera.sources.source import CaptureSettings
 from starpos_interfaces.msg import Capture
-from starpos_testing.lacking import require
 from starpos_testing.patience import WAIT_S, until
 
 LONG = CaptureSettings(6.0, None, 7.0)
@@ -45,7 +44,6 @@ def simulator(tmp_path_factory):
 
 @pytest.fixture
 def liar():
-    require("alpaca")
     liar = Liar()
     yield liar
     liar.close()
@@ -139,7 +137,6 @@ def test_a_server_killed_in_mid_exposure_and_back(tmp_path, record_property):
 
 
 def test_nobody_there_and_addresses_that_are_none():
-    require("alpaca")
     assert "no Alpaca server" in attempt(made(values("alpaca", alpaca__address=f"127.0.0.1:{free_port()}")))
     for address in ("", "127.0.0.1", "http://127.0.0.1:1", "a@b:1", "::1:1", "host:0", "host:99999"):
         assert "HOST:PORT" in Alpaca.refusal(values("alpaca", alpaca__address=address), SHORT)
@@ -271,7 +268,7 @@ def test_it_is_not_sent_on_to_another_server(liar):
         handler.end_headers()
 
     liar.answers["connected"] = elsewhere
-    assert "(TooManyRedirects)" in attempt(make(liar))
+    assert "answers 302" in attempt(make(liar))
     assert "elsewhere" not in liar.asked
 
 
@@ -288,7 +285,7 @@ def test_a_reply_without_end_is_given_up(liar):
 
 @pytest.mark.parametrize("member", ["connected", "imagearray"])
 def test_a_server_that_drips_is_given_up_in_time(liar, member, monkeypatch):
-    from starpos_camera.sources import alpaca_http
+    from starpos_camera.sources import alpaca
 
     stop = threading.Event()
 
@@ -301,7 +298,7 @@ def test_a_server_that_drips_is_given_up_in_time(liar, member, monkeypatch):
             handler.wfile.write(b" ")
             handler.wfile.flush()
 
-    monkeypatch.setattr(alpaca_http, "PICTURE_S", 1.0)
+    monkeypatch.setattr(alpaca, "PICTURE_S", 1.0)
     source = make(liar)
     liar.answers[member] = drip
     assert "in time" in attempt(source)

@@ -1,18 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Folders as Linux's Industrial I/O shows its devices, and the pipe that stands for a buffer."""
-
-import os
-import struct
+"""Folders as Linux's Industrial I/O shows its devices."""
 
 
 def plug(root, number=0, **attributes):
-    """A device's folder; attributes are files, `__` in their names a slash."""
+    """A device's folder; attributes are files."""
     device = root / f"iio:device{number}"
     device.mkdir(parents=True, exist_ok=True)
     for name, text in attributes.items():
-        path = device / name.replace("__", "/")
-        path.parent.mkdir(exist_ok=True)
-        path.write_text(f"{text}\n")
+        (device / name).write_text(f"{text}\n")
     return device
 
 
@@ -33,11 +28,7 @@ def scl3300(root, number=0, raw=(546, -273, 15760), **more):
 
 
 def adxl355(root, number=0, raw=(-13421, 26828, 254288), **more):
-    """Device as the kernel's adxl355 describes itself, with a buffer."""
-    types = {"x": (0, "be:s20/32>>12"), "y": (1, "be:s20/32>>12"), "z": (2, "be:s20/32>>12")}
-    scans = {f"scan_elements__in_accel_{axis}_index": i for axis, (i, _) in types.items()}
-    scans |= {f"scan_elements__in_accel_{axis}_type": t for axis, (_, t) in types.items()}
-    scans |= {f"scan_elements__in_accel_{axis}_en": 0 for axis in types}
+    """Device as the kernel's adxl355 describes itself."""
     values = {f"in_accel_{axis}_raw": value for axis, value in zip("xyz", raw, strict=True)}
     return plug(
         root,
@@ -48,32 +39,6 @@ def adxl355(root, number=0, raw=(-13421, 26828, 254288), **more):
         in_temp_scale=-110.497238,
         in_temp_offset=-2111.25,
         sampling_frequency=4000,
-        scan_elements__in_temp_en=0,
-        scan_elements__in_temp_index=3,
-        scan_elements__in_temp_type="be:u12/16>>0",
-        scan_elements__in_timestamp_en=0,
-        scan_elements__in_timestamp_index=4,
-        scan_elements__in_timestamp_type="le:s64/64>>0",
-        buffer__enable=0,
-        buffer__length=2,
-        trigger__current_trigger="",
-        current_timestamp_clock="realtime",
         **values,
-        **scans,
         **more,
     )
-
-
-def scan(x, y, z, temperature, stamp_ns):
-    """A scan of the ADXL355 as its kernel driver stores it: 20 bits left in 32, big-endian, padded to 8 bytes."""
-    head = b"".join(struct.pack(">i", value << 12) for value in (x, y, z)) + struct.pack(">H", temperature)
-    return head + b"\xaa" * 2 + struct.pack("<q", stamp_ns)
-
-
-def node(folder, name="iio:device0"):
-    """A pipe in the place of the character device; returns the end to write to."""
-    os.mkfifo(folder / name)
-    reader = os.open(folder / name, os.O_RDONLY | os.O_NONBLOCK)
-    writer = os.open(folder / name, os.O_WRONLY)
-    os.close(reader)
-    return writer

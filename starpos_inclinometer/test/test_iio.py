@@ -1,23 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Sensors that Linux's own drivers read: their channels and buffers, and everything such a folder may hold or lose."""
+"""Sensors that Linux's own drivers read: their channels, and everything such a folder may hold or lose."""
 
 import math
-import os
 import shutil
 import time
 
 import numpy as np
 import pytest
-from iio_tree import adxl355, node, plug, scan, scl3300
+from iio_tree import adxl355, plug, scl3300
 
 from starpos.messages.tilt import GAP, OUT_OF_RANGE, STUCK, TIME_UNKNOWN
 from starpos.parameters.table import defaults_of
 from starpos_inclinometer.clock import HostClock, Moment
 from starpos_inclinometer.sources.iio import IioLink, IioSource
 from starpos_inclinometer.sources.iio_device import (
-    Buffer,
     DeviceError,
-    ScanLayout,
     find,
     set_sampling_frequency,
 )
@@ -149,80 +146,6 @@ def test_the_sampling_frequency_is_set_or_its_choices_are_told(tmp_path):
     (device.folder / "sampling_frequency").unlink()
     with pytest.raises(DeviceError, match="has no sampling frequency"):
         set_sampling_frequency(device, 125)
-
-
-@pytest.mark.parametrize(
-    ("text", "data", "number"),
-    [
-        ("le:s12/16>>4", b"\xf0\xff", -1),
-        ("be:u16/16>>0", b"\x80\x00", 32768),
-        ("be:s20/32>>12", b"\x80\x00\x00\x00", -(1 << 19)),
-        ("le:s64/64>>0", b"\x01" + b"\0" * 7, 1),
-        ("le:s16/16", b"\xfe\xff", -2),
-    ],
-)
-def test_elements_of_a_scan(text, data, number):
-    assert ScanLayout({"in": text}).numbers(data)["in"].tolist() == [number]
-
-
-def test_the_layout_is_the_one_of_the_kernels_document():
-    """Four channels of 16, 32, 32 and 64 bits begin at 0, 4, 8 and 16; the first and last alone at 0 and 8."""
-    kinds = ["be:u16/16>>0", "be:u32/32>>0", "be:u32/32>>0", "be:u64/64>>0"]
-    types = {str(i): kind for i, kind in enumerate(kinds)}
-    scan = b"".join([b"\0\1\xff\xff", b"\0\0\0\2", b"\0\0\0\3", b"\xff" * 4, b"\0" * 7 + b"\4"])
-    whole, two = ScanLayout(types), ScanLayout({name: types[name] for name in "03"})
-    assert (whole.dtype.itemsize, two.dtype.itemsize) == (24, 16)
-    assert [v.tolist() for v in whole.numbers(2 * scan).values()] == [[1, 1], [2, 2], [3, 3], [4, 4]]
-    assert [v.tolist() for v in two.numbers(scan[:4] + b"\xff" * 4 + scan[16:]).values()] == [[1], [4]]
-    with pytest.raises(DeviceError, match="a format that is not known"):
-        ScanLayout({"in": "le:f32/32X2>>0"})
-
-
-def test_buffered_scans_have_the_kernels_stamps_and_the_device_is_set_up_for_them(tmp_path):
-    folder, nodes = adxl355(tmp_path), tmp_path / "dev"
-    nodes.mkdir()
-    writer = node(nodes)
-    buffer = Buffer(find(tmp_path, ""), "adxl355-dev0", nodes)
-    assert (folder / "trigger/current_trigger").read_text() == "adxl355-dev0\n"
-    assert (folder / "current_timestamp_clock").read_text() == "monotonic\n"
-    assert (folder / "buffer/enable").read_text() == "1\n"
-    enabled = {p.name for p in (folder / "scan_elements").glob("*_en") if p.read_text() == "1"}
-    assert enabled == {f"in_{n}_en" for n in ("accel_x", "accel_y", "accel_z", "temp", "timestamp")}
-    data = scan(-13421, 26828, 254288, 1885, 5_000_000_123) + scan(1, -1, 0, 1886, 5_008_000_123)
-    # the second comes in two pieces
-    os.write(writer, data[:30])
-    assert buffer.read(1.0) == [((-13421, 26828, 254288, 1885), 5.000000123)]
-    os.write(writer, data[30:])
-    assert [raw for raw, _ in buffer.read(1.0)] == [(1, -1, 0, 1886)]
-    assert buffer.read(0.0) == []
-    os.close(writer)
-    with pytest.raises(OSError, match="sends no more"):
-        buffer.read(1.0)
-    buffer.close()
-    assert (folder / "buffer/enable").read_text() == "0\n"
-
-
-def test_a_buffer_that_is_not_there_is_a_sentence(tmp_path):
-    scl3300(tmp_path)
-    with pytest.raises(DeviceError, match=r"has no buffer: unset `iio\.trigger`"):
-        Buffer(find(tmp_path, ""), "any", tmp_path)
-    adxl355(tmp_path, 1)
-    with pytest.raises(DeviceError, match=r"check `iio\.trigger`"):
-        Buffer(find(tmp_path, "adxl355"), "any", tmp_path / "nowhere")
-
-
-@pytest.mark.parametrize("missing", ["dev/iio:device0", "iio:device0/scan_elements/in_temp_type"])
-def test_a_buffer_that_cannot_be_opened_is_off_again(tmp_path, missing):
-    """While the kernel fills it no program can read the device, and polling it would fail too."""
-    folder, nodes = adxl355(tmp_path), tmp_path / "dev"
-    nodes.mkdir()
-    writer = node(nodes)
-    (tmp_path / missing).unlink()
-    (folder / "buffer/enable").write_text("1\n")
-    with pytest.raises(DeviceError, match=r"check `iio\.trigger`"):
-        Buffer(find(tmp_path, ""), "adxl355-dev0", nodes)
-    assert (folder / "buffer/enable").read_text() == "0\n"
-    os.close(writer)
 
 
 @pytest.mark.parametrize("second", ["scl3300", "adis16209", "adxl355"])

@@ -54,7 +54,7 @@ def test_claims_hold_at_every_rate_and_noise(rate_hz, noise_deg):
     assert np.degrees(sigmas).mean() == pytest.approx(noise_deg, rel=0.12)
 
 
-@pytest.mark.parametrize(("rate_hz", "seconds"), [(1, 250), (10, 120), (50, 60)])
+@pytest.mark.parametrize(("rate_hz", "seconds"), [(1, 250), (50, 60)])
 def test_claims_hold_on_the_firmware(built, rate_hz, seconds):
     """Whose sensor has a bandwidth of 18 Hz: at 50 Hz a mean of n is not as good as one of n independent samples."""
     board = Board(built)

@@ -14,8 +14,8 @@ from starpos.files import path_of
 from starpos.instrument import instrument_file
 from starpos.instrument.instrument import Instrument
 from starpos.session.session import SolverSession
+from starpos.session.settings import Settings
 from starpos_interfaces.srv import Calibrate, SaveCalibration, SelfCalibrate
-from starpos_solver.driver import SolverSettings
 
 
 def save_instrument(path: str, calibration_url: str, instrument: Instrument) -> Path:
@@ -49,7 +49,7 @@ R = TypeVar("R", Calibrate.Response, SelfCalibrate.Response)
 class CalibrationServices:
     """Answers the services by the session's calibration."""
 
-    def __init__(self, node: Node, session: SolverSession, settings: SolverSettings) -> None:
+    def __init__(self, node: Node, session: SolverSession, settings: Settings) -> None:
         self._session, self._calibrating, self._settings = session, session.calibrating, settings
         # A service that awaits its job must not block the other callbacks.
         group = ReentrantCallbackGroup()

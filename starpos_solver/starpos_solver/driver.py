@@ -3,6 +3,7 @@
 
 import time
 from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 from rclpy.impl.rcutils_logger import RcutilsLogger
 from rclpy.node import Node
@@ -10,7 +11,7 @@ from rclpy.node import Node
 from starpos.instrument.camera import Camera
 from starpos.parameters.table import parameters_of
 from starpos.session.driver import Now
-from starpos.session.settings import Settings
+from starpos.session.settings import NodeSettings
 from starpos_common.diagnostics import Diagnosis, Level, Troubles, time_is_simulated
 from starpos_common.parameters import declare
 
@@ -82,26 +83,24 @@ def now_of(node: Node) -> Now:
     return Now.in_data(unix_s) if time_is_simulated(node) else Now(unix_s, time.monotonic())
 
 
-class SolverSettings(Settings):
-    """Settings that are declared by a node and may be set while it runs.
+def declared(
+    node: Node,
+    name: str,
+    settings: NodeSettings,
+    apply: Callable[[frozenset[str]], None],
+    camera: Callable[[], Camera | None] = lambda: None,
+) -> None:
+    """Declare the parameters of the node of that name for its settings, which may be set while it runs.
 
-    camera: returns the camera in use, None before there is one.
-    apply: called with the names that were set.
+    apply: called with the names that were set.  camera: returns the camera in use, None before there is one.
     """
 
-    def __init__(
-        self, node: Node, camera: Callable[[], Camera | None], apply: Callable[[frozenset[str]], None]
-    ) -> None:
-        super().__init__({})
-        self._apply = apply
-        self.values = declare(
-            node,
-            parameters_of("solver"),
-            apply=self._adopted,
-            check=lambda values, names: self.check(values, names, camera()),
-        )
-        self.adopt()
+    def adopted(names: frozenset[str]) -> None:
+        settings.adopt()
+        apply(names)
 
-    def _adopted(self, names: frozenset[str]) -> None:
-        self.adopt()
-        self._apply(names)
+    def check(values: Mapping[str, Any], names: frozenset[str]) -> str | None:
+        return settings.check(values, names, camera())
+
+    settings.values = declare(node, parameters_of(name), apply=adopted, check=check)
+    settings.adopt()

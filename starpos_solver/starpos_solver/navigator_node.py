@@ -11,16 +11,14 @@ from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
 from starpos.fix.attitude import Attitude
-from starpos.parameters.table import parameters_of
 from starpos.session.navigator import Navigated, NavigatorSession, NavigatorSettings
 from starpos_common.diagnostics import Diagnostics
 from starpos_common.messages import quaternion, unix_to_stamp
-from starpos_common.parameters import declare
 from starpos_common.topics import publisher, subscription
 from starpos_common.worker import JobRunner
 from starpos_interfaces import msg
 from starpos_solver import outputs
-from starpos_solver.driver import IMU_QUEUE, Inputs, NodeLog, now_of
+from starpos_solver.driver import IMU_QUEUE, Inputs, NodeLog, declared, now_of
 from starpos_solver.publishing import MOVING, MOVING_QOS, Transforms, transform_of
 
 
@@ -88,10 +86,7 @@ class NavigatorNode(Node):
     def __init__(self) -> None:
         super().__init__("navigator")
         self._settings = NavigatorSettings({})
-        self._settings.values = declare(
-            self, parameters_of("navigator"), apply=self._adopted, check=self._settings.check
-        )
-        self._settings.adopt()
+        declared(self, "navigator", self._settings, self._apply)
         self._inputs = Inputs(self, ("imu/data", "attitude"))
         self._session = NavigatorSession(
             self._settings, lambda: JobRunner(self), self._inputs, NodeLog(self.get_logger())
@@ -119,8 +114,7 @@ class NavigatorNode(Node):
             self._settings.values["frame_id"],
         )
 
-    def _adopted(self, names: frozenset[str]) -> None:
-        self._settings.adopt()
+    def _apply(self, names: frozenset[str]) -> None:
         self._diagnostics.hardware_id = self._settings.values["frame_id"]
         self._outputs.parameters_set()
         self._session.parameters_set()

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The node `solver`: takes stars and tilts, publishes `fix`, `heading/imu` and `solver/solution`."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
@@ -21,13 +21,14 @@ from starpos.session.frames import Output
 from starpos.session.gnss import GNSS_TOPIC, ComparedPlaces
 from starpos.session.gyro import IMU_TOPIC
 from starpos.session.session import CAMERA_TOPIC, SolverSession
+from starpos.session.settings import Settings
 from starpos_common.diagnostics import Diagnosis, Diagnostics, Level, time_is_simulated
 from starpos_common.topics import Dropped, Take, other_publishers, subscription, subscription_from_any
 from starpos_common.worker import JobRunner
 from starpos_interfaces import msg
 from starpos_interfaces.srv import Solve
 from starpos_solver.calibration_services import CalibrationServices
-from starpos_solver.driver import IMU_QUEUE, Inputs, NodeLog, SolverSettings, now_of
+from starpos_solver.driver import IMU_QUEUE, Inputs, NodeLog, declared, now_of
 from starpos_solver.publishing import SolutionPublishers, StaticTransforms
 
 POLL_S = 0.02
@@ -43,7 +44,8 @@ class SolverNode(Node):
 
     def __init__(self) -> None:
         super().__init__("solver")
-        self._settings = SolverSettings(self, self._camera, self._apply)
+        self._settings = Settings({})
+        declared(self, "solver", self._settings, self._apply, self._camera)
         self._values = self._settings.values
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         gyro = (IMU_TOPIC,) * self._values["gyro"]
@@ -73,28 +75,24 @@ class SolverNode(Node):
         self._outputs = SolutionPublishers(self, self._settings)
         self._transforms = StaticTransforms(self)
         session = self._session
-        takes: dict[str, Take] = {
-            CAMERA_TOPIC: lambda m, _: self._publish(session.receive_camera(m, now_of(self))),
-            "tilt": lambda m, info: self._publish(session.receive_tilt(m, _sent(info), now_of(self))),
-            "stars": lambda m, info: self._publish(session.receive_stars(m, now_of(self), _sent(info))),
-        }
-        if session.gnss is not None:
-            takes[GNSS_TOPIC] = lambda m, _: self._publish(session.receive_gnss(m, now_of(self)))
+        take = self._taker(CAMERA_TOPIC, lambda m, _: session.receive_camera(m, now_of(self)))
+        subscription_from_any(self, CameraInfo, CAMERA_TOPIC, take, 10)
+        take = self._taker("tilt", lambda m, info: session.receive_tilt(m, _sent(info), now_of(self)))
+        self._tilts = subscription(self, msg.Tilt, "tilt", take, TILT_QUEUE)
+        take = self._taker("stars", lambda m, info: session.receive_stars(m, now_of(self), _sent(info)))
+        self._stars = subscription(self, msg.StarArray, "stars", take, STARS_QUEUE)
         if session.satellites is not None:
-            takes["trails"] = lambda m, _: self._publish(session.receive_trails(m, now_of(self)))
-        subscription_from_any(self, CameraInfo, CAMERA_TOPIC, self._taker(CAMERA_TOPIC, takes), 10)
-        self._tilts = subscription(self, msg.Tilt, "tilt", self._taker("tilt", takes), TILT_QUEUE)
-        self._stars = subscription(self, msg.StarArray, "stars", self._taker("stars", takes), STARS_QUEUE)
-        if session.satellites is not None:
-            subscription(self, msg.TrailArray, "trails", self._taker("trails", takes), 10)
+            take = self._taker("trails", lambda m, _: session.receive_trails(m, now_of(self)))
+            subscription(self, msg.TrailArray, "trails", take, 10)
         self._again = self.create_guard_condition(self._go_on)
         if self._values["gyro"]:
             best_effort = ReliabilityPolicy.BEST_EFFORT
             subscription(self, Imu, IMU_TOPIC, self._on_imu, IMU_QUEUE, best_effort)
         self._gnss = ComparedPlaces()
-        take = self._compare_gnss if session.gnss is None else self._taker(GNSS_TOPIC, takes)
+        taught = self._taker(GNSS_TOPIC, lambda m, _: session.receive_gnss(m, now_of(self)))
+        hear = self._compare_gnss if session.gnss is None else taught
         # receivers' drivers publish in either way
-        subscription(self, NavSatFix, GNSS_TOPIC, take, 10, ReliabilityPolicy.BEST_EFFORT)
+        subscription(self, NavSatFix, GNSS_TOPIC, hear, 10, ReliabilityPolicy.BEST_EFFORT)
         self.create_service(Solve, "~/solve", self._on_solve)
         self.create_service(Trigger, "~/reset", self._on_reset)
         self.create_service(Trigger, "~/deflection", self._on_deflection)
@@ -134,10 +132,12 @@ class SolverNode(Node):
 
     # inputs ----------------------------------------------------------------------------------------------------------
 
-    def _taker(self, name: str, takes: Mapping[str, Take]) -> Take:
+    def _taker(self, name: str, receive: Callable[[Any, Mapping[str, Any]], list[Output]]) -> Take:
+        """What takes the messages of a topic: the session receives them, and its outputs are published."""
+
         def take(message: Any, info: Mapping[str, Any]) -> None:
             self._note_dropped(name, info)
-            takes[name](message, info)
+            self._publish(receive(message, info))
 
         return take
 
@@ -231,7 +231,10 @@ class SolverNode(Node):
             )
             return Diagnosis(Level.WARN, session.instrument.trouble or waiting, session.pace.counts)
         remarks = session.pace.complaint, self._gnss.remark(session.answer, self._settings.vertical)
-        return reports.of_solution(session.answer, session.pace.counts, "; ".join(filter(None, remarks)))
+        known = {} if (site := self._settings.site) is None else reports.of_site(site)
+        return reports.of_solution(
+            session.answer, session.pace.counts | known, "; ".join(filter(None, remarks))
+        )
 
     def _report_outputs(self) -> Diagnosis:
         if others := other_publishers(self, self._outputs.shared):

@@ -18,11 +18,11 @@ from std_msgs.msg import Header
 from starpos.earth.vertical import Geodetic
 from starpos.instrument.instrument import Instrument
 from starpos.session.frames import Answered, Averaged, BySatellites, Output
+from starpos.session.settings import Settings
 from starpos_common.messages import attitude_to_message, quaternion
 from starpos_common.topics import publisher
 from starpos_interfaces import msg
 from starpos_solver import outputs
-from starpos_solver.driver import SolverSettings
 
 STATIC, MOVING = "/tf_static", "/tf"
 # as tf2_ros has them
@@ -134,7 +134,7 @@ def _can_be_told(node: Node, topic: str) -> bool:
 class SolutionPublishers:
     """Publishes solutions with the present parameters of the node."""
 
-    def __init__(self, node: Node, settings: SolverSettings) -> None:
+    def __init__(self, node: Node, settings: Settings) -> None:
         self._settings, self._values = settings, settings.values
         self._fix = publisher(node, NavSatFix, "fix", 10)
         self._fix_averaged = publisher(node, NavSatFix, "fix_averaged", 10)

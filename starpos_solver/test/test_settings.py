@@ -10,7 +10,8 @@ from rclpy.parameter import Parameter
 from starpos.instrument import instrument_file, sensors
 from starpos.instrument.camera import Camera
 from starpos.instrument.instrument import Instrument
-from starpos_solver.driver import SolverSettings
+from starpos.session.settings import Settings
+from starpos_solver.driver import declared
 from starpos_testing.nodes import take_domain
 
 CAMERA = Camera.from_focal(1000, 800, 2000.0)
@@ -26,7 +27,9 @@ def make():
         overrides = [Parameter(name, value=value) for name, value in given.items()]
         nodes.append(rclpy.create_node("settings", context=context, parameter_overrides=overrides))
         applied = []
-        return nodes[-1], SolverSettings(nodes[-1], lambda: CAMERA, applied.append), applied
+        settings = Settings({})
+        declared(nodes[-1], "solver", settings, applied.append, lambda: CAMERA)
+        return nodes[-1], settings, applied
 
     yield make
     for node in nodes:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Stars without a motion in Tycho-2: how fast they are by Hipparcos, and the fast ones for starpos.sky.tycho2.
+"""Stars without a motion in Tycho-2: how fast they are by Hipparcos, and the fast ones for tycho2.py.
 
     python tools/data/fast_stars.py tycho2_2.orig.tar.xz stars.dat
 
@@ -13,10 +13,9 @@ from pathlib import Path
 
 import numpy as np
 from scipy.spatial import cKDTree
+from tycho2 import MIN_MAS_YEAR, johnson_v, originals, table_of
 
 from starpos.rotation import unit_vector
-from starpos.sky import tycho2
-from starpos.sky.tycho2 import MIN_MAS_YEAR
 from starpos.units import ARCSEC
 
 # hhmmss.ss, +-ddmmss.s at J2000, motions in mas/yr
@@ -43,9 +42,9 @@ def hipparcos(path: Path) -> tuple[np.ndarray, np.ndarray]:
 def unmeasured(path: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Identifiers (N, 3), V (N,) and directions (N, 3) of Tycho-2's stars without a motion."""
     parts = []
-    for name, text in tycho2.originals(path):
-        t = tycho2.table_of(name, text)
-        v = tycho2.johnson_v(t["bt"], t["vt"])
+    for name, text in originals(path):
+        t = table_of(name, text)
+        v = johnson_v(t["bt"], t["vt"])
         keep = ~np.isfinite(t["pm_ra"]) & (v < BRIGHTER)
         tyc = np.stack([t["tyc1"], t["tyc2"], t["tyc3"]], -1)
         parts.append((tyc[keep].astype(int), v[keep], unit_vector(*np.radians([t["ra"], t["dec"]]))[keep]))

@@ -12,9 +12,9 @@ from pathlib import Path
 
 import numpy as np
 from scipy.spatial import cKDTree
+from tycho2 import johnson_v
 
 from starpos.sky import catalogue
-from starpos.sky.tycho2 import johnson_v
 
 LIMIT_MAG = 7.0
 

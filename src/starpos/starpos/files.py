@@ -13,9 +13,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import BinaryIO
 from urllib.parse import unquote, urlsplit
-from urllib.request import url2pathname
 
-from starpos.errors import InstrumentError
+from starpos.errors import InstrumentError, StarposError, WriteError
 
 # Linux opens no longer path.
 LONGEST_PATH = 4096
@@ -120,6 +119,18 @@ def write_whole(path: Path | str, content: bytes) -> None:
             os.close(folder)
 
 
+def save(
+    path: Path | str, content: bytes, what: str = "the file", error: type[StarposError] = WriteError
+) -> None:
+    """Write a file as `write_whole` does; an error of one sentence, with the reason, if that is impossible."""
+    try:
+        write_whole(path, content)
+    # ValueError: the name contains a NUL
+    except (OSError, ValueError) as e:
+        reason = getattr(e, "strerror", None) or e
+        raise error(f"{path}: {what} cannot be written there ({reason})") from None
+
+
 def has_mark(path: Path | str) -> bool:
     """Whether a file is a page or a picture that starpos has made.  Raises OSError as `open_regular` does."""
     with open_regular(path) as file:
@@ -141,6 +152,9 @@ def path_of(url: str) -> Path:
         if len(parts.scheme) < 2:
             return Path(url).expanduser()
         if parts.scheme == "file" and parts.netloc in ("", "localhost") and parts.path:
+            # brings HTTP and TLS along, for which no command should wait that names a file by its path
+            from urllib.request import url2pathname
+
             return Path(url2pathname(parts.path))
         if parts.scheme == "package" and parts.netloc and parts.path:
             return _share_of(parts.netloc) / unquote(parts.path).lstrip("/")

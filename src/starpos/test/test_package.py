@@ -2,7 +2,12 @@
 """What the package says of itself, and the licences that go with it."""
 
 import re
+import subprocess
+import sys
+import tarfile
 from pathlib import Path
+
+import pytest
 
 PACKAGE = Path(__file__).resolve().parents[1]
 REPOSITORY = PACKAGE.parents[1]
@@ -31,6 +36,29 @@ def test_a_wheel_is_tested_by_what_is_there():
     places = {"project": REPOSITORY, "package": PACKAGE}
     named = [places[place] / path for place, path in re.findall(r"\{(project|package)\}/([\w/.]+)", text)]
     assert len(named) > 1 and [path for path in named if not path.exists()] == []
+
+
+def shipped() -> set[str]:
+    """What the package consists of, tables and sources of compiled modules too: `starpos/...`."""
+    made = {".c", ".pyc", ".so"}
+    files = {path.relative_to(PACKAGE).as_posix() for path in PACKAGE.glob("starpos/**/*") if path.is_file()}
+    return {path for path in files if Path(path).suffix not in made or path == "starpos/_numeric/_views.c"}
+
+
+@pytest.mark.parametrize("command", ["sdist", "build_py"])
+def test_a_package_holds_all_that_ships(command, tmp_path):
+    """The source package all, a wheel all but what its compiled modules are made of."""
+    pytest.importorskip("Cython", reason="setup.py asks Cython for its version")
+    options = {"sdist": ("--formats", "tar", "--dist-dir"), "build_py": ("--build-lib",)}[command]
+    setup = [sys.executable, "-W", "ignore", "setup.py", "-q", "egg_info", "--egg-base", str(tmp_path)]
+    subprocess.run([*setup, command, *options, str(tmp_path)], cwd=PACKAGE, check=True, capture_output=True)
+    if command == "sdist":
+        with tarfile.open(*tmp_path.glob("*.tar")) as packed:
+            held, wanted = {name.partition("/")[2] for name in packed.getnames()}, shipped()
+    else:
+        held = {path.relative_to(tmp_path).as_posix() for path in tmp_path.glob("starpos/**/*")}
+        wanted = {path for path in shipped() if Path(path).suffix not in {".c", ".h", ".pxd", ".pyx"}}
+    assert len(wanted) > 200 and wanted - held == set()
 
 
 def test_who_made_the_data_is_said():

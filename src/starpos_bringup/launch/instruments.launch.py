@@ -13,22 +13,15 @@ from dataclasses import replace
 from launch.actions import GroupAction
 from launch_ros.actions import PushRosNamespace
 
+from starpos_bringup import launching
 from starpos_bringup.launch_arguments import names
-from starpos_bringup.launching import (
-    COMMON_ARGUMENTS,
-    LIVE_ARGUMENTS,
-    Common,
-    clock_of,
-    described,
-    instrument,
-)
 
 ARGUMENTS = (
     ("instruments", None, "names of the instruments, separated by commas: left,right"),
-    *COMMON_ARGUMENTS,
+    *launching.COMMON_ARGUMENTS,
     ("params_file", None, "parameters of all nodes of all instruments"),
     ("namespace", "", "of all of them: /NAMESPACE/left/fix and so on"),
-    *LIVE_ARGUMENTS,
+    *launching.LIVE_ARGUMENTS,
 )
 FRAMES = {
     "camera": "starpos_camera_optical_frame",
@@ -38,15 +31,19 @@ FRAMES = {
 
 
 def nodes(told):
-    common = Common.of(told)
+    common = launching.Common.of(told)
     groups = []
     for name in names(told, "instruments"):
         frames = {node: {"frame_id": f"{name.replace('/', '_')}_{frame}"} for node, frame in FRAMES.items()}
         # security's policies are of one namespace each
         own = replace(common, enclaves=f"{common.enclaves}/{name}")
-        groups.append(GroupAction([PushRosNamespace(name), *instrument(own, clock_of(told), frames)]))
+        groups.append(
+            GroupAction(
+                [PushRosNamespace(name), *launching.instrument(own, launching.clock_of(told), frames)]
+            )
+        )
     return groups
 
 
 def generate_launch_description():
-    return described(ARGUMENTS, nodes)
+    return launching.described(ARGUMENTS, nodes)

@@ -10,22 +10,15 @@ from pathlib import Path
 
 from launch.actions import Shutdown
 
+from starpos_bringup import launching
 from starpos_bringup.launch_arguments import LaunchError, is_true, number
-from starpos_bringup.launching import (
-    COMMON_ARGUMENTS,
-    DASHBOARD_ARGUMENT,
-    Common,
-    dashboard,
-    described,
-    process,
-)
 
 ARGUMENTS = (
-    *COMMON_ARGUMENTS,
+    *launching.COMMON_ARGUMENTS,
     ("bag", None, "the rosbag2: a folder, or one .mcap or .db3 file"),
     ("rate", "1", "times real time; 0: as fast as the solver answers"),
     ("detector", "false", "true: stars from the bag's images instead of the bag's stars"),
-    DASHBOARD_ARGUMENT,
+    launching.DASHBOARD_ARGUMENT,
 )
 MAX_RATE = 1e6
 SIMULATED = {"**": {"use_sim_time": True}}
@@ -43,19 +36,19 @@ def nodes(told):
     bag = Path(told["bag"]).expanduser()
     if not bag.exists():
         raise LaunchError(f"bag:={bag}: there is no such bag")
-    common = Common.of(told)
-    processes = [process("starpos_solver", "solver", common, SIMULATED)]
+    common = launching.Common.of(told)
+    processes = [launching.process("starpos_solver", "solver", common, SIMULATED)]
     inputs = "stars"
     if is_true(told, "detector"):
-        processes.append(process("starpos_camera", "detector", common, SIMULATED))
+        processes.append(launching.process("starpos_camera", "detector", common, SIMULATED))
         inputs = "images"
     player = ["--rate", f"{rate:g}", "--inputs", inputs, "--", str(bag)]
     return [
         *processes,
-        *dashboard(told, common, SIMULATED),
-        process("starpos_bringup", "replay", common, arguments=player, on_exit=over),
+        *launching.dashboard(told, common, SIMULATED),
+        launching.process("starpos_bringup", "replay", common, arguments=player, on_exit=over),
     ]
 
 
 def generate_launch_description():
-    return described(ARGUMENTS, nodes)
+    return launching.described(ARGUMENTS, nodes)

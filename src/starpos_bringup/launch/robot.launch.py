@@ -7,22 +7,13 @@
 config/existing_robot.yaml.
 """
 
-from starpos_bringup.launching import (
-    COMMON_ARGUMENTS,
-    DASHBOARD_ARGUMENT,
-    LIVE_ARGUMENTS,
-    Common,
-    clock_of,
-    dashboard,
-    described,
-    process,
-)
+from starpos_bringup import launching
 
 ARGUMENTS = (
     ("image", None, "the camera's topic, sensor_msgs/Image, or the one whose /compressed is sent"),
     ("camera_info", None, "the topic of its intrinsics"),
     ("imu", None, "the IMU's topic, sensor_msgs/Imu with accelerations"),
-    *COMMON_ARGUMENTS,
+    *launching.COMMON_ARGUMENTS,
     (
         "params_file",
         None,
@@ -33,23 +24,23 @@ ARGUMENTS = (
         "starpos",
         "of what the nodes publish: /NAMESPACE/fix, so that it is not mixed with a GNSS receiver's",
     ),
-    *LIVE_ARGUMENTS,
-    DASHBOARD_ARGUMENT,
+    *launching.LIVE_ARGUMENTS,
+    launching.DASHBOARD_ARGUMENT,
 )
 
 
 def nodes(told):
-    common, every = Common.of(told), clock_of(told)
+    common, every = launching.Common.of(told), launching.clock_of(told)
     camera_info, imu = {"camera/camera_info": told["camera_info"]}, {"imu/data": told["imu"]}
     frames = {"camera/image_raw": told["image"], **camera_info, **imu}
     source = every | {"inclinometer": {"source": "imu"}}
     return [
-        process("starpos_camera", "detector", common, every, remaps=frames),
-        process("starpos_inclinometer", "inclinometer", common, source, remaps=imu),
-        process("starpos_solver", "solver", common, every, remaps=camera_info | imu),
-        *dashboard(told, common, every),
+        launching.process("starpos_camera", "detector", common, every, remaps=frames),
+        launching.process("starpos_inclinometer", "inclinometer", common, source, remaps=imu),
+        launching.process("starpos_solver", "solver", common, every, remaps=camera_info | imu),
+        *launching.dashboard(told, common, every),
     ]
 
 
 def generate_launch_description():
-    return described(ARGUMENTS, nodes)
+    return launching.described(ARGUMENTS, nodes)

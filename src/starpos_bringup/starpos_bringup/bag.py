@@ -124,7 +124,7 @@ class Bag:
         """
         connections = self._reader.connections
         names = sorted({c.topic for c in connections})
-        if not remaps.topics and any(name.endswith("/" + needed) for name in names):
+        if not remaps and any(name.endswith("/" + needed) for name in names):
             of_tilt = () if any(name.endswith("/tilt") for name in names) else (IMU_DATA,)
             ends = tuple("/" + relative for relative in (needed, *others, *of_tilt))
             return [name for name in names if name.endswith(ends)]

@@ -10,7 +10,7 @@ import time
 from typing import TYPE_CHECKING
 
 from starpos.errors import BagError, FrameError, StarposError
-from starpos.recording.topics import RAW, Remaps
+from starpos.recording.topics import RAW, remaps_of
 from starpos_bringup.bag import Bag, Topic
 from starpos_bringup.record import parser_of
 from starpos_common.node_main import own_arguments, stop_signals
@@ -40,8 +40,8 @@ def main(arguments: list[str], stopped: list[int]) -> int:
     options = parser_of("replay").parse_args(ours)
     try:
         with Bag(options.bag) as bag:
-            remaps = Remaps.of(options.remap)
-            if remaps.topics and options.inputs != "images":
+            remaps = remaps_of(options.remap)
+            if remaps and options.inputs != "images":
                 raise FrameError("--remap names a bag's images and accelerations: give --inputs images")
             wanted = bag.inputs(*INPUTS[options.inputs], remaps) if options.inputs else options.topics
             if options.inputs:

@@ -42,7 +42,7 @@ def unix_to_stamp(unix_s: float | None) -> Time:
 
 
 def stars_to_message(stars: Stars, frame_id: str) -> msg.StarArray:
-    """Convert stars to a StarArray; what looks like the Sun comes last, as a star with the flag DISC."""
+    """Convert stars to a StarArray; what looks like the Sun, and the Moon, come last, as stars with the flag DISC."""
     covariance = stars.covariance.reshape(-1, 4)
     columns = zip(
         stars.x.tolist(),
@@ -63,7 +63,7 @@ def stars_to_message(stars: Stars, frame_id: str) -> msg.StarArray:
         stars=[
             *(msg.Star(x=x, y=y, flux=f, snr=s, covariance=c, flags=g) for x, y, f, s, c, g in columns),
             # so that the others are counted as in the frame's own list
-            *([] if stars.disc is None else [_disc_to_message(stars.disc)]),
+            *(_disc_to_message(d) for d in (stars.disc, stars.disc and stars.disc.other) if d is not None),
         ],
         **shutter_fields(stars.shutter),
     )

@@ -128,6 +128,14 @@ def test_what_looks_like_the_sun_round_trips_beside_the_stars(heard, sharp):
     assert (got.disc.x, got.disc.y, got.disc.sharp) == (120.5, 33.25, sharp)
     assert got.disc.radius_px == pytest.approx(17.0, rel=1e-6)
     assert np.array_equal(got.disc.covariance, error)
+    both = replace(stars(), disc=replace(disc, other=replace(disc, x=20.0, sharp=True)))
+    got = message_to_stars(heard(messages.stars_to_message(both, "c")))
+    assert (got.disc.x, got.disc.other.x, got.disc.other.sharp, got.disc.other.other) == (
+        120.5,
+        20.0,
+        True,
+        None,
+    )
 
 
 @pytest.mark.parametrize(("field", "value"), [("flux", -1.0), ("x", math.nan), ("covariance", [0.0] * 4)])

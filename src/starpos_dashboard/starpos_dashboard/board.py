@@ -21,6 +21,7 @@ from starpos.earth.orientation import earth_state
 from starpos.earth.place import Place
 from starpos.errors import StarposError
 from starpos.messages.stamp import stamp_to_unix
+from starpos.session.reports import SITE_LATITUDE, SITE_LONGITUDE
 from starpos.sky.bodies import SUN, body_at
 from starpos_interfaces.msg import GnssCheck, Solution, Tilt
 
@@ -229,6 +230,8 @@ class Board:
         self._lights: dict[str, tuple[float, dict[str, Any]]] = {}
         self._track: deque[tuple[int, float, float]] = deque(maxlen=track)
         self._count = 0
+        # a known place by the solver's diagnostics, deg
+        self._site: list[float] | None = None
 
     def keep_track_of(self, fixes: int) -> None:
         """Keep this number of fixes from now on."""
@@ -258,6 +261,7 @@ class Board:
     def hear_diagnostics(self, message: DiagnosticArray) -> None:
         """Keep the diagnostics of the nodes that have lights."""
         for status in message.status[:STATUSES]:
+            self._hear_site(status)
             name = seen_from(self._namespace, status.name)
             if self._nodes and _node_of(name) not in self._nodes:
                 continue
@@ -268,6 +272,16 @@ class Board:
             if len(self._lights) > LIGHTS:
                 del self._lights[next(iter(self._lights))]
             self.changed = True
+
+    def _hear_site(self, status: DiagnosticStatus) -> None:
+        """Keep the known place that a solver reports, from which the Sun is shown before any fix."""
+        told = {v.key: v.value for v in status.values[:STATUSES]}
+        try:
+            place = [number(float(told[key])) for key in (SITE_LATITUDE, SITE_LONGITUDE)]
+        except (KeyError, ValueError):
+            return
+        if None not in place and max(map(abs, place)) <= 360 and abs(place[0]) <= 90:
+            self._site = place
 
     def show_frame(self, number: int, stamp_s: float | None, trouble: str = "") -> None:
         """Note the number of a picture, or why it is missing."""
@@ -287,13 +301,12 @@ class Board:
         return frozenset(seen_from(self._namespace, n) if n[0] == "/" else n for n in nodes)
 
     def _sun(self, now_s: float) -> list[list[float]] | None:
-        """The Sun's way at the newest place, of the stars or of GNSS; None without one."""
-        for name in ("last_fix", "gnss"):
-            told = self._heard.get(name, (0.0, {}))[1]
-            if told.get("latitude") is not None:
-                # to a tenth of a degree, so that it is worked out seldom
-                place = (round(told["latitude"], 1), round(told["longitude"], 1))
-                return sun_way(*place, now_s // SUN_STEP_S * SUN_STEP_S)
+        """The Sun's way at the newest place, of the stars or of GNSS, or at a known one; None without any."""
+        places = [self._heard.get(name, (0.0, {}))[1] for name in ("last_fix", "gnss")]
+        known = [(p["latitude"], p["longitude"]) for p in places if p.get("latitude") is not None]
+        for place in (*known, *([self._site] if self._site else [])):
+            # to a tenth of a degree, so that it is worked out seldom
+            return sun_way(*(round(v, 1) for v in place), now_s // SUN_STEP_S * SUN_STEP_S)
         return None
 
     def as_json(self, now_s: float, slow_s: float) -> str:

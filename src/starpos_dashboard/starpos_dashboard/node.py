@@ -22,8 +22,6 @@ from starpos_common.diagnostics import Diagnosis, Diagnostics, Level
 from starpos_common.parameters import declare
 from starpos_common.topics import subscription
 from starpos_dashboard import board, server
-from starpos_dashboard.board import Board
-from starpos_dashboard.server import DashboardServer, listen
 from starpos_interfaces.msg import GnssCheck, Solution, Tilt
 
 ENCODINGS = ("bgr8", "mono8")
@@ -69,12 +67,12 @@ class DashboardNode(Node):
     def __init__(self) -> None:
         super().__init__("dashboard")
         self._values = declare(self, parameters_of("dashboard"), apply=self._apply)
-        self._board = Board(
+        self._board = board.Board(
             self._values["track"], names(self._values["lights"]), namespace=self.get_namespace()
         )
         address = self._values["address"]
-        self._server = DashboardServer(
-            listen(address, self._values["port"]),
+        self._server = server.DashboardServer(
+            server.listen(address, self._values["port"]),
             server.own_names() | {address.lower()} | {n.lower() for n in names(self._values["hosts"])},
             self._values["clients"],
         )

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 import said
+from diagnostic_msgs.msg import KeyValue
 from sensor_msgs.msg import NavSatFix
 
 from starpos.errors import FrameError
@@ -242,3 +243,16 @@ def test_at_a_gnss_place_the_sun_is_shown_too():
     b = Board(10, ALL)
     b.show("gnss", board.gnss(said.gnss()))
     assert len(told(b, 1748768400.0)["sun"]) == 73
+
+
+def test_at_a_site_by_parameter_the_sun_is_shown_before_any_fix():
+    b, when = Board(10, ALL), 1748768400.0
+    diagnostics = said.diagnostics(("solver: Solution", 0, "heading by the Sun"))
+    site = (("site latitude (deg)", "48.0"), ("site longitude (deg)", "11.0"))
+    diagnostics.status[0].values = [KeyValue(key=key, value=value) for key, value in site]
+    b.hear_diagnostics(diagnostics)
+    assert told(b, when)["sun"][36] == pytest.approx([122.26, 52.83], abs=0.1)
+    diagnostics.status[0].values[0].value = "nan"
+    b.hear_diagnostics(diagnostics)
+    b.hear_fix(said.fix(-30.0, 11.0, (4.0, 0.0, 4.0)))
+    assert told(b, when)["sun"][36][1] < 50

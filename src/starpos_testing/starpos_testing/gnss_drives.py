@@ -12,7 +12,8 @@ import numpy as np
 from starpos.earth.ellipsoid import curvature_radii_m, enu_axes
 from starpos.earth.place import Place
 from starpos.fix.attitude import CAMERA, ITRS, Attitude
-from starpos.gnss.filter import LevelSight
+from starpos.fix.fix import Fix
+from starpos.fix.terms import ErrorTerm
 from starpos.gnss.receiver import gnss_place
 from starpos.instrument.inclinometer import InclinometerErrors, Tilt
 from starpos.instrument.instrument import Calibration, Instrument
@@ -30,7 +31,7 @@ STATED_M = float(np.hypot(WHITE_M, SLOW_M))
 class DriveFrame:
     """A frame of a drive: the sighting, GNSS's place, and the true one (latitude, longitude in rad)."""
 
-    sighting: LevelSight
+    sighting: Fix
     gnss: Place
     place: tuple[float, float]
 
@@ -110,14 +111,32 @@ class GnssDrive:
                     temperature_c=np.nan if self.unmeasured(stop * self.frames + k) else celsius,
                 )
                 yield DriveFrame(
-                    LevelSight(
-                        utc_unix_s=1.7e9 + t,
-                        camera=Attitude(seen, np.eye(3) * STARS_RAD**2, of=CAMERA, into=ITRS),
-                        tilt=tilt,
-                        zenith_covariance=np.eye(3) * STARS_RAD**2,
-                        latitude=latitude,
-                        longitude=longitude,
-                    ),
+                    _fix(seen, tilt, latitude, longitude),
                     gnss_place(1.7e9 + t, latitude + off[1], longitude + off[0], np.eye(2) * STATED_M**2),
                     (latitude, longitude),
                 )
+
+
+def _fix(camera_to_itrs: np.ndarray, tilt: Tilt, latitude: float, longitude: float) -> Fix:
+    """A fix of which only attitude, tilt, rough place and the stars' errors count."""
+    radii = np.diag(curvature_radii_m(latitude)) * STARS_RAD
+    return Fix(
+        utc_unix_s=tilt.utc_unix_s,
+        camera=Attitude(camera_to_itrs, np.eye(3) * STARS_RAD**2, of=CAMERA, into=ITRS),
+        tilt=tilt,
+        latitude=latitude,
+        longitude=longitude,
+        heading=0.0,
+        terms=(ErrorTerm("centroids", np.vstack([radii, np.zeros((4, 2))])),),
+        link_to_enu=np.eye(3),
+        levelling=np.zeros((6, 2)),
+        used=np.zeros(0, int),
+        residual_px=np.zeros((0, 2)),
+        residual_arcsec=0.0,
+        jitter_px=0.0,
+        focal_scale=1.0,
+        zenith_distance=0.0,
+        refraction_arcsec=0.0,
+        diurnal_aberration_arcsec=0.0,
+        ut1_minus_utc_s=0.0,
+    )

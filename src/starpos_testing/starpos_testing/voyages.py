@@ -10,6 +10,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
+from starpos.instrument.camera import Camera
 from starpos.navigation.records import ImuLog, ImuModel, VelocityLog
 from starpos.navigation.sightings import IdentifiedFrame, roughly
 
@@ -306,6 +307,6 @@ def _frame(utc_unix_s, camera_to_itrs, place, rng, on):
         xy=xy + on * rng.normal(0, STAR_SIGMA_PX, xy.shape),
         covariance_px2=np.tile(np.eye(2) * STAR_SIGMA_PX**2, (STARS, 1, 1)),
         itrs=apparent / np.linalg.norm(apparent, axis=1)[:, None],
-        focal_px=FOCAL_PX,
+        optics=Camera(width=1, height=1, fx=FOCAL_PX, fy=FOCAL_PX, cx=0.0, cy=0.0),
         camera=roughly(camera_to_itrs),
     )

@@ -15,7 +15,6 @@ from starpos_inclinometer.clock import Moment
 from starpos_inclinometer.sources.iio_device import (
     FAILED_READS,
     INCLINATION,
-    Buffer,
     DeviceError,
     IioDevice,
     find,
@@ -24,8 +23,6 @@ from starpos_inclinometer.sources.iio_device import (
 from starpos_inclinometer.sources.source import Arrival, Counts, Health, Link, LinkSource, Phase, Surroundings
 from starpos_inclinometer.sources.tilts import SensorTilts, noise_floor_rad
 
-# How soon a stop or silence is noticed.
-WAIT_S = 0.1
 PATIENCE_S = 1.0
 # If reading the channels takes longer, this process stood still in between.
 SLOW_S = 0.1
@@ -37,7 +34,7 @@ class IioLink(Link):
     def __init__(self, host: Surroundings, values: Mapping[str, Any]) -> None:
         super().__init__(host.clock, host.wake, "iio")
         self._root, self._wanted = Path(values["iio.root"]), values["iio.device"].strip()
-        self._trigger, self._sampling_hz = values["iio.trigger"].strip(), values["iio.sampling_frequency"]
+        self._sampling_hz = values["iio.sampling_frequency"]
         self.rate_hz = values["rate"]
         self._good = self._failed = 0
 
@@ -51,10 +48,7 @@ class IioLink(Link):
             if not math.isnan(self._sampling_hz):
                 device = set_sampling_frequency(device, self._sampling_hz)
             self._connections += 1
-            if self._trigger:
-                self._follow_buffer(device)
-            else:
-                self._poll(device)
+            self._poll(device)
         except DeviceError as error:
             self._enter(Phase.ABSENT, str(error))
         except OSError as error:
@@ -80,7 +74,7 @@ class IioLink(Link):
             except OSError as error:
                 if error.errno == errno.EBUSY:
                     raise DeviceError(
-                        f"another program reads the buffer of {device.folder}: end that one, or set `iio.trigger`."
+                        f"another program reads the buffer of {device.folder}: end that one."
                     ) from None
                 if error.errno not in FAILED_READS:
                     raise
@@ -89,41 +83,17 @@ class IioLink(Link):
             took_s = self._clock.monotonic_s() - before.monotonic_s
             good_s = before.monotonic_s
             middle = Moment(before.monotonic_s + took_s / 2, before.host_ns + round(took_s * 5e8))
-            self._queue_readings(device, [Arrival(raw, middle, device, dated=took_s < SLOW_S)])
-
-    def _follow_buffer(self, device: IioDevice) -> None:
-        """Read the device's buffer until the link is stopped; OSError when the device went away."""
-        buffer = Buffer(device, self._trigger)
-        try:
-            good_s = self._clock.monotonic_s()
-            while not self._stop.is_set():
-                scans = buffer.read(WAIT_S)
-                now = self._clock.read()
-                if not scans:
-                    self._fail(good_s, now, f"the buffer of {device.folder} is silent: check `iio.trigger`")
-                    if not device.folder.exists():
-                        raise OSError(errno.ENODEV, "it is gone")
-                    continue
-                good_s = now.monotonic_s
-                arrivals = [
-                    Arrival(raw, Moment(at_s, now.host_ns - round((now.monotonic_s - at_s) * 1e9)), device)
-                    for raw, at_s in scans
-                ]
-                self._queue_readings(device, arrivals)
-        finally:
-            buffer.close()
+            with self._lock:
+                self._good += 1
+            arrival = Arrival(raw, middle, device, dated=took_s < SLOW_S)
+            sentence = f"receiving from {device.model} ({device.folder.name})"
+            self._admit([arrival], [middle.monotonic_s], sentence)
 
     def _fail(self, good_s: float, now: Moment, sentence: str) -> None:
         with self._lock:
             self._failed += 1
         if now.monotonic_s - good_s > PATIENCE_S:
             self._enter(Phase.GARBLED, f"{sentence}; it is retried.")
-
-    def _queue_readings(self, device: IioDevice, arrivals: list[Arrival]) -> None:
-        with self._lock:
-            self._good += len(arrivals)
-        times_s = [arrival.moment.monotonic_s for arrival in arrivals]
-        self._admit(arrivals, times_s, f"receiving from {device.model} ({device.folder.name})")
 
 
 class IioSource(LinkSource):

@@ -1,17 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A sensor that Linux's Industrial I/O drives: its channels in sysfs, its buffer in /dev with the kernel's time stamps.
+"""A sensor that Linux's Industrial I/O drives, by its channels in sysfs.
 
-Sources: Documentation/ABI/testing/sysfs-bus-iio; the kernel's document "Industrial IIO device buffers" for the layout
-of a scan and the order of the settings.
+Source: Documentation/ABI/testing/sysfs-bus-iio.
 """
 
-import contextlib
 import errno
 import math
-import os
-import re
-import select
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -209,112 +203,3 @@ def _number(path: Path) -> float:
 def _is_called(device: IioDevice, wanted: str) -> bool:
     number = device.folder.name.removeprefix("iio:device")
     return wanted.lower() in (device.model, device.folder.name, number)
-
-
-# The kernel stamps with the clock that the host's moments have, so that a step of UTC does not matter.
-CLOCK = "monotonic"
-STAMP = "in_timestamp"
-# Scans that the kernel keeps while this process is busy: 1 s at 100 Hz.
-BUFFER_LENGTH = 128
-READ_BYTES = 65536
-_ELEMENT_TYPE = re.compile(r"(be|le):([su])(\d+)/(8|16|32|64)(?:>>(\d+))?")
-
-
-class ScanLayout:
-    """Where each element of a scan lies, each aligned to its own size, and how its bytes become a number.
-
-    types: the texts of the elements' `_type` attributes, such as le:s12/16>>4, in the order of their indices; DeviceError
-    for another form.
-    """
-
-    def __init__(self, types: Mapping[str, str]) -> None:
-        self._found: dict[str, re.Match[str]] = {}
-        for name, text in types.items():
-            if (found := _ELEMENT_TYPE.fullmatch(text.strip())) is None:
-                raise DeviceError(
-                    f"{name} is stored as {text.strip()!r}, a format that is not known: unset `iio.trigger`."
-                )
-            self._found[name] = found
-        stored = [(n, f"{'<' if m[1] == 'le' else '>'}u{int(m[4]) // 8}") for n, m in self._found.items()]
-        self.dtype = np.dtype(stored, align=True)
-
-    def numbers(self, data: bytes) -> dict[str, np.ndarray]:
-        """Decode the bytes of N whole scans: each element as N numbers."""
-        scans = np.frombuffer(data, self.dtype)
-        return {name: _numbers(scans[name].astype(np.uint64), m) for name, m in self._found.items()}
-
-
-def _numbers(stored: np.ndarray, found: re.Match[str]) -> np.ndarray:
-    bits = np.uint64(int(found[3]))
-    values = stored >> np.uint64(int(found[5] or 0)) & np.uint64((1 << int(bits)) - 1)
-    half = np.uint64(1) << bits - np.uint64(1)
-    # two's complement, extended from any number of bits to 64
-    return ((values ^ half) - half).view(np.int64) if found[2] == "s" else values
-
-
-class Buffer:
-    """The buffer of a device, paced by a trigger; closed it is switched off again.
-
-    trigger: its name, such as adxl355-dev0.
-    nodes: the folder of the character devices.
-    """
-
-    def __init__(self, device: IioDevice, trigger: str, nodes: Path = Path("/dev")) -> None:
-        self._folder = device.folder
-        self._channels = [*device.channels, *([device.temperature] if device.temperature else [])]
-        self._rest = b""
-        names = [c.name for c in self._channels] + [STAMP]
-        elements = self._folder / "scan_elements"
-        if not elements.is_dir():
-            raise DeviceError(
-                f"{self._folder} ({device.model}) has no buffer: unset `iio.trigger` to poll it."
-            )
-        try:
-            self._write("buffer/enable", "0")
-            self._write("trigger/current_trigger", trigger)
-            self._write("current_timestamp_clock", CLOCK)
-            for path in elements.glob("*_en"):
-                path.write_text("1" if path.name.removesuffix("_en") in names else "0")
-            names.sort(key=lambda name: int((elements / f"{name}_index").read_text()))
-            self._layout = ScanLayout({name: (elements / f"{name}_type").read_text() for name in names})
-            self._write("buffer/length", str(BUFFER_LENGTH))
-            self._write("buffer/enable", "1")
-            self._file = os.open(nodes / self._folder.name, os.O_RDONLY | os.O_NONBLOCK)
-        except OSError as error:
-            self._switch_off()
-            raise DeviceError(
-                f"the buffer of {self._folder} cannot be started ({error.strerror}: {error.filename}): check "
-                f"`iio.trigger` ({trigger}) and the right to write there; it is retried."
-            ) from None
-
-    def read(self, timeout_s: float) -> list[tuple[tuple[float, ...], float]]:
-        """Return the whole scans that have come, after waiting for the first one; OSError when the device went away.
-
-        A scan: raw values as `IioDevice.read_raw` gives them, and when the kernel took them (monotonic s).
-        """
-        ready, _, _ = select.select([self._file], [], [], timeout_s)
-        if not ready:
-            return []
-        data = os.read(self._file, READ_BYTES)
-        if not data:
-            raise OSError(f"{self._folder} sends no more")
-        data = self._rest + data
-        whole = len(data) - len(data) % self._layout.dtype.itemsize
-        self._rest = data[whole:]
-        numbers = self._layout.numbers(data[:whole])
-        rows = zip(*(numbers[c.name].tolist() for c in self._channels), strict=True)
-        times_s = (numbers[STAMP] * 1e-9).tolist()
-        return [(tuple(map(float, row)), time_s) for row, time_s in zip(rows, times_s, strict=True)]
-
-    def close(self) -> None:
-        os.close(self._file)
-        self._switch_off()
-
-    def _switch_off(self) -> None:
-        """End the kernel's sampling; while it goes on no program can read the device."""
-        # A device that is gone needs no end.
-        with contextlib.suppress(OSError):
-            self._write("buffer/enable", "0")
-
-    def _write(self, attribute: str, text: str) -> None:
-        (self._folder / attribute).write_text(f"{text}\n")

@@ -292,7 +292,7 @@ def _answer(part: Directions, near: tuple[float, float] | None) -> _Answer:
         left.sort(key=lambda f: -f.zenith @ there)
     elif len(left) > 1:
         first, second = (
-            f"{lat:+.4f} {lon:+.4f}" for lat, lon in map(_degrees, (left[0].zenith, left[1].zenith))
+            f"{lat:+.4f} {lon:+.4f}" for lat, lon in (np.degrees(place_of_zenith(f.zenith)) for f in left[:2])
         )
         raise FixError(
             f"the elevations leave two places, {first} and {second}: turn the camera to directions that do not lie in "
@@ -335,7 +335,7 @@ def _refined(part: Directions, weight: np.ndarray, zenith: np.ndarray) -> _Answe
 
 
 def _average(part: Directions, answer: _Answer, frames: int) -> Average:
-    latitude, longitude = np.radians(_degrees(answer.zenith))
+    latitude, longitude = place_of_zenith(answer.zenith)
     prime, meridian = curvature_radii_m(latitude)
     metres = answer.gain * np.array([[prime], [meridian]])
     every = [c for g in part.circles for c in g]
@@ -361,8 +361,8 @@ def _average(part: Directions, answer: _Answer, frames: int) -> Average:
     times = [c.utc_unix_s for c in every]
     return Average(
         utc_unix_s=float(np.mean(times)),
-        latitude=float(latitude),
-        longitude=float(longitude),
+        latitude=latitude,
+        longitude=longitude,
         heading=float("nan"),
         terms=tuple(terms),
         frames=len(every),
@@ -388,12 +388,6 @@ def excess(chi2: float, free: int) -> float:
     # the ellipse that holds a share WITHIN, over the ellipse of a known scatter
     wide = f_quantile(max(free, 2), WITHIN) / -np.log(1 - WITHIN)
     return float((chi2 / free - 1) * wide)
-
-
-def _degrees(zenith: np.ndarray) -> tuple[float, float]:
-    """Latitude, longitude in deg of a zenith (3,)."""
-    latitude = np.degrees(np.arctan2(zenith[2], np.hypot(zenith[0], zenith[1])))
-    return float(latitude), float(np.degrees(np.arctan2(zenith[1], zenith[0])))
 
 
 def _enu(zenith: np.ndarray) -> np.ndarray:

@@ -221,7 +221,11 @@ def _advanced(sights: Sequence[SextantSight], circles: Sequence[Circle], place: 
 def _star_row(sight: SextantSight, catalogue: Catalogue) -> np.ndarray:
     """Row (1,) of a star in the catalogue, by its name or its Hipparcos number."""
     name = sight.body.removeprefix("hip").strip()
-    hip = int(name) if name.isdecimal() and len(name) < 7 else _star_names().get(sight.body, 0)
+    hip = (
+        int(name)
+        if name.isdecimal() and len(name) < 7
+        else {n.lower(): hip for n, hip in star_names().items()}.get(sight.body, 0)
+    )
     rows = np.flatnonzero(catalogue.hip == hip)
     if not hip or not len(rows):
         raise FixError(
@@ -233,8 +237,8 @@ def _star_row(sight: SextantSight, catalogue: Catalogue) -> np.ndarray:
 
 
 @lru_cache(maxsize=1)
-def _star_names() -> dict[str, int]:
-    """Hipparcos numbers of the Nautical Almanac's stars and Polaris, by their names in small letters."""
+def star_names() -> dict[str, int]:
+    """Hipparcos numbers of the Nautical Almanac's stars and Polaris, by their names."""
     path = Path(__file__).parents[1] / "sky" / "data" / "navigation_stars.csv"
     rows = csv.reader(path.read_text("utf-8").splitlines()[1:])
-    return {name.lower(): int(hip) for name, hip in rows}
+    return {name: int(hip) for name, hip in rows}

@@ -142,24 +142,22 @@ def fit_camera(
             f"{count} identified stars are too few for a camera: give frames with {fewest} at least"
         )
     problem = CameraAdjustment.of(sightings, given, atmosphere, free)
-    fitted = settled_camera(problem)
-    camera = problem.camera(fitted.state.q)
+    state, covariance, keep, jitter2 = settled_camera(problem)
     to_named = problem.named_per_unit()
-    keep = fitted.keep
     held = problem.with_free("scale")
     before, _ = held.refined(
         CameraEstimate(np.zeros(len(problem.sigma)), problem.start), problem.stated + np.eye(2), keep
     )
     return Intrinsics(
-        camera=camera,
-        covariance=to_named @ fitted.covariance @ to_named.T,
+        camera=problem.camera(state.q),
+        covariance=to_named @ covariance @ to_named.T,
         prior_sigma=np.sqrt(np.square(to_named).sum(1)),
-        attitudes=fitted.state.attitudes,
+        attitudes=state.attitudes,
         xy=problem.xy[keep],
         frame=problem.frame[keep],
-        residual=problem.residual(fitted.state)[keep],
+        residual=problem.residual(state)[keep],
         before=held.residual(before)[keep],
-        scatter_px=float(np.sqrt(fitted.jitter2)),
+        scatter_px=float(np.sqrt(jitter2)),
         rejected=int((~keep).sum()),
     )
 
@@ -306,7 +304,7 @@ def calibrate_camera(
             "without a level refraction cannot be separated from a fisheye's distortion: give the place with --site, or "
             "the --tilt of its frames"
         )
-    catalogue = deeper.for_field(catalogue, given, progress)
+    catalogue = deeper.for_field(catalogue, given)
     table = triangles.cached_triangles(catalogue, fisheye.field_rad(given), progress)
     every = parameters(given)
     skies = [

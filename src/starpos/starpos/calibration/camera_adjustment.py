@@ -115,17 +115,6 @@ class CameraEstimate:
 
 
 @at_once
-@dataclass(frozen=True)
-class SettledCamera:
-    """A finished fit: covariance (U, U) of q, mask `keep` (N,) of the stars, variance beyond their errors in px2."""
-
-    state: CameraEstimate
-    covariance: np.ndarray
-    keep: np.ndarray
-    jitter2: float
-
-
-@at_once
 @dataclass(frozen=True, kw_only=True)
 class CameraAdjustment:
     """The least-squares problem: all N stars of all F frames, frame by frame.
@@ -306,8 +295,11 @@ class CameraAdjustment:
         return state, inverse
 
 
-def settled_camera(problem: CameraAdjustment) -> SettledCamera:
-    """The fit without outliers, with the stars' errors widened to their scatter; raises CalibrationError."""
+def settled_camera(problem: CameraAdjustment) -> tuple[CameraEstimate, np.ndarray, np.ndarray, float]:
+    """The fit without outliers, with the stars' errors widened to their scatter; raises CalibrationError.
+
+    Also the covariance (U, U) of q, the mask (N,) of the stars that were kept, and the variance beyond their errors, px2.
+    """
     state = CameraEstimate(np.zeros(len(problem.sigma)), problem.start)
     keep, jitter2, stable = np.ones(len(problem.xy), bool), 0.0, False
     fitted = 3 * len(problem.first) + np.count_nonzero(problem.sigma)
@@ -324,7 +316,7 @@ def settled_camera(problem: CameraAdjustment) -> SettledCamera:
         freedom = max(1 - fitted / (2 * keep.sum()), 0.05)
         jitter2, keep = judged(residual, problem.stated, keep, freedom)
         stable = np.array_equal(keep, before[0]) and abs(jitter2 - before[1]) <= 0.02 * (jitter2 + 1e-6)
-    return SettledCamera(state, covariance, keep, jitter2)
+    return state, covariance, keep, jitter2
 
 
 def _lens_sigma(given: Camera) -> np.ndarray:

@@ -33,15 +33,15 @@ class CommandParser(argparse.ArgumentParser):
         self.exit(BAD_CALL, f"{self.prog}: {message} (see {self.prog} --help)\n")
 
 
-def _one_line_each(command: str) -> Callable[..., None]:
-    """A warnings.showwarning that prints warnings like errors, each sentence once."""
+def _one_line_each(complain: Callable[[str], None]) -> Callable[..., None]:
+    """A warnings.showwarning that complains of each sentence once."""
     shown: set[str] = set()
 
     def show(message: Warning | str, *_about: object, **_more: object) -> None:
         text = " ".join(str(message).split())
         if text not in shown:
             shown.add(text)
-            print(f"starpos {command}: {text}", file=sys.stderr)
+            complain(text)
 
     return show
 
@@ -104,9 +104,16 @@ def main(argv: list[str] | None = None) -> int:
             f"starpos: the module {e.name} is not here: starpos doctor says what is missing", file=sys.stderr
         )
         return BAD_CALL
+    # it loads numpy, as the command in use does
+    console = import_module("starpos.cli.console")
+    with console.speaking(args.command):
+        return _run(args, console.complain)
+
+
+def _run(args: argparse.Namespace, complain: Callable[[object], None]) -> int:
     try:
         with warnings.catch_warnings():
-            warnings.showwarning = _one_line_each(args.command)
+            warnings.showwarning = _one_line_each(complain)
             # PYTHONWARNINGS may make errors of them
             if sys.warnoptions:
                 warnings.simplefilter("default")
@@ -119,7 +126,7 @@ def main(argv: list[str] | None = None) -> int:
         sys.stdout.flush()
         return status
     except StarposError as e:
-        print(f"starpos {args.command}: {e}", file=sys.stderr)
+        complain(e)
         return BAD_CALL
     # the reader of our output has gone, as in `starpos ... | head`
     except BrokenPipeError:
@@ -130,7 +137,7 @@ def main(argv: list[str] | None = None) -> int:
         if e.filename is not None:
             raise
         drop_output()
-        print(f"starpos {args.command}: its output cannot be written ({e.strerror})", file=sys.stderr)
+        complain(f"its output cannot be written ({e.strerror})")
         return BAD_CALL
     except KeyboardInterrupt:
         return 130

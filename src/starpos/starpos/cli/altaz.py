@@ -13,11 +13,9 @@ import numpy as np
 from starpos import rotation
 from starpos.cli import console, inputs, options, overwriting
 from starpos.cli.commands import rows_of
-from starpos.cli.console import Output
-from starpos.cli.overwriting import Written
 from starpos.earth.orientation import earth_state
 from starpos.errors import FrameError, InstrumentError
-from starpos.files import write_whole
+from starpos.files import save
 from starpos.fix.attitude import Attitude
 from starpos.fix.directions import horizontal, towards
 from starpos.fix.heading import AttitudeAtPlace
@@ -42,14 +40,13 @@ def run(args: argparse.Namespace) -> int:
     for name, values in (("X Y", args.pixels), ("--back AZ ALT", args.back)):
         if len(values) % 2:
             raise InstrumentError(f"{name}: {len(values)} numbers are no pairs: give two for each point")
-    if args.overlay is not None:
-        overwriting.check(args, Written("--overlay", args.overlay, overwriting.picture))
+    overwriting.check(args, overlay=overwriting.picture)
     ground = None if args.horizon is None else horizon.read(args.horizon)
     args.frames, pixels = [args.frame], np.reshape(args.pixels, (-1, 2))
     if args.points is not None:
         table = POINTS.read(args.points)
         pixels = np.vstack([pixels, np.stack([table.columns["x"], table.columns["y"]], -1)])
-    answers = list(inputs.seen_at_place("altaz", args))
+    answers = list(inputs.seen_at(args, options.camera_place_of(args)))
     if not answers:
         return console.NOTHING
     seen = _Seen(*answers[0])
@@ -57,7 +54,7 @@ def run(args: argparse.Namespace) -> int:
     backs = seen.pixels(back)
     for (az, alt), xy in zip(np.degrees(back).tolist(), backs.tolist(), strict=True):
         if not np.isfinite(xy).all():
-            console.complain("altaz", f"azimuth {az:g}, altitude {alt:g} deg is not on the frame")
+            console.complain(f"azimuth {az:g}, altitude {alt:g} deg is not on the frame")
     points = np.vstack([pixels, backs[np.isfinite(backs).all(1)]])
     _put(args, seen, points)
     if args.overlay is not None:
@@ -100,7 +97,7 @@ class _Seen:
 
 def _put(args: argparse.Namespace, seen: _Seen, points: np.ndarray) -> None:
     """Print the azimuth and altitude of pixels (N, 2)."""
-    output, found = Output(args, COLUMNS, HEAD), seen.at_place
+    output, found = console.Output(args, COLUMNS, HEAD), seen.at_place
     rays = seen.camera.directions(*points.T)
     sigma = np.hypot(args.stddev_px, found.jitter_px) / seen.camera.fx
     at = horizontal(seen.optics, rays, sigma)
@@ -109,7 +106,6 @@ def _put(args: argparse.Namespace, seen: _Seen, points: np.ndarray) -> None:
     errors[~seen.shown(rays)] = np.nan
     if np.isnan(errors).any():
         console.complain(
-            "altaz",
             f"{int(np.isnan(errors[:, 0]).sum())} points lie further out than any identified star, where the lens is not "
             "known: calibrate it with starpos calibrate --camera --site",
         )
@@ -214,7 +210,4 @@ def _draw(path: str, seen: _Seen, points: np.ndarray, ground: np.ndarray | None)
     # after the header: who made it, so that the next call may replace it
     chunk = b"tEXtSoftware\0starpos"
     made_by = struct.pack(">I", len(chunk) - 4) + chunk + struct.pack(">I", zlib.crc32(chunk))
-    try:
-        write_whole(path, png[:PNG_HEADER] + made_by + png[PNG_HEADER:])
-    except OSError as e:
-        raise InstrumentError(f"{path}: the picture cannot be written there ({e.strerror})") from None
+    save(path, png[:PNG_HEADER] + made_by + png[PNG_HEADER:], "the picture")

@@ -3,7 +3,7 @@
 
 import argparse
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 from importlib.util import find_spec
@@ -18,11 +18,11 @@ from starpos.calibration.misalignment import NOTHING_KNOWN, Calibrated, Known, c
 from starpos.cli import console, inputs, options, overwriting, places_file, watch_output
 from starpos.cli.inputs import checked_tilts, frames_among, given_or_sought, reader_of, stated_site
 from starpos.cli.options import vertical_of
-from starpos.cli.overwriting import CAMERA_NAME, Written, save_instrument
+from starpos.cli.overwriting import CAMERA_NAME, save_instrument
 from starpos.earth.place import Place
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import CalibrationError, FixError, FrameError, InstrumentError, PlaceError, StarposError
-from starpos.files import write_whole
+from starpos.files import save
 from starpos.fix.checks import FIND_TURN, at_another_lean, may_turn
 from starpos.fix.searching import Sight, of_one_camera
 from starpos.fix.solver import Solver
@@ -107,13 +107,11 @@ def run_site(
         )
     else:
         found = calibrate_at(solver, frames, tilts, site, options.turn_of(args), bar, known)
-        for remark in of_inclinometer(instrument):
-            console.complain("calibrate", remark)
+        console.complain(*of_inclinometer(instrument))
     for solution in found.solutions:
         if solution.fix is None:
-            console.complain("calibrate", f"left out: {solution.message}")
-    if found.beyond:
-        console.complain("calibrate", found.beyond)
+            console.complain(f"left out: {solution.message}")
+    console.complain(found.beyond)
     about = _about_site(found, site)
     if args.misalignment is not None:
         about += _against(instrument.calibration, found.instrument.calibration)
@@ -127,11 +125,10 @@ def run_elevations(
     solver = Solver(instrument, catalogue.load_catalogue(), options.atmosphere_of(args))
     for row in circles_of(solver, pointings, tilts):
         if isinstance(row, StarposError):
-            console.complain("calibrate", f"left out: {row}")
+            console.complain(f"left out: {row}")
     site = _site(args)
     found = axis_of(solver, pointings, tilts, site=site)
-    for remark in (*of_left_out(found.left_out), *of_inclinometer(instrument)):
-        console.complain("calibrate", remark)
+    console.complain(*of_left_out(found.left_out), *of_inclinometer(instrument))
     scatter = np.sqrt(1 + found.scatter2)
     if scatter > SCATTERED and found.stddev_arcsec > WORTH_SAVING_ARCSEC:
         raise FixError(
@@ -155,11 +152,8 @@ def _save(args: argparse.Namespace, found: Calibrated, about: str) -> None:
     if args.valid_days is not None:
         lasting = replace(instrument.calibration, valid_days=args.valid_days)
         instrument = replace(instrument, calibration=lasting)
-    save_instrument("calibrate", args.output, instrument, about, camera_found=args.camera is not None)
-    if args.json:
-        console.print_json(_json_of_site(found, args.output))
-    else:
-        print(about, end="")
+    save_instrument(args.output, instrument, about, camera_found=args.camera is not None)
+    console.tell(args, _json_of_site(found, args.output), about.rstrip())
 
 
 def _site(args: argparse.Namespace) -> Place:
@@ -234,7 +228,13 @@ def run(args: argparse.Namespace) -> int:
     if args.pointings is not None and args.camera is not None:
         raise InstrumentError("--pointings hold no stars: give frames for --camera")
     check_site(args)
-    overwriting.check(args, *_written(args))
+    overwriting.check(
+        args,
+        camera=overwriting.camera,
+        map=overwriting.picture,
+        platepar=overwriting.never,
+        output=instrument_file.check_replaceable,
+    )
     if args.map is not None and find_spec("matplotlib") is None:
         raise InstrumentError("--map draws with matplotlib, which is not here: pip install matplotlib")
     if args.pointings is not None:
@@ -262,9 +262,7 @@ def run(args: argparse.Namespace) -> int:
         if args.camera is not None:
             camera = _camera(args, frames, instrument, tilts)
             if args.site is None:
-                console.complain(
-                    "calibrate", "an A3 belongs to the camera it was found with: find it again with this one"
-                )
+                console.complain("an A3 belongs to the camera it was found with: find it again with this one")
             frames = [
                 (s, k and k.but(focal_scale=k.focal_scale * instrument.focal_px / camera.fx))
                 for s, k in frames
@@ -273,10 +271,9 @@ def run(args: argparse.Namespace) -> int:
         if args.output is not None:
             run_site(args, [s for s, _ in frames], instrument, tilts, _known(frames))
     except (CalibrationError, FixError, PlaceError) as e:
-        console.complain("calibrate", e)
+        console.complain(e)
         if not _known(frames):
-            for remark in Solving(replace(given, instrument=instrument)).fitting(frames[0][0]):
-                console.complain("calibrate", remark)
+            console.complain(*Solving(replace(given, instrument=instrument)).fitting(frames[0][0]))
         return console.UNREADABLE if unreadable else NOTHING
     return console.UNREADABLE if unreadable else 0
 
@@ -286,13 +283,10 @@ def _watch(args: argparse.Namespace) -> int:
     if args.frames:
         raise FrameError("--watch names the folder of the nights: leave out the frames")
     args.frames = _frames_below(Path(args.watch))
-    if args.page is not None:
-        overwriting.check(args, Written("--page", args.page, places_file.check_ours))
-    if args.horizon is not None:
-        overwriting.check(args, Written("--horizon", args.horizon, overwriting.never))
+    overwriting.check(args, page=places_file.check_ours, horizon=overwriting.never)
     site = _site(args)
     answers, stars = [], []
-    for item, sight, camera in inputs.seen_at("calibrate", args, site):
+    for item, sight, camera in inputs.seen_at(args, site):
         sky = sky_mag(item, sight.stars, sight.solution, camera) if isinstance(item, Frame) else np.nan
         answers.append(Answer(solution=sight.solution, focal_px=camera.fx, sky_mag=sky))
         if args.horizon is not None:
@@ -300,19 +294,13 @@ def _watch(args: argparse.Namespace) -> int:
     nights = kept(night_poses(answers, site.longitude))
     for night in nights:
         values = watch_output.values_of(night)
-        if args.json:
-            console.print_json(values)
-        else:
-            print(watch_output.line_of(values))
+        console.tell(args, values, watch_output.line_of(values))
         if night.alarm:
-            console.complain("calibrate", watch_output.alarm_of(night))
+            console.complain(watch_output.alarm_of(night))
     if args.page is not None:
         watch_output.write_page(Path(args.page), nights)
     if stars:
-        try:
-            horizon.write(Path(args.horizon), horizon.horizon(stars))
-        except OSError as e:
-            raise InstrumentError(f"{args.horizon}: it cannot be written there ({e.strerror})") from None
+        horizon.write(Path(args.horizon), horizon.horizon(stars))
     return NOTHING if not nights or any(n.alarm for n in nights) else 0
 
 
@@ -351,7 +339,7 @@ def _tilts(args: argparse.Namespace, instrument: Instrument) -> TiltLog | None:
     """The table of --tilt, None without one."""
     if args.tilt is None:
         return None
-    return checked_tilts("calibrate", args.tilt, instrument).log
+    return checked_tilts(args.tilt, instrument).log
 
 
 def _from_pointings(args: argparse.Namespace) -> int:
@@ -360,7 +348,7 @@ def _from_pointings(args: argparse.Namespace) -> int:
     whole = [p for p in pointings if p.has_roll]
     elevations = pointings if not whole and args.tilt is not None else []
     if len(whole) < len(pointings) and not elevations:
-        console.complain("calibrate", f"{len(pointings) - len(whole)} pointings without a roll are left out")
+        console.complain(f"{len(pointings) - len(whole)} pointings without a roll are left out")
     instrument = options.instrument_of(args, NO_CAMERA)
     check_output(args, instrument)
     tilts = _tilts(args, instrument)
@@ -370,21 +358,9 @@ def _from_pointings(args: argparse.Namespace) -> int:
         else:
             run_site(args, whole, instrument, tilts)
     except FixError as e:
-        console.complain("calibrate", e)
+        console.complain(e)
         return NOTHING
     return 0
-
-
-def _written(args: argparse.Namespace) -> Iterator[Written]:
-    """The files that the options name to be written."""
-    if args.camera is not None:
-        yield Written("--camera", args.camera, overwriting.camera)
-    if args.map is not None:
-        yield Written("--map", args.map, overwriting.picture)
-    if args.platepar is not None:
-        yield Written("--platepar", args.platepar, overwriting.never)
-    if args.output is not None:
-        yield Written("--output", args.output, instrument_file.check_replaceable)
 
 
 def _sights(paths: Sequence[str], read: Reader, given: Instruments) -> tuple[list[Sight], bool]:
@@ -395,10 +371,9 @@ def _sights(paths: Sequence[str], read: Reader, given: Instruments) -> tuple[lis
         try:
             sight = work(read(path))
             sights.append(sight)
-            if sight.solution.remark:
-                console.complain("calibrate", sight.solution.remark)
+            console.complain(sight.solution.remark)
         except FrameError as e:
-            console.complain("calibrate", e)
+            console.complain(e)
             unreadable = True
         progress("frames", (k + 1) / len(paths))
     return sights, unreadable
@@ -426,7 +401,7 @@ def _camera(
     site = _site(args) if args.site is not None and tilts is None else None
     found = calibrate_camera(frames, levels, given, catalogue.load_catalogue(), air, bar, _known(seen), site)
     for k in sorted(set(range(len(frames))) - set(found.used)):
-        console.complain("calibrate", f"{frames[k].source}: no part of the sky matches it: it is left out")
+        console.complain(f"{frames[k].source}: no part of the sky matches it: it is left out")
     if tilts is None and site is None:
         _tell_what_tilts_would(found.fit, air, frames)
     about = _about(found)
@@ -436,10 +411,7 @@ def _camera(
         _draw(args.map, found)
     if args.platepar is not None:
         _write_platepar(args.platepar, found, frames, site, air)
-    if args.json:
-        console.print_json(_json_of(found, args.camera))
-    else:
-        print(about, end="")
+    console.tell(args, _json_of(found, args.camera), about.rstrip())
     return whole
 
 
@@ -464,12 +436,8 @@ def _write_platepar(
     times = [frames[k].mid_unix_s or 0.0 for k in found.used]
     seen = seen_by(camera, mean, site, air, times[len(times) // 2])
     plate, worst = platepar.platepar_of(camera, seen)
-    try:
-        write_whole(path, (json.dumps(plate, indent=4, sort_keys=True) + "\n").encode())
-    except OSError as e:
-        raise InstrumentError(f"{path}: the platepar cannot be written there ({e.strerror})") from None
+    save(path, (json.dumps(plate, indent=4, sort_keys=True) + "\n").encode(), "the platepar")
     console.complain(
-        "calibrate",
         f"{path}: RMS sees stars within {worst:.2f} px of this camera; the platepar has no photometry",
     )
 
@@ -489,7 +457,7 @@ def _levelled(
             levels.append(instrument.mounting.level(tilt).camera)
             kept.append((stars, found))
         except StarposError as e:
-            console.complain("calibrate", f"{stars.source} is left out: {e}")
+            console.complain(f"{stars.source} is left out: {e}")
     if not kept:
         raise CalibrationError("no frame has a tilt: check that --tilt is of the same night, or leave it out")
     return kept, levels
@@ -503,7 +471,6 @@ def _tell_what_tilts_would(fit: Intrinsics, air: Atmosphere, frames: Sequence[St
     )
     cost = np.hypot(cost, UNTIMED * timeless)
     console.complain(
-        "calibrate",
         f"without --tilt {what} is not known: {1e6 * cost:.0f} ppm, {cost * fit.camera.fx:.2g} px, of fx "
         f"and fy, which their sigmas include",
     )

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`starpos catalogue`: shows, builds and deepens the catalogues of stars and triangles."""
+"""`starpos catalogue`: shows the catalogues of stars and triangles, puts Gaia's places in, keeps a deeper one."""
 
 import argparse
 import sys
@@ -9,13 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from starpos.cli import console, options, overwriting
-from starpos.cli.overwriting import Written
 from starpos.errors import CatalogueError
 from starpos.instrument.camera import Camera
 from starpos.sky import catalogue, deeper
 from starpos.table_cache import cache_folder
-
-LIMIT_MAG = 11.0
 
 
 def run_info(args: argparse.Namespace) -> int:
@@ -35,7 +32,7 @@ def run_info(args: argparse.Namespace) -> int:
     if args.path is None:
         more = deeper.kept()
         print(
-            "no deeper catalogue in the cache: small fields need one (`starpos catalogue deepen --fetch`)"
+            "no deeper catalogue in the cache: small fields need one (`starpos catalogue deepen FILE`)"
             if more is None
             else f"{len(more)} stars of the deeper catalogue are in the cache, for small fields"
         )
@@ -44,41 +41,28 @@ def run_info(args: argparse.Namespace) -> int:
 
 
 def run_build(args: argparse.Namespace) -> int:
-    """Build a catalogue from the original files, or from Gaia's places; raises CatalogueError."""
-    from starpos.sky import gaia, tycho2
+    """Put the places of a Gaia extract into the catalogue in use; raises CatalogueError."""
+    from starpos.sky import gaia
 
-    if args.originals is None and args.gaia is None:
-        raise CatalogueError("catalogue build: give the original files of Tycho-2, or --gaia TABLE, or both")
-    overwriting.check(args, Written("--out", args.out, overwriting.stars))
-    extract = None if args.gaia is None else gaia.read(Path(args.gaia))
-    if args.originals is None:
-        made = catalogue.load_catalogue()
-    else:
-        limit_mag = LIMIT_MAG if args.limit_mag is None else args.limit_mag
-        made = tycho2.build(args.originals, limit_mag, console.ProgressBar())
-    said = ""
-    if extract is not None:
-        year = float(time.gmtime().tm_year) if args.year is None else args.year
-        made, number = gaia.with_gaia(made, extract, year)
-        said = f", {number} of them with Gaia's places about {year:g}"
+    overwriting.check(args, out=overwriting.stars)
+    year = float(time.gmtime().tm_year) if args.year is None else args.year
+    made, number = gaia.with_gaia(catalogue.load_catalogue(), gaia.read(Path(args.gaia)), year)
     try:
         catalogue.save(made, args.out)
     except OSError as e:
         raise CatalogueError(f"{args.out}: cannot be written ({e.strerror}): give another --out") from None
     size = Path(args.out).stat().st_size / 1e6
     print(
-        f"{args.out}: {len(made)} stars to V = {made.vmag().max():.2f}{said}, {size:.1f} MB", file=sys.stderr
+        f"{args.out}: {len(made)} stars to V = {made.vmag().max():.2f}, {number} of them with Gaia's places about "
+        f"{year:g}, {size:.1f} MB",
+        file=sys.stderr,
     )
     return 0
 
 
 def run_deepen(args: argparse.Namespace) -> int:
-    """Build the deeper catalogue from the original files, here or fetched, into the cache; raises CatalogueError."""
-    bar = console.ProgressBar()
-    if args.originals is None:
-        made = deeper.fetched(args.fetch or None, bar)
-    else:
-        made = deeper.build(args.originals, bar, anew=True)
+    """Keep a deeper catalogue in the cache; raises CatalogueError."""
+    made = deeper.keep(catalogue.read(args.path))
     print(
         f"{len(made)} stars are kept in {cache_folder()}: small fields take them from now on", file=sys.stderr
     )

@@ -7,7 +7,9 @@ import json
 import math
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from typing import Any
 
 import numpy as np
@@ -23,6 +25,14 @@ def print_json(value: dict) -> None:
     print(json.dumps(plain(value)), flush=True)
 
 
+def tell(args: argparse.Namespace, value: dict, line: str) -> None:
+    """Print an answer: as an object where --json asks for it, else the same for people."""
+    if args.json:
+        print_json(value)
+    else:
+        print(line, flush=True)
+
+
 def plain(value: Any) -> Any:
     """The value of types that json knows, without NaN and infinity."""
     if isinstance(value, dict):
@@ -36,19 +46,33 @@ def plain(value: Any) -> Any:
     return value
 
 
-def complain(command: str, error: object) -> None:
-    """Print a line on standard error, as the command's: an error, a remark or a sentence."""
-    # clears a progress bar
-    if sys.stderr.isatty():
-        print("\r\x1b[K", end="", file=sys.stderr)
-    print(f"starpos {command}: {error}", file=sys.stderr)
+# the command that complains
+_speaking: ContextVar[str] = ContextVar("speaking", default="")
+
+
+@contextmanager
+def speaking(command: str) -> Iterator[None]:
+    """Have complaints begin with the name of a command."""
+    before = _speaking.set(command)
+    try:
+        yield
+    finally:
+        _speaking.reset(before)
+
+
+def complain(*said: object) -> None:
+    """Print lines on standard error, as the command's: errors, remarks or sentences; for '' and None none."""
+    for each in filter(None, said):
+        # clears a progress bar
+        if sys.stderr.isatty():
+            print("\r\x1b[K", end="", file=sys.stderr)
+        print(f"starpos {_speaking.get()}: {each}", file=sys.stderr)
 
 
 class FrameComplaints:
     """Complains about frames: a sentence that is true of several, but for their names, is printed once."""
 
-    def __init__(self, command: str) -> None:
-        self._command = command
+    def __init__(self) -> None:
         self._frames: dict[str, list[str]] = {}
 
     def __call__(self, name: str, error: object) -> None:
@@ -57,7 +81,7 @@ class FrameComplaints:
         alike = self._frames.setdefault(reason, [])
         alike.append(name)
         if len(alike) == 1:
-            complain(self._command, error if name in str(error) else f"{name}: {error}")
+            complain(error if name in str(error) else f"{name}: {error}")
 
     def end(self) -> None:
         """Say how many more frames each sentence is true of."""
@@ -66,7 +90,7 @@ class FrameComplaints:
                 start = reason.lstrip(": ")[:60].rsplit(" ", 1)[0]
                 last = f", the last is {others[-1]}" if len(others) > 1 else ""
                 frames = "1 more frame" if len(others) == 1 else f"{len(others)} more frames"
-                complain(self._command, f"the same as of {first} ({start} ...) is true of {frames}{last}")
+                complain(f"the same as of {first} ({start} ...) is true of {frames}{last}")
         self._frames.clear()
 
 

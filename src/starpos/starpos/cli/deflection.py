@@ -9,8 +9,6 @@ from pathlib import Path
 import numpy as np
 
 from starpos.cli import console, inputs, options
-from starpos.cli.console import Output
-from starpos.cli.inputs import checked_tilts, frames_among, given_of, reader_of
 from starpos.earth.place import Place
 from starpos.errors import FixError, FrameError, InstrumentError, TiltError
 from starpos.fix.solution import Solution
@@ -155,8 +153,8 @@ def _of_files(args: argparse.Namespace, mark: Place) -> _Taken | None:
     """The sightings of files; None where no frame can be read, which has been said."""
     if not args.frames or args.tilt is None:
         raise InstrumentError("give frames and --tilt CSV, or a bag")
-    read = reader_of(args)
-    frames = frames_among(args.frames, args.tilt)
+    read = inputs.reader_of(args)
+    frames = inputs.frames_among(args.frames, args.tilt)
     with inputs.workers_of(args, frames) as workers:
         (about,) = workers.map([(First(read), tuple(frames))])
         if about is None:
@@ -164,11 +162,10 @@ def _of_files(args: argparse.Namespace, mark: Place) -> _Taken | None:
             read(frames[0])
             return None
         instrument, doubt = with_frame_size(options.instrument_of(args, about), about)
-        if doubt:
-            console.complain("deflection", doubt)
-        given = replace(given_of(args, about), instrument=instrument)
-        tilts = checked_tilts("deflection", os.path.abspath(args.tilt), instrument)
-        inputs.prepare("deflection", instrument, about)
+        console.complain(doubt)
+        given = replace(inputs.given_of(args, about), instrument=instrument)
+        tilts = inputs.checked_tilts(os.path.abspath(args.tilt), instrument)
+        inputs.prepare(instrument, about)
         work = OnFile(read, ZenithSighted(given, options.atmosphere_of(args), tilts, mark))
         answers = list(inputs.watched(workers.map((work, path) for path in frames), len(frames), lines=False))
     return _Taken(frames, answers, instrument)
@@ -187,8 +184,7 @@ def _of_bag(args: argparse.Namespace, mark: Place) -> _Taken:
     """The sightings of a bag's frames."""
     path = Path(args.frames[0])
     found, instruments = inputs.read_bag(path, args)
-    for remark in found.remarks:
-        console.complain("deflection", remark)
+    console.complain(*found.remarks)
     if found.tilts is None:
         raise TiltError(f"{path}: no usable tilt in it: record the topic tilt too")
     if not found.star_count:
@@ -204,22 +200,20 @@ def _of_bag(args: argparse.Namespace, mark: Place) -> _Taken:
 
 def _tell(args: argparse.Namespace, taken: _Taken, mark: Place) -> int:
     """Adjust the session and print it; returns the exit status."""
-    output = Output(args, COLUMNS, HEAD)
-    for remark in of_inclinometer(taken.instrument):
-        console.complain("deflection", remark)
+    output = console.Output(args, COLUMNS, HEAD)
+    console.complain(*of_inclinometer(taken.instrument))
     rows = list(zip(taken.names, taken.answers, strict=True))
     for name, answer in rows:
         if not isinstance(answer, ZenithSighting):
-            console.complain("deflection", _why(name, answer))
+            console.complain(_why(name, answer))
     sightings = [answer for answer in taken.answers if isinstance(answer, ZenithSighting)]
     try:
         session = checked_session(sightings, taken.instrument, options.atmosphere_of(args), mark)
     except FixError as error:
-        console.complain("deflection", error)
+        console.complain(error)
         return console.NOTHING
     scale = taken.instrument.inclinometer.scale
-    for said in remarks(session, len(rows), scale):
-        console.complain("deflection", said)
+    console.complain(*remarks(session, len(rows), scale))
     at = {id(s): k for k, s in enumerate(session.sightings)}
     for name, answer in rows:
         if isinstance(answer, ZenithSighting):

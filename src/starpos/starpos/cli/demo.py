@@ -42,7 +42,7 @@ def run(args: argparse.Namespace) -> int:
     places = folder / "place.geojson"
     calls = [("solve", *call, "-o", f"{places}")]
     if find_spec("matplotlib") is None:
-        console.complain("demo", f"without a page, which is drawn with matplotlib: {inputs.PIP}")
+        console.complain(f"without a page, which is drawn with matplotlib: {inputs.PIP}")
     else:
         calls.append(("report", *call, "-o", f"{folder / 'page.html'}"))
     for command in calls:

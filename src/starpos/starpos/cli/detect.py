@@ -5,8 +5,6 @@ import argparse
 from typing import TYPE_CHECKING
 
 from starpos.cli import console, inputs
-from starpos.cli.console import Output
-from starpos.cli.inputs import frames_among
 from starpos.errors import FrameError
 from starpos.frames.frame import Stars
 from starpos.night.reading import Reader
@@ -20,8 +18,8 @@ COLUMNS = ("file", "x", "y", "flux", "snr", "sigma_x", "sigma_y", "flags")
 
 
 def run(args: argparse.Namespace) -> int:
-    output = Output(args, COLUMNS, "")
-    args.frames = frames_among(args.frames)
+    output = console.Output(args, COLUMNS, "")
+    args.frames = inputs.frames_among(args.frames)
     status, work, number = 0, OnFile(Reader(), detected), len(args.frames)
     with inputs.workers_of(args, args.frames) as workers:
         answers = inputs.watched(workers.map((work, path) for path in args.frames), number)
@@ -32,9 +30,9 @@ def run(args: argparse.Namespace) -> int:
     return status
 
 
-def _tell(path: str, answer: "tuple[Detection | Stars, float] | FrameError", output: Output) -> None:
+def _tell(path: str, answer: "tuple[Detection | Stars, float] | FrameError", output: console.Output) -> None:
     if isinstance(answer, FrameError):
-        console.complain("detect", answer)
+        console.complain(answer)
         output.put(
             {"file": path, "stars": [], "cpu_ms": 0.0, "negative": False, "status": "bad input"}, "", ()
         )

@@ -144,7 +144,7 @@ def star_catalogue() -> Finding:
     where = os.environ.get("STARPOS_CATALOGUE") or "the one that comes with starpos"
     found = f"{len(stars)} stars to V = {stars.vmag().max():.1f}, {where}"
     if deeper.kept() is None:
-        found += "; no deeper one, which fields under about 1 deg need (starpos catalogue deepen --fetch)"
+        found += "; no deeper one, which fields under about 1 deg need (docs/how-to/small_fields.md)"
     return Finding(State.OK, found)
 
 

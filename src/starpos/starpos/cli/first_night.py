@@ -33,7 +33,7 @@ AGAIN = "the same command goes on where it was"
 
 
 def run(args: argparse.Namespace) -> int:
-    overwriting.check(args, overwriting.Written("--save", args.save, instrument_file.check_replaceable))
+    overwriting.check(args, save=instrument_file.check_replaceable)
     folder = Path(args.folder)
     if not folder.is_dir():
         raise FrameError(
@@ -44,17 +44,13 @@ def run(args: argparse.Namespace) -> int:
     try:
         night, given = _watched(args, folder)
     except KeyboardInterrupt:
-        console.complain("first-night", f"stopped: {AGAIN}")
+        console.complain(f"stopped: {AGAIN}")
         return console.NOTHING
     found = None if night is None else night.turned
     if found is None or found.calibrated is None:
-        console.complain(
-            "first-night", f"no frame has come for {args.patience:g} s, and A3 is not known yet: {AGAIN}"
-        )
+        console.complain(f"no frame has come for {args.patience:g} s, and A3 is not known yet: {AGAIN}")
         return console.NOTHING
-    overwriting.save_instrument(
-        "first-night", args.save, found.calibrated.instrument, "A3 by the first night"
-    )
+    overwriting.save_instrument(args.save, found.calibrated.instrument, "A3 by the first night")
     print(f"done: {args.save} is written -> starpos solve FRAMES --tilt {TILTS} --instrument {args.save}")
     if args.field is not None:
         packed = exposures(folder, given, options.atmosphere_of(args), Deflection(), read=reader_of(args))
@@ -78,7 +74,7 @@ def _watched(args: argparse.Namespace, folder: Path) -> tuple[FirstNight | None,
             except FrameError as error:
                 if time.time() < path.stat().st_mtime + WRITTEN_S:
                     break
-                console.complain("first-night", error)
+                console.complain(error)
                 seen.add(path)
                 continue
             seen.add(path)

@@ -285,7 +285,9 @@ def heading_line_of(path: str, s: Solution, axes: Axes = OPTICS) -> str:
     if s.at_place is None:
         return f"{path}: {s.status.value}, {s.stars_detected} stars detected"
     where = "" if s.fix is None else f"{s.fix.in_degrees.where}, "
-    seen = f"by the {s.bodies[0]}" if s.bodies else f"{len(s.names)} of {s.stars_detected} stars"
+    seen = (
+        f"by the {' and the '.join(s.bodies)}" if s.bodies else f"{len(s.names)} of {s.stars_detected} stars"
+    )
     return f"{path}: {where}{heading_text_of(s.at_place)}{axes_text(json_of_axes(s.at_place, axes))}, {seen}"
 
 

@@ -7,8 +7,6 @@ import math
 import numpy as np
 
 from starpos.cli import console, inputs
-from starpos.cli.console import Output
-from starpos.cli.inputs import frames_among, reader_of
 from starpos.errors import FrameError
 from starpos.fix.solution import Solution, Status
 from starpos.frames.frame import Stars
@@ -26,13 +24,13 @@ HEAD = (
 
 
 def run(args: argparse.Namespace) -> int:
-    args.frames = frames_among(args.frames)
+    args.frames = inputs.frames_among(args.frames)
     any_found, unreadable, number = False, False, len(args.frames)
     lost: Stars | None = None
-    complaints = console.FrameComplaints("identify")
-    read, output = reader_of(args), Output(args, COLUMNS, HEAD)
+    complaints = console.FrameComplaints()
+    read, output = inputs.reader_of(args), console.Output(args, COLUMNS, HEAD)
     with inputs.workers_of(args, args.frames) as workers:
-        solving = inputs.identifying("identify", args, args.frames, read, workers, args.search_time)
+        solving = inputs.identifying(args, args.frames, read, workers, args.search_time)
         work = OnFile(read, solving)
         answers = inputs.watched(workers.map((work, path) for path in args.frames), number)
         for path, answer in zip(args.frames, answers, strict=True):
@@ -47,8 +45,7 @@ def run(args: argparse.Namespace) -> int:
             output.put(as_json(path, found) | {"cpu_ms": cpu_ms}, _line(path, found))
     complaints.end()
     if lost is not None and not any_found:
-        for remark in solving.fitting(lost):
-            console.complain("identify", remark)
+        console.complain(*solving.fitting(lost))
     return console.UNREADABLE if unreadable else 0 if any_found else 1
 
 

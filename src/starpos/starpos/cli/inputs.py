@@ -31,7 +31,7 @@ from starpos.night.work import Solving
 from starpos.parallel.processes import Here, Workers, memory_bytes, processors, workers
 from starpos.progress import quiet
 from starpos.recording.drivers import Drivers
-from starpos.recording.topics import Remaps
+from starpos.recording.topics import remaps_of
 from starpos.sky import catalogue
 
 if TYPE_CHECKING:
@@ -70,21 +70,11 @@ def is_untold(args: argparse.Namespace) -> bool:
     return (args.instrument, args.focal_mm, args.pixel_um) == (None,) * 3 and args.lens == PLUMB_BOB
 
 
-def seen_at_place(command: str, args: argparse.Namespace) -> Iterator[tuple[Frame | Stars, Sight, Camera]]:
-    """Frames with their attitudes at --site, and the camera with the focal length that their stars show.
+def seen_at(args: argparse.Namespace, place: Place) -> Iterator[tuple[Frame | Stars, Sight, Camera]]:
+    """Frames with their attitudes at a place, and the camera with the focal length that their stars show.
 
-    Raises InstrumentError without --site, and StarposError as `solve` does.
+    Frames without an attitude are complained about.  Raises StarposError as `solve` does.
     """
-    place = options.place_of(args, options.vertical_of(args))
-    if place is None:
-        raise InstrumentError(f"{command} needs the place of the camera: give --site LAT LON")
-    return seen_at(command, args, place)
-
-
-def seen_at(
-    command: str, args: argparse.Namespace, place: Place
-) -> Iterator[tuple[Frame | Stars, Sight, Camera]]:
-    """Frames with their attitudes at a place, as `seen_at_place` has them; frames without one are complained about."""
     read = reader_of(args)
     about = First(read)(tuple(args.frames))
     if about is None:
@@ -92,22 +82,21 @@ def seen_at(
         read(args.frames[0])
     assert about is not None
     work, remarks = work_of(given_or_sought(args, about), about, None, options.atmosphere_of(args), place)
-    for remark in remarks:
-        console.complain(command, remark)
+    console.complain(*remarks)
     if work.instruments.sought:
         BlindSolver(catalogue.load_catalogue(), console.ProgressBar()).prepare()
     for path in args.frames:
         try:
             item = read(path)
         except FrameError as e:
-            console.complain(command, e)
+            console.complain(e)
             continue
         sight = work(item)
         answer = sight.solution
         if answer.at_place is None or answer.found is None:
             timed = answer.found is None or item.mid_unix_s
             no_time = f"{item.place}: no time of exposure: {why_no_time(item)}"
-            console.complain(command, answer.message if timed else no_time)
+            console.complain(answer.message if timed else no_time)
             continue
         instrument = sight.instrument or work.instruments.of(item)
         assert instrument is not None
@@ -116,7 +105,6 @@ def seen_at(
 
 
 def identifying(
-    command: str,
     args: argparse.Namespace,
     frames: Sequence[str],
     read: Reader,
@@ -130,18 +118,17 @@ def identifying(
         BlindSolver(catalogue.load_catalogue(), console.ProgressBar()).prepare()
     elif about is not None:
         given = given_of(args, about)
-        prepare(command, options.instrument_of(args, about), about)
+        prepare(options.instrument_of(args, about), about)
     # without a frame that can be read, each one reports why it cannot
     # several at once would write over each other's progress
     progress = console.ProgressBar() if isinstance(workers, Here) else quiet
     return Solving(given, search_s=search_s, progress=progress)
 
 
-def checked_tilts(command: str, path: str, instrument: Instrument) -> TiltFile:
-    """The table of tilts, with a complaint where it looks like radians; raises TiltError as `read_tilt_csv` does."""
+def checked_tilts(path: str, instrument: Instrument) -> TiltFile:
+    """The table of tilts, with a complaint where its steps are coarse; raises TiltError, also for radians."""
     file = TiltFile(path, instrument.inclinometer.noise_rad)
-    for remark in of_tilts(file.log, path, instrument.inclinometer):
-        console.complain(command, remark)
+    console.complain(*of_tilts(file.log, path, instrument.inclinometer))
     return file
 
 
@@ -238,7 +225,7 @@ def read_bag(path: Path, args: argparse.Namespace) -> "tuple[Recorded, Instrumen
     from starpos.night import bag
 
     any_camera = options.instrument_of(args, no_stars(100, 100, focal_px=1000.0))
-    drivers = Drivers.of(args.params_file, args.param, args.namespace, Remaps.of(args.remap))
+    drivers = Drivers.of(args.params_file, args.param, args.namespace, remaps_of(args.remap))
     found = bag.read(path, args.namespace, any_camera.inclinometer.noise_rad, drivers, console.ProgressBar())
     told = (args.instrument, args.focal_mm) != (None, None)
     cameras = found.cameras if args.focal_mm is None else {}
@@ -267,10 +254,10 @@ def watched(answers: Iterable, number: int, what: str = "frame", lines: bool = T
         yield answer
 
 
-def prepare(command: str, instrument: Instrument, about: About) -> None:
+def prepare(instrument: Instrument, about: About) -> None:
     """Put the tables of a field into the cache, for all processes of a machine; reports what the catalogue lacks."""
     solver = Solver(instrument, catalogue.load_catalogue(), progress=console.ProgressBar())
     # the frames report the error
     with suppress(StarposError):
         if thin := solver.prepare(about.width, about.height, about.origin_px):
-            console.complain(command, thin)
+            console.complain(thin)

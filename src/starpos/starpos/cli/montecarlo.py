@@ -12,7 +12,6 @@ from pathlib import Path
 import numpy as np
 
 from starpos.cli import console, options, overwriting
-from starpos.cli.overwriting import Written
 from starpos.errors import FrameError
 from starpos.fix.solver import Solver
 from starpos.frames.frame import Stars
@@ -123,7 +122,7 @@ def _all(args: argparse.Namespace, night: RandomNight) -> list[NightOutcome]:
     for k, outcome in enumerate(_each(night, seeds, args.jobs)):
         outcomes.append(outcome)
         if outcome.trouble:
-            console.complain("montecarlo", f"night {k}: {outcome.trouble}")
+            console.complain(f"night {k}: {outcome.trouble}")
         bar("nights", len(outcomes) / args.nights)
     for o in outcomes if args.json else ():
         sigma = np.sqrt(np.diag(o.covariance))
@@ -168,10 +167,9 @@ PAPER_LIMIT_MAG, PAPER_STARS = 9.0, 24.9
 
 
 def run(args: argparse.Namespace) -> int:
-    if args.keep is not None:
-        overwriting.check(args, Written("--keep", args.keep, overwriting.failed_fields))
+    overwriting.check(args, keep=overwriting.failed_fields)
     camera = options.camera_of(args)
-    stars = deeper.for_field(catalogue.load_catalogue(), camera, console.ProgressBar())
+    stars = deeper.for_field(catalogue.load_catalogue(), camera)
     conditions = _conditions(args, stars, camera)
     solver = Solver(Instrument(camera.fx), stars, progress=console.ProgressBar())
     solver.prepare(camera.width, camera.height)

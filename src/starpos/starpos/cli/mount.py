@@ -10,8 +10,6 @@ from pathlib import Path
 import numpy as np
 
 from starpos.cli import console, inputs, options
-from starpos.cli.console import print_json
-from starpos.cli.options import place_of, vertical_of
 from starpos.earth.place import Place
 from starpos.errors import FixError, FrameError, InstrumentError
 from starpos.files import open_regular
@@ -26,13 +24,10 @@ READING = "azimuth_deg"
 def run(args: argparse.Namespace) -> int:
     axes = options.axes_of(args)
     readings = None if args.readings is None else _readings(args.readings)
-    # what --site cannot be is said before the work
-    place = place_of(args, vertical_of(args))
-    if place is None:
-        raise InstrumentError("mount needs the place of the camera: give --site LAT LON")
+    place = options.camera_place_of(args)
     seen = [
         (sight.stars.source, at)
-        for _, sight, _ in inputs.seen_at_place("mount", args)
+        for _, sight, _ in inputs.seen_at(args, place)
         if (at := sight.solution.at_place) is not None
     ]
     try:
@@ -40,7 +35,7 @@ def run(args: argparse.Namespace) -> int:
             return _axis(args, place, [a for _, a in seen])
         return _circle(args, seen, readings, axes[list(axes)[-1]])
     except FixError as e:
-        console.complain("mount", e)
+        console.complain(e)
         return console.NOTHING
 
 
@@ -61,19 +56,18 @@ def _axis(args: argparse.Namespace, place: Place, seen: Sequence[AttitudeAtPlace
         "rest_arcsec": (found.rest / ARCSEC).tolist(),
         "axis_in_camera": found.in_camera.tolist(),
     }
-    if args.json:
-        print_json(values)
-        return 0
     side = ("right", "left")[int(right < 0)], ("above", "below")[int(above < 0)]
-    print(
+    console.tell(
+        args,
+        values,
         f"the axis of {len(seen)} frames: azimuth {values['azimuth']:.5f}, altitude {values['altitude']:.5f} deg, "
         f"+- {sigma[0] * 3600:.1f} arcsec across, {sigma[1] * 3600:.1f} up; frames are off it by at most "
         f"{found.rest.max() / ARCSEC:.1f} arcsec\n"
         f"it points {abs(right) * 3600:.0f} arcsec {side[0]} of the celestial pole (facing it) and "
-        f"{abs(above) * 3600:.0f} arcsec {side[1]} it"
+        f"{abs(above) * 3600:.0f} arcsec {side[1]} it",
     )
     if len(seen) < 3:
-        console.complain("mount", "two frames do not show whether it is one axis: give three")
+        console.complain("two frames do not show whether it is one axis: give three")
     return 0
 
 
@@ -86,7 +80,7 @@ def _circle(
     """Print the orientation of a horizontal circle."""
     there = [(path, a, readings[Path(path).name]) for path, a in seen if Path(path).name in readings]
     for path in {Path(p).name for p, _ in seen} - set(readings):
-        console.complain("mount", f"{path}: {args.readings} has no reading of it: it is left out")
+        console.complain(f"{path}: {args.readings} has no reading of it: it is left out")
     if not there:
         raise FixError(
             f"no frame with a heading has a reading in {args.readings}: check the names in its column file"
@@ -108,23 +102,19 @@ def _shared(seen: AttitudeAtPlace) -> float:
 
 def _print_circle(args: argparse.Namespace, found: CircleOrientation, names: Sequence[str]) -> None:
     zero, sigma, rest = math.degrees(found.zero), found.sigma / ARCSEC, (found.rest / ARCSEC).tolist()
-    if args.json:
-        print_json(
-            {
-                "frames": len(rest),
-                "zero": zero,
-                "sigma_arcsec": sigma,
-                "sense": found.sense,
-                "rest_arcsec": rest,
-            }
-        )
-        return
-    for name, off in zip(names, rest, strict=True):
-        print(f"{name}: {off:+.1f} arcsec")
+    values = {
+        "frames": len(rest),
+        "zero": zero,
+        "sigma_arcsec": sigma,
+        "sense": found.sense,
+        "rest_arcsec": rest,
+    }
+    lines = [f"{name}: {off:+.1f} arcsec" for name, off in zip(names, rest, strict=True)]
     turns = "clockwise" if found.sense > 0 else "anticlockwise"
-    print(
+    lines.append(
         f"the circle counts {turns} from azimuth {zero:.5f} +- {sigma / 3600:.5f} deg, of {len(rest)} readings"
     )
+    console.tell(args, values, "\n".join(lines))
 
 
 def _readings(path: str) -> dict[str, float]:

@@ -10,23 +10,15 @@ from typing import Any
 import numpy as np
 
 from starpos.cli import console, inputs, options
-from starpos.cli.console import Output
 from starpos.cli.fix_output import FIX_KEYS, HEAD
-from starpos.cli.inputs import frames_among, given_of, reader_of
-from starpos.cli.options import tell_unknown, vertical_of
 from starpos.earth.orientation import earth_orientation
 from starpos.earth.vertical import Geodetic, Vertical
 from starpos.errors import FixError, VoyageError
 from starpos.instrument.instrument import framed
 from starpos.navigation.estimate import VoyageFix
 from starpos.navigation.voyage import Voyage
+from starpos.night import under_way
 from starpos.night.reading import First
-from starpos.night.under_way import (
-    IdentifyingVoyage,
-    Records,
-    VoyageFrame,
-    voyage_frames,
-)
 
 OK, CARRIED, NO_READINGS, BAD_INPUT = "ok", "carried", "no inertial readings", "bad input"
 # the keys of --json that come from a fix
@@ -44,14 +36,14 @@ COLUMNS = ("file", "status", *(k for k in KEYS if not k.startswith("covariance")
 
 
 def run(args: argparse.Namespace) -> int:
-    args.frames = frames_among(args.frames, args.imu, args.velocity)
+    args.frames = inputs.frames_among(args.frames, args.imu, args.velocity)
     if args.velocity is not None and not args.drift_stddev and not math.isnan(args.drift_change):
         raise VoyageError(
             "--drift-change: a --velocity over ground drifts with nothing; give --drift-stddev if it is through water or "
             "air"
         )
-    vertical, read, number = vertical_of(args), reader_of(args), len(args.frames)
-    records = Records(
+    vertical, read, number = options.vertical_of(args), inputs.reader_of(args), len(args.frames)
+    records = under_way.Records(
         imu=args.imu,
         imu_model=args.imu_model,
         velocity=args.velocity,
@@ -67,28 +59,27 @@ def run(args: argparse.Namespace) -> int:
             raise VoyageError(f"none of the {number} frames can be read: give star lists or frames")
         instrument, axis = framed(options.instrument_of(args, about), about)
         vessel, remark = records.vessel(instrument, options.atmosphere_of(args), axis)
-        if remark:
-            console.complain("navigate", remark)
-        inputs.prepare("navigate", instrument, about)
-        work = IdentifyingVoyage(read, replace(given_of(args, about), instrument=instrument))
+        console.complain(remark)
+        inputs.prepare(instrument, about)
+        work = under_way.IdentifyingVoyage(read, replace(inputs.given_of(args, about), instrument=instrument))
         answers = inputs.watched(workers.map((work, path) for path in args.frames), number)
-        frames = voyage_frames(answers)
+        frames = under_way.voyage_frames(answers)
     for frame in frames:
-        if frame.message:
-            console.complain("navigate", frame.message)
+        console.complain(frame.message)
     try:
         voyage = records.voyage(frames, vessel, console.ProgressBar())
     except FixError as error:
-        console.complain("navigate", error)
+        console.complain(error)
         return console.NOTHING
     return tell(args, frames, voyage, vertical)
 
 
-def tell(args: argparse.Namespace, frames: list[VoyageFrame], voyage: Voyage, vertical: Vertical) -> int:
+def tell(
+    args: argparse.Namespace, frames: list[under_way.VoyageFrame], voyage: Voyage, vertical: Vertical
+) -> int:
     """Write the answer for each frame; returns the exit status."""
-    output = Output(args, COLUMNS, HEAD)
-    for fault in voyage.faults:
-        console.complain("navigate", fault)
+    output = console.Output(args, COLUMNS, HEAD)
+    console.complain(*voyage.faults)
     for path, frame, fix in zip(args.frames, frames, voyage.fixes, strict=True):
         status = _status(frame, fix)
         output.put(
@@ -99,15 +90,15 @@ def tell(args: argparse.Namespace, frames: list[VoyageFrame], voyage: Voyage, ve
     if not fixes:
         return console.NOTHING
     last = fixes[-1]
-    tell_unknown("navigate", args, vertical.at(last.latitude, last.longitude))
+    options.tell_unknown(args, vertical.at(last.latitude, last.longitude))
     beyond = earth_orientation(last.utc_unix_s).extrapolated_days
     if beyond > 0:
-        console.complain("navigate", f"the Earth's rotation is extrapolated {beyond:.0f} days beyond the IERS table: "
+        console.complain(f"the Earth's rotation is extrapolated {beyond:.0f} days beyond the IERS table: "
                         "upgrade astropy-iers-data")  # fmt: skip
     return console.UNREADABLE if any(frame.utc_unix_s is None for frame in frames) else 0
 
 
-def _status(frame: VoyageFrame, fix: VoyageFix | None) -> str:
+def _status(frame: under_way.VoyageFrame, fix: VoyageFix | None) -> str:
     if fix is None:
         return BAD_INPUT if frame.utc_unix_s is None else NO_READINGS
     return CARRIED if frame.sighting is None else OK

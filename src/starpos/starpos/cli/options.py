@@ -167,12 +167,11 @@ def _at_height(vertical: Vertical, args: argparse.Namespace) -> AtHeight:
     return AtHeight(vertical) if args.altitude_m is None else AtHeight(vertical, args.altitude_m)
 
 
-def tell_unknown(command: str, args: argparse.Namespace, deflection: Deflection) -> None:
+def tell_unknown(args: argparse.Namespace, deflection: Deflection) -> None:
     """Complain if the geoid that was given has no data at the place."""
     if args.geoid is not None and not deflection.known:
         stddev = deflection.stddev_arcsec
         console.complain(
-            command,
             f"{args.geoid}: no data around this place; the deflection is unknown, {stddev:.2g} arcsec",
         )
 
@@ -189,6 +188,14 @@ def axes_of(args: argparse.Namespace) -> dict[str, tuple[float, ...]]:
             raise InstrumentError(f"--axis {name} {' '.join(xyz)}: give a name and three numbers, not all 0")
         axes[name] = tuple((v / np.linalg.norm(v)).tolist())
     return axes
+
+
+def camera_place_of(args: argparse.Namespace) -> Place:
+    """The place of --site, which the command needs; errors as of `place_of`."""
+    place = place_of(args, vertical_of(args))
+    if place is None:
+        raise InstrumentError(f"{args.command} needs the place of the camera: give --site LAT LON")
+    return place
 
 
 def place_of(args: argparse.Namespace, vertical: Vertical) -> Place | None:

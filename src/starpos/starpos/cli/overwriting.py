@@ -6,7 +6,6 @@ import json
 import os
 import re
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 from starpos import files
@@ -17,7 +16,7 @@ from starpos.instrument.instrument import Instrument
 from starpos.sky import catalogue
 
 # options that name files to be read
-INPUTS = ("frames", "tilt", "pointings", "sights", "imu", "geoid", "originals", "gaia")
+INPUTS = ("frames", "tilt", "pointings", "sights", "imu", "geoid", "gaia")
 # the name in the camera's file, which the camera node uses
 CAMERA_NAME = "camera"
 # 'a.fits[2]' is an image in the file a.fits
@@ -25,36 +24,28 @@ HDU = re.compile(r"\[[^]]*\]$")
 MAX_LIST_BYTES = 1_000_000
 
 
-@dataclass(frozen=True)
-class Written:
-    """A file that an option names to be written.
-
-    check: raises InstrumentError, without advice, unless the existing file of that name may be replaced.
-    """
-
-    option: str
-    name: str
-    check: Callable[[Path], None]
-
-
-def check(args: argparse.Namespace, *written: Written) -> None:
-    """Raise InstrumentError unless each of these files may be written.
+def check(args: argparse.Namespace, **kinds: Callable[[Path], None]) -> None:
+    """Raise InstrumentError unless the files may be written that options name; an option that is not given names none.
 
     An existing file may be replaced if it is of the kind that the command writes. An input may not, and no two outputs
     may be one file. The file of --instrument may: it keeps everything that was not found anew.
+
+    kinds: by option, what raises InstrumentError, without advice, unless an existing file may be replaced.
     """
     read, names = set(_inputs(args)), set()
-    for output in written:
-        path, real = Path(output.name), os.path.realpath(output.name)
-        instead = f"give another {output.option}"
+    for option, check_kind in kinds.items():
+        if (name := getattr(args, option)) is None:
+            continue
+        path, real = Path(name), os.path.realpath(name)
+        instead = f"give another --{option}"
         if real in read:
-            raise InstrumentError(f"{path}: {output.option} would replace what is read: {instead}")
+            raise InstrumentError(f"{path}: --{option} would replace what is read: {instead}")
         if real in names:
             raise InstrumentError(f"{path}: two options would write it: {instead}")
         names.add(real)
         try:
             if path.exists():
-                output.check(path)
+                check_kind(path)
         except InstrumentError as e:
             raise InstrumentError(f"{e}: move it away, or {instead}") from None
         # ValueError: the name contains a NUL
@@ -111,14 +102,11 @@ def failed_fields(folder: Path) -> None:
             raise _there(path, "starpos montecarlo did not write it")
 
 
-def save_instrument(
-    command: str, name: str, found: Instrument, about: str, *, camera_found: bool = False
-) -> None:
+def save_instrument(name: str, found: Instrument, about: str, *, camera_found: bool = False) -> None:
     """Write A3 into an instrument file, new or there already; raises InstrumentError."""
     instrument_file.update(Path(name), found, about, camera_found=camera_found)
     if arcsec := instrument_file.read(name, needs_camera=False).calibration.remounted_arcsec:
         console.complain(
-            command,
             f"{name} keeps remounted_arcsec: {arcsec:g}: A3 is new, so take it out unless you remount again",
         )
 

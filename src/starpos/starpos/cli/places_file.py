@@ -12,8 +12,8 @@ from starpos import __version__
 from starpos.cli.console import plain
 from starpos.cli.fix_output import COLUMNS
 from starpos.earth.ellipsoid import curvature_radii_m
-from starpos.errors import InstrumentError, WriteError
-from starpos.files import has_mark, write_whole
+from starpos.errors import InstrumentError
+from starpos.files import has_mark, save
 from starpos.report.coast import SIGMAS_95
 
 GPX = ".gpx"
@@ -58,12 +58,7 @@ def write(path: str, answers: Iterable[Mapping]) -> None:
     """
     found = [a for a in map(plain, answers) if a.get(NUMBERS[0]) is not None]
     text = _gpx(found) if path.lower().endswith(GPX) else json.dumps(_geojson(found), indent=1)
-    try:
-        write_whole(path, text.encode())
-    except (OSError, ValueError) as e:
-        raise WriteError(
-            f"{path}: the places cannot be written there ({getattr(e, 'strerror', e)})"
-        ) from None
+    save(path, text.encode(), "the places")
 
 
 def _geojson(found: Sequence[Mapping]) -> dict:

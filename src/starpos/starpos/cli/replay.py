@@ -3,23 +3,14 @@
 
 import argparse
 
-from starpos.cli import console, inputs
-from starpos.cli.console import Output
-from starpos.cli.fix_output import (
-    COLUMNS,
-    HEAD,
-    json_about,
-    json_of,
-    line_of,
-    put_combined,
-)
+from starpos.cli import console, fix_output, inputs
 from starpos.earth.vertical import Vertical
 from starpos.errors import FrameError
 from starpos.fix.checks import BY_PARAMETERS, MODEL_BY_PARAMETERS
-from starpos.night.remarks import of_a3, of_inclinometer
-from starpos.night.together import FrameAnswer, Gathered, extrapolated
+from starpos.night.remarks import of_a3, of_extrapolation, of_inclinometer
+from starpos.night.together import FrameAnswer, Gathered
 from starpos.recording.drivers import Drivers
-from starpos.recording.topics import Remaps
+from starpos.recording.topics import remaps_of
 from starpos.session.replay import PlayedNight, Playing
 from starpos.session.settings import Settings
 from starpos.units import utc_text
@@ -27,10 +18,10 @@ from starpos.units import utc_text
 
 def run(args: argparse.Namespace) -> int:
     settings = Settings.of(args.params_file, args.param, args.namespace)
-    output = Output(args, COLUMNS, HEAD)
+    output = console.Output(args, fix_output.COLUMNS, fix_output.HEAD)
     # a wrong parameter is reported once, not for each bag
     Drivers.of(args.params_file, args.param, args.namespace)
-    work = Playing(args.params_file, tuple(args.param), args.namespace, Remaps.of(args.remap))
+    work = Playing(args.params_file, tuple(args.param), args.namespace, remaps_of(args.remap))
     with inputs.workers_of(args, args.bags) as workers:
         answers = inputs.watched(workers.map((work, bag) for bag in args.bags), len(args.bags), "bag")
         return max(
@@ -41,42 +32,42 @@ def run(args: argparse.Namespace) -> int:
 
 def tell(
     args: argparse.Namespace,
-    output: Output,
+    output: console.Output,
     bag: str,
     night: PlayedNight | FrameError,
     vertical: Vertical,
 ) -> int:
     """Write the solutions of a bag and the average of its place; returns the exit status."""
     if isinstance(night, FrameError):
-        console.complain("replay", night)
+        console.complain(night)
         return console.UNREADABLE
     for sentence in night.said:
-        console.complain("replay", f"{bag}: {sentence}")
+        console.complain(f"{bag}: {sentence}")
     gathered = Gathered()
     for solution in night.solutions:
         gathered.gather(FrameAnswer(bag, solution))
         if not solution.fix:
-            console.complain("replay", f"{bag}: {solution.message}")
+            console.complain(f"{bag}: {solution.message}")
         time = "a frame" if solution.utc_unix_s is None else utc_text(solution.utc_unix_s)
         output.put(
-            {"file": bag} | json_of(solution.fix, vertical) | json_about(solution),
-            line_of(f"{bag} {time}", solution, turning=False),
+            {"file": bag} | fix_output.json_of(solution.fix, vertical) | fix_output.json_about(solution),
+            fix_output.line_of(f"{bag} {time}", solution, turning=False),
         )
     whole, solved = night.average, gathered.solved
-    remarks = list(extrapolated(solved))
+    remarks = list(of_extrapolation(solved))
     if solved:
         remarks += of_inclinometer(night.instrument, MODEL_BY_PARAMETERS)
     if whole:
         remarks += of_a3(night.instrument.calibration, whole, BY_PARAMETERS)
     for remark in remarks:
-        console.complain("replay", f"{bag}: {remark}")
+        console.complain(f"{bag}: {remark}")
     if solved:
-        put_combined(output, bag if len(args.bags) > 1 else None, whole, gathered, vertical)
+        fix_output.put_combined(output, bag if len(args.bags) > 1 else None, whole, gathered, vertical)
     if (by_satellites := night.by_satellites) is not None:
         from starpos.cli.satellites import fix_json
 
         value = {"file": bag, "by_satellites": True} | fix_json(by_satellites)
         output.put(value, f"by satellites: {by_satellites.text}", rows=())
     # a trouble names its bag
-    console.complain("replay", night.trouble or f"{bag}: {night.summary}")
+    console.complain(night.trouble or f"{bag}: {night.summary}")
     return console.UNREADABLE if night.trouble else 0 if solved else console.NOTHING

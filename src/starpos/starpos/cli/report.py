@@ -8,8 +8,6 @@ from pathlib import Path
 
 from starpos.cli import console, inputs, options, overwriting, places_file
 from starpos.cli.fix_output import json_of
-from starpos.cli.inputs import given_of, given_or_sought, reader_of
-from starpos.cli.options import vertical_of
 from starpos.cli.solve import read_receiver
 from starpos.errors import FrameError, InstrumentError
 from starpos.frames.reading import are_photographs
@@ -82,13 +80,13 @@ def _nights(groups: list[list[Path]], args: argparse.Namespace) -> list[Night]:
     nights = [_night(paths, args) for paths in groups]
     for night in nights:
         for sentence in (*night.remarks, *([night.why_not] if night.why_not else [])):
-            console.complain("report", f"{night.name}: {sentence}")
+            console.complain(f"{night.name}: {sentence}")
     return nights
 
 
 def _write_places(args: argparse.Namespace) -> int:
     """Write the places of nights for maps, without a page."""
-    overwriting.check(args, overwriting.Written("-o", args.out, places_file.check_ours))
+    overwriting.check(args, out=places_file.check_ours)
     answers: list[dict] = []
     for night in _nights(_groups(args.nights), args):
         answers += [{"file": s.name} | json_of(s.place, night.vertical) for _, s in night.fixed]
@@ -117,7 +115,7 @@ def _pack(args: argparse.Namespace) -> int:
 
 def _night(paths: list[Path], args: argparse.Namespace) -> Night:
     """The Night of a folder, a bag or photographs; raises StarposError if there is nothing to work on."""
-    receiver = read_receiver(args.gnss, None, "report")
+    receiver = read_receiver(args.gnss, None)
     how = How(options.turn_of(args) if args.self_calibrate else None, receiver)
     return solved_night(_exposures(paths, args), how, console.ProgressBar())
 
@@ -126,9 +124,9 @@ def _exposures(paths: list[Path], args: argparse.Namespace) -> Exposures:
     """The exposures of a folder, of photographs or of a bag; raises StarposError without any."""
     from starpos.night import bag
 
-    air, vertical, path = options.atmosphere_of(args), vertical_of(args), paths[0]
+    air, vertical, path = options.atmosphere_of(args), options.vertical_of(args), paths[0]
     if not path.exists():
-        raise FrameError(f"{path}: there is no such night: give a folder, or a rosbag2")
+        raise FrameError(f"{path}: there is no such night: give a folder, a rosbag2, or photographs")
     if bag.is_bag(path):
         if args.gnss is not None:
             raise FrameError(f"{path}: --gnss goes with a folder of frames, and this is a bag: leave it out")
@@ -138,9 +136,9 @@ def _exposures(paths: list[Path], args: argparse.Namespace) -> Exposures:
         raise FrameError(
             f"{path}: neither a folder of frames nor a rosbag2 (.mcap, .db3), nor a photograph: give one of these"
         )
-    read, folder = reader_of(args), path.parent if frames else path
+    read, folder = inputs.reader_of(args), path.parent if frames else path
     about = First(read)(tuple(map(str, frames or frames_in(path))))
     # a field report states the focal length
-    find = given_or_sought if args.field is None else given_of
+    find = inputs.given_or_sought if args.field is None else inputs.given_of
     given = Instruments(None) if about is None else find(args, about)
     return exposures(folder, given, air, vertical, read=read, frames=frames)

@@ -64,8 +64,7 @@ def run(args: argparse.Namespace) -> int:
         return _refused(args, f"none of {len(frames)} frames shows an end of a trail: give more frames")
     begin = float(min(t.utc_unix_s.min() for t in trails))
     usable, about = chosen(_orbits(args.elements), begin, newer=args.newer_elements)
-    for sentence in about:
-        console.complain("satellites", sentence)
+    console.complain(*about)
     prior = _prior(args, begin)
     try:
         fix = locate(trails, usable, prior)
@@ -73,15 +72,17 @@ def run(args: argparse.Namespace) -> int:
         return _refused(args, str(e))
     for k, trail in enumerate(trails):
         value = trail_json(trail, fix, k)
-        _put(args, value, trail_line(value))
+        console.tell(args, value, trail_line(value))
     headings = [h for name, sight in seen.frames.items() if (h := heading_json(name, sight, fix)) is not None]
     lines = [f"{h['file']}: heading {h['heading']:.4f} +- {h['sigma_heading_deg']:.4f} deg" for h in headings]
-    _put(args, {"combined": True} | fix_json(fix) | {"frames": headings}, "\n".join([*lines, fix.text]))
+    console.tell(
+        args, {"combined": True} | fix_json(fix) | {"frames": headings}, "\n".join([*lines, fix.text])
+    )
     return 0
 
 
 def _refused(args: argparse.Namespace, why: str) -> int:
-    console.complain("satellites", why)
+    console.complain(why)
     if args.json:
         console.print_json(
             {"combined": True, "latitude_geodetic": None, "longitude_geodetic": None, "status": why}
@@ -89,20 +90,12 @@ def _refused(args: argparse.Namespace, why: str) -> int:
     return 1
 
 
-def _put(args: argparse.Namespace, value: dict, line: str) -> None:
-    if args.json:
-        console.print_json(value)
-    else:
-        print(line)
-
-
 def _orbits(paths: Sequence[str]) -> list[Orbit]:
     orbits = []
     for path in paths:
         found, about = read_orbits(path)
         orbits += found
-        for sentence in about:
-            console.complain("satellites", sentence)
+        console.complain(*about)
     return orbits
 
 
@@ -110,17 +103,16 @@ def _read(path: str) -> list[SatelliteTrail]:
     if Path(path).suffix.lower() == ".csv":
         return read_sightings(path)
     trails, about = read_iod(path)
-    for sentence in about:
-        console.complain("satellites", sentence)
+    console.complain(*about)
     return trails
 
 
 def _look(args: argparse.Namespace, frames: list[str], seen: SeenTrails) -> None:
     """Add the frames and their trails, numbered on; complains of frames without, and of trails that are left out."""
     number = 1 + max((trail.track for trail in seen.trails), default=-1)
-    complaints, read = console.FrameComplaints("satellites"), inputs.reader_of(args)
+    complaints, read = console.FrameComplaints(), inputs.reader_of(args)
     with inputs.workers_of(args, frames) as workers:
-        solving = inputs.identifying("satellites", args, frames, read, workers, SEARCH_S)
+        solving = inputs.identifying(args, frames, read, workers, SEARCH_S)
         work = OnFile(read, TrailSighted(solving))
         answers = inputs.watched(workers.map((work, path) for path in frames), len(frames))
         for path, answer in zip(frames, answers, strict=True):
@@ -159,8 +151,7 @@ def _joined(path: str, utc_unix_s: float) -> tuple[float, float, np.ndarray]:
     """Latitude, longitude (deg) and covariance (2, 2) of a place: of what `starpos solve --json` printed, or of GNSS."""
     if Path(path).suffix.lower() == ".csv":
         track, faults = read_gnss_csv(path)
-        for sentence in faults:
-            console.complain("satellites", sentence)
+        console.complain(*faults)
         if (place := track.at(utc_unix_s)) is None:
             raise SatelliteError(f"{path}: no GNSS place at {utc_text(utc_unix_s)}, of the first trail")
         return math.degrees(place.latitude), math.degrees(place.longitude), place.covariance
@@ -218,7 +209,7 @@ def heading_json(name: str, sight: Sight, fix: SatelliteFix) -> dict | None:
     try:
         link = solver.attitude_at(sight.stars, sight.found, place.deflected(Deflection())).ellipsoid
     except StarposError as e:
-        console.complain("satellites", f"{name}: no heading: {e}")
+        console.complain(f"{name}: no heading: {e}")
         return None
     sigma = np.degrees(np.sqrt(link.angles_covariance[0, 0]))
     return {"file": name, "heading": np.degrees(link.heading), "sigma_heading_deg": sigma}
@@ -250,8 +241,7 @@ def plan(args: argparse.Namespace) -> int:
     orbits: list[Orbit] = []
     if args.elements:
         orbits, about = chosen(_orbits(args.elements), begin, newer=args.newer_elements)
-        for sentence in about:
-            console.complain("satellites", sentence)
+        console.complain(*about)
     lens = None
     if args.size is not None:
         focal_px = options.instrument_of(args, None).focal_px
@@ -262,14 +252,12 @@ def plan(args: argparse.Namespace) -> int:
         raise SatelliteError(f"--plan {latitude:g} {longitude:g}: give latitude and longitude in deg")
     hours = nights_hours(latitude, longitude, begin, orbits, least_deg=args.min_altitude, lens_deg=lens)
     if not hours:
-        console.complain(
-            "satellites", "the Sun does not sink 6 deg below the horizon there in these 24 hours"
-        )
+        console.complain("the Sun does not sink 6 deg below the horizon there in these 24 hours")
         return 1
     most = max(hours, key=lambda h: h.at_once if lens is None else h.in_lens)
     for hour in hours:
         best = bool(orbits) and hour is most
-        _put(
+        console.tell(
             args, plan_json(hour, lens is not None) | {"best": best}, plan_line(hour, lens is not None, best)
         )
     return 0

@@ -5,7 +5,6 @@ import argparse
 
 from starpos.averaging.sights import circle_of_sight, place_of_sights, read_sights
 from starpos.cli import console, options
-from starpos.cli.console import Output
 from starpos.cli.fix_output import COLUMNS, ELEVATIONS_HEAD, put_combined, put_elevation
 from starpos.cli.inputs import near_of
 from starpos.errors import InstrumentError, StarposError
@@ -24,12 +23,12 @@ def run(args: argparse.Namespace) -> int:
     clock_s = UNKNOWN_CLOCK_S if args.clock_stddev is None else args.clock_stddev
     catalogue, air = load_catalogue(), options.atmosphere_of(args)
     ephemeris = options.ephemeris_of(args)
-    output, used, circles = Output(args, COLUMNS, ELEVATIONS_HEAD), [], []
+    output, used, circles = console.Output(args, COLUMNS, ELEVATIONS_HEAD), [], []
     for sight in sights:
         try:
             circle = circle_of_sight(sight, catalogue, air, clock_s, ephemeris)
         except StarposError as error:
-            console.complain("solve", error)
+            console.complain(error)
             put_elevation(output, sight.source, sight.utc_unix_s, None, vertical, Status.BAD_INPUT.value)
             continue
         used.append(sight)
@@ -41,10 +40,9 @@ def run(args: argparse.Namespace) -> int:
     try:
         place = place_of_sights(used, circles, None if near is None else (near.latitude, near.longitude))
     except StarposError as error:
-        console.complain("solve", error)
+        console.complain(error)
     else:
-        for remark in (*of_average(place), *doubts((), place, None, near)):
-            console.complain("solve", remark)
+        console.complain(*of_average(place), *doubts((), place, None, near))
         about = {} if near is None else {"km_from_near": near.km_from(place.latitude, place.longitude)}
     put_combined(output, None, place, Gathered(), vertical, about)
     return console.NOTHING if place is None else 0

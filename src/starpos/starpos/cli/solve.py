@@ -11,31 +11,6 @@ import numpy as np
 
 from starpos.averaging.elevation_axis import FoundAxis
 from starpos.cli import console, fix_output, inputs, options, overwriting, places_file, sights
-from starpos.cli.console import Output
-from starpos.cli.fix_output import (
-    COLUMNS,
-    ELEVATIONS_HEAD,
-    HEAD,
-    json_about,
-    json_of,
-    json_on_ground,
-    line_of,
-    put_combined,
-    put_elevation,
-    with_heading,
-)
-from starpos.cli.inputs import (
-    NightFolder,
-    checked_tilts,
-    frames_among,
-    given_or_sought,
-    is_untold,
-    near_of,
-    nights_of,
-    reader_of,
-)
-from starpos.cli.options import place_of, tell_unknown, vertical_of
-from starpos.cli.overwriting import Written, save_instrument
 from starpos.earth.place import Place
 from starpos.earth.vertical import Vertical
 from starpos.errors import InstrumentError, StarposError, TiltError
@@ -47,7 +22,6 @@ from starpos.frames.tables import Pointing, read_pointings
 from starpos.gnss import states
 from starpos.gnss.receiver import read_gnss_csv
 from starpos.gnss.solving import Watched
-from starpos.gnss.states import Learned
 from starpos.instrument import instrument_file
 from starpos.instrument.instrument import ByGravity, Instrument
 from starpos.instrument.phone_log import is_phone_log
@@ -73,7 +47,7 @@ from starpos.units import utc_text
 
 def tell(
     args: argparse.Namespace,
-    output: Output,
+    output: console.Output,
     folder: str | None,
     answers: NightAnswers,
     vertical: Vertical,
@@ -87,7 +61,7 @@ def tell(
     work: on the frames, which may say which focal length fits those that were not identified.
     """
     statuses = [] if answers.turned is None else [tell_turned(args, folder, answers.turned)]
-    watched, gathered, complaints = answers.watched, Gathered(), console.FrameComplaints("solve")
+    watched, gathered, complaints = answers.watched, Gathered(), console.FrameComplaints()
     if watched is not None:
         say(folder, *watched.remarks)
         if args.learned is not None:
@@ -101,7 +75,7 @@ def tell(
             complaints(answer.name, s.remark)
         output.put(_json_of_answer(args, answer, vertical, place), _line_of_answer(args, answer, place))
     complaints.end()
-    fixes, headings, near = gathered.fixes, gathered.headings, near_of(args)
+    fixes, headings, near = gathered.fixes, gathered.headings, inputs.near_of(args)
     whole = together(gathered, answers.given, near)
     mean, why = (None, ()) if place is None else fix_output.mean_of(headings)
     unnamed = () if watched is None or answers.instrument is None else of_inclinometer(answers.instrument)
@@ -109,12 +83,14 @@ def tell(
     say(folder, *not_averaged, *(unnamed if fixes else ()), *whole.remarks, *why)
     where, about = whole.average or (fixes[-1] if fixes else None), {}
     if where is not None:
-        tell_unknown("solve", args, vertical.at(where.latitude, where.longitude))
+        options.tell_unknown(args, vertical.at(where.latitude, where.longitude))
         about = {} if near is None else {"km_from_near": near.km_from(where.latitude, where.longitude)}
     if place is not None:
-        about |= with_heading(json_of(whole.average, vertical), mean, place, options.axes_of(args))
+        about |= fix_output.with_heading(
+            fix_output.json_of(whole.average, vertical), mean, place, options.axes_of(args)
+        )
     if where is not None or (headings and place is not None):
-        put_combined(output, folder, whole.average, gathered, vertical, about, mean)
+        fix_output.put_combined(output, folder, whole.average, gathered, vertical, about, mean)
     elif gathered.lost is not None and not headings and work is not None:
         say(folder, *work.fitting(gathered.lost))
     # without tilts headings are all that was asked for, and by day they are all there is
@@ -131,12 +107,14 @@ def _json_of_answer(
     s = answer.solution
     if args.gnss is not None:
         watched = answer.watched or Watched(solution=s)
-        return {"file": answer.name} | json_of_watched(watched) | json_about(s)
-    values = {"file": answer.name} | json_of(s.fix, vertical) | json_about(s)
+        return {"file": answer.name} | json_of_watched(watched) | fix_output.json_about(s)
+    values = {"file": answer.name} | fix_output.json_of(s.fix, vertical) | fix_output.json_about(s)
     if s.circle is not None:
         values |= {"utc": utc_text(s.circle.utc_unix_s)}
         values |= {"zenith_distance_deg": np.degrees(s.circle.zenith_distance)}
-    return values if place is None else with_heading(values, s.at_place, place, options.axes_of(args))
+    return (
+        values if place is None else fix_output.with_heading(values, s.at_place, place, options.axes_of(args))
+    )
 
 
 def _line_of_answer(args: argparse.Namespace, answer: FrameAnswer, place: Place | None) -> str:
@@ -144,7 +122,7 @@ def _line_of_answer(args: argparse.Namespace, answer: FrameAnswer, place: Place 
     if place is not None or s.at_place is not None:
         line = fix_output.heading_line_of(answer.name, s, options.axes_of(args))
     else:
-        line = line_of(answer.name, s, args.self_calibrate)
+        line = fix_output.line_of(answer.name, s, args.self_calibrate)
     if watched is None or watched.compared is None:
         return line
     check = watched.compared
@@ -164,7 +142,7 @@ def tell_turned(args: argparse.Namespace, folder: str | None, turned: TurnedNigh
         return 0 if args.save is None else console.NOTHING
     if args.save is not None:
         about = f"A3 by turning on the spot, {turned.remarks[0]}"
-        save_instrument("solve", args.save, turned.calibrated.instrument, about)
+        overwriting.save_instrument(args.save, turned.calibrated.instrument, about)
     kept = "--save OUT keeps A3 and its errors" if args.save is None else f"{args.save} is written"
     say(folder, *turned.remarks, kept)
     return 0
@@ -173,40 +151,39 @@ def tell_turned(args: argparse.Namespace, folder: str | None, turned: TurnedNigh
 def say(folder: str | None, *texts: object) -> None:
     """Print lines about a whole night on standard error."""
     for text in texts:
-        console.complain("solve", text if folder is None else f"{folder}: {text}")
+        console.complain(text if folder is None else f"{folder}: {text}")
 
 
-def read_receiver(gnss: str | None, learned: str | None, command: str) -> Receiver | None:
+def read_receiver(gnss: str | None, learned: str | None) -> Receiver | None:
     """Read the tables of --gnss and --learned; None without the first.  Raises StarposError."""
     if gnss is None:
         return None
     track, faults = read_gnss_csv(gnss)
-    for fault in faults:
-        console.complain(command, fault)
+    console.complain(*faults)
     before = None if learned is None else states.read_learned(Path(learned))
     return Receiver(track, before)
 
 
-def _save_learned(path: Path, learned: Learned | None) -> None:
+def _save_learned(path: Path, learned: states.Learned | None) -> None:
     if learned is None or not learned.frames:
-        console.complain("solve", f"{path} is not written: no frame with a GNSS place has taught anything")
+        console.complain(f"{path} is not written: no frame with a GNSS place has taught anything")
     else:
         states.save_learned(path, learned)
 
 
 def json_of_watched(told: Watched) -> dict:
     """The keys of --json of a frame that come from its fix, or its heading at GNSS's place, and `gnss`."""
-    keys, check = json_on_ground(told.solution.fix, told.ground), told.compared
+    keys, check = fix_output.json_on_ground(told.solution.fix, told.ground), told.compared
     if (at_place := told.solution.at_place) is not None:
-        keys = with_heading(keys, at_place, at_place.place)
+        keys = fix_output.with_heading(keys, at_place, at_place.place)
     about = ("status", "distance_m", "bearing_deg", "sigma_m")
     return keys | {"gnss": None if check is None else {name: getattr(check, name) for name in about}}
 
 
 def run_pointings(args: argparse.Namespace) -> int:
     """Solve the table of --pointings; returns the exit status."""
-    near = near_of(args)
-    pointings, vertical = read_pointings(args.pointings), vertical_of(args)
+    near = inputs.near_of(args)
+    pointings, vertical = read_pointings(args.pointings), options.vertical_of(args)
     own_level = options.has_own_level(args)
     if args.tilt is None and not own_level:
         raise InstrumentError("--pointings needs the tilts: give --tilt CSV")
@@ -214,9 +191,11 @@ def run_pointings(args: argparse.Namespace) -> int:
     instrument = options.instrument_of(args, NO_CAMERA)
     solver = Solver(instrument, catalogue.load_catalogue(), options.atmosphere_of(args))
     check_save(args, solver.instrument)
-    tilts = NO_TILTS if own_level else checked_tilts("solve", args.tilt, solver.instrument)
+    tilts = NO_TILTS if own_level else inputs.checked_tilts(args.tilt, solver.instrument)
     whole = [p for p in pointings if p.has_roll]
-    output = Output(args, COLUMNS, HEAD if whole else ELEVATIONS_HEAD)
+    output = console.Output(
+        args, fix_output.COLUMNS, fix_output.HEAD if whole else fix_output.ELEVATIONS_HEAD
+    )
     if not whole:
         return _from_elevations(args, output, solver, tilts, pointings, vertical, near)
     found, given = None, solver.instrument if not args.self_calibrate else None
@@ -231,7 +210,7 @@ def run_pointings(args: argparse.Namespace) -> int:
 
 def _from_elevations(
     args: argparse.Namespace,
-    output: Output,
+    output: console.Output,
     solver: Solver,
     tilts: Tilts,
     pointings: Sequence[Pointing],
@@ -242,11 +221,11 @@ def _from_elevations(
     found = from_elevations(solver, pointings, tilts, near, args.self_calibrate)
     for p, circle in zip(pointings, found.circles, strict=True):
         if isinstance(circle, StarposError):
-            console.complain("solve", circle)
+            console.complain(circle)
             status = status_of(p, circle).value
-            put_elevation(output, p.source, p.mid_unix_s, None, vertical, status)
+            fix_output.put_elevation(output, p.source, p.mid_unix_s, None, vertical, status)
         else:
-            put_elevation(output, p.source, p.mid_unix_s, circle.zenith_distance, vertical)
+            fix_output.put_elevation(output, p.source, p.mid_unix_s, circle.zenith_distance, vertical)
     whole, saving = found.together, 0
     if found.axis is not None:
         say(
@@ -258,21 +237,21 @@ def _from_elevations(
     say(None, *([whole.why_not] if whole.why_not else ()), *whole.remarks)
     place, about = whole.average, {}
     if place is not None:
-        tell_unknown("solve", args, vertical.at(place.latitude, place.longitude))
+        options.tell_unknown(args, vertical.at(place.latitude, place.longitude))
         about = {} if near is None else {"km_from_near": near.km_from(place.latitude, place.longitude)}
     if place is not None or whole.why_not:
-        put_combined(output, None, place, Gathered(), vertical, about)
+        fix_output.put_combined(output, None, place, Gathered(), vertical, about)
     return max(saving, 0 if place else console.NOTHING)
 
 
 def _save_axis(args: argparse.Namespace, solver: Solver, axis: FoundAxis | None) -> int:
     """Write the A3 that the elevations determined, as --save asks; console.NOTHING if they did not."""
     if axis is None or axis.stddev_arcsec > WORTH_SAVING_ARCSEC:
-        console.complain("solve", f"{args.save} is not written: the elevations hardly determine A3")
+        console.complain(f"{args.save} is not written: the elevations hardly determine A3")
         return console.NOTHING
     calibration = axis.calibration(solver.instrument.calibration, options.turn_of(args))
     about = f"A3 of elevations alone: the frame's centre to {axis.stddev_arcsec:.2f} arcsec"
-    save_instrument("solve", args.save, replace(solver.instrument, calibration=calibration), about)
+    overwriting.save_instrument(args.save, replace(solver.instrument, calibration=calibration), about)
     return 0
 
 
@@ -290,7 +269,7 @@ def _of_field(args: argparse.Namespace) -> int:
         raise TiltError(f"{args.frames[0]} has its own tilts: leave --tilt out")
     with field.opened(args.frames[0]) as (folder, air):
         args.frames = [str(folder)]
-        if is_untold(args):
+        if inputs.is_untold(args):
             args.instrument = str(folder / field.INSTRUMENT)
         if (args.pressure_hpa, args.temperature_c, args.humidity, args.wavelength_um) == (None,) * 4:
             args.air = air
@@ -299,24 +278,24 @@ def _of_field(args: argparse.Namespace) -> int:
 
 def _run(args: argparse.Namespace) -> int:
     options.check_frames(args)
-    if args.save is not None:
-        overwriting.check(args, Written("--save", args.save, instrument_file.check_replaceable))
-    if args.out is not None:
-        if not places_file.is_places(args.out):
-            raise InstrumentError(
-                f"-o {args.out}: give a name that ends in {' or '.join(places_file.SUFFIXES)}"
-            )
-        overwriting.check(args, Written("-o", args.out, places_file.check_ours))
+    if args.out is not None and not places_file.is_places(args.out):
+        raise InstrumentError(f"-o {args.out}: give a name that ends in {' or '.join(places_file.SUFFIXES)}")
+    overwriting.check(args, save=instrument_file.check_replaceable, out=places_file.check_ours)
     if args.pointings is not None:
         return run_pointings(args)
-    vertical = vertical_of(args)
-    place = place_of(args, vertical)
-    output = Output(
-        args, *((COLUMNS, HEAD) if place is None else (fix_output.HEADING_COLUMNS, fix_output.HEADING_HEAD))
+    vertical = options.vertical_of(args)
+    place = options.place_of(args, vertical)
+    output = console.Output(
+        args,
+        *(
+            (fix_output.COLUMNS, fix_output.HEAD)
+            if place is None
+            else (fix_output.HEADING_COLUMNS, fix_output.HEADING_HEAD)
+        ),
     )
-    near_of(args)
+    inputs.near_of(args)
     own_level = options.has_own_level(args)
-    receiver = read_receiver(args.gnss, args.learned, "solve")
+    receiver = read_receiver(args.gnss, args.learned)
     if receiver is not None and own_level:
         raise InstrumentError(
             "--gnss teaches an inclinometer, and this camera is its own level: leave --gnss out"
@@ -326,14 +305,14 @@ def _run(args: argparse.Namespace) -> int:
     needs_no_tilt = own_level or (
         (place is not None or receiver is not None) and not any(map(os.path.isdir, args.frames))
     )
-    given = nights_of(frames_among(args.frames, args.tilt, args.gnss), args.tilt, needs_no_tilt)
+    given = inputs.nights_of(inputs.frames_among(args.frames, args.tilt, args.gnss), args.tilt, needs_no_tilt)
     if args.save is not None and len(given) > 1:
         raise InstrumentError("--save writes the A3 of one night: give one")
-    nights = [night for night in given if isinstance(night, NightFolder)]
+    nights = [night for night in given if isinstance(night, inputs.NightFolder)]
     by_gravity = not needs_no_tilt and any(night.tilt is None for night in nights)
     by_log = args.tilt is not None and is_phone_log(Path(args.tilt)) and are_photographs(args.frames)
-    read = reader_of(args, by_gravity or by_log)
-    statuses = [_refused(why, given) for why in given if not isinstance(why, NightFolder)]
+    read = inputs.reader_of(args, by_gravity or by_log)
+    statuses = [_refused(why, given) for why in given if not isinstance(why, inputs.NightFolder)]
     with inputs.workers_of(args, [path for night in nights for path in night.frames]) as workers:
         plans = []
         abouts = workers.map((First(read, by_gravity), night.frames) for night in nights)
@@ -360,13 +339,13 @@ def _refused(why: StarposError, given: list) -> int:
     """Complain about a night that cannot be worked on; raises the error if it is the only night."""
     if len(given) == 1:
         raise why
-    console.complain("solve", why)
+    console.complain(why)
     return console.UNREADABLE
 
 
 def _work(
     args: argparse.Namespace,
-    night: NightFolder,
+    night: inputs.NightFolder,
     about: About | None,
     own_level: bool,
     place: Place | None,
@@ -378,14 +357,13 @@ def _work(
     if about is None:
         return Solving(Instruments(None), atmosphere=air)
     tilt = Path(night.tilt) if night.tilt is not None else ByGravity() if by_gravity else None
-    work, remarks = work_of(given_or_sought(args, about), about, tilt, air, place)
+    work, remarks = work_of(inputs.given_or_sought(args, about), about, tilt, air, place)
     work = replace(work, ephemeris=options.ephemeris_of(args))
-    for remark in remarks:
-        console.complain("solve", remark)
+    console.complain(*remarks)
     assert work.instruments.instrument is not None
     if work.instruments.sought:
         BlindSolver(catalogue.load_catalogue(), console.ProgressBar()).prepare()
         return work
     check_save(args, work.instruments.instrument)
-    inputs.prepare("solve", work.instruments.instrument, about)
+    inputs.prepare(work.instruments.instrument, about)
     return replace(work, tilts=NO_TILTS) if own_level else work

@@ -7,10 +7,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from starpos.cli import console
-from starpos.cli.console import Output
 from starpos.cli.places_file import feature_collection
 from starpos.earth import geoid
-from starpos.earth.geoid import Geoid
 from starpos.units import utc_text
 from starpos.zenith.stations import Station, against_grid, read_session, stations_of
 
@@ -19,12 +17,11 @@ def run(args: argparse.Namespace) -> int:
     stations = stations_of([read_session(path) for path in args.sessions])
     grid = None if args.geoid is None else geoid.read(args.geoid)
     for station in stations:
-        if station.doubt:
-            console.complain("stations", station.doubt)
+        console.complain(station.doubt)
     values = [station_json(station, grid) for station in stations]
     if grid is not None and (without := [v["station"] for v in values if v["grid_arcsec"] is None]):
-        console.complain("stations", f"{args.geoid}: no data at {', '.join(without)}")
-    output = Output(args, tuple(flat(values[0])), "")
+        console.complain(f"{args.geoid}: no data at {', '.join(without)}")
+    output = console.Output(args, tuple(flat(values[0])), "")
     if args.geojson:
         console.print_json(_geojson(values))
     else:
@@ -33,10 +30,11 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def station_json(station: Station, grid: Geoid | None) -> dict:
+def station_json(station: Station, grid: geoid.Geoid | None) -> dict:
     """A station for --json; its keys with a grid are None without one, or where that has no data."""
     sigma_xi, sigma_eta = station.sigma
     compared = None if grid is None else against_grid(station, grid)
+    of_grid, off, stddev = compared or (None, None, None)
     return {
         "station": station.name,
         "latitude": np.degrees(station.place.latitude),
@@ -55,9 +53,9 @@ def station_json(station: Station, grid: Geoid | None) -> dict:
         "chi2": station.chi2,
         "degrees": station.degrees,
         "probability": station.probability,
-        "grid_arcsec": None if compared is None else [compared.grid.xi_arcsec, compared.grid.eta_arcsec],
-        "minus_grid_arcsec": None if compared is None else compared.off,
-        "minus_grid_sigma_arcsec": None if compared is None else compared.stddev,
+        "grid_arcsec": of_grid and [of_grid.xi_arcsec, of_grid.eta_arcsec],
+        "minus_grid_arcsec": off,
+        "minus_grid_sigma_arcsec": stddev,
     }
 
 

@@ -6,8 +6,7 @@ from collections.abc import Sequence
 from html import escape
 from pathlib import Path
 
-from starpos.errors import InstrumentError
-from starpos.files import write_whole
+from starpos.files import save
 from starpos.night.watching import Kept
 from starpos.report.html import document, wide_table
 from starpos.units import ARCSEC, utc_text
@@ -66,7 +65,7 @@ def alarm_of(night: Kept) -> str:
 
 
 def write_page(path: Path, nights: Sequence[Kept]) -> None:
-    """Write the history as a page; raises InstrumentError if it cannot be written."""
+    """Write the history as a page; raises WriteError if it cannot be written."""
     rows = [values_of(n) for n in nights]
     most = max([1.0, *(r["moved_arcsec"] for r in rows)])
     step = WIDTH / max(len(rows), 1)
@@ -91,7 +90,4 @@ def write_page(path: Path, nights: Sequence[Kept]) -> None:
         f'<svg width="{WIDTH}" height="{HEIGHT}">{bars}</svg>',
         wide_table([name for name, _ in COLUMNS.values()], cells),
     )
-    try:
-        write_whole(path, document(TITLE, parts).encode())
-    except OSError as e:
-        raise InstrumentError(f"{path}: the page cannot be written there ({e.strerror})") from None
+    save(path, document(TITLE, parts).encode(), "the page")

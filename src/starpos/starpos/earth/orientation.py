@@ -163,9 +163,10 @@ def earth_orientation(utc_unix_s: float) -> EarthOrientation:
     table = _table()
     mjd = utc_unix_s / DAY_S + UNIX_EPOCH_JD - 2400000.5
     beyond = mjd - table.mjd[-1]
+    last_year = 2000 + (table.mjd[-1] - 51544.5) / 365.25
     if mjd < FIRST_MJD or beyond > EXTRAPOLATION_DAYS[-1]:
         raise TimeError(
-            f"{utc_text(utc_unix_s)} lies outside the IERS tables (1973 to {_year(table.mjd[-1]):.1f}, and three years "
+            f"{utc_text(utc_unix_s)} lies outside the IERS tables (1973 to {last_year:.1f}, and three years "
             "of extrapolation): check the frame's clock, or upgrade astropy-iers-data"
         )
     leap = tai_minus_utc(utc_unix_s)
@@ -281,7 +282,3 @@ def station_velocity(zenith_itrs: np.ndarray) -> np.ndarray:
     """Velocity (3,) of the rotating ground in units of c, ITRS, at the place whose zenith is zenith_itrs (3,)."""
     radius = EQUATOR_RADIUS_M / math.sqrt(1 - ECCENTRICITY2 * zenith_itrs[2] ** 2)
     return ROTATION_RAD_S / SPEED_OF_LIGHT * radius * np.array([-zenith_itrs[1], zenith_itrs[0], 0.0])
-
-
-def _year(mjd: float) -> float:
-    return 2000.0 + (mjd - 51544.5) / 365.25

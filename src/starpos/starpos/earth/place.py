@@ -11,7 +11,7 @@ from starpos.earth.ellipsoid import curvature_radii_m, enu_axes, zenith_of
 from starpos.earth.vertical import Deflection, Vertical, astronomic, geodetic
 from starpos.errors import PlaceError
 from starpos.frozen import at_once
-from starpos.rotation import half_turn
+from starpos.rotation import about_axis, half_turn
 from starpos.units import ARCSEC
 
 # a survey mark's place is known to less than a millimetre of up
@@ -54,9 +54,9 @@ class Place:
     longitude: float
     plumb: tuple[float, float]
     covariance: np.ndarray
-    deflection: Deflection
-    plumb_stddev: float
-    ellipsoid_stddev: float
+    deflection: Deflection = UNDEFLECTED
+    plumb_stddev: float = 0.0
+    ellipsoid_stddev: float = 0.0
     height_m: float = math.nan
     utc_unix_s: float = math.nan
 
@@ -80,9 +80,6 @@ class Place:
             longitude=longitude,
             plumb=(latitude, longitude),
             covariance=np.asarray(covariance, float),
-            deflection=UNDEFLECTED,
-            plumb_stddev=0.0,
-            ellipsoid_stddev=0.0,
             height_m=height_m,
             utc_unix_s=utc_unix_s,
         ).deflected(vertical)
@@ -104,7 +101,6 @@ class Place:
             plumb=plumb,
             covariance=np.asarray(covariance, float),
             deflection=ground.deflection,
-            plumb_stddev=0.0,
             ellipsoid_stddev=ground.deflection.stddev_arcsec * ARCSEC,
         )
 
@@ -139,6 +135,12 @@ class Place:
     def plumb_axes(self) -> np.ndarray:
         """Rotation (3, 3) of ITRS into east, north, up by the plumb line."""
         return enu_axes(*self.plumb)
+
+    @property
+    def to_geodetic_north(self) -> np.ndarray:
+        """Rotation (3, 3) about up from the plumb line's north to the ellipsoid's."""
+        north = self.axes @ self.plumb_axes[1]
+        return about_axis(2, -math.atan2(north[0], north[1]))
 
     @property
     def zenith_root(self) -> np.ndarray:

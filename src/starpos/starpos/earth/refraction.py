@@ -4,6 +4,7 @@
 The paper puts aberration in the same place; docs/the_paper.md#matrix-a2 says where it is here.
 """
 
+import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -19,6 +20,9 @@ STANDARD_TEMPERATURE_C = 15.0
 MIN_PRESSURE_PA, MAX_PRESSURE_PA = 30_000.0, 120_000.0
 # ERFA's own limit: below 3 deg of altitude the two-constant model has no meaning.
 MIN_COS_ZENITH = 0.05
+# True altitude below which that model is off by arcseconds, and more and more; what refraction at the horizon changes by
+# from day to day, and how large it is; rad.
+LOW, LAYERS, AT_HORIZON = math.radians(10.0), math.radians(0.16), math.radians(29 / 60)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -107,10 +111,32 @@ class Atmosphere:
         a, b = self._constants
         return Refraction(a * factor, b * factor)
 
+    def raised(self, true: np.ndarray) -> tuple[np.ndarray, float]:
+        """An unrefracted direction (3,) in L as it is seen, down to the horizon, and the error of its altitude, rad.
+
+        Below LOW by Saemundsson's formula (1986, Sky and Telescope 72, 70), from where ERFA's ends.  There the layers of
+        the air count: at the horizon they change by LAYERS (Schaefer and Liller 1990, PASP 102, 796).
+        """
+        altitude = math.asin(true[2])
+        if altitude >= LOW or self.pressure_pa == 0:
+            bent = self.refraction().bend(true)
+            return bent, math.dist(bent, true) * self.relative_sigma
+        low = np.array([math.cos(LOW), 0.0, math.sin(LOW)])
+        size = math.dist(self.refraction().bend(low), low) * _saemundsson(altitude) / _saemundsson(LOW)
+        level = true[:2] / math.hypot(*true[:2]) * math.cos(altitude + size)
+        layers = LAYERS * (size / AT_HORIZON) ** 3
+        return np.array([*level, math.sin(altitude + size)]), math.hypot(size * self.relative_sigma, layers)
+
     @cached_property
     def _constants(self) -> tuple[float, float]:
         a, b = erfa.refco(self.pressure_pa / 100, self.temperature_c, self.humidity, self.wavelength_um)
         return float(a), float(b)
+
+
+def _saemundsson(altitude: float) -> float:
+    """Refraction of a true altitude, rad, over a constant."""
+    degrees = math.degrees(altitude)
+    return 1 / math.tan(math.radians(degrees + 10.3 / (degrees + 5.11)))
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,8 @@ from starpos.frozen import at_once
 
 # Names of frames, as docs/frames_and_symbols.md has them.
 CAMERA, LINK, ITRS, GCRS, ENU = "camera", "link", "ITRS", "GCRS", "ENU"
+# Variance (rad2) of the turn about the only direction that is seen, and from which it is said to be unknown.
+ANY_TURN, UNKNOWN_TURN = 10.0, 1.0
 
 
 @at_once
@@ -81,7 +83,7 @@ class Attitude:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class CameraAttitude:
-    """Attitude of the camera at one time, by its stars alone.
+    """Attitude of the camera at one time, by its stars alone, or by the Sun alone but for the turn about its direction.
 
     utc_unix_s: middle of the exposure, None where it is not known; stamp_stddev_s, clock_stddev_s: of that stamp, and
     of the clock that made it against UTC.  frame_id: the camera's, in a graph of nodes.
@@ -98,6 +100,13 @@ class CameraAttitude:
     covariance: np.ndarray
     stars: int
     log_odds: float
+
+    @property
+    def ray(self) -> np.ndarray | None:
+        """The Sun's direction (3,) in C, about which the attitude is not known; None for one by stars."""
+        variance, axes = np.linalg.eigh(self.covariance)
+        ray = axes[:, 2]
+        return math.copysign(1.0, ray[2]) * ray if variance[2] > UNKNOWN_TURN else None
 
 
 def heading_of(link_to_enu: np.ndarray) -> float:

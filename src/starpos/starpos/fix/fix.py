@@ -11,6 +11,7 @@ import numpy as np
 
 from starpos import rotation
 from starpos._numeric.roots import symmetric_root
+from starpos.earth.ellipsoid import curvature_radii_m, enu_axes
 from starpos.earth.vertical import Geodetic, Vertical, geodetic
 from starpos.fix.attitude import CAMERA, ITRS, Attitude, heading_of
 from starpos.fix.budget import (
@@ -26,7 +27,7 @@ from starpos.fix.budget import (
 )
 from starpos.fix.sighting import FittedSighting, fitted_fields
 from starpos.fix.star_fit import MatchedStars, apparent, fit_stars
-from starpos.fix.terms import ErrorTerm, total_covariance
+from starpos.fix.terms import ErrorTerm, Origin, total_covariance
 from starpos.frames.tables import Pointing
 from starpos.frozen import at_once
 from starpos.instrument.camera import Camera
@@ -183,6 +184,14 @@ class Fix(PlaceFix, FittedSighting):
     def link(self) -> Attitude:
         """Attitude of the base link in east, north, up."""
         return link_attitude(self.link_to_enu, self.terms)
+
+    @cached_property
+    def zenith_by_stars(self) -> np.ndarray:
+        """Covariance (3, 3) in rad2 of the zenith in ITRS by the errors of the stars, the air and the time."""
+        radii = np.array(curvature_radii_m(self.latitude))
+        axes = enu_axes(self.latitude, self.longitude)[:2] / radii[:, None]
+        of_stars = total_covariance([t for t in self.terms if t.origin is Origin.OTHER])
+        return axes.T @ of_stars[:2, :2] @ axes
 
 
 def solve_fix(stars: MatchedStars, tilt: Tilt, about: Circumstances) -> Fix:

@@ -43,7 +43,7 @@ from starpos.frames.tables import Pointing
 from starpos.identification import MIN_STARS, Identification, PointingPrior, Sky, field_of, fisheye, identify
 from starpos.identification._frame import FrameStars, all_within, ideal_frame, mean_sigma, unit_vectors
 from starpos.identification.pose import MIN_SIGMA_PX, TEST_STARS
-from starpos.identification.prior import Hint
+from starpos.identification.prior import AimPrior, Hint
 from starpos.identification.search import (
     Look,
     Priors,
@@ -100,11 +100,19 @@ def high_enough(sines: np.ndarray) -> np.ndarray:
     return sines > math.sin(MIN_ALTITUDE_RAD)
 
 
+def _aims(stars: Stars, field: FrameStars | fisheye.WideField) -> tuple[AimPrior, ...]:
+    """Where a frame's header says that it looks; a fisheye is not pointed."""
+    if stars.aim_deg is None or not isinstance(field, FrameStars):
+        return ()
+    ra, dec = np.radians(stars.aim_deg).tolist()
+    return (AimPrior(rotation.unit_vector(ra, dec)),)
+
+
 # how stars are identified: the field, the sky, the camera
 _Search = Callable[[FrameStars | fisheye.WideField, Sky, Camera], Identification | None]
 
 ENOUGH_SOUND = 8
-SMALLEST_FIELD_DEG, LARGEST_FIELD_DEG = 0.3, 100.0
+SMALLEST_FIELD_DEG, LARGEST_FIELD_DEG = 0.3, 130.0
 
 
 # A fisheye of which only the focal length is known misplaces stars by about this, outwards: it cancels where they lie all
@@ -157,7 +165,9 @@ class Solver:
         Stars without a time have J2000 places.
         part: of the frame in which its stars lie, as a share of its size: triangles that are looked up are no larger.
         """
-        return self._identified(stars, part, lambda field, sky, _: identify(field, sky, predicted))
+        return self._identified(
+            stars, part, lambda field, sky, _: identify(field, sky, (*predicted, *_aims(stars, field)))
+        )
 
     def look_again(self, stars: Stars, look: Look, predicted: Priors = (), part: float = 1.0) -> Solution:
         """Identify stars that alone are too few, by what their frame shows where others should be.
@@ -169,7 +179,7 @@ class Solver:
             field: FrameStars | fisheye.WideField, sky: Sky, camera: Camera
         ) -> Identification | None:
             if isinstance(field, FrameStars):
-                return second_look(field, sky, predicted, camera, look)
+                return second_look(field, sky, (*predicted, *_aims(stars, field)), camera, look)
             return None
 
         return self._identified(stars, part, by_looking)
@@ -222,7 +232,8 @@ class Solver:
             sky = Sky(catalogue, triangles, state.year, tuple(state.velocity))
             field = field_of(directions, mean_sigma(stars.covariance), camera, stars.window)
             if known is None:
-                found = identify(field, sky, (*predicted, *(hint.priors(state, g[2]) if hint else ())))
+                priors = (*predicted, *(hint.priors(state, g[2]) if hint else ()), *_aims(stars, field))
+                found = identify(field, sky, priors)
             elif isinstance(known, Hint):
                 found = identify_near(field, sky, known.priors(state, g[2]))
             else:
@@ -435,7 +446,7 @@ class Solver:
                 f"from {SMALLEST_FIELD_DEG:g} to {LARGEST_FIELD_DEG:g} deg: check focal length and pixel size, and "
                 "whether the lens is a fisheye (equidistant)"
             )
-        return camera, deeper.for_field(self.catalogue, camera, self.progress)
+        return camera, deeper.for_field(self.catalogue, camera)
 
     def triangles_of(
         self, width: int, height: int, part: float, origin_px: tuple[float, float] | None = None

@@ -8,6 +8,8 @@ lamp, and makes the attitude better than by either. Without a place one frame gi
 import math
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -15,12 +17,13 @@ from starpos import rotation
 from starpos._numeric.roots import symmetric_root
 from starpos.earth.orientation import EarthState, earth_state, station_velocity
 from starpos.earth.place import Place, Places
-from starpos.earth.refraction import MIN_COS_ZENITH
+from starpos.earth.refraction import MIN_COS_ZENITH, Atmosphere
 from starpos.errors import FixError, InstrumentError, PlaceError, StarposError
-from starpos.fix.attitude import CAMERA, ITRS, Attitude
-from starpos.fix.budget import sky_terms, tilt_terms
-from starpos.fix.checks import MIN_DEG
+from starpos.fix.attitude import ANY_TURN, CAMERA, ITRS, Attitude, CameraAttitude, heading_of
+from starpos.fix.budget import level_rows, local_north, mount_term, sky_rows, sky_terms, tilt_terms
+from starpos.fix.checks import MIN_DEG, check_unmoved
 from starpos.fix.circle import MIN_SINE, Circle, circle_along
+from starpos.fix.fix import Fix
 from starpos.fix.glows import Glow
 from starpos.fix.heading import AttitudeAtPlace, attitudes_at, zenith_moved
 from starpos.fix.solution import Solution
@@ -39,6 +42,10 @@ LENS_SHARE = 1e-3
 SIZE_SHARE, SIZE_PX, WIDEST_GLOW = 0.06, 1.0, math.radians(10.0)
 # A body's altitude by the level differs from the ephemeris' by at most this; a glow may be a lamp as well.
 LIMB_SIGMAS, GLOW_SIGMAS = 5.3, 3.0
+# of the lowest true altitude, -0.2 deg: there the disc stands on the horizon
+LOWEST_SINE = -0.0035
+# of two discs the brighter is the Sun
+BOTH = SUN, MOON
 # a lens in which the Sun's radius is larger, px, shows its limb: there a glow is a lamp or a cloud
 RESOLVED_PX = 6.0
 
@@ -74,6 +81,50 @@ class _Seen:
         )
 
 
+def sun_alone(solver: Solver, stars: Stars, disc: Disc, frame_id: str) -> CameraAttitude | None:
+    """The attitude of a frame that shows the Sun, but for the turn about it; None for a disc of another size."""
+    if stars.mid_unix_s is None:
+        return None
+    try:
+        state, camera, seen, stamp_s = _looked_at(solver, stars, disc, earth_state(stars.mid_unix_s))
+        body = body_at(SUN, state, solver.ephemeris)
+        _check_size(disc, seen, body, camera, stars.place)
+    except StarposError:
+        return None
+    if seen.ray[2] <= 0:
+        return None
+    own = np.column_stack([seen.own, seen.lens, np.eye(3) * body.sigma])
+    turns = np.cross(seen.ray, own.T)
+    return CameraAttitude(
+        utc_unix_s=state.utc_unix_s,
+        stamp_stddev_s=stamp_s,
+        clock_stddev_s=solver.clock_stddev_s(stars),
+        frame_id=frame_id,
+        camera_to_gcrs=rotation.shortest_turn(seen.ray, state.gcrs_to_itrs.T @ body.itrs),
+        covariance=turns.T @ turns + ANY_TURN * np.outer(seen.ray, seen.ray),
+        stars=0,
+        log_odds=0.0,
+    )
+
+
+def _looked_at(
+    solver: Solver, stars: Stars, disc: Disc, state: EarthState
+) -> tuple[EarthState, Camera, _Seen, float]:
+    """The state at the disc's row, the camera, the disc as a direction, and the error of its time, s."""
+    shutter = solver.shutter(stars)
+    row = np.array([disc.y])
+    if late_s := float(shutter.later_s(row, stars.height)[0]):
+        state = earth_state(state.utc_unix_s + late_s)
+    camera = solver.instrument.camera_for(stars.width, stars.height, stars.origin_px)
+    seen = _Seen.of(disc, camera, stars.place)
+    return (
+        state,
+        camera,
+        seen,
+        math.hypot(stars.stamp_stddev_s, *shutter.errors_s(row, stars.height)[0].tolist()),
+    )
+
+
 def by_sun(solver: Solver, stars: Stars, disc: Disc, tilts: Tilts | None, places: Places | None) -> Solution:
     """The attitude of a frame that shows the Sun or the Moon, or without a known place its circle of equal altitude.
 
@@ -92,47 +143,179 @@ def by_sun(solver: Solver, stars: Stars, disc: Disc, tilts: Tilts | None, places
                 "known place, or state it"
             )
         state, tilt = solver.levelled(stars, tilts or NO_TILTS)
-        shutter = solver.shutter(stars)
-        late_s = float(shutter.later_s(np.array([disc.y]), stars.height)[0])
-        if late_s:
-            state = earth_state(state.utc_unix_s + late_s)
-        camera = solver.instrument.camera_for(stars.width, stars.height, stars.origin_px)
-        seen = _Seen.of(disc, camera, stars.place)
-        stamp_s = math.hypot(
-            stars.stamp_stddev_s, *shutter.errors_s(np.array([disc.y]), stars.height)[0].tolist()
-        )
+        state, camera, seen, stamp_s = _looked_at(solver, stars, disc, state)
         if not disc.sharp:
             sigma = float(np.linalg.norm(seen.own)) / math.sqrt(2)
             glow = Glow(state.utc_unix_s, seen.ray, body_at(SUN, state, solver.ephemeris).itrs, sigma)
+        looked = partial(_looks, solver, stars, disc, camera=camera, state=state)
         if places is None:
+            if disc.other is not None:
+                with suppress(PlaceError):
+                    fix = _two_body_fix(solver, stars, looked(BOTH), tilt, state, stamp_s)
+                    return Solution.of(stars, f"fix by {_named(BOTH)}", fix=fix, tilt=tilt, bodies=BOTH)
             return replace(_on_circle(solver, stars, disc, seen, tilt, state, stamp_s), glow=glow)
-        place, wrong = places.at(state.utc_unix_s), None
-        for name in (SUN, MOON) if disc.sharp else (SUN,):
-            try:
-                body = body_at(name, state, solver.ephemeris)
-                _check_size(disc, seen, body, camera, stars.place)
-                found = _attitude(solver, stars, disc, seen, body, tilt, state, place, stamp_s)
-            except PlaceError as error:
-                wrong = wrong or error
-                continue
-            return Solution.of(
-                stars,
-                f"{found.text}, by the {name.title()}",
-                at_place=found,
-                tilt=tilt,
-                bodies=(name,),
-                glow=glow,
-                extrapolated_days=state.orientation.extrapolated_days,
+        place, wrong = places.at(state.utc_unix_s), []
+        found: dict[tuple[str, ...], AttitudeAtPlace] = {}
+        for names in (BOTH,) * (disc.other is not None) + ((SUN,), (MOON,))[: 1 + disc.sharp]:
+            if BOTH not in found:
+                try:
+                    found[names] = _attitude(solver, stars, looked(names), tilt, state, place, stamp_s)
+                except PlaceError as error:
+                    wrong.append(error)
+        if not found:
+            raise wrong[0 if disc.other is None else 1]
+        (names, attitude), *others = found.items()
+        if others and np.linalg.norm(np.subtract(*(body_at(n, state).itrs for n in BOTH))) > NEAREST:
+            raise FixError(
+                f"{stars.place}: the Sun and the Moon stand equally high, and the disc may be either: wait some minutes"
             )
-        assert wrong is not None
-        raise wrong
+        return Solution.of(
+            stars,
+            f"{attitude.text}, by {_named(names)}",
+            at_place=attitude,
+            tilt=tilt,
+            bodies=names,
+            glow=None if names == BOTH else glow,
+            extrapolated_days=state.orientation.extrapolated_days,
+        )
     except StarposError as error:
         return replace(Solution.refused(stars, error), glow=glow)
 
 
-def _check_size(disc: Disc, seen: _Seen, body: Body, camera: Camera, place: str) -> None:
+def _named(names: tuple[str, ...]) -> str:
+    return " and ".join(f"the {name.title()}" for name in names)
+
+
+@dataclass(frozen=True, eq=False)
+class _Look:
+    """A disc as it is seen, and the body that it is taken for.  sharp: whether its limb was fitted."""
+
+    seen: _Seen
+    body: Body
+    sharp: bool
+
+
+def _looks(
+    solver: Solver, stars: Stars, disc: Disc, names: tuple[str, ...], *, camera: Camera, state: EarthState
+) -> list[_Look]:
+    """The discs of a frame as these bodies; PlaceError if one is of another size."""
+    found = []
+    for name, one in zip(names, (disc, disc.other), strict=False):
+        assert one is not None
+        seen, body = _Seen.of(one, camera, stars.place), body_at(name, state, solver.ephemeris)
+        # where the Moon stands as it must from a glow, that is no lamp
+        _check_size(one, seen, body, camera, stars.place, alone=len(names) == 1)
+        found.append(_Look(seen, body, one.sharp))
+    return found
+
+
+# A second body is where it must be to this many sigma; and so near each other two determine no attitude, rad.
+SECOND_SIGMAS, NEAREST = 5.0, math.radians(2.0)
+PARALLAX_ROUNDS = 6
+# of errors that are each body's own; all others have one cause for all
+EACH_ITS_OWN = ("disc", "ephemeris")
+
+
+def _of_all(by: list[np.ndarray], terms: list[tuple[ErrorTerm, ...]]) -> list[ErrorTerm]:
+    """The terms of several directions, the same ones of each; by (r, 2): the factors' rows for its components."""
+    found = []
+    for of_each in zip(*terms, strict=True):
+        parts = [row @ term.factor for row, term in zip(by, of_each, strict=True)]
+        whole = np.hstack(parts) if of_each[0].name in EACH_ITS_OWN else np.sum(parts, 0)
+        found.append(replace(of_each[0], factor=whole))
+    return found
+
+
+def _two_body_fix(
+    solver: Solver, stars: Stars, looks: list[_Look], tilt: Tilt, state: EarthState, stamp_s: float
+) -> Fix:
+    """Place and attitude by two bodies and the level; PlaceError if they are not as far apart as they must be."""
+    camera = solver.instrument.camera_for(stars.width, stars.height, stars.origin_px)
+    about = solver.circumstances(stars, camera, state)
+    mounting, air = about.mounting, about.atmosphere
+    level = mounting.level(tilt)
+    g = level.camera
+    raised = np.array([g @ look.seen.ray for look in looks])
+    if raised[:, 2].min() < MIN_COS_ZENITH:
+        raise PlaceError(
+            f"{stars.place}: by the level one of its two bright discs is below {MIN_DEG:.0f} deg"
+        )
+    there = air.refraction().unbend(raised)
+    if np.linalg.norm(there[0] - there[1]) < NEAREST:
+        raise PlaceError(f"{stars.place}: its two bright discs are too near each other for a position")
+    variances = np.array(
+        [np.sum(s.own**2) / 2 + np.sum(s.lens**2) + b.sigma**2 for s, b in ((k.seen, k.body) for k in looks)]
+    )
+    zenith, a4 = None, np.eye(3)
+    # the Moon's parallax follows the zenith, of which it is a sixtieth
+    for _ in range(PARALLAX_ROUNDS):
+        sky = np.array([k.body.itrs if zenith is None else k.body.from_place(zenith) for k in looks])
+        a4 = rotation.best_rotation(sky, there, 1 / variances)
+        zenith = a4[2]
+    across = [_across(v) for v in there]
+    turned = [np.cross(v, c) for v, c in zip(there, across, strict=True)]
+    spread = np.linalg.inv(sum(t.T @ t / v for t, v in zip(turned, variances, strict=True)))
+    by = [spread @ t.T / v for t, v in zip(turned, variances, strict=True)]
+    off = there - sky @ a4.T
+    sigmas = math.sqrt(float(np.sum(off**2 / variances[:, None])))
+    if sigmas > SECOND_SIGMAS:
+        apart = [math.degrees(2 * math.asin(np.linalg.norm(v[0] - v[1]) / 2)) for v in (there, sky)]
+        names = _named(tuple(k.body.name for k in looks))
+        raise PlaceError(
+            f"{stars.place}: its two bright discs are {apart[0]:.2f} deg apart, and {names} {apart[1]:.2f}"
+        )
+    place = local_north(a4)
+    link_to_enu = place.local_to_enu @ g @ mounting.link_to_camera
+    of_sky, of_level = sky_rows(place), level_rows(place, link_to_enu)
+    of_bodies = [
+        (
+            ErrorTerm("disc", c @ g @ k.seen.own),
+            ErrorTerm("lens", c @ g @ k.seen.lens, shared=ALWAYS),
+            ErrorTerm("ephemeris", np.eye(2) * k.body.sigma, shared=ALWAYS),
+            ErrorTerm("refraction", c @ (seen - v)[:, None] * air.relative_sigma, shared=ALWAYS),
+        )
+        for k, c, v, seen in zip(looks, across, there, raised, strict=True)
+    ]
+    terms = (
+        *_of_all([of_sky @ row for row in by], of_bodies),
+        *tilt_terms(of_level, level, tilt, mounting, state.utc_unix_s),
+        *sky_terms(of_sky, state, about.clock_stddev_s, stamp_s, a4),
+        *mount_term("mount", link_to_enu, mounting.link_stddev_rad),
+    )
+    own = total_covariance(_of_all(by, [terms[:1] for terms in of_bodies]))
+    axes = rotation.shortest_turn(np.array([0.0, 0.0, 1.0]), level.up)[:, :2]
+    fix = Fix(
+        utc_unix_s=state.utc_unix_s,
+        camera=Attitude(a4.T @ g, a4.T @ own @ a4, of=CAMERA, into=ITRS),
+        stamp_stddev_s=stars.stamp_stddev_s,
+        clock_stddev_s=about.clock_stddev_s,
+        tilt=tilt,
+        residual_arcsec=math.sqrt(float(np.mean(off**2))) / ARCSEC,
+        zenith_distance=math.acos(min(max(float(g[2] @ camera.centre_ray), -1.0), 1.0)),
+        refraction_arcsec=math.dist(raised[0], there[0]) / ARCSEC,
+        diurnal_aberration_arcsec=math.hypot(*station_velocity(a4[2])) / ARCSEC,
+        ut1_minus_utc_s=state.orientation.ut1_minus_utc_s,
+        latitude=place.latitude,
+        longitude=place.longitude,
+        heading=heading_of(link_to_enu),
+        link_to_enu=link_to_enu,
+        terms=terms,
+        levelling=of_level @ (level.turns @ axes),
+        **NO_STARS_FITTED,
+    )
+    check_unmoved(fix, solver.instrument)
+    return fix
+
+
+def _across(direction: np.ndarray) -> np.ndarray:
+    """Unit vectors (2, 3) across a direction (3,): sideways and upwards."""
+    along = np.array([-direction[1], direction[0], 0.0]) / math.hypot(direction[0], direction[1])
+    return np.stack([along, np.cross(direction, along)])
+
+
+def _check_size(disc: Disc, seen: _Seen, body: Body, camera: Camera, place: str, alone: bool = True) -> None:
     """Raise PlaceError if a disc is not as wide as the body."""
-    if not disc.sharp and body.radius * disc.radius_px > RESOLVED_PX * seen.radius:
+    if alone and not disc.sharp and body.radius * disc.radius_px > RESOLVED_PX * seen.radius:
         raise PlaceError(
             f"{place}: a bright spot without a limb, in a lens that shows the Sun's: it is a lamp or a cloud, or the Sun "
             "without a filter, behind which alone such a lens may look at it"
@@ -177,136 +360,113 @@ def _on_circle(
     return Solution.of(stars, text, circle=circle, tilt=tilt, bodies=(SUN,))
 
 
-@dataclass(frozen=True, eq=False)
-class _Adjusted:
-    """An attitude by two directions, a body's and up, each in two components across it, of which one is superfluous.
-
-    g (3, 3): C into east, north, up.  by_body, by_up (3, 2): its rotation for an error of a component of each.
-    """
-
-    g: np.ndarray
-    by_body: np.ndarray
-    by_up: np.ndarray
-
-
+# what a FittedSighting says of stars
+NO_STARS_FITTED: dict[str, Any] = {
+    "used": np.zeros(0, int),
+    "residual_px": np.zeros((0, 2)),
+    "jitter_px": 0.0,
+    "focal_scale": 1.0,
+}
 # change of up's components, towards east and north, by a small rotation
 OF_UP = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
-
-
-@dataclass(frozen=True, eq=False)
-class _TwoDirections:
-    """A body seen where the level says it is, and where the ephemeris does; components are sideways and upwards.
-
-    g (3, 3): C into east, north, up by the level and the body's azimuth.
-    bent (3,): the body's direction as the ephemeris and the air have it, in east, north, up.
-    components (2, 3): unit vectors across it.  turned (2, 3): its components' change by a small rotation.
-    """
-
-    g: np.ndarray
-    bent: np.ndarray
-    components: np.ndarray
-    turned: np.ndarray
-
-    @classmethod
-    def of(cls, level: np.ndarray, ray: np.ndarray, bent: np.ndarray) -> "_TwoDirections | None":
-        """level (3, 3): C into L.  None in the zenith, where there is no azimuth."""
-        local, sine = level @ ray, math.hypot(bent[0], bent[1])
-        if min(sine, math.hypot(local[0], local[1])) < MIN_SINE:
-            return None
-        turn = math.atan2(bent[1], bent[0]) - math.atan2(local[1], local[0])
-        along = np.array([-bent[1], bent[0], 0.0]) / sine
-        components = np.stack([along, np.cross(bent, along)])
-        return cls(rotation.about_axis(2, turn) @ level, bent, components, np.cross(bent, components))
-
-    def adjusted(self, ray: np.ndarray, of_body: np.ndarray, of_up: np.ndarray) -> tuple[_Adjusted, float]:
-        """The attitude, and by how many sigma the altitudes differ; covariances (2, 2) of the components, rad2."""
-        off = self.components @ (self.bent - self.g @ ray)
-        # up that errs by a component moves the altitude
-        altitude = self.turned[1] @ OF_UP.T
-        sigma = math.sqrt(altitude @ of_up @ altitude + of_body[1, 1])
-        body, up = self.turned.T @ np.linalg.inv(of_body), OF_UP.T @ np.linalg.inv(of_up)
-        spread = np.linalg.inv(body @ self.turned + up @ OF_UP)
-        g = rotation.from_vector(spread @ body @ off) @ self.g
-        return _Adjusted(g, spread @ body, spread @ up), abs(float(off[1])) / sigma
 
 
 def _attitude(
     solver: Solver,
     stars: Stars,
-    disc: Disc,
-    seen: _Seen,
-    body: Body,
+    looks: list[_Look],
     tilt: Tilt,
     state: EarthState,
     place: Place,
     stamp_s: float,
 ) -> AttitudeAtPlace:
-    """The attitude by the body's direction and the level; PlaceError if they contradict each other's altitude."""
-    a4, air, mounting, name = (
-        place.plumb_axes,
-        solver.atmosphere,
-        solver.instrument.mounting,
-        body.name.title(),
-    )
-    clock_s, level = solver.clock_stddev_s(stars), mounting.level(tilt)
-    true = a4 @ body.from_place(a4[2])
-    if true[2] < MIN_COS_ZENITH:
-        raise PlaceError(
-            f"{stars.place}: at this time and place the {name} is at an altitude of {_altitude_deg(true):.1f} deg, and a "
-            f"heading takes {MIN_DEG:.0f}: the frame shows something else, or the clock or the place is wrong"
+    """The attitude by directions of bodies and the level, each in two components; PlaceError if they contradict."""
+    a4, air, mounting = place.plumb_axes, solver.atmosphere, solver.instrument.mounting
+    clock_s, level, moved = solver.clock_stddev_s(stars), mounting.level(tilt), zenith_moved(place.plumb[0])
+    first = looks[0]
+    bent, raised, true = _seen_from(first.body, air, a4, stars.place)
+    local = level.camera @ first.seen.ray
+    if min(math.hypot(*bent[:2]), math.hypot(*local[:2])) < MIN_SINE:
+        raise FixError(
+            f"{stars.place}: the {first.body.name.title()} is in the zenith, where it gives no heading"
         )
-    bent = air.refraction().bend(true)
-    two = _TwoDirections.of(level.camera, seen.ray, bent)
-    if two is None:
-        raise FixError(f"{stars.place}: the {name} is in the zenith, where it gives no heading")
-    moved = zenith_moved(place.plumb[0])
-    of_body = (
-        ErrorTerm("disc", two.components @ two.g @ seen.own),
-        ErrorTerm("lens", two.components @ two.g @ seen.lens, shared=ALWAYS),
-        ErrorTerm("ephemeris", np.eye(2) * body.sigma, shared=ALWAYS),
-        ErrorTerm("refraction", two.components @ (bent - true)[:, None] * air.relative_sigma, shared=ALWAYS),
-        *sky_terms(two.turned, state, clock_s, stamp_s, a4),
-        ErrorTerm("place", two.turned @ moved @ place.zenith_root, shared=ALWAYS),
-    )
-    deflected = two.turned @ moved * place.plumb_stddev
-    of_up = tilt_terms(OF_UP @ two.g @ level.camera.T, level, tilt, mounting, state.utc_unix_s)
-    whole = total_covariance((*of_body, ErrorTerm("deflection", deflected)))
-    found, sigmas = two.adjusted(seen.ray, whole, total_covariance(of_up))
-    if sigmas > (LIMB_SIGMAS if disc.sharp else GLOW_SIGMAS):
-        raise PlaceError(
-            f"{stars.place}: by the level its bright disc is at an altitude of "
-            f"{_altitude_deg(level.camera @ seen.ray):.2f} deg, and the {name} at {_altitude_deg(bent):.2f}, "
-            f"{sigmas:.0f} times the stated errors away: it is not the {name}, or the clock, the place, the tilts or A3 "
-            "are wrong"
+    # by the level and the first body's azimuth
+    g = rotation.about_axis(2, math.atan2(bent[1], bent[0]) - math.atan2(local[1], local[0])) @ level.camera
+    of_up = tilt_terms(OF_UP @ g @ level.camera.T, level, tilt, mounting, state.utc_unix_s)
+    up = OF_UP.T @ np.linalg.inv(total_covariance(of_up))
+    normal, found, turned, weighted, of_bodies, off_px = up @ OF_UP, g, [], [], [], []
+    for look in looks:
+        bent, raised, true = _seen_from(look.body, air, a4, stars.place)
+        components = _across(bent)
+        turn = np.cross(bent, components)
+        of_body = (
+            ErrorTerm("disc", components @ g @ look.seen.own),
+            ErrorTerm("lens", components @ g @ look.seen.lens, shared=ALWAYS),
+            ErrorTerm("ephemeris", np.eye(2) * look.body.sigma, shared=ALWAYS),
+            ErrorTerm("refraction", np.array([[0.0], [raised]]), shared=ALWAYS),
+            *sky_terms(turn, state, clock_s, stamp_s, a4),
+            ErrorTerm("place", turn @ moved @ place.zenith_root, shared=ALWAYS),
+            ErrorTerm("plumb", turn @ moved * place.plumb_stddev, shared=ALWAYS),
         )
-    terms = (
-        *(replace(t, factor=found.by_body @ t.factor) for t in of_body),
-        *(replace(t, factor=found.by_up @ t.factor) for t in of_up),
-    )
-    plumb = found.by_body @ deflected
+        whole = total_covariance(of_body)
+        off = components @ (bent - found @ look.seen.ray)
+        # what is known already has no azimuth until there is a body
+        known = turn @ np.linalg.pinv(normal) @ turn.T
+        share = slice(None) if turned else slice(1, 2)
+        sigmas = math.sqrt(off[share] @ np.linalg.solve((whole + known)[share, share], off[share]))
+        if sigmas > (LIMB_SIGMAS if look.sharp else GLOW_SIGMAS):
+            name, seen = look.body.name.title(), found @ look.seen.ray
+            raise PlaceError(
+                f"{stars.place}: by the level its bright disc is at an altitude of {_altitude_deg(seen):.2f} deg, and "
+                f"the {name} at {_altitude_deg(bent):.2f}, {sigmas:.0f} times the stated errors away: it is not the "
+                f"{name}, or the clock, the place, the tilts or A3 are wrong"
+            )
+        weight = turn.T @ np.linalg.inv(whole)
+        normal = normal + weight @ turn
+        found = rotation.from_vector(np.linalg.solve(normal, weight @ off)) @ found
+        turned.append(turn)
+        weighted.append(weight)
+        of_bodies.append(of_body)
+        expected, slope = found.T @ bent, look.seen.slope
+        off_px.append(np.linalg.lstsq(slope, expected - look.seen.ray, rcond=None)[0])
+    spread = np.linalg.inv(normal)
+    *of_bodies, deflected = _of_all([spread @ weight for weight in weighted], of_bodies)
+    terms = (*of_bodies, *(replace(t, factor=spread @ up @ t.factor) for t in of_up))
+    plumb = deflected.factor
     ellipsoid = plumb + moved * (place.ellipsoid_stddev - place.plumb_stddev)
     own = total_covariance(t for t in terms if not t.common)
-    expected = found.g.T @ bent
-    slope = seen.slope
-    off_px = np.linalg.lstsq(slope, expected - seen.ray, rcond=None)[0]
     return AttitudeAtPlace(
         utc_unix_s=state.utc_unix_s,
-        camera=Attitude(a4.T @ found.g, a4.T @ own @ a4, of=CAMERA, into=ITRS),
+        camera=Attitude(a4.T @ found, a4.T @ own @ a4, of=CAMERA, into=ITRS),
         stamp_stddev_s=stars.stamp_stddev_s,
         clock_stddev_s=clock_s,
         tilt=tilt,
-        used=np.zeros(0, int),
-        residual_px=off_px[None],
-        residual_arcsec=math.dist(expected, seen.ray) / ARCSEC,
-        jitter_px=0.0,
-        focal_scale=1.0,
+        residual_arcsec=math.dist(expected, looks[-1].seen.ray) / ARCSEC,
         zenith_distance=math.acos(min(max(bent[2], -1.0), 1.0)),
         refraction_arcsec=math.dist(bent, true) / ARCSEC,
         diurnal_aberration_arcsec=math.hypot(*station_velocity(a4[2])) / ARCSEC,
         ut1_minus_utc_s=state.orientation.ut1_minus_utc_s,
         place=place,
-        **attitudes_at(place, found.g, mounting, terms, (plumb, ellipsoid)),
+        **NO_STARS_FITTED | {"residual_px": np.array(off_px)},
+        **attitudes_at(place, found, mounting, terms, (plumb, ellipsoid)),
     )
+
+
+def _seen_from(
+    body: Body, air: Atmosphere, a4: np.ndarray, frame: str
+) -> tuple[np.ndarray, float, np.ndarray]:
+    """A body's direction (3,) in the air over a place, the error of its altitude, and its direction without air.
+
+    PlaceError below the horizon.
+    """
+    true, name = a4 @ body.from_place(a4[2]), body.name.title()
+    if true[2] < LOWEST_SINE:
+        raise PlaceError(
+            f"{frame}: at this time and place the {name} is at an altitude of {_altitude_deg(true):.1f} deg, and a "
+            "heading takes the whole disc above the horizon: the frame shows something else, or the clock or the place "
+            "is wrong"
+        )
+    return *air.raised(true), true
 
 
 def _altitude_deg(direction: np.ndarray) -> float:

@@ -145,7 +145,10 @@ def _label(
         return
     room, origin = best
     room[:] = KEPT
-    cv2.putText(picture, text, origin, FONT, SCALE, OUTLINE, 3, cv2.LINE_AA)
+    # a thicker text is longer in OpenCV 5: the outline is the same text, shifted
+    for dx, dy in ((-1, 0), (1, 0), (0, -1), (0, 1)):
+        shifted = origin[0] + dx, origin[1] + dy
+        cv2.putText(picture, text, shifted, FONT, SCALE, OUTLINE, 1, cv2.LINE_AA)
     cv2.putText(picture, text, origin, FONT, SCALE, colour, 1, cv2.LINE_AA)
 
 

@@ -191,6 +191,7 @@ class Disc:
 
     x, y: its centre, px, with the covariance (2, 2) px2.  radius_px: of its limb, or of the glow that is saturated.
     sharp: whether its limb was fitted; else it is a saturated glow.
+    other: a second one on the frame, fainter, with a limb; None without.
     """
 
     x: float
@@ -198,6 +199,7 @@ class Disc:
     covariance: np.ndarray
     radius_px: float
     sharp: bool
+    other: "Disc | None" = None
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -11,11 +11,9 @@ from starpos.earth.ellipsoid import curvature_radii_m, enu_axes, place_of_zenith
 from starpos.earth.place import Place
 from starpos.earth.vertical import Vertical
 from starpos.fix.fix import Fix
-from starpos.fix.sighting import Sighting
-from starpos.fix.terms import Origin, total_covariance
-from starpos.frozen import at_once
+from starpos.fix.terms import Origin
 from starpos.gnss.receiver import gnss_place
-from starpos.gnss.states import Learned, aged, ageing, prior
+from starpos.gnss.states import Learned, aged, prior
 from starpos.instrument.inclinometer import Tilt
 from starpos.instrument.instrument import Instrument
 from starpos.units import ARCSEC
@@ -24,44 +22,13 @@ from starpos.units import ARCSEC
 LEARNED_ORIGINS = (Origin.A3, Origin.INCLINOMETER)
 
 
-@at_once
-@dataclass(frozen=True, kw_only=True)
-class LevelSight(Sighting):
-    """A sighting with a tilt, and a rough place.
-
-    zenith_covariance (3, 3): of a zenith in ITRS by the errors of the stars, the air and the time, rad2.
-    latitude, longitude (rad): of the fix, whose A3 may be wrong.
-    """
-
-    tilt: Tilt
-    zenith_covariance: np.ndarray
-    latitude: float
-    longitude: float
-
-    @classmethod
-    def of(cls, fix: Fix, tilt: Tilt) -> "LevelSight":
-        """The sighting of a fix."""
-        stars = [t for t in fix.terms if t.origin is Origin.OTHER]
-        radii = np.array(curvature_radii_m(fix.latitude))
-        axes = enu_axes(fix.latitude, fix.longitude)[:2]
-        covariance = total_covariance(stars)[:2, :2] / np.outer(radii, radii)
-        return cls(
-            utc_unix_s=fix.utc_unix_s,
-            camera=fix.camera,
-            tilt=tilt,
-            zenith_covariance=axes.T @ covariance @ axes,
-            latitude=fix.latitude,
-            longitude=fix.longitude,
-        )
-
-
-def zenith_of_stars(sighting: LevelSight, learned: Learned) -> np.ndarray:
+def zenith_of_stars(sighting: Fix, learned: Learned) -> np.ndarray:
     """Up (3,) in ITRS by the plumb line, as camera and inclinometer have it with what was learned."""
     up_in_camera = learned.rotation.T @ learned.up(sighting.tilt)
     return sighting.camera.rotation @ up_in_camera
 
 
-def zenith_rows(sighting: LevelSight, learned: Learned, up: np.ndarray) -> np.ndarray:
+def zenith_rows(sighting: Fix, learned: Learned, up: np.ndarray) -> np.ndarray:
     """Derivatives (3, n) of `zenith_of_stars` by the states; up (3,): in S."""
     rows = learned.tilted(sighting.tilt)
     rows[:, learned.layout.a3] = rotation.cross_matrix(up)
@@ -81,7 +48,7 @@ class Innovation:
 
 
 def innovation(
-    sighting: LevelSight,
+    sighting: Fix,
     gnss: Place,
     learned: Learned,
     vertical: Vertical,
@@ -104,17 +71,17 @@ def innovation(
     rows[:, at.field] += np.eye(2)
     rows[:, at.gnss] -= np.eye(2)
     radii = np.array(curvature_radii_m(gnss.latitude))
-    noise = axes[:2] @ (sighting.zenith_covariance + tilt_noise(sighting, learned)) @ axes[:2].T
+    noise = axes[:2] @ (sighting.zenith_by_stars + tilt_noise(sighting, learned)) @ axes[:2].T
     return Innovation(seen, rows, noise + gnss.covariance / np.outer(radii, radii))
 
 
-def tilt_noise(sighting: LevelSight, learned: Learned) -> np.ndarray:
+def tilt_noise(sighting: Fix, learned: Learned) -> np.ndarray:
     """Covariance (3, 3) of the zenith in ITRS by the noise of the readings."""
     back = sighting.camera.rotation @ learned.rotation.T @ sighting.tilt.slope
     return back @ sighting.tilt.noise @ back.T
 
 
-def place_of_stars(sighting: LevelSight, learned: Learned, vertical: Vertical) -> Place:
+def place_of_stars(sighting: Fix, learned: Learned, vertical: Vertical) -> Place:
     """The place by the stars alone, on the ellipsoid."""
     zenith = zenith_of_stars(sighting, learned)
     latitude, longitude = place_of_zenith(zenith)
@@ -124,7 +91,7 @@ def place_of_stars(sighting: LevelSight, learned: Learned, vertical: Vertical) -
     at = learned.layout
     rows[:, at.constant] -= np.eye(2)
     rows[:, at.field] -= np.eye(2)
-    noise = axes[:2] @ (sighting.zenith_covariance + tilt_noise(sighting, learned)) @ axes[:2].T
+    noise = axes[:2] @ (sighting.zenith_by_stars + tilt_noise(sighting, learned)) @ axes[:2].T
     covariance = rows @ learned.covariance @ rows.T + noise
     radii = np.array(curvature_radii_m(latitude))
     latitude, longitude = place_of_zenith(rotation.normalised(axes[2] - east_north @ axes[:2]))
@@ -137,19 +104,22 @@ LINEAR_ACROSS_RAD, LINEAR_TURN_RAD = 120 * ARCSEC, 900 * ARCSEC
 ROUNDS, SETTLED_RAD = 6, 1e-6
 
 
+def corrected(
+    state: np.ndarray, covariance: np.ndarray, rows: np.ndarray, noise: np.ndarray, value: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """States (..., n) and covariances (..., n, n) of filters after a measurement, by rows, noise and value of it."""
+    across = covariance @ rows.swapaxes(-1, -2)
+    gain = np.linalg.solve(rows @ across + noise, across.swapaxes(-1, -2)).swapaxes(-1, -2)
+    # Joseph's form stays symmetric and positive
+    kept = np.eye(state.shape[-1]) - gain @ rows
+    covariance = kept @ covariance @ kept.swapaxes(-1, -2) + gain @ noise @ gain.swapaxes(-1, -2)
+    return state + (gain @ value[..., None])[..., 0], (covariance + covariance.swapaxes(-1, -2)) / 2
+
+
 def updated(learned: Learned, seen: Innovation) -> Learned:
     """What is known after a frame with a GNSS place."""
-    across = learned.covariance @ seen.rows.T
-    gain = np.linalg.solve(seen.rows @ across + seen.noise, across.T).T
-    # Joseph's form stays symmetric and positive
-    kept = np.eye(len(learned.state)) - gain @ seen.rows
-    covariance = kept @ learned.covariance @ kept.T + gain @ seen.noise @ gain.T
-    return replace(
-        learned,
-        state=learned.state + gain @ seen.value,
-        covariance=(covariance + covariance.T) / 2,
-        frames=learned.frames + 1,
-    )
+    state, covariance = corrected(learned.state, learned.covariance, seen.rows, seen.noise, seen.value)
+    return replace(learned, state=state, covariance=covariance, frames=learned.frames + 1)
 
 
 def chi2(learned: Learned, seen: Innovation) -> float:
@@ -172,7 +142,7 @@ class GnssFrame:
     up_in_camera (3,): up in C by GNSS at the first frame of the pose.
     """
 
-    sighting: LevelSight
+    sighting: Fix
     gnss: Place
     new_pose: bool
     up_in_camera: np.ndarray
@@ -213,13 +183,10 @@ def taught(learned: Learned, frame: GnssFrame, instrument: Instrument, vertical:
     gnss, sighting = frame.gnss, frame.sighting
     assert learned.place is not None
     moved_m = float(np.linalg.norm(gnss.offset_m(*learned.place))) if frame.new_pose else 0.0
-    stddev = stddev_rad(vertical, gnss.latitude, gnss.longitude)
-    passed = ageing(
-        learned, instrument.inclinometer, sighting.tilt, sighting.utc_unix_s, moved_m, stddev, frame.new_pose
-    )
-    learned = aged(learned, passed, sighting.tilt, sighting.utc_unix_s)
+    here = gnss.latitude, gnss.longitude
+    learned, _ = aged(learned, instrument, vertical, sighting, here, moved_m, frame.new_pose)
     if frame.new_pose:
-        learned = replace(learned, place=(gnss.latitude, gnss.longitude), poses=learned.poses + 1)
+        learned = replace(learned, place=here, poses=learned.poses + 1)
     # about A3 as it was taken: its turn by a few frames would mislead
     about = np.zeros(learned.layout.size)
     # one up for all frames of a pose: GNSS's noise, as large as a good inclinometer's, would seem to lean the camera

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from starpos.earth.place import UNDEFLECTED, Place
+from starpos.earth.place import Place
 from starpos.errors import GnssError
 from starpos.messages.stamp import stamp_to_unix
 from starpos.rotation import half_turn
@@ -30,9 +30,6 @@ def gnss_place(utc_unix_s: float, latitude: float, longitude: float, covariance:
         longitude=longitude,
         plumb=(latitude, longitude),
         covariance=covariance,
-        deflection=UNDEFLECTED,
-        plumb_stddev=0.0,
-        ellipsoid_stddev=0.0,
         utc_unix_s=utc_unix_s,
     )
 

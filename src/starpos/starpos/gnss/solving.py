@@ -16,10 +16,9 @@ from starpos.fix.solution import Solution, Status
 from starpos.fix.solver import Solver
 from starpos.fix.terms import ALWAYS, ErrorTerm, total_covariance
 from starpos.frames.frame import Stars
-from starpos.gnss.filter import LEARNED_ORIGINS, LevelSight, zenith_rows
+from starpos.gnss.filter import LEARNED_ORIGINS, zenith_rows
 from starpos.gnss.states import Learned
 from starpos.gnss.watch import GnssCheck, GnssStatus, GnssWatch
-from starpos.instrument.inclinometer import Tilt
 from starpos.instrument.instrument import Calibration
 from starpos.units import ARCSEC
 
@@ -51,42 +50,40 @@ def watched(solver: Solver, stars: Stars, rough: Solution, gnss: Place | None, w
     rough: its solution by the solver, whose A3 may be wrong, and its heading at GNSS's place.
     gnss: that place, None without one.
     """
-    if rough.fix is None or rough.tilt is None:
+    if rough.fix is None:
         compared = None if gnss is None else GnssCheck(status=GnssStatus.LEARNING, place=gnss)
         return Watched(solution=rough, compared=compared)
-    tilt = rough.tilt
-    watch.advance(LevelSight.of(rough.fix, tilt))
-    up = _up(watch, rough.fix, tilt, gnss)
+    watch.advance(rough.fix)
+    up = _up(watch, rough.fix, gnss)
     levelled, check = _levelled(solver, stars, rough, up), None
     if gnss is not None and levelled.fix is not None:
-        check = watch.judge(LevelSight.of(levelled.fix, tilt), gnss)
+        check = watch.judge(levelled.fix, gnss)
         # what was taken back changes the level, and so does an attitude with another refraction where GNSS gives it
-        again = _up(watch, levelled.fix, tilt, gnss)
+        again = _up(watch, levelled.fix, gnss)
         if again is not None and (up is None or not np.array_equal(again, up)):
             levelled = _levelled(solver, stars, levelled, again)
     fix = levelled.fix
     if fix is None:
         return Watched(solution=levelled)
-    sighting = LevelSight.of(fix, tilt)
-    if watch.learned is not None and watch.tells_place(sighting):
-        fix = _budgeted(fix, sighting, watch.learned)
-        ground = _ground(fix, sighting, watch.learned, watch.vertical)
-        answer = Watched(solution=replace(levelled, fix=fix), ground=ground)
+    if watch.learned is not None and watch.tells_place(fix):
+        budgeted = _budgeted(fix, watch.learned)
+        ground = _ground(budgeted, watch.learned, watch.vertical)
+        answer = Watched(solution=replace(levelled, fix=budgeted), ground=ground)
     else:
         why = f"{stars.place}: {NOTHING_LEARNED}"
         none = replace(levelled, status=Status.POOR_FIT, message=why, fix=None, at_place=rough.at_place)
         answer = Watched(solution=none)
     if gnss is None or check is None:
         return replace(answer, learned=watch.learned)
-    watch.learn(sighting, gnss, check)
+    watch.learn(fix, gnss, check)
     frames, poses = (0, 0) if watch.learned is None else (watch.learned.frames, watch.learned.poses)
     return replace(answer, compared=replace(check, frames=frames, poses=poses), learned=watch.learned)
 
 
-def _up(watch: GnssWatch, fix: Fix, tilt: Tilt, gnss: Place | None) -> np.ndarray | None:
+def _up(watch: GnssWatch, fix: Fix, gnss: Place | None) -> np.ndarray | None:
     """Up (3,) in C: as learned if that gives a place, else by GNSS; None without either."""
-    if watch.tells_place(LevelSight.of(fix, tilt)):
-        return watch.up_in_camera(tilt)
+    if watch.tells_place(fix):
+        return watch.up_in_camera(fix.tilt)
     if gnss is None:
         return None
     stated, axes = watch.vertical.at(gnss.latitude, gnss.longitude), gnss.axes
@@ -112,23 +109,21 @@ def _zenith_moved(fix: Fix) -> np.ndarray:
     return np.stack([-level[:, 1], level[:, 0]], 1)
 
 
-def _zenith_rows(fix: Fix, sighting: LevelSight, learned: Learned) -> np.ndarray:
+def _zenith_rows(fix: Fix, learned: Learned) -> np.ndarray:
     """Derivatives (2, n) of the zenith, to the east and the north of a fix, by the states."""
-    return enu_axes(fix.latitude, fix.longitude)[:2] @ zenith_rows(
-        sighting, learned, learned.up(sighting.tilt)
-    )
+    return enu_axes(fix.latitude, fix.longitude)[:2] @ zenith_rows(fix, learned, learned.up(fix.tilt))
 
 
-def _budgeted(fix: Fix, sighting: LevelSight, learned: Learned) -> Fix:
+def _budgeted(fix: Fix, learned: Learned) -> Fix:
     """The fix with the error of the learned states in place of the errors of A3 and the inclinometer."""
-    rows = _zenith_rows(fix, sighting, learned)
+    rows = _zenith_rows(fix, learned)
     root = symmetric_root(rows @ learned.covariance @ rows.T)
     term = ErrorTerm(LEARNED_TERM, _zenith_moved(fix) @ root, shared=ALWAYS)
     kept = (t for t in fix.terms if t.origin not in LEARNED_ORIGINS)
     return replace(fix, terms=(*kept, term))
 
 
-def _ground(fix: Fix, sighting: LevelSight, learned: Learned, vertical: Vertical) -> Geodetic:
+def _ground(fix: Fix, learned: Learned, vertical: Vertical) -> Geodetic:
     """The geodetic place, whose error knows that A3 and the deflection were learned together."""
     at, covariance = learned.layout, learned.covariance
     deflection = learned.deflection_rad(vertical, fix.latitude, fix.longitude) / ARCSEC
@@ -140,7 +135,7 @@ def _ground(fix: Fix, sighting: LevelSight, learned: Learned, vertical: Vertical
     ground = fix.on_ground(applied)
     prime, meridian = curvature_radii_m(ground.latitude)
     moved = -np.array([[prime, 0.0], [0.0, meridian], [meridian_turn(ground.latitude), 0.0]])
-    rows = _zenith_moved(fix)[:3] @ _zenith_rows(fix, sighting, learned)
+    rows = _zenith_moved(fix)[:3] @ _zenith_rows(fix, learned)
     rows[:, at.constant] += moved
     rows[:, at.field] += moved
     others = total_covariance([t for t in fix.terms if t.name != LEARNED_TERM])[:3, :3]

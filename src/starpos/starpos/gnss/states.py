@@ -18,9 +18,10 @@ from starpos import files, rotation
 from starpos.earth.ellipsoid import EARTH_RADIUS_M
 from starpos.earth.vertical import Vertical
 from starpos.errors import GnssError
-from starpos.instrument.inclinometer import UNMEASURED_WALK_C_PER_SQRT_HOUR, InclinometerErrors, Tilt
+from starpos.fix.fix import Fix
+from starpos.instrument.inclinometer import UNMEASURED_WALK_C_PER_SQRT_HOUR, Tilt
 from starpos.instrument.instrument import Instrument
-from starpos.instrument.mounting import RESPONSE_COEFFICIENTS, Zeroed, response_columns, stated_variances
+from starpos.instrument.mounting import RESPONSE_COEFFICIENTS, response_columns, stated_variances
 from starpos.units import ARCSEC
 
 # Share of the deflection's variance that is the same everywhere the instrument goes; the rest is a field.
@@ -121,8 +122,7 @@ class Learned:
 
     def columns(self, tilt: Tilt) -> tuple[np.ndarray, np.ndarray]:
         """Change of up in S for the response's coefficients (3, m), and for errors of the angles (3, axes)."""
-        zeroed = _zeroed(tuple(self.calibrated_up.tolist()), self.axes)
-        return response_columns(tilt.theta, tilt.up, zeroed), tilt.slope
+        return response_columns(tilt.theta, tilt.up, self.calibrated_up), tilt.slope
 
     def up(self, tilt: Tilt) -> np.ndarray:
         """Up (3,) in S at a tilt, without the errors that are known."""
@@ -145,11 +145,6 @@ class Learned:
         stated, at = vertical.at(latitude, longitude), self.layout
         known = np.array([stated.eta_arcsec, stated.xi_arcsec]) * ARCSEC
         return known + self.state[at.constant] + self.state[at.field]
-
-
-@lru_cache(maxsize=4)
-def _zeroed(up: tuple[float, ...], axes: int) -> Zeroed:
-    return Zeroed.at(np.array(up), axes)
 
 
 def prior(instrument: Instrument, tilt: Tilt, deflection_stddev_rad: float, utc_unix_s: float) -> Learned:
@@ -208,35 +203,34 @@ class Ageing:
         return state * share, covariance
 
 
-def ageing(
+def aged(
     learned: Learned,
-    errors: InclinometerErrors,
-    tilt: Tilt,
-    utc_unix_s: float,
+    instrument: Instrument,
+    vertical: Vertical,
+    fix: Fix,
+    place: tuple[float, float],
     moved_m: float,
-    deflection_stddev_rad: float,
     new_pose: bool,
-) -> Ageing:
-    """What passes until a tilt at a time, for an instrument that was moved by moved_m in between."""
-    at = learned.layout
+) -> tuple[Learned, Ageing]:
+    """What is left at a fix of what was learned, and what passed until then.
+
+    place: latitude, longitude (rad) of the fix by what was learned, or by GNSS; moved_m: how far that is from before.
+    """
+    at, errors, tilt, utc_unix_s = learned.layout, instrument.inclinometer, fix.tilt, fix.utc_unix_s
     share, variance = np.ones(at.size), np.zeros(at.size)
     seconds = abs(utc_unix_s - learned.utc_unix_s)
     measured = np.isfinite(tilt.temperature_c - learned.temperature_c)
     variance[at.zero] = errors.wander_variance(seconds, 0.0 if measured else UNMEASURED_WALK_C_PER_SQRT_HOUR)
-    kept = np.exp(-moved_m / FIELD_LENGTH_M)
-    share[at.field] = kept
-    variance[at.field] = (1 - CONSTANT_SHARE) * deflection_stddev_rad**2 * (1 - kept**2)
+    kept, deflection2 = np.exp(-moved_m / FIELD_LENGTH_M), (vertical.at(*place).stddev_arcsec * ARCSEC) ** 2
+    share[at.field], variance[at.field] = kept, (1 - CONSTANT_SHARE) * deflection2 * (1 - kept**2)
     kept = np.exp(-seconds / GNSS_SLOW_S)
     share[at.gnss], variance[at.gnss] = kept, GNSS_SLOW_RAD**2 * (1 - kept**2)
     if new_pose:
         share[at.pose], variance[at.pose] = 0.0, errors.pose_variance(tilt)
-    return Ageing(share, variance)
-
-
-def aged(learned: Learned, by: Ageing, tilt: Tilt, utc_unix_s: float) -> Learned:
-    """What is left of what was learned after an ageing, at the temperature of a tilt."""
-    state, covariance = by.of(learned.state, learned.covariance)
-    return replace(at_temperature(learned, tilt), state=state, covariance=covariance, utc_unix_s=utc_unix_s)
+    passed = Ageing(share, variance)
+    state, covariance = passed.of(learned.state, learned.covariance)
+    now = replace(at_temperature(learned, tilt), state=state, covariance=covariance, utc_unix_s=utc_unix_s)
+    return now, passed
 
 
 def at_temperature(learned: Learned, tilt: Tilt) -> Learned:
@@ -266,12 +260,8 @@ def save_learned(path: Path, learned: Learned) -> None:
     content = {KEY: VERSION} | {IN_FILE.get(k, k): v for k, v in vars(learned).items()}
     for name in ("since_unix_s", "temperature_c"):
         content[name] = None if math.isnan(content[name]) else content[name]
-    try:
-        files.write_whole(path, (json.dumps(content, default=np.ndarray.tolist) + "\n").encode())
-    # ValueError: the name contains a NUL
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise GnssError(f"{path}: what was learned cannot be written there ({reason})") from None
+    text = json.dumps(content, default=np.ndarray.tolist) + "\n"
+    files.save(path, text.encode(), "what was learned", GnssError)
 
 
 def read_learned(path: Path) -> Learned | None:

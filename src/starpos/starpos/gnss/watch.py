@@ -20,19 +20,20 @@ from starpos.averaging.poses import slip_s
 from starpos.earth.ellipsoid import EARTH_RADIUS_M
 from starpos.earth.place import Place
 from starpos.earth.vertical import Vertical
+from starpos.fix.fix import Fix
 from starpos.gnss.filter import (
     GnssFrame,
     Innovation,
-    LevelSight,
     begun,
     chi2,
+    corrected,
     innovation,
     is_linear,
     place_of_stars,
     stddev_rad,
     updated,
 )
-from starpos.gnss.states import Ageing, Learned, aged, ageing, at_temperature, prior
+from starpos.gnss.states import Ageing, Learned, aged, at_temperature, prior
 from starpos.instrument.inclinometer import Tilt
 from starpos.instrument.instrument import Instrument
 
@@ -106,17 +107,8 @@ class OnsetFilters:
         rows[:, :, n + 2 :] = -np.eye(2) * grown[:, None, None]
         left = np.concatenate([about - self.state[:, :n], -self.state[:, n:]], 1)
         value = seen.value + np.einsum("wij,wj->wi", rows, left)
-        across = self.covariance @ rows.swapaxes(1, 2)
-        spread = rows @ across + seen.noise
-        gain = np.linalg.solve(spread, across.swapaxes(1, 2)).swapaxes(1, 2)
-        kept = np.eye(n + OFFSETS) - gain @ rows
-        covariance = kept @ self.covariance @ kept.swapaxes(1, 2) + gain @ seen.noise @ gain.swapaxes(1, 2)
-        return replace(
-            self,
-            state=self.state + np.einsum("wij,wj->wi", gain, value),
-            covariance=(covariance + covariance.swapaxes(1, 2)) / 2,
-            frames=self.frames + 1,
-        )
+        state, covariance = corrected(self.state, self.covariance, rows, seen.noise, value)
+        return replace(self, state=state, covariance=covariance, frames=self.frames + 1)
 
     def evidence(self, utc_unix_s: float) -> np.ndarray:
         """Evidence of each filter (W,) that GNSS is wrong: the larger chi-square (2 dof) of step and growth."""
@@ -209,6 +201,8 @@ class GnssWatch:
 
     Call `advance` for each frame; where there is a GNSS place, then `judge` and `learn`.
     learned: None before the first frame.
+    is_learning: whether A3 is too uncertain for the linear filter. Until it is not, each frame solves anew for all frames
+    held.
     """
 
     def __init__(self, instrument: Instrument, vertical: Vertical, learned: Learned | None = None) -> None:
@@ -216,23 +210,17 @@ class GnssWatch:
         self.disagrees = False
         self.vertical = vertical
         self._instrument = instrument
-        # Whether A3 is too uncertain for the linear filter. Until it is not, each frame solves anew for all frames held.
-        self._starting = learned is None
+        self.is_learning = learned is None
         self._held: deque[GnssFrame] = deque(maxlen=MAX_HELD)
         self._of_pose = 0
-        self._pose: LevelSight | None = None
+        self._pose: Fix | None = None
         self._new_pose = True
         self._readings: frozenset[float] = frozenset()
         # the readings of a frame that would have been an alarm, before A3 was known
         self._suspicious: frozenset[float] | None = None
         self._onsets = OnsetFilters.empty(0)
 
-    @property
-    def is_learning(self) -> bool:
-        """Whether A3 is still too uncertain for the linear filter."""
-        return self._starting
-
-    def advance(self, sighting: LevelSight) -> None:
+    def advance(self, sighting: Fix) -> None:
         """Advance to the time of a frame, seen with any A3: only the attitude of its camera counts."""
         tilt = sighting.tilt
         self._new_pose = (
@@ -248,16 +236,16 @@ class GnssWatch:
                 return
             stddev = stddev_rad(self.vertical, sighting.latitude, sighting.longitude)
             self.learned = prior(self._instrument, tilt, stddev, sighting.utc_unix_s)
-            self._starting = not is_linear(self.learned, tilt)
+            self.is_learning = not is_linear(self.learned, tilt)
         self._age(sighting)
 
     def _forget(self) -> None:
-        self.learned, self._starting, self.disagrees = None, True, False
+        self.learned, self.is_learning, self.disagrees = None, True, False
         self._held.clear()
         self._suspicious = None
         self._onsets = OnsetFilters.empty(0)
 
-    def _age(self, sighting: LevelSight) -> None:
+    def _age(self, sighting: Fix) -> None:
         learned, tilt = self.learned, sighting.tilt
         assert learned is not None
         place = place_of_stars(sighting, at_temperature(learned, tilt), self.vertical)
@@ -268,16 +256,11 @@ class GnssWatch:
             way_m = float(np.linalg.norm(place.offset_m(*here)))
             if way_m > ELSEWHERE_SIGMA * math.sqrt(np.linalg.eigvalsh(place.covariance)[-1]):
                 moved_m, here = way_m, (place.latitude, place.longitude)
-        passed = ageing(
-            learned,
-            self._instrument.inclinometer,
-            tilt,
-            sighting.utc_unix_s,
-            moved_m,
-            stddev_rad(self.vertical, place.latitude, place.longitude),
-            self._new_pose,
+        at = place.latitude, place.longitude
+        learned, passed = aged(
+            learned, self._instrument, self.vertical, sighting, at, moved_m, self._new_pose
         )
-        self.learned = replace(aged(learned, passed, tilt, sighting.utc_unix_s), place=here)
+        self.learned = replace(learned, place=here)
         if len(self._onsets.since):
             self._onsets = self._onsets.aged(passed)
             # the one that may bring GNSS back has to last for all of its frames, however far they are apart
@@ -288,7 +271,7 @@ class GnssWatch:
         """Up (3,) in C at a tilt by what was learned; None if nothing is known."""
         return None if self.learned is None else self.learned.rotation.T @ self.learned.up(tilt)
 
-    def tells_place(self, sighting: LevelSight) -> bool:
+    def tells_place(self, sighting: Fix) -> bool:
         """Whether the stars give a place with what was learned before this frame."""
         if self.learned is None:
             return False
@@ -309,13 +292,13 @@ class GnssWatch:
         turn2 = min(float(up @ self.learned.covariance[at.a3, at.a3] @ up), 2.0)
         return turn2 / 2 * leaned * EARTH_RADIUS_M
 
-    def judge(self, sighting: LevelSight, gnss: Place) -> GnssCheck:
+    def judge(self, sighting: Fix, gnss: Place) -> GnssCheck:
         """Compare a GNSS place with the stars'; where they disagree, take back what GNSS taught meanwhile."""
         if self.learned is None or not self.tells_place(sighting):
             return GnssCheck(status=GnssStatus.LEARNING, place=gnss)
         seen = innovation(sighting, gnss, self.learned, self.vertical)
         single = chi2(self.learned, seen)
-        if self._starting:
+        if self.is_learning:
             return self._check(self._while_starting(single, sighting.tilt), sighting, gnss)
         onsets = self._onsets if len(self._onsets.since) else OnsetFilters.empty(len(self.learned.state))
         # While GNSS is not believed there is one filter. If GNSS was away for long, it was dropped for its age.
@@ -344,7 +327,7 @@ class GnssWatch:
             self._suspicious = readings
         return GnssStatus.DISAGREES if again else GnssStatus.DOUBTFUL
 
-    def _take_back(self, onset: int, sighting: LevelSight) -> None:
+    def _take_back(self, onset: int, sighting: Fix) -> None:
         """Return to the state one copy before the likeliest onset of the error."""
         self.disagrees = True
         self.learned = self._onsets.before[max(onset - 1, 0)]
@@ -362,7 +345,7 @@ class GnssWatch:
         elif utc_unix_s - self._onsets.since[0] >= BACK_S and self._onsets.frames[0] >= BACK_FRAMES:
             self.disagrees = False
 
-    def _check(self, status: GnssStatus, sighting: LevelSight, gnss: Place) -> GnssCheck:
+    def _check(self, status: GnssStatus, sighting: Fix, gnss: Place) -> GnssCheck:
         assert self.learned is not None
         place = place_of_stars(sighting, self.learned, self.vertical)
         apart = gnss.offset_m(place.latitude, place.longitude)
@@ -376,13 +359,13 @@ class GnssWatch:
             sigma_m=math.sqrt(way @ (place.covariance + gnss.covariance) @ way),
         )
 
-    def learn(self, sighting: LevelSight, gnss: Place, check: GnssCheck) -> None:
+    def learn(self, sighting: Fix, gnss: Place, check: GnssCheck) -> None:
         """Learn from a frame if GNSS is believed, and its readings are new."""
         readings = frozenset(sighting.tilt.times)
         if check.status not in (GnssStatus.LEARNING, GnssStatus.AGREES) or readings & self._readings:
             return
         self._readings = readings
-        if not self._starting:
+        if not self.is_learning:
             assert self.learned is not None
             seen = innovation(sighting, gnss, self.learned, self.vertical)
             first = not math.isfinite(self.learned.since_unix_s)
@@ -400,6 +383,6 @@ class GnssWatch:
         self._held.append(GnssFrame(sighting, gnss, first, up))
         self._of_pose += 1
         self.learned = begun(self._instrument, self._held, self.vertical)
-        self._starting = not is_linear(self.learned, sighting.tilt)
-        if not self._starting:
+        self.is_learning = not is_linear(self.learned, sighting.tilt)
+        if not self.is_learning:
             self._held.clear()

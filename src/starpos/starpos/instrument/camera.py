@@ -28,11 +28,6 @@ THIN_PRISM_FISHEYE = "thin_prism_fisheye"
 OPENCV_NUMBERS = (0, 4, 5, 8, 12, 14)
 
 
-def lens_of(model: str, d: tuple[float, ...]) -> Lens:
-    """The lens of a model with its coefficients."""
-    return Equidistant(d, _reach(d)) if model == EQUIDISTANT else PlumbBob(d)
-
-
 def stated_lens(model: str, d: Sequence[float], place: str) -> tuple[str, tuple[float, ...]]:
     """Model and coefficients for a Camera, from a message's or file's as OpenCV and ROS define them.
 
@@ -157,7 +152,8 @@ class Camera:
     @cached_property
     def lens(self) -> Lens:
         """Its lens: between directions in C and places in focal lengths."""
-        return lens_of(self.model, self.distortion)
+        d = self.distortion
+        return Equidistant(d, _reach(d)) if self.model == EQUIDISTANT else PlumbBob(d)
 
     @cached_property
     def is_ideal(self) -> bool:

@@ -4,7 +4,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass, field, fields, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Protocol
 
 import numpy as np
@@ -75,15 +75,8 @@ def level_errors(sag_arcsec_per_sqrt_hour: float) -> InclinometerErrors:
     return replace(EXACT, noise_rad=NO_NOISE, drift_rad_per_sqrt_hour=sag_arcsec_per_sqrt_hour * ARCSEC)
 
 
-class OwnLevel:
-    """The tilts of that level, as `starpos.instrument.tilt_log.Tilts`: always zero."""
-
-    def average(self, mid_unix_s: float, exposure_s: float, spread_s: float = 0.0) -> Tilt:
-        """Zero, read at the middle of the exposure."""
-        return Tilt(0.0, 0.0, np.eye(2) * NO_NOISE**2, utc_unix_s=mid_unix_s)
-
-
-OWN_LEVEL = OwnLevel()
+# the reading of that level
+OWN_LEVEL = Tilt(0.0, 0.0, np.eye(2) * NO_NOISE**2, utc_unix_s=0.0)
 NO_GRAVITY = (
     "give it as the telephone wrote it (a screenshot, an edited or a sent copy has no gravity). Without gravity "
     "there are still: starpos identify, its heading with --site, a log of the level as --tilt, or a plumb line"
@@ -95,9 +88,11 @@ class ByGravity:
     """The tilts of a telephone's photographs, as `starpos.instrument.tilt_log.Tilts`; S is then C.
 
     log: of the telephone that took them, in S; None: their own files state gravity.
+    camera: that took them; '': any.
     """
 
     log: Tilts | None = None
+    camera: str = ""
 
     def has(self, frame: Exposure) -> bool:
         """Whether a photograph can have a tilt."""
@@ -114,6 +109,11 @@ class ByGravity:
         if gravity.model != model and is_built_in(model):
             raise TiltError(
                 f"{frame.place}: its level is a {gravity.model}'s, the others' a {model}'s: solve them apart"
+            )
+        if self.camera and gravity.camera != self.camera:
+            raise TiltError(
+                f"{frame.place}: it is by another camera ({gravity.camera}) than the first ({self.camera}), whose level "
+                "errs otherwise: solve them apart"
             )
         variance = instrument.inclinometer.noise_rad**2 + gravity.stddev_rad**2
         theta_x, theta_y, theta_z = np.arcsin(np.clip(gravity.up, -1, 1)).tolist()
@@ -322,14 +322,17 @@ class Calibration:
     @property
     def unknown(self) -> bool:
         """Whether nothing is known of how the inclinometer lies against the camera."""
-        variances = np.linalg.eigvalsh(np.asarray(self.covariance_arcsec2, float))
-        return bool(variances[1] >= (UNKNOWN_ARCSEC[0] / 2) ** 2)
+        return bool(self._variances[1] >= (UNKNOWN_ARCSEC[0] / 2) ** 2)
 
     @property
     def turn_stddev_deg(self) -> float:
         """Standard deviation (deg) about the axis about which A3 is known least: mostly the plumb line."""
-        variances = np.linalg.eigvalsh(np.asarray(self.covariance_arcsec2, float))
-        return float(np.sqrt(max(variances[-1], 0.0))) / 3600
+        return float(np.sqrt(max(self._variances[-1], 0.0))) / 3600
+
+    @cached_property
+    def _variances(self) -> np.ndarray:
+        """Variances (3,) in arcsec2 about the axes about which A3 is known best to least."""
+        return np.linalg.eigvalsh(np.asarray(self.covariance_arcsec2, float))
 
     def check_age(self, utc_unix_s: float) -> None:
         """Raise InstrumentError if it is too old, or too new, for a frame of that time."""

@@ -3,7 +3,7 @@
 
 import math
 import reprlib
-from collections.abc import Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -103,6 +103,8 @@ def _ros_matrix(rows: int, columns: int, values: Sequence[float]) -> dict:
     return {"rows": rows, "cols": columns, "data": [float(value) for value in values]}
 
 
+# how the value of each key is read; it states the field of that name, or of the one in RENAMED
+Schema = dict[str, Callable[[dict, str], Any]]
 FORMAT = 1
 MAX_FRAMES = 1 << 31
 # placeholder of a focal length that a file for pointings does not state: it is not used
@@ -118,26 +120,13 @@ INCLINOMETER = {
     "tilt_pose_arcsec": ("pose_rad", ARCSEC),
     "tilt_range_deg": ("range_rad", math.radians(1)),
 }
-CALIBRATED = "utc", "temperature_c", "tilt_deg", "frames", "valid_days", "response", "response_covariance"
 # keys that a calibration finds, of A3 or of a fixed camera's vertical; a file may have some of them
 STDDEV, COVARIANCE = "calibration_stddev_arcsec", "calibration_covariance_arcsec2"
+LINK_STDDEV = "link_to_camera_stddev_arcsec"
+RENAMED = {COVARIANCE: "covariance_arcsec2", LINK_STDDEV: "mount_stddev_arcsec"}
 CALIBRATION_KEYS = "misalignment_deg", STDDEV, COVARIANCE, "calibrated", "vertical"
-KEYS = (
-    "camera",
-    *CALIBRATION_KEYS[:4],
-    "remounted_arcsec",
-    "link_to_camera",
-    "link_to_camera_stddev_arcsec",
-    "inclinometer",
-    *INCLINOMETER,
-    "clock_stddev_s",
-    "shutter",
-    "vertical",
-)
 SIDES = "width", "height"
 INTRINSICS = "fx", "fy", "cx", "cy"
-SHUTTER = "readout_s", "readout_stddev_s"
-VERTICAL = "camera_to_itrs", "covariance_arcsec2", "sag_arcsec_per_sqrt_hour"
 
 
 def read(path: Path | str, needs_camera: bool = True) -> Instrument:
@@ -232,38 +221,33 @@ def write(path: Path | str, instrument: Instrument, comment: str = "") -> None:
 
 def content_of(instrument: Instrument) -> dict[str, Any]:
     """The keys and values of an instrument's file."""
-    c = instrument.calibration
+    c, vertical = instrument.calibration, instrument.vertical
     content: dict[str, Any] = {"starpos_instrument": FORMAT, "camera": _camera_of(instrument)}
-    content["misalignment_deg"] = [float(a) for a in c.misalignment_deg]
-    content[COVARIANCE] = np.asarray(c.covariance_arcsec2, float).tolist()
-    if c.remounted_arcsec:
-        content["remounted_arcsec"] = float(c.remounted_arcsec)
+    content |= _stated(c, CALIBRATION)
     if not math.isnan(c.utc_unix_s):
-        content["calibrated"] = {"utc": utc_text(c.utc_unix_s), "frames": int(c.frames)}
-        content["calibrated"]["tilt_deg"] = [float(t) for t in c.tilt_deg]
-        for key in ("temperature_c", "valid_days"):
-            if math.isfinite(getattr(c, key)):
-                content["calibrated"][key] = float(getattr(c, key))
-        if c.response:
-            content["calibrated"]["response"] = [float(r) for r in c.response]
-            content["calibrated"]["response_covariance"] = np.asarray(c.response_covariance, float).tolist()
-    content["link_to_camera"] = np.asarray(instrument.link_to_camera, float).tolist()
-    if instrument.mount_stddev_arcsec:
-        content["link_to_camera_stddev_arcsec"] = float(instrument.mount_stddev_arcsec)
+        content["calibrated"] = {"utc": utc_text(c.utc_unix_s), **_stated(c, CALIBRATED)}
+    content |= _stated(instrument, INSTRUMENT)
     if instrument.inclinometer_model:
         content["inclinometer"] = {"model": instrument.inclinometer_model}
-    if instrument.vertical is None:
+    if vertical is None:
         for key, (name, unit) in INCLINOMETER.items():
             content[key] = _in_unit(getattr(instrument.inclinometer, name), unit)
     else:
-        content["vertical"] = {
-            key: np.asarray(getattr(instrument.vertical, key)).tolist() for key in VERTICAL[:2]
-        }
-        content["vertical"][VERTICAL[2]] = _in_unit(instrument.inclinometer.drift_rad_per_sqrt_hour, ARCSEC)
-    content["clock_stddev_s"] = float(instrument.clock_stddev_s)
+        sag = _in_unit(instrument.inclinometer.drift_rad_per_sqrt_hour, ARCSEC)
+        content["vertical"] = _stated(vertical, VERTICAL) | {SAG: sag}
     if instrument.shutter is not None:
-        content["shutter"] = {key: float(getattr(instrument.shutter, key)) for key in SHUTTER}
+        content["shutter"] = _stated(instrument.shutter, SHUTTER)
     return content
+
+
+def _stated(of: Any, schema: Schema) -> dict[str, Any]:
+    """The keys and values of a part of an instrument, without what is as good as not stated."""
+    values = {key: np.asarray(getattr(of, RENAMED.get(key, key))).tolist() for key in schema}
+    return {
+        key: v
+        for key, v in values.items()
+        if v != 0 and v != [] and (isinstance(v, list) or math.isfinite(v))
+    }
 
 
 def _camera_of(instrument: Instrument) -> dict[str, Any]:
@@ -287,16 +271,12 @@ def _from_mapping(content: dict, folder: Path, needs_camera: bool) -> Instrument
         optics = _camera(content.get("camera"), folder)
     given = {name: _error(content, key, unit) for key, (name, unit) in INCLINOMETER.items() if key in content}
     sensor, errors = _sensor(content, bool(given))
-    more: dict[str, Any] = {
-        name: read(content, key)
-        for key, (name, read) in {
-            "link_to_camera": ("link_to_camera", _matrix),
-            "link_to_camera_stddev_arcsec": ("mount_stddev_arcsec", _number),
-            "clock_stddev_s": ("clock_stddev_s", _number),
-            "shutter": ("shutter", _shutter),
-        }.items()
-        if key in content
-    }
+    more = _told(content, INSTRUMENT)
+    if "shutter" in content:
+        try:
+            more["shutter"] = Shutter(**_told(_mapping(content, "shutter", SHUTTER), SHUTTER, needed=True))
+        except FrameError as e:
+            raise InstrumentError(str(e)) from None
     instrument = Instrument(
         **optics,
         calibration=_calibration(content),
@@ -304,33 +284,27 @@ def _from_mapping(content: dict, folder: Path, needs_camera: bool) -> Instrument
         inclinometer_model=sensor,
         **more,
     )
-    if "vertical" in content:
-        if given or sensor:
-            raise InstrumentError(
-                "vertical is of a camera without an inclinometer: leave out inclinometer and the tilt_ keys"
-            )
-        instrument = _with_vertical(instrument, content)
-    return instrument
-
-
-def _shutter(content: dict, key: str) -> Shutter:
-    about = _mapping(content, key, SHUTTER)
-    try:
-        return Shutter(*(_number(about, key) for key in SHUTTER))
-    except FrameError as e:
-        raise InstrumentError(str(e)) from None
-
-
-def _with_vertical(instrument: Instrument, content: dict) -> Instrument:
-    """The instrument of a camera that is fixed to the ground."""
-    about = _mapping(content, "vertical", VERTICAL)
+    if "vertical" not in content:
+        return instrument
+    if given or sensor:
+        raise InstrumentError(
+            "vertical is of a camera without an inclinometer: leave out inclinometer and the tilt_ keys"
+        )
+    about = _mapping(content, "vertical", (*VERTICAL, SAG))
     if math.isnan(instrument.calibration.utc_unix_s):
         raise InstrumentError("a vertical sags with time: say when it was found, calibrated: {utc: ...}")
-    sag = _number(about, VERTICAL[2])
+    sag = _number(about, SAG)
     if not 0 <= sag <= MAX_SAG_ARCSEC:
-        raise InstrumentError(f"{VERTICAL[2]} is {sag:g}: give a number from 0 to {MAX_SAG_ARCSEC:g}")
-    vertical = CameraVertical(*(_matrix(about, key) for key in VERTICAL[:2]))
+        raise InstrumentError(f"{SAG} is {sag:g}: give a number from 0 to {MAX_SAG_ARCSEC:g}")
+    vertical = CameraVertical(**_told(about, VERTICAL, needed=True))
     return replace(instrument, vertical=vertical, inclinometer=level_errors(sag))
+
+
+def _told(content: dict, schema: Schema, needed: bool = False) -> dict[str, Any]:
+    """The arguments of a part of an instrument that a mapping states; needed: all of them."""
+    return {
+        RENAMED.get(key, key): read(content, key) for key, read in schema.items() if needed or key in content
+    }
 
 
 def _camera(camera: object, folder: Path) -> dict[str, Any]:
@@ -381,36 +355,18 @@ def _size(camera: dict) -> tuple[int, int]:
 def _calibration(content: dict) -> Calibration:
     if STDDEV in content and COVARIANCE in content:
         raise InstrumentError(f"{STDDEV} and {COVARIANCE} say the same thing: give one of them")
-    angles = _row({"misalignment_deg": [0.0] * 3, **content}, "misalignment_deg")
-    calibration = Calibration(misalignment_deg=angles)
+    more = _told(content, CALIBRATION)
     if STDDEV in content:
-        calibration = Calibration.of(angles, _row(content, STDDEV))
-    if COVARIANCE in content:
-        calibration = replace(calibration, covariance_arcsec2=_matrix(content, COVARIANCE))
-    if "remounted_arcsec" in content:
-        calibration = replace(calibration, remounted_arcsec=_number(content, "remounted_arcsec"))
-    if content.get("calibrated") is None:
-        return calibration
-    about = _mapping(content, "calibrated", CALIBRATED)
-    try:
-        utc = unix_of(str(about.get("utc")))
-    except TimeError as e:
-        raise InstrumentError(f"calibrated: {e}") from None
-    more: dict[str, Any] = {k: _number(about, k) for k in ("temperature_c", "valid_days") if k in about}
-    more |= {k: _row(about, k) for k in ("tilt_deg", "response") if k in about}
-    if "response" in about:
-        rows = _list(about, "response_covariance", "rows of numbers")
-        more["response_covariance"] = tuple(
-            _row({"response_covariance": r}, "response_covariance") for r in rows
-        )
-        if {len(row) for row in more["response_covariance"]} != {len(more["response"])}:
-            raise InstrumentError(
-                "response_covariance has not as many rows and columns as response has numbers"
-            )
-    frames = about.get("frames", 0)
-    if isinstance(frames, bool) or not isinstance(frames, int) or not 0 <= frames < MAX_FRAMES:
-        raise InstrumentError(f"calibrated: frames is {_short(frames)}: give a whole number")
-    return replace(calibration, utc_unix_s=utc, frames=frames, **more)
+        angles = more.get("misalignment_deg", (0.0, 0.0, 0.0))
+        more["covariance_arcsec2"] = Calibration.of(angles, _row(content, STDDEV)).covariance_arcsec2
+    if content.get("calibrated") is not None:
+        about = _mapping(content, "calibrated", ("utc", *CALIBRATED))
+        try:
+            more["utc_unix_s"] = unix_of(str(about.get("utc")))
+        except TimeError as e:
+            raise InstrumentError(f"calibrated: {e}") from None
+        more |= _told(about, CALIBRATED)
+    return Calibration(**more)
 
 
 def _sensor(content: dict, stated: bool) -> tuple[str, InclinometerErrors]:
@@ -427,7 +383,7 @@ def _sensor(content: dict, stated: bool) -> tuple[str, InclinometerErrors]:
     return sensors.find(about["model"])
 
 
-def _mapping(content: dict, key: str, known: tuple[str, ...]) -> dict:
+def _mapping(content: dict, key: str, known: Collection[str]) -> dict:
     """The mapping that a key has, of known keys."""
     about = content.get(key)
     if not isinstance(about, dict):
@@ -436,7 +392,7 @@ def _mapping(content: dict, key: str, known: tuple[str, ...]) -> dict:
     return about
 
 
-def _refuse_others(mapping: dict, known: tuple[str, ...]) -> None:
+def _refuse_others(mapping: dict, known: Collection[str]) -> None:
     if unknown := [key for key in mapping if key not in known]:
         raise InstrumentError(f"unknown key {_short(unknown[0])}: the keys here are {', '.join(known)}")
 
@@ -474,6 +430,17 @@ def _matrix(mapping: dict, key: str) -> tuple:
     return matrix
 
 
+def _square(mapping: dict, key: str) -> tuple:
+    return tuple(_row({key: row}, key) for row in _list(mapping, key, "rows of numbers"))
+
+
+def _count(mapping: dict, key: str) -> int:
+    number = mapping[key]
+    if isinstance(number, bool) or not isinstance(number, int) or not 0 <= number < MAX_FRAMES:
+        raise InstrumentError(f"calibrated: {key} is {_short(number)}: give a whole number")
+    return number
+
+
 def _error(mapping: dict, key: str, unit: float) -> float:
     """An error of the inclinometer, given in `unit`, in rad or as a share."""
     given = _number(mapping, key)
@@ -481,6 +448,24 @@ def _error(mapping: dict, key: str, unit: float) -> float:
     if not 0 <= given * unit <= most:
         raise InstrumentError(f"{key} is {given:g}: give a finite number from 0 to {most / unit:.4g}")
     return given * unit
+
+
+# of A3, of how it was found, of the rest, of a shutter, and of a fixed camera's vertical
+CALIBRATION: Schema = {"misalignment_deg": _row, COVARIANCE: _matrix, "remounted_arcsec": _number}
+CALIBRATED: Schema = {
+    "temperature_c": _number,
+    "tilt_deg": _row,
+    "frames": _count,
+    "valid_days": _number,
+    "response": _row,
+    "response_covariance": _square,
+}
+INSTRUMENT: Schema = {"link_to_camera": _matrix, LINK_STDDEV: _number, "clock_stddev_s": _number}
+SHUTTER: Schema = {"readout_s": _number, "readout_stddev_s": _number}
+VERTICAL: Schema = {"camera_to_itrs": _matrix, "covariance_arcsec2": _matrix}
+SAG = "sag_arcsec_per_sqrt_hour"
+KEYS = ("camera", *CALIBRATION_KEYS[:4], "remounted_arcsec", *tuple(INSTRUMENT)[:2], "inclinometer", *INCLINOMETER,
+        "clock_stddev_s", "shutter", "vertical")  # fmt: skip
 
 
 def _in_unit(value: float, unit: float) -> float:

@@ -8,7 +8,7 @@ Rotations between camera, inclinometer and base link, as matrices with their err
 """
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from itertools import combinations
 
 import numpy as np
@@ -38,31 +38,25 @@ def angles_at(up: np.ndarray, axes: int) -> np.ndarray:
     return np.arcsin(np.clip(up, -1, 1))[:axes]
 
 
-@at_once
-@dataclass(frozen=True)
-class Zeroed:
-    """A lean at which the response counts nothing, because A3 was fitted there.
-
-    theta (axes,): its angles.  turns (axes, 3): the rotation of S that moves up as an error of each angle does.
-    """
-
-    theta: np.ndarray
-    turns: np.ndarray
-
-    @classmethod
-    def at(cls, up: np.ndarray, axes: int) -> "Zeroed":
-        """The lean with up (3,) in S, for a sensor of `axes` axes."""
-        theta = angles_at(up, axes)
-        return cls(theta, rotation.cross(up, up_slope(theta, up).T))
+@lru_cache(maxsize=8)
+def _zeroed(up: tuple[float, ...], axes: int) -> tuple[np.ndarray, np.ndarray]:
+    """Angles (axes,) of a lean, and the rotation of S (axes, 3) that moves up there as an error of each angle does."""
+    there = np.array(up)
+    theta = angles_at(there, axes)
+    return theta, rotation.cross(there, up_slope(theta, there).T)
 
 
-def response_columns(theta: np.ndarray, up: np.ndarray, zeroed: Zeroed) -> np.ndarray:
+def response_columns(theta: np.ndarray, up: np.ndarray, calibrated_up: np.ndarray) -> np.ndarray:
     """Change (3, m) of up (3,) in S, as read at the angles theta (axes,), for each coefficient of the response.
+
+    calibrated_up (3,): where the response counts nothing, because A3 was fitted there.
 
     The m coefficients are the zeros (rad), the scales (shares) and, for each pair of axes, the share of one axis' angle
     that the other shows.
     """
-    axes, lean = len(theta), (theta - zeroed.theta).tolist()
+    axes = len(theta)
+    then, turns = _zeroed(tuple(calibrated_up.tolist()), axes)
+    lean = (theta - then).tolist()
     # change of each angle for each coefficient
     angles = np.zeros((axes, RESPONSE_COEFFICIENTS[axes]))
     for k in range(axes):
@@ -71,7 +65,7 @@ def response_columns(theta: np.ndarray, up: np.ndarray, zeroed: Zeroed) -> np.nd
         angles[i, k], angles[j, k] = lean[j], lean[i]
     columns = up_slope(theta, up) @ angles
     # a rotation of S by up x moved takes up there by `moved`
-    columns[:, :axes] += rotation.cross_matrix(up) @ zeroed.turns.T
+    columns[:, :axes] += rotation.cross_matrix(up) @ turns.T
     return columns
 
 
@@ -173,9 +167,8 @@ class Mounting:
         """
         if tilt.either_way:
             raise TiltError(EITHER_WAY)
-        zeroed = self._zeroed[tilt.axes]
         if self.response:
-            columns = response_columns(tilt.theta, tilt.up, zeroed)
+            columns = response_columns(tilt.theta, tilt.up, self.calibrated_up)
             if columns.shape[1] != len(self.response):
                 raise InstrumentError(
                     f"the calibration's response has {len(self.response)} coefficients, and a tilt of {tilt.axes} axes "
@@ -191,15 +184,10 @@ class Mounting:
             variances = stated_variances(self.inclinometer, tilt.axes)
             wrong = self.inclinometer.contradiction(tilt) / np.maximum(np.cos(theta), MIN_COSINE)
             variances[: tilt.axes] += wrong**2
-            response = response_columns(theta, tilt.up, zeroed) * np.sqrt(variances)
+            response = response_columns(theta, tilt.up, self.calibrated_up) * np.sqrt(variances)
         a2 = level_of(up)
         return LocalLevel(up, a2, a2 @ self.a3, response)
 
     @cached_property
     def _response_root(self) -> np.ndarray:
         return symmetric_root(self.response_covariance)
-
-    @cached_property
-    def _zeroed(self) -> dict[int, Zeroed]:
-        """The lean at which the response counts nothing, for a number of axes."""
-        return {axes: Zeroed.at(self.calibrated_up, axes) for axes in RESPONSE_COEFFICIENTS}

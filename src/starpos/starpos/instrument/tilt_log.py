@@ -50,6 +50,9 @@ ON_STEP = 5e-6
 COARSE_SIGMA, DITHERED, MOST_STEPS = 2.0, 0.03, 5.5
 # A quiet sensor goes from one step to the next: minimum number of such moves, and their median over the smallest.
 MIN_MOVES, ONE_STEP = 5, 2.5
+# Axes that repeat together beyond chance by this many sigma show readings that are published several times, about
+# equally often (up to a limit): these quantiles differ by a factor of 2 at most. Minimum number of changes.
+TOGETHER_SIGMA, QUARTILES, MOST_COPIES, MIN_CHANGES = 4.0, (0.25, 0.75), 64, 3
 
 
 def white_noise(steps: np.ndarray) -> np.ndarray:
@@ -73,6 +76,30 @@ def noise_excess(steps: np.ndarray, stated_rad: float) -> float:
         return 1.0
     found = float(white_noise(steps).max() / stated_rad)
     return found if found > 1 + SIGNIFICANT / np.sqrt(len(steps)) else 1.0
+
+
+def copies(moves: np.ndarray) -> int:
+    """How often each reading is published; 1: once, also where coarse steps repeat by chance.
+
+    moves (M, axes): differences from one to the next. Noise repeats the values of one axis whether the other's repeat or
+    not; what publishes faster than the sensor reads repeats all together.
+    """
+    x, y = moves[:, 0] != 0, moves[:, 1] != 0
+    n, by_x, by_y, both = len(moves), int(x.sum()), int(y.sum()), int((x & y).sum())
+    by_chance = by_x * by_y / max(n, 1)
+    sigma = math.sqrt(by_chance * (n - by_x) * (n - by_y) / max(n * (n - 1), 1))
+    # of a few that agree without exception
+    least = min(TOGETHER_SIGMA, 0.99 * math.sqrt(max(n - 1, 0))) * sigma
+    if both < MIN_CHANGES or sigma == 0 or both - by_chance < least:
+        return 1
+    often = np.diff(np.flatnonzero(np.concatenate([[True], moves.any(1), [True]])))
+    seldom, usual = np.quantile(often, QUARTILES, method="lower").tolist()
+    return int(usual) if usual <= min(2 * seldom, MOST_COPIES) else 1
+
+
+def without_copies(moves: np.ndarray) -> np.ndarray:
+    """The differences of readings that are published several times, without those between equal ones."""
+    return moves[moves.any(1)] if copies(moves) > 1 else moves
 
 
 def coarse_step(theta: np.ndarray, moves: np.ndarray, repeats: np.ndarray, noise_rad: float) -> float:
@@ -125,7 +152,7 @@ class TiltLog:
     covariance : (N, 2, 2) rad2 of each reading's theta_x, theta_y
     theta_z : (N,) rad; None or NaN for a two-axis sensor
     variance_z : (N,) rad2; None or NaN: as for the other two
-    earlier_excess : noise over the stated one that earlier readings showed, which are not in the log
+    earlier_excess, earlier_copies : noise over the stated one, and `copies`, of earlier readings that are not in the log
     either_way : as of a `Tilt`
 
     Examples
@@ -145,6 +172,7 @@ class TiltLog:
     theta_z: np.ndarray | None = None
     variance_z: np.ndarray | None = None
     earlier_excess: float = 1.0
+    earlier_copies: int = 1
     either_way: bool = False
 
     @classmethod
@@ -169,11 +197,11 @@ class TiltLog:
         )
 
     @classmethod
-    def of_readings(cls, readings: Sequence[Tilt], earlier_excess: float = 1.0) -> "TiltLog":
-        """Make a log of readings, each with its own covariance."""
+    def of_readings(cls, readings: Sequence[Tilt], **earlier: Any) -> "TiltLog":
+        """Make a log of readings, each with its own covariance; earlier: the fields of that name."""
         names = [f.name for f in fields(cls) if "ndarray" in str(f.type)]
         columns: dict[str, Any] = {name: np.array([getattr(r, name) for r in readings]) for name in names}
-        return cls(**columns, earlier_excess=earlier_excess)
+        return cls(**columns, **earlier)
 
     def __repr__(self) -> str:
         return f"<{len(self.utc_unix_s)} readings of an inclinometer>"
@@ -202,9 +230,10 @@ class TiltLog:
     @cached_property
     def _moves(self) -> np.ndarray:
         """Differences (M, axes) of neighbours in time."""
-        order = np.argsort(self.utc_unix_s, kind="stable")
-        apart = np.diff(self.utc_unix_s[order])
-        return np.diff(self.theta[order], axis=0)[(apart > 0) & (apart < NEIGHBOURS_S)]
+        return self._moves_of(self._each)
+
+    def _moves_of(self, order: np.ndarray) -> np.ndarray:
+        return np.diff(self.theta[order], axis=0)[np.diff(self.utc_unix_s[order]) < NEIGHBOURS_S]
 
     def until(self, unix_s: float) -> "TiltLog":
         """The readings up to a time."""
@@ -216,15 +245,16 @@ class TiltLog:
     def average(self, mid_unix_s: float, exposure_s: float, spread_s: float = 0.0) -> Tilt:
         """The mean tilt over an exposure, from the readings in it or, for a short one, from two that bracket it closely.
 
-        Two readings of the same time count once. A reading far from the others is left out; two that follow each other
-        and agree are of a turn. If the readings scatter more than stated (wind, footsteps), the covariance is larger.
+        Two readings of the same time count once, and so does one that is published several times. A reading far from
+        the others is left out; two that follow each other and agree are of a turn. If the readings scatter more than
+        stated (wind, footsteps), the covariance is larger.
         Its `step_rad` says whether they are rounded, or repeat without an end.
         TiltError if they do not cover the exposure, the instrument moved, or the sensor was stuck.
 
         spread_s: the full width within which the middle may lie, for a clock of whole seconds; then readings within it
         represent the exposure, if all of them agree.
         """
-        use = self._of_exposure(mid_unix_s, exposure_s, spread_s)
+        use = self._first(self._of_exposure(mid_unix_s, exposure_s, spread_s))
         if self.stuck[use].any():
             raise TiltError(
                 f"the inclinometer repeats the same value in {STUCK_READINGS} readings or more, though its noise is "
@@ -251,6 +281,29 @@ class TiltLog:
         return index[np.unique(self.utc_unix_s[index], return_index=True)[1]]
 
     @cached_property
+    def _number(self) -> np.ndarray:
+        """The number (N,) of the reading of the sensor that each is, if readings are published several times."""
+        order = self._once
+        number = np.arange(len(order))
+        most = max(copies(self._moves_of(order)), self.earlier_copies) + 1
+        if most > 2:
+            new = np.append(True, np.diff(self.theta[order], axis=0).any(1))
+            # a frozen sensor repeats for longer
+            number = np.cumsum((number - np.maximum.accumulate(number * new)) % most == 0)
+        numbers = np.full(len(self.utc_unix_s), -1)
+        numbers[order] = number
+        return numbers
+
+    @cached_property
+    def _each(self) -> np.ndarray:
+        """Indices as `_once`, of the first publication of each reading of the sensor."""
+        return self._first(self._once)
+
+    def _first(self, use: np.ndarray) -> np.ndarray:
+        """The readings of `use`, in order of time, without the copies of another one there."""
+        return use[np.unique(self._number[use], return_index=True)[1]]
+
+    @cached_property
     def stuck(self) -> np.ndarray:
         """Mask (N,) of the readings that stand in a row of STUCK_READINGS or more that are equal to the last digit.
 
@@ -258,7 +311,7 @@ class TiltLog:
         noise and by how rarely other neighbours are equal.
         """
         stuck = np.zeros(len(self.utc_unix_s), bool)
-        order = self._once
+        order = self._each
         steps = np.diff(self.theta[order], axis=0)
         equal = (steps == 0).all(1)
         begin, end = _runs(equal)
@@ -277,7 +330,7 @@ class TiltLog:
         if not coarse and equal[free].mean() < RARE:
             for first, last in zip(begin, end, strict=True):
                 stuck[order[first : last + 1]] = True
-        return stuck
+        return self._of_copies(stuck)
 
     @property
     def step_rad(self) -> float:
@@ -287,7 +340,7 @@ class TiltLog:
     @cached_property
     def _steps(self) -> dict[tuple[bool, ...], float]:
         """`coarse_step` of all readings, by whether X' and Y' repeat."""
-        noise, theta = float(np.sqrt(self.variance.mean())), self.theta[self._once, :2]
+        noise, theta = float(np.sqrt(self.variance.mean())), self.theta[self._each, :2]
         cases = list(itertools.product((False, True), repeat=2))
         return {case: coarse_step(theta, self._moves[:, :2], np.array(case), noise) for case in cases}
 
@@ -295,10 +348,16 @@ class TiltLog:
     def _repeats(self) -> np.ndarray:
         """Mask (N, 2) of the values of X', Y' that stand in a row of STUCK_READINGS or more equal ones."""
         repeats = np.zeros((len(self.utc_unix_s), 2), bool)
-        for axis, equal in enumerate((np.diff(self.theta[self._once, :2], axis=0) == 0).T):
+        for axis, equal in enumerate((np.diff(self.theta[self._each, :2], axis=0) == 0).T):
             for first, last in zip(*_runs(equal), strict=True):
-                repeats[self._once[first : last + 1], axis] = last - first >= STUCK_READINGS - 1
-        return repeats
+                repeats[self._each[first : last + 1], axis] = last - first >= STUCK_READINGS - 1
+        return self._of_copies(repeats)
+
+    def _of_copies(self, of_each: np.ndarray) -> np.ndarray:
+        """What (N, ...) is known of the readings of the sensor, for all their copies."""
+        whole, found = np.zeros_like(of_each), self._number >= 0
+        whole[found] = of_each[self._each][np.unique(self._number[found], return_inverse=True)[1]]
+        return whole
 
     def _mean(self, use: np.ndarray, step_rad: float = 0.0) -> Tilt:
         """The mean tilt of the readings `use` (indices, in order of time), rounded to a step."""
@@ -339,7 +398,7 @@ class TiltLog:
             variance_z=float(variance[2]) / n if third else np.nan,
             utc_unix_s=float(self.utc_unix_s[use].mean()),
             samples=n,
-            temperature_c=_mean_known(self.temperature_c[use]),
+            temperature_c=mean_known(self.temperature_c[use]),
             times=tuple(self.utc_unix_s[use].tolist()),
             either_way=self.either_way,
         )
@@ -434,7 +493,7 @@ def _runs(mask: np.ndarray) -> np.ndarray:
     return np.flatnonzero(np.diff(np.concatenate([[0], mask, [0]]))).reshape(-1, 2).T
 
 
-def _mean_known(celsius: np.ndarray) -> float:
+def mean_known(celsius: np.ndarray) -> float:
     """Mean of the temperatures (N,) that are known; NaN without one."""
     known = celsius[np.isfinite(celsius)]
     return float(known.mean()) if len(known) else np.nan
@@ -487,13 +546,18 @@ class NoiseTracker:
 
     def __init__(self) -> None:
         self._differences: deque[list[float]] = deque(maxlen=LONG_RUN)
+        # of samples, which may be published several times
+        self._moves: deque[list[float]] = deque(maxlen=LONG_RUN)
         self.restart()
 
     def restart(self) -> None:
         """Start again, because the samples are of another kind now, such as another rate."""
         # None: too few samples yet.
         self.sigma: tuple[float, ...] | None = None
+        self._copied = False
+        self._last: tuple[float, ...] = ()
         self._differences.clear()
+        self._moves.clear()
         self.interrupt()
 
     def interrupt(self) -> None:
@@ -505,7 +569,11 @@ class NoiseTracker:
 
     def add_sample(self, time_s: float, *angles: float) -> None:
         """Take a sample (rad, of two axes or three) at `time_s` of a clock that does not step."""
-        block = self._block
+        block, last, self._last = self._block, self._last, angles
+        if len(last) == len(angles):
+            self._moves.append([a - b for a, b in zip(angles, last, strict=True)])
+        if self._copied and last == angles:
+            return
         # With the factor, samples that come every 0.1 s are one block each.
         if block is not None and time_s - block[0] < 0.95 * BLOCK_S:
             block[1:] = [block[1] + 1, *(s + angle for s, angle in zip(block[2:], angles, strict=True))]
@@ -516,6 +584,13 @@ class NoiseTracker:
 
     def _close(self, block: list[float]) -> None:
         begin, n, *sums = block
+        copied = len(self._moves) >= MIN_NEIGHBOURS and copies(np.array(self._moves)) > 1
+        if copied != self._copied:
+            # the differences so far are of other numbers of readings
+            self._copied, self.sigma = copied, None
+            self._differences.clear()
+            self.interrupt()
+            return
         mean = [begin, n, *(s / n for s in sums)]
         before, self._before = self._before, mean
         if before is None or not 0 < begin - before[0] <= APART_S:

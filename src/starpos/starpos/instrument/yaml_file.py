@@ -73,16 +73,11 @@ def parse(text: bytes | str, complaint: str) -> Any:
 
 
 def save(path: Path, content: dict, comment: str = "") -> None:
-    """Write a file whole or not at all (`files.write_whole`); InstrumentError if it cannot be written.
+    """Write a file whole or not at all (`files.save`); InstrumentError if it cannot be written.
 
     comment is text for people, written at its end.
     """
-    try:
-        files.write_whole(path, text_of(content, comment).encode())
-    # ValueError: the name contains a NUL
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise InstrumentError(f"{path}: the file cannot be written there ({reason})") from None
+    files.save(path, text_of(content, comment).encode(), error=InstrumentError)
 
 
 def text_of(content: dict, comment: str = "") -> str:

@@ -148,7 +148,9 @@ class ExposureFacts:
         stamp_ns = header.stamp.sec * NANO + header.stamp.nanosec
         capture = self._captures.pop(key_of(header), None)
         told = None if capture is None else _facts_of(capture)
-        of_driver = capture is not None and self._is_of_driver(capture)
+        # whether it leaves the meaning of the stamp to the parameters
+        unsaid = capture is not None and capture.stamp_source == UNKNOWN_SOURCE
+        of_driver = unsaid and self._values["stamp"] != UNKNOWN_STAMP
         self._exposures_come |= of_driver
         facts = None if of_driver else told or self._usual
         if facts is None:
@@ -163,10 +165,6 @@ class ExposureFacts:
         # the errors of a camera's times and its shutter are the same in all its frames; its exposure may differ
         self._usual = facts | {"exposure_s": 0.0}
         return stamp_ns, lambda frame: replace(frame, **known)
-
-    def _is_of_driver(self, capture: Any) -> bool:
-        """Whether a Capture leaves the meaning of the stamp to the parameters."""
-        return capture.stamp_source == UNKNOWN_SOURCE and self._values["stamp"] != UNKNOWN_STAMP
 
     def _driver_stamp(self, exposure_s: float) -> DriverStamp:
         """The meaning of a driver's stamp by the parameters; exposure_s: from a Capture, 0 without one."""

@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Stars and their shutter from a StarArray, trails from a TrailArray, a camera's attitude from an Attitude."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from starpos import rotation
 from starpos.errors import FrameError
-from starpos.fix.attitude import CameraAttitude
+from starpos.fix.attitude import UNKNOWN_TURN, CameraAttitude
 from starpos.frames.exposure import Shutter
 from starpos.frames.frame import DISC, SATURATED, Disc, FrameTrail, Stars
 from starpos.messages.stamp import stamp_to_unix
@@ -23,7 +24,9 @@ def message_to_stars(message: Any, source: str = "stars") -> Stars:
             f"{source}: {len(message.stars)} stars are more than {MAX_STARS}: send the brightest."
         )
     rows = [s for s in message.stars if not s.flags & DISC]
-    disc = next((_message_to_disc(s, source) for s in message.stars if s.flags & DISC), None)
+    disc = None
+    for s in reversed([s for s in message.stars if s.flags & DISC][:DISCS]):
+        disc = replace(_message_to_disc(s, source), other=disc)
     return Stars(
         x=np.array([s.x for s in rows]),
         y=np.array([s.y for s in rows]),
@@ -104,7 +107,9 @@ def message_to_trails(message: Any) -> list[FrameTrail]:
     return trails
 
 
-# of an attitude's quaternion, and the most that its covariance may say, rad2
+# Of the discs of a frame two count.
+DISCS = 2
+# of an attitude's quaternion, and the most that its covariance may say, rad2, but about the Sun seen alone
 OFF_UNIT, MAX_ATTITUDE_VARIANCE = 1e-3, 0.01
 
 
@@ -127,10 +132,12 @@ def message_to_attitude(message: Any, source: str = "attitude") -> CameraAttitud
         raise FrameError(
             f"{source}: the covariance or an error of its time is not a finite number of at least 0."
         )
+    variances = np.linalg.eigvalsh(covariance)
+    known = variances[:2] if variances[2] > UNKNOWN_TURN else variances
     if not (
-        np.allclose(covariance, covariance.T, rtol=1e-6, atol=0)
-        and np.linalg.eigvalsh(covariance)[0] > 0
-        and covariance.trace() < MAX_ATTITUDE_VARIANCE
+        np.allclose(covariance, covariance.T, rtol=1e-6, atol=1e-9 * variances[2])
+        and variances[0] > 0
+        and known.sum() < MAX_ATTITUDE_VARIANCE
     ):
         raise FrameError(f"{source}: the covariance is not symmetric, positive and below 0.01 rad2.")
     return CameraAttitude(

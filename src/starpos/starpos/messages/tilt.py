@@ -13,7 +13,7 @@ import numpy as np
 from starpos.errors import TiltError
 from starpos.frozen import at_once
 from starpos.instrument.inclinometer import MAX_CELSIUS, SCA100T_NOISE_RAD, SQUARE, Tilt
-from starpos.instrument.tilt_log import NoiseTracker
+from starpos.instrument.tilt_log import NoiseTracker, copies
 from starpos.messages.stamp import PlainHeader, PlainStamp, stamp_to_unix
 from starpos.units import STANDARD_GRAVITY
 
@@ -165,7 +165,7 @@ def acceleration_of(message: Any) -> Acceleration:
 @at_once
 @dataclass(frozen=True)
 class MeanForce:
-    """The messages of one span of time; forces is (N, 3), see `Acceleration`."""
+    """The messages of one span of time; forces is (N, 3), see `Acceleration`, of what is published twice once."""
 
     forces: np.ndarray
     mid_ns: int
@@ -176,8 +176,11 @@ class MeanForce:
 
     @classmethod
     def of(cls, messages: list[Acceleration]) -> "MeanForce":
+        forces = np.array([m.force for m in messages])
+        moves = np.diff(forces, axis=0)
+        new = np.append(True, moves.any(1)) if copies(moves) > 1 else slice(None)
         return cls(
-            np.array([m.force for m in messages]),
+            forces[new],
             (messages[0].stamp_ns + messages[-1].stamp_ns) // 2,
             math.sqrt(sum(m.rotation**2 for m in messages) / len(messages)),
             np.mean([m.variance for m in messages], axis=0),
@@ -333,17 +336,16 @@ class ImuTilts:
         """
         breaks = self.averager.breaks
         average = self.averager.include(said)
-        reading = None if average is None else self._judged(average, temperature_c, step_rad)
+        reading = None
+        if average is not None:
+            self._sequence += 1
+            self.unrest = average.unrest(self._max_force_error, self._max_rotation)
+            if self.unrest:
+                self._gap = True
+            else:
+                reading = self._reading(average, temperature_c, step_rad)
         self._gap |= self.averager.breaks != breaks
         return reading
-
-    def _judged(self, average: MeanForce, temperature_c: float, step_rad: float) -> Reading | None:
-        self.unrest = average.unrest(self._max_force_error, self._max_rotation)
-        if self.unrest:
-            self._sequence += 1
-            self._gap = True
-            return None
-        return self._reading(average, temperature_c, step_rad)
 
     def _reading(self, average: MeanForce, temperature_c: float, step_rad: float) -> Reading:
         x, y, z = average.tilt()
@@ -353,7 +355,6 @@ class ImuTilts:
             self._noise.interrupt()
         if not flags & STUCK:
             self._noise.add_sample(average.mid_ns * 1e-9, x, y, z)
-        self._sequence += 1
         covariance = self._covariance(average) + step_rad**2 / 12 * np.eye(3)
         return Reading(
             stamp_ns=max(average.mid_ns - self._latency_ns, 0),

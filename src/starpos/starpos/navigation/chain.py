@@ -50,9 +50,9 @@ def log_likelihood(chain: Chain) -> float:
     """Logarithm of how likely the equations are, whatever the unknowns, but for the determinants of their whitening."""
     eliminated, last = _forward(chain)
     n = chain.unknowns
-    return -sum(map(_misfit, (*eliminated, last))) - sum(
-        _log_determinant(triangle) for triangle in (*eliminated[:, :n], last[:-1])
-    )
+    misfit = sum(float(triangle[-1, -1] ** 2) for triangle in (*eliminated, last)) / 2
+    diagonals = [np.diagonal(triangle) for triangle in (*eliminated[:, :n], last[:-1])]
+    return -misfit - float(np.log(np.abs(np.concatenate(diagonals))).sum())
 
 
 def _forward(chain: Chain) -> tuple[np.ndarray, np.ndarray]:
@@ -71,14 +71,6 @@ def _forward(chain: Chain) -> tuple[np.ndarray, np.ndarray]:
         triangle = _triangle(rows)
         eliminated[k, :n], eliminated[k, n], carried = triangle[:n], triangle[-1], triangle[n:-1, n:]
     return eliminated, _triangle(np.vstack([carried, chain.nodes[-1]]))
-
-
-def _misfit(triangle: np.ndarray) -> float:
-    return float(triangle[-1, -1] ** 2 / 2)
-
-
-def _log_determinant(triangle: np.ndarray) -> float:
-    return float(np.log(np.abs(np.diagonal(triangle))).sum())
 
 
 def _triangle(rows: np.ndarray) -> np.ndarray:

@@ -6,7 +6,7 @@ until the next one ITRS turns with the Earth. There is no latitude or longitude 
 other places.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -267,6 +267,7 @@ class StarAttitudes:
     """Attitudes of the camera at F of the nodes: index (F,), camera_to_itrs (F, 3, 3), C into ITRS.
 
     covariance (F, 3, 3), by_refraction (F, 3); stamp_stddev_s (F,).
+    rays (F, 3): the Sun in C, about which an attitude is not known; zeros for stars.
     """
 
     index: np.ndarray
@@ -274,6 +275,28 @@ class StarAttitudes:
     covariance: np.ndarray
     by_refraction: np.ndarray
     stamp_stddev_s: np.ndarray
+    rays: np.ndarray
+
+    @property
+    def whole(self) -> np.ndarray:
+        """Mask (F,) of the attitudes that are known about every axis."""
+        return ~self.rays.any(1)
+
+    def part(self, keep: np.ndarray) -> "StarAttitudes":
+        """Some of them, by a mask (F,)."""
+        return StarAttitudes(**{f.name: getattr(self, f.name)[keep] for f in fields(self)})
+
+    def nearest(self, camera: np.ndarray) -> np.ndarray:
+        """The attitudes (F, 3, 3), each turned about its ray so that it is nearest to the camera's (F, 3, 3)."""
+        found, lone = self.camera_to_itrs.copy(), ~self.whole
+        camera, ray = camera[lone], self.rays[lone]
+        believed, seen = _turned(camera, ray), _turned(found[lone], ray)
+        axis = np.cross(believed, seen)
+        sine = np.linalg.norm(axis, axis=1)
+        angle = np.arctan2(sine, np.einsum("ki,ki->k", believed, seen))
+        turn = Rotation.from_rotvec(axis * (angle / np.maximum(sine, 1e-12))[:, None]).as_matrix()
+        found[lone] = turn @ camera
+        return found
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -318,7 +341,7 @@ def star_residuals(motion: Motion, stars: StarAttitudes, sums: Sums, pieces: Pie
     """Equations of the frames with stars: the camera's attitude by the body's, the mount and the lag."""
     k = stars.index
     camera = motion.attitude[k] @ motion.camera_to_body
-    off = Rotation.from_matrix(stars.camera_to_itrs.transpose(0, 2, 1) @ camera).as_rotvec()
+    off = Rotation.from_matrix(stars.nearest(camera).transpose(0, 2, 1) @ camera).as_rotvec()
     rate = _rates(sums, pieces)[k] - np.einsum("kji,j->ki", motion.attitude[k], SPIN)
     rate = rate @ motion.camera_to_body
     rows = np.zeros((len(k), 3, n + CONSTANTS + 1))
@@ -348,6 +371,16 @@ def standing_residuals(motion: Motion, index: np.ndarray, sigma: float, n: int) 
     return Residuals(index=index, rows=rows, covariance=np.tile(sigma**2 * np.eye(3), (len(index), 1, 1)))
 
 
+def place_residuals(
+    motion: Motion, index: np.ndarray, place: np.ndarray, covariance: np.ndarray, n: int
+) -> Residuals:
+    """Equations of nodes (F,) whose place (F, 3) is known, m in ITRS, with its covariance (F, 3, 3)."""
+    rows = np.zeros((len(index), 3, n + CONSTANTS + 1))
+    rows[:, :, PLACE] = np.eye(3)
+    rows[:, :, -1] = place - motion.place[index]
+    return Residuals(index=index, rows=rows, covariance=covariance)
+
+
 def law_residuals(motion: Motion, law: MotionLaw) -> Residuals:
     """Equations of the nodes whose velocity is known only from the motion law: speed along the nose, drift, rest."""
     up, count = zenith_at(motion.place), len(motion)
@@ -364,7 +397,7 @@ def law_residuals(motion: Motion, law: MotionLaw) -> Residuals:
     rows[:, :, -1] = nose * motion.speed[:, None] + drift - motion.velocity
     apart_s = float(np.median(np.diff(motion.utc_unix_s)))
     upward = up[:, :, None] * up[:, None, :]
-    covariance = law.rest_at(apart_s) ** 2 * level + law.climb_at(apart_s) ** 2 * upward
+    covariance = law.longer(apart_s) ** 2 * (law.rest_stddev**2 * level + law.climb_stddev**2 * upward)
     return Residuals(index=np.arange(count), rows=rows, covariance=covariance)
 
 

@@ -83,7 +83,7 @@ NOWHERE = Standstills(first=np.zeros(0, int), last=np.zeros(0, int))
 
 def standstills(stars: StarAttitudes, pieces: Pieces) -> Standstills:
     """The stretches in which the vehicle seems to stand, by attitudes and readings alone."""
-    fine = np.linalg.eigvalsh(stars.covariance)[:, 1] < FINE**2
+    fine = (np.linalg.eigvalsh(stars.covariance)[:, 1] < FINE**2) & stars.whole
     if fine.sum() < MIN_FRAMES:
         return NOWHERE
     index, attitude = stars.index[fine], Rotation.from_matrix(stars.camera_to_itrs[fine])

@@ -11,7 +11,7 @@ import numpy as np
 from starpos.errors import VoyageError
 from starpos.navigation.preintegration import thinned
 from starpos.navigation.records import FASTEST, GAP, MAX_SIGMA, MIN_SIGMA, ImuLog, VelocityLog
-from starpos.navigation.sightings import PlacelessFrame
+from starpos.navigation.sightings import FrameUnderWay
 from starpos.navigation.vessel import Vessel
 from starpos.navigation.voyage import Voyage, adjust_voyage
 
@@ -100,7 +100,7 @@ class RecentRecord:
     """What a job adjusts: blocks of readings (N, 7), frames, and rows of velocities (N, 5), None without any."""
 
     blocks: Sequence[np.ndarray]
-    frames: Sequence[PlacelessFrame]
+    frames: Sequence[FrameUnderWay]
     velocity: np.ndarray | None
 
     def adjusted(self, vessel: Vessel) -> Voyage:
@@ -119,10 +119,10 @@ class Recent:
 
     def __init__(self) -> None:
         self.readings = RecentReadings()
-        self._frames: list[PlacelessFrame] = []
+        self._frames: list[FrameUnderWay] = []
         self._velocities: deque[tuple[float, ...]] = deque()
 
-    def add_frame(self, frame: PlacelessFrame) -> None:
+    def add_frame(self, frame: FrameUnderWay) -> None:
         """Take a frame, whenever it comes; VoyageError for a second one of its time."""
         k = bisect_left(self._frames, frame.utc_unix_s, key=_time)
         if k < len(self._frames) and self._frames[k].utc_unix_s == frame.utc_unix_s:
@@ -175,5 +175,5 @@ class Recent:
         )
 
 
-def _time(frame: PlacelessFrame) -> float:
+def _time(frame: FrameUnderWay) -> float:
     return frame.utc_unix_s

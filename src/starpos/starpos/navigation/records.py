@@ -16,23 +16,18 @@ MAX_BYTES = 1_500_000_000
 EARLIEST_S, LATEST_S = 9.4e7, 4.1e9
 
 
-@dataclass(frozen=True, eq=False)
-class Record:
-    """Rows of a table that can be used, in order of time: times (N,), values (N, C), and a sentence for each fault."""
-
-    utc_unix_s: np.ndarray
-    values: np.ndarray
-    faults: tuple[str, ...]
+# rows that can be used, in order of time: times (N,), values (N, C), and a sentence for each fault
+Rows = tuple[np.ndarray, np.ndarray, tuple[str, ...]]
 
 
-def _read_record(path: Path | str, form: TableForm) -> Record:
+def _read_record(path: Path | str, form: TableForm) -> Rows:
     """Read the columns that a form needs, utc_unix_s first; VoyageError if they cannot be used."""
     columns = form.read(path).columns
     utc_unix_s, *values = (columns[name] for name in form.needed)
     return in_order(utc_unix_s, np.stack(values, -1), f"{path}")
 
 
-def in_order(utc_unix_s: np.ndarray, values: np.ndarray, place: str) -> Record:
+def in_order(utc_unix_s: np.ndarray, values: np.ndarray, place: str) -> Rows:
     """Keep the rows that can be used; VoyageError if none can.
 
     Rows that are not all finite numbers are left out, and so are rows whose time does not come after all before them:
@@ -53,7 +48,7 @@ def in_order(utc_unix_s: np.ndarray, values: np.ndarray, place: str) -> Record:
         )
     if not late.any():
         raise VoyageError(f"{place}: no row can be used: it needs a time in Unix s and finite numbers")
-    return Record(t[late], v[late], tuple(faults))
+    return t[late], v[late], tuple(faults)
 
 
 def _rows(wrong: np.ndarray) -> str:
@@ -150,8 +145,8 @@ def clipped(values: np.ndarray) -> np.ndarray:
 
 def read_imu(path: Path | str) -> ImuLog:
     """Read a CSV of utc_unix_s, gx, gy, gz (rad/s), ax, ay, az (m/s2); VoyageError says why one cannot be used."""
-    record = _read_record(path, IMU_TABLE)
-    return ImuLog.of(record.utc_unix_s, record.values[:, :3], record.values[:, 3:], record.faults, f"{path}")
+    t, values, faults = _read_record(path, IMU_TABLE)
+    return ImuLog.of(t, values[:, :3], values[:, 3:], faults, f"{path}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -244,8 +239,8 @@ class VelocityLog:
 
 def read_velocity(path: Path | str) -> VelocityLog:
     """Read a CSV of utc_unix_s, vx, vy, vz, sigma (m/s); VoyageError says why one cannot be used."""
-    record = _read_record(path, VELOCITY_TABLE)
-    velocity, sigma = record.values[:, :3], record.values[:, 3]
+    t, values, faults = _read_record(path, VELOCITY_TABLE)
+    velocity, sigma = values[:, :3], values[:, 3]
     if np.abs(velocity).max() > FASTEST:
         raise VoyageError(f"{path}: a velocity is beyond {FASTEST:g} m/s: give m/s along the body's axes")
-    return VelocityLog(utc_unix_s=record.utc_unix_s, velocity=velocity, sigma=sigma, faults=record.faults)
+    return VelocityLog(utc_unix_s=t, velocity=velocity, sigma=sigma, faults=faults)

@@ -6,15 +6,12 @@ level is needed: only refraction and the diurnal aberration depend on the zenith
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
 from starpos import rotation
-from starpos.earth.ellipsoid import meridian_turn
 from starpos.earth.orientation import (
     ROTATION_RAD_S,
-    EarthState,
     earth_orientation,
     earth_state,
     station_velocity,
@@ -24,21 +21,17 @@ from starpos.earth.refraction import Atmosphere, Refraction
 from starpos.errors import FixError, FrameError, InstrumentError, TimeError
 from starpos.fix import solver
 from starpos.fix.attitude import CAMERA, ENU, GCRS, ITRS, LINK, Attitude, CameraAttitude
+from starpos.fix.heading import zenith_moved
 from starpos.fix.sighting import Sighting
 from starpos.fix.solution import Solution
-from starpos.fix.star_fit import (
-    StarFit,
-    fit_seen,
-    seen_problem,
-    sound_matches,
-)
+from starpos.fix.star_fit import MatchedStars, StarFit, fit_seen, seen_problem, sound_matches
 from starpos.frames.frame import Stars
 from starpos.frames.reading import why_no_time
 from starpos.frozen import at_once
-from starpos.identification import Identification, fisheye
+from starpos.identification import fisheye
 from starpos.instrument.camera import Camera
 from starpos.navigation.vessel import Vessel
-from starpos.sky.catalogue import Catalogue
+from starpos.sky.bodies import SUN, Body, body_at
 from starpos.units import ARCSEC
 
 # of an attitude without refraction; 1 sigma
@@ -64,21 +57,21 @@ class FrameUnderWay(Sighting, ABC):
 class IdentifiedFrame(FrameUnderWay):
     """N identified stars of a frame; `camera` is without refraction, good to ROUGH rad.
 
-    xy (N, 2), covariance_px2 (N, 2, 2): px from the principal point of an ideal camera of focal length focal_px.
+    xy (N, 2), covariance_px2 (N, 2, 2): px, on a frame of the camera `optics`.
     itrs (N, 3): geocentric apparent directions in ITRS.
     """
 
     xy: np.ndarray
     covariance_px2: np.ndarray
     itrs: np.ndarray
-    focal_px: float
+    optics: Camera
 
     def under(self, zenith: np.ndarray, atmosphere: Atmosphere) -> Attitude:
         """The attitude under a zenith (3,) in ITRS, with the plate scale, by the stars; FixError if they disagree."""
         seen = self._fitted(_seen(self, zenith, atmosphere.refraction()))
         stronger = _seen(self, zenith, atmosphere.refraction(1 + STEP_REFRACTION))
         fit = seen.fit
-        there = seen_problem(self.xy, self._optics, stronger).predict(fit.a4, fit.scale)
+        there = seen_problem(self.xy, self.optics, stronger).predict(fit.a4, fit.scale)
         shift = (there - self.xy - fit.residual)[fit.kept] / STEP_REFRACTION
         # the camera turns the other way than the sky in it
         return _camera_of(seen, -seen.errors.rotated(shift))
@@ -87,14 +80,10 @@ class IdentifiedFrame(FrameUnderWay):
         """Fit attitude and plate scale where no zenith is known: refraction and diurnal aberration stay in it."""
         return _camera_of(self._fitted(self.itrs), np.zeros(3))
 
-    @cached_property
-    def _optics(self) -> Camera:
-        return Camera(width=1, height=1, fx=self.focal_px, fy=self.focal_px, cx=0.0, cy=0.0)
-
     def _fitted(self, seen: np.ndarray) -> StarFit:
         """The fit to the directions seen (N, 3); FixError if the stars disagree."""
         try:
-            return fit_seen(self.xy, self.covariance_px2, self._optics, seen)
+            return fit_seen(self.xy, self.covariance_px2, self.optics, seen)
         except FixError as error:
             raise FixError(f"{self.source}: {error}: left out") from None
 
@@ -138,28 +127,19 @@ def sighting_of(stars: Stars, eye: solver.Solver, answer: Solution) -> Identifie
         )
     if answer.found.mirrored:
         raise InstrumentError(f"{stars.place}: the frame is mirrored (its rows run bottom-up): flip it")
-    return sighted(stars, answer.found, (camera, catalogue), earth_state(mid_unix_s))
-
-
-def sighted(
-    stars: Stars, found: Identification, view: tuple[Camera, Catalogue], state: EarthState
-) -> IdentifiedFrame:
-    """The identified stars of a frame; found.star are rows of stars, view the camera and the catalogue."""
-    camera, catalogue = view
+    found, state = answer.found, earth_state(mid_unix_s)
     use = sound_matches(stars, found, solver.ENOUGH_SOUND)
-    star, index = found.star[use], found.catalogue[use]
-    directions = camera.directions(stars.x[star], stars.y[star])
-    squeeze = np.array([1.0, camera.fx / camera.fy])
-    catalogue_px = np.hypot(catalogue.sigma(index, state.year) * camera.fx, found.blend_px[use])
+    places = catalogue.directions(found.catalogue[use], state.year, state.observer_au)
+    matched = MatchedStars.of(stars, found, use, camera, catalogue, state.year, places)
+    catalogue_px2 = np.square(matched.place_sigma * camera.fx)[:, None, None]
     return IdentifiedFrame(
-        utc_unix_s=state.utc_unix_s,
+        utc_unix_s=mid_unix_s,
         stamp_stddev_s=stars.stamp_stddev_s,
         source=stars.place,
-        xy=directions[:, :2] / directions[:, 2:] * camera.fx,
-        covariance_px2=stars.covariance[star] * np.outer(squeeze, squeeze)
-        + np.eye(2) * (catalogue_px**2)[:, None, None],
-        itrs=state.to_itrs(catalogue.directions(index, state.year, state.observer_au)),
-        focal_px=camera.fx * found.focal_scale,
+        xy=matched.xy,
+        covariance_px2=matched.covariance_px2 + np.eye(2) * catalogue_px2,
+        itrs=state.to_itrs(places),
+        optics=camera.scaled(found.focal_scale),
         camera=roughly(state.gcrs_to_itrs @ found.attitude.T),
     )
 
@@ -218,6 +198,76 @@ class PlacelessFrame(FrameUnderWay):
         return Attitude(camera, camera @ whole @ camera.T, of=CAMERA, into=ITRS, by_refraction=raised)
 
 
+# how far a direction that is said to be the Sun's may be from it, rad
+SUN_NEAR = math.radians(0.05)
+# cosine of the altitude above which errors of the Sun's direction count no more in the heading
+HIGHEST_COSINE = 0.05
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SunFrame(FrameUnderWay):
+    """The Sun seen from a known place: one direction, about which gravity determines the camera's turn.
+
+    ray (3,): in C.  body: the Sun.  place: where it is seen from.
+    """
+
+    ray: np.ndarray
+    body: Body
+    place: Place
+
+    @classmethod
+    def of(cls, seen: CameraAttitude, place: Place) -> "SunFrame":
+        """The frame of an attitude that has a time and a ray; FrameError for another direction than the Sun's."""
+        assert seen.utc_unix_s is not None and seen.ray is not None
+        state = earth_state(seen.utc_unix_s)
+        body, turn = body_at(SUN, state), state.gcrs_to_itrs @ seen.camera_to_gcrs
+        if np.linalg.norm(turn @ seen.ray - body.itrs) > SUN_NEAR:
+            raise FrameError("an attitude about one direction, which is not the Sun's: left out")
+        return cls(
+            utc_unix_s=seen.utc_unix_s,
+            stamp_stddev_s=seen.stamp_stddev_s,
+            camera=Attitude(
+                turn, turn @ seen.covariance @ turn.T, of=CAMERA, into=ITRS, by_refraction=np.zeros(3)
+            ),
+            ray=seen.ray,
+            body=body,
+            place=place,
+        )
+
+    def rough(self) -> Attitude:
+        return self.camera
+
+    def under(self, zenith: np.ndarray, atmosphere: Atmosphere) -> Attitude:
+        """The attitude under a zenith (3,) in ITRS, turned anyhow about the Sun."""
+        true = self.body.from_place(zenith)
+        level = rotation.shortest_turn(zenith, np.array([0.0, 0.0, 1.0]))
+        bent, raised = atmosphere.raised(level @ true)
+        seen = bent @ level
+        turn = rotation.shortest_turn(self.camera.rotation @ self.ray, seen) @ self.camera.rotation
+        layers = raised**2 - (math.dist(seen, true) * atmosphere.relative_sigma) ** 2
+        across = rotation.normalised(np.cross(zenith, seen))
+        covariance = turn @ self.camera.covariance_about_own @ turn.T + layers * np.outer(across, across)
+        return Attitude(turn, covariance, of=CAMERA, into=ITRS, by_refraction=np.cross(true, seen))
+
+    def heading_by(self, link: Attitude) -> Attitude:
+        """The body's attitude at the known place: level by the plumb line, north by WGS 84.
+
+        link: along astronomic east, north, up, by an adjustment that takes errors for new in each frame.  Errors of
+        the lens, the place and the plumb line are not: they are added once more as they are in one frame.
+        """
+        sine = float(self.body.itrs @ self.place.plumb_axes[2])
+        across = np.linalg.eigvalsh(self.camera.covariance)[1]
+        root = self.place.zenith_root
+        common = across + self.place.plumb_stddev**2 + float(np.linalg.eigvalsh(root @ root.T)[1])
+        common /= max(1 - sine**2, HIGHEST_COSINE**2)
+        return Attitude(
+            self.place.to_geodetic_north @ link.rotation,
+            link.covariance + common * np.eye(3),
+            of=LINK,
+            into=ENU,
+        )
+
+
 def body_attitude(frame: PlacelessFrame, place: Place, vessel: Vessel) -> Attitude:
     """The body's axes, x forward, at a known place: level by the plumb line, north by WGS 84.
 
@@ -228,17 +278,14 @@ def body_attitude(frame: PlacelessFrame, place: Place, vessel: Vessel) -> Attitu
     seen = seen.then(a4, ENU)
     assert seen.by_refraction is not None
     late_s = [frame.stamp_stddev_s, vessel.clock_stddev_s, earth_orientation(frame.utc_unix_s).ut1_sigma_s]
-    # a zenith further east, or north, turns level and north
-    level = np.array([[0.0, 1.0], [-1.0, 0.0]])
-    north = -meridian_turn(place.plumb[0]) * np.array([[1.0, 0.0]])
-    deflection = np.vstack([level * place.plumb_stddev, north * place.ellipsoid_stddev])
+    moved = zenith_moved(place.plumb[0])
     columns = np.column_stack([
         seen.by_refraction * air.relative_sigma,
         a4[:, 2] * ROTATION_RAD_S * math.hypot(*late_s),
-        np.vstack([level, north]) @ place.zenith_root,
-        deflection,
+        moved @ place.zenith_root,
+        moved * np.array([[place.plumb_stddev], [place.plumb_stddev], [place.ellipsoid_stddev]]),
     ])  # fmt: skip
-    to_ellipsoid = place.axes @ a4.T
-    turn = rotation.about_axis(2, -math.atan2(to_ellipsoid[0, 1], to_ellipsoid[1, 1]))
     covariance = seen.covariance + columns @ columns.T + np.eye(3) * vessel.mount_stddev**2
-    return Attitude(turn @ seen.rotation @ vessel.camera_to_body.T, covariance, of=LINK, into=ENU)
+    return Attitude(
+        place.to_geodetic_north @ seen.rotation @ vessel.camera_to_body.T, covariance, of=LINK, into=ENU
+    )

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The start of an adjustment: inertial readings checked against the stars, and a first motion from both."""
 
+from dataclasses import replace
 from itertools import permutations, product
 
 import numpy as np
@@ -8,11 +9,15 @@ from scipy.spatial.transform import Rotation
 
 from starpos.earth.ellipsoid import place_of_zenith
 from starpos.earth.gravity import itrs_place
+from starpos.earth.orientation import earth_state
 from starpos.errors import VoyageError
 from starpos.navigation.equations import Motion, Odometry, StarAttitudes, turned_back
 from starpos.navigation.preintegration import Pieces, Sums
 from starpos.navigation.records import ImuModel
-from starpos.rotation import normalised
+from starpos.navigation.sightings import SunFrame
+from starpos.rotation import best_rotation, normalised
+from starpos.sky.bodies import MOON, body_at
+from starpos.units import SIGMA_PER_MAD
 
 GRAVITY = 9.8
 # maximum difference of the mean force from gravity, and the same in sigmas of the model
@@ -25,6 +30,9 @@ CLEARLY, MAX_SHARE = 20.0, 0.3
 MAX_SCATTER = 8.0
 # minimum error (rad) of the turn of a stray frame, and maximum number of stray frames in a row
 STRAY, MAX_STRAYS = np.radians(3.0), 5
+# Intervals before and after a frame that show where up is; sigmas of the altitude at which a disc is no Sun; rad at which
+# the Moon is another body than the Sun.
+AROUND, SUN_SIGMAS, MOON_APART = 3, 4.0, np.radians(2.0)
 # rad/s in other units
 UNITS = {"deg/s": np.degrees(1.0), "rev/min": 30 / np.pi}
 
@@ -104,6 +112,54 @@ def _check_turns(stars: StarAttitudes, pieces: Pieces, model: ImuModel, camera_t
             f"the gyro turns by {np.degrees(np.abs(bias).max()):.3g} deg/s more than the stars, its model allows "
             f"{np.degrees(allowed):.2g}, as if it was in deg/s: give rad/s, and the model of the IMU"
         )
+
+
+def upright(
+    stars: StarAttitudes, zenith: np.ndarray, sums: Sums, camera_to_body: np.ndarray
+) -> tuple[StarAttitudes, np.ndarray]:
+    """Attitudes of which only a ray is known, turned about it until up is where the force points; zenith (3,) in ITRS.
+
+    Returns also by how much the force puts each ray (L,) nearer to the zenith than it is, rad.
+    """
+    lone = ~stars.whole
+    around = np.ones(2 * AROUND + 1) / (2 * AROUND + 1)
+    force = np.stack([np.convolve(part, around, "same") for part in sums.speed.T], -1)
+    up = normalised(force[np.minimum(stars.index[lone], len(force) - 1)]) @ camera_to_body
+    ray, attitude = stars.rays[lone], stars.camera_to_itrs.copy()
+    seen = np.einsum("kij,kj->ki", attitude[lone], ray)
+    attitude[lone] = best_rotation(
+        np.stack([ray, up], 1), np.stack([seen, np.broadcast_to(zenith, seen.shape)], 1)
+    )
+    felt, stated = (
+        np.arccos(np.clip(c, -1, 1)) for c in (np.einsum("ki,ki->k", ray, up), np.sum(seen * zenith, 1))
+    )
+    return replace(stars, camera_to_itrs=attitude), stated - felt
+
+
+def check_sun(
+    off: np.ndarray, sun: SunFrame, model: ImuModel, mount_stddev: float, zenith: np.ndarray
+) -> None:
+    """Raise VoyageError where gravity has another altitude than the Sun's, or the Moon stands as high.
+
+    off (L,): of the frames, as by `upright`.  sun: one of them.
+    """
+    scatter = float(np.median(np.abs(off - np.median(off)))) * SIGMA_PER_MAD
+    at_rest = np.hypot(model.accelerometer_bias_stddev / GRAVITY, mount_stddev)
+    own = np.linalg.eigvalsh(sun.camera.covariance)[1] + scatter**2 / max(1.0, len(off) / (2 * AROUND + 1))
+    most = SUN_SIGMAS * float(np.hypot(at_rest, own**0.5))
+    higher = float(np.median(off))
+    if abs(higher) > most:
+        side = "higher" if higher > 0 else "lower"
+        raise VoyageError(
+            f"gravity has the bright disc {abs(np.degrees(higher)):.1f} deg {side} than the Sun, "
+            f"{np.degrees(most):.1f} at most by the stated errors: it is a lamp, or the clock, the place, "
+            "link_to_camera or the IMU's axes are wrong"
+        )
+    bodies = body_at(MOON, earth_state(sun.utc_unix_s)), sun.body
+    moon, there = (body.from_place(zenith) for body in bodies)
+    above = np.arcsin(moon @ zenith) - np.arcsin(there @ zenith) - higher
+    if moon @ zenith > 0 and abs(above) < most and np.linalg.norm(moon - there) > MOON_APART:
+        raise VoyageError("the Sun and the Moon stand equally high: which of them the disc is shows later")
 
 
 def stray_frames(

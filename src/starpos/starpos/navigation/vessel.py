@@ -2,7 +2,7 @@
 """What is known of instrument and vehicle before a voyage, with the laws of motion where nothing measures the speed."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
@@ -31,91 +31,36 @@ class MotionLaw:
 
     def rest_at(self, apart_s: float) -> float:
         """The rest at times so far apart, m/s: as white noise that in the long run scatters as what keeps its sign."""
-        return self.rest_stddev * self._longer(apart_s)
+        return self.rest_stddev * self.longer(apart_s)
 
-    def climb_at(self, apart_s: float) -> float:
-        """Climbing likewise."""
-        return self.climb_stddev * self._longer(apart_s)
-
-    def _longer(self, apart_s: float) -> float:
+    def longer(self, apart_s: float) -> float:
+        """Factor on the rest, or on climbing, at times so far apart."""
         return max(1.0, 2 * self.rest_s / apart_s) ** 0.5
 
 
+def _law(*row: float) -> MotionLaw:
+    """The law with the fields of a row, in their order."""
+    return MotionLaw(**{f.name: value for f, value in zip(fields(MotionLaw), row, strict=True)})
+
+
 LAWS = {
-    # a path at a walk, that turns and stops as it likes
-    "rover": MotionLaw(
-        speed_stddev=2.0,
-        speed_walk=0.3,
-        drift_stddev=0.01,
-        drift_walk=1e-4,
-        rest_stddev=0.1,
-        climb_stddev=0.2,
-        rest_s=3.0,
-    ),
-    # under way, in waves of seconds, in a current that is steady over an hour
-    "ship": MotionLaw(
-        speed_stddev=10.0,
-        speed_walk=0.05,
-        drift_stddev=1.0,
-        drift_walk=0.003,
-        rest_stddev=0.7,
-        climb_stddev=0.7,
-        rest_s=3.0,
-    ),
-    # a steady airspeed in a wind that changes by 0.3 m/s in ten minutes; gusts of seconds
-    "drone": MotionLaw(
-        speed_stddev=50.0,
-        speed_walk=0.1,
-        drift_stddev=15.0,
-        drift_walk=0.012,
-        rest_stddev=0.8,
-        climb_stddev=0.8,
-        rest_s=4.0,
-    ),
-    "parked": MotionLaw(
-        speed_stddev=1e-3,
-        speed_walk=1e-6,
-        drift_stddev=1e-3,
-        drift_walk=1e-6,
-        rest_stddev=2e-3,
-        climb_stddev=2e-3,
-        rest_s=1.0,
-    ),
+    name: _law(*row)
+    for name, row in {
+        # a path at a walk, that turns and stops as it likes
+        "rover": (2.0, 0.3, 0.01, 1e-4, 0.1, 0.2, 3.0),
+        # under way, in waves of seconds, in a current that is steady over an hour
+        "ship": (10.0, 0.05, 1.0, 0.003, 0.7, 0.7, 3.0),
+        # a steady airspeed in a wind that changes by 0.3 m/s in ten minutes; gusts of seconds
+        "drone": (50.0, 0.1, 15.0, 0.012, 0.8, 0.8, 4.0),
+        "parked": (1e-3, 1e-6, 1e-3, 1e-6, 2e-3, 2e-3, 1.0),
+    }.items()
 }
+# default: any vehicle on land, at sea or in the air
+ANYTHING = _law(100.0, 1.0, 30.0, 0.3, 5.0, 3.0, 10.0)
 # what is said of a drift is how much it changes in so long
 CHANGE_S = 600.0
 # of a drift such a share changes in an hour
 DRIFT_CHANGE, DRIFT_CHANGE_S = 0.5, 3600.0
-
-
-def carried(drift_stddev: float) -> MotionLaw:
-    """The law of a vehicle that measures its velocity against water or air; their drift's 1 sigma, m/s an axis."""
-    return MotionLaw(
-        speed_stddev=1e-3,
-        speed_walk=1e-6,
-        drift_stddev=drift_stddev,
-        drift_walk=DRIFT_CHANGE * drift_stddev / DRIFT_CHANGE_S**0.5,
-        rest_stddev=1e-3,
-        climb_stddev=1e-3,
-        rest_s=1.0,
-    )
-
-
-# default: any vehicle on land, at sea or in the air
-ANYTHING = MotionLaw(
-    speed_stddev=100.0,
-    speed_walk=1.0,
-    drift_stddev=30.0,
-    drift_walk=0.3,
-    rest_stddev=5.0,
-    climb_stddev=3.0,
-    rest_s=10.0,
-)
-
-
-def drifting(law: MotionLaw, change: float) -> MotionLaw:
-    """The law with a drift that changes by so much in ten minutes, 1 sigma, m/s an axis, as it walks at random."""
-    return replace(law, drift_walk=change / CHANGE_S**0.5)
 
 
 PARKED, ROVER = "parked", "rover"
@@ -154,10 +99,14 @@ class Vessel:
     @property
     def carried(self) -> MotionLaw:
         """How the drift changes where velocities are measured against water or air."""
-        return self._drifting(carried(self.drift_stddev))
+        walk = DRIFT_CHANGE * self.drift_stddev / DRIFT_CHANGE_S**0.5
+        return self._drifting(_law(1e-3, 1e-6, self.drift_stddev, walk, 1e-3, 1e-3, 1.0))
 
     def _drifting(self, law: MotionLaw) -> MotionLaw:
-        return law if math.isnan(self.drift_change) else drifting(law, self.drift_change)
+        """The law with the drift's stated change, as it walks at random."""
+        if math.isnan(self.drift_change):
+            return law
+        return replace(law, drift_walk=self.drift_change / CHANGE_S**0.5)
 
     @property
     def parked(self) -> bool:

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from starpos.earth.gravity import zenith_at
+from starpos.earth.gravity import itrs_place, zenith_at
 from starpos.errors import FixError, VoyageError
 from starpos.navigation import start
 from starpos.navigation.chain import Chain, Smoothed, log_likelihood, smoothed
@@ -26,6 +26,7 @@ from starpos.navigation.equations import (
     StarAttitudes,
     law_residuals,
     links_of,
+    place_residuals,
     prior_rows,
     standing_residuals,
     star_residuals,
@@ -42,7 +43,7 @@ from starpos.navigation.evidence import (
 )
 from starpos.navigation.preintegration import Pieces, Sums, summed
 from starpos.navigation.records import ImuLog, VelocityLog
-from starpos.navigation.sightings import FrameUnderWay
+from starpos.navigation.sightings import FrameUnderWay, SunFrame
 from starpos.navigation.start import first_motion, nodes_of
 from starpos.navigation.vessel import MotionLaw, Vessel
 from starpos.progress import Progress, quiet
@@ -54,6 +55,8 @@ SETTLED_M, SETTLED_SHARE = 1.0, 0.02
 NEAR_M = 2000.0
 # minimum ratio of found to stated variances that is reported
 NOTABLE = 4.0
+# least error (m an axis) of a known place
+PLACE_M = 1.0
 # no step on the Earth is longer
 FARTHEST_M, MAX_ROUNDS = 2e7, 25
 # a law is weighed until its terms change by a smaller factor, and so often at most
@@ -92,12 +95,12 @@ class Adjustment:
         self.law = self._law(vessel)
         self.unknowns = MEASURED if self.law is None else BY_LAW
         self.model = vessel.model
-        self.excess = {"frames": 1.0, "velocities": 1.0, "forces": 1.0, "forces at rest": 1.0}
+        self.excess = dict.fromkeys(("frames", "places", "velocities", "forces", "forces at rest"), 1.0)
         # how many times as much wind or current change as their law says
         self.weighings, self.more_drift = 0, 1.0
         self.noise_weighed = False
         # nodes whose measurement of a kind is wrong, and velocities that are
-        self.wrong: dict[str, np.ndarray] = {kind: np.zeros(0, int) for kind in ("frames", "velocities")}
+        self.wrong: dict[str, np.ndarray] = {kind: np.zeros(0, int) for kind in self.excess}
         self.strays = 0
         # frames whose own stars do not agree
         self.unsound = 0
@@ -169,6 +172,11 @@ class Adjustment:
             progress("adjusting", min(0.95, (k + 1) / 8))
             settled = near and not seen_anew and step < max(SETTLED_M, SETTLED_SHARE * sigma)
             if settled and not self._revised(motion, chain, links, stars):
+                if self._suns and self.excess["frames"] > NOTABLE:
+                    raise VoyageError(
+                        "the bright disc does not move as the Sun by gravity and gyro: it is a lamp, or the clock or the "
+                        "place is wrong"
+                    )
                 progress("adjusting", 1.0)
                 return motion, solution, k + 1
         raise FixError(
@@ -182,14 +190,25 @@ class Adjustment:
         zero, none = np.zeros((len(self.nodes) - 1, 3)), np.zeros((3, 3))
         sums = summed(self.pieces, zero, zero, none, none)
         believed = self.vessel.camera_to_body
-        start.check_readings(stars, self.pieces, sums, self.model, believed)
-        stray = start.stray_frames(stars, self.pieces, sums, self.model, believed)
+        told = self.pieces, sums, self.model, believed
+        start.check_readings(stars.part(stars.whole), *told)
+        stray = np.zeros(len(self.frames), bool)
+        stray[stars.whole] = start.stray_frames(stars.part(stars.whole), *told)
         if stray.any():
             self.strays = int(stray.sum())
             self.frames = [frame for frame, wrong in zip(self.frames, stray, strict=True) if not wrong]
             stars = self._attitudes(None)
+        if suns := self._suns:
+            sun = suns[len(suns) // 2]
+            zenith = sun.place.plumb_axes[2]
+            stars, off = start.upright(self._attitudes(zenith), zenith, sums, believed)
+            start.check_sun(off, sun, self.model, self.vessel.mount_stddev, zenith)
         motion = first_motion(self.nodes, stars, self.pieces, sums, self.odometry, believed)
         return stars, motion
+
+    @property
+    def _suns(self) -> list[SunFrame]:
+        return [frame for frame in self.frames if isinstance(frame, SunFrame)]
 
     def _revised(self, motion: Motion, chain: Chain, links: Links, stars: StarAttitudes) -> bool:
         """Whether the motion, settled, changes what is believed of noise, law or standstills."""
@@ -276,7 +295,20 @@ class Adjustment:
             covariance=np.array([a.covariance_about_own for a in found]),
             by_refraction=np.array([a.rotation.T @ a.by_refraction for a in found]),
             stamp_stddev_s=np.array([frame.stamp_stddev_s for frame in used]),
+            rays=np.array([f.ray if isinstance(f, SunFrame) else np.zeros(3) for f in used]),
         )
+
+    def _places(self, motion: Motion) -> Residuals:
+        """Equations of the nodes from whose known place the Sun is seen."""
+        suns, sigma_m = self._suns, self.vessel.height_stddev_m
+        where, covariance = [], []
+        for place in (sun.place for sun in suns):
+            height = self.vessel.height_m if np.isnan(place.height_m) else place.height_m
+            where.append(itrs_place(*place.plumb, height))
+            level, axes = place.covariance + np.eye(2) * PLACE_M**2, place.plumb_axes
+            covariance.append(axes[:2].T @ level @ axes[:2] + np.outer(axes[2], axes[2]) * sigma_m**2)
+        index = np.searchsorted(self.nodes, [sun.utc_unix_s for sun in suns])
+        return place_residuals(motion, index, np.array(where), np.array(covariance), self.unknowns)
 
     def _chain(self, motion: Motion, stars: StarAttitudes, before: Smoothed | None) -> tuple[Chain, Links]:
         """The equations about a motion, without measurements that a solution has shown to be wrong."""
@@ -289,6 +321,8 @@ class Adjustment:
             motion.accel_matrix,
         )
         parts = [self._sound(star_residuals(motion, stars, sums, self.pieces, n), before, "frames")]
+        if self._suns:
+            parts.append(self._sound(self._places(motion), before, "places"))
         if self.odometry is not None:
             parts.append(self._sound(self._velocities(motion, sums, before), before, "velocities"))
         if self.vessel.parked:

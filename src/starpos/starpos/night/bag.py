@@ -75,7 +75,7 @@ def read(
     Raises BagError if the bag cannot be read, FrameError if the instrument is not in it.
     """
     with BagReader(path, typed=True) as bag:
-        chosen = instrument_in(bag, path, namespace, INPUTS, drivers.remaps)
+        chosen = instrument_in(bag, namespace, INPUTS, drivers.remaps)
         reading = _Reading(tilt_noise_rad, DriverMessages(drivers))
         wanted = [c for c in chosen.connections if c.msgtype not in WITH_STARS]
         total = sum(c.msgcount for c in wanted) or 1
@@ -99,7 +99,7 @@ def each_frame(r: Recorded) -> Iterator[tuple[str, Stars | FrameError]]:
     """A name for each frame, one at a time, and its stars, or why it has none."""
     messages = DriverMessages(r.drivers)
     with BagReader(r.path, typed=True) as bag:
-        chosen = instrument_in(bag, r.path, r.namespace, INPUTS, r.drivers.remaps)
+        chosen = instrument_in(bag, r.namespace, INPUTS, r.drivers.remaps)
         wanted = [c for c in chosen.connections if c.msgtype in (*WITH_STARS, CAPTURE)]
         for connection, _, message in bag.decoded(wanted):
             if connection.msgtype == CAPTURE:

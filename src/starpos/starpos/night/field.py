@@ -20,8 +20,8 @@ from pathlib import Path
 import numpy as np
 
 from starpos.earth.refraction import Atmosphere
-from starpos.errors import FrameError, WriteError
-from starpos.files import unpacked, write_whole
+from starpos.errors import FrameError
+from starpos.files import save, unpacked
 from starpos.frames.frame import Stars
 from starpos.frames.tables import SIMULATED, TILTS, TRUTH, write_star_list
 from starpos.instrument import instrument_file
@@ -78,10 +78,7 @@ def write(path: Path, exposures: Exposures, progress: Progress = quiet) -> int:
         for name in sorted(lists):
             # a date of its own would reveal the computer's clock and zone
             file.writestr(zipfile.ZipInfo(name), lists[name], zipfile.ZIP_DEFLATED)
-    try:
-        write_whole(path, packed.getvalue())
-    except OSError as error:
-        raise WriteError(f"{path}: the field report cannot be written there ({error.strerror})") from None
+    save(path, packed.getvalue(), "the field report")
     return sum(name.startswith("stars_") for name in lists)
 
 

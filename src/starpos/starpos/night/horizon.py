@@ -9,7 +9,7 @@ import numpy as np
 
 from starpos.earth.orientation import earth_state
 from starpos.errors import FrameError
-from starpos.files import write_whole
+from starpos.files import save
 from starpos.fix.searching import Sight
 from starpos.instrument.camera import Camera
 from starpos.sky.catalogue import Catalogue
@@ -77,9 +77,9 @@ def horizon(stars: Sequence[Expected]) -> np.ndarray:
 
 
 def write(path: Path, line: np.ndarray) -> None:
-    """Write a horizon (N, 2) as a table; OSError."""
+    """Write a horizon (N, 2) as a table; WriteError."""
     rows = "".join(f"{azimuth:g},{altitude:.1f}\n" for azimuth, altitude in line[np.isfinite(line[:, 1])])
-    write_whole(path, f"azimuth_deg,altitude_deg\n{rows}".encode())
+    save(path, f"azimuth_deg,altitude_deg\n{rows}".encode(), "the horizon")
 
 
 def read(path: str) -> np.ndarray:

@@ -79,7 +79,7 @@ def exposures(
 
     kind = "lists of stars" if frames[0].suffix == ".csv" else "frames"
     return Exposures(
-        name=frames[0].name if len(frames) == 1 else folder.name or str(folder),
+        name=frames[0].name if len(frames) == 1 else folder.resolve().name or str(folder),
         origin=f"solved from {len(frames)} {kind} and {'the gravity in their files' if by_gravity else TILTS}",
         count=len(frames),
         each=each,
@@ -113,6 +113,8 @@ def work_of(
             own = of_gravity(known, by_log)
     instruments, remarks = replace(given, instrument=known).framed(first)
     level: Tilts | None = None if isinstance(tilts, Path) else tilts
+    if isinstance(tilts, ByGravity) and first.gravity is not None:
+        level = replace(tilts, camera=first.gravity.camera)
     if isinstance(tilts, Path):
         known = instruments.instrument
         errors = sensors.unnamed() if known is None else known.inclinometer

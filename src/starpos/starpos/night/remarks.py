@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Remarks on a night, each a sentence; among them doubts: mistaken tilts, a place far from the stated one."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,17 +11,11 @@ from starpos.averaging.elevation_axis import FoundAxis
 from starpos.calibration.misalignment import Calibrated
 from starpos.earth.ellipsoid import EARTH_RADIUS_M, zenith_of
 from starpos.earth.orientation import ROTATION_RAD_S
+from starpos.errors import TiltError
+from starpos.fix import checks
 from starpos.fix.budget import local_north
-from starpos.fix.checks import (
-    BY_OPTIONS,
-    FIND_TURN,
-    MODEL_BY_OPTIONS,
-    at_another_lean,
-    may_turn,
-    unknown_a3,
-    unnamed_inclinometer,
-)
 from starpos.fix.fix import Fix, length_text
+from starpos.fix.solution import Solution
 from starpos.fix.terms import Origin, total_covariance
 from starpos.frames.gravity import PHONE
 from starpos.frozen import at_once
@@ -46,14 +40,16 @@ class Remark(str):
 
 
 def of_tilts(log: TiltLog, path: str, inclinometer: InclinometerErrors) -> tuple[Remark, ...]:
-    """Say that a table of tilts looks like radians, or is rounded to steps coarser than the inclinometer's."""
-    doubts = (like_radians(log), inclinometer.coarser(log.step_rad))
-    return tuple(Remark(f"{path}: {doubt}") for doubt in doubts if doubt)
+    """Say that a table of tilts is rounded to coarser steps than the inclinometer's; TiltError if it is in radians."""
+    if radians := like_radians(log):
+        raise TiltError(f"{path}: {radians}")
+    coarser = inclinometer.coarser(log.step_rad)
+    return (Remark(f"{path}: {coarser}"),) if coarser else ()
 
 
-def of_inclinometer(instrument: Instrument, ways: str = MODEL_BY_OPTIONS) -> tuple[Remark, ...]:
+def of_inclinometer(instrument: Instrument, ways: str = checks.MODEL_BY_OPTIONS) -> tuple[Remark, ...]:
     """Say that the inclinometer's model is not stated; ways: what to do then."""
-    sentence = unnamed_inclinometer(instrument, ways)
+    sentence = checks.unnamed_inclinometer(instrument, ways)
     return (Remark(sentence),) if sentence else ()
 
 
@@ -75,9 +71,23 @@ def of_marks(place: Fix | Average, marks_deg: Sequence[tuple[float, float]]) -> 
     off = np.array([half_turn(place.longitude - mark.longitude), place.latitude - mark.latitude])
     off *= EARTH_RADIUS_M * np.array([np.cos(mark.latitude), 1.0])
     sigmas = float(np.sqrt(off @ np.linalg.solve(place.covariance[:2, :2], off)))
-    claim = "within the claim" if sigmas < CLAIMED_SIGMAS else f"{sigmas:.1f} sigma, beyond the claim"
     km = mark.km_from(place.latitude, place.longitude)
-    return (Remark(f"the place is {km:.0f} km from the GPS place in the file, {claim}"),)
+    told = f"the place is {km:.0f} km from the GPS place in the file"
+    if sigmas < CLAIMED_SIGMAS:
+        return (Remark(f"{told}, within the claim"),)
+    within_km = CLAIMED_SIGMAS * float(np.sqrt(np.diag(place.covariance)[:2].max())) / 1000
+    if ahead_h := _hours_ahead(replace(mark, km=within_km), place):
+        side = "ahead of" if ahead_h > 0 else "behind"
+        why = f"as of a clock {abs(ahead_h):g} h {side} the zone in the file: state its own with --exif-utc-offset"
+    else:
+        why = "the telephone moved while it exposed, or its GPS place is an older one"
+    return (Remark(f"{told}, {sigmas:.1f} sigma, beyond the claim: {why}"),)
+
+
+def of_copies(fixes: Sequence[Fix]) -> tuple[Remark, ...]:
+    """Say that some photographs are of the same moment as others."""
+    copies = len(fixes) - len({f.utc_unix_s for f in fixes})
+    return (Remark(f"{copies} of the photographs are copies of others, and count once"),) if copies else ()
 
 
 def of_table(fixes: Sequence[Fix], whole: Average, given: Instrument) -> tuple[Remark, ...]:
@@ -90,26 +100,22 @@ def of_table(fixes: Sequence[Fix], whole: Average, given: Instrument) -> tuple[R
     if known or (ups @ middle).min() < TABLE_COSINE or gap > TABLE_GAP_RAD:
         return ()
     left = total_covariance(t for t in whole.terms if t.origin is not Origin.A3)
-    km = float(np.sqrt(np.diag(left)[:2].max())) / 1000
+    km, now_km = (float(np.sqrt(np.diag(c)[:2].max())) / 1000 for c in (left, whole.covariance))
     sentence = (
         "the camera was turned where it lay: --self-calibrate finds the error of its level, for a place to about "
-        f"{km:.1f} km, and with --save OUT later photographs have it"
+        f"{km:.1f} km ({now_km:.1f} km without it), and with --save OUT later photographs have it"
     )
     return (Remark(sentence),)
 
 
-def of_axis(doubt: str) -> tuple[Remark, ...]:
-    """Say that the optical axis of a night's frames is not known; doubt: the sentence, '' if it is known."""
-    return (Remark(doubt),) if doubt else ()
-
-
-def of_extrapolation(fix: Fix, days: float) -> tuple[Remark, ...]:
-    """Say by how many days a fix lies beyond the IERS table, and how far it may be off for that."""
-    if days <= 0:
+def of_extrapolation(solved: Iterable[Solution]) -> tuple[Remark, ...]:
+    """Say by how many days the last fix lies beyond the IERS table, and how far it may be off for that."""
+    worst = max(solved, key=lambda s: s.extrapolated_days, default=None)
+    if worst is None or worst.fix is None or worst.extrapolated_days <= 0:
         return ()
-    (ut1,) = (t for t in fix.terms if t.name == "ut1")
+    (ut1,) = (t for t in worst.fix.terms if t.name == "ut1")
     sentence = (
-        f"the Earth's rotation is extrapolated {days:.0f} days beyond the IERS table, "
+        f"the Earth's rotation is extrapolated {worst.extrapolated_days:.0f} days beyond the IERS table, "
         f"{np.sqrt(ut1.covariance[0, 0]):.0f} m east (1 sigma, in the budget): upgrade astropy-iers-data"
     )
     return (Remark(sentence),)
@@ -161,9 +167,11 @@ def of_denied_a3(axis: FoundAxis, given: Calibration) -> Remark:
     )
 
 
-def of_a3(calibration: Calibration, place: Fix | Average, ways: str = BY_OPTIONS) -> tuple[Remark, ...]:
+def of_a3(
+    calibration: Calibration, place: Fix | Average, ways: str = checks.BY_OPTIONS
+) -> tuple[Remark, ...]:
     """Say that A3's error makes the position error large; ways: what to do then."""
-    sentence = unknown_a3(calibration, place.covariance, place.terms, ways)
+    sentence = checks.unknown_a3(calibration, place.covariance, place.terms, ways)
     return (Remark(sentence),) if sentence else ()
 
 
@@ -174,9 +182,9 @@ def of_turn(turned: Calibrated) -> Iterator[Remark]:
         yield Remark(f"not calibrated: the headings hardly determine A3, {error}: turn it further")
         return
     found = turned.instrument.calibration
-    yield Remark(f"calibrated: {error}; {at_another_lean(found)}")
-    if may_turn(found):
-        yield Remark(f"to use A3 at another lean, {FIND_TURN}")
+    yield Remark(f"calibrated: {error}; {checks.at_another_lean(found)}")
+    if checks.may_turn(found):
+        yield Remark(f"to use A3 at another lean, {checks.FIND_TURN}")
     if turned.beyond:
         yield Remark(turned.beyond)
 
@@ -192,6 +200,13 @@ ZONE_H = 0.5
 # camera_to_itrs (3, 3) of a frame, and its tilt
 Leaning = tuple[np.ndarray, Tilt]
 
+
+def _of_minutes(theta: np.ndarray) -> np.ndarray:
+    """Angles of which the digits behind the point are minutes and their decimals."""
+    degrees, minutes = np.divmod(np.abs(np.degrees(theta)), 1)
+    return np.radians(np.sign(theta) * (degrees + minutes / 0.6))
+
+
 # possible mistakes in tilts, and functions that give the corrected angles (N, 2), rad
 MISTAKES: tuple[tuple[str, Callable[[np.ndarray], np.ndarray]], ...] = (
     ("theta_x and theta_y exchanged", lambda theta: theta[:, ::-1]),
@@ -199,6 +214,10 @@ MISTAKES: tuple[tuple[str, Callable[[np.ndarray], np.ndarray]], ...] = (
     ("the other sign of theta_y", lambda theta: theta * [1, -1]),
     ("the other sign of both tilts", lambda theta: -theta),
     ("tilts that were radians", np.degrees),
+    ("tilts that were sines", lambda theta: np.arcsin(np.clip(np.degrees(theta), -1, 1))),
+    ("tilts that were percent", lambda theta: np.arctan(np.degrees(theta) / 100)),
+    ("tilts that were gon", lambda theta: 0.9 * theta),
+    ("tilts that were degrees and minutes (dd.mm or dd.mmss)", _of_minutes),
 )
 
 

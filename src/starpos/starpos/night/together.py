@@ -123,7 +123,7 @@ def together(gathered: Gathered, given: Instrument | None, near: Near | None = N
     except FixError as error:
         why_not = str(error)
     place = fixes[-1] if whole is None else whole
-    said = list(extrapolated(gathered.solved))
+    said = list(remarks.of_extrapolation(gathered.solved))
     said += [] if whole is None else remarks.of_average(whole)
     mounting = None
     if given is not None:
@@ -132,6 +132,7 @@ def together(gathered: Gathered, given: Instrument | None, near: Near | None = N
         if given.vertical is None and not given.calibration.unknown:
             mounting = given.mounting
         said += [] if whole is None else remarks.of_table(fixes, whole, given)
+        said += remarks.of_copies(fixes) if given.has_level_inside else ()
     said += remarks.of_marks(place, gathered.marks_deg)
     said += doubts(fixes, place, mounting, near)
     return Together(whole, why_not, tuple(said))
@@ -149,14 +150,6 @@ def _by_day(circles: Sequence[Circle], near: Near | None) -> Together:
     except FixError as error:
         return Together(None, str(error))
     return Together(place, "", (*remarks.of_average(place), *doubts((), place, None, near)))
-
-
-def extrapolated(solved: Iterable[Solution]) -> tuple[Remark, ...]:
-    """Say of the worst fix that it lies beyond the IERS table, if one does."""
-    worst = max(solved, key=lambda s: s.extrapolated_days, default=None)
-    if worst is None or worst.fix is None:
-        return ()
-    return remarks.of_extrapolation(worst.fix, worst.extrapolated_days)
 
 
 @dataclass(frozen=True)

@@ -13,16 +13,8 @@ from starpos.calibration.camera import lens_of_frame
 from starpos.earth.place import Place, Places
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import FrameError, InstrumentError, StarposError
+from starpos.fix import searching
 from starpos.fix.blind import SEARCH_S, BlindSolver
-from starpos.fix.searching import (
-    Question,
-    Sight,
-    answer_by_header,
-    answer_frame,
-    focal_px_that_fits,
-    identify_blind_every_way,
-    other_focal_length,
-)
 from starpos.fix.solution import Solution
 from starpos.fix.solver import Solver, check_explained, placed
 from starpos.frames.frame import Frame, Stars
@@ -102,11 +94,11 @@ class Solving:
         """What a worker is given: it makes its own solver."""
         return vars(self) | {"_latest": []}
 
-    def __call__(self, item: Frame | Stars) -> Sight:
+    def __call__(self, item: Frame | Stars) -> searching.Sight:
         """The sight of a frame; InstrumentError if its focal length is unknown, and must not be."""
         if isinstance(self.tilts, ByGravity) and not self.tilts.has(item):
             begin, stars = time.process_time(), stars_of(item)
-            sight = Sight(stars, Solution.refused(stars, self.tilts.missing(item)))
+            sight = searching.Sight(stars, Solution.refused(stars, self.tilts.missing(item)))
         elif self.instruments.sought and item.focal_px is None:
             begin = time.process_time()
             sight = self._by_sought_focal_length(item)
@@ -114,30 +106,32 @@ class Solving:
             blind = BlindSolver(catalogue.load_catalogue(), self.progress, search_s=self.search_s)
             blind.prepare()
             begin = time.process_time()
-            sight = identify_blind_every_way(blind, item, stars_of(item))
+            sight = searching.identify_blind_every_way(blind, item, stars_of(item))
         else:
             solver = self.solver(item)
             # the frame reports the error
             with suppress(StarposError):
                 solver.prepare(item.width, item.height, item.origin_px)
             begin = time.process_time()
-            question = Question(item=item, stars=stars_of(item), tilts=self.tilts, places=self.places)
+            question = searching.Question(
+                item=item, stars=stars_of(item), tilts=self.tilts, places=self.places
+            )
             if self.instruments.by_header:
-                sight = answer_by_header(solver, question, self.progress)
+                sight = searching.answer_by_header(solver, question, self.progress)
             else:
-                sight = answer_frame(solver, question)
+                sight = searching.answer_frame(solver, question)
         return replace(sight, cpu_ms=1000 * (time.process_time() - begin))
 
-    def _by_sought_focal_length(self, item: Frame | Stars) -> Sight:
+    def _by_sought_focal_length(self, item: Frame | Stars) -> searching.Sight:
         """The answer with the focal length of an earlier frame of this lens, else with the one that the stars give."""
         stars, lens = stars_of(item), (item.width, item.height, item.rough_focal_px)
-        question = Question(item=item, stars=stars, tilts=self.tilts, places=self.places)
+        question = searching.Question(item=item, stars=stars, tilts=self.tilts, places=self.places)
         if lens in self._found_px:
             sight = self._answer_at(self._found_px[lens], question)
             if sight.found is not None or not sight.solution.lost:
                 return sight
         blind = BlindSolver(catalogue.load_catalogue(), self.progress, search_s=self.search_s or SEARCH_S)
-        found = identify_blind_every_way(blind, item, stars)
+        found = searching.identify_blind_every_way(blind, item, stars)
         if found.solution.pointing is None:
             return found
         focal_px, model = found.solution.pointing.focal_px, found.solution.pointing.model
@@ -145,9 +139,9 @@ class Solving:
         if self._by_phone(item) and abs(focal_px / rough_px - 1) > CUT_OUT:
             cut = FrameError(
                 f"{item.place}: its stars give a focal length of {focal_px:.0f} px, its EXIF {rough_px:.0f} px: it is a "
-                "part of a photograph, whose optical axis is unknown: give the whole one"
+                "part of a photograph, whose optical axis is unknown, or its EXIF is wrong: give the whole one"
             )
-            return Sight(found.stars, Solution.refused(found.stars, cut))
+            return searching.Sight(found.stars, Solution.refused(found.stars, cut))
         sight = self._answer_at((focal_px, model), question)
         if sight.found is None:
             return sight
@@ -162,13 +156,13 @@ class Solving:
         """Whether the level is in the camera that took a photograph."""
         return item.gravity is not None or (isinstance(self.tilts, ByGravity) and self.tilts.has(item))
 
-    def _answer_at(self, lens: tuple[float, str], question: Question) -> Sight:
+    def _answer_at(self, lens: tuple[float, str], question: searching.Question) -> searching.Sight:
         """The answer with this focal length in px and model of a lens."""
         known = self.instruments.instrument
         assert known is not None
         known, doubt = with_frame_size(replace(known, focal_px=lens[0], model=lens[1]), question.stars)
         solver = Solver(known, catalogue.load_catalogue(), self.atmosphere, progress=self.progress)
-        sight = answer_frame(solver, question)
+        sight = searching.answer_frame(solver, question)
         if self._by_phone(question.item) and sight.found is not None and known.camera is None and not doubt:
             # the lens of a telephone bends the field's corners by up to 100 px
             camera, _, _ = solver.view(sight.stars.width, sight.stars.height)
@@ -178,7 +172,7 @@ class Solving:
             known = replace(known, camera=bent, focal_px=bent.fx, lens_stddev_rad=left_rad)
             if bent is camera:
                 question = replace(question, stars=sight.stars, known=sight.found)
-            again = answer_frame(replace(solver, instrument=known), question)
+            again = searching.answer_frame(replace(solver, instrument=known), question)
             sight = sight if again.found is None else again
         solution = replace(sight.solution, remark=sight.solution.remark or doubt)
         return replace(sight, solution=solution, instrument=known)
@@ -200,7 +194,7 @@ class Solving:
             self._latest[:] = [solver]
         return self._latest[0]
 
-    def after(self, sight: Sight, hint: Hint) -> Sight:
+    def after(self, sight: searching.Sight, hint: Hint) -> searching.Sight:
         """The sight of a frame that was not identified, if it looks where an earlier one did; else as it was."""
         if self.tilts is None or not sight.solution.lost or self.instruments.sought:
             return sight
@@ -218,10 +212,10 @@ class Solving:
         # without its header's focal length a frame was searched already
         if instrument is None or self.instruments.by_header:
             return ()
-        focal_px = focal_px_that_fits(self.solver(lost), lost)
+        focal_px = searching.focal_px_that_fits(self.solver(lost), lost)
         if focal_px is None:
             return ()
-        return (Remark(other_focal_length(lost.place, focal_px)),)
+        return (Remark(searching.other_focal_length(lost.place, focal_px)),)
 
 
 def identify(
@@ -293,7 +287,7 @@ class TrailSighted:
 
     solving: Solving
 
-    def __call__(self, item: Frame | Stars) -> "tuple[Sight, FrameTrails] | Solution":
+    def __call__(self, item: Frame | Stars) -> "tuple[searching.Sight, FrameTrails] | Solution":
         """A frame that is identified by every way there is, and its trails; FrameError for a list of stars."""
         from starpos.satellites.frames import trails_of
 

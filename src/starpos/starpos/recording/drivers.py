@@ -2,7 +2,7 @@
 """A robot's own messages as its instrument's: stars detected in its images, tilts made of its accelerations."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,7 @@ class Drivers:
 
     detector: Mapping[str, Any]
     inclinometer: Mapping[str, Any]
-    remaps: Remaps = NO_REMAPS
+    remaps: Remaps = field(default_factory=dict)
 
     @classmethod
     def of(

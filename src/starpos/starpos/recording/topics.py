@@ -27,30 +27,22 @@ DRIVER_INPUTS = {
 MADE_OF = {IMAGE: "stars", PICTURE: "stars", IMU: "tilts"}
 
 
-@dataclass(frozen=True)
-class Remaps:
-    """Topics of a bag by the relative names of the inputs they serve as; FrameError if a name is not an input."""
-
-    topics: Mapping[str, str]
-
-    def __post_init__(self) -> None:
-        for name in self.topics:
-            if name not in DRIVER_INPUTS:
-                raise FrameError(f"--remap {name}:=...: the inputs are {', '.join(DRIVER_INPUTS)}")
-
-    @classmethod
-    def of(cls, texts: Sequence[str]) -> "Remaps":
-        """Read texts NAME:=TOPIC; raises FrameError."""
-        topics = {}
-        for text in texts:
-            name, sign, topic = text.partition(":=")
-            if not (name and sign and topic):
-                raise FrameError(f"--remap {text}: write NAME:=TOPIC, such as {RAW}:=/cam0/image_raw")
-            topics[name.strip("/")] = "/" + topic.strip("/")
-        return cls(topics)
+# topics of a bag by the relative names of the inputs they serve as
+Remaps = Mapping[str, str]
+NO_REMAPS: Remaps = {}
 
 
-NO_REMAPS = Remaps({})
+def remaps_of(texts: Sequence[str]) -> Remaps:
+    """Read texts NAME:=TOPIC; raises FrameError for another one, or if a name is not an input."""
+    topics = {}
+    for text in texts:
+        name, sign, topic = text.partition(":=")
+        if not (name and sign and topic):
+            raise FrameError(f"--remap {text}: write NAME:=TOPIC, such as {RAW}:=/cam0/image_raw")
+        if (name := name.strip("/")) not in DRIVER_INPUTS:
+            raise FrameError(f"--remap {name}:=...: the inputs are {', '.join(DRIVER_INPUTS)}")
+        topics[name] = "/" + topic.strip("/")
+    return topics
 
 
 def driver_topics(
@@ -73,7 +65,7 @@ def driver_topics(
         return {}
     beside = images.removesuffix("/compressed").rpartition("/")[0]
     found = {RAW: images}
-    levels = (IMU_DATA,) if IMU_DATA in remaps.topics else ("tilt", IMU_DATA)
+    levels = (IMU_DATA,) if IMU_DATA in remaps else ("tilt", IMU_DATA)
     for name in ("camera/camera_info", "camera/capture", *levels):
         if not (name == IMU_DATA and "tilt" in found) and (topic := bag.of(name, beside)):
             found[name] = topic
@@ -83,7 +75,7 @@ def driver_topics(
 def named_topics(connections: "Sequence[Connection]", remaps: Remaps, place: Path | str) -> dict[str, str]:
     """The topics that the user names, by the inputs they serve as; raises FrameError as `driver_topics` does."""
     bag = _Topics(connections, remaps, None, f"{place}")
-    return {name: topic for name in remaps.topics if (topic := bag.of(name, ""))}
+    return {name: topic for name in remaps if (topic := bag.of(name, ""))}
 
 
 def sentence_on_use(found: Mapping[str, str], connections: "Sequence[Connection]") -> str:
@@ -105,8 +97,8 @@ class _Topics:
 
     def of(self, name: str, beside: str) -> str | None:
         """The topic of an input, preferably next to `others`; None without one."""
-        if name in self.remaps.topics:
-            return self._named(name, self.remaps.topics[name])
+        if name in self.remaps:
+            return self._named(name, self.remaps[name])
         for kind in DRIVER_INPUTS[name]:
             topics = self._of_type(kind)
             own = [t for t in topics if t.removesuffix("/compressed").endswith(f"/{name}")]
@@ -162,7 +154,6 @@ class Chosen:
 
 def instrument_in(
     bag: BagReader,
-    path: Path,
     namespace: str | None,
     topics: Mapping[str, str],
     remaps: Remaps = NO_REMAPS,
@@ -179,22 +170,24 @@ def instrument_in(
             if c.msgtype == kind and c.topic.endswith(f"/{suffix}"):
                 found.setdefault(c.topic.removesuffix(suffix).rstrip("/") or "/", []).append(c)
     able = sorted(n for n, cs in found.items() if any(c.msgtype == STARS and c.msgcount for c in cs))
-    if not able or RAW in remaps.topics:
-        drivers = driver_topics(bag.connections, remaps, namespace, path)
+    if not able or RAW in remaps:
+        drivers = driver_topics(bag.connections, remaps, namespace, bag.path)
         if drivers:
             return _of_drivers(bag, drivers, namespace)
         raise FrameError(
-            f"{path}: no stars in it, and no images: record stars, tilt and camera/camera_info, or the images and the "
-            "IMU of a robot"
+            f"{bag.path}: no stars in it, and no images: record stars, tilt and camera/camera_info, or the images and "
+            "the IMU of a robot"
         )
     wanted = "/" + namespace.strip("/") if namespace is not None else able[0]
     if able == ["/"] and wanted != "/":
         raise FrameError(
-            f"{path}: the instrument in it has no namespace, not {wanted}: leave --namespace out"
+            f"{bag.path}: the instrument in it has no namespace, not {wanted}: leave --namespace out"
         )
     if wanted not in able or (namespace is None and len(able) > 1):
-        raise FrameError(f"{path}: the instruments in it are {', '.join(able)}: choose one with --namespace")
-    named = named_topics(bag.connections, remaps, path)
+        raise FrameError(
+            f"{bag.path}: the instruments in it are {', '.join(able)}: choose one with --namespace"
+        )
+    named = named_topics(bag.connections, remaps, bag.path)
     replaced = {INPUTS.get("tilt" if name == IMU_DATA else name) for name in named}
     own = [c for c in found[wanted] if c.msgtype not in replaced]
     others = [c for c in bag.connections if c.topic in named.values()]

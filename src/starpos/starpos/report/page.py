@@ -192,6 +192,8 @@ def _sky_caption() -> str:
 
 # maximum number of frames listed by name
 LISTED = 200
+# number of frames of one status without a fix that say why
+REASONS = 5
 
 
 def page(
@@ -287,9 +289,11 @@ def _summary(night: Night) -> str:
     failed = Counter(s.status.value for s in night.shots if s.place is None)
     counts = f"{used} with a fix" + "".join(f", {n} {escape(why)}" for why, n in failed.most_common())
     rows.append(("Frames", f"{len(night.shots)}: {counts}"))
-    for why in failed:
-        first = next(s for s in night.shots if s.place is None and s.status.value == why)
-        rows.append((f"First &lsquo;{escape(why)}&rsquo;", escape(first.message)))
+    whys: Counter[str] = Counter()
+    for s in night.shots:
+        whys[s.status.value] += s.place is None
+        if s.place is None and whys[s.status.value] <= REASONS:
+            rows.append((f"&lsquo;{escape(s.status.value)}&rsquo;", escape(s.message)))
     warned = Counter(warning for s in night.shots for warning in s.warnings)
     if warned:
         rows.append(("Warnings", ", ".join(f"{n} {escape(what)}" for what, n in sorted(warned.items()))))

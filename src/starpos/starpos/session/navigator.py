@@ -26,7 +26,7 @@ from starpos.navigation.equations import PLACE
 from starpos.navigation.estimate import Estimate, Observability, VoyageFix, observability
 from starpos.navigation.recent import BACK_S, LONGEST_GAP_S, Recent
 from starpos.navigation.records import ImuModel, read_imu_model
-from starpos.navigation.sightings import PlacelessFrame, body_attitude
+from starpos.navigation.sightings import PlacelessFrame, SunFrame, body_attitude
 from starpos.navigation.vessel import PARKED, Vessel, check_drift
 from starpos.navigation.voyage import MIN_FRAMES, Voyage
 from starpos.session.driver import Changes, Diagnosis, Heard, Jobs, Level, Log, Now, Outcome, refusing
@@ -119,6 +119,8 @@ class NavigatorSession:
         """Begin a new voyage."""
         self._recent = Recent()
         self._estimate: Estimate | None = None
+        # a frame with the Sun that the estimate is made of: then its place is a given one
+        self._sun: SunFrame | None = None
         self._known: Observability | None = None
         self._origin: np.ndarray | None = None
         self._trouble = STARTING
@@ -164,34 +166,36 @@ class NavigatorSession:
 
     def receive_attitude(self, message: Any, now: Now) -> list[Navigated]:
         """Take a starpos_interfaces/Attitude."""
-        made: list[Navigated] = []
         with refusing(self._heard, "attitude"):
             attitude = message_to_attitude(message)
             self._check_time(attitude.utc_unix_s, now, "an attitude")
-            frame = PlacelessFrame.of(attitude)
+            assert attitude.utc_unix_s is not None
+            by_sun, place = attitude.ray is not None, None
+            if by_sun or self._estimate is None or self._stars_missing:
+                place = self._place_at(attitude.utc_unix_s)
+            if by_sun and place is None:
+                raise VoyageError(
+                    "the Sun gives a heading only at a known place: set site.latitude and site.longitude, or gnss.use "
+                    "and send gnss/fix"
+                )
+            frame = SunFrame.of(attitude, place) if by_sun and place else PlacelessFrame.of(attitude)
             self._recent.add_frame(frame)
             self._clock_stddev_s = attitude.clock_stddev_s
-            made = self._at_place(frame)
-        return made
+            if place is not None and isinstance(frame, PlacelessFrame):
+                # the heading at a known place, while there is no fix
+                found = body_attitude(frame, place, self._settings.vessel(self._clock_stddev_s))
+                return [Navigated(utc_unix_s=frame.utc_unix_s, at_place=found)]
+        return []
 
-    def _at_place(self, frame: PlacelessFrame) -> list[Navigated]:
-        """The heading at a known place, while there is no fix."""
-        if self._estimate is not None and not self._stars_missing:
-            return []
+    def _place_at(self, utc_unix_s: float) -> Place | None:
+        """The known place at a time; None without one."""
+        if self._settings.site is not None or not self._values["gnss.use"]:
+            return self._settings.site
         try:
-            place = self._settings.site or self._by_gnss(frame.utc_unix_s)
+            gnss = self._gnss.at(utc_unix_s)
         except GnssError as e:
             self._heard.refuse("gnss/fix", str(e))
-            return []
-        if place is None:
-            return []
-        found = body_attitude(frame, place, self._settings.vessel(self._clock_stddev_s))
-        return [Navigated(utc_unix_s=frame.utc_unix_s, at_place=found)]
-
-    def _by_gnss(self, utc_unix_s: float) -> Place | None:
-        if not self._values["gnss.use"]:
             return None
-        gnss = self._gnss.at(utc_unix_s)
         return None if gnss is None else gnss.deflected(self._settings.vertical)
 
     def receive_velocity(self, message: Any, now: Now, name: str) -> list[Navigated]:
@@ -262,11 +266,12 @@ class NavigatorSession:
             return
         self._adjusted_s = time_s
         vessel, voyage = self._settings.vessel(self._clock_stddev_s), self._voyage
+        sun = next((f for f in reversed(inside) if isinstance(f, SunFrame)), None)
         self._jobs.run(lambda: record.adjusted(vessel)).add_done_callback(
-            lambda f: self._adjusted(f.result(), voyage)
+            lambda f: self._adjusted(f.result(), voyage, sun)
         )
 
-    def _adjusted(self, made: Outcome, voyage: object) -> None:
+    def _adjusted(self, made: Outcome, voyage: object, sun: SunFrame | None) -> None:
         if voyage is not self._voyage:
             return
         self.counts["adjustments"] += 1
@@ -276,11 +281,11 @@ class NavigatorSession:
             self._changes.say(made.trouble, good=False)
             return
         found: Voyage = made.value
-        self._faults = found.faults
+        self._faults, self._sun = found.faults, sun
         self._seen_s = found.last.utc_unix_s
         self._known = observability(found.last, self._is_measured)
         self._estimate = self._carried_on(found.last)
-        self._changes.say("fixes are coming", good=True)
+        self._changes.say("fixes are coming" if sun is None else "headings by the Sun are coming", good=True)
 
     def _carried_on(self, estimate: Estimate) -> Estimate:
         """An estimate at the last output's time."""
@@ -303,6 +308,8 @@ class NavigatorSession:
         estimate = self._estimate
         if estimate is None or self._stars_missing:
             return Navigated(utc_unix_s=time_s)
+        if self._sun is not None:
+            return Navigated(utc_unix_s=time_s, at_place=self._sun.heading_by(estimate.fix.link))
         self.counts["fixes"] += 1
         ground, (displacement, covariance) = (
             estimate.fix.on_ground(self._settings.vertical),
@@ -359,6 +366,11 @@ class NavigatorSession:
         if self._stars_missing:
             return Diagnosis(Level.WARN, self._why_old(since_s), values)
         faults = list(self._faults)
+        if self._sun is not None:
+            heading_deg = math.degrees(self._sun.heading_by(estimate.fix.link).angles_covariance[0, 0] ** 0.5)
+            values["heading (deg, 1 sigma)"] = heading_deg
+            sentence = "; ".join([f"by the Sun, at a given place: heading to {heading_deg:.3g} deg", *faults])
+            return Diagnosis(Level.WARN if faults else Level.OK, sentence, values)
         gnss = self._gnss.newest
         if gnss is not None and abs(estimate.utc_unix_s - gnss.utc_unix_s) < OLDEST_S:
             fix = estimate.fix

@@ -24,22 +24,9 @@ from starpos.messages.tilt import Reading
 from starpos.night.field import INSTRUMENT, is_field, opened
 from starpos.night.opening import frames_in
 from starpos.night.reading import stars_of
+from starpos.recording import topics
 from starpos.recording.bag import BagReader
 from starpos.recording.drivers import IMAGES, DriverMessages, Drivers
-from starpos.recording.topics import (
-    CAPTURE,
-    GNSS,
-    IMU,
-    INPUTS,
-    NAV_SAT_FIX,
-    NO_REMAPS,
-    SATELLITES,
-    STARS,
-    TILT,
-    TRAILS,
-    Remaps,
-    instrument_in,
-)
 from starpos.session.driver import Heard, JobsInTurn, Log, Now, Sent
 from starpos.session.frames import Answered, Averaged, Output
 from starpos.session.session import SolverSession
@@ -77,10 +64,10 @@ class Replay:
         """
         now_ns, messages = 0, DriverMessages(self._drivers)
         with BagReader(path, typed=True) as bag:
-            topics = INPUTS if self.session.gnss is None else INPUTS | GNSS
+            inputs = topics.INPUTS if self.session.gnss is None else topics.INPUTS | topics.GNSS
             if self.session.satellites is not None:
-                topics = topics | SATELLITES
-            chosen = instrument_in(bag, path, namespace, topics, self._drivers.remaps)
+                inputs = inputs | topics.SATELLITES
+            chosen = topics.instrument_in(bag, namespace, inputs, self._drivers.remaps)
             if chosen.made:
                 self.remarks.append(chosen.made)
             for connection, log_ns, message in bag.decoded(chosen.connections):
@@ -114,9 +101,9 @@ class Replay:
     def _taken(self, kind: str, message: Any, messages: DriverMessages, now: Now) -> list[Output]:
         """Have the session take a message, or the stars or tilt made from it."""
         session = self.session
-        if kind == TILT:
+        if kind == topics.TILT:
             return self._receive_tilt(message, now)
-        if kind == STARS:
+        if kind == topics.STARS:
             self.frames += 1
             return session.receive_stars(message, now)
         if kind in IMAGES:
@@ -127,14 +114,14 @@ class Replay:
                 self._heard.refuse("image_raw", str(error))
                 return []
             return session.receive_detected(stars, header, now)
-        if kind == IMU:
+        if kind == topics.IMU:
             tilt = messages.tilt_of(message, now.unix_s or 0.0)
             return [] if tilt is None else self._receive_tilt(tilt, now)
-        if kind == TRAILS:
+        if kind == topics.TRAILS:
             return session.receive_trails(message, now)
-        if kind == NAV_SAT_FIX:
+        if kind == topics.NAV_SAT_FIX:
             return session.receive_gnss(message, now)
-        if kind == CAPTURE:
+        if kind == topics.CAPTURE:
             messages.receive_capture(message)
             return []
         return session.receive_camera(message, now)
@@ -238,7 +225,7 @@ class Playing:
     params_file: Path | None
     given: Sequence[str]
     namespace: str | None
-    remaps: Remaps = NO_REMAPS
+    remaps: topics.Remaps = field(default_factory=dict)
 
     def __call__(self, bag: str) -> PlayedNight:
         if is_field(bag):

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from starpos.earth.orientation import EQUATOR_M_PER_S, table_age_days
+from starpos.earth.place import Place
 from starpos.fix.checks import MODEL_BY_PARAMETERS, unnamed_inclinometer
 from starpos.fix.heading import AttitudeAtPlace
 from starpos.fix.solution import Solution
@@ -21,6 +22,7 @@ WIDE_CLOCK_S = 0.1
 # stamps count from the boot of their host.
 OLD_S, SINCE_BOOT_S = 40.0, 1e9
 AHEAD_S = 1.0
+SITE_LATITUDE, SITE_LONGITUDE = "site latitude (deg)", "site longitude (deg)"
 ONE_CLOCK = "set the clocks of camera, inclinometer and solver by one source"
 
 OTHER_TILTS = (
@@ -29,7 +31,12 @@ OTHER_TILTS = (
 )
 
 
-def of_solution(answer: Solution, counts: Mapping[str, int], remarks: str = "") -> Diagnosis:
+def of_site(site: Place) -> dict[str, float]:
+    """Values with a known place, deg on WGS 84, which the dashboard reads."""
+    return {SITE_LATITUDE: math.degrees(site.latitude), SITE_LONGITUDE: math.degrees(site.longitude)}
+
+
+def of_solution(answer: Solution, counts: Mapping[str, float], remarks: str = "") -> Diagnosis:
     """Report the solution of the newest frame; remarks: sentences on what is wrong around it."""
     values: dict[str, object] = {**counts, "status": answer.status.value}
     values |= {

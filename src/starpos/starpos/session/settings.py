@@ -10,7 +10,6 @@ from typing import Any, ClassVar
 import numpy as np
 
 from starpos.earth import geoid
-from starpos.earth.geoid import Geoid
 from starpos.earth.place import Place
 from starpos.earth.refraction import Atmosphere
 from starpos.earth.vertical import AtHeight, Deflection, Vertical
@@ -18,12 +17,12 @@ from starpos.errors import GeoidError, InstrumentError, PlaceError, StarposError
 from starpos.files import path_of
 from starpos.fix.solver import Solver
 from starpos.gnss import states
-from starpos.gnss.states import Learned
 from starpos.instrument import instrument_file, sensors
 from starpos.instrument.camera import Camera
 from starpos.instrument.instrument import Calibration, Instrument
 from starpos.parameters.given import values_of
 from starpos.satellites.elements import StoredOrbits
+from starpos.sky.bodies import ERFA, JplKernel
 from starpos.sky.catalogue import Catalogue
 
 NAN = math.nan
@@ -136,7 +135,7 @@ def check_deflection(values: Mapping) -> None:
         )
 
 
-def vertical_of(values: Mapping, known: Geoid | None) -> Vertical:
+def vertical_of(values: Mapping, known: geoid.Geoid | None) -> Vertical:
     """Return the Geoid (`known`, or None), or the deflection that the parameters give for the place.
 
     Plumb lines curve up to the altitude, if it is set, unless the parameters give the deflection at the instrument.
@@ -233,6 +232,7 @@ class Settings(NodeSettings):
         **NodeSettings.readers,
         "gnss.learned": lambda name: states.read_learned(path_of(name)),
         "satellites.elements": lambda name: StoredOrbits(path_of(name)),
+        "ephemeris": lambda name: JplKernel(str(path_of(name))),
     }
 
     @classmethod
@@ -251,7 +251,7 @@ class Settings(NodeSettings):
         check_deflection(values)
 
     @property
-    def learned(self) -> Learned | None:
+    def learned(self) -> states.Learned | None:
         """What earlier sessions learned by GNSS; None without a file."""
         return self._files["gnss.learned"]
 
@@ -290,4 +290,5 @@ class Settings(NodeSettings):
             catalogue,
             atmosphere_of(self.values),
             min_stars=self.values["min_stars"],
+            ephemeris=self._files["ephemeris"] or ERFA,
         )

@@ -7,24 +7,17 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-from starpos.earth.orientation import earth_state
 from starpos.errors import StarposError
+from starpos.fix import searching
 from starpos.fix.attitude import CameraAttitude
-from starpos.fix.searching import (
-    NEVER_S,
-    UNASKED,
-    Question,
-    answer_frame,
-    identify_every_way,
-    other_focal_length,
-)
 from starpos.fix.solution import Solution, Status
 from starpos.fix.solver import Solver, focal_that_fits
+from starpos.fix.sun import sun_alone
 from starpos.frames.frame import Stars
-from starpos.identification import fisheye
-from starpos.navigation.sightings import sighted
+from starpos.navigation.sightings import sighting_of
 from starpos.session.driver import Now
 from starpos.session.gyro import Gyro
+from starpos.sky.bodies import SUN
 
 # Share of the time between frames in which one may be searched.
 MAX_OF_INTERVAL = 0.5
@@ -57,21 +50,21 @@ class Search:
         """
         most_s = self._values["search_time"]
         if now is not None and now.played:
-            return NEVER_S if most_s > 0 else AT_ONCE_S
+            return searching.NEVER_S if most_s > 0 else AT_ONCE_S
         if now is not None:
             most_s = min(most_s, 0.0 if others_wait else MAX_OF_INTERVAL * self._interval_s)
         return time.monotonic() + most_s
 
-    def solve(self, solver: Solver, question: Question) -> Solution:
+    def solve(self, solver: Solver, question: searching.Question) -> Solution:
         """Solve a list by `answer_frame`; while none is identified, say which focal length fits."""
-        answer = answer_frame(solver, question).solution
+        answer = searching.answer_frame(solver, question).solution
         self._identified |= answer.found is not None
         if self._identified or answer.status is not Status.NOT_IDENTIFIED:
             return answer
         focal_px = focal_that_fits(solver, question.stars, question.until_s)
         if focal_px is None:
             return answer
-        return replace(answer, message=other_focal_length(question.stars.place, focal_px))
+        return replace(answer, message=searching.other_focal_length(question.stars.place, focal_px))
 
 
 def camera_attitude_of(
@@ -82,22 +75,19 @@ def camera_attitude_of(
     An identification in doubt, a fisheye and a mirrored frame give no attitude.
     """
     found = answer.found
-    if found is None or answer.warnings or found.mirrored or stars.mid_unix_s is None:
-        return None
     try:
-        camera, catalogue, _ = solver.view(stars.width, stars.height, stars.origin_px)
-        if fisheye.is_wide(camera):
-            return None
-        state = earth_state(stars.mid_unix_s)
-        seen = sighted(stars, found, (camera, catalogue), state).placeless()
+        frame = sighting_of(stars, solver, answer)
+        seen = frame.placeless()
     except StarposError:
         return None
+    assert found is not None
+    gcrs_to_itrs = frame.camera.rotation @ found.attitude
     return CameraAttitude(
-        utc_unix_s=stars.mid_unix_s,
+        utc_unix_s=frame.utc_unix_s,
         stamp_stddev_s=stars.stamp_stddev_s,
         clock_stddev_s=solver.clock_stddev_s(stars),
         frame_id=frame_id,
-        camera_to_gcrs=state.gcrs_to_itrs.T @ seen.rotation,
+        camera_to_gcrs=gcrs_to_itrs.T @ seen.rotation,
         covariance=seen.covariance_about_own,
         stars=len(found.star),
         log_odds=found.log_odds,
@@ -105,14 +95,18 @@ def camera_attitude_of(
 
 
 def attitude_beside(
-    solver: Solver, question: Question, answer: Solution, frame_id: str, gyro: Gyro
+    solver: Solver, question: searching.Question, answer: Solution, frame_id: str, gyro: Gyro
 ) -> CameraAttitude | None:
-    """The attitude of a frame that was asked about, also given to the gyro; None without identified stars.
+    """The attitude of a frame that was asked about, also given to the gyro; None without identified stars or the Sun.
 
-    Where the solver stopped before identification, the stars are identified now.
+    Where the solver stopped before identification, the stars are identified now.  The Sun's limb counts without a heading
+    too: under way the level does not show where up is.  A glow, which may be a lamp's, counts with one alone.
     """
-    if answer.found is None and answer.status in UNASKED:
-        answer = identify_every_way(solver, replace(question, tilts=None, places=None)).solution
+    disc = question.stars.disc
+    if disc is not None and answer.found is None and (disc.sharp or answer.ok):
+        return sun_alone(solver, question.stars, disc, frame_id) if answer.bodies in ((), (SUN,)) else None
+    if answer.found is None and answer.status in searching.UNASKED:
+        answer = searching.identify_every_way(solver, replace(question, tilts=None, places=None)).solution
     attitude = camera_attitude_of(solver, question.stars, answer, frame_id)
     if attitude is not None and answer.found is not None:
         gyro.learn_from(question.stars, answer.found, solver)

@@ -16,18 +16,8 @@ from typing import Any
 import numpy as np
 
 from starpos.errors import TiltError, TiltRangeError
+from starpos.instrument import tilt_log
 from starpos.instrument.inclinometer import Tilt
-from starpos.instrument.tilt_log import (
-    BRACKET_S,
-    NEIGHBOURS_S,
-    OPEN_END,
-    STUCK_READINGS,
-    TOUCH_S,
-    TiltLog,
-    Tilts,
-    coarse_step,
-    noise_excess,
-)
 from starpos.messages.stamp import stamp_to_unix
 from starpos.messages.tilt import OUT_OF_RANGE, SATURATED, STUCK, UNUSABLE, message_to_tilt
 from starpos.session import reports
@@ -54,7 +44,7 @@ class TiltSteps:
         # a repeated sample adds nothing, and counting it would distort the noise
         if self._number and sample.utc_unix_s <= self._rows[self._number - 1, 0]:
             return
-        if not 0 < apart_s < NEIGHBOURS_S or sample.axes != before.axes:
+        if not 0 < apart_s < tilt_log.NEIGHBOURS_S or sample.axes != before.axes:
             return
         # of another number of axes they are of another sensor
         if sample.axes != self._axes:
@@ -76,7 +66,8 @@ class TiltSteps:
         rows = self._until(end_unix_s)
         if not len(rows):
             return 1.0
-        return noise_excess(rows[:, 2 : 2 + self._axes], float(np.sqrt(rows[:, 1].mean())))
+        steps = tilt_log.without_copies(rows[:, 2 : 2 + self._axes])
+        return tilt_log.noise_excess(steps, float(np.sqrt(rows[:, 1].mean())))
 
     def until(self, end_unix_s: float) -> np.ndarray:
         """The differences (N, 2) of X', Y' of samples up to a time, rad."""
@@ -161,7 +152,7 @@ PATIENCE_S, DELAYS = 0.5, 1.5
 # Between two samples of one exposure at most this number of others arrives.
 TOGETHER = 20
 # Samples this near to an exposure may bracket it; a flagged one explains why there is no good one.
-NEAR_S = BRACKET_S
+NEAR_S = tilt_log.BRACKET_S
 # Tolerated disorder of one inclinometer's samples; a sample that arrives after others with later times shows that those
 # were stamped by a clock ahead.
 ORDER_S = 1.0
@@ -273,7 +264,7 @@ class TiltBuffer:
         if not self._late_s or not self._apart_s:
             return 0.0
         late_s, apart_s = max(self._late_s), float(np.median(self._apart_s))
-        return late_s + apart_s if late_s < LATEST_S and apart_s < BRACKET_S else 0.0
+        return late_s + apart_s if late_s < LATEST_S and apart_s < tilt_log.BRACKET_S else 0.0
 
     def patience_s(self, stated_s: float) -> float:
         """How long a frame waits for its tilts, s; a stated NaN: by the tilts' own delay."""
@@ -287,7 +278,7 @@ class TiltBuffer:
             return bool(times)
         period = float(np.median(np.diff(times))) if len(times) > 2 else USUAL_PERIOD_S
         # a sample after the exposure is needed if the last one inside leaves much of it uncovered
-        return times[-1] >= max(end - JITTER * period, end - OPEN_END * span_s)
+        return times[-1] >= max(end - JITTER * period, end - tilt_log.OPEN_END * span_s)
 
     def _near(self, mid_unix_s: float, span_s: float) -> list[Tilt]:
         """The samples near an exposure in order of time, however they came; none counts twice.
@@ -313,29 +304,37 @@ class TiltBuffer:
         if several := self._publishers.several:
             raise TiltError(several)
         near = self._near(mid_unix_s, span_s)
-        inside = [k for k, s in enumerate(near) if abs(s.utc_unix_s - mid_unix_s) <= span_s / 2 + TOUCH_S]
+        inside = [
+            k for k, s in enumerate(near) if abs(s.utc_unix_s - mid_unix_s) <= span_s / 2 + tilt_log.TOUCH_S
+        ]
         if not inside:
             self._explain(mid_unix_s, span_s, bool(near))
         else:
             # Later samples must not count, because their number depends on chance; one may be waited for.
-            open_end = mid_unix_s + span_s / 2 - near[inside[-1]].utc_unix_s > OPEN_END * span_s
+            open_end = mid_unix_s + span_s / 2 - near[inside[-1]].utc_unix_s > tilt_log.OPEN_END * span_s
             near = near[max(inside[0] - 1, 0) : inside[-1] + 1 + open_end]
         # by samples up to the exposure's end: the number since then depends on chance
-        excess = self._steps.excess(mid_unix_s + span_s / 2)
-        tilt = TiltLog.of_readings(near, excess).average(mid_unix_s, span_s)
+        end = mid_unix_s + span_s / 2
+        earlier = {
+            "earlier_excess": self._steps.excess(end),
+            "earlier_copies": tilt_log.copies(self._steps.until(end)),
+        }
+        tilt = tilt_log.TiltLog.of_readings(near, **earlier).average(mid_unix_s, span_s)
         return replace(tilt, step_rad=self._coarse_step(near))
 
     def _coarse_step(self, used: list[Tilt]) -> float:
         """`coarse_step` of the samples used, by these and those before."""
         end = used[-1].utc_unix_s
+        moves = self._steps.until(end)
+        most = tilt_log.STUCK_READINGS * tilt_log.copies(moves)
         until = (s for _, s in reversed(self._good) if s.utc_unix_s <= end)
-        before = [s.theta[:2] for s in itertools.islice(until, STUCK_READINGS)]
-        repeats = np.ptp(before, axis=0) == 0 if len(before) == STUCK_READINGS else np.zeros(2, bool)
+        before = [s.theta[:2] for s in itertools.islice(until, most)]
+        repeats = np.ptp(before, axis=0) == 0 if len(before) == most else np.zeros(2, bool)
         noise = math.sqrt(np.mean([np.diag(s.covariance) for s in used]))
         theta = np.array([s.theta[:2] for s in used])
-        return coarse_step(theta, self._steps.until(end), repeats, noise)
+        return tilt_log.coarse_step(theta, tilt_log.without_copies(moves), repeats, noise)
 
-    def over(self, span_s: float) -> "Tilts":
+    def over(self, span_s: float) -> "tilt_log.Tilts":
         """These tilts for a frame, over a span in place of an exposure that may not be known."""
         return _Over(self, span_s)
 

@@ -386,7 +386,9 @@ def _split(column: np.ndarray) -> np.ndarray:
     """Byte planes (bytes, N) of a column (N,), whose high bytes repeat, so that they compress well; bytes as they are."""
     if column.itemsize == 1:
         return column
-    return np.ascontiguousarray(np.ascontiguousarray(column).view(np.uint8).reshape(len(column), -1).T)
+    return np.ascontiguousarray(
+        np.ascontiguousarray(column).view(np.uint8).reshape(len(column), column.itemsize).T
+    )
 
 
 def _join(planes: np.ndarray, dtype: type[np.integer]) -> np.ndarray:
@@ -429,7 +431,7 @@ def read(path: Path | str) -> Catalogue:
             found.check()
             return found
     except FileNotFoundError:
-        raise CatalogueError(f"{path}: no catalogue there: run `starpos catalogue build --help`") from None
+        raise CatalogueError(f"{path}: no catalogue there: run `starpos catalogue --help`") from None
     except CatalogueError:
         raise
     # a damaged zip file raises many kinds of exception

@@ -1,16 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How deep a catalogue a field needs, and a deeper one for small fields: all of Tycho-2, built once and kept."""
+"""How deep a catalogue a field needs, and a deeper one for small fields: all of Tycho-2, kept in the cache."""
 
 import math
-import os
 from dataclasses import dataclass
 from functools import lru_cache
-from pathlib import Path
 
 import numpy as np
 
 from starpos.instrument.camera import Camera
-from starpos.progress import Progress, quiet
 from starpos.sky.catalogue import CELLS, ZONES, Catalogue, kept_catalogues
 
 # Number of the catalogue's stars that should be on a frame, in all but this share of the sky.
@@ -90,27 +87,17 @@ def _solid_angle_deg2(width: float, height: float) -> float:
     return float(width * height * share * np.degrees(1) ** 2)
 
 
-# The variable of the environment that names the original files: a folder, or Debian's archive of them.
-ORIGINALS = "STARPOS_TYCHO2"
-# A magnitude fainter than all stars of Tycho-2, and their number.
-ALL_MAG, TYCHO2_STARS = 20.0, 2_550_000
-# How to get the deeper catalogue.
-GET_IT = "type `starpos catalogue deepen --fetch` (121 MB, once)"
+# The number of Tycho-2's stars.
+TYCHO2_STARS = 2_550_000
 NAME = "tycho2"
 KEPT = kept_catalogues("stars of the deeper catalogue")
 
 
-def for_field(catalogue: Catalogue, camera: Camera, progress: Progress = quiet) -> Catalogue:
-    """The catalogue, or the deeper one if a camera's field holds too few of its stars.
-
-    The deeper one comes from the cache; if STARPOS_TYCHO2 names the original files, it is built now.  Raises
-    CatalogueError if these cannot be used.
-    """
+def for_field(catalogue: Catalogue, camera: Camera) -> Catalogue:
+    """The catalogue, or the deeper one in the cache if a camera's field holds too few of its stars."""
     if Depth.of(camera, catalogue).enough:
         return catalogue
     deeper = kept()
-    if deeper is None and (originals := os.environ.get(ORIGINALS)):
-        deeper = build(originals, progress)
     return catalogue if deeper is None or len(deeper) <= len(catalogue) else deeper
 
 
@@ -126,32 +113,17 @@ def too_thin(catalogue: Catalogue, camera: Camera) -> str:
     if len(catalogue) >= TYCHO2_STARS or kept() is not None:
         return f"{holds}, deeper than Tycho-2: name one in STARPOS_CATALOGUE, or take a wider field"
     more = depth.mean * TYCHO2_STARS / max(len(catalogue), 1)
-    return f"{holds}; all of Tycho-2 would be {more:.0f}: {GET_IT}"
+    return (
+        f"{holds}; all of Tycho-2 would be {more:.0f}: "
+        "build it (docs/how-to/small_fields.md) and type `starpos catalogue deepen FILE`"
+    )
 
 
 def kept() -> Catalogue | None:
-    """The deeper catalogue, memory-mapped from the cache; None if it was not built."""
+    """The deeper catalogue, memory-mapped from the cache; None if none is kept."""
     return KEPT.stored(NAME)
 
 
-def build(originals: Path | str, progress: Progress = quiet, *, anew: bool = False) -> Catalogue:
-    """Build the deeper catalogue from a folder or an archive of the original files, and keep it in the cache.
-
-    A catalogue built meanwhile is used, unless a new one is wanted.  Raises CatalogueError as `tycho2.build` does.
-    """
-    from starpos.sky import tycho2
-
-    return KEPT.built(NAME, lambda: tycho2.build(originals, ALL_MAG, progress), anew=anew)
-
-
-def fetched(mirror: str | None = None, progress: Progress = quiet) -> Catalogue:
-    """Build the deeper catalogue from the original files that a mirror of Debian has (`fetching.fetch`), and keep it.
-
-    Raises CatalogueError if they cannot be fetched; what has come stays for the next call.
-    """
-    from starpos.sky.tycho2 import fetch
-
-    archive = fetch(mirror, progress)
-    made = build(archive, progress, anew=True)
-    archive.unlink(missing_ok=True)
-    return made
+def keep(catalogue: Catalogue) -> Catalogue:
+    """Keep a catalogue in the cache as the deeper one, for small fields."""
+    return KEPT.built(NAME, lambda: catalogue, anew=True)

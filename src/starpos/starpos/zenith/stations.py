@@ -234,25 +234,13 @@ def _station(sessions: list[SessionResult], number: str) -> Station:
     )
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class AgainstGrid:
-    """A station's deflection at the geoid minus a grid's, arcsec: off, stddev (2,); grid: the grid's own."""
-
-    grid: Deflection
-    off: np.ndarray
-    stddev: np.ndarray
-
-
-def against_grid(station: Station, geoid: Geoid) -> AgainstGrid | None:
-    """The difference of a station from a grid; None where the grid has no data.
+def against_grid(station: Station, geoid: Geoid) -> tuple[Deflection, np.ndarray, np.ndarray] | None:
+    """A grid's deflection, and the station's at the geoid minus it with 1 sigma (2,) each, arcsec; None without data.
 
     Both are at the geoid: the station's by the normal plumb line, so that mountains remain in the difference.
     """
     grid = geoid.at(station.place.latitude, station.place.longitude)
     if not grid.known:
         return None
-    return AgainstGrid(
-        grid=grid,
-        off=station.at_geoid - [grid.xi_arcsec, grid.eta_arcsec],
-        stddev=np.hypot(station.sigma, grid.stddev_arcsec),
-    )
+    off = station.at_geoid - [grid.xi_arcsec, grid.eta_arcsec]
+    return grid, off, np.hypot(station.sigma, grid.stddev_arcsec)

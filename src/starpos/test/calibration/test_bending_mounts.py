@@ -29,7 +29,7 @@ STEP_RAD, NOISE_RAD = 90 * DEG / 2**14, 0.001 * DEG * np.sqrt(10)
 STATED = InclinometerErrors(noise_rad=NOISE_RAD, quantum_rad=STEP_RAD)
 DIRECTIONS, BEND_RAD, OVER_RAD, ROUGH_RAD = 13, 0.1 * DEG, 0.6, 0.01 * DEG
 IMU_SCALE, IMU_NOISE_RAD = 0.014, 0.09 * DEG
-SEEDS = range(4)
+SEEDS = range(3)
 
 
 class Bend:

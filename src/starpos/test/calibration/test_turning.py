@@ -72,8 +72,10 @@ def about_an_axis(catalogue, rng, headings, lean_deg, turn_stddev_deg):
 
 
 @pytest.mark.montecarlo
-@pytest.mark.parametrize("headings", [(0, 180), (0, 90, 180, 270)])
-@pytest.mark.parametrize(("lean", "turn_stddev"), [(0.02, 180.0), (0.3, 180.0), (0.3, 2.0)])
+@pytest.mark.parametrize(
+    ("headings", "lean", "turn_stddev"),
+    [((0, 180), 0.02, 180.0), ((0, 90, 180, 270), 0.3, 180.0), ((0, 180), 0.3, 2.0)],
+)
 def test_about_an_axis_that_leans_the_place_is_as_good_as_the_turn_is_known(
     catalogue, rng, headings, lean, turn_stddev
 ):

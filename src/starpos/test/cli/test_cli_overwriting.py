@@ -19,7 +19,7 @@ def calls(folder, out):
         "--map": ("calibrate", *frames, *tilts, *WIDE, *AIR, "--camera", f"{out}.new", "--map", out),
         "--save": ("solve", *frames, *tilts, *WIDE, *AIR, "--self-calibrate", "--save", out),
         "--keep": ("montecarlo", "--fields", "1", "--keep", out),
-        "--out": ("catalogue", "build", folder, "--out", out),
+        "--out": ("catalogue", "build", "--gaia", folder / "tilt.csv", "--out", out),
     }
 
 

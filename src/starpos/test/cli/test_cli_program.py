@@ -34,18 +34,6 @@ def test_catalogue_info(capsys):
     assert "Hog et al. 2000" in out
 
 
-def test_a_catalogue_that_cannot_be_written(capsys, monkeypatch, catalogue, tmp_path):
-    from starpos.sky import tycho2
-
-    # The real one reads 500 MB.
-    monkeypatch.setattr(tycho2, "build", lambda *_: catalogue)
-    status, _, errors = run(
-        capsys, "catalogue", "build", "x", "--out", tmp_path / "no" / "such" / "folder.npz"
-    )
-    assert (status, len(errors)) == (2, 1)
-    assert "folder.npz" in errors[0]
-
-
 def test_help_and_version(capsys):
     status, out, errors = run(capsys, "--help")
     assert (status, errors) == (0, [])

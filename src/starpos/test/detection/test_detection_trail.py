@@ -50,7 +50,7 @@ def test_the_psf_of_a_trail_is_the_star_that_moves_along_it(length):
 @pytest.mark.parametrize(("count", "length"), [(1, 5.0), (1, 10.0), (1, 15.0), (3, 10.0), (4, 15.0)])
 def test_a_few_stars_with_a_known_trail_are_measured_near_the_bound(count, length, electrons, rng):
     error, pull = [], []
-    for frame, trail, stars in frames(count, length, electrons, rng, 4 * STARS):
+    for frame, trail, stars in frames(count, length, electrons, rng, 2 * STARS):
         found = detect(replace(frame, trail=Trail(middle_px=tuple(trail)))).stars
         assert len(found) == count
         e, p = errors(found, stars)

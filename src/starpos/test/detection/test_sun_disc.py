@@ -64,3 +64,22 @@ def test_stars_are_no_discs() -> None:
     frame[rng.integers(5, 295, 40), rng.integers(5, 395, 40)] = rng.exponential(3e5, 40)
     frame = cv2.GaussianBlur(frame, (0, 0), 1.2) + rng.poisson(100, SHAPE)
     assert find_disc(frame.clip(0, 65535).astype(np.uint16)) is None
+
+
+@pytest.mark.parametrize("lit_deg", [0.0, 130.0, None], ids=["half lit", "half lit", "full"])
+def test_by_day_the_moon_is_a_second_disc_by_its_lit_limb(lit_deg) -> None:
+    """The Sun's glow is far off; alone it has no second disc."""
+    rows, columns = np.mgrid[:600, :800]
+    sun = glow_frame(200.0, 180.0, 6.0, (600, 800)).astype(float)
+    off_x, off_y = columns - 600.3, rows - 400.6
+    moon = 60 / (1 + np.exp(np.clip((np.hypot(off_x, off_y) - 12.0) / 0.6, -50, 50)))
+    if lit_deg is not None:
+        along = off_x * np.cos(np.radians(lit_deg)) + off_y * np.sin(np.radians(lit_deg))
+        moon /= 1 + np.exp(np.clip(-along / 0.6, -50, 50))
+    quiet = cv2.GaussianBlur(sun, (0, 0), 1.5)
+    found = find_disc((quiet + moon).clip(0, 255).astype(np.uint8))
+    assert found is not None and not found.sharp and found.other is not None
+    other = found.other
+    assert other.sharp and other.radius_px == pytest.approx(12.0, rel=0.05)
+    assert np.hypot(other.x - 600.3, other.y - 400.6) < 4 * np.sqrt(other.covariance[0, 0])
+    assert find_disc(quiet.astype(np.uint8)).other is None

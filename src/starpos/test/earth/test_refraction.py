@@ -5,7 +5,7 @@ import erfa
 import numpy as np
 import pytest
 
-from starpos.earth.refraction import Atmosphere, Refraction
+from starpos.earth.refraction import LOW, Atmosphere, Refraction
 from starpos.errors import InstrumentError
 from starpos.units import ARCSEC
 
@@ -131,3 +131,17 @@ def test_a_pressure_in_the_wrong_unit_is_named_in_both():
     ):
         Atmosphere(pressure_pa=880.0)
     assert Atmosphere(pressure_pa=30_000.0).relative_sigma > 0
+
+
+def test_down_to_the_horizon_a_body_is_raised_as_almanacs_have_it():
+    """34.5 arcmin for 1010 hPa and 10 deg C (Explanatory Supplement 1992, 9.33); no step where the models meet."""
+    air = Atmosphere(pressure_pa=101_000.0, temperature_c=10.0)
+    set_deg = -34.5 / 60
+    bent, sigma = air.raised(np.array([0.0, np.cos(np.radians(set_deg)), np.sin(np.radians(set_deg))]))
+    assert abs(np.degrees(np.arcsin(bent[2]))) < 1.5 / 60
+    assert np.radians(0.1) < sigma < np.radians(0.3)
+    above, below = (
+        air.raised(np.array([np.sqrt(1 - s * s), 0.0, s])) for s in (np.sin(LOW) + 1e-9, np.sin(LOW) - 1e-9)
+    )
+    assert np.linalg.norm(above[0] - below[0]) < np.radians(0.01 / 60)
+    assert below[1] > above[1]

@@ -13,7 +13,6 @@ from starpos.rotation import normalised
 from starpos.sky import deeper
 from starpos.sky.catalogue import pack
 from starpos.sky.deeper import Depth
-from starpos_testing.skies.tycho2_files import write_sky
 
 pytestmark = pytest.mark.montecarlo
 
@@ -34,18 +33,21 @@ def sky():
 
 @pytest.fixture(scope="module")
 def thin(sky):
-    ra, dec, mag = (column[: int(THIN * len(sky[0]))] for column in sky)
+    return packed(*(column[: int(THIN * len(sky[0]))] for column in sky))
+
+
+def packed(ra, dec, mag):
     none, tyc = np.zeros(len(mag)), np.ones((len(mag), 3), int)
     return pack(tyc, none, mag, ra, dec, none, none, none + 10, none + 1, none + 1990)
 
 
 @pytest.fixture(scope="module", autouse=True)
 def own_cache(sky, tmp_path_factory):
-    """A cache with the deeper catalogue, of files that hold all stars of the simulated sky."""
+    """A cache with the deeper catalogue, which holds all stars of the simulated sky."""
     folder = tmp_path_factory.mktemp("small")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(folder / "cache"))
-        deeper.build(write_sky(folder / "originals", *sky))
+        deeper.keep(packed(*sky))
         yield
     deeper.KEPT.forget()
 

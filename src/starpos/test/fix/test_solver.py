@@ -102,6 +102,15 @@ def test_pixels_that_are_not_square_and_a_lens_that_distorts(catalogue, rng):
     assert s.pointing.residual_arcsec < 0.1 * camera.scale_arcsec
 
 
+def test_the_ultra_wide_lens_of_a_telephone(catalogue, rng):
+    """118 deg from corner to corner, as of 13 mm on film."""
+    scene = wide_scene(limit_mag=4.0, tilt_noise_deg=0.0, focal_px=365.0, pointing_deg=(140.0, 65.0, 20.0))
+    s = solver_of(scene, catalogue).solve(stars_of(scene, catalogue, rng), tilt_of(scene, rng))
+    assert s.ok, s.message
+    position, heading = off_by_sigma(s.fix, scene)
+    assert position < 4 and heading < 4
+
+
 def test_the_tilt_is_asked_for_the_exposure(night):
     _, stars, tilt, solver = night
     asked = []

@@ -16,7 +16,7 @@ from starpos.errors import FixError
 from starpos.fix.searching import Question, answer_frame
 from starpos.fix.solution import Solution, Status
 from starpos.fix.solver import Solver
-from starpos.fix.sun import by_sun
+from starpos.fix.sun import by_sun, sun_alone
 from starpos.frames.frame import Disc, Stars, no_stars
 from starpos.instrument.inclinometer import InclinometerErrors, Tilt
 from starpos.instrument.instrument import Calibration, Instrument
@@ -241,3 +241,54 @@ def test_many_suns_of_a_turned_level_give_a_place_and_of_one_at_rest_one_as_bad_
         view.up = rotation.about_axis(0, np.radians(LEANING)) @ attitude[2]
         circles.append(view.answer(utc, None, solver).circle)
     assert np.sqrt(place_of_circles(circles).covariance[:2, :2].trace()) > 0.95 * POSE * 6.37e6
+
+
+def test_a_frame_for_the_navigator_is_the_suns_direction_and_no_turn_about_it() -> None:
+    view, solver = View(AZIMUTH, ALTITUDE), solver_of()
+    disc = Disc(x=view.xy[0], y=view.xy[1], covariance=np.eye(2) * 0.04, radius_px=19.7, sharp=True)
+    stars = replace(no_stars(*SIZE, mid_unix_s=unix_of(WHEN), exposure_s=0.0), disc=disc)
+    seen = sun_alone(solver, stars, disc, "camera")
+    assert seen is not None
+    ray = solver.instrument.camera_for(*SIZE).directions(view.xy[:1], view.xy[1:])[0]
+    assert seen.ray == pytest.approx(ray, abs=1e-9)
+    sun = body_at("sun", earth_state(unix_of(WHEN)))
+    assert earth_state(unix_of(WHEN)).gcrs_to_itrs @ seen.camera_to_gcrs @ seen.ray == pytest.approx(
+        sun.itrs, abs=1e-9
+    )
+    across = np.sqrt(np.linalg.eigvalsh(seen.covariance)[:2])
+    assert 0.19 / 4266 < across[0] < across[1] < 1e-3
+    assert sun_alone(solver, stars, replace(disc, radius_px=40.0), "camera") is None
+
+
+@pytest.mark.parametrize("altitude_deg", [3.5, 2.0, 0.5])
+def test_low_as_it_is_the_sun_gives_a_heading_whose_altitude_may_be_off(altitude_deg) -> None:
+    """Days differ by arcminutes in how high they raise the Sun: the heading stays."""
+    utc, place = low_sun(altitude_deg)
+    true = place.plumb_axes @ body_at("sun", earth_state(unix_of(utc))).from_place(place.plumb_axes[2])
+    bent, sigma = AIR.raised(true)
+    azimuth, altitude = np.degrees([np.arctan2(true[0], true[1]), np.arcsin(bent[2])])
+    view = View(azimuth, altitude + np.degrees(2 * sigma), beside=(1.0, 0.5))
+    found = view.answer(utc, place, solver_of())
+    assert found.bodies == ("sun",)
+    off = rotation.half_turn(found.at_place.plumb.heading - view.heading)
+    assert abs(off) < 2.5 * np.sqrt(found.at_place.plumb.angles_covariance[0, 0])
+    # about up; the frame's top, which stands upright, leans as the level errs
+    assert found.at_place.plumb.covariance[2, 2] < np.radians(0.03) ** 2
+
+
+def test_a_sun_that_has_set_gives_no_heading() -> None:
+    utc, place = low_sun(-1.0)
+    found = View(250.0, 0.5).answer(utc, place, solver_of())
+    assert found.at_place is None
+    assert "at an altitude of -1.0 deg" in found.message
+
+
+def low_sun(altitude_deg: float) -> tuple[str, Place]:
+    """A time, and a place on the equator where the Sun stands so high in the west, without refraction."""
+    sun = body_at("sun", earth_state(unix_of(WHEN)))
+    for longitude in np.arange(60.0, 160.0, 0.01):
+        place = Place.on_ellipsoid(0.0, longitude)
+        up = place.plumb_axes[2]
+        if sun.from_place(up) @ up < np.sin(np.radians(altitude_deg)):
+            return WHEN, place
+    raise AssertionError

@@ -129,7 +129,7 @@ def written(monkeypatch) -> list:
 
     def spy(image, text, origin, font, scale, colour, thickness, *rest):
         (width, ascent), descent = cv2.getTextSize(text, font, scale, 1)
-        if thickness == 1:
+        if colour != module.OUTLINE:
             texts.append((text, origin[0], origin[1] - ascent, origin[0] + width, origin[1] + descent))
         return put(image, text, origin, font, scale, colour, thickness, *rest)
 

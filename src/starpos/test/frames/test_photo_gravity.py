@@ -70,6 +70,10 @@ def test_an_iphones_gravity_in_the_axes_of_the_stored_picture(order):
     assert up(exif(apple((-1.0, 0, 0), order))) == pytest.approx([0, -1, 0])
 
 
+def test_the_cameras_own_program_is_no_editor():
+    assert up(exif(apple((0, 0, 1.0)), software="Version1.02")) == pytest.approx([0, 0, 1])
+
+
 def test_a_name_of_another_type_does_no_harm():
     assert up(exif(apple((0, 0, 1.0)), below={42036: (LONG, 1, struct.pack("<I", 300))})) == pytest.approx(
         [0, 0, 1]
@@ -115,7 +119,23 @@ def canon(roll, pitch):
     return lambda at: directory({0x4059: (LONG, 7, level)}, "<", at)
 
 
+def nikon(roll, pitch, version=b"0243", at=0xA0, serial="6001442", mode=0):
+    """The cipher of a camera whose serial number ends with 34 (mod 256) and that was released 70000 times."""
+    plain = bytearray(0x150)
+    plain[:8] = version + b"1.20"
+    struct.pack_into("<I", plain, at, 0x120)
+    struct.pack_into("<3I", plain, 0x120, *(round((x % 360) * 65536) for x in (roll, pitch, 0)))
+    # ExifTool's tables at 34, and at the exclusive or of the bytes of 70000, 0x60
+    step, sum_ = 0xEF, 0x8B
+    for n in range(len(plain) - 4):
+        plain[4 + n] ^= (sum_ + step * sum(range(0x60, 0x61 + n))) & 255
+    tags = {0x1D: text(serial), 0x34: (SHORT, 1, struct.pack("<H", mode))}
+    tags |= {0x91: (BYTES, len(plain), bytes(plain)), 0xA7: (LONG, 1, struct.pack("<I", 70000))}
+    return b"Nikon\0\2\x10\0\0II*\0\x08\0\0\0" + directory(tags, "<", 8)
+
+
 MAKERS = [("Panasonic", panasonic), ("OLYMPUS CORPORATION", olympus), ("PENTAX", pentax), ("Canon", canon)]
+MAKERS += [("NIKON CORPORATION", nikon)]
 
 
 @pytest.mark.parametrize(("make", "note"), MAKERS)
@@ -125,6 +145,25 @@ def test_roll_and_pitch_of_cameras(make, note):
     r, p = np.radians([10, 40])
     assert gravity.up == pytest.approx([-np.sin(r) * np.cos(p), -np.cos(r) * np.cos(p), np.sin(p)])
     assert gravity.model == "camera_level" and np.degrees(gravity.stddev_rad) < 2
+
+
+@pytest.mark.parametrize(
+    ("version", "at"), [(b"0233", 0x84), (b"0803", 0x98), (b"0246", 0x9C), (b"0810", 0x88)]
+)
+def test_the_angles_of_nikons_stand_elsewhere_in_each_model(version, at):
+    assert up(exif(nikon(0, 40, version, at), "NIKON")) == pytest.approx(
+        [0, -np.cos(np.radians(40)), 0.643], abs=1e-3
+    )
+
+
+def test_canons_note_keeps_its_byte_order_where_a_program_has_turned_that_of_exif():
+    assert up(exif(canon(0, 30), "Canon", order=">")) == pytest.approx([0, -np.sqrt(0.75), 0.5])
+
+
+def test_a_canons_note_whose_offsets_lie_elsewhere_is_damaged():
+    data = exif(canon(10, 40), "Canon").replace(struct.pack("<i", 28), struct.pack("<i", 3600))
+    with pytest.raises(FrameError, match=DAMAGED):
+        read_gravity(data, 4000, 3000)
 
 
 def test_a_gimbals_angles_in_xmp():
@@ -143,6 +182,14 @@ SILENT = "its file does not say which way is down"
         (exif(b"no note of any maker known"), SILENT),
         (exif(olympus(0, 0, on=0), "OLYMPUS"), SILENT),
         (exif(pentax(0, 0, position=13), "PENTAX"), SILENT),
+        # cameras without a level write zeros, as a DMC-LX7 does
+        (exif(panasonic(0, 0), "Panasonic"), SILENT),
+        (exif(nikon(1, 2, mode=96), "NIKON"), SILENT),
+        (exif(nikon(1, 2, version=b"0231"), "NIKON"), "a Nikon whose level no public table describes"),
+        (exif(nikon(-89, 2), "NIKON"), "held upright or upside down"),
+        (exif(nikon(1, 2, serial="6001443"), "NIKON"), DAMAGED),
+        (exif(nikon(1, 2, serial="no number"), "NIKON"), DAMAGED),
+        (exif(nikon(1, 2)[:-0x40], "NIKON"), DAMAGED),
         (exif(apple((0, 0, 1.0))[:-30]), DAMAGED),
         (exif(apple((0, 0, 1.0)))[:-8], SILENT),
         (exif(apple((0, 0, 1.0)).replace(b"\1MM", b"\1XX")), DAMAGED),

@@ -7,7 +7,7 @@ import pytest
 
 from starpos.errors import TiltError
 from starpos.instrument.inclinometer import SCA100T_NOISE_RAD, Tilt
-from starpos.instrument.tilt_log import TiltLog
+from starpos.instrument.tilt_log import NoiseTracker, TiltLog
 from starpos.instrument.tilt_table import read_tilt_csv
 
 DEG = np.pi / 180
@@ -443,3 +443,47 @@ def test_a_clock_that_counts_whole_seconds_takes_what_agrees_around_it():
         log(np.repeat([0.0, 5.0], 5)).average(999.6, 0.5, spread_s=1.5)
     with pytest.raises(TiltError, match="no tilt reading in the exposure"):
         reading.average(1002.0, 0.5, spread_s=1.0)
+
+
+def published(often, readings, step_rad, rng):
+    """A log of readings of both axes, each published several times at 100 Hz."""
+    x, y = np.array([[3], [-5]]) * DEG + rng.normal(0, SCA100T_NOISE_RAD, (2, readings))
+    x, y = (np.repeat(step_rad * np.round(axis / step_rad), often) for axis in (x, y))
+    return TiltLog.of(1000 + np.arange(len(x)) / 100, x, y, np.full(len(x), 15.0))
+
+
+@pytest.mark.parametrize("often", [2, 3, 9, 20])
+def test_what_is_published_several_times_counts_once(often, rng):
+    log = published(often, 200, 1e-7, rng)
+    tilt = log.average(1000 + often, often)
+    assert tilt.samples == pytest.approx(100, abs=2)
+    claimed = np.diag(tilt.covariance) / (SCA100T_NOISE_RAD**2 / 100)
+    assert (claimed > 0.9).all()
+    assert (claimed < 1.8).all()
+    assert tilt.step_rad == 0
+
+
+@pytest.mark.parametrize("steps", [0.5, 1.0, 2.0])
+def test_steps_that_repeat_by_chance_count_each(steps, rng):
+    log = published(1, 2000, steps * SCA100T_NOISE_RAD, rng)
+    assert (np.diff(log.theta, axis=0) == 0).all(1).any() or steps < 1
+    assert log.average(1010, 10).samples == pytest.approx(1000, abs=2)
+
+
+def test_a_sensor_that_freezes_is_stuck_however_often_each_reading_is_published(rng):
+    log = published(3, 400, 1e-7, rng)
+    frozen = np.arange(len(log.theta_x)) > 600
+    x, y = (np.where(frozen, axis[600], axis) for axis in (log.theta_x, log.theta_y))
+    log = TiltLog.of(log.utc_unix_s, x, y, log.temperature_c)
+    with pytest.raises(TiltError, match="repeats the same value"):
+        log.average(1010, 2)
+    assert log.average(1003, 2).samples == pytest.approx(67, abs=2)
+
+
+def test_a_driver_measures_the_noise_of_readings_that_are_published_several_times(rng):
+    for often, rate_hz in ((1, 100), (5, 100), (5, 10), (20, 10)):
+        tracker = NoiseTracker()
+        x, y = rng.normal(0, SCA100T_NOISE_RAD, (2, 800)).repeat(often, 1)
+        for k, angles in enumerate(zip(x.tolist(), y.tolist(), strict=True)):
+            tracker.add_sample(k / rate_hz, *angles)
+        np.testing.assert_allclose(tracker.sigma, SCA100T_NOISE_RAD, rtol=0.3)

@@ -131,10 +131,10 @@ def test_rows_that_cannot_be_used_are_told():
     t = np.array([1e9, 1e9 + 1, 1e9 + 1, 1e9 + 2, 1e9 + 0.5, 1e9 + 3, np.nan])
     values = np.arange(14.0).reshape(7, 2)
     values[3, 1] = np.inf
-    record = in_order(t, values, "imu.csv")
-    assert (record.utc_unix_s - 1e9).tolist() == [0, 1, 3]
-    assert len(record.faults) == 2 and "2 rows are without a finite number" in record.faults[0]
-    assert "2 rows are not later than all before" in record.faults[1]
+    kept, _, faults = in_order(t, values, "imu.csv")
+    assert (kept - 1e9).tolist() == [0, 1, 3]
+    assert len(faults) == 2 and "2 rows are without a finite number" in faults[0]
+    assert "2 rows are not later than all before" in faults[1]
 
 
 def test_a_current_that_is_stated_widens_the_claim():

@@ -9,6 +9,7 @@ from starpos import rotation
 from starpos.earth.orientation import earth_state, station_velocity
 from starpos.earth.refraction import Atmosphere
 from starpos.fix.attitude import CameraAttitude
+from starpos.instrument.camera import Camera
 from starpos.navigation.sightings import IdentifiedFrame, PlacelessFrame, roughly
 from starpos.units import ARCSEC
 
@@ -37,7 +38,7 @@ def frame_at(zenith_distance_deg, seed):
         xy=seen[:, :2] / seen[:, 2:] * FOCAL_PX,
         covariance_px2=np.tile(np.eye(2) * 0.1**2, (STARS, 1, 1)),
         itrs=itrs,
-        focal_px=FOCAL_PX,
+        optics=Camera(width=1, height=1, fx=FOCAL_PX, fy=FOCAL_PX, cx=0.0, cy=0.0),
         camera=roughly(camera),
     )
     return frame, zenith

@@ -44,6 +44,7 @@ def recorded(turn, shaking, push=None, t=T, sigma=FINE):
         covariance=np.tile(np.diag(sigma) ** 2, (len(t), 1, 1)),
         by_refraction=np.zeros((len(t), 3)),
         stamp_stddev_s=np.zeros(len(t)),
+        rays=np.zeros((len(t), 3)),
     )
     return stars, Pieces.cut(imu, 1e9 + t)
 

@@ -248,7 +248,7 @@ def test_without_a_focal_length_a_frame_is_refused_or_searched_at_every_scale(st
     with pytest.raises(InstrumentError, match="no focal length"):
         Solving(Instruments(None))(stars)
     blind = Sight(stars, Solution.failed(stars, Status.NOT_IDENTIFIED, "searched"))
-    monkeypatch.setattr("starpos.night.work.identify_blind_every_way", lambda *_: blind)
+    monkeypatch.setattr("starpos.fix.searching.identify_blind_every_way", lambda *_: blind)
     assert Solving(Instruments(None), search_s=1.0)(stars).solution is blind.solution
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import pytest
 
 from starpos.errors import FrameError
-from starpos.recording.topics import Remaps, driver_topics
+from starpos.recording.topics import driver_topics, remaps_of
 
 IMAGE, PICTURE, INFO, IMU = (
     f"sensor_msgs/msg/{n}" for n in ("Image", "CompressedImage", "CameraInfo", "Imu")
@@ -23,7 +23,7 @@ class Topic:
 
 
 def found(*topics, remaps=(), namespace=None):
-    return driver_topics([Topic(*t) for t in topics], Remaps.of(remaps), namespace)
+    return driver_topics([Topic(*t) for t in topics], remaps_of(remaps), namespace)
 
 
 ONE = (("/cam0/image_raw", IMAGE), ("/cam0/camera_info", INFO), ("/imu/data", IMU))

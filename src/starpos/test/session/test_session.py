@@ -11,6 +11,7 @@ import pytest
 
 pytest.importorskip("rosbags")
 
+from starpos.errors import InstrumentError
 from starpos.fix.solution import Status
 from starpos.messages.stamp import stamp_to_unix
 from starpos.recording.bag import BagReader
@@ -87,7 +88,7 @@ class Told:
 def messages():
     """(type, message, time it was recorded at) of the night."""
     with BagReader(NIGHT, typed=True) as bag:
-        chosen = instrument_in(bag, NIGHT, None, INPUTS)
+        chosen = instrument_in(bag, None, INPUTS)
         decoded = bag.decoded(chosen.connections)
         return [(c.msgtype, message, log_ns * 1e-9) for c, log_ns, message in decoded]
 
@@ -403,3 +404,12 @@ def test_a_defect_in_any_part_loses_only_what_that_part_makes(messages, monkeypa
     assert len(told.said.errors) == 1 and "RuntimeError: a defect" in told.said.errors[0]
     assert named in first.message and first.ok == (not named)
     assert others and all(a.found is not None for a in others)
+
+
+def test_an_ephemeris_that_cannot_be_read_is_refused_with_a_sentence(tmp_path):
+    broken = tmp_path / "de440s.bsp"
+    broken.write_bytes(b"DAF/SPK " + bytes(1016))
+    pytest.importorskip("jplephem")
+    for path, said in ((broken, "no ephemeris"), (tmp_path / "none.bsp", "none.bsp")):
+        with pytest.raises(InstrumentError, match=said):
+            Settings.of(None, [f"ephemeris:={path}"])

@@ -85,6 +85,15 @@ def test_samples_that_come_again_and_again_tell_the_noise_once():
     assert buffer_of(10 * five).average(T0, 0.5).covariance == pytest.approx(once, rel=1e-12)
 
 
+@pytest.mark.parametrize("often", [1, 3, 12])
+def test_readings_that_are_published_several_times_count_once(often, rng):
+    x, y = (6 + rng.normal(0, 0.0035, (2, 40))).repeat(often, 1).tolist()
+    buffer = buffer_of(sample(k / 100, x[k], y[k]) for k in range(len(x)))
+    tilt = buffer.average(T0 + 0.2 * often, 0.2 * often)
+    assert tilt.samples == pytest.approx(20, abs=1)
+    assert tilt.step_rad == 0
+
+
 def test_a_cleared_buffer_measures_the_noise_as_a_new_one():
     rng = np.random.default_rng(5)
     noisy = [sample(-6 + k / 10, *([1, -2] + 4 * np.degrees(NOISE) * rng.normal(size=2))) for k in range(63)]

@@ -1,18 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The deeper catalogue: built of the original files, taken by fields that need it, named where it is missing."""
+"""The deeper catalogue: kept in the cache, taken by fields that need it, named where it is missing."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from starpos.errors import CatalogueError
 from starpos.instrument.camera import Camera
 from starpos.sky import deeper
-from starpos.sky.catalogue import pack
+from starpos.sky.catalogue import pack, save
 from starpos.sky.deeper import Depth
 from starpos_testing.command_line import run
-from starpos_testing.skies.tycho2_files import write_sky
 
 SMALL = Camera.from_focal(1000, 700, 80_000.0)
 WIDE = Camera.from_focal(1000, 700, 4_000.0)
@@ -21,7 +19,6 @@ WIDE = Camera.from_focal(1000, 700, 4_000.0)
 @pytest.fixture(autouse=True)
 def own_cache(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    monkeypatch.delenv(deeper.ORIGINALS, raising=False)
     return tmp_path / "cache" / "starpos"
 
 
@@ -36,75 +33,45 @@ def stars(rng):
     )
 
 
-@pytest.fixture
-def originals(stars, tmp_path):
-    return write_sky(tmp_path / "originals", *stars)
-
-
-@pytest.fixture
-def bright(stars):
-    """A catalogue of the 3000 brightest."""
-    ra, dec, mag = (column[:3000] for column in stars)
+def packed(stars, number):
+    """A catalogue of the brightest."""
+    ra, dec, mag = (column[:number] for column in stars)
     none, tyc = np.zeros(len(mag)), np.ones((len(mag), 3), int)
     return pack(tyc, none, mag, ra, dec, none, none, none + 10, none + 1, none + 1990)
 
 
-def test_a_field_with_too_few_stars_takes_the_deeper_catalogue_once_it_is_built(bright, originals):
+def test_a_field_with_too_few_stars_takes_the_deeper_catalogue_once_it_is_kept(stars):
+    bright, deep = packed(stars, 3000), packed(stars, 5000)
     assert deeper.for_field(bright, SMALL) is bright and deeper.kept() is None
-    seen = []
-    made = deeper.build(originals, lambda what, done: seen.append(done))
-    assert len(made) >= 5000 and len(seen) == 21
+    deeper.keep(deep)
     deeper.KEPT.forget()
     kept = deeper.kept()
-    assert kept.fingerprint == made.fingerprint
+    assert kept.fingerprint == deep.fingerprint
     assert deeper.for_field(bright, SMALL) is kept
     everywhere = Camera.from_focal(1000, 700, 300.0)
     assert deeper.for_field(bright, everywhere) is bright
 
 
-def test_original_files_at_hand_are_built_when_a_field_needs_them_and_only_once(
-    bright, originals, monkeypatch
-):
-    monkeypatch.setenv(deeper.ORIGINALS, str(originals))
-    assert len(deeper.for_field(bright, SMALL)) >= 5000
-    deeper.KEPT.forget()
-    monkeypatch.setenv(deeper.ORIGINALS, str(originals / "none"))
-    assert len(deeper.for_field(bright, SMALL)) >= 5000
-
-
-def test_original_files_that_are_none_are_named(bright, tmp_path, monkeypatch):
-    monkeypatch.setenv(deeper.ORIGINALS, str(tmp_path / "none"))
-    with pytest.raises(CatalogueError, match="none: not a folder or archive of Tycho-2's original files"):
-        deeper.for_field(bright, SMALL)
-
-
-def test_what_is_broken_in_the_cache_counts_as_not_built(originals, own_cache):
-    deeper.build(originals)
+def test_what_is_broken_in_the_cache_counts_as_not_kept(stars, own_cache):
+    deeper.keep(packed(stars, 5000))
     (folder,) = own_cache.glob("stars-*")
     deeper.KEPT.forget()
     np.save(folder / "hip.npy", np.zeros(3, np.int32))
     assert deeper.kept() is None
-    assert len(deeper.build(originals)) >= 5000 and deeper.kept() is not None
-
-
-@pytest.mark.parametrize("anew", [False, True])
-def test_it_is_built_once_a_call(originals, anew):
-    before = deeper.build(originals)
-    seen = []
-    made = deeper.build(originals, lambda what, done: seen.append(done), anew=anew)
-    assert len(seen) == 21 * anew and made.fingerprint == before.fingerprint
+    deeper.keep(packed(stars, 4000))
+    assert len(deeper.kept()) == 4000
 
 
 def test_a_thin_field_says_what_it_holds_what_it_needs_and_what_to_type(catalogue):
     said = deeper.too_thin(catalogue, SMALL)
     assert "a field of 0.72 x 0.5 deg holds only 8.2 stars of the catalogue (V < 11.0) on average" in said
     assert "needs one to V = 13.0; all of Tycho-2 would be 22" in said
-    assert said.endswith("type `starpos catalogue deepen --fetch` (121 MB, once)")
+    assert said.endswith("type `starpos catalogue deepen FILE`")
     assert deeper.too_thin(catalogue, WIDE) == ""
 
 
-def test_a_field_too_small_for_tycho_2_says_so(catalogue, originals):
-    deeper.build(originals)
+def test_a_field_too_small_for_tycho_2_says_so(catalogue, stars):
+    deeper.keep(packed(stars, 5000))
     said = deeper.too_thin(catalogue, SMALL)
     assert "deeper than Tycho-2: name one in STARPOS_CATALOGUE" in said and "deepen" not in said
 
@@ -122,20 +89,11 @@ def test_the_mean_number_of_stars_on_a_frame_is_that_of_random_frames(camera, ca
     assert 0.4 < depth.sparse / depth.mean < 0.55
 
 
-def test_the_command_line_builds_it_and_says_that_it_is_there(originals, capsys):
+def test_the_command_line_keeps_it_and_says_that_it_is_there(stars, tmp_path, capsys):
     assert "no deeper catalogue in the cache" in run(capsys, "catalogue", "info")[1]
-    status, out, errors = run(capsys, "catalogue", "deepen", originals)
+    save(packed(stars, 5000), tmp_path / "deep.npz")
+    status, out, errors = run(capsys, "catalogue", "deepen", tmp_path / "deep.npz")
     assert (status, out, len(errors)) == (0, "", 1) and "small fields take them from now on" in errors[0]
-    assert (
-        f"{len(deeper.kept())} stars of the deeper catalogue are in the cache"
-        in run(capsys, "catalogue", "info")[1]
-    )
-    status, _, errors = run(capsys, "catalogue", "deepen", originals / "none")
-    assert (status, len(errors)) == (2, 1) and "not a folder or archive" in errors[0]
-    (originals / "tilt.csv").write_text("utc_unix_s,theta_x_deg\n")
-    (originals / "none").mkdir()
-    for name in ("tilt.csv", "none"):
-        status, _, errors = run(capsys, "catalogue", "deepen", originals / name)
-        assert (status, len(errors)) == (2, 1) and ": give tycho2_2.orig.tar.xz, or a folder with" in errors[
-            0
-        ]
+    assert "5000 stars of the deeper catalogue are in the cache" in run(capsys, "catalogue", "info")[1]
+    status, _, errors = run(capsys, "catalogue", "deepen", tmp_path / "none.npz")
+    assert (status, len(errors)) == (2, 1) and "no catalogue there" in errors[0]

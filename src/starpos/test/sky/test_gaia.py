@@ -147,5 +147,7 @@ def test_the_command_line_puts_them_into_the_catalogue_that_is_in_use(
     assert main(["catalogue", "build", "--gaia", str(path), "--year", "2026", "--out", str(out)]) == 0
     assert f"{N} of them with Gaia's places about 2026" in capsys.readouterr().err
     assert off_mas(catalogue.read(out), truth, 2026.0)[0].max() < 1.1
-    assert main(["catalogue", "build"]) == 2
-    assert "give the original files" in capsys.readouterr().err
+    nowhere = str(tmp_path / "no" / "such" / "folder.npz")
+    assert main(["catalogue", "build", "--gaia", str(path), "--out", nowhere]) == 2
+    (said,) = capsys.readouterr().err.splitlines()
+    assert "folder.npz" in said and "give another --out" in said

@@ -1,16 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A tiltmeter that is worse than its file states: the claimed errors stay true, or the session is refused."""
+"""A tiltmeter that is worse than its file states: the claimed errors stay true; one whose zero jumps is refused."""
 
 from functools import cache
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 from sessions import AS_STATED, INSTRUMENT, MARK, SCALE, VACUUM, Worse, drawn
 
 from starpos.errors import FixError
 from starpos.zenith.doubts import checked_session, remarks
 
-SESSIONS = 30
+SESSIONS = 15
 NOISE, DRIFT, LOOSE = Worse(noise=3), Worse(drift=5), Worse(scale=10)
 
 
@@ -34,42 +35,47 @@ def adjusted(worse, motion, number=SESSIONS):
     return np.array(nees), np.array(claimed), told, refused
 
 
-# motion, and the largest mean of two degrees of freedom: air of 0.4 arcsec hides noise and drift, and a scale of a
-# hundredth does not always show in it
-@pytest.mark.montecarlo
-@pytest.mark.parametrize(
-    ("worse", "motion", "most"),
-    [
-        (AS_STATED, 0.05, 2.8),
-        (AS_STATED, 0.4, 2.8),
-        (NOISE, 0.05, 2.8),
-        (DRIFT, 0.05, 2.8),
-        (LOOSE, 0.05, 2.8),
-        (LOOSE, 0.4, 3.8),
-    ],
-)
-def test_claimed_errors_are_true_though_the_tiltmeter_is_worse(worse, motion, most):
-    nees, _, _, refused = adjusted(worse, motion)
-    assert nees.mean() < most and len(refused) < SESSIONS / 3
+# what is worse, how much the air moves the images (arcsec), and the largest median of the claimed errors (arcsec)
+CASES = [
+    (AS_STATED, 0.05, 0.02),
+    (AS_STATED, 0.4, 0.1),
+    (NOISE, 0.05, 0.045),
+    (DRIFT, 0.05, 0.025),
+    (LOOSE, 0.05, 0.025),
+    (LOOSE, 0.4, 0.1),
+]
+
+
+def likely(nees) -> bool:
+    """Whether errors of two degrees of freedom are those claimed: one set in 500 of true claims is not."""
+    low, high = chi2.ppf([0.001, 0.999], 2 * len(nees))
+    return low < nees.sum() < high
 
 
 @pytest.mark.montecarlo
-def test_a_tiltmeter_as_stated_is_not_called_worse_nor_costs_it_accuracy():
-    _, claimed, told, refused = adjusted(AS_STATED, 0.05)
-    assert not refused and sum(map(bool, told)) <= 1
-    assert np.sqrt(claimed.mean()) < 0.02
+@pytest.mark.parametrize(("worse", "motion", "widest"), CASES)
+def test_claimed_errors_are_true_and_no_wider_than_they_have_to_be(worse, motion, widest):
+    nees, claimed, _, refused = adjusted(worse, motion)
+    assert not refused and likely(nees)
+    assert np.sqrt(np.median(claimed)) < widest
 
 
 @pytest.mark.montecarlo
-@pytest.mark.parametrize(
-    ("worse", "name", "share"),
-    [(DRIFT, "tilt_drift_arcsec_per_sqrt_hour", 0.1), (LOOSE, "tilt_scale", 0.5)],
-    ids=["drift", "scale"],
-)
-def test_what_the_file_understates_is_named(worse, name, share):
-    _, _, told, _ = adjusted(worse, 0.05)
-    assert sum(name in line for line in told) > share * len(told)
-    assert "its file states" in "".join(told)
+def test_over_all_of_them_too():
+    """Where each alone would let pass a claim of three quarters."""
+    assert likely(np.concatenate([adjusted(worse, motion)[0] for worse, motion, _ in CASES]))
+
+
+@pytest.mark.montecarlo
+def test_what_the_file_understates_is_named_and_nothing_else():
+    as_stated, drift, loose = (adjusted(worse, 0.05)[2] for worse in (AS_STATED, DRIFT, LOOSE))
+    assert sum(map(bool, as_stated)) <= 1
+    assert (
+        sum("a tilt_scale of 0.0" in line and "its file states 0.001" in line for line in loose)
+        > SESSIONS / 2
+    )
+    # air hides it in most
+    assert any("tilt_drift_arcsec_per_sqrt_hour" in line and "its file states 0.05" in line for line in drift)
 
 
 @pytest.mark.parametrize("motion", [0.05, 0.4])

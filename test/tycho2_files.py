@@ -3,8 +3,6 @@
 
 from pathlib import Path
 
-import numpy as np
-
 NAMES = [f"tyc2.dat.{i:02d}" for i in range(20)] + ["suppl_1.dat"]
 
 
@@ -67,14 +65,3 @@ def write_files(folder: Path, contents: dict[str, bytes]) -> Path:
         faint = FAINT_SUPPLEMENT if name.startswith("suppl") else FAINT
         (folder / name).write_bytes(contents.get(name, faint))
     return folder
-
-
-def write_sky(folder: Path, ra_deg: np.ndarray, dec_deg: np.ndarray, vmag: np.ndarray) -> Path:
-    """Write files of the stars (N,) of a simulated sky, which do not move and have no colour."""
-    rows = [
-        main((1 + k // 10000, 1 + k % 10000, 1), ra, dec, vt=f"{v:6.3f}", bt=f"{v:6.3f}")
-        for k, (ra, dec, v) in enumerate(zip(ra_deg.tolist(), dec_deg.tolist(), vmag.tolist(), strict=True))
-    ]
-    share = -(-len(rows) // 20)
-    parts = {name: b"".join(rows[k * share : (k + 1) * share]) for k, name in enumerate(NAMES[:20])}
-    return write_files(folder, {name: rows for name, rows in parts.items() if rows})

@@ -1,157 +1,64 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Build the compact catalogue from the original Tycho-2 files (CDS I/259), tyc2.dat.* and suppl_1.dat, and fetch them.
+"""Build the compact catalogue from the original Tycho-2 files (CDS I/259), tyc2.dat.* and suppl_1.dat.
 
-Sources: Tycho-2, Hog et al. 2000, A&A 355, L27; byte positions from the catalogue's own ReadMe. The files come from a
-mirror of Debian: resumed where the connection broke off, checked before they are used.
+    python tools/data/tycho2.py [ORIGINALS] [--limit-mag 11] --out tycho2.npz
+
+ORIGINALS is a folder of the files, or the archive of Debian's source package tycho2 (2-4), which `apt-get source
+--download-only tycho2` brings; without it the archive is fetched from Debian.  Proxies come from the environment.
+
+Sources: Tycho-2, Hog et al. 2000, A&A 355, L27; byte positions from the catalogue's own ReadMe.
 """
 
+import argparse
 import hashlib
-import http.client
 import lzma
-import ssl
+import sys
 import tarfile
-import urllib.error
+import tempfile
 import urllib.request
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from http.client import HTTPException
 from pathlib import Path
-from typing import BinaryIO
 
 import numpy as np
 
-from starpos.errors import LETTERS, CatalogueError
+from starpos.cli.console import ProgressBar
+from starpos.errors import CatalogueError
 from starpos.files import open_regular, read_regular
 from starpos.progress import Progress, quiet
-from starpos.sky.catalogue import EPOCH, Catalogue, pack, parallaxes_mas
-from starpos.table_cache import cache_folder
+from starpos.sky.catalogue import EPOCH, Catalogue, pack, parallaxes_mas, save
 
 # Motions (in right ascension times cos dec) of the fast stars for which Tycho-2 has none: of all faster than this and
-# V < 9 (tools/data/fast_stars.py).  Tycho-2 compares the satellite's places with places on old plates: of bright stars,
+# V < 9 (fast_stars.py).  Tycho-2 compares the satellite's places with places on old plates: of bright stars,
 # which the plates show as blots, and of fast ones, which were not found again, it has only the satellite's place (pflag
 # X).  Some of these move by arcminutes until today.  Their motions are from Hipparcos (ESA SP-1200, 1997); many are
 # pairs, whose orbits it saw for three years only.
-FAST_STARS = Path(__file__).with_name("data") / "fast_stars.csv"
+FAST_STARS = Path(__file__).with_name("fast_stars.csv")
 MIN_MAS_YEAR, FAST_SIGMA_MAS_YEAR = 400.0, 10.0
-# The archive of Debian's source package tycho2 (2-4), and where a mirror has it.
-ARCHIVE = "tycho2_2.orig.tar.xz"
-IN_MIRROR = f"pool/main/t/tycho2/{ARCHIVE}"
-SHA256, BYTES = "b0d74bd4280e53f7cfc4b37ccb30a1cfbbc30131907dda81c706bbbab5632dfa", 121_142_216
-# Debian's mirror network, and its archive of all former packages.
-MIRRORS = "https://deb.debian.org/debian", "https://snapshot.debian.org/archive/debian/20250520T000000Z"
+ARCHIVE = "https://deb.debian.org/debian/pool/main/t/tycho2/tycho2_2.orig.tar.xz"
+SHA256 = "b0d74bd4280e53f7cfc4b37ccb30a1cfbbc30131907dda81c706bbbab5632dfa"
 # Time after which a silent server is given up.
 SILENCE_S = 30.0
-CHUNK_BYTES = 1 << 18
-FETCH_CURE = (
-    "check the network, or give another mirror of Debian or the address of the file "
-    "(`starpos catalogue deepen --fetch URL`)"
-)
 
 
-def fetch(mirror: str | None = None, progress: Progress = quiet) -> Path:
-    """Fetch the archive of the original files into the cache; the caller removes it once it is used.
-
-    mirror: URL of a Debian mirror, or of the file itself (it ends in .xz); None: Debian's own.
-    If the connection breaks off, the received part stays, and the next call goes on from there.  Proxies come from the
-    environment (https_proxy).  Raises CatalogueError if no mirror has the file, or if its checksum is another one.
-    """
-    path = cache_folder() / f"{ARCHIVE}.part"
-    addresses = [_address(m) for m in ((mirror,) if mirror else MIRRORS)]
+def fetch(address: str, path: Path) -> Path:
+    """Fetch the archive of the original files; CatalogueError if it does not come, or is another file."""
+    digest = hashlib.sha256()
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with open(path, "ab") as file, _alone(file, path):
-            _complete(file, addresses, progress)
-    except OSError as e:
-        raise CatalogueError(
-            f"{path}: cannot be written ({e.strerror}): make room, or set XDG_CACHE_HOME"
-        ) from None
-    return path
-
-
-def _address(mirror: str) -> str:
-    """The address of the archive on a mirror, or the mirror itself where that is a file."""
-    if "://" not in mirror:
-        raise CatalogueError(
-            f"{mirror}: no URL of a mirror: give one that begins with https://, or `starpos catalogue deepen FILE` "
-            "for a file that is here"
-        )
-    return mirror if mirror.endswith(".xz") else f"{mirror.rstrip('/')}/{IN_MIRROR}"
-
-
-@contextmanager
-def _alone(file: BinaryIO, path: Path) -> Iterator[None]:
-    """Let one process write the file, if files can be locked; a killed process holds no lock."""
-    with suppress(ImportError):
-        import fcntl
-
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise CatalogueError(f"{path}: another process fetches it: wait for that one") from None
-    yield
-
-
-def _complete(file: BinaryIO, addresses: list[str], progress: Progress) -> None:
-    """Append what a file lacks of the archive, from the first address that has it; CatalogueError if none has."""
-    reasons = []
-    for address in addresses:
-        if reason := _append(file, address, progress):
-            reasons.append(f"{address}: {reason}")
-        elif _is_right(file):
-            return
-        else:
-            _empty(file)
-            reasons.append(f"{address}: the checksum is not that of Tycho-2's original files")
-    raise CatalogueError(f"{'; '.join(reasons)}: {FETCH_CURE}")
-
-
-def _append(file: BinaryIO, address: str, progress: Progress) -> str:
-    """Append what an address has beyond the end of a file; returns why the file is not whole yet, or ''."""
-    have = file.tell()
-    if have == BYTES:
-        return ""
-    request = urllib.request.Request(address, headers={"Range": f"bytes={have}-"} if have else {})
-    try:
-        # urlopen's opener would keep the proxies of its first call
-        with urllib.request.build_opener().open(request, timeout=SILENCE_S) as answer:
-            # a server that knows no ranges sends all of it
-            if have and answer.status != http.client.PARTIAL_CONTENT:
-                _empty(file)
-            while chunk := answer.read(CHUNK_BYTES):
-                if file.tell() + len(chunk) > BYTES:
-                    _empty(file)
-                    return f"it has more than {BYTES} bytes"
+        with urllib.request.urlopen(address, timeout=SILENCE_S) as answer, open(path, "wb") as file:
+            while chunk := answer.read(1 << 18):
                 file.write(chunk)
-                progress(f"fetching {ARCHIVE}", file.tell() / BYTES)
-    except urllib.error.HTTPError as e:
-        return f"the server answers {e.code} {e.reason}"
-    except urllib.error.URLError as e:
-        return str(getattr(e.reason, "strerror", None) or e.reason)[:LETTERS]
-    except (http.client.HTTPException, ssl.SSLError, TimeoutError, ConnectionError) as e:
-        return f"the connection broke off ({str(e)[:LETTERS] or type(e).__name__})"
-    if file.tell() < BYTES:
-        return f"it ended after {file.tell()} of {BYTES} bytes"
-    return ""
-
-
-def _empty(file: BinaryIO) -> None:
-    """Remove the content of a file that is open for writing."""
-    file.seek(0)
-    file.truncate()
-
-
-def _is_right(file: BinaryIO) -> bool:
-    """Whether a file that is open for writing holds the archive."""
-    file.flush()
-    with open(file.name, "rb") as written:
-        digest = hashlib.sha256()
-        while chunk := written.read(CHUNK_BYTES):
-            digest.update(chunk)
-    return digest.hexdigest() == SHA256
+                digest.update(chunk)
+    except (OSError, HTTPException) as e:
+        raise CatalogueError(f"{address}: it does not come ({e}): {CURE}") from None
+    if digest.hexdigest() != SHA256:
+        raise CatalogueError(f"{address}: the checksum is not that of Tycho-2's original files: {CURE}")
+    return path
 
 
 SUPPLEMENT_EPOCH = 1991.25
 # 1 sigma of a motion, along one axis, that Tycho-2 does not have. It is the root mean square in Hipparcos of the same
-# stars, without the fast ones (63 to 97 from V = 2 to 9; tools/data/fast_stars.py). They move faster than other stars,
+# stars, without the fast ones (63 to 97 from V = 2 to 9; fast_stars.py). They move faster than other stars,
 # because fast stars were not found again on old plates.
 UNMEASURED_MAS_YEAR = 100.0
 # A record and its newline.
@@ -333,3 +240,26 @@ def _merge_photocentres(stars: dict) -> dict[str, np.ndarray]:
     keep = np.ones(len(stars["vmag"]), bool)
     keep[np.setdiff1d(pair, pair[first])] = False
     return {k: v[keep] for k, v in stars.items()}
+
+
+def main() -> None:
+    """Build a catalogue; the program ends with status 2 and one sentence where that cannot be."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("originals", nargs="?", type=Path)
+    parser.add_argument("--limit-mag", type=float, default=11.0, help="faintest V (11); 20: all of Tycho-2")
+    parser.add_argument("--out", type=Path, required=True)
+    args = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder:
+        try:
+            originals = args.originals or fetch(ARCHIVE, Path(folder) / "originals.tar.xz")
+            made = build(originals, args.limit_mag, ProgressBar())
+            save(made, args.out)
+        except (CatalogueError, OSError) as e:
+            parser.exit(2, f"tycho2.py: {e}\n")
+    print(f"{args.out}: {len(made)} stars to V = {made.vmag().max():.2f}", file=sys.stderr)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,15 +1,25 @@
 # SPDX-License-Identifier: Apache-2.0
 """The catalogue's build, on records written byte by byte as the ReadMe of CDS I/259 lays them out."""
 
+import hashlib
+import importlib
+import subprocess
+import sys
 import tarfile
+from pathlib import Path
 
 import numpy as np
 import pytest
+from tycho2_files import FAINT, main, supplement, write_files
 
 from starpos.errors import CatalogueError
-from starpos.sky.tycho2 import build, johnson_v
+from starpos.sky.catalogue import read
 from starpos.units import MAS
-from starpos_testing.skies.tycho2_files import FAINT, main, supplement, write_files
+
+TOOLS = Path(__file__).parent.parent / "tools" / "data"
+sys.path.insert(0, str(TOOLS))
+tycho2 = importlib.import_module("tycho2")
+build, johnson_v = tycho2.build, tycho2.johnson_v
 
 STARS = {
     "tyc2.dat.00": main((1, 13, 1), 1.12558209, 2.26739400, (27.7, -0.5), bt="10.488", vt=" 8.670", hip="70")
@@ -157,3 +167,26 @@ def test_bad_originals_give_one_sentence(kind, originals, tmp_path):
     with pytest.raises(CatalogueError) as e:
         build(source, 11.0)
     assert "\n" not in str(e.value)
+
+
+def test_the_command_writes_a_catalogue_or_one_sentence(originals, tmp_path):
+    def run(*arguments):
+        command = [sys.executable, TOOLS / "tycho2.py", *arguments]
+        return subprocess.run(command, capture_output=True, text=True, check=False)
+
+    made = tmp_path / "made.npz"
+    assert "8 stars to V" in run(originals, "--out", made).stderr
+    assert len(read(made)) == 8
+    done = run(tmp_path / "none", "--out", made)
+    assert done.returncode == 2 and "not a folder or archive" in done.stderr.splitlines()[-1]
+
+
+def test_what_is_fetched_is_checked(tmp_path, monkeypatch):
+    there = tmp_path / "archive.tar.xz"
+    there.write_bytes(b"stars" * 999)
+    with pytest.raises(CatalogueError, match="the checksum is not"):
+        tycho2.fetch(there.as_uri(), tmp_path / "here")
+    monkeypatch.setattr(tycho2, "SHA256", hashlib.sha256(there.read_bytes()).hexdigest())
+    assert tycho2.fetch(there.as_uri(), tmp_path / "here").read_bytes() == there.read_bytes()
+    with pytest.raises(CatalogueError, match="does not come"):
+        tycho2.fetch((tmp_path / "none").as_uri(), tmp_path / "here")
