@@ -232,7 +232,7 @@ SUPPORTED = 10.0
 class FromSky:
     """A camera from frames; used: indices of the frames that were identified, in the order of the fit.
 
-    lean_rad, lean_sigma_rad: how far the zenith by refraction is from that of time and place, and its error along the
+    lean_rad, lean_sigma_rad: how far the zenith by refraction is from the one by time and place, and its error along the
     worse axis; NaN where no place is known.
     """
 
@@ -375,14 +375,14 @@ def _decentred(
 def _lean(
     sightings: Sequence[CameraSighting], fit: Intrinsics, atmosphere: Atmosphere
 ) -> tuple[float, float]:
-    """How far (rad) the zenith by refraction is from that of time and place, and its error; PlaceError if they differ."""
+    """How far (rad) the zenith by refraction is from the one by time and place, and its error; PlaceError if they differ."""
     problem = CameraAdjustment.of(sightings, fit.camera, atmosphere, parameters(fit.camera))
     if not problem.upright or atmosphere.pressure_pa == 0:
         return np.nan, np.nan
     settled = settled_camera(problem)
     leaning, errors = problem.leaning(settled.state), problem.stated + np.eye(2) * settled.jitter2
     start = CameraEstimate(np.zeros(len(leaning.sigma)), leaning.start)
-    # one step: a lean beside many terms of a lens has other minima far away
+    # one step: with many terms of a lens free, a lean has other minima far away
     q, _, covariance = leaning.step(start, errors, settled.keep)
     last = slice(-len(LEANS), None)
     widened = covariance[last, last] * feigned(settled.jitter2, problem.stated)

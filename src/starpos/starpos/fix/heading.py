@@ -31,7 +31,7 @@ SETTLED_RAD, MAX_ROUNDS = 1e-9, 10
 MIN_SHARE, REFRACTION_SIGMAS = 0.5, 5.0
 # sigma beyond which the zenith that refraction shows contradicts time and place, and how far off (rad) it may seem to be
 ZENITH_SIGMAS, ZENITH_RAD = 5.0, math.radians(2)
-# what the stars' errors do not explain is of the lens, and alike for neighbours: over a frame it has so many free values
+# residuals beyond the stars' errors are of the lens, and alike for neighbours: number of independent ones on a frame
 LENS_VALUES = 20
 # a zenith that refraction shows to this (rad) confirms the hour
 CONFIRMED_RAD = math.radians(3)
@@ -196,7 +196,7 @@ def feigned(jitter2: float, stated: np.ndarray) -> float:
 
 
 def checked_zenith(lean: np.ndarray, covariance: np.ndarray) -> tuple[float, float]:
-    """How far (rad) the zenith by refraction is from that of time and place, and its error along the worse axis.
+    """How far (rad) the zenith by refraction is from the one by time and place, and its error along the worse axis.
 
     lean (2,), covariance (2, 2): two small rotations, rad.  Raises PlaceError if they differ.
     """
