@@ -72,7 +72,7 @@ class IndiDevice:
         self._message = ""
         # How often the device has defined CONNECTION since it came or was disconnected.
         self._definitions = 0
-        self._parser = ET.XMLPullParser(("start", "end"))
+        self._parser: Any = ET.XMLPullParser(("start", "end"))
         # What the server sends has no root.
         self._parser.feed("<indi>")
         begun: Any = self._parser.read_events()
@@ -177,10 +177,16 @@ class IndiDevice:
             data = b""
         self.lost |= not data
         self._pending += len(data)
+        self._parser.feed(data)
         try:
-            self._parser.feed(data)
+            self._take_all()
         except ET.ParseError as error:
             raise CaptureError(f"the INDI server sends what is no XML ({one_line(error)}).") from None
+        if self._pending > ELEMENT_MAX:
+            raise CaptureError("the INDI server sends more than any frame has.")
+
+    def _take_all(self) -> None:
+        """Take the elements that have come whole; ParseError for what is no XML."""
         events: Any = self._parser.read_events()
         for event, element in events:
             self._depth += 1 if event == "start" else -1
@@ -188,8 +194,6 @@ class IndiDevice:
                 self._take(element)
                 self._root.clear()
                 self._pending = 0
-        if self._pending > ELEMENT_MAX:
-            raise CaptureError("the INDI server sends more than any frame has.")
 
     def _take(self, element: ET.Element) -> None:
         """Note what an element of the server says."""
