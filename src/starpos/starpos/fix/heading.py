@@ -112,8 +112,6 @@ def attitudes_at(
     deflected: rotations (3, m) by 1 sigma of the deflection, by the plumb line and by the ellipsoid.
     """
     link = g @ mounting.link_to_camera
-    to_ellipsoid = place.axes @ place.plumb_axes.T
-    north = rotation.about_axis(2, -math.atan2(to_ellipsoid[0, 1], to_ellipsoid[1, 1]))
     plumb, ellipsoid = deflected
 
     def attitude(link_to_enu: np.ndarray, deflection: np.ndarray) -> Attitude:
@@ -134,8 +132,8 @@ def attitudes_at(
 
     return {
         "plumb": attitude(link, plumb),
-        "ellipsoid": attitude(to_ellipsoid @ link, ellipsoid),
-        "true_north": attitude(north @ link, np.vstack([plumb[:2], ellipsoid[2:]])),
+        "ellipsoid": attitude(place.axes @ place.plumb_axes.T @ link, ellipsoid),
+        "true_north": attitude(place.to_geodetic_north @ link, np.vstack([plumb[:2], ellipsoid[2:]])),
     }
 
 
