@@ -375,17 +375,17 @@ def _decentred(
 def _lean(
     sightings: Sequence[CameraSighting], fit: Intrinsics, atmosphere: Atmosphere
 ) -> tuple[float, float]:
-    """How far (rad) the zenith by refraction is from the one by time and place, and its error; PlaceError if they differ."""
+    """How far (rad) the zenith by refraction is off, and its error; PlaceError if it contradicts time and place."""
     problem = CameraAdjustment.of(sightings, fit.camera, atmosphere, parameters(fit.camera))
     if not problem.upright or atmosphere.pressure_pa == 0:
         return np.nan, np.nan
-    settled = settled_camera(problem)
-    leaning, errors = problem.leaning(settled.state), problem.stated + np.eye(2) * settled.jitter2
+    state, _, keep, jitter2 = settled_camera(problem)
+    leaning, errors = problem.leaning(state), problem.stated + np.eye(2) * jitter2
     start = CameraEstimate(np.zeros(len(leaning.sigma)), leaning.start)
     # one step: with many terms of a lens free, a lean has other minima far away
-    q, _, covariance = leaning.step(start, errors, settled.keep)
+    q, _, covariance = leaning.step(start, errors, keep)
     last = slice(-len(LEANS), None)
-    widened = covariance[last, last] * feigned(settled.jitter2, problem.stated)
+    widened = covariance[last, last] * feigned(jitter2, problem.stated)
     return checked_zenith(LEAN_RAD * q[last], LEAN_RAD**2 * widened)
 
 
