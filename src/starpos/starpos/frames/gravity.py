@@ -35,7 +35,7 @@ MIN_G, MAX_G = 0.97, 1.03
 # Programs that crop, turn or bend pictures and keep the maker's note.
 EDITOR = re.compile(
     r"photoshop|lightroom|gimp|snapseed|capture one|darktable|rawtherapee|picasa|imagemagick|affinity|luminar|hugin|ptgui"
-    r"|pixelmator|vsco|photos \d|picsart|on1|dxo",
+    r"|pixelmator|vsco|photos \d|picsart|\bon1\b|dxo",
     re.IGNORECASE,
 )
 # CustomRendered of a panorama by Apple.
