@@ -144,28 +144,31 @@ def by_sun(solver: Solver, stars: Stars, disc: Disc, tilts: Tilts | None, places
             )
         state, tilt = solver.levelled(stars, tilts or NO_TILTS)
         state, camera, seen, stamp_s = _looked_at(solver, stars, disc, state)
+        sun, moon = (body_at(name, state, solver.ephemeris).itrs for name in BOTH)
         if not disc.sharp:
             sigma = float(np.linalg.norm(seen.own)) / math.sqrt(2)
-            glow = Glow(state.utc_unix_s, seen.ray, body_at(SUN, state, solver.ephemeris).itrs, sigma)
+            glow = Glow(state.utc_unix_s, seen.ray, sun, sigma)
         looked = partial(_looks, solver, stars, disc, camera=camera, state=state)
+        apart = bool(np.linalg.norm(sun - moon) > NEAREST)
+        both = disc.other is not None and apart
         if places is None:
-            if disc.other is not None:
+            if both:
                 with suppress(PlaceError):
                     fix = _two_body_fix(solver, stars, looked(BOTH), tilt, state, stamp_s)
                     return Solution.of(stars, f"fix by {_named(BOTH)}", fix=fix, tilt=tilt, bodies=BOTH)
             return replace(_on_circle(solver, stars, disc, seen, tilt, state, stamp_s), glow=glow)
         place, wrong = places.at(state.utc_unix_s), []
         found: dict[tuple[str, ...], AttitudeAtPlace] = {}
-        for names in (BOTH,) * (disc.other is not None) + ((SUN,), (MOON,))[: 1 + disc.sharp]:
+        for names in (BOTH,) * both + ((SUN,), (MOON,))[: 1 + disc.sharp]:
             if BOTH not in found:
                 try:
                     found[names] = _attitude(solver, stars, looked(names), tilt, state, place, stamp_s)
                 except PlaceError as error:
                     wrong.append(error)
         if not found:
-            raise wrong[0 if disc.other is None else 1]
+            raise wrong[both]
         (names, attitude), *others = found.items()
-        if others and np.linalg.norm(np.subtract(*(body_at(n, state).itrs for n in BOTH))) > NEAREST:
+        if others and apart:
             raise FixError(
                 f"{stars.place}: the Sun and the Moon stand equally high, and the disc may be either: wait some minutes"
             )
@@ -209,8 +212,9 @@ def _looks(
     return found
 
 
-# A second body is where it must be to this many sigma; and so near each other two determine no attitude, rad.
-SECOND_SIGMAS, NEAREST = 5.0, math.radians(2.0)
+# A second body is where it must be to this many sigma.  So near the Sun, rad, the Moon is a crescent that is not seen: a
+# second disc is a ghost.
+SECOND_SIGMAS, NEAREST = 5.0, math.radians(15.0)
 PARALLAX_ROUNDS = 6
 # of errors that are each body's own; all others have one cause for all
 EACH_ITS_OWN = ("disc", "ephemeris")
@@ -241,8 +245,6 @@ def _two_body_fix(
             f"{stars.place}: by the level one of its two bright discs is below {MIN_DEG:.0f} deg"
         )
     there = air.refraction().unbend(raised)
-    if np.linalg.norm(there[0] - there[1]) < NEAREST:
-        raise PlaceError(f"{stars.place}: its two bright discs are too near each other for a position")
     variances = np.array(
         [np.sum(s.own**2) / 2 + np.sum(s.lens**2) + b.sigma**2 for s, b in ((k.seen, k.body) for k in looks)]
     )
