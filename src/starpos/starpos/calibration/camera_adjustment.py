@@ -165,10 +165,6 @@ class CameraAdjustment:
             upright=all(s.upright for s in sightings),
         )
 
-    def with_free(self, name: str) -> "CameraAdjustment":
-        """The problem with one of the unknowns free and all others held."""
-        return replace(self, sigma=self.sigma * np.array([u == name for u in unknowns(self.given)]))
-
     def leaning(self, state: CameraEstimate) -> "CameraAdjustment":
         """The problem near an estimate, with the zenith of the air free too."""
         sigma = np.append(self.sigma[: -len(LEANS)], [LEAN_RAD] * len(LEANS))
