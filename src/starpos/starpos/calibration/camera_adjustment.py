@@ -92,8 +92,8 @@ def with_values(camera: Camera, values: np.ndarray) -> Camera:
 
 
 # The unknowns q are in sigma of their priors: scale, squareness, the camera's other parameters, and these. They are the
-# strength of the refraction relative to the model, and the shrinking of the field along x and y if the level is unknown;
-# the last two are how far north and west of L's the zenith of the air is, rad, which are held unless they are asked for
+# strength of the refraction relative to the model, and the shrinking of the field along x and y if the level is unknown.
+# LEANS turn the zenith of the air against L, rad; they are held unless they are asked for
 LEANS = ("lean_north", "lean_west")
 OF_THE_AIR = ("refraction", "shrink_x", "shrink_y", *LEANS)
 # 1 sigma of a lean by a wrong hour, rad
