@@ -2,7 +2,7 @@
 """Calibrates a camera with the sky: identifies frames, fits the camera and their attitudes, and judges the fit."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from starpos.calibration.camera_adjustment import (
     parameters,
     settled_camera,
     unbent,
+    unknowns,
     with_values,
 )
 from starpos.calibration.misalignment import NOTHING_KNOWN, Known
@@ -141,7 +142,7 @@ def fit_camera(
     problem = CameraAdjustment.of(sightings, given, atmosphere, free)
     state, covariance, keep, jitter2 = settled_camera(problem)
     to_named = problem.named_per_unit()
-    held = problem.with_free("scale")
+    held = replace(problem, sigma=problem.sigma * (np.array(unknowns(given)) == "scale"))
     before, _ = held.refined(
         CameraEstimate(np.zeros(len(problem.sigma)), problem.start), problem.stated + np.eye(2), keep
     )

@@ -155,10 +155,6 @@ class CameraAdjustment:
             upright=all(s.upright for s in sightings),
         )
 
-    def with_free(self, name: str) -> "CameraAdjustment":
-        """The problem with one of the unknowns free and all others held."""
-        return replace(self, sigma=self.sigma * np.array([u == name for u in unknowns(self.given)]))
-
     @cached_property
     def levelled(self) -> np.ndarray:
         """Mask (N,) of the stars whose frame has a known level."""

@@ -119,11 +119,6 @@ SMALLEST_FIELD_DEG, LARGEST_FIELD_DEG = 0.3, 130.0
 NOMINAL_LENS_RAD = 0.002
 
 
-def _one_sided(off: np.ndarray) -> float:
-    """How far places (N, 2), relative to the axis, lie on one side of it: from 0 to 1."""
-    return float(np.hypot(*off.mean(0)) / max(np.hypot(*off.T).mean(), 1e-9))
-
-
 @dataclass(frozen=True)
 class Solver:
     """Solver for one instrument in its surroundings: `solve` makes a fix, `identify` a pointing alone, by one search.
@@ -188,7 +183,7 @@ class Solver:
         try:
             camera, catalogue, triangles = self.view(stars.width, stars.height, stars.origin_px)
             if part != 1.0:
-                triangles = self.triangles_of(stars.width, stars.height, part, stars.origin_px)
+                triangles = cached_triangles(catalogue, part * fisheye.field_rad(camera), self.progress)
             sky = Sky.at(catalogue, triangles, stars.mid_unix_s)
             field: FrameStars | fisheye.WideField | None = as_seen(camera, stars)
             if field is None:
@@ -377,7 +372,10 @@ class Solver:
         use, matched = self._matched(stars, found, camera, up, state, catalogue)
         about = self.circumstances(stars, camera.scaled(found.focal_scale), state)
         if fisheye.is_wide(camera) and not any(camera.distortion):
-            lens = NOMINAL_LENS_RAD * _one_sided(matched.xy - [camera.cx, camera.cy])
+            off = matched.xy - [camera.cx, camera.cy]
+            # how far they lie on one side of the axis, from 0 to 1
+            aside = float(np.hypot(*off.mean(0)) / max(np.hypot(*off.T).mean(), 1e-9))
+            lens = NOMINAL_LENS_RAD * aside
             about = replace(about, axis_stddev=math.hypot(about.axis_stddev, lens))
         attitude = attitude_at_place(matched, place, about)
         return replace(attitude, used=np.flatnonzero(use)[attitude.used])
@@ -437,13 +435,6 @@ class Solver:
                 "whether the lens is a fisheye (equidistant)"
             )
         return camera, deeper.for_field(self.catalogue, camera)
-
-    def triangles_of(
-        self, width: int, height: int, part: float, origin_px: tuple[float, float] | None = None
-    ) -> TriangleCatalogue:
-        """Triangles for a part of such frames, as `identify` has it, from the cache or built."""
-        camera, catalogue, _ = self.view(width, height, origin_px)
-        return cached_triangles(catalogue, part * fisheye.field_rad(camera), self.progress)
 
     def _inside(self, stars: Stars) -> np.ndarray | None:
         """Rows of the stars that lie on their frame and in its lens's picture; None if all do, as is usual."""
