@@ -34,7 +34,7 @@ KEYS = {
 # module of ours that cannot do without is one of them
 OPTIONAL = {
     "PIL", "alpaca", "alpaca_simulators", "argcomplete", "exifread", "fastjsonschema",
-    "gi", "gphoto2", "indipyclient", "jplephem", "lz4", "pillow_heif", "rawpy", "rosbags", "selenium", "sgp4",
+    "gi", "gphoto2", "jplephem", "lz4", "pillow_heif", "rawpy", "rosbags", "selenium", "sgp4",
     "starpos_testing.skies.bags", "starpos_testing.skies.robots",
 }  # fmt: skip
 # Modules next to the tests.

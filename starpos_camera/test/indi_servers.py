@@ -11,7 +11,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from starpos_testing.lacking import lacks, require
+from starpos_testing.lacking import lacks
 from starpos_testing.patience import WAIT_S
 
 SIMULATOR, DEVICE = "indi_simulator_ccd", "CCD Simulator"
@@ -22,7 +22,6 @@ class IndiServer:
     """An indiserver of its own port, with its drivers; `start` again after `kill`."""
 
     def __init__(self, folder, *drivers):
-        require("indipyclient")
         for program in ("indiserver", SIMULATOR):
             if not shutil.which(program):
                 lacks("indi-bin")

@@ -4,6 +4,8 @@
 import math
 import os
 import signal
+import socket
+import threading
 import time
 
 import numpy as np
@@ -12,7 +14,7 @@ from astropy.io import fits
 from attempts import SHORT, in_thread, made, values
 from indi_servers import DEVICE, IndiServer, OtherClient, executable_liar
 
-from starpos_camera.sources import timing
+from starpos_camera.sources import indi, timing
 from starpos_camera.sources.indi import Indi
 from starpos_camera.sources.source import CaptureError, CaptureSettings
 from starpos_interfaces.msg import Capture
@@ -115,10 +117,9 @@ def test_what_another_client_has_set_does_not_stay(source, other):
     other.tell("Switch", "CCD_TRANSFER_FORMAT", FORMAT_NATIVE="On")
     other.tell("Number", "CCD_BINNING", HOR_BIN=2, VER_BIN=2)
     other.tell("Number", "CCD_FRAME", X=10, Y=20, WIDTH=300, HEIGHT=200)
-    server = source._device
-    heard = server.until(lambda: server.device(DEVICE).number("CCD_FRAME", "X") == 10, WAIT_S)
+    device = source._device
     # All that was set before is there.
-    assert server.run(heard)
+    assert device.until(lambda: device.number("CCD_FRAME", "X") == 10, WAIT_S)
     assert source.capture(SHORT).frame.pixels.shape == SIZE
     source.update(values("indi", indi__binning=2))
     assert source.capture(SHORT).frame.pixels.shape == (SIZE[0] // 2, SIZE[1] // 2)
@@ -248,6 +249,35 @@ def liar(tmp_path):
     for source in sources:
         source.close()
     server.kill()
+
+
+@pytest.mark.parametrize(
+    ("sent", "said"),
+    [
+        (b"HTTP/1.1 400 Bad Request\r\n\r\n<p>", "the server has nothing"),
+        (b'<!DOCTYPE a [<!ENTITY b "cc">]><x>&b;</x>', "sends what is no XML"),
+        (b"</x>", "sends what is no XML"),
+        (b'<setBLOBVector device="Liar" name="CCD1">' + b"A" * 4_000_000, "sends more than any frame has"),
+    ],
+)
+def test_a_server_that_is_none_of_indi_is_one_sentence(sent, said, monkeypatch):
+    monkeypatch.setattr(indi, "ELEMENT_MAX", 1_000_000)
+    monkeypatch.setattr(indi, "ANSWER_S", 1.0)
+    with socket.create_server(("127.0.0.1", 0)) as server:
+
+        def serve():
+            client, _ = server.accept()
+            with client:
+                client.sendall(sent)
+                client.recv(1 << 20)
+                client.recv(1 << 20)
+
+        thread = threading.Thread(target=serve)
+        thread.start()
+        source = made(values("indi", indi__port=server.getsockname()[1], indi__device="Liar"))
+        assert said in sentence(source)
+        source.close()
+        thread.join()
 
 
 QUICK = CaptureSettings(0.01, None, 5.0)

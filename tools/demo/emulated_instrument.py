@@ -20,7 +20,6 @@ import sys
 import tempfile
 import time
 from dataclasses import asdict, replace
-from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -57,17 +56,13 @@ ROOT = Path(__file__).resolve().parents[2]
 NEEDED = {"gcc-avr", "avr-libc", "libsimavr-dev", "libelf-dev", "indi-bin"}
 
 
-def lacking(needed: set[str] = NEEDED, modules: tuple[str, ...] = ("indipyclient",)) -> str | None:
-    """Say in commands how to install all that the devices need and this machine lacks; None if it has all."""
+def lacking(needed: set[str] = NEEDED) -> str | None:
+    """Say in a command how to install all that the devices need and this machine lacks; None if it has all."""
     missing = subprocess.run(
         [ROOT / "tools" / "setup" / "missing", "tests"], capture_output=True, text=True, check=True
     )
-    commands = []
-    if packages := sorted(needed & set(missing.stdout.split())):
-        commands.append(f"sudo apt-get install {' '.join(packages)}")
-    if absent := [name for name in modules if not find_spec(name)]:
-        commands.append(f"pip install {' '.join(absent)}")
-    return " && ".join(commands) or None
+    packages = sorted(needed & set(missing.stdout.split()))
+    return f"sudo apt-get install {' '.join(packages)}" if packages else None
 
 
 def start_board(devices: Processes, tilt_deg: np.ndarray) -> tuple[subprocess.Popen, str]:

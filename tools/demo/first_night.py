@@ -87,7 +87,7 @@ def main() -> int:
         "--out", type=Path, default=Path("demo/first_night"), help="folder of night, instrument and logs"
     )
     out = parser.parse_args().out
-    if lack := lacking(NEEDED - {"indi-bin"}, ()):
+    if lack := lacking(NEEDED - {"indi-bin"}):
         print(f"first_night: not all that it needs is here; type: {lack}", file=sys.stderr)
         return 2
     with own_domain(), tempfile.TemporaryDirectory() as scratch:

@@ -2,9 +2,9 @@
 """Frames by day without the Sun: clouds, lamps, walls, globes, trees, panes. None may have a heading.
 
 Each is of a scene that is drawn anew, by a camera of 25 mm without a filter or a fisheye, whose level and place are
-known while the Sun stands 15 to 70 deg high. A lamp may be as high as the Sun, to the errors of level and glow: such a
-frame is counted as `as_high`. Its camera at rest then takes another one a quarter of an hour later. If that has a
-heading too, it is a fault. Exit status 1 where there was one. Needs no ROS.
+known while the Sun stands 15 to 70 deg high. Its camera at rest takes another one a quarter of an hour later. A lamp may
+be as high as the Sun, to the errors of level and glow: such frames are counted as `as_high`. One that has a heading is a
+fault. Exit status 1 where there was one. Needs no ROS.
 """
 
 import json
@@ -185,14 +185,14 @@ def run(args) -> int:
         if disc is not None:
             counts["limb" if disc.sharp else "glow"] += 1
             glows = Glows()
-            for late_s, count in ((0.0, "as_high"), (SECONDS, "headings")):
+            for late_s in (0.0, SECONDS):
                 stars = replace(no_stars(*shape[::-1], mid_unix_s=when + late_s, exposure_s=0.0), disc=disc)
                 now = replace(tilt, utc_unix_s=when + late_s)
-                answer = by_sun(solvers[kind], stars, disc, now, place).beside(glows)
-                if answer.at_place is None:
-                    break
-                counts[count] += 1
-                print(f"{count} seed {args.seed} scene {number} {scene.__name__} {shape}", flush=True)
+                answer = by_sun(solvers[kind], stars, disc, now, place)
+                counts["as_high"] += answer.at_place is not None
+                if answer.beside(glows).at_place is not None:
+                    counts["headings"] += 1
+                    print(f"seed {args.seed} scene {number} {scene.__name__} {shape}", flush=True)
         progress.at(number - args.first + 1, json.dumps(sum(tally.values(), Counter())))
     for name, counts in sorted(tally.items()):
         print(f"{name:24s}", json.dumps(dict(counts)))

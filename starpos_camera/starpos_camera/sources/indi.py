@@ -1,31 +1,32 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cameras behind an INDI server (indilib.org), through PyPI's indipyclient.
+"""Cameras behind an INDI server (indilib.org): its protocol 1.7, XML over TCP, of one device."""
 
-Its event loop runs in a thread of its own.
-"""
-
-import asyncio
-import concurrent.futures
-import logging
+import base64
+import binascii
+import select
+import socket
 import threading
+import time
+import xml.etree.ElementTree as ET
 import zlib
-from collections.abc import Callable, Coroutine, Mapping
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, TypeVar
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 from starpos.errors import one_line
 from starpos.frames.fits import decode_fits
 from starpos.frames.frame import MAX_PIXELS
-from starpos_camera.sources.source import CapturedFrame, CaptureError, CaptureSettings, DeviceSource, missing
+from starpos_camera.sources.source import CapturedFrame, CaptureError, CaptureSettings, DeviceSource
 from starpos_camera.sources.timing import check_exposed, clock_stddev_of, stamp_of
-
-if TYPE_CHECKING:
-    from indipyclient import IPyClient
 
 # A server that has gone is noticed after two of these.
 BEAT_S = 0.5
-LEAVE_S = 2.0
-T = TypeVar("T")
+LINK_S = 2.0
+READ_BYTES = 1 << 20
+# Maximum size of a BLOB, and of an element of the protocol: a BLOB in base64.
+BLOB_MAX = 4 * MAX_PIXELS
+ELEMENT_MAX = 2 * BLOB_MAX
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,168 +38,87 @@ class Blob:
     format: str
 
 
-class IndiServer:
-    """One connection to an INDI server, opened at once; make a new one when it is lost.
+@dataclass
+class Vector:
+    """A property of a device: kind (Switch, Number, Text ...), state, texts of its members and limits of its numbers."""
 
-    The caller's thread calls `run`, any thread `close`; only the coroutine inside `run` uses the rest.
-    """
-
-    def __init__(self, host: str, port: int) -> None:
-        from indipyclient import IPyClient
-
-        # The library prints errors that are reported here anyway.
-        logging.getLogger("indipyclient").setLevel(logging.CRITICAL)
-        self._client = IPyClient(host, port)
-        self._client.timeout_enable = False
-        self._client.rxevent = self._on_event
-        self.lost = False
-        # The newest one.
-        self.blob: Blob | None = None
-        # How often each device has defined CONNECTION since it came or was disconnected.
-        self.definitions: dict[str, int] = {}
-        # The thread sets the loop before `started`.
-        self._loop: asyncio.AbstractEventLoop
-        self._talking: asyncio.Task[Any] | None = None
-        self._working: asyncio.Task[Any] | None = None
-        self._leaving = False
-        self._changed = asyncio.Event()
-        started = threading.Event()
-        self._thread = threading.Thread(target=self._run_loop, args=(started,), name="indi", daemon=True)
-        self._thread.start()
-        started.wait()
-
-    def run(self, work: Coroutine[Any, Any, T]) -> T:
-        """Run a coroutine; return or raise as it does; CaptureError if `close` ends it."""
-        watched = self._watch(work)
-        future: concurrent.futures.Future[T] | None = None
-        try:
-            future = asyncio.run_coroutine_threadsafe(watched, self._loop)
-            while not future.done() and self._thread.is_alive():
-                concurrent.futures.wait([future], BEAT_S)
-        except RuntimeError:
-            # The loop has ended.
-            future = None
-        if future is None or not future.done() or future.cancelled():
-            watched.close()
-            work.close()
-            raise CaptureError("the connection to the INDI server was closed; the frame is given up.")
-        return future.result()
-
-    def close(self) -> None:
-        """Cancel the work, which may still send commands to the device, and leave the server."""
-        leaving = self._leave()
-        try:
-            asyncio.run_coroutine_threadsafe(leaving, self._loop)
-        except RuntimeError:
-            # The loop has ended.
-            leaving.close()
-            return
-        self._thread.join(2 * LEAVE_S)
-        # a loop that ended meanwhile has not begun it
-        if not self._thread.is_alive():
-            leaving.close()
-
-    @property
-    def connected(self) -> bool:
-        return self._client.connected
-
-    def device_names(self) -> list[str]:
-        """Names of the devices that are there now."""
-        return [one_line(name) for name, found in self._client.items() if found.enable]
-
-    def device(self, name: str) -> "IndiDevice":
-        """Return a device by its name, whether it is there or not."""
-        return IndiDevice(self, self._client, name)
-
-    async def until(self, condition: Callable[[], object], seconds: float) -> bool:
-        """Wait for a condition on what server and devices say; False if the time or the connection ends before."""
-        end = self._loop.time() + seconds
-        while not (found := condition()) and not self.lost and (left := end - self._loop.time()) > 0:
-            # wait_for of Python 3.11 may lose a cancellation.
-            if self._leaving:
-                raise asyncio.CancelledError
-            self._changed.clear()
-            try:
-                await asyncio.wait_for(self._changed.wait(), min(left, BEAT_S))
-            except asyncio.TimeoutError:
-                # Only writing shows that a server has gone. No device has this name, so none answers.
-                await self._client.send_getProperties("starpos", "CONNECTION")
-        return bool(found)
-
-    async def _on_event(self, event: Any) -> None:
-        if event.eventtype == "ConnectionLost":
-            self.lost = True
-        elif event.eventtype == "Delete" and event.vectorname in (None, "CCD1"):
-            # The device has gone, or was disconnected.
-            self.definitions.pop(event.devicename, None)
-        elif event.eventtype == "Define" and event.vectorname == "CONNECTION":
-            self.definitions[event.devicename] = self.definitions.get(event.devicename, 0) + 1
-        elif event.eventtype == "SetBLOB":
-            for name, data in event.items():
-                self.blob = Blob(data, *event.sizeformat[name])
-                # Otherwise the client keeps the bytes until the next BLOB comes.
-                event.vector.member(name).membervalue = b"-"
-        self._changed.set()
-
-    def _run_loop(self, started: threading.Event) -> None:
-        async def talk() -> None:
-            self._loop, self._talking = asyncio.get_running_loop(), asyncio.current_task()
-            started.set()
-            await self._client.asyncrun()
-
-        try:
-            asyncio.run(talk())
-        except asyncio.CancelledError:
-            pass
-        finally:
-            self.lost = True
-
-    async def _watch(self, work: Coroutine[Any, Any, T]) -> T:
-        self._working = asyncio.current_task()
-        return await work
-
-    async def _leave(self) -> None:
-        self._leaving = True
-        self._changed.set()
-        if self._working and not self._working.done():
-            self._working.cancel()
-            await asyncio.wait({self._working}, timeout=LEAVE_S)
-        if self._talking is not None:
-            self._talking.cancel()
+    kind: str
+    state: str
+    members: dict[str, str] = field(default_factory=dict)
+    limits: dict[str, tuple[str | None, str | None]] = field(default_factory=dict)
 
 
 class IndiDevice:
-    """The present vectors of a device, and commands to it. A device that is not there has no vectors."""
+    """The present vectors of a device of a server, and commands to it; has no vectors while the device is not there.
 
-    def __init__(self, server: IndiServer, client: "IPyClient", name: str) -> None:
-        self.server, self.name = server, name
-        self._client = client
+    One connection, opened at once; make a new one when it is `lost`. Only the thread that captures uses it, and it hears
+    the server only in `until`. closing: ends the waiting.
+    """
 
-    def has(self, vector: str) -> bool:
-        return self._vector(vector) is not None
+    def __init__(self, host: str, port: int, name: str, closing: threading.Event) -> None:
+        self.name, self._closing = name, closing
+        try:
+            self._socket = socket.create_connection((host, port), LINK_S)
+        except OSError:
+            raise CaptureError(
+                "no INDI server answers: start indiserver, or correct indi.host and indi.port."
+            ) from None
+        self.lost = False
+        # The newest one.
+        self.blob: Blob | None = None
+        # Names of the devices that are there.
+        self.there: set[str] = set()
+        self._vectors: dict[str, Vector] = {}
+        self._message = ""
+        # How often the device has defined CONNECTION since it came or was disconnected.
+        self._definitions = 0
+        self._parser: Any = ET.XMLPullParser(("start", "end"))
+        # What the server sends has no root.
+        self._parser.feed("<indi>")
+        begun: Any = self._parser.read_events()
+        ((_, self._root),) = begun
+        self._depth = self._pending = 0
+        self._ask()
 
-    async def settled(self, seconds: float) -> bool:
+    def close(self) -> None:
+        """Leave the server once it has read all that was sent to it."""
+        end = time.monotonic() + LINK_S
+        with suppress(OSError):
+            self._socket.shutdown(socket.SHUT_WR)
+            while time.monotonic() < end and self._socket.recv(READ_BYTES):
+                pass
+        self._socket.close()
+
+    def until(self, condition: Callable[[], object], seconds: float) -> bool:
+        """Wait for a condition on what server and device say; False if the time or the connection ends before."""
+        end = time.monotonic() + seconds
+        while not (found := condition()) and not self.lost and (left := end - time.monotonic()) > 0:
+            if self._closing.is_set():
+                raise CaptureError("the node ends: the connection to the INDI server is closed.")
+            self._hear(min(left, BEAT_S))
+        return bool(found)
+
+    def settled(self, seconds: float) -> bool:
         """Wait until the device has defined all its vectors.
 
         Nothing marks their end, but a device answers questions in order: a second answer comes after the definitions.
         """
+        for _ in range(self._definitions, 2):
+            self._ask(device=self.name, name="CONNECTION")
+        return self.until(lambda: self._definitions > 1, seconds)
 
-        def answers() -> int:
-            return self.server.definitions.get(self.name, 0)
-
-        for _ in range(answers(), 2):
-            await self._client.send_getProperties(self.name, "CONNECTION")
-        return await self.server.until(lambda: answers() > 1, seconds)
+    def has(self, vector: str) -> bool:
+        return vector in self._vectors
 
     def state(self, vector: str) -> str | None:
         """Idle, Ok, Busy or Alert; None without such a vector."""
-        found = self._vector(vector)
-        return found.state if found is not None else None
+        found = self._vectors.get(vector)
+        return None if found is None else found.state
 
     def value(self, vector: str, member: str) -> str | None:
         """Text of a member; None without one."""
-        found = self._vector(vector)
-        return found.get(member) if found is not None else None
+        found = self._vectors.get(vector)
+        return None if found is None else found.members.get(member)
 
     def number(self, vector: str, member: str) -> float | None:
         """Value of a member as a number; None without one."""
@@ -206,46 +126,126 @@ class IndiDevice:
 
     def limits(self, vector: str, member: str) -> tuple[float | None, float | None]:
         """Smallest and largest allowed value of a number; None where the device states none."""
-        found = self._vector(vector)
-        if found is None:
-            return None, None
-        found = found.member(member)
-        return _number(found.min), _number(found.max)
+        found = self._vectors.get(vector)
+        low, high = (None, None) if found is None else found.limits.get(member, (None, None))
+        return _number(low), _number(high)
 
     def last_message(self) -> str:
         """Last message of the device since `forget`, in brackets; "" without one."""
-        messages = self._client[self.name].messages if self.name in self._client else ()
-        return f" ({one_line(messages[0][1])})" if messages else ""
+        return f" ({one_line(self._message)})" if self._message else ""
 
     def forget(self) -> None:
-        """Forget the messages of the device until now, and the BLOB of the server."""
-        self.server.blob = None
-        if self.name in self._client:
-            self._client[self.name].messages.clear()
+        """Forget the messages of the device until now, and its BLOB."""
+        self.blob, self._message = None, ""
 
-    async def send(self, vector: str, **members: str) -> None:
+    def send(self, vector: str, **members: str) -> None:
         """Set members of a vector, which is Busy until the device answers; does nothing if the device has gone."""
-        await self._client.send_newVector(self.name, vector, members=members)
+        found = self._vectors.get(vector)
+        if found is None:
+            return
+        element = ET.Element(f"new{found.kind}Vector", device=self.name, name=vector)
+        for name, text in members.items():
+            ET.SubElement(element, f"one{found.kind}", name=name).text = text
+        found.state = "Busy"
+        self._tell(element)
 
-    async def enable_blobs(self, vector: str) -> None:
+    def enable_blobs(self, vector: str) -> None:
         """Ask the server to send the BLOBs of a vector, besides everything else."""
-        await self._client.send_enableBLOB("Also", self.name, vector)
+        element = ET.Element("enableBLOB", device=self.name, name=vector)
+        element.text = "Also"
+        self._tell(element)
 
-    def _vector(self, vector: str) -> Any:
-        found = self._client[self.name].get(vector) if self.name in self._client else None
-        return found if found is not None and found.enable else None
+    def _ask(self, **what: str) -> None:
+        self._tell(ET.Element("getProperties", {"version": "1.7", **what}))
+
+    def _tell(self, element: ET.Element) -> None:
+        try:
+            self._socket.sendall(ET.tostring(element))
+        except OSError:
+            self.lost = True
+
+    def _hear(self, seconds: float) -> None:
+        """Take what the server sends; waits for it so long."""
+        ready, _, _ = select.select([self._socket], [], [], seconds)
+        if not ready:
+            # Only writing shows that a server has gone. No device has this name, so none answers.
+            self._ask(device="starpos", name="CONNECTION")
+            return
+        try:
+            data = self._socket.recv(READ_BYTES)
+        except OSError:
+            data = b""
+        self.lost |= not data
+        self._pending += len(data)
+        self._parser.feed(data)
+        try:
+            self._take_all()
+        except ET.ParseError as error:
+            raise CaptureError(f"the INDI server sends what is no XML ({one_line(error)}).") from None
+        if self._pending > ELEMENT_MAX:
+            raise CaptureError("the INDI server sends more than any frame has.")
+
+    def _take_all(self) -> None:
+        """Take the elements that have come whole; ParseError for what is no XML."""
+        events: Any = self._parser.read_events()
+        for event, element in events:
+            self._depth += 1 if event == "start" else -1
+            if self._depth == 0:
+                self._take(element)
+                self._root.clear()
+                self._pending = 0
+
+    def _take(self, element: ET.Element) -> None:
+        """Note what an element of the server says."""
+        kind, name = element.tag, element.get("name", "")
+        device = element.get("device", "")
+        if kind.startswith("def"):
+            self.there.add(device)
+        elif kind == "delProperty" and not name:
+            self.there.discard(device)
+        if device != self.name:
+            return
+        self._message = element.get("message", self._message)
+        if kind == "delProperty":
+            for gone in [name] if name else list(self._vectors):
+                self._vectors.pop(gone, None)
+            if name in ("", "CCD1"):
+                # The device has gone, or was disconnected.
+                self._definitions = 0
+        elif kind.startswith("def"):
+            self._vectors[name] = Vector(
+                kind=kind[3:].removesuffix("Vector"),
+                state=element.get("state", "Idle"),
+                members={m.get("name", ""): (m.text or "").strip() for m in element},
+                limits={m.get("name", ""): (m.get("min"), m.get("max")) for m in element},
+            )
+            self._definitions += name == "CONNECTION"
+        elif kind.startswith("set") and (vector := self._vectors.get(name)) is not None:
+            vector.state = element.get("state", vector.state)
+            for m in element:
+                if m.tag == "oneBLOB":
+                    self.blob = _blob(m)
+                else:
+                    vector.members[m.get("name", "")] = (m.text or "").strip()
+
+
+def _blob(member: ET.Element) -> Blob:
+    try:
+        data, size = base64.b64decode(member.text or ""), int(member.get("size", ""))
+    except (binascii.Error, ValueError) as error:
+        raise CaptureError(f"its frame is no BLOB ({one_line(error)}).") from None
+    return Blob(data, size, member.get("format", ""))
 
 
 def _number(text: str | None) -> float | None:
-    from indipyclient import getfloat
-
     try:
-        return getfloat(text)
-    except TypeError:
+        return None if text is None else float(text)
+    except ValueError:
         return None
 
 
-LINK_S = 2.0
+# For what the server has sent meanwhile.
+DRAIN_S = 0.02
 # For a driver to answer.
 ANSWER_S = 5.0
 # For a driver to open its camera.
@@ -260,18 +260,14 @@ SWITCHES = (
 GAINS = (("CCD_GAIN", "GAIN"), ("CCD_CONTROLS", "Gain"))
 
 
-async def find_device(server: IndiServer, name: str) -> IndiDevice:
-    """Wait for the device of that name; CaptureError if it does not come."""
-    if not await server.until(lambda: server.connected, LINK_S):
-        raise CaptureError("no INDI server answers: start indiserver, or correct indi.host and indi.port.")
-    device = server.device(name)
-    if not await server.until(lambda: device.has("CONNECTION"), ANSWER_S):
-        there = ", ".join(server.device_names()) or "nothing"
+def check_there(device: IndiDevice) -> None:
+    """Wait for the device; CaptureError if it does not come."""
+    if not device.until(lambda: device.has("CONNECTION"), ANSWER_S):
+        there = ", ".join(map(one_line, sorted(device.there))) or "nothing"
         raise CaptureError(f"the server has {there}: start the camera's driver, or correct indi.device.")
-    return device
 
 
-async def connect_camera(device: IndiDevice) -> None:
+def connect_camera(device: IndiDevice) -> None:
     """Make the driver open its camera; another client may have done so already."""
 
     def connected() -> bool:
@@ -282,107 +278,104 @@ async def connect_camera(device: IndiDevice) -> None:
 
     device.forget()
     if not connected():
-        await device.send("CONNECTION", CONNECT="On")
+        device.send("CONNECTION", CONNECT="On")
     wanted = ("CCD_EXPOSURE", "CCD_INFO", "CCD1")
-    await device.server.until(
-        lambda: refused() or (connected() and all(device.has(v) for v in wanted)), CONNECT_S
-    )
-    if refused() or not connected() or not await device.settled(ANSWER_S):
+    device.until(lambda: refused() or (connected() and all(device.has(v) for v in wanted)), CONNECT_S)
+    if refused() or not connected() or not device.settled(ANSWER_S):
         raise CaptureError(
             f"the driver does not reach its camera{device.last_message()}: check cable and power."
         )
     if lacks := [v for v in wanted if not device.has(v)]:
         raise CaptureError(f"{device.name} has no {lacks[0]}, so it is no camera: correct indi.device.")
-    await device.enable_blobs("CCD1")
+    device.enable_blobs("CCD1")
 
 
-async def set_up(device: IndiDevice, exposure_s: float, gain: float | None, binning: int) -> None:
+def set_up(device: IndiDevice, exposure_s: float, gain: float | None, binning: int) -> None:
     """Make all settings of an exposure; CaptureError if the camera cannot do one of them.
 
     gain: None leaves it as it is.  binning: px each way.
     """
     # A client that was killed may have left an exposure.
     if device.state("CCD_EXPOSURE") == "Busy":
-        await device.send("CCD_ABORT_EXPOSURE", ABORT="On")
-        await device.server.until(lambda: device.state("CCD_EXPOSURE") != "Busy", ANSWER_S)
+        device.send("CCD_ABORT_EXPOSURE", ABORT="On")
+        device.until(lambda: device.state("CCD_EXPOSURE") != "Busy", ANSWER_S)
     for vector, member in SWITCHES:
         if device.value(vector, member) == "Off":
-            await _set(device, vector, **{member: "On"})
+            _set(device, vector, **{member: "On"})
     if device.has("CCD_BINNING"):
-        await _set_numbers(device, "CCD_BINNING", HOR_BIN=binning, VER_BIN=binning)
+        _set_numbers(device, "CCD_BINNING", HOR_BIN=binning, VER_BIN=binning)
     elif binning != 1:
         raise CaptureError("it cannot bin: set indi.binning to 1.")
     if device.has("CCD_FRAME"):
         width, height = (device.number("CCD_INFO", f"CCD_MAX_{axis}") or 0.0 for axis in "XY")
         if width and height:
-            await _set_numbers(device, "CCD_FRAME", X=0.0, Y=0.0, WIDTH=width, HEIGHT=height)
+            _set_numbers(device, "CCD_FRAME", X=0.0, Y=0.0, WIDTH=width, HEIGHT=height)
     if gain is not None:
-        vector, member = await _gain_of(device)
+        vector, member = _gain_of(device)
         _check_limits(device, vector, member, gain, "`gain`")
         if device.number(vector, member) != gain:
             # The driver may round the gain to one that the camera has.
-            await _set(device, vector, **{member: repr(float(gain))})
+            _set(device, vector, **{member: repr(float(gain))})
     _check_limits(device, "CCD_EXPOSURE", "CCD_EXPOSURE_VALUE", exposure_s, "`exposure` (s)")
 
 
-async def _gain_of(device: IndiDevice) -> tuple[str, str]:
+def _gain_of(device: IndiDevice) -> tuple[str, str]:
     """The vector and member that set the gain; CaptureError if none comes."""
 
     def there() -> list[tuple[str, str]]:
         return [(v, m) for v, m in GAINS if device.value(v, m) is not None]
 
     # A driver defines its properties one after the other, and nothing says which is the last.
-    if not await device.server.until(there, ANSWER_S):
+    if not device.until(there, ANSWER_S):
         raise CaptureError("it has no gain to be set: leave `gain` unset.")
     return there()[0]
 
 
-async def expose(device: IndiDevice, exposure_s: float, readout_s: float) -> Blob:
+def expose(device: IndiDevice, exposure_s: float, readout_s: float) -> Blob:
     """Expose now and return the frame, which may take readout_s after its end; an exposure given up is aborted."""
-    server = device.server
 
     def state() -> str | None:
         return device.state("CCD_EXPOSURE")
 
     device.forget()
     try:
-        await device.send("CCD_EXPOSURE", CCD_EXPOSURE_VALUE=repr(exposure_s))
-        await server.until(lambda: server.blob or state() in (None, "Alert", "Idle"), exposure_s + readout_s)
-        if server.lost:
+        device.send("CCD_EXPOSURE", CCD_EXPOSURE_VALUE=repr(exposure_s))
+        device.until(lambda: device.blob or state() in (None, "Alert", "Idle"), exposure_s + readout_s)
+        if device.lost:
             raise CaptureError("the INDI server went away during the exposure; it is looked for again.")
         if state() is None:
             raise CaptureError(
                 "the camera or its driver went away during the exposure; it is looked for again."
             )
-        if not server.blob:
+        if not device.blob:
             ends = {"Alert": "failed", "Idle": "was aborted by another client"}
             end = ends.get(state() or "", "gave no frame in time")
             raise CaptureError(f"the exposure {end}{device.last_message()}.")
     except BaseException:
-        # This is for a cancellation too.
-        await device.send("CCD_ABORT_EXPOSURE", ABORT="On")
+        # This is for the node's end too.
+        device.send("CCD_ABORT_EXPOSURE", ABORT="On")
         raise
     # The next exposure would abort one that is still busy.
-    await server.until(lambda: state() != "Busy", ANSWER_S)
-    blob, server.blob = server.blob, None
+    device.until(lambda: state() != "Busy", ANSWER_S)
+    blob, device.blob = device.blob, None
     return blob
 
 
-async def _set(device: IndiDevice, vector: str, **members: str) -> None:
-    await device.send(vector, **members)
-    if not await device.server.until(lambda: device.state(vector) != "Busy", ANSWER_S):
+def _set(device: IndiDevice, vector: str, **members: str) -> None:
+    device.send(vector, **members)
+    if not device.until(lambda: device.state(vector) != "Busy", ANSWER_S):
         raise CaptureError(f"the driver does not answer to {vector}: restart it.")
     if device.state(vector) not in ("Ok", "Idle"):
         asked = ", ".join(f"{m} {v}" for m, v in members.items())
         raise CaptureError(f"the driver refuses {vector} {asked}{device.last_message()}.")
 
 
-async def _set_numbers(device: IndiDevice, vector: str, **numbers: float) -> None:
+def _set_numbers(device: IndiDevice, vector: str, **numbers: float) -> None:
     """Set the numbers that differ, and check that they were taken."""
     wrong = {m: n for m, n in numbers.items() if device.number(vector, m) != n}
     if not wrong:
         return
-    await _set(device, vector, **{m: repr(float(n)) for m, n in numbers.items()})
+    _set(device, vector, **{m: repr(float(n)) for m, n in numbers.items()})
     for member, number in wrong.items():
         found = device.number(vector, member)
         if found is None or abs(found - number) > 1e-6 * abs(number):
@@ -396,17 +389,13 @@ def _check_limits(device: IndiDevice, vector: str, member: str, value: float, na
 
 
 DEFAULT_EXPOSURE_S = 0.5
-# In bytes.
-BLOB_MAX = 4 * MAX_PIXELS
 
 
-class Indi(DeviceSource[IndiServer]):
+class Indi(DeviceSource[IndiDevice]):
     """Takes whole light frames as FITS. Connects the device if need be; aborts an exposure that is given up."""
 
     @staticmethod
     def refusal(values: Mapping, settings: CaptureSettings) -> str | None:
-        if lack := missing("indipyclient", "indipyclient"):
-            return lack
         for name, what in (
             ("indi.host", "the machine that indiserver runs on"),
             ("indi.device", "the camera"),
@@ -421,30 +410,24 @@ class Indi(DeviceSource[IndiServer]):
         self._name = values["indi.device"]
         self.hardware_id = f"{self._name} of indiserver at {self._host}:{self._port}"
 
-    def _open(self) -> IndiServer:
-        return IndiServer(self._host, self._port)
+    def _open(self) -> IndiDevice:
+        return IndiDevice(self._host, self._port, self._name, self._closing)
 
-    def _close(self, device: IndiServer) -> None:
+    def _close(self, device: IndiDevice) -> None:
         device.close()
 
-    # It ends the work that runs, and aborts its exposure.
-    _interrupt = _close
-
-    def _expose(self, server: IndiServer, settings: CaptureSettings) -> CapturedFrame:
-        # The node may have ended while the server was opened.
-        if self._closing.is_set():
-            raise CaptureError("the node ends.")
+    def _expose(self, device: IndiDevice, settings: CaptureSettings) -> CapturedFrame:
         exposure_s = settings.exposure_s or DEFAULT_EXPOSURE_S
-        values = self._values
-
-        async def take() -> tuple[Blob, float]:
-            device = await find_device(server, self._name)
-            await connect_camera(device)
-            await set_up(device, exposure_s, settings.gain, values["indi.binning"])
-            commanded_s = self._now()
-            return await expose(device, exposure_s, values["indi.readout"]), commanded_s
-
-        blob, commanded_s = server.run(take())
+        # What has come since the last frame: perhaps the end of the connection.
+        device.until(lambda: False, DRAIN_S)
+        if device.lost:
+            device.close()
+            device = self._device = self._open()
+        check_there(device)
+        connect_camera(device)
+        set_up(device, exposure_s, settings.gain, self._values["indi.binning"])
+        commanded_s = self._now()
+        blob = expose(device, exposure_s, self._values["indi.readout"])
         return self._frame(blob, exposure_s, commanded_s, self._now())
 
     def _frame(self, blob: Blob, wanted_s: float, commanded_s: float, ready_s: float) -> CapturedFrame:

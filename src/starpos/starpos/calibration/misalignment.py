@@ -189,8 +189,8 @@ def calibrate(
             break
         a3 = solver.instrument.mounting.a3
         agreement = _agreed(find, solved, a3, errors)
-        now = replace(_found(agreement, errors), covariance_arcsec2=given.covariance_arcsec2)
-        solver = _with(solver, now if inside else _unknown(agreement, errors), agreement.errors(errors))
+        now = replace(_found(agreement), covariance_arcsec2=given.covariance_arcsec2)
+        solver = _with(solver, now if inside else _unknown(agreement), agreement.errors)
         # a turn about the plumb line changes no fix
         if k and np.linalg.norm(agreement.plumb.a3[2] - a3[2]) < SETTLED_RAD:
             break
@@ -206,17 +206,15 @@ def calibrate(
             replace(s, fix=_with_zenith_error(s.fix, plumb.astray)) if s.fix else s for s in solutions
         ]
     error = float(plumb.stddev_across(agreement.readings.mean_plumb) / ARCSEC)
-    instrument = replace(
-        solver.instrument, calibration=_dated(agreement, errors), inclinometer=agreement.errors(errors)
-    )
-    return Calibrated(instrument, error, tuple(solutions), agreement.beyond(errors))
+    instrument = replace(solver.instrument, calibration=_dated(agreement), inclinometer=agreement.errors)
+    return Calibrated(instrument, error, tuple(solutions), agreement.beyond)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class _Agreement:
     """The plumb line of the frames that agree, and how well they do.
 
-    readings: of the frames `sound`.  scatter: of these.
+    readings: of the frames `sound`.  scatter: of these.  stated: errors of the inclinometer.
     left_out: utc_unix_s of each frame that disagrees, and by how much, in rad.
     """
 
@@ -225,27 +223,25 @@ class _Agreement:
     sound: list[Fix]
     scatter: Scatter
     left_out: dict[float, float]
-
-    def errors(self, stated: InclinometerErrors) -> InclinometerErrors:
-        """The inclinometer's errors, with its noise and its poses' errors as these frames show them."""
-        noise = stated.noise_rad
-        if self._noisy:
-            samples = np.mean([f.tilt.samples for f in self.sound])
-            noise = float(np.hypot(noise, self.scatter.noise_sigma * np.sqrt(samples)))
-        return replace(stated, pose_rad=self.scatter.pose_sigma, noise_rad=noise)
+    stated: InclinometerErrors
 
     @property
-    def _noisy(self) -> bool:
+    def errors(self) -> InclinometerErrors:
+        """The inclinometer's errors, with its noise and its poses' errors as these frames show them."""
+        noise = self.stated.noise_rad
         own = float(np.sqrt(np.median(self.readings.sigma**2)))
-        return self.scatter.evident and self.scatter.noise_sigma > NOISIER * own
+        if self.scatter.evident and self.scatter.noise_sigma > NOISIER * own:
+            samples = np.mean([f.tilt.samples for f in self.sound])
+            noise = float(np.hypot(noise, self.scatter.noise_sigma * np.sqrt(samples)))
+        return replace(self.stated, pose_rad=self.scatter.pose_sigma, noise_rad=noise)
 
-    def beyond(self, stated: InclinometerErrors) -> str:
+    @property
+    def beyond(self) -> str:
         """Say by how much the frames scatter beyond the stated errors, and what to state; '' if they do not."""
-        found = self.errors(stated)
-        scale = self.plumb.response[self._scales]
-        shown = np.abs(scale) > SHOWN_SIGMA * np.hypot(
-            np.sqrt(np.diag(self.plumb.response_covariance))[self._scales], stated.scale
-        )
+        found, stated, axes = self.errors, self.stated, self.sound[0].tilt.axes
+        scales = slice(axes, 2 * axes)
+        scale, known = self.plumb.response[scales], np.diag(self.plumb.response_covariance)[scales]
+        shown = np.abs(scale) > SHOWN_SIGMA * np.sqrt(known + stated.scale**2)
         told, state = [], []
         if found.noise_rad > stated.noise_rad:
             noise = np.degrees(found.noise_rad)
@@ -268,11 +264,6 @@ class _Agreement:
             f"{', '.join(state)}"
         )
 
-    @property
-    def _scales(self) -> slice:
-        axes = self.sound[0].tilt.axes
-        return slice(axes, 2 * axes)
-
     def check(self) -> None:
         """Raise FixError if the frames are not of one zenith."""
         of = len(self.sound) + len(self.left_out)
@@ -281,7 +272,8 @@ class _Agreement:
             raise FixError(
                 f"{len(self.left_out)} of {of} frames disagree with the others on the zenith: {why}"
             )
-        scatter = self.scatter_left
+        # root mean square in rad of what the fit leaves of the frames
+        scatter = float(np.sqrt(np.mean(np.sum(self.plumb.left**2, 1))))
         # frames too few to show an error of the tilts must agree as they state
         shown = self.scatter.evident or self.scatter.response_evident
         if scatter > MAX_POSE_RAD or (self.plumb.scatter > MAX_SCATTER and not shown):
@@ -289,11 +281,6 @@ class _Agreement:
                 f"{of} frames do not agree on one zenith (they scatter by "
                 f"{np.degrees(scatter):.2f} deg): {why}"
             )
-
-    @property
-    def scatter_left(self) -> float:
-        """Root mean square in rad of what the fit leaves of the frames."""
-        return float(np.sqrt(np.mean(np.sum(self.plumb.left**2, 1))))
 
     def judged(self, solution: Solution) -> Solution:
         """The solution, without a fix if its frame disagrees."""
@@ -325,7 +312,9 @@ def _agreed(find: FindPlumbLine, solved: list[Fix], a3: np.ndarray, errors: Incl
         off = np.linalg.norm(_left(whole, plumb), axis=1)
         for k in np.setdiff1d(np.arange(len(solved)), rows):
             left_out[solved[k].utc_unix_s] = float(off[k])
-    return _Agreement(plumb, readings, sound, scatter, left_out)
+    return _Agreement(
+        plumb=plumb, readings=readings, sound=sound, scatter=scatter, left_out=left_out, stated=errors
+    )
 
 
 def _agreeing(fit: FitOfRows, whole: Readings, pose_rad: float) -> tuple[np.ndarray, PlumbLine]:
@@ -393,12 +382,12 @@ def _left(whole: Readings, plumb: PlumbLine) -> np.ndarray:
     return whole.plumb - np.einsum("ij,kjl,l->ki", plumb.a3, whole.to_camera, plumb.zenith)
 
 
-def _unknown(agreement: _Agreement, errors: InclinometerErrors) -> Calibration:
+def _unknown(agreement: _Agreement) -> Calibration:
     """A3 as the budgets of the fixes take it: unknown, except for its turn about the plumb line if the leans show it.
 
     With an unknown turn every lean would become an error.
     """
-    plumb, found = agreement.plumb, _found(agreement, errors)
+    plumb, found = agreement.plumb, _found(agreement)
     up = up_of(np.radians(found.tilt_deg))
     turn_arcsec = np.sqrt(up @ plumb.covariance @ up) / ARCSEC
     across, about = UNKNOWN_ARCSEC[0], min(UNKNOWN_ARCSEC[2], TURN_SIGMA * turn_arcsec)
@@ -424,11 +413,11 @@ def _with(solver: Solver, calibration: Calibration, errors: InclinometerErrors) 
     )
 
 
-def _dated(agreement: _Agreement, errors: InclinometerErrors) -> Calibration:
+def _dated(agreement: _Agreement) -> Calibration:
     """The calibration at the mean time, temperature and tilt of the frames."""
     sound = agreement.sound
     return replace(
-        _found(agreement, errors),
+        _found(agreement),
         covariance_arcsec2=tuple(map(tuple, (agreement.plumb.covariance / ARCSEC**2).tolist())),
         utc_unix_s=float(np.mean([f.utc_unix_s for f in sound])),
         frames=len(sound),
@@ -436,14 +425,14 @@ def _dated(agreement: _Agreement, errors: InclinometerErrors) -> Calibration:
     )
 
 
-def _found(agreement: _Agreement, errors: InclinometerErrors) -> Calibration:
+def _found(agreement: _Agreement) -> Calibration:
     """The A3 that was found, at the mean temperature and tilt of the frames, with the response if the poses show it."""
     plumb, axes = agreement.plumb, agreement.sound[0].tilt.axes
     found = Calibration(
         temperature_c=mean_known(np.array([f.tilt.temperature_c for f in agreement.sound])),
         tilt_deg=tuple(np.degrees(angles_at(agreement.readings.mean_plumb, axes)).tolist()),
     ).turned_to(plumb.a3)
-    stated = np.diag(stated_variances(errors, axes))
+    stated = np.diag(stated_variances(agreement.stated, axes))
     known, most = np.sqrt(np.diag(plumb.response_covariance)), np.sqrt(np.diag(stated))
     # few poses show no response, nor do poses that scatter so much that they will be refused
     enough = agreement.readings.pose.max() + 1 >= MIN_POSES

@@ -209,58 +209,7 @@ def symmetric(covariance: np.ndarray) -> np.ndarray:
 
 
 @at_once
-@dataclass(frozen=True, kw_only=True)
-class _Model:
-    """What all starts of a fit share, and what each begins with.
-
-    turns (3, 3): axes in S, two across the plumb line and it.  columns (K, 2, M): as Readings', across the plumb line.
-    prior_sigma (n,): of A3's turns (3), the zenith's moves (2) and the columns (M).
-    zenith (T, 3), across (T, 2, 3): of each start, in ITRS.  seen_across (T, 2, K, 3): `across` in the camera.
-    """
-
-    readings: Readings
-    spread: np.ndarray
-    turns: np.ndarray
-    columns: np.ndarray
-    prior_sigma: np.ndarray
-    zenith: np.ndarray
-    across: np.ndarray
-    seen_across: np.ndarray
-
-    @classmethod
-    def of(
-        cls,
-        readings: Readings,
-        starts: np.ndarray,
-        turn_sigma: float,
-        known: np.ndarray | None,
-        zenith_sigma: float,
-    ) -> "_Model":
-        to_camera, mean = readings.to_camera, readings.mean_plumb
-        if known is None:
-            zenith = np.einsum("kji,tlj,kl->ti", to_camera, starts, readings.plumb)
-        else:
-            zenith = np.tile(known, (len(starts), 1))
-        zenith = rotation.normalised(zenith)
-        across = np.linalg.svd(zenith[:, None])[2][:, 1:]
-        turns = np.vstack([np.linalg.svd(mean[None])[2][1:], mean]).T
-        loose = UNKNOWN_ARCSEC[0] * ARCSEC
-        return cls(
-            readings=readings,
-            spread=readings.spread,
-            turns=turns,
-            columns=-np.einsum("kim,ij->kjm", readings.columns, turns[:, :2]),
-            prior_sigma=np.array(
-                [loose, loose, turn_sigma, zenith_sigma, zenith_sigma, *readings.column_sigma]
-            ),
-            zenith=zenith,
-            across=across,
-            seen_across=np.einsum("kij,tdj->tdki", to_camera, across),
-        )
-
-
-@at_once
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class _State:
     """Where T fits stand: a3 (T, 3, 3), up (T, 3) of any length, p (T, n) as in PlumbLine, start (T,): its number."""
 
@@ -268,23 +217,6 @@ class _State:
     up: np.ndarray
     p: np.ndarray
     start: np.ndarray
-
-    def subset(self, rows: np.ndarray) -> "_State":
-        return _State(a3=self.a3[rows], up=self.up[rows], p=self.p[rows], start=self.start[rows])
-
-
-@at_once
-@dataclass(frozen=True, kw_only=True)
-class _Slopes:
-    """A linearisation at T states, and what it costs.
-
-    residual (T, K, 2) in rad without the columns, slope (T, K, 2, n), off (T, K, 2) in sigma, cost (T,).
-    """
-
-    residual: np.ndarray
-    slope: np.ndarray
-    off: np.ndarray
-    cost: np.ndarray
 
 
 def fits(
@@ -301,102 +233,141 @@ def fits(
     zenith (3,): None if nothing is known of it.  The residuals compare the readings with the plumb line of the stars,
     whose error is small compared with theirs.  The prior of A3's tilts is UNKNOWN_ARCSEC.
     """
-    model = _Model.of(readings, starts, turn_sigma, zenith, zenith_sigma)
-    p = np.zeros((len(starts), len(model.prior_sigma)))
-    p[:, 2] = turned
-    now = _State(a3=starts, up=model.zenith, p=p, start=np.arange(len(starts)))
-    best = np.full(len(starts), np.inf)
-    answer = _State(a3=starts.copy(), up=model.zenith.copy(), p=p.copy(), start=now.start)
-    for _ in range(MAX_STEPS):
-        slopes = _slopes(model, now)
-        # if the headings hardly differ, later steps may lead away again
-        better = slopes.cost < best[now.start]
-        rows = now.start[better]
-        best[rows] = slopes.cost[better]
-        answer.a3[rows], answer.up[rows], answer.p[rows] = now.a3[better], now.up[better], now.p[better]
-        step, gain = _step(model, slopes, now.p)
-        now = _stepped(model, now, step).subset(gain >= SETTLED_CHI2)
-        if not len(now.start):
-            break
-    slopes = _slopes(model, answer)
-    return [_plumb_line(model, answer, slopes, t) for t in range(len(starts))]
+    return _Fits(readings, starts, turn_sigma, turned, zenith, zenith_sigma).found()
 
 
-def _slopes(model: _Model, now: _State) -> _Slopes:
-    """Residuals and their derivatives at T states."""
-    plumb, flat = model.readings.plumb, model.turns[:, :2]
-    count, frames, n = len(now.start), len(plumb), len(model.prior_sigma)
-    length = np.linalg.norm(now.up, axis=1)
-    seen = np.tensordot(now.up / length[:, None], model.readings.to_camera, (1, 2))
-    read = seen @ now.a3.swapaxes(1, 2)
-    residual = (plumb - read) @ flat
-    slope = np.empty((count, frames, 2, n))
-    # a turn about an axis moves the reading by axis x reading
-    slope[..., :3] = np.tensordot(read, np.cross(model.turns.T, flat.T[:, None]), (2, 2))
-    moved = model.seen_across[now.start].reshape(count, 2 * frames, 3) @ (now.a3.swapaxes(1, 2) @ flat)
-    slope[..., 3:5] = -moved.reshape(count, 2, frames, 2).transpose(0, 2, 3, 1) / length[:, None, None, None]
-    slope[..., 5:] = model.columns
-    off = (residual + np.tensordot(now.p[:, 5:], model.columns, (1, 2))) / model.spread[:, None]
-    prior = np.sum((now.p / model.prior_sigma) ** 2, axis=1)
-    cost = (robust(off).sum((1, 2)) + prior) / 2
-    return _Slopes(residual=residual, slope=slope, off=off, cost=cost)
+class _Fits:
+    """What all starts of a fit share, and what each begins with.
 
+    turns (3, 3): axes in S, two across the plumb line and it.  columns (K, 2, M): as Readings', across the plumb line.
+    prior_sigma (n,): of A3's turns (3), the zenith's moves (2) and the columns (M).
+    zenith (T, 3), across (T, 2, 3): of each start, in ITRS.  seen_across (T, 2, K, 3): `across` in the camera.
+    """
 
-def _design(model: _Model, slopes: _Slopes) -> tuple[np.ndarray, np.ndarray]:
-    """Weighted design (T, 2 K, n) in units of the prior, and weighted residuals (T, 2 K) in sigma."""
-    off = slopes.off.reshape(len(slopes.off), -1)
-    weight = huber(off)
-    # the prior's own units keep the loose and the tight of one size
-    scaled = slopes.slope.reshape(*off.shape, -1) * model.prior_sigma
-    return scaled * (weight / np.repeat(model.spread, 2))[..., None], off * weight
+    def __init__(
+        self,
+        readings: Readings,
+        starts: np.ndarray,
+        turn_sigma: float,
+        turned: np.ndarray | float,
+        known: np.ndarray | None,
+        zenith_sigma: float,
+    ) -> None:
+        to_camera, mean = readings.to_camera, readings.mean_plumb
+        if known is None:
+            zenith = np.einsum("kji,tlj,kl->ti", to_camera, starts, readings.plumb)
+        else:
+            zenith = np.tile(known, (len(starts), 1))
+        loose = UNKNOWN_ARCSEC[0] * ARCSEC
+        sigma = [loose, loose, turn_sigma, zenith_sigma, zenith_sigma, *readings.column_sigma]
+        self.readings, self.spread, self.prior_sigma = readings, readings.spread, np.array(sigma)
+        self.turns = np.vstack([np.linalg.svd(mean[None])[2][1:], mean]).T
+        self.columns = -np.einsum("kim,ij->kjm", readings.columns, self.turns[:, :2])
+        self.zenith = rotation.normalised(zenith)
+        self.across = np.linalg.svd(self.zenith[:, None])[2][:, 1:]
+        self.seen_across = np.einsum("kij,tdj->tdki", to_camera, self.across)
+        p = np.zeros((len(starts), len(sigma)))
+        p[:, 2] = turned
+        self.begin = _State(starts, self.zenith, p, np.arange(len(starts)))
 
+    def found(self) -> list[PlumbLine]:
+        """The answer from each start."""
+        now = self.begin
+        best = np.full(len(now.start), np.inf)
+        answer = _State(now.a3.copy(), now.up.copy(), now.p.copy(), now.start)
+        for _ in range(MAX_STEPS):
+            _, slope, off, cost = self._slopes(now)
+            # if the headings hardly differ, later steps may lead away again
+            better = cost < best[now.start]
+            rows = now.start[better]
+            best[rows] = cost[better]
+            answer.a3[rows], answer.up[rows], answer.p[rows] = now.a3[better], now.up[better], now.p[better]
+            now = self._stepped(now, slope, off)
+            if not len(now.start):
+                break
+        residual, slope, off, cost = self._slopes(answer)
+        scaled = self._design(slope, off)[0]
+        return [
+            self._plumb_line(answer, t, residual[t], slope[t], scaled[t], float(cost[t]))
+            for t in range(len(best))
+        ]
 
-def _step(model: _Model, slopes: _Slopes, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Gauss-Newton steps (T, n), none longer than LONGEST_STEP, and how much (T,) a whole one would lower chi-square."""
-    design, off = _design(model, slopes)
-    transposed = design.swapaxes(1, 2)
-    pull = (transposed @ off[..., None])[..., 0] + p / model.prior_sigma
-    normal = transposed @ design + np.eye(design.shape[2])
-    moved = np.linalg.solve(normal, pull[..., None])[..., 0]
-    step = -model.prior_sigma * moved
-    longest = np.linalg.norm(step[:, :5], axis=1, keepdims=True)
-    return step * LONGEST_STEP / np.maximum(longest, LONGEST_STEP), np.sum(moved * pull, axis=1)
+    def _slopes(self, now: _State) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """At T states the residuals (T, K, 2) in rad without the columns, their derivatives (T, K, 2, n), the residuals
+        with them in sigma, and the costs (T,).
+        """
+        plumb, flat = self.readings.plumb, self.turns[:, :2]
+        count, frames, n = len(now.start), len(plumb), len(self.prior_sigma)
+        length = np.linalg.norm(now.up, axis=1)
+        seen = np.tensordot(now.up / length[:, None], self.readings.to_camera, (1, 2))
+        read = seen @ now.a3.swapaxes(1, 2)
+        residual = (plumb - read) @ flat
+        slope = np.empty((count, frames, 2, n))
+        # a turn about an axis moves the reading by axis x reading
+        slope[..., :3] = np.tensordot(read, np.cross(self.turns.T, flat.T[:, None]), (2, 2))
+        moved = self.seen_across[now.start].reshape(count, 2 * frames, 3) @ (now.a3.swapaxes(1, 2) @ flat)
+        slope[..., 3:5] = (
+            -moved.reshape(count, 2, frames, 2).transpose(0, 2, 3, 1) / length[:, None, None, None]
+        )
+        slope[..., 5:] = self.columns
+        off = (residual + np.tensordot(now.p[:, 5:], self.columns, (1, 2))) / self.spread[:, None]
+        prior = np.sum((now.p / self.prior_sigma) ** 2, axis=1)
+        return residual, slope, off, (robust(off).sum((1, 2)) + prior) / 2
 
+    def _design(self, slope: np.ndarray, off: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Weighted design (T, 2 K, n) in units of the prior, and weighted residuals (T, 2 K) in sigma."""
+        off = off.reshape(len(off), -1)
+        weight = huber(off)
+        # the prior's own units keep the loose and the tight of one size
+        scaled = slope.reshape(*off.shape, -1) * self.prior_sigma
+        return scaled * (weight / np.repeat(self.spread, 2))[..., None], off * weight
 
-def _stepped(model: _Model, now: _State, step: np.ndarray) -> _State:
-    turned = np.array([rotation.from_vector(model.turns @ s) for s in step[:, :3]]) @ now.a3
-    p = now.p + step
-    moved = np.einsum("td,tdi->ti", p[:, 3:5], model.across[now.start])
-    return _State(a3=turned, up=model.zenith[now.start] + moved, p=p, start=now.start)
+    def _stepped(self, now: _State, slope: np.ndarray, off: np.ndarray) -> _State:
+        """The fits after a Gauss-Newton step of at most LONGEST_STEP, without those that have settled."""
+        design, weighted = self._design(slope, off)
+        transposed = design.swapaxes(1, 2)
+        pull = (transposed @ weighted[..., None])[..., 0] + now.p / self.prior_sigma
+        normal = transposed @ design + np.eye(design.shape[2])
+        moved = np.linalg.solve(normal, pull[..., None])[..., 0]
+        step = -self.prior_sigma * moved
+        longest = np.linalg.norm(step[:, :5], axis=1, keepdims=True)
+        step *= LONGEST_STEP / np.maximum(longest, LONGEST_STEP)
+        # by how much a whole one would lower chi-square
+        go = np.sum(moved * pull, axis=1) >= SETTLED_CHI2
+        step, p, start = step[go], now.p[go] + step[go], now.start[go]
+        turned = np.array([rotation.from_vector(self.turns @ s) for s in step[:, :3]]).reshape(-1, 3, 3)
+        up = self.zenith[start] + np.einsum("td,tdi->ti", p[:, 3:5], self.across[start])
+        return _State(turned @ now.a3[go], up, p, start)
 
-
-def _plumb_line(model: _Model, answer: _State, slopes: _Slopes, t: int) -> PlumbLine:
-    """The answer from start t."""
-    readings, turns, prior_sigma, p = model.readings, model.turns, model.prior_sigma, answer.p[t]
-    scaled = _design(model, slopes)[0][t]
-    normal = scaled.T @ scaled + np.eye(len(prior_sigma))
-    whole = np.outer(prior_sigma, prior_sigma) * np.linalg.inv(normal)
-    # without the turn about the plumb line, which may be as good as unknown
-    told = np.delete(np.arange(len(prior_sigma)), 2)
-    given_turn = np.outer(prior_sigma[told], prior_sigma[told]) * np.linalg.inv(normal[np.ix_(told, told)])
-    response = slice(5 + readings.response.start, 5 + readings.response.stop)
-    cost = float(slopes.cost[t])
-    return PlumbLine(
-        a3=answer.a3[t],
-        covariance=symmetric(turns @ whole[:3, :3] @ turns.T),
-        zenith=rotation.normalised(answer.up[t]),
-        zenith_sigma=float(np.sqrt(np.linalg.eigvalsh(given_turn[2:4, 2:4])[-1])),
-        cost=cost,
-        scatter=2 * cost / max(2 * len(model.spread) - 5, 1),
-        left=slopes.residual[t] + model.columns @ p[5:],
-        response=p[response],
-        response_covariance=symmetric(whole[response, response]),
-        residual=slopes.residual[t],
-        design=slopes.slope[t],
-        prior_sigma=prior_sigma,
-        turns=turns,
-        across=model.across[t],
-    )
+    def _plumb_line(
+        self, answer: _State, t: int, residual: np.ndarray, slope: np.ndarray, scaled: np.ndarray, cost: float
+    ) -> PlumbLine:
+        """The answer from start t."""
+        readings, turns, prior_sigma, p = self.readings, self.turns, self.prior_sigma, answer.p[t]
+        normal = scaled.T @ scaled + np.eye(len(prior_sigma))
+        whole = np.outer(prior_sigma, prior_sigma) * np.linalg.inv(normal)
+        # without the turn about the plumb line, which may be as good as unknown
+        told = np.delete(np.arange(len(prior_sigma)), 2)
+        given_turn = np.outer(prior_sigma[told], prior_sigma[told]) * np.linalg.inv(
+            normal[np.ix_(told, told)]
+        )
+        response = slice(5 + readings.response.start, 5 + readings.response.stop)
+        return PlumbLine(
+            a3=answer.a3[t],
+            covariance=symmetric(turns @ whole[:3, :3] @ turns.T),
+            zenith=rotation.normalised(answer.up[t]),
+            zenith_sigma=float(np.sqrt(np.linalg.eigvalsh(given_turn[2:4, 2:4])[-1])),
+            cost=cost,
+            scatter=2 * cost / max(2 * len(self.spread) - 5, 1),
+            left=residual + self.columns @ p[5:],
+            response=p[response],
+            response_covariance=symmetric(whole[response, response]),
+            residual=residual,
+            design=slope,
+            prior_sigma=prior_sigma,
+            turns=turns,
+            across=self.across[t],
+        )
 
 
 ROBUST_ROUNDS = 10

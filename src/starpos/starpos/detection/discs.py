@@ -14,8 +14,9 @@ from starpos.frames.frame import Disc
 # Frames are searched at steps of their shorter side over this, px, or of 2. Minimum radius, px, and number of bright
 # groups that are tried.
 COARSE, LEAST_PX, TRIED = 800, 4.0, 4
-# The dark part of a frame is at this percentile; a disc is higher by this share of the brightest, and that many sigma.
-DARK, CONTRAST, CLEAR = 20.0, 0.3, 20.0
+# The dark part of a frame is at this percentile of some rows and columns; a disc is higher by this share of the top,
+# and that many sigma.
+SOME, DARK, CONTRAST, CLEAR = 80, 20.0, 0.3, 20.0
 # Directions from a bright group's middle, in each of which its edge is looked for.
 RAYS = 360
 # Minimum slope of an edge, as a share of the disc's height a px, and of the steepest of its direction.
@@ -52,15 +53,16 @@ def find_disc(plane: np.ndarray) -> Disc | None:
     step = max(2, min(plane.shape) // COARSE)
     if min(plane.shape) < 16 * step:
         return None
-    # without single hot pixels
-    small = cv2.medianBlur(np.ascontiguousarray(plane[::step, ::step]), 3)
-    some = small[::4, ::4].astype(float)
-    dark, top = float(np.percentile(some, DARK)), float(small.max())
+    # what is narrower than three of these pixels, as stars and hot pixels are, leaves nothing
+    wide = cv2.erode(np.ascontiguousarray(plane[::step, ::step]), np.ones((3, 3), np.uint8))
+    every = max(1, min(wide.shape) // SOME)
+    some = wide[::every, ::every].astype(float)
+    dark, top = float(np.percentile(some, DARK)), float(wide.max())
     noise = float(np.median(np.abs(np.diff(some, axis=1)))) + 1.0
     height = top - dark
     if height < max(CONTRAST * top, CLEAR * noise):
         return None
-    groups = _groups(small, dark + 0.5 * height, step)
+    groups = _groups(wide, dark + 0.5 * height, step)
     for middle, extent in groups:
         if (disc := _limb(plane, middle, extent, dark, height)) is not None:
             break
@@ -68,12 +70,13 @@ def find_disc(plane: np.ndarray) -> Disc | None:
         disc = _alone(plane, groups, dark, height)
         if disc is None:
             # in a bright sky the Sun's glow is no group of its own, but what is saturated is
-            disc = _alone(plane, _groups(small, dark + HEIGHTS[0] * height, step), dark, height)
-    return None if disc is None else replace(disc, other=_fainter(plane, small, step, disc))
+            disc = _alone(plane, _groups(wide, dark + HEIGHTS[0] * height, step), dark, height)
+    return None if disc is None else replace(disc, other=_fainter(plane, step, disc))
 
 
-def _fainter(plane: np.ndarray, small: np.ndarray, step: int, first: Disc) -> Disc | None:
+def _fainter(plane: np.ndarray, step: int, first: Disc) -> Disc | None:
     """The Moon by day: a second, fainter disc with a limb, far from the first; None without."""
+    small = cv2.medianBlur(np.ascontiguousarray(plane[::step, ::step]), 3)
     wide = 2 * (min(small.shape) // MOON_SHARE) + 1
     # what is narrower than the Moon at its widest, on the sky's own light
     above = cv2.morphologyEx(small, cv2.MORPH_TOPHAT, np.ones((wide, wide), np.uint8)).astype(np.float32)
@@ -84,7 +87,7 @@ def _fainter(plane: np.ndarray, small: np.ndarray, step: int, first: Disc) -> Di
     ] = 0
     if (height := float(above.max())) < FAINT * noise:
         return None
-    for middle, extent in _groups(above, 0.5 * height, step):
+    for middle, extent in _groups(cv2.erode(above, np.ones((3, 3), np.uint8)), 0.5 * height, step):
         around = small[tuple(slice(max(0, int(v / step - wide)), int(v / step + wide)) for v in middle[::-1])]
         sky = float(np.median(around))
         disc = _limb(plane, middle, extent, sky, height)
@@ -93,13 +96,10 @@ def _fainter(plane: np.ndarray, small: np.ndarray, step: int, first: Disc) -> Di
     return None
 
 
-def _groups(small: np.ndarray, level: float, step: int) -> list[tuple[np.ndarray, float]]:
+def _groups(wide: np.ndarray, level: float, step: int) -> list[tuple[np.ndarray, float]]:
     """Middles (2,) px and extents, px, of the largest groups of pixels above a level, of a plane reduced by a step."""
-    bright = (small > small.dtype.type(level)).view(np.uint8)
-    # what stars leave is nothing
-    outlines, _ = cv2.findContours(
-        cv2.erode(bright, np.ones((3, 3), np.uint8)), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE
-    )
+    bright = (wide > wide.dtype.type(level)).view(np.uint8)
+    outlines, _ = cv2.findContours(bright, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     groups = []
     for left, top_row, width, rows in map(cv2.boundingRect, sorted(outlines, key=len, reverse=True)[:TRIED]):
         middle = np.array([left + (width - 1) / 2, top_row + (rows - 1) / 2])

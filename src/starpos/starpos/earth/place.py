@@ -11,7 +11,7 @@ from starpos.earth.ellipsoid import curvature_radii_m, enu_axes, zenith_of
 from starpos.earth.vertical import Deflection, Vertical, astronomic, geodetic
 from starpos.errors import PlaceError
 from starpos.frozen import at_once
-from starpos.rotation import half_turn
+from starpos.rotation import about_axis, half_turn
 from starpos.units import ARCSEC
 
 # a survey mark's place is known to less than a millimetre of up
@@ -135,6 +135,12 @@ class Place:
     def plumb_axes(self) -> np.ndarray:
         """Rotation (3, 3) of ITRS into east, north, up by the plumb line."""
         return enu_axes(*self.plumb)
+
+    @property
+    def to_geodetic_north(self) -> np.ndarray:
+        """Rotation (3, 3) about up from the plumb line's north to the ellipsoid's."""
+        north = self.axes @ self.plumb_axes[1]
+        return about_axis(2, -math.atan2(north[0], north[1]))
 
     @property
     def zenith_root(self) -> np.ndarray:

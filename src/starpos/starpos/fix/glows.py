@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Glows one after another: a lamp stands still in a camera at rest while the Sun moves on."""
+"""Glows one after another: a lamp stands still in a camera at rest while the Sun moves on, which alone proves it."""
 
 import math
 from collections import deque
@@ -10,8 +10,9 @@ import numpy as np
 from starpos import rotation
 from starpos.frozen import at_once
 
-# The Sun has moved on from this many sigma of two glows; what has moved by less than this share of its way stands still.
-MOVED_SIGMAS, STILL = 8.0, 0.5
+# Minimum way of the Sun, and maximum way of a glow that stands still, in sigma of two glows; minimum share of the Sun's
+# way by which a glow moves.
+MOVED_SIGMAS, STILL_SIGMAS, STILL = 8.0, 4.0, 0.5
 # Minimum interval (s) between the glows that later ones are compared with, and their maximum number.
 APART_S, KEPT = 60.0, 60
 
@@ -30,9 +31,10 @@ class Glow:
     sigma: float
 
     def stood_still(self, later: "Glow") -> bool | None:
-        """Whether the spot has kept its place in the camera while the Sun moved; None as long as that is too little."""
+        """Whether the spot has kept its place in the camera while the Sun moved; None while either is too little."""
         went, moved = _angle(self.itrs, later.itrs), _angle(self.ray, later.ray)
-        if went < MOVED_SIGMAS * math.hypot(self.sigma, later.sigma):
+        sigma = math.hypot(self.sigma, later.sigma)
+        if went < MOVED_SIGMAS * sigma or STILL_SIGMAS * sigma < moved < STILL * went:
             return None
         return moved < STILL * went
 
@@ -47,9 +49,12 @@ class Glows:
     def __init__(self) -> None:
         self._kept: deque[Glow] = deque(maxlen=KEPT)
 
-    def still_since(self, glow: Glow) -> float | None:
-        """Take the next glow; since when (Unix s) it has stood still while the Sun moved on; None if it has not."""
-        begun = next((g.utc_unix_s for g in self._kept if g.stood_still(glow)), None)
+    def before(self, glow: Glow) -> tuple[bool | None, float]:
+        """Take the next glow; whether it has stood still while the Sun moved on, and since when (Unix s).
+
+        None where no glow before it shows that.
+        """
+        found = [(still, g.utc_unix_s) for g in self._kept if (still := g.stood_still(glow)) is not None]
         if not self._kept or abs(glow.utc_unix_s - self._kept[-1].utc_unix_s) >= APART_S:
             self._kept.append(glow)
-        return begun
+        return next((one for one in found if one[0]), found[0] if found else (None, math.nan))

@@ -164,20 +164,37 @@ class Solution:
         return cls(Status.BAD_INPUT, str(error), source=source, utc_unix_s=None, stars_detected=0)
 
     def beside(self, glows: Glows) -> "Solution":
-        """The solution after the glows before it: refused if its own is a lamp's, which stands still."""
-        if self.glow is None or (since := glows.still_since(self.glow)) is None:
+        """The solution after the glows before it: refused unless its own has moved as the Sun does."""
+        if self.glow is None:
             return self
-        return self.as_lamp(since)
+        still, since_unix_s = glows.before(self.glow)
+        return self.unproven() if still is None else self.as_lamp(since_unix_s) if still else self
 
     def as_lamp(self, since_unix_s: float) -> "Solution":
         """The solution of a frame whose glow has stood still since then, or until then, while the Sun moved on."""
-        if self.status is not Status.OK or not self.bodies:
-            return self
-        message = (
-            f"{self.source}: its bright spot stands where it stood at {utc_text(since_unix_s)}, and the Sun has moved on "
-            "in between: it is a lamp or a reflection, or the camera follows the Sun"
+        return self._no_sun(
+            f"its bright spot stands where it stood at {utc_text(since_unix_s)}, and the Sun has moved on in between: it "
+            "is a lamp or a reflection, or the camera follows the Sun"
         )
-        return replace(self, status=Status.POOR_FIT, message=message, at_place=None, circle=None, bodies=())
+
+    def unproven(self) -> "Solution":
+        """The solution of a frame whose glow has not been seen to move as the Sun does."""
+        return self._no_sun(
+            "its bright spot may be the Sun, or a lamp that stands as high: give a further frame, some minutes later, "
+            "which shows whether it moves"
+        )
+
+    def _no_sun(self, message: str) -> "Solution":
+        if self.status is not Status.OK or self.glow is None:
+            return self
+        return replace(
+            self,
+            status=Status.POOR_FIT,
+            message=f"{self.source}: {message}",
+            at_place=None,
+            circle=None,
+            bodies=(),
+        )
 
     def among(self, stars: Stars, rows: np.ndarray) -> "Solution":
         """The solution of `stars` that is found by the stars in `rows` (n,) alone."""

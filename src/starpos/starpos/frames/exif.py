@@ -2,7 +2,8 @@
 """What a camera writes into its own files (EXIF 2.31): time, exposure, focal length, and how well they are known.
 
 `Exif` reads the tags of any picture or raw file, one fact a property, and `read_exposure` makes an Exposure of them. A
-new fact is a new property there, and a field of Exposure. `SensorGrid` says which pixels of the sensor a picture shows.
+new fact is a new property there, and a field of Exposure. Rows and columns are the sensor's in every format, however the
+camera was held: what turns a picture for the eye (EXIF's Orientation, the boxes irot and imir of HEIF) is not applied.
 
 A camera's clock is set by hand to the time of some zone, and often shows whole seconds only. So its time is used only if
 a person has said how good the clock is (CameraClock).
@@ -63,41 +64,6 @@ class CameraClock:
             raise TimeError(f"a camera's clock is known to {self.stddev_s:g} s: give 0 to 86400 s")
 
 
-@dataclass(frozen=True)
-class SensorGrid:
-    """How a picture of width x height px lies on the pixels of the sensor that took it.
-
-    made_px  sides (px) of the picture as the camera made it, the longer one first; 0: not stated
-
-    Rows and columns are the sensor's in every format, however the camera was held: what turns a picture for the eye
-    (EXIF's Orientation, the boxes irot and imir of HEIF) is not applied.
-    """
-
-    width: int
-    height: int
-    made_px: tuple[float, float] = (0.0, 0.0)
-
-    @property
-    def diagonal_px(self) -> float:
-        return math.hypot(self.width, self.height)
-
-    @property
-    def scale(self) -> float:
-        """Length of a side, px, over its length in the picture that the camera made; 1 if its size is not stated."""
-        return max(self.width, self.height) / self.made_px[0] if self.made_px[0] else 1.0
-
-    @property
-    def is_cropped(self) -> bool:
-        """Whether the picture has another shape than the one that the camera made, in either orientation."""
-        longer, shorter = self.made_px
-        if not shorter:
-            return False
-        return (
-            abs(shorter / longer * max(self.width, self.height) / min(self.width, self.height) - 1)
-            > SAME_SHAPE
-        )
-
-
 # a date and time in the name of a file, as all-sky cameras have them: image-20260930224951.jpg, 2019-07-29T204726.tiff;
 # it may be of the start or the end of an exposure of up to a minute
 NAMED_TIME = re.compile(
@@ -144,11 +110,26 @@ class Exif:
         value = getattr(self.tags.get(name), "values", "")
         return value.replace("\0", " ").strip() if isinstance(value, str) else ""
 
+    def sexagesimal(self, name: str) -> float:
+        """A GPS tag of degrees or hours, minutes and seconds as one number; NaN without one."""
+        try:
+            whole, minutes, seconds = (value.num / value.den for value in self.tags[f"GPS GPS{name}"].values)
+        except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError):
+            return math.nan
+        return whole + minutes / 60 + seconds / 3600
+
     @property
-    def sensor(self) -> SensorGrid:
-        """How the picture lies on the sensor, by ExifImageWidth and ExifImageLength."""
+    def made_px(self) -> tuple[float, float]:
+        """Sides (px) of the picture as the camera made it, the shorter one first; 0: not stated."""
         shorter, longer = sorted(self.number(name) or 0.0 for name in ("ExifImageWidth", "ExifImageLength"))
-        return SensorGrid(self.width, self.height, (longer, shorter))
+        return shorter, longer
+
+    @property
+    def is_cropped(self) -> bool:
+        """Whether the picture has another shape than the one that the camera made, in either orientation."""
+        shorter, longer = self.made_px
+        shape = max(self.width, self.height) / min(self.width, self.height)
+        return shorter > 0 and abs(shorter / longer * shape - 1) > SAME_SHAPE
 
     @property
     def exposure_s(self) -> float | None:
@@ -161,13 +142,15 @@ class Exif:
         """About the focal length in px: FocalLengthIn35mmFilm, else FocalLength and FocalPlaneXResolution."""
         film_mm, focal_mm = self.number("FocalLengthIn35mmFilm"), self.number("FocalLength")
         per_unit, unit = (self.number(f"FocalPlane{name}") for name in ("XResolution", "ResolutionUnit"))
-        sensor, focal_px = self.sensor, None
+        diagonal_px, focal_px = math.hypot(self.width, self.height), None
         if film_mm is not None:
-            focal_px = film_mm / FILM_MM * sensor.diagonal_px
+            focal_px = film_mm / FILM_MM * diagonal_px
         elif focal_mm is not None and per_unit is not None:
             # the resolution is of the picture as the camera made it, which may have been reduced since
-            focal_px = focal_mm * per_unit / UNITS_MM.get(int(unit or 2), UNITS_MM[2]) * sensor.scale
-        if focal_px is None or not SHORTEST * sensor.diagonal_px < focal_px < LONGEST * sensor.diagonal_px:
+            longer_px = max(self.width, self.height)
+            scale = longer_px / (self.made_px[1] or longer_px)
+            focal_px = focal_mm * per_unit / UNITS_MM.get(int(unit or 2), UNITS_MM[2]) * scale
+        if focal_px is None or not SHORTEST * diagonal_px < focal_px < LONGEST * diagonal_px:
             return None
         return focal_px
 
@@ -179,19 +162,11 @@ class Exif:
     @property
     def gps_deg(self) -> tuple[float, float] | None:
         """GPSLatitude and GPSLongitude, deg on WGS 84, north and east positive."""
-        place = []
-        for name, minus, most in (("Latitude", "S", 90), ("Longitude", "W", 180)):
-            try:
-                whole, minutes, seconds = (
-                    value.num / value.den for value in self.tags[f"GPS GPS{name}"].values
-                )
-            except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError):
-                return None
-            deg = whole + minutes / 60 + seconds / 3600
-            place.append(-deg if self.text(f"GPS GPS{name}Ref").upper() == minus else deg)
-            if not 0 <= deg <= most:
-                return None
-        return place[0], place[1]
+        latitude, longitude = self.sexagesimal("Latitude"), self.sexagesimal("Longitude")
+        if not (0 <= latitude <= 90 and 0 <= longitude <= 180):
+            return None
+        south, west = (self.text(f"GPS GPS{name}Ref").upper() for name in ("Latitude", "Longitude"))
+        return latitude * (-1 if south == "S" else 1), longitude * (-1 if west == "W" else 1)
 
     @property
     def clock_stddev_s(self) -> float:
@@ -209,16 +184,12 @@ class Exif:
         """GPSDateStamp and GPSTimeStamp, UTC of the last fix, as a Unix time."""
         if self.is_stamped_late:
             return None
+        hours = self.sexagesimal("TimeStamp")
         try:
-            day = datetime.strptime(str(self.tags["GPS GPSDate"].values).strip("\0 "), "%Y:%m:%d")
-            hours, minutes, seconds = (
-                value.num / value.den for value in self.tags["GPS GPSTimeStamp"].values
-            )
-        except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError):
+            day = datetime.strptime(self.text("GPS GPSDate"), "%Y:%m:%d")
+        except ValueError:
             return None
-        if not (0 <= hours < 24 and 0 <= minutes < 60 and 0 <= seconds <= 60):
-            return None
-        return day.replace(tzinfo=timezone.utc).timestamp() + 3600 * hours + 60 * minutes + seconds
+        return day.replace(tzinfo=timezone.utc).timestamp() + 3600 * hours if 0 <= hours <= 24 else None
 
     def ahead_of_utc_s(self, clock: CameraClock) -> float | None:
         """Time in s by which the camera's clock was ahead of UTC, by the user or by OffsetTimeOriginal."""
@@ -289,7 +260,7 @@ def read_exposure(data: bytes, place: str, clock: CameraClock | None, shape: tup
         exposure_s=exif.exposure_s,
         rough_focal_px=exif.rough_focal_px,
         fisheye=exif.is_fisheye,
-        origin_px=(math.nan, math.nan) if exif.sensor.is_cropped else None,
+        origin_px=(math.nan, math.nan) if exif.is_cropped else None,
     )
     if clock is None:
         return exposure

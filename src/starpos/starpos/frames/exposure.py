@@ -132,6 +132,8 @@ class Exposure:
     unlevelled      why gravity is None, for messages
     upper_edge      direction in C of the edge that was up, (0, 0) if unknown, of a telephone's picture; None: of others
     site_cards      the cards of its header that state a site, for messages; never used for a place; '': none
+    aim_deg         right ascension and declination to which its header says that it was pointed; only a hint; None: not
+                    stated
     gps_deg         latitude and longitude by GPS in its file, WGS 84; compared with a fix, never used; None: not stated
 
     FrameError if a time, a standard deviation or the focal length is an impossible number.
@@ -154,6 +156,7 @@ class Exposure:
     upper_edge: tuple[int, int] | None = None
     gps_deg: tuple[float, float] | None = None
     site_cards: str = ""
+    aim_deg: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         place = self.place

@@ -109,9 +109,11 @@ PLATE_SCALES = ("SCALE", "PIXSCALE", "SECPIX1")
 LEAST = 1e-9
 # latitude and longitude of a site, deg: programs differ in the sign of the longitude
 SITES = (("SITELAT", "SITELONG"), ("LAT-OBS", "LONG-OBS"), ("OBSGEO-B", "OBSGEO-L"))
+# right ascension and declination of a pointing
+AIMS = (("RA", "DEC"), ("OBJCTRA", "OBJCTDEC"), ("TELRA", "TELDEC"))
 KEYS = (
     *TIME_KEYS,
-    *(key for keys in SITES for key in keys),
+    *(key for keys in (*SITES, *AIMS) for key in keys),
     *(key for keys, _ in CROPS for key in keys),
     *LTM,
     *PLATE_SCALES,
@@ -137,7 +139,35 @@ def read_exposure(header: Mapping, place: str, comments: Mapping[str, str] = NO_
         shutter=shutter(header, place),
         origin_px=origin_px(header),
         site_cards=site_cards(header),
+        aim_deg=aim_deg(header),
     )
+
+
+def aim_deg(header: Mapping) -> tuple[float, float] | None:
+    """Right ascension and declination (deg) to which a header says that the telescope was pointed; None without.
+
+    A number is in deg, a text with colons or blanks in h m s and in deg ' ".
+    """
+    for keys in AIMS:
+        found = [_sexagesimal(header.get(key)) for key in keys]
+        if None not in found:
+            (ra, in_hours), (dec, _) = found
+            if 0 <= (ra := ra * 15 if in_hours else ra) <= 360 and abs(dec) <= 90:
+                return ra, dec
+    return None
+
+
+def _sexagesimal(value: Any) -> tuple[float, bool] | None:
+    """A number, and whether it was written in three parts; None for any other text."""
+    parts = re.split(r"[: hdms]+", str(value).strip(" hdms"))
+    try:
+        sizes = [abs(float(part)) for part in parts]
+    except ValueError:
+        return None
+    size = sum(part / 60**k for k, part in enumerate(sizes))
+    if not math.isfinite(size):
+        return None
+    return -size if parts[0].startswith("-") else size, len(parts) > 1
 
 
 def site_cards(header: Mapping) -> str:

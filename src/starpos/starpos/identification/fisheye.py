@@ -30,7 +30,7 @@ from starpos.identification.evidence import (
     OnFrame,
 )
 from starpos.identification.pose import Pose, close_pairs, mutual_nearest, stars_at
-from starpos.identification.prior import PlumbPrior, PointingPrior
+from starpos.identification.prior import AimPrior, PlumbPrior, PointingPrior
 from starpos.identification.sky import Sky
 from starpos.instrument.camera import EQUIDISTANT, Camera
 from starpos.sky.catalogue import Catalogue, rows_near
@@ -104,13 +104,16 @@ class Part:
         """The stars on the frame of the part's camera."""
         return stars_at(self.camera, self.camera.project(self.directions), self.sigma_px)
 
-    def turned(self, priors: Sequence[PointingPrior | PlumbPrior]) -> tuple[PointingPrior | PlumbPrior, ...]:
-        """Priors of the frame, turned into this part."""
+    def turned(
+        self, priors: Sequence[PointingPrior | PlumbPrior | AimPrior]
+    ) -> tuple[PointingPrior | PlumbPrior, ...]:
+        """Priors of the frame, turned into this part, without those that a fisheye does not have."""
         return tuple(
             replace(p, attitude=self.turn @ p.attitude)
             if isinstance(p, PointingPrior)
             else replace(p, zenith_camera=self.turn @ p.zenith_camera)
             for p in priors
+            if not isinstance(p, AimPrior)
         )
 
 

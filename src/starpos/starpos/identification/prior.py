@@ -12,7 +12,7 @@ from starpos.earth.ellipsoid import zenith_of
 from starpos.earth.orientation import EarthState
 from starpos.frozen import at_once
 from starpos.identification._frame import FrameStars
-from starpos.identification.evidence import SCALE_TOLERANCE, Identification, OnFrame, Prior
+from starpos.identification.evidence import MIRRORED, SCALE_TOLERANCE, Identification, OnFrame, Prior
 from starpos.identification.pose import MATCH_SIGMA, Pose, directions
 from starpos.identification.sky import Sky
 from starpos.units import ARCSEC
@@ -154,6 +154,100 @@ class PlumbPrior:
             scale = abs(np.log(pose.focal_px / field.focal_px))
             possible = off < reach and scale < SCALE_TOLERANCE and not pose.mirrored
             return log_density if possible else -math.inf
+
+        return Prior(density, np.append(np.full(3, np.cbrt(rotations)), 2 * SCALE_TOLERANCE))
+
+
+# Half of the headers' focal lengths are right to this share, half of their pointings to USUALLY_RAD; none is looked for
+# beyond AIMED_RAD. The stars of fields that reach beyond WIDEST_AIMED_RAD from their middle do not lie in a plane.
+# Numbers of brightest stars: of a frame, whose pairs show poses and whose places judge them; of the catalogue, for each
+# area of a frame and in all.
+USUAL_SCALE = 0.01
+USUALLY_RAD, AIMED_RAD, WIDEST_AIMED_RAD = np.radians([0.3, 1.0, 4.0]).tolist()
+AIMED_PAIRS, AIMED_STARS, CATALOGUE_STARS, MOST_STARS = 8, 40, 10, 120
+
+
+@at_once
+@dataclass(frozen=True)
+class AimPrior:
+    """The direction (3,), among `Sky`'s, of the middle of a frame to within AIMED_RAD, at any roll."""
+
+    toward: np.ndarray
+
+    def attempts(self, field: FrameStars, sky: Sky, log_share: float) -> Iterator[Attempt]:
+        """Yield the poses by which most of the brightest stars lie near bright stars of the catalogue."""
+        half_rad = float(np.hypot(*field.half)) / field.focal_px
+        if half_rad > WIDEST_AIMED_RAD:
+            return
+        reach_rad = AIMED_RAD + half_rad
+        frames = math.pi * (reach_rad * field.focal_px) ** 2 / (4 * field.half.prod())
+        near = sky.catalogue.cone(self.toward, reach_rad)[: min(int(CATALOGUE_STARS * frames), MOST_STARS)]
+        axes = _frame_about(self.toward)
+        at = sky.directions(near) @ axes.T
+        # the sky's plane as complex numbers, px; a pose multiplies by `turn` and adds `shift`
+        plane = field.focal_px * (at[:, 0] + 1j * at[:, 1]) / at[:, 2]
+        radius_px = np.hypot(MATCH_SIGMA * field.sigma, ERROR_PX)
+        prior = self._known(field, log_share)
+        for mirrored in (False, True):
+            seen = field.xy[int(mirrored), :AIMED_STARS] @ [1, 1j]
+            for turn, shift in self._most_matched(seen, plane, field):
+                z = -shift / turn / field.focal_px
+                x = np.array([z.real, z.imag, 1.0])
+                right = np.array([(1 / turn).real, (1 / turn).imag, 0.0])
+                out = x / np.linalg.norm(x)
+                right -= out * (out @ right)
+                right /= np.linalg.norm(right)
+                attitude = np.stack([right, np.cross(out, right), out]) @ axes
+                yield Pose(attitude, field.focal_px * abs(turn), mirrored), radius_px, prior
+
+    def _most_matched(
+        self, seen: np.ndarray, plane: np.ndarray, field: FrameStars
+    ) -> list[tuple[complex, complex]]:
+        """Turns and shifts by which most stars are seen, of all pairs of seen stars and of the catalogue's."""
+        one, other = np.triu_indices(min(len(seen), AIMED_PAIRS), 1)
+        first, second = np.nonzero(~np.eye(len(plane), dtype=bool))
+        # of two detections, or stars, in one place
+        with np.errstate(divide="ignore", invalid="ignore"):
+            turn = (seen[one] - seen[other])[:, None] / (plane[first] - plane[second])
+            alike = np.abs(np.log(np.abs(turn))) < SCALE_TOLERANCE
+        shift = seen[one][:, None] - turn * plane[first]
+        off = np.abs(shift - field.middle @ [1, 1j]) / field.focal_px
+        turn, shift = (v[alike & (off < AIMED_RAD)] for v in (turn, shift))
+        # cells of the frame in which a star is seen, and the next ones
+        low = field.middle - field.half - 2 * AGREE_PX
+        size = (2 * field.half / AGREE_PX).astype(int) + 5
+        cells = np.zeros(size, bool)
+        column, row = ((np.array([seen.real, seen.imag]) - low[:, None]) / AGREE_PX).astype(int)
+        for across, down in np.ndindex(3, 3):
+            cells[np.clip(column + across - 1, 0, size[0] - 1), np.clip(row + down - 1, 0, size[1] - 1)] = (
+                True
+            )
+        due = turn[:, None] * plane + shift[:, None]
+        column, row = ((part - start) / AGREE_PX for part, start in ((due.real, low[0]), (due.imag, low[1])))
+        on = (column >= 0) & (row >= 0) & (column < size[0]) & (row < size[1])
+        matched = (on & cells[np.where(on, column, 0).astype(int), np.where(on, row, 0).astype(int)]).sum(1)
+        pick: list[tuple[complex, complex]] = []
+        for k in np.argsort(-matched, kind="stable")[: 20 * MOST].tolist():
+            apart = [abs(shift[k] - b) + field.half.max() * abs(turn[k] - a) for a, b in pick]
+            if len(pick) < MOST and min(apart, default=math.inf) > 2 * AGREE_PX:
+                pick.append((complex(turn[k]), complex(shift[k])))
+        return pick
+
+    def _known(self, field: FrameStars, log_share: float) -> Prior:
+        """The Prior of poses that look there, at any roll: within r with a chance like r^2 / (USUALLY_RAD^2 + r^2)."""
+        rotations = 2 * math.pi**2 * USUALLY_RAD**2 / (1 + (USUALLY_RAD / AIMED_RAD) ** 2)
+        log_density = log_share - math.log(rotations * 2 * SCALE_TOLERANCE)
+        middle = np.append(field.middle, field.focal_px)
+        middle /= np.linalg.norm(middle)
+
+        def density(pose: Pose) -> float:
+            off = np.linalg.norm(middle @ pose.attitude - self.toward)
+            scale = abs(np.log(pose.focal_px / field.focal_px))
+            if off > AIMED_RAD or scale > SCALE_TOLERANCE:
+                return -math.inf
+            parity = math.log(MIRRORED if pose.mirrored else 1 - MIRRORED)
+            usual = math.log(0.5 + 0.5 * (scale < USUAL_SCALE) * SCALE_TOLERANCE / USUAL_SCALE)
+            return float(log_density + parity + usual - 2 * np.log1p((off / USUALLY_RAD) ** 2))
 
         return Prior(density, np.append(np.full(3, np.cbrt(rotations)), 2 * SCALE_TOLERANCE))
 

@@ -31,7 +31,7 @@ from starpos.identification.evidence import (
     verify_pose,
 )
 from starpos.identification.pose import CROWD_STARS, MATCH_SIGMA, MIN_SIGMA_PX, TEST_STARS, Pose
-from starpos.identification.prior import PlumbPrior, PointingPrior
+from starpos.identification.prior import AimPrior, PlumbPrior, PointingPrior
 from starpos.identification.sky import Sky
 from starpos.identification.triangles import TriangleCatalogue
 from starpos.instrument.camera import Camera
@@ -39,7 +39,8 @@ from starpos.sky.catalogue import Catalogue
 
 # (number of brightest stars, their error in px); the last stages are for lenses with distortion.
 STAGES = (5, 0.3), (7, 0.3), (10, 0.3), (14, 0.3), (20, 0.3), (9, 2.5), (8, 6.0)
-LOG_HALF = math.log(0.5)
+# The share of the probability that priors have, and a header's pointing with or without others.
+NEAR, AIMED = 0.5, 0.9
 # Stars so far beyond the frame (px) need no margin; a margin is at most this share of the frame.
 EDGE_PX, WIDEST_MARGIN = 2.0, 0.25
 
@@ -62,7 +63,7 @@ LIMITS = Limits(
     most_supported=40,
 )
 
-Priors = Sequence[PointingPrior | PlumbPrior]
+Priors = Sequence[PointingPrior | PlumbPrior | AimPrior]
 Stages = Sequence[tuple[int, float]]
 
 
@@ -198,7 +199,7 @@ def near_or_lost(
 ) -> Iterator[Identification]:
     """Identifications with log-odds of `enough`: by the priors, then lost in space by `stages`.
 
-    The priors have half of the probability, if there are any.
+    The priors have the share NEAR or AIMED of the probability, if there are any.
     crowded: only triangles that others support are looked at, but all of those.
     """
     if not priors:
@@ -211,7 +212,7 @@ def _near_or_lost(
 ) -> Iterator[Identification]:
     """Yield what the priors identify, and then, where that is asked for, what is identified without them."""
     yield from _near(field, sky, priors, enough)
-    yield from _lost(field, sky, LOG_HALF, enough, stages, crowded)
+    yield from _lost(field, sky, math.log(1 - _share(priors)), enough, stages, crowded)
 
 
 def _lost(
@@ -232,10 +233,15 @@ def identify_near(field: FrameStars | fisheye.WideField, sky: Sky, priors: Prior
     return next(chain.from_iterable(tries), None)
 
 
+def _share(priors: Priors) -> float:
+    return AIMED if any(isinstance(prior, AimPrior) for prior in priors) else NEAR
+
+
 def _near(field: FrameStars, sky: Sky, priors: Priors, enough: float) -> Iterator[Identification]:
-    """Yield what is identified by the priors, which have half of the probability."""
+    """Yield what is identified by the priors."""
+    log_share = math.log(_share(priors) / max(len(priors), 1))
     for prior in priors:
-        for pose, radius_px, known in prior.attempts(field, sky, LOG_HALF - np.log(len(priors))):
+        for pose, radius_px, known in prior.attempts(field, sky, log_share):
             if found := verify_pose(field, sky, pose, radius_px, known, enough):
                 yield found
 

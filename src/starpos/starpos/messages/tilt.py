@@ -336,17 +336,16 @@ class ImuTilts:
         """
         breaks = self.averager.breaks
         average = self.averager.include(said)
-        reading = None if average is None else self._judged(average, temperature_c, step_rad)
+        reading = None
+        if average is not None:
+            self._sequence += 1
+            self.unrest = average.unrest(self._max_force_error, self._max_rotation)
+            if self.unrest:
+                self._gap = True
+            else:
+                reading = self._reading(average, temperature_c, step_rad)
         self._gap |= self.averager.breaks != breaks
         return reading
-
-    def _judged(self, average: MeanForce, temperature_c: float, step_rad: float) -> Reading | None:
-        self.unrest = average.unrest(self._max_force_error, self._max_rotation)
-        if self.unrest:
-            self._sequence += 1
-            self._gap = True
-            return None
-        return self._reading(average, temperature_c, step_rad)
 
     def _reading(self, average: MeanForce, temperature_c: float, step_rad: float) -> Reading:
         x, y, z = average.tilt()
@@ -356,7 +355,6 @@ class ImuTilts:
             self._noise.interrupt()
         if not flags & STUCK:
             self._noise.add_sample(average.mid_ns * 1e-9, x, y, z)
-        self._sequence += 1
         covariance = self._covariance(average) + step_rad**2 / 12 * np.eye(3)
         return Reading(
             stamp_ns=max(average.mid_ns - self._latency_ns, 0),

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from starpos import rotation
-from starpos.earth.ellipsoid import meridian_turn
 from starpos.earth.orientation import (
     ROTATION_RAD_S,
     earth_orientation,
@@ -22,6 +21,7 @@ from starpos.earth.refraction import Atmosphere, Refraction
 from starpos.errors import FixError, FrameError, InstrumentError, TimeError
 from starpos.fix import solver
 from starpos.fix.attitude import CAMERA, ENU, GCRS, ITRS, LINK, Attitude, CameraAttitude
+from starpos.fix.heading import zenith_moved
 from starpos.fix.sighting import Sighting
 from starpos.fix.solution import Solution
 from starpos.fix.star_fit import MatchedStars, StarFit, fit_seen, seen_problem, sound_matches
@@ -261,14 +261,11 @@ class SunFrame(FrameUnderWay):
         common = across + self.place.plumb_stddev**2 + float(np.linalg.eigvalsh(root @ root.T)[1])
         common /= max(1 - sine**2, HIGHEST_COSINE**2)
         return Attitude(
-            _to_north(self.place) @ link.rotation, link.covariance + common * np.eye(3), of=LINK, into=ENU
+            self.place.to_geodetic_north @ link.rotation,
+            link.covariance + common * np.eye(3),
+            of=LINK,
+            into=ENU,
         )
-
-
-def _to_north(place: Place) -> np.ndarray:
-    """Rotation (3, 3) about up from the plumb line's north to WGS 84's."""
-    to_ellipsoid = place.axes @ place.plumb_axes.T
-    return rotation.about_axis(2, -math.atan2(to_ellipsoid[0, 1], to_ellipsoid[1, 1]))
 
 
 def body_attitude(frame: PlacelessFrame, place: Place, vessel: Vessel) -> Attitude:
@@ -281,15 +278,14 @@ def body_attitude(frame: PlacelessFrame, place: Place, vessel: Vessel) -> Attitu
     seen = seen.then(a4, ENU)
     assert seen.by_refraction is not None
     late_s = [frame.stamp_stddev_s, vessel.clock_stddev_s, earth_orientation(frame.utc_unix_s).ut1_sigma_s]
-    # a zenith further east, or north, turns level and north
-    level = np.array([[0.0, 1.0], [-1.0, 0.0]])
-    north = -meridian_turn(place.plumb[0]) * np.array([[1.0, 0.0]])
-    deflection = np.vstack([level * place.plumb_stddev, north * place.ellipsoid_stddev])
+    moved = zenith_moved(place.plumb[0])
     columns = np.column_stack([
         seen.by_refraction * air.relative_sigma,
         a4[:, 2] * ROTATION_RAD_S * math.hypot(*late_s),
-        np.vstack([level, north]) @ place.zenith_root,
-        deflection,
+        moved @ place.zenith_root,
+        moved * np.array([[place.plumb_stddev], [place.plumb_stddev], [place.ellipsoid_stddev]]),
     ])  # fmt: skip
     covariance = seen.covariance + columns @ columns.T + np.eye(3) * vessel.mount_stddev**2
-    return Attitude(_to_north(place) @ seen.rotation @ vessel.camera_to_body.T, covariance, of=LINK, into=ENU)
+    return Attitude(
+        place.to_geodetic_north @ seen.rotation @ vessel.camera_to_body.T, covariance, of=LINK, into=ENU
+    )

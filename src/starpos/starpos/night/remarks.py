@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Remarks on a night, each a sentence; among them doubts: mistaken tilts, a place far from the stated one."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,9 +11,11 @@ from starpos.averaging.elevation_axis import FoundAxis
 from starpos.calibration.misalignment import Calibrated
 from starpos.earth.ellipsoid import EARTH_RADIUS_M, zenith_of
 from starpos.earth.orientation import ROTATION_RAD_S
+from starpos.errors import TiltError
 from starpos.fix import checks
 from starpos.fix.budget import local_north
 from starpos.fix.fix import Fix, length_text
+from starpos.fix.solution import Solution
 from starpos.fix.terms import Origin, total_covariance
 from starpos.frames.gravity import PHONE
 from starpos.frozen import at_once
@@ -38,9 +40,11 @@ class Remark(str):
 
 
 def of_tilts(log: TiltLog, path: str, inclinometer: InclinometerErrors) -> tuple[Remark, ...]:
-    """Say that a table of tilts looks like radians, or is rounded to steps coarser than the inclinometer's."""
-    doubts = (like_radians(log), inclinometer.coarser(log.step_rad))
-    return tuple(Remark(f"{path}: {doubt}") for doubt in doubts if doubt)
+    """Say that a table of tilts is rounded to coarser steps than the inclinometer's; TiltError if it is in radians."""
+    if radians := like_radians(log):
+        raise TiltError(f"{path}: {radians}")
+    coarser = inclinometer.coarser(log.step_rad)
+    return (Remark(f"{path}: {coarser}"),) if coarser else ()
 
 
 def of_inclinometer(instrument: Instrument, ways: str = checks.MODEL_BY_OPTIONS) -> tuple[Remark, ...]:
@@ -104,18 +108,14 @@ def of_table(fixes: Sequence[Fix], whole: Average, given: Instrument) -> tuple[R
     return (Remark(sentence),)
 
 
-def of_axis(doubt: str) -> tuple[Remark, ...]:
-    """Say that the optical axis of a night's frames is not known; doubt: the sentence, '' if it is known."""
-    return (Remark(doubt),) if doubt else ()
-
-
-def of_extrapolation(fix: Fix, days: float) -> tuple[Remark, ...]:
-    """Say by how many days a fix lies beyond the IERS table, and how far it may be off for that."""
-    if days <= 0:
+def of_extrapolation(solved: Iterable[Solution]) -> tuple[Remark, ...]:
+    """Say by how many days the last fix lies beyond the IERS table, and how far it may be off for that."""
+    worst = max(solved, key=lambda s: s.extrapolated_days, default=None)
+    if worst is None or worst.fix is None or worst.extrapolated_days <= 0:
         return ()
-    (ut1,) = (t for t in fix.terms if t.name == "ut1")
+    (ut1,) = (t for t in worst.fix.terms if t.name == "ut1")
     sentence = (
-        f"the Earth's rotation is extrapolated {days:.0f} days beyond the IERS table, "
+        f"the Earth's rotation is extrapolated {worst.extrapolated_days:.0f} days beyond the IERS table, "
         f"{np.sqrt(ut1.covariance[0, 0]):.0f} m east (1 sigma, in the budget): upgrade astropy-iers-data"
     )
     return (Remark(sentence),)
@@ -200,6 +200,13 @@ ZONE_H = 0.5
 # camera_to_itrs (3, 3) of a frame, and its tilt
 Leaning = tuple[np.ndarray, Tilt]
 
+
+def _of_minutes(theta: np.ndarray) -> np.ndarray:
+    """Angles of which the digits behind the point are minutes and their decimals."""
+    degrees, minutes = np.divmod(np.abs(np.degrees(theta)), 1)
+    return np.radians(np.sign(theta) * (degrees + minutes / 0.6))
+
+
 # possible mistakes in tilts, and functions that give the corrected angles (N, 2), rad
 MISTAKES: tuple[tuple[str, Callable[[np.ndarray], np.ndarray]], ...] = (
     ("theta_x and theta_y exchanged", lambda theta: theta[:, ::-1]),
@@ -207,6 +214,10 @@ MISTAKES: tuple[tuple[str, Callable[[np.ndarray], np.ndarray]], ...] = (
     ("the other sign of theta_y", lambda theta: theta * [1, -1]),
     ("the other sign of both tilts", lambda theta: -theta),
     ("tilts that were radians", np.degrees),
+    ("tilts that were sines", lambda theta: np.arcsin(np.clip(np.degrees(theta), -1, 1))),
+    ("tilts that were percent", lambda theta: np.arctan(np.degrees(theta) / 100)),
+    ("tilts that were gon", lambda theta: 0.9 * theta),
+    ("tilts that were degrees and minutes (dd.mm or dd.mmss)", _of_minutes),
 )
 
 

@@ -148,29 +148,33 @@ def _one_by_one(sights: Iterable[tuple[str, Sight | FrameError]], asked: Solving
 def _without_lamps(answers: Iterable[FrameAnswer]) -> Iterator[FrameAnswer]:
     """The answers, of which one by a glow is held back until a later glow shows that it moves with the Sun.
 
-    A glow that stands still meanwhile is a lamp's, and those before it too.
+    A glow that stands still meanwhile is a lamp's, and those before it too.  One that is not seen to move has no answer.
     """
     held: list[FrameAnswer] = []
     lamp: Glow | None = None
+    proven = False
     for answer in answers:
         glow = answer.solution.glow
         if glow is None:
             held.append(answer)
         else:
-            first = lamp or next((a.solution.glow for a in held if a.solution.glow is not None), None)
-            still = None if first is None else first.stood_still(glow)
+            before = [a.solution.glow for a in held if a.solution.glow is not None]
+            first = lamp or next(iter(before), None)
+            stood = [g.stood_still(glow) for g in ([first, *before[-1:]] if first else [])]
+            still = next((s for s in stood if s is not None), None)
             if still and first is not None:
                 lamp = first
                 answer = replace(answer, solution=answer.solution.as_lamp(first.utc_unix_s))
                 held = [replace(a, solution=a.solution.as_lamp(glow.utc_unix_s)) for a in held]
             elif still is False:
                 yield from held
-                held, lamp = [], None
+                held, lamp, proven = [], None, True
             held.append(answer)
         if lamp is not None or all(a.solution.glow is None for a in held):
             yield from held
             held = []
-    yield from held
+    for answer in held:
+        yield replace(answer, solution=answer.solution if proven else answer.solution.unproven())
 
 
 def _in_order(

@@ -233,42 +233,13 @@ def adjusted(
         raise FixError(f"{len(sightings)} frames make no session: at least 3, in several faces, are needed")
     if np.cos(mark.latitude) < MIN_COSINE:
         raise FixError("the mark is within 6 km of a pole, where eta has no direction")
-    in_time = tuple(sorted(sightings, key=lambda s: s.utc_unix_s))
-    places = StarPlaces.of(in_time)
-    placed = places.applied(in_time)
-    session = _Session(
-        seen=in_time,
-        sightings=placed,
-        places=places,
-        faces=faces_of(placed),
-        prior=_prior_of(instrument),
-        bending=atmosphere.refraction().a,
-        given=instrument.calibration,
-        mark=mark,
-    )
     try:
-        return _whole_session(session, instrument.inclinometer)
+        return _Session(sightings, instrument, atmosphere, mark).whole()
     except np.linalg.LinAlgError as error:
         raise FixError(
             f"the session's equations have no solution ({error}): turn the instrument to several faces, and state the "
             "noise of the tiltmeter's readings"
         ) from None
-
-
-def _whole_session(session: "_Session", inclinometer: InclinometerErrors) -> DeflectionSession:
-    """The session with the errors of the tiltmeter as stated, or larger ones where the residuals show them."""
-    stated = session.solved(inclinometer, None)
-    if (shown := session.shown(stated)) is None:
-        return _adjusted(session, stated)
-    larger, size = shown
-    # under one air: what is wrong with the tiltmeter had seemed to be the air's
-    more, less = session.solved(larger, size), session.solved(inclinometer, size)
-    return replace(
-        _adjusted(session, more),
-        as_stated=_adjusted(session, stated),
-        same_air=_adjusted(session, less),
-        gain=less.fit.cost - more.fit.cost,
-    )
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -284,18 +255,44 @@ class _Solved:
     inclinometer: InclinometerErrors
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
 class _Session:
-    """What is given: sightings, as seen and with the stars' places that they adjusted, and what is known before."""
+    """What is given: sightings, as seen and with the stars' places that they adjusted, and what is known before.
 
-    seen: tuple[ZenithSighting, ...]
-    sightings: Sequence[ZenithSighting]
-    places: StarPlaces
-    faces: np.ndarray
-    prior: np.ndarray
-    bending: float
-    given: Calibration
-    mark: Place
+    prior (5, 5): weights of what is known before: A3, as far as the instrument's calibration has it.
+    """
+
+    def __init__(
+        self,
+        sightings: Sequence[ZenithSighting],
+        instrument: Instrument,
+        atmosphere: Atmosphere,
+        mark: Place,
+    ) -> None:
+        c = instrument.calibration
+        self.given, self.mark, self.inclinometer = c, mark, instrument.inclinometer
+        self.seen = tuple(sorted(sightings, key=lambda s: s.utc_unix_s))
+        self.places = StarPlaces.of(self.seen)
+        self.sightings = self.places.applied(self.seen)
+        self.faces = faces_of(self.sightings)
+        self.bending = atmosphere.refraction().a
+        self.prior = np.zeros((5, 5))
+        covariance = np.asarray(c.covariance_arcsec2, float) + np.eye(3) * c.remounted_arcsec**2
+        self.prior[2:, 2:] = np.linalg.inv(covariance * ARCSEC**2 + np.eye(3) * MIN_RAD**2)
+
+    def whole(self) -> DeflectionSession:
+        """The session with the errors of the tiltmeter as stated, or larger ones where the residuals show them."""
+        stated = self.solved(self.inclinometer, None)
+        if (shown := self.shown(stated)) is None:
+            return self.answer(stated)
+        larger, size = shown
+        # under one air: what is wrong with the tiltmeter had seemed to be the air's
+        more, less = self.solved(larger, size), self.solved(self.inclinometer, size)
+        return replace(
+            self.answer(more),
+            as_stated=self.answer(stated),
+            same_air=self.answer(less),
+            gain=less.fit.cost - more.fit.cost,
+        )
 
     def errors(self, lines: Lines, inclinometer: InclinometerErrors) -> dict[str, np.ndarray]:
         since = self.given.utc_unix_s
@@ -312,8 +309,10 @@ class _Session:
             stated = _stated(errors)
             # A3's prior stays where it was
             if size is None:
-                size = _air_of(lines, stated, errors, self.prior, offset)
-            fit = _fitted(lines, _whole(stated, errors, size), self.prior, offset)
+                # wide: in still air the cost hardly changes over a factor of ten
+                simplex = np.array([[0.0, 0.0], [-3.0, 0.0], [0.0, 1.0]])
+                size = _air(self.likeliest(lines, errors, stated, (), offset, simplex, 0.002, 120)[0])
+            fit = self.fitted(lines, _whole(stated, errors, size), offset)
             before, estimate, offset = offset, estimate.moved(fit.step), offset + fit.step
             if np.abs(fit.step).max() < SETTLED * np.sqrt(np.diag(fit.covariance)).min():
                 break
@@ -336,11 +335,8 @@ class _Session:
 
     def shown(self, stated: _Solved) -> tuple[InclinometerErrors, Air] | None:
         """The tiltmeter's errors and the air as the residuals show them; None: as stated, or hardly more."""
-        # slow to import
-        from scipy.optimize import minimize
-
         given, lines = stated.inclinometer, stated.lines
-        leftover, units, base = _leftover(stated, self.mark), {}, _stated(stated.errors)
+        leftover, units, base = self.leftover(stated), {}, _stated(stated.errors)
         for field, source, _ in SHOWN:
             unit = self.errors(lines, _larger(given, {field: 1.0}))[source]
             if leftover.excess(unit) > SHOWN_SIGMA:
@@ -348,25 +344,121 @@ class _Session:
                 base = base - stated.errors[source]
         if not units:
             return None
-
-        def factors(p: np.ndarray) -> np.ndarray:
-            return np.exp(np.clip(p[2:], 0.0, np.log(MAX_FACTOR)))
-
-        def cost(p: np.ndarray) -> float:
-            tilts = sum(f**2 * unit for f, unit in zip(factors(p), units.values(), strict=True))
-            covariance = _whole(base + tilts, stated.errors, _air(p))
-            return _fitted(lines, covariance, self.prior, stated.offset).cost + float(p[1] ** 2)
-
         motion = max(stated.air.motion, 2 * MIN_RAD)
         slow = np.log(stated.air.anomalous / stated.air.motion / AIR_SHARE) / np.log(AIR_FACTOR)
         begin = np.array([np.log(motion / MOTION_RAD), slow, *np.zeros(len(units))])
         simplex = begin + np.vstack([np.zeros(len(begin)), np.diag([-0.5, 0.7, *np.full(len(units), 1.5)])])
-        options = {"initial_simplex": simplex, "xatol": 0.05, "fatol": 0.02, "maxfev": 200}
-        found = minimize(cost, begin, method="Nelder-Mead", options=options)
-        if cost(begin) - float(found.fun) < SHOWN_GAIN:
+        sizes, gain = self.likeliest(
+            lines, stated.errors, base, tuple(units.values()), stated.offset, simplex, 0.02, 200
+        )
+        if gain < SHOWN_GAIN:
             return None
-        shown = dict(zip(units, factors(found.x).tolist(), strict=True))
-        return _larger(given, shown), _air(found.x)
+        return _larger(given, dict(zip(units, _factors(sizes).tolist(), strict=True))), _air(sizes)
+
+    def likeliest(
+        self,
+        lines: Lines,
+        errors: dict[str, np.ndarray],
+        base: np.ndarray,
+        units: tuple[np.ndarray, ...],
+        offset: np.ndarray,
+        simplex: np.ndarray,
+        precision: float,
+        most: int,
+    ) -> tuple[np.ndarray, float]:
+        """The parameters of `_air` and `_factors` that make the residuals likeliest, and what they gain over the first.
+
+        base: covariance (2 N, 2 N) of the readings without the air's, and without errors whose sizes are sought, units.
+        simplex: that the search begins with; precision: of the cost; most: evaluations of it.
+        """
+        # slow to import
+        from scipy.optimize import minimize
+
+        costs = []
+
+        def cost(p: np.ndarray) -> float:
+            tilts = sum(f**2 * unit for f, unit in zip(_factors(p), units, strict=True))
+            covariance = _whole(base + tilts, errors, _air(p))
+            costs.append(self.fitted(lines, covariance, offset).cost + float(p[1] ** 2))
+            return costs[-1]
+
+        options = {"initial_simplex": simplex, "xatol": 0.05, "fatol": precision, "maxfev": most}
+        found = minimize(cost, simplex[0], method="Nelder-Mead", options=options)
+        return found.x, costs[0] - float(found.fun)
+
+    def fitted(self, lines: Lines, covariance: np.ndarray, offset: np.ndarray) -> _Fit:
+        """Weighted fit of the equations; offset (5,): how far the estimate has moved from the prior's."""
+        # slow to import
+        from scipy.linalg import cholesky, solve_triangular
+
+        design, prior = lines.by_parameters.reshape(-1, 5), self.prior
+        root = cholesky(covariance, lower=True)
+        both = solve_triangular(root, np.column_stack([design, lines.off.reshape(-1)]), lower=True)
+        white, off = both[:, :5], both[:, 5]
+        normal = white.T @ white + prior
+        inverse = np.linalg.inv(normal)
+        step = inverse @ (white.T @ off - prior @ offset)
+        left, moved = off - white @ step, offset + step
+        chi2 = float(left @ left + moved @ prior @ moved)
+        cost = chi2 + 2 * float(np.log(np.diag(root)).sum()) + float(np.linalg.slogdet(normal)[1])
+        gain = inverse @ solve_triangular(root, white, lower=True, trans=1).T
+        return _Fit(step=step, covariance=inverse, gain=gain, root=root, cost=cost, chi2=chi2)
+
+    def leftover(self, solved: _Solved) -> Leftover:
+        # slow to import
+        from scipy.linalg import cho_solve
+
+        fit, lines = solved.fit, solved.lines
+        parameters = lines.by_parameters.reshape(-1, 5)
+        inverse = cho_solve((fit.root, True), np.eye(len(parameters)))
+        design = inverse @ parameters
+        return Leftover(
+            by_lean=lines.by_lean,
+            by_second=lines.by_sky @ (self.mark.axes[:, 2] * ROTATION_RAD_S),
+            projector=inverse - design @ fit.covariance @ design.T,
+            weighted=inverse @ (lines.off.reshape(-1) - parameters @ fit.step),
+        )
+
+    def answer(self, solved: _Solved) -> DeflectionSession:
+        """The session as it is solved, with its errors by source."""
+        estimate, lines, errors, fit, air = (
+            solved.estimate, solved.lines, solved.errors, solved.fit, solved.air,
+        )  # fmt: skip
+        size2 = {MOTION: air.motion**2, ANOMALOUS: air.anomalous**2}
+        sources = {name: size2.get(name, 1.0) * covariance for name, covariance in errors.items()}
+        gain = fit.gain[:2] / ARCSEC
+        by_source = {name: gain @ covariance @ gain.T for name, covariance in sources.items()}
+        whole = fit.covariance[:2, :2] / ARCSEC**2
+        values, axes = np.linalg.eigh(whole - np.sum(list(by_source.values()), 0))
+        by_source = {name: term for name, term in by_source.items() if term.any()}
+        # the rest, without what rounding leaves of it
+        by_source["A3 as given"] = (axes * np.maximum(values, 0.0)) @ axes.T
+        left = (lines.off.reshape(-1) - lines.by_parameters.reshape(-1, 5) @ fit.step).reshape(-1, 2)
+        back = np.linalg.inv(lines.by_lean)
+        own = sources["tilt readings"] + sources["centroids"] + sources[MOTION]
+        n = len(self.sightings)
+        own = own.reshape(n, 2, n, 2)[np.arange(n), :, np.arange(n)]
+        per_frame = np.einsum("nab,nbc,ndc->nad", back, own, back)
+        xi, eta = (estimate.deflection(self.mark.latitude) / ARCSEC).tolist()
+        leftover = self.leftover(solved)
+        return DeflectionSession(
+            sightings=self.seen,
+            xi_arcsec=xi,
+            eta_arcsec=eta,
+            covariance_arcsec2=whole,
+            by_source=by_source,
+            a3=estimate.a3,
+            faces=self.faces,
+            frame_arcsec=np.einsum("nab,nb->na", back, left) / ARCSEC,
+            frame_stddev_arcsec=np.sqrt(np.diagonal(per_frame, axis1=1, axis2=2)) / ARCSEC,
+            air=air,
+            catalogue_factor=self.places.factor,
+            chi2_per_degree=fit.chi2 / max(left.size - 5, 1),
+            face_quality=face_qualities(leftover, self.sightings, self.faces),
+            stars=self.places.stars,
+            leftover=leftover,
+            inclinometer=solved.inclinometer,
+        )
 
 
 def check_round(
@@ -394,122 +486,26 @@ def _stated(errors: dict[str, np.ndarray]) -> np.ndarray:
     return np.sum([c for name, c in errors.items() if name not in (MOTION, ANOMALOUS)], axis=0)
 
 
-def _sigma(covariance: np.ndarray) -> np.ndarray:
-    """Standard deviations (2,); rounding may leave a variance of zero below it."""
-    return np.sqrt(np.maximum(np.diag(covariance), 0.0))
-
-
-def _prior_of(instrument: Instrument) -> np.ndarray:
-    """Weights (5, 5) of what is known before: A3, as far as the instrument's calibration has it."""
-    c = instrument.calibration
-    weights = np.zeros((5, 5))
-    covariance = np.asarray(c.covariance_arcsec2, float) + np.eye(3) * c.remounted_arcsec**2
-    weights[2:, 2:] = np.linalg.inv(covariance * ARCSEC**2 + np.eye(3) * MIN_RAD**2)
-    return weights
-
-
 def _whole(stated: np.ndarray, errors: dict[str, np.ndarray], air: Air) -> np.ndarray:
     """Covariance (2 N, 2 N) of the readings."""
     return stated + air.motion**2 * errors[MOTION] + air.anomalous**2 * errors[ANOMALOUS]
 
 
-def _air_of(
-    lines: Lines, stated: np.ndarray, errors: dict[str, np.ndarray], prior: np.ndarray, offset: np.ndarray
-) -> Air:
-    """Sizes of image motion and anomalous refraction, as the residuals make them likeliest."""
-    # slow to import
-    from scipy.optimize import minimize
-
-    def cost(p: np.ndarray) -> float:
-        return _fitted(lines, _whole(stated, errors, _air(p)), prior, offset).cost + float(p[1] ** 2)
-
-    # wide: in still air the cost hardly changes over a factor of ten
-    simplex = np.array([[0.0, 0.0], [-3.0, 0.0], [0.0, 1.0]])
-    options = {"initial_simplex": simplex, "xatol": 0.05, "fatol": 0.002, "maxfev": 120}
-    found = minimize(cost, simplex[0], method="Nelder-Mead", options=options)
-    return _air(found.x)
-
-
 def _air(p: np.ndarray) -> Air:
-    """Sizes of image motion and anomalous refraction by two parameters."""
+    """Sizes of image motion and anomalous refraction by the first two parameters."""
     motion = float(np.hypot(MIN_RAD, MOTION_RAD * np.exp(p[0])))
     slow = AIR_FACTOR ** min(max(float(p[1]), 0.0), MAX_SIGMA)
     return Air(motion=motion, anomalous=motion * AIR_SHARE * slow)
 
 
-def _fitted(lines: Lines, covariance: np.ndarray, prior: np.ndarray, offset: np.ndarray) -> _Fit:
-    """Weighted fit of the equations; offset (5,): how far the estimate has moved from the prior's."""
-    # slow to import
-    from scipy.linalg import cholesky, solve_triangular
-
-    design = lines.by_parameters.reshape(-1, 5)
-    root = cholesky(covariance, lower=True)
-    both = solve_triangular(root, np.column_stack([design, lines.off.reshape(-1)]), lower=True)
-    white, off = both[:, :5], both[:, 5]
-    normal = white.T @ white + prior
-    inverse = np.linalg.inv(normal)
-    step = inverse @ (white.T @ off - prior @ offset)
-    left, moved = off - white @ step, offset + step
-    chi2 = float(left @ left + moved @ prior @ moved)
-    cost = chi2 + 2 * float(np.log(np.diag(root)).sum()) + float(np.linalg.slogdet(normal)[1])
-    gain = inverse @ solve_triangular(root, white, lower=True, trans=1).T
-    return _Fit(step=step, covariance=inverse, gain=gain, root=root, cost=cost, chi2=chi2)
+def _factors(p: np.ndarray) -> np.ndarray:
+    """Factors on errors of the tiltmeter by the other parameters."""
+    return np.exp(np.clip(p[2:], 0.0, np.log(MAX_FACTOR)))
 
 
-def _leftover(solved: _Solved, mark: Place) -> Leftover:
-    # slow to import
-    from scipy.linalg import cho_solve
-
-    fit, lines = solved.fit, solved.lines
-    parameters = lines.by_parameters.reshape(-1, 5)
-    inverse = cho_solve((fit.root, True), np.eye(len(parameters)))
-    design = inverse @ parameters
-    return Leftover(
-        by_lean=lines.by_lean,
-        by_second=lines.by_sky @ (mark.axes[:, 2] * ROTATION_RAD_S),
-        projector=inverse - design @ fit.covariance @ design.T,
-        weighted=inverse @ (lines.off.reshape(-1) - parameters @ fit.step),
-    )
-
-
-def _adjusted(session: _Session, solved: _Solved) -> DeflectionSession:
-    sightings, faces, places, mark = session.sightings, session.faces, session.places, session.mark
-    estimate, lines, errors, fit, air = solved.estimate, solved.lines, solved.errors, solved.fit, solved.air
-    size2 = {MOTION: air.motion**2, ANOMALOUS: air.anomalous**2}
-    sources = {name: size2.get(name, 1.0) * covariance for name, covariance in errors.items()}
-    gain = fit.gain[:2] / ARCSEC
-    by_source = {name: gain @ covariance @ gain.T for name, covariance in sources.items()}
-    whole = fit.covariance[:2, :2] / ARCSEC**2
-    values, axes = np.linalg.eigh(whole - np.sum(list(by_source.values()), 0))
-    by_source = {name: term for name, term in by_source.items() if term.any()}
-    # the rest, without what rounding leaves of it
-    by_source["A3 as given"] = (axes * np.maximum(values, 0.0)) @ axes.T
-    left = (lines.off.reshape(-1) - lines.by_parameters.reshape(-1, 5) @ fit.step).reshape(-1, 2)
-    back = np.linalg.inv(lines.by_lean)
-    own = sources["tilt readings"] + sources["centroids"] + sources[MOTION]
-    n = len(sightings)
-    own = own.reshape(n, 2, n, 2)[np.arange(n), :, np.arange(n)]
-    per_frame = np.einsum("nab,nbc,ndc->nad", back, own, back)
-    xi_eta = estimate.deflection(mark.latitude) / ARCSEC
-    leftover = _leftover(solved, mark)
-    return DeflectionSession(
-        sightings=session.seen,
-        xi_arcsec=float(xi_eta[0]),
-        eta_arcsec=float(xi_eta[1]),
-        covariance_arcsec2=whole,
-        by_source=by_source,
-        a3=estimate.a3,
-        faces=faces,
-        frame_arcsec=np.einsum("nab,nb->na", back, left) / ARCSEC,
-        frame_stddev_arcsec=np.sqrt(np.diagonal(per_frame, axis1=1, axis2=2)) / ARCSEC,
-        air=air,
-        catalogue_factor=places.factor,
-        chi2_per_degree=fit.chi2 / max(left.size - 5, 1),
-        face_quality=face_qualities(leftover, sightings, faces),
-        stars=places.stars,
-        leftover=leftover,
-        inclinometer=solved.inclinometer,
-    )
+def _sigma(covariance: np.ndarray) -> np.ndarray:
+    """Standard deviations (2,); rounding may leave a variance of zero below it."""
+    return np.sqrt(np.maximum(np.diag(covariance), 0.0))
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

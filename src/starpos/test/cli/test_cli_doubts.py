@@ -3,6 +3,7 @@
 
 import csv
 import json
+import math
 import shutil
 
 import numpy as np
@@ -47,10 +48,17 @@ def test_a_fix_near_the_stated_place_is_told_its_distance_and_one_that_is_far_is
     assert away["latitude"] == near["latitude"] and "its times may be 6 h behind UTC" in errors[0]
 
 
+def in_seconds(deg):
+    """dd.mmss of an angle."""
+    minutes, seconds = divmod(abs(deg) * 3600 / 60, 1)
+    return math.copysign(minutes // 60 + (minutes % 60) / 100 + seconds * 60 / 10_000, deg)
+
+
 MISTAKES = {
     "theta_x and theta_y exchanged": lambda x, y: (y, x),
     "the other sign of theta_x": lambda x, y: (-x, y),
-    "tilts that were radians": lambda x, y: tuple(np.radians([x, y]).tolist()),
+    "tilts that were gon": lambda x, y: (x / 0.9, y / 0.9),
+    "tilts that were percent": lambda x, y: tuple((100 * np.tan(np.radians([x, y]))).tolist()),
 }
 
 
@@ -58,24 +66,32 @@ MISTAKES = {
 def test_the_mistake_that_sets_a_place_far_from_near_is_named(mistake, lists, tmp_path, capsys):
     tilt = rewritten(lists / "tilt.csv", tmp_path, MISTAKES[mistake])
     answer, errors = one(capsys, lists, tilt, *NEAR)
-    assert answer["km_from_near"] > 500
+    assert answer["km_from_near"] > 100
     assert f"with {mistake} it would be 27 km from there" in errors[-1]
 
 
-def test_columns_exchanged_show_by_themselves_where_the_camera_is_turned(lists, tmp_path, capsys):
-    tilt = rewritten(lists / "tilt.csv", tmp_path, MISTAKES["theta_x and theta_y exchanged"])
+PACKED = {
+    "dd.mm": lambda x, y: tuple((np.trunc([x, y]) + 0.6 * np.fmod([x, y], 1)).tolist()),
+    "dd.mmss": lambda x, y: (in_seconds(x), in_seconds(y)),
+}
+
+
+@pytest.mark.parametrize("mistake", [*MISTAKES, *PACKED])
+def test_mistakes_show_by_themselves_where_the_camera_is_turned(mistake, lists, tmp_path, capsys):
+    tilt = rewritten(lists / "tilt.csv", tmp_path, (MISTAKES | PACKED)[mistake])
     frames = sorted(lists.glob("stars_*.csv"))
     _, _, errors = run(capsys, "solve", *frames, "--tilt", tilt, *KNOWN)
-    assert any("km apart, and with theta_x and theta_y exchanged" in line for line in errors), errors
+    assert any("km apart, and with" in line and mistake in line for line in errors), errors
 
 
-def test_tilts_that_look_like_radians_are_told(night, tmp_path, capsys):
-    rewritten(night / "tilt.csv", tmp_path, MISTAKES["tilts that were radians"])
+def test_tilts_that_look_like_radians_are_refused(night, tmp_path, capsys):
+    rewritten(night / "tilt.csv", tmp_path, lambda x, y: tuple(np.radians([x, y]).tolist()))
     shutil.copy(night / "frame_0000.fits", tmp_path)
-    _, _, errors = run(capsys, "solve", tmp_path, *KNOWN)
+    status, _, errors = run(capsys, "solve", tmp_path, *KNOWN)
     (line,) = errors
-    assert "the tilts look like radians" in line and "write them in deg" in line
-    assert any("look like radians" in remark for remark in open_night(tmp_path).solve().remarks)
+    assert status == 2 and "the tilts look like radians" in line and "write them in deg" in line
+    (shot,) = open_night(tmp_path).solve().shots
+    assert shot.place is None and "look like radians" in shot.message
 
 
 def test_what_a_glob_takes_in_beside_the_frames_is_left_out(lists, tmp_path, capsys):

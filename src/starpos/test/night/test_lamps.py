@@ -10,7 +10,7 @@ from starpos.earth.orientation import earth_state
 from starpos.earth.place import Place
 from starpos.earth.refraction import Atmosphere
 from starpos.earth.vertical import Deflection
-from starpos.fix.glows import Glows
+from starpos.fix.glows import Glow, Glows
 from starpos.fix.searching import Sight
 from starpos.fix.solver import Solver
 from starpos.fix.sun import by_sun
@@ -55,10 +55,19 @@ def answers(seconds, lamp: bool):
     return made
 
 
-def test_a_lamp_is_refused_once_the_sun_has_moved_on_and_the_sun_never():
-    for lamp, wanted in ((True, [True, True, False, False]), (False, [True] * 4)):
+def test_a_glow_counts_once_it_has_moved_as_the_sun_and_a_lamp_never():
+    for lamp, wanted in ((True, [False] * 4), (False, [False, False, True, True])):
         glows = Glows()
         assert [s.beside(glows).ok for _, s in answers([0, 30, 500, 600], lamp)] == wanted
+
+
+@pytest.mark.parametrize("moved_px, still", [(0.5, True), (30.0, None), (700.0, False)])
+def test_a_camera_that_was_turned_meanwhile_may_have_the_sun_near_its_old_pixel(moved_px, still):
+    def glow(hours, px):
+        sun, ray = (np.array([np.cos(a), np.sin(a), 0.0]) for a in (hours * np.pi / 12, px * np.pi / SIZE))
+        return Glow(NOON + hours * 3600.0, ray, sun, sigma=0.6 * np.pi / SIZE)
+
+    assert glow(0.0, 0.0).stood_still(glow(6.7, moved_px)) is still
 
 
 @pytest.mark.parametrize("lamp", [True, False])
@@ -70,3 +79,10 @@ def test_all_frames_of_a_lamp_are_refused_where_they_are_solved_together(lamp):
     assert [a.solution.ok for a in told] == [not lamp] * 4
     if lamp:
         assert all("lamp" in a.solution.message and a.solution.at_place is None for a in told)
+
+
+def test_a_glow_that_nothing_proves_has_no_heading():
+    sights = [(f"{k}", Sight(stars, s)) for k, (stars, s) in enumerate(answers([0, 30], lamp=False))]
+    told = list(answers_of(sights, Solving(Instruments(INSTRUMENT), atmosphere=AIR), Deflection()).each)
+    assert [a.solution.ok for a in told] == [False, False]
+    assert all("some minutes later" in a.solution.message for a in told)
