@@ -11,7 +11,7 @@ import numpy as np
 
 from starpos import rotation
 from starpos.earth.ellipsoid import curvature_radii_m
-from starpos.earth.orientation import EarthState, earth_state
+from starpos.earth.orientation import ROTATION_RAD_S, EarthState, earth_state
 from starpos.earth.place import Place, Places
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import (
@@ -60,6 +60,7 @@ from starpos.progress import Progress, quiet
 from starpos.sky import deeper
 from starpos.sky.bodies import ERFA, SolarSystem
 from starpos.sky.catalogue import Catalogue
+from starpos.units import HOUR_S
 
 # A fisheye's lower stars are not used: no model describes refraction near the horizon.
 MIN_ALTITUDE_RAD = math.radians(10)
@@ -378,7 +379,16 @@ class Solver:
             lens = NOMINAL_LENS_RAD * aside
             about = replace(about, axis_stddev=math.hypot(about.axis_stddev, lens))
         attitude = attitude_at_place(matched, place, about)
-        return replace(attitude, used=np.flatnonzero(use)[attitude.used])
+        shown = attitude.hour_shown or self._hour_at_horizon(stars, found, camera, state, up)
+        return replace(attitude, used=np.flatnonzero(use)[attitude.used], hour_shown=shown)
+
+    def _hour_at_horizon(
+        self, stars: Stars, found: Identification, camera: Camera, state: EarthState, up: np.ndarray
+    ) -> bool:
+        """Whether an hour more or less would put stars under the horizon; up (3,): the zenith in C."""
+        pole, every = found.attitude @ state.gcrs_to_itrs[2], directions_of(camera, stars)
+        turned = (rotation.from_vector(sign * ROTATION_RAD_S * HOUR_S * pole) @ up for sign in (1, -1))
+        return all(set_stars((every @ zenith)[found.star], every @ zenith) for zenith in turned)
 
     def circumstances(self, frame: Stars | Pointing, camera: Camera, earth: EarthState) -> Circumstances:
         """How a frame was taken, by a camera in its pixels, at a state of the Earth."""
@@ -476,6 +486,11 @@ def check_explained(answer: Solution) -> None:
         )
 
 
+UNSHOWN_HOUR = (
+    "nothing in the frame shows that its hour is right, and a wrong one turns the heading by degrees: state UTC, and "
+    "calibrate the camera with frames whose stars reach down to 10 deg of altitude"
+)
+
 # a correct place lies further from the stars' own once in 1e6 frames
 PLACE_SIGMAS = 5.3
 
@@ -494,6 +509,8 @@ def placed(solver: Solver, stars: Stars, answer: Solution, places: Places) -> So
         if answer.fix is not None:
             check_agrees(answer.fix, place)
         attitude = solver.attitude_at(stars, answer.found, place)
+        if not attitude.hour_shown:
+            answer = replace(answer, remark=UNSHOWN_HOUR)
         alone = answer.ok and answer.fix is None
         return replace(answer, at_place=attitude, message=attitude.text if alone else answer.message)
     except StarposError as e:
