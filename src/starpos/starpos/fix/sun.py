@@ -199,6 +199,15 @@ class _Look:
     body: Body
     sharp: bool
 
+    def terms(self, across: np.ndarray, bent: np.ndarray) -> tuple[ErrorTerm, ...]:
+        """Errors of two components of the direction; across (2, 3): these in C.  bent (2,): by 1 sigma of refraction."""
+        return (
+            ErrorTerm("disc", across @ self.seen.own),
+            ErrorTerm("lens", across @ self.seen.lens, shared=ALWAYS),
+            ErrorTerm("ephemeris", np.eye(2) * self.body.sigma, shared=ALWAYS),
+            ErrorTerm("refraction", bent[:, None], shared=ALWAYS),
+        )
+
 
 def _looks(
     solver: Solver, stars: Stars, disc: Disc, names: tuple[str, ...], *, camera: Camera, state: EarthState
@@ -272,12 +281,7 @@ def _two_body_fix(
     link_to_enu = place.local_to_enu @ g @ mounting.link_to_camera
     of_sky, of_level = sky_rows(place), level_rows(place, link_to_enu)
     of_bodies = [
-        (
-            ErrorTerm("disc", c @ g @ k.seen.own),
-            ErrorTerm("lens", c @ g @ k.seen.lens, shared=ALWAYS),
-            ErrorTerm("ephemeris", np.eye(2) * k.body.sigma, shared=ALWAYS),
-            ErrorTerm("refraction", c @ (seen - v)[:, None] * air.relative_sigma, shared=ALWAYS),
-        )
+        k.terms(c @ g, c @ (seen - v) * air.relative_sigma)
         for k, c, v, seen in zip(looks, across, there, raised, strict=True)
     ]
     terms = (
@@ -418,10 +422,7 @@ def _attitude(
         components = _across(bent)
         turn = np.cross(bent, components)
         of_body = (
-            ErrorTerm("disc", components @ g @ look.seen.own),
-            ErrorTerm("lens", components @ g @ look.seen.lens, shared=ALWAYS),
-            ErrorTerm("ephemeris", np.eye(2) * look.body.sigma, shared=ALWAYS),
-            ErrorTerm("refraction", np.array([[0.0], [raised]]), shared=ALWAYS),
+            *look.terms(components @ g, np.array([0.0, raised])),
             *sky_terms(turn, state, clock_s, stamp_s, a4),
             ErrorTerm("place", turn @ moved @ place.zenith_root, shared=ALWAYS),
             ErrorTerm("plumb", turn @ moved * place.plumb_stddev, shared=ALWAYS),
