@@ -175,7 +175,8 @@ def _contradicting(best: FoundAxis, given: Calibration, site: Place | None) -> s
     number, free = best.directions, best.directions - (2 if site is not None else 4)
     if number < MIN_JUDGED or best.off.max() < OUTLIER_SIGMA:
         return set()
-    problem = _Problem(best.a3, best.circles, given, best.ray, site and site.plumb_stddev)
+    sigma = None if site is None else site.plumb_stddev
+    problem = _Problem(best.a3, best.circles, given, best.ray, sigma)
     off, a3, zenith = best.off, best.a3, best.zenith
     for _ in range(REWEIGHTED):
         problem.doubt = np.maximum(off - 1, 0.0)

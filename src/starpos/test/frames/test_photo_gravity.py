@@ -190,6 +190,10 @@ SILENT = "its file does not say which way is down"
         (exif(nikon(1, 2, serial="6001443"), "NIKON"), DAMAGED),
         (exif(nikon(1, 2, serial="no number"), "NIKON"), DAMAGED),
         (exif(nikon(1, 2)[:-0x40], "NIKON"), DAMAGED),
+        (
+            exif(nikon(1, 2).replace(struct.pack("<HII", LONG, 1, 70000), struct.pack("<HIi", 9, 1, -5))),
+            DAMAGED,
+        ),
         (exif(apple((0, 0, 1.0))[:-30]), DAMAGED),
         (exif(apple((0, 0, 1.0)))[:-8], SILENT),
         (exif(apple((0, 0, 1.0)).replace(b"\1MM", b"\1XX")), DAMAGED),
