@@ -394,7 +394,7 @@ def _join(planes: np.ndarray, dtype: type[np.integer]) -> np.ndarray:
 
 
 def _newer(tyc: np.ndarray) -> dict[str, np.ndarray]:
-    """The columns that older files lack, for stars of these identifiers (N, 3)."""
+    """The columns that the committed file lacks, for stars of these identifiers (N, 3)."""
     zeros = np.zeros(len(tyc), np.int8)
     tenths = np.round(parallaxes_mas(tyc) / TENTH).astype(np.uint16)
     return {"pm_ra_centi": zeros, "pm_dec_centi": zeros, "parallax_tenths": tenths}
@@ -439,14 +439,8 @@ def read(path: Path | str) -> Catalogue:
 
 
 def kept_catalogues(what: str = "") -> KeptTables[Catalogue]:
-    """Catalogues that are unpacked in the cache; what: as of `KeptTables`.
-
-    The number of the format stays as long as older folders can be read: the deeper catalogue of a user without a network
-    is there, too.
-    """
-    return KeptTables(
-        Catalogue, "stars-1-", "uiiiiuuuiiiiiu", what, newer=lambda columns: _newer(columns["tyc"])
-    )
+    """Catalogues that are unpacked in the cache; what: as of `KeptTables`."""
+    return KeptTables(Catalogue, "stars-1-", "uiiiiuuuiiiiiu", what)
 
 
 @lru_cache(maxsize=2)
