@@ -4,8 +4,9 @@
     python tools/benchmarks/random_nights.py nights [--nights 50] [--tiltmeter ARCSEC] [--json]
     python tools/benchmarks/random_nights.py honesty [--nights 500]
 
-nights: the paper's fifty nights: a new place, date, pointing, A3 and zero each night, 25 frames at each of four headings,
-A3 unknown, clock to 1 ms; mean absolute errors on the ground (longitude times the cosine of latitude), and the paper's.
+nights: as the paper has fifty. Each night has a new place, date, pointing, A3 and zero, and 25 frames at each of four
+headings; A3 is unknown, the clock known to 1 ms. Mean absolute errors on the ground (longitude times the cosine of
+latitude) stand beside the paper's.
 Exit status 1 where they are above the aim of 1 arcsec (0.15 with a tiltmeter of 0.1 arcsec, and in proportion).
 
 honesty: nights turned on the spot, and nights calibrated at one place and used days later at another: the errors squared
