@@ -10,7 +10,7 @@ from rclpy.serialization import serialize_message
 from starpos.earth.orientation import earth_state
 from starpos.fix.solution import Status
 from starpos.frames.frame import Frame
-from starpos.session.frames import Answered
+from starpos.session.driver import Answered
 from starpos.session.replay import Replay
 from starpos.session.settings import Settings
 from starpos.simulation.scene import Scene, scene_of

@@ -60,7 +60,9 @@ def test_a_manifest_is_sound(folder):
 
 
 def test_all_have_one_version():
-    assert len({parse_package(folder).version for folder in FOLDERS}) == 1
+    [version] = {parse_package(folder).version for folder in FOLDERS}
+    assert f"All are at version {version} (" in (ROOT / "CHANGELOG.rst").read_text()
+    assert f"\nversion: {version}\n" in (ROOT / "CITATION.cff").read_text()
 
 
 @pytest.mark.filterwarnings("ignore:nodes.Node.traverse:DeprecationWarning")

@@ -12,7 +12,7 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import NavSatFix
 from std_srvs.srv import Trigger
 
-from starpos.session.frames import Answered
+from starpos.session.driver import Answered
 from starpos.session.replay import Replay
 from starpos.session.settings import Settings
 from starpos_bringup.bag import Bag

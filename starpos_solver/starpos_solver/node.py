@@ -16,8 +16,7 @@ from std_srvs.srv import Trigger
 
 from starpos.instrument.camera import Camera
 from starpos.session import reports
-from starpos.session.driver import Sent
-from starpos.session.frames import Output
+from starpos.session.driver import Output, Sent
 from starpos.session.gnss import GNSS_TOPIC, ComparedPlaces
 from starpos.session.gyro import IMU_TOPIC
 from starpos.session.session import CAMERA_TOPIC, SolverSession

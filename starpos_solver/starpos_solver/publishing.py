@@ -17,7 +17,7 @@ from std_msgs.msg import Header
 
 from starpos.earth.vertical import Geodetic
 from starpos.instrument.instrument import Instrument
-from starpos.session.frames import Answered, Averaged, BySatellites, Output
+from starpos.session.driver import Answered, Averaged, BySatellites, Output
 from starpos.session.settings import Settings
 from starpos_common.messages import attitude_to_message, quaternion
 from starpos_common.topics import publisher

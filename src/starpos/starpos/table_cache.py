@@ -39,7 +39,6 @@ class KeptTables(Generic[Table]):
     number_kinds  numpy's kinds of the columns' numbers
     what          name of the table in a warning if it cannot be kept; '' for one that is quick to build
     most          number of tables in memory
-    newer         makes the columns that folders of earlier versions lack, from the others
     """
 
     def __init__(
@@ -49,10 +48,9 @@ class KeptTables(Generic[Table]):
         number_kinds: str,
         what: str = "",
         most: int = 1,
-        newer: Callable[[dict[str, np.ndarray]], dict[str, np.ndarray]] = lambda columns: {},
     ) -> None:
         self.kind, self.prefix, self.number_kinds = kind, prefix, number_kinds
-        self.what, self.most, self.newer = what, most, newer
+        self.what, self.most = what, most
         self._lock = threading.Lock()
         self._in_use: dict[Path, Table] = {}
 
@@ -114,16 +112,12 @@ class KeptTables(Generic[Table]):
         names = [f.name for f in fields(self.kind)]  # type: ignore[arg-type]
         try:
             columns = {
-                name: np.asarray(np.load(path, mmap_mode="r", allow_pickle=False))
+                name: np.asarray(np.load(folder / f"{name}.npy", mmap_mode="r", allow_pickle=False))
                 for name in names
-                if (path := folder / f"{name}.npy").exists()
             }
-            if len(columns) < len(names):
-                columns = {**self.newer(columns), **columns}
-            ordered = {name: columns[name] for name in names}
-            if [c.dtype.kind for c in ordered.values()] != list(self.number_kinds):
+            if [c.dtype.kind for c in columns.values()] != list(self.number_kinds):
                 return None
-            table: Any = self.kind(**ordered)
+            table: Any = self.kind(**columns)
             table.check(*of)
         except (OSError, ValueError, EOFError, KeyError):
             return None

@@ -2,6 +2,7 @@
 """What the package says of itself, and the licences that go with it."""
 
 import re
+import shutil
 import subprocess
 import sys
 import tarfile
@@ -50,8 +51,11 @@ def test_a_package_holds_all_that_ships(command, tmp_path):
     """The source package all, a wheel all but what its compiled modules are made of."""
     pytest.importorskip("Cython", reason="setup.py asks Cython for its version")
     options = {"sdist": ("--formats", "tar", "--dist-dir"), "build_py": ("--build-lib",)}[command]
-    setup = [sys.executable, "-W", "ignore", "setup.py", "-q", "egg_info", "--egg-base", str(tmp_path)]
-    subprocess.run([*setup, command, *options, str(tmp_path)], cwd=PACKAGE, check=True, capture_output=True)
+    # in a copy: it writes next to setup.py, where others may be at work
+    source, unused = tmp_path / "source", ("test", "build", "*.so", "*.egg-info", "__pycache__")
+    shutil.copytree(PACKAGE, source, ignore=shutil.ignore_patterns(*unused))
+    setup = [sys.executable, "-W", "ignore", "setup.py", "-q", command, *options, str(tmp_path)]
+    subprocess.run(setup, cwd=source, check=True, capture_output=True)
     if command == "sdist":
         with tarfile.open(*tmp_path.glob("*.tar")) as packed:
             held, wanted = {name.partition("/")[2] for name in packed.getnames()}, shipped()

@@ -145,12 +145,13 @@ def attitude_to_message(attitude: CameraAttitude) -> msg.Attitude:
 def camera_to_message(camera: Camera, frame_id: str, unix_s: float | None = None) -> CameraInfo:
     """Convert a camera to a CameraInfo without rectification."""
     fx, fy, cx, cy = camera.fx, camera.fy, camera.cx, camera.cy
+    model, distortion = camera.stated
     return CameraInfo(
         header=Header(stamp=unix_to_stamp(unix_s), frame_id=frame_id),
         width=int(camera.width),
         height=int(camera.height),
-        distortion_model=camera.model,
-        d=[float(v) for v in camera.distortion],
+        distortion_model=model,
+        d=[float(v) for v in distortion],
         k=[float(v) for v in (fx, 0, cx, 0, fy, cy, 0, 0, 1)],
         r=[1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
         p=[float(v) for v in (fx, 0, cx, 0, 0, fy, cy, 0, 0, 0, 1, 0)],

@@ -231,7 +231,7 @@ class Board:
         self._track: deque[tuple[int, float, float]] = deque(maxlen=track)
         self._count = 0
         # a known place by the solver's diagnostics, deg
-        self._site: list[float] | None = None
+        self._site: tuple[float, float] | None = None
 
     def keep_track_of(self, fixes: int) -> None:
         """Keep this number of fixes from now on."""
@@ -277,11 +277,11 @@ class Board:
         """Keep the known place that a solver reports, from which the Sun is shown before any fix."""
         told = {v.key: v.value for v in status.values[:STATUSES]}
         try:
-            place = [number(float(told[key])) for key in (SITE_LATITUDE, SITE_LONGITUDE)]
+            latitude, longitude = (float(told[key]) for key in (SITE_LATITUDE, SITE_LONGITUDE))
         except (KeyError, ValueError):
             return
-        if None not in place and max(map(abs, place)) <= 360 and abs(place[0]) <= 90:
-            self._site = place
+        if abs(latitude) <= 90 and abs(longitude) <= 360:
+            self._site = latitude, longitude
 
     def show_frame(self, number: int, stamp_s: float | None, trouble: str = "") -> None:
         """Note the number of a picture, or why it is missing."""

@@ -40,12 +40,16 @@ class Blob:
 
 @dataclass
 class Vector:
-    """A property of a device: kind (Switch, Number, Text ...), state, texts of its members and limits of its numbers."""
+    """A property of a device: kind (Switch, Number, Text ...), state, texts of its members and limits of its numbers.
+
+    asked: whether it was set, and the device has not answered yet.
+    """
 
     kind: str
     state: str
     members: dict[str, str] = field(default_factory=dict)
     limits: dict[str, tuple[str | None, str | None]] = field(default_factory=dict)
+    asked: bool = False
 
 
 class IndiDevice:
@@ -146,7 +150,7 @@ class IndiDevice:
         element = ET.Element(f"new{found.kind}Vector", device=self.name, name=vector)
         for name, text in members.items():
             ET.SubElement(element, f"one{found.kind}", name=name).text = text
-        found.state = "Busy"
+        found.state, found.asked = "Busy", True
         self._tell(element)
 
     def enable_blobs(self, vector: str) -> None:
@@ -222,6 +226,10 @@ class IndiDevice:
             self._definitions += name == "CONNECTION"
         elif kind.startswith("set") and (vector := self._vectors.get(name)) is not None:
             vector.state = element.get("state", vector.state)
+            if vector.asked and vector.state == "Busy":
+                # It begins now: a frame that has come is of an exposure before.
+                self.blob = None
+            vector.asked = False
             for m in element:
                 if m.tag == "oneBLOB":
                     self.blob = _blob(m)

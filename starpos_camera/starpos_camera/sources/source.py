@@ -129,8 +129,6 @@ class DeviceSource(FrameSource, Generic[D]):
 
     def close(self) -> None:
         self._closing.set()
-        if self._device is not None:
-            self._interrupt(self._device)
         with self._in_use:
             self._release()
 
@@ -148,9 +146,6 @@ class DeviceSource(FrameSource, Generic[D]):
 
     def _close(self, device: D) -> None:
         """Give the device up, which may have gone."""
-
-    def _interrupt(self, device: D) -> None:
-        """End the waiting of a `capture` that does not look at `_closing`."""
 
     def _explain(self, error: Exception) -> str | None:
         """Say in a sentence what an error means; None for a defect, which the node reports as one."""

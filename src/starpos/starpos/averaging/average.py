@@ -335,7 +335,7 @@ class _Track:
 
     def touched(self, f: Fix) -> "_Track":
         """The track after somebody touched the camera; `f` is the first fix since."""
-        return replace(self, place_filter=self.place_filter.heading_unknown(), pose=f, in_pose=0)
+        return replace(self, place_filter=self.place_filter.forget((False, False, True)), pose=f, in_pose=0)
 
     def begin(self, f: Fix) -> "_Track":
         """The track with its first fix, which nothing can contradict."""

@@ -3,7 +3,6 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -176,12 +175,12 @@ def _contradicting(best: FoundAxis, given: Calibration, site: Place | None) -> s
     number, free = best.directions, best.directions - (2 if site is not None else 4)
     if number < MIN_JUDGED or best.off.max() < OUTLIER_SIGMA:
         return set()
-    problem = _Problem.about(
-        best.a3, best.circles, given=given, ray=best.ray, zenith_sigma=site and site.plumb_stddev
-    )
+    sigma = None if site is None else site.plumb_stddev
+    problem = _Problem(best.a3, best.circles, given, best.ray, sigma)
     off, a3, zenith = best.off, best.a3, best.zenith
     for _ in range(REWEIGHTED):
-        robust = _descended(replace(problem, doubt=np.maximum(off - 1, 0.0)), a3, zenith)
+        problem.doubt = np.maximum(off - 1, 0.0)
+        robust = problem.descended(a3, zenith)
         if robust is None:
             return set()
         off, a3, zenith = robust.off, robust.a3, robust.zenith
@@ -217,8 +216,6 @@ def _slope(circle: Circle, across: np.ndarray) -> np.ndarray:
     return -(across @ circle.up) / max(np.sin(circle.zenith_distance), 1e-9)
 
 
-@at_once
-@dataclass(frozen=True, kw_only=True)
 class _Problem:
     """The circles about an A3 (3, 3), of which refraction and errors stay as they are while the axis moves a little.
 
@@ -226,29 +223,19 @@ class _Problem:
     zenith_sigma: None if the zenith is unknown.
     """
 
-    given: Calibration
-    ray: np.ndarray
-    zenith_sigma: float | None
-    circles: Sequence[Circle]
-    part: Directions
-    up: np.ndarray
-    bent: np.ndarray
-    stated: np.ndarray
-    doubt: np.ndarray | float = 0.0
-
-    @classmethod
-    def about(cls, a3: np.ndarray, circles: Sequence[Circle], **what: Any) -> "_Problem":
-        """The problem of circles (N) that were made with an A3."""
-        part, up = Directions.of(circles), np.array([c.up for c in circles])
-        seen = _seen(up, a3 @ what["ray"])
-        return cls(
-            circles=circles,
-            part=part,
-            up=up,
-            bent=np.array([c.zenith_distance for c in circles]) - seen,
-            stated=np.sum([c for name, c in part.sources.items() if name != OF_A3], axis=0),
-            **what,
-        )
+    def __init__(
+        self,
+        a3: np.ndarray,
+        circles: Sequence[Circle],
+        given: Calibration,
+        ray: np.ndarray,
+        zenith_sigma: float | None,
+    ) -> None:
+        self.circles, self.given, self.ray, self.zenith_sigma = circles, given, ray, zenith_sigma
+        self.part, self.up = Directions.of(circles), np.array([c.up for c in circles])
+        self.bent = np.array([c.zenith_distance for c in circles]) - _seen(self.up, a3 @ ray)
+        self.stated = np.sum([c for name, c in self.part.sources.items() if name != OF_A3], axis=0)
+        self.doubt: np.ndarray | float = 0.0
 
     def at(self, a3: np.ndarray, zenith: np.ndarray) -> "_Normal | None":
         """Linearise at an A3 and a zenith; None for an axis that some frames cannot have."""
@@ -281,6 +268,35 @@ class _Problem:
             chi2=float(left @ weighted[:, 0] + off @ prior @ off),
             off=np.abs(left) / np.sqrt(np.diag(stated)),
         )
+
+    def descended(self, a3: np.ndarray, zenith: np.ndarray) -> "_Normal | None":
+        """The least chi-square near an A3 and a zenith, by Levenberg and Marquardt's method.
+
+        Axis and zenith together lie in a narrow, bent valley where the sensor leans about alike in all directions.
+        """
+        damping, now, ray = FIRST_DAMPING, self.at(a3, zenith), self.ray
+        axis = rotation.normalised(a3 @ ray)
+        if now is None:
+            return None
+        for _ in range(AXIS_ROUNDS):
+            damped = now.matrix + damping * np.diag(np.diag(now.matrix))
+            step = -np.linalg.solve(damped, now.pull)
+            step /= max(1.0, float(np.abs(step).max()) / MAX_STEP_RAD)
+            moved = rotation.normalised(now.a3 @ ray + step[:2] @ now.across)
+            # each from the first, because products of many turns grow apart from a rotation
+            tried_a3, there = rotation.shortest_turn(axis, moved) @ a3, now.zenith
+            if self.zenith_sigma is None:
+                there = rotation.normalised(there + step[2:] @ Directions.east_north(there))
+            tried = self.at(tried_a3, there)
+            if tried is None or tried.chi2 > now.chi2:
+                damping *= 10
+                if damping > LAST_DAMPING:
+                    break
+                continue
+            gain, now, damping = now.chi2 - tried.chi2, tried, damping / 10
+            if gain < SETTLED_CHI2:
+                break
+        return now
 
 
 def _seen(up: np.ndarray, axis: np.ndarray) -> np.ndarray:
@@ -321,8 +337,8 @@ def _fitted(
         if len(circles) < frames:
             return None
         frames, before = len(circles), a3
-        problem = _Problem.about(a3, circles, given=given, ray=ray, zenith_sigma=zenith_sigma)
-        now = _descended(problem, a3, zenith)
+        problem = _Problem(a3, circles, given, ray, zenith_sigma)
+        now = problem.descended(a3, zenith)
         if now is None:
             return None
         a3, zenith = now.a3, now.zenith
@@ -345,33 +361,3 @@ def _fitted(
         chi2=now.chi2,
         circles=circles,
     )
-
-
-def _descended(problem: _Problem, a3: np.ndarray, zenith: np.ndarray) -> _Normal | None:
-    """The least chi-square near an A3 and a zenith, by Levenberg and Marquardt's method.
-
-    Axis and zenith together lie in a narrow, bent valley where the sensor leans about alike in all directions.
-    """
-    damping, now, ray = FIRST_DAMPING, problem.at(a3, zenith), problem.ray
-    axis = rotation.normalised(a3 @ ray)
-    if now is None:
-        return None
-    for _ in range(AXIS_ROUNDS):
-        damped = now.matrix + damping * np.diag(np.diag(now.matrix))
-        step = -np.linalg.solve(damped, now.pull)
-        step /= max(1.0, float(np.abs(step).max()) / MAX_STEP_RAD)
-        moved = rotation.normalised(now.a3 @ ray + step[:2] @ now.across)
-        # each from the first, because products of many turns grow apart from a rotation
-        tried_a3, there = rotation.shortest_turn(axis, moved) @ a3, now.zenith
-        if problem.zenith_sigma is None:
-            there = rotation.normalised(there + step[2:] @ Directions.east_north(there))
-        tried = problem.at(tried_a3, there)
-        if tried is None or tried.chi2 > now.chi2:
-            damping *= 10
-            if damping > LAST_DAMPING:
-                break
-            continue
-        gain, now, damping = now.chi2 - tried.chi2, tried, damping / 10
-        if gain < SETTLED_CHI2:
-            break
-    return now

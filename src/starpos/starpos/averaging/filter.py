@@ -132,10 +132,6 @@ class PlaceFilter:
         sources[:, which, :] = sources[:, :, which] = 0.0
         return replace(self, sources=sources, known=self.known & ~np.array(unknown))
 
-    def heading_unknown(self) -> "PlaceFilter":
-        """The filter after the instrument was turned at its place."""
-        return self.forget((False, False, True))
-
     def elsewhere(self, f: Fix) -> "PlaceFilter":
         """The filter at an unknown place in the plane of a fix, with all that is known of the instrument's errors."""
         return replace(self.forget((True, True, True)), plane=Plane.at(f))

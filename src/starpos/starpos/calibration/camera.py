@@ -2,11 +2,13 @@
 """Calibrates a camera with the sky: identifies frames, fits the camera and their attitudes, and judges the fit."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from starpos.calibration.camera_adjustment import (
+    LEAN_RAD,
+    LEANS,
     STEP_RAD,
     CameraAdjustment,
     CameraEstimate,
@@ -15,6 +17,7 @@ from starpos.calibration.camera_adjustment import (
     parameters,
     settled_camera,
     unbent,
+    unknowns,
     with_values,
 )
 from starpos.calibration.misalignment import NOTHING_KNOWN, Known
@@ -23,6 +26,7 @@ from starpos.earth.place import Place
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import CalibrationError, InstrumentError, TimeError
 from starpos.fix.checks import check_risen
+from starpos.fix.heading import checked_zenith, feigned
 from starpos.fix.solver import ENOUGH_SOUND, high_enough
 from starpos.fix.star_fit import MatchedStars, sound_matches
 from starpos.frames.frame import Stars
@@ -30,7 +34,7 @@ from starpos.frames.reading import why_no_time
 from starpos.frozen import at_once
 from starpos.identification import Identification, PointingPrior, Sky, field_of, fisheye, identify, triangles
 from starpos.identification.triangles import TriangleCatalogue
-from starpos.instrument.camera import EQUIDISTANT, Camera
+from starpos.instrument.camera import DECENTRED, EQUIDISTANT, Camera
 from starpos.instrument.platepar import SkyPixels
 from starpos.progress import Progress, quiet
 from starpos.sky import deeper
@@ -141,7 +145,7 @@ def fit_camera(
     problem = CameraAdjustment.of(sightings, given, atmosphere, free)
     state, covariance, keep, jitter2 = settled_camera(problem)
     to_named = problem.named_per_unit()
-    held = problem.with_free("scale")
+    held = replace(problem, sigma=problem.sigma * (np.array(unknowns(given)) == "scale"))
     before, _ = held.refined(
         CameraEstimate(np.zeros(len(problem.sigma)), problem.start), problem.stated + np.eye(2), keep
     )
@@ -221,12 +225,22 @@ ROUNDS = 5
 SETTLED_SHARE = 0.002
 
 
+# BIC by which two more terms must be better
+SUPPORTED = 10.0
+
+
 @dataclass(frozen=True)
 class FromSky:
-    """A camera from frames; used: indices of the frames that were identified, in the order of the fit."""
+    """A camera from frames; used: indices of the frames that were identified, in the order of the fit.
+
+    lean_rad, lean_sigma_rad: how far the zenith by refraction is from the one by time and place, and its error along the
+    worse axis; NaN where no place is known.
+    """
 
     fit: Intrinsics
     used: tuple[int, ...]
+    lean_rad: float = np.nan
+    lean_sigma_rad: float = np.nan
 
 
 def calibrate_camera(
@@ -253,6 +267,8 @@ def calibrate_camera(
     known : the stars of frames, by the frames' numbers, that only a longer search identifies
     site : where the camera is: the stars then show its level, and `levels` are not needed
 
+    A fisheye has DECENTRED terms if the stars support them.
+
     Returns
     -------
     FromSky
@@ -263,7 +279,7 @@ def calibrate_camera(
     CalibrationError
         no camera can be found
     PlaceError
-        stars would be under the horizon of the site
+        stars would be under the horizon of the site, or refraction shows another zenith
     InstrumentError
         a frame is mirrored
     TimeError
@@ -299,12 +315,14 @@ def calibrate_camera(
     for n, found in known.items():
         skies[n].check_risen(frames[n], found, given)
     attitudes = {n: found.attitude for n, found in known.items() if not found.mirrored}
-    for k, free in enumerate((*FIRST_FREE, *[every] * ROUNDS)):
+    rounds = len(FIRST_FREE) + ROUNDS
+    for k in range(rounds):
+        free = FIRST_FREE[k] if k < len(FIRST_FREE) else every
         sightings = {}
         for n, frame in enumerate(skies):
             if sighting := frame.sighting(camera, atmosphere, attitudes.get(n)):
                 sightings[n] = sighting
-            progress("camera", (k + (n + 1) / len(skies)) / (len(FIRST_FREE) + ROUNDS))
+            progress("camera", (k + (n + 1) / len(skies)) / rounds)
         if not sightings:
             raise CalibrationError(
                 f"no part of the sky matches any of the {len(frames)} frames: check the focal length "
@@ -317,7 +335,10 @@ def calibrate_camera(
         attitudes = {n: skies[n].of_sky(a) for n, a in zip(sightings, fit.attitudes, strict=True)}
         count = sum(len(s.stars.xy) for s in sightings.values())
         if k >= len(FIRST_FREE) and abs(count - before) <= SETTLED_SHARE * count:
-            break
+            if (more := _decentred(list(sightings.values()), given, atmosphere, fit)) is None:
+                break
+            fit, given = more, replace(given, distortion=(*given.distortion, *[0.0] * len(DECENTRED)))
+            camera, every = fit.camera, parameters(given)
         before = count
     there = sum(len(skies[n].stars) for n in sightings)
     few = FEW * fewest_stars(every)
@@ -326,8 +347,47 @@ def calibrate_camera(
             f"{len(fit.xy)} of {there} stars fit one camera, too few to be sure of it: give frames with {few} or more"
         )
     check_sound(fit, given)
+    lean = _lean(list(sightings.values()), fit, atmosphere) if site is not None else ()
     progress("camera", 1.0)
-    return FromSky(fit, tuple(sightings))
+    return FromSky(fit, tuple(sightings), *lean)
+
+
+def _decentred(
+    sightings: Sequence[CameraSighting], given: Camera, atmosphere: Atmosphere, fit: Intrinsics
+) -> Intrinsics | None:
+    """The fit of a fisheye with DECENTRED terms, if the stars support them better than `fit`; else None."""
+    if not fisheye.is_wide(given) or given.coefficients[-2:] == DECENTRED:
+        return None
+    more = replace(given, distortion=(*given.distortion, *[0.0] * len(DECENTRED)))
+    other = fit_camera(sightings, more, atmosphere)
+    # of the stars that both fits keep
+    names = [set(zip(f.frame.tolist(), *f.xy.T.tolist(), strict=True)) for f in (fit, other)]
+    squares = [
+        np.sum(
+            f.residual[[name in shared for name in zip(f.frame.tolist(), *f.xy.T.tolist(), strict=True)]] ** 2
+        )
+        for f, shared in ((fit, names[1]), (other, names[0]))
+    ]
+    n = 2 * len(names[0] & names[1])
+    gain = n * np.log(squares[0] / squares[1]) - len(DECENTRED) * np.log(n)
+    return other if gain > SUPPORTED else None
+
+
+def _lean(
+    sightings: Sequence[CameraSighting], fit: Intrinsics, atmosphere: Atmosphere
+) -> tuple[float, float]:
+    """How far (rad) the zenith by refraction is off, and its error; PlaceError if it contradicts time and place."""
+    problem = CameraAdjustment.of(sightings, fit.camera, atmosphere, parameters(fit.camera))
+    if not problem.upright or atmosphere.pressure_pa == 0:
+        return np.nan, np.nan
+    state, _, keep, jitter2 = settled_camera(problem)
+    leaning, errors = problem.leaning(state), problem.stated + np.eye(2) * jitter2
+    start = CameraEstimate(np.zeros(len(leaning.sigma)), leaning.start)
+    # one step: with many terms of a lens free, a lean has other minima far away
+    q, _, covariance = leaning.step(start, errors, keep)
+    last = slice(-len(LEANS), None)
+    widened = covariance[last, last] * feigned(jitter2, problem.stated)
+    return checked_zenith(LEAN_RAD * q[last], LEAN_RAD**2 * widened)
 
 
 # stars lower than this do not show where a platepar's pixels look

@@ -16,15 +16,15 @@ from starpos.earth.refraction import Atmosphere
 from starpos.errors import CalibrationError
 from starpos.fix.star_fit import MatchedStars, distance2, judged
 from starpos.frozen import at_once
-from starpos.instrument.camera import COEFFICIENTS, EQUIDISTANT, PLUMB_BOB, RATIONAL, Camera
+from starpos.instrument.camera import COEFFICIENTS, DECENTRED, EQUIDISTANT, PLUMB_BOB, RATIONAL, Camera
 
 # 1 sigma of the priors about the given camera: relative focal length, fx over fy, principal point (share of the longer
 # side), and the shift of a corner by k1, k2, p1, p2, k3 (share of half the diagonal)
 FOCAL, SQUARE, PRINCIPAL = 0.03, 0.005, 0.03
 CORNER = (0.02, 0.01, 0.003, 0.003, 0.005)
 # The same of a fisheye's k1, k2, k3, k4, whose picture's end may be shifted by a quarter (a stereographic lens); it is
-# at most so far off the axis, rad.
-FISHEYE_EDGE, FISHEYE_MOST_RAD = (0.15, 0.08, 0.04, 0.02), 1.6
+# at most so far off the axis, rad; and of p1, p2, which hardly move it.
+FISHEYE_EDGE, FISHEYE_MOST_RAD, FISHEYE_DECENTRED = (0.15, 0.08, 0.04, 0.02), 1.6, 0.02
 # Refraction shrinks the field: across the vertical as at the zenith, along it twice as much at 45 deg.  For a frame of
 # unknown level: the shrinking that is assumed, and its sigma per axis, in units of that at the zenith
 UNLEVELLED = 1.25, 0.3
@@ -68,7 +68,13 @@ def _shrinking(atmosphere: Atmosphere) -> float:
 
 def parameters(camera: Camera) -> tuple[str, ...]:
     """Names (P,) of the parameters of a camera that can be found: of a rational lens all but its denominator's."""
-    return ("fx", "fy", "cx", "cy", *COEFFICIENTS[PLUMB_BOB if camera.model == RATIONAL else camera.model])
+    return (
+        "fx",
+        "fy",
+        "cx",
+        "cy",
+        *(COEFFICIENTS[PLUMB_BOB] if camera.model == RATIONAL else camera.coefficients),
+    )
 
 
 def camera_values(camera: Camera) -> np.ndarray:
@@ -86,8 +92,12 @@ def with_values(camera: Camera, values: np.ndarray) -> Camera:
 
 
 # The unknowns q are in sigma of their priors: scale, squareness, the camera's other parameters, and these. They are the
-# strength of the refraction relative to the model, and the shrinking of the field along x and y if the level is unknown
-OF_THE_AIR = ("refraction", "shrink_x", "shrink_y")
+# strength of the refraction relative to the model, and the shrinking of the field along x and y if the level is unknown.
+# LEANS turn the zenith of the air against L, rad; they are held unless they are asked for
+LEANS = ("lean_north", "lean_west")
+OF_THE_AIR = ("refraction", "shrink_x", "shrink_y", *LEANS)
+# 1 sigma of a lean by a wrong hour, rad
+LEAN_RAD = 0.3
 
 
 def unknowns(camera: Camera) -> tuple[str, ...]:
@@ -142,7 +152,7 @@ class CameraAdjustment:
         camera = np.array([FOCAL, SQUARE, side, side, *_lens_sigma(given)]) * held
         return cls(
             given=given,
-            sigma=np.array([*camera, atmosphere.relative_sigma, shrink, shrink]),
+            sigma=np.array([*camera, atmosphere.relative_sigma, shrink, shrink, *np.zeros(len(LEANS))]),
             xy=np.concatenate([s.stars.xy for s in sightings]),
             stated=np.concatenate([s.stars.covariance_px2 for s in sightings])
             + np.eye(2) * direction2[:, None, None],
@@ -155,9 +165,10 @@ class CameraAdjustment:
             upright=all(s.upright for s in sightings),
         )
 
-    def with_free(self, name: str) -> "CameraAdjustment":
-        """The problem with one of the unknowns free and all others held."""
-        return replace(self, sigma=self.sigma * np.array([u == name for u in unknowns(self.given)]))
+    def leaning(self, state: CameraEstimate) -> "CameraAdjustment":
+        """The problem near an estimate, with the zenith of the air free too."""
+        sigma = np.append(self.sigma[: -len(LEANS)], [LEAN_RAD] * len(LEANS))
+        return replace(self, given=self.camera(state.q), start=state.attitudes, sigma=sigma)
 
     @cached_property
     def levelled(self) -> np.ndarray:
@@ -176,9 +187,12 @@ class CameraAdjustment:
 
     def light(self, state: CameraEstimate) -> np.ndarray:
         """Directions (N, 3) in C from which the light of the stars comes."""
-        strength, *shrink = (state.q * self.sigma)[-len(OF_THE_AIR) :]
+        strength, *shrink, north, west = (state.q * self.sigma)[-len(OF_THE_AIR) :]
         model = self.atmosphere.refraction(1 + strength)
-        places = model.bend(self.places) if self.upright else self.places
+        places = self.places
+        if self.upright:
+            lean = rotation.from_vector(np.array([north, west, 0.0]))
+            places = model.bend(places @ lean.T) @ lean
         u = np.einsum("nij,nj->ni", state.attitudes[self.frame], places)
         if self.upright:
             return u
@@ -305,7 +319,9 @@ def _lens_sigma(given: Camera) -> np.ndarray:
     """1 sigma of the priors of the lens's coefficients."""
     if given.model == EQUIDISTANT:
         edge = min(given.half_diagonal_rad, FISHEYE_MOST_RAD)
-        return np.array(FISHEYE_EDGE) / edge ** np.array([2, 4, 6, 8])
+        radial = np.array(FISHEYE_EDGE) / edge ** np.array([2, 4, 6, 8])
+        decentred = given.coefficients[-2:] == DECENTRED
+        return np.append(radial, [FISHEYE_DECENTRED / (3 * edge)] * 2) if decentred else radial
     r = np.hypot(given.width, given.height) / 2 / np.sqrt(given.fx * given.fy)
     return np.array(CORNER) / np.array([r**2, r**4, 3 * r, 3 * r, r**6])
 

@@ -490,6 +490,11 @@ def _about(found: FromSky) -> str:
         by = "from the stars" if told else "from the prior"
         lines.append(f"  {name:<4} {value:>16.{digits}f} +- {sigma:<12.{digits}f} {by}")
     lines.append(f"predicted positions (attitude and scale aside): +- {fit.worst_sigma_px:.3f} px at worst")
+    if np.isfinite(found.lean_rad):
+        lean, sigma = np.degrees([found.lean_rad, found.lean_sigma_rad])
+        lines.append(
+            f"refraction shows the zenith {lean:.2f} +- {sigma:.2f} deg from where time and place put it"
+        )
     return "\n".join(lines) + "\n"
 
 

@@ -173,7 +173,8 @@ def put_combined(
 def _lines_of(folder: str | None, together: Average, vertical: Vertical) -> str:
     """The lines of an average: its place, the place on WGS 84, the sources of error, the IERS table."""
     ground = geodetic(together.latitude, together.longitude, 0.0, together.covariance, vertical)
-    turned = f" (the last of {together.poses} poses)" if together.poses > 1 else ""
+    headed = together.poses > 1 and not np.isnan(together.heading)
+    turned = f" (the last of {together.poses} poses)" if headed else ""
     night = "" if folder is None else f"{folder}: "
     on_ground = InDegrees.of(ground.latitude, ground.longitude, 0.0, ground.covariance)
     frames = counted(together.frames) + ("" if together.frames == 1 else " together")

@@ -7,8 +7,8 @@ from starpos.cli import console, fix_output, inputs
 from starpos.earth.vertical import Vertical
 from starpos.errors import FrameError
 from starpos.fix.checks import BY_PARAMETERS, MODEL_BY_PARAMETERS
-from starpos.night.remarks import of_a3, of_inclinometer
-from starpos.night.together import FrameAnswer, Gathered, extrapolated
+from starpos.night.remarks import of_a3, of_extrapolation, of_inclinometer
+from starpos.night.together import FrameAnswer, Gathered
 from starpos.recording.drivers import Drivers
 from starpos.recording.topics import remaps_of
 from starpos.session.replay import PlayedNight, Playing
@@ -54,7 +54,7 @@ def tell(
             fix_output.line_of(f"{bag} {time}", solution, turning=False),
         )
     whole, solved = night.average, gathered.solved
-    remarks = list(extrapolated(solved))
+    remarks = list(of_extrapolation(solved))
     if solved:
         remarks += of_inclinometer(night.instrument, MODEL_BY_PARAMETERS)
     if whole:

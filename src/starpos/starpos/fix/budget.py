@@ -3,7 +3,7 @@
 
 import math
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import partial
 
 import numpy as np
 
@@ -28,17 +28,11 @@ CALIBRATION = "calibration"
 @at_once
 @dataclass(frozen=True)
 class LocalNorth:
-    """The place that A4 contains: latitude, longitude (rad); east and north as unit vectors (3,) of L."""
+    """The place that A4 contains: latitude, longitude (rad); local_to_enu (3, 3): rotation of L into east, north, up."""
 
     latitude: float
     longitude: float
-    east: np.ndarray
-    north: np.ndarray
-
-    @cached_property
-    def local_to_enu(self) -> np.ndarray:
-        """Rotation (3, 3) of L into east, north, up."""
-        return np.array([self.east, self.north, [0.0, 0.0, 1.0]])
+    local_to_enu: np.ndarray
 
 
 def local_north(a4: np.ndarray) -> LocalNorth:
@@ -46,8 +40,8 @@ def local_north(a4: np.ndarray) -> LocalNorth:
     latitude, longitude = place_of_zenith(a4[2])
     x, y, _ = (a4 @ enu_axes(latitude, longitude)[1]).tolist()
     level = math.hypot(x, y)
-    north = np.array([x / level, y / level, 0.0])
-    return LocalNorth(latitude, longitude, np.array([y / level, -x / level, 0.0]), north)
+    c, s = y / level, x / level
+    return LocalNorth(latitude, longitude, np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]))
 
 
 @at_once
@@ -74,7 +68,7 @@ class Circumstances:
 def sky_rows(place: LocalNorth) -> np.ndarray:
     """Change (6, 3) of the rows of an ErrorTerm for small rotations of the sky about L's axes, which change A4 only."""
     prime, meridian = curvature_radii_m(place.latitude)
-    east, north = place.east, place.north
+    east, north, _ = place.local_to_enu
     rows = np.zeros((6, 3))
     # a rotation by (dx, dy) moves the zenith among the stars by (-dy, dx)
     rows[0, 0], rows[0, 1] = prime * east[1], -prime * east[0]

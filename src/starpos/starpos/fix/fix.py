@@ -95,7 +95,7 @@ class InDegrees:
     def facing(self) -> str:
         """The heading with its error; that it is not known."""
         if math.isnan(self.heading):
-            return "heading not known: the camera was touched, or its roll is unknown"
+            return "heading not known: of elevations alone, or the camera was touched"
         return f"heading {self.heading:.4f} +- {self.sigma_heading:.4f} deg"
 
     def __str__(self) -> str:

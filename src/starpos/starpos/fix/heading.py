@@ -19,15 +19,24 @@ from starpos.fix.attitude import CAMERA, ENU, Attitude, heading_row
 from starpos.fix.budget import Circumstances, link_attitude, mount_term, sky_terms
 from starpos.fix.checks import check_visible
 from starpos.fix.sighting import FittedSighting, fitted_fields
-from starpos.fix.star_fit import MatchedStars, StarFit, apparent, fit_stars
+from starpos.fix.star_fit import MatchedStars, StarFit, adjustment_of, apparent, fit_stars
 from starpos.fix.terms import ALWAYS, ErrorTerm, total_covariance
 from starpos.frozen import at_once
+from starpos.identification import fisheye
 from starpos.instrument.mounting import Mounting
 
 # the level settles to this, rad; refraction turns with it, and settles a thousand times faster, or ten times at 10 deg
 SETTLED_RAD, MAX_ROUNDS = 1e-9, 10
 # minimum share of the refraction expected at the place, and significance in sigma: less belongs to another place
 MIN_SHARE, REFRACTION_SIGMAS = 0.5, 5.0
+# sigma beyond which the zenith that refraction shows contradicts time and place, and how far off (rad) it may seem to be
+ZENITH_SIGMAS, ZENITH_RAD = 5.0, math.radians(2)
+# residuals beyond the stars' errors are of the lens, and alike for neighbours: number of independent ones on a frame
+LENS_VALUES = 20
+# a zenith that refraction shows to this (rad) confirms the hour
+CONFIRMED_RAD = math.radians(3)
+# step of the numerical derivatives, rad
+STEP_RAD = 1e-3
 
 
 @at_once
@@ -35,6 +44,7 @@ MIN_SHARE, REFRACTION_SIGMAS = 0.5, 5.0
 class AttitudeAtPlace(FittedSighting):
     """Attitude of the instrument at a known place, by the stars alone, or by the Sun and the level.
 
+    hour_shown: whether the stars themselves show that place and time fit, to an hour.
     plumb: in east, north, up by the plumb line (astronomic).  ellipsoid: by WGS 84's normal (geodetic).
     true_north: level by the plumb line, north by the ellipsoid, as the fix's attitude in a graph of nodes.
     """
@@ -43,6 +53,7 @@ class AttitudeAtPlace(FittedSighting):
     plumb: Attitude
     ellipsoid: Attitude
     true_north: Attitude
+    hour_shown: bool = True
 
     @property
     def optics(self) -> Attitude:
@@ -84,6 +95,16 @@ def attitude_at_place(stars: MatchedStars, place: Place, about: Circumstances) -
     else:
         raise FixError("the stars lie too low for their refraction to be known: point the camera higher")
     _check_refraction(seen, atmosphere)
+    shown = True
+    if fisheye.is_wide(camera) and atmosphere.pressure_pa:
+        leaned = [rotation.from_vector(turn) for turn in np.eye(3)[:2] * STEP_RAD]
+        moved = [
+            adjustment_of(stars.xy, camera, r @ g, itrs, refraction).predict(
+                r @ seen.fit.a4, seen.fit.scale, refraction.compiled
+            )
+            for r in leaned
+        ]
+        shown = any(camera.distortion) and _zenith_shown(seen, np.stack(moved, -1), atmosphere)
     moved = zenith_moved(place.plumb[0])
     terms = (
         *seen.terms(np.eye(3), about),
@@ -95,6 +116,7 @@ def attitude_at_place(stars: MatchedStars, place: Place, about: Circumstances) -
         **fitted_fields(seen, about, g, a4),
         **attitudes_at(place, g, about.mounting, terms, deflected, about.axis_stddev),
         place=place,
+        hour_shown=shown,
     )
 
 
@@ -149,6 +171,42 @@ def _check_refraction(seen: StarFit, atmosphere: Atmosphere) -> None:
             f"from the given place the air would bend this field more than the stars show ({share:.2f} +- {sigma:.2f} of "
             "it): check latitude and longitude, their order and signs, the clock, and the camera's fx and fy"
         )
+
+
+def _zenith_shown(seen: StarFit, leaned: np.ndarray, atmosphere: Atmosphere) -> bool:
+    """Whether refraction shows the zenith; PlaceError if it shows another one.
+
+    leaned (N, 2, 2): places of the stars in px, if the zenith were STEP_RAD further along each axis.
+    """
+    kept = seen.fit.kept
+    moved = (leaned[kept] - (seen.problem.xy + seen.fit.residual)[kept, :, None]) / STEP_RAD
+    found, covariance = seen.more(moved, atmosphere)
+    lean = checked_zenith(found, covariance * feigned(seen.fit.jitter2, seen.errors.centroids))
+    return lean[1] < CONFIRMED_RAD
+
+
+def feigned(jitter2: float, stated: np.ndarray) -> float:
+    """Factor by which a lens that is not modelled widens covariances; stated (N, 2, 2): of the stars' places, px2.
+
+    jitter2: variance of the stars beyond it, px2.
+    """
+    share = jitter2 / (jitter2 + float(np.trace(stated, axis1=1, axis2=2).mean()) / 2)
+    # a few percent of it are chance
+    return 1 + max(share - 3 / math.sqrt(len(stated)), 0.0) * len(stated) / LENS_VALUES
+
+
+def checked_zenith(lean: np.ndarray, covariance: np.ndarray) -> tuple[float, float]:
+    """How far (rad) the zenith by refraction is from the one by time and place, and its error along the worse axis.
+
+    lean (2,), covariance (2, 2): two small rotations, rad.  Raises PlaceError if they differ.
+    """
+    off, sigma = float(np.linalg.norm(lean)), float(np.sqrt(np.linalg.eigvalsh(covariance)[-1]))
+    if off > ZENITH_RAD and lean @ np.linalg.solve(covariance, lean) > ZENITH_SIGMAS**2:
+        raise PlaceError(
+            f"refraction shows the zenith {math.degrees(off):.1f} +- {math.degrees(sigma):.1f} deg from where time and "
+            "place put it: check latitude and longitude, their order and signs, and the hour (UTC, not local time)"
+        )
+    return off, sigma
 
 
 def zenith_moved(latitude: float) -> np.ndarray:

@@ -11,7 +11,7 @@ import numpy as np
 
 from starpos import rotation
 from starpos.earth.ellipsoid import curvature_radii_m
-from starpos.earth.orientation import EarthState, earth_state
+from starpos.earth.orientation import ROTATION_RAD_S, EarthState, earth_state
 from starpos.earth.place import Place, Places
 from starpos.earth.refraction import Atmosphere
 from starpos.errors import (
@@ -60,6 +60,7 @@ from starpos.progress import Progress, quiet
 from starpos.sky import deeper
 from starpos.sky.bodies import ERFA, SolarSystem
 from starpos.sky.catalogue import Catalogue
+from starpos.units import HOUR_S
 
 # A fisheye's lower stars are not used: no model describes refraction near the horizon.
 MIN_ALTITUDE_RAD = math.radians(10)
@@ -117,11 +118,6 @@ SMALLEST_FIELD_DEG, LARGEST_FIELD_DEG = 0.3, 130.0
 # A fisheye of which only the focal length is known misplaces stars by about this, outwards: it cancels where they lie all
 # around, and not where a mask leaves one side.
 NOMINAL_LENS_RAD = 0.002
-
-
-def _one_sided(off: np.ndarray) -> float:
-    """How far places (N, 2), relative to the axis, lie on one side of it: from 0 to 1."""
-    return float(np.hypot(*off.mean(0)) / max(np.hypot(*off.T).mean(), 1e-9))
 
 
 @dataclass(frozen=True)
@@ -188,7 +184,7 @@ class Solver:
         try:
             camera, catalogue, triangles = self.view(stars.width, stars.height, stars.origin_px)
             if part != 1.0:
-                triangles = self.triangles_of(stars.width, stars.height, part, stars.origin_px)
+                triangles = cached_triangles(catalogue, part * fisheye.field_rad(camera), self.progress)
             sky = Sky.at(catalogue, triangles, stars.mid_unix_s)
             field: FrameStars | fisheye.WideField | None = as_seen(camera, stars)
             if field is None:
@@ -377,10 +373,22 @@ class Solver:
         use, matched = self._matched(stars, found, camera, up, state, catalogue)
         about = self.circumstances(stars, camera.scaled(found.focal_scale), state)
         if fisheye.is_wide(camera) and not any(camera.distortion):
-            lens = NOMINAL_LENS_RAD * _one_sided(matched.xy - [camera.cx, camera.cy])
+            off = matched.xy - [camera.cx, camera.cy]
+            # how far they lie on one side of the axis, from 0 to 1
+            aside = float(np.hypot(*off.mean(0)) / max(np.hypot(*off.T).mean(), 1e-9))
+            lens = NOMINAL_LENS_RAD * aside
             about = replace(about, axis_stddev=math.hypot(about.axis_stddev, lens))
         attitude = attitude_at_place(matched, place, about)
-        return replace(attitude, used=np.flatnonzero(use)[attitude.used])
+        shown = attitude.hour_shown or self._hour_at_horizon(stars, found, camera, state, up)
+        return replace(attitude, used=np.flatnonzero(use)[attitude.used], hour_shown=shown)
+
+    def _hour_at_horizon(
+        self, stars: Stars, found: Identification, camera: Camera, state: EarthState, up: np.ndarray
+    ) -> bool:
+        """Whether an hour more or less would put stars under the horizon; up (3,): the zenith in C."""
+        pole, every = found.attitude @ state.gcrs_to_itrs[2], directions_of(camera, stars)
+        turned = (rotation.from_vector(sign * ROTATION_RAD_S * HOUR_S * pole) @ up for sign in (1, -1))
+        return all(set_stars((every @ zenith)[found.star], every @ zenith) for zenith in turned)
 
     def circumstances(self, frame: Stars | Pointing, camera: Camera, earth: EarthState) -> Circumstances:
         """How a frame was taken, by a camera in its pixels, at a state of the Earth."""
@@ -438,13 +446,6 @@ class Solver:
             )
         return camera, deeper.for_field(self.catalogue, camera)
 
-    def triangles_of(
-        self, width: int, height: int, part: float, origin_px: tuple[float, float] | None = None
-    ) -> TriangleCatalogue:
-        """Triangles for a part of such frames, as `identify` has it, from the cache or built."""
-        camera, catalogue, _ = self.view(width, height, origin_px)
-        return cached_triangles(catalogue, part * fisheye.field_rad(camera), self.progress)
-
     def _inside(self, stars: Stars) -> np.ndarray | None:
         """Rows of the stars that lie on their frame and in its lens's picture; None if all do, as is usual."""
         try:
@@ -485,6 +486,11 @@ def check_explained(answer: Solution) -> None:
         )
 
 
+UNSHOWN_HOUR = (
+    "nothing in the frame shows that its hour is right, and a wrong one turns the heading by degrees: state UTC, and "
+    "calibrate the camera with frames whose stars reach down to 10 deg of altitude"
+)
+
 # a correct place lies further from the stars' own once in 1e6 frames
 PLACE_SIGMAS = 5.3
 
@@ -503,6 +509,8 @@ def placed(solver: Solver, stars: Stars, answer: Solution, places: Places) -> So
         if answer.fix is not None:
             check_agrees(answer.fix, place)
         attitude = solver.attitude_at(stars, answer.found, place)
+        if not attitude.hour_shown:
+            answer = replace(answer, remark=UNSHOWN_HOUR)
         alone = answer.ok and answer.fix is None
         return replace(answer, at_place=attitude, message=attitude.text if alone else answer.message)
     except StarposError as e:

@@ -257,7 +257,16 @@ class StarFit:
 
         An attitude and a plate scale absorb most of it; the rest compresses the field along the vertical.
         """
-        slope = np.dstack([self.fit.slope[self.fit.kept], self._bent(atmosphere) / STEP_REFRACTION])
+        found, covariance = self.more(np.zeros((len(self.residual), 2, 0)), atmosphere)
+        return 1 + float(found[0]), float(np.sqrt(covariance[0, 0]))
+
+    def more(self, moved: np.ndarray, atmosphere: Atmosphere) -> tuple[np.ndarray, np.ndarray]:
+        """Refraction beyond the air's, relative, and k more values, which move the M stars by moved (M, 2, k) px a unit.
+
+        With attitude and plate scale free. Returns them (k + 1,), without the first if k > 0, and their covariance.
+        """
+        strength = self._bent(atmosphere)[..., None] / STEP_REFRACTION
+        slope = np.concatenate([self.fit.slope[self.fit.kept], strength, moved], -1)
         whole = self.errors.centroids + self.errors.catalogue
         weighted = np.linalg.solve(whole, slope)
         covariance = np.linalg.pinv(np.einsum("nki,nkj->ij", slope, weighted))
@@ -266,7 +275,8 @@ class StarFit:
         left = -self.residual - slope @ found
         free = max(left.size - len(found), 1)
         scatter2 = np.vdot(left, np.linalg.solve(whole, left[..., None])[..., 0]) / free
-        return 1 + float(found[4]), float(np.sqrt(covariance[4, 4] * scatter2))
+        begin = 4 + (moved.shape[2] > 0)
+        return found[begin:], covariance[begin:, begin:] * scatter2
 
     def _bent(self, atmosphere: Atmosphere) -> np.ndarray:
         """Move (M, 2) of the stars, px, by STEP_REFRACTION of their refraction more."""

@@ -5,7 +5,9 @@ Two directions make an attitude, the body's and the plumb line's. They contain t
 lamp, and makes the attitude better than by either. Without a place one frame gives a circle of equal altitude.
 """
 
+import itertools
 import math
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
@@ -45,7 +47,7 @@ LIMB_SIGMAS, GLOW_SIGMAS = 5.3, 3.0
 # of the lowest true altitude, -0.2 deg: there the disc stands on the horizon
 LOWEST_SINE = -0.0035
 # of two discs the brighter is the Sun
-BOTH = SUN, MOON
+BOTH: tuple[str, ...] = SUN, MOON
 # a lens in which the Sun's radius is larger, px, shows its limb: there a glow is a lamp or a cloud
 RESOLVED_PX = 6.0
 
@@ -144,28 +146,31 @@ def by_sun(solver: Solver, stars: Stars, disc: Disc, tilts: Tilts | None, places
             )
         state, tilt = solver.levelled(stars, tilts or NO_TILTS)
         state, camera, seen, stamp_s = _looked_at(solver, stars, disc, state)
+        sun, moon = (body_at(name, state, solver.ephemeris).itrs for name in BOTH)
         if not disc.sharp:
             sigma = float(np.linalg.norm(seen.own)) / math.sqrt(2)
-            glow = Glow(state.utc_unix_s, seen.ray, body_at(SUN, state, solver.ephemeris).itrs, sigma)
+            glow = Glow(state.utc_unix_s, seen.ray, sun, sigma)
         looked = partial(_looks, solver, stars, disc, camera=camera, state=state)
+        apart = bool(np.linalg.norm(sun - moon) > NEAREST)
+        both = disc.other is not None and apart
         if places is None:
-            if disc.other is not None:
+            if both:
                 with suppress(PlaceError):
                     fix = _two_body_fix(solver, stars, looked(BOTH), tilt, state, stamp_s)
                     return Solution.of(stars, f"fix by {_named(BOTH)}", fix=fix, tilt=tilt, bodies=BOTH)
             return replace(_on_circle(solver, stars, disc, seen, tilt, state, stamp_s), glow=glow)
         place, wrong = places.at(state.utc_unix_s), []
         found: dict[tuple[str, ...], AttitudeAtPlace] = {}
-        for names in (BOTH,) * (disc.other is not None) + ((SUN,), (MOON,))[: 1 + disc.sharp]:
+        for names in itertools.chain((BOTH,) * both, ((SUN,), (MOON,))[: 1 + disc.sharp]):
             if BOTH not in found:
                 try:
                     found[names] = _attitude(solver, stars, looked(names), tilt, state, place, stamp_s)
                 except PlaceError as error:
                     wrong.append(error)
         if not found:
-            raise wrong[0 if disc.other is None else 1]
+            raise wrong[both]
         (names, attitude), *others = found.items()
-        if others and np.linalg.norm(np.subtract(*(body_at(n, state).itrs for n in BOTH))) > NEAREST:
+        if others and apart:
             raise FixError(
                 f"{stars.place}: the Sun and the Moon stand equally high, and the disc may be either: wait some minutes"
             )
@@ -194,6 +199,15 @@ class _Look:
     body: Body
     sharp: bool
 
+    def terms(self, across: np.ndarray, bent: np.ndarray) -> tuple[ErrorTerm, ...]:
+        """Errors of two components of the direction; across (2, 3): these in C.  bent (2,): by 1 sigma of refraction."""
+        return (
+            ErrorTerm("disc", across @ self.seen.own),
+            ErrorTerm("lens", across @ self.seen.lens, shared=ALWAYS),
+            ErrorTerm("ephemeris", np.eye(2) * self.body.sigma, shared=ALWAYS),
+            ErrorTerm("refraction", bent[:, None], shared=ALWAYS),
+        )
+
 
 def _looks(
     solver: Solver, stars: Stars, disc: Disc, names: tuple[str, ...], *, camera: Camera, state: EarthState
@@ -209,14 +223,15 @@ def _looks(
     return found
 
 
-# A second body is where it must be to this many sigma; and so near each other two determine no attitude, rad.
-SECOND_SIGMAS, NEAREST = 5.0, math.radians(2.0)
+# A second body is where it must be to this many sigma.  So near the Sun, rad, the Moon is a crescent that is not seen: a
+# second disc is a ghost.
+SECOND_SIGMAS, NEAREST = 5.0, math.radians(15.0)
 PARALLAX_ROUNDS = 6
 # of errors that are each body's own; all others have one cause for all
 EACH_ITS_OWN = ("disc", "ephemeris")
 
 
-def _of_all(by: list[np.ndarray], terms: list[tuple[ErrorTerm, ...]]) -> list[ErrorTerm]:
+def _of_all(by: Sequence[np.ndarray], terms: Sequence[tuple[ErrorTerm, ...]]) -> list[ErrorTerm]:
     """The terms of several directions, the same ones of each; by (r, 2): the factors' rows for its components."""
     found = []
     for of_each in zip(*terms, strict=True):
@@ -241,8 +256,6 @@ def _two_body_fix(
             f"{stars.place}: by the level one of its two bright discs is below {MIN_DEG:.0f} deg"
         )
     there = air.refraction().unbend(raised)
-    if np.linalg.norm(there[0] - there[1]) < NEAREST:
-        raise PlaceError(f"{stars.place}: its two bright discs are too near each other for a position")
     variances = np.array(
         [np.sum(s.own**2) / 2 + np.sum(s.lens**2) + b.sigma**2 for s, b in ((k.seen, k.body) for k in looks)]
     )
@@ -268,12 +281,7 @@ def _two_body_fix(
     link_to_enu = place.local_to_enu @ g @ mounting.link_to_camera
     of_sky, of_level = sky_rows(place), level_rows(place, link_to_enu)
     of_bodies = [
-        (
-            ErrorTerm("disc", c @ g @ k.seen.own),
-            ErrorTerm("lens", c @ g @ k.seen.lens, shared=ALWAYS),
-            ErrorTerm("ephemeris", np.eye(2) * k.body.sigma, shared=ALWAYS),
-            ErrorTerm("refraction", c @ (seen - v)[:, None] * air.relative_sigma, shared=ALWAYS),
-        )
+        k.terms(c @ g, c @ (seen - v) * air.relative_sigma)
         for k, c, v, seen in zip(looks, across, there, raised, strict=True)
     ]
     terms = (
@@ -285,26 +293,44 @@ def _two_body_fix(
     own = total_covariance(_of_all(by, [terms[:1] for terms in of_bodies]))
     axes = rotation.shortest_turn(np.array([0.0, 0.0, 1.0]), level.up)[:, :2]
     fix = Fix(
-        utc_unix_s=state.utc_unix_s,
-        camera=Attitude(a4.T @ g, a4.T @ own @ a4, of=CAMERA, into=ITRS),
-        stamp_stddev_s=stars.stamp_stddev_s,
-        clock_stddev_s=about.clock_stddev_s,
-        tilt=tilt,
+        **_fields(stars, state, tilt, about.clock_stddev_s, a4, g, own),
         residual_arcsec=math.sqrt(float(np.mean(off**2))) / ARCSEC,
         zenith_distance=math.acos(min(max(float(g[2] @ camera.centre_ray), -1.0), 1.0)),
         refraction_arcsec=math.dist(raised[0], there[0]) / ARCSEC,
-        diurnal_aberration_arcsec=math.hypot(*station_velocity(a4[2])) / ARCSEC,
-        ut1_minus_utc_s=state.orientation.ut1_minus_utc_s,
         latitude=place.latitude,
         longitude=place.longitude,
         heading=heading_of(link_to_enu),
         link_to_enu=link_to_enu,
         terms=terms,
         levelling=of_level @ (level.turns @ axes),
-        **NO_STARS_FITTED,
     )
     check_unmoved(fix, solver.instrument)
     return fix
+
+
+def _fields(
+    stars: Stars,
+    state: EarthState,
+    tilt: Tilt,
+    clock_s: float,
+    a4: np.ndarray,
+    g: np.ndarray,
+    own: np.ndarray,
+) -> dict[str, Any]:
+    """Fields of a FittedSighting without stars; g (3, 3): C into L, own (3, 3): covariance of the frame's own errors."""
+    return {
+        "utc_unix_s": state.utc_unix_s,
+        "camera": Attitude(a4.T @ g, a4.T @ own @ a4, of=CAMERA, into=ITRS),
+        "stamp_stddev_s": stars.stamp_stddev_s,
+        "clock_stddev_s": clock_s,
+        "tilt": tilt,
+        "used": np.zeros(0, int),
+        "residual_px": np.zeros((0, 2)),
+        "jitter_px": 0.0,
+        "focal_scale": 1.0,
+        "diurnal_aberration_arcsec": math.hypot(*station_velocity(a4[2])) / ARCSEC,
+        "ut1_minus_utc_s": state.orientation.ut1_minus_utc_s,
+    }
 
 
 def _across(direction: np.ndarray) -> np.ndarray:
@@ -360,13 +386,6 @@ def _on_circle(
     return Solution.of(stars, text, circle=circle, tilt=tilt, bodies=(SUN,))
 
 
-# what a FittedSighting says of stars
-NO_STARS_FITTED: dict[str, Any] = {
-    "used": np.zeros(0, int),
-    "residual_px": np.zeros((0, 2)),
-    "jitter_px": 0.0,
-    "focal_scale": 1.0,
-}
 # change of up's components, towards east and north, by a small rotation
 OF_UP = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
 
@@ -394,16 +413,16 @@ def _attitude(
     g = rotation.about_axis(2, math.atan2(bent[1], bent[0]) - math.atan2(local[1], local[0])) @ level.camera
     of_up = tilt_terms(OF_UP @ g @ level.camera.T, level, tilt, mounting, state.utc_unix_s)
     up = OF_UP.T @ np.linalg.inv(total_covariance(of_up))
-    normal, found, turned, weighted, of_bodies, off_px = up @ OF_UP, g, [], [], [], []
+    normal, found = up @ OF_UP, g
+    weighted: list[np.ndarray] = []
+    of_bodies: list[tuple[ErrorTerm, ...]] = []
+    off_px = []
     for look in looks:
         bent, raised, true = _seen_from(look.body, air, a4, stars.place)
         components = _across(bent)
         turn = np.cross(bent, components)
         of_body = (
-            ErrorTerm("disc", components @ g @ look.seen.own),
-            ErrorTerm("lens", components @ g @ look.seen.lens, shared=ALWAYS),
-            ErrorTerm("ephemeris", np.eye(2) * look.body.sigma, shared=ALWAYS),
-            ErrorTerm("refraction", np.array([[0.0], [raised]]), shared=ALWAYS),
+            *look.terms(components @ g, np.array([0.0, raised])),
             *sky_terms(turn, state, clock_s, stamp_s, a4),
             ErrorTerm("place", turn @ moved @ place.zenith_root, shared=ALWAYS),
             ErrorTerm("plumb", turn @ moved * place.plumb_stddev, shared=ALWAYS),
@@ -412,7 +431,7 @@ def _attitude(
         off = components @ (bent - found @ look.seen.ray)
         # what is known already has no azimuth until there is a body
         known = turn @ np.linalg.pinv(normal) @ turn.T
-        share = slice(None) if turned else slice(1, 2)
+        share = slice(None) if weighted else slice(1, 2)
         sigmas = math.sqrt(off[share] @ np.linalg.solve((whole + known)[share, share], off[share]))
         if sigmas > (LIMB_SIGMAS if look.sharp else GLOW_SIGMAS):
             name, seen = look.body.name.title(), found @ look.seen.ray
@@ -424,30 +443,22 @@ def _attitude(
         weight = turn.T @ np.linalg.inv(whole)
         normal = normal + weight @ turn
         found = rotation.from_vector(np.linalg.solve(normal, weight @ off)) @ found
-        turned.append(turn)
         weighted.append(weight)
         of_bodies.append(of_body)
         expected, slope = found.T @ bent, look.seen.slope
         off_px.append(np.linalg.lstsq(slope, expected - look.seen.ray, rcond=None)[0])
     spread = np.linalg.inv(normal)
-    *of_bodies, deflected = _of_all([spread @ weight for weight in weighted], of_bodies)
-    terms = (*of_bodies, *(replace(t, factor=spread @ up @ t.factor) for t in of_up))
+    *of_sky, deflected = _of_all([spread @ weight for weight in weighted], of_bodies)
+    terms = (*of_sky, *(replace(t, factor=spread @ up @ t.factor) for t in of_up))
     plumb = deflected.factor
     ellipsoid = plumb + moved * (place.ellipsoid_stddev - place.plumb_stddev)
     own = total_covariance(t for t in terms if not t.common)
     return AttitudeAtPlace(
-        utc_unix_s=state.utc_unix_s,
-        camera=Attitude(a4.T @ found, a4.T @ own @ a4, of=CAMERA, into=ITRS),
-        stamp_stddev_s=stars.stamp_stddev_s,
-        clock_stddev_s=clock_s,
-        tilt=tilt,
+        **_fields(stars, state, tilt, clock_s, a4, found, own) | {"residual_px": np.array(off_px)},
         residual_arcsec=math.dist(expected, looks[-1].seen.ray) / ARCSEC,
         zenith_distance=math.acos(min(max(bent[2], -1.0), 1.0)),
         refraction_arcsec=math.dist(bent, true) / ARCSEC,
-        diurnal_aberration_arcsec=math.hypot(*station_velocity(a4[2])) / ARCSEC,
-        ut1_minus_utc_s=state.orientation.ut1_minus_utc_s,
         place=place,
-        **NO_STARS_FITTED | {"residual_px": np.array(off_px)},
         **attitudes_at(place, found, mounting, terms, (plumb, ellipsoid)),
     )
 

@@ -35,7 +35,7 @@ MIN_G, MAX_G = 0.97, 1.03
 # Programs that crop, turn or bend pictures and keep the maker's note.
 EDITOR = re.compile(
     r"photoshop|lightroom|gimp|snapseed|capture one|darktable|rawtherapee|picasa|imagemagick|affinity|luminar|hugin|ptgui"
-    r"|pixelmator|vsco|photos \d|picsart|on1|dxo",
+    r"|pixelmator|vsco|photos \d|picsart|\bon1\b|dxo",
     re.IGNORECASE,
 )
 # CustomRendered of a panorama by Apple.
@@ -192,6 +192,8 @@ BY_RELEASES = bytes.fromhex(
 )
 # ShutterMode of pictures that are taken of a film
 FILMED = 96
+# of a serial number
+MOST_DIGITS = 20
 
 
 def _nikon(note: _Note) -> Gravity | None:
@@ -202,7 +204,7 @@ def _nikon(note: _Note) -> Gravity | None:
     block, serial = bytes(tags[0x91]), _text(tags[0x1D])
     if block[:4] not in NIKON_LEVELS:
         raise FrameError("it is by a Nikon whose level no public table describes")
-    plain = _deciphered(block, int(serial), tags[0xA7][0])
+    plain = _deciphered(block, int(serial[:MOST_DIGITS]), tags[0xA7][0])
     # the version of its firmware
     if not re.match(rb"\d[\d.]", plain[4:]):
         raise ValueError("another serial number or number of releases")
@@ -219,7 +221,7 @@ def _deciphered(block: bytes, serial: int, releases: int) -> bytes:
     """A block of Nikon in plain bytes; the releases of its shutter are the second part of the key."""
     step, sum_ = (
         BY_SERIAL[serial & 255],
-        BY_RELEASES[int(np.bitwise_xor.reduce(list(releases.to_bytes(4, "big"))))],
+        BY_RELEASES[np.bitwise_xor.reduce(list(struct.pack("<I", releases)))],
     )
     n = np.arange(len(block) - 4, dtype=np.uint32) + 0x60
     mask = (sum_ + step * np.cumsum(n, dtype=np.uint64)).astype(np.uint8)

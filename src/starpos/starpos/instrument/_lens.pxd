@@ -15,6 +15,9 @@ cdef class PlumbBob(Lens):
 
 cdef class Equidistant(Lens):
     cdef readonly double reach
+    cdef bint centred
     cdef double distance(self, double theta) noexcept nogil
     cdef double stretched(self, double theta) noexcept nogil
     cdef double angle(self, double distance) noexcept nogil
+    cdef void from_axis(self, const double *place, double *v) noexcept nogil
+    cdef void moved(self, const double *v, double *place) noexcept nogil

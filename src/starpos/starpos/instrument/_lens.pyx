@@ -154,15 +154,17 @@ cdef class Equidistant(Lens):
 
     A direction theta off the axis is seen theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8) focal lengths from
     the principal point, also where theta is beyond 90 deg. Out to where that distance no longer grows, at `reach` rad, the
-    lens has a picture.
+    lens has a picture. With p1, p2 its glasses are not on one axis: as in COLMAP's THIN_PRISM_FISHEYE each place is moved
+    by 2 p1 x y + p2 (theta^2 + 2 x^2) and p1 (theta^2 + 2 y^2) + 2 p2 x y, where x, y are theta along the two axes.
     """
 
     def __init__(self, d, double reach):
         super().__init__(d)
         self.reach = reach
+        self.centred = not any(d[4:])
 
     def __reduce__(self):
-        return Equidistant, (tuple(self.d)[:4], self.reach)
+        return Equidistant, (tuple(self.d)[:4 if self.centred else 6], self.reach)
 
     @property
     def picture(self):
@@ -188,6 +190,15 @@ cdef class Equidistant(Lens):
         # straight behind has no direction on the plane
         cdef double stretch = (self.distance(theta) / off if off > 0 else 1.0) if theta < self.reach else NAN
         place[0], place[1] = v[0] * stretch, v[1] * stretch
+        if not self.centred:
+            self.moved(v, place)
+
+    cdef void moved(self, const double *v, double *place) noexcept nogil:
+        """Add to place (2,) how far the decentred lens moves the direction v (3,)."""
+        cdef double off = fmax(hypot(v[0], v[1]), MIN_OFF), theta = atan2(off, v[2]), x = theta * v[0] / off
+        cdef double y = theta * v[1] / off, p1 = self.d[4], p2 = self.d[5], t2 = theta * theta
+        place[0] += 2 * p1 * x * y + p2 * (t2 + 2 * x * x)
+        place[1] += p1 * (t2 + 2 * y * y) + 2 * p2 * x * y
 
     cdef void seen_slopes(self, const double *v, double *slope) noexcept nogil:
         cdef double off = fmax(hypot(v[0], v[1]), MIN_OFF), theta = atan2(off, v[2])
@@ -206,8 +217,44 @@ cdef class Equidistant(Lens):
                 slope[3 * i + j] = outward[i] * outward[j] * (v[2] * grows - stretch)
             slope[3 * i + i] += stretch
             slope[3 * i + 2] = -outward[i] * off * grows
+        if self.centred:
+            return
+        # of x and y, and of what they move the place by
+        cdef double p1 = self.d[4], p2 = self.d[5], x = theta * outward[0], y = theta * outward[1]
+        cdef double[4] by = [2 * p1 * y + 6 * p2 * x, 2 * p1 * x + 2 * p2 * y, 2 * p1 * x + 2 * p2 * y, 6 * p1 * y + 2 * p2 * x]
+        cdef double[6] turn
+        stretch = theta / off
+        for i in range(2):
+            for j in range(2):
+                turn[3 * i + j] = outward[i] * outward[j] * (v[2] / length2 - stretch)
+            turn[3 * i + i] += stretch
+            turn[3 * i + 2] = -outward[i] * off / length2
+        for i in range(2):
+            for j in range(3):
+                slope[3 * i + j] += by[2 * i] * turn[j] + by[2 * i + 1] * turn[3 + j]
 
     cdef void ray(self, const double *place, double *v) noexcept nogil:
+        cdef double[2] centred, move
+        cdef double off
+        cdef int step
+        self.from_axis(place, v)
+        if self.centred:
+            return
+        # what moves the place hardly changes over the move
+        centred[0], centred[1] = place[0], place[1]
+        for step in range(STEPS):
+            move[0] = move[1] = 0.0
+            self.moved(v, move)
+            off = hypot(place[0] - move[0] - centred[0], place[1] - move[1] - centred[1])
+            centred[0], centred[1] = place[0] - move[0], place[1] - move[1]
+            self.from_axis(centred, v)
+            if not off > SETTLED_RAD:
+                break
+        if not off < GOOD:
+            v[0] = v[1] = v[2] = NAN
+
+    cdef void from_axis(self, const double *place, double *v) noexcept nogil:
+        """Set v (3,) to what a lens with the same distances, but centred, sees at place (2,); NaN if nothing."""
         cdef double distance = hypot(place[0], place[1]), theta = self.angle(distance)
         cdef double stretch = sin(theta) / distance if distance > 0 else 1.0
         v[0], v[1], v[2] = place[0] * stretch, place[1] * stretch, cos(theta)

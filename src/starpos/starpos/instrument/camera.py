@@ -14,13 +14,16 @@ from numpy.typing import ArrayLike
 from starpos.errors import InstrumentError
 from starpos.instrument._lens import Equidistant, Lens, PlumbBob
 
-# ROS's names of the models that are understood, and the names of their coefficients.
+# ROS's names of the models that are understood, and the names of their coefficients; a fisheye's may have two more.
 PLUMB_BOB, EQUIDISTANT, RATIONAL = "plumb_bob", "equidistant", "rational_polynomial"
 COEFFICIENTS = {
     PLUMB_BOB: ("k1", "k2", "p1", "p2", "k3"),
     EQUIDISTANT: ("k1", "k2", "k3", "k4"),
     RATIONAL: ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
 }
+DECENTRED = "p1", "p2"
+# COLMAP's name of a decentred fisheye in files and messages: k1, k2, p1, p2, k3, k4, and a thin prism's two
+THIN_PRISM_FISHEYE = "thin_prism_fisheye"
 # numbers of a pinhole's coefficients in OpenCV: 12 and 14 include a thin prism and a tilted sensor
 OPENCV_NUMBERS = (0, 4, 5, 8, 12, 14)
 
@@ -35,6 +38,8 @@ def stated_lens(model: str, d: Sequence[float], place: str) -> tuple[str, tuple[
     model = model or PLUMB_BOB
     if model == EQUIDISTANT and len(d) in (0, 4):
         return model, tuple(d)
+    if model == THIN_PRISM_FISHEYE and len(d) == 8 and not any(d[6:]):
+        return EQUIDISTANT, (*d[:2], *d[4:6], *d[2:4])
     if model in (PLUMB_BOB, RATIONAL) and len(d) in OPENCV_NUMBERS:
         terms = [*d, *[0.0] * 14]
         if not any(terms[8:]):
@@ -42,7 +47,8 @@ def stated_lens(model: str, d: Sequence[float], place: str) -> tuple[str, tuple[
             return pinhole, tuple(terms[: len(COEFFICIENTS[pinhole])])
     raise InstrumentError(
         f"{place}: the distortion model is {model[:40]!r} with {len(d)} terms; {PLUMB_BOB!r} and {RATIONAL!r} with 4, 5 "
-        f"or 8 and {EQUIDISTANT!r} with 4 are understood (further ones must be 0): calibrate with one of them."
+        f"or 8, {EQUIDISTANT!r} with 4 and {THIN_PRISM_FISHEYE!r} with 8 are understood (further ones and a thin "
+        "prism's must be 0): calibrate with one of them."
     )
 
 
@@ -80,7 +86,7 @@ class Camera:
     width, height : px of the frame
     fx, fy : focal lengths, px
     cx, cy : principal point, px
-    distortion : coefficients of the model, by the names in COEFFICIENTS; (): all 0
+    distortion : coefficients of the model, by the names in COEFFICIENTS, a fisheye's also with DECENTRED; (): all 0
     model : of the lens: PLUMB_BOB or RATIONAL, or EQUIDISTANT for a fisheye
 
     Examples
@@ -116,7 +122,7 @@ class Camera:
             )
         if self.fx <= 0 or self.fy <= 0:
             raise InstrumentError(f"focal length {self.fx} x {self.fy} px: must be positive")
-        names = COEFFICIENTS[self.model]
+        names = self.coefficients
         if len(self.distortion) != len(names):
             raise InstrumentError(
                 f"{len(self.distortion)} distortion terms: {self.model} has {len(names)}, {' '.join(names)}"
@@ -127,6 +133,21 @@ class Camera:
         """An ideal camera: square pixels, principal point at the frame's centre, all coefficients 0."""
         cx, cy = (width - 1) / 2, (height - 1) / 2
         return cls(width=width, height=height, fx=focal_px, fy=focal_px, cx=cx, cy=cy, model=model)
+
+    @property
+    def coefficients(self) -> tuple[str, ...]:
+        """Names of the coefficients of its distortion."""
+        names = COEFFICIENTS[self.model]
+        more = self.model == EQUIDISTANT and len(self.distortion) == len(names) + len(DECENTRED)
+        return (*names, *DECENTRED) if more else names
+
+    @property
+    def stated(self) -> tuple[str, tuple[float, ...]]:
+        """Model and coefficients in files and messages, as `stated_lens` reads them."""
+        if self.coefficients[-2:] != DECENTRED:
+            return self.model, self.distortion
+        k1, k2, k3, k4, p1, p2 = self.distortion
+        return THIN_PRISM_FISHEYE, (k1, k2, p1, p2, k3, k4, 0.0, 0.0)
 
     @cached_property
     def lens(self) -> Lens:

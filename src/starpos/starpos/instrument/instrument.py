@@ -4,7 +4,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass, field, fields, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Protocol
 
 import numpy as np
@@ -322,14 +322,17 @@ class Calibration:
     @property
     def unknown(self) -> bool:
         """Whether nothing is known of how the inclinometer lies against the camera."""
-        variances = np.linalg.eigvalsh(np.asarray(self.covariance_arcsec2, float))
-        return bool(variances[1] >= (UNKNOWN_ARCSEC[0] / 2) ** 2)
+        return bool(self._variances[1] >= (UNKNOWN_ARCSEC[0] / 2) ** 2)
 
     @property
     def turn_stddev_deg(self) -> float:
         """Standard deviation (deg) about the axis about which A3 is known least: mostly the plumb line."""
-        variances = np.linalg.eigvalsh(np.asarray(self.covariance_arcsec2, float))
-        return float(np.sqrt(max(variances[-1], 0.0))) / 3600
+        return float(np.sqrt(max(self._variances[-1], 0.0))) / 3600
+
+    @cached_property
+    def _variances(self) -> np.ndarray:
+        """Variances (3,) in arcsec2 about the axes about which A3 is known best to least."""
+        return np.linalg.eigvalsh(np.asarray(self.covariance_arcsec2, float))
 
     def check_age(self, utc_unix_s: float) -> None:
         """Raise InstrumentError if it is too old, or too new, for a frame of that time."""

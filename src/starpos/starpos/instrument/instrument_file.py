@@ -86,13 +86,14 @@ def camera_as_written(path: Path, name: str) -> bool:
 
 def _camera_content(camera: Camera, name: str) -> dict:
     fx, fy, cx, cy = camera.fx, camera.fy, camera.cx, camera.cy
+    model, distortion = camera.stated
     return {
         "image_width": camera.width,
         "image_height": camera.height,
         "camera_name": name,
         "camera_matrix": _ros_matrix(3, 3, (fx, 0, cx, 0, fy, cy, 0, 0, 1)),
-        "distortion_model": camera.model,
-        "distortion_coefficients": _ros_matrix(1, len(camera.distortion), camera.distortion),
+        "distortion_model": model,
+        "distortion_coefficients": _ros_matrix(1, len(distortion), distortion),
         "rectification_matrix": _ros_matrix(3, 3, (1, 0, 0, 0, 1, 0, 0, 0, 1)),
         "projection_matrix": _ros_matrix(3, 4, (fx, 0, cx, 0, 0, fy, cy, 0, 0, 0, 1, 0)),
     }

@@ -280,7 +280,7 @@ class StarAttitudes:
     @property
     def whole(self) -> np.ndarray:
         """Mask (F,) of the attitudes that are known about every axis."""
-        return ~self.rays.any(1)
+        return np.asarray(~self.rays.any(1))
 
     def part(self, keep: np.ndarray) -> "StarAttitudes":
         """Some of them, by a mask (F,)."""

@@ -110,32 +110,11 @@ def standstills(stars: StarAttitudes, pieces: Pieces) -> Standstills:
     return Standstills(first=first, last=last)
 
 
-@dataclass(frozen=True, eq=False, kw_only=True)
-class ByTheRest:
-    """Velocities (J, 3) at which the rest of a record arrives where the vehicle seems to stand, m/s along ITRS's axes.
+def by_the_rest(trial: Residuals, sigma: float, solution: Smoothed) -> tuple[np.ndarray, np.ndarray]:
+    """Velocities (J, 3) of standstills by the rest of a record, m/s along ITRS's axes, and covariances (J, 3, 3).
 
-    covariance (J, 3, 3): of their errors.  sigma: of the standstill itself, m/s an axis.
+    trial: the equation of each standstill, within sigma m/s an axis, with which the record was solved.
     """
-
-    velocity: np.ndarray
-    covariance: np.ndarray
-    sigma: float
-
-    @property
-    def checked(self) -> np.ndarray:
-        """Mask (J,) of those where a vehicle that rolls would have shown."""
-        return np.linalg.eigvalsh(self.covariance)[:, -1] < CHECKED**2
-
-    @property
-    def contradicted(self) -> bool:
-        """Whether any of them cannot be 0, given that the others are."""
-        spread = self.covariance + self.sigma**2 * np.eye(3)
-        scaled = np.linalg.solve(spread, self.velocity[..., None])[..., 0]
-        return bool((np.einsum("ji,ji->j", self.velocity, scaled) > ONE_IN_1000).any())
-
-
-def by_the_rest(trial: Residuals, sigma: float, solution: Smoothed) -> ByTheRest:
-    """What each of the standstills would be without its own equation: trial has one of each, with which it was solved."""
     slope, short = trial.rows[..., :-1], trial.rows[..., -1]
     constants = np.tile(solution.constants, (len(short), 1))
     unknowns = np.concatenate([solution.nodes[trial.index], constants], 1)
@@ -144,11 +123,17 @@ def by_the_rest(trial: Residuals, sigma: float, solution: Smoothed) -> ByTheRest
     # the errors of the residuals: where they nearly vanish, only the equation itself determines the velocity
     size, axes = np.linalg.eigh(np.eye(3) - told / sigma**2)
     inverse = (axes / np.maximum(size, MIN_LEFT)[:, None]) @ axes.transpose(0, 2, 1)
-    return ByTheRest(
-        velocity=-np.einsum("jik,jk->ji", inverse, left),
-        covariance=sigma**2 * (inverse - np.eye(3)),
-        sigma=sigma,
-    )
+    return -np.einsum("jik,jk->ji", inverse, left), sigma**2 * (inverse - np.eye(3))
+
+
+def judged_by(velocity: np.ndarray, covariance: np.ndarray, sigma: float) -> tuple[np.ndarray, bool]:
+    """Mask (J,) of standstills where a vehicle that rolls would have shown, and whether any cannot be one.
+
+    velocity, covariance: `by_the_rest`.
+    """
+    scaled = np.linalg.solve(covariance + sigma**2 * np.eye(3), velocity[..., None])[..., 0]
+    contradicted = bool((np.einsum("ji,ji->j", velocity, scaled) > ONE_IN_1000).any())
+    return np.linalg.eigvalsh(covariance)[:, -1] < CHECKED**2, contradicted
 
 
 def noise_density2(pieces: Pieces, standing: Standstills) -> float:

@@ -38,6 +38,7 @@ from starpos.navigation.evidence import (
     Standstills,
     borne_out,
     by_the_rest,
+    judged_by,
     noise_density2,
     standstills,
 )
@@ -225,9 +226,9 @@ class Adjustment:
             trial = standing_residuals(motion, seeming.middle, TRIAL_SIGMA, self.unknowns)
             nodes = np.concatenate([chain.nodes[:, : -trial.rows.shape[1]], self._by_law(motion, trial)], 1)
             rest = by_the_rest(trial, TRIAL_SIGMA, smoothed(replace(chain, nodes=nodes)))
-            self.contradicted |= rest.contradicted
-            enough = rest.checked.sum() >= MIN_STANDSTILLS and not rest.contradicted
-            seeming = seeming.but(rest.checked & enough)
+            checked, contradicted = judged_by(*rest, TRIAL_SIGMA)
+            self.contradicted |= contradicted
+            seeming = seeming.but(checked & (checked.sum() >= MIN_STANDSTILLS and not contradicted))
         self.standing = seeming
         return len(seeming) != before
 

@@ -20,7 +20,7 @@ from starpos.instrument.inclinometer import Tilt
 from starpos.instrument.instrument import Instrument, with_frame_size
 from starpos.instrument.tilt_log import TiltLog
 from starpos.instrument.tilt_table import read_tilt_csv
-from starpos.night.remarks import Remark, of_axis
+from starpos.night.remarks import Remark
 
 
 @dataclass(frozen=True)
@@ -132,7 +132,7 @@ class Instruments:
         if self.instrument is None or self.sought:
             return self, ()
         instrument, doubt = with_frame_size(self.instrument, first)
-        return replace(self, instrument=instrument), of_axis(doubt)
+        return replace(self, instrument=instrument), (Remark(doubt),) if doubt else ()
 
     def of(self, frame: Frame | Stars) -> Instrument | None:
         """The instrument of a frame; None if its focal length is unknown."""

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Remarks on a night, each a sentence; among them doubts: mistaken tilts, a place far from the stated one."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -108,18 +108,14 @@ def of_table(fixes: Sequence[Fix], whole: Average, given: Instrument) -> tuple[R
     return (Remark(sentence),)
 
 
-def of_axis(doubt: str) -> tuple[Remark, ...]:
-    """Say that the optical axis of a night's frames is not known; doubt: the sentence, '' if it is known."""
-    return (Remark(doubt),) if doubt else ()
-
-
-def of_extrapolation(fix: Fix, days: float) -> tuple[Remark, ...]:
-    """Say by how many days a fix lies beyond the IERS table, and how far it may be off for that."""
-    if days <= 0:
+def of_extrapolation(solved: Iterable[Solution]) -> tuple[Remark, ...]:
+    """Say by how many days the last fix lies beyond the IERS table, and how far it may be off for that."""
+    worst = max(solved, key=lambda s: s.extrapolated_days, default=None)
+    if worst is None or worst.fix is None or worst.extrapolated_days <= 0:
         return ()
-    (ut1,) = (t for t in fix.terms if t.name == "ut1")
+    (ut1,) = (t for t in worst.fix.terms if t.name == "ut1")
     sentence = (
-        f"the Earth's rotation is extrapolated {days:.0f} days beyond the IERS table, "
+        f"the Earth's rotation is extrapolated {worst.extrapolated_days:.0f} days beyond the IERS table, "
         f"{np.sqrt(ut1.covariance[0, 0]):.0f} m east (1 sigma, in the budget): upgrade astropy-iers-data"
     )
     return (Remark(sentence),)

@@ -123,7 +123,7 @@ def together(gathered: Gathered, given: Instrument | None, near: Near | None = N
     except FixError as error:
         why_not = str(error)
     place = fixes[-1] if whole is None else whole
-    said = list(extrapolated(gathered.solved))
+    said = list(remarks.of_extrapolation(gathered.solved))
     said += [] if whole is None else remarks.of_average(whole, gathered.solved)
     mounting = None
     if given is not None:
@@ -150,14 +150,6 @@ def _by_day(circles: Sequence[Circle], near: Near | None) -> Together:
     except FixError as error:
         return Together(None, str(error))
     return Together(place, "", (*remarks.of_average(place), *doubts((), place, None, near)))
-
-
-def extrapolated(solved: Iterable[Solution]) -> tuple[Remark, ...]:
-    """Say of the worst fix that it lies beyond the IERS table, if one does."""
-    worst = max(solved, key=lambda s: s.extrapolated_days, default=None)
-    if worst is None or worst.fix is None:
-        return ()
-    return remarks.of_extrapolation(worst.fix, worst.extrapolated_days)
 
 
 @dataclass(frozen=True)

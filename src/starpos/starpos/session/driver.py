@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a session and its driver exchange: times, sentences, diagnostics, and jobs of several seconds."""
+"""What a session and its driver exchange: times, sentences, answers, diagnostics, and jobs of several seconds."""
 
 import math
 import traceback
@@ -7,10 +7,19 @@ from collections.abc import Callable, Generator, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from enum import IntEnum
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 from starpos.errors import StarposError
 from starpos.parameters.table import FRAME_NAME
+
+# every node loads this module, and few of them what a solution consists of
+if TYPE_CHECKING:
+    from starpos.averaging.average import Average
+    from starpos.earth.vertical import Geodetic
+    from starpos.fix.attitude import CameraAttitude
+    from starpos.fix.solution import Solution
+    from starpos.gnss.watch import GnssCheck
+    from starpos.satellites.locating import SatelliteFix
 
 # Times that differ by more are not of the same evening.
 ANOTHER_TIME_S = 3600.0
@@ -56,6 +65,43 @@ class Now:
             return 0.0
         ahead_s = unix_s - self.unix_s
         return 0.0 if ahead_s > ANOTHER_TIME_S and not self.played else ahead_s
+
+
+@dataclass(frozen=True, kw_only=True)
+class Answered:
+    """The answer to a frame: its message's stamp, its solution, the place on the ellipsoid, None without one.
+
+    no_camera: no camera calibration has arrived.
+    attitude: the camera's, by its stars; None if they do not determine it.
+    compared: the GNSS place at the frame, and what the guard says of it; None without one.
+    """
+
+    stamp: Any
+    solution: "Solution"
+    ground: "Geodetic | None"
+    no_camera: bool
+    attitude: "CameraAttitude | None" = None
+    compared: "GnssCheck | None" = None
+
+
+@dataclass(frozen=True)
+class Averaged:
+    """The average after a frame was added to it, with the stamp of that frame's message."""
+
+    stamp: Any
+    place: "Average"
+    ground: "Geodetic"
+
+
+@dataclass(frozen=True)
+class BySatellites:
+    """The place by the satellites on the last frames, None where they give none; with the stamp of the newest."""
+
+    stamp: Any
+    fix: "SatelliteFix | None"
+
+
+Output = Answered | Averaged | BySatellites
 
 
 class Log(Protocol):

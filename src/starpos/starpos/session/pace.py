@@ -4,8 +4,11 @@
 import math
 import statistics
 from collections import deque
+from dataclasses import dataclass, replace
+from typing import Any
 
-from starpos.session.frames import Waiting
+from starpos.frames.frame import Stars
+from starpos.session.driver import Now
 
 # Interval over which the share of dropped frames is taken, and minimum number of frames.
 LATELY_S, MIN_FRAMES = 10.0, 10
@@ -104,6 +107,28 @@ MAX_WAITING, MAX_NEWEST = 1000, 4
 COSTS = 9
 # Tolerated delay of an answer behind others: short load by other programs then loses no frame.
 MAX_LATE_S = 0.1
+
+
+@dataclass(frozen=True)
+class Waiting:
+    """A frame that waits: the header of its message, and its stars with the error of their time.
+
+    since_s: when it came, by the clock in which waiting is counted.
+    ahead_s: how far the middle of its exposure was ahead of the session's clock then.
+    doubted: whether its stars contradict its time.
+    """
+
+    header: Any
+    stars: Stars
+    since_s: float
+    ahead_s: float
+    doubted: bool = False
+
+    def dated(self, now: Now) -> "Waiting":
+        """Correct how far it is ahead of a played clock, whose tick may have arrived only after the frame."""
+        if not now.played:
+            return self
+        return replace(self, ahead_s=min(now.ahead_s(self.stars.mid_unix_s), self.ahead_s))
 
 
 class Backlog:

@@ -27,8 +27,7 @@ from starpos.night.reading import stars_of
 from starpos.recording import topics
 from starpos.recording.bag import BagReader
 from starpos.recording.drivers import IMAGES, DriverMessages, Drivers
-from starpos.session.driver import Heard, JobsInTurn, Log, Now, Sent
-from starpos.session.frames import Answered, Averaged, Output
+from starpos.session.driver import Answered, Averaged, Heard, JobsInTurn, Log, Now, Output, Sent
 from starpos.session.session import SolverSession
 from starpos.session.settings import Settings
 

@@ -19,8 +19,7 @@ from starpos.satellites.elements import StoredOrbits, chosen
 from starpos.satellites.frames import FrameSky
 from starpos.satellites.locating import SatelliteFix, locate
 from starpos.satellites.trails import SatelliteTrail
-from starpos.session.driver import Diagnosis, Heard, Jobs, Level, refusing
-from starpos.session.frames import BySatellites, Output
+from starpos.session.driver import BySatellites, Diagnosis, Heard, Jobs, Level, Output, refusing
 from starpos.session.settings import Settings
 from starpos.sky import catalogue
 

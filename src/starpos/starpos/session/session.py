@@ -32,11 +32,10 @@ from starpos.session import reports
 from starpos.session.calibrating import Calibrating, Seen
 from starpos.session.camera_solver import CameraSolver
 from starpos.session.deflection import LiveDeflection
-from starpos.session.driver import Changes, Heard, Jobs, Log, Now, Sent, refusing
-from starpos.session.frames import Answered, Averaged, Output, Waiting
+from starpos.session.driver import Answered, Averaged, Changes, Heard, Jobs, Log, Now, Output, Sent, refusing
 from starpos.session.gnss import GnssTeacher, SessionPlaces
 from starpos.session.gyro import Gyro
-from starpos.session.pace import MAX_WAITING, Backlog, Pace
+from starpos.session.pace import MAX_WAITING, Backlog, Pace, Waiting
 from starpos.session.settings import Settings
 from starpos.session.solving import AT_ONCE_S, Search, attitude_beside
 from starpos.session.standing import ClockDoubt

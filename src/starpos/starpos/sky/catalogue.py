@@ -24,7 +24,6 @@ from numpy.typing import ArrayLike
 from starpos.errors import CatalogueError
 from starpos.files import open_regular
 from starpos.rotation import normalised
-from starpos.sky._labels import Labels
 from starpos.table_cache import KeptTables, digest_of, rising
 from starpos.units import MAS, MAS_DEG
 
@@ -197,10 +196,6 @@ class Catalogue:
         """First row of each cell, as `zones.cell_starts` returns it."""
         return cell_starts(self.zone_start, self.ra_mas * MAS_DEG)
 
-    @cached_property
-    def _labels(self) -> Labels:
-        return Labels(self.hip, self.tyc, self.vmag_centi)
-
     def vmag(self, index: Rows = slice(None)) -> np.ndarray:
         """Johnson V magnitudes (n,) of the rows `index`."""
         return self.vmag_centi[index] * 0.01
@@ -246,7 +241,9 @@ class Catalogue:
 
     def labels(self, index: np.ndarray) -> tuple[tuple[str, ...], np.ndarray]:
         """Names and V magnitudes (n,) of the rows `index` (n,)."""
-        return self._labels.of(np.ascontiguousarray(index, np.intp))
+        numbers = zip(self.hip[index].tolist(), self.tyc[index].tolist(), strict=True)
+        names = (f"HIP {hip}" if hip else f"TYC {one}-{two}-{three}" for hip, (one, two, three) in numbers)
+        return tuple(names), self.vmag(index)
 
     def names(self, index: np.ndarray) -> tuple[str, ...]:
         """Designations of the rows `index`: 'HIP 1234', or 'TYC 1-2-3' for a star without a Hipparcos number."""
@@ -397,7 +394,7 @@ def _join(planes: np.ndarray, dtype: type[np.integer]) -> np.ndarray:
 
 
 def _newer(tyc: np.ndarray) -> dict[str, np.ndarray]:
-    """The columns that older files lack, for stars of these identifiers (N, 3)."""
+    """The columns that the committed file lacks, for stars of these identifiers (N, 3)."""
     zeros = np.zeros(len(tyc), np.int8)
     tenths = np.round(parallaxes_mas(tyc) / TENTH).astype(np.uint16)
     return {"pm_ra_centi": zeros, "pm_dec_centi": zeros, "parallax_tenths": tenths}
@@ -442,14 +439,8 @@ def read(path: Path | str) -> Catalogue:
 
 
 def kept_catalogues(what: str = "") -> KeptTables[Catalogue]:
-    """Catalogues that are unpacked in the cache; what: as of `KeptTables`.
-
-    The number of the format stays as long as older folders can be read: the deeper catalogue of a user without a network
-    is there, too.
-    """
-    return KeptTables(
-        Catalogue, "stars-1-", "uiiiiuuuiiiiiu", what, newer=lambda columns: _newer(columns["tyc"])
-    )
+    """Catalogues that are unpacked in the cache; what: as of `KeptTables`."""
+    return KeptTables(Catalogue, "stars-1-", "uiiiiuuuiiiiiu", what)
 
 
 @lru_cache(maxsize=2)

@@ -94,6 +94,39 @@ def test_a_wrong_hour_puts_stars_under_the_horizon(catalogue, rng):
     assert sound.at_place is not None
 
 
+def test_a_decentred_lens_is_found_where_the_stars_show_it(catalogue, rng):
+    true = random_fisheye((*LENSES["equisolid"], 4e-3, -3e-3), rng)
+    lists, _ = nights(true, catalogue, rng, 2)
+    found = calibrate_camera(lists, [None] * 2, IDEAL, catalogue, AIR, site=SITE)
+    assert found.fit.camera.coefficients[-2:] == ("p1", "p2")
+    assert np.abs((found.fit.values - values(true)) / found.fit.sigma).max() < 4
+    assert rms(picture_errors(true, found.fit.camera)) < 0.03
+    assert found.lean_rad < 4 * found.lean_sigma_rad
+
+
+def test_refraction_shows_an_hour_that_no_star_under_the_horizon_does(catalogue, rng):
+    true = random_fisheye(LENSES["equisolid"], rng)
+    lists, _ = nights(true, catalogue, rng, 3)
+    solver = Solver(Instrument(IDEAL.fx, camera=true), catalogue, AIR)
+    up = answer_frame(solver, Question(item=lists[0], stars=lists[0], places=SITE)).solution
+    assert up.at_place.hour_shown and not up.remark
+    late = [replace(s, mid_unix_s=s.mid_unix_s + 2400) for s in lists]
+    with pytest.raises(PlaceError, match=r"refraction shows the zenith|under the horizon"):
+        calibrate_camera(late, [None] * 3, IDEAL, catalogue, AIR, site=SITE)
+    answer = answer_frame(solver, Question(item=late[0], stars=late[0], places=SITE)).solution
+    assert answer.at_place is None and "UTC" in answer.message
+
+
+def test_a_frame_of_the_middle_of_the_sky_does_not_show_its_hour(catalogue, rng):
+    true = random_fisheye(LENSES["equisolid"], rng)
+    (stars,), _ = nights(true, catalogue, rng, 1)
+    near = np.hypot(stars.x - true.cx, stars.y - true.cy) < 0.7 * true.fx
+    solver = Solver(Instrument(IDEAL.fx, model=EQUIDISTANT), catalogue, AIR)
+    middle = stars.select(near)
+    answer = answer_frame(solver, Question(item=middle, stars=middle, places=SITE)).solution
+    assert answer.at_place is not None and "its hour is right" in answer.remark
+
+
 def test_without_tilts_refraction_would_pass_for_the_lens(catalogue, rng):
     true = random_fisheye(LENSES["equisolid"], rng)
     lists, _ = nights(true, catalogue, rng, 1)

@@ -38,6 +38,16 @@ def skies(tmp_path_factory):
     return folder
 
 
+def test_a_lens_of_113_degrees_that_is_no_fisheye_is_none(tmp_path, run):
+    """The header alone says its focal length: as a fisheye's it was said to be wrong, and the place was 6 km off."""
+    shot = ("--stars-only", "-n", "1", "--size", "4000", "4000", "--focal-mm", "12")
+    assert main(["simulate", str(tmp_path / "night"), *shot]) == 0
+    status, out, err = run("solve", tmp_path / "night", *A3, "--json")
+    *_, together = objects(out)
+    assert status == 0 and "header is wrong" not in err
+    assert abs(together["latitude"] - 35.7046) < 4 * together["sigma_north_m"] / 111_000 < 0.03
+
+
 def test_a_night_of_the_whole_sky_is_solved(skies, run):
     lists = sorted(skies.glob("stars_*.csv"))
     status, out, err = run("solve", *lists, "--tilt", skies / "tilt.csv", *LENS, *A3, *AIR, "--json")

@@ -70,6 +70,10 @@ def test_an_iphones_gravity_in_the_axes_of_the_stored_picture(order):
     assert up(exif(apple((-1.0, 0, 0), order))) == pytest.approx([0, -1, 0])
 
 
+def test_the_cameras_own_program_is_no_editor():
+    assert up(exif(apple((0, 0, 1.0)), software="Version1.02")) == pytest.approx([0, 0, 1])
+
+
 def test_a_name_of_another_type_does_no_harm():
     assert up(exif(apple((0, 0, 1.0)), below={42036: (LONG, 1, struct.pack("<I", 300))})) == pytest.approx(
         [0, 0, 1]
@@ -186,6 +190,10 @@ SILENT = "its file does not say which way is down"
         (exif(nikon(1, 2, serial="6001443"), "NIKON"), DAMAGED),
         (exif(nikon(1, 2, serial="no number"), "NIKON"), DAMAGED),
         (exif(nikon(1, 2)[:-0x40], "NIKON"), DAMAGED),
+        (
+            exif(nikon(1, 2).replace(struct.pack("<HII", LONG, 1, 70000), struct.pack("<HIi", 9, 1, -5))),
+            DAMAGED,
+        ),
         (exif(apple((0, 0, 1.0))[:-30]), DAMAGED),
         (exif(apple((0, 0, 1.0)))[:-8], SILENT),
         (exif(apple((0, 0, 1.0)).replace(b"\1MM", b"\1XX")), DAMAGED),

@@ -8,6 +8,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+import yaml
 
 from starpos.errors import InstrumentError
 from starpos.instrument import instrument_file
@@ -61,6 +62,16 @@ def test_reads_and_writes_a_fisheye(tmp_path):
     assert instrument_file.read_camera(path) == fisheye
     instrument_file.write_camera(path, fisheye, "camera")
     assert instrument_file.read_camera(path) == fisheye and "cols: 4" in path.read_text()
+
+
+def test_a_decentred_fisheye_has_colmaps_name_and_order(tmp_path):
+    path = tmp_path / "camera.yaml"
+    decentred = replace(CAMERA, model="equidistant", distortion=(-0.04, 5e-4, 1e-5, -2e-6, 1e-3, 2e-3))
+    instrument_file.write_camera(path, decentred, "camera")
+    told = yaml.safe_load(path.read_text())
+    assert told["distortion_model"] == "thin_prism_fisheye"
+    assert told["distortion_coefficients"]["data"] == [-0.04, 5e-4, 1e-3, 2e-3, 1e-5, -2e-6, 0, 0]
+    assert instrument_file.read_camera(path) == decentred
 
 
 def test_reads_and_writes_a_rational_lens(tmp_path):

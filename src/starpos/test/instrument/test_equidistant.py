@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 from starpos.errors import InstrumentError
+from starpos.fix.star_fit import seen_problem
 from starpos.instrument.camera import EQUIDISTANT, Camera
+from starpos.rotation import from_vector
 
 # of a lens that is nearly equisolid, one that is nearly stereographic, one that ends its picture at 100 deg
 EQUISOLID, STEREOGRAPHIC, SHORT = (
@@ -125,3 +127,29 @@ def test_a_fisheye_whose_lens_is_made_goes_to_other_processes():
     assert camera.sees([900.0], [900.0]).all()
     again = pickle.loads(pickle.dumps(camera))
     np.testing.assert_array_equal(again.directions([900.0], [900.0]), camera.directions([900.0], [900.0]))
+
+
+def test_a_decentred_lens_is_colmaps_and_is_inverted(rng):
+    k1, k2, k3, k4 = EQUISOLID
+    p1, p2 = 2e-3, -3e-3
+    camera, v = fisheye((*EQUISOLID, p1, p2)), directions(rng.uniform(0, np.radians(95), 500), rng)
+    # THIN_PRISM_FISHEYE as COLMAP documents it
+    theta, phi = np.arccos(v[:, 2]), np.arctan2(v[:, 1], v[:, 0])
+    x, y = theta * np.cos(phi), theta * np.sin(phi)
+    radial = 1 + k1 * theta**2 + k2 * theta**4 + k3 * theta**6 + k4 * theta**8
+    seen_x = x * radial + 2 * p1 * x * y + p2 * (theta**2 + 2 * x**2)
+    seen_y = y * radial + 2 * p2 * x * y + p1 * (theta**2 + 2 * y**2)
+    xy = np.stack([camera.fx * seen_x + camera.cx, camera.fy * seen_y + camera.cy], -1)
+    np.testing.assert_allclose(camera.project(v), xy, atol=1e-9)
+    np.testing.assert_allclose(camera.directions(*xy.T), v, atol=1e-12)
+    np.testing.assert_allclose(pickle.loads(pickle.dumps(camera)).project(v), xy, atol=1e-9)
+
+
+def test_the_fit_of_a_decentred_lens_has_its_slopes(rng):
+    camera = fisheye((*EQUISOLID, 0.02, -0.03))
+    v = directions(rng.uniform(0.01, np.radians(80), 50), rng)
+    problem = seen_problem(camera.project(v), camera, v)
+    slope = np.asarray(problem.jacobian(np.eye(3), 1.0))
+    for k, turn in enumerate(np.eye(3) * 1e-6):
+        ahead, behind = (np.asarray(problem.predict(from_vector(s * turn), 1.0)) for s in (1, -1))
+        np.testing.assert_allclose(slope[..., k], (ahead - behind) / 2e-6, atol=1e-3)

@@ -116,15 +116,13 @@ def test_what_the_rest_leads_to_is_a_solution_without_that_equation(rng):
         links=across + np.hstack([-np.eye(n), np.eye(n), np.zeros((n, CONSTANTS + 1))]),
         constants=CONSTANTS,
     )
-    rest = by_the_rest(trial, 0.3, smoothed(chain))
+    velocity, covariance = by_the_rest(trial, 0.3, smoothed(chain))
     for j, k in enumerate(index):
         nodes = chain.nodes.copy()
         nodes[k] = 0.0
         without = smoothed(replace(chain, nodes=nodes))
-        assert rest.velocity[j] == pytest.approx(without.nodes[k, VELOCITY] - rows[j, :, -1], abs=1e-6)
-        assert rest.covariance[j] == pytest.approx(
-            without.covariance[k, VELOCITY, VELOCITY], rel=1e-6, abs=1e-6
-        )
+        assert velocity[j] == pytest.approx(without.nodes[k, VELOCITY] - rows[j, :, -1], abs=1e-6)
+        assert covariance[j] == pytest.approx(without.covariance[k, VELOCITY, VELOCITY], rel=1e-6, abs=1e-6)
 
 
 def test_standstills_are_some_of_them_by_a_mask():

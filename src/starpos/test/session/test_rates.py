@@ -18,8 +18,7 @@ from test_session import CAMERA_INFO, STARS, TILT, Told, first, messages  # noqa
 
 from starpos.fix.solution import Solution, Status
 from starpos.messages.stamp import stamp_to_unix
-from starpos.session.driver import Now, Sent
-from starpos.session.frames import Answered
+from starpos.session.driver import Answered, Now, Sent
 
 EXPOSURE_S, SECONDS, STEP_S = 0.03, 6.0, 0.004
 

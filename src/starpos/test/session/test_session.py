@@ -17,8 +17,7 @@ from starpos.messages.stamp import stamp_to_unix
 from starpos.recording.bag import BagReader
 from starpos.recording.topics import CAMERA_INFO, INPUTS, STARS, TILT, instrument_in
 from starpos.session import reports
-from starpos.session.driver import JobsInTurn, Level, Now, Sent
-from starpos.session.frames import Answered
+from starpos.session.driver import Answered, JobsInTurn, Level, Now, Sent
 from starpos.session.replay import Replay
 from starpos.session.session import SolverSession
 from starpos.session.settings import Settings

@@ -16,7 +16,6 @@ from starpos.frames.frame import Stars
 from starpos.instrument.inclinometer import EXACT, Tilt
 from starpos.instrument.instrument import Instrument
 from starpos.navigation.sightings import sighting_of
-from starpos.sky import catalogue as module
 from starpos.sky.catalogue import load_catalogue, pack, read, save
 from starpos.sky.site import Site
 from starpos.units import ARCSEC, DAY_S, MAS
@@ -96,18 +95,6 @@ def test_a_file_from_before_parallaxes_has_those_of_its_near_stars(near, tmp_pat
     assert old.parallax_tenths.tolist() == [expected[tuple(t)] for t in old.tyc]
     assert not old.pm_ra_centi.any() and (old.pm_ra == near.pm_ra).all()
     assert old.fingerprint == near.fingerprint
-
-
-def test_an_unpacked_catalogue_from_before_parallaxes_is_still_one(near, tmp_path):
-    from starpos.table_cache import _store
-
-    _store(near, tmp_path / "stars-1-old", "stars-1-")
-    for name in NEWER:
-        (tmp_path / "stars-1-old" / f"{name}.npy").unlink()
-    old = module.kept_catalogues().mapped(tmp_path / "stars-1-old")
-    assert old.fingerprint == near.fingerprint and (old.parallax_tenths >= 200).all()
-    (tmp_path / "stars-1-old" / "tyc.npy").unlink()
-    assert module.kept_catalogues().mapped(tmp_path / "stars-1-old") is None
 
 
 def test_motions_are_kept_to_a_hundredth(near):
