@@ -55,7 +55,7 @@ TURN_SIGMA = 3.0
 OUTLIER_SIGMA, MAX_OUTLIERS, JUDGED = 6.0, 1 / 3, 5
 # number of poses of which two thirds leave the fit, with its five parameters, free enough to judge the others
 MANY_POSES = 10
-# Number of frames from which one alone can be told to be wrong, and by how many times what the others differ: errors of
+# Number of frames from which one alone is shown to be wrong, and by how many times what the others differ: errors of
 # poses look so once in 1000 nights of five frames
 FEW_FRAMES, FAR_WRONG = 5, 20.0
 # frames that scatter more than any inclinometer or mount were moved, or are of several places
