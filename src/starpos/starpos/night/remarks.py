@@ -133,8 +133,8 @@ def of_average(whole: Average, solved: Sequence[Solution] = ()) -> Iterator[Rema
     if whole.left_out == 1 and off and max(off)[1]:
         away_m, source = max(off)
         yield Remark(
-            f"{source}: its place lies {length_text(away_m)} from the place of the others, further than its errors allow: it "
-            "is not in the average: check its tilt and time"
+            f"{source}: its place lies {length_text(away_m)} from the place of the others, further than its errors "
+            "allow: it is not in the average: check its tilt and time"
         )
     elif whole.left_out:
         yield Remark(
