@@ -55,6 +55,9 @@ TURN_SIGMA = 3.0
 OUTLIER_SIGMA, MAX_OUTLIERS, JUDGED = 6.0, 1 / 3, 5
 # number of poses of which two thirds leave the fit, with its five parameters, free enough to judge the others
 MANY_POSES = 10
+# Number of frames from which one alone is shown to be wrong, and by how many times what the others differ: errors of
+# poses look so once in 1000 nights of five frames
+FEW_FRAMES, FAR_WRONG = 5, 20.0
 # frames that scatter more than any inclinometer or mount were moved, or are of several places
 MAX_POSE_RAD = np.radians(0.5)
 # minimum noise over a frame's own error that is worth stating
@@ -323,6 +326,8 @@ def _agreeing(fit: FitOfRows, whole: Readings, pose_rad: float) -> tuple[np.ndar
     Of few poses the robust fit may end between sound and bad tilts. A second one begins with the frames that agree with
     their own poses, and the fit from which half of the frames are less far counts.
     """
+    if (rows := _but_one(fit, whole)) is not None:
+        return rows, fit(rows)
     starts, calm = [_unhidden(fit, whole)], _calm(whole)
     if (1 - MAX_OUTLIERS) * len(whole.pose) <= len(calm) < len(starts[0]):
         starts.append(calm)
@@ -341,6 +346,21 @@ def _kept(fit: FitOfRows, whole: Readings, pose_rad: float, rows: np.ndarray) ->
             break
         rows = rows[agree]
     return rows, plumb
+
+
+def _but_one(fit: FitOfRows, whole: Readings) -> np.ndarray | None:
+    """Indices of a few frames without one that is alone wrong, by far; None if none is."""
+    number = len(whole.pose)
+    if not FEW_FRAMES <= number < MANY_POSES:
+        return None
+    stated = np.hypot(whole.sigma, whole.pose_sigma)
+    if (np.linalg.norm(fit(np.arange(number)).left, axis=1) < OUTLIER_SIGMA * stated).all():
+        return None
+    apart, others = [], [np.delete(np.arange(number), k) for k in range(number)]
+    for k, rows in enumerate(others):
+        size = np.linalg.norm(_left(whole, fit(rows)), axis=1)
+        apart.append(size[k] / max(size[rows].max(), stated[rows].max()))
+    return others[int(np.argmax(apart))] if max(apart) > FAR_WRONG else None
 
 
 def _calm(whole: Readings) -> np.ndarray:

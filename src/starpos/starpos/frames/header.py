@@ -149,9 +149,9 @@ def aim_deg(header: Mapping) -> tuple[float, float] | None:
     A number is in deg, a text with colons or blanks in h m s and in deg ' ".
     """
     for keys in AIMS:
-        found = [_sexagesimal(header.get(key)) for key in keys]
-        if None not in found:
-            (ra, in_hours), (dec, _) = found
+        right, up = (_sexagesimal(header.get(key)) for key in keys)
+        if right is not None and up is not None:
+            (ra, in_hours), (dec, _) = right, up
             if 0 <= (ra := ra * 15 if in_hours else ra) <= 360 and abs(dec) <= 90:
                 return ra, dec
     return None

@@ -121,14 +121,22 @@ def of_extrapolation(solved: Iterable[Solution]) -> tuple[Remark, ...]:
     return (Remark(sentence),)
 
 
-def of_average(whole: Average) -> Iterator[Remark]:
-    """Say what an average leaves out."""
+def of_average(whole: Average, solved: Sequence[Solution] = ()) -> Iterator[Remark]:
+    """Say what an average leaves out; solved: the frames with its fixes, of which a single one left out is named."""
+    there = whole.latitude, whole.longitude
     if whole.moved:
         begin = utc_text(whole.began_unix_s)
         yield Remark(
             f"the instrument was moved: the average is of its last place, {whole.frames} frames since {begin}"
         )
-    if whole.left_out:
+    off = [(apart_m((f.latitude, f.longitude), there), s.source) for s in solved if (f := s.fix)]
+    if whole.left_out == 1 and off and max(off)[1]:
+        away_m, source = max(off)
+        yield Remark(
+            f"{source}: its place lies {length_text(away_m)} from the place of the others, further than its errors "
+            "allow: it is not in the average: check its tilt and time"
+        )
+    elif whole.left_out:
         yield Remark(
             f"{whole.left_out} fixes lie further from the others than their errors allow: they are not in the average"
         )

@@ -124,7 +124,7 @@ def together(gathered: Gathered, given: Instrument | None, near: Near | None = N
         why_not = str(error)
     place = fixes[-1] if whole is None else whole
     said = list(remarks.of_extrapolation(gathered.solved))
-    said += [] if whole is None else remarks.of_average(whole)
+    said += [] if whole is None else remarks.of_average(whole, gathered.solved)
     mounting = None
     if given is not None:
         said += remarks.of_inclinometer(given)

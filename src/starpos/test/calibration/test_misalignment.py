@@ -137,6 +137,26 @@ def test_a_bad_tilt_among_ten_does_not_move_it(catalogue, ten, off_deg, which):
     assert stddev(found) == pytest.approx(stddev(expected), rel=0.15)
 
 
+@pytest.mark.parametrize(("off_deg", "named"), [(0.3, True), (-4.0, True), (0.0, False)])
+def test_one_bad_tilt_among_five_headings_is_named_and_left_out(catalogue, rng, off_deg, named):
+    shot = shots(catalogue, rng, [0.0] * 5)
+    shot.spoil(3, off_deg)
+    found = found_at(shot, catalogue)
+    said = [s.message for s in found.solutions if s.fix is None]
+    assert len(said) == named
+    assert all("its tilt is off by" in message for message in said)
+    assert [s.fix is None for s in found.solutions].index(True) == 3 if named else True
+    assert found.beyond == "" and found.plumb_stddev_arcsec < 30
+
+
+def test_five_headings_that_all_scatter_are_all_used(catalogue, rng):
+    shot = shots(catalogue, rng, [0.0] * 5)
+    for k, off_deg in enumerate(rng.normal(0, 0.05, 5)):
+        shot.spoil(k, off_deg)
+    found = found_at(shot, catalogue)
+    assert len(found.fixes) == 5 and found.beyond
+
+
 @pytest.mark.parametrize("bad", [[0], [0, 1], [1, 2, 3]])
 def test_frames_that_do_not_agree(catalogue, rng, bad):
     """No noise of any inclinometer explains degrees: which of two or four frames are right is undetermined."""
