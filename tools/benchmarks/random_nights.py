@@ -6,7 +6,7 @@
 
 nights: as the paper has fifty. Each night has a new place, date, pointing, A3 and zero, and 25 frames at each of four
 headings; A3 is unknown, the clock known to 1 ms. Mean absolute errors on the ground (longitude times the cosine of
-latitude) stand beside the paper's.
+latitude) are compared with the paper's.
 Exit status 1 where they are above the aim of 1 arcsec (0.15 with a tiltmeter of 0.1 arcsec, and in proportion).
 
 honesty: nights turned on the spot, and nights calibrated at one place and used days later at another: the errors squared
