@@ -186,6 +186,8 @@ def why_noise(stars: Stars) -> str:
 WIDE_PX = 8.0
 # If this share of the brightest detections is saturated, their order of brightness may be wrong.
 BRIGHTEST_STARS, MANY_SATURATED = 20, 0.5
+# Half of the widest field that lenses without a fisheye's projection usually have, rad.
+USUAL_HALF_FIELD = math.radians(50.0)
 
 
 def why_unidentified(stars: Stars, camera: Camera, catalogue: Catalogue) -> str:
@@ -212,6 +214,8 @@ def why_unidentified(stars: Stars, camera: Camera, catalogue: Catalogue) -> str:
             f"{int(saturated[:BRIGHTEST_STARS].sum())} of its {min(n, BRIGHTEST_STARS)} brightest are saturated, so that "
             "their order of brightness says little: expose for a shorter time"
         )
+    if camera.half_diagonal_rad > USUAL_HALF_FIELD and not fisheye.is_wide(camera):
+        causes.append("a lens as wide as this is usually a fisheye (equidistant)")
     causes.append(f"check the focal length ({camera.fx:.0f} px given, 3 % is allowed), clouds and exposure")
     return f"{stars.place}: no part of the sky matches its {n} stars: {'; '.join(causes)}"
 

@@ -98,13 +98,13 @@ def attitude_at_place(stars: MatchedStars, place: Place, about: Circumstances) -
     shown = True
     if fisheye.is_wide(camera) and atmosphere.pressure_pa:
         leaned = [rotation.from_vector(turn) for turn in np.eye(3)[:2] * STEP_RAD]
-        moved = [
+        leaning = [
             adjustment_of(stars.xy, camera, r @ g, itrs, refraction).predict(
                 r @ seen.fit.a4, seen.fit.scale, refraction.compiled
             )
             for r in leaned
         ]
-        shown = any(camera.distortion) and _zenith_shown(seen, np.stack(moved, -1), atmosphere)
+        shown = any(camera.distortion) and _zenith_shown(seen, np.stack(leaning, -1), atmosphere)
     moved = zenith_moved(place.plumb[0])
     terms = (
         *seen.terms(np.eye(3), about),

@@ -257,7 +257,7 @@ def answer_by_header(solver: Solver, question: Question, progress: Progress) -> 
     if again.solution.pointing is None:
         return sight
     remark = wrong_header(item, again.solution.pointing.focal_px)
-    return replace(again, solution=replace(again.solution, remark=remark), instrument=fitting)
+    return replace(again, solution=again.solution.with_remark(remark), instrument=fitting)
 
 
 def of_one_camera(solver: Solver, sights: Sequence[Sight]) -> tuple[Solver, list[Sight]]:

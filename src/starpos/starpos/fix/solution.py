@@ -163,6 +163,10 @@ class Solution:
         """A solution of a file that holds no frame."""
         return cls(Status.BAD_INPUT, str(error), source=source, utc_unix_s=None, stars_detected=0)
 
+    def with_remark(self, sentence: str) -> "Solution":
+        """The solution with a sentence, which may be '', before its other remarks."""
+        return replace(self, remark="; ".join(filter(None, (sentence, self.remark))))
+
     def beside(self, glows: Glows) -> "Solution":
         """The solution after the glows before it: refused unless its own has moved as the Sun does."""
         if self.glow is None:

@@ -510,7 +510,7 @@ def placed(solver: Solver, stars: Stars, answer: Solution, places: Places) -> So
             check_agrees(answer.fix, place)
         attitude = solver.attitude_at(stars, answer.found, place)
         if not attitude.hour_shown:
-            answer = replace(answer, remark=UNSHOWN_HOUR)
+            answer = answer.with_remark(UNSHOWN_HOUR)
         alone = answer.ok and answer.fix is None
         return replace(answer, at_place=attitude, message=attitude.text if alone else answer.message)
     except StarposError as e:

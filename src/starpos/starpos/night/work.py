@@ -150,7 +150,7 @@ class Solving:
         if item.rough_focal_px is not None:
             told = f"its EXIF gives a focal length of about {item.rough_focal_px:.0f} px"
         remark = f"{item.place}: {told}: its stars give {focal_px:.0f} px"
-        return replace(sight, solution=replace(sight.solution, remark=sight.solution.remark or remark))
+        return replace(sight, solution=sight.solution.with_remark(remark))
 
     def _by_phone(self, item: Frame | Stars) -> bool:
         """Whether the level is in the camera that took a photograph."""
@@ -174,8 +174,7 @@ class Solving:
                 question = replace(question, stars=sight.stars, known=sight.found)
             again = searching.answer_frame(replace(solver, instrument=known), question)
             sight = sight if again.found is None else again
-        solution = replace(sight.solution, remark=sight.solution.remark or doubt)
-        return replace(sight, solution=solution, instrument=known)
+        return replace(sight, solution=sight.solution.with_remark(doubt), instrument=known)
 
     def solver(self, item: Frame | Stars) -> Solver:
         """The solver of a frame; InstrumentError if its focal length is unknown."""

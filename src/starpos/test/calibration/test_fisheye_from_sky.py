@@ -125,6 +125,7 @@ def test_a_frame_of_the_middle_of_the_sky_does_not_show_its_hour(catalogue, rng)
     middle = stars.select(near)
     answer = answer_frame(solver, Question(item=middle, stars=middle, places=SITE)).solution
     assert answer.at_place is not None and "its hour is right" in answer.remark
+    assert answer.with_remark("first").remark == f"first; {answer.remark}"
 
 
 def test_without_tilts_refraction_would_pass_for_the_lens(catalogue, rng):
