@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The deflection of the vertical from a grid of geoid undulations, with an error for what the grid cannot resolve.
 
-Grids are NOAA's GTX, and GeoTIFFs of one float band in geographic degrees, whose pixels OpenCV decodes.
+Grids are NOAA's GTX, NGS's .bin, and GeoTIFFs of one float band in geographic degrees, whose pixels OpenCV decodes.
 Sources: GeoTIFF 1.1 (OGC 19-008r4), and PROJ's specification of geodetic TIFF grids for two tags of GDAL.
 """
 
@@ -134,6 +134,9 @@ def _nodata(tags: dict) -> float | None:
 
 # South, west, step in latitude, step in longitude (deg), rows, columns: the whole header of a GTX, always big endian.
 GTX_HEADER = struct.Struct(">4d2i")
+# In a .bin of NGS one word follows: the kind of its values, of which there is one, REAL*4. NGS gives both byte orders.
+NGS_KIND, REAL4 = "i", 1
+BYTE_ORDERS = "><"
 GTX_NODATA = np.float32(-88.8888)
 # A grid of the whole globe with 1 arcmin has 233 million nodes of 4 bytes.
 MAX_BYTES = 1_200_000_000
@@ -340,7 +343,7 @@ class Geoid:
 
 
 def read(path: Path | str) -> Geoid:
-    """Read a Geoid from a GTX or GeoTIFF file; GeoidError says why a file cannot be used.
+    """Read a Geoid from a GTX, .bin (NGS) or GeoTIFF file; GeoidError says why a file cannot be used.
 
     A file name without a folder is also looked for among PROJ's grids.
     """
@@ -357,7 +360,7 @@ def read(path: Path | str) -> Geoid:
             return Geoid(*_read_plain(file))
     except OSError as e:
         raise GeoidError(
-            f"{path}: the geoid grid cannot be read ({e.strerror or e}): give a GTX or GeoTIFF file"
+            f"{path}: the geoid grid cannot be read ({e.strerror or e}): give a GTX, NGS .bin or GeoTIFF file"
         ) from None
     except GeoidError as e:
         raise GeoidError(f"{path}: no geoid grid that can be used: {e}") from None
@@ -377,22 +380,41 @@ def find(path: Path | str) -> Path:
 
 
 def _read_plain(file: BinaryIO) -> tuple[np.ndarray, float, float, float, float]:
-    """Values, south, west and steps of an open GTX file: rows from south to north after a short header.
+    """Values, south, west and steps of an open GTX or .bin file: rows from south to north after a short header.
 
     The values stay in the file until they are used.
     """
     size = file.seek(0, os.SEEK_END)
     file.seek(0)
-    head = file.read(GTX_HEADER.size)
+    head = file.read(GTX_HEADER.size + struct.calcsize(NGS_KIND))
     if len(head) < GTX_HEADER.size:
         raise GeoidError("it is shorter than a header")
     if head.startswith(b"P5"):
         raise GeoidError("it is a PGM, as GeographicLib has them: give the same geoid as a GTX or GeoTIFF")
-    south, west, step_latitude, step_longitude, rows, columns = GTX_HEADER.unpack(head)
+    order, start = _ngs_order(head, size), len(head)
+    if not order:
+        order, start = ">", GTX_HEADER.size
+    south, west, step_latitude, step_longitude, rows, columns = struct.unpack_from(order + "4d2i", head)
     if rows <= 0 or columns <= 0 or 4 * rows * columns > MAX_BYTES:
-        raise GeoidError(f"its header claims {columns} x {rows} nodes: is it a GTX or GeoTIFF file?")
-    missing = GTX_HEADER.size + 4 * rows * columns - size
+        raise GeoidError(
+            f"its header claims {columns} x {rows} nodes: is it a GTX, NGS .bin or GeoTIFF file?"
+        )
+    missing = start + 4 * rows * columns - size
     if missing > 0:
         raise GeoidError(f"{missing} bytes are missing at its end: copy it again")
-    values = np.memmap(file, ">f4", "r", GTX_HEADER.size, (rows, columns))
+    values = np.memmap(file, f"{order}f4", "r", start, (rows, columns))
     return values, south, west, step_latitude, step_longitude
+
+
+def _ngs_order(head: bytes, size: int) -> str:
+    """The byte order of a .bin of NGS whose file has this size; '' of another file.
+
+    A GTX that is read as one would have a first value of 1e-45 m, and four bytes too many.
+    """
+    for order in BYTE_ORDERS:
+        layout = struct.Struct(order + "4d2i" + NGS_KIND)
+        if len(head) == layout.size:
+            *_, rows, columns, kind = layout.unpack(head)
+            if kind == REAL4 and rows > 0 and columns > 0 and size == layout.size + 4 * rows * columns:
+                return order
+    return ""

@@ -260,6 +260,18 @@ def test_no_data_of_a_geotiff(tmp_path):
     assert geoid.read(path).at(*np.radians([46.1, 12.0])) != Deflection()
 
 
+@pytest.mark.parametrize("order", "<>")
+def test_a_grid_of_ngs_says_what_the_gtx_says_in_either_byte_order(tmp_path, order):
+    """Its header has one word more than a GTX's: taken for one, each node would be a column off."""
+    heights, south, west, _ = hill(30.0, 0.3, 0.1)
+    plain = gtx(tmp_path / "a.gtx", heights, south, west, 0.1)
+    header = struct.pack(order + "4d3i", south, west, 0.1, 0.1, *heights.shape, 1)
+    (tmp_path / "a.bin").write_bytes(header + heights.astype(order + "f4").tobytes())
+    told, expected = geoid.read(tmp_path / "a.bin"), geoid.read(plain)
+    assert np.array_equal(told.values, expected.values)
+    assert (told.south, told.west, told.step_longitude) == (south, west, 0.1)
+
+
 BROKEN_GTX = {
     "empty": (b"", "shorter"),
     "a text": (b"latitude longitude undulation, all of them in one line\n", "nodes"),
