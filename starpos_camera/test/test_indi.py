@@ -221,7 +221,12 @@ def test_a_frame_that_does_not_come_in_time_is_given_up(server, source, other):
     text, _ = capture.result(WAIT_S)
     os.kill(driver, signal.SIGCONT)
     assert "gave no frame in time" in text
-    impatient.capture(SHORT)
+    try:
+        impatient.capture(SHORT)
+    except CaptureError as error:
+        # the frame of the exposure that was given up, which may come late, is not taken for the one that was asked for
+        assert "has exposed for 1 s" in str(error)
+        impatient.capture(SHORT)
     impatient.close()
 
 

@@ -119,6 +119,11 @@ class IndiDevice:
         found = self._vectors.get(vector)
         return None if found is None else found.state
 
+    def answered(self, vector: str) -> bool:
+        """Whether the device has answered since the vector was set."""
+        found = self._vectors.get(vector)
+        return found is not None and not found.asked
+
     def value(self, vector: str, member: str) -> str | None:
         """Text of a member; None without one."""
         found = self._vectors.get(vector)
@@ -348,7 +353,13 @@ def expose(device: IndiDevice, exposure_s: float, readout_s: float) -> Blob:
     device.forget()
     try:
         device.send("CCD_EXPOSURE", CCD_EXPOSURE_VALUE=repr(exposure_s))
-        device.until(lambda: device.blob or state() in (None, "Alert", "Idle"), exposure_s + readout_s)
+
+        def ended() -> bool:
+            # before the answer a frame is of an exposure that was given up
+            done = device.blob is not None and device.answered("CCD_EXPOSURE")
+            return done or state() in (None, "Alert", "Idle")
+
+        device.until(ended, exposure_s + readout_s)
         if device.lost:
             raise CaptureError("the INDI server went away during the exposure; it is looked for again.")
         if state() is None:

@@ -425,7 +425,7 @@ def _attitude(
             *look.terms(components @ g, np.array([0.0, raised])),
             *sky_terms(turn, state, clock_s, stamp_s, a4),
             ErrorTerm("place", turn @ moved @ place.zenith_root, shared=ALWAYS),
-            ErrorTerm("plumb", turn @ moved * place.plumb_stddev, shared=ALWAYS),
+            ErrorTerm("deflection", turn @ moved * place.plumb_stddev, shared=ALWAYS),
         )
         whole = total_covariance(of_body)
         off = components @ (bent - found @ look.seen.ray)

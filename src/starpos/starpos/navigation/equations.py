@@ -289,6 +289,9 @@ class StarAttitudes:
     def nearest(self, camera: np.ndarray) -> np.ndarray:
         """The attitudes (F, 3, 3), each turned about its ray so that it is nearest to the camera's (F, 3, 3)."""
         found, lone = self.camera_to_itrs.copy(), ~self.whole
+        # scipy 1.11, as Ubuntu has it, makes no empty array of rotations
+        if not lone.any():
+            return found
         camera, ray = camera[lone], self.rays[lone]
         believed, seen = _turned(camera, ray), _turned(found[lone], ray)
         axis = np.cross(believed, seen)
