@@ -19,7 +19,12 @@ T0 = 1_793_642_400.0
 
 
 def sample(
-    seconds: float, x_deg: float = 1.0, y_deg: float = -2.0, flags: int = 0, variance: float = 0.0
+    seconds: float,
+    x_deg: float = 1.0,
+    y_deg: float = -2.0,
+    flags: int = 0,
+    variance: float = 0.0,
+    z_variance: float = 0.0,
 ) -> SimpleNamespace:
     """A message as rclpy or rosbags gives it."""
     whole, part = divmod(round((T0 + seconds) * 1e6), 1_000_000)
@@ -28,8 +33,10 @@ def sample(
         header=header,
         x=math.radians(x_deg),
         y=math.radians(y_deg),
-        z=0.0,
-        z_variance=0.0,
+        z=math.acos(math.hypot(math.sin(math.radians(x_deg)), math.sin(math.radians(y_deg))))
+        if z_variance
+        else 0.0,
+        z_variance=z_variance,
         covariance=[variance, 0.0, 0.0, variance],
         temperature=10.0,
         flags=flags,
@@ -204,11 +211,12 @@ BMI088, ADIS16209 = (sensors.find(model)[1] for model in ("bmi088", "adis16209")
 LEVEL = InclinometerErrors()
 
 
-def judged(readings, errors, period_s=0.1):
+def judged(readings, errors, period_s=0.1, axes=3):
     """The tilt of an exposure at T0 that an inclinometer of these errors gives; readings (N, 2) deg until 0.5 s later."""
     last = len(readings) - 1 - round(0.5 / period_s)
     variance = errors.noise_rad**2
-    messages = (sample((k - last) * period_s, *xy, variance=variance) for k, xy in enumerate(readings))
+    third = variance if axes == 3 else 0.0
+    messages = (sample((k - last) * period_s, *xy, 0, variance, third) for k, xy in enumerate(readings))
     tilt = buffer_of(messages).average(T0, 0.5)
     errors.check_live(tilt)
     return tilt
@@ -233,6 +241,16 @@ def test_a_topic_whose_level_does_not_measure_gives_no_tilt(kind, rng):
     }
     with pytest.raises(TiltError, match="repeats the same value"):
         judged(lies[kind], LEVEL)
+    if kind in ("zeros", "since a while", "one axis"):
+        with pytest.raises(TiltError, match="repeats the same value"):
+            judged(lies[kind], LEVEL, axes=2)
+
+
+def test_a_mean_of_an_inclinometer_that_its_driver_repeats_is_believed():
+    """A stuck one is flagged by the driver; of a rounded mean the rounding counts."""
+    tilt = judged(np.full((60, 2), -4.51234), LEVEL, axes=2)
+    assert tilt.step_rad == 0 and np.degrees(tilt.theta[:2]) == pytest.approx([-4.51234] * 2)
+    assert np.degrees(judged(np.full((60, 2), [3.0, -12.0]), LEVEL, axes=2).step_rad) > 0.1
 
 
 @pytest.mark.parametrize(
@@ -247,7 +265,7 @@ def test_a_topic_whose_level_does_not_measure_gives_no_tilt(kind, rng):
 )
 def test_a_topic_of_a_level_at_rest_is_believed(errors, step_deg, noise_deg, period_s, rng):
     tilt = judged(np.round(at_rest(rng, 600, noise_deg) / step_deg) * step_deg, errors, period_s)
-    assert tilt.step_rad == 0 and np.degrees(tilt.theta) == pytest.approx([3.1234, -11.7777], abs=0.03)
+    assert tilt.step_rad == 0 and np.degrees(tilt.theta[:2]) == pytest.approx([3.1234, -11.7777], abs=0.03)
 
 
 def test_a_topic_of_an_old_level_whose_coarse_steps_are_stated_costs_them(rng):
