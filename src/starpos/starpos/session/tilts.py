@@ -330,8 +330,8 @@ class TiltBuffer:
         until = (s for _, s in reversed(self._good) if s.utc_unix_s <= end)
         before = np.array([s.theta[:2] for s in itertools.islice(until, most)])
         repeats = np.ptp(before, axis=0) == 0 if len(before) == most else np.zeros(2, bool)
-        # The source of an inclinometer flags one that is stuck, and other people's may publish a mean that repeats. An
-        # accelerometer, of three axes, has nobody to flag it; nor do zeros, or noise before, come from a mean.
+        # The source of an inclinometer flags one that is stuck, and other people's may publish a mean that repeats. The
+        # messages of an accelerometer, which has three axes, have no such flag. Zeros, and noise before, are of no mean.
         if used[-1].axes == 2 and not moves.any() and before.any():
             repeats[:] = False
         noise = math.sqrt(np.mean([np.diag(s.covariance) for s in used]))
