@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A gyro's readings of the last minute: how the body has turned, and the trails that this gives the stars of a frame."""
+"""A gyro's readings of the last minute, and the trails that the body's turn gives the stars of a frame."""
 
 from dataclasses import replace
 from typing import Any
@@ -22,17 +22,29 @@ KEPT_S, BLOCK_S = 60.0, 1.0
 # rad/s; every gyro measures up to this, so values repeated below it are not clipping
 MIN_RANGE = 1.0
 NO_RATES = np.zeros((0, 3))
+# this share of an exposure may be without readings
+MAX_MISSING = 0.1
+# cosine of the largest turn in an exposure: 60 deg
+MIN_COSINE = 0.5
 
 
-class GyroReadings:
-    """Takes sensor_msgs/Imu of which only the turn rates count, rad/s along the IMU's axes."""
+class Trails:
+    """Takes a gyro's readings and the camera's intrinsics, and gives frames their trails.
 
-    def __init__(self) -> None:
+    calibration_url: instrument file whose link_to_camera takes the IMU's axes into C, '' for the usual ones;
+    InstrumentError if it is broken.
+    """
+
+    def __init__(self, calibration_url: str) -> None:
+        # it needs scipy's rotations, which a detector without a gyro does not load
+        known = known_instrument(calibration_url)
+        self._link = np.asarray(known.link_to_camera if known else TOP_OF_FRAME, float)
         self._recent = RecentReadings()
         self._block_s = -np.inf
+        self._focal_px: float | None = None
 
-    def receive(self, message: Any) -> None:
-        """Keep a reading; VoyageError in a sentence if it cannot be used."""
+    def receive_imu(self, message: Any) -> None:
+        """Keep the turn rates of a sensor_msgs/Imu, rad/s; VoyageError in a sentence if it cannot be used."""
         w, time_s = message.angular_velocity, stamp_to_unix(message.header.stamp)
         if message.angular_velocity_covariance[0] == -1:
             raise VoyageError(
@@ -51,12 +63,32 @@ class GyroReadings:
             self._recent.close()
             self._recent.forget(time_s - KEPT_S)
 
-    def turn(
-        self, begin_s: float, end_s: float, most_missing_s: float, bias: np.ndarray
-    ) -> np.ndarray | None:
-        """The body's axes (3, 3) at a time in those at an earlier one, with a bias (3,) in rad/s taken off.
+    def receive_camera(self, message: Any) -> None:
+        """Take a CameraInfo; InstrumentError in a sentence if it cannot be used."""
+        # a size that it leaves open does not matter here
+        self._focal_px = message_to_camera(message, size=(1, 1)).fx
 
-        None where more than most_missing_s of it are without readings, or where readings look clipped.
+    def with_trail(self, frame: Frame) -> Frame:
+        """The frame with its trail; as it is where time, exposure, focal length or readings lack, or it turned far."""
+        if self._focal_px is None or frame.mid_unix_s is None or not frame.exposure_s:
+            return frame
+        begin_s, end_s = (frame.mid_unix_s + share * frame.exposure_s for share in (-0.5, 0.5))
+        turn = self._turn(begin_s, end_s)
+        if turn is None:
+            return frame
+        # of directions at the beginning into those at the end; its last column is where a star on the axis goes
+        moved = self._link @ turn.T @ self._link.T
+        x, y = self._focal_px * moved[:2, 2] / max(moved[2, 2], MIN_COSINE)
+        # turned so far that stars cross the frame: their trail cannot be determined
+        if np.trace(moved) < 1 + 2 * MIN_COSINE or np.hypot(x, y) > frame.width + frame.height:
+            return frame
+        roll_rad = np.arctan2(moved[1, 0] - moved[0, 1], moved[0, 0] + moved[1, 1])
+        return replace(frame, trail=Trail(middle_px=(float(x), float(y)), roll_rad=float(roll_rad)))
+
+    def _turn(self, begin_s: float, end_s: float) -> np.ndarray | None:
+        """The body's axes (3, 3) at the end of an exposure in those at its beginning.
+
+        None where more than MAX_MISSING of it is without readings, or where readings look clipped.
         """
         recent = self._recent
         if not (np.isfinite(recent.last_s) and recent.last_s - KEPT_S < begin_s < end_s):
@@ -68,52 +100,5 @@ class GyroReadings:
         rates = np.concatenate([NO_RATES, *rows])
         if len(rates) and (np.abs(rates[clipped(rates)]) > MIN_RANGE).any():
             return None
-        turn, missing_s = turn_between(replace(imu, gyro=imu.gyro - bias), begin_s, end_s)
-        return turn if missing_s <= most_missing_s else None
-
-
-# this share of an exposure may be without readings
-MAX_MISSING = 0.1
-# cosine of the largest turn in an exposure: 60 deg
-MIN_COSINE = 0.5
-
-
-class Trails:
-    """Takes a gyro's readings and the camera's intrinsics, and gives frames their trails.
-
-    calibration_url: instrument file whose link_to_camera takes the IMU's axes into C, '' for the usual ones;
-    InstrumentError if it is broken.
-    """
-
-    def __init__(self, calibration_url: str) -> None:
-        # it needs scipy's rotations, which a detector without a gyro does not load
-        known = known_instrument(calibration_url)
-        self._link = np.asarray(known.link_to_camera if known else TOP_OF_FRAME, float)
-        self._readings = GyroReadings()
-        self._focal_px: float | None = None
-
-    def receive_imu(self, message: Any) -> None:
-        """Take a sensor_msgs/Imu; VoyageError in a sentence if it cannot be used."""
-        self._readings.receive(message)
-
-    def receive_camera(self, message: Any) -> None:
-        """Take a CameraInfo; InstrumentError in a sentence if it cannot be used."""
-        # a size that it leaves open does not matter here
-        self._focal_px = message_to_camera(message, size=(1, 1)).fx
-
-    def with_trail(self, frame: Frame) -> Frame:
-        """The frame with its trail; as it is where time, exposure, focal length or readings lack, or it turned far."""
-        if self._focal_px is None or frame.mid_unix_s is None or not frame.exposure_s:
-            return frame
-        begin_s, end_s = (frame.mid_unix_s + share * frame.exposure_s for share in (-0.5, 0.5))
-        turn = self._readings.turn(begin_s, end_s, MAX_MISSING * frame.exposure_s, np.zeros(3))
-        if turn is None:
-            return frame
-        # of directions at the beginning into those at the end; its last column is where a star on the axis goes
-        moved = self._link @ turn.T @ self._link.T
-        x, y = self._focal_px * moved[:2, 2] / max(moved[2, 2], MIN_COSINE)
-        # turned so far that stars cross the frame: their trail cannot be determined
-        if np.trace(moved) < 1 + 2 * MIN_COSINE or np.hypot(x, y) > frame.width + frame.height:
-            return frame
-        roll_rad = np.arctan2(moved[1, 0] - moved[0, 1], moved[0, 0] + moved[1, 1])
-        return replace(frame, trail=Trail(middle_px=(float(x), float(y)), roll_rad=float(roll_rad)))
+        turn, missing_s = turn_between(imu, begin_s, end_s)
+        return turn if missing_s <= MAX_MISSING * (end_s - begin_s) else None

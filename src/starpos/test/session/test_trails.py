@@ -88,6 +88,26 @@ def test_where_anything_lacks_there_is_none(told):
     assert unknown.with_trail(FRAME).trail is None
 
 
+@pytest.mark.parametrize(("largest", "is_known"), [(2.0, False), (9.0, True)])
+def test_clipped_readings_give_no_trail(told, largest, is_known):
+    for t in np.arange(-0.5, 0.5, 0.01):
+        told.receive_imu(reading(MID_S + t, (0.0, 0.0, np.clip(5.0 * np.cos(8.0 * t), -largest, largest))))
+    assert (told.with_trail(FRAME).trail is not None) == is_known
+
+
+def test_a_reading_without_rates_or_time_is_refused(told):
+    with pytest.raises(VoyageError, match="measures no rates"):
+        told.receive_imu(reading(MID_S, (0.0, 0.0, 0.0), measured=False))
+    with pytest.raises(VoyageError, match="no time stamp"):
+        told.receive_imu(reading(0.0, (0.0, 0.0, 0.0)))
+
+
+def test_a_clock_that_is_set_back_begins_anew(told):
+    told.receive_imu(reading(MID_S + 3600.0, (0.1, 0.0, 0.0)))
+    turn(told, (0.1, 0.0, 0.0))
+    assert told.with_trail(FRAME).trail is not None
+
+
 def test_a_broken_instrument_file_is_told(tmp_path):
     with pytest.raises(InstrumentError):
         Trails(f"{tmp_path / 'none.yaml'}")
