@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from starpos.averaging.average import SCATTER, Average
+from starpos.averaging.elevation_axis import FoundAxis
 from starpos.calibration.misalignment import Calibrated
 from starpos.earth.ellipsoid import EARTH_RADIUS_M, zenith_of
 from starpos.earth.orientation import ROTATION_RAD_S
@@ -141,27 +142,37 @@ def of_average(whole: Average, solved: Sequence[Solution] = ()) -> Iterator[Rema
         )
 
 
-# a claim that scatter widens by more is worth a word
-WIDENED = 1.4
+def beyond_stated(place: Average | None) -> bool:
+    """Whether the residuals of elevations are beyond their stated errors; they are if no place fits."""
+    if place is None:
+        return True
+    shares = [np.trace(t.covariance[:2, :2]) for t in place.terms if t.name == SCATTER]
+    return place.left_out > 0 or sum(shares) > np.trace(place.covariance[:2, :2]) / 2
 
 
-def scatter_of(place: Average) -> float:
-    """Factor by which the residuals widen the claimed error of a place."""
-    whole = np.trace(place.covariance[:2, :2])
-    beyond = sum(np.trace(t.covariance[:2, :2]) for t in place.terms if t.name == SCATTER)
-    return float(np.sqrt(whole / (whole - beyond)))
+def of_left_out(elevations: int) -> Iterator[Remark]:
+    """Say that some elevations are not used."""
+    if elevations:
+        yield Remark(
+            f"{elevations} elevations contradict the others and are left out: their tilts or pointings are wrong"
+        )
 
 
 def of_elevations(place: Average) -> Iterator[Remark]:
     """Say which elevations the place is not from, and that the others scatter."""
-    if place.left_out:
-        yield Remark(
-            f"{place.left_out} elevations contradict the others and are left out: their tilts or pointings are wrong"
-        )
-    if scatter_of(place) > WIDENED:
+    yield from of_left_out(place.left_out)
+    if beyond_stated(replace(place, left_out=0)):
         yield Remark(
             "the elevations scatter by more than the stated errors of tilts and A3: the claimed error includes it"
         )
+
+
+def of_denied_a3(axis: FoundAxis, given: Calibration) -> Remark:
+    """Say that the elevations deny the A3 that was given."""
+    return Remark(
+        f"the elevations deny the A3 given, by {axis.sigma_from(given):.0f} sigma: the place is from the A3 that they "
+        "determine: calibrate again"
+    )
 
 
 def of_a3(
