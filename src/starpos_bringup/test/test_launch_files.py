@@ -243,7 +243,7 @@ def test_a_robots_topics_are_remapped_and_its_own_fix_has_another_name():
             ("imu/data", "imu"),
         )
     )
-    assert remaps == {"detector": [image, info, imu], "inclinometer": [imu], "solver": [info, imu]}
+    assert remaps == {"detector": [image, info, imu], "inclinometer": [imu], "solver": [info]}
     assert robot["inclinometer"].more["/**/inclinometer"] == {"source": "imu"}
     assert {p.namespace for p in robot.values()} == {"/starpos"} and {
         p.user_file for p in robot.values()

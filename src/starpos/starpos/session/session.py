@@ -24,7 +24,6 @@ from starpos.fix.solver import Solver
 from starpos.frames.frame import Stars
 from starpos.gnss.solving import Watched
 from starpos.identification.prior import Hint
-from starpos.identification.search import Priors
 from starpos.instrument.camera import Camera
 from starpos.messages.stamp import stamp_to_unix
 from starpos.messages.stars import message_to_stars
@@ -34,7 +33,6 @@ from starpos.session.camera_solver import CameraSolver
 from starpos.session.deflection import LiveDeflection
 from starpos.session.driver import Answered, Averaged, Changes, Heard, Jobs, Log, Now, Output, Sent, refusing
 from starpos.session.gnss import GnssTeacher, SessionPlaces
-from starpos.session.gyro import Gyro
 from starpos.session.pace import MAX_WAITING, Backlog, Pace, Waiting
 from starpos.session.settings import Settings
 from starpos.session.solving import AT_ONCE_S, Search, attitude_beside
@@ -82,7 +80,6 @@ class SolverSession:
         self.more = False
         self.tilts = TiltBuffer()
         self.doubt = ClockDoubt()
-        self.gyro = Gyro(heard)
         self.satellites: LiveSatellites | None = None
         if settings.orbits is not None:
             from starpos.session import satellites
@@ -127,7 +124,6 @@ class SolverSession:
         self._hint = None
         self._search.other_camera()
         self._glows = Glows()
-        self.gyro.forget()
         if self.gnss is not None:
             self.gnss.other_camera()
         self.calibrating.camera_changed()
@@ -336,11 +332,8 @@ class SolverSession:
         return stars.exposure_s or self._values["tilt_window"]
 
     def _solve(self, frame: Waiting, now: Now) -> list[Output]:
-        predicted: Priors = self._guarded(
-            lambda: self.gyro.predicted(frame.stars, self.instrument.solver), lambda e: ()
-        )
         until_s = self._search.until_s(now, bool(self._backlog))
-        question = self._question(frame, predicted=predicted, hint=self._hint, until_s=until_s)
+        question = self._question(frame, hint=self._hint, until_s=until_s)
         answer = self._answer(frame, question)
         if (fix := answer.fix) is not None and answer.ok:
             frame, answer = self._guarded(
@@ -427,8 +420,7 @@ class SolverSession:
             return None
         question = replace(question, item=frame.stars, stars=frame.stars)
         return self._guarded(
-            lambda: attitude_beside(solver, question, answer, frame.header.frame_id, self.gyro),
-            lambda e: None,
+            lambda: attitude_beside(solver, question, answer, frame.header.frame_id), lambda e: None
         )
 
     def _learn(self, frame: Waiting, answer: Solution) -> list[Output]:
@@ -482,7 +474,6 @@ class SolverSession:
         self.tilts.clear()
         self._backlog.clear()
         self.latest = self.answer = self._hint = None
-        self.gyro.forget()
         if self.gnss is not None:
             self.gnss.places.forget()
         if self.satellites is not None:
