@@ -210,7 +210,7 @@ class Exif:
             )
 
     def gravity(self, data: bytes) -> Gravity:
-        """Up in the picture by its bytes, or those of its EXIF; FrameError says why its file does not say so."""
+        """Up in the picture by its bytes, or by the bytes of its EXIF; FrameError says why its file does not say so."""
         up = felt_up(data)
         self.check_whole()
         if contradicts(self.upper_edge, up):
