@@ -20,8 +20,9 @@ from starpos.instrument.camera import EQUIDISTANT, Camera
 from starpos.units import ARCSEC, DAY_S, HOUR_S
 
 # how far an untouched camera may wander from night to night, 1 sigma per axis: from the stiffest mount to a post in the
-# Sun, each size as probable as any other until the nights have shown it
-WANDERS_RAD = np.geomspace(0.3, 20, 25) * ARCSEC
+# Sun.  Until the nights have shown it, each size up to USUAL_RAD is as probable as any other, and larger ones are so rare
+# that a third night already shows a knock
+WANDERS_RAD, USUAL_RAD, RARER = np.geomspace(0.3, 60, 30) * ARCSEC, 10 * ARCSEC, 5
 # a camera that stands still leaves its own scatter by more in this share of the nights
 ALARM_CHANCE = 1e-6
 # the sky is measured within SKY_RAD of the axis, the black level beyond DARK_RAD, on each SPARSE-th pixel of each
@@ -172,7 +173,7 @@ def kept(poses: Iterable[NightPose]) -> tuple[Kept, ...]:
     The sizes of the wander from night to night are weighed by what the nights have shown of them so far.
     """
     before: list[NightPose] = []
-    log_weight = np.zeros(len(WANDERS_RAD))
+    log_weight = -RARER * np.log(np.maximum(WANDERS_RAD / USUAL_RAD, 1))
     found = []
     for pose in poses:
         turned, covariance, alarm = np.zeros(3), pose.own, False

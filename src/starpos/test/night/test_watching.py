@@ -60,6 +60,11 @@ def test_a_knock_is_found_the_same_night_and_none_is_invented(wander, rng):
     assert 0.8 < np.std(sigmas) < 1.2
 
 
+def test_a_post_that_wanders_far_is_no_alarm():
+    months = [kept(month(np.random.default_rng(k), 35 * ARCSEC)) for k in range(20)]
+    assert sum(night.alarm for nights in months for night in nights) == 0
+
+
 def test_the_brightness_of_the_sky_by_its_stars(rng):
     camera = Camera.from_focal(600, 600, 100.0, EQUIDISTANT)
     y, x = np.mgrid[:600, :600] - 299.5
