@@ -41,6 +41,8 @@ def month(rng, wander, knock=None, nights=30):
                 optics=optics,
                 focal_px=1,
                 limit_mag=5,
+                extinction=np.nan,
+                extinction_sigma=np.nan,
                 sky_mag=21,
             )
         )
