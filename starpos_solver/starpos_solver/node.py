@@ -89,7 +89,6 @@ class SolverNode(Node):
         subscription(self, NavSatFix, GNSS_TOPIC, hear, 10, ReliabilityPolicy.BEST_EFFORT)
         self.create_service(Solve, "~/solve", self._on_solve)
         self.create_service(Trigger, "~/reset", self._on_reset)
-        self.create_service(Trigger, "~/deflection", self._on_deflection)
         self._calibration_services = CalibrationServices(self, self._session, self._settings)
         group = MutuallyExclusiveCallbackGroup()
         self._poll = self.create_timer(
@@ -109,8 +108,6 @@ class SolverNode(Node):
             tasks["GNSS"] = session.gnss.report
         if session.satellites is not None:
             tasks["Satellites"] = session.satellites.report
-        if session.deflection.measures:
-            tasks["Deflection"] = session.deflection.report
         self._diagnostics = Diagnostics(self, tasks, self._values["frame_id"])
         self._update_transforms()
 
@@ -200,16 +197,6 @@ class SolverNode(Node):
         self._session.reset()
         response.success = True
         response.message = "tilts, frames and the place are forgotten; a calibration that was found is not"
-        return response
-
-    def _on_deflection(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        if not self._session.deflection.measures:
-            response.message = (
-                "no deflection is measured: start the solver with deflection.wanted, a site and altitude"
-            )
-            return response
-        told = self._session.deflection.report()
-        response.success, response.message = told.level == Level.OK, told.message
         return response
 
     # diagnostics -----------------------------------------------------------------------------------------------------

@@ -30,7 +30,6 @@ from starpos.messages.stars import message_to_stars
 from starpos.session import reports
 from starpos.session.calibrating import Calibrating, Seen
 from starpos.session.camera_solver import CameraSolver
-from starpos.session.deflection import LiveDeflection
 from starpos.session.driver import Answered, Averaged, Changes, Heard, Jobs, Log, Now, Output, Sent, refusing
 from starpos.session.gnss import GnssTeacher, SessionPlaces
 from starpos.session.pace import MAX_WAITING, Backlog, Pace, Waiting
@@ -89,7 +88,6 @@ class SolverSession:
         if settings.values["gnss.use"]:
             self.gnss = GnssTeacher(settings, jobs(), heard, log, self.satellites)
         self.places = SessionPlaces(settings, self.gnss, self.satellites)
-        self.deflection = LiveDeflection(settings, jobs())
         self._search = Search(settings.values)
         self._glows = Glows()
         self._settings, self._values = settings, settings.values
@@ -129,7 +127,6 @@ class SolverSession:
         self.calibrating.camera_changed()
         if self.satellites is not None:
             self.satellites.forget()
-        self.deflection.forget()
 
     @property
     def waits(self) -> bool:
@@ -140,7 +137,7 @@ class SolverSession:
     def busy(self) -> bool:
         """Whether a job runs: what comes meanwhile may be answered with its outcome, or without."""
         located = self.satellites is not None and self.satellites.busy
-        return located or self.instrument.preparing or self.calibrating.busy or self.deflection.busy
+        return located or self.instrument.preparing or self.calibrating.busy
 
     # parameters ------------------------------------------------------------------------------------------------------
 
@@ -149,7 +146,6 @@ class SolverSession:
         if "clock_stddev" in names:
             self.doubt.clear()
         self.calibrating.parameters_set(names)
-        self.deflection.parameters_set(names)
         self.instrument.remake()
 
     # inputs ----------------------------------------------------------------------------------------------------------
@@ -438,7 +434,6 @@ class SolverSession:
             solver.instrument.inclinometer.check_live(tilt)
         except StarposError:
             return []
-        self._guarded(lambda: self.deflection.include(solver, stars, tilt, answer.found), lambda e: None)
         place = self._guarded(
             lambda: self.calibrating.include(Seen(stars, tilt, answer.found), answer.fix),
             # data that cause a defect must not stay
@@ -480,7 +475,6 @@ class SolverSession:
             self.satellites.forget()
         self.doubt.clear()
         self.calibrating.forget()
-        self.deflection.forget()
 
 
 def _failed(frame: Waiting, what: str, error: Exception) -> Solution:
