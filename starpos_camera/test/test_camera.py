@@ -249,6 +249,7 @@ def test_bad_parameters_are_refused(options, sentence):
 
 def test_unset_parameters_are_nan_in_ros_too(start, listener):
     node = start("camera", *SMALL)
+    listener.wait_for_state("camera: Capture", 0, "taking frames")
     assert listener.set("camera", exposure=1.0).successful
     assert listener.set("camera", exposure=math.nan).successful
     assert not listener.set("camera", exposure=math.inf).successful
