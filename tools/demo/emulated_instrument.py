@@ -3,7 +3,7 @@
 
 The inclinometer's firmware, as it is flashed, runs on an emulated ATmega8 with its converter and sensor
 (starpos_inclinometer/test/sim). The camera is the CCD simulator of a real indiserver; indi_sky.py gives it the sky of
-each exposure, and a shutter that opens 0.3 s after the command, which the camera node is told. The four nodes are the
+each exposure, and a shutter that opens 0.3 s after the command, which the camera node has as a parameter. The four nodes are the
 installed ones. The place is drawn at random, and the nodes do not know it. Exit status 0 if the truth lies within 4
 sigma and all ended cleanly; 2 where something is not installed.
 """
@@ -44,8 +44,8 @@ START_S = 5.0
 EXACT_ARCSEC = 0.1
 # Of the emulated camera, from the command to the open shutter.
 LAG_S, LAG_STDDEV_S = 0.3, 0.004
-# What the camera node is told of its error: the sky of a busy machine comes late too.
-LAG_TOLD_STDDEV_S = 0.02
+# Its stated error: the sky of a busy machine comes late too.
+LAG_STATED_STDDEV_S = 0.02
 ROOT = Path(__file__).resolve().parents[2]
 NEEDED = {"gcc-avr", "avr-libc", "libsimavr-dev", "libelf-dev", "indi-bin"}
 
@@ -99,7 +99,7 @@ def start_devices(devices: Processes, place: Place, seed: int) -> dict[str, dict
         "indi.device": DEVICE,
         "pixel_um": PIXEL_UM * BINNING,
         "driver_lag": LAG_S,
-        "driver_lag_stddev": LAG_TOLD_STDDEV_S,
+        "driver_lag_stddev": LAG_STATED_STDDEV_S,
     }
     return {"inclinometer": {"port": link}, "camera": camera}
 
