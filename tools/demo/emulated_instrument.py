@@ -3,9 +3,9 @@
 
 The inclinometer's firmware, as it is flashed, runs on an emulated ATmega8 with its converter and sensor
 (starpos_inclinometer/test/sim). The camera is the CCD simulator of a real indiserver; indi_sky.py gives it the sky of
-each exposure, and a shutter that opens 0.3 s after the command, which the camera node has as a parameter. The four nodes are the
-installed ones. The place is drawn at random, and the nodes do not know it. Exit status 0 if the truth lies within 4
-sigma and all ended cleanly; 2 where something is not installed.
+each exposure, and a shutter that opens 0.3 s after the command; the camera node has this lag as a parameter. The four
+nodes are the installed ones. The place is drawn at random, and the nodes do not know it. Exit status 0 if the truth lies
+within 4 sigma and all ended cleanly; 2 where something is not installed.
 """
 
 import json
