@@ -109,9 +109,9 @@ def _altitude_text(sine: float) -> str:
 # across, px, for which the detector's FWHM is the geometric mean of length and width.
 TRAIL_WIDTHS, TRAIL_PX, ACROSS_PX = 3.0, 3.0, 0.8
 # The same by the stars' shapes, where they are measured: a trail this many times as long as wide would be seen, and
-# shapes that are circles to this share are nobody's measurement.
+# shapes that are circles to this share are not measured.
 LONGER_THAN_WIDE, SHAPELESS = 1.5, 1e-6
-# square of a trail's length over that of the FWHM of a normal curve of the same variance
+# (FWHM / length)^2 of the normal curve with a trail's variance
 TRAIL_VARIANCE = 8 * math.log(2) / 12
 
 
