@@ -83,7 +83,8 @@ OPENING = re.compile(r"\b(start|begin|beginning|open(ing)?)\b", re.IGNORECASE)
 CENTRE = re.compile(r"\b(mid|middle|midpoint|cent(er|re))\b", re.IGNORECASE)
 CLOSING = re.compile(r"\b(end|ending|finish|stop|closed?|closing|frame grabbed)\b", re.IGNORECASE)
 CREATED = re.compile(r"\b(image created|file (created|written))\b", re.IGNORECASE)
-OTHER_SCALE_S = {"GPS": 18, "TAI": 37, "TT": 69}  # ahead of UTC
+# ahead of UTC
+OTHER_SCALE_S = {"GPS": 18, "TAI": 37, "TT": 69}
 OTHER_SCALE = re.compile(r"\b(GPS|TAI|TT)\b", re.IGNORECASE)
 # Cards of the UTC of some moment of the exposure may be off by the time in which a header is written. Up to FOUND_S the
 # difference is an error of the stamp; a larger one is another time, as a local one is.
