@@ -69,8 +69,8 @@ class Video(DeviceSource["VideoCapture"]):
         device = values["video.device"]
         if not (device.isdecimal() or device.startswith("/dev/")):
             return (
-                f"video.device must be a V4L2 camera of this machine, below /dev, not {device!r}: video files and streams of "
-                "a network do not state when a frame was taken."
+                f"video.device must be a V4L2 camera of this machine, below /dev, not {device!r}: video files and "
+                "streams of a network do not state when a frame was taken."
             )
         if values["video.format"] and values["video.format"].ljust(4) not in FORMATS:
             known = ", ".join(f.strip() for f in FORMATS)
