@@ -29,13 +29,13 @@ from starpos.messages.camera import message_to_camera
 from starpos.parameters.table import parameters_of
 from starpos_camera.sources.registry import SOURCES
 from starpos_camera.sources.source import CapturedFrame, CaptureSettings, FrameSource, NothingYet, SourceEnded
-from starpos_camera.sources.timing import OF_SYSTEM_CLOCK, in_one_time
+from starpos_camera.sources.timing import OF_SYSTEM_CLOCK, ShutterTimes, in_one_time
 from starpos_common.diagnostics import ClockReport, Diagnosis, Diagnostics, Level, time_is_simulated
 from starpos_common.messages import camera_to_message, frame_to_message, shutter_fields, unix_to_stamp
 from starpos_common.parameters import declare
-from starpos_common.topics import publisher
+from starpos_common.topics import publisher, subscription
 from starpos_common.worker import Worker
-from starpos_interfaces.msg import Capture
+from starpos_interfaces.msg import Capture, Pulse
 from starpos_interfaces.srv import SetCapture
 
 if TYPE_CHECKING:
@@ -79,6 +79,10 @@ class CameraNode(Node):
                     f"{self._calibration_path}: there is no calibration yet; the camera is ideal, of focal_mm "
                     "and pixel_um, until ~/set_camera_info is called."
                 )
+        self._shutter: ShutterTimes | None = None
+        if self._values["pulses"]:
+            self._shutter = ShutterTimes(self._values)
+            subscription(self, Pulse, "pulses", self._shutter.hear, 100)
         self._source: FrameSource = SOURCES[self._values["source"]](self._values, self._now_s)
 
         self._frames = self._failed = self._skipped = 0
@@ -162,7 +166,7 @@ class CameraNode(Node):
         if time_is_simulated(self):
             exposure, clock = self._source.capture(settings), None
         else:
-            exposure = in_one_time(lambda: self._source.capture(settings), self._clock_report.watch)
+            exposure = self._capture(settings)
             # If the source states an error, the clock is another machine's.
             ours = exposure.stamp_source in OF_SYSTEM_CLOCK and not exposure.frame.clock_stddev_s
             clock = system_clock.read() if ours else None
@@ -183,6 +187,13 @@ class CameraNode(Node):
         image = frame_to_message(frame, header.frame_id) if heard else None
         exposure = replace(exposure, frame=frame)
         return PreparedFrame(exposure, capture, image, time.monotonic() - begin)
+
+    def _capture(self, settings: CaptureSettings) -> CapturedFrame:
+        if self._shutter is None:
+            return in_one_time(lambda: self._source.capture(settings), self._clock_report.watch)
+        since_s = self._now_s()
+        exposure = in_one_time(lambda: self._source.capture(settings), self._clock_report.watch)
+        return self._shutter.date_frame(exposure, since_s, self._now_s())
 
     def _on_wake(self) -> None:
         for result in self._worker.fetch():
@@ -323,6 +334,7 @@ class CameraNode(Node):
             "skipped": self._skipped,
             "cadence (s)": cadence,
             "calibrated": self._calibration is not None,
+            **(self._shutter.values() if self._shutter is not None else {}),
         }
         if last is not None and self._size is not None:
             width, height = self._size

@@ -7,10 +7,12 @@ import signal
 import cv2
 import numpy as np
 import pytest
+from builtin_interfaces.msg import Time
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo, Image
 from sensor_msgs.srv import SetCameraInfo
+from std_msgs.msg import Header
 
 from starpos.detection import detect
 from starpos.frames.exposure import UNKNOWN_LATENCY_S
@@ -23,7 +25,7 @@ from starpos.simulation.scene import expose
 from starpos.sky.catalogue import load_catalogue
 from starpos_camera.camera import CameraNode
 from starpos_common.messages import camera_to_message
-from starpos_interfaces.msg import Capture
+from starpos_interfaces.msg import Capture, Pulse
 from starpos_interfaces.srv import SetCapture
 from starpos_testing.lacking import require
 from starpos_testing.nodes import refusal
@@ -247,9 +249,14 @@ def test_bad_parameters_are_refused(options, sentence):
     assert sentence in refusal(CameraNode, *options)
 
 
-def test_unset_parameters_are_nan_in_ros_too(start, listener):
-    node = start("camera", *SMALL)
-    listener.wait_for_state("camera: Capture", 0, "taking frames")
+def test_unset_parameters_are_nan_in_ros_too_and_pulses_are_heard(start, listener):
+    node = start("camera", *SMALL, "pulses:=true")
+    # the shutter's edges are heard too, and the receiver's seconds are not taken for any
+    edges = listener.node.create_publisher(Pulse, "pulses", 10)
+    listener.wait(edges.get_subscription_count)
+    for which in (Pulse.SHUTTER, Pulse.PPS, Pulse.SHUTTER):
+        edges.publish(Pulse(header=Header(stamp=Time(sec=1_700_000_000)), input=which))
+    listener.values_of("camera: Capture", lambda values: values["edges of the shutter"] == "2")
     assert listener.set("camera", exposure=1.0).successful
     assert listener.set("camera", exposure=math.nan).successful
     assert not listener.set("camera", exposure=math.inf).successful

@@ -6,6 +6,9 @@
 #include <avr/io.h>
 
 // SPI: PB3 MOSI, PB4 MISO, PB5 SCK. PB2 is SS, which must be an output while the MCU is the master.
+// Pulses: PB0 is ICP1, the shutter; PD3 is INT1, a receiver's pulse per second.
+#define PIN_SHUTTER PB0
+#define PIN_PPS PD3
 
 #ifdef BOARD_PAPER
 
@@ -29,6 +32,7 @@
 _Static_assert(SENSOR_SWING_MV * 1000 < ADC_RANGE_UV * DIVIDER_RATIO, "30 deg must lie within the ADC's range");
 
 #define UART_FRAME (_BV(URSEL) | _BV(UCSZ1) | _BV(UCSZ0)) // 8N1
+#define PPS_ENABLE() (MCUCR |= _BV(ISC11) | _BV(ISC10), GICR |= _BV(INT1)) // rising edge
 
 #else // BOARD_NANO
 
@@ -40,10 +44,13 @@ _Static_assert(SENSOR_SWING_MV * 1000 < ADC_RANGE_UV * DIVIDER_RATIO, "30 deg mu
 #define SPI_SELECTS _BV(PIN_SCL3300_CS)
 
 #define UART_FRAME (_BV(UCSZ01) | _BV(UCSZ00))
+#define PPS_ENABLE() (EICRA |= _BV(ISC11) | _BV(ISC10), EIMSK |= _BV(INT1))
 
 // The ATmega8's names of the same registers and interrupts.
 #define MCUCSR MCUSR
 #define TIMSK TIMSK1
+#define TIFR TIFR1
+#define TICIE1 ICIE1
 #define UBRRH UBRR0H
 #define UBRRL UBRR0L
 #define UCSRA UCSR0A

@@ -3,6 +3,7 @@
 
 #include <avr/interrupt.h>
 #include <avr/io.h>
+#include <stdbool.h>
 #include <util/atomic.h>
 
 #include "board.h"
@@ -28,4 +29,12 @@ uint32_t clock_ms(void)
     uint32_t now;
     ATOMIC_BLOCK(ATOMIC_RESTORESTATE) { now = milliseconds; }
     return now;
+}
+
+struct instant clock_instant(uint16_t timer)
+{
+    // The timer may have wrapped while interrupts were off: then the millisecond is not counted yet.
+    bool uncounted = (TIFR & _BV(OCF1A)) && timer < CYCLES_PER_MS / 2;
+    uint16_t us = timer / (F_CPU / 1000000);
+    return (struct instant){milliseconds + uncounted, us < 1000 ? us : 999};
 }

@@ -10,6 +10,7 @@
 #include "clock.h"
 #include "frame.h"
 #include "front.h"
+#include "pulses.h"
 #include "sampler.h"
 #include "spi.h"
 #include "uart.h"
@@ -96,6 +97,7 @@ int main(void)
     uart_init();
     spi_init();
     front_init();
+    pulses_init();
     set_sleep_mode(SLEEP_MODE_IDLE);
     sampler_init(after_watchdog);
     sei();
@@ -105,6 +107,7 @@ int main(void)
         wdt_reset();
         poll_commands();
         sampler_poll();
+        pulses_poll(now);
         sleep_until_interrupt(now);
     }
 }

@@ -146,6 +146,18 @@ class ArrivalFilter:
         """How slow the device's clock is against the host's, 1e-6; 0 until it is known."""
         return self._slope * 1e6
 
+    def arrival_s(self, milliseconds: int, now_s: float) -> float | None:
+        """When a line with this device time would come at the earliest, on the monotonic clock.
+
+        None while the clocks' relation is not known, and for a time impossible for a line that came at now_s.
+        """
+        ahead_s = ((milliseconds - self._last_ms + (1 << 31)) % (1 << 32) - (1 << 31)) * 1e-3
+        if not self._live or not self._points or abs(ahead_s) > LATE_S:
+            return None
+        time = self._time + ahead_s
+        arrival_s = time + self._level + self._slope * time
+        return arrival_s if -LATE_S < arrival_s - now_s < LATE_S else None
+
     def restart(self) -> None:
         """Forget the device's clock: it was reset, or may have been reset unnoticed."""
         self._points.clear()

@@ -18,7 +18,7 @@ from starpos_common.topics import publisher
 from starpos_inclinometer.clock import HostClock
 from starpos_inclinometer.sources.registry import SOURCES
 from starpos_inclinometer.sources.source import Counts, Health, Phase, Surroundings
-from starpos_interfaces.msg import Tilt
+from starpos_interfaces.msg import Pulse, Tilt
 
 # Above this share of corrupted or lost lines since the last report the link gets a warning.
 BAD_SHARE = 0.05
@@ -110,6 +110,7 @@ class InclinometerNode(Node):
             check=lambda values, _: SOURCES[values["source"]].refusal(values),
         )
         self._publisher = publisher(self, Tilt, "tilt", 100)
+        self._pulses = publisher(self, Pulse, "pulses", 100)
         self._phases, self._steps = Changes(self.get_logger()), Changes(self.get_logger())
         self._reporter = Reporter()
         self._wake = self.create_guard_condition(self._on_wake)
@@ -136,6 +137,8 @@ class InclinometerNode(Node):
         for reading in self._source.fetch():
             self._publisher.publish(self._message(reading))
             urgent |= self._reporter.count(reading.flags)
+        for pulse in self._source.fetch_pulses():
+            self._pulses.publish(pulse)
         return urgent
 
     def _on_wake(self) -> None:

@@ -9,7 +9,7 @@ from board import Board
 from diagnostic_msgs.msg import DiagnosticArray
 
 from starpos_inclinometer.sources.source import Phase
-from starpos_interfaces.msg import Tilt
+from starpos_interfaces.msg import Pulse, Tilt
 from starpos_testing.nodes import Listener, Process, take_domain
 
 TILT_DEG = (3.0, -11.0)
@@ -44,6 +44,7 @@ def test_the_link_sets_the_rate_and_sees_a_stuck_converter(board, read):
 def test_the_node_publishes_the_tilt_of_the_device(board):
     listener = Listener()
     tilts = listener.hear(Tilt, "tilt", 100)
+    pulses = listener.hear(Pulse, "pulses", 100)
     reports = listener.hear(DiagnosticArray, "/diagnostics")
 
     def report():
@@ -64,6 +65,15 @@ def test_the_node_publishes_the_tilt_of_the_device(board):
         listener.wait(lambda: reports and report().level == b"\x00")
         values = {v.key: v.value for v in report().values}
         assert (values["unit"], values["firmware"], values["checksum errors"]) == ("0000002A", "2.0", "0")
+        board.tell("shutter 5 40 1")
+        listener.wait(lambda: len(pulses) == 2)
+        assert [(p.input, p.rising, p.disciplined) for p in pulses] == [
+            (Pulse.SHUTTER, False, False),
+            (Pulse.SHUTTER, True, False),
+        ]
+        assert pulses[1].device_time - pulses[0].device_time == pytest.approx(0.0404, abs=1e-3)
+        stamps = [p.header.stamp.sec + p.header.stamp.nanosec * 1e-9 for p in pulses]
+        assert stamps[1] - stamps[0] == pytest.approx(0.0404, abs=0.002)
         board.tell("reference 0")
         listener.wait(lambda: tilts[-1].flags & Tilt.STUCK and report().level == b"\x02")
         board.tell("reference 1")

@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The whole instrument with emulated devices: firmware, INDI camera, detector, solver.
+"""The whole instrument with emulated devices: firmware, hot shoe, GNSS pulses, INDI camera, detector, solver.
 
 The inclinometer's firmware, as it is flashed, runs on an emulated ATmega8 with its converter and sensor
 (starpos_inclinometer/test/sim). The camera is the CCD simulator of a real indiserver; indi_sky.py gives it the sky of
-each exposure, and a shutter that opens 0.3 s after the command; the camera node has this lag as a parameter. The four
-nodes are the installed ones. The place is drawn at random, and the nodes do not know it. Exit status 0 if the truth lies
-within 4 sigma and all ended cleanly; 2 where something is not installed.
+each exposure, and a shutter that opens 0.3 s after the command: its contact and a receiver's pulse per second go to the
+board. The four nodes are the installed ones. The place is drawn at random, and the nodes know neither it nor the lag:
+the frames with a time of their shutter (the sixth and later ones) make the place.  The same frames are solved once more
+with the true times.  Exit status 0 if the truth lies within 4 sigma, both places are within 10 m, the camera node has
+measured the lag within 10 ms, and all ended cleanly; 2 where something is not installed.
 """
 
 import json
@@ -26,11 +28,13 @@ from instrument_run import (
     Place,
     Processes,
     Watcher,
+    error_m,
     introduce,
     known_of,
     parse,
     parser_of,
     say_errors,
+    stamp_of,
     summarise,
     trouble_of,
 )
@@ -41,11 +45,13 @@ FRAMES, CADENCE_S, EXPOSURE_S = 20, 1.5, 0.5
 # Frames of a quarter of the pixels take a quarter of the time.
 BINNING = 2
 START_S = 5.0
-EXACT_ARCSEC = 0.1
+EXACT_ARCSEC, EXACT_S = 0.1, 0.001
+# Capture.HARDWARE
+HARDWARE = 4
 # Of the emulated camera, from the command to the open shutter.
 LAG_S, LAG_STDDEV_S = 0.3, 0.004
-# Its stated error: the sky of a busy machine comes late too.
-LAG_STATED_STDDEV_S = 0.02
+# How far the measured lag, and a place by pulses from that by known times, may be off.
+LAG_OFF_S, PLACE_OFF_M = 0.01, 10.0
 ROOT = Path(__file__).resolve().parents[2]
 NEEDED = {"gcc-avr", "avr-libc", "libsimavr-dev", "libelf-dev", "indi-bin"}
 
@@ -73,7 +79,7 @@ def start_board(devices: Processes, tilt_deg: np.ndarray) -> tuple[subprocess.Po
 def start_devices(devices: Processes, place: Place, seed: int) -> dict[str, dict]:
     """Start inclinometer, camera and sky; return for each node the parameters by which it finds its device."""
     folder = devices.folder
-    _, link = start_board(devices, np.degrees(place.scene().tilt))
+    board, link = start_board(devices, np.degrees(place.scene().tilt))
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = str(probe.getsockname()[1])
@@ -90,17 +96,19 @@ def start_devices(devices: Processes, place: Place, seed: int) -> dict[str, dict
         str(seed),
     ]
     sky += [json.dumps(asdict(place)), str(LAG_S), str(LAG_STDDEV_S)]
-    sky = devices.start("sky", sky, stderr=subprocess.PIPE, text=True)
+    sky = devices.start("sky", sky, stdout=board.stdin, stderr=subprocess.PIPE, text=True)
     if (said := sky.stderr.readline()) != "ready\n":
         raise RuntimeError(f"the sky does not come up: {said}{sky.stderr.read()}")
+    board.stdin.write(f"pps {1e3 * (1 - time.time() % 1):.3f} 1000\n".encode())
+    board.stdin.flush()
+    # The lag is not stated, only that there may be one as long.
+    lag = {"driver_lag_stddev": LAG_S, "pulses": True, "pulses.curtain_stddev": EXACT_S}
     camera = {
         "source": "indi",
         "indi.port": port,
         "indi.device": DEVICE,
         "pixel_um": PIXEL_UM * BINNING,
-        "driver_lag": LAG_S,
-        "driver_lag_stddev": LAG_STATED_STDDEV_S,
-    }
+    } | lag
     return {"inclinometer": {"port": link}, "camera": camera}
 
 
@@ -131,7 +139,44 @@ def start_nodes(nodes: Processes, place: Place, found: dict):
     nodes.node("starpos_camera", "camera", found["camera"] | {"cadence": CADENCE_S, "exposure": EXPOSURE_S})
 
 
-def times_off(solutions: list, begun_s: list[float]) -> np.ndarray:
+class Recorder:
+    """Listens, on the watcher's node, to the solver's inputs and to the lag that the camera reports."""
+
+    def __init__(self, watcher: Watcher):
+        from diagnostic_msgs.msg import DiagnosticArray
+        from sensor_msgs.msg import CameraInfo
+
+        from starpos_interfaces.msg import StarArray, Tilt
+
+        self.stars, self.tilts, self.infos, self.lag = {}, [], [], ""
+        listen = watcher.node.create_subscription
+        listen(StarArray, "stars", lambda m: self.stars.setdefault(stamp_of(m), m), 10)
+        listen(Tilt, "tilt", self.tilts.append, 100)
+        listen(CameraInfo, "camera/camera_info", self.infos.append, 10)
+        listen(DiagnosticArray, "/diagnostics", self._on_diagnostics, 10)
+
+    def _on_diagnostics(self, message):
+        values = {v.key: v.value for s in message.status if s.name == "camera: Capture" for v in s.values}
+        self.lag = values.get("measured lag", self.lag)
+
+    def solved(self, stamp: tuple[int, int], mid_s: float, place: Place):
+        """The fix of a frame whose middle of the exposure is known."""
+        from starpos.messages.camera import message_to_camera
+        from starpos.messages.stars import message_to_stars
+        from starpos.session.settings import Settings
+        from starpos.session.tilts import TiltBuffer
+        from starpos.sky.catalogue import load_catalogue
+
+        settings = Settings.of(None, [f"{name}:={value}" for name, value in known_by(place).items()])
+        solver = settings.solver(message_to_camera(self.infos[-1]), None, load_catalogue())
+        tilts = TiltBuffer()
+        for tilt in self.tilts:
+            tilts.keep(tilt, settings.tilt_stddev_rad)
+        stars = replace(message_to_stars(self.stars[stamp]), mid_unix_s=mid_s)
+        return solver.solve(stars, tilts.over(EXPOSURE_S)).fix
+
+
+def times_off(watcher: Watcher, solutions: list, begun_s: list[float]) -> np.ndarray:
     """How late the stamp of each solution's frame is, in s, after the true middle of its exposure."""
     mids = np.array([mid_of(s) for s in solutions])
     away = mids[:, None] - (np.array(begun_s) + EXPOSURE_S / 2)
@@ -140,6 +185,19 @@ def times_off(solutions: list, begun_s: list[float]) -> np.ndarray:
 
 def mid_of(message) -> float:
     return message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
+
+
+def by_known_times(recorder: Recorder, solutions: list, off_s: np.ndarray, place: Place) -> np.ndarray:
+    """How far (m east, north) the mean place of frames is from theirs with known times.
+
+    A busy machine may lose the stars of a frame on their way to the recorder: such a frame is in neither mean.
+    """
+    heard = [(s, late_s) for s, late_s in zip(solutions, off_s, strict=True) if stamp_of(s) in recorder.stars]
+    errors = []
+    for solution, late_s in heard:
+        fix = recorder.solved(stamp_of(solution), mid_of(solution) - late_s, place)
+        errors.append(error_m(np.degrees(fix.latitude), np.degrees(fix.longitude), place))
+    return np.mean([error_m(s.latitude, s.longitude, place) for s, _ in heard], 0) - np.mean(errors, 0)
 
 
 def main() -> int:
@@ -164,6 +222,7 @@ def run(seed: int, frames: int, out: Path) -> int:
     with tempfile.TemporaryDirectory() as scratch:
         devices, nodes = Processes(Path(scratch)), Processes(Path(scratch))
         watcher = Watcher(place)
+        recorder = Recorder(watcher)
         begun, memory = "", {}
         try:
             found = start_devices(devices, place, seed)
@@ -183,31 +242,42 @@ def run(seed: int, frames: int, out: Path) -> int:
         for log in Path(scratch).glob("*.log"):
             shutil.copy(log, out)
     watcher.close()
-    return conclude(watcher, trouble_of(watcher, codes, trouble), begun, memory, out)
+    return conclude(watcher, recorder, trouble_of(watcher, codes, trouble), begun, memory, out)
 
 
-def conclude(watcher: Watcher, trouble: str | None, begun: str, memory: dict, out: Path) -> int:
-    good = watcher.good()
-    if not trouble and not good:
-        trouble = "no frame has a place"
+def conclude(
+    watcher: Watcher, recorder: Recorder, trouble: str | None, begun: str, memory: dict, out: Path
+) -> int:
+    # A busy machine may lose a Capture.
+    heard = [s for s in watcher.good() if stamp_of(s) in watcher.captures]
+    timed = [s for s in heard if watcher.captures[stamp_of(s)].stamp_source == HARDWARE]
+    if not trouble and not timed:
+        trouble = "no frame has a time of its shutter"
     if trouble:
         print(f"\nemulated_instrument: {trouble}; the logs are in {out}", file=sys.stderr)
         return 1
-    summary, *_ = summarise(good, watcher.place)
+    summary, *_ = summarise(timed, watcher.place)
     inside = say_errors(watcher, summary)
-    off_s = times_off(good, [float(s) for s in begun.split()])
+    off_s = times_off(watcher, timed, [float(s) for s in begun.split()])
+    moved = by_known_times(recorder, timed, off_s, watcher.place)
+    lag_s = float(recorder.lag.split()[0])
     summary |= {
         "solved": len(watcher.solutions),
         "times_off_ms": (1e3 * off_s).tolist(),
+        "east_of_known_times_m": moved[0],
+        "north_of_known_times_m": moved[1],
+        "lag_s": lag_s,
         "peak_memory_mb": memory,
     }
     (out / "summary.json").write_text(json.dumps(summary, indent=1) + "\n")
     print(
-        f"the stamps of {len(good)} frames are off by {1e3 * np.median(np.abs(off_s)):.2f} ms (median; at most "
-        f"{1e3 * np.abs(off_s).max():.2f})"
+        f"{len(timed)} frames have the time of their shutter, off by {1e3 * np.median(np.abs(off_s)):.2f} ms (median; at "
+        f"most {1e3 * np.abs(off_s).max():.2f}): {np.hypot(*moved):.2f} m from where known times put them. "
+        f"Lag: {LAG_S} s, measured {recorder.lag}"
     )
     print("peak memory " + ", ".join(f"{name} {mb} MB" for name, mb in memory.items()))
-    return 0 if inside else 1
+    near = np.hypot(*moved) < PLACE_OFF_M and abs(lag_s - LAG_S) < LAG_OFF_S
+    return 0 if inside and near else 1
 
 
 if __name__ == "__main__":

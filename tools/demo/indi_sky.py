@@ -6,7 +6,8 @@
 The simulator reads its frames from a folder when an exposure is commanded.  The folder has one file, and this process
 holds a lease on it (fcntl(2), F_SETLEASE). When the simulator opens the file, the kernel notifies this process, and the
 simulator waits until the lease is given back.  As in a single-lens reflex the shutter opens a lag after the command: the
-sky of that moment is drawn.  The lease is given back when the exposure is over.  Only this process knows the place.
+contact of its hot shoe closes (`shutter`, with bounces, for the emulated board, on standard output), and the sky of that
+moment is drawn.  The lease is given back when the exposure is over.  Only this process knows the place and the lag.
 Prints `ready` on standard error, then the Unix time of each exposure's begin.
 """
 
@@ -29,6 +30,7 @@ PIXEL_UM = 6.4
 PATIENCE_S = 5.0
 # The simulator may read the file once more for the same exposure.
 AGAIN_S = 0.3
+BOUNCES = 2
 ENDS = {signal.SIGINT, signal.SIGTERM}
 
 
@@ -91,6 +93,11 @@ def set_up(port: str, folder: Path):
     subprocess.run(["indi_eval", "-p", port, "-t", "10", "-w", enabled], check=True)
 
 
+def shutter(begin_s: float, exposure_s: float):
+    """Have the contact close and open again: it is closed while the shutter is open."""
+    print(f"shutter {1e3 * (begin_s - time.time()):.3f} {1e3 * exposure_s:.3f} {BOUNCES}", flush=True)
+
+
 def main() -> int:
     port, folder, exposure_s, seed, place, lag_s, lag_stddev_s = sys.argv[1:]
     folder, exposure_s, rng = Path(folder), float(exposure_s), np.random.default_rng(int(seed))
@@ -113,6 +120,7 @@ def main() -> int:
         now = time.time()
         if now > ended + AGAIN_S:
             begun = now + rng.normal(float(lag_s), float(lag_stddev_s))
+            shutter(begun, exposure_s)
             stars = expose(scene, catalogue, begun, exposure_s, rng)
             picture.draw(render(scene, stars, begun, exposure_s, rng).pixels)
             print(f"{begun:.6f}", file=sys.stderr, flush=True)

@@ -24,7 +24,7 @@ from typing import Any
 BAUD, MAX_RATE_HZ = 38400, 50
 PROTOCOL_VERSION, FIRMWARE, UNIT = 2, 0x0200, 0x53494D00
 # Bit of the K field of a `$P` line, the status of the first sample, the reasons of a refusal.
-FIRST = 0x08
+RISING, FIRST = 0x80, 0x08
 CHECKSUM, UNKNOWN, OUT_OF_RANGE = 1, 2, 3
 COMMAND = re.compile(rb"\$([^$*\r\n]{1,40})\*([0-9A-F]{4})\r\n")
 # The AD7730's codes: offset binary, 80 mV at a reference of 5 V; the divider of 30 and 1 kohm before it.
@@ -65,6 +65,14 @@ def identity_line(
     """Make a `$I` line."""
     numbers = (version, firmware, unit, rate_hz, delay_ms, kind)
     return frame(b"I,%02X,%04X,%08X,%02X,%04X,%02X" % numbers)
+
+
+def pulse_line(
+    *, channel: int, rising: bool, number: int, bounces: int, milliseconds: int, microseconds: int
+) -> bytes:
+    """Make a `$P` line; channel: 0 shutter, 1 second."""
+    kind = channel | (RISING if rising else 0)
+    return frame(b"P,%02X,%02X,%02X,%08X,%04X" % (kind, number, bounces, milliseconds, microseconds))
 
 
 def refusal_line(reason: int) -> bytes:

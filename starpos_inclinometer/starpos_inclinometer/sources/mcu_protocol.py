@@ -20,6 +20,8 @@ MIN_RATE_HZ, MAX_RATE_HZ = 1, 50
 MAX_LINE = 48
 # Bytes of a `$T` line.
 SAMPLE_LINE = 43
+# Bit of the K field of a `$P` line.
+RISING = 0x80
 # A line is sent within the period of its sample and this time.
 MAX_SENDING_MS = 50
 
@@ -31,6 +33,7 @@ _SAMPLE = re.compile(
 _IDENTITY = re.compile(
     rb"I,([0-9A-F]{2}),([0-9A-F]{4}),([0-9A-F]{8}),([0-9A-F]{2}),([0-9A-F]{4})(?:,([0-9A-F]{2}))?"
 )
+_PULSE = re.compile(rb"P,([0-9A-F]{2}),([0-9A-F]{2}),([0-9A-F]{2}),([0-9A-F]{8}),([0-9A-F]{4})")
 _REFUSAL = re.compile(rb"N,([0-9A-F]{2})")
 
 
@@ -61,6 +64,13 @@ class SensorKind(IntEnum):
     SCA100T = 0
     # SCL3300-D01.
     SCL3300 = 1
+
+
+class Input(IntEnum):
+    """What a pulse came from."""
+
+    SHUTTER = 0
+    PPS = 1
 
 
 class Reason(IntEnum):
@@ -110,13 +120,29 @@ class Identity:
     kind: int = SensorKind.SCA100T
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Pulse:
+    """One `$P` line: an edge of an input."""
+
+    # One of Input.
+    input: int
+    rising: bool
+    # 8 bits; a jump shows how many were lost.
+    number: int
+    # Edges of this input since the one before, within 2 ms of one another: they have no line.
+    bounces: int
+    # The MCU's clock at the edge, 32 bits and 0 to 999.
+    milliseconds: int
+    microseconds: int
+
+
 @dataclass(frozen=True, slots=True)
 class Refusal:
     # One of Reason.
     reason: int
 
 
-Message = Sample | Identity | Refusal
+Message = Sample | Identity | Refusal | Pulse
 
 
 def checksum(body: bytes) -> int:
@@ -187,6 +213,17 @@ def _parse(body: bytes) -> Message | None:
             version=version, firmware=firmware, unit=unit, rate_hz=rate_hz, delay_ms=delay_ms, kind=kind
         )
         return identity if _possible(identity) else None
+    if match := _PULSE.fullmatch(body):
+        kind, number, bounces, milliseconds, microseconds = (int(group, 16) for group in match.groups())
+        pulse = Pulse(
+            input=kind & ~RISING,
+            rising=bool(kind & RISING),
+            number=number,
+            bounces=bounces,
+            milliseconds=milliseconds,
+            microseconds=microseconds,
+        )
+        return pulse if pulse.input in list(Input) and microseconds < 1000 else None
     if match := _REFUSAL.fullmatch(body):
         return Refusal(int(match[1], 16))
     return None

@@ -12,6 +12,7 @@ from typing import Any, Protocol
 import serial
 
 from starpos_inclinometer.clock import HostClock, Moment
+from starpos_inclinometer.sources import mcu_protocol
 from starpos_inclinometer.sources.source import Arrival, Counts, Link, Phase
 
 # How soon a stop, a command or silence is noticed.
@@ -157,7 +158,8 @@ class SerialLink(Link):
         if self._decoder.answered:
             self._next_command = 0.0
         if arrivals:
-            self._admit(arrivals, [moment.monotonic_s] * len(arrivals), f"receiving from {self._port}")
+            samples = [a for a in arrivals if not isinstance(a.sample, mcu_protocol.Pulse)]
+            self._admit(arrivals, [moment.monotonic_s] * len(samples), f"receiving from {self._port}")
         return lines, bool(arrivals)
 
     def _moved(self, device: serial.Serial) -> bool:

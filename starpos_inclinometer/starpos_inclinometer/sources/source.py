@@ -15,6 +15,7 @@ from rclpy.node import Node
 
 from starpos.messages.tilt import Reading
 from starpos_inclinometer.clock import HostClock, Moment, Step
+from starpos_interfaces.msg import Pulse
 
 # A device that came back is read again within a second.
 RETRY_S = 0.4
@@ -209,6 +210,10 @@ class TiltSource:
     def fetch(self) -> list[Reading]:
         """Return the readings since the last call, in order."""
         raise NotImplementedError
+
+    def fetch_pulses(self) -> list[Pulse]:
+        """Return the edges that the device has timed since the last call, with their times; most devices time none."""
+        return []
 
     def health(self) -> Health:
         """State of the source, for a person to read."""

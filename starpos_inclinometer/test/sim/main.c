@@ -27,6 +27,8 @@ static const char USAGE[] =
     "  freeze 0|1     1: the converter does not finish what it does\n"
     "  reference 0|1  0: the converter's reference is open\n"
     "  sensor 0|1     0: the sensor does not answer on the SPI bus\n"
+    "  shutter AFTER_MS MS [BOUNCES]  its contact closes, and opens again\n"
+    "  pps AFTER_MS EVERY_MS          a receiver's pulses; 0 ends them\n"
     "  face 0|1       1: the board lies on its face\n"
     "  miso 0|1       0: the SCL3300's answers do not arrive\n"
     "  noisy 0|1      1: each third answer of the SCL3300 has a wrong bit\n"
@@ -146,6 +148,10 @@ static bool obey(const char *command)
         mcu.adc.reference_missing = !v[0];
     else if (!strcmp(name, "sensor") && n == 1)
         mcu.sensor.absent = !v[0];
+    else if (!strcmp(name, "shutter") && (n == 2 || n == 3))
+        mcu_shutter(v[0] * 1e-3, v[1] * 1e-3, v[2]);
+    else if (!strcmp(name, "pps") && n == 2)
+        mcu_pps(v[0] * 1e-3, v[1] * 1e-3);
     else if (!strcmp(name, "face") && n == 1)
         mcu.scl3300.upside_down = v[0];
     else if (!strcmp(name, "miso") && n == 1)

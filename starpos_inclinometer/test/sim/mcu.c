@@ -27,13 +27,17 @@ static const struct chip CHIPS[] = {
 #define PIN_RDY 2
 #define MODE_3 0x0C // CPOL, CPHA
 #define PIN_SCL3300_CS 2
+#define PIN_SHUTTER 0
+#define PIN_PPS 3
+#define BOUNCE_S 0.2e-3
+#define PPS_S 0.1 // how long a receiver's pulse lasts
 
 struct mcu mcu;
 
 static avr_t *avr;
 static const struct chip *chip;
 static enum board board;
-static avr_irq_t *rdy;
+static avr_irq_t *rdy, *shutter, *pps;
 static bool ad7730_selected;
 static char input[4096];
 static size_t input_length;
@@ -145,6 +149,58 @@ static void on_scl3300_cs(struct avr_irq_t *irq, uint32_t level, void *unused)
     scl3300_select(&mcu.scl3300, !(level & 1), &mcu.sensor, mcu_now());
 }
 
+// Pulses: the shutter's contact, low while it is closed, and the receiver's second.
+
+static struct {
+    unsigned edges; // of the contact, still to come
+    double seconds, every_s;
+    bool high;
+} pulses;
+
+// simavr would let the pull-up win at each write to the port, if it were not told of the contact.
+static void set_shutter(bool high)
+{
+    avr_ioport_external_t contact = {.name = 'B', .mask = 1 << PIN_SHUTTER, .value = high << PIN_SHUTTER};
+    avr_ioctl(avr, AVR_IOCTL_IOPORT_SET_EXTERNAL('B'), &contact);
+    avr_raise_irq(shutter, high);
+}
+
+static avr_cycle_count_t on_shutter(avr_t *which, avr_cycle_count_t when, void *unused)
+{
+    (void)which, (void)unused;
+    // The last edge opens it, the one before that was the end of the bounces, with the contact closed.
+    pulses.edges--;
+    set_shutter(!(pulses.edges & 1));
+    if (!pulses.edges)
+        return 0;
+    return when + (avr_cycle_count_t)((pulses.edges == 1 ? pulses.seconds : BOUNCE_S) * chip->hz);
+}
+
+void mcu_shutter(double after_s, double seconds, unsigned bounces)
+{
+    pulses.edges = 2 * bounces + 2;
+    pulses.seconds = seconds;
+    avr_cycle_timer_register(avr, after_s * chip->hz + 1, on_shutter, NULL);
+}
+
+static avr_cycle_count_t on_pps(avr_t *which, avr_cycle_count_t when, void *unused)
+{
+    (void)which, (void)unused;
+    pulses.high = !pulses.high;
+    avr_raise_irq(pps, pulses.high);
+    return when + (avr_cycle_count_t)((pulses.high ? PPS_S : pulses.every_s - PPS_S) * chip->hz);
+}
+
+void mcu_pps(double after_s, double every_s)
+{
+    avr_cycle_timer_cancel(avr, on_pps, NULL);
+    pulses.high = false;
+    avr_raise_irq(pps, 0);
+    pulses.every_s = every_s;
+    if (every_s)
+        avr_cycle_timer_register(avr, after_s * chip->hz + 1, on_pps, NULL);
+}
+
 // UART.
 
 static uint32_t byte_cycles(void)
@@ -194,6 +250,8 @@ static void on_reset(struct avr_io_t *io)
     mcu.reset_at = mcu_now();
     ad7730_selected = false;
     mcu.scl3300.selected = false;
+    pulses.edges = 0;
+    set_shutter(true);
     input_length = 0;
     input_running = false;
     adc_interrupt(&mcu.adc);
@@ -251,6 +309,8 @@ bool mcu_init(const char *elf, enum board which, uint32_t unit)
         avr_irq_register_notify(portb + PIN_AD7730_CS, on_ad7730_cs, NULL);
         avr_irq_register_notify(portb + PIN_SCA100T_CS, on_sca100t_cs, NULL);
     }
+    shutter = avr_io_getirq(avr, AVR_IOCTL_IOPORT_GETIRQ('B'), PIN_SHUTTER);
+    pps = avr_io_getirq(avr, AVR_IOCTL_IOPORT_GETIRQ('D'), PIN_PPS);
     avr_irq_register_notify(avr_io_getirq(avr, AVR_IOCTL_UART_GETIRQ('0'), UART_IRQ_OUTPUT), on_sent, NULL);
     rdy = avr_io_getirq(avr, AVR_IOCTL_IOPORT_GETIRQ('D'), PIN_RDY);
     avr_register_io(avr, &module);

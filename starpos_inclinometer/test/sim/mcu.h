@@ -29,5 +29,7 @@ bool mcu_init(const char *elf, enum board board, uint32_t unit); // false: no su
 double mcu_now(void);                          // s since power-on, of the MCU's crystal
 bool mcu_run(double until);                    // false: it crashed
 void mcu_reset(bool power);                    // by its pin, or all of the board by its power
+void mcu_shutter(double after_s, double seconds, unsigned bounces); // closes after a time, bounces, opens
+void mcu_pps(double after_s, double every_s);                       // pulses of a receiver from then on; 0: no more
 void mcu_hang(void);                           // an endless loop with interrupts off, as a fault would leave it
 size_t mcu_receive(const char *bytes, size_t count); // at the UART; how many it takes now

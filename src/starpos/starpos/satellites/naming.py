@@ -94,7 +94,7 @@ class OrbitsAbove:
         beyond = np.sqrt(np.maximum(np.einsum("ki,ki->k", r, r) - EQUATOR_RADIUS_M**2, 0.0))
         return np.flatnonzero(r @ direction > beyond - MOST_WAY_M)
 
-    def at(self, utc_unix_s: float, which: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def at(self, utc_unix_s: float, which: np.ndarray | slice = slice(None)) -> tuple[np.ndarray, np.ndarray]:
         """Positions and velocities (S, 3), ITRS, m and m/s; NaN where there is no satellite."""
         first = self._computed_from(utc_unix_s)
         (r0, v0), (r1, v1) = ((r[which], v[which]) for r, v in (self._nodes[first], self._nodes[first + 1]))
