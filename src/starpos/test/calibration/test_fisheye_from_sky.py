@@ -127,7 +127,7 @@ def test_a_frame_of_the_middle_of_the_sky_does_not_show_its_hour(catalogue, rng)
     answer = answer_frame(solver, Question(item=middle, stars=middle, places=SITE)).solution
     assert answer.at_place is not None and "its hour is right" in answer.remark
     assert answer.with_remark("first").remark == f"first; {answer.remark}"
-    # of a file whose clock's error nobody states the hour may be wrong
+    # with no error of the clock stated the hour may be wrong
     from_files = replace(solver, hour_by_lens=hour_by_lens)
     wide = answer_frame(from_files, Question(item=middle, stars=middle, places=SITE)).solution.at_place
     assert math.sqrt(wide.plumb.angles_covariance[0, 0]) > math.radians(5)
