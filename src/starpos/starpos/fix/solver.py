@@ -46,7 +46,6 @@ from starpos.identification.pose import MIN_SIGMA_PX, TEST_STARS
 from starpos.identification.prior import AimPrior, Hint
 from starpos.identification.search import (
     Look,
-    Priors,
     identify_near,
     second_look,
     through,
@@ -54,7 +53,7 @@ from starpos.identification.search import (
 from starpos.identification.triangles import TriangleCatalogue, cached_triangles
 from starpos.instrument.camera import EQUIDISTANT, Camera
 from starpos.instrument.inclinometer import EITHER_WAY, Tilt
-from starpos.instrument.instrument import OWN_LEVEL, ByGravity, Instrument
+from starpos.instrument.instrument import OWN_LEVEL, UNKNOWN_CLOCK_S, ByGravity, Instrument
 from starpos.instrument.tilt_log import NO_TILTS, Tilts
 from starpos.progress import Progress, quiet
 from starpos.sky import deeper
@@ -111,6 +110,8 @@ def _aims(stars: Stars, field: FrameStars | fisheye.WideField) -> tuple[AimPrior
 # how stars are identified: the field, the sky, the camera
 _Search = Callable[[FrameStars | fisheye.WideField, Sky, Camera], Identification | None]
 
+HourByLens = Callable[[Stars, Identification, Camera, Catalogue, Atmosphere, Place], bool]
+
 ENOUGH_SOUND = 8
 SMALLEST_FIELD_DEG, LARGEST_FIELD_DEG = 0.3, 130.0
 
@@ -128,6 +129,8 @@ class Solver:
 
     catalogue: or the deeper one in its stead, for a field that needs it.
     ephemeris: of the Sun, the Moon and planets.
+    hour_by_lens: whether the stars of a fisheye's frame at a place show its hour, with a lens fitted to them alone; None
+        for stamps that are surely UTC, as of a node's camera.
 
     Examples
     --------
@@ -144,6 +147,7 @@ class Solver:
     min_stars: int = 5
     progress: Progress = quiet
     ephemeris: SolarSystem = ERFA
+    hour_by_lens: "HourByLens | None" = None
 
     def prepare(self, width: int, height: int, origin_px: tuple[float, float] | None = None) -> str:
         """Load the tables for frames of this size in px, or build them; raises StarposError.
@@ -154,17 +158,15 @@ class Solver:
         Sky(catalogue, triangles).load()
         return deeper.too_thin(catalogue, camera)
 
-    def identify(self, stars: Stars, predicted: Priors = (), part: float = 1.0) -> Solution:
-        """Names of the stars and pointing of the camera, near a prediction or anywhere.
+    def identify(self, stars: Stars, part: float = 1.0) -> Solution:
+        """Names of the stars and pointing of the camera.
 
         Stars without a time have J2000 places.
         part: of the frame in which its stars lie, as a share of its size: triangles that are looked up are no larger.
         """
-        return self._identified(
-            stars, part, lambda field, sky, _: identify(field, sky, (*predicted, *_aims(stars, field)))
-        )
+        return self._identified(stars, part, lambda field, sky, _: identify(field, sky, _aims(stars, field)))
 
-    def look_again(self, stars: Stars, look: Look, predicted: Priors = (), part: float = 1.0) -> Solution:
+    def look_again(self, stars: Stars, look: Look, part: float = 1.0) -> Solution:
         """Identify stars that alone are too few, by what their frame shows where others should be.
 
         Only for a frame on which `identify` has failed; a fisheye's stays unidentified.
@@ -174,7 +176,7 @@ class Solver:
             field: FrameStars | fisheye.WideField, sky: Sky, camera: Camera
         ) -> Identification | None:
             if isinstance(field, FrameStars):
-                return second_look(field, sky, (*predicted, *_aims(stars, field)), camera, look)
+                return second_look(field, sky, _aims(stars, field), camera, look)
             return None
 
         return self._identified(stars, part, by_looking)
@@ -205,19 +207,18 @@ class Solver:
         stars: Stars,
         tilts: Tilts = NO_TILTS,
         hint: Hint | None = None,
-        predicted: Priors = (),
         known: Identification | Hint | None = None,
     ) -> Solution:
         """The fix of one frame; a fault of the frame, the tilt or the time is a status and never an exception.
 
         tilts: not used for a camera that is its own level.
-        predicted, hint: where to look, the latter of an earlier solution; a wrong one costs 0.5 ms and does no harm.
+        hint: where to look, of an earlier solution; a wrong one costs 0.5 ms and does no harm.
         known: an identification of these stars, or a hint outside of which they are not to be searched.
         """
         if (rows := self._inside(stars)) is not None:
             if isinstance(known, Identification):
                 known = known.but(star=np.searchsorted(rows, known.star))
-            return self.solve(stars.select(rows), tilts, hint, predicted, known).among(stars, rows)
+            return self.solve(stars.select(rows), tilts, hint, known).among(stars, rows)
         try:
             state, tilt = self.levelled(stars, tilts)
             camera, catalogue, triangles = self.view(stars.width, stars.height, stars.origin_px)
@@ -227,7 +228,7 @@ class Solver:
             sky = Sky(catalogue, triangles, state.year, tuple(state.velocity))
             field = field_of(directions, mean_sigma(stars.covariance), camera, stars.window)
             if known is None:
-                priors = (*predicted, *(hint.priors(state, g[2]) if hint else ()), *_aims(stars, field))
+                priors = (*(hint.priors(state, g[2]) if hint else ()), *_aims(stars, field))
                 found = identify(field, sky, priors)
             elif isinstance(known, Hint):
                 found = identify_near(field, sky, known.priors(state, g[2]))
@@ -372,7 +373,8 @@ class Solver:
         check_risen(stars, found, camera, sky, up)
         use, matched = self._matched(stars, found, camera, up, state, catalogue)
         about = self.circumstances(stars, camera.scaled(found.focal_scale), state)
-        if fisheye.is_wide(camera) and not any(camera.distortion):
+        uncalibrated = fisheye.is_wide(camera) and not any(camera.distortion)
+        if uncalibrated:
             off = matched.xy - [camera.cx, camera.cy]
             # how far they lie on one side of the axis, from 0 to 1
             aside = float(np.hypot(*off.mean(0)) / max(np.hypot(*off.T).mean(), 1e-9))
@@ -380,6 +382,11 @@ class Solver:
             about = replace(about, axis_stddev=math.hypot(about.axis_stddev, lens))
         attitude = attitude_at_place(matched, place, about)
         shown = attitude.hour_shown or self._hour_at_horizon(stars, found, camera, state, up)
+        if not shown and self.hour_by_lens is not None:
+            air = self.atmosphere
+            shown = uncalibrated and self.hour_by_lens(stars, found, about.camera, catalogue, air, place)
+            if not shown and about.clock_stddev_s == UNKNOWN_CLOCK_S:
+                attitude = attitude_at_place(matched, place, replace(about, clock_stddev_s=HOUR_S))
         return replace(attitude, used=np.flatnonzero(use)[attitude.used], hour_shown=shown)
 
     def _hour_at_horizon(
@@ -487,8 +494,9 @@ def check_explained(answer: Solution) -> None:
 
 
 UNSHOWN_HOUR = (
-    "nothing in the frame shows that its hour is right, and a wrong one turns the heading by degrees: state UTC, and "
-    "calibrate the camera with frames whose stars reach down to 10 deg of altitude"
+    "nothing in the frame shows that its hour is right, and a wrong one turns the heading by degrees: its error "
+    "holds for UTC within the clock's stated error, and where none is stated (--clock-stddev) it contains an "
+    "hour. Stars down to 10 deg of altitude show the hour"
 )
 
 # a correct place lies further from the stars' own once in 1e6 frames
