@@ -12,7 +12,7 @@ import starpos
 from starpos.cli import COMMANDS, parser_for
 
 ROOT = Path(__file__).resolve().parents[1]
-# lines of a docstring that tell of something by its name, in columns or after a colon
+# lines of a docstring that describe something by its name, in columns or after a colon
 COLUMNS, NAMED = re.compile(r"[\w, ]*\w(?: \([^)]*\))? {2,}\S"), re.compile(r"[\w, ]*\w(?: \([^)]*\))?: \S")
 # an entry of a section of numpydoc
 ENTRY = re.compile(r"\*{0,2}\w+(?:, \w+)* : \S")
