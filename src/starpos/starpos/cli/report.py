@@ -7,6 +7,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from starpos.cli import console, inputs, options
+from starpos.cli.solve import read_receiver
 from starpos.errors import FrameError, InstrumentError
 from starpos.frames.reading import are_photographs
 from starpos.night.opening import exposures, frames_in
@@ -41,7 +42,10 @@ def run(args: argparse.Namespace) -> int:
     out = Path(args.out)
     folder, index = (out.parent, out.name) if out.suffix.lower() in PAGES else (out, PAGE)
     check_folder(folder, index)
-    how = How(options.turn_of(args) if args.self_calibrate else None)
+    how = How(
+        options.turn_of(args) if args.self_calibrate else None,
+        read_receiver(args.gnss, None),
+    )
     night = solved_night(_exposures(paths, args), how, console.ProgressBar())
     for sentence in filter(None, (*night.remarks, night.why_not)):
         console.complain(f"{night.name}: {sentence}")
@@ -75,6 +79,8 @@ def _exposures(paths: list[Path], args: argparse.Namespace) -> Exposures:
     if not path.exists():
         raise FrameError(f"{path}: there is no such night: give a folder, a rosbag2, or photographs")
     if bag.is_bag(path):
+        if args.gnss is not None:
+            raise FrameError(f"{path}: --gnss goes with a folder of frames, and this is a bag: leave it out")
         return bag.exposures(*inputs.read_bag(path, args), air, vertical)
     frames = paths if path.is_file() else []
     if frames and not are_photographs(frames):

@@ -16,6 +16,8 @@ from starpos.averaging.average import Average
 from starpos.calibration import residual_map
 from starpos.errors import TimeError
 from starpos.fix.fix import PlaceFix, length_text
+from starpos.gnss.solving import Watched
+from starpos.gnss.watch import GnssStatus
 from starpos.night.night import Night, Truth
 from starpos.report import coast, measures, night_figures
 from starpos.report.html import document, figures, sexagesimal, table
@@ -50,6 +52,10 @@ def _figures(night: Night, catalogue: Catalogue) -> Iterator[_Figure]:
             yield "sky", title, _sky_caption(), 6.4, lambda f: draw.draw_sky(f, night, catalogue)
     if not night.shots:
         return
+    if night.watched is not None and draw.compared_of(night.watched.answers):
+        answers = night.watched.answers
+        title = "The drive beside GNSS"
+        yield "drive", title, _drive_caption(answers), 8.6, lambda f: draw.draw_drive(f, answers)
     yield "health", "Frame by frame", HEALTH, 6.4, lambda f: draw.draw_health(f, night)
 
 
@@ -103,6 +109,21 @@ HEALTH = (
     "go (clouds, dew), a residual that rises (focus, wind), a tilt that drifts or jumps (the mount), slow "
     "identification."
 )
+DRIVE = (
+    "Above, the stars' own places, each with what was learned before it, and the GNSS places in the colour of what the "
+    "guard said. In the middle, how far they are apart; below, how well A3 and the deflection were known. Suspicious: a "
+    "distance that grows evenly (a drag)."
+)
+
+
+def _drive_caption(answers: Sequence[Watched]) -> str:
+    compared = night_figures.compared_of(answers)
+    alarm = next((a for a in compared if a.compared and a.compared.status == GnssStatus.DISAGREES), None)
+    if alarm is None or alarm.compared is None:
+        told = "No alarm: GNSS never disagreed."
+    else:
+        told = f"Alarm at {utc_text(alarm.solution.utc_unix_s or 0.0)}: {alarm.compared.sentence}."
+    return f"{DRIVE} {told}"
 
 
 def _stability_caption(s: measures.Stability, text: str) -> str:
