@@ -186,6 +186,29 @@ def _shares(place: PlaceFix, night: Night) -> dict[str, np.ndarray]:
     return shares
 
 
+def draw_nights(figure: "Figure", nights: Sequence[tuple[int, Night]]) -> None:
+    """Draw the errors of latitude and longitude in arcsec of numbered nights; at least one with a place and a truth."""
+    known = [(k, n.combined, n.truth) for k, n in nights if n.combined and n.truth]
+    number = [k for k, _, _ in known]
+    error = np.array([measures.error_arcsec(place, truth) for _, place, truth in known])
+    sigma = np.array([measures.sigma_arcsec(place) for _, place, _ in known])
+    panels = figure.subplots(2, 1, sharex=True)
+    for k, (axes, name, paper) in enumerate(
+        zip(panels, ("latitude", "longitude"), measures.PAPER_NIGHTS, strict=True)
+    ):
+        plain(axes)
+        axes.axhline(0, color=GREY, lw=0.8)
+        axes.axhspan(-paper, paper, color=GREY, alpha=0.1, lw=0, label="the paper's mean absolute error")
+        axes.errorbar(number, error[:, k], sigma[:, k], fmt="o", color=BLUE, ms=5, ecolor=SKY, elinewidth=1.5)
+        reach = 1.15 * max(paper, (np.abs(error[:, k]) + sigma[:, k]).max())
+        mean = figures_of(np.abs(error[:, k]).mean())
+        axes.set_title(f"{name}: mean absolute error {mean}″ (the paper's {paper:.1f}″)", fontsize=10)
+        axes.set(ylim=(-reach, reach), ylabel="arcsec")
+    panels[0].legend(loc="upper right", fontsize=8, framealpha=0.9)
+    number_axis(panels[-1], number)
+    panels[-1].set_xlabel("night")
+
+
 def draw_health(figure: "Figure", night: Night) -> None:
     """Draw stars, residual, tilt and working time of every frame against time."""
     shots = night.shots
